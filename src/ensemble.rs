@@ -1,4 +1,4 @@
-//! Stage · several views of one camera become one.
+//! Stage: blends several views of one camera into one.
 //!
 //! `I(p) = Σ_k w_k · clamp(I_k(p), 0, 1)`, the paper's §5 with `w` = 0.1 baseline, 0.6 T-Face,
 //! 0.3 I-Face. Which member is the better one differs from capture to capture, and fixed weights that suit
@@ -24,14 +24,15 @@ use rayon::prelude::*;
 /// The paper's §5: baseline, T-Face, I-Face.
 pub const PAPER_WEIGHTS: [f32; 3] = [0.1, 0.6, 0.3];
 
-/// The members with one weight each, in float; round once, when it is written.
+/// Blends the members with one weight each, in float; the result is rounded once, when it is written.
 ///
 /// Weights are shares: finite, from 0 up, with sum 1. A sum beside 1 by at most 0.001 is taken as
 /// rounding and divided out; beyond that it is an error, since the blend would be darker or brighter
 /// than its members.
 ///
 /// # Errors
-/// When there is not one weight for each member, or a weight or their sum is no share.
+/// Fails if the number of weights differs from that of the members, if a weight is negative or not finite, or if
+/// their sum is not 1.
 ///
 /// # Examples
 ///
@@ -142,7 +143,7 @@ mod tests {
         let alone = Members::new(&list).unwrap().cut(&[1.0, 0.0, 0.0]).unwrap();
         let out = blend(&alone, &[1.0, 0.0, 0.0]).unwrap();
         near(out.pixel(1, 0), [0.52, 0.52, 0.52, 0.65]);
-        // nothing to cut by: nothing is cut
+        // without masked members nothing is cut
         let only = Members::new(&list[..1]).unwrap().cut(&[1.0]).unwrap();
         assert_eq!(blend(&only, &[1.0]).unwrap(), baseline);
     }

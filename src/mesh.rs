@@ -1,10 +1,10 @@
-//! Stage: a surface an artist can open. The zero level set of a signed distance becomes a closed mesh.
+//! Stage: extraction of a signed distance's zero level set as a closed mesh, and its preparation for artists.
 //!
-//! - `extract`: [`marching`] meshes a dense grid, [`sparse`] evaluates a field only near its surface, [`clean`] keeps the
-//!   head and drops the dust; [`extract`] is all of it, with normals and colors, and takes small handles away. [`Cap`]
-//!   closes what the frames cut.
-//! - `finish`: [`simplify`], [`atlas`] and [`bake`] make of it what an artist opens.
-//! - [`files`]: GLB, OBJ and PLY in and out, and whether a mesh is sound.
+//! - `extract`: [`marching`] meshes a dense grid, [`sparse`] evaluates a field only near its surface, [`clean`] keeps
+//!   the head and drops loose pieces; [`extract`] runs all of this, adds normals and colors, and removes small handles.
+//!   [`Cap`] closes the surface where the frames cut it.
+//! - `finish`: [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured head mesh.
+//! - [`files`]: reads, writes and checks GLB, OBJ and PLY.
 
 mod extract;
 pub mod files;

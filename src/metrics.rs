@@ -1,4 +1,4 @@
-//! Stage · how near a view is to the photograph, and a mesh to a reference.
+//! Stage: compares views with photographs, and a mesh with a reference.
 //!
 //! Views are compared as they would be after a trip through an 8-bit file: every value is rounded to
 //! 1/255 first. Figures are in f64, averaged per image, then over images. A figure that has no value
@@ -32,23 +32,23 @@ use crate::image::{Gray, Image, Photo, quantize};
 use crate::{Error, Result};
 use serde::Serialize;
 
-/// A mask counts from here on: half.
+/// Threshold from which a mask counts: half.
 const INSIDE: u8 = 128;
 
-/// Figures of one view.
+/// Metrics of one view.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ViewMetrics {
     /// The photograph's name.
     pub name: String,
-    /// Of the whole frame, dB.
+    /// PSNR of the whole frame, dB.
     pub psnr: Option<f64>,
-    /// Of the whole frame, the published variant ([`ssim_valid`]).
+    /// SSIM of the whole frame, the published variant ([`ssim_valid`]).
     pub ssim: Option<f64>,
-    /// Over the pixels that are in the mask and valid, dB.
+    /// PSNR over the pixels that are in the mask and valid, dB.
     pub psnr_masked: Option<f64>,
     /// Mean of [`ssim_reflect_map`] over the pixels that are in the mask and valid.
     pub ssim_masked: Option<f64>,
-    /// LPIPS of the whole frame, where a network was given for it.
+    /// LPIPS of the whole frame, if a network was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
 }
@@ -56,30 +56,30 @@ pub struct ViewMetrics {
 /// Means over all views that have a value.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Means {
-    /// Of `psnr`.
+    /// Mean of `psnr`.
     pub psnr: Option<f64>,
-    /// Of `ssim`.
+    /// Mean of `ssim`.
     pub ssim: Option<f64>,
-    /// Of `psnr_masked`.
+    /// Mean of `psnr_masked`.
     pub psnr_masked: Option<f64>,
-    /// Of `ssim_masked`.
+    /// Mean of `ssim_masked`.
     pub ssim_masked: Option<f64>,
-    /// Of `lpips`.
+    /// Mean of `lpips`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
 }
 
-/// What `metrics.json` holds.
+/// The content of `metrics.json`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Metrics {
-    /// Over all views.
+    /// Means over all views.
     pub mean: Means,
-    /// One by one, in the order given.
+    /// Metrics of each view, in the order given.
     pub views: Vec<ViewMetrics>,
 }
 
 impl Metrics {
-    /// Adds the means.
+    /// Returns the views with their means.
     pub fn new(views: Vec<ViewMetrics>) -> Metrics {
         let mean = |of: fn(&ViewMetrics) -> Option<f64>| {
             let values: Vec<f64> = views.iter().filter_map(of).collect();
@@ -145,7 +145,7 @@ pub fn compare(
     })
 }
 
-/// The colors after a trip through 8 bits; values that are not a number become 0.
+/// Rounds the colors to 8 bits and back; NaN becomes 0.
 fn rounded(image: &Image) -> Image {
     let mut out = Image::new(image.width, image.height, 3);
     for (o, i) in out.data.as_chunks_mut::<3>().0.iter_mut().zip(image.data.chunks_exact(image.channels)) {
@@ -154,7 +154,7 @@ fn rounded(image: &Image) -> Image {
     out
 }
 
-/// A photograph as a picture of floats.
+/// Converts a photograph to floats.
 fn picture(photo: &Photo) -> Image {
     let mut out = Image::new(photo.width, photo.height, 3);
     for (o, rgb) in out.data.as_chunks_mut::<3>().0.iter_mut().zip(&photo.rgb) {

@@ -1,23 +1,24 @@
-//! The line: from photographs to a mesh, views and numbers. The only place where stages meet.
+//! The pipeline: from photographs to a mesh, views and metrics. Stages meet only in this module.
 //!
 //! ```text
-//! mask      which pixels are the head, and where that puts it in space
-//! baseline  a radiance field learned from whole photographs
-//! tface     the same, learned from masked ones
-//! iface     a signed distance learned from the masked photographs
+//! mask      which pixels are the head, and where the head is in space
+//! baseline  a radiance field trained on whole photographs
+//! tface     the same, trained on masked photographs
+//! iface     a signed distance field trained on the masked photographs
 //! mesh      its zero level set, closed, in the dataset's world
 //! render    held-out views, by marching the fields and by casting rays at the mesh
-//! ensemble  those views become one
-//! metrics   all of them against the photographs
+//! ensemble  blends those views into one
+//! metrics   compares all of them with the photographs
 //! ```
 //!
-//! Views from other cameras, a turntable for example, are a product beside the line ([`Line::with_camera_path`]).
+//! Views from other cameras, a turntable for example, are a separate output of the pipeline
+//! ([`Line::with_camera_path`]).
 //!
-//! Each stage names those it reads from ([`Stage::needs`]); a command runs what its stage needs and
-//! nothing else. What shapes a stage is known before it runs: its settings, and the same of the stages
-//! it needs. So all fingerprints can be computed at once ([`Line::plan`]), a dry run tells what would
-//! be done, and a finished stage is skipped without loading anything. The device is not part of it: it
-//! decides how fast a field is learned, not what it is.
+//! Each stage names the stages that it reads from ([`Stage::needs`]); a command runs what its stage needs and nothing
+//! else. A stage is determined by its settings and by those of the stages it needs, which are known before it runs.
+//! So all fingerprints can be computed at once ([`Line::plan`]), a dry run lists what would be done, and a finished
+//! stage is skipped without loading anything. The device is not part of the fingerprint, because it decides how fast
+//! a field is trained, not what the field is.
 
 mod bench;
 mod clicks;
@@ -54,7 +55,7 @@ pub use surface::{Fields, Radiance, Surface};
 use crate::Result;
 use crate::run::{Done, StageDir};
 
-/// Completes every stage that `until` needs, and itself, and writes the report.
+/// Completes `until` and every stage that it needs, and writes the report.
 pub fn reconstruct(line: &Line, until: Stage) -> Result<Vec<(Stage, Done)>> {
     let fields = learn::trained_fields(line);
     let mut done = Vec::new();
@@ -66,8 +67,8 @@ pub fn reconstruct(line: &Line, until: Stage) -> Result<Vec<(Stage, Done)>> {
     Ok(done)
 }
 
-/// Completes a stage from what those before it left in the run, or skips it if it is done. `fields` are what was
-/// learned; they are only asked for by a stage that has something to do.
+/// Completes a stage from the outputs of the stages before it, or skips it if it is done. `fields` are the trained
+/// fields; only a stage that has work to do loads them.
 pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> {
     let Line { capture, config, run, .. } = line;
     if stage == Stage::Ensemble {

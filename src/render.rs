@@ -1,4 +1,4 @@
-//! Stage · ways to make a view.
+//! Stage: the ways to render a view.
 
 mod look;
 pub mod path;

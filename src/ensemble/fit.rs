@@ -10,10 +10,10 @@
 //!
 //! # Tiles
 //!
-//! Squares of the training photographs that nothing learns from: what the weights are fitted on.
+//! Tiles are squares of the training photographs that are excluded from training; the weights are fitted on them.
 //!
-//! Whole views would be missed by the fields; a few squares of each are not, since other views show the
-//! same skin. They are large enough that what is in them cannot be guessed from the pixels around.
+//! Excluding whole views would harm the fields; excluding a few squares of each does not, since other views show the
+//! same skin. The squares are large enough that their content cannot be guessed from the pixels around.
 
 use super::members::{in_bands, no_members, normalized};
 use super::{BlendTarget, Members};
@@ -22,19 +22,19 @@ use crate::{Error, Result};
 
 /// Sums over the pixels seen so far: `members²` numbers, so each view may keep its own.
 ///
-/// Give it pixels that were held out of training: on those it learned from a member looks better
-/// than it is. Never test views.
+/// The pixels must have been excluded from training, because a member looks better than it is on its training pixels.
+/// They must never come from test views.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fit {
     members: usize,
     /// D, `[members · members]`, symmetric.
     products: Vec<f64>,
-    /// How many pixels, each by its weight.
+    /// Weighted number of pixels.
     pixels: f64,
 }
 
 impl Fit {
-    /// Of no views yet. At most [`MAX_MEMBERS`] members.
+    /// Returns a fit without views, of at most [`MAX_MEMBERS`] members.
     pub fn new(members: usize) -> Result<Fit> {
         match members {
             0 => Err(no_members()),
@@ -62,7 +62,7 @@ impl Fit {
         bands.iter().try_for_each(|band| self.merge(band))
     }
 
-    /// Adds the views of another. The last bits depend on the order, nothing else does.
+    /// Adds the views of another fit. Only the last bits depend on the order.
     pub fn merge(&mut self, other: &Fit) -> Result<()> {
         self.same_members(other.members)?;
         self.products.iter_mut().zip(&other.products).for_each(|(a, b)| *a += b);
@@ -70,19 +70,19 @@ impl Fit {
         Ok(())
     }
 
-    /// How many pixels were counted, each by its weight.
+    /// Returns the weighted number of pixels.
     pub fn pixels(&self) -> f64 {
         self.pixels
     }
 
-    /// The weights: `argmin wᵀDw`, `w ≥ 0`, `Σ w = 1`; `None` where no pixel counts. Members that are alike share
-    /// alike.
+    /// Returns the weights `argmin wᵀDw`, `w ≥ 0`, `Σ w = 1`; `None` if no pixel counts. Identical members get equal
+    /// weights.
     pub fn solve(&self) -> Option<Vec<f32>> {
         if self.pixels <= 0.0 {
             return None;
         }
         let m = self.members;
-        // far below what 8 bits can tell; it decides only between members that are the same
+        // far below 8-bit resolution, so it only decides between identical members
         let trace: f64 = (0..m).map(|k| self.products[k * m + k]).sum();
         let ridge = (1e-9 * trace / m as f64).max(1e-30);
         let mut h = self.products.clone();
@@ -91,18 +91,18 @@ impl Fit {
         Some(weights[..m].iter().map(|w| *w as f32).collect())
     }
 
-    /// PSNR of the blend with these weights over the counted pixels of all views together, dB.
+    /// Returns the PSNR of the blend with these weights over the counted pixels of all views together, dB.
     ///
     /// Before 8-bit rounding, and one mean over all pixels, where `metrics` takes one for each view.
     /// `None` without pixels or without any error.
     pub fn psnr(&self, weights: &[f32]) -> Result<Option<f64>> {
         let weights = normalized(weights, self.members)?;
-        // a number unless there are no pixels or no error
+        // finite unless there are no pixels or no error
         let decibels = -10.0 * (self.error(&weights) / (3.0 * self.pixels)).log10();
         Ok(decibels.is_finite().then_some(decibels))
     }
 
-    /// wᵀDw.
+    /// Returns wᵀDw.
     fn error(&self, weights: &[f32]) -> f64 {
         let m = self.members;
         let row = |k: usize| -> f64 { (0..m).map(|l| self.products[k * m + l] * weights[l] as f64).sum() };
@@ -131,8 +131,9 @@ impl Fit {
     }
 }
 
-/// The weights of least squared error over several views; all of one member where that member alone is no
-/// worse on views that had no say, each judged with the weights of the others. `None` where no pixel counts.
+/// Returns the weights of least squared error over several views. A single member gets the whole weight if it alone
+/// is no worse under cross-validation, in which each view is evaluated with weights fitted to the others. `None` if
+/// no pixel counts.
 pub fn fit_weights(views: &[Fit]) -> Result<Option<Vec<f32>>> {
     let Some(first) = views.first() else { return Ok(None) };
     let merged = |left_out: Option<usize>| -> Result<Fit> {
@@ -145,7 +146,7 @@ pub fn fit_weights(views: &[Fit]) -> Result<Option<Vec<f32>>> {
     let Some(weights) = all.solve() else { return Ok(None) };
     let mut unseen = 0.0;
     for (i, view) in views.iter().enumerate().filter(|(_, view)| view.pixels > 0.0) {
-        // the only view with a pixel: nothing can judge it
+        // this is the only view with pixels, so nothing remains to cross-validate with
         let Some(others) = merged(Some(i))?.solve() else { return Ok(Some(weights)) };
         unseen += view.error(&others);
     }
@@ -157,7 +158,7 @@ pub fn fit_weights(views: &[Fit]) -> Result<Option<Vec<f32>>> {
     }))
 }
 
-/// The most members a fit can weigh.
+/// Maximum number of members in a fit.
 pub const MAX_MEMBERS: usize = 8;
 
 /// Factors the symmetric positive definite `a` (`[n · n]`, its lower half is read) in place, A = LLᵀ.
@@ -224,8 +225,8 @@ pub(super) fn least(h: &[f64], g: &[f64]) -> [f64; MAX_MEMBERS] {
     best
 }
 
-/// The minimum on one face, if it has no weight below 0. Corners need no equations, so there is
-/// always an answer.
+/// Returns the minimum on one face, if it has no weight below 0. Corners need no equations, so a solution always
+/// exists.
 fn on_face(h: &[f64], g: &[f64], on: &[usize]) -> Option<[f64; MAX_MEMBERS]> {
     let (n, m) = (g.len(), on.len());
     let mut x = [0.0; MAX_MEMBERS];
@@ -271,15 +272,15 @@ pub struct Tile {
 }
 
 impl Tile {
-    /// The pixels of the tile in a picture `width` wide, row by row.
+    /// Returns the pixels of the tile in a picture `width` wide, row by row.
     pub fn pixels(self, width: u32) -> impl Iterator<Item = usize> {
         let Tile { x, y, side } = self;
         (y..y + side).flat_map(move |y| (x..x + side).map(move |x| y as usize * width as usize + x as usize))
     }
 }
 
-/// The tiles of the photograph number `view`: about `share` of its pixels, at least one tile, each at a random
-/// place in its own cell of a grid. None where `share` is 0. The same arguments give the same tiles.
+/// Returns the tiles of photograph number `view`: about `share` of its pixels, at least one tile, each at a random
+/// position in its own cell of a grid; none if `share` is 0. The same arguments give the same tiles.
 pub fn tiles(width: u32, height: u32, share: f64, seed: u64, view: u64) -> Vec<Tile> {
     let shorter = width.min(height);
     let side = (shorter / PARTS).max(LEAST).min(shorter);

@@ -1,4 +1,4 @@
-//! The renders of one view, checked once, and how their pixels are read.
+//! The renders of one view: their validation and access to their pixels.
 
 use crate::image::{Gray, Image, Photo};
 use crate::{Error, Result};
@@ -12,21 +12,21 @@ const BANDS: usize = 32;
 /// One render of the view.
 #[derive(Clone, Copy, Debug)]
 pub struct Member<'a> {
-    /// What errors call it: `baseline`, `tface`, `iface`.
+    /// The name in error messages: `baseline`, `tface`, `iface`.
     pub name: &'a str,
     /// RGBA, sRGB-coded over black (premultiplied); alpha = opacity.
     pub image: &'a Image,
-    /// Was it trained with masks? One that was not shows the background too.
+    /// Whether the member was trained with masks. One that was not shows the background too.
     pub masked: bool,
 }
 
-/// What the members should have shown.
+/// The photograph that the members are compared with.
 #[derive(Clone, Copy, Debug)]
 pub struct BlendTarget<'a> {
     /// The photograph over black: its colors multiplied by the mask.
     pub photo: &'a Photo,
-    /// How much a pixel counts, 255 = once, 0 = not at all: the mask, or the mask from half on, and
-    /// 0 where the photograph is not valid.
+    /// Weight of each pixel, 255 = once, 0 = not at all: the mask, or the mask from half on, and 0 where the
+    /// photograph is not valid.
     pub weight: &'a Gray,
 }
 
@@ -39,7 +39,7 @@ pub struct Members<'a> {
 }
 
 impl<'a> Members<'a> {
-    /// Checks them. The order is that of the weights.
+    /// Checks the renders. Their order is that of the weights.
     ///
     /// A pixel that is not finite is an error, here and so in every fit: it comes from a member that
     /// has diverged, of which no other pixel should be trusted.
@@ -62,10 +62,9 @@ impl<'a> Members<'a> {
 
     /// Cuts the members that were trained without masks to the head.
     ///
-    /// They fill the frame, and a blend would show a ghost of the background at their weight. Color and
-    /// alpha are multiplied by the mean opacity of the masked members, averaged with their
-    /// `weights` (alike if those are all 0); where the head is opaque nothing changes. Without
-    /// masked members there is nothing to cut by, and nothing is cut.
+    /// They fill the frame, and a blend would show a ghost of the background at their weight. Color and alpha are
+    /// multiplied by the mean opacity of the masked members, averaged with their `weights` (equally if those are all
+    /// 0); where the head is opaque nothing changes. Without masked members nothing is cut.
     pub fn cut(mut self, weights: &[f32]) -> Result<Members<'a>> {
         let weights = normalized(weights, self.list.len())?;
         let shares = |of: &dyn Fn(usize) -> f32| -> Option<Vec<f32>> {
@@ -77,12 +76,12 @@ impl<'a> Members<'a> {
         Ok(self)
     }
 
-    /// How many.
+    /// Returns the number of members.
     pub fn count(&self) -> usize {
         self.list.len()
     }
 
-    /// Width and height.
+    /// Returns width and height.
     pub fn size(&self) -> (u32, u32) {
         (self.list[0].image.width, self.list[0].image.height)
     }
@@ -91,7 +90,7 @@ impl<'a> Members<'a> {
         self.size().0 as usize * self.size().1 as usize
     }
 
-    /// All members at pixel `i`, clamped to 0..=1 and cut. `out`: `[members]`.
+    /// Reads all members at pixel `i`, clamped to 0..=1 and cut. `out`: `[members]`.
     #[inline]
     pub(super) fn read(&self, i: usize, out: &mut [[f32; 4]]) {
         for (o, member) in out.iter_mut().zip(&self.list) {
@@ -106,14 +105,14 @@ impl<'a> Members<'a> {
         }
     }
 
-    /// Is the target one of this view?
+    /// Checks that the target belongs to this view.
     pub(super) fn check(&self, target: &BlendTarget) -> Result<()> {
         let (photo, weight) = (target.photo, target.weight);
         same_size("the photograph", (photo.width, photo.height), self.size())?;
         same_size("the weight map", (weight.width, weight.height), self.size())
     }
 
-    /// Calls `with(i, weight, member − photo)` for the pixels that count. Errors: `[members]`, RGB.
+    /// Calls `with(i, weight, member − photo)` for the pixels that count. The errors are `[members]`, RGB.
     pub(super) fn errors(
         &self,
         target: &BlendTarget,
@@ -133,17 +132,17 @@ impl<'a> Members<'a> {
     }
 }
 
-/// One result for each band of a picture, in order.
+/// Returns one result for each band of a picture, in order.
 pub(super) fn in_bands<T: Send>(pixels: usize, band: impl Fn(Range<usize>) -> T + Sync) -> Vec<T> {
     (0..BANDS).into_par_iter().map(|b| band(b * pixels / BANDS..(b + 1) * pixels / BANDS)).collect()
 }
 
-/// The error where there is nothing to blend.
+/// Returns the error for an empty list of members.
 pub(super) fn no_members() -> Error {
     Error::cannot("there are no members to blend", "name at least one member whose views are rendered")
 }
 
-/// Weights that have a sum of 1 exactly. More than 0.001 beside it is no rounding but a mistake.
+/// Normalizes weights to a sum of exactly 1. A sum that is off by more than 0.001 is an error.
 pub(super) fn normalized(weights: &[f32], members: usize) -> Result<Vec<f32>> {
     let found = weights.len();
     if found != members {
@@ -165,7 +164,7 @@ pub(super) fn normalized(weights: &[f32], members: usize) -> Result<Vec<f32>> {
     Ok(weights.iter().map(|w| (*w as f64 / sum) as f32).collect())
 }
 
-/// The suggested fix for weights whose sum is not 1.
+/// Returns the hint for weights whose sum is not 1.
 pub fn shares_hint(weights: &[f32]) -> String {
     let sum: f64 = weights.iter().map(|w| *w as f64).sum();
     if sum <= 0.0 {

@@ -1,4 +1,4 @@
-//! The stage: from a signed distance to a closed mesh with normals and colors.
+//! The stage `mesh`, first part: from a signed distance to a closed mesh with normals and colors.
 
 mod cap;
 mod clean;
@@ -135,7 +135,7 @@ pub struct MeshReport {
 }
 
 impl MeshReport {
-    /// The box of the grid.
+    /// Returns the box of the grid.
     pub fn bounds(&self) -> Aabb {
         let [min, max] = self.grid.map(Vec3::from);
         Aabb { min, max }
@@ -374,7 +374,7 @@ impl NodeGrid {
         (self.origin.as_dvec3() + n * f64::from(self.spacing)).as_vec3()
     }
 
-    /// Number of nodes.
+    /// Returns the number of nodes.
     pub fn nodes(&self) -> usize {
         self.dims.iter().product()
     }

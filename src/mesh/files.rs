@@ -1,8 +1,8 @@
-//! Meshes as files: GLB, OBJ and PLY, written and read, and whether what is in them is sound.
+//! Mesh files: GLB, OBJ and PLY, written, read and checked.
 //!
-//! [`to_glb`], [`to_obj`] and [`to_ply`] write; [`read()`] reads all three, whoever wrote them. [`check()`] examines
-//! a surface, [`uv_check()`] its texture coordinates. [`ExtractedSurface`] and [`HeadMesh`] are what the stages after
-//! this one read.
+//! [`to_glb`], [`to_obj`] and [`to_ply`] write; [`read()`] reads all three formats from any program. [`check()`]
+//! examines a surface, [`uv_check()`] its texture coordinates. [`ExtractedSurface`] and [`HeadMesh`] are the meshes
+//! that later stages read.
 
 mod check;
 mod compact;

@@ -1,12 +1,11 @@
-//! What callers give is checked: settings, meshes, and the answers of fields.
+//! Validation of the callers' input: settings, meshes, and the values that fields return.
 
 use crate::geom::Mesh;
 use crate::{Error, Monitor, Result};
 use glam::Vec3;
 use std::fmt::Display;
 
-/// Refuses a setting that is not `ok`. `name` is that of the parameter or field, or of the configuration's key where
-/// there is one.
+/// Refuses a setting that is not `ok`. `name` is the configuration's key if it has one, else the parameter or field.
 pub(super) fn setting(ok: bool, name: &str, expected: &str, found: impl Display) -> Result<()> {
     if ok { Ok(()) } else { Err(Error::cannot(format!("`{name}` is {found}, expected {expected}"), "")) }
 }
@@ -28,7 +27,7 @@ fn not_finite(mesh: &Mesh, first: usize) -> Error {
     ))
 }
 
-/// Refuses triangles over vertices that are not there or not finite.
+/// Refuses triangles with missing or non-finite vertices.
 pub(super) fn check_indices(mesh: &Mesh) -> Result<()> {
     let vertices = mesh.positions.len();
     for (i, &v) in mesh.triangles.as_flattened().iter().enumerate() {
@@ -53,7 +52,7 @@ pub(super) fn check_count(vertices: u64, triangles: u64) -> Result<()> {
     Err(Error::cannot(message, "lower `mesh.resolution`"))
 }
 
-/// Refuses answers of another number than the points.
+/// Refuses a field's values if their number differs from the number of points.
 pub(super) fn check_len(what: &str, points: usize, answers: usize) -> Result<()> {
     if points == answers {
         return Ok(());

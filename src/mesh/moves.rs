@@ -1,6 +1,6 @@
-//! Vertices move towards a surface, none so far that it spoils a triangle.
+//! Movement of vertices towards a surface without spoiling triangles.
 //!
-//! [`Polish`]: vertices move onto the field's zero and apart from each other, without ever spoiling a face.
+//! [`Polish`] moves vertices onto the field's zero and apart from each other, without ever spoiling a face.
 //!
 //! A Newton step `p −= f g / |g|²` takes out most of the error of linear interpolation; what two steps
 //! leave is the chord error of flat triangles. With the first step each vertex also slides along the
@@ -11,15 +11,15 @@ use crate::geom::{area_vector, shape};
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// The first-order step to a field's zero, `−f g / |g|²`; none where the field says nothing useful.
+/// Returns the first-order step to a field's zero, `−f g / |g|²`; zero if value or gradient is unusable.
 pub(super) fn newton(f: f32, g: Vec3) -> Option<Vec3> {
     let slope = g.length_squared();
     let step = -f / slope * g;
     (slope.is_finite() && slope >= 1e-12 && step.is_finite()).then_some(step)
 }
 
-/// Moves vertices all the way, half of it, a quarter, or not at all where a triangle would be spoiled; returns how many
-/// were held back.
+/// Moves vertices all the way, half of it, a quarter, or not at all where a triangle would be spoiled; returns how
+/// many were held back.
 ///
 /// `at(v, p, share)` is where vertex `v`, now at `p`, is after that share of its way. `spoiled(t, from, to)` is only
 /// asked for triangles of which a vertex moved.
@@ -40,7 +40,7 @@ pub(super) fn move_vertices(
             watched.into_par_iter().filter(|&t| moved(t) && spoiled(t, &from, positions)).collect();
         let mut corners: Vec<u32> =
             bad.iter().flat_map(|&t| triangles[t]).filter(|&v| share[v as usize] > 0).collect();
-        // triangles that were spoiled from the start stay so without anyone to hold back
+        // triangles that were spoiled from the start do not hold vertices back
         if corners.is_empty() {
             break;
         }
@@ -63,19 +63,19 @@ const POOR: f32 = 0.02;
 /// A face may turn until this cosine against its direction at extraction.
 const TURN: f32 = 0.2;
 
-/// Vertices on their way, and where they started.
+/// Moving vertices, with their start positions.
 pub(super) struct Polish<'a> {
     triangles: &'a [[u32; 3]],
     start: Vec<Vec3>,
     /// Twice the area vectors at the start.
     facing: Vec<Vec3>,
-    /// No vertex goes farther from its start.
+    /// Maximum distance of a vertex from its start.
     reach: f32,
     fixed: Vec<bool>,
 }
 
 impl<'a> Polish<'a> {
-    /// `fixed` vertices stay; the others move at most `reach`.
+    /// Returns a polish in which `fixed` vertices stay and the others move at most `reach`.
     pub(super) fn new(
         positions: &[Vec3],
         triangles: &'a [[u32; 3]],
@@ -86,9 +86,9 @@ impl<'a> Polish<'a> {
         Polish { triangles, start: positions.to_vec(), facing, reach, fixed }
     }
 
-    /// One Newton step with values and gradients at `positions`, plus the share `relax` of the way along
-    /// the surface to the middle of the neighbours. Steps that would spoil a face are shortened or
-    /// undone; how many vertices that held back.
+    /// Makes one Newton step with values and gradients at `positions`, plus the share `relax` of the way along the
+    /// surface to the mean of the neighbours. Steps that would spoil a face are shortened or undone; returns the
+    /// number of such vertices.
     pub(super) fn step(
         &self,
         positions: &mut [Vec3],
@@ -121,7 +121,7 @@ impl<'a> Polish<'a> {
         move_vertices(positions, self.triangles, at, spoiled)
     }
 
-    /// Mean of each vertex's neighbours.
+    /// Returns the mean of each vertex's neighbours.
     fn middles(&self, positions: &[Vec3]) -> Vec<Vec3> {
         let mut sums = vec![(Vec3::ZERO, 0.0f32); positions.len()];
         for t in self.triangles {

@@ -1,8 +1,7 @@
-//! How far one surface is from another.
+//! Distances between surfaces.
 //!
-//! Points are spread evenly by area over one mesh, always at the same places, and their nearest
-//! points on the other are found. Both directions are needed: what is missing shows in one, what is
-//! too much in the other.
+//! Points are spread evenly by area over one mesh, always at the same positions, and their nearest points on the
+//! other are found. Both directions are needed: missing parts show in one, superfluous parts in the other.
 
 use crate::geom::{Bvh, Camera, Mesh, Ray};
 use glam::Vec3;
@@ -13,19 +12,19 @@ use std::ops::RangeInclusive;
 /// Distances from one surface to another, in the units of the meshes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Distances {
-    /// How many points were measured.
+    /// Number of points that were measured.
     pub samples: usize,
     /// Mean.
     pub mean: f64,
-    /// Half of the points are nearer.
+    /// Median.
     pub median: f64,
-    /// Nine tenths of the points are nearer.
+    /// 90th percentile.
     pub p90: f64,
     /// Largest.
     pub max: f64,
 }
 
-/// Distances from `samples` points on `from` to the surface `to`; `None` when a mesh has no area.
+/// Returns the distances from `samples` points on `from` to the surface `to`; `None` if a mesh has no area.
 pub fn one_way(from: &Mesh, to: &Bvh, samples: usize) -> Option<Distances> {
     distances(sample(from, samples), to)
 }
@@ -43,13 +42,13 @@ fn distances(points: Vec<Vec3>, to: &Bvh) -> Option<Distances> {
     Some(Distances { samples: distances.len(), mean, median: rank(0.5), p90: rank(0.9), max: rank(1.0) })
 }
 
-/// `count` points spread evenly by area: equal steps through the summed areas choose the triangle,
-/// the R2 sequence (Roberts 2018) the place in it. Without area, no points.
+/// Returns `count` points spread evenly by area: equal steps through the summed areas choose the triangle, the R2
+/// sequence (Roberts 2018) the point in it. Without area, no points.
 pub fn sample(mesh: &Mesh, count: usize) -> Vec<Vec3> {
     sample_triangles(mesh, count).into_iter().map(|(p, _)| p).collect()
 }
 
-/// [`sample`] with the triangle each point lies on.
+/// Runs [`sample`] and returns the triangle of each point, too.
 pub fn sample_triangles(mesh: &Mesh, count: usize) -> Vec<(Vec3, u32)> {
     let mut total = 0.0f64;
     let areas: Vec<f64> = (0..mesh.triangles.len() as u32)
@@ -76,28 +75,28 @@ pub fn sample_triangles(mesh: &Mesh, count: usize) -> Vec<(Vec3, u32)> {
     (0..count).into_par_iter().map(point).collect()
 }
 
-/// Least cosine between a surface's normal and the way to a camera that counts as seeing it (75°, the
-/// limit of texture baking too): flatter views tell little.
+/// Minimum cosine between a surface's normal and the direction to a camera that counts as seeing it (75°, the limit
+/// of texture baking too): flatter views carry little information.
 const LEAST_COSINE: f32 = 0.26;
 
-/// How many cameras see a point, and what they take it for.
+/// Visibility of a point, and its label.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SurfaceVisibility {
-    /// So many cameras see it: inside the frame, not steeper than 75°, nothing in between.
+    /// Number of cameras that see the point: inside the frame, not steeper than 75°, and unoccluded.
     pub cameras: u32,
-    /// So many of those take it for the first kind, and for the second.
+    /// Number of these cameras whose pixel shows the first kind, and the second.
     pub kinds: [u32; 2],
 }
 
 impl SurfaceVisibility {
-    /// Three or more cameras see the point, and more than half of them take it for this kind.
+    /// Returns whether three or more cameras see the point, and more than half of them label it as this kind.
     pub fn is(&self, kind: usize) -> bool {
         self.cameras >= 3 && 2 * self.kinds[kind] > self.cameras
     }
 }
 
-/// Returns what the cameras see of points of a mesh; `kind` says what a camera (its index) has at a pixel (column,
-/// row), 0 or 1, if it is either.
+/// Returns the visibility of points of a mesh; `kind` returns the label of a camera (its index) at a pixel (column,
+/// row): 0 or 1, if it has one.
 ///
 /// Where fewer than three cameras look (a cap below the frames' border, the inside of a nostril, the underside of a
 /// bust) photographs do not determine the surface, and its distance to the truth says nothing about a method.
@@ -140,8 +139,9 @@ fn normal(mesh: &Mesh, triangle: u32) -> Vec3 {
     (b - a).cross(c - a).normalize_or_zero()
 }
 
-/// Distances from `from` to `to` over the parts that the cameras take for either kind ([`SurfaceVisibility::is`]), with the
-/// median of the signed ones: positive where `to` is outside. `None` for a part that is empty.
+/// Returns the distances from `from` to `to` over the parts that the cameras label as either kind
+/// ([`SurfaceVisibility::is`]), with the median of the signed ones: positive where `to` is outside. `None` for an
+/// empty part.
 pub fn kinds_one_way(
     from: &Mesh,
     to: &Bvh,
@@ -165,8 +165,8 @@ pub fn kinds_one_way(
     })
 }
 
-/// Distances from `from` to `to` over the parts that so many cameras see, and each part's share of the area, in
-/// the order of `views`. `None` for a part that is empty.
+/// Returns the distances from `from` to `to` over the parts seen by so many cameras, and each part's share of the
+/// area, in the order of `views`. `None` for an empty part.
 pub fn seen_one_way(
     from: &Mesh,
     to: &Bvh,
@@ -266,7 +266,7 @@ mod tests {
         assert!((share - 4.0 / 6.0).abs() < 0.01, "{share}");
         // the upper sheet lies 1 above, the free half up to 2 beyond the end at x = 2: mean (1 + 1) / 2
         assert!((d.mean - 1.0).abs() < 0.02 && (d.max - 2.0).abs() < 0.05, "{d:?}");
-        // what nobody sees is the rest, and lies on the other; nothing is seen twice
+        // the invisible rest lies on the other surface; no point is counted twice
         let (hidden, rest) = parts[1].unwrap();
         assert!((rest - 2.0 / 6.0).abs() < 0.01 && hidden.mean < 0.01, "{hidden:?}");
         assert!(parts[2].is_none());

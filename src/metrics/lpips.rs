@@ -1,8 +1,8 @@
 //! LPIPS (Zhang et al. 2018), by a network that the user brings as an ONNX file: AlexNet or VGG with the published weights,
 //! exported with two pictures as its inputs.
 //!
-//! It sees both pictures as `2 c − 1` of colors in 0..1 (`normalize=True` of the published package), after a trip through
-//! 8 bits. A network that gives a map counts by its mean. Nothing is downloaded.
+//! Its input is `2 c − 1` of colors in 0..1 (`normalize=True` of the published package), rounded to 8 bits. If a
+//! network returns a map, its mean counts. Nothing is downloaded.
 
 use super::{picture, rounded};
 use crate::image::{Image, Photo};
@@ -11,19 +11,19 @@ use crate::{Error, Result};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
-/// A network that says how far two pictures are apart.
+/// A network that measures the perceptual distance of two pictures.
 pub struct Lpips {
-    /// One run at a time: its arrays are of a whole photograph each.
+    /// The network; the lock serializes its runs, because each has arrays of a whole photograph.
     session: Mutex<NetworkSession>,
     file: NetworkFile,
 }
 
 impl Lpips {
-    /// Opens the network's file; `onnxruntime` names a library, or is empty for the built-in engine, whose arrays may take
-    /// `memory_gib` each.
+    /// Opens the network's file; `onnxruntime` names a library, or is empty for the built-in engine, whose arrays may
+    /// take `memory_gib` each.
     ///
     /// # Errors
-    /// When a file cannot be read, is no sound ONNX file, or takes anything but two pictures.
+    /// Fails if a file cannot be read, is no valid ONNX file, or does not take two pictures.
     pub fn open(path: &Path, onnxruntime: &str, memory_gib: f64) -> Result<Lpips> {
         let runtime = match onnxruntime {
             "" => None,
@@ -35,15 +35,15 @@ impl Lpips {
         Ok(Lpips { session: Mutex::new(session), file })
     }
 
-    /// What was loaded.
+    /// Returns the record of the loaded network.
     pub fn file(&self) -> &NetworkFile {
         &self.file
     }
 
-    /// How far a render is from a photograph of its size, 0 where they are alike.
+    /// Returns the distance of a render from a photograph of its size, 0 for identical ones.
     ///
     /// # Errors
-    /// When the network takes another size only, fails, or gives what is no number.
+    /// Fails if the network requires another size, fails itself, or returns a non-finite number.
     pub fn distance(&self, render: &Image, photo: &Photo) -> Result<f64> {
         let session = self.session.lock().unwrap_or_else(PoisonError::into_inner);
         let (w, h) = (render.width as usize, render.height as usize);
@@ -70,7 +70,7 @@ impl Lpips {
     }
 }
 
-/// `[1, 3, height, width]` of `2 c − 1`.
+/// Returns `2 c − 1` as `[1, 3, height, width]`.
 fn planes(image: &Image) -> NetworkArray {
     let pixels = image.width as usize * image.height as usize;
     let mut values = vec![0.0; 3 * pixels];

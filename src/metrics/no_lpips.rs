@@ -1,10 +1,10 @@
-//! What stands for LPIPS in a build without the feature `matting`: no network can be opened.
+//! A stub of LPIPS for builds without the feature `matting`: no network can be opened.
 
 use crate::image::{Image, Photo};
 use crate::{Error, Result};
 use std::convert::Infallible;
 
-/// A network for LPIPS, of which there are none in this build.
+/// A network for LPIPS, which cannot exist in this build.
 pub enum Lpips {}
 
 impl Lpips {
@@ -12,7 +12,7 @@ impl Lpips {
     ///
     /// # Errors
     ///
-    /// Always.
+    /// Always fails.
     pub fn open(_: &std::path::Path, _: &str, _: f64) -> Result<Lpips> {
         Err(Error::cannot(
             "this build cannot run networks, but `metrics.lpips` names one",
@@ -20,16 +20,16 @@ impl Lpips {
         ))
     }
 
-    /// What was loaded.
+    /// Returns the record of the loaded network.
     pub fn file(&self) -> Infallible {
         match *self {}
     }
 
-    /// The distance of two pictures.
+    /// Returns the distance of two pictures.
     ///
     /// # Errors
     ///
-    /// Never: there is no network.
+    /// Never fails, because no network exists.
     pub fn distance(&self, _: &Image, _: &Photo) -> Result<f64> {
         match *self {}
     }

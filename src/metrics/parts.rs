@@ -1,14 +1,14 @@
-//! Where a picture is right: parts of the head judged apart, and what of it is covered.
+//! Metrics of parts of the head, and its coverage.
 //!
 //! | part | pixels |
 //! | --- | --- |
-//! | opaque | the mask is 1 (alpha ≥ 0.999): neither background nor partial coverage has a say |
+//! | opaque | the mask is 1 (alpha ≥ 0.999): neither background nor partial coverage has an influence |
 //! | edge | within 3 pixels of the mask's 0.5 contour, on either side of it; the frame's border is no contour |
-//! | skin, hair | of the region of interest, where [`Tones`] tells them apart |
+//! | skin, hair | pixels of the region of interest, as [`Tones`] classifies them |
 //!
-//! Covered is where the render's opacity is at least 0.5. Head pixels that are not are missing, covered ones
-//! without head are extra; [`PartMetrics::psnr_cap`] is what a picture with the photograph's own colors in
-//! every covered pixel would reach over the mask.
+//! Pixels are covered if the render's opacity is at least 0.5. Head pixels that are not covered are missing, covered
+//! pixels without head are extra; [`PartMetrics::psnr_cap`] is the masked PSNR of a picture with the photograph's own
+//! colors in every covered pixel.
 
 use super::{INSIDE, picture, rounded};
 use crate::Result;
@@ -21,19 +21,19 @@ use serde::Serialize;
 /// Half of the band around the mask's contour, pixels.
 const EDGE_PX: usize = 3;
 
-/// What belongs to one photograph; all of one size.
+/// The masks of one photograph; all of one size.
 #[derive(Clone, Copy)]
 pub struct Masks<'a> {
     /// Soft alpha of the head.
     pub mask: &'a Gray,
-    /// Where the photograph can be used; everywhere without it.
+    /// Pixels where the photograph can be used; all if absent.
     pub valid: Option<&'a Gray>,
     /// Face, ears and hair, without neck and garment.
     pub region: Option<&'a Gray>,
 }
 
 impl Masks<'_> {
-    /// Those of a view; `None` without a mask of the head.
+    /// Loads the masks of a view; `None` without a mask of the head.
     pub fn of(view: &LoadedView) -> Option<Masks<'_>> {
         let (valid, region) = (view.valid.as_ref(), view.region.as_ref());
         view.mask.as_ref().map(|mask| Masks { mask, valid, region })
@@ -48,27 +48,27 @@ impl Masks<'_> {
     }
 }
 
-/// Figures of one view, or their means over views.
+/// Metrics of one view, or their means over views.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct PartMetrics {
-    /// Over the opaque pixels, dB.
+    /// PSNR over the opaque pixels, dB.
     pub psnr_opaque: Option<f64>,
-    /// Along the outline, dB.
+    /// PSNR along the outline, dB.
     pub psnr_edge: Option<f64>,
-    /// Over the region's skin, dB.
+    /// PSNR over the region's skin, dB.
     pub psnr_skin: Option<f64>,
-    /// Over the region's hair, its soft rim included, dB.
+    /// PSNR over the region's hair, its soft rim included, dB.
     pub psnr_hair: Option<f64>,
-    /// Pixels of the head that are not covered.
+    /// Number of head pixels that are not covered.
     pub missing: Option<f64>,
-    /// Covered pixels without head.
+    /// Number of covered pixels without head.
     pub extra: Option<f64>,
-    /// Masked PSNR that coverage allows, dB; `None` also where nothing is missing.
+    /// Masked PSNR that coverage allows, dB; `None` also if no pixel is missing.
     pub psnr_cap: Option<f64>,
 }
 
 impl PartMetrics {
-    /// Means over the views that have a value, figure by figure.
+    /// Returns the means over the views that have a value, for each metric.
     pub fn mean(views: &[PartMetrics]) -> PartMetrics {
         let mean = |of: fn(&PartMetrics) -> Option<f64>| {
             let values: Vec<f64> = views.iter().filter_map(of).collect();
@@ -86,7 +86,7 @@ impl PartMetrics {
     }
 }
 
-/// Judges a render, over the background it was made for, part by part.
+/// Evaluates a render part by part, over the background it was made for.
 ///
 /// `expected` is the photograph over the same background, `behind` that background's color (sRGB-coded),
 /// `opacity` the render's alpha if it is known, `[height · width]`. Sizes agree, as [`super::compare`] makes sure.
@@ -115,7 +115,7 @@ pub fn parts(
         let covered = |i: usize| opacity[i] >= 0.5;
         let count = |of: Vec<bool>| of.into_iter().filter(|x| *x).count() as f64;
         let missing = masks.all(|i, m| m >= INSIDE && !covered(i));
-        // the best that can be shown: the photograph where something is, the background where nothing is
+        // the best possible picture: the photograph in covered pixels, the background elsewhere
         let mut best = theirs.clone();
         for (p, _) in best.data.as_chunks_mut::<3>().0.iter_mut().zip(&missing).filter(|(_, m)| **m) {
             *p = behind;
@@ -127,7 +127,7 @@ pub fn parts(
     found
 }
 
-/// The band around the mask's contour.
+/// Returns the band around the mask's contour.
 fn edge(masks: Masks) -> Vec<bool> {
     let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
     let rest: Vec<bool> = head.iter().map(|h| !h).collect();
@@ -135,13 +135,13 @@ fn edge(masks: Masks) -> Vec<bool> {
     masks.all(|i, _| to_head[i] && to_rest[i])
 }
 
-/// The pixels of a set and those whose centers are within `radius` of one of its centers.
+/// Returns the pixels of a set and those whose centers are within `radius` of one of its centers.
 fn near(set: &[bool], width: usize, radius: usize) -> Vec<bool> {
     let mut out = set.to_vec();
     let height = set.len() / width.max(1);
     for (i, _) in set.iter().enumerate().filter(|(_, s)| **s) {
         let (x, y) = (i % width, i / width);
-        // a pixel inside the set adds nothing that those at its rim do not
+        // inner pixels of the set add none that its border does not
         let rim = (x > 0 && !set[i - 1])
             || (x + 1 < width && !set[i + 1])
             || (y > 0 && !set[i - width])
@@ -160,20 +160,20 @@ fn near(set: &[bool], width: usize, radius: usize) -> Vec<bool> {
 /// Around a soft rim this many pixels of opaque head are the hair's, and along a hard rim the skin's.
 const SAMPLE_PX: usize = 6;
 
-/// Nearer than this to a soft rim an outline is not taken for skin's.
+/// An outline nearer than this to a soft rim does not count as skin's.
 const APART_PX: usize = 10;
 
-/// The share of each kind among the samples that is needed to tell them apart.
+/// Minimum share of each kind among the samples for a classification.
 const LEAST_SHARE: f64 = 0.05;
 
-/// Colors of skin and of hair, as a capture itself shows them.
+/// Classifier of skin and hair by color, learned from the capture itself.
 ///
-/// Where a mask is soft over more than the one pixel of an antialiased outline (a pixel whose eight neighbors
-/// are all soft, too), hair is in front of the background: opaque pixels of the region beside it are samples of
-/// hair, those along the other outlines samples of skin. Every opaque pixel of the region then goes to the kind
-/// whose median is nearer, counted in that kind's own median deviations. Brows and lips go with the hair where
-/// they are as dark. Without soft rims (a shaven head, a bust, hard masks), without hard ones, or with hair of
-/// the skin's color nothing is told apart.
+/// Where a mask is soft over more than the one pixel of an antialiased outline (a pixel whose eight neighbors are all
+/// soft, too), hair is in front of the background: opaque pixels of the region beside it are samples of hair, those
+/// along the other outlines samples of skin. Every opaque pixel of the region is then assigned to the kind whose
+/// median is nearer, in units of that kind's own median deviation. Brows and lips are classified as hair if they are
+/// as dark. Without soft rims (a shaven head, a bust, hard masks), without hard ones, or with hair of the skin's
+/// color no classification is made.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tones {
     skin: Tone,
@@ -187,12 +187,12 @@ struct Tone {
     deviation: [f64; 3],
 }
 
-/// How often each value of each channel occurs in the samples of skin, and of hair.
+/// Histograms of each channel over the samples of skin, and of hair.
 #[derive(Clone)]
 struct ToneSamples([[[u64; 256]; 3]; 2]);
 
 impl ToneSamples {
-    /// Collects those of one photograph (not cut out); `None` without a region of interest.
+    /// Collects the samples of one photograph (not cut out); `None` without a region of interest.
     fn of(photo: &Photo, masks: Masks) -> Option<ToneSamples> {
         let (region, width) = (masks.region?, masks.mask.width as usize);
         let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
@@ -214,14 +214,14 @@ impl ToneSamples {
         Some(ToneSamples(counts))
     }
 
-    /// Those of two photographs together.
+    /// Adds the samples of two photographs.
     fn and(mut self, other: &ToneSamples) -> ToneSamples {
         let counts = self.0.as_flattened_mut().as_flattened_mut();
         counts.iter_mut().zip(other.0.as_flattened().as_flattened()).for_each(|(a, b)| *a += b);
         self
     }
 
-    /// Returns the two kinds, if these samples tell them apart.
+    /// Returns the classifier, if these samples separate the kinds.
     fn tones(&self) -> Option<Tones> {
         let [skin, hair] = [0, 1].map(|kind| self.0[kind][0].iter().sum::<u64>());
         if (skin.min(hair) as f64) <= LEAST_SHARE * (skin + hair) as f64 {
@@ -251,7 +251,7 @@ impl Tone {
     }
 }
 
-/// The least value that half of the samples do not exceed.
+/// Returns the least value that half of the samples do not exceed.
 fn median(counts: &[u64; 256]) -> usize {
     let (total, mut sum) = (counts.iter().sum::<u64>(), 0);
     let at = |n: &u64| {
@@ -262,7 +262,7 @@ fn median(counts: &[u64; 256]) -> usize {
 }
 
 impl Tones {
-    /// Learns them from photographs; `None` where those do not tell skin and hair apart.
+    /// Learns the classifier from photographs; `None` if they do not separate skin and hair.
     pub fn of(views: &[&View]) -> Result<Option<Tones>> {
         let samples = |view: &&View| -> Result<Option<ToneSamples>> {
             let loaded = view.load(&Limits::default())?;
@@ -285,7 +285,7 @@ impl Tones {
     }
 }
 
-/// Pixels where the mask and all eight neighbors (those within the frame) are neither 0 nor 1.
+/// Returns the pixels where the mask and all eight neighbors (those within the frame) are neither 0 nor 1.
 fn soft_rim(mask: &Gray) -> Vec<bool> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let soft = |x: usize, y: usize| !matches!(mask.values[y * w + x], 0 | u8::MAX);

@@ -1,4 +1,4 @@
-//! How alike two pictures are, pixel by pixel and in structure.
+//! Similarity of two pictures, per pixel and in structure.
 //!
 //! Peak signal-to-noise ratio: `−10 log10(Σ e² / (3 · pixels))`, data range 1.
 //!
@@ -53,7 +53,7 @@ pub fn ssim_reflect_map(a: &Image, b: &Image) -> Option<Vec<f64>> {
     Some((0..maps[0].len()).map(|i| maps.iter().map(|m| m[i]).sum::<f64>() / count).collect())
 }
 
-/// A map per channel, after mirroring `border` pixels on every side.
+/// Returns a map per channel, after mirroring `border` pixels on every side.
 fn maps(a: &Image, b: &Image, border: usize, possible: bool) -> Option<Vec<Vec<f64>>> {
     let (w, h) = (a.width as usize, a.height as usize);
     let same = (a.width, a.height, a.channels) == (b.width, b.height, b.channels) && a.channels > 0;

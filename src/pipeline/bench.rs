@@ -1,9 +1,8 @@
-//! Speed against error of each decision, measured on a capture: what `tiface bench` does.
+//! The command `tiface bench`: speed against error of design decisions, measured on a capture.
 //!
-//! Every sweep runs the code of the stages themselves on the same photographs and changes one thing. Errors are taken
-//! where nothing was learned from: masked PSNR of some held-out views. Some sweep what training
-//! costs and brings (steps, photographs' size, the hash grid), others the way from a surface to what an artist opens
-//! (simplification, texture).
+//! Every sweep runs the stages' own code on the same photographs and changes one setting. Errors are measured as
+//! masked PSNR of some held-out views. Some sweeps vary the cost of training (steps, photographs' size, the hash
+//! grid), others the path from a surface to the head mesh (simplification, texture).
 
 use super::finish::{Export, finish};
 use super::line::Line;
@@ -28,36 +27,36 @@ use glam::Vec3;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
-/// What can be swept, in order.
+/// The available sweeps, in order.
 pub const SWEEPS: [&str; 5] = ["steps", "photographs", "hash", "triangles", "texture"];
 
-/// A capture whose decisions are measured.
+/// A capture on which decisions are measured.
 pub struct Bench<'l> {
-    /// Where fields are trained for it; its run is thrown away.
+    /// The session in which fields are trained; its run is deleted.
     line: &'l Line<'l>,
-    /// A run whose finished fields are taken instead.
+    /// A run whose finished fields are used instead of training new ones.
     finished: Option<&'l Line<'l>>,
     scene: Scene,
-    judge: Judge<'l>,
-    /// Asks to stop when the user does.
+    evaluator: Evaluator<'l>,
+    /// Set when the user asks to stop.
     watch: StopAt<'l>,
 }
 
 impl<'l> Bench<'l> {
-    /// On a line whose run is thrown away. The finished fields of another one of the same capture are taken instead of
-    /// training some where that is not what is measured.
+    /// Returns a bench on a session whose run is deleted. The finished fields of another run of the same capture are
+    /// used where training itself is not measured.
     ///
     /// # Errors
     ///
-    /// The photographs cannot be read, or there is no held-out view.
+    /// Fails if the photographs cannot be read, or if there is no held-out view.
     pub fn new(line: &'l Line<'l>, finished: Option<&'l Line<'l>>) -> Result<Bench<'l>> {
         complete(line, Stage::Mask, &learn::trained_fields(line))?;
-        let (scene, judge) = (line.scene()?, Judge::new(line)?);
+        let (scene, evaluator) = (line.scene()?, Evaluator::new(line)?);
         let watch = StopAt::new(u64::MAX, line.run.stop());
-        Ok(Bench { line, finished, scene, judge, watch })
+        Ok(Bench { line, finished, scene, evaluator, watch })
     }
 
-    /// Nothing measured yet: program, machine and capture.
+    /// Returns an empty report: program, machine and capture.
     pub fn begin(&self) -> BenchResult {
         BenchResult {
             version: env!("CARGO_PKG_VERSION"),
@@ -99,7 +98,7 @@ impl<'l> Bench<'l> {
         }
     }
 
-    /// Trained fields: those of a finished run, else of this one, trained now if need be.
+    /// Returns trained fields: those of a finished run, else those of this one, trained now if necessary.
     fn fields(&self, stages: &[Stage]) -> Result<impl Fields + 'l> {
         let done = |line: &&&'l Line<'l>| stages.iter().all(|s| line.run.is_done(&line.plan(*s)));
         let line: &'l Line<'l> = match self.finished.as_ref().filter(done) {
@@ -112,13 +111,13 @@ impl<'l> Bench<'l> {
         Ok(learn::trained_fields(line))
     }
 
-    /// Cameras that were learned from, in the scene.
+    /// Returns the training cameras, in the scene.
     fn cameras(&self) -> Vec<Camera> {
         let views = self.line.capture.split(Split::Train);
         views.map(|v| v.camera.transformed(&self.scene.scene_from_world)).collect()
     }
 
-    /// The extraction, and what closes it.
+    /// Returns the extracted surface with its cap and patches.
     fn extracted(&self, fields: &dyn Fields, c: &MeshConfig) -> Result<Extracted> {
         let capture = &self.line.capture;
         let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
@@ -130,7 +129,7 @@ impl<'l> Bench<'l> {
         Ok(Extracted { mesh, report, cap, patches })
     }
 
-    /// Millimetres in a unit of the scene.
+    /// Returns the number of millimetres in a scene unit.
     fn mm(&self) -> f64 {
         1000.0 * self.config().capture.unit_m / self.scene.scene_from_world.scale
     }
@@ -144,11 +143,11 @@ struct Extracted {
     patches: Option<Patches>,
 }
 
-/// The figure that views of fields are judged by: those of the same settings and other random numbers differ by as much
-/// as its noise.
+/// The metric that views of fields are evaluated by: two trainings with the same settings and different seeds differ
+/// by as much as its noise.
 const PSNR: Measure = Measure { name: "PSNR, dB", digits: 2, more_is_better: Some(true), noise: (0.2, 0.0) };
 
-/// Returns what `work` returns, and what it took.
+/// Returns the result of `work`, and the time it took.
 fn timed<T>(work: impl FnOnce() -> Result<T>) -> Result<(T, WorkCost)> {
     io::forget_peak_memory();
     let (start, cpu) = (Instant::now(), io::cpu_seconds());
@@ -158,18 +157,18 @@ fn timed<T>(work: impl FnOnce() -> Result<T>) -> Result<(T, WorkCost)> {
     Ok((result, WorkCost { wall_s, cpu_s, memory_mib }))
 }
 
-/// Held-out views that are looked at: each costs seconds in each choice of a sweep.
+/// Number of held-out views that are evaluated: each costs seconds for each choice of a sweep.
 const VIEWS: usize = 4;
 
-/// Some held-out photographs.
-struct Judge<'l> {
+/// A few held-out photographs.
+struct Evaluator<'l> {
     views: Vec<(&'l View, LoadedView, Photo)>,
     background: ViewBackground,
 }
 
-impl<'l> Judge<'l> {
-    /// Those of a line.
-    pub fn new(line: &'l Line<'l>) -> Result<Judge<'l>> {
+impl<'l> Evaluator<'l> {
+    /// Loads some of a session's.
+    pub fn new(line: &'l Line<'l>) -> Result<Evaluator<'l>> {
         let held_out = [Split::Test, Split::Val].map(|s| line.capture.split(s).collect::<Vec<_>>());
         let Some(all) = held_out.into_iter().find(|views| !views.is_empty()) else {
             return Err(Error::cannot(
@@ -185,10 +184,10 @@ impl<'l> Judge<'l> {
             let expected = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
             Ok((view, loaded, expected))
         });
-        Ok(Judge { views: views.collect::<Result<_>>()?, background })
+        Ok(Evaluator { views: views.collect::<Result<_>>()?, background })
     }
 
-    /// Mean PSNR of the views by a method, inside the mask (of the frame without one), dB.
+    /// Returns the mean PSNR of the views by a method, inside the mask (of the frame without one), dB.
     pub fn psnr(&self, scene: &Scene, renderer: &Renderer, method: Method) -> Result<Option<f64>> {
         let mut found = Vec::new();
         for (view, loaded, expected) in &self.views {
@@ -207,11 +206,11 @@ impl<'l> Judge<'l> {
     }
 }
 
-/// Shares of the training after which a field is looked at.
+/// Shares of the training after which a field is evaluated.
 const SHARES: [f64; 5] = [0.125, 0.25, 0.5, 0.75, 1.0];
 
-/// Of the steps of a whole training, where trainings of other settings are compared: what is ahead after so many
-/// steps is ahead at the end in most cases, and all sweeps are to end while somebody waits.
+/// Share of a whole training's steps at which trainings of different settings are compared: the setting that leads
+/// after so many steps leads at the end in most cases, and all sweeps should finish in reasonable time.
 const SHORT: f64 = 0.2;
 
 /// Asks a training to stop at a step, or when the user asks.
@@ -222,7 +221,7 @@ struct StopAt<'a> {
 }
 
 impl<'a> StopAt<'a> {
-    /// No step is done yet.
+    /// Returns a limit with no steps done.
     pub fn new(at: u64, stop: &'a Stop) -> StopAt<'a> {
         StopAt { at, reached: AtomicU64::new(0), stop }
     }
@@ -238,7 +237,7 @@ impl Monitor for StopAt<'_> {
     }
 }
 
-/// Steps of a stage's whole training.
+/// Returns the number of steps of a stage's whole training.
 fn steps(config: &Config, stage: Stage) -> u64 {
     match stage {
         Stage::Iface => config.iface.steps,
@@ -249,7 +248,7 @@ fn steps(config: &Config, stage: Stage) -> u64 {
     }
 }
 
-/// Trains a field of a line up to a step; goes on from where it is.
+/// Trains a field of a session up to a step, resuming from the current one.
 fn train_until(line: &Line, stage: Stage, step: u64) -> Result<()> {
     let monitor = StopAt::new(step, line.run.stop());
     let folder = line.run.path(stage);
@@ -272,21 +271,21 @@ fn train_until(line: &Line, stage: Stage, step: u64) -> Result<()> {
     }
 }
 
-/// Trains a field of a line to its end.
+/// Trains a field of a session to its end.
 fn train_to_end(line: &Line, stage: Stage) -> Result<()> {
     train_until(line, stage, u64::MAX)
 }
 
-/// What views of a line's field are worth.
-fn judged(line: &Line, stage: Stage, judge: &Judge) -> Result<Vec<Option<f64>>> {
+/// Returns the metrics of the views of a session's field.
+fn evaluate(line: &Line, stage: Stage, evaluator: &Evaluator) -> Result<Vec<Option<f64>>> {
     let (fields, scene, meshes) = (learn::trained_fields(line), line.scene()?, Meshes::load(line, &[])?);
     let method = if stage == Stage::Iface { Method::Volume } else { Method::Tface };
     let renderer = Renderer::new(&scene, &fields, &meshes, 1, &Quiet);
-    Ok(vec![judge.psnr(&scene, &renderer, method)?])
+    Ok(vec![evaluator.psnr(&scene, &renderer, method)?])
 }
 
 impl Bench<'_> {
-    /// Both fields after shares of their training.
+    /// Evaluates both fields after shares of their training.
     fn steps(&self) -> Result<Sweep> {
         let line = self.line;
         let mut rows = Vec::new();
@@ -296,7 +295,7 @@ impl Bench<'_> {
             for share in SHARES {
                 let step = ((all as f64 * share) as u64).max(1);
                 cost = cost + timed(|| train_until(line, stage, step))?.1;
-                let figures = judged(line, stage, &self.judge)?;
+                let figures = evaluate(line, stage, &self.evaluator)?;
                 rows.push(Row { series, choice: format!("{step} steps"), cost, figures });
             }
         }
@@ -305,7 +304,7 @@ impl Bench<'_> {
         Ok(Sweep { name: "steps", title: "Training steps", note: note.into(), measures: vec![PSNR], rows })
     }
 
-    /// I-Face trained from smaller photographs, judged on whole ones.
+    /// Evaluates I-Face trained from smaller photographs on full-size ones.
     fn photographs(&self) -> Result<Sweep> {
         let mut rows = Vec::new();
         for times in [4, 2, 1] {
@@ -318,7 +317,7 @@ impl Bench<'_> {
         Ok(Sweep { name: "photographs", title: "Size of the photographs", note, measures, rows })
     }
 
-    /// I-Face trained with other hash grids.
+    /// Evaluates I-Face trained with different hash grids.
     fn hash(&self) -> Result<Sweep> {
         let mut rows = Vec::new();
         let whole = (self.config().iface.levels, self.config().iface.log2_table);
@@ -333,7 +332,7 @@ impl Bench<'_> {
         Ok(Sweep { name: "hash", title: "Hash grid", note, measures: vec![PSNR], rows })
     }
 
-    /// The configuration for a share of its steps.
+    /// Returns the configuration for a share of its steps.
     fn short(&self) -> Config {
         let mut config = self.config().clone();
         config.iface.steps = ((config.iface.steps as f64 * SHORT) as u64).max(1);
@@ -344,7 +343,7 @@ impl Bench<'_> {
         format!("I-Face, {} steps. {more}", self.short().iface.steps)
     }
 
-    /// Trains and judges I-Face of other settings.
+    /// Trains and evaluates I-Face with other settings.
     fn row(&self, choice: String, config: &Config) -> Result<Row> {
         self.check_stop()?;
         let scratch = tempfile::tempdir_in(self.line.run.dir()).map_err(|e| {
@@ -354,18 +353,18 @@ impl Bench<'_> {
         let line = Line::open(config, &run)?;
         complete(&line, Stage::Mask, &learn::trained_fields(&line))?;
         let ((), cost) = timed(|| train_until(&line, Stage::Iface, config.iface.steps))?;
-        Ok(Row { series: "I-Face", choice, cost, figures: judged(&line, Stage::Iface, &self.judge)? })
+        Ok(Row { series: "I-Face", choice, cost, figures: evaluate(&line, Stage::Iface, &self.evaluator)? })
     }
 }
 
-/// Points of a mesh that are compared with the field.
+/// Number of mesh points that are compared with the field.
 const POINTS: usize = 20_000;
 
-/// Triangles of a simplified mesh.
+/// Numbers of triangles of a simplified mesh.
 const TRIANGLES: [usize; 6] = [2000, 5000, 10_000, 20_000, 50_000, 100_000];
 
 impl Bench<'_> {
-    /// Median distance of a mesh to the zero of a field, to first order, mm.
+    /// Returns the median distance of a mesh to the zero set of a field, to first order, mm.
     fn off_field(&self, mesh: &Mesh, gradient: &dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>)) -> Option<f64> {
         let (values, gradients) = gradient(&distance::sample(mesh, POINTS));
         let mut off: Vec<f32> =
@@ -374,7 +373,7 @@ impl Bench<'_> {
         off.get(off.len() / 2).map(|d| f64::from(*d) * self.mm())
     }
 
-    /// Fewer and fewer triangles.
+    /// Measures decreasing numbers of triangles.
     fn triangles(&self) -> Result<Sweep> {
         let fields = self.fields(&[Stage::Iface])?;
         let c = &self.config().mesh;
@@ -404,7 +403,7 @@ impl Bench<'_> {
         Ok(Sweep { name: "triangles", title: "Triangles after simplification", note, measures, rows })
     }
 
-    /// Size of the texture, where its colors come from, and how they change with the view.
+    /// Measures the texture's size, the source of its colors, and their view dependence.
     fn texture(&self) -> Result<Sweep> {
         let fields = self.fields(&[Stage::Iface])?;
         let base = &self.config().mesh;
@@ -441,7 +440,7 @@ impl Bench<'_> {
             let triangles = head.mesh.triangles.len() as f64;
             let meshes = Meshes::of_head(head, [true, false]);
             let renderer = Renderer::new(&self.scene, &fields, &meshes, 2, self.monitor());
-            let psnr = self.judge.psnr(&self.scene, &renderer, Method::Textured)?;
+            let psnr = self.evaluator.psnr(&self.scene, &renderer, Method::Textured)?;
             let figures = vec![psnr, Some(triangles)];
             rows.push(Row { series, choice, cost, figures });
         }
@@ -451,7 +450,7 @@ impl Bench<'_> {
     }
 }
 
-/// A simplified surface that is finished again and again.
+/// A simplified surface that is baked repeatedly.
 struct Finisher<'f> {
     mesh: Mesh,
     extracted: Extracted,
@@ -460,7 +459,7 @@ struct Finisher<'f> {
 }
 
 impl<'f> Finisher<'f> {
-    /// Extracts and simplifies as `c` says.
+    /// Extracts and simplifies a surface with the settings `c`.
     pub fn new(bench: &Bench, fields: &'f dyn Fields, c: &MeshConfig) -> Result<Finisher<'f>> {
         let mut extracted = bench.extracted(fields, c)?;
         let mut mesh = std::mem::take(&mut extracted.mesh);
@@ -473,7 +472,7 @@ impl<'f> Finisher<'f> {
         Ok(Finisher { mesh, extracted, fields, views })
     }
 
-    /// Lays out, bakes and fits as `c` says.
+    /// Lays out, bakes and fits with the settings `c`.
     pub fn finish(&self, bench: &Bench, c: &MeshConfig) -> Result<HeadMesh> {
         let (capture, config) = (&bench.line.capture, bench.config());
         let (export, cell) = (Export::new(capture, config), self.extracted.report.cell_size);

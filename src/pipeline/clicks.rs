@@ -1,5 +1,5 @@
-//! Masks from clicks: cut where somebody clicked, propagated to every other view, made soft. Or without any: what a network
-//! proposes for each view, as far as the views agree, stands for the clicks.
+//! Masks from clicks: the clicked views are cut, propagated to every other view, and matted. Without clicks, a
+//! network's proposals for each view replace them, as far as the views agree.
 //!
 //! ```text
 //! clicks → cut (GrabCut, or SAM) ─┬─ propagated through the cameras → band → matting (closed form, ViTMatte) → alpha
@@ -23,27 +23,27 @@ use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Memory that photographs worked on side by side may take without networks, bytes.
+/// Memory that photographs processed in parallel may take without networks, bytes.
 const MOST_BYTES: u64 = 3 << 29;
 
-/// What masks are made from: clicks, or none where a network proposes them.
+/// The input of mask making: clicks, or none if a network proposes masks.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct MaskPrompts {
-    /// Of each view, in pixels of its camera.
+    /// Clicks of each view, in pixels of its camera.
     pub clicks: Vec<Vec<Click>>,
-    /// The file they came from, byte for byte; empty without one.
+    /// The file that they were read from, byte for byte; empty without one.
     pub file: Vec<u8>,
-    /// What shapes the masks beside the settings: digests of clicks and network files.
+    /// Inputs of the masks beside the settings: digests of clicks and network files.
     pub inputs: Vec<(&'static str, String)>,
 }
 
-/// What of the clicks comes from files, as `inputs` names them.
+/// Keys of `inputs` whose values are digests of files.
 const INPUTS: [&str; 5] = ["clicks", "sam", "sam_decoder", "vitmatte", "alpha_net"];
 
 impl MaskPrompts {
-    /// What a configuration means, checked against the capture; `None` if masks are not made.
+    /// Reads the prompts of a configuration and checks them against the capture; `None` if no masks are made.
     ///
-    /// `kept` is the copy of the clicks that the run keeps, for when the file is gone.
+    /// `kept` is the run's copy of the clicks, which is used if the original file was removed.
     pub fn open(config: &MaskConfig, capture: &Capture, kept: &Path) -> Result<Option<MaskPrompts>> {
         if !config.made() {
             return Ok(None);
@@ -84,7 +84,7 @@ impl MaskPrompts {
         }
         for (name, path) in network_files(config) {
             let mut digest = digest(path)?;
-            // what says how a picture is prepared for the network lies beside it
+            // the settings that prepare a picture for the network lie beside it
             for sidecar in ["preprocessor_config.json", "../preprocessor_config.json"] {
                 let sidecar = path.with_file_name(sidecar);
                 if io::is_file(&sidecar) {
@@ -96,7 +96,7 @@ impl MaskPrompts {
         Ok(Some(MaskPrompts { clicks, file, inputs }))
     }
 
-    /// What a stage's record holds of clicks that are no longer there: their digests.
+    /// Restores the digests of removed clicks from the stage's record.
     pub fn from_inputs(inputs: &BTreeMap<String, String>) -> MaskPrompts {
         let input = |name: &'static str| Some((name, inputs.get(name)?.clone()));
         let inputs = INPUTS.into_iter().filter_map(input).collect();
@@ -104,7 +104,7 @@ impl MaskPrompts {
     }
 }
 
-/// The network files that will be used, by their key in `[mask]`.
+/// Returns the network files that will be used, by their key in `[mask]`.
 fn network_files(config: &MaskConfig) -> impl Iterator<Item = (&'static str, &Path)> {
     let sam = [("sam", &config.sam), ("sam_decoder", &config.sam_decoder)];
     let files = sam.map(|file| config.with_sam().then_some(file)).into_iter();
@@ -126,7 +126,7 @@ fn soften_options(config: &MaskConfig) -> SoftenOptions {
     SoftenOptions { side: config.side_px, band }
 }
 
-/// How many photographs of a size may be worked on side by side.
+/// Returns how many photographs of a size may be processed in parallel.
 fn photos_at_once(
     networks: Option<&Networks>,
     (width, height): (u32, u32),
@@ -147,7 +147,7 @@ fn photo(capture: &Capture, view: usize, dir: &StageDir) -> Result<Photo> {
     capture.views[view].load_photo(&Limits::default())
 }
 
-/// Makes masks of all views from clicks on some, gives them to `keep` in order, and returns a record of the networks
+/// Makes masks of all views from clicks on some, passes them to `keep` in order, and returns a record of the networks
 /// that were used.
 pub(super) fn make_masks(
     capture: &Capture,
@@ -161,7 +161,7 @@ pub(super) fn make_masks(
     let sizes = capture.views.iter().map(|v| (v.camera.width, v.camera.height));
     let largest = sizes.max_by_key(|&(w, h)| (u64::from(w) * u64::from(h), w)).unwrap_or((1, 1));
     if let Some(networks) = networks {
-        // a file that the engine cannot run is refused before the work
+        // refuse a file that the engine cannot run before any work
         let (w, h) = working_size(largest.0, largest.1, config.side_px);
         networks.prepare(w, h)?;
         networks.files().iter().for_each(|file| dir.note(&file.to_string()));
@@ -196,7 +196,7 @@ pub(super) fn make_masks(
     Ok(networks.map_or(json!([]), |n| json!(n.files())))
 }
 
-/// What the alpha network proposes for each view, at the size that masks are cut at.
+/// Returns the alpha network's proposal for each view, at the size that masks are cut at.
 fn proposals(networks: &Networks, capture: &Capture, at_once: usize, dir: &StageDir) -> Result<Vec<Gray>> {
     let mut out = Vec::new();
     while out.len() < capture.views.len() {
@@ -217,7 +217,7 @@ fn proposals(networks: &Networks, capture: &Capture, at_once: usize, dir: &Stage
     Ok(out)
 }
 
-/// Hard masks of all views, from clicks, or from what was proposed for each.
+/// Returns hard masks of all views, from clicks or from the proposals for each view.
 fn hard_masks(
     capture: &Capture,
     clicks: &[Vec<Click>],
@@ -233,7 +233,7 @@ fn hard_masks(
     } else {
         let view = |(v, clicks)| {
             let v: &crate::capture::View = v;
-            // held-out photographs shape nothing but their own masks
+            // held-out photographs affect only their own masks
             PropagateView { name: &v.name, camera: &v.camera, clicks, votes: v.split == Split::Train }
         };
         let views: Vec<PropagateView> =
@@ -250,7 +250,7 @@ fn hard_masks(
     Ok(masks)
 }
 
-/// One view's alpha.
+/// Computes one view's alpha.
 fn soft_mask(
     networks: Option<&Networks>,
     photo: &Photo,
@@ -282,8 +282,8 @@ fn soft_mask(
     Ok(SoftMask { warnings, ..found })
 }
 
-/// Clicks for a view that nobody clicked: the deepest places of the mask that was propagated to it, each outside the
-/// disc of those before, and the two places farthest from it.
+/// Places clicks on a view without any: the deepest points of its propagated mask, each outside the disc of those
+/// before, and the two points farthest from the mask.
 pub(super) fn propagated_clicks(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let mut out = Vec::new();

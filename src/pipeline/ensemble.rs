@@ -1,11 +1,12 @@
-//! Stage `ensemble`: the members' views become one, in float, rounded once when they are written.
+//! Stage `ensemble`: blends the members' views into one, in float, rounded once when written.
 //!
 //! ```text
 //! ensemble/NAME.png       over the background
-//!          weights.json   the weights, and what they gain where they were fitted
+//!          weights.json   the weights, and their gain on the pixels they were fitted to
 //! ```
 //!
-//! The weights are fitted on the squares of the training photographs that nothing learned from, unless they are given.
+//! The weights are fitted on tiles of the training photographs that were excluded from training, unless the settings
+//! give them.
 
 use super::line::Line;
 use super::render::{Meshes, Renderer, cameras};
@@ -23,10 +24,10 @@ use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
 
-/// A mask and a valid mask count from here on, as in `metrics`.
+/// Threshold from which mask and valid mask count, as in `metrics`.
 const INSIDE: u8 = 128;
 
-/// Blends one picture per camera of `render`. `fields` are only evaluated if weights are to be fitted.
+/// Blends one picture per camera of `render`. `fields` are evaluated only if weights are to be fitted.
 pub(super) fn ensemble(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
     let Config { ensemble: c, render, capture, .. } = line.config;
     let cameras = cameras(line, scene)?;
@@ -50,12 +51,12 @@ pub(super) fn ensemble(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &St
     let mut summary = json!({"members": words(&c.members), "weights": weights, "fitted": fitted});
     io::write_atomic(&dir.folder().join("weights.json"), format!("{summary:#}\n").as_bytes())?;
     summary["views"] = json!(cameras.len());
-    // of the blend alone: its members' are in the stage `render`
+    // warnings about the blend alone: its members' warnings are in the stage `render`
     summary["seconds_per_view"] = json!(spent.as_secs_f64() / cameras.len().max(1) as f64);
     Ok(summary)
 }
 
-/// Will everything be there that is to be blended? Asked before any work.
+/// Checks, before any work, that the members of the blend will be available.
 pub(super) fn can_blend(config: &Config) -> Result<()> {
     let c = &config.ensemble;
     let wrong = |key: &'static str, problem: String, hint: &str| {
@@ -104,19 +105,19 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// The words of methods.
+/// Returns the names of methods.
 fn words(methods: &[Method]) -> Vec<&'static str> {
     methods.iter().map(|m| m.folder()).collect()
 }
 
-/// What is shown and what is blended, as `--with` takes it.
+/// Returns the shown and the blended methods in the syntax of `--with`.
 fn shown_with_members(config: &Config) -> String {
     let mut methods = config.render.method.clone();
     methods.extend(config.ensemble.members.iter().filter(|m| !config.render.method.contains(m)));
     words(&methods).join(",")
 }
 
-/// The weights as given; alike where none are.
+/// Returns the weights of the settings, or equal ones if there are none.
 fn shares(c: &EnsembleConfig) -> Vec<f32> {
     match c.weights.is_empty() {
         true => vec![1.0 / c.members.len() as f32; c.members.len()],
@@ -124,7 +125,7 @@ fn shares(c: &EnsembleConfig) -> Vec<f32> {
     }
 }
 
-/// The views of all members from one camera, in float.
+/// Reads the views of all members from one camera, in float.
 fn member_views(line: &Line, name: &str) -> Result<Vec<Image>> {
     let view = |member: &Method| {
         let word = member.folder();
@@ -146,9 +147,9 @@ fn member_views(line: &Line, name: &str) -> Result<Vec<Image>> {
     line.config.ensemble.members.iter().map(view).collect()
 }
 
-/// The members of one view, checked, and cut to the head where that is asked for.
+/// Checks the members of one view, and cuts them to the head if the settings say so.
 ///
-/// Never by fitted weights: so a fit sees the members as they will be blended.
+/// Fitted weights never affect the cut, so that a fit sees the members as they will be blended.
 fn members<'i>(line: &Line, views: &'i [Image]) -> Result<Members<'i>> {
     let c = &line.config.ensemble;
     let member = |(m, image): (&Method, &'i Image)| Member {
@@ -161,7 +162,7 @@ fn members<'i>(line: &Line, views: &'i [Image]) -> Result<Members<'i>> {
     if c.cut { Ok(members.cut(&shares(c))?) } else { Ok(members) }
 }
 
-/// Was the field learned with masks?
+/// Whether the field was trained with masks.
 fn trained_with_masks(line: &Line, method: Method) -> bool {
     let has_mask = |v: &View| v.mask != ViewMask::None && v.mask_meaning == MaskMeaning::Empty;
     let used = match method {
@@ -171,7 +172,7 @@ fn trained_with_masks(line: &Line, method: Method) -> bool {
     used && line.capture.views.iter().any(has_mask)
 }
 
-/// Returns weights for the members, and what is known of them; alike where no tile shows the head.
+/// Returns weights for the members, and a report of the fit; equal weights if no tile shows the head.
 ///
 /// Only the tiles are rendered: a few percent of the pixels of the training views.
 fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<(Vec<f32>, Value)> {
@@ -225,7 +226,7 @@ fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Resul
     Ok((weights, record))
 }
 
-/// What the members should have shown of a view, and where that counts.
+/// Returns the photograph that the members are compared with, and where it counts.
 fn target(view: &View) -> Result<(Photo, Gray)> {
     let loaded = view.load(&Limits::default())?;
     let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), ViewBackground::None);
@@ -236,7 +237,7 @@ fn target(view: &View) -> Result<(Photo, Gray)> {
     Ok((photo, Gray { width, height, values }))
 }
 
-/// What of them is in a tile.
+/// Returns the pixels of the members in a tile.
 fn cut_out(photo: &Photo, weight: &Gray, tile: Tile) -> (Photo, Gray) {
     let (width, height) = (tile.side, tile.side);
     let rgb = tile.pixels(photo.width).map(|i| photo.rgb[i]).collect();

@@ -1,5 +1,5 @@
-//! The paper's tables: which runs they are made of, and what those came to. A row is a preset of settings; a run is made by
-//! the line like any other, and one that is done is not made again.
+//! The paper's tables: the runs that they are made of and their results. A row is a preset of settings; its run is
+//! made by the pipeline like any other, and a finished run is not made again.
 
 use super::line::{Line, capture_options};
 use super::{Stage, complete, learn, reconstruct};
@@ -15,7 +15,7 @@ use crate::{Error, Result};
 use serde_json::Value;
 use std::path::Path;
 
-/// The tables, by their word and heading.
+/// The tables, by their name and heading.
 pub const TABLES: [(&str, &str); 4] = [
     ("components", "Components"),
     ("tface", "T-Face: masks and mask losses"),
@@ -65,7 +65,7 @@ const fn more(table: &'static str, better: &'static str, worse: &'static str, by
     Ordering { table, better, worse, by, or_equal: false }
 }
 
-/// What the paper says of its rows, and what we say of ours: that a blend is better than each of its members.
+/// The claims of the paper and of our own rows, for example that a blend is better than each of its members.
 pub const ORDERINGS: [Ordering; 15] = [
     more("components", "tface", "baseline", "masked"),
     more("components", "iface", "baseline", "masked"),
@@ -84,7 +84,7 @@ pub const ORDERINGS: [Ordering; 15] = [
     more("leaderboard", "standard", "standard-mesh", "masked"),
 ];
 
-/// The runs that some tables are made of, each once, in the order of the rows.
+/// Returns the runs that some tables are made of, each once, in the order of the rows.
 pub fn runs(tables: &[&str]) -> Vec<&'static str> {
     let mut out = Vec::new();
     for row in ROWS.iter().filter(|row| tables.contains(&row.table)) {
@@ -95,19 +95,20 @@ pub fn runs(tables: &[&str]) -> Vec<&'static str> {
     out
 }
 
-/// Does a run of I-Face's table have a surface, whose pieces are counted?
+/// Whether a run belongs to I-Face's table, which counts the pieces of the surface.
 fn has_surface(run: &str) -> bool {
     run.starts_with("iface") || run == "paper"
 }
 
-/// Settings of a run, at a share of the published effort; `set` are `KEY=VALUE` on top of them.
+/// Returns the settings of a run, at a share of the published effort; `set` are `KEY=VALUE` pairs applied on top of
+/// them.
 ///
 /// A scale of 1 is the publication. Below, rays, voxels, samples and steps of I-Face are that share, steps of T-Face and
 /// the baseline its square (each costs more rays and samples, too), and warm-up and annealing follow the steps.
 ///
 /// # Errors
 ///
-/// An unknown run, or settings that are not allowed.
+/// Fails for an unknown run or for settings that are not allowed.
 pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
     let preset = if run == "standard" { Preset::Standard } else { Preset::Paper };
     let mut c = Config::preset(preset);
@@ -161,7 +162,7 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
     if scale < 1.0 {
         shrink(&mut c, scale);
     }
-    // as text, as everybody's settings are: ranges are looked at, and what is set wins
+    // parsed from text, as the user's settings are, so that ranges are checked and explicit settings win
     let sources = Sources {
         preset: Some(preset),
         files: vec![(format!("run `{run}`"), c.to_toml())],
@@ -171,7 +172,7 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
     Config::resolve(&sources)
 }
 
-/// The settings of a run for a capture that has no masks, where the run needs none; as they are for every other.
+/// Adapts the settings of a run to a capture without masks, if the run needs none; returns them unchanged otherwise.
 pub fn without_masks(run: &str, config: &mut Config) {
     let options = capture_options(config);
     let bare = || {
@@ -188,11 +189,11 @@ fn unknown(run: &str) -> Error {
     Error::usage(format!("no table has a run `{run}`"), format!("runs are {}", known.join(", ")))
 }
 
-/// Less effort of everything.
+/// Scales the effort of all settings down.
 fn shrink(c: &mut Config, scale: f64) {
     let share = |n: u64, by: f64, least: u64| ((n as f64 * by).round() as u64).max(least.min(n));
     let published = c.preset == Preset::Paper;
-    // our own presets have few steps of many rays as they are
+    // our own presets already have few steps of many rays
     let (of_steps, of_rays) = if published { (scale * scale, scale) } else { (scale.sqrt(), 1.0) };
     let radiance = |t: &mut VmConfig| {
         let before = t.steps;
@@ -222,7 +223,8 @@ fn shrink(c: &mut Config, scale: f64) {
     c.mesh.resolution = share(c.mesh.resolution.into(), scale.sqrt(), 96) as u32;
 }
 
-/// Makes what is not done yet of a run. Whether I-Face's rows have a surface is a result: that there is none is no error.
+/// Completes the unfinished stages of a run. I-Face's rows count surfaces, so a missing surface is a result and no
+/// error.
 pub fn work(line: &Line, run: &str) -> Result<()> {
     line.remember(Stage::Metrics)?;
     reconstruct(line, Stage::Metrics)?;
@@ -236,14 +238,14 @@ pub fn work(line: &Line, run: &str) -> Result<()> {
     Ok(())
 }
 
-/// The stages that a run is made of.
+/// Returns the stages that a run is made of.
 fn stages(line: &Line, run: &str) -> Vec<Stage> {
     let mut order = line.order(Stage::Metrics);
     order.extend(has_surface(run).then_some(Stage::Mesh));
     order
 }
 
-/// What stages of a run failed with, and the first one that is not done as the line has it.
+/// Returns the errors of a run's failed stages, and the first stage that is not done with the session's settings.
 fn problems(line: &Line, run: &str) -> Vec<String> {
     let failed = |stage: Stage| {
         let status = read_status(&line.run.path(stage)).ok().flatten()?;
@@ -258,12 +260,12 @@ fn problems(line: &Line, run: &str) -> Vec<String> {
     {
         out.push(format!("stage `{}` is not done yet", plan.name));
     }
-    // differences of settings stand on a line each, a problem on one
+    // each changed setting is on a line of its own; a problem must fit on one line
     out.iter().map(|text| text.replace(":\n  ", ": ").replace("\n  ", ", ")).collect()
 }
 
-/// What a row came to in its run. Figures count where the run's stages are done with the line's configuration: what others
-/// left in the same folder has none.
+/// Returns the results of a row in its run. Figures count only if the run's stages are done with the session's
+/// configuration; results of other settings in the same folder are ignored.
 pub fn measured(line: &Line, row: &ExperimentRow) -> Measured {
     let mut out = Measured::default();
     let mut problems = problems(line, row.run);
@@ -277,7 +279,7 @@ pub fn measured(line: &Line, row: &ExperimentRow) -> Measured {
     out
 }
 
-/// Figures of a row whose stages are done; `value` is what `metrics.json` holds.
+/// Returns the figures of a row whose stages are done; `value` is the content of `metrics.json`.
 fn figures(line: &Line, row: &ExperimentRow, value: &Value) -> Measured {
     let mut out = Measured::default();
     let set = &value[row.pictures];
@@ -296,7 +298,7 @@ fn figures(line: &Line, row: &ExperimentRow, value: &Value) -> Measured {
     let summary =
         |stage: Stage| read_record(&line.run.path(stage)).ok().flatten().map_or(Value::Null, |r| r.summary);
     let shown = summary(Stage::Render);
-    // 0 stands where an interrupted process had made all views, and nobody knows how long that took
+    // a time of 0 means that an interrupted process had rendered all views, so the time they took is unknown
     let seconds = |method: &str| shown["seconds_per_view"][method].as_f64().filter(|s| *s > 0.0);
     out.seconds = match row.pictures {
         "ensemble" => {
@@ -312,7 +314,7 @@ fn figures(line: &Line, row: &ExperimentRow, value: &Value) -> Measured {
     out
 }
 
-/// What the stages of a run that are not made yet may cost, one after the other; `None` if all are made.
+/// Returns the estimated cost of the unfinished stages of a run, one after the other; `None` if all are done.
 pub fn ahead(line: &Line, run: &str) -> Option<Cost> {
     let stages = stages(line, run).into_iter().filter(|stage| !line.run.is_done(&line.plan(*stage)));
     stages.map(|stage| line.cost(stage)).reduce(|sum, cost| sum + cost)
@@ -329,7 +331,7 @@ mod tests {
     use glam::Vec3;
     use serde_json::json;
 
-    /// A tiny capture in a folder; its path.
+    /// Writes a tiny capture into a folder and returns its path.
     fn head(dir: &Path) -> String {
         let root = dir.join("head");
         std::fs::create_dir_all(&root).unwrap();
@@ -434,7 +436,7 @@ mod tests {
         assert!(config("iface-nerf", 1.0, &["device=gpu".into()]).is_err());
     }
 
-    /// Stages that are done without any work, in a folder that is then asked about with other settings.
+    /// Stages that are marked as done without any work, in a folder that is then queried with other settings.
     #[test]
     fn figures_count_only_where_the_stages_are_done_as_asked_for() {
         let dir = tempfile::tempdir().unwrap();
@@ -466,11 +468,11 @@ mod tests {
             made.unwrap();
         }
         let (surface, blend) = (row_of("iface", "sparsity"), row_of("components", "ensemble"));
-        let told = |m: &Measured| m.problem.clone().unwrap_or_default();
+        let problem_of = |m: &Measured| m.problem.clone().unwrap_or_default();
 
-        // a surface is asked for, too; that there is none is a result, and said
+        // the row needs a surface, too; a missing one is a result and reported as such
         let found = measured(&line, &surface);
-        assert_eq!((found.figures.len(), told(&found).as_str()), (1, "stage `mesh` is not done yet"));
+        assert_eq!((found.figures.len(), problem_of(&found).as_str()), (1, "stage `mesh` is not done yet"));
         let positive = |points: &[Vec3]| vec![1.0; points.len()];
         let slopes = |points: &[Vec3]| (vec![1.0; points.len()], vec![Vec3::X; points.len()]);
         let colors = |points: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; points.len()];
@@ -481,9 +483,9 @@ mod tests {
         assert!(none.unwrap_err().is_no_surface());
         let found = measured(&line, &surface);
         assert!(found.figures.len() == 1 && found.pieces.is_none(), "{found:?}");
-        assert!(told(&found).starts_with("stage `mesh`: no surface"), "{found:?}");
+        assert!(problem_of(&found).starts_with("stage `mesh`: no surface"), "{found:?}");
         // of every row of the run
-        assert_eq!(told(&measured(&line, &blend)), told(&found));
+        assert_eq!(problem_of(&measured(&line, &blend)), problem_of(&found));
         run.stage(line.plan(Stage::Mesh), |_| Ok(json!({"report": {"topology": {"pieces": 3}}}))).unwrap();
         let found = measured(&line, &surface);
         assert_eq!((found.pieces, found.seconds, found.problem), (Some(3), Some(4.0), None));
@@ -491,14 +493,16 @@ mod tests {
         // its members' 1.5, 2 and 4, and 0.5 of the blend
         assert_eq!(measured(&line, &blend).seconds, Some(8.0));
 
-        // another mesh: figures of the views are those, the pieces are not
+        // a different mesh: the figures of the views still count, the pieces do not
         let mut finer = c.clone();
         finer.mesh.resolution += 1;
         let found = measured(&Line::open(&finer, &run).unwrap(), &surface);
         assert!(found.figures.len() == 1 && found.pieces.is_none(), "{found:?}");
-        assert!(told(&found).contains("stage `mesh` was done with other settings: mesh.resolution: was"));
+        assert!(
+            problem_of(&found).contains("stage `mesh` was done with other settings: mesh.resolution: was")
+        );
 
-        // another scale: nothing is
+        // a different scale: no figure counts
         let line = Line::open(&other, &run).unwrap();
         let refused = work(&line, "paper").unwrap_err();
         assert!(refused.to_string().contains("was done with other settings") && !refused.is_no_surface());
@@ -506,13 +510,16 @@ mod tests {
             let found = measured(&line, &row);
             assert!(found.views.is_empty() && found.figures.is_empty());
             assert_eq!((found.seconds, found.pieces, found.masks.clone()), (None, None, None));
-            let told = told(&found);
-            assert!(told.contains("was done with other settings: ") && !told.contains('\n'), "{told}");
-            assert!(told.contains("voxels_final: was "), "{told}");
+            let problem = problem_of(&found);
+            assert!(
+                problem.contains("was done with other settings: ") && !problem.contains('\n'),
+                "{problem}"
+            );
+            assert!(problem.contains("voxels_final: was "), "{problem}");
         }
     }
 
-    /// Two rows of a tiny capture, made, read, and not made again.
+    /// Two rows of a tiny capture are made, read, and not made again.
     #[test]
     fn a_row_is_made_measured_and_not_made_again() {
         let dir = tempfile::tempdir().unwrap();

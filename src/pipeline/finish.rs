@@ -1,4 +1,4 @@
-//! From the whole extraction to what an artist opens: simplified, laid out, baked.
+//! From the extracted surface to the head mesh: simplification, atlas and texture baking.
 //!
 //! The files of a head mesh are in the dataset's coordinates or turned so that the face looks at the viewer ([`Export`]).
 
@@ -23,19 +23,19 @@ use serde_json::{Map, Value, json};
 /// How far the true surface may lie from a triangle, in cells: the chords of large triangles and half a cell.
 pub(super) const REACH: f32 = 2.5;
 
-/// The head mesh, what is to be kept beside it, and what happened.
+/// The head mesh, the files kept beside it, and reports.
 pub(super) struct FinishedHead {
-    /// What an artist opens.
+    /// The simplified, textured mesh.
     pub head: HeadMesh,
     /// The baked color, linear.
     pub linear: Option<Image>,
     /// A report per step.
     pub report: Map<String, Value>,
-    /// What a person should know.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
 }
 
-/// Cameras that the network's colors are taken from where photographs say the rest.
+/// Number of cameras that the network's colors are sampled from, where photographs give the rest.
 const FALLBACK_VIEWS: usize = 3;
 
 /// Finishes a surface in scene coordinates, extracted with cells of `cell`; cameras are in scene coordinates, too.
@@ -65,7 +65,7 @@ pub(super) fn finish(
         report.insert("simplify".into(), json!(done));
     }
     let world_from_scene = scene.scene_from_world.inverse();
-    // lobes are turned as `Export::files` turns the file; what is in no file is the same in all of them
+    // the lobes are turned as `Export::files` turns the file; data that is in no file is the same in all formats
     let frame = if c.lobes > 0 { export.frame } else { MeshFrame::Dataset };
     let asset_from_world = Export { frame, ..export.clone() }.asset_from_world(&mesh, &world_from_scene);
     let turned = asset_from_world * world_from_scene.rotation_f32();
@@ -104,7 +104,7 @@ pub(super) fn finish(
     report.insert("atlas".into(), json!(done));
 
     let config = BakeConfig {
-        // what photographs are to say need not be said exactly
+        // colors that are then fitted to photographs need no exact baking
         side: if photographs_say { 1 } else { c.texture_samples },
         views: if photographs_say { FALLBACK_VIEWS } else { usize::MAX },
         gutter_px: c.gutter_px,
@@ -154,15 +154,15 @@ pub(super) fn finish(
     Ok(FinishedHead { head, linear: c.exr.then_some(baked.color), report, warnings })
 }
 
-/// Linear color as a picture, rounded to nearest.
+/// Returns linear color as an 8-bit picture, rounded to nearest.
 fn coded(image: &Image) -> Photo {
     let texel = |c: &[f32; 3]| c.map(|v| quantize(srgb_from_linear(v)));
     let rgb = image.data.as_chunks::<3>().0.iter().map(texel).collect();
     Photo { width: image.width, height: image.height, rgb, alpha: None }
 }
 
-/// Lobes as pictures. Each is scaled by what all but a thousandth of its texels keep within: a few wild texels
-/// must not cost the others their precision.
+/// Returns the lobes as pictures. Each is scaled by the value that all but a thousandth of its texels stay below, so
+/// that a few outliers do not cost the others their precision.
 fn lobes(images: &[Image], asset_from_world: Mat3) -> Option<Lobes> {
     if images.is_empty() {
         return None;
@@ -187,24 +187,24 @@ const JPEG_QUALITY: u8 = 92;
 /// How a mesh is exported from the dataset's world.
 #[derive(Clone, Debug)]
 pub struct Export {
-    /// What viewers call it.
+    /// The name that viewers show.
     pub name: String,
-    /// Up in the world.
+    /// The up direction in the world.
     pub up: Vec3,
     /// Metres per dataset unit.
     pub unit_m: f64,
-    /// Whose coordinates.
+    /// The coordinate frame of the files.
     pub frame: MeshFrame,
     /// How pictures are stored with the mesh.
     pub texture_format: TextureFormat,
-    /// What light does to the GLB.
+    /// The material of the GLB, lit or unlit.
     pub material: Material,
-    /// Where the cameras stood, world: faces look at cameras.
+    /// Camera positions in the world; a face is assumed to look at the cameras.
     pub cameras: Vec<DVec3>,
 }
 
 impl Export {
-    /// Returns how the mesh of a capture is exported.
+    /// Returns the export options of a capture.
     pub fn new(capture: &Capture, config: &Config) -> Export {
         Export {
             name: capture.name.clone(),
@@ -217,7 +217,7 @@ impl Export {
         }
     }
 
-    /// Returns a head mesh as the files of a format, the mesh first. `stem` names them.
+    /// Returns the files of a head mesh in a format, the mesh first. `stem` is their base name.
     pub(super) fn files(&self, head: &HeadMesh, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
         let HeadMesh { mesh, world_from_scene, texture, shells, .. } = head;
         let (up, world_from_mesh) = match self.frame {
@@ -229,7 +229,7 @@ impl Export {
             stem: stem.into(),
             up,
             unit_m: self.unit_m,
-            // an unlit material shows no normal map: who asks for one wants light
+            // an unlit material shows no normal map, so a normal map implies a lit one
             unlit: self.material == Material::Unlit && texture.as_ref().is_none_or(|t| t.normal.is_none()),
             world_from_mesh,
             jpeg_quality: (self.texture_format == TextureFormat::Jpeg).then_some(JPEG_QUALITY),
@@ -240,23 +240,23 @@ impl Export {
                 Ok(ExportedFiles { files: vec![(format!("{stem}.glb"), bytes)], warnings: Vec::new() })
             }
             MeshFormat::Obj => to_obj(mesh, texture.as_ref(), &options),
-            // the dataset's world whatever the frame, and colors at the vertices: one index, so the surface stays
-            // closed for whoever reads it
+            // always in the dataset's world, with colors at the vertices: one index per vertex, so that the surface
+            // stays closed for every reader
             MeshFormat::Ply => {
                 to_ply(mesh, None, &ExportOptions { world_from_mesh: *world_from_scene, ..options })
             }
         }
     }
 
-    /// Where the face of a head at `center` looks: see `front`.
+    /// Returns the direction in which the face of a head at `center` looks; see `front`.
     pub fn front(&self, center: DVec3) -> Option<Vec3> {
         front(self.up, &self.cameras, center)
     }
 
-    /// The turn that brings up to +Y and the face of a head at `center` towards +Z.
+    /// Returns the rotation that brings up to +Y and the face of a head at `center` towards +Z.
     fn head_from_world(&self, center: DVec3) -> DMat3 {
         let up = self.up.as_dvec3().normalize_or(DVec3::Y);
-        // cameras all around say nothing: any direction across `up` will do
+        // if the cameras stand all around, any direction perpendicular to `up` will do
         let front = self.front(center).map_or_else(|| up.any_orthonormal_vector(), |f| f.as_dvec3());
         let front = front.reject_from_normalized(up).normalize_or(up.any_orthonormal_vector());
         DMat3::from_cols(up.cross(front), up, front).transpose()
@@ -274,7 +274,7 @@ impl Export {
         Similarity { translation: turned.translation - 0.5 * (low + high), ..turned }
     }
 
-    /// From the dataset's world to the coordinates of GLB and OBJ files, metres.
+    /// Returns the transform from the dataset's world to the coordinates of GLB and OBJ files, in metres.
     pub(super) fn file_from_world(&self, head: &HeadMesh) -> Result<Similarity> {
         let HeadMesh { mesh, world_from_scene, .. } = head;
         let turned = match self.frame {
@@ -284,7 +284,7 @@ impl Export {
         Ok(Similarity { scale: self.unit_m, ..Similarity::IDENTITY }.after(&turned))
     }
 
-    /// The turn from the dataset's world to the coordinates of GLB and OBJ files.
+    /// Returns the rotation from the dataset's world to the coordinates of GLB and OBJ files.
     pub(super) fn asset_from_world(&self, mesh: &Mesh, world_from_mesh: &Similarity) -> Mat3 {
         match self.frame {
             MeshFrame::Dataset => turn_to_y_up(self.up).unwrap_or(DMat3::IDENTITY).as_mat3(),
@@ -293,8 +293,8 @@ impl Export {
     }
 }
 
-/// Where the face of a head at `center` looks, a unit vector of the world across `up`: taken to be where most `cameras`
-/// stand. `None` where they stand all around.
+/// Returns the direction in which the face of a head at `center` looks, as a unit vector of the world perpendicular
+/// to `up`: the direction in which most `cameras` stand. `None` if they stand all around.
 pub(super) fn front(up: Vec3, cameras: &[DVec3], center: DVec3) -> Option<Vec3> {
     let up = up.as_dvec3().normalize_or(DVec3::Y);
     let across = |c: &DVec3| (c - center).reject_from_normalized(up).normalize_or_zero();
@@ -302,7 +302,7 @@ pub(super) fn front(up: Vec3, cameras: &[DVec3], center: DVec3) -> Option<Vec3> 
     (towards.length() > 1e-3).then(|| towards.normalize().as_vec3())
 }
 
-/// The middle of a mesh's box, in the world.
+/// Returns the center of a mesh's box, in the world.
 pub(super) fn center(mesh: &Mesh, world_from_mesh: &Similarity) -> DVec3 {
     world_from_mesh.point_f64(mesh.bounds().center().as_dvec3())
 }
@@ -421,7 +421,7 @@ mod tests {
             let file_from_world = export.file_from_world(head).unwrap();
             for (found, t) in corners.iter().zip(0..) {
                 let expected = mesh.corners(t).map(exact);
-                // whoever looks at the file finds the world there
+                // a reader of the file must find the world coordinates
                 let wanted = file_from_world.point_f64(expected[0]) - translation;
                 assert!(wanted.distance(found[0].as_dvec3()) < close, "{wanted}");
                 for (p, e) in found.iter().zip(expected) {

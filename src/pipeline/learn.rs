@@ -1,7 +1,7 @@
-//! The learned fields: the stages `baseline`, `tface` and `iface`, and their results when asked for.
+//! The trained fields: the stages `baseline`, `tface` and `iface`, and the loading of their results.
 //!
-//! The squares of the training photographs that nothing learns from are chosen here too: the weights of the blend are
-//! fitted there.
+//! The tiles of the training photographs that are excluded from training are chosen here too: the ensemble's weights
+//! are fitted on them.
 
 use super::line::Line;
 use super::surface::{Fields, Radiance, Surface, march};
@@ -32,7 +32,7 @@ use serde_json::{Value, json};
 use std::cell::OnceCell;
 use std::path::Path;
 
-/// Learns, or imports, the field of a stage that learns; goes on from its last checkpoint.
+/// Trains or imports the field of a stage; training resumes from the last checkpoint.
 pub(super) fn learn(
     stage: Stage,
     capture: &Capture,
@@ -53,8 +53,8 @@ pub(super) fn learn(
     Ok(report)
 }
 
-/// The start of a stage's random numbers. The published radiance fields have another than I-Face's 42; a seed that is
-/// set changes both.
+/// Returns the random seed of a stage. The published radiance fields use another seed than I-Face's 42; a seed in the
+/// settings changes both.
 pub(super) fn seed(stage: Stage, config: &Config) -> u64 {
     match config.preset {
         Preset::Paper if stage != Stage::Iface => config.seed ^ 42 ^ 20_211_202,
@@ -62,7 +62,7 @@ pub(super) fn seed(stage: Stage, config: &Config) -> u64 {
     }
 }
 
-/// Learns, or imports, the field of a stage in a session. Returns its report, and what a person should know.
+/// Trains or imports the field of a stage in a session. Returns its report and warnings.
 pub(super) fn train(
     stage: Stage,
     capture: &Capture,
@@ -80,20 +80,20 @@ pub(super) fn train(
         let (_, report) = iface::train(&views, hull.as_ref(), &config.iface, session)?;
         return Ok((json!(report), report.warnings));
     }
-    // `baseline` and `tface` are the same learning with other settings
+    // `baseline` and `tface` run the same training with different settings
     let c = config.radiance(stage);
     if !c.import.is_empty() {
         tface::import(Path::new(&c.import), c.import_scale, &scene.scene_from_world, session)?;
         return Ok((json!({"imported": c.import}), Vec::new()));
     }
-    // without masks nothing may know the head's outline nor what that carves; only the box stays
+    // without masks the training must use neither the head's outline nor the hull carved from it; only the box stays
     let masked = c.masks != MaskUse::None;
     let views = train_views(capture, scene, config, masked)?;
     let report = tface::train(views, scene.aabb, hull.as_ref().filter(|_| masked), &c, session)?;
     Ok((json!(report), report.warnings))
 }
 
-/// The photographs that are learned from, in the scene. Pixels of `capture.tiles` count as not valid.
+/// Returns the training photographs, in the scene. Pixels of `capture.tiles` count as not valid.
 pub(super) fn train_views(
     capture: &Capture,
     scene: &Scene,
@@ -115,7 +115,7 @@ fn bitmask(scene: &Scene) -> Option<Bitmask> {
     Bitmask::from_words(hull.resolution, hull.bits.clone())
 }
 
-/// The fields as they lie in the run, each loaded when it is first asked for.
+/// The trained fields of a run, each loaded when it is first used.
 struct TrainedFields<'l> {
     line: &'l Line<'l>,
     iface: OnceCell<Box<dyn Surface>>,
@@ -123,7 +123,7 @@ struct TrainedFields<'l> {
     baseline: OnceCell<FieldMean>,
 }
 
-/// Returns the fields as they lie in the run; nothing is loaded yet.
+/// Returns the trained fields of a run; nothing is loaded yet.
 pub(super) fn trained_fields<'l>(line: &'l Line<'l>) -> impl Fields {
     TrainedFields { line, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
 }
@@ -165,11 +165,11 @@ impl Fields for TrainedFields<'_> {
     }
 }
 
-/// What a camera in the scene sees of a field.
+/// A function that renders a field as a camera in the scene sees it.
 pub(super) type FieldLook = Box<dyn Fn(&Camera) -> RenderedView>;
 
-/// Returns the field of a stage as the newest checkpoint in a run has it, finished or not: what a camera in the scene sees
-/// of it. Of several fields that are learned one after the other the first.
+/// Returns a renderer for the newest checkpoint of a stage's field in a run, finished or not. If several fields are
+/// trained one after the other, the first one is used.
 pub(super) fn load_field(run: &Path, config: &Config, scene: &Scene, stage: Stage) -> Result<FieldLook> {
     let (folder, world_from_scene) = (run.join(stage.word()), scene.scene_from_world.inverse());
     if stage == Stage::Iface && config.iface.field == FieldKind::Density {
@@ -197,7 +197,7 @@ fn once<T>(cell: &OnceCell<T>, load: impl FnOnce() -> Result<T>) -> Result<&T> {
     cell.get().ok_or_else(|| Error::cannot("no field", ""))
 }
 
-/// The training views, each with its squares.
+/// Returns the training views, each with its tiles.
 pub(super) fn held_out_tiles<'c>(capture: &'c Capture, config: &Config) -> Vec<(&'c View, Vec<Tile>)> {
     let (share, seed) = (config.capture.tiles, config.seed);
     let tiles = |(i, v): (usize, &'c View)| {
@@ -206,8 +206,7 @@ pub(super) fn held_out_tiles<'c>(capture: &'c Capture, config: &Config) -> Vec<(
     capture.split(Split::Train).enumerate().map(tiles).collect()
 }
 
-/// The photographs that are learned from, with their cameras in the scene. Pixels of `capture.tiles` count as not
-/// valid.
+/// Returns the training photographs, with their cameras in the scene. Pixels of `capture.tiles` count as not valid.
 pub(super) fn training_views(
     capture: &Capture,
     scene: &Scene,

@@ -1,4 +1,4 @@
-//! A capture, its configuration and its run: what every stage works on.
+//! A capture, its configuration and its run folder, which every stage works on.
 
 use super::clicks::MaskPrompts;
 use super::lpips::measure;
@@ -23,55 +23,56 @@ pub struct Line<'a> {
     pub(super) run: &'a Run,
     /// Digest of everything read from the capture.
     pub(super) digest: String,
-    /// Digest of each file and camera of the capture, by what people call it; nothing where it is only remembered.
+    /// Digest of each file and camera of the capture, keyed by the name shown to users; empty if the capture was
+    /// restored from the run.
     inputs: BTreeMap<String, String>,
-    /// What `render` shows instead of the held-out views.
+    /// The camera path that `render` shows instead of the held-out views.
     pub(super) path: Option<CameraPath>,
-    /// Checkpoints that stages take instead of learning.
+    /// Checkpoints that stages import instead of training.
     pub(super) imports: Vec<Import>,
-    /// Why the capture cannot be opened, where it is only as the run remembers it.
-    pub(super) gone: Option<String>,
-    /// Is the capture the demo head, whose surface is known?
+    /// Why the capture cannot be opened, if it was restored from the run.
+    pub(super) missing_capture: Option<String>,
+    /// Whether the capture is the synthetic head, whose surface is known.
     pub(super) synthetic: bool,
-    /// What masks are made from, if not found.
+    /// The clicks and networks that masks are made from, if masks are not read from the capture.
     pub(super) clicks: Option<MaskPrompts>,
-    /// Where masks are made: those that the capture has all the same. Views are judged by them, for no run may shape what
-    /// it is judged by.
+    /// The capture's own masks, if the run makes others. The metrics use these, because a run must not influence the
+    /// masks that it is evaluated with.
     pub(super) own_masks: Option<OwnMasks>,
     /// Digest of the network for LPIPS.
     pub(super) lpips: Option<String>,
 }
 
-/// Masks that the capture has beside those that are made.
+/// Masks that the capture contains although the run makes its own.
 pub(super) struct OwnMasks {
-    /// Of each view.
+    /// One for each view.
     masks: Vec<ViewMask>,
-    /// Digest of all of them.
+    /// Digest of all these masks.
     pub digest: String,
 }
 
-/// A checkpoint that a stage takes instead of learning.
+/// A checkpoint that a stage imports instead of training.
 pub(super) struct Import {
     /// The stage.
     pub stage: Stage,
     /// Digest of the file.
     pub digest: String,
-    /// Why the file cannot be read, where its digest is only as the run remembers it.
-    gone: Option<Error>,
+    /// Why the file cannot be read, if its digest was restored from the run.
+    missing: Option<Error>,
 }
 
-/// Digests of the files and cameras of the capture, in the folder of the stage `mask`.
+/// File name of the digests of the capture's files and cameras, in the folder of the stage `mask`.
 const INPUTS: &str = "inputs.json";
 
 impl<'a> Line<'a> {
-    /// Opens the capture and reads every byte of it once, for its digest. Nothing is written.
+    /// Opens the capture and reads every byte of it once to compute its digest. Nothing is written.
     ///
-    /// The capture of a run that is done may lie somewhere else by now: its cameras are then those that the run
-    /// remembers, and nothing can be worked on ([`Line::remember`]).
+    /// The capture of a finished run may have been moved. Its cameras are then restored from the run, and no stage
+    /// can be worked on ([`Line::remember`]).
     pub fn open(config: &'a Config, run: &'a Run) -> Result<Line<'a>> {
         check_feasible(config)?;
         let options = capture_options(config);
-        let (mut capture, (digest, inputs), clicks, gone) =
+        let (mut capture, (digest, inputs), clicks, missing_capture) =
             match capture::open(Path::new(&config.capture.path), &options) {
                 Err(e) => restore_from_run(config, run, e)?,
                 Ok(capture) => {
@@ -88,7 +89,7 @@ impl<'a> Line<'a> {
         let lpips = lpips(config, run)?;
         capture.warnings.iter().for_each(|warning| run.warn("capture", warning));
         if clicks.is_some() {
-            // what later stages read is what the stage `mask` makes
+            // later stages read the masks that the stage `mask` makes
             for view in &mut capture.views {
                 view.mask = ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
             }
@@ -101,7 +102,7 @@ impl<'a> Line<'a> {
             inputs,
             path: None,
             imports,
-            gone,
+            missing_capture,
             synthetic: false,
             clicks,
             own_masks,
@@ -109,54 +110,54 @@ impl<'a> Line<'a> {
         })
     }
 
-    /// Returns the line of the demo head, whose surface is known: the metrics compare the mesh with it.
+    /// Returns this session with the synthetic head's known surface, which the metrics compare the mesh with.
     pub fn with_synthetic_truth(mut self) -> Line<'a> {
         self.synthetic = true;
         self.capture.name = "demo".into(); // its folder is called after what it holds
         self
     }
 
-    /// Returns the line whose stage `render` makes views of `render.cameras` in a folder of their own, and not those
-    /// of the evaluation; a file of cameras is read here. For `test` the line as it is.
+    /// Returns a session whose stage `render` makes the views of `render.cameras` in a folder of their own instead of
+    /// the evaluation's views; a file of cameras is read here. For `test` the session is returned unchanged.
     pub fn with_camera_path(self, render: RenderConfig) -> Result<Line<'a>> {
         let path = CameraPath::new(render, &self.capture)?;
         Ok(Line { path, ..self })
     }
 
-    /// A view as it is judged: with the capture's own mask, if it has one.
+    /// Returns a view as the metrics use it: with the capture's own mask, if it has one.
     pub(super) fn evaluation_view(&self, view: &View) -> View {
         let place = self.capture.views.iter().position(|v| v.name == view.name);
         let own = self.own_masks.as_ref().zip(place).map(|(own, i)| own.masks[i].clone());
         View { mask: own.filter(|m| *m != ViewMask::None).unwrap_or(view.mask.clone()), ..view.clone() }
     }
 
-    /// Whose masks say where figures of held-out views count: `capture`, `run` (made by this run, for one of them at least:
-    /// others may judge otherwise) or `none`.
+    /// Returns the source of the masks that the figures of held-out views are restricted to: `capture`, `run` (this
+    /// run made at least one of them, so other runs may evaluate differently) or `none`.
     pub(super) fn mask_source(&self) -> &'static str {
         let held_out: Vec<&View> = self.capture.views.iter().filter(|v| v.split != Split::Train).collect();
         let all: Vec<&View> = self.capture.views.iter().collect();
-        let judged = if held_out.is_empty() { all } else { held_out };
+        let evaluated = if held_out.is_empty() { all } else { held_out };
         let is_own = |view: &&View| self.evaluation_view(view).mask != view.mask;
         match &self.own_masks {
-            _ if judged.iter().all(|v| self.evaluation_view(v).mask == ViewMask::None) => "none",
-            Some(_) if !judged.iter().all(is_own) => "run",
+            _ if evaluated.iter().all(|v| self.evaluation_view(v).mask == ViewMask::None) => "none",
+            Some(_) if !evaluated.iter().all(is_own) => "run",
             _ => "capture",
         }
     }
 
-    /// The capture.
+    /// Returns the capture.
     pub fn capture(&self) -> &Capture {
         &self.capture
     }
 
-    /// The box and hull that the stage `mask` found.
+    /// Returns the box and hull that the stage `mask` found.
     pub fn scene(&self) -> Result<Scene> {
         scene_file::read_scene(&self.run.path("mask/scene.json")).map_err(|e| unusable(e, Stage::Mask))
     }
 
-    /// Writes `cameras.json`, where the photographs are there.
+    /// Writes `cameras.json`, if the photographs can be opened.
     pub(super) fn write_cameras(&self, idle: bool) -> Result<()> {
-        if self.gone.is_some() {
+        if self.missing_capture.is_some() {
             return Ok(());
         }
         let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
@@ -164,14 +165,14 @@ impl<'a> Line<'a> {
         self.write("cameras.json", &cameras, idle)
     }
 
-    /// Writes what of the capture the stage `mask` is made from, so that a later change of it can be named.
+    /// Writes the digests of the capture's files that the stage `mask` reads, so that a later change can be named.
     pub(super) fn write_inputs(&self, folder: &Path) -> Result<()> {
         let text = serde_json::to_string_pretty(&self.inputs).unwrap_or_default();
         Ok(io::write_atomic(&folder.join(INPUTS), format!("{text}\n").as_bytes())?)
     }
 
-    /// The first file or camera of the capture that is not what the stage `mask` was made from, and how many more are not;
-    /// nothing where the run does not say.
+    /// Returns the first file or camera of the capture that has changed since the stage `mask` ran, and how many
+    /// others have; `None` if the run has no record of them.
     pub(super) fn changed_input(&self) -> Option<String> {
         let path = self.run.path(Stage::Mask).join(INPUTS);
         let old: BTreeMap<String, String> = io::read_typed(&path, &Limits::default()).ok()?;
@@ -190,19 +191,19 @@ impl<'a> Line<'a> {
         Some(format!("{first} {state}{more}"))
     }
 
-    /// How the views of the stage `render` are made: those of the path, if there is one.
+    /// Returns how the views of the stage `render` are made: with the settings of the camera path, if the session has
+    /// one.
     pub(super) fn render_config(&self) -> &RenderConfig {
         self.path.as_ref().map_or(&self.config.render, |path| &path.render)
     }
 
-    /// An error if something that one of these stages works on is not there: photographs, checkpoints, networks, the
-    /// device.
+    /// Fails if an input of one of these stages is missing: photographs, checkpoints, networks or the device.
     pub(super) fn require_inputs(&self, stages: &[Stage]) -> Result<()> {
-        if let Some(problem) = self.gone.as_ref().filter(|_| !stages.is_empty()) {
+        if let Some(problem) = self.missing_capture.as_ref().filter(|_| !stages.is_empty()) {
             return Err(missing_capture(problem));
         }
         let mut lost =
-            self.imports.iter().filter(|i| stages.contains(&i.stage)).filter_map(|i| i.gone.clone());
+            self.imports.iter().filter(|i| stages.contains(&i.stage)).filter_map(|i| i.missing.clone());
         lost.next().map_or(Ok(()), Err)?;
         if stages.contains(&Stage::Metrics) {
             measure(self.config)?;
@@ -217,8 +218,8 @@ impl<'a> Line<'a> {
         }
     }
 
-    /// Writes a file of the run itself. That it cannot be written is no failure where nothing is left to do: a run
-    /// that is done may lie where nobody may write.
+    /// Writes a file of the run itself. A write error is ignored if no work is left, because a finished run may lie
+    /// on a read-only disk.
     pub(super) fn write(&self, name: &str, bytes: &[u8], idle: bool) -> Result<()> {
         match self.run.write(name, bytes) {
             Err(e) if idle => {
@@ -230,7 +231,7 @@ impl<'a> Line<'a> {
     }
 }
 
-/// Refuses settings that contradict each other, and a box that is none.
+/// Refuses settings that contradict each other, and an invalid box.
 pub fn check_feasible(config: &Config) -> Result<()> {
     if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
         return Err(Error::usage(format!("`{key}` {problem}"), hint));
@@ -239,13 +240,13 @@ pub fn check_feasible(config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// Refuses a device that this build or this machine does not have, or that somebody else uses. What is done needs none:
-/// so this is asked where a stage is to do that computes on it.
+/// Refuses a device that this build or this machine does not have, or that another process uses. Finished stages need
+/// no device, so this is checked only if a stage that computes on it has work left.
 pub fn require_device(config: &Config) -> Result<()> {
     crate::field::require_device(&config.device)
 }
 
-/// How the configuration opens a capture.
+/// Returns the options with which the configuration opens a capture.
 pub fn capture_options(config: &Config) -> CaptureOptions {
     let c = &config.capture;
     CaptureOptions {
@@ -259,24 +260,24 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
     }
 }
 
-/// The masks that lie beside the photographs, though others are made.
+/// Returns the masks beside the photographs, although the run makes its own.
 fn own_masks(capture: &Capture, options: &CaptureOptions) -> Result<OwnMasks> {
     let options = CaptureOptions { masks: MaskSource::Auto, ..options.clone() };
-    // what cannot be opened with its masks can be worked on without
+    // a capture that cannot be opened with its masks can still be used without them
     let found = capture::open(&capture.root, &options).map_or(Vec::new(), |c| c.views);
     let mask =
         |view: &View| found.iter().find(|v| v.name == view.name).map_or(ViewMask::None, |v| v.mask.clone());
     let masks: Vec<ViewMask> = capture.views.iter().map(mask).collect();
     let digests = masks.par_iter().map(|mask| match mask {
         ViewMask::File(path) => Ok(file_digest(path)?),
-        // its photograph is part of the capture's digest
+        // the photograph is already part of the capture's digest
         other => Ok(format!("{other:?}")),
     });
     let digests = digests.collect::<Result<Vec<String>>>()?;
     Ok(OwnMasks { masks, digest: Fingerprint::of_bytes(digests.join(" ").as_bytes()) })
 }
 
-/// Digest of all that a capture means: cameras, splits and the bytes of every picture; and of each of them.
+/// Returns the digest of the whole capture (cameras, splits and the bytes of every picture), and that of each part.
 fn capture_digest(capture: &Capture) -> Result<(String, BTreeMap<String, String>)> {
     let views = capture
         .views
@@ -313,24 +314,24 @@ fn file_digest(path: &Path) -> Result<String, io::ReadError> {
     Ok(Fingerprint::of_bytes(&io::read_bytes(path, &Limits::default())?))
 }
 
-/// The checkpoints that the configuration names. A stage that took one needs it no more: one that is no longer where
-/// the run found it has the digest that the stage's record holds.
+/// Returns the checkpoints that the configuration names. A stage that has imported one no longer needs the file: if
+/// it has been moved, the digest is taken from the stage's record.
 fn imports(config: &Config, run: &Run) -> Result<Vec<Import>> {
     let named = [(Stage::Baseline, &config.baseline.import), (Stage::Tface, &config.tface.import)];
     let open = |(stage, file): (Stage, &String)| match file_digest(Path::new(file)) {
-        Ok(digest) => Ok(Import { stage, digest, gone: None }),
+        Ok(digest) => Ok(Import { stage, digest, missing: None }),
         Err(e) => {
             let record = read_record(&run.path(stage)).ok().flatten();
             let record = record.filter(|_| is_missing(&e) && saved_import(run, stage).as_ref() == Some(file));
             let digest = record.and_then(|r| r.fingerprint.inputs.get("import").cloned());
             let e = Error::from(e);
-            digest.map(|digest| Import { stage, digest, gone: Some(e.clone()) }).ok_or(e)
+            digest.map(|digest| Import { stage, digest, missing: Some(e.clone()) }).ok_or(e)
         }
     };
     named.into_iter().filter(|(_, file)| !file.is_empty()).map(open).collect()
 }
 
-/// Digest of the network for LPIPS, if one is named; figures that are there need it no more.
+/// Returns the digest of the network for LPIPS, if one is named; finished metrics no longer need the file.
 fn lpips(config: &Config, run: &Run) -> Result<Option<String>> {
     let file = &config.metrics.lpips;
     if file.is_empty() {
@@ -349,7 +350,7 @@ fn lpips(config: &Config, run: &Run) -> Result<Option<String>> {
     }
 }
 
-/// The checkpoint that a stage took when the run was last worked on, if the run says so.
+/// Returns the checkpoint that a stage imported when the run was last worked on, if it is recorded.
 fn saved_import(run: &Run, stage: Stage) -> Option<String> {
     let saved = Config::of_run(run.dir())?;
     Some(if stage == Stage::Baseline { saved.baseline.import } else { saved.tface.import })
@@ -359,13 +360,13 @@ fn is_missing(e: &io::ReadError) -> bool {
     matches!(e, io::ReadError::Io { source, .. } if source.kind() == NotFound)
 }
 
-/// What a run remembers of a capture that is no longer there: its cameras, its digest, the clicks' digests, and why it
-/// cannot be opened. A run that is done does not need its photographs any more.
+/// Restores what a run recorded of a capture that has been moved: its cameras, its digest, the clicks' digests, and
+/// why it cannot be opened. A finished run no longer needs its photographs.
 ///
 /// # Errors
 ///
-/// `error` itself if the capture is there, and it tells what is wrong with it, or if there is no run yet; else that the
-/// run has not come far enough to remember it.
+/// `error` itself if the capture exists (the error then says what is wrong with it) or if the run does not exist yet;
+/// otherwise that the run has not recorded its capture yet.
 fn restore_from_run(
     config: &Config,
     run: &Run,
@@ -386,7 +387,7 @@ fn restore_from_run(
     Ok((capture, (digest, BTreeMap::new()), clicks, Some(problem)))
 }
 
-/// The capture of a run that has work left is no longer where it was.
+/// Returns the error for an unfinished run whose capture has been moved.
 fn missing_capture(problem: &str) -> Error {
     Error::cannot(
         format!("the capture of this run cannot be opened: {problem}"),
@@ -394,7 +395,7 @@ fn missing_capture(problem: &str) -> Error {
     )
 }
 
-/// A file that a stage of this run made cannot be used: the suggested fix is to make it again.
+/// Returns the error for an unusable file that a stage of this run made: the hint is to make it again.
 pub(super) fn unusable(e: io::ReadError, stage: impl Display) -> Error {
     match &e {
         io::ReadError::Io { source, .. } if source.kind() != NotFound => e.into(),

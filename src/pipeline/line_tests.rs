@@ -354,8 +354,8 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
         }
     }
     // the tunnel goes through the ears as well
-    let [(gone, 0), (0, kept)] = counts[..] else { panic!("{counts:?}") };
-    assert!(gone == kept && gone > 0, "{counts:?}");
+    let [(removed, 0), (0, kept)] = counts[..] else { panic!("{counts:?}") };
+    assert!(removed == kept && removed > 0, "{counts:?}");
     assert_ne!(digests[0], digests[1]);
 }
 

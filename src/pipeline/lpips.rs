@@ -1,4 +1,4 @@
-//! The network that judges views by LPIPS, in builds with and without networks.
+//! The network that computes LPIPS, in builds with and without networks.
 
 #[cfg(not(feature = "matting"))]
 use crate::Error;
@@ -7,7 +7,7 @@ use crate::config::Config;
 #[cfg(feature = "matting")]
 pub(super) use crate::metrics::Lpips;
 
-/// The network for LPIPS, if one is named.
+/// Loads the network for LPIPS, if one is named.
 #[cfg(feature = "matting")]
 pub(super) fn measure(config: &Config) -> Result<Option<Lpips>> {
     let file = &config.metrics.lpips;
@@ -17,7 +17,7 @@ pub(super) fn measure(config: &Config) -> Result<Option<Lpips>> {
     Lpips::open(file.as_ref(), &config.mask.onnxruntime, config.mask.memory_gib).map(Some)
 }
 
-/// What stands for LPIPS in a build that runs no networks.
+/// A stub of LPIPS for a build without networks.
 #[cfg(not(feature = "matting"))]
 pub(super) enum Lpips {}
 

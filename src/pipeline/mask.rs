@@ -1,4 +1,4 @@
-//! Stage `mask`: which pixels are the head, and where that puts it in space.
+//! Stage `mask`: which pixels are the head, and where the head is in space.
 
 use super::clicks::{MaskPrompts, make_masks};
 use super::scene_file;
@@ -19,37 +19,37 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// The contact sheet, in the stage's folder.
+/// File name of the contact sheet, in the stage's folder.
 pub(super) const SHEET: &str = "sheet.html";
 
-/// The clicks that masks were made from, in the stage's folder: the run outlives the file they came from.
+/// File name of the clicks, in the stage's folder: the run keeps a copy because it may outlive the original file.
 pub(super) const CLICKS: &str = "prompts.json";
 
-/// Longest side of the masks that the head is placed by; a hull is coarser still.
+/// Longest side of the masks that the head is located with; a hull is coarser still.
 const PLACED_PX: u32 = 1024;
 
-/// Share of a mask that contradicts the others from which it cannot be right. Outlines that are six pixels of 512 off
-/// contradict nothing; half a mask, that of another view or an empty one 0.1 to 1.
+/// Share of a mask that must contradict the other masks before it counts as wrong. Outlines that are off by six of
+/// 512 pixels contradict nothing; half a mask, the mask of another view or an empty one reach 0.1 to 1.
 const WRONG_SHARE: f64 = 0.1;
 
-/// Masks compared with each other, at most.
+/// Maximum number of masks compared with each other.
 const MOST_COMPARED: usize = 256;
 
-/// Masks as they were found or made.
+/// The masks, whether read or made.
 #[derive(Default)]
 struct CaptureMasks {
-    /// Of each view, as small as is enough to compare them.
+    /// One for each view, at a size sufficient to compare them.
     masks: Vec<Option<Gray>>,
-    /// The views that have masks, for the contact sheet, each with its number.
+    /// The views that have masks, each with its index, for the contact sheet.
     sheet: Vec<(usize, SheetView)>,
     /// How they were made, for the stage's record.
     record: Value,
-    /// Why those that were found cannot be right.
+    /// Contradictions in masks read from the capture.
     refused: Vec<Error>,
 }
 
-/// Finds the masks beside the photographs, or makes them from clicks: the masks as pictures, a sheet of them, and the
-/// box and hull they leave (`scene.json`).
+/// Reads the masks beside the photographs, or makes them from clicks. Writes the masks as pictures, a contact sheet,
+/// and the box and hull derived from them (`scene.json`).
 pub(super) fn mask(
     capture: &Capture,
     prompts: Option<&MaskPrompts>,
@@ -79,7 +79,7 @@ pub(super) fn mask(
     let silhouettes = config.meaning == MaskMeaning::Empty;
     let (conflicts, compared) = if silhouettes { conflicts(capture, &masks) } else { (Vec::new(), 0) };
     let mut wrong = if silhouettes { refused } else { Vec::new() };
-    let (contradicting, warnings) = judged(&conflicts, compared);
+    let (contradicting, warnings) = classify_conflicts(&conflicts, compared);
     wrong.extend(contradicting);
     for (_, view) in views.iter_mut().filter(|(i, _)| conflicts.iter().any(|(view, ..)| view == i)) {
         view.suspicions.push("disagrees with the others".into());
@@ -89,14 +89,14 @@ pub(super) fn mask(
         io::write_atomic(&dir.folder().join(SHEET), sheet(&views)?.as_bytes())?;
     }
     let wrong = grouped(&wrong);
-    // masks that the stage made are not refused: they are looked at before anything is learned from them
+    // masks that the stage made only cause warnings: the user reviews them before training
     if let Some(problem) = wrong.first().filter(|_| prompts.is_none() && !config.trust) {
         return Err(problem.into());
     }
     wrong.iter().map(Problem::to_string).chain(warnings).for_each(|text| dir.warn(&text));
     let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
     let suspicious: Vec<&String> = suspicious.collect();
-    // what a mask calls "not looked at" may still hold head
+    // pixels that a mask marks as unknown may still show the head
     let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
     let height = scene::height(&scene, capture.up);
@@ -113,7 +113,7 @@ pub(super) fn mask(
     }))
 }
 
-/// Where the stage keeps the mask of a view, in its folder.
+/// Returns the path of a view's mask in the stage's folder.
 pub(super) fn mask_file(folder: &Path, view: &str) -> PathBuf {
     folder.join(format!("{view}.png"))
 }
@@ -126,12 +126,12 @@ fn write_mask(folder: &Path, view: &str, mask: &Gray) -> Result<()> {
     Ok(io::write_png_gray(&file, mask)?)
 }
 
-/// The masks that lie beside the photographs.
+/// Reads the masks beside the photographs.
 fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<CaptureMasks> {
     let limits = Limits::default();
     let total = capture.views.len();
     let mut out = CaptureMasks::default();
-    // a few at a time: decoding is what takes time, and photographs are large
+    // a few at a time: decoding dominates, and photographs are large
     for (i, views) in capture.views.chunks(8).enumerate() {
         let loaded: Vec<Result<_>> = views
             .par_iter()
@@ -157,7 +157,7 @@ fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<CaptureMasks> {
     Ok(out)
 }
 
-/// Masks made from clicks.
+/// Makes masks from clicks.
 fn masks_from_clicks(
     capture: &Capture,
     prompts: &MaskPrompts,
@@ -187,7 +187,7 @@ fn masks_from_clicks(
     Ok(out)
 }
 
-/// Where the head is, from the views that are learned from; held-out ones have no say.
+/// Locates the head from the training views; held-out views do not take part.
 fn place(
     capture: &Capture,
     silhouettes: impl Iterator<Item = Option<Gray>>,
@@ -208,12 +208,13 @@ fn place(
     Ok(scene)
 }
 
-/// A view whose mask does not fit the others: its number, how large a share of the masks that concerns, and a sentence.
+/// A view whose mask contradicts the others: its index, the largest contradicting share, and a message.
 type MaskConflict = (usize, f64, String);
 
-/// The views whose masks do not fit the others, none where the cameras cannot tell; and how many masks were compared.
+/// Returns the views whose masks contradict the others (none if the cameras cannot decide), and how many masks were
+/// compared.
 fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> (Vec<MaskConflict>, usize) {
-    // evenly spread ones, where there are very many: the check keeps bits of every cell for each
+    // if there are very many views, evenly spread ones: the check keeps bits of every cell for each
     let every = capture.views.len().div_ceil(MOST_COMPARED);
     let views: Vec<ConsistencyView> = (capture.views.iter().zip(masks).enumerate())
         .map(|(i, (v, mask))| ConsistencyView {
@@ -224,13 +225,13 @@ fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> (Vec<MaskConflict>, u
         .collect();
     let found = check_consistency(&views).unwrap_or_default();
     let conflicts = found.conflicts.into_iter().map(|d| (d.view, d.too_much.max(d.too_little), d.text));
-    // less than that is a matter of pixels
+    // smaller shares are within the accuracy of pixels
     (conflicts.filter(|(_, share, _)| *share >= 0.005).collect(), found.masks)
 }
 
-/// The conflicts as sentences: masks that cannot be right, and those that a person should look at. When most masks are
-/// doubted it is not single masks that are wrong.
-fn judged(conflicts: &[MaskConflict], compared: usize) -> (Vec<Error>, Vec<String>) {
+/// Returns the conflicts as messages: errors for wrong masks and warnings for doubtful ones. When most masks
+/// conflict, the cause is not a single mask, and one message says so.
+fn classify_conflicts(conflicts: &[MaskConflict], compared: usize) -> (Vec<Error>, Vec<String>) {
     let mut found: Vec<(bool, String)> =
         conflicts.iter().map(|(_, share, text)| (*share >= WRONG_SHARE, text.clone())).collect();
     let n = found.len();
@@ -247,29 +248,29 @@ fn judged(conflicts: &[MaskConflict], compared: usize) -> (Vec<Error>, Vec<Strin
     (refused.collect(), doubted.into_iter().map(|(_, text)| text).collect())
 }
 
-/// A mask at a size that is enough to place the head and to compare masks.
+/// Shrinks a mask to a size that is sufficient to locate the head and to compare masks.
 fn for_placing(mask: &Gray) -> Gray {
     resize_gray(mask, working_size(mask.width, mask.height, PLACED_PX))
 }
 
-/// Returns everything that [`inspect`] finds in a capture, and which of its masks contradict each other.
+/// Returns the findings of [`inspect`] for a capture, and which of its masks contradict each other.
 pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     let mut found = inspect(root, options);
     if options.mask_meaning == MaskMeaning::Ignore {
         return found; // no silhouettes
     }
-    // what cannot be opened or read is among the problems
+    // inputs that cannot be opened or read are already among the problems
     let Ok(capture) = capture::open(root, options) else { return found };
     let load = |v: &View| Some(for_placing(&v.load_mask(&options.limits).ok().flatten()?));
     let masks: Vec<Option<Gray>> = capture.views.par_iter().map(load).collect();
     let (conflicts, compared) = conflicts(&capture, &masks);
-    let (wrong, warnings) = judged(&conflicts, compared);
+    let (wrong, warnings) = classify_conflicts(&conflicts, compared);
     found.add_refused_masks(&wrong, options);
     found.warnings.extend(warnings);
     found
 }
 
-/// An annotation page; `prompts` are clicks that are there already.
+/// Returns an annotation page that shows the existing clicks `prompts`.
 pub fn click_page(capture: &Capture, prompts: Option<&Path>) -> Result<String> {
     let limits = Limits::default();
     let prompts = prompts.map(|file| read_prompts(file, &limits)).transpose()?;

@@ -1,4 +1,5 @@
-//! Stage `mesh`: the zero level set of the learned distance, closed, in the dataset's world; and what an artist opens.
+//! Stage `mesh`: the zero level set of the trained distance field, closed, in the dataset's world; and the head mesh
+//! made from it.
 //!
 //! ```text
 //! mesh/surface.ply   the whole extraction with colors at its vertices, in the dataset's world
@@ -25,8 +26,8 @@ use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Stage `mesh`: the whole surface as `surface.ply` in the dataset's world, and the head mesh in the formats asked
-/// for.
+/// Runs the stage `mesh`: writes the whole surface as `surface.ply` in the dataset's world, and the head mesh in the
+/// configured formats.
 pub(super) fn mesh(
     capture: &Capture,
     scene: &Scene,
@@ -51,7 +52,7 @@ pub(super) fn mesh(
             cap.open(&mut surface);
         }
     }
-    // what took longest is kept, whatever comes of the rest
+    // the extraction took longest, so it is kept even if a later step fails
     let in_world = ExportOptions {
         stem: "surface".into(),
         world_from_mesh: world_from_scene,
@@ -59,7 +60,8 @@ pub(super) fn mesh(
     };
     write_files(&to_ply(&surface, None, &in_world)?, dir.folder())?;
     let surface_triangles = surface.triangles.len();
-    // vertices have the color seen straight; textures and rays that of the cameras, and so their cap
+    // vertices have the color seen along the normal; textures and rays, and so their cap, have the color that cameras
+    // see
     let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
     let views = match c.color {
         ColorSource::Network if c.hair == Hair::None => Vec::new(),
@@ -101,7 +103,7 @@ pub(super) fn mesh(
         exported.warnings.iter().for_each(|w| dir.warn(w));
         write_files(&exported, dir.folder())?;
     }
-    // without the way, which f32 may not hold
+    // without the translation, which f32 may not represent
     let in_place = Similarity { translation: DVec3::ZERO, ..world_from_scene };
     let size = head.mesh.transformed(&in_place).bounds().size() * config.capture.unit_m as f32;
     Ok(json!({
@@ -117,7 +119,7 @@ pub(super) fn mesh(
     }))
 }
 
-/// Loaded views as what colors are fitted to.
+/// Returns loaded views in the form that colors are fitted to.
 pub(super) fn photographs(views: &[(Camera, LoadedView)]) -> Vec<Photograph<'_>> {
     views
         .iter()
@@ -130,7 +132,7 @@ pub(super) fn photographs(views: &[(Camera, LoadedView)]) -> Vec<Photograph<'_>>
         .collect()
 }
 
-/// The whole surface with colors at its vertices, closed where the training cameras stop looking.
+/// Extracts the whole surface with colors at its vertices, closed where the training cameras' frames end.
 pub(super) fn extract(
     scene: &Scene,
     field: &dyn Surface,
@@ -139,7 +141,7 @@ pub(super) fn extract(
     c: &MeshConfig,
     monitor: &dyn Monitor,
 ) -> Result<(Mesh, MeshReport)> {
-    // the color of a vertex is what is seen looking straight at it
+    // the color of a vertex is the one seen along its normal
     let color = |points: &[Vec3], normals: &[Vec3]| {
         let directions: Vec<Vec3> = normals.iter().map(|n| -*n).collect();
         field.color(points, normals, &directions)
@@ -161,12 +163,12 @@ pub(super) fn extract(
     };
     let hull = scene.hull.as_ref().map(|hull| |p: Vec3| hull.contains(p));
     let inside_hull = hull.as_ref().map(|f| f as &(dyn Fn(Vec3) -> bool + Sync));
-    // below the frames' border the surface is a guess: close the mesh where enough cameras look
+    // below the frames' border the surface is a guess: close the mesh where enough cameras see it
     let kept = capture::well_seen(scene, cameras, up, c.seen_by);
     mesh::extract(sdf, gradient, color, kept, inside_hull, &config, monitor)
 }
 
-/// The mesh names the others: it comes last.
+/// The mesh file refers to the others, so it is written last.
 fn write_files(exported: &ExportedFiles, folder: &Path) -> Result<()> {
     for (name, bytes) in exported.files.iter().rev() {
         io::write_atomic(&folder.join(name), bytes)?;
@@ -180,20 +182,20 @@ fn write_exr(linear: &Image, path: &Path) -> Result<()> {
     Ok(io::write_exr(path, linear.width, linear.height, &channels)?)
 }
 
-/// Returns the head mesh of a run as the files of a format, the mesh first. `stem` names them.
+/// Returns the files of a run's head mesh in a format, the mesh first. `stem` is their base name.
 ///
 /// # Errors
 ///
-/// The stage `mesh` has left none, or it is damaged.
+/// Fails if the stage `mesh` has left no head mesh, or if it is damaged.
 pub fn export_head(line: &Line, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
     Export::new(&line.capture, line.config).files(&head_mesh(line)?, format, stem)
 }
 
-/// The record of the stage in a run.
+/// Returns the stage's record in a run.
 ///
 /// # Errors
 ///
-/// It is not done; the error says whether a process works on it.
+/// Fails if the stage is not done; the error says whether a process works on it.
 pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
     let StageStatus { phase, status, record, .. } = StageStatus::read(&run.join(Stage::Mesh), Stage::Mesh);
     let shown = run.display();
@@ -209,23 +211,23 @@ pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
     })
 }
 
-/// The head mesh that the stage left.
+/// Returns the head mesh that the stage wrote.
 pub(super) fn head_mesh(line: &Line) -> Result<HeadMesh> {
     HeadMesh::load(&line.run.path("mesh/parts"))
 }
 
-/// The extracted surface that the stage left, in scene coordinates, as it was before it became a file.
+/// Returns the extracted surface that the stage wrote, in scene coordinates, as it was before export.
 pub(super) fn extracted_surface(line: &Line) -> Result<ExtractedSurface> {
     ExtractedSurface::load(&line.run.path("mesh/parts"))
 }
 
-/// The extracted surface that the stage left, in the dataset's world.
+/// Returns the extracted surface that the stage wrote, in the dataset's world.
 pub(super) fn surface_in_world(line: &Line) -> Result<Mesh> {
     let path = line.run.path("mesh/surface.ply");
     read(&io::read_bytes(&path, &Limits::default())?, &path)
 }
 
-/// What became of handles, in millimetres around.
+/// Describes how many handles were cut, filled or left, with lengths in millimetres.
 fn handles(report: &HandleReport, mm: f64) -> Value {
     let each = |lengths: &[f32]| lengths.iter().map(|&l| f64::from(l) * mm).collect::<Vec<_>>();
     json!({

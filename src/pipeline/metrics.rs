@@ -1,4 +1,4 @@
-//! Stage `metrics`: every view, of every member and of the blends, against its photograph.
+//! Stage `metrics`: compares every view of every member and of the blends with its photograph.
 //!
 //! A mesh of the demo head is compared with its exact surface ([`against_truth`]).
 
@@ -20,37 +20,37 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 
-/// A mask counts as empty only where it is nothing at all.
+/// Largest mask value that counts as empty.
 const NOTHING: u8 = 0;
 
-/// Pictures of one kind, one for each view.
+/// Rendered pictures of one method, one for each view.
 pub(super) struct PictureSet {
-    /// What it is called in `metrics.json`: a member, or `ensemble`.
+    /// The name in `metrics.json`: a member, or `ensemble`.
     pub name: String,
-    /// Where its pictures are.
+    /// The folder of its pictures.
     folder: PathBuf,
 }
 
-/// A picture that has a photograph.
+/// A rendered picture with its photograph.
 pub(super) struct Comparable<'a> {
     /// Its view.
     pub view: &'a View,
     /// The picture.
     pub file: PathBuf,
-    /// The same in float, if it is there.
+    /// The float version of the picture, if it exists.
     float: PathBuf,
 }
 
-/// Figures of one picture.
+/// Metrics of one picture.
 struct ViewFigures {
     head: ViewMetrics,
     region: Option<ViewMetrics>,
     parts: PartMetrics,
-    /// Sum of opacity² over the pixels without any head, and how many those are.
+    /// Sum of opacity² over the pixels without any head, and the number of these pixels.
     outside: Option<(f64, u64)>,
 }
 
-/// Everything that is judged, in the order of the line.
+/// Returns all sets that are evaluated, in pipeline order.
 pub(super) fn picture_sets(line: &Line) -> Vec<PictureSet> {
     let set = |name: &str, folder: &str| PictureSet { name: name.into(), folder: line.run.path(folder) };
     let methods = line.config.render.method.iter().map(|m| m.folder());
@@ -61,7 +61,7 @@ pub(super) fn picture_sets(line: &Line) -> Vec<PictureSet> {
     sets
 }
 
-/// The pictures of a set that have a photograph.
+/// Returns the pictures of a set that have a photograph.
 pub(super) fn comparable<'l>(line: &'l Line, set: &PictureSet) -> Vec<Comparable<'l>> {
     let floats = set.folder.join(pictures::FLOAT);
     let picture = |view: &'l View| {
@@ -71,20 +71,20 @@ pub(super) fn comparable<'l>(line: &'l Line, set: &PictureSet) -> Vec<Comparable
     line.capture.views.iter().map(picture).filter(|c| io::is_file(&c.file)).collect()
 }
 
-/// Writes `metrics.json`: every rendered or blended view against its photograph, inside the mask and inside the
-/// capture's region of interest, and part by part (opaque pixels, outline, skin, hair, what is covered); how much of
-/// it is in the way outside; and the mesh against the truth where it is known.
+/// Writes `metrics.json`. Every rendered or blended view is compared with its photograph, inside the mask and inside
+/// the capture's region of interest, and part by part (opaque pixels, outline, skin, hair, coverage); opacity outside
+/// the head is measured, and the mesh is compared with the true surface if that is known.
 pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     let mut out = Map::new();
     let sets = picture_sets(line);
-    let judged: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(line, set)).collect();
-    let mut views: Vec<View> = judged.iter().flatten().map(|c| line.evaluation_view(c.view)).collect();
+    let comparables: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(line, set)).collect();
+    let mut views: Vec<View> = comparables.iter().flatten().map(|c| line.evaluation_view(c.view)).collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));
     views.dedup_by(|a, b| a.name == b.name);
     let lpips = measure(line.config)?;
     lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
     let tones = Tones::of(&views.iter().collect::<Vec<_>>())?;
-    for (i, (set, pictures)) in sets.iter().zip(&judged).enumerate() {
+    for (i, (set, pictures)) in sets.iter().zip(&comparables).enumerate() {
         let figures = pictures.par_iter().map(|p| figures(line, p, tones.as_ref(), lpips.as_ref()));
         let figures = figures.collect::<Result<Vec<_>>>()?;
         if !figures.is_empty() {
@@ -113,7 +113,7 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
     Ok(means(&value))
 }
 
-/// How much better a blend of several members is than the best of them, dB.
+/// Returns how much better a blend of several members is than the best of them, dB.
 fn blend_gain(sets: &Map<String, Value>, members: &[Method]) -> Option<Value> {
     let psnr = |set: &str| {
         let mean = sets.get(set)?.pointer("/head/mean")?;
@@ -143,7 +143,7 @@ fn figures(
     let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;
     let mut head = against(loaded.mask.as_ref())?;
     head.lpips = lpips.map(|network| network.distance(&render, &photo)).transpose()?;
-    // a picture over a background is opaque; what it was before is in the float view
+    // a picture over a background is opaque; its original alpha is in the float view
     let before = match io::is_file(&picture.float) {
         true => Some(pictures::read_float(&picture.float)?),
         false => None,
@@ -157,7 +157,7 @@ fn figures(
     Ok(ViewFigures { head, region, parts, outside })
 }
 
-/// One set's part of the file.
+/// Returns one set's part of the file.
 fn entry(figures: Vec<ViewFigures>) -> Value {
     let (mut heads, mut regions, mut parts, mut outside) = (Vec::new(), Vec::new(), Vec::new(), (0.0, 0));
     for f in figures {
@@ -182,8 +182,8 @@ fn entry(figures: Vec<ViewFigures>) -> Value {
     Value::Object(entry)
 }
 
-/// Sum of opacity² over the valid pixels of which the mask says that no head is there, and how many
-/// there are; `None` without a mask. What floats before the background shows here.
+/// Returns the sum of opacity² over the valid pixels where the mask shows no head, and the number of these pixels;
+/// `None` without a mask. This measures floaters in front of the background.
 fn square_opacity_outside(opacity: &[f32], loaded: &LoadedView) -> Option<(f64, u64)> {
     let mask = loaded.mask.as_ref()?;
     let valid = |i: usize| loaded.valid.as_ref().is_none_or(|v| v.values[i] > 0);
@@ -192,7 +192,7 @@ fn square_opacity_outside(opacity: &[f32], loaded: &LoadedView) -> Option<(f64, 
     Some(counted.fold((0.0, 0), |(sum, n), (_, (a, _))| (sum + (*a as f64).powi(2), n + 1)))
 }
 
-/// The part of a metrics file worth a line: means, without the single views.
+/// Returns the summary of a metrics file: means without the single views.
 fn means(metrics: &Value) -> Value {
     match metrics {
         Value::Object(map) => {
@@ -208,17 +208,17 @@ fn means(metrics: &Value) -> Value {
 pub struct Truth {
     /// Points measured in each direction.
     pub points: usize,
-    /// Mean distance from the mesh to the true surface: how wrong what is there is.
+    /// Mean distance from the mesh to the true surface (accuracy).
     pub accuracy_mean: f64,
     /// 90 % of the mesh is nearer than this.
     pub accuracy_p90: f64,
-    /// Mean distance from the true surface to the mesh: how much of it is missed.
+    /// Mean distance from the true surface to the mesh (completeness).
     pub completeness_mean: f64,
     /// 90 % of the true surface is nearer than this.
     pub completeness_p90: f64,
 }
 
-/// Compares a mesh in world coordinates with the demo head. `None` if none of it is head.
+/// Compares a mesh in world coordinates with the synthetic head. `None` if no part of it is head.
 pub fn against_truth(mesh: &Mesh, points: usize) -> Option<Truth> {
     let percent = |d: f32| 100.0 * d as f64 / SyntheticHead::HEAD_HEIGHT as f64;
     let summary = |mut d: Vec<f32>| {

@@ -1,7 +1,8 @@
-//! `report.html`, from what lies in the run: the head to turn, views beside their photographs, figures, times, settings.
+//! `report.html`, from the contents of a run: a 3D viewer of the head, views beside their photographs, metrics,
+//! times, settings.
 //!
-//! The page stays below eight megabytes, so that it opens at once and can be sent: pictures are small copies, with links to
-//! those beside the page; of many views and masks some are shown.
+//! The page stays below eight megabytes, so that it opens at once and can be sent: pictures are small copies that
+//! link to the originals; if there are many views and masks, only some are shown.
 
 pub(super) mod views;
 
@@ -16,20 +17,20 @@ use crate::run::{Record, read_record};
 use serde_json::Value;
 use std::path::Path;
 
-/// Bytes of a page without its fixed parts.
+/// Maximum size of a page without its fixed parts, bytes.
 const MOST_BYTES: usize = 7_600_000;
-/// Of them, for the masks.
+/// The part of it that masks may take.
 const MASK_BYTES: usize = 800_000;
 
-/// Writes `report.html`, of every stage that is done; without the photographs it stays as it is.
+/// Writes `report.html` with every finished stage; without the photographs an existing report is kept.
 pub(super) fn write_report(line: &Line, idle: bool) -> Result<()> {
-    if line.gone.is_some() || idle && is_current(line) {
+    if line.missing_capture.is_some() || idle && is_current(line) {
         return Ok(());
     }
     line.write("report.html", page(line)?.as_bytes(), idle)
 }
 
-/// Is the report newer than every stage and the settings? Making it opens all pictures.
+/// Whether the report is newer than every stage and the settings. Writing it again would open all pictures.
 fn is_current(line: &Line) -> bool {
     let time = |name: &str| io::modified(&line.run.path(name));
     let report = time("report.html").filter(|_| io::is_file(&line.run.path("report.html")));
@@ -37,11 +38,11 @@ fn is_current(line: &Line) -> bool {
     report.is_some_and(|report| records.into_iter().flatten().chain(time("config.toml")).all(|t| t < report))
 }
 
-/// Writes the report of a run anew, from what lies in it.
+/// Writes the report of a run again, from the run's contents.
 ///
 /// # Errors
 ///
-/// The photographs are no longer there, or a file of the run is damaged.
+/// Fails if the photographs have been moved, or if a file of the run is damaged.
 pub fn renew_report(line: &Line) -> Result<()> {
     line.require_inputs(&[Stage::Metrics])?;
     line.run.write("report.html", page(line)?.as_bytes())
@@ -89,7 +90,7 @@ fn page(line: &Line) -> Result<String> {
     })
 }
 
-/// A file as text; empty if it is not there.
+/// Reads a file as text; empty if the file does not exist.
 fn text(file: &Path) -> Result<String> {
     if !io::is_file(file) {
         return Ok(String::new());
@@ -119,7 +120,7 @@ fn facts(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
     facts
 }
 
-/// What stages and the capture say that a person should know.
+/// Returns the warnings of the stages and of the capture.
 fn warnings(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
     let mut all = line.capture.warnings.clone();
     for (stage, record) in records {
@@ -133,7 +134,7 @@ fn warnings(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
     all
 }
 
-/// The figures of a stage that is done; those of pictures have a table of their own.
+/// Returns the metrics of a finished stage; those of pictures have a table of their own.
 fn summary((stage, record): &(Stage, Record)) -> Option<(String, Vec<(String, String)>)> {
     let mut figures = record.summary.clone();
     if let (Stage::Metrics, Value::Object(sets)) = (stage, &mut figures) {
@@ -143,7 +144,7 @@ fn summary((stage, record): &(Stage, Record)) -> Option<(String, Vec<(String, St
     (!rows.is_empty()).then(|| (stage.to_string(), rows))
 }
 
-/// A word as a shell takes it.
+/// Quotes a word for the shell.
 fn quoted(word: &str) -> String {
     let plain = |c: char| c.is_alphanumeric() || "/._-+=:@,".contains(c);
     match !word.is_empty() && word.chars().all(plain) && !word.starts_with('-') {
@@ -152,7 +153,7 @@ fn quoted(word: &str) -> String {
     }
 }
 
-/// Columns of the table: heading, digits, and whether more is better, less is, or neither.
+/// Columns of the table: heading, number of digits, and whether more is better, less is, or neither.
 const COLUMNS: [(&str, usize, Option<bool>); 8] = [
     ("PSNR, head", 2, Some(true)),
     ("SSIM, head", 4, Some(true)),
@@ -164,7 +165,7 @@ const COLUMNS: [(&str, usize, Option<bool>); 8] = [
     ("triangles", 0, None),
 ];
 
-/// What the second table of pictures shows: a heading, where it stands in `metrics.json`, and how many digits.
+/// Rows of the second table of pictures: heading, key in `metrics.json`, and number of digits.
 const QUALITY: [(&str, &str, usize); 12] = [
     ("PSNR", "/head/mean/psnr_masked", 2),
     ("SSIM", "/head/mean/ssim_masked", 4),
@@ -180,7 +181,7 @@ const QUALITY: [(&str, &str, usize); 12] = [
     ("opacity² outside", "/mean_square_opacity_outside", 4),
 ];
 
-/// The table of methods, in the order of the line; empty before the stage `metrics`.
+/// Returns the table of methods, in pipeline order; empty before the stage `metrics`.
 fn table(line: &Line) -> MethodTable {
     let summary = |stage: Stage| read_record(&line.run.path(stage)).ok().flatten();
     let Some(metrics) = summary(Stage::Metrics).map(|r| r.summary) else { return MethodTable::default() };
@@ -207,7 +208,7 @@ fn table(line: &Line) -> MethodTable {
     MethodTable::new(&COLUMNS, NAMES.iter().filter_map(row).collect())
 }
 
-/// The stages that must have run before a picture of this word can be made, the last one last.
+/// Returns the stages that must have run before a picture of this method can be made, in order.
 fn stages_of(line: &Line, word: &str) -> Vec<Stage> {
     let members = &line.config.ensemble.members;
     match line.config.render.method.iter().find(|m| m.folder() == word) {
@@ -221,7 +222,7 @@ fn stages_of(line: &Line, word: &str) -> Vec<Stage> {
     }
 }
 
-/// The files that hold what it shows.
+/// Returns the files that hold the data a method shows.
 fn files_of(line: &Line, word: &str) -> Vec<std::path::PathBuf> {
     let Some(method) = line.config.render.method.iter().find(|m| m.folder() == word) else {
         let members = line.config.ensemble.members.iter();
@@ -244,7 +245,7 @@ fn files_of(line: &Line, word: &str) -> Vec<std::path::PathBuf> {
     }
 }
 
-/// A row for every kind of picture that was judged, below the heading; nothing where none was.
+/// Returns a row for every evaluated kind of picture below the heading; empty if there is none.
 fn quality(line: &Line) -> Vec<Vec<String>> {
     let record = read_record(&line.run.path(Stage::Metrics)).ok().flatten();
     let Some(Value::Object(sets)) = record.map(|done| done.summary) else { return Vec::new() };

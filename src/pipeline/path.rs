@@ -1,13 +1,13 @@
-//! Views along a path of cameras: a product of its own, made of the same fields as the evaluation's views.
+//! Views along a camera path: a separate output, made of the same fields as the evaluation's views.
 //!
 //! ```text
 //! render/paths/orbit/tface/0001.png   around the head
-//!              train/                 from where it was learned
+//!              train/                 from the training cameras
 //!              flight-1f0c2a9b/       from a file of cameras: its name, and the beginning of its digest
 //! ```
 //!
-//! No stage reads them, so none is out of date with them: they come and go without the evaluation's views, their
-//! blend and the metrics.
+//! No stage reads these views, so making or removing them does not affect the evaluation's views, their blend or the
+//! metrics.
 
 use crate::capture::{Capture, Split, View};
 use crate::config::RenderConfig;
@@ -18,26 +18,26 @@ use crate::run::Fingerprint;
 use crate::{Error, Result};
 use std::path::Path;
 
-/// Below the run: one folder for each path.
+/// Folder of the paths, relative to the run: one folder for each path.
 pub(super) const PATHS: &str = "render/paths";
 
-/// So many characters of a file's name stand before its digest: a name has room for 255 bytes.
+/// Number of characters of a file's name kept before its digest: a file name is limited to 255 bytes.
 const STEM: usize = 50;
 
-/// Which cameras, and how their views are made.
+/// A set of cameras, and the settings of their views.
 pub(super) struct CameraPath {
-    /// Its folder, below the run.
+    /// Its folder, relative to the run.
     pub folder: String,
-    /// How the views are made.
+    /// The settings of the views.
     pub render: RenderConfig,
-    /// `None` for an orbit: where it is depends on the head.
+    /// `None` for an orbit, which depends on where the head is.
     pub cameras: Option<Vec<NamedCamera>>,
-    /// Of the file the cameras come from.
+    /// Digest of the file that the cameras come from.
     pub digest: Option<String>,
 }
 
 impl CameraPath {
-    /// The path that `render.cameras` names, a file of cameras read; `None` for the held-out views.
+    /// Returns the path that `render.cameras` names, reading a file of cameras; `None` for the held-out views.
     pub fn new(render: RenderConfig, capture: &Capture) -> Result<Option<CameraPath>> {
         let mut digest = None;
         let (name, cameras) = match render.cameras.as_str() {
@@ -54,19 +54,19 @@ impl CameraPath {
                 (format!("{stem}-{}", &digest[..8]), Some(cameras))
             }
         };
-        // what is kept in float is kept for a blend, and these views are in none
+        // float views are only kept for the ensemble, which does not read these views
         let render = RenderConfig { float: false, ..render };
         Ok(Some(CameraPath { folder: format!("{PATHS}/{name}"), render, cameras, digest }))
     }
 }
 
-/// The cameras of one split, named like their photographs.
+/// Returns the cameras of one split, named like their photographs.
 pub(super) fn cameras_of(capture: &Capture, split: Split) -> Vec<NamedCamera> {
     let named = |v: &View| NamedCamera { name: v.name.clone(), camera: v.camera.clone() };
     capture.split(split).map(named).collect()
 }
 
-/// The cameras in the bytes of a file, each of a name of its own.
+/// Returns the cameras in the bytes of a file, each with a unique name.
 pub(super) fn cameras_of_file(file: &str, bytes: &[u8], like: &Camera) -> Result<Vec<NamedCamera>> {
     let cameras = from_json(&String::from_utf8_lossy(bytes), like)?;
     let mut names: Vec<&str> = cameras.iter().map(|c| c.name.as_str()).collect();

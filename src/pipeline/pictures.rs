@@ -1,4 +1,4 @@
-//! Rendered views as files, and back.
+//! Writing and reading rendered views.
 
 use crate::Result;
 use crate::config::{PictureFormat, ViewBackground};
@@ -16,10 +16,10 @@ pub(super) fn behind(background: ViewBackground) -> Option<[f32; 3]> {
     }
 }
 
-/// Below a method's folder: its views as `ensemble` reads them.
+/// Folder of the float views that `ensemble` reads, below a method's folder.
 pub(super) const FLOAT: &str = "float";
 
-/// The file of a view: `folder/NAME.png` or `.exr`.
+/// Returns the file of a view: `folder/NAME.png` or `.exr`.
 pub(super) fn path(folder: &Path, name: &str, format: PictureFormat) -> PathBuf {
     let ending = match format {
         PictureFormat::Png => "png",
@@ -28,7 +28,7 @@ pub(super) fn path(folder: &Path, name: &str, format: PictureFormat) -> PathBuf 
     folder.join(format!("{name}.{ending}"))
 }
 
-/// All files of a view: the pictures as shown, and the float one below `float`.
+/// Returns all files of a view: the pictures as shown, and the float one below `float`.
 pub(super) fn files(folder: &Path, name: &str, float: Option<&Path>, format: PictureFormat) -> Vec<PathBuf> {
     let mut files: Vec<PathBuf> = float.map(|f| float_path(f, name)).into_iter().collect();
     files.push(path(folder, name, format));
@@ -94,12 +94,12 @@ pub(super) fn write(
 /// The channels of a float view. Not R, G and B: those are scene-linear in an EXR, these are coded.
 const CODED: [&str; 5] = ["coded.R", "coded.G", "coded.B", "A", "Z"];
 
-/// The float file of a view: `folder/NAME.exr`.
+/// Returns the float file of a view: `folder/NAME.exr`.
 pub(super) fn float_path(folder: &Path, name: &str) -> PathBuf {
     path(folder, name, PictureFormat::Exr)
 }
 
-/// Writes a view as it is: 32-bit coded color over black, opacity, and depth in world units.
+/// Writes a view unchanged: 32-bit coded color over black, opacity, and depth in world units.
 pub(super) fn write_float(folder: &Path, name: &str, view: &RenderedView) -> Result<(), WriteError> {
     let file = float_path(folder, name);
     io::create_folder(file.parent().unwrap_or(folder))?;
@@ -109,7 +109,7 @@ pub(super) fn write_float(folder: &Path, name: &str, view: &RenderedView) -> Res
     io::write_exr(&file, view.color.width, view.color.height, &channels)
 }
 
-/// Reads what [`write_float`] wrote, bit by bit: the color (RGBA over black).
+/// Reads the color (RGBA over black) that [`write_float`] wrote, bit by bit.
 pub(super) fn read_float(file: &Path) -> Result<Image, ReadError> {
     let read = io::read_exr(file, &[&CODED[..4]], &Limits::default())?;
     if read.replaced > 0 {
@@ -121,13 +121,13 @@ pub(super) fn read_float(file: &Path) -> Result<Image, ReadError> {
     Ok(read.image)
 }
 
-/// Coded color no longer multiplied by alpha.
+/// Divides coded color by alpha.
 pub(super) fn straight([r, g, b, a]: [f32; 4]) -> [f32; 4] {
     let k = if a > 0.0 { 1.0 / a } else { 0.0 };
     [r * k, g * k, b * k, a]
 }
 
-/// Reads a view as it was written: RGBA, coded color premultiplied over black.
+/// Reads a view as RGBA, coded color premultiplied over black.
 pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadError> {
     let limits = Limits::default();
     match format {
@@ -153,8 +153,8 @@ pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadErro
     }
 }
 
-/// The photograph as the render should look: cut out by its mask and laid over the same
-/// background. Without a mask it stays as it is.
+/// Returns the photograph as the render should look: cut out by its mask and composited over the same background.
+/// Without a mask it is returned unchanged.
 pub(super) fn expected(photo: &Photo, mask: Option<&Gray>, background: ViewBackground) -> Photo {
     let Some(mask) = mask else { return photo.clone() };
     let behind = behind(background).unwrap_or([0.0; 3]);

@@ -1,6 +1,6 @@
-//! What each stage builds on, and so what shapes it, and what it may cost: known before anything runs.
+//! The inputs and the estimated cost of each stage, known before anything runs.
 //!
-//! Costs are counts of rays, samples, cells and pixels times what one of each took where it was measured.
+//! A cost is a number of rays, samples, cells or pixels times the measured time of one.
 
 use super::ensemble::can_blend;
 use super::line::{Line, capture_options};
@@ -14,11 +14,11 @@ use crate::run::{Cost, ESTIMATE, Estimate, Fingerprint, Plan, read_record, read_
 use crate::{Error, Result, io};
 use std::path::Path;
 
-/// Raised when the meaning of a stage's files changes.
+/// Version of the stages' files; raised when their meaning changes.
 const FORMAT: u32 = 2;
 
-/// Keys of `[mask]` that shape no mask which is made: where something lies, what it holds being an input of the stage, and
-/// what is asked of others.
+/// Keys of `[mask]` that do not affect the masks that are made: paths, whose contents are inputs of the stage
+/// instead, and checks of other masks.
 const PLACES: [&str; 10] = [
     "mask.trust",
     "mask.prompts",
@@ -32,14 +32,14 @@ const PLACES: [&str; 10] = [
     "mask.memory_gib",
 ];
 
-/// Keys of `[mask]` that shape masks which were found.
+/// Keys of `[mask]` that affect masks read from the capture.
 const FOUND: [&str; 2] = ["mask.source", "mask.meaning"];
 
-/// Keys of `[mesh]` that shape files for other programs, and nothing that views show.
+/// Keys of `[mesh]` that affect files for other programs, but no rendered view.
 const FILE_KEYS: [&str; 5] =
     ["mesh.format", "mesh.material", "mesh.texture_format", "mesh.exr", "mesh.verify"];
 
-/// Keys of `[mesh]` that shape the head mesh, and not the surface it is made from.
+/// Keys of `[mesh]` that affect the head mesh, but not the surface it is made from.
 const HEAD_KEYS: [&str; 7] = [
     "mesh.frame",
     "mesh.triangles",
@@ -51,8 +51,8 @@ const HEAD_KEYS: [&str; 7] = [
 ];
 
 impl Line<'_> {
-    /// The stages up to `until` that it needs, itself the last, in the order of the line. Views of a path need what
-    /// they show, and nothing that only the evaluation shows.
+    /// Returns `until` and the stages it needs, in pipeline order. Views along a camera path need only the stages
+    /// whose results they show, not those that only the evaluation shows.
     pub fn order(&self, until: Stage) -> Vec<Stage> {
         match &self.path {
             Some(path) if until == Stage::Render => {
@@ -64,20 +64,20 @@ impl Line<'_> {
         }
     }
 
-    /// The folder of the views that this line makes, below the run.
+    /// Returns the folder of the views that this session makes, relative to the run.
     pub fn views(&self) -> &str {
         self.path.as_ref().map_or("render", |path| &path.folder)
     }
 
-    /// What would be done for `until`: the folder of each stage with `None` if it has to be worked on, else what
-    /// differs from the result that lies there (nothing, if it is done). An error if the settings contradict
-    /// each other. Nothing is written.
+    /// Returns the state of each stage for `until`: its folder, with `None` if the stage was never completed, else
+    /// the differences from the existing result (none if it is up to date). Fails if the settings contradict each
+    /// other. Nothing is written.
     pub fn stage_states(&self, until: Stage) -> Result<Vec<(String, Option<Vec<String>>)>> {
         self.can_make(until)?;
         let (mut found, mut missing) = (Vec::new(), Vec::new());
         for stage in self.order(until) {
             let Plan { name, fingerprint, .. } = self.compared_plan(stage);
-            // a record that cannot be read is none: the stage counts as not done
+            // a stage whose record cannot be read counts as not done
             let record = read_record(&self.run.path(name)).ok().flatten();
             missing.extend(record.is_none().then_some(stage));
             let differences = record.map(|r| {
@@ -91,7 +91,7 @@ impl Line<'_> {
         Ok(found)
     }
 
-    /// Refuses what the stage `mask` would refuse, if it is one of those that are made.
+    /// Refuses settings that the stage `mask` would refuse, if that stage is to run.
     fn require_masks(&self, made: &[Stage]) -> Result<()> {
         if !made.contains(&Stage::Mask) {
             return Ok(());
@@ -100,9 +100,9 @@ impl Line<'_> {
         inspection.problems.first().map_or(Ok(()), |problem| Err(Error::from(problem)))
     }
 
-    /// Writes the complete configuration into the run: what repeats it. Refused, before anything is
-    /// changed, if a stage that `until` needs was made or begun with other settings, if the settings contradict
-    /// each other, or if there is work left and no capture to do it on.
+    /// Writes the complete configuration into the run, so that the run can be repeated. Fails before anything is
+    /// changed if a stage that `until` needs was made or begun with other settings, if the settings contradict each
+    /// other, or if work is left without a capture.
     pub fn remember(&self, until: Stage) -> Result<()> {
         self.agrees(until, &[])?;
         let order = self.order(until).into_iter();
@@ -112,12 +112,12 @@ impl Line<'_> {
         self.write("config.toml", self.config.to_toml().as_bytes(), left.is_empty())
     }
 
-    /// Folders below the run that hold something and are out of date when a stage is made anew, in the order of the line:
-    /// its own, those of what builds on it, and views of paths that show it. Where views of a path are made anew, they
-    /// alone.
+    /// Returns the non-empty folders of the run that become out of date when a stage is made again, in pipeline
+    /// order: its own folder, those of the stages that depend on it, and views along paths that show it. If the views
+    /// of a path are made again, only their own folder is returned.
     ///
-    /// What builds on it, is done, and reads nothing that its changed settings shape stays. Where nothing has changed, a
-    /// stage is made anew with all that follows.
+    /// A finished stage that depends on it is kept if none of its inputs is affected by the changed settings. If no
+    /// setting has changed, the stage and all later ones are made again.
     pub fn out_of_date(&self, stage: Stage) -> Result<Vec<String>> {
         let mut names = vec![self.views().to_string()];
         if stage != Stage::Render || self.path.is_none() {
@@ -129,7 +129,7 @@ impl Line<'_> {
             let stays = |s: &Stage| !repeated && *s != stage && is_done(*s);
             let followers = stage.followers(self.config).into_iter();
             names = followers.filter(|s| !stays(s)).map(|s| s.to_string()).collect();
-            // views of a path show the head mesh or the extracted surface alone
+            // views of a path show only the head mesh or the extracted surface
             let kept = [true, false].map(|head| self.mesh_input(head));
             let removed = names.clone();
             let is_old = |input: &String, digest: &String| {
@@ -151,8 +151,8 @@ impl Line<'_> {
         Ok(holds)
     }
 
-    /// Removes what is out of date when a stage is made anew on the way to `until`, and says so before; nothing, if what
-    /// `until` asks for would be refused then.
+    /// Removes what becomes out of date when a stage is made again on the way to `until`, after logging it. Removes
+    /// nothing if `until` would then be refused.
     pub fn fresh(&self, stage: Stage, until: Stage) -> Result<()> {
         let names = self.require(until, Some(stage))?;
         if !names.is_empty() {
@@ -162,11 +162,11 @@ impl Line<'_> {
         self.run.fresh(&names)
     }
 
-    /// Returns what is out of date for `until`, if a stage is to be made anew on the way. Nothing is written.
+    /// Returns the folders that are out of date for `until`, if a stage is to be made again. Nothing is written.
     ///
     /// # Errors
     ///
-    /// The command would be refused before any work.
+    /// Fails if the command would be refused before any work.
     pub fn require(&self, until: Stage, fresh: Option<Stage>) -> Result<Vec<String>> {
         let Some(stage) = fresh else { return self.agrees(until, &[]).map(|()| Vec::new()) };
         let names = self.out_of_date(stage)?;
@@ -177,7 +177,7 @@ impl Line<'_> {
             .collect();
         self.require_inputs(&made)?;
         self.require_masks(&made)?;
-        // a finished blend is not cleared for views that it could not be made of again
+        // do not clear a finished blend whose views could not be made again
         let blended = names.iter().any(|n| n == Stage::Ensemble.word())
             && !self.config.ensemble.members.is_empty()
             && read_record(&self.run.path(Stage::Ensemble)).ok().flatten().is_some();
@@ -194,7 +194,7 @@ impl Line<'_> {
         Ok(names)
     }
 
-    /// Does what lies in the run agree with what `until` asks for, but for the folders in `cleared`?
+    /// Checks that the run's contents agree with the settings of `until`, except for the folders in `cleared`.
     fn agrees(&self, until: Stage, cleared: &[String]) -> Result<()> {
         self.can_make(until)?;
         let plans = self.order(until).into_iter().map(|stage| self.compared_plan(stage));
@@ -202,7 +202,7 @@ impl Line<'_> {
         kept.try_for_each(|plan| self.run.agrees(&plan))
     }
 
-    /// Do the settings go together, as far as `until` depends on them? Asked before any work.
+    /// Checks, before any work, that the settings that `until` depends on are consistent.
     fn can_make(&self, until: Stage) -> Result<()> {
         let order = self.order(until);
         let cameras = &self.config.render.cameras;
@@ -220,7 +220,7 @@ impl Line<'_> {
         if order.contains(&Stage::Ensemble) { can_blend(self.config) } else { Ok(()) }
     }
 
-    /// What a stage is about to do; its fingerprint holds those of the stages it needs.
+    /// Returns the plan of a stage; its fingerprint includes those of the stages it needs.
     pub fn plan(&self, stage: Stage) -> Plan<'_> {
         match &self.path {
             Some(path) if stage == Stage::Render => self.path_plan(path),
@@ -228,7 +228,7 @@ impl Line<'_> {
         }
     }
 
-    /// The plan of a stage with what an earlier process saw differently in the capture.
+    /// Returns the plan of a stage with the capture's digests as an earlier process recorded them.
     fn compared_plan(&self, stage: Stage) -> Plan<'_> {
         let mut plan = self.plan(stage);
         if stage == Stage::Mask {
@@ -237,7 +237,7 @@ impl Line<'_> {
         plan
     }
 
-    /// The plan of a stage whose views, if it makes any, are those of the evaluation.
+    /// Returns the plan of a stage; if the stage makes views, they are those of the evaluation.
     fn stage_plan(&self, stage: Stage) -> Plan<'_> {
         let config = self.config;
         let name = stage.word();
@@ -261,7 +261,7 @@ impl Line<'_> {
                 }
                 inputs.push(("capture", self.digest.clone()));
                 match &self.clicks {
-                    // where clicks and networks lie does not matter either, nor how much memory they get
+                    // the paths of clicks and networks do not matter either, nor does the memory limit
                     Some(clicks) => {
                         settings.retain(|key, _| !PLACES.contains(&key.as_str()));
                         if !config.mask.with_alpha_net() {
@@ -269,7 +269,7 @@ impl Line<'_> {
                         }
                         inputs.extend(clicks.inputs.iter().cloned());
                     }
-                    // how masks would be made does not shape those that were found
+                    // settings for making masks do not affect masks read from the capture
                     None => {
                         settings.retain(|key, _| !key.starts_with("mask.") || FOUND.contains(&key.as_str()))
                     }
@@ -284,7 +284,7 @@ impl Line<'_> {
                 needs_bytes += (config.iface.levels as u64) << config.iface.log2_table.min(40) << 3 << 3;
             }
             Stage::Baseline | Stage::Tface => {
-                // the baseline's own table says only where it differs from T-Face's
+                // the baseline's own table holds only its differences from T-Face's
                 let learned = Config { tface: config.radiance(stage), ..config.clone() };
                 for (key, value) in learned.values("tface") {
                     let own = key.replacen("tface", name, 1);
@@ -316,7 +316,7 @@ impl Line<'_> {
                 needs_bytes += c.texels() * (6 * c.pictures() + 3 + if c.exr { 12 } else { 0 });
             }
             Stage::Render => {
-                // what only paths ask for shapes no held-out view
+                // settings that only camera paths use do not affect held-out views
                 settings.remove("render.cameras");
                 settings.remove("render.orbit_views");
                 let each = if config.render.float { 12 + 10 } else { 12 };
@@ -336,10 +336,11 @@ impl Line<'_> {
         Plan { name, fingerprint, device: &config.device, needs_bytes, saves: stage.learns() }
     }
 
-    /// Digest of a stage as that in the folder `reader` takes it; of the mesh it is what views by these methods show.
+    /// Returns the digest of a stage as an input of the folder `reader`; for the mesh, the digest of the parts that
+    /// views by these methods show.
     fn input(&self, stage: Stage, reader: &str, methods: &[Method]) -> String {
         let whole = self.stage_plan(stage).fingerprint.digest();
-        // in runs from before there was a difference it was all of the mesh
+        // older runs made no difference and used the digest of the whole mesh
         let old = || {
             let folder = self.run.path(reader);
             let record = read_record(&folder).ok().flatten().map(|r| r.fingerprint);
@@ -354,7 +355,7 @@ impl Line<'_> {
         }
     }
 
-    /// Digest of the head mesh, or of the extracted surface alone, without the settings that shape nothing of it.
+    /// Returns the digest of the head mesh or of the extracted surface, without the settings that do not affect it.
     fn mesh_input(&self, head: bool) -> String {
         let mut fingerprint = self.stage_plan(Stage::Mesh).fingerprint;
         // lobes are in the coordinates of the file
@@ -366,7 +367,7 @@ impl Line<'_> {
         fingerprint.digest()
     }
 
-    /// What the views of a path are made of.
+    /// Returns the inputs of the views along a path.
     fn path_plan<'p>(&'p self, path: &'p CameraPath) -> Plan<'p> {
         let CameraPath { folder, render, cameras, digest } = path;
         let mut settings = Config { render: render.clone(), ..self.config.clone() }.values("render");
@@ -393,14 +394,15 @@ impl Line<'_> {
         Plan { name: folder, fingerprint, device: &self.config.device, needs_bytes, saves: false }
     }
 
-    /// Of all photographs.
+    /// Returns the number of pixels of all photographs.
     pub(super) fn pixels(&self) -> u64 {
         let pixels = |v: &View| v.camera.width as u64 * v.camera.height as u64;
         self.capture.views.iter().map(pixels).sum()
     }
 }
 
-/// Do the views in a path's folder show a stage, of this digest, that is old? Views whose records cannot be read may.
+/// Whether the views in a path's folder show an outdated stage of this digest. Views with unreadable records count as
+/// such.
 fn may_show(folder: &Path, is_old: &dyn Fn(&String, &String) -> bool) -> bool {
     let any = |f: &Fingerprint| f.inputs.iter().any(|(stage, digest)| is_old(stage, digest));
     match (read_status(folder), read_record(folder)) {
@@ -421,15 +423,15 @@ fn vm_bytes(c: &VmConfig) -> u64 {
 const MIB: f64 = (1u64 << 20) as f64;
 
 impl Line<'_> {
-    /// The folders of the stages that `until` needs and that are not done, with what each may cost on the processor.
+    /// Returns the folders of the unfinished stages that `until` needs, with the estimated cost of each on the CPU.
     pub fn ahead(&self, until: Stage) -> Vec<(String, Cost)> {
         let order = self.order(until).into_iter().map(|stage| (stage, self.plan(stage)));
         order.filter(|(_, p)| !self.run.is_done(p)).map(|(s, p)| (p.name.into(), self.cost(s))).collect()
     }
 
-    /// Writes what the whole line may cost into the run, where the photographs are there to count.
+    /// Writes the estimated cost of the whole pipeline into the run, if the photographs can be counted.
     pub(super) fn write_estimate(&self, idle: bool) -> Result<()> {
-        if self.gone.is_some() || self.path.is_some() {
+        if self.missing_capture.is_some() || self.path.is_some() {
             return Ok(());
         }
         let stages = self.order(Stage::Metrics).into_iter();
@@ -438,10 +440,10 @@ impl Line<'_> {
         self.write(ESTIMATE, format!("{text}\n").as_bytes(), idle)
     }
 
-    /// What a stage may cost on the processor.
+    /// Returns the estimated cost of a stage on the CPU.
     ///
-    /// The constants are those of runs of the demo head and of a bust, at 64 x 80 to 384 x 512 pixels and tiny to full
-    /// settings; `docs/many-heads.md` says how far off others were.
+    /// The constants were measured on runs of the synthetic head and of a bust, at 64 x 80 to 384 x 512 pixels and
+    /// tiny to full settings; `docs/many-heads.md` says how far off other runs were.
     pub fn cost(&self, stage: Stage) -> Cost {
         let Config { iface, mesh, .. } = self.config;
         let published = self.config.preset == Preset::Paper;
@@ -455,9 +457,9 @@ impl Line<'_> {
             None => held_out,
         };
         let methods = &self.render_config().method;
-        // carried to all views, and made soft
+        // propagating to all views, and matting
         let clicked = if self.clicks.is_some() { 2.5e-6 * all } else { 0.0 };
-        // ISNet takes 4.5 s of a core a photograph with ONNX Runtime; others more or less
+        // ISNet takes 4.5 core seconds a photograph with ONNX Runtime; other networks differ
         let m = &self.config.mask;
         let files = [&m.sam, &m.vitmatte, &m.alpha_net].into_iter().filter(|file| !file.is_empty()).count();
         let networks = 5.0 * (files * self.capture.views.len()) as f64;
@@ -467,8 +469,8 @@ impl Line<'_> {
                 let c = self.config.radiance(stage);
                 let rays = (c.steps as usize * c.rays * c.learned()) as f64;
                 let parameters = vm_parameters(&c);
-                // whole frames are mostly outside the hull, and nothing of them is skipped; nor is the shell that two
-                // backgrounds leave
+                // whole frames are mostly outside the hull, where no pixel is skipped; nor is the shell left by
+                // training against two backgrounds
                 let outside = match stage {
                     Stage::Baseline => 4.0,
                     _ if shell(&c) => 2.3,
@@ -495,7 +497,7 @@ impl Line<'_> {
                 )
             }
             Stage::Render => {
-                // through all of the box, in all of the picture
+                // the whole box, in the whole picture
                 let whole = |method: &Method| {
                     let c = self.config.radiance(method.stage());
                     let empty = if *method == Method::Baseline || shell(&c) { 0.25e-6 } else { 0.1e-6 };
@@ -503,7 +505,7 @@ impl Line<'_> {
                 };
                 let pixel = |method: &Method| match method {
                     Method::Baseline | Method::Tface if published => whole(method),
-                    // nothing says where there is nothing, so all of a ray is looked at
+                    // no occupancy exists yet, so every sample of a ray is evaluated
                     Method::Volume if published && self.config.mask.source == MaskSource::None => 700e-6,
                     Method::Volume if published => 90e-6,
                     Method::Baseline | Method::Tface => 8e-6,
@@ -521,7 +523,7 @@ impl Line<'_> {
     }
 }
 
-/// Numbers in the planes and lines of the last grid.
+/// Returns the number of parameters in the planes and lines of the final grid.
 fn vm_parameters(c: &VmConfig) -> f64 {
     let channels: usize = c.density_rank.iter().chain(&c.color_rank).sum();
     let side = (c.voxels_final as f64).cbrt();

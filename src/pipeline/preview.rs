@@ -1,7 +1,7 @@
-//! Pictures of a mesh to look at: of a run's head, or of a file that anybody wrote.
+//! Previews of a mesh: of a run's head, or of any mesh file.
 //!
-//! A small view of a field while it is learned is made from its newest checkpoint ([`field_view`]). Whoever looks makes it:
-//! the training knows nothing of it, and no byte of it changes.
+//! A small view of a field in training is rendered from its newest checkpoint ([`field_view`]). The viewing process
+//! renders it, so the training is not disturbed and its results stay the same, bit by bit.
 
 use super::finish::{center as center_of, front as front_of};
 use super::learn::load_field;
@@ -26,23 +26,23 @@ use rayon::prelude::*;
 use std::ops::Range;
 use std::path::Path;
 
-/// The lens of a preview: the distance at which a picture shows as much as it is wide. A long one, as for portraits.
+/// The lens of a preview: distance over visible width. A long one, as for portraits.
 const FOCAL: f64 = 2.5;
 
-/// Sizes of a mesh whose squares and cubes are no trouble to 32-bit floats.
+/// Sizes of a mesh whose squares and cubes are safe in 32-bit floats.
 const SIZES: Range<f64> = 1e-9..1e9;
 
 /// A mesh that can be shown.
 pub struct Preview {
     head: HeadMesh,
-    /// Where its triangles would lie in a texture that it does not have.
+    /// The UV coordinates of a mesh without a texture.
     bare_atlas: Option<Atlas>,
-    /// Unit, in the mesh's coordinates, across each other.
+    /// The up and front directions: unit vectors in the mesh's coordinates, perpendicular to each other.
     up: Vec3,
     front: Vec3,
-    /// The photographs of a run, their cameras in the world.
+    /// The photographs of a run with their cameras in the world.
     views: Vec<View>,
-    /// What of it cannot be shown.
+    /// Features of the file that cannot be shown.
     pub warnings: Vec<String>,
 }
 
@@ -51,9 +51,9 @@ impl Preview {
     ///
     /// # Errors
     ///
-    /// The run has no mesh yet, or it is damaged.
+    /// Fails if the run has no mesh yet, or if it is damaged.
     pub fn of_run(run: &Path) -> Result<Preview> {
-        // pictures are of `mesh/parts`: what is wrong with other files of the stage is no reason for none
+        // previews show `mesh/parts`, so a problem with other files of the stage does not matter
         let problem = finished_mesh(run)?.require_products(&run.join(Stage::Mesh)).err();
         let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
         let head = HeadMesh::load(&run.join("mesh/parts"))?;
@@ -67,12 +67,12 @@ impl Preview {
         Ok(Preview { head, bare_atlas: None, up, front, views: capture.views, warnings })
     }
 
-    /// Returns the mesh in a `.glb`, `.obj` or `.ply` file. `up` is where its up is, +Y for most; its front is then +Z, or
-    /// −Y where +Z is up, as in Blender.
+    /// Returns the mesh in a `.glb`, `.obj` or `.ply` file. `up` is its up direction, +Y for most files; the front is
+    /// then +Z, or −Y if +Z is up, as in Blender.
     ///
     /// # Errors
     ///
-    /// The file cannot be read, or has no surface.
+    /// Fails if the file cannot be read or has no surface.
     pub fn of_file(path: &Path, up: Vec3) -> Result<Preview> {
         let OpenedMesh { mut head, bare_atlas, warnings } = open_mesh(path)?;
         at_hand(&mut head, path)?;
@@ -80,20 +80,20 @@ impl Preview {
         Ok(Preview { head, bare_atlas, up, front, views: Vec::new(), warnings })
     }
 
-    /// What is shown where nobody asks for a look: its color if it has one, else its shape.
+    /// Returns the default look: the color if the mesh has one, else the shape.
     pub fn look(&self) -> Look {
         let is_colored = self.head.texture.is_some() || !self.head.mesh.colors.is_empty();
         if is_colored { Look::Unlit } else { Look::Studio }
     }
 
-    /// Does it say where its triangles lie in a texture?
+    /// Whether the mesh has UV coordinates.
     pub fn has_uvs(&self) -> bool {
         self.head.texture.is_some() || self.bare_atlas.is_some()
     }
 
-    /// Returns `count` cameras on a circle around the mesh, in its coordinates, so far away that square pictures of `side`
-    /// pixels show all of it. The first stands `turn` radians from the front towards the mesh's left, and all of them
-    /// `tilt` radians above.
+    /// Returns `count` cameras on a circle around the mesh, in its coordinates, far enough away that square pictures
+    /// of `side` pixels show all of it. The first stands `turn` radians from the front towards the mesh's left, and
+    /// all of them `tilt` radians above.
     pub fn around(&self, turn: f64, tilt: f64, side: u32, count: usize) -> Result<Vec<NamedCamera>> {
         let (up, front) = (self.up.as_dvec3(), self.front.as_dvec3());
         let level = front * turn.cos() + up.cross(front) * turn.sin();
@@ -119,8 +119,8 @@ impl Preview {
         orbit(&[like], bounds, up.as_vec3(), count)
     }
 
-    /// Returns the cameras that `--cameras` names, in the mesh's coordinates: `train`, `test` (of a run) or a file (a
-    /// nerfstudio camera path or a transforms.json, in the world).
+    /// Returns the cameras that `--cameras` names, in the mesh's coordinates: `train` or `test` of a run, or a file
+    /// (a nerfstudio camera path or a transforms.json, in the world).
     pub fn cameras(&self, which: &str, side: u32) -> Result<Vec<NamedCamera>> {
         let scene_from_world = self.head.world_from_scene.inverse();
         let split =
@@ -143,7 +143,7 @@ impl Preview {
         Ok(cameras.into_iter().map(moved).collect())
     }
 
-    /// Prepares it for pictures.
+    /// Prepares the mesh for rendering.
     pub fn renderer(&self) -> PreviewRenderer<'_> {
         let HeadMesh { mesh, world_from_scene, texture, shells, .. } = &self.head;
         let layers = shells.as_ref().map(|shells| RasterLayers::new(mesh, shells));
@@ -159,7 +159,7 @@ impl Preview {
     }
 }
 
-/// A picture to look at, 8 bit, sRGB-coded with straight alpha.
+/// An 8-bit preview picture, sRGB-coded with straight alpha.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PreviewPicture {
     /// Pixels per row.
@@ -171,7 +171,7 @@ pub struct PreviewPicture {
 }
 
 impl PreviewPicture {
-    /// Pictures of one size side by side, so many in a row.
+    /// Arranges pictures of one size in a grid of so many columns.
     pub fn sheet(pictures: &[PreviewPicture], columns: usize) -> PreviewPicture {
         let Some(PreviewPicture { width, height, .. }) = pictures.first() else {
             return PreviewPicture { width: 0, height: 0, rgba: Vec::new() };
@@ -189,7 +189,7 @@ impl PreviewPicture {
     }
 }
 
-/// Makes pictures of a mesh.
+/// Renders previews of a mesh.
 pub struct PreviewRenderer<'a> {
     preview: &'a Preview,
     texture: Option<MeshTexture>,
@@ -197,7 +197,7 @@ pub struct PreviewRenderer<'a> {
 }
 
 impl PreviewRenderer<'_> {
-    /// What a camera in the mesh's coordinates sees, in the memory of an earlier view.
+    /// Renders the view of a camera in the mesh's coordinates, reusing the memory of an earlier view.
     fn view(&self, seen: &mut RasterView, camera: &Camera, look: Look) {
         let Preview { head, bare_atlas, .. } = self.preview;
         let surface = Surface {
@@ -216,12 +216,13 @@ impl PreviewRenderer<'_> {
         raster_into(seen, &head.mesh, layers, camera, &options, |hits| surface.shown(look, hits, camera));
     }
 
-    /// The held-out photograph that looks at the face, cut out by its mask, and how far the mesh is from it in the colors
-    /// of errors, each in the middle of a square of `side` pixels; nothing where there is none.
+    /// Returns the held-out photograph nearest to the face's front, cut out by its mask, and the mesh's error against
+    /// it in the colors of the error scale, each centered in a square of `side` pixels; `None` if no such photograph
+    /// exists.
     ///
     /// # Errors
     ///
-    /// The photograph is no longer where it was, or cannot be read.
+    /// Fails if the photograph has been moved or cannot be read.
     pub fn against_photograph(&self, side: u32) -> Result<Option<[PreviewPicture; 2]>> {
         let Preview { head, views, front, .. } = self.preview;
         let scene_from_world = head.world_from_scene.inverse();
@@ -251,14 +252,14 @@ impl PreviewRenderer<'_> {
         Ok(Some([framed(photo.rgb), framed(heat)]))
     }
 
-    /// Many of them, made side by side.
+    /// Renders many previews in parallel.
     pub fn pictures(
         &self,
         shots: &[(Camera, Look)],
         background: ViewBackground,
         stop: impl Fn() -> bool + Sync,
     ) -> Vec<PreviewPicture> {
-        // a picture uses one thread where there are many of them
+        // each picture uses one thread if there are many of them
         let picture = |seen: &mut RasterView, (camera, look): &(Camera, Look)| match stop() {
             true => PreviewPicture { width: 0, height: 0, rgba: Vec::new() },
             false => self.picture(seen, camera, *look, background),
@@ -266,7 +267,7 @@ impl PreviewRenderer<'_> {
         shots.par_iter().map_init(RasterView::default, picture).collect()
     }
 
-    /// One of them, over a color or over nothing.
+    /// Renders one preview, over a color or over nothing.
     fn picture(
         &self,
         seen: &mut RasterView,
@@ -284,7 +285,7 @@ impl PreviewRenderer<'_> {
     }
 }
 
-/// Brings a mesh as large or as small as hardly a number can say to a size at hand.
+/// Scales a mesh of extreme size so that 32-bit floats can hold its squares and cubes.
 fn at_hand(head: &mut HeadMesh, path: &Path) -> Result<()> {
     let corner = |pick: fn(f64, f64) -> f64| {
         let all = head.mesh.positions.iter().map(|p| p.as_dvec3());
@@ -309,12 +310,12 @@ fn at_hand(head: &mut HeadMesh, path: &Path) -> Result<()> {
 /// Pixels along the longest side.
 const SIDE: u32 = 240;
 
-/// Returns what the first held-out camera sees of the field that a stage of a run has learned so far, over black, as a
-/// JPEG file.
+/// Returns the view of the first held-out camera of the field that a stage of a run has trained so far, over black,
+/// as a JPEG file.
 ///
 /// # Errors
 ///
-/// There is no checkpoint yet, or a file of the run is damaged.
+/// Fails if there is no checkpoint yet, or if a file of the run is damaged.
 pub fn field_view(run: &Path, config: &Config, stage: Stage) -> Result<Vec<u8>> {
     let scene = read_scene(&run.join("mask/scene.json"))?;
     let capture = read_capture(&run.join("cameras.json"), Path::new(""))?;

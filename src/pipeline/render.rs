@@ -6,7 +6,7 @@
 //!        tface/float/     the same view for `ensemble`: float, coded, no background
 //! ```
 //!
-//! These are the held-out views. Those of other cameras lie in a folder of their own, `render/paths/`.
+//! These are the held-out views. Views along a camera path are written to a folder of their own, `render/paths/`.
 
 use super::line::Line;
 use super::mesh::{extracted_surface, head_mesh};
@@ -29,8 +29,8 @@ use crate::{Error, Monitor, Result};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
 
-/// Makes one folder per method, one picture per camera, of the held-out views or along a path ([`Line::with_camera_path`]). Only
-/// those `fields` are asked for that the methods show.
+/// Renders one folder per method and one picture per camera, of the held-out views or along a path
+/// ([`Line::with_camera_path`]). Of `fields`, only those that the methods show are loaded.
 pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
     let c = line.render_config();
     let meshes = Meshes::load(line, &c.method)?;
@@ -46,7 +46,7 @@ pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &Stag
         for NamedCamera { name, camera } in &cameras {
             let float = c.float.then(|| folder.join(pictures::FLOAT));
             let files = pictures::files(&folder, name, float.as_deref(), c.format);
-            // an interrupted process left whole files or none, of the same settings
+            // an interrupted process left only complete files of the same settings
             if !files.iter().all(|file| io::is_file(file)) {
                 let camera = camera.transformed(&scene.scene_from_world);
                 let begin = Instant::now();
@@ -74,13 +74,13 @@ pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &Stag
     Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
 }
 
-/// The cameras of the evaluation: held out from training, else all there are.
+/// Returns the cameras of the evaluation: those held out from training, or all if none is.
 pub(super) fn held_out(capture: &Capture) -> Vec<NamedCamera> {
     let mut splits = [Split::Test, Split::Val, Split::Train].map(|s| cameras_of(capture, s)).into_iter();
     splits.find(|cameras| !cameras.is_empty()).unwrap_or_default()
 }
 
-/// The cameras to render: named like photographs where they have one.
+/// Returns the cameras to render, named after their photographs if they have one.
 pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
     let capture = &line.capture;
     match &line.path {
@@ -93,7 +93,8 @@ pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
     }
 }
 
-/// Do some methods show the head mesh? Fitted colors lie on it, the network's wherever rays meet the extracted surface.
+/// Whether some methods show the head mesh. Fitted colors lie on it; the network's colors are evaluated on the
+/// extracted surface.
 pub(super) fn shows_head(config: &Config, methods: &[Method]) -> bool {
     let fitted = config.mesh.color == ColorSource::Photographs;
     let shows =
@@ -101,16 +102,16 @@ pub(super) fn shows_head(config: &Config, methods: &[Method]) -> bool {
     methods.iter().any(shows)
 }
 
-/// The meshes that some methods show.
+/// The meshes that the chosen methods show.
 pub(super) struct Meshes {
     extracted: Option<ExtractedSurface>,
     head: Option<HeadMesh>,
-    /// Is the head shown as a viewer shows it, and with all that is known of its color?
+    /// Whether the head is shown as a viewer shows it, and with view-dependent color.
     shown: [bool; 2],
 }
 
 impl Meshes {
-    /// Those that `methods` show, as they lie in the run.
+    /// Loads the meshes that `methods` show from the run.
     pub fn load(line: &Line, methods: &[Method]) -> Result<Meshes> {
         let (raycast, textured) = (methods.contains(&Method::Raycast), methods.contains(&Method::Textured));
         let raster = methods.contains(&Method::Raster);
@@ -126,21 +127,21 @@ impl Meshes {
         Ok(Meshes { extracted, head, shown: [textured || raster, raycast && fitted] })
     }
 
-    /// A head mesh, to be shown as a viewer shows it and with all that is known of its color.
+    /// Prepares a head mesh for rendering as a viewer shows it and with view-dependent color.
     pub fn of_head(head: HeadMesh, shown: [bool; 2]) -> Meshes {
         Meshes { extracted: None, head: Some(head), shown }
     }
 }
 
-/// The head mesh and what rays need to find it.
+/// The head mesh with its acceleration structure.
 struct VisibleHead<'a> {
     head: &'a HeadMesh,
     bvh: Bvh,
     shells: Option<ShellCaster<'a>>,
     layers: Option<RasterLayers<'a>>,
-    /// What a viewer shows of its texture.
+    /// The texture as an ordinary viewer shows it.
     shown: Option<MeshTexture>,
-    /// Base color alone.
+    /// The base color alone.
     base: Option<MeshTexture>,
 }
 
@@ -163,7 +164,7 @@ impl<'a> VisibleHead<'a> {
         VisibleHead { head, bvh: Bvh::new(mesh), shells, layers, shown, base }
     }
 
-    /// A view with its soft layers, in these colors.
+    /// Renders a view with its soft layers, in these colors.
     fn view(
         &self,
         camera: &Camera,
@@ -173,7 +174,7 @@ impl<'a> VisibleHead<'a> {
         raycast(&self.bvh, &self.head.mesh, self.shells.as_ref(), camera, options, color)
     }
 
-    /// sRGB-coded colors of what rays met, with all that is known of them.
+    /// Returns the sRGB-coded colors of hits, with view-dependent color.
     fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
         let mesh = &self.head.mesh;
         let mut colors = match &self.base {
@@ -190,7 +191,7 @@ impl<'a> VisibleHead<'a> {
     }
 }
 
-/// Makes views by any method.
+/// Renders views by any method.
 pub(super) struct Renderer<'a> {
     fields: &'a dyn Fields,
     extracted: Option<(&'a ExtractedSurface, Bvh)>,
@@ -201,7 +202,8 @@ pub(super) struct Renderer<'a> {
 }
 
 impl<'a> Renderer<'a> {
-    /// Of these fields and meshes; `samples` rays along each side of a pixel that shows a mesh.
+    /// Returns a renderer of these fields and meshes; `samples` is the number of rays along each side of a pixel that
+    /// shows a mesh.
     pub fn new(
         scene: &Scene,
         fields: &'a dyn Fields,
@@ -219,14 +221,14 @@ impl<'a> Renderer<'a> {
         }
     }
 
-    /// The view of a camera in scene coordinates, over nothing.
+    /// Renders the view of a camera in scene coordinates, over nothing.
     pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>> {
         let samples = self.samples;
         let options = RaycastOptions { samples, world_from_scene: self.world_from_scene };
         Ok(match (method, &self.extracted) {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
-                // a large view takes minutes: nobody who asks to stop waits for the rest of it
+                // a large view takes minutes, so a stop request is checked within it
                 let see = |rays: &[Ray]| match self.monitor.stop() {
                     true => Vec::new(),
                     false => field.render_rays(rays, camera.forward()),
@@ -238,7 +240,7 @@ impl<'a> Renderer<'a> {
                 let field = self.fields.surface()?;
                 Some(raycast(bvh, mesh, None, camera, &options, |hits| {
                     let mut colors = field.color(&hits.points, &hits.normals, &hits.directions);
-                    // what the field says of a cap is of the body's inside
+                    // the field's color at the cap is that of the body's inside
                     if let Some(cap) = cap {
                         cap.recolor(&hits.points, &mut colors);
                     }

@@ -1,4 +1,4 @@
-//! `mask/scene.json` and `cameras.json`: where the head is, kept between stages and for other programs.
+//! `mask/scene.json` and `cameras.json`: where the head is, kept for later stages and for other programs.
 
 use crate::Result;
 use crate::capture::scene::{Hull, Scene};
@@ -10,7 +10,7 @@ use serde::Deserialize;
 use serde_json::json;
 use std::path::Path;
 
-/// Cells along an axis of a hull, at most: the stage makes 128.
+/// Maximum number of cells along an axis of a hull; the stage makes 128.
 const MOST_CELLS: usize = 1024;
 
 /// Writes a scene with its hull.
@@ -19,7 +19,7 @@ pub(super) fn write_scene(path: &Path, scene: &Scene) -> Result<(), WriteError> 
     io::write_atomic(path, &text)
 }
 
-/// Reads what [`write_scene`] wrote; what could not have been written is refused with its key.
+/// Reads the file of [`write_scene`]; content that it cannot have written is refused with its key.
 pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
     let scene: Scene = io::read_typed(path, &Limits::default())?;
     let wrong = |key: &str, found: String, expected: &str| Err(ReadError::value(path, key, found, expected));
@@ -48,8 +48,8 @@ pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
     Ok(scene)
 }
 
-/// The text of `cameras.json`: every view with split, intrinsics and pose, and how the scene sits in
-/// the world.
+/// Returns the text of `cameras.json`: every view with split, intrinsics and pose, and the transform from the world
+/// to the scene.
 pub(super) fn cameras_json(capture: &Capture, scene: &Scene) -> Vec<u8> {
     let value = json!({
         "capture": capture.name,
@@ -72,14 +72,14 @@ struct CamerasFile {
     views: Vec<View>,
 }
 
-/// Reads the capture that [`cameras_json`] was written of; `root` is where its photographs were.
+/// Reads a capture from the text of [`cameras_json`]; `root` is the folder of its photographs.
 pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadError> {
     let file: CamerasFile = io::read_typed(path, &Limits::default())?;
     if file.views.is_empty() {
         return Err(ReadError::value(path, "views", "empty", "at least one view"));
     }
     for (k, view) in file.views.iter().enumerate() {
-        // pictures are written under these names
+        // pictures are written under these names, so they must be safe
         let leads_out = view.name.split(['/', '\\']).any(|part| ["", ".", ".."].contains(&part));
         if leads_out || view.name.contains('\0') {
             let key = format!("views[{k}].name");
@@ -120,7 +120,7 @@ mod tests {
         }
     }
 
-    /// What reading says after `change`.
+    /// Returns the error of reading a file after `change`.
     fn after(change: &dyn Fn(&mut Value)) -> Result<Scene, ReadError> {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scene.json");

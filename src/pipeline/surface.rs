@@ -1,7 +1,7 @@
-//! What the later stages need of a learned field, and of anything else that can stand in for it.
+//! The interface of a trained field that later stages use, so that another field can stand in for it.
 //!
-//! Views are made by marching rays through a field, a band of rows at a time: a photograph of twelve megapixels
-//! has room for its picture, not for a ray and what it saw in every pixel.
+//! Views are made by marching rays through a field, a band of rows at a time: for a photograph of twelve megapixels,
+//! memory holds the picture, but not a ray and its result for every pixel.
 
 use crate::Result;
 use crate::config::Stage;
@@ -24,38 +24,38 @@ pub trait Surface: Sync {
     /// `[n, 3]` → `[n]`.
     fn sharpness(&self, points: &[Vec3]) -> Vec<f32>;
 
-    /// sRGB-coded color of surface points `[n, 3]` with unit normals `[n, 3]`, point `i` seen along `counts[i]` unit
-    /// directions, away from the camera, all in one list: one color a direction.
+    /// Returns the sRGB-coded color of surface points `[n, 3]` with unit normals `[n, 3]`. Point `i` is seen along
+    /// `counts[i]` unit directions, away from the camera, all in one list; one color is returned per direction.
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], directions: &[Vec3])
     -> Vec<[f32; 3]>;
 
-    /// The same, every point seen along one direction.
+    /// Returns the same with one direction per point.
     fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
         self.colors(points, normals, &vec![1; points.len()], directions)
     }
 
-    /// The view of a camera in scene coordinates by marching through the field itself; depth and
-    /// normals in the world. `None` for what is only a surface.
+    /// Returns the view of a camera in scene coordinates by marching rays through the field itself; depth and normals
+    /// are in the world. `None` if the field is only a surface.
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView>;
 
-    /// What a person should know of its answers so far: a GPU that failed.
+    /// Returns warnings about the evaluations so far, for example that a GPU failed.
     fn warning(&self) -> Option<&str> {
         None
     }
 }
 
-/// A surface with what closes it where the field's own zero does not.
+/// A surface with the parts that close it where the field's own zero set does not.
 pub(super) struct ClosedSurface<'a> {
     pub field: &'a dyn Surface,
-    /// Where the frames cut the body.
+    /// The cap where the frames cut the body.
     pub cap: Option<&'a Cap>,
-    /// Where handles were cut.
+    /// The patches where handles were cut.
     pub patches: Option<&'a Patches>,
 }
 
 impl ClosedSurface<'_> {
-    /// As [`Surface::sdf_gradient`]: on an open surface the field's own zero ends at the opening, which the closed
-    /// one holds as well.
+    /// Evaluates [`Surface::sdf_gradient`] with the caps and patches. The closed surface also contains the opening of
+    /// the field's own zero set.
     pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let (mut values, mut gradients) = self.field.sdf_gradient(points);
         if let Some(cap) = self.cap {
@@ -67,7 +67,7 @@ impl ClosedSurface<'_> {
         (values, gradients)
     }
 
-    /// As [`Surface::colors`], the cap in its own color.
+    /// Evaluates [`Surface::colors`]; the cap has its own color.
     pub fn colors(
         &self,
         points: &[Vec3],
@@ -90,22 +90,22 @@ impl ClosedSurface<'_> {
     }
 }
 
-/// A field that is looked at by marching rays through it.
+/// A field that is rendered by marching rays through it.
 pub trait Radiance: Sync {
-    /// What rays in scene coordinates see, of a camera that looks along the unit vector `forward`; normals
-    /// are not asked for. `[n]` → `[n]`.
+    /// Returns color and depth along rays in scene coordinates, for a camera that looks along the unit vector
+    /// `forward`; no normals are computed. `[n]` → `[n]`.
     fn render_rays(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult>;
 }
 
-/// The trained fields, each loaded when it is first asked for.
+/// The trained fields, each loaded when it is first used.
 pub trait Fields {
-    /// I-Face.
+    /// Returns I-Face.
     fn surface(&self) -> Result<&dyn Surface>;
 
-    /// The field of the stage `baseline` or `tface`.
+    /// Returns the field of the stage `baseline` or `tface`.
     fn radiance(&self, stage: Stage) -> Result<&dyn Radiance>;
 
-    /// What a person should know of their answers so far.
+    /// Returns warnings about the fields' evaluations so far.
     fn warnings(&self) -> Vec<&str> {
         Vec::new()
     }
@@ -153,7 +153,7 @@ impl Surface for crate::iface::DensityField {
         self.sdf_gradient(points)
     }
 
-    /// None that is known.
+    /// Returns infinite sharpness, because it is unknown.
     fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
         vec![f32::INFINITY; points.len()]
     }
@@ -173,19 +173,19 @@ impl Radiance for crate::tface::FieldMean {
     }
 }
 
-/// Rays marched together: some megabytes, and enough for any number of threads.
+/// Number of rays marched together: a few megabytes, and enough for any number of threads.
 const BAND: usize = 1 << 16;
 
-/// The view of a camera in scene coordinates; depth and normals in the world.
+/// Renders a camera in scene coordinates; depth and normals are in the world.
 ///
-/// Depth and normal are kept where the opacity is at least a half. Where the lens model folds over, no
-/// ray is: the pixel stays empty. `see`: `[n]` rays → `[n]`, some tens of thousands at a time; where it
-/// answers nothing, those pixels stay empty too.
+/// Depth and normal are kept where the opacity is at least a half. A pixel where the lens model folds over has no ray
+/// and stays empty. `render_rays` maps `[n]` rays to `[n]` colors, some tens of thousands at a time; where it returns
+/// nothing, those pixels stay empty too.
 pub(super) fn march(
     camera: &Camera,
     world_from_scene: &Similarity,
     with_normals: bool,
-    see: impl Fn(&[Ray]) -> Vec<RayResult>,
+    render_rays: impl Fn(&[Ray]) -> Vec<RayResult>,
 ) -> RenderedView {
     let (w, h) = (camera.width, camera.height);
     let sized = |wanted: bool| if wanted { (w, h) } else { (0, 0) };
@@ -207,14 +207,14 @@ pub(super) fn march(
             })
             .collect();
         let (at, rays): (Vec<usize>, Vec<Ray>) = made.into_iter().unzip();
-        for ((i, ray), seen) in at.iter().zip(&rays).zip(see(&rays)) {
-            let [r, g, b] = seen.color;
-            view.color.data[4 * i..4 * i + 4].copy_from_slice(&[r, g, b, seen.opacity]);
-            if seen.opacity >= 0.5 {
-                let along = seen.depth * ray.direction.dot(camera.forward());
+        for ((i, ray), result) in at.iter().zip(&rays).zip(render_rays(&rays)) {
+            let [r, g, b] = result.color;
+            view.color.data[4 * i..4 * i + 4].copy_from_slice(&[r, g, b, result.opacity]);
+            if result.opacity >= 0.5 {
+                let along = result.depth * ray.direction.dot(camera.forward());
                 view.depth.data[*i] = along * world_from_scene.scale as f32;
                 if with_normals {
-                    let normal = world_from_scene.direction(seen.normal);
+                    let normal = world_from_scene.direction(result.normal);
                     view.normal.data[3 * i..3 * i + 3].copy_from_slice(&normal.to_array());
                 }
             }

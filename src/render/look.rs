@@ -1,4 +1,4 @@
-//! How a mesh is shown to people: as it is colored, or so that its shape, its normals or its texture coordinates are seen.
+//! Display modes of a mesh: its color, or a visualization of its shape, normals or texture coordinates.
 
 use super::raycast::RayHits;
 use super::texture::MeshTexture;
@@ -6,77 +6,77 @@ use crate::geom::{Atlas, Camera, Harmonics, Mesh};
 use crate::image::{linear_from_srgb, srgb_from_linear};
 use glam::{Vec2, Vec3};
 
-/// What a surface without any color of its own has, sRGB-coded.
+/// sRGB-coded color of a surface that has no color of its own.
 const GRAY: [f32; 3] = [0.8; 3];
 
 /// Squares of the chequer along each side of a texture.
 const SQUARES: f32 = 32.0;
 
-/// Lamps that follow the camera: where they are (right, up, to the viewer; not unit), and how bright. Key, fill and rim.
+/// Lamps that follow the camera: direction (right, up, to the viewer; not unit) and brightness. Key, fill and rim.
 const LAMPS: [([f32; 3], f32); 3] =
     [([-0.6, 0.7, 0.8], 0.75), ([0.9, 0.1, 0.6], 0.25), ([0.3, 0.8, -0.8], 0.3)];
 
-/// Light from everywhere.
+/// Ambient light.
 const AMBIENT: f32 = 0.18;
 
 /// Half the width of a line of the wireframe, pixels.
 const LINE: f32 = 0.4;
 
-/// Triangles lower than so many pixels have fainter lines.
+/// Triangles lower than so many pixels get fainter lines.
 const FADED: f32 = 8.0;
 
-/// What is shown of a surface.
+/// The display mode of a surface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Look {
-    /// Its color under three lamps.
+    /// Color under three lamps.
     Studio,
-    /// Its color, as it is stored.
+    /// Color as it is stored.
     Unlit,
-    /// Its normals as the camera sees them: right red, up green, to the viewer blue.
+    /// Normals in camera coordinates: right red, up green, to the viewer blue.
     Normals,
-    /// Its shape, as if made of clay.
+    /// Shape, shaded as clay.
     Matcap,
-    /// Where it lies in its texture: a chequer.
+    /// Texture coordinates, as a chequer.
     Uv,
-    /// Its triangles.
+    /// Triangles, as a wireframe.
     Wire,
 }
 
 impl Look {
-    /// All of them.
+    /// All looks.
     pub const ALL: [Look; 6] = [Look::Studio, Look::Unlit, Look::Normals, Look::Matcap, Look::Uv, Look::Wire];
 
-    /// Are soft layers seen with it? They have a color and no shape of their own.
+    /// Whether the soft layers are shown too. They have a color and no shape of their own.
     pub fn has_layers(self) -> bool {
         matches!(self, Look::Studio | Look::Unlit)
     }
 
-    /// Does it take no more than the color of a place, which is known without its point and normal?
+    /// Whether the look needs only the color of a hit, not its point and normal.
     pub fn is_bare(self) -> bool {
         matches!(self, Look::Unlit | Look::Uv)
     }
 
-    /// The word of the command line.
+    /// Returns the look's name on the command line.
     pub fn word(self) -> &'static str {
         ["studio", "unlit", "normals", "matcap", "uv", "wire"][self as usize]
     }
 }
 
-/// A surface with all that is known of its color.
+/// A surface with all its color data.
 #[derive(Clone, Copy)]
 pub struct Surface<'a> {
-    /// The triangles, with their normals, and colors at their vertices.
+    /// The triangles, with normals, and colors at the vertices.
     pub mesh: &'a Mesh,
     /// Its texture.
     pub texture: Option<&'a MeshTexture>,
-    /// Where it lies in a texture, whether or not there is one.
+    /// The texture coordinates, whether or not there is a texture.
     pub atlas: Option<&'a Atlas>,
-    /// What depends on the view, where there is no texture.
+    /// View-dependent color at the vertices, for a surface without a texture.
     pub harmonics: Option<&'a Harmonics>,
 }
 
 impl Surface<'_> {
-    /// sRGB-coded colors of what is seen through the pixels of a camera.
+    /// Returns the sRGB-coded colors of the hits of a camera.
     pub fn colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         if let Some(texture) = self.texture {
             return texture.smooth_colors(hits, camera);
@@ -96,10 +96,10 @@ impl Surface<'_> {
         hits.hits.iter().zip(&hits.directions).map(color).collect()
     }
 
-    /// The same as a look shows it.
+    /// Returns the colors of the hits in a look.
     pub fn shown(&self, look: Look, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let from_world = camera.rotation.transpose().as_mat3();
-        // as the camera sees them; of a surface seen from behind the side that is seen
+        // in camera coordinates; if the surface is seen from behind, the normal of the visible side
         let normals = || {
             hits.normals
                 .iter()
@@ -131,7 +131,7 @@ impl Surface<'_> {
         Some((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c)
     }
 
-    /// A chequer that runs from red to green along u and from dark to light along v (down the texture).
+    /// Returns a chequer that runs from red to green along u and from dark to light along v (down the texture).
     fn chequer(&self, hits: &RayHits, i: usize) -> [f32; 3] {
         let Some(uv) = self.uv(hits, i) else { return GRAY };
         let square = (uv * SQUARES).floor();
@@ -140,30 +140,30 @@ impl Surface<'_> {
         c.map(|v| if dark { 0.55 * v } else { v })
     }
 
-    /// How much of a line of the wireframe is at a point, 0..=1.
+    /// Returns the coverage of a wireframe line at a point, 0..=1.
     fn line(&self, hits: &RayHits, i: usize, camera: &Camera) -> f32 {
         let hit = &hits.hits[i];
         let [a, b, c] = self.mesh.corners(hit.triangle);
         let pixel = hit.t * hits.directions[i].dot(camera.forward()) / camera.fx.abs() as f32;
         let area = (b - a).cross(c - a).length();
-        // the distance to a side is the share of the corner across times its height
+        // the distance to a side is the opposite corner's share times its height
         let sides = [(1.0 - hit.u - hit.v, c - b), (hit.u, c - a), (hit.v, b - a)];
         let heights = sides.map(|(share, side)| (share, area / side.length().max(1e-20) / pixel.max(1e-20)));
         let nearest = heights.iter().map(|(share, height)| share * height).fold(f32::INFINITY, f32::min);
         let low = heights.iter().map(|(_, height)| *height).fold(f32::INFINITY, f32::min);
-        // lines of triangles as small as pixels would leave nothing but lines
+        // lines of triangles as small as pixels would fill the picture
         (LINE + 0.5 - nearest).clamp(0.0, 1.0) * (low / FADED).clamp(0.2, 1.0)
     }
 }
 
-/// A color under the lamps; `n` as the camera sees it.
+/// Shades a color under the lamps; `n` is in camera coordinates.
 fn lit(color: [f32; 3], n: Vec3) -> [f32; 3] {
     let lamps = LAMPS.iter().map(|(at, power)| power * n.dot(Vec3::from(*at).normalize()).max(0.0));
     let light = AMBIENT + lamps.sum::<f32>();
     color.map(|c| srgb_from_linear(linear_from_srgb(c) * light))
 }
 
-/// A clay that is warm in the light and cool in the shade, with a soft shine.
+/// Returns the color of a clay that is warm in the light and cool in the shade, with a soft shine.
 fn clay(n: Vec3) -> [f32; 3] {
     let toward = |i: usize| n.dot(Vec3::from(LAMPS[i].0).normalize());
     let key = (0.5 + 0.5 * toward(0)).powi(2);

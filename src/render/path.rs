@@ -1,4 +1,4 @@
-//! Which cameras a novel view is seen through: an orbit around the head, or a file.
+//! Cameras of novel views: an orbit around the head, or a file.
 //!
 //! Two kinds of JSON are read: nerfstudio's camera path (`camera_path`, made in its viewer) and
 //! `transforms.json` (`frames`). Both give camera-to-world matrices with OpenGL axes, as ours are, and
@@ -12,22 +12,22 @@ use glam::{BVec3, DMat3, DVec3, Vec3};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-/// Most cameras in one file.
+/// Maximum number of cameras in one file.
 const MAX_CAMERAS: usize = 100_000;
 
 /// Largest side of a picture.
 const MAX_SIDE: u32 = 16_384;
 
-/// A camera and what its picture is called.
+/// A camera with the name of its picture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedCamera {
-    /// File name without folder and ending.
+    /// File name without folder and extension.
     pub name: String,
-    /// Where it is and how it looks.
+    /// Pose and intrinsics.
     pub camera: Camera,
 }
 
-/// The error for a file that is no camera path.
+/// Returns the error for a file that is no camera path.
 fn not_a_path(message: String) -> Error {
     Error::cannot(message, "export a camera path from nerfstudio's viewer, or give a transforms.json")
 }
@@ -37,7 +37,7 @@ fn no_orbit(what: &str) -> Error {
     Error::cannot(format!("no orbit: {what}"), hint)
 }
 
-/// Checks how many cameras there are.
+/// Checks the number of cameras.
 fn check_count(found: usize) -> Result<()> {
     match found {
         1..=MAX_CAMERAS => Ok(()),
@@ -45,10 +45,10 @@ fn check_count(found: usize) -> Result<()> {
     }
 }
 
-/// The part of a picture that `orbit` fills at most, so that nothing touches its border.
+/// Maximum part of a picture that the head fills in `orbit`, so that it does not touch the border.
 const FILLED: f64 = 0.95;
 
-/// `count` cameras on a circle around the middle of `bounds`, evenly spaced, all looking at it.
+/// Returns `count` cameras on a circle around the middle of `bounds`, evenly spaced, all looking at it.
 ///
 /// The circle lies across `up` at the mean height and mean distance of the capture's cameras, or so much
 /// farther away, in the same direction, that every picture shows all of `bounds`. It begins where the mean
@@ -56,8 +56,8 @@ const FILLED: f64 = 0.95;
 /// distortion and with the middle of the picture as principal point.
 ///
 /// # Errors
-/// When there is no camera to copy, `up` has no direction, `count` is 0 or beyond 100,000, or the cameras stand on the
-/// axis of the circle.
+/// Fails if `cameras` is empty, `up` has no direction, `count` is 0 or beyond 100,000, or the cameras lie on the axis
+/// of the circle.
 ///
 /// # Examples
 ///
@@ -94,7 +94,7 @@ pub fn orbit(cameras: &[Camera], bounds: Aabb, up: Vec3, count: usize) -> Result
     if !(radius.is_finite() && height.is_finite() && radius > 0.0) {
         return Err(no_orbit("the cameras stand on the axis of the circle"));
     }
-    // cameras all around have no mean direction: any will do
+    // cameras all around have no mean direction, so any direction will do
     let start = if toward.length() > 1e-6 { toward.normalize() } else { up.any_orthonormal_vector() };
     let side = up.cross(start);
     let digits = count.to_string().len().max(4);
@@ -143,7 +143,7 @@ struct PathFile {
 #[derive(Deserialize)]
 struct PathKey {
     camera_to_world: Vec<f64>,
-    /// Vertical, degrees.
+    /// Vertical field of view, degrees.
     fov: Option<f64>,
 }
 
@@ -151,16 +151,16 @@ struct PathKey {
 struct TransformsFrame {
     transform_matrix: Vec<Vec<f64>>,
     file_path: Option<String>,
-    /// Intrinsics of its own.
+    /// The frame's own intrinsics.
     #[serde(flatten)]
     numbers: Map<String, Value>,
 }
 
-/// Cameras from the text of a nerfstudio camera path or a `transforms.json`. What the file does not
-/// say about the lens is taken from `like`.
+/// Reads cameras from the text of a nerfstudio camera path or a `transforms.json`. Lens parameters that the file
+/// lacks are taken from `like`.
 ///
 /// # Errors
-/// When the text is neither, holds no cameras or too many, or one of them is wrong.
+/// Fails if the text is neither, holds no cameras or too many, or if one of them is invalid.
 pub fn from_json(text: &str, like: &Camera) -> Result<Vec<NamedCamera>> {
     let text = text.trim_start_matches('\u{feff}');
     let file: PathFile =
@@ -188,7 +188,7 @@ pub fn from_json(text: &str, like: &Camera) -> Result<Vec<NamedCamera>> {
     cameras.collect()
 }
 
-/// The photograph's name; nothing that could lead out of a folder.
+/// Returns the photograph's name, without any path components.
 fn stem(frame: &TransformsFrame) -> Option<String> {
     let last = frame.file_path.as_deref()?.rsplit(['/', '\\']).next()?;
     let stem = match last.rsplit_once('.') {
@@ -246,8 +246,8 @@ fn side(object: &Map<String, Value>, name: &str, other: u32) -> Result<u32, Stri
     }
 }
 
-/// Rotation and position of a camera-to-world matrix of 3 or 4 rows. A uniform scale, which viewers
-/// leave in, is taken out.
+/// Returns rotation and position of a camera-to-world matrix of 3 or 4 rows. A uniform scale, which viewers leave in,
+/// is divided out.
 fn pose(rows: &[Vec<f64>]) -> Result<(DMat3, DVec3), String> {
     if !(3..=4).contains(&rows.len()) || rows.iter().any(|r| r.len() != 4) {
         return Err("its matrix is not 4 × 4".into());

@@ -1,4 +1,4 @@
-//! A view of a mesh, rasterized: as the ray caster sees it, in a hundredth of the time.
+//! Rasterization of a mesh: the same view as the ray caster's, in a hundredth of the time.
 //!
 //! 1. Corners are projected and snapped to 1/256 of a pixel, triangles cut to what the camera sees, and sorted into tiles
 //!    of 32 × 32 pixels (`project`). A lens that bends straight lines gets triangles halved until that no longer shows: so
@@ -27,19 +27,19 @@ use project::{Bins, Faces, Lens, TILE};
 use rayon::prelude::*;
 use tile::{NOTHING, SAMPLES, Tile};
 
-/// Depth change over one pixel, in pixel footprints, from which on a surface ends: tan 84°, as for rays.
+/// Depth change over one pixel, in pixel footprints, from which on a surface ends: tan 84°, as in the ray caster.
 const JUMP: f32 = 10.0;
 
-/// How a mesh is rasterized.
+/// Options of rasterization.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RasterOptions {
-    /// Are triangles seen from behind left out? Of a closed mesh nobody misses them.
+    /// Whether back faces are culled. On a closed mesh they are always hidden.
     pub cull: bool,
-    /// Is the picture of normals made? Else it has no pixels.
+    /// Whether the picture of normals is rendered; otherwise it has no pixels.
     pub normals: bool,
-    /// Are hits given to be colored without points and normals? Those who look them up in a texture need none.
+    /// Whether hits are passed to the color function without points and normals, which texture lookups do not need.
     pub bare_hits: bool,
-    /// From the mesh's coordinates (in which the camera stands too) to those of depth and normals.
+    /// The transform from the mesh's coordinates (which the camera is in, too) to those of depth and normals.
     pub world_from_scene: Similarity,
 }
 
@@ -49,24 +49,24 @@ impl Default for RasterOptions {
     }
 }
 
-/// What one camera sees, and which triangles.
+/// The view of one camera, with the visible triangles.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RasterView {
-    /// Color, depth and normals, as of a ray caster.
+    /// Color, depth and normals, as from the ray caster.
     pub view: RenderedView,
-    /// `[height · width]` triangles at the centers of the pixels, [`RasterView::NOTHING`] where there is none.
+    /// `[height · width]` triangles at the centers of the pixels, [`RasterView::NOTHING`] for empty ones.
     pub triangles: Vec<u32>,
 }
 
 impl RasterView {
-    /// Stands for no triangle.
+    /// The index that stands for no triangle.
     pub const NOTHING: u32 = NOTHING;
 }
 
-/// Rasterizes a mesh, with translucent layers around it if there are any.
+/// Rasterizes a mesh, with optional translucent layers around it.
 ///
-/// `color` is given batches of what is seen and returns sRGB-coded colors in 0..=1, one a hit, `[n, 3]`; what it leaves
-/// out is black. It runs on several threads at once.
+/// `color` gets batches of hits and returns sRGB-coded colors in 0..=1, one per hit, `[n, 3]`; missing ones are
+/// black. It runs on several threads at once.
 ///
 /// # Examples
 ///
@@ -110,7 +110,7 @@ pub struct RasterLayers<'a> {
 struct RasterLayer<'a> {
     layer: &'a ShellLayer,
     positions: Vec<Vec3>,
-    /// Triangles that show, and which of the mesh's they are.
+    /// The visible triangles, and their indices in the mesh.
     triangles: Vec<[u32; 3]>,
     ids: Vec<u32>,
 }
@@ -120,7 +120,7 @@ impl<'a> RasterLayers<'a> {
     ///
     /// # Panics
     ///
-    /// A layer has not one offset and one alpha for each vertex.
+    /// Panics if a layer does not have one offset and one alpha for each vertex.
     pub fn new(mesh: &Mesh, shells: &'a Shells) -> RasterLayers<'a> {
         let layer = |layer: &'a ShellLayer| {
             let shown = mesh.triangles.iter().enumerate().filter(|(_, t)| layer.has(t));
@@ -131,7 +131,7 @@ impl<'a> RasterLayers<'a> {
     }
 }
 
-/// Rasterizes a mesh as [`raster`] does, into the memory of an earlier view.
+/// Rasterizes a mesh like [`raster`], reusing the memory of an earlier view.
 pub fn raster_into(
     seen: &mut RasterView,
     mesh: &Mesh,
@@ -143,7 +143,7 @@ pub fn raster_into(
     let (width, height) = (camera.width, camera.height);
     let RasterView { view, triangles } = seen;
     let normals = if options.normals { [width, height] } else { [0, 0] };
-    // of pictures that are new every pixel is 0
+    // every pixel of a new picture is 0
     let mut is_clear = true;
     for (image, [width, height], channels) in [
         (&mut view.color, [width, height], 4),
@@ -166,7 +166,7 @@ pub fn raster_into(
         out.triangles.fill(NOTHING);
     };
     let w = width as usize;
-    // no rows of a picture that is not made
+    // a picture that is not rendered has no rows
     let mut normal_rows: Vec<&mut [f32]> = view.normal.data.chunks_mut((TILE * w * 3).max(1)).collect();
     normal_rows.resize_with((height as usize).div_ceil(TILE), Default::default);
     let rows = view
@@ -237,7 +237,7 @@ pub fn raster_into(
 }
 
 crate::dispatch! {
-    /// Draws what a tile holds: first what faces the camera, which hides most of the rest.
+    /// Draws the faces of a tile: first the front faces, which hide most of the rest.
     fn draw / draw_faces(tile: &mut Tile, bins: &[Bins], index: usize)
 }
 

@@ -1,26 +1,26 @@
-//! A view of a mesh: the mean of `samples × samples` rays through each pixel, colored where they hit.
+//! Ray casting of a mesh: a pixel is the mean of `samples × samples` rays, colored where they hit.
 //!
-//! On an edge that would leave stairs: where some rays hit and some miss, or depth jumps by more than a surface seen
-//! at 84° would within one pixel, there are twice as many each way. What misses counts as transparent black. The mean
-//! is of sRGB-coded values, as everywhere in a render here: the fields composite coded color, so alpha does too.
+//! Edges get twice as many rays each way to avoid aliasing: pixels where some rays hit and some miss, or where depth
+//! jumps by more than a surface seen at 84° would within one pixel. Misses count as transparent black. The mean is of
+//! sRGB-coded values, as everywhere in rendering here: the fields composite coded color, so alpha does too.
 
 use crate::geom::{Bvh, Camera, Hit, Mesh, Ray, ShellCaster, Similarity};
 use crate::image::Image;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-/// Pixels worked on at once by one thread: bounds memory, and feeds the color network well.
+/// Pixels processed at once by one thread: bounds memory, and gives the color network large batches.
 const BATCH: usize = 8192;
 
 /// Depth change over one pixel, in pixel footprints, from which on it is an edge: tan 84°.
 const JUMP: f32 = 10.0;
 
-/// How rays are cast.
+/// Options of ray casting.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RaycastOptions {
     /// Rays along each side of a pixel; twice as many on an edge. 1 is one ray everywhere.
     pub samples: u32,
-    /// From the mesh's coordinates (in which the camera stands too) to those of depth and normals.
+    /// The transform from the mesh's coordinates (which the camera is in, too) to those of depth and normals.
     pub world_from_scene: Similarity,
 }
 
@@ -30,36 +30,36 @@ impl Default for RaycastOptions {
     }
 }
 
-/// What one camera sees.
+/// The view of one camera.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderedView {
     /// RGBA: sRGB-coded color premultiplied over black, and coverage.
     pub color: Image,
     /// One channel: distance along the viewing axis in world units at the pixel's center; 0 = nothing.
     pub depth: Image,
-    /// Three channels: unit normal in the world at the pixel's center; 0 = nothing. No pixels at all where
-    /// the method knows no normals.
+    /// Three channels: unit normal in the world at the pixel's center; 0 = nothing. No pixels at all if the method
+    /// has no normals.
     pub normal: Image,
 }
 
-/// What rays met, for whoever colors it. All `[n]`.
+/// The hits of rays, for the color function. All `[n]`.
 #[derive(Clone, Debug, Default)]
 pub struct RayHits {
-    /// Where, in the mesh's coordinates.
+    /// Points, in the mesh's coordinates.
     pub points: Vec<Vec3>,
-    /// Unit normals: the vertices' interpolated, or the triangle's own where there are none.
+    /// Unit normals: the vertices' interpolated, or the triangle's own if the mesh has none.
     pub normals: Vec<Vec3>,
     /// Unit directions, away from the camera.
     pub directions: Vec<Vec3>,
     /// Triangle, weights of its corners and distance.
     pub hits: Vec<Hit>,
-    /// Which pixel each belongs to, and its share of it.
+    /// The pixel of each hit, and the hit's weight in it.
     pixels: Vec<(usize, f32)>,
 }
 
 /// Casts the rays of a camera at a mesh.
 ///
-/// `color` is given batches of hits and returns sRGB-coded colors in 0..=1, one a hit, `[n, 3]`; what it leaves out is
+/// `color` gets batches of hits and returns sRGB-coded colors in 0..=1, one per hit, `[n, 3]`; missing ones are
 /// black. It runs on several threads at once.
 ///
 /// # Examples
@@ -116,7 +116,7 @@ pub fn raycast(
     view
 }
 
-/// Everything a band of rows needs.
+/// The data that every band of rows shares.
 struct Raycaster<'a> {
     bvh: &'a Bvh,
     mesh: &'a Mesh,
@@ -126,7 +126,7 @@ struct Raycaster<'a> {
 }
 
 impl Raycaster<'_> {
-    /// Fills the rows from `top` on, as many as the slices hold.
+    /// Renders the rows from `top` on, as many as the slices hold.
     fn band(
         &self,
         top: usize,
@@ -173,18 +173,18 @@ impl Raycaster<'_> {
         found.extend((0..n * n).map(|k| self.cast(x + sub(k % n), y + sub(k / n))));
     }
 
-    /// What a ray through a picture position meets: the first hit of the mesh, and the layers before it.
+    /// Returns the first hit of a ray with the mesh, and the layers in front of it.
     fn cast(&self, x: f32, y: f32) -> Met {
         let ray = self.camera.ray(Vec2::new(x, y))?;
         Some((ray, self.bvh.closest_hit(&ray)))
     }
 
-    /// Distance along the viewing axis, in the mesh's units.
+    /// Returns the distance along the viewing axis, in the mesh's units.
     fn depth(&self, ray: &Ray, hit: &Hit) -> f32 {
         hit.t * ray.direction.dot(self.camera.forward())
     }
 
-    /// Returns whether some of a pixel's rays miss and others hit, or meet far apart.
+    /// Returns whether some of a pixel's rays miss and others hit, or hit at very different depths.
     fn is_edge(&self, found: &[Met]) -> bool {
         let (mut low, mut high) = (f32::INFINITY, 0f32);
         for one in found {
@@ -198,7 +198,7 @@ impl Raycaster<'_> {
         (low == 0.0) != (high == 0.0) || high - low > JUMP * low / self.camera.fx.abs() as f32
     }
 
-    /// The shading normal of a hit.
+    /// Returns the shading normal of a hit.
     fn normal(&self, hit: &Hit) -> Vec3 {
         if let Some(n) = self.mesh.normal_at(hit) {
             return n;
@@ -207,7 +207,7 @@ impl Raycaster<'_> {
         (b - a).cross(c - a).normalize_or_zero()
     }
 
-    /// Counts what a ray met into the pixel's alpha and queues it for its color.
+    /// Adds a hit to the pixel's alpha and queues it for its color.
     fn enqueue(&self, queue: &mut RayHits, pixel: usize, met: &Met, weight: f32, rgba: &mut [[f32; 4]]) {
         let Some((ray, hit)) = met else { return };
         let mut left = weight;
@@ -232,7 +232,7 @@ impl Raycaster<'_> {
     }
 }
 
-/// A ray, and where it met the mesh first.
+/// A ray, and its first hit of the mesh.
 type Met = Option<(Ray, Option<Hit>)>;
 
 /// Colors everything queued.

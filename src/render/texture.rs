@@ -1,11 +1,11 @@
-//! Colors from a texture: mip-mapped, filtered in linear light, with lobes for what depends on the view.
+//! Texture lookup: mip-mapped, filtered in linear light, with lobes for view-dependent color.
 //!
 //! A level has half the texels of the one before, rounded down, each the mean of the part of the picture that it
 //! covers: of three texels by their share where the number is odd (Guthe and Heckbert, *Non-power-of-two
 //! mipmapping*, 2005), so that no level is shifted against another.
 //!
-//! Texels are whole numbers of 16 bits, half as large as floats and finer than any picture of 8: what they stand for is
-//! computed once a place, after the filter.
+//! Texels are 16-bit integers, half as large as floats and finer than any 8-bit picture: they are decoded once per
+//! lookup, after filtering.
 
 use super::raycast::RayHits;
 use crate::geom::sphharm;
@@ -21,32 +21,32 @@ use std::sync::OnceLock;
 pub struct LobePictures<'a> {
     /// Pictures of the atlas's size.
     pub pictures: &'a [Photo],
-    /// Scale of each.
+    /// Scale of each function.
     pub scale: &'a [f32],
-    /// Turns directions of the mesh's coordinates into those of the harmonics.
+    /// Rotates directions of the mesh's coordinates to those of the harmonics.
     pub turned: Mat3,
 }
 
-/// A texture ready to be looked up.
+/// A texture prepared for lookups.
 pub struct MeshTexture {
     /// `[levels, height, width, groups]`: linear color and then the lobes.
     texels: Vec<Texel>,
     levels: Vec<MipLevel>,
     /// Groups of four channels a texel.
     groups: usize,
-    /// What a step of each channel stands for, and what 0 does; of the lobes.
+    /// Scale and offset of each channel of the lobes.
     scale: Vec<Vec4>,
     offset: Vec<Vec4>,
-    /// Do coordinates leave the picture? It is then repeated.
+    /// Whether coordinates leave the picture, which is then repeated.
     repeats: bool,
     turned: Mat3,
     triangles: Vec<TexturedTriangle>,
 }
 
-/// Where a triangle lies in the texture.
+/// The texture coordinates of a triangle.
 #[derive(Clone, Copy)]
 struct TexturedTriangle {
-    /// Its first corner, and from there to the others.
+    /// The first corner, and the vectors from it to the others.
     first: Vec2,
     right: Vec2,
     down: Vec2,
@@ -63,20 +63,20 @@ const STEPS: f32 = 65535.0;
 /// Steps of a lobe's channel between two bytes.
 const LOBE_STEPS: u16 = 257;
 
-/// A picture of a texture.
+/// A mip level of a texture.
 #[derive(Clone, Copy)]
 struct MipLevel {
-    /// The place of its first texel among those of all levels.
+    /// Index of its first texel among those of all levels.
     first: u32,
     width: f32,
     height: f32,
 }
 
-/// Hits that are looked up together.
+/// Number of hits that are looked up together.
 const LANES: usize = 8;
 
-/// The level for so many texels a pixel, and how far it is on the way to the next: the base-2 logarithm, its fraction by
-/// the chord's parabola (off by 0.009).
+/// Returns the level for so many texels a pixel, and how far it is on the way to the next: the base-2 logarithm, its
+/// fraction by the chord's parabola (off by 0.009).
 #[inline(always)]
 fn mip_level(texels: f32, levels: usize) -> (usize, f32) {
     let bits = texels.max(1.0).to_bits();
@@ -89,7 +89,7 @@ fn mip_level(texels: f32, levels: usize) -> (usize, f32) {
 const SRGB_STEPS: usize = 4096;
 
 /// sRGB-coded from linear, by [`srgb_table`].
-// `clamp` would keep what is no number
+// `clamp` would keep NaN
 #[allow(clippy::manual_clamp)]
 #[inline(always)]
 fn coded(table: &[f32; SRGB_STEPS + 1], linear: f32) -> f32 {
@@ -99,7 +99,7 @@ fn coded(table: &[f32; SRGB_STEPS + 1], linear: f32) -> f32 {
     low + (at - k as i32 as f32) * (high - low)
 }
 
-/// sRGB-coded from linear, and the last value once more.
+/// Table of sRGB-coded values of linear ones, with the last value repeated.
 fn srgb_table() -> &'static [f32; SRGB_STEPS + 1] {
     static TABLE: OnceLock<Box<[f32; SRGB_STEPS + 1]>> = OnceLock::new();
     TABLE.get_or_init(|| {
@@ -113,7 +113,7 @@ impl MeshTexture {
     pub fn new(mesh: &Mesh, atlas: &Atlas, color: &Photo, lobes: Option<&LobePictures>) -> MeshTexture {
         let table: [u16; 256] = from_fn(|i| (linear_from_srgb(i as f32 / 255.0) * STEPS).round() as u16);
         let pictures = lobes.map_or(&[][..], |l| l.pictures);
-        // filled up, so that a texel is whole vectors
+        // padded, so that a texel is a whole number of vectors
         let groups = (3 + 3 * pictures.len()).div_ceil(4);
         let (mut width, mut height) = (color.width as usize, color.height as usize);
         let mut texels = Vec::with_capacity((width * height / 3 * 4 + 2 * (width + height)) * groups);
@@ -168,19 +168,19 @@ impl MeshTexture {
         }
     }
 
-    /// Are there lobes, so that directions matter?
+    /// Whether the texture has lobes, so that directions matter.
     pub fn has_lobes(&self) -> bool {
         self.groups > 1
     }
 
-    /// Returns the sRGB-coded colors of what is seen through the pixels of a camera, between two levels (trilinear).
+    /// Returns the sRGB-coded colors of a camera's visible hits, interpolated between two levels (trilinear).
     pub fn smooth_colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let mut colors = Vec::with_capacity(hits.hits.len());
         smooth(self, hits, camera, &mut colors);
         colors
     }
 
-    /// Returns the sRGB-coded colors of what rays of a camera met, `samples` of them along each side of a pixel.
+    /// Returns the sRGB-coded colors of the hits of a camera's rays, `samples` of them along each side of a pixel.
     pub fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
         let forward = camera.forward();
         let mut values = vec![Vec4::ZERO; self.groups];
@@ -198,7 +198,7 @@ impl MeshTexture {
         hits.hits.iter().enumerate().map(one).collect()
     }
 
-    /// Where a hit lies in the picture, and how many texels a unit of length is there.
+    /// Returns the texture coordinates of a hit, and the number of texels per unit of length at it.
     #[inline(always)]
     fn place(&self, hit: &Hit) -> (Vec2, f32) {
         let TexturedTriangle { first, right, down, density } = self.triangles[hit.triangle as usize];
@@ -206,7 +206,7 @@ impl MeshTexture {
         (if self.repeats { uv - uv.floor() } else { uv }, density)
     }
 
-    /// Bilinear, in steps.
+    /// Interpolates bilinearly, in integer steps.
     fn look_up(&self, level: &MipLevel, uv: Vec2, out: &mut [Vec4]) {
         let (texels, f) = around(level, uv.x, uv.y);
         for (g, out) in out.iter_mut().enumerate() {
@@ -214,7 +214,7 @@ impl MeshTexture {
         }
     }
 
-    /// A base color with what its looked-up lobes add along a direction.
+    /// Adds the looked-up lobes' values along a direction to a base color.
     #[inline(always)]
     fn with_lobes(&self, base: [f32; 3], values: &mut [Vec4], direction: Vec3) -> [f32; 3] {
         if self.groups == 1 {
@@ -230,7 +230,7 @@ impl MeshTexture {
 }
 
 crate::dispatch! {
-    /// Colors between two levels.
+    /// Interpolates colors between two levels.
     fn smooth / smooth_all(texture: &MeshTexture, hits: &RayHits, camera: &Camera, colors: &mut Vec<[f32; 3]>)
 }
 
@@ -295,13 +295,13 @@ fn smooth_all<const F: bool>(
     }
 }
 
-/// Four numbers of 16 bits as floats.
+/// Converts four 16-bit integers to floats.
 #[inline(always)]
 fn floats(t: Texel) -> Vec4 {
     Vec4::new(f32::from(t[0]), f32::from(t[1]), f32::from(t[2]), f32::from(t[3]))
 }
 
-/// Half the texels each way of a picture of so many across and down.
+/// Returns the next level of a picture of so many texels across and down: half as many each way.
 fn halved(texels: &[Texel], [across, down]: [usize; 2], groups: usize) -> Vec<Texel> {
     let (width, height) = ((across / 2).max(1), (down / 2).max(1));
     let (columns, rows) = (shares(across, width), shares(down, height));
@@ -322,7 +322,8 @@ fn halved(texels: &[Texel], [across, down]: [usize; 2], groups: usize) -> Vec<Te
     half
 }
 
-/// The four texels around a place of a level, clamped at its borders, and how far it is on the way between them.
+/// Returns the four texels around a place of a level, clamped at its borders, and how far it is on the way between
+/// them.
 #[inline(always)]
 fn around(level: &MipLevel, u: f32, v: f32) -> ([u32; 4], Vec2) {
     let (x, y) = (
@@ -337,8 +338,8 @@ fn around(level: &MipLevel, u: f32, v: f32) -> ([u32; 4], Vec2) {
     ([above + left, above + right, below + left, below + right], way)
 }
 
-/// The whole part of a number, 0 of one below.
-// `clamp` would keep what is no number
+/// Returns the integer part of a number, 0 if it is negative.
+// `clamp` would keep NaN
 #[allow(clippy::manual_clamp)]
 #[inline(always)]
 fn whole(v: f32) -> u32 {
@@ -353,7 +354,8 @@ fn bilinear([a, b, c, d]: [Vec4; 4], f: Vec2) -> Vec4 {
     top + f.y * (bottom - top)
 }
 
-/// The texels under each of `n` equal parts of a row of `from`, which has two to three a part, with their shares.
+/// Returns the texels under each of `n` equal parts of a row of `from`, which has two to three a part, with their
+/// shares.
 fn shares(from: usize, n: usize) -> Vec<[(usize, f32); 3]> {
     let part = |i: usize| {
         let first = i * from / n;

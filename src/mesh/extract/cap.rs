@@ -35,12 +35,12 @@ pub struct RimVertex {
 }
 
 impl Cap {
-    /// A cap without a ring, for queries of where it lies.
+    /// Returns a cap without a ring, for queries of where it lies.
     pub(super) fn bare(bounds: Aabb, cell: f32) -> Cap {
         Cap { bounds, near: cell / 256.0, ring: Vec::new() }
     }
 
-    /// The cap of a mesh extracted within `bounds` with cells of `cell`, if it has one.
+    /// Returns the cap of a mesh extracted within `bounds` with cells of `cell`, if it has one.
     pub fn of(mesh: &Mesh, bounds: Aabb, cell: f32) -> Option<Cap> {
         let cap = Cap::bare(bounds, cell);
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| cap.holds(p)).collect();
@@ -72,7 +72,7 @@ impl Cap {
         (p - self.bounds.min).min_element() < self.near || (self.bounds.max - p).min_element() < self.near
     }
 
-    /// The color of a point of the cap.
+    /// Returns the color of a point of the cap.
     pub fn color(&self, p: Vec3) -> [f32; 3] {
         let (mut sum, mut total) = ([0f64; 3], 0f64);
         for RimVertex { position, color, .. } in &self.ring {
@@ -97,13 +97,13 @@ impl Cap {
         self.ring.iter_mut().zip(colors).for_each(|(skin, color)| skin.color = color);
     }
 
-    /// Gives those of the points that lie on the cap its color instead.
+    /// Gives the points that lie on the cap its color instead.
     pub fn recolor(&self, points: &[Vec3], colors: &mut [[f32; 3]]) {
         let on_cap = points.par_iter().zip(colors).filter(|(p, _)| self.holds(**p));
         on_cap.for_each(|(p, color)| *color = self.color(*p));
     }
 
-    /// Takes the cap off: an opening for those who fit something to it. Returns the triangles removed.
+    /// Removes the cap, for callers that fit something to the opening. Returns the triangles removed.
     pub fn open(&self, mesh: &mut Mesh) -> usize {
         let before = mesh.triangles.len();
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| self.holds(p)).collect();

@@ -1,4 +1,5 @@
-//! What does not belong to the head goes: dust, inner shells, doubled faces, vertices that touch.
+//! Removal of everything that does not belong to the head: loose pieces, inner shells, doubled faces, touching
+//! vertices.
 //!
 //! Order: faces without three vertices and doubled faces; vertices whose triangles form several fans
 //! become several; small holes are closed; then whole pieces by their signed volume. Nothing here opens a closed
@@ -10,7 +11,7 @@ use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
-/// What [`clean`] did.
+/// The result of [`clean`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CleanReport {
     /// Pieces found.
@@ -85,7 +86,7 @@ pub fn clean(mesh: &mut Mesh, keep_share: f64) -> Result<CleanReport> {
         return Err(Error::cannot(message, "the field may be inverted: negative must be inside"));
     };
     if pieces[largest].volume < 0.0 {
-        // A hollow is smaller than what it is in, so the largest volume tells which way is out.
+        // A hollow is smaller than the piece around it, so the largest volume tells which way is out.
         report.turned = true;
         mesh.triangles.iter_mut().for_each(|t| t.swap(1, 2));
         mesh.normals.iter_mut().for_each(|n| *n = -*n);
@@ -277,7 +278,7 @@ mod tests {
         let found = crate::mesh::marching(&volume, true).unwrap();
         let mut m = Mesh { positions: found.positions, triangles: found.triangles, ..Mesh::default() };
         let r = clean(&mut m, 1.0).unwrap();
-        // the specks, the head, its hollow and what is in there
+        // the specks, the head, its hollow and the piece inside that
         assert_eq!((r.pieces, r.kept, r.dust + r.inner_shells), (23, 1, 22));
         let t = topology(&m.positions, &m.triangles);
         assert_eq!((t.pieces, t.euler), (1, 2));

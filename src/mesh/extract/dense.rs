@@ -1,10 +1,10 @@
-//! The whole grid, twice: how the published code meshes a field.
+//! Dense extraction: the two-pass method of the published code.
 //!
-//! instant-nsr-pl's `isosurface`: marching cubes over `resolution`³ nodes of the box, then once more over as many nodes
-//! of the surface's own box, grown by a tenth of its size on every side. Nothing is closed, cleaned, moved or left out:
-//! a surface that leaves the box is open there.
+//! instant-nsr-pl's `isosurface` runs marching cubes over `resolution`³ nodes of the box, then once more over as many
+//! nodes of the surface's own box, grown by a tenth of its size on every side. Nothing is closed, cleaned, moved or
+//! left out: a surface that leaves the box is open at its border.
 //!
-//! Did the sparse extraction lose anything? The dense grid knows.
+//! The dense grid also measures what the sparse extraction misses.
 
 use super::marching::{Volume, marching};
 use super::{MeshReport, NodeGrid, off_surface};
@@ -18,13 +18,14 @@ use std::time::Instant;
 /// How much the surface's box grows on each side, as a share of its size.
 const MARGIN: f32 = 0.1;
 
-/// Meshes the zero level set of `sdf` (negative inside) on all nodes of a grid of `resolution`³ nodes, which is laid over
-/// `bounds` and then over what is found there. Needs four bytes a node. The closures are those of
-/// [`extract`](super::extract), `batch` the most points they get at once.
+/// Meshes the zero level set of `sdf` (negative inside) on all nodes of a grid of `resolution`³ nodes, first over
+/// `bounds` and then over the box of the surface found. Needs four bytes a node. The closures are those of
+/// [`extract`](super::extract), `batch` is the maximum number of points per call.
 ///
 /// # Errors
 ///
-/// A resolution outside 2..=2048, a field without a surface, answers of the wrong length, a request to stop.
+/// Fails for a resolution outside 2..=2048, a field without a surface, values of the wrong length, or a request to
+/// stop.
 pub fn extract_dense(
     sdf: impl Fn(&[Vec3]) -> Vec<f32>,
     sdf_gradient: impl Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>),
@@ -109,7 +110,7 @@ pub fn extract_dense(
     Ok((mesh, report))
 }
 
-/// The sparse extraction beside the dense one.
+/// The sparse extraction compared with the dense one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Verified {
     /// Triangles of the dense grid's surface.

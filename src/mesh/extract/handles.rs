@@ -23,7 +23,7 @@ use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-/// Sides of the longest loop that is cut: the triangulation takes the cube of it.
+/// Maximum number of sides of a loop that is cut: the triangulation's cost grows with its cube.
 const MOST_SIDES: usize = 256;
 
 /// How far the rims are drawn back, as shares of the way to the vertices behind them; the first that fits.
@@ -35,23 +35,23 @@ const EFFORT_OF_A_CAP: usize = 1 << 20;
 /// A triangle may turn until this cosine when its rim is drawn back.
 const TURN: f64 = 0.3;
 
-/// What became of a surface's handles. Lengths are of loops, in units of the positions.
+/// The result for a surface's handles. Lengths are of loops, in units of the positions.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct HandleReport {
-    /// LoopFinder around matter that was cut.
+    /// Loops around matter that was cut.
     pub cut: Vec<f32>,
-    /// LoopFinder around holes that were filled.
+    /// Loops around holes that were filled.
     pub filled: Vec<f32>,
-    /// Handles that stayed.
+    /// Number of handles that were kept.
     pub left: usize,
-    /// A loop of one that stayed although it was to go: too long, or in the way of something.
+    /// A loop of a handle that was kept although it was short enough: it is too long to triangulate, or blocked.
     pub left_length: Option<f32>,
     /// Triangles that close cut rims: the last ones of the mesh.
     pub triangles: usize,
 }
 
 impl HandleReport {
-    /// One sentence if handles were cut or filled; `mm` is the unit of the positions in millimetres.
+    /// Returns a sentence if handles were cut or filled; `mm` is the unit of the positions in millimetres.
     pub fn warning(&self, mm: f64) -> Option<String> {
         let list = |lengths: &[f32]| {
             let each: Vec<String> = lengths.iter().map(|&l| format!("{:.0}", f64::from(l) * mm)).collect();
@@ -71,13 +71,13 @@ impl HandleReport {
     }
 }
 
-/// Takes away the handles of a closed manifold that have a loop no longer than `longest`, in place. Where `sdf`
-/// is not finite it counts as 0. Attributes of vertices must not be there yet. A surface without handles, or one
-/// that is open, stays as it is.
+/// Removes the handles of a closed manifold that have a loop no longer than `longest`, in place. Where `sdf` is not
+/// finite it counts as 0. The mesh must not have vertex attributes yet. A surface without handles, or an open one, is
+/// unchanged.
 ///
 /// # Errors
 ///
-/// Those of `sdf`, and a request to stop.
+/// Returns the errors of `sdf`, and a request to stop.
 pub(super) fn cut_handles(
     mesh: &mut Mesh,
     longest: f32,
@@ -108,14 +108,14 @@ pub(super) fn cut_handles(
     Ok(report)
 }
 
-/// A loop and what could close it.
+/// A loop with the discs that could close it.
 struct Disc {
     rim: Loop,
     /// Places in the rim.
     triangles: Vec<[usize; 3]>,
 }
 
-/// A disc for each loop that has one, each loop once.
+/// Returns a disc for each loop that has one, each loop once.
 fn discs(loops: &LoopFinder, found: Vec<Loop>) -> Vec<Disc> {
     let mut seen = BTreeSet::new();
     let disc = |rim: Loop| {
@@ -167,15 +167,15 @@ struct HandleCutter<'a> {
     loops: &'a LoopFinder<'a>,
     boxes: Boxes,
     next: Mesh,
-    /// Triangles of `mesh` that are no longer what they were.
+    /// Triangles of `mesh` that have changed.
     changed: Vec<bool>,
-    /// What stands for them in `next`, and what is new there.
+    /// The triangles that replace them in `next`, and the new ones.
     fresh: Vec<u32>,
     /// The classes of the loops cut, reduced: while they are independent, the surface stays in one piece.
     basis: Vec<u64>,
 }
 
-/// What a cut does to the mesh.
+/// The changes that a cut makes to the mesh.
 struct CutPlan {
     /// Where vertices go, the copies included.
     moved: HashMap<u32, Vec3>,
@@ -197,8 +197,8 @@ impl<'a> HandleCutter<'a> {
         }
     }
 
-    /// Cuts along a rim and closes both sides. Returns whether matter was cut, or else a hole filled; `None` if it cannot be
-    /// done, or not in one with what has been done already.
+    /// Cuts along a rim and closes both sides. Returns whether matter was cut or a hole filled; `None` if the cut is
+    /// impossible, also in combination with earlier ones.
     fn along(&mut self, disc: &Disc) -> Option<bool> {
         let class = self.basis.iter().fold(disc.rim.class, |word, b| word.min(word ^ b));
         if class == 0 {
@@ -302,14 +302,14 @@ fn span(corners: [Vec3; 3]) -> DBox {
     DBox::around(corners.map(Vec3::as_dvec3))
 }
 
-/// The triangles that close what was cut: part of the surface, although the field is not zero there.
+/// The triangles that close the cuts: part of the surface, although the field is not zero at them.
 pub struct Patches {
     mesh: Mesh,
     bvh: Bvh,
 }
 
 impl Patches {
-    /// The patches of a mesh as extracted; `None` if nothing was cut.
+    /// Returns the patches of a mesh as extracted; `None` if nothing was cut.
     pub fn of(mesh: &Mesh, report: &HandleReport) -> Option<Patches> {
         let first = mesh.triangles.len().checked_sub(report.triangles)?;
         let triangles = mesh.triangles[first..].to_vec();
@@ -317,12 +317,12 @@ impl Patches {
         (!mesh.triangles.is_empty()).then(|| Patches { bvh: Bvh::new(&mesh), mesh })
     }
 
-    /// The vertices of the mesh that patches use.
+    /// Returns the vertices of the mesh that patches use.
     pub(super) fn corners(&self) -> impl Iterator<Item = u32> + '_ {
         self.mesh.triangles.iter().flatten().copied()
     }
 
-    /// Makes a field's answers at `points` those of whichever is nearer, its own zero or a patch.
+    /// Replaces a field's values at `points` where a patch is nearer than the field's own zero.
     pub fn close(&self, points: &[Vec3], values: &mut [f32], gradients: &mut [Vec3]) {
         for ((&p, f), g) in points.iter().zip(values).zip(gradients) {
             let Some(near) = self.bvh.closest_point(p) else { continue };

@@ -192,8 +192,8 @@ fn noise_full_of_handles_comes_out_sound_with_fewer() {
     assert!(before.topology.genus > Some(20), "{:?}", before.topology);
     assert!(report.topology.is_solid() && report.topology.pieces == 1);
     assert!(report.topology.genus < before.topology.genus, "{:?}", report.topology);
-    let gone = report.handles.cut.len() + report.handles.filled.len();
-    assert_eq!(Some((gone + report.handles.left) as i64), before.topology.genus);
+    let removed = report.handles.cut.len() + report.handles.filled.len();
+    assert_eq!(Some((removed + report.handles.left) as i64), before.topology.genus);
     assert!(check(&mesh, 1.0).self_intersections <= check(&kept, 1.0).self_intersections);
 }
 

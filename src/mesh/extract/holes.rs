@@ -64,8 +64,8 @@ pub(super) fn fill_holes(mesh: &mut Mesh) -> (usize, usize) {
     (holes, mesh.triangles.len() - before)
 }
 
-/// The triangulation of a closed polygon with the least area, its corners in the polygon's order. A diagonal that
-/// is `taken` would give an edge a third triangle; `None` if there is no way around those.
+/// Returns the triangulation of a closed polygon with the least area, its corners in the polygon's order. A diagonal
+/// that is `taken` would give an edge a third triangle; `None` if those cannot be avoided.
 pub(super) fn least_area(points: &[DVec3], taken: impl Fn(usize, usize) -> bool) -> Option<Vec<[usize; 3]>> {
     let n = points.len();
     let at = |i: usize, j: usize| i * n + j;

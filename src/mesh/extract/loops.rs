@@ -38,8 +38,8 @@ pub(super) struct Loop {
     pub class: u64,
 }
 
-/// A closed manifold and how its loops are told apart. Corner `3 t + k` stands for the side from vertex k to
-/// k + 1 of triangle t.
+/// A closed manifold with a word for each side, which distinguishes its loops. Corner `3 t + k` stands for the side
+/// from vertex k to k + 1 of triangle t.
 pub(super) struct LoopFinder<'a> {
     positions: &'a [Vec3],
     triangles: &'a [[u32; 3]],
@@ -83,7 +83,7 @@ impl<'a> LoopFinder<'a> {
         side_ends(self.triangles, side).1
     }
 
-    /// The sides that start at a vertex, counter-clockwise from a given one.
+    /// Returns the sides that start at a vertex, counter-clockwise from a given one.
     pub(super) fn around(&self, from: u32) -> impl Iterator<Item = u32> + '_ {
         let next = move |&c: &u32| {
             let before = c / 3 * 3 + (c % 3 + 2) % 3;
@@ -92,7 +92,7 @@ impl<'a> LoopFinder<'a> {
         std::iter::successors(Some(from), next)
     }
 
-    /// The sides that start at a vertex.
+    /// Returns the sides that start at a vertex.
     pub(super) fn at(&self, vertex: u32) -> impl Iterator<Item = u32> + '_ {
         self.around(self.first[vertex as usize])
     }
@@ -286,7 +286,7 @@ impl<'a> Ball<'a> {
         }
     }
 
-    /// Of every class the side that closes the shortest walk there and back, and the walk's length.
+    /// Returns for every class the side that closes the shortest closed walk, and the walk's length.
     fn closing(&self) -> BTreeMap<u64, (f32, u32)> {
         let mut best: BTreeMap<u64, (f32, u32)> = BTreeMap::new();
         for &v in &self.reached {
@@ -306,7 +306,7 @@ impl<'a> Ball<'a> {
         best
     }
 
-    /// The loop that a side closes, without the way to it and back.
+    /// Returns the loop that a side closes, without the path to it and back.
     fn closed(&self, side: u32) -> Loop {
         let loops = self.loops;
         let (v, w) = (loops.start(side), loops.end(side));

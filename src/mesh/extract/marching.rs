@@ -51,7 +51,7 @@ impl LevelSet {
     }
 }
 
-/// The zero level set of a volume.
+/// Returns the zero level set of a volume.
 ///
 /// With `closed`, nodes on the outer faces count as outside, so that what runs off the box is capped
 /// within a thousandth of a cell of its faces; without, the surface is open there.
@@ -98,7 +98,7 @@ pub(super) fn cell_point(origin: Vec3, spacing: Vec3, cell: [usize; 3], at: [f64
     (origin.as_dvec3() + p * spacing.as_dvec3()).as_vec3()
 }
 
-/// A value as the interpolation may see it: a node counted as outside is never below zero.
+/// Returns a value as the interpolation may see it: a node counted as outside is never below zero.
 pub(super) fn sided(value: f32, inside: bool) -> f32 {
     if inside { value } else { value.max(0.0) }
 }
@@ -424,7 +424,7 @@ pub(super) fn crossings(bits: &Bits, j: usize, k: usize, axis: usize, mut found:
     }
 }
 
-/// The bits of word `w` that stand for positions before `end`.
+/// Returns the bits of word `w` that stand for positions before `end`.
 #[inline]
 fn below(end: usize, w: usize) -> u64 {
     match end.saturating_sub(64 * w) {

@@ -167,8 +167,8 @@ impl Loops {
     }
 }
 
-/// The surface in a cell with these values: inside corners (bits of `case`) below zero, the others at
-/// or above it, all finite.
+/// Returns the surface in a cell with these values: inside corners (bits of `case`) below zero, the others at or above
+/// it, all finite.
 pub(super) fn resolve(case: u8, values: &[f32; 8]) -> CellSurface {
     let v = values.map(f64::from);
     let loops = Loops::trace(case, |face| {
@@ -393,7 +393,7 @@ struct StripSearch<'a> {
 }
 
 impl StripSearch<'_> {
-    /// The steps of the best strip and the vertex of q it starts from.
+    /// Returns the steps of the best strip and the vertex of q it starts from.
     fn run(p: &[u8], q: &[u8], at: &[[f64; 3]; 12], free: bool) -> Option<(Vec<bool>, usize)> {
         let best = (f64::INFINITY, Vec::new(), 0);
         let mut search = StripSearch { p, q, at, free, start: 0, steps: Vec::new(), best };

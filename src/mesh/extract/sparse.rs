@@ -1,4 +1,4 @@
-//! The zero level set of a field that is expensive to evaluate: only nodes near the surface are evaluated.
+//! Sparse extraction of the zero level set of an expensive field: only nodes near the surface are evaluated.
 //!
 //! 1. Every `coarse_step`-th node of the grid, along each axis, is evaluated (every 8th: 0.2 %).
 //! 2. Coarse edges that change sign are bisected down to one crossed grid edge each. Coarse cells
@@ -21,7 +21,7 @@ use crate::mesh::input::{check_len, setting};
 use crate::{Monitor, Result};
 use glam::Vec3;
 
-/// A surface and what it cost.
+/// A surface and the cost of its extraction.
 #[derive(Clone, Debug, Default)]
 pub struct Sparse {
     /// The closed surface; empty when no piece was met.
@@ -36,7 +36,7 @@ pub struct Sparse {
     pub range: (f32, f32),
 }
 
-/// The zero level set of `field` over `grid`, closed at its borders.
+/// Returns the zero level set of `field` over `grid`, closed at its borders.
 ///
 /// The first nodes evaluated lie `coarse_step` cells apart. `field` gets at most `batch` points a call and is called
 /// from one thread: it may well use all of them. Nodes for which `inside_hull` is false count as outside.
@@ -178,7 +178,7 @@ impl Flood<'_> {
         Ok(())
     }
 
-    /// Is a lattice node inside? What was not evaluated is not.
+    /// Whether a lattice node is inside. A node that was not evaluated is not.
     fn coarse_inside(&self, at: [usize; 3]) -> bool {
         self.coarse[self.lattice_index(at)] < 0.0
     }
@@ -237,7 +237,7 @@ impl Flood<'_> {
         Ok(())
     }
 
-    /// The lattice's value of a node, where it has been evaluated.
+    /// Returns the lattice's value of a node, where it has been evaluated.
     fn lattice_value(&self, node: [usize; 3]) -> Option<f32> {
         let step = self.coarse_step;
         (node.iter().all(|c| c % step == 0) && !self.grid.on_border(node))
@@ -251,7 +251,7 @@ impl Flood<'_> {
         }
     }
 
-    /// Evaluates what is wanted and queues the cells around every edge found crossed.
+    /// Evaluates the wanted nodes and queues the cells around every crossed edge.
     fn settle(&mut self) -> Result<()> {
         let nodes = std::mem::take(&mut self.wanted);
         let (old, new): (Vec<_>, Vec<_>) = nodes.iter().partition(|&&n| self.lattice_value(n).is_some());

@@ -118,7 +118,7 @@ impl Blocks {
         self.known(node) == Some(true)
     }
 
-    /// The side of a node, when known.
+    /// Returns the side of a node, when known.
     pub(super) fn known(&self, node: [usize; 3]) -> Option<bool> {
         let block = self.find(node)?;
         let (plane, bit) = bit_of(node);
@@ -161,7 +161,7 @@ impl Blocks {
         }
     }
 
-    /// The closed surface through all evaluated cells, blocks in order of z, y, x.
+    /// Returns the closed surface through all evaluated cells, blocks in order of z, y, x.
     pub(super) fn surface(&mut self, grid: &NodeGrid) -> Result<LevelSet> {
         let mut out = LevelSet::default();
         self.repair(&mut out);
@@ -214,7 +214,7 @@ impl Blocks {
         Ok(out)
     }
 
-    /// The block after `block` along `axis`.
+    /// Returns the block after `block` along `axis`.
     fn after(&self, block: &Block, axis: usize) -> Option<&Block> {
         let mut node = block.start;
         node[axis] += 8;
@@ -249,7 +249,7 @@ impl Blocks {
         owner
     }
 
-    /// The eight blocks that hold the corners of this block's cells, by corner of the 2³ blocks.
+    /// Returns the eight blocks that hold the corners of this block's cells, by corner of the 2³ blocks.
     fn around(&self, block: &Block) -> [u32; 8] {
         std::array::from_fn(|c| {
             let node: [usize; 3] = std::array::from_fn(|a| block.start[a] + 8 * (c >> a & 1));
@@ -374,7 +374,7 @@ impl Blocks {
     }
 }
 
-/// The block (of the 2³ around), plane and bit of a corner of a block's cell.
+/// Returns the block (of the 2³ around), plane and bit of a corner of a block's cell.
 fn locate(cell: [usize; 3], corner: u8) -> (usize, usize, usize) {
     let [x, y, z] = std::array::from_fn(|a| cell[a] + (corner >> a & 1) as usize);
     ((x >> 3) | (y >> 3) << 1 | (z >> 3) << 2, z & 7, (x & 7) + 8 * (y & 7))

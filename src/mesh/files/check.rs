@@ -1,4 +1,4 @@
-//! Is this mesh sound? Counted on vertices welded by equal position, so texture seams do not matter.
+//! Validation of a mesh. Counts are on vertices welded by equal position, so texture seams do not matter.
 //!
 //! - closed: every edge in exactly two triangles, oppositely wound;
 //! - manifold: no edge in more than two triangles, no vertex with more than one fan;
@@ -24,7 +24,7 @@ const SLIVER: f64 = 0.05;
 /// How far from 1 a normal's length may be; the Khronos validator's own bound.
 const UNIT: f32 = 5e-4;
 
-/// What [`check`] found. Counts of triangles are of the mesh as given; topology is after welding.
+/// The result of [`check`]. Counts of triangles are of the mesh as given; topology is after welding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CheckReport {
     /// Vertices as stored.
@@ -70,25 +70,26 @@ pub struct CheckReport {
     pub size_m: [f64; 3],
     /// Enclosed volume in litres, negative when wound inward; an open mesh encloses none.
     pub volume_l: Option<f64>,
-    /// Does every vertex have a color?
+    /// Whether every vertex has a color.
     pub has_colors: bool,
-    /// Does a picture give it its colors? For those who have read it: [`check`] knows only the mesh.
+    /// Whether a texture gives the mesh its colors; set by readers, because [`check`] knows only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub has_texture: Option<bool>,
-    /// Does every vertex have a normal?
+    /// Whether every vertex has a normal.
     pub has_normals: bool,
     /// Normals whose length is not 1 within 5e-4.
     pub bad_normals: usize,
-    /// Its texture coordinates, for those who have measured them: [`check`] knows only the mesh.
+    /// The report on its texture coordinates; set by callers of [`uv_check`](super::uv_check()), because [`check`]
+    /// sees only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub uv: Option<UvReport>,
 }
 
-/// What [`CheckReport::require`] understands.
+/// The requirements that [`CheckReport::require`] accepts.
 pub const BARS: [&str; 5] = ["watertight", "manifold", "one-piece", "no-self-intersections", "sound-uv"];
 
 impl CheckReport {
-    /// Closed, and wound outward?
+    /// Whether the mesh is closed and wound outward.
     fn is_watertight(&self) -> bool {
         self.closed && self.orientation().is_empty()
     }
@@ -101,7 +102,7 @@ impl CheckReport {
     ///
     /// # Errors
     ///
-    /// The first bar missed, as [`ErrorKind::BelowBar`](crate::ErrorKind::BelowBar); or one that does not exist, as
+    /// Returns the first bar missed, as [`ErrorKind::BelowBar`](crate::ErrorKind::BelowBar); or an unknown bar, as
     /// [`ErrorKind::Usage`](crate::ErrorKind::Usage).
     pub fn require(&self, bars: &[&str]) -> Result<()> {
         for &bar in bars {
@@ -225,7 +226,7 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
     let (weld, welded) = places(mesh);
     let valid =
         |t: &[u32; 3]| t.iter().all(|&i| mesh.positions.get(i as usize).is_some_and(|p| p.is_finite()));
-    // Triangles that are still triangles after welding: their welded corners, and which they are.
+    // triangles that remain triangles after welding: their welded corners and their indices
     let (mut faces, mut sources) = (Vec::new(), Vec::new());
     let (mut invalid, mut degenerate, mut slivers, mut volume) = (0, 0, 0, 0.0);
     let mut bounds = Aabb::EMPTY;
@@ -289,13 +290,14 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
     }
 }
 
-/// What comparing two triangles costs, in comparisons of boxes.
+/// Cost of comparing two triangles, in comparisons of boxes.
 const COMPARING: usize = 16;
 
-/// How many triangles pass through or lie on another one, and how many more were not compared with all they might.
+/// Returns how many triangles pass through or lie on another one, and how many others were not compared with all
+/// candidates.
 fn self_intersections(mesh: &Mesh, faces: &[[u32; 3]], sources: &[u32]) -> (usize, usize) {
-    // Triangles over the same corners lie on each other, and one of them stands for all: a shape shown twice in
-    // one place is no more work than shown once.
+    // Triangles over the same corners lie on each other, so one of them stands for all: a shape that is repeated in
+    // one place costs no more than a single one.
     let mut sorted: Vec<([u32; 3], u32)> = (0..faces.len() as u32)
         .into_par_iter()
         .filter_map(|f| {
@@ -370,7 +372,7 @@ mod tests {
         assert!((r.size_m[2] - 0.4).abs() < 1e-12);
         assert_eq!((r.self_intersections, r.slivers, r.degenerate), (0, 0, 0));
         assert_eq!(r.require(&BARS[..4]), Ok(()));
-        // nobody has measured its texture coordinates
+        // its texture coordinates have not been measured
         assert!(r.require(&["sound-uv"]).is_err());
         assert!(r.to_string().contains("watertight           yes"));
     }

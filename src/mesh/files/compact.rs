@@ -1,10 +1,10 @@
-//! A GLB as small as a page wants it: for a screen, not for an artist.
+//! A GLB small enough to embed in a page, for display only.
 //!
-//! What is not seen goes: other scenes, normal maps, tangents, pictures that nothing shows. Positions become 16 bit of
-//! the longest side (a head: steps of 8 µm), normals 8 bit, texture coordinates 16 bit (`KHR_mesh_quantization`); the
-//! base color becomes a JPEG of at most [`COLOR_PX`] texels along a side, the functions of view-dependent color, which
-//! are smooth, of [`LOBE_PX`]. A picture with alpha stays as it is. Parts keep their order, for those that are
-//! blended are drawn in it.
+//! Data that is not displayed is dropped: other scenes, normal maps, tangents, unused pictures. Positions become 16
+//! bit of the longest side (steps of 8 µm for a head), normals 8 bit, texture coordinates 16 bit
+//! (`KHR_mesh_quantization`); the base color becomes a JPEG of at most [`COLOR_PX`] texels along a side, the
+//! functions of view-dependent color, which are smooth, of [`LOBE_PX`]. A picture with alpha is kept unchanged. Parts
+//! keep their order, because blended parts are drawn in it.
 //!
 //! A head of 50,000 triangles, 1,024² texels and four lobes (`draft`): 4.3 MB become 0.9.
 
@@ -33,12 +33,12 @@ const LOBE_PX: u32 = 512;
 /// Errors of this JPEG are below those of the texture: 40 dB.
 const QUALITY: u8 = 88;
 
-/// Returns a smaller copy of a GLB, +Y up, with everything that a viewer shows of its default scene: triangles, base
-/// colors, colors that depend on the view. `path` is for messages only.
+/// Returns a smaller copy of a GLB, +Y up, with everything that viewers display of its default scene: triangles, base
+/// colors and view-dependent colors. `path` is for messages only.
 ///
 /// # Errors
 ///
-/// As [`super::read()`]; and when a picture is broken, or the mesh uses what a page does not show.
+/// Fails like [`super::read()`], and when a picture is broken or the mesh uses features that a page does not show.
 pub fn compact_glb(bytes: &[u8], path: &Path) -> Result<Vec<u8>> {
     let source = Source { path, format: "GLB", options: &ReadOptions::DEFAULT };
     let glb = chunks(bytes, source)?;
@@ -88,11 +88,11 @@ struct FileMaterials {
     materials: Vec<Value>,
 }
 
-/// A file as it grows.
+/// A file under construction.
 #[derive(Default)]
 struct Packed {
     document: GlbDocument,
-    /// New numbers of the file's textures, with the side they were made for, and of its materials.
+    /// New indices of the file's textures, with the side they were made for, and of its materials.
     known: (BTreeMap<(u32, u32), Index<json::Texture>>, BTreeMap<u32, Index<Material>>),
 }
 
@@ -135,7 +135,7 @@ impl Packed {
                 [r, g, b, short(alpha(i))]
             };
             let colors = if mesh.colors.iter().all(|c| *c == [1.0; 3]) {
-                // alpha alone: a byte is enough
+                // a texture for alpha alone: a byte is enough
                 let white = |i| [255, 255, 255, (alpha(i) * 255.0).round() as u8];
                 let colors: Vec<[u8; 4]> = (0..vertices).map(white).collect();
                 document.normalized(&colors, ComponentType::U8, Type::Vec4)
@@ -169,7 +169,7 @@ impl Packed {
             |k: usize| old["pbrMetallicRoughness"]["baseColorFactor"][k].as_f64().unwrap_or(1.0) as f32;
         pbr.base_color_factor = PbrBaseColorFactor(match texture {
             Some(_) => [0, 1, 2, 3].map(factor),
-            // the vertices have been multiplied with it
+            // the vertex colors already contain this factor
             None => [1.0, 1.0, 1.0, factor(3)],
         });
         let texture = texture.map(|texture| self.texture(texture, COLOR_PX, reader)).transpose()?;
@@ -192,7 +192,7 @@ impl Packed {
         Ok(new)
     }
 
-    /// The new number of a texture with at most `side` texels along a side.
+    /// Returns the new index of a texture with at most `side` texels along a side.
     fn texture(&mut self, index: u32, side: u32, reader: &GlbReader) -> Result<Index<json::Texture>> {
         if let Some(&known) = self.known.0.get(&(index, side)) {
             return Ok(known);
@@ -210,7 +210,7 @@ impl Packed {
     }
 }
 
-/// A picture as a JPEG, unless it is smaller as it is.
+/// Returns a picture as a JPEG, or unchanged if that is smaller.
 fn smaller(bytes: Vec<u8>, photo: &Photo, side: u32, path: &Path) -> Result<(Vec<u8>, &'static str)> {
     let size = working_size(photo.width, photo.height, side);
     let jpeg = io::jpeg_bytes(&reduce_photo(photo, size), QUALITY, path)?;

@@ -1,5 +1,5 @@
-//! What every file format asks of a mesh before it becomes bytes: sound indices, finite numbers,
-//! unit normals, the right way up, the right size.
+//! Preparation of a mesh for any file format: index checks, finite numbers, unit normals, the file's up direction and
+//! unit.
 //!
 //! The dataset's world stays untouched until here. glTF and OBJ are right-handed with +Y up, so a
 //! capture with another `up` is turned once, in the vertices: `(x, y, z) → (x, z, −y)` for +Z up.
@@ -12,7 +12,7 @@
 //! everything, so there vertices are split where corners disagree. The copies are bit-identical in
 //! position and normal: welding equal positions closes the surface again.
 //!
-//! What is wrong with a mesh or a texture that cannot become a file is found before there are any bytes.
+//! All problems that prevent a mesh or a texture from being written are found before any bytes are produced.
 //!
 //! # Tangents
 //!
@@ -31,24 +31,24 @@ use glam::{DMat3, DVec3, Mat3, Vec2, Vec3, Vec4};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// How a mesh leaves the dataset's world, and what its files are called.
+/// Coordinates and names of an exported mesh.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExportOptions {
-    /// What viewers call the object.
+    /// The object's name in viewers.
     pub name: String,
-    /// What the files are called, without ending. Other characters than ASCII letters, digits, `-`,
-    /// `_` and `.` become `_`, since readers of MTL take a space for the end of a name.
+    /// Base name of the files. Characters other than ASCII letters, digits, `-`, `_` and `.` become `_`, since
+    /// readers of MTL take a space for the end of a name.
     pub stem: String,
-    /// Where up is in the dataset's world; any length but 0.
+    /// The up direction in the dataset's world; any length but 0.
     pub up: Vec3,
     /// Metres per dataset unit.
     pub unit_m: f64,
-    /// Do the colors already contain the light? Then viewers should not light them again.
+    /// Whether the colors already contain the light, so that viewers should not light them again.
     pub unlit: bool,
-    /// From the mesh's own coordinates into the dataset's world.
+    /// The transform from the mesh's own coordinates into the dataset's world.
     pub world_from_mesh: Similarity,
-    /// Quality, 1..=100, of colors stored as JPEG: smaller, and a little wrong. `None` stores PNG, which is
-    /// lossless; normal maps are always PNG.
+    /// Quality, 1..=100, of colors stored as JPEG, which is smaller but lossy. `None` stores PNG, which is lossless;
+    /// normal maps are always PNG.
     pub jpeg_quality: Option<u8>,
 }
 
@@ -67,7 +67,7 @@ impl Default for ExportOptions {
 }
 
 impl ExportOptions {
-    /// From the mesh's own coordinates to metres with +Y up.
+    /// Returns the transform from the mesh's own coordinates to metres with +Y up.
     pub(super) fn file_from_mesh(&self) -> Result<Similarity> {
         if !(self.unit_m.is_finite() && self.unit_m > 0.0) {
             return Err(wrong_option("unit_m", self.unit_m, "metres per unit, above 0"));
@@ -83,35 +83,36 @@ impl ExportOptions {
 pub struct ExportedFiles {
     /// Bare names and bytes; the mesh comes first.
     pub files: Vec<(String, Vec<u8>)>,
-    /// What the format could not hold.
+    /// Features that the format could not represent.
     pub warnings: Vec<String>,
 }
 
-/// A mesh that can be written: checked, turned and scaled.
+/// A mesh ready to be written: checked, turned and scaled.
 pub(super) struct FileMesh {
     pub positions: Vec<Vec3>,
     /// Unit, or empty.
     pub normals: Vec<Vec3>,
     /// sRGB-coded, or empty.
     pub colors: Vec<[f32; 3]>,
-    /// Which vertex of the mesh each is.
+    /// The index of each vertex in the original mesh.
     pub source: Vec<u32>,
-    /// Without those that use a vertex twice.
+    /// The triangles, without those that use a vertex twice.
     pub triangles: Vec<[u32; 3]>,
-    /// Texture coordinates, 0..=1; empty without a texture. + 0, so that equal coordinates are equal bytes.
+    /// Texture coordinates, 0..=1; empty without a texture. Zeros are positive, so that equal coordinates have equal
+    /// bytes.
     pub uvs: Vec<Vec2>,
-    /// Where the corners of the triangles lie in `uvs`; empty once the mesh is split.
+    /// Indices into `uvs` for the corners of the triangles; empty once the mesh is split.
     pub corners: Vec<[u32; 3]>,
-    /// One for each vertex of a mesh that was split for a normal map, else empty.
+    /// Tangents, one for each vertex of a mesh that was split for a normal map, else empty.
     pub tangents: Vec<Vec4>,
-    /// To be added to every position, in f64; zero unless the mesh lies far from the origin. Every
-    /// coordinate is a number of f32.
+    /// Offset of all positions, in f64; zero unless the mesh lies far from the origin. Every coordinate is
+    /// representable as f32.
     pub translation: DVec3,
 }
 
 impl FileMesh {
-    /// Checks, turns and scales a mesh with its texture. One far from the origin comes back around its own middle,
-    /// with that middle as `translation`.
+    /// Checks, turns and scales a mesh with its texture. A mesh far from the origin is returned around its own
+    /// center, with that center as `translation`.
     pub fn new(mesh: &Mesh, texture: Option<&HeadTexture>, file_from_mesh: &Similarity) -> Result<FileMesh> {
         let vertices = mesh.positions.len();
         texture.map_or(Ok(()), |t| check_atlas(mesh, &t.atlas))?;
@@ -128,7 +129,7 @@ impl FileMesh {
             return Err(Error::cannot("the mesh has no triangles to write", hint));
         }
         let (center, _, far) = middle(placed_box(mesh, file_from_mesh));
-        // rounded, so that those who keep it in f32 and those who do not have the same
+        // rounded, so that readers in f32 and in f64 get the same value
         let translation = if far { center.as_vec3().as_dvec3() } else { DVec3::ZERO };
         let mut positions = Vec::with_capacity(vertices);
         for (vertex, p) in mesh.positions.iter().enumerate() {
@@ -175,19 +176,19 @@ impl FileMesh {
         }
     }
 
-    /// Does f32 lose visible precision where this mesh lies?
+    /// Whether f32 would lose visible precision at this mesh's position.
     pub fn is_far(&self) -> bool {
         self.translation != DVec3::ZERO
     }
 
-    /// Where a position really is.
+    /// Returns a position with the translation added.
     pub fn place(&self, position: Vec3) -> DVec3 {
         self.translation + position.as_dvec3()
     }
 
-    /// Gives everything one index: vertices are split where corners disagree about the texture coordinate or, for
-    /// a normal map, the tangent. Vertices come in the order of their first use; those without a triangle are left
-    /// out. A mesh without a texture stays as it is.
+    /// Converts to a single index: vertices are split where corners disagree about the texture coordinate or, for a
+    /// normal map, the tangent. Vertices come in the order of their first use; unused ones are left out. A mesh
+    /// without a texture is unchanged.
     pub fn split(self, with_tangents: bool) -> FileMesh {
         if self.corners.is_empty() {
             return self;
@@ -220,7 +221,7 @@ impl FileMesh {
         out
     }
 
-    /// The part of this mesh that has these soft layers. Of a mesh that has been split.
+    /// Returns the part of this mesh that has these soft layers. The mesh must have been split.
     pub fn under(&self, shells: &Shells) -> FileMesh {
         let mut out = FileMesh::empty(self.translation);
         let mut known = vec![u32::MAX; self.positions.len()];
@@ -243,7 +244,8 @@ impl FileMesh {
         out
     }
 
-    /// Positions of a layer over this part of a mesh: `scale` leads from lengths of the mesh to those of the file.
+    /// Returns the positions of a layer over this part of a mesh: `scale` converts lengths of the mesh to those of
+    /// the file.
     pub fn moved(&self, layer: &ShellLayer, scale: f32) -> Vec<Vec3> {
         let offset = |v: &u32| scale * layer.offsets[*v as usize];
         let each = self.positions.iter().zip(&self.normals).zip(&self.source);
@@ -251,29 +253,29 @@ impl FileMesh {
     }
 }
 
-/// From how many of its own sizes away on a mesh counts as far: up to there f32 rounds by less than a
-/// millionth of the size.
+/// Distance from the origin, in the mesh's own sizes, beyond which a mesh counts as far: up to it f32 rounds by less
+/// than a millionth of the size.
 const FAR_IN_SIZES: f64 = 15.0;
 
-/// The box of a mesh where it goes.
+/// Returns the box of a mesh in the file's coordinates.
 fn placed_box(mesh: &Mesh, file_from_mesh: &Similarity) -> (DVec3, DVec3) {
     let empty = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let place = |p: &Vec3| file_from_mesh.point_f64(p.as_dvec3());
     mesh.positions.iter().map(place).fold(empty, |(low, high), q| (low.min(q), high.max(q)))
 }
 
-/// Middle and size of a box, and whether it is far from the origin.
+/// Returns center and size of a box, and whether it is far from the origin.
 pub(super) fn middle((low, high): (DVec3, DVec3)) -> (DVec3, f64, bool) {
     let (center, size) = (0.5 * (low + high), (high - low).max_element());
     (center, size, center.abs().max_element() > FAR_IN_SIZES * size)
 }
 
-/// Returns what becomes of a mesh far from the origin in a format that keeps every vertex where it is: the files
-/// hold enough digits, but many readers do not. `None` where nothing is lost.
+/// Returns the warning for a mesh far from the origin in a format that keeps absolute positions: the files hold
+/// enough digits, but many readers do not. `None` if no precision is lost.
 pub(super) fn distance_warning(mesh: &Mesh, file_from_mesh: &Similarity, ending: &str) -> Option<String> {
     let (center, size, far) = middle(placed_box(mesh, file_from_mesh));
     let away = center.abs().max_element();
-    // the distance between neighbouring numbers of f32
+    // the distance between neighbouring f32 values
     let step = 2f64.powf(away.log2().floor() - 23.0);
     (far && away.is_finite()).then(|| {
         format!(
@@ -285,9 +287,9 @@ pub(super) fn distance_warning(mesh: &Mesh, file_from_mesh: &Similarity, ending:
     })
 }
 
-/// Gives every normal that is zero or not finite the area-weighted mean of its faces, or +Y.
+/// Replaces every normal that is zero or not finite by the area-weighted mean of its faces, or +Y.
 fn repair_normals(normals: &mut [Vec3], positions: &[Vec3], triangles: &[[u32; 3]]) {
-    // turned and normalized before: unit or zero, or NaN
+    // already turned and normalized: unit, zero or NaN
     let bad: Vec<bool> = normals.iter().map(|n| *n == Vec3::ZERO || n.is_nan()).collect();
     if !bad.contains(&true) {
         return;
@@ -322,7 +324,7 @@ pub(crate) fn turn_to_y_up(up: Vec3) -> Result<DMat3> {
     Ok(DMat3::IDENTITY + skew + skew * skew * (1.0 / (1.0 + u.y)))
 }
 
-/// A picture as a file: its bytes and its ending.
+/// Returns an encoded picture: its bytes and its file extension.
 pub(super) fn encode(
     what: &str,
     picture: &Photo,
@@ -336,7 +338,7 @@ pub(super) fn encode(
     }
 }
 
-/// A name, of a file too, that every reader of OBJ and MTL understands.
+/// Returns a name, also for files, that every reader of OBJ and MTL understands.
 pub(super) fn safe_name(name: &str) -> String {
     let safe = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
     let name: String = name.trim().chars().map(safe).collect();
@@ -345,7 +347,7 @@ pub(super) fn safe_name(name: &str) -> String {
     if name.is_empty() { "mesh".into() } else { name.into() }
 }
 
-/// Says what a format without a place for it leaves out of a texture.
+/// Returns a warning about the parts of a texture that the format leaves out.
 pub(super) fn left_out(texture: Option<&HeadTexture>, ending: &str) -> Vec<String> {
     let mut warnings = Vec::new();
     if texture.is_some_and(|t| t.normal.is_some()) {
@@ -360,28 +362,28 @@ pub(super) fn left_out(texture: Option<&HeadTexture>, ending: &str) -> Vec<Strin
     warnings
 }
 
-/// The texture of a mesh: where its triangles lie, and the pictures they lie in.
+/// The texture of a mesh: its texture coordinates and pictures.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeadTexture {
-    /// Where the triangles lie in the pictures.
+    /// The texture coordinates.
     pub atlas: Atlas,
     /// Base color, sRGB-coded; its alpha is not written.
     pub color: Photo,
     /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents of
     /// [`tangents()`]. GLB only.
     pub normal: Option<Photo>,
-    /// What depends on the view. GLB only.
+    /// View-dependent color. GLB only.
     pub lobes: Option<Lobes>,
 }
 
 /// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lobes {
-    /// One picture a spherical-harmonic function; a byte `b` is `(b − 128) / 127 · scale`.
+    /// One picture per spherical-harmonic function; a byte `b` stands for `(b − 128) / 127 · scale`.
     pub pictures: Vec<Photo>,
     /// Scale of each, sRGB-coded.
     pub scale: Vec<f32>,
-    /// From directions of the dataset's world to those of the exported files.
+    /// Rotates directions of the dataset's world to those of the exported files.
     pub asset_from_world: Mat3,
 }
 
@@ -391,12 +393,12 @@ impl HeadTexture {
         HeadTexture { atlas, color, normal: None, lobes: None }
     }
 
-    /// The pictures of the lobes, if there are any.
+    /// Returns the pictures of the lobes, if the texture has any.
     pub(super) fn lobe_pictures(&self) -> &[Photo] {
         self.lobes.as_ref().map_or(&[], |l| &l.pictures)
     }
 
-    /// Every picture is whole, and of the atlas's shape; its scale is free.
+    /// Checks that every picture is complete and has the atlas's aspect ratio; its scale is free.
     fn check_pictures(&self) -> Result<()> {
         self.check("base color", &self.color)?;
         self.normal.as_ref().map_or(Ok(()), |normal| self.check("normal map", normal))?;
@@ -420,7 +422,7 @@ impl HeadTexture {
 
 const DAMAGED: &str = "the mesh is damaged; extract it again";
 
-/// Every triangle names vertices that are there.
+/// Checks that every triangle's indices are valid.
 fn check_indices(mesh: &Mesh) -> Result<()> {
     let vertices = mesh.positions.len();
     for (triangle, t) in mesh.triangles.iter().enumerate() {
@@ -432,7 +434,7 @@ fn check_indices(mesh: &Mesh) -> Result<()> {
     Ok(())
 }
 
-/// The atlas belongs to this mesh, and stays on its texture.
+/// Checks that the atlas belongs to this mesh and lies within its texture.
 fn check_atlas(mesh: &Mesh, atlas: &Atlas) -> Result<()> {
     let wrong = |what: String| {
         Err(Error::cannot(what, "the atlas is damaged or belongs to another mesh; unwrap it again"))
@@ -459,35 +461,34 @@ fn check_atlas(mesh: &Mesh, atlas: &Atlas) -> Result<()> {
     }
 }
 
-/// Normals or colors for some vertices only.
+/// Returns an error if only some vertices have normals or colors.
 pub(super) fn wrong_length(found: usize, what: &str, vertices: usize) -> Error {
     Error::cannot(format!("{found} {what} for {vertices} vertices"), DAMAGED)
 }
 
-/// A coordinate that is NaN or infinite, as it is or after turning and scaling.
+/// Returns an error if a coordinate is NaN or infinite, before or after turning and scaling.
 fn not_finite(vertex: usize, what: &str, found: String) -> Error {
     let what = format!("vertex {vertex} has the {what} {found}, which is not finite in single precision");
     Error::cannot(what, DAMAGED)
 }
 
-/// An up direction without direction, or a unit without size.
+/// Returns an error for an up direction without direction, or a unit without size.
 fn wrong_option(what: &str, found: impl ToString, expected: &str) -> Error {
     let hint = "set it in the configuration, or leave it to the capture";
     Error::cannot(format!("`{what}` is {}, expected {expected}", found.to_string()), hint)
 }
 
-/// A picture that does not fit its own size or the atlas.
+/// Returns an error if a picture does not fit its own size or the atlas.
 fn wrong_picture(what: &str, found: String, expected: &str) -> Error {
     let hint = "bake it again, for this atlas";
     Error::cannot(format!("the {what} is {found}, expected {expected}"), hint)
 }
 
-/// Returns the tangent at each corner of each triangle: `xyz` unit, `w` ±1. Corners of a vertex agree within
-/// a chart.
+/// Returns the tangent at each corner of each triangle: `xyz` unit, `w` ±1. Corners of a vertex agree within a chart.
 ///
 /// # Errors
 ///
-/// The atlas does not belong to the mesh, or the mesh has no normals.
+/// Fails if the atlas does not belong to the mesh, or if the mesh has no normals.
 pub fn tangents(mesh: &Mesh, atlas: &Atlas) -> Result<Vec<[Vec4; 3]>> {
     check_atlas(mesh, atlas)?;
     let (found, vertices) = (mesh.normals.len(), mesh.positions.len());
@@ -498,7 +499,7 @@ pub fn tangents(mesh: &Mesh, atlas: &Atlas) -> Result<Vec<[Vec4; 3]>> {
     Ok(tangents_of(&mesh.positions, &mesh.normals, &mesh.triangles, &atlas.uvs, &atlas.triangles))
 }
 
-/// [`tangents`] of parts whose indices are known to be right.
+/// Computes [`tangents`] of parts whose indices have been checked.
 fn tangents_of(
     positions: &[Vec3],
     normals: &[Vec3],
@@ -508,7 +509,7 @@ fn tangents_of(
 ) -> Vec<[Vec4; 3]> {
     let found = vec![[Vec4::ZERO; 3]; triangles.len()];
     let mut input = TangentInput { positions, normals, triangles, uvs, corners, found };
-    // it fails only for a mesh where no triangle has an area; what stays 0 is repaired below
+    // this fails only if no triangle has an area; remaining zeros are repaired below
     let _ = generate_tangents(&mut input);
     let mut found = input.found;
     for (tangents, vertices) in found.iter_mut().zip(triangles) {
@@ -519,8 +520,8 @@ fn tangents_of(
     found
 }
 
-/// Unit and across the normal, whatever came: triangles without area in the texture have no
-/// direction of their own.
+/// Makes tangents unit and perpendicular to the normal. Triangles without area in the texture have no direction of
+/// their own.
 fn repaired(tangent: Vec4, normal: Vec3) -> Vec4 {
     let across = tangent.truncate().reject_from(normal);
     let unit = if tangent.is_finite() && across.length() > 1e-4 {
@@ -569,8 +570,8 @@ impl Geometry for TangentInput<'_> {
     }
 }
 
-/// Returns for each vertex the number of its position, in order of first use, and those positions: files with a
-/// texture repeat vertices at seams. −0 is 0.
+/// Returns for each vertex the index of its unique position, in order of first use, and these positions: files with a
+/// texture repeat vertices at seams. −0 equals 0.
 pub(super) fn places(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
     let mut numbers: HashMap<[u32; 3], u32> = HashMap::with_capacity(mesh.positions.len());
     let mut welded = Vec::new();
@@ -585,8 +586,8 @@ pub(super) fn places(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
     (places, welded)
 }
 
-/// Returns the mesh with equal positions merged, −0 being 0. Triangles keep their number and order, so an atlas
-/// stays parallel to them; those that fold are kept too.
+/// Returns the mesh with equal positions merged, where −0 equals 0. Triangles keep their number and order, so an
+/// atlas stays parallel to them; degenerate ones are kept too.
 ///
 /// A merged vertex has the color of its first copy, and their common normal; copies that disagree, as
 /// on creases, get the unit of their sum.

@@ -10,18 +10,17 @@
 //!
 //! # Soft layers
 //!
-//! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node that anybody can hide: one
+//! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node that users can hide: one
 //! primitive each, the innermost first, blended, with the mesh's base color times the alpha of `COLOR_0`, their back
-//! faces not drawn. glTF knows no order of drawing: they look right where primitives are drawn as they stand in the
-//! file, after all that is opaque. Their material says `"extras": { "tiface": { "soft_layers": 2 } }`.
+//! faces not drawn. glTF defines no drawing order: the layers look right where primitives are drawn in the file's
+//! order, after all opaque ones. Their material says `"extras": { "tiface": { "soft_layers": 2 } }`.
 //!
 //! # Textures that depend on the view
 //!
-//! A texture that nothing refers to may be dropped by any tool, and the Khronos validator says so for
-//! one that is named in `extras` alone. So each lobe is the base color of a material of its own, which
-//! the primitive offers as a variant (`KHR_materials_variants`). Viewers show the first material
-//! unless somebody asks for a variant, and those that know nothing of variants always do. The first
-//! material says how to use them:
+//! Tools may drop a texture that nothing refers to, and the Khronos validator warns about a texture that only
+//! `extras` refers to. So each lobe is the base color of a material of its own, which the primitive offers as a
+//! variant (`KHR_materials_variants`). Viewers show the first material unless the user selects a variant; viewers
+//! without support for variants always do. The first material says how to use the lobes:
 //!
 //! ```json
 //! "extras": { "tiface": { "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ],
@@ -30,7 +29,7 @@
 //!
 //! # The document
 //!
-//! A glTF document as it grows, with the bytes it speaks of: accessors, pictures, the GLB around them.
+//! A glTF document under construction, with its binary data: accessors, pictures, and the GLB container.
 //!
 //! Every accessor has a view of its own, at a multiple of four bytes; `min` and `max` are the stored
 //! numbers themselves. Views of pictures carry neither target nor stride.
@@ -59,8 +58,8 @@ use std::collections::BTreeMap;
 ///
 /// # Errors
 ///
-/// There is nothing to write, the mesh is damaged, texture and mesh do not belong together, an option makes no
-/// sense, or the file would pass 4 GiB.
+/// Fails if the mesh is empty or damaged, if texture and mesh do not belong together, if an option is invalid, or if
+/// the file would exceed 4 GiB.
 ///
 /// # Examples
 ///
@@ -132,7 +131,7 @@ pub fn to_glb(
     finish(document, &file, main, variants, layers, options)
 }
 
-/// Soft layers as a glTF mesh; see the head of this file. `None` where nothing of them shows.
+/// Writes soft layers as a glTF mesh; see the head of this file. `None` if no layer is visible.
 fn soft_layers(
     document: &mut GlbDocument,
     file: &FileMesh,
@@ -149,7 +148,7 @@ fn soft_layers(
     if part.triangles.is_empty() {
         return None;
     }
-    // all but places and opacity is the same for all layers; who lights nothing needs no normals
+    // all layers share everything but positions and opacity; an unlit material needs no normals
     let indices = document.indices(&part.triangles, part.positions.len());
     let uvs = (!part.uvs.is_empty()).then(|| document.floats(&part.uvs));
     let normals = (!options.unlit).then(|| document.floats(&part.normals));
@@ -194,7 +193,7 @@ fn lobe_name(k: usize) -> String {
     format!("lobe {k}")
 }
 
-/// One material for each lobe, offered by the primitive as variants.
+/// Adds one material for each lobe, offered by the primitive as variants.
 fn variants(
     document: &mut GlbDocument,
     lobes: &[Index<json::Texture>],
@@ -215,7 +214,7 @@ fn variants(
     mesh::KhrMaterialsVariants { mappings }
 }
 
-/// What the first material says of the lobes; see the head of this file.
+/// Returns the first material's `extras` about the lobes; see the head of this file.
 fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> json::Extras {
     let list = textures.iter().enumerate().map(|(i, texture)| {
         json!({"name": lobe_name(i), "texture": texture.value(), "material": i + 1, "variant": i})
@@ -232,7 +231,7 @@ fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> json::Extras 
     extras(notes)
 }
 
-/// Notes of ours on a material.
+/// Returns our `extras` of a material.
 pub(super) fn extras(notes: Value) -> json::Extras {
     let text = json!({ "tiface": notes }).to_string();
     Some(json::extras::RawValue::from_string(text).expect("a value is valid JSON"))
@@ -252,7 +251,7 @@ fn material(options: &ExportOptions, name: String) -> Material {
     }
 }
 
-/// Puts the mesh under its material and packs the file.
+/// Adds the mesh with its material and packs the file.
 fn finish(
     mut document: GlbDocument,
     file: &FileMesh,
@@ -283,7 +282,7 @@ fn finish(
     if options.unlit {
         document.root.extensions_used.push("KHR_materials_unlit".into());
     }
-    // within f32's reach its shortest digits will do
+    // within f32's precision its shortest digits suffice
     document.placed = file.is_far().then_some((node, file.translation, 1.0));
     document.pack()
 }
@@ -322,7 +321,7 @@ pub(super) struct GlbDocument {
 }
 
 impl GlbDocument {
-    /// A view of bytes at a multiple of four.
+    /// Adds a view of bytes at a multiple of four.
     fn view(
         &mut self,
         bytes: &[u8],
@@ -344,7 +343,8 @@ impl GlbDocument {
         view
     }
 
-    /// Elements of so many bytes each, or the accessor that has the same already: layers around a mesh have its corners.
+    /// Adds elements of so many bytes each, or returns an existing accessor with the same bytes: layers around a mesh
+    /// share its corners.
     fn accessor(
         &mut self,
         bytes: &[u8],
@@ -389,8 +389,8 @@ impl GlbDocument {
         self.accessor(bytes_of(values), size_of::<T>(), kind, false)
     }
 
-    /// Vectors of integers that stand for 0..=1, or −1..=1 where they have a sign, a multiple of four bytes each; those of
-    /// three have a fourth component that is not read.
+    /// Adds vectors of integers that stand for 0..=1, or −1..=1 if signed, padded to a multiple of four bytes;
+    /// vectors of three have a fourth component that is not read.
     pub fn normalized<T: bytemuck::NoUninit>(
         &mut self,
         values: &[T],
@@ -400,7 +400,7 @@ impl GlbDocument {
         self.accessor(bytes_of(values), size_of::<T>(), (component, type_), true)
     }
 
-    /// Says the bounds of an accessor, which positions must do.
+    /// Sets the bounds of an accessor, which are mandatory for positions.
     pub fn bound(&mut self, accessor: Index<Accessor>, bounds: [impl Into<Value>; 2]) {
         let [min, max] = bounds.map(|bound| Some(bound.into()));
         let accessor = &mut self.root.accessors[accessor.value()];
@@ -425,7 +425,7 @@ impl GlbDocument {
         self.accessor(bytes_of(flat), 4, (ComponentType::U32, Type::Scalar), false)
     }
 
-    /// A picture inside the file: filtered smoothly, not repeated.
+    /// Adds a picture as a texture that is filtered smoothly and not repeated.
     pub fn texture(&mut self, name: Option<String>, bytes: &[u8], mime: &str) -> Index<Texture> {
         if self.root.samplers.is_empty() {
             self.root.push(Sampler {
@@ -454,14 +454,14 @@ impl GlbDocument {
         })
     }
 
-    /// Makes a scene of a node, which is the one that viewers show.
+    /// Makes a scene of a node, which viewers show by default.
     pub fn show(&mut self, node: Index<gltf::json::Node>) {
         let (extensions, extras) = Default::default();
         let scene = gltf::json::Scene { nodes: vec![node], name: None, extensions, extras };
         self.root.scene = Some(self.root.push(scene));
     }
 
-    /// The document and its bytes as one file.
+    /// Returns the document and its bytes as one file.
     pub fn pack(mut self) -> Result<Vec<u8>> {
         self.root.asset.generator = Some(concat!("tiface ", env!("CARGO_PKG_VERSION")).into());
         self.root.push(gltf::json::Buffer {
@@ -495,7 +495,7 @@ impl GlbDocument {
     }
 }
 
-/// A texture as a material names it.
+/// Returns a material's reference to a texture.
 pub(super) fn info(index: Index<Texture>) -> Info {
     Info { index, tex_coord: 0, extensions: None, extras: Default::default() }
 }
@@ -679,7 +679,7 @@ mod tests {
         let surface = |glb: &[u8]| read(glb, Path::new("a.glb")).unwrap();
         assert_eq!(surface(&glb), surface(&bare));
         let json = json_of(&glb);
-        // whoever takes the first mesh or node takes the head
+        // readers that take the first mesh or node get the head
         assert_eq!(json["nodes"][0]["children"], json!([1]));
         assert_eq!((&json["nodes"][1]["mesh"], &json["scenes"][0]["nodes"]), (&json!(1), &json!([0])));
         let layers = json["meshes"][1]["primitives"].as_array().unwrap();

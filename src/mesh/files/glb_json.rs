@@ -1,7 +1,7 @@
-//! What is read of a GLB's JSON: the surface, where its nodes put it, and its base color.
+//! The parts of a GLB's JSON that are read: the surface, its nodes' transforms, and its base color.
 //!
-//! Nothing else in the file can refuse it, and numbers are f64: a node may stand kilometres from the origin, where
-//! the f32 of `gltf-json` are half a metre apart.
+//! No other part of the file can cause an error, and numbers are f64: a node may lie kilometres from the origin,
+//! where `gltf-json`'s f32 has steps of half a metre.
 
 use super::source::Source;
 use crate::Result;
@@ -36,10 +36,10 @@ pub(super) struct GlbRoot {
 }
 
 impl GlbRoot {
-    /// The document, with memory bounded before it is parsed.
+    /// Parses the document, after bounding the memory that it may take.
     pub fn parse(json: &[u8], source: Source) -> Result<GlbRoot> {
         let at = "the JSON chunk";
-        // those in strings count too: they are few where a file is no attack
+        // brackets in strings count too, but a file has few unless it is an attack
         let count = |marks: &[u8]| json.iter().filter(|b| marks.contains(b)).count();
         let (nested, values) = (count(b"{["), count(b"{[,"));
         if nested > MOST_NESTED || values > MOST_VALUES {
@@ -85,7 +85,7 @@ pub(super) struct GlbBuffer {
 #[derive(Deserialize)]
 pub(super) struct GlbMesh {
     pub primitives: Vec<GlbPrimitive>,
-    /// Of morph targets, where a node has none of its own.
+    /// Weights of morph targets, for nodes that have none of their own.
     #[serde(default)]
     pub weights: Value,
 }
@@ -123,7 +123,7 @@ struct GlbNodeExtensions {
 }
 
 impl GlbNode {
-    /// What puts the triangles of its mesh elsewhere than their accessors and the nodes' transforms say.
+    /// Features that move the triangles of a mesh away from their accessors and the nodes' transforms.
     pub fn deformation(&self, mesh: &GlbMesh) -> Option<&'static str> {
         let weights = self.weights.as_deref().unwrap_or(&mesh.weights);
         let is_morphed = mesh.primitives.iter().any(|p| p.targets.is_some())
@@ -136,7 +136,7 @@ impl GlbNode {
         found.into_iter().find_map(|(is_there, name)| is_there.then_some(name))
     }
 
-    /// From the node's coordinates to its parent's.
+    /// Returns the transform from the node's coordinates to its parent's.
     pub fn parent_from_node(&self) -> DMat4 {
         if let Some(matrix) = &self.matrix {
             return DMat4::from_cols_array(matrix);
@@ -165,7 +165,7 @@ pub(super) struct GlbMaterial {
 }
 
 impl GlbMaterial {
-    /// Does it say that it is of the soft layers around a mesh?
+    /// Whether the material says that it belongs to the soft layers around a mesh.
     pub fn is_soft_layer(&self) -> bool {
         self.extras["tiface"]["soft_layers"].is_u64()
     }
@@ -175,12 +175,12 @@ impl GlbMaterial {
 #[serde(rename_all = "camelCase", default)]
 pub(super) struct GlbPbr {
     pub base_color_texture: Option<GlbTextureUse>,
-    /// What colors and texture are multiplied with, whatever stands there.
+    /// Factors of colors and texture, whatever the JSON contains.
     pub base_color_factor: Value,
 }
 
 impl GlbPbr {
-    /// Linear red, green and blue that colors are multiplied with, if that says something.
+    /// Returns the linear red, green and blue factors of colors, if they are not all 1.
     pub fn tint(&self) -> Option<[f32; 3]> {
         let [r, g, b] = [0, 1, 2].map(|k| self.base_color_factor[k].as_f64().map(|v| v as f32));
         let tint = [r?, g?, b?];
@@ -188,7 +188,7 @@ impl GlbPbr {
     }
 }
 
-/// A texture as a material names it.
+/// A material's reference to a texture.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct GlbTextureUse {
@@ -219,7 +219,7 @@ pub(super) struct GlbImage {
     pub uri: Option<IgnoredAny>,
 }
 
-/// Not a test of reading (those are in `tests/hostile_mesh.rs`), but of where nodes put things.
+/// Tests node transforms; reading is tested in `tests/hostile_mesh.rs`.
 #[cfg(test)]
 mod tests {
     use super::*;

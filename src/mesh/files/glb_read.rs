@@ -1,7 +1,7 @@
-//! GLB → mesh: all triangles of the default scene, moved to where their nodes put them, and their base color.
+//! Reads a GLB: all triangles of the default scene, transformed by their nodes, and their base color.
 //!
-//! `gltf` takes the file apart; what the document names is checked here before it is used. Only what lies in the file
-//! is read: buffers with an address are refused, whatever it is.
+//! `gltf` parses the file; the document's references are checked here before they are used. Only data in the file is
+//! read: buffers with a URI are refused.
 
 use super::glb_json::{GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};
 use super::source::{ParsedMesh, PictureSource, Source};
@@ -15,7 +15,7 @@ use gltf::json::mesh::{Mode, Semantic};
 use gltf::json::validation::Checked::{Invalid, Valid};
 use std::collections::BTreeSet;
 
-/// What allows 8 and 16 bits in more attributes.
+/// The extension that allows 8 and 16 bits in more attributes.
 pub(super) const QUANTIZED: &str = "KHR_mesh_quantization";
 const SHORTENED: [C; 5] = [C::F32, C::I8, C::U8, C::I16, C::U16];
 
@@ -35,7 +35,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     let reader = GlbReader { root: &root, bin: glb.bin.as_deref().unwrap_or_default(), source };
     let mut gathered = Primitives::default();
     reader.each_part(|part| {
-        // soft layers are around the surface, not of it
+        // the soft layers surround the surface and are not part of it
         let material = part.primitive.material.and_then(|m| root.materials.get(m as usize));
         if material.is_some_and(|m| m.is_soft_layer()) {
             Ok(())
@@ -46,7 +46,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
     reader.finish(gathered)
 }
 
-/// The JSON chunk and the binary one.
+/// Returns the JSON chunk and the binary one.
 pub(super) fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
     let word = |at: usize| bytes.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     let (Some(version), Some(total)) = (word(4), word(8)) else {
@@ -67,13 +67,13 @@ pub(super) fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
     Ok(glb)
 }
 
-/// The nodes that were reached and not yet read, with their parents' transforms. Each comes once.
+/// The reachable nodes that are still to be read, with their parents' transforms. Each occurs once.
 struct NodeStack<'a> {
     reached: Vec<bool>,
     nodes: Vec<(u32, &'a GlbNode, DMat4)>,
 }
 
-/// Triangles of the default scene, where their node puts them.
+/// Triangles of the default scene, in their node's position.
 pub(super) struct GlbPart<'a> {
     /// Where in the file, for messages.
     at: String,
@@ -82,30 +82,30 @@ pub(super) struct GlbPart<'a> {
     matrix: DMat4,
 }
 
-/// The mesh as it grows. Normals, colors and texture coordinates survive only if every part has them; or colors if a
-/// material without a texture gives one.
+/// The mesh under construction. Normals, colors and texture coordinates are kept only if every part has them; colors
+/// also if a material without a texture has one.
 #[derive(Default)]
 pub(super) struct Primitives {
     pub positions: Vec<DVec3>,
-    /// The rest of it.
+    /// Everything but the positions.
     pub mesh: Mesh,
-    /// Of the vertices' colors; those of parts that have any.
+    /// Factors of the vertices' colors, for parts that have any.
     pub alphas: Vec<f32>,
     bare_normals: bool,
     bare_colors: bool,
-    /// Has a material without a texture given a color?
+    /// Whether a material without a texture has a color.
     tinted: bool,
     /// One for each vertex.
     pub uvs: Vec<Vec2>,
     bare_uvs: bool,
     /// The base colors of the parts; `None` for a part without.
     textures: BTreeSet<Option<u32>>,
-    /// What those of parts with a texture are multiplied with.
+    /// Factors of the parts with a texture.
     tints: Vec<Option<[f32; 3]>>,
 }
 
 impl Primitives {
-    /// Do its vertices have colors or opacity of their own?
+    /// Whether the vertices have colors or opacity of their own.
     pub fn is_colored(&self) -> bool {
         !self.bare_colors || self.tinted
     }
@@ -118,7 +118,7 @@ pub(super) struct GlbReader<'a> {
 }
 
 impl<'a> GlbReader<'a> {
-    /// What an index names.
+    /// Looks up an index of the document.
     fn get<T>(&self, what: &str, all: &'a [T], index: u32) -> Result<&'a T> {
         all.get(index as usize).ok_or_else(|| {
             let count = all.len();
@@ -126,7 +126,7 @@ impl<'a> GlbReader<'a> {
         })
     }
 
-    /// Puts nodes on the stack, the first on top.
+    /// Pushes nodes on the stack, the first on top.
     fn push(&self, nodes: &[u32], parent: DMat4, tree: &mut NodeStack<'a>) -> Result<()> {
         for &index in nodes.iter().rev() {
             let node = self.get("node", &self.root.nodes, index)?;
@@ -194,7 +194,7 @@ impl<'a> GlbReader<'a> {
         }
     }
 
-    /// Gives `visit` all parts with triangles, in the order of the scene.
+    /// Calls `visit` for all parts with triangles, in the order of the scene.
     pub fn each_part(&self, mut visit: impl FnMut(&GlbPart<'a>) -> Result<()>) -> Result<()> {
         let root = self.root;
         if root.nodes.is_empty() {
@@ -415,7 +415,7 @@ impl<'a> GlbReader<'a> {
         Ok((numbers, width))
     }
 
-    /// The bytes of a buffer view, and the stride it gives its elements.
+    /// Returns the bytes of a buffer view, and the stride it gives its elements.
     fn view(&self, index: u32) -> Result<(&'a [u8], Option<usize>)> {
         let source = self.source;
         let view = self.get("buffer view", &self.root.buffer_views, index)?;
@@ -437,7 +437,7 @@ impl<'a> GlbReader<'a> {
         }
     }
 
-    /// The base color texture of a material, if it has one.
+    /// Returns the base color texture of a material, if it has one.
     pub fn base_color(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
         let Some(index) = material else { return Ok(None) };
         let material = self.get("material", &self.root.materials, index)?;
@@ -448,8 +448,8 @@ impl<'a> GlbReader<'a> {
         Ok(info)
     }
 
-    /// The picture behind a texture, and its size in the atlas. Its header is checked against the
-    /// limits for pictures; it is not decoded.
+    /// Returns the picture behind a texture, and its size in the atlas. Its header is checked against the limits for
+    /// pictures; it is not decoded.
     pub fn picture(&self, texture: u32, atlas: Option<&mut Atlas>) -> Result<PictureSource> {
         let source = self.source;
         let Some(index) = self.get("texture", &self.root.textures, texture)?.source else {

@@ -33,8 +33,7 @@ use std::path::Path;
 ///
 /// # Errors
 ///
-/// There is nothing to write, the mesh is damaged, texture and mesh do not belong together, or an option makes no
-/// sense.
+/// Fails if the mesh is empty or damaged, if texture and mesh do not belong together, or if an option is invalid.
 pub fn to_obj(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOptions) -> Result<ExportedFiles> {
     let file_from_mesh = options.file_from_mesh()?;
     let mut file = FileMesh::new(mesh, texture, &file_from_mesh)?;
@@ -90,7 +89,7 @@ fn write(out: &mut Vec<u8>, file: &FileMesh, stem: &str, name: &str) -> std::io:
     Ok(())
 }
 
-/// `v` with colors where there are any, then `vn`.
+/// Writes `v`, with colors if the mesh has any, then `vn`.
 fn write_vertices(out: &mut Vec<u8>, mesh: &FileMesh) -> std::io::Result<()> {
     out.reserve(mesh.positions.len() * 60 + mesh.triangles.len() * 30);
     let size = Aabb::around(mesh.positions.iter().copied()).size().max_element();
@@ -113,7 +112,7 @@ fn write_vertices(out: &mut Vec<u8>, mesh: &FileMesh) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Shortest digits that give the same f32 back; with an exponent where zeros would fill the line.
+/// A number displayed by the shortest digits that give the same f32 back; with an exponent if zeros would fill the line.
 struct Short(f32);
 
 impl std::fmt::Display for Short {
@@ -127,19 +126,19 @@ impl std::fmt::Display for Short {
     }
 }
 
-/// The mesh as it grows.
+/// The mesh under construction.
 #[derive(Default)]
 struct Obj {
     positions: Vec<DVec3>,
     /// Colors and triangles.
     mesh: Mesh,
     normals: Vec<Vec3>,
-    /// Which normal each vertex was used with, if any.
+    /// Index of the normal that each vertex was used with, if any.
     normal_of: Vec<Option<u32>>,
-    /// Did a vertex get two normals, as on a crease, or none?
+    /// Whether a vertex has two normals, as on a crease, or none.
     creased: bool,
     atlas: Atlas,
-    /// Does a face lack texture coordinates?
+    /// Whether a face lacks texture coordinates.
     bare: bool,
     library: Option<String>,
     material: Option<String>,
@@ -253,8 +252,8 @@ impl Obj {
     }
 }
 
-/// The lines with their numbers. One that ends with a backslash goes on in the next, under its own number; what is
-/// in a comment does not.
+/// Returns the lines with their numbers. A line that ends with a backslash continues in the next, under its own
+/// number; a comment does not.
 fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     let mut lines = bytes.split(|&b| b == b'\n').map(|line| line.trim_ascii()).zip(1..);
     std::iter::from_fn(move || {
@@ -274,12 +273,11 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     })
 }
 
-/// The bare name of the picture that a `.mtl` file gives as its base color (`map_Kd`), if any.
+/// Returns the bare name of the picture that a `.mtl` file gives as its base color (`map_Kd`), if any.
 ///
 /// # Errors
 ///
-/// It lies in another folder or behind an address, comes
-/// with options, or there are several.
+/// Fails if the picture lies in another folder or behind a URL, has options, or is one of several.
 pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>> {
     let source = Source { path, format: "MTL", options: &ReadOptions::default() };
     let mut found: Option<String> = None;

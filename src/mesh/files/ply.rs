@@ -24,12 +24,12 @@ use crate::geom::{Atlas, Mesh};
 use crate::image::quantize;
 use glam::{DVec3, Vec2, Vec3};
 
-/// Returns a mesh as a `.ply`, colored by its vertices; with a texture split at seams, and its picture beside it. Of
-/// the options `up` and `unit_m` do not matter.
+/// Returns a mesh as a `.ply`, colored by its vertices; a textured mesh is split at seams, with its picture beside
+/// it. The options `up` and `unit_m` do not matter.
 ///
 /// # Errors
 ///
-/// There is nothing to write, the mesh is damaged, or texture and mesh do not belong together.
+/// Fails if the mesh is empty or damaged, or if texture and mesh do not belong together.
 pub fn to_ply(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOptions) -> Result<ExportedFiles> {
     let world_from_mesh = &options.world_from_mesh;
     let file = FileMesh::new(mesh, texture, world_from_mesh)?.split(false);
@@ -141,7 +141,7 @@ impl Scalar {
         }
     }
 
-    /// What white is, for colors.
+    /// Returns the value of white, for colors.
     fn white(self) -> f64 {
         match self {
             Scalar::U8 => 255.0,
@@ -154,7 +154,7 @@ impl Scalar {
 struct Property {
     name: String,
     item: Scalar,
-    /// Of a list: the type of its length.
+    /// The type of a list's length.
     length: Option<Scalar>,
 }
 
@@ -196,16 +196,16 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
 struct Header {
     order: Order,
     elements: Vec<Element>,
-    /// Where the body begins.
+    /// Offset of the body.
     start: usize,
-    /// Of `comment TextureFile`, as MeshLab writes it.
+    /// The picture named by `comment TextureFile`, as MeshLab writes it.
     picture: Option<String>,
 }
 
 fn header(bytes: &[u8], source: Source) -> Result<Header> {
     let (mut order, mut elements, mut at) = (None, Vec::<Element>::new(), 0);
     let mut picture = None;
-    // All lines end as the first one does: what follows the last may be any byte, a line feed too.
+    // All lines end as the first one does: the byte after the last line end may be anything, also a line feed.
     let end = bytes.iter().position(|b| b"\r\n".contains(b)).unwrap_or(0);
     let ending: &[u8] = match bytes.get(end..) {
         Some([b'\r', b'\n', ..]) => b"\r\n",
@@ -275,7 +275,7 @@ fn header(bytes: &[u8], source: Source) -> Result<Header> {
     unreachable!("the loop over line numbers only returns")
 }
 
-/// What follows the header, and how far it was read.
+/// The body after the header, with the reading position.
 struct Body<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -284,7 +284,7 @@ struct Body<'a> {
 }
 
 impl Body<'_> {
-    /// Can the bytes that remain hold this element at all? Asked before anything is reserved.
+    /// Whether the remaining bytes can hold this element at all. Checked before any allocation.
     fn check(&self, element: &Element) -> Result<()> {
         let sizes = element.properties.iter().map(|p| match self.order {
             Order::Text => 1, // one digit; the spaces are extra
@@ -360,7 +360,7 @@ impl Body<'_> {
     }
 }
 
-/// Adds the vertices; their texture coordinates come back, if wanted and there.
+/// Adds the vertices; returns their texture coordinates if they are wanted and present.
 fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<Option<Vec<Vec2>>> {
     let source = body.source;
     source.allow(element.count, 0)?;
@@ -420,8 +420,8 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<
     Ok(uvs)
 }
 
-/// Adds the triangles of polygons, which are fanned, or of strips: there each corner makes a triangle with the two
-/// before it, wound the other way every other time, and −1 starts anew.
+/// Adds the triangles of polygons, which are fanned, or of strips, where each corner forms a triangle with the two
+/// before it, with alternating winding, and −1 starts a new strip.
 fn triangles(body: &mut Body, element: &Element, out: &mut Vec<[u32; 3]>) -> Result<()> {
     let (source, strips) = (body.source, element.name == "tristrips");
     let is_list =
@@ -432,7 +432,7 @@ fn triangles(body: &mut Body, element: &Element, out: &mut Vec<[u32; 3]>) -> Res
     };
     source.allow(0, if strips { 0 } else { element.count })?;
     for i in 0..element.count {
-        // how many corners there were, and the two that the next one makes a triangle with
+        // number of corners so far, and the two corners that the next one forms a triangle with
         let (mut corners, mut pair) = (0, [0, 0]);
         let mut corner = |v: f64| {
             if strips && v == -1.0 {
@@ -446,7 +446,7 @@ fn triangles(body: &mut Body, element: &Element, out: &mut Vec<[u32; 3]>) -> Res
             }
             let ([a, b], c) = (pair, v as u32);
             corners += 1;
-            // corners of a strip that repeat only carry it on
+            // repeated corners of a strip only continue it
             if corners > 2 && !(strips && (a == b || b == c || c == a)) {
                 source.allow(0, out.len() + 1)?;
                 out.push(if strips && corners % 2 == 0 { [b, a, c] } else { [a, b, c] });

@@ -1,8 +1,8 @@
-//! Meshes from files others wrote: GLB, PLY and OBJ, from bytes.
+//! Reading of meshes from files of other programs: GLB, PLY and OBJ, from bytes.
 //!
-//! [`read`] gives the surface, [`read_with`] also its texture. What the bytes are decides, not the name. Every
-//! count is compared with the bytes that remain before anything is reserved, no other file is opened, and numbers
-//! that are not finite are refused.
+//! [`read`] returns the surface, [`read_with`] also its texture. The format is detected from the bytes, not from the
+//! name. Every count is compared with the remaining bytes before any allocation, no other file is opened, and
+//! non-finite numbers are refused.
 //!
 //! Positions are read in f64. Those of a mesh far from the origin, where f32 steps over its triangles, come around
 //! an origin of their own, see [`ReadMesh::origin`].
@@ -24,12 +24,11 @@ use std::path::{Path, PathBuf};
 pub struct ReadMesh {
     /// The surface, its positions relative to `origin`.
     pub mesh: Mesh,
-    /// Where in the file's coordinates the mesh's are 0: the middle of a mesh that lies more than fifteen of its
-    /// sizes from the file's origin, else that.
+    /// The origin of the mesh in the file's coordinates: the center of a mesh that lies more than fifteen of its
+    /// sizes from the file's origin, else that origin.
     pub origin: DVec3,
-    /// Where its triangles lie in the texture, if the file says so for all of them. The size is that
-    /// of the picture in the file, else 0 × 0. Coordinates are finite; in files of others they may
-    /// leave 0..=1, where a texture repeats.
+    /// Texture coordinates, if the file has them for all triangles. The size is that of the picture in the file, else
+    /// 0 × 0. Coordinates are finite; in files of other programs they may leave 0..=1, where a texture repeats.
     pub atlas: Option<Atlas>,
     /// The base color.
     pub picture: Option<PictureSource>,
@@ -45,8 +44,8 @@ pub struct ReadMesh {
 ///
 /// # Errors
 ///
-/// The bytes are none of these formats, break its rules, use what is not supported, hold no triangles, or more than
-/// the limits of [`ReadOptions`].
+/// Fails if the bytes are none of these formats, break its rules, use unsupported features, hold no triangles, or
+/// more than the limits of [`ReadOptions`].
 pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh> {
     let ParsedMesh { positions, mesh, .. } = parse(bytes, path, &ReadOptions::SURFACE)?;
     Ok(Mesh { positions: positions.iter().map(|p| p.as_vec3()).collect(), ..mesh })
@@ -56,17 +55,17 @@ pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh> {
 ///
 /// # Errors
 ///
-/// As [`read`]; and when the texture is wanted but broken, lies outside the file and its folder, or when there are
-/// several.
+/// Fails like [`read`], and when the texture is wanted but broken, lies outside the file and its folder, or when
+/// there are several textures.
 pub fn read_with(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
     let ParsedMesh { positions, mut mesh, atlas, picture, tint } = parse(bytes, path, options)?;
-    // the box of what is shown: loose vertices may be anywhere
+    // the box of the used vertices: loose ones may be anywhere
     let corners = mesh.triangles.iter().flatten().map(|&i| positions[i as usize]);
     let (low, high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let (center, _, far) = middle(corners.fold((low, high), |(low, high), p| (low.min(p), high.max(p))));
-    // rounded as export does, so that what it wrote comes back as it was
+    // rounded as export does, so that exported positions are read back exactly
     let origin = if far { center.as_vec3().as_dvec3() } else { DVec3::ZERO };
-    // −0 stays what it was
+    // −0 is kept
     let place = |p: &DVec3| if far { (p - origin).as_vec3() } else { p.as_vec3() };
     mesh.positions = positions.iter().map(place).collect::<Vec<Vec3>>();
     Ok(ReadMesh { mesh, origin, atlas, picture, tint })
@@ -91,7 +90,7 @@ fn parse(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ParsedMesh>
     Ok(found)
 }
 
-/// Does some early line start with a word of OBJ?
+/// Whether some early line starts with a keyword of OBJ.
 fn looks_like_obj(bytes: &[u8]) -> bool {
     let start = &bytes[..bytes.len().min(1 << 16)];
     !start.contains(&0)
@@ -101,22 +100,22 @@ fn looks_like_obj(bytes: &[u8]) -> bool {
         })
 }
 
-/// What a mesh file holds.
+/// The content of a mesh file.
 #[derive(Debug)]
 pub struct OpenedMesh {
     /// The mesh with its texture; the file's coordinates are taken for the world.
     pub head: HeadMesh,
-    /// Where the triangles would lie in a texture that is not there.
+    /// The texture coordinates of a missing texture.
     pub bare_atlas: Option<Atlas>,
-    /// What cannot be shown.
+    /// Features that cannot be shown.
     pub warnings: Vec<String>,
 }
 
-/// The picture that lies beside a mesh file; `None` where the file names none, or has it inside.
+/// Returns the picture beside a mesh file; `None` if the file names none, or contains it.
 ///
 /// # Errors
 ///
-/// The material file that should name it cannot be read.
+/// Fails if the material file that should name it cannot be read.
 pub fn picture_beside(picture: Option<&PictureSource>, path: &Path) -> Result<Option<PathBuf>> {
     let name = match picture {
         Some(PictureSource::Beside(name)) => Some(name.clone()),
@@ -129,11 +128,11 @@ pub fn picture_beside(picture: Option<&PictureSource>, path: &Path) -> Result<Op
     Ok(name.map(|name| path.with_file_name(name)))
 }
 
-/// Opens a `.glb`, `.obj` or `.ply` file with its texture, and says what of it cannot be shown.
+/// Opens a `.glb`, `.obj` or `.ply` file with its texture, and returns the features that cannot be shown.
 ///
 /// # Errors
 ///
-/// The surface itself cannot be read.
+/// Fails if the surface itself cannot be read.
 pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
     let bytes = io::read_bytes(path, &Limits::default())?;
     let mut warnings = Vec::new();
@@ -173,7 +172,7 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
     })
 }
 
-/// Multiplies the light of a picture.
+/// Multiplies the linear light of a picture.
 fn multiply(photo: &mut Photo, tint: [f32; 3]) {
     let coded = |byte: u8, factor: f32| {
         quantize(srgb_from_linear(linear_from_srgb(f32::from(byte) / 255.0) * factor))

@@ -1,4 +1,4 @@
-//! What the readers of all formats share: which file, how much it may ask for, and what is wrong with it.
+//! Shared parts of the readers: the file, its limits, and its errors.
 
 use crate::geom::{Atlas, Mesh};
 use crate::{Error, Result};
@@ -6,8 +6,8 @@ use glam::DVec3;
 use std::fmt::Display;
 use std::path::Path;
 
-/// What is read of a file, and how much it may ask for. GLB can show one buffer many times, so bytes alone do not
-/// bound it.
+/// Options and limits of reading a file. GLB can reuse one buffer many times, so the number of bytes alone is no
+/// limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadOptions {
     /// Most vertices.
@@ -16,7 +16,7 @@ pub struct ReadOptions {
     pub triangles: usize,
     /// Most bytes of JSON in a GLB. Of them, at most 2²⁰ may be objects or arrays, and 2²² values.
     pub json: usize,
-    /// Also the texture? Else it is passed over, sound or not.
+    /// Whether to read the texture; otherwise it is skipped, valid or not.
     pub texture: bool,
 }
 
@@ -35,7 +35,7 @@ impl Default for ReadOptions {
     }
 }
 
-/// Where the base color of a file is.
+/// Location of a file's base color.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PictureSource {
     /// In the file: PNG or JPEG, for [`crate::io::parse_photo`]. Its header is within the limits for
@@ -47,12 +47,12 @@ pub enum PictureSource {
     Material(String),
 }
 
-/// What a reader finds.
+/// The result of a reader.
 #[derive(Default)]
 pub(super) struct ParsedMesh {
     /// In the file's coordinates.
     pub positions: Vec<DVec3>,
-    /// All but the positions.
+    /// The mesh without its positions.
     pub mesh: Mesh,
     pub atlas: Option<Atlas>,
     pub picture: Option<PictureSource>,
@@ -60,7 +60,7 @@ pub(super) struct ParsedMesh {
     pub tint: Option<[f32; 3]>,
 }
 
-/// Which file is read, as what, and how much it may ask for.
+/// The file being read, its format, and its limits.
 #[derive(Clone, Copy)]
 pub(super) struct Source<'a> {
     pub path: &'a Path,
@@ -70,7 +70,7 @@ pub(super) struct Source<'a> {
 }
 
 impl Source<'_> {
-    /// A file that breaks its own rules.
+    /// Returns the error for a file that breaks its format's rules.
     pub fn broken(&self, at: impl Display, what: impl Display) -> Error {
         let hint = match self.format {
             "GLB" => "export it again; the Khronos validator explains a GLB in detail",
@@ -79,7 +79,7 @@ impl Source<'_> {
         Error::cannot(format!("`{}`, {at}: {what}", self.path.display()), hint)
     }
 
-    /// A file that is right, but beyond this reader.
+    /// Returns the error for a valid file that this reader does not support.
     pub fn unsupported(&self, at: impl Display, feature: impl Display) -> Error {
         let hint = match self.format {
             "GLB" => {
@@ -93,7 +93,7 @@ impl Source<'_> {
         Error::cannot(what, hint)
     }
 
-    /// The name of a file in the same folder: no path, no address.
+    /// Returns the name of a file in the same folder: no path, no URL.
     pub fn bare_name(&self, at: impl Display, name: &str) -> Result<String> {
         let name = name.trim();
         let name = name.strip_prefix("./").unwrap_or(name);
@@ -103,7 +103,7 @@ impl Source<'_> {
         if is_bare { Ok(name.into()) } else { Err(self.unsupported(at, "a texture outside the folder")) }
     }
 
-    /// Are this many vertices and triangles allowed?
+    /// Checks the numbers of vertices and triangles against the limits.
     pub fn allow(&self, vertices: usize, triangles: usize) -> Result<()> {
         let limits = self.options;
         for (what, found, limit) in

@@ -1,8 +1,8 @@
-//! Meshes as tensors, for the stages after this one: in scene coordinates, since the world may lie so far away that
-//! f32 could not hold a head in it.
+//! Meshes as tensors, for later stages: in scene coordinates, because the world may be so far away that f32 could not
+//! represent a head in it.
 //!
-//! - The extracted surface, as the stages after this one find it: what rays are cast at.
-//! - The head mesh: what an artist opens, and what the stages after this one find of it.
+//! - The extracted surface: the target of ray casting.
+//! - The head mesh: the simplified mesh with its texture.
 //!
 //! ```text
 //! geometry.safetensors             the mesh, and where it lies in its texture
@@ -19,7 +19,7 @@ use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Version of the layout; part of what the stage is, so that a mesh of another version is made again.
+/// Version of the layout; part of the stage's fingerprint, so that a mesh of another version is made again.
 pub(crate) const FORMAT: &str = "tiface-mesh-2";
 
 const MAKE_AGAIN: &str = "make the mesh again: `tiface mesh RUN --fresh mesh`";
@@ -36,7 +36,7 @@ pub(super) fn indices(name: &str, values: &[[u32; 3]]) -> Tensor {
     (name.into(), vec![values.len(), 3], TensorValues::U32(values.as_flattened().to_vec()))
 }
 
-/// The tensors of a mesh.
+/// Returns the tensors of a mesh.
 fn geometry(mesh: &Mesh) -> Vec<Tensor> {
     vec![
         floats::<3>("positions", bytemuck::cast_slice(&mesh.positions)),
@@ -46,12 +46,12 @@ fn geometry(mesh: &Mesh) -> Vec<Tensor> {
     ]
 }
 
-/// The version as it stands in a file.
+/// Returns the version as it is written in a file.
 pub(super) fn format() -> BTreeMap<String, String> {
     BTreeMap::from([("format".to_owned(), FORMAT.to_owned())])
 }
 
-/// A file that cannot be used: what is missing or damaged can be made again.
+/// Returns the error for an unusable file: missing or damaged ones can be made again.
 pub(super) fn damaged(e: ReadError) -> Error {
     match &e {
         ReadError::Io { source, .. } if source.kind() != std::io::ErrorKind::NotFound => e.into(),
@@ -59,7 +59,7 @@ pub(super) fn damaged(e: ReadError) -> Error {
     }
 }
 
-/// Tensors that have been read, and where.
+/// Tensors of a file, with its path.
 struct StoredTensors {
     path: PathBuf,
     tensors: BTreeMap<String, (Vec<usize>, TensorValues)>,
@@ -179,18 +179,18 @@ const SURFACE_FILE: &str = "surface.safetensors";
 /// The whole zero level set of a field, in scene coordinates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExtractedSurface {
-    /// Without colors: those of rays are the field's.
+    /// The mesh, without colors, because rays take the field's.
     pub mesh: Mesh,
-    /// What closes it where the box ends.
+    /// The cap that closes it where the box ends.
     pub cap: Option<Cap>,
 }
 
 impl ExtractedSurface {
-    /// Writes it into a folder, which is made if need be.
+    /// Writes the surface into a folder, which is created if necessary.
     ///
     /// # Errors
     ///
-    /// The folder cannot be written to.
+    /// Fails if the folder cannot be written to.
     pub fn save(&self, folder: &Path) -> Result<()> {
         io::create_folder(folder)?;
         let mut tensors = geometry(&self.mesh);
@@ -205,11 +205,11 @@ impl ExtractedSurface {
         Ok(io::write_tensors(&folder.join(SURFACE_FILE), &tensors, &format())?)
     }
 
-    /// Reads it back.
+    /// Reads the surface from a folder.
     ///
     /// # Errors
     ///
-    /// The file is missing, damaged or of another version; the suggested fix is to make it again.
+    /// Fails if the file is missing, damaged or of another version; the suggested fix is to make it again.
     pub fn load(folder: &Path) -> Result<ExtractedSurface> {
         let mut stored = StoredTensors::open(&folder.join(SURFACE_FILE))?;
         let mesh = stored.mesh()?;
@@ -239,7 +239,7 @@ impl ExtractedSurface {
 
 const HEAD_FILE: &str = "geometry.safetensors";
 
-/// Most functions of a spherical-harmonic color.
+/// Maximum number of functions of a spherical-harmonic color.
 const MOST_LOBES: usize = 16;
 
 /// A simplified mesh with its texture.
@@ -247,22 +247,22 @@ const MOST_LOBES: usize = 16;
 pub struct HeadMesh {
     /// The surface in scene coordinates; without a texture it has colors at its vertices.
     pub mesh: Mesh,
-    /// Where the scene sits in the dataset's world.
+    /// The transform from the scene to the dataset's world.
     pub world_from_scene: Similarity,
     /// Its texture, if it has one.
     pub texture: Option<HeadTexture>,
-    /// What views of it add to its base color, if photographs told.
+    /// View-dependent color added to its base color, if it was fitted to photographs.
     pub harmonics: Option<Harmonics>,
     /// Soft layers around it, if they show more of the head.
     pub shells: Option<Shells>,
 }
 
 impl HeadMesh {
-    /// Writes it into a folder, which is made if need be.
+    /// Writes the mesh into a folder, which is created if necessary.
     ///
     /// # Errors
     ///
-    /// The folder cannot be written to.
+    /// Fails if the folder cannot be written to.
     pub fn save(&self, folder: &Path) -> Result<()> {
         io::create_folder(folder)?;
         let mut tensors = geometry(&self.mesh);
@@ -309,11 +309,11 @@ impl HeadMesh {
         Ok(io::write_tensors(&folder.join(HEAD_FILE), &tensors, &metadata)?)
     }
 
-    /// Reads it back.
+    /// Reads the mesh from a folder.
     ///
     /// # Errors
     ///
-    /// Files are missing, damaged or of another version; the suggested fix is to make them again.
+    /// Fails if files are missing, damaged or of another version; the suggested fix is to make them again.
     pub fn load(folder: &Path) -> Result<HeadMesh> {
         let mut stored = StoredTensors::open(&folder.join(HEAD_FILE))?;
         let (mesh, world_from_scene) = (stored.mesh()?, stored.similarity("world_from_scene")?);
@@ -378,7 +378,7 @@ fn load_shells(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Shells> {
     Ok(Shells { layers: offsets.into_iter().zip(alphas).map(layer).collect() })
 }
 
-/// A picture of the texture; all have the size of the first.
+/// Loads a picture of the texture; all have the size of the first.
 fn load_photo(folder: &Path, name: &str, size: Option<(u32, u32)>) -> Result<Photo> {
     let path = folder.join(name);
     let photo = io::read_photo(&path, size, &Limits::default()).map_err(damaged)?;

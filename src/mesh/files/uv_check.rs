@@ -1,4 +1,4 @@
-//! Is this atlas sound, and how good is it? For any mesh with texture coordinates, also from other tools.
+//! Validation and quality of an atlas, for any mesh with texture coordinates, also from other tools.
 //!
 //! Charts are triangles joined across edges whose two sides have equal uv. With Γ ≥ γ the largest and
 //! smallest length that a unit step in the texture has on the surface, both scaled so that texture and
@@ -9,7 +9,7 @@
 //! - area stretch of a triangle: (Γγ + 1 / Γγ) / 2, its angle stretch: (Γ/γ + γ/Γ) / 2 (the parts that Degener,
 //!   Meseth, Klein 2003, §3 split it into); 1 is perfect.
 //!
-//! Texels are square even where the texture is not: all of it is measured in texels.
+//! Texels are square even if the texture is not: all lengths are measured in texels.
 
 use super::file_mesh::places;
 use crate::geom::{
@@ -22,10 +22,10 @@ use serde::Serialize;
 use std::collections::HashMap;
 use std::fmt;
 
-/// A triangle below this area has none, in texels: it is rounding that decides its shape.
+/// Triangles below this area, in texels, count as having none: rounding decides their shape.
 pub const NO_AREA_PX: f64 = 1e-6;
 
-/// What [`uv_check`] found.
+/// The result of [`uv_check`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct UvReport {
     /// Triangles of the mesh.
@@ -79,14 +79,14 @@ impl UvReport {
     /// Charts farther apart than this are not measured.
     pub const FARTHEST_PX: f64 = 128.0;
 
-    /// Can every point of the surface have its own texel? No triangle invalid, overlapping, flipped, without
+    /// Whether every point of the surface has its own texel: no triangle is invalid, overlapping, flipped, without
     /// area or outside.
     pub fn is_sound(&self) -> bool {
         self.overlaps_left == 0
             && self.invalid + self.overlapping + self.flipped + self.zero_area + self.outside == 0
     }
 
-    /// What stands in the way of being sound, for a person.
+    /// Describes the defects of the atlas for the user.
     pub(super) fn faults(&self) -> String {
         let UvReport { overlapping, flipped, zero_area, outside, invalid, .. } = self;
         let (least, left) = bound("at least ", self.overlaps_left, "triangles");
@@ -125,7 +125,7 @@ apart                {apart}, from the border {border:.2} texels
     }
 }
 
-/// How a figure is printed for which so many were not looked at further: what stands before and after it.
+/// Returns the text before and after a figure that is a bound because so many candidates were not compared.
 pub(super) fn bound(which: &'static str, left: usize, of: &str) -> (&'static str, String) {
     if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not looked at further)")) }
 }
@@ -210,8 +210,8 @@ fn is_valid(mesh: &Mesh, atlas: &Atlas, t: usize) -> bool {
         && atlas.triangles[t].iter().all(|&i| atlas.uvs.get(i as usize).is_some_and(|v| v.is_finite()))
 }
 
-/// Length of the seams that look at someone looking from `front` within 45 degrees, over √area: edges whose two
-/// triangles together do, hidden or not.
+/// Returns the length of the seams visible from `front` within 45 degrees, over √area: edges whose two triangles
+/// together face that direction, hidden or not.
 pub fn seams_facing(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
     let valid: Vec<bool> =
         (0..mesh.triangles.len().min(atlas.triangles.len())).map(|t| is_valid(mesh, atlas, t)).collect();

@@ -47,7 +47,7 @@ const MOST_GAIN: f32 = 1.25;
 /// Smoothness of the diffuse color over texels.
 const TEXELS: Smoothness = Smoothness { constant: 0.25, others: 0.0, ridge: 0.0 };
 
-/// Candidates for the smoothness of what depends on the view, over vertices: skin wants the first, hair the second.
+/// Candidates for the smoothness of view-dependent color, over vertices: skin prefers the first, hair the second.
 const VERTICES: [Smoothness; 2] = [
     Smoothness { constant: 0.02, others: 0.05, ridge: 8e-6 },
     Smoothness { constant: 0.25, others: 0.75, ridge: 1e-4 },
@@ -60,34 +60,34 @@ pub struct Appearance {
     pub texels: (Vec<[f32; 3]>, Vec<bool>),
     /// Diffuse color of the vertices, sRGB-coded.
     pub vertices: Vec<[f32; 3]>,
-    /// What depends on the view, if that says something of photographs that were left out.
+    /// View-dependent color, if it improves photographs that were left out.
     pub harmonics: Option<Harmonics>,
-    /// What was done.
+    /// A report of the fit.
     pub report: AppearanceReport,
 }
 
-/// What a fit did.
+/// A report of a fit.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct AppearanceReport {
     /// Pixels of photographs that were fitted to.
     pub pixels: usize,
     /// Share of the nodes that some of them show, 0..=1.
     pub seen: f64,
-    /// Degree of what depends on the view.
+    /// Degree of view-dependent color.
     pub degree: u32,
     /// Weight of its smoothness, if its degree is above 0.
     pub smoothness: f32,
     /// PSNR of photographs left out, dB: diffuse, then per candidate (degree, smoothness, PSNR).
     pub left_out: Vec<(u32, f32, f64)>,
-    /// PSNR of the pixels that were fitted to, dB: before, diffuse, with what depends on the view.
+    /// PSNR of the fitted pixels, dB: before, diffuse, with view-dependent color.
     pub psnr: [f64; 3],
     /// Smallest and largest gain of a photograph.
     pub gains: [f32; 2],
-    /// How long it took.
+    /// Duration of the fit.
     pub seconds: f64,
 }
 
-/// Where colors live, and what they are before the fit, sRGB-coded.
+/// The nodes of the colors, with their values before the fit, sRGB-coded.
 pub enum Colors<'a> {
     /// Texels of an atlas: a picture of its size, 3 channels.
     Texels(&'a Atlas, &'a Image),
@@ -178,7 +178,7 @@ pub fn fit(
     Ok(Some(Appearance { texels, vertices, harmonics, report }))
 }
 
-/// What the photographs that were left out say.
+/// Degree and smoothness, chosen by the photographs that were left out.
 struct Choice {
     degree: u32,
     smoothness: Smoothness,
@@ -228,7 +228,7 @@ fn choose(
         candidates.push((degree, smoothness, judge(&error)));
     }
     let left_out = candidates.iter().map(|(d, s, db)| (*d, s.others, *db)).collect();
-    // where there is nothing to judge by, the careful one
+    // without data to decide on, the more careful one
     let enough = (0..photographs as u32).any(held);
     let best = match enough {
         true => candidates.iter().fold(&candidates[0], |best, c| if c.2 > best.2 { c } else { best }),
@@ -237,13 +237,13 @@ fn choose(
     Ok(Choice { degree: best.0, smoothness: best.1, gains, left_out })
 }
 
-/// The photographs' pixels with gains, `[rows]`.
+/// Returns the photographs' pixels with gains, `[rows]`.
 fn photo(rows: &Rows, gains: &[[f32; 3]]) -> Vec<[f32; 3]> {
     let with = |(c, v): (&[f32; 3], &u32)| std::array::from_fn(|k| c[k] * gains[*v as usize][k]);
     rows.photo.iter().zip(&rows.view).map(with).collect()
 }
 
-/// The gain of each photograph that brings it closest to what a fit shows of it, which is the photograph less
+/// Returns the gain of each photograph that brings it closest to what a fit shows of it, which is the photograph less
 /// `error` `[rows]`; relative to their mean.
 fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]> {
     let mut sums = vec![[[0f64; 2]; 3]; photographs];
@@ -266,14 +266,14 @@ fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]
     sums.iter().map(gain).collect()
 }
 
-/// PSNR of errors, dB; what is exact counts as 100.
+/// Returns the PSNR of errors, dB; an exact fit counts as 100.
 fn psnr(errors: &[[f32; 3]]) -> f64 {
     let sum: f64 = errors.iter().flatten().map(|e| f64::from(*e).powi(2)).sum();
     (-10.0 * (sum / (3 * errors.len()).max(1) as f64).log10()).min(100.0)
 }
 
 impl System<'_> {
-    /// Returns what is missing of `target` `[rows]` beside what `x` `[nodes, count]` shows.
+    /// Returns the residual of `target` `[rows]` after subtracting the rows of `x` `[nodes, count]`.
     fn missing(&self, target: &[[f32; 3]], x: &[[f32; 3]], count: usize) -> Vec<[f32; 3]> {
         let left = |(p, t): (usize, &[f32; 3])| {
             let shown = self.shown(p, x, count);

@@ -30,10 +30,10 @@ use pack::{ChartPose, half_squares, pack};
 use serde::Serialize;
 use std::time::Instant;
 
-/// How an atlas came about, and how good it is.
+/// A report of an atlas: its construction and quality.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct AtlasReport {
-    /// Why every triangle became a half square of its own; none when charts were possible.
+    /// Why every triangle became a half square of its own; `None` if charts were possible.
     pub fallback: Option<String>,
     /// Triangles that would have been flipped, overlapping or without area, and got a small chart of their own.
     pub repaired: usize,
@@ -48,7 +48,7 @@ pub struct AtlasReport {
 }
 
 impl AtlasReport {
-    /// Returns what a person should know, one sentence each.
+    /// Returns warnings for the user, one sentence each.
     pub fn warnings(&self) -> Vec<String> {
         let mut out = Vec::new();
         if let Some(reason) = &self.fallback {
@@ -149,7 +149,7 @@ fn atlas_by(
 /// Steps that the monitor hears of.
 const STEPS: u64 = 4;
 
-/// How a mesh is laid into its texture.
+/// Options of an atlas.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AtlasConfig {
     /// Texels across and down; 16..=16384.
@@ -200,7 +200,7 @@ struct AtlasLayout {
 /// coordinates at 4096.
 const THIN_PX: f64 = 2e-3;
 
-/// How often bad triangles are looked for before it is given up.
+/// Maximum number of rounds of repairing bad triangles.
 const ROUNDS: usize = 5;
 
 /// Lays a mesh out by `uvunwrap`, with a packer of our own.

@@ -51,16 +51,16 @@ use light::{SurfacePoints, Visibility, settle, shade};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// How a texture is baked. Lengths are in the mesh's units.
+/// Options of baking. Lengths are in the mesh's units.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BakeConfig {
     /// Samples along each side of a texel, 1..=8.
     pub side: u32,
     /// Texels that repeat a chart's border around it.
     pub gutter_px: u32,
-    /// How far a sample may lie from the true surface: the simplification's error and half a cell.
+    /// Maximum distance of a sample from the true surface: the simplification's error and half a cell.
     pub reach: f32,
-    /// Cameras that a sample is seen by at most: those that look at it most directly.
+    /// Maximum number of cameras per sample: those that look at it most directly.
     pub views: usize,
     /// Degree of the lobes, 1 or 2; 0 for none.
     pub lobes: u32,
@@ -79,11 +79,11 @@ pub struct Baked {
     pub lobes: Vec<Image>,
     /// Unit normals of the field in the mesh's coordinates, 3 channels.
     pub normal: Option<Image>,
-    /// What was done.
+    /// A report of baking.
     pub report: BakeReport,
 }
 
-/// What baking did.
+/// A report of baking.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct BakeReport {
     /// Texels across and down.
@@ -94,11 +94,11 @@ pub struct BakeReport {
     pub samples: usize,
     /// Share of the samples that at least one camera sees.
     pub seen: f64,
-    /// Cameras that see a sample, on average over those that one sees.
+    /// Mean number of cameras that see a sample, over the samples that any camera sees.
     pub views: f64,
-    /// How far samples moved onto the true surface: mean, mesh units.
+    /// Mean distance by which samples moved onto the true surface, mesh units.
     pub moved: f64,
-    /// How long it took.
+    /// Duration of baking.
     pub seconds: f64,
 }
 
@@ -176,7 +176,7 @@ pub fn bake(
                 let at = texel[0].texel as usize;
                 covered[at] = true;
                 let all = i..i + texel.len();
-                // where some samples are seen, the unseen say nothing
+                // if some samples of a texel are visible, the invisible ones are ignored
                 let any = shades.seen[all.clone()].contains(&true);
                 let counts = |s: usize| if any && !shades.seen[s] { 0.0 } else { 1.0 };
                 let total: f32 = all.clone().map(counts).sum();
@@ -308,7 +308,7 @@ pub fn tangent_space(
             let m: Vec3 = (0..3).map(|k| weights[k] * corners[k]).sum::<Vec3>().normalize_or(Vec3::Z);
             let tangent = tangents[s.triangle as usize];
             let t: Vec3 = (0..3).map(|k| weights[k] * tangent[k].truncate()).sum();
-            // what a renderer does: tangent across the normal, bitangent from both
+            // as a renderer does: tangent perpendicular to the normal, bitangent from both
             let t = (t - m * m.dot(t)).normalize_or(m.any_orthonormal_vector());
             let b = tangent[0].w * m.cross(t);
             let at = s.texel as usize;
@@ -440,7 +440,7 @@ mod tests {
             rgb,
             alpha: None,
         });
-        // the hardest paint there is; 12.7 without
+        // the hardest possible paint; 12.7 without
         assert!(step < 4.0, "{step}");
     }
 

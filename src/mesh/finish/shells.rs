@@ -56,7 +56,7 @@ const SMOOTH: f64 = 0.05;
 /// The most steps of conjugate gradients.
 const STEPS: usize = 60;
 
-/// What came of it.
+/// A report of the layers.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ShellsReport {
     /// Triangles that have layers.
@@ -66,12 +66,12 @@ pub struct ShellsReport {
     /// Root mean square error of opacity near the outlines of left-out photographs: without layers, with those of the
     /// field, with fitted ones.
     pub left_out: [f64; 3],
-    /// Are there layers in the end?
+    /// Whether the layers are kept.
     pub kept: bool,
 }
 
 /// Returns layers around a mesh whose vertices have normals, of the local `sharpness` of the field at its vertices.
-/// `None` where masks say nothing, nothing is soft, or left-out photographs do not look better.
+/// Returns `None` if the masks carry no information, nothing is soft, or left-out photographs do not look better.
 ///
 /// # Errors
 ///
@@ -107,7 +107,7 @@ pub fn fit(
     Ok((Some(shells), report))
 }
 
-/// The layers that the field itself says, and the median softness of their vertices, in pixels.
+/// Returns the layers of the field itself, and the median softness of their vertices, in pixels.
 fn from_field(
     mesh: &Mesh,
     nodes: &Nodes,
@@ -157,7 +157,7 @@ fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
 }
 
-/// What the rays of pixels near the outlines meet.
+/// The hits of the rays of pixels near the outlines.
 #[derive(Default)]
 struct Outlines {
     /// Photograph of each row.
@@ -175,7 +175,7 @@ struct Outlines {
 /// The layers that a ray meets, outermost first, and where.
 type Layers = Vec<(usize, Hit)>;
 
-/// How many rays of a pixel meet the mesh, and the layers that the others do.
+/// Returns the number of a pixel's rays that hit the mesh, and the layers that the others hit.
 fn look(camera: &Camera, (x, y): (usize, usize), bvh: &Bvh, caster: &ShellCaster) -> (usize, [Layers; RAYS]) {
     let (mut whole, mut rays) = (0, [const { Layers::new() }; RAYS]);
     for (k, layers) in rays.iter_mut().enumerate() {

@@ -34,10 +34,10 @@ use rounds::{CrossingSearch, Task, bounded, counted};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// A first attempt without looking, two that look near what was found, one that looks everywhere.
+/// Attempts: one without checking, two that check near the crossings found, one that checks everywhere.
 const ATTEMPTS: usize = 4;
 
-/// With more crossings than this, finding the vertices near them costs more than looking everywhere.
+/// With more crossings than this, finding the vertices near them costs more than checking everywhere.
 const MANY: usize = 1000;
 
 /// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colors
@@ -130,24 +130,24 @@ pub fn simplify(
     Ok(report)
 }
 
-/// Where vertices lie in the end, when there is a field.
+/// Final placement of vertices, if a field is given.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum VertexPlacement {
     /// On the field's zero. Between them the triangles are chords.
     OnSurface,
-    /// Where the triangles are nearest to the zero, in the least-squares sense.
+    /// At the least-squares zero of their triangles.
     #[default]
     Nearest,
 }
 
-/// How far to simplify.
+/// Options of simplification.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimplifyConfig {
     /// Triangles to keep; 0 goes as far as `error` lets it.
     pub triangles: usize,
     /// Most distance from the surface, in units of the positions; 0 goes as far as `triangles` says.
     pub error: f32,
-    /// Where vertices lie in the end; with an `error` always on the zero.
+    /// Final placement of vertices; with an `error` always on the zero.
     pub placement: VertexPlacement,
     /// Most points in one call of the field; at least 1.
     pub batch: usize,
@@ -182,7 +182,7 @@ impl SimplifyConfig {
     }
 }
 
-/// What [`simplify`](super::simplify) did.
+/// The result of [`simplify`](super::simplify).
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SimplifyReport {
     /// Triangles given.
@@ -203,7 +203,7 @@ pub struct SimplifyReport {
     pub held_back: usize,
     /// Points at which the field was evaluated.
     pub asked: usize,
-    /// How often the work began anew because of self-intersections.
+    /// Number of restarts because of self-intersections.
     pub again: usize,
     /// Triangles that meet others in the result; not more than in the input.
     pub self_intersections: usize,
@@ -215,7 +215,7 @@ pub struct SimplifyReport {
 }
 
 impl SimplifyReport {
-    /// Returns what a person should know, one sentence each.
+    /// Returns warnings for the user, one sentence each.
     pub fn warnings(&self, config: &SimplifyConfig) -> Vec<String> {
         let mut out = Vec::new();
         if config.triangles > 0 && self.after > config.triangles && config.error == 0.0 {

@@ -1,6 +1,6 @@
-//! Small copies of photographs and of what was rendered for them, and how far those are apart.
+//! Small copies of photographs and of their renders, and the error between them.
 //!
-//! The head to turn, for a page: a copy of `head.glb` that is small enough, and where the photographs were taken from.
+//! Also the 3D viewer of a page: a copy of `head.glb` that is small enough, and the cameras of the photographs.
 
 use crate::capture::{Split, View};
 use crate::config::{MeshFormat, MeshFrame, Stage, called};
@@ -27,13 +27,13 @@ use std::path::Path;
 
 /// Longest side of a picture on the page: of few views, and of many.
 const SIDE_PX: (u32, u32) = (480, 320);
-/// So many views are few.
+/// Up to so many views count as few.
 const FEW: usize = 10;
-/// Of JPEGs: about 25 kB each.
+/// JPEG quality: about 25 kB per picture.
 const QUALITY: u8 = 84;
 
-/// The views that have pictures, or else the held-out ones, in about `most` bytes; and the files of those that found no
-/// room, relative to the run.
+/// Returns the views that have pictures, or else the held-out ones, in about `most` bytes; and the files of the
+/// omitted ones, relative to the run.
 pub(super) fn rows(line: &Line, most: usize) -> Result<(Vec<ViewRow>, Vec<String>)> {
     let sets: Vec<_> = picture_sets(line).into_iter().map(|set| (comparable(line, &set), set.name)).collect();
     let pictures = |view: &View| -> Vec<(&Comparable, &str)> {
@@ -43,10 +43,10 @@ pub(super) fn rows(line: &Line, most: usize) -> Result<(Vec<ViewRow>, Vec<String
     };
     let all: Vec<(&View, Vec<(&Comparable, &str)>)> =
         line.capture.views.iter().map(|view| (view, pictures(view))).collect();
-    let judged = all.iter().any(|(_, p)| !p.is_empty());
+    let evaluated = all.iter().any(|(_, p)| !p.is_empty());
     let shown: Vec<_> = all
         .into_iter()
-        .filter(|(v, p)| if judged { !p.is_empty() } else { v.split != Split::Train })
+        .filter(|(v, p)| if evaluated { !p.is_empty() } else { v.split != Split::Train })
         .collect();
     let side = if shown.len() > FEW { SIDE_PX.1 } else { SIDE_PX.0 };
     let figures =
@@ -76,7 +76,7 @@ pub(super) fn rows(line: &Line, most: usize) -> Result<(Vec<ViewRow>, Vec<String
     Ok((rows, left_out))
 }
 
-/// A file of the run as an address.
+/// Returns the URL of a file of the run.
 fn relative(line: &Line, file: &Path) -> String {
     link(&file.strip_prefix(line.run.dir()).unwrap_or(file).to_string_lossy())
 }
@@ -124,13 +124,13 @@ fn row(
     Ok(ViewRow { name: view.name.clone(), width: size.0, height: size.1, photo: url(&photo)?, pictures })
 }
 
-/// The mean difference of the channels as a share of [`MOST_ERROR`], in all three channels.
+/// Returns the mean difference of the channels as a share of [`MOST_ERROR`], in all three channels.
 pub(in crate::pipeline) fn error(a: [u8; 3], b: [u8; 3]) -> [u8; 3] {
     let sum: u32 = (0..3).map(|k| a[k].abs_diff(b[k]) as u32).sum();
     [quantize(sum as f32 / 3.0 / 255.0 / MOST_ERROR); 3]
 }
 
-/// The color of an error, 0..=1.
+/// Returns the color of an error, 0..=1.
 pub(in crate::pipeline) fn heat(t: f32) -> [u8; 3] {
     let at = t.clamp(0.0, 1.0) * (HEAT.len() - 1) as f32;
     let k = (at as usize).min(HEAT.len() - 2);
@@ -138,7 +138,7 @@ pub(in crate::pipeline) fn heat(t: f32) -> [u8; 3] {
     [0, 1, 2].map(|c| mix(c).round() as u8)
 }
 
-/// A picture as a pinhole camera of the same intrinsics would have taken it: what a viewer can lay over a mesh.
+/// Resamples a picture to a pinhole camera of the same intrinsics, so that a viewer can overlay it on a mesh.
 fn straightened(picture: Photo, camera: &Camera) -> Photo {
     if camera.distortion.is_none() {
         return picture;
@@ -167,12 +167,13 @@ fn straightened(picture: Photo, camera: &Camera) -> Photo {
     Photo { rgb: (0..w * h).map(from).collect(), alpha: None, ..picture }
 }
 
-/// Bytes of a mesh inside a page at most: 200,000 triangles with a texture.
+/// Maximum size of a mesh inside a page, bytes: 200,000 triangles with a texture.
 const MOST_BYTES: usize = 4_600_000;
-/// Triangles of a copy of a larger mesh, which has colors at its vertices.
+/// Number of triangles of a larger mesh's copy, which has colors at its vertices.
 const FEWER: usize = 100_000;
 
-/// The head of a run, without cameras, and from the dataset's world to its coordinates; `None` before the stage `mesh`.
+/// Returns the head of a run without cameras, and the transform from the dataset's world to its coordinates; `None`
+/// before the stage `mesh`.
 pub(super) fn viewer(line: &Line) -> Result<Option<(Viewer, Similarity)>> {
     match read_record(&line.run.path(Stage::Mesh)) {
         Ok(Some(record)) => shown(line, &record).map(Some),
@@ -180,7 +181,7 @@ pub(super) fn viewer(line: &Line) -> Result<Option<(Viewer, Similarity)>> {
     }
 }
 
-/// The head of a run whose mesh is done.
+/// Returns the head of a run whose mesh is done.
 fn shown(line: &Line, mesh: &Record) -> Result<(Viewer, Similarity)> {
     mesh.require_products(&line.run.path(Stage::Mesh))?;
     let (file, export) = (line.run.path("mesh/head.glb"), Export::new(&line.capture, line.config));
@@ -201,7 +202,7 @@ fn shown(line: &Line, mesh: &Record) -> Result<(Viewer, Similarity)> {
     Ok((viewer, file_from_world))
 }
 
-/// Where the photographs of these rows were taken from.
+/// Returns the cameras of these rows' photographs.
 pub(super) fn cameras(line: &Line, rows: &[ViewRow], file_from_world: &Similarity) -> Vec<ViewerCamera> {
     let camera = |(i, row): (usize, &ViewRow)| {
         let view = line.capture.views.iter().find(|v| v.name == row.name)?;
@@ -222,26 +223,27 @@ pub(super) fn cameras(line: &Line, rows: &[ViewRow], file_from_world: &Similarit
     rows.iter().enumerate().filter_map(camera).collect()
 }
 
-/// Returns a page with the head of a run to turn, and its held-out photographs if they are there.
+/// Returns a page with a 3D viewer of a run's head, and its held-out photographs if they can be opened.
 ///
 /// # Errors
 ///
-/// The run has no mesh yet, or it is damaged.
+/// Fails if the run has no mesh yet, or if it is damaged.
 pub fn head_page(line: &Line) -> Result<String> {
     let (mut viewer, file_from_world) = shown(line, &finished_mesh(line.run.dir())?)?;
     let most = super::MOST_BYTES.saturating_sub(viewer.glb.len().div_ceil(3) * 4);
-    // without photographs there is still the head
-    let (mut rows, _) = if line.gone.is_none() { rows(line, most)? } else { Default::default() };
+    // without photographs the page still shows the head
+    let (mut rows, _) = if line.missing_capture.is_none() { rows(line, most)? } else { Default::default() };
     rows.iter_mut().for_each(|row| row.pictures.clear());
     viewer.cameras = cameras(line, &rows, &file_from_world);
     viewer_html(&viewer, &rows)
 }
 
-/// Returns a page with the mesh of a GLB, OBJ or PLY file to turn, and what of it cannot be shown. `up` is where its up is.
+/// Returns a page with a 3D viewer of a GLB, OBJ or PLY file, and the features of it that cannot be shown. `up` is
+/// its up direction.
 ///
 /// # Errors
 ///
-/// The file cannot be read, or shows what a page cannot.
+/// Fails if the file cannot be read, or uses features that a page cannot show.
 pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
     let bytes = io::read_bytes(path, &Limits::default())?;
     let warnings = RefCell::new(Vec::new());
@@ -255,7 +257,7 @@ pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
             ExportOptions { world_from_mesh: head.world_from_scene, up, ..ExportOptions::default() };
         to_glb(&head.mesh, head.texture.as_ref(), head.shells.as_ref(), &options)
     };
-    // as it is, with all that a GLB can say, unless it must be turned
+    // unchanged, with every GLB feature, unless it must be turned
     let is_glb = bytes.starts_with(b"glTF");
     let glb = if is_glb && up == Vec3::Y { bytes } else { as_glb(&open()?)? };
     if is_glb && up != Vec3::Y {
@@ -269,7 +271,8 @@ pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
     Ok((html, warnings.into_inner()))
 }
 
-/// A copy for a page, and how it differs. Of one that is too large, `head` gives the mesh and `as_glb` the file again.
+/// Returns a copy for a page, and how it differs. If the file is too large, `head` returns the mesh and `as_glb`
+/// writes the copy.
 fn small(
     glb: &[u8],
     path: &Path,
@@ -302,7 +305,7 @@ fn small(
     Ok((copy, format!("A copy of {after} of the {before} triangles, with colors at its vertices.")))
 }
 
-/// The nearest texel, coded.
+/// Returns the nearest texel, coded.
 fn texel(photo: &Photo, [u, v]: [f32; 2]) -> [f32; 3] {
     let at = |t: f32, n: u32| ((t - t.floor()) * n as f32).min(n as f32 - 1.0) as usize;
     let i = at(v, photo.height) * photo.width as usize + at(u, photo.width);

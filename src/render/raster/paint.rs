@@ -1,5 +1,5 @@
-//! From what a tile knows to pixels: where the rays through its samples meet their triangles, and what share of a pixel
-//! each of these places has.
+//! The third step, from the visible triangles of a tile to pixels: intersects the rays through the samples with their
+//! triangles, and weights the hits of each pixel.
 
 use super::super::raycast::RayHits;
 use super::project::{TILE, UNIT};
@@ -7,10 +7,10 @@ use super::tile::{CENTER, GRID, NOTHING, SAMPLES, Tile};
 use crate::geom::{Camera, Hit, Mesh, ShellLayer};
 use glam::{DVec3, Mat3, Vec2, Vec3};
 
-/// Places that are met with their triangles at once.
+/// Number of samples that are intersected with their triangles at once.
 const BATCH: usize = 64;
 
-/// So much waits for its color before it is asked for: what caches hold.
+/// Number of hits queued before they are colored, so that they fit into the caches.
 const QUEUE: usize = 4 * BATCH;
 
 /// All samples of a pixel.
@@ -19,11 +19,11 @@ const FULL: u8 = (1 << SAMPLES) - 1;
 /// Triangles that share their vertices, the mesh's own or those of a layer around it.
 pub(super) struct Sheet<'a> {
     pub positions: &'a [Vec3],
-    /// The layer; `None` of the mesh itself.
+    /// The layer; `None` for the mesh itself.
     pub layer: Option<&'a ShellLayer>,
 }
 
-/// Some rows of the pictures that are made.
+/// Some rows of the rendered pictures.
 pub(super) struct Band<'a> {
     pub top: usize,
     pub rgba: &'a mut [[f32; 4]],
@@ -40,25 +40,26 @@ pub(super) struct Part {
     pub height: usize,
 }
 
-/// Turns what a tile knows into pixels.
+/// Writes the pixels of tiles.
 pub(super) struct Painter<'a, C> {
     pub mesh: &'a Mesh,
     pub camera: &'a Camera,
     pub origin: Vec3,
     pub forward: Vec3,
-    /// From the mesh's units to those of depth.
+    /// Scale from the mesh's units to those of depth.
     pub scale: f32,
     pub world_from_mesh: Mat3,
-    /// Of a lens that bends nothing: the ray through the picture's corner, and a pixel on in x and y.
+    /// For a lens without distortion: the ray through the picture's corner, and the steps to the next pixel in x and
+    /// y.
     pub straight: Option<[DVec3; 3]>,
-    /// Change of depth over one pixel, as a share of it, from which on a surface ends.
+    /// Relative change of depth over one pixel from which on a surface ends.
     pub jump: f32,
-    /// Do hits get no points and normals?
+    /// Whether hits get no points and normals.
     pub bare: bool,
     pub color: C,
 }
 
-/// The rays of a camera that bends nothing, before they are made unit ones.
+/// Returns the rays of a camera without distortion, before they are normalized.
 pub(super) fn straight_rays(c: &Camera) -> Option<[DVec3; 3]> {
     let through = |x: f64, y: f64, z: f64| c.rotation * DVec3::new(x, y, z);
     c.distortion.is_none().then(|| {
@@ -71,8 +72,8 @@ pub(super) fn straight_rays(c: &Camera) -> Option<[DVec3; 3]> {
 }
 
 impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
-    /// Writes what is known of the pixels of a tile, and queues what is to be colored. `light` is the share of each sample
-    /// that what was painted before leaves; empty where that is all of it.
+    /// Writes depth and normals of a tile's pixels, and queues its hits for coloring. `light` is the transmittance of
+    /// each sample after the layers drawn before; empty if it is 1 everywhere.
     pub fn paint(
         &self,
         tile: &Tile,
@@ -108,7 +109,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                     rest &= !samples;
                     self.add(batch, [x, y], s, seen[s], samples, part, out.top);
                 }
-                // no pixel has more
+                // a pixel has no further samples
                 if batch.count > BATCH - SAMPLES - 1 {
                     self.finish(sheet, light, part, out, batch, queue);
                 }
@@ -133,7 +134,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
         let [px, py] = [GRID[place].0, GRID[place].1].map(|v| v as f32 / UNIT as f32);
         (batch.x[k], batch.y[k]) = ((part.left + x) as f32 + px, (top + y) as f32 + py);
         if self.straight.is_none() {
-            // where the lens folds over there is no ray
+            // no ray exists where the lens model folds over
             let Some(ray) = self.camera.ray(Vec2::new(batch.x[k], batch.y[k])) else { return };
             (0..3).for_each(|c| batch.direction[c][k] = ray.direction[c]);
         }
@@ -142,7 +143,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
         batch.count += 1;
     }
 
-    /// Meets what waits in a batch.
+    /// Intersects the rays of a batch.
     fn finish(
         &self,
         sheet: &Sheet,
@@ -213,15 +214,15 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
     }
 }
 
-/// Places on the picture and the triangles to be met there.
+/// Samples on the picture and the triangles to intersect at them.
 pub(super) struct Batch {
     count: usize,
     x: [f32; BATCH],
     y: [f32; BATCH],
-    /// In the tile.
+    /// Pixel in the tile.
     pixel: [u32; BATCH],
     triangle: [u32; BATCH],
-    /// A bit for each sample that is colored so.
+    /// One bit for each sample that gets this color.
     samples: [u8; BATCH],
     is_center: [bool; BATCH],
     direction: [[f32; BATCH]; 3],
@@ -253,7 +254,8 @@ impl Batch {
 }
 
 crate::dispatch! {
-    /// Where rays meet their triangles, or pass them most closely: samples lie in snapped triangles.
+    /// Returns the intersections of rays with their triangles, or the nearest points: samples lie in snapped
+    /// triangles.
     fn meet / meet_all(batch: &mut Batch, straight: Option<[DVec3; 3]>, origin: Vec3)
 }
 
@@ -267,14 +269,14 @@ fn meet_all<const F: bool>(batch: &mut Batch, straight: Option<[DVec3; 3]>, orig
             for c in 0..3 {
                 d[c] = corner[c] + x * right[c] + y * down[c];
             }
-            // as a ray caster does it: rounded once
+            // rounded once, as in the ray caster
             let over = 1.0 / dot(d, d).sqrt();
             for c in 0..3 {
                 batch.direction[c][k] = (d[c] * over) as f32;
             }
         }
     }
-    // Möller and Trumbore, without its bounds; in f64 for what is seen edge-on
+    // Möller and Trumbore, without the bounds test; in f64 for triangles seen edge-on
     for k in 0..BATCH {
         let (mut d, mut corners) = ([0.0; 3], [[0.0; 3]; 3]);
         for c in 0..3 {
@@ -288,7 +290,7 @@ fn meet_all<const F: bool>(batch: &mut Batch, straight: Option<[DVec3; 3]>, orig
         let p = cross(d, ac);
         let over = 1.0 / dot(ab, p);
         let (u, v) = (-dot(a, p) * over, -dot(d, cross(a, ab)) * over);
-        // an edge-on triangle has no place of its own
+        // a triangle seen edge-on has no unique intersection
         let is_known = (u + v).abs() < f64::INFINITY;
         let (u, v) =
             (if is_known { u.max(0.0) } else { 1.0 / 3.0 }, if is_known { v.max(0.0) } else { 1.0 / 3.0 });
@@ -314,7 +316,7 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// What waits for its color, with its pixel and its share of it.
+/// The hits that wait for their color, with their pixels and weights.
 #[derive(Default)]
 pub(super) struct Queue {
     hits: RayHits,

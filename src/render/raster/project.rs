@@ -15,13 +15,13 @@ pub(super) const UNIT: i32 = 256;
 const FIRST: i32 = 32;
 const LAST: i32 = 224;
 
-/// Triangles that are binned together: what comes out does not depend on how many threads there are.
+/// Number of triangles that are binned together; fixed, so that the result does not depend on the number of threads.
 const CHUNK: usize = 4096;
 
 /// Farthest from the picture's corner, 1/256 pixels: products of two distances fit into 64 bits many times over.
 const FARTHEST: f64 = (1 << 23) as f64;
 
-/// ... of a corner that a cut has made there: it is rounded.
+/// The same for a corner made by clipping, which is rounded.
 const CUT: f64 = FARTHEST + 8192.0;
 
 /// Nearest to the camera, as a share of the distance to the farthest corner of the mesh's box.
@@ -30,7 +30,7 @@ const NEAREST: f32 = 1e-5;
 /// How far a straight line may lie from where the lens bends it to, pixels.
 const BENT: f64 = 1.0 / 64.0;
 
-/// Places along each side of a picture whose rays tell how much the lens sees.
+/// Samples along each side of a picture whose rays determine the field of view of the lens.
 const LENS_GRID: usize = 33;
 
 /// A corner of a triangle on the picture.
@@ -44,12 +44,12 @@ pub(super) struct Corner {
     pub inverse_depth: f32,
 }
 
-/// A triangle on the picture, or a piece of one; clockwise there, so that its area is positive.
+/// A triangle on the picture, or a piece of one, wound clockwise so that its area is positive.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Face {
     pub corners: [Corner; 3],
     pub triangle: u32,
-    /// Is the triangle seen from behind?
+    /// Whether the triangle is a back face.
     pub back: bool,
 }
 
@@ -65,19 +65,19 @@ pub(super) struct Bins {
     faces: Vec<Face>,
     /// Faces of all tiles, one tile after the other.
     order: Vec<u32>,
-    /// Where each tile begins in `order`, and where the last one ends.
+    /// Start of each tile in `order`, and the end of the last one.
     starts: Vec<u32>,
 }
 
 impl Bins {
-    /// The faces of a tile in the order of their triangles.
+    /// Returns the faces of a tile in the order of their triangles.
     pub fn of(&self, tile: usize) -> impl ExactSizeIterator<Item = &Face> {
         let (from, to) = (self.starts[tile] as usize, self.starts[tile + 1] as usize);
         self.order[from..to].iter().map(|&face| &self.faces[face as usize])
     }
 }
 
-/// A camera, ready for triangles.
+/// A camera prepared for projecting triangles.
 pub(super) struct Lens<'a> {
     camera: &'a Camera,
     camera_from_mesh: Mat3,
@@ -94,14 +94,14 @@ pub(super) struct Lens<'a> {
 pub(super) struct Faces<'a> {
     pub positions: &'a [Vec3],
     pub triangles: &'a [[u32; 3]],
-    /// What each of them is called; `None`: by its index.
+    /// Their indices in the mesh; `None` if they are the same.
     pub ids: Option<&'a [u32]>,
-    /// Are those seen from behind left out?
+    /// Whether back faces are left out.
     pub cull: bool,
 }
 
 impl<'a> Lens<'a> {
-    /// `None` where no pixel has a ray.
+    /// Returns `None` if no pixel has a ray.
     pub fn new(camera: &'a Camera, mesh: &Mesh) -> Option<Lens<'a>> {
         let origin = camera.position.as_vec3();
         let bounds = mesh.bounds();
@@ -179,7 +179,7 @@ impl<'a> Lens<'a> {
         chunks.map(bin).collect()
     }
 
-    /// A point in the camera: right, down and away.
+    /// Returns a point in camera coordinates: right, down and away.
     fn inside(&self, p: Vec3) -> Vec3 {
         let q = self.camera_from_mesh * (p - self.origin);
         Vec3::new(q.x, -q.y, -q.z)
@@ -191,7 +191,7 @@ impl<'a> Lens<'a> {
         if q.z >= self.near { Vec3::new(q.x, q.y, 1.0) / q.z } else { Vec3::ZERO }
     }
 
-    /// Where the lens puts it, pixels.
+    /// Returns the pixel position after distortion.
     fn bent(&self, ideal: Vec3) -> (f64, f64) {
         let c = self.camera;
         let (x, y) = match c.distortion.is_none() {

@@ -9,11 +9,10 @@ use std::array::from_fn;
 use std::hint::black_box;
 use std::ops::{Add, BitOr, Mul, Sub};
 
-/// Places in a pixel that are worked on at once.
+/// Samples of a pixel that are processed at once.
 const LANES: usize = 8;
 
-/// Pixels of a row that are asked at once whether a large face can be there, and along each side of a block of which the
-/// farthest depth is known.
+/// Pixels of a row that are tested at once against a large face, and side of a block whose farthest depth is cached.
 const BLOCK: usize = 8;
 const BLOCKS: usize = TILE / BLOCK;
 
@@ -23,8 +22,8 @@ const REFRESH: usize = 256;
 /// Samples of a pixel's coverage.
 pub(super) const SAMPLES: usize = 4;
 
-/// Where they lie in a pixel: a rotated grid, in which no two share a row or a column; and then, of what is seen there but
-/// does not count, the center, in all lanes that are left over.
+/// Positions of the samples in a pixel: a rotated grid, in which no two share a row or a column. The remaining lanes
+/// hold the center, which is sampled but does not count for coverage.
 pub(super) const GRID: [(i32, i32); LANES] =
     [(96, 32), (224, 96), (32, 160), (160, 224), (128, 128), (128, 128), (128, 128), (128, 128)];
 
@@ -40,7 +39,7 @@ const SMALL: i32 = 64 * UNIT;
 /// The nearest triangles of a tile.
 #[repr(C, align(64))]
 pub(super) struct Tile {
-    /// One over depth at each place of [`GRID`] in each pixel, 0 where there is nothing.
+    /// Inverse depth at each position of [`GRID`] in each pixel, 0 for empty ones.
     pub inverse_depth: [[f32; LANES]; TILE * TILE],
     pub triangle: [[u32; LANES]; TILE * TILE],
     /// The smallest inverse depth in each block.
@@ -53,7 +52,7 @@ pub(super) struct Tile {
 }
 
 impl Tile {
-    /// With nothing in it, of no size.
+    /// Returns an empty tile of no size.
     pub fn new() -> Box<Tile> {
         Box::new(Tile {
             inverse_depth: [[0.0; LANES]; TILE * TILE],
@@ -67,7 +66,7 @@ impl Tile {
         })
     }
 
-    /// Empties it for another part of the picture.
+    /// Clears the tile for another part of the picture.
     pub fn move_to(&mut self, left: usize, top: usize, width: usize, height: usize) {
         (self.left, self.top, self.width, self.height) =
             (left as i32, top as i32, width as i32, height as i32);
@@ -77,7 +76,7 @@ impl Tile {
         self.drawn = 0;
     }
 
-    /// Empties it, but for the depth of what another tile holds in the same part of the picture.
+    /// Clears the tile, but keeps the depth of another tile at the same part of the picture.
     pub fn behind(&mut self, other: &Tile) {
         self.inverse_depth = other.inverse_depth;
         self.triangle.as_flattened_mut().fill(NOTHING);
@@ -86,7 +85,7 @@ impl Tile {
         self.drawn = 0;
     }
 
-    /// Draws a face over what is there; at equal depth the earlier one stays.
+    /// Draws a face over the earlier ones; at equal depth the earlier one stays.
     #[inline(always)]
     pub fn draw(&mut self, face: &Face) {
         let ((left, right), (top, bottom)) = reach(face);
@@ -115,7 +114,7 @@ impl Tile {
         }
     }
 
-    /// Looks up how far away the farthest sample of each block is.
+    /// Updates the depth of the farthest sample of each block.
     #[inline(always)]
     pub fn look_up_farthest(&mut self) {
         for (k, farthest) in self.farthest.iter_mut().enumerate() {
@@ -193,7 +192,7 @@ impl Tile {
 trait Whole:
     Copy + From<i32> + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + BitOr<Output = Self>
 {
-    /// −1 of what is negative, else 0.
+    /// Returns −1 for negative numbers, else 0.
     fn sign(self) -> i32;
 }
 
@@ -215,10 +214,10 @@ impl Whole for i64 {
 struct Edge<T> {
     /// At the places of [`GRID`] in the first pixel.
     at: [T; LANES],
-    /// A pixel on.
+    /// The step to the next pixel.
     right: T,
     down: T,
-    /// No place in that pixel and those of its block to the right has more than that.
+    /// Upper bound over that pixel and those of its block to the right.
     most: T,
 }
 

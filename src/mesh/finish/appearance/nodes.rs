@@ -87,7 +87,7 @@ impl Nodes {
         Nodes { place, count, near_start, near }
     }
 
-    /// Returns how many there are.
+    /// Returns the number of nodes.
     pub fn len(&self) -> usize {
         self.count
     }

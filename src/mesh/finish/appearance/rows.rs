@@ -1,4 +1,4 @@
-//! What pixels of photographs show, as rows of a linear system.
+//! Pixels of photographs as rows of a linear system.
 
 use super::nodes::Nodes;
 use crate::geom::{Bvh, Camera, Hit, Mesh};
@@ -39,7 +39,7 @@ impl Photograph<'_> {
     pub(crate) fn outline(&self, margin: usize) -> Vec<usize> {
         let Some(mask) = self.mask else { return Vec::new() };
         let (w, h) = (mask.width as usize, mask.height as usize);
-        // beyond its border a mask goes on as it is there
+        // a mask continues beyond its border with the value at the border
         let (wide, high) = (w + 2 * margin, h + 2 * margin);
         let inner = |at: usize, n: usize| at.clamp(margin, margin + n - 1) - margin;
         let side = |head: bool| {
@@ -61,15 +61,15 @@ impl Photograph<'_> {
 /// Pixels that the head fills, by the mask and by all of their rays; `[rows]` each.
 #[derive(Default)]
 pub struct Rows {
-    /// What the photograph shows, sRGB-coded.
+    /// Colors of the photograph, sRGB-coded.
     pub photo: Vec<[f32; 3]>,
     /// Unit directions to the viewer, turned to the coordinates of the harmonics.
     pub directions: Vec<Vec3>,
-    /// How much a row counts, 0..=1: the root of the cosine between view and surface.
+    /// Weights of the rows, 0..=1: the root of the cosine between view and surface.
     pub weight: Vec<f32>,
     /// Photograph of each row.
     pub view: Vec<u32>,
-    /// What the rays of a row met, all rows in one list.
+    /// The hits of a row's rays, all rows in one list.
     hits: Vec<Hit>,
 }
 
@@ -141,7 +141,7 @@ impl Rows {
         }
     }
 
-    /// Returns how many rows there are.
+    /// Returns the number of rows.
     pub fn len(&self) -> usize {
         self.photo.len()
     }

@@ -12,7 +12,7 @@ const TOLERANCE: f64 = 1e-8;
 /// The most steps of conjugate gradients.
 const STEPS: usize = 30;
 
-/// Weights of what keeps a fit smooth, against the square of one pixel's error.
+/// Weights of the smoothness terms, relative to the squared error of one pixel.
 ///
 /// On a surface the sum of squared differences is the same however fine the nodes are: its weight says how many pixels
 /// there are, on average, in the area over which a fit is smoothed.
@@ -30,7 +30,7 @@ pub struct Smoothness {
 pub struct System<'a> {
     /// The pixels.
     pub rows: &'a Rows,
-    /// Which nodes they show.
+    /// Nodes of each row.
     pub matrix: &'a Matrix,
     /// The nodes.
     pub nodes: &'a Nodes,
@@ -46,7 +46,7 @@ impl System<'_> {
         std::array::from_fn(|k| if k == 0 { 1.0 } else { y[k] })
     }
 
-    /// Returns what `x` `[nodes, count]` adds to a row.
+    /// Returns the product of a row with `x` `[nodes, count]`.
     pub fn shown(&self, row: usize, x: &[[f32; 3]], count: usize) -> [f32; 3] {
         let y = if count > 1 { self.functions(row) } else { [1.0; MOST_OF_DEGREE_2] };
         self.sum(row, x, &y[..count])
@@ -105,7 +105,7 @@ impl System<'_> {
     }
 }
 
-/// `Aᵀ D A` and what keeps it smooth.
+/// The operator `Aᵀ D A` with the smoothness terms.
 struct Normal<'a> {
     system: &'a System<'a>,
     weight: &'a [f32],

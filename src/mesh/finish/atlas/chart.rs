@@ -16,7 +16,7 @@ pub(super) struct Flat {
     pub triangles: Vec<u32>,
     /// Their corners, into `points`.
     pub corners: Vec<[u32; 3]>,
-    /// Where the corners lie.
+    /// Texture positions of the corners.
     pub points: Vec<DVec2>,
 }
 
@@ -25,14 +25,14 @@ pub(super) fn twice_area([a, b, c]: [DVec2; 3]) -> f64 {
     (b - a).perp_dot(c - a)
 }
 
-/// The smallest height of a triangle; negative when clockwise.
+/// Returns the smallest height of a triangle; negative when clockwise.
 pub(super) fn height(p: [DVec2; 3]) -> f64 {
     let longest = p[0].distance(p[1]).max(p[1].distance(p[2])).max(p[2].distance(p[0]));
     if longest > 0.0 { twice_area(p) / longest } else { 0.0 }
 }
 
 impl Flat {
-    /// The corners of a triangle of the chart.
+    /// Returns the corners of a triangle of the chart.
     pub fn at(&self, k: usize) -> [DVec2; 3] {
         self.corners[k].map(|i| self.points[i as usize])
     }
@@ -60,7 +60,7 @@ impl Flat {
         alone.map(|run| side_ends(&self.corners, run[0].1)).collect()
     }
 
-    /// The parts that hang together across sides, without the triangles that are not to be `kept`. Parts that
+    /// Returns the parts that hang together across sides, without the triangles that are not to be `kept`. Parts that
     /// meet in a corner only no longer share it.
     pub fn parts(&self, kept: impl Fn(usize) -> bool) -> Vec<Flat> {
         let mut sets = Sets::new(self.corners.len());
@@ -94,7 +94,7 @@ impl Flat {
     }
 }
 
-/// The corner of a triangle with its largest angle: opposite the longest side.
+/// Returns the corner of a triangle with its largest angle: opposite the longest side.
 pub(super) fn widest(mesh: &Mesh, triangle: u32) -> usize {
     let p = mesh.corners(triangle);
     let opposite = |k: usize| p[(k + 1) % 3].distance_squared(p[(k + 2) % 3]);
@@ -104,7 +104,7 @@ pub(super) fn widest(mesh: &Mesh, triangle: u32) -> usize {
 /// No triangle, no vertex, no number.
 pub(super) const NONE: u32 = u32::MAX;
 
-/// The triangles that are `wanted`, and which those were.
+/// Returns the `wanted` triangles and their indices.
 pub(super) fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>) {
     let number: Vec<u32> = (0..mesh.triangles.len() as u32).filter(|&t| wanted(t)).collect();
     let mut vertex = vec![NONE; mesh.positions.len()];
@@ -136,7 +136,8 @@ pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
     sum / whole
 }
 
-/// Across the side from corner k to k + 1 of each triangle; [`NONE`] where there is not exactly one other.
+/// Returns the triangle across the side from corner k to k + 1 of each triangle; [`NONE`] if not exactly one other
+/// shares it.
 pub(super) fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
     let mut beside = vec![[NONE; 3]; mesh.triangles.len()];
     for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {

@@ -36,7 +36,7 @@ const RELAXING_WORK: usize = 1_000_000;
 /// Mean area stretch, (r + 1/r) / 2, from which a relaxed chart is halved.
 const STRETCH: f64 = 1.05;
 
-/// How often a chart is halved.
+/// Maximum number of times a chart is halved.
 const SPLITS: usize = 3;
 
 /// Divides a mesh and lays it flat.
@@ -60,7 +60,7 @@ pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<ChartSet> {
     Ok(best)
 }
 
-/// A chart at its true sizes, or its halves if it cannot have them without stretching.
+/// Returns a chart at its true sizes, or its halves if it cannot have them without stretching.
 fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
     let steps = (RELAXING_WORK / chart.triangles.len().max(1)).clamp(RELAXING / 4, RELAXING);
     relax(mesh, &mut chart, steps);
@@ -82,8 +82,8 @@ fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
         .collect()
 }
 
-/// A chart in pieces that do not cover themselves: relaxing lets borders go where they like, and where two of them
-/// meet, the smaller of the two strips that lie over each other becomes a chart of its own.
+/// Returns a chart in pieces that do not cover themselves: relaxing lets borders go where they like, and where two of
+/// them meet, the smaller of the two strips that lie over each other becomes a chart of its own.
 fn uncovered(chart: Flat) -> Vec<Flat> {
     let points: Vec<Vec2> = chart.points.iter().map(|p| p.as_vec2()).collect();
     let pairs = overlaps(&points, &chart.corners, &vec![true; chart.corners.len()], THOROUGH).pairs;
@@ -192,7 +192,7 @@ const OFF: f64 = 5e-4;
 /// Cosine of the angle by which a triangle may lean.
 const LEAN: f64 = 0.999;
 
-/// The flat pieces of at least a hundredth of the surface, the largest triangles looked at first.
+/// Returns the flat pieces of at least a hundredth of the surface, the largest triangles looked at first.
 pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
     let count = mesh.triangles.len();
     let corners = |t: u32| mesh.corners(t).map(|p| p.as_dvec3());

@@ -35,7 +35,7 @@ const STRETCH: f64 = 1.05;
 /// How many times smaller or larger than the rest a triangle of the smooth copy may be: relaxing evens it out.
 const FACE_STRETCHED: f32 = 2.0 * STRETCHED;
 
-/// Divides a mesh, with its face in one chart if there is a way.
+/// Divides a mesh, with its face in one chart if possible.
 pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<ChartSet> {
     for inside in caps(mesh, front.normalize()).take(TRIES) {
         let (face, number) = part(mesh, |t| inside[t as usize]);
@@ -112,7 +112,7 @@ fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<boo
             }
         }
     }
-    // of that only what hangs together with the foremost triangle: other pieces have charts of their own
+    // only the component of the foremost triangle: other pieces have charts of their own
     let mut own: Vec<u32> = piece.iter().map(|&p| if p == outside { behind } else { NONE }).collect();
     flood(beside, &mut own, foremost, 0);
     own.iter().map(|&p| p == 0).collect()
@@ -161,7 +161,7 @@ mod tests {
         let mut seen = vec![0; mesh.triangles.len()];
         flat.charts.iter().flat_map(|c| &c.triangles).for_each(|&t| seen[t as usize] += 1);
         assert!(seen.iter().all(|&n| n == 1) && flat.without.is_empty());
-        // the nose, and what is around it up to 30 degrees
+        // the nose, and its surroundings up to 30 degrees
         let chart = |t: u32| flat.charts.iter().position(|c| c.triangles.contains(&t));
         let near = |t: &u32| mesh.corners(*t).iter().all(|p| p.normalize().z > 0.87);
         let mut charts: Vec<_> = (0..mesh.triangles.len() as u32).filter(near).map(chart).collect();

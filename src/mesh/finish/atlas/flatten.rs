@@ -47,7 +47,7 @@ pub(super) struct ChartSet {
 }
 
 impl ChartSet {
-    /// The same for a mesh in which triangle `t` is `number[t]`.
+    /// Returns the charts with each triangle `t` renumbered to `number[t]`.
     pub fn renumbered(mut self, number: &[u32]) -> ChartSet {
         let triangles = self.charts.iter_mut().flat_map(|c| &mut c.triangles).chain(&mut self.without);
         triangles.for_each(|t| *t = number[*t as usize]);
@@ -164,7 +164,7 @@ fn collect(out: &uvunwrap::OutputMesh, page: DVec2) -> Result<ChartSet> {
     Ok(ChartSet { charts, without })
 }
 
-/// Why there will be no charts.
+/// Returns the error for a mesh that cannot be divided into charts.
 fn unusable(reason: impl Display) -> Error {
     Error::cannot(reason, "")
 }
@@ -174,7 +174,7 @@ fn words(panic: &(dyn std::any::Any + Send)) -> String {
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("without a word").into()
 }
 
-/// The same triangles after `rounds` of smoothing; a border is smoothed along itself.
+/// Returns the same triangles after `rounds` of smoothing; a border is smoothed along itself.
 pub(super) fn smoothed(mesh: &Mesh, rounds: usize) -> Mesh {
     let (mut inner, mut rim) = (Vec::new(), Vec::new());
     let mut on_rim = vec![false; mesh.positions.len()];
@@ -231,7 +231,7 @@ const REST: f64 = 4.01;
 
 /// The surface's side of a triangle, as the energy needs it.
 struct RestTriangle {
-    /// Its corners, into the chart's points.
+    /// Its corners, as indices of the chart's points.
     corners: [u32; 3],
     area: f64,
     /// Squared lengths of the sides at corner 0 and their scalar product, over 2 · area.
@@ -301,7 +301,7 @@ fn energy(rest: &[RestTriangle], points: &[DVec2], slope: Option<&mut [DVec2]>) 
     sum
 }
 
-/// How far along `step` the first triangle loses its area.
+/// Returns how far along `step` the first triangle loses its area.
 fn reach(rest: &[RestTriangle], points: &[DVec2], step: &[DVec2]) -> f64 {
     let mut nearest = f64::INFINITY;
     for r in rest {

@@ -25,7 +25,7 @@ use rayon::prelude::*;
 /// Cells along the texture, about: between four and five texels each of 2048.
 const CELLS: f64 = 448.0;
 
-/// Turns tried for each chart; fewer where there are many charts.
+/// Number of turns tried for each chart; smaller if there are many charts.
 const TURNS: usize = 16;
 
 /// Orders tried, times charts.
@@ -70,8 +70,8 @@ pub(super) fn pack(
     monitor: &dyn Monitor,
 ) -> Result<Vec<ChartPose>> {
     let area: f64 = charts.iter().map(Flat::area).sum();
-    let room = size_px - 2.0 * gutter_px;
-    if !(area > 0.0 && area.is_finite() && room >= 1.0) {
+    let inner_px = size_px - 2.0 * gutter_px;
+    if !(area > 0.0 && area.is_finite() && inner_px >= 1.0) {
         return Err(too_small());
     }
     let outlines: Vec<Vec<[DVec2; 2]>> = charts
@@ -87,17 +87,17 @@ pub(super) fn pack(
     let mut order: Vec<usize> = (0..charts.len()).collect();
     order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
     let turns = (16_000 / charts.len()).clamp(4, TURNS) / 4 * 4;
-    let cells = CELLS.min(room);
+    let cells = CELLS.min(inner_px);
     let mut used = USED;
     while used > 1e-3 {
         // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a fifth wider.
-        let scale = cells * (used / area).sqrt() * size_px / room;
+        let scale = cells * (used / area).sqrt() * size_px / inner_px;
         let mut most = (1.2 * cells) as usize;
         let mut start = cells as usize;
         let mut found = None;
         // The first time with the gutter that the widest needs, then with that of the size found.
         for _ in 0..2 {
-            let reach = gutter_px * most as f64 / room;
+            let reach = gutter_px * most as f64 / inner_px;
             let drawn = draw(&outlines, stands, scale, reach, turns);
             match smallest(&drawn, &mut order, start, most, monitor)? {
                 Some((side, layout)) => {
@@ -108,7 +108,7 @@ pub(super) fn pack(
             }
         }
         if let Some((drawn, layout, side, reach)) = found {
-            let cell = room / side as f64;
+            let cell = inner_px / side as f64;
             let place = |(chart, &(turn, x, y)): (usize, &(usize, usize, usize))| {
                 let TurnedMask { turn, low, .. } = drawn[chart][turn];
                 // The page begins a gutter from the border, the chart its reach from its shape's corner.
@@ -149,8 +149,8 @@ fn draw(
     outlines.par_iter().zip(stands).map(one).collect()
 }
 
-/// The smallest side found at which everything fits, from `start` on, at most `most`; `order` becomes the one that
-/// did it.
+/// Returns the smallest side found at which everything fits, from `start` on, at most `most`; `order` becomes the one
+/// that did it.
 fn smallest(
     drawn: &[Vec<TurnedMask>],
     order: &mut Vec<usize>,
@@ -224,7 +224,7 @@ struct Mask {
     height: usize,
     /// Taken cells `[from, to)`, all rows one after the other.
     spans: Vec<[u32; 2]>,
-    /// Where each row's spans begin, and the end of the last.
+    /// Start of each row's spans, and the end of the last.
     starts: Vec<u32>,
     /// The longest span of each row.
     longest: Vec<u32>,
@@ -237,7 +237,7 @@ impl Mask {
         &self.spans[self.starts[y] as usize..self.starts[y + 1] as usize]
     }
 
-    /// The shape within an outline whose lowest coordinates are 0, grown by `reach`, so that the outline's
+    /// Returns the shape within an outline whose lowest coordinates are 0, grown by `reach`, so that the outline's
     /// lowest corner lies at (`reach`, `reach`). Cells are squares of one unit.
     fn of(outline: &[[DVec2; 2]], high: DVec2, reach: f64) -> Mask {
         let [width, height] = (high + 2.0 * reach).to_array().map(|v| (v.ceil() as usize).max(1));
@@ -330,7 +330,7 @@ fn fill(row: &mut [u64], from: usize, to: usize) {
     }
 }
 
-/// The first bit of a row from x on that is set (or clear); `end` if there is none before it.
+/// Returns the first bit of a row from x on that is set (or clear); `end` if none is set before it.
 fn next(row: &[u64], x: usize, end: usize, set: bool) -> usize {
     if x >= end {
         return end;
@@ -371,12 +371,12 @@ impl Page {
         Page { side, words, bits: vec![0; words * side], free: vec![side as u32; side] }
     }
 
-    /// The first cell of a row from x on that is taken (or free); `side` if there is none.
+    /// Returns the first cell of a row from x on that is taken (or free); `side` if none is.
     fn next(&self, y: usize, x: usize, taken: bool) -> usize {
         next(&self.bits[y * self.words..(y + 1) * self.words], x, self.side, taken)
     }
 
-    /// The lowest and then leftmost place for a mask whose upper end stays below `limit`.
+    /// Returns the lowest and then leftmost place for a mask whose upper end stays below `limit`.
     fn find(&self, mask: &Mask, limit: usize) -> Option<(usize, usize)> {
         if mask.width > self.side || mask.height > self.side {
             return None;

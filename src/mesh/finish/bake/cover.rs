@@ -45,12 +45,12 @@ impl Bands {
         Bands { rows, triangles }
     }
 
-    /// How many bands there are.
+    /// Returns the number of bands.
     pub fn len(&self) -> usize {
         self.triangles.len()
     }
 
-    /// The samples of one band, sorted by texel; `side` points along each side of a texel.
+    /// Returns the samples of one band, sorted by texel; `side` points along each side of a texel.
     ///
     /// A point that two triangles share (on a common edge) counts for both; a texel has a nearest-point
     /// sample only where no regular point of it lies in any triangle.

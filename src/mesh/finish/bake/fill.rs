@@ -1,4 +1,4 @@
-//! What lies between the charts of a texture.
+//! Filling of the texels between charts.
 //!
 //! Filtering and mip maps read beyond a chart's border. The nearest `gutter` texels repeat the chart's own
 //! (nearest covered texel), all else is filled by pull and push over a pyramid (Gortler et al. 1996), so that
@@ -6,7 +6,7 @@
 
 use crate::image::Image;
 
-/// Fills what is not covered. `covered` has one flag a texel; values of covered texels stay as they are.
+/// Fills uncovered texels. `covered` has one flag per texel; values of covered texels are kept.
 ///
 /// Nothing happens where no texel is covered.
 pub fn fill(image: &mut Image, covered: &[bool], gutter: u32) {

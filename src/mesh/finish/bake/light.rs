@@ -1,4 +1,4 @@
-//! What color a point of the surface has: where exactly it lies, which cameras see it, what they see.
+//! Colors of surface points: their exact positions, the cameras that see them, and the field's colors.
 
 use crate::geom::sphharm::{MOST_OF_DEGREE_2 as MOST, sh16};
 use crate::geom::{Bvh, Camera, Mesh, Ray};
@@ -20,7 +20,7 @@ pub struct Learned<'a> {
 
 /// Points of the surface with their unit normals.
 pub struct SurfacePoints {
-    /// Where they are.
+    /// Their positions.
     pub positions: Vec<Vec3>,
     /// Unit normals, pointing out.
     pub normals: Vec<Vec3>,
@@ -60,19 +60,19 @@ pub fn settle(flat: &SurfacePoints, reach: f32, learned: &Learned) -> SurfacePoi
     points
 }
 
-/// Who sees points: the training cameras, with the mesh in the way.
+/// Visibility of points from the training cameras, occluded by the mesh.
 pub struct Visibility<'a> {
     /// The cameras, in the mesh's coordinates.
     pub cameras: &'a [Camera],
     /// The mesh that hides.
     pub bvh: &'a Bvh,
-    /// How far in front of the flat triangle a line of sight starts, so that it does not meet its own triangle.
+    /// Offset of a line of sight from the flat triangle, so that it does not hit its own triangle.
     pub clearance: f32,
-    /// Cameras of a point at most: those that look at it most directly.
+    /// Maximum number of cameras of a point: those that look at it most directly.
     pub most: usize,
 }
 
-/// Cameras that stand in for those that see a point, where none does.
+/// Number of substitute cameras for a point that none sees.
 const STAND_INS: usize = 3;
 
 /// Directions to the cameras that see each point, all in one list.
@@ -89,7 +89,7 @@ pub struct ViewDirections {
 }
 
 impl Visibility<'_> {
-    /// The cameras that see each point: in the frame, at most 75 degrees from its normal, nothing between.
+    /// Returns the cameras that see each point: in the frame, at most 75 degrees from its normal, nothing between.
     ///
     /// Angles are those to the mesh's own normals and lines of sight start from the mesh (`flat`): the field's
     /// normals are rough, and a camera must not come and go from texel to texel. A point that no camera sees is
@@ -396,8 +396,8 @@ mod tests {
         assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
         assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
         let bvh = Bvh::new(&Mesh::default());
-        let nobody = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0, most: 8 };
-        let straight = nobody.directions(&points, &points);
+        let no_cameras = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0, most: 8 };
+        let straight = no_cameras.directions(&points, &points);
         let straight = shade(&points, straight, &learned, 0, glam::Mat3::IDENTITY);
         assert_eq!(straight.linear[0][0], 0.0);
     }
@@ -441,7 +441,7 @@ mod tests {
         assert!(error(2) < 0.5 * error(1) && error(1) < 0.8 * none, "{} {} {none}", error(2), error(1));
         let mut out = [[0f32; 3]; 4];
         fit_lobes([0.5; 3], &[Vec3::Z], &[0.3], &[[0.6; 3]], &mut out);
-        // seen from there it is nearly right, from the other side it is no farther off than the base
+        // from that side it is nearly right, from the other it is no worse than the base
         assert!((add(&out, Vec3::Z)[0] - 0.1).abs() < 0.02 && add(&out, -Vec3::Z)[0].abs() < 0.1);
         fit_lobes([0.5; 3], &[], &[], &[], &mut out);
         assert_eq!(out, [[0.0; 3]; 4]);

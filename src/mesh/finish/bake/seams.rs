@@ -122,8 +122,8 @@ impl Seams {
         ]
     }
 
-    /// The texels that seams are drawn from, and one row for each point of a seam: weights of its texels whose sum
-    /// should be zero, times the root of the length the point stands for.
+    /// Returns the texels that seams are drawn from, and one row for each point of a seam: weights of its texels whose
+    /// sum should be zero, times the root of the length the point stands for.
     fn system(&self) -> (Vec<u32>, Vec<[(u32, f64); 8]>) {
         let size = Vec2::new(self.width as f32, self.height as f32);
         let mut texels = Vec::new();

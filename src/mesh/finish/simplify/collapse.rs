@@ -24,14 +24,14 @@ pub(super) struct FanTriangle {
     pub to: u32,
 }
 
-/// What is around an edge. Kept between collapses for its memory.
+/// The neighborhood of an edge, reused between collapses to save allocations.
 #[derive(Default)]
 pub(super) struct EdgeLink {
     /// Triangles of a, then of b, that stay; the first `of_a` are a's.
     pub sides: Vec<FanTriangle>,
     of_a: usize,
     /// Triangles that hold the edge, with the vertex opposite to it.
-    gone: Vec<(u32, u32)>,
+    dropped: Vec<(u32, u32)>,
     /// Neighbours of the vertex to be.
     pub around: Vec<u32>,
     leans: Vec<Vec3>,
@@ -52,10 +52,10 @@ impl EdgeLink {
             self.epoch = 0;
         }
         self.epoch += 2;
-        // neighbours of a, and those of b alone
+        // marks for neighbours of a, and for those of b alone
         let (near_a, near_b) = (self.epoch, self.epoch + 1);
         self.sides.clear();
-        self.gone.clear();
+        self.dropped.clear();
         self.around.clear();
         let (va, vb) = (rings.valence(a), rings.valence(b));
         if va + vb > (CROWN + 4).max(va.max(vb) + 4) {
@@ -70,21 +70,21 @@ impl EdgeLink {
                 }
             }
             if from == b {
-                self.gone.push((t, to));
+                self.dropped.push((t, to));
             } else if to == b {
-                self.gone.push((t, from));
+                self.dropped.push((t, from));
             } else {
                 self.sides.push(FanTriangle { triangle: t, from, to });
             }
         }
         self.of_a = self.sides.len();
-        let opposite = match self.gone[..] {
+        let opposite = match self.dropped[..] {
             [(_, c)] => [c, c],
             [(_, c), (_, d)] if c != d => [c, d],
             _ => return false,
         };
         let borders = (rings.flags[a as usize] & BORDER, rings.flags[b as usize] & BORDER);
-        if borders.0 & borders.1 != 0 && self.gone.len() == 2 {
+        if borders.0 & borders.1 != 0 && self.dropped.len() == 2 {
             return false; // would pinch the surface between two borders
         }
         let spans = |s: &FanTriangle| [s.from, s.to] == opposite || [s.to, s.from] == opposite;
@@ -138,12 +138,12 @@ impl EdgeLink {
         true
     }
 
-    /// The triangles of both ends, before the collapse.
+    /// Returns the triangles of both ends, before the collapse.
     pub(super) fn triangles(&self) -> impl Iterator<Item = u32> {
-        self.sides.iter().map(|side| side.triangle).chain(self.gone.iter().map(|gone| gone.0))
+        self.sides.iter().map(|side| side.triangle).chain(self.dropped.iter().map(|dropped| dropped.0))
     }
 
-    /// The largest distance of `x` from the planes of the triangles of both ends.
+    /// Returns the largest distance of `x` from the planes of the triangles of both ends.
     pub(super) fn strays(&self, rings: &Rings, x: Vec3) -> f32 {
         let far = |t: u32| {
             let at = rings.positions[rings.triangles[t as usize][0] as usize];
@@ -152,7 +152,7 @@ impl EdgeLink {
         self.triangles().map(far).fold(0.0, f32::max)
     }
 
-    /// The worst quality among all triangles of both ends.
+    /// Returns the worst quality among all triangles of both ends.
     fn worst(&self, rings: &Rings) -> f32 {
         self.triangles().map(|t| shape(rings.corners(t))).fold(f32::INFINITY, f32::min)
     }
@@ -171,7 +171,7 @@ impl EdgeLink {
         rings.flags[a as usize] |= rings.flags[b as usize];
         rings.stamps[a as usize] += 1;
         rings.stamps[b as usize] += 1;
-        for &(t, opposite) in &self.gone {
+        for &(t, opposite) in &self.dropped {
             rings.triangles[t as usize] = [NONE; 3];
             rings.spreads[opposite as usize].subtract(rings.leans[t as usize]);
             rings.leave(opposite, t);
@@ -208,7 +208,7 @@ impl EdgeLink {
     }
 }
 
-/// The best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
+/// Returns the best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
 #[inline]
 pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);

@@ -62,7 +62,7 @@ impl Cells {
         (c.z as usize * self.dims.y as usize + c.y as usize) * self.dims.x as usize + c.x as usize
     }
 
-    /// The cells of a box of cells, with their numbers.
+    /// Returns the cells of a box of cells, with their numbers.
     fn between(self, low: IVec3, high: IVec3) -> impl Iterator<Item = (IVec3, usize)> {
         let row = move |y, z| (low.x..=high.x).map(move |x| IVec3::new(x, y, z));
         let layer = move |z| (low.y..=high.y).flat_map(move |y| row(y, z));
@@ -120,7 +120,7 @@ impl Facet {
     }
 }
 
-/// The triangles that meet others in more than common corners, in order.
+/// Returns the triangles that meet others in more than common corners, in order.
 pub(super) fn crossings(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<u32> {
     let facets: Vec<Facet> =
         triangles.par_iter().map(|&t| Facet::new(t, t.map(|v| positions[v as usize]))).collect();
@@ -144,14 +144,14 @@ pub(super) fn crossings(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<u32> 
     found
 }
 
-/// Where the triangles of a shrinking mesh are, so that a collapse can be refused.
+/// An index of the triangles of a shrinking mesh, used to refuse collapses that cause crossings.
 pub(super) struct Sheets {
     cells: Cells,
     /// Per cell the last link of its chain.
     heads: Vec<u32>,
     /// Triangle and the link before. Triangles stay entered where they once were.
     links: Vec<(u32, u32)>,
-    /// Which query saw a triangle last.
+    /// The last query that visited each triangle.
     seen: Vec<u32>,
     query: u32,
 }

@@ -1,6 +1,6 @@
 //! The mesh while it shrinks: which triangles are around each vertex.
 //!
-//! Flat arrays only. The rings of all vertices lie in one pool; a ring that outgrows its place moves
+//! Flat arrays only. The rings of all vertices lie in one pool; a ring that outgrows its slot moves
 //! to the pool's end. A collapse of (a, b) gives b's triangles to a and drops the one or two that held
 //! the edge; nothing else in the mesh changes its number.
 //!
@@ -29,7 +29,7 @@ use rayon::prelude::*;
 /// Another sheet of the surface is near: collapses look for intersections.
 pub(super) const CROWDED: u8 = 4;
 
-/// What a dropped triangle's corners are.
+/// Stands for the corners of a dropped triangle.
 pub(super) const NONE: u32 = u32::MAX;
 
 /// A border edge resists leaving its line as much as a triangle of this many times its length squared.
@@ -39,7 +39,7 @@ const BORDER_WEIGHT: f32 = 3.0;
 struct RingSlot {
     start: u32,
     len: u32,
-    room: u32,
+    capacity: u32,
 }
 
 /// A mesh under collapse.
@@ -54,11 +54,11 @@ pub(super) struct Rings {
     pub leans: Vec<Vec3>,
     pub spreads: Vec<PlaneQuadric>,
     pub flags: Vec<u8>,
-    /// Grows whenever a vertex is what a collapse left or took away.
+    /// Incremented whenever a collapse changes or removes a vertex.
     pub stamps: Vec<u32>,
     /// Triangles that are left.
     pub count: usize,
-    places: Vec<RingSlot>,
+    slots: Vec<RingSlot>,
     pool: Vec<u32>,
 }
 
@@ -78,23 +78,23 @@ impl Rings {
             flags: vec![0; n],
             stamps: vec![0; n],
             count: triangles.len(),
-            places: vec![RingSlot::default(); n],
+            slots: vec![RingSlot::default(); n],
             pool: vec![0; 3 * triangles.len()],
             triangles,
         };
         for &v in rings.triangles.as_flattened() {
-            rings.places[v as usize].room += 1;
+            rings.slots[v as usize].capacity += 1;
         }
         let mut start = 0;
-        for place in &mut rings.places {
-            place.start = start;
-            start += place.room;
+        for slot in &mut rings.slots {
+            slot.start = start;
+            start += slot.capacity;
         }
         for (t, triangle) in rings.triangles.iter().enumerate() {
             for &v in triangle {
-                let place = &mut rings.places[v as usize];
-                rings.pool[(place.start + place.len) as usize] = t as u32;
-                place.len += 1;
+                let slot = &mut rings.slots[v as usize];
+                rings.pool[(slot.start + slot.len) as usize] = t as u32;
+                slot.len += 1;
             }
         }
         rings.flags = (0..n as u32)
@@ -109,15 +109,15 @@ impl Rings {
         rings
     }
 
-    /// The triangles around a vertex.
+    /// Returns the triangles around a vertex.
     pub(super) fn ring(&self, v: u32) -> &[u32] {
-        let place = self.places[v as usize];
-        &self.pool[place.start as usize..(place.start + place.len) as usize]
+        let slot = self.slots[v as usize];
+        &self.pool[slot.start as usize..(slot.start + slot.len) as usize]
     }
 
-    /// How many triangles are around a vertex; none when it is gone.
+    /// Returns the number of triangles around a vertex; 0 if it was removed.
     pub(super) fn valence(&self, v: u32) -> usize {
-        self.places[v as usize].len as usize
+        self.slots[v as usize].len as usize
     }
 
     /// Changes with either end: stamps only grow, so their sum stays the same only if both do.
@@ -125,12 +125,12 @@ impl Rings {
         self.stamps[a as usize].wrapping_add(self.stamps[b as usize])
     }
 
-    /// The three corners of a triangle.
+    /// Returns the three corners of a triangle.
     pub(super) fn corners(&self, t: u32) -> [Vec3; 3] {
         self.triangles[t as usize].map(|v| self.positions[v as usize])
     }
 
-    /// The triangles that are left.
+    /// Returns the triangles that are left.
     pub(super) fn alive(&self) -> impl Iterator<Item = u32> {
         (0..self.triangles.len() as u32).filter(|&t| self.triangles[t as usize][0] != NONE)
     }
@@ -140,7 +140,7 @@ impl Rings {
         self.triangles[t as usize][..2].iter().position(|&w| w == v).unwrap_or(2)
     }
 
-    /// The other two corners of a triangle, in order.
+    /// Returns the other two corners of a triangle, in order.
     pub(super) fn opposite(&self, t: u32, v: u32) -> (u32, u32) {
         let (triangle, k) = (self.triangles[t as usize], self.corner_of(t, v));
         (triangle[(k + 1) % 3], triangle[(k + 2) % 3])
@@ -188,42 +188,42 @@ impl Rings {
         self.spreads[v as usize] = spread;
     }
 
-    /// How many triangles hold both vertices.
+    /// Returns how many triangles share both vertices.
     fn shared(&self, v: u32, w: u32) -> usize {
         self.ring(v).iter().filter(|&&t| self.triangles[t as usize].contains(&w)).count()
     }
 
-    /// Gives the vertex this ring, in place when there is room.
+    /// Sets the ring of a vertex, in place if its slot has the capacity.
     pub(super) fn set_ring(&mut self, v: u32, ring: &[u32]) {
-        let place = &mut self.places[v as usize];
-        place.len = ring.len() as u32;
-        if place.len > place.room {
-            place.start = self.pool.len() as u32;
-            place.room = place.len;
+        let slot = &mut self.slots[v as usize];
+        slot.len = ring.len() as u32;
+        if slot.len > slot.capacity {
+            slot.start = self.pool.len() as u32;
+            slot.capacity = slot.len;
             self.pool.extend_from_slice(ring);
         } else {
-            self.pool[place.start as usize..][..ring.len()].copy_from_slice(ring);
+            self.pool[slot.start as usize..][..ring.len()].copy_from_slice(ring);
         }
     }
 
     /// Takes one triangle out of a vertex's ring.
     pub(super) fn leave(&mut self, v: u32, t: u32) {
-        let place = &mut self.places[v as usize];
-        let ring = &mut self.pool[place.start as usize..(place.start + place.len) as usize];
+        let slot = &mut self.slots[v as usize];
+        let ring = &mut self.pool[slot.start as usize..(slot.start + slot.len) as usize];
         if let Some(i) = ring.iter().position(|&other| other == t) {
             ring[i] = ring[ring.len() - 1];
-            place.len -= 1;
+            slot.len -= 1;
         }
     }
 
-    /// Drops gone vertices and triangles from the arrays; the order of the rest stays. And which vertices
-    /// must not move: those of borders, and where the mesh is no surface.
+    /// Compacts the arrays, keeping the order of the remaining vertices and triangles. Also returns which vertices
+    /// must not move: those of borders, and where the mesh is not a manifold.
     pub(super) fn into_mesh(self) -> (Mesh, Vec<bool>) {
         let mut fixed = Vec::new();
         let mut number = vec![NONE; self.positions.len()];
         let mut mesh = Mesh::default();
         for v in 0..self.positions.len() {
-            if self.places[v].len > 0 {
+            if self.slots[v].len > 0 {
                 number[v] = mesh.positions.len() as u32;
                 mesh.positions.push(self.positions[v]);
                 fixed.push(self.flags[v] & (BORDER | HELD) != 0);
@@ -238,7 +238,7 @@ impl Rings {
     }
 }
 
-/// Has an edge with one triangle.
+/// Flag of a vertex at an edge with one triangle.
 pub(super) const BORDER: u8 = 1;
 /// Takes part in no collapse and does not move.
 pub(super) const HELD: u8 = 2;
@@ -304,7 +304,7 @@ pub(super) fn lean(area: Vec3) -> Vec3 {
     if length > 0.0 { area / length.sqrt() } else { Vec3::ZERO }
 }
 
-/// The outer product of a vector with itself.
+/// Returns the outer product of a vector with itself.
 #[inline]
 fn outer(s: Vec3) -> [f32; 6] {
     [s.x * s.x, s.x * s.y, s.x * s.z, s.y * s.y, s.y * s.z, s.z * s.z]
@@ -336,7 +336,7 @@ fn times(m: &[f64; 6], v: DVec3) -> DVec3 {
     )
 }
 
-/// Where an edge may collapse to.
+/// The targets of a collapse.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CollapseTarget {
     /// Anywhere.
@@ -347,7 +347,7 @@ pub(super) enum CollapseTarget {
     Second,
 }
 
-/// The best point for the collapse of edge (a, b), and what it costs: squared distance times area.
+/// Returns the best point for the collapse of edge (a, b), and its cost: squared distance times area.
 ///
 /// Where the 3 × 3 system is worse than a condition of 1e6 or its solution lies far off, the better of
 /// the ends and the middle.

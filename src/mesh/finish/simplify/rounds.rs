@@ -76,7 +76,7 @@ impl CrossingSearch<'_> {
     }
 }
 
-/// What every round needs to know.
+/// The data shared by all rounds.
 #[derive(Clone, Copy)]
 pub(super) struct Task<'a> {
     pub field: Option<&'a Field<'a>>,
@@ -98,7 +98,7 @@ pub(super) fn counted(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
     Ok(out)
 }
 
-/// A mesh ready for collapses.
+/// Returns a mesh ready for collapses.
 fn prepare(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Rings {
     let mut rings = Rings::new(mesh);
     report.degenerate += mesh.triangles.len() - rings.triangles.len();
@@ -124,7 +124,7 @@ pub(super) fn reduce(
     let mut sheets = (!task.look.is_nowhere()).then(|| Sheets::new(rings));
     let mut breath = 0;
     let mut offers: Vec<(u32, u32)> = Vec::new();
-    // What was refused may be possible when all around has changed: so once more until nothing is.
+    // A refused collapse may become possible when its surroundings change, so repeat until none is.
     loop {
         let before = rings.count;
         let mut queue = fill(rings);
@@ -200,7 +200,7 @@ fn fill(rings: &Rings) -> EdgeQueue {
         let triangle = rings.triangles[t as usize];
         for k in 0..3 {
             let (a, b) = (triangle[k], triangle[(k + 1) % 3]);
-            // inner edges are met from both ends, those of a border from one
+            // inner edges are visited from both ends, border edges from one
             let border = rings.flags[a as usize] & rings.flags[b as usize] & BORDER != 0;
             if (a < b || border)
                 && let Some((_, cost)) = place(rings, a, b)
@@ -473,7 +473,7 @@ fn offsets(positions: &[Vec3], triangles: &[[u32; 3]], at_vertices: &[f32], at_m
     x
 }
 
-/// The middles of triangles.
+/// Returns the middles of triangles.
 pub(super) fn middles(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<Vec3> {
     triangles.iter().map(|t| t.iter().map(|&v| positions[v as usize] / 3.0).sum()).collect()
 }
@@ -481,7 +481,7 @@ pub(super) fn middles(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<Vec3> {
 /// Of the bits of a cost: sign and exponent, and four bits of its mantissa.
 const SHIFT: u32 = 19;
 
-/// An edge and what its ends were when it was entered.
+/// A queued edge with the stamps of its ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Entry {
     a: u32,
@@ -507,7 +507,7 @@ impl EdgeQueue {
         EdgeQueue { buckets, lowest: usize::MAX, current: Vec::new(), done: 0, bucket: 0 }
     }
 
-    /// The bucket of a cost ≥ 0; whatever is not a number goes last.
+    /// Returns the bucket of a cost ≥ 0; whatever is not a number goes last.
     fn bucket(cost: f32) -> usize {
         // + 0 makes −0 and 0 equal
         let cost = if cost.is_nan() { f32::INFINITY } else { cost.max(0.0) + 0.0 };
@@ -519,7 +519,7 @@ impl EdgeQueue {
         self.lowest = self.lowest.min(bucket);
     }
 
-    /// The next entry and its bucket.
+    /// Returns the next entry and its bucket.
     fn pop(&mut self) -> Option<(usize, Entry)> {
         while self.done == self.current.len() {
             self.current.clear();
