@@ -2,7 +2,7 @@
 //!
 //! `I(p) = Σ_k w_k · clamp(I_k(p), 0, 1)`, the paper's §5 with `w` = 0.1 baseline, 0.6 T-Face,
 //! 0.3 I-Face. Which member is the better one differs from capture to capture, and fixed weights that suit
-//! one make the blend of another worse than its best member. So weights are fitted ([`weigh`]): those of
+//! one make the blend of another worse than its best member. So weights are fitted ([`fit_weights`]): those of
 //! least squared error, `w ≥ 0`, `Σ w = 1`, on squares of the training photographs that nothing learned
 //! from ([`tiles`]), never on test views.
 //!
