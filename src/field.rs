@@ -1,7 +1,7 @@
-//! What the learned fields share: the trainer, what it asks of a device, parameters, photographs, checkpoints.
+//! Code that all learned fields share: the trainer, its device operations, parameters, photographs and checkpoints.
 //!
-//! A model ([`training::Model`]) says what differs between fields; its step is written once, over operations
-//! ([`ops::Ops`]) that each device implements with its own kernels.
+//! A model ([`training::Model`]) defines what differs between fields. Its training step is written once, over
+//! operations ([`ops::Ops`]) that each device implements with its own kernels.
 
 pub mod background;
 #[cfg(any(test, feature = "wgpu"))]
@@ -25,11 +25,11 @@ use crate::{Error, Result};
 #[cfg(feature = "wgpu")]
 use std::sync::{Mutex, OnceLock};
 
-/// Where a field is learned.
-// a process has one, or two
+/// The device that a field is trained on.
+// A process holds one or two of these, so boxing the larger variant would save nothing.
 #[allow(clippy::large_enum_variant)]
 pub enum ComputeDevice {
-    /// The processor, with the reason where `auto` found nothing else.
+    /// The processor, with the reason if `auto` found no usable GPU.
     Cpu(String),
     /// A GPU.
     #[cfg(feature = "wgpu")]
@@ -37,7 +37,7 @@ pub enum ComputeDevice {
 }
 
 impl ComputeDevice {
-    /// Returns what it is and why it was chosen, for reports.
+    /// Returns the device's name and the reason for choosing it, for reports.
     pub fn description(&self) -> String {
         match self {
             ComputeDevice::Cpu(why) if why.is_empty() => "the processor".into(),
@@ -47,9 +47,13 @@ impl ComputeDevice {
         }
     }
 
-    /// Takes the processor where a GPU that nobody named cannot do what is asked; where it was named, that is an error.
-    pub fn fallback_to_cpu(self, asked: impl FnOnce(&ComputeDevice) -> Result<()>) -> Result<ComputeDevice> {
-        match asked(&self) {
+    /// Falls back to the processor if `check` refuses a GPU that `auto` selected.
+    ///
+    /// # Errors
+    ///
+    /// The error of `check`, if the user named the device.
+    pub fn fallback_to_cpu(self, check: impl FnOnce(&ComputeDevice) -> Result<()>) -> Result<ComputeDevice> {
+        match check(&self) {
             Ok(()) => Ok(self),
             #[cfg(feature = "wgpu")]
             Err(why) if matches!(&self, ComputeDevice::Gpu(gpu) if gpu.auto_selected) => {
@@ -65,38 +69,38 @@ impl ComputeDevice {
 pub struct SelfTest {
     /// The name of the field.
     pub field: &'static str,
-    /// Makes the step on an adapter and on the processor.
+    /// Runs the step on an adapter and on the processor, and compares the results.
     #[cfg(feature = "wgpu")]
     pub run: fn(&crate::kernel::gpu::Adapter) -> Result<Vec<devices::Check>>,
 }
 
-/// Returns the device that a word names: see [`DeviceChoice`]. `auto` takes a GPU only where it passes the test of the
-/// field that is to be computed there.
+/// Opens the device named `name`; see [`DeviceChoice`] for the syntax. `auto` selects a GPU only if it passes `test`, the
+/// self-test of the field to be computed.
 ///
 /// # Errors
 ///
-/// Where this build or this machine does not have it.
+/// If this build or this machine has no such device.
 pub fn compute_device(name: &str, test: &SelfTest) -> Result<ComputeDevice> {
-    let choice = parsed(name)?;
+    let choice = parse_choice(name)?;
     if choice.name == "auto" {
         #[cfg(feature = "wgpu")]
         return Ok(devices::best(&choice, &[*test]).map_or_else(ComputeDevice::Cpu, ComputeDevice::Gpu));
     }
     let _ = test;
-    named(&choice)
+    open_named(&choice)
 }
 
-/// Refuses a device that [`compute_device`] would refuse. Nothing is asked of any GPU where none is named.
+/// Refuses a device that [`compute_device`] would refuse. No GPU is opened unless one is named.
 ///
 /// # Errors
 ///
-/// Where this build or this machine does not have it.
+/// If this build or this machine has no such device.
 pub fn require_device(name: &str) -> Result<()> {
-    let choice = parsed(name)?;
-    if choice.name == "auto" { Ok(()) } else { named(&choice).map(drop) }
+    let choice = parse_choice(name)?;
+    if choice.name == "auto" { Ok(()) } else { open_named(&choice).map(drop) }
 }
 
-fn parsed(name: &str) -> Result<DeviceChoice> {
+fn parse_choice(name: &str) -> Result<DeviceChoice> {
     let choice = DeviceChoice::parse(name).ok_or_else(|| {
         Error::usage(format!("unknown device `{name}`"), "`tiface config --explain device` says which")
     })?;
@@ -110,7 +114,7 @@ fn parsed(name: &str) -> Result<DeviceChoice> {
     Ok(choice)
 }
 
-fn named(choice: &DeviceChoice) -> Result<ComputeDevice> {
+fn open_named(choice: &DeviceChoice) -> Result<ComputeDevice> {
     match choice.name.as_str() {
         "cpu" => Ok(ComputeDevice::Cpu(String::new())),
         #[cfg(feature = "wgpu")]
@@ -125,7 +129,7 @@ fn named(choice: &DeviceChoice) -> Result<ComputeDevice> {
     }
 }
 
-/// A field on a GPU, which answers instead of the processor until it fails.
+/// A field on a GPU, which is evaluated in place of the processor's until the GPU fails.
 #[cfg(feature = "wgpu")]
 pub struct GpuField<T> {
     field: Mutex<Option<T>>,
@@ -134,26 +138,27 @@ pub struct GpuField<T> {
 
 #[cfg(feature = "wgpu")]
 impl<T> GpuField<T> {
-    /// Takes the field; without one there is never an answer.
+    /// Wraps a field; with `None`, [`ask`](GpuField::ask) always returns `None`.
     pub fn new(field: Option<T>) -> GpuField<T> {
         GpuField { field: Mutex::new(field), failure: OnceLock::new() }
     }
 
-    /// Returns why the processor answers in its place, once it failed.
+    /// Returns why the GPU is no longer used, once it has failed.
     pub fn failure(&self) -> Option<&str> {
         self.failure.get().map(String::as_str)
     }
 
-    /// Returns the answer; none where there is no field, or where it failed: then the processor answers.
-    pub fn ask<A>(&self, question: impl FnOnce(&mut T) -> Result<A>) -> Option<A> {
+    /// Evaluates the field on the GPU. Returns `None` if there is no field or the GPU failed, so that the caller
+    /// evaluates it on the processor.
+    pub fn ask<A>(&self, evaluate: impl FnOnce(&mut T) -> Result<A>) -> Option<A> {
         let mut field = self.field.lock().ok()?;
-        let answer = question(field.as_mut()?);
-        if let Err(e) = &answer {
+        let result = evaluate(field.as_mut()?);
+        if let Err(e) = &result {
             let text = self.failure.get_or_init(|| format!("{e}; the processor goes on"));
             tracing::warn!("{text}");
             *field = None;
         }
-        answer.ok()
+        result.ok()
     }
 }
 

@@ -46,9 +46,9 @@ pub(super) fn doctor(common: &Common) -> Result<()> {
     let features = [("wgpu", cfg!(feature = "wgpu")), ("matting", cfg!(feature = "matting"))];
     #[cfg(feature = "wgpu")]
     let (devices, auto) = {
-        use crate::field::devices::{best, examine};
+        use crate::field::devices::{best, examine_adapters};
         let tests = [crate::iface::SDF_TEST, crate::tface::VM_TEST, crate::iface::DENSITY_TEST];
-        let devices = examine(&tests);
+        let devices = examine_adapters(&tests);
         let choice = crate::config::DeviceChoice::parse("auto").expect("a device's name");
         let auto = match best(&choice, &tests) {
             Ok(gpu) => format!("{}: {}", gpu.device.name(), gpu.why),

@@ -1,15 +1,16 @@
-//! What is behind the head in training: random colors, and the photograph as it would be over black.
+//! Backgrounds in training: random colors behind the rays, and photographs recomposited over black.
 //!
 //! Where the mask is soft, a photograph mixes head and background: `photo = α F + (1 − α) B` in linear light. The
-//! published target `α · photo` darkens the head twice there and keeps part of the background's light. Here the
-//! background `B` is estimated from the pixels nearby that are all background, and taken away:
-//! `target over black = coded(α F) = coded(photo − (1 − α) B)`, which is what a render over black shows.
+//! published target `α · photo` darkens the head twice there and keeps part of the background's light. This module
+//! estimates the background `B` from nearby pixels that are fully background, and subtracts it:
+//! `target over black = coded(α F) = coded(photo − (1 − α) B)`, which is the color of a render over black.
 
 use super::training::StepAt;
 use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::kernel::cpu::rng;
 
-/// One color a ray for target and render, which numbers of this stream give; black without one.
+/// Returns the background color of each ray, used for both target and render: random colors from the given random
+/// stream, or black without one.
 pub fn ray_backgrounds(at: StepAt, stream: Option<u64>, rays: usize) -> Vec<[f32; 3]> {
     let Some(stream) = stream else { return vec![[0.0; 3]; rays] };
     let channel = |i: u64| rng::uniform(at.seed, at.step << 4 | stream, i);
@@ -19,16 +20,15 @@ pub fn ray_backgrounds(at: StepAt, stream: Option<u64>, rays: usize) -> Vec<[f32
 /// Half edge of the window that collects background pixels, as a share of the picture's height.
 const WINDOW: f32 = 0.02;
 
-/// The soft pixels of a photograph as they would be over black. All others show the photograph, or nothing.
+/// Colors over black of a photograph's soft pixels. All other pixels keep the photograph's color or are black.
 pub struct SoftPixels {
-    /// Which they are, rising.
+    /// Indices of the soft pixels, in ascending order.
     at: Vec<u32>,
     color: Vec<[u8; 3]>,
 }
 
 impl SoftPixels {
-    /// Returns what pixel `p` of the photograph shows over black: the photograph where the mask is full, black where it
-    /// is empty.
+    /// Returns the color of pixel `p` over black: the photograph's where the mask is 255, black where it is 0.
     pub fn over_black(&self, photo: &Photo, mask: &Gray, p: usize) -> [u8; 3] {
         match mask.values[p] {
             0 => [0; 3],
@@ -38,7 +38,7 @@ impl SoftPixels {
     }
 }
 
-/// Takes the background's light out of the soft pixels.
+/// Removes the background's light from the soft pixels.
 ///
 /// No channel exceeds the mask's alpha, so that color never asks for more than the mask's opacity.
 pub fn soft_pixels(photo: &Photo, mask: &Gray) -> SoftPixels {
@@ -46,12 +46,12 @@ pub fn soft_pixels(photo: &Photo, mask: &Gray) -> SoftPixels {
     let linear: [f32; 256] = std::array::from_fn(|i| linear_from_srgb(i as f32 / 255.0));
     let at: Vec<u32> = (0..(w * h) as u32).filter(|&p| !matches!(mask.values[p as usize], 0 | 255)).collect();
     let reach = ((WINDOW * h as f32).ceil() as usize).max(2);
-    // large photographs are looked at every few pixels: the background is smooth
+    // Large photographs are sampled every few pixels, because the background is smooth.
     let stride = (reach / 16).max(1);
     let over_black = |&p: &u32| {
         let p = p as usize;
         let (x, y) = (p % w, p / w);
-        // nearer background pixels count more; a window without any leaves it black
+        // Nearer background pixels weigh more. A window without background pixels estimates black.
         let (mut sum, mut weight) = ([0f32; 3], 0f32);
         for v in (y.saturating_sub(reach)..(y + reach + 1).min(h)).step_by(stride) {
             for u in (x.saturating_sub(reach)..(x + reach + 1).min(w)).step_by(stride) {

@@ -1,4 +1,4 @@
-//! Photographs of an analytic ball: what self-tests and tests train on.
+//! Photographs of an analytic ball, the training data of self-tests and tests.
 
 use super::pixels::TrainView;
 use crate::geom::{Camera, Distortion};
@@ -6,10 +6,10 @@ use crate::image::{Gray, Photo};
 use crate::kernel::cpu::march::Bitmask;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 
-/// Its radius.
+/// Radius of the ball, scene units.
 pub const BALL: f32 = 0.6;
 
-/// A red and green ball in front of a blue wall, seen from eight sides.
+/// Returns photographs from eight sides of a red and green ball in front of a blue wall.
 pub fn views() -> Vec<TrainView> {
     let color = |p: Vec3| if p.y > 0.0 { [200, 40, 30] } else { [40, 180, 60] };
     (0..8)
@@ -17,7 +17,7 @@ pub fn views() -> Vec<TrainView> {
         .collect()
 }
 
-/// A photograph of the ball with its mask.
+/// Renders a photograph of the ball, with its mask.
 pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8; 3]) -> TrainView {
     let rotation = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-elevation);
     let camera = Camera {
@@ -58,7 +58,7 @@ pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8
     }
 }
 
-/// Cells that the ball lies in, and some around them.
+/// Returns the cells that contain the ball, with a margin of 0.1.
 pub fn hull() -> Bitmask {
     let r = 32;
     let mut hull = Bitmask::filled(r, false);

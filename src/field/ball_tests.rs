@@ -1,4 +1,4 @@
-//! What the tests of learned fields share beside the ball.
+//! Helpers that the tests of the learned fields share, besides the ball.
 
 use super::view;
 use crate::field::checkpoint::newest;
@@ -11,7 +11,7 @@ use glam::Vec3;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A ball with waves of some pixels all over it, seen from twelve sides, nine of them from before it.
+/// Returns photographs of a ball textured with waves of a few pixels: nine from the front and three from the back.
 pub fn textured_views() -> Vec<TrainView> {
     let waves = |p: Vec3| {
         let wave = |i: u64| {
@@ -29,7 +29,7 @@ pub fn temporary() -> tempfile::TempDir {
     tempfile::tempdir().expect("a temporary folder")
 }
 
-/// A training on the CPU from seed 3.
+/// Returns a session that trains on the CPU from seed 3.
 pub fn session<'a>(
     stage: &'static str,
     dir: &'a Path,
@@ -39,7 +39,7 @@ pub fn session<'a>(
     TrainingSession { stage, seed: 3, device: "cpu", dir, identity, monitor }
 }
 
-/// Asks to stop after so many steps.
+/// A monitor that requests a stop after a number of steps.
 pub struct StopAfter(AtomicU64);
 
 impl StopAfter {
@@ -57,7 +57,7 @@ impl Monitor for StopAfter {
     }
 }
 
-/// Writes the newest checkpoint of a stage folder again, with a change.
+/// Rewrites the newest checkpoint of a stage folder with a change applied.
 pub fn tampered(dir: &Path, change: impl FnOnce(&mut Tensors)) {
     let path = newest(dir);
     let mut all = read_tensors(&path, &Limits::default()).unwrap();
@@ -66,12 +66,12 @@ pub fn tampered(dir: &Path, change: impl FnOnce(&mut Tensors)) {
     write_tensors(&path, &tensors, &all.1).unwrap();
 }
 
-/// A change that makes a number of the header this one.
+/// Returns a change that sets an entry of the header.
 pub fn says(key: &str, value: &str) -> impl Fn(&mut Tensors) {
     move |(_, header)| drop(header.insert(key.into(), value.into()))
 }
 
-/// A change that makes the first value of a tensor negative.
+/// Returns a change that makes the first value of a tensor negative.
 pub fn negative(name: &str) -> impl Fn(&mut Tensors) {
     move |(tensors, _)| match &mut tensors.get_mut(name).unwrap().1 {
         TensorValues::F32(values) => values[0] = -1.0,
@@ -79,7 +79,7 @@ pub fn negative(name: &str) -> impl Fn(&mut Tensors) {
     }
 }
 
-/// A change that gives a vector of whole numbers these values.
+/// Returns a change that overwrites a vector of integers.
 pub fn words(name: &str, values: [u64; 3]) -> impl Fn(&mut Tensors) {
     move |(tensors, _)| match &mut tensors.get_mut(name).unwrap().1 {
         TensorValues::U64(words) => words.copy_from_slice(&values),
@@ -87,16 +87,16 @@ pub fn words(name: &str, values: [u64; 3]) -> impl Fn(&mut Tensors) {
     }
 }
 
-/// A training that returns its warnings.
+/// A function that trains in a folder and returns the warnings.
 pub type Run<'a> = &'a dyn Fn(&Path, &dyn Monitor) -> Result<Vec<String>>;
 
-/// The newest checkpoint's bytes.
+/// Returns the bytes of the newest checkpoint.
 pub fn bytes(dir: &Path) -> Vec<u8> {
     std::fs::read(newest(dir)).unwrap()
 }
 
-/// A training that is stopped `stops` times after 11 steps, and whose newest checkpoint is then cut short by a
-/// crash, gives the bytes of an undisturbed one, whose folder is returned.
+/// Asserts that a training stopped `stops` times after 11 steps, whose newest checkpoint is then truncated as by a crash,
+/// ends with the same bytes as an uninterrupted training. Returns the folder of the latter.
 pub fn resumes(run: Run, stops: usize) -> tempfile::TempDir {
     let (undisturbed, stopped) = (temporary(), temporary());
     run(undisturbed.path(), &Quiet).unwrap();
@@ -111,8 +111,8 @@ pub fn resumes(run: Run, stops: usize) -> tempfile::TempDir {
     undisturbed
 }
 
-/// Each changed checkpoint of a training that was stopped twice is named by what is wrong with it, and the one
-/// before it is taken; where there is none, the error says how to start afresh.
+/// Asserts that each changed checkpoint of a training that was stopped twice is reported with its defect and that the
+/// previous checkpoint is used; without a previous one, the error must say how to restart the stage.
 pub fn refuses(run: Run, stop_after: u64, stage: &str, rows: &[(&str, &dyn Fn(&mut Tensors))]) {
     let (begun, undisturbed) = (temporary(), temporary());
     for _ in 0..2 {
@@ -130,7 +130,7 @@ pub fn refuses(run: Run, stop_after: u64, stage: &str, rows: &[(&str, &dyn Fn(&m
             assert!(warnings.iter().any(|w| w.contains(key) && w.contains("falling back")), "{warnings:?}");
             assert_eq!(bytes(undisturbed.path()), bytes(dir.path()));
         } else {
-            // nothing before it to take
+            // Without the previous checkpoint there is no fallback.
             std::fs::remove_file(dir.path().join("checkpoint.previous.safetensors")).unwrap();
             let e = run(dir.path(), &Quiet).unwrap_err();
             assert!(e.to_string().contains(key) && e.to_string().contains("checkpoint.safetensors"), "{e}");

@@ -1,9 +1,9 @@
-//! Checkpoints: everything a training needs to go on, in one safetensors file, for every field.
+//! Checkpoints: everything needed to resume the training of a field, in one safetensors file.
 //!
-//! Tensors by name (`model.`, `first.` and `second.` for the optimizer's moments, and what else a field keeps)
-//! stand beside a header of texts: `format`, `identity` (what shaped the training: settings, inputs, seed),
-//! `finished`, `step` and what else a field counts. Two files take turns, so that the newest complete one is
-//! never replaced before its successor is there, and one that fails its checks falls back to the other.
+//! A file holds named tensors (`model.` for values, `first.` and `second.` for the optimizer's moments, and others by
+//! field) and a header of strings: `format`, `identity` (settings, inputs and seed of the training), `finished`, `step`
+//! and others by field. Two files alternate, so that the newest complete checkpoint is never replaced before its
+//! successor is written, and a checkpoint that fails validation falls back to the previous one.
 
 use crate::io::{
     Limits, ReadError, TensorValues, Tensors, is_file, read_tensors, remove, rename, write_tensors,
@@ -31,24 +31,24 @@ fn previous(dir: &Path) -> PathBuf {
     dir.join("checkpoint.previous.safetensors")
 }
 
-/// Removes the older checkpoint: training is complete, the newest is all anyone needs.
+/// Removes the previous checkpoint, which a completed training no longer needs.
 pub fn finish(dir: &Path) -> Result<()> {
     Ok(remove(&previous(dir))?)
 }
 
-/// What to do where neither checkpoint of a stage can be taken.
-fn afresh(stage: &str) -> String {
+/// Returns the hint for errors that no checkpoint of a stage can recover from.
+fn restart_hint(stage: &str) -> String {
     format!("start the stage afresh with `--fresh {stage}`")
 }
 
 fn unreadable(e: ReadError, stage: &str) -> Error {
-    let hint = if matches!(e, ReadError::Io { .. }) { e.hint() } else { afresh(stage) };
+    let hint = if matches!(e, ReadError::Io { .. }) { e.hint() } else { restart_hint(stage) };
     Error::cannot(e, hint)
 }
 
 impl Checkpoint {
-    /// Returns a checkpoint without tensors. `stage` is the table of the settings, for messages; `identity`
-    /// names what shaped the training.
+    /// Returns a checkpoint without tensors. `stage` is the settings table that messages name; `identity` identifies
+    /// settings, inputs and seed of the training.
     pub fn new(stage: &'static str, format: &str, identity: &str) -> Checkpoint {
         let mut empty =
             Checkpoint { path: PathBuf::new(), stage, tensors: BTreeMap::new(), header: BTreeMap::new() };
@@ -57,7 +57,7 @@ impl Checkpoint {
         empty
     }
 
-    /// Reads one file of this format.
+    /// Reads a checkpoint file of the given format.
     pub fn read(path: &Path, stage: &'static str, format: &str) -> Result<Checkpoint> {
         let content = read_tensors(path, &Limits::default()).map_err(|e| unreadable(e, stage))?;
         Checkpoint::parse(path, stage, format, content)
@@ -72,7 +72,7 @@ impl Checkpoint {
         let file = Checkpoint { path: path.into(), stage, tensors, header };
         match file.text("format")? {
             found if found == format => Ok(file),
-            found => Err(file.wrong(format!("format is `{found}`, this build reads `{format}`"))),
+            found => Err(file.mismatch(format!("format is `{found}`, this build reads `{format}`"))),
         }
     }
 
@@ -91,12 +91,12 @@ impl Checkpoint {
         self.put(name, shape, TensorValues::F32(values));
     }
 
-    /// Adds a vector of whole numbers.
+    /// Adds a vector of unsigned integers.
     pub fn put_words(&mut self, name: &str, values: Vec<u64>) {
         self.put(name, &[values.len()], TensorValues::U64(values));
     }
 
-    /// Writes it as the newest of a stage folder; the one that was becomes the previous one.
+    /// Writes the checkpoint as the newest of a stage folder; the newest so far becomes the previous one.
     pub fn save(self, dir: &Path) -> Result<()> {
         let path = newest(dir);
         let next = dir.join("checkpoint.next.safetensors");
@@ -108,18 +108,18 @@ impl Checkpoint {
         Ok(rename(&next, &path)?)
     }
 
-    /// Returns the error that it does not belong to the model that reads it.
-    pub fn wrong(&self, reason: String) -> Error {
-        Error::cannot(format!("`{}`: {reason}", self.path.display()), afresh(self.stage))
+    /// Returns the error for a checkpoint that does not match the model reading it.
+    pub fn mismatch(&self, reason: String) -> Error {
+        Error::cannot(format!("`{}`: {reason}", self.path.display()), restart_hint(self.stage))
     }
 
     /// Returns an entry of the header.
     pub fn text(&self, key: &str) -> Result<&str> {
         let text = self.header.get(key).map(|text| text.as_str());
-        text.ok_or_else(|| self.wrong(format!("its metadata has no `{key}`")))
+        text.ok_or_else(|| self.mismatch(format!("its metadata has no `{key}`")))
     }
 
-    /// Returns a whole number of the header; one that no training can have written is an error.
+    /// Returns an integer from the header; a value outside `range` is an error, because no training writes one.
     pub fn number(&self, key: &str, range: RangeInclusive<u64>) -> Result<u64> {
         let found = self.header.get(key);
         found.and_then(|text| text.parse().ok()).filter(|n| range.contains(n)).ok_or_else(|| {
@@ -130,27 +130,27 @@ impl Checkpoint {
     }
 
     fn unexpected(&self, key: &str, found: impl ToString, expected: impl Into<String>) -> Error {
-        Error::cannot(ReadError::value(&self.path, key, found, expected), afresh(self.stage))
+        Error::cannot(ReadError::value(&self.path, key, found, expected), restart_hint(self.stage))
     }
 
-    /// Returns whether it holds a tensor.
+    /// Returns whether the checkpoint holds a tensor.
     pub fn has(&self, name: &str) -> bool {
         self.tensors.contains_key(name)
     }
 
-    /// Takes a tensor of floats of exactly this shape out of it.
+    /// Removes and returns a tensor of floats, which must have exactly this shape.
     pub fn floats(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
         match self.tensors.remove(name) {
-            None => Err(self.wrong(format!("tensor `{name}` is missing"))),
+            None => Err(self.mismatch(format!("tensor `{name}` is missing"))),
             Some((found, _)) if found != shape => {
-                Err(self.wrong(format!("tensor `{name}` has shape {found:?}, expected {shape:?}")))
+                Err(self.mismatch(format!("tensor `{name}` has shape {found:?}, expected {shape:?}")))
             }
             Some((_, TensorValues::F32(values))) => Ok(values),
-            Some(_) => Err(self.wrong(format!("tensor `{name}` is not f32"))),
+            Some(_) => Err(self.mismatch(format!("tensor `{name}` is not f32"))),
         }
     }
 
-    /// Takes a tensor of numbers that are never negative, as mean squares are, of which roots are taken.
+    /// Removes and returns a tensor of non-negative floats, such as mean squares, whose roots will be taken.
     pub fn squares(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
         let values = self.floats(name, shape)?;
         match values.iter().position(|v| *v < 0.0) {
@@ -162,33 +162,33 @@ impl Checkpoint {
         }
     }
 
-    /// Takes a vector of whole numbers out of it.
+    /// Removes and returns a vector of unsigned integers.
     pub fn words(&mut self, name: &str) -> Result<Vec<u64>> {
         match self.tensors.remove(name) {
             Some((_, TensorValues::U64(values))) => Ok(values),
-            _ => Err(self.wrong(format!("tensor `{name}` is missing or of another type"))),
+            _ => Err(self.mismatch(format!("tensor `{name}` is missing or of another type"))),
         }
     }
 }
 
-/// How far a training has come.
+/// Progress of a training.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TrainingProgress {
     /// Optimizer steps done.
     pub step: u64,
-    /// Running mean of the squared color error, for the PSNR that is shown.
+    /// Running mean of the squared color error, for the displayed PSNR.
     pub mean_square: f64,
-    /// Mixed into the seed: 1 after a step that diverged, so that other rays are drawn.
+    /// Value mixed into the seed: 1 after a step diverged, so that other rays are drawn.
     pub salt: u64,
 }
 
 impl TrainingProgress {
-    /// PSNR of the last batches, dB.
+    /// Returns the PSNR of the last batches in dB.
     pub fn psnr(&self) -> f64 {
         -10.0 * self.mean_square.max(1e-12).log10()
     }
 
-    /// Puts it into a checkpoint; the running mean bit by bit.
+    /// Writes the progress into a checkpoint, with the exact bits of the running mean.
     pub fn save(&self, into: &mut Checkpoint, finished: bool) {
         into.set("step", self.step);
         into.set("mean_square", self.mean_square.to_bits());
@@ -196,11 +196,11 @@ impl TrainingProgress {
         into.set("finished", u64::from(finished));
     }
 
-    /// Takes it out of a checkpoint of a training of `steps`, and whether that was finished.
+    /// Reads the progress from a checkpoint of a training of `steps` steps, and whether the training had finished.
     pub fn restore(from: &Checkpoint, steps: u64) -> Result<(TrainingProgress, bool)> {
-        // the format's first writers knew no `finished`
+        // Early versions of the format have no `finished` entry.
         let finished = from.header.contains_key("finished") && from.number("finished", 0..=1)? == 1;
-        // a finished one may have no moments to go on with
+        // A finished checkpoint may lack moments, so it cannot be continued to more steps.
         let step = from.number("step", if finished { steps } else { 0 }..=steps)?;
         let key = "mean_square";
         let mean_square = f64::from_bits(from.number(key, 0..=u64::MAX)?);
@@ -212,8 +212,8 @@ impl TrainingProgress {
     }
 }
 
-/// Takes the newest checkpoint of a stage folder that `read` accepts, with what was wrong with a newer one;
-/// `None` where there is none at all. One of another identity is refused.
+/// Restores the newest checkpoint of a stage folder that `read` accepts, and returns it with warnings about a newer one
+/// that it refused. Returns `None` if the folder has no checkpoint. A checkpoint of another identity is refused.
 pub fn restore<T>(
     dir: &Path,
     stage: &'static str,
@@ -228,29 +228,29 @@ pub fn restore<T>(
             continue;
         }
         let content = match read_tensors(&path, &Limits::default()) {
-            // a disk that does not answer is no damaged file: nothing may be lost over it
+            // A read failure of the disk does not mean a damaged file, so no checkpoint may be discarded for it.
             Err(e @ (ReadError::Io { .. } | ReadError::TooLarge { .. })) => return Err(unreadable(e, stage)),
             content => content.map_err(|e| unreadable(e, stage)),
         };
-        let whole = content.is_ok();
+        let readable = content.is_ok();
         let opened = content.and_then(|content| {
             let file = Checkpoint::parse(&path, stage, format, content)?;
             match file.text("identity")? {
                 found if found == identity => Ok(file),
-                _ => Err(file.wrong("it was trained with other settings or inputs".into())),
+                _ => Err(file.mismatch("it was trained with other settings or inputs".into())),
             }
         });
-        // one of another training, or of another release, is sound
-        let damaged = !whole || opened.is_ok();
+        // A checkpoint of another training or release is intact, so it is not deleted.
+        let damaged = !readable || opened.is_ok();
         match opened.and_then(|mut file| read(&mut file)) {
             Ok(state) => {
-                // a damaged newest one must not take this one's place at the next save
+                // A damaged newest checkpoint must not replace this one at the next save.
                 if matches!(failure, Some((_, true))) {
                     remove(&newest(dir))?;
                 }
                 return Ok(Some((state, warnings)));
             }
-            // nor over a device that does not
+            // A failure of the compute device does not mean a damaged file either.
             Err(e) if e.kind() == ErrorKind::NotNow => return Err(e),
             Err(e) => {
                 warnings.push(format!("{e}; falling back to the checkpoint before it"));

@@ -1,42 +1,42 @@
-//! Rays of training steps on a device, wherever the photographs lie.
+//! Sampling of training rays for a device, from photographs in device or host memory.
 //!
-//! Where these fit they lie on the device and kernels draw from them. Where they do not, the processor draws the same
-//! rays from its own memory while the device is busy with the step before, and sends what their pixels show: some half
-//! a megabyte a step.
+//! Photographs that fit are copied to the device, and kernels sample them. Otherwise the processor samples the same rays
+//! from host memory while the device computes the previous step, and uploads rays and colors: about half a megabyte per
+//! step.
 
 use super::background::ray_backgrounds;
 use super::pixels::{Pixels, SampledRay};
 use super::training::StepAt;
 use crate::kernel::gpu::{BUFFERS, Batch, Buffer, Device, Photographs, SamplingOptions};
 
-/// Where rays of a training on a device come from.
+/// Source of the rays of a training on a device.
 pub struct DeviceRays {
-    /// None where the processor draws.
+    /// Photographs in device memory; `None` if the processor samples the rays.
     resident: Option<Photographs>,
     drawing: SamplingOptions,
 }
 
-/// Bytes of photographs that fit in `available` bytes of a device; none where they do not.
+/// Returns the bytes that the photographs take on a device, or `None` if they do not fit in `available` bytes.
 pub fn resident(pixels: &Pixels, device: &Device, available: u64) -> Option<u64> {
     let buffers = pixels.buffers_on_device(device.limits().largest_buffer);
-    // beside a pixel's four bytes its bit, and what counts these
+    // A pixel takes four bytes for its color, one bit for whether it is drawable, and its share of the bits' counts.
     let bytes = buffers.iter().sum::<u64>() * 17 / 4;
     let fits = buffers.len() <= BUFFERS && bytes <= available;
     (fits && pixels.count() <= u32::MAX as u64).then_some(bytes)
 }
 
 impl DeviceRays {
-    /// From photographs that lie on the device where that is said.
+    /// Creates the source, and copies the photographs to the device if they are to be `resident`.
     pub fn new(pixels: &Pixels, device: &Device, drawing: SamplingOptions, resident: bool) -> DeviceRays {
         let largest = device.limits().largest_buffer;
         DeviceRays { resident: resident.then(|| pixels.on_device(device, drawing, largest)), drawing }
     }
 
-    /// Draws the rays of a step into `batch`: a function of seed and step alone. See [`Pixels::draw`].
+    /// Draws the rays of a step into `batch`. They depend on seed and step alone; see [`Pixels::draw`].
     ///
     /// # Shapes
     ///
-    /// - wanted: `[1]`, how many rays; those of `batch` behind them are none
+    /// - wanted: `[1]`, number of rays to draw; the remaining rays of `batch` are marked inactive
     pub fn draw(
         &self,
         device: &Device,
@@ -51,7 +51,7 @@ impl DeviceRays {
         }
         let rays = batch.rays();
         let drawn = pixels.draw_each(seed, step, rays, self.drawing.jitter, detail);
-        let stream = self.drawing.background.then_some(self.drawing.behind);
+        let stream = self.drawing.background.then_some(self.drawing.background_stream);
         let background = ray_backgrounds(StepAt { seed, step }, stream, rays);
         let planes = |of: &dyn Fn(usize) -> [f32; 3]| -> Buffer {
             device.upload(&(0..3 * rays).map(|i| of(i % rays)[i / rays]).collect::<Vec<f32>>())
@@ -84,7 +84,7 @@ mod tests {
         let Some(device) = device() else { return };
         let views = ball::textured_views();
         let pixels = Pixels::new(&views, 0.25, 1.0, Foreground::Estimated, false).with_large(1.0);
-        let drawing = SamplingOptions { jitter: true, background: true, behind: 8 };
+        let drawing = SamplingOptions { jitter: true, background: true, background_stream: 8 };
         assert!(resident(&pixels, &device, 0).is_none() && resident(&pixels, &device, 1 << 30).is_some());
         let wanted = device.upload(&[900u32]);
         for detail in [0.0, 0.2] {
@@ -107,10 +107,10 @@ mod tests {
         }
     }
 
-    /// Kilobytes of memory of this process: now, or at most since this was last asked.
-    fn resident_memory(most: bool) -> u64 {
+    /// Returns the resident memory of this process in kilobytes: the current amount, or the peak since the last call.
+    fn resident_memory(peak: bool) -> u64 {
         let status = std::fs::read_to_string("/proc/self/status").unwrap();
-        let name = if most { "VmHWM:" } else { "VmRSS:" };
+        let name = if peak { "VmHWM:" } else { "VmRSS:" };
         let line = status.lines().find(|line| line.starts_with(name)).unwrap();
         let kilobytes = line.split_whitespace().nth(1).unwrap().parse().unwrap();
         std::fs::write("/proc/self/clear_refs", "5").unwrap();
@@ -134,7 +134,7 @@ mod tests {
         let mut views: Vec<_> = (0..5).map(|i| ball::view(2000, i as f64, 0.0, |_| [90; 3])).collect();
         views.iter_mut().for_each(|view| view.mask = None);
         let pixels = Pixels::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
-        let drawing = SamplingOptions { jitter: true, background: true, behind: 8 };
+        let drawing = SamplingOptions { jitter: true, background: true, background_stream: 8 };
         let bytes = resident(&pixels, &device, u64::MAX).unwrap();
         let before = resident_memory(false);
         let _rays = DeviceRays::new(&pixels, &device, drawing, true);
@@ -142,7 +142,7 @@ mod tests {
         let more = 1024 * (resident_memory(true) - before);
         let share = more as f64 / bytes as f64;
         println!("{bytes} bytes of photographs: {more} bytes at most, {share:.2} times as much");
-        // a software device holds them in the same memory, once
+        // A software device keeps its own copy in the same memory.
         assert!(bytes > 75 << 20 && share < 3.2, "{share}");
     }
 }

@@ -1,31 +1,31 @@
-//! Does a training fit a device's memory?
+//! Planning of a training's memory on a device.
 
 use super::drawing::resident;
 use super::pixels::Pixels;
 use crate::kernel::gpu::Device;
 use crate::{Error, Result};
 
-/// What a training wants of a device's memory.
+/// Memory that a training needs on a device.
 pub struct MemoryNeed {
-    /// Bytes whatever the step's size, and what they are for.
+    /// Bytes that do not depend on the step's size, and their purpose for messages.
     pub fixed: (u64, &'static str),
-    /// What a step is counted in: `samples` or `rays`.
+    /// Unit of a step's size: `samples` or `rays`.
     pub unit: &'static str,
-    /// Bytes of each, and those of the largest buffer alone.
+    /// Bytes per unit in all buffers together, and in the largest buffer.
     pub each: [u64; 2],
-    /// The most that a step makes use of.
+    /// Largest number of units that a step uses.
     pub wanted: u64,
-    /// The fewest that it needs.
+    /// Smallest number of units that a step can run with.
     pub least: u64,
 }
 
 impl MemoryNeed {
-    /// Returns how many samples or rays the device has room for, up to those that are wanted, and whether the photographs
-    /// lie there, too.
+    /// Returns how many samples or rays fit on the device, up to the wanted number, and whether the photographs fit as
+    /// well.
     ///
     /// # Errors
     ///
-    /// Where there is room for fewer than the least; `remedy` says by their number what to lower.
+    /// If fewer than the minimum fit; `remedy` receives how many fit and returns the setting to lower.
     pub fn plan(
         &self,
         pixels: &Pixels,
@@ -37,18 +37,18 @@ impl MemoryNeed {
         let left = device.available_memory().saturating_sub(fixed);
         let resident = resident(pixels, device, left.saturating_sub(self.wanted.saturating_mul(bytes)));
         let by_buffer = device.limits().largest_buffer / widest;
-        let most = self.wanted.min(by_buffer).min((left - resident.unwrap_or(0)) / bytes);
-        if most < self.least {
+        let fits = self.wanted.min(by_buffer).min((left - resident.unwrap_or(0)) / bytes);
+        if fits < self.least {
             let problem = format!(
-                "the device `{}` has room for {most} {} of a step beside {} MiB of {what}, {} are needed",
+                "the device `{}` has room for {fits} {} of a step beside {} MiB of {what}, {} are needed",
                 device.name(),
                 self.unit,
                 fixed.div_ceil(1 << 20),
                 self.least,
             );
-            let hint = format!("lower {}, or give more with `--memory`", remedy(most));
+            let hint = format!("lower {}, or give more with `--memory`", remedy(fits));
             return Err(Error::cannot(problem, hint));
         }
-        Ok((most as usize, resident.is_some()))
+        Ok((fits as usize, resident.is_some()))
     }
 }

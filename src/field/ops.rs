@@ -1,8 +1,9 @@
-//! What every field asks of the device that trains it.
+//! Operations that every field needs from the device it trains on.
 //!
-//! A model's training step is written once, over a trait of operations ([`Ops`] and one for each model); a device
-//! implements it with kernels of its own. The processor computes on burn's Flex tensors, each step to its end; a GPU, on
-//! burn's tensors of CubeCL, is given the launches of many steps and is read once in [`ArrayDevice::READ_EVERY`].
+//! A model's training step is written once, over traits of operations ([`Ops`] and one for each model); each device
+//! implements them with its own kernels. The processor computes on burn's Flex tensors and completes each step. A GPU
+//! computes on burn's CubeCL tensors; the host queues the launches of many steps and reads results back once in
+//! [`ArrayDevice::READ_EVERY`] steps.
 
 use crate::Result;
 use crate::kernel::cpu::adam::{self, AdamStep};
@@ -14,18 +15,17 @@ use burn::backend::Flex;
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::TensorData;
 
-/// A device with arrays of floats, and the optimizer.
+/// A device that stores arrays of floats and runs the optimizer on them.
 pub trait ArrayDevice {
     /// A flat array of floats.
     type Array;
 
-    /// Whether there is anything to step along: not where a training step met no sample, nor once a gradient was not
-    /// finite.
+    /// Condition for an optimizer step: closed if the training step had no sample, or once a gradient was not finite.
     type Gate<'a>
     where
         Self: 'a;
 
-    /// Steps between two reads of losses and flags: what goes wrong is known that much later.
+    /// Steps between two readbacks of losses and flags, which is also the delay in detecting an error.
     const READ_EVERY: u64;
 
     /// Copies values to the device.
@@ -35,11 +35,10 @@ pub trait ArrayDevice {
     ///
     /// # Errors
     ///
-    /// Where the device does not answer.
+    /// If the device does not respond.
     fn download(&self, array: &Self::Array) -> Result<Vec<f32>>;
 
-    /// Makes an AdamW step of values, first and second moments in place and leaves the gradient zero, where the gate is
-    /// open.
+    /// Makes an AdamW step of values, first and second moments in place and zeroes the gradient, if the gate is open.
     fn adam(
         &self,
         state: [&mut Self::Array; 3],
@@ -51,20 +50,20 @@ pub trait ArrayDevice {
 
 /// The operations of a model on a device.
 pub trait Ops: Sized {
-    /// The device.
+    /// The device that the operations run on.
     type Device: ArrayDevice;
 
-    /// The device.
+    /// Returns the device.
     fn device(&self) -> &Self::Device;
 
-    /// The gate of the last step's gradients.
+    /// Returns the gate of the last step's gradients.
     fn gate(&self) -> <Self::Device as ArrayDevice>::Gate<'_>;
 }
 
 /// The processor.
 pub struct Cpu;
 
-/// An array of the processor.
+/// An array in host memory.
 pub type CpuArray = FloatTensor<Flex>;
 
 /// Returns the values of an array.
@@ -72,7 +71,7 @@ pub fn slice(array: &CpuArray) -> &[f32] {
     array.as_slice::<f32>().expect("arrays of this crate are contiguous f32")
 }
 
-/// Returns the values of an array that nothing else refers to, to be written.
+/// Returns the values of an array for writing; no other handle may refer to the array.
 pub fn slice_mut(array: &mut CpuArray) -> &mut [f32] {
     array.storage_mut::<f32>()
 }

@@ -1,8 +1,8 @@
 //! Trained arrays with their AdamW moments: on the host, as checkpoints hold them, and on the device that trains.
 //!
-//! A group is what the optimizer steps at one rate, one flat array; in checkpoints each of its parts has its own name.
-//! Groups have their own learning rate and decay, the hash table updates touched rows only,
-//! and the moments lie in the same safetensors checkpoint as the weights, so that a resumed run gives the same bytes.
+//! A group is one flat array of parameters with a common learning rate and weight decay; in checkpoints each of its parts
+//! has its own name. The hash table updates touched rows only. Checkpoints store the moments beside the weights, so that
+//! a resumed run gives the same bytes.
 
 use super::checkpoint::Checkpoint;
 use super::ops::ArrayDevice;
@@ -12,14 +12,14 @@ use crate::kernel::cpu::adam::AdamStep;
 /// A named array of a group.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Part {
-    /// Its name in checkpoints.
+    /// Name in checkpoints.
     pub name: &'static str,
-    /// Its shape there.
+    /// Shape in checkpoints.
     pub shape: Vec<usize>,
 }
 
 impl Part {
-    /// How many values it has.
+    /// Returns the number of values.
     pub fn count(&self) -> usize {
         self.shape.iter().product()
     }
@@ -28,24 +28,24 @@ impl Part {
 /// A group on the host.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HostGroup {
-    /// Its parts, one after the other.
+    /// Parts, concatenated in this order.
     pub parts: Vec<Part>,
-    /// Values, running mean of the gradient and that of its square.
+    /// Values, running mean of the gradient, and running mean of its square.
     pub state: [Vec<f32>; 3],
 }
 
-/// Names of a group's arrays in checkpoints.
-const KINDS: [&str; 3] = ["model", "first", "second"];
+/// Prefixes of a group's arrays in checkpoints.
+const PREFIXES: [&str; 3] = ["model", "first", "second"];
 
 impl HostGroup {
-    /// Returns a group of these parts and values, with zero moments.
+    /// Creates a group from parts and values, with zero moments.
     pub fn new(parts: Vec<Part>, values: Vec<f32>) -> HostGroup {
         assert_eq!(values.len(), parts.iter().map(Part::count).sum::<usize>());
         let zeros = vec![0.0; values.len()];
         HostGroup { parts, state: [values, zeros.clone(), zeros] }
     }
 
-    /// Returns a group of one flat array.
+    /// Creates a group with a single part, a flat array.
     pub fn flat(name: &'static str, values: Vec<f32>) -> HostGroup {
         HostGroup::new(vec![Part { name, shape: vec![values.len()] }], values)
     }
@@ -55,42 +55,43 @@ impl HostGroup {
         &self.state[0]
     }
 
-    /// Is every value a finite number?
+    /// Returns whether every value is finite.
     pub fn is_finite(&self) -> bool {
         self.values().iter().all(|v| v.is_finite())
     }
 
-    /// Makes the moments zero, as before the first step.
-    pub fn forget_moments(&mut self) {
+    /// Resets the moments to zero, as before the first step.
+    pub fn reset_moments(&mut self) {
         self.state[1..].iter_mut().for_each(|moment| moment.fill(0.0));
     }
 
-    /// Puts it into a checkpoint; without the moments where no training goes on from it.
+    /// Writes the group into a checkpoint, without moments if no training will resume from it.
     pub fn save(&self, into: &mut Checkpoint, with_moments: bool) {
-        let kinds = KINDS.into_iter().zip(&self.state).take(if with_moments { 3 } else { 1 });
-        for (kind, values) in kinds {
+        let prefixes = PREFIXES.into_iter().zip(&self.state).take(if with_moments { 3 } else { 1 });
+        for (kind, values) in prefixes {
             let mut rest = &values[..];
             for part in &self.parts {
-                let own = rest.split_off(..part.count()).expect("a value for each of the parts'");
-                into.put_floats(&format!("{kind}.{}", part.name), &part.shape, own.to_vec());
+                let part_values = rest.split_off(..part.count()).expect("a value for each of the parts'");
+                into.put_floats(&format!("{kind}.{}", part.name), &part.shape, part_values.to_vec());
             }
         }
     }
 
-    /// Takes parts of exactly these shapes out of a checkpoint, with zero moments where no training goes on from it;
-    /// nothing is reserved by what the shapes say.
+    /// Reads parts of exactly these shapes from a checkpoint. Without `with_moments` the moments are zero. Memory is
+    /// allocated only for tensors that the file really holds, whatever the shapes promise.
     pub fn restore(parts: Vec<Part>, from: &mut Checkpoint, with_moments: bool) -> Result<HostGroup> {
         let mut state = [Vec::new(), Vec::new(), Vec::new()];
         for part in &parts {
             let name = |kind: &str| format!("{kind}.{}", part.name);
-            let value = from.floats(&name(KINDS[0]), &part.shape)?;
+            let value = from.floats(&name(PREFIXES[0]), &part.shape)?;
             let (first, second) = match with_moments {
-                true => {
-                    (from.floats(&name(KINDS[1]), &part.shape)?, from.squares(&name(KINDS[2]), &part.shape)?)
-                }
+                true => (
+                    from.floats(&name(PREFIXES[1]), &part.shape)?,
+                    from.squares(&name(PREFIXES[2]), &part.shape)?,
+                ),
                 false => (vec![0.0; value.len()], vec![0.0; value.len()]),
             };
-            state.iter_mut().zip([value, first, second]).for_each(|(all, own)| all.extend(own));
+            state.iter_mut().zip([value, first, second]).for_each(|(group, part)| group.extend(part));
         }
         Ok(HostGroup { parts, state })
     }
@@ -99,9 +100,9 @@ impl HostGroup {
 /// A group on the device that trains it.
 pub struct ParameterGroup<D: ArrayDevice> {
     parts: Vec<Part>,
-    /// Values, running mean of the gradient and that of its square.
+    /// Values, running mean of the gradient, and running mean of its square.
     state: [D::Array; 3],
-    /// Zero before the backward of a step, which adds to it or writes it.
+    /// Gradient; zero before the backward pass of a step, which adds to it or overwrites it.
     pub gradient: D::Array,
 }
 
@@ -118,22 +119,22 @@ impl<D: ArrayDevice> ParameterGroup<D> {
         Ok(HostGroup { parts: self.parts.clone(), state: [values?, first?, second?] })
     }
 
-    /// The values.
+    /// Returns the values.
     pub fn value(&self) -> &D::Array {
         &self.state[0]
     }
 
-    /// The values, to change them in place.
+    /// Returns the values for changes in place.
     pub fn value_mut(&mut self) -> &mut D::Array {
         &mut self.state[0]
     }
 
-    /// Values, beside the gradient to be written.
+    /// Returns the values, and the gradient for writing.
     pub fn value_and_gradient(&mut self) -> (&D::Array, &mut D::Array) {
         (&self.state[0], &mut self.gradient)
     }
 
-    /// Makes an optimizer step, and the gradient zero, where the gate is open.
+    /// Makes an optimizer step and zeroes the gradient, if the gate is open.
     pub fn step(&mut self, device: &D, step: &AdamStep, gate: D::Gate<'_>) {
         device.adam(self.state.each_mut(), &mut self.gradient, step, gate);
     }

@@ -1,11 +1,11 @@
-//! Where training rays come from: random pixels that can tell something about the head.
+//! Sampling of training rays: random pixels of the photographs that carry information about the head.
 //!
-//! A pixel farther from the mask than the visual hull's cells reach meets no sample and teaches
-//! nothing, so only the mask and a margin around it are drawn. Photographs stay 8 bit.
+//! The ray of a pixel farther from the mask than the visual hull's cells reach meets no sample and contributes nothing,
+//! so only the mask and a margin around it are drawn. Photographs stay 8 bit.
 //!
-//! Where pixels are finer than what the field resolves in the end, photographs are large: while the field is coarser
-//! still, a ray stands for a square of pixels, with their mean color through their middle, as if it were drawn from a
-//! level of the photograph's pyramid. Single pixels would show it noise.
+//! A photograph counts as large if its pixels are finer than the field's final resolution. While the field is still
+//! coarser, a ray of a large photograph stands for a square of pixels: it passes through their middle and has their mean
+//! color, as if drawn from a level of an image pyramid. Single pixels would alias and act as noise.
 
 use super::background::{SoftPixels, soft_pixels};
 use crate::config::iface::Foreground;
@@ -19,19 +19,19 @@ use crate::kernel::gpu;
 use glam::Vec2;
 use rayon::prelude::*;
 
-/// One photograph to learn from.
+/// One training photograph.
 pub struct TrainView {
-    /// Its camera, in scene coordinates (the head's box in [-1, 1]³).
+    /// Camera in scene coordinates (the head's box is [-1, 1]³).
     pub camera: Camera,
-    /// What it saw.
+    /// Photograph.
     pub photo: Photo,
-    /// Soft alpha of the head, same size; `None` where there are no masks.
+    /// Soft alpha of the head, same size; `None` without a mask.
     pub mask: Option<Gray>,
     /// Usable pixels (non-zero), same size.
     pub valid: Option<Gray>,
 }
 
-/// Pixels drawn for one step.
+/// Rays drawn for one step, with the colors and alphas of their pixels.
 #[derive(Default)]
 pub struct Batch {
     /// Rays in field coordinates.
@@ -51,37 +51,39 @@ type Drawable = (u32, u32, u32, u32, Vec<u64>);
 /// The drawable pixels of all views.
 pub struct Pixels<'a> {
     views: &'a [TrainView],
-    /// Per view: what a render over black should show; none where that is alpha times the photograph.
+    /// Per view: target colors over black of the soft pixels; `None` if the target is alpha times the photograph.
     soft: Vec<Option<SoftPixels>>,
-    /// Per view: the width of a pixel at the scene's middle, scene units; infinite where photographs are not large.
+    /// Per view: width of a pixel at the scene's center, scene units; infinite if the photograph is not large.
     pixel: Vec<f32>,
     /// Per view.
     drawable: Vec<Drawable>,
     /// Running count of drawable pixels.
     cumulative: Vec<u64>,
     radius: f32,
-    /// Has any view a mask that says something?
+    /// Whether any view has a mask that is not white all over.
     pub has_masks: bool,
     reference_sampling: bool,
-    /// How pixels follow each other that are drawn without repetition.
+    /// Order of drawing without repetition; `None` for independent draws.
     order: Option<Order>,
 }
 
-/// Every drawable pixel once, then again in another order: TensoRF's sampler.
+/// Order that draws every drawable pixel once, then all again in another order: TensoRF's sampler.
 struct Order {
     /// Per view: drawable pixels before each word of its bits.
     before: Vec<Vec<u32>>,
-    /// Directions have depth 1 in front of the camera, not length 1.
+    /// Whether directions have depth 1 along the optical axis instead of length 1.
     depth_directions: bool,
 }
 
 impl<'a> Pixels<'a> {
-    /// `reach` is how far outside the mask, in scene units, a ray may still meet an occupied cell.
+    /// Collects the drawable pixels of the views. `reach` is how far outside the mask, in scene units, a ray may still
+    /// meet an occupied cell.
     ///
-    /// `foreground` says what a soft pixel's target is. Where some views have a mask, those without one
-    /// (or with one that is white all over) are not drawn from: they would teach that all of it is head.
+    /// `foreground` selects the target color of soft pixels. If some views have masks, views without one (or with one
+    /// that is white all over) are not drawn from: they would label the whole frame as head.
     ///
-    /// `reference_sampling` draws as the published code does: every view as often, any pixel of its frame.
+    /// `reference_sampling` draws as the published code does: a uniformly random view, then a uniformly random pixel of
+    /// its frame.
     pub fn new(
         views: &'a [TrainView],
         reach: f32,
@@ -109,12 +111,12 @@ impl<'a> Pixels<'a> {
         Pixels { views, soft, pixel, drawable, cumulative, radius, has_masks, reference_sampling, order }
     }
 
-    /// Pixels as TensoRF's code draws them: all valid ones whose ray meets the box `bounds` at any distance, in a random
-    /// order without repetition, which starts anew where fewer than a batch are left. With `depth_directions` rays
-    /// have directions of depth 1 before the camera, as in its loader of forward-facing captures.
+    /// Collects pixels as TensoRF's code draws them: all valid ones whose ray meets the box `bounds` at any distance, in a
+    /// random order without repetition, which restarts when less than a batch is left. With `depth_directions`, ray
+    /// directions have depth 1 along the optical axis, as in its loader of forward-facing captures.
     ///
-    /// The order is a permutation that is computed, not stored: twenty-four photographs of twelve megapixels would have
-    /// a list of two gigabytes.
+    /// The permutation is computed, not stored: for twenty-four photographs of twelve megapixels its table would take two
+    /// gigabytes.
     pub fn permuted(
         views: &'a [TrainView],
         foreground: Foreground,
@@ -151,36 +153,36 @@ impl<'a> Pixels<'a> {
         pixels
     }
 
-    /// The same where photographs count as large whose pixels, at the scene's middle, are finer than `finest`: what the
-    /// field resolves in the end, scene units.
+    /// Treats photographs as large whose pixels, at the scene's center, are finer than `finest`, the field's final
+    /// resolution in scene units.
     pub fn with_large(mut self, finest: f32) -> Self {
-        for (own, view) in self.pixel.iter_mut().zip(self.views) {
+        for (width, view) in self.pixel.iter_mut().zip(self.views) {
             let camera = &view.camera;
             let pixel = (camera.position.length() / camera.fx.max(camera.fy)) as f32;
-            *own = if pixel < finest { pixel } else { f32::INFINITY };
+            *width = if pixel < finest { pixel } else { f32::INFINITY };
         }
         self
     }
 
-    /// The photographs.
+    /// Returns the photographs.
     pub fn views(&self) -> &'a [TrainView] {
         self.views
     }
 
-    /// Drawable pixels of all views.
+    /// Returns the number of drawable pixels of all views.
     pub fn count(&self) -> u64 {
         self.cumulative.last().copied().unwrap_or(0)
     }
 
-    /// `count` random rays of a step: a function of seed and step alone. Of large photographs each stands for a square of
-    /// pixels, the widest of [`SIDES`] that is no wider than `detail`, in scene units.
+    /// Draws `count` random rays of a step, which depend on seed and step alone. A ray of a large photograph stands for a
+    /// square of pixels, the widest of [`SIDES`] that is at most `detail` wide, in scene units.
     pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool, detail: f32) -> Batch {
         let drawn = self.draw_each(seed, step, count, jitter, detail).into_iter().flatten();
         let (rays, color, alpha) = drawn.collect();
         Batch { rays, color, alpha }
     }
 
-    /// The same, each at its index: none where a pixel has no ray.
+    /// Draws as [`draw`](Pixels::draw), but keeps each ray at its index, with `None` if its pixel has no ray.
     pub fn draw_each(
         &self,
         seed: u64,
@@ -196,7 +198,8 @@ impl<'a> Pixels<'a> {
         (0..count).into_par_iter().with_min_len(256).map(draw).collect()
     }
 
-    /// Copies the photographs to a device, where the same rays are drawn from them, in buffers of `largest` bytes at most.
+    /// Copies the photographs to a device, in buffers of at most `largest` bytes. The device draws the same rays from
+    /// them.
     #[cfg(feature = "wgpu")]
     pub fn on_device(
         &self,
@@ -209,20 +212,23 @@ impl<'a> Pixels<'a> {
             None if self.reference_sampling => gpu::PixelOrder::EachView,
             None => gpu::PixelOrder::Random,
         };
-        // packed as many at a time as there are threads, for packed photographs are as large as these
+        // Packing one photograph per thread at a time bounds the extra memory: packed photographs are as large as the
+        // originals.
         let (count, threads) = (self.views.len(), rayon::current_num_threads());
-        let some = |first: usize| -> Vec<gpu::DrawnView> {
-            (first..count.min(first + threads)).into_par_iter().map(|v| self.drawn_view(v)).collect()
+        let pack = |first: usize| -> Vec<gpu::DrawnView> {
+            (first..count.min(first + threads)).into_par_iter().map(|v| self.packed_view(v)).collect()
         };
-        let views = (0..count).step_by(threads).flat_map(some);
+        let views = (0..count).step_by(threads).flat_map(pack);
         gpu::Photographs::new(device, views, &self.buffers_on_device(largest), self.radius, order, drawing)
     }
 
-    /// Pixels in each buffer of the photographs on a device where a buffer has `largest` bytes at most.
+    /// Returns how many pixels each buffer of the photographs holds on a device whose buffers have at most `largest` bytes.
     #[cfg(feature = "wgpu")]
     pub fn buffers_on_device(&self, largest: u64) -> Vec<u64> {
         let mut buffers = vec![0];
-        for area in self.drawable.iter().map(|view| part(view)[2] as u64 * part(view)[3] as u64) {
+        for area in
+            self.drawable.iter().map(|view| drawable_box(view)[2] as u64 * drawable_box(view)[3] as u64)
+        {
             match buffers.last_mut() {
                 Some(last) if 4 * (*last + area) <= largest => *last += area,
                 _ => buffers.push(area),
@@ -231,12 +237,12 @@ impl<'a> Pixels<'a> {
         buffers
     }
 
-    /// The drawable part of a view, packed.
+    /// Packs the box of a view's drawable pixels for a device.
     #[cfg(feature = "wgpu")]
-    fn drawn_view(&self, v: usize) -> gpu::DrawnView {
+    fn packed_view(&self, v: usize) -> gpu::DrawnView {
         let view = &self.views[v];
         let (.., bits) = &self.drawable[v];
-        let [x, y, width, height] = part(&self.drawable[v]);
+        let [x, y, width, height] = drawable_box(&self.drawable[v]);
         let mut pixels = Vec::with_capacity((width * height) as usize);
         let mut drawable = vec![0u32; (width * height).div_ceil(32) as usize];
         for row in y..y + height {
@@ -257,7 +263,7 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// Pixel `i` of a batch of `count` in the order that all are gone through.
+    /// Draws ray `i` of a batch of `count` in the order without repetition.
     fn draw_next(
         &self,
         order: &Order,
@@ -281,7 +287,7 @@ impl<'a> Pixels<'a> {
         Some((MarchRay { origin, direction, jitter }, color, alpha))
     }
 
-    /// Pixel `p` of view `v`, and its alpha: over black already where the view has soft pixels.
+    /// Returns color and alpha of pixel `p` of view `v`. The color is already over black if the view has soft pixels.
     fn pixel(&self, v: usize, p: usize) -> ([u8; 3], u8) {
         let view = &self.views[v];
         let alpha = view.mask.as_ref().map_or(255, |m| m.values[p]);
@@ -291,7 +297,7 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// What pixel `p` of view `v` should show over black, and its alpha.
+    /// Returns the target color over black of pixel `p` of view `v`, and its alpha.
     fn premultiplied_color(&self, v: usize, p: usize) -> ([f32; 3], f32) {
         let (color, alpha) = self.pixel(v, p);
         let alpha = alpha as f32 / 255.0;
@@ -299,7 +305,7 @@ impl<'a> Pixels<'a> {
         (color.map(|c| share * c as f32 / 255.0), alpha)
     }
 
-    /// What the drawable pixels of a square show on average, its corner at `at`, and their middle.
+    /// Returns the middle of the drawable pixels of the square with its corner at `at`, and their mean color and alpha.
     fn square(&self, v: usize, at: [u32; 2], side: u32) -> (Vec2, [f32; 3], f32) {
         let (.., bits) = &self.drawable[v];
         let photo = &self.views[v].photo;
@@ -308,9 +314,9 @@ impl<'a> Pixels<'a> {
             for x in at[0]..(at[0] + side).min(photo.width) {
                 let p = y as usize * photo.width as usize + x as usize;
                 if bits[p >> 6] >> (p & 63) & 1 == 1 {
-                    let (own, a) = self.pixel(v, p);
+                    let (rgb, a) = self.pixel(v, p);
                     let share = if self.soft[v].is_some() { 255 } else { a as u32 };
-                    (0..3).for_each(|c| color[c] += share * own[c] as u32);
+                    (0..3).for_each(|c| color[c] += share * rgb[c] as u32);
                     middle = [middle[0] + x - at[0], middle[1] + y - at[1]];
                     alpha += a as u32;
                     count += 1;
@@ -332,12 +338,12 @@ impl<'a> Pixels<'a> {
         };
         let (x0, y0, x1, y1, bits) = &self.drawable[v];
         if x0 > x1 {
-            return None; // a view without a drawable pixel
+            return None; // the view has no drawable pixel
         }
         let view = &self.views[v];
         let width = view.photo.width;
-        // rejection inside the box of drawable pixels: a head fills most of its box
-        // (published: a pixel that is not valid is dropped, and the batch shrinks)
+        // Rejection sampling in the box of drawable pixels is cheap, because a head fills most of its box.
+        // (The published code drops a pixel that is not valid, and the batch shrinks.)
         for attempt in 0..if self.reference_sampling { 1 } else { 256 } {
             let k = i << 9 | attempt << 1;
             let x = x0 + rng::below(seed, stream + 1, k, (x1 - x0 + 1) as u64) as u32;
@@ -361,19 +367,19 @@ impl<'a> Pixels<'a> {
     }
 }
 
-/// The widest pixel of a photograph that counts as large, scene units: a thousand of them lie across the scene. Coarser
-/// photographs are learned pixel by pixel from the first step, however coarse the field is.
+/// Widest pixel of a large photograph, scene units: a thousandth of the scene's width. Coarser photographs are sampled
+/// pixel by pixel from the first step, however coarse the field is.
 pub const LARGE: f32 = 2.0 / 1000.0;
 
-/// How many pixels wide squares are.
+/// Possible widths of a square, in pixels.
 pub const SIDES: [u32; 4] = [1, 2, 4, 8];
 
-/// The widest square of pixels of this width that is no wider than `detail`; a pixel where none is.
+/// Returns the side in pixels of the widest square that is at most `detail` wide, for pixels of width `pixel`; at least 1.
 fn side(pixel: f32, detail: f32) -> u32 {
     SIDES.into_iter().rfind(|&side| side as f32 * pixel <= detail).unwrap_or(1)
 }
 
-/// Drawable pixels of the views up to and with each.
+/// Returns the running count of drawable pixels, up to and including each view.
 fn cumulative(drawable: &[Drawable]) -> Vec<u64> {
     let mut sum = 0;
     let count = |(.., bits): &Drawable| {
@@ -383,36 +389,36 @@ fn cumulative(drawable: &[Drawable]) -> Vec<u64> {
     drawable.iter().map(count).collect()
 }
 
-/// Corner and size of the box of drawable pixels.
+/// Returns corner and size of the box of drawable pixels.
 #[cfg(feature = "wgpu")]
-fn part(&(x0, y0, x1, y1, _): &Drawable) -> [u32; 4] {
+fn drawable_box(&(x0, y0, x1, y1, _): &Drawable) -> [u32; 4] {
     if x0 > x1 { [0; 4] } else { [x0, y0, x1 - x0 + 1, y1 - y0 + 1] }
 }
 
-/// The middle of pixel `p`.
+/// Returns the center of pixel `p`.
 fn center(p: usize, width: usize) -> Vec2 {
     Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5)
 }
 
-/// Box and bits of the pixels worth drawing in one view: those within `reach` scene units of the mask, all where there is
-/// no mask; none without a reach.
+/// Returns box and bits of the pixels to draw from in one view: those within `reach` scene units of the mask, or all
+/// without a mask; none if `reach` is `None`.
 fn drawable(view: &TrainView, reach: Option<f32>) -> Drawable {
     let (w, h) = (view.photo.width as usize, view.photo.height as usize);
-    let mut near = vec![reach.is_some(); w * h];
+    let mut in_reach = vec![reach.is_some(); w * h];
     if let (Some(mask), Some(reach)) = (&view.mask, reach)
         && reach.is_finite()
     {
-        // reach in pixels at the box's distance; the nearest part of the box is at most one unit closer
+        // The reach in pixels is largest at the nearest part of the box, at most one unit closer than its center.
         let distance = (view.camera.position.length() - 1.0).max(0.2);
         let margin = (reach as f64 * view.camera.fx.max(view.camera.fy) / distance).ceil() as usize + 1;
-        near = dilated(&mask.values, w, h, margin);
+        in_reach = dilated(&mask.values, w, h, margin);
     }
     if let Some(valid) = &view.valid {
-        near.iter_mut().zip(&valid.values).for_each(|(n, &v)| *n &= v != 0);
+        in_reach.iter_mut().zip(&valid.values).for_each(|(n, &v)| *n &= v != 0);
     }
     let mut bits = vec![0u64; (w * h).div_ceil(64)];
     let (mut x0, mut y0, mut x1, mut y1) = (u32::MAX, u32::MAX, 0, 0);
-    for (p, _) in near.iter().enumerate().filter(|(_, n)| **n) {
+    for (p, _) in in_reach.iter().enumerate().filter(|(_, n)| **n) {
         bits[p >> 6] |= 1 << (p & 63);
         let (x, y) = ((p % w) as u32, (p / w) as u32);
         (x0, y0, x1, y1) = (x0.min(x), y0.min(y), x1.max(x), y1.max(y));
@@ -420,22 +426,22 @@ fn drawable(view: &TrainView, reach: Option<f32>) -> Drawable {
     (x0, y0, x1, y1, bits)
 }
 
-/// Pixels with a non-zero value within a square of half edge `margin`: two one-dimensional passes.
+/// Returns the pixels with a non-zero value within a square of half edge `margin`, by two one-dimensional passes.
 fn dilated(values: &[u8], w: usize, h: usize, margin: usize) -> Vec<bool> {
-    let mut near: Vec<bool> = values.iter().map(|&v| v > 0).collect();
+    let mut in_reach: Vec<bool> = values.iter().map(|&v| v > 0).collect();
     for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
         for first in (0..lines).map(|line| line * step) {
-            // a marked pixel reaches as far ahead as it does behind; what is done is not done again
-            let marked: Vec<usize> = (0..n).filter(|i| near[first + i * stride]).collect();
+            // A marked pixel marks `margin` pixels on both sides; starting at `done` avoids marking any twice.
+            let marked: Vec<usize> = (0..n).filter(|i| in_reach[first + i * stride]).collect();
             let mut done = 0;
             for i in marked {
                 let end = (i + margin + 1).min(n);
-                (i.saturating_sub(margin).max(done)..end).for_each(|k| near[first + k * stride] = true);
+                (i.saturating_sub(margin).max(done)..end).for_each(|k| in_reach[first + k * stride] = true);
                 done = end;
             }
         }
     }
-    near
+    in_reach
 }
 
 #[cfg(test)]

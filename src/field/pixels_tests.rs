@@ -1,4 +1,4 @@
-//! Pixels that are drawn, on the processor and on a device.
+//! Tests of pixel sampling on the processor and on a device.
 
 use super::*;
 
@@ -51,7 +51,8 @@ fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_
     for (ray, (color, alpha)) in batch.rays.iter().zip(batch.color.iter().zip(&batch.alpha)) {
         let d = ray.direction;
         let (x, y) = (d[0] / -d[2] * 20.0 + 10.0, d[1] / d[2] * 20.0 + 5.0);
-        // columns 6 to 10, rows 3 to 7: squares begin at even ones, and have their middle where they are drawable
+        // Columns 6 to 10 and rows 3 to 7 are drawable. Squares begin at even ones, and their rays pass through the
+        // middle of their drawable pixels.
         let near = |v: f32, middles: &[f32]| middles.iter().any(|m| (v - m).abs() < 1e-3);
         assert!(near(x, &[7.0, 9.0, 10.5]) && near(y, &[3.5, 5.0, 7.0]), "{x} {y}");
         if *alpha > 0.0 {
@@ -66,7 +67,7 @@ fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_
     }
     // four of 25 pixels lie in that square
     assert!((40..90).contains(&head), "{head} of 400 should be about 64");
-    // in the end, and where pixels are not that fine, every ray is a pixel
+    // At detail 0, and for pixels that are not that fine, every ray is a single pixel.
     let small = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false).with_large(0.1);
     for (pixels, detail) in [(&large, 0.0), (&small, 0.5)] {
         assert_eq!(pixels.draw(1, 2, 400, true, detail).rays, large.draw(1, 2, 400, true, 0.3).rays);
@@ -81,7 +82,7 @@ fn a_view_without_a_mask_teaches_nothing_beside_views_with_one() {
     let views = [view(), TrainView { mask: None, ..view() }, white];
     let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
     assert_eq!(pixels.count(), 25);
-    // alone it is drawn from everywhere
+    // As the only view it is drawn from everywhere.
     let alone = [TrainView { mask: None, ..view() }];
     assert_eq!(Pixels::new(&alone, 0.1, 1.0, Foreground::Photo, false).count(), 200);
 }
@@ -119,7 +120,7 @@ fn an_epoch_has_every_valid_pixel_that_meets_the_box_once_with_directions_of_dep
     assert!(
         first == pixels.draw(1, 0, 50, false, 0.0).rays && first != pixels.draw(1, 4, 50, false, 0.0).rays
     );
-    // more than there are: all of them, once
+    // A batch larger than the number of pixels draws each of them once.
     assert_eq!(pixels.draw(1, 9, 1000, false, 0.0).rays.len(), 239);
 }
 
@@ -170,10 +171,10 @@ fn a_device_draws_the_same_rays() {
         (permuted(false), false, 0.0, 1600),
         (permuted(true), false, 0.0, u64::MAX),
     ] {
-        let drawing = gpu::SamplingOptions { jitter: !published, background: true, behind: 3 };
+        let drawing = gpu::SamplingOptions { jitter: !published, background: true, background_stream: 3 };
         let photographs = pixels.on_device(&device, drawing, largest);
         let (seed, step) = (77, 1 << 33);
-        // a batch of more pixels than there are has each once
+        // A batch larger than the number of pixels draws each of them once.
         let wanted = 2000;
         let batch = gpu::Batch::new(&device, if pixels.order.is_some() { wanted } else { 2050 });
         let rays = batch.rays();
@@ -182,7 +183,7 @@ fn a_device_draws_the_same_rays() {
         let alive = device.read::<u32>(&batch.alive);
         assert!(alive[wanted..].iter().all(|&a| a == 0));
         let kept: Vec<usize> = (0..rays).filter(|&r| alive[r] == 1).collect();
-        // published: pixels that are not valid leave a gap
+        // In the published code, pixels that are not valid leave a gap.
         let gaps = published || pixels.order.is_some();
         assert_eq!((kept.len(), kept.len() < wanted), (want.rays.len(), gaps));
         let take = |buffer: &gpu::Buffer, planes: usize| -> Vec<f32> {
@@ -199,7 +200,7 @@ fn a_device_draws_the_same_rays() {
         agree("drawn colors", &take(&batch.color, 3), &planes(&want.color, n), 1e-6);
         assert_eq!(take(&batch.alpha, 1), want.alpha);
         assert_eq!(take(&batch.jitter, 1), want.rays.iter().map(|r| r.jitter).collect::<Vec<_>>());
-        let behind = device.read::<f32>(&batch.background);
-        assert_eq!(behind[rays + 9], rng::uniform(seed, step << 4 | 3, 3 * 9 + 1));
+        let background_stream = device.read::<f32>(&batch.background);
+        assert_eq!(background_stream[rays + 9], rng::uniform(seed, step << 4 | 3, 3 * 9 + 1));
     }
 }

@@ -1,4 +1,4 @@
-//! The trainer of every field.
+//! The trainer that all fields share.
 //!
 //! ```text
 //! restore, or start and save → prepare → rays, losses, gradients → Adam → read losses → after the step
@@ -7,68 +7,68 @@
 //!                                → finish
 //! ```
 //!
-//! A model says what differs between fields and leaves what it needs between steps (rays, samples, parameters, moments)
-//! where it is: the trainer sees named figures after a step, and the whole state when a checkpoint is due.
+//! A model defines what differs between fields, and keeps its rays, samples, parameters and moments on its device between
+//! steps. The trainer sees named figures after a step, and the whole state only when a checkpoint is due.
 
 use super::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::{Error, Monitor, Result};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// What a training is given besides its photographs and settings.
+/// Context of a training, besides its photographs and settings.
 #[derive(Clone, Copy)]
 pub struct TrainingSession<'a> {
-    /// The stage, which is the table of its settings: `iface`, `tface` or `baseline`.
+    /// Stage, which is also its settings table: `iface`, `tface` or `baseline`.
     pub stage: &'static str,
     /// Seed of every random number.
     pub seed: u64,
-    /// Name of the device: see [`super::compute_device`].
+    /// Name of the device; see [`super::compute_device`].
     pub device: &'a str,
-    /// The folder of the checkpoints; training continues from those that lie there.
+    /// Folder of the checkpoints; training resumes from those it contains.
     pub dir: &'a Path,
-    /// Names settings and inputs: a checkpoint of another identity is refused.
+    /// Identity of settings and inputs; a checkpoint of another identity is refused.
     pub identity: &'a str,
-    /// Hears of every step and asks to stop.
+    /// Receives every step's progress, and can request a stop.
     pub monitor: &'a dyn Monitor,
 }
 
 /// A step of a training.
 #[derive(Clone, Copy, Debug)]
 pub struct StepAt {
-    /// Seed of its random numbers: another one after a step that diverged.
+    /// Seed of the step's random numbers, which changes after a step diverged.
     pub seed: u64,
-    /// Optimizer steps before it.
+    /// Number of optimizer steps before this one.
     pub step: u64,
 }
 
-/// What a step came to, on the host.
+/// Figures of a step, on the host.
 pub struct StepReport {
-    /// Mean squared error of the colors of all steps since the last report; none where they met nothing.
+    /// Mean squared error of the colors of all steps since the last report; `None` if no ray met a sample.
     pub square_error: Option<f32>,
-    /// Named figures, for people.
+    /// Named figures, for display.
     pub figures: Vec<(&'static str, f64)>,
 }
 
-/// Why there is no next step.
+/// Reason for which training cannot go on to the next step.
 pub enum StepError {
     /// A loss or gradient is NaN or infinite; nothing was updated.
     NotFinite {
-        /// Which term.
+        /// Name of the term.
         term: &'static str,
         /// Its value.
         value: f32,
     },
-    /// Going back would not help.
+    /// Any other error, for which going back to a checkpoint would not help.
     Failed(Error),
 }
 
 impl StepError {
-    /// The error that a gradient is not finite: a finite loss does not promise one.
+    /// Returns the error for a gradient that is not finite, which can happen even if the loss is finite.
     pub fn gradient() -> StepError {
         StepError::NotFinite { term: "gradient of the", value: f32::NAN }
     }
 
-    /// The first of these named terms that is not finite.
+    /// Returns an error for the first of these named terms that is not finite.
     pub fn check(terms: impl IntoIterator<Item = (&'static str, f32)>) -> Result<(), StepError> {
         match terms.into_iter().find(|(_, value)| !value.is_finite()) {
             Some((term, value)) => Err(StepError::NotFinite { term, value }),
@@ -85,43 +85,43 @@ impl From<Error> for StepError {
 
 /// A field in training.
 pub trait Model {
-    /// Name of its checkpoints' format.
+    /// Format name of the model's checkpoints.
     const FORMAT: &'static str;
-    /// The settings that hold its learning rates.
+    /// Names of the settings that hold the learning rates, for messages.
     const RATES: [&'static str; 2];
     /// Steps between two reports.
     const READ_EVERY: u64;
 
-    /// Learning rate of the networks at a step.
+    /// Returns the learning rate of the networks at a step.
     fn learning_rate(&self, step: u64) -> f64;
 
-    /// Does what is due before a step: occupancy, stereo points.
+    /// Does the work due before a step, such as updating the occupancy or searching stereo points.
     fn prepare(&mut self, _: StepAt) -> Result<(), StepError> {
         Ok(())
     }
 
-    /// Draws rays and leaves the gradients of their losses in the parameter groups.
+    /// Draws rays and writes the gradients of their losses into the parameter groups.
     fn backward(&mut self, at: StepAt);
 
     /// Makes the optimizer's step of every parameter group.
     fn optimize(&mut self, step: u64);
 
-    /// Waits for the device and returns what `step`, the last one, or the mean of those since the last report came to.
+    /// Waits for the device and returns the figures of `step`, the last one, or their means since the last report.
     fn report(&mut self, step: u64) -> Result<StepReport, StepError>;
 
-    /// Does what is due after a step: finer grids.
+    /// Does the work due after a step, such as refining grids.
     fn finish_step(&mut self, _: u64) -> Result<(), StepError> {
         Ok(())
     }
 
-    /// Puts everything needed to go on into a checkpoint; of a finished one only the result is read.
+    /// Writes everything needed to resume into a checkpoint. A finished checkpoint needs only the result.
     fn save(&self, into: &mut Checkpoint, finished: bool) -> Result<(), StepError>;
 
-    /// Takes up a checkpoint's state, with its progress and whether it is finished, or the one before the first step.
+    /// Restores the state from a checkpoint, given its progress and whether it is finished, or sets the initial state.
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError>;
 }
 
-/// Makes a step, and returns what it came to where that is read.
+/// Runs a step, and returns its report if `read`.
 pub fn step<M: Model>(
     model: &mut M,
     seed: u64,
@@ -137,8 +137,8 @@ pub fn step<M: Model>(
     Ok(report)
 }
 
-/// Trains until `steps`, saving a checkpoint every `checkpoint_s` seconds. A finished training is left as it is.
-/// Returns how far it came and oddities on the way.
+/// Trains until `steps`, saving a checkpoint every `checkpoint_s` seconds. A finished training is left unchanged.
+/// Returns the progress and warnings.
 pub fn train<M: Model>(
     model: &mut M,
     session: &TrainingSession,
@@ -150,7 +150,7 @@ pub fn train<M: Model>(
     let save = |model: &M, progress: &TrainingProgress, finished: bool| -> Result<(), StepError> {
         let mut into = Checkpoint::new(stage, M::FORMAT, identity);
         progress.save(&mut into, finished);
-        // a poisoned field must not take the place of a good checkpoint
+        // A model with non-finite values returns an error here, so that it does not replace a good checkpoint.
         model.save(&mut into, finished)?;
         Ok(into.save(dir)?)
     };
@@ -166,7 +166,7 @@ pub fn train<M: Model>(
         Some(restored) => restored,
         None => {
             let progress = TrainingProgress::default();
-            // a training that breaks early goes back to here
+            // A training that diverges early goes back to this checkpoint.
             let started = model.restore(None).and_then(|()| save(model, &progress, false));
             started.map_err(|e| failure(model, e, stage, 0, false))?;
             (progress, Vec::new())
@@ -187,7 +187,7 @@ pub fn train<M: Model>(
                 let new = (done - 1) % M::READ_EVERY + 1;
                 progress.mean_square = running_mean(progress.mean_square, done - new, error.into(), new);
             }
-            // none before the first error is known, which a device tells once in many steps
+            // The error is unknown until the first readback, which a GPU makes once in many steps.
             let psnr = (progress.mean_square > 0.0).then(|| ("psnr", progress.psnr()));
             let figures: Vec<_> = psnr.into_iter().chain(report.figures).collect();
             monitor.step(done, steps, &figures);
@@ -211,7 +211,7 @@ pub fn train<M: Model>(
                     return Err(Error::cannot("the checkpoint of the start is gone", "start again"));
                 };
                 warnings.extend(notes);
-                // other rays, or the same step would break in the same way
+                // The salt draws other rays; the same ones would make the step diverge again.
                 progress = TrainingProgress { salt: 1, ..restored };
             }
             Err(e) => return Err(failure(model, e, stage, done - 1, went_back)),
@@ -221,20 +221,20 @@ pub fn train<M: Model>(
     Ok((progress, warnings))
 }
 
-/// Returns the mean of all steps, of which each counts 2 % less than the one after it: from that of the first `old` ones
-/// and the mean of the `new` ones behind them.
+/// Returns the running mean over all steps, each weighted 2 % less than the next, from the mean of the first `old` steps
+/// and the mean of the `new` steps after them.
 fn running_mean(mean: f64, old: u64, of_new: f64, new: u64) -> f64 {
     let weight = |steps: u64| 1.0 - 0.98f64.powf(steps as f64);
     let keep = (1.0 - weight(new)) * weight(old) / weight(old + new);
     if mean == 0.0 { of_new } else { keep * mean + (1.0 - keep) * of_new }
 }
 
-/// Returns the error of a training that was asked to stop; what was done is saved.
+/// Returns the error of a training that stopped on request after saving its progress.
 pub fn stopped(step: u64, steps: u64) -> Error {
     Error::stopped(format!("saved at step {step} of {steps}"))
 }
 
-/// Returns the error that no view has a pixel to learn from.
+/// Returns the error for views without a drawable pixel.
 pub fn no_pixels() -> Error {
     Error::cannot(
         "no training view has a pixel to learn from (masks empty, or everything marked invalid)",
@@ -274,7 +274,7 @@ mod tests {
                 assert!(apart.abs() < if step < 200 { 0.7 } else { 0.25 }, "step {step}: {apart:.2} dB");
             }
         }
-        // the weights by hand: 0.98 and 1 of two steps
+        // By hand: the weights of two steps are 0.98 and 1.
         assert!(
             (running_mean(running_mean(0.0, 0, 3.0, 1), 1, 1.0, 1) - (0.98 * 3.0 + 1.0) / 1.98).abs() < 1e-12
         );

@@ -3,7 +3,7 @@
 use super::model::shape;
 use super::occupancy::Occupancy;
 use super::ops::{
-    BACKGROUND_STREAM, MOST_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
+    BACKGROUND_STREAM, MAX_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
     random_background,
 };
 use super::schedule;
@@ -30,16 +30,16 @@ pub struct CpuSdf<'a> {
     occupancy: Occupancy,
     all_points: Vec<SurfacePoint>,
     rays: usize,
-    /// Steps in a row that met no sample.
+    /// Number of consecutive steps without a sample.
     blind: u64,
-    /// Samples of the last step, as many as there would have been with room for all; none before the first one.
+    /// Samples of the last step before truncation to the budget; `None` before the first step.
     samples_wanted: Option<usize>,
     weights: Option<Weights>,
     inv_s: f32,
     step: CpuStep,
 }
 
-/// What the operations of a step leave for the next ones.
+/// Intermediate results that the operations of a step pass to the next ones.
 #[derive(Default)]
 struct CpuStep {
     dt: f32,
@@ -69,12 +69,12 @@ impl CpuStep {
     }
 }
 
-/// Drops the last rays of a batch until at most `most` samples are left (one ray always stays).
-fn truncate(batch: &mut Batch, samples: &mut Samples, most: usize) {
-    if samples.t.len() <= most {
+/// Drops the last rays of a batch until at most `max_samples` are left (one ray always stays).
+fn truncate(batch: &mut Batch, samples: &mut Samples, max_samples: usize) {
+    if samples.t.len() <= max_samples {
         return;
     }
-    let kept = samples.offsets.iter().rposition(|&o| o as usize <= most).unwrap_or(0).max(1);
+    let kept = samples.offsets.iter().rposition(|&o| o as usize <= max_samples).unwrap_or(0).max(1);
     samples.offsets.truncate(kept + 1);
     samples.t.truncate(samples.offsets[kept] as usize);
     batch.rays.truncate(kept);
@@ -83,7 +83,7 @@ fn truncate(batch: &mut Batch, samples: &mut Samples, most: usize) {
 }
 
 impl<'a> CpuSdf<'a> {
-    /// The operations of a training with these settings and photographs.
+    /// Creates the operations of a training with these settings and photographs.
     pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>) -> CpuSdf<'a> {
         CpuSdf {
             config,
@@ -176,7 +176,7 @@ impl SdfOps for CpuSdf<'_> {
         let (config, step) = (self.config, &mut self.step);
         step.samples = self.occupancy.march(config, step.dt, &step.batch.rays);
         let wanted = step.samples.t.len();
-        truncate(&mut step.batch, &mut step.samples, MOST_BUDGETS * config.samples);
+        truncate(&mut step.batch, &mut step.samples, MAX_BUDGETS * config.samples);
         step.background.truncate(step.batch.rays.len());
         step.direction = step.batch.rays.iter().map(|r| r.direction).collect();
         step.dts = vec![step.dt; step.samples.t.len()];
@@ -199,7 +199,7 @@ impl SdfOps for CpuSdf<'_> {
         let step = &self.step;
         let (mut x, mut d) = step.samples.points(&step.batch.rays, 0);
         x.extend(step.points.iter().map(|p| p.position));
-        d.resize(x.len(), [0.0, 0.0, 1.0]); // the color of points has no loss
+        d.resize(x.len(), [0.0, 0.0, 1.0]); // any direction will do: the color of points has no loss
         let table = bytemuck::cast_slice(slice(table.value()));
         let activations = sdf::forward(&self.shape, table, self.prepared(), &x, &d);
         self.step.activations = Some(activations);
@@ -243,7 +243,8 @@ impl SdfOps for CpuSdf<'_> {
         weight_norm::backward(self.shape.layout(), slice(parameters), &g_flat, g_network);
         let g_variance = 10.0 * self.inv_s * self.step.g_inv_s;
         slice_mut(&mut variance.gradient)[0] = g_variance;
-        // what breaks the table's gradient passes through the layers above it; nothing is applied to a loss that is none
+        // A non-finite gradient of the table passes through the layers above it, so checking those suffices. The loss
+        // terms are checked too, so that no step follows a loss that is not finite.
         let all = g_network.iter().chain(&self.step.terms).chain([&g_variance]);
         self.step.broken |= !all.into_iter().all(|g| g.is_finite());
     }

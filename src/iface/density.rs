@@ -1,8 +1,8 @@
-//! Instant-NeRF, the row that the paper's I-Face is compared with: a density where I-Face has a distance.
+//! Instant-NeRF, the paper's baseline for I-Face: a density field in place of the signed distance.
 //!
-//! instant-nsr-pl's `nerf-blender` configuration for these captures: hash grid of base 16, smooth-L1 on the colors of
-//! rays that met something, the distortion loss, no mask loss, masked photographs over black; AdamW at 0.01, which three
-//! milestones take to a third each. Meshed where the density is 5.
+//! It follows instant-nsr-pl's `nerf-blender` configuration, adapted to these captures: a hash grid of base 16, smooth-L1
+//! on the colors of rays with samples, the distortion loss, no mask loss, and masked photographs over black. AdamW starts
+//! at a rate of 0.01, which each of three milestones reduces to a third. The mesh is the level set of density 5.
 
 mod cpu;
 mod field;
@@ -41,10 +41,10 @@ use std::time::Instant;
 /// Version of the checkpoints' layout.
 const FORMAT: &str = "tiface-density-1";
 
-/// Milestones of the learning rate, as shares of the steps (10, 15 and 18 of 20 thousand), and what each leaves of it.
+/// Milestones of the learning rate, as shares of the steps (10, 15 and 18 of 20 thousand), and its factor at each.
 const MILESTONES: ([f64; 3], f64) = ([0.5, 0.75, 0.9], 0.33);
 
-/// Training between two steps: hash table and networks.
+/// State of a training between two steps, with the groups hash table and networks.
 type DensityState = FieldState<2>;
 
 const NAMES: [&str; 2] = ["table", "network"];
@@ -54,7 +54,8 @@ fn shape(config: &IfaceConfig) -> DensityShape {
     DensityShape { levels, radius: config.radius }
 }
 
-/// U(±1e-4) for the table, Xavier's bounds for the networks, the last layer's as if it had 16 outputs: tiny-cuda-nn.
+/// Returns the initial parameters as in tiny-cuda-nn: U(±1e-4) for the table, Xavier's bounds for the networks, with the
+/// last layer padded to 16 outputs.
 fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 2] {
     let shape = shape(config);
     let entries = hash::entries(&shape.levels) as u64;
@@ -68,7 +69,7 @@ fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 2] {
     [HostGroup::flat(NAMES[0], table), HostGroup::flat(NAMES[1], network)]
 }
 
-/// Both groups as they lie in a checkpoint.
+/// Returns the parts of both groups, as checkpoints store them.
 fn parts(config: &IfaceConfig) -> [Vec<Part>; 2] {
     let shape = shape(config);
     let lengths = [2 * hash::entries(&shape.levels), shape.len()];
@@ -133,7 +134,7 @@ fn train_on<O: DensityOps>(
     Ok((model.state()?, progress, warnings))
 }
 
-/// What ranges of single keys cannot say.
+/// Checks the constraints between settings that ranges of single keys cannot express.
 fn check(config: &IfaceConfig) -> Result<()> {
     let wrong = |key: &str, why: &str, hint: &str| Err(Error::usage(format!("`iface.{key}` {why}"), hint));
     if !config.levels.is_multiple_of(4) {
@@ -145,7 +146,7 @@ fn check(config: &IfaceConfig) -> Result<()> {
     Ok(())
 }
 
-/// Learning rate of a step, as a share of the first.
+/// Returns the learning rate of a step relative to the first step's.
 fn learning_rate(config: &IfaceConfig, step: u64) -> f64 {
     let (milestones, factor) = MILESTONES;
     let passed = milestones.iter().filter(|m| step as f64 >= **m * config.steps as f64).count();
@@ -153,7 +154,7 @@ fn learning_rate(config: &IfaceConfig, step: u64) -> f64 {
 }
 
 impl<'a, O: DensityOps> DensityModel<'a, O> {
-    /// Before the first step; a checkpoint is not looked for yet.
+    /// Creates the model in its initial state, without looking for a checkpoint.
     fn new(ops: O, config: &'a IfaceConfig, session: &TrainingSession<'a>) -> DensityModel<'a, O> {
         let state = DensityState::start(initial(config, session.seed), config, None);
         let groups = state.groups.map(|group| ParameterGroup::upload(ops.device(), group));
@@ -167,7 +168,7 @@ impl<'a, O: DensityOps> DensityModel<'a, O> {
         self.occupancy = state.occupancy;
     }
 
-    /// Waits for the device; the state as it is there.
+    /// Waits for the device and returns the current state.
     fn state(&self) -> Result<DensityState> {
         let [table, network] = self.groups.each_ref().map(|group| group.download(self.ops.device()));
         let mut occupancy = self.occupancy.clone();
@@ -254,11 +255,11 @@ impl<O: DensityOps> TestedModel for DensityModel<'_, O> {
 /// Compares a training step on a GPU with one on the processor.
 #[cfg(feature = "wgpu")]
 pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<Check>> {
-    use crate::field::self_test::{CELLS_AT, SEED, compare, compare_cells, outcome, session};
+    use crate::field::self_test::{CELLS_AT, SEED, compare, compare_cells, run_step, session};
     const FIELD: &str = "density";
     let (views, session) = (fields::ball::views(), session("iface"));
     let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
-    // as if it had learned for a while: something to be seen, and not the same everywhere
+    // Larger values imitate a partly trained field: it is visible, and varies in space.
     let start = || {
         let mut state = DensityState::start(initial(config, SEED), config, None);
         let [table, network] = &mut state.groups;
@@ -278,7 +279,7 @@ pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<C
     let mut checks = vec![compare_cells(FIELD, &got.occupied.bits, &want.occupied.bits)];
     on_cpu.load(DensityState { occupancy: want.clone(), ..start() });
     on_gpu.load(DensityState { occupancy: want, ..start() });
-    checks.extend(compare(FIELD, &outcome(&mut on_gpu)?, &outcome(&mut on_cpu)?));
+    checks.extend(compare(FIELD, &run_step(&mut on_gpu)?, &run_step(&mut on_cpu)?));
     Ok(checks)
 }
 

@@ -1,10 +1,10 @@
-//! A training step of the signed-distance field on a GPU, with the host waiting for nothing: rays are drawn, marched,
-//! shaded, compared and applied there.
+//! A training step of the signed-distance field on a GPU. Sampling, marching, evaluation, losses and optimizer all run
+//! on the device, so the host never waits within a step.
 
 use super::model::shape;
 use super::occupancy::{Occupancy, band};
 use super::ops::{
-    BACKGROUND_STREAM, MOST_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
+    BACKGROUND_STREAM, MAX_BUDGETS, STEREO_POINTS, SdfGroups, SdfOps, VARIANCE, loss_weights,
     random_background,
 };
 use super::schedule;
@@ -26,13 +26,13 @@ use crate::kernel::gpu::{
 };
 use crate::{Error, Result};
 
-/// How the cells to march through are updated.
+/// Rule that updates the cells to march through.
 enum CellRule {
     Band(Box<Band>),
     Nerfacc(Box<Nerfacc>),
 }
 
-/// The operations of [`SdfOps`] on a GPU, and its memory for them.
+/// The operations of [`SdfOps`] on a GPU, with their device memory.
 pub struct GpuSdf<'a> {
     config: &'a IfaceConfig,
     pixels: &'a Pixels<'a>,
@@ -56,12 +56,12 @@ pub struct GpuSdf<'a> {
     schedule: Schedule,
     occupancy: gpu::Occupancy,
     cells: CellRule,
-    /// Has a step been made since the state was loaded?
+    /// Whether a step was made since the state was loaded.
     stepped: bool,
 }
 
 impl<'a> GpuSdf<'a> {
-    /// Refuses a training that a device cannot take: it knows no such field, or has too little memory.
+    /// Checks that a device supports the field and has enough memory for the training.
     pub fn fits(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<()> {
         let shape = shape(config);
         if !Sdf::supports(&shape) {
@@ -71,11 +71,11 @@ impl<'a> GpuSdf<'a> {
         max_samples(config, &shape, pixels, device).map(drop)
     }
 
-    /// The operations of a training that [`fits`](GpuSdf::fits) a device.
+    /// Creates the operations of a training that [`fits`](GpuSdf::fits) a device.
     ///
     /// # Errors
     ///
-    /// Where the device has too little memory.
+    /// If the device has too little memory.
     pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>, device: Device) -> Result<GpuSdf<'a>> {
         let shape = shape(config);
         let rays = config.rays.max(config.max_rays);
@@ -84,7 +84,7 @@ impl<'a> GpuSdf<'a> {
         let drawing = SamplingOptions {
             jitter: config.jitter,
             background: random_background(config),
-            behind: BACKGROUND_STREAM,
+            background_stream: BACKGROUND_STREAM,
         };
         let flat = shape.layout().len();
         let start = Occupancy::new(config, None);
@@ -125,28 +125,29 @@ impl<'a> GpuSdf<'a> {
     }
 }
 
-/// Stereo points that a step has room for.
+/// Returns the capacity for stereo points of a step.
 fn stereo_points(config: &IfaceConfig) -> usize {
     if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 }
 }
 
-/// Samples that a step has room for, as many as on the processor where the device's memory and buffers are large enough;
-/// and do photographs lie there, too?
+/// Returns the sample capacity of a step, which equals the processor's if the device's memory and buffers are large
+/// enough, and whether the photographs fit on the device as well.
 pub(super) fn max_samples(
     config: &IfaceConfig,
     shape: &FieldShape,
     pixels: &Pixels,
     device: &Device,
 ) -> Result<(usize, bool)> {
-    /// Samples with their rays, compositing and losses, and the cells that are looked at in their place.
-    const BESIDE: usize = 3 + 3 + 2 + 9 + 2 + 1;
+    /// Words per sample outside the field: positions, directions, steps, compositing, losses, and the index of the cell
+    /// that takes the sample's place during an occupancy update.
+    const EXTRA_WORDS: usize = 3 + 3 + 2 + 9 + 2 + 1;
     let [words, widest] = Sdf::words_per_sample(shape);
     let sums = Sdf::words_of_sums(shape);
-    samples_that_fit(config, [words + BESIDE, widest], sums, stereo_points(config), pixels, device)
+    samples_that_fit(config, [words + EXTRA_WORDS, widest], sums, stereo_points(config), pixels, device)
 }
 
-/// As [`max_samples`], of a field on a hash grid that takes so many words a sample, and of the largest buffer, so many for
-/// sums, and evaluates so many points beside the samples of a step.
+/// Computes [`max_samples`] for any field on a hash grid, from its words per sample in all buffers and in the largest
+/// one, its words for sums, and the number of points it evaluates besides the samples of a step.
 pub(super) fn samples_that_fit(
     config: &IfaceConfig,
     [words, widest]: [usize; 2],
@@ -156,14 +157,15 @@ pub(super) fn samples_that_fit(
     device: &Device,
 ) -> Result<(usize, bool)> {
     let bytes = 4 * words as u64;
-    // values, moments and gradient; cells with their number, distance and reach or history and last draw, and bits
+    // The tables hold values, two moments and the gradient. A cell has its index, two words of its rule (distance and
+    // reach, or history and last draw), and bits.
     let cells = config.occupancy_resolution.pow(3) as u64;
     let fixed = |log2_table: u32| {
         let levels = hash::levels(config.levels, config.base_resolution, config.growth, log2_table);
         32 * hash::entries(&levels) as u64 + 13 * cells + 4 * sums as u64
     };
     let least = (config.samples + points) as u64;
-    let wanted = (MOST_BUDGETS * config.samples + points) as u64;
+    let wanted = (MAX_BUDGETS * config.samples + points) as u64;
     let need = MemoryNeed {
         fixed: (fixed(config.log2_table), "hash tables, cells and sums"),
         unit: "samples",
@@ -181,13 +183,13 @@ pub(super) fn samples_that_fit(
             _ => "iface.samples, then iface.log2_table".into(),
         }
     })?;
-    // the last tile is a whole one
+    // The capacity is a whole number of tiles.
     let whole =
         if capacity as u64 == wanted { capacity.next_multiple_of(TILE) } else { capacity / TILE * TILE };
     Ok((whole, resident))
 }
 
-/// The cells to march through, and how they are updated.
+/// Creates the cells to march through, and the rule that updates them.
 fn cells(
     device: &Device,
     config: &IfaceConfig,

@@ -411,7 +411,7 @@ fn a_device_with_too_little_room_is_refused_before_the_first_step() {
     }
     let [whole, few] = [900, 536].map(|mib| room(&some, &of(mib)).unwrap());
     println!("samples, and do photographs lie there: {whole:?} {few:?}");
-    assert!(whole.1 && whole.0 > MOST_BUDGETS * 4096 && !few.1 && few.0 < whole.0 && few.0 > 4096);
+    assert!(whole.1 && whole.0 > MAX_BUDGETS * 4096 && !few.1 && few.0 < whole.0 && few.0 > 4096);
 }
 
 /// `cargo test --release --features wgpu --lib exchange_costs -- --ignored --nocapture`

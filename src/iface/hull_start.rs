@@ -1,4 +1,4 @@
-//! The visual hull as a first signed distance.
+//! Initialization of the signed distance from the visual hull.
 //!
 //! The hull is known before training and lies within millimetres of most of the head. Fitting the field
 //! to its distance for a few hundred cheap steps replaces the thousands that carve a sphere, and gives
@@ -25,7 +25,7 @@ pub struct HullDistance {
     values: Vec<f32>,
 }
 
-/// Distance in cells from each cell's centre to the nearest centre of a cell in `seeds`.
+/// Returns the distance in cells from each cell's center to the nearest center of a cell in `seeds`.
 fn distance(resolution: usize, seeds: impl Fn(usize) -> bool + Sync) -> Vec<f32> {
     let r = resolution;
     /// Larger than any squared distance on the grid, small enough to stay exact in f32.
@@ -54,7 +54,7 @@ fn distance(resolution: usize, seeds: impl Fn(usize) -> bool + Sync) -> Vec<f32>
 }
 
 impl HullDistance {
-    /// From a hull; beyond the box counts as outside.
+    /// Computes the distance from a hull; everything beyond the box counts as outside.
     pub fn new(hull: &Bitmask) -> HullDistance {
         let r = hull.resolution;
         let border = |i: usize| [i / (r * r), i / r % r, i % r].iter().any(|&c| c == 0 || c == r - 1);
@@ -62,7 +62,7 @@ impl HullDistance {
         let to_inside = distance(r, inside);
         let to_outside = distance(r, |i| !inside(i));
         let cell = 2.0 / r as f32;
-        // the boundary runs half a cell before the nearest centre of the other kind
+        // The boundary runs half a cell before the nearest center of the other kind.
         let value = |i: usize| match inside(i) {
             true => -(to_outside[i] - 0.5).max(0.0) * cell,
             false => (to_inside[i] - 0.5).max(0.0) * cell,
@@ -70,7 +70,7 @@ impl HullDistance {
         HullDistance { resolution: r, values: (0..r * r * r).map(value).collect() }
     }
 
-    /// Trilinear value at a point of [-1, 1]³.
+    /// Interpolates the distance at a point of [-1, 1]³ trilinearly.
     pub fn at(&self, p: [f32; 3]) -> f32 {
         let r = self.resolution;
         let mut low = [0usize; 3];
@@ -90,8 +90,8 @@ impl HullDistance {
     }
 }
 
-/// Fits the geometry of the field to the hull's distance, on the processor: half of the points in a band around its
-/// boundary.
+/// Fits the geometry of the field to the hull's distance, on the processor. Half of the points lie in a band around the
+/// hull's boundary.
 pub fn fit_hull(
     state: &mut SdfState,
     hull: &Bitmask,
@@ -107,7 +107,7 @@ pub fn fit_hull(
     let distance = HullDistance::new(hull);
     let shape = FieldShape { active: schedule::active_levels(config, 0), ..shape(config) };
     let layout = shape.layout();
-    // the colors, behind the geometry, stay as they are
+    // The color network's parameters follow the geometry's in the group, and are not fitted.
     let colors = |part: &&Part| part.name.starts_with('c');
     let [table, network, _] = &state.groups;
     let colored: usize = network.parts.iter().filter(colors).map(|part| part.count()).sum();
@@ -164,7 +164,7 @@ pub fn fit_hull(
         }
     }
     // training starts with its own moments
-    state.groups.iter_mut().for_each(|group| group.forget_moments());
+    state.groups.iter_mut().for_each(|group| group.reset_moments());
     Ok(())
 }
 

@@ -1,4 +1,4 @@
-//! A trained field, evaluated: distances, normals, colors, volume renders.
+//! Evaluation of a trained field: distances, normals, colors and volume renders.
 
 use super::model::{parts, shape};
 use super::occupancy::Occupancy;
@@ -34,12 +34,12 @@ pub struct IFace {
     weights: Weights,
     inv_s: f32,
     occupancy: Occupancy,
-    /// The weights once more, as a device takes them.
+    /// The weights as a flat array, for upload to a device.
     #[cfg(feature = "wgpu")]
     flat: Vec<f32>,
     #[cfg(feature = "wgpu")]
     on_gpu: GpuField<Evaluator>,
-    /// Held while the field is.
+    /// Lock of the GPU, held for the field's lifetime.
     #[cfg(feature = "wgpu")]
     _lock: Option<Arc<Lock>>,
 }
@@ -66,7 +66,7 @@ impl IFace {
             _lock: None,
         };
         if config.occupancy == OccupancyRule::Band {
-            // the surface moved since the last update
+            // The surface has moved since the last update of the cells.
             let mut occupancy = face.occupancy.clone();
             let soft = |x: &[[f32; 3]]| sdf::softness(&face.shape, face.table(), &face.weights, x);
             occupancy.update(config, (0, 0), face.inv_s, 0.0, |x| face.raw_sdf(x), soft);
@@ -75,7 +75,7 @@ impl IFace {
         face
     }
 
-    /// Loads the field from the checkpoint in a stage folder. `config` and `hull` are those it was trained with.
+    /// Loads the field from the checkpoint in a stage folder. `config` and `hull` must be the training's.
     pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
         TrainingProgress::restore(&file, config.steps)?;
@@ -83,7 +83,7 @@ impl IFace {
         Ok(IFace::new(config, state))
     }
 
-    /// Lets a GPU answer, if `device` is one.
+    /// Evaluates the field on `device` from now on, if it is a GPU that supports the field.
     #[cfg(feature = "wgpu")]
     pub fn on(mut self, device: ComputeDevice) -> IFace {
         let ComputeDevice::Gpu(Gpu { device, lock, .. }) = device else { return self };
@@ -96,13 +96,13 @@ impl IFace {
         self
     }
 
-    /// Returns why a GPU no longer answers, where one failed.
+    /// Returns why the GPU is no longer used, if it failed.
     #[cfg(feature = "wgpu")]
     pub fn gpu_failure(&self) -> Option<&str> {
         self.on_gpu.failure()
     }
 
-    /// Sharpness of the trained surface where it is sharpest, per scene unit.
+    /// Returns the sharpness of the trained surface at its sharpest, per scene unit.
     pub fn inv_s(&self) -> f32 {
         self.inv_s * self.config.radius
     }
@@ -111,7 +111,7 @@ impl IFace {
         bytemuck::cast_slice(&self.table)
     }
 
-    /// Column `column` of the field's output, which `on_cpu` gives on the processor.
+    /// Evaluates channel `column` of the field's output on the GPU, or by `on_cpu`.
     fn output(
         &self,
         x: &[[f32; 3]],
@@ -134,7 +134,7 @@ impl IFace {
         points.iter().map(|p| (*p * self.config.radius).to_array()).collect()
     }
 
-    /// Signed distance, negative inside. `[n]` points → `[n]`.
+    /// Returns the signed distance, negative inside. `[n]` points → `[n]`.
     pub fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         let mut f = self.raw_sdf(&self.scaled(points));
         if self.config.radius != 1.0 {
@@ -143,14 +143,14 @@ impl IFace {
         f
     }
 
-    /// Local sharpness of the surface, per scene unit: opacity at a distance `f` outside is σ(−f · sharpness). `[n]`
-    /// points → `[n]`.
+    /// Returns the local sharpness of the surface, per scene unit: the opacity at a distance `f` outside is
+    /// σ(−f · sharpness). `[n]` points → `[n]`.
     pub fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
         let soft = self.output(&self.scaled(points), WIDTH - 1, sdf::softness);
         soft.iter().map(|soft| self.inv_s() * soft.exp()).collect()
     }
 
-    /// Signed distance and its gradient (not normalized).
+    /// Returns the signed distance and its gradient (not normalized).
     pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let x = self.scaled(points);
         #[cfg(feature = "wgpu")]
@@ -163,8 +163,8 @@ impl IFace {
         all.into_iter().map(|(f, n)| (f / self.config.radius, Vec3::from(n))).unzip()
     }
 
-    /// sRGB-coded color of surface points with unit `normals`, point `i` seen along `counts[i]` unit `directions`
-    /// (away from the camera), all in one list: one color a direction.
+    /// Returns the sRGB-coded colors of surface points with unit `normals`, one color per direction. Point `i` is viewed
+    /// along `counts[i]` unit `directions` (away from the camera), which are concatenated in one list.
     pub fn colors(
         &self,
         points: &[Vec3],
@@ -176,10 +176,10 @@ impl IFace {
         let (x, normals, directions) = (self.scaled(points), arrays(normals), arrays(directions));
         #[cfg(feature = "wgpu")]
         if let Some(rgb) = self.on_gpu.ask(|field| {
-            // a point with several directions is evaluated for each
+            // The GPU evaluates a point once for each of its directions.
             let each = |rows: &[[f32; 3]]| -> Vec<[f32; 3]> {
-                let own = |(row, &n): (&[f32; 3], &u32)| std::iter::repeat_n(*row, n as usize);
-                rows.iter().zip(counts).flat_map(own).collect()
+                let repeated = |(row, &n): (&[f32; 3], &u32)| std::iter::repeat_n(*row, n as usize);
+                rows.iter().zip(counts).flat_map(repeated).collect()
             };
             field.evaluate(&each(&x), Some(&directions), Some(&each(&normals)), 4..7)
         }) {
@@ -188,7 +188,7 @@ impl IFace {
         sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, Some(counts), &directions)
     }
 
-    /// Volume render of rays in scene coordinates: the reference every faster view is compared with.
+    /// Renders rays in scene coordinates by volume rendering, the reference for faster renderers.
     pub fn render(&self, rays: &[Ray]) -> Vec<RayResult> {
         /// Rays marched together.
         const PASS: usize = 1 << 13;
@@ -204,7 +204,7 @@ impl IFace {
             return composited.iter().map(|o| self.result(o)).collect();
         }
         let samples = self.occupancy.march(config, dt, &marched);
-        // pieces of whole rays with a bounded number of samples: a sample costs some two kilobytes
+        // Rays are composited in pieces with a bounded number of samples: a sample takes about two kilobytes.
         let mut out = Vec::with_capacity(rays.len());
         let mut first = 0;
         while first < marched.len() {
@@ -235,7 +235,7 @@ impl IFace {
             .collect()
     }
 
-    /// What a ray composited, in scene units.
+    /// Converts a composited ray to scene units.
     fn result(&self, o: &[f32]) -> RayResult {
         RayResult {
             color: [o[0], o[1], o[2]],

@@ -16,7 +16,7 @@ use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS};
 use crate::kernel::cpu::rng;
 use crate::kernel::cpu::sdf::FieldShape;
 
-/// Shape of the field that a configuration describes.
+/// Returns the shape of the field that a configuration describes.
 pub fn shape(config: &IfaceConfig) -> FieldShape {
     FieldShape {
         levels: hash::levels(config.levels, config.base_resolution, config.growth, config.log2_table),
@@ -44,7 +44,7 @@ pub fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 3] {
         .collect();
     let mean = std::f32::consts::PI.sqrt() / (HIDDEN as f32).sqrt();
     let scale = if config.unit_start { config.radius } else { 1.0 };
-    // row 0 is the sdf; the others are features of the color network
+    // Row 0 is the sdf; the other rows are features for the color network.
     let apart = |i: usize| i >= HIDDEN && config.spread_features;
     let v2: Vec<f32> = (0..OUTPUTS * HIDDEN)
         .map(|i| {
@@ -77,7 +77,7 @@ pub fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 3] {
         .map(|values| HostGroup::new(parts.next().unwrap_or_default(), values))
 }
 
-/// Names and shapes of the parameters of the three groups that are stepped together.
+/// Returns names and shapes of the parameters in each of the three groups.
 pub fn parts(config: &IfaceConfig) -> [Vec<Part>; 3] {
     let shape = shape(config);
     let layout = shape.layout();

@@ -1,4 +1,4 @@
-//! Which cells of the box may hold surface.
+//! The grid of cells that may contain surface.
 
 use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
@@ -8,25 +8,25 @@ use crate::kernel::cpu::neus;
 use crate::kernel::cpu::occupancy::{self, BandRule};
 use rayon::prelude::*;
 
-/// Cells to march through, cells known to be deep inside, and the history the nerfacc rule keeps.
+/// Cells to march through, cells known to be deep inside, and the history of the nerfacc rule.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Occupancy {
-    /// March here.
+    /// Cells to march through.
     pub occupied: Bitmask,
-    /// Deep inside: nothing behind is seen (`band` rule only; empty under `nerfacc`).
+    /// Cells deep inside, where rays end (`band` rule only; empty under `nerfacc`).
     pub solid: Bitmask,
-    /// Never outside these: the visual hull, or everything.
+    /// Cells that may ever be occupied: the visual hull, or all.
     allowed: Bitmask,
     /// Decaying maximum of the opacity (`nerfacc` rule), `[cells]`.
     pub history: Vec<f32>,
 }
 
-/// How wide the band around the zero set is.
+/// Returns the rule for the width of the band around the zero set.
 pub fn band(config: &IfaceConfig) -> BandRule {
     BandRule { width: config.band, soften: config.soften as f32 }
 }
 
-/// `hull` seen at another resolution: a cell is kept when it overlaps a kept cell.
+/// Resamples `hull` to another resolution: a cell is set if it overlaps a set cell.
 fn resampled(hull: &Bitmask, resolution: usize) -> Bitmask {
     let mut out = Bitmask::filled(resolution, false);
     let n = hull.resolution;
@@ -44,12 +44,11 @@ fn resampled(hull: &Bitmask, resolution: usize) -> Bitmask {
 }
 
 impl Occupancy {
-    /// Starts with all cells of the hull; all cells where there is none. The `band` rule adds one layer of
-    /// cells: a surface learned a hair outside the hull would otherwise be entered from behind, and show as
-    /// a hole.
+    /// Marks all cells of the hull as occupied, or all cells without a hull. The `band` rule adds one layer of cells:
+    /// rays would otherwise enter a surface learned slightly outside the hull from its inside, which renders as a hole.
     pub fn new(config: &IfaceConfig, hull: Option<&Bitmask>) -> Occupancy {
         let r = config.occupancy_resolution;
-        // the published system knows no hull
+        // The published system does not use a hull.
         let hull = hull.filter(|_| config.occupancy == OccupancyRule::Band);
         let allowed = match hull {
             Some(hull) if hull.resolution == r => hull.clone(),
@@ -67,7 +66,7 @@ impl Occupancy {
         Occupancy { occupied: allowed.clone(), solid: Bitmask::filled(r, false), allowed, history }
     }
 
-    /// Puts cells and their history into a checkpoint.
+    /// Writes cells and their history into a checkpoint.
     pub fn save(&self, into: &mut Checkpoint) {
         into.put_words("occupancy.occupied", self.occupied.bits.clone());
         into.put_words("occupancy.solid", self.solid.bits.clone());
@@ -76,32 +75,32 @@ impl Occupancy {
         }
     }
 
-    /// Takes cells and history out of a checkpoint, of the same resolution and rule.
+    /// Reads cells and history from a checkpoint of the same resolution and rule.
     pub fn restore(&mut self, from: &mut Checkpoint) -> Result<()> {
         if !self.history.is_empty() {
             self.history = from.floats("occupancy.history", &[self.history.len()])?;
         }
         for (name, mask) in [("occupancy.occupied", &mut self.occupied), ("occupancy.solid", &mut self.solid)]
         {
-            // checkpoints of a density were written without solid cells, of which this rule has none
+            // Checkpoints of a density have no solid cells, because the nerfacc rule has none.
             if name == "occupancy.solid" && !self.history.is_empty() && !from.has(name) {
                 continue;
             }
             let bits = from.words(name)?;
             *mask = Bitmask::from_words(mask.resolution, bits)
-                .ok_or_else(|| from.wrong(format!("tensor `{name}` has another size")))?;
+                .ok_or_else(|| from.mismatch(format!("tensor `{name}` has another size")))?;
         }
         Ok(())
     }
 
-    /// The cells that may ever be marched through.
+    /// Returns the cells that may ever be marched through.
     #[cfg(feature = "wgpu")]
     pub fn allowed(&self) -> &Bitmask {
         &self.allowed
     }
 
-    /// Looks at the field again. `sdf` evaluates points in field coordinates, `soft` the logarithm of the local
-    /// sharpness as a share of `inv_s`; `step` is the march step.
+    /// Updates the cells from the field. `sdf` returns distances at points in field coordinates, `soft` the logarithm of
+    /// the local sharpness relative to `inv_s`; `step` is the march step.
     pub fn update(
         &mut self,
         config: &IfaceConfig,
@@ -127,8 +126,7 @@ impl Occupancy {
         }
     }
 
-    /// Evaluates the field again by nerfacc's rule: cells above `threshold`, or above the mean where that is less, are
-    /// marched through.
+    /// Updates the cells by nerfacc's rule: cells above `threshold`, or above the mean if that is less, are occupied.
     pub fn update_nerfacc(
         &mut self,
         at: (u64, u64),
@@ -140,14 +138,14 @@ impl Occupancy {
         occupancy::update_nerfacc(cells, &self.allowed, radius, at, threshold, opacity);
     }
 
-    /// Marches rays through the cells that may hold surface, with steps of `dt`.
+    /// Marches rays through the occupied cells, with steps of `dt`.
     pub fn march(&self, config: &IfaceConfig, dt: f32, rays: &[MarchRay]) -> Samples {
         let solid = (config.occupancy == OccupancyRule::Band).then_some(&self.solid);
         let limit = (3.6 * config.radius / dt) as usize + 2;
         march::march(&self.occupied, solid, config.radius, dt, rays, limit)
     }
 
-    /// Share of all cells that are marched through.
+    /// Returns the share of cells that are occupied.
     pub fn share(&self) -> f64 {
         self.occupied.count() as f64 / self.occupied.resolution.pow(3) as f64
     }

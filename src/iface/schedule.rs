@@ -1,4 +1,4 @@
-//! What changes with the step: learning rate, rays per step, active levels, march step.
+//! Schedules of a training: learning rate, rays per step, active levels, march step.
 
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::kernel::cpu::adam::AdamStep;
@@ -15,7 +15,8 @@ pub fn learning_rate(config: &IfaceConfig, n: u64) -> f64 {
     }
 }
 
-/// AdamW of the three groups at step number `step`, from 1, where learning rates are `factor` of their peak.
+/// Returns the AdamW parameters of the three groups at step number `step`, counted from 1, with learning rates at
+/// `factor` of their peak.
 pub fn adam_steps(config: &IfaceConfig, factor: f64, step: u64) -> [AdamStep; 3] {
     let rate = |lr: f64, decay: f64| AdamStep {
         weight_decay: decay as f32,
@@ -26,13 +27,13 @@ pub fn adam_steps(config: &IfaceConfig, factor: f64, step: u64) -> [AdamStep; 3]
     [AdamStep { skip_zero: config.touched_rows, ..table }, network, variance]
 }
 
-/// How the rays of a step follow the samples of the one before it.
+/// Returns the rule by which the number of rays adapts to the samples of the previous step.
 pub fn ray_budget(config: &IfaceConfig) -> RayBudget {
     let min = if config.occupancy == OccupancyRule::Band { 64 } else { 1 };
     RayBudget { samples: config.samples, min, max: config.max_rays }
 }
 
-/// Hash levels that take part at a step.
+/// Returns the number of active hash levels at a step.
 pub fn active_levels(config: &IfaceConfig, step: u64) -> usize {
     if config.level_every == 0 {
         return config.levels;
@@ -40,28 +41,28 @@ pub fn active_levels(config: &IfaceConfig, step: u64) -> usize {
     (config.start_levels + (step / config.level_every) as usize).min(config.levels)
 }
 
-/// Width of the cells of the finest of so many levels, scene units.
+/// Returns the cell width of the finest of `levels` levels, scene units.
 pub fn cell(config: &IfaceConfig, levels: usize) -> f32 {
     (2.0 / (config.base_resolution as f64 * config.growth.powi(levels as i32 - 1))) as f32
 }
 
-/// What a ray of a large photograph stands for at a step, scene units: as much as a cell of the finest level that takes
-/// part; a pixel in the second half.
+/// Returns the width that a ray of a large photograph stands for at a step, scene units: the cell width of the finest
+/// active level, or a single pixel (0) in the second half of the training.
 pub fn detail(config: &IfaceConfig, step: u64) -> f32 {
     if 2 * step < config.steps { cell(config, active_levels(config, step)) } else { 0.0 }
 }
 
-/// Share of the hard cosine in the alpha at a step: 0 → 1 over `anneal_end`.
+/// Returns the share of the hard cosine in the alpha at a step: 0 → 1 over `anneal_end`.
 pub fn anneal(config: &IfaceConfig, step: u64) -> f32 {
     if config.anneal_end == 0 { 1.0 } else { (step as f32 / config.anneal_end as f32).min(1.0) }
 }
 
-/// The step at which stereo is looked for; none where it has no weight.
+/// Returns the step at which stereo points are searched, or `None` if their loss has no weight.
 pub fn stereo_step(config: &IfaceConfig) -> Option<u64> {
     (config.stereo > 0.0).then_some((config.steps as f64 * config.stereo_at) as u64)
 }
 
-/// How long march steps are.
+/// Returns the rule for the length of march steps.
 pub fn step_length(config: &IfaceConfig) -> StepLength {
     match config.occupancy {
         // nerfacc's constant 1.732 where √3 is meant, kept for the published step length
@@ -74,7 +75,8 @@ pub fn step_length(config: &IfaceConfig) -> StepLength {
     }
 }
 
-/// Is the occupancy updated before this step? A new level, and the end of the hull's fit, move the surface: at once then.
+/// Returns whether the occupancy is updated before this step. A new level, and the end of the hull's fit, move the
+/// surface, so the update follows at once.
 pub fn updates_occupancy(config: &IfaceConfig, step: u64) -> bool {
     let level_came = config.level_every > 0 && step.is_multiple_of(config.level_every);
     step.is_multiple_of(config.occupancy_every) || (config.occupancy == OccupancyRule::Band && level_came)

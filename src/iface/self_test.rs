@@ -1,4 +1,4 @@
-//! One training step of a signed distance and of a density on a GPU and on the processor.
+//! Self-tests that compare a training step of a signed distance, and of a density, on a GPU with the processor's.
 
 use super::cpu::CpuSdf;
 use super::density;
@@ -16,7 +16,9 @@ use crate::config::iface::IfaceConfig;
 use crate::field::ball::{self, BALL};
 use crate::field::devices::Check;
 use crate::field::parameters::HostGroup;
-use crate::field::self_test::{CELLS_AT, SEED, TestedModel, compare, compare_cells, outcome, session, ways};
+use crate::field::self_test::{
+    CELLS_AT, SEED, TestedModel, compare, compare_cells, devices, run_step, session,
+};
 use crate::field::training::StepAt;
 use crate::kernel::cpu::rng;
 use crate::kernel::gpu::Adapter;
@@ -27,7 +29,7 @@ impl<O: SdfOps> TestedModel for SdfModel<'_, O> {
     }
 }
 
-/// Some 20,000 samples: several tiles for each group of threads.
+/// Returns settings for about 20,000 samples, so that each workgroup has several tiles.
 pub(super) fn config(preset: Preset) -> IfaceConfig {
     IfaceConfig {
         steps: 1000,
@@ -43,7 +45,7 @@ pub(super) fn config(preset: Preset) -> IfaceConfig {
     }
 }
 
-/// A field that is not the same everywhere, and points that its surface should pass through.
+/// Returns a field that varies in space, and points that its surface should pass through.
 fn start(config: &IfaceConfig) -> SdfState {
     let mut state = SdfState::start(initial(config, SEED), config, None);
     state.groups[0].state[0].iter_mut().for_each(|v| *v *= 100.0);
@@ -57,7 +59,7 @@ fn start(config: &IfaceConfig) -> SdfState {
     state
 }
 
-/// The cells that a field as it starts keeps.
+/// Returns the cells that an update keeps for the initial field.
 fn cells<O: SdfOps>(model: &mut SdfModel<O>) -> Result<Occupancy> {
     model.load(start(model.config));
     let at = StepAt { seed: SEED, step: CELLS_AT };
@@ -74,12 +76,12 @@ pub(super) fn sdf(adapter: &Adapter) -> Result<Vec<Check>> {
     let pixels = pixels(&views, None, &config)?;
     let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);
     let occupancy = cells(&mut on_cpu)?;
-    // rounding apart both keep the same cells: the step goes through the processor's
+    // Both keep the same cells up to rounding. The compared step uses the processor's on both.
     let start = || SdfState { occupancy: occupancy.clone(), ..start(&config) };
     on_cpu.load(start());
-    let want = outcome(&mut on_cpu)?;
+    let want = run_step(&mut on_cpu)?;
     let mut checks = Vec::new();
-    for (way, device) in [FIELD, "signed distance in fixed point"].into_iter().zip(ways(adapter)) {
+    for (way, device) in [FIELD, "signed distance in fixed point"].into_iter().zip(devices(adapter)) {
         let mut on_gpu =
             SdfModel::new(GpuSdf::new(&config, &pixels, device)?, &pixels, None, &config, &session);
         if way == FIELD {
@@ -87,7 +89,7 @@ pub(super) fn sdf(adapter: &Adapter) -> Result<Vec<Check>> {
             checks.push(compare_cells(way, &got.occupied.bits, &occupancy.occupied.bits));
         }
         on_gpu.load(start());
-        checks.extend(compare(way, &outcome(&mut on_gpu)?, &want));
+        checks.extend(compare(way, &run_step(&mut on_gpu)?, &want));
     }
     Ok(checks)
 }

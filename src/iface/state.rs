@@ -1,4 +1,4 @@
-//! What a training of I-Face keeps between steps, and how it lies in a checkpoint.
+//! The state of an I-Face training between steps, and its checkpoint format.
 
 use super::occupancy::Occupancy;
 use super::stereo::SurfacePoint;
@@ -14,29 +14,29 @@ use crate::kernel::cpu::weight_norm;
 /// Version of the checkpoints' layout.
 pub const FORMAT: &str = "tiface-iface-1";
 
-/// Training between two steps, of a field of so many groups.
+/// State of a training between two steps, for a field with `GROUPS` parameter groups.
 pub struct FieldState<const GROUPS: usize> {
     /// Hash table, networks and, of a signed distance, variance.
     pub groups: [HostGroup; GROUPS],
     /// Cells to march through.
     pub occupancy: Occupancy,
-    /// Rays of the next step.
+    /// Number of rays of the next step.
     pub rays: usize,
-    /// Points on which photographs agree, once they are found.
+    /// Stereo points that several photographs agree on, once they are found.
     pub stereo: Vec<SurfacePoint>,
 }
 
-/// Of a signed distance.
+/// State of a signed distance's training.
 pub type SdfState = FieldState<3>;
 
 impl<const GROUPS: usize> FieldState<GROUPS> {
-    /// Returns the state before the first step, of these groups.
+    /// Returns the state before the first step, with the given groups.
     pub fn start(groups: [HostGroup; GROUPS], config: &IfaceConfig, hull: Option<&Bitmask>) -> Self {
         let occupancy = Occupancy::new(config, hull);
         FieldState { groups, occupancy, rays: config.rays, stereo: Vec::new() }
     }
 
-    /// Puts the state into a checkpoint.
+    /// Writes the state into a checkpoint.
     pub fn save(&self, into: &mut Checkpoint) {
         self.groups.iter().for_each(|group| group.save(into, true));
         self.occupancy.save(into);
@@ -47,7 +47,7 @@ impl<const GROUPS: usize> FieldState<GROUPS> {
         into.set("rays", self.rays);
     }
 
-    /// Takes the state out of a checkpoint; names, shapes and types must be exactly those of the parts.
+    /// Reads the state from a checkpoint; names, shapes and types must be exactly those of the parts.
     pub fn restore(
         parts: [Vec<Part>; GROUPS],
         config: &IfaceConfig,
@@ -75,7 +75,8 @@ impl SdfState {
         bytemuck::cast_slice(self.groups[0].values())
     }
 
-    /// Returns the flat network weights of the field, weight norm applied, and the same prepared for its kernels.
+    /// Returns the flat network weights of the field with weight norm applied, and the same weights prepared for the
+    /// CPU kernels.
     pub fn weights(&self, shape: &FieldShape) -> (Vec<f32>, Weights) {
         let flat = weight_norm::forward(shape.layout(), self.groups[1].values());
         let weights = Weights::new(shape.layout(), &flat);

@@ -1,8 +1,8 @@
-//! Points of the surface that several photographs agree on, found from the field as it is.
+//! Search for surface points that several photographs agree on, starting from the current field.
 //!
-//! Rays meet the field's zero set; points spread over it are moved along their normals until all photographs that see
-//! them show the same there ([`crate::kernel::cpu::stereo`]). Hair is left out: stereo finds its strands some millimeters
-//! inside of where its outline is.
+//! Rays are intersected with the field's zero set. Points spread over it are moved along their normals until all
+//! photographs in which they are visible match there ([`crate::kernel::cpu::stereo`]). Hair is excluded, because stereo
+//! places its strands some millimeters inside its outline.
 
 use super::occupancy::Occupancy;
 use crate::config::iface::IfaceConfig;
@@ -16,21 +16,21 @@ use crate::kernel::cpu::stereo::{self, StereoPoint, StereoView, Surfel};
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-/// Pixels between the rays.
+/// Distance between neighboring rays, pixels.
 const STRIDE: usize = 4;
 
-/// Softest place that is looked at, the logarithm of its sharpness as a share of the sharpest: half as sharp.
+/// Softest surface that is searched: logarithm of the sharpness relative to the sharpest, here a half.
 const SOFTEST: f32 = -std::f32::consts::LN_2;
 
 /// A point that the surface should pass through, in field coordinates; in checkpoints and on GPUs a row of its numbers.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct SurfacePoint {
-    /// Where.
+    /// Position in field coordinates.
     pub position: [f32; 3],
-    /// Length of a pixel there.
+    /// Length of a pixel at the point.
     pub footprint: f32,
-    /// How much it counts, at most 1.
+    /// Weight in the loss, at most 1.
     pub weight: f32,
 }
 
@@ -45,12 +45,12 @@ pub struct HostField<'a> {
 }
 
 impl HostField<'_> {
-    /// Distances at points in field coordinates.
+    /// Returns the distances at points in field coordinates.
     fn values(&self, x: &[[f32; 3]]) -> Vec<f32> {
         sdf::values(self.shape, self.table, self.weights, x)
     }
 
-    /// Points in field coordinates moved onto the zero set nearby, with their unit normals.
+    /// Moves points in field coordinates onto the nearby zero set, and returns them with their unit normals.
     fn project(&self, mut x: Vec<[f32; 3]>) -> Vec<(Vec3, Option<Vec3>)> {
         /// Gradients have lengths of about one, and points start within a pixel or two.
         const ROUNDS: usize = 2;
@@ -69,7 +69,7 @@ impl HostField<'_> {
     }
 }
 
-/// The zero set as the cameras see it, and points spread over it, in scene units.
+/// Returns the depths of the zero set in each view, and points spread over it, in scene units.
 fn surface(
     views: &[TrainView],
     config: &IfaceConfig,
@@ -89,7 +89,7 @@ fn surface(
             let normal = Vec3::from(*n).try_normalize()?;
             let surfel = Surfel { position: Vec3::from(*x) / radius, normal };
             let footprint = stereo::owned_footprint(&stereo_views, v, &surfel)?;
-            // four in the place of one, two pixels apart
+            // Each point becomes four, two pixels apart.
             let axis = normal.any_orthonormal_vector();
             let other = normal.cross(axis);
             let at =
@@ -106,20 +106,21 @@ fn surface(
     (stereo_views, surfels.collect())
 }
 
-/// A view for stereo with its depths, and where its rays meet the zero set first, in field coordinates.
+/// Returns a view for stereo with its depths, and the first crossings of its rays with the zero set, in field
+/// coordinates.
 fn first_crossings(
     view: &TrainView,
     config: &IfaceConfig,
     field: &HostField,
     occupancy: &Occupancy,
 ) -> (StereoView, Vec<[f32; 3]>) {
-    /// A patch around a usable pixel, its size and a margin, lies in the head.
+    /// Margin of usable pixels: a patch of this half width around one lies in the head.
     const MARGIN: usize = 5;
     /// Samples of a ray that are evaluated together.
     const AHEAD: usize = 6;
-    let Reduced { camera, gray, whole, partly } = Reduced::new(view);
+    let Reduced { camera, gray, fully_head, partly_head } = Reduced::new(view);
     let (w, h) = (camera.width as usize, camera.height as usize);
-    let usable = eroded(whole, w, h, MARGIN);
+    let usable = eroded(fully_head, w, h, MARGIN);
     let (columns, rows) = (w.div_ceil(STRIDE), h.div_ceil(STRIDE));
     let middle = |i: usize| {
         ((i % columns * STRIDE + STRIDE / 2).min(w - 1), (i / columns * STRIDE + STRIDE / 2).min(h - 1))
@@ -128,7 +129,7 @@ fn first_crossings(
         .into_par_iter()
         .filter_map(|i| {
             let (x, y) = middle(i);
-            if !partly[y * w + x] {
+            if !partly_head[y * w + x] {
                 return None;
             }
             let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
@@ -138,16 +139,18 @@ fn first_crossings(
     let rays: Vec<MarchRay> = pixels.iter().map(|p| p.1).collect();
     let samples = occupancy.march(config, config.min_step, &rays);
     let at = |r: usize, t: f32| std::array::from_fn(|a| rays[r].origin[a] + t * rays[r].direction[a]);
-    // the first step from outside to inside, some samples of every ray after the others
+    // A crossing is the first step from outside to inside. Each round evaluates the next few samples of every open ray.
     let mut crossing = vec![None; rays.len()];
-    let mut going: Vec<(usize, usize, f32)> =
+    let mut open_rays: Vec<(usize, usize, f32)> =
         (0..rays.len()).map(|r| (r, samples.offsets[r] as usize, f32::NAN)).collect();
-    while !going.is_empty() {
+    while !open_rays.is_empty() {
         let piece = |&(r, k, _): &(usize, usize, f32)| k..(k + AHEAD).min(samples.offsets[r + 1] as usize);
-        let x: Vec<[f32; 3]> =
-            going.iter().flat_map(|g| piece(g).map(|k| at(g.0, samples.t[k])).collect::<Vec<_>>()).collect();
+        let x: Vec<[f32; 3]> = open_rays
+            .iter()
+            .flat_map(|g| piece(g).map(|k| at(g.0, samples.t[k])).collect::<Vec<_>>())
+            .collect();
         let mut f = field.values(&x).into_iter();
-        going.retain_mut(|g| {
+        open_rays.retain_mut(|g| {
             let span = piece(g);
             let mut before = g.2;
             for (k, f) in span.clone().zip(f.by_ref().take(span.len()).collect::<Vec<_>>()) {
@@ -176,15 +179,15 @@ fn first_crossings(
     (StereoView { camera, gray, usable, cell: STRIDE, depth }, found)
 }
 
-/// A photograph at the size that stereo looks at.
+/// A photograph reduced to the resolution of the stereo search.
 struct Reduced {
     camera: Camera,
     /// Brightness, white is 1.
     gray: Vec<f32>,
-    /// Is all of the pixel head, and to be learned from?
-    whole: Vec<bool>,
-    /// Is half of a part of it head?
-    partly: Vec<bool>,
+    /// Per pixel: whether all source pixels are head and valid.
+    fully_head: Vec<bool>,
+    /// Per pixel: whether any source pixel is head with an alpha of at least one half.
+    partly_head: Vec<bool>,
 }
 
 impl Reduced {
@@ -202,17 +205,18 @@ impl Reduced {
         let (k, across) = (factor as usize, width as usize);
         let one = |i: usize| {
             let (x, y) = (i % across * k, i / across * k);
-            let (mut gray, mut whole, mut partly) = (0.0, true, false);
+            let (mut gray, mut fully_head, mut partly_head) = (0.0, true, false);
             for p in (0..k * k).map(|j| (y + j / k) * w as usize + x + j % k) {
                 gray += luma(view.photo.rgb[p]);
-                whole &= head(p) == 255 && valid(p);
-                partly |= head(p) >= 128;
+                fully_head &= head(p) == 255 && valid(p);
+                partly_head |= head(p) >= 128;
             }
-            (gray / (k * k) as f32, (whole, partly))
+            (gray / (k * k) as f32, (fully_head, partly_head))
         };
         let pixels = across * height as usize;
-        let (gray, (whole, partly)) = (0..pixels).into_par_iter().with_min_len(4096).map(one).unzip();
-        Reduced { camera, gray, whole, partly }
+        let (gray, (fully_head, partly_head)) =
+            (0..pixels).into_par_iter().with_min_len(4096).map(one).unzip();
+        Reduced { camera, gray, fully_head, partly_head }
     }
 }
 
@@ -225,7 +229,7 @@ pub fn points(
 ) -> Vec<SurfacePoint> {
     let (stereo_views, surfels) = surface(views, config, field, occupancy);
     let found = stereo::matches(&stereo_views, &surfels);
-    // the middle one: a few photographs may be taken from near by
+    // The median is robust against a few photographs taken from close up.
     let mut footprints: Vec<f32> = found.iter().map(|p| p.footprint).collect();
     let middle = footprints.len() / 2;
     if footprints.is_empty() {
@@ -263,9 +267,9 @@ mod tests {
         assert_eq!((small.camera.width, small.camera.height, small.gray.len()), (515, 3, 515 * 3));
         // (3 · 0.2 + 1) / 4
         assert!((small.gray[1] - 0.4).abs() < 1e-6 && (small.gray[2] - 0.2).abs() < 1e-6);
-        let not_whole: Vec<usize> = (0..515 * 3).filter(|&i| !small.whole[i]).collect();
+        let not_whole: Vec<usize> = (0..515 * 3).filter(|&i| !small.fully_head[i]).collect();
         assert_eq!(not_whole, [0, 515, 515 * 2 + 514]);
-        assert!(small.partly.iter().all(|&partly| partly));
+        assert!(small.partly_head.iter().all(|&partly_head| partly_head));
         // the middle of a pixel is the corner that its four share
         let (ray, same) = (small.camera.ray(Vec2::splat(0.5)).unwrap(), view.camera.ray(Vec2::ONE).unwrap());
         assert!((ray.direction - same.direction).length() < 1e-6);

@@ -24,7 +24,7 @@ use crate::{Error, Result};
 use serde::Serialize;
 use std::time::Instant;
 
-/// What training did.
+/// Report of a training.
 #[derive(Clone, Debug, Serialize)]
 pub struct IfaceReport {
     /// Optimizer steps.
@@ -37,13 +37,13 @@ pub struct IfaceReport {
     pub train_psnr: f64,
     /// Share of the occupancy grid that was marched at the end.
     pub occupied: f64,
-    /// What learned it, and why that.
+    /// Device of the training, and the reason for choosing it.
     pub device: String,
-    /// Oddities on the way: a damaged checkpoint, a restored step.
+    /// Warnings, such as a damaged checkpoint or a restored step.
     pub warnings: Vec<String>,
 }
 
-/// Steps in a row without a single sample after which nothing can bring the surface back.
+/// Number of consecutive steps without a sample after which the surface cannot recover.
 const LOST_AFTER: u64 = 20;
 
 /// Names of the losses.
@@ -57,19 +57,19 @@ pub(super) struct SdfModel<'a, O: SdfOps> {
     pub pixels: &'a Pixels<'a>,
     pub ops: O,
     pub groups: SdfGroups<O>,
-    /// The cells as they were loaded, older than those on the device.
+    /// Cells at the time of loading; those on the device are newer.
     occupancy: Occupancy,
-    /// Points on which photographs agree, once they are found.
+    /// Stereo points that several photographs agree on, once they are found.
     stereo: Vec<SurfacePoint>,
 }
 
-/// The pixels that photographs are drawn from.
+/// Collects the pixels that training rays are drawn from.
 pub(super) fn pixels<'a>(
     views: &'a [TrainView],
     hull: Option<&Bitmask>,
     config: &IfaceConfig,
 ) -> Result<Pixels<'a>> {
-    // without a hull every ray may meet a sample; with one, cells reach some four beyond the outline
+    // Without a hull every ray may meet a sample; with one, occupied cells reach about four cells beyond the outline.
     let reach = match hull {
         Some(_) => 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32,
         None => f32::INFINITY,
@@ -135,7 +135,7 @@ fn train_on<O: SdfOps>(
 }
 
 impl<'a, O: SdfOps> SdfModel<'a, O> {
-    /// Before the first step; a checkpoint is not looked for yet.
+    /// Creates the model in its initial state, without looking for a checkpoint.
     pub fn new(
         ops: O,
         pixels: &'a Pixels<'a>,
@@ -149,7 +149,7 @@ impl<'a, O: SdfOps> SdfModel<'a, O> {
         SdfModel { config, session: *session, hull, pixels, ops, groups, occupancy, stereo }
     }
 
-    /// Waits for the device; the state as it is there.
+    /// Waits for the device and returns the current state.
     pub fn state(&self) -> Result<SdfState> {
         let [table, network, variance] =
             self.groups.each_ref().map(|group| group.download(self.ops.device()));
@@ -167,7 +167,7 @@ impl<'a, O: SdfOps> SdfModel<'a, O> {
         (self.occupancy, self.stereo) = (state.occupancy, state.stereo);
     }
 
-    /// Looks for points that photographs agree on, around the surface as it is.
+    /// Searches stereo points around the current surface.
     fn find_stereo(&mut self, levels: usize) -> Result<()> {
         let state = self.state()?;
         let mut shape = shape(self.config);
@@ -232,12 +232,17 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
                 "look at the masks and poses with `tiface inspect`; lower iface.lr_network",
             )));
         }
-        // a term of no weight is not shown
+        // Terms without weight are shown as 0.
         let config = self.config;
-        let only = |weight: f64, value: f32| if weight > 0.0 { value } else { 0.0 };
+        let weighted = |weight: f64, value: f32| if weight > 0.0 { value } else { 0.0 };
         let masked = if self.pixels.has_masks { config.mask } else { 0.0 };
-        let terms =
-            [rgb, only(masked, mask), eikonal, only(config.sparsity, sparsity), only(config.stereo, stereo)];
+        let terms = [
+            rgb,
+            weighted(masked, mask),
+            eikonal,
+            weighted(config.sparsity, sparsity),
+            weighted(config.stereo, stereo),
+        ];
         if samples > 0 {
             StepError::check(TERMS.into_iter().zip(terms))?;
         }

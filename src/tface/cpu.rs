@@ -25,7 +25,7 @@ pub struct CpuVm<'a> {
 }
 
 impl<'a> CpuVm<'a> {
-    /// The operations of a training with these settings and photographs.
+    /// Creates the operations of a training with these settings and photographs.
     pub fn new(config: &'a VmConfig, pixels: &'a Pixels<'a>) -> CpuVm<'a> {
         CpuVm {
             config,

@@ -1,5 +1,6 @@
-//! A training step of the vector-matrix field on a GPU, with the host waiting for nothing: rays are drawn, marched, decoded,
-//! compared and applied there. Masks and finer grids, a handful in a training, are made on the host.
+//! A training step of the vector-matrix field on a GPU. Sampling, marching, decoding, losses and optimizer all run on the
+//! device, so the host never waits within a step. Alpha masks and refined grids, a handful per training, are computed on
+//! the host.
 
 use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
 use super::record::decoder;
@@ -19,7 +20,7 @@ use crate::kernel::gpu::{
 use crate::{Error, Result};
 use std::sync::Arc;
 
-/// The operations of [`VmOps`] on a GPU, and its memory for them.
+/// The operations of [`VmOps`] on a GPU, with their device memory.
 pub struct GpuVm<'a> {
     pixels: &'a Pixels<'a>,
     pub(super) device: Device,
@@ -28,15 +29,15 @@ pub struct GpuVm<'a> {
     ray_count: Buffer,
     batch: Batch,
     losses: VmLosses,
-    /// None while no field is loaded.
+    /// Kernels and buffers of the field; `None` while no field is loaded.
     vm: Option<Vm>,
     /// `[1]`: not 0 once a gradient was not finite.
     broken: Buffer,
 }
 
 impl<'a> GpuVm<'a> {
-    /// Refuses a training that a device cannot take: it knows no such field, or has too little memory for the last grids.
-    /// Do photographs lie there, too?
+    /// Checks that a device supports the field and has enough memory for the last grids. Returns whether the photographs
+    /// fit as well.
     pub fn fits(
         stage: &str,
         config: &VmConfig,
@@ -56,7 +57,7 @@ impl<'a> GpuVm<'a> {
             .fold([0; 2], |a, b| [a[0].max(b[0]), a[1].max(b[1])]);
         let widest = fields.iter().map(Vm::widest).max().unwrap_or(1);
         let rays = config.rays as u64;
-        // lattice points of all steps between two reads are counted in 32 bits
+        // A 32-bit counter sums the lattice points of all steps between two readbacks.
         let countable = u32::MAX as u64 / Device::READ_EVERY / (widest / 12 + 2);
         let need = MemoryNeed {
             fixed: (fixed, "grids and gradients"),
@@ -72,13 +73,13 @@ impl<'a> GpuVm<'a> {
         plan.map(|(_, resident)| resident)
     }
 
-    /// The operations of a training that [`fits`](GpuVm::fits) a device, whose memory has room for the photographs where
-    /// they are `resident`.
+    /// Creates the operations of a training that [`fits`](GpuVm::fits) a device. `resident` copies the photographs to the
+    /// device.
     pub fn new(config: &'a VmConfig, pixels: &'a Pixels<'a>, device: Device, resident: bool) -> GpuVm<'a> {
         let drawing = SamplingOptions {
             jitter: true,
             background: random_background(config),
-            behind: BACKGROUND_STREAM,
+            background_stream: BACKGROUND_STREAM,
         };
         GpuVm {
             pixels,
@@ -97,7 +98,7 @@ impl<'a> GpuVm<'a> {
     }
 }
 
-/// The arrays of all groups.
+/// Selects one array of each group.
 fn arrays<'g>(
     groups: &'g VmGroups<GpuVm>,
     which: impl Fn(&'g ParameterGroup<Device>) -> &'g Buffer,

@@ -1,7 +1,8 @@
-//! Published checkpoints in place of training, as `tools/reference/th_to_safetensors.py` converts them.
+//! Import of published checkpoints, converted by `tools/reference/th_to_safetensors.py`, in place of training.
 //!
-//! A converted checkpoint is one of ours ([`FORMAT`]), but for its positions, which are the dataset's, scaled: `frame` in
-//! its metadata is `world`. Its rays have depth 1 ([`Placement::depth_directions`]), as in the published loader.
+//! A converted checkpoint has our format ([`FORMAT`]), except that its positions are in scaled dataset coordinates, which
+//! the metadata marks by `frame` = `world`. Its ray directions have depth 1 ([`Placement::depth_directions`]), as in the
+//! published loader.
 
 use super::infer::TFace;
 use super::record::{FORMAT, FieldRecord, Placement};
@@ -11,7 +12,7 @@ use crate::field::training::TrainingSession;
 use crate::geom::Similarity;
 use std::path::Path;
 
-/// Takes a converted checkpoint as the result of a stage: reads it, places it in the scene and writes it into the
+/// Imports a converted checkpoint as the result of a stage: reads it, places it in the scene and writes it into the
 /// session's folder. `scale` is the length of a dataset unit in the checkpoint's world.
 pub fn import(
     path: &Path,
@@ -22,7 +23,7 @@ pub fn import(
     let place = || -> Result<(Checkpoint, TFace)> {
         let mut file = Checkpoint::read(path, session.stage, FORMAT)?;
         if file.text("frame")? != "world" {
-            return Err(file.wrong("its `frame` is not `world`".into()));
+            return Err(file.mismatch("its `frame` is not `world`".into()));
         }
         // field = scale · world = scale · (scene − t) / s
         let k = scale / scene_from_world.scale;

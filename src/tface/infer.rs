@@ -1,4 +1,4 @@
-//! A trained field, evaluated.
+//! Evaluation of a trained field.
 
 use super::record::{FORMAT, FieldRecord, NAMES, Placement, geometry};
 use crate::Result;
@@ -26,7 +26,7 @@ pub struct TFace {
     on_gpu: GpuField<gpu::VmRenderer>,
 }
 
-/// Rays rendered together: what they keep stays in the low hundreds of megabytes.
+/// Number of rays rendered together, which keeps their memory in the low hundreds of megabytes.
 const PASS: usize = 1 << 13;
 
 impl TFace {
@@ -47,7 +47,7 @@ impl TFace {
         TFace::restore(Checkpoint::read(&checkpoint::newest(dir), stage, FORMAT)?)
     }
 
-    /// Takes the field out of a checkpoint.
+    /// Reads the field from a checkpoint.
     pub(super) fn restore(mut file: Checkpoint) -> Result<TFace> {
         let record = FieldRecord::restore(&file)?;
         let (bounds, size, mask) = geometry(&mut file)?;
@@ -60,7 +60,7 @@ impl TFace {
         Ok(TFace::from_parts(field, values, record.placement))
     }
 
-    /// Lets a device answer, where it can decode this field.
+    /// Renders on `device` from now on, if it supports the field's decoder.
     #[cfg(feature = "wgpu")]
     pub(super) fn on(&mut self, device: Arc<gpu::Device>) {
         if gpu::DeviceDecoder::supports(&self.field.decoder).is_ok() {
@@ -70,14 +70,13 @@ impl TFace {
         }
     }
 
-    /// Returns why a GPU no longer answers.
+    /// Returns why the GPU is no longer used, if it failed.
     #[cfg(feature = "wgpu")]
     pub(super) fn gpu_failure(&self) -> Option<&str> {
         self.on_gpu.failure()
     }
 
-    /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
-    /// vector `forward`.
+    /// Renders rays in scene coordinates, with unit directions, of a camera that looks along the unit vector `forward`.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         let p = self.placement.unwrap_or(Placement { scale: 1.0, offset: [0.0; 3], depth_directions: false });
         // length of each direction in the field's units of t

@@ -1,8 +1,8 @@
-//! Several fields of one head, learned from different random numbers and seen as one.
+//! The mean of several fields of one head, trained with different random seeds.
 //!
-//! What a field makes up where photographs leave it free, in hair above all, is another thing in each training; the
-//! mean of a few is nearer to the truth than any of them (Lakshminarayanan, Pritzel, Blundell 2017, "Deep
-//! ensembles"). Masked PSNR of eight held-out views, 24 photographs of 384 × 512 pixels:
+//! Where the photographs do not determine the field, above all in hair, each training gives a different result; the mean
+//! of a few is closer to the truth than any of them (Lakshminarayanan, Pritzel, Blundell 2017, "Deep ensembles"). Masked
+//! PSNR of eight held-out views, 24 photographs of 384 × 512 pixels:
 //!
 //! | | steps × rays, voxels | one field | mean of two |
 //! |---|---|---|---|
@@ -11,8 +11,8 @@
 //! | | 2000 × 16,384, 256³ | 32.49 | |
 //! | a bust | 1500 × 8,192, 192³ (`draft`) | 32.82 | 33.09 |
 //!
-//! Decay of the weights, smaller random numbers at the start, dropped channels, rays anywhere in a pixel, a running
-//! mean of the weights and stronger smoothing all leave one field where it is, or below.
+//! Weight decay, smaller initial values, channel dropout, jittered rays within a pixel, a running mean of the weights and
+//! stronger smoothing all failed to improve a single field.
 
 use super::TFace;
 use super::train::{self, TfaceReport, train_one};
@@ -34,7 +34,7 @@ use std::sync::Arc;
 /// The trained fields of a stage. Positions and distances are in scene units.
 pub struct FieldMean {
     fields: Vec<TFace>,
-    /// Held while a device answers.
+    /// Lock of the GPU, held for the fields' lifetime.
     #[cfg(feature = "wgpu")]
     _lock: Option<Arc<Lock>>,
 }
@@ -50,7 +50,7 @@ impl FieldMean {
         })
     }
 
-    /// Lets a GPU answer, if `device` is one.
+    /// Renders on `device` from now on, if it is a GPU that supports the fields.
     #[cfg(feature = "wgpu")]
     pub fn on(mut self, device: ComputeDevice) -> FieldMean {
         let ComputeDevice::Gpu(gpu) = device else { return self };
@@ -59,14 +59,14 @@ impl FieldMean {
         FieldMean { _lock: gpu.lock, ..self }
     }
 
-    /// Returns why a GPU no longer answers, where one failed.
+    /// Returns why the GPU is no longer used, if it failed.
     #[cfg(feature = "wgpu")]
     pub fn gpu_failure(&self) -> Option<&str> {
         self.fields.iter().find_map(TFace::gpu_failure)
     }
 
-    /// Volume render of rays in scene coordinates, with unit directions, of a camera that looks along the unit
-    /// vector `forward`: mean color (premultiplied, coded) and opacity; depth by opacity.
+    /// Renders rays in scene coordinates, with unit directions, of a camera that looks along the unit vector `forward`.
+    /// Returns the mean color (premultiplied, coded), the mean opacity, and the depth weighted by opacity.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         let Some((first, others)) = self.fields.split_first() else { return Vec::new() };
         let mut mean = first.render(rays, forward);
@@ -91,7 +91,7 @@ impl FieldMean {
     }
 }
 
-/// Where a field lies in its stage's folder: the first in the folder itself, the others in one each.
+/// Returns the folder of field `i` of a stage: the stage's folder itself for the first, a subfolder for each other.
 fn folder(dir: &Path, i: usize) -> PathBuf {
     if i == 0 { dir.to_owned() } else { dir.join(format!("field_{}", i + 1)) }
 }
@@ -140,7 +140,7 @@ pub fn train(
         io::create_folder(&folder)?;
         let part = Part { monitor: session.monitor, field: i + 1, fields, before };
         let own = TrainingSession {
-            // far from the seeds that people count through
+            // The offset keeps derived seeds away from the small numbers that users choose.
             seed: session.seed ^ (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15),
             dir: &folder,
             identity: &identity,

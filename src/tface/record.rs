@@ -1,4 +1,4 @@
-//! A field as it lies in a checkpoint: what it is besides its values, and where its grid lies.
+//! The metadata of a field in a checkpoint: its shape and settings, and the geometry of its grid.
 
 use crate::Result;
 use crate::config::{DensityActivation, VmConfig};
@@ -13,12 +13,12 @@ pub const FORMAT: &str = "tiface-vm-1";
 /// Names of the parameters in checkpoints.
 pub const NAMES: [&str; 3] = ["density", "color", "network"];
 
-/// Where a field's coordinates are not the scene's: `field = scale · scene + offset`.
+/// Transform from scene to field coordinates, where they differ: `field = scale · scene + offset`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Placement {
     /// Field units in a scene unit.
     pub scale: f32,
-    /// Where the scene's origin is in the field.
+    /// The scene's origin in field coordinates.
     pub offset: [f32; 3],
     /// Ray directions are scaled to depth 1 along the optical axis before the decoder sees them, and steps are
     /// so much longer off the axis: what the published ILSH loader does.
@@ -29,12 +29,12 @@ fn triple(list: &[usize]) -> [usize; 3] {
     [list[0], list[1], list[2]]
 }
 
-/// Grids of a size: density, appearance.
+/// Returns the grids of density and appearance for a size.
 pub fn grids(config: &VmConfig, size: [usize; 3]) -> (Grid, Grid) {
     (Grid { size, rank: triple(&config.density_rank) }, Grid { size, rank: triple(&config.color_rank) })
 }
 
-/// The decoder that a configuration describes.
+/// Returns the decoder that a configuration describes.
 pub fn decoder(config: &VmConfig) -> DecoderShape {
     DecoderShape {
         channels: config.color_rank.iter().sum(),
@@ -45,7 +45,7 @@ pub fn decoder(config: &VmConfig) -> DecoderShape {
     }
 }
 
-/// What a field is besides its values: enough to render it without the settings it was made with.
+/// Description of a field without its values, sufficient to render it without the settings of its training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FieldRecord {
     /// Channels of the density's planes.
@@ -97,7 +97,7 @@ impl FieldRecord {
         }
     }
 
-    /// Can this be rendered at all? What is impossible, else.
+    /// Checks that the field can be rendered, and otherwise returns the reason.
     pub fn validate(&self) -> Result<(), &'static str> {
         let (d, s) = (&self.decoder, &self.shading);
         let numbers = [s.shift, s.distance_scale, s.weight_threshold, s.stop, self.mask_threshold];
@@ -147,12 +147,12 @@ impl FieldRecord {
         }
     }
 
-    /// Puts the record alone into a checkpoint.
+    /// Writes only the record into a checkpoint.
     pub fn write(&self, into: &mut Checkpoint) {
         into.set("field", serde_json::to_string(self).expect("plain numbers become JSON"));
     }
 
-    /// Puts the record into a checkpoint, and where its grid lies.
+    /// Writes the record and the grid's geometry into a checkpoint.
     pub fn save(
         &self,
         bounds: [[f32; 3]; 2],
@@ -172,11 +172,11 @@ impl FieldRecord {
         }
     }
 
-    /// Takes the record out of a checkpoint.
+    /// Reads the record from a checkpoint.
     pub fn restore(from: &Checkpoint) -> Result<FieldRecord> {
         let record: FieldRecord = serde_json::from_str(from.text("field")?)
-            .map_err(|e| from.wrong(format!("its `field` cannot be understood: {e}")))?;
-        record.validate().map_err(|why| from.wrong(why.into()))?;
+            .map_err(|e| from.mismatch(format!("its `field` cannot be understood: {e}")))?;
+        record.validate().map_err(|why| from.mismatch(why.into()))?;
         Ok(record)
     }
 }
@@ -185,7 +185,7 @@ fn bounds(from: &mut Checkpoint, name: &str) -> Result<[[f32; 3]; 2]> {
     let v = from.floats(name, &[2, 3])?;
     let b = [[v[0], v[1], v[2]], [v[3], v[4], v[5]]];
     let sound = (0..3).all(|a| b[0][a].is_finite() && b[1][a].is_finite() && b[0][a] < b[1][a]);
-    if sound { Ok(b) } else { Err(from.wrong(format!("`{name}` is no box: {b:?}"))) }
+    if sound { Ok(b) } else { Err(from.mismatch(format!("`{name}` is no box: {b:?}"))) }
 }
 
 fn size(from: &mut Checkpoint, name: &str, least: u64) -> Result<[usize; 3]> {
@@ -194,11 +194,11 @@ fn size(from: &mut Checkpoint, name: &str, least: u64) -> Result<[usize; 3]> {
         [x, y, z] if [x, y, z].iter().all(|n| (least..=1 << 16).contains(n)) => {
             Ok([x as usize, y as usize, z as usize])
         }
-        _ => Err(from.wrong(format!("`{name}` is no grid size: {v:?}"))),
+        _ => Err(from.mismatch(format!("`{name}` is no grid size: {v:?}"))),
     }
 }
 
-/// Takes out of a checkpoint where a field's grid lies: box, vertices and mask.
+/// Reads the geometry of a field's grid from a checkpoint: box, size in vertices, and mask.
 pub fn geometry(from: &mut Checkpoint) -> Result<([[f32; 3]; 2], [usize; 3], Option<BoxMask>)> {
     let (box_, vertices) = (bounds(from, "bounds")?, size(from, "size", 2)?);
     if !from.has("mask.bounds") {
@@ -207,6 +207,6 @@ pub fn geometry(from: &mut Checkpoint) -> Result<([[f32; 3]; 2], [usize; 3], Opt
     let [low, high] = bounds(from, "mask.bounds")?;
     let cells = size(from, "mask.size", 1)?;
     let mask = BoxMask::from_bits(low, high, cells, from.words("mask.bits")?)
-        .ok_or_else(|| from.wrong("the alpha mask has another number of cells".into()))?;
+        .ok_or_else(|| from.mismatch("the alpha mask has another number of cells".into()))?;
     Ok((box_, vertices, Some(mask)))
 }

@@ -1,4 +1,4 @@
-//! Between steps: the alpha mask is rebuilt, the box shrinks, the grids become finer.
+//! Refinement between steps: rebuilding the alpha mask, shrinking the box, upsampling the grids.
 
 use super::record::{NAMES, grids};
 use super::state::VmState;
@@ -34,7 +34,7 @@ pub fn update_mask(state: &mut VmState, config: &VmConfig, step: u64) -> bool {
     true
 }
 
-/// Vertices with enough alpha, and those beside them. `(x · ny + y) · nz + z`.
+/// Returns the vertices with enough alpha, and their neighbors, indexed by `(x · ny + y) · nz + z`.
 fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Vec<bool> {
     let field = state.field(config, false);
     let density = state.groups[0].values();
@@ -48,7 +48,7 @@ fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Ve
         let mut index = Vec::with_capacity(slab);
         for i in 0..slab {
             let p = [at(0, x), at(1, i / size[2]), at(2, i % size[2])];
-            // what the mask before has emptied stays empty: only the rest is evaluated
+            // Cells that the previous mask excludes stay empty, so only the others are evaluated.
             if state.mask.as_ref().is_none_or(|m| m.contains(p)) {
                 points.push(p);
                 index.push(i);
@@ -126,6 +126,6 @@ fn replace(state: &mut VmState, density: Vec<f32>, color: Vec<f32>, step: u64) {
     let [of_density, of_color, network] = &mut state.groups;
     *of_density = HostGroup::flat(NAMES[0], density);
     *of_color = HostGroup::flat(NAMES[1], color);
-    network.forget_moments();
+    network.reset_moments();
     state.moments_from = step;
 }

@@ -1,4 +1,4 @@
-//! One training step of the vector-matrix field on a GPU and on the processor.
+//! Self-test that compares a training step of the vector-matrix field on a GPU with the processor's.
 
 use super::cpu::CpuVm;
 use super::gpu::GpuVm;
@@ -11,7 +11,7 @@ use crate::field::ball;
 use crate::field::devices::Check;
 use crate::field::parameters::HostGroup;
 use crate::field::pixels::Pixels;
-use crate::field::self_test::{SEED, TestedModel, compare, outcome, session, ways};
+use crate::field::self_test::{SEED, TestedModel, compare, devices, run_step, session};
 use crate::kernel::gpu::Adapter;
 
 // no plane of symmetry between the cameras lies on the border of a cell, where rounding decides
@@ -39,14 +39,14 @@ pub(super) fn vm(adapter: &Adapter) -> Result<Vec<Check>> {
     let state = VmState::new(&config, SEED, BOUNDS, Some(&hull));
     let mut on_cpu = VmModel::new(CpuVm::new(&config, &pixels), state.clone(), &config, &session);
     on_cpu.load();
-    let want = outcome(&mut on_cpu)?;
+    let want = run_step(&mut on_cpu)?;
     let mut checks = Vec::new();
-    for (way, device) in [FIELD, "vector-matrix in fixed point"].into_iter().zip(ways(adapter)) {
+    for (way, device) in [FIELD, "vector-matrix in fixed point"].into_iter().zip(devices(adapter)) {
         let resident = GpuVm::fits("tface", &config, &pixels, &state, &device)?;
         let ops = GpuVm::new(&config, &pixels, device, resident);
         let mut on_gpu = VmModel::new(ops, state.clone(), &config, &session);
         on_gpu.load();
-        checks.extend(compare(way, &outcome(&mut on_gpu)?, &want));
+        checks.extend(compare(way, &run_step(&mut on_gpu)?, &want));
     }
     Ok(checks)
 }

@@ -1,4 +1,4 @@
-//! What is learned, and the grid it lives on.
+//! The state of a T-Face training between steps: parameters, and the geometry of the grid.
 
 use super::record::{FieldRecord, NAMES, decoder, geometry, grids};
 use crate::Result;
@@ -11,7 +11,7 @@ use crate::kernel::cpu::vm::mask::BoxMask;
 use crate::kernel::cpu::vm::{VmField, size_for};
 use std::sync::Arc;
 
-/// Training between two steps.
+/// State of a training between two steps.
 #[derive(Clone)]
 pub struct VmState {
     /// Lower and upper corner of the grid, scene units.
@@ -20,13 +20,13 @@ pub struct VmState {
     pub size: [usize; 3],
     /// Flat planes and lines of the density, those of the appearance, flat decoder weights.
     pub groups: [HostGroup; 3],
-    /// Cells that may hold anything; all without.
+    /// Cells that may be non-empty; all cells if `None`.
     pub mask: Option<BoxMask>,
     /// Step at which the learning rates last started.
     pub reset: u64,
     /// Step at which the moments last started: whenever the grids change their size.
     pub moments_from: u64,
-    /// Has the alpha mask been rebuilt at least once?
+    /// Whether the alpha mask has been rebuilt at least once.
     pub masked: bool,
 }
 
@@ -57,7 +57,7 @@ fn hull_mask(hull: &Bitmask) -> Option<BoxMask> {
 }
 
 impl VmState {
-    /// Returns the start, before any step.
+    /// Returns the state before the first step.
     pub fn new(config: &VmConfig, seed: u64, bounds: [[f32; 3]; 2], hull: Option<&Bitmask>) -> VmState {
         let extent = std::array::from_fn(|a| bounds[1][a] - bounds[0][a]);
         let size = size_for(extent, config.voxels_start);
@@ -68,8 +68,8 @@ impl VmState {
         VmState { bounds, size, groups, mask, reset: 0, moments_from: 0, masked: false }
     }
 
-    /// Is every weight a finite number? A NaN in a relu density has neither weight nor gradient: no loss
-    /// would tell, and total variation would spread it.
+    /// Returns whether every weight is finite. A NaN in a relu density has neither weight nor gradient, so no loss would
+    /// show it, and total variation would spread it.
     pub fn is_finite(&self) -> bool {
         self.groups.iter().all(|group| group.is_finite())
     }
@@ -100,8 +100,8 @@ impl VmState {
         )
     }
 
-    /// Puts the state into a checkpoint. The optimizer's moments are left out of a finished one: nobody goes on
-    /// from it.
+    /// Writes the state into a checkpoint. A finished checkpoint omits the optimizer's moments, because no training
+    /// resumes from it.
     pub fn save(&self, config: &VmConfig, into: &mut Checkpoint, finished: bool) {
         FieldRecord::of(config).save(self.bounds, self.size, self.mask.as_ref(), into);
         self.groups.iter().for_each(|group| group.save(into, !finished));
@@ -110,7 +110,7 @@ impl VmState {
         into.set("masked", u64::from(self.masked));
     }
 
-    /// Takes the state after `step` out of a checkpoint; sizes and types must be exactly the configured model's.
+    /// Reads the state after `step` from a checkpoint; sizes and types must be exactly the configured model's.
     pub fn restore(
         &mut self,
         config: &VmConfig,

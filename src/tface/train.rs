@@ -20,7 +20,7 @@ use crate::{Error, Result};
 use serde::Serialize;
 use std::time::Instant;
 
-/// What training did.
+/// Report of a training.
 #[derive(Clone, Debug, Serialize)]
 pub struct TfaceReport {
     /// Fields learned.
@@ -43,9 +43,9 @@ pub struct TfaceReport {
     pub density_samples: u64,
     /// Those whose color was decoded.
     pub color_samples: u64,
-    /// What learned the first of them, and why that.
+    /// Device of the first field's training, and the reason for choosing it.
     pub device: String,
-    /// Oddities on the way.
+    /// Warnings of all fields.
     pub warnings: Vec<String>,
 }
 
@@ -136,7 +136,7 @@ fn train_on<O: VmOps>(
     Ok((model.state, progress, model.counts, warnings))
 }
 
-/// What ranges of single keys cannot say.
+/// Checks the constraints between settings that ranges of single keys cannot express.
 pub(super) fn check(stage: &str, config: &VmConfig) -> Result<()> {
     let wrong = |key: &str, problem: &str| {
         let hint = format!("`tiface config --explain {stage}.{key}` says what it means");
@@ -172,11 +172,10 @@ fn tv_fade(config: &VmConfig, step: u64) -> f64 {
     0.1f64.powf((step + 1) as f64 / config.steps as f64)
 }
 
-/// The share of a cell that is told apart: densities and colors change across a cell as its corners say, and outlines lie
-/// anywhere in it.
+/// Resolvable detail as a share of a cell: interpolation between a cell's corners places outlines anywhere within it.
 pub(super) const DETAIL: f32 = 0.25;
 
-/// The views with their masks as the setting wants them.
+/// Returns the views with their masks removed or binarized as configured.
 pub(super) fn masked_as_configured(mut views: Vec<TrainView>, masks: MaskUse) -> Vec<TrainView> {
     let least = match masks {
         MaskUse::None | MaskUse::Soft => None,
@@ -193,7 +192,7 @@ pub(super) fn masked_as_configured(mut views: Vec<TrainView>, masks: MaskUse) ->
 }
 
 impl<'a, O: VmOps> VmModel<'a, O> {
-    /// Before the first step; a checkpoint is not looked for yet.
+    /// Creates the model in its initial state, without looking for a checkpoint.
     pub fn new(
         ops: O,
         state: VmState,
@@ -211,13 +210,13 @@ impl<'a, O: VmOps> VmModel<'a, O> {
 
     /// Copies the state to the device.
     pub fn load(&mut self) {
-        // what lies there goes first, or there would have to be room for both
+        // The old field is freed first, so that the device need not hold both.
         self.ops.unload(self.groups.take());
         let groups = std::mem::take(&mut self.state.groups);
         self.groups = Some(self.ops.load(&self.state.field(self.config, true), groups));
     }
 
-    /// Waits for the device; the state as it is there.
+    /// Waits for the device and returns the current state.
     fn state(&self) -> Result<VmState, StepError> {
         if self.ops.is_broken()? {
             return Err(StepError::gradient());
@@ -230,7 +229,8 @@ impl<'a, O: VmOps> VmModel<'a, O> {
         Ok(state)
     }
 
-    /// What a ray of a large photograph stands for at a step, scene units; a pixel in the second half.
+    /// Returns the width that a ray of a large photograph stands for at a step, scene units, or a single pixel (0) in the
+    /// second half of the training.
     fn detail(&self, step: u64) -> f32 {
         let [low, high] = self.state.bounds;
         let cell =
@@ -238,7 +238,7 @@ impl<'a, O: VmOps> VmModel<'a, O> {
         if 2 * step < self.config.steps { DETAIL * cell } else { 0.0 }
     }
 
-    /// Weights of both grids' total variation at a step.
+    /// Returns the weights of both grids' total variation at a step.
     fn penalties(&self, step: u64) -> [f32; 2] {
         let faded = tv_fade(self.config, step);
         [self.config.tv_density, self.config.tv_color].map(|weight| (0.01 * weight * faded) as f32)
@@ -302,7 +302,7 @@ impl<O: VmOps> Model for VmModel<'_, O> {
         if !masking && upsampling.is_none() {
             return Ok(());
         }
-        // what is not finite would be spread, or taken for empty
+        // Non-finite values would spread by interpolation, or count as empty.
         self.state = self.state()?;
         if masking && !update_mask(&mut self.state, config, step + 1) {
             let (stage, threshold) = (self.session.stage, config.mask_threshold);
@@ -336,7 +336,7 @@ impl<O: VmOps> Model for VmModel<'_, O> {
         }
         self.ops.forget();
         self.unread = 0;
-        // no training goes on from a finished one, which has no moments
+        // A finished checkpoint has no moments, and no training resumes from it.
         if !finished {
             self.load();
         }

@@ -14,7 +14,7 @@ use crate::kernel::cpu::losses::TERMS;
 use crate::kernel::cpu::march::{MarchRay, Samples};
 use crate::kernel::cpu::schedule::Figures;
 
-/// Returns the samples along rays in marked cells, up to where the light is gone.
+/// Returns the samples along rays in occupied cells, up to where the transmittance has vanished.
 pub fn march(
     config: &IfaceConfig,
     occupancy: &Occupancy,
@@ -34,20 +34,20 @@ pub struct CpuDensity<'a> {
     shape: DensityShape,
     occupancy: Occupancy,
     rays: usize,
-    /// Samples of the last step; none before the first one.
+    /// Samples of the last step; `None` before the first step.
     last_samples: Option<usize>,
     batch: Batch,
     samples: Samples,
     weights: Option<DensityWeights>,
     found: Option<DensitySamples>,
     terms: [f32; 3],
-    /// By densities and colors of the samples.
+    /// Gradients with respect to densities and colors of the samples.
     gradients: (Vec<f32>, Vec<[f32; 3]>),
     broken: bool,
 }
 
 impl<'a> CpuDensity<'a> {
-    /// The operations of a training with these settings and photographs.
+    /// Creates the operations of a training with these settings and photographs.
     pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>) -> CpuDensity<'a> {
         CpuDensity {
             config,

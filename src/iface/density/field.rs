@@ -13,7 +13,7 @@ use crate::kernel::cpu::march::MarchRay;
 use glam::Vec3;
 use std::path::Path;
 
-/// The density that the surface has.
+/// Density of the level set that is taken as the surface.
 const LEVEL: f32 = 5.0;
 
 /// The trained field. Positions are in scene units, the box is [-1, 1]³.
@@ -34,7 +34,7 @@ impl DensityField {
         DensityField { config: config.clone(), shape, table, weights, occupancy }
     }
 
-    /// Loads the field from the checkpoint in a stage folder. `config` is what it was trained with.
+    /// Loads the field from the checkpoint in a stage folder. `config` must be the training's.
     pub fn load(dir: &Path, config: &IfaceConfig) -> Result<DensityField> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
         TrainingProgress::restore(&file, config.steps)?;
@@ -57,12 +57,13 @@ impl DensityField {
         points.chunks(1 << 16).flat_map(look).collect()
     }
 
-    /// What is left to the surface's density: negative inside. `[n]` points → `[n]`.
+    /// Returns the surface's density minus the local density, which is negative inside. `[n]` points → `[n]`.
     pub fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         self.density(points).into_iter().map(|s| LEVEL - s).collect()
     }
 
-    /// The same and its gradient, by differences over a thousandth of the box.
+    /// Returns the values of [`sdf`](DensityField::sdf) and their gradients, by central differences over a thousandth of
+    /// the box.
     pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         const STEP: f32 = 2e-3;
         let along = |axis: Vec3| -> Vec<f32> {
@@ -75,7 +76,8 @@ impl DensityField {
         (self.sdf(points), (0..points.len()).map(|i| Vec3::new(x[i], y[i], z[i])).collect())
     }
 
-    /// sRGB-coded colors of points, point `i` seen along `counts[i]` unit `directions`, all in one list.
+    /// Returns the sRGB-coded colors of points. Point `i` is viewed along `counts[i]` unit `directions`, which are
+    /// concatenated in one list.
     pub fn colors(&self, points: &[Vec3], counts: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
         let places = self.scaled(points).into_iter().zip(counts);
         let x: Vec<[f32; 3]> = places.flat_map(|(p, n)| std::iter::repeat_n(p, *n as usize)).collect();
@@ -86,7 +88,7 @@ impl DensityField {
         x.chunks(1 << 16).zip(d.chunks(1 << 16)).flat_map(look).collect()
     }
 
-    /// Volume render of rays in scene coordinates.
+    /// Renders rays in scene coordinates.
     pub fn render(&self, rays: &[Ray]) -> Vec<RayResult> {
         const PASS: usize = 1 << 10;
         rays.chunks(PASS).flat_map(|rays| self.pass(rays)).collect()

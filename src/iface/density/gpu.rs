@@ -1,4 +1,4 @@
-//! A training step of the density on a GPU, with the host waiting for nothing.
+//! A training step of the density on a GPU. The host never waits within a step.
 
 use super::ops::{DensityGroups, DensityOps, OCCUPIED};
 use super::shape;
@@ -16,14 +16,14 @@ use crate::kernel::gpu::{
 };
 use crate::{Error, Result};
 
-/// The operations of [`DensityOps`] on a GPU, and its memory for them.
+/// The operations of [`DensityOps`] on a GPU, with their device memory.
 pub struct GpuDensity<'a> {
     config: &'a IfaceConfig,
     pixels: &'a Pixels<'a>,
     device: Device,
     photographs: DeviceRays,
     batch: Batch,
-    /// In all marked cells, and those up to where the light is gone.
+    /// Samples in all occupied cells; `samples` has those up to where the transmittance has vanished.
     marched: Samples,
     samples: Samples,
     density: Density,
@@ -34,12 +34,12 @@ pub struct GpuDensity<'a> {
     schedule: Schedule,
     occupancy: gpu::Occupancy,
     cells: Nerfacc,
-    /// Has a step been made since the state was loaded?
+    /// Whether a step was made since the state was loaded.
     stepped: bool,
 }
 
 impl<'a> GpuDensity<'a> {
-    /// Refuses a training that a device cannot take: it knows no such field, or has too little memory.
+    /// Checks that a device supports the field and has enough memory for the training.
     pub fn fits(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<()> {
         if !Density::supports(&shape(config)) {
             let problem = format!("a device has no room for {} levels in a tile", config.levels);
@@ -48,15 +48,15 @@ impl<'a> GpuDensity<'a> {
         max_samples(config, pixels, device).map(drop)
     }
 
-    /// The operations of a training that [`fits`](GpuDensity::fits) a device.
+    /// Creates the operations of a training that [`fits`](GpuDensity::fits) a device.
     ///
     /// # Errors
     ///
-    /// Where the device has too little memory.
+    /// If the device has too little memory.
     pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>, device: Device) -> Result<GpuDensity<'a>> {
         let rays = config.rays.max(config.max_rays);
         let (capacity, resident) = max_samples(config, pixels, &device)?;
-        let drawing = SamplingOptions { jitter: config.jitter, background: false, behind: 0 };
+        let drawing = SamplingOptions { jitter: config.jitter, background: false, background_stream: 0 };
         let (occupancy, cells) = cells(&device, config, &Occupancy::new(config, None), capacity);
         let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         Ok(GpuDensity {
@@ -78,14 +78,14 @@ impl<'a> GpuDensity<'a> {
     }
 }
 
-/// Samples that a step has room for, and whether photographs lie on the device, too.
+/// Returns the sample capacity of a step, and whether the photographs fit on the device as well.
 fn max_samples(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<(usize, bool)> {
     let shape = shape(config);
     let (words, sums) = (Density::words_per_sample(&shape), Density::words_of_sums(&shape));
     samples_that_fit(config, words, sums, 0, pixels, device)
 }
 
-/// The cells to march through, and how they are updated.
+/// Creates the cells to march through, and the rule that updates them.
 fn cells(
     device: &Device,
     config: &IfaceConfig,
@@ -135,7 +135,7 @@ impl DensityOps for GpuDensity<'_> {
         let dt = schedule::step_length(self.config).at(0.0);
         self.density.prepare(device, network.value());
         self.cells.update(device, (at.seed, at.step), &self.occupancy, x, |count| {
-            // a plane of densities comes first
+            // The first plane of the output holds the densities.
             (self.density.evaluate(device, table.value(), x, None, count), dt)
         });
     }

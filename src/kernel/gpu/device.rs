@@ -1,4 +1,4 @@
-//! A device, its memory, and what it was asked to do.
+//! GPU devices: adapters, memory, kernel launches and readbacks.
 
 use crate::{Error, Result};
 use burn::backend::tensor::FloatTensor;
@@ -23,7 +23,7 @@ use std::sync::{Mutex, Once, OnceLock};
 /// launches are lost while reads go on answering.
 static WGPU_ERROR: Mutex<Option<String>> = Mutex::new(None);
 
-/// Notes errors of wgpu from now on, rather than printing them.
+/// Installs a panic hook that records errors of wgpu instead of printing them.
 fn note_errors() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
@@ -36,13 +36,13 @@ fn note_errors() {
     });
 }
 
-/// Notes an error, if it is the first since a device was read.
+/// Records an error, if it is the first since the last readback.
 fn note(message: String) {
     let mut noted = WGPU_ERROR.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     noted.get_or_insert(message);
 }
 
-/// Takes the error of wgpu that was noted since the last call.
+/// Returns and clears the error recorded since the last call.
 fn noted_error() -> Option<String> {
     WGPU_ERROR.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).take()
 }
@@ -50,11 +50,11 @@ fn noted_error() -> Option<String> {
 /// How threads add to one float.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Atomics {
-    /// The device adds floats itself.
+    /// The device has native atomic addition of floats.
     Native,
-    /// Words are exchanged until nobody came between: for adapters that cannot.
+    /// A compare-and-exchange loop, for adapters without atomic addition of floats.
     Exchange,
-    /// Integers of a fixed unit, chosen from a bound on the sum: the same bytes in any order.
+    /// Fixed-point integers, scaled by a bound on the sum, which give the same bytes in any order.
     Fixed,
 }
 
@@ -76,10 +76,10 @@ pub type Buffer = FloatTensor<Cube>;
 
 /// A tensor as kernels see it.
 pub trait Words {
-    /// How many words of 32 bits it holds.
+    /// Returns the number of 32-bit words.
     fn words(&self) -> usize;
 
-    /// As an argument of a kernel.
+    /// Returns the buffer as a kernel argument.
     fn arg(&self) -> BufferArg;
 }
 
@@ -94,34 +94,34 @@ impl Words for Buffer {
     }
 }
 
-/// What a device offers.
+/// Limits of a device.
 #[derive(Clone, Copy, Debug)]
 pub struct DeviceLimits {
-    /// Bytes of memory; none where the driver does not say.
+    /// Bytes of memory; `None` if the driver does not report it.
     pub memory: Option<u64>,
     /// Bytes of the largest buffer.
     pub largest_buffer: u64,
-    /// Bytes of memory that a group of threads shares.
+    /// Bytes of shared memory of a workgroup.
     pub shared: usize,
 }
 
-/// A way to a GPU: an adapter as one API offers it.
+/// A GPU as one API exposes it.
 pub struct Adapter {
     device: CubeDevice,
     /// `vulkan`, `metal` or `dx12`.
     pub api: &'static str,
     /// `discrete`, `integrated`, `virtual`, `other` (some virtual machines say no more) or `software`.
     pub kind: &'static str,
-    /// Does the processor do the work?
+    /// Whether the adapter is a software renderer.
     pub software: bool,
-    /// The driver and its version; empty where it does not say.
+    /// Driver and version; empty if the API does not report them.
     pub driver: String,
-    /// Bytes of its memory; none where the API does not say.
+    /// Bytes of memory; `None` if the API does not report it.
     memory: Option<u64>,
     ready: Once,
 }
 
-/// What the adapters of a machine are called, the fastest kind first.
+/// Names of the kinds of adapters, the fastest first.
 const KINDS: [&str; 5] = ["discrete", "integrated", "virtual", "other", "software"];
 
 impl Adapter {
@@ -132,7 +132,7 @@ impl Adapter {
         ALL.get_or_init(Adapter::find)
     }
 
-    /// Asks one instance of all APIs.
+    /// Enumerates the adapters of all APIs through one instance.
     fn find() -> Vec<Adapter> {
         use WgpuDeviceKind::{Cpu, DiscreteGpu, IntegratedGpu, Other, VirtualGpu};
         const APIS: [(wgpu::Backend, WgpuBackend, &str); 3] = [
@@ -164,7 +164,7 @@ impl Adapter {
                 1 => IntegratedGpu(number),
                 2 => VirtualGpu(number),
                 3 => Other(number),
-                // CubeCL opens the first one alone
+                // CubeCL can open only the first software adapter.
                 _ if number > 0 => continue,
                 _ => Cpu,
             };
@@ -189,7 +189,7 @@ impl Adapter {
         self.ready.call_once(|| {
             if let (CubeDevice::Wgpu(device), Ok(options)) = (&self.device, RuntimeOptions::try_default()) {
                 let memory_config = MemoryConfiguration::ExclusivePages;
-                // opened by its defaults where this fails, which says why
+                // If this fails, the device opens with default options, and reports the cause itself.
                 let _ =
                     try_init_setup::<AutoGraphicsApi>(device, RuntimeOptions { memory_config, ..options });
             }
@@ -220,7 +220,7 @@ fn memory_of(_: &wgpu::Adapter) -> Option<u64> {
 }
 
 impl Device {
-    /// Opens an adapter, with the atomics it does best.
+    /// Opens an adapter with the fastest atomics it supports.
     pub fn open(adapter: &Adapter) -> Device {
         note_errors();
         let (device, client) = (adapter.device.clone(), adapter.client());
@@ -236,23 +236,23 @@ impl Device {
         Device { device, client, driver, atomics, memory, launches, readbacks, kernels }
     }
 
-    /// As the adapter names itself.
+    /// Returns the adapter's name.
     pub fn name(&self) -> &str {
         &self.client.properties().identity.name
     }
 
-    /// The driver and its version; what it compiles for where it does not say.
+    /// Returns driver and version, or the compilation target if they are unknown.
     pub fn driver(&self) -> &str {
         &self.driver
     }
 
-    /// Where the card is plugged in; none where there is no card.
+    /// Returns the PCI address of the card, if there is one.
     pub fn card(&self) -> Option<String> {
         let physical = self.client.properties().identity.physical.as_ref()?;
         physical.pci_address.as_ref().map(|address| format!("{address:?}"))
     }
 
-    /// What it offers.
+    /// Returns the device's limits.
     pub fn limits(&self) -> DeviceLimits {
         let properties = self.client.properties();
         DeviceLimits {
@@ -262,19 +262,19 @@ impl Device {
         }
     }
 
-    /// Bytes that a training may take: what there is but for what the driver and others keep. All that can be counted
-    /// where the driver does not say.
+    /// Returns the bytes that a training may use: the device's memory minus a reserve for the driver and other programs,
+    /// or `u64::MAX` if the driver does not report the memory.
     pub fn available_memory(&self) -> u64 {
         const KEPT: u64 = 512 << 20;
         self.memory.map_or(u64::MAX, |memory| memory.saturating_sub(KEPT))
     }
 
-    /// How this device adds.
+    /// Returns the kind of atomics in use.
     pub fn atomics(&self) -> Atomics {
         self.atomics
     }
 
-    /// The same device adding in another way: [`Atomics::Native`] only where it was native before.
+    /// Selects another kind of atomics; [`Atomics::Native`] only if the device has them.
     pub fn with_atomics(self, atomics: Atomics) -> Device {
         assert!(
             atomics != Atomics::Native || self.atomics == Atomics::Native,
@@ -283,20 +283,20 @@ impl Device {
         Device { atomics, ..self }
     }
 
-    /// The same device of which no more than so many bytes are to be taken.
+    /// Limits the device's memory to `bytes`.
     pub fn with_memory(self, bytes: u64) -> Device {
         Device { memory: Some(self.memory.map_or(bytes, |all| all.min(bytes))), ..self }
     }
 
-    /// Bytes that are taken of the device's memory, by all that is open there.
+    /// Returns the bytes reserved in the device's memory, by all clients of this process.
     #[cfg(test)]
     pub fn reserved_memory(&self) -> u64 {
         self.client.memory_report(burn::cubecl::MemoryScope::Device).usage().bytes_reserved
     }
 
-    /// Gives memory back that nobody uses any more.
+    /// Frees memory that is no longer in use.
     pub fn release_unused(&self) {
-        // what cannot be given back now is so later
+        // Memory that cannot be freed now is freed later.
         let _ = self.client.memory_cleanup();
     }
 
@@ -305,7 +305,7 @@ impl Device {
         self.upload_vec(values.to_vec())
     }
 
-    /// As [`Device::upload`], without another copy on the host.
+    /// Copies values to the device as [`Device::upload`] does, without another copy on the host.
     pub fn upload_vec<T: Element>(&self, values: Vec<T>) -> Buffer {
         let words = values.len();
         self.tensor(self.client.create(Bytes::from_elems(values)), words, T::dtype())
@@ -316,16 +316,16 @@ impl Device {
         let behind = into.words() - first - values.len();
         let handle = into.handle.clone().offset_start(4 * first as u64).offset_end(4 * behind as u64);
         self.client.write(&handle, Bytes::from_elems(values));
-        // what fails here fails the next read, too
+        // A failure here also fails the next read.
         let _ = self.client.flush();
     }
 
-    /// Memory of **arbitrary contents**: a kernel writes it before another reads it.
+    /// Allocates memory with **arbitrary contents**, which a kernel must write before another reads it.
     pub fn scratch<T: Element>(&self, words: usize) -> Buffer {
         self.tensor(self.client.empty(words.max(1) * 4), words, T::dtype())
     }
 
-    /// Memory of zeros.
+    /// Allocates memory filled with zeros.
     pub fn zeros<T: Element>(&self, words: usize) -> Buffer {
         self.upload_vec(vec![T::zeroed(); words.max(1)])
     }
@@ -357,7 +357,7 @@ impl Device {
         Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.words() * 4]))
     }
 
-    /// As [`Device::fetch`], some of a buffer's floats.
+    /// Reads a part of a buffer's floats as [`Device::fetch`] does.
     pub(super) fn fetch_part(&self, buffer: &Buffer, part: Range<usize>) -> Result<Vec<f32>> {
         let behind = buffer.words() - part.end;
         let handle = buffer.handle.clone().offset_start(4 * part.start as u64).offset_end(4 * behind as u64);
@@ -393,7 +393,7 @@ impl Device {
         Error::not_now(problem, "repeat the command: it goes on from the last checkpoint")
     }
 
-    /// What the next launch runs on; counts it.
+    /// Counts a launch and returns the client to launch on.
     pub(super) fn launch(&self) -> &Client {
         self.launches.fetch_add(1, Ordering::Relaxed);
         &self.client
@@ -412,7 +412,7 @@ impl Device {
         }
     }
 
-    /// Launches and readbacks so far.
+    /// Returns the number of launches and readbacks so far.
     pub fn counts(&self) -> (usize, usize) {
         (self.launches.load(Ordering::Relaxed), self.readbacks.load(Ordering::Relaxed))
     }
@@ -435,11 +435,11 @@ macro_rules! launch {
 }
 pub(super) use launch;
 
-/// Groups of threads in one dimension that every adapter launches.
+/// Number of workgroups in one dimension that every adapter can launch.
 pub(super) const MOST_GROUPS: u32 = 65_535;
 
-/// So many groups of threads, beyond 65,535 in two dimensions: a kernel uses its position among all and ignores
-/// those that are too many.
+/// Returns the launch size for `count` workgroups, in two dimensions beyond 65,535. Kernels use their absolute position
+/// and ignore the excess.
 pub(super) fn groups(count: usize) -> CubeCount {
     let rows = count.div_ceil(MOST_GROUPS as usize).max(1);
     CubeCount::Static(count.div_ceil(rows) as u32, rows as u32, 1)

@@ -1,6 +1,6 @@
-//! Random rays from photographs that lie on the device: 8 bits a channel, only the box around the pixels worth drawing.
+//! Sampling of random rays from photographs in device memory: 8 bits a channel, cropped to the box of drawable pixels.
 //!
-//! Which pixel a ray is drawn from is a function of seed, step and its number alone, the same as on the CPU.
+//! The pixel of a ray depends on seed, step and the ray's index alone, as on the CPU.
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::rng::{Wide, below, permuted, stream, uniform};
@@ -19,30 +19,31 @@ const FIRST_PIXEL: usize = 5;
 const BUFFER: usize = 6;
 const FIRST_WORD: usize = 7;
 const OVER_BLACK: usize = 8;
-/// Where its camera's begin.
+/// First word of the camera.
 const CAMERA: usize = 9;
 const LENS: usize = CAMERA + 4;
 const ROTATION: usize = LENS + 13;
 const POSITION: usize = ROTATION + 9;
 const PIXEL: usize = POSITION + 3;
 
-/// Tries to meet a pixel worth drawing in its box.
+/// Attempts to draw a drawable pixel from the box before a ray is given up.
 const TRIES: u32 = 256;
 
 /// Buffers of pixels: no adapter binds more than 2³¹ bytes at once, however much memory it has.
 pub const BUFFERS: usize = 4;
 
-/// A photograph to draw from.
+/// A packed photograph to draw from.
 pub struct DrawnView {
-    /// Its camera in scene coordinates.
+    /// Camera in scene coordinates.
     pub camera: Camera,
-    /// Column and row where the box of pixels worth drawing begins, its width and height; no width: none.
+    /// First column and row of the box of drawable pixels, its width and height; a width of 0 means none.
     pub part: [u32; 4],
     /// The box's pixels, row by row: red, green, blue and alpha, from the lowest byte on.
     pub pixels: Vec<u32>,
-    /// Is color of the head alone, over black? Else it is the photograph's, times alpha over black.
+    /// Whether the colors are the head's over black already; otherwise they are the photograph's, to be multiplied by
+    /// alpha.
     pub over_black: bool,
-    /// A bit a pixel of the box, from the lowest of 32 on: is it drawn?
+    /// One bit per pixel of the box, from the lowest of each word: whether the pixel is drawable.
     pub drawable: Vec<u32>,
     /// The width of a pixel at the scene's middle, scene units, where rays may stand for squares of pixels; else infinite.
     pub pixel: f32,
@@ -86,7 +87,7 @@ struct Point {
     found: bool,
 }
 
-/// What the coefficients of a lens do to a projected point, and how that changes with it.
+/// A point distorted by a lens, and the Jacobian of the distortion.
 #[derive(CubeType, Clone, Copy)]
 struct DistortJacobian {
     x: f32,
@@ -126,7 +127,7 @@ fn distort(views: &[u32], lens: usize, x: f32, y: f32) -> DistortJacobian {
     }
 }
 
-/// The way back through a lens: see [`crate::geom::Distortion::undistort`].
+/// Inverts the distortion of a lens; see [`crate::geom::Distortion::undistort`].
 #[cube]
 fn undistort(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
     let mut x = xd;
@@ -182,13 +183,13 @@ struct Square {
     count: u32,
 }
 
-/// Is pixel `at` of a view's box drawable?
+/// Returns whether pixel `at` of a view's box is drawable.
 #[cube]
 fn is_drawable(views: &[u32], drawable: &[u32], view: usize, at: u32) -> bool {
     (drawable[(views[view + FIRST_WORD] + (at >> 5)) as usize] >> (at & 31)) & 1 == 1
 }
 
-/// The square around a pixel of a view's box, as wide as `detail` says; columns and rows count within the box.
+/// Sums the square around a pixel of a view's box, at most `detail` wide; column and row are relative to the box.
 #[cube]
 fn square(
     views: &[u32],
@@ -241,7 +242,7 @@ fn square(
     sums
 }
 
-/// The view of a drawable pixel: the first whose running count is beyond it.
+/// Returns the view of a drawable pixel: the first whose running count exceeds the pixel's index.
 #[cube]
 fn view_of(views: &[u32], which: u32) -> usize {
     let mut low = 0usize;
@@ -257,7 +258,8 @@ fn view_of(views: &[u32], which: u32) -> usize {
     low
 }
 
-/// The drawable pixel of a view's box that so many come before, which `before` counts by words of `drawable`.
+/// Returns the drawable pixel of a view's box with the given rank; `before` holds the count before each word of
+/// `drawable`.
 #[cube]
 fn ranked(before: &[u32], drawable: &[u32], first: usize, words: usize, rank: u32) -> u32 {
     let mut low = first;
@@ -299,10 +301,10 @@ fn draw_rays(
     view_low: u32,
     pixel_high: u32,
     pixel_low: u32,
-    shift_high: u32,
-    shift_low: u32,
-    behind_high: u32,
-    behind_low: u32,
+    jitter_high: u32,
+    jitter_low: u32,
+    background_high: u32,
+    background_low: u32,
     key_high: u32,
     key_low: u32,
     half_bits: u32,
@@ -318,14 +320,14 @@ fn draw_rays(
         let i = u32::cast_from(r);
         let all = views.len() / VIEW;
         let count = views[(all - 1) * VIEW];
-        // the pixel's number among all drawable ones, where these are counted
+        // Index of the pixel among all drawable ones, unless views are drawn first.
         let mut which = 0u32;
         let mut wanted = i < wanted[0];
         let view = if comptime!(order == PixelOrder::EachView) {
             below(view_high, view_low, i, u32::cast_from(all)) as usize
         } else {
             if comptime!(order.is_permuted()) {
-                // a batch of more than there are
+                // A batch may be larger than the number of drawable pixels.
                 wanted = wanted && position + i < count;
                 which =
                     permuted(Wide { high: key_high, low: key_low }, half_bits, (position + i) % count, count);
@@ -416,16 +418,16 @@ fn draw_rays(
         }
         let mut shift = 0.0f32;
         if shifted {
-            shift = uniform(shift_high, shift_low, i);
+            shift = uniform(jitter_high, jitter_low, i);
         }
         jitter[r] = shift;
         #[unroll]
         for c in 0..3u32 {
-            let mut behind = 0.0f32;
+            let mut channel = 0.0f32;
             if random {
-                behind = uniform(behind_high, behind_low, 3 * i + c);
+                channel = uniform(background_high, background_low, 3 * i + c);
             }
-            background[c as usize * rays + r] = behind;
+            background[c as usize * rays + r] = channel;
         }
     }
 }
@@ -450,14 +452,14 @@ pub struct Batch {
     pub color: Buffer,
     /// `[rays]`: soft alpha, 1 where there is no mask.
     pub alpha: Buffer,
-    /// Planes `[3, rays]`: what both are seen over.
+    /// Planes `[3, rays]`: background color of render and target.
     pub background: Buffer,
     /// `[rays]`: 1 where there is a ray; the others have no samples and no part in any mean.
     pub alive: Buffer,
 }
 
 impl Batch {
-    /// Room for so many rays, none of them there.
+    /// Allocates a batch with a capacity of `rays`, all inactive.
     pub fn new(device: &Device, rays: usize) -> Batch {
         Batch {
             origin: device.zeros::<f32>(3 * rays),
@@ -470,7 +472,7 @@ impl Batch {
         }
     }
 
-    /// These rays, up to as many as there is room for, that show nothing.
+    /// Uploads rays into a batch of the given capacity, with black colors.
     pub fn of_rays(device: &Device, rays: &[MarchRay], room: usize) -> Batch {
         assert!(rays.len() <= room);
         let mut planes = [vec![0f32; 3 * room], vec![0f32; 3 * room]];
@@ -491,19 +493,19 @@ impl Batch {
         }
     }
 
-    /// How many rays there is room for.
+    /// Returns the capacity in rays.
     pub fn rays(&self) -> usize {
         self.jitter.words()
     }
 
-    /// Keeps so many of them, `[1]`: those behind are none.
+    /// Deactivates all rays after the first `wanted`, `[1]`.
     pub fn keep(&self, device: &Device, wanted: &Buffer) {
         let count = groups(self.rays().div_ceil(UNITS as usize));
         launch!(device, keep::launch, count, UNITS; wanted, self.alive);
     }
 }
 
-/// Which pixels follow each other.
+/// Order in which pixels are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum PixelOrder {
     /// Any drawable pixel, each as likely.
@@ -518,21 +520,21 @@ pub enum PixelOrder {
 }
 
 impl PixelOrder {
-    /// Is every pixel drawn once before any is drawn again?
+    /// Returns whether every pixel is drawn once before any is drawn again.
     pub fn is_permuted(self) -> bool {
         matches!(self, PixelOrder::Permuted { .. })
     }
 }
 
-/// How rays are drawn.
+/// Options for drawing rays.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SamplingOptions {
-    /// Is each ray's first sample shifted by a random part of a step?
+    /// Whether each ray's first sample is shifted by a random part of a step.
     pub jitter: bool,
-    /// A random color behind each ray, else black.
+    /// Whether each ray has a random background color, rather than black.
     pub background: bool,
-    /// Which random numbers of a step these are.
-    pub behind: u64,
+    /// Random stream of the background colors.
+    pub background_stream: u64,
 }
 
 /// Photographs on a device.
@@ -593,12 +595,12 @@ impl Photographs {
         Photographs { views, pixels, drawable, before, count: cumulative, order, drawing }
     }
 
-    /// Draws the rays of a step: a function of seed and step alone. Of large photographs each stands for a square of
-    /// pixels no wider than `detail`.
+    /// Draws the rays of a step, which depend on seed and step alone. A ray of a large photograph stands for a square of
+    /// pixels at most `detail` wide.
     ///
     /// # Shapes
     ///
-    /// - wanted: `[1]`, how many rays; those of `into` behind them are none
+    /// - wanted: `[1]`, number of rays to draw; the remaining rays of `into` are marked inactive
     pub fn draw(
         &self,
         device: &Device,
@@ -607,15 +609,15 @@ impl Photographs {
         into: &Batch,
         detail: f32,
     ) {
-        let [view, pixel, shift, behind] =
-            [0, 1, 2, self.drawing.behind].map(|k| stream(seed, step << 4 | k));
+        let [view, pixel, shift, background] =
+            [0, 1, 2, self.drawing.background_stream].map(|k| stream(seed, step << 4 | k));
         assert!(into.rays() < 1 << 22, "the number of a try has 32 bits");
         let permutation = rng::Permutation::of_step((seed, step), into.rays() as u64, self.count as u64);
         let [pixels0, pixels1, pixels2, pixels3] = &self.pixels;
         launch!(device, draw_rays::launch, groups(into.rays().div_ceil(UNITS as usize)), UNITS;
             self.views, pixels0, pixels1, pixels2, pixels3, self.drawable, self.before, wanted, into.origin,
             into.direction, into.jitter, into.color, into.alpha, into.background, into.alive;
-            view[0], view[1], pixel[0], pixel[1], shift[0], shift[1], behind[0], behind[1],
+            view[0], view[1], pixel[0], pixel[1], shift[0], shift[1], background[0], background[1],
             (permutation.key >> 32) as u32, permutation.key as u32, permutation.half_bits,
             permutation.first as u32, detail, self.order, self.drawing.jitter, self.drawing.background
         );

@@ -1,4 +1,4 @@
-//! A trained signed-distance field on a device: what it is evaluated for after training, in batches that fill the device.
+//! Evaluation of a trained signed-distance field on a device, in batches that fill the device.
 
 use super::device::{Buffer, Device};
 use super::draw::Batch;
@@ -12,16 +12,16 @@ use crate::kernel::cpu::neus::RAY_WIDTH;
 use crate::kernel::cpu::sdf::FieldShape;
 use std::ops::Range;
 
-/// Samples evaluated together: some two hundred megabytes of memory.
+/// Number of samples evaluated together, which takes about two hundred megabytes of memory.
 const CAPACITY: usize = 1 << 17;
 
-/// The same where fewer points are evaluated: planes are copied whole.
+/// Smaller capacities for fewer points, because planes are copied whole.
 const FEWER: [usize; 2] = [1 << 10, 1 << 14];
 
-/// Rays marched together.
+/// Number of rays marched together.
 const RAYS: usize = 1 << 14;
 
-/// Rows `[n, W]` as planes `[W, capacity]`.
+/// Transposes rows `[n, W]` to planes `[W, capacity]`.
 pub(crate) fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<f32> {
     let mut out = vec![0.0; W * capacity];
     for (i, row) in rows.iter().enumerate() {
@@ -30,7 +30,7 @@ pub(crate) fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<
     out
 }
 
-/// A field and what its evaluation needs.
+/// A field on a device, with the buffers for its evaluation.
 pub struct Evaluator {
     device: Device,
     /// For [`CAPACITY`] samples, and for [`FEWER`].
@@ -45,7 +45,7 @@ pub struct Evaluator {
 }
 
 impl Evaluator {
-    /// Can a device evaluate a field of this shape?
+    /// Returns whether devices can evaluate a field of this shape.
     pub fn supports(shape: &FieldShape) -> bool {
         Sdf::supports(shape)
     }
@@ -141,7 +141,7 @@ impl Evaluator {
             };
             let seen: Vec<f32> = device.fetch(neus.forward(device, bundle, field, &self.inv_s, 1.0))?;
             let alive: Vec<u32> = device.fetch(&batch.alive)?;
-            // those there was no room for come with the next ones
+            // Rays that exceeded the sample capacity are marched again with the next batch.
             let done = alive[..own.len()].iter().position(|&a| a == 0).unwrap_or(own.len());
             assert!(done > 0, "one ray has more samples than there is room for");
             out.extend((0..done).map(|r| std::array::from_fn(|k| seen[k * RAYS + r])));
