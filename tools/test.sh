@@ -2,18 +2,26 @@
 # The whole check, as the README gives it: format, lints, documentation, tests, and what independent
 # readers say about our files. Nothing is skipped in silence; any failure fails the whole.
 #
-#     tools/test.sh            everything
-#     tools/test.sh --no-demo  without training the demo head (the readers then see the sphere and the globe)
+#     tools/test.sh              every part
+#     tools/test.sh lint unit    only these parts, of: lint unit integration readers guides demo fuzz
+#
+# lint         format, clippy with all features and with none, documentation
+# unit         unit tests, examples in the documentation
+# integration  the program as a user runs it: commands, hostile files, kills
+# readers      exported shapes in independent readers, and the annotation page in a browser
+# guides       the commands of the guides, many heads under kills, the first look at a GPU
+# demo         the demo head, trained for a few steps, in all readers and in a browser
+# fuzz         a minute for every reader of foreign bytes
 set -u -o pipefail
 cd "$(dirname "$0")/.."
 
-demo=yes
-for option in "$@"; do
-  case "$option" in
-    --no-demo) demo=no ;;
-    *) echo "unknown option $option" >&2; exit 2 ;;
-  esac
+known=(lint unit integration readers guides demo fuzz)
+parts=("$@")
+[ $# -gt 0 ] || parts=("${known[@]}")
+for part in "${parts[@]}"; do
+  [[ " ${known[*]} " == *" $part "* ]] || { echo "unknown part $part; the parts are ${known[*]}" >&2; exit 2; }
 done
+wanted() { [[ " ${parts[*]} " == *" $1 "* ]]; }
 
 target=${CARGO_TARGET_DIR:-target}
 scratch=$(mktemp -d)
@@ -22,7 +30,7 @@ results=()
 failed=0
 fuzzers=()
 
-# step NAME COMMAND...: runs it, shows it, remembers how it ended
+# step NAME COMMAND...: runs the command and records its result and time
 step() {
   local name=$1 begin=$SECONDS
   shift
@@ -59,18 +67,17 @@ print(*glob.glob(i.find_spec("onnxruntime").submodule_search_locations[0] + "/ca
   export TIFACE_ONNXRUNTIME
 }
 
-# Tests skip aloud what a machine cannot give; here those lines are shown again, so that nobody
-# takes a skipped test for a passed one. One build serves them all: with the networks, on both engines, and with the
-# kernels of GPUs.
+# Tests print what they skip; the summary repeats those lines, so that a skipped test is not taken for a passed one.
+# One build serves them all: with the networks, on both engines, and with the kernels of GPUs.
 tests() {
-  cargo test --release --features matting,wgpu --no-fail-fast -- --nocapture 2>&1 | tee "$scratch/tests.log"
+  cargo test --release --features matting,wgpu --no-fail-fast "$@" -- --nocapture 2>&1 | tee "$scratch/tests.log"
   local ended=${PIPESTATUS[0]}
-  grep -h '^skipped:' "$scratch/tests.log" | sort -u > "$scratch/skipped"
+  grep -h '^skipped:' "$scratch/tests.log" | sort -u >> "$scratch/skipped"
   return "$ended"
 }
 
-# A Vulkan in software for the kernels of GPUs, rather than whichever adapter is here; left out aloud where apt cannot
-# get it.
+# A Vulkan driver in software for the kernels of GPUs, whatever adapters the machine has; the summary names it where apt
+# cannot install it.
 vulkan_is_here() {
   driver() { find /usr/share/vulkan/icd.d -name 'lvp_icd*.json' 2> /dev/null | head -n 1; }
   if [ -z "$(driver)" ] && command -v apt-get > /dev/null; then
@@ -84,8 +91,8 @@ vulkan_is_here() {
   echo "$VK_DRIVER_FILES"
 }
 
-# A minute for every reader of foreign bytes, a quarter of it from each of four beginnings, beside whatever else is done:
-# it takes what the other steps leave of the processors.
+# A minute for every reader of foreign bytes, a quarter of it from each of four seeds, at low priority beside the other
+# steps.
 fuzz_begins() {
   local seed
   for seed in 1 2 3 4; do
@@ -112,8 +119,8 @@ check() {
 
 example() { "$target/release/examples/$1" "$2"; }
 
-# Blender as a module has its own environment: it brings its own numpy. Only when pip cannot get it
-# (no wheel for this system, no network) or the system cannot load it is it left out, and the summary says so.
+# Blender as a module has its own environment, since it brings its own numpy. It is skipped, and the summary says so, only
+# if pip cannot install it (no wheel for this system, no network) or the system cannot load it.
 blender_is_here() {
   [ -x .venv-blender/bin/python ] || "${PYTHON:-python3}" -m venv .venv-blender || return
   .venv-blender/bin/python -m pip install --quiet --disable-pip-version-check \
@@ -128,7 +135,7 @@ blender_is_here() {
   .venv-blender/bin/python -c 'import bpy'
 }
 
-# A browser for the page to click on; left out aloud where there is none and apt cannot get it.
+# A browser for the pages; skipped, and the summary says so, where apt cannot install one.
 browser_is_here() {
   "${CHROMIUM:-/usr/bin/chromium}" --version 2> /dev/null && return
   [ -z "${CHROMIUM:-}" ] && command -v apt-get > /dev/null || return
@@ -163,62 +170,108 @@ demo_pages() {
     node tools/page/check_watch.mjs "$target/release/tiface" "$scratch/demo"
 }
 
-step "independent readers are here" readers
-step "format" cargo fmt --all -- --check
-# Everything is checked once with all features, and once without any; then built once.
-step "lints, all features" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
-step "lints, no features" cargo clippy --release -- -D warnings
-step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting,wgpu --no-deps
-step "build" cargo build --release --features matting,wgpu --bins --examples
-step "ONNX Runtime is here" onnx_runtime
-printf '\n== Vulkan is here\n'
-if ! vulkan_is_here; then
-  results+=("SKIPPED a Vulkan in software for the kernels of GPUs: apt cannot install mesa-vulkan-drivers")
-fi
-step "tests" tests
-fuzz_begins
-blender=yes
-printf '\n== Blender is here\n'
-if ! blender_is_here; then
-  blender=no
-  results+=("SKIPPED Blender: tools/readers/requirements-blender.txt could not be installed, or not be loaded")
-fi
-browser=yes
-printf '\n== a browser is here\n'
-if ! browser_is_here; then
-  browser=no
-  results+=("SKIPPED the page to click on, reports, and lobes in three.js: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
-fi
-mkdir -p "$scratch/click"
-step "the page to click on is written" example click_page "$scratch/click/page.html"
-if [ $browser = yes ]; then
-  step "a browser clicks on the page" node tools/page/check_page.mjs "$scratch/click/page.html"
-fi
-step "a sphere is written" example sphere_to_glb "$scratch/sphere"
-readers_agree "the sphere" "$scratch/sphere/sphere.glb"
-step "a textured globe is written" example textured_sphere "$scratch/globe"
-readers_agree "the globe" "$scratch/globe/globe.glb"
-step "three.js agrees on the globe" node tools/readers/check_three.mjs "$scratch/globe/globe.glb"
-# with a normal map and a second texture
-cp "$scratch/globe/globe.png" "$scratch/globe/globe_rich.png"
-readers_agree "the rich globe" "$scratch/globe/globe_rich.glb"
-step "three.js agrees on the rich globe" node tools/readers/check_three.mjs "$scratch/globe/globe_rich.glb"
-# with soft layers, which trimesh and open3d take for part of the surface
-cp "$scratch/globe/globe.png" "$scratch/globe/globe_soft.png"
-step "the Khronos validator accepts the soft globe" node tools/readers/validate.mjs "$scratch/globe/globe_soft.glb"
-step "three.js agrees on the soft globe" node tools/readers/check_three.mjs "$scratch/globe/globe_soft.glb"
-if [ $blender = yes ]; then
-  step "Blender agrees on the soft globe" .venv-blender/bin/python tools/readers/check_blender.py "$scratch/globe/globe_soft.glb" --up 0 0 1
-fi
-step "a published checkpoint is converted" .venv/bin/python tools/reference/tensorf_checkpoint.py --check tests/reference
-step "the engine of many heads is here" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
-  -r tools/fleet/requirements.txt
-if [ -n "${VK_DRIVER_FILES:-}" ]; then
-  step "a first look at a GPU runs" env SHARE=1 CARGO_TARGET_DIR="$target" tools/gpu/first_look.sh vulkan:0 "$scratch/look"
-fi
-step "many heads outlive kills" check tools/fleet/check_fleet.py
-step "the commands of the guides work" check tools/guides/check_guides.py
-if [ $demo = yes ]; then
+# Tools of others, set up once by the first part that needs them.
+readers_ready=no
+need_readers() {
+  [ $readers_ready = yes ] && return
+  readers_ready=yes
+  step "independent readers are installed" readers
+  blender=yes
+  printf '\n== Blender is installed\n'
+  if ! blender_is_here; then
+    blender=no
+    results+=("SKIPPED Blender: tools/readers/requirements-blender.txt could not be installed, or not be loaded")
+  fi
+  browser=yes
+  printf '\n== a browser is installed\n'
+  if ! browser_is_here; then
+    browser=no
+    results+=("SKIPPED the annotation page, reports, and lobes in three.js: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
+  fi
+}
+
+vulkan_ready=no
+need_vulkan() {
+  [ $vulkan_ready = yes ] && return
+  vulkan_ready=yes
+  printf '\n== Vulkan in software is installed\n'
+  if ! vulkan_is_here; then
+    results+=("SKIPPED a Vulkan in software for the kernels of GPUs: apt cannot install mesa-vulkan-drivers")
+  fi
+}
+
+built=no
+need_program() {
+  [ $built = yes ] && return
+  built=yes
+  step "build" cargo build --release --features matting,wgpu --bins --examples
+}
+
+lint() {
+  step "format" cargo fmt --all -- --check
+  # Everything is checked once with all features, and once without any; then built once.
+  step "lints, all features" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
+  step "lints, no features" cargo clippy --release -- -D warnings
+  step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting,wgpu --no-deps
+}
+
+unit() {
+  step "ONNX Runtime is installed" onnx_runtime
+  need_vulkan
+  step "unit tests" tests --lib --bins
+  step "examples in the documentation" tests --doc
+}
+
+integration() {
+  need_program
+  step "ONNX Runtime is installed" onnx_runtime
+  need_vulkan
+  step "integration tests" tests --test '*'
+}
+
+shapes() {
+  need_readers
+  need_program
+  mkdir -p "$scratch/click"
+  step "the annotation page is written" example click_page "$scratch/click/page.html"
+  if [ $browser = yes ]; then
+    step "a browser clicks on the page" node tools/page/check_page.mjs "$scratch/click/page.html"
+  fi
+  step "a sphere is written" example sphere_to_glb "$scratch/sphere"
+  readers_agree "the sphere" "$scratch/sphere/sphere.glb"
+  step "a textured globe is written" example textured_sphere "$scratch/globe"
+  readers_agree "the globe" "$scratch/globe/globe.glb"
+  step "three.js agrees on the globe" node tools/readers/check_three.mjs "$scratch/globe/globe.glb"
+  # with a normal map and a second texture
+  cp "$scratch/globe/globe.png" "$scratch/globe/globe_rich.png"
+  readers_agree "the rich globe" "$scratch/globe/globe_rich.glb"
+  step "three.js agrees on the rich globe" node tools/readers/check_three.mjs "$scratch/globe/globe_rich.glb"
+  # with soft layers, which trimesh and open3d take for part of the surface
+  cp "$scratch/globe/globe.png" "$scratch/globe/globe_soft.png"
+  step "the Khronos validator accepts the soft globe" node tools/readers/validate.mjs "$scratch/globe/globe_soft.glb"
+  step "three.js agrees on the soft globe" node tools/readers/check_three.mjs "$scratch/globe/globe_soft.glb"
+  if [ $blender = yes ]; then
+    step "Blender agrees on the soft globe" .venv-blender/bin/python tools/readers/check_blender.py "$scratch/globe/globe_soft.glb" --up 0 0 1
+  fi
+  step "a published checkpoint is converted" .venv/bin/python tools/reference/tensorf_checkpoint.py --check tests/reference
+}
+
+guides() {
+  need_readers
+  need_vulkan
+  need_program
+  step "the engine of many heads is installed" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
+    -r tools/fleet/requirements.txt
+  if [ -n "${VK_DRIVER_FILES:-}" ]; then
+    step "a first look at a GPU runs" env SHARE=1 CARGO_TARGET_DIR="$target" tools/gpu/first_look.sh vulkan:0 "$scratch/look"
+  fi
+  step "many heads outlive kills" check tools/fleet/check_fleet.py
+  step "the commands of the guides work" check tools/guides/check_guides.py
+}
+
+demo() {
+  need_readers
+  need_program
   step "the demo head is reconstructed" train_demo
   readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1
   step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$scratch/demo/mesh/head.glb"
@@ -229,10 +282,16 @@ if [ $demo = yes ]; then
   if [ $blender = yes ]; then
     step "Blender shows its lobes" .venv-blender/bin/python tools/readers/check_lobes.py "$scratch/demo"
   fi
-else
-  results+=("SKIPPED the demo head, as asked by --no-demo")
-fi
-step "no input makes a reader panic, hang or fill the memory" fuzz_ends
+}
+
+wanted lint && lint
+wanted unit && unit
+wanted integration && integration
+wanted fuzz && fuzz_begins
+wanted readers && shapes
+wanted guides && guides
+wanted demo && demo
+wanted fuzz && step "no input makes a reader panic, hang or fill the memory" fuzz_ends
 
 # how long which step took, and what could not run
 printf '\n== summary\n'
