@@ -19,11 +19,12 @@
 //! ```
 
 pub mod distance;
-#[cfg_attr(not(feature = "matting"), path = "metrics/no_lpips.rs")]
+#[cfg(feature = "matting")]
 mod lpips;
 mod parts;
 mod psnr_ssim;
 
+#[cfg(feature = "matting")]
 pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr_ssim::{psnr, ssim_reflect_map, ssim_valid};

@@ -1,24 +1,21 @@
-//! ONNX networks in a session: a file is read once, recognized, and run by one of two engines.
+//! ONNX networks in a session: a file is read once, recognized, and run by tract.
 //!
-//! | engine | when | what it runs |
-//! | --- | --- | --- |
-//! | tract (built in) | no library is named | float32 files of the public generation |
-//! | ONNX Runtime | the user names its library | those too, and recent exporters, float16, int8 |
+//! The same bytes are hashed and given to the engine, and a file that refers to another one is refused, so the record
+//! describes exactly what ran. Nothing is downloaded.
 //!
-//! The bytes are read once: the same ones are hashed and given to the engine, and a file that would have another
-//! one opened is refused, so the record tells what has really run. Nothing is downloaded.
+//! The engine is a large program that reads untrusted files. Every call into it runs under `catch_unwind`: a panic inside
+//! becomes an error that names the file. (The process's panic hook still prints its line.) Arrays beyond a limit are
+//! refused before they are allocated.
 //!
-//! Engines are large programs fed with a stranger's file. Every call into one runs under `catch_unwind`: a
-//! panic inside becomes an error that names the file. (The process's panic hook still shows its line, and
-//! an engine that runs out of memory ends the process; the built-in one is kept from arrays beyond a limit.)
+//! ONNX Runtime, loaded from a library of the user's, was tried as a second engine: ViTMatte-S on a photograph of 384 × 512
+//! pixels takes 2.4 CPU s with tract and 1.3 with ONNX Runtime. It also runs float16 and int8 files and more of what recent
+//! exporters write; but it needs a library to be installed, cannot be kept from large arrays, and a crash ends the process.
 
 mod network;
-mod ort;
 mod tract;
 
 pub use self::network::NetworkFile;
 pub(crate) use self::network::{Contract, NetworkArray, Role, file_error};
-pub(crate) use self::ort::Runtime;
 
 use self::network::{Port, guarded, in_words, one_line};
 use crate::io::{self, Limits};
@@ -28,21 +25,6 @@ use tract_onnx::prelude::Framework;
 
 /// Bytes of a network's file at most; a Protocol Buffers message cannot be larger.
 const MOST_FILE_BYTES: u64 = 2 << 30;
-
-/// What runs networks, and within which bounds.
-pub(crate) struct Engines {
-    /// ONNX Runtime; without it tract runs the files.
-    pub runtime: Option<Runtime>,
-    /// Bytes of the largest single array that tract may plan.
-    pub array_bytes: u64,
-    /// Threads of ONNX Runtime inside one run; 0: as many as it likes. tract uses one.
-    pub threads: usize,
-}
-
-enum Engine {
-    Tract(Box<tract::TractModel>),
-    Ort(ort::OrtModel),
-}
 
 /// A network ready to run.
 pub(crate) struct NetworkSession {
@@ -54,12 +36,13 @@ pub(crate) struct NetworkSession {
     pub contract: Contract,
     /// The outputs that are asked for.
     outputs: Vec<String>,
-    engine: Engine,
+    model: tract::TractModel,
 }
 
 impl NetworkSession {
-    /// Reads, recognizes and loads a file, which must be of a form of this role.
-    pub(crate) fn open(role: Role, path: &Path, engines: &Engines) -> Result<NetworkSession> {
+    /// Reads, recognizes and loads a file, which must be of a form of this role. `array_bytes` is the size of the largest
+    /// single array that may be planned.
+    pub(crate) fn open(role: Role, path: &Path, array_bytes: u64) -> Result<NetworkSession> {
         let bytes = io::read_bytes(path, &Limits { file_bytes: MOST_FILE_BYTES, ..Limits::default() })?;
         if names_another_file(&bytes) {
             return Err(file_error(
@@ -94,22 +77,10 @@ impl NetworkSession {
             return Err(file_error(path, &format!("is a {contract}, but was given as {named}"), hint));
         }
         let outputs = contract.outputs(&outputs);
-        let engine = match &engines.runtime {
-            None => guarded(|| tract::TractModel::load(&proto, &outputs, engines.array_bytes))
-                .map(|model| Engine::Tract(Box::new(model))),
-            Some(runtime) => {
-                guarded(|| ort::OrtModel::load(runtime, &bytes, &outputs, engines.threads)).map(Engine::Ort)
-            }
-        };
-        let engine = engine.map_err(|e| engine_error(path, engines.runtime.is_some(), "load", &e))?;
-        let name = if engines.runtime.is_some() { ort::NAME } else { tract::NAME };
-        let file = NetworkFile::new(key, path, &bytes, contract, name);
-        Ok(NetworkSession { file, inputs, contract, outputs, engine })
-    }
-
-    /// Does one run at a time use all threads? tract runs several side by side, each on one thread.
-    pub(crate) fn runs_alone(&self) -> bool {
-        matches!(self.engine, Engine::Ort(_))
+        let model = guarded(|| tract::TractModel::load(&proto, &outputs, array_bytes));
+        let model = model.map_err(|e| engine_error(path, "load", &e))?;
+        let file = NetworkFile::new(key, path, &bytes, contract, tract::NAME);
+        Ok(NetworkSession { file, inputs, contract, outputs, model })
     }
 
     /// Feeds the inputs by name; gives the outputs of its form, every number of them finite.
@@ -120,12 +91,9 @@ impl NetworkSession {
                 let found = inputs.iter().find(|(name, _)| *name == port.name);
                 fed.push((port, &found.ok_or(format!("`{}` is not fed", port.name))?.1));
             }
-            match &self.engine {
-                Engine::Tract(model) => model.run(&fed),
-                Engine::Ort(model) => model.run(&fed),
-            }
+            self.model.run(&fed)
         };
-        let given = guarded(run).map_err(|e| engine_error(&self.file.path, self.runs_alone(), "run", &e))?;
+        let given = guarded(run).map_err(|e| engine_error(&self.file.path, "run", &e))?;
         if given.len() != self.outputs.len() {
             return Err(self.unusable(&self.outputs[0], "the engine left outputs out"));
         }
@@ -184,16 +152,10 @@ fn names_another_file(bytes: &[u8]) -> bool {
         || bytes.windows(9).any(|w| w == b"EPContext")
 }
 
-fn engine_error(path: &Path, runtime: bool, doing: &str, problem: &str) -> Error {
-    let (engine, hint) = match runtime {
-        true => (ort::NAME, "take a newer ONNX Runtime, or the float32 file from its publisher again"),
-        false => (
-            tract::NAME,
-            "use the float32 file of this network, or ONNX Runtime, which runs files that the built-in engine \
-             cannot: name its library, 1.17 or later (`pip install onnxruntime` brings one)",
-        ),
-    };
-    Error::cannot(format!("{engine} cannot {doing} `{}`: {}", path.display(), one_line(problem)), hint)
+fn engine_error(path: &Path, doing: &str, problem: &str) -> Error {
+    let hint = "use the float32 file that the network's publisher offers; float16 and int8 files, and some that recent \
+                exporters write, are not supported";
+    Error::cannot(format!("{} cannot {doing} `{}`: {}", tract::NAME, path.display(), one_line(problem)), hint)
 }
 
 #[cfg(test)]

@@ -677,7 +677,7 @@ fn more_frames_than_views_are_allowed_is_an_error_in_a_moment() {
     // one more than counters of views can hold
     let many = |_: &[String]| format!(r#"{{"frames": [{}0]}}"#, "0,".repeat(65_535));
     let e = open(&capture_with(many, 1)).unwrap_err();
-    assert!(e.to_string().contains("the number of frames is 65536, the limit is 65535"), "{e}");
+    assert!(e.to_string().contains("the number of views is 65536, the limit is 65535"), "{e}");
     // a million entries are more values than one file may hold
     let e =
         open(&capture_with(|_| format!(r#"{{"frames": [{}0]}}"#, "[],".repeat(9_000_000)), 1)).unwrap_err();

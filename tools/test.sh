@@ -49,19 +49,8 @@ readers() {
     npm ci --silent --no-audit --no-fund --prefix tools/readers
 }
 
-# The library of ONNX Runtime comes as a Python wheel; only the library in it is used.
-onnx_runtime() {
-  [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv || return
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements-onnx.txt || return
-  TIFACE_ONNXRUNTIME=$(.venv/bin/python -c 'import glob, importlib.util as i
-print(*glob.glob(i.find_spec("onnxruntime").submodule_search_locations[0] + "/capi/libonnxruntime.*"))') || return
-  [ -f "$TIFACE_ONNXRUNTIME" ] || { echo "the wheel holds no library: '$TIFACE_ONNXRUNTIME'" >&2; return 1; }
-  export TIFACE_ONNXRUNTIME
-}
-
 # Tests skip aloud what a machine cannot give; here those lines are shown again, so that nobody
-# takes a skipped test for a passed one. One build serves them all: with the networks, on both engines, and with the
-# kernels of GPUs.
+# takes a skipped test for a passed one. One build serves them all: with the networks and with the kernels of GPUs.
 tests() {
   cargo test --release --features matting,wgpu --no-fail-fast -- --nocapture 2>&1 | tee "$scratch/tests.log"
   local ended=${PIPESTATUS[0]}
@@ -170,7 +159,6 @@ step "lints, all features" cargo clippy --release --all-targets --features matti
 step "lints, no features" cargo clippy --release -- -D warnings
 step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting,wgpu --no-deps
 step "build" cargo build --release --features matting,wgpu --bins --examples
-step "ONNX Runtime is here" onnx_runtime
 printf '\n== Vulkan is here\n'
 if ! vulkan_is_here; then
   results+=("SKIPPED a Vulkan in software for the kernels of GPUs: apt cannot install mesa-vulkan-drivers")

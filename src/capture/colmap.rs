@@ -183,12 +183,11 @@ fn frame(
     };
     let intrinsics = camera.model.intrinsics((width, height), &camera.values);
     let intrinsics = intrinsics.map_err(|text| problem(format!("camera {}: {text}", image.camera)))?;
-    let (rotation, position) = image.pose.camera_in_world().map_err(|text| problem(text.into()))?;
-    let (relative, photo) = folder.photo(file, &join(base, &image.name))?;
+    let pose = image.pose.camera_in_world().map_err(|text| problem(text.into()))?;
+    let photo = folder.photo(file, &join(base, &image.name))?;
     let split = held_out.map(|names| if names.contains(&image.name) { Split::Test } else { Split::Train });
     let mask = folder.mask_of(file, &image.name)?;
-    let (file, name) = (file.to_string(), image.name.clone());
-    Ok(CameraFrame { file, name, photo, relative, split, intrinsics, rotation, position, mask, region: None })
+    Ok(CameraFrame { split, mask, ..CameraFrame::new(file, &image.name, photo, intrinsics, pose) })
 }
 
 impl Rigid {

@@ -9,7 +9,7 @@ use super::frame::Listing;
 use super::{llff, metashape, neus, realitycapture, transforms};
 use crate::Error;
 use crate::config::Config;
-use crate::io::{self, ReadError};
+use crate::io;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -118,9 +118,7 @@ impl CameraFiles {
             CameraFiles::Xmp(inside) => realitycapture::list_xmp(folder, inside, listing),
         };
         listing.problems.extend(listed.err());
-        let (found, limit) = (listing.frames.len() as u64, folder.options.limits.views as u64);
-        if found > limit {
-            let problem = ReadError::too_large(folder.root, "the number of views", found, limit);
+        if let Err(problem) = folder.options.limits.check_views(folder.root, listing.frames.len()) {
             listing.problems.push(problem.into());
             listing.frames.clear();
         }

@@ -81,6 +81,22 @@ pub(super) struct CameraFrame {
     pub region: Option<PathBuf>,
 }
 
+impl CameraFrame {
+    /// A frame of `file`, without split, mask and region. `name` is the photograph as written there, `photo` what
+    /// [`CaptureFolder::photo`](super::folder::CaptureFolder::photo) found of it.
+    pub fn new(
+        file: &str,
+        name: &str,
+        (relative, photo): (PathBuf, Option<PathBuf>),
+        intrinsics: Intrinsics,
+        (rotation, position): (DMat3, DVec3),
+    ) -> CameraFrame {
+        let (file, name) = (file.to_string(), name.to_string());
+        let (split, mask, region) = (None, None, None);
+        CameraFrame { file, name, photo, relative, split, intrinsics, rotation, position, mask, region }
+    }
+}
+
 /// Intrinsics as declared; complete only together with the photograph's size.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Intrinsics {

@@ -10,7 +10,7 @@ use super::lens::{self, LensModel};
 use super::view::Split;
 use crate::Result;
 use crate::geom::{Camera, Distortion};
-use crate::io::{self, ReadError};
+use crate::io;
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
 use serde_json::{Map, Value};
@@ -137,10 +137,7 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         let hint = "it must describe at least one photograph";
         return Err(in_file(file, "its list `frames` is empty", hint));
     }
-    let (found, limit) = (frames.len() as u64, limits.views as u64);
-    if found > limit {
-        return Err(ReadError::too_large(&path, "the number of frames", found, limit).into());
-    }
+    limits.check_views(&path, frames.len())?;
     let about: TopKeys = io::typed(&value).map_err(|[key, found, expected]| {
         in_file(file, format_args!("`{key}` is {found}, expected {expected}"), "list file names there")
     })?;
@@ -167,32 +164,21 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         let problem = |text: String| in_frame(file, name.unwrap_or(&number), text);
         let frame = FrameKeys::read(top, entry).map_err(problem).and_then(|keys| {
             let split = split_of_file.or(about.split(&keys.file_path));
-            let (rotation, position) =
+            let pose =
                 upper_rows(&keys.transform_matrix).and_then(|rows| frame::pose(&rows)).map_err(problem)?;
             let split = named_split(keys.split.as_deref(), split).map_err(problem)?;
             let intrinsics = intrinsics(&keys, &mut ignored).map_err(problem)?;
-            let (relative, photo) = folder.photo(file, &keys.file_path)?;
+            let photo = folder.photo(file, &keys.file_path)?;
             let beside = |name: &Option<String>| -> Result<_> {
                 let named = name.as_ref().map(|name| folder.relative(file, name)).transpose()?;
                 Ok(named.and_then(|name| folder.file(&name)))
             };
             let (mask, region) = (beside(&keys.mask_path)?, beside(&keys.face_mask_path)?);
-            if keys.mask_path.is_some() && mask.is_none() && photo.is_some() {
+            if keys.mask_path.is_some() && mask.is_none() && photo.1.is_some() {
                 listing.problems.push(problem("the mask it names is missing".into()));
             }
-            let (file, name) = (file.to_string(), keys.file_path);
-            Ok(CameraFrame {
-                file,
-                name,
-                photo,
-                relative,
-                split,
-                intrinsics,
-                rotation,
-                position,
-                mask,
-                region,
-            })
+            let frame = CameraFrame::new(file, &keys.file_path, photo, intrinsics, pose);
+            Ok(CameraFrame { split, mask, region, ..frame })
         });
         match frame {
             Ok(frame) => listing.frames.push(frame),

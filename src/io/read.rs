@@ -108,6 +108,11 @@ impl Default for Limits {
 }
 
 impl Limits {
+    pub(crate) fn check_views(&self, path: &Path, views: usize) -> Result<(), ReadError> {
+        let too_large = || ReadError::too_large(path, "the number of views", views as u64, self.views as u64);
+        if views > self.views { Err(too_large()) } else { Ok(()) }
+    }
+
     pub(super) fn check_side(&self, path: &Path, side: u64) -> Result<(), ReadError> {
         let (what, limit) = ("the picture's longest side in pixels", self.side_px.into());
         if side > limit { Err(ReadError::too_large(path, what, side, limit)) } else { Ok(()) }

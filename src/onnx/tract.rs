@@ -1,4 +1,4 @@
-//! The built-in engine: `tract`, in Rust, one thread to a run.
+//! The engine: `tract`, in Rust, one thread to a run.
 //!
 //! It wants every shape fixed. The file is parsed once; for each set of input shapes a plan is made from it
 //! (0.2 to 1 s for public networks) and kept, since the photographs of a capture share their size.

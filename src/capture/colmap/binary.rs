@@ -140,9 +140,7 @@ fn read_images(source: &Source, limits: &Limits) -> Result<Vec<Image>, ReadError
     let mut c = Cursor::of(source);
     // number, pose, camera, an empty name, no points
     let n = c.counted(4 + 56 + 4 + 1 + 8, "images")?;
-    if n > limits.views {
-        return Err(ReadError::too_large(&source.0, "the number of views", n as u64, limits.views as u64));
-    }
+    limits.check_views(&source.0, n)?;
     let mut images = Vec::with_capacity(n);
     for _ in 0..n {
         let (id, pose, camera, name) = (c.u32()?, c.rigid()?, c.u32()?, c.name()?);
