@@ -21,7 +21,6 @@ pub mod grabcut;
 
 pub mod propagate;
 
-pub mod agreement;
 pub mod consistency;
 
 pub mod matting;

@@ -174,7 +174,7 @@ pub(super) fn explain(root: &Path) -> Error {
         None => {
             let nearest = nearest(&found).map_or(String::new(), |n| format!("; nearest is {n}"));
             let others = "Meshroom, OpenSfM, OpenMVG, Bundler, NVM, MVSNet, Polycam, NeRSemble, Multiface, FaceScape, \
-                          photographs alone or a video are named with the way from found_of";
+                          photographs alone or a video are recognized, with advice on how to convert them";
             not_a_capture(
                 root,
                 format!("it holds none of the camera files that are read: {LOOKED_FOR}{nearest}"),

@@ -3,7 +3,7 @@
 //! A mask votes for a cell when the cell's center falls on the head, against it when it falls beside, and not at
 //! all outside its frame: there nothing was seen. A set of cells is drawn back into any view by its surface.
 
-use crate::capture::carve::{Cube, Projector, meeting_point};
+use crate::capture::carve::{Cube, Projector, around, meeting_point};
 use crate::geom::Camera;
 use crate::image::Gray;
 use crate::{Error, Result};
@@ -169,17 +169,6 @@ pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
     }
     let deepest = depth.iter().copied().max().unwrap_or(0) as f64;
     depth.iter().map(|&d| d > 0 && d as f64 > share * deepest).collect()
-}
-
-/// Neighbors of a cell over faces, or over corners too.
-fn around([x, y, z]: [usize; 3], n: usize, corners: bool) -> impl Iterator<Item = usize> {
-    let span = move |v: usize| v.saturating_sub(1)..(v + 2).min(n);
-    span(x).flat_map(move |u| span(y).flat_map(move |v| span(z).map(move |w| (u, v, w)))).filter_map(
-        move |(u, v, w)| {
-            let steps = u.abs_diff(x) + v.abs_diff(y) + w.abs_diff(z);
-            (steps == 1 || (corners && steps > 1)).then_some((u * n + v) * n + w)
-        },
-    )
 }
 
 #[cfg(test)]

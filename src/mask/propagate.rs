@@ -10,10 +10,9 @@
 //! The hull is an outer bound: it excludes and never includes, but for its core.
 //!
 //! Where a network has proposed a mask for every view ([`propagate_proposals`]), those that agree
-//! ([`agreement`](super::agreement)) stand for the clicked ones: they teach the colors and carve the hull. What lies well inside a proposal that is not unlike the others is definite head.
+//! ([`verdicts`]) stand for the clicked ones: they teach the colors and carve the hull. What lies well inside a proposal that is not unlike the others is definite head.
 
-use super::agreement::{MaskVerdict, beliefs};
-use super::consistency::ConsistencyView;
+use super::consistency::{ConsistencyView, MaskVerdict, verdicts};
 use super::grabcut::mixture::Rgb;
 use super::grabcut::{self, Grabcut, Models, Seed};
 use super::hull::{self, Voter};
@@ -355,9 +354,9 @@ where
             mask: Some(mask).filter(|_| v.votes),
         })
         .collect();
-    let beliefs = beliefs(&asked)?;
+    let verdicts = verdicts(&asked)?;
     let mut propagation = Propagation::new(CELLS, AT_ONCE, views, load)?;
-    let start = propagation.proposed(proposals, &beliefs)?;
+    let start = propagation.proposed(proposals, &verdicts)?;
     Ok(propagation.run(start))
 }
 
@@ -371,11 +370,11 @@ pub fn rows_size(photo: &Photo) -> (u32, u32) {
 
 impl Propagation<'_> {
     /// Takes the proposed masks of the views that agree, and learns the common colors from them.
-    fn proposed(&mut self, proposals: &[Gray], beliefs: &[MaskVerdict]) -> Result<StartViews> {
+    fn proposed(&mut self, proposals: &[Gray], verdicts: &[MaskVerdict]) -> Result<StartViews> {
         let (mut inside, mut outside): (Vec<Rgb>, Vec<Rgb>) = Default::default();
         let mut heads: Vec<Option<Vec<bool>>> = vec![None; self.views.len()];
         let mut others = Vec::new();
-        for (i, (mask, belief)) in proposals.iter().zip(beliefs).enumerate() {
+        for (i, (mask, verdict)) in proposals.iter().zip(verdicts).enumerate() {
             let (photo, view) = (&self.photos[i], &self.views[i]);
             let (w, h) = (photo.width as usize, photo.height as usize);
             if (mask.width, mask.height) != (photo.width, photo.height) {
@@ -389,10 +388,10 @@ impl Propagation<'_> {
             }
             let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
             // nobody judged a held-out view, and only its own mask comes from it
-            if !view.votes || *belief != MaskVerdict::Unlike {
+            if !view.votes || *verdict != MaskVerdict::Unlike {
                 self.inside[i] = shrink(&head, w, h, INSIDE * h as f32);
             }
-            if *belief != MaskVerdict::Agrees || !view.votes {
+            if *verdict != MaskVerdict::Agrees || !view.votes {
                 others.extend(view.votes.then_some(view.name));
                 continue;
             }
