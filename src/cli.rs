@@ -321,7 +321,7 @@ all trainings (capture.tiles).")]
   tiface preview runs/002_00                    draw a three-quarter view, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --up z --out scan.png
   tiface preview runs/002_00 --sheet            draw all sides, wireframe, normals, texture coordinates, errors
-  tiface preview runs/002_00 --turntable --out turn.gif     animate; also .png, and .mp4 with ffmpeg
+  tiface preview runs/002_00 --turntable --out turn.gif     animate; also .png
   tiface preview runs/002_00 --cameras test --out views/    draw from the held-out cameras
   tiface preview runs/002_00 --page             write a page to turn it in a browser
   tiface preview runs/002_00 --watch            write watch.html in the run, and update it while the run works")]

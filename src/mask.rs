@@ -11,7 +11,6 @@
 
 mod hull;
 pub mod morphology;
-pub mod scale;
 
 pub mod prompts;
 

@@ -17,7 +17,7 @@ use std::str::FromStr;
 
 /// Elements and attributes of one file; a project of ten thousand photographs has half as many.
 const MAX_NODES: u32 = 2_000_000;
-/// A translation beyond is one of the whole earth: single precision would tell half a metre there.
+/// A longer translation is geocentric: single precision resolves half a metre at that distance.
 const GEOCENTRIC: f64 = 1e5;
 /// Skew moves no pixel farther.
 const SKEW_PX: f64 = 0.1;

@@ -64,7 +64,7 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     Ok(())
 }
 
-/// Pictures in the first of these folders that is there, in name order.
+/// Pictures in the first of these folders that exists, in name order.
 fn pictures(folder: &CaptureFolder, names: &[&str]) -> Result<Vec<String>> {
     let Some(name) = names.iter().find(|n| io::is_folder(&folder.root.join(n))) else {
         return Ok(Vec::new());

@@ -5,8 +5,7 @@
 //! errors, but for [`LENIENT`] and `up`, which count as absent as well.
 
 use super::folder::{CaptureFolder, in_file, in_frame};
-use super::frame::{self, CameraFrame, Intrinsics, Listing};
-use super::lens::{self, LensModel};
+use super::frame::{self, CameraFrame, Intrinsics, LensModel, Listing};
 use super::view::Split;
 use crate::Result;
 use crate::geom::{Camera, Distortion};
@@ -18,8 +17,8 @@ use std::collections::HashSet;
 
 type Object = Map<String, Value>;
 
-/// Keys of the focal length: whoever names one names all, or a frame's own angle would be overruled by the whole
-/// file's focal length.
+/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would be overruled by
+/// the whole file's focal length.
 const FOCAL: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// The other keys that may stand at the top for all frames.
@@ -139,7 +138,11 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
     }
     limits.check_views(&path, frames.len())?;
     let about: TopKeys = io::typed(&value).map_err(|[key, found, expected]| {
-        in_file(file, format_args!("`{key}` is {found}, expected {expected}"), "list file names there")
+        in_file(
+            file,
+            format_args!("`{key}` is {found}, expected {expected}"),
+            "it must be a list of file names",
+        )
     })?;
     if top.contains_key("applied_transform") || top.contains_key("applied_scale") {
         listing.reasons.push(format!(
@@ -281,14 +284,14 @@ fn distortion(keys: &FrameKeys, model: &str, ignored: &mut Vec<String>) -> Resul
     };
     let all = "k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega".split(' ');
     for key in all.filter(|key| !parameters.split(' ').any(|p| p == *key)) {
-        if *lens::coefficient(&mut { given }, key) != 0.0 {
+        if *frame::coefficient(&mut { given }, key) != 0.0 {
             return Err(format!(
                 "its lens has `{key}`, which its camera model `{model}` has not; undistort the photographs first"
             ));
         }
     }
-    let distortion = Distortion { projection: lens::projection(model), ..given };
-    lens::check(&distortion)?;
+    let distortion = Distortion { projection: frame::projection(model), ..given };
+    frame::check_distortion(&distortion)?;
     Ok(distortion)
 }
 

@@ -68,7 +68,7 @@ impl WriteError {
     }
 }
 
-/// Replaces `path` by `bytes` in one step; a file that was there keeps its permissions.
+/// Replaces `path` by `bytes` in one step; an existing file keeps its permissions.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     write_with(path, bytes.len(), |file| file.write_all(bytes))
 }
@@ -94,7 +94,7 @@ pub fn rename(from: &Path, to: &Path) -> Result<(), WriteError> {
     }
 }
 
-/// Removes a file; one that is not there is fine.
+/// Removes a file, if it exists.
 pub fn remove(path: &Path) -> Result<(), WriteError> {
     match fs::remove_file(path) {
         Err(e) if e.kind() != ErrorKind::NotFound => Err(WriteError::Io { path: path.into(), source: e }),
@@ -137,7 +137,7 @@ fn write_with(
 fn create(aside: &Path) -> std::io::Result<File> {
     let open = || OpenOptions::new().write(true).create_new(true).open(aside);
     match open() {
-        // left by a crashed process that had our number: nobody else may own that name now
+        // left by a crashed process with our number: no other process can own that name now
         Err(e) if e.kind() == ErrorKind::AlreadyExists => {
             fs::remove_file(aside)?;
             open()

@@ -25,11 +25,10 @@
 
 use super::hull::{self, ViewFrame};
 use super::morphology::squared_distance;
-use super::scale::resize_hard;
 use crate::Result;
 use crate::capture::carve::Cube;
 use crate::geom::Camera;
-use crate::image::Gray;
+use crate::image::{Gray, resize_hard};
 use glam::{DVec3, Vec2};
 use rayon::prelude::*;
 
@@ -68,7 +67,7 @@ pub struct Conflict {
     pub too_much: f64,
     /// Share of the other views' masks, 0..=1, that it takes away.
     pub too_little: f64,
-    /// What a person should read.
+    /// A sentence for the user.
     pub text: String,
 }
 
@@ -165,7 +164,7 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
 struct SilhouetteConstraints {
     camera: Camera,
     frame: ViewFrame,
-    /// Pixels so far beside the mask that a cell there is ruled out.
+    /// Pixels so far beside the mask that they rule out the cells they show.
     beside: Vec<bool>,
     on: Vec<bool>,
     /// Pixels well inside the mask, whose rays must meet something.
@@ -363,20 +362,20 @@ fn cells_on_ray<'a>(
     })
 }
 
-/// The cell on a pixel's ray that fewest views rule out, of those that another view has on the head if there are
-/// any; of equals the one that most have there. Nothing when no other view looks at the ray within the cube.
+/// The cell on a pixel's ray that fewest views rule out, among those that another view has on the head, if any;
+/// of equals the one that most views have on the head. `None` when no other view looks at the ray within the cube.
 fn best_on_ray(
     cube: &Cube,
     claims: &SilhouetteConstraints,
     pixel: usize,
     costs: &[(u16, u16)],
 ) -> Option<(u16, usize)> {
-    // whom the ray's own view has on its side comes first, then who is against
+    // first whether another view supports it, then how many are against it
     let mut best: Option<(bool, u16, u16, usize)> = None;
     for i in cells_on_ray(cube, claims, pixel) {
         let (no, yes) = costs[i];
         if no == 0 && yes < 2 {
-            continue; // no other view looks there, which explains nothing
+            continue; // no other view sees this cell, so it explains nothing
         }
         let alone = yes < 2;
         if best.is_none_or(|(a, cost, agreed, _)| (alone, no, agreed) < (a, cost, yes)) {
@@ -403,12 +402,12 @@ const MOST_RULED_OUT: f64 = 0.003;
 /// Share of its own claims that may stand open.
 const MOST_OPEN: f64 = 0.05;
 
-/// What is to be made of a mask.
+/// The verdict on a proposed mask.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MaskVerdict {
     /// It agrees with the others.
     Agrees,
-    /// It leaves out what others show; what it shows may be believed.
+    /// It leaves out what others show; what it shows is reliable.
     LeavesOut,
     /// It shows what no other does, or nothing at all.
     Unlike,

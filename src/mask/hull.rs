@@ -1,7 +1,7 @@
 //! What masks of several views say about space: votes for every cell of a cube, and their silhouettes.
 //!
 //! A mask votes for a cell when the cell's center falls on the head, against it when it falls beside, and not at
-//! all outside its frame: there nothing was seen. A set of cells is drawn back into any view by its surface.
+//! all outside its frame. A set of cells is drawn back into any view by its surface.
 
 use crate::capture::carve::{Cube, Projector, around, meeting_point};
 use crate::geom::Camera;
@@ -32,7 +32,7 @@ impl ViewFrame {
     }
 }
 
-/// Lets every frame vote on every cell: `vote(values of the cell, which frame, its pixel there)`.
+/// Lets every frame vote on every cell: `vote(values of the cell, index of the frame, pixel that shows the cell)`.
 ///
 /// # Shapes
 ///
@@ -85,7 +85,7 @@ pub(super) fn cells(votes: &[[u16; 2]], most_negative: usize, least_positive: us
     votes.iter().map(|&[no, yes]| no as usize <= most_negative && yes as usize >= least_positive).collect()
 }
 
-/// The cube around the point the cameras look at, `margin` times as high as their frames are there.
+/// The cube around the point the cameras look at, `margin` times as high as their frames at that point.
 pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
     let alike = |how: &str| {
         Error::cannot(

@@ -22,8 +22,7 @@ pub mod closed_form;
 
 use self::closed_form::{ClosedFormOptions, closed_form};
 use super::morphology;
-use super::scale::{enlarge, resize_hard};
-use crate::image::{Gray, Photo, reduce_photo, working_size};
+use crate::image::{Gray, Photo, enlarge, reduce_photo, resize_hard, working_size};
 use crate::{Error, Result};
 
 /// Alphas below become 0.
@@ -65,7 +64,7 @@ pub struct SoftMask {
     pub alpha: Gray,
     /// At the working size: 0, 128, 255.
     pub trimap: Gray,
-    /// What a person should know, one sentence each.
+    /// Warnings, one sentence each.
     pub warnings: Vec<String>,
 }
 
@@ -136,7 +135,7 @@ fn solved(
     mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect()
 }
 
-/// What a person should know about the band, whoever finds its opacity.
+/// Warnings about the band, by whichever method its opacity is found.
 fn band_warnings(trimap: &Gray) -> Vec<String> {
     let mut warnings = Vec::new();
     let band = unknown_share(trimap);
@@ -263,8 +262,8 @@ fn dilate_lines(
 #[cfg(test)]
 mod tests {
     use super::super::morphology;
-    use super::super::scale::resize_gray;
     use super::*;
+    use crate::image::resize_gray;
     use crate::io::{Limits, read_gray, read_photo};
 
     /// A bright disc on a dark background whose rim is soft over 6 pixels.

@@ -35,7 +35,7 @@ impl Networks {
     /// Opens every file that the configuration uses; returns `None` where it uses none.
     ///
     /// # Errors
-    /// When a file cannot be read, is no sound ONNX file, is refused for what it holds, is of no known form or
+    /// When a file cannot be read, is no valid ONNX file, is refused for its content, is of no known form or
     /// of the other network, when encoder and decoder do not fit, or when the engine cannot load it.
     pub fn open(config: &MaskConfig) -> Result<Option<Networks>> {
         if !config.with_networks() {

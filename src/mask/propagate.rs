@@ -18,11 +18,10 @@ use super::grabcut::{self, Grabcut, Models, Seed};
 use super::hull::{self, Voter};
 use super::morphology::{gray, grow, shrink};
 use super::prompts::{self, Click};
-use super::scale::reduce_to_rows;
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
 use crate::geom::Camera;
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, reduce_to_rows, size_at_rows};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -56,7 +55,7 @@ pub struct PropagateView<'a> {
     pub name: &'a str,
     /// Its camera, at the size of the photograph.
     pub camera: &'a Camera,
-    /// Its clicks in pixels of the photograph; none where nobody clicked.
+    /// Its clicks in pixels of the photograph; none for a view without clicks.
     pub clicks: &'a [Click],
     /// May its photograph shape the masks of other views? Held-out views may not.
     pub votes: bool,
@@ -67,9 +66,9 @@ pub struct PropagateView<'a> {
 pub struct HardMasks {
     /// In the order of the views given: 255 head, 0 background, at the working size.
     pub masks: Vec<Gray>,
-    /// What a person should look at.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
-    /// What a person may want to know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
@@ -326,7 +325,7 @@ impl<'a> Propagation<'a> {
             }
             if ambiguous[i] > 0.05 {
                 self.warnings.push(format!(
-                    "view `{view}`: {:.0} % of the picture may be head or background by its color; click there",
+                    "view `{view}`: {:.0} % of the picture may be head or background by its color; click on both",
                     100.0 * ambiguous[i]
                 ));
             }
@@ -362,10 +361,7 @@ where
 
 /// Width and height that a photograph is cut at.
 pub fn rows_size(photo: &Photo) -> (u32, u32) {
-    match photo.height {
-        h if h <= grabcut::ROWS => (photo.width, h),
-        h => ((photo.width as f64 * grabcut::ROWS as f64 / h as f64).round().max(1.0) as u32, grabcut::ROWS),
-    }
+    size_at_rows((photo.width, photo.height), grabcut::ROWS)
 }
 
 impl Propagation<'_> {
@@ -387,7 +383,7 @@ impl Propagation<'_> {
                 ));
             }
             let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
-            // nobody judged a held-out view, and only its own mask comes from it
+            // held-out views are not compared, and shape only their own masks
             if !view.votes || *verdict != MaskVerdict::Unlike {
                 self.inside[i] = shrink(&head, w, h, INSIDE * h as f32);
             }

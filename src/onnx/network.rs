@@ -165,7 +165,7 @@ pub(super) fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
 pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
     let mut near = None;
     let gives = |name: &&str| outputs.iter().any(|p| p.name == **name);
-    // one that is called anything is told by its extents
+    // an output of any name is recognized by its extents
     let fits = |form: &&Form| match (form.contract, outputs.first().map(|port| &port.dims)) {
         (_, None) => false,
         (Contract::Alpha, Some(Some(dims))) => {

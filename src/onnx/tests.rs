@@ -67,7 +67,7 @@ fn refused_for(word: &str, bytes: &[u8]) {
 fn reason(error: &Error) -> Option<&'static str> {
     let said = error.to_string();
     let reasons = [
-        "is not a sound ONNX file",
+        "is not a valid ONNX file",
         "is refused: its weights lie in another file",
         "is no network that is known",
         ", but was given as the ViTMatte network",
@@ -98,7 +98,7 @@ fn a_valid_network_made_by_hand_gives_the_trimap() {
 fn text_nothing_and_half_a_file_are_no_onnx() {
     let page = b"<!DOCTYPE html><html><body>404</body></html>".as_slice();
     for bytes in [page, b"version https://git-lfs.github.com/spec/v1\n", &[0xff; 100], b"\n\x00\x12"] {
-        refused_for("is not a sound ONNX file", bytes);
+        refused_for("is not a valid ONNX file", bytes);
     }
     refused_for("it holds no graph", &Message::new().int(1, 7).0);
     assert!(tried(b"").is_err_and(|e| e.to_string().contains("is empty (0 bytes)")));
@@ -349,6 +349,6 @@ fn a_panic_inside_the_engine_becomes_its_message() {
 
 #[test]
 fn the_engine_recorded_is_the_one_the_manifest_pins() {
-    let version = tract::NAME.strip_prefix("tract ").unwrap();
+    let version = NAME.strip_prefix("tract ").unwrap();
     assert!(include_str!("../../Cargo.toml").contains(&format!("tract-onnx = {{ version = \"={version}\"")));
 }

@@ -1,7 +1,7 @@
 //! The binary files: little-endian numbers, counts before lists. Every count is compared with the bytes that
 //! are left before anything is reserved.
 
-use super::super::lens::LensModel;
+use super::super::frame::LensModel;
 use super::{Camera, Image, Model, Rigid};
 use crate::Result;
 use crate::io::{Limits, ReadError};
@@ -129,7 +129,7 @@ fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, ReadError> {
         let values = (0..model.count()).map(|_| c.f64()).collect::<Result<_, _>>()?;
         if cameras.insert(id, Camera { model, width, height, values }).is_some() {
             c.at = start;
-            return Err(c.bad(format!("camera {id} stands there twice")));
+            return Err(c.bad(format!("camera {id} appears twice")));
         }
     }
     c.end()?;

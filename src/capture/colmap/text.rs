@@ -1,7 +1,7 @@
 //! The text files: a line of numbers for each entry, two for an image, `#` before comments.
 
 use super::super::folder::{in_file, shortened};
-use super::super::lens::LensModel;
+use super::super::frame::LensModel;
 use super::{Camera, Image, Model, Rigid};
 use crate::io::Limits;
 use crate::{Error, Result};
@@ -89,7 +89,7 @@ fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>> {
         let values = values.collect::<Result<Vec<f64>>>()?;
         line.end()?;
         if cameras.insert(id, Camera { model, width, height, values }).is_some() {
-            return Err(line.bad(format_args!("camera {id} stands there twice")));
+            return Err(line.bad(format_args!("camera {id} appears twice")));
         }
     }
     Ok(cameras)

@@ -10,8 +10,8 @@
 //! that a reconstruction must not take for the head.
 
 use super::shape::{
-    EYE, EYE_RADIUS, HeadMaterial, LOWER_LIP, OFFSET, Part, SyntheticHead, UPPER_LIP, cloud, combed, noise,
-    parts, smooth, trilinear, unit,
+    EYE, EYE_RADIUS, HeadMaterial, OFFSET, SyntheticHead, cloud, combed, lower_lip, noise, parts, smooth,
+    trilinear, unit, upper_lip,
 };
 use crate::geom::{Aabb, Camera};
 use crate::image::{Gray, Photo, quantize, srgb_from_linear};
@@ -241,10 +241,10 @@ impl DistanceGrid {
         let g = ((p - self.bounds.min) / CELL).clamp(Vec3::ZERO, self.size.as_vec3() - 1.001);
         let i = g.as_uvec3();
         let f = g - i.as_vec3();
-        let (row, slab) = (self.size.x as usize, (self.size.x * self.size.y) as usize);
-        let first = (i.z * self.size.y * self.size.x + i.y * self.size.x + i.x) as usize;
-        let cell = &self.values[first..first + slab + row + 2];
-        trilinear(f, std::array::from_fn(|c| cell[(c >> 2) * slab + (c >> 1 & 1) * row + (c & 1)]))
+        trilinear(f, |corner| {
+            let [x, y, z] = corner.map(|c| c as u32);
+            self.values[(((i.z + z) * self.size.y + i.y + y) * self.size.x + i.x + x) as usize]
+        })
     }
 
     /// A stride that surely meets nothing: the slope is at most 1, so the trilinear value errs by
@@ -308,7 +308,7 @@ fn skin(q: Vec3) -> Vec3 {
     c *= Vec3::ONE - red.min(1.0) * Vec3::new(0.02, 0.24, 0.22);
 
     // lips: inside either lip's tube, fading out towards the skin
-    let lips = UPPER_LIP.distance(s).min(LOWER_LIP.distance(s)) + 0.0008 * (noise(q * 700.0) - 0.5);
+    let lips = upper_lip(s).min(lower_lip(s)) + 0.0008 * (noise(q * 700.0) - 0.5);
     let lips = smooth(0.0026, 0.0006, lips) * smooth(-0.07, -0.08, q.y);
     c = c
         .lerp(Vec3::new(0.43, 0.135, 0.120) * (0.85 + 0.3 * noise(q * Vec3::new(900.0, 200.0, 200.0))), lips);

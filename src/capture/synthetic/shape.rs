@@ -43,9 +43,6 @@ pub(super) const OFFSET: Vec3 = Vec3::new(0.03, -0.02, 0.05);
 /// 1.69, in the combed hair). Dividing by it makes every value a safe step for a ray.
 const LIPSCHITZ: f32 = 1.75;
 
-/// Within this distance of each other skin and hair flow together.
-const HAIR_BLEND: f32 = 0.002;
-
 /// The middle of an eyeball on the +X side, head coordinates.
 pub(super) const EYE: Vec3 = Vec3::new(0.0315, -0.0765, 0.004);
 /// Radius of an eyeball, metres.
@@ -132,7 +129,7 @@ impl SyntheticHead {
 impl MaterialDistances {
     /// The union of all materials; skin and hair meet without a crack.
     pub fn whole(&self) -> f32 {
-        union(self.skin.min(self.eye), self.hair, HAIR_BLEND).min(self.garment)
+        union(self.skin.min(self.eye), self.hair, 0.002).min(self.garment)
     }
 
     pub fn material(&self) -> HeadMaterial {
@@ -159,19 +156,25 @@ fn above_jaw(q: Vec3) -> bool {
 pub(super) fn parts(q: Vec3) -> MaterialDistances {
     let s = Vec3::new(q.x.abs(), q.y, q.z); // the features are symmetric, the hair is not
     let skull = ellipsoid(q - Vec3::new(0.0, 0.020, 0.043), Vec3::new(0.0745, 0.094, 0.085));
-    let (skin, eye) = (skin(q, s, skull), sphere(s - EYE, EYE_RADIUS));
-    MaterialDistances { skin, eye, hair: hair(q, skull, skin.min(eye)), garment: garment(q) }
+    MaterialDistances {
+        skin: skin(q, s, skull),
+        eye: sphere(s - EYE, EYE_RADIUS),
+        hair: hair(q, skull),
+        garment: garment(q),
+    }
 }
 
 fn skin(q: Vec3, s: Vec3, skull: f32) -> f32 {
     let mut d = skull;
     // each part is evaluated only where its blend can reach
     if q.z > -0.165 {
-        d = Ellipsoid([0.0, -0.030, -0.026], [0.059, 0.063, 0.090]).joined(d, q, 0.03);
+        let face = ellipsoid(q - Vec3::new(0.0, -0.030, -0.026), Vec3::new(0.059, 0.063, 0.090));
+        d = union(d, face, 0.03);
     }
     if q.z > -0.165 && q.z < 0.035 {
-        d = Cone([0.050, 0.004, -0.052], [0.015, -0.066, -0.100], 0.018, 0.015).joined(d, s, 0.024);
-        d = Ellipsoid([0.0, -0.079, -0.102], [0.022, 0.019, 0.017]).joined(d, q, 0.018);
+        let jaw = cone(s, Vec3::new(0.050, 0.004, -0.052), Vec3::new(0.015, -0.066, -0.100), 0.018, 0.015);
+        d = union(d, jaw, 0.024);
+        d = union(d, ellipsoid(q - Vec3::new(0.0, -0.079, -0.102), Vec3::new(0.022, 0.019, 0.017)), 0.018);
         d = union(d, sphere(s - Vec3::new(0.043, -0.062, -0.020), 0.017), 0.028);
     }
     if q.z < 0.035 {
@@ -185,33 +188,41 @@ fn skin(q: Vec3, s: Vec3, skull: f32) -> f32 {
 
 /// Brow, sockets, lids, nose, mouth: everything in front. `head` is the distance without them.
 fn features(s: Vec3, head: f32) -> f32 {
-    let mut d = Cone([0.008, -0.086, 0.021], [0.046, -0.073, 0.021], 0.008, 0.007).joined(head, s, 0.022);
-    d = Ellipsoid([0.033, -0.099, 0.002], [0.020, 0.016, 0.012]).taken_from(d, s, 0.014);
+    let brow = cone(s, Vec3::new(0.008, -0.086, 0.021), Vec3::new(0.046, -0.073, 0.021), 0.008, 0.007);
+    let mut d = union(head, brow, 0.022);
+    d = cut(d, ellipsoid(s - Vec3::new(0.033, -0.099, 0.002), Vec3::new(0.020, 0.016, 0.012)), 0.014);
     // the lids: a shell around the eyeball with an almond cut out of it
     let lid = sphere(s - EYE, EYE_RADIUS + 0.0016);
-    let almond = Ellipsoid([0.0005, -0.012, -0.0008], [0.0120, 0.012, 0.0041]);
-    // cutting only makes a distance larger
-    if lid < d + 0.005 {
-        d = union(d, almond.taken_from(lid, s - EYE, 0.0015), 0.005);
-    }
+    let almond = ellipsoid(s - EYE - Vec3::new(0.0005, -0.012, -0.0008), Vec3::new(0.0120, 0.012, 0.0041));
+    d = union(d, cut(lid, almond, 0.0015), 0.005);
 
-    // bridge, tip, wings and holes of the nose
-    d = Cone([0.0, -0.084, 0.018], [0.0, -0.1105, -0.029], 0.0080, 0.0105).joined(d, s, 0.018);
+    let bridge = cone(s, Vec3::new(0.0, -0.084, 0.018), Vec3::new(0.0, -0.1105, -0.029), 0.0080, 0.0105);
+    d = union(d, bridge, 0.018);
     d = union(d, sphere(s - Vec3::new(0.0, -0.1125, -0.0325), 0.0098), 0.008);
-    d = Ellipsoid([0.0128, -0.0985, -0.0360], [0.0080, 0.0110, 0.0078]).joined(d, s, 0.009);
-    d = Ellipsoid([0.0065, -0.1060, -0.0450], [0.0034, 0.0062, 0.0045]).taken_from(d, s, 0.003);
+    d = union(
+        d,
+        ellipsoid(s - Vec3::new(0.0128, -0.0985, -0.0360), Vec3::new(0.0080, 0.0110, 0.0078)),
+        0.009,
+    );
+    d = cut(d, ellipsoid(s - Vec3::new(0.0065, -0.1060, -0.0450), Vec3::new(0.0034, 0.0062, 0.0045)), 0.003);
 
-    // mouth: its mound, the lips, the seam between them, the groove above
-    d = Ellipsoid([0.0, -0.076, -0.066], [0.036, 0.021, 0.027]).joined(d, s, 0.016);
-    d = UPPER_LIP.joined(d, s, 0.006);
-    d = LOWER_LIP.joined(d, s, 0.006);
-    d = Cone([0.0, -0.1035, -0.0672], [0.0255, -0.0890, -0.0668], 0.0005, 0.0005).taken_from(d, s, 0.0032);
-    Cone([0.0, -0.1065, -0.046], [0.0, -0.1045, -0.057], 0.002, 0.003).taken_from(d, s, 0.005)
+    let mound = ellipsoid(s - Vec3::new(0.0, -0.076, -0.066), Vec3::new(0.036, 0.021, 0.027));
+    d = union(d, mound, 0.016);
+    d = union(d, upper_lip(s), 0.006);
+    d = union(d, lower_lip(s), 0.006);
+    let seam = cone(s, Vec3::new(0.0, -0.1035, -0.0672), Vec3::new(0.0255, -0.0890, -0.0668), 0.0005, 0.0005);
+    d = cut(d, seam, 0.0032);
+    let philtrum = cone(s, Vec3::new(0.0, -0.1065, -0.046), Vec3::new(0.0, -0.1045, -0.057), 0.002, 0.003);
+    cut(d, philtrum, 0.005)
 }
 
-pub(super) const UPPER_LIP: Cone =
-    Cone([0.005, -0.0958, -0.0626], [0.0245, -0.0845, -0.0664], 0.0056, 0.0022);
-pub(super) const LOWER_LIP: Cone = Cone([0.0, -0.0945, -0.0728], [0.0215, -0.0850, -0.0685], 0.0068, 0.0025);
+pub(super) fn upper_lip(s: Vec3) -> f32 {
+    cone(s, Vec3::new(0.005, -0.0958, -0.0626), Vec3::new(0.0245, -0.0845, -0.0664), 0.0056, 0.0022)
+}
+
+pub(super) fn lower_lip(s: Vec3) -> f32 {
+    cone(s, Vec3::new(0.0, -0.0945, -0.0728), Vec3::new(0.0215, -0.0850, -0.0685), 0.0068, 0.0025)
+}
 
 /// The middle of the ear on the +X side, head coordinates.
 const EAR: Vec3 = Vec3::new(0.0765, 0.020, -0.006);
@@ -232,7 +243,7 @@ fn ear(s: Vec3) -> f32 {
 
 /// Ends inside the garment, so that only the garment stands on the ground.
 fn neck(q: Vec3) -> f32 {
-    Cone([0.0, 0.026, -0.050], [0.0, 0.035, -0.135], 0.046, 0.0485).distance(q)
+    cone(q, Vec3::new(0.0, 0.026, -0.050), Vec3::new(0.0, 0.035, -0.135), 0.046, 0.0485)
 }
 
 /// Shoulders and a collar, cut level underneath.
@@ -255,12 +266,8 @@ fn ring(p: Vec3, radius: f32, tube: f32) -> f32 {
     Vec2::new(out, 0.45 * z).length() - tube
 }
 
-/// The cap: the skull grown outward, ended by a ragged hairline, displaced along strands. Where it lies so far behind
-/// what is `before` it that the two do not blend, a lower bound.
-fn hair(q: Vec3, skull: f32, before: f32) -> f32 {
-    if skull - 0.022 > (before + HAIR_BLEND).max(0.006) {
-        return skull - 0.022;
-    }
+/// The cap: the skull grown outward, ended by a ragged hairline, displaced along strands.
+fn hair(q: Vec3, skull: f32) -> f32 {
     // hair above a plane rising from the nape over the ears to the forehead; sideburns before the
     // ears hang below it, the ears stay free
     let side = smooth(0.055, 0.072, q.x.abs());
@@ -307,68 +314,18 @@ fn sphere(p: Vec3, radius: f32) -> f32 {
     p.length() - radius
 }
 
-/// First-order distance to an ellipsoid around the origin: exact on the surface, right in sign everywhere.
+/// First-order distance to an ellipsoid: exact on the surface, right in sign everywhere.
 fn ellipsoid(p: Vec3, radii: Vec3) -> f32 {
     let k0 = (p / radii).length();
     let k1 = (p / (radii * radii)).length();
     if k0 < 1e-3 { -radii.min_element() } else { k0 * (k0 - 1.0) / k1 }
 }
 
-/// A part of the head that is blended with the others. Most parts are too far away from most points to have an effect, and
-/// a bound tells so for less than the distance costs; the result is the same to the last bit.
-pub(super) trait Part {
-    fn distance(&self, p: Vec3) -> f32;
-
-    /// Is the distance from `p` surely over `limit`?
-    fn is_beyond(&self, p: Vec3, limit: f32) -> bool;
-
-    /// [`union`] of `d` and this part.
-    fn joined(&self, d: f32, p: Vec3, k: f32) -> f32 {
-        if self.is_beyond(p, d + k) { d } else { union(d, self.distance(p), k) }
-    }
-
-    /// `d` without this part, as [`cut`].
-    fn taken_from(&self, d: f32, p: Vec3, k: f32) -> f32 {
-        if self.is_beyond(p, k - d) { d } else { cut(d, self.distance(p), k) }
-    }
-}
-
-/// What rounding may add to a bound, metres.
-const SLACK: f32 = 1e-5;
-
-/// An ellipsoid: its middle and its radii.
-struct Ellipsoid([f32; 3], [f32; 3]);
-
-impl Part for Ellipsoid {
-    fn distance(&self, p: Vec3) -> f32 {
-        ellipsoid(p - Vec3::from(self.0), self.1.into())
-    }
-
-    /// With the largest radius R and the smallest r, `(|p| / R − 1) r` is at most the first-order distance outside.
-    fn is_beyond(&self, p: Vec3, limit: f32) -> bool {
-        let radii = Vec3::from(self.1);
-        let reach = radii.max_element() * (1.0 + (limit + SLACK) / radii.min_element());
-        limit >= 0.0 && p.distance_squared(self.0.into()) > reach * reach
-    }
-}
-
-/// A capsule between two points whose radius changes linearly from the third value to the fourth.
-pub(super) struct Cone([f32; 3], [f32; 3], f32, f32);
-
-impl Part for Cone {
-    fn distance(&self, p: Vec3) -> f32 {
-        let (a, b) = (Vec3::from(self.0), Vec3::from(self.1));
-        let (pa, ba) = (p - a, b - a);
-        let h = (pa.dot(ba) / ba.length_squared()).clamp(0.0, 1.0);
-        (pa - ba * h).length() - (self.2 + (self.3 - self.2) * h)
-    }
-
-    /// By the ball around it.
-    fn is_beyond(&self, p: Vec3, limit: f32) -> bool {
-        let (a, b) = (Vec3::from(self.0), Vec3::from(self.1));
-        let reach = 0.5 * a.distance(b) + self.2.max(self.3) + limit + SLACK;
-        reach <= 0.0 || p.distance_squared(0.5 * (a + b)) > reach * reach
-    }
+/// A capsule from `a` to `b` whose radius goes linearly from `ra` to `rb`.
+fn cone(p: Vec3, a: Vec3, b: Vec3, ra: f32, rb: f32) -> f32 {
+    let (pa, ba) = (p - a, b - a);
+    let h = (pa.dot(ba) / ba.length_squared()).clamp(0.0, 1.0);
+    (pa - ba * h).length() - (ra + (rb - ra) * h)
 }
 
 /// Smooth union: within `k` of each other the two surfaces flow together.
@@ -407,38 +364,31 @@ fn mix(mut z: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// Random numbers in 0..=1 at the corners of the lattice cell at `i`; corner `4z + 2y + x`.
-fn lattice(i: IVec3) -> [f32; 8] {
-    const PRIMES: [u32; 3] = [0x8DA6_B343, 0xD816_3841, 0xCB1A_B31F];
-    let [x, y, z] = [0, 1, 2].map(|k| {
-        let low = (i[k] as u32).wrapping_mul(PRIMES[k]);
-        [low, low.wrapping_add(PRIMES[k])]
-    });
-    std::array::from_fn(|c| {
-        let mut h = x[c & 1] ^ y[c >> 1 & 1] ^ z[c >> 2];
-        h = (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D);
-        h = (h ^ (h >> 12)).wrapping_mul(0x297A_2D39);
-        (h ^ (h >> 15)) as f32 / u32::MAX as f32
-    })
+fn lattice(x: i32, y: i32, z: i32) -> f32 {
+    let mut h = (x as u32).wrapping_mul(0x8DA6_B343)
+        ^ (y as u32).wrapping_mul(0xD816_3841)
+        ^ (z as u32).wrapping_mul(0xCB1A_B31F);
+    h = (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D);
+    h = (h ^ (h >> 12)).wrapping_mul(0x297A_2D39);
+    (h ^ (h >> 15)) as f32 / u32::MAX as f32
 }
 
 /// Value noise in 0..=1 over a unit lattice, trilinear in cubic-smoothed coordinates: continuous
 /// with its slope, which stays below 1.5 per axis.
 pub(super) fn noise(p: Vec3) -> f32 {
-    // `floor` of numbers that fit into 32 bits, without the library call
-    let cut = p.as_ivec3();
-    let i = cut - IVec3::from(cut.as_vec3().cmpgt(p));
-    let f = p - i.as_vec3();
+    let floor = p.floor();
+    let f = p - floor;
     let t = f * f * (3.0 - 2.0 * f);
-    trilinear(t, lattice(i))
+    let i: IVec3 = floor.as_ivec3();
+    trilinear(t, |[x, y, z]| lattice(i.x + x, i.y + y, i.z + z))
 }
 
-/// Between the corners of a cell, at `t` inside it; corner `4z + 2y + x`.
-#[inline(always)]
-pub(super) fn trilinear(t: Vec3, corners: [f32; 8]) -> f32 {
+/// Between the corners (0 or 1 along each axis) of a cell, at `t` inside it.
+pub(super) fn trilinear(t: Vec3, corner: impl Fn([i32; 3]) -> f32) -> f32 {
     let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
-    let edges: [f32; 4] = std::array::from_fn(|k| mix(corners[2 * k], corners[2 * k + 1], t.x));
-    mix(mix(edges[0], edges[1], t.y), mix(edges[2], edges[3], t.y), t.z)
+    let edge = |y, z| mix(corner([0, y, z]), corner([1, y, z]), t.x);
+    let face = |z| mix(edge(0, z), edge(1, z), t.y);
+    mix(face(0), face(1), t.z)
 }
 
 /// Three octaves of [`noise`], 0..=1.
@@ -523,7 +473,7 @@ mod tests {
     #[test]
     fn noise_meets_its_lattice_and_is_continuous_across_cells() {
         let at = Vec3::new(3.0, -2.0, 5.0);
-        assert_eq!(noise(at), lattice(IVec3::new(3, -2, 5))[0]);
+        assert_eq!(noise(at), lattice(3, -2, 5));
         let (below, above) = (noise(at - Vec3::splat(1e-4)), noise(at + Vec3::splat(1e-4)));
         assert!((below - above).abs() < 1e-3);
     }

@@ -19,8 +19,7 @@
 use super::processor::{self, IMAGENET, Normal};
 use super::sam::resized;
 use crate::config::VitmatteColors;
-use crate::image::{Gray, Photo, quantize};
-use crate::mask::scale::bilinear;
+use crate::image::{Gray, Photo, bilinear, quantize};
 use crate::onnx::{NetworkArray, NetworkSession, Role, file_error};
 use crate::{Error, Result};
 use std::path::Path;

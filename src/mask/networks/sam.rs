@@ -10,9 +10,8 @@
 //! end when no box is given. S and the embedding's width are read from the files.
 
 use super::processor::{self, IMAGENET, Normal};
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, bilinear};
 use crate::mask::prompts::{self, Click};
-use crate::mask::scale::bilinear;
 use crate::onnx::{Contract, NetworkArray, NetworkSession, Role, file_error};
 use crate::{Error, Result};
 use image::RgbImage;
