@@ -28,7 +28,6 @@ mod format;
 mod frame;
 mod gather;
 pub mod inspect;
-mod lens;
 mod llff;
 mod masks;
 mod metashape;

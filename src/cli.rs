@@ -96,9 +96,6 @@ struct ClickOptions {
     /// Make masks without clicks, by a network that predicts alpha (U²-Net, ISNet, MODNet, BiRefNet), an ONNX file
     #[arg(long, value_name = "FILE", conflicts_with_all = ["prompts", "point"])]
     alpha_net: Option<PathBuf>,
-    /// Run networks with this ONNX Runtime library instead of the built-in engine
-    #[arg(long, value_name = "FILE")]
-    onnxruntime: Option<PathBuf>,
 }
 
 impl ClickOptions {
@@ -118,7 +115,6 @@ impl ClickOptions {
             file("--sam-decoder", "mask.sam_decoder", &self.sam_decoder)?,
             file("--vitmatte", "mask.vitmatte", &self.vitmatte)?,
             file("--alpha-net", "mask.alpha_net", &self.alpha_net)?,
-            file("--onnxruntime", "mask.onnxruntime", &self.onnxruntime)?,
         ];
         let mut keys: Vec<KeyOption> = files.into_iter().flatten().collect();
         if !self.point.is_empty() {
@@ -206,7 +202,7 @@ background twice. The masks of the other views follow from the cameras.")]
         #[command(flatten)]
         clicks: ClickOptions,
         /// Write a page to click on instead, to --out or <capture>_clicks.html
-        #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "alpha_net", "onnxruntime"])]
+        #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "alpha_net"])]
         page: bool,
     },
     /// Stage: train T-Face, a radiance field of the masked photographs
@@ -325,7 +321,7 @@ all trainings (capture.tiles).")]
   tiface preview runs/002_00                    draw a three-quarter view, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --up z --out scan.png
   tiface preview runs/002_00 --sheet            draw all sides, wireframe, normals, texture coordinates, errors
-  tiface preview runs/002_00 --turntable --out turn.gif     animate; also .png, and .mp4 with ffmpeg
+  tiface preview runs/002_00 --turntable --out turn.gif     animate; also .png
   tiface preview runs/002_00 --cameras test --out views/    draw from the held-out cameras
   tiface preview runs/002_00 --page             write a page to turn it in a browser
   tiface preview runs/002_00 --watch            write watch.html in the run, and update it while the run works")]

@@ -1,7 +1,7 @@
 //! What went wrong, what to do about it, and how the process should end: one error for the whole crate.
 //!
 //! A caller acts on the kind (retry, correct the command, tell a person); a person reads the message and the
-//! suggested fix. Modules add no enums of their own unless somebody looks at the variants.
+//! suggested fix. Modules add no enums of their own unless a caller matches on the variants.
 
 use std::fmt::{self, Display};
 
@@ -31,7 +31,7 @@ impl ErrorKind {
         self as u8
     }
 
-    /// Returns whether somebody asked for this end, so that it is no failure.
+    /// Returns whether the process was stopped by a signal, which is no failure.
     pub fn is_stop(self) -> bool {
         matches!(self, ErrorKind::Interrupted | ErrorKind::Terminated)
     }
@@ -89,7 +89,7 @@ impl Error {
     }
 
     /// Returns the error that ends work on request, with what became of the work. It counts as
-    /// [`ErrorKind::Interrupted`] until whoever heard the signal says which one it was.
+    /// [`ErrorKind::Interrupted`] until the signal handler's kind replaces it.
     pub fn stopped(kept: impl Display) -> Error {
         Error { hint: "repeat the command to continue".into(), ..Error::new(ErrorKind::Interrupted, kept) }
     }

@@ -3,10 +3,12 @@
 //! The fields learn and render **sRGB-coded** color, as the published system does, so a render
 //! here is coded too and meets linear light only at the edge (EXR, glTF vertex colors, filtering).
 
-mod reduce;
+mod resize;
 
-pub(crate) use reduce::{CODED, LIGHT, average};
-pub use reduce::{reduce_photo, working_size};
+pub(crate) use resize::bilinear;
+pub use resize::{
+    enlarge, reduce_photo, reduce_to_rows, resize_gray, resize_hard, size_at_rows, working_size,
+};
 
 /// sRGB-coded from linear (IEC 61966-2-1), any value clamped to 0..=1.
 pub fn srgb_from_linear(c: f32) -> f32 {

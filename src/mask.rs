@@ -11,7 +11,6 @@
 
 mod hull;
 pub mod morphology;
-pub mod scale;
 
 pub mod prompts;
 
@@ -21,7 +20,6 @@ pub mod grabcut;
 
 pub mod propagate;
 
-pub mod agreement;
 pub mod consistency;
 
 pub mod matting;

@@ -19,11 +19,12 @@
 //! ```
 
 pub mod distance;
-#[cfg_attr(not(feature = "matting"), path = "metrics/no_lpips.rs")]
+#[cfg(feature = "matting")]
 mod lpips;
 mod parts;
 mod psnr_ssim;
 
+#[cfg(feature = "matting")]
 pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr_ssim::{psnr, ssim_reflect_map, ssim_valid};
@@ -81,10 +82,7 @@ pub struct Metrics {
 impl Metrics {
     /// Returns the views with their means.
     pub fn new(views: Vec<ViewMetrics>) -> Metrics {
-        let mean = |of: fn(&ViewMetrics) -> Option<f64>| {
-            let values: Vec<f64> = views.iter().filter_map(of).collect();
-            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-        };
+        let mean = |of: fn(&ViewMetrics) -> Option<f64>| mean(&views, of);
         let mean = Means {
             psnr: mean(|v| v.psnr),
             ssim: mean(|v| v.ssim),
@@ -94,6 +92,12 @@ impl Metrics {
         };
         Metrics { mean, views }
     }
+}
+
+/// Returns the mean over the views that have a value.
+fn mean<V>(views: &[V], of: fn(&V) -> Option<f64>) -> Option<f64> {
+    let values: Vec<f64> = views.iter().filter_map(of).collect();
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 /// Compares a render with the photograph of the same view.

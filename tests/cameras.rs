@@ -250,9 +250,9 @@ fn hostile_metashape_files_are_refused_by_name() {
         "<!DOCTYPE d [<!ENTITY a \"aaaa\"><!ENTITY b \"&a;&a;\">]>{}",
         sound.split_once("?>").unwrap().1
     );
-    says(&bomb, &["cameras.xml", "not a sound XML file"]);
+    says(&bomb, &["cameras.xml", "not a valid XML file"]);
     let deep = format!("<document><chunk>{}", "<a>".repeat(300_000));
-    says(&deep, &["cameras.xml", "not a sound XML file"]);
+    says(&deep, &["cameras.xml", "not a valid XML file"]);
     for cut in (200..sound.len() - 11).step_by(37) {
         put(&dir, "cameras.xml", &sound[..cut]);
         assert!(open(&dir).is_err(), "cut at {cut}");
@@ -346,7 +346,7 @@ fn realitycapture_tables_and_sidecars_say_the_same() {
         ("0 0 0.001", "0 1 0.001", &["k4"]),
         ("Skew=\"0\"", "Skew=\"0.1\"", &["skewed"]),
         ("FocalLength35mm=\"45\"", "FocalLength35mm=\"inf\"", &["`FocalLength35mm` is not 1 finite"]),
-        ("</rdf:RDF>", "", &["not a sound XMP file"]),
+        ("</rdf:RDF>", "", &["not a valid XMP file"]),
         ("<xcr:Position>", "<xcr:Position>7 ", &["`Position` is not 3"]),
     ] {
         put(&beside, "images/03.xmp", xmp(3).replace(old, new));

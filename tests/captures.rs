@@ -148,13 +148,13 @@ fn inspecting_a_sound_capture_finds_it_sound() {
         let mut options = CaptureOptions::default();
         if masks == 0 {
             let found = inspect(&root, &options);
-            assert!(!found.is_sound() && found.problems.len() == 1, "{:?}", found.problems);
+            assert!(!found.is_usable() && found.problems.len() == 1, "{:?}", found.problems);
             assert!(found.problems[0].hint.contains("--page"), "{:?}", found.problems);
             options.masks = MaskSource::None; // as asked
         }
         let found = inspect(&root, &options);
         eprintln!("{found}");
-        assert!(found.is_sound() && found.masks == masks, "{:?}", found.problems);
+        assert!(found.is_usable() && found.masks == masks, "{:?}", found.problems);
         assert!(found.scene.unwrap().size().cmpgt(Vec3::ZERO).all());
         assert!(serde_json::to_string(&found).unwrap().contains("\"problems\":[]"));
         let distance = found.distance.unwrap();

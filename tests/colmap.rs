@@ -342,7 +342,7 @@ fn hostile_numbers_and_names_are_refused_by_name() {
     refused(&with(&|r| r[2].translation.y = f64::INFINITY), &[images, "not finite"]);
     refused(&with(&|r| r[2].quaternion = [0.0; 4]), &[images, "quaternion is zero"]);
     refused(&with(&|r| r[2].camera = 99), &[images, "camera 99 is not in the cameras file"]);
-    refused(&with(&|r| r[2].id = 2), &["stands there twice"]);
+    refused(&with(&|r| r[2].id = 2), &["appears twice"]);
     refused(&with(&|r| r[2].name = r[1].name.clone()), &["would both be called `cam 1/01`"]);
     for name in ["../../x.png", "/etc/passwd", "C:\\x.png", "..\\..\\x.png", ""] {
         let dir = with(&|r| r[2].name = name.as_bytes().to_vec());
@@ -404,7 +404,7 @@ fn hostile_numbers_and_names_are_refused_by_name() {
     refused(&dir, &["is 160 × 120 pixels", "says 170 × 120"]);
     put(&dir, "sparse/0/images.bin", huge(0, b""));
     refused(&dir, &["images.bin", "it has no images"]);
-    assert!(!inspect(dir.path(), &CaptureOptions::default()).is_sound());
+    assert!(!inspect(dir.path(), &CaptureOptions::default()).is_usable());
 }
 
 #[test]
@@ -487,7 +487,7 @@ fn every_format_is_written_and_read_again() {
         same(&head, &Capture { up, ..last.clone() }, true);
         // what is there is never touched
         let e = convert(&from, format, &folder).unwrap_err();
-        assert!(e.to_string().contains("is there already"), "{e}");
+        assert!(e.to_string().contains("already exists"), "{e}");
     }
     assert!(last.format.starts_with("transforms"), "{}", last.format);
 }

@@ -677,7 +677,7 @@ fn more_frames_than_views_are_allowed_is_an_error_in_a_moment() {
     // one more than counters of views can hold
     let many = |_: &[String]| format!(r#"{{"frames": [{}0]}}"#, "0,".repeat(65_535));
     let e = open(&capture_with(many, 1)).unwrap_err();
-    assert!(e.to_string().contains("the number of frames is 65536, the limit is 65535"), "{e}");
+    assert!(e.to_string().contains("the number of views is 65536, the limit is 65535"), "{e}");
     // a million entries are more values than one file may hold
     let e =
         open(&capture_with(|_| format!(r#"{{"frames": [{}0]}}"#, "[],".repeat(9_000_000)), 1)).unwrap_err();
@@ -1072,11 +1072,11 @@ fn inspecting_reports_every_problem_not_the_first() {
     fs::write(dir.path().join("images/5.png"), &torn).unwrap();
     let found = inspect(dir.path(), &CaptureOptions::default());
     let text = found.to_string();
-    for word in ["mirrors", "outside the capture", "5 × 5", "`images/none.png`", "5.png` is not a sound PNG"]
+    for word in ["mirrors", "outside the capture", "5 × 5", "`images/none.png`", "5.png` is not a valid PNG"]
     {
         assert!(text.contains(word), "{word} is missing in\n{text}");
     }
-    assert!(!found.is_sound() && found.problems.len() >= 4);
+    assert!(!found.is_usable() && found.problems.len() >= 4);
     assert!(found.problems.iter().all(|p| !p.hint.is_empty()));
 }
 
@@ -1158,7 +1158,7 @@ fn photographs_without_masks_do_not_pass_inspection() {
         let found = inspect(dir.path(), options);
         let of = |p: &&tiface::capture::inspect::Problem| p.hint.contains("--page");
         let problem = found.problems.iter().find(of).cloned();
-        assert!(problem.is_none() || !found.to_string().contains("nothing stands in the way"));
+        assert!(problem.is_none() || !found.to_string().contains("no problems found"));
         // what stops training is what inspection says
         let open = capture::open(dir.path(), options).unwrap();
         let required = capture::require_masks(&open, options);

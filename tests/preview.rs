@@ -203,33 +203,3 @@ fn what_cannot_be_shown_is_said() {
         assert!(err(&o).contains(text), "{words:?}: {}", err(&o));
     }
 }
-
-#[test]
-#[cfg(unix)]
-fn a_film_goes_through_ffmpeg_or_says_that_there_is_none() {
-    use std::os::unix::fs::PermissionsExt;
-    use std::process::Command;
-    let dir = folder();
-    let bin = dir.path().join("bin");
-    std::fs::create_dir(&bin).unwrap();
-    let film = |path: &Path| {
-        let words = ["preview", "b.ply", "--turntable", "--frames", "3", "--size", "16", "--out", "a.mp4"];
-        Command::new(env!("CARGO_BIN_EXE_tiface"))
-            .args(words)
-            .current_dir(dir.path())
-            .env("XDG_CONFIG_HOME", dir.path())
-            .env("PATH", path)
-            .output()
-            .unwrap()
-    };
-    let o = film(&bin);
-    assert!(code(&o) == 1 && err(&o).contains("`ffmpeg` cannot be started"), "{}", err(&o));
-    assert!(!dir.path().join("a.mp4").exists());
-    // one that keeps what it is given
-    let script = "#!/bin/sh\nfor file; do :; done\n/bin/cat > \"$file\"\n";
-    std::fs::write(bin.join("ffmpeg"), script).unwrap();
-    std::fs::set_permissions(bin.join("ffmpeg"), std::fs::Permissions::from_mode(0o755)).unwrap();
-    let o = film(&bin);
-    assert_eq!(code(&o), 0, "{}", err(&o));
-    assert_eq!(std::fs::read(dir.path().join("a.mp4")).unwrap().len(), 3 * 16 * 16 * 3);
-}

@@ -57,18 +57,8 @@ readers() {
     npm ci --silent --no-audit --no-fund --prefix tools/readers
 }
 
-# The library of ONNX Runtime comes as a Python wheel; only the library in it is used.
-onnx_runtime() {
-  [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv || return
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements-onnx.txt || return
-  TIFACE_ONNXRUNTIME=$(.venv/bin/python -c 'import glob, importlib.util as i
-print(*glob.glob(i.find_spec("onnxruntime").submodule_search_locations[0] + "/capi/libonnxruntime.*"))') || return
-  [ -f "$TIFACE_ONNXRUNTIME" ] || { echo "the wheel holds no library: '$TIFACE_ONNXRUNTIME'" >&2; return 1; }
-  export TIFACE_ONNXRUNTIME
-}
-
 # Tests print what they skip; the summary repeats those lines, so that a skipped test is not taken for a passed one.
-# One build serves them all: with the networks, on both engines, and with the kernels of GPUs.
+# One build serves them all: with the networks and with the kernels of GPUs.
 tests() {
   cargo test --release --features matting,wgpu --no-fail-fast "$@" -- --nocapture 2>&1 | tee "$scratch/tests.log"
   local ended=${PIPESTATUS[0]}
@@ -216,7 +206,6 @@ lint() {
 }
 
 unit() {
-  step "ONNX Runtime is installed" onnx_runtime
   need_vulkan
   step "unit tests" tests --lib --bins
   step "examples in the documentation" tests --doc
@@ -224,7 +213,6 @@ unit() {
 
 integration() {
   need_program
-  step "ONNX Runtime is installed" onnx_runtime
   need_vulkan
   step "integration tests" tests --test '*'
 }

@@ -223,40 +223,58 @@ pub(super) fn carve(cube: &Cube, silhouettes: &[SilhouetteTable]) -> Carved {
     carved
 }
 
-/// Removes every 26-connected piece smaller than `share` of the largest one; says how many cells went.
-pub(crate) fn drop_dust(kept: &mut [bool], n: usize, share: f64) -> usize {
-    let mut label = vec![0u32; kept.len()];
-    let mut sizes: Vec<usize> = vec![0];
+/// Connected pieces of a set of cells or pixels.
+pub(crate) struct Pieces {
+    /// The piece of each element, numbered from 1 in the order of their first elements; 0 outside the set.
+    pub label: Vec<u32>,
+    /// How many elements each piece has; 0 for number 0.
+    pub size: Vec<usize>,
+}
+
+/// Finds the connected pieces of the marked elements; `around` returns the neighbors of an element.
+pub(crate) fn pieces<I: Iterator<Item = usize>>(marked: &[bool], around: impl Fn(usize) -> I) -> Pieces {
+    let mut label = vec![0u32; marked.len()];
+    let mut size: Vec<usize> = vec![0];
     let mut stack = Vec::new();
-    for start in 0..kept.len() {
-        if !kept[start] || label[start] != 0 {
+    for start in 0..marked.len() {
+        if !marked[start] || label[start] != 0 {
             continue;
         }
-        let id = sizes.len() as u32;
-        sizes.push(0);
+        let id = size.len() as u32;
+        size.push(0);
         label[start] = id;
         stack.push(start);
         while let Some(i) = stack.pop() {
-            sizes[id as usize] += 1;
-            let (x, y, z) = (i / (n * n), i / n % n, i % n);
-            let around = |v: usize| v.saturating_sub(1)..(v + 2).min(n);
-            for u in around(x) {
-                for v in around(y) {
-                    for w in around(z) {
-                        let j = (u * n + v) * n + w;
-                        if kept[j] && label[j] == 0 {
-                            label[j] = id;
-                            stack.push(j);
-                        }
-                    }
+            size[id as usize] += 1;
+            for j in around(i) {
+                if marked[j] && label[j] == 0 {
+                    label[j] = id;
+                    stack.push(j);
                 }
             }
         }
     }
-    let least = share * sizes.iter().copied().max().unwrap_or(0) as f64;
+    Pieces { label, size }
+}
+
+/// Neighbors of a cell over faces, or over corners too.
+pub(crate) fn around([x, y, z]: [usize; 3], n: usize, corners: bool) -> impl Iterator<Item = usize> {
+    let span = move |v: usize| v.saturating_sub(1)..(v + 2).min(n);
+    span(x).flat_map(move |u| span(y).flat_map(move |v| span(z).map(move |w| (u, v, w)))).filter_map(
+        move |(u, v, w)| {
+            let steps = u.abs_diff(x) + v.abs_diff(y) + w.abs_diff(z);
+            (steps == 1 || (corners && steps > 1)).then_some((u * n + v) * n + w)
+        },
+    )
+}
+
+/// Removes every 26-connected piece smaller than `share` of the largest one; returns how many cells it removed.
+pub(crate) fn drop_dust(kept: &mut [bool], n: usize, share: f64) -> usize {
+    let Pieces { label, size } = pieces(kept, |i| around([i / (n * n), i / n % n, i % n], n, true));
+    let least = share * size.iter().copied().max().unwrap_or(0) as f64;
     let mut dropped = 0;
     for (cell, &id) in kept.iter_mut().zip(&label) {
-        if *cell && (sizes[id as usize] as f64) < least {
+        if *cell && (size[id as usize] as f64) < least {
             *cell = false;
             dropped += 1;
         }

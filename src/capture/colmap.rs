@@ -11,8 +11,7 @@ mod binary;
 mod text;
 
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join};
-use super::frame::{CameraFrame, Listing};
-use super::lens::LensModel;
+use super::frame::{CameraFrame, LensModel, Listing};
 use super::masks::few;
 use super::view::Split;
 use crate::io::{self, ReadError};
@@ -94,7 +93,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Lis
     let mut seen = HashSet::new();
     for image in &images {
         if !seen.insert(image.id) {
-            let problem = format!("its number {} stands there twice", image.id);
+            let problem = format!("its number {} appears twice", image.id);
             listing.problems.push(in_frame(&name_of, &image.name, problem));
         }
     }
@@ -108,7 +107,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Lis
     let others = other_models(folder.root, files);
     if !others.is_empty() {
         let text = "only the first of several models is read; COLMAP made pieces that it could not join";
-        listing.warnings.push(format!("{text}: {} also lie there", few(others)));
+        listing.warnings.push(format!("{text}: there are also {}", few(others)));
     }
     let held_out = held_out(folder, files)?;
     let base = folder.image_folder(images.iter().map(|image| image.name.as_str()));
@@ -183,12 +182,11 @@ fn frame(
     };
     let intrinsics = camera.model.intrinsics((width, height), &camera.values);
     let intrinsics = intrinsics.map_err(|text| problem(format!("camera {}: {text}", image.camera)))?;
-    let (rotation, position) = image.pose.camera_in_world().map_err(|text| problem(text.into()))?;
-    let (relative, photo) = folder.photo(file, &join(base, &image.name))?;
+    let pose = image.pose.camera_in_world().map_err(|text| problem(text.into()))?;
+    let photo = folder.photo(file, &join(base, &image.name))?;
     let split = held_out.map(|names| if names.contains(&image.name) { Split::Test } else { Split::Train });
     let mask = folder.mask_of(file, &image.name)?;
-    let (file, name) = (file.to_string(), image.name.clone());
-    Ok(CameraFrame { file, name, photo, relative, split, intrinsics, rotation, position, mask, region: None })
+    Ok(CameraFrame { split, mask, ..CameraFrame::new(file, &image.name, photo, intrinsics, pose) })
 }
 
 impl Rigid {

@@ -1,12 +1,12 @@
-//! A capture written again with cameras of another format: nothing is resampled, nothing that is there is touched.
+//! A capture written again with cameras of another format: nothing is resampled, and existing files are not changed.
 //!
 //! Photographs go to `images/`, head masks to `masks/`, valid pixels to `valid/` and regions to `face_masks/`, as
 //! they are; the camera files come last, so that a folder that has them is complete. What a format cannot say is an error
 //! where pictures would no longer fit their cameras, and a warning otherwise.
 
 use super::colmap;
+use super::frame::LensModel;
 use super::gather::{every_eighth, up};
-use super::lens::LensModel;
 use super::view::{Capture, Split, View, ViewMask};
 use crate::geom::Camera;
 use crate::io::{self, Limits};
@@ -105,8 +105,8 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
     let is_empty =
         || Ok::<_, Error>(io::list_files(folder)?.is_empty() && io::list_folders(folder)?.is_empty());
     if io::exists(folder) && !(io::is_folder(folder) && is_empty()?) {
-        let message = format!("`{}` is there already", folder.display());
-        return Err(Error::cannot(message, "name a new folder: nothing that is there is overwritten"));
+        let message = format!("`{}` already exists", folder.display());
+        return Err(Error::cannot(message, "name a new folder: nothing is overwritten"));
     }
     let mut out = Conversion { folder: folder.into(), views: capture.views.len(), ..Conversion::default() };
     let places: Vec<ViewFiles> = capture.views.iter().map(|v| place(v, to)).collect();
@@ -177,7 +177,7 @@ fn place(view: &View, to: CameraFormat) -> ViewFiles<'_> {
         |folder: &str, file: &Option<PathBuf>| file.as_ref().map(|f| format!("{folder}/{stem}{}", ending(f)));
     ViewFiles {
         view,
-        // of the photograph as it lies there: the check above has seen to that
+        // at the size of the stored photograph, as checked above
         camera: view.camera.clone(),
         photo: format!("images/{name}"),
         mask,
@@ -211,7 +211,7 @@ fn lens(place: &ViewFiles) -> Result<Map<String, Value>> {
 
 fn transforms(capture: &Capture, places: &[ViewFiles], named_splits: bool) -> Result<Files> {
     let lenses: Vec<Map<String, Value>> = places.iter().map(lens).collect::<Result<_>>()?;
-    // readers that know one lens for all look for it at the top
+    // readers that support only one lens look for it at the top
     let shared = lenses.iter().all(|l| *l == lenses[0]);
     let frame = |(place, lens): (&ViewFiles, &Map<String, Value>)| {
         let (r, p) = (place.camera.rotation, place.camera.position);

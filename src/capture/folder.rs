@@ -6,6 +6,7 @@ use super::view::CaptureOptions;
 use crate::io::{self, Limits, ReadError};
 use crate::{Error, Result};
 use glam::DMat3;
+use roxmltree::{Document, ParsingOptions};
 use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
 
@@ -231,6 +232,24 @@ pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
 pub(super) fn has_ending(name: &str, endings: &[&str]) -> bool {
     let found = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
     endings.iter().any(|e| e.eq_ignore_ascii_case(found))
+}
+
+/// Parses the text of an XML file of at most so many nodes. A DTD, whose entities could grow without bound, is refused.
+pub(super) fn parse_xml<'t>(
+    path: &Path,
+    format: &'static str,
+    text: &'t str,
+    nodes: u32,
+) -> Result<Document<'t>, ReadError> {
+    let options = ParsingOptions { allow_dtd: false, nodes_limit: nodes, ..ParsingOptions::default() };
+    let problem = |e: roxmltree::Error| e.to_string().chars().take(200).collect::<String>();
+    Document::parse_with_options(text, options)
+        .map_err(|e| ReadError::damaged(path, format, None, problem(e)))
+}
+
+/// The beginning of a text from a file, for a message.
+pub(super) fn shortened(text: &str) -> String {
+    text.chars().take(40).collect()
 }
 
 /// A camera file lacks what it must have.

@@ -1,7 +1,6 @@
 //! Which camera files a folder has. Where there are several kinds, the first of [`CameraFiles`] is read.
 //!
-//! Formats that are recognized but not read are explained, each by its telltale files, with the way from there to
-//! `transforms.json`.
+//! Formats that are recognized but not read, each by its telltale files, are explained with the way to `transforms.json`.
 
 use super::colmap::{self, ModelFiles};
 use super::folder::{CaptureFolder, FolderEntries, PHOTOGRAPHS, has_ending};
@@ -9,7 +8,7 @@ use super::frame::Listing;
 use super::{llff, metashape, neus, realitycapture, transforms};
 use crate::Error;
 use crate::config::Config;
-use crate::io::{self, ReadError};
+use crate::io;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -118,9 +117,7 @@ impl CameraFiles {
             CameraFiles::Xmp(inside) => realitycapture::list_xmp(folder, inside, listing),
         };
         listing.problems.extend(listed.err());
-        let (found, limit) = (listing.frames.len() as u64, folder.options.limits.views as u64);
-        if found > limit {
-            let problem = ReadError::too_large(folder.root, "the number of views", found, limit);
+        if let Err(problem) = folder.options.limits.check_views(folder.root, listing.frames.len()) {
             listing.problems.push(problem.into());
             listing.frames.clear();
         }
@@ -138,18 +135,49 @@ const BY_HAND: &str = "no common tool converts it: write `transforms.json` with 
                        `cx`, `cy` and `transform_matrix` for each photograph (camera to world, +Y up and looking along \
                        -Z: the second and third column of an OpenCV pose, negated)";
 
-/// A command of nerfstudio, and what to do with what it writes.
-fn nerfstudio(kind: &str, data: impl Display, more: &str) -> String {
-    format!(
-        "nerfstudio converts it: `ns-process-data {kind} --data {data}{more} --output-dir NEW`, then `tiface inspect NEW`"
-    )
-}
+/// For cameras that another program writes in COLMAP's form.
+const TO_COLMAP: &str = "writes its cameras as COLMAP's: put `cameras`, `images` and `points3D` (`.bin` or `.txt`) into \
+                         `sparse/0`, the photographs beside it into `images/`";
 
-/// What else becomes of cameras that another program brought into COLMAP's form.
-fn through_colmap(command: &str) -> String {
+/// Folders of other programs: what they are; the files or folders, else the endings, that identify them; and how to
+/// convert them, where `{root}` is the folder and `{file}` the file that was found.
+#[rustfmt::skip]
+const FOREIGN: &[(&str, &[&str], &[&str], &str)] = &[
+    ("a Multiface recording", &["KRT"], &[],
+        "{BY_HAND}; it holds K, distortion and [R|t] of each camera; take one frame of one expression of `images/`"),
+    ("a NeRSemble participant", &["calibration/camera_params.json", "camera_params.json"], &[],
+        "{BY_HAND}; it holds `world_2_cam` of each camera and one `intrinsics`; take one moment of one sequence, its \
+         `alpha_maps` are masks"),
+    ("a FaceScape tuple", &["params.json"], &[],
+        "{BY_HAND}; it holds `I_K`, `I_Rt` (world to camera), `I_distortion` and `I_valid` of photograph I.jpg: leave \
+         out what is not valid"),
+    ("a Polycam raw export", &["keyframes"], &[], "{polycam}"),
+    ("a Metashape project", &[], &["psx", "psz"],
+        "export its cameras as XML into this folder: File, Export, Export Cameras"),
+    ("a RealityCapture project", &[], &["rcproj", "rsproj"],
+        "export its registration as CSV (`Internal/External camera parameters`) into this folder, or its metadata as \
+         XMP beside the photographs"),
+    ("a Meshroom project", &["MeshroomCache"], &["mg", "sfm"],
+        "its node `ExportColmap` (or `aliceVision_exportColmap --input cameras.sfm --output NEW`) {TO_COLMAP}"),
+    ("an OpenSfM project", &["reconstruction.json"], &[], "`opensfm export_colmap {root}` {TO_COLMAP}"),
+    ("an OpenMVG scene", &["sfm_data.json", "sfm_data.bin"], &[],
+        "`openMVG_main_openMVG2Colmap -i {file} -o NEW` {TO_COLMAP}"),
+    ("a VisualSFM scene", &[], &["nvm"],
+        "OpenMVS (`InterfaceVisualSFM -i {file} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`) {TO_COLMAP}"),
+    ("a Bundler scene", &["bundle.out", "bundle/bundle.out"], &[],
+        "OpenMVS (`InterfaceVisualSFM -i {file} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`) {TO_COLMAP}"),
+    ("an MVSNet scene", &["cams/00000000_cam.txt", "Cameras/00000000_cam.txt", "pair.txt"], &[],
+        "OpenMVS (`InterfaceMVSNet -i {root} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`) {TO_COLMAP}"),
+    ("an incomplete COLMAP project",
+        &["sparse", "colmap", "cameras.bin", "cameras.txt", "images.bin", "images.txt", "database.db"], &[],
+        "its cameras and images files are missing: run `colmap mapper`, or copy `cameras.bin` and `images.bin` (or \
+         `.txt`) into `sparse/0`"),
+];
+
+/// A command of nerfstudio, and what to do with what it writes.
+fn nerfstudio(kind: &str, data: impl Display) -> String {
     format!(
-        "{command} writes its cameras as COLMAP's: put `cameras`, `images` and `points3D` (`.bin` or `.txt`) into \
-         `sparse/0`, the photographs beside it into `images/`"
+        "nerfstudio converts it: `ns-process-data {kind} --data {data} --output-dir NEW`, then `tiface inspect NEW`"
     )
 }
 
@@ -157,7 +185,7 @@ fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> E
     Error::cannot(format_args!("`{}` is not a capture: {found}", root.display()), hint)
 }
 
-/// Why a folder is no capture: what it looks like instead, and the way from there.
+/// The error for a folder that is no capture: what it looks like instead, and how to convert it.
 pub(super) fn explain(root: &Path) -> Error {
     let found = FolderEntries::of(root);
     if let Some(run) = Config::of_run(root).filter(|run| !run.capture.path.is_empty()) {
@@ -176,7 +204,7 @@ pub(super) fn explain(root: &Path) -> Error {
         None => {
             let nearest = nearest(&found).map_or(String::new(), |n| format!("; nearest is {n}"));
             let others = "Meshroom, OpenSfM, OpenMVG, Bundler, NVM, MVSNet, Polycam, NeRSemble, Multiface, FaceScape, \
-                          photographs alone or a video are named with the way from found_of";
+                          photographs alone or a video are recognized, with advice on how to convert them";
             not_a_capture(
                 root,
                 format!("it holds none of the camera files that are read: {LOOKED_FOR}{nearest}"),
@@ -186,7 +214,7 @@ pub(super) fn explain(root: &Path) -> Error {
     }
 }
 
-/// What is read, for who has none of it.
+/// The camera files that are read, for messages.
 const LOOKED_FOR: &str = "`transforms.json`, `transforms_train.json`, `poses_bounds*.npy` (LLFF), `cameras` and `images` as \
                           `.bin` or `.txt` in `sparse/0`, `sparse` or here (COLMAP), `cameras_sphere.npz` or `cameras.npz` \
                           (NeuS, IDR, H3DS), an `.xml` with `<chunk` (Metashape), a `.csv` that begins with `#name,x,y,alt` \
@@ -226,8 +254,7 @@ pub(super) fn explain_file(file: &Path) -> Error {
 }
 
 fn from_video(file: &Path) -> String {
-    nerfstudio("video", file.display(), "")
-        + " (it needs COLMAP; a head must hold still while the camera moves)"
+    nerfstudio("video", file.display()) + " (it needs COLMAP; a head must hold still while the camera moves)"
 }
 
 /// A folder inside that is a capture, with its first camera file.
@@ -236,78 +263,27 @@ fn nested(found: &FolderEntries) -> Option<(&str, String)> {
     found.folders.iter().take(1000).find_map(|name| Some((name.as_str(), of(name)?)))
 }
 
-/// What it looks like, by which file, and the way to `transforms.json`.
+/// What it looks like, by which file, and how to get to `transforms.json`.
 fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
     let photographs = found.photographs();
-    let one = |what, telltale: &str, way| Some((what, telltale.to_owned(), way));
-    let by_hand = |what, telltale, more: &str| one(what, telltale, format!("{BY_HAND}; {more}"));
-    if let Some(t) = found.any(&["KRT"]) {
-        let moment =
-            "it holds K, distortion and [R|t] of each camera; take one frame of one expression of `images/`";
-        return by_hand("a Multiface recording", t, moment);
-    }
-    if let Some(t) = found.any(&["calibration/camera_params.json", "camera_params.json"]) {
-        let moment = "it holds `world_2_cam` of each camera and one `intrinsics`; take one moment of one sequence, \
-                      its `alpha_maps` are masks";
-        return by_hand("a NeRSemble participant", t, moment);
-    }
-    if let Some(t) = found.any(&["params.json"]).filter(|_| photographs.is_some()) {
-        let keys = "it holds `I_K`, `I_Rt` (world to camera), `I_distortion` and `I_valid` of photograph I.jpg: \
-                    leave out what is not valid";
-        return by_hand("a FaceScape tuple", t, keys);
-    }
-    if let Some(t) = found.any(&["keyframes"]) {
-        return one("a Polycam raw export", t, nerfstudio("polycam", found.root.display(), ""));
-    }
-    if let Some(t) = found.ending(&["psx", "psz"]) {
-        let way = "export its cameras as XML into this folder: File, Export, Export Cameras";
-        return one("a Metashape project", t, way.into());
-    }
-    if let Some(t) = found.ending(&["rcproj", "rsproj"]) {
-        let way = "export its registration as CSV (`Internal/External camera parameters`) into this folder, or its \
-                   metadata as XMP beside the photographs";
-        return one("a RealityCapture project", t, way.into());
-    }
-    let meshroom = found.any(&["MeshroomCache"]).or_else(|| found.ending(&["mg", "sfm"]).map(String::as_str));
-    if let Some(t) = meshroom {
-        let way = "its node `ExportColmap` (or `aliceVision_exportColmap --input cameras.sfm --output NEW`)";
-        return one("a Meshroom project", t, through_colmap(way));
-    }
-    if let Some(t) = found.any(&["reconstruction.json"]) {
-        let way = format!("`opensfm export_colmap {}`", found.root.display());
-        return one("an OpenSfM project", t, through_colmap(&way));
-    }
-    if let Some(t) = found.any(&["sfm_data.json", "sfm_data.bin"]) {
-        let way = format!("`openMVG_main_openMVG2Colmap -i {} -o NEW`", found.at(t));
-        return one("an OpenMVG scene", t, through_colmap(&way));
-    }
-    let openmvs = |import: &str, from: String| {
-        let way = format!(
-            "OpenMVS (`{import} -i {from} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`)"
-        );
-        through_colmap(&way)
-    };
-    let nvm = found.ending(&["nvm"]).map(|t| ("a VisualSFM scene", t.as_str()));
-    let bundler = || found.any(&["bundle.out", "bundle/bundle.out"]).map(|t| ("a Bundler scene", t));
-    if let Some((what, t)) = nvm.or_else(bundler) {
-        return one(what, t, openmvs("InterfaceVisualSFM", found.at(t)));
-    }
-    let mvsnet = ["cams/00000000_cam.txt", "Cameras/00000000_cam.txt", "pair.txt"];
-    if let Some(t) = found.any(&mvsnet) {
-        return one("an MVSNet scene", t, openmvs("InterfaceMVSNet", found.root.display().to_string()));
-    }
-    let colmap =
-        ["sparse", "colmap", "cameras.bin", "cameras.txt", "images.bin", "images.txt", "database.db"];
-    if let Some(t) = found.any(&colmap) {
-        let way = "its cameras and images files are missing: run `colmap mapper`, or copy `cameras.bin` and `images.bin` \
-                   (or `.txt`) into `sparse/0`";
-        return one("an incomplete COLMAP project", t, way.into());
+    // a file of this name has no meaning without photographs
+    let is_candidate = |files: &[&str]| photographs.is_some() || files != ["params.json"];
+    for (what, files, endings, way) in FOREIGN.iter().filter(|(_, files, ..)| is_candidate(files)) {
+        let file = found.any(files).or_else(|| found.ending(endings).map(String::as_str));
+        if let Some(file) = file {
+            let root = found.root.display().to_string();
+            let values = [("{BY_HAND}", BY_HAND), ("{TO_COLMAP}", TO_COLMAP), ("{root}", &root)];
+            let way =
+                way.replace("{polycam}", &nerfstudio("polycam", &root)).replace("{file}", &found.at(file));
+            let way = values.iter().fold(way, |way, (key, value)| way.replace(key, value));
+            return Some((what, file.into(), way));
+        }
     }
     if let Some(folder) = photographs {
         let first = FolderEntries::of(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();
-        let way = nerfstudio("images", folder.display(), "");
-        return one("photographs without cameras", &first, format!("{way} (it needs COLMAP)"));
+        let way = nerfstudio("images", folder.display()) + " (it needs COLMAP)";
+        return Some(("photographs without cameras", first, way));
     }
     let video = found.ending(&VIDEOS)?;
-    one("a video", video, from_video(&found.root.join(video)))
+    Some(("a video", video.clone(), from_video(&found.root.join(video))))
 }

@@ -1,4 +1,4 @@
-//! What was found: format, cameras, masks, splits, and every problem there is, not only the first.
+//! The report on a capture: format, cameras, masks, splits, and all problems, not only the first.
 
 use super::frame::Agreement;
 use super::gather::gather;
@@ -98,7 +98,7 @@ pub struct Inspection {
     pub root: PathBuf,
     /// The format, if one was recognized.
     pub format: Option<String>,
-    /// Why, and what else lies there.
+    /// What the format was recognized by, and what else was found.
     pub reasons: Vec<String>,
     /// Views to learn from.
     pub train: usize,
@@ -136,13 +136,13 @@ pub struct Inspection {
     pub scene_text: Option<String>,
     /// What stops the work.
     pub problems: Vec<Problem>,
-    /// What a person should know.
+    /// Warnings, which do not stop the work.
     pub warnings: Vec<String>,
 }
 
 impl Inspection {
-    /// Can the capture be used?
-    pub fn is_sound(&self) -> bool {
+    /// Returns whether the capture can be used.
+    pub fn is_usable(&self) -> bool {
         self.problems.is_empty() && self.format.is_some()
     }
 
@@ -205,7 +205,7 @@ fn cameras(capture: &Capture, out: &mut Inspection) {
     let folded: Vec<&str> = capture.views.iter().filter(folds).map(|v| v.name.as_str()).collect();
     if !folded.is_empty() {
         out.warnings.push(format!(
-            "the lens distortion folds over in the corners of {} views, whose pixels there are not used: {}",
+            "the lens distortion folds over in the corners of {} views; those pixels are not used: {}",
             folded.len(),
             few(folded)
         ));
@@ -339,8 +339,8 @@ impl fmt::Display for Inspection {
         for problem in &self.problems {
             writeln!(f, "  problem   {problem}\n            hint: {}", problem.hint)?;
         }
-        if self.is_sound() {
-            writeln!(f, "  sound     nothing stands in the way")?;
+        if self.is_usable() {
+            writeln!(f, "  result    no problems found")?;
         }
         Ok(())
     }

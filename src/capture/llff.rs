@@ -201,24 +201,12 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
             return Err(problem(file, format!("it has {} rows for {} photographs", rows.len(), names.len())));
         }
         for (row, name) in rows.iter().zip(names) {
-            let (relative, photo) = folder.photo(file, &name)?;
+            let photo = folder.photo(file, &name)?;
             let PoseRow { rotation, position, size, focal } = *row;
             let intrinsics =
                 Intrinsics { size: Some(size), focal: [Some(focal); 2], ..Intrinsics::default() };
-            let (file, split) = (file.to_string(), split_of(file));
-            let (mask, region) = (None, None);
-            listing.frames.push(CameraFrame {
-                file,
-                name,
-                photo,
-                relative,
-                split,
-                intrinsics,
-                rotation,
-                position,
-                mask,
-                region,
-            });
+            let frame = CameraFrame::new(file, &name, photo, intrinsics, (rotation, position));
+            listing.frames.push(CameraFrame { split: split_of(file), ..frame });
         }
     }
     Ok(())

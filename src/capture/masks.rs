@@ -118,8 +118,8 @@ pub(super) fn choose(
     Ok(())
 }
 
-/// Are the head masks there that `options` ask for? Without, everything the cameras see would be learned as the head:
-/// whoever wants that says so with [`MaskSource::None`]. Held-out views need none, and of the others at least half must
+/// Checks that the head masks exist that `options` ask for. Without masks, everything the cameras see would be learned as the
+/// head, which must be asked for with [`MaskSource::None`]. Held-out views need no mask, and of the others at least half must
 /// have one.
 pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> {
     if matches!(options.masks, MaskSource::None | MaskSource::Clicks) {
@@ -143,13 +143,13 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
     let shown = root.display();
     let prompts = root.join("prompts.json");
     let clicks = if io::is_file(&prompts) {
-        format!("make them from the clicks that lie there: `--prompts {}`", prompts.display())
+        format!("make them from the clicks in the capture: `--prompts {}`", prompts.display())
     } else {
         format!("click on three photographs: `tiface mask {shown} --page`, then `--prompts prompts.json`")
     };
     let photographs = train.first().and_then(|v| v.photo.parent()).unwrap_or(root).display();
     let hint = format!(
-        "{clicks}; or put masks there, white on the head, found by themselves as alpha, `mask_path`, `vit_mask/NAME.png` \
+        "{clicks}; or add masks, white on the head, which are found as alpha, `mask_path`, `vit_mask/NAME.png` \
          or `masks/NAME.png` (a background remover writes them: `rembg p -om {photographs} {shown}/masks`), or in a \
          folder named with `--set capture.mask_dir=FOLDER`; or go on without any, and learn whatever the cameras see: \
          `--set mask.source=none`"
@@ -157,7 +157,7 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
     Err(Error::cannot(format_args!("`{shown}`: {problem}"), hint))
 }
 
-/// The first of these files that is there, below the first base with any.
+/// The first of these files that exists, below the first base with any.
 fn first_of(folder: &CaptureFolder, bases: &[&Path], names: &[String]) -> Option<PathBuf> {
     bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name))).find_map(|p| folder.file(&p))
 }

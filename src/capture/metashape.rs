@@ -4,20 +4,20 @@
 //! P1 and P2 are OpenCV's p2 and p1, B1 is added to the horizontal focal length, and K4 multiplies r⁸ (Metashape
 //! manual, appendix D). Of a perspective lens that coefficient is refused, as is skew that could be seen.
 
-use super::folder::{CaptureFolder, FLIP, in_file, in_frame};
+use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join, parse_xml, shortened};
 use super::frame::{self, CameraFrame, Intrinsics, Listing};
 use super::masks::few;
 use crate::Result;
 use crate::geom::{Distortion, Projection};
 use crate::io::{self, ReadError};
 use glam::{DMat3, DVec3};
-use roxmltree::{Document, Node, ParsingOptions};
+use roxmltree::Node;
 use std::collections::HashMap;
 use std::str::FromStr;
 
 /// Elements and attributes of one file; a project of ten thousand photographs has half as many.
 const MAX_NODES: u32 = 2_000_000;
-/// A translation beyond is one of the whole earth: single precision would tell half a metre there.
+/// A longer translation is geocentric: single precision resolves half a metre at that distance.
 const GEOCENTRIC: f64 = 1e5;
 /// Skew moves no pixel farther.
 const SKEW_PX: f64 = 0.1;
@@ -29,10 +29,7 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     let text = String::from_utf8(bytes).map_err(|e| {
         ReadError::damaged(&path, "XML", e.utf8_error().valid_up_to() as u64, "it is not UTF-8")
     })?;
-    let options = ParsingOptions { allow_dtd: false, nodes_limit: MAX_NODES, ..ParsingOptions::default() };
-    let document = Document::parse_with_options(&text, options).map_err(|e| {
-        ReadError::damaged(&path, "XML", None, e.to_string().chars().take(200).collect::<String>())
-    })?;
+    let document = parse_xml(&path, "XML", &text, MAX_NODES)?;
     let hint = "export the cameras again: File, Export, Export Cameras, as Agisoft XML";
     let chunks: Vec<Node> = document.descendants().filter(|n| n.has_tag_name("chunk")).collect();
     let chunk = chunks.iter().find(|c| child(**c, "cameras").is_some());
@@ -54,10 +51,7 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     }
     let whole = Frame::of(chunk).map_err(problem)?;
     let cameras: Vec<Node> = within(chunk, "cameras", "camera").collect();
-    if cameras.len() > folder.options.limits.views {
-        let (found, limit) = (cameras.len() as u64, folder.options.limits.views as u64);
-        return Err(ReadError::too_large(&path, "the number of views", found, limit).into());
-    }
+    folder.options.limits.check_views(&path, cameras.len())?;
     let label = |camera: &Node| camera.attribute("label").unwrap_or_default().to_string();
     let (aligned, others): (Vec<Node>, Vec<Node>) = cameras.into_iter().partition(|camera| {
         let off = matches!(camera.attribute("enabled"), Some("0" | "false"));
@@ -91,20 +85,10 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
         far |= origin != frame.translation;
         let position = frame.scale * (frame.rotation * position) + origin;
         let rotation = frame.rotation * rotation * FLIP;
-        let (relative, photo) = folder.photo(file, &super::folder::join(base, name))?;
+        let photo = folder.photo(file, &join(base, name))?;
         let mask = folder.mask_of(file, name)?;
-        listing.frames.push(CameraFrame {
-            file: file.into(),
-            name: name.clone(),
-            photo,
-            relative,
-            split: None,
-            intrinsics,
-            rotation,
-            position,
-            mask,
-            region: None,
-        });
+        let frame = CameraFrame::new(file, name, photo, intrinsics, (rotation, position));
+        listing.frames.push(CameraFrame { mask, ..frame });
     }
     if far {
         listing.warnings.push(format!(
@@ -174,9 +158,7 @@ fn numbers(node: Option<Node>) -> Result<Vec<f64>, String> {
     let text = node.and_then(|n| n.text()).unwrap_or_default();
     text.split_whitespace()
         .take(17)
-        .map(|w| {
-            f64::from_str(w).map_err(|_| format!("`{}` is no number", w.chars().take(40).collect::<String>()))
-        })
+        .map(|w| f64::from_str(w).map_err(|_| format!("`{}` is no number", shortened(w))))
         .collect()
 }
 
@@ -189,7 +171,7 @@ fn sensor_intrinsics(sensor: Node) -> Result<Intrinsics, String> {
     let side = |name: &str| -> Result<u32, String> {
         let text = resolution.and_then(|r| r.attribute(name)).ok_or("it has no `resolution`")?;
         let side = text.parse().ok().filter(|s| (1..=1_000_000).contains(s));
-        side.ok_or_else(|| format!("its {name} is `{}`", text.chars().take(40).collect::<String>()))
+        side.ok_or_else(|| format!("its {name} is `{}`", shortened(text)))
     };
     let (width, height) = (side("width")?, side("height")?);
     let value = |name: &str| -> Result<f64, String> {

@@ -39,21 +39,12 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
         let camera =
             matrix(&arrays, &format!("world_mat_{i}")).and_then(|m| decompose(&m)).map_err(problem)?;
         let (intrinsics, rotation, position) = camera;
-        let (relative, photo) = folder.photo(file, name)?;
+        let photo = folder.photo(file, name)?;
         // masks have names of their own: they are paired in order, as NeuS does
         let mask = masks.get(i).filter(|_| masks.len() == photos.len());
-        listing.frames.push(CameraFrame {
-            file: file.into(),
-            name: name.clone(),
-            photo,
-            relative,
-            split: None,
-            intrinsics,
-            rotation,
-            position,
-            mask: mask.and_then(|mask| folder.file(Path::new(mask))),
-            region: None,
-        });
+        let mask = mask.and_then(|mask| folder.file(Path::new(mask)));
+        let frame = CameraFrame::new(file, name, photo, intrinsics, (rotation, position));
+        listing.frames.push(CameraFrame { mask, ..frame });
     }
     listing.masks_named = "`mask/`, in the order of the photographs";
     if arrays.contains_key("scale_mat_0") {
@@ -73,7 +64,7 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     Ok(())
 }
 
-/// Pictures in the first of these folders that is there, in name order.
+/// Pictures in the first of these folders that exists, in name order.
 fn pictures(folder: &CaptureFolder, names: &[&str]) -> Result<Vec<String>> {
     let Some(name) = names.iter().find(|n| io::is_folder(&folder.root.join(n))) else {
         return Ok(Vec::new());

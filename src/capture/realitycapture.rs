@@ -6,13 +6,16 @@
 //! t2 as OpenCV's p1 and p2; k4 and the division model are refused. (Capturing Reality, "XMP camera math"; nerfstudio,
 //! `realitycapture_utils.py`.)
 
-use super::folder::{CaptureFolder, FLIP, FolderEntries, PHOTOGRAPHS, has_ending, in_file, in_frame, join};
+use super::folder::{
+    CaptureFolder, FLIP, FolderEntries, PHOTOGRAPHS, has_ending, in_file, in_frame, join, parse_xml,
+    shortened,
+};
 use super::frame::{self, CameraFrame, Intrinsics, Listing};
 use crate::geom::Distortion;
-use crate::io::{self, ReadError};
+use crate::io;
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
-use roxmltree::{Document, Node, ParsingOptions};
+use roxmltree::Node;
 use std::path::{Path, PathBuf};
 
 /// How a CSV file begins.
@@ -54,16 +57,17 @@ pub(super) fn list_csv(folder: &CaptureFolder, file: &str, listing: &mut Listing
                 None | Some("") if !needed => Ok(0.0),
                 Some(text) => match text.parse::<f64>() {
                     Ok(v) if v.is_finite() => Ok(v),
-                    _ => Err(wrong(
-                        line,
-                        format!("`{name}` is `{}`", text.chars().take(40).collect::<String>()),
-                    )),
+                    _ => Err(wrong(line, format!("`{name}` is `{}`", shortened(text)))),
                 },
                 None => Err(wrong(line, format!("it has no `{name}`"))),
             }
         };
         let angle = |name| value(name, true).map(f64::to_radians);
         let (heading, pitch, roll) = (angle("heading")?, angle("pitch")?, angle("roll")?);
+        let mut coefficients = [0.0; 6];
+        for (coefficient, name) in coefficients.iter_mut().zip(["k1", "k2", "k3", "k4", "t1", "t2"]) {
+            *coefficient = value(name, false)?;
+        }
         let turned = DMat3::from_rotation_z(-heading) * DMat3::from_rotation_x(pitch);
         entries.push(Entry {
             name,
@@ -71,19 +75,9 @@ pub(super) fn list_csv(folder: &CaptureFolder, file: &str, listing: &mut Listing
             position: DVec3::new(value("x", true)?, value("y", true)?, value("alt", true)?),
             focal: value("f", true)?,
             center: [value("px", false)?, value("py", false)?],
-            coefficients: [
-                value("k1", false)?,
-                value("k2", false)?,
-                value("k3", false)?,
-                value("k4", false)?,
-                value("t1", false)?,
-                value("t2", false)?,
-            ],
+            coefficients,
         });
-        if entries.len() > folder.options.limits.views {
-            let (found, limit) = (entries.len() as u64, folder.options.limits.views as u64);
-            return Err(ReadError::too_large(Path::new(file), "the number of views", found, limit).into());
-        }
+        folder.options.limits.check_views(Path::new(file), entries.len())?;
     }
     if entries.is_empty() {
         return Err(in_file(file, "it lists no photographs", hint));
@@ -151,10 +145,7 @@ fn read_xmp(folder: &CaptureFolder, file: &str, name: &str) -> Result<Option<Ent
     let Some(path) = folder.file(Path::new(file)) else { return Ok(None) };
     let bytes = io::read_bytes(&path, &folder.options.limits)?;
     let text = String::from_utf8_lossy(&bytes);
-    let options = ParsingOptions { allow_dtd: false, nodes_limit: 10_000, ..ParsingOptions::default() };
-    let document = Document::parse_with_options(&text, options).map_err(|e| {
-        ReadError::damaged(&path, "XMP", None, e.to_string().chars().take(200).collect::<String>())
-    })?;
+    let document = parse_xml(&path, "XMP", &text, 10_000)?;
     let nodes: Vec<Node> = document.descendants().filter(Node::is_element).collect();
     let value = |name: &str| {
         let attribute = |n: &Node| n.attributes().find(|a| a.name() == name).map(|a| a.value().to_string());
@@ -181,9 +172,9 @@ fn read_xmp(folder: &CaptureFolder, file: &str, name: &str) -> Result<Option<Ent
     let coefficients = numbers("DistortionCoeficients", 6)?.unwrap_or_else(|| vec![0.0; 6]);
     let coefficients: [f64; 6] = coefficients.try_into().unwrap_or_default();
     if !(model == "perspective" || model.starts_with("brown")) && coefficients.iter().any(|&c| c != 0.0) {
-        let shown: String = model.chars().take(40).collect();
         return Err(wrong(format!(
-            "its distortion model `{shown}` is not supported; align with Brown3 (Alignment settings, Distortion model)"
+            "its distortion model `{}` is not supported; align with Brown3 (Alignment settings, Distortion model)",
+            shortened(&model)
         )));
     }
     let (skew, aspect) = (one("Skew", 0.0)?, one("AspectRatio", 1.0)?);
@@ -208,8 +199,8 @@ fn read_xmp(folder: &CaptureFolder, file: &str, name: &str) -> Result<Option<Ent
 /// Lists one camera; its numbers mean pixels only together with the photograph's size.
 fn frame(folder: &CaptureFolder, file: &str, name: &str, entry: Entry, listing: &mut Listing) {
     let framed = || -> Result<CameraFrame> {
-        let (relative, photo) = folder.photo(file, name)?;
-        let size = match &photo {
+        let photo = folder.photo(file, name)?;
+        let size = match &photo.1 {
             Some(path) => {
                 let info = io::picture_info(path, &folder.options.limits)?;
                 (info.width, info.height)
@@ -225,25 +216,14 @@ fn frame(folder: &CaptureFolder, file: &str, name: &str, entry: Entry, listing: 
         let longer = size.0.max(size.1) as f64;
         let middle = [0.5 * size.0 as f64, 0.5 * size.1 as f64];
         let intrinsics = Intrinsics {
-            size: photo.is_some().then_some(size),
+            size: photo.1.is_some().then_some(size),
             focal: [Some(focal * longer / FRAME_WIDTH); 2],
             center: [0, 1].map(|k| Some(middle[k] + center[k] * longer)),
             distortion: Distortion { k1, k2, k3, p1, p2, ..Distortion::default() },
             ..Intrinsics::default()
         };
-        let (file, mask) = (file.to_string(), folder.mask_of(file, &name)?);
-        Ok(CameraFrame {
-            file,
-            name,
-            photo,
-            relative,
-            split: None,
-            intrinsics,
-            rotation,
-            position,
-            mask,
-            region: None,
-        })
+        let mask = folder.mask_of(file, &name)?;
+        Ok(CameraFrame { mask, ..CameraFrame::new(file, &name, photo, intrinsics, (rotation, position)) })
     };
     match framed() {
         Ok(frame) => listing.frames.push(frame),

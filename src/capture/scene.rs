@@ -1,4 +1,4 @@
-//! Where the head is: a box from cameras and masks, so that nobody guesses near, far or radius.
+//! Where the head is: a box from cameras and masks, so that near, far and radius need not be guessed.
 //!
 //! With masks: the rays through the masks' middles meet near the head; a cube around that point, wide
 //! enough for every frame, is carved by the silhouettes at a coarse resolution, the cube is drawn tight
@@ -7,18 +7,18 @@
 //!
 //! - the *box* is drawn around the cells that touch the masks of a third of the views (three at least):
 //!   farther out too few cameras look for anything to be reconstructed;
-//! - the *hull* is everything inside that box that touches three masks: what one still may find there.
+//! - the *hull* is everything inside that box that touches three masks: the space in which the head may still be.
 //!
 //! Without masks: the box of the region that 40 % of the cameras have in their frame, no farther from the
-//! meeting point of the viewing axes than 0.6 of the cameras' median distance to it; drawn tighter around points that
-//! the dataset has there, or the dataset's own box.
+//! meeting point of the viewing axes than 0.6 of the cameras' median distance to it; drawn tighter around the
+//! dataset's points within it, or the dataset's own box.
 //!
 //! A box that is given, and the published one, say where the head is taken to be, whatever the masks say. TI-Face's code
 //! has two worlds for its captures: T-Face's and the baseline's is the dataset's divided by 0.3, their box
 //! ±(1.5, 1.67, 1.0) in it; I-Face's is the dataset's, its box ±0.3. So a scene whose unit is 0.3 of the dataset's has
 //! I-Face in [-1, 1]³, as every scene has, and T-Face in its published numbers.
 //!
-//! A body that the frames cut goes on where hardly a camera looks; what a field learns there is a guess.
+//! A body that the frames cut goes on where hardly a camera looks; a field can only guess that part.
 //! Training still needs that part (rays of good pixels pass through it), the mesh does not: it is closed by
 //! a flat cap where too few cameras see the body ([`well_seen`]).
 
@@ -85,7 +85,7 @@ impl Hull {
 /// Mask values over this may be head; low, so that soft hair is not carved away.
 const THRESHOLD: u8 = 12;
 
-/// Masks that a cell must touch; no more than there are.
+/// Masks that a cell must touch, or all if there are fewer.
 const LEAST_VIEWS: usize = 3;
 
 /// Cells of air around the hull.
@@ -448,7 +448,7 @@ const ILSH_UNIT: f64 = 0.3;
 pub enum SceneBox {
     /// Where cameras and masks say that the head is.
     Head,
-    /// The published box of the ILSH captures, if the head is there.
+    /// The published box of the ILSH captures, if it contains the head.
     Ilsh,
     /// Any box, in dataset units.
     Given(Aabb),

@@ -5,12 +5,11 @@
 //! errors, but for [`LENIENT`] and `up`, which count as absent as well.
 
 use super::folder::{CaptureFolder, in_file, in_frame};
-use super::frame::{self, CameraFrame, Intrinsics, Listing};
-use super::lens::{self, LensModel};
+use super::frame::{self, CameraFrame, Intrinsics, LensModel, Listing};
 use super::view::Split;
 use crate::Result;
 use crate::geom::{Camera, Distortion};
-use crate::io::{self, ReadError};
+use crate::io;
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
 use serde_json::{Map, Value};
@@ -18,8 +17,8 @@ use std::collections::HashSet;
 
 type Object = Map<String, Value>;
 
-/// Keys of the focal length: whoever names one names all, or a frame's own angle would be overruled by the whole
-/// file's focal length.
+/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would be overruled by
+/// the whole file's focal length.
 const FOCAL: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// The other keys that may stand at the top for all frames.
@@ -137,12 +136,13 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         let hint = "it must describe at least one photograph";
         return Err(in_file(file, "its list `frames` is empty", hint));
     }
-    let (found, limit) = (frames.len() as u64, limits.views as u64);
-    if found > limit {
-        return Err(ReadError::too_large(&path, "the number of frames", found, limit).into());
-    }
+    limits.check_views(&path, frames.len())?;
     let about: TopKeys = io::typed(&value).map_err(|[key, found, expected]| {
-        in_file(file, format_args!("`{key}` is {found}, expected {expected}"), "list file names there")
+        in_file(
+            file,
+            format_args!("`{key}` is {found}, expected {expected}"),
+            "it must be a list of file names",
+        )
     })?;
     if top.contains_key("applied_transform") || top.contains_key("applied_scale") {
         listing.reasons.push(format!(
@@ -167,32 +167,21 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         let problem = |text: String| in_frame(file, name.unwrap_or(&number), text);
         let frame = FrameKeys::read(top, entry).map_err(problem).and_then(|keys| {
             let split = split_of_file.or(about.split(&keys.file_path));
-            let (rotation, position) =
+            let pose =
                 upper_rows(&keys.transform_matrix).and_then(|rows| frame::pose(&rows)).map_err(problem)?;
             let split = named_split(keys.split.as_deref(), split).map_err(problem)?;
             let intrinsics = intrinsics(&keys, &mut ignored).map_err(problem)?;
-            let (relative, photo) = folder.photo(file, &keys.file_path)?;
+            let photo = folder.photo(file, &keys.file_path)?;
             let beside = |name: &Option<String>| -> Result<_> {
                 let named = name.as_ref().map(|name| folder.relative(file, name)).transpose()?;
                 Ok(named.and_then(|name| folder.file(&name)))
             };
             let (mask, region) = (beside(&keys.mask_path)?, beside(&keys.face_mask_path)?);
-            if keys.mask_path.is_some() && mask.is_none() && photo.is_some() {
+            if keys.mask_path.is_some() && mask.is_none() && photo.1.is_some() {
                 listing.problems.push(problem("the mask it names is missing".into()));
             }
-            let (file, name) = (file.to_string(), keys.file_path);
-            Ok(CameraFrame {
-                file,
-                name,
-                photo,
-                relative,
-                split,
-                intrinsics,
-                rotation,
-                position,
-                mask,
-                region,
-            })
+            let frame = CameraFrame::new(file, &keys.file_path, photo, intrinsics, pose);
+            Ok(CameraFrame { split, mask, region, ..frame })
         });
         match frame {
             Ok(frame) => listing.frames.push(frame),
@@ -295,14 +284,14 @@ fn distortion(keys: &FrameKeys, model: &str, ignored: &mut Vec<String>) -> Resul
     };
     let all = "k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega".split(' ');
     for key in all.filter(|key| !parameters.split(' ').any(|p| p == *key)) {
-        if *lens::coefficient(&mut { given }, key) != 0.0 {
+        if *frame::coefficient(&mut { given }, key) != 0.0 {
             return Err(format!(
                 "its lens has `{key}`, which its camera model `{model}` has not; undistort the photographs first"
             ));
         }
     }
-    let distortion = Distortion { projection: lens::projection(model), ..given };
-    lens::check(&distortion)?;
+    let distortion = Distortion { projection: frame::projection(model), ..given };
+    frame::check_distortion(&distortion)?;
     Ok(distortion)
 }
 

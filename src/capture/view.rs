@@ -49,7 +49,7 @@ impl From<Option<PathBuf>> for ViewMask {
 pub struct CaptureOptions {
     /// Whole factor by which photographs are averaged down, at least 1.
     pub downscale: u32,
-    /// Which masks to use: those that are there, unless another source is set; none with [`MaskSource::Clicks`].
+    /// Which masks to use: those of the capture, unless another source is set; none with [`MaskSource::Clicks`].
     pub masks: MaskSource,
     /// The only folder of masks, relative to the capture; empty to look beside the photographs.
     pub mask_dir: String,
@@ -99,7 +99,7 @@ pub struct Capture {
     pub focus: Option<Aabb>,
     /// Metres per dataset unit.
     pub unit_m: f64,
-    /// What a person should know; nothing here stops the work.
+    /// Warnings, none of which stops the work.
     pub warnings: Vec<String>,
 }
 

@@ -21,7 +21,7 @@ pub(super) fn inspect(common: &Common, capture: &Path) -> Result<()> {
         format!("{found}\n")
     };
     print(&text)?;
-    if found.is_sound() { Ok(()) } else { Err(Error::already_printed(ErrorKind::Cannot)) }
+    if found.is_usable() { Ok(()) } else { Err(Error::already_printed(ErrorKind::Cannot)) }
 }
 
 pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<()> {

@@ -35,7 +35,7 @@ pub(super) struct PreviewOptions {
     #[arg(long, value_name = "LOOK")]
     #[arg(value_parser = PossibleValuesParser::new(Look::ALL.map(Look::word)).map(|word| look(&word)))]
     light: Option<Look>,
-    /// Frames all around instead: --out ends in .png (animated), .gif, .mp4 or / (a folder of pictures)
+    /// Frames all around instead: --out ends in .png (animated), .gif or / (a folder of pictures)
     #[arg(long, conflicts_with_all = ["sheet", "cameras"])]
     turntable: bool,
     /// Frames of a turntable

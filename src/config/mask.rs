@@ -122,8 +122,6 @@ table! {
         /// Size and normalization of its input: auto (from the file beside it, else by its name), SIDE,MEAN,SCALE as
         /// 1024,0.5,1, or SIDE,imagenet.
         alpha_input: String => "auto".into();
-        /// ONNX Runtime library to run networks with; empty: the built-in engine.
-        onnxruntime: String => String::new();
         /// Normalization of the input of ViTMatte: auto (from the file beside it, else imagenet), imagenet or half.
         vitmatte_colors: VitmatteColors => VitmatteColors::Auto;
         /// Largest memory for running networks, GiB.

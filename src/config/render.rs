@@ -153,7 +153,6 @@ table! {
         /// mask, over render.background).
         truth: TruthPhoto => TruthPhoto::Masked, TruthPhoto::Masked, TruthPhoto::Photo;
         /// LPIPS network, an ONNX file that takes two pictures (needs a build with the feature `matting`); empty: no LPIPS.
-        /// Run by `mask.onnxruntime` if that is given.
         lpips: String => String::new();
         /// Number of points sampled on a surface to compare it with a known one.
         surface_points: u32, 100.0..=10_000_000.0 => 20_000, 100_000, 100_000;

@@ -15,8 +15,7 @@
 //! Excluding whole views would harm the fields; excluding a few squares of each does not, since other views show the
 //! same skin. The squares are large enough that their content cannot be guessed from the pixels around.
 
-use super::members::{in_bands, no_members, normalized};
-use super::{BlendTarget, Members};
+use super::{BlendTarget, Members, in_bands, no_members, normalized};
 use crate::kernel::cpu::rng;
 use crate::{Error, Result};
 
@@ -388,5 +387,211 @@ mod tests {
         assert!(tiles(384, 512, 0.0, 42, 3).is_empty());
         assert_ne!(tiles(384, 512, 0.04, 42, 3), tiles(384, 512, 0.04, 42, 4));
         assert_ne!(tiles(384, 512, 0.04, 42, 3), tiles(384, 512, 0.04, 43, 3));
+    }
+}
+
+/// Fits of the blend: known weights are found again, and scarce data change little.
+#[cfg(test)]
+mod blend_tests {
+    use super::*;
+    use crate::ensemble::{Member, PAPER_WEIGHTS, blend};
+    use crate::image::{Gray, Image, Photo, quantize};
+    use crate::kernel::cpu::rng::{normal, uniform};
+
+    const SIZE: u32 = 64;
+    const PIXELS: usize = (SIZE * SIZE) as usize;
+
+    fn view(color: impl Fn(usize, usize) -> f32) -> Image {
+        let mut image = Image::new(SIZE, SIZE, 4);
+        for (i, pixel) in image.data.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+            *pixel = [color(i, 0), color(i, 1), color(i, 2), 1.0];
+        }
+        image
+    }
+
+    fn photo(color: impl Fn(usize, usize) -> f32) -> Photo {
+        let rgb = (0..PIXELS).map(|i| std::array::from_fn(|j| quantize(color(i, j)))).collect();
+        Photo { width: SIZE, height: SIZE, rgb, alpha: None }
+    }
+
+    fn everywhere() -> Gray {
+        Gray { width: SIZE, height: SIZE, values: vec![255; PIXELS] }
+    }
+
+    /// A color from 0.3 to 0.7.
+    fn color(seed: u64, i: usize, j: usize) -> f32 {
+        0.3 + 0.4 * uniform(seed, j as u64, i as u64)
+    }
+
+    fn noise(seed: u64, sigma: f32, i: usize, j: usize) -> f32 {
+        sigma * normal(seed, 20 + j as u64, i as u64)
+    }
+
+    fn members(views: &[Image]) -> Members<'_> {
+        let names = ["baseline", "tface", "iface", "other"];
+        let list: Vec<Member> =
+            views.iter().zip(names).map(|(image, name)| Member { name, image, masked: true }).collect();
+        Members::new(&list).unwrap()
+    }
+
+    fn fit(views: &[Image], photo: &Photo, weight: &Gray) -> Fit {
+        let mut fit = Fit::new(views.len()).unwrap();
+        fit.add(&members(views), &BlendTarget { photo, weight }).unwrap();
+        fit
+    }
+
+    #[test]
+    fn two_flat_members_are_weighed_as_worked_by_hand() {
+        // 0.2 and 0.4 around 68/255 = 0.2667: two thirds and a third; none beyond the greater one
+        let views = [view(|_, _| 0.2), view(|_, _| 0.4)];
+        let between = fit(&views, &photo(|_, _| 68.0 / 255.0), &everywhere());
+        let w = between.solve().unwrap();
+        assert!((w[0] - 2.0 / 3.0).abs() < 1e-4 && (w[1] - 1.0 / 3.0).abs() < 1e-4, "{w:?}");
+        let beyond = fit(&views, &photo(|_, _| 0.6), &everywhere());
+        assert_eq!(beyond.solve().unwrap(), [0.0, 1.0]);
+        // error 0.2 of the second: −10 log10 0.04 = 13.9794; halves: 0.3, 10.4576
+        assert!((beyond.psnr(&[0.0, 1.0]).unwrap().unwrap() - 13.9794).abs() < 1e-4);
+        assert!((beyond.psnr(&[0.5, 0.5]).unwrap().unwrap() - 10.4576).abs() < 1e-4);
+    }
+
+    #[test]
+    fn known_weights_are_found_again_inside_and_on_the_boundary() {
+        for truth in [[0.1, 0.6, 0.3], [0.0, 0.7, 0.3], [0.0, 0.0, 1.0]] {
+            let views: Vec<Image> = (0..3).map(|k| view(|i, j| color(k, i, j))).collect();
+            let photo = photo(|i, j| {
+                let mix: f32 = (0..3).map(|k| truth[k] * color(k as u64, i, j)).sum();
+                mix + noise(9, 0.01, i, j)
+            });
+            let fit = fit(&views, &photo, &everywhere());
+            let w = fit.solve().unwrap();
+            assert!((0..3).all(|k| (w[k] - truth[k]).abs() < 0.005), "{truth:?} → {w:?}");
+            assert!((w.iter().sum::<f32>() - 1.0).abs() < 1e-6 && w.iter().all(|v| *v >= 0.0));
+            // no better than the noise of 0.01 (40 dB), and no worse than the truth
+            let psnr = |w: &[f32]| fit.psnr(w).unwrap().unwrap();
+            assert!((psnr(&w) - 40.0).abs() < 0.3 && psnr(&w) >= psnr(&truth) - 1e-9);
+        }
+    }
+
+    #[test]
+    fn the_sums_say_what_the_pixels_say() {
+        let views: Vec<Image> = (0..3).map(|k| view(|i, j| color(k, i, j))).collect();
+        let photo = photo(|i, j| color(7, i, j));
+        let mut weight = everywhere();
+        (0..PIXELS / 2).for_each(|i| weight.values[i] = 0);
+        let blended = blend(&members(&views), &PAPER_WEIGHTS).unwrap();
+        let squares = (PIXELS / 2..PIXELS)
+            .flat_map(|i| (0..3).map(move |j| (i, j)))
+            .map(|(i, j)| (blended.data[4 * i + j] as f64 - photo.rgb[i][j] as f64 / 255.0).powi(2));
+        let expected = -10.0 * (squares.sum::<f64>() / (1.5 * PIXELS as f64)).log10();
+        let found = fit(&views, &photo, &weight).psnr(&PAPER_WEIGHTS).unwrap().unwrap();
+        assert!((found - expected).abs() < 1e-5, "{found} {expected}");
+    }
+
+    #[test]
+    fn members_that_are_the_same_share_alike() {
+        let views = [view(|i, j| color(1, i, j)), view(|i, j| color(1, i, j)), view(|i, j| color(2, i, j))];
+        let photo = photo(|i, j| color(1, i, j) + noise(3, 0.02, i, j));
+        let w = fit(&views, &photo, &everywhere()).solve().unwrap();
+        assert!((w[0] - w[1]).abs() < 1e-4 && w[2] < 0.01, "{w:?}");
+        // and a member that is perfect takes all, without dividing by 0
+        let black = [view(|_, _| 0.0), view(|_, _| 1.0)];
+        let perfect = fit(&black, &self::photo(|_, _| 0.0), &everywhere());
+        assert_eq!(perfect.psnr(&[1.0, 0.0]).unwrap(), None);
+        assert!(perfect.solve().unwrap()[0] > 0.999_999);
+    }
+
+    #[test]
+    fn half_a_weight_counts_half_a_pixel_and_views_add_up() {
+        let views = [view(|i, j| color(1, i, j)), view(|i, j| color(2, i, j))];
+        let photo = photo(|i, j| color(3, i, j));
+        let mut weight = everywhere();
+        weight.values.fill(51); // a fifth
+        let fifth = fit(&views, &photo, &weight);
+        assert!((fifth.pixels() - PIXELS as f64 / 5.0).abs() < 1e-6);
+        let whole = fit(&views, &photo, &everywhere());
+        assert!(
+            (fifth.psnr(&[0.5, 0.5]).unwrap().unwrap() - whole.psnr(&[0.5, 0.5]).unwrap().unwrap()).abs()
+                < 1e-9
+        );
+        let mut twice = whole.clone();
+        twice.merge(&whole).unwrap();
+        let mut streamed = whole.clone();
+        streamed.add(&members(&views), &BlendTarget { photo: &photo, weight: &everywhere() }).unwrap();
+        assert!((twice.pixels() - streamed.pixels()).abs() < 1e-9);
+        let (a, b) = (twice.solve().unwrap(), streamed.solve().unwrap());
+        assert!((a[0] - b[0]).abs() < 1e-6);
+    }
+
+    /// A view of two members with errors of these sizes, in so many of its pixels.
+    fn noisy(seed: u64, sigmas: [f32; 2], pixels: usize) -> Fit {
+        let views =
+            [0, 1].map(|k| view(|i, j| color(seed, i, j) + noise(seed * 10 + k, sigmas[k as usize], i, j)));
+        let mut weight = everywhere();
+        weight.values[pixels..].fill(0);
+        fit(&views, &photo(|i, j| color(seed, i, j)), &weight)
+    }
+
+    #[test]
+    fn the_blend_of_a_capture_follows_its_better_member() {
+        // independent errors a and b: weights as 1/a² and 1/b²
+        for (sigmas, first) in [([0.02, 0.02], 0.5), ([0.02, 0.04], 0.8), ([0.04, 0.02], 0.2)] {
+            let views: Vec<Fit> = (1..4).map(|seed| noisy(seed, sigmas, PIXELS)).collect();
+            let w = fit_weights(&views).unwrap().unwrap();
+            assert!((w[0] - first).abs() < 0.02 && (w[0] + w[1] - 1.0).abs() < 1e-6, "{sigmas:?} → {w:?}");
+        }
+    }
+
+    #[test]
+    fn where_no_weights_hold_on_other_views_the_best_member_stands_alone() {
+        // errors of the members: 0.1 and -0.3 in one view, -0.1 and 0.02 in the other. Over both, (0.7, 0.3) is best;
+        // but the first alone asks for (0.75, 0.25) and the second for (0.17, 0.83), which leave 0.0049 of the second
+        // and 0.0544 of the first, and the first member alone 0.01 of each
+        let of =
+            |errors: [f32; 2]| fit(&errors.map(|e| view(|_, _| 0.4 + e)), &photo(|_, _| 0.4), &everywhere());
+        let views = [of([0.1, -0.3]), of([-0.1, 0.02])];
+        let mut both = views[0].clone();
+        both.merge(&views[1]).unwrap();
+        assert!((both.solve().unwrap()[0] - 0.7).abs() < 0.01);
+        assert_eq!(fit_weights(&views).unwrap().unwrap(), [1.0, 0.0]);
+        // one view has no other to judge it, and one without a pixel is none
+        let one = noisy(1, [0.02, 0.04], PIXELS);
+        assert_eq!(fit_weights(&[one.clone(), Fit::new(2).unwrap()]).unwrap(), one.solve());
+        assert_eq!(fit_weights(&[]), Ok(None));
+        assert_eq!(fit_weights(&[Fit::new(2).unwrap()]), Ok(None));
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        let run = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| {
+                let views = [view(|i, j| color(1, i, j)), view(|i, j| color(2, i, j))];
+                let fit = fit(&views, &photo(|i, j| color(3, i, j)), &everywhere());
+                let weights = fit.solve().unwrap();
+                let out = blend(&members(&views), &weights).unwrap();
+                (fit, weights, out)
+            })
+        };
+        let one = run(1);
+        let nan_free = |image: &Image| image.data.iter().all(|v| v.is_finite());
+        assert!(nan_free(&one.2) && one == run(3) && one == run(5));
+    }
+
+    #[test]
+    fn what_cannot_be_fitted_is_said() {
+        assert_eq!(Fit::new(0).unwrap_err().to_string(), "there are no members to blend");
+        assert_eq!(Fit::new(9).unwrap_err().to_string(), "9 members cannot be fitted, at most 8");
+        assert_eq!(Fit::new(2).unwrap().solve(), None);
+
+        let views = [view(|_, _| 0.5), view(|_, _| 0.5)];
+        let (photo, weight) = (photo(|_, _| 0.5), Gray { width: 1, height: 1, values: vec![255] });
+        let e = Fit::new(2)
+            .unwrap()
+            .add(&members(&views), &BlendTarget { photo: &photo, weight: &weight })
+            .unwrap_err();
+        assert_eq!(e.to_string(), "the weight map is 1 × 1 pixels, expected 64 × 64");
+        let target = BlendTarget { photo: &photo, weight: &everywhere() };
+        let e = Fit::new(3).unwrap().add(&members(&views), &target).unwrap_err();
+        assert_eq!(e.to_string(), "there are 2 members, expected 3");
     }
 }

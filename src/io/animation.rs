@@ -1,14 +1,9 @@
-//! Moving pictures: animated PNG and GIF, and films through the system's `ffmpeg`.
+//! Animated PNG and GIF.
 
-use super::read::read_bytes;
 use super::write::{WriteError, write_atomic};
-use super::{Limits, ReadError};
-use crate::image::over_black;
-use crate::{Error, Result};
+use crate::Result;
 use rayon::prelude::*;
-use std::io::Write;
 use std::path::Path;
-use std::process::{Command, Stdio};
 
 /// Frames of one size, shown over and over.
 #[derive(Clone, Copy, Debug)]
@@ -17,7 +12,7 @@ pub struct Animation {
     pub width: u32,
     /// Rows.
     pub height: u32,
-    /// How many there are.
+    /// Number of frames.
     pub count: u32,
     /// Frames a second, 1 to 100.
     pub rate: u16,
@@ -31,24 +26,22 @@ pub type Frames<'a> = &'a mut dyn Iterator<Item = Result<Vec<[u8; 4]>>>;
 const AT_ONCE: usize = 8;
 
 /// The endings of [`write_animation`].
-pub const ANIMATIONS: [&str; 3] = ["png", "gif", "mp4"];
+pub const ANIMATIONS: [&str; 2] = ["png", "gif"];
 
-/// Writes an animated PNG, a GIF (of 256 colors a frame, without half transparency) or an MP4 (over black), as `ending`
-/// says.
+/// Writes an animated PNG, or a GIF (of 256 colors a frame, without half transparency), as `ending` says.
 ///
 /// # Errors
 ///
-/// The file cannot be written, the frames cannot be stored so, or there is no working `ffmpeg` for an MP4; or a frame is an
-/// error, which is handed on. Nothing is written then.
+/// The file cannot be written, the frames cannot be stored so, or a frame is an error, which is handed on. Nothing is
+/// written then.
 pub fn write_animation(path: &Path, ending: &str, animation: &Animation, frames: Frames) -> Result<()> {
     let mut failed = None;
     // up to the first that fails
     let mut good = frames.map_while(|frame| frame.map_err(|e| failed = Some(e)).ok());
-    let content = |problem: String| WriteError::content(path, problem).into();
+    let content = |problem: String| WriteError::content(path, problem);
     let bytes = match ending {
-        "png" => png_bytes(animation, &mut good).map_err(|e| content(e.to_string())),
         "gif" => gif_bytes(animation, &mut good).map_err(|e| content(e.to_string())),
-        _ => mp4_bytes(animation, &mut good),
+        _ => png_bytes(animation, &mut good).map_err(|e| content(e.to_string())),
     };
     match failed {
         Some(e) => Err(e),
@@ -101,61 +94,10 @@ fn gif_bytes(animation: &Animation, frames: Good) -> Result<Vec<u8>, gif::Encodi
     Ok(out)
 }
 
-fn mp4_bytes(animation: &Animation, frames: Good) -> Result<Vec<u8>> {
-    let failed = |problem: String| {
-        let hint = "install ffmpeg with libx264, or end --out in .gif, .png or / instead";
-        Error::cannot(format!("no film was made: {problem}"), hint)
-    };
-    let folder = tempfile::tempdir().map_err(|e| failed(e.to_string()))?;
-    let file = folder.path().join("film.mp4");
-    let size = format!("{}x{}", animation.width, animation.height);
-    let rate = animation.rate.to_string();
-    // H.264 as players want it: sides even, chroma halved
-    let words = [
-        "-hide_banner",
-        "-loglevel",
-        "error",
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-s",
-        &size,
-        "-r",
-        &rate,
-    ];
-    let more = ["-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"];
-    let mut ffmpeg = Command::new("ffmpeg")
-        .args(words)
-        .args(more)
-        .args(["-movflags", "+faststart", "-y"])
-        .arg(&file)
-        .stdin(Stdio::piped())
-        .stdout(Stdio::null())
-        .stderr(Stdio::piped())
-        .spawn()
-        .map_err(|e| failed(format!("`ffmpeg` cannot be started: {e}")))?;
-    if let Some(mut input) = ffmpeg.stdin.take() {
-        for frame in frames {
-            let rgb: Vec<u8> = frame.into_iter().flat_map(over_black).collect();
-            if input.write_all(&rgb).is_err() {
-                break; // it has ended: what it says of that is told below
-            }
-        }
-    }
-    let done = ffmpeg.wait_with_output().map_err(|e| failed(e.to_string()))?;
-    if !done.status.success() {
-        let said = String::from_utf8_lossy(&done.stderr);
-        let last = said.lines().last().unwrap_or("nothing");
-        return Err(failed(format!("`ffmpeg` ended with {}: {last}", done.status)));
-    }
-    let limits = Limits::default();
-    read_bytes(&file, &limits).map_err(|e: ReadError| failed(e.to_string()))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Error;
     use image::AnimationDecoder;
     use image::codecs::png::PngDecoder;
     use std::io::Cursor;

@@ -35,7 +35,7 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
     for entry in entries(path).map_err(failed(path))? {
         let inside = entry.path();
         let is_folder = entry.file_type().map_err(failed(&inside))?.is_dir();
-        let gone = if is_folder && !apart(&inside) {
+        let removed = if is_folder && !apart(&inside) {
             clear_folder(&inside, keep, apart)?;
             match fs::remove_dir(&inside) {
                 Err(e) if e.kind() == ErrorKind::DirectoryNotEmpty => Ok(()), // something apart is in it
@@ -46,7 +46,7 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
         } else {
             fs::remove_file(&inside)
         };
-        gone.map_err(failed(&inside))?;
+        removed.map_err(failed(&inside))?;
     }
     Ok(())
 }
@@ -84,17 +84,17 @@ pub fn file_sizes(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<BTreeMap
     Ok(sizes)
 }
 
-/// Is there a regular file (through links)?
+/// Returns whether the path is a regular file (through links).
 pub fn is_file(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|m| m.is_file())
 }
 
-/// Is there anything by this name, even a link that leads nowhere?
+/// Returns whether anything has this name, even a dangling link.
 pub fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
 
-/// Is there a folder (through links)?
+/// Returns whether the path is a folder (through links).
 pub fn is_folder(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|m| m.is_dir())
 }
@@ -125,7 +125,7 @@ pub fn real_path(path: &Path) -> Result<PathBuf, ReadError> {
     fs::canonicalize(path).map_err(|e| ReadError::io(path, e))
 }
 
-/// Is there a link, wherever it leads?
+/// Returns whether the path is a link, dangling or not.
 pub fn is_link(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|m| m.is_symlink())
 }
@@ -144,12 +144,12 @@ pub fn list_folders(path: &Path) -> Result<Vec<PathBuf>, ReadError> {
     Ok(folders)
 }
 
-/// How many bytes a file has; `None` if it is not there.
+/// How many bytes a file has; `None` if it does not exist.
 pub fn file_size(path: &Path) -> Option<u64> {
     fs::metadata(path).ok().filter(|m| m.is_file()).map(|m| m.len())
 }
 
-/// When a file was last changed; `None` if it is not there or the system does not say.
+/// When a file was last changed; `None` if it does not exist or the system does not say.
 pub fn modified(path: &Path) -> Option<SystemTime> {
     fs::metadata(path).and_then(|m| m.modified()).ok()
 }
@@ -249,7 +249,7 @@ impl Lock {
         }
     }
 
-    /// [`Lock::take`] that waits for whoever holds it: for locks that are held for moments.
+    /// [`Lock::take`] that waits for the holder, for locks that are held for moments.
     pub fn wait(path: &Path) -> Result<Lock, LockError> {
         let file = lock_file(path)?;
         file.lock().map_err(|source| LockError::Io { path: path.into(), source })?;

@@ -20,7 +20,7 @@ pub fn read_typed<T: DeserializeOwned>(path: &Path, limits: &Limits) -> Result<T
         .map_err(|[key, found, expected]| ReadError::value(path, key, found, expected))
 }
 
-/// A JSON value as a value of a type, or the key that does not fit, what stands there and what could, in plain words.
+/// Converts a JSON value to a type, or returns the key that does not fit, its value and what was expected, in plain words.
 pub fn typed<'v, T: Deserialize<'v>>(value: &'v Value) -> Result<T, [String; 3]> {
     serde_path_to_error::deserialize(value).map_err(|e| {
         let (key, text) = (e.path().to_string(), e.inner().to_string());
@@ -34,7 +34,7 @@ pub fn typed<'v, T: Deserialize<'v>>(value: &'v Value) -> Result<T, [String; 3]>
     })
 }
 
-/// What serde calls a value or a type, for people who know neither Rust nor serde.
+/// Translates serde's names of values and types for readers without knowledge of Rust.
 fn in_plain_words(serde: &str) -> String {
     let value = |kind: &str| serde.strip_prefix(kind)?.strip_prefix(" `")?.strip_suffix('`');
     if let Some(value) = ["integer", "floating point", "boolean"].into_iter().find_map(value) {
@@ -148,10 +148,6 @@ impl<'de> Visitor<'de> for BoundedValue<'_> {
     }
 
     fn visit_str<E: Error>(self, v: &str) -> Result<Value, E> {
-        Ok(v.into())
-    }
-
-    fn visit_string<E: Error>(self, v: String) -> Result<Value, E> {
         Ok(v.into())
     }
 

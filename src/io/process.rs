@@ -1,4 +1,4 @@
-//! What this process has cost so far, what it runs on, and whether others are there, as far as the system says.
+//! Cost of this process, its processor, and whether other processes run, as far as the system says.
 
 use std::path::Path;
 
@@ -32,33 +32,33 @@ pub fn forget_peak_memory() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 
-/// Returns whether a process of this machine is there and has a file open. Where the system shows no open files (another
-/// user's process, too), that it is there must do.
+/// Returns whether a process of this machine runs and has a file open. Where the system shows no open files (such as of
+/// another user's process), whether it runs.
 pub fn has_open(pid: u32, file: &Path) -> bool {
     let files = std::fs::read_dir(format!("/proc/{pid}/fd")).ok();
     match (files, file.canonicalize()) {
         (Some(files), Ok(file)) => {
             files.flatten().any(|f| std::fs::read_link(f.path()).is_ok_and(|to| to == file))
         }
-        _ => is_there(pid),
+        _ => is_running(pid),
     }
 }
 
 /// Returns whether a process of this machine has ended: another one, or an earlier one of this one's number.
 pub fn has_ended(pid: u32) -> bool {
-    pid == std::process::id() || !is_there(pid)
+    pid == std::process::id() || !is_running(pid)
 }
 
 #[cfg(unix)]
-fn is_there(pid: u32) -> bool {
+fn is_running(pid: u32) -> bool {
     use rustix::process::{Pid, test_kill_process};
     let pid = i32::try_from(pid).ok().and_then(Pid::from_raw);
-    // one that may not be asked is there
+    // a process of another user refuses the signal, so it runs
     pid.is_some_and(|pid| test_kill_process(pid).err().is_none_or(|e| e == rustix::io::Errno::PERM))
 }
 
 #[cfg(not(unix))]
-fn is_there(_: u32) -> bool {
+fn is_running(_: u32) -> bool {
     true
 }
 

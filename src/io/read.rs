@@ -108,6 +108,11 @@ impl Default for Limits {
 }
 
 impl Limits {
+    pub(crate) fn check_views(&self, path: &Path, views: usize) -> Result<(), ReadError> {
+        let too_large = || ReadError::too_large(path, "the number of views", views as u64, self.views as u64);
+        if views > self.views { Err(too_large()) } else { Ok(()) }
+    }
+
     pub(super) fn check_side(&self, path: &Path, side: u64) -> Result<(), ReadError> {
         let (what, limit) = ("the picture's longest side in pixels", self.side_px.into());
         if side > limit { Err(ReadError::too_large(path, what, side, limit)) } else { Ok(()) }
@@ -158,7 +163,7 @@ pub enum ReadError {
         limit: u64,
     },
     /// The bytes are not what the format demands.
-    #[error("`{}` is not a sound {format} file: {problem}{}", path.display(), at(*offset))]
+    #[error("`{}` is not a valid {format} file: {problem}{}", path.display(), at(*offset))]
     Damaged {
         /// The file.
         path: PathBuf,
@@ -166,10 +171,10 @@ pub enum ReadError {
         format: &'static str,
         /// Byte offset of the damage, where known.
         offset: Option<u64>,
-        /// What is wrong there.
+        /// What is wrong.
         problem: String,
     },
-    /// A sound file of a kind that is not read.
+    /// A valid file of a kind that is not read.
     #[error("`{}`: {what} cannot be used", path.display())]
     Unsupported {
         /// The file.
@@ -188,19 +193,19 @@ pub enum ReadError {
         line: usize,
         /// Column, from 1.
         column: usize,
-        /// What is wrong there.
+        /// What is wrong.
         problem: String,
     },
-    /// A value that whoever wrote the file cannot have written.
+    /// A value that the program's own writer cannot have written.
     #[error("`{}`: `{key}` is {found}, expected {expected}", path.display())]
     Value {
         /// The file.
         path: PathBuf,
         /// Where in it.
         key: String,
-        /// What stands there.
+        /// The value found.
         found: String,
-        /// What could.
+        /// What was expected.
         expected: String,
     },
 }

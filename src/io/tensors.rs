@@ -26,7 +26,7 @@ pub enum TensorValues {
 }
 
 impl TensorValues {
-    /// How many values there are.
+    /// Returns the number of values.
     pub fn len(&self) -> usize {
         match self {
             TensorValues::F32(v) => v.len(),
@@ -36,7 +36,7 @@ impl TensorValues {
         }
     }
 
-    /// Is there none?
+    /// Returns whether it has no values.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }

@@ -68,36 +68,20 @@ impl WriteError {
     }
 }
 
-/// Replaces `path` by `bytes` in one step; a file that was there keeps its permissions.
+/// Replaces `path` by `bytes` in one step; an existing file keeps its permissions.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
-    write_with(path, bytes, |file, bytes| file.write_all(bytes))
+    write_with(path, bytes.len(), |file| file.write_all(bytes))
 }
 
 /// Copies a file to a name that nothing has, in one step; `from` may be a link.
 pub fn copy(from: &Path, to: &Path) -> Result<(), WriteError> {
-    let fail = |source| WriteError::Io { path: to.into(), source };
-    absent(to).map_err(fail)?;
-    let bytes = fs::metadata(from).map_or(0, |m| m.len() as usize);
-    let aside = to.with_file_name(aside_name(&to.file_name().unwrap_or_default().to_string_lossy()));
-    let result = (|| {
-        // where the disk can, the bytes are shared instead of copied
-        let mut copied = create(&aside)?;
-        std::io::copy(&mut File::open(from)?, &mut copied)?;
-        copied.sync_all()?;
-        fs::rename(&aside, to)
-    })();
-    result.map_err(|e| {
-        let _ = fs::remove_file(&aside); // the first error is the one to tell
-        WriteError::from_io(to, bytes, e)
-    })
-}
-
-fn absent(path: &Path) -> std::io::Result<()> {
-    match fs::symlink_metadata(path) {
-        Ok(_) => Err(std::io::Error::new(ErrorKind::AlreadyExists, "it is already there")),
-        Err(e) if e.kind() == ErrorKind::NotFound => Ok(()),
-        Err(e) => Err(e),
+    if fs::symlink_metadata(to).is_ok() {
+        let source = std::io::Error::new(ErrorKind::AlreadyExists, "it already exists");
+        return Err(WriteError::Io { path: to.into(), source });
     }
+    let bytes = fs::metadata(from).map_or(0, |m| m.len() as usize);
+    // where the disk can, the bytes are shared instead of copied
+    write_with(to, bytes, |file| std::io::copy(&mut File::open(from)?, file).map(drop))
 }
 
 /// Gives a file another name in the same folder, replacing what had it, and syncs the folder.
@@ -110,7 +94,7 @@ pub fn rename(from: &Path, to: &Path) -> Result<(), WriteError> {
     }
 }
 
-/// Removes a file; one that is not there is fine.
+/// Removes a file, if it exists.
 pub fn remove(path: &Path) -> Result<(), WriteError> {
     match fs::remove_file(path) {
         Err(e) if e.kind() != ErrorKind::NotFound => Err(WriteError::Io { path: path.into(), source: e }),
@@ -118,13 +102,13 @@ pub fn remove(path: &Path) -> Result<(), WriteError> {
     }
 }
 
-/// [`write_atomic`] with the writing itself given, so that tests can let it fail.
+/// Replaces `path` in one step by what `put` writes, about `bytes` bytes.
 fn write_with(
     path: &Path,
-    bytes: &[u8],
-    put: impl FnOnce(&mut File, &[u8]) -> std::io::Result<()>,
+    bytes: usize,
+    put: impl FnOnce(&mut File) -> std::io::Result<()>,
 ) -> Result<(), WriteError> {
-    let fail = |e| WriteError::from_io(path, bytes.len(), e);
+    let fail = |e| WriteError::from_io(path, bytes, e);
     let Some(name) = path.file_name() else {
         return Err(fail(std::io::Error::new(ErrorKind::InvalidInput, "the path names no file")));
     };
@@ -135,7 +119,7 @@ fn write_with(
     let aside = folder.join(aside_name(&name.to_string_lossy()));
     let result = (|| {
         let mut file = create(&aside)?;
-        put(&mut file, bytes)?;
+        put(&mut file)?;
         if let Ok(old) = fs::metadata(path) {
             file.set_permissions(old.permissions())?;
         }
@@ -153,7 +137,7 @@ fn write_with(
 fn create(aside: &Path) -> std::io::Result<File> {
     let open = || OpenOptions::new().write(true).create_new(true).open(aside);
     match open() {
-        // left by a crashed process that had our number: nobody else may own that name now
+        // left by a crashed process with our number: no other process can own that name now
         Err(e) if e.kind() == ErrorKind::AlreadyExists => {
             fs::remove_file(aside)?;
             open()
@@ -236,8 +220,8 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.txt");
         write_atomic(&path, b"old").unwrap();
-        let error = write_with(&path, b"12345678", |file, bytes| {
-            file.write_all(&bytes[..3])?;
+        let error = write_with(&path, 8, |file| {
+            file.write_all(b"123")?;
             Err(ErrorKind::StorageFull.into())
         })
         .unwrap_err();

@@ -6,15 +6,29 @@
 //! them together can. The view whose removal settles most of the conflict is named first, and the rest is asked
 //! again without it, until what is left is no more than discretisation.
 //!
-//! Nothing but masks and cameras is needed, so masks a person brought are checked the same way.
+//! Nothing but masks and cameras is needed, so the masks of a capture are checked in the same way.
+//!
+//! # Masks proposed by a network
+//!
+//! A network leaves out parts of the head, a garment or a crown, in some views and shows them in others; it seldom takes
+//! background for the head. Therefore [`verdicts`] weighs the two errors differently. The best cell of a pixel's ray is the one
+//! that the fewest other views rule out, among the cells that most views see and that a quarter of these have on the head.
+//! The views that rule it out share the blame in equal parts; a pixel without such a cell, or whose best cell is ruled out,
+//! is an open claim. The view with the largest
+//!
+//! ```text
+//! claims of others that it rules out + ⅓ · its own open claims        in whole masks
+//! ```
+//!
+//! is set aside, and the comparison is repeated without it until no view exceeds the limits. (⅓ is the weight of an open
+//! claim relative to one that is ruled out.)
 
 use super::hull::{self, ViewFrame};
 use super::morphology::squared_distance;
-use super::scale::resize_hard;
 use crate::Result;
 use crate::capture::carve::Cube;
 use crate::geom::Camera;
-use crate::image::Gray;
+use crate::image::{Gray, resize_hard};
 use glam::{DVec3, Vec2};
 use rayon::prelude::*;
 
@@ -53,7 +67,7 @@ pub struct Conflict {
     pub too_much: f64,
     /// Share of the other views' masks, 0..=1, that it takes away.
     pub too_little: f64,
-    /// What a person should read.
+    /// A sentence for the user.
     pub text: String,
 }
 
@@ -111,7 +125,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
 }
 
 /// The cube that some views look at, and what the mask of each claims.
-pub(super) fn claims_of(
+fn claims_of(
     views: &[ConsistencyView],
     used: &[usize],
     cells: usize,
@@ -147,14 +161,14 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
 }
 
 /// What a reduced mask claims: where the head is, and where it cannot be.
-pub(super) struct SilhouetteConstraints {
+struct SilhouetteConstraints {
     camera: Camera,
     frame: ViewFrame,
-    /// Pixels so far beside the mask that a cell there is ruled out.
+    /// Pixels so far beside the mask that they rule out the cells they show.
     beside: Vec<bool>,
     on: Vec<bool>,
     /// Pixels well inside the mask, whose rays must meet something.
-    pub(super) inner: Vec<usize>,
+    inner: Vec<usize>,
 }
 
 impl SilhouetteConstraints {
@@ -177,14 +191,14 @@ impl SilhouetteConstraints {
 }
 
 /// Which views vote against and for every cell: bits of views, `words` of them against and as many for.
-pub(super) struct Votes {
-    pub(super) cube: Cube,
+struct Votes {
+    cube: Cube,
     words: usize,
     bits: Vec<u64>,
 }
 
 impl Votes {
-    pub(super) fn count(cube: Cube, claims: &[SilhouetteConstraints]) -> Votes {
+    fn count(cube: Cube, claims: &[SilhouetteConstraints]) -> Votes {
         let words = claims.len().div_ceil(64);
         let frames: Vec<&ViewFrame> = claims.iter().map(|c| &c.frame).collect();
         let bits = hull::vote(&cube, &frames, 2 * words, |cell: &mut [u64], k, pixel| {
@@ -195,7 +209,7 @@ impl Votes {
     }
 
     /// Cells as what they cost: how many active views rule them out, and how many have them on the head.
-    pub(super) fn costs(&self, active: &[bool]) -> Vec<(u16, u16)> {
+    fn costs(&self, active: &[bool]) -> Vec<(u16, u16)> {
         let mut mask = vec![0u64; self.words];
         for i in (0..active.len()).filter(|&i| active[i]) {
             mask[i / 64] |= 1 << (i % 64);
@@ -206,12 +220,12 @@ impl Votes {
     }
 
     /// Does a view rule a cell out?
-    pub(super) fn rules_out(&self, view: usize, cell: usize) -> bool {
+    fn rules_out(&self, view: usize, cell: usize) -> bool {
         self.bits[2 * cell * self.words + view / 64] & (1 << (view % 64)) != 0
     }
 }
 
-/// Who stands against whom among the views still believed.
+/// The conflicts among the views that are still active.
 struct Conflicts {
     /// Per view: unexplained share of its own claims.
     too_much: Vec<f64>,
@@ -226,20 +240,26 @@ impl Conflicts {
     fn of(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Conflicts {
         let count = claims.len();
         let costs = votes.costs(active);
-        let found: Vec<Option<(f64, Vec<f64>)>> = (0..count)
+        let best = |claims, pixel| {
+            best_on_ray(&votes.cube, claims, pixel, &costs).map(|(no, cell)| (false, no, cell))
+        };
+        let found: Vec<Option<Opposition>> = (0..count)
             .into_par_iter()
-            .map(|j| active[j].then(|| open_claims(votes, &claims[j], &costs, active)))
+            .map(|j| active[j].then(|| Opposition::of(votes, &claims[j], active, |p| best(&claims[j], p))))
             .collect();
         let others = (active.iter().filter(|a| **a).count().max(2) - 1) as f64;
         let zero = || vec![0.0; count];
         let mut conflict = Conflicts { too_much: zero(), taken: zero(), credit: zero(), others };
         for (j, open) in found.into_iter().enumerate() {
-            let Some((own, takers)) = open else { continue };
+            let Some(Opposition { asked, open, takers }) = open else { continue };
+            // where hardly a ray comes where another view looks, the camera is turned away from what its mask shows
+            let is_turned = 10 * asked < claims[j].inner.len();
+            let own = if is_turned { 1.0 } else { open };
             conflict.too_much[j] = own;
             conflict.credit[j] += own;
-            for (i, t) in takers.into_iter().enumerate() {
-                conflict.taken[i] += t;
-                conflict.credit[i] += t;
+            for (i, [taken, _]) in takers.into_iter().enumerate().filter(|_| !is_turned) {
+                conflict.taken[i] += taken;
+                conflict.credit[i] += taken;
             }
         }
         conflict
@@ -260,38 +280,46 @@ impl Conflicts {
     }
 }
 
-/// The share of a view's claims that nothing explains, and the views that rule out the best point of each such
-/// ray: `k` of them share a claim in equal parts.
-fn open_claims(
-    votes: &Votes,
-    claims: &SilhouetteConstraints,
-    costs: &[(u16, u16)],
-    active: &[bool],
-) -> (f64, Vec<f64>) {
-    let mut takers = vec![0.0; active.len()];
-    let (mut open, mut asked) = (0usize, 0usize);
-    for &pixel in &claims.inner {
-        let Some((cost, cell)) = best_on_ray(&votes.cube, claims, pixel, costs) else { continue };
-        asked += 1;
-        if cost == 0 {
-            continue;
+/// How the claims of one view stand against the other views.
+struct Opposition {
+    /// Claims whose ray meets a cell that another view looks at.
+    asked: usize,
+    /// Share of them that nothing explains.
+    open: f64,
+    /// Per view: the share of the claims that it rules out, divided among all views that do; and the same undivided.
+    takers: Vec<[f64; 2]>,
+}
+
+impl Opposition {
+    /// `best` returns the best cell on a pixel's ray: whether it lacks support (then it explains nothing, but no view is
+    /// to blame), how many active views rule it out, and its index.
+    fn of(
+        votes: &Votes,
+        claims: &SilhouetteConstraints,
+        active: &[bool],
+        best: impl Fn(usize) -> Option<(bool, u16, usize)>,
+    ) -> Opposition {
+        let mut takers = vec![[0.0; 2]; active.len()];
+        let (mut open, mut asked) = (0usize, 0usize);
+        for (alone, no, cell) in claims.inner.iter().filter_map(|&pixel| best(pixel)) {
+            asked += 1;
+            open += (alone || no > 0) as usize;
+            if alone || no == 0 {
+                continue;
+            }
+            for i in (0..active.len()).filter(|&i| active[i] && votes.rules_out(i, cell)) {
+                takers[i][0] += 1.0 / f64::from(no);
+                takers[i][1] += 1.0;
+            }
         }
-        open += 1;
-        for i in (0..active.len()).filter(|&i| active[i] && votes.rules_out(i, cell)) {
-            takers[i] += 1.0 / cost as f64;
-        }
+        let total = asked.max(1) as f64;
+        takers.iter_mut().flatten().for_each(|t| *t /= total);
+        Opposition { asked, open: open as f64 / total, takers }
     }
-    if 10 * asked < claims.inner.len() {
-        // hardly a ray comes where another view looks: the camera is turned away from what its mask shows
-        return (1.0, vec![0.0; active.len()]);
-    }
-    let asked = asked.max(1) as f64;
-    takers.iter_mut().for_each(|t| *t /= asked);
-    (open as f64 / asked, takers)
 }
 
 /// The cells on a pixel's ray, from the camera on, each half a cell from the last.
-pub(super) fn cells_on_ray<'a>(
+fn cells_on_ray<'a>(
     cube: &'a Cube,
     claims: &SilhouetteConstraints,
     pixel: usize,
@@ -334,20 +362,20 @@ pub(super) fn cells_on_ray<'a>(
     })
 }
 
-/// The cell on a pixel's ray that fewest views rule out, of those that another view has on the head if there are
-/// any; of equals the one that most have there. Nothing when no other view looks at the ray within the cube.
+/// The cell on a pixel's ray that fewest views rule out, among those that another view has on the head, if any;
+/// of equals the one that most views have on the head. `None` when no other view looks at the ray within the cube.
 fn best_on_ray(
     cube: &Cube,
     claims: &SilhouetteConstraints,
     pixel: usize,
     costs: &[(u16, u16)],
 ) -> Option<(u16, usize)> {
-    // whom the ray's own view has on its side comes first, then who is against
+    // first whether another view supports it, then how many are against it
     let mut best: Option<(bool, u16, u16, usize)> = None;
     for i in cells_on_ray(cube, claims, pixel) {
         let (no, yes) = costs[i];
         if no == 0 && yes < 2 {
-            continue; // no other view looks there, which explains nothing
+            continue; // no other view sees this cell, so it explains nothing
         }
         let alone = yes < 2;
         if best.is_none_or(|(a, cost, agreed, _)| (alone, no, agreed) < (a, cost, yes)) {
@@ -358,6 +386,110 @@ fn best_on_ray(
         }
     }
     best.map(|(_, cost, _, i)| (cost, i))
+}
+
+/// Rows and cells of [`verdicts`], which compares masks that a network proposes.
+const PROPOSAL_ROWS: u32 = 96;
+const PROPOSAL_CELLS: usize = 96;
+/// Share of the views that must see a cell for it to explain a claim: what lies below all frames explains everything.
+const SEEN: f64 = 0.75;
+/// Share of the views that see a cell which must have it on the head.
+const SUPPORT: f64 = 0.25;
+/// What an open claim weighs, in parts of one that is taken away.
+const OWN: f64 = 1.0 / 3.0;
+/// Mean share of the others' masks that a view may rule out.
+const MOST_RULED_OUT: f64 = 0.003;
+/// Share of its own claims that may stand open.
+const MOST_OPEN: f64 = 0.05;
+
+/// The verdict on a proposed mask.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MaskVerdict {
+    /// It agrees with the others.
+    Agrees,
+    /// It leaves out what others show; what it shows is reliable.
+    LeavesOut,
+    /// It shows what no other does, or nothing at all.
+    Unlike,
+}
+
+/// What speaks against one mask.
+#[derive(Default)]
+struct Disagreement {
+    /// Open share of its own claims.
+    open: f64,
+    /// Shares of the others' claims that it rules out, each divided among all views that do.
+    taken: f64,
+    /// The same undivided.
+    ruled_out: f64,
+}
+
+/// Judges masks against each other; a view without one, or with an empty one, is [`MaskVerdict::Unlike`] the others.
+///
+/// # Errors
+/// When the cameras stand at one place or look in one direction.
+pub fn verdicts(views: &[ConsistencyView]) -> Result<Vec<MaskVerdict>> {
+    let mut out = vec![MaskVerdict::Unlike; views.len()];
+    let shows = |v: &ConsistencyView| v.mask.is_some_and(|m| m.values.iter().any(|&v| v > 127));
+    let used: Vec<usize> = (0..views.len()).filter(|&i| shows(&views[i])).collect();
+    used.iter().for_each(|&i| out[i] = MaskVerdict::Agrees);
+    if used.len() < 2 {
+        return Ok(out);
+    }
+    let (cube, claims) = claims_of(views, &used, PROPOSAL_CELLS, PROPOSAL_ROWS)?;
+    let votes = Votes::count(cube, &claims);
+    let mut active = vec![true; claims.len()];
+    loop {
+        let left = active.iter().filter(|a| **a).count();
+        let blame = blame(&votes, &claims, &active);
+        let weight = |b: &Disagreement| OWN * b.open + b.taken;
+        let mean = |b: &Disagreement| b.ruled_out / (left.max(2) - 1) as f64;
+        // of equals the first
+        let worst = (0..claims.len())
+            .filter(|&i| active[i] && (blame[i].open > MOST_OPEN || mean(&blame[i]) > MOST_RULED_OUT))
+            .rev()
+            .max_by(|&a, &b| weight(&blame[a]).total_cmp(&weight(&blame[b])));
+        let Some(worst) = worst else { break };
+        if left <= 2 {
+            // two that contradict each other say nothing of who is right
+            active.iter().zip(&used).filter(|(a, _)| **a).for_each(|(_, &i)| out[i] = MaskVerdict::Unlike);
+            break;
+        }
+        active[worst] = false;
+        let much = OWN * blame[worst].open > blame[worst].taken;
+        out[used[worst]] = if much { MaskVerdict::Unlike } else { MaskVerdict::LeavesOut };
+    }
+    Ok(out)
+}
+
+fn blame(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Vec<Disagreement> {
+    let costs = votes.costs(active);
+    let least_seen = SEEN * active.iter().filter(|a| **a).count() as f64;
+    // first whether it lacks support, then how many views are against it, then how many are for it
+    let key = |&cell: &usize| {
+        let (no, yes) = costs[cell];
+        let alone = yes < 2 || f64::from(yes) < SUPPORT * f64::from(no + yes);
+        (alone, no, u16::MAX - yes)
+    };
+    let best = |claims: &SilhouetteConstraints, pixel| {
+        let cells = cells_on_ray(&votes.cube, claims, pixel);
+        let seen = cells.filter(|&cell| f64::from(costs[cell].0 + costs[cell].1) >= least_seen);
+        seen.min_by_key(key).map(|cell| (key(&cell).0, costs[cell].0, cell))
+    };
+    let found: Vec<Option<Opposition>> = (0..claims.len())
+        .into_par_iter()
+        .map(|j| active[j].then(|| Opposition::of(votes, &claims[j], active, |p| best(&claims[j], p))))
+        .collect();
+    let mut out: Vec<Disagreement> = claims.iter().map(|_| Disagreement::default()).collect();
+    for (j, opposition) in found.iter().enumerate() {
+        let Some(Opposition { open, takers, .. }) = opposition else { continue };
+        out[j].open = *open;
+        for (blame, [taken, ruled_out]) in out.iter_mut().zip(takers) {
+            blame.taken += taken;
+            blame.ruled_out += ruled_out;
+        }
+    }
+    out
 }
 
 #[cfg(test)]
@@ -491,5 +623,113 @@ mod tests {
         // 4 x 2 to 2 x 1: left block three of four masked, right block one
         let mask = Gray { width: 4, height: 2, values: vec![255, 255, 0, 0, 255, 0, 0, 200] };
         assert_eq!(resize_hard(&mask, (2, 1)).values, [255, 0]);
+    }
+}
+
+#[cfg(test)]
+mod proposal_tests {
+    use super::*;
+    use crate::geom::Distortion;
+    use glam::DMat3;
+
+    /// Twelve cameras on a ring, looking a little down.
+    fn ring() -> Vec<Camera> {
+        (0..12)
+            .map(|i| {
+                let turn = i as f64 * std::f64::consts::TAU / 12.0;
+                let rotation = DMat3::from_rotation_y(turn) * DMat3::from_rotation_x(-0.2);
+                Camera {
+                    width: 96,
+                    height: 128,
+                    fx: 300.0,
+                    fy: 300.0,
+                    cx: 48.0,
+                    cy: 64.0,
+                    distortion: Distortion::default(),
+                    rotation,
+                    position: rotation * DVec3::new(0.0, 0.0, 10.0),
+                }
+            })
+            .collect()
+    }
+
+    /// A ball with a smaller one on top, or the ball alone.
+    fn mask(camera: &Camera, whole: bool) -> Gray {
+        let balls = [(DVec3::new(0.0, -0.4, 0.0), 0.9), (DVec3::new(0.0, 0.9, 0.0), 0.6)];
+        let hit = |i: u32| {
+            let ray = camera.ray(Vec2::new((i % 96) as f32 + 0.5, (i / 96) as f32 + 0.5)).unwrap();
+            balls[..1 + whole as usize]
+                .iter()
+                .any(|(c, r)| (*c - camera.position).cross(ray.direction.as_dvec3()).length() < *r)
+        };
+        Gray { width: 96, height: 128, values: (0..96 * 128).map(|i| 255 * hit(i) as u8).collect() }
+    }
+
+    fn judged(masks: &[Gray]) -> Vec<MaskVerdict> {
+        let cameras = ring();
+        let views: Vec<ConsistencyView> = cameras
+            .iter()
+            .zip(masks)
+            .map(|(camera, m)| ConsistencyView { name: "v", camera, mask: Some(m) })
+            .collect();
+        verdicts(&views).unwrap()
+    }
+
+    fn masks(without: &[usize]) -> Vec<Gray> {
+        ring().iter().enumerate().map(|(i, c)| mask(c, !without.contains(&i))).collect()
+    }
+
+    #[test]
+    fn two_masks_that_contradict_each_other_both_fail() {
+        // what one shows lies above everything that the other does
+        let cameras = ring();
+        let at = |y: f64, i: usize| {
+            let c = DVec3::new(0.0, y, 0.0);
+            let hit = |p: u32| {
+                let ray = cameras[i].ray(Vec2::new((p % 96) as f32 + 0.5, (p / 96) as f32 + 0.5)).unwrap();
+                (c - cameras[i].position).cross(ray.direction.as_dvec3()).length() < 0.5
+            };
+            Gray { width: 96, height: 128, values: (0..96 * 128).map(|p| 255 * hit(p) as u8).collect() }
+        };
+        let (high, low) = (at(1.0, 0), at(-1.0, 3));
+        let view = |i: usize, mask| ConsistencyView { name: "v", camera: &cameras[i], mask: Some(mask) };
+        let found = verdicts(&[view(0, &high), view(3, &low)]).unwrap();
+        assert!(!found.contains(&MaskVerdict::Agrees), "{found:?}");
+        let same = at(1.0, 3);
+        assert_eq!(verdicts(&[view(0, &high), view(3, &same)]).unwrap(), [MaskVerdict::Agrees; 2]);
+    }
+
+    #[test]
+    fn what_many_views_leave_out_is_missed_in_each_of_them() {
+        assert_eq!(judged(&masks(&[])), [MaskVerdict::Agrees; 12]);
+        // even if it is seven of twelve
+        let without = [0, 1, 3, 5, 6, 8, 10];
+        let found = judged(&masks(&without));
+        for (i, verdict) in found.into_iter().enumerate() {
+            let expected = if without.contains(&i) { MaskVerdict::LeavesOut } else { MaskVerdict::Agrees };
+            assert_eq!(verdict, expected, "view {i}");
+        }
+    }
+
+    #[test]
+    fn what_a_single_view_shows_alone_fails() {
+        let mut all = masks(&[]);
+        all[2].values.fill(255);
+        all[7].values.fill(0);
+        // beside the head, a quarter of the picture
+        (0..96 * 128).filter(|i| i % 96 < 24 && i / 96 > 32).for_each(|i| all[9].values[i] = 255);
+        let found = judged(&all);
+        for (i, verdict) in found.into_iter().enumerate() {
+            let expected = if [2, 7, 9].contains(&i) { MaskVerdict::Unlike } else { MaskVerdict::Agrees };
+            assert_eq!(verdict, expected, "view {i}");
+        }
+    }
+
+    #[test]
+    fn one_mask_alone_agrees() {
+        let mut all = masks(&[]);
+        all[1..].iter_mut().for_each(|m| m.values.fill(0));
+        let found = judged(&all);
+        assert!(found[0] == MaskVerdict::Agrees && found[1..].iter().all(|b| *b == MaskVerdict::Unlike));
     }
 }

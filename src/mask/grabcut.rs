@@ -20,8 +20,7 @@ use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
 use super::morphology::{fill_holes, gray, keep_pieces, open, squared_distance};
 use super::prompts::{self, Click};
-use super::scale::reduce_to_rows;
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, reduce_to_rows};
 use crate::{Error, Result};
 
 /// Rows of the working size; larger photographs are averaged down to it.
@@ -50,7 +49,7 @@ pub struct HardMask {
     pub mask: Gray,
     /// Share of the picture, 0..=1, that lies near the outline and has a color that fits both sides.
     pub ambiguous: f64,
-    /// What a person should look at.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
 }
 
@@ -136,7 +135,7 @@ pub(super) struct Grabcut {
     pub photo: Photo,
     pub width: usize,
     pub height: usize,
-    /// Clicks in working pixels; empty where nobody clicked.
+    /// Clicks in working pixels; empty for a view without clicks.
     pub clicks: Vec<Click>,
     /// `[height · width]`.
     pub seeds: Vec<Seed>,
@@ -268,7 +267,7 @@ impl Grabcut {
             if head[at(c.y, self.height) * self.width + at(c.x, self.width)] != c.head {
                 let (said, is) = if c.head { ("head", "background") } else { ("background", "head") };
                 found.push(format!(
-                    "view `{view}`: click {} says {said}, but its surroundings made it {is}; click more there",
+                    "view `{view}`: click {} says {said}, but its surroundings made it {is}; click more around it",
                     n + 1
                 ));
             }
@@ -277,7 +276,7 @@ impl Grabcut {
     }
 }
 
-/// `γ exp(−β ‖Δ‖²) / distance` to the four neighbors ahead; 0 where there is none.
+/// `γ exp(−β ‖Δ‖²) / distance` to the four neighbors ahead; 0 at the border.
 fn edges(photo: &Photo) -> Vec<[i32; 4]> {
     let (w, h) = (photo.width as usize, photo.height as usize);
     let square = |i: usize, step: (usize, isize, isize)| -> Option<u32> {
@@ -405,7 +404,7 @@ fn from_clicks(
             }
         }
     }
-    // one sentence a view, however many there are
+    // one sentence a view for any number of pairs
     if let Some((i, j, apart)) = close.first() {
         let more = match close.len() {
             1 => String::new(),
@@ -516,7 +515,7 @@ mod tests {
         let (photo, truth) = head(3.0);
         let cut = cut_at(128, "a", &photo, &clicks(3.0)).unwrap();
         assert_eq!((cut.mask.width, cut.mask.height), (96, 128));
-        let large = super::super::scale::resize_hard(&cut.mask, (photo.width, photo.height));
+        let large = crate::image::resize_hard(&cut.mask, (photo.width, photo.height));
         assert!(overlap(&large, &truth) > 0.97, "{}", overlap(&large, &truth));
     }
 

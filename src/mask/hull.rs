@@ -1,9 +1,9 @@
 //! What masks of several views say about space: votes for every cell of a cube, and their silhouettes.
 //!
 //! A mask votes for a cell when the cell's center falls on the head, against it when it falls beside, and not at
-//! all outside its frame: there nothing was seen. A set of cells is drawn back into any view by its surface.
+//! all outside its frame. A set of cells is drawn back into any view by its surface.
 
-use crate::capture::carve::{Cube, Projector, meeting_point};
+use crate::capture::carve::{Cube, Projector, around, meeting_point};
 use crate::geom::Camera;
 use crate::image::Gray;
 use crate::{Error, Result};
@@ -32,7 +32,7 @@ impl ViewFrame {
     }
 }
 
-/// Lets every frame vote on every cell: `vote(values of the cell, which frame, its pixel there)`.
+/// Lets every frame vote on every cell: `vote(values of the cell, index of the frame, pixel that shows the cell)`.
 ///
 /// # Shapes
 ///
@@ -85,7 +85,7 @@ pub(super) fn cells(votes: &[[u16; 2]], most_negative: usize, least_positive: us
     votes.iter().map(|&[no, yes]| no as usize <= most_negative && yes as usize >= least_positive).collect()
 }
 
-/// The cube around the point the cameras look at, `margin` times as high as their frames are there.
+/// The cube around the point the cameras look at, `margin` times as high as their frames at that point.
 pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
     let alike = |how: &str| {
         Error::cannot(
@@ -169,17 +169,6 @@ pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
     }
     let deepest = depth.iter().copied().max().unwrap_or(0) as f64;
     depth.iter().map(|&d| d > 0 && d as f64 > share * deepest).collect()
-}
-
-/// Neighbors of a cell over faces, or over corners too.
-fn around([x, y, z]: [usize; 3], n: usize, corners: bool) -> impl Iterator<Item = usize> {
-    let span = move |v: usize| v.saturating_sub(1)..(v + 2).min(n);
-    span(x).flat_map(move |u| span(y).flat_map(move |v| span(z).map(move |w| (u, v, w)))).filter_map(
-        move |(u, v, w)| {
-            let steps = u.abs_diff(x) + v.abs_diff(y) + w.abs_diff(z);
-            (steps == 1 || (corners && steps > 1)).then_some((u * n + v) * n + w)
-        },
-    )
 }
 
 #[cfg(test)]

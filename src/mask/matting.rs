@@ -22,8 +22,7 @@ pub mod closed_form;
 
 use self::closed_form::{ClosedFormOptions, closed_form};
 use super::morphology;
-use super::scale::{enlarge, resize_hard};
-use crate::image::{Gray, Photo, reduce_photo, working_size};
+use crate::image::{Gray, Photo, enlarge, reduce_photo, resize_hard, working_size};
 use crate::{Error, Result};
 
 /// Alphas below become 0.
@@ -49,29 +48,6 @@ impl Default for SoftenOptions {
 }
 
 impl SoftenOptions {
-    /// Names the first option that makes no sense.
-    fn check(&self) -> Result<()> {
-        let wrong = |name: &str, found: String, expected: &str| {
-            let message = format!("the matting option `{name}` is {found}; expected {expected}");
-            Err(Error::cannot(message, format!("choose {expected}")))
-        };
-        if self.side < 16 {
-            return wrong("side", self.side.to_string(), "at least 16 pixels");
-        }
-        match self.band {
-            UnknownBand::Squares { kernel, iterations }
-                if !(1..=1000).contains(&kernel) || iterations > 1000 =>
-            {
-                let found = format!("{kernel} × {kernel} ones, {iterations} times");
-                wrong("band", found, "a kernel of 1 to 1000 pixels and up to 1000 iterations")
-            }
-            UnknownBand::Discs { share } if !(0.0..=1.0).contains(&share) => {
-                wrong("band", share.to_string(), "a share of the height, 0 to 1")
-            }
-            _ => Ok(()),
-        }
-    }
-
     /// Bytes needed at most beside the photograph and the mask themselves, for one photograph of this size:
     /// the alpha, the working pictures, and the equations if the whole working picture were unknown.
     pub fn memory_bytes(&self, width: u32, height: u32) -> u64 {
@@ -88,7 +64,7 @@ pub struct SoftMask {
     pub alpha: Gray,
     /// At the working size: 0, 128, 255.
     pub trimap: Gray,
-    /// What a person should know, one sentence each.
+    /// Warnings, one sentence each.
     pub warnings: Vec<String>,
 }
 
@@ -96,7 +72,7 @@ pub struct SoftMask {
 /// has the photograph's proportions. Where closed-form matting finds no solution the band stays hard, with a warning.
 ///
 /// # Errors
-/// When the mask has other proportions than the photograph, or an option makes no sense.
+/// When the mask has other proportions than the photograph.
 pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<SoftMask> {
     soften_with(photo, mask, options, |_, _| Ok(None))
 }
@@ -109,7 +85,6 @@ pub fn soften_with(
     options: &SoftenOptions,
     network: impl FnOnce(&Photo, &Gray) -> Result<Option<Vec<f32>>>,
 ) -> Result<SoftMask> {
-    options.check()?;
     let size = (photo.width, photo.height);
     let working = working_size(photo.width, photo.height, options.side);
     // sides of w s and h s, each rounded by up to half a pixel
@@ -160,7 +135,7 @@ fn solved(
     mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect()
 }
 
-/// What a person should know about the band, whoever finds its opacity.
+/// Warnings about the band, by whichever method its opacity is found.
 fn band_warnings(trimap: &Gray) -> Vec<String> {
     let mut warnings = Vec::new();
     let band = unknown_share(trimap);
@@ -287,8 +262,8 @@ fn dilate_lines(
 #[cfg(test)]
 mod tests {
     use super::super::morphology;
-    use super::super::scale::resize_gray;
     use super::*;
+    use crate::image::resize_gray;
     use crate::io::{Limits, read_gray, read_photo};
 
     /// A bright disc on a dark background whose rim is soft over 6 pixels.
@@ -378,16 +353,6 @@ mod tests {
         let other = Gray { width: 80, height: 64, values: vec![0; 80 * 64] };
         let error = soften(&photo, &other, &SoftenOptions::default()).unwrap_err();
         assert_eq!(error.to_string(), "the mask is 80 × 64 pixels, but its photograph is 64 × 80");
-        let mask = Gray { width: 64, height: 80, values: vec![0; 80 * 64] };
-        let options = SoftenOptions::default();
-        for (options, name) in [
-            (SoftenOptions { side: 0, ..options }, "side"),
-            (SoftenOptions { band: UnknownBand::Discs { share: f32::NAN }, ..options }, "band"),
-            (SoftenOptions { band: UnknownBand::Squares { kernel: 0, iterations: 1 }, ..options }, "band"),
-        ] {
-            let error = soften(&photo, &mask, &options).unwrap_err();
-            assert!(error.to_string().contains(name) && error.hint().starts_with("choose"), "{error}");
-        }
     }
 
     #[test]

@@ -2,6 +2,7 @@
 //! follows from it, growing and shrinking by discs, nearest of two sets; and connected pieces: keeping some, filling holes,
 //! smoothing with a 3 × 3 square.
 
+use crate::capture::carve::{self, Pieces};
 use crate::image::Gray;
 use crate::kernel::cpu::distance::LowerEnvelope;
 use rayon::prelude::*;
@@ -56,42 +57,16 @@ pub fn shrink(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<
     squared_distance(&outside, width, height).iter().map(|&d| d > radius * radius).collect()
 }
 
-/// Pieces that hang together, numbered from 1 in the order of their first pixel; 0 where `marked` is not.
-struct Pieces {
-    /// `[height · width]`.
-    label: Vec<u32>,
-    /// Pixels of each piece; entry 0 counts the rest.
-    size: Vec<usize>,
-}
-
-/// Finds pieces, over edges only (`corners` false) or over corners too.
+/// Connected pieces, over edges only (`corners` false) or over corners too.
 fn pieces(marked: &[bool], width: usize, height: usize, corners: bool) -> Pieces {
-    let mut label = vec![0u32; marked.len()];
-    let mut size = vec![marked.iter().filter(|m| !**m).count()];
-    let mut stack = Vec::new();
-    for start in 0..marked.len() {
-        if !marked[start] || label[start] != 0 {
-            continue;
-        }
-        let id = size.len() as u32;
-        size.push(0);
-        label[start] = id;
-        stack.push(start);
-        while let Some(i) = stack.pop() {
-            size[id as usize] += 1;
-            let (x, y) = (i % width, i / width);
-            for v in y.saturating_sub(1)..(y + 2).min(height) {
-                for u in x.saturating_sub(1)..(x + 2).min(width) {
-                    let j = v * width + u;
-                    if marked[j] && label[j] == 0 && (corners || u == x || v == y) {
-                        label[j] = id;
-                        stack.push(j);
-                    }
-                }
-            }
-        }
-    }
-    Pieces { label, size }
+    carve::pieces(marked, |i| {
+        let (x, y) = (i % width, i / width);
+        let rows = y.saturating_sub(1)..(y + 2).min(height);
+        let columns = x.saturating_sub(1)..(x + 2).min(width);
+        rows.flat_map(move |v| columns.clone().map(move |u| (u, v)))
+            .filter(move |&(u, v)| corners || u == x || v == y)
+            .map(move |(u, v)| v * width + u)
+    })
 }
 
 /// Takes away every piece of less than `least` pixels without one of `seeds`.
@@ -203,8 +178,8 @@ mod tests {
     #[test]
     fn corners_join_pieces_only_when_asked() {
         let (m, w, h) = picture(&["#..", ".#.", "..#"]);
-        assert_eq!(pieces(&m, w, h, true).size, [6, 3]);
-        assert_eq!(pieces(&m, w, h, false).size, [6, 1, 1, 1]);
+        assert_eq!(pieces(&m, w, h, true).size, [0, 3]);
+        assert_eq!(pieces(&m, w, h, false).size, [0, 1, 1, 1]);
     }
 
     #[test]

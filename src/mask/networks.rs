@@ -6,8 +6,7 @@
 //! ```
 //!
 //! Files are recognized by their inputs and outputs, looked through before an engine sees them, and recorded
-//! with size and SHA-256. Nothing is downloaded, and nothing is read but the files named, the processor
-//! file beside a network, and the ONNX Runtime library when one is named.
+//! with size and SHA-256. Nothing is downloaded, and only the named files and the processor file beside a network are read.
 
 mod alpha;
 mod processor;
@@ -20,9 +19,8 @@ use self::sam::Sam;
 use super::prompts::Click;
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
-use crate::onnx::{Contract, Engines, Runtime};
+use crate::onnx::Contract;
 use crate::{Error, Result};
-use std::path::Path;
 
 /// The networks at hand.
 pub struct Networks {
@@ -37,38 +35,33 @@ impl Networks {
     /// Opens every file that the configuration uses; returns `None` where it uses none.
     ///
     /// # Errors
-    /// When a file cannot be read, is no sound ONNX file, is refused for what it holds, is of no known form or
+    /// When a file cannot be read, is no valid ONNX file, is refused for its content, is of no known form or
     /// of the other network, when encoder and decoder do not fit, or when the engine cannot load it.
     pub fn open(config: &MaskConfig) -> Result<Option<Networks>> {
         if !config.with_networks() {
             return Ok(None);
         }
         let memory_bytes = (config.memory_gib * (1u64 << 30) as f64) as u64;
-        let runtime = match config.onnxruntime.as_str() {
-            "" => None,
-            path => Some(Runtime::load(Path::new(path))?),
-        };
-        let engines = Engines { runtime, array_bytes: memory_bytes, threads: 0 };
         if config.with_sam() && (config.sam.is_empty() || config.sam_decoder.is_empty()) {
             return Err(Error::cannot(
                 "no file was given for SAM's other half",
                 "name both of its files; the built-in path needs no file at all",
             ));
         }
-        let sam = || Sam::open(config.sam.as_ref(), config.sam_decoder.as_ref(), &engines);
+        let sam = || Sam::open(config.sam.as_ref(), config.sam_decoder.as_ref(), memory_bytes);
         let sam = config.with_sam().then(sam).transpose()?;
-        let vitmatte = || VitMatte::open(config.vitmatte.as_ref(), &engines, config.vitmatte_colors);
+        let vitmatte = || VitMatte::open(config.vitmatte.as_ref(), memory_bytes, config.vitmatte_colors);
         let vitmatte = config.with_vitmatte().then(vitmatte).transpose()?;
-        let alpha_net = || AlphaNet::open(config.alpha_net.as_ref(), &engines, &config.alpha_input);
+        let alpha_net = || AlphaNet::open(config.alpha_net.as_ref(), memory_bytes, &config.alpha_input);
         let alpha_net = config.with_alpha_net().then(alpha_net).transpose()?;
         let networks = sam.iter().flat_map(|sam| [&sam.encoder, &sam.decoder]);
         let networks = networks.chain(vitmatte.iter().map(|v| &v.session));
-        let networks = networks.chain(alpha_net.iter().map(|a| &a.session)).map(|session| &session.file);
-        let files = networks.chain(engines.runtime.iter().map(|r| &r.file)).cloned().collect();
+        let networks = networks.chain(alpha_net.iter().map(|a| &a.session));
+        let files = networks.map(|session| session.file.clone()).collect();
         Ok(Some(Networks { sam, vitmatte, alpha_net, files, memory_bytes }))
     }
 
-    /// What was loaded: SAM's encoder and decoder, ViTMatte, the alpha network, the library.
+    /// The loaded files: SAM's encoder and decoder, ViTMatte, the alpha network.
     pub fn files(&self) -> &[NetworkFile] {
         &self.files
     }
@@ -151,14 +144,8 @@ impl Networks {
         sam.max(vitmatte).max(alpha)
     }
 
-    /// How many photographs of this size may be run side by side within the memory and `threads`: at least one. ONNX
-    /// Runtime takes one at a time and spreads it over the threads itself.
+    /// How many photographs of this size may be run side by side within the memory and `threads`: at least one.
     pub fn photos_at_once(&self, width: u32, height: u32, threads: usize) -> usize {
-        let sessions = self.sam.iter().map(|s| &s.encoder).chain(self.vitmatte.iter().map(|v| &v.session));
-        let sessions = sessions.chain(self.alpha_net.iter().map(|a| &a.session));
-        if sessions.into_iter().any(|session| session.runs_alone()) {
-            return 1;
-        }
         let fit = self.memory_bytes / self.bytes_per_photo(width, height).max(1);
         usize::try_from(fit).unwrap_or(usize::MAX).min(threads).max(1)
     }

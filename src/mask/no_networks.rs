@@ -1,11 +1,11 @@
-//! What stands for networks in a build without the feature `matting`: none can be opened.
+//! A stub of the networks for builds without the feature `matting`: none can be opened.
 
 use super::prompts::Click;
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::{Error, Result};
 
-/// Networks, of which there are none in this build.
+/// The type of networks in a build without them, which has no value.
 #[derive(Clone, Copy, Debug)]
 pub enum NoNetworks {}
 

@@ -12,9 +12,8 @@
 
 use super::matting::{UNKNOWN, unknown_share};
 use super::prompts::{Prompts, file_path};
-use super::scale::{resize_gray, resize_hard};
 use crate::capture::{Capture, View, coverage, findings};
-use crate::image::{Gray, Photo, reduce_photo, working_size};
+use crate::image::{Gray, Photo, reduce_photo, resize_gray, resize_hard, working_size};
 use crate::io::{self, Limits};
 use crate::report::{base64, escape};
 use crate::{Error, ErrorKind, Result};
@@ -53,7 +52,7 @@ impl PageView {
     }
 }
 
-/// Returns the page of a capture, with clicks that are there already.
+/// Returns the page of a capture, with existing clicks.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -246,7 +245,7 @@ mod tests {
     #[test]
     fn nothing_is_loaded_from_elsewhere() {
         let page = page("t", &[view("a")], &Prompts::default());
-        // the one address is the name of SVG's vocabulary, which nobody fetches
+        // the one address is the name of SVG's vocabulary, which is never fetched
         let addresses: Vec<_> = page.match_indices("http").map(|(i, _)| &page[i..i + 26]).collect();
         assert!(
             addresses

@@ -209,7 +209,7 @@ fn below(name: &str) -> Result<String, &'static str> {
     if parts.is_empty() { Err("is empty") } else { Ok(parts.join("/")) }
 }
 
-/// The name by which `prompts.json` and camera files know a view's photograph: its path below the capture.
+/// The name of a view's photograph in `prompts.json` and camera files: its path below the capture.
 pub fn file_path(capture: &Capture, view: &View) -> String {
     let path = view.photo.strip_prefix(&capture.root).unwrap_or(&view.photo);
     let parts: Vec<_> = path.components().map(|c| c.as_os_str().to_string_lossy()).collect();
@@ -342,7 +342,7 @@ pub struct Click {
     pub x: f32,
     /// Row, as a pixel index: 0 is the center of the top pixels.
     pub y: f32,
-    /// Is the head there?
+    /// Whether it is on the head.
     pub head: bool,
 }
 

@@ -10,20 +10,18 @@
 //! The hull is an outer bound: it excludes and never includes, but for its core.
 //!
 //! Where a network has proposed a mask for every view ([`propagate_proposals`]), those that agree
-//! ([`agreement`](super::agreement)) stand for the clicked ones: they teach the colors and carve the hull. What lies well inside a proposal that is not unlike the others is definite head.
+//! ([`verdicts`]) stand for the clicked ones: they teach the colors and carve the hull. What lies well inside a proposal that is not unlike the others is definite head.
 
-use super::agreement::{MaskVerdict, beliefs};
-use super::consistency::ConsistencyView;
+use super::consistency::{ConsistencyView, MaskVerdict, verdicts};
 use super::grabcut::mixture::Rgb;
 use super::grabcut::{self, Grabcut, Models, Seed};
 use super::hull::{self, Voter};
 use super::morphology::{gray, grow, shrink};
 use super::prompts::{self, Click};
-use super::scale::reduce_to_rows;
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
 use crate::geom::Camera;
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, reduce_to_rows, size_at_rows};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -57,7 +55,7 @@ pub struct PropagateView<'a> {
     pub name: &'a str,
     /// Its camera, at the size of the photograph.
     pub camera: &'a Camera,
-    /// Its clicks in pixels of the photograph; none where nobody clicked.
+    /// Its clicks in pixels of the photograph; none for a view without clicks.
     pub clicks: &'a [Click],
     /// May its photograph shape the masks of other views? Held-out views may not.
     pub votes: bool,
@@ -68,9 +66,9 @@ pub struct PropagateView<'a> {
 pub struct HardMasks {
     /// In the order of the views given: 255 head, 0 background, at the working size.
     pub masks: Vec<Gray>,
-    /// What a person should look at.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
-    /// What a person may want to know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
@@ -327,7 +325,7 @@ impl<'a> Propagation<'a> {
             }
             if ambiguous[i] > 0.05 {
                 self.warnings.push(format!(
-                    "view `{view}`: {:.0} % of the picture may be head or background by its color; click there",
+                    "view `{view}`: {:.0} % of the picture may be head or background by its color; click on both",
                     100.0 * ambiguous[i]
                 ));
             }
@@ -355,27 +353,24 @@ where
             mask: Some(mask).filter(|_| v.votes),
         })
         .collect();
-    let beliefs = beliefs(&asked)?;
+    let verdicts = verdicts(&asked)?;
     let mut propagation = Propagation::new(CELLS, AT_ONCE, views, load)?;
-    let start = propagation.proposed(proposals, &beliefs)?;
+    let start = propagation.proposed(proposals, &verdicts)?;
     Ok(propagation.run(start))
 }
 
 /// Width and height that a photograph is cut at.
 pub fn rows_size(photo: &Photo) -> (u32, u32) {
-    match photo.height {
-        h if h <= grabcut::ROWS => (photo.width, h),
-        h => ((photo.width as f64 * grabcut::ROWS as f64 / h as f64).round().max(1.0) as u32, grabcut::ROWS),
-    }
+    size_at_rows((photo.width, photo.height), grabcut::ROWS)
 }
 
 impl Propagation<'_> {
     /// Takes the proposed masks of the views that agree, and learns the common colors from them.
-    fn proposed(&mut self, proposals: &[Gray], beliefs: &[MaskVerdict]) -> Result<StartViews> {
+    fn proposed(&mut self, proposals: &[Gray], verdicts: &[MaskVerdict]) -> Result<StartViews> {
         let (mut inside, mut outside): (Vec<Rgb>, Vec<Rgb>) = Default::default();
         let mut heads: Vec<Option<Vec<bool>>> = vec![None; self.views.len()];
         let mut others = Vec::new();
-        for (i, (mask, belief)) in proposals.iter().zip(beliefs).enumerate() {
+        for (i, (mask, verdict)) in proposals.iter().zip(verdicts).enumerate() {
             let (photo, view) = (&self.photos[i], &self.views[i]);
             let (w, h) = (photo.width as usize, photo.height as usize);
             if (mask.width, mask.height) != (photo.width, photo.height) {
@@ -388,11 +383,11 @@ impl Propagation<'_> {
                 ));
             }
             let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
-            // nobody judged a held-out view, and only its own mask comes from it
-            if !view.votes || *belief != MaskVerdict::Unlike {
+            // held-out views are not compared, and shape only their own masks
+            if !view.votes || *verdict != MaskVerdict::Unlike {
                 self.inside[i] = shrink(&head, w, h, INSIDE * h as f32);
             }
-            if *belief != MaskVerdict::Agrees || !view.votes {
+            if *verdict != MaskVerdict::Agrees || !view.votes {
                 others.extend(view.votes.then_some(view.name));
                 continue;
             }

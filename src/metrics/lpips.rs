@@ -6,7 +6,7 @@
 
 use super::{picture, rounded};
 use crate::image::{Image, Photo};
-use crate::onnx::{Engines, NetworkArray, NetworkFile, NetworkSession, Role, Runtime};
+use crate::onnx::{NetworkArray, NetworkFile, NetworkSession, Role};
 use crate::{Error, Result};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -19,18 +19,13 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Opens the network's file; `onnxruntime` names a library, or is empty for the built-in engine, whose arrays may
-    /// take `memory_gib` each.
+    /// Opens the network's file, whose arrays may take `memory_gib` each.
     ///
     /// # Errors
     /// Fails if a file cannot be read, is no valid ONNX file, or does not take two pictures.
-    pub fn open(path: &Path, onnxruntime: &str, memory_gib: f64) -> Result<Lpips> {
-        let runtime = match onnxruntime {
-            "" => None,
-            library => Some(Runtime::load(Path::new(library))?),
-        };
+    pub fn open(path: &Path, memory_gib: f64) -> Result<Lpips> {
         let array_bytes = (memory_gib * f64::from(1u32 << 30)) as u64;
-        let session = NetworkSession::open(Role::LPIPS, path, &Engines { runtime, array_bytes, threads: 0 })?;
+        let session = NetworkSession::open(Role::LPIPS, path, array_bytes)?;
         let file = session.file.clone();
         Ok(Lpips { session: Mutex::new(session), file })
     }
@@ -85,7 +80,6 @@ fn planes(image: &Image) -> NetworkArray {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::onnx::tests::engines;
     use crate::onnx::tests::made::{floats, graph, ints, model, node, port};
 
     /// LPIPS of one layer in the published form: features `r = relu(W x)`, each pixel's divided by their length,
@@ -130,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_network_of_the_published_form_gives_its_arithmetic_on_each_engine() {
+    fn a_network_of_the_published_form_gives_its_arithmetic() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("lpips.onnx");
         std::fs::write(&path, network()).unwrap();
@@ -146,13 +140,10 @@ mod tests {
         let photo = |rgb: &[[u8; 3]]| Photo { width: 20, height: 12, rgb: rgb.to_vec(), alpha: None };
         let expected = expected(&ours, &theirs);
         assert!(expected > 0.05);
-        for engine in engines() {
-            let library = engine.map_or(String::new(), |path| path.to_str().unwrap().into());
-            let lpips = Lpips::open(&path, &library, 1.0).unwrap();
-            let found = lpips.distance(&render, &photo(&theirs)).unwrap();
-            assert!((found - expected).abs() < 1e-6 * expected.max(1.0), "{found} against {expected}");
-            assert!(lpips.distance(&render, &photo(&ours)).unwrap() < 1e-9);
-        }
+        let lpips = Lpips::open(&path, 1.0).unwrap();
+        let found = lpips.distance(&render, &photo(&theirs)).unwrap();
+        assert!((found - expected).abs() < 1e-6 * expected.max(1.0), "{found} against {expected}");
+        assert!(lpips.distance(&render, &photo(&ours)).unwrap() < 1e-9);
     }
 
     #[test]
@@ -162,7 +153,7 @@ mod tests {
         let nodes = [node("ReduceMean", &["x"], &["y"], &[ints("axes", &[1])])];
         let one = graph(&nodes, &[], &[port("x", 1, &[1, 3, 0, 0])], &[port("y", 1, &[1, 1, 0, 0])]);
         std::fs::write(&path, model(&one)).unwrap();
-        let Err(e) = Lpips::open(&path, "", 1.0) else { panic!("it opened") };
+        let Err(e) = Lpips::open(&path, 1.0) else { panic!("it opened") };
         assert!(
             e.to_string().contains("is a network for alphas, but was given as the network for LPIPS"),
             "{e}"

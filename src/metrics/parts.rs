@@ -70,10 +70,7 @@ pub struct PartMetrics {
 impl PartMetrics {
     /// Returns the means over the views that have a value, for each metric.
     pub fn mean(views: &[PartMetrics]) -> PartMetrics {
-        let mean = |of: fn(&PartMetrics) -> Option<f64>| {
-            let values: Vec<f64> = views.iter().filter_map(of).collect();
-            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-        };
+        let mean = |of: fn(&PartMetrics) -> Option<f64>| super::mean(views, of);
         PartMetrics {
             psnr_opaque: mean(|v| v.psnr_opaque),
             psnr_edge: mean(|v| v.psnr_edge),

@@ -1,6 +1,6 @@
 //! Which network a file is, by its inputs and outputs and never by its name.
 //!
-//! What both engines are given and give, and how they are called.
+//! Also the arrays that the engine takes and returns, and how it is called.
 
 use crate::Error;
 use sha2::{Digest, Sha256};
@@ -165,7 +165,7 @@ pub(super) fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
 pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
     let mut near = None;
     let gives = |name: &&str| outputs.iter().any(|p| p.name == **name);
-    // one that is called anything is told by its extents
+    // an output of any name is recognized by its extents
     let fits = |form: &&Form| match (form.contract, outputs.first().map(|port| &port.dims)) {
         (_, None) => false,
         (Contract::Alpha, Some(Some(dims))) => {
@@ -215,7 +215,7 @@ fn misfit(inputs: &[Port], wanted: &[(&str, i32, &[usize])]) -> Option<String> {
 /// A file that was loaded, for the record of a run.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 pub struct NetworkFile {
-    /// "sam", "sam_decoder", "vitmatte", "alpha_net", "lpips" or "onnxruntime": the name of the setting that named it.
+    /// The name of the setting that named it: "sam", "sam_decoder", "vitmatte", "alpha_net" or "lpips".
     pub role: &'static str,
     /// The file as named.
     pub path: PathBuf,
@@ -225,7 +225,7 @@ pub struct NetworkFile {
     pub sha256: String,
     /// What it was recognized as, and how it is fed.
     pub contract: String,
-    /// What runs it; of the library, what it says of itself.
+    /// The engine that runs it, with its version.
     pub engine: String,
 }
 

@@ -1,4 +1,4 @@
-//! Hostile files, each with the error it must produce; and that the engines really refuse what they refuse.
+//! Hostile files, each with the error it must produce; and that the engine really refuses what it refuses.
 
 use self::made::{Message, floats, graph, integers, model, node, port, tensor, trimap_times, vitmatte};
 use super::*;
@@ -23,46 +23,30 @@ pub(crate) fn shared(folder: &str) -> Option<PathBuf> {
     None
 }
 
-/// The ONNX Runtime library the environment names.
-pub(crate) fn onnxruntime() -> Option<PathBuf> {
-    let named = std::env::var_os("TIFACE_ONNXRUNTIME").map(PathBuf::from);
-    if named.is_none() {
-        eprintln!("skipped: ONNX Runtime, TIFACE_ONNXRUNTIME names no library");
-    }
-    named
+/// A configuration that names nothing.
+pub(crate) fn config() -> MaskConfig {
+    MaskConfig::preset(Preset::Standard)
 }
 
-/// Both engines, or the one there is.
-pub(crate) fn engines() -> Vec<Option<PathBuf>> {
-    std::iter::once(None).chain(onnxruntime().map(Some)).collect()
-}
-
-/// A configuration that names nothing, or the library.
-pub(crate) fn config(onnxruntime: &Option<PathBuf>) -> MaskConfig {
-    let named = |path: &PathBuf| path.to_str().unwrap().to_owned();
-    let onnxruntime = onnxruntime.as_ref().map_or(String::new(), named);
-    MaskConfig { onnxruntime, ..MaskConfig::preset(Preset::Standard) }
-}
-
-fn opened_with(bytes: &[u8], onnxruntime: Option<PathBuf>) -> Result<Networks> {
+fn opened_with(bytes: &[u8]) -> Result<Networks> {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("network.onnx");
     fs::write(&path, bytes).unwrap();
     let vitmatte = path.to_str().unwrap().to_owned();
-    let networks = Networks::open(&MaskConfig { vitmatte, ..config(&onnxruntime) })?;
+    let networks = Networks::open(&MaskConfig { vitmatte, ..config() })?;
     Ok(networks.expect("a file is named"))
 }
 
 /// Opens a file and runs it once on an empty photograph.
-fn tried(bytes: &[u8], engine: Option<PathBuf>) -> Result<Networks> {
-    let networks = opened_with(bytes, engine)?;
+fn tried(bytes: &[u8]) -> Result<Networks> {
+    let networks = opened_with(bytes)?;
     networks.prepare(32, 32)?;
     Ok(networks)
 }
 
-/// What a file that must not be used is refused with, on each engine: a sentence with its name, and a suggested fix.
-fn refusals(bytes: &[u8]) -> Vec<String> {
-    let each = engines().into_iter().map(|engine| match tried(bytes, engine) {
+/// What a file that must not be used is refused with: a sentence with its name, and a suggested fix.
+fn refusal(bytes: &[u8]) -> String {
+    match tried(bytes) {
         Ok(_) => panic!("it runs"),
         Err(error) => {
             let said = error.to_string();
@@ -70,22 +54,20 @@ fn refusals(bytes: &[u8]) -> Vec<String> {
             assert!(error.hint().len() > 10, "no suggested fix of: {said}");
             said
         }
-    });
-    each.collect()
+    }
 }
 
-/// As [`refusals`], each of which holds the word.
+/// As [`refusal`], which contains the word.
 fn refused_for(word: &str, bytes: &[u8]) {
-    for said in refusals(bytes) {
-        assert!(said.contains(word), "not for `{word}`: {said}");
-    }
+    let said = refusal(bytes);
+    assert!(said.contains(word), "not for `{word}`: {said}");
 }
 
 /// Why a file was refused, if it is one of the reasons that lie in the file.
 fn reason(error: &Error) -> Option<&'static str> {
     let said = error.to_string();
     let reasons = [
-        "is not a sound ONNX file",
+        "is not a valid ONNX file",
         "is refused: its weights lie in another file",
         "is no network that is known",
         ", but was given as the ViTMatte network",
@@ -103,30 +85,28 @@ fn photo(width: u32, height: u32) -> (Photo, Gray) {
 }
 
 #[test]
-fn a_sound_network_made_by_hand_gives_the_trimap_on_each_engine() {
+fn a_valid_network_made_by_hand_gives_the_trimap() {
     // odd sizes: padded to 64 × 64, cut back to 35 × 33
     let (photo, trimap) = photo(35, 33);
-    for engine in engines() {
-        let networks = opened_with(&trimap_times(1.0), engine).unwrap();
-        let alpha = networks.alpha(&photo, &trimap).unwrap().unwrap();
-        let expected: Vec<f32> = trimap.values.iter().map(|&v| [0.0, 0.5, 1.0][v as usize / 100]).collect();
-        assert_eq!(alpha, expected);
-    }
+    let networks = opened_with(&trimap_times(1.0)).unwrap();
+    let alpha = networks.alpha(&photo, &trimap).unwrap().unwrap();
+    let expected: Vec<f32> = trimap.values.iter().map(|&v| [0.0, 0.5, 1.0][v as usize / 100]).collect();
+    assert_eq!(alpha, expected);
 }
 
 #[test]
 fn text_nothing_and_half_a_file_are_no_onnx() {
     let page = b"<!DOCTYPE html><html><body>404</body></html>".as_slice();
     for bytes in [page, b"version https://git-lfs.github.com/spec/v1\n", &[0xff; 100], b"\n\x00\x12"] {
-        refused_for("is not a sound ONNX file", bytes);
+        refused_for("is not a valid ONNX file", bytes);
     }
     refused_for("it holds no graph", &Message::new().int(1, 7).0);
-    assert!(tried(b"", None).is_err_and(|e| e.to_string().contains("is empty (0 bytes)")));
+    assert!(tried(b"").is_err_and(|e| e.to_string().contains("is empty (0 bytes)")));
     let whole = trimap_times(1.0);
     for end in 1..whole.len() {
         // an end between two fields leaves a message that parses and lacks what comes later; the last one is the
         // opset, without which the rest still stands
-        if let Err(error) = tried(&whole[..end], None) {
+        if let Err(error) = tried(&whole[..end]) {
             assert!(reason(&error).is_some(), "cut at {end}: {error}");
         }
     }
@@ -139,7 +119,7 @@ fn any_single_byte_may_be_wrong_without_a_crash() {
         for flip in [0x01, 0xff] {
             let mut bytes = whole.clone();
             bytes[at] ^= flip;
-            if let Err(error) = tried(&bytes, None) {
+            if let Err(error) = tried(&bytes) {
                 assert!(!error.hint().is_empty() && error.to_string().contains("network.onnx"), "{error}");
                 assert!(reason(&error).is_some() || error.to_string().contains(" takes only "), "{error}");
             }
@@ -149,7 +129,7 @@ fn any_single_byte_may_be_wrong_without_a_crash() {
 
 /// Minutes long, for changes here: `cargo test --release --features matting --lib damage -- --ignored`.
 #[test]
-#[ignore = "300 damaged networks on each engine take minutes; run with --ignored after changes here"]
+#[ignore = "300 damaged networks take minutes; run with --ignored after changes here"]
 fn random_damage_to_a_whole_network_ends_in_a_result_or_an_error() {
     let Some(folder) = shared("vitmatte_tiny") else { return };
     let whole = fs::read(folder.join("model.onnx")).unwrap();
@@ -170,15 +150,12 @@ fn random_damage_to_a_whole_network_ends_in_a_result_or_an_error() {
             let at = random() % (whole.len() / 4);
             bytes[at] ^= 1 << (random() % 8);
         }
-        for engine in engines() {
-            let name = if engine.is_some() { "ONNX Runtime" } else { "tract" };
-            let end = match opened_with(&bytes, engine).and_then(|n| n.alpha(&photo, &trimap)) {
-                Ok(_) => "an alpha".to_string(),
-                Err(e) if e.to_string().contains("broke down") => format!("a panic caught: {e}"),
-                Err(e) => reason(&e).unwrap_or("takes only another size").to_string(),
-            };
-            *ends.entry(format!("{name}: {end}")).or_insert(0) += 1;
-        }
+        let end = match opened_with(&bytes).and_then(|n| n.alpha(&photo, &trimap)) {
+            Ok(_) => "an alpha".to_string(),
+            Err(e) if e.to_string().contains("broke down") => format!("a panic caught: {e}"),
+            Err(e) => reason(&e).unwrap_or("takes only another size").to_string(),
+        };
+        *ends.entry(end).or_insert(0) += 1;
     }
     for (end, times) in ends {
         println!("{times:4} {end}");
@@ -200,7 +177,7 @@ fn weights_in_another_file_are_refused_wherever_they_lie() {
         let path = dir.path().join("network.onnx");
         fs::write(&path, &bytes).unwrap();
         let vitmatte = path.to_str().unwrap().to_owned();
-        let Err(error) = Networks::open(&MaskConfig { vitmatte, ..config(&None) }) else {
+        let Err(error) = Networks::open(&MaskConfig { vitmatte, ..config() }) else {
             panic!("{location} was followed")
         };
         assert!(
@@ -217,11 +194,11 @@ fn weights_in_another_file_are_refused_wherever_they_lie() {
     let entry = [b"\x0a\x88\x80\x00location\x12\x01w".as_slice()].concat();
     refused_for("in another file", &vitmatte(&nodes, &[tensor("w", 1, &[1, 4, 1, 1]).bytes(13, &entry)]));
     // announced, but not named
-    refusals(&vitmatte(&nodes, &[tensor("w", 1, &[1, 4, 1, 1]).int(14, 1)]));
+    refusal(&vitmatte(&nodes, &[tensor("w", 1, &[1, 4, 1, 1]).int(14, 1)]));
     // a name that only contains the word is no key
     let named = [node("Conv", &["pixel_values", "relocation"], &["alphas"], &[])];
     let weights = [floats("relocation", &[1, 4, 1, 1], &[0.0; 4])];
-    tried(&vitmatte(&named, &weights), None).unwrap();
+    tried(&vitmatte(&named, &weights)).unwrap();
 }
 
 #[test]
@@ -231,17 +208,17 @@ fn a_circle_and_a_name_from_nowhere_are_refused() {
         node("Relu", &["a"], &["b"], &[]),
         node("Identity", &["b"], &["alphas"], &[]),
     ];
-    refusals(&vitmatte(&circle, &[]));
-    refusals(&vitmatte(&[node("Relu", &["alphas"], &["alphas"], &[])], &[]));
-    refusals(&vitmatte(&[node("Add", &["pixel_values", "ghost"], &["alphas"], &[])], &[]));
-    refusals(&vitmatte(&[], &[]));
+    refusal(&vitmatte(&circle, &[]));
+    refusal(&vitmatte(&[node("Relu", &["alphas"], &["alphas"], &[])], &[]));
+    refusal(&vitmatte(&[node("Add", &["pixel_values", "ghost"], &["alphas"], &[])], &[]));
+    refusal(&vitmatte(&[], &[]));
     // graphs in graphs beyond any depth
     let deep = (0..200).fold(graph(&[], &[], &[], &[]), |inner, _| {
         let branch = made::graph_attribute("then_branch", &inner);
         graph(&[node("If", &["pixel_values"], &["x"], &[branch])], &[], &[], &[])
     });
     let branch = made::graph_attribute("then_branch", &deep);
-    refusals(&vitmatte(&[node("If", &["pixel_values"], &["alphas"], &[branch])], &[]));
+    refusal(&vitmatte(&[node("If", &["pixel_values"], &["alphas"], &[branch])], &[]));
 }
 
 #[test]
@@ -260,7 +237,7 @@ fn extents_that_the_data_does_not_fill_are_refused() {
         tensor("w", 1, &[4]).bytes(4, &[0; 12]),
         tensor("w", 99, &[1]),
     ] {
-        refusals(&vitmatte(&nodes, &[w]));
+        refusal(&vitmatte(&nodes, &[w]));
     }
 }
 
@@ -281,7 +258,7 @@ fn constants_that_ask_for_an_array_beyond_all_pictures_are_refused() {
         ];
         let size = if size.len() == 1 { made::integer("size", size[0]) } else { integers("size", &size) };
         let weights = [size, made::integer("zero", 0), made::integer("one", 1)];
-        refusals(&vitmatte(&nodes, &weights));
+        refusal(&vitmatte(&nodes, &weights));
     }
 }
 
@@ -296,21 +273,21 @@ fn extents_computed_from_constants_are_followed() {
         node("Add", &["pixel_values", "most"], &["alphas"], &[]),
     ];
     let weights = [integers("half", &[1 << 15]), integers("more", &[64])];
-    let Err(error) = tried(&vitmatte(&nodes, &weights), None) else { panic!("it runs") };
+    let Err(error) = tried(&vitmatte(&nodes, &weights)) else { panic!("it runs") };
     assert!(error.to_string().contains("asks for an array of 274877906944 bytes"), "{error}");
 }
 
 #[test]
 fn extents_computed_from_the_picture_end_in_an_error_too() {
-    // the picture's own shape times 2³⁰: [2³⁰, 4, 32, 32], 16 TiB, which the built-in engine sees beforehand
+    // the picture's own shape times 2³⁰: [2³⁰, 4, 32, 32], 16 TiB, which is found before it is allocated
     let nodes = [
         node("Shape", &["pixel_values"], &["shape"], &[]),
         node("Mul", &["shape", "factor"], &["size"], &[]),
         node("Expand", &["pixel_values", "size"], &["alphas"], &[]),
     ];
     let bytes = vitmatte(&nodes, &[integers("factor", &[1 << 30, 1, 1, 1])]);
-    let said = refusals(&bytes);
-    assert!(said[0].contains("asks for an array of 17592186044416 bytes"), "{}", said[0]);
+    let said = refusal(&bytes);
+    assert!(said.contains("asks for an array of 17592186044416 bytes"), "{said}");
 }
 
 #[test]
@@ -348,46 +325,30 @@ fn outputs_that_are_not_as_promised_are_errors() {
         node("Log", &["n"], &["alphas"], &[]),
     ]);
     let too_large = trimap_times(7.0);
-    for engine in engines() {
-        for (bytes, word) in [(&four_channels, "[1, 4, 32, 32]"), (&nan, "number"), (&too_large, "0 to 1")] {
-            let networks = opened_with(bytes, engine.clone()).unwrap();
-            let error = networks.alpha(&photo, &trimap).unwrap_err();
-            let said = error.to_string();
-            assert!(said.contains("gave an unusable `alphas`") && said.contains(word), "{said}");
-        }
+    for (bytes, word) in [(&four_channels, "[1, 4, 32, 32]"), (&nan, "number"), (&too_large, "0 to 1")] {
+        let networks = opened_with(bytes).unwrap();
+        let error = networks.alpha(&photo, &trimap).unwrap_err();
+        let said = error.to_string();
+        assert!(said.contains("gave an unusable `alphas`") && said.contains(word), "{said}");
     }
 }
 
 #[test]
-fn operators_nobody_knows_are_an_error_of_the_engine_with_a_fix() {
+fn unknown_operators_are_an_error_of_the_engine_with_a_fix() {
     let bytes = vitmatte(&[node("Teleport", &["pixel_values"], &["alphas"], &[])], &[]);
-    for engine in engines() {
-        let builtin = engine.is_none();
-        let Err(error) = tried(&bytes, engine) else { panic!("it runs") };
-        assert!(error.to_string().contains(" cannot "), "{error}");
-        assert_eq!(error.hint().contains("pip install onnxruntime"), builtin, "{}", error.hint());
-    }
+    let Err(error) = tried(&bytes) else { panic!("it runs") };
+    assert!(error.to_string().contains(" cannot "), "{error}");
+    assert!(error.hint().contains("float32 file"), "{}", error.hint());
 }
 
 #[test]
-fn a_panic_inside_an_engine_becomes_its_message() {
+fn a_panic_inside_the_engine_becomes_its_message() {
     let said = guarded::<()>(|| panic!("index {} of {}", 3, 2)).unwrap_err();
     assert_eq!(said, "it broke down: index 3 of 2");
 }
 
 #[test]
-fn a_file_that_is_no_library_is_refused_with_a_fix() {
-    let dir = tempfile::tempdir().unwrap();
-    let path = dir.path().join("libonnxruntime.so");
-    fs::write(&path, "not a library").unwrap();
-    let Err(error) = Runtime::load(&path) else { panic!("it loaded") };
-    assert!(error.to_string().contains("cannot be used as ONNX Runtime"), "{error}");
-    assert!(error.hint().contains("1.17") || error.hint().contains("anew"), "{}", error.hint());
-    assert!(Runtime::load(&dir.path().join("none.so")).is_err_and(|e| e.to_string().contains("none.so")));
-}
-
-#[test]
 fn the_engine_recorded_is_the_one_the_manifest_pins() {
-    let version = tract::NAME.strip_prefix("tract ").unwrap();
+    let version = NAME.strip_prefix("tract ").unwrap();
     assert!(include_str!("../../Cargo.toml").contains(&format!("tract-onnx = {{ version = \"={version}\"")));
 }

@@ -14,7 +14,7 @@ pub(super) fn measure(config: &Config) -> Result<Option<Lpips>> {
     if file.is_empty() {
         return Ok(None);
     }
-    Lpips::open(file.as_ref(), &config.mask.onnxruntime, config.mask.memory_gib).map(Some)
+    Lpips::open(file.as_ref(), config.mask.memory_gib).map(Some)
 }
 
 /// A stub of LPIPS for a build without networks.

@@ -19,7 +19,7 @@ const FORMAT: u32 = 2;
 
 /// Keys of `[mask]` that do not affect the masks that are made: paths, whose contents are inputs of the stage
 /// instead, and checks of other masks.
-const PLACES: [&str; 10] = [
+const PLACES: [&str; 9] = [
     "mask.trust",
     "mask.prompts",
     "mask.point",
@@ -28,7 +28,6 @@ const PLACES: [&str; 10] = [
     "mask.sam_decoder",
     "mask.vitmatte",
     "mask.alpha_net",
-    "mask.onnxruntime",
     "mask.memory_gib",
 ];
 

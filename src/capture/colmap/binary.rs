@@ -1,7 +1,7 @@
 //! The binary files: little-endian numbers, counts before lists. Every count is compared with the bytes that
 //! are left before anything is reserved.
 
-use super::super::lens::LensModel;
+use super::super::frame::LensModel;
 use super::{Camera, Image, Model, Rigid};
 use crate::Result;
 use crate::io::{Limits, ReadError};
@@ -129,7 +129,7 @@ fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, ReadError> {
         let values = (0..model.count()).map(|_| c.f64()).collect::<Result<_, _>>()?;
         if cameras.insert(id, Camera { model, width, height, values }).is_some() {
             c.at = start;
-            return Err(c.bad(format!("camera {id} stands there twice")));
+            return Err(c.bad(format!("camera {id} appears twice")));
         }
     }
     c.end()?;
@@ -140,9 +140,7 @@ fn read_images(source: &Source, limits: &Limits) -> Result<Vec<Image>, ReadError
     let mut c = Cursor::of(source);
     // number, pose, camera, an empty name, no points
     let n = c.counted(4 + 56 + 4 + 1 + 8, "images")?;
-    if n > limits.views {
-        return Err(ReadError::too_large(&source.0, "the number of views", n as u64, limits.views as u64));
-    }
+    limits.check_views(&source.0, n)?;
     let mut images = Vec::with_capacity(n);
     for _ in 0..n {
         let (id, pose, camera, name) = (c.u32()?, c.rigid()?, c.u32()?, c.name()?);

@@ -1,9 +1,9 @@
 //! The text files: a line of numbers for each entry, two for an image, `#` before comments.
 
-use super::super::folder::in_file;
-use super::super::lens::LensModel;
+use super::super::folder::{in_file, shortened};
+use super::super::frame::LensModel;
 use super::{Camera, Image, Model, Rigid};
-use crate::io::{Limits, ReadError};
+use crate::io::Limits;
 use crate::{Error, Result};
 use glam::DVec3;
 use std::collections::HashMap;
@@ -52,8 +52,7 @@ impl<'s> Line<'s> {
 
     fn number<T: FromStr>(&mut self, what: &str) -> Result<T> {
         let word = self.word(what)?;
-        let shown: String = word.chars().take(40).collect();
-        word.parse().map_err(|_| self.bad(format_args!("`{shown}` is not {what}")))
+        word.parse().map_err(|_| self.bad(format_args!("`{}` is not {what}", shortened(word))))
     }
 
     fn rigid(&mut self) -> Result<Rigid> {
@@ -67,9 +66,7 @@ impl<'s> Line<'s> {
     fn end(&mut self) -> Result<()> {
         match self.words.next() {
             None => Ok(()),
-            Some(word) => {
-                Err(self.bad(format_args!("`{}` is left over", word.chars().take(40).collect::<String>())))
-            }
+            Some(word) => Err(self.bad(format_args!("`{}` is left over", shortened(word)))),
         }
     }
 }
@@ -92,7 +89,7 @@ fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>> {
         let values = values.collect::<Result<Vec<f64>>>()?;
         line.end()?;
         if cameras.insert(id, Camera { model, width, height, values }).is_some() {
-            return Err(line.bad(format_args!("camera {id} stands there twice")));
+            return Err(line.bad(format_args!("camera {id} appears twice")));
         }
     }
     Ok(cameras)
@@ -119,10 +116,7 @@ fn read_images((file, text): &Source, limits: &Limits) -> Result<Vec<Image>> {
             return Err(line.bad("it ends where a photograph's name should follow"));
         }
         images.push(Image { id, pose, camera, name });
-        if images.len() > limits.views {
-            let (found, limit) = (images.len() as u64, limits.views as u64);
-            return Err(ReadError::too_large(Path::new(file), "the number of views", found, limit).into());
-        }
+        limits.check_views(Path::new(file), images.len())?;
         // the second line holds points (x, y, number) and is empty where there are none
         if let Some((i, points)) = lines.next()
             && points.split_whitespace().count() % 3 != 0

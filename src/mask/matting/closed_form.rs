@@ -1,7 +1,7 @@
 //! Closed-form matting (Levin, Lischinski, Weiss 2008): the opacity of the unknown band from the photograph.
 //!
 //! Where colors of head and background each lie on a line within every 3 × 3 window, alpha is an affine function
-//! of color there. How far it is from one, over all windows, is a quadratic form `αᵀ L α` with
+//! of color in that window. Its deviation from one, over all windows, is a quadratic form `αᵀ L α` with
 //!
 //! ```text
 //! L_ij = Σ_w  δ_ij − (1 + (I_i − μ_w)ᵀ (Σ_w + ε/9 · 1)⁻¹ (I_j − μ_w)) / 9

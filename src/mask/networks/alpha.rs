@@ -19,9 +19,8 @@
 use super::processor::{self, IMAGENET, Normal};
 use super::sam::resized;
 use crate::config::VitmatteColors;
-use crate::image::{Gray, Photo, quantize};
-use crate::mask::scale::bilinear;
-use crate::onnx::{Engines, NetworkArray, NetworkSession, Role, file_error};
+use crate::image::{Gray, Photo, bilinear, quantize};
+use crate::onnx::{NetworkArray, NetworkSession, Role, file_error};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -51,8 +50,8 @@ pub(super) struct AlphaNet {
 
 impl AlphaNet {
     /// Opens the file; `input` is `auto` or `SIDE,MEAN,SCALE`.
-    pub(super) fn open(path: &Path, engines: &Engines, input: &str) -> Result<AlphaNet> {
-        let mut session = NetworkSession::open(Role::ALPHA, path, engines)?;
+    pub(super) fn open(path: &Path, array_bytes: u64, input: &str) -> Result<AlphaNet> {
+        let mut session = NetworkSession::open(Role::ALPHA, path, array_bytes)?;
         let name = path.file_name().map(|n| n.to_string_lossy().to_lowercase()).unwrap_or_default();
         let (side, normal) = if input != "auto" {
             parse(input)?
@@ -132,8 +131,8 @@ pub(super) struct VitMatte {
 
 impl VitMatte {
     /// Opens the file; `colors` may override what lies beside it.
-    pub(super) fn open(path: &Path, engines: &Engines, colors: VitmatteColors) -> Result<VitMatte> {
-        let mut session = NetworkSession::open(Role::VITMATTE, path, engines)?;
+    pub(super) fn open(path: &Path, array_bytes: u64, colors: VitmatteColors) -> Result<VitMatte> {
+        let mut session = NetworkSession::open(Role::VITMATTE, path, array_bytes)?;
         let half = Normal { mean: [0.5; 3], std: [0.5; 3] };
         let normal = match colors {
             VitmatteColors::Imagenet => None,
@@ -204,7 +203,7 @@ mod tests {
     use crate::config::MaskConfig;
     use crate::image::Photo;
     use crate::mask::networks::Networks;
-    use crate::onnx::tests::{config, engines, made};
+    use crate::onnx::tests::{config, made};
     use std::fs;
 
     #[test]
@@ -221,22 +220,20 @@ mod tests {
         ] {
             let path = dir.path().join("net.onnx");
             fs::write(&path, made::brightness(32, weight, bias)).unwrap();
-            for engine in engines() {
-                let config = MaskConfig {
-                    alpha_net: path.to_str().unwrap().into(),
-                    alpha_input: "512,0.5,0.5".into(), // but the file has a side of its own
-                    ..config(&engine)
-                };
-                let networks = Networks::open(&config).unwrap().expect("a file is named");
-                assert!(networks.files()[0].contract.contains("shown 32 × 32"), "{}", networks.files()[0]);
-                networks.prepare(64, 48).unwrap();
-                let alpha = networks.propose(&photo, (64, 48)).unwrap().unwrap();
-                for (i, &v) in alpha.values.iter().enumerate() {
-                    match i % 64 {
-                        ..29 => assert_eq!(v, left, "{i}"),
-                        35.. => assert_eq!(v, right, "{i}"),
-                        _ => {}
-                    }
+            let config = MaskConfig {
+                alpha_net: path.to_str().unwrap().into(),
+                alpha_input: "512,0.5,0.5".into(), // but the file has a side of its own
+                ..config()
+            };
+            let networks = Networks::open(&config).unwrap().expect("a file is named");
+            assert!(networks.files()[0].contract.contains("shown 32 × 32"), "{}", networks.files()[0]);
+            networks.prepare(64, 48).unwrap();
+            let alpha = networks.propose(&photo, (64, 48)).unwrap().unwrap();
+            for (i, &v) in alpha.values.iter().enumerate() {
+                match i % 64 {
+                    ..29 => assert_eq!(v, left, "{i}"),
+                    35.. => assert_eq!(v, right, "{i}"),
+                    _ => {}
                 }
             }
         }
@@ -251,7 +248,7 @@ mod tests {
             let named = MaskConfig {
                 alpha_net: path.to_str().unwrap().into(),
                 alpha_input: input.into(),
-                ..config(&None)
+                ..config()
             };
             Networks::open(&named).map(|n| n.unwrap().files()[0].contract.clone())
         };

@@ -10,10 +10,9 @@
 //! end when no box is given. S and the embedding's width are read from the files.
 
 use super::processor::{self, IMAGENET, Normal};
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, bilinear};
 use crate::mask::prompts::{self, Click};
-use crate::mask::scale::bilinear;
-use crate::onnx::{Contract, Engines, NetworkArray, NetworkSession, Role, file_error};
+use crate::onnx::{Contract, NetworkArray, NetworkSession, Role, file_error};
 use crate::{Error, Result};
 use image::RgbImage;
 use image::imageops::{self, FilterType};
@@ -58,9 +57,9 @@ pub(super) struct Candidates {
 }
 
 impl Sam {
-    pub(super) fn open(encoder: &Path, decoder: &Path, engines: &Engines) -> Result<Sam> {
-        let mut encoder = NetworkSession::open(Role::SAM, encoder, engines)?;
-        let mut decoder = NetworkSession::open(Role::SAM_DECODER, decoder, engines)?;
+    pub(super) fn open(encoder: &Path, decoder: &Path, array_bytes: u64) -> Result<Sam> {
+        let mut encoder = NetworkSession::open(Role::SAM, encoder, array_bytes)?;
+        let mut decoder = NetworkSession::open(Role::SAM_DECODER, decoder, array_bytes)?;
         let mismatch = |problem: String| {
             let problem = format!("does not fit to `{}`: {problem}", decoder.file.path.display());
             Err(file_error(&encoder.file.path, &problem, "take encoder and decoder from the same export"))

@@ -1,4 +1,4 @@
-//! SAM and ViTMatte against the stored inputs and outputs of the reference, on every engine there is.
+//! SAM and ViTMatte against the stored inputs and outputs of the reference.
 //!
 //! Tolerances are those of the vectors' own description: 1e-4 for embeddings, masks and logits, 5e-5 for scores
 //! and alphas, 1e-6 for normalized pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
@@ -12,8 +12,8 @@ use crate::config::{MaskConfig, VitmatteColors};
 use crate::image::{Gray, Photo};
 use crate::io::{Limits, NpyValues, read_gray, read_json, read_npy, read_photo};
 use crate::mask::Click;
-use crate::onnx::tests::{config, engines, made, shared};
-use crate::onnx::{Engines, NetworkArray, NetworkSession, Role, Runtime};
+use crate::onnx::tests::{config, made, shared};
+use crate::onnx::{NetworkArray, NetworkSession, Role};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -27,31 +27,16 @@ fn numbers(array: &NetworkArray) -> &[f32] {
     &array.values
 }
 
-/// Largest difference, said aloud: the record of how far each engine is from the reference.
-fn close(what: &str, engine: &str, found: &[f32], expected: &[f32], tolerance: f32) {
+/// Checks the largest difference and prints it: the record of how far results are from the reference.
+fn close(what: &str, found: &[f32], expected: &[f32], tolerance: f32) {
     assert_eq!(found.len(), expected.len(), "{what}");
     let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    println!("{engine}: {what} differs by at most {worst:.2e} (allowed {tolerance:.0e})");
-    assert!(worst <= tolerance, "{what} on {engine}: {worst} > {tolerance}");
+    println!("{what} differs by at most {worst:.2e} (allowed {tolerance:.0e})");
+    assert!(worst <= tolerance, "{what}: {worst} > {tolerance}");
 }
 
-fn built_in() -> Engines {
-    Engines { runtime: None, array_bytes: 1 << 32, threads: 0 }
-}
-
-/// Each engine with its name.
-fn each_engine() -> Vec<(&'static str, Engines)> {
-    engines()
-        .iter()
-        .map(|engine| match engine {
-            None => ("tract", built_in()),
-            Some(path) => {
-                let runtime = Some(Runtime::load(path).unwrap());
-                ("ONNX Runtime", Engines { runtime, ..built_in() })
-            }
-        })
-        .collect()
-}
+/// Bytes of the largest array that may be planned.
+const ARRAY_BYTES: u64 = 1 << 32;
 
 fn picture(folder: &Path) -> Photo {
     read_photo(&folder.join("image.png"), None, &Limits::default()).unwrap()
@@ -78,19 +63,19 @@ const DECODER: &str = "prompt_encoder_mask_decoder.onnx";
 const NO_LABELS: &str = "prompt_encoder_mask_decoder_nolabels.onnx";
 const ORIGINAL: &str = "sam_decoder_multi.onnx";
 
-fn sam(folder: &Path, decoder: &str, engines: &Engines) -> Result<Sam> {
-    Sam::open(&folder.join("vision_encoder.onnx"), &folder.join(decoder), engines)
+fn sam(folder: &Path, decoder: &str) -> Result<Sam> {
+    Sam::open(&folder.join("vision_encoder.onnx"), &folder.join(decoder), ARRAY_BYTES)
 }
 
 fn text(path: PathBuf) -> String {
     path.to_str().unwrap().into()
 }
 
-fn sam_files(folder: &Path, decoder: &str, onnxruntime: &Option<PathBuf>) -> MaskConfig {
+fn sam_files(folder: &Path, decoder: &str) -> MaskConfig {
     MaskConfig {
         sam: text(folder.join("vision_encoder.onnx")),
         sam_decoder: text(folder.join(decoder)),
-        ..config(onnxruntime)
+        ..config()
     }
 }
 
@@ -124,15 +109,9 @@ fn the_encoder_sees_the_pixels_of_the_reference() {
     let Some(folder) = shared("sam_tiny") else { return };
     let resized = read_photo(&folder.join("resized.png"), None, &Limits::default()).unwrap();
     let pixels = normalized(&resized.rgb, 192, 256, &IMAGENET);
-    close(
-        "pixel_values",
-        "no engine",
-        numbers(&pixels),
-        numbers(&array(&folder.join("pixel_values.npy"))),
-        1e-6,
-    );
+    close("pixel_values", numbers(&pixels), numbers(&array(&folder.join("pixel_values.npy"))), 1e-6);
     // the file's own side and processor are obeyed: 256, not 1024
-    let sam = sam(&folder, DECODER, &built_in()).unwrap();
+    let sam = sam(&folder, DECODER).unwrap();
     assert_eq!((sam.side, sam.fitted(150, 200)), (256, (192, 256)));
 }
 
@@ -140,48 +119,44 @@ fn the_encoder_sees_the_pixels_of_the_reference() {
 fn sam_gives_the_reference_from_the_stored_inputs() {
     let Some(folder) = shared("sam_tiny") else { return };
     let at = |name: &str| array(&folder.join(name));
-    for (engine, engines) in each_engine() {
-        let open = |role, name: &str| NetworkSession::open(role, &folder.join(name), &engines).unwrap();
-        let encoder = open(Role::SAM, "vision_encoder.onnx");
-        let names = ["image_embeddings", "image_positional_embeddings"];
-        let given = encoder.run(&[("pixel_values", at("pixel_values.npy"))]).unwrap();
-        for (name, output) in names.iter().zip(&given) {
-            close(name, engine, &output.values, numbers(&at(&format!("{name}.npy"))), 1e-4);
+    let open = |role, name: &str| NetworkSession::open(role, &folder.join(name), ARRAY_BYTES).unwrap();
+    let encoder = open(Role::SAM, "vision_encoder.onnx");
+    let names = ["image_embeddings", "image_positional_embeddings"];
+    let given = encoder.run(&[("pixel_values", at("pixel_values.npy"))]).unwrap();
+    for (name, output) in names.iter().zip(&given) {
+        close(name, &output.values, numbers(&at(&format!("{name}.npy"))), 1e-4);
+    }
+    for (file, prefix) in [(DECODER, ""), (NO_LABELS, "nolabels_")] {
+        let mut inputs = vec![
+            ("input_points", at("input_points.npy")),
+            (names[0], at("image_embeddings.npy")),
+            (names[1], at("image_positional_embeddings.npy")),
+        ];
+        if prefix.is_empty() {
+            inputs.push(("input_labels", at("input_labels.npy")));
         }
-        for (file, prefix) in [(DECODER, ""), (NO_LABELS, "nolabels_")] {
-            let mut inputs = vec![
-                ("input_points", at("input_points.npy")),
-                (names[0], at("image_embeddings.npy")),
-                (names[1], at("image_positional_embeddings.npy")),
-            ];
-            if prefix.is_empty() {
-                inputs.push(("input_labels", at("input_labels.npy")));
-            }
-            let given = open(Role::SAM_DECODER, file).run(&inputs).unwrap();
-            for (name, tolerance, output) in
-                [("iou_scores", 5e-5, &given[0]), ("pred_masks", 1e-4, &given[1])]
-            {
-                let name = format!("{prefix}{name}");
-                close(&name, engine, &output.values, numbers(&at(&format!("{name}.npy"))), tolerance);
-            }
+        let given = open(Role::SAM_DECODER, file).run(&inputs).unwrap();
+        for (name, tolerance, output) in [("iou_scores", 5e-5, &given[0]), ("pred_masks", 1e-4, &given[1])] {
+            let name = format!("{prefix}{name}");
+            close(&name, &output.values, numbers(&at(&format!("{name}.npy"))), tolerance);
         }
-        let decoder = open(Role::SAM_DECODER, ORIGINAL);
-        for (prefix, has) in [("meta_", 0.0), ("meta_with_mask_", 1.0)] {
-            let inputs = [
-                (names[0], at("image_embeddings.npy")),
-                ("point_coords", at("meta_point_coords.npy")),
-                ("point_labels", at("meta_point_labels.npy")),
-                ("mask_input", at("meta_mask_input.npy")),
-                ("has_mask_input", NetworkArray::new(&[1], vec![has])),
-                ("orig_im_size", at("meta_orig_im_size.npy")),
-            ];
-            let given = decoder.run(&inputs).unwrap();
-            for (name, tolerance, output) in
-                [("iou_predictions", 5e-5, &given[0]), ("low_res_masks", 1e-4, &given[1])]
-            {
-                let name = format!("{prefix}{name}");
-                close(&name, engine, &output.values, numbers(&at(&format!("{name}.npy"))), tolerance);
-            }
+    }
+    let decoder = open(Role::SAM_DECODER, ORIGINAL);
+    for (prefix, has) in [("meta_", 0.0), ("meta_with_mask_", 1.0)] {
+        let inputs = [
+            (names[0], at("image_embeddings.npy")),
+            ("point_coords", at("meta_point_coords.npy")),
+            ("point_labels", at("meta_point_labels.npy")),
+            ("mask_input", at("meta_mask_input.npy")),
+            ("has_mask_input", NetworkArray::new(&[1], vec![has])),
+            ("orig_im_size", at("meta_orig_im_size.npy")),
+        ];
+        let given = decoder.run(&inputs).unwrap();
+        for (name, tolerance, output) in
+            [("iou_predictions", 5e-5, &given[0]), ("low_res_masks", 1e-4, &given[1])]
+        {
+            let name = format!("{prefix}{name}");
+            close(&name, &output.values, numbers(&at(&format!("{name}.npy"))), tolerance);
         }
     }
 }
@@ -196,7 +171,7 @@ fn logits_reach_the_photograph_as_in_the_reference() {
         let found: Vec<f32> = (0..count)
             .flat_map(|i| enlarged(&numbers(&small)[i * 4096..][..4096], 64, 256, (192, 256), (150, 200)))
             .collect();
-        close(large, "no engine", &found, numbers(&array(&folder.join(large))), 1e-4);
+        close(large, &found, numbers(&array(&folder.join(large))), 1e-4);
     }
 }
 
@@ -204,16 +179,14 @@ fn logits_reach_the_photograph_as_in_the_reference() {
 fn clicks_become_the_mask_of_the_reference_end_to_end() {
     let Some(folder) = shared("sam_tiny") else { return };
     let (photo, clicks) = (picture(&folder), clicks(&folder));
-    for engine in engines() {
-        let networks = opened(&sam_files(&folder, DECODER, &engine));
-        let (mask, score) = networks.segment(&photo, &clicks).unwrap().unwrap();
-        let off = differing(&mask, &gray(&folder.join("mask.png")));
-        println!("{engine:?}: mask differs on {:.3} % of the pixels, score {score}", 100.0 * off);
-        assert!(off <= 0.01);
-        let scores = array(&folder.join("iou_scores.npy"));
-        let best = numbers(&scores).iter().copied().fold(f32::MIN, f32::max);
-        assert!((score - best).abs() < 1e-2, "{score} {best}");
-    }
+    let networks = opened(&sam_files(&folder, DECODER));
+    let (mask, score) = networks.segment(&photo, &clicks).unwrap().unwrap();
+    let off = differing(&mask, &gray(&folder.join("mask.png")));
+    println!("the mask differs on {:.3} % of the pixels, score {score}", 100.0 * off);
+    assert!(off <= 0.01);
+    let scores = array(&folder.join("iou_scores.npy"));
+    let best = numbers(&scores).iter().copied().fold(f32::MIN, f32::max);
+    assert!((score - best).abs() < 1e-2, "{score} {best}");
 }
 
 #[test]
@@ -222,33 +195,31 @@ fn the_original_decoder_gets_the_padding_point_once_and_gives_the_first_of_four_
     let (photo, clicks) = (picture(&folder), clicks(&folder));
     let reference = array(&folder.join("meta_masks.npy"));
     let coords = array(&folder.join("meta_point_coords.npy"));
-    for (engine, engines) in each_engine() {
-        let sam = sam(&folder, ORIGINAL, &engines).unwrap();
-        let embedding = sam.embed(&photo).unwrap();
-        // the prompt holds four clicks and one padding point, as the stored one
-        let prompt = sam.prompt(&embedding, &clicks);
-        let (_, points) = prompt.iter().find(|(name, _)| *name == "point_coords").unwrap();
-        let (_, labels) = prompt.iter().find(|(name, _)| *name == "point_labels").unwrap();
-        close("point_coords", engine, numbers(points), numbers(&coords), 1e-4);
-        assert_eq!(numbers(labels), [1.0, 1.0, 1.0, 0.0, -1.0]);
-        let candidates = sam.decode(&embedding, &clicks).unwrap();
-        assert_eq!((candidates.scores.len(), candidates.best), (4, 0));
-        let logits = sam.on_photo(&embedding, &candidates, 0);
-        // from the photograph on: the resized pixels may differ from the stored ones by rounding
-        let off = logits.iter().zip(numbers(&reference)).filter(|(a, b)| (**a > 0.0) != (**b > 0.0)).count();
-        assert!(off * 100 <= logits.len(), "{off} pixels of {}", logits.len());
-        // one click alone: the best of the three others
-        let one = sam.decode(&embedding, &clicks[..1]).unwrap();
-        let best = (1..4).max_by(|&a, &b| one.scores[a].total_cmp(&one.scores[b])).unwrap();
-        assert_eq!(one.best, best);
-    }
+    let sam = sam(&folder, ORIGINAL).unwrap();
+    let embedding = sam.embed(&photo).unwrap();
+    // the prompt holds four clicks and one padding point, as the stored one
+    let prompt = sam.prompt(&embedding, &clicks);
+    let (_, points) = prompt.iter().find(|(name, _)| *name == "point_coords").unwrap();
+    let (_, labels) = prompt.iter().find(|(name, _)| *name == "point_labels").unwrap();
+    close("point_coords", numbers(points), numbers(&coords), 1e-4);
+    assert_eq!(numbers(labels), [1.0, 1.0, 1.0, 0.0, -1.0]);
+    let candidates = sam.decode(&embedding, &clicks).unwrap();
+    assert_eq!((candidates.scores.len(), candidates.best), (4, 0));
+    let logits = sam.on_photo(&embedding, &candidates, 0);
+    // from the photograph on: the resized pixels may differ from the stored ones by rounding
+    let off = logits.iter().zip(numbers(&reference)).filter(|(a, b)| (**a > 0.0) != (**b > 0.0)).count();
+    assert!(off * 100 <= logits.len(), "{off} pixels of {}", logits.len());
+    // one click alone: the best of the three others
+    let one = sam.decode(&embedding, &clicks[..1]).unwrap();
+    let best = (1..4).max_by(|&a, &b| one.scores[a].total_cmp(&one.scores[b])).unwrap();
+    assert_eq!(one.best, best);
 }
 
 #[test]
 fn a_decoder_without_labels_takes_clicks_on_the_head_and_no_others() {
     let Some(folder) = shared("sam_tiny") else { return };
     let (photo, clicks) = (picture(&folder), clicks(&folder));
-    let sam = sam(&folder, NO_LABELS, &built_in()).unwrap();
+    let sam = sam(&folder, NO_LABELS).unwrap();
     let Err(error) = sam.segment(&photo, &clicks) else { panic!("the background was taken for head") };
     assert!(error.to_string().contains("click 4 is on the background"), "{error}");
     assert!(error.hint().contains("input_labels"));
@@ -259,7 +230,7 @@ fn a_decoder_without_labels_takes_clicks_on_the_head_and_no_others() {
 fn clicks_that_make_no_sense_are_named() {
     let Some(folder) = shared("sam_tiny") else { return };
     let photo = picture(&folder);
-    let sam = sam(&folder, DECODER, &built_in()).unwrap();
+    let sam = sam(&folder, DECODER).unwrap();
     let head = |x: f32, y: f32| Click { x, y, head: true };
     for (clicks, word) in [
         (vec![], "the photograph has no clicks"),
@@ -284,7 +255,7 @@ fn odd_sizes_and_a_single_row_of_pixels_get_a_mask_of_their_own_size() {
     let Some(folder) = shared("sam_tiny") else { return };
     let vitmatte = shared("vitmatte_tiny").map_or(String::new(), |f| text(f.join("model.onnx")));
     let has_vitmatte = !vitmatte.is_empty();
-    let networks = opened(&MaskConfig { vitmatte, ..sam_files(&folder, DECODER, &None) });
+    let networks = opened(&MaskConfig { vitmatte, ..sam_files(&folder, DECODER) });
     for (width, height) in [(151, 97), (97, 151), (333, 1), (1, 1), (257, 256)] {
         let rgb = (0..width * height).map(|i| [(i % 255) as u8; 3]).collect();
         let photo = Photo { width, height, rgb, alpha: None };
@@ -305,24 +276,22 @@ fn both_encoders_of_the_original_form_feed_the_original_decoder() {
     let rgb: Vec<[u8; 3]> = (0..256 * 256).map(|i| [(i % 256) as u8, (i / 256) as u8, 40]).collect();
     let photo = Photo { width: 256, height: 256, rgb, alpha: None };
     let click = Click { x: 120.0, y: 130.0, head: true };
-    for (engine, engines) in each_engine() {
-        for picture in [true, false] {
-            let path = dir.path().join(format!("encoder_{picture}.onnx"));
-            fs::write(&path, made::original_encoder(picture, 256, 32)).unwrap();
-            let sam = Sam::open(&path, &folder.join(ORIGINAL), &engines).unwrap();
-            assert_eq!(sam.side, 256);
-            let pixels = sam.pixels(&photo);
-            let shape: &[usize] = if picture { &[256, 256, 3] } else { &[1, 3, 256, 256] };
-            assert_eq!(pixels.shape, shape);
-            // cell (1, 0) spans columns 16..32: mean red 23.5, of rows 0..16: mean green 7.5; channel 1 weighs 3, 4, 5 of 96
-            let given = sam.encoder.run(&[("input_image", pixels)]).unwrap();
-            let color =
-                |v: f64, c: usize| if picture { v } else { (v / 255.0 - IMAGENET.mean[c]) / IMAGENET.std[c] };
-            let expected = (3.0 * color(23.5, 0) + 4.0 * color(7.5, 1) + 5.0 * color(40.0, 2)) / 96.0;
-            close("cell (1, 0)", engine, &[given[0].values[256 + 1]], &[expected as f32], 1e-5);
-            let (mask, score) = sam.segment(&photo, &[click]).unwrap();
-            assert!(mask.values.len() == 65536 && score.is_finite());
-        }
+    for picture in [true, false] {
+        let path = dir.path().join(format!("encoder_{picture}.onnx"));
+        fs::write(&path, made::original_encoder(picture, 256, 32)).unwrap();
+        let sam = Sam::open(&path, &folder.join(ORIGINAL), ARRAY_BYTES).unwrap();
+        assert_eq!(sam.side, 256);
+        let pixels = sam.pixels(&photo);
+        let shape: &[usize] = if picture { &[256, 256, 3] } else { &[1, 3, 256, 256] };
+        assert_eq!(pixels.shape, shape);
+        // cell (1, 0) spans columns 16..32: mean red 23.5, of rows 0..16: mean green 7.5; channel 1 weighs 3, 4, 5 of 96
+        let given = sam.encoder.run(&[("input_image", pixels)]).unwrap();
+        let color =
+            |v: f64, c: usize| if picture { v } else { (v / 255.0 - IMAGENET.mean[c]) / IMAGENET.std[c] };
+        let expected = (3.0 * color(23.5, 0) + 4.0 * color(7.5, 1) + 5.0 * color(40.0, 2)) / 96.0;
+        close("cell (1, 0)", &[given[0].values[256 + 1]], &[expected as f32], 1e-5);
+        let (mask, score) = sam.segment(&photo, &[click]).unwrap();
+        assert!(mask.values.len() == 65536 && score.is_finite());
     }
 }
 
@@ -336,7 +305,7 @@ fn encoder_and_decoder_that_do_not_fit_are_named_together() {
         path
     };
     let decoder = |name: &str| folder.join(name);
-    let open = |e: &Path, d: &Path| Sam::open(e, d, &built_in());
+    let open = |e: &Path, d: &Path| Sam::open(e, d, ARRAY_BYTES);
     let Err(error) = open(&encoder(false, 256, 32), &decoder(DECODER)) else { panic!("no position") };
     assert!(error.to_string().contains("image_positional_embeddings"), "{error}");
     let Err(error) = open(&encoder(false, 512, 32), &decoder(ORIGINAL)) else { panic!("512 is not 256") };
@@ -351,36 +320,33 @@ fn encoder_and_decoder_that_do_not_fit_are_named_together() {
     // each in the other's place
     let swapped = open(&decoder(DECODER), &decoder("vision_encoder.onnx"));
     assert!(swapped.is_err_and(|e| e.to_string().contains("was given as the SAM encoder")));
-    let alone = Networks::open(&MaskConfig { sam: text(decoder("vision_encoder.onnx")), ..config(&None) });
+    let alone = Networks::open(&MaskConfig { sam: text(decoder("vision_encoder.onnx")), ..config() });
     assert!(alone.is_err_and(|e| e.to_string().contains("no file was given")));
 }
 
 #[test]
 fn vitmatte_gives_the_reference_from_the_stored_inputs() {
     let Some(folder) = shared("vitmatte_tiny") else { return };
-    for (engine, engines) in each_engine() {
-        let open = |name: &str| NetworkSession::open(Role::VITMATTE, &folder.join(name), &engines);
-        let session = open("model.onnx").unwrap();
-        for kind in ["", "_imagenet", "_random_160x224", "_random_96x128"] {
-            let pixels = array(&folder.join(format!("pixel_values{kind}.npy")));
-            let alphas = array(&folder.join(format!("alphas{kind}.npy")));
-            let given = session.run(&[("pixel_values", pixels.clone())]).unwrap();
-            assert_eq!(given[0].shape, alphas.shape);
-            close(&format!("alphas{kind}"), engine, &given[0].values, numbers(&alphas), 5e-5);
-            // the harder file: the same numbers, or one clear sentence
-            let recent = open("model_recent_exporter.onnx")
-                .and_then(|session| session.run(&[("pixel_values", pixels)]));
-            match recent {
-                Ok(given) => {
-                    let what = format!("alphas{kind} of the recent exporter");
-                    close(&what, engine, &given[0].values, numbers(&alphas), 5e-5);
-                }
-                Err(error) => {
-                    println!("{engine}: {error}; {}", error.hint());
-                    assert!(engines.runtime.is_none(), "{error}");
-                    assert!(error.to_string().ends_with("Reshape: Reshape volume mismatch"), "{error}");
-                    assert!(error.hint().contains("name its library"));
-                }
+    let open = |name: &str| NetworkSession::open(Role::VITMATTE, &folder.join(name), ARRAY_BYTES);
+    let session = open("model.onnx").unwrap();
+    for kind in ["", "_imagenet", "_random_160x224", "_random_96x128"] {
+        let pixels = array(&folder.join(format!("pixel_values{kind}.npy")));
+        let alphas = array(&folder.join(format!("alphas{kind}.npy")));
+        let given = session.run(&[("pixel_values", pixels.clone())]).unwrap();
+        assert_eq!(given[0].shape, alphas.shape);
+        close(&format!("alphas{kind}"), &given[0].values, numbers(&alphas), 5e-5);
+        // the harder file: the same numbers, or one clear sentence
+        let recent =
+            open("model_recent_exporter.onnx").and_then(|session| session.run(&[("pixel_values", pixels)]));
+        match recent {
+            Ok(given) => {
+                let what = format!("alphas{kind} of the recent exporter");
+                close(&what, &given[0].values, numbers(&alphas), 5e-5);
+            }
+            Err(error) => {
+                println!("{error}; {}", error.hint());
+                assert!(error.to_string().ends_with("Reshape: Reshape volume mismatch"), "{error}");
+                assert!(error.hint().contains("exporters"));
             }
         }
     }
@@ -400,78 +366,60 @@ fn vitmatte_is_shown_the_colors_of_each_convention() {
         (&beside, VitmatteColors::Imagenet, "_imagenet"),
         (&alone, VitmatteColors::Half, ""),
     ] {
-        for (engine, engines) in each_engine() {
-            let network = VitMatte::open(path, &engines, set).unwrap();
-            let recorded = &network.session.file.contract;
-            assert_eq!(recorded.ends_with("colors as in the original code"), kind == "_imagenet");
-            let padded = network.padded(150, 200).unwrap();
-            assert_eq!(padded, (160, 224));
-            let pixels = network.pixels(&photo, &trimap, padded);
-            let expected = array(&folder.join(format!("pixel_values{kind}.npy")));
-            close("pixel_values", "no engine", numbers(&pixels), numbers(&expected), 1e-6);
-            let alpha = network.alpha(&photo, &trimap).unwrap();
-            let whole = array(&folder.join(format!("alphas{kind}.npy")));
-            let cut: Vec<f32> =
-                numbers(&whole).chunks(160).take(200).flat_map(|row| row[..150].to_vec()).collect();
-            close(&format!("alpha{kind} of the photograph"), engine, &alpha, &cut, 5e-5);
-        }
+        let network = VitMatte::open(path, ARRAY_BYTES, set).unwrap();
+        let recorded = &network.session.file.contract;
+        assert_eq!(recorded.ends_with("colors as in the original code"), kind == "_imagenet");
+        let padded = network.padded(150, 200).unwrap();
+        assert_eq!(padded, (160, 224));
+        let pixels = network.pixels(&photo, &trimap, padded);
+        let expected = array(&folder.join(format!("pixel_values{kind}.npy")));
+        close("pixel_values", numbers(&pixels), numbers(&expected), 1e-6);
+        let alpha = network.alpha(&photo, &trimap).unwrap();
+        let whole = array(&folder.join(format!("alphas{kind}.npy")));
+        let cut: Vec<f32> =
+            numbers(&whole).chunks(160).take(200).flat_map(|row| row[..150].to_vec()).collect();
+        close(&format!("alpha{kind} of the photograph"), &alpha, &cut, 5e-5);
     }
 }
 
 #[test]
 fn the_record_names_each_file_with_its_size_and_its_hash() {
     let (Some(folder), Some(matte)) = (shared("sam_tiny"), shared("vitmatte_tiny")) else { return };
-    for engine in engines() {
-        let vitmatte = text(matte.join("model.onnx"));
-        let files = MaskConfig { vitmatte, memory_gib: 8.0, ..sam_files(&folder, DECODER, &engine) };
-        let networks = opened(&files);
-        let record = networks.files();
-        let roles: Vec<_> = record.iter().map(|f| f.role).collect();
-        assert_eq!(roles[..3], ["sam", "sam_decoder", "vitmatte"]);
-        assert_eq!(roles.len(), 3 + usize::from(engine.is_some()));
-        assert_eq!(record[0].bytes, 899_688);
-        assert!(record.iter().all(|f| f.sha256.len() == 64));
-        for file in record {
-            println!("{file:?}");
-        }
-        let at_once = networks.photos_at_once(384, 512, 2);
-        assert_eq!(at_once, if engine.is_some() { 1 } else { 2 });
-        let tight = opened(&MaskConfig { memory_gib: 1e-9, ..files });
-        assert_eq!(tight.photos_at_once(384, 512, 2), 1);
-        networks.prepare(150, 200).unwrap();
+    let vitmatte = text(matte.join("model.onnx"));
+    let files = MaskConfig { vitmatte, memory_gib: 8.0, ..sam_files(&folder, DECODER) };
+    let networks = opened(&files);
+    let record = networks.files();
+    let roles: Vec<_> = record.iter().map(|f| f.role).collect();
+    assert_eq!(roles, ["sam", "sam_decoder", "vitmatte"]);
+    assert_eq!(record[0].bytes, 899_688);
+    assert!(record.iter().all(|f| f.sha256.len() == 64));
+    for file in record {
+        println!("{file:?}");
     }
+    assert_eq!(networks.photos_at_once(384, 512, 2), 2);
+    let tight = opened(&MaskConfig { memory_gib: 1e-9, ..files });
+    assert_eq!(tight.photos_at_once(384, 512, 2), 1);
+    networks.prepare(150, 200).unwrap();
 }
 
 #[test]
 fn photographs_side_by_side_get_what_they_get_alone() {
     let (Some(folder), Some(matte)) = (shared("sam_tiny"), shared("vitmatte_tiny")) else { return };
     let (photo, clicks, trimap) = (picture(&folder), clicks(&folder), gray(&matte.join("trimap.png")));
-    for engine in engines() {
-        let made = |threads: usize| {
-            let runtime = engine.as_ref().map(|path| Runtime::load(path).unwrap());
-            let engines = Engines { runtime, threads, ..built_in() };
-            let sam = sam(&folder, DECODER, &engines).unwrap();
-            let vitmatte = VitMatte::open(&matte.join("model.onnx"), &engines, VitmatteColors::Auto).unwrap();
-            std::thread::scope(|scope| {
-                let each: Vec<_> = (0..3)
-                    .map(|_| {
-                        scope.spawn(|| {
-                            (sam.segment(&photo, &clicks).unwrap(), vitmatte.alpha(&photo, &trimap).unwrap())
-                        })
-                    })
-                    .collect();
-                each.into_iter().map(|t| t.join().unwrap()).collect::<Vec<_>>()
-            })
-        };
-        let (one, two) = (made(1), made(2));
-        assert!(one.iter().chain(&two).all(|r| *r == one[0]), "{engine:?}");
-    }
+    let sam = sam(&folder, DECODER).unwrap();
+    let vitmatte = VitMatte::open(&matte.join("model.onnx"), ARRAY_BYTES, VitmatteColors::Auto).unwrap();
+    let both = || (sam.segment(&photo, &clicks).unwrap(), vitmatte.alpha(&photo, &trimap).unwrap());
+    let alone = both();
+    std::thread::scope(|scope| {
+        let each: Vec<_> = (0..3).map(|_| scope.spawn(both)).collect();
+        assert!(each.into_iter().all(|thread| thread.join().unwrap() == alone));
+    });
 }
 
 #[test]
 fn a_photograph_beyond_the_memory_limit_is_refused_before_it_is_run() {
     let Some(folder) = shared("vitmatte_tiny") else { return };
-    let networks = opened(&MaskConfig { vitmatte: text(folder.join("model.onnx")), ..config(&None) });
+    let networks = opened(&MaskConfig { vitmatte: text(folder.join("model.onnx")), ..config() });
     // 3000 × 4096 is 48 128 cells, and 48 bytes for each pair of them 104 GiB
     let error = networks.prepare(3000, 4096).unwrap_err();
     assert!(error.to_string().contains("GiB") && error.hint().contains("1024"), "{error}");

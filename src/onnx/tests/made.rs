@@ -1,4 +1,4 @@
-//! Small ONNX files written by hand, byte by byte: sound ones of each form, and hostile ones.
+//! Small ONNX files written by hand, byte by byte: valid ones of each form, and hostile ones.
 
 /// A message of Protocol Buffers under construction.
 #[derive(Clone, Default)]
@@ -126,7 +126,7 @@ pub(crate) fn vitmatte(nodes: &[Message], weights: &[Message]) -> Vec<u8> {
     model(&graph(nodes, weights, &inputs, &outputs))
 }
 
-/// A sound network of ViTMatte's form: alpha is the weight of the trimap channel times it, 1 × 1.
+/// A valid network of ViTMatte's form: alpha is the weight of the trimap channel times it, 1 × 1.
 pub(crate) fn trimap_times(weight: f32) -> Vec<u8> {
     let weights = [floats("w", &[1, 4, 1, 1], &[0.0, 0.0, 0.0, weight])];
     vitmatte(&[node("Conv", &["pixel_values", "w"], &["alphas"], &[])], &weights)
