@@ -125,13 +125,14 @@ mod tests {
         }
     }
 
-    /// `cargo test --release --features wgpu --lib memory_of_photographs -- --ignored --nocapture`
+    /// `TIFACE_PHOTOGRAPHS=28 cargo test --release --features wgpu --lib memory_of_photographs -- --ignored --nocapture`
     #[test]
     #[cfg(target_os = "linux")]
     #[ignore = "run by the test above, in a process of its own"]
     fn memory_of_photographs() {
         let device = device().unwrap();
-        let mut views: Vec<_> = (0..5).map(|i| ball::view(2000, i as f64, 0.0, |_| [90; 3])).collect();
+        let count = std::env::var("TIFACE_PHOTOGRAPHS").map_or(5, |n| n.parse().unwrap());
+        let mut views: Vec<_> = (0..count).map(|i| ball::view(2000, i as f64, 0.0, |_| [90; 3])).collect();
         views.iter_mut().for_each(|view| view.mask = None);
         let pixels = Pixels::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
         let drawing = SamplingOptions { jitter: true, background: true, background_stream: 8 };

@@ -142,8 +142,14 @@ pub(super) fn max_samples(
     /// that takes the sample's place during an occupancy update.
     const EXTRA_WORDS: usize = 3 + 3 + 2 + 9 + 2 + 1;
     let [words, widest] = Sdf::words_per_sample(shape);
-    let sums = Sdf::words_of_sums(shape);
-    samples_that_fit(config, [words + EXTRA_WORDS, widest], sums, stereo_points(config), pixels, device)
+    let points = stereo_points(config);
+    let sums = Sdf::words_of_sums(shape, wanted_samples(config, points));
+    samples_that_fit(config, [words + EXTRA_WORDS, widest], sums, points, pixels, device)
+}
+
+/// Returns the sample capacity of a step that the processor has, with `points` besides its samples.
+pub(super) fn wanted_samples(config: &IfaceConfig, points: usize) -> usize {
+    MAX_BUDGETS * config.samples + points
 }
 
 /// Computes [`max_samples`] for any field on a hash grid, from its words per sample in all buffers and in the largest
@@ -165,7 +171,7 @@ pub(super) fn samples_that_fit(
         32 * hash::entries(&levels) as u64 + 13 * cells + 4 * sums as u64
     };
     let least = (config.samples + points) as u64;
-    let wanted = (MAX_BUDGETS * config.samples + points) as u64;
+    let wanted = wanted_samples(config, points) as u64;
     let need = MemoryNeed {
         fixed: (fixed(config.log2_table), "hash tables, cells and sums"),
         unit: "samples",

@@ -8,6 +8,7 @@
 //! Many threads that add to one word use atomics, whose kind [`Atomics`] selects. All other sums have a fixed order.
 
 mod adam;
+mod color;
 mod density;
 mod device;
 mod draw;

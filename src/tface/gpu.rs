@@ -52,7 +52,7 @@ impl<'a> GpuVm<'a> {
         let fields = [start.size, start.last_size(config)].map(|size| start.field_of(config, size, true));
         let [fixed, ray] = fields
             .each_ref()
-            .map(|f| Vm::bytes(device, f))
+            .map(|f| Vm::bytes(device, f, config.rays))
             .into_iter()
             .fold([0; 2], |a, b| [a[0].max(b[0]), a[1].max(b[1])]);
         let widest = fields.iter().map(Vm::widest).max().unwrap_or(1);

@@ -165,6 +165,42 @@ fn what_steps_before_a_finer_grid_came_to_is_counted() {
 }
 
 #[test]
+fn a_training_reserves_the_memory_that_was_planned() {
+    if device().is_some() {
+        crate::kernel::gpu::tests::alone("tface::gpu::tests::memory_of_a_training");
+    }
+}
+
+#[test]
+#[ignore = "run by the test above, in a process of its own"]
+fn memory_of_a_training() {
+    let (dir, views) = (temporary(), ball::views());
+    let config = VmConfig {
+        rays: 4096,
+        voxels_start: 40 * 40 * 40,
+        voxels_final: 40 * 40 * 40,
+        upsample_steps: vec![],
+        mask_steps: vec![],
+        ..config()
+    };
+    let pixels = pixels(&views, &config);
+    let with = |mib: u64| device().unwrap().with_memory((512 + mib) << 20);
+    let fits =
+        |mib: &u64| GpuVm::fits("tface", &config, &pixels, &start(&config), &with(*mib)).is_ok_and(|r| r);
+    let planned = (8..4096).step_by(4).find(fits).unwrap();
+    let session = session("tface", dir.path(), "ball", &Quiet);
+    let before = with(planned).reserved_memory();
+    let mut model = begun(on_gpu(&config, &pixels, with(planned)), &config, &session);
+    for step in 0..2 {
+        let progress = TrainingProgress { step, ..TrainingProgress::default() };
+        training::step(&mut model, session.seed, &progress, true).ok().unwrap();
+    }
+    let share = (model.ops.device.reserved_memory() - before) as f64 / (planned << 20) as f64;
+    println!("{share:.3} of {planned} MiB are reserved");
+    assert!((0.9..=1.05).contains(&share), "{share}");
+}
+
+#[test]
 fn rays_that_the_host_draws_in_order_give_the_losses_of_the_cpu() {
     let Some(device) = device() else { return };
     let (dir, views) = (temporary(), ball::views());
@@ -250,7 +286,7 @@ fn a_device_with_too_little_memory_is_refused_before_the_first_step_and_told_wha
     assert!(refused(&VmConfig { rays: most + 1, ..config() }, 2048).is_err());
     // what is counted is what is made, but for what is a matter of kilobytes
     let field = start(&config()).field(&config(), true);
-    let [fixed, ray] = Vm::bytes(&device, &field);
+    let [fixed, ray] = Vm::bytes(&device, &field, config().rays);
     println!("{} KiB of grids and gradients, {ray} bytes a ray", fixed >> 10);
     // ‖(16, 16, 16)‖ = 27.7: 27 samples, of which the last is none, of 17 words each, and 34 words of the ray
     assert_eq!((ray, Vm::widest(&field)), (4 * (26 * 17 + 34), 12 * 26));

@@ -7,7 +7,7 @@ use crate::field::drawing::DeviceRays;
 use crate::field::ops::Ops;
 use crate::field::pixels::Pixels;
 use crate::field::training::StepAt;
-use crate::iface::gpu::samples_that_fit;
+use crate::iface::gpu::{samples_that_fit, wanted_samples};
 use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule;
 use crate::kernel::cpu::schedule::Figures;
@@ -81,8 +81,8 @@ impl<'a> GpuDensity<'a> {
 /// Returns the sample capacity of a step, and whether the photographs fit on the device as well.
 fn max_samples(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<(usize, bool)> {
     let shape = shape(config);
-    let (words, sums) = (Density::words_per_sample(&shape), Density::words_of_sums(&shape));
-    samples_that_fit(config, words, sums, 0, pixels, device)
+    let sums = Density::words_of_sums(&shape, wanted_samples(config, 0));
+    samples_that_fit(config, Density::words_per_sample(&shape), sums, 0, pixels, device)
 }
 
 /// Creates the cells to march through, and the rule that updates them.

@@ -1,21 +1,21 @@
 //! The density field of [`crate::kernel::cpu::density`], whose module holds the formulas: its networks forward and backward,
 //! truncation of rays by transmittance, and compositing with the losses.
 
+use super::color::{ColorPlan, color_backward, color_forward, color_inputs, unit};
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::Batch;
 use super::hash::Grid;
-use super::losses::sum;
+use super::losses::{HIT, LAST, TALLY, sum, tally};
 use super::march::{Samples, prefix_sum};
-use super::sdf::kernels::{harmonics, masked, prepare, reduce};
-use super::sdf::{SUMMING, ends};
-use super::sum::group_sum;
+use super::sdf::kernels::{prepare, reduce};
+use super::sdf::{ends, maps, summing};
 use super::tile::{
-    CHANNELS, LANES, UNITS, at, load_planes, outer, output_layer, product, relu, relu_backward, sigmoid,
-    store_block, store_planes, uniform_count,
+    CHANNELS, LANES, Lane, UNITS, at, lane_of, load_planes, outer, output_layer, product, relu,
+    relu_backward, store_block, store_planes, uniform_count,
 };
 use super::weight_norm::finite;
 use crate::kernel::cpu::density::{
-    COLOR_INPUTS, DISTORTION, DensityShape, FEATURES, HIDDEN, MAX_EXP_GRADIENT, MIN_TRANSMITTANCE,
+    COLOR_INPUTS, DISTORTION, DensityShape, FEATURES, HIDDEN, MIN_TRANSMITTANCE,
 };
 use crate::kernel::cpu::losses::{RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::mlp::TILE;
@@ -32,36 +32,40 @@ const WIDTH: usize = 4;
 struct Plan {
     /// Number of hash features: two per level.
     features: usize,
+    color: ColorPlan,
 }
 
 impl Plan {
-    /// Returns the first rows of W1ᵀ, W1, W2, C1ᵀ, C1, C2ᵀ, C2, C3, and the end.
-    fn rows(&self) -> [usize; 9] {
-        ends([self.features, HIDDEN, FEATURES, COLOR_INPUTS, HIDDEN, HIDDEN, HIDDEN, 3])
+    fn new(shape: &DensityShape) -> Plan {
+        let features = 2 * shape.levels.len();
+        let color = ColorPlan {
+            outputs: FEATURES,
+            signed: false,
+            features: 0,
+            inputs: COLOR_INPUTS,
+            weights: features + HIDDEN + FEATURES,
+            gradients: [HIDDEN + FEATURES, 3 * HIDDEN + FEATURES + 3],
+            colors: 1,
+        };
+        Plan { features, color }
     }
 
-    /// Returns the first rows of the gradients of W1, W2, C1, C2, C3, and the end.
-    fn gradients(&self) -> [usize; 6] {
-        ends([HIDDEN, FEATURES, HIDDEN, HIDDEN, 3])
+    /// Returns the first rows of W1ᵀ, W1, W2.
+    fn rows(&self) -> [usize; 3] {
+        ends([self.features, HIDDEN, FEATURES])
     }
 
-    /// Returns two index maps: for each float of the prepared weights its index in the flat vector, or `u32::MAX` for
-    /// padding; and for each float of the flat vector its index in the gradients.
+    /// Returns the maps of the weights and of their gradients; see [`maps`].
     fn maps(&self, shape: &DensityShape) -> (Vec<u32>, Vec<u32>) {
-        let (rows, gradients) = (self.rows(), self.gradients());
-        let mut prepared = vec![u32::MAX; rows[8] * CHANNELS];
-        let mut summed = Vec::with_capacity(shape.len());
-        for (part, (outputs, inputs)) in shape.shapes().into_iter().enumerate() {
-            let [original, transposed] = [[1, 2, 4, 6, 7][part], [0, 8, 3, 5, 8][part]];
-            for (o, i) in (0..outputs).flat_map(|o| (0..inputs).map(move |i| (o, i))) {
-                prepared[(rows[original] + o) * CHANNELS + i] = summed.len() as u32;
-                if transposed < 8 {
-                    prepared[(rows[transposed] + i) * CHANNELS + o] = summed.len() as u32;
-                }
-                summed.push(((gradients[part] + o) * CHANNELS + i) as u32);
-            }
-        }
-        (prepared, summed)
+        let ([w1t, w1, w2], c, g_c) = (self.rows(), self.color.rows(), self.color.gradient_rows());
+        let places = [
+            (Some(w1), Some(w1t), 0),
+            (Some(w2), None, HIDDEN),
+            (Some(c[1]), Some(c[0]), g_c[0]),
+            (Some(c[3]), Some(c[2]), g_c[1]),
+            (Some(c[4]), None, g_c[2]),
+        ];
+        maps(&shape.shapes(), &places, c[5], |_, i| i)
     }
 }
 
@@ -83,13 +87,14 @@ fn forward(
 ) {
     let rows = comptime!(plan.rows());
     let plane = direction.len() / 3;
-    let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
+    let color = comptime!(plan.color);
     let tile = CUBE_POS;
-    let here = tile * LANES + row;
+    let lane = lane_of(tile, plane);
+    let (row, column, here) = (lane.row, lane.column, lane.here);
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     if tile * TILE < uniform_count(count, &mut a) {
-        features(&mut a, value, plane, here, row, column, comptime!(plan.features));
+        features(&mut a, value, &lane, comptime!(plan.features));
         sync_cube();
         let first =
             relu(&product(&a, 0usize, w, comptime!(rows[0]), comptime!(plan.features), row, column, LANES));
@@ -100,133 +105,70 @@ fn forward(
             out[here] = (output - F4::new(1.0f32)).exp();
         }
         if colors {
-            store_planes(h, &first, plane, here, column, HIDDEN);
+            store_planes(h, &first, &lane, HIDDEN);
             o[column * plane + here] = output;
-            a[at(column, row, LANES)] = output;
-            if column == 13 {
-                let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
-                harmonics(&mut a, FEATURES, x, y, z, row);
-            }
+            // densities have no normal
+            let none = F4::new(0.0f32);
+            let normal = unit(none, none, none);
+            color_inputs(&mut a, output, &normal, direction, value, &lane, color);
             sync_cube();
-            let first = relu(&product(&a, 0usize, w, comptime!(rows[3]), COLOR_INPUTS, row, column, LANES));
-            store_planes(c1, &first, plane, here, column, HIDDEN);
-            store_block(&mut b, &first, row, column, LANES);
-            sync_cube();
-            let second = relu(&product(&b, 0usize, w, comptime!(rows[5]), HIDDEN, row, column, LANES));
-            store_planes(c2, &second, plane, here, column, HIDDEN);
-            store_block(&mut a, &second, row, column, LANES);
-            sync_cube();
-            let rgb = output_layer(&a, w, comptime!(rows[7]), row, column, 3usize, LANES);
-            if column < 3 {
-                out[(1 + column) * plane + here] = sigmoid(rgb);
-            }
+            color_forward(&mut a, &mut b, w, c1, c2, out, &lane, color);
         }
     }
 }
 
 /// Writes hash features to a tile, padded with zeros.
 #[cube]
-fn features(
-    a: &mut [F4],
-    value: &[F4],
-    plane: usize,
-    here: usize,
-    row: usize,
-    column: usize,
-    #[comptime] count: usize,
-) {
+fn features(a: &mut [F4], value: &[F4], lane: &Lane, #[comptime] count: usize) {
     for j in 0..4usize {
-        let c = column + 16 * j;
+        let c = lane.column + 16 * j;
         let mut v = F4::new(0.0f32);
         if c < count {
-            v = value[c * plane + here];
+            v = value[c * lane.plane + lane.here];
         }
-        a[at(c, row, LANES)] = v;
+        a[at(c, lane.row, LANES)] = v;
     }
 }
 
-/// Writes the gradients with respect to the features of each sample, and partial sums by group of those with respect to
-/// the weights.
+/// Backward pass of the geometry network. Writes the gradients with respect to the features of each sample, and partial
+/// sums by group of those with respect to the weights.
 #[cube(launch_unchecked)]
-fn backward(
+fn geometry_backward(
     w: &[F4],
     value: &[F4],
-    direction: &[F4],
     count: &[u32],
     h: &[F4],
-    o: &[F4],
-    c1: &[F4],
-    c2: &[F4],
-    out: &[F4],
-    g_out: &[F4],
+    g_o: &[F4],
     g_value: &mut [F4],
     partial: &mut [f32],
     #[comptime] plan: Plan,
 ) {
     let rows = comptime!(plan.rows());
-    let gradient_rows = comptime!(plan.gradients());
     let inputs = comptime!(plan.features);
-    let plane = direction.len() / 3;
-    let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
+    let plane = g_o.len() / FEATURES;
     let group = CUBE_POS;
-    let sum = group * comptime!(gradient_rows[5] * CHANNELS);
+    let sum = group * comptime!(plan.color.gradients[1] * CHANNELS);
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let samples = uniform_count(count, &mut a);
     for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
-        let here = tile * LANES + row;
-        let first = 4 * here;
+        let lane = lane_of(tile, plane);
+        let (row, column, here) = (lane.row, lane.column, lane.here);
         let fresh = tile == group;
-        if column < 3 {
-            let y = out[(1 + column) * plane + here];
-            let g = masked(g_out[(1 + column) * plane + here], first, samples);
-            a[at(column, row, LANES)] = g * y * (F4::new(1.0f32) - y);
-        }
-        load_planes(&mut b, c2, plane, here, row, column);
+        a[at(column, row, LANES)] = g_o[column * plane + here];
+        load_planes(&mut b, h, &lane);
         sync_cube();
-        let start = sum + comptime!(gradient_rows[4] * CHANNELS);
-        outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column, LANES);
-        let g_c2 = product(&a, 0usize, w, comptime!(rows[7]), 3usize, row, column, LANES);
-        let g_c2 = relu_backward(&g_c2, &b, row, column, LANES);
-        sync_cube();
-        store_block(&mut a, &g_c2, row, column, LANES);
-        load_planes(&mut b, c1, plane, here, row, column);
-        sync_cube();
-        let start = sum + comptime!(gradient_rows[3] * CHANNELS);
-        outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column, LANES);
-        let g_c1 = product(&a, 0usize, w, comptime!(rows[6]), HIDDEN, row, column, LANES);
-        let g_c1 = relu_backward(&g_c1, &b, row, column, LANES);
-        sync_cube();
-        store_block(&mut a, &g_c1, row, column, LANES);
-        b[at(column, row, LANES)] = o[column * plane + here];
-        if column == 13 {
-            let (x, y, z) = (direction[here], direction[plane + here], direction[2 * plane + here]);
-            harmonics(&mut b, FEATURES, x, y, z, row);
-        }
-        sync_cube();
-        let start = sum + comptime!(gradient_rows[2] * CHANNELS);
-        outer(&a, 0usize, &b, HIDDEN, COLOR_INPUTS, partial, start, fresh, row, column, LANES);
-        let g_c0 = product(&a, 0usize, w, comptime!(rows[4]), HIDDEN, row, column, LANES);
-        sync_cube();
-        store_block(&mut a, &g_c0, row, column, LANES);
-        load_planes(&mut b, h, plane, here, row, column);
-        sync_cube();
-        if column == 0 {
-            let steep = min(out[here], F4::new(MAX_EXP_GRADIENT));
-            a[at(0usize, row, LANES)] += masked(g_out[here], first, samples) * steep;
-        }
-        sync_cube();
-        let start = sum + comptime!(gradient_rows[1] * CHANNELS);
+        let start = sum + comptime!(HIDDEN * CHANNELS);
         outer(&a, 0usize, &b, FEATURES, HIDDEN, partial, start, fresh, row, column, LANES);
         let g_h = product(&a, 0usize, w, comptime!(rows[2]), FEATURES, row, column, LANES);
         let g_h = relu_backward(&g_h, &b, row, column, LANES);
         sync_cube();
         store_block(&mut a, &g_h, row, column, LANES);
-        features(&mut b, value, plane, here, row, column, inputs);
+        features(&mut b, value, &lane, inputs);
         sync_cube();
         outer(&a, 0usize, &b, HIDDEN, inputs, partial, sum, fresh, row, column, LANES);
         let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
-        store_planes(g_value, &g_u, plane, here, column, inputs);
+        store_planes(g_value, &g_u, &lane, inputs);
         sync_cube();
     }
 }
@@ -283,31 +225,6 @@ fn cut(
     }
 }
 
-/// Counts the rays with samples, and finds the number of the last one of them, counted from 1; both results are at least
-/// 1. Runs as one group of threads.
-#[cube(launch)]
-fn tally(offsets: &[u32], out: &mut [u32]) {
-    let unit = UNIT_POS as usize;
-    let mut hit_rays = 0u32;
-    let mut last = 0u32;
-    for r in range_stepped(unit, offsets.len() - 1, UNITS as usize) {
-        if offsets[r + 1] > offsets[r] {
-            hit_rays += 1;
-            last = u32::cast_from(r) + 1;
-        }
-    }
-    let mut lasts = Shared::<[u32]>::new_slice(UNITS as usize);
-    lasts[unit] = last;
-    let hit_rays = group_sum::<u32>(hit_rays, UNITS as usize);
-    if unit == 0 {
-        for i in 1..UNITS as usize {
-            last = max(last, lasts[i]);
-        }
-        out[0] = max(hit_rays, 1u32);
-        out[1] = max(last, 1u32);
-    }
-}
-
 /// Returns `1 − e⁻ˣ` for x ≥ 0.
 #[cube]
 fn opacity(x: f32) -> f32 {
@@ -336,7 +253,8 @@ fn of_rays(
     let r = ABSOLUTE_POS;
     if r < rays {
         let (first, end) = (offsets[r] as usize, offsets[r + 1] as usize);
-        let (hit_rays, last) = (f32::cast_from(tally[0]), f32::cast_from(tally[1]));
+        let hit_rays = f32::cast_from(max(tally[HIT], 1u32));
+        let last = f32::cast_from(max(tally[LAST], 1u32));
         let mut thickness = 0.0f32;
         let mut red = 0.0f32;
         let mut green = 0.0f32;
@@ -413,6 +331,7 @@ pub struct Density {
     out: Buffer,
     light: Buffer,
     g_out: Buffer,
+    g_o: Buffer,
     g_value: Buffer,
     partial: Buffer,
     tally: Buffer,
@@ -425,7 +344,7 @@ impl Density {
     /// Creates a field that is marched in steps of `dt`; `capacity` must be a multiple of [`TILE`].
     pub fn new(device: &Device, shape: &DensityShape, dt: f32, rays: usize, capacity: usize) -> Density {
         assert!(capacity.is_multiple_of(TILE) && capacity > 0 && Density::supports(shape));
-        let plan = Plan { features: 2 * shape.levels.len() };
+        let plan = Plan::new(shape);
         let (prepared, summed) = plan.maps(shape);
         let planes = |count: usize| device.scratch::<f32>(count * capacity);
         Density {
@@ -444,9 +363,10 @@ impl Density {
             out: planes(WIDTH),
             light: planes(2),
             g_out: planes(WIDTH),
+            g_o: planes(FEATURES),
             g_value: planes(plan.features),
-            partial: device.scratch::<f32>(SUMMING * plan.gradients()[5] * CHANNELS),
-            tally: device.scratch::<u32>(2),
+            partial: device.scratch::<f32>(summing(capacity) * plan.color.gradients[1] * CHANNELS),
+            tally: device.scratch::<u32>(TALLY),
             ray_terms: device.scratch::<f32>(RAY_TERMS * rays),
             no_terms: device.zeros::<f32>(SAMPLE_TERMS),
             sums: device.zeros::<f32>(TERMS + 2),
@@ -462,12 +382,12 @@ impl Density {
     /// that of the largest buffer.
     pub fn words_per_sample(shape: &DensityShape) -> [usize; 2] {
         let features = 2 * shape.levels.len();
-        [2 * features + 3 * HIDDEN + FEATURES + 2 * WIDTH + 2 + 2 * (3 + 3 + 2), HIDDEN.max(features)]
+        [2 * features + 3 * HIDDEN + 2 * FEATURES + 2 * WIDTH + 2 + 2 * (3 + 3 + 2), HIDDEN.max(features)]
     }
 
-    /// Returns the memory of the groups' partial gradient sums in words, which does not depend on the number of samples.
-    pub fn words_of_sums(shape: &DensityShape) -> usize {
-        SUMMING * Plan { features: 2 * shape.levels.len() }.gradients()[5] * CHANNELS
+    /// Returns the memory of the groups' partial gradient sums in words, for up to `capacity` samples.
+    pub fn words_of_sums(shape: &DensityShape, capacity: usize) -> usize {
+        summing(capacity) * Plan::new(shape).color.gradients[1] * CHANNELS
     }
 
     /// Converts new network weights to the layout of the kernels.
@@ -524,7 +444,8 @@ impl Density {
     /// [`backward`](Density::backward).
     pub fn losses(&self, device: &Device, samples: &Samples, batch: &Batch) {
         let offsets = &samples.offsets;
-        launch!(device, tally::launch, CubeCount::new_single(), UNITS; offsets, self.tally);
+        let one = CubeCount::new_single();
+        launch!(device, tally::launch, one, UNITS; offsets, batch.alpha, batch.alive, self.tally; true);
         launch!(device, of_rays::launch, groups(batch.rays().div_ceil(UNITS as usize)), UNITS;
             self.out, offsets, samples.t, batch.color, self.tally, self.light, self.g_out, self.ray_terms;
             self.dt
@@ -545,19 +466,23 @@ impl Density {
         broken: &Buffer,
     ) {
         let count = &samples.count;
-        let summing = SUMMING.min(self.capacity / TILE);
+        let (weights, partial, direction) = (&self.weights, &self.partial, &samples.direction);
+        let summing = summing(self.capacity);
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
-            launch!(device, backward::launch_unchecked, groups(summing), UNITS;
-                self.weights, self.value, samples.direction, count, self.h, self.o, self.c1, self.c2, self.out,
-                self.g_out, self.g_value, self.partial;
-                self.plan
+            launch!(device, color_backward::launch_unchecked, groups(summing), UNITS;
+                weights, self.value, direction, count, self.o, self.c1, self.c2, self.out, self.g_out, self.g_o,
+                self.g_o, self.g_value, partial;
+                0.0, self.plan.color
+            );
+            launch!(device, geometry_backward::launch_unchecked, groups(summing), UNITS;
+                weights, self.value, count, self.h, self.g_o, self.g_value, partial; self.plan
             );
         }
         let over = groups(g_flat.words().div_ceil(UNITS as usize));
         launch!(device, reduce::launch, over.clone(), UNITS;
-            self.partial, self.summed_map, count, g_flat;
-            (self.plan.gradients()[5] * CHANNELS) as u32, summing
+            partial, self.summed_map, count, g_flat;
+            (self.plan.color.gradients[1] * CHANNELS) as u32, TILE, summing, true
         );
         launch!(device, check::launch, over, UNITS; g_flat, broken);
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);

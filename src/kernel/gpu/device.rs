@@ -525,6 +525,7 @@ pub(crate) mod tests {
                 "a_buffer_larger_than_memory",
                 "a_kernel_that_does_not_compile",
                 "a_group_of_too_many_threads",
+                "a_device_that_is_lost",
             ] {
                 alone(&format!("kernel::gpu::device::tests::{test}"));
             }
@@ -606,6 +607,28 @@ pub(crate) mod tests {
         let out = device.zeros::<f32>(64);
         launch!(device, set::launch, CubeCount::new_single(), 1 << 20; out);
         is_refused(&device, &out, "set");
+    }
+
+    #[test]
+    #[ignore = "run by the test above, in a process of its own"]
+    fn a_device_that_is_lost() {
+        let adapter = &Adapter::all()[0];
+        let CubeDevice::Wgpu(wgpu_device) = &adapter.device else { panic!("not a device of wgpu") };
+        let options = RuntimeOptions::try_default().unwrap();
+        let setup = try_init_setup::<AutoGraphicsApi>(wgpu_device, options).unwrap();
+        let device = Device::open(adapter);
+        let out = device.zeros::<f32>(64);
+        let set = || launch!(device, set::launch, CubeCount::new_single(), 64; out);
+        set();
+        assert_eq!(device.fetch::<f32>(&out).unwrap(), [1.0; 64]);
+        setup.device.destroy();
+        // nothing is trusted from then on
+        for _ in 0..3 {
+            set();
+            let e = device.fetch::<f32>(&out).expect_err("the device is lost");
+            println!("{e}: {}", e.hint());
+            assert!(e.kind() as i32 == 75 && e.hint().contains("repeat"), "{e}");
+        }
     }
 
     #[test]

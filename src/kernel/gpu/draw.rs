@@ -3,7 +3,8 @@
 //! The pixel of a ray depends on seed, step and the ray's index alone, as on the CPU.
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::rng::{Wide, below, permuted, stream, uniform};
+use super::march::{ranked, upper_bound};
+use super::rng::{Wide, below, permuted, stream, uniform, word};
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::rng;
@@ -172,7 +173,7 @@ fn undistort(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
 }
 
 /// Sums over the drawable pixels of a square.
-#[derive(CubeType, Clone, Copy)]
+#[derive(CubeType, cubecl::CubeTypeMut, Clone, Copy)]
 struct Square {
     x: u32,
     y: u32,
@@ -242,44 +243,6 @@ fn square(
     sums
 }
 
-/// Returns the view of a drawable pixel: the first whose running count exceeds the pixel's index.
-#[cube]
-fn view_of(views: &[u32], which: u32) -> usize {
-    let mut low = 0usize;
-    let mut high = views.len() / VIEW;
-    while low < high {
-        let middle = (low + high) / 2;
-        if views[middle * VIEW] <= which {
-            low = middle + 1;
-        } else {
-            high = middle;
-        }
-    }
-    low
-}
-
-/// Returns the drawable pixel of a view's box with the given rank; `before` holds the count before each word of
-/// `drawable`.
-#[cube]
-fn ranked(before: &[u32], drawable: &[u32], first: usize, words: usize, rank: u32) -> u32 {
-    let mut low = first;
-    let mut high = first + words;
-    while low < high {
-        let middle = (low + high) / 2;
-        if before[middle] <= rank {
-            low = middle + 1;
-        } else {
-            high = middle;
-        }
-    }
-    let word = low - 1;
-    let mut bits = drawable[word];
-    for _ in before[word]..rank {
-        bits &= bits - 1;
-    }
-    32 * u32::cast_from(word - first) + bits.trailing_zeros()
-}
-
 #[cube(launch)]
 fn draw_rays(
     views: &[u32],
@@ -297,16 +260,11 @@ fn draw_rays(
     alpha: &mut [f32],
     background: &mut [f32],
     alive: &mut [u32],
-    view_high: u32,
-    view_low: u32,
-    pixel_high: u32,
-    pixel_low: u32,
-    jitter_high: u32,
-    jitter_low: u32,
-    background_high: u32,
-    background_low: u32,
-    key_high: u32,
-    key_low: u32,
+    of_view: Wide,
+    of_pixel: Wide,
+    of_jitter: Wide,
+    of_background: Wide,
+    key: Wide,
     half_bits: u32,
     position: u32,
     detail: f32,
@@ -324,17 +282,17 @@ fn draw_rays(
         let mut which = 0u32;
         let mut wanted = i < wanted[0];
         let view = if comptime!(order == PixelOrder::EachView) {
-            below(view_high, view_low, i, u32::cast_from(all)) as usize
+            below(&of_view, i, u32::cast_from(all)) as usize
         } else {
             if comptime!(order.is_permuted()) {
                 // A batch may be larger than the number of drawable pixels.
                 wanted = wanted && position + i < count;
-                which =
-                    permuted(Wide { high: key_high, low: key_low }, half_bits, (position + i) % count, count);
+                which = permuted(&key, half_bits, (position + i) % count, count);
             } else {
-                which = below(view_high, view_low, i, count);
+                which = below(&of_view, i, count);
             }
-            view_of(views, which)
+            // the first view whose running count exceeds the pixel's index
+            upper_bound(views, 0usize, all, which, VIEW)
         };
         let view = view * VIEW;
         let (width, height) = (views[view + 3], views[view + 4]);
@@ -347,11 +305,8 @@ fn draw_rays(
         }
         let mut x = 0.0f32;
         let mut y = 0.0f32;
-        let mut red = 0u32;
-        let mut green = 0u32;
-        let mut blue = 0u32;
-        let mut opaque = 0u32;
-        let mut count = 1u32;
+        let mut sums =
+            Square { x: 0u32, y: 0u32, red: 0u32, green: 0u32, blue: 0u32, alpha: 0u32, count: 1u32 };
         while attempt < last {
             let at = if comptime!(order.is_permuted()) {
                 let mut rank = which;
@@ -362,12 +317,12 @@ fn draw_rays(
                 ranked(before, drawable, views[view + FIRST_WORD] as usize, words, rank)
             } else {
                 let k = (i << 9) | (attempt << 1);
-                let column = below(pixel_high, pixel_low, k, width);
-                below(pixel_high, pixel_low, k | 1, height) * width + column
+                let column = below(&of_pixel, k, width);
+                below(&of_pixel, k | 1, height) * width + column
             };
             attempt += 1;
             if is_drawable(views, drawable, view, at) {
-                let seen = square(
+                sums = square(
                     views,
                     pixels0,
                     pixels1,
@@ -379,13 +334,8 @@ fn draw_rays(
                     at / width,
                     detail,
                 );
-                red = seen.red;
-                green = seen.green;
-                blue = seen.blue;
-                opaque = seen.alpha;
-                count = seen.count;
-                let whole = f32::cast_from(count);
-                let (u, v) = (f32::cast_from(seen.x) / whole, f32::cast_from(seen.y) / whole);
+                let whole = f32::cast_from(sums.count);
+                let (u, v) = (f32::cast_from(sums.x) / whole, f32::cast_from(sums.y) / whole);
                 let xd = (u + 0.5f32 - number(views, view, CAMERA + 2)) / number(views, view, CAMERA);
                 let yd = (v + 0.5f32 - number(views, view, CAMERA + 3)) / number(views, view, CAMERA + 1);
                 // pictures have y down
@@ -397,12 +347,12 @@ fn draw_rays(
             }
         }
         let kept = select(found, 1u32, 0u32);
-        let most = f32::cast_from(255 * count);
+        let most = f32::cast_from(255 * sums.count);
         alive[r] = kept;
-        alpha[r] = f32::cast_from(kept * opaque) / most;
-        color[r] = f32::cast_from(kept * red) / (255.0f32 * most);
-        color[rays + r] = f32::cast_from(kept * green) / (255.0f32 * most);
-        color[2 * rays + r] = f32::cast_from(kept * blue) / (255.0f32 * most);
+        alpha[r] = f32::cast_from(kept * sums.alpha) / most;
+        color[r] = f32::cast_from(kept * sums.red) / (255.0f32 * most);
+        color[rays + r] = f32::cast_from(kept * sums.green) / (255.0f32 * most);
+        color[2 * rays + r] = f32::cast_from(kept * sums.blue) / (255.0f32 * most);
         // cameras look along −Z
         let mut over = 1.0f32;
         if comptime!(order != PixelOrder::Permuted { depth_directions: true }) {
@@ -418,14 +368,14 @@ fn draw_rays(
         }
         let mut shift = 0.0f32;
         if shifted {
-            shift = uniform(jitter_high, jitter_low, i);
+            shift = uniform(&of_jitter, i);
         }
         jitter[r] = shift;
         #[unroll]
         for c in 0..3u32 {
             let mut channel = 0.0f32;
             if random {
-                channel = uniform(background_high, background_low, 3 * i + c);
+                channel = uniform(&of_background, 3 * i + c);
             }
             background[c as usize * rays + r] = channel;
         }
@@ -617,8 +567,7 @@ impl Photographs {
         launch!(device, draw_rays::launch, groups(into.rays().div_ceil(UNITS as usize)), UNITS;
             self.views, pixels0, pixels1, pixels2, pixels3, self.drawable, self.before, wanted, into.origin,
             into.direction, into.jitter, into.color, into.alpha, into.background, into.alive;
-            view[0], view[1], pixel[0], pixel[1], shift[0], shift[1], background[0], background[1],
-            (permutation.key >> 32) as u32, permutation.key as u32, permutation.half_bits,
+            view, pixel, shift, background, word(permutation.key), permutation.half_bits,
             permutation.first as u32, detail, self.order, self.drawing.jitter, self.drawing.background
         );
     }

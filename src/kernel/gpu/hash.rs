@@ -439,4 +439,27 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn sums_of_a_level_need_not_fit_in_one_launch_of_a_group_for_each() {
+        let Some(device) = device().map(|d| d.with_atomics(Atomics::Fixed)) else { return };
+        // the largest level of `log2_table` 24 that a buffer of 128 MiB holds, dense
+        let levels = hash::levels(1, 250, 1.5, 24);
+        let entries = hash::entries(&levels);
+        assert!(2 * entries > 256 * MOST_GROUPS as usize && entries < 1 << 24);
+        let x = [[0.75f32; 3], [-1.5, 1.25, 0.5]];
+        let g = [[1.0f32, -2.0], [0.5, 4.0]];
+        let mut want = vec![[0f32; 2]; entries];
+        hash::scatter(&levels, &mut want, &inside(&x), 0.5 / RADIUS, &g, &[[0.0; 2]; 2], &[[0.0; 3]; 2]);
+        let [planes_of_x, planes_of_g] = [planes(&x, 64), planes(&g, 64)].map(|v| device.upload(&v));
+        let gradient = device.zeros::<f32>(2 * entries);
+        let count = device.upload(&[2u32]);
+        let grid = Grid::new(&device, &levels, 1, RADIUS);
+        grid.scatter(&device, &gradient, &planes_of_x, &count, &planes_of_g, None);
+        let got = device.read::<f32>(&gradient);
+        let worst = got.iter().zip(want.as_flattened()).map(|(a, b)| (a - b).abs()).fold(0f32, f32::max);
+        let touched = got.iter().filter(|v| **v != 0.0).count();
+        println!("{entries} entries, {touched} floats changed, error {worst:.1e}");
+        assert!(touched >= 8 && worst < 1e-6, "{touched} {worst}");
+    }
 }

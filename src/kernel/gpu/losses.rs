@@ -9,25 +9,56 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Counts the rays with samples, the rays whose pixel is entirely head, and all rays. Runs as one group of threads.
+/// Number of words of [`tally`].
+pub(super) const TALLY: usize = 5;
+
+/// Offsets in the words of a tally: rays; rays with samples; rays whose pixel is entirely head; rays whose pixel is
+/// background; the last ray with samples, counted from 1.
+pub(super) const HIT: usize = 1;
+const HEAD: usize = 2;
+pub(super) const BACKGROUND: usize = 3;
+pub(super) const LAST: usize = 4;
+
+/// Counts rays. Runs as one group of threads. Without `sampled`, `offsets` is not read and no ray counts as one with
+/// samples.
 #[cube(launch)]
-fn tally(offsets: &[u32], alpha: &[f32], alive: &[u32], out: &mut [u32]) {
+pub(super) fn tally(
+    offsets: &[u32],
+    alpha: &[f32],
+    alive: &[u32],
+    out: &mut [u32],
+    #[comptime] sampled: bool,
+) {
     let unit = UNIT_POS as usize;
+    let mut rays = 0u32;
     let mut hit_rays = 0u32;
     let mut head_rays = 0u32;
-    let mut rays = 0u32;
+    let mut background_rays = 0u32;
+    let mut last = 0u32;
     for r in range_stepped(unit, alpha.len(), UNITS as usize) {
         rays += alive[r];
-        hit_rays += select(offsets[r + 1] > offsets[r], 1u32, 0u32);
         head_rays += select(alpha[r] > 0.999f32, alive[r], 0u32);
+        background_rays += select(alpha[r] == 0.0f32, alive[r], 0u32);
+        if sampled && offsets[r + 1] > offsets[r] {
+            hit_rays += 1;
+            last = u32::cast_from(r) + 1;
+        }
     }
+    let mut lasts = Shared::<[u32]>::new_slice(UNITS as usize);
+    lasts[unit] = last;
+    let rays = group_sum::<u32>(rays, UNITS as usize);
     let hit_rays = group_sum::<u32>(hit_rays, UNITS as usize);
     let head_rays = group_sum::<u32>(head_rays, UNITS as usize);
-    let rays = group_sum::<u32>(rays, UNITS as usize);
+    let background_rays = group_sum::<u32>(background_rays, UNITS as usize);
     if unit == 0 {
-        out[0] = hit_rays;
-        out[1] = head_rays;
-        out[2] = rays;
+        for i in 1..UNITS as usize {
+            last = max(last, lasts[i]);
+        }
+        out[0] = rays;
+        out[HIT] = hit_rays;
+        out[HEAD] = head_rays;
+        out[BACKGROUND] = background_rays;
+        out[LAST] = last;
     }
 }
 
@@ -54,8 +85,9 @@ fn of_rays(
         let (opacity, a) = (composed[3 * rays + r], alpha[r]);
         let is_alive = f32::cast_from(alive[r]);
         let is_hit = select(offsets[r + 1] > offsets[r], 1.0f32, 0.0f32);
-        let share = is_hit / (3.0f32 * max(f32::cast_from(tally[0]), 1.0f32));
-        let head = select(a > 0.999f32, is_alive, 0.0f32) / (3.0f32 * max(f32::cast_from(tally[1]), 1.0f32));
+        let share = is_hit / (3.0f32 * max(f32::cast_from(tally[HIT]), 1.0f32));
+        let head =
+            select(a > 0.999f32, is_alive, 0.0f32) / (3.0f32 * max(f32::cast_from(tally[HEAD]), 1.0f32));
         let mut square = 0.0f32;
         let mut sample_error = composed[8 * rays + r];
         let mut g_opacity = 0.0f32;
@@ -69,7 +101,7 @@ fn of_rays(
             g_opacity += h * h * rgb_sample * head - b * g;
         }
         let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
-        let ray_share = is_alive / max(f32::cast_from(tally[2]), 1.0f32);
+        let ray_share = is_alive / max(f32::cast_from(tally[0]), 1.0f32);
         let cross = -(a * p.ln() + (1.0f32 - a) * (1.0f32 - p).ln()) * ray_share;
         let by_p = ((1.0f32 - a) / (1.0f32 - p) - a / p) * ray_share * mask;
         g_out[3 * rays + r] = g_opacity + select(p == opacity, by_p, 0.0f32);
@@ -169,7 +201,7 @@ impl Losses {
     pub fn new(device: &Device, weights: LossWeights, rays: usize, capacity: usize) -> Losses {
         Losses {
             weights,
-            tally: device.scratch::<u32>(3),
+            tally: device.scratch::<u32>(TALLY),
             g_out: device.scratch::<f32>(RAY_WIDTH * rays),
             ray_terms: device.scratch::<f32>(RAY_TERMS * rays),
             sample_terms: device.scratch::<f32>(SAMPLE_TERMS * capacity),
@@ -184,7 +216,7 @@ impl Losses {
         let Batch { color, alpha, background, alive, .. } = batch;
         let tally = &self.tally;
         let one = CubeCount::new_single();
-        launch!(device, tally::launch, one, UNITS; offsets, alpha, alive, tally);
+        launch!(device, tally::launch, one, UNITS; offsets, alpha, alive, tally; true);
         launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
             composed, color, alpha, background, alive, offsets, tally, self.g_out, self.ray_terms;
             w.rgb_mse, w.rgb_sample, w.mask

@@ -10,7 +10,7 @@ use burn::cubecl::{self, prelude::*};
 const UNITS: u32 = 256;
 
 /// A distance beyond any sample.
-const FAR: f32 = 1e30;
+pub(super) const FAR: f32 = 1e30;
 
 /// Returns bit `i` of a mask.
 #[cube]
@@ -26,24 +26,61 @@ fn cell(g: f32, top: i32) -> i32 {
 
 /// Interval of `t` in which a ray lies inside the box.
 #[derive(CubeType)]
-struct Span {
-    enter: f32,
-    leave: f32,
+pub(super) struct Span {
+    pub enter: f32,
+    pub leave: f32,
+}
+
+/// Intersects an interval with the one between `p` and `q`.
+#[cube]
+pub(super) fn narrowed(span: Span, p: f32, q: f32) -> Span {
+    Span { enter: max(span.enter, min(p, q)), leave: min(span.leave, max(p, q)) }
 }
 
 /// Intersects the interval with the extent of the box along one axis.
 #[cube]
 fn clipped(span: Span, o: f32, d: f32, radius: f32) -> Span {
-    let mut enter = span.enter;
-    let mut leave = span.leave;
-    if d == 0.0f32 {
-        leave = select(o.abs() > radius, -1.0f32, leave);
-    } else {
-        let (p, q) = ((-radius - o) / d, (radius - o) / d);
-        enter = max(enter, min(p, q));
-        leave = min(leave, max(p, q));
+    // all of a line beside the axis lies inside, or nothing
+    let beside = select(o.abs() > radius, -1.0f32, FAR);
+    let low = select(d == 0.0f32, 0.0f32, (-radius - o) / d);
+    let high = select(d == 0.0f32, beside, (radius - o) / d);
+    narrowed(span, low, high)
+}
+
+/// Returns the first of `values[first..end]` that exceeds `v`, of values that do not fall; only every `stride`-th counts,
+/// and indices count those.
+#[cube]
+pub(super) fn upper_bound(
+    values: &[u32],
+    first: usize,
+    end: usize,
+    v: u32,
+    #[comptime] stride: usize,
+) -> usize {
+    let mut low = first;
+    let mut high = end;
+    while low < high {
+        let middle = (low + high) / 2;
+        if values[middle * stride] <= v {
+            low = middle + 1;
+        } else {
+            high = middle;
+        }
     }
-    Span { enter, leave }
+    low
+}
+
+/// Returns the bit of the words `first..first + words` of a mask that has so many set bits before it; `before` holds the
+/// count before each word.
+#[cube]
+pub(super) fn ranked(before: &[u32], mask: &[u32], first: usize, words: usize, rank: u32) -> u32 {
+    let word = upper_bound(before, first, first + words, rank, 1usize) - 1;
+    let mut bits = mask[word];
+    for _ in before[word]..rank {
+        // clears the lowest bit
+        bits &= bits - 1;
+    }
+    32 * u32::cast_from(word - first) + bits.trailing_zeros()
 }
 
 /// Returns the distance along the ray to the border of a cell along one axis, in units of cells.

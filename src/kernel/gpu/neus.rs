@@ -30,7 +30,7 @@ struct Sample {
 }
 
 #[cube]
-fn sigmoid(v: f32) -> f32 {
+pub(super) fn sigmoid(v: f32) -> f32 {
     1.0f32 / (1.0f32 + (-v).exp())
 }
 

@@ -6,7 +6,7 @@
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::march::Samples;
-use super::rng::{below, stream};
+use super::rng::{Wide, below, stream};
 use crate::kernel::cpu::losses::{LossWeights, STEREO_STREAM};
 use crate::kernel::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
@@ -27,8 +27,7 @@ fn append(
     view_dir: &mut [f32],
     available: u32,
     per_step: u32,
-    high: u32,
-    low: u32,
+    stream: Wide,
 ) {
     let i = ABSOLUTE_POS;
     let plane = x.len() / 3;
@@ -36,7 +35,7 @@ fn append(
     // a step without samples gets no points either
     let points = select(first > 0, per_step, 0u32);
     if i < points as usize {
-        let which = below(high, low, u32::cast_from(i), available);
+        let which = below(&stream, u32::cast_from(i), available);
         drawn[i] = which;
         let s = first as usize + i;
         #[unroll]
@@ -130,10 +129,10 @@ impl SurfacePoints {
     /// Draws points by seed and step, writes them after the step's samples, and returns the number of samples and points,
     /// `[1]`.
     pub fn append(&self, device: &Device, (seed, step): (u64, u64), samples: &Samples) -> &Buffer {
-        let [high, low] = stream(seed, step << 4 | STEREO_STREAM);
+        let stream = stream(seed, step << 4 | STEREO_STREAM);
         launch!(device, append::launch, groups(self.max_per_step().div_ceil(UNITS as usize)), UNITS;
             self.rows, samples.count, self.total, self.drawn, samples.x, samples.direction;
-            self.count as u32, if self.count > 0 { self.max_per_step() as u32 } else { 0 }, high, low
+            self.count as u32, if self.count > 0 { self.max_per_step() as u32 } else { 0 }, stream
         );
         &self.total
     }

@@ -5,7 +5,7 @@ use crate::kernel::cpu::rng;
 use burn::cubecl::{self, prelude::*};
 
 /// A word of 64 bits.
-#[derive(CubeType, Clone, Copy)]
+#[derive(CubeType, CubeLaunch, Clone, Copy)]
 pub(super) struct Wide {
     pub high: u32,
     pub low: u32,
@@ -28,11 +28,11 @@ fn xor_shifted(a: Wide, #[comptime] bits: u32) -> Wide {
 
 /// Returns 64 random bits for number `index` of a stream, whose key [`stream`] returns.
 #[cube]
-pub(super) fn bits(high: u32, low: u32, index: u32) -> Wide {
+pub(super) fn bits(stream: &Wide, index: u32) -> Wide {
     let step = times(Wide { high: 0u32, low: index }, 0x9e37_79b9u32, 0x7f4a_7c15u32);
-    let sum = low + step.low;
-    let carry = select(sum < low, 1u32, 0u32);
-    mix(Wide { high: high + step.high + carry, low: sum })
+    let sum = stream.low + step.low;
+    let carry = select(sum < stream.low, 1u32, 0u32);
+    mix(Wide { high: stream.high + step.high + carry, low: sum })
 }
 
 /// Returns SplitMix64's finalizer of a word.
@@ -45,7 +45,7 @@ fn mix(z: Wide) -> Wide {
 
 /// Returns number `i` of the permutation of `0..n`, n > 0, of [`rng::Permutation`].
 #[cube]
-pub(super) fn permuted(key: Wide, half_bits: u32, i: u32, n: u32) -> u32 {
+pub(super) fn permuted(key: &Wide, half_bits: u32, i: u32, n: u32) -> u32 {
     let lower = (1u32 << half_bits) - 1;
     let mut x = i;
     let mut inside = false;
@@ -55,7 +55,7 @@ pub(super) fn permuted(key: Wide, half_bits: u32, i: u32, n: u32) -> u32 {
         #[unroll]
         for round in 0..4u32 {
             let stream = mix(Wide { high: key.high, low: key.low ^ round });
-            let mixed = bits(stream.high, stream.low, right).low & lower;
+            let mixed = bits(&stream, right).low & lower;
             let next = left ^ mixed;
             left = right;
             right = next;
@@ -68,23 +68,27 @@ pub(super) fn permuted(key: Wide, half_bits: u32, i: u32, n: u32) -> u32 {
 
 /// Returns a uniform number in [0, 1).
 #[cube]
-pub(super) fn uniform(high: u32, low: u32, index: u32) -> f32 {
-    f32::cast_from(bits(high, low, index).high >> 8) / 16_777_216.0f32
+pub(super) fn uniform(stream: &Wide, index: u32) -> f32 {
+    f32::cast_from(bits(stream, index).high >> 8) / 16_777_216.0f32
 }
 
 /// Returns a uniform integer in `0..n`, n > 0.
 #[cube]
-pub(super) fn below(high: u32, low: u32, index: u32, n: u32) -> u32 {
-    let drawn = bits(high, low, index);
+pub(super) fn below(stream: &Wide, index: u32, n: u32) -> u32 {
+    let drawn = bits(stream, index);
     let middle = drawn.high * n;
     let sum = middle + u32::mul_hi(drawn.low, n);
     u32::mul_hi(drawn.high, n) + select(sum < middle, 1u32, 0u32)
 }
 
-/// Returns the key of a stream, which all of its numbers share: high and low word.
-pub(super) fn stream(seed: u64, stream: u64) -> [u32; 2] {
-    let mixed = rng::stream_key(seed, stream);
-    [(mixed >> 32) as u32, mixed as u32]
+/// Returns the key of a stream, which all of its numbers share.
+pub(super) fn stream(seed: u64, stream: u64) -> WideLaunch {
+    word(rng::stream_key(seed, stream))
+}
+
+/// Returns a word as an argument of a launch.
+pub(super) fn word(bits: u64) -> WideLaunch {
+    WideLaunch::new((bits >> 32) as u32, bits as u32)
 }
 
 #[cfg(test)]
@@ -94,16 +98,16 @@ mod tests {
     use super::*;
 
     #[cube(launch)]
-    fn draws(out: &mut [u32], high: u32, low: u32, n: u32) {
+    fn draws(out: &mut [u32], stream: Wide, n: u32) {
         let i = ABSOLUTE_POS;
         let count = out.len() / 4;
         if i < count {
             let index = u32::cast_from(i) * 7_919;
-            let random = bits(high, low, index);
+            let random = bits(&stream, index);
             out[i] = random.high;
             out[count + i] = random.low;
-            out[2 * count + i] = below(high, low, index, n);
-            out[3 * count + i] = u32::reinterpret(uniform(high, low, index));
+            out[2 * count + i] = below(&stream, index, n);
+            out[3 * count + i] = u32::reinterpret(uniform(&stream, index));
         }
     }
 
@@ -113,8 +117,7 @@ mod tests {
         const COUNT: usize = 1 << 12;
         for (seed, of, n) in [(0, 0, 1), (42, 1 << 40 | 3, 289_123_456), (u64::MAX, u64::MAX, u32::MAX)] {
             let out = device.scratch::<u32>(4 * COUNT);
-            let [high, low] = stream(seed, of);
-            launch!(device, draws::launch, groups(COUNT / 256), 256; out; high, low, n);
+            launch!(device, draws::launch, groups(COUNT / 256), 256; out; stream(seed, of), n);
             let out = device.read::<u32>(&out);
             for i in 0..COUNT {
                 let index = 7_919 * i as u64;

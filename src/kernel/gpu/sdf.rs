@@ -9,18 +9,23 @@
 
 pub(super) mod kernels;
 
+use super::color::{ColorPlan, color_backward};
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::hash::Grid;
 use super::tile::{CHANNELS, UNITS};
 use crate::kernel::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
 use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
-use kernels::{color_backward, forward, geometry_backward, prepare, reduce};
+use kernels::{forward, geometry_backward, prepare, reduce};
 
-/// Maximum number of groups that sum gradients of weights, each over its own tiles.
-pub(super) const SUMMING: usize = 256;
+/// Maximum number of groups that sum gradients of weights, each over its own tiles. wgpu states no number of
+/// multiprocessors; the largest cards run about a thousand groups of 256 threads with 32 KiB of workgroup memory at once.
+/// More groups than tiles are never launched.
+const SUMMING: usize = 1024;
 
-/// First channel of the normal among the inputs of the color network.
-const NORMAL: usize = OUTPUTS + 16;
+/// Returns the number of groups that sum gradients of up to `capacity` samples.
+pub(super) fn summing(capacity: usize) -> usize {
+    SUMMING.min(capacity / TILE)
+}
 
 /// Offsets of the matrices of a field, in rows of 64 floats. Weights are stored in the orders in which they are read,
 /// gradients row-major like on the CPU. Geometry columns are `[hash, x]`.
@@ -30,10 +35,8 @@ struct Plan {
     features: usize,
     /// Number of inputs of the geometry network, padded.
     padded: usize,
-    /// Number of inputs of the color network, padded.
-    color: usize,
-    /// Whether the color network also reads the hash features.
-    skip: bool,
+    /// The color network, which may read the hash features as well.
+    color: ColorPlan,
 }
 
 impl Plan {
@@ -43,55 +46,87 @@ impl Plan {
     }
 
     fn new(layout: Layout) -> Plan {
-        let (padded, color) = (layout.padded(), layout.color_padded());
         assert!(Plan::fits(layout), "the field has more levels than a tile can hold");
-        Plan { features: layout.inputs - 3, padded, color, skip: layout.color_skip }
+        let (features, padded) = (layout.inputs - 3, layout.padded());
+        let color = ColorPlan {
+            outputs: OUTPUTS,
+            signed: true,
+            features: if layout.color_skip { features } else { 0 },
+            inputs: layout.color_padded(),
+            weights: 0,
+            gradients: [0; 2],
+            colors: 4,
+        };
+        let mut plan = Plan { features, padded, color };
+        plan.color.weights = plan.rows()[5];
+        plan.color.gradients[0] = plan.gradients()[4];
+        plan.color.gradients[1] = plan.color.gradient_rows()[3];
+        plan
     }
 
-    /// Returns the first rows of W1ᵀ, W1, b1, W2, b2 (each value four times), C1ᵀ, C1, C2ᵀ, C2, C3, and the end.
-    fn rows(&self) -> [usize; 11] {
-        let counts = [self.padded, HIDDEN, 1, OUTPUTS, 1, self.color, HIDDEN, HIDDEN, HIDDEN, 3];
-        ends(counts)
+    /// Returns the first rows of W1ᵀ, W1, b1, W2, b2 (each value four times), and the end.
+    fn rows(&self) -> [usize; 6] {
+        ends([self.padded, HIDDEN, 1, OUTPUTS, 1])
     }
 
-    /// Returns the first rows of the gradients of W1, b1, W2, b2, C1, C2, C3, and the end.
-    fn gradients(&self) -> [usize; 8] {
-        ends([HIDDEN, 1, OUTPUTS, 1, HIDDEN, HIDDEN, 3])
+    /// Returns the first rows of the gradients of W1, b1, W2, b2, and the end.
+    fn gradients(&self) -> [usize; 5] {
+        ends([HIDDEN, 1, OUTPUTS, 1])
     }
 
-    /// Returns two index maps: for each float of the prepared weights its index in the flat vector, or `u32::MAX` for
-    /// padding; and for each float of the flat vector its index in the gradients.
+    /// Returns the maps of the weights and of their gradients; see [`maps`].
     fn maps(&self, layout: Layout) -> (Vec<u32>, Vec<u32>) {
-        let (rows, gradients) = (self.rows(), self.gradients());
-        let mut prepared = vec![u32::MAX; rows[10] * CHANNELS];
-        let mut summed = vec![u32::MAX; layout.len()];
-        let mut flat = 0;
-        for (part, (outputs, inputs)) in layout.shapes().into_iter().enumerate() {
-            for (o, i) in (0..outputs).flat_map(|o| (0..inputs).map(move |i| (o, i))) {
-                // the kernels read [hash, x], but the flat weights are ordered [x, hash]
-                let c = if part == 0 { (i + inputs - 3) % inputs } else { i };
-                let float = |row: usize, column: usize| row * CHANNELS + column;
-                let [original, transposed] = match part {
-                    0 => [Some(float(rows[1] + o, c)), Some(float(rows[0] + c, o))],
-                    1 => [Some(float(rows[2], o)), None],
-                    2 => [Some(float(rows[3] + o, c)), None],
-                    3 => [None, None],
-                    4 => [Some(float(rows[6] + o, c)), Some(float(rows[5] + c, o))],
-                    5 => [Some(float(rows[8] + o, c)), Some(float(rows[7] + c, o))],
-                    _ => [Some(float(rows[9] + o, c)), None],
-                };
-                original.into_iter().chain(transposed).for_each(|at| prepared[at] = flat);
-                if part == 3 {
-                    (0..4).for_each(|k| prepared[float(rows[4], 4 * o + k)] = flat);
-                }
-                let biases = [1, 3].contains(&part);
-                let row = gradients[part] + if biases { 0 } else { o };
-                summed[flat as usize] = float(row, if biases { o } else { c }) as u32;
-                flat += 1;
-            }
-        }
+        let ([w1t, w1, b1, w2, b2, _], [g_w1, g_b1, g_w2, g_b2, _]) = (self.rows(), self.gradients());
+        let (c, g_c) = (self.color.rows(), self.color.gradient_rows());
+        let places = [
+            (Some(w1), Some(w1t), g_w1),
+            (None, Some(b1), g_b1),
+            (Some(w2), None, g_w2),
+            (None, None, g_b2),
+            (Some(c[1]), Some(c[0]), g_c[0]),
+            (Some(c[3]), Some(c[2]), g_c[1]),
+            (Some(c[4]), None, g_c[2]),
+        ];
+        // the kernels read [hash, x], but the flat weights are ordered [x, hash]
+        let column = |part: usize, i: usize| match part {
+            0 => (i + layout.inputs - 3) % layout.inputs,
+            _ => i,
+        };
+        let shapes = layout.shapes();
+        let (mut prepared, summed) = maps(&shapes, &places, c[5], column);
+        let first: usize = shapes[..3].iter().map(|(outputs, inputs)| outputs * inputs).sum();
+        (0..4 * OUTPUTS).for_each(|i| prepared[b2 * CHANNELS + i] = (first + i / 4) as u32);
         (prepared, summed)
     }
+}
+
+/// Returns two index maps: for each float of the prepared weights, `rows` of 64, its index in the flat vector, or
+/// `u32::MAX` for padding; and for each float of the flat vector its index in the gradients.
+///
+/// The flat vector has matrices of these `shapes`, `(outputs, inputs)`; one with a single input is a bias, which is one
+/// row elsewhere. `places` are the first rows of a matrix as it is, of its transpose, and of its gradient. `column` returns
+/// the column of an input of a matrix.
+pub(super) fn maps(
+    shapes: &[(usize, usize)],
+    places: &[(Option<usize>, Option<usize>, usize)],
+    rows: usize,
+    column: impl Fn(usize, usize) -> usize,
+) -> (Vec<u32>, Vec<u32>) {
+    let (mut prepared, mut summed) = (vec![u32::MAX; rows * CHANNELS], Vec::new());
+    let float = |first: usize, row: usize, column: usize| (first + row) * CHANNELS + column;
+    for (part, (&(outputs, inputs), &(original, transposed, gradient))) in
+        shapes.iter().zip(places).enumerate()
+    {
+        for (o, i) in (0..outputs).flat_map(|o| (0..inputs).map(move |i| (o, i))) {
+            let c = column(part, i);
+            let original = original.map(|first| float(first, o, c));
+            let transposed = transposed.map(|first| float(first, c, o));
+            original.into_iter().chain(transposed).for_each(|at| prepared[at] = summed.len() as u32);
+            let (row, column) = if inputs == 1 { (0, o) } else { (o, c) };
+            summed.push(float(gradient, row, column) as u32);
+        }
+    }
+    (prepared, summed)
 }
 
 /// Returns running sums of `counts`, from 0.
@@ -157,7 +192,7 @@ impl Sdf {
             g_o: planes(OUTPUTS),
             g_value: planes(plan.features),
             g_normal: planes(3),
-            partial: device.scratch::<f32>(SUMMING * plan.gradients()[7] * CHANNELS),
+            partial: device.scratch::<f32>(summing(capacity) * plan.color.gradients[1] * CHANNELS),
         }
     }
 
@@ -167,9 +202,9 @@ impl Sdf {
         [6 * features + 3 * HIDDEN + 2 * OUTPUTS + WIDTH + 3, HIDDEN.max(3 * features)]
     }
 
-    /// Returns the memory of the groups' partial gradient sums in words, which does not depend on the number of samples.
-    pub fn words_of_sums(shape: &FieldShape) -> usize {
-        SUMMING * Plan::new(shape.layout()).gradients()[7] * CHANNELS
+    /// Returns the memory of the groups' partial gradient sums in words, for up to `capacity` samples.
+    pub fn words_of_sums(shape: &FieldShape, capacity: usize) -> usize {
+        summing(capacity) * Plan::new(shape.layout()).color.gradients[1] * CHANNELS
     }
 
     /// Returns the output of the last forward pass, planes `[8, capacity]`.
@@ -249,13 +284,13 @@ impl Sdf {
     ) {
         assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
         assert!(g_out.words() == WIDTH * self.capacity);
-        let summing_groups = groups(SUMMING.min(self.capacity / TILE));
+        let summing_groups = groups(summing(self.capacity));
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
             launch!(device, color_backward::launch_unchecked, summing_groups.clone(), UNITS;
                 self.weights, self.value, direction, count, self.o, self.c1, self.c2, self.out, g_out,
                 self.g_o, self.g_normal, self.g_value, self.partial;
-                self.soften, self.plan
+                self.soften, self.plan.color
             );
             launch!(device, geometry_backward::launch_unchecked, summing_groups, UNITS;
                 self.weights, self.value, self.jacobian, x, count, self.h, self.g_o, self.g_normal,
@@ -265,7 +300,7 @@ impl Sdf {
         }
         launch!(device, reduce::launch, groups(g_flat.words().div_ceil(UNITS as usize)), UNITS;
             self.partial, self.summed_map, count, g_flat;
-            (self.plan.gradients()[7] * CHANNELS) as u32, SUMMING.min(self.capacity / TILE)
+            (self.plan.color.gradients[1] * CHANNELS) as u32, TILE, summing(self.capacity), true
         );
         let slopes = Some([&self.q, &self.g_normal]);
         self.grid.scatter(device, g_table, x, count, &self.g_value, slopes);

@@ -51,6 +51,24 @@ pub fn uniform_count(count: &[u32], tile: &mut [F4]) -> usize {
     n as usize
 }
 
+/// A thread's place in a tile of 64 samples, and its vector of samples in planes.
+#[derive(CubeType, Clone, Copy)]
+pub struct Lane {
+    pub row: usize,
+    pub column: usize,
+    /// Number of vectors of a plane.
+    pub plane: usize,
+    /// Index of the thread's vector in a plane.
+    pub here: usize,
+}
+
+/// Returns the calling thread's place in tile number `tile`.
+#[cube]
+pub fn lane_of(tile: usize, plane: usize) -> Lane {
+    let (row, column) = (UNIT_POS as usize / 16, UNIT_POS as usize % 16);
+    Lane { row, column, plane, here: tile * LANES + row }
+}
+
 /// Four channels of a thread's vector of samples.
 #[derive(CubeType, Clone, Copy)]
 pub struct Block {
@@ -170,29 +188,22 @@ pub fn load_block(a: &[F4], row: usize, column: usize, #[comptime] lanes: usize)
 
 /// Writes the channels below `end` of a thread's block to planes.
 #[cube]
-pub fn store_planes(
-    to: &mut [F4],
-    block: &Block,
-    plane: usize,
-    here: usize,
-    column: usize,
-    #[comptime] end: usize,
-) {
+pub fn store_planes(to: &mut [F4], block: &Block, lane: &Lane, #[comptime] end: usize) {
     #[unroll]
     for j in 0..4usize {
-        let c = 4 * column + j;
+        let c = 4 * lane.column + j;
         if c < end {
-            to[c * plane + here] = block.channel(j);
+            to[c * lane.plane + lane.here] = block.channel(j);
         }
     }
 }
 
 /// Fills a tile from 64 planes.
 #[cube]
-pub fn load_planes(a: &mut [F4], from: &[F4], plane: usize, here: usize, row: usize, column: usize) {
+pub fn load_planes(a: &mut [F4], from: &[F4], lane: &Lane) {
     for j in 0..4usize {
-        let c = column + 16 * j;
-        a[at(c, row, LANES)] = from[c * plane + here];
+        let c = lane.column + 16 * j;
+        a[at(c, lane.row, LANES)] = from[c * lane.plane + lane.here];
     }
 }
 
@@ -275,7 +286,7 @@ pub fn sample_sums(
 
 /// Adds `v` to a gradient, or overwrites it if `fresh` is set.
 #[cube]
-fn add(gradient: &mut [f32], i: usize, v: f32, fresh: bool) {
+pub fn add(gradient: &mut [f32], i: usize, v: f32, fresh: bool) {
     gradient[i] = if fresh { v } else { gradient[i] + v };
 }
 

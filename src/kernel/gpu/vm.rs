@@ -61,15 +61,16 @@ impl Vm {
         Vm::with_room(device, field, rays, if learns { usize::MAX } else { SEEN }, learns)
     }
 
-    /// Bytes that a field takes that learns: with values, moments and gradients, and for each ray of a batch. Rays have
-    /// room for all samples that they can have.
-    pub fn bytes(device: &Device, field: &VmField) -> [u64; 2] {
-        let floats = |grid: Grid| DeviceGrid::padded(grid).len() as u64;
+    /// Returns the bytes of a field that learns from batches of so many rays: with values, moments and gradients, and for
+    /// each ray of a batch. Rays have room for all samples that they can have.
+    pub fn bytes(device: &Device, field: &VmField, rays: usize) -> [u64; 2] {
+        let floats = |grid: Grid| DeviceGrid::padded(grid).len();
         let copies = if device.atomics() == Atomics::Fixed { 5 } else { 4 };
         let grids = copies * (floats(field.density) + floats(field.color));
-        let products = DeviceGrid::padded(field.color).channels() * DeviceDecoder::CHUNK;
-        let samples = DeviceLattice::most(field) * (VmSamples::WORDS + Along::WORDS);
-        [4 * (grids + products as u64), 4 * (samples + Along::OF_RAY) as u64]
+        let (most, quads) = (DeviceLattice::most(field), DeviceGrid::quads_of(field.color));
+        let gradients = DeviceDecoder::words_of_gradients(&field.decoder, quads, rays * most);
+        let samples = most * (VmSamples::WORDS + Along::WORDS);
+        [4 * (grids + gradients) as u64, 4 * (samples + Along::OF_RAY) as u64]
     }
 
     /// Bytes of the largest buffer for each ray of a batch.

@@ -1,8 +1,8 @@
 //! nerfacc's rule: a decaying maximum of the opacity of each cell, updated at randomly drawn cells.
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::march::prefix_sum;
-use super::super::rng;
+use super::super::march::{prefix_sum, ranked};
+use super::super::rng::{self, Wide};
 use super::super::sum::group_sum;
 use super::{Occupancy, UNITS};
 use crate::Result;
@@ -18,28 +18,6 @@ fn tally(mask: &[u32], counts: &mut [u32]) {
     }
 }
 
-/// Returns occupied cell number `rank`; `before` is the number of occupied cells before each word of the mask.
-#[cube]
-fn of_rank(mask: &[u32], before: &[u32], rank: u32) -> u32 {
-    // the last word with no more than `rank` before it
-    let mut low = 0u32;
-    let mut high = u32::cast_from(mask.len());
-    while high - low > 1 {
-        let middle = (low + high) / 2;
-        if before[middle as usize] <= rank {
-            low = middle;
-        } else {
-            high = middle;
-        }
-    }
-    let mut left = mask[low as usize];
-    for _ in before[low as usize]..rank {
-        // clears the lowest bit
-        left &= left - 1;
-    }
-    low * 32 + left.trailing_zeros()
-}
-
 /// Returns the cell of draw `k`, or `u32::MAX` if there is no such draw: see [`update_nerfacc`](crate::kernel::cpu::occupancy::update_nerfacc).
 #[cube]
 fn drawn_cell(
@@ -47,8 +25,8 @@ fn drawn_cell(
     before: &[u32],
     k: u32,
     cells: u32,
-    any_stream: &Draws,
-    occupied_stream: &Draws,
+    any_stream: &Wide,
+    occupied_stream: &Wide,
     #[comptime] warmup: bool,
 ) -> u32 {
     let mut cell = k;
@@ -56,27 +34,17 @@ fn drawn_cell(
         let quarter = cells / 4;
         let kept = before[mask.len()];
         if k < quarter {
-            cell = rng::below(any_stream.high, any_stream.low, k, cells);
+            cell = rng::below(any_stream, k, cells);
         } else if kept > quarter {
-            cell = of_rank(
-                mask,
-                before,
-                rng::below(occupied_stream.high, occupied_stream.low, k - quarter, kept),
-            );
+            let rank = rng::below(occupied_stream, k - quarter, kept);
+            cell = ranked(before, mask, 0usize, mask.len(), rank);
         } else if k - quarter < kept {
-            cell = of_rank(mask, before, k - quarter);
+            cell = ranked(before, mask, 0usize, mask.len(), k - quarter);
         } else {
             cell = u32::MAX;
         }
     }
     cell
-}
-
-/// Key of a random stream, as two words.
-#[derive(CubeType, CubeLaunch, Clone, Copy)]
-struct Draws {
-    high: u32,
-    low: u32,
 }
 
 /// Writes the number of the last draw of each cell, counted from 1, so that only one draw updates a cell.
@@ -86,8 +54,8 @@ fn find_last_draws(
     before: &[u32],
     last: &[Atomic<u32>],
     cells: u32,
-    any_stream: Draws,
-    occupied_stream: Draws,
+    any_stream: Wide,
+    occupied_stream: Wide,
 ) {
     let k = u32::cast_from(ABSOLUTE_POS);
     if k < cells / 4 * 2 {
@@ -110,9 +78,9 @@ fn sample_points(
     batch: u32,
     resolution: u32,
     radius: f32,
-    any_stream: Draws,
-    occupied_stream: Draws,
-    jitter_stream: Draws,
+    any_stream: Wide,
+    occupied_stream: Wide,
+    jitter_stream: Wide,
     #[comptime] warmup: bool,
 ) {
     let s = ABSOLUTE_POS;
@@ -126,9 +94,9 @@ fn sample_points(
         let i = select(cell < cells, cell, 0u32);
         let width = 2.0f32 * radius / f32::cast_from(resolution);
         let (a, b, c) = (i / (resolution * resolution), i / resolution % resolution, i % resolution);
-        let u = rng::uniform(jitter_stream.high, jitter_stream.low, 3 * k);
-        let v = rng::uniform(jitter_stream.high, jitter_stream.low, 3 * k + 1);
-        let w = rng::uniform(jitter_stream.high, jitter_stream.low, 3 * k + 2);
+        let u = rng::uniform(&jitter_stream, 3 * k);
+        let v = rng::uniform(&jitter_stream, 3 * k + 1);
+        let w = rng::uniform(&jitter_stream, 3 * k + 2);
         x[s] = (f32::cast_from(a) + u) * width - radius;
         x[plane + s] = (f32::cast_from(b) + v) * width - radius;
         x[2 * plane + s] = (f32::cast_from(c) + w) * width - radius;
@@ -278,10 +246,7 @@ impl Nerfacc {
         let warmup = n < WARMUP_STEPS;
         let [any_stream, occupied_stream, jitter_stream] = STREAMS;
         let groups_for = |count: usize| groups(count.div_ceil(UNITS as usize));
-        let draws = |purpose: u64| {
-            let [high, low] = rng::stream(seed, n << 4 | purpose);
-            DrawsLaunch::new(high, low)
-        };
+        let draws = |purpose: u64| rng::stream(seed, n << 4 | purpose);
         let draw_count = if warmup { cells } else { cells / 4 * 2 };
         if !warmup {
             let mask = &occupancy.mask;

@@ -14,15 +14,17 @@ mod kernels;
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
+use super::super::sdf::kernels::reduce;
 use super::super::tile::{self, UNITS};
 use super::grid::{DeviceGrid, NONE};
 use super::march::VmSamples;
 use super::rays::Along;
 use crate::kernel::cpu::vm::DecoderShape;
-use kernels::{backward, chain, forward, prepare, reduce};
+use kernels::{backward, chain, forward, prepare};
 
-/// Maximum number of groups that sum gradients of weights, each over its own tiles.
-const GROUPS: usize = 256;
+/// Maximum number of groups that sum gradients of weights, each over its own tiles: four for each multiprocessor of the
+/// largest cards, since the sums of a group take 200 kB where hidden layers have 128 channels.
+const GROUPS: usize = 512;
 
 /// Sizes and offsets of the matrices of a decoder, in rows with as many floats as a tile has channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -37,6 +39,12 @@ struct Plan {
 }
 
 impl Plan {
+    fn new(shape: &DecoderShape, quads: [usize; 3]) -> Plan {
+        let lanes = if shape.hidden > tile::channels(16) { 8 } else { 16 };
+        let (channels, features, hidden) = (shape.channels, shape.features, shape.hidden);
+        Plan { quads, channels, features, hidden, lanes }
+    }
+
     /// Returns the number of vectors of products.
     fn products(&self) -> usize {
         self.quads.iter().sum()
@@ -120,6 +128,13 @@ impl DeviceDecoder {
         if shape.hidden > 128 { Err("hidden layers wider than 128") } else { Ok(()) }
     }
 
+    /// Returns the memory of the gradients of products and weights in words, for up to `capacity` samples.
+    pub fn words_of_gradients(shape: &DecoderShape, quads: [usize; 3], capacity: usize) -> usize {
+        let plan = Plan::new(shape, quads);
+        let products = capacity.min(Self::CHUNK) * 4 * plan.products();
+        products + (GROUPS + 1) * plan.gradients()[6] * plan.width()
+    }
+
     /// Creates a decoder of the products of a grid, for up to `capacity` samples; buffers for gradients are allocated only if
     /// `learns` is set.
     pub fn new(
@@ -130,9 +145,7 @@ impl DeviceDecoder {
         learns: bool,
     ) -> DeviceDecoder {
         assert_eq!(DeviceDecoder::supports(shape), Ok(()));
-        let lanes = if shape.hidden > tile::channels(16) { 8 } else { 16 };
-        let (features, hidden, quads) = (shape.features, shape.hidden, grid.quads());
-        let plan = Plan { quads, channels: shape.channels, features, hidden, lanes };
+        let plan = Plan::new(shape, grid.quads());
         let real = grid.channels();
         let mut padded = vec![0u32; shape.channels];
         for (c, &cpu_channel) in real.iter().enumerate().filter(|(_, real)| **real != NONE) {
@@ -216,7 +229,8 @@ impl DeviceDecoder {
             grid.scatter(device, g_values, values, place, part, count, &self.g_products);
         }
         launch!(device, reduce::launch, groups(self.summed.words().div_ceil(UNITS as usize)), UNITS;
-            self.partial, along.count, self.summed; 4 * self.plan.lanes as u32, self.summing() as u32
+            self.partial, self.real, along.count, self.summed;
+            self.summed.words() as u32, 4 * self.plan.lanes, self.summing(), false
         );
         launch!(device, chain::launch, groups(flat.words().div_ceil(UNITS as usize)), UNITS;
             flat, self.real, self.padded, self.summed, g_flat, broken; self.plan

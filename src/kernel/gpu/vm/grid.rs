@@ -360,7 +360,12 @@ impl DeviceGrid {
 
     /// Returns the number of vectors of each term.
     pub(super) fn quads(&self) -> [usize; 3] {
-        self.padded.rank.map(|r| r / 4)
+        DeviceGrid::quads_of(self.grid)
+    }
+
+    /// Returns the number of vectors of each term of a grid.
+    pub(super) fn quads_of(grid: Grid) -> [usize; 3] {
+        grid.rank.map(|r| r.div_ceil(4))
     }
 
     /// Returns the sizes and offsets that kernels need for interpolation.

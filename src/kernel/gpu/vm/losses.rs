@@ -2,6 +2,7 @@
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
+use super::super::losses::{BACKGROUND, TALLY, tally};
 use super::super::sum::group_sum;
 use super::Vm;
 use crate::Result;
@@ -13,24 +14,6 @@ const UNITS: u32 = 256;
 
 /// Number of words of the results of steps: loss terms, lattice points, evaluated samples, decoded samples, rays, broken.
 const TOTALS: usize = TERMS + 5;
-
-/// Counts the rays, and those of them whose pixel is background. Runs as one group of threads.
-#[cube(launch)]
-fn tally(alpha: &[f32], alive: &[u32], out: &mut [u32]) {
-    let unit = UNIT_POS as usize;
-    let mut rays = 0u32;
-    let mut background_rays = 0u32;
-    for r in range_stepped(unit, alpha.len(), UNITS as usize) {
-        rays += alive[r];
-        background_rays += select(alpha[r] == 0.0f32, alive[r], 0u32);
-    }
-    let rays = group_sum::<u32>(rays, UNITS as usize);
-    let background_rays = group_sum::<u32>(background_rays, UNITS as usize);
-    if unit == 0 {
-        out[0] = rays;
-        out[1] = background_rays;
-    }
-}
 
 /// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
 /// `[5, rays]`.
@@ -69,7 +52,8 @@ fn of_rays(
             g_out[c * rays + r] = g;
             g_opacity -= g * (b + lift);
         }
-        let background_share = select(a == 0.0f32, is_alive, 0.0f32) / max(f32::cast_from(tally[1]), 1.0f32);
+        let background_share =
+            select(a == 0.0f32, is_alive, 0.0f32) / max(f32::cast_from(tally[BACKGROUND]), 1.0f32);
         let empty = opacity * opacity * background_share;
         let mut mask = 0.0f32;
         if l2 {
@@ -143,7 +127,7 @@ impl VmLosses {
     pub fn new(device: &Device, rays: usize, term: MaskTerm) -> VmLosses {
         VmLosses {
             term,
-            tally: device.scratch::<u32>(2),
+            tally: device.scratch::<u32>(TALLY),
             g_out: device.scratch::<f32>(RAY_WIDTH * rays),
             terms: device.scratch::<f32>(TERMS * rays),
             totals: device.zeros::<u32>(TOTALS),
@@ -166,7 +150,7 @@ impl VmLosses {
         };
         let Batch { color, alpha, background, alive, .. } = batch;
         let one = CubeCount::new_single();
-        launch!(device, tally::launch, one, UNITS; alpha, alive, self.tally);
+        launch!(device, tally::launch, one, UNITS; alive, alpha, alive, self.tally; false);
         launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
             composed, color, alpha, background, alive, self.tally, self.g_out, self.terms;
             mode.lift, f32::from(mode.target), weight, l2, ce
@@ -179,7 +163,7 @@ impl VmLosses {
         &self.g_out
     }
 
-    /// Returns the number of rays of the last batch, and of those whose pixel is background, `[2]`.
+    /// Returns the number of rays of the last batch, in the first word.
     pub fn rays(&self) -> &Buffer {
         &self.tally
     }

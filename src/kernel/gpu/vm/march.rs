@@ -3,16 +3,13 @@
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
-use super::super::march::{bit, prefix_sum};
+use super::super::march::{FAR, Span, bit, narrowed, prefix_sum};
 use super::super::occupancy::words;
 use crate::kernel::cpu::vm::VmField;
 use crate::kernel::cpu::vm::mask::BLOCK;
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
-
-/// A distance beyond any sample.
-const FAR: f32 = 1e30;
 
 /// Offsets in the floats of a lattice: box (6), step, near, far; corner of the mask (3), its cells per unit of length (3).
 const STEP: usize = 6;
@@ -24,20 +21,12 @@ const VERTICES: usize = 1;
 const CELLS: usize = 4;
 const BLOCKS: usize = 7;
 
-/// Interval of `t` in which a ray lies inside the box.
-#[derive(CubeType)]
-struct Span {
-    enter: f32,
-    leave: f32,
-}
-
 /// Intersects the interval with the extent of the box along one axis. A zero component of the direction is replaced by
 /// 1e-6, as in the published code.
 #[cube]
 fn crossed(span: Span, o: f32, d: f32, low: f32, high: f32) -> Span {
     let d = select(d == 0.0f32, 1e-6f32, d);
-    let (p, q) = ((low - o) / d, (high - o) / d);
-    Span { enter: max(span.enter, min(p, q)), leave: min(span.leave, max(p, q)) }
+    narrowed(span, (low - o) / d, (high - o) / d)
 }
 
 /// Returns whether `v` lies outside `low..=high` by more than `slack`, which allows for rounding.

@@ -3,16 +3,12 @@
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
+use super::super::neus::sigmoid;
 use super::march::VmSamples;
 use crate::kernel::cpu::vm::{RAY_WIDTH, VmField};
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
-
-#[cube]
-fn sigmoid(v: f32) -> f32 {
-    1.0f32 / (1.0f32 + (-v).exp())
-}
 
 /// Computes the weights of samples up to where a ray's transmittance is used up, and counts the samples whose weight is
 /// above the threshold, which need a color.

@@ -2,7 +2,7 @@
 //! weights.
 
 use super::super::super::tile::{
-    self, Block, at, outer, output_layer, product, relu_backward, sample_sums, store_block, transposed,
+    self, Block, add, at, outer, output_layer, product, relu_backward, sample_sums, store_block, transposed,
 };
 use super::super::super::weight_norm::finite;
 use super::super::grid::{NONE, looked_up, term};
@@ -270,12 +270,6 @@ fn from_colors(g0: F4, g1: F4, g2: F4, w0: F4, w1: F4, w2: F4, #[comptime] j: us
     g0 * broadcast(w0, j) + g1 * broadcast(w1, j) + g2 * broadcast(w2, j)
 }
 
-/// Adds `v` to a gradient, or overwrites it if `fresh` is set.
-#[cube]
-fn add(gradient: &mut [f32], i: usize, v: f32, fresh: bool) {
-    gradient[i] = if fresh { v } else { gradient[i] + v };
-}
-
 /// Writes the gradients with respect to products of samples `from..from + limit`, `[limit, channels]`, and partial sums by
 /// group of those with respect to the weights.
 #[cube(launch_unchecked)]
@@ -354,33 +348,15 @@ pub(super) fn backward(
         sync_cube();
         let at_w2 = sum + comptime!(gradient_rows[2] * width);
         outer(&a, 0usize, &b, hidden, hidden, partial, at_w2, fresh, row, column, lanes);
-        sample_sums(
-            &a,
-            0usize,
-            hidden,
-            partial,
-            sum + comptime!(gradient_rows[3] * width),
-            fresh,
-            row,
-            column,
-            lanes,
-        );
+        let at_b2 = sum + comptime!(gradient_rows[3] * width);
+        sample_sums(&a, 0usize, hidden, partial, at_b2, fresh, row, column, lanes);
         let g_h1 = product(&a, 0usize, w, comptime!(rows[7]), hidden, row, column, lanes);
         let g_z1 = relu_backward(&g_h1, &b, row, column, lanes);
         sync_cube();
         store_block(&mut b, &g_z1, row, column, lanes);
         sync_cube();
-        sample_sums(
-            &b,
-            0usize,
-            hidden,
-            partial,
-            sum + comptime!(gradient_rows[1] * width),
-            fresh,
-            row,
-            column,
-            lanes,
-        );
+        let at_b1 = sum + comptime!(gradient_rows[1] * width);
+        sample_sums(&b, 0usize, hidden, partial, at_b1, fresh, row, column, lanes);
         #[unroll]
         for p in 0..comptime!(plan.pieces()) {
             inputs(&mut a, values, words, place, ray, direction, index, tile, samples, row, column, p, plan);
@@ -403,21 +379,6 @@ pub(super) fn backward(
             }
             sync_cube();
         }
-    }
-}
-
-/// Sums the partial gradients of the groups, in the order of the groups.
-#[cube(launch)]
-pub(super) fn reduce(partial: &[f32], count: &[u32], summed: &mut [f32], tile: u32, groups: u32) {
-    let i = ABSOLUTE_POS;
-    let size = summed.len();
-    if i < size {
-        let tiles = count[0].div_ceil(tile);
-        let mut sum = 0.0f32;
-        for group in 0..min(tiles, groups) {
-            sum += partial[group as usize * size + i];
-        }
-        summed[i] = sum;
     }
 }
 
