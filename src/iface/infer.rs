@@ -68,8 +68,9 @@ impl IFace {
         if config.occupancy == OccupancyRule::Band {
             // The surface has moved since the last update of the cells.
             let mut occupancy = face.occupancy.clone();
-            let soft = |x: &[[f32; 3]]| sdf::softness(&face.shape, face.table(), &face.weights, x);
-            occupancy.update(config, (0, 0), face.inv_s, 0.0, |x| face.raw_sdf(x), soft);
+            let field =
+                |x: &[[f32; 3]]| sdf::values_and_softness(&face.shape, face.table(), &face.weights, x);
+            occupancy.update(config, (0, 0), face.inv_s, 0.0, field);
             face.occupancy = occupancy;
         }
         face
