@@ -196,7 +196,7 @@ impl SdfOps for CpuSdf<'_> {
             return;
         }
         let step = &self.step;
-        let (mut x, mut d) = step.samples.points(&step.batch.rays, 0);
+        let (mut x, mut d) = step.samples.points(&step.batch.rays);
         x.extend(step.points.iter().map(|p| p.position));
         d.resize(x.len(), [0.0, 0.0, 1.0]); // any direction will do: the color of points has no loss
         let table = bytemuck::cast_slice(slice(table.value()));

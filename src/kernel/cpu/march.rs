@@ -118,11 +118,11 @@ pub struct Samples {
 }
 
 impl Samples {
-    /// Returns positions and directions of the samples of `rays`, where `rays[0]` is ray number `first` of the batch.
-    pub fn points(&self, rays: &[MarchRay], first: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
+    /// Returns positions and directions of the samples of the batch's rays.
+    pub fn points(&self, rays: &[MarchRay]) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
         let ray_points = |(r, ray): (usize, &MarchRay)| {
             let MarchRay { origin: o, direction: d, .. } = *ray;
-            let span = self.offsets[first + r] as usize..self.offsets[first + r + 1] as usize;
+            let span = self.offsets[r] as usize..self.offsets[r + 1] as usize;
             self.t[span].iter().map(move |t| (std::array::from_fn(|a| o[a] + t * d[a]), d))
         };
         rays.iter().enumerate().flat_map(ray_points).unzip()
