@@ -225,14 +225,9 @@ impl Config {
 
     /// With the constants of its preset, which are not read from text.
     fn keep_constants(self) -> Config {
-        let mut iface = self.iface.keep_constants(self.preset);
-        if self.preset == Preset::Paper {
-            // the published shares of the steps, so that less of everything is learned by the same schedule
-            (iface.warmup, iface.anneal_end) = ((iface.steps / 40).max(1), iface.steps);
-        }
         Config {
             tface: self.tface.keep_constants(self.preset),
-            iface,
+            iface: self.iface.keep_constants(self.preset),
             mesh: self.mesh.keep_constants(self.preset),
             ..self
         }

@@ -38,7 +38,7 @@ const SMALL_MESH: [&str; 8] = [
     "--set",
     "mesh.texture_px=128",
     "--set",
-    "tface.upsample_steps=[]",
+    "tface.upsample_at=[]",
 ];
 
 fn capture(folder: &Path) {

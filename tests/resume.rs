@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
 /// Small enough for seconds, large enough that every stage can be hit.
-const SETTINGS: [&str; 26] = [
+const SETTINGS: [&str; 24] = [
     "iface.steps=150",
     "iface.rays=256",
     "iface.max_rays=512",
@@ -22,8 +22,6 @@ const SETTINGS: [&str; 26] = [
     "tface.rays=512",
     "tface.voxels_start=4096",
     "tface.voxels_final=13824",
-    "tface.upsample_steps=20,40",
-    "tface.mask_steps=20,40",
     "tface.checkpoint_s=0.1",
     "baseline.steps=30",
     "baseline.rays=256",

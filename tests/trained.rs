@@ -101,7 +101,7 @@ fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
 }
 
 /// A few steps of everything.
-const FEW: [&str; 14] = [
+const FEW: [&str; 12] = [
     "device=cpu",
     "iface.steps=12",
     "iface.rays=128",
@@ -114,8 +114,6 @@ const FEW: [&str; 14] = [
     "tface.rays=128",
     "tface.voxels_start=1000",
     "tface.voxels_final=2000",
-    "tface.upsample_steps=4",
-    "tface.mask_steps=4",
 ];
 
 /// Works on a stage or the line with these settings and `set`.

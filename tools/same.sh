@@ -33,7 +33,6 @@ settings=(
   --set iface.steps=200 --set iface.rays=512 --set iface.samples=8192
   --set tface.steps=120 --set tface.fields=2 --set tface.rays=1024
   --set tface.voxels_start=32768 --set tface.voxels_final=110592
-  --set tface.upsample_steps=40,80 --set tface.mask_steps=40,80
   --set baseline.steps=60 --set baseline.rays=512
   --set mesh.resolution=96 --set mesh.triangles=6000 --set mesh.texture_px=512
   --set mesh.lobes=2 --set mesh.normal_map=true --set mesh.format=glb,obj,ply

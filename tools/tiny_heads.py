@@ -21,8 +21,6 @@ fields = 1
 rays = 512
 voxels_start = 4096
 voxels_final = 13824
-upsample_steps = [20, 40]
-mask_steps = [20, 40]
 checkpoint_s = 0.1
 [baseline]
 steps = 20

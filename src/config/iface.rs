@@ -104,8 +104,8 @@ table! {
     constants {
         /// Levels that are active at the first step.
         start_levels: usize => 6, 6, 16;
-        /// Steps between the activation of two levels (0: all at once).
-        level_every: u64 => 100, 250, 0;
+        /// Share of the steps after which all levels are active; they are activated at equal intervals.
+        all_levels: f64 => 0.25, 0.25, 0.0;
         /// Does the color network read the hash features beside the geometry network's outputs?
         color_skip: bool => true, true, false;
         /// Half edge of the field's box.
@@ -115,8 +115,8 @@ table! {
         /// Learning rate of the variance at its peak. Four times the published one: with local softness, skin may become
         /// as sharp as it is.
         lr_variance: f64 => 4e-3, 4e-3, 1e-3;
-        /// Steps of linear warm-up from 1 % of the peak.
-        warmup: u64 => 100, 100, 500;
+        /// Share of the steps over which the rates warm up linearly, from 1 % of the peak.
+        warmup: f64 => 0.025;
         /// Learning rate at the end, as a share of the peak; exponential in between.
         lr_final: f64 => 0.05, 0.02, 0.1;
         /// Decoupled weight decay of the networks and the variance.
@@ -134,12 +134,12 @@ table! {
         sparsity_scale: f64 => 50.0, 50.0, 1.0;
         /// Start value of the variance v; inv_s = exp(10 v).
         variance: f64 => 0.3;
-        /// Steps over which NeuS' cosine is annealed; 0 does not.
-        anneal_end: u64 => 1000, 3000, 20_000;
+        /// Share of the steps over which NeuS' cosine is annealed.
+        anneal_end: f64 => 0.35, 0.35, 1.0;
         /// Rule that selects occupied cells.
         occupancy: OccupancyRule => OccupancyRule::Band, OccupancyRule::Band, OccupancyRule::Nerfacc;
-        /// Steps between updates of the occupancy grid.
-        occupancy_every: u64 => 50, 50, 16;
+        /// Share of the steps between updates of the occupancy grid (`band` rule).
+        occupancy_every: f64 => 0.08;
         /// Half width of the band in units of 1 / local sharpness.
         band: f32 => 4.0, 4.0, 6.0;
         /// Share of the steps after which stereo points are searched for: the surface is accurate to a pixel or two by then.

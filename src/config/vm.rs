@@ -96,11 +96,11 @@ table! {
         voxels_start: u64, 8.0..=1e12 => 96 * 96 * 96, 128 * 128 * 128, 2_097_156;
         /// Number of voxels after the last upsampling.
         voxels_final: u64, 8.0..=1e12 => 192 * 192 * 192, 256 * 256 * 256, 27_000_000;
-        /// Steps after which the grids are upsampled, an increasing list.
-        upsample_steps: Vec<u64>, 0.0..=1e7
-            => vec![150, 300, 500], vec![200, 400, 650, 1000], vec![2000, 3000, 4000, 5500, 7000];
-        /// Steps after which the alpha mask is rebuilt, an increasing list.
-        mask_steps: Vec<u64>, 0.0..=1e7 => vec![150, 500], vec![200, 650], vec![2000, 4000];
+        /// Shares of the steps after which the grids are upsampled, an increasing list.
+        upsample_at: Vec<f64>, 0.0..=1.0
+            => vec![0.1, 0.2, 0.33], vec![0.1, 0.2, 0.325, 0.5], vec![0.04, 0.06, 0.08, 0.11, 0.14];
+        /// Shares of the steps after which the alpha mask is rebuilt, an increasing list.
+        mask_at: Vec<f64>, 0.0..=1.0 => vec![0.1, 0.33], vec![0.1, 0.325], vec![0.04, 0.08];
         /// Channels of the density's planes xy, xz, yz. The published ranks favour one axis of one light stage; a
         /// head may face any way.
         density_rank: Vec<usize>, 0.0..=1024.0 => vec![8, 8, 8], vec![8, 8, 8], vec![16, 4, 4];
@@ -148,6 +148,8 @@ table! {
         activation: DensityActivation => DensityActivation::Relu;
         /// Added to the feature before softplus.
         density_shift: f64 => -10.0;
+        /// Share of the rays in steps up to the last upsampling.
+        early_rays: f64 => 0.5, 0.5, 1.0;
         /// Optical lengths are lengths times density times this, in scene units or those of `box_half`. Denser matter sets
         /// a thinner surface, and fewer samples of a ray need a color, but from 200 on hair hardens.
         distance_scale: f64 => 100.0, 100.0, 25.0;
@@ -193,6 +195,18 @@ impl VmConfig {
             box_half: None,
             ..self.clone()
         }
+    }
+
+    /// Returns which entry of a list of shares of the steps is due after `step`; the last one, if a training is so short
+    /// that several are.
+    pub fn due(&self, shares: &[f64], step: u64) -> Option<usize> {
+        shares.iter().rposition(|share| (share * self.steps as f64).round() as u64 == step)
+    }
+
+    /// Returns the number of rays of a step.
+    pub fn rays_at(&self, step: u64) -> usize {
+        let finest = self.upsample_at.last().is_none_or(|share| step as f64 > share * self.steps as f64);
+        if finest { self.rays } else { ((self.rays as f64 * self.early_rays) as usize).max(1) }
     }
 
     /// How many fields there are in the end: at least one, and no more where it comes from a file.
@@ -251,7 +265,7 @@ mod tests {
         let p = &paper.tface;
         let extent = [3.0, 3.34, 2.0];
         let mut sizes = vec![size_for(extent, p.voxels_start)];
-        let finer = voxel_schedule(p.voxels_start, p.voxels_final, p.upsample_steps.len());
+        let finer = voxel_schedule(p.voxels_start, p.voxels_final, p.upsample_at.len());
         sizes.extend(finer.into_iter().map(|v| size_for(extent, v)));
         assert_eq!((sizes[0], sizes[1], sizes[5]), ([141, 157, 94], [167, 186, 111], [331, 368, 220]));
         // samples of a training ray: ‖N‖ / 0.5

@@ -155,10 +155,9 @@ impl SdfOps for CpuSdf<'_> {
         self.shape.active = levels;
         let (shape, table) = (&self.shape, bytemuck::cast_slice(slice(table.value())));
         let weights = self.weights.as_ref().expect("weights are computed before the field is evaluated");
-        let distances = |x: &[[f32; 3]]| sdf::values(shape, table, weights, x);
-        let soft = |x: &[[f32; 3]]| sdf::softness(shape, table, weights, x);
+        let field = |x: &[[f32; 3]]| sdf::values_and_softness(shape, table, weights, x);
         let dt = schedule::step_length(self.config).at(self.inv_s);
-        self.occupancy.update(self.config, (at.seed, at.step), self.inv_s, dt, distances, soft);
+        self.occupancy.update(self.config, (at.seed, at.step), self.inv_s, dt, field);
     }
 
     fn advance(&mut self) {
@@ -197,7 +196,7 @@ impl SdfOps for CpuSdf<'_> {
             return;
         }
         let step = &self.step;
-        let (mut x, mut d) = step.samples.points(&step.batch.rays, 0);
+        let (mut x, mut d) = step.samples.points(&step.batch.rays);
         x.extend(step.points.iter().map(|p| p.position));
         d.resize(x.len(), [0.0, 0.0, 1.0]); // any direction will do: the color of points has no loss
         let table = bytemuck::cast_slice(slice(table.value()));

@@ -13,6 +13,7 @@ mod ops;
 pub use field::DensityField;
 
 use super::occupancy::Occupancy;
+use super::schedule;
 use super::state::FieldState;
 use super::train::IfaceReport;
 use crate::config::iface::{Foreground, IfaceConfig, OccupancyRule};
@@ -187,7 +188,7 @@ impl<O: DensityOps> Model for DensityModel<'_, O> {
     }
 
     fn prepare(&mut self, at: StepAt) -> Result<(), StepError> {
-        if at.step.is_multiple_of(self.config.occupancy_every) {
+        if schedule::updates_occupancy(self.config, at.step) {
             self.ops.update_occupancy(&self.groups, at);
         }
         Ok(())

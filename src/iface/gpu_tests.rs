@@ -28,9 +28,8 @@ fn config() -> IfaceConfig {
         levels: 6,
         log2_table: 12,
         occupancy_resolution: 32,
-        level_every: 30,
-        anneal_end: 50,
-        warmup: 20,
+        anneal_end: 0.25,
+        warmup: 0.1,
         min_step: 0.03,
         ..IfaceConfig::preset(Preset::Draft)
     }
@@ -187,8 +186,8 @@ fn a_step_waits_for_nothing() {
         return;
     }
     let views = textured_views();
-    let config = IfaceConfig { start: Start::Sphere, stereo: 0.0, occupancy_every: 1 << 20, ..config() };
-    let config = IfaceConfig { level_every: 0, ..config };
+    let config = IfaceConfig { start: Start::Sphere, stereo: 0.0, occupancy_every: 1.0, ..config() };
+    let config = IfaceConfig { all_levels: 0.0, ..config };
     let (hull, dir) = (hull(), temporary());
     let session = on("wgpu:0", dir.path(), &Quiet);
     let pixels = pixels(&views, Some(&hull), &config).unwrap();

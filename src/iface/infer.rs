@@ -12,7 +12,7 @@ use crate::field::{ComputeDevice, GpuField, devices::Gpu};
 use crate::geom::{Ray, RayResult};
 #[cfg(feature = "wgpu")]
 use crate::io::Lock;
-use crate::kernel::cpu::march::{Bitmask, MarchRay, Samples};
+use crate::kernel::cpu::march::{Bitmask, MarchRay};
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::neus::{self, Rays};
 use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
@@ -22,9 +22,6 @@ use glam::Vec3;
 use std::path::Path;
 #[cfg(feature = "wgpu")]
 use std::sync::Arc;
-
-/// Samples evaluated together in a volume render.
-const SAMPLES: usize = 1 << 16;
 
 /// The trained field on the host. All positions and distances are in scene units, the box is [-1, 1]³.
 pub struct IFace {
@@ -68,8 +65,9 @@ impl IFace {
         if config.occupancy == OccupancyRule::Band {
             // The surface has moved since the last update of the cells.
             let mut occupancy = face.occupancy.clone();
-            let soft = |x: &[[f32; 3]]| sdf::softness(&face.shape, face.table(), &face.weights, x);
-            occupancy.update(config, (0, 0), face.inv_s, 0.0, |x| face.raw_sdf(x), soft);
+            let field =
+                |x: &[[f32; 3]]| sdf::values_and_softness(&face.shape, face.table(), &face.weights, x);
+            occupancy.update(config, (0, 0), face.inv_s, 0.0, field);
             face.occupancy = occupancy;
         }
         face
@@ -196,43 +194,54 @@ impl IFace {
     }
 
     fn render_pass(&self, rays: &[Ray]) -> Vec<RayResult> {
-        let config = &self.config;
-        let dt = step_length(config).at(self.inv_s);
-        let marched: Vec<MarchRay> = rays.iter().map(|r| MarchRay::new(r, config.radius, 0.0)).collect();
+        let dt = step_length(&self.config).at(self.inv_s);
+        let marched: Vec<MarchRay> = rays.iter().map(|r| MarchRay::new(r, self.config.radius, 0.0)).collect();
         #[cfg(feature = "wgpu")]
         if let Some(composited) = self.on_gpu.ask(|field| field.render(&marched, dt)) {
             return composited.iter().map(|o| self.result(o)).collect();
         }
-        let samples = self.occupancy.march(config, dt, &marched);
-        // Rays are composited in pieces with a bounded number of samples: a sample takes about two kilobytes.
-        let mut out = Vec::with_capacity(rays.len());
-        let mut first = 0;
-        while first < marched.len() {
-            let most = samples.offsets[first] as usize + SAMPLES;
-            let fits = samples.offsets.partition_point(|&o| o as usize <= most) - 1;
-            let last = fits.clamp(first + 1, marched.len());
-            out.extend(self.composite(&marched[first..last], &samples, first, dt));
-            first = last;
-        }
-        out
+        self.composite(&marched, dt).iter().map(|o| self.result(o)).collect()
     }
 
-    /// Composites rays `first..first + rays.len()` of a march.
-    fn composite(&self, rays: &[MarchRay], samples: &Samples, first: usize, dt: f32) -> Vec<RayResult> {
-        let offsets = &samples.offsets[first..=first + rays.len()];
-        let start = offsets[0] as usize;
-        let t = &samples.t[start..offsets[rays.len()] as usize];
-        let offsets: Vec<i32> = offsets.iter().map(|&o| o - start as i32).collect();
-        let n = t.len();
-        let (x, d) = samples.points(rays, first);
-        let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
-        let direction: Vec<[f32; 3]> = rays.iter().map(|r| r.direction).collect();
-        let steps = vec![dt; n];
-        let bundle = Rays { offsets: &offsets, direction: &direction, t, dt: &steps };
-        neus::forward(bundle, field.output(), self.inv_s, 1.0)
-            .chunks_exact(neus::RAY_WIDTH)
-            .map(|o| self.result(o))
-            .collect()
+    /// Composites the samples of rays. Each round evaluates the next few samples of the rays that are not opaque yet; a
+    /// sample takes about two kilobytes.
+    fn composite(&self, rays: &[MarchRay], dt: f32) -> Vec<[f32; neus::RAY_WIDTH]> {
+        /// Samples of a ray that are evaluated together.
+        const AHEAD: usize = 8;
+        /// Light that may be left where a ray ends.
+        const OPAQUE: f32 = 1e-4;
+        let samples = self.occupancy.march(&self.config, dt, rays);
+        let end = |r: usize| samples.offsets[r + 1] as usize;
+        let mut out = vec![[0f32; neus::RAY_WIDTH]; rays.len()];
+        let mut open: Vec<(usize, usize)> =
+            (0..rays.len()).map(|r| (r, samples.offsets[r] as usize)).filter(|&(r, k)| k < end(r)).collect();
+        while !open.is_empty() {
+            let (mut x, mut d, mut t, mut offsets) = (Vec::new(), Vec::new(), Vec::new(), vec![0]);
+            for &(r, k) in &open {
+                let MarchRay { origin, direction, .. } = rays[r];
+                for &at in &samples.t[k..end(r).min(k + AHEAD)] {
+                    x.push(std::array::from_fn(|a| origin[a] + at * direction[a]));
+                    d.push(direction);
+                    t.push(at);
+                }
+                offsets.push(t.len() as i32);
+            }
+            let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
+            let direction: Vec<[f32; 3]> = open.iter().map(|&(r, _)| rays[r].direction).collect();
+            let pieces = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &vec![dt; t.len()] };
+            let composited = neus::forward(pieces, field.output(), self.inv_s, 1.0);
+            let mut pieces = composited.as_chunks::<{ neus::RAY_WIDTH }>().0.iter();
+            open.retain_mut(|(r, k)| {
+                let out = &mut out[*r];
+                let light = 1.0 - out[3];
+                for (out, piece) in out.iter_mut().zip(pieces.next().into_iter().flatten()) {
+                    *out += light * piece;
+                }
+                *k += AHEAD;
+                1.0 - out[3] > OPAQUE && *k < end(*r)
+            });
+        }
+        out
     }
 
     /// Converts a composited ray to scene units.

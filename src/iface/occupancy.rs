@@ -99,27 +99,25 @@ impl Occupancy {
         &self.allowed
     }
 
-    /// Updates the cells from the field. `sdf` returns distances at points in field coordinates, `soft` the logarithm of
-    /// the local sharpness relative to `inv_s`; `step` is the march step.
+    /// Updates the cells from the field, which returns distances at points in field coordinates, and the logarithm of the
+    /// local sharpness relative to `inv_s`; `step` is the march step.
     pub fn update(
         &mut self,
         config: &IfaceConfig,
         (seed, n): (u64, u64),
         inv_s: f32,
         step: f32,
-        sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
-        soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+        field: impl Fn(&[[f32; 3]]) -> Vec<[f32; 2]>,
     ) {
         match config.occupancy {
             OccupancyRule::Band => {
                 let cells = [&mut self.occupied, &mut self.solid];
-                occupancy::update_band(cells, &self.allowed, config.radius, band(config), inv_s, sdf, soft);
+                occupancy::update_band(cells, &self.allowed, config.radius, band(config), inv_s, field);
             }
             OccupancyRule::Nerfacc => {
                 let opacity = |points: &[[f32; 3]]| -> Vec<f32> {
-                    let local = if config.soften > 1.0 { soft(points) } else { vec![0.0; points.len()] };
-                    let each = sdf(points).into_par_iter().zip(local);
-                    each.map(|(f, soft)| neus::occupancy(f, 0.5 * step, inv_s * soft.exp())).collect()
+                    let each = field(points).into_par_iter();
+                    each.map(|[f, soft]| neus::occupancy(f, 0.5 * step, inv_s * soft.exp())).collect()
                 };
                 self.update_nerfacc((seed, n), config.radius, occupancy::OPAQUE, opacity);
             }
@@ -156,12 +154,13 @@ mod tests {
     use super::*;
     use crate::config::Preset;
 
-    fn even(points: &[[f32; 3]]) -> Vec<f32> {
-        vec![0.0; points.len()]
+    /// Returns a field of one sharpness everywhere.
+    fn even(sdf: impl Fn(&[f32; 3]) -> f32) -> impl Fn(&[[f32; 3]]) -> Vec<[f32; 2]> {
+        move |points| points.iter().map(|p| [sdf(p), 0.0]).collect()
     }
 
-    fn sphere(points: &[[f32; 3]]) -> Vec<f32> {
-        points.iter().map(|p| (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt() - 0.5).collect()
+    fn sphere(p: &[f32; 3]) -> f32 {
+        (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt() - 0.5
     }
 
     #[test]
@@ -169,10 +168,10 @@ mod tests {
         let config =
             IfaceConfig { occupancy_resolution: 32, band: 6.0, ..IfaceConfig::preset(Preset::Draft) };
         let mut o = Occupancy::new(&config, None);
-        o.update(&config, (1, 0), 600.0, 0.0, sphere, even);
+        o.update(&config, (1, 0), 600.0, 0.0, even(sphere));
         let center = |i: usize| [i / 1024, i / 32 % 32, i % 32].map(|c| (c as f32 + 0.5) / 16.0 - 1.0);
         for i in 0..32 * 32 * 32 {
-            let f = sphere(&[center(i)])[0];
+            let f = sphere(&center(i));
             // half diagonal of a cell is 0.054, band 6 / 600 = 0.01
             assert_eq!(o.occupied.get(i), f.abs() < 0.06413);
             assert_eq!(o.solid.get(i), f <= -0.06413);
@@ -187,7 +186,7 @@ mod tests {
         let mut o = Occupancy::new(&config, Some(&hull));
         // half of the box is hull, and one layer more is kept
         assert_eq!(o.occupied.count(), 16 * 16 * 9);
-        o.update(&config, (1, 0), 20.0, 0.01, sphere, even);
+        o.update(&config, (1, 0), 20.0, 0.01, even(sphere));
         assert!((0..16 * 16 * 7).all(|i| !o.occupied.get(i)) && o.occupied.count() > 0);
         // the published rule knows no hull
         let config = IfaceConfig { occupancy: OccupancyRule::Nerfacc, ..config };
@@ -200,30 +199,28 @@ mod tests {
     fn the_published_rule_decays_what_it_visits_and_keeps_what_is_above_the_mean_or_a_thousandth() {
         let config = IfaceConfig { occupancy_resolution: 8, ..IfaceConfig::preset(Preset::Paper) };
         let (inv_s, step) = (3f32.exp(), 0.001_014_843_75);
-        let all = |f: f32| move |p: &[[f32; 3]]| vec![f; p.len()];
+        let all = |f: f32| even(move |_| f);
         let near = |a: f32, b: f64| (f64::from(a) - b).abs() < 2e-4 * b;
         // below step 256 every cell is visited; 0.00546 is more than a thousandth
         let mut o = Occupancy::new(&config, None);
-        o.update(&config, (1, 0), inv_s, step, all(0.05), even);
+        o.update(&config, (1, 0), inv_s, step, all(0.05));
         assert!(o.history.iter().all(|&h| near(h, 0.005_463_57)) && o.occupied.count() == 512);
         // what is seen later is less than 0.95 of it
         for k in 1..16u64 {
-            o.update(&config, (1, 16 * k), inv_s, step, all(0.2), even);
+            o.update(&config, (1, 16 * k), inv_s, step, all(0.2));
             assert!(o.history.iter().all(|&h| near(h, 0.005_463_57 * 0.95f64.powi(k as i32))), "{k}");
         }
         // from then on a quarter anywhere and as many of the occupied, both with repetition: of 512 cells some
         // 512 (1 − (1 − 1/512)²⁵⁶) = 201 fall once
         let before = o.history[0];
-        o.update(&config, (1, 256), inv_s, step, all(0.2), even);
+        o.update(&config, (1, 256), inv_s, step, all(0.2));
         let fallen = o.history.iter().filter(|&&h| near(h, 0.95 * f64::from(before))).count();
         let kept = o.history.iter().filter(|&&h| h == before).count();
         assert!((180..225).contains(&fallen) && fallen + kept == 512, "{fallen} {kept}");
         // one cell near the surface, 511 far: the mean, 0.00038, is the threshold
-        let corner = |p: &[[f32; 3]]| {
-            p.iter().map(|p| if p.iter().all(|&c| c < -0.225) { 0.05 } else { 0.2 }).collect()
-        };
+        let corner = even(|p| if p.iter().all(|&c| c < -0.225) { 0.05 } else { 0.2 });
         let mut o = Occupancy::new(&config, None);
-        o.update(&config, (1, 0), inv_s, step, corner, even);
+        o.update(&config, (1, 0), inv_s, step, corner);
         assert!(o.occupied.count() == 1 && o.occupied.get(0));
         assert!(near(o.history[511], 3.706_32e-4) && near(o.history[0], 0.005_463_57));
     }
@@ -233,7 +230,7 @@ mod tests {
         // slope 40: every centre is far from zero in value, the wall at x = 0.01 is crossed all the same
         let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::preset(Preset::Draft) };
         let mut o = Occupancy::new(&config, None);
-        o.update(&config, (1, 0), 600.0, 0.0, |p| p.iter().map(|p| 40.0 * (p[0] - 0.01)).collect(), even);
+        o.update(&config, (1, 0), 600.0, 0.0, even(|p| 40.0 * (p[0] - 0.01)));
         for x in 0..16 {
             assert_eq!(o.occupied.get((x * 16 + 5) * 16 + 5), x == 7 || x == 8, "{x}");
             assert_eq!(o.solid.get((x * 16 + 5) * 16 + 5), x < 7, "{x}");
@@ -245,9 +242,12 @@ mod tests {
         let config =
             IfaceConfig { occupancy_resolution: 32, band: 4.0, ..IfaceConfig::preset(Preset::Draft) };
         // one side of the sphere is eight times softer
-        let soft = |p: &[[f32; 3]]| p.iter().map(|p| if p[0] > 0.0 { -(8f32.ln()) } else { 0.0 }).collect();
+        let soft = |p: &[[f32; 3]]| {
+            let share = |p: &[f32; 3]| if p[0] > 0.0 { -(8f32.ln()) } else { 0.0 };
+            p.iter().map(|p| [sphere(p), share(p)]).collect()
+        };
         let mut o = Occupancy::new(&config, None);
-        o.update(&config, (1, 0), 200.0, 0.0, sphere, soft);
+        o.update(&config, (1, 0), 200.0, 0.0, soft);
         let at = |x: f32| {
             let cell = |c: f32| ((c + 1.0) * 16.0) as usize;
             let i = (cell(x) * 32 + cell(0.01)) * 32 + cell(0.01);
@@ -257,9 +257,10 @@ mod tests {
         assert_eq!((at(-0.37), at(0.37)), ((false, true), (true, false)));
         // a sharp cell beside soft ones does not end a ray either
         let hard_spot = |p: &[[f32; 3]]| {
-            p.iter().map(|p| if (p[0] - 0.36).abs() < 0.032 { 0.0 } else { -(8f32.ln()) }).collect()
+            let share = |p: &[f32; 3]| if (p[0] - 0.36).abs() < 0.032 { 0.0 } else { -(8f32.ln()) };
+            p.iter().map(|p| [sphere(p), share(p)]).collect()
         };
-        o.update(&config, (1, 1), 200.0, 0.0, sphere, hard_spot);
+        o.update(&config, (1, 1), 200.0, 0.0, hard_spot);
         let i = ((1.36f32 * 16.0) as usize * 32 + 16) * 32 + 16;
         assert!(o.occupied.get(i) && !o.solid.get(i));
     }

@@ -4,10 +4,15 @@ use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::kernel::cpu::adam::AdamStep;
 use crate::kernel::cpu::schedule::{RayBudget, StepLength};
 
+/// Returns a share of the steps as a number of steps, at least one.
+fn steps(config: &IfaceConfig, share: f64) -> u64 {
+    ((config.steps as f64 * share).round() as u64).max(1)
+}
+
 /// Learning-rate factor at optimizer step `n`: linear from 1 % over `warmup`, then exponential down to
 /// `lr_final` at `steps`.
 pub fn learning_rate(config: &IfaceConfig, n: u64) -> f64 {
-    let (n, warmup, steps) = (n as f64, config.warmup as f64, config.steps as f64);
+    let (n, warmup, steps) = (n as f64, steps(config, config.warmup) as f64, config.steps as f64);
     if n < warmup {
         0.01 + 0.99 * n / warmup
     } else {
@@ -35,10 +40,10 @@ pub fn ray_budget(config: &IfaceConfig) -> RayBudget {
 
 /// Returns the number of active hash levels at a step.
 pub fn active_levels(config: &IfaceConfig, step: u64) -> usize {
-    if config.level_every == 0 {
-        return config.levels;
-    }
-    (config.start_levels + (step / config.level_every) as usize).min(config.levels)
+    let added = config.levels.saturating_sub(config.start_levels);
+    // the share of all levels that is due, of `added` equal intervals
+    let due = (step * added as u64).checked_div((config.steps as f64 * config.all_levels).round() as u64);
+    config.levels.min(config.start_levels + due.map_or(added, |due| due as usize))
 }
 
 /// Returns the cell width of the finest of `levels` levels, scene units.
@@ -54,7 +59,7 @@ pub fn detail(config: &IfaceConfig, step: u64) -> f32 {
 
 /// Returns the share of the hard cosine in the alpha at a step: 0 → 1 over `anneal_end`.
 pub fn anneal(config: &IfaceConfig, step: u64) -> f32 {
-    if config.anneal_end == 0 { 1.0 } else { (step as f32 / config.anneal_end as f32).min(1.0) }
+    (step as f32 / steps(config, config.anneal_end) as f32).min(1.0)
 }
 
 /// Returns the step at which stereo points are searched, or `None` if their loss has no weight.
@@ -76,10 +81,17 @@ pub fn step_length(config: &IfaceConfig) -> StepLength {
 }
 
 /// Returns whether the occupancy is updated before this step. A new level, and the end of the hull's fit, move the
-/// surface, so the update follows at once.
+/// surface, so the update of the `band` rule follows at once.
 pub fn updates_occupancy(config: &IfaceConfig, step: u64) -> bool {
-    let level_came = config.level_every > 0 && step.is_multiple_of(config.level_every);
-    step.is_multiple_of(config.occupancy_every) || (config.occupancy == OccupancyRule::Band && level_came)
+    /// As published.
+    const NERFACC_EVERY: u64 = 16;
+    match config.occupancy {
+        OccupancyRule::Nerfacc => step.is_multiple_of(NERFACC_EVERY),
+        OccupancyRule::Band => {
+            let level_came = active_levels(config, step) != active_levels(config, step.saturating_sub(1));
+            level_came || step.is_multiple_of(steps(config, config.occupancy_every))
+        }
+    }
 }
 
 #[cfg(test)]
@@ -106,11 +118,29 @@ mod tests {
     }
 
     #[test]
+    fn a_schedule_keeps_its_shape_for_any_number_of_steps() {
+        let [few, many] =
+            [400, 4000].map(|steps| IfaceConfig { steps, ..IfaceConfig::preset(Preset::Draft) });
+        for step in (0..400).filter(|step| step % 5 == 0) {
+            assert_eq!(active_levels(&few, step), active_levels(&many, 10 * step), "{step}");
+            assert!((anneal(&few, step) - anneal(&many, 10 * step)).abs() < 1e-6, "{step}");
+            assert!((learning_rate(&few, step) - learning_rate(&many, 10 * step)).abs() < 1e-9, "{step}");
+        }
+        // at each of the eight levels that are added, and every 32 or 320 steps
+        let updates =
+            |config: &IfaceConfig| (0..config.steps).filter(|&s| updates_occupancy(config, s)).count();
+        assert_eq!((updates(&few), updates(&many)), (8 + 13, 8 + 13));
+        let one = IfaceConfig { steps: 1, ..few };
+        assert!(updates_occupancy(&one, 0) && learning_rate(&one, 0) > 0.0 && anneal(&one, 0) == 0.0);
+    }
+
+    #[test]
     fn rays_stand_for_less_as_levels_come_and_for_a_pixel_in_the_second_half() {
-        let config = IfaceConfig::preset(Preset::Draft);
+        let config = IfaceConfig { steps: 3200, ..IfaceConfig::preset(Preset::Draft) };
+        // all fourteen levels after a quarter of the steps, eight of them in intervals of a hundred;
         // cells of the level with 16 · 1.4⁵ = 86.05 of them on a side of 2, then 120.5; the finest has 1269.7
         for (step, want) in
-            [(0, 0.023_242), (99, 0.023_242), (100, 0.016_602), (1499, 0.001_575_2), (1500, 0.0)]
+            [(0, 0.023_242), (99, 0.023_242), (100, 0.016_602), (1599, 0.001_575_2), (1600, 0.0)]
         {
             assert!((detail(&config, step) - want).abs() < 1e-6, "{step}: {}", detail(&config, step));
         }

@@ -159,7 +159,7 @@ fn formulas(
     assert!(n > 150, "{n} samples");
     let steps = vec![dt as f32; n];
     let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &steps };
-    let anneal = step as f64 / config.anneal_end as f64;
+    let anneal = step as f64 / (config.anneal_end * config.steps as f64).round();
     let seen = neus::composite(rays, &outputs, inv_s, anneal);
     // Σ w ‖c − head‖²: the same compositing of what each sample is off
     let owner: Vec<usize> =

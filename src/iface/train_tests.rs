@@ -20,9 +20,8 @@ fn config() -> IfaceConfig {
         levels: 6,
         log2_table: 12,
         occupancy_resolution: 32,
-        level_every: 30,
-        anneal_end: 50,
-        warmup: 20,
+        anneal_end: 0.2,
+        warmup: 0.08,
         min_step: 0.02,
         ..IfaceConfig::preset(Preset::Draft)
     }
@@ -63,7 +62,7 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 #[test]
 fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
     let (views, hull) = (textured_views(), hull());
-    let config = IfaceConfig { steps: 70, ..config() };
+    let config = IfaceConfig { steps: 70, anneal_end: 0.7, warmup: 0.3, ..config() };
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train(&views, Some(&hull), &config, &session("iface", dir, "waves", monitor)).map(|(_, r)| r.warnings)
     };
@@ -132,7 +131,7 @@ fn a_checkpoint_of_other_settings_is_refused() {
 fn a_diverging_run_restores_once_and_then_names_step_term_and_rate() {
     let (views, hull) = (views(), hull());
     let dir = temporary();
-    let config = IfaceConfig { lr_table: 1e38, warmup: 0, ..config() };
+    let config = IfaceConfig { lr_table: 1e38, warmup: 0.0, ..config() };
     let end = train(&views, Some(&hull), &config, &session("iface", dir.path(), "ball", &Quiet));
     let e = end.err().unwrap();
     let message = e.to_string();

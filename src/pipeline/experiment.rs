@@ -196,17 +196,11 @@ fn shrink(c: &mut Config, scale: f64) {
     // our own presets already have few steps of many rays
     let (of_steps, of_rays) = if published { (scale * scale, scale) } else { (scale.sqrt(), 1.0) };
     let radiance = |t: &mut VmConfig| {
-        let before = t.steps;
-        t.steps = share(before, of_steps, 50);
+        t.steps = share(t.steps, of_steps, 50);
         t.rays = share(t.rays as u64, of_rays, 256) as usize;
         if published {
             t.voxels_start = share(t.voxels_start, scale, 8000);
             t.voxels_final = share(t.voxels_final, scale, 27_000).max(t.voxels_start);
-        }
-        let ratio = t.steps as f64 / before as f64;
-        for list in [&mut t.upsample_steps, &mut t.mask_steps] {
-            list.iter_mut().for_each(|s| *s = (*s as f64 * ratio).round() as u64);
-            list.dedup();
         }
     };
     radiance(&mut c.tface);
@@ -389,14 +383,9 @@ mod tests {
         let c = config("paper", 0.1, &["tface.steps=77".into(), "seed=5".into()]).unwrap();
         assert_eq!((c.tface.steps, c.baseline.steps, c.iface.steps, c.seed), (77, 500, 2000, 5));
         assert_eq!((c.tface.rays, c.tface.voxels_final, c.iface.samples), (410, 2_700_000, 26_214));
-        assert_eq!((c.iface.warmup, c.iface.anneal_end, c.iface.log2_table), (50, 2000, 16));
-        // 2000, 3000, 4000, 5500 and 7000 of 50,000 steps, of 500
-        assert_eq!(c.tface.upsample_steps, [20, 30, 40, 55, 70]);
-        assert_eq!(config("paper", 1.0, &[]).unwrap().iface.warmup, 500);
+        assert_eq!(c.iface.log2_table, 16);
         assert!(config("paper", 0.1, &["tface.stepz=1".into()]).is_err());
-        // a fortieth of the steps as they are set; no setting names these themselves, so that none is overwritten
-        let c = config("paper", 0.1, &["iface.steps=400".into()]).unwrap();
-        assert_eq!((c.iface.steps, c.iface.warmup, c.iface.anneal_end), (400, 10, 400));
+        // no setting names shares of the steps themselves, so that none is overwritten
         for constant in ["iface.warmup", "iface.anneal_end"] {
             let e = config("paper", 0.1, &[format!("{constant}=7")]).unwrap_err().to_string();
             assert!(e.ends_with(&format!("there is no key `{constant}`")), "{e}");
@@ -524,11 +513,7 @@ mod tests {
     fn a_row_is_made_measured_and_not_made_again() {
         let dir = tempfile::tempdir().unwrap();
         let less = ["tface.steps=12", "tface.rays=128", "tface.voxels_start=1000", "tface.voxels_final=2000"];
-        let less: Vec<String> = less
-            .iter()
-            .chain(&["tface.upsample_steps=6", "tface.mask_steps=6"])
-            .map(|s| s.to_string())
-            .collect();
+        let less = less.map(String::from);
         let mut c = config("tface-ce-one", 0.01, &less).unwrap();
         c.capture.path = head(dir.path());
         let run = Run::quiet(&dir.path().join("run"));

@@ -76,8 +76,8 @@ impl VmOps for CpuVm<'_> {
         Ok(self.figures.broken)
     }
 
-    fn draw(&mut self, at: StepAt, detail: f32) {
-        self.batch = self.pixels.draw(at.seed, at.step, self.config.rays, true, detail);
+    fn draw(&mut self, at: StepAt, rays: usize, detail: f32) {
+        self.batch = self.pixels.draw(at.seed, at.step, rays, true, detail);
         let stream = random_background(self.config).then_some(BACKGROUND_STREAM);
         self.background = ray_backgrounds(at, stream, self.batch.rays.len());
         let lattice = &self.field().lattice;

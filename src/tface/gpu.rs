@@ -25,7 +25,8 @@ pub struct GpuVm<'a> {
     pixels: &'a Pixels<'a>,
     pub(super) device: Device,
     photographs: DeviceRays,
-    /// `[1]`: rays of a step.
+    /// Number of rays of a step, and the same on the device, `[1]`.
+    rays: usize,
     ray_count: Buffer,
     batch: Batch,
     losses: VmLosses,
@@ -84,6 +85,7 @@ impl<'a> GpuVm<'a> {
         GpuVm {
             pixels,
             photographs: DeviceRays::new(pixels, &device, drawing, resident),
+            rays: config.rays,
             ray_count: device.upload(&[config.rays as u32]),
             batch: Batch::new(&device, config.rays),
             losses: VmLosses::new(&device, config.rays, mask_term(config, pixels)),
@@ -153,7 +155,10 @@ impl VmOps for GpuVm<'_> {
         Ok(self.device.fetch::<u32>(&self.broken)?[0] != 0)
     }
 
-    fn draw(&mut self, at: StepAt, detail: f32) {
+    fn draw(&mut self, at: StepAt, rays: usize, detail: f32) {
+        if self.rays != rays {
+            (self.rays, self.ray_count) = (rays, self.device.upload(&[rays as u32]));
+        }
         let (device, at) = (&self.device, (at.seed, at.step));
         self.photographs.draw(device, self.pixels, at, &self.ray_count, &mut self.batch, detail);
     }

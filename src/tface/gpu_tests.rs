@@ -24,8 +24,8 @@ fn config() -> VmConfig {
         rays: 128,
         voxels_start: 16 * 16 * 16,
         voxels_final: 24 * 24 * 24,
-        upsample_steps: vec![30, 60],
-        mask_steps: vec![30, 70],
+        upsample_at: vec![0.3, 0.6],
+        mask_at: vec![0.3, 0.7],
         density_rank: vec![8, 8, 8],
         color_rank: vec![8, 4, 9],
         hidden: 32,
@@ -59,7 +59,7 @@ fn losses_follow_those_of_the_cpu_and_nobody_waits() {
     let Some(device) = device() else { return };
     let (dir, views) = (temporary(), ball::views());
     // after a grid has grown, Adam's first steps go by the sign of what is zero but for rounding: that is another story
-    let config = VmConfig { steps: 200, upsample_steps: vec![], mask_steps: vec![], ..config() };
+    let config = VmConfig { steps: 200, upsample_at: vec![], mask_at: vec![], ..config() };
     let pixels = pixels(&views, &config);
     let session = session("tface", dir.path(), "ball", &Quiet);
     let mut on_cpu = begun(CpuVm::new(&config, &pixels), &config, &session);
@@ -149,13 +149,20 @@ fn what_steps_before_a_finer_grid_came_to_is_counted() {
     let (views, config) = (ball::views(), config());
     let pixels = pixels(&views, &config);
     // grids grow at steps between two reads
-    assert!(config.upsample_steps.iter().all(|step| !(step + 1).is_multiple_of(Device::READ_EVERY)));
+    let upsampled = (0..config.steps).filter(|&step| config.due(&config.upsample_at, step).is_some());
+    assert!(
+        upsampled.clone().count() == 2
+            && upsampled.into_iter().all(|s| !(s + 1).is_multiple_of(Device::READ_EVERY))
+    );
     let [on_cpu, on_gpu] = ["cpu", "wgpu:0"].map(|device| {
         let dir = temporary();
         let session = TrainingSession { device, ..session("tface", dir.path(), "ball", &Quiet) };
         train_one(&pixels, BOUNDS, Some(&hull()), &config, &session).unwrap()
     });
-    assert_eq!((on_gpu.rays, on_gpu.rays), (on_cpu.rays, config.steps * config.rays as u64));
+    assert_eq!(
+        (on_gpu.rays, on_gpu.rays),
+        (on_cpu.rays, (0..config.steps).map(|s| config.rays_at(s) as u64).sum())
+    );
     assert!(
         (on_gpu.train_psnr - on_cpu.train_psnr).abs() < 0.5,
         "{} {}",

@@ -203,8 +203,8 @@ mod tests {
             rays: 256,
             voxels_start: 1000,
             voxels_final: 4096,
-            upsample_steps: vec![20],
-            mask_steps: vec![20],
+            upsample_at: vec![0.5],
+            mask_at: vec![0.5],
             ..VmConfig::preset(Preset::Draft)
         }
     }

@@ -56,8 +56,8 @@ pub trait VmOps: Ops {
     /// Waits for the device and returns whether any gradient was not finite since the state was loaded.
     fn is_broken(&self) -> Result<bool>;
 
-    /// Draws rays. A ray of a large photograph stands for a square of pixels at most `detail` wide.
-    fn draw(&mut self, at: StepAt, detail: f32);
+    /// Draws `rays` rays. A ray of a large photograph stands for a square of pixels at most `detail` wide.
+    fn draw(&mut self, at: StepAt, rays: usize, detail: f32);
 
     /// Marches the rays, evaluates and decodes the field at their samples, and composites them.
     fn vm_render(&mut self, groups: &VmGroups<Self>);

@@ -109,8 +109,8 @@ fn shrink(
 
 /// Makes the grids finer where, after `step` steps, upsampling `which` (from 0) is due.
 pub fn upsample(state: &mut VmState, config: &VmConfig, which: usize, step: u64) {
-    let VmConfig { voxels_start, voxels_final, upsample_steps, .. } = config;
-    let voxels = voxel_schedule(*voxels_start, *voxels_final, upsample_steps.len().max(1))[which];
+    let VmConfig { voxels_start, voxels_final, upsample_at, .. } = config;
+    let voxels = voxel_schedule(*voxels_start, *voxels_final, upsample_at.len().max(1))[which];
     let extent = std::array::from_fn(|a| state.bounds[1][a] - state.bounds[0][a]);
     let size = size_for(extent, voxels);
     let (old_density, old_color) = grids(config, state.size);

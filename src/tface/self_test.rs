@@ -30,8 +30,8 @@ pub(super) fn vm(adapter: &Adapter) -> Result<Vec<Check>> {
         steps: 1000,
         rays: 2048,
         voxels_start: 24 * 24 * 24,
-        upsample_steps: Vec::new(),
-        mask_steps: Vec::new(),
+        upsample_at: Vec::new(),
+        mask_at: Vec::new(),
         ..VmConfig::preset(Preset::Draft)
     };
     let (views, hull, session) = (ball::views(), ball::hull(), session("tface"));

@@ -96,7 +96,7 @@ impl VmState {
         let extent = std::array::from_fn(|a| self.bounds[1][a] - self.bounds[0][a]);
         size_for(
             extent,
-            if config.upsample_steps.is_empty() { config.voxels_start } else { config.voxels_final },
+            if config.upsample_at.is_empty() { config.voxels_start } else { config.voxels_final },
         )
     }
 

@@ -253,7 +253,7 @@ fn the_published_background_is_white_in_half_of_the_batches() {
 #[test]
 fn the_alpha_mask_looks_at_steps_of_the_published_world() {
     // box of half 0.8 for 1.67: 1 − exp(−σ step / unit) ≥ 1e-4. Density of one value everywhere: 0.1 · 0.1 · 6 channels
-    let config = VmConfig { mask_steps: vec![0], ..paper() };
+    let config = VmConfig { mask_at: vec![0.0], ..paper() };
     let (dir, views) = (temporary(), views());
     let pixels = Pixels::permuted(&views, config.foreground, BOX, true);
     let unit = 0.8 / 1.67;

@@ -147,7 +147,7 @@ pub(super) fn check(stage: &str, config: &VmConfig) -> Result<()> {
             return wrong(key, "needs three numbers, not all 0: channels of the planes xy, xz, yz");
         }
     }
-    for (key, list) in [("upsample_steps", &config.upsample_steps), ("mask_steps", &config.mask_steps)] {
+    for (key, list) in [("upsample_at", &config.upsample_at), ("mask_at", &config.mask_at)] {
         if list.windows(2).any(|w| w[0] >= w[1]) {
             return wrong(key, "must rise");
         }
@@ -258,7 +258,7 @@ impl<O: VmOps> Model for VmModel<'_, O> {
         let (detail, penalties) = (self.detail(at.step), self.penalties(at.step));
         let groups = self.groups.as_mut().expect("parameters are loaded before the first step");
         let ops = &mut self.ops;
-        ops.draw(at, detail);
+        ops.draw(at, self.config.rays_at(at.step), detail);
         ops.vm_render(groups);
         ops.losses(background_mode(self.config, at));
         ops.backward(groups);
@@ -297,8 +297,8 @@ impl<O: VmOps> Model for VmModel<'_, O> {
     /// Rebuilds the mask and refines the grids where that is due, on the host.
     fn finish_step(&mut self, step: u64) -> Result<(), StepError> {
         let config = self.config;
-        let masking = config.mask_steps.contains(&step);
-        let upsampling = config.upsample_steps.iter().position(|&s| s == step);
+        let masking = config.due(&config.mask_at, step).is_some();
+        let upsampling = config.due(&config.upsample_at, step);
         if !masking && upsampling.is_none() {
             return Ok(());
         }

@@ -21,8 +21,8 @@ fn config() -> VmConfig {
         rays: 512,
         voxels_start: 16 * 16 * 16,
         voxels_final: 28 * 28 * 28,
-        upsample_steps: vec![40, 70],
-        mask_steps: vec![40, 90],
+        upsample_at: vec![0.267, 0.467],
+        mask_at: vec![0.267, 0.6],
         density_rank: vec![8, 8, 8],
         color_rank: vec![8, 4, 9],
         hidden: 32,
@@ -59,13 +59,13 @@ fn a_ball_is_learned_from_eight_views() {
 #[test]
 fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
     // two upsamplings, two masks and the shrinking box lie before, between and after the stops
-    let config = VmConfig { steps: 60, upsample_steps: vec![10, 25], mask_steps: vec![10, 30], ..config() };
+    let config = VmConfig { steps: 60, upsample_at: vec![0.17, 0.42], mask_at: vec![0.17, 0.5], ..config() };
     resumes(&|dir, monitor| run(&config, dir, monitor).map(|r| r.warnings), 5);
 }
 
 #[test]
 fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
-    let config = VmConfig { steps: 9, upsample_steps: vec![5], mask_steps: vec![5], ..config() };
+    let config = VmConfig { steps: 9, upsample_at: vec![0.55], mask_at: vec![0.55], ..config() };
     let infinite = f64::INFINITY.to_bits().to_string();
     refuses(
         &|dir, monitor| run(&config, dir, monitor).map(|r| r.warnings),
@@ -145,7 +145,7 @@ fn a_diverging_run_restores_once_and_then_names_term_and_step() {
     let dir = temporary();
     // softplus, or every density would die before a color breaks
     let activation = DensityActivation::Softplus;
-    let config = VmConfig { lr_grid: 1e38, lr_network: 1e38, activation, mask_steps: vec![], ..config() };
+    let config = VmConfig { lr_grid: 1e38, lr_network: 1e38, activation, mask_at: vec![], ..config() };
     let e = run(&config, dir.path(), &Quiet).err().unwrap();
     let message = e.to_string();
     assert!(message.contains("NaN at step") || message.contains("inf at step"), "{message}");
@@ -158,7 +158,7 @@ fn impossible_settings_and_empty_masks_are_named() {
     let message = |config: &VmConfig| run(config, dir.path(), &Quiet).err().unwrap().to_string();
     let cases = [
         (VmConfig { density_rank: vec![4, 4], ..config() }, "`baseline.density_rank` needs three numbers"),
-        (VmConfig { upsample_steps: vec![9, 5], ..config() }, "`baseline.upsample_steps` must rise"),
+        (VmConfig { upsample_at: vec![0.9, 0.5], ..config() }, "`baseline.upsample_at` must rise"),
         (VmConfig { hidden: 30, ..config() }, "`baseline.hidden` must be a multiple of 8"),
         (VmConfig { voxels_final: 100, ..config() }, "`baseline.voxels_final` is less"),
     ];

@@ -9,7 +9,7 @@ use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 const SETTINGS: &str = "device=cpu mask.source=none iface.steps=4 iface.rays=64 iface.max_rays=128 \
     iface.samples=1024 iface.levels=4 iface.log2_table=10 iface.occupancy_resolution=16 iface.stereo=0 \
     tface.steps=4 tface.fields=2 tface.rays=64 tface.voxels_start=512 tface.voxels_final=1728 \
-    tface.upsample_steps=1,2 tface.mask_steps=1,2 baseline.steps=2 baseline.rays=64 mesh.resolution=32 \
+    baseline.steps=2 baseline.rays=64 mesh.resolution=32 \
     mesh.triangles=300 mesh.texture_px=64 mesh.format=glb,obj mesh.hair=none render.samples=1 \
     render.method=baseline,tface,volume,textured ensemble.members=tface,volume ensemble.weights=0.8,0.2";
 

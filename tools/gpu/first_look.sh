@@ -99,7 +99,7 @@ photographs=(--size 256x320 --views 32)
 # Settings under which every stage takes seconds
 tiny=(--preset draft --set iface.steps=4 --set iface.samples=4096 --set iface.levels=6 --set iface.log2_table=12
   --set tface.steps=4 --set tface.fields=1 --set tface.rays=256 --set tface.voxels_start=4096 --set tface.voxels_final=13824
-  --set tface.upsample_steps=2 --set tface.mask_steps=2 --set baseline.steps=4 --set mesh.resolution=48
+  --set baseline.steps=4 --set mesh.resolution=48
   --set mesh.texture_px=256 --set mesh.triangles=4000)
 # The paper's preset expects a box that fits the head.
 paper=(--preset paper --set capture.box=head)

@@ -23,7 +23,7 @@ pub fn march(
 ) -> Samples {
     let dt = schedule::step_length(config).at(0.0);
     let all = occupancy.march(config, dt, rays);
-    let (x, _) = all.points(rays, 0);
+    let (x, _) = all.points(rays);
     density::cut(&all, &density::evaluate(shape, table, weights, &x, None).density, dt)
 }
 
@@ -128,7 +128,7 @@ impl DensityOps for CpuDensity<'_> {
 
     fn density_field(&mut self, [table, _]: &DensityGroups<Self>) {
         let Some(weights) = self.weights.as_ref().filter(|_| !self.samples.t.is_empty()) else { return };
-        let (x, d) = self.samples.points(&self.batch.rays, 0);
+        let (x, d) = self.samples.points(&self.batch.rays);
         let table = bytemuck::cast_slice(slice(table.value()));
         self.found = Some(density::evaluate(&self.shape, table, weights, &x, Some(&d)));
     }

@@ -104,7 +104,7 @@ impl DensityField {
         let rays: Vec<MarchRay> = rays.iter().map(marched).collect();
         let field = (&self.shape, self.table(), &self.weights);
         let samples = march(&self.config, &self.occupancy, field, &rays);
-        let (x, d) = samples.points(&rays, 0);
+        let (x, d) = samples.points(&rays);
         let found = density::evaluate(&self.shape, self.table(), &self.weights, &x, Some(&d));
         let dt = step_length(&self.config).at(0.0);
         let seen = |own: &[i32]| {

@@ -118,11 +118,11 @@ pub struct Samples {
 }
 
 impl Samples {
-    /// Returns positions and directions of the samples of `rays`, where `rays[0]` is ray number `first` of the batch.
-    pub fn points(&self, rays: &[MarchRay], first: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
+    /// Returns positions and directions of the samples of the batch's rays.
+    pub fn points(&self, rays: &[MarchRay]) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
         let ray_points = |(r, ray): (usize, &MarchRay)| {
             let MarchRay { origin: o, direction: d, .. } = *ray;
-            let span = self.offsets[first + r] as usize..self.offsets[first + r + 1] as usize;
+            let span = self.offsets[r] as usize..self.offsets[r + 1] as usize;
             self.t[span].iter().map(move |t| (std::array::from_fn(|a| o[a] + t * d[a]), d))
         };
         rays.iter().enumerate().flat_map(ray_points).unzip()
@@ -170,7 +170,8 @@ pub fn march_one(
             return;
         }
         let g: [f32; 3] = std::array::from_fn(|a| (ray.origin[a] + t * ray.direction[a] + radius) * scale);
-        let c: [i32; 3] = std::array::from_fn(|a| (g[a].floor() as i32).clamp(0, top));
+        // casts truncate, which is `floor` here: what is negative belongs to the first cell
+        let c: [i32; 3] = std::array::from_fn(|a| (g[a] as i32).clamp(0, top));
         let cell = (c[0] as usize * mask.resolution + c[1] as usize) * mask.resolution + c[2] as usize;
         if mask.get(cell) {
             if !emit(t) {
@@ -190,8 +191,9 @@ pub fn march_one(
                 border = border.min((wall - g[a]) * inverse[a]);
             }
         }
-        let skip = (border.max(0.0) / (scale * step)).ceil().max(1.0);
-        k += skip as i64;
+        let skip = border.max(0.0) / (scale * step);
+        let whole = skip as i64;
+        k += (whole + i64::from(skip > whole as f32)).max(1);
     }
 }
 

@@ -24,13 +24,6 @@ impl Matrix {
     }
 }
 
-/// Returns `values`, zero-padded to length `len`.
-pub fn padded(values: &[f32], len: usize) -> Vec<f32> {
-    let mut p = values.to_vec();
-    p.resize(len, 0.0);
-    p
-}
-
 /// Splits the flat vector of a network's weights into row-major matrices of the given shapes.
 pub fn split<const N: usize>(mut flat: &[f32], shapes: [(usize, usize); N]) -> [&[f32]; N] {
     shapes.map(|(rows, columns)| {

@@ -9,7 +9,7 @@
 //! With the color skip (not published) the color network also reads the hash features: twelve outputs of a layer
 //! that is trained to represent the surface are a bottleneck for the appearance of a head.
 
-use super::matrix::{Matrix, padded, split};
+use super::matrix::{Matrix, split};
 
 /// Width of every hidden layer.
 pub const HIDDEN: usize = 64;
@@ -96,13 +96,13 @@ impl Layout {
 #[derive(Debug)]
 pub struct Weights {
     pub(super) layout: Layout,
-    pub(super) w1: Matrix,   // [64, kp]
-    pub(super) b1: Vec<f32>, // [64]
-    pub(super) w2: Matrix,   // [16, 64]
-    pub(super) b2: Vec<f32>, // [16]
-    pub(super) c1: Matrix,   // [64, cp]
-    pub(super) c2: Matrix,   // [64, 64]
-    pub(super) c3: Matrix,   // [8, 64]
+    pub(super) w1: Matrix, // [64, kp]
+    pub(super) b1: [f32; HIDDEN],
+    pub(super) w2: Matrix, // [16, 64]
+    pub(super) b2: [f32; OUTPUTS_PADDED],
+    pub(super) c1: Matrix, // [64, cp]
+    pub(super) c2: Matrix, // [64, 64]
+    pub(super) c3: Matrix, // [8, 64]
 }
 
 impl Weights {
@@ -116,12 +116,18 @@ impl Weights {
         Weights {
             layout,
             w1: Matrix::new(&reordered, (HIDDEN, k), (HIDDEN, layout.padded())),
-            b1: b1.to_vec(),
+            b1: std::array::from_fn(|j| b1[j]),
             w2: Matrix::new(w2, (OUTPUTS, HIDDEN), (OUTPUTS_PADDED, HIDDEN)),
-            b2: padded(b2, OUTPUTS_PADDED),
+            b2: std::array::from_fn(|j| b2.get(j).copied().unwrap_or(0.0)),
             c1: Matrix::new(c1, (HIDDEN, ci), (HIDDEN, layout.color_padded())),
             c2: Matrix::new(c2, (HIDDEN, HIDDEN), (HIDDEN, HIDDEN)),
             c3: Matrix::new(c3, (3, HIDDEN), (RGB_PADDED, HIDDEN)),
         }
+    }
+
+    /// Returns the row of `W2` that gives output `output`.
+    #[inline(always)]
+    pub(super) fn output_row(&self, output: usize) -> &[f32; HIDDEN] {
+        &self.w2.m.as_chunks().0[output]
     }
 }

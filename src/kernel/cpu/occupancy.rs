@@ -30,38 +30,30 @@ pub struct BandRule {
 /// about one, or if the sdf has the other sign at the center of a neighbor, however steep the field is there. All other
 /// cells with a negative sdf are solid.
 ///
-/// `sdf` evaluates signed distances at points of `[-radius, radius]³`, and `soft` the logarithm of the local sharpness
-/// divided by `inv_s`.
+/// `field` evaluates signed distances at points of `[-radius, radius]³`, and the logarithms of the local sharpness divided
+/// by `inv_s`.
 pub fn update_band(
     [occupied, solid]: [&mut Bitmask; 2],
     allowed: &Bitmask,
     radius: f32,
     rule: BandRule,
     inv_s: f32,
-    sdf: impl Fn(&[[f32; 3]]) -> Vec<f32>,
-    soft: impl Fn(&[[f32; 3]]) -> Vec<f32>,
+    field: impl Fn(&[[f32; 3]]) -> Vec<[f32; 2]>,
 ) {
     let r = allowed.resolution;
     let cell = 2.0 * radius / r as f32;
     let half_diagonal = 0.5 * 3f32.sqrt() * cell;
-    let widest = rule.width * rule.soften / inv_s + half_diagonal;
     let cells: Vec<usize> = (0..r * r * r).filter(|&i| allowed.get(i)).collect();
     let center = |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - radius);
     // cells that are not evaluated are NaN, which has no sign and never differs in sign from a neighbor
     let mut f = vec![f32::NAN; r * r * r];
+    let mut band = vec![rule.width / inv_s + half_diagonal; r * r * r];
     for cells in cells.chunks(1 << 17) {
         let points: Vec<[f32; 3]> = cells.par_iter().map(|&i| center(i)).collect();
-        for (&i, value) in cells.iter().zip(sdf(&points)) {
-            f[i] = value;
-        }
-    }
-    // sharpness is evaluated only where the softest surface would reach
-    let mut band = vec![rule.width / inv_s + half_diagonal; r * r * r];
-    if rule.soften > 1.0 {
-        let near: Vec<usize> = cells.iter().copied().filter(|&i| f[i].abs() < widest).collect();
-        for near in near.chunks(1 << 17) {
-            let points: Vec<[f32; 3]> = near.par_iter().map(|&i| center(i)).collect();
-            for (&i, soft) in near.iter().zip(soft(&points)) {
+        for (&i, [distance, soft]) in cells.iter().zip(field(&points)) {
+            f[i] = distance;
+            // even the softest surface does not reach farther
+            if distance.abs() < rule.width * rule.soften / inv_s + half_diagonal {
                 band[i] = rule.width / (inv_s * soft.exp()) + half_diagonal;
             }
         }

@@ -56,6 +56,15 @@ pub fn pieces<'a, const N: usize>(
     move || cut.each_mut().map(|c| c.next().unwrap_or_default())
 }
 
+/// Splits the rows of a matrix, which are `width` long, into chunks of columns: for each chunk its part of every row.
+pub fn by_chunk<T>(matrix: &mut [T], width: usize, chunk: usize) -> Vec<Vec<&mut [T]>> {
+    let mut chunks: Vec<Vec<&mut [T]>> = (0..width.div_ceil(chunk)).map(|_| Vec::new()).collect();
+    for row in matrix.chunks_mut(width.max(1)) {
+        chunks.iter_mut().zip(row.chunks_mut(chunk)).for_each(|(parts, part)| parts.push(part));
+    }
+    chunks
+}
+
 impl Drop for Buffer {
     fn drop(&mut self) {
         let v = std::mem::take(&mut self.0);

@@ -22,12 +22,12 @@
 //!
 //! Of `z`, `h` and `s` only `h` is kept for the backward pass, because `s = 1 − e^{−100 h}`.
 
-use super::hash::{self, Level};
+use super::hash::{self, JacobianBlock, LANES, Level};
 use super::mlp::{
     COLOR_INPUTS, HIDDEN, Layout, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
 };
-use super::pool::{Buffer, pieces};
-use super::simd::{exp, gemm, ln_1p, sigmoid};
+use super::pool::{Buffer, by_chunk, pieces};
+use super::simd::{exp, fma, gemm, ln_1p, sigmoid};
 use crate::dispatch;
 use crate::geom::sphharm::sh16;
 use rayon::prelude::*;
@@ -37,7 +37,7 @@ mod backward;
 mod infer;
 
 pub use backward::backward;
-pub use infer::{colors, gradients, softness, values};
+pub use infer::{colors, gradients, softness, values, values_and_softness};
 
 /// Number of values per sample of the field's output: sdf, gradient (3), color (3), logarithm of the ratio of the local
 /// to the maximum sharpness (0 if the sharpness is global).
@@ -88,7 +88,7 @@ pub struct Activations {
     shape: FieldShape,
     samples: usize,
     x01: Vec<[f32; 3]>,
-    jacobian: Buffer, // [levels, n, 6]
+    jacobian: Buffer, // [levels, blocks, 6, 8]
     q: Buffer,        // [levels, n, 2]
     u: Buffer,        // [np, kp]; np = n rounded up to whole tiles
     h: Buffer,        // [np, 64]
@@ -128,6 +128,12 @@ impl<'a> Inputs<'a> {
         }
     }
 
+    /// Returns the index of a level's first Jacobian block of the tile that starts at sample `base`.
+    #[inline(always)]
+    fn first_block(&self, level: usize, base: usize) -> usize {
+        level * self.total.div_ceil(LANES) + (self.start + base) / LANES
+    }
+
     /// Writes the rows of a tile that starts at sample `base`. Columns of inactive levels and of padding are not
     /// written.
     #[inline(always)]
@@ -152,27 +158,26 @@ impl<'a> Inputs<'a> {
 struct SdfForwardTask<'a> {
     inputs: Inputs<'a>,
     direction: Option<&'a [[f32; 3]]>,
-    jacobian: &'a [f32],
+    jacobian: &'a [JacobianBlock], // of all samples
     soften: f32,
     u: &'a mut [f32],
     h: &'a mut [f32],
-    q: &'a mut [f32], // [n, kp]
+    q: Vec<&'a mut [[f32; 2]]>, // of each level
     c0: &'a mut [f32],
     c1: &'a mut [f32],
     c2: &'a mut [f32],
     out: &'a mut [f32],
 }
 
-/// Replaces `z` by h = softplus₁₀₀(z + b) and writes s = sigmoid(100 (z + b)), sharing one exponential. Rows have 64
-/// columns.
+/// Replaces `z` by h = softplus₁₀₀(z + b) and writes a = w ⊙ sigmoid(100 (z + b)), sharing one exponential.
 #[inline(always)]
-fn activate<const F: bool>(z: &mut [f32], s: &mut [f32], b: &[f32]) {
-    for (z, s) in z.chunks_exact_mut(HIDDEN).zip(s.chunks_exact_mut(HIDDEN)) {
+fn activate<const F: bool>(z: &mut [f32], a: &mut [f32], b: &[f32; HIDDEN], w: &[f32; HIDDEN]) {
+    for (z, a) in z.as_chunks_mut::<HIDDEN>().0.iter_mut().zip(a.as_chunks_mut::<HIDDEN>().0) {
         for j in 0..HIDDEN {
             let v = z[j] + b[j];
             let e = exp::<F>(-(100.0 * v).abs());
             let inverse = 1.0 / (1.0 + e);
-            s[j] = if v >= 0.0 { inverse } else { e * inverse };
+            a[j] = w[j] * if v >= 0.0 { inverse } else { e * inverse };
             z[j] = v.max(0.0) + 0.01 * ln_1p::<F>(e);
         }
     }
@@ -184,7 +189,8 @@ fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
     let inputs = &t.inputs;
     let first = 2 * inputs.levels;
     let samples = inputs.x.len();
-    let mut s = [0f32; TILE * HIDDEN];
+    let mut a = [0f32; TILE * HIDDEN];
+    let mut q = vec![0f32; TILE * kp];
     let mut o = [0f32; TILE * OUTPUTS_PADDED];
     let mut rgb = [0f32; TILE * RGB_PADDED];
     for tile in 0..samples.div_ceil(TILE) {
@@ -196,69 +202,87 @@ fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
         let u = &*u;
         let h = &mut t.h[base * HIDDEN..][..TILE * HIDDEN];
         gemm::<F>((TILE, HIDDEN, kp), u, (kp, 1), &w.w1.t, HIDDEN, h, HIDDEN, false);
-        activate::<F>(h, &mut s, &w.b1);
+        activate::<F>(h, &mut a, &w.b1, w.output_row(0));
         let out16 = OUTPUTS_PADDED;
         gemm::<F>((TILE, out16, HIDDEN), h, (HIDDEN, 1), &w.w2.t, out16, &mut o, out16, false);
-        for row in o.chunks_exact_mut(out16) {
-            for j in 0..out16 {
+        for row in o.as_chunks_mut::<OUTPUTS_PADDED>().0 {
+            for j in 0..OUTPUTS_PADDED {
                 row[j] += w.b2[j];
             }
         }
-        // a = w ⊙ s in place, then q = a W1
-        for row in s.chunks_exact_mut(HIDDEN) {
-            for j in 0..HIDDEN {
-                row[j] *= w.w2.m[j];
-            }
-        }
-        let q = &mut t.q[base * kp..][..TILE * kp];
-        gemm::<F>((TILE, kp, HIDDEN), &s, (HIDDEN, 1), &w.w1.m, kp, q, kp, false);
-        let mut n = [[0f32; 3]; TILE];
-        for r in 0..rows {
-            n[r] = std::array::from_fn(|a| q[r * kp + first + a] * inputs.inv_radius);
-        }
-        for l in 0..inputs.active {
-            let j = &t.jacobian[(l * inputs.total + inputs.start + base) * 6..][..rows * 6];
-            for r in 0..rows {
-                let (q0, q1) = (q[r * kp + 2 * l], q[r * kp + 2 * l + 1]);
-                for a in 0..3 {
-                    n[r][a] += j[6 * r + a] * q0 + j[6 * r + 3 + a] * q1;
+        gemm::<F>((TILE, kp, HIDDEN), &a, (HIDDEN, 1), &w.w1.m, kp, &mut q, kp, false);
+        let mut n: [[f32; TILE]; 3] =
+            std::array::from_fn(|k| std::array::from_fn(|r| q[r * kp + first + k] * inputs.inv_radius));
+        for (l, level_q) in t.q.iter_mut().enumerate() {
+            let jacobian = &t.jacobian[inputs.first_block(l, base)..][..rows.div_ceil(LANES)];
+            for (b, j) in jacobian.iter().enumerate() {
+                let pair: [[f32; LANES]; 2] =
+                    std::array::from_fn(|c| std::array::from_fn(|i| q[(b * LANES + i) * kp + 2 * l + c]));
+                for (k, n) in n.iter_mut().enumerate() {
+                    for i in 0..LANES {
+                        let n = &mut n[b * LANES + i];
+                        *n = fma::<F>(j[k][i], pair[0][i], fma::<F>(j[3 + k][i], pair[1][i], *n));
+                    }
                 }
+            }
+            for (r, pair) in level_q[base..][..rows].iter_mut().enumerate() {
+                *pair = [q[r * kp + 2 * l], q[r * kp + 2 * l + 1]];
             }
         }
         let c0 = &mut t.c0[base * ci..][..TILE * ci];
         if let Some(direction) = t.direction {
+            let units = units(&n);
             for r in 0..rows {
                 let row = &mut c0[r * ci..][..ci];
                 row[..OUTPUTS].copy_from_slice(&o[r * out16..][..OUTPUTS]);
                 row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(direction[base + r]));
-                row[OUTPUTS + 16..COLOR_INPUTS].copy_from_slice(&unit(n[r]));
+                row[OUTPUTS + 16..COLOR_INPUTS].copy_from_slice(&[units[0][r], units[1][r], units[2][r]]);
                 write_skip(w.layout, &u[r * kp..], row);
             }
             c0[rows * ci..].fill(0.0);
             let c1 = &mut t.c1[base * HIDDEN..][..TILE * HIDDEN];
             let c2 = &mut t.c2[base * HIDDEN..][..TILE * HIDDEN];
             color_layers::<F>(w, c0, c1, c2, &mut rgb);
-            rgb.iter_mut().for_each(|v| *v = sigmoid::<F>(*v));
+        }
+        let mut soft = [0f32; TILE];
+        for r in 0..TILE {
+            soft[r] = softened::<F>(t.soften, o[r * out16 + SOFTNESS]);
         }
         for r in 0..rows {
             let (c, out) = (&rgb[r * RGB_PADDED..], &mut t.out[(base + r) * WIDTH..][..WIDTH]);
-            let soft = softened::<F>(t.soften, o[r * out16 + SOFTNESS]);
-            out.copy_from_slice(&[o[r * out16], n[r][0], n[r][1], n[r][2], c[0], c[1], c[2], soft]);
+            out.copy_from_slice(&[o[r * out16], n[0][r], n[1][r], n[2][r], c[0], c[1], c[2], soft[r]]);
         }
     }
 }
 
 dispatch! { fn forward_task / forward_body(t: &mut SdfForwardTask, w: &Weights) }
 
-/// Evaluates the color network on a tile of inputs, up to its last activation.
+/// Evaluates the color network on a tile of inputs.
 #[inline(always)]
-fn color_layers<const F: bool>(w: &Weights, c0: &[f32], c1: &mut [f32], c2: &mut [f32], rgb: &mut [f32]) {
+fn color_layers<const F: bool>(
+    w: &Weights,
+    c0: &[f32],
+    c1: &mut [f32],
+    c2: &mut [f32],
+    rgb: &mut [f32; TILE * RGB_PADDED],
+) {
     let ci = w.layout.color_padded();
     gemm::<F>((TILE, HIDDEN, ci), c0, (ci, 1), &w.c1.t, HIDDEN, c1, HIDDEN, false);
-    c1.iter_mut().for_each(|v| *v = v.max(0.0));
+    relu(c1);
     gemm::<F>((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2.t, HIDDEN, c2, HIDDEN, false);
-    c2.iter_mut().for_each(|v| *v = v.max(0.0));
+    relu(c2);
     gemm::<F>((TILE, RGB_PADDED, HIDDEN), c2, (HIDDEN, 1), &w.c3.t, RGB_PADDED, rgb, RGB_PADDED, false);
+    for v in rgb {
+        *v = sigmoid::<F>(*v);
+    }
+}
+
+// Loops here are no closures: closures are compiled without the vector instructions of the kernel that calls them.
+#[inline(always)]
+fn relu(values: &mut [f32]) {
+    for v in values {
+        *v = v.max(0.0);
+    }
 }
 
 /// Writes the columns of a row after the first [`COLOR_INPUTS`]: the hash features, if the color network reads them, and
@@ -270,11 +294,17 @@ fn write_skip(layout: Layout, u: &[f32], row: &mut [f32]) {
     row[COLOR_INPUTS + count..].fill(0.0);
 }
 
-/// Returns v / ‖v‖ with the norm clamped to at least 1e-12, like torch's `normalize`.
+/// Returns v / ‖v‖ of each column, with the norm clamped to at least 1e-12, like torch's `normalize`.
 #[inline(always)]
-fn unit(v: [f32; 3]) -> [f32; 3] {
-    let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt().max(1e-12);
-    v.map(|c| c / length)
+fn units(v: &[[f32; TILE]; 3]) -> [[f32; TILE]; 3] {
+    let mut out = *v;
+    for r in 0..TILE {
+        let length = (v[0][r] * v[0][r] + v[1][r] * v[1][r] + v[2][r] * v[2][r]).sqrt().max(1e-12);
+        for k in 0..3 {
+            out[k][r] /= length;
+        }
+    }
+    out
 }
 
 /// Evaluates sdf, gradient and color at points, and keeps the activations that the backward pass needs.
@@ -308,7 +338,8 @@ fn run(
     let (kp, ci) = (weights.layout.padded(), weights.layout.color_padded());
     let x01 = shape.x01(x);
     let mut value = Buffer::scratch(levels * n * 2);
-    let mut jacobian = Buffer::scratch(levels * n * 6);
+    let block_floats = n.div_ceil(LANES) * 6 * LANES;
+    let mut jacobian = Buffer::scratch(levels * block_floats);
     let active = &shape.levels[..shape.active];
     hash::gather(
         active,
@@ -316,40 +347,35 @@ fn run(
         &x01,
         shape.world(),
         bytemuck::cast_slice_mut(&mut value[..active.len() * n * 2]),
-        Some(bytemuck::cast_slice_mut(&mut jacobian[..active.len() * n * 6])),
+        Some(bytemuck::cast_slice_mut(&mut jacobian[..active.len() * block_floats])),
     );
     let color = direction.is_some();
     let mut u = Buffer::scratch(np * kp);
-    let mut qr = Buffer::scratch(np * kp);
+    let mut q = Buffer::scratch(active.len() * n * 2);
     let mut h = Buffer::scratch(np * HIDDEN);
     let mut c0 = Buffer::scratch(np * ci);
     let mut c1 = Buffer::scratch(if color { np * HIDDEN } else { 0 });
     let mut c2 = Buffer::scratch(if color { np * HIDDEN } else { 0 });
     let mut out = Buffer::scratch(n * WIDTH);
-    let widths = [kp, kp, HIDDEN, ci, HIDDEN, HIDDEN, WIDTH];
-    let mut cut = pieces([&mut u, &mut qr, &mut h, &mut c0, &mut c1, &mut c2, &mut out], widths, CHUNK);
+    let widths = [kp, HIDDEN, ci, HIDDEN, HIDDEN, WIDTH];
+    let mut cut = pieces([&mut u, &mut h, &mut c0, &mut c1, &mut c2, &mut out], widths, CHUNK);
+    let q_of_chunks = by_chunk(bytemuck::cast_slice_mut(&mut q), n, CHUNK);
+    let jacobian_blocks = bytemuck::cast_slice(&jacobian);
     let mut tasks: Vec<SdfForwardTask> = (0..n)
         .step_by(CHUNK)
-        .map(|start| {
+        .zip(q_of_chunks)
+        .map(|(start, q)| {
             let range = start..(start + CHUNK).min(n);
             let direction = direction.map(|d| &d[range.clone()]);
             let inputs = Inputs::new(shape, x, &value, range);
-            let [u, q, h, c0, c1, c2, out] = cut();
-            let soften = shape.soften;
-            SdfForwardTask { inputs, direction, jacobian: &jacobian, soften, u, h, q, c0, c1, c2, out }
+            let [u, h, c0, c1, c2, out] = cut();
+            let (jacobian, soften) = (jacobian_blocks, shape.soften);
+            SdfForwardTask { inputs, direction, jacobian, soften, u, h, q, c0, c1, c2, out }
         })
         .collect();
     tasks.par_iter_mut().for_each(|t| forward_task(t, weights));
     drop((tasks, cut));
     drop(value);
-    // the scatter reads q level by level
-    let mut q = Buffer::scratch(levels * n * 2);
-    q.par_chunks_mut(n.max(1) * 2).enumerate().for_each(|(l, q)| {
-        for s in 0..n {
-            q[2 * s] = qr[s * kp + 2 * l];
-            q[2 * s + 1] = qr[s * kp + 2 * l + 1];
-        }
-    });
     Activations { shape: shape.clone(), samples: n, x01, jacobian, q, u, h, c0, c1, c2, out }
 }
 

@@ -107,7 +107,8 @@ pub fn gemm<const F: bool>(
 pub fn exp<const F: bool>(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0);
     // x = n ln 2 + r, |r| ≤ ln 2 / 2; ln 2 in two parts (Cody, Waite) keeps r exact.
-    let n = fma::<F>(x, std::f32::consts::LOG2_E, 12_582_912.0) - 12_582_912.0;
+    let rounded = fma::<F>(x, std::f32::consts::LOG2_E, 12_582_912.0);
+    let n = rounded - 12_582_912.0;
     let r = fma::<F>(n, -0.693_145_75, x);
     let r = fma::<F>(n, -1.428_606_8e-6, r);
     let p = fma::<F>(r, 1.0 / 720.0, 1.0 / 120.0);
@@ -115,8 +116,9 @@ pub fn exp<const F: bool>(x: f32) -> f32 {
     let p = fma::<F>(r, p, 1.0 / 6.0);
     let p = fma::<F>(r, p, 0.5);
     let p = fma::<F>(r * r, p, r + 1.0);
-    // SAFETY of the bit trick: n is an integer in [-126, 127], so the exponent stays in range.
-    p * f32::from_bits(((n as i32 + 127) as u32) << 23)
+    // The lowest bits of `rounded` are n in [-126, 127], which becomes the exponent. A cast of n to an integer would
+    // saturate, which keeps loops from being vectorized.
+    p * f32::from_bits((rounded.to_bits() << 23).wrapping_add(127 << 23))
 }
 
 /// ln(1 + e) for e in [0, 1], error below 2e-7 relative: 2 artanh(e / (2 + e)).
@@ -131,6 +133,13 @@ pub fn ln_1p<const F: bool>(e: f32) -> f32 {
     let p = fma::<F>(s, p, 1.0 / 3.0);
     let p = fma::<F>(s, p, 1.0);
     2.0 * t * p
+}
+
+/// Returns `g` if `h` is positive, else 0: the gradient of a relu whose output is `h`. A branch would become a masked store,
+/// which takes tens of cycles on some processors.
+#[inline(always)]
+pub fn relu_gradient(g: f32, h: f32) -> f32 {
+    f32::from_bits(g.to_bits() & u32::from(h > 0.0).wrapping_neg())
 }
 
 /// 1 / (1 + e⁻ˣ).

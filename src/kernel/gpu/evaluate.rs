@@ -204,7 +204,7 @@ mod tests {
         let some: Vec<usize> = (0..rays.len()).step_by(97).collect();
         let few: Vec<MarchRay> = some.iter().map(|&r| rays[r]).collect();
         let samples = march::march(&mask, None, shape.radius, 0.04, &few, usize::MAX);
-        let (x, d) = samples.points(&few, 0);
+        let (x, d) = samples.points(&few);
         let field = sdf::forward(&shape, &table, &weights, &x, &d);
         let along: Vec<[f32; 3]> = few.iter().map(|r| r.direction).collect();
         let dt = vec![0.04; x.len()];

@@ -375,12 +375,16 @@ mod tests {
         let (levels, table, x) = grid();
         let n = levels.len();
         let mut value = vec![[0f32; 2]; n * SAMPLES];
-        let mut jacobian = vec![[0f32; 6]; n * SAMPLES];
+        let blocks = SAMPLES.div_ceil(hash::LANES);
+        let mut jacobian = vec![[[0f32; hash::LANES]; 6]; n * blocks];
         hash::gather(&levels, &table, &inside(&x), 0.5 / RADIUS, &mut value, Some(&mut jacobian));
         let want = |l: usize| &value[l * SAMPLES..][..SAMPLES];
         let want: Vec<f32> = (0..n).flat_map(|l| planes(want(l), CAPACITY)).collect();
-        let slopes: Vec<f32> =
-            (0..n).flat_map(|l| planes(&jacobian[l * SAMPLES..][..SAMPLES], CAPACITY)).collect();
+        let slope = |i: usize| jacobian[i / hash::LANES].map(|lanes| lanes[i % hash::LANES]);
+        let rows = |l: usize| -> Vec<[f32; 6]> {
+            (0..SAMPLES).map(|s| slope(l * blocks * hash::LANES + s)).collect()
+        };
+        let slopes: Vec<f32> = (0..n).flat_map(|l| planes(&rows(l), CAPACITY)).collect();
 
         let device_grid = Grid::new(&device, &levels, levels.len(), RADIUS);
         let (table, x) = (device.upload(table.as_flattened()), device.upload(&planes(&x, CAPACITY)));

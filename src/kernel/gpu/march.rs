@@ -364,7 +364,7 @@ mod tests {
             assert_eq!(device.read::<i32>(&got.offsets)[..=rays.len()], want.offsets);
             assert!((0..alive.len()).all(|r| (alive[r] == 1) == (r < rays.len())));
             agree("marched t", &device.read::<f32>(&got.t)[..n], &want.t, 1e-5);
-            let (x, d) = want.points(&rays, 0);
+            let (x, d) = want.points(&rays);
             agree("marched x", &device.read::<f32>(&got.x), &planes(&x, 1 << 16), 1e-5);
             agree("marched directions", &device.read::<f32>(&got.direction), &planes(&d, 1 << 16), 1e-5);
             println!("{n} samples");

@@ -17,16 +17,16 @@ pub(crate) fn features<R: Real>(shape: &FieldShape, table: &[[R; 2]], x: [f32; 3
     }
     for (l, level) in shape.levels.iter().enumerate().take(shape.active) {
         let x01: [f32; 3] = from_fn(|a| x[a] * (0.5 / shape.radius) + 0.5);
-        let (index, fraction) = hash::cell::<true>(level, x01);
+        let (index, fraction) = hash::cells::<true>(level, &[x01; hash::LANES]);
         let f: [f64; 3] = from_fn(|a| {
             let p = level.scale as f64 * (x[a] as f64 * (0.5 / r) + 0.5) + 0.5;
-            p - (p - fraction[a] as f64).round()
+            p - (p - fraction[a][0] as f64).round()
         });
         let slope = level.scale as f64 * 0.5 / r;
         for c in 0..8 {
             let bit = |a: usize| c >> a & 1 == 1;
             let w: [f64; 3] = from_fn(|a| if bit(a) { f[a] } else { 1.0 - f[a] });
-            let e = table[level.offset + index[c] as usize];
+            let e = table[level.offset + index[c][0] as usize];
             for j in 0..2 {
                 u[3 + 2 * l + j] += R::of(w[0] * w[1] * w[2]) * e[j];
                 for a in 0..3 {

@@ -115,11 +115,10 @@ fn config(folder: &Path) -> Config {
     config.capture.path = folder.display().to_string();
     let f = &mut config.iface;
     (f.steps, f.rays, f.max_rays, f.samples, f.start, f.stereo) = (100, 256, 512, 4096, Start::Sphere, 0.0);
-    (f.levels, f.log2_table, f.occupancy_resolution, f.level_every) = (6, 12, 32, 30);
-    (f.anneal_end, f.warmup, f.min_step) = (50, 20, 0.02);
+    (f.levels, f.log2_table, f.occupancy_resolution) = (6, 12, 32);
+    (f.anneal_end, f.warmup, f.min_step) = (0.5, 0.2, 0.02);
     let f = &mut config.tface;
     (f.steps, f.rays, f.voxels_start, f.voxels_final, f.hidden) = (100, 512, 16 * 16 * 16, 32 * 32 * 32, 32);
-    (f.upsample_steps, f.mask_steps) = (vec![30, 60], vec![40]);
     (f.density_rank, f.color_rank) = (vec![4; 3], vec![8; 3]);
     config
 }

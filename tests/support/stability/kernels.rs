@@ -126,7 +126,9 @@ fn grids(cases: &mut Cases) {
         let (wide, x) = (wide_table(&table), points(1500, 1.0));
         let x01: Vec<[f32; 3]> = x.iter().map(|p| p.map(|c| c * 0.5 + 0.5)).collect();
         let n = x.len();
-        let (mut value, mut jacobian) = (vec![[0f32; 2]; count * n], vec![[0f32; 6]; count * n]);
+        let blocks = n.div_ceil(hash::LANES);
+        let (mut value, mut jacobian) =
+            (vec![[0f32; 2]; count * n], vec![[[0f32; hash::LANES]; 6]; count * blocks]);
         hash::gather(&shape.levels, &table, &x01, 0.5, &mut value, Some(&mut jacobian));
         let (mut values, mut slopes) = (Vec::new(), Vec::new());
         for (i, p) in x.iter().enumerate() {
@@ -136,7 +138,9 @@ fn grids(cases: &mut Cases) {
                 values.push(relative(value[l * n + i], &u[at..at + 2], 1.0));
                 let want: Vec<f64> =
                     du[at..at + 2].iter().flatten().map(|d| d / (0.5 * level.scale as f64)).collect();
-                slopes.push(relative(jacobian[l * n + i].map(|d| d / (0.5 * level.scale)), &want, 1.0));
+                let got =
+                    jacobian[l * blocks + i / hash::LANES].map(|d| d[i % hash::LANES] / (0.5 * level.scale));
+                slopes.push(relative(got, &want, 1.0));
             }
         }
         // positions of f32 in the finest of some thousand cells: 2048 · 6e-8, times the slopes of the table

@@ -212,7 +212,7 @@ fn spheres(cases: &mut Cases) {
         let see = |height: f32| {
             let r = MarchRay { origin: [height, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.37 };
             let samples = march(&full, None, 1.0, step, &[r], 1 << 20);
-            let (x, _) = samples.points(&[r], 0);
+            let (x, _) = samples.points(&[r]);
             let field: Vec<f32> = x
                 .iter()
                 .flat_map(|p| {

@@ -2,22 +2,22 @@
 
 use super::{Activations, CHUNK, WIDTH};
 use crate::dispatch;
-use crate::kernel::cpu::hash;
+use crate::kernel::cpu::hash::{self, JacobianBlock, LANES};
 use crate::kernel::cpu::matrix::add_to;
 use crate::kernel::cpu::mlp::{
     COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
 };
 use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
-use crate::kernel::cpu::pool::Buffer;
-use crate::kernel::cpu::simd::{exp, gemm};
+use crate::kernel::cpu::pool::{Buffer, by_chunk};
+use crate::kernel::cpu::simd::{exp, fma, gemm, relu_gradient};
 use rayon::prelude::*;
 
 /// The backward pass of a range of samples.
 struct SdfBackwardTask<'a> {
     start: usize,
     g_out: &'a [f32],
-    g_value: &'a mut [f32],       // [n, 2L], row-major, transposed afterwards
-    g_normal: &'a mut [[f32; 3]], // [n, 3]
+    g_value: Vec<&'a mut [[f32; 2]]>, // of each active level
+    g_normal: &'a mut [[f32; 3]],     // [n, 3]
     /// Gradients with respect to the matrices, in the shapes of [`Layout::gradient_shapes`](crate::kernel::cpu::mlp::Layout::gradient_shapes).
     gradients: [Vec<f32>; 7],
 }
@@ -25,11 +25,11 @@ struct SdfBackwardTask<'a> {
 #[inline(always)]
 fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &Weights) {
     let (kp, ci) = (w.layout.padded(), w.layout.color_padded());
-    let levels = a.shape.levels.len();
-    let features = 2 * levels;
+    let features = 2 * a.shape.levels.len();
     let features_padded = features.next_multiple_of(8);
     let inv_radius = 1.0 / a.shape.radius;
-    let total = a.samples;
+    let blocks = a.samples.div_ceil(LANES);
+    let jacobian: &[JacobianBlock] = bytemuck::cast_slice(&a.jacobian);
     let [g_w1, g_b1, g_w2, g_b2, g_c1_weights, g_c2_weights, g_c3_weights] = &mut t.gradients;
     let mut g_pre = [0f32; TILE * RGB_PADDED];
     let mut g_c2 = [0f32; TILE * HIDDEN];
@@ -64,12 +64,12 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
         gemm::<F>((4, HIDDEN, TILE), &g_pre, (1, RGB_PADDED), c2, HIDDEN, g_c3_weights, HIDDEN, true);
         gemm::<F>((TILE, HIDDEN, 3), &g_pre, (RGB_PADDED, 1), &w.c3.m, HIDDEN, &mut g_c2, HIDDEN, false);
         for i in 0..TILE * HIDDEN {
-            g_c2[i] = if c2[i] > 0.0 { g_c2[i] } else { 0.0 };
+            g_c2[i] = relu_gradient(g_c2[i], c2[i]);
         }
         gemm::<F>((HIDDEN, HIDDEN, TILE), &g_c2, (1, HIDDEN), c1, HIDDEN, g_c2_weights, HIDDEN, true);
         gemm::<F>((TILE, HIDDEN, HIDDEN), &g_c2, (HIDDEN, 1), &w.c2.m, HIDDEN, &mut g_c1, HIDDEN, false);
         for i in 0..TILE * HIDDEN {
-            g_c1[i] = if c1[i] > 0.0 { g_c1[i] } else { 0.0 };
+            g_c1[i] = relu_gradient(g_c1[i], c1[i]);
         }
         gemm::<F>((HIDDEN, ci, TILE), &g_c1, (1, HIDDEN), c0, ci, g_c1_weights, ci, true);
         gemm::<F>((TILE, ci, HIDDEN), &g_c1, (HIDDEN, 1), &w.c1.m, ci, &mut g_c0, ci, false);
@@ -77,6 +77,7 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
         // outputs of the geometry network and the spatial gradient
         g_o.fill(0.0);
         g_q.fill(0.0);
+        let mut normal = [[0f32; TILE]; 3];
         for r in 0..rows {
             let from_color = &g_c0[r * ci..][..ci];
             g_o[r * OUTPUTS_PADDED..][..OUTPUTS].copy_from_slice(&from_color[..OUTPUTS]);
@@ -99,40 +100,50 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
             });
             t.g_normal[tile * TILE + r] = n;
             for k in 0..3 {
+                normal[k][r] = n[k];
                 g_q[r * kp + features + k] = n[k] * inv_radius;
             }
         }
         for l in 0..a.shape.active {
-            let j = &a.jacobian[(l * total + base) * 6..][..rows * 6];
-            for r in 0..rows {
-                let n = t.g_normal[tile * TILE + r];
-                let j = &j[6 * r..][..6];
-                g_q[r * kp + 2 * l] = j[0] * n[0] + j[1] * n[1] + j[2] * n[2];
-                g_q[r * kp + 2 * l + 1] = j[3] * n[0] + j[4] * n[1] + j[5] * n[2];
+            let jacobian = &jacobian[l * blocks + base / LANES..][..rows.div_ceil(LANES)];
+            for (b, j) in jacobian.iter().enumerate() {
+                let mut pair = [[0f32; LANES]; 2];
+                for c in 0..2 {
+                    for i in 0..LANES {
+                        let n: [f32; 3] = std::array::from_fn(|k| normal[k][b * LANES + i]);
+                        let j = &j[3 * c..];
+                        pair[c][i] = fma::<F>(j[0][i], n[0], fma::<F>(j[1][i], n[1], j[2][i] * n[2]));
+                    }
+                }
+                for i in 0..LANES {
+                    g_q[(b * LANES + i) * kp + 2 * l..][..2].copy_from_slice(&[pair[0][i], pair[1][i]]);
+                }
             }
         }
-        for (row, (s, a)) in
-            h.chunks_exact(HIDDEN).zip(s.chunks_exact_mut(HIDDEN).zip(weighted.chunks_exact_mut(HIDDEN)))
-        {
+        let first_row = w.output_row(0);
+        let hidden_rows = h.as_chunks::<HIDDEN>().0.iter().zip(s.as_chunks_mut::<HIDDEN>().0);
+        for ((h, s), a) in hidden_rows.zip(weighted.as_chunks_mut::<HIDDEN>().0) {
             for j in 0..HIDDEN {
-                s[j] = 1.0 - exp::<F>(-100.0 * row[j]);
-                a[j] = s[j] * w.w2.m[j];
+                s[j] = 1.0 - exp::<F>(-100.0 * h[j]);
+                a[j] = s[j] * first_row[j];
             }
         }
         gemm::<F>((TILE, HIDDEN, kp), &g_q, (kp, 1), &w.w1.t, HIDDEN, &mut g_a, HIDDEN, false);
         let (go, op) = (&g_o, OUTPUTS_PADDED);
         gemm::<F>((TILE, HIDDEN, OUTPUTS), go, (op, 1), &w.w2.m, HIDDEN, &mut g_z, HIDDEN, false);
         gemm::<F>((op, HIDDEN, TILE), go, (1, op), h, HIDDEN, g_w2, HIDDEN, true);
-        for r in 0..rows {
-            for j in 0..op {
-                g_b2[j] += g_o[r * op + j];
-            }
-            let row = r * HIDDEN..(r + 1) * HIDDEN;
-            let (s, g_a, g_z) = (&s[row.clone()], &g_a[row.clone()], &mut g_z[row]);
+        for row in g_o.as_chunks::<OUTPUTS_PADDED>().0 {
+            g_b2.iter_mut().zip(row).for_each(|(sum, g)| *sum += g);
+        }
+        let sums: (&mut [[f32; HIDDEN]], &mut [[f32; HIDDEN]]) =
+            (g_w2.as_chunks_mut().0, g_b1.as_chunks_mut().0);
+        let (g_row, g_bias) = (&mut sums.0[0], &mut sums.1[0]);
+        let given = s.as_chunks::<HIDDEN>().0.iter().zip(g_a.as_chunks::<HIDDEN>().0);
+        for ((s, g_a), g_z) in given.zip(g_z.as_chunks_mut::<HIDDEN>().0).take(rows) {
             for j in 0..HIDDEN {
-                g_w2[j] += g_a[j] * s[j];
-                g_z[j] = s[j] * (g_z[j] + 100.0 * g_a[j] * w.w2.m[j] * (1.0 - s[j]));
-                g_b1[j] += g_z[j];
+                g_row[j] += g_a[j] * s[j];
+                g_z[j] = s[j] * (g_z[j] + 100.0 * g_a[j] * first_row[j] * (1.0 - s[j]));
+                g_bias[j] += g_z[j];
             }
         }
         g_z[rows * HIDDEN..].fill(0.0);
@@ -140,12 +151,12 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
         gemm::<F>((HIDDEN, kp, TILE), &g_z, (1, HIDDEN), u, kp, g_w1, kp, true);
         let wide = (TILE, features_padded, HIDDEN);
         gemm::<F>(wide, &g_z, (HIDDEN, 1), &w.w1.m, kp, &mut g_u, kp, false);
-        for r in 0..rows {
-            let g_features_row = &mut t.g_value[(tile * TILE + r) * features..][..features];
-            g_features_row.copy_from_slice(&g_u[r * kp..][..features]);
-            if w.layout.color_skip {
-                let skipped = &g_c0[r * ci + COLOR_INPUTS..][..features];
-                g_features_row.iter_mut().zip(skipped).for_each(|(g, s)| *g += s);
+        for (l, g_value) in t.g_value.iter_mut().enumerate() {
+            for (r, g) in g_value[tile * TILE..][..rows].iter_mut().enumerate() {
+                let of_layer = &g_u[r * kp + 2 * l..][..2];
+                let skip =
+                    if w.layout.color_skip { &g_c0[r * ci + COLOR_INPUTS + 2 * l..][..2] } else { &[0.0; 2] };
+                *g = [of_layer[0] + skip[0], of_layer[1] + skip[1]];
             }
         }
     }
@@ -170,12 +181,11 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
     if n == 0 {
         return flat;
     }
-    let levels = a.shape.levels.len();
-    let features = 2 * levels;
-    let mut g_value = Buffer::scratch(n * features);
+    let active = &a.shape.levels[..a.shape.active];
+    let mut g_value = Buffer::scratch(active.len() * n * 2);
     let mut g_normal = vec![[0f32; 3]; n];
-    let mut tasks: Vec<SdfBackwardTask> = g_value
-        .chunks_mut(CHUNK * features)
+    let mut tasks: Vec<SdfBackwardTask> = by_chunk(bytemuck::cast_slice_mut(&mut g_value), n, CHUNK)
+        .into_iter()
         .zip(g_normal.chunks_mut(CHUNK))
         .zip(g_out.chunks(CHUNK * WIDTH))
         .enumerate()
@@ -197,21 +207,13 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
         add_to(&mut flat, &layout.shapes(), &parts);
     }
     drop(tasks);
-    let active = &a.shape.levels[..a.shape.active];
-    let mut transposed = Buffer::scratch(active.len() * n * 2);
-    transposed.par_chunks_mut(n * 2).enumerate().for_each(|(l, out)| {
-        for s in 0..n {
-            out[2 * s] = g_value[s * features + 2 * l];
-            out[2 * s + 1] = g_value[s * features + 2 * l + 1];
-        }
-    });
     hash::scatter(
         active,
         g_table,
         &a.x01,
         a.shape.world(),
-        bytemuck::cast_slice(&transposed),
-        bytemuck::cast_slice(&a.q[..active.len() * n * 2]),
+        bytemuck::cast_slice(&g_value),
+        bytemuck::cast_slice(&a.q),
         &g_normal,
     );
     flat

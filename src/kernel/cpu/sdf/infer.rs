@@ -8,70 +8,69 @@ use crate::kernel::cpu::mlp::{
     COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
 };
 use crate::kernel::cpu::pool::Buffer;
-use crate::kernel::cpu::simd::{exp, gemm, ln_1p, sigmoid};
+use crate::kernel::cpu::simd::{exp, fma, gemm, ln_1p};
 use rayon::prelude::*;
 
-/// Returns softplus₁₀₀(v).
+/// Replaces `z` by softplus₁₀₀(z + b).
 #[inline(always)]
-fn softplus<const F: bool>(v: f32) -> f32 {
-    v.max(0.0) + 0.01 * ln_1p::<F>(exp::<F>(-(100.0 * v).abs()))
+fn softplus<const F: bool>(z: &mut [f32], b: &[f32; HIDDEN]) {
+    for row in z.as_chunks_mut::<HIDDEN>().0 {
+        for j in 0..HIDDEN {
+            let v = row[j] + b[j];
+            row[j] = v.max(0.0) + 0.01 * ln_1p::<F>(exp::<F>(-(100.0 * v).abs()));
+        }
+    }
 }
 
-/// Evaluates one output of the geometry network for the samples of a task.
+/// Evaluates signed distance and softness of the samples of a task.
 #[inline(always)]
-fn value_body<const F: bool>(inputs: &Inputs, output: usize, values: &mut [f32], w: &Weights) {
+fn values_body<const F: bool>(inputs: &Inputs, soften: f32, values: &mut [[f32; 2]], w: &Weights) {
     let kp = w.layout.padded();
-    let samples = inputs.x.len();
     let mut u = vec![0f32; TILE * kp];
     let mut h = [0f32; TILE * HIDDEN];
-    let w2 = &w.w2.m[output * HIDDEN..][..HIDDEN];
-    for tile in 0..samples.div_ceil(TILE) {
-        let base = tile * TILE;
-        let rows = TILE.min(samples - base);
-        inputs.fill(&mut u, kp, base, rows);
+    for (tile, values) in values.chunks_mut(TILE).enumerate() {
+        inputs.fill(&mut u, kp, tile * TILE, values.len());
         gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
-        for r in 0..rows {
-            let row = &h[r * HIDDEN..][..HIDDEN];
-            let mut sum = [0f32; 8];
-            for j in 0..HIDDEN {
-                sum[j % 8] += softplus::<F>(row[j] + w.b1[j]) * w2[j];
+        softplus::<F>(&mut h, &w.b1);
+        for (value, h) in values.iter_mut().zip(h.as_chunks::<HIDDEN>().0) {
+            for (value, output) in value.iter_mut().zip([0, SOFTNESS]) {
+                let mut sum = [0f32; 8];
+                for (h, w) in h.as_chunks::<8>().0.iter().zip(w.output_row(output).as_chunks::<8>().0) {
+                    for k in 0..8 {
+                        sum[k] = fma::<F>(h[k], w[k], sum[k]);
+                    }
+                }
+                *value = sum.iter().sum::<f32>() + w.b2[output];
             }
-            values[base + r] = sum.iter().sum::<f32>() + w.b2[output];
+            value[1] = softened::<F>(soften, value[1]);
         }
     }
 }
 
 dispatch! {
-    fn value_task / value_body(inputs: &Inputs, output: usize, values: &mut [f32], w: &Weights)
+    fn values_task / values_body(inputs: &Inputs, soften: f32, values: &mut [[f32; 2]], w: &Weights)
 }
 
-/// Returns the signed distances at points, `[n, 3]` → `[n]`, in a quarter of the time of [`super::forward`].
+/// Returns the signed distances at points, `[n, 3]` → `[n]`, in a third of the time of [`super::forward`].
 pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
-    output(shape, table, weights, x, 0)
+    values_and_softness(shape, table, weights, x).into_iter().map(|[value, _]| value).collect()
 }
 
 /// Returns ln of the ratio of the local to the maximum sharpness at points, `[n, 3]` → `[n]`, in `-soften..=0`.
 pub fn softness(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
-    if shape.soften == 0.0 {
-        return vec![0.0; x.len()];
-    }
-    let mut soft = output(shape, table, weights, x, SOFTNESS);
-    // no fused multiply-add: outside of a dispatched function it would be a call into the C library
-    soft.iter_mut().for_each(|v| *v = softened::<false>(shape.soften, *v));
-    soft
+    values_and_softness(shape, table, weights, x).into_iter().map(|[_, soft]| soft).collect()
 }
 
-/// Returns one output of the geometry network at points, `[n, 3]` → `[n]`.
-fn output(
+/// Returns the signed distances at points, and their [`softness`], `[n, 3]` → `[n, 2]`.
+pub fn values_and_softness(
     shape: &FieldShape,
     table: &[[f32; 2]],
     weights: &Weights,
     x: &[[f32; 3]],
-    output: usize,
-) -> Vec<f32> {
+) -> Vec<[f32; 2]> {
     /// Points per pass, which bounds the scratch memory for any number of points.
     const PASS: usize = 1 << 16;
-    let mut values = vec![0.0; x.len()];
+    let mut values = vec![[0.0; 2]; x.len()];
     let active = &shape.levels[..shape.active];
     for (x, values) in x.chunks(PASS).zip(values.chunks_mut(PASS)) {
         let n = x.len();
@@ -80,7 +79,7 @@ fn output(
         let value = &value[..];
         values.par_chunks_mut(CHUNK).enumerate().for_each(|(i, values)| {
             let range = i * CHUNK..i * CHUNK + values.len();
-            value_task(&Inputs::new(shape, x, value, range), output, values, weights);
+            values_task(&Inputs::new(shape, x, value, range), shape.soften, values, weights);
         });
     }
     values
@@ -109,8 +108,8 @@ impl Shader {
     fn run<const F: bool>(&mut self, w: &Weights, out: &mut [[f32; 3]]) {
         let Shader { c0, c1, c2, rgb } = self;
         color_layers::<F>(w, c0, c1, c2, rgb);
-        for (r, out) in out.iter_mut().enumerate() {
-            *out = std::array::from_fn(|c| sigmoid::<F>(rgb[r * RGB_PADDED + c]));
+        for (rgb, out) in rgb.as_chunks::<RGB_PADDED>().0.iter().zip(out) {
+            *out = [rgb[0], rgb[1], rgb[2]];
         }
     }
 }
@@ -135,11 +134,7 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
         let rows = TILE.min(samples - base);
         task.inputs.fill(&mut u, kp, base, rows);
         gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
-        for row in h.chunks_exact_mut(HIDDEN) {
-            for j in 0..HIDDEN {
-                row[j] = softplus::<F>(row[j] + w.b1[j]);
-            }
-        }
+        softplus::<F>(&mut h, &w.b1);
         let op = OUTPUTS_PADDED;
         gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2.t, op, &mut o, op, false);
         for r in 0..rows {

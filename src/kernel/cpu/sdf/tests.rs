@@ -23,6 +23,10 @@ fn small_field(color_skip: bool) -> (FieldShape, Vec<[f32; 2]>, Vec<f32>) {
     (shape, table, flat)
 }
 
+fn unit(v: [f32; 3]) -> [f32; 3] {
+    glam::Vec3::from(v).normalize().to_array()
+}
+
 fn points(n: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
     let at = |i: usize, k: f32| ((i as f32 + 0.37) * k).sin();
     let x = (0..n).map(|i| [at(i, 1.7), at(i, 2.9), at(i, 0.83)]).collect();
@@ -36,7 +40,7 @@ fn the_activation_gives_the_published_values() {
     let golden = [(-0.05, 6.715348e-5), (0.0, 0.0069314718), (0.01, 0.0131326169), (0.3, 0.3)];
     let (mut z, mut s) = ([0f32; HIDDEN], [0f32; HIDDEN]);
     golden.iter().zip(&mut z).for_each(|((place, _), z)| *z = *place);
-    activate::<true>(&mut z, &mut s, &[0.0; HIDDEN]);
+    activate::<true>(&mut z, &mut s, &[0.0; HIDDEN], &[1.0; HIDDEN]);
     for ((place, want), got) in golden.iter().zip(z) {
         assert!((got - want).abs() < 2e-9 + 2e-7 * want, "{place}: {got} {want}");
     }

@@ -9,9 +9,9 @@
 use super::gather::FactorGradients;
 use super::{Cell, Grid};
 use crate::dispatch;
-use crate::kernel::cpu::matrix::{Matrix, add_to, padded, split};
+use crate::kernel::cpu::matrix::{Matrix, add_to, split};
 use crate::kernel::cpu::pool::{Buffer, pieces};
-use crate::kernel::cpu::simd::{gemm, sigmoid};
+use crate::kernel::cpu::simd::{gemm, relu_gradient, sigmoid};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -76,8 +76,8 @@ pub struct DecoderWeights {
     b1: Vec<f32>,
     w2: Matrix, // [h, h]
     b2: Vec<f32>,
-    w3: Matrix,   // [8, h]
-    b3: Vec<f32>, // [8]
+    w3: Matrix, // [8, h]
+    b3: [f32; RGB],
 }
 
 impl DecoderWeights {
@@ -96,7 +96,7 @@ impl DecoderWeights {
             w2: Matrix::new(w2, shapes[3], (h, h)),
             b2: b2.to_vec(),
             w3: Matrix::new(w3, shapes[5], (RGB, h)),
-            b3: padded(b3, RGB),
+            b3: std::array::from_fn(|c| b3.get(c).copied().unwrap_or(0.0)),
         }
     }
 
@@ -257,7 +257,7 @@ struct DecodeBackwardTask<'a> {
 fn relu_backward(g: &mut [f32], h: &[f32], bias: &mut [f32]) {
     for (g, h) in g.chunks_exact_mut(bias.len()).zip(h.chunks_exact(bias.len())) {
         for ((g, h), b) in g.iter_mut().zip(h).zip(bias.iter_mut()) {
-            *g = if *h > 0.0 { *g } else { 0.0 };
+            *g = relu_gradient(*g, *h);
             *b += *g;
         }
     }
