@@ -5,6 +5,7 @@ use super::super::raycast::RayHits;
 use super::project::{TILE, UNIT};
 use super::tile::{CENTER, GRID, NOTHING, SAMPLES, Tile};
 use crate::geom::{Camera, Hit, Mesh, ShellLayer};
+use bytemuck::Zeroable;
 use glam::{DVec3, Mat3, Vec2, Vec3};
 
 /// Number of samples that are intersected with their triangles at once.
@@ -82,7 +83,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
         part: Part,
         out: &mut Band,
         batch: &mut Batch,
-        queue: &mut Queue,
+        queue: &mut RayHits,
     ) {
         for y in 0..part.height {
             for x in 0..part.width {
@@ -151,7 +152,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
         part: Part,
         out: &mut Band,
         batch: &mut Batch,
-        queue: &mut Queue,
+        queue: &mut RayHits,
     ) {
         let count = std::mem::take(&mut batch.count);
         for k in 0..count {
@@ -169,17 +170,11 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
             let direction = Vec3::from(batch.direction.each_ref().map(|d| d[k]));
             let i = batch.pixel[k] as usize;
             let pixel = i / TILE * w + part.left + i % TILE;
-            let normal = || {
-                self.mesh.normal_at(&hit).unwrap_or_else(|| {
-                    let [a, b, c] = self.mesh.corners(triangle);
-                    (b - a).cross(c - a).normalize_or_zero()
-                })
-            };
             if batch.is_center[k] && sheet.layer.is_none() {
                 out.depth[pixel] = hit.t * direction.dot(self.forward) * self.scale;
                 out.triangles[pixel] = triangle;
                 if let Some(own) = out.normal.get_mut(pixel) {
-                    *own = (self.world_from_mesh * normal()).to_array();
+                    *own = (self.world_from_mesh * self.mesh.shading_normal(&hit)).to_array();
                 }
             }
             let share = match (light.get_mut(i), batch.samples[k]) {
@@ -200,21 +195,21 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                 continue;
             }
             if !self.bare {
-                let [a, b, c] = self.mesh.corners(triangle);
-                queue.hits.points.push((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c);
-                queue.hits.normals.push(normal());
+                queue.points.push(self.mesh.point_at(&hit));
+                queue.normals.push(self.mesh.shading_normal(&hit));
             }
-            queue.hits.directions.push(direction);
-            queue.hits.hits.push(hit);
-            queue.shares.push((pixel, share));
+            queue.directions.push(direction);
+            queue.hits.push(hit);
+            queue.pixels.push((pixel, share));
         }
-        if queue.shares.len() >= QUEUE {
+        if queue.pixels.len() >= QUEUE {
             queue.shade(out.rgba, &self.color);
         }
     }
 }
 
 /// Samples on the picture and the triangles to intersect at them.
+#[derive(Zeroable)]
 pub(super) struct Batch {
     count: usize,
     x: [f32; BATCH],
@@ -231,26 +226,6 @@ pub(super) struct Batch {
     u: [f32; BATCH],
     v: [f32; BATCH],
     t: [f32; BATCH],
-}
-
-impl Batch {
-    pub fn new() -> Box<Batch> {
-        let none = [0.0; BATCH];
-        Box::new(Batch {
-            count: 0,
-            x: none,
-            y: none,
-            pixel: [0; BATCH],
-            triangle: [0; BATCH],
-            samples: [0; BATCH],
-            is_center: [false; BATCH],
-            direction: [none; 3],
-            corners: [[none; 3]; 3],
-            u: none,
-            v: none,
-            t: none,
-        })
-    }
 }
 
 crate::dispatch! {
@@ -314,30 +289,4 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 #[inline(always)]
 fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-/// The hits that wait for their color, with their pixels and weights.
-#[derive(Default)]
-pub(super) struct Queue {
-    hits: RayHits,
-    shares: Vec<(usize, f32)>,
-}
-
-impl Queue {
-    /// Colors everything queued.
-    fn shade(&mut self, rgba: &mut [[f32; 4]], color: &impl Fn(&RayHits) -> Vec<[f32; 3]>) {
-        if self.shares.is_empty() {
-            return;
-        }
-        let colors = color(&self.hits);
-        for (k, (pixel, share)) in self.shares.drain(..).enumerate() {
-            let c = colors.get(k).unwrap_or(&[0.0; 3]);
-            let p = &mut rgba[pixel];
-            *p = [p[0] + share * c[0], p[1] + share * c[1], p[2] + share * c[2], p[3] + share];
-        }
-        self.hits.points.clear();
-        self.hits.normals.clear();
-        self.hits.directions.clear();
-        self.hits.hits.clear();
-    }
 }

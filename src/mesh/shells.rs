@@ -248,8 +248,7 @@ impl Outlines {
                     let others =
                         (0..alphas.len()).filter(|&o| o != k).map(|o| 1.0 - alphas[o]).product::<f32>();
                     let own = &shells.layers[*layer].alphas;
-                    let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
-                    for (v, w) in self.triangles[hit.triangle as usize].into_iter().zip(weights) {
+                    for (v, w) in self.triangles[hit.triangle as usize].into_iter().zip(hit.weights()) {
                         let alpha = own[v as usize];
                         let slope = others * w * alpha * (1.0 - alpha) / RAYS as f32;
                         let at = (layer * own.len()) as u32 + v;
@@ -343,9 +342,9 @@ mod tests {
         let values: Vec<f32> = (0..N * N * N).map(value).collect();
         let spacing = Vec3::splat(2.0 / (N - 1) as f32);
         let volume = Volume { dims: [N; 3], values: &values, origin: Vec3::NEG_ONE, spacing };
-        let surface = marching(&volume, true).unwrap();
+        let surface = marching(&volume, true).unwrap().mesh;
         let normals = surface.positions.iter().map(|p| p.normalize()).collect();
-        Mesh { positions: surface.positions, normals, triangles: surface.triangles, ..Mesh::default() }
+        Mesh { normals, ..surface }
     }
 
     /// Cameras around it, three units away.
