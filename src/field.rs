@@ -22,7 +22,7 @@ pub mod training;
 
 use crate::config::DeviceChoice;
 use crate::{Error, Result};
-#[cfg(feature = "wgpu")]
+use serde::Serialize;
 use std::sync::{Mutex, OnceLock};
 
 /// The device that a field is trained on.
@@ -71,7 +71,79 @@ pub struct SelfTest {
     pub field: &'static str,
     /// Runs the step on an adapter and on the processor, and compares the results.
     #[cfg(feature = "wgpu")]
-    pub run: fn(&crate::kernel::gpu::Adapter) -> Result<Vec<devices::Check>>,
+    pub run: fn(&crate::kernel::gpu::Adapter) -> Result<Vec<Check>>,
+}
+
+/// One quantity of a training step, and its deviation from the processor's value.
+#[derive(Debug, Serialize)]
+pub struct Check {
+    /// Field and quantity.
+    pub name: String,
+    /// Relative error; NaN if the device did not compute the quantity.
+    pub error: f32,
+    /// Largest error that passes.
+    pub allowed: f32,
+    /// Whether the error is within the limit.
+    pub passed: bool,
+}
+
+impl Check {
+    /// Compares an error with its limit.
+    pub fn new(name: String, error: f32, allowed: f32) -> Check {
+        Check { name, error, allowed, passed: error <= allowed }
+    }
+}
+
+/// The report of `tiface doctor` on a device.
+#[derive(Debug, Serialize)]
+pub struct Found {
+    /// Name for `--device`.
+    pub name: String,
+    /// Name that the driver reports.
+    pub adapter: String,
+    /// `discrete`, `integrated`, `virtual`, `other` or `software`.
+    pub kind: &'static str,
+    /// The driver and its version.
+    pub driver: String,
+    /// PCI address, if the device is a card.
+    pub card: Option<String>,
+    /// Atomic addition of floats: `native` or `exchange`.
+    pub atomics: &'static str,
+    /// Bytes of memory; `None` if the driver does not report it.
+    pub memory: Option<u64>,
+    /// Bytes of the largest buffer.
+    pub largest_buffer: u64,
+    /// Bytes of shared memory of a workgroup.
+    pub shared: usize,
+    /// Whether another training uses the device.
+    pub in_use: bool,
+    /// Comparisons of training steps with the processor's.
+    pub checks: Vec<Check>,
+    /// The error that prevented the comparison, if any.
+    pub error: Option<String>,
+    /// Seconds that the self-test took, including the driver's compilation of kernels.
+    pub seconds: f64,
+}
+
+/// Returns the report on every GPU of this machine, software renderers included, and the device that `--device auto`
+/// selects for all fields. The self-tests run, whatever earlier verdicts say.
+pub fn examine_devices(tests: &[SelfTest]) -> Result<(Vec<Found>, ComputeDevice)> {
+    #[cfg(feature = "wgpu")]
+    let found = devices::examine_adapters(tests);
+    #[cfg(not(feature = "wgpu"))]
+    let found = Vec::new();
+    Ok((found, select(&parse_choice("auto")?, tests)))
+}
+
+/// Returns the GPU that `auto` selects, or else the processor, with the reason.
+fn select(choice: &DeviceChoice, tests: &[SelfTest]) -> ComputeDevice {
+    #[cfg(feature = "wgpu")]
+    return devices::best(choice, tests).map_or_else(ComputeDevice::Cpu, ComputeDevice::Gpu);
+    #[cfg(not(feature = "wgpu"))]
+    {
+        let _ = (choice, tests);
+        ComputeDevice::Cpu(String::new())
+    }
 }
 
 /// Opens the device named `name`; see [`DeviceChoice`] for the syntax. `auto` selects a GPU only if it passes `test`, the
@@ -82,12 +154,7 @@ pub struct SelfTest {
 /// If this build or this machine has no such device.
 pub fn compute_device(name: &str, test: &SelfTest) -> Result<ComputeDevice> {
     let choice = parse_choice(name)?;
-    if choice.name == "auto" {
-        #[cfg(feature = "wgpu")]
-        return Ok(devices::best(&choice, &[*test]).map_or_else(ComputeDevice::Cpu, ComputeDevice::Gpu));
-    }
-    let _ = test;
-    open_named(&choice)
+    if choice.name == "auto" { Ok(select(&choice, &[*test])) } else { open_named(&choice) }
 }
 
 /// Refuses a device that [`compute_device`] would refuse. No GPU is opened unless one is named.
@@ -120,8 +187,6 @@ fn open_named(choice: &DeviceChoice) -> Result<ComputeDevice> {
         #[cfg(feature = "wgpu")]
         _ => Ok(ComputeDevice::Gpu(devices::open(choice)?)),
         #[cfg(not(feature = "wgpu"))]
-        "auto" => Ok(ComputeDevice::Cpu(String::new())),
-        #[cfg(not(feature = "wgpu"))]
         other => {
             let problem = format!("device `{other}`: this build learns on the processor alone");
             Err(Error::usage(problem, "build with `--features wgpu`, or leave `--device` out"))
@@ -130,13 +195,11 @@ fn open_named(choice: &DeviceChoice) -> Result<ComputeDevice> {
 }
 
 /// A field on a GPU, which is evaluated in place of the processor's until the GPU fails.
-#[cfg(feature = "wgpu")]
 pub struct GpuField<T> {
     field: Mutex<Option<T>>,
     failure: OnceLock<String>,
 }
 
-#[cfg(feature = "wgpu")]
 impl<T> GpuField<T> {
     /// Wraps a field; with `None`, [`ask`](GpuField::ask) always returns `None`.
     pub fn new(field: Option<T>) -> GpuField<T> {
@@ -162,7 +225,7 @@ impl<T> GpuField<T> {
     }
 }
 
-#[cfg(all(test, feature = "wgpu"))]
+#[cfg(test)]
 mod tests {
     use super::*;
 

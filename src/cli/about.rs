@@ -6,6 +6,7 @@ use super::options::{Common, RunTarget};
 use super::out::Out;
 use super::screen::print;
 use crate::config::explain;
+use crate::field::{Found, examine_devices};
 use crate::{Error, ErrorKind, Result, io};
 use clap::{Command, ValueEnum};
 use clap_complete::{Shell, generate};
@@ -36,35 +37,25 @@ struct Examination {
     system: String,
     processor: String,
     threads: usize,
-    #[cfg(feature = "wgpu")]
-    devices: Vec<crate::field::devices::Found>,
+    devices: Vec<Found>,
     /// What `--device auto` takes.
     auto: String,
 }
 
 pub(super) fn doctor(common: &Common) -> Result<()> {
     let features = [("wgpu", cfg!(feature = "wgpu")), ("matting", cfg!(feature = "matting"))];
-    #[cfg(feature = "wgpu")]
-    let (devices, auto) = {
-        use crate::field::devices::{best, examine_adapters};
-        let tests = [crate::iface::SDF_TEST, crate::tface::VM_TEST, crate::iface::DENSITY_TEST];
-        let devices = examine_adapters(&tests);
-        let choice = crate::config::DeviceChoice::parse("auto").expect("a device's name");
-        let auto = match best(&choice, &tests) {
-            Ok(gpu) => format!("{}: {}", gpu.device.name(), gpu.why),
-            Err(why) => format!("the processor: {why}"),
-        };
-        (devices, auto)
+    let tests = [crate::iface::SDF_TEST, crate::tface::VM_TEST, crate::iface::DENSITY_TEST];
+    let (devices, auto) = examine_devices(&tests)?;
+    let auto = match cfg!(feature = "wgpu") {
+        true => auto.description(),
+        false => "the processor: this build knows no GPU (`--features wgpu`)".into(),
     };
-    #[cfg(not(feature = "wgpu"))]
-    let auto = "the processor: this build knows no GPU (`--features wgpu`)".to_string();
     let found = Examination {
         version: env!("CARGO_PKG_VERSION"),
         features: features.into_iter().filter(|(_, is_on)| *is_on).map(|(name, _)| name).collect(),
         system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
         processor: io::processor(),
         threads: rayon::current_num_threads(),
-        #[cfg(feature = "wgpu")]
         devices,
         auto,
     };
@@ -79,10 +70,7 @@ pub(super) fn doctor(common: &Common) -> Result<()> {
 impl Examination {
     /// Does every device that is here compute what the processor does?
     fn is_sound(&self) -> bool {
-        #[cfg(feature = "wgpu")]
-        return self.devices.iter().all(|d| d.error.is_none() && d.checks.iter().all(|c| c.passed));
-        #[cfg(not(feature = "wgpu"))]
-        true
+        self.devices.iter().all(|d| d.error.is_none() && d.checks.iter().all(|c| c.passed))
     }
 }
 
@@ -90,7 +78,6 @@ impl Display for Examination {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         writeln!(f, "tiface {} ({}), {}", self.version, self.features.join(", "), self.system)?;
         writeln!(f, "cpu           {}, {} threads", self.processor, self.threads)?;
-        #[cfg(feature = "wgpu")]
         for d in &self.devices {
             let gib = |bytes: u64| format!("{:.1} GiB", bytes as f64 / (1u64 << 30) as f64);
             let memory = d.memory.map_or("unknown".into(), gib);

@@ -4,12 +4,11 @@
 //! device, it compares a training step on the device with the processor's. The verdict is stored in the user's cache, so
 //! the test runs once for each adapter, driver, program and field.
 
-use super::SelfTest;
+use super::{Check, Found, SelfTest};
 use crate::config::DeviceChoice;
 use crate::io::{self, Limits, Lock, LockError};
 use crate::kernel::gpu::{self, Adapter, Device};
 use crate::{Error, Result};
-use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -144,26 +143,6 @@ fn verdict_file() -> Option<PathBuf> {
     Some(base.join("tiface/devices.json"))
 }
 
-/// One quantity of a training step, and its deviation from the processor's value.
-#[derive(Debug, Serialize)]
-pub struct Check {
-    /// Field and quantity.
-    pub name: String,
-    /// Relative error; NaN if the device did not compute the quantity.
-    pub error: f32,
-    /// Largest error that passes.
-    pub allowed: f32,
-    /// Whether the error is within the limit.
-    pub passed: bool,
-}
-
-impl Check {
-    /// Compares an error with its limit.
-    pub fn new(name: String, error: f32, allowed: f32) -> Check {
-        Check { name, error, allowed, passed: error <= allowed }
-    }
-}
-
 /// Returns the cache key of a verdict. It names adapter, driver, API, program and field, so that a change of any of them
 /// runs the test again.
 fn verdict_key(device: &Device, adapter: &Adapter, test: &SelfTest) -> String {
@@ -219,37 +198,6 @@ fn require_passed(
         }
     };
     if passed { Ok(()) } else { Err("failed the self-test (`tiface doctor` shows it)".into()) }
-}
-
-/// The report of `tiface doctor` on a device.
-#[derive(Debug, Serialize)]
-pub struct Found {
-    /// Name for `--device`.
-    pub name: String,
-    /// Name that the driver reports.
-    pub adapter: String,
-    /// `discrete`, `integrated`, `virtual`, `other` or `software`.
-    pub kind: &'static str,
-    /// The driver and its version.
-    pub driver: String,
-    /// PCI address, if the device is a card.
-    pub card: Option<String>,
-    /// Atomic addition of floats: `native` or `exchange`.
-    pub atomics: &'static str,
-    /// Bytes of memory; `None` if the driver does not report it.
-    pub memory: Option<u64>,
-    /// Bytes of the largest buffer.
-    pub largest_buffer: u64,
-    /// Bytes of shared memory of a workgroup.
-    pub shared: usize,
-    /// Whether another training uses the device.
-    pub in_use: bool,
-    /// Comparisons of training steps with the processor's.
-    pub checks: Vec<Check>,
-    /// The error that prevented the comparison, if any.
-    pub error: Option<String>,
-    /// Seconds that the self-test took, including the driver's compilation of kernels.
-    pub seconds: f64,
 }
 
 /// Tests every adapter of this machine, including software renderers.

@@ -1,8 +1,8 @@
 //! Self-tests of GPUs: one training step of a field on the GPU and on the processor, compared before `auto` trusts an
 //! adapter and its driver.
 
+use super::Check;
 use super::checkpoint::TrainingProgress;
-use super::devices::Check;
 use super::parameters::HostGroup;
 use super::training::{self, Model, StepError, TrainingSession};
 use crate::kernel::gpu::{Adapter, Atomics, Device};

@@ -24,7 +24,7 @@ use crate::field::pixels::{Pixels, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self as fields, ComputeDevice};
 #[cfg(feature = "wgpu")]
-use crate::field::{devices::Check, self_test::TestedModel};
+use crate::field::{Check, self_test::TestedModel};
 use crate::kernel::cpu::adam::AdamStep;
 use crate::kernel::cpu::density::DensityShape;
 use crate::kernel::cpu::losses::TERMS;

@@ -1,6 +1,7 @@
 //! A training step of the signed-distance field on a GPU. Sampling, marching, evaluation, losses and optimizer all run
 //! on the device, so the host never waits within a step.
 
+use super::infer::DeviceField;
 use super::model::shape;
 use super::occupancy::{Occupancy, band};
 use super::ops::{
@@ -16,7 +17,9 @@ use crate::field::ops::Ops;
 use crate::field::pixels::Pixels;
 use crate::field::training::StepAt;
 use crate::kernel::cpu::hash;
+use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::mlp::TILE;
+use crate::kernel::cpu::neus::RAY_WIDTH;
 use crate::kernel::cpu::occupancy::OPAQUE;
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::sdf::FieldShape;
@@ -25,6 +28,7 @@ use crate::kernel::gpu::{
     Sdf, SurfacePoints, WeightNorm, Words,
 };
 use crate::{Error, Result};
+use std::ops::Range;
 
 /// Rule that updates the cells to march through.
 enum CellRule {
@@ -334,6 +338,22 @@ impl SdfOps for GpuSdf<'_> {
         let figures = self.schedule.figures(device, sums, variance.value(), count, &self.broken);
         self.losses.forget(device);
         figures
+    }
+}
+
+impl DeviceField for gpu::Evaluator {
+    fn evaluate(
+        &self,
+        points: &[[f32; 3]],
+        directions: Option<&[[f32; 3]]>,
+        normals: Option<&[[f32; 3]]>,
+        channels: Range<usize>,
+    ) -> Result<Vec<Vec<f32>>> {
+        gpu::Evaluator::evaluate(self, points, directions, normals, channels)
+    }
+
+    fn render(&mut self, rays: &[MarchRay], dt: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
+        gpu::Evaluator::render(self, rays, dt)
     }
 }
 

@@ -7,21 +7,32 @@ use super::state::{FORMAT, SdfState};
 use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
-#[cfg(feature = "wgpu")]
-use crate::field::{ComputeDevice, GpuField, devices::Gpu};
+use crate::field::{ComputeDevice, GpuField};
 use crate::geom::{Ray, RayResult, SdfField};
-#[cfg(feature = "wgpu")]
 use crate::io::Lock;
 use crate::kernel::cpu::march::{Bitmask, MarchRay};
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::neus::{self, Rays};
 use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
-#[cfg(feature = "wgpu")]
-use crate::kernel::gpu::Evaluator;
 use glam::Vec3;
+use std::ops::Range;
 use std::path::Path;
-#[cfg(feature = "wgpu")]
 use std::sync::Arc;
+
+/// The field on a device. Points, directions and normals are `[n, 3]`, in the network's coordinates.
+pub(super) trait DeviceField: Send {
+    /// Returns `channels` of the field's output, `[channels, n]`.
+    fn evaluate(
+        &self,
+        points: &[[f32; 3]],
+        directions: Option<&[[f32; 3]]>,
+        normals: Option<&[[f32; 3]]>,
+        channels: Range<usize>,
+    ) -> Result<Vec<Vec<f32>>>;
+
+    /// Returns the composited rays of a volume render with samples `dt` apart.
+    fn render(&mut self, rays: &[MarchRay], dt: f32) -> Result<Vec<[f32; neus::RAY_WIDTH]>>;
+}
 
 /// The trained field on the host. All positions and distances are in scene units, the box is [-1, 1]³.
 pub struct IFace {
@@ -34,10 +45,8 @@ pub struct IFace {
     /// The weights as a flat array, for upload to a device.
     #[cfg(feature = "wgpu")]
     flat: Vec<f32>,
-    #[cfg(feature = "wgpu")]
-    on_gpu: GpuField<Evaluator>,
+    on_gpu: GpuField<Box<dyn DeviceField>>,
     /// Lock of the GPU, held for the field's lifetime.
-    #[cfg(feature = "wgpu")]
     _lock: Option<Arc<Lock>>,
 }
 
@@ -57,9 +66,7 @@ impl IFace {
             occupancy,
             #[cfg(feature = "wgpu")]
             flat: _flat,
-            #[cfg(feature = "wgpu")]
             on_gpu: GpuField::new(None),
-            #[cfg(feature = "wgpu")]
             _lock: None,
         };
         if config.occupancy == OccupancyRule::Band {
@@ -82,20 +89,26 @@ impl IFace {
     }
 
     /// Evaluates the field on `device` from now on, if it is a GPU that supports the field.
-    #[cfg(feature = "wgpu")]
-    pub fn on(mut self, device: ComputeDevice) -> IFace {
-        let ComputeDevice::Gpu(Gpu { device, lock, .. }) = device else { return self };
-        if Evaluator::supports(&self.shape) {
-            let band = self.config.occupancy == OccupancyRule::Band;
-            let masks = [Some(&self.occupancy.occupied), band.then_some(&self.occupancy.solid)];
-            let evaluator = Evaluator::new(device, &self.shape, &self.table, &self.flat, self.inv_s, masks);
-            (self.on_gpu, self._lock) = (GpuField::new(Some(evaluator)), lock);
+    pub fn on(self, device: ComputeDevice) -> IFace {
+        match device {
+            ComputeDevice::Cpu(_) => self,
+            #[cfg(feature = "wgpu")]
+            ComputeDevice::Gpu(gpu) => {
+                use crate::kernel::gpu::Evaluator;
+                if !Evaluator::supports(&self.shape) {
+                    return self;
+                }
+                let band = self.config.occupancy == OccupancyRule::Band;
+                let masks = [Some(&self.occupancy.occupied), band.then_some(&self.occupancy.solid)];
+                let (shape, inv_s) = (&self.shape, self.inv_s);
+                let field = Evaluator::new(gpu.device, shape, &self.table, &self.flat, inv_s, masks);
+                let field: Box<dyn DeviceField> = Box::new(field);
+                IFace { on_gpu: GpuField::new(Some(field)), _lock: gpu.lock, ..self }
+            }
         }
-        self
     }
 
     /// Returns why the GPU is no longer used, if it failed.
-    #[cfg(feature = "wgpu")]
     pub fn gpu_failure(&self) -> Option<&str> {
         self.on_gpu.failure()
     }
@@ -116,11 +129,9 @@ impl IFace {
         column: usize,
         on_cpu: fn(&FieldShape, &[[f32; 2]], &Weights, &[[f32; 3]]) -> Vec<f32>,
     ) -> Vec<f32> {
-        #[cfg(feature = "wgpu")]
         if let Some(mut planes) = self.on_gpu.ask(|field| field.evaluate(x, None, None, column..column + 1)) {
             return planes.swap_remove(0);
         }
-        let _ = column; // only a GPU selects by it
         on_cpu(&self.shape, self.table(), &self.weights, x)
     }
 
@@ -149,7 +160,6 @@ impl SdfField for IFace {
 
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let x = self.scaled(points);
-        #[cfg(feature = "wgpu")]
         if let Some(planes) = self.on_gpu.ask(|field| field.evaluate(&x, None, None, 0..4)) {
             let [f, nx, ny, nz] = [0, 1, 2, 3].map(|k| &planes[k]);
             let normal = |i: usize| Vec3::new(nx[i], ny[i], nz[i]);
@@ -168,7 +178,6 @@ impl SdfField for IFace {
     ) -> Vec<[f32; 3]> {
         let arrays = |v: &[Vec3]| -> Vec<[f32; 3]> { v.iter().map(|v| v.to_array()).collect() };
         let (x, normals, directions) = (self.scaled(points), arrays(normals), arrays(directions));
-        #[cfg(feature = "wgpu")]
         if let Some(rgb) = self.on_gpu.ask(|field| {
             // The GPU evaluates a point once for each of its directions.
             let each = |rows: &[[f32; 3]]| -> Vec<[f32; 3]> {
@@ -194,7 +203,6 @@ impl IFace {
     fn render_pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let dt = step_length(&self.config).at(self.inv_s);
         let marched: Vec<MarchRay> = rays.iter().map(|r| MarchRay::new(r, self.config.radius, 0.0)).collect();
-        #[cfg(feature = "wgpu")]
         if let Some(composited) = self.on_gpu.ask(|field| field.render(&marched, dt)) {
             return composited.iter().map(|o| self.result(o)).collect();
         }

@@ -13,8 +13,8 @@ use super::train::{SdfModel, pixels};
 use crate::Result;
 use crate::config::Preset;
 use crate::config::iface::IfaceConfig;
+use crate::field::Check;
 use crate::field::ball::{self, BALL};
-use crate::field::devices::Check;
 use crate::field::parameters::HostGroup;
 use crate::field::self_test::{
     CELLS_AT, SEED, TestedModel, compare, compare_cells, devices, run_step, session,

@@ -10,22 +10,17 @@ use crate::capture::{Capture, LoadedView, Split, View};
 use crate::config::iface::FieldKind;
 use crate::config::{Config, MaskUse, Preset, Stage};
 use crate::ensemble::{self, Tile};
-#[cfg(feature = "wgpu")]
 use crate::field::compute_device;
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
 use crate::geom::Camera;
-#[cfg(feature = "wgpu")]
-use crate::iface::SDF_TEST;
-use crate::iface::{self, DensityField, IFace};
+use crate::iface::{self, DensityField, IFace, SDF_TEST};
 use crate::image::Gray;
 use crate::io::Limits;
 use crate::kernel::cpu::march::Bitmask;
 use crate::render::RenderedView;
 use crate::run::StageDir;
-#[cfg(feature = "wgpu")]
-use crate::tface::VM_TEST;
-use crate::tface::{self, FieldMean};
+use crate::tface::{self, FieldMean, VM_TEST};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -138,7 +133,6 @@ impl Fields for TrainedFields<'_> {
             }
             let hull = bitmask(&self.session.scene()?);
             let field = IFace::load(&folder, &config.iface, hull.as_ref())?;
-            #[cfg(feature = "wgpu")]
             let field = field.on(compute_device(&config.device, &SDF_TEST)?);
             Ok(Box::new(field))
         };
@@ -150,7 +144,6 @@ impl Fields for TrainedFields<'_> {
         let load = || {
             let count = config.radiance(stage).learned();
             let field = FieldMean::load(stage.word(), &run.path(stage), count)?;
-            #[cfg(feature = "wgpu")]
             let field = field.on(compute_device(&config.device, &VM_TEST)?);
             Ok(field)
         };
@@ -158,7 +151,6 @@ impl Fields for TrainedFields<'_> {
         once(cell, load).map(|f| f as &dyn Radiance)
     }
 
-    #[cfg(feature = "wgpu")]
     fn warnings(&self) -> Vec<&str> {
         let radiance = [&self.baseline, &self.tface].into_iter().filter_map(|f| f.get()?.gpu_failure());
         radiance.chain(self.iface.get().and_then(|f| f.warning())).collect()

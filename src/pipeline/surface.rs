@@ -106,7 +106,6 @@ impl Surface for crate::iface::IFace {
         Some(march(camera, world_from_scene, true, |rays| self.render(rays)))
     }
 
-    #[cfg(feature = "wgpu")]
     fn warning(&self) -> Option<&str> {
         self.gpu_failure()
     }

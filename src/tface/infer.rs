@@ -2,18 +2,16 @@
 
 use super::record::{FORMAT, FieldRecord, NAMES, Placement, geometry};
 use crate::Result;
-#[cfg(feature = "wgpu")]
 use crate::field::GpuField;
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::geom::{Ray, RayResult};
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
-#[cfg(feature = "wgpu")]
-use crate::kernel::gpu;
 use glam::Vec3;
 use std::path::Path;
-#[cfg(feature = "wgpu")]
-use std::sync::Arc;
+
+/// Renders rays in the field's coordinates on a device. `[n]` rays → `[n]`.
+type Renderer = dyn FnMut(&[MarchRay]) -> Result<Vec<[f32; RAY_WIDTH]>> + Send;
 
 /// The trained field on the host. Positions and distances are in scene units.
 pub struct TFace {
@@ -22,8 +20,7 @@ pub struct TFace {
     pub(super) values: [Vec<f32>; 3],
     weights: DecoderWeights,
     pub(super) placement: Option<Placement>,
-    #[cfg(feature = "wgpu")]
-    on_gpu: GpuField<gpu::VmRenderer>,
+    on_gpu: GpuField<Box<Renderer>>,
 }
 
 /// Number of rays rendered together, which keeps their memory in the low hundreds of megabytes.
@@ -32,14 +29,7 @@ const PASS: usize = 1 << 13;
 impl TFace {
     pub(super) fn from_parts(field: VmField, values: [Vec<f32>; 3], placement: Option<Placement>) -> TFace {
         let weights = DecoderWeights::new(field.decoder, &values[2]);
-        TFace {
-            field,
-            values,
-            weights,
-            placement,
-            #[cfg(feature = "wgpu")]
-            on_gpu: GpuField::new(None),
-        }
+        TFace { field, values, weights, placement, on_gpu: GpuField::new(None) }
     }
 
     /// Loads the field from the checkpoint in a folder of `stage`.
@@ -62,16 +52,17 @@ impl TFace {
 
     /// Renders on `device` from now on, if it supports the field's decoder.
     #[cfg(feature = "wgpu")]
-    pub(super) fn on(&mut self, device: Arc<gpu::Device>) {
-        if gpu::DeviceDecoder::supports(&self.field.decoder).is_ok() {
-            let renderer =
-                gpu::VmRenderer::new(device, &self.field, self.values.each_ref().map(|v| v.as_slice()));
-            self.on_gpu = GpuField::new(Some(renderer));
+    pub(super) fn on(&mut self, device: std::sync::Arc<crate::kernel::gpu::Device>) {
+        use crate::kernel::gpu::{DeviceDecoder, VmRenderer};
+        if DeviceDecoder::supports(&self.field.decoder).is_ok() {
+            let values = self.values.each_ref().map(|v| v.as_slice());
+            let mut renderer = VmRenderer::new(device, &self.field, values);
+            let render: Box<Renderer> = Box::new(move |rays: &[MarchRay]| renderer.render(rays));
+            self.on_gpu = GpuField::new(Some(render));
         }
     }
 
     /// Returns why the GPU is no longer used, if it failed.
-    #[cfg(feature = "wgpu")]
     pub(super) fn gpu_failure(&self) -> Option<&str> {
         self.on_gpu.failure()
     }
@@ -97,8 +88,7 @@ impl TFace {
             depth: if o[3] > 0.0 { o[4] / o[3] * stretch(r) / p.scale } else { 0.0 },
             normal: Vec3::ZERO,
         };
-        #[cfg(feature = "wgpu")]
-        if let Some(composited) = self.on_gpu.ask(|renderer| renderer.render(&in_field(rays))) {
+        if let Some(composited) = self.on_gpu.ask(|render| render(&in_field(rays))) {
             return composited.iter().zip(rays).map(result).collect();
         }
         let [density, color, _] = &self.values;

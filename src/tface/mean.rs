@@ -17,25 +17,21 @@
 use super::TFace;
 use super::train::{self, TfaceReport, train_one};
 use crate::config::{MaskUse, VmConfig, VmStart};
-#[cfg(feature = "wgpu")]
 use crate::field::ComputeDevice;
 use crate::field::pixels::{LARGE, Pixels, TrainView};
 use crate::field::training::{self, TrainingSession};
 use crate::geom::{Aabb, Ray, RayResult};
-#[cfg(feature = "wgpu")]
 use crate::io::Lock;
 use crate::kernel::cpu::march::Bitmask;
 use crate::{Monitor, Result, io};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
-#[cfg(feature = "wgpu")]
 use std::sync::Arc;
 
 /// The trained fields of a stage. Positions and distances are in scene units.
 pub struct FieldMean {
     fields: Vec<TFace>,
     /// Lock of the GPU, held for the fields' lifetime.
-    #[cfg(feature = "wgpu")]
     _lock: Option<Arc<Lock>>,
 }
 
@@ -43,24 +39,23 @@ impl FieldMean {
     /// Loads `count` fields from the checkpoints in a folder of `stage`.
     pub fn load(stage: &'static str, dir: &Path, count: usize) -> Result<FieldMean> {
         let fields = (0..count).map(|i| TFace::load(stage, &folder(dir, i))).collect::<Result<_>>()?;
-        Ok(FieldMean {
-            fields,
-            #[cfg(feature = "wgpu")]
-            _lock: None,
-        })
+        Ok(FieldMean { fields, _lock: None })
     }
 
     /// Renders on `device` from now on, if it is a GPU that supports the fields.
-    #[cfg(feature = "wgpu")]
-    pub fn on(mut self, device: ComputeDevice) -> FieldMean {
-        let ComputeDevice::Gpu(gpu) = device else { return self };
-        let device = Arc::new(gpu.device);
-        self.fields.iter_mut().for_each(|field| field.on(device.clone()));
-        FieldMean { _lock: gpu.lock, ..self }
+    pub fn on(self, device: ComputeDevice) -> FieldMean {
+        match device {
+            ComputeDevice::Cpu(_) => self,
+            #[cfg(feature = "wgpu")]
+            ComputeDevice::Gpu(gpu) => {
+                let (device, mut fields) = (Arc::new(gpu.device), self.fields);
+                fields.iter_mut().for_each(|field| field.on(device.clone()));
+                FieldMean { fields, _lock: gpu.lock }
+            }
+        }
     }
 
     /// Returns why the GPU is no longer used, if it failed.
-    #[cfg(feature = "wgpu")]
     pub fn gpu_failure(&self) -> Option<&str> {
         self.fields.iter().find_map(TFace::gpu_failure)
     }
