@@ -21,6 +21,7 @@
 //! a field is trained, not what the field is.
 
 mod bench;
+mod cameras;
 mod clicks;
 mod ensemble;
 pub mod experiment;
@@ -80,9 +81,9 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
             mask::mask(capture, line.clicks.as_ref(), config, dir)
         }
         Stage::Baseline | Stage::Tface | Stage::Iface => {
-            learn::learn(stage, capture, &line.scene()?, config, dir)
+            learn::learn(stage, line.refined_capture()?, &line.scene()?, config, dir)
         }
-        Stage::Mesh => mesh::mesh(capture, &line.scene()?, fields.surface()?, config, dir),
+        Stage::Mesh => mesh::mesh(line.refined_capture()?, &line.scene()?, fields.surface()?, config, dir),
         Stage::Render => render::render(line, &line.scene()?, fields, dir),
         Stage::Ensemble => ensemble::ensemble(line, &line.scene()?, fields, dir),
         Stage::Metrics => metrics::metrics(line, dir),
@@ -100,6 +101,8 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
     Ok(done)
 }
 
+#[cfg(test)]
+mod cameras_tests;
 #[cfg(test)]
 mod clicks_tests;
 #[cfg(test)]

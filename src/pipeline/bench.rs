@@ -113,13 +113,14 @@ impl<'l> Bench<'l> {
 
     /// Returns the training cameras, in the scene.
     fn cameras(&self) -> Vec<Camera> {
-        let views = self.line.capture.split(Split::Train);
+        let capture = self.line.refined_capture().unwrap_or(&self.line.capture);
+        let views = capture.split(Split::Train);
         views.map(|v| v.camera.transformed(&self.scene.scene_from_world)).collect()
     }
 
     /// Returns the extracted surface with its cap and patches.
     fn extracted(&self, fields: &dyn Fields, c: &MeshConfig) -> Result<Extracted> {
-        let capture = &self.line.capture;
+        let capture = self.line.refined_capture()?;
         let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
         let field = fields.surface()?;
         let (mesh, report) =
@@ -261,7 +262,7 @@ fn train_until(line: &Line, stage: Stage, step: u64) -> Result<()> {
         identity: "bench",
         monitor: &monitor,
     };
-    match learn::train(stage, &line.capture, &line.scene()?, line.config, &session) {
+    match learn::train(stage, line.refined_capture()?, &line.scene()?, line.config, &session) {
         Ok(_) => Ok(()),
         Err(e) if e.kind().is_stop() => match line.run.stop().requested() {
             Some(kind) => Err(Error::stopped("what was measured is kept").with_kind(kind)),
@@ -468,7 +469,7 @@ impl<'f> Finisher<'f> {
             let config = SimplifyConfig { triangles: c.triangles as usize, ..SimplifyConfig::default() };
             simplify(&mut mesh, Some(&|p: &[Vec3]| closed.sdf_gradient(p)), &config, bench.monitor())?;
         }
-        let views = learn::training_views(&bench.line.capture, &bench.scene, bench.config())?;
+        let views = learn::training_views(bench.line.refined_capture()?, &bench.scene, bench.config())?;
         Ok(Finisher { mesh, extracted, fields, views })
     }
 

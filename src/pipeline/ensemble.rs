@@ -188,7 +188,7 @@ fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Resul
     let meshes = Meshes::load(line, &c.members)?;
     let renderer = Renderer::new(scene, fields, &meshes, line.config.render.samples, dir.monitor());
     let mut sums = Vec::new();
-    for (view, tiles) in learn::held_out_tiles(&line.capture, line.config) {
+    for (view, tiles) in learn::held_out_tiles(line.refined_capture()?, line.config) {
         let (photo, weight) = target(view)?;
         let camera = view.camera.transformed(&scene.scene_from_world);
         let mut sum = Fit::new(c.members.len())?;

@@ -1,5 +1,6 @@
 //! A capture, its configuration and its run folder, which every stage works on.
 
+use super::cameras::CameraCheck;
 use super::clicks::MaskPrompts;
 use super::lpips::measure;
 use super::path::CameraPath;
@@ -15,10 +16,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Display;
 use std::io::ErrorKind::NotFound;
 use std::path::Path;
+use std::sync::OnceLock;
 
 /// A capture, its configuration and its run folder.
 pub struct Line<'a> {
     pub(super) capture: Capture,
+    /// The capture with the poses that the stage `mask` refined, once they are used.
+    refined: OnceLock<Capture>,
     pub(super) config: &'a Config,
     pub(super) run: &'a Run,
     /// Digest of everything read from the capture.
@@ -96,6 +100,7 @@ impl<'a> Line<'a> {
         }
         Ok(Line {
             capture,
+            refined: OnceLock::new(),
             config,
             run,
             digest,
@@ -150,6 +155,17 @@ impl<'a> Line<'a> {
         &self.capture
     }
 
+    /// Returns the capture with the poses that the stage `mask` refined, for the stages after it.
+    pub(super) fn refined_capture(&self) -> Result<&Capture> {
+        if let Some(capture) = self.refined.get() {
+            return Ok(capture);
+        }
+        let mut capture = self.capture.clone();
+        let check = CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
+        check.iter().for_each(|check| check.apply(&mut capture));
+        Ok(self.refined.get_or_init(|| capture))
+    }
+
     /// Returns the box and hull that the stage `mask` found.
     pub fn scene(&self) -> Result<Scene> {
         scene_file::read_scene(&self.run.path("mask/scene.json")).map_err(|e| unusable(e, Stage::Mask))
@@ -161,7 +177,8 @@ impl<'a> Line<'a> {
             return Ok(());
         }
         let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
-        let cameras = scene_file::cameras_json(&self.capture, &scene);
+        let check = CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
+        let cameras = scene_file::cameras_json(&self.capture, &scene, check.as_ref());
         self.write("cameras.json", &cameras, idle)
     }
 
@@ -255,6 +272,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
         mask_dir: c.mask_dir.clone(),
         mask_meaning: config.mask.meaning,
         trust_masks: config.mask.trust,
+        cameras: c.cameras,
         unit_m: c.unit_m,
         ..CaptureOptions::default()
     }

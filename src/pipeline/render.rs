@@ -82,7 +82,7 @@ pub(super) fn held_out(capture: &Capture) -> Vec<NamedCamera> {
 
 /// Returns the cameras to render, named after their photographs if they have one.
 pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
-    let capture = &line.capture;
+    let capture = line.refined_capture()?;
     match &line.path {
         None => Ok(held_out(capture)),
         Some(CameraPath { cameras: Some(cameras), .. }) => Ok(cameras.clone()),
