@@ -22,7 +22,6 @@ pub use tracks::RigView;
 use crate::geom::{Camera, Mesh};
 use adjust::{Track, adjust, gauge, median, project};
 use glam::DVec3;
-use tracks::Seed;
 
 /// Points spread over the surface. A third of them is found on skin with stubble and pores.
 const POINTS: usize = 8000;
@@ -67,18 +66,17 @@ impl Rig {
 pub fn measure(views: &[RigView], given: &[Camera], surface: &Mesh, all: bool) -> Rig {
     let mut cameras = given.to_vec();
     let mut seeds = tracks::seeds(surface, given, views, POINTS);
-    let mut found = Vec::new();
+    let (mut tracks, mut expected) = (Vec::new(), Vec::new());
     for passes in ROUNDS {
-        found = tracks::find(views, &cameras, &seeds, passes);
+        expected = tracks::looked_up(&cameras, &seeds);
+        let found = tracks::find(views, &cameras, &seeds, passes);
         let every = found.iter().flatten().count().div_ceil(MOST_AGAIN).max(1);
         let kept = seeds.into_iter().zip(found).filter_map(|(seed, track)| Some((seed, track?)));
-        let (kept_seeds, mut kept_tracks): (Vec<Seed>, Vec<Track>) = kept.step_by(every).unzip();
-        cameras = refined(given, cameras, &mut kept_tracks);
-        seeds = tracks::moved_to(&kept_seeds, &kept_tracks);
-        found = kept_tracks.into_iter().map(Some).collect();
+        (seeds, tracks) = kept.step_by(every).unzip();
+        cameras = refined(given, cameras, &mut tracks);
+        seeds = tracks::moved_to(&seeds, &tracks);
     }
-    let found: Vec<Track> = found.into_iter().flatten().collect();
-    gate::decide(given, cameras, found, all)
+    gate::decide(given, cameras, tracks, &expected, all)
 }
 
 /// Returns the cameras that fit the tracks best, in the world of the given ones, and moves the tracks' points there. A camera

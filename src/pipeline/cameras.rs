@@ -47,6 +47,8 @@ struct CheckedCamera {
     view: String,
     state: CameraState,
     sightings: usize,
+    /// How many points of other photographs were looked up in its own.
+    expected: usize,
     /// Median distance of its sightings, pixels of its photograph.
     given_px: f64,
     adjusted_px: f64,
@@ -98,6 +100,7 @@ pub(super) fn check_cameras(
             view: view.name.clone(),
             state: fit.state,
             sightings: fit.sightings,
+            expected: fit.expected,
             given_px: pixels * fit.given_px,
             adjusted_px: pixels * fit.adjusted_px,
             moved_px: pixels * fit.moved_px,
@@ -199,9 +202,6 @@ impl CameraCheck {
 
     /// Returns cameras that can be neither used nor refined.
     pub(super) fn problems(&self) -> Vec<Error> {
-        let mut counts: Vec<usize> = self.cameras.iter().map(|c| c.sightings).collect();
-        counts.sort_unstable();
-        let usual = counts[counts.len() / 2];
         let problem = |c: &CheckedCamera| match c.state {
             CameraState::Lost if c.sightings >= LEAST_SIGHTINGS => Some(format!(
                 "the photograph of view `{}` does not show what its camera should see: the points found in it stay \
@@ -209,9 +209,9 @@ impl CameraCheck {
                 c.view, c.adjusted_px, self.adjusted_px
             )),
             CameraState::Lost => Some(format!(
-                "the photograph of view `{}` does not show what its camera should see: only {} points of the head were \
-                 found in it, fewer than {LEAST_SIGHTINGS}, and {usual} in the middle one",
-                c.view, c.sightings
+                "the photograph of view `{}` does not show what its camera should see: only {} of {} points \
+                 that other photographs share were found in it",
+                c.view, c.sightings, c.expected
             )),
             CameraState::Far => Some(format!(
                 "the camera of view `{}` is {:.0} px off where the others fit within {:.1} px",

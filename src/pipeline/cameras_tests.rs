@@ -1,10 +1,12 @@
 //! Cameras of the demo head: exact ones, disturbed ones, one that was moved, and photographs that are swapped.
 
 use super::cameras::{CameraCheck, POSES, check_cameras};
+use super::tests::{NoFields, quiet};
+use super::{Line, Stage, complete};
 use crate::capture::scene::{self, Scene, SceneOptions};
 use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, write_capture};
 use crate::capture::{self, Capture, CaptureOptions, Split, View};
-use crate::config::CameraPoses;
+use crate::config::{CameraPoses, Config, Preset};
 use crate::geom::Camera;
 use crate::io::{self, Limits};
 use glam::{DMat3, DQuat, DVec3};
@@ -149,4 +151,35 @@ fn without_masks_nothing_is_said() {
     bare.views.iter_mut().for_each(|v| v.mask = capture::ViewMask::None);
     let found = check_cameras(&bare, &scene.unwrap().0, CameraPoses::Auto, &Limits::default()).unwrap();
     assert!(found.is_none());
+}
+
+#[test]
+fn the_stage_mask_keeps_refined_poses_for_later_stages_unless_given_ones_are_asked_for() {
+    let (dir, exact) = demo();
+    let mut wrong = exact.clone();
+    (0..14).for_each(|v| disturb(&mut wrong, v, 1.5));
+    let file = dir.path().join("transforms.json");
+    let mut frames: Value = io::read_json(&file, &Limits::default()).unwrap();
+    for (frame, view) in frames["frames"].as_array_mut().unwrap().iter_mut().zip(&wrong.views) {
+        for (row, column) in (0..9).map(|i| (i / 3, i % 3)) {
+            frame["transform_matrix"][row][column] = json!(view.camera.rotation.col(column)[row]);
+        }
+    }
+    std::fs::write(&file, frames.to_string()).unwrap();
+    for (poses, refined) in [(CameraPoses::Given, false), (CameraPoses::Auto, true)] {
+        let folder = tempfile::tempdir().unwrap();
+        let run = quiet(folder.path());
+        let mut config = Config::preset(Preset::Draft);
+        config.capture.path = dir.path().display().to_string();
+        config.capture.cameras = poses;
+        let session = Line::open(&config, &run).unwrap();
+        complete(&session, Stage::Mask, &NoFields).unwrap();
+        assert_eq!(run.path("mask").join(POSES).is_file(), refined);
+        let used = session.refined_capture().unwrap();
+        assert_eq!(error_px(used, &exact) < error_px(&wrong, &exact) / 3.0, refined);
+        let cameras: Value = io::read_json(&run.path("cameras.json"), &Limits::default()).unwrap();
+        assert_eq!(cameras["fit"]["cameras"][3]["refined"].is_object(), refined);
+        // a finished stage is not made again for what it found itself
+        assert!(complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
+    }
 }

@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 /// Sightings that a camera needs to be judged at all.
 pub const LEAST_SIGHTINGS: usize = 30;
 
+/// Points that a camera must be expected to see for too few sightings to mean that it is wrong.
+const LEAST_EXPECTED: usize = 5 * LEAST_SIGHTINGS;
+
 /// Points that must be found for anything to be said.
 const LEAST_TRACKS: usize = 100;
 
@@ -65,6 +68,8 @@ pub struct CameraFit {
     pub state: CameraState,
     /// How many points were found in its photograph.
     pub sightings: usize,
+    /// How many points of the last round, all found in other photographs before, were looked up in it.
+    pub expected: usize,
     /// Median distance of these from the projections of free points with the poses given, pixels.
     pub given_px: f64,
     /// The same after the adjustment of all cameras.
@@ -75,8 +80,15 @@ pub struct CameraFit {
     pub camera: Camera,
 }
 
-/// Decides what to do, given the cameras and tracks of an adjustment of all.
-pub(super) fn decide(given: &[Camera], adjusted: Vec<Camera>, tracks: Vec<Track>, all: bool) -> Rig {
+/// Decides what to do, given the cameras and tracks of an adjustment of all. `expected` is how many points each camera was
+/// expected to see, and `all` asks for all cameras to be refined.
+pub(super) fn decide(
+    given: &[Camera],
+    adjusted: Vec<Camera>,
+    tracks: Vec<Track>,
+    expected: &[usize],
+    all: bool,
+) -> Rig {
     let mut at_given = tracks.clone();
     let fixed = vec![false; given.len()];
     let points = sampled(&tracks);
@@ -89,6 +101,7 @@ pub(super) fn decide(given: &[Camera], adjusted: Vec<Camera>, tracks: Vec<Track>
     let fit = |v: usize| CameraFit {
         state: CameraState::Stays,
         sightings: counts[v],
+        expected: expected[v],
         given_px: median(&mut before[v].clone()),
         adjusted_px: median(&mut refined[v].clone()),
         moved_px: distance_px(&given[v], &adjusted[v], &points),
@@ -117,15 +130,13 @@ pub(super) fn decide(given: &[Camera], adjusted: Vec<Camera>, tracks: Vec<Track>
 /// Sets the state of each camera and returns the verdict. `residual` is that of all after the adjustment, and `gains` says
 /// whether it falls enough.
 fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> Verdict {
-    let mut counts: Vec<f64> = cameras.iter().map(|c| c.sightings as f64).collect();
-    let usual = median(&mut counts);
     let moves = cameras.iter().filter(|c| c.sightings >= LEAST_SIGHTINGS).map(|c| c.moved_px);
     let usual_move = median(&mut moves.collect::<Vec<f64>>());
     for c in cameras.iter_mut() {
         let stands_out = c.moved_px > LEAST_MOVE_PX.max(STANDS_OUT * usual_move);
         c.state = match () {
-            // where nobody finds much, such as at the back of a head, few sightings mean nothing
-            () if c.sightings < LEAST_SIGHTINGS && usual < 5.0 * LEAST_SIGHTINGS as f64 => CameraState::Stays,
+            // where few points are found in other photographs either, such as in hair, few sightings mean nothing
+            () if c.sightings < LEAST_SIGHTINGS && c.expected < LEAST_EXPECTED => CameraState::Stays,
             () if c.sightings < LEAST_SIGHTINGS => CameraState::Lost,
             () if c.adjusted_px > LOST_PX.max(LOST_SHARE * residual) => CameraState::Lost,
             () if c.moved_px > FARTHEST_PX => CameraState::Far,

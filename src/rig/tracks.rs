@@ -308,20 +308,33 @@ fn align(placed: &mut Vec<Placed>, level: usize, patch: &mut Patch) -> Vec<f32> 
     fits
 }
 
+/// Returns the views that a point is looked up in, the most frontal one first.
+fn frontal(cameras: &[Camera], seed: &Seed) -> Vec<usize> {
+    let cosine = |v: usize| (cameras[v].position.as_vec3() - seed.position).normalize().dot(seed.normal);
+    let mut views: Vec<(f32, usize)> =
+        seed.views.iter().map(|&v| (cosine(v), v)).filter(|(c, _)| *c >= MIN_COSINE).collect();
+    views.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    views.truncate(MAX_VIEWS);
+    views.into_iter().map(|(_, v)| v).collect()
+}
+
+/// Returns how many points are looked up in each view.
+pub fn looked_up(cameras: &[Camera], seeds: &[Seed]) -> Vec<usize> {
+    let mut counts = vec![0; cameras.len()];
+    seeds.iter().flat_map(|seed| frontal(cameras, seed)).for_each(|v| counts[v] += 1);
+    counts
+}
+
 /// Looks up points in the photographs. `levels` counts passes: two begin in the blurred pictures. Returns for each seed the
 /// point with its sightings, if enough views agree.
 pub fn find(views: &[RigView], cameras: &[Camera], seeds: &[Seed], levels: usize) -> Vec<Option<Track>> {
     let look_up = |seed: &Seed| {
-        let cosine = |v: usize| (cameras[v].position.as_vec3() - seed.position).normalize().dot(seed.normal);
-        let mut frontal: Vec<(f32, usize)> =
-            seed.views.iter().map(|&v| (cosine(v), v)).filter(|(c, _)| *c >= MIN_COSINE).collect();
-        frontal.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-        frontal.truncate(MAX_VIEWS);
-        let first = &cameras[frontal.first()?.1];
+        let frontal = frontal(cameras, seed);
+        let first = &cameras[*frontal.first()?];
         let footprint = first.position.as_vec3().distance(seed.position) / first.fx as f32;
         let axis = seed.normal.any_orthonormal_vector();
         let axes = [footprint * axis, footprint * seed.normal.cross(axis)];
-        let place = |&(_, v): &(f32, usize)| Placed::new((v, &views[v]), &cameras[v], seed, axes);
+        let place = |&v: &usize| Placed::new((v, &views[v]), &cameras[v], seed, axes);
         let mut placed: Vec<Placed> = frontal.iter().filter_map(place).collect();
         let mut patch = Patch { value: [0.0; PATCH], slope: [[0.0; PATCH]; 2] };
         let mut fits = Vec::new();
