@@ -1,12 +1,12 @@
 //! How well calibrated cameras fit each other, and poses that fit better.
 //!
-//! The visual hull of the masks is a rough surface. Patches of it are found again in the photographs ([`tracks`]), and poses
-//! and points that explain where they were found follow from a robust bundle adjustment ([`adjust`]). Points are free: a
+//! The visual hull of the masks is a rough surface. Patches of it are found again in the photographs (`tracks`), and poses
+//! and points that explain where they were found follow from a robust bundle adjustment (`adjust`). Points are free: a
 //! surface contains the errors of the poses that it was made with, so aligning photographs to it would keep half of them.
 //! The points that result are the next surface; after four rounds they lie within a fraction of a pixel, whatever the hull
 //! was like.
 //!
-//! Exact cameras gain an error this way, since shading that moves with the view moves patches a little. [`gate`] therefore
+//! Exact cameras gain an error this way, since shading that moves with the view moves patches a little. `gate` therefore
 //! decides from the residuals which cameras are refined: none, those that stand out, or all.
 //!
 //! Everything is in scene coordinates and in pixels of the pictures searched, and a function of its arguments alone,
@@ -52,13 +52,6 @@ pub struct Rig {
     pub given_px: f64,
     /// The same after the adjustment of all cameras.
     pub adjusted_px: f64,
-}
-
-impl Rig {
-    /// Returns the number of sightings of all cameras.
-    pub fn sightings(&self) -> usize {
-        self.cameras.iter().map(|c| c.sightings).sum()
-    }
 }
 
 /// Measures how well cameras fit each other. `surface` is any rough surface of the head with normals; `views` and `given`
