@@ -65,6 +65,8 @@ pub mod report;
 
 pub mod mask;
 
+pub mod rig;
+
 pub mod tface;
 
 pub mod iface;

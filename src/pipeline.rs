@@ -21,6 +21,7 @@
 //! a field is trained, not what the field is.
 
 mod bench;
+mod cameras;
 mod clicks;
 mod ensemble;
 pub mod experiment;
@@ -82,17 +83,21 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
             mask::mask(capture, session.inputs.clicks.as_ref(), config, dir)
         }
         Stage::Baseline | Stage::Tface | Stage::Iface => {
-            learn::learn(stage, capture, &session.scene()?, config, dir)
+            learn::learn(stage, session.refined_capture()?, &session.scene()?, config, dir)
         }
-        Stage::Mesh => mesh::mesh(capture, &session.scene()?, fields.surface()?, config, dir),
+        Stage::Mesh => {
+            mesh::mesh(session.refined_capture()?, &session.scene()?, fields.surface()?, config, dir)
+        }
         Stage::Render => {
             let (scene, c) = (session.scene()?, session.render_config());
-            let cameras = render::cameras(capture, session.path.as_ref(), &scene)?;
+            let cameras = render::cameras(session.refined_capture()?, session.path.as_ref(), &scene)?;
             let meshes = Meshes::load(run, config, &c.method)?;
             let renderer = Renderer::new(&scene, fields, &meshes, c.samples, dir.monitor());
             render::render(c, &renderer, &cameras, &scene, config.capture.unit_m, dir)
         }
-        Stage::Ensemble => ensemble::ensemble(capture, config, run, &session.scene()?, fields, dir),
+        Stage::Ensemble => {
+            ensemble::ensemble(session.refined_capture()?, config, run, &session.scene()?, fields, dir)
+        }
         Stage::Metrics => {
             let has_mesh = session.order(Stage::Metrics).contains(&Stage::Mesh);
             let demo = has_mesh && session::is_demo(config, run);
@@ -115,6 +120,8 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
     Ok(done)
 }
 
+#[cfg(test)]
+mod cameras_tests;
 #[cfg(test)]
 mod clicks_tests;
 #[cfg(test)]

@@ -9,7 +9,7 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("vocabulary", &["error", "monitor", "geom", "image"]),
     ("ground", &["io", "config", "kernel"]),
     ("shared", &["capture", "field", "onnx", "run", "report"]),
-    ("stages", &["mask", "tface", "iface", "mesh", "render", "ensemble", "metrics"]),
+    ("stages", &["mask", "rig", "tface", "iface", "mesh", "render", "ensemble", "metrics"]),
     ("pipeline", &["pipeline"]),
     ("cli", &["cli"]),
 ];

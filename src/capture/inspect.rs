@@ -3,7 +3,7 @@
 use super::frame::Agreement;
 use super::gather::gather;
 use super::masks::{self, few};
-use super::scene::{self, SceneOptions};
+use super::scene::{self, Scene, SceneOptions};
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::Error;
 use crate::config::MaskMeaning;
@@ -134,6 +134,12 @@ pub struct Inspection {
     pub scene: Option<Aabb>,
     /// The same in words.
     pub scene_text: Option<String>,
+    /// How well the cameras fit each other, measured on the photographs, and what a run does about it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fit: Option<String>,
+    /// The head's box and hull.
+    #[serde(skip)]
+    pub placed: Option<Scene>,
     /// What stops the work.
     pub problems: Vec<Problem>,
     /// Warnings, which do not stop the work.
@@ -284,6 +290,7 @@ fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
             }
             out.scene_text = Some(scene::describe(&scene));
             out.scene = Some(b);
+            out.placed = Some(scene);
             out.warnings.extend(warnings);
         }
         Err(e) => out.problems.extend(grouped(&[e])),
@@ -311,6 +318,9 @@ impl fmt::Display for Inspection {
         }
         if let Some(r) = self.distance {
             writeln!(f, "            {:.3} to {:.3} units from the head", r.min, r.max)?;
+        }
+        if let Some(text) = &self.fit {
+            writeln!(f, "            {text}")?;
         }
         if let Some(up) = self.up {
             writeln!(f, "            up is ({:.3}, {:.3}, {:.3})", up.x, up.y, up.z)?;

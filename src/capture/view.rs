@@ -5,7 +5,7 @@
 //! so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as a sensor
 //! with larger pixels would, weighted by alpha where there is one.
 
-use crate::config::{MaskMeaning, MaskSource};
+use crate::config::{CameraPoses, MaskMeaning, MaskSource};
 use crate::geom::{Aabb, Camera};
 use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::io::{self, Limits, NpyValues};
@@ -57,6 +57,8 @@ pub struct CaptureOptions {
     pub mask_meaning: MaskMeaning,
     /// Are masks that cannot be right a matter of warnings only?
     pub trust_masks: bool,
+    /// Whether poses are to be measured.
+    pub cameras: CameraPoses,
     /// Metres per dataset unit.
     pub unit_m: f64,
     /// What is refused for its size.
@@ -71,6 +73,7 @@ impl Default for CaptureOptions {
             mask_dir: String::new(),
             mask_meaning: MaskMeaning::Empty,
             trust_masks: false,
+            cameras: CameraPoses::Auto,
             unit_m: 1.0,
             limits: Limits::default(),
         }

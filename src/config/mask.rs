@@ -11,6 +11,9 @@ table! {
         path: String => String::new();
         /// Integer factor by which photographs are reduced, by averaging.
         downscale: u32, 1.0..=64.0 => 1;
+        /// Poses of the training views: auto (measured on the photographs, and refined where they do not fit), refine
+        /// (always) or given.
+        cameras: CameraPoses => CameraPoses::Auto, CameraPoses::Auto, CameraPoses::Given;
         /// Bounding box of the fields: head (found from cameras and masks), ilsh (published: ±0.45, ±0.501, ±0.3 dataset
         /// units for radiance, ±0.3 for I-Face; falls back to head if the head is elsewhere) or six numbers in dataset
         /// units, lowest corner first.
@@ -22,6 +25,18 @@ table! {
         /// Share of the training pixels that is held out, in small squares, to fit the weights of the blend; 0: none.
         tiles: f64, 0.0..=0.25 => 0.04, 0.04, 0.0;
     }
+}
+
+/// Which poses training views have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CameraPoses {
+    /// Those given, or refined ones where a measurement says that they do not fit.
+    Auto,
+    /// Refined ones.
+    Refine,
+    /// Those given, unmeasured.
+    Given,
 }
 
 /// Where masks come from.

@@ -169,6 +169,43 @@ impl Distortion {
         )
     }
 
+    /// Derivatives of [`Self::bend`]: rows are its two outputs, columns x and y.
+    fn bend_slopes(&self, x: f64, y: f64) -> [[f64; 2]; 2] {
+        let r2 = x * x + y * y;
+        let (radial, slope) = self.radial(r2);
+        let slope = 2.0 * slope;
+        let xx = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x + 2.0 * self.sx1 * x;
+        let xy = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y;
+        let yy = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x + 2.0 * self.sy1 * y;
+        // the thin prism alone makes the Jacobian unsymmetric
+        [[xx, xy + 2.0 * self.sx1 * y], [xy + 2.0 * self.sy1 * x, yy]]
+    }
+
+    /// Returns the derivatives of [`Self::apply`]: rows are its two outputs, columns x and y.
+    pub fn slopes(&self, x: f64, y: f64) -> [[f64; 2]; 2] {
+        let tangent = x.hypot(y);
+        let along = match self.projection {
+            _ if tangent < 1e-9 => None,
+            Projection::Perspective => None,
+            Projection::Fisheye => Some(1.0 / (1.0 + tangent * tangent)),
+            Projection::Fov if self.omega.abs() < 1e-6 => None,
+            Projection::Fov => {
+                let spread = 2.0 * (0.5 * self.omega).tan();
+                Some(spread / (self.omega * (1.0 + (spread * tangent).powi(2))))
+            }
+        };
+        // the radius as a function of the tangent has the slope `along`; across it, the scale is radius / tangent
+        let scale = self.radius_over_tangent(self.projection, tangent);
+        let bent = self.bend_slopes(scale * x, scale * y);
+        let Some(along) = along else { return bent.map(|row| row.map(|v| v * scale)) };
+        let (u, v) = (x / tangent, y / tangent);
+        let more = along - scale;
+        bent.map(|[bx, by]| {
+            let toward = more * (bx * u + by * v);
+            [scale * bx + toward * u, scale * by + toward * v]
+        })
+    }
+
     /// Distorted normalized coordinates back to ideal ones: Newton on the coefficients with their exact Jacobian,
     /// whose result is checked, then the projection's inverse. `None` where the model folds over (no ideal point
     /// maps there) and from 90° on.
@@ -180,14 +217,7 @@ impl Distortion {
         for _ in 0..50 {
             let (fx, fy) = self.bend(x, y);
             let (ex, ey) = (fx - xd, fy - yd);
-            let r2 = x * x + y * y;
-            let (radial, slope) = self.radial(r2);
-            let slope = 2.0 * slope;
-            let xx = radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x + 2.0 * self.sx1 * x;
-            let xy = x * y * slope + 2.0 * self.p1 * x + 2.0 * self.p2 * y;
-            let yy = radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x + 2.0 * self.sy1 * y;
-            // the thin prism alone makes the Jacobian unsymmetric
-            let (right, down) = (xy + 2.0 * self.sx1 * y, xy + 2.0 * self.sy1 * x);
+            let [[xx, right], [down, yy]] = self.bend_slopes(x, y);
             let det = xx * yy - right * down;
             if det.is_nan() || det <= 1e-6 {
                 return None; // past the fold: the mapping is no longer one to one
@@ -418,6 +448,24 @@ mod tests {
                 let (xd, yd) = lens.apply(x, y);
                 let (u, v) = lens.undistort(xd, yd).unwrap();
                 assert!((u - x).abs() + (v - y).abs() < 1e-11, "{lens:?} at {x}, {y}: {u}, {v}");
+            }
+        }
+    }
+
+    #[test]
+    fn slopes_of_every_lens_are_its_finite_differences() {
+        const STEP: f64 = 1e-5;
+        for lens in lenses() {
+            for (x, y) in [(0.0, 0.0), (0.31, -0.2), (-0.5, 0.44), (0.02, 0.6)] {
+                let slopes = lens.slopes(x, y);
+                for (column, (dx, dy)) in [(STEP, 0.0), (0.0, STEP)].into_iter().enumerate() {
+                    let (after, before) = (lens.apply(x + dx, y + dy), lens.apply(x - dx, y - dy));
+                    let measured = [(after.0 - before.0) / (2.0 * STEP), (after.1 - before.1) / (2.0 * STEP)];
+                    for row in 0..2 {
+                        let off = (slopes[row][column] - measured[row]).abs();
+                        assert!(off < 1e-8, "{lens:?} at {x}, {y}: {slopes:?}, {measured:?}");
+                    }
+                }
             }
         }
     }

@@ -112,13 +112,14 @@ impl<'l> Bench<'l> {
 
     /// Returns the training cameras, in the scene.
     fn cameras(&self) -> Vec<Camera> {
-        let views = self.session.capture.split(Split::Train);
+        let capture = self.session.refined_capture().unwrap_or(&self.session.capture);
+        let views = capture.split(Split::Train);
         views.map(|v| v.camera.transformed(&self.scene.scene_from_world)).collect()
     }
 
     /// Returns the extracted surface with its cap and patches.
     fn extracted(&self, fields: &dyn Fields, c: &MeshConfig) -> Result<Extracted> {
-        let capture = &self.session.capture;
+        let capture = self.session.refined_capture()?;
         let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
         let field = fields.surface()?;
         let (mesh, report) =
@@ -261,7 +262,7 @@ fn train_until(session: &Session, stage: Stage, step: u64) -> Result<()> {
         identity: "bench",
         monitor: &monitor,
     };
-    match learn::train(stage, &session.capture, &session.scene()?, session.config, &training) {
+    match learn::train(stage, session.refined_capture()?, &session.scene()?, session.config, &training) {
         Ok(_) => Ok(()),
         Err(e) if e.kind().is_stop() => match session.run.stop().requested() {
             Some(kind) => Err(Error::stopped("what was measured is kept").with_kind(kind)),
@@ -473,7 +474,7 @@ impl<'f> Finisher<'f> {
             let config = SimplifyConfig { triangles: c.triangles as usize, ..SimplifyConfig::default() };
             simplify(&mut mesh, Some(&closed), &config, bench.monitor())?;
         }
-        let views = learn::training_views(&bench.session.capture, &bench.scene, bench.config())?;
+        let views = learn::training_views(bench.session.refined_capture()?, &bench.scene, bench.config())?;
         Ok(Finisher { mesh, extracted, fields, views })
     }
 

@@ -1,11 +1,12 @@
 //! Stage `mask`: which pixels are the head, and where the head is in space.
 
+use super::cameras::{CameraCheck, check_cameras};
 use super::clicks::{MaskPrompts, make_masks};
 use super::scene_file;
 use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
 use crate::capture::scene::{self, Scene, SceneBox, SceneOptions, in_box};
 use crate::capture::{self, Capture, CaptureOptions, MASK_HINT, Split, View};
-use crate::config::{Config, MaskConfig, MaskMeaning, Preset};
+use crate::config::{CameraPoses, Config, MaskConfig, MaskMeaning, Preset};
 use crate::image::{Gray, Photo, resize_gray, working_size};
 use crate::io::{self, Limits};
 use crate::mask::consistency::{ConsistencyView, check_consistency};
@@ -98,10 +99,17 @@ pub(super) fn mask(
     // pixels that a mask marks as unknown may still show the head
     let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
+    let cameras = whole.capture.cameras;
+    let measured = silhouettes && cameras != CameraPoses::Given;
+    let check =
+        measured.then(|| check_cameras(capture, &scene, cameras, &Limits::default())).transpose()?.flatten();
+    if let Some(check) = &check {
+        require_cameras(check, dir)?;
+    }
     let height = scene::height(&scene, capture.up);
     height.and_then(|h| scene::doubtful_height(h, capture.unit_m)).iter().for_each(|text| dir.warn(text));
     let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
-    Ok(json!({
+    let mut summary = json!({
         "views": capture.views.len(),
         "masks": coverage.len(),
         "coverage": covered,
@@ -109,7 +117,22 @@ pub(super) fn mask(
         "made": record,
         "box": scene::world_box(&scene),
         "height_m": height.map(|h| h * capture.unit_m),
-    }))
+    });
+    if let Some(check) = check {
+        summary["cameras"] = check.summary();
+    }
+    Ok(summary)
+}
+
+/// Refuses cameras that can be neither used nor refined, and keeps what was measured.
+fn require_cameras(check: &CameraCheck, dir: &StageDir) -> Result<()> {
+    if let Some(problem) = grouped(&check.problems()).first() {
+        return Err(problem.into());
+    }
+    if check.refines() {
+        dir.warn(&format!("{}: refined", check.sentence()));
+    }
+    check.write(dir.folder())
 }
 
 /// Returns the path of a view's mask in the stage's folder.
@@ -266,6 +289,19 @@ pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     let (wrong, warnings) = classify_conflicts(&conflicts, compared);
     found.add_refused_masks(&wrong, options);
     found.warnings.extend(warnings);
+    // a measurement says something only of cameras whose masks fit together
+    if let Some(scene) =
+        found.placed.take().filter(|_| found.is_usable() && options.cameras != CameraPoses::Given)
+    {
+        match check_cameras(&capture, &scene, options.cameras, &options.limits) {
+            Ok(Some(check)) => {
+                found.fit = Some(check.announcement());
+                found.problems.extend(grouped(&check.problems()));
+            }
+            Ok(None) => {}
+            Err(e) => found.problems.extend(grouped(&[e])),
+        }
+    }
     found
 }
 

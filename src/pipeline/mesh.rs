@@ -206,7 +206,7 @@ pub(super) fn extracted_surface(run: &Run) -> Result<ExtractedSurface> {
 
 /// Returns the extracted surface that the stage wrote, in the dataset's world.
 pub(super) fn surface_in_world(run: &Run) -> Result<Mesh> {
-    let path = session.run.path("mesh/surface.ply");
+    let path = run.path("mesh/surface.ply");
     read(&io::read_bytes(&path, &Limits::default())?, &path)
 }
 

@@ -9,7 +9,9 @@ use super::render::{held_out, shows_head};
 use super::session::{Session, capture_options};
 use crate::capture::View;
 use crate::config::iface::FieldKind;
-use crate::config::{Config, MaskSource, Material, Method, Preset, Stage, VmBackground, VmConfig};
+use crate::config::{
+    CameraPoses, Config, MaskSource, Material, Method, Preset, Stage, VmBackground, VmConfig,
+};
 use crate::run::{Cost, ESTIMATE, Estimate, Fingerprint, Plan, read_record, read_status};
 use crate::{Error, Result, io};
 use std::path::Path;
@@ -254,6 +256,9 @@ impl Session<'_> {
                 settings.extend(config.values("capture"));
                 settings.remove("capture.path"); // its content counts, not its path
                 settings.remove("capture.tiles"); // masks are of whole photographs
+                if config.capture.cameras == CameraPoses::Given {
+                    settings.remove("capture.cameras"); // as in runs from before poses were measured
+                }
                 if config.capture.r#box == "head" {
                     settings.remove("capture.box"); // as in runs from before there was another
                 }

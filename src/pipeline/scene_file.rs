@@ -1,5 +1,6 @@
 //! `mask/scene.json` and `cameras.json`: where the head is, kept for later stages and for other programs.
 
+use super::cameras::CameraCheck;
 use crate::Result;
 use crate::capture::scene::{Hull, Scene};
 use crate::capture::{Capture, View};
@@ -49,9 +50,9 @@ pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
 }
 
 /// Returns the text of `cameras.json`: every view with split, intrinsics and pose, and the transform from the world
-/// to the scene.
-pub(super) fn cameras_json(capture: &Capture, scene: &Scene) -> Vec<u8> {
-    let value = json!({
+/// to the scene. `check` adds how well the poses fit, and the refined ones.
+pub(super) fn cameras_json(capture: &Capture, scene: &Scene, check: Option<&CameraCheck>) -> Vec<u8> {
+    let mut value = json!({
         "capture": capture.name,
         "format": capture.format,
         "up": capture.up.to_array(),
@@ -60,6 +61,9 @@ pub(super) fn cameras_json(capture: &Capture, scene: &Scene) -> Vec<u8> {
         "world_from_scene": scene.scene_from_world.inverse(),
         "views": capture.views,
     });
+    if let Some(check) = check {
+        value["fit"] = json!(check);
+    }
     format!("{value:#}\n").into_bytes()
 }
 

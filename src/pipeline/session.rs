@@ -1,5 +1,6 @@
 //! A capture, its configuration and its run folder, which every stage works on.
 
+use super::cameras::CameraCheck;
 use super::inputs::{Inputs, missing_capture};
 use super::lpips::measure;
 use super::path::CameraPath;
@@ -13,10 +14,13 @@ use crate::{Error, Result};
 use std::fmt::Display;
 use std::io::ErrorKind::NotFound;
 use std::path::Path;
+use std::sync::OnceLock;
 
 /// A capture, its configuration and its run folder.
 pub struct Session<'a> {
     pub(super) capture: Capture,
+    /// The capture with the poses that the stage `mask` refined, once they are used.
+    refined: OnceLock<Capture>,
     pub(super) config: &'a Config,
     pub(super) run: &'a Run,
     /// What the fingerprints of the stages depend on besides the settings.
@@ -46,7 +50,7 @@ impl<'a> Session<'a> {
         if is_demo(config, run) {
             capture.name = "demo".into();
         }
-        Ok(Session { capture, config, run, inputs, path: None })
+        Ok(Session { capture, refined: OnceLock::new(), config, run, inputs, path: None })
     }
 
     /// Returns a session whose stage `render` makes the views of `render.cameras` in a folder of their own instead of
@@ -85,6 +89,17 @@ impl<'a> Session<'a> {
         &self.capture
     }
 
+    /// Returns the capture with the poses that the stage `mask` refined, for the stages after it.
+    pub(super) fn refined_capture(&self) -> Result<&Capture> {
+        if let Some(capture) = self.refined.get() {
+            return Ok(capture);
+        }
+        let mut capture = self.capture.clone();
+        let check = CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
+        check.iter().for_each(|check| check.apply(&mut capture));
+        Ok(self.refined.get_or_init(|| capture))
+    }
+
     /// Returns the box and hull that the stage `mask` found.
     pub fn scene(&self) -> Result<Scene> {
         scene_file::read_scene(&self.run.path("mask/scene.json")).map_err(|e| unusable(e, Stage::Mask))
@@ -96,7 +111,8 @@ impl<'a> Session<'a> {
             return Ok(());
         }
         let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
-        let cameras = scene_file::cameras_json(&self.capture, &scene);
+        let check = CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
+        let cameras = scene_file::cameras_json(&self.capture, &scene, check.as_ref());
         self.write("cameras.json", &cameras, idle)
     }
 
@@ -173,6 +189,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
         mask_dir: c.mask_dir.clone(),
         mask_meaning: config.mask.meaning,
         trust_masks: config.mask.trust,
+        cameras: c.cameras,
         unit_m: c.unit_m,
         ..CaptureOptions::default()
     }

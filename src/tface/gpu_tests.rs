@@ -186,8 +186,8 @@ fn memory_of_a_training() {
         rays: 4096,
         voxels_start: 40 * 40 * 40,
         voxels_final: 40 * 40 * 40,
-        upsample_steps: vec![],
-        mask_steps: vec![],
+        upsample_at: vec![],
+        mask_at: vec![],
         ..config()
     };
     let pixels = pixels(&views, &config);

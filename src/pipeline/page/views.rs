@@ -193,7 +193,8 @@ pub(super) fn viewer(session: &Session) -> Result<Option<(Viewer, Similarity)>> 
 /// Returns the head of a run whose mesh is done.
 fn shown(session: &Session, mesh: &Record) -> Result<(Viewer, Similarity)> {
     mesh.require_products(&session.run.path(Stage::Mesh))?;
-    let export = Export { texture_format: TextureFormat::Jpeg, ..Export::new(&session.capture, session.config) };
+    let export =
+        Export { texture_format: TextureFormat::Jpeg, ..Export::new(&session.capture, session.config) };
     let head = head_mesh(session.run)?;
     let as_glb = |head: &HeadMesh| Ok(export.files(head, MeshFormat::Glb, "head")?.files.swap_remove(0).1);
     let file_from_world = export.frames(&head.mesh, &head.world_from_scene)?.file_from_world();

@@ -1,0 +1,185 @@
+//! Cameras of the demo head: exact ones, disturbed ones, one that was moved, and photographs that are swapped.
+
+use super::cameras::{CameraCheck, POSES, check_cameras};
+use super::tests::{NoFields, quiet};
+use super::{Session, Stage, complete};
+use crate::capture::scene::{self, Scene, SceneOptions};
+use crate::capture::synthetic::{SyntheticHead, SyntheticOptions, write_capture};
+use crate::capture::{self, Capture, CaptureOptions, Split, View};
+use crate::config::{CameraPoses, Config, Preset};
+use crate::geom::Camera;
+use crate::io::{self, Limits};
+use glam::{DMat3, DQuat, DVec3};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+fn demo() -> (TempDir, Capture) {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 144, height: 180, train: 14, test: 1, seed: 1 };
+    write_capture(dir.path(), &options).unwrap();
+    let capture = capture::open(dir.path(), &CaptureOptions::default()).unwrap();
+    (dir, capture)
+}
+
+fn train(capture: &Capture) -> Vec<&View> {
+    capture.split(Split::Train).collect()
+}
+
+fn check(capture: &Capture, poses: CameraPoses) -> Option<CameraCheck> {
+    let views = train(capture);
+    let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
+    let masks: Vec<_> = views.iter().map(|v| v.load_mask(&Limits::default()).unwrap()).collect();
+    let (scene, _): (Scene, _) = scene::fit(&cameras, &masks, &SceneOptions::default()).unwrap();
+    check_cameras(capture, &scene, poses, &Limits::default()).unwrap()
+}
+
+/// Turns and moves a camera about so many pixels; neighbors in number move oppositely, so that the world stays.
+fn disturb(capture: &mut Capture, view: usize, pixels: f64) {
+    let camera = &mut capture.views[view].camera;
+    let sign = if view % 2 == 0 { 1.0 } else { -1.0 };
+    let axis = DVec3::new(1.0, (view / 2 % 3) as f64 - 1.0, 0.5).normalize();
+    let turn = DQuat::from_scaled_axis(sign * pixels / camera.fx * axis);
+    // about the head: what it does to the picture is the turn alone
+    camera.rotation *= DMat3::from_quat(turn);
+}
+
+/// Returns the root mean square of how far the head lies from its true place in the pictures.
+fn error_px(capture: &Capture, exact: &Capture) -> f64 {
+    let points = SyntheticHead.surface_points(200, 1);
+    let mut squares = Vec::new();
+    for (a, b) in train(capture).into_iter().zip(train(exact)) {
+        for p in &points {
+            let [a, b] = [a, b].map(|v| v.camera.project(*p).unwrap().0);
+            squares.push(f64::from(a.distance_squared(b)));
+        }
+    }
+    (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
+}
+
+fn state(check: &CameraCheck, key: &str) -> Vec<(String, Value)> {
+    let value = json!(check);
+    let cameras = value["cameras"].as_array().unwrap().iter();
+    cameras.map(|c| (c["view"].as_str().unwrap().to_string(), c[key].clone())).collect()
+}
+
+#[test]
+fn exact_poses_stay_and_wrong_ones_fall_to_a_third_for_any_number_of_threads() {
+    let (_dir, exact) = demo();
+    let clean = check(&exact, CameraPoses::Auto).unwrap();
+    assert!(!clean.refines() && clean.problems().is_empty(), "{clean:?}");
+    assert!(clean.sentence().starts_with("poses fit within 0."), "{}", clean.sentence());
+
+    let mut wrong = exact.clone();
+    (0..14).for_each(|v| disturb(&mut wrong, v, 1.5));
+    let before = error_px(&wrong, &exact);
+    let found = check(&wrong, CameraPoses::Auto).unwrap();
+    let pool = |n: usize| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
+    let again = pool(3).install(|| check(&wrong, CameraPoses::Auto)).unwrap();
+    assert_eq!(json!(found), json!(again));
+    assert!(found.sentence().contains("off against each other"), "{}", found.sentence());
+    let mut refined = wrong.clone();
+    found.apply(&mut refined);
+    let after = error_px(&refined, &exact);
+    assert!(before > 1.0 && after < before / 3.0, "{before} {after} {}", found.sentence());
+    // held-out views keep their poses
+    assert_eq!(refined.views[14].camera, exact.views[14].camera);
+}
+
+#[test]
+fn one_camera_that_was_moved_is_named_and_refined_alone() {
+    let (_dir, exact) = demo();
+    let mut wrong = exact.clone();
+    disturb(&mut wrong, 5, 3.0);
+    let found = check(&wrong, CameraPoses::Auto).unwrap();
+    assert!(found.sentence().contains("except camera `005` by"), "{}", found.sentence());
+    let mut refined = wrong.clone();
+    found.apply(&mut refined);
+    let kept = |v: usize| refined.views[v].camera == exact.views[v].camera;
+    assert!((0..15).all(|v| v == 5 || kept(v)));
+    let (before, after) = (error_px(&wrong, &exact), error_px(&refined, &exact));
+    assert!(after < before / 3.0, "{before} {after}");
+}
+
+#[test]
+fn swapped_photographs_are_refused_by_name() {
+    let (_dir, exact) = demo();
+    let mut swapped = exact.clone();
+    for (a, b) in [(3, 9), (9, 3)] {
+        swapped.views[a].photo.clone_from(&exact.views[b].photo);
+        swapped.views[a].mask.clone_from(&exact.views[b].mask);
+    }
+    let problems = check(&swapped, CameraPoses::Auto).map_or(Vec::new(), |c| c.problems());
+    let named = |view: &str| problems.iter().any(|p| p.to_string().contains(view));
+    assert!(problems.len() == 2 && named("`003`") && named("`009`"), "{problems:?}");
+    assert!(problems[0].hint().contains("capture.cameras=given"));
+}
+
+#[test]
+fn poses_are_read_back_and_what_is_no_pose_is_refused_with_its_key() {
+    let (_dir, mut exact) = demo();
+    disturb(&mut exact, 2, 3.0);
+    let found = check(&exact, CameraPoses::Refine).unwrap();
+    assert!(state(&found, "refined").iter().all(|(_, pose)| pose.is_object()));
+    let dir = tempfile::tempdir().unwrap();
+    assert!(CameraCheck::read(dir.path()).unwrap().is_none());
+    found.write(dir.path()).unwrap();
+    assert_eq!(json!(CameraCheck::read(dir.path()).unwrap()), json!(found));
+    let path = dir.path().join(POSES);
+    let written: Value = io::read_json(&path, &Limits::default()).unwrap();
+    for (key, value) in [
+        ("rotation", json!([0, 0, 0, 0, 0, 0, 0, 0, 0])),
+        ("rotation", json!([-1, 0, 0, 0, 1, 0, 0, 0, 1])),
+        ("position", json!([null, 0, 0])),
+        ("position", json!("here")),
+    ] {
+        let mut bad = written.clone();
+        bad["cameras"][4]["refined"][key] = value;
+        std::fs::write(&path, bad.to_string()).unwrap();
+        let error = CameraCheck::read(dir.path()).unwrap_err().to_string();
+        assert!(error.contains(key) && error.contains(POSES), "{error}");
+    }
+}
+
+#[test]
+fn without_masks_nothing_is_said() {
+    let (_dir, mut bare) = demo();
+    let scene = scene::fit(
+        &train(&bare).iter().map(|v| v.camera.clone()).collect::<Vec<_>>(),
+        &[const { None }; 14],
+        &SceneOptions::default(),
+    );
+    bare.views.iter_mut().for_each(|v| v.mask = capture::ViewMask::None);
+    let found = check_cameras(&bare, &scene.unwrap().0, CameraPoses::Auto, &Limits::default()).unwrap();
+    assert!(found.is_none());
+}
+
+#[test]
+fn the_stage_mask_keeps_refined_poses_for_later_stages_unless_given_ones_are_asked_for() {
+    let (dir, exact) = demo();
+    let mut wrong = exact.clone();
+    (0..14).for_each(|v| disturb(&mut wrong, v, 1.5));
+    let file = dir.path().join("transforms.json");
+    let mut frames: Value = io::read_json(&file, &Limits::default()).unwrap();
+    for (frame, view) in frames["frames"].as_array_mut().unwrap().iter_mut().zip(&wrong.views) {
+        for (row, column) in (0..9).map(|i| (i / 3, i % 3)) {
+            frame["transform_matrix"][row][column] = json!(view.camera.rotation.col(column)[row]);
+        }
+    }
+    std::fs::write(&file, frames.to_string()).unwrap();
+    for (poses, refined) in [(CameraPoses::Given, false), (CameraPoses::Auto, true)] {
+        let folder = tempfile::tempdir().unwrap();
+        let run = quiet(folder.path());
+        let mut config = Config::preset(Preset::Draft);
+        config.capture.path = dir.path().display().to_string();
+        config.capture.cameras = poses;
+        let session = Session::open(&config, &run).unwrap();
+        complete(&session, Stage::Mask, &NoFields).unwrap();
+        assert_eq!(run.path("mask").join(POSES).is_file(), refined);
+        let used = session.refined_capture().unwrap();
+        assert_eq!(error_px(used, &exact) < error_px(&wrong, &exact) / 3.0, refined);
+        let cameras: Value = io::read_json(&run.path("cameras.json"), &Limits::default()).unwrap();
+        assert_eq!(cameras["fit"]["cameras"][3]["refined"].is_object(), refined);
+        // a finished stage is not made again for what it found itself
+        assert!(complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
+    }
+}

@@ -1,0 +1,169 @@
+//! Which cameras are to be refined, from what an adjustment of all found.
+
+use super::adjust::{Track, adjust, median};
+use super::{LEAST_SCALE, Rig, distance_px, residuals, sampled, sightings};
+use crate::geom::Camera;
+use serde::{Deserialize, Serialize};
+
+/// Sightings that a camera needs to be judged at all.
+pub const LEAST_SIGHTINGS: usize = 30;
+
+/// Points that a camera must be expected to see for too few sightings to mean that it is wrong.
+const LEAST_EXPECTED: usize = 5 * LEAST_SIGHTINGS;
+
+/// Points that must be found for anything to be said.
+const LEAST_TRACKS: usize = 100;
+
+/// A camera is not repaired but reported if it has to move farther, pixels: the patches would hardly be found.
+const FARTHEST_PX: f64 = 10.0;
+
+/// Patches of a photograph fit somewhere by chance: its camera is lost if its residual stays above so many pixels …
+const LOST_PX: f64 = 1.0;
+
+/// … and above this many times that of all.
+const LOST_SHARE: f64 = 4.0;
+
+/// All cameras are refined if the residual falls below this share of what it is with the poses given.
+const GAIN: f64 = 0.8;
+
+/// A single camera is refined if it has to move at least so far, pixels …
+const LEAST_MOVE_PX: f64 = 0.8;
+
+/// … and this many times as far as the median camera.
+const STANDS_OUT: f64 = 3.0;
+
+/// What is to be done about the cameras of a rig.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Verdict {
+    /// Too little of the head was found again: poses stay as they are.
+    Unchecked,
+    /// They fit: poses stay as they are.
+    Fit,
+    /// Only those that stand out are refined.
+    Some,
+    /// All are refined.
+    All,
+}
+
+/// What is to be done about one camera.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CameraState {
+    /// It keeps its pose.
+    Stays,
+    /// Its pose is refined.
+    Refined,
+    /// Its photograph does not show what it should: it has too few sightings, though it sees as much of the head as
+    /// others, or they fit no pose.
+    Lost,
+    /// It is too far off to be refined.
+    Far,
+}
+
+/// What was measured of one camera.
+#[derive(Clone, Debug)]
+pub struct CameraFit {
+    /// What is to be done about it.
+    pub state: CameraState,
+    /// How many points were found in its photograph.
+    pub sightings: usize,
+    /// How many points of the last round, all found in other photographs before, were looked up in it.
+    pub expected: usize,
+    /// Median distance of these from the projections of free points with the poses given, pixels.
+    pub given_px: f64,
+    /// The same after the adjustment of all cameras.
+    pub adjusted_px: f64,
+    /// How far the head moves in its picture from the pose given to the adjusted one, pixels (root mean square).
+    pub moved_px: f64,
+    /// The camera with the pose to use.
+    pub camera: Camera,
+}
+
+/// Decides what to do, given the cameras and tracks of an adjustment of all. `expected` is how many points each camera was
+/// expected to see, and `all` asks for all cameras to be refined.
+pub(super) fn decide(
+    given: &[Camera],
+    adjusted: Vec<Camera>,
+    tracks: Vec<Track>,
+    expected: &[usize],
+    all: bool,
+) -> Rig {
+    let mut at_given = tracks.clone();
+    let fixed = vec![false; given.len()];
+    let points = sampled(&tracks);
+    let refined = residuals(&adjusted, &tracks);
+    let adjusted_px = median(&mut refined.concat());
+    adjust(given, &mut given.to_vec(), &mut at_given, &fixed, adjusted_px.max(LEAST_SCALE));
+    let before = residuals(given, &at_given);
+    let given_px = median(&mut before.concat());
+    let counts = sightings(&tracks, given.len());
+    let fit = |v: usize| CameraFit {
+        state: CameraState::Stays,
+        sightings: counts[v],
+        expected: expected[v],
+        given_px: median(&mut before[v].clone()),
+        adjusted_px: median(&mut refined[v].clone()),
+        moved_px: distance_px(&given[v], &adjusted[v], &points),
+        camera: given[v].clone(),
+    };
+    let cameras = (0..given.len()).map(fit).collect();
+    let mut rig = Rig { verdict: Verdict::Unchecked, cameras, given_px, adjusted_px };
+    let measured = counts.iter().filter(|&&n| n >= LEAST_SIGHTINGS).count();
+    if tracks.len() < LEAST_TRACKS || 2 * measured < given.len() {
+        return rig;
+    }
+    rig.verdict = judge(&mut rig.cameras, adjusted_px, all || adjusted_px < GAIN * given_px);
+    let poses = match rig.verdict {
+        Verdict::Some => alone(given, adjusted, tracks, &rig.cameras, adjusted_px),
+        _ => adjusted,
+    };
+    for (camera, pose) in rig.cameras.iter_mut().zip(poses) {
+        if camera.state == CameraState::Refined {
+            camera.moved_px = distance_px(&camera.camera, &pose, &points);
+            camera.camera = pose;
+        }
+    }
+    rig
+}
+
+/// Sets the state of each camera and returns the verdict. `residual` is that of all after the adjustment, and `gains` says
+/// whether it falls enough.
+fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> Verdict {
+    let moves = cameras.iter().filter(|c| c.sightings >= LEAST_SIGHTINGS).map(|c| c.moved_px);
+    let usual_move = median(&mut moves.collect::<Vec<f64>>());
+    for c in cameras.iter_mut() {
+        let stands_out = c.moved_px > LEAST_MOVE_PX.max(STANDS_OUT * usual_move);
+        c.state = match () {
+            // where few points are found in other photographs either, such as in hair, few sightings mean nothing
+            () if c.sightings < LEAST_SIGHTINGS && c.expected < LEAST_EXPECTED => CameraState::Stays,
+            () if c.sightings < LEAST_SIGHTINGS => CameraState::Lost,
+            () if c.adjusted_px > LOST_PX.max(LOST_SHARE * residual) => CameraState::Lost,
+            () if c.moved_px > FARTHEST_PX => CameraState::Far,
+            () if gains || stands_out => CameraState::Refined,
+            () => CameraState::Stays,
+        };
+    }
+    match cameras.iter().any(|c| c.state == CameraState::Refined) {
+        _ if gains => Verdict::All,
+        true => Verdict::Some,
+        false => Verdict::Fit,
+    }
+}
+
+/// Returns the poses of the cameras to refine where all others keep theirs.
+fn alone(
+    given: &[Camera],
+    adjusted: Vec<Camera>,
+    mut tracks: Vec<Track>,
+    fits: &[CameraFit],
+    scale: f64,
+) -> Vec<Camera> {
+    let free: Vec<bool> = fits.iter().map(|c| c.state == CameraState::Refined).collect();
+    let pick = |(v, pose): (usize, Camera)| if free[v] { pose } else { given[v].clone() };
+    let mut cameras: Vec<Camera> = adjusted.into_iter().enumerate().map(pick).collect();
+    for _ in 0..2 {
+        adjust(given, &mut cameras, &mut tracks, &free, scale.max(LEAST_SCALE));
+    }
+    cameras
+}
