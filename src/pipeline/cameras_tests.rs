@@ -36,7 +36,7 @@ fn check(capture: &Capture, poses: CameraPoses) -> Option<CameraCheck> {
 /// Turns and moves a camera about so many pixels; neighbors in number move oppositely, so that the world stays.
 fn disturb(capture: &mut Capture, view: usize, pixels: f64) {
     let camera = &mut capture.views[view].camera;
-    let sign = if view % 2 == 0 { 1.0 } else { -1.0 };
+    let sign = if view.is_multiple_of(2) { 1.0 } else { -1.0 };
     let axis = DVec3::new(1.0, (view / 2 % 3) as f64 - 1.0, 0.5).normalize();
     let turn = DQuat::from_scaled_axis(sign * pixels / camera.fx * axis);
     // about the head: what it does to the picture is the turn alone
