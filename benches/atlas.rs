@@ -20,9 +20,7 @@ use tiface::mesh::{AtlasConfig, ExtractOptions, atlas, extract};
 
 fn head(resolution: usize) -> Mesh {
     let config = ExtractOptions { resolution, ..ExtractOptions::default() };
-    let color = |p: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; p.len()];
-    let (field, slope) = (fields::batch(fields::head), fields::batch_gradient(fields::head));
-    extract(field, slope, color, Aabb::SCENE, None, &config, &Quiet).expect("a head").0
+    extract(&fields::head, Aabb::SCENE, &config, &Quiet).expect("a head").0
 }
 
 fn main() {

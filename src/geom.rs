@@ -1,8 +1,8 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
-mod boxes;
 mod bvh;
 mod camera;
+mod field;
 mod mesh;
 mod overlap;
 mod ray;
@@ -12,12 +12,15 @@ pub mod sphharm;
 mod symmetric;
 mod topology;
 
-pub(crate) use boxes::{Boxes, DBox, EFFORT, Effort, share_out};
 pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion, Projection};
+pub use field::SdfField;
 pub use mesh::{Atlas, Mesh};
 pub(crate) use mesh::{area_vector, shape};
-pub(crate) use overlap::{OutlineSide, THOROUGH, intersect, nearest_charts, overlaps, shared_area, turn};
+pub(crate) use overlap::{
+    Boxes, DBox, EFFORT, Effort, OutlineSide, THOROUGH, intersect, nearest_charts, overlaps, share_out,
+    shared_area, turn,
+};
 pub use ray::{Aabb, Hit, Ray, RayResult};
 pub use shells::{ShellCaster, ShellLayer, Shells};
 pub use similarity::Similarity;
@@ -25,3 +28,6 @@ pub use sphharm::Harmonics;
 pub(crate) use symmetric::cofactors;
 pub(crate) use topology::{Sets, fans, side_ends, sorted_sides};
 pub use topology::{Topology, topology};
+
+#[cfg(test)]
+pub(crate) use field::Painted;

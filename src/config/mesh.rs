@@ -84,8 +84,6 @@ table! {
         /// Topological handles, such as loops of hair: keep, or simple (cut or filled, up to a loop of 0.15 of the
         /// surface's longest side, about 45 mm on a head).
         genus: Genus => Genus::Simple, Genus::Simple, Genus::Keep;
-        /// Evaluate the whole grid too, and report what the sparse extraction missed: slow.
-        verify: bool => false;
         /// Close the surface where the frames cut the body: true or false.
         cap: bool => true, true, false;
         /// Number of triangles after simplification; 0 keeps all.
@@ -118,18 +116,10 @@ table! {
     constants {
         /// Evaluate the whole grid, and leave what is found there as it is (published).
         dense: bool => false, false, true;
-        /// Components with less than this share of the largest one's area are dropped: a head is one piece.
-        keep_share: f64 => 1.0;
         /// Share of the cameras that must have the median cell of a slab in their frames, or the body is cut off
         /// above it. On `lps` a sixth keeps 8 cm more than a third does and the lower half of that is off by 1 to 4 cm;
         /// a quarter keeps 3.4 cm whose median error is 1 to 2 mm, and covers as much of the training views.
         seen_by: f64 => 0.25, 0.25, 1.0 / 3.0;
-        /// Every how many cells the field is evaluated first.
-        coarse_step: u32 => 8;
-        /// Newton steps that pull vertices onto the zero level of the field.
-        newton_steps: u32 => 2;
-        /// How far vertices slide towards the middle of their neighbors with the first step.
-        relax: f32 => 0.5;
         /// Samples along each side of a texel, where colors are the network's.
         texture_samples: u32 => 2;
         /// Texels that repeat a chart's border around it; charts lie twice as far apart.

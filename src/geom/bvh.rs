@@ -530,16 +530,13 @@ impl Bvh {
                     self.nodes[ours].bounds[0][axis][lane] = b.min[axis];
                     self.nodes[ours].bounds[1][axis][lane] = b.max[axis];
                 }
-                let triangles: Vec<u32> =
-                    if tree.nodes[n].is_leaf() { members(n).collect() } else { Vec::new() };
-                self.nodes[ours].child[lane] = match triangles.len() {
-                    0 => {
-                        self.nodes.push(WideNode::EMPTY);
-                        work.push((self.nodes.len() - 1, n, level + 1));
-                        self.nodes.len() as u32 - 1
-                    }
-                    1..=4 => self.add_leaf(mesh, &triangles),
-                    _ => self.add_crowd(mesh, &triangles, grown),
+                self.nodes[ours].child[lane] = if tree.nodes[n].is_leaf() {
+                    // no more than the four that the builder was asked for
+                    self.add_leaf(mesh, &members(n).collect::<Vec<u32>>())
+                } else {
+                    self.nodes.push(WideNode::EMPTY);
+                    work.push((self.nodes.len() - 1, n, level + 1));
+                    self.nodes.len() as u32 - 1
                 };
             }
         }
@@ -558,28 +555,6 @@ impl Bvh {
         }
         self.leaves.push(leaf);
         LEAF | (self.leaves.len() as u32 - 1)
-    }
-
-    /// More than four triangles in one of the builder's leaves: a chain of nodes, three leaves each.
-    fn add_crowd(&mut self, mesh: &Mesh, triangles: &[u32], grown: f32) -> u32 {
-        let ours = self.nodes.len();
-        self.nodes.push(WideNode::EMPTY);
-        let (here, rest) = triangles.split_at(triangles.len().min(12));
-        let mut parts: Vec<&[u32]> = here.chunks(4).collect();
-        if !rest.is_empty() {
-            parts.push(rest);
-        }
-        for (lane, part) in parts.into_iter().enumerate() {
-            let b = Aabb::around(part.iter().flat_map(|&t| mesh.corners(t))).grown(grown);
-            for axis in 0..3 {
-                self.nodes[ours].bounds[0][axis][lane] = b.min[axis];
-                self.nodes[ours].bounds[1][axis][lane] = b.max[axis];
-            }
-            let child =
-                if part.len() <= 4 { self.add_leaf(mesh, part) } else { self.add_crowd(mesh, part, grown) };
-            self.nodes[ours].child[lane] = child;
-        }
-        ours as u32
     }
 }
 

@@ -85,19 +85,23 @@ impl Mesh {
     /// they cancel.
     pub fn normal_at(&self, hit: &Hit) -> Option<Vec3> {
         let corners = self.triangles[hit.triangle as usize];
-        let [a, b, c] = corners.map(|v| self.normals.get(v as usize).copied().unwrap_or_default());
-        ((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c).try_normalize()
+        hit.mix(corners.map(|v| self.normals.get(v as usize).copied().unwrap_or_default())).try_normalize()
+    }
+
+    /// Returns the same, or the triangle's own normal.
+    pub fn shading_normal(&self, hit: &Hit) -> Vec3 {
+        self.normal_at(hit).unwrap_or_else(|| area_vector(self.corners(hit.triangle)).normalize_or_zero())
+    }
+
+    /// Returns the position of a point of a triangle.
+    pub fn point_at(&self, hit: &Hit) -> Vec3 {
+        hit.mix(self.corners(hit.triangle))
     }
 
     /// Returns the color of a point of a triangle, interpolated between its vertices; black without colors.
     pub fn color_at(&self, hit: &Hit) -> [f32; 3] {
-        let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
-        let mut out = [0f32; 3];
-        for (&vertex, w) in self.triangles[hit.triangle as usize].iter().zip(weights) {
-            let own = self.colors.get(vertex as usize).unwrap_or(&[0.0; 3]);
-            (0..3).for_each(|k| out[k] += w * own[k]);
-        }
-        out
+        let color = |v: u32| Vec3::from(self.colors.get(v as usize).copied().unwrap_or_default());
+        hit.mix(self.triangles[hit.triangle as usize].map(color)).to_array()
     }
 
     /// Drops vertices no triangle uses.

@@ -6,8 +6,16 @@
 //! count.
 //!
 //! Beside that: whether two triangles in space pass through each other, and how far the charts of an atlas are apart.
+//!
+//! # Boxes
+//!
+//! Which boxes meet, for a bounded effort.
+//!
+//! A triangle of a sound mesh has a few dozen neighbours, but a file may put all of its triangles into one place,
+//! and comparing all with all is quadratic. So every search here counts what it looks at: each item gets a share
+//! of an effort proportional to their number, what some leave over is dealt to those that need more, and who is
+//! not done then is named. All of it is counted work, never time: the answer is the same on every machine.
 
-use super::boxes::{Boxes, DBox, EFFORT, share_out};
 use glam::{DVec2, DVec3, Vec2};
 use rayon::prelude::*;
 
@@ -20,11 +28,13 @@ pub(crate) fn turn(a: Vec2, b: Vec2, c: Vec2) -> i32 {
 
 /// Returns whether two triangles, neither without area, share area.
 pub(crate) fn share_area(p: [Vec2; 3], q: [Vec2; 3]) -> bool {
-    let separates = |a: [Vec2; 3], b: [Vec2; 3]| {
-        let inner = turn(a[0], a[1], a[2]);
-        (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * inner <= 0))
-    };
-    !separates(p, q) && !separates(q, p)
+    !separates(p, q, turn) && !separates(q, p, turn)
+}
+
+/// Returns whether a side of a triangle has all of another one on its far side, by the sign of a turn.
+fn separates<V: Copy>(a: [V; 3], b: [V; 3], turn: impl Fn(V, V, V) -> i32) -> bool {
+    let inner = turn(a[0], a[1], a[2]);
+    (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * inner <= 0))
 }
 
 /// The area two triangles share, in the square of the coordinates' unit.
@@ -53,7 +63,7 @@ pub(crate) fn shared_area(p: [DVec2; 3], q: [DVec2; 3]) -> f64 {
 
 /// Pairs of triangles that share area.
 pub(crate) struct Overlaps {
-    /// Each pair once, lower index first, in the order of where they begin in the texture.
+    /// Each pair once, lower index first, in order.
     pub pairs: Vec<(u32, u32)>,
     /// How many triangles share area with another one.
     pub covered: usize,
@@ -91,6 +101,7 @@ pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effor
         pairs
     });
     let mut pairs: Vec<(u32, u32)> = shared.found.into_iter().flatten().collect();
+    pairs.par_sort_unstable();
     let mut covered = vec![false; triangles.len()];
     pairs.iter().for_each(|&(a, b)| (covered[a as usize], covered[b as usize]) = (true, true));
     if !shared.unfinished.is_empty() {
@@ -116,19 +127,6 @@ pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effor
             known
         });
         rest.iter().zip(known.found).for_each(|(&t, known)| covered[t as usize] = known);
-    }
-    if !pairs.is_empty() {
-        // cells of about a triangle each, were they spread evenly
-        let low_of = |t: u32| corners(t).into_iter().fold(Vec2::INFINITY, Vec2::min);
-        let high_of = |t: u32| corners(t).into_iter().fold(Vec2::NEG_INFINITY, Vec2::max);
-        let low = listed.iter().fold(Vec2::INFINITY, |m, &t| m.min(low_of(t)));
-        let high = listed.iter().fold(Vec2::NEG_INFINITY, |m, &t| m.max(high_of(t)));
-        let side = ((listed.len() as f32).sqrt() as usize).clamp(1, 2048) as f32;
-        let scale = side / (high - low).max(Vec2::splat(f32::MIN_POSITIVE));
-        pairs.par_sort_by_cached_key(|&(a, b)| {
-            let at = ((low_of(a).max(low_of(b)) - low) * scale).clamp(Vec2::ZERO, Vec2::splat(side - 1.0));
-            (at.y as u32, at.x as u32, a, b)
-        });
     }
     let covered = covered.iter().filter(|&&c| c).count();
     Overlaps { pairs, covered, left: shared.unfinished.len() }
@@ -192,14 +190,10 @@ fn overlap_in_plane(p: [DVec3; 3], q: [DVec3; 3]) -> bool {
     };
     let turn = |a: DVec2, b: DVec2, c: DVec2| {
         let (x, y) = ((b.x - a.x) * (c.y - a.y), (b.y - a.y) * (c.x - a.x));
-        if (x - y).abs() <= 1e-15 * (x.abs() + y.abs()) { 0.0 } else { x - y }
-    };
-    let separates = |a: [DVec2; 3], b: [DVec2; 3]| {
-        let winding = turn(a[0], a[1], a[2]);
-        (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * winding <= 0.0))
+        if (x - y).abs() <= 1e-15 * (x.abs() + y.abs()) { 0 } else { (x - y).signum() as i32 }
     };
     let (p, q) = (p.map(flat), q.map(flat));
-    !separates(p, q) && !separates(q, p)
+    !separates(p, q, turn) && !separates(q, p, turn)
 }
 
 /// A piece of a chart's outline, in texels.
@@ -278,6 +272,189 @@ fn distance(a: &OutlineSide, b: &OutlineSide) -> f64 {
     }
     let ends = [point_distance(a.from, b), point_distance(a.to, b), point_distance(b.from, a)];
     ends.into_iter().fold(point_distance(b.to, a), f64::min)
+}
+
+/// What may be spent on each item on average, in comparisons of boxes of two or three nanoseconds. A triangle of a
+/// sound mesh takes half of it or less.
+pub(crate) const EFFORT: usize = 1024;
+
+/// As many items' effort may be spent however few there are: two thousand triangles in one place are no reason.
+const ALWAYS: usize = 1 << 15;
+
+/// What one item may still spend.
+pub(crate) struct Effort {
+    left: usize,
+    short: bool,
+}
+
+impl Effort {
+    pub(crate) fn of(left: usize) -> Effort {
+        Effort { left, short: false }
+    }
+
+    /// Returns whether too little was left for something.
+    pub(crate) fn ran_short(&self) -> bool {
+        self.short
+    }
+
+    /// Spends, or returns false from the first time that too little is left.
+    pub(crate) fn spend(&mut self, cost: usize) -> bool {
+        self.short |= self.left < cost;
+        self.left = if self.short { 0 } else { self.left - cost };
+        !self.short
+    }
+}
+
+/// What [`share_out`] found.
+pub(crate) struct Shared<T> {
+    /// One for each item; of those that were not finished, what they have so far.
+    pub(crate) found: Vec<T>,
+    /// Who ran short, in order.
+    pub(crate) unfinished: Vec<usize>,
+}
+
+/// Does `work` for each item, with `each` to spend on average and no more than that on all.
+pub(crate) fn share_out<T: Send>(
+    items: usize,
+    each: usize,
+    work: impl Fn(usize, &mut Effort) -> T + Sync,
+) -> Shared<T> {
+    let total = each.saturating_mul(items.max(ALWAYS));
+    let mut found: Vec<Option<T>> = (0..items).map(|_| None).collect();
+    let (mut unfinished, mut share, mut spent): (Vec<usize>, _, _) = ((0..items).collect(), each, 0);
+    // a second time from the start, with what the others left over
+    for _ in 0..2 {
+        let run = |&i: &usize| {
+            let mut effort = Effort::of(share);
+            (work(i, &mut effort), share - effort.left, effort.short)
+        };
+        let runs: Vec<(T, usize, bool)> = unfinished.par_iter().map(run).collect();
+        let mut short = Vec::new();
+        for (i, (result, cost, ran_short)) in unfinished.into_iter().zip(runs) {
+            found[i] = Some(result);
+            spent += cost;
+            if ran_short {
+                short.push(i);
+            }
+        }
+        unfinished = short;
+        let left = total.saturating_sub(spent) / unfinished.len().max(1);
+        if unfinished.is_empty() || left <= each {
+            break;
+        }
+        share = left;
+    }
+    Shared { found: found.into_iter().flatten().collect(), unfinished }
+}
+
+/// A box along the axes.
+#[derive(Clone, Copy)]
+pub(crate) struct DBox {
+    low: DVec3,
+    high: DVec3,
+}
+
+impl DBox {
+    const EMPTY: DBox = DBox { low: DVec3::INFINITY, high: DVec3::NEG_INFINITY };
+
+    pub(crate) fn around(points: impl IntoIterator<Item = DVec3>) -> DBox {
+        points.into_iter().fold(DBox::EMPTY, |s, p| DBox { low: s.low.min(p), high: s.high.max(p) })
+    }
+
+    pub(crate) fn grown(self, margin: f64) -> DBox {
+        DBox { low: self.low - margin, high: self.high + margin }
+    }
+
+    fn with(self, other: DBox) -> DBox {
+        DBox { low: self.low.min(other.low), high: self.high.max(other.high) }
+    }
+
+    fn meets(&self, other: &DBox) -> bool {
+        self.low.cmple(other.high).all() && other.low.cmple(self.high).all()
+    }
+
+    /// Twice its middle.
+    fn middle(&self) -> DVec3 {
+        self.low + self.high
+    }
+}
+
+/// Most boxes in a leaf of the tree.
+const LEAF: usize = 4;
+
+/// Boxes in a balanced tree: each node holds half of its parent's, parted across the longest side. Its depth does
+/// not depend on where they are.
+pub(crate) struct Boxes {
+    /// In the order of the tree, with their numbers.
+    items: Vec<(DBox, u32)>,
+    /// A node, then those below its first half, then those below its second.
+    nodes: Vec<DBox>,
+}
+
+impl Boxes {
+    pub(crate) fn new(spans: impl Iterator<Item = DBox>) -> Boxes {
+        let mut items: Vec<(DBox, u32)> = spans.zip(0..).collect();
+        let leaves = items.len().div_ceil(LEAF).next_power_of_two();
+        let mut nodes = vec![DBox::EMPTY; 2 * leaves - 1];
+        part(&mut items, &mut nodes);
+        Boxes { items, nodes }
+    }
+
+    /// The numbers of the boxes, neighbours mostly beside each other.
+    pub(crate) fn order(&self) -> impl Iterator<Item = u32> {
+        self.items.iter().map(|&(_, i)| i)
+    }
+
+    /// Calls `visit` with every box that meets `query`, until it returns false or the effort is spent.
+    pub(crate) fn meeting(
+        &self,
+        query: &DBox,
+        effort: &mut Effort,
+        mut visit: impl FnMut(u32, &mut Effort) -> bool,
+    ) {
+        // node, nodes from it on, its items
+        let mut stack = vec![(0, self.nodes.len(), 0, self.items.len())];
+        while let Some((node, count, from, to)) = stack.pop() {
+            if !effort.spend(1) {
+                return;
+            }
+            if !self.nodes[node].meets(query) {
+                continue;
+            }
+            if count > 1 {
+                let (below, half) = (count / 2, from + (to - from) / 2);
+                stack.push((node + 1 + below, below, half, to));
+                stack.push((node + 1, below, from, half));
+                continue;
+            }
+            for (span, i) in &self.items[from..to] {
+                if !effort.spend(1) || span.meets(query) && !visit(*i, effort) {
+                    return;
+                }
+            }
+        }
+    }
+}
+
+fn part(items: &mut [(DBox, u32)], nodes: &mut [DBox]) {
+    let Some((node, below)) = nodes.split_first_mut() else { return };
+    *node = items.iter().fold(DBox::EMPTY, |s, i| s.with(i.0));
+    if below.is_empty() || items.is_empty() {
+        return;
+    }
+    let middles = DBox::around(items.iter().map(|i| i.0.middle()));
+    let axis = (middles.high - middles.low).max_position();
+    let at = |i: &(DBox, u32)| i.0.middle()[axis];
+    let half = items.len() / 2;
+    items.select_nth_unstable_by(half, |a, b| at(a).total_cmp(&at(b)).then(a.1.cmp(&b.1)));
+    let (a, b) = items.split_at_mut(half);
+    let (below_a, below_b) = below.split_at_mut(below.len() / 2);
+    if b.len() > 4096 {
+        rayon::join(|| part(a, below_a), || part(b, below_b));
+    } else {
+        part(a, below_a);
+        part(b, below_b);
+    }
 }
 
 #[cfg(test)]
@@ -398,5 +575,58 @@ mod tests {
             }
         }
         assert_eq!(nearest(&sides, 64.0), Some(least));
+    }
+}
+
+#[cfg(test)]
+mod box_tests {
+    use super::*;
+
+    #[test]
+    fn the_tree_finds_what_all_pairs_find() {
+        // boxes 0 to 0.2 wide in the unit cube, from a counter; one of them far out, as strays of scans are
+        let mut state = 7u64;
+        let mut next = move || {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            (state >> 40) as f64 / (1u64 << 24) as f64
+        };
+        let mut spans: Vec<DBox> = (0..501)
+            .map(|_| {
+                let low = DVec3::new(next(), next(), next());
+                DBox { low, high: low + 0.2 * DVec3::new(next(), next(), next()) }
+            })
+            .collect();
+        spans[17] = DBox::around([DVec3::splat(1e30)]);
+        let boxes = Boxes::new(spans.iter().copied());
+        for query in &spans {
+            let mut found = Vec::new();
+            let mut effort = Effort { left: usize::MAX, short: false };
+            boxes.meeting(query, &mut effort, |i, _| {
+                found.push(i);
+                true
+            });
+            found.sort_unstable();
+            let all = (0..501).filter(|&i| spans[i as usize].meets(query)).collect::<Vec<u32>>();
+            assert_eq!(found, all);
+            // most of the tree is not looked at
+            assert!(usize::MAX - effort.left < 400);
+        }
+        assert_eq!(Boxes::new(std::iter::empty()).nodes.len(), 1);
+    }
+
+    #[test]
+    fn what_some_leave_over_goes_to_those_that_need_more() {
+        // item 3 asks for a hundred thousand, which all of them together may spend; none else asks for any
+        let need = |i: usize| if i == 3 { 100_000 } else { 0 };
+        let work = |i: usize, effort: &mut Effort| (0..need(i)).take_while(|_| effort.spend(1)).count();
+        let shared = share_out(10, 10, work);
+        assert_eq!((shared.found[3], shared.unfinished.len()), (100_000, 0));
+        // three of them are more than that: each is told what it has
+        let work = |_: usize, effort: &mut Effort| (0..200_000).take_while(|_| effort.spend(1)).count();
+        let shared = share_out(3, 10, work);
+        assert_eq!(shared.unfinished, [0, 1, 2]);
+        assert!(
+            shared.found.iter().sum::<usize>() <= 10 * ALWAYS && shared.found.iter().all(|&n| n > 100_000)
+        );
     }
 }

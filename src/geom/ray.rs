@@ -2,6 +2,7 @@
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use std::ops::{Add, Mul};
 
 /// A half line with the part of it that matters.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -47,6 +48,22 @@ pub struct Hit {
     pub u: f32,
     /// Weight of the triangle's third vertex.
     pub v: f32,
+}
+
+impl Hit {
+    /// Returns the weights of the triangle's vertices.
+    pub fn weights(&self) -> [f32; 3] {
+        [1.0 - self.u - self.v, self.u, self.v]
+    }
+
+    /// Returns what values at the triangle's vertices are at the hit.
+    pub fn mix<T: Add<Output = T>>(&self, [a, b, c]: [T; 3]) -> T
+    where
+        f32: Mul<T, Output = T>,
+    {
+        let [wa, wb, wc] = self.weights();
+        wa * a + wb * b + wc * c
+    }
 }
 
 /// An axis-aligned box, `min <= max` on every axis unless it is [`Aabb::EMPTY`].

@@ -31,14 +31,20 @@ impl ShellLayer {
 
     /// Returns the opacity at a point of a triangle of these vertices.
     pub fn alpha(&self, hit: &Hit, triangle: [u32; 3]) -> f32 {
-        let [a, b, c] = triangle.map(|v| self.alphas[v as usize]);
-        (1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c
+        hit.mix(triangle.map(|v| self.alphas[v as usize]))
     }
 
-    /// Returns the positions of the layer's vertices, those of `mesh` moved.
-    pub fn positions(&self, mesh: &Mesh) -> Vec<Vec3> {
+    /// Returns the layer around a mesh with normals, and for each of its triangles the mesh's.
+    ///
+    /// # Panics
+    ///
+    /// The layer has not one offset and one alpha for each vertex.
+    pub fn surface(&self, mesh: &Mesh) -> (Mesh, Vec<u32>) {
         let moved = |((p, n), offset): ((&Vec3, &Vec3), &f32)| *p + *n * *offset;
-        mesh.positions.iter().zip(&mesh.normals).zip(&self.offsets).map(moved).collect()
+        let positions = mesh.positions.iter().zip(&mesh.normals).zip(&self.offsets).map(moved).collect();
+        let shown = mesh.triangles.iter().enumerate().filter(|(_, t)| self.has(t));
+        let (source, triangles) = shown.map(|(id, t)| (id as u32, *t)).unzip();
+        (Mesh { positions, triangles, ..Mesh::default() }, source)
     }
 }
 
@@ -64,14 +70,8 @@ impl<'a> ShellCaster<'a> {
     /// A layer has not one offset and one alpha for each vertex.
     pub fn new(mesh: &'a Mesh, shells: &'a Shells) -> ShellCaster<'a> {
         let caster = |layer: &'a ShellLayer| {
-            let mut surface = Mesh { positions: layer.positions(mesh), ..Mesh::default() };
-            let mut source = Vec::new();
-            for (t, triangle) in mesh.triangles.iter().enumerate().filter(|(_, t)| layer.has(t)) {
-                surface.triangles.push(*triangle);
-                source.push(t as u32);
-            }
-            let bvh = Bvh::new(&surface);
-            LayerCaster { layer, surface, bvh, source }
+            let (surface, source) = layer.surface(mesh);
+            LayerCaster { layer, bvh: Bvh::new(&surface), surface, source }
         };
         ShellCaster { mesh, layers: shells.layers.iter().map(caster).collect() }
     }

@@ -67,14 +67,8 @@ impl Harmonics {
     /// vertices.
     pub fn seen_along(&self, direction: Vec3, hit: &Hit, triangle: [u32; 3]) -> [f32; 3] {
         let d = (self.turned * -direction).to_array();
-        let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
-        let mut out = [0f32; 3];
-        for (vertex, w) in triangle.into_iter().zip(weights) {
-            let own = &self.coefficients[vertex as usize * self.functions..][..self.functions];
-            let color = combine(own, d);
-            (0..3).for_each(|k| out[k] += w * color[k]);
-        }
-        out
+        let of = |v: u32| &self.coefficients[v as usize * self.functions..][..self.functions];
+        hit.mix(triangle.map(|v| Vec3::from(combine(of(v), d)))).to_array()
     }
 }
 

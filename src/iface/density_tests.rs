@@ -4,6 +4,7 @@ use super::cpu::march;
 use super::*;
 use crate::config::Preset;
 use crate::field::ball::{BALL, resumes, session, temporary, views};
+use crate::geom::SdfField;
 use crate::iface::schedule::step_length;
 use crate::kernel::cpu::density::DensityWeights;
 use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};

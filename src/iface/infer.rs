@@ -9,7 +9,7 @@ use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
 #[cfg(feature = "wgpu")]
 use crate::field::{ComputeDevice, GpuField, devices::Gpu};
-use crate::geom::{Ray, RayResult};
+use crate::geom::{Ray, RayResult, SdfField};
 #[cfg(feature = "wgpu")]
 use crate::io::Lock;
 use crate::kernel::cpu::march::{Bitmask, MarchRay, Samples};
@@ -133,9 +133,10 @@ impl IFace {
     fn scaled(&self, points: &[Vec3]) -> Vec<[f32; 3]> {
         points.iter().map(|p| (*p * self.config.radius).to_array()).collect()
     }
+}
 
-    /// Returns the signed distance, negative inside. `[n]` points → `[n]`.
-    pub fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+impl SdfField for IFace {
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         let mut f = self.raw_sdf(&self.scaled(points));
         if self.config.radius != 1.0 {
             f.iter_mut().for_each(|f| *f /= self.config.radius);
@@ -143,15 +144,12 @@ impl IFace {
         f
     }
 
-    /// Returns the local sharpness of the surface, per scene unit: the opacity at a distance `f` outside is
-    /// σ(−f · sharpness). `[n]` points → `[n]`.
-    pub fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
+    fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
         let soft = self.output(&self.scaled(points), WIDTH - 1, sdf::softness);
         soft.iter().map(|soft| self.inv_s() * soft.exp()).collect()
     }
 
-    /// Returns the signed distance and its gradient (not normalized).
-    pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let x = self.scaled(points);
         #[cfg(feature = "wgpu")]
         if let Some(planes) = self.on_gpu.ask(|field| field.evaluate(&x, None, None, 0..4)) {
@@ -163,9 +161,7 @@ impl IFace {
         all.into_iter().map(|(f, n)| (f / self.config.radius, Vec3::from(n))).unzip()
     }
 
-    /// Returns the sRGB-coded colors of surface points with unit `normals`, one color per direction. Point `i` is viewed
-    /// along `counts[i]` unit `directions` (away from the camera), which are concatenated in one list.
-    pub fn colors(
+    fn colors(
         &self,
         points: &[Vec3],
         normals: &[Vec3],
@@ -187,7 +183,9 @@ impl IFace {
         }
         sdf::colors(&self.shape, self.table(), &self.weights, &x, &normals, Some(counts), &directions)
     }
+}
 
+impl IFace {
     /// Renders rays in scene coordinates by volume rendering, the reference for faster renderers.
     pub fn render(&self, rays: &[Ray]) -> Vec<RayResult> {
         /// Rays marched together.

@@ -7,6 +7,7 @@ use crate::field::ball::{
     BALL, hull, negative, refuses, resumes, says, session, tampered, temporary, textured_views, views,
 };
 use crate::field::checkpoint::{self, Checkpoint};
+use crate::geom::SdfField;
 use crate::{Monitor, Quiet};
 use glam::{Vec2, Vec3};
 use std::path::Path;

@@ -4,25 +4,22 @@ mod cap;
 mod clean;
 mod dense;
 mod handles;
-mod holes;
 mod loops;
 mod marching;
 mod marching_cell;
 mod sparse;
-mod sparse_blocks;
 
 pub use cap::{Cap, RimVertex};
 pub use clean::{CleanReport, clean};
-pub use dense::{Verified, extract_dense};
+pub use dense::extract_dense;
 pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
 
 use super::input::{check_len, evaluate, setting};
 use super::moves::Polish;
-use crate::geom::{Aabb, Mesh, Topology, topology};
+use crate::geom::{Aabb, Mesh, SdfField, Topology, topology};
 use crate::{Error, Monitor, Result};
-use dense::dense_triangles;
 use glam::{DVec3, Vec3};
 use handles::cut_handles;
 use serde::{Deserialize, Serialize};
@@ -35,60 +32,27 @@ pub struct ExtractOptions {
     pub resolution: usize,
     /// Every how many cells the field is evaluated first: 2, 4 or 8. Smaller finds smaller loose pieces.
     pub coarse_step: usize,
-    /// Most points in one call of the field; at least 1.
-    pub batch: usize,
-    /// Pieces beside the largest stay when they have at least this share of its volume; 0..=1, where 1
-    /// keeps the largest alone.
-    pub keep_share: f64,
-    /// Newton steps that move vertices onto the field's zero; 0..=8, 0 leaves them where they are.
-    pub newton_steps: usize,
-    /// How far vertices slide towards the middle of their neighbours with the first step; 0..=1.
-    pub relax: f32,
     /// Handles are cut, or their holes filled, where they have a loop no longer than this share of the surface's
     /// longest side; 0..=1, 0 leaves them all.
     pub longest_handle: f32,
-    /// Also evaluate the whole grid and report what the sparse extraction lost: slow, for checking.
-    pub verify: bool,
 }
 
 /// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm long, which
 /// is a strand or a hole as thick as a thumb. A share, since not every capture knows its unit.
 pub const LONGEST_HANDLE: f32 = 0.15;
 
+/// Most points in one call of a field.
+pub(super) const BATCH: usize = 1 << 16;
+
+/// Newton steps that move vertices onto the field's zero.
+const NEWTON_STEPS: usize = 2;
+
+/// How far vertices slide towards the middle of their neighbors with the first step.
+const RELAX: f32 = 0.5;
+
 impl Default for ExtractOptions {
     fn default() -> ExtractOptions {
-        ExtractOptions {
-            resolution: 512,
-            coarse_step: 8,
-            batch: 1 << 16,
-            keep_share: 1.0,
-            newton_steps: 2,
-            relax: 0.5,
-            longest_handle: LONGEST_HANDLE,
-            verify: false,
-        }
-    }
-}
-
-impl ExtractOptions {
-    /// The ranges that no later step looks at.
-    fn check(&self) -> Result<()> {
-        let share = 0.0..=1.0;
-        setting(self.batch > 0, "ExtractOptions::batch", "at least 1", self.batch)?;
-        setting(
-            (0.0..=1.0).contains(&self.keep_share),
-            "ExtractOptions::keep_share",
-            "0..=1",
-            self.keep_share,
-        )?;
-        setting(self.newton_steps <= 8, "ExtractOptions::newton_steps", "0..=8", self.newton_steps)?;
-        setting(share.contains(&self.relax), "ExtractOptions::relax", "0..=1", self.relax)?;
-        setting(
-            share.contains(&self.longest_handle),
-            "ExtractOptions::longest_handle",
-            "0..=1",
-            self.longest_handle,
-        )
+        ExtractOptions { resolution: 512, coarse_step: 8, longest_handle: LONGEST_HANDLE }
     }
 }
 
@@ -107,14 +71,10 @@ pub struct MeshReport {
     pub share_evaluated: f64,
     /// Nodes outside the hull, taken as outside without being evaluated.
     pub nodes_outside_hull: usize,
-    /// 99th percentile of the field's gradient norm over coarse nodes; 1 for a true distance.
-    pub gradient_norm: f32,
     /// Nodes whose value was not finite.
     pub non_finite: usize,
     /// Inside nodes on the faces of the box, where the surface was capped.
     pub capped: usize,
-    /// The dense extraction beside this one, with `verify`.
-    pub verified: Option<Verified>,
     /// What cleaning removed.
     pub clean: CleanReport,
     /// Mean |f| / |∇f| over vertices before they moved, in cells.
@@ -139,6 +99,14 @@ impl MeshReport {
     pub fn bounds(&self) -> Aabb {
         let [min, max] = self.grid.map(Vec3::from);
         Aabb { min, max }
+    }
+
+    /// Adds what is measured of the finished mesh.
+    fn measure(&mut self, mesh: &Mesh, begin: Instant) {
+        self.topology = topology(&mesh.positions, &mesh.triangles);
+        self.handles.left = self.topology.genus.map_or(0, |g| g as usize);
+        self.volume = mesh.signed_volume();
+        self.seconds = begin.elapsed().as_secs_f64();
     }
 
     /// Returns what a person should know, one sentence each; `cap`: has the cap stayed?
@@ -167,11 +135,10 @@ impl MeshReport {
     }
 }
 
-/// Meshes the zero level set of `sdf` (negative inside) within `bounds`.
+/// Meshes the zero level set of a field within `bounds`.
 ///
-/// All closures get points of the same space as `bounds`, at most `options.batch` a call, from one
-/// thread. `sdf_gradient` returns values and gradients; `color` returns sRGB-coded colors for points
-/// with unit normals. Points for which `inside_hull` is false count as outside and are not evaluated.
+/// The field gets points of the same space as `bounds`, tens of thousands a call, from one thread. Vertices are colored
+/// as they are seen along their normals.
 ///
 /// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's zero,
 /// its normals the field's gradient. Handles with a loop no longer than `options.longest_handle` are gone.
@@ -181,11 +148,9 @@ impl MeshReport {
 /// use tiface::geom::Aabb;
 /// use tiface::mesh::{ExtractOptions, extract};
 ///
-/// let sdf = |points: &[Vec3]| points.iter().map(|p| p.length() - 0.7).collect::<Vec<f32>>();
-/// let gradient = |points: &[Vec3]| (sdf(points), points.iter().map(|p| p.normalize_or_zero()).collect());
-/// let color = |points: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; points.len()];
+/// let ball = |p: Vec3| p.length() - 0.7;
 /// let options = ExtractOptions { resolution: 32, ..ExtractOptions::default() };
-/// let (mesh, report) = extract(sdf, gradient, color, Aabb::SCENE, None, &options, &tiface::Quiet)?;
+/// let (mesh, report) = extract(&ball, Aabb::SCENE, &options, &tiface::Quiet)?;
 /// assert!(mesh.is_closed() && report.topology.genus == Some(0));
 /// assert!(mesh.positions.iter().all(|p| (p.length() - 0.7).abs() < 1e-3));
 /// # Ok::<(), tiface::Error>(())
@@ -195,35 +160,24 @@ impl MeshReport {
 ///
 /// A box or option out of range, a field without a surface, answers of the wrong length, a request to stop.
 pub fn extract(
-    sdf: impl Fn(&[Vec3]) -> Vec<f32> + Sync,
-    sdf_gradient: impl Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync,
-    color: impl Fn(&[Vec3], &[Vec3]) -> Vec<[f32; 3]> + Sync,
+    field: &dyn SdfField,
     bounds: Aabb,
-    inside_hull: Option<&(dyn Fn(Vec3) -> bool + Sync)>,
     options: &ExtractOptions,
     monitor: &dyn Monitor,
 ) -> Result<(Mesh, MeshReport)> {
     let begin = Instant::now();
-    options.check()?;
+    let share = options.longest_handle;
+    setting((0.0..=1.0).contains(&share), "ExtractOptions::longest_handle", "0..=1", share)?;
     let grid = NodeGrid::fit(bounds, options.resolution)?;
-    let steps = options.newton_steps as u64 + 4;
     let mut done = 0;
     let mut progress = |values: &[(&str, f64)]| {
         done += 1;
-        monitor.step(done, steps, values);
+        monitor.step(done, NEWTON_STEPS as u64 + 4, values);
         monitor.check_stop()
     };
 
-    let inside_hull = inside_hull.map(|inside| inside as &dyn Fn(Vec3) -> bool);
-    let found = sparse(&sdf, inside_hull, &grid, options.coarse_step, options.batch, monitor)?;
+    let found = sparse(field, &grid, options.coarse_step, monitor)?;
     check_surface(&found)?;
-    let verified = match options.verify {
-        true => Some(Verified {
-            dense_triangles: dense_triangles(&sdf, inside_hull, &grid, options.batch, monitor)?,
-            sparse_triangles: found.surface.triangles.len(),
-        }),
-        false => None,
-    };
     let mut report = MeshReport {
         cells: grid.dims.map(|d| d - 1),
         cell_size: grid.spacing,
@@ -231,40 +185,34 @@ pub fn extract(
         nodes_evaluated: found.evaluated,
         share_evaluated: found.evaluated as f64 / grid.nodes() as f64,
         nodes_outside_hull: found.skipped,
-        gradient_norm: found.gradient_norm,
         non_finite: found.surface.non_finite,
         capped: found.surface.capped,
-        verified,
         ..MeshReport::default()
     };
     let mut mesh = found.surface.into_mesh();
     progress(&[("nodes", found.evaluated as f64), ("triangles", mesh.triangles.len() as f64)])?;
 
-    report.clean = clean(&mut mesh, options.keep_share)?;
+    report.clean = clean(&mut mesh)?;
     progress(&[("pieces", report.clean.pieces as f64), ("triangles", mesh.triangles.len() as f64)])?;
 
     let cap = Cap::bare(report.bounds(), grid.spacing);
     let on_faces = |mesh: &Mesh| -> Vec<bool> { mesh.positions.iter().map(|&p| cap.holds(p)).collect() };
     let capped = on_faces(&mesh);
-    let gradient = |points: &[Vec3]| evaluate(&sdf_gradient, points, options.batch, monitor);
+    let gradient = |points: &[Vec3]| evaluate(field, points, BATCH, monitor);
     let polish = Polish::new(&mesh.positions, &mesh.triangles, 0.5 * grid.spacing, capped.clone());
     let (mut values, mut gradients) = gradient(&mesh.positions)?;
     report.off_surface_before = off_surface(&values, &gradients, &capped, grid.spacing);
-    for step in 0..options.newton_steps {
-        let relax = if step == 0 { options.relax } else { 0.0 };
+    for step in 0..NEWTON_STEPS {
+        let relax = if step == 0 { RELAX } else { 0.0 };
         report.held_back += polish.step(&mut mesh.positions, &values, &gradients, relax);
         (values, gradients) = gradient(&mesh.positions)?;
         progress(&[("held_back", report.held_back as f64)])?;
     }
     report.off_surface_after = off_surface(&values, &gradients, &capped, grid.spacing);
 
-    let longest = options.longest_handle * mesh.bounds().size().max_element();
+    let longest = share * mesh.bounds().size().max_element();
     if longest > 0.0 {
-        let values = |points: &[Vec3]| {
-            let values: Vec<f32> = points.chunks(options.batch).flat_map(&sdf).collect();
-            check_len("signed distance", points.len(), values.len()).map(|()| values)
-        };
-        report.handles = cut_handles(&mut mesh, longest, &values, monitor)?;
+        report.handles = cut_handles(&mut mesh, longest, field, monitor)?;
     }
     // vertices whose normal is not the field's slope
     let mut edged = on_faces(&mesh);
@@ -272,7 +220,6 @@ pub fn extract(
         patches.corners().for_each(|v| edged[v as usize] = true);
         gradients = gradient(&mesh.positions)?.1;
     }
-
     mesh.normals = mesh.angle_weighted_normals();
     for (i, normal) in mesh.normals.iter_mut().enumerate() {
         let g = gradients[i];
@@ -280,20 +227,24 @@ pub fn extract(
             *normal = g.normalize();
         }
     }
-    for (points, normals) in mesh.positions.chunks(options.batch).zip(mesh.normals.chunks(options.batch)) {
-        let colors = color(points, normals);
-        check_len("color", points.len(), colors.len())?;
-        let tame = |c: f32| if c.is_finite() { c.clamp(0.0, 1.0) } else { 0.0 };
-        mesh.colors.extend(colors.iter().map(|c| c.map(tame)));
-    }
+    mesh.colors = colors_along_normals(&mesh, field)?;
     progress(&[("vertices", mesh.positions.len() as f64)])?;
-
-    report.topology = topology(&mesh.positions, &mesh.triangles);
-    report.handles.left = report.topology.genus.map_or(0, |g| g as usize);
-    report.volume = mesh.signed_volume();
-    report.seconds = begin.elapsed().as_secs_f64();
+    report.measure(&mesh, begin);
     progress(&[("euler", report.topology.euler as f64)])?;
     Ok((mesh, report))
+}
+
+/// Returns the colors of the vertices as they are seen along their normals; what is not finite is black.
+fn colors_along_normals(mesh: &Mesh, field: &dyn SdfField) -> Result<Vec<[f32; 3]>> {
+    let mut out = Vec::with_capacity(mesh.positions.len());
+    for (points, normals) in mesh.positions.chunks(BATCH).zip(mesh.normals.chunks(BATCH)) {
+        let away: Vec<Vec3> = normals.iter().map(|n| -*n).collect();
+        let colors = field.color(points, normals, &away);
+        check_len("color", points.len(), colors.len())?;
+        let tame = |c: f32| if c.is_finite() { c.clamp(0.0, 1.0) } else { 0.0 };
+        out.extend(colors.iter().map(|c| c.map(tame)));
+    }
+    Ok(out)
 }
 
 /// Refuses an extraction that met no surface.
@@ -392,21 +343,13 @@ mod handles_tests;
 mod tests {
     use super::*;
     use crate::Quiet;
+    use crate::geom::Painted;
 
     fn mesh_of(f: impl Fn(Vec3) -> f32 + Sync, config: &ExtractOptions) -> Result<(Mesh, MeshReport)> {
-        let gradient = |p: Vec3| {
-            let d = |e: Vec3| (f(p + 1e-3 * e) - f(p - 1e-3 * e)) / 2e-3;
-            Vec3::new(d(Vec3::X), d(Vec3::Y), d(Vec3::Z))
+        let paint = |_: &[Vec3], n: &[Vec3], _: &[u32], _: &[Vec3]| {
+            n.iter().map(|n| (0.5 * *n + 0.5).to_array()).collect()
         };
-        extract(
-            |p| p.iter().map(|&p| f(p)).collect(),
-            |p| p.iter().map(|&p| (f(p), gradient(p))).unzip(),
-            |_, n| n.iter().map(|n| (0.5 * *n + 0.5).to_array()).collect(),
-            Aabb::SCENE,
-            None,
-            config,
-            &Quiet,
-        )
+        extract(&Painted { shape: f, paint }, Aabb::SCENE, config, &Quiet)
     }
 
     fn coarse() -> ExtractOptions {
@@ -431,7 +374,6 @@ mod tests {
 
     #[test]
     fn moving_leaves_no_slivers_and_turns_no_face() {
-        let plain = ExtractOptions { newton_steps: 0, ..coarse() };
         let slivers = |m: &Mesh| {
             let poor = (0..m.triangles.len() as u32).filter(|&t| {
                 let [a, b, c] = m.corners(t);
@@ -441,7 +383,8 @@ mod tests {
             poor.count() as f64 / m.triangles.len() as f64
         };
         let f = |p: Vec3| p.length() - 0.7;
-        let (before, _) = mesh_of(f, &plain).unwrap();
+        let grid = NodeGrid::fit(Aabb::SCENE, coarse().resolution).unwrap();
+        let before = sparse(&f, &grid, 8, &Quiet).unwrap().surface.into_mesh();
         let (after, _) = mesh_of(f, &coarse()).unwrap();
         assert!(slivers(&after) < 0.2 * slivers(&before), "{} {}", slivers(&before), slivers(&after));
         for t in 0..after.triangles.len() as u32 {
@@ -493,12 +436,12 @@ mod tests {
 
     #[test]
     fn a_bad_option_is_named() {
-        let bad = ExtractOptions { keep_share: 2.0, ..coarse() };
+        let bad = ExtractOptions { longest_handle: 2.0, ..coarse() };
         assert!(
             mesh_of(|p| p.length() - 0.5, &bad)
                 .unwrap_err()
                 .to_string()
-                .contains("`ExtractOptions::keep_share` is 2")
+                .contains("`ExtractOptions::longest_handle` is 2")
         );
     }
 }

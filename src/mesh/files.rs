@@ -5,30 +5,24 @@
 //! that later stages read.
 
 mod check;
-mod compact;
 mod file_mesh;
 mod glb;
-mod glb_json;
 mod glb_read;
 mod obj;
 mod ply;
 mod read;
 mod source;
 mod stored;
-mod uv_check;
 
-pub use check::{BARS, CheckReport, check, check_around};
-pub use compact::compact_glb;
-pub(crate) use file_mesh::turn_to_y_up;
+pub use check::{BARS, CheckReport, NO_AREA_PX, UvReport, check, check_around, seams_facing, uv_check};
 pub use file_mesh::{ExportOptions, ExportedFiles, HeadTexture, Lobes, tangents, weld};
 pub use glb::to_glb;
 pub use obj::{picture_of_mtl, to_obj};
 pub use ply::to_ply;
-pub use read::{OpenedMesh, ReadMesh, open_mesh, picture_beside, read, read_with};
-pub use source::{PictureSource, ReadOptions};
+pub use read::{OpenedMesh, open_mesh, picture_beside, read, read_with};
+pub use source::{PictureSource, ReadMesh, ReadOptions};
 pub(crate) use stored::FORMAT;
 pub use stored::{ExtractedSurface, HeadMesh};
-pub use uv_check::{NO_AREA_PX, UvReport, seams_facing, uv_check};
 
 #[cfg(test)]
 pub(crate) use stored::tests::head as test_head;

@@ -1,6 +1,6 @@
 //! Validation of the callers' input: settings, meshes, and the values that fields return.
 
-use crate::geom::Mesh;
+use crate::geom::{Mesh, SdfField};
 use crate::{Error, Monitor, Result};
 use glam::Vec3;
 use std::fmt::Display;
@@ -61,12 +61,9 @@ pub(super) fn check_len(what: &str, points: usize, answers: usize) -> Result<()>
     Err(Error::cannot(message, "a field must return one value a point, in order"))
 }
 
-/// Values and gradients at points.
-pub(super) type Field<'a> = dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync + 'a;
-
-/// Evaluates a field at points, at most `batch` of them a call.
+/// Returns values and gradients of a field at points, evaluated at most `batch` of them a call.
 pub(super) fn evaluate(
-    field: &Field,
+    field: &dyn SdfField,
     points: &[Vec3],
     batch: usize,
     monitor: &dyn Monitor,
@@ -74,7 +71,7 @@ pub(super) fn evaluate(
     let (mut values, mut gradients) = (Vec::with_capacity(points.len()), Vec::with_capacity(points.len()));
     for points in points.chunks(batch) {
         monitor.check_stop()?;
-        let (f, g) = field(points);
+        let (f, g) = field.sdf_gradient(points);
         check_len("gradient", points.len(), f.len().min(g.len()))?;
         values.extend(f);
         gradients.extend(g);

@@ -14,7 +14,7 @@ use crate::capture::scene::Scene;
 use crate::capture::{LoadedView, Split, View};
 use crate::config::{ColorSource, Config, Hair, MeshConfig, Method, Stage, ViewBackground};
 use crate::field::training::TrainingSession;
-use crate::geom::{Camera, Mesh};
+use crate::geom::{Camera, Mesh, SdfField};
 use crate::image::Photo;
 use crate::io::{self, Limits};
 use crate::mesh::files::HeadMesh;
@@ -23,7 +23,6 @@ use crate::metrics::{compare, distance};
 use crate::report::bench::{BenchResult, Measure, Row, Sweep, WorkCost};
 use crate::run::{Run, Stop};
 use crate::{Error, Monitor, Quiet, Result};
-use glam::Vec3;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
@@ -365,8 +364,8 @@ const TRIANGLES: [usize; 6] = [2000, 5000, 10_000, 20_000, 50_000, 100_000];
 
 impl Bench<'_> {
     /// Returns the median distance of a mesh to the zero set of a field, to first order, mm.
-    fn off_field(&self, mesh: &Mesh, gradient: &dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>)) -> Option<f64> {
-        let (values, gradients) = gradient(&distance::sample(mesh, POINTS));
+    fn off_field(&self, mesh: &Mesh, field: &dyn SdfField) -> Option<f64> {
+        let (values, gradients) = field.sdf_gradient(&distance::sample(mesh, POINTS));
         let mut off: Vec<f32> =
             values.iter().zip(&gradients).map(|(f, g)| f.abs() / g.length().max(0.05)).collect();
         off.sort_by(f32::total_cmp);
@@ -389,9 +388,8 @@ impl Bench<'_> {
             self.check_stop()?;
             let mut mesh = mesh.clone();
             let config = SimplifyConfig { triangles, ..SimplifyConfig::default() };
-            let gradient = |points: &[Vec3]| closed.sdf_gradient(points);
-            let (_, cost) = timed(|| simplify(&mut mesh, Some(&gradient), &config, self.monitor()))?;
-            let figures = vec![self.off_field(&mesh, &gradient)];
+            let (_, cost) = timed(|| simplify(&mut mesh, Some(&closed), &config, self.monitor()))?;
+            let figures = vec![self.off_field(&mesh, &closed)];
             rows.push(Row { series: "", choice: triangles.to_string(), cost, figures });
         }
         let measures = vec![Measure {
@@ -466,7 +464,7 @@ impl<'f> Finisher<'f> {
         if c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len() {
             let closed = extracted.closed(fields.surface()?);
             let config = SimplifyConfig { triangles: c.triangles as usize, ..SimplifyConfig::default() };
-            simplify(&mut mesh, Some(&|p: &[Vec3]| closed.sdf_gradient(p)), &config, bench.monitor())?;
+            simplify(&mut mesh, Some(&closed), &config, bench.monitor())?;
         }
         let views = learn::training_views(&bench.line.capture, &bench.scene, bench.config())?;
         Ok(Finisher { mesh, extracted, fields, views })
@@ -488,6 +486,6 @@ impl<'f> Finisher<'f> {
 
 impl Extracted {
     fn closed<'a>(&'a self, field: &'a dyn Surface) -> ClosedSurface<'a> {
-        ClosedSurface { field, cap: self.cap.as_ref(), patches: self.patches.as_ref() }
+        ClosedSurface { field, hull: None, cap: self.cap.as_ref(), patches: self.patches.as_ref() }
     }
 }

@@ -473,11 +473,8 @@ mod tests {
         // the row needs a surface, too; a missing one is a result and reported as such
         let found = measured(&line, &surface);
         assert_eq!((found.figures.len(), problem_of(&found).as_str()), (1, "stage `mesh` is not done yet"));
-        let positive = |points: &[Vec3]| vec![1.0; points.len()];
-        let slopes = |points: &[Vec3]| (vec![1.0; points.len()], vec![Vec3::X; points.len()]);
-        let colors = |points: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; points.len()];
         let none = run.stage(line.plan(Stage::Mesh), |_| {
-            extract_dense(positive, slopes, colors, Aabb::SCENE, (9, 100), &Quiet)?;
+            extract_dense(&|_: Vec3| 1.0, Aabb::SCENE, 9, &Quiet)?;
             Ok(Value::Null)
         });
         assert!(none.unwrap_err().is_no_surface());

@@ -2,16 +2,14 @@
 //!
 //! The files of a head mesh are in the dataset's coordinates or turned so that the face looks at the viewer ([`Export`]).
 
-use super::surface::ClosedSurface;
 use crate::capture::Capture;
 use crate::capture::scene::Scene;
 use crate::config::{ColorSource, Config, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
-use crate::geom::{Camera, Mesh, Similarity};
+use crate::geom::{Camera, Mesh, SdfField, Similarity};
 use crate::image::{Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
-use crate::mesh::bake::{BakeConfig, Learned, Seams, bake, bake_harmonics, complete, tangent_space};
+use crate::mesh::bake::{BakeConfig, Seams, bake, bake_harmonics, complete, tangent_space};
 use crate::mesh::files::{
     ExportOptions, ExportedFiles, HeadMesh, HeadTexture, Lobes, tangents, to_glb, to_obj, to_ply,
-    turn_to_y_up,
 };
 use crate::mesh::{
     AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
@@ -42,7 +40,7 @@ const FALLBACK_VIEWS: usize = 3;
 pub(super) fn finish(
     surface: &Mesh,
     cell: f32,
-    closed: &ClosedSurface,
+    field: &dyn SdfField,
     cameras: &[Camera],
     photographs: &[Photograph],
     scene: &Scene,
@@ -52,23 +50,18 @@ pub(super) fn finish(
 ) -> Result<FinishedHead> {
     let (mut report, mut warnings) = (Map::new(), Vec::new());
     let mut mesh = surface.clone();
-    let gradient = |points: &[Vec3]| closed.sdf_gradient(points);
     let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
     if fewer || c.max_error > 0.0 {
-        let config = SimplifyConfig {
-            triangles: c.triangles as usize,
-            error: c.max_error * cell,
-            ..SimplifyConfig::default()
-        };
-        let done = simplify(&mut mesh, Some(&gradient), &config, monitor)?;
+        let config = SimplifyConfig { triangles: c.triangles as usize, error: c.max_error * cell };
+        let done = simplify(&mut mesh, Some(field), &config, monitor)?;
         warnings.extend(done.warnings(&config));
         report.insert("simplify".into(), json!(done));
     }
     let world_from_scene = scene.scene_from_world.inverse();
     // the lobes are turned as `Export::files` turns the file; data that is in no file is the same in all formats
     let frame = if c.lobes > 0 { export.frame } else { MeshFrame::Dataset };
-    let asset_from_world = Export { frame, ..export.clone() }.asset_from_world(&mesh, &world_from_scene);
-    let turned = asset_from_world * world_from_scene.rotation_f32();
+    let frames = Export { frame, ..export.clone() }.frames(&mesh, &world_from_scene)?;
+    let turned = frames.file_from_scene.rotation_f32();
     let most = if c.lobes > 0 { c.lobes } else { 2 };
     let fits = c.color == ColorSource::Photographs;
     let photographs_say = fits && photographs.iter().any(|p| p.head_pixels() > 0);
@@ -77,8 +70,7 @@ pub(super) fn finish(
     }
     let mut shells = None;
     if c.hair == Hair::Shells {
-        let (found, done) =
-            fit_shells(&mesh, &closed.field.sharpness(&mesh.positions), photographs, monitor)?;
+        let (found, done) = fit_shells(&mesh, &field.sharpness(&mesh.positions), photographs, monitor)?;
         report.insert("shells".into(), json!(done));
         shells = found;
     }
@@ -113,9 +105,7 @@ pub(super) fn finish(
         normals: c.normal_map,
         turned,
     };
-    let colors = |p: &[Vec3], n: &[Vec3], counts: &[u32], d: &[Vec3]| closed.colors(p, n, counts, d);
-    let learned = Learned { gradient: &gradient, colors: &colors };
-    let mut baked = bake(&mesh, &layout, &learned, cameras, &config, monitor)?;
+    let mut baked = bake(&mesh, &layout, field, cameras, &config, monitor)?;
     report.insert("bake".into(), json!(baked.report));
     let mut harmonics = None;
     if photographs_say {
@@ -148,7 +138,7 @@ pub(super) fn finish(
     if let Some(harmonics) = harmonics.as_ref().filter(|_| c.lobes > 0) {
         baked.lobes = bake_harmonics(&mesh, &layout, harmonics, c.gutter_px);
     }
-    let lobes = lobes(&baked.lobes, asset_from_world);
+    let lobes = lobes(&baked.lobes, frames.file_from_world().rotation_f32());
     let texture = Some(HeadTexture { atlas: layout, color, normal, lobes });
     let head = HeadMesh { mesh, world_from_scene, texture, harmonics, shells };
     Ok(FinishedHead { head, linear: c.exr.then_some(baked.color), report, warnings })
@@ -220,19 +210,13 @@ impl Export {
     /// Returns the files of a head mesh in a format, the mesh first. `stem` is their base name.
     pub(super) fn files(&self, head: &HeadMesh, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
         let HeadMesh { mesh, world_from_scene, texture, shells, .. } = head;
-        let (up, world_from_mesh) = match self.frame {
-            MeshFrame::Dataset => (self.up, *world_from_scene),
-            MeshFrame::Head => (Vec3::Y, self.head_from_mesh(mesh, world_from_scene)),
-        };
         let options = ExportOptions {
             name: self.name.clone(),
             stem: stem.into(),
-            up,
-            unit_m: self.unit_m,
             // an unlit material shows no normal map, so a normal map implies a lit one
             unlit: self.material == Material::Unlit && texture.as_ref().is_none_or(|t| t.normal.is_none()),
-            world_from_mesh,
             jpeg_quality: (self.texture_format == TextureFormat::Jpeg).then_some(JPEG_QUALITY),
+            ..self.placed(mesh, world_from_scene)
         };
         match format {
             MeshFormat::Glb => {
@@ -246,6 +230,21 @@ impl Export {
                 to_ply(mesh, None, &ExportOptions { world_from_mesh: *world_from_scene, ..options })
             }
         }
+    }
+
+    /// Returns the options that place a mesh in its files, whatever it is called and shows.
+    fn placed(&self, mesh: &Mesh, world_from_scene: &Similarity) -> ExportOptions {
+        let (up, world_from_mesh) = match self.frame {
+            MeshFrame::Dataset => (self.up, *world_from_scene),
+            MeshFrame::Head => (Vec3::Y, self.head_from_mesh(mesh, world_from_scene)),
+        };
+        ExportOptions { up, unit_m: self.unit_m, world_from_mesh, ..ExportOptions::default() }
+    }
+
+    /// Returns the frames of a mesh, its scene, and its GLB and OBJ files.
+    pub(super) fn frames(&self, mesh: &Mesh, world_from_scene: &Similarity) -> Result<Frames> {
+        let file_from_scene = self.placed(mesh, world_from_scene).file_from_mesh()?;
+        Ok(Frames { world_from_scene: *world_from_scene, file_from_scene })
     }
 
     /// Returns the direction in which the face of a head at `center` looks; see `front`.
@@ -263,7 +262,7 @@ impl Export {
     }
 
     /// +Y up through the crown, the face towards +Z, the origin at the middle of the box.
-    pub(super) fn head_from_mesh(&self, mesh: &Mesh, world_from_mesh: &Similarity) -> Similarity {
+    fn head_from_mesh(&self, mesh: &Mesh, world_from_mesh: &Similarity) -> Similarity {
         let rotation = self.head_from_world(center(mesh, world_from_mesh));
         let turned = Similarity { rotation, ..Similarity::IDENTITY }.after(world_from_mesh);
         let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
@@ -273,23 +272,20 @@ impl Export {
         }
         Similarity { translation: turned.translation - 0.5 * (low + high), ..turned }
     }
+}
 
-    /// Returns the transform from the dataset's world to the coordinates of GLB and OBJ files, in metres.
-    pub(super) fn file_from_world(&self, head: &HeadMesh) -> Result<Similarity> {
-        let HeadMesh { mesh, world_from_scene, .. } = head;
-        let turned = match self.frame {
-            MeshFrame::Dataset => Similarity { rotation: turn_to_y_up(self.up)?, ..Similarity::IDENTITY },
-            MeshFrame::Head => self.head_from_mesh(mesh, world_from_scene).after(&world_from_scene.inverse()),
-        };
-        Ok(Similarity { scale: self.unit_m, ..Similarity::IDENTITY }.after(&turned))
-    }
+/// The frames of a head mesh.
+pub(super) struct Frames {
+    /// From the scene to the dataset's world.
+    pub world_from_scene: Similarity,
+    /// From the scene to the coordinates of GLB and OBJ files: metres, +Y up.
+    pub file_from_scene: Similarity,
+}
 
-    /// Returns the rotation from the dataset's world to the coordinates of GLB and OBJ files.
-    pub(super) fn asset_from_world(&self, mesh: &Mesh, world_from_mesh: &Similarity) -> Mat3 {
-        match self.frame {
-            MeshFrame::Dataset => turn_to_y_up(self.up).unwrap_or(DMat3::IDENTITY).as_mat3(),
-            MeshFrame::Head => self.head_from_world(center(mesh, world_from_mesh)).as_mat3(),
-        }
+impl Frames {
+    /// Returns the transform from the dataset's world to the coordinates of GLB and OBJ files.
+    pub fn file_from_world(&self) -> Similarity {
+        self.file_from_scene.after(&self.world_from_scene.inverse())
     }
 }
 
@@ -418,7 +414,8 @@ mod tests {
             let notes =
                 String::from_utf8_lossy(&glb.files[0].1).contains("\"extras\":{\"tiface\":{\"lobes\":[{");
             assert_eq!(notes, head.texture.is_some());
-            let file_from_world = export.file_from_world(head).unwrap();
+            let file_from_world =
+                export.frames(&head.mesh, &head.world_from_scene).unwrap().file_from_world();
             for (found, t) in corners.iter().zip(0..) {
                 let expected = mesh.corners(t).map(exact);
                 // a reader of the file must find the world coordinates
@@ -442,7 +439,8 @@ mod tests {
             let front = ((export.cameras[0] - centre) * DVec3::new(1.0, 1.0, 0.0)).normalize();
             let axes = [DVec3::Z.cross(front), DVec3::Z, front];
             let turned = |p: Vec3| DVec3::from(axes.map(|a| a.dot(exact(p) - place.translation)));
-            let file_from_world = export.file_from_world(head).unwrap();
+            let file_from_world =
+                export.frames(&head.mesh, &head.world_from_scene).unwrap().file_from_world();
             let all = || mesh.positions.iter().map(|&p| turned(p));
             let middle = 0.5 * (all().reduce(DVec3::min).unwrap() + all().reduce(DVec3::max).unwrap());
             for (found, t) in corners.iter().zip(0..) {

@@ -8,10 +8,9 @@ use crate::config::{
     ColorSource, Config, Genus, MaskSource, Material, MeshConfig, MeshFormat, MeshFrame, Method, Preset,
     TextureFormat, ViewBackground,
 };
-use crate::geom::{Camera, Similarity};
+use crate::geom::{SdfField, Similarity};
 use crate::io::{self, Limits};
 use crate::metrics::compare;
-use crate::render::RenderedView;
 use crate::run::{Run, Stop, read_record};
 use crate::{ErrorKind, Result};
 use glam::Vec3;
@@ -24,7 +23,7 @@ struct Exact {
     world_from_scene: Similarity,
 }
 
-impl Surface for Exact {
+impl SdfField for Exact {
     fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         let scale = self.world_from_scene.scale as f32;
         points.iter().map(|&p| SyntheticHead.sdf(self.world_from_scene.point(p)) / scale).collect()
@@ -48,11 +47,9 @@ impl Surface for Exact {
         let each = points.iter().zip(counts).flat_map(|(p, &n)| std::iter::repeat_n(p, n as usize));
         each.zip(directions).map(paint).collect()
     }
-
-    fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
-        None
-    }
 }
+
+impl Surface for Exact {}
 
 /// The demo head's formula in the place of all learned fields.
 struct Formula(Exact);
@@ -282,7 +279,7 @@ impl Drilled {
     }
 }
 
-impl Surface for Drilled {
+impl SdfField for Drilled {
     fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         let drilled = |(f, p): (f32, &Vec3)| f.max(Self::tunnel(p).0);
         self.0.sdf(points).into_iter().zip(points).map(drilled).collect()
@@ -304,11 +301,9 @@ impl Surface for Drilled {
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], d: &[Vec3]) -> Vec<[f32; 3]> {
         self.0.colors(points, normals, counts, d)
     }
-
-    fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
-        None
-    }
 }
+
+impl Surface for Drilled {}
 
 impl Fields for Drilled {
     fn surface(&self) -> Result<&dyn Surface> {

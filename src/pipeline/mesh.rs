@@ -17,7 +17,7 @@ use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, MeshFormat, St
 use crate::geom::{Aabb, Camera, Mesh, Similarity};
 use crate::image::Image;
 use crate::io::{self, Limits};
-use crate::mesh::bake::{Learned, seen_colors};
+use crate::mesh::bake::seen_colors;
 use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshReport, Patches, Photograph};
 use crate::run::{Phase, Record, StageDir, StageStatus, Status};
@@ -68,15 +68,11 @@ pub(super) fn mesh(
         _ => learn::training_views(capture, scene, config)?,
     };
     if let Some(cap) = cap.as_mut() {
-        let learned = Learned {
-            gradient: &|p| field.sdf_gradient(p),
-            colors: &|p, n, counts, d| field.colors(p, n, counts, d),
-        };
         let reach = REACH * report.cell_size;
-        cap.shade(|p, n| seen_colors(&surface, p, n, &learned, &cameras, reach));
+        cap.shade(|p, n| seen_colors(&surface, p, n, field, &cameras, reach));
     }
     let photographs = photographs(&views);
-    let closed = ClosedSurface { field, cap: cap.as_ref(), patches: patches.as_ref() };
+    let closed = ClosedSurface { field, hull: None, cap: cap.as_ref(), patches: patches.as_ref() };
     let finished = finish(
         &surface,
         report.cell_size,
@@ -141,31 +137,18 @@ pub(super) fn extract(
     c: &MeshConfig,
     monitor: &dyn Monitor,
 ) -> Result<(Mesh, MeshReport)> {
-    // the color of a vertex is the one seen along its normal
-    let color = |points: &[Vec3], normals: &[Vec3]| {
-        let directions: Vec<Vec3> = normals.iter().map(|n| -*n).collect();
-        field.color(points, normals, &directions)
-    };
-    let (sdf, gradient) = (|p: &[Vec3]| field.sdf(p), |p: &[Vec3]| field.sdf_gradient(p));
     if c.dense {
-        let each = (c.resolution as usize, 1 << 16);
-        return mesh::extract_dense(sdf, gradient, color, Aabb::SCENE, each, monitor);
+        return mesh::extract_dense(field, Aabb::SCENE, c.resolution as usize, monitor);
     }
-    let config = mesh::ExtractOptions {
+    let options = mesh::ExtractOptions {
         resolution: c.resolution as usize,
-        coarse_step: c.coarse_step as usize,
-        keep_share: c.keep_share,
-        newton_steps: c.newton_steps as usize,
-        relax: c.relax,
         longest_handle: if c.genus == Genus::Simple { LONGEST_HANDLE } else { 0.0 },
-        verify: c.verify,
         ..mesh::ExtractOptions::default()
     };
-    let hull = scene.hull.as_ref().map(|hull| |p: Vec3| hull.contains(p));
-    let inside_hull = hull.as_ref().map(|f| f as &(dyn Fn(Vec3) -> bool + Sync));
+    let field = ClosedSurface { field, hull: scene.hull.as_ref(), cap: None, patches: None };
     // below the frames' border the surface is a guess: close the mesh where enough cameras see it
     let kept = capture::well_seen(scene, cameras, up, c.seen_by);
-    mesh::extract(sdf, gradient, color, kept, inside_hull, &config, monitor)
+    mesh::extract(&field, kept, &options, monitor)
 }
 
 /// The mesh file refers to the others, so it is written last.

@@ -36,8 +36,7 @@ const PLACES: [&str; 10] = [
 const FOUND: [&str; 2] = ["mask.source", "mask.meaning"];
 
 /// Keys of `[mesh]` that affect files for other programs, but no rendered view.
-const FILE_KEYS: [&str; 5] =
-    ["mesh.format", "mesh.material", "mesh.texture_format", "mesh.exr", "mesh.verify"];
+const FILE_KEYS: [&str; 4] = ["mesh.format", "mesh.material", "mesh.texture_format", "mesh.exr"];
 
 /// Keys of `[mesh]` that affect the head mesh, but not the surface it is made from.
 const HEAD_KEYS: [&str; 7] = [

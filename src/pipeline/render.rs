@@ -275,7 +275,7 @@ mod tests {
     use super::*;
     use crate::Quiet;
     use crate::config::Stage;
-    use crate::geom::{Aabb, Mesh};
+    use crate::geom::{Aabb, Mesh, SdfField};
     use crate::mesh::{Cap, RimVertex};
     use glam::Vec3;
 
@@ -292,7 +292,7 @@ mod tests {
         }
     }
 
-    impl Surface for Red {
+    impl SdfField for Red {
         fn sdf(&self, _: &[Vec3]) -> Vec<f32> {
             panic!("no distance is asked for")
         }
@@ -301,18 +301,12 @@ mod tests {
             panic!("no distance is asked for")
         }
 
-        fn sharpness(&self, _: &[Vec3]) -> Vec<f32> {
-            panic!("no sharpness is asked for")
-        }
-
         fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
             vec![[1.0, 0.0, 0.0]; directions.len()]
         }
-
-        fn volume(&self, _: &Camera, _: &Similarity) -> Option<RenderedView> {
-            None
-        }
     }
+
+    impl Surface for Red {}
 
     #[test]
     fn rays_see_the_cap_painted_and_the_skin_as_the_field_has_it() {

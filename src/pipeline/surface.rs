@@ -4,39 +4,22 @@
 //! memory holds the picture, but not a ray and its result for every pixel.
 
 use crate::Result;
+use crate::capture::scene::Hull;
 use crate::config::Stage;
-use crate::geom::{Camera, Ray, RayResult, Similarity};
+use crate::geom::{Camera, Ray, RayResult, SdfField, Similarity};
 use crate::image::Image;
 use crate::mesh::{Cap, Patches};
 use crate::render::RenderedView;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
-/// A colored signed distance in scene coordinates.
-pub trait Surface: Sync {
-    /// Signed distance, negative inside. `[n, 3]` → `[n]`.
-    fn sdf(&self, points: &[Vec3]) -> Vec<f32>;
-
-    /// Signed distance and its gradient. `[n, 3]` → `[n]`, `[n, 3]`.
-    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>);
-
-    /// Local sharpness, per scene unit: the opacity at a distance `f` outside the surface is σ(−f · sharpness).
-    /// `[n, 3]` → `[n]`.
-    fn sharpness(&self, points: &[Vec3]) -> Vec<f32>;
-
-    /// Returns the sRGB-coded color of surface points `[n, 3]` with unit normals `[n, 3]`. Point `i` is seen along
-    /// `counts[i]` unit directions, away from the camera, all in one list; one color is returned per direction.
-    fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], directions: &[Vec3])
-    -> Vec<[f32; 3]>;
-
-    /// Returns the same with one direction per point.
-    fn color(&self, points: &[Vec3], normals: &[Vec3], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        self.colors(points, normals, &vec![1; points.len()], directions)
-    }
-
+/// A signed distance that may also be rendered by marching rays through it.
+pub trait Surface: SdfField {
     /// Returns the view of a camera in scene coordinates by marching rays through the field itself; depth and normals
     /// are in the world. `None` if the field is only a surface.
-    fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView>;
+    fn volume(&self, _camera: &Camera, _world_from_scene: &Similarity) -> Option<RenderedView> {
+        None
+    }
 
     /// Returns warnings about the evaluations so far, for example that a GPU failed.
     fn warning(&self) -> Option<&str> {
@@ -44,19 +27,25 @@ pub trait Surface: Sync {
     }
 }
 
-/// A surface with the parts that close it where the field's own zero set does not.
+/// A field within the visual hull, with the parts that close it where its own zero set does not.
+#[derive(Clone, Copy)]
 pub(super) struct ClosedSurface<'a> {
     pub field: &'a dyn Surface,
+    /// What lies outside of it is outside of the surface.
+    pub hull: Option<&'a Hull>,
     /// The cap where the frames cut the body.
     pub cap: Option<&'a Cap>,
     /// The patches where handles were cut.
     pub patches: Option<&'a Patches>,
 }
 
-impl ClosedSurface<'_> {
-    /// Evaluates [`Surface::sdf_gradient`] with the caps and patches. The closed surface also contains the opening of
-    /// the field's own zero set.
-    pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+impl SdfField for ClosedSurface<'_> {
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        self.field.sdf(points)
+    }
+
+    /// The closed surface also contains the opening of the field's own zero set.
+    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let (mut values, mut gradients) = self.field.sdf_gradient(points);
         if let Some(cap) = self.cap {
             cap.close(points, &mut values, &mut gradients);
@@ -67,15 +56,9 @@ impl ClosedSurface<'_> {
         (values, gradients)
     }
 
-    /// Evaluates [`Surface::colors`]; the cap has its own color.
-    pub fn colors(
-        &self,
-        points: &[Vec3],
-        normals: &[Vec3],
-        counts: &[u32],
-        directions: &[Vec3],
-    ) -> Vec<[f32; 3]> {
-        let mut colors = self.field.colors(points, normals, counts, directions);
+    /// The cap has its own color.
+    fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], away: &[Vec3]) -> Vec<[f32; 3]> {
+        let mut colors = self.field.colors(points, normals, counts, away);
         if let Some(cap) = self.cap {
             let mut rest = &mut colors[..];
             for (p, &count) in points.iter().zip(counts) {
@@ -87,6 +70,14 @@ impl ClosedSurface<'_> {
             }
         }
         colors
+    }
+
+    fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
+        self.field.sharpness(points)
+    }
+
+    fn excludes(&self, point: Vec3) -> bool {
+        self.hull.is_some_and(|hull| !hull.contains(point))
     }
 }
 
@@ -112,28 +103,6 @@ pub trait Fields {
 }
 
 impl Surface for crate::iface::IFace {
-    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
-        self.sdf(points)
-    }
-
-    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
-        self.sdf_gradient(points)
-    }
-
-    fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
-        self.sharpness(points)
-    }
-
-    fn colors(
-        &self,
-        points: &[Vec3],
-        normals: &[Vec3],
-        counts: &[u32],
-        directions: &[Vec3],
-    ) -> Vec<[f32; 3]> {
-        self.colors(points, normals, counts, directions)
-    }
-
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView> {
         Some(march(camera, world_from_scene, true, |rays| self.render(rays)))
     }
@@ -145,23 +114,6 @@ impl Surface for crate::iface::IFace {
 }
 
 impl Surface for crate::iface::DensityField {
-    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
-        self.sdf(points)
-    }
-
-    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
-        self.sdf_gradient(points)
-    }
-
-    /// Returns infinite sharpness, because it is unknown.
-    fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
-        vec![f32::INFINITY; points.len()]
-    }
-
-    fn colors(&self, points: &[Vec3], _: &[Vec3], counts: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
-        self.colors(points, counts, directions)
-    }
-
     fn volume(&self, camera: &Camera, world_from_scene: &Similarity) -> Option<RenderedView> {
         Some(march(camera, world_from_scene, false, |rays| self.render(rays)))
     }

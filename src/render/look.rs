@@ -127,8 +127,7 @@ impl Surface<'_> {
 
     fn uv(&self, hits: &RayHits, i: usize) -> Option<Vec2> {
         let (atlas, hit) = (self.atlas?, &hits.hits[i]);
-        let [a, b, c] = atlas.triangles[hit.triangle as usize].map(|i| atlas.uvs[i as usize]);
-        Some((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c)
+        Some(hit.mix(atlas.triangles[hit.triangle as usize].map(|i| atlas.uvs[i as usize])))
     }
 
     /// Returns a chequer that runs from red to green along u and from dark to light along v (down the texture).
@@ -147,7 +146,8 @@ impl Surface<'_> {
         let pixel = hit.t * hits.directions[i].dot(camera.forward()) / camera.fx.abs() as f32;
         let area = (b - a).cross(c - a).length();
         // the distance to a side is the opposite corner's share times its height
-        let sides = [(1.0 - hit.u - hit.v, c - b), (hit.u, c - a), (hit.v, b - a)];
+        let [of_a, of_b, of_c] = hit.weights();
+        let sides = [(of_a, c - b), (of_b, c - a), (of_c, b - a)];
         let heights = sides.map(|(share, side)| (share, area / side.length().max(1e-20) / pixel.max(1e-20)));
         let nearest = heights.iter().map(|(share, height)| share * height).fold(f32::INFINITY, f32::min);
         let low = heights.iter().map(|(_, height)| *height).fold(f32::INFINITY, f32::min);

@@ -21,7 +21,7 @@ mod tile;
 use super::raycast::{RayHits, RenderedView};
 use crate::geom::{Camera, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Image;
-use glam::Vec3;
+use bytemuck::Zeroable;
 use paint::{Band, Batch, Painter, Part, Queue, Sheet, straight_rays};
 use project::{Bins, Faces, Lens, TILE};
 use rayon::prelude::*;
@@ -109,9 +109,8 @@ pub struct RasterLayers<'a> {
 
 struct RasterLayer<'a> {
     layer: &'a ShellLayer,
-    positions: Vec<Vec3>,
-    /// The visible triangles, and their indices in the mesh.
-    triangles: Vec<[u32; 3]>,
+    surface: Mesh,
+    /// The indices of its triangles in the mesh.
     ids: Vec<u32>,
 }
 
@@ -123,9 +122,8 @@ impl<'a> RasterLayers<'a> {
     /// Panics if a layer does not have one offset and one alpha for each vertex.
     pub fn new(mesh: &Mesh, shells: &'a Shells) -> RasterLayers<'a> {
         let layer = |layer: &'a ShellLayer| {
-            let shown = mesh.triangles.iter().enumerate().filter(|(_, t)| layer.has(t));
-            let (ids, triangles) = shown.map(|(id, t)| (id as u32, *t)).unzip();
-            RasterLayer { layer, positions: layer.positions(mesh), triangles, ids }
+            let (surface, ids) = layer.surface(mesh);
+            RasterLayer { layer, surface, ids }
         };
         RasterLayers { layers: shells.layers.iter().map(layer).collect() }
     }
@@ -190,7 +188,7 @@ pub fn raster_into(
         Faces { positions: &mesh.positions, triangles: &mesh.triangles, ids: None, cull: options.cull };
     let mut sheets = vec![(lens.bin(&core), Sheet { positions: &mesh.positions, layer: None })];
     for layer in layers.iter().flat_map(|l| &l.layers) {
-        let RasterLayer { layer, positions, triangles, ids } = layer;
+        let RasterLayer { layer, surface: Mesh { positions, triangles, .. }, ids } = layer;
         let faces = Faces { positions, triangles, ids: Some(ids), cull: true };
         sheets.push((lens.bin(&faces), Sheet { positions, layer: Some(layer) }));
     }
@@ -206,7 +204,7 @@ pub fn raster_into(
         bare: options.bare_hits,
         color,
     };
-    let start = || (Tile::new(), Vec::new(), Batch::new(), Queue::default());
+    let start = || (Tile::new(), Vec::new(), Box::<Batch>::new(Zeroable::zeroed()), Queue::default());
     rows.for_each_init(start, |(tile, over, batch, queue), mut out| {
         let out = &mut out;
         clear(out);

@@ -144,7 +144,7 @@ impl Raycaster<'_> {
             let center = self.cast(x + 0.5, y + 0.5);
             if let Some((ray, Some(hit))) = &center {
                 depth[i] = self.depth(ray, hit) * self.options.world_from_scene.scale as f32;
-                let up = self.options.world_from_scene.direction(self.normal(hit));
+                let up = self.options.world_from_scene.direction(self.mesh.shading_normal(hit));
                 normal[i] = up.normalize_or_zero().to_array();
             }
             found.clear();
@@ -198,24 +198,14 @@ impl Raycaster<'_> {
         (low == 0.0) != (high == 0.0) || high - low > JUMP * low / self.camera.fx.abs() as f32
     }
 
-    /// Returns the shading normal of a hit.
-    fn normal(&self, hit: &Hit) -> Vec3 {
-        if let Some(n) = self.mesh.normal_at(hit) {
-            return n;
-        }
-        let [a, b, c] = self.mesh.corners(hit.triangle);
-        (b - a).cross(c - a).normalize_or_zero()
-    }
-
     /// Adds a hit to the pixel's alpha and queues it for its color.
     fn enqueue(&self, queue: &mut RayHits, pixel: usize, met: &Met, weight: f32, rgba: &mut [[f32; 4]]) {
         let Some((ray, hit)) = met else { return };
         let mut left = weight;
         let mut push = |hit: &Hit, weight: f32| {
             rgba[pixel][3] += weight;
-            let [a, b, c] = self.mesh.corners(hit.triangle);
-            queue.points.push((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c);
-            queue.normals.push(self.normal(hit));
+            queue.points.push(self.mesh.point_at(hit));
+            queue.normals.push(self.mesh.shading_normal(hit));
             queue.directions.push(ray.direction);
             queue.hits.push(*hit);
             queue.pixels.push((pixel, weight));

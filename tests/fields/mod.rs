@@ -57,25 +57,6 @@ pub fn gyroid(p: Vec3) -> f32 {
     (s.x * c.y + s.y * c.z + s.z * c.x).abs() / 12.0 - 0.03
 }
 
-/// All points of a batch, in parallel.
-pub fn batch(field: impl Fn(Vec3) -> f32 + Sync) -> impl Fn(&[Vec3]) -> Vec<f32> + Sync {
-    move |points| points.par_iter().with_min_len(256).map(|&p| field(p)).collect()
-}
-
-/// Central differences beside the values.
-pub fn batch_gradient(
-    field: impl Fn(Vec3) -> f32 + Sync,
-) -> impl Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync {
-    move |points| {
-        let e = 1e-3;
-        let slope = |p: Vec3, d: Vec3| (field(p + e * d) - field(p - e * d)) / (2.0 * e);
-        points
-            .par_iter()
-            .map(|&p| (field(p), Vec3::new(slope(p, Vec3::X), slope(p, Vec3::Y), slope(p, Vec3::Z))))
-            .unzip()
-    }
-}
-
 /// `n³` nodes over [-1, 1]³, x fastest; with the node distance.
 pub fn grid(field: impl Fn(Vec3) -> f32 + Sync, n: usize) -> (Vec<f32>, f32) {
     let h = 2.0 / (n - 1) as f32;

@@ -5,7 +5,7 @@ use super::{DensityState, FORMAT, parts, shape};
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
-use crate::geom::{Ray, RayResult};
+use crate::geom::{Ray, RayResult, SdfField};
 use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule::step_length;
 use crate::kernel::cpu::density::{self, DensityShape, DensityWeights};
@@ -56,15 +56,16 @@ impl DensityField {
         };
         points.chunks(1 << 16).flat_map(look).collect()
     }
+}
 
-    /// Returns the surface's density minus the local density, which is negative inside. `[n]` points → `[n]`.
-    pub fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+impl SdfField for DensityField {
+    /// Returns the surface's density minus the local density, which is negative inside.
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         self.density(points).into_iter().map(|s| LEVEL - s).collect()
     }
 
-    /// Returns the values of [`sdf`](DensityField::sdf) and their gradients, by central differences over a thousandth of
-    /// the box.
-    pub fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+    /// Gradients are central differences over a thousandth of the box.
+    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         const STEP: f32 = 2e-3;
         let along = |axis: Vec3| -> Vec<f32> {
             let moved =
@@ -76,9 +77,7 @@ impl DensityField {
         (self.sdf(points), (0..points.len()).map(|i| Vec3::new(x[i], y[i], z[i])).collect())
     }
 
-    /// Returns the sRGB-coded colors of points. Point `i` is viewed along `counts[i]` unit `directions`, which are
-    /// concatenated in one list.
-    pub fn colors(&self, points: &[Vec3], counts: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
+    fn colors(&self, points: &[Vec3], _: &[Vec3], counts: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
         let places = self.scaled(points).into_iter().zip(counts);
         let x: Vec<[f32; 3]> = places.flat_map(|(p, n)| std::iter::repeat_n(p, *n as usize)).collect();
         let d: Vec<[f32; 3]> = directions.iter().map(|d| d.to_array()).collect();
@@ -87,7 +86,9 @@ impl DensityField {
         };
         x.chunks(1 << 16).zip(d.chunks(1 << 16)).flat_map(look).collect()
     }
+}
 
+impl DensityField {
     /// Renders rays in scene coordinates.
     pub fn render(&self, rays: &[Ray]) -> Vec<RayResult> {
         const PASS: usize = 1 << 10;

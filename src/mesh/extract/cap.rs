@@ -132,25 +132,18 @@ impl Cap {
 mod tests {
     use super::*;
     use crate::Quiet;
+    use crate::geom::Painted;
     use crate::mesh::{ExtractOptions, extract};
 
     /// A column through the floor of the scene's box, red to the left and green to the right.
     fn column() -> (Mesh, Cap) {
         let f = |p: Vec3| (p.x.hypot(p.z) - 0.3).max(p.y - 0.5);
-        let slope = |p: Vec3| {
-            let d = |e: Vec3| (f(p + 1e-3 * e) - f(p - 1e-3 * e)) / 2e-3;
-            Vec3::new(d(Vec3::X), d(Vec3::Y), d(Vec3::Z))
+        let paint = |p: &[Vec3], _: &[Vec3], _: &[u32], _: &[Vec3]| {
+            p.iter().map(|p| if p.x < 0.0 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] }).collect()
         };
-        let (mut mesh, report) = extract(
-            |p| p.iter().map(|&p| f(p)).collect(),
-            |p| p.iter().map(|&p| (f(p), slope(p))).unzip(),
-            |p, _| p.iter().map(|p| if p.x < 0.0 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] }).collect(),
-            Aabb::SCENE,
-            None,
-            &ExtractOptions { resolution: 48, ..ExtractOptions::default() },
-            &Quiet,
-        )
-        .unwrap();
+        let options = ExtractOptions { resolution: 48, ..ExtractOptions::default() };
+        let (mut mesh, report) =
+            extract(&Painted { shape: f, paint }, Aabb::SCENE, &options, &Quiet).unwrap();
         let cap = Cap::of(&mesh, report.bounds(), report.cell_size).unwrap();
         cap.paint(&mut mesh);
         (mesh, cap)

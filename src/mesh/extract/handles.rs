@@ -1,7 +1,7 @@
 //! Small handles go: loops of hair are cut, holes between locks are filled.
 //!
 //! A surface is cut along a short loop that does not separate it (`loops`), both rims are drawn apart by half an
-//! edge and each is closed by the triangulation of least area. That takes away exactly one handle and
+//! edge and each is closed by the triangulation of least area (Barequet & Sharir 1995). That takes away exactly one handle and
 //! changes nothing else: where the loop goes around matter it is cut, where it goes around air that is
 //! filled, and the two differ only in which side of the new triangles is out.
 //!
@@ -15,9 +15,10 @@
 //! A loop whose discs would meet the surface is no place to cut (another strand may run through the hole): the
 //! next best is taken, and without any the handle stays and is counted.
 
-use super::holes::least_area;
+use super::BATCH;
 use super::loops::{Loop, LoopFinder};
-use crate::geom::{Aabb, Boxes, Bvh, DBox, Effort, Mesh, area_vector, intersect, topology};
+use crate::geom::{Aabb, Boxes, Bvh, DBox, Effort, Mesh, SdfField, area_vector, intersect, topology};
+use crate::mesh::input::check_len;
 use crate::{Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
@@ -31,6 +32,9 @@ const DRAWN: [f32; 3] = [0.5, 0.25, 0.1];
 
 /// Boxes compared for one triangle of a cap, at most: a sound surface takes hundreds.
 const EFFORT_OF_A_CAP: usize = 1 << 20;
+
+/// A triangle with less area than this share of a side's square is flat.
+const FLAT: f64 = 1e-4;
 
 /// A triangle may turn until this cosine when its rim is drawn back.
 const TURN: f64 = 0.3;
@@ -71,24 +75,24 @@ impl HandleReport {
     }
 }
 
-/// Removes the handles of a closed manifold that have a loop no longer than `longest`, in place. Where `sdf` is not
+/// Removes the handles of a closed manifold that have a loop no longer than `longest`, in place. Where the field is not
 /// finite it counts as 0. The mesh must not have vertex attributes yet. A surface without handles, or an open one, is
 /// unchanged.
 ///
 /// # Errors
 ///
-/// Returns the errors of `sdf`, and a request to stop.
+/// A field that returns the wrong number of values, a request to stop.
 pub(super) fn cut_handles(
     mesh: &mut Mesh,
     longest: f32,
-    sdf: &dyn Fn(&[Vec3]) -> Result<Vec<f32>>,
+    field: &dyn SdfField,
     monitor: &dyn Monitor,
 ) -> Result<HandleReport> {
     let mut report = HandleReport::default();
     while topology(&mesh.positions, &mesh.triangles).genus.is_some_and(|handles| handles > 0) {
         let Some(loops) = LoopFinder::new(&mesh.positions, &mesh.triangles) else { break };
         let found = loops.short(longest, monitor)?;
-        let discs = by_field(discs(&loops, found), |v| loops.place(v), sdf)?;
+        let discs = by_field(discs(&loops, found), |v| loops.place(v), field)?;
         let mut work = HandleCutter::new(mesh, &loops);
         for disc in &discs {
             if let Some(cut) = work.along(disc) {
@@ -139,12 +143,51 @@ fn discs(loops: &LoopFinder, found: Vec<Loop>) -> Vec<Disc> {
     found.into_iter().filter_map(disc).collect()
 }
 
+/// Returns the triangulation of a closed polygon with the least area, its corners in the polygon's order. A diagonal
+/// that is `taken` would give an edge a third triangle; `None` if those cannot be avoided.
+fn least_area(points: &[DVec3], taken: impl Fn(usize, usize) -> bool) -> Option<Vec<[usize; 3]>> {
+    let n = points.len();
+    let at = |i: usize, j: usize| i * n + j;
+    let mut cost = vec![f64::INFINITY; n * n];
+    let mut apex = vec![usize::MAX; n * n];
+    for i in 0..n - 1 {
+        cost[at(i, i + 1)] = 0.0;
+    }
+    for span in 2..n {
+        for i in 0..n - span {
+            let j = i + span;
+            if taken(i, j) {
+                continue;
+            }
+            for k in i + 1..j {
+                let area = 0.5 * (points[k] - points[i]).cross(points[j] - points[i]).length();
+                // along a straight side a triangle without area would cost nothing: only if nothing else is left
+                let across = points[j].distance_squared(points[i]);
+                let flat = if area <= FLAT * across { across / FLAT } else { 0.0 };
+                let sum = cost[at(i, k)] + cost[at(k, j)] + area + flat;
+                if sum < cost[at(i, j)] {
+                    cost[at(i, j)] = sum;
+                    apex[at(i, j)] = k;
+                }
+            }
+        }
+    }
+    if !cost[at(0, n - 1)].is_finite() {
+        return None;
+    }
+    let (mut open, mut out) = (vec![(0, n - 1)], Vec::with_capacity(n - 2));
+    while let Some((i, j)) = open.pop() {
+        if j > i + 1 {
+            let k = apex[at(i, j)];
+            out.push([i, k, j]);
+            open.extend([(i, k), (k, j)]);
+        }
+    }
+    Some(out)
+}
+
 /// Those first over which the field is least to be overcome: `∫ |f|`, by the middles of the triangles.
-fn by_field(
-    discs: Vec<Disc>,
-    place: impl Fn(u32) -> Vec3,
-    sdf: &dyn Fn(&[Vec3]) -> Result<Vec<f32>>,
-) -> Result<Vec<Disc>> {
+fn by_field(discs: Vec<Disc>, place: impl Fn(u32) -> Vec3, field: &dyn SdfField) -> Result<Vec<Disc>> {
     let (mut middles, mut areas) = (Vec::new(), Vec::new());
     for disc in &discs {
         for t in &disc.triangles {
@@ -153,7 +196,8 @@ fn by_field(
             areas.push(0.5 * (b - a).cross(c - a).length());
         }
     }
-    let values = sdf(&middles)?;
+    let values: Vec<f32> = middles.chunks(BATCH).flat_map(|points| field.sdf(points)).collect();
+    check_len("signed distance", middles.len(), values.len())?;
     let mut each = values.iter().zip(&areas).map(|(f, a)| if f.is_finite() { f.abs() * a } else { 0.0 });
     let mut costs: Vec<(f32, Disc)> =
         discs.into_iter().map(|disc| (each.by_ref().take(disc.triangles.len()).sum(), disc)).collect();
@@ -333,5 +377,39 @@ impl Patches {
                 *g = out;
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_straight_side_of_many_vertices_gets_no_triangle_without_area() {
+        // a square of 4 × 1 with the long sides in quarters
+        let at = |i: usize| match i {
+            0..=4 => DVec3::new(i as f64, 0.0, 0.0),
+            _ => DVec3::new(9.0 - i as f64, 1.0, 0.0),
+        };
+        let points: Vec<DVec3> = (0..10).map(at).collect();
+        let found = least_area(&points, |_, _| false).unwrap();
+        let area = |t: &[usize; 3]| {
+            let [a, b, c] = t.map(|i| points[i]);
+            0.5 * (b - a).cross(c - a).z
+        };
+        assert!(found.iter().all(|t| area(t) > 0.1), "{found:?}");
+        assert!((found.iter().map(area).sum::<f64>() - 4.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_diagonal_that_is_an_edge_already_is_not_made_again() {
+        // a square whose one diagonal is taken: the other, although it is the longer one in space
+        let points = [DVec3::ZERO, DVec3::X, DVec3::new(1.0, 1.0, 0.5), DVec3::Y];
+        let free = least_area(&points, |_, _| false).unwrap();
+        let by = |i: usize, j: usize| (i, j) == (0, 2);
+        let forced = least_area(&points, by).unwrap();
+        assert!(forced.iter().all(|t| !(t.contains(&0) && t.contains(&2))), "{forced:?} {free:?}");
+        assert!(least_area(&points, |_, j| j != 3).is_some());
+        assert!(least_area(&points, |i, j| (i, j) == (0, 2) || (i, j) == (1, 3)).is_none());
     }
 }

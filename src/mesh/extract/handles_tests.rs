@@ -14,17 +14,7 @@ fn mesh_of(f: impl Fn(Vec3) -> f32 + Sync, longest_handle: f32) -> (Mesh, MeshRe
 
 fn mesh_at(resolution: usize, f: impl Fn(Vec3) -> f32 + Sync, longest_handle: f32) -> (Mesh, MeshReport) {
     let config = ExtractOptions { resolution, longest_handle, ..ExtractOptions::default() };
-    let slope = |p: Vec3| slope(&f, p);
-    extract(
-        |p| p.iter().map(|&p| f(p)).collect(),
-        |p| p.iter().map(|&p| (f(p), slope(p))).unzip(),
-        |p, _| vec![[0.5; 3]; p.len()],
-        Aabb::SCENE,
-        None,
-        &config,
-        &Quiet,
-    )
-    .unwrap()
+    extract(&f, Aabb::SCENE, &config, &Quiet).unwrap()
 }
 
 fn slope(f: &impl Fn(Vec3) -> f32, p: Vec3) -> Vec3 {

@@ -8,7 +8,7 @@
 //!
 //! An exact zero is outside, `-0.0` too.
 
-use super::marching_cell::{CASES, CellSurface, INNER, crossing, resolve};
+use super::marching_cell::{CASES, CellOutput, CellSurface, crossing, resolve};
 use crate::geom::Mesh;
 use crate::mesh::input::check_count;
 use crate::{Error, Result};
@@ -38,8 +38,6 @@ pub struct LevelSet {
     pub triangles: Vec<[u32; 3]>,
     /// How many values were not finite (`+inf`, `NaN` count as outside, `-inf` as inside).
     pub non_finite: usize,
-    /// The first of them, as a node.
-    pub first_non_finite: Option<[usize; 3]>,
     /// Inside nodes on the outer faces that were taken as outside to close the surface.
     pub capped: usize,
 }
@@ -48,6 +46,52 @@ impl LevelSet {
     /// Returns the surface alone.
     pub fn into_mesh(self) -> Mesh {
         Mesh { positions: self.positions, triangles: self.triangles, ..Mesh::default() }
+    }
+}
+
+/// How much of a level set one part of a grid makes.
+#[derive(Clone, Copy, Default)]
+pub(super) struct PartCounts {
+    /// Vertices on edges.
+    pub vertices: u64,
+    /// Vertices inside cells.
+    pub inner: u64,
+    pub triangles: u64,
+}
+
+/// Where one part of a grid writes.
+pub(super) struct PartOutput<'a> {
+    /// Index of the first of `vertices`.
+    pub first: u32,
+    pub vertices: &'a mut [Vec3],
+    pub cells: CellOutput<'a>,
+}
+
+impl LevelSet {
+    /// Makes room for parts, and shares it out.
+    pub(super) fn share_out(&mut self, counts: &[PartCounts]) -> Result<Vec<PartOutput<'_>>> {
+        let sum = |of: fn(&PartCounts) -> u64| counts.iter().map(of).sum::<u64>();
+        let (edges, inside, triangles) = (sum(|c| c.vertices), sum(|c| c.inner), sum(|c| c.triangles));
+        check_count(edges + inside, triangles)?;
+        self.positions = vec![Vec3::ZERO; (edges + inside) as usize];
+        self.triangles = vec![[0; 3]; triangles as usize];
+        let (mut vertices, mut inner) = self.positions.split_at_mut(edges as usize);
+        let mut triangles = &mut self.triangles[..];
+        let (mut first, mut first_inner) = (0, edges as u32);
+        let part = |count: &PartCounts| {
+            let own = PartOutput {
+                first,
+                vertices: vertices.split_off_mut(..count.vertices as usize).unwrap_or_default(),
+                cells: CellOutput {
+                    triangles: triangles.split_off_mut(..count.triangles as usize).unwrap_or_default(),
+                    inner: inner.split_off_mut(..count.inner as usize).unwrap_or_default(),
+                    first_inner,
+                },
+            };
+            (first, first_inner) = (first + count.vertices as u32, first_inner + count.inner as u32);
+            own
+        };
+        Ok(counts.iter().map(part).collect())
     }
 }
 
@@ -111,7 +155,6 @@ fn repair(volume: &Volume, out: &mut LevelSet) -> Vec<f32> {
     for (i, &v) in volume.values.iter().enumerate().filter(|(_, v)| !v.is_finite()) {
         let node = [i % nx, i / nx % ny, i / nx / ny];
         out.non_finite += 1;
-        out.first_non_finite.get_or_insert(node);
         let size = largest_neighbour(node, volume.dims, |[x, y, z]| volume.values[(z * ny + y) * nx + x]);
         values[i] = if v == f32::NEG_INFINITY { -size } else { size };
     }
@@ -145,58 +188,26 @@ struct Passes<'a> {
     bits: Bits,
 }
 
-/// What one plane of nodes and the layer of cells above it hold.
-#[derive(Clone, Copy, Default)]
-struct Plane {
-    vertices: u64,
-    inner: u64,
-    triangles: u64,
-}
-
 impl Passes<'_> {
     fn run(&self, out: &mut LevelSet) -> Result<()> {
         let [_, ny, nz] = self.dims;
         // Vertices before each row's x, y and z edges, counted from the start of its plane.
         let mut rows = vec![[0u32; 3]; ny * nz];
-        let planes: Vec<Plane> =
+        let planes: Vec<PartCounts> =
             rows.par_chunks_mut(ny).enumerate().map(|(k, rows)| self.count(k, rows)).collect();
-
-        let mut starts = Vec::with_capacity(nz);
-        let mut total = Plane::default();
-        for p in &planes {
-            starts.push(total);
-            total.vertices += p.vertices;
-            total.inner += p.inner;
-            total.triangles += p.triangles;
-        }
-        check_count(total.vertices + total.inner, total.triangles)?;
-        rows.par_chunks_mut(ny).zip(&starts).for_each(|(rows, start)| {
-            rows.iter_mut().flatten().for_each(|r| *r += start.vertices as u32);
+        let parts = out.share_out(&planes)?;
+        rows.par_chunks_mut(ny).zip(&parts).for_each(|(rows, part)| {
+            rows.iter_mut().flatten().for_each(|r| *r += part.first);
         });
-
-        out.positions = vec![Vec3::ZERO; (total.vertices + total.inner) as usize];
-        out.triangles = vec![[0; 3]; total.triangles as usize];
-        let (mut on_edges, mut inner) = out.positions.split_at_mut(total.vertices as usize);
-        let mut triangles = out.triangles.as_mut_slice();
-        let mut jobs = Vec::with_capacity(nz);
-        for (k, p) in planes.iter().enumerate() {
-            let (v, rest) = on_edges.split_at_mut(p.vertices as usize);
-            on_edges = rest;
-            let (c, rest) = inner.split_at_mut(p.inner as usize);
-            inner = rest;
-            let (t, rest) = triangles.split_at_mut(p.triangles as usize);
-            triangles = rest;
-            jobs.push((k, v, c, t));
-        }
-        let inner_start = total.vertices as u32;
-        jobs.into_par_iter().for_each(|(k, v, c, t)| {
-            self.place(k, v);
-            self.connect(k, &rows, inner_start + starts[k].inner as u32, c, t);
+        parts.into_par_iter().enumerate().for_each(|(k, part)| {
+            self.place(k, part.vertices);
+            self.connect(k, &rows, part.cells);
         });
         Ok(())
     }
 
-    fn count(&self, k: usize, rows: &mut [[u32; 3]]) -> Plane {
+    /// Counts what one plane of nodes and the layer of cells above it hold.
+    fn count(&self, k: usize, rows: &mut [[u32; 3]]) -> PartCounts {
         let mut vertices = 0u32;
         for (j, row) in rows.iter_mut().enumerate() {
             for axis in 0..3 {
@@ -204,7 +215,7 @@ impl Passes<'_> {
                 crossings(&self.bits, j, k, axis, |_, word| vertices += word.count_ones());
             }
         }
-        let mut plane = Plane { vertices: u64::from(vertices), ..Plane::default() };
+        let mut plane = PartCounts { vertices: u64::from(vertices), ..PartCounts::default() };
         let cases = &*CASES;
         if k + 1 < self.dims[2] {
             for j in 0..self.dims[1] - 1 {
@@ -258,20 +269,12 @@ impl Passes<'_> {
     }
 
     /// The triangles of one layer of cells, and their inner vertices.
-    fn connect(
-        &self,
-        k: usize,
-        rows: &[[u32; 3]],
-        mut next_inner: u32,
-        mut inner: &mut [Vec3],
-        triangles: &mut [[u32; 3]],
-    ) {
+    fn connect(&self, k: usize, rows: &[[u32; 3]], mut out: CellOutput) {
         let [_, ny, nz] = self.dims;
         if k + 1 == nz {
             return;
         }
         let cases = &*CASES;
-        let mut at = 0;
         for j in 0..ny - 1 {
             let (r00, r10) = (rows[k * ny + j], rows[k * ny + j + 1]);
             let (r01, r11) = (rows[(k + 1) * ny + j], rows[(k + 1) * ny + j + 1]);
@@ -296,29 +299,9 @@ impl Passes<'_> {
                     next[7],
                     next[7] + step[7],
                 ];
-                if case.ambiguous {
-                    let cell = self.cell(index, i, j, k);
-                    let id = |code: u8| match code {
-                        0..INNER => ids[code as usize],
-                        _ => next_inner + u32::from(code - INNER),
-                    };
-                    for t in &cell.triangles {
-                        triangles[at] = t.map(id);
-                        at += 1;
-                    }
-                    let (now, later) = std::mem::take(&mut inner).split_at_mut(cell.inner.len());
-                    inner = later;
-                    next_inner += now.len() as u32;
-                    for (vertex, &p) in now.iter_mut().zip(&cell.inner) {
-                        *vertex = cell_point(self.origin, self.spacing, [i, j, k], p);
-                    }
-                } else {
-                    let n = case.count as usize;
-                    for (out, t) in triangles[at..at + n].iter_mut().zip(&case.triangles) {
-                        *out = [ids[t[0] as usize], ids[t[1] as usize], ids[t[2] as usize]];
-                    }
-                    at += n;
-                }
+                let resolved = case.ambiguous.then(|| self.cell(index, i, j, k));
+                let point = |at| cell_point(self.origin, self.spacing, [i, j, k], at);
+                out.write(case, resolved, &ids, point);
                 next.iter_mut().zip(step).for_each(|(n, s)| *n += s);
             });
         }
@@ -544,7 +527,7 @@ mod tests {
         v[13] = f32::NEG_INFINITY;
         v[4] = f32::NAN;
         let s = marching(&cube(3, &v), false).unwrap();
-        assert_eq!((s.non_finite, s.first_non_finite), (2, Some([1, 1, 0])));
+        assert_eq!(s.non_finite, 2);
         // -2 against +2: half way.
         assert!(s.positions.iter().all(|p| p.is_finite() && (*p - Vec3::ONE).length() == 0.5));
     }

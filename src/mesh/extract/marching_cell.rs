@@ -17,6 +17,7 @@
 //!    one cube face, because the neighbour may use the same pair and the edge would have four faces. A
 //!    loop that allows no such triangulation gets a vertex in its middle.
 
+use glam::Vec3;
 use std::sync::LazyLock;
 
 /// The corners of each edge, lower first.
@@ -28,7 +29,7 @@ const FACES: [[u8; 4]; 6] =
     [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
 
 /// First of the vertex codes that name inner vertices instead of edges.
-pub(super) const INNER: u8 = 12;
+const INNER: u8 = 12;
 
 /// Where the surface crosses an edge, 0..=1 from the end with value `a`; one end is inside (< 0), the
 /// other outside (≥ 0). Kept off the nodes: vertices never coincide and no face loses its area when a
@@ -45,6 +46,44 @@ pub(super) struct CellSurface {
     pub triangles: Vec<[u8; 3]>,
     /// Inner vertices in cell units, each coordinate in 0..1.
     pub inner: Vec<[f64; 3]>,
+}
+
+/// Where the triangles and inner vertices of some cells are written, one cell after the other.
+pub(super) struct CellOutput<'a> {
+    pub triangles: &'a mut [[u32; 3]],
+    pub inner: &'a mut [Vec3],
+    /// Index of the first of `inner`.
+    pub first_inner: u32,
+}
+
+impl CellOutput<'_> {
+    /// Writes a cell with these vertices on its edges: the surface of its case, or the one that was resolved. `point`
+    /// places its inner vertices.
+    #[inline]
+    pub(super) fn write(
+        &mut self,
+        case: &Case,
+        resolved: Option<CellSurface>,
+        ids: &[u32; 12],
+        point: impl Fn([f64; 3]) -> Vec3,
+    ) {
+        let Some(surface) = resolved else {
+            let own = self.triangles.split_off_mut(..case.count as usize).unwrap_or_default();
+            for (out, t) in own.iter_mut().zip(&case.triangles) {
+                *out = [ids[t[0] as usize], ids[t[1] as usize], ids[t[2] as usize]];
+            }
+            return;
+        };
+        let id = |code: u8| match code {
+            0..INNER => ids[code as usize],
+            _ => self.first_inner + u32::from(code - INNER),
+        };
+        let own = self.triangles.split_off_mut(..surface.triangles.len()).unwrap_or_default();
+        own.iter_mut().zip(&surface.triangles).for_each(|(out, t)| *out = t.map(id));
+        let own = self.inner.split_off_mut(..surface.inner.len()).unwrap_or_default();
+        own.iter_mut().zip(&surface.inner).for_each(|(out, &at)| *out = point(at));
+        self.first_inner += surface.inner.len() as u32;
+    }
 }
 
 /// What the case alone says.

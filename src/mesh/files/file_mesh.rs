@@ -25,6 +25,7 @@
 
 use crate::geom::{Atlas, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Photo;
+use crate::mesh::input::check_indices;
 use crate::{Error, Result, io};
 use bevy_mikktspace::{Geometry, TangentSpace, generate_tangents};
 use glam::{DMat3, DVec3, Mat3, Vec2, Vec3, Vec4};
@@ -68,7 +69,7 @@ impl Default for ExportOptions {
 
 impl ExportOptions {
     /// Returns the transform from the mesh's own coordinates to metres with +Y up.
-    pub(super) fn file_from_mesh(&self) -> Result<Similarity> {
+    pub(crate) fn file_from_mesh(&self) -> Result<Similarity> {
         if !(self.unit_m.is_finite() && self.unit_m > 0.0) {
             return Err(wrong_option("unit_m", self.unit_m, "metres per unit, above 0"));
         }
@@ -88,6 +89,7 @@ pub struct ExportedFiles {
 }
 
 /// A mesh ready to be written: checked, turned and scaled.
+#[derive(Default)]
 pub(super) struct FileMesh {
     pub positions: Vec<Vec3>,
     /// Unit, or empty.
@@ -162,18 +164,14 @@ impl FileMesh {
         Ok(FileMesh { positions, normals, colors, source, triangles, uvs, corners, tangents, translation })
     }
 
-    fn empty(translation: DVec3) -> FileMesh {
-        FileMesh {
-            positions: Vec::new(),
-            normals: Vec::new(),
-            colors: Vec::new(),
-            source: Vec::new(),
-            triangles: Vec::new(),
-            uvs: Vec::new(),
-            corners: Vec::new(),
-            tangents: Vec::new(),
-            translation,
-        }
+    /// Adds a copy of a vertex of another mesh, and returns its index.
+    fn copy(&mut self, of: &FileMesh, vertex: u32) -> u32 {
+        let v = vertex as usize;
+        self.source.push(of.source[v]);
+        self.positions.push(of.positions[v]);
+        self.normals.extend(of.normals.get(v));
+        self.colors.extend(of.colors.get(v));
+        self.positions.len() as u32 - 1
     }
 
     /// Whether f32 would lose visible precision at this mesh's position.
@@ -195,7 +193,7 @@ impl FileMesh {
         }
         let tangents = with_tangents
             .then(|| tangents_of(&self.positions, &self.normals, &self.triangles, &self.uvs, &self.corners));
-        let mut out = FileMesh::empty(self.translation);
+        let mut out = FileMesh { translation: self.translation, ..FileMesh::default() };
         let mut known: HashMap<(u32, [u32; 2], [u32; 4]), u32> = HashMap::with_capacity(self.positions.len());
         for (t, (vertices, corner)) in self.triangles.iter().zip(&self.corners).enumerate() {
             let mut triangle = [0; 3];
@@ -203,17 +201,11 @@ impl FileMesh {
                 let (vertex, uv) = (vertices[k], self.uvs[corner[k] as usize]);
                 let tangent = tangents.as_ref().map(|all| all[t][k]);
                 let bits = tangent.unwrap_or(Vec4::ZERO).to_array().map(f32::to_bits);
-                let next = out.positions.len() as u32;
                 let key = (vertex, uv.to_array().map(f32::to_bits), bits);
                 triangle[k] = *known.entry(key).or_insert_with(|| {
-                    out.source.push(vertex);
-                    let vertex = vertex as usize;
-                    out.positions.push(self.positions[vertex]);
-                    out.normals.extend(self.normals.get(vertex));
-                    out.colors.extend(self.colors.get(vertex));
                     out.uvs.push(uv);
                     out.tangents.extend(tangent);
-                    next
+                    out.copy(&self, vertex)
                 });
             }
             out.triangles.push(triangle);
@@ -223,22 +215,17 @@ impl FileMesh {
 
     /// Returns the part of this mesh that has these soft layers. The mesh must have been split.
     pub fn under(&self, shells: &Shells) -> FileMesh {
-        let mut out = FileMesh::empty(self.translation);
+        let mut out = FileMesh { translation: self.translation, ..FileMesh::default() };
         let mut known = vec![u32::MAX; self.positions.len()];
         let of_mesh = |t: &[u32; 3]| t.map(|v| self.source[v as usize]);
         let has = |t: &&[u32; 3]| shells.layers.iter().any(|layer| layer.has(&of_mesh(t)));
         for triangle in self.triangles.iter().filter(has) {
             out.triangles.push(triangle.map(|v| {
-                let v = v as usize;
-                if known[v] == u32::MAX {
-                    known[v] = out.positions.len() as u32;
-                    out.source.push(self.source[v]);
-                    out.positions.push(self.positions[v]);
-                    out.normals.extend(self.normals.get(v));
-                    out.colors.extend(self.colors.get(v));
-                    out.uvs.extend(self.uvs.get(v));
+                if known[v as usize] == u32::MAX {
+                    out.uvs.extend(self.uvs.get(v as usize));
+                    known[v as usize] = out.copy(self, v);
                 }
-                known[v]
+                known[v as usize]
             }));
         }
         out
@@ -309,7 +296,7 @@ fn repair_normals(normals: &mut [Vec3], positions: &[Vec3], triangles: &[[u32; 3
 }
 
 /// Returns the smallest rotation that brings `up` to +Y; exact for the six axes.
-pub(crate) fn turn_to_y_up(up: Vec3) -> Result<DMat3> {
+fn turn_to_y_up(up: Vec3) -> Result<DMat3> {
     let u = up.as_dvec3().try_normalize();
     let u = u.ok_or_else(|| wrong_option("up", up, "a direction, such as [0, 0, 1]"))?;
     let axis = DVec3::from_array(u.to_array().map(f64::round));
@@ -421,18 +408,6 @@ impl HeadTexture {
 }
 
 const DAMAGED: &str = "the mesh is damaged; extract it again";
-
-/// Checks that every triangle's indices are valid.
-fn check_indices(mesh: &Mesh) -> Result<()> {
-    let vertices = mesh.positions.len();
-    for (triangle, t) in mesh.triangles.iter().enumerate() {
-        if let Some(index) = t.iter().find(|&&i| i as usize >= vertices) {
-            let what = format!("triangle {triangle} uses vertex {index}, but there are only {vertices}");
-            return Err(Error::cannot(what, DAMAGED));
-        }
-    }
-    Ok(())
-}
 
 /// Checks that the atlas belongs to this mesh and lies within its texture.
 fn check_atlas(mesh: &Mesh, atlas: &Atlas) -> Result<()> {
@@ -656,10 +631,10 @@ pub(super) mod tests {
         let folded = Mesh { triangles: vec![[0, 0, 1]], ..triangle() };
         assert_eq!(at_home(&folded), "the mesh has no triangles to write");
         let outside = Mesh { triangles: vec![[0, 1, 3]], ..triangle() };
-        assert_eq!(at_home(&outside), "triangle 0 uses vertex 3, but there are only 3");
+        assert_eq!(at_home(&outside), "triangle 0 names vertex 3, but the mesh has 3");
         let mut nan = triangle();
         nan.positions[1].y = f32::NAN;
-        assert!(at_home(&nan).starts_with("vertex 1 has the position [1, NaN, 0], which is not finite"));
+        assert!(at_home(&nan).ends_with("a coordinate that is not finite, the first is vertex 1"));
         let short = Mesh { colors: vec![[0.0; 3]], ..triangle() };
         assert_eq!(at_home(&short), "1 colors for 3 vertices");
         let large = Mesh { positions: vec![Vec3::ZERO, Vec3::splat(1e38), Vec3::Y], ..triangle() };

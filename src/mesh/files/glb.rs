@@ -40,7 +40,7 @@ use crate::image::{Photo, linear_from_srgb, quantize};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use gltf::json::accessor::{ComponentType, GenericComponentType, Type};
-use gltf::json::buffer::{Stride, Target};
+use gltf::json::buffer::Target;
 use gltf::json::extensions::scene::khr_materials_variants::Variant;
 use gltf::json::extensions::{material, mesh, root};
 use gltf::json::image::MimeType;
@@ -102,7 +102,7 @@ pub fn to_glb(
         let mut picture = |name: &str, picture: &Photo, quality| -> Result<Index<json::Texture>> {
             let (bytes, ending) = encode(name, picture, quality)?;
             let mime = if ending == "png" { "image/png" } else { "image/jpeg" };
-            Ok(document.texture(Some(name.into()), &bytes, mime))
+            Ok(document.texture(name, &bytes, mime))
         };
         let color = picture("base color", &texture.color, options.jpeg_quality)?;
         main.pbr_metallic_roughness.base_color_texture = Some(info(color));
@@ -162,7 +162,7 @@ fn soft_layers(
         let colors: Vec<[u8; 4]> = part.source.iter().enumerate().map(color).collect();
         let mut attributes = BTreeMap::from([
             (Valid(Semantic::Positions), document.positions(&part.moved(layer, scale))),
-            (Valid(Semantic::Colors(0)), document.normalized(&colors, ComponentType::U8, Type::Vec4)),
+            (Valid(Semantic::Colors(0)), document.bytes(&colors)),
         ]);
         attributes.extend(uvs.map(|uvs| (Valid(Semantic::TexCoords(0)), uvs)));
         attributes.extend(normals.map(|normals| (Valid(Semantic::Normals), normals)));
@@ -173,11 +173,11 @@ fn soft_layers(
     Some(mesh(primitives, Some(name)))
 }
 
-pub(super) fn mesh(primitives: Vec<Primitive>, name: Option<String>) -> json::Mesh {
+fn mesh(primitives: Vec<Primitive>, name: Option<String>) -> json::Mesh {
     json::Mesh { primitives, name, weights: None, extensions: None, extras: Default::default() }
 }
 
-pub(super) fn primitive(attributes: Attributes, indices: Index<json::Accessor>) -> Primitive {
+fn primitive(attributes: Attributes, indices: Index<json::Accessor>) -> Primitive {
     Primitive {
         attributes,
         indices: Some(indices),
@@ -232,7 +232,7 @@ fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> json::Extras 
 }
 
 /// Returns our `extras` of a material.
-pub(super) fn extras(notes: Value) -> json::Extras {
+fn extras(notes: Value) -> json::Extras {
     let text = json!({ "tiface": notes }).to_string();
     Some(json::extras::RawValue::from_string(text).expect("a value is valid JSON"))
 }
@@ -278,12 +278,14 @@ fn finish(
         let child = root.push(json::Node { name, mesh, ..Default::default() });
         root.nodes[node.value()].children = Some(vec![child]);
     }
-    document.show(node);
+    let (extensions, extras) = Default::default();
+    let scene = json::Scene { nodes: vec![node], name: None, extensions, extras };
+    document.root.scene = Some(document.root.push(scene));
     if options.unlit {
         document.root.extensions_used.push("KHR_materials_unlit".into());
     }
     // within f32's precision its shortest digits suffice
-    document.placed = file.is_far().then_some((node, file.translation, 1.0));
+    document.placed = file.is_far().then_some((node, file.translation));
     document.pack()
 }
 
@@ -312,27 +314,21 @@ fn attributes(document: &mut GlbDocument, file: &FileMesh) -> Attributes {
 const SHORT_INDICES: usize = 65_535;
 
 #[derive(Default)]
-pub(super) struct GlbDocument {
-    pub root: Root,
-    pub bin: Vec<u8>,
-    /// A node with its translation and scale in f64: gltf-json's own are f32, and print as numbers that read as others
-    /// in f64.
-    pub placed: Option<(Index<gltf::json::Node>, DVec3, f64)>,
+struct GlbDocument {
+    root: Root,
+    bin: Vec<u8>,
+    /// A node with its translation in f64: gltf-json's own is f32, and prints as numbers that read as others in f64.
+    placed: Option<(Index<json::Node>, DVec3)>,
 }
 
 impl GlbDocument {
     /// Adds a view of bytes at a multiple of four.
-    fn view(
-        &mut self,
-        bytes: &[u8],
-        stride: Option<usize>,
-        target: Option<Target>,
-    ) -> Index<gltf::json::buffer::View> {
-        let view = self.root.push(gltf::json::buffer::View {
+    fn view(&mut self, bytes: &[u8], target: Option<Target>) -> Index<json::buffer::View> {
+        let view = self.root.push(json::buffer::View {
             buffer: Index::new(0),
             byte_length: USize64(bytes.len() as u64),
             byte_offset: Some(USize64(self.bin.len() as u64)),
-            byte_stride: stride.map(Stride),
+            byte_stride: None,
             name: None,
             target: target.map(Valid),
             extensions: None,
@@ -343,40 +339,34 @@ impl GlbDocument {
         view
     }
 
-    /// Adds elements of so many bytes each, or returns an existing accessor with the same bytes: layers around a mesh
-    /// share its corners.
-    fn accessor(
-        &mut self,
-        bytes: &[u8],
-        element: usize,
-        (component, type_): (ComponentType, Type),
-        normalized: bool,
-    ) -> Index<Accessor> {
+    /// Adds elements without gaps, or returns an accessor of the same bytes: layers may cover the whole mesh. Only
+    /// bytes are normalized.
+    fn accessor(&mut self, bytes: &[u8], (component, type_): (ComponentType, Type)) -> Index<Accessor> {
         let is_same = |a: &Accessor| {
             let view = a.buffer_view.map(|view| &self.root.buffer_views[view.value()]);
-            let offset = view.and_then(|view| view.byte_offset).map_or(0, |offset| offset.0 as usize);
             matches!(a.component_type, Valid(GenericComponentType(known)) if known == component)
-                && (a.type_, a.normalized) == (Valid(type_), normalized)
-                && view.is_some_and(|view| view.byte_length.0 == bytes.len() as u64)
-                && self.bin[offset..].starts_with(bytes)
+                && a.type_ == Valid(type_)
+                && view.is_some_and(|view| {
+                    let start = view.byte_offset.map_or(0, |offset| offset.0 as usize);
+                    self.bin[start..start + view.byte_length.0 as usize] == *bytes
+                })
         };
         if let Some(known) = self.root.accessors.iter().position(is_same) {
             return Index::new(known as u32);
         }
         let is_index = matches!(type_, Type::Scalar);
         let target = if is_index { Target::ElementArrayBuffer } else { Target::ArrayBuffer };
-        let is_padded = element > component.size() * type_.multiplicity();
-        let view = self.view(bytes, is_padded.then_some(element), Some(target));
+        let view = self.view(bytes, Some(target));
         self.root.push(Accessor {
             buffer_view: Some(view),
             byte_offset: None,
-            count: USize64((bytes.len() / element.max(1)) as u64),
+            count: USize64((bytes.len() / (component.size() * type_.multiplicity())) as u64),
             component_type: Valid(GenericComponentType(component)),
             type_: Valid(type_),
             min: None,
             max: None,
             name: None,
-            normalized,
+            normalized: matches!(component, ComponentType::U8),
             sparse: None,
             extensions: None,
             extras: Default::default(),
@@ -384,49 +374,42 @@ impl GlbDocument {
     }
 
     /// Vectors of f32: [`glam::Vec2`], `Vec3`, `Vec4` or arrays.
-    pub fn floats<T: bytemuck::NoUninit>(&mut self, values: &[T]) -> Index<Accessor> {
-        let kind = (ComponentType::F32, vector(size_of::<T>() / 4));
-        self.accessor(bytes_of(values), size_of::<T>(), kind, false)
+    fn floats<T: bytemuck::NoUninit>(&mut self, values: &[T]) -> Index<Accessor> {
+        let kind = match size_of::<T>() / 4 {
+            2 => Type::Vec2,
+            3 => Type::Vec3,
+            _ => Type::Vec4,
+        };
+        self.accessor(bytes_of(values), (ComponentType::F32, kind))
     }
 
-    /// Adds vectors of integers that stand for 0..=1, or −1..=1 if signed, padded to a multiple of four bytes;
-    /// vectors of three have a fourth component that is not read.
-    pub fn normalized<T: bytemuck::NoUninit>(
-        &mut self,
-        values: &[T],
-        component: ComponentType,
-        type_: Type,
-    ) -> Index<Accessor> {
-        self.accessor(bytes_of(values), size_of::<T>(), (component, type_), true)
+    /// Adds vectors of four bytes that stand for 0..=1.
+    fn bytes(&mut self, values: &[[u8; 4]]) -> Index<Accessor> {
+        self.accessor(bytes_of(values), (ComponentType::U8, Type::Vec4))
     }
 
-    /// Sets the bounds of an accessor, which are mandatory for positions.
-    pub fn bound(&mut self, accessor: Index<Accessor>, bounds: [impl Into<Value>; 2]) {
-        let [min, max] = bounds.map(|bound| Some(bound.into()));
-        let accessor = &mut self.root.accessors[accessor.value()];
-        (accessor.min, accessor.max) = (min, max);
-    }
-
-    /// Positions with their bounds.
-    pub fn positions(&mut self, values: &[Vec3]) -> Index<Accessor> {
+    /// Positions with their bounds, which are mandatory.
+    fn positions(&mut self, values: &[Vec3]) -> Index<Accessor> {
         let bounds = Aabb::around(values.iter().copied());
-        let accessor = self.floats(values);
-        self.bound(accessor, [bounds.min, bounds.max].map(|corner| corner.to_array().to_vec()));
-        accessor
+        let index = self.floats(values);
+        let accessor = &mut self.root.accessors[index.value()];
+        (accessor.min, accessor.max) =
+            (Some(bounds.min.to_array().to_vec().into()), Some(bounds.max.to_array().to_vec().into()));
+        index
     }
 
     /// Corners of triangles among `vertices` vertices.
-    pub fn indices(&mut self, triangles: &[[u32; 3]], vertices: usize) -> Index<Accessor> {
+    fn indices(&mut self, triangles: &[[u32; 3]], vertices: usize) -> Index<Accessor> {
         let flat = triangles.as_flattened();
         if vertices < SHORT_INDICES {
             let short: Vec<u16> = flat.iter().map(|&i| i as u16).collect();
-            return self.accessor(bytes_of(&short), 2, (ComponentType::U16, Type::Scalar), false);
+            return self.accessor(bytes_of(&short), (ComponentType::U16, Type::Scalar));
         }
-        self.accessor(bytes_of(flat), 4, (ComponentType::U32, Type::Scalar), false)
+        self.accessor(bytes_of(flat), (ComponentType::U32, Type::Scalar))
     }
 
     /// Adds a picture as a texture that is filtered smoothly and not repeated.
-    pub fn texture(&mut self, name: Option<String>, bytes: &[u8], mime: &str) -> Index<Texture> {
+    fn texture(&mut self, name: &str, bytes: &[u8], mime: &str) -> Index<Texture> {
         if self.root.samplers.is_empty() {
             self.root.push(Sampler {
                 mag_filter: Some(Valid(MagFilter::Linear)),
@@ -436,11 +419,11 @@ impl GlbDocument {
                 ..Default::default()
             });
         }
-        let view = self.view(bytes, None, None);
+        let view = self.view(bytes, None);
         let source = self.root.push(Image {
             buffer_view: Some(view),
             mime_type: Some(MimeType(mime.into())),
-            name,
+            name: Some(name.into()),
             uri: None,
             extensions: None,
             extras: Default::default(),
@@ -454,17 +437,10 @@ impl GlbDocument {
         })
     }
 
-    /// Makes a scene of a node, which viewers show by default.
-    pub fn show(&mut self, node: Index<gltf::json::Node>) {
-        let (extensions, extras) = Default::default();
-        let scene = gltf::json::Scene { nodes: vec![node], name: None, extensions, extras };
-        self.root.scene = Some(self.root.push(scene));
-    }
-
     /// Returns the document and its bytes as one file.
-    pub fn pack(mut self) -> Result<Vec<u8>> {
+    fn pack(mut self) -> Result<Vec<u8>> {
         self.root.asset.generator = Some(concat!("tiface ", env!("CARGO_PKG_VERSION")).into());
-        self.root.push(gltf::json::Buffer {
+        self.root.push(json::Buffer {
             byte_length: USize64(self.bin.len() as u64),
             name: None,
             uri: None,
@@ -474,12 +450,8 @@ impl GlbDocument {
         let GlbDocument { root, bin, placed } = self;
         let json = match placed {
             None => root.to_vec(),
-            Some((node, at, scale)) => serde_json::to_value(&root).and_then(|mut json| {
-                let node = &mut json["nodes"][node.value()];
-                node["translation"] = at.to_array().to_vec().into();
-                if scale != 1.0 {
-                    node["scale"] = vec![scale; 3].into();
-                }
+            Some((node, at)) => serde_json::to_value(&root).and_then(|mut json| {
+                json["nodes"][node.value()]["translation"] = at.to_array().to_vec().into();
                 serde_json::to_vec(&json)
             }),
         };
@@ -496,16 +468,8 @@ impl GlbDocument {
 }
 
 /// Returns a material's reference to a texture.
-pub(super) fn info(index: Index<Texture>) -> Info {
+fn info(index: Index<Texture>) -> Info {
     Info { index, tex_coord: 0, extensions: None, extras: Default::default() }
-}
-
-fn vector(width: usize) -> Type {
-    match width {
-        2 => Type::Vec2,
-        3 => Type::Vec3,
-        _ => Type::Vec4,
-    }
 }
 
 /// Numbers as glTF stores them. Its order is little endian, and so is every machine we build for.

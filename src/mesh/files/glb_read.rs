@@ -1,22 +1,25 @@
 //! Reads a GLB: all triangles of the default scene, transformed by their nodes, and their base color.
 //!
-//! `gltf` parses the file; the document's references are checked here before they are used. Only data in the file is
-//! read: buffers with a URI are refused.
+//! `gltf` takes the container apart. Of its JSON only what is read here can cause an error, and numbers are f64: a node
+//! may lie kilometres from the origin, where `gltf-json`'s f32 has steps of half a metre. The document's references are
+//! checked before they are used. Only data in the file is read: buffers with a URI are refused.
 
-use super::glb_json::{GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};
-use super::source::{ParsedMesh, PictureSource, Source};
-use crate::geom::{Atlas, Mesh};
+use super::source::{PictureSource, ReadMesh, Source};
+use crate::geom::Atlas;
 use crate::image::{linear_from_srgb, srgb_from_linear};
 use crate::{Result, io};
-use glam::{DMat3, DMat4, DVec3, Vec2};
+use glam::{DMat3, DMat4, DQuat, DVec3, Vec2};
 use gltf::Glb;
 use gltf::json::accessor::{ComponentType as C, GenericComponentType, Type};
 use gltf::json::mesh::{Mode, Semantic};
-use gltf::json::validation::Checked::{Invalid, Valid};
-use std::collections::BTreeSet;
+use gltf::json::validation::Checked::{self, Invalid, Valid};
+use serde::Deserialize;
+use serde::de::IgnoredAny;
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// The extension that allows 8 and 16 bits in more attributes.
-pub(super) const QUANTIZED: &str = "KHR_mesh_quantization";
+const QUANTIZED: &str = "KHR_mesh_quantization";
 const SHORTENED: [C; 5] = [C::F32, C::I8, C::U8, C::I16, C::U16];
 
 /// Extensions that leave shape and color attributes alone, or that are read.
@@ -26,28 +29,31 @@ fn is_harmless(extension: &str) -> bool {
         || ["KHR_texture_transform", "EXT_texture_webp", "KHR_texture_basisu"].contains(&extension)
 }
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     let glb = chunks(bytes, source)?;
     let root = GlbRoot::parse(&glb.json, source)?;
     if let Some(extension) = root.extensions_required.iter().find(|e| !is_harmless(e)) {
         return Err(source.unsupported("`extensionsRequired`", format!("`{extension}`")));
     }
-    let reader = GlbReader { root: &root, bin: glb.bin.as_deref().unwrap_or_default(), source };
-    let mut gathered = Primitives::default();
-    reader.each_part(|part| {
-        // the soft layers surround the surface and are not part of it
-        let material = part.primitive.material.and_then(|m| root.materials.get(m as usize));
-        if material.is_some_and(|m| m.is_soft_layer()) {
-            Ok(())
-        } else {
-            reader.add_triangles(part, &mut gathered)
-        }
-    })?;
-    reader.finish(gathered)
+    let short = root.extensions_required.iter().any(|e| e == QUANTIZED);
+    let mut reader = GlbReader {
+        root: &root,
+        bin: glb.bin.as_deref().unwrap_or_default(),
+        source,
+        short: if short { &SHORTENED } else { &[C::F32] },
+        out: ReadMesh { atlas: Some(Atlas::default()), ..ReadMesh::default() },
+        bare_normals: false,
+        bare_colors: false,
+        tinted: false,
+        textures: BTreeSet::new(),
+        tints: Vec::new(),
+    };
+    reader.scene()?;
+    reader.finish()
 }
 
 /// Returns the JSON chunk and the binary one.
-pub(super) fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
+fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
     let word = |at: usize| bytes.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     let (Some(version), Some(total)) = (word(4), word(8)) else {
         return Err(source.broken(format!("byte {}", bytes.len()), "the file ends inside a header"));
@@ -73,48 +79,23 @@ struct NodeStack<'a> {
     nodes: Vec<(u32, &'a GlbNode, DMat4)>,
 }
 
-/// Triangles of the default scene, in their node's position.
-pub(super) struct GlbPart<'a> {
-    /// Where in the file, for messages.
-    at: String,
-    /// The triangles and their material.
-    pub primitive: &'a GlbPrimitive,
-    matrix: DMat4,
-}
-
-/// The mesh under construction. Normals, colors and texture coordinates are kept only if every part has them; colors
-/// also if a material without a texture has one.
-#[derive(Default)]
-pub(super) struct Primitives {
-    pub positions: Vec<DVec3>,
-    /// Everything but the positions.
-    pub mesh: Mesh,
-    /// Factors of the vertices' colors, for parts that have any.
-    pub alphas: Vec<f32>,
+/// A document and the mesh that is read from it. Normals, colors and texture coordinates are kept only if every part has
+/// them; colors also if a material without a texture has one.
+struct GlbReader<'a> {
+    root: &'a GlbRoot,
+    bin: &'a [u8],
+    source: Source<'a>,
+    /// Components that positions and normals may have.
+    short: &'static [C],
+    out: ReadMesh,
     bare_normals: bool,
     bare_colors: bool,
     /// Whether a material without a texture has a color.
     tinted: bool,
-    /// One for each vertex.
-    pub uvs: Vec<Vec2>,
-    bare_uvs: bool,
     /// The base colors of the parts; `None` for a part without.
     textures: BTreeSet<Option<u32>>,
     /// Factors of the parts with a texture.
     tints: Vec<Option<[f32; 3]>>,
-}
-
-impl Primitives {
-    /// Whether the vertices have colors or opacity of their own.
-    pub fn is_colored(&self) -> bool {
-        !self.bare_colors || self.tinted
-    }
-}
-
-pub(super) struct GlbReader<'a> {
-    pub root: &'a GlbRoot,
-    pub bin: &'a [u8],
-    pub source: Source<'a>,
 }
 
 impl<'a> GlbReader<'a> {
@@ -139,42 +120,28 @@ impl<'a> GlbReader<'a> {
         Ok(())
     }
 
-    fn finish(&self, gathered: Primitives) -> Result<ParsedMesh> {
-        let Primitives {
-            positions,
-            mut mesh,
-            bare_normals,
-            bare_colors,
-            tinted,
-            uvs,
-            bare_uvs,
-            textures,
-            mut tints,
-            ..
-        } = gathered;
-        if bare_normals {
-            mesh.normals.clear();
+    fn finish(mut self) -> Result<ReadMesh> {
+        if self.bare_normals {
+            self.out.mesh.normals.clear();
         }
-        if bare_colors && !tinted {
-            mesh.colors.clear();
+        if self.bare_colors && !self.tinted {
+            self.out.mesh.colors.clear();
         }
-        let mut out = ParsedMesh { positions, mesh, ..ParsedMesh::default() };
-        if !self.source.options.texture || out.mesh.triangles.is_empty() {
-            return Ok(out);
+        if !self.source.options.texture || self.out.mesh.triangles.is_empty() {
+            return Ok(ReadMesh { atlas: None, ..self.out });
         }
-        if !bare_uvs {
-            out.atlas = Some(Atlas { uvs, triangles: out.mesh.triangles.clone(), width: 0, height: 0 });
+        if let Some(atlas) = &mut self.out.atlas {
+            atlas.triangles.clone_from(&self.out.mesh.triangles);
         }
-        let mut textures = textures.into_iter();
+        let mut textures = std::mem::take(&mut self.textures).into_iter();
         let (first, second) = (textures.next().flatten(), textures.next());
-        tints.dedup();
-        if second.is_some() || tints.len() > 1 {
+        self.tints.dedup();
+        if second.is_some() || self.tints.len() > 1 {
             return Err(self.source.unsupported("`materials`", "a mesh with several base colors"));
         }
-        let picture = first.map(|texture| self.picture(texture, out.atlas.as_mut()));
-        out.picture = picture.transpose()?;
-        out.tint = tints.first().copied().flatten();
-        Ok(out)
+        self.out.tint = self.tints.first().copied().flatten();
+        self.out.picture = first.map(|texture| self.picture(texture)).transpose()?;
+        Ok(self.out)
     }
 
     fn roots(&self) -> Result<Vec<u32>> {
@@ -194,12 +161,12 @@ impl<'a> GlbReader<'a> {
         }
     }
 
-    /// Calls `visit` for all parts with triangles, in the order of the scene.
-    pub fn each_part(&self, mut visit: impl FnMut(&GlbPart<'a>) -> Result<()>) -> Result<()> {
+    /// Reads all parts with triangles, in the order of the scene.
+    fn scene(&mut self) -> Result<()> {
         let root = self.root;
         if root.nodes.is_empty() {
             for mesh in 0..root.meshes.len() as u32 {
-                self.parts_of(mesh, &GlbNode::default(), DMat4::IDENTITY, &mut visit)?;
+                self.parts_of(mesh, &GlbNode::default(), DMat4::IDENTITY)?;
             }
         }
         let mut tree = NodeStack { reached: vec![false; root.nodes.len()], nodes: Vec::new() };
@@ -210,20 +177,14 @@ impl<'a> GlbReader<'a> {
                 return Err(self.source.broken(format!("node {index}"), "its transform is not finite"));
             }
             if let Some(mesh) = node.mesh {
-                self.parts_of(mesh, node, matrix, &mut visit)?;
+                self.parts_of(mesh, node, matrix)?;
             }
             self.push(&node.children, matrix, &mut tree)?;
         }
         Ok(())
     }
 
-    fn parts_of(
-        &self,
-        index: u32,
-        node: &GlbNode,
-        matrix: DMat4,
-        visit: &mut impl FnMut(&GlbPart<'a>) -> Result<()>,
-    ) -> Result<()> {
+    fn parts_of(&mut self, index: u32, node: &GlbNode, matrix: DMat4) -> Result<()> {
         let mesh = self.get("mesh", &self.root.meshes, index)?;
         if let Some(feature) = node.deformation(mesh) {
             return Err(self.source.unsupported(format!("mesh {index}"), feature));
@@ -231,7 +192,7 @@ impl<'a> GlbReader<'a> {
         for (k, primitive) in mesh.primitives.iter().enumerate() {
             let at = format!("mesh {index}, primitive {k}");
             match primitive.mode {
-                Valid(Mode::Triangles) => visit(&GlbPart { at, primitive, matrix })?,
+                Valid(Mode::Triangles) => self.add_triangles(&at, primitive, matrix)?,
                 Valid(mode @ (Mode::TriangleStrip | Mode::TriangleFan)) => {
                     let feature = format!("primitive mode {} (strips and fans)", mode.as_gl_enum());
                     return Err(self.source.unsupported(at, feature));
@@ -243,14 +204,16 @@ impl<'a> GlbReader<'a> {
         Ok(())
     }
 
-    /// Adds every triangle of a part.
-    pub fn add_triangles(&self, part: &GlbPart, out: &mut Primitives) -> Result<()> {
-        let (GlbPart { at, primitive, matrix }, source) = (part, self.source);
+    /// Adds every triangle of a part, unless it is a soft layer around the surface.
+    fn add_triangles(&mut self, at: &str, primitive: &GlbPrimitive, matrix: DMat4) -> Result<()> {
+        let source = self.source;
+        let material = primitive.material.and_then(|m| self.root.materials.get(m as usize));
+        if material.is_some_and(|m| m.is_soft_layer()) {
+            return Ok(());
+        }
         let of = |semantic: Semantic| primitive.attributes.get(&Valid(semantic)).copied();
         let position = of(Semantic::Positions).ok_or_else(|| source.broken(at, "there is no `POSITION`"))?;
-        let short: &[C] =
-            if self.root.extensions_required.iter().any(|e| e == QUANTIZED) { &SHORTENED } else { &[C::F32] };
-        let (positions, _) = self.numbers(position, &[Type::Vec3], short)?;
+        let (positions, _) = self.numbers(position, &[Type::Vec3], self.short)?;
         let count = positions.len() / 3;
         let indices: Vec<u32> = match primitive.indices {
             Some(i) => {
@@ -265,31 +228,30 @@ impl<'a> GlbReader<'a> {
         if let Some(i) = indices.iter().find(|&&i| i as usize >= count) {
             return Err(source.broken(at, format!("index {i}, but there are {count} vertices")));
         }
-        let first = out.positions.len();
-        source.allow(first + count, out.mesh.triangles.len() + indices.len() / 3)?;
-
-        let linear = DMat3::from_mat4(*matrix);
+        let first = self.out.places.len();
+        source.allow(first + count, self.out.mesh.triangles.len() + indices.len() / 3)?;
+        let linear = DMat3::from_mat4(matrix);
         let mirrored = linear.determinant() < 0.0;
         for p in positions.as_chunks::<3>().0 {
             let moved = matrix.transform_point3(DVec3::from(*p));
             if !moved.as_vec3().is_finite() {
                 return Err(source.broken(at, "a vertex is not finite once its node has moved it"));
             }
-            out.positions.push(moved);
+            self.out.places.push(moved);
         }
         // One value a vertex of an attribute that a part may lack.
-        let attribute = |semantic: Semantic, kinds: &[Type], components: &[C]| {
+        let attribute = |reader: &GlbReader, semantic: Semantic, kinds: &[Type], components: &[C]| {
             let name = semantic.to_string();
             let Some(index) = of(semantic) else { return Ok(None) };
-            let (numbers, width) = self.numbers(index, kinds, components)?;
+            let (numbers, width) = reader.numbers(index, kinds, components)?;
             let found = numbers.len() / width;
             if found != count {
                 return Err(source.broken(at, format!("{found} of `{name}` for {count} of `POSITION`")));
             }
             Ok(Some((numbers, width)))
         };
-        match attribute(Semantic::Normals, &[Type::Vec3], short)? {
-            None => out.bare_normals = true,
+        match attribute(self, Semantic::Normals, &[Type::Vec3], self.short)? {
+            None => self.bare_normals = true,
             Some((normals, _)) => {
                 // the inverse transpose, up to a factor that normalizing removes, also for singular matrices
                 let cofactor = DMat3::from_cols(
@@ -298,51 +260,48 @@ impl<'a> GlbReader<'a> {
                     linear.x_axis.cross(linear.y_axis),
                 ) * if mirrored { -1.0 } else { 1.0 };
                 let moved = |n: &[f64; 3]| (cofactor * DVec3::from(*n)).normalize_or_zero().as_vec3();
-                out.mesh.normals.extend(normals.as_chunks::<3>().0.iter().map(moved));
+                self.out.mesh.normals.extend(normals.as_chunks::<3>().0.iter().map(moved));
             }
         }
-        match attribute(Semantic::Colors(0), &[Type::Vec3, Type::Vec4], &[C::F32, C::U8, C::U16])? {
+        match attribute(self, Semantic::Colors(0), &[Type::Vec3, Type::Vec4], &[C::F32, C::U8, C::U16])? {
             None => {
-                out.bare_colors = true;
-                out.mesh.colors.resize(first + count, [1.0; 3]);
+                self.bare_colors = true;
+                self.out.mesh.colors.resize(first + count, [1.0; 3]);
             }
             Some((colors, width)) => {
-                let each = || colors.chunks_exact(width);
                 let coded = |c: &[f64]| [c[0], c[1], c[2]].map(|v| srgb_from_linear(v as f32));
-                out.mesh.colors.extend(each().map(coded));
-                out.alphas.extend(each().filter_map(|c| c.get(3)).map(|&a| a as f32));
+                self.out.mesh.colors.extend(colors.chunks_exact(width).map(coded));
             }
         }
-        let material = primitive.material.and_then(|m| self.root.materials.get(m as usize));
         let pbr = material.map(|m| &m.pbr_metallic_roughness).filter(|pbr| pbr.base_color_texture.is_none());
-        if let Some([r, g, b]) = pbr.and_then(|pbr| pbr.tint()) {
-            out.tinted = true;
-            for color in &mut out.mesh.colors[first..] {
-                let tint = |c: f32, f: f32| srgb_from_linear(linear_from_srgb(c) * f);
-                *color = [tint(color[0], r), tint(color[1], g), tint(color[2], b)];
+        if let Some(factors) = pbr.and_then(|pbr| pbr.tint()) {
+            self.tinted = true;
+            for (c, f) in self.out.mesh.colors[first..].iter_mut().flat_map(|c| c.iter_mut().zip(factors)) {
+                *c = srgb_from_linear(linear_from_srgb(*c) * f);
             }
         }
         if source.options.texture {
             let info = self.base_color(primitive.material)?;
-            out.textures.insert(info.map(|i| i.index));
+            self.textures.insert(info.map(|i| i.index));
             if info.is_some() {
-                out.tints.push(material.and_then(|m| m.pbr_metallic_roughness.tint()));
+                self.tints.push(material.and_then(|m| m.pbr_metallic_roughness.tint()));
             }
             let set = info.map_or(0, |i| i.tex_coord);
-            match attribute(Semantic::TexCoords(set), &[Type::Vec2], &SHORTENED)? {
-                Some((uvs, _)) => {
+            match (attribute(self, Semantic::TexCoords(set), &[Type::Vec2], &SHORTENED)?, info) {
+                (Some((uvs, _)), _) => {
                     let uv = |&[u, v]: &[f64; 2]| Vec2::new(u as f32, v as f32);
-                    out.uvs.extend(uvs.as_chunks::<2>().0.iter().map(uv));
+                    let uvs = uvs.as_chunks::<2>().0.iter().map(uv);
+                    self.out.atlas.iter_mut().for_each(|atlas| atlas.uvs.extend(uvs.clone()));
                 }
-                None if info.is_some() => {
+                (None, Some(_)) => {
                     return Err(source.broken(at, format!("there is no `TEXCOORD_{set}`")));
                 }
-                None => out.bare_uvs = true,
+                (None, None) => self.out.atlas = None,
             }
         }
         for t in indices.as_chunks::<3>().0 {
             let [a, b, c] = t.map(|i| first as u32 + i);
-            out.mesh.triangles.push(if mirrored { [a, c, b] } else { [a, b, c] });
+            self.out.mesh.triangles.push(if mirrored { [a, c, b] } else { [a, b, c] });
         }
         Ok(())
     }
@@ -438,7 +397,7 @@ impl<'a> GlbReader<'a> {
     }
 
     /// Returns the base color texture of a material, if it has one.
-    pub fn base_color(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
+    fn base_color(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
         let Some(index) = material else { return Ok(None) };
         let material = self.get("material", &self.root.materials, index)?;
         let info = material.pbr_metallic_roughness.base_color_texture.as_ref();
@@ -450,7 +409,7 @@ impl<'a> GlbReader<'a> {
 
     /// Returns the picture behind a texture, and its size in the atlas. Its header is checked against the limits for
     /// pictures; it is not decoded.
-    pub fn picture(&self, texture: u32, atlas: Option<&mut Atlas>) -> Result<PictureSource> {
+    fn picture(&mut self, texture: u32) -> Result<PictureSource> {
         let source = self.source;
         let Some(index) = self.get("texture", &self.root.textures, texture)?.source else {
             let at = format!("texture {texture}");
@@ -465,7 +424,7 @@ impl<'a> GlbReader<'a> {
         let (bytes, _) = self.view(view)?;
         let info = io::parse_picture_info(bytes, source.path, &io::Limits::default())
             .map_err(|e| source.broken(&at, e))?;
-        if let Some(atlas) = atlas {
+        if let Some(atlas) = &mut self.out.atlas {
             (atlas.width, atlas.height) = (info.width, info.height);
         }
         Ok(PictureSource::Inside(bytes.to_vec()))
@@ -477,4 +436,243 @@ fn names<T: std::fmt::Debug>(all: &[T]) -> String {
     let names: Vec<String> = all.iter().map(|v| format!("{v:?}")).collect();
     let (last, rest) = names.split_last().expect("something is always allowed");
     if rest.is_empty() { last.clone() } else { format!("{} or {last}", rest.join(", ")) }
+}
+
+/// Most objects and arrays. One takes two bytes of JSON and up to 144 in memory, and twice that while a list grows.
+const MOST_NESTED: usize = 1 << 20;
+/// Most values. A key with an index takes six bytes of JSON and up to a hundred in memory.
+const MOST_VALUES: usize = 4 << 20;
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+struct GlbRoot {
+    accessors: Vec<GlbAccessor>,
+    buffer_views: Vec<GlbView>,
+    buffers: Vec<GlbBuffer>,
+    meshes: Vec<GlbMesh>,
+    nodes: Vec<GlbNode>,
+    scenes: Vec<GlbScene>,
+    scene: Option<u32>,
+    extensions_required: Vec<String>,
+    materials: Vec<GlbMaterial>,
+    textures: Vec<GlbTexture>,
+    images: Vec<GlbImage>,
+}
+
+impl GlbRoot {
+    /// Parses the document, after bounding the memory that it may take.
+    fn parse(json: &[u8], source: Source) -> Result<GlbRoot> {
+        let at = "the JSON chunk";
+        // brackets in strings count too, but a file has few unless it is an attack
+        let count = |marks: &[u8]| json.iter().filter(|b| marks.contains(b)).count();
+        let (nested, values) = (count(b"{["), count(b"{[,"));
+        if nested > MOST_NESTED || values > MOST_VALUES {
+            let most = format!("more than {MOST_NESTED} objects and arrays or {MOST_VALUES} values");
+            return Err(source.broken(at, format!("{nested} and {values}, {most}")));
+        }
+        serde_json::from_slice(json).map_err(|e| source.broken(at, e))
+    }
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct GlbAccessor {
+    buffer_view: Option<u32>,
+    #[serde(default)]
+    byte_offset: u64,
+    component_type: Checked<GenericComponentType>,
+    count: u64,
+    #[serde(rename = "type")]
+    kind: Checked<Type>,
+    #[serde(default)]
+    normalized: bool,
+    sparse: Option<IgnoredAny>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct GlbView {
+    buffer: u32,
+    #[serde(default)]
+    byte_offset: u64,
+    byte_length: u64,
+    byte_stride: Option<usize>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct GlbBuffer {
+    byte_length: u64,
+    uri: Option<IgnoredAny>,
+}
+
+#[derive(Deserialize)]
+struct GlbMesh {
+    primitives: Vec<GlbPrimitive>,
+    /// Weights of morph targets, for nodes that have none of their own.
+    #[serde(default)]
+    weights: Value,
+}
+
+#[derive(Deserialize)]
+struct GlbPrimitive {
+    attributes: BTreeMap<Checked<Semantic>, u32>,
+    indices: Option<u32>,
+    #[serde(default)]
+    mode: Checked<Mode>,
+    material: Option<u32>,
+    /// Morph targets.
+    targets: Option<IgnoredAny>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+struct GlbNode {
+    mesh: Option<u32>,
+    children: Vec<u32>,
+    matrix: Option<Box<[f64; 16]>>,
+    translation: Option<[f64; 3]>,
+    rotation: Option<Box<[f64; 4]>>,
+    scale: Option<[f64; 3]>,
+    skin: Option<IgnoredAny>,
+    weights: Option<Box<Value>>,
+    extensions: GlbNodeExtensions,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+struct GlbNodeExtensions {
+    #[serde(rename = "EXT_mesh_gpu_instancing")]
+    instancing: Option<IgnoredAny>,
+}
+
+impl GlbNode {
+    /// Features that move the triangles of a mesh away from their accessors and the nodes' transforms.
+    fn deformation(&self, mesh: &GlbMesh) -> Option<&'static str> {
+        let weights = self.weights.as_deref().unwrap_or(&mesh.weights);
+        let is_morphed = mesh.primitives.iter().any(|p| p.targets.is_some())
+            && weights.as_array().into_iter().flatten().any(|w| w.as_f64().is_some_and(|w| w != 0.0));
+        let found = [
+            (self.skin.is_some(), "a skin"),
+            (is_morphed, "a morph target whose weight is not 0"),
+            (self.extensions.instancing.is_some(), "`EXT_mesh_gpu_instancing`"),
+        ];
+        found.into_iter().find_map(|(is_there, name)| is_there.then_some(name))
+    }
+
+    /// Returns the transform from the node's coordinates to its parent's.
+    fn parent_from_node(&self) -> DMat4 {
+        if let Some(matrix) = &self.matrix {
+            return DMat4::from_cols_array(matrix);
+        }
+        let q = self.rotation.as_deref().map_or(DQuat::IDENTITY, |q| DQuat::from_array(*q));
+        let q = if q.length() > 0.0 { q / q.length() } else { DQuat::IDENTITY };
+        DMat4::from_scale_rotation_translation(
+            self.scale.map_or(DVec3::ONE, DVec3::from),
+            q,
+            self.translation.map_or(DVec3::ZERO, DVec3::from),
+        )
+    }
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+struct GlbScene {
+    nodes: Vec<u32>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+struct GlbMaterial {
+    pbr_metallic_roughness: GlbPbr,
+    extras: Value,
+}
+
+impl GlbMaterial {
+    /// Whether the material says that it belongs to the soft layers around a mesh.
+    fn is_soft_layer(&self) -> bool {
+        self.extras["tiface"]["soft_layers"].is_u64()
+    }
+}
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+struct GlbPbr {
+    base_color_texture: Option<GlbTextureUse>,
+    /// Factors of colors and texture, whatever the JSON contains.
+    base_color_factor: Value,
+}
+
+impl GlbPbr {
+    /// Returns the linear red, green and blue factors of colors, if they are not all 1.
+    fn tint(&self) -> Option<[f32; 3]> {
+        let [r, g, b] = [0, 1, 2].map(|k| self.base_color_factor[k].as_f64().map(|v| v as f32));
+        let tint = [r?, g?, b?];
+        (tint.iter().all(|v| v.is_finite()) && tint != [1.0; 3]).then_some(tint)
+    }
+}
+
+/// A material's reference to a texture.
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct GlbTextureUse {
+    index: u32,
+    #[serde(default)]
+    tex_coord: u32,
+    #[serde(default)]
+    extensions: GlbTextureExtensions,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+struct GlbTextureExtensions {
+    #[serde(rename = "KHR_texture_transform")]
+    transform: Option<IgnoredAny>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(default)]
+struct GlbTexture {
+    source: Option<u32>,
+}
+
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+struct GlbImage {
+    buffer_view: Option<u32>,
+    uri: Option<IgnoredAny>,
+}
+
+/// Tests node transforms; reading is tested in `tests/hostile_mesh.rs`.
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn translation_rotation_and_scale_apply_in_gltf_order() {
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        let node = GlbNode {
+            translation: Some([10.0, 0.0, 0.0]),
+            rotation: Some(Box::new([0.0, 0.0, half, half])), // a quarter turn about z: x → y
+            scale: Some([2.0, 1.0, 1.0]),
+            ..GlbNode::default()
+        };
+        // (1, 0, 0) → scaled (2, 0, 0) → turned (0, 2, 0) → moved (10, 2, 0)
+        let p = node.parent_from_node().transform_point3(DVec3::X);
+        assert!(p.distance(DVec3::new(10.0, 2.0, 0.0)) < 1e-12);
+        assert_eq!(GlbNode::default().parent_from_node(), DMat4::IDENTITY);
+    }
+
+    #[test]
+    fn a_full_document_takes_a_few_hundred_megabytes() {
+        let largest = [
+            size_of::<GlbAccessor>(),
+            size_of::<GlbView>(),
+            size_of::<GlbMesh>(),
+            size_of::<GlbPrimitive>(),
+            size_of::<GlbNode>(),
+            size_of::<GlbMaterial>(),
+        ];
+        assert!(largest.iter().all(|&size| size <= 144), "{largest:?}");
+    }
 }

@@ -19,7 +19,7 @@
 use super::file_mesh::{
     ExportOptions, ExportedFiles, FileMesh, HeadTexture, distance_warning, encode, left_out, safe_name,
 };
-use super::source::{ParsedMesh, PictureSource, ReadOptions, Source};
+use super::source::{PictureSource, ReadMesh, ReadOptions, Source};
 use crate::Result;
 use crate::geom::{Aabb, Atlas, Mesh};
 use glam::{DVec3, Vec2, Vec3};
@@ -126,40 +126,36 @@ impl std::fmt::Display for Short {
     }
 }
 
-/// The mesh under construction.
+/// A mesh and what is known of it until all lines are read.
 #[derive(Default)]
 struct Obj {
-    positions: Vec<DVec3>,
-    /// Colors and triangles.
-    mesh: Mesh,
+    out: ReadMesh,
+    atlas: Atlas,
     normals: Vec<Vec3>,
     /// Index of the normal that each vertex was used with, if any.
     normal_of: Vec<Option<u32>>,
     /// Whether a vertex has two normals, as on a crease, or none.
     creased: bool,
-    atlas: Atlas,
     /// Whether a face lacks texture coordinates.
     bare: bool,
-    library: Option<String>,
     material: Option<String>,
 }
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     let mut obj = Obj::default();
     for (number, line) in lines(bytes) {
         obj.line(&line, &source, &format_args!("line {number}"))?;
     }
-    let Obj { positions, mut mesh, normals, normal_of, atlas, .. } = obj;
-    if mesh.colors.len() != positions.len() {
-        mesh.colors.clear();
+    let Obj { mut out, normals, normal_of, atlas, .. } = obj;
+    if out.mesh.colors.len() != out.places.len() {
+        out.mesh.colors.clear();
     }
     if !obj.creased {
         let normals = normal_of.iter().map(|n| n.map(|n| normals[n as usize].normalize_or_zero()));
-        mesh.normals = normals.collect::<Option<_>>().unwrap_or_default();
+        out.mesh.normals = normals.collect::<Option<_>>().unwrap_or_default();
     }
-    let atlas = (source.options.texture && !obj.bare).then_some(atlas);
-    let picture = obj.library.map(PictureSource::Material);
-    Ok(ParsedMesh { positions, mesh, atlas, picture, tint: None })
+    out.atlas = (source.options.texture && !obj.bare).then_some(atlas);
+    Ok(out)
 }
 
 impl Obj {
@@ -172,11 +168,11 @@ impl Obj {
             "v" => {
                 let numbers = floats(words, source, at)?;
                 let [x, y, z, rest @ ..] = &numbers[..] else { return Err(few(&numbers, "x y z")) };
-                source.allow(self.positions.len() + 1, 0)?;
-                self.positions.push(DVec3::new(*x, *y, *z));
+                source.allow(self.out.places.len() + 1, 0)?;
+                self.out.places.push(DVec3::new(*x, *y, *z));
                 self.normal_of.push(None);
                 if let [r, g, b] = rest {
-                    self.mesh.colors.push([*r, *g, *b].map(|c| c.clamp(0.0, 1.0) as f32));
+                    self.out.mesh.colors.push([*r, *g, *b].map(|c| c.clamp(0.0, 1.0) as f32));
                 }
             }
             "vn" => {
@@ -190,13 +186,13 @@ impl Obj {
                 source.allow(self.atlas.uvs.len() + 1, 0)?;
                 self.atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
             }
-            "mtllib" if source.options.texture && self.library.is_none() => {
+            "mtllib" if source.options.texture && self.out.picture.is_none() => {
                 let name = line.strip_prefix("mtllib").unwrap_or("");
-                self.library = Some(source.bare_name(at, name)?);
+                self.out.picture = Some(PictureSource::Material(source.bare_name(at, name)?));
             }
             "usemtl" if source.options.texture => {
                 let name = words.collect::<Vec<_>>().join(" ");
-                if !self.mesh.triangles.is_empty() && self.material.as_ref() != Some(&name) {
+                if !self.out.mesh.triangles.is_empty() && self.material.as_ref() != Some(&name) {
                     return Err(source.unsupported(at, "a mesh with several materials"));
                 }
                 self.material = Some(name);
@@ -217,7 +213,7 @@ impl Obj {
         for word in words {
             let mut parts = word.split('/');
             let mut part = || parts.next().unwrap_or("");
-            let vertex = resolve(part(), self.positions.len(), "vertices", source, at)?;
+            let vertex = resolve(part(), self.out.places.len(), "vertices", source, at)?;
             let (uv, normal) = (part(), part());
             if source.options.texture && !uv.is_empty() {
                 mapped.push(resolve(uv, self.atlas.uvs.len(), "texture coordinates", source, at)?);
@@ -239,11 +235,11 @@ impl Obj {
                 source.broken(at, format!("a face with {} corners, expected at least 3", corners.len()))
             );
         }
-        source.allow(0, self.mesh.triangles.len() + corners.len() - 2)?;
+        source.allow(0, self.out.mesh.triangles.len() + corners.len() - 2)?;
         let fan = |c: &[u32], out: &mut Vec<[u32; 3]>| {
             out.extend(c.windows(2).skip(1).map(|w| [c[0], w[0], w[1]]));
         };
-        fan(&corners, &mut self.mesh.triangles);
+        fan(&corners, &mut self.out.mesh.triangles);
         self.bare |= mapped.len() != corners.len();
         if !self.bare {
             fan(&mapped, &mut self.atlas.triangles);

@@ -18,7 +18,7 @@
 use super::file_mesh::{
     ExportOptions, ExportedFiles, FileMesh, HeadTexture, distance_warning, encode, left_out, safe_name,
 };
-use super::source::{ParsedMesh, PictureSource, Source};
+use super::source::{PictureSource, ReadMesh, Source};
 use crate::Result;
 use crate::geom::{Atlas, Mesh};
 use crate::image::quantize;
@@ -164,10 +164,10 @@ struct Element {
     properties: Vec<Property>,
 }
 
-pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
+pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     let Header { order, elements, start, picture } = header(bytes, source)?;
     let mut body = Body { bytes, at: start, order, source };
-    let mut out = ParsedMesh::default();
+    let mut out = ReadMesh::default();
     let mut uvs = None;
     for element in &elements {
         body.check(element)?;
@@ -181,7 +181,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ParsedMesh> {
             }
         }
     }
-    let count = out.positions.len();
+    let count = out.places.len();
     for (i, t) in out.mesh.triangles.iter().enumerate() {
         if let Some(v) = t.iter().find(|&&v| v as usize >= count) {
             let what = format!("index {v}, but there are {count} vertices");
@@ -361,10 +361,10 @@ impl Body<'_> {
 }
 
 /// Adds the vertices; returns their texture coordinates if they are wanted and present.
-fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<Option<Vec<Vec2>>> {
+fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Option<Vec<Vec2>>> {
     let source = body.source;
     source.allow(element.count, 0)?;
-    if !out.positions.is_empty() {
+    if !out.places.is_empty() {
         return Err(source.broken("element `vertex`", "comes twice"));
     }
     let slot = |name: &str| element.properties.iter().position(|p| p.name == name && p.length.is_none());
@@ -397,7 +397,7 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ParsedMesh) -> Result<
         if !position.as_vec3().is_finite() || !direction.is_finite() {
             return Err(source.broken(format!("vertex {i}"), format!("{position} {direction} is not finite")));
         }
-        out.positions.push(position);
+        out.places.push(position);
         if normal.is_some() {
             out.mesh.normals.push(direction.normalize_or_zero());
         }

@@ -9,7 +9,7 @@
 
 use super::file_mesh::{HeadTexture, middle};
 use super::obj::{self, picture_of_mtl};
-use super::source::{ParsedMesh, PictureSource, ReadOptions, Source};
+use super::source::{PictureSource, ReadMesh, ReadOptions, Source};
 use super::stored::HeadMesh;
 use super::{glb_read, ply};
 use crate::geom::{Atlas, Mesh, Similarity};
@@ -18,23 +18,6 @@ use crate::io::{self, Limits};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use std::path::{Path, PathBuf};
-
-/// A mesh as it was read, with its texture.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct ReadMesh {
-    /// The surface, its positions relative to `origin`.
-    pub mesh: Mesh,
-    /// The origin of the mesh in the file's coordinates: the center of a mesh that lies more than fifteen of its
-    /// sizes from the file's origin, else that origin.
-    pub origin: DVec3,
-    /// Texture coordinates, if the file has them for all triangles. The size is that of the picture in the file, else
-    /// 0 × 0. Coordinates are finite; in files of other programs they may leave 0..=1, where a texture repeats.
-    pub atlas: Option<Atlas>,
-    /// The base color.
-    pub picture: Option<PictureSource>,
-    /// Linear red, green and blue that it is multiplied with, if the file says so.
-    pub tint: Option<[f32; 3]>,
-}
 
 /// Returns the mesh in the bytes of a `.glb`, `.ply` or `.obj` file, in the file's own coordinates, rounded to f32:
 /// for a mesh far from the origin see [`read_with`].
@@ -47,8 +30,8 @@ pub struct ReadMesh {
 /// Fails if the bytes are none of these formats, break its rules, use unsupported features, hold no triangles, or
 /// more than the limits of [`ReadOptions`].
 pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh> {
-    let ParsedMesh { positions, mesh, .. } = parse(bytes, path, &ReadOptions::SURFACE)?;
-    Ok(Mesh { positions: positions.iter().map(|p| p.as_vec3()).collect(), ..mesh })
+    let ReadMesh { places, mesh, .. } = parse(bytes, path, &ReadOptions::SURFACE)?;
+    Ok(Mesh { positions: places.iter().map(|p| p.as_vec3()).collect(), ..mesh })
 }
 
 /// Returns a mesh around an origin of its own, with its texture as far as these bytes hold it.
@@ -58,20 +41,21 @@ pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh> {
 /// Fails like [`read`], and when the texture is wanted but broken, lies outside the file and its folder, or when
 /// there are several textures.
 pub fn read_with(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
-    let ParsedMesh { positions, mut mesh, atlas, picture, tint } = parse(bytes, path, options)?;
+    let mut out = parse(bytes, path, options)?;
+    let places = std::mem::take(&mut out.places);
     // the box of the used vertices: loose ones may be anywhere
-    let corners = mesh.triangles.iter().flatten().map(|&i| positions[i as usize]);
+    let corners = out.mesh.triangles.iter().flatten().map(|&i| places[i as usize]);
     let (low, high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let (center, _, far) = middle(corners.fold((low, high), |(low, high), p| (low.min(p), high.max(p))));
     // rounded as export does, so that exported positions are read back exactly
     let origin = if far { center.as_vec3().as_dvec3() } else { DVec3::ZERO };
     // −0 is kept
     let place = |p: &DVec3| if far { (p - origin).as_vec3() } else { p.as_vec3() };
-    mesh.positions = positions.iter().map(place).collect::<Vec<Vec3>>();
-    Ok(ReadMesh { mesh, origin, atlas, picture, tint })
+    out.mesh.positions = places.iter().map(place).collect::<Vec<Vec3>>();
+    Ok(ReadMesh { origin, ..out })
 }
 
-fn parse(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ParsedMesh> {
+fn parse(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
     let source = |format| Source { path, format, options };
     let found = if bytes.starts_with(b"glTF") {
         glb_read::read(bytes, source("GLB"))?
@@ -144,7 +128,7 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
             found
         }
     };
-    let ReadMesh { mesh, origin, atlas, picture, tint } = found;
+    let ReadMesh { mesh, origin, atlas, picture, tint, .. } = found;
     let mut photo = open_picture(picture.as_ref(), path).unwrap_or_else(|e| {
         warnings.push(format!("{e}; shown without its texture"));
         None

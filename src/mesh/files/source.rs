@@ -1,4 +1,4 @@
-//! Shared parts of the readers: the file, its limits, and its errors.
+//! What readers share: the mesh that they make, the file, its limits, and its errors.
 
 use crate::geom::{Atlas, Mesh};
 use crate::{Error, Result};
@@ -45,19 +45,6 @@ pub enum PictureSource {
     Beside(String),
     /// In the picture that [`super::picture_of_mtl`] finds in the `.mtl` of this bare name, in the same folder.
     Material(String),
-}
-
-/// The result of a reader.
-#[derive(Default)]
-pub(super) struct ParsedMesh {
-    /// In the file's coordinates.
-    pub positions: Vec<DVec3>,
-    /// The mesh without its positions.
-    pub mesh: Mesh,
-    pub atlas: Option<Atlas>,
-    pub picture: Option<PictureSource>,
-    /// Linear red, green and blue that the picture is multiplied with.
-    pub tint: Option<[f32; 3]>,
 }
 
 /// The file being read, its format, and its limits.
@@ -116,4 +103,23 @@ impl Source<'_> {
         }
         Ok(())
     }
+}
+
+/// A mesh as it was read, with its texture.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReadMesh {
+    /// The surface, its positions relative to `origin`.
+    pub mesh: Mesh,
+    /// The origin of the mesh in the file's coordinates: the center of a mesh that lies more than fifteen of its
+    /// sizes from the file's origin, else that origin.
+    pub origin: DVec3,
+    /// Texture coordinates, if the file has them for all triangles. The size is that of the picture in the file, else
+    /// 0 × 0. Coordinates are finite; in files of other programs they may leave 0..=1, where a texture repeats.
+    pub atlas: Option<Atlas>,
+    /// The base color.
+    pub picture: Option<PictureSource>,
+    /// Linear red, green and blue that it is multiplied with, if the file says so.
+    pub tint: Option<[f32; 3]>,
+    /// The positions in the file's coordinates while the file is read; then they move to `mesh`.
+    pub(super) places: Vec<DVec3>,
 }

@@ -27,12 +27,12 @@ const MAKE_AGAIN: &str = "make the mesh again: `tiface mesh RUN --fresh mesh`";
 type Tensor = (String, Vec<usize>, TensorValues);
 
 /// `[n, N]` numbers.
-pub(super) fn floats<const N: usize>(name: &str, values: &[[f32; N]]) -> Tensor {
+fn floats<const N: usize>(name: &str, values: &[[f32; N]]) -> Tensor {
     (name.into(), vec![values.len(), N], TensorValues::F32(values.as_flattened().to_vec()))
 }
 
 /// `[n, 3]` indices.
-pub(super) fn indices(name: &str, values: &[[u32; 3]]) -> Tensor {
+fn indices(name: &str, values: &[[u32; 3]]) -> Tensor {
     (name.into(), vec![values.len(), 3], TensorValues::U32(values.as_flattened().to_vec()))
 }
 
@@ -47,12 +47,12 @@ fn geometry(mesh: &Mesh) -> Vec<Tensor> {
 }
 
 /// Returns the version as it is written in a file.
-pub(super) fn format() -> BTreeMap<String, String> {
+fn format() -> BTreeMap<String, String> {
     BTreeMap::from([("format".to_owned(), FORMAT.to_owned())])
 }
 
 /// Returns the error for an unusable file: missing or damaged ones can be made again.
-pub(super) fn damaged(e: ReadError) -> Error {
+fn damaged(e: ReadError) -> Error {
     match &e {
         ReadError::Io { source, .. } if source.kind() != std::io::ErrorKind::NotFound => e.into(),
         _ => Error::cannot(&e, "make it again: repeat the command with `--fresh mesh`"),
@@ -95,36 +95,30 @@ impl StoredTensors {
         damaged(ReadError::value(&self.path, key, found, expected))
     }
 
-    /// `[n, N]` numbers.
-    fn rows<const N: usize>(&mut self, name: &str) -> Result<Vec<[f32; N]>> {
+    /// Numbers of a shape that `fits`.
+    fn numbers(&mut self, name: &str, fits: impl Fn(&[usize]) -> bool) -> Result<(Vec<usize>, Vec<f32>)> {
         match self.tensors.remove(name) {
-            Some((shape, TensorValues::F32(v))) if shape.len() == 2 && shape[1] == N => {
-                Ok(v.as_chunks::<N>().0.to_vec())
-            }
+            Some((shape, TensorValues::F32(values))) if fits(&shape) => Ok((shape, values)),
             _ => Err(self.missing(name)),
         }
     }
 
-    /// `[vertices, n, 3]` numbers, and `n`.
-    fn per_vertex(&mut self, name: &str, vertices: usize) -> Result<(usize, Vec<[f32; 3]>)> {
-        match self.tensors.remove(name) {
-            Some((shape, TensorValues::F32(v)))
-                if shape.len() == 3 && shape[0] == vertices && shape[1] > 0 && shape[2] == 3 =>
-            {
-                Ok((shape[1], v.as_chunks::<3>().0.to_vec()))
-            }
-            _ => Err(self.missing(name)),
-        }
+    /// `[n, N]` numbers.
+    fn rows<const N: usize>(&mut self, name: &str) -> Result<Vec<[f32; N]>> {
+        let (_, values) = self.numbers(name, |shape| shape.len() == 2 && shape[1] == N)?;
+        Ok(values.as_chunks::<N>().0.to_vec())
     }
 
     /// `[n, count]` numbers, a list for each of the `n`.
     fn each_of(&mut self, count: usize, name: &str) -> Result<Vec<Vec<f32>>> {
-        match self.tensors.remove(name) {
-            Some((shape, TensorValues::F32(v))) if shape.len() == 2 && shape[1] == count && count > 0 => {
-                Ok(v.chunks_exact(count).map(<[f32]>::to_vec).collect())
-            }
-            _ => Err(self.missing(name)),
-        }
+        let (_, values) = self.numbers(name, |shape| shape.len() == 2 && shape[1] == count && count > 0)?;
+        Ok(values.chunks_exact(count).map(<[f32]>::to_vec).collect())
+    }
+
+    /// A matrix by its columns.
+    fn matrix(&mut self, name: &str) -> Result<Mat3> {
+        let &[x, y, z] = &self.rows::<3>(name)?[..] else { return Err(self.missing(name)) };
+        Ok(Mat3::from_cols(x.into(), y.into(), z.into()))
     }
 
     /// `[n, 3]` numbers.
@@ -340,28 +334,21 @@ fn load_texture(folder: &Path, stored: &mut StoredTensors, mesh: &Mesh) -> Resul
     }
     if stored.contains("lobe_scale") {
         let scale = stored.rows::<1>("lobe_scale")?.into_flattened();
-        let turned = stored.rows::<3>("asset_from_world")?;
-        let &[x, y, z] = &turned[..] else { return Err(stored.missing("asset_from_world")) };
+        let asset_from_world = stored.matrix("asset_from_world")?;
         if scale.len() > MOST_LOBES {
             return Err(stored.missing("lobe_scale"));
         }
         let pictures = (0..scale.len()).map(|k| load_photo(folder, &format!("lobe_{k}.png"), size));
-        let (pictures, asset_from_world) =
-            (pictures.collect::<Result<_>>()?, Mat3::from_cols(x.into(), y.into(), z.into()));
-        texture.lobes = Some(Lobes { pictures, scale, asset_from_world });
+        texture.lobes = Some(Lobes { pictures: pictures.collect::<Result<_>>()?, scale, asset_from_world });
     }
     Ok(texture)
 }
 
 fn load_harmonics(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Harmonics> {
-    let (functions, coefficients) = stored.per_vertex("harmonics", mesh.positions.len())?;
-    let &[x, y, z] = &stored.rows::<3>("harmonics_from_scene")?[..] else {
-        return Err(stored.missing("harmonics_from_scene"));
-    };
-    if functions > MOST_LOBES {
-        return Err(stored.missing("harmonics"));
-    }
-    Ok(Harmonics { functions, coefficients, turned: Mat3::from_cols(x.into(), y.into(), z.into()) })
+    let fits = |shape: &[usize]| matches!(*shape, [n, count, 3] if n == mesh.positions.len() && (1..=MOST_LOBES).contains(&count));
+    let (shape, values) = stored.numbers("harmonics", fits)?;
+    let turned = stored.matrix("harmonics_from_scene")?;
+    Ok(Harmonics { functions: shape[1], coefficients: values.as_chunks::<3>().0.to_vec(), turned })
 }
 
 fn load_shells(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Shells> {

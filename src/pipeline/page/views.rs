@@ -1,13 +1,13 @@
 //! Small copies of photographs and of their renders, and the error between them.
 //!
-//! Also the 3D viewer of a page: a copy of `head.glb` that is small enough, and the cameras of the photographs.
+//! Also the 3D viewer of a page: a copy of the head that is small enough, and the cameras of the photographs.
 
 use crate::capture::{Split, View};
-use crate::config::{MeshFormat, MeshFrame, Stage, called};
-use crate::geom::{Camera, Similarity};
+use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, called};
+use crate::geom::{Atlas, Camera, Similarity};
 use crate::image::{Photo, quantize, reduce_photo, working_size};
 use crate::io::{self, Limits, ReadError};
-use crate::mesh::files::{ExportOptions, HeadMesh, HeadTexture, compact_glb, open_mesh, to_glb, weld};
+use crate::mesh::files::{ExportOptions, HeadMesh, HeadTexture, Lobes, OpenedMesh, open_mesh, to_glb, weld};
 use crate::mesh::{SimplifyConfig, simplify};
 use crate::pipeline::finish::{Export, center};
 use crate::pipeline::line::Line;
@@ -22,7 +22,6 @@ use crate::{Error, Quiet, Result};
 use glam::Vec3;
 use rayon::prelude::*;
 use serde_json::Value;
-use std::cell::RefCell;
 use std::path::Path;
 
 /// Longest side of a picture on the page: of few views, and of many.
@@ -167,8 +166,13 @@ fn straightened(picture: Photo, camera: &Camera) -> Photo {
     Photo { rgb: (0..w * h).map(from).collect(), alpha: None, ..picture }
 }
 
-/// Maximum size of a mesh inside a page, bytes: 200,000 triangles with a texture.
+/// Maximum size of a mesh inside a page, bytes: 100,000 triangles with a texture.
 const MOST_BYTES: usize = 4_600_000;
+/// Longest side of a base color in a page, and of a function of view-dependent color, which is smooth.
+const COLOR_PX: u32 = 2048;
+const LOBE_PX: u32 = 512;
+/// What marks a GLB as written by this program.
+const GENERATOR: &[u8] = b"\"generator\":\"tiface ";
 /// Number of triangles of a larger mesh's copy, which has colors at its vertices.
 const FEWER: usize = 100_000;
 
@@ -184,11 +188,10 @@ pub(super) fn viewer(line: &Line) -> Result<Option<(Viewer, Similarity)>> {
 /// Returns the head of a run whose mesh is done.
 fn shown(line: &Line, mesh: &Record) -> Result<(Viewer, Similarity)> {
     mesh.require_products(&line.run.path(Stage::Mesh))?;
-    let (file, export) = (line.run.path("mesh/head.glb"), Export::new(&line.capture, line.config));
+    let export = Export { texture_format: TextureFormat::Jpeg, ..Export::new(&line.capture, line.config) };
     let head = head_mesh(line)?;
     let as_glb = |head: &HeadMesh| Ok(export.files(head, MeshFormat::Glb, "head")?.files.swap_remove(0).1);
-    let bytes = if io::is_file(&file) { io::read_bytes(&file, &Limits::default())? } else { as_glb(&head)? };
-    let file_from_world = export.file_from_world(&head)?;
+    let file_from_world = export.frames(&head.mesh, &head.world_from_scene)?.file_from_world();
     let front = match export.frame {
         MeshFrame::Head => Vec3::Z,
         MeshFrame::Dataset => {
@@ -196,7 +199,7 @@ fn shown(line: &Line, mesh: &Record) -> Result<(Viewer, Similarity)> {
             file_from_world.direction(front)
         }
     };
-    let (glb, note) = small(&bytes, &file, || Ok(head), as_glb)?;
+    let (glb, note) = small(head, &line.run.path("mesh/parts"), as_glb)?;
     let name = line.capture.name.clone();
     let viewer = Viewer { name, note, front: front.to_array(), glb, cameras: Vec::new() };
     Ok((viewer, file_from_world))
@@ -246,44 +249,53 @@ pub fn head_page(line: &Line) -> Result<String> {
 /// Fails if the file cannot be read, or uses features that a page cannot show.
 pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
     let bytes = io::read_bytes(path, &Limits::default())?;
-    let warnings = RefCell::new(Vec::new());
-    let open = || {
-        let opened = open_mesh(path)?;
-        warnings.replace(opened.warnings);
-        Ok(opened.head)
-    };
+    let OpenedMesh { head, mut warnings, .. } = open_mesh(path)?;
     let as_glb = |head: &HeadMesh| {
-        let options =
-            ExportOptions { world_from_mesh: head.world_from_scene, up, ..ExportOptions::default() };
+        let options = ExportOptions {
+            world_from_mesh: head.world_from_scene,
+            up,
+            jpeg_quality: Some(92),
+            ..ExportOptions::default()
+        };
         to_glb(&head.mesh, head.texture.as_ref(), head.shells.as_ref(), &options)
     };
-    // unchanged, with every GLB feature, unless it must be turned
-    let is_glb = bytes.starts_with(b"glTF");
-    let glb = if is_glb && up == Vec3::Y { bytes } else { as_glb(&open()?)? };
-    if is_glb && up != Vec3::Y {
-        let what =
-            "turned by `--up`, it has lost its soft layers and what depends on the view, if there were any";
-        warnings.borrow_mut().push(what.into());
-    }
-    let (glb, note) = small(&glb, path, open, as_glb)?;
+    // a file of ours is shown unchanged, with soft layers and what depends on the view
+    let is_ours = bytes.starts_with(b"glTF") && bytes.windows(GENERATOR.len()).any(|w| w == GENERATOR);
+    let (glb, note) = if is_ours && up == Vec3::Y && bytes.len() <= MOST_BYTES {
+        (bytes, String::new())
+    } else {
+        if is_ours {
+            let why = if up == Vec3::Y { "too large to be shown as it is" } else { "turned by `--up`" };
+            warnings.push(format!(
+                "{why}, it has lost its soft layers and what depends on the view, if there were any"
+            ));
+        }
+        small(head, path, as_glb)?
+    };
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let html = viewer_html(&Viewer { name, note, front: [0.0, 0.0, 1.0], glb, cameras: Vec::new() }, &[])?;
-    Ok((html, warnings.into_inner()))
+    Ok((html, warnings))
 }
 
-/// Returns a copy for a page, and how it differs. If the file is too large, `head` returns the mesh and `as_glb`
-/// writes the copy.
+/// Returns a head as a GLB for a page, and how it differs: with smaller pictures, then without soft layers and what
+/// depends on the view, then with fewer triangles that are colored at their vertices. `path` is for messages only.
 fn small(
-    glb: &[u8],
+    mut head: HeadMesh,
     path: &Path,
-    head: impl FnOnce() -> Result<HeadMesh>,
     as_glb: impl Fn(&HeadMesh) -> Result<Vec<u8>>,
 ) -> Result<(Vec<u8>, String)> {
-    let copy = compact_glb(glb, path)?;
+    head.texture = head.texture.map(reduced);
+    let copy = as_glb(&head)?;
     if copy.len() <= MOST_BYTES {
         return Ok((copy, String::new()));
     }
-    let HeadMesh { mut mesh, texture, world_from_scene, .. } = head()?;
+    head.shells = None;
+    head.texture.iter_mut().for_each(|texture| texture.lobes = None);
+    let copy = as_glb(&head)?;
+    if copy.len() <= MOST_BYTES {
+        return Ok((copy, "A copy without soft layers and what depends on the view.".into()));
+    }
+    let HeadMesh { mut mesh, texture, world_from_scene, .. } = head;
     if let Some(HeadTexture { atlas, color, .. }) = &texture {
         mesh.colors = vec![[0.5; 3]; mesh.positions.len()];
         for (triangle, corners) in mesh.triangles.iter().zip(&atlas.triangles) {
@@ -297,12 +309,24 @@ fn small(
     simplify(&mut mesh, None, &SimplifyConfig { triangles: FEWER, ..SimplifyConfig::default() }, &Quiet)?;
     let after = mesh.triangles.len();
     let head = HeadMesh { mesh, world_from_scene, texture: None, harmonics: None, shells: None };
-    let copy = compact_glb(&as_glb(&head)?, path)?;
+    let copy = as_glb(&head)?;
     if copy.len() > MOST_BYTES {
         let hint = "simplify it first, and make its texture smaller";
         return Err(Error::cannot(format!("`{}` is too large for a page", path.display()), hint));
     }
     Ok((copy, format!("A copy of {after} of the {before} triangles, with colors at its vertices.")))
+}
+
+/// Returns a texture with smaller pictures, and without a normal map.
+fn reduced(texture: HeadTexture) -> HeadTexture {
+    let smaller = |photo: &Photo, side| reduce_photo(photo, working_size(photo.width, photo.height, side));
+    let color = smaller(&texture.color, COLOR_PX);
+    let lobes = texture.lobes.map(|lobes| Lobes {
+        pictures: lobes.pictures.iter().map(|picture| smaller(picture, LOBE_PX)).collect(),
+        ..lobes
+    });
+    let atlas = Atlas { width: color.width, height: color.height, ..texture.atlas };
+    HeadTexture { atlas, color, normal: None, lobes }
 }
 
 /// Returns the nearest texel, coded.

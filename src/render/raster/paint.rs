@@ -5,6 +5,7 @@ use super::super::raycast::RayHits;
 use super::project::{TILE, UNIT};
 use super::tile::{CENTER, GRID, NOTHING, SAMPLES, Tile};
 use crate::geom::{Camera, Hit, Mesh, ShellLayer};
+use bytemuck::Zeroable;
 use glam::{DVec3, Mat3, Vec2, Vec3};
 
 /// Number of samples that are intersected with their triangles at once.
@@ -169,17 +170,11 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
             let direction = Vec3::from(batch.direction.each_ref().map(|d| d[k]));
             let i = batch.pixel[k] as usize;
             let pixel = i / TILE * w + part.left + i % TILE;
-            let normal = || {
-                self.mesh.normal_at(&hit).unwrap_or_else(|| {
-                    let [a, b, c] = self.mesh.corners(triangle);
-                    (b - a).cross(c - a).normalize_or_zero()
-                })
-            };
             if batch.is_center[k] && sheet.layer.is_none() {
                 out.depth[pixel] = hit.t * direction.dot(self.forward) * self.scale;
                 out.triangles[pixel] = triangle;
                 if let Some(own) = out.normal.get_mut(pixel) {
-                    *own = (self.world_from_mesh * normal()).to_array();
+                    *own = (self.world_from_mesh * self.mesh.shading_normal(&hit)).to_array();
                 }
             }
             let share = match (light.get_mut(i), batch.samples[k]) {
@@ -200,9 +195,8 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                 continue;
             }
             if !self.bare {
-                let [a, b, c] = self.mesh.corners(triangle);
-                queue.hits.points.push((1.0 - hit.u - hit.v) * a + hit.u * b + hit.v * c);
-                queue.hits.normals.push(normal());
+                queue.hits.points.push(self.mesh.point_at(&hit));
+                queue.hits.normals.push(self.mesh.shading_normal(&hit));
             }
             queue.hits.directions.push(direction);
             queue.hits.hits.push(hit);
@@ -215,6 +209,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
 }
 
 /// Samples on the picture and the triangles to intersect at them.
+#[derive(Zeroable)]
 pub(super) struct Batch {
     count: usize,
     x: [f32; BATCH],
@@ -231,26 +226,6 @@ pub(super) struct Batch {
     u: [f32; BATCH],
     v: [f32; BATCH],
     t: [f32; BATCH],
-}
-
-impl Batch {
-    pub fn new() -> Box<Batch> {
-        let none = [0.0; BATCH];
-        Box::new(Batch {
-            count: 0,
-            x: none,
-            y: none,
-            pixel: [0; BATCH],
-            triangle: [0; BATCH],
-            samples: [0; BATCH],
-            is_center: [false; BATCH],
-            direction: [none; 3],
-            corners: [[none; 3]; 3],
-            u: none,
-            v: none,
-            t: none,
-        })
-    }
 }
 
 crate::dispatch! {

@@ -4,7 +4,7 @@ use super::case::{Cases, StabilityCase, worst};
 use glam::{DVec3, Vec3};
 use std::collections::BTreeMap;
 use tiface::Quiet;
-use tiface::geom::{Aabb, Mesh, topology};
+use tiface::geom::{Aabb, Mesh, SdfField, topology};
 use tiface::kernel::cpu::rng;
 use tiface::mesh::{ExtractOptions, SimplifyConfig, Volume, extract, marching, simplify};
 
@@ -66,6 +66,34 @@ fn volumes(cases: &mut Cases) {
 /// Cells along the box of an extraction.
 const CELLS: usize = 24;
 
+/// A field and its slope in a box around a center.
+struct Shape<F, S> {
+    center: DVec3,
+    half: f64,
+    field: F,
+    slope: S,
+}
+
+impl<F, S> SdfField for Shape<F, S>
+where
+    F: Fn(DVec3) -> f64 + Sync,
+    S: Fn(DVec3) -> DVec3 + Sync,
+{
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        let local = |p: &Vec3| (p.as_dvec3() - self.center) / self.half;
+        points.iter().map(|p| (self.half * (self.field)(local(p))) as f32).collect()
+    }
+
+    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        let local = |p: &Vec3| (p.as_dvec3() - self.center) / self.half;
+        (self.sdf(points), points.iter().map(|p| (self.slope)(local(p)).as_vec3()).collect())
+    }
+
+    fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        vec![[0.5; 3]; directions.len()]
+    }
+}
+
 /// The zero set of `field` in a box around `center`, of half edge `half`, coordinates f64. NaN in the place of the
 /// errors where it is refused.
 fn extracted(
@@ -74,15 +102,10 @@ fn extracted(
     field: impl Fn(DVec3) -> f64 + Sync,
     slope: impl Fn(DVec3) -> DVec3 + Sync,
 ) -> Option<Mesh> {
-    let local = |p: &Vec3| (p.as_dvec3() - center) / half;
-    let sdf = |points: &[Vec3]| points.iter().map(|p| (half * field(local(p))) as f32).collect::<Vec<f32>>();
-    let gradient =
-        |points: &[Vec3]| (sdf(points), points.iter().map(|p| slope(local(p)).as_vec3()).collect());
-    let color = |points: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; points.len()];
+    let shape = Shape { center, half, field, slope };
     let bounds = Aabb { min: (center - half).as_vec3(), max: (center + half).as_vec3() };
-    let options =
-        ExtractOptions { resolution: CELLS, coarse_step: 2, keep_share: 0.0, ..ExtractOptions::default() };
-    extract(sdf, gradient, color, bounds, None, &options, &Quiet).ok().map(|(mesh, _)| mesh)
+    let options = ExtractOptions { resolution: CELLS, coarse_step: 2, ..ExtractOptions::default() };
+    extract(&shape, bounds, &options, &Quiet).ok().map(|(mesh, _)| mesh)
 }
 
 /// The largest |`field`| over the vertices, in cells.

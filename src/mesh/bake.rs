@@ -4,7 +4,7 @@
 //! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
 //! they see in linear light (`light`), or those of them that look most directly. What the cameras see differently can be kept as a few lobes a texel
 //! (see below), and the field's normal as a picture of normals
-//! ([`tangent_space`]). Gaps are filled by `fill`; color and lobes are then made to agree along seams by [`Seams`].
+//! ([`tangent_space`]). Gaps are filled; color and lobes are then made to agree along seams by [`Seams`].
 //!
 //! The picture is baked in bands of rows, so that samples never lie in memory together: twelve bytes a texel for
 //! color, normals and each lobe are what it takes.
@@ -32,22 +32,21 @@
 //! tangent along u and `b = w · m × t` its bitangent up the picture (MikkTSpace, Mikkelsen 2008; OpenGL's +Y).
 
 mod cover;
-mod fill;
 mod light;
 mod seams;
 
-pub use light::{Learned, seen_colors};
+pub use light::seen_colors;
 pub use seams::Seams;
 
 use crate::geom::sphharm::functions;
-use crate::geom::{Atlas, Bvh, Camera, Harmonics, Mesh, area_vector};
+use crate::geom::{Atlas, Bvh, Camera, Harmonics, Mesh, SdfField, area_vector};
 use crate::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
 use crate::mesh::input::setting;
 use crate::{Monitor, Result};
 use cover::{Bands, ROWS, Sample};
-use fill::fill;
 use glam::{Mat3, Vec3, Vec4};
 use light::{SurfacePoints, Visibility, settle, shade};
+use seams::fill;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -110,7 +109,7 @@ const BATCH: usize = 1 << 17;
 /// ```
 /// use glam::{Mat3, Vec3};
 /// use tiface::geom::Mesh;
-/// use tiface::mesh::bake::{BakeConfig, Learned, bake};
+/// use tiface::mesh::bake::{BakeConfig, bake};
 /// use tiface::mesh::{AtlasConfig, atlas};
 ///
 /// let mesh = Mesh {
@@ -123,12 +122,10 @@ const BATCH: usize = 1 << 17;
 /// };
 /// let (atlas, _) = atlas(&mesh, &AtlasConfig { size_px: 64, gutter_px: 2, ..AtlasConfig::default() }, &tiface::Quiet)?;
 /// // a ball that shows sRGB-coded 0.5 from everywhere
-/// let gradient = |points: &[Vec3]| points.iter().map(|p| (p.length() - 1.0, p.normalize_or_zero())).unzip();
-/// let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]| vec![[0.5; 3]; directions.len()];
-/// let learned = Learned { gradient: &gradient, colors: &colors };
+/// let ball = |p: Vec3| p.length() - 1.0;
 /// let config =
 ///     BakeConfig { side: 2, gutter_px: 2, reach: 0.5, views: 8, lobes: 0, normals: false, turned: Mat3::IDENTITY };
-/// let baked = bake(&mesh, &atlas, &learned, &[], &config, &tiface::Quiet)?;
+/// let baked = bake(&mesh, &atlas, &ball, &[], &config, &tiface::Quiet)?;
 /// assert!(baked.color.data.iter().all(|v| (v - 0.2140).abs() < 1e-3)); // linear
 /// # Ok::<(), tiface::Error>(())
 /// ```
@@ -139,7 +136,7 @@ const BATCH: usize = 1 << 17;
 pub fn bake(
     mesh: &Mesh,
     atlas: &Atlas,
-    learned: &Learned,
+    field: &dyn SdfField,
     cameras: &[Camera],
     config: &BakeConfig,
     monitor: &dyn Monitor,
@@ -161,7 +158,7 @@ pub fn bake(
         for own in whole_texels(&all) {
             monitor.check_stop()?;
             let flat = on_triangles(mesh, own);
-            let points = settle(&flat, config.reach, learned);
+            let points = settle(&flat, config.reach, field);
             let seen = eyes.directions(&points, &flat);
             samples += own.len();
             for (_, &count) in seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known) {
@@ -170,7 +167,7 @@ pub fn bake(
             }
             let ways = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
             moved += ways.sum::<f64>();
-            let shades = shade(&points, seen, learned, count, config.turned);
+            let shades = shade(&points, seen, field, count, config.turned);
             let mut i = 0;
             for texel in own.chunk_by(|a, b| a.texel == b.texel) {
                 let at = texel[0].texel as usize;
@@ -203,11 +200,11 @@ pub fn bake(
         monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", samples as f64)]);
     }
     let seams = Seams::new(mesh, atlas);
-    fill::fill(&mut color, &covered, config.gutter_px);
+    fill(&mut color, &covered, config.gutter_px);
     seams.even(&mut color, srgb_from_linear, linear_from_srgb);
     lobes.iter_mut().for_each(|l| complete(l, &covered, config.gutter_px, &seams));
     if let Some(normal) = &mut normal {
-        fill::fill(normal, &covered, config.gutter_px);
+        fill(normal, &covered, config.gutter_px);
     }
     let share = |a: f64, b: usize| if b > 0 { a / b as f64 } else { 0.0 };
     let report = BakeReport {
@@ -225,7 +222,7 @@ pub fn bake(
 /// Fills a picture of 3 channels between its charts, of which the `known` texels lie in one, and makes it agree along
 /// seams.
 pub fn complete(image: &mut Image, known: &[bool], gutter_px: u32, seams: &Seams) {
-    fill::fill(image, known, gutter_px);
+    fill(image, known, gutter_px);
     seams.even(image, |v| v, |v| v);
 }
 
@@ -237,15 +234,11 @@ pub fn bake_harmonics(mesh: &Mesh, atlas: &Atlas, harmonics: &Harmonics, gutter_
     let bands = Bands::new(atlas, ROWS);
     for sample in (0..bands.len()).flat_map(|band| bands.samples(atlas, band, 1)) {
         let at = sample.texel as usize;
-        let weights = [1.0 - sample.u - sample.v, sample.u, sample.v];
         known[at] = true;
         for (k, picture) in pictures.iter_mut().enumerate() {
-            let mut sum = [0f32; 3];
-            for (&vertex, w) in mesh.triangles[sample.triangle as usize].iter().zip(weights) {
-                let own = harmonics.coefficients[vertex as usize * count + k];
-                (0..3).for_each(|c| sum[c] += w * own[c]);
-            }
-            picture.data[3 * at..3 * at + 3].copy_from_slice(&sum);
+            let own = |vertex: u32| Vec3::from(harmonics.coefficients[vertex as usize * count + k]);
+            let sum = sample.hit().mix(mesh.triangles[sample.triangle as usize].map(own));
+            picture.data[3 * at..3 * at + 3].copy_from_slice(&sum.to_array());
         }
     }
     let seams = Seams::new(mesh, atlas);
@@ -274,14 +267,10 @@ fn whole_texels(samples: &[Sample]) -> impl Iterator<Item = &[Sample]> {
 
 /// Positions and interpolated normals of samples.
 fn on_triangles(mesh: &Mesh, samples: &[Sample]) -> SurfacePoints {
-    let mix = |values: &[Vec3], s: &Sample| {
-        let [a, b, c] = mesh.triangles[s.triangle as usize].map(|i| values[i as usize]);
-        (1.0 - s.u - s.v) * a + s.u * b + s.v * c
-    };
     let face = |s: &Sample| area_vector(mesh.corners(s.triangle)).normalize_or(Vec3::Z);
-    let normal = |s: &Sample| mix(&mesh.normals, s).normalize_or(face(s));
+    let normal = |s: &Sample| mesh.normal_at(&s.hit()).unwrap_or_else(|| face(s));
     SurfacePoints {
-        positions: samples.iter().map(|s| mix(&mesh.positions, s)).collect(),
+        positions: samples.iter().map(|s| mesh.point_at(&s.hit())).collect(),
         normals: samples.iter().map(normal).collect(),
     }
 }
@@ -303,11 +292,9 @@ pub fn tangent_space(
     for band in 0..bands.len() {
         for group in bands.samples(atlas, band, 1).chunk_by(|a, b| a.texel == b.texel) {
             let s = group[0];
-            let corners = mesh.triangles[s.triangle as usize].map(|i| mesh.normals[i as usize]);
-            let weights = [1.0 - s.u - s.v, s.u, s.v];
-            let m: Vec3 = (0..3).map(|k| weights[k] * corners[k]).sum::<Vec3>().normalize_or(Vec3::Z);
+            let m = mesh.normal_at(&s.hit()).unwrap_or(Vec3::Z);
             let tangent = tangents[s.triangle as usize];
-            let t: Vec3 = (0..3).map(|k| weights[k] * tangent[k].truncate()).sum();
+            let t = s.hit().mix(tangent.map(Vec4::truncate));
             // as a renderer does: tangent perpendicular to the normal, bitangent from both
             let t = (t - m * m.dot(t)).normalize_or(m.any_orthonormal_vector());
             let b = tangent[0].w * m.cross(t);
@@ -333,6 +320,7 @@ pub fn tangent_space(
 mod tests {
     use super::*;
     use crate::Quiet;
+    use crate::geom::Painted;
     use glam::Vec2;
 
     /// A latitude-longitude sphere of radius 0.5 (coarse), with a seam.
@@ -363,8 +351,8 @@ mod tests {
         (mesh, atlas)
     }
 
-    fn gradient(p: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
-        p.iter().map(|p| (p.length() - 0.5, p.normalize_or_zero())).unzip()
+    fn sphere_sdf(p: Vec3) -> f32 {
+        p.length() - 0.5
     }
 
     fn ring() -> Vec<Camera> {
@@ -397,7 +385,7 @@ mod tests {
         let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {
             p.iter().zip(counts).flat_map(|(p, &n)| std::iter::repeat_n(paint(*p), n as usize)).collect()
         };
-        let learned = Learned { gradient: &gradient, colors: &colors };
+        let learned = Painted { shape: sphere_sdf, paint: colors };
         let config = BakeConfig { normals: true, ..config() };
         let baked = bake(&mesh, &atlas, &learned, &ring(), &config, &Quiet).unwrap();
         assert!(baked.report.covered > 0.9 && baked.report.seen > 0.7, "{:?}", baked.report);
@@ -430,7 +418,7 @@ mod tests {
             let paint = |p: &Vec3| if (20.0 * p.y).rem_euclid(2.0) < 1.0 { [0.1; 3] } else { [0.9; 3] };
             p.iter().zip(counts).flat_map(|(p, &n)| std::iter::repeat_n(paint(p), n as usize)).collect()
         };
-        let learned = Learned { gradient: &gradient, colors: &colors };
+        let learned = Painted { shape: sphere_sdf, paint: colors };
         let baked = bake(&mesh, &atlas, &learned, &ring(), &config(), &Quiet).unwrap();
         let rgb = baked.color.data.as_chunks::<3>().0.iter();
         let rgb = rgb.map(|c| c.map(|v| crate::image::quantize(srgb_from_linear(v)))).collect();
@@ -451,7 +439,7 @@ mod tests {
         let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], away: &[Vec3]| -> Vec<[f32; 3]> {
             away.iter().map(|d| [0.5 - 0.2 * d.x, 0.5, 0.5]).collect()
         };
-        let learned = Learned { gradient: &gradient, colors: &colors };
+        let learned = Painted { shape: sphere_sdf, paint: colors };
         let config = BakeConfig { lobes: 1, ..config() };
         let baked = bake(&mesh, &atlas, &learned, &ring(), &config, &Quiet).unwrap();
         assert_eq!(baked.lobes.len(), 4);
@@ -481,7 +469,7 @@ mod tests {
         let colors = |p: &[Vec3], _: &[Vec3], counts: &[u32], _: &[Vec3]| -> Vec<[f32; 3]> {
             p.iter().zip(counts).flat_map(|(p, &n)| vec![(0.5 + 0.8 * *p).to_array(); n as usize]).collect()
         };
-        let learned = Learned { gradient: &gradient, colors: &colors };
+        let learned = Painted { shape: sphere_sdf, paint: colors };
         let mut turned = atlas.clone();
         turned.uvs.iter_mut().for_each(|uv| uv.x = 1.0 - uv.x);
         let [plain, mirrored] =
@@ -510,7 +498,7 @@ mod tests {
             assert!(counts.iter().all(|&c| c == 1));
             n.iter().zip(away).map(|(n, d)| [n.dot(-*d), 0.0, 0.0]).collect()
         };
-        let learned = Learned { gradient: &gradient, colors: &colors };
+        let learned = Painted { shape: sphere_sdf, paint: colors };
         for (width, height) in [(8, 4), (1, 1)] {
             let atlas = Atlas { width, height, ..atlas.clone() };
             let baked = bake(&mesh, &atlas, &learned, &[], &config(), &Quiet).unwrap();

@@ -13,7 +13,6 @@
 
 mod chart;
 mod divide;
-mod face;
 mod flatten;
 mod pack;
 
@@ -22,8 +21,7 @@ use crate::mesh::files::{UvReport, seams_facing, uv_check};
 use crate::mesh::input::{check_indices, setting};
 use crate::{Error, Monitor, Result};
 use chart::{Flat, height, neighbours, part, upright};
-use divide::{divide, planar};
-use face::divide_around;
+use divide::{divide, divide_around, planar};
 use flatten::ChartSet;
 use glam::{DVec2, Vec2, Vec3};
 use pack::{ChartPose, half_squares, pack};

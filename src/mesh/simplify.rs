@@ -2,7 +2,7 @@
 //!
 //! Garland, Heckbert 1997 with the memoryless quadrics of Lindstrom, Turk 1998; see `rings`. Every
 //! collapse keeps the link condition, turns no triangle by more than 60° and leaves none thinner than
-//! the thinnest it found (`collapse`), so a closed manifold stays one, of the same genus.
+//! the thinnest it found, so a closed manifold stays one, of the same genus.
 //!
 //! The field is a network: thousands of points a call are cheap, single ones are not. So it is evaluated
 //! between rounds of collapses: at the vertices and in the middles of triangles, in one batch each (`rounds`).
@@ -16,37 +16,27 @@
 //! (`cargo bench --bench simplify`).
 //!
 //! Self-intersections are looked for once, at the end, which costs a tenth of the collapses. If there
-//! are any the work begins anew, and collapses near them look for crossings one by one (`crossing`); the
-//! last attempt looks everywhere, at seven times the cost. So none is made, and those of the input do not
-//! become more.
+//! are any the work begins anew, and every collapse looks for crossings (`crossing`), at seven times the cost. So none is
+//! made, and those of the input do not become more.
 
-mod collapse;
 mod crossing;
 mod rings;
 mod rounds;
 
-use crate::geom::Mesh;
-use crate::mesh::input::{Field, check_count, check_indices, finite, setting};
+use crate::geom::{Mesh, SdfField};
+use crate::mesh::input::{check_count, check_indices, finite, setting};
 use crate::{Monitor, Result};
 use crossing::crossings;
-use glam::Vec3;
-use rounds::{CrossingSearch, Task, bounded, counted};
+use rounds::{Task, bounded, counted};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-
-/// Attempts: one without checking, two that check near the crossings found, one that checks everywhere.
-const ATTEMPTS: usize = 4;
-
-/// With more crossings than this, finding the vertices near them costs more than checking everywhere.
-const MANY: usize = 1000;
 
 /// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colors
 /// follow their vertices. A mesh that has no more triangles than `config.triangles` stays as it is.
 ///
-/// `field` returns values (negative inside) and gradients, at most `config.batch` points a call, from one
-/// thread. With it, vertices end as `config.placement` says and normals are its gradient; without it, or
-/// where the gradient is shorter than 1e-6, normals are angle-weighted. Without it the `error` is kept
-/// by adding up how far each collapse strays from the planes before it, which is cautious.
+/// With a field, vertices end where the triangles lie nearest to its zero set (with an `error` to keep: on it) and normals
+/// are its gradient; without it, or where the gradient is shorter than 1e-6, normals are angle-weighted. Without it the
+/// `error` is kept by adding up how far each collapse strays from the planes before it, which is cautious.
 ///
 /// Topology never changes; borders stay borders. Vertices of edges with more than two triangles, or of
 /// several fans, are not touched. The same bytes for any number of threads.
@@ -73,7 +63,7 @@ const MANY: usize = 1000;
 /// the wrong number of values, a request to stop. The mesh is then as it was.
 pub fn simplify(
     mesh: &mut Mesh,
-    field: Option<&Field>,
+    field: Option<&dyn SdfField>,
     config: &SimplifyConfig,
     monitor: &dyn Monitor,
 ) -> Result<SimplifyReport> {
@@ -89,36 +79,21 @@ pub fn simplify(
         return Ok(report);
     }
 
-    let mut near: Vec<(Vec3, f32)> = Vec::new();
-    let mut found_before = None;
     let mut out = Mesh::default();
-    for attempt in 0..ATTEMPTS {
-        let look = match attempt {
-            0 => CrossingSearch::Nowhere,
-            i if i + 1 == ATTEMPTS || near.len() > MANY => CrossingSearch::Everywhere,
-            _ => CrossingSearch::Near(&near),
-        };
-        report = SimplifyReport { before, again: attempt, asked: report.asked, ..SimplifyReport::default() };
-        let task = Task { field, config, look, monitor };
+    // the second attempt looks for crossings at every collapse
+    for apart in [false, true] {
+        let again = usize::from(apart);
+        report = SimplifyReport { before, again, asked: report.asked, ..SimplifyReport::default() };
+        let task = Task { field, config, apart, monitor };
         out = if config.error > 0.0 {
             bounded(mesh, &task, &mut report)?
         } else {
             counted(mesh, &task, &mut report)?
         };
-        let found = crossings(&out.positions, &out.triangles);
-        report.self_intersections = found.len();
-        if found.is_empty() {
+        report.self_intersections = crossings(&out.positions, &out.triangles).len();
+        let most = || crossings(&mesh.positions, &mesh.triangles).len();
+        if report.self_intersections == 0 || report.self_intersections <= most() {
             break;
-        }
-        let before = *found_before.get_or_insert_with(|| crossings(&mesh.positions, &mesh.triangles).len());
-        if found.len() <= before {
-            break;
-        }
-        for &t in &found {
-            let corners = out.corners(t);
-            let middle = (corners[0] + corners[1] + corners[2]) / 3.0;
-            let reach = corners.iter().map(|c| c.distance(middle)).fold(0.0, f32::max);
-            near.push((middle, 3.0 * (attempt + 1) as f32 * reach));
         }
     }
     if field.is_none() && !mesh.normals.is_empty() {
@@ -130,16 +105,6 @@ pub fn simplify(
     Ok(report)
 }
 
-/// Final placement of vertices, if a field is given.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum VertexPlacement {
-    /// On the field's zero. Between them the triangles are chords.
-    OnSurface,
-    /// At the least-squares zero of their triangles.
-    #[default]
-    Nearest,
-}
-
 /// Options of simplification.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimplifyConfig {
@@ -147,20 +112,11 @@ pub struct SimplifyConfig {
     pub triangles: usize,
     /// Most distance from the surface, in units of the positions; 0 goes as far as `triangles` says.
     pub error: f32,
-    /// Final placement of vertices; with an `error` always on the zero.
-    pub placement: VertexPlacement,
-    /// Most points in one call of the field; at least 1.
-    pub batch: usize,
 }
 
 impl Default for SimplifyConfig {
     fn default() -> SimplifyConfig {
-        SimplifyConfig {
-            triangles: 200_000,
-            error: 0.0,
-            placement: VertexPlacement::default(),
-            batch: 1 << 16,
-        }
+        SimplifyConfig { triangles: 200_000, error: 0.0 }
     }
 }
 
@@ -177,8 +133,7 @@ impl SimplifyConfig {
             "SimplifyConfig::triangles",
             "at least 1, or an `error`",
             0,
-        )?;
-        setting(self.batch > 0, "SimplifyConfig::batch", "at least 1", 0)
+        )
     }
 }
 

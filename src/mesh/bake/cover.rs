@@ -4,7 +4,7 @@
 //! without meeting any point still belongs to it (conservative rasterization): its one sample is the
 //! triangle's point nearest to the texel's centre. Triangles thinner than a texel are never lost.
 
-use crate::geom::Atlas;
+use crate::geom::{Atlas, Hit};
 use glam::Vec2;
 use std::ops::Range;
 
@@ -22,6 +22,13 @@ pub struct Sample {
     pub u: f32,
     /// Weight of the third vertex.
     pub v: f32,
+}
+
+impl Sample {
+    /// Returns the point of the triangle.
+    pub fn hit(&self) -> Hit {
+        Hit { t: 0.0, triangle: self.triangle, u: self.u, v: self.v }
+    }
 }
 
 /// Triangles sorted into bands of rows, so that a picture is covered piece by piece in bounded memory.

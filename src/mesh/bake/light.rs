@@ -1,22 +1,13 @@
 //! Colors of surface points: their exact positions, the cameras that see them, and the field's colors.
 
 use crate::geom::sphharm::{MOST_OF_DEGREE_2 as MOST, sh16};
-use crate::geom::{Bvh, Camera, Mesh, Ray};
+use crate::geom::{Bvh, Camera, Mesh, Ray, SdfField};
 use crate::image::{linear_from_srgb, srgb_from_linear};
 use glam::Vec3;
 use rayon::prelude::*;
 
 /// Cosine of the steepest angle at which a camera still tells the color of a point: 75 degrees.
 const STEEPEST: f32 = 0.258_819;
-
-/// The learned field in the mesh's coordinates.
-pub struct Learned<'a> {
-    /// Signed distance and its gradient. `[n, 3]` → `[n]`, `[n, 3]`.
-    pub gradient: &'a (dyn Fn(&[Vec3]) -> (Vec<f32>, Vec<Vec3>) + Sync),
-    /// sRGB-coded colors of points `[n, 3]` with unit normals `[n, 3]`, point `i` seen along `counts[i]` unit
-    /// directions away from the camera, all in one list: one color a direction.
-    pub colors: &'a (dyn Fn(&[Vec3], &[Vec3], &[u32], &[Vec3]) -> Vec<[f32; 3]> + Sync),
-}
 
 /// Points of the surface with their unit normals.
 pub struct SurfacePoints {
@@ -29,13 +20,13 @@ pub struct SurfacePoints {
 /// Moves points of the flat triangles onto the field's zero along their interpolated normals, at most `reach`
 /// far, and gives them the field's normals. A point from where the field's zero is not met stays as it is, with
 /// its interpolated normal.
-pub fn settle(flat: &SurfacePoints, reach: f32, learned: &Learned) -> SurfacePoints {
+pub fn settle(flat: &SurfacePoints, reach: f32, field: &dyn SdfField) -> SurfacePoints {
     let n = flat.positions.len();
     let mut offset = vec![0f32; n];
     let mut start = vec![f32::INFINITY; n];
     let mut points = SurfacePoints { positions: flat.positions.clone(), normals: flat.normals.clone() };
     for step in 0..3 {
-        let (values, gradients) = (learned.gradient)(&points.positions);
+        let (values, gradients) = field.sdf_gradient(&points.positions);
         for i in 0..n {
             let (Some(&f), Some(&g)) = (values.get(i), gradients.get(i)) else { continue };
             let slope = g.dot(flat.normals[i]);
@@ -182,13 +173,13 @@ pub struct Shades {
 pub fn shade(
     points: &SurfacePoints,
     seen: ViewDirections,
-    learned: &Learned,
+    field: &dyn SdfField,
     functions: usize,
     turned: glam::Mat3,
 ) -> Shades {
     let n = points.positions.len();
     let away: Vec<Vec3> = seen.directions.iter().map(|d| -*d).collect();
-    let colors = (learned.colors)(&points.positions, &points.normals, &seen.counts, &away);
+    let colors = field.colors(&points.positions, &points.normals, &seen.counts, &away);
     let mut first = Vec::with_capacity(n + 1);
     first.push(0usize);
     seen.counts.iter().for_each(|&c| first.push(first[first.len() - 1] + c as usize));
@@ -227,7 +218,7 @@ pub fn seen_colors(
     mesh: &Mesh,
     positions: &[Vec3],
     normals: &[Vec3],
-    learned: &Learned,
+    field: &dyn SdfField,
     cameras: &[Camera],
     reach: f32,
 ) -> Vec<[f32; 3]> {
@@ -235,7 +226,7 @@ pub fn seen_colors(
     let bvh = Bvh::new(mesh);
     let seen = Visibility { cameras, bvh: &bvh, clearance: 0.5 * reach, most: usize::MAX }
         .directions(&points, &points);
-    let shades = shade(&points, seen, learned, 0, glam::Mat3::IDENTITY);
+    let shades = shade(&points, seen, field, 0, glam::Mat3::IDENTITY);
     shades.linear.into_iter().map(|c| c.map(srgb_from_linear)).collect()
 }
 
@@ -306,11 +297,12 @@ fn fit_lobes(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geom::Painted;
     use crate::geom::sphharm::{combine, functions};
     use crate::kernel::cpu::rng;
 
-    fn sphere_gradient(p: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
-        p.iter().map(|p| (p.length() - 0.5, p.normalize_or_zero())).unzip()
+    fn sphere(p: Vec3) -> f32 {
+        p.length() - 0.5
     }
 
     fn flat(points: &[Vec3]) -> SurfacePoints {
@@ -320,10 +312,8 @@ mod tests {
 
     #[test]
     fn points_move_onto_the_sphere_unless_it_is_out_of_reach() {
-        let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], d: &[Vec3]| vec![[0.0; 3]; d.len()];
-        let learned = Learned { gradient: &sphere_gradient, colors: &colors };
         let start = flat(&[Vec3::new(0.0, 0.0, 0.51), Vec3::new(0.0, 0.485, 0.0), Vec3::new(0.3, 0.0, 0.0)]);
-        let moved = settle(&start, 0.02, &learned);
+        let moved = settle(&start, 0.02, &sphere);
         assert!(moved.positions[0].distance(Vec3::Z * 0.5) < 1e-6);
         assert!(moved.positions[1].distance(Vec3::Y * 0.5) < 1e-6);
         // 0.2 deep, as a cap is: stays
@@ -355,7 +345,7 @@ mod tests {
             assert_eq!(d.len(), p.len());
             p.iter().zip(d).map(|(p, d)| [0.0, -d.z, f32::from(p.x > 0.0)]).collect()
         };
-        let learned = Learned { gradient: &sphere_gradient, colors: &colors };
+        let learned = Painted { shape: sphere, paint: colors };
         let [first] = seen_colors(&hiding, &[at(0.5, Vec3::Z).0], &[Vec3::Z], &learned, &cameras, 2e-3)[..]
         else {
             panic!("one color a point")
@@ -375,7 +365,7 @@ mod tests {
         let colors = |_: &[Vec3], _: &[Vec3], _: &[u32], d: &[Vec3]| {
             d.iter().map(|d| [f32::from(d.x < 0.0), 0.5, 0.0]).collect::<Vec<_>>()
         };
-        let learned = Learned { gradient: &sphere_gradient, colors: &colors };
+        let learned = Painted { shape: sphere, paint: colors };
         let points = SurfacePoints { positions: vec![Vec3::Z; 2], normals: vec![Vec3::Z; 2] };
         let side = |x: f32| Vec3::new(x, 0.0, 1.0).normalize();
         let directions = vec![side(1.0), side(-1.0), side(1.0)];

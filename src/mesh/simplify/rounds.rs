@@ -30,13 +30,13 @@
 //! in, first out, which also visits neighbours in memory one after another. Outdated entries stay
 //! where they are: the caller recognises them by `stamp`.
 
-use super::collapse::{EdgeLink, POOR, TURN, place};
 use super::crossing::{Sheets, crossings};
-use super::rings::{BORDER, CROWDED, HELD, Rings};
-use super::{SimplifyConfig, SimplifyReport, VertexPlacement};
-use crate::geom::{Aabb, Mesh, area_vector, shape};
+use super::rings::{BORDER, EdgeLink, HELD, POOR, Rings, TURN, place};
+use super::{SimplifyConfig, SimplifyReport};
+use crate::geom::{Aabb, Mesh, SdfField, area_vector, shape};
 use crate::kernel::cpu::cg::conjugate_gradients;
-use crate::mesh::input::{Field, evaluate};
+use crate::mesh::extract::BATCH;
+use crate::mesh::input::evaluate;
 use crate::mesh::moves::{move_vertices, newton};
 use crate::{Monitor, Result};
 use glam::Vec3;
@@ -52,46 +52,23 @@ const OFFERS: usize = 3;
 /// Asking whether to stop costs nothing this often.
 const BREATH: usize = 1 << 12;
 
-/// Which collapses are tested for crossings.
-#[derive(Clone, Copy)]
-pub(super) enum CrossingSearch<'a> {
-    Nowhere,
-    /// Around these points, within these distances.
-    Near(&'a [(Vec3, f32)]),
-    Everywhere,
-}
-
-impl CrossingSearch<'_> {
-    /// Returns whether a collapse here is to be tested.
-    fn at(&self, p: Vec3) -> bool {
-        match self {
-            CrossingSearch::Nowhere => false,
-            CrossingSearch::Near(balls) => balls.iter().any(|(c, r)| p.distance_squared(*c) <= r * r),
-            CrossingSearch::Everywhere => true,
-        }
-    }
-
-    fn is_nowhere(&self) -> bool {
-        matches!(self, CrossingSearch::Nowhere)
-    }
-}
-
 /// The data shared by all rounds.
 #[derive(Clone, Copy)]
 pub(super) struct Task<'a> {
-    pub field: Option<&'a Field<'a>>,
+    pub field: Option<&'a dyn SdfField>,
     pub config: &'a SimplifyConfig,
-    pub look: CrossingSearch<'a>,
+    /// Whether collapses are tested for crossings.
+    pub apart: bool,
     pub monitor: &'a dyn Monitor,
 }
 
 /// Collapses down to the number of triangles asked for, then takes the vertices to the field.
 pub(super) fn counted(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh> {
-    let mut rings = prepare(mesh, task, report);
+    let mut rings = prepare(mesh, report);
     reduce(&mut rings, task, task.config.triangles, None, report)?;
     let (mut out, fixed) = rings.into_mesh();
     if let Some(field) = task.field {
-        settle(&mut out, &fixed, field, task, task.config.placement, report)?;
+        settle(&mut out, &fixed, field, task, VertexPlacement::Nearest, report)?;
     }
     let values = [("triangles", out.triangles.len() as f64), ("refused", report.refused as f64)];
     task.monitor.step(1, 1, &values);
@@ -99,15 +76,10 @@ pub(super) fn counted(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
 }
 
 /// Returns a mesh ready for collapses.
-fn prepare(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Rings {
-    let mut rings = Rings::new(mesh);
+fn prepare(mesh: &Mesh, report: &mut SimplifyReport) -> Rings {
+    let rings = Rings::new(mesh);
     report.degenerate += mesh.triangles.len() - rings.triangles.len();
     report.held = rings.flags.iter().filter(|&&f| f & HELD != 0).count();
-    if !task.look.is_nowhere() {
-        for (flags, &p) in rings.flags.iter_mut().zip(&rings.positions) {
-            *flags |= if task.look.at(p) { CROWDED } else { 0 };
-        }
-    }
     rings
 }
 
@@ -121,7 +93,7 @@ pub(super) fn reduce(
     report: &mut SimplifyReport,
 ) -> Result<()> {
     let mut star = EdgeLink::new(rings.positions.len());
-    let mut sheets = (!task.look.is_nowhere()).then(|| Sheets::new(rings));
+    let mut sheets = task.apart.then(|| Sheets::new(rings));
     let mut breath = 0;
     let mut offers: Vec<(u32, u32)> = Vec::new();
     // A refused collapse may become possible when its surroundings change, so repeat until none is.
@@ -156,12 +128,11 @@ pub(super) fn reduce(
                 budgets[a as usize] = left;
             }
             if let Some(sheets) = &mut sheets {
-                let crowded = (rings.flags[a as usize] | rings.flags[b as usize]) & CROWDED != 0;
                 let made = star.sides.iter().map(|s| {
                     let [p, q] = [s.from, s.to].map(|v| rings.positions[v as usize]);
                     ([a, s.from, s.to], [x, p, q])
                 });
-                if crowded && sheets.would_cross(rings, star.triangles(), made) {
+                if sheets.would_cross(rings, star.triangles(), made) {
                     report.crossing += 1;
                     continue;
                 }
@@ -212,25 +183,33 @@ fn fill(rings: &Rings) -> EdgeQueue {
     queue
 }
 
+/// Where vertices go.
+#[derive(Clone, Copy)]
+enum VertexPlacement {
+    /// On the field's zero. Between them the triangles are chords.
+    OnSurface,
+    /// At the least-squares zero of their triangles.
+    Nearest,
+}
+
 /// Takes the vertices that are not `fixed` to the field, and their normals from it.
 fn settle(
     mesh: &mut Mesh,
     fixed: &[bool],
-    field: &Field,
+    field: &dyn SdfField,
     task: &Task,
     placement: VertexPlacement,
     report: &mut SimplifyReport,
 ) -> Result<()> {
     let reaches = reaches(&mesh.positions, &mesh.triangles);
     let start = mesh.positions.clone();
-    let batch = task.config.batch;
     let mut gradients = Vec::new();
     let steps = match placement {
         VertexPlacement::OnSurface => 2,
         VertexPlacement::Nearest => 1,
     };
     for _ in 0..steps {
-        let (values, slopes) = evaluate(field, &mesh.positions, batch, task.monitor)?;
+        let (values, slopes) = evaluate(field, &mesh.positions, BATCH, task.monitor)?;
         report.asked += values.len();
         let targets: Vec<Vec3> = match placement {
             VertexPlacement::OnSurface => (0..values.len())
@@ -241,7 +220,7 @@ fn settle(
                 .collect(),
             VertexPlacement::Nearest => {
                 let points = middles(&mesh.positions, &mesh.triangles);
-                let (f, g) = evaluate(field, &points, batch, task.monitor)?;
+                let (f, g) = evaluate(field, &points, BATCH, task.monitor)?;
                 report.asked += f.len();
                 let signed = |f: &[f32], g: &[Vec3]| -> Vec<f32> {
                     let d = |(&f, &g): (&f32, &Vec3)| newton(f, g).map_or(0.0, |s| s.length().copysign(f));
@@ -262,7 +241,7 @@ fn settle(
         report.held_back += move_to(&mut mesh.positions, &mesh.triangles, &targets);
         gradients = slopes;
     }
-    if !task.look.is_nowhere() {
+    if task.apart {
         report.held_back += without_crossings(&mut mesh.positions, &mesh.triangles, &start);
     }
     mesh.normals = mesh.angle_weighted_normals();
@@ -313,7 +292,7 @@ const LITTLE: f64 = 0.03;
 pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh> {
     let (error, target) = (task.config.error, task.config.triangles.max(1));
     let Some(field) = task.field else {
-        let mut rings = prepare(mesh, task, report);
+        let mut rings = prepare(mesh, report);
         let mut budgets = vec![error; rings.positions.len()];
         reduce(&mut rings, task, target, Some(&mut budgets), report)?;
         return Ok(rings.into_mesh().0);
@@ -324,7 +303,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
     let (mut part, mut undone) = (1.0, 0);
     for round in 0..ROUNDS {
         let before = good.triangles.len();
-        let mut rings = prepare(&good, task, report);
+        let mut rings = prepare(&good, report);
         let mut budgets: Vec<f32> = at.iter().map(|e| part * (error - e)).collect();
         let goal = target.max((SHARE * before as f64) as usize);
         reduce(&mut rings, task, goal, Some(&mut budgets), report)?;
@@ -388,7 +367,7 @@ fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<
             }
         }
     }
-    let (f, g) = evaluate(field, &points, task.config.batch, task.monitor)?;
+    let (f, g) = evaluate(field, &points, BATCH, task.monitor)?;
     report.asked += f.len();
     for (i, whom) in whom.iter().enumerate() {
         let d = newton(f[i], g[i]).map_or(0.0, Vec3::length);

@@ -1,7 +1,6 @@
 //! The normal equations of a fit, never formed, solved by conjugate gradients.
 
-use super::nodes::Nodes;
-use super::rows::{Matrix, Rows};
+use super::rows::{Matrix, Nodes, Rows};
 use crate::geom::sphharm::{MOST_OF_DEGREE_2, sh16};
 use crate::kernel::cpu::cg::{conjugate_gradients, dot};
 use rayon::prelude::*;
@@ -42,7 +41,7 @@ pub type Functions = [f32; MOST_OF_DEGREE_2];
 impl System<'_> {
     /// Returns the values of the functions in the direction of a row.
     pub fn functions(&self, row: usize) -> Functions {
-        let y = sh16(self.rows.directions[row].to_array());
+        let y = sh16(self.rows[row].direction.to_array());
         std::array::from_fn(|k| if k == 0 { 1.0 } else { y[k] })
     }
 
@@ -73,8 +72,7 @@ impl System<'_> {
         keep: &(dyn Fn(u32) -> bool + Sync),
     ) -> Vec<[f32; 3]> {
         let rows = self.rows;
-        let kept = |p: usize| if keep(rows.view[p]) { rows.weight[p] } else { 0.0 };
-        let weight: Vec<f32> = (0..rows.len()).map(kept).collect();
+        let weight: Vec<f32> = rows.iter().map(|row| if keep(row.view) { row.weight } else { 0.0 }).collect();
         let harmonics = match count {
             1 => Vec::new(),
             _ => (0..rows.len()).into_par_iter().map(|p| self.functions(p)).collect(),

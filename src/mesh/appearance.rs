@@ -17,11 +17,10 @@
 //! shows. What depends on the view is smooth over the surface, so that the vertices carry it, as a difference to the
 //! diffuse color. What no photograph shows follows its neighbors some nodes far, and keeps its color beyond.
 
-mod nodes;
 mod rows;
 mod solve;
 
-pub(super) use nodes::Nodes;
+pub(super) use rows::Nodes;
 pub use rows::Photograph;
 
 use crate::geom::sphharm::{Y0, functions};
@@ -30,7 +29,7 @@ use crate::image::Image;
 use crate::{Monitor, Result};
 use glam::Mat3;
 use rayon::prelude::*;
-use rows::Rows;
+use rows::{Row, Rows};
 use serde::Serialize;
 use solve::{Smoothness, System};
 use std::time::Instant;
@@ -115,7 +114,7 @@ pub fn fit(
     let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
     let stride = (head as f64 / PIXELS as f64).sqrt().ceil().max(1.0) as u32;
     let rows = Rows::new(mesh, &Bvh::new(mesh), photographs, stride, turned);
-    if rows.len() == 0 {
+    if rows.is_empty() {
         return Ok(None);
     }
     let vertices = Nodes::vertices(mesh);
@@ -163,7 +162,7 @@ pub fn fit(
         Colors::Vertices => (Default::default(), own),
         Colors::Texels(_, image) => (fine.onto(&own, image), fine.at_corners(mesh, &own)),
     };
-    let shown = |v: &usize| rows.view.binary_search(&(*v as u32)).is_ok();
+    let shown = |v: &usize| rows.binary_search_by_key(&(*v as u32), |row| row.view).is_ok();
     let of_all = (0..gains.len()).filter(shown).flat_map(|v| gains[v]);
     report = AppearanceReport {
         pixels: rows.len(),
@@ -216,7 +215,8 @@ fn choose(
     let change = of_fine.solve(&target, 1, smooth, &|v| !held(v));
     let rest = of_fine.missing(&target, &change, 1);
     let judge = |error: &[[f32; 3]]| -> f64 {
-        let of: Vec<[f32; 3]> = (0..rows.len()).filter(|&p| held(rows.view[p])).map(|p| error[p]).collect();
+        let of: Vec<[f32; 3]> =
+            rows.iter().zip(error).filter(|(row, _)| held(row.view)).map(|(_, e)| *e).collect();
         psnr(&of)
     };
     let mut candidates: Vec<(u32, Smoothness, f64)> = Vec::new();
@@ -239,18 +239,18 @@ fn choose(
 
 /// Returns the photographs' pixels with gains, `[rows]`.
 fn photo(rows: &Rows, gains: &[[f32; 3]]) -> Vec<[f32; 3]> {
-    let with = |(c, v): (&[f32; 3], &u32)| std::array::from_fn(|k| c[k] * gains[*v as usize][k]);
-    rows.photo.iter().zip(&rows.view).map(with).collect()
+    let with = |row: &Row| std::array::from_fn(|k| row.photo[k] * gains[row.view as usize][k]);
+    rows.iter().map(with).collect()
 }
 
 /// Returns the gain of each photograph that brings it closest to what a fit shows of it, which is the photograph less
 /// `error` `[rows]`; relative to their mean.
 fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]> {
     let mut sums = vec![[[0f64; 2]; 3]; photographs];
-    for p in 0..rows.len() {
+    for (row, error) in rows.iter().zip(error) {
         for k in 0..3 {
-            let (y, e) = (f64::from(rows.photo[p][k]), f64::from(error[p][k]));
-            let sum = &mut sums[rows.view[p] as usize][k];
+            let (y, e) = (f64::from(row.photo[k]), f64::from(error[k]));
+            let sum = &mut sums[row.view as usize][k];
             *sum = [sum[0] + (y - e) * y, sum[1] + y * y];
         }
     }

@@ -8,6 +8,23 @@ use crate::monitor::{Quiet, Stopping};
 
 type Answer = (Vec<f32>, Vec<Vec3>);
 
+/// A field that gives these answers.
+struct Answers(fn(&[Vec3]) -> Answer);
+
+impl SdfField for Answers {
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        (self.0)(points).0
+    }
+
+    fn sdf_gradient(&self, points: &[Vec3]) -> Answer {
+        (self.0)(points)
+    }
+
+    fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], _: &[Vec3]) -> Vec<[f32; 3]> {
+        panic!("no color is asked for")
+    }
+}
+
 /// The zero of `f` in [-1, 1]³ on `n³` nodes.
 fn mesh_of(f: impl Fn(Vec3) -> f32, n: usize) -> Mesh {
     let h = 2.0 / (n - 1) as f32;
@@ -21,10 +38,6 @@ fn mesh_of(f: impl Fn(Vec3) -> f32, n: usize) -> Mesh {
 
 fn ball(p: Vec3) -> f32 {
     p.length() - 0.7
-}
-
-fn ball_field(points: &[Vec3]) -> Answer {
-    points.iter().map(|&p| (ball(p), p.normalize_or_zero())).unzip()
 }
 
 fn to(triangles: usize) -> SimplifyConfig {
@@ -82,7 +95,7 @@ fn mean_off_ball(mesh: &Mesh) -> f32 {
 
 #[test]
 fn a_ball_ends_near_a_tetrahedron_when_asked_for_four_triangles() {
-    for field in [None, Some(&ball_field as &Field)] {
+    for field in [None, Some(&ball as &dyn SdfField)] {
         let mut mesh = mesh_of(ball, 24);
         let report = simplify(&mut mesh, field, &to(4), &Quiet).unwrap();
         let t = shape(&mesh);
@@ -98,7 +111,7 @@ fn a_target_above_the_input_leaves_the_mesh_alone() {
     let before = mesh_of(ball, 12);
     for triangles in [before.triangles.len(), 1 << 30] {
         let mut mesh = before.clone();
-        let report = simplify(&mut mesh, Some(&ball_field), &to(triangles), &Quiet).unwrap();
+        let report = simplify(&mut mesh, Some(&ball), &to(triangles), &Quiet).unwrap();
         assert_eq!((mesh, report.collapses), (before.clone(), 0));
     }
     assert!(simplify(&mut Mesh::default(), None, &to(4), &Quiet).is_ok());
@@ -229,10 +242,6 @@ fn random_surfaces_keep_their_topology_and_never_cross_themselves() {
             let sum: f32 = waves.iter().map(|(k, phase)| (k.dot(p) + phase).sin()).sum();
             (0.15 * (sum - 0.3)).max(p.length() - 0.9)
         };
-        let field = |points: &[Vec3]| -> Answer {
-            let d = |p: Vec3, e: Vec3| (f(p + 1e-3 * e) - f(p - 1e-3 * e)) / 2e-3;
-            points.iter().map(|&p| (f(p), Vec3::new(d(p, Vec3::X), d(p, Vec3::Y), d(p, Vec3::Z)))).unzip()
-        };
         let before = mesh_of(f, 14 + (seed % 7) as usize);
         let t = shape(&before);
         assert!(t.is_solid());
@@ -241,10 +250,9 @@ fn random_surfaces_keep_their_topology_and_never_cross_themselves() {
             let mut mesh = before.clone();
             let config = SimplifyConfig {
                 triangles: (before.triangles.len() / share).max(4),
-                placement: if seed % 2 == 0 { VertexPlacement::Nearest } else { VertexPlacement::OnSurface },
                 ..SimplifyConfig::default()
             };
-            let field = (seed % 4 < 3).then_some(&field as &Field);
+            let field = (seed % 4 < 3).then_some(&f as &dyn SdfField);
             let report = simplify(&mut mesh, field, &config, &Quiet).unwrap();
             again += report.again;
             let after = shape(&mesh);
@@ -294,17 +302,17 @@ fn crossings_of_the_input_do_not_become_more() {
 #[test]
 fn vertices_end_on_the_zero_or_where_triangles_are_nearest() {
     let start = mesh_of(ball, 32);
-    let with = |placement| {
+    let with = |error| {
         let mut mesh = start.clone();
-        let config = SimplifyConfig { placement, ..to(600) };
-        let report = simplify(&mut mesh, Some(&ball_field), &config, &Quiet).unwrap();
+        let config = SimplifyConfig { error, ..to(600) };
+        let report = simplify(&mut mesh, Some(&ball), &config, &Quiet).unwrap();
         assert_eq!((report.self_intersections, report.after <= 600), (0, true));
         assert!(mesh.normals.iter().zip(&mesh.positions).all(|(n, p)| n.distance(p.normalize()) < 1e-3));
         mesh
     };
-    let on = with(VertexPlacement::OnSurface);
+    let on = with(0.1);
     assert!(on.positions.iter().all(|&p| ball(p).abs() < 1e-6));
-    let near = with(VertexPlacement::Nearest);
+    let near = with(0.0);
     // The fit takes out most of the chords' mean error; the module says three quarters of the best.
     let (chord, fitted) = (mean_off_ball(&on), mean_off_ball(&near));
     assert!(fitted < 0.4 * chord, "{fitted} {chord}");
@@ -317,7 +325,7 @@ fn an_error_is_kept_with_and_without_a_field() {
     for error in [2e-3, 1e-2, 4e-2] {
         let config = SimplifyConfig { triangles: 0, error, ..SimplifyConfig::default() };
         let mut mesh = start.clone();
-        let report = simplify(&mut mesh, Some(&ball_field), &config, &Quiet).unwrap();
+        let report = simplify(&mut mesh, Some(&ball), &config, &Quiet).unwrap();
         let worst = off_ball(&mesh);
         assert!(worst <= 1.01 * error && (report.worst.unwrap() - worst).abs() < 1e-5, "{worst} {report:?}");
         // An equilateral triangle of edge l on a ball of radius r strays by l²/(6 r) in its middle: the
@@ -353,7 +361,7 @@ fn one_thread_and_two_give_the_same_bytes() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let mut mesh = mesh_of(ball, 32);
-            simplify(&mut mesh, Some(&ball_field), &to(500), &Quiet).unwrap();
+            simplify(&mut mesh, Some(&ball), &to(500), &Quiet).unwrap();
             mesh
         })
     };
@@ -363,7 +371,7 @@ fn one_thread_and_two_give_the_same_bytes() {
 #[test]
 fn a_mesh_that_is_none_and_a_bad_field_are_named_errors_and_change_nothing() {
     let sound = mesh_of(ball, 12);
-    let fails = |mesh: &Mesh, field: Option<&Field>, config: &SimplifyConfig, name: &str| {
+    let fails = |mesh: &Mesh, field: Option<&dyn SdfField>, config: &SimplifyConfig, name: &str| {
         let mut copy = mesh.clone();
         let e = simplify(&mut copy, field, config, &Quiet).unwrap_err();
         assert!(e.to_string().contains(name), "{e} is not {name}");
@@ -383,13 +391,12 @@ fn a_mesh_that_is_none_and_a_bad_field_are_named_errors_and_change_nothing() {
     let mut bad = sound.clone();
     bad.triangles[3][1] = 1 << 20;
     fails(&bad, None, &to(4), "triangle 3 names vertex 1048576");
-    let short = |_: &[Vec3]| -> Answer { (vec![0.0], vec![Vec3::X]) };
+    let short = Answers(|_| (vec![0.0], vec![Vec3::X]));
     fails(&sound, Some(&short), &to(100), "and returned 1");
     fails(&sound, None, &to(0), "`SimplifyConfig::triangles` is 0");
     fails(&sound, None, &SimplifyConfig { error: f32::NAN, ..to(9) }, "`SimplifyConfig::error` is NaN");
-    fails(&sound, None, &SimplifyConfig { batch: 0, ..to(9) }, "`SimplifyConfig::batch` is 0");
     // a field without numbers moves nothing, and the mesh stays sound
-    let nothing = |p: &[Vec3]| -> Answer { (vec![f32::NAN; p.len()], vec![Vec3::NAN; p.len()]) };
+    let nothing = Answers(|p| (vec![f32::NAN; p.len()], vec![Vec3::NAN; p.len()]));
     let mut mesh = sound.clone();
     simplify(&mut mesh, Some(&nothing), &to(100), &Quiet).unwrap();
     assert!(shape(&mesh).is_solid() && mesh.normals.iter().all(|n| (n.length() - 1.0).abs() < 1e-5));
@@ -419,8 +426,8 @@ fn rubbish_never_panics() {
         for _ in 0..60 {
             mesh.triangles.push([0; 3].map(|_| (noise.next() * vertices as f32) as u32 % vertices));
         }
-        let field = |p: &[Vec3]| -> Answer { p.iter().map(|p| (p.x, Vec3::X)).unzip() };
-        for field in [None, Some(&field as &Field)] {
+        let field = Answers(|p| p.iter().map(|p| (p.x, Vec3::X)).unzip());
+        for field in [None, Some(&field as &dyn SdfField)] {
             for error in [0.0, 1e-3] {
                 let mut copy = mesh.clone();
                 simplify(&mut copy, field, &SimplifyConfig { error, ..to(10) }, &Quiet).unwrap();

@@ -248,8 +248,7 @@ impl Outlines {
                     let others =
                         (0..alphas.len()).filter(|&o| o != k).map(|o| 1.0 - alphas[o]).product::<f32>();
                     let own = &shells.layers[*layer].alphas;
-                    let weights = [1.0 - hit.u - hit.v, hit.u, hit.v];
-                    for (v, w) in self.triangles[hit.triangle as usize].into_iter().zip(weights) {
+                    for (v, w) in self.triangles[hit.triangle as usize].into_iter().zip(hit.weights()) {
                         let alpha = own[v as usize];
                         let slope = others * w * alpha * (1.0 - alpha) / RAYS as f32;
                         let at = (layer * own.len()) as u32 + v;
