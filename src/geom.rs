@@ -16,7 +16,7 @@ pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion, Projection};
 pub use field::SdfField;
 pub use mesh::{Atlas, Mesh};
-pub(crate) use mesh::{area_vector, shape};
+pub(crate) use mesh::{area_vector, bilinear_taps, shape};
 pub(crate) use overlap::{
     Boxes, DBox, EFFORT, Effort, OutlineSide, THOROUGH, intersect, nearest_charts, overlaps, share_out,
     shared_area, turn,

@@ -156,6 +156,22 @@ impl Atlas {
     }
 }
 
+/// Returns the texels that a bilinear look-up mixes, row-major, and their weights. `at` is in texels, whose centers are at
+/// whole numbers here; beyond the border the picture continues.
+pub(crate) fn bilinear_taps(at: Vec2, [width, height]: [u32; 2]) -> [(u32, f32); 4] {
+    let along = |p: f32, n: u32| {
+        let p = p.clamp(0.0, (n - 1) as f32);
+        (p as u32, (p as u32 + 1).min(n - 1), p.fract())
+    };
+    let ((x0, x1, fx), (y0, y1, fy)) = (along(at.x, width), along(at.y, height));
+    [
+        (y0 * width + x0, (1.0 - fx) * (1.0 - fy)),
+        (y0 * width + x1, fx * (1.0 - fy)),
+        (y1 * width + x0, (1.0 - fx) * fy),
+        (y1 * width + x1, fx * fy),
+    ]
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

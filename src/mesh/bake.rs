@@ -43,7 +43,7 @@ use crate::geom::{Atlas, Bvh, Camera, Harmonics, Mesh, SdfField, area_vector};
 use crate::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
 use crate::mesh::input::setting;
 use crate::{Monitor, Result};
-use cover::{Bands, ROWS, Sample};
+use cover::{Bands, Sample};
 use glam::{Mat3, Vec3, Vec4};
 use light::{SurfacePoints, Visibility, settle, shade};
 use seams::fill;
@@ -101,9 +101,6 @@ pub struct BakeReport {
     pub seconds: f64,
 }
 
-/// Points handed to the field at once.
-const BATCH: usize = 1 << 17;
-
 /// Bakes a texture for `mesh` with normals, laid out by `atlas`, from the field it was extracted from.
 ///
 /// ```
@@ -152,50 +149,48 @@ pub fn bake(
     let (mut samples, mut visible, mut views, mut moved) = (0, 0, 0, 0.0);
     let bvh = Bvh::new(mesh);
     let eyes = Visibility { cameras, bvh: &bvh, clearance: 0.5 * config.reach, most: config.views };
-    let bands = Bands::new(atlas, ROWS);
+    let bands = Bands::new(atlas, config.side);
     for band in 0..bands.len() {
-        let all = bands.samples(atlas, band, config.side);
-        for own in whole_texels(&all) {
-            monitor.check_stop()?;
-            let flat = on_triangles(mesh, own);
-            let points = settle(&flat, config.reach, field);
-            let seen = eyes.directions(&points, &flat);
-            samples += own.len();
-            for (_, &count) in seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known) {
-                visible += 1;
-                views += count as usize;
-            }
-            let ways = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
-            moved += ways.sum::<f64>();
-            let shades = shade(&points, seen, field, count, config.turned);
-            let mut i = 0;
-            for texel in own.chunk_by(|a, b| a.texel == b.texel) {
-                let at = texel[0].texel as usize;
-                covered[at] = true;
-                let all = i..i + texel.len();
-                // if some samples of a texel are visible, the invisible ones are ignored
-                let any = shades.seen[all.clone()].contains(&true);
-                let counts = |s: usize| if any && !shades.seen[s] { 0.0 } else { 1.0 };
-                let total: f32 = all.clone().map(counts).sum();
-                let mean = |value: &dyn Fn(usize) -> [f32; 3]| -> [f32; 3] {
-                    let mut sum = [0f32; 3];
-                    for s in all.clone() {
-                        let w = counts(s) / total;
-                        value(s).iter().zip(&mut sum).for_each(|(v, sum)| *sum += w * v);
-                    }
-                    sum
-                };
-                let put = |image: &mut Image, v: [f32; 3]| image.data[3 * at..3 * at + 3].copy_from_slice(&v);
-                put(&mut color, mean(&|s| shades.linear[s]));
-                for (k, image) in lobes.iter_mut().enumerate() {
-                    put(image, mean(&|s| shades.lobes[s * count + k]));
+        let own = &bands.samples(atlas, band, config.side);
+        monitor.check_stop()?;
+        let flat = on_triangles(mesh, own);
+        let points = settle(&flat, config.reach, field);
+        let seen = eyes.directions(&points, &flat);
+        samples += own.len();
+        for (_, &count) in seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known) {
+            visible += 1;
+            views += count as usize;
+        }
+        let ways = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
+        moved += ways.sum::<f64>();
+        let shades = shade(&points, seen, field, count, config.turned);
+        let mut i = 0;
+        for texel in own.chunk_by(|a, b| a.texel == b.texel) {
+            let at = texel[0].texel as usize;
+            covered[at] = true;
+            let all = i..i + texel.len();
+            // if some samples of a texel are visible, the invisible ones are ignored
+            let any = shades.seen[all.clone()].contains(&true);
+            let counts = |s: usize| if any && !shades.seen[s] { 0.0 } else { 1.0 };
+            let total: f32 = all.clone().map(counts).sum();
+            let mean = |value: &dyn Fn(usize) -> [f32; 3]| -> [f32; 3] {
+                let mut sum = [0f32; 3];
+                for s in all.clone() {
+                    let w = counts(s) / total;
+                    value(s).iter().zip(&mut sum).for_each(|(v, sum)| *sum += w * v);
                 }
-                if let Some(image) = &mut normal {
-                    let n = Vec3::from(mean(&|s| points.normals[s].to_array()));
-                    put(image, n.normalize_or(points.normals[all.start]).to_array());
-                }
-                i = all.end;
+                sum
+            };
+            let put = |image: &mut Image, v: [f32; 3]| image.data[3 * at..3 * at + 3].copy_from_slice(&v);
+            put(&mut color, mean(&|s| shades.linear[s]));
+            for (k, image) in lobes.iter_mut().enumerate() {
+                put(image, mean(&|s| shades.lobes[s * count + k]));
             }
+            if let Some(image) = &mut normal {
+                let n = Vec3::from(mean(&|s| points.normals[s].to_array()));
+                put(image, n.normalize_or(points.normals[all.start]).to_array());
+            }
+            i = all.end;
         }
         monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", samples as f64)]);
     }
@@ -231,7 +226,7 @@ pub fn bake_harmonics(mesh: &Mesh, atlas: &Atlas, harmonics: &Harmonics, gutter_
     let (width, height, count) = (atlas.width, atlas.height, harmonics.functions);
     let mut pictures = vec![Image::new(width, height, 3); count];
     let mut known = vec![false; width as usize * height as usize];
-    let bands = Bands::new(atlas, ROWS);
+    let bands = Bands::new(atlas, 1);
     for sample in (0..bands.len()).flat_map(|band| bands.samples(atlas, band, 1)) {
         let at = sample.texel as usize;
         known[at] = true;
@@ -244,25 +239,6 @@ pub fn bake_harmonics(mesh: &Mesh, atlas: &Atlas, harmonics: &Harmonics, gutter_
     let seams = Seams::new(mesh, atlas);
     pictures.iter_mut().for_each(|p| complete(p, &known, gutter_px, &seams));
     pictures
-}
-
-/// Pieces of at most [`BATCH`] samples (or one texel) that end between texels.
-fn whole_texels(samples: &[Sample]) -> impl Iterator<Item = &[Sample]> {
-    let mut rest = samples;
-    std::iter::from_fn(move || {
-        if rest.is_empty() {
-            return None;
-        }
-        let mut end = rest.len().min(BATCH);
-        if end < rest.len() {
-            let last = rest[end].texel;
-            let texel = rest.partition_point(|s| s.texel < last);
-            end = if texel > 0 { texel } else { rest.partition_point(|s| s.texel <= last) };
-        }
-        let (own, after) = rest.split_at(end);
-        rest = after;
-        Some(own)
-    })
 }
 
 /// Positions and interpolated normals of samples.
@@ -288,7 +264,7 @@ pub fn tangent_space(
     let (width, height) = (atlas.width, atlas.height);
     let mut out = Image::new(width, height, 3);
     let mut covered = vec![false; width as usize * height as usize];
-    let bands = Bands::new(atlas, ROWS);
+    let bands = Bands::new(atlas, 1);
     for band in 0..bands.len() {
         for group in bands.samples(atlas, band, 1).chunk_by(|a, b| a.texel == b.texel) {
             let s = group[0];

@@ -7,7 +7,6 @@ use crate::Result;
 use crate::capture::scene::Hull;
 use crate::config::Stage;
 use crate::geom::{Camera, Ray, RayResult, SdfField, Similarity};
-use crate::image::Image;
 use crate::mesh::{Cap, Patches};
 use crate::render::RenderedView;
 use glam::{Vec2, Vec3};
@@ -140,13 +139,7 @@ pub(super) fn march(
     render_rays: impl Fn(&[Ray]) -> Vec<RayResult>,
 ) -> RenderedView {
     let (w, h) = (camera.width, camera.height);
-    let sized = |wanted: bool| if wanted { (w, h) } else { (0, 0) };
-    let (nw, nh) = sized(with_normals);
-    let mut view = RenderedView {
-        color: Image::new(w, h, 4),
-        depth: Image::new(w, h, 1),
-        normal: Image::new(nw, nh, 3),
-    };
+    let mut view = RenderedView::new(w, h, with_normals);
     let width = w as usize;
     let rows = (BAND / width.max(1)).max(1);
     for top in (0..h as usize).step_by(rows) {

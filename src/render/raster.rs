@@ -22,7 +22,7 @@ use super::raycast::{RayHits, RenderedView};
 use crate::geom::{Camera, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Image;
 use bytemuck::Zeroable;
-use paint::{Band, Batch, Painter, Part, Queue, Sheet, straight_rays};
+use paint::{Band, Batch, Painter, Part, Sheet, straight_rays};
 use project::{Bins, Faces, Lens, TILE};
 use rayon::prelude::*;
 use tile::{NOTHING, SAMPLES, Tile};
@@ -204,7 +204,7 @@ pub fn raster_into(
         bare: options.bare_hits,
         color,
     };
-    let start = || (Tile::new(), Vec::new(), Box::<Batch>::new(Zeroable::zeroed()), Queue::default());
+    let start = || (Tile::new(), Vec::new(), Box::<Batch>::new(Zeroable::zeroed()), RayHits::default());
     rows.for_each_init(start, |(tile, over, batch, queue), mut out| {
         let out = &mut out;
         clear(out);

@@ -42,6 +42,18 @@ pub struct RenderedView {
     pub normal: Image,
 }
 
+impl RenderedView {
+    /// Returns a view of nothing.
+    pub fn new(width: u32, height: u32, has_normals: bool) -> RenderedView {
+        let [w, h] = if has_normals { [width, height] } else { [0, 0] };
+        RenderedView {
+            color: Image::new(width, height, 4),
+            depth: Image::new(width, height, 1),
+            normal: Image::new(w, h, 3),
+        }
+    }
+}
+
 /// The hits of rays, for the color function. All `[n]`.
 #[derive(Clone, Debug, Default)]
 pub struct RayHits {
@@ -54,7 +66,26 @@ pub struct RayHits {
     /// Triangle, weights of its corners and distance.
     pub hits: Vec<Hit>,
     /// The pixel of each hit, and the hit's weight in it.
-    pixels: Vec<(usize, f32)>,
+    pub(super) pixels: Vec<(usize, f32)>,
+}
+
+impl RayHits {
+    /// Adds the colors of all hits to their pixels, and forgets the hits.
+    pub(super) fn shade(&mut self, rgba: &mut [[f32; 4]], color: &impl Fn(&RayHits) -> Vec<[f32; 3]>) {
+        if self.pixels.is_empty() {
+            return;
+        }
+        let colors = color(self);
+        for (k, (pixel, share)) in self.pixels.drain(..).enumerate() {
+            let c = colors.get(k).unwrap_or(&[0.0; 3]).map(|c| c.clamp(0.0, 1.0));
+            let p = &mut rgba[pixel];
+            *p = [p[0] + share * c[0], p[1] + share * c[1], p[2] + share * c[2], p[3] + share];
+        }
+        self.points.clear();
+        self.normals.clear();
+        self.directions.clear();
+        self.hits.clear();
+    }
 }
 
 /// Casts the rays of a camera at a mesh.
@@ -93,11 +124,7 @@ pub fn raycast(
     color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
 ) -> RenderedView {
     let (width, height) = (camera.width, camera.height);
-    let mut view = RenderedView {
-        color: Image::new(width, height, 4),
-        depth: Image::new(width, height, 1),
-        normal: Image::new(width, height, 3),
-    };
+    let mut view = RenderedView::new(width, height, true);
     if width == 0 || height == 0 {
         return view;
     }
@@ -158,13 +185,13 @@ impl Raycaster<'_> {
                 }
             }
             for one in &found {
-                self.enqueue(&mut queue, i, one, 1.0 / found.len() as f32, rgba);
+                self.enqueue(&mut queue, i, one, 1.0 / found.len() as f32);
             }
             if queue.pixels.len() >= BATCH {
-                shade(&mut queue, rgba, color);
+                queue.shade(rgba, color);
             }
         }
-        shade(&mut queue, rgba, color);
+        queue.shade(rgba, color);
     }
 
     /// Casts `n × n` rays through the pixel at a corner.
@@ -198,12 +225,11 @@ impl Raycaster<'_> {
         (low == 0.0) != (high == 0.0) || high - low > JUMP * low / self.camera.fx.abs() as f32
     }
 
-    /// Adds a hit to the pixel's alpha and queues it for its color.
-    fn enqueue(&self, queue: &mut RayHits, pixel: usize, met: &Met, weight: f32, rgba: &mut [[f32; 4]]) {
+    /// Queues a hit for its color.
+    fn enqueue(&self, queue: &mut RayHits, pixel: usize, met: &Met, weight: f32) {
         let Some((ray, hit)) = met else { return };
         let mut left = weight;
         let mut push = |hit: &Hit, weight: f32| {
-            rgba[pixel][3] += weight;
             queue.points.push(self.mesh.point_at(hit));
             queue.normals.push(self.mesh.shading_normal(hit));
             queue.directions.push(ray.direction);
@@ -224,19 +250,6 @@ impl Raycaster<'_> {
 
 /// A ray, and its first hit of the mesh.
 type Met = Option<(Ray, Option<Hit>)>;
-
-/// Colors everything queued.
-fn shade(queue: &mut RayHits, rgba: &mut [[f32; 4]], color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync)) {
-    if queue.pixels.is_empty() {
-        return;
-    }
-    for ((pixel, weight), c) in queue.pixels.iter().zip(color(queue)) {
-        for channel in 0..3 {
-            rgba[*pixel][channel] += weight * c[channel].clamp(0.0, 1.0);
-        }
-    }
-    *queue = RayHits::default();
-}
 
 #[cfg(test)]
 mod tests {

@@ -4,7 +4,7 @@
 //!
 //! Where fitted colors live: the vertices of a mesh, or the texels of its atlas.
 
-use crate::geom::{Atlas, Bvh, Camera, Hit, Mesh, area_vector};
+use crate::geom::{Atlas, Bvh, Camera, Hit, Mesh, area_vector, bilinear_taps};
 use crate::image::{Gray, Image, Photo, eroded};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -139,17 +139,10 @@ impl Rows {
             }
             entries.extend(part);
         }
-        let mut column_start = vec![0u32; nodes.len() + 1];
-        entries.iter().for_each(|e| column_start[e.0 as usize + 1] += 1);
-        (0..nodes.len()).for_each(|i| column_start[i + 1] += column_start[i]);
-        let mut next = column_start.clone();
-        let mut column_entries = vec![(0u32, 0f32); entries.len()];
-        for p in 0..self.len() {
-            for &(node, w) in &entries[start[p] as usize..start[p + 1] as usize] {
-                column_entries[next[node as usize] as usize] = (p as u32, w);
-                next[node as usize] += 1;
-            }
-        }
+        let row = |p: usize| start[p] as usize..start[p + 1] as usize;
+        let by_node =
+            (0..self.len()).flat_map(|p| entries[row(p)].iter().map(move |e| (e.0, (p as u32, e.1))));
+        let (column_start, column_entries) = grouped(nodes.len(), by_node, (0, 0.0));
         Matrix { start, entries, column_start, column_entries }
     }
 }
@@ -186,6 +179,24 @@ impl Row {
             hits,
         })
     }
+}
+
+/// Returns items by the group that each is in, in their order: the start of each group, and all groups in one list.
+fn grouped<T: Copy>(
+    groups: usize,
+    items: impl Iterator<Item = (u32, T)> + Clone,
+    none: T,
+) -> (Vec<u32>, Vec<T>) {
+    let mut start = vec![0u32; groups + 1];
+    items.clone().for_each(|(group, _)| start[group as usize + 1] += 1);
+    (0..groups).for_each(|i| start[i + 1] += start[i]);
+    let mut next = start.clone();
+    let mut all = vec![none; start[groups] as usize];
+    for (group, item) in items {
+        all[next[group as usize] as usize] = item;
+        next[group as usize] += 1;
+    }
+    (start, all)
 }
 
 /// Which nodes a row shows and which rows show a node, with the node's share of the row.
@@ -282,17 +293,8 @@ impl Nodes {
     }
 
     fn linked(place: NodeLayout, count: usize, edges: &[[u32; 2]]) -> Nodes {
-        let mut near_start = vec![0u32; count + 1];
-        edges.iter().flatten().for_each(|&n| near_start[n as usize + 1] += 1);
-        (0..count).for_each(|i| near_start[i + 1] += near_start[i]);
-        let mut next = near_start.clone();
-        let mut near = vec![0u32; 2 * edges.len()];
-        for &[a, b] in edges {
-            for (from, to) in [(a, b), (b, a)] {
-                near[next[from as usize] as usize] = to;
-                next[from as usize] += 1;
-            }
-        }
+        let both = edges.iter().flat_map(|&[a, b]| [(a, b), (b, a)]);
+        let (near_start, near) = grouped(count, both, 0);
         Nodes { place, count, near_start, near }
     }
 
@@ -313,17 +315,9 @@ impl Nodes {
                 triangles[hit.triangle as usize].iter().zip(hit.weights()).for_each(|(&i, w)| f(i, w));
             }
             NodeLayout::Texels { corners, width, height, node } => {
-                let p = hit.mix(corners[hit.triangle as usize]);
-                let (x, y) = (p.x.clamp(0.0, (width - 1) as f32), p.y.clamp(0.0, (height - 1) as f32));
-                let (x0, y0) = (x as usize, y as usize);
-                let (x1, y1) = ((x0 + 1).min(width - 1), (y0 + 1).min(height - 1));
-                let (fx, fy) = (x.fract(), y.fract());
-                let taps = [
-                    (node[y0 * width + x0], (1.0 - fx) * (1.0 - fy)),
-                    (node[y0 * width + x1], fx * (1.0 - fy)),
-                    (node[y1 * width + x0], (1.0 - fx) * fy),
-                    (node[y1 * width + x1], fx * fy),
-                ];
+                let at = hit.mix(corners[hit.triangle as usize]);
+                let taps = bilinear_taps(at, [*width as u32, *height as u32])
+                    .map(|(texel, w)| (node[texel as usize], w));
                 let known = |t: &&(u32, f32)| t.0 != u32::MAX && t.1 > 0.0;
                 let total: f32 = taps.iter().filter(known).map(|t| t.1).sum();
                 taps.iter().filter(known).for_each(|t| f(t.0, t.1 / total));

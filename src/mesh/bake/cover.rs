@@ -8,8 +8,9 @@ use crate::geom::{Atlas, Hit};
 use glam::Vec2;
 use std::ops::Range;
 
-/// Rows baked together.
-pub const ROWS: u32 = 32;
+/// Most rows that are looked at together, and most samples, if a row has no more.
+const ROWS: u32 = 32;
+const SAMPLES: u32 = 1 << 17;
 
 /// One sample of a texel.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,8 +40,12 @@ pub struct Bands {
 }
 
 impl Bands {
-    /// Sorts the triangles of an atlas into bands of `rows` rows.
-    pub fn new(atlas: &Atlas, rows: u32) -> Bands {
+    /// Sorts the triangles of an atlas into bands; each texel is looked at through `side` samples each way.
+    pub fn new(atlas: &Atlas, side: u32) -> Bands {
+        Bands::of_rows(atlas, (SAMPLES / (atlas.width * side * side).max(1)).clamp(1, ROWS))
+    }
+
+    fn of_rows(atlas: &Atlas, rows: u32) -> Bands {
         let count = atlas.height.div_ceil(rows);
         let mut triangles = vec![Vec::new(); count as usize];
         for t in 0..atlas.triangles.len() as u32 {
@@ -176,7 +181,7 @@ mod tests {
         let uvs = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0), (1.0, 3.0)].map(|(x, y)| Vec2::new(x, y) / 4.0);
         let triangles = vec![[0, 1, 2], [0, 2, 3]];
         let atlas = Atlas { uvs: uvs.to_vec(), triangles, width: 4, height: 4 };
-        let bands = Bands::new(&atlas, 2);
+        let bands = Bands::of_rows(&atlas, 2);
         assert_eq!(bands.len(), 2);
         let all: Vec<Sample> = (0..2).flat_map(|b| bands.samples(&atlas, b, 4)).collect();
         for texel in 0..16u32 {
@@ -193,7 +198,7 @@ mod tests {
     fn samples_lie_where_their_weights_say() {
         let corners = [Vec2::new(0.5, 0.5), Vec2::new(7.0, 2.0), Vec2::new(2.0, 6.5)];
         let atlas = one(corners, 8, 8);
-        for s in Bands::new(&atlas, 8).samples(&atlas, 0, 2) {
+        for s in Bands::of_rows(&atlas, 8).samples(&atlas, 0, 2) {
             let p = corners[0] + s.u * (corners[1] - corners[0]) + s.v * (corners[2] - corners[0]);
             let center = Vec2::new((s.texel % 8) as f32 + 0.5, (s.texel / 8) as f32 + 0.5);
             assert!((p - center).abs().max_element() <= 0.5 + 1e-5);
@@ -204,7 +209,7 @@ mod tests {
     fn a_needle_thinner_than_a_texel_leaves_no_gap() {
         // crosses columns 0..8 in row 3 between two sample rows
         let atlas = one([Vec2::new(0.1, 3.6), Vec2::new(7.9, 3.6), Vec2::new(7.9, 3.601)], 8, 8);
-        let samples = Bands::new(&atlas, 3).samples(&atlas, 1, 1);
+        let samples = Bands::of_rows(&atlas, 3).samples(&atlas, 1, 1);
         let texels: Vec<u32> = samples.iter().map(|s| s.texel).collect();
         assert_eq!(texels, (24..32).collect::<Vec<_>>());
     }
@@ -215,20 +220,20 @@ mod tests {
             [[Vec2::splat(2.3); 3], [Vec2::new(2.1, 2.1), Vec2::new(2.2, 2.1), Vec2::new(2.1, 2.2)]]
         {
             let atlas = one(corners, 4, 4);
-            let samples = Bands::new(&atlas, 4).samples(&atlas, 0, 1);
+            let samples = Bands::of_rows(&atlas, 4).samples(&atlas, 0, 1);
             assert_eq!(samples.len(), 1);
             assert_eq!(samples[0].texel, 10);
         }
         // a texture of one texel
         let atlas = one([Vec2::ZERO, Vec2::X, Vec2::Y], 1, 1);
-        assert_eq!(Bands::new(&atlas, 1).samples(&atlas, 0, 4).len(), 10);
+        assert_eq!(Bands::of_rows(&atlas, 1).samples(&atlas, 0, 4).len(), 10);
     }
 
     #[test]
     fn a_chart_on_the_border_and_a_mirrored_one_are_covered() {
         let border = one([Vec2::ZERO, Vec2::new(4.0, 0.0), Vec2::new(0.0, 4.0)], 4, 4);
         let mirrored = one([Vec2::ZERO, Vec2::new(0.0, 4.0), Vec2::new(4.0, 0.0)], 4, 4);
-        let count = |a: &Atlas| Bands::new(a, 4).samples(a, 0, 2).len();
+        let count = |a: &Atlas| Bands::of_rows(a, 4).samples(a, 0, 2).len();
         assert_eq!(count(&border), count(&mirrored));
         assert!(count(&border) > 30);
     }

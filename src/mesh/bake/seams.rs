@@ -13,7 +13,7 @@
 //! (nearest covered texel), all else is filled by pull and push over a pyramid (Gortler et al. 1996), so that
 //! every mip level of every chart sees its own colors. ([`super::Seams`] then moves the texels next to a seam a little.)
 
-use crate::geom::{Atlas, Mesh};
+use crate::geom::{Atlas, Mesh, bilinear_taps};
 use crate::image::{Image, Photo};
 use crate::kernel::cpu::cg::{conjugate_gradients, dot};
 use glam::Vec2;
@@ -39,9 +39,6 @@ pub struct Seams {
     width: u32,
     height: u32,
 }
-
-/// A bilinear look-up: texels and their weights.
-type SeamTexels = [(u32, f32); 4];
 
 impl Seams {
     /// Finds the seams of a manifold mesh, closed or open, edge by edge in the order of its triangles.
@@ -115,25 +112,18 @@ impl Seams {
         }
     }
 
-    fn taps(&self, uv: Vec2) -> SeamTexels {
-        let at = |u: f32, n: u32| {
-            let p = (u * n as f32 - 0.5).clamp(0.0, (n - 1) as f32);
-            (p as u32, (p as u32 + 1).min(n - 1), p.fract())
-        };
-        let ((x0, x1, fx), (y0, y1, fy)) = (at(uv.x, self.width), at(uv.y, self.height));
-        let w = self.width;
-        [
-            (y0 * w + x0, (1.0 - fy) * (1.0 - fx)),
-            (y0 * w + x1, (1.0 - fy) * fx),
-            (y1 * w + x0, fy * (1.0 - fx)),
-            (y1 * w + x1, fy * fx),
-        ]
+    fn taps(&self, uv: Vec2) -> [(u32, f32); 4] {
+        bilinear_taps(uv * self.size() - 0.5, [self.width, self.height])
+    }
+
+    fn size(&self) -> Vec2 {
+        Vec2::new(self.width as f32, self.height as f32)
     }
 
     /// Returns the texels that seams are drawn from, and one row for each point of a seam: weights of its texels whose
     /// sum should be zero, times the root of the length the point stands for.
     fn system(&self) -> (Vec<u32>, Vec<[(u32, f64); 8]>) {
-        let size = Vec2::new(self.width as f32, self.height as f32);
+        let size = self.size();
         let mut texels = Vec::new();
         let mut known: HashMap<u32, u32> = HashMap::new();
         let mut rows = Vec::new();

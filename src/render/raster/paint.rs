@@ -83,7 +83,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
         part: Part,
         out: &mut Band,
         batch: &mut Batch,
-        queue: &mut Queue,
+        queue: &mut RayHits,
     ) {
         for y in 0..part.height {
             for x in 0..part.width {
@@ -152,7 +152,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
         part: Part,
         out: &mut Band,
         batch: &mut Batch,
-        queue: &mut Queue,
+        queue: &mut RayHits,
     ) {
         let count = std::mem::take(&mut batch.count);
         for k in 0..count {
@@ -195,14 +195,14 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                 continue;
             }
             if !self.bare {
-                queue.hits.points.push(self.mesh.point_at(&hit));
-                queue.hits.normals.push(self.mesh.shading_normal(&hit));
+                queue.points.push(self.mesh.point_at(&hit));
+                queue.normals.push(self.mesh.shading_normal(&hit));
             }
-            queue.hits.directions.push(direction);
-            queue.hits.hits.push(hit);
-            queue.shares.push((pixel, share));
+            queue.directions.push(direction);
+            queue.hits.push(hit);
+            queue.pixels.push((pixel, share));
         }
-        if queue.shares.len() >= QUEUE {
+        if queue.pixels.len() >= QUEUE {
             queue.shade(out.rgba, &self.color);
         }
     }
@@ -289,30 +289,4 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 #[inline(always)]
 fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-}
-
-/// The hits that wait for their color, with their pixels and weights.
-#[derive(Default)]
-pub(super) struct Queue {
-    hits: RayHits,
-    shares: Vec<(usize, f32)>,
-}
-
-impl Queue {
-    /// Colors everything queued.
-    fn shade(&mut self, rgba: &mut [[f32; 4]], color: &impl Fn(&RayHits) -> Vec<[f32; 3]>) {
-        if self.shares.is_empty() {
-            return;
-        }
-        let colors = color(&self.hits);
-        for (k, (pixel, share)) in self.shares.drain(..).enumerate() {
-            let c = colors.get(k).unwrap_or(&[0.0; 3]);
-            let p = &mut rgba[pixel];
-            *p = [p[0] + share * c[0], p[1] + share * c[1], p[2] + share * c[2], p[3] + share];
-        }
-        self.hits.points.clear();
-        self.hits.normals.clear();
-        self.hits.directions.clear();
-        self.hits.hits.clear();
-    }
 }
