@@ -26,7 +26,7 @@ fn best_ms(values: &[f32], n: usize, threads: usize, runs: usize) -> (f64, usize
             let start = Instant::now();
             let surface = marching(&volume, false).expect("a valid volume");
             best = best.min(start.elapsed().as_secs_f64() * 1e3);
-            triangles = surface.triangles.len();
+            triangles = surface.mesh.triangles.len();
         }
         (best, triangles)
     })

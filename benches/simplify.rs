@@ -116,8 +116,7 @@ fn show(name: &str, ms: Option<(f64, f64)>, mesh: &Mesh) {
 fn head(n: usize) -> Mesh {
     let (values, h) = fields::grid(fields::head, n);
     let volume = Volume { dims: [n; 3], values: &values, origin: Vec3::NEG_ONE, spacing: Vec3::splat(h) };
-    let surface = marching(&volume, true).expect("a valid volume");
-    Mesh { positions: surface.positions, triangles: surface.triangles, ..Mesh::default() }
+    marching(&volume, true).expect("a valid volume").mesh
 }
 
 fn measure(n: usize, triangles: usize) {

@@ -26,7 +26,7 @@ pub use shells::{ShellCaster, ShellLayer, Shells};
 pub use similarity::Similarity;
 pub use sphharm::Harmonics;
 pub(crate) use symmetric::cofactors;
-pub(crate) use topology::{Sets, fans, side_ends, sorted_sides};
+pub(crate) use topology::{Sets, side_ends, sorted_sides};
 pub use topology::{Topology, topology};
 
 #[cfg(test)]

@@ -9,13 +9,13 @@ use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use rayon::prelude::*;
 use tiface::geom::{Aabb, Mesh, Topology, topology};
-use tiface::mesh::{ExtractOptions, LevelSet, NodeGrid, Sparse, Volume, extract, marching, sparse};
+use tiface::mesh::{ExtractOptions, NodeGrid, Sparse, Volume, extract, marching, sparse};
 
-fn surface(dims: [usize; 3], values: &[f32], closed: bool) -> LevelSet {
-    marching(&Volume { dims, values, origin: Vec3::ZERO, spacing: Vec3::ONE }, closed).unwrap()
+fn surface(dims: [usize; 3], values: &[f32], closed: bool) -> Mesh {
+    marching(&Volume { dims, values, origin: Vec3::ZERO, spacing: Vec3::ONE }, closed).unwrap().mesh
 }
 
-fn analysed(s: &LevelSet) -> Topology {
+fn analysed(s: &Mesh) -> Topology {
     topology(&s.positions, &s.triangles)
 }
 
@@ -161,7 +161,8 @@ fn a_surface_that_leaves_the_box_anywhere_is_capped() {
             .collect();
         let t = assert_sound("off the box", [16; 3], &v, true);
         assert_eq!((t.pieces, t.euler), (1, 2));
-        assert_eq!(surface([16; 3], &v, true).capped > 0, i != 13);
+        let volume = Volume { dims: [16; 3], values: &v, origin: Vec3::ZERO, spacing: Vec3::ONE };
+        assert_eq!(marching(&volume, true).unwrap().capped > 0, i != 13);
     }
 }
 
@@ -379,7 +380,7 @@ fn the_head_has_the_area_and_volume_of_another_marching_cubes() {
         false,
     )
     .unwrap();
-    let ours = Mesh { positions: s.positions, triangles: s.triangles, ..Mesh::default() };
+    let ours = s.mesh;
     let area = |m: &Mesh| -> f64 {
         (0..m.triangles.len() as u32)
             .map(|t| {
@@ -410,7 +411,7 @@ fn cost(field: fn(Vec3) -> f32, cells: usize) -> (f64, i64) {
     let (values, h) = fields::grid(field, cells + 1);
     let volume =
         Volume { dims: [cells + 1; 3], values: &values, origin: Vec3::NEG_ONE, spacing: Vec3::splat(h) };
-    let dense = marching(&volume, true).unwrap();
+    let dense = marching(&volume, true).unwrap().mesh;
     let n = cells + 1;
     // The least any scheme can do: nodes of crossed cells.
     let mut needed = vec![false; n * n * n];
@@ -426,14 +427,14 @@ fn cost(field: fn(Vec3) -> f32, cells: usize) -> (f64, i64) {
     }
     let least = needed.iter().filter(|&&n| n).count() as f64 / grid.nodes() as f64;
     let share = few.evaluated as f64 / grid.nodes() as f64;
-    let lost = dense.triangles.len() as i64 - few.surface.triangles.len() as i64;
+    let lost = dense.triangles.len() as i64 - few.surface.mesh.triangles.len() as i64;
     println!(
         "{cells}³: {:.3} % evaluated, {:.3} % at least, {lost} of {} triangles lost, {seconds:.2} s",
         100.0 * share,
         100.0 * least,
         dense.triangles.len()
     );
-    assert_eq!(few.surface.positions.len(), dense.positions.len());
+    assert_eq!(few.surface.mesh.positions.len(), dense.positions.len());
     (share, lost)
 }
 
@@ -463,7 +464,7 @@ fn a_head_at_1024_fits_in_half_a_gigabyte() {
     println!(
         "1024³: {:.3} % evaluated, {} triangles, {:.2} s",
         100.0 * few.evaluated as f64 / grid.nodes() as f64,
-        few.surface.triangles.len(),
+        few.surface.mesh.triangles.len(),
         start.elapsed().as_secs_f64()
     );
     // Linux only; elsewhere there is nothing to read and nothing is claimed.
@@ -486,7 +487,7 @@ fn fields_of_any_slope_and_offset_lose_nothing() {
     assert_eq!(cost(steep, 64).1, 0);
     assert_eq!(cost(saturated, 64).1, 0);
     let grid = NodeGrid::fit(Aabb::SCENE, 32).unwrap();
-    assert!(extracted(|_| 0.5, &grid).surface.triangles.is_empty());
+    assert!(extracted(|_| 0.5, &grid).surface.mesh.triangles.is_empty());
     assert!(ball(Vec3::ZERO) < 0.0);
 }
 
@@ -528,7 +529,7 @@ fn noise_through_the_whole_stage_stays_a_closed_manifold() {
     assert!(report.topology.is_solid(), "{report:?}");
     // and every piece of it, before the largest is kept
     let grid = NodeGrid::fit(bounds, 24).unwrap();
-    let all = sparse(&field, &grid, 8, &tiface::Quiet).unwrap().surface;
+    let all = sparse(&field, &grid, 8, &tiface::Quiet).unwrap().surface.mesh;
     let found = topology(&all.positions, &all.triangles);
     assert!(found.is_solid() && found.pieces == report.clean.pieces, "{found:?}");
 }

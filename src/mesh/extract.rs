@@ -189,7 +189,7 @@ pub fn extract(
         capped: found.surface.capped,
         ..MeshReport::default()
     };
-    let mut mesh = found.surface.into_mesh();
+    let mut mesh = found.surface.mesh;
     progress(&[("nodes", found.evaluated as f64), ("triangles", mesh.triangles.len() as f64)])?;
 
     report.clean = clean(&mut mesh)?;
@@ -265,7 +265,7 @@ fn check_surface(found: &Sparse) -> Result<()> {
         );
     }
     // with an empty hull nothing is evaluated: then the smallest is infinite
-    if found.surface.triangles.is_empty() {
+    if found.surface.mesh.triangles.is_empty() {
         return none(
             format!("positive at all {nodes} nodes evaluated (smallest {smallest:.3e}), nothing is inside"),
             "train `iface` longer, check that the box holds the head, or raise `mesh.resolution` for small pieces",
@@ -384,7 +384,7 @@ mod tests {
         };
         let f = |p: Vec3| p.length() - 0.7;
         let grid = NodeGrid::fit(Aabb::SCENE, coarse().resolution).unwrap();
-        let before = sparse(&f, &grid, 8, &Quiet).unwrap().surface.into_mesh();
+        let before = sparse(&f, &grid, 8, &Quiet).unwrap().surface.mesh;
         let (after, _) = mesh_of(f, &coarse()).unwrap();
         assert!(slivers(&after) < 0.2 * slivers(&before), "{} {}", slivers(&before), slivers(&after));
         for t in 0..after.triangles.len() as u32 {

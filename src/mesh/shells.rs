@@ -342,9 +342,9 @@ mod tests {
         let values: Vec<f32> = (0..N * N * N).map(value).collect();
         let spacing = Vec3::splat(2.0 / (N - 1) as f32);
         let volume = Volume { dims: [N; 3], values: &values, origin: Vec3::NEG_ONE, spacing };
-        let surface = marching(&volume, true).unwrap();
+        let surface = marching(&volume, true).unwrap().mesh;
         let normals = surface.positions.iter().map(|p| p.normalize()).collect();
-        Mesh { positions: surface.positions, normals, triangles: surface.triangles, ..Mesh::default() }
+        Mesh { normals, ..surface }
     }
 
     /// Cameras around it, three units away.

@@ -50,7 +50,7 @@ use std::time::Instant;
 /// let distance = |i: usize| Vec3::new(at(i % 32), at(i / 32 % 32), at(i / 1024)).length() - 12.0;
 /// let values: Vec<f32> = (0..32 * 32 * 32).map(distance).collect();
 /// let volume = Volume { dims: [32; 3], values: &values, origin: Vec3::ZERO, spacing: Vec3::ONE };
-/// let mut mesh = marching(&volume, true)?.into_mesh();
+/// let mut mesh = marching(&volume, true)?.mesh;
 /// let config = SimplifyConfig { triangles: 500, ..SimplifyConfig::default() };
 /// simplify(&mut mesh, None, &config, &tiface::Quiet)?;
 /// assert!(mesh.triangles.len() <= 500 && mesh.is_closed());

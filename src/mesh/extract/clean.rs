@@ -131,8 +131,7 @@ mod tests {
         let values: Vec<f32> = (0..n * n * n).map(|i| f(node(i))).collect();
         let volume =
             crate::mesh::Volume { dims: [n; 3], values: &values, origin: Vec3::ZERO, spacing: Vec3::ONE };
-        let found = crate::mesh::marching(&volume, true).unwrap();
-        let mut m = Mesh { positions: found.positions, triangles: found.triangles, ..Mesh::default() };
+        let mut m = crate::mesh::marching(&volume, true).unwrap().mesh;
         let r = clean(&mut m).unwrap();
         // the specks, the head, its hollow and the piece inside that
         assert_eq!((r.pieces, r.dust + r.inner_shells), (23, 22));

@@ -57,7 +57,7 @@ pub fn extract_dense(
         let (values, spacing) = layers(pass, inside)?;
         let volume = Volume { dims: [resolution; 3], values: &values, origin: inside.min, spacing };
         let found = marching(&volume, false)?;
-        if found.triangles.is_empty() {
+        if found.mesh.triangles.is_empty() {
             let (nodes, size) = (values.len(), inside.size());
             return Err(Error::no_surface(
                 format!("the field does not change its sign at {nodes} nodes of {size:.3}"),
@@ -70,7 +70,7 @@ pub fn extract_dense(
         report.nodes_evaluated += values.len();
         report.share_evaluated = 1.0;
         report.non_finite = found.non_finite;
-        mesh = found.into_mesh();
+        mesh = found.mesh;
         let surface = mesh.bounds();
         let margin = MARGIN * surface.size();
         inside =

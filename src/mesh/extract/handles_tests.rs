@@ -2,7 +2,7 @@
 
 use super::{ExtractOptions, MeshReport, Patches, extract};
 use crate::Quiet;
-use crate::geom::{Aabb, Mesh, topology};
+use crate::geom::{Aabb, Mesh, SdfField, topology};
 use crate::mesh::files::check;
 use crate::mesh::{SimplifyConfig, simplify};
 use glam::Vec3;
@@ -187,32 +187,46 @@ fn noise_full_of_handles_comes_out_sound_with_fewer() {
     assert!(check(&mesh, 1.0).self_intersections <= check(&kept, 1.0).self_intersections);
 }
 
+/// The field of [`lock`] with the patches of its cuts.
+struct Closed(Patches);
+
+impl SdfField for Closed {
+    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
+        self.sdf_gradient(points).0
+    }
+
+    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
+        let (mut f, mut g): (Vec<f32>, Vec<Vec3>) =
+            points.iter().map(|&p| (lock(p), slope(&lock, p))).unzip();
+        self.0.close(points, &mut f, &mut g);
+        (f, g)
+    }
+
+    fn colors(&self, _: &[Vec3], _: &[Vec3], _: &[u32], directions: &[Vec3]) -> Vec<[f32; 3]> {
+        vec![[0.5; 3]; directions.len()]
+    }
+}
+
 #[test]
 fn what_was_cut_stays_where_it_is_when_triangles_are_held_against_the_field() {
     let (mut mesh, report) = simple(lock, 0.5, 1);
-    let patches = Patches::of(&mesh, &report.handles).unwrap();
-    let closed = |points: &[Vec3]| {
-        let (mut f, mut g): (Vec<f32>, Vec<Vec3>) =
-            points.iter().map(|&p| (lock(p), slope(&lock, p))).unzip();
-        patches.close(points, &mut f, &mut g);
-        (f, g)
-    };
+    let closed = Closed(Patches::of(&mesh, &report.handles).unwrap());
     let first = mesh.triangles.len() - report.handles.triangles;
     let middles: Vec<Vec3> =
         (first..mesh.triangles.len()).map(|t| mesh.corners(t as u32).iter().sum::<Vec3>() / 3.0).collect();
     // the field itself is up to 0.05 deep there
     assert!(middles.iter().any(|&p| lock(p) < -0.02));
-    let (values, slopes) = closed(&middles);
+    let (values, slopes) = closed.sdf_gradient(&middles);
     assert!(values.iter().all(|f| f.abs() < 1e-6));
     assert!(slopes.iter().all(|g| (g.length() - 1.0).abs() < 1e-3));
     // elsewhere it is the field
-    assert_eq!(closed(&[Vec3::new(-0.6, 0.0, 0.05)]).0, [lock(Vec3::new(-0.6, 0.0, 0.05))]);
+    assert_eq!(closed.sdf(&[Vec3::new(-0.6, 0.0, 0.05)]), [lock(Vec3::new(-0.6, 0.0, 0.05))]);
 
     let config = SimplifyConfig { triangles: mesh.triangles.len() / 4, ..SimplifyConfig::default() };
     let done = simplify(&mut mesh, Some(&closed), &config, &Quiet).unwrap();
     let t = topology(&mesh.positions, &mesh.triangles);
     assert!(t.is_solid() && t.genus == Some(0), "{t:?}");
     assert_eq!(done.self_intersections, 0);
-    let lowest = mesh.positions.iter().map(|&p| closed(&[p]).0[0].abs()).fold(0.0, f32::max);
+    let lowest = mesh.positions.iter().map(|&p| closed.sdf(&[p])[0].abs()).fold(0.0, f32::max);
     assert!(lowest < 0.5 * report.cell_size, "{lowest}");
 }

@@ -32,21 +32,12 @@ pub struct Volume<'a> {
 /// A level set as triangles, counter-clockwise seen from outside.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LevelSet {
-    /// Vertices: first one for each crossed grid edge, then those inside cells.
-    pub positions: Vec<Vec3>,
-    /// Three vertex indices each.
-    pub triangles: Vec<[u32; 3]>,
+    /// The surface: first a vertex for each crossed grid edge, then those inside cells.
+    pub mesh: Mesh,
     /// How many values were not finite (`+inf`, `NaN` count as outside, `-inf` as inside).
     pub non_finite: usize,
     /// Inside nodes on the outer faces that were taken as outside to close the surface.
     pub capped: usize,
-}
-
-impl LevelSet {
-    /// Returns the surface alone.
-    pub fn into_mesh(self) -> Mesh {
-        Mesh { positions: self.positions, triangles: self.triangles, ..Mesh::default() }
-    }
 }
 
 /// How much of a level set one part of a grid makes.
@@ -73,10 +64,10 @@ impl LevelSet {
         let sum = |of: fn(&PartCounts) -> u64| counts.iter().map(of).sum::<u64>();
         let (edges, inside, triangles) = (sum(|c| c.vertices), sum(|c| c.inner), sum(|c| c.triangles));
         check_count(edges + inside, triangles)?;
-        self.positions = vec![Vec3::ZERO; (edges + inside) as usize];
-        self.triangles = vec![[0; 3]; triangles as usize];
-        let (mut vertices, mut inner) = self.positions.split_at_mut(edges as usize);
-        let mut triangles = &mut self.triangles[..];
+        self.mesh.positions = vec![Vec3::ZERO; (edges + inside) as usize];
+        self.mesh.triangles = vec![[0; 3]; triangles as usize];
+        let (mut vertices, mut inner) = self.mesh.positions.split_at_mut(edges as usize);
+        let mut triangles = &mut self.mesh.triangles[..];
         let (mut first, mut first_inner) = (0, edges as u32);
         let part = |count: &PartCounts| {
             let own = PartOutput {
@@ -498,20 +489,20 @@ mod tests {
         let mut v = vec![1.0; 27];
         v[13] = -1.0;
         let s = marching(&cube(3, &v), false).unwrap();
-        assert_eq!((s.positions.len(), s.triangles.len()), (6, 8));
-        let mesh = crate::geom::Mesh { positions: s.positions, triangles: s.triangles, ..Default::default() };
+        let mesh = s.mesh;
+        assert_eq!((mesh.positions.len(), mesh.triangles.len()), (6, 8));
         assert!(mesh.is_closed());
         assert!((mesh.signed_volume() - 1.0 / 6.0).abs() < 1e-6);
     }
 
     #[test]
     fn a_volume_without_a_surface_is_empty_and_a_full_one_is_capped() {
-        assert!(marching(&cube(4, &[1.0; 64]), true).unwrap().triangles.is_empty());
-        assert!(marching(&cube(4, &[-1.0; 64]), false).unwrap().triangles.is_empty());
+        assert!(marching(&cube(4, &[1.0; 64]), true).unwrap().mesh.triangles.is_empty());
+        assert!(marching(&cube(4, &[-1.0; 64]), false).unwrap().mesh.triangles.is_empty());
         let full = marching(&cube(4, &[-1.0; 64]), true).unwrap();
         // 64 nodes, 8 of them inside the outer faces.
         assert_eq!(full.capped, 56);
-        assert!(!full.triangles.is_empty());
+        assert!(!full.mesh.triangles.is_empty());
     }
 
     #[test]
@@ -529,7 +520,7 @@ mod tests {
         let s = marching(&cube(3, &v), false).unwrap();
         assert_eq!(s.non_finite, 2);
         // -2 against +2: half way.
-        assert!(s.positions.iter().all(|p| p.is_finite() && (*p - Vec3::ONE).length() == 0.5));
+        assert!(s.mesh.positions.iter().all(|p| p.is_finite() && (*p - Vec3::ONE).length() == 0.5));
     }
 
     #[test]

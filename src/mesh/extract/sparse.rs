@@ -582,10 +582,11 @@ mod tests {
     /// The triangles as sorted positions: equal for equal surfaces, however numbered.
     fn key(s: &LevelSet) -> Vec<[[u32; 3]; 3]> {
         let mut all: Vec<_> = s
+            .mesh
             .triangles
             .iter()
             .map(|t| {
-                let mut c = t.map(|i| s.positions[i as usize].to_array().map(f32::to_bits));
+                let mut c = t.map(|i| s.mesh.positions[i as usize].to_array().map(f32::to_bits));
                 let first = (0..3).min_by_key(|&k| c[k]).unwrap();
                 c.rotate_left(first);
                 c
@@ -608,7 +609,7 @@ mod tests {
     fn asking_few_gives_the_dense_surface() {
         let (few, dense) = both(ball(Vec3::new(0.1, -0.05, 0.02), 0.6), Aabb::SCENE, 64);
         assert_eq!(key(&few.surface), key(&dense));
-        assert_eq!(few.surface.positions.len(), dense.positions.len());
+        assert_eq!(few.surface.mesh.positions.len(), dense.mesh.positions.len());
         assert!(few.evaluated * 8 < 65 * 65 * 65, "{}", few.evaluated);
     }
 
@@ -635,7 +636,7 @@ mod tests {
         assert_eq!(key(&few.surface), key(&dense));
         let tube = |p: Vec3| (p.x - 0.25).hypot(p.y - 0.25).max(p.z.abs() - 0.6) - 0.04;
         let (few, dense) = both(tube, Aabb::SCENE, 64);
-        assert!(!dense.triangles.is_empty());
+        assert!(!dense.mesh.triangles.is_empty());
         assert_eq!(key(&few.surface), key(&dense));
     }
 
@@ -682,11 +683,7 @@ mod tests {
     fn a_skipped_half_is_never_evaluated_and_the_rest_is_closed_there() {
         let grid = NodeGrid::fit(Aabb::SCENE, 48).unwrap();
         let s = sparse(&Half(ball(Vec3::ZERO, 0.6)), &grid, 8, &Quiet).unwrap();
-        let mesh = crate::geom::Mesh {
-            positions: s.surface.positions,
-            triangles: s.surface.triangles,
-            ..Default::default()
-        };
+        let mesh = s.surface.mesh;
         assert!(s.skipped > 0 && mesh.is_closed());
         assert!(mesh.bounds().max.x < 0.1 + grid.spacing);
     }

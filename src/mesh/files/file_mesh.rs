@@ -220,13 +220,14 @@ impl FileMesh {
         let of_mesh = |t: &[u32; 3]| t.map(|v| self.source[v as usize]);
         let has = |t: &&[u32; 3]| shells.layers.iter().any(|layer| layer.has(&of_mesh(t)));
         for triangle in self.triangles.iter().filter(has) {
-            out.triangles.push(triangle.map(|v| {
+            let own = triangle.map(|v| {
                 if known[v as usize] == u32::MAX {
                     out.uvs.extend(self.uvs.get(v as usize));
                     known[v as usize] = out.copy(self, v);
                 }
                 known[v as usize]
-            }));
+            });
+            out.triangles.push(own);
         }
         out
     }

@@ -5,6 +5,7 @@ use super::*;
 use crate::geom::{Topology, topology};
 use crate::mesh::{Volume, marching};
 use crate::monitor::{Quiet, Stopping};
+use glam::Vec3;
 
 type Answer = (Vec<f32>, Vec<Vec3>);
 
@@ -32,8 +33,7 @@ fn mesh_of(f: impl Fn(Vec3) -> f32, n: usize) -> Mesh {
     let values: Vec<f32> =
         (0..n * n * n).map(|i| f(Vec3::new(at(i % n), at(i / n % n), at(i / (n * n))))).collect();
     let volume = Volume { dims: [n; 3], values: &values, origin: Vec3::NEG_ONE, spacing: Vec3::splat(h) };
-    let surface = marching(&volume, true).unwrap();
-    Mesh { positions: surface.positions, triangles: surface.triangles, ..Mesh::default() }
+    marching(&volume, true).unwrap().mesh
 }
 
 fn ball(p: Vec3) -> f32 {
@@ -323,7 +323,7 @@ fn an_error_is_kept_with_and_without_a_field() {
     let start = mesh_of(ball, 40);
     let mut last = usize::MAX;
     for error in [2e-3, 1e-2, 4e-2] {
-        let config = SimplifyConfig { triangles: 0, error, ..SimplifyConfig::default() };
+        let config = SimplifyConfig { triangles: 0, error };
         let mut mesh = start.clone();
         let report = simplify(&mut mesh, Some(&ball), &config, &Quiet).unwrap();
         let worst = off_ball(&mesh);

@@ -4,7 +4,7 @@ use super::*;
 use crate::geom::{Bvh, Distortion, ShellCaster};
 use crate::kernel::cpu::rng;
 use crate::render::{RaycastOptions, raycast};
-use glam::{DMat3, DVec3, Vec2};
+use glam::{DMat3, DVec3, Vec2, Vec3};
 
 fn white(hits: &RayHits) -> Vec<[f32; 3]> {
     vec![[1.0; 3]; hits.hits.len()]

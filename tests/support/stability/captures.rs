@@ -8,7 +8,7 @@ use tiface::Result;
 use tiface::capture::Split;
 use tiface::capture::synthetic::{SyntheticHead, SyntheticOptions, cameras, write_photographs};
 use tiface::config::{Config, Preset, Stage, iface::Start};
-use tiface::geom::{Camera, Ray, Similarity};
+use tiface::geom::{Camera, Ray, SdfField, Similarity};
 use tiface::iface::IFace;
 use tiface::io::Limits;
 use tiface::kernel::cpu::march::Bitmask;

@@ -30,7 +30,7 @@ fn ball() -> Mesh {
     let values: Vec<f32> = (0..n * n * n).map(|i| at(i).length() - 0.8).collect();
     let spacing = Vec3::splat(1.0 / 15.5);
     let volume = Volume { dims: [n; 3], values: &values, origin: Vec3::NEG_ONE, spacing };
-    marching(&volume, true).map(|s| s.into_mesh()).unwrap_or_default()
+    marching(&volume, true).map(|s| s.mesh).unwrap_or_default()
 }
 
 fn ray(origin: Vec3, direction: Vec3) -> Ray {

@@ -55,7 +55,7 @@ fn volumes(cases: &mut Cases) {
         let values: Vec<f32> = (0..17 * 17 * 17).map(value).collect();
         let volume = Volume { dims: [17; 3], values: &values, origin: Vec3::ZERO, spacing: Vec3::ONE };
         let error = marching(&volume, true).map_or(f64::NAN, |s| {
-            let mesh = s.into_mesh();
+            let mesh = s.mesh;
             let flat = (0..mesh.triangles.len() as u32).filter(|&t| mesh.area(t) <= 0.0).count();
             faults(&mesh) + flat as f64
         });
