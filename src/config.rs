@@ -160,7 +160,7 @@ const ROOT_KEYS: &[Key] = &[
     ),
 ];
 
-/// Every table with its keys, in the order of the line; the first has no name.
+/// Every table with its keys, in pipeline order; the first has no name.
 const TABLES: &[(&str, &[Key])] = &[
     ("", ROOT_KEYS),
     ("capture", CaptureConfig::KEYS),
@@ -208,7 +208,7 @@ impl Config {
         Config::read(&folder.join("config.toml")).ok()
     }
 
-    /// Reads a configuration that stands alone in a file.
+    /// Reads a configuration from the text of a complete file.
     ///
     /// # Errors
     ///

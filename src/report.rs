@@ -1,5 +1,5 @@
 //! Pages to look at, one file each, nothing loaded from elsewhere: `report.html` of a run, a page of many runs, the head
-//! to turn, a run while it works. What they look like stands in `report/*.html`.
+//! to turn, a run while it works. Their markup is in `report/*.html`.
 //!
 //! Everything that comes from outside is escaped by the templates; only what this module made itself (drawings,
 //! pictures, JSON) goes in as it is.

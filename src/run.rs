@@ -6,7 +6,7 @@
 //!                   log.jsonl    one object per logged step
 //!                   …            the stage's own files
 //!                   done.json    last: what shaped the result, and its figures
-//! runs/002_00/estimate.json      what stages may cost, told before they are worked on
+//! runs/002_00/estimate.json      estimated cost of the stages, written before they run
 //!             failed.json        what a command ended with before any stage could say so
 //! ```
 //!
@@ -87,7 +87,7 @@ impl Run {
             return Ok(());
         }
         io::create_folder(&self.dir)?;
-        // one process at a time: what else of this file looks half-written was left by one that is gone
+        // one process at a time: other temporary files of this name were left by a process that has ended
         let lock = Lock::wait(&self.path(LOCK));
         if lock.is_ok() {
             let _ = io::remove_leftovers(&self.dir, |of, _| of == name); // the next one tries again
@@ -95,7 +95,7 @@ impl Run {
         Ok(io::write_atomic(&path, bytes)?)
     }
 
-    /// Removes what stages have made, so that they start anew; `names` in the order of the line. All their
+    /// Removes what stages have made, so that they start anew; `names` in pipeline order. All their
     /// locks are held meanwhile. What has a lock or a record of its own below a stage's folder stays.
     ///
     /// # Errors
@@ -116,7 +116,7 @@ impl Run {
         for name in folders {
             locks.push((self.path(name), self.lock(name)?));
         }
-        // the last stage first: stopped halfway, no stage is left whose input is gone
+        // the last stage first: stopped halfway, no stage is left without its input
         for (folder, _lock) in locks.iter().rev() {
             io::remove(&folder.join("done.json"))?;
             io::clear_folder(folder, LOCK, &has_record)?;

@@ -1,4 +1,4 @@
-//! Short trainings from one end of the line to the other: from photographs without masks to closed meshes at several
+//! Short trainings from one end of the pipeline to the other: from photographs without masks to closed meshes at several
 //! resolutions, of one capture in two formats, and of photographs at full size.
 
 mod command;
@@ -118,7 +118,7 @@ const FEW: [&str; 14] = [
     "tface.mask_steps=4",
 ];
 
-/// Works on a stage or the line with these settings and `set`.
+/// Runs a stage or the pipeline with these settings and `set`.
 fn few(folder: &Path, words: &[&str], set: &[&str]) {
     let sets = FEW.iter().chain(set).flat_map(|s| ["--set", *s]);
     let words: Vec<&str> = words.iter().copied().chain(["--preset", "draft"]).chain(sets).collect();
@@ -196,7 +196,7 @@ fn full_size(root: &Path, border: u32) {
 
 /// A few steps of both fields and a coarse mesh; the photographs are what is large.
 #[test]
-fn photographs_of_full_size_with_borders_go_through_the_line() {
+fn photographs_of_full_size_with_borders_go_through_the_pipeline() {
     let dir = tempfile::tempdir().unwrap();
     full_size(&dir.path().join("head"), 60);
     let inspected = tiface(dir.path(), &["inspect", "head", "--json"]);

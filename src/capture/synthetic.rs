@@ -1,7 +1,7 @@
 //! The demo capture: an analytic head photographed among the lamps of a small light stage, with exact truth.
 //!
 //! Written in the layout of a real capture (`images/`, `masks/`, `transforms.json`), so that the
-//! whole line runs on it unchanged; and its surface is a formula ([`SyntheticHead`]), so that what
+//! whole pipeline runs on it unchanged; and its surface is a formula ([`SyntheticHead`]), so that what
 //! comes out can be measured against the truth instead of against another reconstruction.
 //!
 //! Same options, same bytes.

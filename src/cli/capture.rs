@@ -51,7 +51,7 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
     print(&format!("{shown}\n"))
 }
 
-/// Writes the page for a capture. Clicks that are there already, `prompts` or the capture's own `prompts.json`, are in
+/// Writes the page for a capture. Existing clicks, `prompts` or the capture's own `prompts.json`, are in
 /// it.
 pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option<&Path>) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);

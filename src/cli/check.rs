@@ -210,7 +210,7 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     Ok(Against { whole: mm(whole), seen, by_views, back: mm(back), parts })
 }
 
-/// Skin and hair of each photograph, row by row: 0, 1, or neither. Empty where they are not told apart.
+/// Skin and hair of each photograph, row by row: 0, 1, or neither. Empty if the capture does not separate them.
 fn skin_and_hair(views: &[&View]) -> Result<Vec<Vec<Option<usize>>>> {
     // photographs are read only where they can say something
     let able = views.iter().any(|v| v.region.is_some());

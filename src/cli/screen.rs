@@ -107,7 +107,7 @@ impl Screen {
     }
 
     fn object(&self, value: &Value) {
-        // a reader that has gone away does not stop the work
+        // a closed pipe does not stop the work
         let _ = print(&format!("{value}\n"));
     }
 
@@ -190,7 +190,7 @@ impl Observer for Screen {
         if self.json {
             self.object(&json!(event));
         }
-        // a warning is for people too, whoever reads the objects
+        // a warning is also for people, even if a program reads the objects
         if !text.is_empty() && (!self.json || matches!(event, Event::Warning { .. })) {
             self.note(&head, &text);
         }
@@ -244,7 +244,7 @@ pub(super) fn figure(value: f64) -> String {
     }
 }
 
-/// Prints data to stdout, as [`plain`] text. A reader that has gone away (`| head`) is not an error.
+/// Prints data to stdout, as [`plain`] text. A closed pipe (`| head`) is not an error.
 pub(super) fn print(text: &str) -> Result<()> {
     let mut out = std::io::stdout().lock();
     let written = out.write_all(plain(text).as_bytes()).and_then(|()| out.flush());
@@ -262,7 +262,7 @@ fn plain(text: &str) -> Cow<'_, str> {
     escaped(text, |c| acts(c) && c != '\n' && c != '\t')
 }
 
-/// The same as one line, for what stands among others.
+/// Returns the same as one line, for a row among others.
 pub(super) fn one_line(text: &str) -> Cow<'_, str> {
     escaped(text, acts)
 }

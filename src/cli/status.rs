@@ -80,7 +80,7 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
     }
 }
 
-/// Where a run stands, if it is a folder at all.
+/// Returns the state of a run, if it is a folder.
 fn look(run: &Path) -> Result<RunStatus> {
     if !io::is_folder(run) {
         return Err(Error::cannot(format!("`{}` is not a folder", run.display()), ""));
@@ -88,7 +88,7 @@ fn look(run: &Path) -> Result<RunStatus> {
     Ok(RunStatus::read(run))
 }
 
-/// Is this one that somebody has to look after?
+/// Whether the run needs a user's attention.
 fn has_failed(run: &Result<RunStatus>) -> bool {
     let wrong = [Phase::Failed, Phase::Killed, Phase::Unreadable];
     run.as_ref().map_or(true, |s| wrong.contains(&s.phase))
@@ -125,7 +125,7 @@ fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> Strin
             continue;
         }
         let bar: String = standing.stages.iter().map(|s| sign(s.phase)).collect();
-        let _ = writeln!(text, "{:<width$}  {bar}  {}", name(run), one_line(&told(standing)));
+        let _ = writeln!(text, "{:<width$}  {bar}  {}", name(run), one_line(&described(standing)));
     }
     for (word, names) in shared {
         let mut line = format!("{word}:");
@@ -172,8 +172,8 @@ fn sign(phase: Phase) -> char {
     }
 }
 
-/// Where a run stands, after its bar.
-fn told(run: &RunStatus) -> String {
+/// Describes the state of a run, after its bar.
+fn described(run: &RunStatus) -> String {
     let at = run.stages.iter().find(|s| Some(s.stage) == run.at);
     let percent = at.and_then(|s| s.status.as_ref()?.percent());
     let share = percent.map_or(String::new(), |p| format!(" {p} %"));
@@ -240,7 +240,7 @@ fn stages(run: &Path, standing: &RunStatus) -> String {
         row(&name, &of_stage(&StageStatus::read(&path, Stage::Render)));
     }
     if standing.at.is_none() && standing.error.is_some() {
-        row("–", &told(standing));
+        row("–", &described(standing));
     }
     if let Some(left) = standing.left_s.filter(|s| *s > 0.0) {
         row("all", &format!("about {} left", duration(left)));
@@ -248,7 +248,7 @@ fn stages(run: &Path, standing: &RunStatus) -> String {
     text
 }
 
-/// Where a stage stands, in words.
+/// Describes the state of a stage.
 fn of_stage(s: &StageStatus) -> String {
     match &s.error {
         Some(error) if s.phase == Phase::Unreadable => format!("UNREADABLE: {error}"),

@@ -47,7 +47,7 @@ pub enum MaskSource {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskMeaning {
-    /// Empty space: nothing of the head is there.
+    /// Empty space: no part of the head.
     Empty,
     /// Not looked at, as nerfstudio's `mask_path` means it.
     Ignore,
@@ -81,7 +81,7 @@ pub enum MattingMethod {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VitmatteColors {
-    /// What lies beside the file says it, else ImageNet's mean and deviation.
+    /// From the file of settings beside it, or else ImageNet's mean and deviation.
     Auto,
     /// ImageNet's mean and deviation, as the original code.
     Imagenet,

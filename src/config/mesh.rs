@@ -116,7 +116,7 @@ table! {
         frame: MeshFrame => MeshFrame::Dataset;
     }
     constants {
-        /// Evaluate the whole grid, and leave what is found there as it is (published).
+        /// Evaluate the whole grid, and keep every surface found (published).
         dense: bool => false, false, true;
         /// Components with less than this share of the largest one's area are dropped: a head is one piece.
         keep_share: f64 => 1.0;

@@ -25,7 +25,7 @@ pub enum Method {
     Raster,
 }
 
-/// Pictures that are judged, in the order of the line: their word in folders, the configuration and
+/// Pictures that are judged, in pipeline order: their word in folders, the configuration and
 /// `metrics.json`, and what they are called. All but the last are those of [`Method`].
 pub const NAMES: [(&str, &str); 7] = [
     ("baseline", "baseline"),
@@ -72,7 +72,7 @@ pub enum PictureFormat {
     Exr,
 }
 
-/// What stands behind the head.
+/// The background of the views.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ViewBackground {

@@ -47,7 +47,7 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config> {
         given.push((key.clone(), RawValue::Text(value.clone()), format!("`{typed}`")));
     }
 
-    // the preset comes first whatever line it stands on; what it means is checked by `assign` below
+    // the preset comes first, on whatever line it is; `assign` checks its value below
     let named = given.iter().rfind(|(key, ..)| key == "preset").and_then(|(_, value, _)| {
         let word = match value {
             RawValue::Toml(value) => value.as_str()?,

@@ -1,4 +1,4 @@
-//! The words of the line: each names a stage, its table in `config.toml`, its folder in the run and its command.
+//! The words of the stages: each names a stage, its table in `config.toml`, its folder in the run and its command.
 
 use super::Config;
 use crate::{Error, Result};
@@ -6,7 +6,7 @@ use std::fmt::{self, Display};
 use std::path::Path;
 use std::str::FromStr;
 
-/// A stage of the line.
+/// A stage of the pipeline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Stage {
     /// Which pixels are the head, and where that puts it in space.

@@ -60,7 +60,7 @@ const WIDTH: f64 = 420.0;
 const HEIGHT: f64 = 170.0;
 const LEFT: f64 = 44.0;
 const BOTTOM: f64 = 18.0;
-/// Points of a line at most: more cannot be told apart.
+/// Maximum number of points of a line: more cannot be distinguished.
 const MOST: usize = 240;
 /// A figure over more than this many times its least value is drawn by its logarithm.
 const WIDE: f64 = 30.0;

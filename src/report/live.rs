@@ -22,7 +22,7 @@ struct StageRow {
     share: u64,
 }
 
-/// Returns the page of a run as it stands, for a file in its folder: pictures are named by their paths. `view` gives the
+/// Returns the page of a run in its current state, for a file in its folder: pictures are named by their paths. `view` gives the
 /// JPEG file of what a stage that is learning has learned so far, from its checkpoint of that time. The page loads itself
 /// again while `renewed`.
 ///
@@ -78,7 +78,7 @@ fn pictures(run: &Path) -> Vec<String> {
     NAMES.iter().flat_map(|(word, _)| views(run, word)).filter(|name| !name.ends_with(".exr")).collect()
 }
 
-/// Where a stage stands; nothing before it began.
+/// Describes the state of a stage; empty before it begins.
 fn row(run: &Path, stage: Stage) -> Option<StageRow> {
     let folder = run.join(stage);
     if let Ok(Some(record)) = read_record(&folder) {

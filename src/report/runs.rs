@@ -23,9 +23,9 @@ pub struct RunRow {
     /// A picture of the head: a `data:` address, or nothing.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub picture: String,
-    /// Where it stands.
+    /// Its state.
     pub state: String,
-    /// Is there nothing left to do?
+    /// Whether all stages are done.
     pub done: bool,
     /// Did it end by an error?
     pub failed: bool,
@@ -109,7 +109,7 @@ impl RunRow {
     }
 }
 
-/// Where a run stands, in words.
+/// Describes the state of a run.
 fn state(run: &RunStatus) -> String {
     let stage = run.stages.iter().find(|s| Some(s.stage) == run.at);
     let place = stage.map_or(String::new(), |s| format!("{} ", s.stage));
@@ -136,7 +136,7 @@ fn picture(run: &Path) -> Option<String> {
     Some(picture_url(&small_view(&run.join(file), PICTURE_PX, 78)?))
 }
 
-/// The way from a folder to a file; the file itself where one of them is not there.
+/// The way from a folder to a file; the file itself if one of them does not exist.
 fn relative(file: &Path, folder: &Path) -> PathBuf {
     let (Ok(file), Ok(folder)) = (io::real_path(file), io::real_path(folder)) else { return file.into() };
     let shared = file.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
@@ -175,7 +175,7 @@ fn outliers(values: &[Option<f64>]) -> Vec<bool> {
     }
     let middle = median(known.clone());
     let spread = 1.4826 * median(known.iter().map(|v| (v - middle).abs()).collect());
-    // most may be alike to the last digit: then whatever differs by more than a thousandth stands out
+    // most may be alike to the last digit: then any difference of more than a thousandth is an outlier
     let spread = spread.max(1e-3 * middle.abs() / OUTLIER);
     values.iter().map(|v| v.is_some_and(|v| (v - middle).abs() > OUTLIER * spread)).collect()
 }

@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// What happens in a run, for whoever shows it.
+/// Receives the events of a run.
 #[derive(Clone, Copy, Debug, Serialize)]
 #[serde(tag = "event", rename_all = "lowercase")]
 pub enum Event<'a> {
@@ -255,7 +255,7 @@ impl Monitor for Progress {
     }
 }
 
-/// A request to stop, shared between whoever hears signals and everything that computes.
+/// A request to stop, shared between the signal handler and all computation.
 #[derive(Clone, Default)]
 pub struct Stop(Arc<StopState>);
 

@@ -1,4 +1,4 @@
-//! Where a run stands as a whole: its stages by what they left, what is still to do, and what went wrong.
+//! The state of a whole run, from the files of its stages: what is done, what is left, and what failed.
 
 use super::{LOCK, Record, State, Status, read_estimate, read_record, read_status};
 use crate::config::{Config, Stage};
@@ -6,7 +6,7 @@ use crate::io::{self, Limits};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// Where a stage, or a run, stands.
+/// The state of a stage or a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Phase {
@@ -14,7 +14,7 @@ pub enum Phase {
     Waiting,
     /// A process works on it; on another machine: it was not heard to end.
     Running,
-    /// Its process is gone without having said why.
+    /// Its process has ended without recording a reason.
     Killed,
     /// Stopped on request after saving.
     Stopped,
@@ -33,7 +33,7 @@ pub enum Phase {
 pub struct StageStatus {
     /// Which.
     pub stage: Stage,
-    /// Where it stands.
+    /// Its state.
     pub phase: Phase,
     /// Its `status.json`.
     pub status: Option<Status>,
@@ -50,7 +50,7 @@ pub struct StageStatus {
 pub struct RunStatus {
     /// The stages that it is to have, in order; where it does not say, all of them.
     pub stages: Vec<StageStatus>,
-    /// Where it stands.
+    /// Its state.
     pub phase: Phase,
     /// The stage at work, else the one that ended last without being done.
     pub at: Option<Stage>,
@@ -78,7 +78,7 @@ pub struct Failure {
 pub const FAILED: &str = "failed.json";
 
 impl RunStatus {
-    /// Reads where the run in a folder stands; what is missing or damaged is part of the answer.
+    /// Reads the state of the run in a folder; missing and damaged files are part of the state.
     pub fn read(run: &Path) -> RunStatus {
         let estimate = read_estimate(run).unwrap_or_default();
         let is_part = |stage: &Stage| estimate.as_ref().is_none_or(|e| e.contains_key(stage.word()));
@@ -145,7 +145,7 @@ impl RunStatus {
 }
 
 impl StageStatus {
-    /// Reads where a stage stands from what it left in its folder.
+    /// Reads the state of a stage from the files in its folder.
     pub fn read(folder: &Path, stage: Stage) -> StageStatus {
         let (record, status) = (read_record(folder), read_status(folder));
         let unreadable = record.as_ref().err().or(status.as_ref().err()).map(|e| e.to_string());

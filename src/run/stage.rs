@@ -14,7 +14,7 @@ use std::sync::Arc;
 /// What a stage is about to do.
 #[derive(Clone, Debug)]
 pub struct Plan<'a> {
-    /// Its name: a word of the line.
+    /// Its name: the word of a stage.
     pub name: &'a str,
     /// Everything that shapes its result.
     pub fingerprint: Fingerprint,
@@ -22,7 +22,7 @@ pub struct Plan<'a> {
     pub device: &'a str,
     /// Bytes it will need on the disk, roughly.
     pub needs_bytes: u64,
-    /// Does it save what it has when asked to stop, to go on from there? Nobody waits for one that does not.
+    /// Whether it saves its progress on a request to stop, to resume from it. A stage that does not is not waited for.
     pub saves: bool,
 }
 
@@ -59,7 +59,7 @@ impl StageDir {
         self.check_stop()
     }
 
-    /// An error if somebody asked to stop.
+    /// Fails after a request to stop.
     pub fn check_stop(&self) -> Result<()> {
         self.progress.check_stop()
     }
@@ -176,7 +176,7 @@ impl Run {
         }
     }
 
-    /// Was what lies in the stage's folder made, or begun, with this plan? An error that prints the
+    /// Checks that the content of the stage's folder was made, or begun, with this plan. An error that prints the
     /// differences if not; an empty folder agrees with everything. An error, too, if what lies there was made by
     /// no stage.
     pub fn agrees(&self, plan: &Plan) -> Result<()> {
@@ -215,7 +215,7 @@ impl Run {
         record.is_ok_and(|r| r.is_some_and(|r| r.fingerprint == plan.fingerprint))
     }
 
-    /// The finished stage, if its record is there and fits.
+    /// Returns the finished stage, if its record exists and fits.
     fn complete(&self, plan: &Plan) -> Result<Option<Done>> {
         let record = match read_record(&self.path(plan.name)) {
             Ok(record) => record,
@@ -573,7 +573,7 @@ mod tests {
         }
         assert_eq!(fs::read(own.join("a.png")).unwrap(), b"mine");
         assert_eq!(fs::read_dir(dir.path().join("iface")).unwrap().count(), 1);
-        // refused as a whole: the stage that could have been cleared is still there
+        // refused as a whole: the stage that could have been cleared still exists
         assert!(dir.path().join("mask/done.json").is_file());
         fs::remove_dir_all(&own).unwrap();
         assert!(run.stage(plan(5), work).is_ok());

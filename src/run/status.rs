@@ -1,5 +1,5 @@
 //! `status.json` and `done.json`: what a stage says of itself; and `estimate.json`: what the stages of a run may cost,
-//! told before they are worked on.
+//! estimated before they run.
 
 use super::Fingerprint;
 use crate::io::{self, Limits, ReadError};
@@ -11,7 +11,7 @@ use std::ops::Add;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Where a stage stands.
+/// The state of a stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum State {
@@ -28,7 +28,7 @@ pub enum State {
 /// `status.json`, replaced as a whole about once a second.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Status {
-    /// Where it stands.
+    /// Its state.
     pub state: State,
     /// Steps done.
     pub step: u64,
@@ -195,7 +195,7 @@ fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Result<Option<T>, ReadEr
     io::read_typed(path, &Limits::default()).map(Some)
 }
 
-/// Seconds since 1970; 0 if the clock stands before that.
+/// Seconds since 1970; 0 if the clock is before that.
 pub(super) fn now() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())
 }
@@ -212,7 +212,7 @@ pub(super) fn host() -> String {
 /// Its name in a run.
 pub const ESTIMATE: &str = "estimate.json";
 
-/// What a stage may cost. No more than an estimate: whoever shows it corrects it by what is measured meanwhile.
+/// Estimated cost of a stage; displays correct it by what is measured meanwhile.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
     /// Seconds of one processor core; the clock shows them divided by the cores at work.

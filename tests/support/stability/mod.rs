@@ -1,5 +1,5 @@
 //! Hard cases, each with the largest error met and what it must stay below: what floating point, odd volumes, grazing
-//! rays and hard captures do to every part of the line.
+//! rays and hard captures do to every part of the pipeline.
 //!
 //! `tests/stability.rs` holds them to their bounds, `cargo bench --bench stability` prints them.
 
