@@ -29,7 +29,7 @@ use experiment::ExperimentOptions;
 use options::{Common, KeyOption, RunTarget};
 use out::Out;
 use preview::PreviewOptions;
-use run::LineCommand;
+use run::StageCommand;
 use screen::Screen;
 use status::StatusOptions;
 use std::io::Write;
@@ -470,7 +470,7 @@ pub fn main() -> ExitCode {
         Command::Doctor => makes_nothing("doctor").and_then(|()| about::doctor(&common)),
         Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
             .and_then(|out| about::completions(*form, Cli::command(), out.as_ref())),
-        stages => run::run(&invocation, &stages.on_line(&common)?),
+        stages => run::run(&invocation, &stages.on_stages(&common)?),
     });
     ExitCode::from(match ended {
         Ok(()) => 0,
@@ -482,8 +482,8 @@ pub fn main() -> ExitCode {
 }
 
 impl Command {
-    /// What a command on stages does on the line.
-    fn on_line(&self, common: &Common) -> Result<LineCommand<'_>> {
+    /// Returns the stages that a command runs, and its settings.
+    fn on_stages(&self, common: &Common) -> Result<StageCommand<'_>> {
         let on = |flag: bool, value: &'static str| flag.then_some(value);
         let (place, until, keys) = match self {
             Command::Run { place, clicks, .. } => (place, Stage::Metrics, clicks.keys()?),
@@ -533,7 +533,7 @@ impl Command {
                 (place, Stage::Ensemble, keys)
             }
             Command::Metrics { place, .. } => (place, Stage::Metrics, Vec::new()),
-            other => unreachable!("{other:?} does not work on the line"),
+            other => unreachable!("{other:?} runs no stage"),
         };
         let (product, require) = match self {
             Command::Run { require, .. } => ("run", &require[..]),
@@ -541,7 +541,7 @@ impl Command {
             _ => (until.word(), &[][..]),
         };
         let target = RunTarget::find(common, place.path.as_deref())?;
-        Ok(LineCommand { product, until, target, require, keys, fallback: None })
+        Ok(StageCommand { product, until, target, require, keys, fallback: None })
     }
 }
 
@@ -559,7 +559,7 @@ struct Invocation<'a> {
     pub common: &'a Common,
     /// Where people see what happens.
     pub screen: Arc<Screen>,
-    /// Set when somebody asks to stop.
+    /// Set on a request to stop.
     pub stop: Stop,
 }
 

@@ -3,7 +3,7 @@
 //! ```
 //! use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 //! use tiface::config::{Config, Preset};
-//! use tiface::pipeline::{Line, Stage, reconstruct};
+//! use tiface::pipeline::{Session, Stage, reconstruct};
 //! use tiface::run::Run;
 //!
 //! // a small analytic head in the place of photographs
@@ -18,8 +18,8 @@
 //! (config.mesh.resolution, config.mesh.triangles, config.mesh.texture_px) = (48, 2000, 128);
 //!
 //! let run = Run::quiet(&folder.path().join("run"));
-//! let line = Line::open(&config, &run)?;
-//! let done = reconstruct(&line, Stage::Mesh)?;
+//! let session = Session::open(&config, &run)?;
+//! let done = reconstruct(&session, Stage::Mesh)?;
 //!
 //! let (stage, mesh) = &done[2];
 //! assert_eq!((*stage, &mesh.summary["closed"]), (Stage::Mesh, &true.into()));
@@ -27,13 +27,13 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! The line, one word per stage: **capture** (what was photographed, from where) → **mask** (which
+//! The pipeline, one word per stage: **capture** (what was photographed, from where) → **mask** (which
 //! pixels are the head) → **baseline**, **tface** (radiance fields without and with masks), **iface** (a
 //! learned signed distance) → **mesh** (its zero level set, closed) → **render** (views by volume rendering and by
-//! ray casting) → **ensemble** (they become one) → **metrics**. [`pipeline`] is that line as functions; every stage
+//! ray casting) → **ensemble** (they become one) → **metrics**. [`pipeline`] runs them; every stage
 //! leaves a folder of plain files in the [`run`], and is skipped when it is done.
 //!
-//! Modules are declared in the order of that line; what they share stands first. The parts can be used alone:
+//! Modules are declared in pipeline order, after the modules that they share. The parts can be used alone:
 //! [`mesh`] meshes any signed distance and needs no field, [`capture`] reads `transforms*.json` and LLFF and says of other datasets what they are, [`io`] opens every
 //! file within limits. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file and
 //! place, and a suggested fix.

@@ -12,11 +12,11 @@
 //! ```
 //!
 //! Views from other cameras, a turntable for example, are a separate output of the pipeline
-//! ([`Line::with_camera_path`]).
+//! ([`Session::with_camera_path`]).
 //!
 //! Each stage names the stages that it reads from ([`Stage::needs`]); a command runs what its stage needs and nothing
 //! else. A stage is determined by its settings and by those of the stages it needs, which are known before it runs.
-//! So all fingerprints can be computed at once ([`Line::plan`]), a dry run lists what would be done, and a finished
+//! So all fingerprints can be computed at once ([`Session::plan`]), a dry run lists what would be done, and a finished
 //! stage is skipped without loading anything. The device is not part of the fingerprint, because it decides how fast
 //! a field is trained, not what the field is.
 
@@ -25,8 +25,8 @@ mod clicks;
 mod ensemble;
 pub mod experiment;
 mod finish;
+mod inputs;
 mod learn;
-mod line;
 mod lpips;
 mod mask;
 mod mesh;
@@ -38,56 +38,71 @@ mod plan;
 mod preview;
 mod render;
 mod scene_file;
+mod session;
 mod surface;
 
 pub use crate::config::Stage;
 pub use crate::geom::RayResult;
 pub use bench::{Bench, SWEEPS};
 pub use finish::Export;
-pub use line::{Line, capture_options, check_feasible, require_device};
 pub use mask::{click_page, inspect_capture};
 pub use mesh::export_head;
 pub use metrics::{Truth, against_truth};
 pub use page::{head_page, renew_report, viewer_of_file};
 pub use preview::{Preview, PreviewPicture, PreviewRenderer, field_view};
+pub use session::{DEMO_CAPTURE, Session, capture_options, check_feasible, require_device};
 pub use surface::{Fields, Radiance, Surface};
 
 use crate::Result;
 use crate::run::{Done, StageDir};
+use render::{Meshes, Renderer};
 
 /// Completes `until` and every stage that it needs, and writes the report.
-pub fn reconstruct(line: &Line, until: Stage) -> Result<Vec<(Stage, Done)>> {
-    let fields = learn::trained_fields(line);
+pub fn reconstruct(session: &Session, until: Stage) -> Result<Vec<(Stage, Done)>> {
+    let fields = learn::trained_fields(session);
     let mut done = Vec::new();
-    for stage in line.order(until) {
-        done.push((stage, complete(line, stage, &fields)?));
+    for stage in session.order(until) {
+        done.push((stage, complete(session, stage, &fields)?));
     }
     let idle = done.iter().all(|(_, stage)| stage.skipped);
-    page::write_report(line, idle)?;
+    page::write_report(session, idle)?;
     Ok(done)
 }
 
 /// Completes a stage from the outputs of the stages before it, or skips it if it is done. `fields` are the trained
 /// fields; only a stage that has work to do loads them.
-pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> {
-    let Line { capture, config, run, .. } = line;
+pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<Done> {
+    let Session { capture, config, run, .. } = session;
     if stage == Stage::Ensemble {
         ensemble::can_blend(config)?;
     }
     let work = |dir: &StageDir| match stage {
         Stage::Mask => {
-            line.write_inputs(dir.folder())?;
-            mask::mask(capture, line.clicks.as_ref(), config, dir)
+            session.inputs.write(dir.folder())?;
+            mask::mask(capture, session.inputs.clicks.as_ref(), config, dir)
         }
         Stage::Baseline | Stage::Tface | Stage::Iface => {
-            learn::learn(stage, capture, &line.scene()?, config, dir)
+            learn::learn(stage, capture, &session.scene()?, config, dir)
         }
-        Stage::Mesh => mesh::mesh(capture, &line.scene()?, fields.surface()?, config, dir),
-        Stage::Render => render::render(line, &line.scene()?, fields, dir),
-        Stage::Ensemble => ensemble::ensemble(line, &line.scene()?, fields, dir),
-        Stage::Metrics => metrics::metrics(line, dir),
+        Stage::Mesh => mesh::mesh(capture, &session.scene()?, fields.surface()?, config, dir),
+        Stage::Render => {
+            let (scene, c) = (session.scene()?, session.render_config());
+            let cameras = render::cameras(capture, session.path.as_ref(), &scene)?;
+            let meshes = Meshes::load(run, config, &c.method)?;
+            let renderer = Renderer::new(&scene, fields, &meshes, c.samples, dir.monitor());
+            render::render(c, &renderer, &cameras, &scene, config.capture.unit_m, dir)
+        }
+        Stage::Ensemble => ensemble::ensemble(capture, config, run, &session.scene()?, fields, dir),
+        Stage::Metrics => {
+            let has_mesh = session.order(Stage::Metrics).contains(&Stage::Mesh);
+            let demo = has_mesh && session::is_demo(config, run);
+            let surface = demo.then(|| mesh::surface_in_world(run)).transpose()?;
+            let evaluated = session.evaluation_capture();
+            let masks = session.mask_source(&evaluated);
+            metrics::metrics(&evaluated, config, run, masks, surface.as_ref(), dir)
+        }
     };
-    let done = run.stage(line.plan(stage), |dir| {
+    let done = run.stage(session.plan(stage), |dir| {
         let summary = work(dir)?;
         if matches!(stage, Stage::Mesh | Stage::Render | Stage::Ensemble) {
             fields.warnings().into_iter().for_each(|text| dir.warn(text));
@@ -95,7 +110,7 @@ pub fn complete(line: &Line, stage: Stage, fields: &dyn Fields) -> Result<Done> 
         Ok(summary)
     })?;
     if stage == Stage::Mask {
-        line.write_cameras(done.skipped)?;
+        session.write_cameras(done.skipped)?;
     }
     Ok(done)
 }
@@ -105,8 +120,8 @@ mod clicks_tests;
 #[cfg(test)]
 mod ensemble_tests;
 #[cfg(test)]
-mod line_tests;
-#[cfg(test)]
 mod path_tests;
+#[cfg(test)]
+mod session_tests;
 #[cfg(test)]
 mod tests;

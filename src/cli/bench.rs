@@ -6,7 +6,7 @@ use super::out::Out;
 use super::screen::print;
 use crate::config::{Config, Preset};
 use crate::io;
-use crate::pipeline::{Bench, Line, SWEEPS, check_feasible, require_device};
+use crate::pipeline::{Bench, SWEEPS, Session, check_feasible, require_device};
 use crate::report::duration;
 use crate::run::{Event, Observer, Run};
 use crate::{Error, Result};
@@ -28,7 +28,7 @@ pub(super) struct BenchOptions {
     sweep: Vec<String>,
 }
 
-/// Half the steps of a first look: all sweeps are to end while somebody waits.
+/// Half the steps of a first look: all sweeps end within minutes.
 const HALF: &str = "iface.steps = 1500\n";
 
 /// Tells warnings, and nothing of the rest: a bench has its own lines.
@@ -73,9 +73,9 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
     let run = quiet(&scratch.path().join("run"));
     io::create_folder(run.dir())?;
     let saved = target.saved.as_ref().map(|_| quiet(&target.run));
-    let open = |run| Line::open(&config, run);
-    let (line, finished) = (open(&run)?, saved.as_ref().map(open).transpose()?);
-    let bench = Bench::new(&line, finished.as_ref())?;
+    let open = |run| Session::open(&config, run);
+    let (session, finished) = (open(&run)?, saved.as_ref().map(open).transpose()?);
+    let bench = Bench::new(&session, finished.as_ref())?;
     let mut result = bench.begin();
     let start = Instant::now();
     for (i, sweep) in chosen.iter().enumerate() {

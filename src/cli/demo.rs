@@ -1,13 +1,13 @@
-//! `tiface demo`: the line on a synthetic head made on the spot.
+//! `tiface demo`: the pipeline on a synthetic head that it photographs first.
 
 use super::Invocation;
-use super::options::{DEMO_CAPTURE, RunTarget};
+use super::options::RunTarget;
 use super::out::Out;
-use super::run::{LineCommand, run as run_line};
+use super::run::{StageCommand, run as run_stages};
 use crate::capture::synthetic::{SyntheticOptions, check, write_borders, write_capture};
 use crate::config::Preset;
 use crate::io;
-use crate::pipeline::{Stage, check_feasible, require_device};
+use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
 use crate::report::duration;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -60,7 +60,7 @@ pub(super) fn run(
     }
     let target = RunTarget { capture: Some(io::real_path(&capture)?), saved, run, guessed: false };
     let (product, until) = ("run", Stage::Metrics);
-    run_line(invocation, &LineCommand { product, until, target, require: &[], keys: Vec::new(), fallback })
+    run_stages(invocation, &StageCommand { product, until, target, require: &[], keys: Vec::new(), fallback })
 }
 
 /// The default photographs, of another size or number.

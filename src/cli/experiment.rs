@@ -8,7 +8,7 @@ use super::screen::print;
 use crate::capture::synthetic::SyntheticOptions;
 use crate::config::Config;
 use crate::io::{self, Limits};
-use crate::pipeline::Line;
+use crate::pipeline::Session;
 use crate::pipeline::experiment::{
     ORDERINGS, ROWS, TABLES, ahead, config, measured, runs, without_masks, work,
 };
@@ -36,7 +36,7 @@ pub(super) struct ExperimentOptions {
     /// Make this run alone, as named by --dry-run, and no tables; repeatable
     #[arg(long, value_name = "CAPTURE/RUN")]
     only: Vec<String>,
-    /// Make no run, only the tables of those that are there
+    /// Make no run, only the tables of existing runs
     #[arg(long, conflicts_with = "only")]
     collect: bool,
     /// Figures of the publication: lines of table,row,measure,value
@@ -128,11 +128,12 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     let chosen = |task: &&Task| !options.collect && (all || options.only.contains(&task.name));
     let open = |task: &Task| Run::open(&folder.join(&task.name), stop.clone(), screen.clone());
     let opened: Vec<Run> = tasks.iter().map(open).collect();
-    let mut lines: Vec<Option<Line>> = tasks.iter().map(|_| None).collect();
+    let mut sessions: Vec<Option<Session>> = tasks.iter().map(|_| None).collect();
     let (mut failed, mut sum) = (None, Cost::default());
-    for ((task, run), line) in tasks.iter().zip(&opened).zip(&mut lines).filter(|((task, _), _)| chosen(task))
+    for ((task, run), session) in
+        tasks.iter().zip(&opened).zip(&mut sessions).filter(|((task, _), _)| chosen(task))
     {
-        let opened = match Line::open(&task.config, run) {
+        let opened = match Session::open(&task.config, run) {
             Ok(opened) => opened,
             // what a capture lacks for one row, as masks, it does not lack for each
             Err(e) if common.dry_run => {
@@ -148,9 +149,9 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
                 continue;
             }
         };
-        let line = &*line.insert(opened);
+        let session = &*session.insert(opened);
         if common.dry_run {
-            let cost = ahead(line, task.run);
+            let cost = ahead(session, task.run);
             sum = sum + cost.unwrap_or_default();
             if common.json {
                 let done = cost.is_none();
@@ -163,7 +164,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         }
         io::create_folder(run.dir())?;
         screen.note("experiment", &task.name);
-        match work(line, task.run) {
+        match work(session, task.run) {
             Err(e) if e.kind().is_stop() => {
                 failed = Some(e);
                 break;
@@ -189,10 +190,10 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     let rows: Vec<_> = ROWS.into_iter().filter(|row| words.contains(&row.table)).collect();
     let mut measured: Vec<Vec<Measured>> = vec![Vec::new(); rows.len()];
     // every capture has every run, in the same order: so each row gets one of each capture, in theirs
-    for (task, line) in tasks.iter().zip(&lines) {
+    for (task, session) in tasks.iter().zip(&sessions) {
         let (own, places): (Vec<&ExperimentRow>, Vec<&mut Vec<Measured>>) =
             rows.iter().zip(&mut measured).filter(|(row, _)| row.run == task.run).unzip();
-        places.into_iter().zip(found(&folder, task, line.as_ref(), &own)).for_each(|(to, m)| to.push(m));
+        places.into_iter().zip(found(&folder, task, session.as_ref(), &own)).for_each(|(to, m)| to.push(m));
     }
     let orderings = ORDERINGS.into_iter().filter(|o| words.contains(&o.table)).collect();
     let experiment =
@@ -230,15 +231,15 @@ fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> 
 }
 
 /// What some rows came to in their run; one that was not worked on is opened here, and only looked at.
-fn found(folder: &Path, task: &Task, line: Option<&Line>, rows: &[&ExperimentRow]) -> Vec<Measured> {
-    let of = |line: &Line| rows.iter().map(|row| measured(line, row)).collect();
-    if let Some(line) = line {
-        return of(line);
+fn found(folder: &Path, task: &Task, session: Option<&Session>, rows: &[&ExperimentRow]) -> Vec<Measured> {
+    let of = |session: &Session| rows.iter().map(|row| measured(session, row)).collect();
+    if let Some(session) = session {
+        return of(session);
     }
     let run = Run::quiet(&folder.join(&task.name));
     let problem = if io::is_folder(run.dir()) {
-        match Line::open(&task.config, &run) {
-            Ok(line) => return of(&line),
+        match Session::open(&task.config, &run) {
+            Ok(session) => return of(&session),
             Err(e) => e.to_string(),
         }
     } else {

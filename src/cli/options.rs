@@ -174,14 +174,11 @@ pub(super) struct RunTarget {
     pub run: PathBuf,
     /// The capture, absolute; `None` if the run remembers it.
     pub capture: Option<PathBuf>,
-    /// The run's own configuration, if the command takes it from there.
+    /// The run's own configuration, if the command uses it.
     pub saved: Option<PathBuf>,
     /// Was the run chosen without being named?
     pub guessed: bool,
 }
-
-/// Where in its run the demo keeps its photographs.
-pub(super) const DEMO_CAPTURE: &str = "capture";
 
 impl RunTarget {
     /// From the path on the command line and `--run`.
@@ -306,7 +303,7 @@ mod tests {
         // the demo's own photographs lie in its run
         ["config.toml", "capture/transforms.json", "capture/images/000.png"].into_iter().for_each(put);
         assert!(is_run(dir.path()));
-        // beside the settings it is a capture, until a stage was done there
+        // beside the settings it is a capture, until one of its stages is done
         put("transforms.json");
         assert!(!is_run(dir.path()));
         put("mask/done.json");

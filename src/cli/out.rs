@@ -1,12 +1,11 @@
 //! `--out`: where the product of a command goes as well. One rule for all of them, and checked before anything begins.
 //!
-//! An ending that the product has is a file of that kind; a folder, there already or named with a `/` at its end,
+//! An ending that the product has is a file of that kind; a folder, which exists or is named with a `/` at its end,
 //! takes the product under its own names; all else is refused.
 
-use super::options::DEMO_CAPTURE;
 use crate::config::MeshFormat;
 use crate::io;
-use crate::pipeline::{Line, Stage, export_head};
+use crate::pipeline::{DEMO_CAPTURE, Session, Stage, export_head};
 use crate::run::Run;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -16,7 +15,7 @@ use std::path::{Path, PathBuf};
 pub(super) enum Out {
     /// One file, and the ending that says which, in small letters.
     File(PathBuf, String),
-    /// A folder; made if it is not there.
+    /// A folder; made if it does not exist.
     Folder(PathBuf),
 }
 
@@ -110,12 +109,12 @@ impl Out {
     }
 
     /// Puts the command's product where `--out` says, and returns what was written.
-    pub fn write(&self, product: &str, line: &Line, run: &Run) -> Result<Vec<PathBuf>> {
+    pub fn write(&self, product: &str, session: &Session, run: &Run) -> Result<Vec<PathBuf>> {
         self.prepare()?;
         match self {
             Out::File(file, ending) if let Some(format) = mesh_format(ending) => {
                 let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
-                let exported = export_head(line, format, stem)?;
+                let exported = export_head(session, format, stem)?;
                 exported.warnings.iter().for_each(|w| run.warn("mesh", w));
                 let files = exported.files;
                 // the mesh names its pictures: it comes last, and under the name that was asked for
@@ -137,7 +136,7 @@ impl Out {
                 // fields, and pictures that only another stage can read, stay where they are
                 match product {
                     "run" => copy_folder(run.dir(), folder, &["baseline", "tface", "iface", DEMO_CAPTURE])?,
-                    "render" => copy_folder(&run.path(line.views()), folder, &["float", "paths"])?,
+                    "render" => copy_folder(&run.path(session.views()), folder, &["float", "paths"])?,
                     stage => copy_folder(&run.path(stage), folder, &["float", "parts"])?,
                 }
                 if product == "metrics" {

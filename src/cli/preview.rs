@@ -4,12 +4,11 @@
 use super::Invocation;
 use super::options::RunTarget;
 use super::out::Out;
-use super::run::is_demo;
 use super::screen::print;
 use crate::config::ViewBackground;
 use crate::geom::Camera;
 use crate::io::{self, Animation};
-use crate::pipeline::{Line, Preview, PreviewPicture, Stage, field_view, head_page, viewer_of_file};
+use crate::pipeline::{Preview, PreviewPicture, Session, Stage, field_view, head_page, viewer_of_file};
 use crate::render::Look;
 use crate::report::live_html;
 use crate::run::Run;
@@ -91,10 +90,10 @@ fn axis(word: &str) -> Vec3 {
     if word.starts_with('-') { -axis } else { axis }
 }
 
-/// Where the camera of a single picture stands: so far to the side of the front, and so far above. Radians.
+/// Azimuth from the front and elevation of the camera of a single picture, radians.
 const THREE_QUARTERS: (f64, f64) = (0.6, 0.15);
 
-/// How far a turntable's camera stands above, radians.
+/// Elevation of a turntable's camera, radians.
 const ABOVE: f64 = 0.1;
 
 /// Frames of an animation a second.
@@ -144,7 +143,7 @@ impl Kind {
         matches!(self, Kind::Turntable | Kind::Cameras)
     }
 
-    /// Where it goes: as asked for, else beside whoever asks.
+    /// Its file: from `--out`, or else in the working directory.
     fn place(self, asked: Option<Out>, name: &str) -> Out {
         let file = match self {
             Kind::Picture => format!("{name}_preview.png"),
@@ -293,7 +292,7 @@ fn shots(
         Kind::Sheet => {
             let (mut names, mut shots) = (Vec::new(), Vec::new());
             for (name, turn, tilt, own) in SHEET {
-                // what has no texture coordinates shows its shape there
+                // a mesh without texture coordinates shows its shape instead
                 let is_shape = own == Some(Look::Uv) && !preview.has_uvs();
                 let own = if is_shape { Look::Matcap } else { own.unwrap_or(look) };
                 shots.push((around(turn, tilt, size.unwrap_or(512), 1)?.remove(0).camera, own));
@@ -398,8 +397,7 @@ fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, asked: O
                 let name = io::real_path(&target.run).map_or_else(|_| "run".into(), |run| named(&run));
                 let html = move || {
                     let run = Run::open(&target.run, invocation.stop.clone(), screen.clone());
-                    let line = Line::open(&config, &run)?;
-                    head_page(&if is_demo(&config, &run) { line.with_synthetic_truth() } else { line })
+                    head_page(&Session::open(&config, &run)?)
                 };
                 (name, Box::new(html))
             }
@@ -435,7 +433,7 @@ const WATCHED: &str = "watch.html";
 /// How often that is written.
 const EVERY: Duration = Duration::from_secs(2);
 
-/// Writes the page of a run again and again until somebody stops it.
+/// Writes the page of a run repeatedly until the process is stopped.
 fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     let (common, stop) = (invocation.common, &invocation.stop);
     let (target, config) = target(invocation, path)?;

@@ -3,10 +3,9 @@
 use super::Invocation;
 use super::options::RunTarget;
 use super::out::Out;
-use super::run::is_demo;
 use super::screen::print;
 use crate::io;
-use crate::pipeline::{Line, renew_report};
+use crate::pipeline::{Session, renew_report};
 use crate::report::{RunRow, runs_csv, runs_html};
 use crate::run::Run;
 use crate::{Error, Result};
@@ -38,23 +37,20 @@ fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()
     };
     let config = common.resolve(Some(saved), None, &[])?;
     let run = Run::open(&target.run, invocation.stop.clone(), invocation.screen.clone());
-    let mut line = Line::open(&config, &run)?;
-    if is_demo(&config, &run) {
-        line = line.with_synthetic_truth();
-    }
+    let session = Session::open(&config, &run)?;
     let mut page = run.path("report.html");
     if common.dry_run {
         invocation.screen.note("report", &format!("would write `{}`", page.display()));
         return Ok(());
     }
-    renew_report(&line)?;
+    renew_report(&session)?;
     if let Some(out) = asked {
         let copy = out.file("report.html");
         out.prepare()?;
         io::write_atomic(&copy, &io::read_bytes(&page, &io::Limits::default())?)?;
         page = copy;
     }
-    told(invocation, &page)
+    print_page_path(invocation, &page)
 }
 
 /// Writes the page of many runs, and their figures beside it as CSV.
@@ -76,11 +72,11 @@ fn many(invocation: &Invocation, runs: &[PathBuf], asked: Option<&Out>) -> Resul
         let line = |row: RunRow| format!("{}\n", json!(RunRow { picture: String::new(), ..row }));
         print(&rows.into_iter().map(line).collect::<String>())?;
     }
-    told(invocation, &page)
+    print_page_path(invocation, &page)
 }
 
 /// Says where the page is.
-fn told(invocation: &Invocation, page: &Path) -> Result<()> {
+fn print_page_path(invocation: &Invocation, page: &Path) -> Result<()> {
     let common = invocation.common;
     match (common.json, common.quiet) {
         (true, _) => print(&format!("{}\n", json!({"event": "result", "report": page}))),

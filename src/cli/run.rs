@@ -1,20 +1,20 @@
-//! `tiface run` and the commands of single stages: the line, up to a stage; what its result must reach (`--require`); and
+//! `tiface run` and the commands of single stages: the pipeline up to a stage; what its result must reach (`--require`); and
 //! what is printed at the end: where everything is, and how good it is.
 
 use super::Invocation;
-use super::options::{Common, DEMO_CAPTURE, KeyOption, RunTarget};
+use super::options::{Common, KeyOption, RunTarget};
 use super::out::Out;
 use super::screen::{figure, print};
 use crate::config::{Config, NAMES, Preset, RenderConfig, called};
-use crate::pipeline::{Line, Stage, reconstruct};
+use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::{blend_verdict, duration, judged_by};
 use crate::run::{Cost, Done, Phase, Run, RunStatus};
 use crate::{Error, ErrorKind, Result, io};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
 
-/// A command that works on the line.
-pub(super) struct LineCommand<'a> {
+/// A command that runs stages.
+pub(super) struct StageCommand<'a> {
     /// What it makes: `run` (all there is), or the stage.
     pub product: &'static str,
     /// The last stage that it needs.
@@ -30,9 +30,9 @@ pub(super) struct LineCommand<'a> {
 }
 
 /// Completes the stages that a command needs, and puts its product where it was asked for.
-pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> {
+pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()> {
     let Invocation { common, screen, stop } = invocation;
-    let LineCommand { product, until, target, require, .. } = command;
+    let StageCommand { product, until, target, require, .. } = command;
     let out = Out::find(common.out.as_deref(), product)?;
     if target.guessed {
         screen.note("run", &format!("using `{}`", target.run.display()));
@@ -45,7 +45,7 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
     }
     let bars = require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>>>()?;
     let run = Run::open(&target.run, stop.clone(), screen.clone());
-    let line = ready(common, command, &config, &run, path, out.as_ref()).inspect_err(|e| {
+    let session = ready(common, command, &config, &run, path, out.as_ref()).inspect_err(|e| {
         // who runs many heads looks for what went wrong in their folders, not in logs; a run that is done stays as it is,
         // what was asked for otherwise than before is no fault of one that has begun, and a wrong command makes no folder
         let is_named = io::is_folder(run.dir()) || common.run.is_some() && e.kind() == ErrorKind::Cannot;
@@ -63,20 +63,20 @@ pub(super) fn run(invocation: &Invocation, command: &LineCommand) -> Result<()> 
         }
     })?;
     if common.dry_run {
-        print(&plan_summary(&line, *until, common)?)?;
-        return line.require(*until, common.fresh).map(|_| ());
+        print(&plan_summary(&session, *until, common)?)?;
+        return session.require(*until, common.fresh).map(|_| ());
     }
     run.not_failed();
-    screen.expect(line.ahead(*until).into_iter().map(|(stage, cost)| (stage, cost.seconds())).collect());
-    let done = reconstruct(&line, *until)?;
-    let written = out.map(|out| out.write(product, &line, &run)).transpose()?.unwrap_or_default();
+    screen.expect(session.ahead(*until).into_iter().map(|(stage, cost)| (stage, cost.seconds())).collect());
+    let done = reconstruct(&session, *until)?;
+    let written = out.map(|out| out.write(product, &session, &run)).transpose()?.unwrap_or_default();
     if common.json {
         let stages: Map<String, Value> =
             done.iter().map(|(s, d)| (s.to_string(), d.summary.clone())).collect();
         let result = json!({"event": "result", "run": run.dir(), "out": written, "stages": stages});
         print(&format!("{result}\n"))?;
     } else if !common.quiet {
-        print(&summary(&run, line.views(), &done, &written))?;
+        print(&summary(&run, session.views(), &done, &written))?;
     }
     bars.iter().try_for_each(|bar| bar.check(&done))
 }
@@ -92,40 +92,37 @@ fn without_device(settings: &str) -> String {
     settings.lines().filter(|line| !line.starts_with("device = ")).map(|line| format!("{line}\n")).collect()
 }
 
-/// The line, opened; all that can be refused before the first stage is refused here.
+/// Opens the session, and refuses here all that can be refused before the first stage.
 fn ready<'a>(
     common: &Common,
-    command: &LineCommand,
+    command: &StageCommand,
     config: &'a Config,
     run: &'a Run,
     path: Option<RenderConfig>,
     out: Option<&Out>,
-) -> Result<Line<'a>> {
-    let mut line = Line::open(config, run)?;
-    if is_demo(config, run) {
-        line = line.with_synthetic_truth();
-    }
+) -> Result<Session<'a>> {
+    let mut session = Session::open(config, run)?;
     if let Some(path) = path {
-        line = line.with_camera_path(path)?;
+        session = session.with_camera_path(path)?;
     }
     if let Some(out) = out {
-        out.check(run.dir(), &line.order(command.until))?;
+        out.check(run.dir(), &session.order(command.until))?;
     }
     if !common.dry_run {
         if let Some(fresh) = common.fresh {
-            line.fresh(fresh, command.until)?;
+            session.fresh(fresh, command.until)?;
         }
-        line.remember(command.until)?;
+        session.remember(command.until)?;
     }
-    Ok(line)
+    Ok(session)
 }
 
 /// What would be done for `until`, a row for each stage, with what each may cost, and all together.
-fn plan_summary(line: &Line, until: Stage, common: &Common) -> Result<String> {
-    let mut removed = common.fresh.map(|f| line.out_of_date(f)).transpose()?.unwrap_or_default();
+fn plan_summary(session: &Session, until: Stage, common: &Common) -> Result<String> {
+    let mut removed = common.fresh.map(|f| session.out_of_date(f)).transpose()?.unwrap_or_default();
     let mut text = String::new();
     let mut sum = Cost::default();
-    for (of, (stage, found)) in line.order(until).into_iter().zip(line.stage_states(until)?) {
+    for (of, (stage, found)) in session.order(until).into_iter().zip(session.stage_states(until)?) {
         let anew = removed.contains(&stage);
         removed.retain(|name| *name != stage);
         let (outlook, differences) = match found {
@@ -134,7 +131,7 @@ fn plan_summary(line: &Line, until: Stage, common: &Common) -> Result<String> {
             Some(d) if d.is_empty() => ("done", d),
             Some(d) => ("would stop: it differs", d),
         };
-        let cost = outlook.starts_with("to do").then(|| line.cost(of));
+        let cost = outlook.starts_with("to do").then(|| session.cost(of));
         sum = sum + cost.unwrap_or_default();
         if common.json {
             let found =
@@ -168,8 +165,8 @@ pub(super) fn in_words(cost: Cost) -> String {
 }
 
 /// The configuration that a target and the options amount to; it remembers its capture.
-fn configure(common: &Common, command: &LineCommand) -> Result<Config> {
-    let LineCommand { target, fallback, keys, .. } = command;
+fn configure(common: &Common, command: &StageCommand) -> Result<Config> {
+    let StageCommand { target, fallback, keys, .. } = command;
     let mut keys = keys.clone();
     if let Some(capture) = &target.capture {
         let path = capture.to_str().ok_or_else(|| {
@@ -199,12 +196,6 @@ fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
         None => common.resolve(None, None, &[])?,
     };
     Ok(RenderConfig { cameras: "test".into(), ..config.render })
-}
-
-/// Was this run made by `tiface demo`, also when its stages are run one by one?
-pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
-    let made = run.path(DEMO_CAPTURE);
-    io::real_path(&made).is_ok_and(|made| made == Path::new(&config.capture.path))
 }
 
 /// A bar set by `--require`.

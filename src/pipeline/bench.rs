@@ -5,9 +5,9 @@
 //! grid), others the path from a surface to the head mesh (simplification, texture).
 
 use super::finish::{Export, finish};
-use super::line::Line;
 use super::mesh::photographs;
 use super::render::{Meshes, Renderer};
+use super::session::Session;
 use super::surface::{ClosedSurface, Fields, Surface};
 use super::{complete, learn, pictures};
 use crate::capture::scene::Scene;
@@ -33,11 +33,11 @@ pub const SWEEPS: [&str; 5] = ["steps", "photographs", "hash", "triangles", "tex
 /// A capture on which decisions are measured.
 pub struct Bench<'l> {
     /// The session in which fields are trained; its run is deleted.
-    line: &'l Line<'l>,
+    session: &'l Session<'l>,
     /// A run whose finished fields are used instead of training new ones.
-    finished: Option<&'l Line<'l>>,
+    finished: Option<&'l Session<'l>>,
     scene: Scene,
-    evaluator: Evaluator<'l>,
+    evaluator: Evaluator,
     /// Set when the user asks to stop.
     watch: StopAt<'l>,
 }
@@ -49,11 +49,11 @@ impl<'l> Bench<'l> {
     /// # Errors
     ///
     /// Fails if the photographs cannot be read, or if there is no held-out view.
-    pub fn new(line: &'l Line<'l>, finished: Option<&'l Line<'l>>) -> Result<Bench<'l>> {
-        complete(line, Stage::Mask, &learn::trained_fields(line))?;
-        let (scene, evaluator) = (line.scene()?, Evaluator::new(line)?);
-        let watch = StopAt::new(u64::MAX, line.run.stop());
-        Ok(Bench { line, finished, scene, evaluator, watch })
+    pub fn new(session: &'l Session<'l>, finished: Option<&'l Session<'l>>) -> Result<Bench<'l>> {
+        complete(session, Stage::Mask, &learn::trained_fields(session))?;
+        let (scene, evaluator) = (session.scene()?, Evaluator::new(session)?);
+        let watch = StopAt::new(u64::MAX, session.run.stop());
+        Ok(Bench { session, finished, scene, evaluator, watch })
     }
 
     /// Returns an empty report: program, machine and capture.
@@ -63,7 +63,7 @@ impl<'l> Bench<'l> {
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
             processor: io::processor(),
             threads: rayon::current_num_threads(),
-            capture: self.line.capture.name.clone(),
+            capture: self.session.capture.name.clone(),
             sweeps: Vec::new(),
         }
     }
@@ -84,7 +84,7 @@ impl<'l> Bench<'l> {
     }
 
     fn config(&self) -> &Config {
-        self.line.config
+        self.session.config
     }
 
     fn monitor(&self) -> &dyn Monitor {
@@ -92,7 +92,7 @@ impl<'l> Bench<'l> {
     }
 
     fn check_stop(&self) -> Result<()> {
-        match self.line.run.stop().requested() {
+        match self.session.run.stop().requested() {
             Some(kind) => Err(Error::stopped("what was measured is kept").with_kind(kind)),
             None => Ok(()),
         }
@@ -100,26 +100,26 @@ impl<'l> Bench<'l> {
 
     /// Returns trained fields: those of a finished run, else those of this one, trained now if necessary.
     fn fields(&self, stages: &[Stage]) -> Result<impl Fields + 'l> {
-        let done = |line: &&&'l Line<'l>| stages.iter().all(|s| line.run.is_done(&line.plan(*s)));
-        let line: &'l Line<'l> = match self.finished.as_ref().filter(done) {
-            Some(line) => line,
+        let done = |session: &&&'l Session<'l>| stages.iter().all(|s| session.run.is_done(&session.plan(*s)));
+        let session: &'l Session<'l> = match self.finished.as_ref().filter(done) {
+            Some(session) => session,
             None => {
-                stages.iter().try_for_each(|stage| train_to_end(self.line, *stage))?;
-                self.line
+                stages.iter().try_for_each(|stage| train_to_end(self.session, *stage))?;
+                self.session
             }
         };
-        Ok(learn::trained_fields(line))
+        Ok(learn::trained_fields(session))
     }
 
     /// Returns the training cameras, in the scene.
     fn cameras(&self) -> Vec<Camera> {
-        let views = self.line.capture.split(Split::Train);
+        let views = self.session.capture.split(Split::Train);
         views.map(|v| v.camera.transformed(&self.scene.scene_from_world)).collect()
     }
 
     /// Returns the extracted surface with its cap and patches.
     fn extracted(&self, fields: &dyn Fields, c: &MeshConfig) -> Result<Extracted> {
-        let capture = &self.line.capture;
+        let capture = &self.session.capture;
         let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
         let field = fields.surface()?;
         let (mesh, report) =
@@ -161,15 +161,16 @@ fn timed<T>(work: impl FnOnce() -> Result<T>) -> Result<(T, WorkCost)> {
 const VIEWS: usize = 4;
 
 /// A few held-out photographs.
-struct Evaluator<'l> {
-    views: Vec<(&'l View, LoadedView, Photo)>,
+struct Evaluator {
+    views: Vec<(View, LoadedView, Photo)>,
     background: ViewBackground,
 }
 
-impl<'l> Evaluator<'l> {
+impl Evaluator {
     /// Loads some of a session's.
-    pub fn new(line: &'l Line<'l>) -> Result<Evaluator<'l>> {
-        let held_out = [Split::Test, Split::Val].map(|s| line.capture.split(s).collect::<Vec<_>>());
+    pub fn new(session: &Session) -> Result<Evaluator> {
+        let capture = session.evaluation_capture();
+        let held_out = [Split::Test, Split::Val].map(|s| capture.split(s).collect::<Vec<_>>());
         let Some(all) = held_out.into_iter().find(|views| !views.is_empty()) else {
             return Err(Error::cannot(
                 "no view of this capture is held out: there is nothing to judge by",
@@ -177,12 +178,12 @@ impl<'l> Evaluator<'l> {
             ));
         };
         let count = all.len().min(VIEWS);
-        let background = line.config.render.background;
+        let background = session.config.render.background;
         let views = (0..count).map(|i| {
             let view = all[i * all.len() / count];
-            let loaded = line.evaluation_view(view).load(&Limits::default())?;
+            let loaded = view.load(&Limits::default())?;
             let expected = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
-            Ok((view, loaded, expected))
+            Ok((view.clone(), loaded, expected))
         });
         Ok(Evaluator { views: views.collect::<Result<_>>()?, background })
     }
@@ -249,21 +250,21 @@ fn steps(config: &Config, stage: Stage) -> u64 {
 }
 
 /// Trains a field of a session up to a step, resuming from the current one.
-fn train_until(line: &Line, stage: Stage, step: u64) -> Result<()> {
-    let monitor = StopAt::new(step, line.run.stop());
-    let folder = line.run.path(stage);
+fn train_until(session: &Session, stage: Stage, step: u64) -> Result<()> {
+    let monitor = StopAt::new(step, session.run.stop());
+    let folder = session.run.path(stage);
     io::create_folder(&folder)?;
-    let session = TrainingSession {
+    let training = TrainingSession {
         stage: stage.word(),
-        seed: learn::seed(stage, line.config),
-        device: &line.config.device,
+        seed: learn::seed(stage, session.config),
+        device: &session.config.device,
         dir: &folder,
         identity: "bench",
         monitor: &monitor,
     };
-    match learn::train(stage, &line.capture, &line.scene()?, line.config, &session) {
+    match learn::train(stage, &session.capture, &session.scene()?, session.config, &training) {
         Ok(_) => Ok(()),
-        Err(e) if e.kind().is_stop() => match line.run.stop().requested() {
+        Err(e) if e.kind().is_stop() => match session.run.stop().requested() {
             Some(kind) => Err(Error::stopped("what was measured is kept").with_kind(kind)),
             None => Ok(()),
         },
@@ -272,13 +273,14 @@ fn train_until(line: &Line, stage: Stage, step: u64) -> Result<()> {
 }
 
 /// Trains a field of a session to its end.
-fn train_to_end(line: &Line, stage: Stage) -> Result<()> {
-    train_until(line, stage, u64::MAX)
+fn train_to_end(session: &Session, stage: Stage) -> Result<()> {
+    train_until(session, stage, u64::MAX)
 }
 
 /// Returns the metrics of the views of a session's field.
-fn evaluate(line: &Line, stage: Stage, evaluator: &Evaluator) -> Result<Vec<Option<f64>>> {
-    let (fields, scene, meshes) = (learn::trained_fields(line), line.scene()?, Meshes::load(line, &[])?);
+fn evaluate(session: &Session, stage: Stage, evaluator: &Evaluator) -> Result<Vec<Option<f64>>> {
+    let (fields, scene, meshes) =
+        (learn::trained_fields(session), session.scene()?, Meshes::load(session.run, session.config, &[])?);
     let method = if stage == Stage::Iface { Method::Volume } else { Method::Tface };
     let renderer = Renderer::new(&scene, &fields, &meshes, 1, &Quiet);
     Ok(vec![evaluator.psnr(&scene, &renderer, method)?])
@@ -287,15 +289,15 @@ fn evaluate(line: &Line, stage: Stage, evaluator: &Evaluator) -> Result<Vec<Opti
 impl Bench<'_> {
     /// Evaluates both fields after shares of their training.
     fn steps(&self) -> Result<Sweep> {
-        let line = self.line;
+        let session = self.session;
         let mut rows = Vec::new();
         for (series, stage) in [("I-Face", Stage::Iface), ("T-Face", Stage::Tface)] {
-            let all = steps(line.config, stage);
+            let all = steps(session.config, stage);
             let mut cost = WorkCost::default();
             for share in SHARES {
                 let step = ((all as f64 * share) as u64).max(1);
-                cost = cost + timed(|| train_until(line, stage, step))?.1;
-                let figures = evaluate(line, stage, &self.evaluator)?;
+                cost = cost + timed(|| train_until(session, stage, step))?.1;
+                let figures = evaluate(session, stage, &self.evaluator)?;
                 rows.push(Row { series, choice: format!("{step} steps"), cost, figures });
             }
         }
@@ -310,7 +312,7 @@ impl Bench<'_> {
         for times in [4, 2, 1] {
             let mut config = self.short();
             config.capture.downscale *= times;
-            let camera = &self.line.capture.views[0].camera;
+            let camera = &self.session.capture.views[0].camera;
             rows.push(self.row(format!("{} × {}", camera.width / times, camera.height / times), &config)?);
         }
         let (note, measures) = (self.note("Judged on photographs of full size."), vec![PSNR]);
@@ -346,14 +348,19 @@ impl Bench<'_> {
     /// Trains and evaluates I-Face with other settings.
     fn row(&self, choice: String, config: &Config) -> Result<Row> {
         self.check_stop()?;
-        let scratch = tempfile::tempdir_in(self.line.run.dir()).map_err(|e| {
+        let scratch = tempfile::tempdir_in(self.session.run.dir()).map_err(|e| {
             Error::cannot(format!("no scratch folder: {e}"), "free space, or name another place in TMPDIR")
         })?;
-        let run = Run::open(scratch.path(), self.line.run.stop().clone(), std::sync::Arc::new(Quiet));
-        let line = Line::open(config, &run)?;
-        complete(&line, Stage::Mask, &learn::trained_fields(&line))?;
-        let ((), cost) = timed(|| train_until(&line, Stage::Iface, config.iface.steps))?;
-        Ok(Row { series: "I-Face", choice, cost, figures: evaluate(&line, Stage::Iface, &self.evaluator)? })
+        let run = Run::open(scratch.path(), self.session.run.stop().clone(), std::sync::Arc::new(Quiet));
+        let session = Session::open(config, &run)?;
+        complete(&session, Stage::Mask, &learn::trained_fields(&session))?;
+        let ((), cost) = timed(|| train_until(&session, Stage::Iface, config.iface.steps))?;
+        Ok(Row {
+            series: "I-Face",
+            choice,
+            cost,
+            figures: evaluate(&session, Stage::Iface, &self.evaluator)?,
+        })
     }
 }
 
@@ -468,13 +475,13 @@ impl<'f> Finisher<'f> {
             let config = SimplifyConfig { triangles: c.triangles as usize, ..SimplifyConfig::default() };
             simplify(&mut mesh, Some(&|p: &[Vec3]| closed.sdf_gradient(p)), &config, bench.monitor())?;
         }
-        let views = learn::training_views(&bench.line.capture, &bench.scene, bench.config())?;
+        let views = learn::training_views(&bench.session.capture, &bench.scene, bench.config())?;
         Ok(Finisher { mesh, extracted, fields, views })
     }
 
     /// Lays out, bakes and fits with the settings `c`.
     pub fn finish(&self, bench: &Bench, c: &MeshConfig) -> Result<HeadMesh> {
-        let (capture, config) = (&bench.line.capture, bench.config());
+        let (capture, config) = (&bench.session.capture, bench.config());
         let (export, cell) = (Export::new(capture, config), self.extracted.report.cell_size);
         let (closed, cameras) = (self.extracted.closed(self.fields.surface()?), bench.cameras());
         let photographs = photographs(&self.views);

@@ -1,4 +1,4 @@
-//! Masks from clicks, as a stage of the line.
+//! Masks from clicks, as a stage of the pipeline.
 
 use super::clicks::propagated_clicks;
 use super::tests::NoFields;
@@ -48,13 +48,13 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
     let dir = tempfile::tempdir().unwrap();
     let (config, truth) = clicked(dir.path());
     let run = run(dir.path(), "run");
-    let line = Line::open(&config, &run).unwrap();
-    line.remember(Stage::Mask).unwrap();
-    let done = complete(&line, Stage::Mask, &NoFields).unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    session.remember(Stage::Mask).unwrap();
+    let done = complete(&session, Stage::Mask, &NoFields).unwrap();
     assert_eq!(done.summary["masks"], 10);
     assert_eq!(done.summary["made"]["clicked_views"], 3);
     assert_eq!(done.summary["suspicious"], serde_json::json!([]));
-    for (view, truth) in line.capture().views.iter().zip(&truth) {
+    for (view, truth) in session.capture().views.iter().zip(&truth) {
         // what a training reads
         let loaded = view.load(&Limits::default()).unwrap().mask.unwrap();
         assert!(iou(&loaded, truth) > 0.95, "{}: {}", view.name, iou(&loaded, truth));
@@ -63,22 +63,22 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
     }
     let sheet = String::from_utf8(io::read_bytes(&run.path("mask/sheet.html"), &Limits::default()).unwrap());
     assert_eq!(sheet.unwrap().matches("<figure").count(), 10);
-    assert!(complete(&line, Stage::Mask, &NoFields).unwrap().skipped);
+    assert!(complete(&session, Stage::Mask, &NoFields).unwrap().skipped);
 
     // the same clicks from another file are the same; other clicks are not
     let moved = dir.path().join("elsewhere.json");
     std::fs::rename(&config.mask.prompts, &moved).unwrap();
     let mut config = config;
     config.mask.prompts = moved.to_str().unwrap().into();
-    assert!(complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
+    assert!(complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
     // and the run outlives the file
     let text = std::fs::read_to_string(&moved).unwrap();
     std::fs::remove_file(&moved).unwrap();
-    assert!(complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
+    assert!(complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap().skipped);
     let mut prompts: serde_json::Value = serde_json::from_str(&text).unwrap();
     prompts["frames"][0]["points"].as_array_mut().unwrap().pop();
     std::fs::write(&moved, prompts.to_string()).unwrap();
-    let error = complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+    let error = complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     assert!(error.to_string().contains("clicks"), "{error}");
 }
 
@@ -87,18 +87,19 @@ fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_ma
     let dir = tempfile::tempdir().unwrap();
     let (config, truth) = clicked(dir.path());
     let run = run(dir.path(), "run");
-    let line = Line::open(&config, &run).unwrap();
-    complete(&line, Stage::Mask, &NoFields).unwrap();
-    assert_eq!(line.mask_source(), "capture");
-    for (view, truth) in line.capture().views.iter().zip(&truth) {
-        let judged = line.evaluation_view(view).load_mask(&Limits::default()).unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    complete(&session, Stage::Mask, &NoFields).unwrap();
+    let evaluated = session.evaluation_capture();
+    assert_eq!(session.mask_source(&evaluated), "capture");
+    for ((view, own), truth) in session.capture().views.iter().zip(&evaluated.views).zip(&truth) {
+        let judged = own.load_mask(&Limits::default()).unwrap();
         assert!(judged.as_ref() == Some(truth) && view.load_mask(&Limits::default()).unwrap() != judged);
     }
-    let plan = line.plan(Stage::Metrics).fingerprint;
+    let plan = session.plan(Stage::Metrics).fingerprint;
     // other masks judge otherwise; without any the run's own have to, and say so
     let masks = dir.path().join("head/masks");
     std::fs::copy(masks.join("001.png"), masks.join("000.png")).unwrap();
-    let other = Line::open(&config, &run).unwrap();
+    let other = Session::open(&config, &run).unwrap();
     assert!(
         other.plan(Stage::Metrics).fingerprint.differences(&plan).iter().any(|d| d.contains("own masks"))
     );
@@ -109,9 +110,10 @@ fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_ma
         let text = std::fs::read_to_string(&file).unwrap();
         std::fs::write(&file, text.replace("\"mask_path\"", "\"other\"")).unwrap();
     }
-    let bare = Line::open(&config, &run).unwrap();
+    let bare = Session::open(&config, &run).unwrap();
     let view = &bare.capture().views[0];
-    assert_eq!((bare.mask_source(), bare.evaluation_view(view).mask), ("run", view.mask.clone()));
+    let evaluated = bare.evaluation_capture();
+    assert_eq!((bare.mask_source(&evaluated), &evaluated.views[0].mask), ("run", &view.mask));
 }
 
 #[test]
@@ -122,7 +124,7 @@ fn clicks_that_make_no_sense_end_before_anything_is_written() {
         let mut config = good.clone();
         change(&mut config);
         let run = run(dir.path(), "refused");
-        let error = Line::open(&config, &run).err().expect("an error");
+        let error = Session::open(&config, &run).err().expect("an error");
         assert!(!error.hint().is_empty() && !run.dir().exists());
         error.to_string()
     };
@@ -159,7 +161,7 @@ fn a_network_that_is_no_network_is_refused_in_one_sentence() {
     let (mut config, _) = clicked(dir.path());
     config.mask.vitmatte = config.mask.prompts.clone();
     let run = run(dir.path(), "run");
-    let error = complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+    let error = complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     let expected = if cfg!(feature = "matting") { "prompts.json" } else { "this build cannot run networks" };
     assert!(error.to_string().contains(expected), "{error}");
     assert!(!run.path("mask/done.json").exists());
@@ -183,14 +185,15 @@ fn networks_cut_and_soften_and_are_recorded() {
     config.mask.sam = file("sam_tiny/vision_encoder.onnx");
     config.mask.sam_decoder = file("sam_tiny/prompt_encoder_mask_decoder.onnx");
     let run = run(dir.path(), "run");
-    let line = Line::open(&config, &run).unwrap();
-    let done = complete(&line, Stage::Mask, &NoFields).unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    let done = complete(&session, Stage::Mask, &NoFields).unwrap();
     let networks = &done.summary["made"]["networks"];
     assert_eq!(networks.as_array().unwrap().len(), 3, "{networks}");
     assert!(networks.to_string().contains("sha256"));
-    let first = run.path("mask").join(format!("{}.png", line.capture().views[0].name));
+    let first = run.path("mask").join(format!("{}.png", session.capture().views[0].name));
     assert!(first.is_file());
-    let inputs: Vec<&str> = line.clicks.as_ref().map(|c| c.inputs.iter().map(|i| i.0).collect()).unwrap();
+    let inputs: Vec<&str> =
+        session.inputs.clicks.as_ref().map(|c| c.inputs.iter().map(|i| i.0).collect()).unwrap();
     assert_eq!(inputs, ["clicks", "sam", "sam_decoder", "vitmatte"]);
 }
 
@@ -212,19 +215,22 @@ fn a_network_masks_all_views_without_a_click() {
     config.mask.prompts.clear();
     (config.mask.alpha_net, config.mask.alpha_input) = (file.to_str().unwrap().into(), "96,0,1".into());
     let run = run(dir.path(), "run");
-    let line = Line::open(&config, &run).unwrap();
-    let done = complete(&line, Stage::Mask, &NoFields).unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    let done = complete(&session, Stage::Mask, &NoFields).unwrap();
     assert_eq!((&done.summary["masks"], &done.summary["made"]["clicked_views"]), (&10.into(), &0.into()));
     assert_eq!(done.summary["made"]["networks"][0]["role"], "alpha_net");
-    assert_eq!(line.clicks.as_ref().unwrap().inputs.iter().map(|i| i.0).collect::<Vec<_>>(), ["alpha_net"]);
-    for (view, truth) in line.capture().views.iter().zip(&truth) {
+    assert_eq!(
+        session.inputs.clicks.as_ref().unwrap().inputs.iter().map(|i| i.0).collect::<Vec<_>>(),
+        ["alpha_net"]
+    );
+    for (view, truth) in session.capture().views.iter().zip(&truth) {
         let made = view.load_mask(&Limits::default()).unwrap().unwrap();
         assert!(iou(&made, truth) > 0.95, "{}: {}", view.name, iou(&made, truth));
     }
-    assert!(complete(&line, Stage::Mask, &NoFields).unwrap().skipped);
-    // a head's masks follow from what the network is shown, not from where it lies
+    assert!(complete(&session, Stage::Mask, &NoFields).unwrap().skipped);
+    // a head's masks follow from the network's content, not from its path
     config.mask.alpha_input = "96,0.1,1".into();
-    let other = complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+    let other = complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     assert!(other.to_string().contains("mask.alpha_input"), "{other}");
 }
 
@@ -247,13 +253,13 @@ fn three_clicked_photographs_of_a_light_stage_mask_them_all() {
         config.mask.prompts = root.join("prompts.json").to_str().unwrap().into();
         config.mask.band = band;
         let run = run(dir.path(), name);
-        let line = Line::open(&config, &run).unwrap();
+        let session = Session::open(&config, &run).unwrap();
         assert_eq!(
-            complete(&line, Stage::Mask, &NoFields).unwrap().summary["suspicious"],
+            complete(&session, Stage::Mask, &NoFields).unwrap().summary["suspicious"],
             serde_json::json!([])
         );
         let (mut overlap, mut error) = (Vec::new(), 0.0);
-        for (view, truth) in line.capture().views.iter().zip(&truth.views) {
+        for (view, truth) in session.capture().views.iter().zip(&truth.views) {
             let limits = Limits::default();
             let (made, truth) = (view.load_mask(&limits).unwrap(), truth.load_mask(&limits).unwrap());
             let (made, truth) = (made.unwrap(), truth.unwrap());
@@ -291,9 +297,9 @@ fn held_out_photographs_shape_only_their_own_masks() {
     prompts.write(Path::new(&config.mask.prompts)).unwrap();
     let masks = |name: &str| -> Vec<Vec<u8>> {
         let run = run(dir.path(), name);
-        let line = Line::open(&config, &run).unwrap();
-        complete(&line, Stage::Mask, &NoFields).unwrap();
-        let train = line.capture().views.iter().filter(|v| v.split == Split::Train);
+        let session = Session::open(&config, &run).unwrap();
+        complete(&session, Stage::Mask, &NoFields).unwrap();
+        let train = session.capture().views.iter().filter(|v| v.split == Split::Train);
         train.map(|v| v.load_mask(&Limits::default()).unwrap().unwrap().values).collect()
     };
     let before = masks("before");
@@ -306,7 +312,7 @@ fn held_out_photographs_shape_only_their_own_masks() {
     prompts.frames.drain(..3);
     prompts.write(Path::new(&config.mask.prompts)).unwrap();
     let run = run(dir.path(), "alone");
-    let error = complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+    let error = complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
     assert!(error.to_string().contains("held-out"), "{error}");
 }
 
@@ -327,7 +333,7 @@ fn paper_masks_without_networks_are_a_warning() {
     let warned = |config: &Config, name: &str| {
         let seen = std::sync::Arc::new(Warnings(Default::default()));
         let run = Run::open(&dir.path().join(name), Stop::new(), seen.clone());
-        complete(&Line::open(config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
+        complete(&Session::open(config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
         seen.0.lock().unwrap().iter().filter(|t| t.contains("the published masks are SAM's")).count()
     };
     assert_eq!((warned(&draft, "draft"), warned(&paper, "paper")), (0, 1));

@@ -8,18 +8,17 @@
 //! The weights are fitted on tiles of the training photographs that were excluded from training, unless the settings
 //! give them.
 
-use super::line::Line;
-use super::render::{Meshes, Renderer, cameras};
+use super::render::{Meshes, Renderer, held_out};
 use super::surface::Fields;
 use super::{learn, pictures};
 use crate::capture::scene::Scene;
-use crate::capture::{MaskMeaning, View, ViewMask};
+use crate::capture::{Capture, MaskMeaning, View, ViewMask};
 use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, called};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::image::{Gray, Image, Photo};
 use crate::io::{self, Limits};
 use crate::render::RenderedView;
-use crate::run::StageDir;
+use crate::run::{Run, StageDir};
 use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
@@ -28,24 +27,35 @@ use std::time::{Duration, Instant};
 const INSIDE: u8 = 128;
 
 /// Blends one picture per camera of `render`. `fields` are evaluated only if weights are to be fitted.
-pub(super) fn ensemble(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
-    let Config { ensemble: c, render, capture, .. } = line.config;
-    let cameras = cameras(line, scene)?;
+pub(super) fn ensemble(
+    capture: &Capture,
+    config: &Config,
+    run: &Run,
+    scene: &Scene,
+    fields: &dyn Fields,
+    dir: &StageDir,
+) -> Result<Value> {
+    let Config { ensemble: c, render, .. } = config;
+    let cameras = held_out(capture);
     let (weights, fitted) = match c.weights.is_empty() {
-        true => fit(line, scene, fields, dir)?,
+        true => {
+            let meshes = Meshes::load(run, config, &c.members)?;
+            let renderer = Renderer::new(scene, fields, &meshes, render.samples, dir.monitor());
+            fit(capture, config, scene, &renderer, dir)?
+        }
         false => (shares(c), Value::Null),
     };
     let mut spent = Duration::ZERO;
     for (i, camera) in cameras.iter().enumerate() {
-        let views = member_views(line, &camera.name)?;
+        let views = member_views(config, run, &camera.name)?;
         let begin = Instant::now();
-        let color = blend(&members(line, &views)?, &weights)?;
+        let color = blend(&members(capture, config, &views)?, &weights)?;
         spent += begin.elapsed();
         let mut view = RenderedView { color, depth: Image::new(0, 0, 1), normal: Image::new(0, 0, 3) };
         if let Some(background) = pictures::behind(render.background) {
             pictures::over(&mut view, background);
         }
-        pictures::write(dir.folder(), &camera.name, &view, render.format, capture.unit_m)?;
+        pictures::write(dir.folder(), &camera.name, &view, render.format, config.capture.unit_m)?;
         dir.step(i + 1, cameras.len())?;
     }
     let mut summary = json!({"members": words(&c.members), "weights": weights, "fitted": fitted});
@@ -126,11 +136,11 @@ fn shares(c: &EnsembleConfig) -> Vec<f32> {
 }
 
 /// Reads the views of all members from one camera, in float.
-fn member_views(line: &Line, name: &str) -> Result<Vec<Image>> {
+fn member_views(config: &Config, run: &Run, name: &str) -> Result<Vec<Image>> {
     let view = |member: &Method| {
         let word = member.folder();
         let below = format!("render/{word}/{}", pictures::FLOAT);
-        let file = pictures::float_path(&line.run.path(&below), name);
+        let file = pictures::float_path(&run.path(&below), name);
         if io::is_file(&file) {
             return Ok(pictures::read_float(&file)?);
         }
@@ -139,23 +149,23 @@ fn member_views(line: &Line, name: &str) -> Result<Vec<Image>> {
             format!(
                 "`tiface render RUN --fresh render --with {}` makes it from the stage `{}`, or leave it out of \
                  ensemble.members",
-                shown_with_members(line.config),
+                shown_with_members(config),
                 member.stage()
             ),
         ))
     };
-    line.config.ensemble.members.iter().map(view).collect()
+    config.ensemble.members.iter().map(view).collect()
 }
 
 /// Checks the members of one view, and cuts them to the head if the settings say so.
 ///
 /// Fitted weights never affect the cut, so that a fit sees the members as they will be blended.
-fn members<'i>(line: &Line, views: &'i [Image]) -> Result<Members<'i>> {
-    let c = &line.config.ensemble;
+fn members<'i>(capture: &Capture, config: &Config, views: &'i [Image]) -> Result<Members<'i>> {
+    let c = &config.ensemble;
     let member = |(m, image): (&Method, &'i Image)| Member {
         name: m.folder(),
         image,
-        masked: trained_with_masks(line, *m),
+        masked: trained_with_masks(capture, config, *m),
     };
     let list: Vec<Member<'i>> = c.members.iter().zip(views).map(member).collect();
     let members = Members::new(&list)?;
@@ -163,21 +173,30 @@ fn members<'i>(line: &Line, views: &'i [Image]) -> Result<Members<'i>> {
 }
 
 /// Whether the field was trained with masks.
-fn trained_with_masks(line: &Line, method: Method) -> bool {
+fn trained_with_masks(capture: &Capture, config: &Config, method: Method) -> bool {
     let has_mask = |v: &View| v.mask != ViewMask::None && v.mask_meaning == MaskMeaning::Empty;
     let used = match method {
-        Method::Baseline | Method::Tface => line.config.radiance(method.stage()).masks != MaskUse::None,
+        Method::Baseline | Method::Tface => config.radiance(method.stage()).masks != MaskUse::None,
         Method::Volume | Method::Raycast | Method::Textured | Method::Raster => true,
     };
-    used && line.capture.views.iter().any(has_mask)
+    used && capture.views.iter().any(has_mask)
 }
 
 /// Returns weights for the members, and a report of the fit; equal weights if no tile shows the head.
 ///
 /// Only the tiles are rendered: a few percent of the pixels of the training views.
-fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<(Vec<f32>, Value)> {
-    let c = &line.config.ensemble;
-    let imported = |method: &&Method| line.imports.iter().any(|import| import.stage == method.stage());
+fn fit(
+    capture: &Capture,
+    config: &Config,
+    scene: &Scene,
+    renderer: &Renderer,
+    dir: &StageDir,
+) -> Result<(Vec<f32>, Value)> {
+    let c = &config.ensemble;
+    let imported = |method: &&Method| {
+        matches!(method, Method::Baseline | Method::Tface)
+            && !config.radiance(method.stage()).import.is_empty()
+    };
     for method in c.members.iter().filter(imported) {
         dir.warn(&format!(
             "`{}` was not learned here and may know the pixels that weights are fitted on: its weight may be too \
@@ -185,10 +204,8 @@ fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Resul
             method.stage()
         ));
     }
-    let meshes = Meshes::load(line, &c.members)?;
-    let renderer = Renderer::new(scene, fields, &meshes, line.config.render.samples, dir.monitor());
     let mut sums = Vec::new();
-    for (view, tiles) in learn::held_out_tiles(&line.capture, line.config) {
+    for (view, tiles) in learn::held_out_tiles(capture, config) {
         let (photo, weight) = target(view)?;
         let camera = view.camera.transformed(&scene.scene_from_world);
         let mut sum = Fit::new(c.members.len())?;
@@ -204,7 +221,7 @@ fn fit(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Resul
                 dir.check_stop()?; // what it holds then is not whole
                 images.push(view.map_or_else(|| Image::new(tile.side, tile.side, 4), |view| view.color));
             }
-            sum.add(&members(line, &images)?, &BlendTarget { photo: &photo, weight: &weight })?;
+            sum.add(&members(capture, config, &images)?, &BlendTarget { photo: &photo, weight: &weight })?;
         }
         sums.push(sum);
     }

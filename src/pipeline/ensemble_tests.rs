@@ -53,14 +53,14 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     let paper = Config::preset(Preset::Paper);
     (config.ensemble, config.render.method) = (paper.ensemble, paper.render.method);
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).unwrap();
-    complete(&line, Stage::Mask, &NoFields).unwrap();
-    let names: Vec<String> = line.capture().split(Split::Test).map(|v| v.name.clone()).collect();
+    let session = Session::open(&config, &run).unwrap();
+    complete(&session, Stage::Mask, &NoFields).unwrap();
+    let names: Vec<String> = session.capture().split(Split::Test).map(|v| v.name.clone()).collect();
     for name in &names {
         put(&run, "baseline", name, flat([0.2, 0.2, 0.2, 1.0]));
         put(&run, "tface", name, flat([0.402, 0.402, 0.402, 1.0]));
     }
-    let e = complete(&line, Stage::Ensemble, &NoFields).unwrap_err();
+    let e = complete(&session, Stage::Ensemble, &NoFields).unwrap_err();
     let missing = format!("render/volume/float/{}.exr", names[0]);
     assert_eq!(
         e.to_string(),
@@ -74,7 +74,7 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     for name in &names {
         put(&run, "volume", name, flat([0.601, 0.601, 0.601, 1.0]));
     }
-    let done = complete(&line, Stage::Ensemble, &NoFields).unwrap();
+    let done = complete(&session, Stage::Ensemble, &NoFields).unwrap();
     assert_eq!(done.summary["views"], 2);
     // 0.1 · 0.2 + 0.6 · 0.402 + 0.3 · 0.601 = 0.4415 → 112.58 → 113; bytes blended would give
     // 0.1 · 51 + 0.6 · 103 + 0.3 · 153 = 112.8, and truncated 112
@@ -82,7 +82,7 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     assert_eq!(pixel(&run, &format!("ensemble/{}.png", names[1]), 77), [113; 3]);
     let weights = io::read_json(&run.path("ensemble/weights.json"), &io::Limits::default()).unwrap();
     assert_eq!((&weights["weights"], &weights["fitted"]), (&json!([0.1f32, 0.6f32, 0.3f32]), &json!(null)));
-    assert!(complete(&line, Stage::Ensemble, &NoFields).unwrap().skipped);
+    assert!(complete(&session, Stage::Ensemble, &NoFields).unwrap().skipped);
 }
 
 /// A field that has learned every photograph by heart, each pixel `off` from what it should be.
@@ -92,8 +92,8 @@ struct ByHeart {
 }
 
 impl ByHeart {
-    fn new(line: &Line, off: f32) -> ByHeart {
-        let scene = line.scene().unwrap();
+    fn new(session: &Session, off: f32) -> ByHeart {
+        let scene = session.scene().unwrap();
         let learned = |view: &View| {
             let loaded = view.load(&io::Limits::default()).unwrap();
             let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), ViewBackground::None);
@@ -103,7 +103,7 @@ impl ByHeart {
             }
             (view.camera.transformed(&scene.scene_from_world), image)
         };
-        ByHeart { views: line.capture().views.iter().map(learned).collect(), asked: 0.into() }
+        ByHeart { views: session.capture().views.iter().map(learned).collect(), asked: 0.into() }
     }
 }
 
@@ -146,16 +146,16 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
         config.ensemble.members = vec![Method::Tface, Method::Baseline];
         config.metrics.surface_points = 100;
         let run = quiet(dir.path());
-        let line = Line::open(&config, &run).unwrap();
-        complete(&line, Stage::Mask, &NoFields).unwrap();
+        let session = Session::open(&config, &run).unwrap();
+        complete(&session, Stage::Mask, &NoFields).unwrap();
         // what is rendered of test views says the opposite: had they a say, the worse member would win
-        let names: Vec<String> = line.capture().split(Split::Test).map(|v| v.name.clone()).collect();
+        let names: Vec<String> = session.capture().split(Split::Test).map(|v| v.name.clone()).collect();
         for name in &names {
             put(&run, "tface", name, flat([1.0; 4]));
             put(&run, "baseline", name, flat([0.0, 0.0, 0.0, 1.0]));
         }
-        let fields = Two(ByHeart::new(&line, tface), ByHeart::new(&line, baseline));
-        let done = complete(&line, Stage::Ensemble, &fields).unwrap().summary;
+        let fields = Two(ByHeart::new(&session, tface), ByHeart::new(&session, baseline));
+        let done = complete(&session, Stage::Ensemble, &fields).unwrap().summary;
         let first = done["weights"][0].as_f64().unwrap();
         assert!((first - expected).abs() < 0.05, "{tface} {baseline}: {done}");
         let found = &done["fitted"];
@@ -170,7 +170,7 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
         assert!((shown - 255.0 * first).abs() < 1.0, "{shown} {first}");
         // only squares are marched: 8 views of 32 × 40 pixels, one tile of 8 × 8 in each
         assert!(fields.0.asked.into_inner() <= 8 * 64, "of 8 · 1280");
-        let sets: Vec<String> = metrics::picture_sets(&line).into_iter().map(|s| s.name).collect();
+        let sets: Vec<String> = metrics::picture_sets(&config, &run).into_iter().map(|s| s.name).collect();
         assert_eq!(sets, ["tface", "baseline", "ensemble"]);
     }
 }
@@ -181,12 +181,12 @@ fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
     let blind = |config: &Config| -> Vec<usize> {
-        let line = Line::open(config, &run).unwrap();
+        let session = Session::open(config, &run).unwrap();
         if !run.path("mask/scene.json").exists() {
-            complete(&line, Stage::Mask, &NoFields).unwrap();
+            complete(&session, Stage::Mask, &NoFields).unwrap();
         }
-        let views = learn::train_views(&line.capture, &line.scene().unwrap(), config, true).unwrap();
-        let tiles = learn::held_out_tiles(&line.capture, config);
+        let views = learn::train_views(&session.capture, &session.scene().unwrap(), config, true).unwrap();
+        let tiles = learn::held_out_tiles(&session.capture, config);
         for (view, (_, tiles)) in views.iter().zip(&tiles) {
             let Some(valid) = &view.valid else { continue };
             assert!(tiles.iter().flat_map(|t| t.pixels(SIZE.0)).all(|i| valid.values[i] == 0));
@@ -210,8 +210,8 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
     let error = |change: &dyn Fn(&mut Config)| {
         let mut config = base.clone();
         change(&mut config);
-        let line = Line::open(&config, &run).unwrap();
-        let e = line.remember(Stage::Metrics).unwrap_err();
+        let session = Session::open(&config, &run).unwrap();
+        let e = session.remember(Stage::Metrics).unwrap_err();
         assert_eq!(e.kind(), ErrorKind::Usage);
         assert!(!run.path("config.toml").exists());
         (e.to_string(), e.hint().to_owned())
@@ -233,7 +233,7 @@ fn what_cannot_be_blended_is_said_before_anything_is_learned() {
     let mut config = base.clone();
     config.render.method = vec![Method::Volume];
     config.ensemble.members.clear();
-    let line = Line::open(&config, &run).unwrap();
-    assert_eq!(words(&line.order(Stage::Metrics)), "mask iface render metrics");
-    line.remember(Stage::Metrics).unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    assert_eq!(words(&session.order(Stage::Metrics)), "mask iface render metrics");
+    session.remember(Stage::Metrics).unwrap();
 }

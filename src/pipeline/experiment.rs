@@ -1,7 +1,7 @@
 //! The paper's tables: the runs that they are made of and their results. A row is a preset of settings; its run is
 //! made by the pipeline like any other, and a finished run is not made again.
 
-use super::line::{Line, capture_options};
+use super::session::{Session, capture_options};
 use super::{Stage, complete, learn, reconstruct};
 use crate::capture;
 use crate::config::iface::FieldKind;
@@ -225,12 +225,12 @@ fn shrink(c: &mut Config, scale: f64) {
 
 /// Completes the unfinished stages of a run. I-Face's rows count surfaces, so a missing surface is a result and no
 /// error.
-pub fn work(line: &Line, run: &str) -> Result<()> {
-    line.remember(Stage::Metrics)?;
-    reconstruct(line, Stage::Metrics)?;
+pub fn work(session: &Session, run: &str) -> Result<()> {
+    session.remember(Stage::Metrics)?;
+    reconstruct(session, Stage::Metrics)?;
     if has_surface(run) {
-        let fields = learn::trained_fields(line);
-        match complete(line, Stage::Mesh, &fields) {
+        let fields = learn::trained_fields(session);
+        match complete(session, Stage::Mesh, &fields) {
             Err(e) if !e.is_no_surface() => return Err(e),
             _ => {}
         }
@@ -239,23 +239,23 @@ pub fn work(line: &Line, run: &str) -> Result<()> {
 }
 
 /// Returns the stages that a run is made of.
-fn stages(line: &Line, run: &str) -> Vec<Stage> {
-    let mut order = line.order(Stage::Metrics);
+fn stages(session: &Session, run: &str) -> Vec<Stage> {
+    let mut order = session.order(Stage::Metrics);
     order.extend(has_surface(run).then_some(Stage::Mesh));
     order
 }
 
 /// Returns the errors of a run's failed stages, and the first stage that is not done with the session's settings.
-fn problems(line: &Line, run: &str) -> Vec<String> {
+fn problems(session: &Session, run: &str) -> Vec<String> {
     let failed = |stage: Stage| {
-        let status = read_status(&line.run.path(stage)).ok().flatten()?;
+        let status = read_status(&session.run.path(stage)).ok().flatten()?;
         Some(format!("stage `{stage}`: {}", status.error?))
     };
     let mut out: Vec<String> = Stage::ALL.into_iter().filter_map(failed).collect();
-    let plans: Vec<_> = stages(line, run).into_iter().map(|stage| line.plan(stage)).collect();
-    if let Some(e) = plans.iter().find_map(|plan| line.run.agrees(plan).err()) {
+    let plans: Vec<_> = stages(session, run).into_iter().map(|stage| session.plan(stage)).collect();
+    if let Some(e) = plans.iter().find_map(|plan| session.run.agrees(plan).err()) {
         out.push(e.to_string());
-    } else if let Some(plan) = plans.iter().find(|plan| !line.run.is_done(plan))
+    } else if let Some(plan) = plans.iter().find(|plan| !session.run.is_done(plan))
         && out.is_empty()
     {
         out.push(format!("stage `{}` is not done yet", plan.name));
@@ -266,12 +266,12 @@ fn problems(line: &Line, run: &str) -> Vec<String> {
 
 /// Returns the results of a row in its run. Figures count only if the run's stages are done with the session's
 /// configuration; results of other settings in the same folder are ignored.
-pub fn measured(line: &Line, row: &ExperimentRow) -> Measured {
+pub fn measured(session: &Session, row: &ExperimentRow) -> Measured {
     let mut out = Measured::default();
-    let mut problems = problems(line, row.run);
-    if line.order(Stage::Metrics).into_iter().all(|stage| line.run.is_done(&line.plan(stage))) {
-        match io::read_json(&line.run.path("metrics/metrics.json"), &Limits::default()) {
-            Ok(value) => out = figures(line, row, &value),
+    let mut problems = problems(session, row.run);
+    if session.order(Stage::Metrics).into_iter().all(|stage| session.run.is_done(&session.plan(stage))) {
+        match io::read_json(&session.run.path("metrics/metrics.json"), &Limits::default()) {
+            Ok(value) => out = figures(session, row, &value),
             Err(e) => problems.push(e.to_string()),
         }
     }
@@ -280,7 +280,7 @@ pub fn measured(line: &Line, row: &ExperimentRow) -> Measured {
 }
 
 /// Returns the figures of a row whose stages are done; `value` is the content of `metrics.json`.
-fn figures(line: &Line, row: &ExperimentRow, value: &Value) -> Measured {
+fn figures(session: &Session, row: &ExperimentRow, value: &Value) -> Measured {
     let mut out = Measured::default();
     let set = &value[row.pictures];
     let list = |part: &str| set[part]["views"].as_array().cloned().unwrap_or_default();
@@ -295,29 +295,30 @@ fn figures(line: &Line, row: &ExperimentRow, value: &Value) -> Measured {
     }
     out.masks = value["truth"]["masks"].as_str().map(String::from);
     out.outside = set["mean_square_opacity_outside"].as_f64();
-    let summary =
-        |stage: Stage| read_record(&line.run.path(stage)).ok().flatten().map_or(Value::Null, |r| r.summary);
+    let summary = |stage: Stage| {
+        read_record(&session.run.path(stage)).ok().flatten().map_or(Value::Null, |r| r.summary)
+    };
     let shown = summary(Stage::Render);
     // a time of 0 means that an interrupted process had rendered all views, so the time they took is unknown
     let seconds = |method: &str| shown["seconds_per_view"][method].as_f64().filter(|s| *s > 0.0);
     out.seconds = match row.pictures {
         "ensemble" => {
             let blend = summary(Stage::Ensemble)["seconds_per_view"].as_f64();
-            let members = line.config.ensemble.members.iter().map(|member| seconds(member.folder()));
+            let members = session.config.ensemble.members.iter().map(|member| seconds(member.folder()));
             members.chain([blend]).sum()
         }
         method => seconds(method),
     };
-    if row.table == "iface" && has_surface(row.run) && line.run.is_done(&line.plan(Stage::Mesh)) {
+    if row.table == "iface" && has_surface(row.run) && session.run.is_done(&session.plan(Stage::Mesh)) {
         out.pieces = summary(Stage::Mesh)["report"]["topology"]["pieces"].as_u64();
     }
     out
 }
 
 /// Returns the estimated cost of the unfinished stages of a run, one after the other; `None` if all are done.
-pub fn ahead(line: &Line, run: &str) -> Option<Cost> {
-    let stages = stages(line, run).into_iter().filter(|stage| !line.run.is_done(&line.plan(*stage)));
-    stages.map(|stage| line.cost(stage)).reduce(|sum, cost| sum + cost)
+pub fn ahead(session: &Session, run: &str) -> Option<Cost> {
+    let stages = stages(session, run).into_iter().filter(|stage| !session.run.is_done(&session.plan(*stage)));
+    stages.map(|stage| session.cost(stage)).reduce(|sum, cost| sum + cost)
 }
 
 #[cfg(test)]
@@ -412,7 +413,7 @@ mod tests {
             c.capture.path.clone_from(&path);
             without_masks(run, &mut c);
             let run = Run::quiet(&dir.path().join("run"));
-            Line::open(&c, &run).map(|_| c.mask.source)
+            Session::open(&c, &run).map(|_| c.mask.source)
         };
         assert!(opens("baseline-one").is_ok_and(|source| source == MaskSource::Auto));
         std::fs::remove_dir_all(Path::new(&path).join("masks")).unwrap();
@@ -448,13 +449,13 @@ mod tests {
         };
         let (c, other) = (of(0.01), of(0.02));
         let run = Run::quiet(&dir.path().join("run"));
-        let line = Line::open(&c, &run).unwrap();
+        let session = Session::open(&c, &run).unwrap();
         let view = json!([{"name": "v", "psnr_masked": 30.0, "psnr": 20.0}]);
         let set = json!({"head": {"views": view}});
         let metrics =
             json!({"volume": set, "ensemble": set, "truth": {"photographs": "photo", "masks": "run"}});
-        for stage in line.order(Stage::Metrics) {
-            let made = run.stage(line.plan(stage), |dir| match stage {
+        for stage in session.order(Stage::Metrics) {
+            let made = run.stage(session.plan(stage), |dir| match stage {
                 Stage::Render => {
                     Ok(json!({"seconds_per_view": {"baseline": 1.5, "tface": 2.0, "volume": 4.0}}))
                 }
@@ -471,43 +472,43 @@ mod tests {
         let problem_of = |m: &Measured| m.problem.clone().unwrap_or_default();
 
         // the row needs a surface, too; a missing one is a result and reported as such
-        let found = measured(&line, &surface);
+        let found = measured(&session, &surface);
         assert_eq!((found.figures.len(), problem_of(&found).as_str()), (1, "stage `mesh` is not done yet"));
         let positive = |points: &[Vec3]| vec![1.0; points.len()];
         let slopes = |points: &[Vec3]| (vec![1.0; points.len()], vec![Vec3::X; points.len()]);
         let colors = |points: &[Vec3], _: &[Vec3]| vec![[0.5; 3]; points.len()];
-        let none = run.stage(line.plan(Stage::Mesh), |_| {
+        let none = run.stage(session.plan(Stage::Mesh), |_| {
             extract_dense(positive, slopes, colors, Aabb::SCENE, (9, 100), &Quiet)?;
             Ok(Value::Null)
         });
         assert!(none.unwrap_err().is_no_surface());
-        let found = measured(&line, &surface);
+        let found = measured(&session, &surface);
         assert!(found.figures.len() == 1 && found.pieces.is_none(), "{found:?}");
         assert!(problem_of(&found).starts_with("stage `mesh`: no surface"), "{found:?}");
         // of every row of the run
-        assert_eq!(problem_of(&measured(&line, &blend)), problem_of(&found));
-        run.stage(line.plan(Stage::Mesh), |_| Ok(json!({"report": {"topology": {"pieces": 3}}}))).unwrap();
-        let found = measured(&line, &surface);
+        assert_eq!(problem_of(&measured(&session, &blend)), problem_of(&found));
+        run.stage(session.plan(Stage::Mesh), |_| Ok(json!({"report": {"topology": {"pieces": 3}}}))).unwrap();
+        let found = measured(&session, &surface);
         assert_eq!((found.pieces, found.seconds, found.problem), (Some(3), Some(4.0), None));
         assert_eq!(found.masks.as_deref(), Some("run"));
         // its members' 1.5, 2 and 4, and 0.5 of the blend
-        assert_eq!(measured(&line, &blend).seconds, Some(8.0));
+        assert_eq!(measured(&session, &blend).seconds, Some(8.0));
 
         // a different mesh: the figures of the views still count, the pieces do not
         let mut finer = c.clone();
         finer.mesh.resolution += 1;
-        let found = measured(&Line::open(&finer, &run).unwrap(), &surface);
+        let found = measured(&Session::open(&finer, &run).unwrap(), &surface);
         assert!(found.figures.len() == 1 && found.pieces.is_none(), "{found:?}");
         assert!(
             problem_of(&found).contains("stage `mesh` was done with other settings: mesh.resolution: was")
         );
 
         // a different scale: no figure counts
-        let line = Line::open(&other, &run).unwrap();
-        let refused = work(&line, "paper").unwrap_err();
+        let session = Session::open(&other, &run).unwrap();
+        let refused = work(&session, "paper").unwrap_err();
         assert!(refused.to_string().contains("was done with other settings") && !refused.is_no_surface());
         for row in [surface, blend] {
-            let found = measured(&line, &row);
+            let found = measured(&session, &row);
             assert!(found.views.is_empty() && found.figures.is_empty());
             assert_eq!((found.seconds, found.pieces, found.masks.clone()), (None, None, None));
             let problem = problem_of(&found);
@@ -533,17 +534,17 @@ mod tests {
         c.capture.path = head(dir.path());
         let run = Run::quiet(&dir.path().join("run"));
         let row = row_of("tface", "ce-one");
-        let line = Line::open(&c, &run).unwrap();
-        assert_eq!(measured(&line, &row).problem.as_deref(), Some("stage `mask` is not done yet"));
-        work(&line, row.run).unwrap();
-        assert!(ahead(&line, row.run).is_none());
-        let found = measured(&line, &row);
+        let session = Session::open(&c, &run).unwrap();
+        assert_eq!(measured(&session, &row).problem.as_deref(), Some("stage `mask` is not done yet"));
+        work(&session, row.run).unwrap();
+        assert!(ahead(&session, row.run).is_none());
+        let found = measured(&session, &row);
         assert_eq!((found.views.len(), found.problem.clone()), (2, None));
         assert_eq!(found.masks.as_deref(), Some("capture"));
         assert!(found.figures.iter().all(|f| f[0].is_some() && f[1].is_some()) && found.seconds.is_some());
         let when = |file: &str| std::fs::metadata(run.path(file)).unwrap().modified().unwrap();
         let before = when("tface/checkpoint.safetensors");
-        work(&line, row.run).unwrap();
+        work(&session, row.run).unwrap();
         assert_eq!(when("tface/checkpoint.safetensors"), before);
     }
 }

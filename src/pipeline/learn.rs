@@ -3,7 +3,7 @@
 //! The tiles of the training photographs that are excluded from training are chosen here too: the ensemble's weights
 //! are fitted on them.
 
-use super::line::Line;
+use super::session::Session;
 use super::surface::{Fields, Radiance, Surface, march};
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, LoadedView, Split, View};
@@ -117,26 +117,26 @@ fn bitmask(scene: &Scene) -> Option<Bitmask> {
 
 /// The trained fields of a run, each loaded when it is first used.
 struct TrainedFields<'l> {
-    line: &'l Line<'l>,
+    session: &'l Session<'l>,
     iface: OnceCell<Box<dyn Surface>>,
     tface: OnceCell<FieldMean>,
     baseline: OnceCell<FieldMean>,
 }
 
 /// Returns the trained fields of a run; nothing is loaded yet.
-pub(super) fn trained_fields<'l>(line: &'l Line<'l>) -> impl Fields {
-    TrainedFields { line, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
+pub(super) fn trained_fields<'l>(session: &'l Session<'l>) -> impl Fields {
+    TrainedFields { session, iface: OnceCell::new(), tface: OnceCell::new(), baseline: OnceCell::new() }
 }
 
 impl Fields for TrainedFields<'_> {
     fn surface(&self) -> Result<&dyn Surface> {
-        let Line { run, config, .. } = self.line;
+        let Session { run, config, .. } = self.session;
         let load = || -> Result<Box<dyn Surface>> {
             let folder = run.path(Stage::Iface);
             if config.iface.field == FieldKind::Density {
                 return Ok(Box::new(DensityField::load(&folder, &config.iface)?));
             }
-            let hull = bitmask(&self.line.scene()?);
+            let hull = bitmask(&self.session.scene()?);
             let field = IFace::load(&folder, &config.iface, hull.as_ref())?;
             #[cfg(feature = "wgpu")]
             let field = field.on(compute_device(&config.device, &SDF_TEST)?);
@@ -146,7 +146,7 @@ impl Fields for TrainedFields<'_> {
     }
 
     fn radiance(&self, stage: Stage) -> Result<&dyn Radiance> {
-        let Line { run, config, .. } = self.line;
+        let Session { run, config, .. } = self.session;
         let load = || {
             let count = config.radiance(stage).learned();
             let field = FieldMean::load(stage.word(), &run.path(stage), count)?;

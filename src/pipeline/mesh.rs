@@ -9,7 +9,7 @@
 
 use super::finish::{Export, FinishedHead, REACH, finish};
 use super::learn;
-use super::line::Line;
+use super::session::Session;
 use super::surface::{ClosedSurface, Surface};
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, LoadedView, Split};
@@ -20,7 +20,7 @@ use crate::io::{self, Limits};
 use crate::mesh::bake::{Learned, seen_colors};
 use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshReport, Patches, Photograph};
-use crate::run::{Phase, Record, StageDir, StageStatus, Status};
+use crate::run::{Phase, Record, Run, StageDir, StageStatus, Status};
 use crate::{Error, Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
@@ -187,8 +187,8 @@ fn write_exr(linear: &Image, path: &Path) -> Result<()> {
 /// # Errors
 ///
 /// Fails if the stage `mesh` has left no head mesh, or if it is damaged.
-pub fn export_head(line: &Line, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
-    Export::new(&line.capture, line.config).files(&head_mesh(line)?, format, stem)
+pub fn export_head(session: &Session, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
+    Export::new(&session.capture, session.config).files(&head_mesh(session.run)?, format, stem)
 }
 
 /// Returns the stage's record in a run.
@@ -212,18 +212,18 @@ pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
 }
 
 /// Returns the head mesh that the stage wrote.
-pub(super) fn head_mesh(line: &Line) -> Result<HeadMesh> {
-    HeadMesh::load(&line.run.path("mesh/parts"))
+pub(super) fn head_mesh(run: &Run) -> Result<HeadMesh> {
+    HeadMesh::load(&run.path("mesh/parts"))
 }
 
 /// Returns the extracted surface that the stage wrote, in scene coordinates, as it was before export.
-pub(super) fn extracted_surface(line: &Line) -> Result<ExtractedSurface> {
-    ExtractedSurface::load(&line.run.path("mesh/parts"))
+pub(super) fn extracted_surface(run: &Run) -> Result<ExtractedSurface> {
+    ExtractedSurface::load(&run.path("mesh/parts"))
 }
 
 /// Returns the extracted surface that the stage wrote, in the dataset's world.
-pub(super) fn surface_in_world(line: &Line) -> Result<Mesh> {
-    let path = line.run.path("mesh/surface.ply");
+pub(super) fn surface_in_world(run: &Run) -> Result<Mesh> {
+    let path = run.path("mesh/surface.ply");
     read(&io::read_bytes(&path, &Limits::default())?, &path)
 }
 

@@ -2,18 +2,16 @@
 //!
 //! A mesh of the demo head is compared with its exact surface ([`against_truth`]).
 
-use super::line::Line;
 use super::lpips::{Lpips, measure};
-use super::mesh::surface_in_world;
 use super::pictures;
 use crate::capture::synthetic::SyntheticHead;
-use crate::capture::{LoadedView, View};
-use crate::config::{Method, Stage, TruthPhoto, ViewBackground};
+use crate::capture::{Capture, LoadedView, View};
+use crate::config::{Config, Method, TruthPhoto, ViewBackground};
 use crate::geom::{Bvh, Mesh};
 use crate::image::Gray;
 use crate::io::{self, Limits};
 use crate::metrics::{Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
-use crate::run::StageDir;
+use crate::run::{Run, StageDir};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -51,41 +49,49 @@ struct ViewFigures {
 }
 
 /// Returns all sets that are evaluated, in pipeline order.
-pub(super) fn picture_sets(line: &Line) -> Vec<PictureSet> {
-    let set = |name: &str, folder: &str| PictureSet { name: name.into(), folder: line.run.path(folder) };
-    let methods = line.config.render.method.iter().map(|m| m.folder());
+pub(super) fn picture_sets(config: &Config, run: &Run) -> Vec<PictureSet> {
+    let set = |name: &str, folder: &str| PictureSet { name: name.into(), folder: run.path(folder) };
+    let methods = config.render.method.iter().map(|m| m.folder());
     let mut sets: Vec<PictureSet> = methods.map(|m| set(m, &format!("render/{m}"))).collect();
-    if !line.config.ensemble.members.is_empty() {
+    if !config.ensemble.members.is_empty() {
         sets.push(set("ensemble", "ensemble"));
     }
     sets
 }
 
 /// Returns the pictures of a set that have a photograph.
-pub(super) fn comparable<'l>(line: &'l Line, set: &PictureSet) -> Vec<Comparable<'l>> {
+pub(super) fn comparable<'c>(capture: &'c Capture, config: &Config, set: &PictureSet) -> Vec<Comparable<'c>> {
     let floats = set.folder.join(pictures::FLOAT);
-    let picture = |view: &'l View| {
-        let file = pictures::path(&set.folder, &view.name, line.config.render.format);
+    let picture = |view: &'c View| {
+        let file = pictures::path(&set.folder, &view.name, config.render.format);
         Comparable { view, file, float: pictures::float_path(&floats, &view.name) }
     };
-    line.capture.views.iter().map(picture).filter(|c| io::is_file(&c.file)).collect()
+    capture.views.iter().map(picture).filter(|c| io::is_file(&c.file)).collect()
 }
 
 /// Writes `metrics.json`. Every rendered or blended view is compared with its photograph, inside the mask and inside
 /// the capture's region of interest, and part by part (opaque pixels, outline, skin, hair, coverage); opacity outside
-/// the head is measured, and the mesh is compared with the true surface if that is known.
-pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
+/// the head is measured. `capture` has the masks that the metrics use, from the source `masks`; `surface` is the demo's
+/// mesh, which is compared with the true surface.
+pub(super) fn metrics(
+    capture: &Capture,
+    config: &Config,
+    run: &Run,
+    masks: &str,
+    surface: Option<&Mesh>,
+    dir: &StageDir,
+) -> Result<Value> {
     let mut out = Map::new();
-    let sets = picture_sets(line);
-    let comparables: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(line, set)).collect();
-    let mut views: Vec<View> = comparables.iter().flatten().map(|c| line.evaluation_view(c.view)).collect();
+    let sets = picture_sets(config, run);
+    let comparables: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(capture, config, set)).collect();
+    let mut views: Vec<&View> = comparables.iter().flatten().map(|c| c.view).collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));
     views.dedup_by(|a, b| a.name == b.name);
-    let lpips = measure(line.config)?;
+    let lpips = measure(config)?;
     lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
-    let tones = Tones::of(&views.iter().collect::<Vec<_>>())?;
+    let tones = Tones::of(&views)?;
     for (i, (set, pictures)) in sets.iter().zip(&comparables).enumerate() {
-        let figures = pictures.par_iter().map(|p| figures(line, p, tones.as_ref(), lpips.as_ref()));
+        let figures = pictures.par_iter().map(|p| figures(config, p, tones.as_ref(), lpips.as_ref()));
         let figures = figures.collect::<Result<Vec<_>>>()?;
         if !figures.is_empty() {
             out.insert(set.name.clone(), entry(figures));
@@ -98,16 +104,12 @@ pub(super) fn metrics(line: &Line, dir: &StageDir) -> Result<Value> {
             "name methods in `render.method`, and make their views with `--fresh render`",
         ));
     }
-    if line.synthetic && line.order(Stage::Metrics).contains(&Stage::Mesh) {
-        let points = line.config.metrics.surface_points as usize;
-        let truth = against_truth(&surface_in_world(line)?, points);
+    if let Some(surface) = surface {
+        let truth = against_truth(surface, config.metrics.surface_points as usize);
         out.insert("truth_percent_of_head".into(), json!(truth));
     }
-    out.extend(blend_gain(&out, &line.config.ensemble.members).map(|gain| ("blend".into(), gain)));
-    out.insert(
-        "truth".into(),
-        json!({"photographs": line.config.metrics.truth, "masks": line.mask_source()}),
-    );
+    out.extend(blend_gain(&out, &config.ensemble.members).map(|gain| ("blend".into(), gain)));
+    out.insert("truth".into(), json!({"photographs": config.metrics.truth, "masks": masks}));
     let value = Value::Object(out);
     io::write_atomic(&dir.folder().join("metrics.json"), format!("{value:#}\n").as_bytes())?;
     Ok(means(&value))
@@ -125,16 +127,15 @@ fn blend_gain(sets: &Map<String, Value>, members: &[Method]) -> Option<Value> {
 }
 
 fn figures(
-    line: &Line,
+    config: &Config,
     picture: &Comparable,
     tones: Option<&Tones>,
     lpips: Option<&Lpips>,
 ) -> Result<ViewFigures> {
-    let config = &line.config.render;
-    let background = config.background;
-    let loaded = line.evaluation_view(picture.view).load(&Limits::default())?;
-    let render = pictures::read(&picture.file, config.format)?;
-    let photo = match line.config.metrics.truth {
+    let background = config.render.background;
+    let loaded = picture.view.load(&Limits::default())?;
+    let render = pictures::read(&picture.file, config.render.format)?;
+    let photo = match config.metrics.truth {
         TruthPhoto::Photo => loaded.photo.clone(),
         TruthPhoto::Masked => pictures::expected(&loaded.photo, loaded.mask.as_ref(), background),
     };

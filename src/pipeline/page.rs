@@ -8,7 +8,7 @@ pub(super) mod views;
 
 pub use views::{head_page, viewer_of_file};
 
-use super::line::Line;
+use super::session::Session;
 use crate::Result;
 use crate::config::{NAMES, Stage, called};
 use crate::io::{self, Limits};
@@ -23,17 +23,17 @@ const MOST_BYTES: usize = 7_600_000;
 const MASK_BYTES: usize = 800_000;
 
 /// Writes `report.html` with every finished stage; without the photographs an existing report is kept.
-pub(super) fn write_report(line: &Line, idle: bool) -> Result<()> {
-    if line.missing_capture.is_some() || idle && is_current(line) {
+pub(super) fn write_report(session: &Session, idle: bool) -> Result<()> {
+    if session.inputs.missing_capture.is_some() || idle && is_current(session) {
         return Ok(());
     }
-    line.write("report.html", page(line)?.as_bytes(), idle)
+    session.write("report.html", page(session)?.as_bytes(), idle)
 }
 
 /// Whether the report is newer than every stage and the settings. Writing it again would open all pictures.
-fn is_current(line: &Line) -> bool {
-    let time = |name: &str| io::modified(&line.run.path(name));
-    let report = time("report.html").filter(|_| io::is_file(&line.run.path("report.html")));
+fn is_current(session: &Session) -> bool {
+    let time = |name: &str| io::modified(&session.run.path(name));
+    let report = time("report.html").filter(|_| io::is_file(&session.run.path("report.html")));
     let records = Stage::ALL.map(|stage| time(&format!("{stage}/done.json")));
     report.is_some_and(|report| records.into_iter().flatten().chain(time("config.toml")).all(|t| t < report))
 }
@@ -43,50 +43,53 @@ fn is_current(line: &Line) -> bool {
 /// # Errors
 ///
 /// Fails if the photographs have been moved, or if a file of the run is damaged.
-pub fn renew_report(line: &Line) -> Result<()> {
-    line.require_inputs(&[Stage::Metrics])?;
-    line.run.write("report.html", page(line)?.as_bytes())
+pub fn renew_report(session: &Session) -> Result<()> {
+    session.require_inputs(&[Stage::Metrics])?;
+    session.run.write("report.html", page(session)?.as_bytes())
 }
 
-fn page(line: &Line) -> Result<String> {
-    let sheet = text(&line.run.path(Stage::Mask).join(super::mask::SHEET))?;
+fn page(session: &Session) -> Result<String> {
+    let sheet = text(&session.run.path(Stage::Mask).join(super::mask::SHEET))?;
     let masks = crate::mask::pages::part(&sheet, MASK_BYTES).unwrap_or_default();
-    let found = views::viewer(line)?;
+    let found = views::viewer(session)?;
     let glb = found.as_ref().map_or(0, |(v, _)| v.glb.len().div_ceil(3) * 4);
-    let (views, left_out) = views::rows(line, MOST_BYTES.saturating_sub(masks.len() + glb))?;
+    let (views, left_out) = views::rows(session, MOST_BYTES.saturating_sub(masks.len() + glb))?;
     let viewer = found.map(|(viewer, file_from_world)| Viewer {
-        cameras: views::cameras(line, &views, &file_from_world),
+        cameras: views::cameras(session, &views, &file_from_world),
         ..viewer
     });
     let mut charts = Vec::new();
     for (stage, names) in LEARNED {
-        let log = text(&line.run.path(stage).join("log.jsonl"))?;
+        let log = text(&session.run.path(stage).join("log.jsonl"))?;
         charts.extend(report::charts(stage.word(), &log, names).iter().map(report::Chart::html));
     }
     let records: Vec<(Stage, Record)> = Stage::ALL
         .into_iter()
-        .filter_map(|stage| Some((stage, read_record(&line.run.path(stage)).ok()??)))
+        .filter_map(|stage| Some((stage, read_record(&session.run.path(stage)).ok()??)))
         .collect();
     let longest = records.iter().map(|(_, r)| r.elapsed_s).fold(1e-3, f64::max);
     let time = |(stage, r): &(Stage, Record)| {
         (stage.to_string(), duration(r.elapsed_s), (100.0 * r.elapsed_s / longest * 10.0).round() / 10.0)
     };
     report::html(&Report {
-        title: line.capture.name.clone(),
-        facts: facts(line, &records),
+        title: session.capture.name.clone(),
+        facts: facts(session, &records),
         viewer,
-        table: table(line),
-        quality: quality(line),
+        table: table(session),
+        quality: quality(session),
         views,
         left_out,
         masks,
         charts,
         times: records.iter().map(time).collect(),
-        changes: line.config.changes(),
-        warnings: warnings(line, &records),
-        repeat: format!("tiface run {} --config config.toml --run again", quoted(&line.config.capture.path)),
+        changes: session.config.changes(),
+        warnings: warnings(session, &records),
+        repeat: format!(
+            "tiface run {} --config config.toml --run again",
+            quoted(&session.config.capture.path)
+        ),
         summaries: records.iter().filter_map(summary).collect(),
-        settings: line.config.to_toml(),
+        settings: session.config.to_toml(),
     })
 }
 
@@ -98,13 +101,13 @@ fn text(file: &Path) -> Result<String> {
     Ok(String::from_utf8_lossy(&io::read_maybe_empty(file, &Limits::default())?).into_owned())
 }
 
-fn facts(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
+fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
     use crate::capture::Split::{Test, Train};
-    let [train, test] = [Train, Test].map(|split| line.capture.split(split).count());
+    let [train, test] = [Train, Test].map(|split| session.capture.split(split).count());
     let mut facts = vec![
         format!("{train} photographs to learn from, {test} held out"),
-        format!("preset {}", line.config.preset.name()),
-        format!("seed {}", line.config.seed),
+        format!("preset {}", session.config.preset.name()),
+        format!("seed {}", session.config.seed),
     ];
     let of = |stage: Stage| records.iter().find(|(s, _)| *s == stage).map(|(_, record)| &record.summary);
     if let Some(height) = of(Stage::Mask).and_then(|mask| mask["height_m"].as_f64()) {
@@ -121,8 +124,8 @@ fn facts(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
 }
 
 /// Returns the warnings of the stages and of the capture.
-fn warnings(line: &Line, records: &[(Stage, Record)]) -> Vec<String> {
-    let mut all = line.capture.warnings.clone();
+fn warnings(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
+    let mut all = session.capture.warnings.clone();
     for (stage, record) in records {
         let said = record.summary["warnings"].as_array().into_iter().flatten().filter_map(Value::as_str);
         all.extend(said.map(|w| format!("{stage}: {w}")));
@@ -182,17 +185,17 @@ const QUALITY: [(&str, &str, usize); 12] = [
 ];
 
 /// Returns the table of methods, in pipeline order; empty before the stage `metrics`.
-fn table(line: &Line) -> MethodTable {
-    let summary = |stage: Stage| read_record(&line.run.path(stage)).ok().flatten();
+fn table(session: &Session) -> MethodTable {
+    let summary = |stage: Stage| read_record(&session.run.path(stage)).ok().flatten();
     let Some(metrics) = summary(Stage::Metrics).map(|r| r.summary) else { return MethodTable::default() };
     let seconds = summary(Stage::Render).map_or(Value::Null, |r| r.summary["seconds_per_view"].clone());
     let triangles = summary(Stage::Mesh).and_then(|r| r.summary["triangles"].as_f64());
     let row = |(word, _): &(&str, &str)| {
         let mean = metrics.get(*word)?.pointer("/head/mean")?;
         let figure = |key: &str| mean[key].as_f64();
-        let stages = stages_of(line, word);
+        let stages = stages_of(session, word);
         let spent = stages.iter().map(|&stage| summary(stage).map(|r| r.elapsed_s)).sum::<Option<f64>>();
-        let bytes: u64 = files_of(line, word).iter().filter_map(|file| io::file_size(file)).sum();
+        let bytes: u64 = files_of(session, word).iter().filter_map(|file| io::file_size(file)).sum();
         let figures = vec![
             figure("psnr_masked"),
             figure("ssim_masked"),
@@ -209,13 +212,13 @@ fn table(line: &Line) -> MethodTable {
 }
 
 /// Returns the stages that must have run before a picture of this method can be made, in order.
-fn stages_of(line: &Line, word: &str) -> Vec<Stage> {
-    let members = &line.config.ensemble.members;
-    match line.config.render.method.iter().find(|m| m.folder() == word) {
+fn stages_of(session: &Session, word: &str) -> Vec<Stage> {
+    let members = &session.config.ensemble.members;
+    match session.config.render.method.iter().find(|m| m.folder() == word) {
         Some(method) if method.stage() == Stage::Mesh => vec![Stage::Iface, Stage::Mesh],
         Some(method) => vec![method.stage()],
         None => {
-            let needed: Vec<Stage> = members.iter().flat_map(|m| stages_of(line, m.folder())).collect();
+            let needed: Vec<Stage> = members.iter().flat_map(|m| stages_of(session, m.folder())).collect();
             let is_needed = |stage: &Stage| needed.contains(stage) || *stage == Stage::Ensemble;
             Stage::ALL.into_iter().filter(is_needed).collect()
         }
@@ -223,15 +226,15 @@ fn stages_of(line: &Line, word: &str) -> Vec<Stage> {
 }
 
 /// Returns the files that hold the data a method shows.
-fn files_of(line: &Line, word: &str) -> Vec<std::path::PathBuf> {
-    let Some(method) = line.config.render.method.iter().find(|m| m.folder() == word) else {
-        let members = line.config.ensemble.members.iter();
-        let mut all: Vec<_> = members.flat_map(|m| files_of(line, m.folder())).collect();
+fn files_of(session: &Session, word: &str) -> Vec<std::path::PathBuf> {
+    let Some(method) = session.config.render.method.iter().find(|m| m.folder() == word) else {
+        let members = session.config.ensemble.members.iter();
+        let mut all: Vec<_> = members.flat_map(|m| files_of(session, m.folder())).collect();
         all.sort();
         all.dedup();
         return all;
     };
-    let folder = line.run.path(method.stage());
+    let folder = session.run.path(method.stage());
     let inside = |folder: &Path| -> Vec<_> {
         io::list_files(folder).unwrap_or_default().iter().map(|name| folder.join(name)).collect()
     };
@@ -246,8 +249,8 @@ fn files_of(line: &Line, word: &str) -> Vec<std::path::PathBuf> {
 }
 
 /// Returns a row for every evaluated kind of picture below the heading; empty if there is none.
-fn quality(line: &Line) -> Vec<Vec<String>> {
-    let record = read_record(&line.run.path(Stage::Metrics)).ok().flatten();
+fn quality(session: &Session) -> Vec<Vec<String>> {
+    let record = read_record(&session.run.path(Stage::Metrics)).ok().flatten();
     let Some(Value::Object(sets)) = record.map(|done| done.summary) else { return Vec::new() };
     let row = |(set, figures): (&String, &Value)| {
         figures.get("head")?;

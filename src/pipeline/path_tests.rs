@@ -51,15 +51,15 @@ fn turn(config: &Config, cameras: &str) -> RenderConfig {
 }
 
 /// All stages, with fields that nobody has learned; were they skipped?
-fn evaluate(line: &Line) -> Vec<bool> {
-    line.remember(Stage::Metrics).unwrap();
-    let skipped = |stage| complete(line, stage, &Fog).unwrap().skipped;
+fn evaluate(session: &Session) -> Vec<bool> {
+    session.remember(Stage::Metrics).unwrap();
+    let skipped = |stage| complete(session, stage, &Fog).unwrap().skipped;
     let mask = skipped(Stage::Mask);
     for stage in [Stage::Baseline, Stage::Tface] {
-        line.run.stage(line.plan(stage), |_| Ok(Value::Null)).unwrap();
+        session.run.stage(session.plan(stage), |_| Ok(Value::Null)).unwrap();
     }
     let rest = [Stage::Render, Stage::Ensemble, Stage::Metrics].map(skipped);
-    page::write_report(line, false).unwrap();
+    page::write_report(session, false).unwrap();
     [&[mask], &rest[..]].concat()
 }
 
@@ -89,7 +89,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    let open = || Line::open(&config, &run).unwrap();
+    let open = || Session::open(&config, &run).unwrap();
     assert_eq!(evaluate(&open()), [false; 4]);
     let before = files(run.dir());
     assert!(before.iter().any(|(path, _)| path.ends_with("metrics/metrics.json")));
@@ -98,17 +98,17 @@ fn camera_paths_never_touch_the_evaluations_views() {
     let eye = "[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]";
     std::fs::write(&flight, format!(r#"{{"frames": [{{"transform_matrix": {eye}}}]}}"#)).unwrap();
     for (cameras, views) in [("orbit", 3), ("train", 4), (flight.to_str().unwrap(), 1)] {
-        let line = open().with_camera_path(turn(&config, cameras)).unwrap();
+        let session = open().with_camera_path(turn(&config, cameras)).unwrap();
         // nothing but what the views show, and nothing that builds on them
-        assert_eq!(words(&line.order(Stage::Render)), "mask tface render");
-        line.fresh(Stage::Render, Stage::Render).unwrap();
+        assert_eq!(words(&session.order(Stage::Render)), "mask tface render");
+        session.fresh(Stage::Render, Stage::Render).unwrap();
         for again in [false, true] {
-            line.remember(Stage::Render).unwrap();
-            let done = complete(&line, Stage::Render, &Fog).unwrap();
-            page::write_report(&line, false).unwrap();
+            session.remember(Stage::Render).unwrap();
+            let done = complete(&session, Stage::Render, &Fog).unwrap();
+            page::write_report(&session, false).unwrap();
             assert_eq!((done.skipped, &done.summary["cameras"]), (again, &Value::from(views)), "{cameras}");
         }
-        let folder = run.path(line.views());
+        let folder = run.path(session.views());
         assert!(folder.starts_with(run.path("render/paths")), "{}", folder.display());
         assert_eq!(io::list_files(&folder.join("tface")).unwrap().len() as u64, views);
         assert!(!folder.join("tface/float").exists());
@@ -129,30 +129,31 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    let line = || Line::open(&config, &run).unwrap();
-    evaluate(&line());
+    let session = || Session::open(&config, &run).unwrap();
+    evaluate(&session());
     let orbit = turn(&config, "orbit");
-    complete(&line().with_camera_path(orbit.clone()).unwrap(), Stage::Render, &Fog).unwrap();
-    complete(&line().with_camera_path(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap();
-    let black =
-        line().with_camera_path(RenderConfig { background: ViewBackground::Black, ..orbit.clone() }).unwrap();
+    complete(&session().with_camera_path(orbit.clone()).unwrap(), Stage::Render, &Fog).unwrap();
+    complete(&session().with_camera_path(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap();
+    let black = session()
+        .with_camera_path(RenderConfig { background: ViewBackground::Black, ..orbit.clone() })
+        .unwrap();
     let e = black.remember(Stage::Render).unwrap_err();
     assert!(e.to_string().contains("render.background: was \"white\", is \"black\""), "{e}");
     assert!(e.hint().contains("`--fresh render`") && e.hint().contains("nothing else"), "{}", e.hint());
     black.fresh(Stage::Render, Stage::Render).unwrap();
     assert!(!complete(&black, Stage::Render, &Fog).unwrap().skipped);
-    assert_eq!(evaluate(&line()), [true; 4]);
+    assert_eq!(evaluate(&session()), [true; 4]);
     assert!(
-        complete(&line().with_camera_path(turn(&config, "train")).unwrap(), Stage::Render, &Fog)
+        complete(&session().with_camera_path(turn(&config, "train")).unwrap(), Stage::Render, &Fog)
             .unwrap()
             .skipped
     );
     // the held-out views made anew are no reason to make others anew, another field is one
-    line().fresh(Stage::Render, Stage::Metrics).unwrap();
+    session().fresh(Stage::Render, Stage::Metrics).unwrap();
     assert!(run.path("render/paths/orbit/done.json").is_file() && !run.path("render/done.json").is_file());
-    line().fresh(Stage::Baseline, Stage::Metrics).unwrap();
+    session().fresh(Stage::Baseline, Stage::Metrics).unwrap();
     assert!(run.path("render/paths/orbit/done.json").is_file());
-    line().fresh(Stage::Tface, Stage::Metrics).unwrap();
+    session().fresh(Stage::Tface, Stage::Metrics).unwrap();
     assert!(!run.path("render/paths/orbit/done.json").exists());
 }
 
@@ -161,11 +162,11 @@ fn views_of_a_path_whose_records_cannot_be_read_are_made_anew_with_any_field() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Line::open(&config, &run).unwrap());
-    let line = Line::open(&config, &run).unwrap().with_camera_path(turn(&config, "orbit")).unwrap();
-    complete(&line, Stage::Render, &Fog).unwrap();
+    evaluate(&Session::open(&config, &run).unwrap());
+    let session = Session::open(&config, &run).unwrap().with_camera_path(turn(&config, "orbit")).unwrap();
+    complete(&session, Stage::Render, &Fog).unwrap();
     let orbit = "render/paths/orbit".to_string();
-    let is_out_of_date = |stage| line.out_of_date(stage).unwrap().contains(&orbit);
+    let is_out_of_date = |stage| session.out_of_date(stage).unwrap().contains(&orbit);
     assert!(is_out_of_date(Stage::Tface) && !is_out_of_date(Stage::Iface));
     // the finished record says it as well
     std::fs::write(run.path(&orbit).join("status.json"), "{").unwrap();
@@ -182,9 +183,9 @@ fn a_file_of_cameras_is_read_before_anything_is_learned() {
     let path = dir.path().join("path.json");
     let along = |text: &str| {
         std::fs::write(&path, text).unwrap();
-        let line = Line::open(&config, &run).unwrap();
-        let line = line.with_camera_path(turn(&config, path.to_str().unwrap()))?;
-        Ok::<_, crate::Error>(line.views().to_owned())
+        let session = Session::open(&config, &run).unwrap();
+        let session = session.with_camera_path(turn(&config, path.to_str().unwrap()))?;
+        Ok::<_, crate::Error>(session.views().to_owned())
     };
     let e = along("{}").unwrap_err();
     assert!(e.to_string().contains("camera_path") && e.kind().code() == 1, "{e}");
@@ -202,9 +203,9 @@ fn a_method_that_is_not_asked_for_is_not_called_changed() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Line::open(&config, &run).unwrap());
+    evaluate(&Session::open(&config, &run).unwrap());
     config.render.method = vec![Method::Tface];
-    let e = Line::open(&config, &run).unwrap().remember(Stage::Render).unwrap_err().to_string();
+    let e = Session::open(&config, &run).unwrap().remember(Stage::Render).unwrap_err().to_string();
     assert!(e.contains("render.method: was [\"baseline\", \"tface\"], is [\"tface\"]"), "{e}");
     assert!(
         e.contains("baseline: was part of it, is not asked for now") && !e.contains("has changed"),
@@ -218,15 +219,15 @@ fn an_evaluation_of_other_cameras_than_the_held_out_ones_is_refused_with_the_way
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
     config.render.cameras = "orbit".into();
-    let line = Line::open(&config, &run).unwrap();
-    let e = line.remember(Stage::Metrics).unwrap_err();
+    let session = Session::open(&config, &run).unwrap();
+    let e = session.remember(Stage::Metrics).unwrap_err();
     assert!(e.to_string().starts_with("`render.cameras` is orbit") && e.kind() == ErrorKind::Usage, "{e}");
     assert!(
         e.hint().contains("--set render.cameras=test") && e.hint().contains("--cameras orbit"),
         "{}",
         e.hint()
     );
-    assert!(line.stage_states(Stage::Metrics).is_err() && !run.dir().exists());
+    assert!(session.stage_states(Stage::Metrics).is_err() && !run.dir().exists());
 }
 
 #[test]
@@ -236,10 +237,10 @@ fn nothing_to_judge_is_an_error_and_no_empty_file() {
     config.render.method.clear();
     config.ensemble.members.clear();
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).unwrap();
-    complete(&line, Stage::Mask, &NoFields).unwrap();
-    complete(&line, Stage::Render, &Fog).unwrap();
-    let e = complete(&line, Stage::Metrics, &NoFields).unwrap_err();
+    let session = Session::open(&config, &run).unwrap();
+    complete(&session, Stage::Mask, &NoFields).unwrap();
+    complete(&session, Stage::Render, &Fog).unwrap();
+    let e = complete(&session, Stage::Metrics, &NoFields).unwrap_err();
     assert!(e.hint().contains("`render.method`") && !run.path("metrics/metrics.json").exists(), "{e}");
 }
 
@@ -248,23 +249,23 @@ fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).unwrap();
-    evaluate(&line);
+    let session = Session::open(&config, &run).unwrap();
+    evaluate(&session);
     let page = || std::fs::read_to_string(run.path("report.html")).unwrap();
     let whole = page();
     assert!(whole.contains("<span>mask</span>") && whole.contains("<h2>Against the photographs</h2>"));
     std::fs::remove_file(run.path("report.html")).unwrap();
     // as a later command on one stage leaves it
-    let line = Line::open(&config, &run).unwrap();
-    line.remember(Stage::Mask).unwrap();
-    complete(&line, Stage::Mask, &NoFields).unwrap();
-    page::write_report(&line, false).unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    session.remember(Stage::Mask).unwrap();
+    complete(&session, Stage::Mask, &NoFields).unwrap();
+    page::write_report(&session, false).unwrap();
     assert!(page() == whole);
-    // where nothing was done it is not made anew, unless somebody asks
+    // if nothing was done, it is not made again except on request
     std::fs::write(run.path("report.html"), "kept").unwrap();
-    page::write_report(&line, true).unwrap();
+    page::write_report(&session, true).unwrap();
     assert!(page() == "kept");
-    renew_report(&line).unwrap();
+    renew_report(&session).unwrap();
     assert!(page() == whole);
 }
 
@@ -274,22 +275,22 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
     let root = dir.path().join("head");
     let config = config(&root);
     let run = quiet(dir.path());
-    let first = Line::open(&config, &run).unwrap();
+    let first = Session::open(&config, &run).unwrap();
     evaluate(&first);
     let (before, export) = (files(run.dir()), Export::new(first.capture(), &config));
     std::fs::rename(&root, dir.path().join("moved")).unwrap();
 
-    let line = Line::open(&config, &run).unwrap();
-    assert_eq!(evaluate(&line), [true; 4]);
-    assert!(line.stage_states(Stage::Metrics).is_ok());
+    let session = Session::open(&config, &run).unwrap();
+    assert_eq!(evaluate(&session), [true; 4]);
+    assert!(session.stage_states(Stage::Metrics).is_ok());
     assert!(before == files(run.dir()));
-    let again = Export::new(line.capture(), &config);
+    let again = Export::new(session.capture(), &config);
     assert_eq!((again.name, again.up, again.cameras), (export.name, export.up, export.cameras));
 
     // there is work: nothing is removed or written before it is known that it cannot be done
     for e in [
-        line.fresh(Stage::Metrics, Stage::Metrics).unwrap_err(),
-        Line::open(&config, &run)
+        session.fresh(Stage::Metrics, Stage::Metrics).unwrap_err(),
+        Session::open(&config, &run)
             .unwrap()
             .with_camera_path(turn(&config, "orbit"))
             .unwrap()
@@ -301,15 +302,15 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
     }
     assert!(before == files(run.dir()));
     std::fs::remove_file(run.path("mask/done.json")).unwrap();
-    let e = Line::open(&config, &run).err().unwrap();
+    let e = Session::open(&config, &run).err().unwrap();
     assert!(e.hint().contains("--set capture.path="), "{e}");
 
     // and the suggested fix is one
     let mut moved = config.clone();
     moved.capture.path = dir.path().join("moved").to_str().unwrap().into();
-    assert_eq!(evaluate(&Line::open(&moved, &run).unwrap()), [false, true, true, true]);
+    assert_eq!(evaluate(&Session::open(&moved, &run).unwrap()), [false, true, true, true]);
     // where there is no run, it is the capture that is wrong
-    let e = Line::open(&config, &quiet(&dir.path().join("new"))).err().unwrap();
+    let e = Session::open(&config, &quiet(&dir.path().join("new"))).err().unwrap();
     assert!(!e.hint().contains("capture.path"), "{e}");
 }
 
@@ -318,20 +319,20 @@ fn a_finished_run_that_cannot_be_written_is_still_done() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Line::open(&config, &run).unwrap());
+    evaluate(&Session::open(&config, &run).unwrap());
     // a folder in the place of a file cannot be written by anybody
     for file in ["config.toml", "cameras.json", "report.html"] {
         std::fs::remove_file(run.path(file)).unwrap();
         std::fs::create_dir(run.path(file)).unwrap();
     }
     config.device = "cpu".into();
-    let line = Line::open(&config, &run).unwrap();
-    line.remember(Stage::Metrics).unwrap();
-    let done = reconstruct(&line, Stage::Metrics).unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    session.remember(Stage::Metrics).unwrap();
+    let done = reconstruct(&session, Stage::Metrics).unwrap();
     assert!(done.len() == 6 && done.iter().all(|(_, stage)| stage.skipped), "{done:?}");
     // with work to do it is an error, before that is begun
-    line.fresh(Stage::Metrics, Stage::Metrics).unwrap();
-    assert!(line.remember(Stage::Metrics).unwrap_err().to_string().contains("config.toml"));
+    session.fresh(Stage::Metrics, Stage::Metrics).unwrap();
+    assert!(session.remember(Stage::Metrics).unwrap_err().to_string().contains("config.toml"));
 }
 
 #[test]
@@ -339,13 +340,13 @@ fn a_command_that_is_refused_clears_nothing_with_fresh() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Line::open(&config, &run).unwrap());
+    evaluate(&Session::open(&config, &run).unwrap());
     let before = files(run.dir());
     let refused = |change: &dyn Fn(&mut Config)| {
         let mut config = config.clone();
         change(&mut config);
-        let line = Line::open(&config, &run).unwrap();
-        line.fresh(Stage::Render, Stage::Metrics).unwrap_err().to_string()
+        let session = Session::open(&config, &run).unwrap();
+        session.fresh(Stage::Render, Stage::Metrics).unwrap_err().to_string()
     };
     // what has no member, other cameras, and a field of other settings that is not made anew
     assert!(refused(&|c| c.render.method = vec![Method::Tface]).contains("`ensemble.members`"));

@@ -3,10 +3,10 @@
 //! A cost is a number of rays, samples, cells or pixels times the measured time of one.
 
 use super::ensemble::can_blend;
-use super::line::{Line, capture_options};
 use super::mask::inspect_capture;
 use super::path::{CameraPath, PATHS};
 use super::render::{held_out, shows_head};
+use super::session::{Session, capture_options};
 use crate::capture::View;
 use crate::config::iface::FieldKind;
 use crate::config::{Config, MaskSource, Material, Method, Preset, Stage, VmBackground, VmConfig};
@@ -50,7 +50,7 @@ const HEAD_KEYS: [&str; 7] = [
     "mesh.normal_map",
 ];
 
-impl Line<'_> {
+impl Session<'_> {
     /// Returns `until` and the stages it needs, in pipeline order. Views along a camera path need only the stages
     /// whose results they show, not those that only the evaluation shows.
     pub fn order(&self, until: Stage) -> Vec<Stage> {
@@ -232,7 +232,7 @@ impl Line<'_> {
     fn compared_plan(&self, stage: Stage) -> Plan<'_> {
         let mut plan = self.plan(stage);
         if stage == Stage::Mask {
-            plan.fingerprint.changed = self.changed_input();
+            plan.fingerprint.changed = self.inputs.changed(self.run);
         }
         plan
     }
@@ -254,13 +254,13 @@ impl Line<'_> {
         match stage {
             Stage::Mask => {
                 settings.extend(config.values("capture"));
-                settings.remove("capture.path"); // where it lies does not matter, what it holds does
+                settings.remove("capture.path"); // its content counts, not its path
                 settings.remove("capture.tiles"); // masks are of whole photographs
                 if config.capture.r#box == "head" {
                     settings.remove("capture.box"); // as in runs from before there was another
                 }
-                inputs.push(("capture", self.digest.clone()));
-                match &self.clicks {
+                inputs.push(("capture", self.inputs.digest.clone()));
+                match &self.inputs.clicks {
                     // the paths of clicks and networks do not matter either, nor does the memory limit
                     Some(clicks) => {
                         settings.retain(|key, _| !PLACES.contains(&key.as_str()));
@@ -294,7 +294,7 @@ impl Line<'_> {
                 if stage == Stage::Baseline {
                     settings.remove("tface.mask_weight"); // of a loss that it has not
                 }
-                if let Some(import) = self.imports.iter().find(|import| import.stage == stage) {
+                if let Some(import) = self.inputs.imports.iter().find(|import| import.stage == stage) {
                     settings.retain(|key, _| !key.ends_with(".import") && key != "capture.tiles");
                     inputs.push(("import", import.digest.clone()));
                 }
@@ -324,9 +324,9 @@ impl Line<'_> {
             }
             Stage::Ensemble => needs_bytes += self.pixels() * 4,
             Stage::Metrics => {
-                inputs.extend(self.own_masks.as_ref().map(|own| ("own masks", own.digest.clone())));
-                settings.remove("metrics.lpips"); // what the file holds matters, not where it lies
-                inputs.extend(self.lpips.clone().map(|digest| ("lpips", digest)));
+                inputs.extend(self.inputs.own_masks.as_ref().map(|own| ("own masks", own.digest.clone())));
+                settings.remove("metrics.lpips"); // the file's content counts, not its path
+                inputs.extend(self.inputs.lpips.clone().map(|digest| ("lpips", digest)));
             }
         }
         let mut fingerprint = Fingerprint::new(FORMAT, settings);
@@ -376,7 +376,7 @@ impl Line<'_> {
             settings.remove("render.orbit_views");
         }
         if digest.is_some() {
-            settings.remove("render.cameras"); // what the file holds matters, not where it lies
+            settings.remove("render.cameras"); // the file's content counts, not its path
         }
         let mut fingerprint = Fingerprint::new(FORMAT, settings);
         if let Some(digest) = digest {
@@ -422,7 +422,7 @@ fn vm_bytes(c: &VmConfig) -> u64 {
 
 const MIB: f64 = (1u64 << 20) as f64;
 
-impl Line<'_> {
+impl Session<'_> {
     /// Returns the folders of the unfinished stages that `until` needs, with the estimated cost of each on the CPU.
     pub fn ahead(&self, until: Stage) -> Vec<(String, Cost)> {
         let order = self.order(until).into_iter().map(|stage| (stage, self.plan(stage)));
@@ -431,7 +431,7 @@ impl Line<'_> {
 
     /// Writes the estimated cost of the whole pipeline into the run, if the photographs can be counted.
     pub(super) fn write_estimate(&self, idle: bool) -> Result<()> {
-        if self.missing_capture.is_some() || self.path.is_some() {
+        if self.inputs.missing_capture.is_some() || self.path.is_some() {
             return Ok(());
         }
         let stages = self.order(Stage::Metrics).into_iter();
@@ -458,7 +458,7 @@ impl Line<'_> {
         };
         let methods = &self.render_config().method;
         // propagating to all views, and matting
-        let clicked = if self.clicks.is_some() { 2.5e-6 * all } else { 0.0 };
+        let clicked = if self.inputs.clicks.is_some() { 2.5e-6 * all } else { 0.0 };
         // ISNet takes 4.5 core seconds a photograph with ONNX Runtime; other networks differ
         let m = &self.config.mask;
         let files = [&m.sam, &m.vitmatte, &m.alpha_net].into_iter().filter(|file| !file.is_empty()).count();

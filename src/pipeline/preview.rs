@@ -92,7 +92,7 @@ impl Preview {
     }
 
     /// Returns `count` cameras on a circle around the mesh, in its coordinates, far enough away that square pictures
-    /// of `side` pixels show all of it. The first stands `turn` radians from the front towards the mesh's left, and
+    /// of `side` pixels show all of it. The first is turned by `turn` radians from the front towards the mesh's left, and
     /// all of them `tilt` radians above.
     pub fn around(&self, turn: f64, tilt: f64, side: u32, count: usize) -> Result<Vec<NamedCamera>> {
         let (up, front) = (self.up.as_dvec3(), self.front.as_dvec3());

@@ -8,14 +8,13 @@
 //!
 //! These are the held-out views. Views along a camera path are written to a folder of their own, `render/paths/`.
 
-use super::line::Line;
 use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
 use super::pictures;
 use super::surface::{Fields, march};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Capture, Split};
-use crate::config::{ColorSource, Config, Method};
+use crate::config::{ColorSource, Config, Method, RenderConfig};
 use crate::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
 use crate::io;
 use crate::mesh::files::{ExtractedSurface, HeadMesh};
@@ -24,18 +23,20 @@ use crate::render::{
     LobePictures, MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView, Surface,
     raster, raycast,
 };
-use crate::run::StageDir;
+use crate::run::{Run, StageDir};
 use crate::{Error, Monitor, Result};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
 
-/// Renders one folder per method and one picture per camera, of the held-out views or along a path
-/// ([`Line::with_camera_path`]). Of `fields`, only those that the methods show are loaded.
-pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &StageDir) -> Result<Value> {
-    let c = line.render_config();
-    let meshes = Meshes::load(line, &c.method)?;
-    let renderer = Renderer::new(scene, fields, &meshes, c.samples, dir.monitor());
-    let cameras = cameras(line, scene)?;
+/// Renders one folder per method and one picture per camera; `unit_m` is the number of metres in a dataset unit.
+pub(super) fn render(
+    c: &RenderConfig,
+    renderer: &Renderer,
+    cameras: &[NamedCamera],
+    scene: &Scene,
+    unit_m: f64,
+    dir: &StageDir,
+) -> Result<Value> {
     let background = pictures::behind(c.background);
     let total = cameras.len() * c.method.len();
     let mut done = 0;
@@ -43,7 +44,7 @@ pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &Stag
     for &method in &c.method {
         let (mut spent, mut made) = (Duration::ZERO, 0);
         let folder = dir.folder().join(method.folder());
-        for NamedCamera { name, camera } in &cameras {
+        for NamedCamera { name, camera } in cameras {
             let float = c.float.then(|| folder.join(pictures::FLOAT));
             let files = pictures::files(&folder, name, float.as_deref(), c.format);
             // an interrupted process left only complete files of the same settings
@@ -61,7 +62,7 @@ pub(super) fn render(line: &Line, scene: &Scene, fields: &dyn Fields, dir: &Stag
                     if let Some(background) = background {
                         pictures::over(&mut view, background);
                     }
-                    pictures::write(&folder, name, &view, c.format, line.config.capture.unit_m)?;
+                    pictures::write(&folder, name, &view, c.format, unit_m)?;
                 }
             }
             done += 1;
@@ -81,9 +82,12 @@ pub(super) fn held_out(capture: &Capture) -> Vec<NamedCamera> {
 }
 
 /// Returns the cameras to render, named after their photographs if they have one.
-pub(super) fn cameras(line: &Line, scene: &Scene) -> Result<Vec<NamedCamera>> {
-    let capture = &line.capture;
-    match &line.path {
+pub(super) fn cameras(
+    capture: &Capture,
+    path: Option<&CameraPath>,
+    scene: &Scene,
+) -> Result<Vec<NamedCamera>> {
+    match path {
         None => Ok(held_out(capture)),
         Some(CameraPath { cameras: Some(cameras), .. }) => Ok(cameras.clone()),
         Some(CameraPath { render, .. }) => {
@@ -112,12 +116,12 @@ pub(super) struct Meshes {
 
 impl Meshes {
     /// Loads the meshes that `methods` show from the run.
-    pub fn load(line: &Line, methods: &[Method]) -> Result<Meshes> {
+    pub fn load(run: &Run, config: &Config, methods: &[Method]) -> Result<Meshes> {
         let (raycast, textured) = (methods.contains(&Method::Raycast), methods.contains(&Method::Textured));
         let raster = methods.contains(&Method::Raster);
-        let fitted = line.config.mesh.color == ColorSource::Photographs;
-        let extracted = (raycast && !fitted).then(|| extracted_surface(line)).transpose()?;
-        let head = shows_head(line.config, methods).then(|| head_mesh(line)).transpose()?;
+        let fitted = config.mesh.color == ColorSource::Photographs;
+        let extracted = (raycast && !fitted).then(|| extracted_surface(run)).transpose()?;
+        let head = shows_head(config, methods).then(|| head_mesh(run)).transpose()?;
         if textured && head.as_ref().is_some_and(|head| head.texture.is_none()) {
             return Err(Error::cannot(
                 "the mesh has no texture to be shown",

@@ -1,11 +1,11 @@
-//! What the tests of the line share.
+//! What the tests of the pipeline share.
 
 use super::{Fields, Radiance, Stage, Surface};
 use crate::Result;
 use crate::run::Run;
 use std::path::Path;
 
-/// Fields that nobody may ask for.
+/// Fields that no stage may load.
 pub(super) struct NoFields;
 
 impl Fields for NoFields {

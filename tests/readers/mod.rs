@@ -11,7 +11,7 @@ use tiface::geom::{Camera, Distortion};
 use tiface::iface::IFace;
 use tiface::io::{self, Limits};
 use tiface::mesh::files::{ExtractedSurface, HeadMesh, ReadOptions, check_around, open_mesh, read_with};
-use tiface::pipeline::Line;
+use tiface::pipeline::Session;
 use tiface::report::RunRow;
 use tiface::report::experiment::{ExperimentRow, read_published};
 use tiface::run::{Run, RunStatus, read_estimate, read_record, read_status};
@@ -227,7 +227,7 @@ fn cameras(dir: &Path, bytes: &[u8]) -> String {
     let mut config = Config::preset(Preset::Draft);
     config.capture.path = dir.join("gone").display().to_string();
     config.device = "cpu".into();
-    told(Line::open(&config, &run))
+    told(Session::open(&config, &run))
 }
 
 fn camera_path(_: &Path, bytes: &[u8]) -> String {

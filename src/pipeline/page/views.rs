@@ -10,10 +10,10 @@ use crate::io::{self, Limits, ReadError};
 use crate::mesh::files::{ExportOptions, HeadMesh, HeadTexture, compact_glb, open_mesh, to_glb, weld};
 use crate::mesh::{SimplifyConfig, simplify};
 use crate::pipeline::finish::{Export, center};
-use crate::pipeline::line::Line;
 use crate::pipeline::mesh::{finished_mesh, head_mesh};
 use crate::pipeline::metrics::{Comparable, comparable, picture_sets};
 use crate::pipeline::pictures;
+use crate::pipeline::session::Session;
 use crate::report::{
     HEAT, MOST_ERROR, ViewPicture, ViewRow, Viewer, ViewerCamera, link, picture_url, viewer_html,
 };
@@ -34,15 +34,19 @@ const QUALITY: u8 = 84;
 
 /// Returns the views that have pictures, or else the held-out ones, in about `most` bytes; and the files of the
 /// omitted ones, relative to the run.
-pub(super) fn rows(line: &Line, most: usize) -> Result<(Vec<ViewRow>, Vec<String>)> {
-    let sets: Vec<_> = picture_sets(line).into_iter().map(|set| (comparable(line, &set), set.name)).collect();
+pub(super) fn rows(session: &Session, most: usize) -> Result<(Vec<ViewRow>, Vec<String>)> {
+    let Session { capture, config, run, .. } = session;
+    let sets: Vec<_> = picture_sets(config, run)
+        .into_iter()
+        .map(|set| (comparable(capture, config, &set), set.name))
+        .collect();
     let pictures = |view: &View| -> Vec<(&Comparable, &str)> {
         sets.iter()
             .filter_map(|(set, name)| Some((set.iter().find(|c| c.view.name == view.name)?, name.as_str())))
             .collect()
     };
     let all: Vec<(&View, Vec<(&Comparable, &str)>)> =
-        line.capture.views.iter().map(|view| (view, pictures(view))).collect();
+        session.capture.views.iter().map(|view| (view, pictures(view))).collect();
     let evaluated = all.iter().any(|(_, p)| !p.is_empty());
     let shown: Vec<_> = all
         .into_iter()
@@ -50,16 +54,17 @@ pub(super) fn rows(line: &Line, most: usize) -> Result<(Vec<ViewRow>, Vec<String
         .collect();
     let side = if shown.len() > FEW { SIDE_PX.1 } else { SIDE_PX.0 };
     let figures =
-        io::read_json(&line.run.path("metrics/metrics.json"), &Limits::default()).unwrap_or_default();
+        io::read_json(&session.run.path("metrics/metrics.json"), &Limits::default()).unwrap_or_default();
     let (mut rows, mut left_out, mut bytes) = (Vec::new(), Vec::new(), 0);
     // few at a time: large photographs fill the memory
     for part in shown.chunks(4) {
         if bytes >= most {
-            left_out
-                .extend(part.iter().flat_map(|(_, pictures)| pictures).map(|(c, _)| relative(line, &c.file)));
+            left_out.extend(
+                part.iter().flat_map(|(_, pictures)| pictures).map(|(c, _)| relative(session, &c.file)),
+            );
             continue;
         }
-        let made = part.par_iter().map(|(view, pictures)| row(line, view, pictures, side, &figures));
+        let made = part.par_iter().map(|(view, pictures)| row(session, view, pictures, side, &figures));
         for row in made.collect::<Result<Vec<_>>>()? {
             bytes += row.photo.len();
             bytes += row.pictures.iter().map(|p| p.picture.len() + p.error.len()).sum::<usize>();
@@ -77,18 +82,18 @@ pub(super) fn rows(line: &Line, most: usize) -> Result<(Vec<ViewRow>, Vec<String
 }
 
 /// Returns the URL of a file of the run.
-fn relative(line: &Line, file: &Path) -> String {
-    link(&file.strip_prefix(line.run.dir()).unwrap_or(file).to_string_lossy())
+fn relative(session: &Session, file: &Path) -> String {
+    link(&file.strip_prefix(session.run.dir()).unwrap_or(file).to_string_lossy())
 }
 
 fn row(
-    line: &Line,
+    session: &Session,
     view: &View,
     files: &[(&Comparable, &str)],
     side: u32,
     figures: &Value,
 ) -> Result<ViewRow> {
-    let render = &line.config.render;
+    let render = &session.config.render;
     let loaded = view.load(&Limits::default())?;
     let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), render.background);
     let size = working_size(photo.width, photo.height, side);
@@ -118,7 +123,7 @@ fn row(
             picture: url(&like(rgb))?,
             error: url(&error)?,
             psnr: psnr.map(|p| format!("{p:.1}")).unwrap_or_default(),
-            file: relative(line, &file.file),
+            file: relative(session, &file.file),
         });
     }
     Ok(ViewRow { name: view.name.clone(), width: size.0, height: size.1, photo: url(&photo)?, pictures })
@@ -174,18 +179,18 @@ const FEWER: usize = 100_000;
 
 /// Returns the head of a run without cameras, and the transform from the dataset's world to its coordinates; `None`
 /// before the stage `mesh`.
-pub(super) fn viewer(line: &Line) -> Result<Option<(Viewer, Similarity)>> {
-    match read_record(&line.run.path(Stage::Mesh)) {
-        Ok(Some(record)) => shown(line, &record).map(Some),
+pub(super) fn viewer(session: &Session) -> Result<Option<(Viewer, Similarity)>> {
+    match read_record(&session.run.path(Stage::Mesh)) {
+        Ok(Some(record)) => shown(session, &record).map(Some),
         _ => Ok(None),
     }
 }
 
 /// Returns the head of a run whose mesh is done.
-fn shown(line: &Line, mesh: &Record) -> Result<(Viewer, Similarity)> {
-    mesh.require_products(&line.run.path(Stage::Mesh))?;
-    let (file, export) = (line.run.path("mesh/head.glb"), Export::new(&line.capture, line.config));
-    let head = head_mesh(line)?;
+fn shown(session: &Session, mesh: &Record) -> Result<(Viewer, Similarity)> {
+    mesh.require_products(&session.run.path(Stage::Mesh))?;
+    let (file, export) = (session.run.path("mesh/head.glb"), Export::new(&session.capture, session.config));
+    let head = head_mesh(session.run)?;
     let as_glb = |head: &HeadMesh| Ok(export.files(head, MeshFormat::Glb, "head")?.files.swap_remove(0).1);
     let bytes = if io::is_file(&file) { io::read_bytes(&file, &Limits::default())? } else { as_glb(&head)? };
     let file_from_world = export.file_from_world(&head)?;
@@ -197,15 +202,19 @@ fn shown(line: &Line, mesh: &Record) -> Result<(Viewer, Similarity)> {
         }
     };
     let (glb, note) = small(&bytes, &file, || Ok(head), as_glb)?;
-    let name = line.capture.name.clone();
+    let name = session.capture.name.clone();
     let viewer = Viewer { name, note, front: front.to_array(), glb, cameras: Vec::new() };
     Ok((viewer, file_from_world))
 }
 
 /// Returns the cameras of these rows' photographs.
-pub(super) fn cameras(line: &Line, rows: &[ViewRow], file_from_world: &Similarity) -> Vec<ViewerCamera> {
+pub(super) fn cameras(
+    session: &Session,
+    rows: &[ViewRow],
+    file_from_world: &Similarity,
+) -> Vec<ViewerCamera> {
     let camera = |(i, row): (usize, &ViewRow)| {
-        let view = line.capture.views.iter().find(|v| v.name == row.name)?;
+        let view = session.capture.views.iter().find(|v| v.name == row.name)?;
         let c = view.camera.resized(row.width, row.height).transformed(file_from_world);
         Some(ViewerCamera {
             name: row.name.clone(),
@@ -228,13 +237,14 @@ pub(super) fn cameras(line: &Line, rows: &[ViewRow], file_from_world: &Similarit
 /// # Errors
 ///
 /// Fails if the run has no mesh yet, or if it is damaged.
-pub fn head_page(line: &Line) -> Result<String> {
-    let (mut viewer, file_from_world) = shown(line, &finished_mesh(line.run.dir())?)?;
+pub fn head_page(session: &Session) -> Result<String> {
+    let (mut viewer, file_from_world) = shown(session, &finished_mesh(session.run.dir())?)?;
     let most = super::MOST_BYTES.saturating_sub(viewer.glb.len().div_ceil(3) * 4);
     // without photographs the page still shows the head
-    let (mut rows, _) = if line.missing_capture.is_none() { rows(line, most)? } else { Default::default() };
+    let (mut rows, _) =
+        if session.inputs.missing_capture.is_none() { rows(session, most)? } else { Default::default() };
     rows.iter_mut().for_each(|row| row.pictures.clear());
-    viewer.cameras = cameras(line, &rows, &file_from_world);
+    viewer.cameras = cameras(session, &rows, &file_from_world);
     viewer_html(&viewer, &rows)
 }
 

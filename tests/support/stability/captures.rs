@@ -12,7 +12,7 @@ use tiface::geom::{Camera, Ray, Similarity};
 use tiface::iface::IFace;
 use tiface::io::Limits;
 use tiface::kernel::cpu::march::Bitmask;
-use tiface::pipeline::{Line, reconstruct};
+use tiface::pipeline::{Session, reconstruct};
 use tiface::run::Run;
 use tiface::tface::FieldMean;
 
@@ -128,15 +128,15 @@ fn config(folder: &Path) -> Config {
 /// zero from the head's surface, millimetres.
 fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> {
     let run = Run::quiet(&folder.join("run"));
-    let line = Line::open(&config, &run)?;
-    reconstruct(&line, Stage::Tface)?;
-    reconstruct(&line, Stage::Iface)?;
-    let scene = line.scene()?;
+    let session = Session::open(&config, &run)?;
+    reconstruct(&session, Stage::Tface)?;
+    reconstruct(&session, Stage::Iface)?;
+    let scene = session.scene()?;
     let radiance = FieldMean::load("tface", &run.path(Stage::Tface), config.tface.learned())?;
     let hull = scene.hull.as_ref().and_then(|h| Bitmask::from_words(h.resolution, h.bits.clone()));
     let surface = IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref())?;
     let (mut error, mut count) = (0.0, 0.0);
-    for view in line.capture().split(Split::Test) {
+    for view in session.capture().split(Split::Test) {
         let loaded = view.load(&Limits::default())?;
         let camera = view.camera.transformed(&scene.scene_from_world);
         let mask = loaded.mask.map(|m| m.values).unwrap_or_default();
@@ -176,8 +176,8 @@ fn variances(cases: &mut Cases, scratch: &Path) -> Result<()> {
         for steps in (1..=8).rev().map(|k| 5 * k) {
             config.iface.steps = steps;
             let run = Run::quiet(&scratch.join(format!("{name}_{steps}")));
-            let line = Line::open(&config, &run)?;
-            let done = reconstruct(&line, Stage::Iface).ok();
+            let session = Session::open(&config, &run)?;
+            let done = reconstruct(&session, Stage::Iface).ok();
             let inv_s = done.and_then(|done| done.last()?.1.summary["inv_s"].as_f64());
             outside += inv_s.map_or(f64::NAN, |s| f64::from(!(1e-6..=1e6).contains(&s)));
             stays *= inv_s.map_or(f64::NAN, |s| f64::from((s.ln() - 10.0 * start).abs() < 1e-3));

@@ -1,4 +1,4 @@
-//! The line on the demo head.
+//! The pipeline on the demo head.
 
 use super::tests::{NoFields, quiet, words};
 use super::*;
@@ -89,8 +89,8 @@ fn views_held_out_for_validation_cost_what_test_views_cost() {
     capture(&root, 6, 3);
     let (config, run) = (draft(&root), quiet(dir.path()));
     let costs = || {
-        let line = Line::open(&config, &run).unwrap();
-        [Stage::Render, Stage::Ensemble, Stage::Metrics].map(|stage| line.cost(stage).cpu_s)
+        let session = Session::open(&config, &run).unwrap();
+        [Stage::Render, Stage::Ensemble, Stage::Metrics].map(|stage| session.cost(stage).cpu_s)
     };
     let of_test = costs();
     let test = root.join("transforms_test.json");
@@ -100,13 +100,12 @@ fn views_held_out_for_validation_cost_what_test_views_cost() {
     assert_eq!(costs(), of_test);
 }
 
-/// The line with its own formula in the place of a learned field: whatever is wrong then is not the
-/// learning.
+/// The pipeline with the head's formula in place of a trained field: any error is then not one of the training.
 #[test]
-fn the_line_after_learning_keeps_the_exact_head_exact() {
+fn the_stages_after_learning_keep_the_exact_head_exact() {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 96, height: 120, train: 12, test: 2, seed: 1 };
-    let root = dir.path().join("head");
+    let root = dir.path().join("run/capture");
     write_capture(&root, &options).unwrap();
     let mut config = draft(&root);
     config.mesh.resolution = 128;
@@ -117,18 +116,18 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     config.ensemble.members = vec![Method::Raycast];
     config.ensemble.weights = vec![1.0];
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
-    line.remember(Stage::Metrics).unwrap();
-    assert_eq!(complete(&line, Stage::Mask, &NoFields).unwrap().summary["masks"], 14);
-    let scene = line.scene().unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    session.remember(Stage::Metrics).unwrap();
+    assert_eq!(complete(&session, Stage::Mask, &NoFields).unwrap().summary["masks"], 14);
+    let scene = session.scene().unwrap();
     let exact = Formula(Exact { world_from_scene: scene.scene_from_world.inverse() });
-    let mesh = complete(&line, Stage::Mesh, &exact).unwrap();
+    let mesh = complete(&session, Stage::Mesh, &exact).unwrap();
     assert_eq!(mesh.summary["closed"], true);
     let record = read_record(&run.path(Stage::Mesh)).unwrap().unwrap();
     assert!(record.warnings.iter().any(|w| w == "the GPU failed"), "{:?}", record.warnings);
-    complete(&line, Stage::Render, &exact).unwrap();
-    complete(&line, Stage::Ensemble, &NoFields).unwrap();
-    let metrics = complete(&line, Stage::Metrics, &NoFields).unwrap();
+    complete(&session, Stage::Render, &exact).unwrap();
+    complete(&session, Stage::Ensemble, &NoFields).unwrap();
+    let metrics = complete(&session, Stage::Metrics, &NoFields).unwrap();
 
     // a cell is 0.35 m / 128 = 2.7 mm = 1.1 % of the head; vertices lie on the surface, and the
     // chords between them err by a small part of a cell
@@ -139,7 +138,7 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     // outline is in the right place, and next to nothing of it is outside
     let file = run.path("render/raycast/012.png");
     let render = pictures::read(&file, config.render.format).unwrap();
-    let view = line.capture().views.iter().find(|v| v.name == "012").unwrap();
+    let view = session.capture().views.iter().find(|v| v.name == "012").unwrap();
     let mask = view.load_mask(&Limits::default()).unwrap().unwrap();
     let off = |(p, m): (&[f32; 4], &u8)| (p[3] - *m as f32 / 255.0).abs() as f64;
     let mean = render.data.as_chunks::<4>().0.iter().zip(&mask.values).map(off).sum::<f64>()
@@ -154,9 +153,9 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
 
     // all of it again: nothing is loaded, nothing is done
     for stage in [Stage::Mask, Stage::Mesh, Stage::Render, Stage::Ensemble, Stage::Metrics] {
-        assert!(complete(&line, stage, &NoFields).unwrap().skipped);
+        assert!(complete(&session, stage, &NoFields).unwrap().skipped);
     }
-    page::write_report(&line, false).unwrap();
+    page::write_report(&session, false).unwrap();
     let page = String::from_utf8(bytes("report.html")).unwrap();
     assert!(page.contains("alt=\"012 by blend (ensemble)\"") && run.path("cameras.json").is_file());
     // the head to turn, and where the held-out photograph was taken from
@@ -168,7 +167,7 @@ fn the_line_after_learning_keeps_the_exact_head_exact() {
     assert!(Preview::of_run(run.dir()).unwrap().warnings.is_empty());
     std::fs::write(run.path("mesh/head.glb"), b"glTF").unwrap();
     let warnings = Preview::of_run(run.dir()).unwrap().warnings;
-    let error = head_page(&line).unwrap_err();
+    let error = head_page(&session).unwrap_err();
     assert!(error.to_string().contains("mesh/head.glb` has 4 bytes") && warnings.len() == 1, "{error}");
     assert!(warnings[0].contains("head.glb` has 4 bytes") && warnings[0].contains("`--fresh mesh`"));
 }
@@ -198,15 +197,15 @@ fn the_textured_head_looks_like_the_field_it_was_baked_from() {
         config.mesh.normal_map = lobes > 0;
         config.mesh.frame = frame;
         let run = quiet(&dir.path().join(errors.len().to_string()));
-        let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
-        line.remember(Stage::Render).unwrap();
-        complete(&line, Stage::Mask, &NoFields).unwrap();
-        let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
-        let mesh = complete(&line, Stage::Mesh, &exact).unwrap().summary;
+        let session = Session::open(&config, &run).unwrap();
+        session.remember(Stage::Render).unwrap();
+        complete(&session, Stage::Mask, &NoFields).unwrap();
+        let exact = Formula(Exact { world_from_scene: session.scene().unwrap().scene_from_world.inverse() });
+        let mesh = complete(&session, Stage::Mesh, &exact).unwrap().summary;
         assert_eq!((&mesh["closed"], &mesh["triangles"]), (&json!(true), &json!(8000)));
         // two texels a millimetre: the step across a seam is below a byte
         assert!(mesh["steps"]["seam_step_255"].as_f64().unwrap() < 1.0, "{mesh}");
-        complete(&line, Stage::Render, &exact).unwrap();
+        complete(&session, Stage::Render, &exact).unwrap();
         for ending in ["glb", "obj", "mtl", "png", "ply"] {
             assert!(run.path(format!("mesh/head.{ending}")).is_file(), "{ending}");
         }
@@ -215,7 +214,7 @@ fn the_textured_head_looks_like_the_field_it_was_baked_from() {
         };
         // by the photographs: what rays show is what a viewer shows, and near the photograph
         if color == ColorSource::Photographs {
-            let view = line.capture.views.iter().find(|v| v.name == "012").unwrap();
+            let view = session.capture.views.iter().find(|v| v.name == "012").unwrap();
             let photo = view.load(&Limits::default()).unwrap();
             let figures = |method: &str| {
                 compare("012", &picture(method), &photo.photo, photo.mask.as_ref(), None).unwrap()
@@ -255,18 +254,18 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     config.render.method = vec![Method::Textured];
     config.ensemble.members = Vec::new();
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
-    line.remember(Stage::Render).unwrap();
-    complete(&line, Stage::Mask, &NoFields).unwrap();
-    let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
-    let mesh = complete(&line, Stage::Mesh, &exact).unwrap().summary;
+    let session = Session::open(&config, &run).unwrap();
+    session.remember(Stage::Render).unwrap();
+    complete(&session, Stage::Mask, &NoFields).unwrap();
+    let exact = Formula(Exact { world_from_scene: session.scene().unwrap().scene_from_world.inverse() });
+    let mesh = complete(&session, Stage::Mesh, &exact).unwrap().summary;
     // the demo's neck runs out of the box
     assert_eq!(mesh["closed"], json!(mesh["report"]["capped"] == 0), "{mesh}");
     assert_eq!(mesh["texture_px"], 0);
-    let error = complete(&line, Stage::Render, &exact).unwrap_err();
+    let error = complete(&session, Stage::Render, &exact).unwrap_err();
     assert!(error.hint().contains("--texture"), "{error}");
     config.mesh.lobes = 1;
-    let error = Line::open(&config, &run).map(Line::with_synthetic_truth).err().unwrap();
+    let error = Session::open(&config, &run).err().unwrap();
     assert!(error.to_string().contains("mesh.lobes") && error.hint().contains("texture_px"), "{error}");
 }
 
@@ -334,14 +333,14 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
         config.mesh.texture_px = 0;
         config.mesh.genus = genus;
         let run = Run::quiet(&dir.path().join(format!("{genus:?}")));
-        let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
-        line.remember(Stage::Mesh).unwrap();
-        complete(&line, Stage::Mask, &NoFields).unwrap();
-        let world_from_scene = line.scene().unwrap().scene_from_world.inverse();
+        let session = Session::open(&config, &run).unwrap();
+        session.remember(Stage::Mesh).unwrap();
+        complete(&session, Stage::Mask, &NoFields).unwrap();
+        let world_from_scene = session.scene().unwrap().scene_from_world.inverse();
         let mm = world_from_scene.scale * config.capture.unit_m * 1000.0;
-        let summary = complete(&line, Stage::Mesh, &Drilled(Exact { world_from_scene })).unwrap().summary;
-        digests.push(line.plan(Stage::Mesh).fingerprint.digest());
-        let (handles, product) = (&summary["handles"], super::mesh::head_mesh(&line).unwrap().mesh);
+        let summary = complete(&session, Stage::Mesh, &Drilled(Exact { world_from_scene })).unwrap().summary;
+        digests.push(session.plan(Stage::Mesh).fingerprint.digest());
+        let (handles, product) = (&summary["handles"], super::mesh::head_mesh(&run).unwrap().mesh);
         let left = handles["left"].as_u64().unwrap() as usize;
         let lengths = |key: &str| handles[key].as_array().unwrap().len();
         counts.push((lengths("cut_mm") + lengths("filled_mm"), left));
@@ -391,19 +390,19 @@ fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
     config.render.method = vec![Method::Tface];
     config.render.background = ViewBackground::White;
     let run = quiet(dir.path());
-    complete(&Line::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
+    complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
     let interrupted = Fog(0.into(), Some(run.stop().clone()));
-    let e = complete(&Line::open(&config, &run).unwrap(), Stage::Render, &interrupted).unwrap_err();
+    let e = complete(&Session::open(&config, &run).unwrap(), Stage::Render, &interrupted).unwrap_err();
     assert_eq!(e.kind(), ErrorKind::Interrupted);
     let made = |run: &Run| io::list_files(&run.path("render/tface")).map_or(0, |f| f.len());
     assert_eq!(made(&run), 1);
     let run = quiet(dir.path());
     let rest = Fog(0.into(), None);
-    let line = Line::open(&config, &run).unwrap();
-    assert_eq!(complete(&line, Stage::Render, &rest).unwrap().summary["cameras"], 3);
+    let session = Session::open(&config, &run).unwrap();
+    assert_eq!(complete(&session, Stage::Render, &rest).unwrap().summary["cameras"], 3);
     assert_eq!((made(&run), rest.0.into_inner()), (3, 2));
     // half a gray of 0.5 over white is 0.25 + 0.5; in float it is as it was
-    let name = line.capture().split(Split::Test).next().unwrap().name.clone();
+    let name = session.capture().split(Split::Test).next().unwrap().name.clone();
     let shown = pictures::read(&run.path(format!("render/tface/{name}.png")), config.render.format).unwrap();
     assert_eq!(shown.pixel(3, 3), [191.0 / 255.0, 191.0 / 255.0, 191.0 / 255.0, 1.0]);
     let float = pictures::read_float(&run.path(format!("render/tface/float/{name}.exr"))).unwrap();
@@ -425,14 +424,14 @@ fn a_run_without_masks_stops_before_anything_is_written_unless_masks_are_decline
     }
     let run = quiet(dir.path());
     let mut config = draft(&root);
-    let e = Line::open(&config, &run).err().unwrap();
+    let e = Session::open(&config, &run).err().unwrap();
     assert!(e.to_string().contains("head mask") && e.kind() == ErrorKind::Cannot, "{e}");
     assert!(e.hint().contains("--page") && e.hint().contains("--set mask.source=none"), "{}", e.hint());
     assert!(!run.dir().exists());
     config.mask.source = MaskSource::None;
-    let line = Line::open(&config, &run).unwrap();
-    line.remember(Stage::Mask).unwrap();
-    assert_eq!(complete(&line, Stage::Mask, &NoFields).unwrap().summary["masks"], 0);
+    let session = Session::open(&config, &run).unwrap();
+    session.remember(Stage::Mask).unwrap();
+    assert_eq!(complete(&session, Stage::Mask, &NoFields).unwrap().summary["masks"], 0);
 }
 
 #[test]
@@ -443,27 +442,27 @@ fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
     let mut config = draft(&root);
     config.render.method = vec![Method::Tface];
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).unwrap();
-    complete(&line, Stage::Mask, &NoFields).unwrap();
+    let session = Session::open(&config, &run).unwrap();
+    complete(&session, Stage::Mask, &NoFields).unwrap();
     let path = run.path("mask/scene.json");
     let mut value = io::read_json(&path, &Limits::default()).unwrap();
     value["hull"] = json!({"resolution": 0, "bits": []});
     std::fs::write(&path, value.to_string()).unwrap();
     let fog = Fog(0.into(), None);
     // a stage that was done has lost what it made
-    let e = complete(&line, Stage::Mask, &NoFields).unwrap_err();
+    let e = complete(&session, Stage::Mask, &NoFields).unwrap_err();
     assert!(e.to_string().contains("mask/scene.json` has "), "{e}");
     assert!(e.hint().contains("`--fresh mask`") && e.kind() == ErrorKind::Cannot, "{}", e.hint());
     for e in [
-        complete(&line, Stage::Mesh, &NoFields).unwrap_err(),
-        complete(&line, Stage::Render, &fog).unwrap_err(),
+        complete(&session, Stage::Mesh, &NoFields).unwrap_err(),
+        complete(&session, Stage::Render, &fog).unwrap_err(),
     ] {
         assert!(e.to_string().contains("`hull.resolution` is 0, expected 2 to 1024"), "{e}");
         assert!(e.hint().contains("`--fresh mask`") && e.kind() == ErrorKind::Cannot, "{}", e.hint());
     }
     // which it is
-    line.fresh(Stage::Mask, Stage::Mask).unwrap();
-    complete(&line, Stage::Mask, &NoFields).unwrap();
+    session.fresh(Stage::Mask, Stage::Mask).unwrap();
+    complete(&session, Stage::Mask, &NoFields).unwrap();
 }
 
 #[test]
@@ -476,7 +475,7 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
         if !methods.is_empty() {
             config.render.method = methods.to_vec();
         }
-        words(&Line::open(&config, &run).unwrap().order(until))
+        words(&Session::open(&config, &run).unwrap().order(until))
     };
     assert_eq!(order(Stage::Baseline, &[]), "mask baseline");
     assert_eq!(order(Stage::Tface, &[]), "mask tface");
@@ -507,8 +506,8 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     let digests = |change: &dyn Fn(&mut Config)| -> Vec<String> {
         let mut config = draft(dir.path());
         change(&mut config);
-        let line = Line::open(&config, &run).unwrap();
-        Stage::ALL.iter().map(|s| line.plan(*s).fingerprint.digest()).collect()
+        let session = Session::open(&config, &run).unwrap();
+        Stage::ALL.iter().map(|s| session.plan(*s).fingerprint.digest()).collect()
     };
     let base = digests(&|_| {});
     let changed = |change: &dyn Fn(&mut Config)| -> String {
@@ -526,7 +525,7 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     assert_eq!(changed(&|c| c.capture.downscale = 2), all);
     assert_eq!(changed(&|c| c.capture.tiles = 0.0), all.replace("mask ", ""));
     assert_eq!(changed(&|c| c.device = "cpu".into()), "");
-    // what is imported counts, not where it lies
+    // the imported content counts, not its path
     let import = |name: &str| {
         let path = dir.path().join(name).to_str().unwrap().to_string();
         digests(&|c| c.tface.import = path.clone())
@@ -549,7 +548,7 @@ fn what_is_not_rendered_does_not_shape_the_views() {
         let mut config = draft(dir.path());
         config.render.method = vec![Method::Tface];
         change(&mut config);
-        Line::open(&config, &run).unwrap().plan(Stage::Render).fingerprint
+        Session::open(&config, &run).unwrap().plan(Stage::Render).fingerprint
     };
     let base = render(&|_| {});
     assert_eq!(base.inputs.keys().map(String::as_str).collect::<Vec<_>>(), ["mask", "tface"]);
@@ -559,15 +558,15 @@ fn what_is_not_rendered_does_not_shape_the_views() {
 }
 
 /// Records every stage as done without any work.
-fn finish(line: &Line) {
-    for stage in line.order(Stage::Metrics) {
-        line.run.stage(line.plan(stage), |_| Ok(json!(null))).unwrap();
+fn finish(session: &Session) {
+    for stage in session.order(Stage::Metrics) {
+        session.run.stage(session.plan(stage), |_| Ok(json!(null))).unwrap();
     }
 }
 
 /// The stages of a run that are done as planned.
-fn done(line: &Line) -> String {
-    words(&Stage::ALL.into_iter().filter(|s| line.run.is_done(&line.plan(*s))).collect::<Vec<_>>())
+fn done(session: &Session) -> String {
+    words(&Stage::ALL.into_iter().filter(|s| session.run.is_done(&session.plan(*s))).collect::<Vec<_>>())
 }
 
 #[test]
@@ -577,7 +576,7 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
     capture(&root, 8, 1);
     let mut config = draft(&root);
     let run = quiet(dir.path());
-    finish(&Line::open(&config, &run).unwrap());
+    finish(&Session::open(&config, &run).unwrap());
     let all = "mask tface iface mesh render ensemble metrics";
     for change in [
         |c: &mut Config| c.mesh.material = Material::Lit,
@@ -585,14 +584,14 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
         |c: &mut Config| (c.mesh.frame, c.mesh.texture_format) = (MeshFrame::Head, TextureFormat::Jpeg),
     ] {
         change(&mut config);
-        let line = Line::open(&config, &run).unwrap();
-        assert_eq!(line.require(Stage::Mesh, Some(Stage::Mesh)).unwrap(), ["mesh"]);
-        line.fresh(Stage::Mesh, Stage::Mesh).unwrap();
-        assert_eq!(done(&line), all.replace("mesh ", ""));
+        let session = Session::open(&config, &run).unwrap();
+        assert_eq!(session.require(Stage::Mesh, Some(Stage::Mesh)).unwrap(), ["mesh"]);
+        session.fresh(Stage::Mesh, Stage::Mesh).unwrap();
+        assert_eq!(done(&session), all.replace("mesh ", ""));
         // also where the command is repeated after it was killed
-        assert!(line.require(Stage::Mesh, Some(Stage::Mesh)).unwrap().is_empty());
-        line.run.stage(line.plan(Stage::Mesh), |_| Ok(json!(null))).unwrap();
-        assert_eq!(done(&line), all);
+        assert!(session.require(Stage::Mesh, Some(Stage::Mesh)).unwrap().is_empty());
+        session.run.stage(session.plan(Stage::Mesh), |_| Ok(json!(null))).unwrap();
+        assert_eq!(done(&session), all);
     }
     // views of a path stay as well, unless the mesh has fewer triangles
     let orbit = crate::config::RenderConfig {
@@ -600,16 +599,16 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
         method: vec![Method::Raycast],
         ..config.render.clone()
     };
-    let line = Line::open(&config, &run).unwrap().with_camera_path(orbit).unwrap();
-    line.run.stage(line.plan(Stage::Render), |_| Ok(json!(null))).unwrap();
+    let session = Session::open(&config, &run).unwrap().with_camera_path(orbit).unwrap();
+    session.run.stage(session.plan(Stage::Render), |_| Ok(json!(null))).unwrap();
     for (material, triangles, expected) in [
         (Material::Unlit, config.mesh.triangles, &["mesh"][..]),
         (Material::Lit, 100, &["mesh", "render", "ensemble", "metrics", "render/paths/orbit"]),
     ] {
         let mesh = MeshConfig { material, triangles, ..config.mesh.clone() };
         let other = Config { mesh, ..config.clone() };
-        let line = Line::open(&other, &run).unwrap();
-        assert_eq!(line.out_of_date(Stage::Mesh).unwrap(), expected);
+        let session = Session::open(&other, &run).unwrap();
+        assert_eq!(session.out_of_date(Stage::Mesh).unwrap(), expected);
     }
     // fewer triangles are seen, but where rays meet the surface that they are made from
     let follow = ["mesh", "render", "ensemble", "metrics"];
@@ -622,13 +621,13 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
         config.render.method = vec![method];
         (config.ensemble.members, config.ensemble.weights) = (vec![method], vec![1.0]);
         let run = Run::quiet(&dir.path().join(format!("{color:?} {method:?}")));
-        finish(&Line::open(&config, &run).unwrap());
+        finish(&Session::open(&config, &run).unwrap());
         let fewer = Config { mesh: MeshConfig { triangles: 100, ..config.mesh.clone() }, ..config.clone() };
-        let line = Line::open(&fewer, &run).unwrap();
-        assert_eq!(line.out_of_date(Stage::Mesh).unwrap(), expected, "{color:?} {method:?}");
+        let session = Session::open(&fewer, &run).unwrap();
+        assert_eq!(session.out_of_date(Stage::Mesh).unwrap(), expected, "{color:?} {method:?}");
         // what is made anew as it was is made anew with all that follows
-        let line = Line::open(&config, &run).unwrap();
-        assert_eq!(line.out_of_date(Stage::Mesh).unwrap(), follow);
+        let session = Session::open(&config, &run).unwrap();
+        assert_eq!(session.out_of_date(Stage::Mesh).unwrap(), follow);
     }
 }
 
@@ -640,17 +639,17 @@ fn views_from_before_files_of_the_mesh_were_told_apart_are_still_done() {
     let mut config = draft(&root);
     (config.mesh.material, config.mesh.format) = (Material::Lit, vec![MeshFormat::Ply]);
     let run = quiet(dir.path());
-    let line = Line::open(&config, &run).unwrap();
-    for stage in line.order(Stage::Metrics) {
-        let mut plan = line.plan(stage);
+    let session = Session::open(&config, &run).unwrap();
+    for stage in session.order(Stage::Metrics) {
+        let mut plan = session.plan(stage);
         if stage == Stage::Render {
-            let whole = line.plan(Stage::Mesh).fingerprint.digest();
+            let whole = session.plan(Stage::Mesh).fingerprint.digest();
             assert_ne!(plan.fingerprint.inputs.insert("mesh".into(), whole.clone()), Some(whole));
         }
-        line.run.stage(plan, |_| Ok(json!(null))).unwrap();
+        session.run.stage(plan, |_| Ok(json!(null))).unwrap();
     }
-    assert_eq!(done(&line), "mask tface iface mesh render ensemble metrics");
-    line.remember(Stage::Metrics).unwrap();
+    assert_eq!(done(&session), "mask tface iface mesh render ensemble metrics");
+    session.remember(Stage::Metrics).unwrap();
 }
 
 #[test]
@@ -666,10 +665,10 @@ fn the_frame_of_a_file_shapes_nothing_that_views_show() {
         config.mesh.texture_px = 128;
         config.mesh.frame = frame;
         let run = Run::quiet(&dir.path().join(format!("{frame:?}")));
-        let line = Line::open(&config, &run).map(Line::with_synthetic_truth).unwrap();
-        complete(&line, Stage::Mask, &NoFields).unwrap();
-        let exact = Formula(Exact { world_from_scene: line.scene().unwrap().scene_from_world.inverse() });
-        complete(&line, Stage::Mesh, &exact).unwrap();
+        let session = Session::open(&config, &run).unwrap();
+        complete(&session, Stage::Mask, &NoFields).unwrap();
+        let exact = Formula(Exact { world_from_scene: session.scene().unwrap().scene_from_world.inverse() });
+        complete(&session, Stage::Mesh, &exact).unwrap();
         let parts = run.path("mesh/parts");
         let names = io::list_files(&parts).unwrap();
         names.into_iter().map(|n| (std::fs::read(parts.join(&n)).unwrap(), n)).collect::<Vec<_>>()
@@ -684,19 +683,19 @@ fn a_stage_that_the_disk_has_no_room_for_is_refused_before_the_old_one_is_cleare
     capture(&root, 8, 1);
     let mut config = draft(&root);
     let run = quiet(dir.path());
-    finish(&Line::open(&config, &run).unwrap());
+    finish(&Session::open(&config, &run).unwrap());
     if io::free_bytes(dir.path()).is_none() {
         eprintln!("skipped: this system does not tell how much room is left");
         return;
     }
     config.iface.log2_table = 40;
-    let line = Line::open(&config, &run).unwrap();
-    let error = line.fresh(Stage::Iface, Stage::Metrics).unwrap_err();
+    let session = Session::open(&config, &run).unwrap();
+    let error = session.fresh(Stage::Iface, Stage::Metrics).unwrap_err();
     assert!(
         error.to_string().contains("`iface` needs about") && error.kind() == ErrorKind::Cannot,
         "{error}"
     );
-    for stage in line.order(Stage::Metrics) {
+    for stage in session.order(Stage::Metrics) {
         assert!(run.path(stage).join("done.json").is_file(), "{stage} was cleared");
     }
 }

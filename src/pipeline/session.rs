@@ -1,0 +1,187 @@
+//! A capture, its configuration and its run folder, which every stage works on.
+
+use super::inputs::{Inputs, missing_capture};
+use super::lpips::measure;
+use super::path::CameraPath;
+use super::{mask, scene_file};
+use crate::capture::scene::{Scene, SceneBox};
+use crate::capture::{Capture, CaptureOptions, Split, ViewMask};
+use crate::config::{Config, MaskSource, RenderConfig, Stage};
+use crate::io;
+use crate::run::Run;
+use crate::{Error, Result};
+use std::fmt::Display;
+use std::io::ErrorKind::NotFound;
+use std::path::Path;
+
+/// A capture, its configuration and its run folder.
+pub struct Session<'a> {
+    pub(super) capture: Capture,
+    pub(super) config: &'a Config,
+    pub(super) run: &'a Run,
+    /// What the fingerprints of the stages depend on besides the settings.
+    pub(super) inputs: Inputs,
+    /// The camera path that `render` shows instead of the held-out views.
+    pub(super) path: Option<CameraPath>,
+}
+
+/// Folder of the demo's photographs, in its run.
+pub const DEMO_CAPTURE: &str = "capture";
+
+impl<'a> Session<'a> {
+    /// Opens the capture and reads every byte of it once to compute its digest. Nothing is written.
+    ///
+    /// The capture of a finished run may have been moved. Its cameras are then restored from the run, and no stage
+    /// can be worked on ([`Session::remember`]).
+    pub fn open(config: &'a Config, run: &'a Run) -> Result<Session<'a>> {
+        check_feasible(config)?;
+        let (mut capture, inputs) = Inputs::read(config, run)?;
+        capture.warnings.iter().for_each(|warning| run.warn("capture", warning));
+        if inputs.clicks.is_some() {
+            // later stages read the masks that the stage `mask` makes
+            for view in &mut capture.views {
+                view.mask = ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
+            }
+        }
+        if is_demo(config, run) {
+            capture.name = "demo".into();
+        }
+        Ok(Session { capture, config, run, inputs, path: None })
+    }
+
+    /// Returns a session whose stage `render` makes the views of `render.cameras` in a folder of their own instead of
+    /// the evaluation's views; a file of cameras is read here. For `test` the session is returned unchanged.
+    pub fn with_camera_path(self, render: RenderConfig) -> Result<Session<'a>> {
+        let path = CameraPath::new(render, &self.capture)?;
+        Ok(Session { path, ..self })
+    }
+
+    /// Returns the capture as the metrics use it: each view with the capture's own mask, if it has one.
+    pub(super) fn evaluation_capture(&self) -> Capture {
+        let mut capture = self.capture.clone();
+        let own = self.inputs.own_masks.iter().flat_map(|own| &own.masks);
+        for (view, own) in capture.views.iter_mut().zip(own).filter(|(_, own)| **own != ViewMask::None) {
+            view.mask = own.clone();
+        }
+        capture
+    }
+
+    /// Returns the source of the masks that the figures of held-out views are restricted to: `capture`, `run` (this
+    /// run made at least one of them, so other runs may evaluate differently) or `none`.
+    pub(super) fn mask_source(&self, evaluated: &Capture) -> &'static str {
+        let masks = self.capture.views.iter().zip(&evaluated.views);
+        let all: Vec<_> = masks.map(|(view, evaluated)| (view.split, &view.mask, &evaluated.mask)).collect();
+        let held_out: Vec<_> = all.iter().copied().filter(|(split, ..)| *split != Split::Train).collect();
+        let masks = if held_out.is_empty() { all } else { held_out };
+        match &self.inputs.own_masks {
+            _ if masks.iter().all(|(_, _, evaluated)| **evaluated == ViewMask::None) => "none",
+            Some(_) if !masks.iter().all(|(_, made, evaluated)| made != evaluated) => "run",
+            _ => "capture",
+        }
+    }
+
+    /// Returns the capture.
+    pub fn capture(&self) -> &Capture {
+        &self.capture
+    }
+
+    /// Returns the box and hull that the stage `mask` found.
+    pub fn scene(&self) -> Result<Scene> {
+        scene_file::read_scene(&self.run.path("mask/scene.json")).map_err(|e| unusable(e, Stage::Mask))
+    }
+
+    /// Writes `cameras.json`, if the photographs can be opened.
+    pub(super) fn write_cameras(&self, idle: bool) -> Result<()> {
+        if self.inputs.missing_capture.is_some() {
+            return Ok(());
+        }
+        let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
+        let cameras = scene_file::cameras_json(&self.capture, &scene);
+        self.write("cameras.json", &cameras, idle)
+    }
+
+    /// Returns how the views of the stage `render` are made: with the settings of the camera path, if the session has
+    /// one.
+    pub(super) fn render_config(&self) -> &RenderConfig {
+        self.path.as_ref().map_or(&self.config.render, |path| &path.render)
+    }
+
+    /// Fails if an input of one of these stages is missing: photographs, checkpoints, networks or the device.
+    pub(super) fn require_inputs(&self, stages: &[Stage]) -> Result<()> {
+        if let Some(problem) = self.inputs.missing_capture.as_ref().filter(|_| !stages.is_empty()) {
+            return Err(missing_capture(problem));
+        }
+        let mut lost = self
+            .inputs
+            .imports
+            .iter()
+            .filter(|i| stages.contains(&i.stage))
+            .filter_map(|i| i.missing.clone());
+        lost.next().map_or(Ok(()), Err)?;
+        if stages.contains(&Stage::Metrics) {
+            measure(self.config)?;
+        }
+        #[cfg(not(feature = "matting"))]
+        if self.inputs.clicks.is_some() && stages.contains(&Stage::Mask) {
+            crate::mask::networks::Networks::open(&self.config.mask)?;
+        }
+        match stages.iter().any(|stage| stage.uses_device()) {
+            true => require_device(self.config),
+            false => Ok(()),
+        }
+    }
+
+    /// Writes a file of the run itself. A write error is ignored if no work is left, because a finished run may lie
+    /// on a read-only disk.
+    pub(super) fn write(&self, name: &str, bytes: &[u8], idle: bool) -> Result<()> {
+        match self.run.write(name, bytes) {
+            Err(e) if idle => {
+                self.run.warn("run", &format!("{e}; all that was asked for is done"));
+                Ok(())
+            }
+            other => other,
+        }
+    }
+}
+
+/// Refuses settings that contradict each other, and an invalid box.
+pub fn check_feasible(config: &Config) -> Result<()> {
+    if let Some((key, problem, hint)) = config.mesh.problem().or_else(|| config.mask.problem()) {
+        return Err(Error::usage(format!("`{key}` {problem}"), hint));
+    }
+    SceneBox::parse(&config.capture.r#box)?;
+    Ok(())
+}
+
+/// Whether the capture is the synthetic head of a demo, whose surface is known.
+pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
+    io::real_path(&run.path(DEMO_CAPTURE)).is_ok_and(|made| made == Path::new(&config.capture.path))
+}
+
+/// Refuses a device that this build or this machine does not have, or that another process uses. Finished stages need
+/// no device, so this is checked only if a stage that computes on it has work left.
+pub fn require_device(config: &Config) -> Result<()> {
+    crate::field::require_device(&config.device)
+}
+
+/// Returns the options with which the configuration opens a capture.
+pub fn capture_options(config: &Config) -> CaptureOptions {
+    let c = &config.capture;
+    CaptureOptions {
+        downscale: c.downscale,
+        masks: if config.mask.made() { MaskSource::Clicks } else { config.mask.source },
+        mask_dir: c.mask_dir.clone(),
+        mask_meaning: config.mask.meaning,
+        trust_masks: config.mask.trust,
+        unit_m: c.unit_m,
+        ..CaptureOptions::default()
+    }
+}
+
+/// Returns the error for an unusable file that a stage of this run made: the hint is to make it again.
+pub(super) fn unusable(e: io::ReadError, stage: impl Display) -> Error {
+    match &e {
+        io::ReadError::Io { source, .. } if source.kind() != NotFound => e.into(),
+        _ => Error::cannot(&e, format!("make it again: repeat the command with `--fresh {stage}`")),
+    }
+}
