@@ -52,11 +52,7 @@ pub(super) fn finish(
     let mut mesh = surface.clone();
     let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
     if fewer || c.max_error > 0.0 {
-        let config = SimplifyConfig {
-            triangles: c.triangles as usize,
-            error: c.max_error * cell,
-            ..SimplifyConfig::default()
-        };
+        let config = SimplifyConfig { triangles: c.triangles as usize, error: c.max_error * cell };
         let done = simplify(&mut mesh, Some(field), &config, monitor)?;
         warnings.extend(done.warnings(&config));
         report.insert("simplify".into(), json!(done));

@@ -339,8 +339,21 @@ impl GlbDocument {
         view
     }
 
-    /// Adds elements without gaps. Only bytes are normalized.
+    /// Adds elements without gaps, or returns an accessor of the same bytes: layers may cover the whole mesh. Only
+    /// bytes are normalized.
     fn accessor(&mut self, bytes: &[u8], (component, type_): (ComponentType, Type)) -> Index<Accessor> {
+        let is_same = |a: &Accessor| {
+            let view = a.buffer_view.map(|view| &self.root.buffer_views[view.value()]);
+            matches!(a.component_type, Valid(GenericComponentType(known)) if known == component)
+                && a.type_ == Valid(type_)
+                && view.is_some_and(|view| {
+                    let start = view.byte_offset.map_or(0, |offset| offset.0 as usize);
+                    self.bin[start..start + view.byte_length.0 as usize] == *bytes
+                })
+        };
+        if let Some(known) = self.root.accessors.iter().position(is_same) {
+            return Index::new(known as u32);
+        }
         let is_index = matches!(type_, Type::Scalar);
         let target = if is_index { Target::ElementArrayBuffer } else { Target::ArrayBuffer };
         let view = self.view(bytes, Some(target));

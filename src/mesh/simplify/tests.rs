@@ -323,7 +323,7 @@ fn an_error_is_kept_with_and_without_a_field() {
     let start = mesh_of(ball, 40);
     let mut last = usize::MAX;
     for error in [2e-3, 1e-2, 4e-2] {
-        let config = SimplifyConfig { triangles: 0, error, ..SimplifyConfig::default() };
+        let config = SimplifyConfig { triangles: 0, error };
         let mut mesh = start.clone();
         let report = simplify(&mut mesh, Some(&ball), &config, &Quiet).unwrap();
         let worst = off_ball(&mesh);
