@@ -5,9 +5,8 @@
 
 mod resize;
 
-pub(crate) use resize::bilinear;
 pub use resize::{
-    enlarge, reduce_photo, reduce_to_rows, resize_gray, resize_hard, size_at_rows, working_size,
+    bilinear, enlarge, reduce_photo, reduce_to_rows, resize_gray, resize_hard, size_at_rows, working_size,
 };
 
 /// sRGB-coded from linear (IEC 61966-2-1), any value clamped to 0..=1.

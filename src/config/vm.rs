@@ -203,9 +203,10 @@ impl VmConfig {
         shares.iter().rposition(|share| (share * self.steps as f64).round() as u64 == step)
     }
 
-    /// Returns the number of rays of a step.
+    /// Returns the number of rays of a step. The published order of pixels counts rays of steps that all have the same.
     pub fn rays_at(&self, step: u64) -> usize {
-        let finest = self.upsample_at.last().is_none_or(|share| step as f64 > share * self.steps as f64);
+        let finest = self.whole_frame
+            || self.upsample_at.last().is_none_or(|share| step as f64 > share * self.steps as f64);
         if finest { self.rays } else { ((self.rays as f64 * self.early_rays) as usize).max(1) }
     }
 

@@ -153,7 +153,7 @@ pub fn enlarge(alpha: &[f32], from: (u32, u32), size: (u32, u32), lowest: f32, h
 
 /// A field of `from` (width, height) at the pixel centers of `to`, each value given to `with`; edges are repeated. Rows
 /// of `values` are `stride` apart, so the upper left `from` of a larger field can be taken.
-pub(crate) fn bilinear<T: Copy + Default + Send>(
+pub fn bilinear<T: Copy + Default + Send>(
     values: &[f32],
     stride: u32,
     from: (u32, u32),

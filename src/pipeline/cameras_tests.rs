@@ -158,7 +158,7 @@ fn the_stage_mask_keeps_refined_poses_for_later_stages_unless_given_ones_are_ask
     let (dir, exact) = demo();
     let mut wrong = exact.clone();
     (0..14).for_each(|v| disturb(&mut wrong, v, 1.5));
-    let file = dir.path().join("transforms.json");
+    let file = dir.path().join("transforms_train.json");
     let mut frames: Value = io::read_json(&file, &Limits::default()).unwrap();
     for (frame, view) in frames["frames"].as_array_mut().unwrap().iter_mut().zip(&wrong.views) {
         for (row, column) in (0..9).map(|i| (i / 3, i % 3)) {
