@@ -46,12 +46,13 @@ pub use crate::config::Stage;
 pub use crate::geom::RayResult;
 pub use bench::{Bench, SWEEPS};
 pub use finish::Export;
+pub use inputs::capture_options;
 pub use mask::{click_page, inspect_capture};
 pub use mesh::export_head;
 pub use metrics::{Truth, against_truth};
 pub use page::{head_page, renew_report, viewer_of_file};
 pub use preview::{Preview, PreviewPicture, PreviewRenderer, field_view};
-pub use session::{DEMO_CAPTURE, Session, capture_options, check_feasible, require_device};
+pub use session::{DEMO_CAPTURE, Session, check_feasible, require_device};
 pub use surface::{Fields, Radiance, Surface};
 
 use crate::Result;

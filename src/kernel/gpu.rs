@@ -22,6 +22,7 @@ mod points;
 mod rng;
 mod schedule;
 mod sdf;
+mod search;
 mod sum;
 #[cfg(test)]
 mod test_case;

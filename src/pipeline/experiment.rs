@@ -1,7 +1,8 @@
 //! The paper's tables: the runs that they are made of and their results. A row is a preset of settings; its run is
 //! made by the pipeline like any other, and a finished run is not made again.
 
-use super::session::{Session, capture_options};
+use super::inputs::capture_options;
+use super::session::Session;
 use super::{Stage, complete, learn, reconstruct};
 use crate::capture;
 use crate::config::iface::FieldKind;

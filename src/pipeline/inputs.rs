@@ -3,7 +3,6 @@
 //! A finished run no longer needs these files: the digests of those that have been moved are restored from its records.
 
 use super::clicks::MaskPrompts;
-use super::session::capture_options;
 use super::{mask, scene_file};
 use crate::capture::{self, Capture, CaptureOptions, View, ViewMask};
 use crate::config::{Config, MaskSource, Stage};
@@ -154,6 +153,21 @@ fn capture_digest(capture: &Capture) -> Result<(String, BTreeMap<String, String>
         text += &format!("\n{focus:?}");
     }
     Ok((Fingerprint::of_bytes(text.as_bytes()), inputs.into_iter().flatten().collect()))
+}
+
+/// Returns the options with which the configuration opens a capture.
+pub fn capture_options(config: &Config) -> CaptureOptions {
+    let c = &config.capture;
+    CaptureOptions {
+        downscale: c.downscale,
+        masks: if config.mask.made() { MaskSource::Clicks } else { config.mask.source },
+        mask_dir: c.mask_dir.clone(),
+        mask_meaning: config.mask.meaning,
+        trust_masks: config.mask.trust,
+        cameras: c.cameras,
+        unit_m: c.unit_m,
+        ..CaptureOptions::default()
+    }
 }
 
 fn file_digest(path: &Path) -> Result<String, io::ReadError> {

@@ -3,10 +3,11 @@
 //! A cost is a number of rays, samples, cells or pixels times the measured time of one.
 
 use super::ensemble::can_blend;
+use super::inputs::capture_options;
 use super::mask::inspect_capture;
 use super::path::{CameraPath, PATHS};
 use super::render::{held_out, shows_head};
-use super::session::{Session, capture_options};
+use super::session::Session;
 use crate::capture::View;
 use crate::config::iface::FieldKind;
 use crate::config::{

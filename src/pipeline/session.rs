@@ -6,8 +6,8 @@ use super::lpips::measure;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::{Scene, SceneBox};
-use crate::capture::{Capture, CaptureOptions, Split, ViewMask};
-use crate::config::{Config, MaskSource, RenderConfig, Stage};
+use crate::capture::{Capture, Split, ViewMask};
+use crate::config::{Config, RenderConfig, Stage};
 use crate::io;
 use crate::run::Run;
 use crate::{Error, Result};
@@ -178,21 +178,6 @@ pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
 /// no device, so this is checked only if a stage that computes on it has work left.
 pub fn require_device(config: &Config) -> Result<()> {
     crate::field::require_device(&config.device)
-}
-
-/// Returns the options with which the configuration opens a capture.
-pub fn capture_options(config: &Config) -> CaptureOptions {
-    let c = &config.capture;
-    CaptureOptions {
-        downscale: c.downscale,
-        masks: if config.mask.made() { MaskSource::Clicks } else { config.mask.source },
-        mask_dir: c.mask_dir.clone(),
-        mask_meaning: config.mask.meaning,
-        trust_masks: config.mask.trust,
-        cameras: c.cameras,
-        unit_m: c.unit_m,
-        ..CaptureOptions::default()
-    }
 }
 
 /// Returns the error for an unusable file that a stage of this run made: the hint is to make it again.

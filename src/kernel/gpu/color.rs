@@ -1,10 +1,9 @@
 //! The color network that both fields on a hash grid have: two hidden layers over the outputs of the geometry network, the
 //! direction's spherical harmonics and, by field, the unit normal and the hash features.
 
-use super::sdf::ends;
 use super::tile::{
-    self, CHANNELS, LANES, Lane, at, load_planes, outer, output_layer, product, relu, relu_backward, sigmoid,
-    store_block, store_planes,
+    self, CHANNELS, LANES, Lane, at, ends, load_planes, outer, output_layer, product, relu, relu_backward,
+    sigmoid, store_block, store_planes,
 };
 use crate::kernel::cpu::density::MAX_EXP_GRADIENT;
 use crate::kernel::cpu::mlp::{HIDDEN, SOFTNESS, TILE};

@@ -8,9 +8,9 @@ use super::hash::Grid;
 use super::losses::{HIT, LAST, TALLY, sum, tally};
 use super::march::{Samples, prefix_sum};
 use super::sdf::kernels::{prepare, reduce};
-use super::sdf::{ends, maps, summing};
+use super::sdf::{maps, summing};
 use super::tile::{
-    CHANNELS, LANES, Lane, UNITS, at, lane_of, load_planes, outer, output_layer, product, relu,
+    CHANNELS, LANES, Lane, UNITS, at, ends, lane_of, load_planes, outer, output_layer, product, relu,
     relu_backward, store_block, store_planes, uniform_count,
 };
 use super::weight_norm::finite;

@@ -12,7 +12,7 @@ pub(super) mod kernels;
 use super::color::{ColorPlan, color_backward};
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::hash::Grid;
-use super::tile::{CHANNELS, UNITS};
+use super::tile::{CHANNELS, UNITS, ends};
 use crate::kernel::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
 use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
 use kernels::{forward, geometry_backward, prepare, reduce};
@@ -127,11 +127,6 @@ pub(super) fn maps(
         }
     }
     (prepared, summed)
-}
-
-/// Returns running sums of `counts`, from 0.
-pub(super) fn ends<const N: usize, const M: usize>(counts: [usize; N]) -> [usize; M] {
-    std::array::from_fn(|i| counts[..i].iter().sum())
 }
 
 /// A signed-distance field on a device, with the activations and gradients of up to `capacity` samples.

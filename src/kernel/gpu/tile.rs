@@ -413,3 +413,8 @@ pub fn softplus_backward(s: &Block, g_h: &Block, g_a: &Block, w: F4) -> Block {
 fn softplus_backward_channel(s: F4, g_h: F4, g_a: F4, w: f32) -> F4 {
     s * (g_h + g_a * F4::new(100.0f32 * w) * (F4::new(1.0f32) - s))
 }
+
+/// Returns running sums of `counts`, from 0.
+pub(super) fn ends<const N: usize, const M: usize>(counts: [usize; N]) -> [usize; M] {
+    std::array::from_fn(|i| counts[..i].iter().sum())
+}

@@ -1,8 +1,9 @@
 //! nerfacc's rule: a decaying maximum of the opacity of each cell, updated at randomly drawn cells.
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::march::{prefix_sum, ranked};
+use super::super::march::prefix_sum;
 use super::super::rng::{self, Wide};
+use super::super::search::ranked;
 use super::super::sum::group_sum;
 use super::{Occupancy, UNITS};
 use crate::Result;
