@@ -143,7 +143,7 @@ pub fn harden(alpha: f32, lowest: f32, highest: f32) -> f32 {
     }
 }
 
-/// Alphas `[from.1 · from.0]` brought to `size` by bilinear interpolation, then [`harden`]ed and coded in 8
+/// Alphas `[from.1 · from.0]` brought to `size` by bilinear interpolation, then hardened (`harden`) and coded in 8
 /// bit. Values that are no numbers become 0.
 pub fn enlarge(alpha: &[f32], from: (u32, u32), size: (u32, u32), lowest: f32, highest: f32) -> Gray {
     assert_eq!(alpha.len(), from.0 as usize * from.1 as usize);
