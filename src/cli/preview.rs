@@ -21,7 +21,7 @@ use serde_json::json;
 use std::collections::HashMap;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 /// How a preview is made.
 #[derive(Args, Debug)]
@@ -430,6 +430,9 @@ fn no_up(up: Option<Vec3>) -> Result<()> {
 /// The page of a run at work, in its folder.
 const WATCHED: &str = "watch.html";
 
+/// How often a request to stop is looked for: its handler ends an idle command after half a second.
+const STOP_CHECK: Duration = Duration::from_millis(50);
+
 /// How often that is written.
 const EVERY: Duration = Duration::from_secs(2);
 
@@ -465,10 +468,16 @@ fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     } else {
         print(&format!("watch     {} (open it in a browser), until Ctrl-C\n", page.display()))?;
     }
+    let mut written = Instant::now();
     while stop.requested().is_none() {
-        std::thread::park_timeout(EVERY);
-        write(stop.requested().is_none())?;
+        std::thread::sleep(STOP_CHECK);
+        if written.elapsed() >= EVERY {
+            write(true)?;
+            written = Instant::now();
+        }
     }
+    // a stop may come while the page is written, so the last page is written after the loop
+    write(false)?;
     Err(stop.error("the page stays as it is"))
 }
 
