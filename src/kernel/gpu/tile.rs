@@ -102,8 +102,8 @@ pub fn product(
     a: &[F4],
     #[comptime] first: usize,
     w: &[F4],
-    #[comptime] from: usize,
-    #[comptime] k: usize,
+    from: usize,
+    k: usize,
     row: usize,
     column: usize,
     #[comptime] lanes: usize,
@@ -215,7 +215,7 @@ pub fn outer(
     #[comptime] first: usize,
     b: &[F4],
     #[comptime] m: usize,
-    #[comptime] n: usize,
+    n: usize,
     gradient: &mut [f32],
     start: usize,
     fresh: bool,
@@ -240,13 +240,13 @@ pub fn outer(
             }
             let target = start + i * comptime!(channels(lanes)) + column;
             add(gradient, target, s0, fresh);
-            if comptime!(n > columns) {
+            if n > columns {
                 add(gradient, target + columns, s1, fresh);
             }
-            if comptime!(n > 2 * columns) {
+            if n > 2 * columns {
                 add(gradient, target + 2 * columns, s2, fresh);
             }
-            if comptime!(n > 3 * columns) {
+            if n > 3 * columns {
                 add(gradient, target + 3 * columns, s3, fresh);
             }
         }

@@ -65,11 +65,6 @@ impl Plan {
         self.inputs().div_ceil(self.width())
     }
 
-    /// Returns the number of inputs in piece `p`.
-    fn piece(&self, p: usize) -> usize {
-        (self.inputs() - p * self.width()).min(self.width())
-    }
-
     /// Returns the first rows of `[M, W1_direction]ᵀ`, b1, W2ᵀ, b2, W3, b3, `[M, W1_direction]` (one piece after the
     /// other), W2, and the end.
     fn rows(&self) -> [usize; 9] {

@@ -118,6 +118,12 @@ fn input(
     v
 }
 
+/// Returns the number of inputs in piece `p`, which fills a tile or is the last one.
+#[cube]
+fn piece_inputs(p: usize, #[comptime] plan: Plan) -> usize {
+    min(comptime!(plan.inputs()) - p * comptime!(plan.width()), comptime!(plan.width()))
+}
+
 /// Fills a tile with one piece of the inputs of the samples of tile number `tile`.
 #[cube]
 fn inputs(
@@ -132,11 +138,11 @@ fn inputs(
     samples: usize,
     row: usize,
     column: usize,
-    #[comptime] piece: usize,
+    piece: usize,
     #[comptime] plan: Plan,
 ) {
     let lanes = comptime!(plan.lanes);
-    let quad = comptime!(piece * tile::columns(lanes)) + column;
+    let quad = piece * comptime!(tile::columns(lanes)) + column;
     if quad < comptime!(plan.inputs() / 4) {
         let k = 4 * (tile * lanes + row);
         let block = Block::of(
@@ -175,16 +181,17 @@ fn first_layer(
     let lanes = comptime!(plan.lanes);
     let rows = comptime!(plan.rows());
     let bias = w[comptime!(rows[1] * tile::columns(lanes)) + column];
+    // a loop of the kernel, like the other one over pieces: unrolled, the interpolation is compiled once for each piece,
+    // which takes software drivers a minute
     let mut c0 = broadcast(bias, 0usize);
     let mut c1 = broadcast(bias, 1usize);
     let mut c2 = broadcast(bias, 2usize);
     let mut c3 = broadcast(bias, 3usize);
-    #[unroll]
     for p in 0..comptime!(plan.pieces()) {
         inputs(a, values, words, place, ray, direction, index, tile, samples, row, column, p, plan);
         sync_cube();
-        let from = comptime!(p * plan.width());
-        let z = product(&*a, 0usize, w, from, comptime!(plan.piece(p)), row, column, lanes);
+        let z =
+            product(&*a, 0usize, w, p * comptime!(plan.width()), piece_inputs(p, plan), row, column, lanes);
         c0 += z.channel(0usize);
         c1 += z.channel(1usize);
         c2 += z.channel(2usize);
@@ -357,18 +364,16 @@ pub(super) fn backward(
         sync_cube();
         let at_b1 = sum + comptime!(gradient_rows[1] * width);
         sample_sums(&b, 0usize, hidden, partial, at_b1, fresh, row, column, lanes);
-        #[unroll]
         for p in 0..comptime!(plan.pieces()) {
             inputs(&mut a, values, words, place, ray, direction, index, tile, samples, row, column, p, plan);
             sync_cube();
-            let at_m = sum + comptime!(p * width * width);
-            let n = comptime!(plan.piece(p));
+            let at_m = sum + p * comptime!(width * width);
+            let n = piece_inputs(p, plan);
             outer(&b, 0usize, &a, hidden, n, partial, at_m, fresh, row, column, lanes);
-            if comptime!(p * columns < plan.products()) {
-                let from_m = comptime!(rows[6] + p * width);
+            let (quad, products) = (p * columns + column, comptime!(plan.products()));
+            if p * columns < products {
+                let from_m = comptime!(rows[6]) + p * width;
                 let g = transposed(&product(&b, 0usize, w, from_m, hidden, row, column, lanes));
-                let quad = comptime!(p * columns) + column;
-                let products = comptime!(plan.products());
                 if quad < products {
                     let k = (4 * here - from as usize) * products + quad;
                     #[unroll]
