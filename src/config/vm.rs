@@ -80,7 +80,7 @@ table! {
         /// `import`. Two fields are better than one with twice the rays, which takes the same time.
         fields: usize, 1.0..=16.0 => 1, 2, 1;
         /// Optimizer steps of each field. Few steps of many rays are better than many steps of few.
-        steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;
+        steps: u64, 1.0..=1e7 => 1500, 2000, 50_000, 450;
         /// Rays per step.
         rays: usize, 1.0..=1_048_576.0 => 8192, 8192, 4096;
         /// How masks are applied to the photographs: none, binary (alpha > 0 is head), hard (alpha ≥ 0.5 is head) or soft.
@@ -210,6 +210,14 @@ impl VmConfig {
         if finest { self.rays } else { ((self.rays as f64 * self.early_rays) as usize).max(1) }
     }
 
+    /// Returns the sum of the rays of all steps of a field's training.
+    pub fn training_rays(&self) -> f64 {
+        let early =
+            if self.whole_frame { 0.0 } else { self.upsample_at.last().copied().unwrap_or(0.0).min(1.0) };
+        let [early_steps, late_steps] = [early, 1.0 - early].map(|share| share * self.steps as f64);
+        early_steps * self.rays_at(0) as f64 + late_steps * self.rays as f64
+    }
+
     /// How many fields there are in the end: at least one, and no more where it comes from a file.
     pub fn learned(&self) -> usize {
         if self.import.is_empty() { self.fields.max(1) } else { 1 }
@@ -292,6 +300,16 @@ mod tests {
         // the baseline is the same field on photographs as they are
         let b = paper.baseline.field(p);
         assert_eq!(VmConfig { masks: p.masks, mask_loss: p.mask_loss, ..b }, *p);
+    }
+
+    #[test]
+    fn the_rays_of_a_training_are_the_sum_of_those_of_its_steps() {
+        for preset in Preset::ALL {
+            let config = VmConfig { steps: 2000, ..VmConfig::preset(preset) };
+            let sum: usize = (0..config.steps).map(|step| config.rays_at(step)).sum();
+            // the step at which the last upsampling is done counts among the early ones
+            assert!((config.training_rays() - sum as f64).abs() <= config.rays as f64, "{preset:?}: {sum}");
+        }
     }
 
     #[test]

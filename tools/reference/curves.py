@@ -68,7 +68,7 @@ def measure(program, out, capture, demo, field, steps, variant, settings):
             "check", str(surface), "--against", str(capture / "gt.ply"), "--seen-by", str(capture), "--json"
         )
         against = json.loads(text)["against"]
-        parts = {part["part"]: part["median"] for part in against["parts"]}
+        parts = {part["part"]: part["median"] for part in against.get("parts", [])}
         distance = parts.get("skin", against["seen"][0]["median"])
     round_to = lambda value, digits: value if value == "" else round(value, digits)
     values = [name, field, steps, variant, round(cpu_s, 1), round(max_mib), round(psnr, 3), round_to(distance, 4)]
