@@ -213,7 +213,7 @@ impl IFace {
     /// sample takes about two kilobytes.
     fn composite(&self, rays: &[MarchRay], dt: f32) -> Vec<[f32; neus::RAY_WIDTH]> {
         /// Samples of a ray that are evaluated together.
-        const AHEAD: usize = 4;
+        const AHEAD: usize = 8;
         /// Light that may be left where a ray ends.
         const OPAQUE: f32 = 1e-4;
         let samples = self.occupancy.march(&self.config, dt, rays);

@@ -364,7 +364,6 @@ fn mix(mut z: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-#[inline(always)]
 fn lattice(x: i32, y: i32, z: i32) -> f32 {
     let mut h = (x as u32).wrapping_mul(0x8DA6_B343)
         ^ (y as u32).wrapping_mul(0xD816_3841)
@@ -376,19 +375,15 @@ fn lattice(x: i32, y: i32, z: i32) -> f32 {
 
 /// Value noise in 0..=1 over a unit lattice, trilinear in cubic-smoothed coordinates: continuous
 /// with its slope, which stays below 1.5 per axis.
-#[inline(always)]
 pub(super) fn noise(p: Vec3) -> f32 {
-    // casts truncate; without SSE 4.1 `floor` would be a call
-    let cut = p.as_ivec3();
-    let below = |x: f32, i: i32| i - i32::from(x < i as f32);
-    let i = IVec3::new(below(p.x, cut.x), below(p.y, cut.y), below(p.z, cut.z));
-    let f = p - i.as_vec3();
+    let floor = p.floor();
+    let f = p - floor;
     let t = f * f * (3.0 - 2.0 * f);
+    let i: IVec3 = floor.as_ivec3();
     trilinear(t, |[x, y, z]| lattice(i.x + x, i.y + y, i.z + z))
 }
 
 /// Between the corners (0 or 1 along each axis) of a cell, at `t` inside it.
-#[inline(always)]
 pub(super) fn trilinear(t: Vec3, corner: impl Fn([i32; 3]) -> f32) -> f32 {
     let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
     let edge = |y, z| mix(corner([0, y, z]), corner([1, y, z]), t.x);

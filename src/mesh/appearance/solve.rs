@@ -51,15 +51,12 @@ impl System<'_> {
         self.sum(row, x, &y[..count])
     }
 
-    fn sum<const C: usize>(&self, row: usize, x: &[[f32; C]], y: &[f32]) -> [f32; C] {
-        let mut out = [0f32; C];
+    fn sum(&self, row: usize, x: &[[f32; 3]], y: &[f32]) -> [f32; 3] {
+        let mut out = [0f32; 3];
         for &(node, w) in self.matrix.row(row) {
             let own = &x[node as usize * y.len()..][..y.len()];
             for (c, y) in own.iter().zip(y) {
-                let wy = w * y;
-                for k in 0..C {
-                    out[k] += wy * c[k];
-                }
+                (0..3).for_each(|k| out[k] += w * y * c[k]);
             }
         }
         out
@@ -90,7 +87,7 @@ impl System<'_> {
             constant: [constant, 0.0],
             others: [others, per_node * ridge],
         };
-        let right: Vec<Quad> = target.iter().zip(&weight).map(|(t, w)| quad(t.map(|t| w * t))).collect();
+        let right: Vec<[f32; 3]> = target.iter().zip(&weight).map(|(t, w)| t.map(|t| w * t)).collect();
         let mut residual = vec![0f64; self.nodes.len() * count * 3];
         normal.gather(&right, |_, _, _| [0.0; 3], &mut residual);
         let first = dot(&residual, &residual);
@@ -104,13 +101,6 @@ impl System<'_> {
         conjugate_gradients(&mut x, residual, |v, out| normal.apply(v, out), precondition, done);
         x.as_chunks::<3>().0.iter().map(|c| c.map(|v| v as f32)).collect()
     }
-}
-
-/// A color and a zero: four numbers fill a vector register, so that the products take a third of the time.
-type Quad = [f32; 4];
-
-fn quad([r, g, b]: [f32; 3]) -> Quad {
-    [r, g, b, 0.0]
 }
 
 /// The operator `Aᵀ D A` with the smoothness terms.
@@ -134,18 +124,16 @@ impl Normal<'_> {
     /// Writes `Aᵀ values`, and `more` of each node and function.
     fn gather(
         &self,
-        values: &[Quad],
+        values: &[[f32; 3]],
         more: impl Fn(usize, usize, &[u32]) -> [f32; 3] + Sync,
         out: &mut [f64],
     ) {
         out.par_chunks_mut(3 * self.count).enumerate().with_min_len(256).for_each(|(node, out)| {
-            let mut own = [[0f32; 4]; MOST_OF_DEGREE_2];
+            let mut own = [[0f32; 3]; MOST_OF_DEGREE_2];
             for &(p, w) in self.system.matrix.column(node) {
                 let r = values[p as usize].map(|v| w * v);
                 for (own, y) in own.iter_mut().zip(self.y(p as usize)) {
-                    for c in 0..4 {
-                        own[c] += y * r[c];
-                    }
+                    (0..3).for_each(|c| own[c] += y * r[c]);
                 }
             }
             let near = self.system.nodes.near(node);
@@ -157,9 +145,9 @@ impl Normal<'_> {
     }
 
     fn apply(&self, x: &[f64], out: &mut [f64]) {
-        let x: Vec<Quad> = x.as_chunks::<3>().0.par_iter().map(|c| quad(c.map(|v| v as f32))).collect();
+        let x: Vec<[f32; 3]> = x.as_chunks::<3>().0.par_iter().map(|c| c.map(|v| v as f32)).collect();
         let value = |p: usize| self.system.sum(p, &x, self.y(p)).map(|v| self.weight[p] * v);
-        let values: Vec<Quad> =
+        let values: Vec<[f32; 3]> =
             (0..self.weight.len()).into_par_iter().with_min_len(4096).map(value).collect();
         let more = |node: usize, k: usize, near: &[u32]| {
             let [smooth, ridge] = if k == 0 { self.constant } else { self.others };
