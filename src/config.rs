@@ -78,7 +78,9 @@ impl Key {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// A first look in minutes.
+    /// A look in two minutes on two cores: [`Preset::Draft`] with fewer steps.
+    Quick,
+    /// A first result in minutes.
     Draft,
     /// What to use.
     #[default]
@@ -89,11 +91,12 @@ pub enum Preset {
 
 impl Preset {
     /// All presets, from the least effort to the most.
-    pub const ALL: [Preset; 3] = [Preset::Draft, Preset::Standard, Preset::Paper];
+    pub const ALL: [Preset; 4] = [Preset::Quick, Preset::Draft, Preset::Standard, Preset::Paper];
 
     /// Its word in the configuration.
     pub fn name(self) -> &'static str {
         match self {
+            Preset::Quick => "quick",
             Preset::Draft => "draft",
             Preset::Standard => "standard",
             Preset::Paper => "paper",
@@ -107,7 +110,7 @@ impl FromStr for Preset {
     fn from_str(word: &str) -> Result<Preset> {
         let found = Preset::ALL.into_iter().find(|preset| preset.name() == word);
         found.ok_or_else(|| {
-            Error::usage(format!("there is no preset `{word}`"), "use draft, standard or paper")
+            Error::usage(format!("there is no preset `{word}`"), "use quick, draft, standard or paper")
         })
     }
 }
@@ -145,7 +148,8 @@ pub struct Config {
 const ROOT_KEYS: &[Key] = &[
     Key::word(
         "preset",
-        "Preset that all other keys default to: draft (a first look), standard, paper (the published recipe).",
+        "Preset that all other keys default to: quick (a look in two minutes), draft (a first result), standard, paper (the \
+         published recipe).",
     ),
     Key::number(
         "seed",
@@ -316,12 +320,13 @@ pub fn explain(name: &str) -> Result<String> {
         if !key.range().is_empty() {
             let _ = writeln!(out, "  allowed: {}", key.range());
         }
-        let [draft, standard, paper] =
+        let [quick, draft, standard, paper] =
             tables.each_ref().map(|t| lookup(t, &full).map(show).unwrap_or_default());
-        if full == "preset" || (draft == standard && standard == paper) {
+        if full == "preset" || (quick == draft && draft == standard && standard == paper) {
             let _ = writeln!(out, "  default: {standard}");
         } else {
-            let _ = writeln!(out, "  draft: {draft}   standard: {standard}   paper: {paper}");
+            let quick = if quick == draft { String::new() } else { format!("quick: {quick}   ") };
+            let _ = writeln!(out, "  {quick}draft: {draft}   standard: {standard}   paper: {paper}");
         }
     }
     Ok(out)
@@ -444,6 +449,8 @@ mod tests {
             text.contains("allowed: 16 to 4096") && text.contains("draft: 256   standard: 512"),
             "{text}"
         );
+        let text = explain("iface.steps").unwrap();
+        assert!(text.contains("quick: 1200   draft: 3000   standard: 8000"), "{text}");
         assert!(explain("mesh").unwrap().matches("mesh.").count() > 3);
         assert!(explain("mesh.resolutoin").unwrap_err().hint().contains("mesh.resolution"));
     }

@@ -65,7 +65,7 @@ table! {
         /// Kind of field: sdf (signed distance, as in NeuS) or density (Instant-NeRF, in preset paper).
         field: FieldKind => FieldKind::Sdf;
         /// Optimizer steps.
-        steps: u64, 1.0..=1e7 => 3000, 8000, 20_000;
+        steps: u64, 1.0..=1e7 => 3000, 8000, 20_000, 1200;
         /// Rays per step at the start.
         rays: usize, 1.0..=1_048_576.0 => 1024, 1024, 256;
         /// Largest number of rays per step; the number adapts to `samples`.

@@ -9,6 +9,8 @@
 ///     keys {
 ///         /// What it means, with its unit.
 ///         steps: u64, 1.0..=1e7 => 3000, 8000, 20_000;   // draft, standard, paper
+///         /// One more value is that of the preset quick, which otherwise is draft's.
+///         rays: usize, 1.0..=1e6 => 1024, 1024, 256, 512;
 ///         /// A word, text, switch or list has no range; one value may serve every preset.
 ///         masks: MaskUse => MaskUse::Soft;
 ///     }
@@ -27,7 +29,7 @@ macro_rules! table {
         pub struct $name:ident;
         keys {
             $($(#[doc = $doc:literal])+ $key:ident: $ty:ty $(, $min:literal ..= $max:literal)?
-                => $draft:expr $(, $standard:expr, $paper:expr)?;)+
+                => $draft:expr $(, $standard:expr, $paper:expr $(, $quick:expr)?)?;)+
         }
         $(constants {
             $($(#[doc = $constant_doc:literal])+ $constant:ident: $constant_ty:ty
@@ -55,7 +57,9 @@ macro_rules! table {
             /// The values a preset starts with.
             pub fn preset(preset: super::Preset) -> $name {
                 $name {
-                    $($key: $crate::config::table::of_preset!(preset, $draft $(, $standard, $paper)?),)+
+                    $($key: $crate::config::table::of_preset!(
+                        preset, $draft $(, $standard, $paper $(, $quick)?)?
+                    ),)+
                     $($($constant: $crate::config::table::of_preset!(
                         preset, $constant_draft $(, $constant_standard, $constant_paper)?
                     ),)+)?
@@ -99,13 +103,17 @@ macro_rules! bound {
     };
 }
 
-/// The value of a preset: one for all, or draft, standard, paper.
+/// The value of a preset: one for all, or draft, standard, paper, and quick where it is not draft's.
 macro_rules! of_preset {
     ($preset:ident, $all:expr) => {
         $all
     };
     ($preset:ident, $draft:expr, $standard:expr, $paper:expr) => {
+        $crate::config::table::of_preset!($preset, $draft, $standard, $paper, $draft)
+    };
+    ($preset:ident, $draft:expr, $standard:expr, $paper:expr, $quick:expr) => {
         match $preset {
+            super::Preset::Quick => $quick,
             super::Preset::Draft => $draft,
             super::Preset::Standard => $standard,
             super::Preset::Paper => $paper,

@@ -471,7 +471,7 @@ impl Session<'_> {
             Stage::Mask => (0.7 + 3e-7 * all + clicked + networks, 115.0 + 5e-6 * all),
             Stage::Baseline | Stage::Tface => {
                 let c = self.config.radiance(stage);
-                let rays = (c.steps as usize * c.rays * c.learned()) as f64;
+                let rays = c.training_rays() * c.learned() as f64;
                 let parameters = vm_parameters(&c);
                 // whole frames are mostly outside the hull, where no pixel is skipped; nor is the shell left by
                 // training against two backgrounds
@@ -481,7 +481,7 @@ impl Session<'_> {
                     _ => 1.0,
                 };
                 // samples along a ray are as dense as the grid
-                let ray = outside * (5e-6 + 0.16e-6 * (c.voxels_final as f64).cbrt());
+                let ray = outside * (3e-6 + 0.09e-6 * (c.voxels_final as f64).cbrt());
                 let cpu_s = 0.1 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
                 let mib = 45.0 + 25e-6 * all + 24e-6 * parameters + 0.07 * c.rays as f64;
                 if c.import.is_empty() { (cpu_s, mib) } else { (1.0, mib) }
@@ -489,7 +489,7 @@ impl Session<'_> {
             Stage::Iface => {
                 let samples = (iface.steps as usize * iface.samples) as f64;
                 let table = ((iface.levels as u64 * 2) << iface.log2_table.min(32)) as f64;
-                let cpu_s = 3.8 + 4.7e-6 * samples + 2e-9 * table * iface.steps as f64 + 1.8e-6 * all;
+                let cpu_s = 3.8 + 2.5e-6 * samples + 2e-9 * table * iface.steps as f64 + 1.8e-6 * all;
                 (cpu_s, 100.0 + 25e-6 * all + 20e-6 * table + 0.012 * iface.samples as f64)
             }
             Stage::Mesh => {

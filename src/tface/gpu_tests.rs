@@ -245,7 +245,7 @@ fn a_device_that_is_lost_leaves_the_last_checkpoint_and_the_training_goes_on() {
     if device().is_none() {
         return;
     }
-    let (views, config, dir) = (ball::views(), VmConfig { early_rays: 1.0, ..config() }, temporary());
+    let (views, config, dir) = (ball::views(), config(), temporary());
     let pixels = pixels(&views, &config);
     let train = |answers: usize, steps: u64| {
         let stop = StopAfter::new(steps);

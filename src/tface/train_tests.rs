@@ -19,7 +19,6 @@ fn config() -> VmConfig {
     VmConfig {
         steps: 150,
         rays: 512,
-        early_rays: 1.0,
         voxels_start: 16 * 16 * 16,
         voxels_final: 28 * 28 * 28,
         upsample_at: vec![0.267, 0.467],

@@ -5,7 +5,7 @@
 //! as a whole or empty, so cells are stored here, and a ray skips empty ones *before* the field is evaluated. Sample
 //! positions `t = entry + step · (k + jitter)` do not depend on the mask.
 
-use crate::kernel::cpu::march::MarchRay;
+use crate::kernel::cpu::march::{BLOCK, MarchRay};
 
 /// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`. A second bitmask holds
 /// the blocks with an occupied cell, so that rays can skip empty blocks.
@@ -18,9 +18,6 @@ pub struct BoxMask {
     /// One bit per block of `BLOCK`³ cells, set if the block contains an occupied cell.
     blocks: Vec<u64>,
 }
-
-/// Number of cells along the edge of a block.
-pub(in crate::kernel) const BLOCK: usize = 8;
 
 fn bit(bits: &[u64], i: usize) -> bool {
     bits[i >> 6] >> (i & 63) & 1 == 1

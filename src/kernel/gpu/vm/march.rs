@@ -5,8 +5,8 @@ use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
 use super::super::march::{FAR, Span, bit, narrowed, prefix_sum};
 use super::super::occupancy::words;
+use crate::kernel::cpu::march::BLOCK;
 use crate::kernel::cpu::vm::VmField;
-use crate::kernel::cpu::vm::mask::BLOCK;
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
