@@ -39,6 +39,7 @@ mod transforms;
 mod view;
 
 pub use crate::config::{MaskMeaning, MaskSource};
+pub use format::is_run;
 pub use gather::{has_cameras, open};
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
 pub use scene::well_seen;

@@ -18,8 +18,8 @@ pub use field::SdfField;
 pub use mesh::{Atlas, Mesh};
 pub(crate) use mesh::{area_vector, bilinear_taps, shape};
 pub(crate) use overlap::{
-    Boxes, DBox, EFFORT, Effort, OutlineSide, THOROUGH, intersect, nearest_charts, overlaps, share_out,
-    shared_area, turn,
+    Boxes, DBox, DEFAULT_EFFORT, Effort, OutlineSide, THOROUGH_EFFORT, intersect, nearest_charts, overlaps,
+    share_out, shared_area, turn,
 };
 pub use ray::{Aabb, Hit, Ray, RayResult};
 pub use shells::{ShellCaster, ShellLayer, Shells};

@@ -19,7 +19,7 @@ mod simplify;
 pub use appearance::{Appearance, AppearanceReport, Colors, Photograph, fit as fit_appearance};
 pub use atlas::{AtlasConfig, AtlasReport, atlas};
 pub use extract::{
-    Cap, CleanReport, ExtractOptions, HandleReport, LONGEST_HANDLE, LevelSet, MeshReport, NodeGrid, Patches,
+    Cap, CleanReport, ExtractOptions, HandleReport, LevelSet, MAX_HANDLE, MeshReport, NodeGrid, Patches,
     RimVertex, Sparse, Volume, clean, extract, extract_dense, marching, sparse,
 };
 pub use shells::{ShellsReport, fit as fit_shells};

@@ -30,7 +30,7 @@ use tract_onnx::prelude::*;
 use tract_onnx::tract_hir::infer::Factoid;
 
 /// Bytes of a network's file at most; a Protocol Buffers message cannot be larger.
-const MOST_FILE_BYTES: u64 = 2 << 30;
+const MAX_FILE_BYTES: u64 = 2 << 30;
 
 /// A network ready to run.
 pub(crate) struct NetworkSession {
@@ -49,7 +49,7 @@ impl NetworkSession {
     /// Reads, recognizes and loads a file, which must be of a form of this role. `array_bytes` is the size of the largest
     /// single array that may be planned.
     pub(crate) fn open(role: Role, path: &Path, array_bytes: u64) -> Result<NetworkSession> {
-        let bytes = io::read_bytes(path, &Limits { file_bytes: MOST_FILE_BYTES, ..Limits::default() })?;
+        let bytes = io::read_bytes(path, &Limits { file_bytes: MAX_FILE_BYTES, ..Limits::default() })?;
         if names_another_file(&bytes) {
             return Err(file_error(
                 path,

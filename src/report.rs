@@ -35,9 +35,9 @@ pub const LEARNED: [(Stage, &[&str]); 3] = [
 ];
 
 /// The error that is drawn brightest: a fifth of the range of a color.
-pub const MOST_ERROR: f32 = 0.2;
+pub const MAX_ERROR: f32 = 0.2;
 
-/// Colors of errors from none to [`MOST_ERROR`], even steps: dark to bright, also in gray.
+/// Colors of errors from none to [`MAX_ERROR`], even steps: dark to bright, also in gray.
 pub const HEAT: [[u8; 3]; 6] =
     [[0, 0, 4], [66, 10, 104], [147, 38, 103], [221, 81, 58], [252, 165, 10], [252, 255, 164]];
 
@@ -181,7 +181,7 @@ pub struct ViewerCamera {
 impl Viewer {
     /// The part of a page that shows it; [`VIEWER_SCRIPT`] makes it work.
     fn html(&self) -> Result<String> {
-        let data = json!({"cameras": self.cameras, "front": self.front, "most": MOST_ERROR, "heat": HEAT});
+        let data = json!({"cameras": self.cameras, "front": self.front, "most": MAX_ERROR, "heat": HEAT});
         // no name can end the script that holds it
         let data = data.to_string().replace('<', "\\u003c");
         let glb = base64(&self.glb);
@@ -236,7 +236,7 @@ pub fn html(report: &Report) -> Result<String> {
         include_str!("report/page.html"),
         context! {
             style => STYLE, script => include_str!("report/page.js"), viewer_script => VIEWER_SCRIPT,
-            viewer, methods, heat => heat(), most => (MOST_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
+            viewer, methods, heat => heat(), most => (MAX_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
         },
     )
 }

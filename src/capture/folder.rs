@@ -159,7 +159,7 @@ pub(super) fn view_names(frames: &[CameraFrame]) -> (PathBuf, Vec<String>) {
 pub(super) const PHOTOGRAPHS: [&str; 8] = ["png", "jpg", "jpeg", "tif", "tiff", "heic", "webp", "bmp"];
 
 /// How many of them, from the first, are those of files that are read.
-const READ: usize = 3;
+const READABLE_FORMATS: usize = 3;
 
 /// Where photographs lie, if not beside the cameras.
 const IMAGE_FOLDERS: [&str; 5] = ["images", "image", "input", "rgb", "photos"];
@@ -222,8 +222,8 @@ impl FolderEntries {
 /// name.
 pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
     let mut files = io::list_files(folder)?;
-    let can_be_read = files.iter().any(|f| has_ending(f, &PHOTOGRAPHS[..READ]));
-    let endings = if can_be_read { &PHOTOGRAPHS[..READ] } else { &PHOTOGRAPHS };
+    let can_be_read = files.iter().any(|f| has_ending(f, &PHOTOGRAPHS[..READABLE_FORMATS]));
+    let endings = if can_be_read { &PHOTOGRAPHS[..READABLE_FORMATS] } else { &PHOTOGRAPHS };
     files.retain(|f| has_ending(f, endings));
     Ok(files)
 }

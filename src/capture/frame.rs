@@ -214,7 +214,7 @@ const fn model(id: i32, name: &'static str, parameters: &'static str) -> LensMod
 }
 
 /// Names of models that COLMAP has besides, for messages.
-const OTHERS: [(i32, &str); 5] = [
+const UNSUPPORTED_MODELS: [(i32, &str); 5] = [
     (11, "RAD_TAN_THIN_PRISM_FISHEYE"),
     (12, "SIMPLE_DIVISION"),
     (13, "DIVISION"),
@@ -239,7 +239,9 @@ impl LensModel {
 
     /// The model of this number.
     pub fn numbered(id: i32) -> Result<&'static LensModel, String> {
-        let other = || OTHERS.iter().find(|(n, _)| *n == id).map_or(format!("number {id}"), |o| o.1.into());
+        let other = || {
+            UNSUPPORTED_MODELS.iter().find(|(n, _)| *n == id).map_or(format!("number {id}"), |o| o.1.into())
+        };
         MODELS.iter().find(|m| m.id == id).ok_or_else(|| unknown(&other()))
     }
 

@@ -1,11 +1,11 @@
-//! From camera files to views: everything is checked but the pixels.
+//! Opens a capture: from camera files to views. Everything but the pixels is checked.
 
 use super::folder::{CaptureFolder, in_frame, no_views};
 use super::format::CameraFiles;
 use super::frame::{CameraFrame, Listing};
 use super::masks::few;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask, downscaled, wrong_size};
-use super::{folder, format, masks, scene};
+use super::{colmap, folder, format, llff, masks, metashape, neus, realitycapture, scene, transforms};
 use crate::io::{self, PictureInfo};
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
@@ -28,21 +28,40 @@ pub fn has_cameras(root: &Path) -> bool {
     io::is_folder(root) && CameraFiles::find(root).is_some()
 }
 
-/// A capture as far as one can be used, and everything that was found on the way, problems above all.
+/// Returns the usable part of a capture, and everything that was found: problems, warnings, reasons.
 pub(super) fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>, Listing) {
     let mut listing = Listing::default();
-    let capture = open_folder(root, options).map(|(folder, files)| {
-        let (format, reason) = files.describe();
-        listing.format = Some(format);
-        listing.reasons.push(reason);
-        files.list(&folder, &mut listing);
-        build(&folder, format, &mut listing)
-    });
-    let capture = capture.unwrap_or_else(|problem| {
-        listing.problems.push(problem);
-        None
-    });
-    (capture, listing)
+    let (folder, files) = match open_folder(root, options) {
+        Ok(opened) => opened,
+        Err(problem) => {
+            listing.problems.push(problem);
+            return (None, listing);
+        }
+    };
+    let (format, reason) = files.describe();
+    listing.format = Some(format);
+    listing.reasons.push(reason);
+    let listed = match &files {
+        CameraFiles::Transforms { json, poses } => {
+            transforms::list(&folder, json, &mut listing);
+            if listing.problems.is_empty() {
+                llff::check(&folder, poses, &mut listing);
+            }
+            Ok(())
+        }
+        CameraFiles::Llff(poses) => llff::list(&folder, poses, &mut listing),
+        CameraFiles::Colmap(files) => colmap::list(&folder, files, &mut listing),
+        CameraFiles::Neus(file) => neus::list(&folder, file, &mut listing),
+        CameraFiles::Metashape(file) => metashape::list(&folder, file, &mut listing),
+        CameraFiles::RealityCapture(file) => realitycapture::list_csv(&folder, file, &mut listing),
+        CameraFiles::Xmp(inside) => realitycapture::list_xmp(&folder, inside, &mut listing),
+    };
+    listing.problems.extend(listed.err());
+    if let Err(problem) = options.limits.check_views(root, listing.frames.len()) {
+        listing.problems.push(problem.into());
+        listing.frames.clear();
+    }
+    (build(&folder, format, &mut listing), listing)
 }
 
 fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(CaptureFolder<'a>, CameraFiles)> {

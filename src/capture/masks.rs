@@ -10,7 +10,7 @@ use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
 /// The brightest value of a pixel that counts as black.
-const BLACK: u8 = 16;
+const MAX_BLACK: u8 = 16;
 
 /// Names for a message: at most six, then how many more.
 pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {
@@ -203,7 +203,7 @@ const INVERTED: &str = "looks inverted: white must keep the head";
 /// where it shows the head.
 pub fn refuse(view: &str, photo: &Photo, mask: &Gray) -> Result<()> {
     let head = || photo.rgb.iter().zip(&mask.values).filter(|(_, m)| **m > 127).map(|(rgb, _)| rgb);
-    let (all, lit) = (head().count(), head().filter(|rgb| rgb.iter().any(|&v| v > BLACK)).count());
+    let (all, lit) = (head().count(), head().filter(|rgb| rgb.iter().any(|&v| v > MAX_BLACK)).count());
     let problem = if findings(mask).contains(&INVERTED) {
         format!("the mask of view `{view}` {INVERTED}")
     } else if 100 * lit < all {

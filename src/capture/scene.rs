@@ -86,7 +86,7 @@ impl Hull {
 const THRESHOLD: u8 = 12;
 
 /// Masks that a cell must touch, or all if there are fewer.
-const LEAST_VIEWS: usize = 3;
+const MIN_VIEWS: usize = 3;
 
 /// Cells of air around the hull.
 const MARGIN_CELLS: usize = 2;
@@ -181,7 +181,7 @@ pub fn fit(
         .iter()
         .filter_map(|&i| Some(SilhouetteTable::new(i, &cameras[i], masks[i].as_ref()?, THRESHOLD)))
         .collect();
-    let least = LEAST_VIEWS.min(used.len());
+    let least = MIN_VIEWS.min(used.len());
     let core = used.len().div_ceil(3).max(least);
     let margin = MARGIN_CELLS as f64;
 
@@ -316,18 +316,18 @@ fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
 }
 
 /// Points that a box needs to be drawn around them.
-const LEAST_POINTS: usize = 100;
+const MIN_POINTS: usize = 100;
 
 /// The box around points that lie where the cameras look, one in a hundred left out on each side, and a twentieth more;
 /// `None` for too few.
 pub(super) fn around_points(views: &[View], points: &[DVec3]) -> Option<Aabb> {
-    if points.len() < LEAST_POINTS {
+    if points.len() < MIN_POINTS {
         return None;
     }
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
     let seen = world_box(&from_frusta(&cameras, None).ok()?);
     let within: Vec<Vec3> = points.iter().map(|p| p.as_vec3()).filter(|p| seen.contains(*p)).collect();
-    if within.len() < LEAST_POINTS {
+    if within.len() < MIN_POINTS {
         return None;
     }
     let [x, y, z] = [0, 1, 2].map(|k| {

@@ -2,7 +2,7 @@
 //!
 //! Poses are camera-to-world with OpenGL axes in all three. Intrinsics may stand at the top or in each
 //! frame; a frame's own win. Unknown keys are ignored, `null` counts as absent; known ones of the wrong type are
-//! errors, but for [`LENIENT`] and `up`, which count as absent as well.
+//! errors, but for [`LENIENT_KEYS`] and `up`, which count as absent as well.
 
 use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, CameraFrame, Intrinsics, LensModel, Listing};
@@ -19,13 +19,13 @@ type Object = Map<String, Value>;
 
 /// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would be overruled by
 /// the whole file's focal length.
-const FOCAL: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
+const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// The other keys that may stand at the top for all frames.
-const SHARED: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega is_fisheye camera_model";
+const SHARED_KEYS: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega is_fisheye camera_model";
 
 /// Keys that count as absent where their value is of another type, and whether it is of theirs.
-const LENIENT: [(&str, fn(&Value) -> bool); 3] = [
+const LENIENT_KEYS: [(&str, fn(&Value) -> bool); 3] = [
     ("is_fisheye", Value::is_boolean),
     ("camera_model", Value::is_string),
     ("face_mask_path", Value::is_string),
@@ -97,13 +97,14 @@ impl FrameKeys {
     }
 
     fn merged(top: &Object, own: &Object) -> Result<FrameKeys, String> {
-        let own_focal = FOCAL.iter().any(|key| own.contains_key(*key));
-        let shared = SHARED.split(' ').chain(FOCAL.into_iter().filter(|_| !own_focal));
+        let own_focal = FOCAL_KEYS.iter().any(|key| own.contains_key(*key));
+        let shared = SHARED_KEYS.split(' ').chain(FOCAL_KEYS.into_iter().filter(|_| !own_focal));
         let shared = shared.filter_map(|key| top.get_key_value(key));
-        let is_given = |(key, value): &(&String, &Value)| match LENIENT.iter().find(|(name, _)| key == name) {
-            Some((_, is_usable)) => is_usable(value),
-            None => !value.is_null(),
-        };
+        let is_given =
+            |(key, value): &(&String, &Value)| match LENIENT_KEYS.iter().find(|(name, _)| key == name) {
+                Some((_, is_usable)) => is_usable(value),
+                None => !value.is_null(),
+            };
         let merged: Object = (shared.filter(is_given).chain(own.iter().filter(is_given)))
             .map(|(key, value)| (key.clone(), value.clone()))
             .collect();

@@ -1,6 +1,5 @@
-//! What the program says of itself: `tiface config`, the effective configuration or what a key means; `tiface doctor`, what
-//! this machine and this build can do, to choose a device and to paste into a bug report; `tiface completions`, what a shell
-//! needs to complete commands and options, and the manual pages.
+//! `tiface config`: the effective configuration, or the documentation of a key. `tiface doctor`: devices and features of this
+//! machine and build, for the choice of a device and for bug reports. `tiface completions`: shell completions and manual pages.
 
 use super::options::{Common, RunTarget};
 use super::out::Out;
@@ -20,7 +19,7 @@ pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) ->
         print(&explain(key)?)?;
         return Ok(());
     }
-    // without a capture or run it is the configuration of a run that is yet to be
+    // without a capture or run, this is the configuration of a new run
     let saved = match path.or(common.run.as_deref()) {
         Some(path) => RunTarget::find(common, Some(path))?.saved,
         None => None,
@@ -29,7 +28,7 @@ pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) ->
     Ok(())
 }
 
-/// What is said of a machine.
+/// A machine's devices and features.
 #[derive(Serialize)]
 struct Examination {
     version: &'static str,
@@ -38,7 +37,7 @@ struct Examination {
     processor: String,
     threads: usize,
     devices: Vec<Found>,
-    /// What `--device auto` takes.
+    /// The device that `--device auto` selects.
     auto: String,
 }
 
@@ -48,7 +47,7 @@ pub(super) fn doctor(common: &Common) -> Result<()> {
     let (devices, auto) = examine_devices(&tests)?;
     let auto = match cfg!(feature = "wgpu") {
         true => auto.description(),
-        false => "the processor: this build knows no GPU (`--features wgpu`)".into(),
+        false => "the CPU: this build has no GPU support (`--features wgpu`)".into(),
     };
     let found = Examination {
         version: env!("CARGO_PKG_VERSION"),
@@ -68,7 +67,7 @@ pub(super) fn doctor(common: &Common) -> Result<()> {
 }
 
 impl Examination {
-    /// Does every device that is here compute what the processor does?
+    /// Returns whether every device passed its self-test against the CPU.
     fn is_sound(&self) -> bool {
         self.devices.iter().all(|d| d.error.is_none() && d.checks.iter().all(|c| c.passed))
     }
@@ -95,11 +94,7 @@ impl Display for Examination {
                 None => {
                     let failed = d.checks.iter().filter(|c| !c.passed).count();
                     let verdict = if failed == 0 { "passed".into() } else { format!("FAILED ({failed})") };
-                    writeln!(
-                        f,
-                        "  self-test   {verdict} in {:.1} s; errors, and what they may be:",
-                        d.seconds
-                    )?;
+                    writeln!(f, "  self-test   {verdict} in {:.1} s; errors and their limits:", d.seconds)?;
                 }
             }
             for c in &d.checks {
@@ -111,7 +106,7 @@ impl Display for Examination {
     }
 }
 
-/// What `completions` writes.
+/// The output of `completions`.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Form {
     Shell(Shell),
@@ -142,7 +137,10 @@ impl ValueEnum for Form {
 pub(super) fn completions(form: Form, mut command: Command, out: Option<&Out>) -> Result<()> {
     let pages = match (form, out) {
         (Form::Shell(_), Some(_)) => {
-            return Err(Error::usage("the script of a shell goes to stdout", "send it on with `> FILE`"));
+            return Err(Error::usage(
+                "a completion script is written to stdout",
+                "redirect it with `> FILE`",
+            ));
         }
         (Form::Shell(shell), None) => {
             let mut script = Vec::new();
@@ -155,7 +153,7 @@ pub(super) fn completions(form: Form, mut command: Command, out: Option<&Out>) -
             let of_commands: Vec<Command> =
                 command.get_subcommands().filter(|c| c.get_name() != "help").cloned().collect();
             let named = of_commands.into_iter().map(|c| {
-                // a command's name lives as long as the program
+                // clap wants static names; they live as long as the process
                 let name: &'static str = format!("tiface-{}", c.get_name()).leak();
                 c.name(name).display_name(name)
             });
@@ -168,7 +166,7 @@ pub(super) fn completions(form: Form, mut command: Command, out: Option<&Out>) -
     pages.iter().try_for_each(|(name, text)| Ok(io::write_atomic(&out.file(name), text)?))
 }
 
-/// A manual page and the name of its file.
+/// Returns a manual page and the name of its file.
 fn page(command: Command) -> Result<(String, Vec<u8>)> {
     let man = Man::new(command);
     let mut text = Vec::new();

@@ -29,7 +29,7 @@ pub(super) struct BenchOptions {
 }
 
 /// Half the steps of a first look: all sweeps end within minutes.
-const HALF: &str = "iface.steps = 1500\n";
+const BENCH_SETTINGS: &str = "iface.steps = 1500\n";
 
 /// Tells warnings, and nothing of the rest: a bench has its own lines.
 struct Warnings(Arc<super::screen::Screen>);
@@ -103,7 +103,7 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
 
 /// A run's own configuration; else that of a first look.
 fn configure(common: &Common, target: &RunTarget) -> Result<Config> {
-    let mut config = common.resolve(target.saved.as_deref(), Some((Preset::Draft, HALF)), &[])?;
+    let mut config = common.resolve(target.saved.as_deref(), Some((Preset::Draft, BENCH_SETTINGS)), &[])?;
     if let Some(capture) = &target.capture {
         config.capture.path = capture.to_str().map(String::from).ok_or_else(|| {
             let shown = capture.display();

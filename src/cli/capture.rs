@@ -2,7 +2,7 @@
 //! another format; `tiface mask --page`, one file to click on in a browser.
 
 use super::Invocation;
-use super::options::{Common, is_run};
+use super::options::Common;
 use super::out::Out;
 use super::screen::print;
 use crate::capture::convert::CameraFormat;
@@ -60,7 +60,7 @@ pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option
         return Err(Error::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
     };
     // a run knows its capture, and how large its photographs are taken
-    let saved = is_run(path).then(|| path.join("config.toml"));
+    let saved = capture::is_run(path).then(|| path.join("config.toml"));
     let config = common.resolve(saved.as_deref(), None, &[])?;
     let root = match config.capture.path.as_str() {
         "" => path,

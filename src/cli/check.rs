@@ -18,7 +18,7 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 /// Points spread over each surface.
-const POINTS: usize = 200_000;
+const SURFACE_SAMPLES: usize = 200_000;
 
 /// How far the mesh is from another surface, millimetres.
 #[derive(Serialize)]
@@ -48,7 +48,7 @@ struct Part {
 }
 
 /// The parts of a surface by how many cameras see them.
-const VIEWS: [(&str, RangeInclusive<u32>); 5] =
+const VIEW_COUNTS: [(&str, RangeInclusive<u32>); 5] =
     [("0", 0..=0), ("1", 1..=1), ("2", 2..=2), ("3 or 4", 3..=4), ("5 or more", 5..=u32::MAX)];
 
 #[derive(Serialize)]
@@ -114,7 +114,7 @@ fn load(path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
 }
 
 /// A texture of unknown size is measured as if it had this many texels along each side.
-const UNKNOWN_PX: u32 = 1024;
+const DEFAULT_TEXTURE_PX: u32 = 1024;
 
 /// Returns whether there is a picture, and the texture coordinates, measured.
 fn check_texture(found: &ReadMesh, path: &Path) -> (bool, Option<UvReport>) {
@@ -123,7 +123,8 @@ fn check_texture(found: &ReadMesh, path: &Path) -> (bool, Option<UvReport>) {
     let uv = found.atlas.clone().map(|mut atlas| {
         if atlas.width == 0 || atlas.height == 0 {
             let info = beside.and_then(|file| io::picture_info(&file, &Limits::default()).ok());
-            (atlas.width, atlas.height) = info.map_or((UNKNOWN_PX, UNKNOWN_PX), |i| i.size(None));
+            (atlas.width, atlas.height) =
+                info.map_or((DEFAULT_TEXTURE_PX, DEFAULT_TEXTURE_PX), |i| i.size(None));
         }
         uv_check(&weld(&found.mesh), &atlas)
     });
@@ -182,25 +183,25 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     let empty = |e: &Path| Error::cannot(format!("`{}` has no surface to measure", e.display()), "");
     let bvh = Bvh::new(&truth);
     let mm = |d| Millimetres::new(d, unit_m);
-    let whole = one_way(mesh, &bvh, POINTS).ok_or_else(|| empty(other))?;
-    let back = one_way(&truth, &Bvh::new(mesh), POINTS).ok_or_else(|| empty(other))?;
+    let whole = one_way(mesh, &bvh, SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
+    let back = one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
     let (mut seen, mut by_views, mut parts) = (None, Vec::new(), Vec::new());
     if let Some(root) = seen_by {
         let capture = capture::open(root, &CaptureOptions::default())?;
         let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
         let views: Vec<&View> = capture.split(Split::Train).collect();
         let cameras: Vec<Camera> = views.iter().map(|v| moved(&v.camera)).collect();
-        let ranges: Vec<_> = [3..=u32::MAX].into_iter().chain(VIEWS.map(|(_, range)| range)).collect();
-        let mut found = seen_one_way(mesh, &bvh, POINTS, &cameras, &ranges).into_iter();
+        let ranges: Vec<_> = [3..=u32::MAX].into_iter().chain(VIEW_COUNTS.map(|(_, range)| range)).collect();
+        let mut found = seen_one_way(mesh, &bvh, SURFACE_SAMPLES, &cameras, &ranges).into_iter();
         seen = found.next().flatten().map(|(d, share)| (mm(d), share));
-        let named = found.zip(VIEWS).filter_map(|(part, (views, _))| Some((part?, views)));
+        let named = found.zip(VIEW_COUNTS).filter_map(|(part, (views, _))| Some((part?, views)));
         by_views = named.map(|((d, share), views)| ByViews { views, share, distance: mm(d) }).collect();
         let kinds = skin_and_hair(&views)?;
         if !kinds.is_empty() {
             let kind = |i: usize, [x, y]: [u32; 2]| {
                 kinds[i].get(y as usize * cameras[i].width as usize + x as usize).copied().flatten()
             };
-            let found = kinds_one_way(&truth, &Bvh::new(mesh), POINTS, &cameras, kind);
+            let found = kinds_one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES, &cameras, kind);
             let named = found.into_iter().zip(["skin", "hair"]).filter_map(|(d, part)| Some((d?, part)));
             let part =
                 |((d, signed), part)| Part { part, signed_median: 1e3 * unit_m * signed, distance: mm(d) };

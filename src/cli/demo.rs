@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// The demo's pictures are small, and it should end while its user still looks.
-pub(super) const SHORTER: &str = "\
+pub(super) const DEMO_SETTINGS: &str = "\
 tface.steps = 800
 tface.rays = 2048
 baseline.steps = 600
@@ -35,7 +35,7 @@ pub(super) fn run(
     let capture = run.join(DEMO_CAPTURE);
     // repeated without options, the demo goes on as it was begun
     let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
-    let fallback = Some((Preset::Draft, SHORTER));
+    let fallback = Some((Preset::Draft, DEMO_SETTINGS));
     // what is wrong with the command line is reported before the head is photographed
     Out::find(common.out.as_deref(), "run")?;
     let config = common.resolve(saved.as_deref(), fallback, &[])?;

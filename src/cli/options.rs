@@ -1,9 +1,10 @@
 //! The options that every command shares, the configuration they amount to, and which capture and which run a command
 //! means.
 
+use crate::capture::is_run;
 use crate::config::{Config, Preset, Sources, Stage};
 use crate::io::{self, Limits};
-use crate::{Error, Result, capture};
+use crate::{Error, Result};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ColorChoice};
 use std::path::{Path, PathBuf};
@@ -214,12 +215,6 @@ impl RunTarget {
     }
 }
 
-/// A run has its configuration; a capture has cameras. A folder with both is a run only if a stage was done in it.
-pub(super) fn is_run(path: &Path) -> bool {
-    let is_done = || io::is_file(&path.join("mask/done.json"));
-    io::is_file(&path.join("config.toml")) && (!capture::has_cameras(path) || is_done())
-}
-
 /// The run in `here`, else the one under `here/runs` that was configured last.
 fn guess(here: &Path) -> Result<RunTarget> {
     if is_run(here) {
@@ -275,17 +270,25 @@ mod tests {
 
     #[test]
     fn a_capture_of_any_format_that_holds_a_config_toml_is_not_taken_for_a_run() {
-        let formats: [&[&str]; 4] = [
+        // the last ones cannot be opened, and must be refused as captures
+        let formats: [&[&str]; 9] = [
             &["transforms.json"],
             &["cameras_sphere.npz"],
             &["cameras.npz"],
             &["sparse/0/cameras.bin", "sparse/0/images.bin"],
+            &["image/000.png"],
+            &["000.jpg"],
+            &["database.db", "images/000.jpg"],
+            &["project.psx"],
+            &["head.mp4"],
         ];
         for files in formats {
             let dir = tempfile::tempdir().unwrap();
             fs::write(dir.path().join("config.toml"), "").unwrap();
             assert!(is_run(dir.path()));
-            fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
+            ["sparse/0", "image", "images"]
+                .iter()
+                .for_each(|d| fs::create_dir_all(dir.path().join(d)).unwrap());
             files.iter().for_each(|file| fs::write(dir.path().join(file), "x").unwrap());
             let target = RunTarget::find(&Common::default(), Some(dir.path())).unwrap();
             assert_eq!((target.capture.is_some(), target.saved), (true, None), "{files:?}");

@@ -94,13 +94,13 @@ fn axis(word: &str) -> Vec3 {
 const THREE_QUARTERS: (f64, f64) = (0.6, 0.15);
 
 /// Elevation of a turntable's camera, radians.
-const ABOVE: f64 = 0.1;
+const TURNTABLE_ELEVATION: f64 = 0.1;
 
 /// Frames of an animation a second.
-const RATE: u16 = 12;
+const FRAMES_PER_SECOND: u16 = 12;
 
 /// The sheet: what is called so, so far to the side of the front, so far above, and as what; `None` is as the colors are.
-const SHEET: [(&str, f64, f64, Option<Look>); 8] = [
+const SHEET_VIEWS: [(&str, f64, f64, Option<Look>); 8] = [
     ("FRONT", 0.0, 0.0, None),
     ("LEFT", FRAC_PI_2, 0.0, None),
     ("RIGHT", -FRAC_PI_2, 0.0, None),
@@ -112,13 +112,13 @@ const SHEET: [(&str, f64, f64, Option<Look>); 8] = [
 ];
 
 /// Pixels along each side of a picture on a sheet, at most: all of them are held at once.
-const MOST_OF_SHEET: u32 = 2048;
+const MAX_SHEET_PX: u32 = 2048;
 
 /// Columns of the sheet; one more where a photograph and the errors against it are on it.
-const COLUMNS: usize = 4;
+const SHEET_COLUMNS: usize = 4;
 
 /// Pixels of pictures that are made side by side: 1 GiB while they are floats.
-const AT_ONCE_PX: u64 = 1 << 25;
+const BATCH_PX: u64 = 1 << 25;
 
 /// What is made, and its name in `--out`, in the name of a file of its own and in messages.
 #[derive(Clone, Copy, PartialEq)]
@@ -171,8 +171,8 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         return page(invocation, options.path.as_deref(), options.up, asked.as_ref());
     }
     let kind = Kind::of(options);
-    if kind == Kind::Sheet && options.size.is_some_and(|size| size > MOST_OF_SHEET) {
-        let what = format!("`--size` of a picture on a sheet is at most {MOST_OF_SHEET}");
+    if kind == Kind::Sheet && options.size.is_some_and(|size| size > MAX_SHEET_PX) {
+        let what = format!("`--size` of a picture on a sheet is at most {MAX_SHEET_PX}");
         return Err(Error::usage(what, "make larger pictures one by one"));
     }
     let asked = Out::find(common.out.as_deref(), if kind.is_moving() { "turntable" } else { "preview" })?;
@@ -224,10 +224,10 @@ fn make(
         }
         Ok(pictures)
     };
-    let at_once = (AT_ONCE_PX / largest.max(1)).clamp(1, 32) as usize;
+    let at_once = (BATCH_PX / largest.max(1)).clamp(1, 32) as usize;
     match place {
         Out::File(file, _) if kind == Kind::Sheet => {
-            let (mut pictures, mut names, mut columns) = (some(shots)?, names.to_vec(), COLUMNS);
+            let (mut pictures, mut names, mut columns) = (some(shots)?, names.to_vec(), SHEET_COLUMNS);
             match renderer.against_photograph(width) {
                 Ok(Some(more)) => {
                     pictures.extend(more);
@@ -251,7 +251,7 @@ fn make(
                 Ok(pictures) => pictures.into_iter().map(|p| Ok(p.rgba)).collect(),
                 Err(e) => vec![Err(e)],
             });
-            let animation = Animation { width, height, count: shots.len() as u32, rate: RATE };
+            let animation = Animation { width, height, count: shots.len() as u32, rate: FRAMES_PER_SECOND };
             io::write_animation(file, ending, &animation, &mut frames)?;
             Ok(vec![file.clone()])
         }
@@ -285,13 +285,13 @@ fn shots(
     let around = |turn, tilt, side: u32, count| preview.around(turn, tilt, side, count);
     let cameras = match kind {
         Kind::Picture => around(THREE_QUARTERS.0, THREE_QUARTERS.1, size.unwrap_or(1024), 1)?,
-        Kind::Turntable => around(0.0, ABOVE, size.unwrap_or(512), options.frames as usize)?,
+        Kind::Turntable => around(0.0, TURNTABLE_ELEVATION, size.unwrap_or(512), options.frames as usize)?,
         Kind::Cameras => {
             preview.cameras(options.cameras.as_deref().unwrap_or_default(), size.unwrap_or(1024))?
         }
         Kind::Sheet => {
             let (mut names, mut shots) = (Vec::new(), Vec::new());
-            for (name, turn, tilt, own) in SHEET {
+            for (name, turn, tilt, own) in SHEET_VIEWS {
                 // a mesh without texture coordinates shows its shape instead
                 let is_shape = own == Some(Look::Uv) && !preview.has_uvs();
                 let own = if is_shape { Look::Matcap } else { own.unwrap_or(look) };
@@ -358,19 +358,21 @@ fn rows(letter: char) -> [u8; 7] {
 }
 
 /// A letter with the space behind it, dots.
-const STEP: u32 = 6;
+const LETTER_WIDTH: u32 = 6;
 
 /// Writes a name of capital letters into the upper left corner of a picture: white on a dark field, so that it can be read
 /// over anything.
 fn write_name(picture: &mut PreviewPicture, name: &str) {
     let dot = (picture.width / 256).max(1);
-    let (across, down) = (STEP * name.len() as u32 + 3, 11);
+    let (across, down) = (LETTER_WIDTH * name.len() as u32 + 3, 11);
     let letters: Vec<[u8; 7]> = name.chars().map(rows).collect();
     for y in 0..(down * dot).min(picture.height) {
         for x in 0..(across * dot).min(picture.width) {
             let (column, row) = ((x / dot).wrapping_sub(2), (y / dot).wrapping_sub(2));
-            let letter = letters.get((column / STEP) as usize).filter(|_| row < 7 && column % STEP < 5);
-            let is_on = letter.is_some_and(|rows| rows[row as usize] >> (4 - column % STEP) & 1 == 1);
+            let letter = letters
+                .get((column / LETTER_WIDTH) as usize)
+                .filter(|_| row < 7 && column % LETTER_WIDTH < 5);
+            let is_on = letter.is_some_and(|rows| rows[row as usize] >> (4 - column % LETTER_WIDTH) & 1 == 1);
             let shade = if is_on { 255 } else { 32 };
             picture.rgba[(y * picture.width + x) as usize] = [shade, shade, shade, 255];
         }
@@ -428,19 +430,19 @@ fn no_up(up: Option<Vec3>) -> Result<()> {
 }
 
 /// The page of a run at work, in its folder.
-const WATCHED: &str = "watch.html";
+const WATCH_FILE: &str = "watch.html";
 
 /// How often a request to stop is looked for: its handler ends an idle command after half a second.
 const STOP_CHECK: Duration = Duration::from_millis(50);
 
 /// How often that is written.
-const EVERY: Duration = Duration::from_secs(2);
+const REFRESH_INTERVAL: Duration = Duration::from_secs(2);
 
 /// Writes the page of a run repeatedly until the process is stopped.
 fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     let (common, stop) = (invocation.common, &invocation.stop);
     let (target, config) = target(invocation, path)?;
-    let page = target.run.join(WATCHED);
+    let page = target.run.join(WATCH_FILE);
     if common.dry_run {
         invocation.screen.note("preview", &format!("would keep a page up to date in `{}`", page.display()));
         return Ok(());
@@ -471,7 +473,7 @@ fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     let mut written = Instant::now();
     while stop.requested().is_none() {
         std::thread::sleep(STOP_CHECK);
-        if written.elapsed() >= EVERY {
+        if written.elapsed() >= REFRESH_INTERVAL {
             write(true)?;
             written = Instant::now();
         }

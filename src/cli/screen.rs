@@ -35,8 +35,8 @@ struct MovingLine {
     ahead: Vec<(String, f64)>,
 }
 
-const PLAIN: Duration = Duration::from_secs(30);
-const OBJECTS: Duration = Duration::from_secs(1);
+const PLAIN_INTERVAL: Duration = Duration::from_secs(30);
+const JSON_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Screen {
     pub fn new(common: &Common) -> Arc<Screen> {
@@ -164,7 +164,7 @@ impl Observer for Screen {
             Event::Progress { stage, step, steps, rate, eta_s, values } => {
                 let all_s = rate.filter(|r| *r > 0.0).map(|r| steps as f64 / r);
                 let (after, run_eta_s) = self.after(stage, eta_s, all_s);
-                if self.json && self.due(OBJECTS, step >= steps) {
+                if self.json && self.due(JSON_INTERVAL, step >= steps) {
                     let mut object = json!(event);
                     object["stages_after"] = json!(after);
                     object["run_eta_s"] = json!(run_eta_s);
@@ -174,7 +174,9 @@ impl Observer for Screen {
                 let bar = self.moving().bar.clone();
                 match bar {
                     Some(bar) => bar.set_message(text),
-                    None if !self.quiet && !self.json && self.due(PLAIN, false) => self.line(stage, &text),
+                    None if !self.quiet && !self.json && self.due(PLAIN_INTERVAL, false) => {
+                        self.line(stage, &text)
+                    }
                     None => {}
                 }
                 return;

@@ -29,11 +29,11 @@ pub(super) struct StatusOptions {
     watch: bool,
 }
 
-const EVERY: Duration = Duration::from_secs(2);
+const REFRESH_INTERVAL: Duration = Duration::from_secs(2);
 /// More runs than this: those with nothing to tell but that they are done, or not begun, share lines.
-const LINES: usize = 40;
+const MAX_LINES: usize = 40;
 /// Columns of a shared line.
-const WIDTH: usize = 100;
+const LINE_WIDTH: usize = 100;
 
 pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()> {
     let common = invocation.common;
@@ -60,7 +60,7 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
         };
         let may_change = [Phase::Waiting, Phase::Running, Phase::Begun, Phase::Killed, Phase::Stopped];
         if options.watch && is(&may_change) > 0 && invocation.stop.requested().is_none() {
-            std::thread::park_timeout(EVERY);
+            std::thread::park_timeout(REFRESH_INTERVAL);
             if invocation.stop.requested().is_none() {
                 continue;
             }
@@ -120,7 +120,7 @@ fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> Strin
             }
         };
         let settled = [Phase::Done, Phase::Waiting].contains(&standing.phase);
-        if settled && !each && runs.len() > LINES {
+        if settled && !each && runs.len() > MAX_LINES {
             shared.entry(word(standing.phase)).or_default().push(name(run));
             continue;
         }
@@ -130,7 +130,7 @@ fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> Strin
     for (word, names) in shared {
         let mut line = format!("{word}:");
         for name in names {
-            if line.len() + 1 + name.len() > WIDTH {
+            if line.len() + 1 + name.len() > LINE_WIDTH {
                 text += &format!("{line}\n");
                 line = "  ".into();
             }

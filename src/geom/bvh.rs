@@ -26,13 +26,13 @@ use std::time::Duration;
 
 /// Rounding of the shear (2.5 ε of the distance) for distances up to five times the largest
 /// coordinate, and the 4 ε every coordinate gets.
-const GROWTH: f32 = 16.0 * f32::EPSILON;
+const BOX_PADDING: f32 = 16.0 * f32::EPSILON;
 
 /// Rays that start farther out than this many times the largest coordinate are moved closer.
-const FAR: f32 = 4.0;
+const FAR_ORIGIN: f32 = 4.0;
 
 /// Ize 2013: 1 + 2 γ₃, with γ₃ = 3 u / (1 − 3 u) and u = ε/2.
-const SLAB: f32 = 1.0 + 4.0 * f32::EPSILON;
+const SLAB_ROUNDING: f32 = 1.0 + 4.0 * f32::EPSILON;
 
 /// Set in a child reference that names a leaf.
 const LEAF: u32 = 1 << 31;
@@ -289,7 +289,7 @@ impl Bvh {
                     .min((b[1 - near_side[1]][1] - oy) * iy)
                     .min((b[1 - near_side[2]][2] - oz) * iz);
                 let near = near.max(start);
-                let far = (far * SLAB).min(Vec4::splat(best.t));
+                let far = (far * SLAB_ROUNDING).min(Vec4::splat(best.t));
                 let hits = near.cmple(far).bitmask();
                 if hits != 0 && hits & (hits - 1) == 0 {
                     current = node.child[hits.trailing_zeros() as usize];
@@ -313,11 +313,11 @@ impl Bvh {
 
     /// Where to start from, and how far along the ray that is. Only far rays move.
     fn approach(&self, ray: &Ray) -> Option<(Vec3, f64)> {
-        if ray.origin.abs().max_element() <= FAR * self.reach {
+        if ray.origin.abs().max_element() <= FAR_ORIGIN * self.reach {
             return Some((ray.origin, 0.0));
         }
         let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
-        let grown = (GROWTH * self.reach).max(f32::MIN_POSITIVE) as f64;
+        let grown = (BOX_PADDING * self.reach).max(f32::MIN_POSITIVE) as f64;
         let (low, high) = (self.bounds.min.as_dvec3() - grown, self.bounds.max.as_dvec3() + grown);
         let (mut enter, mut leave) = (0.0f64, f64::INFINITY);
         for axis in 0..3 {
@@ -506,7 +506,7 @@ impl Bvh {
                 Aabb { min: a.min.min(b.min), max: a.max.max(b.max) }
             };
         }
-        let grown = (GROWTH * self.reach).max(f32::MIN_POSITIVE);
+        let grown = (BOX_PADDING * self.reach).max(f32::MIN_POSITIVE);
         // Work: which of our nodes stands for which of theirs, and how deep it is.
         let mut work = vec![(0usize, 0usize, 1usize)];
         self.nodes.push(WideNode::EMPTY);

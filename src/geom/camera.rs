@@ -91,7 +91,7 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 }
 
 /// Angles from here on count as 90°: the tangent would be too large to be of use.
-const WIDEST: f64 = std::f64::consts::FRAC_PI_2 - 1e-3;
+const MAX_ANGLE: f64 = std::f64::consts::FRAC_PI_2 - 1e-3;
 
 impl Distortion {
     /// Returns whether it does nothing.
@@ -131,7 +131,7 @@ impl Distortion {
         match self.projection {
             Projection::Perspective => Some(1.0),
             Projection::Fisheye if small => Some(1.0),
-            Projection::Fisheye => (radius < WIDEST).then(|| radius.tan() / radius),
+            Projection::Fisheye => (radius < MAX_ANGLE).then(|| radius.tan() / radius),
             Projection::Fov if self.omega.abs() < 1e-6 => Some(1.0),
             Projection::Fov => {
                 let spread = 2.0 * (0.5 * self.omega).tan();
@@ -139,7 +139,7 @@ impl Distortion {
                 if small {
                     return Some(self.omega / spread);
                 }
-                (angle < WIDEST).then(|| angle.tan() / (spread.abs() * radius))
+                (angle < MAX_ANGLE).then(|| angle.tan() / (spread.abs() * radius))
             }
         }
     }
@@ -229,7 +229,7 @@ impl Distortion {
             }
         }
         let (fx, fy) = self.bend(x, y);
-        if (fx - xd).abs() + (fy - yd).abs() >= RESIDUAL {
+        if (fx - xd).abs() + (fy - yd).abs() >= MAX_RESIDUAL {
             return None;
         }
         let scale = self.tangent_over_radius(x.hypot(y))?;
@@ -238,7 +238,7 @@ impl Distortion {
 }
 
 /// How near [`Distortion::undistort`] must come; at a focal length of 10 000 pixels, 1e-6 of a pixel.
-const RESIDUAL: f64 = 1e-10;
+const MAX_RESIDUAL: f64 = 1e-10;
 
 /// One camera: intrinsics in pixels of its own picture, pose in the dataset's world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -26,11 +26,11 @@ use crate::image::{Gray, Photo, enlarge, reduce_photo, resize_hard, working_size
 use crate::{Error, Result};
 
 /// Alphas below become 0.
-const LOWEST: f32 = 0.02;
+const MIN_ALPHA: f32 = 0.02;
 /// Alphas above become 1.
-const HIGHEST: f32 = 0.98;
+const MAX_ALPHA: f32 = 0.98;
 /// A band that is a larger share of the picture is worth a warning.
-const MOST_UNKNOWN: f64 = 0.3;
+const MAX_UNKNOWN: f64 = 0.3;
 
 /// How a hard mask is made soft.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -110,7 +110,7 @@ pub fn soften_with(
         }
         None => solved(&photo, &mask, &trimap, &ClosedFormOptions::default(), &mut warnings),
     };
-    let alpha = enlarge(&alpha, working, size, LOWEST, HIGHEST);
+    let alpha = enlarge(&alpha, working, size, MIN_ALPHA, MAX_ALPHA);
     Ok(SoftMask { alpha, trimap, warnings })
 }
 
@@ -139,7 +139,7 @@ fn solved(
 fn band_warnings(trimap: &Gray) -> Vec<String> {
     let mut warnings = Vec::new();
     let band = unknown_share(trimap);
-    if band > MOST_UNKNOWN {
+    if band > MAX_UNKNOWN {
         warnings.push(format!(
             "{:.0} % of the picture are unknown: the mask is ragged or full of holes; a click on what it missed helps",
             100.0 * band

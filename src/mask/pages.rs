@@ -30,7 +30,7 @@ const SIDE_PX: u32 = 1024;
 /// JPEG quality of the photographs, 1 to 100.
 const QUALITY: u8 = 85;
 /// Photographs at most; of more, those with clicks and evenly spread ones are shown.
-const MOST_VIEWS: usize = 200;
+const MAX_VIEWS: usize = 200;
 
 /// A photograph in the page.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -59,7 +59,7 @@ impl PageView {
 pub fn page_of(capture: &Capture, prompts: &Prompts, limits: &Limits) -> Result<String> {
     let clicked = prompts.clicks("prompts.json", capture).unwrap_or_default();
     let clicked = |i: usize| clicked.get(i).is_some_and(|points| !points.is_empty());
-    let chosen = evenly(capture.views.len(), MOST_VIEWS, clicked);
+    let chosen = evenly(capture.views.len(), MAX_VIEWS, clicked);
     let read = |view: &View| {
         let photo = io::read_photo(&view.photo, Some(view.photo_size), limits)?;
         PageView::new(file_path(capture, view), view.declared, &photo, SIDE_PX)
@@ -110,9 +110,9 @@ const BAND: [u8; 3] = [255, 200, 0];
 /// Longest side of a picture on the sheet, pixels: about 20 kB each.
 const PICTURE_PX: u32 = 320;
 /// Pictures on a sheet at most, about 10 MB of them.
-const MOST: usize = 500;
+const MAX_PICTURES: usize = 500;
 /// What encloses the sheet on a page of its own.
-const MARKS: [&str; 2] = ["<!-- sheet -->", "<!-- end of the sheet -->"];
+const SHEET_MARKERS: [&str; 2] = ["<!-- sheet -->", "<!-- end of the sheet -->"];
 
 /// One view of a sheet.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -185,7 +185,7 @@ fn outline(picture: &mut Photo, mask: &Gray) {
 /// Returns the sheet of these views, in their order, as a page of its own. When there are more than fit, suspicious
 /// ones and evenly spread others are shown, and a last line says so.
 pub fn sheet(views: &[SheetView]) -> Result<String> {
-    let shown = evenly(views.len(), MOST, |i| !views[i].suspicions.is_empty());
+    let shown = evenly(views.len(), MAX_PICTURES, |i| !views[i].suspicions.is_empty());
     let shown: Vec<&SheetView> = shown.into_iter().map(|i| &views[i]).collect();
     let mut pages = Environment::new();
     pages.set_trim_blocks(true);
@@ -197,7 +197,7 @@ pub fn sheet(views: &[SheetView]) -> Result<String> {
 /// What a [`sheet`] shows, without the page around it: for a page with more, in about `most` bytes. Where not all views
 /// have room, suspicious ones and evenly spread others stay.
 pub fn part(sheet: &str, most: usize) -> Option<String> {
-    let inside = sheet.split_once(MARKS[0])?.1.split_once(MARKS[1])?.0;
+    let inside = sheet.split_once(SHEET_MARKERS[0])?.1.split_once(SHEET_MARKERS[1])?.0;
     let (head, rest) = inside.split_once("<figure")?;
     let (figures, tail) = rest.rsplit_once("</figure>")?;
     let figures: Vec<&str> =
@@ -342,11 +342,11 @@ mod tests {
 
     #[test]
     fn a_sheet_of_very_many_views_says_what_it_leaves_out_and_keeps_the_suspicious() {
-        let mut views = vec![SheetView::new("a", &photo(6, 8), &bust(), None).unwrap(); MOST + 100];
+        let mut views = vec![SheetView::new("a", &photo(6, 8), &bust(), None).unwrap(); MAX_PICTURES + 100];
         views.iter_mut().for_each(|t| t.suspicions.clear());
-        views[MOST + 99].suspicions.push("odd".into());
+        views[MAX_PICTURES + 99].suspicions.push("odd".into());
         let page = sheet(&views).unwrap();
-        assert_eq!(page.matches("<figure").count(), MOST);
+        assert_eq!(page.matches("<figure").count(), MAX_PICTURES);
         assert!(page.contains("class=\"odd\"") && page.contains("<p>500 of 600 views.</p>"));
         assert!(!sheet(&[]).unwrap().contains("<figure"));
     }

@@ -24,11 +24,11 @@ use std::path::{Component, Path};
 const CONVENTION: &str =
     "x right, y down, pixel indices from the top left; label 1 = foreground, 0 = background";
 /// A person clicks a dozen times on a photograph.
-const MOST_POINTS: usize = 500;
+const MAX_POINTS: usize = 500;
 /// Longer names fit no file system.
-const LONGEST_NAME: usize = 4096;
+const MAX_NAME_BYTES: usize = 4096;
 /// As many views as a capture may have, with ten points each, stay below this.
-const MOST_BYTES: u64 = 64 << 20;
+const MAX_BYTES: u64 = 64 << 20;
 
 /// The suggested fix for a file of another shape.
 const SHAPE: &str = "write `{\"frames\": [{\"file_path\": …, \"points\": [{\"x\": …, \"y\": …, \"label\": 1}]}]}`, or \
@@ -67,7 +67,7 @@ pub fn parse_prompts(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Promp
 }
 
 fn at_most(limits: &Limits) -> Limits {
-    Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() }
+    Limits { json_bytes: limits.json_bytes.min(MAX_BYTES), ..limits.clone() }
 }
 
 /// One click as written on a command line: `x,y,label`.
@@ -164,8 +164,8 @@ fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
             let problem = format!("`{}` was clicked on in `frames[{first}]` already", shown(&file_path));
             return Err(wrong(&place, problem, "put all points of a photograph into one frame"));
         }
-        if entry.points.len() > MOST_POINTS {
-            let problem = format!("it has {} points, the limit is {MOST_POINTS}", entry.points.len());
+        if entry.points.len() > MAX_POINTS {
+            let problem = format!("it has {} points, the limit is {MAX_POINTS}", entry.points.len());
             return Err(wrong(&place, problem, "a dozen clicks are enough"));
         }
         let click = |(j, point): (usize, &PointEntry)| -> Result<Click> {
@@ -189,7 +189,7 @@ fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
 /// A name below the capture with `/` between its parts, or why it is none.
 fn below(name: &str) -> Result<String, &'static str> {
     let text = name.replace('\\', "/");
-    if text.len() > LONGEST_NAME {
+    if text.len() > MAX_NAME_BYTES {
         return Err("is too long for a name");
     }
     if text.contains('\0') {
@@ -509,7 +509,7 @@ mod tests {
 
     #[test]
     fn sizes_and_numbers_beyond_reason_are_refused_by_the_reader() {
-        let many = format!("[{}]", vec![r#"{"x":1,"y":1,"label":1}"#; MOST_POINTS + 1].join(","));
+        let many = format!("[{}]", vec![r#"{"x":1,"y":1,"label":1}"#; MAX_POINTS + 1].join(","));
         assert!(parsed(&one("a", &many)).unwrap_err().to_string().contains("the limit is 500"));
         let few = Limits { views: 1, ..Limits::default() };
         let two = format!("{{\"frames\": [{}, {}]}}", frame("a", POINT), frame("b", POINT));

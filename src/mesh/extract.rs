@@ -39,7 +39,7 @@ pub struct ExtractOptions {
 
 /// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm long, which
 /// is a strand or a hole as thick as a thumb. A share, since not every capture knows its unit.
-pub const LONGEST_HANDLE: f32 = 0.15;
+pub const MAX_HANDLE: f32 = 0.15;
 
 /// Most points in one call of a field.
 pub(super) const BATCH: usize = 1 << 16;
@@ -52,7 +52,7 @@ const RELAX: f32 = 0.5;
 
 impl Default for ExtractOptions {
     fn default() -> ExtractOptions {
-        ExtractOptions { resolution: 512, coarse_step: 8, longest_handle: LONGEST_HANDLE }
+        ExtractOptions { resolution: 512, coarse_step: 8, longest_handle: MAX_HANDLE }
     }
 }
 

@@ -247,6 +247,6 @@ fn restore_from_run(config: &Config, run: &Run, error: Error) -> Result<(Capture
 pub(super) fn missing_capture(problem: &str) -> Error {
     Error::cannot(
         format!("the capture of this run cannot be opened: {problem}"),
-        "say where it lies now: `--set capture.path=FOLDER`; the same photographs give the same run",
+        "name its current folder with `--set capture.path=FOLDER`; the same photographs continue the same run",
     )
 }

@@ -19,7 +19,7 @@ use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 
 /// Largest mask value that counts as empty.
-const NOTHING: u8 = 0;
+const MAX_EMPTY: u8 = 0;
 
 /// Rendered pictures of one method, one for each view.
 pub(super) struct PictureSet {
@@ -189,7 +189,7 @@ fn square_opacity_outside(opacity: &[f32], loaded: &LoadedView) -> Option<(f64, 
     let mask = loaded.mask.as_ref()?;
     let valid = |i: usize| loaded.valid.as_ref().is_none_or(|v| v.values[i] > 0);
     let counted =
-        opacity.iter().zip(&mask.values).enumerate().filter(|(i, (_, m))| **m == NOTHING && valid(*i));
+        opacity.iter().zip(&mask.values).enumerate().filter(|(i, (_, m))| **m == MAX_EMPTY && valid(*i));
     Some(counted.fold((0.0, 0), |(sum, n), (_, (a, _))| (sum + (*a as f64).powi(2), n + 1)))
 }
 

@@ -18,7 +18,7 @@ use serde_json::Value;
 use std::path::Path;
 
 /// Maximum size of a page without its fixed parts, bytes.
-const MOST_BYTES: usize = 7_600_000;
+const MAX_BYTES: usize = 7_600_000;
 /// The part of it that masks may take.
 const MASK_BYTES: usize = 800_000;
 
@@ -53,7 +53,7 @@ fn page(session: &Session) -> Result<String> {
     let masks = crate::mask::pages::part(&sheet, MASK_BYTES).unwrap_or_default();
     let found = views::viewer(session)?;
     let glb = found.as_ref().map_or(0, |(v, _)| v.glb.len().div_ceil(3) * 4);
-    let (views, left_out) = views::rows(session, MOST_BYTES.saturating_sub(masks.len() + glb))?;
+    let (views, left_out) = views::rows(session, MAX_BYTES.saturating_sub(masks.len() + glb))?;
     let viewer = found.map(|(viewer, file_from_world)| Viewer {
         cameras: views::cameras(session, &views, &file_from_world),
         ..viewer

@@ -20,7 +20,7 @@ pub const MEASURES: [(&str, &str, usize); 7] = [
 const OWN_MASKS: &str = " †";
 
 /// Resamplings of an interval.
-const DRAWS: u64 = 1000;
+const RESAMPLES: u64 = 1000;
 
 /// A row of a table: which run it comes from, and which of its pictures.
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -176,7 +176,7 @@ pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
         groups.iter().enumerate().map(|(i, g)| mean_of(i, g)).sum::<f64>() / groups.len() as f64
     };
     let mean = over(&|_, g| g.iter().sum::<f64>() / g.len() as f64);
-    let mut drawn: Vec<f64> = (0..DRAWS)
+    let mut drawn: Vec<f64> = (0..RESAMPLES)
         .map(|draw| {
             over(&|i, g| {
                 let n = g.len() as u64;
@@ -186,7 +186,7 @@ pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
         })
         .collect();
     drawn.sort_by(f64::total_cmp);
-    let at = |share: f64| drawn[((DRAWS - 1) as f64 * share).round() as usize];
+    let at = |share: f64| drawn[((RESAMPLES - 1) as f64 * share).round() as usize];
     Some(Interval { mean, low: at(0.025), high: at(0.975) })
 }
 
@@ -372,7 +372,7 @@ impl Experiment {
             "{many} {captures} ({}), scale {} of the published effort. PSNR and SSIM are means over held-out photographs as \
              they were taken, then over captures; masks are the captures' own{own}. Seconds a view of an ensemble are \
              those of its members and of the blend. A row that some captures lack is the mean of the others; \
-             orderings on average are over the captures that have both rows. Intervals: {DRAWS} resamplings of the photographs.{}",
+             orderings on average are over the captures that have both rows. Intervals: {RESAMPLES} resamplings of the photographs.{}",
             self.captures.join(", "),
             self.scale,
             if self.published.is_empty() {

@@ -110,18 +110,18 @@ struct Pace {
 impl Pace {
     fn remember(&mut self, warning: &str) {
         // once each, and as many as anybody reads
-        if self.warnings.len() < MOST_WARNINGS && !self.warnings.iter().any(|w| w == warning) {
+        if self.warnings.len() < MAX_WARNINGS && !self.warnings.iter().any(|w| w == warning) {
             self.warnings.push(warning.to_owned());
         }
     }
 }
 
-const MOST_WARNINGS: usize = 50;
-const SHOW: Duration = Duration::from_millis(100);
-const LOG: Duration = Duration::from_secs(1);
-const SAVE: Duration = Duration::from_secs(2);
+const MAX_WARNINGS: usize = 50;
+const SHOW_INTERVAL: Duration = Duration::from_millis(100);
+const LOG_INTERVAL: Duration = Duration::from_secs(1);
+const SAVE_INTERVAL: Duration = Duration::from_secs(2);
 /// The rate is renewed over windows of this length.
-const WINDOW: Duration = Duration::from_secs(3);
+const RATE_WINDOW: Duration = Duration::from_secs(3);
 
 fn due(last: Option<Instant>, every: Duration) -> bool {
     last.is_none_or(|t| t.elapsed() >= every)
@@ -215,7 +215,7 @@ impl Monitor for Progress {
         let seconds = now.duration_since(since).as_secs_f64();
         if seconds > 0.2 && step > from {
             let fresh = (step - from) as f64 / seconds;
-            if status.rate.is_none() || now.duration_since(since) >= WINDOW {
+            if status.rate.is_none() || now.duration_since(since) >= RATE_WINDOW {
                 status.rate = Some(status.rate.map_or(fresh, |old| 0.5 * old + 0.5 * fresh));
                 pace.mark = Some((step, now));
             }
@@ -227,11 +227,11 @@ impl Monitor for Progress {
 
         let last = step >= steps;
         let mut trouble = None;
-        if last || due(pace.logged, LOG) {
+        if last || due(pace.logged, LOG_INTERVAL) {
             pace.logged = Some(now);
             trouble = self.log(step, steps, values).err();
         }
-        if due(pace.saved, SAVE) {
+        if due(pace.saved, SAVE_INTERVAL) {
             trouble = self.write(status, pace).err().or(trouble);
         }
         if let Some(e) = trouble
@@ -242,7 +242,7 @@ impl Monitor for Progress {
             pace.remember(&text);
             self.observer.event(&Event::Warning { stage: &self.stage, text: &text });
         }
-        if last || due(pace.shown, SHOW) {
+        if last || due(pace.shown, SHOW_INTERVAL) {
             pace.shown = Some(now);
             let (rate, eta_s) = (status.rate, status.eta_s);
             let stage = self.stage.as_str();

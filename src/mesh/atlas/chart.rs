@@ -166,10 +166,10 @@ pub(super) fn straighten<L: Copy + PartialEq>(beside: &[[u32; 3]], region: &mut 
 }
 
 /// Of the surface, a chart that is no more than a sliver of the face need not stand.
-const LEAST: f64 = 0.01;
+const MIN_UPRIGHT_SHARE: f64 = 0.01;
 
 /// Less than this share of the steepest rise says nothing of where up is.
-const LEAST_RISE: f64 = 0.1;
+const MIN_RISE: f64 = 0.1;
 
 /// For each chart where up is in it, of length 1, if it has to stand upright: the one that the foremost triangle, seen
 /// along `front`, is part of.
@@ -178,7 +178,8 @@ pub(super) fn upright(mesh: &Mesh, charts: &[Flat], front: Vec3, up: Vec3) -> Ve
     let foremost = (0..mesh.triangles.len() as u32).max_by(|&a, &b| depth(a).total_cmp(&depth(b)));
     let whole: f64 = charts.iter().map(Flat::area).sum();
     let stands = |chart: &Flat| {
-        let is_face = foremost.is_some_and(|t| chart.triangles.contains(&t)) && chart.area() > LEAST * whole;
+        let is_face = foremost.is_some_and(|t| chart.triangles.contains(&t))
+            && chart.area() > MIN_UPRIGHT_SHARE * whole;
         is_face.then(|| rising(mesh, chart, up)).flatten()
     };
     charts.iter().map(stands).collect()
@@ -197,7 +198,7 @@ fn rising(mesh: &Mesh, chart: &Flat, up: Vec3) -> Option<DVec2> {
             * twice_area([a, b, c]).signum();
     }
     // seen from below or above, up is nowhere in it; the gradient of what stands straight is 1 everywhere
-    (sum.length() > LEAST_RISE * 2.0 * chart.area()).then(|| sum.normalize())
+    (sum.length() > MIN_RISE * 2.0 * chart.area()).then(|| sum.normalize())
 }
 
 #[cfg(test)]

@@ -21,7 +21,7 @@
 
 use super::chart::{Flat, NONE, neighbours, part, straighten, stretch};
 use super::flatten::{ChartSet, STRETCHED, flatten, relax, smoothed};
-use crate::geom::{Mesh, THOROUGH, overlaps};
+use crate::geom::{Mesh, THOROUGH_EFFORT, overlaps};
 use crate::{Monitor, Result};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -32,7 +32,7 @@ use std::collections::HashMap;
 const SMOOTHING: usize = 30;
 
 /// Share of the surface below which a chart joins a neighbour.
-const SMALL: f64 = 0.008;
+const MIN_CHART_SHARE: f64 = 0.008;
 
 /// Times that regions are joined and laid flat.
 const JOINS: usize = 2;
@@ -96,7 +96,7 @@ fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
 /// them meet, the smaller of the two strips that lie over each other becomes a chart of its own.
 fn uncovered(chart: Flat) -> Vec<Flat> {
     let points: Vec<Vec2> = chart.points.iter().map(|p| p.as_vec2()).collect();
-    let pairs = overlaps(&points, &chart.corners, &vec![true; chart.corners.len()], THOROUGH).pairs;
+    let pairs = overlaps(&points, &chart.corners, &vec![true; chart.corners.len()], THOROUGH_EFFORT).pairs;
     if pairs.is_empty() {
         return vec![chart];
     }
@@ -152,7 +152,7 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
             }
         }
     }
-    let least = SMALL * area.iter().sum::<f64>();
+    let least = MIN_CHART_SHARE * area.iter().sum::<f64>();
     let mut into: Vec<u32> = (0..regions).collect();
     let mut open: Vec<u32> = (0..regions).filter(|&r| area[r as usize] < least).collect();
     // the smallest first, so that confetti becomes pieces before pieces are given away
@@ -197,10 +197,10 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
 const SHARE: f64 = 0.01;
 
 /// How far a vertex may be off the plane, in parts of the surface's extent.
-const OFF: f64 = 5e-4;
+const MAX_PLANE_DISTANCE: f64 = 5e-4;
 
 /// Cosine of the angle by which a triangle may lean.
-const LEAN: f64 = 0.999;
+const MIN_PLANE_COSINE: f64 = 0.999;
 
 /// Returns the flat pieces of at least a hundredth of the surface, the largest triangles looked at first.
 pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
@@ -215,7 +215,7 @@ pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
     let areas: Vec<f64> = across.iter().map(|n| n.length()).collect();
     let whole: f64 = areas.iter().sum();
     let extent = f64::from(mesh.bounds().size().max_element());
-    let off = OFF * extent;
+    let off = MAX_PLANE_DISTANCE * extent;
     let mut seeds: Vec<u32> = (0..count as u32).collect();
     seeds.sort_by(|&a, &b| areas[b as usize].total_cmp(&areas[a as usize]).then(a.cmp(&b)));
     let mut piece = vec![NONE; count];
@@ -237,7 +237,7 @@ pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
                     continue;
                 }
                 let lies = corners(k).iter().all(|p| (*p - at).dot(n).abs() <= off);
-                if lies && across[k as usize].dot(n) >= LEAN * areas[k as usize] {
+                if lies && across[k as usize].dot(n) >= MIN_PLANE_COSINE * areas[k as usize] {
                     piece[k as usize] = seed;
                     open.push(k);
                 }
@@ -274,11 +274,11 @@ fn projected(mesh: &Mesh, triangles: &[u32], n: DVec3) -> Flat {
 
 /// The deepest plane lies so far behind the foremost point, in parts of the mesh's depth; the others are closer by
 /// equal steps.
-const DEEPEST: f32 = 0.5;
-const PLANES: usize = 16;
+const MAX_CUT_DEPTH: f32 = 0.5;
+const CUT_PLANES: usize = 16;
 
 /// Flattenings that may fail.
-const TRIES: usize = 8;
+const MAX_FAILURES: usize = 8;
 
 /// Rounds of smoothing for the copy that is flattened. With 30 a nose still folds, with 120 the ears of other heads do.
 const FACE_SMOOTHING: usize = 60;
@@ -287,17 +287,17 @@ const FACE_SMOOTHING: usize = 60;
 const FACE_RELAXING: usize = 200;
 
 /// The share of the surface that a face may have.
-const LARGEST: f64 = 0.3;
+const MAX_FACE_SHARE: f64 = 0.3;
 
 /// How many times smaller or larger than the rest a triangle of the smooth copy may be: relaxing evens it out.
-const FACE_STRETCHED: f32 = 2.0 * STRETCHED;
+const MAX_FACE_STRETCH: f32 = 2.0 * STRETCHED;
 
 /// Divides a mesh, with its face in one chart if possible.
 pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<ChartSet> {
-    for inside in caps(mesh, front.normalize()).take(TRIES) {
+    for inside in caps(mesh, front.normalize()).take(MAX_FAILURES) {
         let (face, number) = part(mesh, |t| inside[t as usize]);
         let whole = vec![0; face.triangles.len()];
-        let mut alone = flatten(&smoothed(&face, FACE_SMOOTHING), Some(&whole), FACE_STRETCHED, monitor)?;
+        let mut alone = flatten(&smoothed(&face, FACE_SMOOTHING), Some(&whole), MAX_FACE_STRETCH, monitor)?;
         let [chart] = &mut alone.charts[..] else { continue };
         relax(&face, chart, FACE_RELAXING);
         if stretch(&face, chart) > STRETCH {
@@ -327,12 +327,12 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     let whole: f64 = areas.iter().sum();
     let foremost = (0..count).fold(0, |best, t| if depth[t] > depth[best] { t } else { best });
     let (high, low) = (depth[foremost], depth.iter().copied().fold(f32::INFINITY, f32::min));
-    (1..=PLANES).rev().filter_map(move |i| {
-        let plane = high - (high - low) * DEEPEST * i as f32 / PLANES as f32;
+    (1..=CUT_PLANES).rev().filter_map(move |i| {
+        let plane = high - (high - low) * MAX_CUT_DEPTH * i as f32 / CUT_PLANES as f32;
         let mut inside = cap(&beside, &depth, foremost as u32, plane);
         straighten(&beside, &mut inside);
         let share = (0..count).filter(|&t| inside[t]).map(|t| areas[t]).sum::<f64>() / whole;
-        (share > 0.01 && share < LARGEST).then_some(inside)
+        (share > 0.01 && share < MAX_FACE_SHARE).then_some(inside)
     })
 }
 

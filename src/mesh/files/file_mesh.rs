@@ -243,7 +243,7 @@ impl FileMesh {
 
 /// Distance from the origin, in the mesh's own sizes, beyond which a mesh counts as far: up to it f32 rounds by less
 /// than a millionth of the size.
-const FAR_IN_SIZES: f64 = 15.0;
+const FAR_ORIGIN: f64 = 15.0;
 
 /// Returns the box of a mesh in the file's coordinates.
 fn placed_box(mesh: &Mesh, file_from_mesh: &Similarity) -> (DVec3, DVec3) {
@@ -255,7 +255,7 @@ fn placed_box(mesh: &Mesh, file_from_mesh: &Similarity) -> (DVec3, DVec3) {
 /// Returns center and size of a box, and whether it is far from the origin.
 pub(super) fn middle((low, high): (DVec3, DVec3)) -> (DVec3, f64, bool) {
     let (center, size) = (0.5 * (low + high), (high - low).max_element());
-    (center, size, center.abs().max_element() > FAR_IN_SIZES * size)
+    (center, size, center.abs().max_element() > FAR_ORIGIN * size)
 }
 
 /// Returns the warning for a mesh far from the origin in a format that keeps absolute positions: the files hold
