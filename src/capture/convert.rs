@@ -6,8 +6,8 @@
 
 use super::colmap;
 use super::frame::LensModel;
-use super::gather::{every_eighth, up};
 use super::view::{Capture, Split, View, ViewMask};
+use super::{every_eighth, up};
 use crate::geom::Camera;
 use crate::io::{self, Limits};
 use crate::{Error, Result};

@@ -1,7 +1,7 @@
 //! The report on a capture: format, cameras, masks, splits, and all problems, not only the first.
 
 use super::frame::Agreement;
-use super::gather::gather;
+use super::gather;
 use super::masks::{self, few};
 use super::scene::{self, Scene, SceneOptions};
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};

@@ -18,7 +18,7 @@ mod pack;
 
 use crate::geom::{Atlas, Mesh, THOROUGH_EFFORT, overlaps, turn};
 use crate::mesh::files::{UvReport, seams_facing, uv_check};
-use crate::mesh::input::{check_indices, setting};
+use crate::mesh::{check_indices, setting};
 use crate::{Error, Monitor, Result};
 use chart::{Flat, height, neighbours, part, upright};
 use divide::{divide, divide_around, planar};

@@ -41,7 +41,7 @@ pub use seams::Seams;
 use crate::geom::sphharm::functions;
 use crate::geom::{Atlas, Bvh, Camera, Harmonics, Mesh, SdfField, area_vector};
 use crate::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
-use crate::mesh::input::setting;
+use crate::mesh::setting;
 use crate::{Monitor, Result};
 use cover::{Bands, Sample};
 use glam::{Mat3, Vec3, Vec4};

@@ -16,8 +16,8 @@ pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
 
-use super::input::{check_len, evaluate, setting};
 use super::moves::Polish;
+use super::{check_len, evaluate, setting};
 use crate::geom::{Aabb, Mesh, SdfField, Topology, topology};
 use crate::{Error, Monitor, Result};
 use glam::{DVec3, Vec3};

@@ -24,7 +24,7 @@ mod rings;
 mod rounds;
 
 use crate::geom::{Mesh, SdfField};
-use crate::mesh::input::{check_count, check_indices, finite, setting};
+use crate::mesh::{check_count, check_indices, finite, setting};
 use crate::{Monitor, Result};
 use crossing::crossings;
 use rounds::{Task, bounded, counted};

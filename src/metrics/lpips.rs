@@ -19,15 +19,18 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Opens the network's file, whose arrays may take `memory_gib` each.
+    /// Opens the network's file, whose arrays may take `memory_gib` each; returns `None` for an empty path.
     ///
     /// # Errors
     /// Fails if a file cannot be read, is no valid ONNX file, or does not take two pictures.
-    pub fn open(path: &Path, memory_gib: f64) -> Result<Lpips> {
+    pub fn open(path: &Path, memory_gib: f64) -> Result<Option<Lpips>> {
+        if path.as_os_str().is_empty() {
+            return Ok(None);
+        }
         let array_bytes = (memory_gib * f64::from(1u32 << 30)) as u64;
         let session = NetworkSession::open(Role::LPIPS, path, array_bytes)?;
         let file = session.file.clone();
-        Ok(Lpips { session: Mutex::new(session), file })
+        Ok(Some(Lpips { session: Mutex::new(session), file }))
     }
 
     /// Returns the record of the loaded network.
@@ -140,7 +143,7 @@ mod tests {
         let photo = |rgb: &[[u8; 3]]| Photo { width: 20, height: 12, rgb: rgb.to_vec(), alpha: None };
         let expected = expected(&ours, &theirs);
         assert!(expected > 0.05);
-        let lpips = Lpips::open(&path, 1.0).unwrap();
+        let lpips = Lpips::open(&path, 1.0).unwrap().unwrap();
         let found = lpips.distance(&render, &photo(&theirs)).unwrap();
         assert!((found - expected).abs() < 1e-6 * expected.max(1.0), "{found} against {expected}");
         assert!(lpips.distance(&render, &photo(&ours)).unwrap() < 1e-9);

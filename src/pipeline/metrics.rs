@@ -2,7 +2,6 @@
 //!
 //! A mesh of the demo head is compared with its exact surface ([`against_truth`]).
 
-use super::lpips::{Lpips, measure};
 use super::pictures;
 use crate::capture::synthetic::SyntheticHead;
 use crate::capture::{Capture, LoadedView, View};
@@ -10,7 +9,7 @@ use crate::config::{Config, Method, TruthPhoto, ViewBackground};
 use crate::geom::{Bvh, Mesh};
 use crate::image::Gray;
 use crate::io::{self, Limits};
-use crate::metrics::{Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
+use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
 use crate::run::{Run, StageDir};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -87,7 +86,7 @@ pub(super) fn metrics(
     let mut views: Vec<&View> = comparables.iter().flatten().map(|c| c.view).collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));
     views.dedup_by(|a, b| a.name == b.name);
-    let lpips = measure(config)?;
+    let lpips = Lpips::open(config.metrics.lpips.as_ref(), config.mask.memory_gib)?;
     lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
     let tones = Tones::of(&views)?;
     for (i, (set, pictures)) in sets.iter().zip(&comparables).enumerate() {

@@ -2,13 +2,13 @@
 
 use super::cameras::CameraCheck;
 use super::inputs::{Inputs, missing_capture};
-use super::lpips::measure;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::{Scene, SceneBox};
 use crate::capture::{Capture, Split, ViewMask};
 use crate::config::{Config, RenderConfig, Stage};
 use crate::io;
+use crate::metrics::Lpips;
 use crate::run::Run;
 use crate::{Error, Result};
 use std::fmt::Display;
@@ -135,7 +135,7 @@ impl<'a> Session<'a> {
             .filter_map(|i| i.missing.clone());
         lost.next().map_or(Ok(()), Err)?;
         if stages.contains(&Stage::Metrics) {
-            measure(self.config)?;
+            Lpips::open(self.config.metrics.lpips.as_ref(), self.config.mask.memory_gib)?;
         }
         #[cfg(not(feature = "matting"))]
         if self.inputs.clicks.is_some() && stages.contains(&Stage::Mask) {

@@ -168,11 +168,6 @@ impl MeshTexture {
         }
     }
 
-    /// Whether the texture has lobes, so that directions matter.
-    pub fn has_lobes(&self) -> bool {
-        self.groups > 1
-    }
-
     /// Returns the sRGB-coded colors of a camera's visible hits, interpolated between two levels (trilinear).
     pub fn smooth_colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let mut colors = Vec::with_capacity(hits.hits.len());

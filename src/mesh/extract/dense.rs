@@ -7,7 +7,7 @@
 use super::marching::{Volume, marching};
 use super::{BATCH, MeshReport, NodeGrid, colors_along_normals, off_surface};
 use crate::geom::{Aabb, Mesh, SdfField};
-use crate::mesh::input::{check_len, evaluate, setting};
+use crate::mesh::{check_len, evaluate, setting};
 use crate::{Error, Monitor, Result};
 use glam::Vec3;
 use std::time::Instant;

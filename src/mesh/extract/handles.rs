@@ -18,7 +18,7 @@
 use super::BATCH;
 use super::loops::{Loop, LoopFinder};
 use crate::geom::{Aabb, Boxes, Bvh, DBox, Effort, Mesh, SdfField, area_vector, intersect, topology};
-use crate::mesh::input::check_len;
+use crate::mesh::check_len;
 use crate::{Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};

@@ -10,7 +10,7 @@
 
 use super::marching_cell::{CASES, CellOutput, CellSurface, crossing, resolve};
 use crate::geom::Mesh;
-use crate::mesh::input::check_count;
+use crate::mesh::check_count;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;

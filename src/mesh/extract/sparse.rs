@@ -23,7 +23,7 @@ use super::marching::{LevelSet, PartCounts, cell_point, edge_point, largest_neig
 use super::marching_cell::{CASES, CellOutput, CellSurface, EDGES, crossed, crossing, resolve};
 use super::{BATCH, NodeGrid};
 use crate::geom::SdfField;
-use crate::mesh::input::{check_len, setting};
+use crate::mesh::{check_len, setting};
 use crate::{Monitor, Result};
 use glam::Vec3;
 use rayon::prelude::*;

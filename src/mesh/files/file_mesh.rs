@@ -25,7 +25,7 @@
 
 use crate::geom::{Atlas, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Photo;
-use crate::mesh::input::check_indices;
+use crate::mesh::check_indices;
 use crate::{Error, Result, io};
 use bevy_mikktspace::{Geometry, TangentSpace, generate_tangents};
 use glam::{DMat3, DVec3, Mat3, Vec2, Vec3, Vec4};

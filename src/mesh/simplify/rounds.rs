@@ -35,8 +35,8 @@ use super::rings::{BORDER, EdgeLink, FIXED, MIN_QUALITY, MIN_TURN_COSINE, Rings,
 use super::{SimplifyConfig, SimplifyReport};
 use crate::geom::{Aabb, Mesh, SdfField, area_vector, shape};
 use crate::kernel::cpu::cg::conjugate_gradients;
+use crate::mesh::evaluate;
 use crate::mesh::extract::BATCH;
-use crate::mesh::input::evaluate;
 use crate::mesh::moves::{move_vertices, newton};
 use crate::{Monitor, Result};
 use glam::Vec3;
