@@ -265,8 +265,8 @@ fn name_splits(views: &mut [View], kept: &[(CameraFrame, PictureInfo)], listing:
     listing.reasons.push("no splits are named: every 8th view in name order is held out for testing".into());
 }
 
-/// The splits of a capture that names none: every 8th view in name order, starting with the first, is held out, but none
-/// of fewer than four.
+/// Returns the splits of a capture that names none: every 8th view in name order, starting with the first, is held out,
+/// but none of fewer than four.
 fn every_eighth<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Split> {
     let mut order: Vec<(&str, usize)> = names.zip(0..).collect();
     order.sort_unstable();

@@ -1,7 +1,7 @@
-//! The command line: a file per command, named as it is typed, but that small ones share `about` and `capture`. The only
-//! module that prints.
+//! The command line: a file per command, with its name; small commands share `about` and `capture`. The only module that
+//! prints.
 //!
-//! Data goes to stdout, everything else to stderr; the exit code says whether to try again
+//! Data goes to stdout, everything else to stderr; the exit code distinguishes errors worth a retry
 //! ([`crate::ErrorKind`]).
 
 mod about;
@@ -63,7 +63,7 @@ struct Cli {
     common: Common,
 }
 
-/// What a stage command works on.
+/// Capture or run of a stage command.
 #[derive(Args, Debug)]
 struct CaptureOrRun {
     /// Capture (a folder of photographs with cameras) or run [default: the run in this folder, else the newest under
@@ -72,7 +72,7 @@ struct CaptureOrRun {
     path: Option<PathBuf>,
 }
 
-/// Masks from clicks.
+/// Options for masks from clicks.
 #[derive(Args, Debug, Default)]
 struct ClickOptions {
     /// Make masks from the clicks in a prompts.json
@@ -99,7 +99,8 @@ struct ClickOptions {
 }
 
 impl ClickOptions {
-    /// As keys of the configuration; files by their absolute path, so that the run remembers them from anywhere.
+    /// Returns the options as keys of the configuration; files by their absolute path, so that the run finds them from any
+    /// working directory.
     fn keys(&self) -> Result<Vec<KeyOption>> {
         let file = |option: &str, key: &str, file: &Option<PathBuf>| -> Result<Option<KeyOption>> {
             let Some(file) = file else { return Ok(None) };
@@ -316,7 +317,7 @@ all trainings (capture.tiles).")]
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
-    /// Draw a run's mesh, or any .glb, .obj or .ply
+    /// Render pictures of a run's mesh, or of any .glb, .obj or .ply
     #[command(after_long_help = "Examples:
   tiface preview runs/002_00                    draw a three-quarter view, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --up z --out scan.png
@@ -419,20 +420,19 @@ It exits with 1 if a device fails its self-test against the CPU. A build without
     },
 }
 
-/// Ends the process where memory for so many bytes cannot be had. Nothing is allocated on the way, and nothing is lost
-/// that a kill would have kept.
+/// Ends the process after a failed allocation of `bytes`. Does not allocate; loses no more than a kill would.
 #[cold]
 pub fn out_of_memory(bytes: usize) -> ! {
     let _ = writeln!(
         std::io::stderr(),
-        "error: out of memory: {bytes} bytes more cannot be had\n\n\
+        "error: out of memory: {bytes} more bytes are not available\n\n\
          hint: free memory, raise `capture.downscale`, or lower `mesh.resolution` or the `rays` of a field; what is \
          complete is kept: repeat the command to continue"
     );
     signal_hook::low_level::exit(crate::ErrorKind::NotNow.code().into())
 }
 
-/// Parses the command line, does what it says, and gives the exit code.
+/// Parses the command line, runs the command and returns the exit code.
 pub fn main() -> ExitCode {
     let Cli { command, common } = match Cli::try_parse() {
         Ok(cli) => cli,
@@ -541,7 +541,7 @@ impl Command {
     }
 }
 
-/// Options of one command that are keys of the configuration under a shorter name: those that were given.
+/// Returns the given options of a command, each as the configuration key that it sets.
 fn key_options<const N: usize>(options: [(&str, &str, Option<&str>); N]) -> Vec<KeyOption> {
     let given = options.into_iter().filter_map(|(option, key, value)| {
         value.map(|v| (format!("{option} {v}"), key.to_string(), v.to_string()))
@@ -549,11 +549,11 @@ fn key_options<const N: usize>(options: [(&str, &str, Option<&str>); N]) -> Vec<
     given.collect()
 }
 
-/// One command at work.
+/// A running command.
 struct Invocation<'a> {
     /// The options that every command shares.
     pub common: &'a Common,
-    /// Where people see what happens.
+    /// Output for users.
     pub screen: Arc<Screen>,
     /// Set on a request to stop.
     pub stop: Stop,

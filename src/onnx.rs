@@ -126,7 +126,7 @@ impl NetworkSession {
         Err(self.unusable(&self.outputs[output], problem))
     }
 
-    /// The output is not as its form promises.
+    /// Returns the error for an output that does not match its declared form.
     pub(crate) fn unusable(&self, output: &str, problem: impl std::fmt::Display) -> Error {
         let hint = "take the network's file from its publisher again; its weights or its graph are damaged";
         file_error(&self.file.path, &format!("gave an unusable `{output}`: {problem}"), hint)
@@ -232,7 +232,7 @@ impl TractModel {
         Ok(())
     }
 
-    /// What is known of a node's outputs once what is known of its inputs is taken in. Inferring also computes
+    /// Returns what is known of a node's outputs once what is known of its inputs is taken in. Inferring also computes
     /// what is constant, so the extents alone are asked for first.
     fn inferred(&self, model: &InferenceModel, id: usize) -> TractResult<Vec<InferenceFact>> {
         let node = model.node(id);
@@ -274,7 +274,7 @@ impl TractModel {
     }
 }
 
-/// Where and why, in a sentence: the first of what the engine says, and the beginning of the innermost; the
+/// Returns where and why, in a sentence: the first of what the engine says, and the beginning of the innermost; the
 /// pages of shape algebra between them go to the log.
 fn sentence(error: &TractError) -> String {
     tracing::debug!(target: "tract", "{error:#}");

@@ -57,7 +57,8 @@ pub fn grouped(all: &[Error]) -> Vec<Problem> {
     problems
 }
 
-/// A message without its digits and what it quotes as the name of a frame, a view or a file that is no camera file.
+/// Returns a message without its digits and what it quotes as the name of a frame, a view or a file that is no camera
+/// file.
 fn without_names(message: &str) -> String {
     let mut before = "";
     let mut rest = String::new();

@@ -199,7 +199,8 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
     Ok(())
 }
 
-/// The camera of a frame, whose pose is known. What neither it nor the top of its file says of the lens is as `like` has it.
+/// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the lens is as
+/// `like` has it.
 pub(crate) fn camera_like(
     top: &Object,
     own: &Object,
@@ -217,7 +218,7 @@ pub(crate) fn camera_like(
     Ok(Camera { cx, cy, distortion, rotation, position, ..like })
 }
 
-/// The split a frame names, else the one it is in otherwise.
+/// Returns the split a frame names, else the one it is in otherwise.
 fn named_split(name: Option<&str>, otherwise: Option<Split>) -> Result<Option<Split>, String> {
     match name {
         None => Ok(otherwise),
@@ -228,7 +229,7 @@ fn named_split(name: Option<&str>, otherwise: Option<Split>) -> Result<Option<Sp
     }
 }
 
-/// The upper three rows of a 3×4 or 4×4 matrix.
+/// Returns the upper three rows of a 3×4 or 4×4 matrix.
 fn upper_rows(matrix: &[Vec<f64>]) -> Result<[[f64; 4]; 3], String> {
     let rows: Option<Vec<[f64; 4]>> = matrix.iter().map(|row| row.as_slice().try_into().ok()).collect();
     let ([a, b, c], last) = match rows.as_deref() {
@@ -266,8 +267,8 @@ fn intrinsics(keys: &FrameKeys, ignored: &mut Vec<String>) -> Result<Intrinsics,
     Ok(Intrinsics { size: w.zip(h), focal, angle, center, distortion })
 }
 
-/// The coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as well, and nerfstudio's
-/// perspective k4 is none that anybody else has.
+/// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as well, and
+/// nerfstudio's perspective k4 is none that anybody else has.
 fn distortion(keys: &FrameKeys, model: &str, ignored: &mut Vec<String>) -> Result<Distortion, String> {
     let &FrameKeys { k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1, omega, .. } = keys;
     let given = Distortion { k1, k2, k3, p1, p2, k4, k5, k6, sx1, sy1, omega, ..Distortion::default() };

@@ -1,4 +1,4 @@
-//! `tiface check`: is a mesh sound, and how far is it from another?
+//! `tiface check`: validates a mesh, and measures its distance to another.
 
 use super::options::Common;
 use super::screen::{one_line, print};
@@ -17,24 +17,24 @@ use std::fmt::{self, Display};
 use std::ops::RangeInclusive;
 use std::path::Path;
 
-/// Points spread over each surface.
+/// Points sampled on each surface.
 const SURFACE_SAMPLES: usize = 200_000;
 
-/// How far the mesh is from another surface, millimetres.
+/// Distances between the mesh and another surface, millimetres.
 #[derive(Serialize)]
 struct Against {
     /// From every part of the mesh, caps included.
     whole: Millimetres,
-    /// From what three or more training cameras see, and that part's share of the area.
+    /// From the part that three or more training cameras see, and its share of the area.
     #[serde(skip_serializing_if = "Option::is_none")]
     seen: Option<(Millimetres, f64)>,
-    /// From what so many training cameras see, and the shares: how far a distance can be trusted.
+    /// From the parts seen by each number of training cameras, and their shares of the area.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     by_views: Vec<ByViews>,
-    /// From the other surface to the mesh: what is missed.
+    /// From the other surface to the mesh: what the mesh misses.
     back: Millimetres,
     /// ... and back from its skin and its hair where three or more training cameras look, with the signed median
-    /// (negative where the mesh is inside), where the photographs tell them apart.
+    /// (negative where the mesh is inside); only for photographs that separate the two.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     parts: Vec<Part>,
 }
@@ -102,7 +102,7 @@ impl Display for Against {
 struct CheckJson<'a> {
     #[serde(flatten)]
     report: &'a CheckReport,
-    /// Why the texture was not looked at.
+    /// Why the texture was not checked.
     #[serde(skip_serializing_if = "Option::is_none")]
     texture_problem: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -113,10 +113,10 @@ fn load(path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
     read_with(&io::read_bytes(path, &Limits::default())?, path, options)
 }
 
-/// A texture of unknown size is measured as if it had this many texels along each side.
+/// Side assumed for a texture of unknown size, texels.
 const DEFAULT_TEXTURE_PX: u32 = 1024;
 
-/// Returns whether there is a picture, and the texture coordinates, measured.
+/// Returns whether the mesh has a texture, and the measured texture coordinates.
 fn check_texture(found: &ReadMesh, path: &Path) -> (bool, Option<UvReport>) {
     let beside = picture_beside(found.picture.as_ref(), path).ok().flatten();
     let is_there = beside.is_some() || matches!(found.picture, Some(PictureSource::Inside(_)));
@@ -139,7 +139,7 @@ pub(super) fn run(
     seen_by: Option<&Path>,
 ) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
-    // a texture that cannot be understood is no reason not to check the mesh
+    // the mesh is checked even if its texture cannot be read
     let (found, problem) = match load(path, &ReadOptions::default()) {
         Ok(found) => (found, None),
         Err(e) => (load(path, &ReadOptions::SURFACE)?, Some(e.to_string())),
@@ -165,7 +165,7 @@ pub(super) fn run(
     } else {
         let uv = match (&report.uv, &problem) {
             (Some(uv), _) => format!("\ntexture\n{uv}"),
-            (None, Some(e)) => format!("texture              NOT LOOKED AT: {}\n", one_line(e)),
+            (None, Some(e)) => format!("texture              NOT CHECKED: {}\n", one_line(e)),
             (None, None) => String::new(),
         };
         format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
@@ -211,9 +211,9 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     Ok(Against { whole: mm(whole), seen, by_views, back: mm(back), parts })
 }
 
-/// Skin and hair of each photograph, row by row: 0, 1, or neither. Empty if the capture does not separate them.
+/// Returns skin (0) and hair (1) of each photograph's pixels, row by row. Empty if the capture does not separate them.
 fn skin_and_hair(views: &[&View]) -> Result<Vec<Vec<Option<usize>>>> {
-    // photographs are read only where they can say something
+    // only photographs with region masks are read
     let able = views.iter().any(|v| v.region.is_some());
     let Some(tones) = able.then(|| Tones::of(views)).transpose()?.flatten() else { return Ok(Vec::new()) };
     let kinds = |view: &&View| -> Result<Vec<Option<usize>>> {

@@ -1,4 +1,4 @@
-//! `tiface report`: the page of a run made anew, or one page of many runs.
+//! `tiface report`: rewrites the page of a run, or writes one page of many runs.
 
 use super::Invocation;
 use super::options::RunTarget;
@@ -28,7 +28,7 @@ pub(super) fn run(invocation: &Invocation, runs: &[PathBuf], table: bool) -> Res
     }
 }
 
-/// Writes the page of one run, and a copy where it was asked for.
+/// Writes the page of one run, and a copy to `--out`.
 fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()> {
     let common = invocation.common;
     let target = RunTarget::find(common, Some(path))?;
@@ -75,7 +75,7 @@ fn many(invocation: &Invocation, runs: &[PathBuf], asked: Option<&Out>) -> Resul
     print_page_path(invocation, &page)
 }
 
-/// Says where the page is.
+/// Prints the path of the page.
 fn print_page_path(invocation: &Invocation, page: &Path) -> Result<()> {
     let common = invocation.common;
     match (common.json, common.quiet) {

@@ -307,7 +307,7 @@ fn judgement(metrics: &Value) -> Vec<String> {
     lines
 }
 
-/// Where a set is right: one line of what is known.
+/// Returns a line of PSNR by part of the picture, as far as known.
 fn in_parts(mean: &Value) -> Option<String> {
     let of = |key: &str| mean[key].as_f64();
     let db = [("opaque", "psnr_opaque"), ("edge", "psnr_edge"), ("skin", "psnr_skin"), ("hair", "psnr_hair")];

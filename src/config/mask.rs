@@ -197,7 +197,7 @@ impl MaskConfig {
         }
     }
 
-    /// What the ranges of single keys cannot say: a key, its problem, and a suggested fix.
+    /// Returns what the ranges of single keys cannot say: a key, its problem, and a suggested fix.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         let given = !self.prompts.is_empty() || !self.point.is_empty();
         let problem = |key, problem: &str, hint| Some((key, problem.to_owned(), hint));

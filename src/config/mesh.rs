@@ -139,7 +139,7 @@ impl MeshConfig {
         1 + u64::from(self.normal_map) + lobes
     }
 
-    /// What the ranges of single keys cannot say: a key, its problem, and a suggested fix.
+    /// Returns what the ranges of single keys cannot say: a key, its problem, and a suggested fix.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         let px = self.texture_px;
         if px == 0 {

@@ -48,7 +48,7 @@ impl Stage {
         self.learns() || matches!(self, Mesh | Render)
     }
 
-    /// The stages that it reads from. What views are made of decides what `render` needs.
+    /// Returns the stages that it reads from. What views are made of decides what `render` needs.
     pub fn needs(self, config: &Config) -> Vec<Stage> {
         match self {
             Mask => Vec::new(),
@@ -61,7 +61,7 @@ impl Stage {
         }
     }
 
-    /// The stages and all that they need, in order.
+    /// Returns the stages and all that they need, in order.
     pub fn with_needs(mut wanted: Vec<Stage>, config: &Config) -> Vec<Stage> {
         let mut next = 0;
         while next < wanted.len() {
@@ -72,7 +72,7 @@ impl Stage {
         Stage::ALL.into_iter().filter(|stage| wanted.contains(stage)).collect()
     }
 
-    /// The stage and all that build on it, in order: what is out of date when it is made anew.
+    /// Returns the stage and all that build on it, in order: what is out of date when it is made anew.
     pub fn followers(self, config: &Config) -> Vec<Stage> {
         Stage::ALL.into_iter().filter(|s| Stage::with_needs(vec![*s], config).contains(&self)).collect()
     }

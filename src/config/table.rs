@@ -52,7 +52,7 @@ macro_rules! table {
                 },)+
             ];
 
-            /// The values a preset starts with.
+            /// Returns the values a preset starts with.
             pub fn preset(preset: super::Preset) -> $name {
                 $name {
                     $($key: $crate::config::table::of_preset!(preset, $draft $(, $standard, $paper)?),)+
@@ -78,7 +78,7 @@ macro_rules! table {
     };
 }
 
-/// The name of a field as it is written in TOML: without the mark of a word that is Rust's own.
+/// Returns the name of a field as it is written in TOML: without the mark of a word that is Rust's own.
 pub(super) const fn plain(field: &'static str) -> &'static str {
     match field.as_bytes() {
         [b'r', b'#', name @ ..] => match std::str::from_utf8(name) {

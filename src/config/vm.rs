@@ -176,7 +176,8 @@ impl VmConfig {
         self.box_half.map_or(1.0, |of| half / of)
     }
 
-    /// The settings of a field that starts in a box, all lengths in scene units; done once, before the box shrinks.
+    /// Returns the settings of a field that starts in a box, all lengths in scene units; done once, before the box
+    /// shrinks.
     ///
     /// ```
     /// # use tiface::config::{Preset, VmConfig};
@@ -210,7 +211,7 @@ impl VmConfig {
         if finest { self.rays } else { ((self.rays as f64 * self.early_rays) as usize).max(1) }
     }
 
-    /// How many fields there are in the end: at least one, and no more where it comes from a file.
+    /// Returns how many fields there are in the end: at least one, and no more where it comes from a file.
     pub fn learned(&self) -> usize {
         if self.import.is_empty() { self.fields.max(1) } else { 1 }
     }

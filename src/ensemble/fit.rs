@@ -418,7 +418,7 @@ mod blend_tests {
         Gray { width: SIZE, height: SIZE, values: vec![255; PIXELS] }
     }
 
-    /// A color from 0.3 to 0.7.
+    /// Returns a color from 0.3 to 0.7.
     fn color(seed: u64, i: usize, j: usize) -> f32 {
         0.3 + 0.4 * uniform(seed, j as u64, i as u64)
     }
@@ -522,7 +522,7 @@ mod blend_tests {
         assert!((a[0] - b[0]).abs() < 1e-6);
     }
 
-    /// A view of two members with errors of these sizes, in so many of its pixels.
+    /// Returns a view of two members with errors of these sizes, in so many of its pixels.
     fn noisy(seed: u64, sigmas: [f32; 2], pixels: usize) -> Fit {
         let views =
             [0, 1].map(|k| view(|i, j| color(seed, i, j) + noise(seed * 10 + k, sigmas[k as usize], i, j)));

@@ -37,7 +37,7 @@ fn separates<V: Copy>(a: [V; 3], b: [V; 3], turn: impl Fn(V, V, V) -> i32) -> bo
     (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * inner <= 0))
 }
 
-/// The area two triangles share, in the square of the coordinates' unit.
+/// Returns the area two triangles share, in the square of the coordinates' unit.
 pub(crate) fn shared_area(p: [DVec2; 3], q: [DVec2; 3]) -> f64 {
     // Sutherland and Hodgman 1974: the first one clipped by the sides of the second.
     let winding = (q[1] - q[0]).perp_dot(q[2] - q[0]).signum();
@@ -156,7 +156,7 @@ pub(crate) fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u
     count < 2 && (crosses(p, in_p, q) || crosses(q, in_q, p))
 }
 
-/// Whether the segment goes from one side of the triangle to the other, through it or its border.
+/// Returns whether the segment goes from one side of the triangle to the other, through it or its border.
 fn pierces(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> bool {
     if orient(a, b, c, from) * orient(a, b, c, to) >= 0 {
         return false;
@@ -176,7 +176,7 @@ fn orient(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> i32 {
     if det.abs() <= 1e-15 * permanent { 0 } else { det.signum() as i32 }
 }
 
-/// Whether two triangles of one plane share area: not if a side of either separates them.
+/// Returns whether two triangles of one plane share area: not if a side of either separates them.
 fn overlap_in_plane(p: [DVec3; 3], q: [DVec3; 3]) -> bool {
     let normal = (p[1] - p[0]).cross(p[2] - p[0]).abs();
     let flat = |v: DVec3| {
@@ -216,7 +216,7 @@ pub(crate) struct ChartDistance {
     pub left: usize,
 }
 
-/// The smallest distance between sides of different charts, up to `farthest`, beyond which it is given as that.
+/// Returns the smallest distance between sides of different charts, up to `farthest`, beyond which it is given as that.
 pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDistance {
     if sides.iter().all(|s| s.chart == sides[0].chart) {
         return ChartDistance { distance: None, left: 0 };
@@ -373,7 +373,7 @@ impl DBox {
         self.low.cmple(other.high).all() && other.low.cmple(self.high).all()
     }
 
-    /// Twice its middle.
+    /// Returns twice its middle.
     fn middle(&self) -> DVec3 {
         self.low + self.high
     }
@@ -400,7 +400,7 @@ impl Boxes {
         Boxes { items, nodes }
     }
 
-    /// The numbers of the boxes, neighbours mostly beside each other.
+    /// Returns the numbers of the boxes, neighbours mostly beside each other.
     pub(crate) fn order(&self) -> impl Iterator<Item = u32> {
         self.items.iter().map(|&(_, i)| i)
     }

@@ -16,7 +16,7 @@ pub fn functions(degree: u32) -> usize {
     ((degree + 1) * (degree + 1)) as usize
 }
 
-/// The 16 basis functions at the unit direction `d`, in the order and with the signs of
+/// Returns the 16 basis functions at the unit direction `d`, in the order and with the signs of
 /// tiny-cuda-nn's degree-4 encoding.
 #[inline(always)]
 pub fn sh16([x, y, z]: [f32; 3]) -> [f32; 16] {

@@ -40,7 +40,7 @@ pub enum WriteError {
 crate::error::error_from!(WriteError, Cannot);
 
 impl WriteError {
-    /// The suggested fix.
+    /// Returns the suggested fix.
     pub fn hint(&self) -> String {
         match self {
             WriteError::Full { needed, .. } => format!("free at least {needed} bytes on that disk"),
@@ -188,7 +188,7 @@ pub fn remove_leftovers(folder: &Path, is_over: impl Fn(&str, u32) -> bool) -> R
     Ok(removed)
 }
 
-/// The file that was being written and by which process, if a name is that of a file in progress.
+/// Returns the file that was being written and by which process, if a name is that of a file in progress.
 fn leftover_of(name: &str) -> Option<(&str, u32)> {
     let (rest, pid) = name.strip_prefix('.')?.strip_suffix(".tmp")?.rsplit_once('.')?;
     Some((rest, pid.parse().ok()?)).filter(|_| !rest.is_empty())

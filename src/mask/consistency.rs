@@ -124,7 +124,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
     }
 }
 
-/// The cube that some views look at, and what the mask of each claims.
+/// Returns the cube that some views look at, and what the mask of each claims.
 fn claims_of(
     views: &[ConsistencyView],
     used: &[usize],
@@ -274,7 +274,7 @@ impl Conflicts {
         own > CERTAIN_THRESHOLD || (own > THRESHOLD && own > times * mean)
     }
 
-    /// Mean share that a view takes away from the others.
+    /// Returns the mean share that a view takes away from the others.
     fn too_little(&self, i: usize) -> f64 {
         self.taken[i] / self.others
     }
@@ -318,7 +318,7 @@ impl Opposition {
     }
 }
 
-/// The cells on a pixel's ray, from the camera on, each half a cell from the last.
+/// Returns the cells on a pixel's ray, from the camera on, each half a cell from the last.
 fn cells_on_ray<'a>(
     cube: &'a Cube,
     claims: &SilhouetteConstraints,
@@ -362,7 +362,7 @@ fn cells_on_ray<'a>(
     })
 }
 
-/// The cell on a pixel's ray that fewest views rule out, among those that another view has on the head, if any;
+/// Returns the cell on a pixel's ray that fewest views rule out, among those that another view has on the head, if any;
 /// of equals the one that most views have on the head. `None` when no other view looks at the ray within the cube.
 fn best_on_ray(
     cube: &Cube,
@@ -519,7 +519,7 @@ mod tests {
             .collect()
     }
 
-    /// A snowman with a nose, seen by a camera.
+    /// Returns a snowman with a nose, seen by a camera.
     fn mask(camera: &Camera) -> Gray {
         let balls = [
             (DVec3::new(0.0, -0.6, 0.0), 0.8),
@@ -653,7 +653,7 @@ mod proposal_tests {
             .collect()
     }
 
-    /// A ball with a smaller one on top, or the ball alone.
+    /// Returns a ball with a smaller one on top, or the ball alone.
     fn mask(camera: &Camera, whole: bool) -> Gray {
         let balls = [(DVec3::new(0.0, -0.4, 0.0), 0.9), (DVec3::new(0.0, 0.9, 0.0), 0.6)];
         let hit = |i: u32| {

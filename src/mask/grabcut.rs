@@ -95,7 +95,7 @@ fn cut_at(rows: u32, view: &str, photo: &Photo, clicks: &[Click]) -> Result<Hard
     Ok(HardMask { mask: gray(&head, grabcut.width, grabcut.height), ambiguous, warnings })
 }
 
-/// The error for a view in which nothing of the clicked head was left.
+/// Returns the error for a view in which nothing of the clicked head was left.
 pub(super) fn empty(view: &str) -> Error {
     Error::cannot(
         format!("view `{view}`: the cut left nothing of the head"),
@@ -119,7 +119,7 @@ impl Models {
         })
     }
 
-    /// Each side measured anew.
+    /// Returns each side measured anew.
     pub fn refit(&self, head: &[Rgb], background: &[Rgb]) -> Models {
         Models { head: self.head.refit(head), background: self.background.refit(background) }
     }
@@ -184,7 +184,7 @@ impl Grabcut {
         (head, models)
     }
 
-    /// Colors of the pixels inside and outside a mask.
+    /// Returns the colors of the pixels inside and outside a mask.
     pub fn colors(&self, head: &[bool]) -> (Vec<Rgb>, Vec<Rgb>) {
         let of =
             |side: bool| self.photo.rgb.iter().zip(head).filter(move |(_, h)| **h == side).map(|(c, _)| *c);
@@ -240,7 +240,7 @@ impl Grabcut {
         open(&head, self.width, self.height)
     }
 
-    /// Share of the picture near the outline whose color does not tell the sides apart.
+    /// Returns the share of the picture near the outline whose color does not tell the sides apart.
     pub fn ambiguous(&self, head: &[bool], models: &Models) -> f64 {
         let (w, h) = (self.width, self.height);
         let radius = OUTLINE_BAND * h as f32;
@@ -259,7 +259,7 @@ impl Grabcut {
         open.count() as f64 / (w * h) as f64
     }
 
-    /// What looks wrong about a finished mask.
+    /// Returns what looks wrong about a finished mask.
     pub fn warnings(&self, view: &str, head: &[bool]) -> Vec<String> {
         let mut found = Vec::new();
         for (n, c) in self.clicks.iter().enumerate() {
@@ -366,8 +366,8 @@ fn draw(marked: &mut [bool], width: usize, height: usize, a: (f32, f32), b: (f32
     }
 }
 
-/// What is certain from the clicks, with a border margin of this share of the height: `[height · width]`, and warnings
-/// about clicks in each other's way.
+/// Returns what is certain from the clicks, with a border margin of this share of the height: `[height · width]`, and
+/// warnings about clicks in each other's way.
 fn from_clicks(
     view: &str,
     clicks: &[Click],
@@ -418,7 +418,7 @@ fn from_clicks(
     (seeds, warnings)
 }
 
-/// The margins along the borders where no head is expected.
+/// Returns the margins along the borders where no head is expected.
 fn border(width: usize, height: usize, margin: f32) -> Vec<Seed> {
     let margin = (margin * height as f32).ceil() as usize;
     let sides = (BORDER_SIDES * height as f32) as usize;
@@ -434,7 +434,7 @@ fn border(width: usize, height: usize, margin: f32) -> Vec<Seed> {
         .collect()
 }
 
-/// The head's clicks as discs, joined by a line in their order: what the start measures distances from.
+/// Returns the head's clicks as discs, joined by a line in their order: what the start measures distances from.
 fn skeleton(seeds: &[Seed], clicks: &[Click], width: usize, height: usize) -> Vec<bool> {
     let h = height as f32;
     let mut skeleton: Vec<bool> = seeds.iter().map(|k| *k == Seed::Head).collect();
@@ -448,8 +448,9 @@ fn skeleton(seeds: &[Seed], clicks: &[Click], width: usize, height: usize) -> Ve
     skeleton
 }
 
-/// The Voronoi start, twice `[height · width]`: whether a pixel is nearer to the skeleton than to definite background,
-/// and false where it is so much nearer to definite background that its color is taken for the background's.
+/// Returns the Voronoi start, twice `[height · width]`: whether a pixel is nearer to the skeleton than to definite
+/// background, and false where it is so much nearer to definite background that its color is taken for the
+/// background's.
 fn start(seeds: &[Seed], skeleton: &[bool], width: usize, height: usize) -> [Vec<bool>; 2] {
     let background: Vec<bool> = seeds.iter().map(|k| *k == Seed::Background).collect();
     let to_head = squared_distance(skeleton, width, height);
@@ -469,7 +470,8 @@ mod tests {
     use super::*;
     use crate::kernel::cpu::rng;
 
-    /// A noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges everything.
+    /// Returns a noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges
+    /// everything.
     fn head(scale: f32) -> (Photo, Vec<bool>) {
         let (width, height) = ((96.0 * scale) as u32, (128.0 * scale) as u32);
         let mut truth = Vec::new();

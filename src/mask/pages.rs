@@ -85,7 +85,7 @@ fn evenly(count: usize, most: usize, wanted: impl Fn(usize) -> bool) -> Vec<usiz
     chosen
 }
 
-/// The page.
+/// Returns the page.
 pub fn page(title: &str, views: &[PageView], prompts: &Prompts) -> String {
     let view = |v: &PageView| {
         let src = format!("data:image/jpeg;base64,{}", base64(&v.jpeg));
@@ -142,7 +142,7 @@ impl SheetView {
     }
 }
 
-/// The reduced photograph with the mask's outline and the unknown band drawn into it.
+/// Returns the reduced photograph with the mask's outline and the unknown band drawn into it.
 fn overlaid(photo: &Photo, alpha: &Gray, trimap: Option<&Gray>, side: u32) -> Photo {
     let size = working_size(photo.width, photo.height, side);
     let mut picture = reduce_photo(photo, size);
@@ -194,8 +194,8 @@ pub fn sheet(views: &[SheetView]) -> Result<String> {
     page.map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
-/// What a [`sheet`] shows, without the page around it: for a page with more, in about `most` bytes. Where not all views
-/// have room, suspicious ones and evenly spread others stay.
+/// Returns what a [`sheet`] shows, without the page around it: for a page with more, in about `most` bytes. Where not
+/// all views have room, suspicious ones and evenly spread others stay.
 pub fn part(sheet: &str, most: usize) -> Option<String> {
     let inside = sheet.split_once(SHEET_MARKERS[0])?.1.split_once(SHEET_MARKERS[1])?.0;
     let (head, rest) = inside.split_once("<figure")?;
@@ -220,7 +220,7 @@ mod tests {
         PageView { file_path: name.into(), size: (3000, 4096), jpeg: vec![0xFF, 0xD8, 1] }
     }
 
-    /// What the page's script will find.
+    /// Returns what the page's script will find.
     fn data(page: &str) -> Value {
         let text = page.split_once("id=\"data\">").unwrap().1.split_once("</script>").unwrap().0;
         serde_json::from_str(text).unwrap()

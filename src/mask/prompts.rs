@@ -95,7 +95,7 @@ pub fn parse_point(text: &str) -> Result<Click> {
     Ok(Click { x: number("x", x)?, y: number("y", y)?, head })
 }
 
-/// A coordinate that some photograph may have.
+/// Returns a coordinate that some photograph may have.
 fn coordinate(value: f64) -> Result<f32, String> {
     match (-0.5..1e6).contains(&value) {
         true => Ok(value as f32),
@@ -103,14 +103,14 @@ fn coordinate(value: f64) -> Result<f32, String> {
     }
 }
 
-/// A text from a stranger, for a message: short and on one line.
+/// Returns a text from a stranger, for a message: short and on one line.
 fn shown(text: &str) -> String {
     let plain: String = text.chars().take(80).flat_map(char::escape_debug).collect();
     let cut = if text.chars().nth(80).is_some() { "…" } else { "" };
     plain.replace("\\'", "'").replace("\\\"", "\"") + cut
 }
 
-/// What is wrong at a place of a file.
+/// Returns what is wrong at a place of a file.
 fn wrong(file: &str, place: &str, problem: String, hint: &str) -> Error {
     Error::cannot(format!("`{file}`, {place}: {problem}"), hint)
 }
@@ -186,7 +186,7 @@ fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
     Ok(prompts)
 }
 
-/// A name below the capture with `/` between its parts, or why it is none.
+/// Returns a name below the capture with `/` between its parts, or why it is none.
 fn below(name: &str) -> Result<String, &'static str> {
     let text = name.replace('\\', "/");
     if text.len() > MAX_NAME_BYTES {
@@ -209,14 +209,14 @@ fn below(name: &str) -> Result<String, &'static str> {
     if parts.is_empty() { Err("is empty") } else { Ok(parts.join("/")) }
 }
 
-/// The name of a view's photograph in `prompts.json` and camera files: its path below the capture.
+/// Returns the name of a view's photograph in `prompts.json` and camera files: its path below the capture.
 pub fn file_path(capture: &Capture, view: &View) -> String {
     let path = view.photo.strip_prefix(&capture.root).unwrap_or(&view.photo);
     let parts: Vec<_> = path.components().map(|c| c.as_os_str().to_string_lossy()).collect();
     parts.join("/")
 }
 
-/// A name without the ending of a picture.
+/// Returns a name without the ending of a picture.
 fn stem(name: &str) -> &str {
     match name.rsplit_once('.') {
         Some((stem, ending)) if ["png", "jpg", "jpeg"].iter().any(|e| ending.eq_ignore_ascii_case(e)) => stem,
@@ -251,7 +251,7 @@ impl Photographed<'_> {
 }
 
 impl Prompts {
-    /// The clicks of each view of a capture, parallel to its `views`, in pixel indices of its camera's picture;
+    /// Returns the clicks of each view of a capture, parallel to its `views`, in pixel indices of its camera's picture;
     /// none where nothing was clicked. `file` is for messages.
     ///
     /// # Errors
@@ -354,7 +354,7 @@ impl Click {
         inside(self.x, width) && inside(self.y, height)
     }
 
-    /// The same point of the photograph on a picture of it at another size; sizes are width and height.
+    /// Returns the same point of the photograph on a picture of it at another size; sizes are width and height.
     pub fn moved(&self, from: (u32, u32), to: (u32, u32)) -> Click {
         let moved = |v: f32, from: u32, to: u32| ((v as f64 + 0.5) * to as f64 / from as f64 - 0.5) as f32;
         Click { x: moved(self.x, from.0, to.0), y: moved(self.y, from.1, to.1), head: self.head }
@@ -412,7 +412,7 @@ pub(super) fn check_places(subject: &str, clicks: &[Click], width: u32, height: 
     Ok(())
 }
 
-/// The error for a photograph without clicks.
+/// Returns the error for a photograph without clicks.
 pub(super) fn no_clicks(subject: &str) -> Error {
     Error::cannot(
         format!("{subject} has no clicks"),

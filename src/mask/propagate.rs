@@ -114,7 +114,7 @@ where
     Ok(propagation.run(start))
 }
 
-/// The photograph of a view at its working size, if it is one of its camera.
+/// Returns the photograph of a view at its working size, if it is one of its camera.
 fn reduced(view: &PropagateView, photo: Photo) -> Result<Photo> {
     let PropagateView { name, camera, .. } = view;
     let (w, h) = (photo.width, photo.height);
@@ -168,7 +168,7 @@ impl<'a> Propagation<'a> {
         Ok(Propagation { views, photos, cube, inside, warnings: Vec::new(), notes: Vec::new() })
     }
 
-    /// The colors of both sides.
+    /// Returns the colors of both sides.
     fn common(&self, mut inside: Vec<Rgb>, mut outside: Vec<Rgb>) -> Option<Models> {
         for side in [&mut inside, &mut outside] {
             let every = side.len().div_ceil(MAX_COLORS).max(1);
@@ -181,8 +181,8 @@ impl<'a> Propagation<'a> {
         Some(models)
     }
 
-    /// The clicks of a view brought to its working size. The border margins are a guess: once a hull says where the head
-    /// is, it may touch any border.
+    /// Returns the clicks of a view brought to its working size. The border margins are a guess: once a hull says where
+    /// the head is, it may touch any border.
     fn grabcut(&self, i: usize, margins: bool) -> (Grabcut, Vec<String>) {
         let (v, photo) = (&self.views[i], &self.photos[i]);
         let margin = if margins { grabcut::BORDER_MARGIN } else { 0.0 };
@@ -259,7 +259,7 @@ impl<'a> Propagation<'a> {
         self.inside.iter().any(|inside| !inside.is_empty())
     }
 
-    /// The cells where the head may be, and the core where it must be.
+    /// Returns the cells where the head may be, and the core where it must be.
     fn carve(&self, masks: &[Option<Gray>]) -> (Vec<bool>, Vec<bool>) {
         let voters: Vec<Voter> = (self.views.iter().zip(masks))
             .filter(|(v, _)| v.votes)
@@ -440,7 +440,7 @@ mod tests {
             .collect()
     }
 
-    /// A ball of two colors before a dark background with lamps, and which pixels are the ball.
+    /// Returns a ball of two colors before a dark background with lamps, and which pixels are the ball.
     pub(super) fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
         let mut truth = Vec::new();
         let rgb = (0..72 * 96u32)

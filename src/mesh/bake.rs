@@ -299,7 +299,7 @@ mod tests {
     use crate::geom::Painted;
     use glam::Vec2;
 
-    /// A latitude-longitude sphere of radius 0.5 (coarse), with a seam.
+    /// Returns a latitude-longitude sphere of radius 0.5 (coarse), with a seam.
     fn sphere(width: u32, height: u32) -> (Mesh, Atlas) {
         let (nu, nv) = (24u32, 12u32);
         let mut mesh = Mesh::default();

@@ -274,7 +274,7 @@ fn check_surface(found: &Sparse) -> Result<()> {
     Ok(())
 }
 
-/// Mean first-order distance to the surface, in cells, over vertices that are not capped.
+/// Returns the mean first-order distance to the surface, in cells, over vertices that are not capped.
 fn off_surface(values: &[f32], gradients: &[Vec3], capped: &[bool], cell: f32) -> f64 {
     let distances = (0..values.len())
         .filter(|&i| !capped[i])
@@ -319,7 +319,7 @@ impl NodeGrid {
         Ok(NodeGrid { dims: cells.map(|c| c + 1), origin, spacing })
     }
 
-    /// Where a node lies.
+    /// Returns where a node lies.
     pub fn point(&self, node: [usize; 3]) -> Vec3 {
         let n = DVec3::new(node[0] as f64, node[1] as f64, node[2] as f64);
         (self.origin.as_dvec3() + n * f64::from(self.spacing)).as_vec3()

@@ -344,7 +344,7 @@ mod tests {
 
     const SIZE: u32 = 48;
 
-    /// A ball of triangles of radius 0.5 around the origin.
+    /// Returns a ball of triangles of radius 0.5 around the origin.
     fn ball() -> Mesh {
         const N: usize = 33;
         let at = |i: usize| i as f32 / (N - 1) as f32 * 2.0 - 1.0;
@@ -370,8 +370,8 @@ mod tests {
         (0..12).map(camera).collect()
     }
 
-    /// The mask of a ball whose opacity falls from 1 to 0 as that of a field of this sharpness does, seen by a camera:
-    /// a ray that comes as near as `f` to the surface has σ(−f · sharpness).
+    /// Returns the mask of a ball whose opacity falls from 1 to 0 as that of a field of this sharpness does, seen by a
+    /// camera: a ray that comes as near as `f` to the surface has σ(−f · sharpness).
     fn mask(camera: &Camera, sharpness: f32) -> Gray {
         let value = |i: u32| {
             let ray = camera.ray(Vec2::new((i % SIZE) as f32 + 0.5, (i / SIZE) as f32 + 0.5)).unwrap();

@@ -190,7 +190,7 @@ mod tests {
     use super::*;
     use glam::DVec3;
 
-    /// A 2 × 1 rectangle at height z, of two triangles.
+    /// Returns a 2 × 1 rectangle at height z, of two triangles.
     fn sheet(z: f32) -> Mesh {
         Mesh {
             positions: vec![

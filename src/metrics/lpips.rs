@@ -111,7 +111,7 @@ mod tests {
     const W: [f32; 6] = [0.5, 0.25, 0.25, -0.3, 0.9, 0.2];
     const L: [f32; 2] = [0.7, 1.3];
 
-    /// The same in f64.
+    /// Returns the same in f64.
     fn expected(a: &[[u8; 3]], b: &[[u8; 3]]) -> f64 {
         let features = |color: &[u8; 3]| {
             let x = color.map(|v| 2.0 * f64::from(v) / 255.0 - 1.0);

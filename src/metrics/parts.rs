@@ -369,8 +369,8 @@ mod tests {
         assert!(near(&[true; 49], 7, 2).iter().all(|d| *d));
     }
 
-    /// A capture of one photograph, 40 × 20: background above, below it a soft rim of hair on the left half and a
-    /// hard outline of skin on the right; the lowest rows are neck.
+    /// Returns a capture of one photograph, 40 × 20: background above, below it a soft rim of hair on the left half and
+    /// a hard outline of skin on the right; the lowest rows are neck.
     fn head(hair: [u8; 3], skin: [u8; 3]) -> (Photo, Gray, Gray) {
         let (w, h) = (40, 20);
         let mask = |x: usize, y: usize| match (x < w / 2, y) {

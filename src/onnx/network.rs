@@ -99,12 +99,12 @@ impl Contract {
         FORMS.iter().find(|f| f.contract == self).unwrap_or(&FORMS[0])
     }
 
-    /// What a network of this form can be named for.
+    /// Returns what a network of this form can be named for.
     pub(super) fn role(self) -> Role {
         self.form().role
     }
 
-    /// The outputs that are asked for of a file that has these, in order.
+    /// Returns the outputs that are asked for of a file that has these, in order.
     pub(super) fn outputs(self, given: &[Port]) -> Vec<String> {
         match self.form().outputs {
             [] => given.iter().take(1).map(|port| port.name.clone()).collect(),
@@ -161,7 +161,7 @@ pub(super) fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
     format!("[{}]", each.join(", "))
 }
 
-/// The form of a file with these inputs and outputs, or why it is none.
+/// Returns the form of a file with these inputs and outputs, or why it is none.
 pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
     let mut near = None;
     let gives = |name: &&str| outputs.iter().any(|p| p.name == **name);
@@ -186,7 +186,7 @@ pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, S
     Err(format!("{why} ({} → {})", side(inputs), side(outputs)))
 }
 
-/// What keeps these from being exactly the inputs wanted.
+/// Returns what keeps these from being exactly the inputs wanted.
 fn misfit(inputs: &[Port], wanted: &[(&str, i32, &[usize])]) -> Option<String> {
     for (i, (name, kind, extents)) in wanted.iter().enumerate() {
         let any = inputs.get(i).filter(|_| name.is_empty());
@@ -291,7 +291,7 @@ pub(super) fn guarded<T>(piece: impl FnOnce() -> Result<T, String>) -> Result<T,
     })
 }
 
-/// What an engine or a file says: one line, no control characters, not endless.
+/// Returns what an engine or a file says: one line, no control characters, not endless.
 pub(super) fn one_line(said: &str) -> String {
     let line = said.split_whitespace().collect::<Vec<_>>().join(" ");
     let line: String = line.chars().filter(|c| !c.is_control()).collect();
@@ -301,7 +301,7 @@ pub(super) fn one_line(said: &str) -> String {
     }
 }
 
-/// The error for a file that is not what it was named for.
+/// Returns the error for a file that is not what it was named for.
 pub(crate) fn file_error(path: &Path, problem: &str, hint: impl Into<String>) -> Error {
     Error::cannot(format!("`{}` {problem}", path.display()), hint)
 }

@@ -172,7 +172,7 @@ fn members<'i>(capture: &Capture, config: &Config, views: &'i [Image]) -> Result
     if c.cut { Ok(members.cut(&shares(c))?) } else { Ok(members) }
 }
 
-/// Whether the field was trained with masks.
+/// Returns whether the field was trained with masks.
 fn trained_with_masks(capture: &Capture, config: &Config, method: Method) -> bool {
     let has_mask = |v: &View| v.mask != ViewMask::None && v.mask_meaning == MaskMeaning::Empty;
     let used = match method {

@@ -30,7 +30,7 @@ pub(super) fn write_report(session: &Session, idle: bool) -> Result<()> {
     session.write("report.html", page(session)?.as_bytes(), idle)
 }
 
-/// Whether the report is newer than every stage and the settings. Writing it again would open all pictures.
+/// Returns whether the report is newer than every stage and the settings. Writing it again would open all pictures.
 fn is_current(session: &Session) -> bool {
     let time = |name: &str| io::modified(&session.run.path(name));
     let report = time("report.html").filter(|_| io::is_file(&session.run.path("report.html")));

@@ -405,8 +405,8 @@ impl Session<'_> {
     }
 }
 
-/// Whether the views in a path's folder show an outdated stage of this digest. Views with unreadable records count as
-/// such.
+/// Returns whether the views in a path's folder show an outdated stage of this digest. Views with unreadable records
+/// count as such.
 fn may_show(folder: &Path, is_old: &dyn Fn(&String, &String) -> bool) -> bool {
     let any = |f: &Fingerprint| f.inputs.iter().any(|(stage, digest)| is_old(stage, digest));
     match (read_status(folder), read_record(folder)) {

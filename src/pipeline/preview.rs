@@ -86,7 +86,7 @@ impl Preview {
         if is_colored { Look::Unlit } else { Look::Studio }
     }
 
-    /// Whether the mesh has UV coordinates.
+    /// Returns whether the mesh has UV coordinates.
     pub fn has_uvs(&self) -> bool {
         self.head.texture.is_some() || self.bare_atlas.is_some()
     }

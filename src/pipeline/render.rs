@@ -97,7 +97,7 @@ pub(super) fn cameras(
     }
 }
 
-/// Whether some methods show the head mesh. Fitted colors lie on it; the network's colors are evaluated on the
+/// Returns whether some methods show the head mesh. Fitted colors lie on it; the network's colors are evaluated on the
 /// extracted surface.
 pub(super) fn shows_head(config: &Config, methods: &[Method]) -> bool {
     let fitted = config.mesh.color == ColorSource::Photographs;

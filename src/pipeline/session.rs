@@ -169,7 +169,7 @@ pub fn check_feasible(config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// Whether the capture is the synthetic head of a demo, whose surface is known.
+/// Returns whether the capture is the synthetic head of a demo, whose surface is known.
 pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
     io::real_path(&run.path(DEMO_CAPTURE)).is_ok_and(|made| made == Path::new(&config.capture.path))
 }

@@ -43,7 +43,7 @@ impl SdfField for ClosedSurface<'_> {
         self.field.sdf(points)
     }
 
-    /// The closed surface also contains the opening of the field's own zero set.
+    /// Returns values and gradients; the closed surface includes the cap over the opening of the field's zero set.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let (mut values, mut gradients) = self.field.sdf_gradient(points);
         if let Some(cap) = self.cap {
@@ -55,7 +55,7 @@ impl SdfField for ClosedSurface<'_> {
         (values, gradients)
     }
 
-    /// The cap has its own color.
+    /// Returns colors; the cap has its own.
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], away: &[Vec3]) -> Vec<[f32; 3]> {
         let mut colors = self.field.colors(points, normals, counts, away);
         if let Some(cap) = self.cap {

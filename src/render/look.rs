@@ -46,12 +46,12 @@ impl Look {
     /// All looks.
     pub const ALL: [Look; 6] = [Look::Studio, Look::Unlit, Look::Normals, Look::Matcap, Look::Uv, Look::Wire];
 
-    /// Whether the soft layers are shown too. They have a color and no shape of their own.
+    /// Returns whether the soft layers are shown too. They have a color and no shape of their own.
     pub fn has_layers(self) -> bool {
         matches!(self, Look::Studio | Look::Unlit)
     }
 
-    /// Whether the look needs only the color of a hit, not its point and normal.
+    /// Returns whether the look needs only the color of a hit, not its point and normal.
     pub fn is_bare(self) -> bool {
         matches!(self, Look::Unlit | Look::Uv)
     }

@@ -371,7 +371,7 @@ mod tests {
     use super::*;
     use crate::geom::Bvh;
 
-    /// A square from −1 to 1 at z = 0, its texture 4 × 4 from red (left) to green (right).
+    /// Returns a square from −1 to 1 at z = 0, its texture 4 × 4 from red (left) to green (right).
     fn square() -> (Mesh, Atlas, Photo) {
         let at = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
         let mesh = Mesh {

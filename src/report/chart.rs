@@ -22,9 +22,9 @@ pub struct Chart {
     pub curves: Vec<Curve>,
 }
 
-/// The named figures of a `log.jsonl` over its steps, one chart a figure and one curve for each field that a stage
-/// learns. Lines that are not JSON (cut short by a crash) are passed over; a step logged twice, before and after an
-/// interruption, counts the second time.
+/// Returns the named figures of a `log.jsonl` over its steps, one chart a figure and one curve for each field that a
+/// stage learns. Lines that are not JSON (cut short by a crash) are passed over; a step logged twice, before and after
+/// an interruption, counts the second time.
 pub fn charts(stage: &str, log: &str, names: &[&str]) -> Vec<Chart> {
     let title = |name: &&str| Chart { title: format!("{stage} {name}"), curves: Vec::new() };
     let mut charts: Vec<Chart> = names.iter().map(title).collect();
@@ -66,7 +66,7 @@ const MAX_POINTS: usize = 240;
 const MIN_LOG_RANGE: f64 = 30.0;
 
 impl Chart {
-    /// The drawing with its title and what its lines are called: a part of a page.
+    /// Returns the drawing with its title and what its lines are called: a part of a page.
     pub fn html(&self) -> String {
         let points = || self.curves.iter().flat_map(|c| &c.points).filter(|p| p.1.is_finite());
         let span = |values: &mut dyn Iterator<Item = f64>| {

@@ -165,8 +165,8 @@ pub struct Interval {
     pub high: f64,
 }
 
-/// Mean over groups of the mean of each, and its interval by resampling within each group (Efron 1979, percentiles). The
-/// draws are those of a fixed seed.
+/// Returns the mean over groups of the mean of each, and its interval by resampling within each group (Efron 1979,
+/// percentiles). The draws are those of a fixed seed.
 pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
     let groups: Vec<&Vec<f64>> = groups.iter().filter(|g| !g.is_empty()).collect();
     if groups.is_empty() {
@@ -210,7 +210,7 @@ impl Experiment {
         self.rows.iter().position(|r| r.table == table && r.row == row)
     }
 
-    /// Mean over the captures of a row.
+    /// Returns the mean over the captures of a row.
     fn mean(&self, row: usize, measure: usize) -> Option<f64> {
         let values: Vec<f64> = self.measured[row].iter().filter_map(|m| m.mean(measure)).collect();
         (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
@@ -227,8 +227,8 @@ impl Experiment {
         self.measured[row].iter().zip(&self.measured[from]).map(pair).collect()
     }
 
-    /// Whether an ordering holds, and by how much the better row is better: for each capture, and on average over those
-    /// that have both rows.
+    /// Returns whether an ordering holds, and by how much the better row is better: for each capture, and on average
+    /// over those that have both rows.
     pub fn holds(&self, ordering: &Ordering) -> (Vec<Verdict>, Verdict) {
         let measure = MEASURES.iter().position(|m| m.0 == ordering.by).unwrap_or(0);
         let rows = (self.index(ordering.table, ordering.better), self.index(ordering.table, ordering.worse));
@@ -262,7 +262,7 @@ impl Experiment {
         self.measured[row].iter().any(|m| m.masks.as_deref() == Some("run"))
     }
 
-    /// What a person reads of a row, marked where it was judged by its run's own masks.
+    /// Returns what a person reads of a row, marked where it was judged by its run's own masks.
     fn title(&self, row: usize) -> String {
         let mark = if self.judged_itself(row) { OWN_MASKS } else { "" };
         format!("{}{mark}", self.rows[row].title)
@@ -270,7 +270,7 @@ impl Experiment {
 }
 
 impl Experiment {
-    /// The measures that anything has, by their places in [`MEASURES`].
+    /// Returns the measures that anything has, by their places in [`MEASURES`].
     fn measures(&self) -> Vec<usize> {
         (0..MEASURES.len())
             .filter(|&k| k == 0 || (0..self.rows.len()).any(|i| self.mean(i, k).is_some()))
@@ -315,7 +315,7 @@ impl Experiment {
         out
     }
 
-    /// What is wrong with single runs, a sentence for each capture and problem.
+    /// Returns what is wrong with single runs, a sentence for each capture and problem.
     fn problems(&self) -> Vec<String> {
         let mut out: Vec<((&str, &str), Vec<&str>)> = Vec::new();
         for (k, capture) in self.captures.iter().enumerate() {
@@ -336,7 +336,7 @@ impl Experiment {
             .collect()
     }
 
-    /// The orderings as cells: the heading, then one line each.
+    /// Returns the orderings as cells: the heading, then one line each.
     fn verdicts(&self) -> Vec<Vec<String>> {
         let mut out = vec![vec!["as expected, by PSNR inside the mask".to_owned()]];
         out[0].extend(self.captures.iter().cloned());
@@ -408,7 +408,7 @@ impl Experiment {
         out
     }
 
-    /// All of it, as JSON, with intervals and verdicts.
+    /// Returns all of it, as JSON, with intervals and verdicts.
     pub fn json(&self) -> String {
         let mut value = serde_json::json!(self);
         let rows: Vec<_> = (0..self.rows.len())

@@ -62,7 +62,7 @@ pub fn live_html(
     )
 }
 
-/// The fields that are being learned and have a checkpoint: the stage, and when that was saved.
+/// Returns the fields that are being learned and have a checkpoint: the stage, and when that was saved.
 fn learning(run: &Path) -> impl Iterator<Item = (Stage, SystemTime)> {
     LEARNED.into_iter().filter_map(move |(stage, _)| {
         let folder = run.join(stage);
@@ -72,7 +72,7 @@ fn learning(run: &Path) -> impl Iterator<Item = (Stage, SystemTime)> {
     })
 }
 
-/// The pictures of a run, relative to it.
+/// Returns the pictures of a run, relative to it.
 fn pictures(run: &Path) -> Vec<String> {
     // browsers show no EXR
     NAMES.iter().flat_map(|(word, _)| views(run, word)).filter(|name| !name.ends_with(".exr")).collect()

@@ -50,7 +50,7 @@ pub struct PixelGraph {
 }
 
 impl PixelGraph {
-    /// A graph without any capacity.
+    /// Returns a graph without any capacity.
     pub fn new(width: usize, height: usize) -> PixelGraph {
         let row = width + 2;
         let n = row * (height + 2);
@@ -185,7 +185,7 @@ impl PixelGraph {
         None
     }
 
-    /// The edge that carries flow between a node and its parent: the node it leaves, and in which direction.
+    /// Returns the edge that carries flow between a node and its parent: the node it leaves, and in which direction.
     fn edge_to_parent(&self, p: usize) -> (usize, usize) {
         let up = self.parent[p] as usize;
         if self.tree[p] == HEAD { (self.step(p, up), up ^ 1) } else { (p, up) }

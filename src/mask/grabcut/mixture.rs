@@ -151,7 +151,7 @@ impl Gaussian {
     }
 }
 
-/// Which value is the largest, of equals the first.
+/// Returns which value is the largest, of equals the first.
 fn first_largest(values: impl Iterator<Item = f64>) -> usize {
     let mut best = (f64::NEG_INFINITY, 0);
     for (k, value) in values.enumerate() {

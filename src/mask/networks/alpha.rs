@@ -79,7 +79,7 @@ impl AlphaNet {
         Ok(AlphaNet { session, size, normal })
     }
 
-    /// The alpha of a photograph, at `size`.
+    /// Returns the alpha of a photograph, at `size`.
     pub(super) fn alpha(&self, photo: &Photo, size: (u32, u32)) -> Result<Gray> {
         let (w, h) = self.size;
         let planes = self.normal.planes(&resized(photo, w, h), w, (w, h), 3);
@@ -164,7 +164,7 @@ impl VitMatte {
         }
     }
 
-    /// Colors and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
+    /// Returns the colors and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
     pub(super) fn pixels(&self, photo: &Photo, trimap: &Gray, padded: (usize, usize)) -> NetworkArray {
         let (w, h) = padded;
         let width = photo.width as usize;

@@ -63,7 +63,7 @@ struct ProcessorFile {
     size: Value,
 }
 
-/// The processor file of the network at `network`, `None` without one, or if it is of another network than
+/// Returns the processor file of the network at `network`, `None` without one, or if it is of another network than
 /// `kind` ("sam", "vitmatte", or empty for any).
 pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
     const NAME: &str = "preprocessor_config.json";

@@ -20,7 +20,7 @@ pub(super) struct Flat {
     pub points: Vec<DVec2>,
 }
 
-/// Twice the area, positive when counter-clockwise.
+/// Returns twice the area, positive when counter-clockwise.
 pub(super) fn twice_area([a, b, c]: [DVec2; 3]) -> f64 {
     (b - a).perp_dot(c - a)
 }
@@ -122,7 +122,7 @@ pub(super) fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>
     (part, number)
 }
 
-/// Mean of (r + 1/r) / 2 over a chart that has the area of its surface.
+/// Returns the mean of (r + 1/r) / 2 over a chart that has the area of its surface.
 pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
     let (mut sum, mut whole) = (0.0, 0.0);
     for (k, &t) in flat.triangles.iter().enumerate() {
@@ -185,7 +185,7 @@ pub(super) fn upright(mesh: &Mesh, charts: &[Flat], front: Vec3, up: Vec3) -> Ve
     charts.iter().map(stands).collect()
 }
 
-/// Where in a chart the surface rises, on the mean over its area; `None` where it does not.
+/// Returns where in a chart the surface rises, on the mean over its area; `None` where it does not.
 fn rising(mesh: &Mesh, chart: &Flat, up: Vec3) -> Option<DVec2> {
     let mut sum = DVec2::ZERO;
     for (k, &t) in chart.triangles.iter().enumerate() {
@@ -206,7 +206,7 @@ mod tests {
     use super::*;
     use glam::Vec3;
 
-    /// A strip of four triangles over the corners 0 1 2 above 3 4 5.
+    /// Returns a strip of four triangles over the corners 0 1 2 above 3 4 5.
     fn strip() -> Flat {
         let p = |x: f64, y: f64| DVec2::new(x, y);
         Flat {

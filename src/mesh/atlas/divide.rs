@@ -352,7 +352,8 @@ fn flood(beside: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usi
     count
 }
 
-/// What hangs together with the foremost triangle in front of the plane, and all it encloses: eye sockets are deep.
+/// Returns what hangs together with the foremost triangle in front of the plane, and all it encloses: eye sockets are
+/// deep.
 fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<bool> {
     // What is behind the plane has a number, so it is not flooded; then the rest takes its place.
     let behind = u32::MAX - 1;
@@ -467,7 +468,7 @@ mod tests {
         assert!(divided.charts.iter().all(|c| stretch(&mesh, c) < STRETCH));
     }
 
-    /// A dome of latitude rings on a flat disc at z = 0, closed.
+    /// Returns a dome of latitude rings on a flat disc at z = 0, closed.
     fn bust() -> Mesh {
         let (rings, around) = (12u32, 40u32);
         let mut mesh = Mesh { positions: vec![Vec3::Z, Vec3::ZERO], ..Mesh::default() };
@@ -520,7 +521,7 @@ mod face_tests {
     use super::*;
     use crate::Quiet;
 
-    /// A closed ball around the origin, a bump like a nose at its front (+z) and a dent below it.
+    /// Returns a closed ball around the origin, a bump like a nose at its front (+z) and a dent below it.
     fn ball() -> Mesh {
         let (rings, around) = (40u32, 60u32);
         let mut mesh = Mesh { positions: vec![Vec3::Y], ..Mesh::default() };

@@ -478,7 +478,7 @@ mod tests {
         assert_eq!(smoothed(&sheet(), 0), sheet());
     }
 
-    /// A cylinder's quarter, 12 × 8 squares, and its coordinates seen from the front.
+    /// Returns a cylinder's quarter, 12 × 8 squares, and its coordinates seen from the front.
     fn quarter() -> (Mesh, Flat) {
         let mut mesh = Mesh::default();
         let mut flat = Flat::default();

@@ -127,7 +127,7 @@ fn bounds(outline: &[[DVec2; 2]], turn: DVec2) -> (DVec2, DVec2) {
     ends.fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)))
 }
 
-/// Each chart in each direction, `scale` cells a unit.
+/// Returns each chart in each direction, `scale` cells a unit.
 fn draw(
     outlines: &[Vec<[DVec2; 2]>],
     stands: &[Option<DVec2>],
@@ -483,7 +483,7 @@ mod tests {
     use crate::monitor::{Quiet, Stopping};
     use glam::Vec3;
 
-    /// A rectangle of two triangles.
+    /// Returns a rectangle of two triangles.
     fn rectangle(width: f64, height: f64) -> Flat {
         let p = |x: f64, y: f64| DVec2::new(x, y);
         Flat {

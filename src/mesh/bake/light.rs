@@ -152,7 +152,7 @@ impl Visibility<'_> {
     }
 }
 
-/// Whether a point is within a camera's picture.
+/// Returns whether a point is within a camera's picture.
 fn in_frame(camera: &Camera, p: Vec3) -> bool {
     let (w, h) = (camera.width as f32, camera.height as f32);
     camera.project(p).is_some_and(|(at, _)| (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y))

@@ -303,7 +303,7 @@ impl<'a> HandleCutter<'a> {
         Some(CutPlan { moved, at_rims, caps: left.chain(right).collect() })
     }
 
-    /// Whether no triangle is turned over, flat, or in the way of another.
+    /// Returns whether no triangle is turned over, flat, or in the way of another.
     fn fits(&self, cut: &CutPlan) -> bool {
         let corners = |t: [u32; 3]| {
             t.map(|v| cut.moved.get(&v).copied().unwrap_or_else(|| self.next.positions[v as usize]))

@@ -97,7 +97,7 @@ impl<'a> LoopFinder<'a> {
         self.around(self.first[vertex as usize])
     }
 
-    /// Where a vertex is.
+    /// Returns where a vertex is.
     pub(super) fn place(&self, vertex: u32) -> Vec3 {
         self.positions[vertex as usize]
     }
@@ -219,7 +219,7 @@ impl<'a> LoopFinder<'a> {
         Ok(out)
     }
 
-    /// Length of a loop that does not separate the surface: no longer one than the shortest through a few
+    /// Returns the length of a loop that does not separate the surface: no longer one than the shortest through a few
     /// places of its handles. `None` without handles.
     pub(super) fn some_length(&self) -> Option<f32> {
         let mut ball = Ball::new(self);

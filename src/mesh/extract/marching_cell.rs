@@ -31,7 +31,7 @@ const FACES: [[u8; 4]; 6] =
 /// First of the vertex codes that name inner vertices instead of edges.
 const INNER: u8 = 12;
 
-/// Where the surface crosses an edge, 0..=1 from the end with value `a`; one end is inside (< 0), the
+/// Returns where the surface crosses an edge, 0..=1 from the end with value `a`; one end is inside (< 0), the
 /// other outside (≥ 0). Kept off the nodes: vertices never coincide and no face loses its area when a
 /// node is exactly zero.
 pub(super) fn crossing(a: f32, b: f32) -> f64 {
@@ -235,7 +235,7 @@ pub(super) fn resolve(case: u8, values: &[f32; 8]) -> CellSurface {
     out
 }
 
-/// Which loops lie on one piece of the surface: equal numbers.
+/// Returns which loops lie on one piece of the surface: equal numbers.
 fn join(case: u8, v: &[f64; 8], loops: &Loops) -> [u8; 4] {
     let mut group = [0, 1, 2, 3];
     if loops.loops.len() < 2 {

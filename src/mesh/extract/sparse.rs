@@ -95,7 +95,7 @@ struct Flood<'a> {
 }
 
 impl Flood<'_> {
-    /// Values at nodes, outside ones without evaluating them. Order as given.
+    /// Returns the values at nodes, outside ones without evaluating them. Order as given.
     fn evaluate(&mut self, nodes: &[[usize; 3]]) -> Result<Vec<f32>> {
         let mut values = Vec::with_capacity(nodes.len());
         for nodes in nodes.chunks(BATCH) {
@@ -142,7 +142,7 @@ impl Flood<'_> {
         Ok(())
     }
 
-    /// Whether a lattice node is inside. A node that was not evaluated is not.
+    /// Returns whether a lattice node is inside. A node that was not evaluated is not.
     fn coarse_inside(&self, at: [usize; 3]) -> bool {
         self.coarse[self.lattice_index(at)] < 0.0
     }
@@ -579,7 +579,7 @@ mod tests {
         (few, marching(&volume, true).unwrap())
     }
 
-    /// The triangles as sorted positions: equal for equal surfaces, however numbered.
+    /// Returns the triangles as sorted positions: equal for equal surfaces, however numbered.
     fn key(s: &LevelSet) -> Vec<[[u32; 3]; 3]> {
         let mut all: Vec<_> = s
             .mesh

@@ -107,7 +107,7 @@ pub struct CheckReport {
 pub const BARS: [&str; 5] = ["watertight", "manifold", "one-piece", "no-self-intersections", "sound-uv"];
 
 impl CheckReport {
-    /// Whether the mesh is closed and wound outward.
+    /// Returns whether the mesh is closed and wound outward.
     fn is_watertight(&self) -> bool {
         self.closed && self.orientation().is_empty()
     }
@@ -414,8 +414,8 @@ impl UvReport {
     /// Charts farther apart than this are not measured.
     pub const MAX_CHART_DISTANCE_PX: f64 = 128.0;
 
-    /// Whether every point of the surface has its own texel: no triangle is invalid, overlapping, flipped, without
-    /// area or outside.
+    /// Returns whether every point of the surface has its own texel: no triangle is invalid, overlapping, flipped,
+    /// without area or outside.
     pub fn is_sound(&self) -> bool {
         self.overlaps_left == 0
             && self.invalid + self.overlapping + self.flipped + self.zero_area + self.outside == 0
@@ -573,7 +573,7 @@ struct Joined {
 }
 
 impl Joined {
-    /// Length of the cuts between those sides, over √area.
+    /// Returns the length of the cuts between those sides, over √area.
     fn seam_length(&self, between: impl Fn(u32, u32) -> bool) -> f64 {
         let kept = self.cuts.iter().filter(|(a, b, _)| between(*a, *b));
         let length = kept.fold(0.0, |sum, cut| sum + cut.2);
@@ -667,7 +667,7 @@ fn stretches(report: &mut UvReport, triangles: &[([DVec3; 3], [DVec2; 3])]) {
     (report.angle_stretch_median, report.angle_stretch_p99) = quantiles(&mut angles);
 }
 
-/// Median and 99th percentile.
+/// Returns the median and 99th percentile.
 fn quantiles(values: &mut [f64]) -> (f64, f64) {
     let mut at = |share: f64| {
         let i = ((values.len() - 1) as f64 * share).round() as usize;
@@ -681,7 +681,7 @@ mod tests {
     use super::*;
     use crate::ErrorKind;
 
-    /// A box from `low` to `high`, wound outward.
+    /// Returns a box from `low` to `high`, wound outward.
     fn cuboid(low: Vec3, high: Vec3) -> Mesh {
         let at = |i: u32| Vec3::from([0, 1, 2].map(|k| if i >> k & 1 == 1 { high[k] } else { low[k] }));
         let quads = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];

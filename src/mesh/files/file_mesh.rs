@@ -174,7 +174,7 @@ impl FileMesh {
         self.positions.len() as u32 - 1
     }
 
-    /// Whether f32 would lose visible precision at this mesh's position.
+    /// Returns whether f32 would lose visible precision at this mesh's position.
     pub fn is_far(&self) -> bool {
         self.translation != DVec3::ZERO
     }
@@ -675,7 +675,7 @@ pub(super) mod tests {
         assert!(text.contains("the .obj lies 5.000e6") && text.contains("to 5.0e-1, 2.0e0 of its"), "{text}");
     }
 
-    /// A tetrahedron of which every face has a corner of the texture to itself, and its pictures.
+    /// Returns a tetrahedron of which every face has a corner of the texture to itself, and its pictures.
     pub fn tetrahedron() -> (Mesh, HeadTexture) {
         let mesh = Mesh {
             positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z],
@@ -785,7 +785,7 @@ pub(super) mod tests {
         assert!(encode("x", &color, Some(0)).is_err());
     }
 
-    /// A square in the plane z = 0 that looks along +Z, with the picture upright or mirrored.
+    /// Returns a square in the plane z = 0 that looks along +Z, with the picture upright or mirrored.
     fn square(mirrored: bool) -> (Mesh, Atlas) {
         let positions = vec![Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y];
         // v runs down: the top of the picture, v = 0, is at y = 1

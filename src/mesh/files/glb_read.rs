@@ -306,7 +306,8 @@ impl<'a> GlbReader<'a> {
         Ok(())
     }
 
-    /// All numbers of an accessor, flat, and how many an element has; normalized integers become −1..=1. Finite.
+    /// Returns all numbers of an accessor, flat, and how many an element has; normalized integers become −1..=1.
+    /// Finite.
     fn numbers(&self, index: u32, kinds: &[Type], components: &[C]) -> Result<(Vec<f64>, usize)> {
         let source = self.source;
         let accessor = self.get("accessor", &self.root.accessors, index)?;
@@ -589,7 +590,7 @@ struct GlbMaterial {
 }
 
 impl GlbMaterial {
-    /// Whether the material says that it belongs to the soft layers around a mesh.
+    /// Returns whether the material says that it belongs to the soft layers around a mesh.
     fn is_soft_layer(&self) -> bool {
         self.extras["tiface"]["soft_layers"].is_u64()
     }

@@ -115,7 +115,7 @@ impl StoredTensors {
         Ok(values.chunks_exact(count).map(<[f32]>::to_vec).collect())
     }
 
-    /// A matrix by its columns.
+    /// Returns a matrix by its columns.
     fn matrix(&mut self, name: &str) -> Result<Mat3> {
         let &[x, y, z] = &self.rows::<3>(name)?[..] else { return Err(self.missing(name)) };
         Ok(Mat3::from_cols(x.into(), y.into(), z.into()))
@@ -418,7 +418,7 @@ pub(super) mod tests {
         assert!(missing.hint().contains("--fresh mesh"), "{missing:?}");
     }
 
-    /// A tetrahedron far away, with everything.
+    /// Returns a tetrahedron far away, with everything.
     pub fn head() -> HeadMesh {
         let at = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)];
         let mesh = Mesh {
@@ -464,7 +464,7 @@ pub(super) mod tests {
         assert_eq!(HeadMesh::load(dir.path()).unwrap(), bare);
     }
 
-    /// A picture of another size than the texture.
+    /// Returns a picture of another size than the texture.
     fn odd() -> Photo {
         Photo { width: 3, height: 1, rgb: vec![[1, 2, 3]; 3], alpha: None }
     }

@@ -53,7 +53,7 @@ impl Cells {
         self.dims.x as usize * self.dims.y as usize * self.dims.z as usize
     }
 
-    /// The conversion cuts off, which for points of the box is rounding down.
+    /// Returns the cell of a point in the box; the conversion truncates, which is rounding down for such points.
     fn cell(&self, p: Vec3) -> IVec3 {
         ((p - self.origin) * self.per_unit).as_ivec3().clamp(IVec3::ZERO, self.dims - 1)
     }
@@ -104,7 +104,7 @@ impl Facet {
             && intersect(self.p, self.ids, other.p, other.ids)
     }
 
-    /// Whether the other one lies strictly on one side, but for common corners.
+    /// Returns whether the other one lies strictly on one side, but for common corners.
     fn is_clear_of(&self, other: &Facet, unsure: f64) -> bool {
         let (mut above, mut below) = (false, false);
         for k in 0..3 {

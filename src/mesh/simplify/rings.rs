@@ -249,8 +249,8 @@ pub(super) const BORDER: u8 = 1;
 /// Takes part in no collapse and does not move.
 pub(super) const FIXED: u8 = 2;
 
-/// What a vertex is, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it, each from one neighbour to the
-/// next: one closed walk through all of them is the inside of a surface, one open walk its border.
+/// Returns what a vertex is, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it, each from one neighbour
+/// to the next: one closed walk through all of them is the inside of a surface, one open walk its border.
 pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
     sides.sort_unstable();
     let after = |w: u32| sides.binary_search_by_key(&w, |side| side.0).ok();

@@ -164,7 +164,7 @@ pub(super) fn reduce(
     }
 }
 
-/// All edges.
+/// Returns all edges.
 fn fill(rings: &Rings) -> EdgeQueue {
     let mut queue = EdgeQueue::new();
     for t in rings.alive() {
@@ -381,7 +381,7 @@ fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<
 /// Conjugate gradients on a mass matrix gain a digit in about five steps; two digits are ample.
 const STEPS: usize = 12;
 
-/// Half the mean length of the edges at each vertex: how far it may go in a step.
+/// Returns half the mean length of the edges at each vertex: how far it may go in a step.
 fn reaches(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<f32> {
     let mut sums = vec![(0.0f32, 0.0f32); positions.len()];
     for t in triangles {

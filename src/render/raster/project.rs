@@ -53,7 +53,7 @@ pub(super) struct Face {
     pub back: bool,
 }
 
-/// Twice the area of a triangle, 1/65,536 pixels; positive if it is clockwise.
+/// Returns twice the area of a triangle, 1/65,536 pixels; positive if it is clockwise.
 pub(super) fn area([a, b, c]: [Corner; 3]) -> i64 {
     let to = |p: Corner| (i64::from(p.x) - i64::from(a.x), i64::from(p.y) - i64::from(a.y));
     let ((bx, by), (cx, cy)) = (to(b), to(c));
