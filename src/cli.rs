@@ -22,9 +22,9 @@ mod status;
 use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
-use about::Form;
 use bench::BenchOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap_complete::Shell;
 use experiment::ExperimentOptions;
 use options::{Common, KeyOption, RunTarget};
 use out::Out;
@@ -409,14 +409,14 @@ that are done or have not begun are summed up; -v prints a line for each.")]
 
 It exits with 1 if a device fails its self-test against the CPU. A build without the feature `wgpu` has no GPUs.")]
     Doctor,
-    /// Print shell completions, or write manual pages
+    /// Print shell completions
     #[command(after_long_help = "Examples:
   tiface completions bash > /etc/bash_completion.d/tiface
-  tiface completions man | man -l -             show the manual page
-  tiface completions man --out man1/            write a page for each command: tiface.1, tiface-run.1, ...")]
+  tiface completions zsh > ~/.zfunc/_tiface
+  tiface completions fish > ~/.config/fish/completions/tiface.fish")]
     Completions {
-        /// Shell, or `man` for manual pages
-        form: Form,
+        /// Shell to complete for
+        shell: Shell,
     },
 }
 
@@ -464,8 +464,9 @@ pub fn main() -> ExitCode {
         Command::Config { place, explain } => makes_nothing("config")
             .and_then(|()| about::config(&common, place.path.as_deref(), explain.as_deref())),
         Command::Doctor => makes_nothing("doctor").and_then(|()| about::doctor(&common)),
-        Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
-            .and_then(|out| about::completions(*form, Cli::command(), out.as_ref())),
+        Command::Completions { shell } => {
+            makes_nothing("completions").and_then(|()| about::completions(*shell, Cli::command()))
+        }
         stages => run::run(&invocation, &stages.on_stages(&common)?),
     });
     ExitCode::from(match ended {

@@ -375,14 +375,6 @@ fn shells_get_their_completions() {
         let o = tiface(dir.path(), &["completions", shell]);
         assert!(code(&o) == 0 && out(&o).contains("tiface"), "{shell}");
     }
-    let o = tiface(dir.path(), &["completions", "man", "--out", "man1/"]);
-    assert_eq!(code(&o), 0, "{}", err(&o));
-    for (page, word) in
-        [("tiface.1", "Exit codes"), ("tiface-run.1", "psnr=28"), ("tiface-mesh.1", "triangles")]
-    {
-        let text = std::fs::read_to_string(dir.path().join("man1").join(page)).unwrap();
-        assert!(text.starts_with(".ie") && text.contains(word), "{page}");
-    }
     assert_eq!(code(&tiface(dir.path(), &["completions", "bash", "--out", "x/"])), 2);
 }
 

@@ -1,15 +1,13 @@
 //! `tiface config`: the effective configuration, or the documentation of a key. `tiface doctor`: devices and features of this
-//! machine and build, for the choice of a device and for bug reports. `tiface completions`: shell completions and manual pages.
+//! machine and build, for the choice of a device and for bug reports. `tiface completions`: shell completions.
 
 use super::options::{Common, RunTarget};
-use super::out::Out;
 use super::screen::print;
 use crate::config::explain;
 use crate::field::{Found, examine_devices};
 use crate::{Error, ErrorKind, Result, io};
-use clap::{Command, ValueEnum};
+use clap::Command;
 use clap_complete::{Shell, generate};
-use clap_mangen::Man;
 use serde::Serialize;
 use std::fmt::{self, Display};
 use std::path::Path;
@@ -106,70 +104,8 @@ impl Display for Examination {
     }
 }
 
-/// The output of `completions`.
-#[derive(Clone, Copy, Debug)]
-pub(super) enum Form {
-    Shell(Shell),
-    Man,
-}
-
-impl ValueEnum for Form {
-    fn value_variants<'a>() -> &'a [Form] {
-        use Form::{Man, Shell as For};
-        &[
-            For(Shell::Bash),
-            For(Shell::Zsh),
-            For(Shell::Fish),
-            For(Shell::PowerShell),
-            For(Shell::Elvish),
-            Man,
-        ]
-    }
-
-    fn to_possible_value(&self) -> Option<clap::builder::PossibleValue> {
-        match self {
-            Form::Shell(shell) => shell.to_possible_value(),
-            Form::Man => Some(clap::builder::PossibleValue::new("man")),
-        }
-    }
-}
-
-pub(super) fn completions(form: Form, mut command: Command, out: Option<&Out>) -> Result<()> {
-    let pages = match (form, out) {
-        (Form::Shell(_), Some(_)) => {
-            return Err(Error::usage(
-                "a completion script is written to stdout",
-                "redirect it with `> FILE`",
-            ));
-        }
-        (Form::Shell(shell), None) => {
-            let mut script = Vec::new();
-            generate(shell, &mut command, "tiface", &mut script);
-            return print(&String::from_utf8_lossy(&script));
-        }
-        (Form::Man, None) => vec![page(command)?],
-        (Form::Man, Some(_)) => {
-            command.build();
-            let of_commands: Vec<Command> =
-                command.get_subcommands().filter(|c| c.get_name() != "help").cloned().collect();
-            let named = of_commands.into_iter().map(|c| {
-                // clap wants static names; they live as long as the process
-                let name: &'static str = format!("tiface-{}", c.get_name()).leak();
-                c.name(name).display_name(name)
-            });
-            let all: Vec<Command> = named.collect();
-            std::iter::once(command).chain(all).map(page).collect::<Result<_>>()?
-        }
-    };
-    let Some(out) = out else { return print(&String::from_utf8_lossy(&pages[0].1)) };
-    out.prepare()?;
-    pages.iter().try_for_each(|(name, text)| Ok(io::write_atomic(&out.file(name), text)?))
-}
-
-/// Returns a manual page and the name of its file.
-fn page(command: Command) -> Result<(String, Vec<u8>)> {
-    let man = Man::new(command);
-    let mut text = Vec::new();
-    man.render(&mut text).map_err(|e| Error::new(crate::ErrorKind::Bug, e))?;
-    Ok((man.get_filename(), text))
+pub(super) fn completions(shell: Shell, mut command: Command) -> Result<()> {
+    let mut script = Vec::new();
+    generate(shell, &mut command, "tiface", &mut script);
+    print(&String::from_utf8_lossy(&script))
 }
