@@ -138,7 +138,7 @@ enum Command {
   tiface run captures/002_00 --require psnr=28      exit with 3 if the PSNR is lower")]
     Run {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         #[command(flatten)]
         clicks: ClickOptions,
         /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
@@ -199,7 +199,7 @@ On three photographs from different sides, click the face, the hair, every garme
 background twice. The masks of the other views follow from the cameras.")]
     Mask {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         #[command(flatten)]
         clicks: ClickOptions,
         /// Write a page to click on instead, to --out or <capture>_clicks.html
@@ -234,7 +234,7 @@ background twice. The masks of the other views follow from the cameras.")]
   tiface mesh runs/002_00 --fresh mesh --triangles 20000 --texture 4096 --lobes 1 --normal-map")]
     Mesh {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Formats to write: glb, obj, ply
         #[arg(long, value_name = "LIST")]
         format: Option<String>,
@@ -274,7 +274,7 @@ Views of other cameras than the held-out ones are written to render/paths/, one 
 held-out views, their blend and the metrics do not change; --fresh render then renders only that path again.")]
     Render {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Cameras: test (the held-out views), train, orbit or a file (a nerfstudio camera path or a
         /// transforms.json)
         #[arg(long, value_name = "WHICH")]
@@ -300,7 +300,7 @@ Without --weights, the weights are fitted on small squares of the training photo
 all trainings (capture.tiles).")]
     Ensemble {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
         /// and raster (head.glb)
         #[arg(long, value_name = "LIST")]
@@ -312,7 +312,7 @@ all trainings (capture.tiles).")]
     /// Stage: compare views and blends with held-out photographs
     Metrics {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
@@ -397,7 +397,7 @@ that are done or have not begun are summed up; -v prints a line for each.")]
   tiface config --explain iface.steps           explain a key; --explain mesh explains a table")]
     Config {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Explain a key or a table: meaning, range and value in every preset
         #[arg(long, value_name = "KEY")]
         explain: Option<String>,
@@ -447,8 +447,8 @@ pub fn main() -> ExitCode {
     let makes_nothing = |command: &str| Out::none(common.out.as_deref(), command);
     let ended = signals::listen(&invocation).and_then(|()| match &command {
         Command::Demo { size, views, border } => demo::run(&invocation, size.as_deref(), *views, *border),
-        Command::Mask { place, clicks, page: true } => {
-            capture::page(&invocation, place.path.as_deref(), clicks.prompts.as_deref())
+        Command::Mask { input, clicks, page: true } => {
+            capture::page(&invocation, input.path.as_deref(), clicks.prompts.as_deref())
         }
         Command::Inspect { capture } => {
             makes_nothing("inspect").and_then(|()| capture::inspect(&common, capture))
@@ -461,8 +461,8 @@ pub fn main() -> ExitCode {
         Command::Experiment(options) => experiment::run(&invocation, options),
         Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
         Command::Report { runs, table } => report::run(&invocation, runs, *table),
-        Command::Config { place, explain } => makes_nothing("config")
-            .and_then(|()| about::config(&common, place.path.as_deref(), explain.as_deref())),
+        Command::Config { input, explain } => makes_nothing("config")
+            .and_then(|()| about::config(&common, input.path.as_deref(), explain.as_deref())),
         Command::Doctor => makes_nothing("doctor").and_then(|()| about::doctor(&common)),
         Command::Completions { shell } => {
             makes_nothing("completions").and_then(|()| about::completions(*shell, Cli::command()))
@@ -482,14 +482,14 @@ impl Command {
     /// Returns the stages that a command runs, and its settings.
     fn on_stages(&self, common: &Common) -> Result<StageCommand<'_>> {
         let on = |flag: bool, value: &'static str| flag.then_some(value);
-        let (place, until, keys) = match self {
-            Command::Run { place, clicks, .. } => (place, Stage::Metrics, clicks.keys()?),
-            Command::Mask { place, clicks, .. } => (place, Stage::Mask, clicks.keys()?),
-            Command::Baseline(place) => (place, Stage::Baseline, Vec::new()),
-            Command::Tface(place) => (place, Stage::Tface, Vec::new()),
-            Command::Iface(place) => (place, Stage::Iface, Vec::new()),
+        let (input, until, keys) = match self {
+            Command::Run { input, clicks, .. } => (input, Stage::Metrics, clicks.keys()?),
+            Command::Mask { input, clicks, .. } => (input, Stage::Mask, clicks.keys()?),
+            Command::Baseline(input) => (input, Stage::Baseline, Vec::new()),
+            Command::Tface(input) => (input, Stage::Tface, Vec::new()),
+            Command::Iface(input) => (input, Stage::Iface, Vec::new()),
             Command::Mesh {
-                place,
+                input,
                 format,
                 frame,
                 triangles,
@@ -511,25 +511,25 @@ impl Command {
                     ("--normal-map", "mesh.normal_map", on(*normal_map, "true")),
                     ("--no-cap", "mesh.cap", on(*no_cap, "false")),
                 ]);
-                (place, Stage::Mesh, keys)
+                (input, Stage::Mesh, keys)
             }
-            Command::Render { place, cameras, method, format, background } => {
+            Command::Render { input, cameras, method, format, background } => {
                 let keys = key_options([
                     ("--cameras", "render.cameras", cameras.as_deref()),
                     ("--with", "render.method", method.as_deref()),
                     ("--format", "render.format", format.as_deref()),
                     ("--background", "render.background", background.as_deref()),
                 ]);
-                (place, Stage::Render, keys)
+                (input, Stage::Render, keys)
             }
-            Command::Ensemble { place, members, weights } => {
+            Command::Ensemble { input, members, weights } => {
                 let keys = key_options([
                     ("--members", "ensemble.members", members.as_deref()),
                     ("--weights", "ensemble.weights", weights.as_deref()),
                 ]);
-                (place, Stage::Ensemble, keys)
+                (input, Stage::Ensemble, keys)
             }
-            Command::Metrics { place, .. } => (place, Stage::Metrics, Vec::new()),
+            Command::Metrics { input, .. } => (input, Stage::Metrics, Vec::new()),
             other => unreachable!("{other:?} runs no stage"),
         };
         let (product, require) = match self {
@@ -537,7 +537,7 @@ impl Command {
             Command::Metrics { require, .. } => ("metrics", &require[..]),
             _ => (until.word(), &[][..]),
         };
-        let target = RunTarget::find(common, place.path.as_deref())?;
+        let target = RunTarget::find(common, input.path.as_deref())?;
         Ok(StageCommand { product, until, target, require, keys, fallback: None })
     }
 }
@@ -578,7 +578,7 @@ mod tests {
         ] {
             let cli = Cli::try_parse_from(words).unwrap();
             assert_eq!(cli.common.seed, Some(7));
-            assert!(matches!(cli.command, Command::Run { place, .. } if place.path.is_some()));
+            assert!(matches!(cli.command, Command::Run { input, .. } if input.path.is_some()));
         }
     }
 

@@ -359,7 +359,7 @@ pub struct DeviceChoice {
     pub number: Option<usize>,
     /// Are sums of many threads made in whole numbers, so that they are the same bytes every time? The processor's are.
     pub deterministic: bool,
-    /// GiB of its memory that a training may take; all of it where nothing is said.
+    /// Memory that a training may use, GiB; `None`: all of it.
     pub memory_gib: Option<f64>,
 }
 

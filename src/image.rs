@@ -99,7 +99,7 @@ pub fn quantize(c: f32) -> u8 {
 pub fn eroded(mut set: Vec<bool>, w: usize, h: usize, margin: usize) -> Vec<bool> {
     for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
         for first in (0..lines).map(|line| line * step) {
-            // so many set ones in a row, up to here
+            // length of the run of set values that ends here
             let mut run = 0;
             let runs: Vec<usize> = (0..n)
                 .map(|i| {

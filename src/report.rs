@@ -209,7 +209,7 @@ pub struct ViewRow {
 /// A picture of a view.
 #[derive(Clone, Debug, Serialize)]
 pub struct ViewPicture {
-    /// The word of who made it.
+    /// The name of the method that made it.
     pub method: String,
     /// What a person calls that.
     pub title: String,

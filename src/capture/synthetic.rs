@@ -152,7 +152,7 @@ pub fn write_photographs(
     Ok(())
 }
 
-/// Writes `valid/NAME.npy` for every view of a capture: a border of so many pixels is not usable, as in the ILSH
+/// Writes `valid/NAME.npy` for every view of a capture: a border of this width is not usable, as in the ILSH
 /// dataset, whose photographs are undistorted. To be written before the capture, whose cameras say that it is complete.
 pub fn write_borders(dir: &Path, options: &SyntheticOptions, border: u32) -> Result<()> {
     let (w, h) = (options.width, options.height);

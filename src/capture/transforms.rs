@@ -268,7 +268,7 @@ fn intrinsics(keys: &FrameKeys, ignored: &mut Vec<String>) -> Result<Intrinsics,
 }
 
 /// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as well, and
-/// nerfstudio's perspective k4 is none that anybody else has.
+/// nerfstudio's perspective k4 exists in no other program.
 fn distortion(keys: &FrameKeys, model: &str, ignored: &mut Vec<String>) -> Result<Distortion, String> {
     let &FrameKeys { k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1, omega, .. } = keys;
     let given = Distortion { k1, k2, k3, p1, p2, k4, k5, k6, sx1, sy1, omega, ..Distortion::default() };

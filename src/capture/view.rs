@@ -193,7 +193,7 @@ impl View {
         Ok(LoadedView { photo, mask, valid, region })
     }
 
-    /// Only the mask of this view, at the camera's size, whatever it means; `None` without one.
+    /// Returns the mask of this view at the camera's size, without its meaning; `None` without one.
     pub fn load_mask(&self, limits: &Limits) -> Result<Option<Gray>> {
         let alpha = match self.mask {
             ViewMask::Alpha => self.load_photo(limits)?.alpha,

@@ -44,13 +44,13 @@ impl Observer for Warnings {
 
 pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()> {
     let Invocation { common, screen, stop } = invocation;
-    let asked = Out::find(common.out.as_deref(), "bench")?;
+    let out = Out::find(common.out.as_deref(), "bench")?;
     let target = RunTarget::find(common, Some(&options.path))?;
     let config = configure(common, &target)?;
     check_feasible(&config)?;
     require_device(&config)?;
     let name = target.run.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
-    let folder = asked.map_or_else(|| Path::new("bench").join(name), |out| out.file(""));
+    let folder = out.map_or_else(|| Path::new("bench").join(name), |out| out.file(""));
     let results = folder.join("bench.json");
     if io::exists(&results) {
         let what = format!("`{}` holds the results of another bench", folder.display());

@@ -54,7 +54,7 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
 /// Writes the page for a capture, with existing clicks from `prompts` or the capture's own `prompts.json`.
 pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option<&Path>) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
-    let asked = Out::find(common.out.as_deref(), "page")?;
+    let destination = Out::find(common.out.as_deref(), "page")?;
     let Some(path) = path else {
         return Err(Error::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
     };
@@ -81,12 +81,12 @@ pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option
         prompts => click_page(&capture, prompts)?,
     };
     let name = format!("{}_clicks.html", capture.name);
-    let out = asked.as_ref().map_or_else(|| PathBuf::from(&name), |out| out.file(&name));
+    let out = destination.as_ref().map_or_else(|| PathBuf::from(&name), |out| out.file(&name));
     if common.dry_run {
         screen.note("page", &format!("would write an annotation page to `{}`", out.display()));
         return Ok(());
     }
-    asked.iter().try_for_each(Out::prepare)?;
+    destination.iter().try_for_each(Out::prepare)?;
     io::write_atomic(&out, html.as_bytes())?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "page": out})))?;

@@ -144,14 +144,14 @@ impl Kind {
     }
 
     /// Returns the output file: from `--out`, or else in the working directory.
-    fn place(self, asked: Option<Out>, name: &str) -> Out {
+    fn destination(self, out: Option<Out>, name: &str) -> Out {
         let file = match self {
             Kind::Picture => format!("{name}_preview.png"),
             Kind::Sheet => format!("{name}_sheet.png"),
             Kind::Turntable => format!("{name}_turntable.png"),
             Kind::Cameras => format!("{name}_views/"),
         };
-        match asked {
+        match out {
             Some(Out::Folder(folder)) if !self.is_moving() => Out::File(folder.join(file), "png".into()),
             Some(out) => out,
             None if self == Kind::Cameras => Out::Folder(file.into()),
@@ -167,15 +167,15 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         return watch(invocation, options.path.as_deref());
     }
     if options.page {
-        let asked = Out::find(common.out.as_deref(), "page")?;
-        return page(invocation, options.path.as_deref(), options.up, asked.as_ref());
+        let out = Out::find(common.out.as_deref(), "page")?;
+        return page(invocation, options.path.as_deref(), options.up, out.as_ref());
     }
     let kind = Kind::of(options);
     if kind == Kind::Sheet && options.size.is_some_and(|size| size > MAX_SHEET_PX) {
         let what = format!("`--size` of a picture on a sheet is at most {MAX_SHEET_PX}");
         return Err(Error::usage(what, "render larger pictures one by one"));
     }
-    let asked = Out::find(common.out.as_deref(), if kind.is_moving() { "turntable" } else { "preview" })?;
+    let out = Out::find(common.out.as_deref(), if kind.is_moving() { "turntable" } else { "preview" })?;
     let (preview, name) = open(invocation, options)?;
     preview.warnings.iter().for_each(|w| screen.note("preview: warning", w));
     let look = options.light.unwrap_or(preview.look());
@@ -184,15 +184,15 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         return Err(Error::cannot(what, "choose another --light, or add texture coordinates"));
     }
     let (names, shots) = shots(&preview, options, kind, look)?;
-    let place = kind.place(asked, &name);
-    let (Out::File(shown, _) | Out::Folder(shown)) = &place;
+    let destination = kind.destination(out, &name);
+    let (Out::File(shown, _) | Out::Folder(shown)) = &destination;
     if common.dry_run {
         let count = shots.len();
         screen.note("preview", &format!("would render {count} pictures for `{}`", shown.display()));
         return Ok(());
     }
-    place.prepare()?;
-    let files = make(&preview, &place, kind, &names, &shots, options.background, invocation)?;
+    destination.prepare()?;
+    let files = make(&preview, &destination, kind, &names, &shots, options.background, invocation)?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "preview": files})))?;
     } else if !common.quiet {
@@ -379,7 +379,7 @@ fn write_name(picture: &mut PreviewPicture, name: &str) {
 }
 
 /// Writes the page of a mesh file with the up axis `up`, or of a run's head with its photographs.
-fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, asked: Option<&Out>) -> Result<()> {
+fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, out: Option<&Out>) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
     let named = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let (name, html): (String, Box<dyn FnOnce() -> Result<String>>) =
@@ -404,13 +404,13 @@ fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, asked: O
             }
         };
     let file = format!("{name}_preview.html");
-    let file = asked.map_or_else(|| PathBuf::from(&file), |out| out.file(&file));
+    let file = out.map_or_else(|| PathBuf::from(&file), |out| out.file(&file));
     if common.dry_run {
         screen.note("preview", &format!("would write a page to `{}`", file.display()));
         return Ok(());
     }
     let html = html()?;
-    asked.into_iter().try_for_each(Out::prepare)?;
+    out.into_iter().try_for_each(Out::prepare)?;
     io::write_atomic(&file, html.as_bytes())?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "preview": [file]})))?;

@@ -72,14 +72,14 @@ impl Screen {
             return;
         }
         let (message, hint) = (error.to_string(), error.hint());
-        let asked = error.kind().is_stop();
+        let is_stop = error.kind().is_stop();
         if self.json {
-            let event = if asked { "stopped" } else { "error" };
+            let event = if is_stop { "stopped" } else { "error" };
             self.object(
                 &json!({"event": event, "exit": error.kind().code(), "message": message, "hint": hint}),
             );
         }
-        if asked {
+        if is_stop {
             let hint = if hint.is_empty() { String::new() } else { format!("; {hint}") };
             return self.note("stopped", &format!("{message}{hint}"));
         }

@@ -154,7 +154,7 @@ table! {
 
 impl MaskConfig {
     /// Are the masks made, from clicks or by a network?
-    pub fn made(&self) -> bool {
+    pub fn makes_masks(&self) -> bool {
         self.clicked() || self.with_alpha_net()
     }
 
@@ -227,7 +227,7 @@ impl MaskConfig {
             return problem("mask.alpha_net", "is named beside clicks", hint);
         }
         let networks = [&self.sam, &self.sam_decoder, &self.vitmatte, &self.alpha_net];
-        if !self.made() && networks.iter().any(|file| !file.is_empty()) {
+        if !self.makes_masks() && networks.iter().any(|file| !file.is_empty()) {
             let hint = "give clicks: `--prompts prompts.json`, or `--alpha-net FILE.onnx`";
             return problem(
                 "mask.sam",
@@ -235,7 +235,7 @@ impl MaskConfig {
                 hint,
             );
         }
-        if self.made() && self.meaning == MaskMeaning::Ignore {
+        if self.makes_masks() && self.meaning == MaskMeaning::Ignore {
             let hint = "set `mask.meaning` to empty: masks that are made say what is head";
             return problem("mask.meaning", "is ignore, but masks are made", hint);
         }
@@ -273,7 +273,7 @@ mod tests {
         assert_eq!(key(MaskConfig { source: MaskSource::Clicks, ..start() }), "mask.source");
         assert_eq!(key(MaskConfig { source: MaskSource::Folder, ..clicked.clone() }), "mask.source");
         let named = MaskConfig { alpha_net: "a.onnx".into(), ..start() };
-        assert!(named.made() && !named.clicked() && named.problem().is_none());
+        assert!(named.makes_masks() && !named.clicked() && named.problem().is_none());
         assert_eq!(key(MaskConfig { prompts: "p.json".into(), ..named }), "mask.alpha_net");
         assert_eq!(key(MaskConfig { source: MaskSource::Network, ..start() }), "mask.source");
         assert_eq!(key(MaskConfig { point: vec!["1,2,1".into()], ..clicked.clone() }), "mask.point");

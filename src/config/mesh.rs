@@ -160,7 +160,7 @@ impl MeshConfig {
         }
         // held as floats while they are baked
         let pictures = self.pictures();
-        // and what a fit knows of each texel
+        // and the sums of a fit for each texel
         let fit = if self.color == ColorSource::Photographs { 250 } else { 0 };
         let gib = (self.texels() * (21 * pictures + fit)) >> 30;
         (gib > 16).then(|| {

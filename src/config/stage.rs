@@ -1,4 +1,4 @@
-//! The words of the stages: each names a stage, its table in `config.toml`, its folder in the run and its command.
+//! The stages. The name of a stage is also its table in `config.toml`, its folder in the run and its command.
 
 use super::Config;
 use crate::{Error, Result};

@@ -51,7 +51,7 @@ pub enum VmBackground {
 pub enum VmStart {
     /// The whole box (published).
     Box,
-    /// The masks' visual hull; the box where there is none, or where masks are not used.
+    /// The visual hull of the masks; the box without a hull, or if masks are not used.
     #[default]
     Hull,
 }

@@ -13,7 +13,7 @@
 //!
 //! A triangle of a sound mesh has a few dozen neighbours, but a file may put all of its triangles into one place,
 //! and comparing all with all is quadratic. So every search here counts what it looks at: each item gets a share
-//! of an effort proportional to their number, what some leave over is dealt to those that need more, and who is
+//! of an effort proportional to their number, what some leave over is given to those that need more, and what is
 //! not done then is named. All of it is counted work, never time: the answer is the same on every machine.
 
 use glam::{DVec2, DVec3, Vec2};

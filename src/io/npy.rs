@@ -151,7 +151,7 @@ pub fn npy_bytes(kind: &str, shape: &[usize], values: &[u8]) -> Vec<u8> {
 }
 
 /// Are the header's numbers plain ones, and can their product be held, with 1 for an extent of 0? The parser
-/// also knows sums, signs, hexadecimals and `1_000`, which no array needs.
+/// also accepts sums, signs, hexadecimals and `1_000`, which no array needs.
 fn countable(header: &[u8]) -> bool {
     let words = header.split(|b| !(b.is_ascii_alphanumeric() || b"_+-".contains(b)));
     let mut numbers = words.filter(|w| w.first().is_some_and(|b| !(b.is_ascii_alphabetic() || *b == b'_')));

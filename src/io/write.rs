@@ -170,7 +170,7 @@ fn sync_folder(_: &Path) -> std::io::Result<()> {
 }
 
 /// Removes what interrupted writes left directly in `folder`, as far as `is_over` says so of the file's name and the
-/// process, and says how many files that were. A holder of the lock for a file knows; for others see [`has_ended`](super::has_ended).
+/// process, and says how many files that were. The holder of a file's lock decides; for others see [`has_ended`](super::has_ended).
 pub fn remove_leftovers(folder: &Path, is_over: impl Fn(&str, u32) -> bool) -> Result<usize, WriteError> {
     let fail = |source| WriteError::Io { path: folder.into(), source };
     let mut removed = 0;

@@ -451,7 +451,7 @@ pub fn verdicts(views: &[ConsistencyView]) -> Result<Vec<MaskVerdict>> {
             .max_by(|&a, &b| weight(&blame[a]).total_cmp(&weight(&blame[b])));
         let Some(worst) = worst else { break };
         if left <= 2 {
-            // two that contradict each other say nothing of who is right
+            // of two masks that contradict each other, neither is known to be right
             active.iter().zip(&used).filter(|(a, _)| **a).for_each(|(_, &i)| out[i] = MaskVerdict::Unlike);
             break;
         }

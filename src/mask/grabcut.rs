@@ -119,7 +119,7 @@ impl Models {
         })
     }
 
-    /// Returns each side measured anew.
+    /// Returns each side, measured again.
     pub fn refit(&self, head: &[Rgb], background: &[Rgb]) -> Models {
         Models { head: self.head.refit(head), background: self.background.refit(background) }
     }
@@ -528,7 +528,7 @@ mod tests {
         let run = || grabcut("a", &photo, &clicks(1.0));
         assert_eq!(run(), run());
         let flat = Photo { rgb: vec![[9, 9, 9]; photo.rgb.len()], ..photo };
-        // nothing tells head from background: whatever comes, it holds the clicks or says so
+        // head and background have the same color: the mask satisfies the clicks, or the result has a warning
         if let Ok(cut) = grabcut("a", &flat, &clicks(1.0)) {
             assert!(cut.ambiguous > 0.0);
         }

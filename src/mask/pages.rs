@@ -79,8 +79,9 @@ pub fn page_of(capture: &Capture, prompts: &Prompts, limits: &Limits) -> Result<
 fn evenly(count: usize, most: usize, wanted: impl Fn(usize) -> bool) -> Vec<usize> {
     let named: Vec<usize> = (0..count).filter(|&i| wanted(i)).take(most).collect();
     let rest: Vec<usize> = (0..count).filter(|i| named.binary_search(i).is_err()).collect();
-    let room = (most - named.len()).min(rest.len());
-    let mut chosen: Vec<usize> = (0..room).map(|k| rest[k * rest.len() / room]).chain(named).collect();
+    let remaining = (most - named.len()).min(rest.len());
+    let mut chosen: Vec<usize> =
+        (0..remaining).map(|k| rest[k * rest.len() / remaining]).chain(named).collect();
     chosen.sort_unstable();
     chosen
 }
@@ -195,15 +196,15 @@ pub fn sheet(views: &[SheetView]) -> Result<String> {
 }
 
 /// Returns what a [`sheet`] shows, without the page around it: for a page with more, in about `most` bytes. Where not
-/// all views have room, suspicious ones and evenly spread others stay.
+/// all views fit, suspicious ones and evenly spread others stay.
 pub fn part(sheet: &str, most: usize) -> Option<String> {
     let inside = sheet.split_once(SHEET_MARKERS[0])?.1.split_once(SHEET_MARKERS[1])?.0;
     let (head, rest) = inside.split_once("<figure")?;
     let (figures, tail) = rest.rsplit_once("</figure>")?;
     let figures: Vec<&str> =
         figures.split("<figure").map(|f| f.trim_end().trim_end_matches("</figure>")).collect();
-    let room = most.saturating_mul(figures.len()) / inside.len();
-    let shown = evenly(figures.len(), room, |i| figures[i].starts_with(" class=\"odd\""));
+    let remaining = most.saturating_mul(figures.len()) / inside.len();
+    let shown = evenly(figures.len(), remaining, |i| figures[i].starts_with(" class=\"odd\""));
     let shown: Vec<String> = shown.into_iter().map(|i| format!("<figure{}</figure>\n", figures[i])).collect();
     Some(format!("{head}{}{}", shown.concat(), tail.trim_start()))
 }

@@ -6,7 +6,7 @@
 //! ```
 //!
 //! `x` runs right and `y` down, as pixel indices of the photograph at the size its camera was calibrated for,
-//! whatever it is reduced to later; label 1 is the head, 0 is not. The file is a stranger's: names are only
+//! whatever it is reduced to later; label 1 is the head, 0 is not. The file is untrusted: names are only
 //! compared with those of the capture, never opened, and every number is checked.
 //!
 //! What must hold of all clicks on one photograph stands here as well, wherever they come from.

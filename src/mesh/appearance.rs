@@ -37,7 +37,7 @@ use std::time::Instant;
 /// Pixels that colors are fitted to, about, at most: more hardly change the colors.
 const MAX_PIXELS: usize = 1_000_000;
 
-/// Every so many photographs one is left out of the first fits, to judge them by.
+/// One in this many photographs is left out of the first fits, to validate them.
 const VALIDATION_STRIDE: u32 = 6;
 
 /// Gains stay within this factor of their mean: more is no exposure.

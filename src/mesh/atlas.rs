@@ -144,7 +144,7 @@ fn atlas_by(
     }
 }
 
-/// Steps that the monitor hears of.
+/// Number of steps reported to the monitor.
 const STEPS: u64 = 4;
 
 /// Options of an atlas.

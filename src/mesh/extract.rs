@@ -38,7 +38,7 @@ pub struct ExtractOptions {
 }
 
 /// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm long, which
-/// is a strand or a hole as thick as a thumb. A share, since not every capture knows its unit.
+/// is a strand or a hole as thick as a thumb. A share, because not every capture has a known unit.
 pub const MAX_HANDLE: f32 = 0.15;
 
 /// Most points in one call of a field.
@@ -141,7 +141,7 @@ impl MeshReport {
 /// as they are seen along their normals.
 ///
 /// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's zero,
-/// its normals the field's gradient. Handles with a loop no longer than `options.longest_handle` are gone.
+/// its normals the field's gradient. Handles with a loop no longer than `options.longest_handle` are removed.
 ///
 /// ```
 /// use glam::Vec3;

@@ -43,7 +43,7 @@ const RAYS_PER_SIDE: usize = 2;
 /// Rays of a pixel.
 const RAYS_PER_PIXEL: usize = RAYS_PER_SIDE * RAYS_PER_SIDE;
 
-/// Every so many photographs one is left out, to judge layers by.
+/// One in this many photographs is left out, to validate the layers.
 const VALIDATION_STRIDE: usize = 6;
 
 /// Share of the squared error of left-out outlines that layers must take away.

@@ -165,7 +165,7 @@ pub fn kinds_one_way(
     })
 }
 
-/// Returns the distances from `from` to `to` over the parts seen by so many cameras, and each part's share of the
+/// Returns the distances from `from` to `to` over the parts seen by each number of cameras, and each part's share of the
 /// area, in the order of `views`. `None` for an empty part.
 pub fn seen_one_way(
     from: &Mesh,

@@ -57,7 +57,7 @@ struct Form {
     name: &'static str,
     /// Name ("" for any), numbers and extents (0 for any) of each input.
     inputs: &'static [(&'static str, i32, &'static [usize])],
-    /// None by name: the first output is asked for, whatever it is called.
+    /// No name: the first output is used.
     outputs: &'static [&'static str],
 }
 

@@ -194,9 +194,9 @@ impl Evaluator {
         for (view, loaded, expected) in &self.views {
             let camera = view.camera.transformed(&scene.scene_from_world);
             let mut rendered = renderer.view(method, &camera)?.ok_or_else(|| {
-                Error::cannot(format!("there is nothing to show for `{}`", method.folder()), "")
+                Error::cannot(format!("no view can be rendered for `{}`", method.folder()), "")
             })?;
-            if let Some(background) = pictures::behind(self.background) {
+            if let Some(background) = pictures::background_color(self.background) {
                 pictures::over(&mut rendered, background);
             }
             let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
@@ -349,7 +349,7 @@ impl Bench<'_> {
     fn row(&self, choice: String, config: &Config) -> Result<Row> {
         self.check_stop()?;
         let scratch = tempfile::tempdir_in(self.session.run.dir()).map_err(|e| {
-            Error::cannot(format!("no scratch folder: {e}"), "free space, or name another place in TMPDIR")
+            Error::cannot(format!("no scratch folder: {e}"), "free space, or set TMPDIR to another folder")
         })?;
         let run = Run::open(scratch.path(), self.session.run.stop().clone(), std::sync::Arc::new(Quiet));
         let session = Session::open(config, &run)?;

@@ -45,7 +45,7 @@ impl MaskPrompts {
     ///
     /// `kept` is the run's copy of the clicks, which is used if the original file was removed.
     pub fn open(config: &MaskConfig, capture: &Capture, kept: &Path) -> Result<Option<MaskPrompts>> {
-        if !config.made() {
+        if !config.makes_masks() {
             return Ok(None);
         }
         let mut file = Vec::new();

@@ -52,7 +52,7 @@ pub(super) fn ensemble(
         let color = blend(&members(capture, config, &views)?, &weights)?;
         spent += begin.elapsed();
         let mut view = RenderedView { color, depth: Image::new(0, 0, 1), normal: Image::new(0, 0, 3) };
-        if let Some(background) = pictures::behind(render.background) {
+        if let Some(background) = pictures::background_color(render.background) {
             pictures::over(&mut view, background);
         }
         pictures::write(dir.folder(), &camera.name, &view, render.format, config.capture.unit_m)?;

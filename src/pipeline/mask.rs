@@ -72,8 +72,7 @@ pub(super) fn mask(
     let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
     if coverage.is_empty() {
         dir.warn(
-            "no head masks, as asked: nothing says which pixels are background, and the box learns whatever it \
-             holds",
+            "no head masks (`mask.source`): background is unknown, so everything inside the box is reconstructed",
         );
     }
     let silhouettes = config.meaning == MaskMeaning::Empty;

@@ -150,7 +150,7 @@ fn figures(
     };
     let open = before.as_ref().or((background == ViewBackground::None).then_some(&render));
     let opacity = open.map(|image| image.channel(3));
-    let behind = pictures::behind(background).unwrap_or([0.0; 3]);
+    let behind = pictures::background_color(background).unwrap_or([0.0; 3]);
     let parts = Masks::of(&loaded).map(|m| parts(&render, &photo, m, opacity.as_deref(), behind, tones));
     let parts = parts.unwrap_or_default();
     let outside = opacity.and_then(|opacity| square_opacity_outside(&opacity, &loaded));

@@ -152,7 +152,7 @@ impl<'a> Session<'a> {
     pub(super) fn write(&self, name: &str, bytes: &[u8], idle: bool) -> Result<()> {
         match self.run.write(name, bytes) {
             Err(e) if idle => {
-                self.run.warn("run", &format!("{e}; all that was asked for is done"));
+                self.run.warn("run", &format!("{e}; all requested stages are done"));
                 Ok(())
             }
             other => other,

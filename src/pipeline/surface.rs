@@ -181,7 +181,7 @@ mod tests {
     fn a_large_view_is_marched_in_bands_and_every_pixel_is_its_own() {
         let largest = Cell::new(0);
         // the plane z = 0, all opaque on the left, a quarter on the right
-        let see = |rays: &[Ray]| -> Vec<RayResult> {
+        let render_rays = |rays: &[Ray]| -> Vec<RayResult> {
             largest.set(largest.get().max(rays.len()));
             let one = |ray: &Ray| RayResult {
                 color: [0.5, 0.25, 0.0],
@@ -193,7 +193,7 @@ mod tests {
         };
         let world_from_scene = Similarity { scale: 2.0, ..Similarity::IDENTITY };
         let camera = camera(1000, 200);
-        let view = march(&camera, &world_from_scene, false, see);
+        let view = march(&camera, &world_from_scene, false, render_rays);
         assert!(largest.get() <= BAND && largest.get() > BAND / 2, "{}", largest.get());
         assert_eq!((view.normal.width, view.normal.data.len()), (0, 0));
         assert_eq!(view.color.pixel(10, 199), [0.5, 0.25, 0.0, 1.0]);
@@ -201,7 +201,7 @@ mod tests {
         // 3 scene units before the camera, 6 of the world; none where three quarters shine through
         assert!((view.depth.pixel(10, 199)[0] - 6.0).abs() < 1e-5);
         assert_eq!(view.depth.pixel(990, 0), [0.0]);
-        let upright = march(&camera, &world_from_scene, true, see);
+        let upright = march(&camera, &world_from_scene, true, render_rays);
         assert_eq!(upright.normal.pixel(10, 5), [0.0, 0.0, 1.0]);
     }
 }

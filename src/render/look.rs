@@ -22,7 +22,7 @@ const AMBIENT: f32 = 0.18;
 /// Half the width of a line of the wireframe, pixels.
 const LINE_HALF_WIDTH_PX: f32 = 0.4;
 
-/// Triangles lower than so many pixels get fainter lines.
+/// Triangles lower than this many pixels get fainter lines.
 const FADE_HEIGHT_PX: f32 = 8.0;
 
 /// The display mode of a surface.

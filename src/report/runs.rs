@@ -163,7 +163,7 @@ const DIGITS: [usize; FIGURES.len()] = [2, 4, 2, 2, 0, 1, 1, 1, 2, 0];
 const OUTLIER: f64 = 3.5;
 
 /// Returns which of some values are far from the others, by the modified z-score: the distance from the median over
-/// 1.4826 times the median of all distances. Of fewer than five nothing is said.
+/// 1.4826 times the median of all distances. None of fewer than five.
 fn outliers(values: &[Option<f64>]) -> Vec<bool> {
     let median = |mut v: Vec<f64>| {
         v.sort_by(f64::total_cmp);

@@ -2,7 +2,7 @@
 //!
 //! `p(c) = Σ_k w_k · N(c; μ_k, Σ_k)`. It starts from seeded k-means (Arthur & Vassilvitskii 2007) and is refitted
 //! as in GrabCut (Rother, Kolmogorov, Blake 2004): every color goes to its likeliest Gaussian, whose mean and
-//! covariance are measured anew. A covariance always gains what 8-bit rounding and sensor noise leave at least,
+//! covariance are measured again. A covariance always gains the least that 8-bit rounding and sensor noise leave,
 //! so that one flat color is no singular Gaussian.
 
 use crate::geom::cofactors;
@@ -80,7 +80,7 @@ impl Mixture {
         Some(Mixture::measure(colors, &member, centers.len()))
     }
 
-    /// Sends every color to its likeliest Gaussian and measures these anew; unchanged without colors.
+    /// Sends every color to its likeliest Gaussian and measures these again; unchanged without colors.
     pub fn refit(&self, colors: &[Rgb]) -> Mixture {
         if colors.is_empty() {
             return self.clone();

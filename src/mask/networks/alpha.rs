@@ -27,7 +27,7 @@ use std::path::Path;
 const ISNET: Normal = Normal { mean: [0.5; 3], std: [1.0; 3] };
 const MODNET: Normal = Normal { mean: [0.5; 3], std: [0.5; 3] };
 
-/// What a file's name tells, lower case, the first that is found in it: side of the square, colors. As the publishers' own
+/// Words in file names, lower case, the first match counts: side of the square, colors. As the publishers' own
 /// scripts have it.
 const KNOWN: [(&str, usize, Normal); 8] = [
     ("u2net", 320, IMAGENET),
@@ -55,7 +55,7 @@ impl AlphaNet {
         let name = path.file_name().map(|n| n.to_string_lossy().to_lowercase()).unwrap_or_default();
         let (side, normal) = if input != "auto" {
             parse(input)?
-        } else if let Some(beside) = processor::beside(path, "")? {
+        } else if let Some(beside) = processor::find(path, "")? {
             (beside.side.unwrap_or(1024), beside.normal)
         } else if let Some((_, side, normal)) = KNOWN.iter().find(|(known, ..)| name.contains(known)) {
             (*side, *normal)
@@ -137,7 +137,7 @@ impl VitMatte {
         let normal = match colors {
             VitmatteColors::Imagenet => None,
             VitmatteColors::Half => Some(half),
-            VitmatteColors::Auto => processor::beside(path, "vitmatte")?.map(|p| p.normal),
+            VitmatteColors::Auto => processor::find(path, "vitmatte")?.map(|p| p.normal),
         };
         let thirds = normal.is_none();
         let how = if thirds { "as in the original code" } else { "as in transformers" };

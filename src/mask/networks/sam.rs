@@ -69,7 +69,7 @@ impl Sam {
         {
             return mismatch(format!("the decoder wants `{POSITION}`, which the encoder does not give"));
         }
-        let processor = processor::beside(&encoder.file.path, "sam")?;
+        let processor = processor::find(&encoder.file.path, "sam")?;
         let takes = &encoder.inputs[0];
         if takes.extent(2).zip(takes.extent(3)).is_some_and(|(rows, columns)| rows != columns) {
             return mismatch(format!("the encoder's input {} is not square", takes.shape_in_words()));

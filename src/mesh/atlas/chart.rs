@@ -3,7 +3,7 @@
 //! Patches of a surface: which triangles lie beside each other, parts as meshes of their own, how far a chart is
 //! from the sizes of its surface.
 //!
-//! The face stands upright in the texture: who paints there sees what it is.
+//! The face stands upright in the texture: so that it can be painted.
 
 use crate::geom::{Mesh, Sets, side_ends, sorted_sides};
 use glam::{DVec2, Vec3};

@@ -51,11 +51,11 @@ const SPLITS: usize = 3;
 
 /// Divides a mesh and lays it flat.
 pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<ChartSet> {
-    let beside = neighbours(mesh);
+    let adjacent = neighbours(mesh);
     let smooth = smoothed(mesh, SMOOTHING);
     let mut best = flatten(&smooth, None, STRETCHED, monitor)?;
     for _ in 0..JOINS {
-        let labels = joined(mesh, &beside, &best);
+        let labels = joined(mesh, &adjacent, &best);
         let regions = labels.iter().max().map_or(0, |most| *most as usize + 1);
         if regions == best.charts.len() {
             break;
@@ -127,7 +127,7 @@ fn uncovered(chart: Flat) -> Vec<Flat> {
 }
 
 /// One number a triangle, from 0: its chart, or the neighbour that this joined.
-fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
+fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
     let count = mesh.triangles.len();
     // a triangle without a chart is a region of its own until it joins one
     let mut label = vec![NONE; count];
@@ -146,7 +146,7 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
         let p = mesh.corners(t as u32).map(|p| p.as_dvec3());
         area[own as usize] += mesh.area(t as u32);
         for k in 0..3 {
-            let n = beside[t][k];
+            let n = adjacent[t][k];
             if n != NONE && label[n as usize] != own {
                 *border[own as usize].entry(label[n as usize]).or_default() += p[k].distance(p[(k + 1) % 3]);
             }
@@ -182,7 +182,7 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
         r
     };
     label.iter_mut().for_each(|l| *l = root(*l));
-    straighten(beside, &mut label);
+    straighten(adjacent, &mut label);
     let mut number = HashMap::new();
     label
         .iter()
@@ -203,7 +203,7 @@ const MAX_PLANE_DISTANCE: f64 = 5e-4;
 const MIN_PLANE_COSINE: f64 = 0.999;
 
 /// Returns the flat pieces of at least a hundredth of the surface, the largest triangles looked at first.
-pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
+pub(super) fn planar(mesh: &Mesh, adjacent: &[[u32; 3]]) -> Vec<Flat> {
     let count = mesh.triangles.len();
     let corners = |t: u32| mesh.corners(t).map(|p| p.as_dvec3());
     let across: Vec<DVec3> = (0..count as u32)
@@ -232,7 +232,7 @@ pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
         while let Some(t) = open.pop() {
             members.push(t);
             area += areas[t as usize];
-            for k in beside[t as usize] {
+            for k in adjacent[t as usize] {
                 if k == NONE || piece[k as usize] != NONE {
                     continue;
                 }
@@ -316,7 +316,7 @@ pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> 
 /// Caps worth flattening, the deepest first: for each triangle whether it belongs.
 fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     let count = mesh.triangles.len();
-    let beside = neighbours(mesh);
+    let adjacent = neighbours(mesh);
     let depth: Vec<f32> = (0..count as u32)
         .map(|t| {
             let [a, b, c] = mesh.corners(t).map(|p| p.dot(front));
@@ -329,19 +329,19 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     let (high, low) = (depth[foremost], depth.iter().copied().fold(f32::INFINITY, f32::min));
     (1..=CUT_PLANES).rev().filter_map(move |i| {
         let plane = high - (high - low) * MAX_CUT_DEPTH * i as f32 / CUT_PLANES as f32;
-        let mut inside = cap(&beside, &depth, foremost as u32, plane);
-        straighten(&beside, &mut inside);
+        let mut inside = cap(&adjacent, &depth, foremost as u32, plane);
+        straighten(&adjacent, &mut inside);
         let share = (0..count).filter(|&t| inside[t]).map(|t| areas[t]).sum::<f64>() / whole;
         (share > 0.01 && share < MAX_FACE_SHARE).then_some(inside)
     })
 }
 
 /// Gives `number` to the first triangle and all without one that hang together with it; how many they are.
-fn flood(beside: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usize {
+fn flood(adjacent: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usize {
     let (mut open, mut count) = (vec![first], 1);
     piece[first as usize] = number;
     while let Some(t) = open.pop() {
-        for n in beside[t as usize] {
+        for n in adjacent[t as usize] {
             if n != NONE && piece[n as usize] == NONE {
                 piece[n as usize] = number;
                 count += 1;
@@ -354,17 +354,17 @@ fn flood(beside: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usi
 
 /// Returns what hangs together with the foremost triangle in front of the plane, and all it encloses: eye sockets are
 /// deep.
-fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<bool> {
+fn cap(adjacent: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<bool> {
     // What is behind the plane has a number, so it is not flooded; then the rest takes its place.
     let behind = u32::MAX - 1;
     let mut piece: Vec<u32> = depth.iter().map(|&d| if d > plane { NONE } else { behind }).collect();
-    flood(beside, &mut piece, foremost, 0);
+    flood(adjacent, &mut piece, foremost, 0);
     piece.iter_mut().filter(|p| **p == behind).for_each(|p| *p = NONE);
     let (mut outside, mut most, mut number) = (NONE, 0, 0);
-    for t in 0..beside.len() {
+    for t in 0..adjacent.len() {
         if piece[t] == NONE {
             number += 1;
-            let count = flood(beside, &mut piece, t as u32, number);
+            let count = flood(adjacent, &mut piece, t as u32, number);
             if count > most {
                 (outside, most) = (number, count);
             }
@@ -372,7 +372,7 @@ fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<boo
     }
     // only the component of the foremost triangle: other pieces have charts of their own
     let mut own: Vec<u32> = piece.iter().map(|&p| if p == outside { behind } else { NONE }).collect();
-    flood(beside, &mut own, foremost, 0);
+    flood(adjacent, &mut own, foremost, 0);
     own.iter().map(|&p| p == 0).collect()
 }
 
@@ -575,12 +575,12 @@ mod face_tests {
         let sizes: Vec<usize> = found.iter().map(|c| c.iter().filter(|i| **i).count()).collect();
         assert!(sizes.is_sorted_by(|a, b| a > b), "{sizes:?}");
         // one piece within, one without: the rim is one line
-        let beside = neighbours(&mesh);
+        let adjacent = neighbours(&mesh);
         for inside in found {
             for side in [true, false] {
                 let first = inside.iter().position(|&i| i == side).unwrap();
                 let mut own: Vec<u32> = inside.iter().map(|&i| if i == side { NONE } else { 7 }).collect();
-                let count = flood(&beside, &mut own, first as u32, 1);
+                let count = flood(&adjacent, &mut own, first as u32, 1);
                 assert_eq!(count, inside.iter().filter(|&&i| i == side).count());
             }
         }
@@ -589,7 +589,7 @@ mod face_tests {
     #[test]
     fn a_dent_behind_the_plane_is_part_of_the_face() {
         // a strip: 0 in front, 1 behind, 2 in front, 3 to 6 behind
-        let beside = [
+        let adjacent = [
             [NONE, 1, 2],
             [0, 2, NONE],
             [1, 0, 3],
@@ -599,6 +599,6 @@ mod face_tests {
             [5, NONE, NONE],
         ];
         let depth = [1.0, 0.2, 0.9, 0.1, 0.0, 0.0, 0.0];
-        assert_eq!(cap(&beside, &depth, 0, 0.5), [true, true, true, false, false, false, false]);
+        assert_eq!(cap(&adjacent, &depth, 0, 0.5), [true, true, true, false, false, false, false]);
     }
 }

@@ -6,7 +6,7 @@ use crate::image::{linear_from_srgb, srgb_from_linear};
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Cosine of the steepest angle at which a camera still tells the color of a point: 75 degrees.
+/// Cosine of the steepest angle at which a camera still shows the color of a point: 75 degrees.
 const MIN_COSINE: f32 = 0.258_819;
 
 /// Points of the surface with their unit normals.

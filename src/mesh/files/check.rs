@@ -460,7 +460,7 @@ apart                {apart}, from the border {border:.2} texels
     }
 }
 
-/// Returns the text before and after a figure that is a bound because so many candidates were not compared.
+/// Returns the text before and after a figure that is a bound because `left` candidates were not compared.
 pub(super) fn bound(which: &'static str, left: usize, of: &str) -> (&'static str, String) {
     if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not looked at further)")) }
 }

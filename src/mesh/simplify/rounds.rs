@@ -107,7 +107,7 @@ pub(super) fn reduce(
             }
             let Some((bucket, Entry { a, b, stamp })) = queue.pop() else { break };
             if rings.stamp(a, b) != stamp {
-                continue; // an end is gone, or its edges were entered anew
+                continue; // an end was removed, or its edges were entered again
             }
             let Some((x, cost)) = place(rings, a, b) else { continue };
             let now = EdgeQueue::bucket(cost);
@@ -352,7 +352,7 @@ fn worst(errors: &[f32]) -> f32 {
 fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<f32>> {
     let mut errors = vec![0.0f32; mesh.positions.len()];
     let Some(field) = task.field else { return Ok(errors) };
-    // Where, and for whom: each inner edge once.
+    // Each inner edge once, with its place.
     let mut points = mesh.positions.clone();
     let mut whom: Vec<[u32; 3]> = (0..points.len() as u32).map(|v| [v; 3]).collect();
     for t in &mesh.triangles {

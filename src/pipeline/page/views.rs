@@ -26,7 +26,7 @@ use std::path::Path;
 
 /// Longest side of a picture on the page: of few views, and of many.
 const SIDE_PX: (u32, u32) = (480, 320);
-/// Up to so many views count as few.
+/// Maximum number of views that count as few.
 const FEW_VIEWS: usize = 10;
 /// JPEG quality: about 25 kB per picture.
 const QUALITY: u8 = 84;
