@@ -56,7 +56,7 @@ use std::collections::HashMap;
 use std::path::Path;
 use view::{downscaled, wrong_size};
 
-/// Opens a capture, or returns the first thing that is wrong with it; [`super::inspect::inspect`] returns all.
+/// Opens a capture, or returns the first thing that is wrong with it; [`inspect::inspect`] returns all.
 pub fn open(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     let (capture, listing) = gather(root, options);
     match (listing.problems.into_iter().next(), capture) {

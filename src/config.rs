@@ -357,7 +357,7 @@ pub struct DeviceChoice {
     pub name: String,
     /// Which of its adapters, from 0.
     pub number: Option<usize>,
-    /// Are sums of many threads made in whole numbers, so that they are the same bytes every time? The processor's are.
+    /// Whether GPU sums are accumulated in fixed point, bitwise reproducible; on the CPU they always are.
     pub deterministic: bool,
     /// Memory that a training may use, GiB; `None`: all of it.
     pub memory_gib: Option<f64>,

@@ -61,7 +61,7 @@ impl Projector {
         Some((self.camera.fx * x + self.camera.cx, self.camera.fy * y + self.camera.cy, depth))
     }
 
-    /// Is the point inside the frame?
+    /// Returns whether the point is inside the frame.
     pub fn sees(&self, point: DVec3) -> bool {
         let (w, h) = (self.camera.width as f64, self.camera.height as f64);
         self.project(point).is_some_and(|(x, y, _)| x >= 0.0 && y >= 0.0 && x < w && y < h)
@@ -77,7 +77,7 @@ pub(super) struct SilhouetteTable {
     height: usize,
     /// Masked pixels above and left of each corner, `[height + 1, width + 1]`.
     table: Vec<u32>,
-    /// Does the mask come within two pixels of the left, top, right, bottom border?
+    /// Whether the mask comes within two pixels of the left, top, right, bottom border.
     cut: [bool; 4],
 }
 
@@ -112,7 +112,7 @@ impl SilhouetteTable {
         silhouette
     }
 
-    /// Is there a masked pixel with x0 ≤ x < x1, y0 ≤ y < y1?
+    /// Returns whether a pixel with x0 ≤ x < x1, y0 ≤ y < y1 is masked.
     fn any(&self, x0: usize, y0: usize, x1: usize, y1: usize) -> bool {
         let at = |x: usize, y: usize| self.table[y * (self.width + 1) + x];
         at(x1, y1) + at(x0, y0) > at(x0, y1) + at(x1, y0)

@@ -154,7 +154,7 @@ fn names_in(text: &str) -> impl Iterator<Item = &str> {
     text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'))
 }
 
-/// Does a photograph's name come back from a model, and from `test.txt` if it is held out?
+/// Returns whether a photograph's name can be read back from a model, and from `test.txt` if it is held out.
 pub(super) fn can_name(name: &str, in_test: bool) -> bool {
     let is_relative = join("images", name).len() > name.len();
     is_relative && (!in_test || !name.contains(char::is_control) && names_in(name).eq([name]))

@@ -55,7 +55,7 @@ pub struct CaptureOptions {
     pub mask_dir: String,
     /// What they mean.
     pub mask_meaning: MaskMeaning,
-    /// Are masks that cannot be right a matter of warnings only?
+    /// Whether masks that cannot be right are reported as warnings only.
     pub trust_masks: bool,
     /// Whether poses are to be measured.
     pub cameras: CameraPoses,

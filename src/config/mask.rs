@@ -153,12 +153,12 @@ table! {
 }
 
 impl MaskConfig {
-    /// Are the masks made, from clicks or by a network?
+    /// Returns whether the run makes the masks, from clicks or by a network.
     pub fn makes_masks(&self) -> bool {
         self.clicked() || self.with_alpha_net()
     }
 
-    /// Are the masks made by the alpha network alone?
+    /// Returns whether the masks are made by the alpha network alone.
     pub fn with_alpha_net(&self) -> bool {
         match self.source {
             MaskSource::Network => true,
@@ -167,12 +167,12 @@ impl MaskConfig {
         }
     }
 
-    /// Is any network to run?
+    /// Returns whether any network is used.
     pub fn with_networks(&self) -> bool {
         self.with_sam() || self.with_vitmatte() || self.with_alpha_net()
     }
 
-    /// Are the masks made from clicks?
+    /// Returns whether the masks are made from clicks.
     pub fn clicked(&self) -> bool {
         match self.source {
             MaskSource::Clicks => true,
@@ -181,7 +181,7 @@ impl MaskConfig {
         }
     }
 
-    /// Is SAM to cut?
+    /// Returns whether SAM makes the hard masks.
     pub fn with_sam(&self) -> bool {
         match self.cut {
             CutMethod::Auto => !self.sam.is_empty(),
@@ -189,7 +189,7 @@ impl MaskConfig {
         }
     }
 
-    /// Is ViTMatte to find the alpha?
+    /// Returns whether ViTMatte makes the alpha.
     pub fn with_vitmatte(&self) -> bool {
         match self.matting {
             MattingMethod::Auto => !self.vitmatte.is_empty(),

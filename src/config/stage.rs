@@ -38,12 +38,12 @@ impl Stage {
         ["mask", "baseline", "tface", "iface", "mesh", "render", "ensemble", "metrics"][self as usize]
     }
 
-    /// Does it learn a field, step by step?
+    /// Returns whether the stage trains a field.
     pub fn learns(self) -> bool {
         matches!(self, Baseline | Tface | Iface)
     }
 
-    /// Does it compute on the device, where that is a GPU?
+    /// Returns whether the stage computes on the configured device.
     pub fn uses_device(self) -> bool {
         self.learns() || matches!(self, Mesh | Render)
     }

@@ -183,14 +183,14 @@ fn ends_with_newline(file: &mut File) -> std::io::Result<bool> {
     Ok(last[0] == b'\n')
 }
 
-/// May files be made in this folder, as far as can be known without making one?
+/// Returns whether files can be created in this folder, as far as is known without creating one.
 #[cfg(unix)]
 pub fn is_writable(folder: &Path) -> bool {
     use rustix::fs::{Access, access};
     access(folder, Access::WRITE_OK | Access::EXEC_OK).is_ok()
 }
 
-/// May files be made in this folder, as far as can be known without making one?
+/// Returns whether files can be created in this folder, as far as is known without creating one.
 #[cfg(not(unix))]
 pub fn is_writable(folder: &Path) -> bool {
     fs::metadata(folder).is_ok_and(|m| !m.permissions().readonly())

@@ -162,7 +162,7 @@ fn countable(header: &[u8]) -> bool {
     product.is_some()
 }
 
-/// Is it bool, an integer or a float of up to 64 bits?
+/// Returns whether the type is bool, an integer or a float of up to 64 bits.
 fn is_read(kind: &TypeStr) -> bool {
     match kind.type_char() {
         TypeChar::Bool | TypeChar::Int | TypeChar::Uint => true,

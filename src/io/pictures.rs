@@ -23,7 +23,7 @@ pub struct PictureInfo {
     pub width: u32,
     /// Stored rows.
     pub height: u32,
-    /// Does it have an alpha channel?
+    /// Whether it has an alpha channel.
     pub alpha: bool,
     /// EXIF orientation, 1 (upright) to 8.
     pub exif: u8,
@@ -37,7 +37,7 @@ impl PictureInfo {
     }
 }
 
-/// Is the turn that EXIF asks for applied? A quarter turn is, only when it is what makes the declared size true:
+/// Returns whether the EXIF rotation is applied. A quarter turn is, only when it is what makes the declared size true:
 /// else cameras were found for the stored pixels. Half turns and mirrors fit any size, so nothing can tell whether
 /// the cameras were found before or after them; like COLMAP they are left alone.
 fn is_turned(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> bool {

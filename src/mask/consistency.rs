@@ -219,7 +219,7 @@ impl Votes {
         cells.map(|cell| (ones(&cell[..self.words]), ones(&cell[self.words..]))).collect()
     }
 
-    /// Does a view rule a cell out?
+    /// Returns whether a view rules a cell out.
     fn rules_out(&self, view: usize, cell: usize) -> bool {
         self.bits[2 * cell * self.words + view / 64] & (1 << (view % 64)) != 0
     }
@@ -265,7 +265,7 @@ impl Conflicts {
         conflict
     }
 
-    /// Is a view's part in the conflict large, or at least unlike that of the others? Of `left` views a single
+    /// Returns whether a view's part in the conflict is large, or at least unlike that of the others. Of `left` views a single
     /// wrong one has half of all credit, so few views can stand out less.
     fn names(&self, i: usize, left: usize) -> bool {
         let mean = self.credit.iter().sum::<f64>() / left as f64;

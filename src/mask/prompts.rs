@@ -236,7 +236,7 @@ struct Photographed<'a> {
 }
 
 impl Photographed<'_> {
-    /// Is it what a file of clicks calls `name`? With or without ending, with or without the folder common to all
+    /// Returns whether a file of clicks means this photograph by `name`: with or without ending, with or without the folder common to all
     /// photographs, and in the folder of pictures already reduced (`images_4/`) as well.
     fn is_called(&self, name: &str) -> bool {
         let bare = stem(name);
@@ -347,7 +347,7 @@ pub struct Click {
 }
 
 impl Click {
-    /// Is it on a photograph of this size? Index 0 is a pixel's center, so a picture reaches from −½ to just before
+    /// Returns whether the click is on a photograph of this size. Index 0 is a pixel's center, so a picture reaches from −½ to just before
     /// `side` − ½, which rounds to the pixel behind the last.
     pub fn is_inside(&self, (width, height): (u32, u32)) -> bool {
         let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;

@@ -57,7 +57,7 @@ pub struct PropagateView<'a> {
     pub camera: &'a Camera,
     /// Its clicks in pixels of the photograph; none for a view without clicks.
     pub clicks: &'a [Click],
-    /// May its photograph shape the masks of other views? Held-out views may not.
+    /// Whether its photograph affects the masks of other views; not for held-out views.
     pub votes: bool,
 }
 
@@ -254,7 +254,7 @@ impl<'a> Propagation<'a> {
         HardMasks { masks, warnings: self.warnings, notes: self.notes }
     }
 
-    /// Does what was proposed stand for the clicks?
+    /// Returns whether a proposed mask replaces the clicks.
     fn is_proposed(&self) -> bool {
         self.inside.iter().any(|inside| !inside.is_empty())
     }

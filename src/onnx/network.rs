@@ -33,12 +33,12 @@ pub enum Contract {
     SamEncoder,
     /// SAM's prompt encoder and mask decoder as transformers exports them.
     SamDecoder {
-        /// Does it take labels? The oldest exports call every point head.
+        /// Whether it takes labels; the oldest exports call every point head.
         labels: bool,
     },
     /// SAM's or MobileSAM's image encoder for the original decoder.
     OriginalEncoder {
-        /// Does it take the picture `[H,W,3]` in 0..255, and normalize and pad inside?
+        /// Whether it takes the picture `[H,W,3]` in 0..255, and normalizes and pads it itself.
         picture: bool,
     },
     /// The original SAM decoder export.

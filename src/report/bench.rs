@@ -34,7 +34,7 @@ pub struct Measure {
     pub name: &'static str,
     /// Digits after the point.
     pub digits: usize,
-    /// Is more better? `None` for what is only counted.
+    /// Whether more is better; `None` for counts.
     pub more_is_better: Option<bool>,
     /// Differences up to this one are noise: of the unit, and as a share of the value.
     pub noise: (f64, f64),

@@ -48,7 +48,7 @@ pub struct Ordering {
     pub worse: &'static str,
     /// The measure by which.
     pub by: &'static str,
-    /// May they be equal, within a twentieth of a decibel?
+    /// Whether they may be equal, within a twentieth of a decibel.
     pub or_equal: bool,
 }
 
@@ -190,7 +190,7 @@ pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
     Some(Interval { mean, low: at(0.025), high: at(0.975) })
 }
 
-/// Does an ordering hold?
+/// Whether an ordering holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Holds {
@@ -257,7 +257,7 @@ impl Experiment {
         found.map(|p| p.value)
     }
 
-    /// Was a row judged by masks that its own run made, for a capture at least?
+    /// Returns whether, for at least one capture, a row was evaluated with masks that its own run made.
     fn judged_itself(&self, row: usize) -> bool {
         self.measured[row].iter().any(|m| m.masks.as_deref() == Some("run"))
     }

@@ -27,7 +27,7 @@ pub struct RunRow {
     pub state: String,
     /// Whether all stages are done.
     pub done: bool,
-    /// Did it end by an error?
+    /// Whether it ended with an error.
     pub failed: bool,
     /// The preset, if it can be read.
     pub preset: String,
@@ -39,7 +39,7 @@ pub struct RunRow {
     pub method: String,
     /// Masked PSNR of the mesh, as the best viewer of it shows.
     pub mesh_psnr: Option<f64>,
-    /// Is the mesh watertight?
+    /// Whether the mesh is watertight.
     pub watertight: Option<bool>,
     /// Of the mesh.
     pub triangles: Option<u64>,

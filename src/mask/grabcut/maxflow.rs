@@ -148,7 +148,7 @@ impl PixelGraph {
         }
     }
 
-    /// Can flow run between `p` and its neighbor in the sense of `p`'s tree, away from the root?
+    /// Returns whether flow can run between `p` and its neighbor in the sense of `p`'s tree, away from the root.
     fn open(&self, p: usize, direction: usize, q: usize) -> bool {
         if self.tree[p] == HEAD {
             self.residual[p][direction] > 0
@@ -282,7 +282,7 @@ impl PixelGraph {
         self.tree[p] = 0;
     }
 
-    /// May flow run between the root and `p` through its neighbor `q` in this direction?
+    /// Returns whether flow may run between the root and `p` through its neighbor `q` in this direction.
     fn feeds(&self, q: usize, p: usize, direction: usize) -> bool {
         if self.tree[p] == HEAD {
             self.residual[q][direction ^ 1] > 0

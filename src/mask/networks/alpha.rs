@@ -125,7 +125,7 @@ const STEP: usize = 32;
 pub(super) struct VitMatte {
     pub(super) session: NetworkSession,
     normal: Normal,
-    /// Is it shown the thirds of the original code, or the trimap over 255?
+    /// Whether the input is the thirds of the original code, instead of the trimap divided by 255.
     thirds: bool,
 }
 

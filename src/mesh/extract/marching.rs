@@ -341,7 +341,7 @@ impl Bits {
         &self.words[start..start + self.per_row]
     }
 
-    /// Is this node inside?
+    /// Returns whether this node is inside.
     pub(super) fn get(&self, i: usize, j: usize, k: usize) -> bool {
         self.row(j, k)[i / 64] >> (i % 64) & 1 == 1
     }

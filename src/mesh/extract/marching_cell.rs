@@ -107,7 +107,7 @@ fn bit(case: u8, corner: u8) -> bool {
     case >> corner & 1 == 1
 }
 
-/// Is this edge crossed?
+/// Returns whether this edge is crossed.
 pub(super) fn crossed(case: u8, edge: usize) -> bool {
     bit(case, EDGES[edge][0]) != bit(case, EDGES[edge][1])
 }
@@ -148,7 +148,7 @@ fn edge_between(a: u8, b: u8) -> u8 {
     }
 }
 
-/// Do two edges lie on one cube face? They do when they agree on a coordinate that is fixed for both.
+/// Returns whether two edges lie on one cube face: they do when they agree on a coordinate that is fixed for both.
 fn share_face(a: u8, b: u8) -> bool {
     let (ca, cb) = (EDGES[a as usize], EDGES[b as usize]);
     (0..3).any(|axis| {

@@ -176,7 +176,7 @@ impl Flood<'_> {
             .then(|| self.coarse[self.lattice_index(node.map(|c| c / step))])
     }
 
-    /// Has a node evaluated with the next batch, unless it is known.
+    /// Adds a node to the next batch, unless its value is known.
     fn want(&mut self, node: [usize; 3]) {
         if self.blocks.claim(node) {
             self.wanted.push(node);
@@ -350,7 +350,7 @@ impl Blocks {
         }
     }
 
-    /// Is a known node inside?
+    /// Returns whether a known node is inside.
     fn inside(&self, node: [usize; 3]) -> bool {
         self.known(node) == Some(true)
     }
