@@ -1,7 +1,7 @@
-//! The command line: a file per command, named as it is typed, but that small ones share `about` and `capture`. The only
-//! module that prints.
+//! The command line: a file per command, with its name; small commands share `about` and `capture`. The only module that
+//! prints.
 //!
-//! Data goes to stdout, everything else to stderr; the exit code says whether to try again
+//! Data goes to stdout, everything else to stderr; the exit code distinguishes errors worth a retry
 //! ([`crate::ErrorKind`]).
 
 mod about;
@@ -22,9 +22,9 @@ mod status;
 use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
-use about::Form;
 use bench::BenchOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap_complete::Shell;
 use experiment::ExperimentOptions;
 use options::{Common, KeyOption, RunTarget};
 use out::Out;
@@ -63,7 +63,7 @@ struct Cli {
     common: Common,
 }
 
-/// What a stage command works on.
+/// Capture or run of a stage command.
 #[derive(Args, Debug)]
 struct CaptureOrRun {
     /// Capture (a folder of photographs with cameras) or run [default: the run in this folder, else the newest under
@@ -72,7 +72,7 @@ struct CaptureOrRun {
     path: Option<PathBuf>,
 }
 
-/// Masks from clicks.
+/// Options for masks from clicks.
 #[derive(Args, Debug, Default)]
 struct ClickOptions {
     /// Make masks from the clicks in a prompts.json
@@ -99,7 +99,8 @@ struct ClickOptions {
 }
 
 impl ClickOptions {
-    /// As keys of the configuration; files by their absolute path, so that the run remembers them from anywhere.
+    /// Returns the options as keys of the configuration; files by their absolute path, so that the run finds them from any
+    /// working directory.
     fn keys(&self) -> Result<Vec<KeyOption>> {
         let file = |option: &str, key: &str, file: &Option<PathBuf>| -> Result<Option<KeyOption>> {
             let Some(file) = file else { return Ok(None) };
@@ -137,7 +138,7 @@ enum Command {
   tiface run captures/002_00 --require psnr=28      exit with 3 if the PSNR is lower")]
     Run {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         #[command(flatten)]
         clicks: ClickOptions,
         /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
@@ -198,7 +199,7 @@ On three photographs from different sides, click the face, the hair, every garme
 background twice. The masks of the other views follow from the cameras.")]
     Mask {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         #[command(flatten)]
         clicks: ClickOptions,
         /// Write a page to click on instead, to --out or <capture>_clicks.html
@@ -233,7 +234,7 @@ background twice. The masks of the other views follow from the cameras.")]
   tiface mesh runs/002_00 --fresh mesh --triangles 20000 --texture 4096 --lobes 1 --normal-map")]
     Mesh {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Formats to write: glb, obj, ply
         #[arg(long, value_name = "LIST")]
         format: Option<String>,
@@ -273,7 +274,7 @@ Views of other cameras than the held-out ones are written to render/paths/, one 
 held-out views, their blend and the metrics do not change; --fresh render then renders only that path again.")]
     Render {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Cameras: test (the held-out views), train, orbit or a file (a nerfstudio camera path or a
         /// transforms.json)
         #[arg(long, value_name = "WHICH")]
@@ -299,7 +300,7 @@ Without --weights, the weights are fitted on small squares of the training photo
 all trainings (capture.tiles).")]
     Ensemble {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
         /// and raster (head.glb)
         #[arg(long, value_name = "LIST")]
@@ -311,12 +312,12 @@ all trainings (capture.tiles).")]
     /// Stage: compare views and blends with held-out photographs
     Metrics {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
-    /// Draw a run's mesh, or any .glb, .obj or .ply
+    /// Render pictures of a run's mesh, or of any .glb, .obj or .ply
     #[command(after_long_help = "Examples:
   tiface preview runs/002_00                    draw a three-quarter view, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --up z --out scan.png
@@ -396,7 +397,7 @@ that are done or have not begun are summed up; -v prints a line for each.")]
   tiface config --explain iface.steps           explain a key; --explain mesh explains a table")]
     Config {
         #[command(flatten)]
-        place: CaptureOrRun,
+        input: CaptureOrRun,
         /// Explain a key or a table: meaning, range and value in every preset
         #[arg(long, value_name = "KEY")]
         explain: Option<String>,
@@ -408,31 +409,30 @@ that are done or have not begun are summed up; -v prints a line for each.")]
 
 It exits with 1 if a device fails its self-test against the CPU. A build without the feature `wgpu` has no GPUs.")]
     Doctor,
-    /// Print shell completions, or write manual pages
+    /// Print shell completions
     #[command(after_long_help = "Examples:
   tiface completions bash > /etc/bash_completion.d/tiface
-  tiface completions man | man -l -             show the manual page
-  tiface completions man --out man1/            write a page for each command: tiface.1, tiface-run.1, ...")]
+  tiface completions zsh > ~/.zfunc/_tiface
+  tiface completions fish > ~/.config/fish/completions/tiface.fish")]
     Completions {
-        /// Shell, or `man` for manual pages
-        form: Form,
+        /// Shell to complete for
+        shell: Shell,
     },
 }
 
-/// Ends the process where memory for so many bytes cannot be had. Nothing is allocated on the way, and nothing is lost
-/// that a kill would have kept.
+/// Ends the process after a failed allocation of `bytes`. Does not allocate; loses no more than a kill would.
 #[cold]
 pub fn out_of_memory(bytes: usize) -> ! {
     let _ = writeln!(
         std::io::stderr(),
-        "error: out of memory: {bytes} bytes more cannot be had\n\n\
+        "error: out of memory: {bytes} more bytes are not available\n\n\
          hint: free memory, raise `capture.downscale`, or lower `mesh.resolution` or the `rays` of a field; what is \
          complete is kept: repeat the command to continue"
     );
     signal_hook::low_level::exit(crate::ErrorKind::NotNow.code().into())
 }
 
-/// Parses the command line, does what it says, and gives the exit code.
+/// Parses the command line, runs the command and returns the exit code.
 pub fn main() -> ExitCode {
     let Cli { command, common } = match Cli::try_parse() {
         Ok(cli) => cli,
@@ -447,8 +447,8 @@ pub fn main() -> ExitCode {
     let makes_nothing = |command: &str| Out::none(common.out.as_deref(), command);
     let ended = signals::listen(&invocation).and_then(|()| match &command {
         Command::Demo { size, views, border } => demo::run(&invocation, size.as_deref(), *views, *border),
-        Command::Mask { place, clicks, page: true } => {
-            capture::page(&invocation, place.path.as_deref(), clicks.prompts.as_deref())
+        Command::Mask { input, clicks, page: true } => {
+            capture::page(&invocation, input.path.as_deref(), clicks.prompts.as_deref())
         }
         Command::Inspect { capture } => {
             makes_nothing("inspect").and_then(|()| capture::inspect(&common, capture))
@@ -461,11 +461,12 @@ pub fn main() -> ExitCode {
         Command::Experiment(options) => experiment::run(&invocation, options),
         Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
         Command::Report { runs, table } => report::run(&invocation, runs, *table),
-        Command::Config { place, explain } => makes_nothing("config")
-            .and_then(|()| about::config(&common, place.path.as_deref(), explain.as_deref())),
+        Command::Config { input, explain } => makes_nothing("config")
+            .and_then(|()| about::config(&common, input.path.as_deref(), explain.as_deref())),
         Command::Doctor => makes_nothing("doctor").and_then(|()| about::doctor(&common)),
-        Command::Completions { form } => Out::find(common.out.as_deref(), "completions")
-            .and_then(|out| about::completions(*form, Cli::command(), out.as_ref())),
+        Command::Completions { shell } => {
+            makes_nothing("completions").and_then(|()| about::completions(*shell, Cli::command()))
+        }
         stages => run::run(&invocation, &stages.on_stages(&common)?),
     });
     ExitCode::from(match ended {
@@ -481,14 +482,14 @@ impl Command {
     /// Returns the stages that a command runs, and its settings.
     fn on_stages(&self, common: &Common) -> Result<StageCommand<'_>> {
         let on = |flag: bool, value: &'static str| flag.then_some(value);
-        let (place, until, keys) = match self {
-            Command::Run { place, clicks, .. } => (place, Stage::Metrics, clicks.keys()?),
-            Command::Mask { place, clicks, .. } => (place, Stage::Mask, clicks.keys()?),
-            Command::Baseline(place) => (place, Stage::Baseline, Vec::new()),
-            Command::Tface(place) => (place, Stage::Tface, Vec::new()),
-            Command::Iface(place) => (place, Stage::Iface, Vec::new()),
+        let (input, until, keys) = match self {
+            Command::Run { input, clicks, .. } => (input, Stage::Metrics, clicks.keys()?),
+            Command::Mask { input, clicks, .. } => (input, Stage::Mask, clicks.keys()?),
+            Command::Baseline(input) => (input, Stage::Baseline, Vec::new()),
+            Command::Tface(input) => (input, Stage::Tface, Vec::new()),
+            Command::Iface(input) => (input, Stage::Iface, Vec::new()),
             Command::Mesh {
-                place,
+                input,
                 format,
                 frame,
                 triangles,
@@ -510,25 +511,25 @@ impl Command {
                     ("--normal-map", "mesh.normal_map", on(*normal_map, "true")),
                     ("--no-cap", "mesh.cap", on(*no_cap, "false")),
                 ]);
-                (place, Stage::Mesh, keys)
+                (input, Stage::Mesh, keys)
             }
-            Command::Render { place, cameras, method, format, background } => {
+            Command::Render { input, cameras, method, format, background } => {
                 let keys = key_options([
                     ("--cameras", "render.cameras", cameras.as_deref()),
                     ("--with", "render.method", method.as_deref()),
                     ("--format", "render.format", format.as_deref()),
                     ("--background", "render.background", background.as_deref()),
                 ]);
-                (place, Stage::Render, keys)
+                (input, Stage::Render, keys)
             }
-            Command::Ensemble { place, members, weights } => {
+            Command::Ensemble { input, members, weights } => {
                 let keys = key_options([
                     ("--members", "ensemble.members", members.as_deref()),
                     ("--weights", "ensemble.weights", weights.as_deref()),
                 ]);
-                (place, Stage::Ensemble, keys)
+                (input, Stage::Ensemble, keys)
             }
-            Command::Metrics { place, .. } => (place, Stage::Metrics, Vec::new()),
+            Command::Metrics { input, .. } => (input, Stage::Metrics, Vec::new()),
             other => unreachable!("{other:?} runs no stage"),
         };
         let (product, require) = match self {
@@ -536,12 +537,12 @@ impl Command {
             Command::Metrics { require, .. } => ("metrics", &require[..]),
             _ => (until.word(), &[][..]),
         };
-        let target = RunTarget::find(common, place.path.as_deref())?;
+        let target = RunTarget::find(common, input.path.as_deref())?;
         Ok(StageCommand { product, until, target, require, keys, fallback: None })
     }
 }
 
-/// Options of one command that are keys of the configuration under a shorter name: those that were given.
+/// Returns the given options of a command, each as the configuration key that it sets.
 fn key_options<const N: usize>(options: [(&str, &str, Option<&str>); N]) -> Vec<KeyOption> {
     let given = options.into_iter().filter_map(|(option, key, value)| {
         value.map(|v| (format!("{option} {v}"), key.to_string(), v.to_string()))
@@ -549,11 +550,11 @@ fn key_options<const N: usize>(options: [(&str, &str, Option<&str>); N]) -> Vec<
     given.collect()
 }
 
-/// One command at work.
+/// A running command.
 struct Invocation<'a> {
     /// The options that every command shares.
     pub common: &'a Common,
-    /// Where people see what happens.
+    /// Output for users.
     pub screen: Arc<Screen>,
     /// Set on a request to stop.
     pub stop: Stop,
@@ -577,7 +578,7 @@ mod tests {
         ] {
             let cli = Cli::try_parse_from(words).unwrap();
             assert_eq!(cli.common.seed, Some(7));
-            assert!(matches!(cli.command, Command::Run { place, .. } if place.path.is_some()));
+            assert!(matches!(cli.command, Command::Run { input, .. } if input.path.is_some()));
         }
     }
 

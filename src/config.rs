@@ -53,12 +53,12 @@ pub struct Key {
 }
 
 impl Key {
-    /// A number between `min` and `max`, both allowed.
+    /// Returns a number between `min` and `max`, both allowed.
     pub const fn number(name: &'static str, doc: &'static str, min: f64, max: f64) -> Key {
         Key { name, doc, min, max }
     }
 
-    /// A word, text, switch or list.
+    /// Returns a word, text, switch or list.
     pub const fn word(name: &'static str, doc: &'static str) -> Key {
         Key { name, doc, min: f64::NEG_INFINITY, max: f64::INFINITY }
     }
@@ -178,7 +178,7 @@ const TABLES: &[(&str, &[Key])] = &[
     ("metrics", MetricsConfig::KEYS),
 ];
 
-/// Every key with its full, dotted name.
+/// Returns every key with its full, dotted name.
 fn all_keys() -> impl Iterator<Item = (String, &'static Key)> {
     TABLES.iter().flat_map(|(table, keys)| keys.iter().map(|k| (dotted(table, k.name), k)))
 }
@@ -237,7 +237,7 @@ impl Config {
         }
     }
 
-    /// The configuration that `sources` describe, or the first thing wrong with them.
+    /// Returns the configuration that `sources` describe, or the first thing wrong with them.
     ///
     /// ```
     /// use tiface::config::{Config, Preset, Sources};
@@ -273,7 +273,7 @@ impl Config {
         out
     }
 
-    /// The values of one table (`iface`), by full name (`iface.steps`), as they are written in TOML:
+    /// Returns the values of one table (`iface`), by full name (`iface.steps`), as they are written in TOML:
     /// what a stage's fingerprint is made of.
     pub fn values(&self, table: &str) -> BTreeMap<String, String> {
         let root = self.to_table();
@@ -283,7 +283,7 @@ impl Config {
             .collect()
     }
 
-    /// The keys whose values are not those of the preset: full name, value, the preset's value, as in TOML.
+    /// Returns the keys whose values are not those of the preset: full name, value, the preset's value, as in TOML.
     pub fn changes(&self) -> Vec<[String; 3]> {
         let (own, preset) = (self.to_table(), Config::preset(self.preset).to_table());
         let change = |(name, _): (String, &Key)| {
@@ -302,7 +302,7 @@ impl Config {
     }
 }
 
-/// What a key or a whole table means, its range and its value in every preset; an unknown name is an
+/// Returns what a key or a whole table means, its range and its value in every preset; an unknown name is an
 /// error that knows the nearest one.
 pub fn explain(name: &str) -> Result<String> {
     let wanted: Vec<_> =
@@ -341,7 +341,7 @@ fn lookup<'a>(root: &'a Table, dotted: &str) -> Option<&'a Value> {
     Some(value)
 }
 
-/// A value as it is written in TOML. A number that came from an f32 is written with an f32's digits
+/// Returns a value as it is written in TOML. A number that came from an f32 is written with an f32's digits
 /// (0.1, not 0.10000000149011612): read back, it is the same f32.
 fn show(value: &Value) -> String {
     match value {
@@ -362,9 +362,9 @@ pub struct DeviceChoice {
     pub name: String,
     /// Which of its adapters, from 0.
     pub number: Option<usize>,
-    /// Are sums of many threads made in whole numbers, so that they are the same bytes every time? The processor's are.
+    /// Whether GPU sums are accumulated in fixed point, bitwise reproducible; on the CPU they always are.
     pub deterministic: bool,
-    /// GiB of its memory that a training may take; all of it where nothing is said.
+    /// Memory that a training may use, GiB; `None`: all of it.
     pub memory_gib: Option<f64>,
 }
 

@@ -26,7 +26,7 @@ pub enum ErrorKind {
 }
 
 impl ErrorKind {
-    /// The exit code a shell sees.
+    /// Returns the exit code a shell sees.
     pub fn code(self) -> u8 {
         self as u8
     }
@@ -104,12 +104,12 @@ impl Error {
         self.message.is_empty()
     }
 
-    /// What a caller can do about it.
+    /// Returns what a caller can do about it.
     pub fn kind(&self) -> ErrorKind {
         self.kind
     }
 
-    /// What to do about it, for a person; may be empty.
+    /// Returns what to do about it, for a person; may be empty.
     pub fn hint(&self) -> &str {
         &self.hint
     }

@@ -9,7 +9,6 @@ mod ray;
 mod shells;
 mod similarity;
 pub mod sphharm;
-mod symmetric;
 mod topology;
 
 pub use bvh::{Bvh, Closest};
@@ -18,16 +17,54 @@ pub use field::SdfField;
 pub use mesh::{Atlas, Mesh};
 pub(crate) use mesh::{area_vector, bilinear_taps, shape};
 pub(crate) use overlap::{
-    Boxes, DBox, EFFORT, Effort, OutlineSide, THOROUGH, intersect, nearest_charts, overlaps, share_out,
-    shared_area, turn,
+    Boxes, DBox, DEFAULT_EFFORT, Effort, OutlineSide, THOROUGH_EFFORT, intersect, nearest_charts, overlaps,
+    share_out, shared_area, turn,
 };
 pub use ray::{Aabb, Hit, Ray, RayResult};
 pub use shells::{ShellCaster, ShellLayer, Shells};
 pub use similarity::Similarity;
 pub use sphharm::Harmonics;
-pub(crate) use symmetric::cofactors;
 pub(crate) use topology::{Sets, side_ends, sorted_sides};
 pub use topology::{Topology, topology};
 
 #[cfg(test)]
 pub(crate) use field::Painted;
+
+/// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of entries
+/// `xx xy xz yy yz zz`: their quotient is the inverse.
+#[inline]
+pub(crate) fn cofactors([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> ([f64; 6], f64) {
+    let c = [
+        yy * zz - yz * yz,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz * xz,
+        xy * xz - xx * yz,
+        xx * yy - xy * xy,
+    ];
+    (c, xx * c[0] + xy * c[1] + xz * c[2])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_matrix_times_its_cofactors_is_its_determinant() {
+        let (m, [xx, xy, xz, yy, yz, zz]) = {
+            let m = [4.0, 1.0, -2.0, 3.0, 0.5, 5.0];
+            (m, m)
+        };
+        let (c, determinant) = cofactors(m);
+        // 4 · (15 − 0.25) − 1 · (5 + 1) − 2 · (0.5 + 6)
+        assert_eq!(determinant, 40.0);
+        let rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+        let columns = [[c[0], c[1], c[2]], [c[1], c[3], c[4]], [c[2], c[4], c[5]]];
+        for (i, row) in rows.iter().enumerate() {
+            for (j, column) in columns.iter().enumerate() {
+                let sum: f64 = row.iter().zip(column).map(|(a, b)| a * b).sum();
+                assert_eq!(sum, if i == j { determinant } else { 0.0 });
+            }
+        }
+    }
+}

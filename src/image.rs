@@ -62,30 +62,30 @@ pub struct Image {
 }
 
 impl Image {
-    /// All zero.
+    /// Returns an image of zeros.
     pub fn new(width: u32, height: u32, channels: usize) -> Image {
         Image { width, height, channels, data: vec![0.0; width as usize * height as usize * channels] }
     }
 
-    /// The values of channel `k`, one a pixel.
+    /// Returns the values of channel `k`, one a pixel.
     pub fn channel(&self, k: usize) -> Vec<f32> {
         self.data.iter().skip(k).step_by(self.channels).copied().collect()
     }
 
-    /// The values of one pixel.
+    /// Returns the values of one pixel.
     pub fn pixel(&self, x: u32, y: u32) -> &[f32] {
         let i = (y as usize * self.width as usize + x as usize) * self.channels;
         &self.data[i..i + self.channels]
     }
 
-    /// The values of one pixel, to write.
+    /// Returns the values of one pixel, to write.
     pub fn pixel_mut(&mut self, x: u32, y: u32) -> &mut [f32] {
         let i = (y as usize * self.width as usize + x as usize) * self.channels;
         &mut self.data[i..i + self.channels]
     }
 }
 
-/// A pixel with straight alpha as it is over black.
+/// Returns a pixel with straight alpha as it is over black.
 pub fn over_black([r, g, b, a]: [u8; 4]) -> [u8; 3] {
     [r, g, b].map(|v| ((u16::from(v) * u16::from(a) + 127) / 255) as u8)
 }
@@ -99,7 +99,7 @@ pub fn quantize(c: f32) -> u8 {
 pub fn eroded(mut set: Vec<bool>, w: usize, h: usize, margin: usize) -> Vec<bool> {
     for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
         for first in (0..lines).map(|line| line * step) {
-            // so many set ones in a row, up to here
+            // length of the run of set values that ends here
             let mut run = 0;
             let runs: Vec<usize> = (0..n)
                 .map(|i| {

@@ -19,12 +19,11 @@
 //! ```
 
 pub mod distance;
-#[cfg(feature = "matting")]
+#[cfg_attr(not(feature = "matting"), path = "metrics/no_lpips.rs")]
 mod lpips;
 mod parts;
 mod psnr_ssim;
 
-#[cfg(feature = "matting")]
 pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr_ssim::{psnr, ssim_reflect_map, ssim_valid};

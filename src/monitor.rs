@@ -11,7 +11,7 @@ pub trait Monitor: Send + Sync {
     /// `step` of `steps` is done; `values` are named figures of this step (losses, rays, rate, ...).
     fn step(&self, step: u64, steps: u64, values: &[(&str, f64)]);
 
-    /// Has someone asked to stop?
+    /// Returns whether a stop was requested.
     fn stop(&self) -> bool;
 
     /// Returns an error once someone has asked to stop.

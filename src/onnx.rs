@@ -30,7 +30,7 @@ use tract_onnx::prelude::*;
 use tract_onnx::tract_hir::infer::Factoid;
 
 /// Bytes of a network's file at most; a Protocol Buffers message cannot be larger.
-const MOST_FILE_BYTES: u64 = 2 << 30;
+const MAX_FILE_BYTES: u64 = 2 << 30;
 
 /// A network ready to run.
 pub(crate) struct NetworkSession {
@@ -49,7 +49,7 @@ impl NetworkSession {
     /// Reads, recognizes and loads a file, which must be of a form of this role. `array_bytes` is the size of the largest
     /// single array that may be planned.
     pub(crate) fn open(role: Role, path: &Path, array_bytes: u64) -> Result<NetworkSession> {
-        let bytes = io::read_bytes(path, &Limits { file_bytes: MOST_FILE_BYTES, ..Limits::default() })?;
+        let bytes = io::read_bytes(path, &Limits { file_bytes: MAX_FILE_BYTES, ..Limits::default() })?;
         if names_another_file(&bytes) {
             return Err(file_error(
                 path,
@@ -126,7 +126,7 @@ impl NetworkSession {
         Err(self.unusable(&self.outputs[output], problem))
     }
 
-    /// The output is not as its form promises.
+    /// Returns the error for an output that does not match its declared form.
     pub(crate) fn unusable(&self, output: &str, problem: impl std::fmt::Display) -> Error {
         let hint = "take the network's file from its publisher again; its weights or its graph are damaged";
         file_error(&self.file.path, &format!("gave an unusable `{output}`: {problem}"), hint)
@@ -232,7 +232,7 @@ impl TractModel {
         Ok(())
     }
 
-    /// What is known of a node's outputs once what is known of its inputs is taken in. Inferring also computes
+    /// Returns what is known of a node's outputs once what is known of its inputs is taken in. Inferring also computes
     /// what is constant, so the extents alone are asked for first.
     fn inferred(&self, model: &InferenceModel, id: usize) -> TractResult<Vec<InferenceFact>> {
         let node = model.node(id);
@@ -274,7 +274,7 @@ impl TractModel {
     }
 }
 
-/// Where and why, in a sentence: the first of what the engine says, and the beginning of the innermost; the
+/// Returns where and why, in a sentence: the first of what the engine says, and the beginning of the innermost; the
 /// pages of shape algebra between them go to the log.
 fn sentence(error: &TractError) -> String {
     tracing::debug!(target: "tract", "{error:#}");

@@ -28,7 +28,6 @@ pub mod experiment;
 mod finish;
 mod inputs;
 mod learn;
-mod lpips;
 mod mask;
 mod mesh;
 mod metrics;

@@ -35,9 +35,9 @@ pub const LEARNED: [(Stage, &[&str]); 3] = [
 ];
 
 /// The error that is drawn brightest: a fifth of the range of a color.
-pub const MOST_ERROR: f32 = 0.2;
+pub const MAX_ERROR: f32 = 0.2;
 
-/// Colors of errors from none to [`MOST_ERROR`], even steps: dark to bright, also in gray.
+/// Colors of errors from none to [`MAX_ERROR`], even steps: dark to bright, also in gray.
 pub const HEAT: [[u8; 3]; 6] =
     [[0, 0, 4], [66, 10, 104], [147, 38, 103], [221, 81, 58], [252, 165, 10], [252, 255, 164]];
 
@@ -179,9 +179,9 @@ pub struct ViewerCamera {
 }
 
 impl Viewer {
-    /// The part of a page that shows it; [`VIEWER_SCRIPT`] makes it work.
+    /// Returns the part of a page that shows it; [`VIEWER_SCRIPT`] makes it work.
     fn html(&self) -> Result<String> {
-        let data = json!({"cameras": self.cameras, "front": self.front, "most": MOST_ERROR, "heat": HEAT});
+        let data = json!({"cameras": self.cameras, "front": self.front, "most": MAX_ERROR, "heat": HEAT});
         // no name can end the script that holds it
         let data = data.to_string().replace('<', "\\u003c");
         let glb = base64(&self.glb);
@@ -209,7 +209,7 @@ pub struct ViewRow {
 /// A picture of a view.
 #[derive(Clone, Debug, Serialize)]
 pub struct ViewPicture {
-    /// The word of who made it.
+    /// The name of the method that made it.
     pub method: String,
     /// What a person calls that.
     pub title: String,
@@ -236,7 +236,7 @@ pub fn html(report: &Report) -> Result<String> {
         include_str!("report/page.html"),
         context! {
             style => STYLE, script => include_str!("report/page.js"), viewer_script => VIEWER_SCRIPT,
-            viewer, methods, heat => heat(), most => (MOST_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
+            viewer, methods, heat => heat(), most => (MAX_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
         },
     )
 }
@@ -251,7 +251,7 @@ pub fn viewer_html(viewer: &Viewer, views: &[ViewRow]) -> Result<String> {
     )
 }
 
-/// The colors of errors as CSS.
+/// Returns the colors of errors as CSS.
 fn heat() -> String {
     let colors: Vec<String> = HEAT.iter().map(|[r, g, b]| format!("rgb({r} {g} {b})")).collect();
     format!("linear-gradient(to right, {})", colors.join(", "))
@@ -268,7 +268,7 @@ fn fill(template: &str, context: minijinja::Value) -> Result<String> {
     parts.and(page).and_then(|page| page.render(context)).map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
-/// A picture file, PNG, JPEG or SVG, as a `data:` address.
+/// Returns a picture file, PNG, JPEG or SVG, as a `data:` address.
 pub fn picture_url(file: &[u8]) -> String {
     let kind = match file {
         [0xFF, 0xD8, ..] => "jpeg",
@@ -278,7 +278,7 @@ pub fn picture_url(file: &[u8]) -> String {
     format!("data:image/{kind};base64,{}", base64(file))
 }
 
-/// A path as an address relative to the page: whatever could mean something else there is coded (RFC 3986).
+/// Returns a path as an address relative to the page: whatever could mean something else there is coded (RFC 3986).
 pub fn link(path: &str) -> String {
     let byte = |b: u8| match b {
         b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' | b'/' => (b as char).to_string(),
@@ -305,8 +305,8 @@ pub fn leaves(value: &Value) -> Vec<(String, String)> {
     map.iter().flat_map(inner).collect()
 }
 
-/// What the figures of `metrics.json` were taken against, from its `truth`: a few words, or nothing where it says
-/// nothing.
+/// Returns what the figures of `metrics.json` were taken against, from its `truth`: a few words, or nothing where it
+/// says nothing.
 pub fn judged_by(truth: &Value) -> Option<String> {
     let photographs = match truth["photographs"].as_str()? {
         "photo" => "against photographs as they were taken",

@@ -1,4 +1,4 @@
-//! A run directory: one folder per stage, and how a stage reports from inside it.
+//! A run directory: one folder per stage, with its status and its record.
 //!
 //! ```text
 //! runs/002_00/iface/.lock        held while a process works on the stage
@@ -7,16 +7,15 @@
 //!                   …            the stage's own files
 //!                   done.json    last: what shaped the result, and its figures
 //! runs/002_00/estimate.json      estimated cost of the stages, written before they run
-//!             failed.json        what a command ended with before any stage could say so
+//!             failed.json        the error of a command that ended before its first stage
 //! ```
 //!
 //! A stage whose `done.json` has the same fingerprint is skipped without touching a file; one with
-//! another fingerprint is an error that prints the difference, since neither retraining nor reusing
-//! should happen in silence.
+//! another fingerprint is an error that prints the difference: nothing is retrained or reused silently.
 //!
-//! Repeating a command after any accident gives the same bytes in the stage's own files (on one
-//! device and for one seed). `status.json`, `log.jsonl` and `done.json` tell when and how fast
-//! things happened, and so differ from run to run.
+//! Repeating a command after an interruption gives the same bytes in the stage's own files (on one
+//! device and for one seed). `status.json`, `log.jsonl` and `done.json` contain times and rates, and
+//! so differ from run to run.
 
 use crate::{Error, ErrorKind, Quiet, Result};
 mod fingerprint;
@@ -48,8 +47,8 @@ pub struct Run {
 
 const LOCK: &str = ".lock";
 
-/// Is this the folder of a stage, or of a product of its own below one? It has a lock from the first moment;
-/// a copy may have lost that.
+/// Returns whether this is the folder of a stage, or of a separate product inside one: it has a lock, or, as a copy may
+/// have lost it, a record or a status.
 fn has_record(folder: &Path) -> bool {
     let lock = folder.join(LOCK);
     (io::is_file(&lock) && !io::is_link(&lock))
@@ -58,29 +57,29 @@ fn has_record(folder: &Path) -> bool {
 }
 
 impl Run {
-    /// The run in `dir`; the folder is made with the first file that is written. Events go to
-    /// `observer`; every stage stops when `stop` says so.
+    /// Opens the run in `dir`; the folder is created with the first file. Events go to `observer`; `stop` stops every
+    /// stage.
     pub fn open(dir: &Path, stop: Stop, observer: Arc<dyn Observer>) -> Run {
         Run { dir: dir.into(), stop, observer }
     }
 
-    /// The run in `dir`, which reports nothing and never stops.
+    /// Opens the run in `dir` without an observer or a stop request.
     pub fn quiet(dir: &Path) -> Run {
         Run::open(dir, Stop::new(), Arc::new(Quiet))
     }
 
-    /// The folder of the run.
+    /// Returns the folder of the run.
     pub fn dir(&self) -> &Path {
         &self.dir
     }
 
-    /// A file or folder of the run.
+    /// Returns the path of a file or folder of the run.
     pub fn path(&self, name: impl AsRef<Path>) -> PathBuf {
         self.dir.join(name)
     }
 
-    /// Writes a file of the run itself (`config.toml`, `cameras.json`, `report.html`); one that
-    /// holds the same bytes already is left alone, so that its time of modification stays honest.
+    /// Writes a file of the run itself (`config.toml`, `cameras.json`, `report.html`); a file with the same bytes is not
+    /// rewritten, so that its modification time stays meaningful.
     pub fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
         let path = self.path(name);
         if io::is_file(&path) && io::read_bytes(&path, &io::Limits::default()).is_ok_and(|old| old == bytes) {
@@ -95,18 +94,18 @@ impl Run {
         Ok(io::write_atomic(&path, bytes)?)
     }
 
-    /// Removes what stages have made, so that they start anew; `names` in pipeline order. All their
-    /// locks are held meanwhile. What has a lock or a record of its own below a stage's folder stays.
+    /// Removes the results of stages, so that they are computed again; `names` in pipeline order. All their locks are
+    /// held meanwhile. Subfolders with a lock or a record of their own stay.
     ///
     /// # Errors
     ///
-    /// A folder that is a link, or that holds what no stage has made, and then nothing is removed at all.
+    /// Fails if a folder is a link or contains files of another origin; then nothing is removed.
     pub fn fresh(&self, names: &[String]) -> Result<()> {
         let folders: Vec<&String> = names.iter().filter(|n| io::is_folder(&self.path(n))).collect();
         for name in &folders {
             if let Some(link) = self.link(name) {
                 return Err(Error::cannot(
-                    format!("`{}` is a link, and what lies behind a link is not removed", link.display()),
+                    format!("`{}` is a link, and links are not followed to remove files", link.display()),
                     "remove the link, then repeat the command",
                 ));
             }
@@ -124,46 +123,42 @@ impl Run {
         Ok(())
     }
 
-    /// An error if a stage's folder holds something, and nothing says that a stage has made it.
+    /// Fails if a stage's folder contains files but no trace of a stage.
     fn is_ours(&self, name: &str) -> Result<()> {
         let folder = self.path(name);
         if has_record(&folder) {
             return Ok(());
         }
         match io::any_file(&folder, &has_record)? {
-            // another process began the stage between the two looks
+            // another process began the stage between the two checks
             Some(_) if has_record(&folder) => Ok(()),
             Some(file) => Err(Error::cannot(
-                format!(
-                    "`{}` is in the way: it is no folder of a run, and holds `{}`",
-                    folder.display(),
-                    file.display()
-                ),
-                "choose another folder for the run with `--run DIR`, or move what lies there somewhere else",
+                format!("`{}` is not a folder of a run, and contains `{}`", folder.display(), file.display()),
+                "choose another folder for the run with `--run DIR`, or move its files elsewhere",
             )),
             None => Ok(()),
         }
     }
 
-    /// The link, if there is one, on the way from the run's folder to that of a stage.
+    /// Returns the first link on the path from the run's folder to that of a stage.
     fn link(&self, name: &str) -> Option<PathBuf> {
         let below = self.path(name);
         let inside = below.ancestors().take_while(|path| *path != self.dir);
         inside.filter(|path| io::is_link(path)).last().map(Path::to_path_buf)
     }
 
-    /// Tells the observer something that went differently than hoped.
+    /// Sends a warning to the observer.
     pub fn warn(&self, stage: &str, text: &str) {
         self.observer.event(&Event::Warning { stage, text });
     }
 
-    /// The stop request this run listens to.
+    /// Returns the stop request of this run.
     pub fn stop(&self) -> &Stop {
         &self.stop
     }
 
-    /// Leaves word of what a command ended with before any stage could say so; whether that succeeds is no matter. In a
-    /// folder that holds other things than a run, nothing is left.
+    /// Records the error of a command that ended before its first stage; a failure to write it is ignored. Nothing is
+    /// written into a folder that contains files but no run.
     pub fn failed(&self, error: &Error) {
         let is_run = ["config.toml", FAILED].iter().any(|name| io::is_file(&self.path(name)));
         if !is_run && !matches!(io::any_file(&self.dir, &|_| false), Ok(None)) {
@@ -174,7 +169,7 @@ impl Run {
         let _ = self.write(FAILED, format!("{}\n", serde_json::json!(failure)).as_bytes());
     }
 
-    /// Takes back what [`Run::failed`] said.
+    /// Removes the record of [`Run::failed`].
     pub fn not_failed(&self) {
         let _ = io::remove(&self.path(FAILED));
     }
@@ -183,7 +178,7 @@ impl Run {
         Lock::take(&self.path(stage).join(LOCK)).map_err(|e| match e {
             LockError::Held { .. } => {
                 let run = self.dir.display();
-                let problem = format!("stage `{stage}` of `{run}` is locked: another process works on it");
+                let problem = format!("stage `{stage}` of `{run}` is locked by another process");
                 Error::new(ErrorKind::NotNow, problem)
                     .with_hint("wait for it, or stop it, then repeat the command")
             }

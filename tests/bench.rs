@@ -104,7 +104,7 @@ fn what_cannot_be_measured_is_said_before_anything_is_written() {
         assert!(!dir.path().join("bench").exists());
     };
     wrong(&["--sweep", "speed"], 2, "speed");
-    wrong(&["--out", "results.json"], 2, "makes no such file");
+    wrong(&["--out", "results.json"], 2, "writes no such file");
     wrong(&["--dry-run", "--sweep", "texture,hash"], 0, "would measure hash, texture");
     let none = tiface(dir.path(), &["bench", "absent"]);
     assert!(none.status.code() == Some(1) && said(&none).contains("absent"));

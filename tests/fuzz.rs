@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
 /// What a reader may hold beyond what was held before it, bytes: its limits and as much again to work with, many times.
-const MOST_BYTES: usize = 160 << 20;
+const MAX_BYTES: usize = 160 << 20;
 /// Work for one input, seconds.
 const MOST_SECONDS: f64 = 1.0;
 /// A reader that has not come back by then never will, on however busy a machine, seconds.
@@ -185,7 +185,7 @@ fn measured(read: Reader, dir: &Path, input: &[u8]) -> Result<String, String> {
     let answer = catch_unwind(AssertUnwindSafe(|| read(dir, input))).map_err(|_| "a panic".to_string())?;
     let seconds = (tiface::io::cpu_seconds() - work).min(begin.elapsed().as_secs_f64());
     let bytes = PEAK.load(Relaxed).saturating_sub(before);
-    if seconds > MOST_SECONDS || bytes > MOST_BYTES {
+    if seconds > MOST_SECONDS || bytes > MAX_BYTES {
         return Err(format!("{seconds:.2} s of work, {bytes} bytes"));
     }
     // what is quoted from the input is no answer of the reader's

@@ -904,7 +904,11 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
         ),
         (&[picture("input/1.png")], "photographs without cameras (`1.png`)", "--data ROOT/input"),
         (&[("head.MOV", b"ftyp")], "a video (`head.MOV`)", "video --data ROOT/head.MOV"),
-        (&[("scan/transforms.json", b"{}")], "`transforms.json` lies in its folder `scan`", "`ROOT/scan`"),
+        (
+            &[("scan/transforms.json", b"{}")],
+            "its subfolder `scan` contains `transforms.json`",
+            "`ROOT/scan`",
+        ),
     ];
     for (files, what, way) in rows {
         let (message, hint) = unread(files);
@@ -927,7 +931,10 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
         assert!(hint.contains(format), "{hint}");
     }
     for (name, words) in [
-        ("transforms_all.json", "`transforms_all.json`: if it is one, call it `transforms.json`"),
+        (
+            "transforms_all.json",
+            "`transforms_all.json`: if it is such a file, rename it to `transforms.json`",
+        ),
         ("poses.npy", "call it `poses_bounds.npy`"),
         ("cams.npz", "call it `cameras_sphere.npz`"),
         ("list.csv", "does not begin with `#name,x,y,alt`"),
@@ -945,7 +952,7 @@ fn a_file_in_the_place_of_a_folder_says_which_folder() {
         assert!(e.to_string().contains("is not a capture"), "{e}");
         (e.to_string(), e.hint().replace(&dir.path().display().to_string(), "ROOT"))
     };
-    assert_eq!(of("transforms.json").1, "give the folder it lies in: `ROOT`");
+    assert_eq!(of("transforms.json").1, "give its folder: `ROOT`");
     let (message, hint) = of("head.mp4");
     assert!(
         message.contains("it is a video") && hint.contains("ns-process-data video --data ROOT/head.mp4"),

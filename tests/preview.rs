@@ -185,8 +185,8 @@ fn what_cannot_be_shown_is_said() {
         (&["preview", "a.obj", "--light", "uv"][..], 1, "has no texture coordinates"),
         (&["preview", "absent.glb"], 1, "absent.glb"),
         (&["preview", "points.obj"], 1, "holds no triangles"),
-        (&["preview", "a.obj", "--out", "a.jpg"], 2, "makes no such file"),
-        (&["preview", "a.obj", "--out", "a.gif"], 2, "makes no such file"),
+        (&["preview", "a.obj", "--out", "a.jpg"], 2, "writes no such file"),
+        (&["preview", "a.obj", "--out", "a.gif"], 2, "writes no such file"),
         (&["preview", "a.obj", "--size", "0"], 2, "--size"),
         (&["preview", "dot.obj"], 1, "lie at one place"),
         // nothing is ignored in silence

@@ -237,7 +237,7 @@ fn a_signal_is_heard_where_nothing_can_be_saved() {
     let mut said = std::io::BufReader::new(child.stderr.take().unwrap());
     let mut line = String::new();
     std::io::BufRead::read_line(&mut said, &mut line).unwrap();
-    assert!(line.contains("photographing"), "{line}");
+    assert!(line.contains("rendering"), "{line}");
     Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     line.clear();
     std::io::BufRead::read_line(&mut said, &mut line).unwrap();

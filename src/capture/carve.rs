@@ -61,7 +61,7 @@ impl Projector {
         Some((self.camera.fx * x + self.camera.cx, self.camera.fy * y + self.camera.cy, depth))
     }
 
-    /// Is the point inside the frame?
+    /// Returns whether the point is inside the frame.
     pub fn sees(&self, point: DVec3) -> bool {
         let (w, h) = (self.camera.width as f64, self.camera.height as f64);
         self.project(point).is_some_and(|(x, y, _)| x >= 0.0 && y >= 0.0 && x < w && y < h)
@@ -77,7 +77,7 @@ pub(super) struct SilhouetteTable {
     height: usize,
     /// Masked pixels above and left of each corner, `[height + 1, width + 1]`.
     table: Vec<u32>,
-    /// Does the mask come within two pixels of the left, top, right, bottom border?
+    /// Whether the mask comes within two pixels of the left, top, right, bottom border.
     cut: [bool; 4],
 }
 
@@ -112,7 +112,7 @@ impl SilhouetteTable {
         silhouette
     }
 
-    /// Is there a masked pixel with x0 ≤ x < x1, y0 ≤ y < y1?
+    /// Returns whether a pixel with x0 ≤ x < x1, y0 ≤ y < y1 is masked.
     fn any(&self, x0: usize, y0: usize, x1: usize, y1: usize) -> bool {
         let at = |x: usize, y: usize| self.table[y * (self.width + 1) + x];
         at(x1, y1) + at(x0, y0) > at(x0, y1) + at(x1, y0)
@@ -161,7 +161,7 @@ impl Cube {
         self.center + DVec3::new(at(x), at(y), at(z))
     }
 
-    /// Half the diagonal of a cell.
+    /// Returns half the diagonal of a cell.
     pub fn radius(&self) -> f64 {
         0.5 * self.cell() * 3f64.sqrt()
     }
@@ -176,7 +176,7 @@ pub(super) struct Carved {
 }
 
 impl Carved {
-    /// The cells that touch at least `least` masks.
+    /// Returns the cells that touch at least `least` masks.
     pub fn touching(&self, least: usize) -> Vec<bool> {
         self.support.iter().map(|&s| s as usize >= least.max(1)).collect()
     }
@@ -293,7 +293,7 @@ pub(super) fn extent(kept: &[bool], n: usize) -> Option<[(usize, usize); 3]> {
     (found[0].0 != usize::MAX).then_some(found)
 }
 
-/// The point nearest to all rays, least squares: `Σ (I − ddᵀ)(p − o) = 0`. `None` when they are parallel
+/// Returns the point nearest to all rays, least squares: `Σ (I − ddᵀ)(p − o) = 0`. `None` when they are parallel
 /// within about half a degree.
 pub(crate) fn meeting_point(rays: &[(DVec3, DVec3)]) -> Option<DVec3> {
     // sums relative to one origin: far-away worlds would lose digits
@@ -314,7 +314,7 @@ pub(crate) fn meeting_point(rays: &[(DVec3, DVec3)]) -> Option<DVec3> {
     Some(base + a.inverse() * b)
 }
 
-/// The direction through the middle of a mask's weight, or along the viewing axis without one.
+/// Returns the direction through the middle of a mask's weight, or along the viewing axis without one.
 pub(super) fn ray_to(camera: &Camera, mask: Option<&Gray>) -> (DVec3, DVec3) {
     let axis = -camera.rotation.z_axis;
     let Some(mask) = mask else { return (camera.position, axis) };

@@ -31,14 +31,14 @@ pub(super) struct ModelFiles {
 }
 
 impl ModelFiles {
-    /// The first model of a folder.
+    /// Returns the first model of a folder.
     pub fn find(root: &Path) -> Option<ModelFiles> {
         let mut all =
             FOLDERS.iter().flat_map(|&folder| ["bin", "txt"].map(|ending| ModelFiles { folder, ending }));
         all.find(|m| ["cameras", "images"].iter().all(|kind| io::is_file(&root.join(m.name(kind)))))
     }
 
-    /// The path of one of its files below the capture.
+    /// Returns the path of one of its files below the capture.
     pub fn name(&self, kind: &str) -> String {
         let slash = if self.folder.is_empty() { "" } else { "/" };
         format!("{}{slash}{kind}.{}", self.folder, self.ending)
@@ -142,7 +142,7 @@ fn other_models(root: &Path, files: &ModelFiles) -> Vec<String> {
     io::list_folders(&root.join(parent)).unwrap_or_default().iter().filter_map(numbered).collect()
 }
 
-/// Names in `test.txt` beside the model, as 3D Gaussian splatting has them.
+/// Returns the names in `test.txt` beside the model, as 3D Gaussian splatting has them.
 fn held_out(folder: &CaptureFolder, files: &ModelFiles) -> Result<Option<HashSet<String>>> {
     let name = ModelFiles { ending: "txt", ..files.clone() }.name("test");
     let Some(path) = folder.file(Path::new(&name)) else { return Ok(None) };
@@ -154,7 +154,7 @@ fn names_in(text: &str) -> impl Iterator<Item = &str> {
     text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'))
 }
 
-/// Does a photograph's name come back from a model, and from `test.txt` if it is held out?
+/// Returns whether a photograph's name can be read back from a model, and from `test.txt` if it is held out.
 pub(super) fn can_name(name: &str, in_test: bool) -> bool {
     let is_relative = join("images", name).len() > name.len();
     is_relative && (!in_test || !name.contains(char::is_control) && names_in(name).eq([name]))
@@ -190,14 +190,14 @@ fn frame(
 }
 
 impl Rigid {
-    /// Rotation and position of the camera, in our axes.
+    /// Returns the rotation and position of the camera, in our axes.
     fn camera_in_world(&self) -> Result<(DMat3, DVec3), &'static str> {
         let rotation = self.matrix()?;
         let world_from_camera = rotation.transpose();
         Ok((world_from_camera * FLIP, -(world_from_camera * self.translation)))
     }
 
-    /// The rotation; quaternions of other lengths are brought to 1.
+    /// Returns the rotation; quaternions of other lengths are brought to 1.
     fn matrix(&self) -> Result<DMat3, &'static str> {
         let [w, x, y, z] = self.quaternion;
         let q = DQuat::from_xyzw(x, y, z, w);
@@ -214,7 +214,7 @@ impl Rigid {
     }
 }
 
-/// A rotation and position of ours as COLMAP's quaternion (w, x, y, z) and translation.
+/// Returns a rotation and position of ours as COLMAP's quaternion (w, x, y, z) and translation.
 fn pose_of(rotation: DMat3, position: DVec3) -> ([f64; 4], DVec3) {
     let camera_from_world = (rotation * FLIP).transpose();
     let q = DQuat::from_mat3(&camera_from_world).normalize();
@@ -263,7 +263,7 @@ impl From<[f64; 7]> for Rigid {
     }
 }
 
-/// The files of a model as (name, bytes), or which lens COLMAP has no model for.
+/// Returns the files of a model as (name, bytes), or which lens COLMAP has no model for.
 pub(super) fn files(images: &[(String, &geom::Camera)]) -> Result<[(&'static str, Vec<u8>); 3], String> {
     let mut lenses: Vec<(i32, u64, u64, Vec<f64>)> = Vec::new();
     let mut listed = (images.len() as u64).to_le_bytes().to_vec();

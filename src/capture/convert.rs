@@ -1,13 +1,13 @@
-//! A capture written again with cameras of another format: nothing is resampled, and existing files are not changed.
+//! Writes a copy of a capture with its cameras in another format. Nothing is resampled, and no existing file is changed.
 //!
-//! Photographs go to `images/`, head masks to `masks/`, valid pixels to `valid/` and regions to `face_masks/`, as
-//! they are; the camera files come last, so that a folder that has them is complete. What a format cannot say is an error
-//! where pictures would no longer fit their cameras, and a warning otherwise.
+//! Photographs are copied to `images/`, head masks to `masks/`, valid pixels to `valid/` and regions to `face_masks/`; the
+//! camera files are written last, so that a folder with camera files is complete. Data that the format cannot represent is
+//! an error if pictures would no longer match their cameras, and a warning otherwise.
 
 use super::colmap;
 use super::frame::LensModel;
-use super::gather::{every_eighth, up};
 use super::view::{Capture, Split, View, ViewMask};
+use super::{every_eighth, up};
 use crate::geom::Camera;
 use crate::io::{self, Limits};
 use crate::{Error, Result};
@@ -26,7 +26,7 @@ pub enum CameraFormat {
 }
 
 impl CameraFormat {
-    /// The format of this name: `transforms` or `colmap`.
+    /// Returns the format of this name: `transforms` or `colmap`.
     pub fn named(name: &str) -> Option<CameraFormat> {
         match name {
             "transforms" => Some(CameraFormat::Transforms),
@@ -36,26 +36,26 @@ impl CameraFormat {
     }
 }
 
-/// What [`convert`] wrote.
+/// The result of [`convert`].
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Conversion {
-    /// Where.
+    /// The new folder.
     pub folder: PathBuf,
-    /// How many views.
+    /// Number of views.
     pub views: usize,
-    /// How many head masks, those in alpha channels left out.
+    /// Number of head masks, without those in alpha channels.
     pub masks: usize,
-    /// What the format could not say.
+    /// Data that the format could not represent.
     pub warnings: Vec<String>,
 }
 
-/// Where a view's pictures go, relative to the new capture.
+/// Destination of a view's pictures, relative to the new capture.
 struct ViewFiles<'v> {
     view: &'v View,
     camera: Camera,
-    /// Without its ending, `/` between, below the folder of photographs.
+    /// Name without ending, relative to the folder of photographs, separated by `/`.
     stem: String,
-    /// With its ending.
+    /// Name with ending.
     name: String,
     photo: String,
     mask: Option<String>,
@@ -63,11 +63,11 @@ struct ViewFiles<'v> {
     region: Option<String>,
 }
 
-/// What a file of the new capture holds.
+/// Content of a file of the new capture.
 enum Content<'v> {
     /// The bytes of another file.
     File(&'v Path),
-    /// A mask that is no PNG yet, and the size of its photograph.
+    /// A mask that is not stored as a PNG, and the size of its photograph.
     Mask(&'v Path, (u32, u32)),
     Bytes(Vec<u8>),
 }
@@ -93,13 +93,13 @@ impl Content<'_> {
 ///
 /// # Errors
 ///
-/// If the capture was opened reduced in size, the folder holds anything, or the format has no such lens.
+/// Fails if the capture was opened at reduced size, the folder is not empty, or the format has no such lens model.
 pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Conversion> {
     if let Some(view) = capture.views.iter().find(|v| v.photo_size != (v.camera.width, v.camera.height)) {
-        let message = format!("the photograph of `{}` would be converted reduced in size", view.name);
+        let message = format!("the photograph of `{}` would be converted at reduced size", view.name);
         return Err(Error::cannot(
             message,
-            "convert with `--set capture.downscale=1`: photographs are kept as they are",
+            "convert with `--set capture.downscale=1`, which copies photographs unchanged",
         ));
     }
     let is_empty =
@@ -125,16 +125,16 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
         CameraFormat::Colmap => colmap::can_name(&p.name, named_splits && p.view.split != Split::Train),
     };
     if let Some(place) = places.iter().find(|p| !can_name(p)) {
-        let message = format!("the photograph `{}` has a name that this format cannot carry", place.name);
+        let message = format!("the photograph `{}` has a name that this format cannot represent", place.name);
         return Err(Error::cannot(message, "rename it, or choose `--to transforms`"));
     }
-    // what cannot be said is found before anything is written
+    // data that the format cannot represent is found before anything is written
     let files = match to {
         CameraFormat::Transforms => transforms(capture, &places, named_splits)?,
         CameraFormat::Colmap => sparse(capture, &places, named_splits, &mut out.warnings)?,
     };
     let mut contents: Vec<(PathBuf, Content)> = Vec::new();
-    // a link may name anything: only what is a picture is copied
+    // a link may point to anything: only pictures are copied
     capture.views.par_iter().try_for_each(|view| {
         if view.valid.is_some() || matches!(view.mask, ViewMask::File(_)) {
             view.load(&Limits::default())?;
@@ -190,7 +190,7 @@ fn place(view: &View, to: CameraFormat) -> ViewFiles<'_> {
 
 type Files = Vec<(String, Vec<u8>)>;
 
-/// What COLMAP's names call the lens, and all its numbers.
+/// Returns COLMAP's name of the lens model, and its parameters.
 fn lens(place: &ViewFiles) -> Result<Map<String, Value>> {
     let camera = &place.camera;
     let unknown = || {
@@ -211,7 +211,7 @@ fn lens(place: &ViewFiles) -> Result<Map<String, Value>> {
 
 fn transforms(capture: &Capture, places: &[ViewFiles], named_splits: bool) -> Result<Files> {
     let lenses: Vec<Map<String, Value>> = places.iter().map(lens).collect::<Result<_>>()?;
-    // readers that support only one lens look for it at the top
+    // readers that support only one lens read it from the top level
     let shared = lenses.iter().all(|l| *l == lenses[0]);
     let frame = |(place, lens): (&ViewFiles, &Map<String, Value>)| {
         let (r, p) = (place.camera.rotation, place.camera.position);
@@ -232,7 +232,7 @@ fn transforms(capture: &Capture, places: &[ViewFiles], named_splits: bool) -> Re
         Value::Object(frame)
     };
     let mut top = if shared { lenses[0].clone() } else { Map::new() };
-    // as the reader will find it, unless the dataset had named another
+    // the reader derives it from the cameras, unless the dataset names another
     if up(&capture.views, None) != capture.up {
         top.insert("up".into(), json!(capture.up.as_dvec3()));
     }
@@ -248,8 +248,8 @@ fn sparse(
 ) -> Result<Files> {
     let guessed = up(&capture.views, None);
     if guessed != capture.up {
-        let taken = format!("{guessed} will be taken instead of {}", capture.up);
-        warnings.push(format!("COLMAP does not say where up is: {taken}"));
+        let taken = format!("readers will use {guessed} instead of {}", capture.up);
+        warnings.push(format!("COLMAP has no up direction: {taken}"));
     }
     let images: Vec<(String, &Camera)> = places.iter().map(|p| (p.name.clone(), &p.camera)).collect();
     let hint = "undistort the photographs first";
@@ -259,7 +259,7 @@ fn sparse(
         let held_out = places.iter().filter(|p| p.view.split != Split::Train);
         let names: String = held_out.map(|p| format!("{}\n", p.name)).collect();
         if capture.split(Split::Val).next().is_some() {
-            warnings.push("COLMAP has no validation views: they are held out with those for testing".into());
+            warnings.push("COLMAP has no validation views: they become test views".into());
         }
         files.push(("sparse/0/test.txt".into(), names.into()));
     }

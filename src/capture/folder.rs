@@ -1,5 +1,5 @@
-//! A capture's folder: what lies directly in it, what the names in camera files mean, and the errors that several parts
-//! of a capture can have. Only what lies inside the capture is ever opened.
+//! A capture's folder: its entries, the paths that names in camera files refer to, and errors shared by the camera formats.
+//! No file outside the capture is opened.
 
 use super::frame::CameraFrame;
 use super::view::CaptureOptions;
@@ -10,17 +10,17 @@ use roxmltree::{Document, ParsingOptions};
 use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
 
-/// What may be missing at the end of a photograph's name: endings of files that are read, and of those that are found to
-/// be refused by name.
+/// Endings that may be missing from a photograph's name: of supported files, and of files that are found only to be refused
+/// by name.
 const ENDINGS: [&[&str]; 2] = [
     &["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"],
     &[".tif", ".tiff", ".webp", ".heic", ".TIF", ".TIFF"],
 ];
 
-/// OpenCV's camera axes to ours: right, down, ahead to right, up, back.
+/// From OpenCV's camera axes to ours: right, down, forward to right, up, backward.
 pub(super) const FLIP: DMat3 = DMat3::from_cols_array(&[1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0]);
 
-/// A photograph's name below its folder; absolute names stay as they are.
+/// Returns a photograph's name below its folder; absolute names are returned unchanged.
 pub(super) fn join(base: &str, name: &str) -> String {
     let is_absolute = name.starts_with(['/', '\\']) || name.as_bytes().get(1) == Some(&b':');
     if base.is_empty() || is_absolute { name.into() } else { format!("{base}/{name}") }
@@ -28,9 +28,9 @@ pub(super) fn join(base: &str, name: &str) -> String {
 
 /// The folder of a capture that is being opened.
 pub(super) struct CaptureFolder<'a> {
-    /// As given.
+    /// The path as given.
     pub root: &'a Path,
-    /// Without links.
+    /// The path without links.
     real: PathBuf,
     pub options: &'a CaptureOptions,
 }
@@ -40,13 +40,13 @@ impl CaptureFolder<'_> {
         Ok(CaptureFolder { root, real: io::real_path(root)?, options })
     }
 
-    /// A path relative to the capture, for messages.
+    /// Returns a path relative to the capture, for messages.
     pub fn shown(&self, path: &Path) -> String {
         path.strip_prefix(self.root).unwrap_or(path).to_string_lossy().into_owned()
     }
 
-    /// The path below the capture that `name` means. `\` counts as a separator, since tools on Windows
-    /// write it; an absolute name is taken if it points into the capture.
+    /// Returns the path below the capture that `name` refers to. `\` counts as a separator, since tools on Windows
+    /// write it; an absolute name is accepted if it points into the capture.
     pub fn relative(&self, file: &str, name: &str) -> Result<PathBuf> {
         let outside = || outside(file, name);
         if name.is_empty() || name.contains('\0') {
@@ -74,14 +74,14 @@ impl CaptureFolder<'_> {
         Ok(relative)
     }
 
-    /// The regular file at a relative path, if it exists. Links are followed: data sets are kept as links into a store,
+    /// Returns the regular file at a relative path, if it exists. Links are followed: data sets are kept as links into a store,
     /// and the paths that [`CaptureFolder::relative`] returns cannot climb out of the capture.
     pub fn file(&self, relative: &Path) -> Option<PathBuf> {
         Some(self.root.join(relative)).filter(|path| io::is_file(path))
     }
 
-    /// The folder that photographs' names start from, where the format does not say: the one that has most of the
-    /// first of them.
+    /// Returns the folder that photographs' names are relative to, if the format does not define it: the one that contains
+    /// most of the first names.
     pub fn image_folder<'n>(&self, names: impl Iterator<Item = &'n str>) -> &'static str {
         let names: Vec<&str> = names.take(64).collect();
         let is_in = |base: &str, name: &str| {
@@ -92,7 +92,7 @@ impl CaptureFolder<'_> {
         counted.fold(("images", 0), |best, next| if next.1 > best.1 { next } else { best }).0
     }
 
-    /// A mask that COLMAP itself would take (`masks/NAME.jpg.png`), or of the photograph's name without its ending.
+    /// Returns the mask of a photograph: by COLMAP's own convention (`masks/NAME.jpg.png`), or by its name without ending.
     pub fn mask_of(&self, file: &str, name: &str) -> Result<Option<PathBuf>> {
         let stem =
             if has_ending(name, &PHOTOGRAPHS) { Path::new(name).with_extension("") } else { name.into() };
@@ -104,7 +104,7 @@ impl CaptureFolder<'_> {
         Ok(None)
     }
 
-    /// The photograph that `name` means, with its path below the capture: the very name, else with a
+    /// Returns the photograph that `name` refers to, with its path below the capture: the exact name, else with a
     /// usual ending, else in the folder of pictures already reduced by `options.downscale`
     /// (`images_4/`, `images_4x/`).
     pub fn photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
@@ -131,7 +131,7 @@ impl CaptureFolder<'_> {
     }
 }
 
-/// The folder common to all photographs, and each one's path below it without ending, `/` between.
+/// Returns the common folder of all photographs, and each one's path below it without ending, separated by `/`.
 pub(super) fn view_names(frames: &[CameraFrame]) -> (PathBuf, Vec<String>) {
     let mut folder: Option<PathBuf> = None;
     for frame in frames {
@@ -155,16 +155,16 @@ pub(super) fn view_names(frames: &[CameraFrame]) -> (PathBuf, Vec<String>) {
     (folder, names)
 }
 
-/// Endings of photographs, those that are not read among them.
+/// Endings of photographs, supported ones first.
 pub(super) const PHOTOGRAPHS: [&str; 8] = ["png", "jpg", "jpeg", "tif", "tiff", "heic", "webp", "bmp"];
 
-/// How many of them, from the first, are those of files that are read.
-const READ: usize = 3;
+/// Number of supported endings in [`PHOTOGRAPHS`].
+const READABLE_FORMATS: usize = 3;
 
-/// Where photographs lie, if not beside the cameras.
+/// Usual folders of photographs.
 const IMAGE_FOLDERS: [&str; 5] = ["images", "image", "input", "rgb", "photos"];
 
-/// Names of what lies directly in a folder.
+/// The entries of a folder.
 pub(super) struct FolderEntries {
     pub root: PathBuf,
     pub files: Vec<String>,
@@ -172,7 +172,7 @@ pub(super) struct FolderEntries {
 }
 
 impl FolderEntries {
-    /// Names that are not UTF-8 tell nothing, nor do those that cannot be listed.
+    /// Lists a folder. Names that are not UTF-8, and folders that cannot be listed, are ignored.
     pub fn of(root: &Path) -> FolderEntries {
         let name = |p: &PathBuf| Some(p.file_name()?.to_str()?.to_owned());
         let folders = io::list_folders(root).unwrap_or_default();
@@ -183,17 +183,17 @@ impl FolderEntries {
         }
     }
 
-    /// The first of these files or folders that exists, `/` between a folder and what it holds.
+    /// Returns the first of these files or folders that exists; names may contain `/`.
     pub fn any<'a>(&self, names: &[&'a str]) -> Option<&'a str> {
         names.iter().copied().find(|n| io::exists(&self.root.join(n)))
     }
 
-    /// The first file with one of these endings.
+    /// Returns the first file with one of these endings.
     pub fn ending(&self, endings: &[&str]) -> Option<&String> {
         self.files.iter().find(|f| has_ending(f, endings))
     }
 
-    /// The first file with this ending whose beginning holds `words`.
+    /// Returns the first file with this ending whose beginning contains `words`.
     pub fn holding(&self, ending: &str, words: &str) -> Option<&String> {
         let limits = Limits { file_bytes: 64 << 20, ..Limits::default() };
         let holds = |name: &&String| {
@@ -207,7 +207,7 @@ impl FolderEntries {
         self.root.join(name).display().to_string()
     }
 
-    /// The folder of photographs, as far as one can tell.
+    /// Returns the folder that probably contains the photographs.
     pub fn photographs(&self) -> Option<PathBuf> {
         let folders = IMAGE_FOLDERS.into_iter().filter(|n| self.any(&[n]).is_some());
         let folders = folders.map(|n| self.root.join(n));
@@ -218,23 +218,22 @@ impl FolderEntries {
     }
 }
 
-/// The photographs in a folder, in name order; only where none can be read those of other formats, to be refused by
-/// name.
+/// Returns the photographs in a folder, in name order; if none is supported, those of other formats, to be refused by name.
 pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
     let mut files = io::list_files(folder)?;
-    let can_be_read = files.iter().any(|f| has_ending(f, &PHOTOGRAPHS[..READ]));
-    let endings = if can_be_read { &PHOTOGRAPHS[..READ] } else { &PHOTOGRAPHS };
+    let can_be_read = files.iter().any(|f| has_ending(f, &PHOTOGRAPHS[..READABLE_FORMATS]));
+    let endings = if can_be_read { &PHOTOGRAPHS[..READABLE_FORMATS] } else { &PHOTOGRAPHS };
     files.retain(|f| has_ending(f, endings));
     Ok(files)
 }
 
-/// Does a name end so, in any case?
+/// Returns whether a name has one of these endings, ignoring case.
 pub(super) fn has_ending(name: &str, endings: &[&str]) -> bool {
     let found = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
     endings.iter().any(|e| e.eq_ignore_ascii_case(found))
 }
 
-/// Parses the text of an XML file of at most so many nodes. A DTD, whose entities could grow without bound, is refused.
+/// Parses an XML file with at most `nodes` nodes. A DTD is refused, because its entities could grow without bound.
 pub(super) fn parse_xml<'t>(
     path: &Path,
     format: &'static str,
@@ -247,23 +246,23 @@ pub(super) fn parse_xml<'t>(
         .map_err(|e| ReadError::damaged(path, format, None, problem(e)))
 }
 
-/// The beginning of a text from a file, for a message.
+/// Returns the beginning of a text from a file, for a message.
 pub(super) fn shortened(text: &str) -> String {
     text.chars().take(40).collect()
 }
 
-/// A camera file lacks what it must have.
+/// Returns the error for a camera file that is incomplete.
 pub(super) fn in_file(file: &str, problem: impl Display, hint: impl Into<String>) -> Error {
     Error::cannot(problem, hint).within(format_args!("`{file}`"))
 }
 
-/// One frame of a camera file is wrong; it is named by its photograph, or its number if it has none.
+/// Returns the error for one frame of a camera file, named by its photograph or its number.
 pub(super) fn in_frame(file: &str, frame: &str, problem: impl Display) -> Error {
     let place = format_args!("`{file}`, frame `{frame}`");
     Error::cannot(problem, "correct that frame, or remove it").within(place)
 }
 
-/// A name leads out of the capture.
+/// Returns the error for a name that points outside the capture.
 fn outside(file: &str, name: &str) -> Error {
     Error::cannot(
         format_args!("`{file}` names `{name}`, which is outside the capture"),
@@ -271,7 +270,7 @@ fn outside(file: &str, name: &str) -> Error {
     )
 }
 
-/// There is nothing to learn from.
+/// Returns the error for a capture without usable views.
 pub(super) fn no_views(root: &Path, found: &str) -> Error {
     Error::cannot(
         format_args!("`{}` has no usable view: {found}", root.display()),

@@ -1,11 +1,10 @@
-//! Which camera files a folder has. Where there are several kinds, the first of [`CameraFiles`] is read.
+//! Recognizes the camera files of a folder. If it has several kinds, the first of [`CameraFiles`] is read.
 //!
-//! Formats that are recognized but not read, each by its telltale files, are explained with the way to `transforms.json`.
+//! A folder of another program is recognized by its files, and the error explains how to convert it.
 
-use super::colmap::{self, ModelFiles};
-use super::folder::{CaptureFolder, FolderEntries, PHOTOGRAPHS, has_ending};
-use super::frame::Listing;
-use super::{llff, metashape, neus, realitycapture, transforms};
+use super::colmap::ModelFiles;
+use super::folder::{FolderEntries, PHOTOGRAPHS, has_ending};
+use super::{neus, realitycapture};
 use crate::Error;
 use crate::config::Config;
 use crate::io;
@@ -61,7 +60,7 @@ impl CameraFiles {
         metashape().or_else(csv).or_else(|| realitycapture::xmp_folder(root).map(CameraFiles::Xmp))
     }
 
-    /// One of them, for messages.
+    /// Returns the name of one of the files, for messages.
     pub fn first(&self) -> String {
         match self {
             CameraFiles::Transforms { json: files, .. } | CameraFiles::Llff(files) => files[0].into(),
@@ -72,7 +71,7 @@ impl CameraFiles {
         }
     }
 
-    /// The format, and which files say so.
+    /// Returns the format's name and the files that it was recognized by.
     pub fn describe(&self) -> (&'static str, String) {
         let quote = |names: &[&str]| names.iter().map(|n| format!("`{n}`")).collect::<Vec<_>>().join(", ");
         match self {
@@ -98,51 +97,27 @@ impl CameraFiles {
             CameraFiles::Xmp(_) => ("RealityCapture", format!("cameras from `{}`", self.first())),
         }
     }
-
-    /// Lists the frames; everything wrong goes to the listing's problems.
-    pub fn list(&self, folder: &CaptureFolder, listing: &mut Listing) {
-        let listed = match self {
-            CameraFiles::Transforms { json, poses } => {
-                transforms::list(folder, json, listing);
-                if listing.problems.is_empty() {
-                    llff::check(folder, poses, listing);
-                }
-                Ok(())
-            }
-            CameraFiles::Llff(poses) => llff::list(folder, poses, listing),
-            CameraFiles::Colmap(files) => colmap::list(folder, files, listing),
-            CameraFiles::Neus(file) => neus::list(folder, file, listing),
-            CameraFiles::Metashape(file) => metashape::list(folder, file, listing),
-            CameraFiles::RealityCapture(file) => realitycapture::list_csv(folder, file, listing),
-            CameraFiles::Xmp(inside) => realitycapture::list_xmp(folder, inside, listing),
-        };
-        listing.problems.extend(listed.err());
-        if let Err(problem) = folder.options.limits.check_views(folder.root, listing.frames.len()) {
-            listing.problems.push(problem.into());
-            listing.frames.clear();
-        }
-    }
 }
 
-/// What a capture needs, one of them.
-const READ: [&str; 4] =
+/// Names of camera files; a path to one of them is answered with its folder.
+const CAMERA_FILES: [&str; 4] =
     ["transforms.json", "transforms_train.json", "poses_bounds.npy", "poses_bounds_train.npy"];
 
 const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
 
-/// For datasets with cameras that no common tool converts.
+/// Advice for datasets with cameras that no common tool converts.
 const BY_HAND: &str = "no common tool converts it: write `transforms.json` with `file_path`, `w`, `h`, `fl_x`, `fl_y`, \
                        `cx`, `cy` and `transform_matrix` for each photograph (camera to world, +Y up and looking along \
                        -Z: the second and third column of an OpenCV pose, negated)";
 
-/// For cameras that another program writes in COLMAP's form.
+/// Advice for cameras that another program exports to COLMAP.
 const TO_COLMAP: &str = "writes its cameras as COLMAP's: put `cameras`, `images` and `points3D` (`.bin` or `.txt`) into \
                          `sparse/0`, the photographs beside it into `images/`";
 
-/// Folders of other programs: what they are; the files or folders, else the endings, that identify them; and how to
-/// convert them, where `{root}` is the folder and `{file}` the file that was found.
+/// Folders of other programs: description; the files or folders, else the endings, that identify them; how to convert
+/// them, where `{root}` is the folder and `{file}` the file that was found.
 #[rustfmt::skip]
-const FOREIGN: &[(&str, &[&str], &[&str], &str)] = &[
+const OTHER_PROGRAMS: &[(&str, &[&str], &[&str], &str)] = &[
     ("a Multiface recording", &["KRT"], &[],
         "{BY_HAND}; it holds K, distortion and [R|t] of each camera; take one frame of one expression of `images/`"),
     ("a NeRSemble participant", &["calibration/camera_params.json", "camera_params.json"], &[],
@@ -174,32 +149,42 @@ const FOREIGN: &[(&str, &[&str], &[&str], &str)] = &[
          `.txt`) into `sparse/0`"),
 ];
 
-/// A command of nerfstudio, and what to do with what it writes.
+/// Returns advice to convert data with nerfstudio.
 fn nerfstudio(kind: &str, data: impl Display) -> String {
     format!(
         "nerfstudio converts it: `ns-process-data {kind} --data {data} --output-dir NEW`, then `tiface inspect NEW`"
     )
 }
 
+/// Returns whether a folder is a run: it has a run's configuration, and either a stage was completed in it or nothing else
+/// in it is a capture's, be it one that cannot be read (photographs without cameras, a project of another program).
+pub fn is_run(folder: &Path) -> bool {
+    let is_done = || io::is_file(&folder.join("mask/done.json"));
+    let is_capture =
+        || CameraFiles::find(folder).is_some() || recognized(&FolderEntries::of(folder)).is_some();
+    io::is_file(&folder.join("config.toml")) && (is_done() || !is_capture())
+}
+
 fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> Error {
     Error::cannot(format_args!("`{}` is not a capture: {found}", root.display()), hint)
 }
 
-/// The error for a folder that is no capture: what it looks like instead, and how to convert it.
+/// Returns the error for a folder that is no capture: what it looks like, and how to convert it.
 pub(super) fn explain(root: &Path) -> Error {
     let found = FolderEntries::of(root);
-    if let Some(run) = Config::of_run(root).filter(|run| !run.capture.path.is_empty()) {
-        let hint =
-            format!("inspect its capture, `{}`; `tiface status` says how far the run is", run.capture.path);
+    if is_run(root)
+        && let Some(path) = Config::of_run(root).map(|run| run.capture.path).filter(|path| !path.is_empty())
+    {
+        let hint = format!("inspect its capture, `{path}`; `tiface status` shows the state of the run");
         return not_a_capture(root, "it is the folder of a run", hint);
     }
     if let Some((inner, file)) = nested(&found) {
-        let what = format!("`{file}` lies in its folder `{inner}`");
+        let what = format!("its subfolder `{inner}` contains `{file}`");
         return not_a_capture(root, what, format!("give that folder: `{}`", found.at(inner)));
     }
     match recognized(&found) {
         Some((what, telltale, hint)) => {
-            not_a_capture(root, format!("it looks like {what} (`{telltale}`); that is not read"), hint)
+            not_a_capture(root, format!("it looks like {what} (`{telltale}`), which is not supported"), hint)
         }
         None => {
             let nearest = nearest(&found).map_or(String::new(), |n| format!("; nearest is {n}"));
@@ -207,25 +192,25 @@ pub(super) fn explain(root: &Path) -> Error {
                           photographs alone or a video are recognized, with advice on how to convert them";
             not_a_capture(
                 root,
-                format!("it holds none of the camera files that are read: {LOOKED_FOR}{nearest}"),
-                format!("give the folder that holds one of them; {others}"),
+                format!("it contains none of the supported camera files: {CAMERA_FILES_TEXT}{nearest}"),
+                format!("give the folder that contains one of them; {others}"),
             )
         }
     }
 }
 
-/// The camera files that are read, for messages.
-const LOOKED_FOR: &str = "`transforms.json`, `transforms_train.json`, `poses_bounds*.npy` (LLFF), `cameras` and `images` as \
+/// The supported camera files, for messages.
+const CAMERA_FILES_TEXT: &str = "`transforms.json`, `transforms_train.json`, `poses_bounds*.npy` (LLFF), `cameras` and `images` as \
                           `.bin` or `.txt` in `sparse/0`, `sparse` or here (COLMAP), `cameras_sphere.npz` or `cameras.npz` \
                           (NeuS, IDR, H3DS), an `.xml` with `<chunk` (Metashape), a `.csv` that begins with `#name,x,y,alt` \
                           or `.xmp` files with a pose (RealityCapture)";
 
-/// The file that looks most like one of those, and what it lacks.
+/// Returns the file most similar to a supported camera file, and what it lacks.
 fn nearest(found: &FolderEntries) -> Option<String> {
     let like = |ending: &str, word: &str| {
         found.files.iter().find(|f| has_ending(f, &[ending]) && f.to_lowercase().contains(word))
     };
-    let rename = |file: &String, to: &str| format!("`{file}`: if it is one, call it `{to}`");
+    let rename = |file: &String, to: &str| format!("`{file}`: if it is such a file, rename it to `{to}`");
     like("json", "transform")
         .or_else(|| found.holding("json", "transform_matrix"))
         .map(|f| rename(f, "transforms.json"))
@@ -237,19 +222,22 @@ fn nearest(found: &FolderEntries) -> Option<String> {
         .or_else(|| {
             like("csv", "").map(|f| format!("`{f}`, which does not begin with `{}`", realitycapture::HEADER))
         })
-        .or_else(|| like("xmp", "").map(|f| format!("`{f}`, which has nothing of RealityCapture's")))
+        .or_else(|| like("xmp", "").map(|f| format!("`{f}`, which has no fields of RealityCapture")))
 }
 
-/// Why a file is no capture.
+/// Returns the error for a file given as a capture.
 pub(super) fn explain_file(file: &Path) -> Error {
     let name = file.file_name().and_then(|n| n.to_str()).unwrap_or_default();
     let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     if has_ending(name, &VIDEOS) {
         not_a_capture(file, "it is a video", from_video(file))
-    } else if READ.contains(&name) || name.starts_with("transforms_") || name.starts_with("poses_bounds") {
-        not_a_capture(file, "it is a file", format!("give the folder it lies in: `{}`", folder.display()))
+    } else if CAMERA_FILES.contains(&name)
+        || name.starts_with("transforms_")
+        || name.starts_with("poses_bounds")
+    {
+        not_a_capture(file, "it is a file", format!("give its folder: `{}`", folder.display()))
     } else {
-        not_a_capture(file, "it is a file", "give the folder that holds the photographs and cameras")
+        not_a_capture(file, "it is a file", "give the folder that contains the photographs and cameras")
     }
 }
 
@@ -257,18 +245,18 @@ fn from_video(file: &Path) -> String {
     nerfstudio("video", file.display()) + " (it needs COLMAP; a head must hold still while the camera moves)"
 }
 
-/// A folder inside that is a capture, with its first camera file.
+/// Returns a subfolder that is a capture, with its first camera file.
 fn nested(found: &FolderEntries) -> Option<(&str, String)> {
     let of = |name: &String| CameraFiles::find(&found.root.join(name)).map(|files| files.first());
     found.folders.iter().take(1000).find_map(|name| Some((name.as_str(), of(name)?)))
 }
 
-/// What it looks like, by which file, and how to get to `transforms.json`.
+/// Returns what the folder looks like, the file that shows it, and how to get to `transforms.json`.
 fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
     let photographs = found.photographs();
-    // a file of this name has no meaning without photographs
+    // `params.json` is too common a name to identify anything without photographs
     let is_candidate = |files: &[&str]| photographs.is_some() || files != ["params.json"];
-    for (what, files, endings, way) in FOREIGN.iter().filter(|(_, files, ..)| is_candidate(files)) {
+    for (what, files, endings, way) in OTHER_PROGRAMS.iter().filter(|(_, files, ..)| is_candidate(files)) {
         let file = found.any(files).or_else(|| found.ending(endings).map(String::as_str));
         if let Some(file) = file {
             let root = found.root.display().to_string();

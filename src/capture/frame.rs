@@ -1,5 +1,5 @@
-//! The content of camera files, before any photograph is read: frames, pose matrices, and lens models by the names that COLMAP
-//! gave them, which nerfstudio and instant-ngp use as well.
+//! The content of camera files, before any photograph is read: frames, pose matrices, and lens models by COLMAP's names, which
+//! nerfstudio and instant-ngp also use.
 
 use super::view::Split;
 use crate::Error;
@@ -8,25 +8,25 @@ use glam::{DMat3, DVec3};
 use serde::Serialize;
 use std::path::PathBuf;
 
-/// Everything a format's reader found.
+/// Everything that a reader of camera files found.
 #[derive(Debug)]
 pub(super) struct Listing {
-    /// The format, in words, once one was recognized.
+    /// Name of the format, once recognized.
     pub format: Option<&'static str>,
     pub frames: Vec<CameraFrame>,
-    /// What the format was recognized by, and what else was found.
+    /// How the format was recognized, and other findings.
     pub reasons: Vec<String>,
     pub warnings: Vec<String>,
     pub problems: Vec<Error>,
-    /// How well each LLFF file agrees with the JSON beside it.
+    /// Agreement of each LLFF file with the JSON next to it.
     pub agreements: Vec<Agreement>,
-    /// The world's up, where the dataset names it.
+    /// Up direction of the world, if the dataset names it.
     pub up: Option<DVec3>,
-    /// Where the frames' own masks are from, in words.
+    /// Source of the frames' own masks, for messages.
     pub masks_named: &'static str,
-    /// Where the dataset says the head is.
+    /// The dataset's own box of the head.
     pub focus: Option<Aabb>,
-    /// Points on what was photographed.
+    /// Points on the photographed surface.
     pub points: Vec<DVec3>,
 }
 
@@ -47,12 +47,12 @@ impl Default for Listing {
     }
 }
 
-/// How well two camera files agree.
+/// Agreement of two camera files.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Agreement {
     /// The LLFF file.
     pub poses: String,
-    /// How many cameras were compared.
+    /// Number of compared cameras.
     pub cameras: usize,
     /// Largest difference of positions, dataset units.
     pub position: f64,
@@ -82,7 +82,7 @@ pub(super) struct CameraFrame {
 }
 
 impl CameraFrame {
-    /// A frame of `file`, without split, mask and region. `name` is the photograph's name as written in it, `photo`
+    /// Returns a frame of `file`, without split, mask and region. `name` is the photograph's name as written in it, `photo`
     /// the result of [`CaptureFolder::photo`](super::folder::CaptureFolder::photo).
     pub fn new(
         file: &str,
@@ -103,15 +103,15 @@ pub(super) struct Intrinsics {
     pub size: Option<(u32, u32)>,
     /// Focal lengths in pixels.
     pub focal: [Option<f64>; 2],
-    /// Full opening angles in radians, used where the focal length is absent.
+    /// Full fields of view in radians, used if the focal length is absent.
     pub angle: [Option<f64>; 2],
-    /// Principal point from the top-left corner, pixels; the middle where absent.
+    /// Principal point from the top-left corner, pixels; the center if absent.
     pub center: [Option<f64>; 2],
     pub distortion: Distortion,
 }
 
 impl Intrinsics {
-    /// The camera of a picture of `size`. One focal length stands for both.
+    /// Returns the camera of a picture of `size`. A single focal length is used for both axes.
     pub fn camera(&self, size: (u32, u32), rotation: DMat3, position: DVec3) -> Result<Camera, String> {
         let side = [size.0 as f64, size.1 as f64];
         let focal =
@@ -130,7 +130,7 @@ impl Intrinsics {
         }
         let [cx, cy] = [0, 1].map(|k| self.center[k].unwrap_or(0.5 * side[k]));
         let (width, height) = size;
-        // beyond a whole picture beside it, the intrinsics belong to another size
+        // a principal point farther outside than a whole picture belongs to another size
         if [(cx, side[0]), (cy, side[1])].iter().any(|&(c, side)| !(c > -side && c < 2.0 * side)) {
             return Err(format!(
                 "the principal point ({cx}, {cy}) is far outside its {width} × {height} pixels"
@@ -141,11 +141,11 @@ impl Intrinsics {
     }
 }
 
-/// How far `RᵀR` may be from the identity.
+/// Maximum difference of `RᵀR` from the identity.
 const TOLERANCE: f64 = 1e-3;
 
-/// Rotation and position of the upper three rows of a camera-to-world matrix; the rotation comes back
-/// exactly orthonormal. The problem says whether the matrix mirrors, scales or shears.
+/// Returns rotation and position of the upper three rows of a camera-to-world matrix, the rotation exactly orthonormal.
+/// The error says whether the matrix mirrors, scales or shears.
 pub(super) fn pose(rows: &[[f64; 4]; 3]) -> Result<(DMat3, DVec3), String> {
     if rows.iter().flatten().any(|v| !v.is_finite()) {
         return Err("its pose holds a number that is not finite".into());
@@ -155,7 +155,7 @@ pub(super) fn pose(rows: &[[f64; 4]; 3]) -> Result<(DMat3, DVec3), String> {
     Ok((rotation, column(3)))
 }
 
-/// The nearest rotation to one that is a rotation within [`TOLERANCE`].
+/// Returns the nearest rotation to a matrix that is a rotation within [`TOLERANCE`].
 pub(super) fn orthonormal(m: DMat3) -> Result<DMat3, String> {
     let lengths = [m.x_axis.length(), m.y_axis.length(), m.z_axis.length()];
     let determinant = m.determinant();
@@ -186,7 +186,7 @@ pub(super) fn orthonormal(m: DMat3) -> Result<DMat3, String> {
     Ok(r)
 }
 
-/// A model: its number in binary files, its name, and what its parameters are, in order.
+/// A lens model: its number in binary files, its name, and its parameters in order.
 #[derive(Debug, PartialEq)]
 pub(super) struct LensModel {
     pub id: i32,
@@ -194,7 +194,7 @@ pub(super) struct LensModel {
     pub parameters: &'static str,
 }
 
-/// Those with an inverse (COLMAP, `src/colmap/sensor/models.h`).
+/// Models with an inverse (COLMAP, `src/colmap/sensor/models.h`).
 pub(super) const MODELS: [LensModel; 11] = [
     model(0, "SIMPLE_PINHOLE", "f cx cy"),
     model(1, "PINHOLE", "fx fy cx cy"),
@@ -213,8 +213,8 @@ const fn model(id: i32, name: &'static str, parameters: &'static str) -> LensMod
     LensModel { id, name, parameters }
 }
 
-/// Names of models that COLMAP has besides, for messages.
-const OTHERS: [(i32, &str); 5] = [
+/// Names of COLMAP's other models, for messages.
+const UNSUPPORTED_MODELS: [(i32, &str); 5] = [
     (11, "RAD_TAN_THIN_PRISM_FISHEYE"),
     (12, "SIMPLE_DIVISION"),
     (13, "DIVISION"),
@@ -222,7 +222,7 @@ const OTHERS: [(i32, &str); 5] = [
     (15, "FISHEYE"),
 ];
 
-/// What bends the light, and how.
+/// Returns the projection of a lens model.
 pub(super) fn projection(model: &str) -> Projection {
     match model {
         "FOV" => Projection::Fov,
@@ -232,23 +232,25 @@ pub(super) fn projection(model: &str) -> Projection {
 }
 
 impl LensModel {
-    /// The model of this name.
+    /// Returns the model of this name.
     pub fn named(name: &str) -> Result<&'static LensModel, String> {
         MODELS.iter().find(|m| m.name == name).ok_or_else(|| unknown(name))
     }
 
-    /// The model of this number.
+    /// Returns the model of this number.
     pub fn numbered(id: i32) -> Result<&'static LensModel, String> {
-        let other = || OTHERS.iter().find(|(n, _)| *n == id).map_or(format!("number {id}"), |o| o.1.into());
+        let other = || {
+            UNSUPPORTED_MODELS.iter().find(|(n, _)| *n == id).map_or(format!("number {id}"), |o| o.1.into())
+        };
         MODELS.iter().find(|m| m.id == id).ok_or_else(|| unknown(&other()))
     }
 
-    /// How many parameters it has.
+    /// Returns the number of parameters.
     pub fn count(&self) -> usize {
         self.parameters.split(' ').count()
     }
 
-    /// Its parameters as what all formats share.
+    /// Returns the intrinsics of these parameters.
     pub fn intrinsics(&self, size: (u32, u32), values: &[f64]) -> Result<Intrinsics, String> {
         if values.len() != self.count() {
             let (name, parameters, found) = (self.name, self.parameters, values.len());
@@ -273,7 +275,7 @@ impl LensModel {
         Ok(out)
     }
 
-    /// The shortest model that says everything about a camera's lens, and its parameters.
+    /// Returns the shortest model that says everything about a camera's lens, and its parameters.
     pub fn of(camera: &Camera) -> Option<(&'static LensModel, Vec<f64>)> {
         let shortest = ["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FOV"];
         shortest.into_iter().find_map(|name| {
@@ -301,7 +303,7 @@ fn unknown(name: &str) -> String {
     )
 }
 
-/// The coefficient that a parameter names.
+/// Returns the coefficient that a parameter names.
 pub(super) fn coefficient<'d>(d: &'d mut Distortion, key: &str) -> &'d mut f64 {
     match key {
         "k1" => &mut d.k1,

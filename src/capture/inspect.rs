@@ -1,7 +1,7 @@
 //! The report on a capture: format, cameras, masks, splits, and all problems, not only the first.
 
 use super::frame::Agreement;
-use super::gather::gather;
+use super::gather;
 use super::masks::{self, few};
 use super::scene::{self, Scene, SceneOptions};
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
@@ -57,7 +57,8 @@ pub fn grouped(all: &[Error]) -> Vec<Problem> {
     problems
 }
 
-/// A message without its digits and what it quotes as the name of a frame, a view or a file that is no camera file.
+/// Returns a message without its digits and what it quotes as the name of a frame, a view or a file that is no camera
+/// file.
 fn without_names(message: &str) -> String {
     let mut before = "";
     let mut rest = String::new();

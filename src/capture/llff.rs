@@ -212,7 +212,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
     Ok(())
 }
 
-/// The photographs in `images` + `suffix`, or in that folder of pictures already reduced, in name order; `None`
+/// Returns the photographs in `images` + `suffix`, or in that folder of pictures already reduced, in name order; `None`
 /// without such a folder.
 fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String>>> {
     let downscale = folder.options.downscale;
@@ -247,7 +247,7 @@ mod tests {
         }
     }
 
-    /// The row of a frame, with columns down, right, backwards.
+    /// Returns the row of a frame, with columns down, right, backwards.
     fn llff(f: &CameraFrame) -> [f64; 17] {
         let r = f.rotation;
         let mut v = [0.0; 17];

@@ -1,4 +1,4 @@
-//! Which masks lie beside the photographs, and whether they look like masks of a head.
+//! Finds the masks of a capture, and checks that they look like masks of a head.
 
 use super::folder::CaptureFolder;
 use super::frame::{CameraFrame, Listing};
@@ -9,19 +9,19 @@ use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// The brightest value of a pixel that counts as black.
-const BLACK: u8 = 16;
+/// Maximum value of a pixel that counts as black.
+const MAX_BLACK: u8 = 16;
 
-/// Names for a message: at most six, then how many more.
+/// Returns names for a message: at most six, then the number of others.
 pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {
     let names: Vec<String> = names.into_iter().map(|n| format!("`{}`", n.as_ref())).collect();
     let text = names[..names.len().min(6)].join(", ");
     if names.len() > 6 { format!("{text} and {} more", names.len() - 6) } else { text }
 }
 
-/// Decides where masks come from, once for the whole capture, and finds valid masks and regions.
+/// Selects the source of the masks, once for the whole capture, and finds valid masks and regions.
 ///
-/// `common` is the folder of all photographs; mask folders lie beside it, or in the root.
+/// `common` is the common folder of all photographs; mask folders are next to it, or in the root.
 pub(super) fn choose(
     folder: &CaptureFolder,
     common: &Path,
@@ -81,20 +81,20 @@ pub(super) fn choose(
                 let without = views.iter().filter(|v| v.mask == ViewMask::None).map(|v| v.name.as_str());
                 let mut text = format!("{} views have no mask: {}", views.len() - n, few(without));
                 if folder.options.mask_meaning == MaskMeaning::Empty {
-                    text += "; what is learned with masks learns nothing from them";
+                    text += "; stages that use masks ignore these views";
                 }
                 listing.warnings.push(text);
             }
         }
         None => match masks {
             MaskSource::None | MaskSource::Clicks => {
-                listing.reasons.push("masks are not used, as asked".into())
+                listing.reasons.push("masks are not used, by `mask.source`".into())
             }
             MaskSource::Alpha => {
                 listing.warnings.push("no photograph has a mask in its alpha channel".into())
             }
-            _ if mask_dir.is_empty() => listing.reasons.push("no masks are beside the photographs".into()),
-            _ => listing.warnings.push(format!("the mask folder `{mask_dir}` holds no mask for any view")),
+            _ if mask_dir.is_empty() => listing.reasons.push("the capture has no masks".into()),
+            _ => listing.warnings.push(format!("the mask folder `{mask_dir}` has no mask of any view")),
         },
     }
 
@@ -118,9 +118,9 @@ pub(super) fn choose(
     Ok(())
 }
 
-/// Checks that the head masks exist that `options` ask for. Without masks, everything the cameras see would be learned as the
-/// head, which must be asked for with [`MaskSource::None`]. Held-out views need no mask, and of the others at least half must
-/// have one.
+/// Checks that the head masks exist that `options` require. Without masks, everything in view would be reconstructed as part
+/// of the head, which [`MaskSource::None`] must allow explicitly. Held-out views need no mask; at least half of the others
+/// must have one.
 pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> {
     if matches!(options.masks, MaskSource::None | MaskSource::Clicks) {
         return Ok(());
@@ -157,19 +157,19 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
     Err(Error::cannot(format_args!("`{shown}`: {problem}"), hint))
 }
 
-/// The first of these files that exists, below the first base with any.
+/// Returns the first of these files that exists, below the first base with any.
 fn first_of(folder: &CaptureFolder, bases: &[&Path], names: &[String]) -> Option<PathBuf> {
     bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name))).find_map(|p| folder.file(&p))
 }
 
-/// A view's name with its photograph's ending.
+/// Returns a view's name with its photograph's ending.
 fn full_name(view: &View) -> String {
     let ending = view.photo.extension().unwrap_or_default().to_string_lossy();
     format!("{}.{ending}", view.name)
 }
 
-/// Is the alpha channel only a formality? Three photographs decide: an exporter that adds an opaque
-/// alpha adds it to all.
+/// Returns whether the alpha channels are opaque, by three photographs: an exporter that adds an opaque channel adds it to
+/// all.
 fn all_opaque(
     views: &[View],
     kept: &[(CameraFrame, PictureInfo)],
@@ -186,24 +186,23 @@ fn all_opaque(
     Ok(true)
 }
 
-/// Share of the picture a soft mask covers, 0..=1.
+/// Returns the share of the picture that a soft mask covers, 0..=1.
 pub fn coverage(mask: &Gray) -> f64 {
     let sum: u64 = mask.values.iter().map(|&v| v as u64).sum();
     sum as f64 / (255.0 * mask.values.len().max(1) as f64)
 }
 
-/// What to do about a mask that cannot be right.
+/// Hint for a mask that cannot be right.
 pub const MASK_HINT: &str = "correct masks, photograph or camera, or remove the frame; a run that had begun then goes on with \
                              `--fresh mask`. `--set mask.trust=true` goes on with the masks as they are";
 
-/// The finding of a mask that keeps what it should leave out.
+/// The finding for an inverted mask.
 const INVERTED: &str = "looks inverted: white must keep the head";
 
-/// Refuses a view whose mask cannot be right, whatever the other views show: it is inverted, or the photograph is black
-/// where it shows the head.
+/// Refuses a view whose mask cannot be right by itself: it is inverted, or the photograph is black inside it.
 pub fn refuse(view: &str, photo: &Photo, mask: &Gray) -> Result<()> {
     let head = || photo.rgb.iter().zip(&mask.values).filter(|(_, m)| **m > 127).map(|(rgb, _)| rgb);
-    let (all, lit) = (head().count(), head().filter(|rgb| rgb.iter().any(|&v| v > BLACK)).count());
+    let (all, lit) = (head().count(), head().filter(|rgb| rgb.iter().any(|&v| v > MAX_BLACK)).count());
     let problem = if findings(mask).contains(&INVERTED) {
         format!("the mask of view `{view}` {INVERTED}")
     } else if 100 * lit < all {
@@ -214,8 +213,8 @@ pub fn refuse(view: &str, photo: &Photo, mask: &Gray) -> Result<()> {
     Err(Error::cannot(problem, MASK_HINT))
 }
 
-/// What makes a mask suspicious as the mask of a head: empty, all white, probably inverted, touching
-/// three borders or more. A person should look; [`refuse`] says what is refused.
+/// Returns why a mask is suspicious as the mask of a head: empty, all white, probably inverted, touching three borders or
+/// more. These are warnings for a user to check; [`refuse`] has the errors.
 pub fn findings(mask: &Gray) -> Vec<&'static str> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let brightest = mask.values.iter().copied().max().unwrap_or(0);

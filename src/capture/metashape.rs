@@ -111,7 +111,7 @@ struct Frame {
 impl Frame {
     const IDENTITY: Frame = Frame { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
-    /// The `transform` of a node; `None` without one.
+    /// Returns the `transform` of a node; `None` without one.
     fn of(node: Node) -> Result<Option<Frame>, String> {
         let Some(transform) = child(node, "transform") else { return Ok(None) };
         let part = |name: &str, count: usize| match child(transform, name) {

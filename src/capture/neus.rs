@@ -72,7 +72,7 @@ fn pictures(folder: &CaptureFolder, names: &[&str]) -> Result<Vec<String>> {
     Ok(folder::photographs(&folder.root.join(name))?.into_iter().map(|f| format!("{name}/{f}")).collect())
 }
 
-/// The upper three rows of a 4×4 or 3×4 array, finite.
+/// Returns the upper three rows of a 4×4 or 3×4 array, finite.
 fn matrix(arrays: &BTreeMap<String, Npy>, name: &str) -> Result<[f64; 12], String> {
     let Some(Npy { shape, values: NpyValues::Number(values) }) = arrays.get(name) else {
         return Err(format!("`{name}` is missing or holds no numbers"));

@@ -91,7 +91,7 @@ pub(super) fn list_csv(folder: &CaptureFolder, file: &str, listing: &mut Listing
     Ok(())
 }
 
-/// The values of a line, without the quotes around those that hold commas; `""` inside is a quote (RFC 4180).
+/// Returns the values of a line, without the quotes around those that hold commas; `""` inside is a quote (RFC 4180).
 fn fields(line: &str) -> Vec<String> {
     let (mut all, mut quoted) = (vec![String::new()], false);
     let mut chars = line.chars().peekable();
@@ -105,7 +105,7 @@ fn fields(line: &str) -> Vec<String> {
     all.iter().map(|field| field.trim().to_string()).collect()
 }
 
-/// The folder below the capture whose photographs have XMP files of RealityCapture beside them.
+/// Returns the folder below the capture whose photographs have XMP files of RealityCapture beside them.
 pub(super) fn xmp_folder(root: &Path) -> Option<PathBuf> {
     let inside = FolderEntries::of(root).photographs().into_iter();
     let mut folders = [root.to_path_buf()].into_iter().chain(inside);
@@ -140,7 +140,7 @@ pub(super) fn list_xmp(folder: &CaptureFolder, inside: &Path, listing: &mut List
     Ok(())
 }
 
-/// The camera in an XMP file; `None` where it has no pose.
+/// Returns the camera in an XMP file; `None` where it has no pose.
 fn read_xmp(folder: &CaptureFolder, file: &str, name: &str) -> Result<Option<Entry>> {
     let Some(path) = folder.file(Path::new(file)) else { return Ok(None) };
     let bytes = io::read_bytes(&path, &folder.options.limits)?;

@@ -1,24 +1,24 @@
-//! Where the head is: a box from cameras and masks, so that near, far and radius need not be guessed.
+//! Locates the head: a box from cameras and masks, which gives near, far and radius.
 //!
-//! With masks: the rays through the masks' middles meet near the head; a cube around that point, wide
-//! enough for every frame, is carved by the silhouettes at a coarse resolution, the cube is drawn tight
-//! around what is left, and carved again until it no longer shrinks. What lies outside a frame, beyond a border
-//! that the mask touches, is undecided for that view. So two rules say where a body ends that the frames cut:
+//! With masks: the rays through the masks' centroids meet near the head. A cube around that point, wide
+//! enough for every frame, is carved by the silhouettes at a coarse resolution, shrunk to the remaining cells, and
+//! carved again until it no longer shrinks. Space outside a frame, beyond a border that the mask touches, is undecided
+//! for that view. So two rules define the end of a body that the frames cut:
 //!
 //! - the *box* is drawn around the cells that touch the masks of a third of the views (three at least):
-//!   farther out too few cameras look for anything to be reconstructed;
+//!   farther out, too few cameras see the body to reconstruct it;
 //! - the *hull* is everything inside that box that touches three masks: the space in which the head may still be.
 //!
 //! Without masks: the box of the region that 40 % of the cameras have in their frame, no farther from the
 //! meeting point of the viewing axes than 0.6 of the cameras' median distance to it; drawn tighter around the
 //! dataset's points within it, or the dataset's own box.
 //!
-//! A box that is given, and the published one, say where the head is taken to be, whatever the masks say. TI-Face's code
+//! A given box, and the published one, override the masks. TI-Face's code
 //! has two worlds for its captures: T-Face's and the baseline's is the dataset's divided by 0.3, their box
 //! ±(1.5, 1.67, 1.0) in it; I-Face's is the dataset's, its box ±0.3. So a scene whose unit is 0.3 of the dataset's has
 //! I-Face in [-1, 1]³, as every scene has, and T-Face in its published numbers.
 //!
-//! A body that the frames cut goes on where hardly a camera looks; a field can only guess that part.
+//! A body that the frames cut continues where hardly any camera sees it; a field can only guess that part.
 //! Training still needs that part (rays of good pixels pass through it), the mesh does not: it is closed by
 //! a flat cap where too few cameras see the body ([`well_seen`]).
 
@@ -38,16 +38,16 @@ pub struct Scene {
     pub scene_from_world: Similarity,
     /// The tight box in scene coordinates, within [-1, 1]³.
     pub aabb: Aabb,
-    /// What the silhouettes leave; `None` without masks.
+    /// The visual hull; `None` without masks.
     pub hull: Option<Hull>,
 }
 
-/// The visual hull as cells over [-1, 1]³ of the scene; it holds the head, and never less.
+/// The visual hull as cells over [-1, 1]³ of the scene; it contains the whole head.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Hull {
     /// Cells per axis.
     pub resolution: usize,
-    /// One bit a cell, cell `(x · R + y) · R + z`, lowest bit first.
+    /// One bit per cell, cell `(x · R + y) · R + z`, lowest bit first.
     pub bits: Vec<u64>,
 }
 
@@ -60,17 +60,17 @@ impl Hull {
         Hull { resolution, bits }
     }
 
-    /// Is cell `i = (x · R + y) · R + z` part of the hull?
+    /// Returns whether cell `i = (x · R + y) · R + z` is part of the hull.
     pub fn get(&self, i: usize) -> bool {
         self.bits[i / 64] >> (i % 64) & 1 == 1
     }
 
-    /// How many cells it has.
+    /// Returns the number of cells in the hull.
     pub fn count(&self) -> usize {
         self.bits.iter().map(|b| b.count_ones() as usize).sum()
     }
 
-    /// Is a point in scene coordinates in a cell of the hull?
+    /// Returns whether a point in scene coordinates is in a cell of the hull.
     pub fn contains(&self, point: Vec3) -> bool {
         if !Aabb::SCENE.contains(point) {
             return false;
@@ -82,23 +82,23 @@ impl Hull {
     }
 }
 
-/// Mask values over this may be head; low, so that soft hair is not carved away.
+/// Mask values above this may be head; low, so that soft hair is not carved away.
 const THRESHOLD: u8 = 12;
 
-/// Masks that a cell must touch, or all if there are fewer.
-const LEAST_VIEWS: usize = 3;
+/// Number of masks that a cell must touch, or all if there are fewer.
+const MIN_VIEWS: usize = 3;
 
-/// Cells of air around the hull.
+/// Margin of empty cells around the hull.
 const MARGIN_CELLS: usize = 2;
 
-/// How the box is found.
+/// Options of [`fit`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneOptions {
     /// Cells per axis of the hull.
     pub resolution: usize,
     /// Names of the views for messages; numbers where absent.
     pub names: Vec<String>,
-    /// Where the dataset says the head is; used where fewer than two masks say it.
+    /// The dataset's own box of the head; used with fewer than two masks.
     pub focus: Option<Aabb>,
 }
 
@@ -108,7 +108,7 @@ impl Default for SceneOptions {
     }
 }
 
-/// Finds the box, and the hull where there are masks; warnings name views that look wrong.
+/// Returns the scene: the box, and with masks the hull; warnings name suspicious views.
 ///
 /// `masks[i]` belongs to `cameras[i]`; a view without one does not carve. Masks may have another size than
 /// their camera. Empty and all-white masks are left out with a warning.
@@ -154,8 +154,8 @@ pub fn fit(
     if used.is_empty() && !white.is_empty() {
         let n = white.len();
         return Err(Error::cannot(
-            format_args!("all {n} masks are white everywhere, so they say nothing about where the head is"),
-            "make head masks: `tiface mask CAPTURE --page`; or go on without: `--set mask.source=none`",
+            format_args!("all {n} masks are white everywhere, so they do not locate the head"),
+            "make head masks: `tiface mask CAPTURE --page`; or continue without: `--set mask.source=none`",
         ));
     }
     if used.is_empty() && !empty.is_empty() {
@@ -169,7 +169,7 @@ pub fn fit(
         }
     }
     if used.len() < 2 {
-        // one silhouette alone bounds nothing in depth
+        // a single silhouette gives no bound in depth
         let scene = from_frusta(cameras, options.focus)?;
         return Ok((scene, warnings));
     }
@@ -181,14 +181,14 @@ pub fn fit(
         .iter()
         .filter_map(|&i| Some(SilhouetteTable::new(i, &cameras[i], masks[i].as_ref()?, THRESHOLD)))
         .collect();
-    let least = LEAST_VIEWS.min(used.len());
+    let least = MIN_VIEWS.min(used.len());
     let core = used.len().div_ceil(3).max(least);
     let margin = MARGIN_CELLS as f64;
 
     let mut cube = Cube { center, half: first_half(&some, center), n: 64.min(options.resolution) };
     let mut grown = 0;
     let mut shrunk = 0;
-    // how much each view removes alone, and what all keep: from the coarse cube, which holds everything
+    // cells that each view alone removes, and cells that all keep: from the coarse cube, which contains everything
     let mut word: (Vec<u64>, u64) = Default::default();
     let (extent, mut kept) = loop {
         let carved = carve::carve(&cube, &silhouettes);
@@ -216,10 +216,9 @@ pub fn fit(
             continue;
         }
         if cut && shrunk == 0 {
-            warnings
-                .push("the cameras hardly bound the head in depth; the box ends where it was cut off".into());
+            warnings.push("the cameras hardly bound the head in depth, so the box was cut off".into());
         }
-        // the middle and half side of what is left, with its air
+        // center and half side of the remaining cells, with the margin
         let lo = DVec3::from(extent.map(|(lo, _)| lo as f64));
         let hi = DVec3::from(extent.map(|(_, hi)| hi as f64 + 1.0));
         let middle = cube.center - cube.half + 0.5 * (lo + hi) * cube.cell();
@@ -253,7 +252,7 @@ pub fn fit(
             ));
         }
     }
-    // nothing of the hull outside the box, air included
+    // the hull is restricted to the box with its margin
     let air = MARGIN_CELLS;
     for (i, cell) in kept.iter_mut().enumerate() {
         let at = [i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n];
@@ -272,12 +271,12 @@ fn scene_from(center: DVec3, half: f64) -> Similarity {
     Similarity::scale_translate(1.0 / half, -center / half)
 }
 
-/// Where the rays meet, once it is clear that they do.
+/// Returns the point where the rays meet, or an error if they do not.
 fn aim(cameras: &[&Camera], rays: &[(DVec3, DVec3)]) -> Result<DVec3> {
     let n = cameras.len();
     let alike = |how: &str| {
         Error::cannot(
-            format_args!("all {n} cameras {how}, so nothing says how far away the head is"),
+            format_args!("all {n} cameras {how}, so the distance of the head is unknown"),
             "check that each frame has its own pose; cameras must look from different sides",
         )
     };
@@ -305,7 +304,7 @@ fn head_outside(seen: usize, cameras: usize) -> Error {
     )
 }
 
-/// Half the side of a cube around `center` that no frame's picture of it leaves, short of the cameras.
+/// Returns half the side of a cube around `center` that covers every frame, and does not reach the cameras.
 fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
     let wide = cameras.iter().map(|c| {
         let (x, y) = (0.5 * c.width as f64 / c.fx, 0.5 * c.height as f64 / c.fy);
@@ -315,19 +314,19 @@ fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
     (1.2 * wide.fold(0.0, f64::max)).min(0.95 * nearest)
 }
 
-/// Points that a box needs to be drawn around them.
-const LEAST_POINTS: usize = 100;
+/// Minimum number of points for a box around them.
+const MIN_POINTS: usize = 100;
 
-/// The box around points that lie where the cameras look, one in a hundred left out on each side, and a twentieth more;
-/// `None` for too few.
+/// Returns the box of the points that the cameras see, without one percent on each side, enlarged by a twentieth; `None`
+/// for too few points.
 pub(super) fn around_points(views: &[View], points: &[DVec3]) -> Option<Aabb> {
-    if points.len() < LEAST_POINTS {
+    if points.len() < MIN_POINTS {
         return None;
     }
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
     let seen = world_box(&from_frusta(&cameras, None).ok()?);
     let within: Vec<Vec3> = points.iter().map(|p| p.as_vec3()).filter(|p| seen.contains(*p)).collect();
-    if within.len() < LEAST_POINTS {
+    if within.len() < MIN_POINTS {
         return None;
     }
     let [x, y, z] = [0, 1, 2].map(|k| {
@@ -340,7 +339,7 @@ pub(super) fn around_points(views: &[View], points: &[DVec3]) -> Option<Aabb> {
     Some(Aabb { min: (min - more).max(seen.min), max: (max + more).min(seen.max) })
 }
 
-/// The scene of a box in the world, without a hull; `None` for a flat one.
+/// Returns the scene of a box in the world, without a hull; `None` for a flat box.
 fn from_box(b: Aabb) -> Option<Scene> {
     let (size, middle) = (b.size().as_dvec3(), b.center().as_dvec3());
     let half = 0.5 * size.max_element();
@@ -352,7 +351,7 @@ fn from_box(b: Aabb) -> Option<Scene> {
     Some(Scene { scene_from_world: scene_from(middle, half), aabb, hull: None })
 }
 
-/// The box without masks: see the module's text.
+/// Returns the scene without masks, as described in the module documentation.
 fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Scene> {
     if let Some(scene) = focus.and_then(from_box) {
         return Ok(scene);
@@ -389,11 +388,11 @@ fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Scene> {
     })
 }
 
-/// Heights of what is taken for a head, metres: with or without neck and shoulders, of a child or an adult.
+/// Plausible heights of a head, metres: with or without neck and shoulders, of a child or an adult.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.15..=0.6;
 
-/// Returns how high the hull is along `up`, in dataset units; `None` without a hull, since nothing then says where the
-/// head ends.
+/// Returns the height of the hull along `up`, in dataset units; `None` without a hull, because the end of the head is then
+/// unknown.
 pub fn height(scene: &Scene, up: Vec3) -> Option<f64> {
     let hull = scene.hull.as_ref()?;
     let r = hull.resolution;
@@ -404,7 +403,7 @@ pub fn height(scene: &Scene, up: Vec3) -> Option<f64> {
     (low <= high).then(|| f64::from(high - low + 1.0) * cell)
 }
 
-/// Returns a sentence if no head is so high, because a unit of the dataset is not what `capture.unit_m` says.
+/// Returns a warning if the height is implausible for a head, probably because `capture.unit_m` is wrong.
 pub fn doubtful_height(height: f64, unit_m: f64) -> Option<String> {
     let height_m = height * unit_m;
     (!HEIGHTS_M.contains(&height_m)).then(|| {
@@ -418,13 +417,13 @@ pub fn doubtful_height(height: f64, unit_m: f64) -> Option<String> {
     })
 }
 
-/// The box in world coordinates.
+/// Returns the box in world coordinates.
 pub fn world_box(scene: &Scene) -> Aabb {
     let world_from_scene = scene.scene_from_world.inverse();
     Aabb { min: world_from_scene.point(scene.aabb.min), max: world_from_scene.point(scene.aabb.max) }
 }
 
-/// One line about a scene, for people: its box in world units and how much of it the hull fills.
+/// Returns a line that describes a scene: its box in world units and the share of it that the hull fills.
 pub fn describe(scene: &Scene) -> String {
     let b = world_box(scene);
     let size = b.size();
@@ -443,10 +442,10 @@ const ILSH_HALF: Vec3 = Vec3::new(1.5, 1.67, 1.0);
 /// Dataset units in a unit of T-Face's published world.
 const ILSH_UNIT: f64 = 0.3;
 
-/// Where fields are learned: `capture.box`.
+/// The box in which fields are trained: `capture.box`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum SceneBox {
-    /// Where cameras and masks say that the head is.
+    /// The box located by cameras and masks.
     Head,
     /// The published box of the ILSH captures, if it contains the head.
     Ilsh,
@@ -455,7 +454,7 @@ pub enum SceneBox {
 }
 
 impl SceneBox {
-    /// Returns what the words or numbers of `capture.box` mean.
+    /// Parses `capture.box`.
     pub fn parse(text: &str) -> Result<SceneBox> {
         let wrong = |why: String| {
             let hint = "write head, ilsh or the lowest and the highest corner: `-0.4,-0.5,-0.3,0.4,0.5,0.3`";
@@ -473,13 +472,13 @@ impl SceneBox {
         };
         let (min, max) = (Vec3::new(x0, y0, z0), Vec3::new(x1, y1, z1));
         if !(min.is_finite() && max.is_finite() && min.cmplt(max).all()) {
-            return wrong(format!("is `{text}`: no box, its lowest corner first"));
+            return wrong(format!("is `{text}`, which is not a box with its lowest corner first"));
         }
         Ok(SceneBox::Given(Aabb { min, max }))
     }
 }
 
-/// The scene of the published box: its unit is 0.3 dataset units, its origin the dataset's.
+/// Returns the scene of the published box: its unit is 0.3 dataset units, its origin the dataset's.
 fn ilsh() -> Scene {
     Scene {
         scene_from_world: Similarity::scale_translate(1.0 / ILSH_UNIT, DVec3::ZERO),
@@ -488,9 +487,9 @@ fn ilsh() -> Scene {
     }
 }
 
-/// Returns the scene in the box that is asked for, and a sentence where that cannot be.
+/// Returns the scene of the configured box, and a warning if it cannot be used.
 ///
-/// `found` is what cameras and masks say; a given box stands without it. Such a box is taken as it is: it has no hull.
+/// `found` locates the head by cameras and masks, and is not called for a given box, which has no hull.
 pub fn in_box(
     found: impl FnOnce() -> Result<(Scene, Vec<String>)>,
     wanted: SceneBox,
@@ -522,7 +521,7 @@ pub fn in_box(
     Ok((scene, warnings))
 }
 
-/// The part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
+/// Returns the part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
 /// median, inside the frames of a `share` of the cameras, 0..=1 (three at least). `cameras` are in the world;
 /// only the face that looks most downward moves (`up` is a world direction): frames cut heads below, and a body
 /// whose shoulders end in walls left and right looks like a box.
@@ -582,7 +581,7 @@ mod tests {
     use crate::kernel::cpu::vm::{samples_across, size_for, step_size};
     use glam::DMat3;
 
-    /// A camera at `position` looking at `target`, 60 × 60 pixels, focal length 80.
+    /// Returns a camera at `position` looking at `target`, 60 × 60 pixels, focal length 80.
     fn camera(position: DVec3, target: DVec3) -> Camera {
         let back = (position - target).normalize();
         let right = DVec3::Z.cross(back).normalize();
@@ -613,7 +612,7 @@ mod tests {
             .collect()
     }
 
-    /// The silhouette of the ball of [`RADIUS`] around [`CENTER`].
+    /// Returns the silhouette of the ball of [`RADIUS`] around [`CENTER`].
     fn ball(camera: &Camera) -> Option<Gray> {
         let values = (0..3600)
             .map(|i| {

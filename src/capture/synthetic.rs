@@ -39,7 +39,7 @@ impl Default for SyntheticOptions {
     }
 }
 
-/// The cameras of a capture, training views first: `(camera, is it for training)`.
+/// Returns the cameras of a capture, training views first: `(camera, is it for training)`.
 ///
 /// They stand on a dome about 1.1 m from the head, azimuth ±110° around the face, elevation −18°
 /// to +50°, one in each cell of an even lattice, so that the whole bust is in every frame. The back
@@ -65,7 +65,7 @@ pub fn cameras(options: &SyntheticOptions) -> Vec<(Camera, bool)> {
     train.chain(dome(options.test, 0x6865).into_iter().map(|c| (c, false))).collect()
 }
 
-/// A camera on the dome, looking at the middle of the bust, rolled by `roll` radians.
+/// Returns a camera on the dome, looking at the middle of the bust, rolled by `roll` radians.
 fn aim(options: &SyntheticOptions, azimuth: f64, elevation: f64, distance: f64, roll: f64) -> Camera {
     let centre = SyntheticHead.bounds().center().as_dvec3();
     let (sin, cos) = elevation.sin_cos();
@@ -152,7 +152,7 @@ pub fn write_photographs(
     Ok(())
 }
 
-/// Writes `valid/NAME.npy` for every view of a capture: a border of so many pixels is not usable, as in the ILSH
+/// Writes `valid/NAME.npy` for every view of a capture: a border of this width is not usable, as in the ILSH
 /// dataset, whose photographs are undistorted. To be written before the capture, whose cameras say that it is complete.
 pub fn write_borders(dir: &Path, options: &SyntheticOptions, border: u32) -> Result<()> {
     let (w, h) = (options.width, options.height);
@@ -166,7 +166,7 @@ pub fn write_borders(dir: &Path, options: &SyntheticOptions, border: u32) -> Res
     Ok(())
 }
 
-/// The frames of one split (`Some(train)`), or all with their split named.
+/// Returns the frames of one split (`Some(train)`), or all with their split named.
 fn transforms(cameras: &[(Camera, bool)], split: Option<bool>) -> Value {
     let frames: Vec<Value> = cameras
         .iter()

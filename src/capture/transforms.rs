@@ -2,7 +2,7 @@
 //!
 //! Poses are camera-to-world with OpenGL axes in all three. Intrinsics may stand at the top or in each
 //! frame; a frame's own win. Unknown keys are ignored, `null` counts as absent; known ones of the wrong type are
-//! errors, but for [`LENIENT`] and `up`, which count as absent as well.
+//! errors, but for [`LENIENT_KEYS`] and `up`, which count as absent as well.
 
 use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, CameraFrame, Intrinsics, LensModel, Listing};
@@ -19,13 +19,13 @@ type Object = Map<String, Value>;
 
 /// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would be overruled by
 /// the whole file's focal length.
-const FOCAL: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
+const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// The other keys that may stand at the top for all frames.
-const SHARED: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega is_fisheye camera_model";
+const SHARED_KEYS: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega is_fisheye camera_model";
 
 /// Keys that count as absent where their value is of another type, and whether it is of theirs.
-const LENIENT: [(&str, fn(&Value) -> bool); 3] = [
+const LENIENT_KEYS: [(&str, fn(&Value) -> bool); 3] = [
     ("is_fisheye", Value::is_boolean),
     ("camera_model", Value::is_string),
     ("face_mask_path", Value::is_string),
@@ -97,13 +97,14 @@ impl FrameKeys {
     }
 
     fn merged(top: &Object, own: &Object) -> Result<FrameKeys, String> {
-        let own_focal = FOCAL.iter().any(|key| own.contains_key(*key));
-        let shared = SHARED.split(' ').chain(FOCAL.into_iter().filter(|_| !own_focal));
+        let own_focal = FOCAL_KEYS.iter().any(|key| own.contains_key(*key));
+        let shared = SHARED_KEYS.split(' ').chain(FOCAL_KEYS.into_iter().filter(|_| !own_focal));
         let shared = shared.filter_map(|key| top.get_key_value(key));
-        let is_given = |(key, value): &(&String, &Value)| match LENIENT.iter().find(|(name, _)| key == name) {
-            Some((_, is_usable)) => is_usable(value),
-            None => !value.is_null(),
-        };
+        let is_given =
+            |(key, value): &(&String, &Value)| match LENIENT_KEYS.iter().find(|(name, _)| key == name) {
+                Some((_, is_usable)) => is_usable(value),
+                None => !value.is_null(),
+            };
         let merged: Object = (shared.filter(is_given).chain(own.iter().filter(is_given)))
             .map(|(key, value)| (key.clone(), value.clone()))
             .collect();
@@ -198,7 +199,8 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
     Ok(())
 }
 
-/// The camera of a frame, whose pose is known. What neither it nor the top of its file says of the lens is as `like` has it.
+/// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the lens is as
+/// `like` has it.
 pub(crate) fn camera_like(
     top: &Object,
     own: &Object,
@@ -216,7 +218,7 @@ pub(crate) fn camera_like(
     Ok(Camera { cx, cy, distortion, rotation, position, ..like })
 }
 
-/// The split a frame names, else the one it is in otherwise.
+/// Returns the split a frame names, else the one it is in otherwise.
 fn named_split(name: Option<&str>, otherwise: Option<Split>) -> Result<Option<Split>, String> {
     match name {
         None => Ok(otherwise),
@@ -227,7 +229,7 @@ fn named_split(name: Option<&str>, otherwise: Option<Split>) -> Result<Option<Sp
     }
 }
 
-/// The upper three rows of a 3×4 or 4×4 matrix.
+/// Returns the upper three rows of a 3×4 or 4×4 matrix.
 fn upper_rows(matrix: &[Vec<f64>]) -> Result<[[f64; 4]; 3], String> {
     let rows: Option<Vec<[f64; 4]>> = matrix.iter().map(|row| row.as_slice().try_into().ok()).collect();
     let ([a, b, c], last) = match rows.as_deref() {
@@ -265,8 +267,8 @@ fn intrinsics(keys: &FrameKeys, ignored: &mut Vec<String>) -> Result<Intrinsics,
     Ok(Intrinsics { size: w.zip(h), focal, angle, center, distortion })
 }
 
-/// The coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as well, and nerfstudio's
-/// perspective k4 is none that anybody else has.
+/// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as well, and
+/// nerfstudio's perspective k4 exists in no other program.
 fn distortion(keys: &FrameKeys, model: &str, ignored: &mut Vec<String>) -> Result<Distortion, String> {
     let &FrameKeys { k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1, omega, .. } = keys;
     let given = Distortion { k1, k2, k3, p1, p2, k4, k5, k6, sx1, sy1, omega, ..Distortion::default() };

@@ -55,7 +55,7 @@ pub struct CaptureOptions {
     pub mask_dir: String,
     /// What they mean.
     pub mask_meaning: MaskMeaning,
-    /// Are masks that cannot be right a matter of warnings only?
+    /// Whether masks that cannot be right are reported as warnings only.
     pub trust_masks: bool,
     /// Whether poses are to be measured.
     pub cameras: CameraPoses,
@@ -137,7 +137,7 @@ pub struct View {
 }
 
 impl Capture {
-    /// The views of one split.
+    /// Returns the views of one split.
     pub fn split(&self, split: Split) -> impl Iterator<Item = &View> {
         self.views.iter().filter(move |v| v.split == split)
     }
@@ -193,7 +193,7 @@ impl View {
         Ok(LoadedView { photo, mask, valid, region })
     }
 
-    /// Only the mask of this view, at the camera's size, whatever it means; `None` without one.
+    /// Returns the mask of this view at the camera's size, without its meaning; `None` without one.
     pub fn load_mask(&self, limits: &Limits) -> Result<Option<Gray>> {
         let alpha = match self.mask {
             ViewMask::Alpha => self.load_photo(limits)?.alpha,
@@ -211,12 +211,12 @@ impl View {
         }
     }
 
-    /// A soft mask at the camera's size.
+    /// Returns a soft mask at the camera's size.
     fn read_mask(&self, path: &Path, limits: &Limits) -> Result<Gray> {
         self.reduced(path, io::read_gray(path, Some(self.photo_size), limits)?, Average::Mean)
     }
 
-    /// A valid mask as 0 or 255; `.npy` of shape (h, w) or (h, w, 1), or a picture.
+    /// Returns a valid mask as 0 or 255; `.npy` of shape (h, w) or (h, w, 1), or a picture.
     fn read_valid(&self, path: &Path, limits: &Limits) -> Result<Gray> {
         if path.extension().is_none_or(|e| e != "npy") {
             let mut gray = io::read_gray(path, Some(self.photo_size), limits)?;
@@ -255,7 +255,7 @@ impl View {
     }
 }
 
-/// The camera of a picture averaged down by `d`.
+/// Returns the camera of a picture averaged down by `d`.
 pub(super) fn downscaled(camera: &Camera, d: u32) -> Camera {
     let s = 1.0 / d as f64;
     Camera {
@@ -294,7 +294,7 @@ fn average_gray(gray: &Gray, d: u32, average: Average) -> Gray {
     Gray { width, height, values }
 }
 
-/// Indices of the pixels of one block, row by row.
+/// Returns the indices of the pixels of one block, row by row.
 fn block(x: u32, y: u32, d: u32, row: u32) -> impl Iterator<Item = usize> {
     (y * d..(y + 1) * d)
         .flat_map(move |v| (x * d..(x + 1) * d).map(move |u| v as usize * row as usize + u as usize))
@@ -329,7 +329,7 @@ fn average_photo(photo: &Photo, d: u32) -> Photo {
     Photo { width, height, rgb, alpha }
 }
 
-/// A picture's size is not the one that `file` declares; the factor between the two is the suggested fix.
+/// Returns the error for a picture whose size differs from the one that `file` declares; the hint is their ratio.
 pub(super) fn wrong_size(
     picture: &str,
     found: (u32, u32),

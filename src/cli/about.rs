@@ -1,16 +1,13 @@
-//! What the program says of itself: `tiface config`, the effective configuration or what a key means; `tiface doctor`, what
-//! this machine and this build can do, to choose a device and to paste into a bug report; `tiface completions`, what a shell
-//! needs to complete commands and options, and the manual pages.
+//! `tiface config`: the effective configuration, or the documentation of a key. `tiface doctor`: devices and features of this
+//! machine and build, for the choice of a device and for bug reports. `tiface completions`: shell completions.
 
 use super::options::{Common, RunTarget};
-use super::out::Out;
 use super::screen::print;
 use crate::config::explain;
 use crate::field::{Found, examine_devices};
 use crate::{Error, ErrorKind, Result, io};
-use clap::{Command, ValueEnum};
+use clap::Command;
 use clap_complete::{Shell, generate};
-use clap_mangen::Man;
 use serde::Serialize;
 use std::fmt::{self, Display};
 use std::path::Path;
@@ -20,7 +17,7 @@ pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) ->
         print(&explain(key)?)?;
         return Ok(());
     }
-    // without a capture or run it is the configuration of a run that is yet to be
+    // without a capture or run, this is the configuration of a new run
     let saved = match path.or(common.run.as_deref()) {
         Some(path) => RunTarget::find(common, Some(path))?.saved,
         None => None,
@@ -29,7 +26,7 @@ pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) ->
     Ok(())
 }
 
-/// What is said of a machine.
+/// A machine's devices and features.
 #[derive(Serialize)]
 struct Examination {
     version: &'static str,
@@ -38,7 +35,7 @@ struct Examination {
     processor: String,
     threads: usize,
     devices: Vec<Found>,
-    /// What `--device auto` takes.
+    /// The device that `--device auto` selects.
     auto: String,
 }
 
@@ -48,7 +45,7 @@ pub(super) fn doctor(common: &Common) -> Result<()> {
     let (devices, auto) = examine_devices(&tests)?;
     let auto = match cfg!(feature = "wgpu") {
         true => auto.description(),
-        false => "the processor: this build knows no GPU (`--features wgpu`)".into(),
+        false => "the CPU: this build has no GPU support (`--features wgpu`)".into(),
     };
     let found = Examination {
         version: env!("CARGO_PKG_VERSION"),
@@ -68,7 +65,7 @@ pub(super) fn doctor(common: &Common) -> Result<()> {
 }
 
 impl Examination {
-    /// Does every device that is here compute what the processor does?
+    /// Returns whether every device passed its self-test against the CPU.
     fn is_sound(&self) -> bool {
         self.devices.iter().all(|d| d.error.is_none() && d.checks.iter().all(|c| c.passed))
     }
@@ -95,11 +92,7 @@ impl Display for Examination {
                 None => {
                     let failed = d.checks.iter().filter(|c| !c.passed).count();
                     let verdict = if failed == 0 { "passed".into() } else { format!("FAILED ({failed})") };
-                    writeln!(
-                        f,
-                        "  self-test   {verdict} in {:.1} s; errors, and what they may be:",
-                        d.seconds
-                    )?;
+                    writeln!(f, "  self-test   {verdict} in {:.1} s; errors and their limits:", d.seconds)?;
                 }
             }
             for c in &d.checks {
@@ -111,67 +104,8 @@ impl Display for Examination {
     }
 }
 
-/// What `completions` writes.
-#[derive(Clone, Copy, Debug)]
-pub(super) enum Form {
-    Shell(Shell),
-    Man,
-}
-
-impl ValueEnum for Form {
-    fn value_variants<'a>() -> &'a [Form] {
-        use Form::{Man, Shell as For};
-        &[
-            For(Shell::Bash),
-            For(Shell::Zsh),
-            For(Shell::Fish),
-            For(Shell::PowerShell),
-            For(Shell::Elvish),
-            Man,
-        ]
-    }
-
-    fn to_possible_value(&self) -> Option<clap::builder::PossibleValue> {
-        match self {
-            Form::Shell(shell) => shell.to_possible_value(),
-            Form::Man => Some(clap::builder::PossibleValue::new("man")),
-        }
-    }
-}
-
-pub(super) fn completions(form: Form, mut command: Command, out: Option<&Out>) -> Result<()> {
-    let pages = match (form, out) {
-        (Form::Shell(_), Some(_)) => {
-            return Err(Error::usage("the script of a shell goes to stdout", "send it on with `> FILE`"));
-        }
-        (Form::Shell(shell), None) => {
-            let mut script = Vec::new();
-            generate(shell, &mut command, "tiface", &mut script);
-            return print(&String::from_utf8_lossy(&script));
-        }
-        (Form::Man, None) => vec![page(command)?],
-        (Form::Man, Some(_)) => {
-            command.build();
-            let of_commands: Vec<Command> =
-                command.get_subcommands().filter(|c| c.get_name() != "help").cloned().collect();
-            let named = of_commands.into_iter().map(|c| {
-                // a command's name lives as long as the program
-                let name: &'static str = format!("tiface-{}", c.get_name()).leak();
-                c.name(name).display_name(name)
-            });
-            let all: Vec<Command> = named.collect();
-            std::iter::once(command).chain(all).map(page).collect::<Result<_>>()?
-        }
-    };
-    let Some(out) = out else { return print(&String::from_utf8_lossy(&pages[0].1)) };
-    out.prepare()?;
-    pages.iter().try_for_each(|(name, text)| Ok(io::write_atomic(&out.file(name), text)?))
-}
-
-/// A manual page and the name of its file.
-fn page(command: Command) -> Result<(String, Vec<u8>)> {
-    let man = Man::new(command);
-    let mut text = Vec::new();
-    man.render(&mut text).map_err(|e| Error::new(crate::ErrorKind::Bug, e))?;
-    Ok((man.get_filename(), text))
+pub(super) fn completions(shell: Shell, mut command: Command) -> Result<()> {
+    let mut script = Vec::new();
+    generate(shell, &mut command, "tiface", &mut script);
+    print(&String::from_utf8_lossy(&script))
 }

@@ -1,4 +1,4 @@
-//! `tiface bench`: speed against error of each decision, measured on this machine.
+//! `tiface bench`: speed against error of settings, measured on this machine.
 
 use super::Invocation;
 use super::options::{Common, RunTarget};
@@ -17,21 +17,21 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// What is measured.
+/// Options of `tiface bench`.
 #[derive(Args, Debug)]
 pub(super) struct BenchOptions {
-    /// A capture; or a run, whose finished fields are taken where training is not what is measured
+    /// Capture, or run whose finished fields are reused by sweeps that do not measure training
     #[arg(value_name = "CAPTURE|RUN")]
     path: PathBuf,
-    /// Of these decisions, with commas [default: all]
+    /// Settings to sweep, separated by commas [default: all]
     #[arg(long, value_name = "LIST", value_delimiter = ',', value_parser = PossibleValuesParser::new(SWEEPS))]
     sweep: Vec<String>,
 }
 
-/// Half the steps of a first look: all sweeps end within minutes.
-const HALF: &str = "iface.steps = 1500\n";
+/// Half the steps of the preset `draft`, so that all sweeps end within minutes.
+const BENCH_SETTINGS: &str = "iface.steps = 1500\n";
 
-/// Tells warnings, and nothing of the rest: a bench has its own lines.
+/// Passes on warnings only: a bench prints its own progress.
 struct Warnings(Arc<super::screen::Screen>);
 
 impl Observer for Warnings {
@@ -44,13 +44,13 @@ impl Observer for Warnings {
 
 pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()> {
     let Invocation { common, screen, stop } = invocation;
-    let asked = Out::find(common.out.as_deref(), "bench")?;
+    let out = Out::find(common.out.as_deref(), "bench")?;
     let target = RunTarget::find(common, Some(&options.path))?;
     let config = configure(common, &target)?;
     check_feasible(&config)?;
     require_device(&config)?;
     let name = target.run.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
-    let folder = asked.map_or_else(|| Path::new("bench").join(name), |out| out.file(""));
+    let folder = out.map_or_else(|| Path::new("bench").join(name), |out| out.file(""));
     let results = folder.join("bench.json");
     if io::exists(&results) {
         let what = format!("`{}` holds the results of another bench", folder.display());
@@ -65,9 +65,9 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
         return Ok(());
     }
     io::create_folder(&folder)?;
-    // where the system removes what a killed program leaves
+    // in the system's folder for temporary files, which is cleaned after a killed process
     let scratch = tempfile::tempdir().map_err(|e| {
-        Error::cannot(format!("there is no room for scratch files: {e}"), "name another place in TMPDIR")
+        Error::cannot(format!("temporary files cannot be created: {e}"), "set TMPDIR to another folder")
     })?;
     let quiet = |dir: &Path| Run::open(dir, stop.clone(), Arc::new(Warnings(screen.clone())));
     let run = quiet(&scratch.path().join("run"));
@@ -87,7 +87,7 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
             _ => e,
         });
         result.sweeps.push(measured?);
-        // the results last: a program may wait for them
+        // the results are written last: a program may wait for them
         let page = folder.join("bench.html");
         io::write_atomic(&page, result.html()?.as_bytes())?;
         io::write_atomic(&results, result.json().as_bytes())?;
@@ -101,9 +101,9 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
     Ok(())
 }
 
-/// A run's own configuration; else that of a first look.
+/// Returns a run's own configuration, or that of a bench on a capture.
 fn configure(common: &Common, target: &RunTarget) -> Result<Config> {
-    let mut config = common.resolve(target.saved.as_deref(), Some((Preset::Draft, HALF)), &[])?;
+    let mut config = common.resolve(target.saved.as_deref(), Some((Preset::Draft, BENCH_SETTINGS)), &[])?;
     if let Some(capture) = &target.capture {
         config.capture.path = capture.to_str().map(String::from).ok_or_else(|| {
             let shown = capture.display();

@@ -1,8 +1,8 @@
-//! Commands on a capture alone: `tiface inspect`, what was found in it; `tiface convert`, the same with its cameras in
-//! another format; `tiface mask --page`, one file to click on in a browser.
+//! Commands on a capture: `tiface inspect` checks it, `tiface convert` rewrites its cameras in another format,
+//! `tiface mask --page` writes a page to click on in a browser.
 
 use super::Invocation;
-use super::options::{Common, is_run};
+use super::options::Common;
 use super::out::Out;
 use super::screen::print;
 use crate::capture::convert::CameraFormat;
@@ -27,7 +27,7 @@ pub(super) fn inspect(common: &Common, capture: &Path) -> Result<()> {
 pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<()> {
     let common = invocation.common;
     let format = CameraFormat::named(to).ok_or_else(|| {
-        Error::usage(format_args!("`--to {to}` is no format of cameras"), "choose transforms or colmap")
+        Error::usage(format_args!("`--to {to}` is not a camera format"), "choose transforms or colmap")
     })?;
     let options = capture_options(&common.resolve(None, None, &[])?);
     let capture = capture::open(from, &options)?;
@@ -51,26 +51,25 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
     print(&format!("{shown}\n"))
 }
 
-/// Writes the page for a capture. Existing clicks, `prompts` or the capture's own `prompts.json`, are in
-/// it.
+/// Writes the page for a capture, with existing clicks from `prompts` or the capture's own `prompts.json`.
 pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option<&Path>) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
-    let asked = Out::find(common.out.as_deref(), "page")?;
+    let destination = Out::find(common.out.as_deref(), "page")?;
     let Some(path) = path else {
         return Err(Error::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
     };
-    // a run knows its capture, and how large its photographs are taken
-    let saved = is_run(path).then(|| path.join("config.toml"));
+    // a run's configuration has its capture and the size of its photographs
+    let saved = capture::is_run(path).then(|| path.join("config.toml"));
     let config = common.resolve(saved.as_deref(), None, &[])?;
     let root = match config.capture.path.as_str() {
         "" => path,
         _ if saved.is_none() => path,
         known => Path::new(known),
     };
-    // photographs are clicked on whether or not they have masks
+    // masks are not needed to click
     let options = capture::CaptureOptions { masks: capture::MaskSource::None, ..capture_options(&config) };
     let capture = capture::open(root, &options)?;
-    // the capture's own clicks are a help: what is wrong with them does not keep anybody from clicking
+    // invalid clicks of the capture are a warning only
     let own = capture.root.join("prompts.json");
     let inside =
         io::real_path(&own).is_ok_and(|p| io::real_path(&capture.root).is_ok_and(|r| p.starts_with(r)));
@@ -82,12 +81,12 @@ pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option
         prompts => click_page(&capture, prompts)?,
     };
     let name = format!("{}_clicks.html", capture.name);
-    let out = asked.as_ref().map_or_else(|| PathBuf::from(&name), |out| out.file(&name));
+    let out = destination.as_ref().map_or_else(|| PathBuf::from(&name), |out| out.file(&name));
     if common.dry_run {
         screen.note("page", &format!("would write an annotation page to `{}`", out.display()));
         return Ok(());
     }
-    asked.iter().try_for_each(Out::prepare)?;
+    destination.iter().try_for_each(Out::prepare)?;
     io::write_atomic(&out, html.as_bytes())?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "page": out})))?;

@@ -1,4 +1,4 @@
-//! `tiface check`: is a mesh sound, and how far is it from another?
+//! `tiface check`: validates a mesh, and measures its distance to another.
 
 use super::options::Common;
 use super::screen::{one_line, print};
@@ -17,24 +17,24 @@ use std::fmt::{self, Display};
 use std::ops::RangeInclusive;
 use std::path::Path;
 
-/// Points spread over each surface.
-const POINTS: usize = 200_000;
+/// Points sampled on each surface.
+const SURFACE_SAMPLES: usize = 200_000;
 
-/// How far the mesh is from another surface, millimetres.
+/// Distances between the mesh and another surface, millimetres.
 #[derive(Serialize)]
 struct Against {
     /// From every part of the mesh, caps included.
     whole: Millimetres,
-    /// From what three or more training cameras see, and that part's share of the area.
+    /// From the part that three or more training cameras see, and its share of the area.
     #[serde(skip_serializing_if = "Option::is_none")]
     seen: Option<(Millimetres, f64)>,
-    /// From what so many training cameras see, and the shares: how far a distance can be trusted.
+    /// From the parts seen by each number of training cameras, and their shares of the area.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     by_views: Vec<ByViews>,
-    /// From the other surface to the mesh: what is missed.
+    /// From the other surface to the mesh: what the mesh misses.
     back: Millimetres,
     /// ... and back from its skin and its hair where three or more training cameras look, with the signed median
-    /// (negative where the mesh is inside), where the photographs tell them apart.
+    /// (negative where the mesh is inside); only for photographs that separate the two.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     parts: Vec<Part>,
 }
@@ -48,7 +48,7 @@ struct Part {
 }
 
 /// The parts of a surface by how many cameras see them.
-const VIEWS: [(&str, RangeInclusive<u32>); 5] =
+const VIEW_COUNTS: [(&str, RangeInclusive<u32>); 5] =
     [("0", 0..=0), ("1", 1..=1), ("2", 2..=2), ("3 or 4", 3..=4), ("5 or more", 5..=u32::MAX)];
 
 #[derive(Serialize)]
@@ -102,7 +102,7 @@ impl Display for Against {
 struct CheckJson<'a> {
     #[serde(flatten)]
     report: &'a CheckReport,
-    /// Why the texture was not looked at.
+    /// Why the texture was not checked.
     #[serde(skip_serializing_if = "Option::is_none")]
     texture_problem: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -113,17 +113,18 @@ fn load(path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
     read_with(&io::read_bytes(path, &Limits::default())?, path, options)
 }
 
-/// A texture of unknown size is measured as if it had this many texels along each side.
-const UNKNOWN_PX: u32 = 1024;
+/// Side assumed for a texture of unknown size, texels.
+const DEFAULT_TEXTURE_PX: u32 = 1024;
 
-/// Returns whether there is a picture, and the texture coordinates, measured.
+/// Returns whether the mesh has a texture, and the measured texture coordinates.
 fn check_texture(found: &ReadMesh, path: &Path) -> (bool, Option<UvReport>) {
     let beside = picture_beside(found.picture.as_ref(), path).ok().flatten();
     let is_there = beside.is_some() || matches!(found.picture, Some(PictureSource::Inside(_)));
     let uv = found.atlas.clone().map(|mut atlas| {
         if atlas.width == 0 || atlas.height == 0 {
             let info = beside.and_then(|file| io::picture_info(&file, &Limits::default()).ok());
-            (atlas.width, atlas.height) = info.map_or((UNKNOWN_PX, UNKNOWN_PX), |i| i.size(None));
+            (atlas.width, atlas.height) =
+                info.map_or((DEFAULT_TEXTURE_PX, DEFAULT_TEXTURE_PX), |i| i.size(None));
         }
         uv_check(&weld(&found.mesh), &atlas)
     });
@@ -138,7 +139,7 @@ pub(super) fn run(
     seen_by: Option<&Path>,
 ) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
-    // a texture that cannot be understood is no reason not to check the mesh
+    // the mesh is checked even if its texture cannot be read
     let (found, problem) = match load(path, &ReadOptions::default()) {
         Ok(found) => (found, None),
         Err(e) => (load(path, &ReadOptions::SURFACE)?, Some(e.to_string())),
@@ -164,7 +165,7 @@ pub(super) fn run(
     } else {
         let uv = match (&report.uv, &problem) {
             (Some(uv), _) => format!("\ntexture\n{uv}"),
-            (None, Some(e)) => format!("texture              NOT LOOKED AT: {}\n", one_line(e)),
+            (None, Some(e)) => format!("texture              NOT CHECKED: {}\n", one_line(e)),
             (None, None) => String::new(),
         };
         format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
@@ -182,25 +183,25 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     let empty = |e: &Path| Error::cannot(format!("`{}` has no surface to measure", e.display()), "");
     let bvh = Bvh::new(&truth);
     let mm = |d| Millimetres::new(d, unit_m);
-    let whole = one_way(mesh, &bvh, POINTS).ok_or_else(|| empty(other))?;
-    let back = one_way(&truth, &Bvh::new(mesh), POINTS).ok_or_else(|| empty(other))?;
+    let whole = one_way(mesh, &bvh, SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
+    let back = one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
     let (mut seen, mut by_views, mut parts) = (None, Vec::new(), Vec::new());
     if let Some(root) = seen_by {
         let capture = capture::open(root, &CaptureOptions::default())?;
         let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
         let views: Vec<&View> = capture.split(Split::Train).collect();
         let cameras: Vec<Camera> = views.iter().map(|v| moved(&v.camera)).collect();
-        let ranges: Vec<_> = [3..=u32::MAX].into_iter().chain(VIEWS.map(|(_, range)| range)).collect();
-        let mut found = seen_one_way(mesh, &bvh, POINTS, &cameras, &ranges).into_iter();
+        let ranges: Vec<_> = [3..=u32::MAX].into_iter().chain(VIEW_COUNTS.map(|(_, range)| range)).collect();
+        let mut found = seen_one_way(mesh, &bvh, SURFACE_SAMPLES, &cameras, &ranges).into_iter();
         seen = found.next().flatten().map(|(d, share)| (mm(d), share));
-        let named = found.zip(VIEWS).filter_map(|(part, (views, _))| Some((part?, views)));
+        let named = found.zip(VIEW_COUNTS).filter_map(|(part, (views, _))| Some((part?, views)));
         by_views = named.map(|((d, share), views)| ByViews { views, share, distance: mm(d) }).collect();
         let kinds = skin_and_hair(&views)?;
         if !kinds.is_empty() {
             let kind = |i: usize, [x, y]: [u32; 2]| {
                 kinds[i].get(y as usize * cameras[i].width as usize + x as usize).copied().flatten()
             };
-            let found = kinds_one_way(&truth, &Bvh::new(mesh), POINTS, &cameras, kind);
+            let found = kinds_one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES, &cameras, kind);
             let named = found.into_iter().zip(["skin", "hair"]).filter_map(|(d, part)| Some((d?, part)));
             let part =
                 |((d, signed), part)| Part { part, signed_median: 1e3 * unit_m * signed, distance: mm(d) };
@@ -210,9 +211,9 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     Ok(Against { whole: mm(whole), seen, by_views, back: mm(back), parts })
 }
 
-/// Skin and hair of each photograph, row by row: 0, 1, or neither. Empty if the capture does not separate them.
+/// Returns skin (0) and hair (1) of each photograph's pixels, row by row. Empty if the capture does not separate them.
 fn skin_and_hair(views: &[&View]) -> Result<Vec<Vec<Option<usize>>>> {
-    // photographs are read only where they can say something
+    // only photographs with region masks are read
     let able = views.iter().any(|v| v.region.is_some());
     let Some(tones) = able.then(|| Tones::of(views)).transpose()?.flatten() else { return Ok(Vec::new()) };
     let kinds = |view: &&View| -> Result<Vec<Option<usize>>> {

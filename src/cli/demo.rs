@@ -1,4 +1,4 @@
-//! `tiface demo`: the pipeline on a synthetic head that it photographs first.
+//! `tiface demo`: renders photographs of a synthetic head, and runs the pipeline on them.
 
 use super::Invocation;
 use super::options::RunTarget;
@@ -13,8 +13,8 @@ use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// The demo's pictures are small, and it should end while its user still looks.
-pub(super) const SHORTER: &str = "\
+/// Settings of the demo: few steps, because its pictures are small.
+pub(super) const DEMO_SETTINGS: &str = "\
 tface.steps = 800
 tface.rays = 2048
 baseline.steps = 600
@@ -33,17 +33,17 @@ pub(super) fn run(
     check_border(&options, border)?;
     let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
     let capture = run.join(DEMO_CAPTURE);
-    // repeated without options, the demo goes on as it was begun
+    // repeated without options, the demo continues with its saved settings
     let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
-    let fallback = Some((Preset::Draft, SHORTER));
-    // what is wrong with the command line is reported before the head is photographed
+    let fallback = Some((Preset::Draft, DEMO_SETTINGS));
+    // command-line errors are reported before any photograph is rendered
     Out::find(common.out.as_deref(), "run")?;
     let config = common.resolve(saved.as_deref(), fallback, &[])?;
     check_feasible(&config)?;
-    // the cameras are written last: where they are, everything is
+    // the cameras are written last: if they exist, the capture is complete
     if io::is_file(&capture.join("transforms.json")) {
         if size.is_some() || views.is_some() || border.is_some() {
-            let message = format!("the head in `{}` is photographed already", capture.display());
+            let message = format!("`{}` already contains photographs of the head", capture.display());
             return Err(Error::usage(
                 message,
                 "leave out --size, --views and --border, or name another --run",
@@ -52,7 +52,7 @@ pub(super) fn run(
     } else {
         require_device(&config)?;
         if common.dry_run {
-            let text = format!("would photograph a synthetic head into `{}`", capture.display());
+            let text = format!("would render photographs of a synthetic head into `{}`", capture.display());
             invocation.screen.note("capture", &text);
             return Ok(());
         }
@@ -63,13 +63,13 @@ pub(super) fn run(
     run_stages(invocation, &StageCommand { product, until, target, require: &[], keys: Vec::new(), fallback })
 }
 
-/// The default photographs, of another size or number.
+/// Returns the options of the photographs, with another size or number.
 fn photographs(size: Option<&str>, views: Option<usize>) -> Result<SyntheticOptions> {
     let mut options = SyntheticOptions::default();
     if let Some(size) = size {
         let sides = size.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
         (options.width, options.height) = sides.ok_or_else(|| {
-            Error::usage(format_args!("`--size {size}` is no size in pixels"), "write it as 3000x4096")
+            Error::usage(format_args!("`--size {size}` is not a size in pixels"), "write it as 3000x4096")
         })?;
     }
     if let Some(views) = views {
@@ -77,8 +77,8 @@ fn photographs(size: Option<&str>, views: Option<usize>) -> Result<SyntheticOpti
         options.train = views.saturating_sub(options.test);
         if options.train < 2 {
             return Err(Error::usage(
-                format!("`--views {views}` leaves {} to learn from, and one is held out", options.train),
-                "name three at least: two cameras place a head",
+                format!("`--views {views}` leaves {} to train on, and one is held out", options.train),
+                "choose at least three: two training views are needed",
             ));
         }
     }
@@ -89,14 +89,14 @@ fn check_border(options: &SyntheticOptions, border: Option<u32>) -> Result<()> {
     let narrow = options.width.min(options.height);
     match border.filter(|b| b.saturating_mul(2) >= narrow) {
         Some(border) => Err(Error::usage(
-            format!("`--border {border}` leaves nothing of a side of {narrow} pixels"),
-            "name less than half of it",
+            format!("`--border {border}` leaves no pixels of a side of {narrow}"),
+            "choose less than half of it",
         )),
         None => Ok(()),
     }
 }
 
-/// Photographs the demo head into a folder.
+/// Renders the photographs of the demo head into a folder.
 pub(super) fn photograph(
     capture: &Path,
     options: &SyntheticOptions,
@@ -104,7 +104,7 @@ pub(super) fn photograph(
     invocation: &Invocation,
 ) -> Result<()> {
     let views = options.train + options.test;
-    invocation.screen.note("capture", &format!("photographing a synthetic head from {views} sides"));
+    invocation.screen.note("capture", &format!("rendering {views} photographs of a synthetic head"));
     let start = Instant::now();
     io::create_folder(capture)?;
     if let Some(border) = border {

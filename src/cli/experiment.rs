@@ -1,4 +1,4 @@
-//! `tiface experiment`: the paper's tables over captures, beside what was published.
+//! `tiface experiment`: the paper's tables on captures, next to the published figures.
 
 use super::Invocation;
 use super::demo::photograph;
@@ -21,25 +21,25 @@ use clap::builder::PossibleValuesParser;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// What is reproduced.
+/// Options of `tiface experiment`.
 #[derive(Args, Debug)]
 pub(super) struct ExperimentOptions {
     /// Captures; `demo` is the synthetic head
     #[arg(value_name = "CAPTURE", required = true)]
     captures: Vec<PathBuf>,
-    /// Of these tables, with commas [default: all]
+    /// Tables to make, separated by commas [default: all]
     #[arg(long, value_name = "LIST", value_delimiter = ',', value_parser = PossibleValuesParser::new(TABLES.map(|t| t.0)))]
     tables: Vec<String>,
-    /// A share of the published effort, 0.001 to 1
+    /// Share of the published number of steps, 0.001 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 1.0)]
     scale: f64,
-    /// Make this run alone, as named by --dry-run, and no tables; repeatable
+    /// Make only this run, as named by --dry-run, and no tables; repeatable
     #[arg(long, value_name = "CAPTURE/RUN")]
     only: Vec<String>,
-    /// Make no run, only the tables of existing runs
+    /// Make only the tables, from existing runs
     #[arg(long, conflicts_with = "only")]
     collect: bool,
-    /// Figures of the publication: lines of table,row,measure,value
+    /// Published figures to compare with, as lines of table,row,measure,value
     #[arg(long, value_name = "FILE")]
     published: Option<PathBuf>,
 }
@@ -55,7 +55,7 @@ struct Task {
 pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Result<()> {
     let Invocation { common, screen, stop } = invocation;
     if !(0.001..=1.0).contains(&options.scale) {
-        let found = format!("`--scale {}` is not within 0.001 and 1", options.scale);
+        let found = format!("`--scale {}` is not between 0.001 and 1", options.scale);
         return Err(Error::usage(
             found,
             "0.1 makes all tables of two captures in some 70 minutes on two cores",
@@ -68,10 +68,10 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         ("--run", common.run.is_some()),
     ];
     if let Some((word, _)) = ignored.iter().find(|(_, given)| *given) {
-        let problem = format!("`{word}` does not go with `experiment`, whose rows are settings of their own");
+        let problem = format!("`{word}` cannot be used with `experiment`, whose rows set it");
         return Err(Error::usage(
             problem,
-            "change all of them with `--set KEY=VALUE`; `--out FOLDER` names the folder",
+            "change a setting of all rows with `--set KEY=VALUE`; `--out FOLDER` sets the folder",
         ));
     }
     let folder = match Out::find(common.out.as_deref(), "experiment")? {
@@ -119,10 +119,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     }
     if let Some(wrong) = options.only.iter().find(|o| !tasks.iter().any(|t| t.name == **o)) {
         let known: Vec<&str> = tasks.iter().map(|t| t.name.as_str()).collect();
-        return Err(Error::usage(
-            format!("there is no run `{wrong}`"),
-            format!("runs are {}", known.join(", ")),
-        ));
+        return Err(Error::usage(format!("unknown run `{wrong}`"), format!("runs are {}", known.join(", "))));
     }
     let all = options.only.is_empty();
     let chosen = |task: &&Task| !options.collect && (all || options.only.contains(&task.name));
@@ -135,7 +132,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     {
         let opened = match Session::open(&task.config, run) {
             Ok(opened) => opened,
-            // what a capture lacks for one row, as masks, it does not lack for each
+            // a capture may lack the inputs of one row (masks) and have those of others
             Err(e) if common.dry_run => {
                 match common.json {
                     true => print(&format!("{}\n", json!({"run": task.name, "error": e.to_string()})))?,
@@ -169,7 +166,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
                 failed = Some(e);
                 break;
             }
-            // a row that fails is a result; the others are made all the same
+            // a failed row is a result, and does not stop the others
             Err(e) => {
                 screen.note("experiment", &format!("{}: {e}", task.name));
                 failed.get_or_insert(e.within(&task.name));
@@ -183,13 +180,13 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         }
         return Ok(());
     }
-    // a run alone is one task of many: each would read all captures to say what the others came to
+    // with --only, no tables: every task of a cluster would read all captures
     if !all {
         return failed.map_or(Ok(()), Err);
     }
     let rows: Vec<_> = ROWS.into_iter().filter(|row| words.contains(&row.table)).collect();
     let mut measured: Vec<Vec<Measured>> = vec![Vec::new(); rows.len()];
-    // every capture has every run, in the same order: so each row gets one of each capture, in theirs
+    // every capture has the same runs in the same order, so each row has one of each capture
     for (task, session) in tasks.iter().zip(&sessions) {
         let (own, places): (Vec<&ExperimentRow>, Vec<&mut Vec<Measured>>) =
             rows.iter().zip(&mut measured).filter(|(row, _)| row.run == task.run).unzip();
@@ -212,7 +209,7 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     failed.map_or(Ok(()), Err)
 }
 
-/// A capture as it was named; `demo`, where no folder is called so, is the demo head, photographed into the experiment.
+/// Returns the folder of a capture; `demo`, if no folder has this name, is the demo head, rendered into the experiment.
 fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> {
     if path != Path::new("demo") || io::is_folder(path) {
         return Ok(path.into());
@@ -221,8 +218,8 @@ fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> 
     if !io::is_file(&capture.join("transforms.json")) {
         if invocation.common.dry_run {
             return Err(Error::usage(
-                "the demo head is not photographed yet, so nothing can be said of its runs",
-                "repeat without --dry-run, or photograph it: `tiface demo --run FOLDER`",
+                "the photographs of the demo head are not rendered yet, so its runs cannot be planned",
+                "repeat without --dry-run, or render them: `tiface demo --run FOLDER`",
             ));
         }
         photograph(&capture, &SyntheticOptions::default(), None, invocation)?;
@@ -230,7 +227,7 @@ fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> 
     Ok(capture)
 }
 
-/// What some rows came to in their run; one that was not worked on is opened here, and only looked at.
+/// Returns the figures of some rows from their run, which is only read.
 fn found(folder: &Path, task: &Task, session: Option<&Session>, rows: &[&ExperimentRow]) -> Vec<Measured> {
     let of = |session: &Session| rows.iter().map(|row| measured(session, row)).collect();
     if let Some(session) = session {
@@ -243,12 +240,12 @@ fn found(folder: &Path, task: &Task, session: Option<&Session>, rows: &[&Experim
             Err(e) => e.to_string(),
         }
     } else {
-        "not made yet".to_owned() // and the capture need not be read to say so
+        "not made yet".to_owned() // without reading the capture
     };
     vec![Measured { problem: Some(problem), ..Measured::default() }; rows.len()]
 }
 
-/// Writes the tables in both forms, the JSON last: a program may wait for it.
+/// Writes the tables as Markdown and JSON, the JSON last: a program may wait for it.
 fn write(folder: &Path, experiment: &Experiment) -> Result<()> {
     io::create_folder(folder)?;
     io::write_atomic(&folder.join("experiment.md"), experiment.markdown().as_bytes())?;

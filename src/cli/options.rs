@@ -1,14 +1,14 @@
-//! The options that every command shares, the configuration they amount to, and which capture and which run a command
-//! means.
+//! Options that all commands share, the configuration that they result in, and the capture and run of a command.
 
+use crate::capture::is_run;
 use crate::config::{Config, Preset, Sources, Stage};
 use crate::io::{self, Limits};
-use crate::{Error, Result, capture};
+use crate::{Error, Result};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ColorChoice};
 use std::path::{Path, PathBuf};
 
-/// An option of one command that is a key of the configuration: as typed, the key, its value.
+/// An option of one command that sets a key of the configuration: as typed, the key, its value.
 pub(super) type KeyOption = (String, String, String);
 
 #[derive(Args, Debug, Default)]
@@ -31,7 +31,7 @@ pub(super) struct Common {
     /// Set a configuration key; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Device to learn and render on: auto, cpu, wgpu, vulkan, metal or dx12; :N selects an adapter by number
+    /// Device to train and render on: auto, cpu, wgpu, vulkan, metal or dx12; :N selects an adapter by number
     #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
     pub device: Option<String>,
     /// Make training on a GPU bitwise reproducible, by fixed-point accumulation; on the CPU it always is
@@ -83,7 +83,7 @@ impl Common {
             .try_init();
     }
 
-    /// Should messages on stderr be colored?
+    /// Returns whether messages on stderr are colored.
     pub fn colored(&self) -> bool {
         use std::io::IsTerminal;
         match self.color {
@@ -95,9 +95,10 @@ impl Common {
         }
     }
 
-    /// The configuration: the user's own file, `TIFACE_PRESET`, the run's (`saved`), `--config`, `--set`, options.
+    /// Returns the configuration from, in rising priority: the user's file, `TIFACE_PRESET`, the run's (`saved`),
+    /// `--config`, `--set`, options.
     ///
-    /// `fallback` is the preset where nothing names one, and what it starts with on top of that, as TOML.
+    /// `fallback` is the preset if no source names one, and settings on top of it, as TOML.
     pub fn resolve(
         &self,
         saved: Option<&Path>,
@@ -115,7 +116,7 @@ impl Common {
         let mut files = Vec::from_iter(own);
         match saved {
             Some(saved) if self.preset.is_some() => {
-                // another preset starts over, for all values of a run would win against it; on the same photographs
+                // another preset starts over on the same photographs: the saved values would override all of it
                 let path = Common::default().resolve(Some(saved), None, &[])?.capture.path;
                 let text = format!("capture.path = {}", toml::Value::from(path));
                 sources.files.push((saved.display().to_string(), text));
@@ -131,7 +132,7 @@ impl Common {
             sources.files.push((name, text));
         }
         if let Some(word) = std::env::var("TIFACE_PRESET").ok().filter(|word| !word.is_empty()) {
-            // only `--preset` starts a run over: this one is weaker than what the run remembers
+            // only `--preset` starts a run over: the variable is weaker than the run's saved preset
             sources.files.insert(has_own, ("TIFACE_PRESET".into(), format!("preset = {word:?}")));
         }
         if let Some(word) = self.device_word() {
@@ -144,7 +145,7 @@ impl Common {
         Config::resolve(&sources)
     }
 
-    /// The device that was chosen and how it is to be used; none where nothing was said.
+    /// Returns the device option with its modifiers, or `None` if no option of the device is given.
     pub(super) fn device_word(&self) -> Option<String> {
         if self.device.is_none() && !self.deterministic && self.memory.is_none() {
             return None;
@@ -167,21 +168,21 @@ fn own_file() -> Option<PathBuf> {
     Some(base.join("tiface/config.toml"))
 }
 
-/// What a command works on.
+/// The run, and the capture, of a command.
 #[derive(Debug, PartialEq)]
 pub(super) struct RunTarget {
     /// The run folder; need not exist.
     pub run: PathBuf,
-    /// The capture, absolute; `None` if the run remembers it.
+    /// The capture, absolute; `None` if the run's configuration has it.
     pub capture: Option<PathBuf>,
     /// The run's own configuration, if the command uses it.
     pub saved: Option<PathBuf>,
-    /// Was the run chosen without being named?
+    /// Whether the run was selected without being named.
     pub guessed: bool,
 }
 
 impl RunTarget {
-    /// From the path on the command line and `--run`.
+    /// Returns the target of the path on the command line and `--run`.
     pub fn find(common: &Common, path: Option<&Path>) -> Result<RunTarget> {
         match path {
             Some(path) if is_run(path) => Ok(RunTarget::run(path.into(), false)),
@@ -191,7 +192,10 @@ impl RunTarget {
                     Some(run) => run.clone(),
                     None => {
                         let name = capture.file_name().ok_or_else(|| {
-                            Error::usage("this capture has no name", "place the run with `--run DIR`")
+                            Error::usage(
+                                "the folder of this capture has no name",
+                                "name the run folder with `--run DIR`",
+                            )
                         })?;
                         Path::new("runs").join(name)
                     }
@@ -214,13 +218,7 @@ impl RunTarget {
     }
 }
 
-/// A run has its configuration; a capture has cameras. A folder with both is a run only if a stage was done in it.
-pub(super) fn is_run(path: &Path) -> bool {
-    let is_done = || io::is_file(&path.join("mask/done.json"));
-    io::is_file(&path.join("config.toml")) && (!capture::has_cameras(path) || is_done())
-}
-
-/// The run in `here`, else the one under `here/runs` that was configured last.
+/// Returns the run in `here`, else the most recently configured one under `here/runs`.
 fn guess(here: &Path) -> Result<RunTarget> {
     if is_run(here) {
         return Ok(RunTarget::run(here.into(), true));
@@ -231,7 +229,7 @@ fn guess(here: &Path) -> Result<RunTarget> {
     match newest {
         Some(run) => Ok(RunTarget::run(run, true)),
         None => Err(Error::usage(
-            "no capture or run is named, this folder is no run, and there is none under `runs/`",
+            "no capture or run is named, this folder is not a run, and `runs/` contains none",
             "name a capture: `tiface run CAPTURE`, or try `tiface demo`",
         )),
     }
@@ -275,17 +273,25 @@ mod tests {
 
     #[test]
     fn a_capture_of_any_format_that_holds_a_config_toml_is_not_taken_for_a_run() {
-        let formats: [&[&str]; 4] = [
+        // the last ones cannot be opened, and must be refused as captures
+        let formats: [&[&str]; 9] = [
             &["transforms.json"],
             &["cameras_sphere.npz"],
             &["cameras.npz"],
             &["sparse/0/cameras.bin", "sparse/0/images.bin"],
+            &["image/000.png"],
+            &["000.jpg"],
+            &["database.db", "images/000.jpg"],
+            &["project.psx"],
+            &["head.mp4"],
         ];
         for files in formats {
             let dir = tempfile::tempdir().unwrap();
             fs::write(dir.path().join("config.toml"), "").unwrap();
             assert!(is_run(dir.path()));
-            fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
+            ["sparse/0", "image", "images"]
+                .iter()
+                .for_each(|d| fs::create_dir_all(dir.path().join(d)).unwrap());
             files.iter().for_each(|file| fs::write(dir.path().join(file), "x").unwrap());
             let target = RunTarget::find(&Common::default(), Some(dir.path())).unwrap();
             assert_eq!((target.capture.is_some(), target.saved), (true, None), "{files:?}");

@@ -1,7 +1,7 @@
-//! `--out`: where the product of a command goes as well. One rule for all of them, and checked before anything begins.
+//! `--out`: another place to write the product of a command to. One rule for all commands, checked before any work begins.
 //!
-//! An ending that the product has is a file of that kind; a folder, which exists or is named with a `/` at its end,
-//! takes the product under its own names; all else is refused.
+//! A path with an ending of the product's formats is a file; an existing folder, or a path that ends in `/`, receives the
+//! product under its usual names; everything else is refused.
 
 use crate::config::MeshFormat;
 use crate::io;
@@ -10,16 +10,16 @@ use crate::run::Run;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// A place that can be written.
+/// A writable destination.
 #[derive(Debug, PartialEq)]
 pub(super) enum Out {
-    /// One file, and the ending that says which, in small letters.
+    /// One file, and its ending in lower case, which selects the format.
     File(PathBuf, String),
-    /// A folder; made if it does not exist.
+    /// A folder; created if it does not exist.
     Folder(PathBuf),
 }
 
-/// The endings of what a command makes.
+/// Returns the file endings that a command can write.
 fn endings(product: &str) -> &'static [&'static str] {
     match product {
         "run" => &["glb", "obj", "ply", "json"],
@@ -33,7 +33,7 @@ fn endings(product: &str) -> &'static [&'static str] {
 }
 
 impl Out {
-    /// Where `out` is for the product of a command, which is called as the command is. Nothing is written.
+    /// Returns the destination that `out` means for the product of a command, named like the command. Nothing is written.
     pub fn find(out: Option<&Path>, product: &str) -> Result<Option<Out>> {
         let Some(out) = out else { return Ok(None) };
         let shown = out.display();
@@ -49,39 +49,39 @@ impl Out {
                 0 => "name a folder, with `/` at its end".to_string(),
                 _ => format!("end it in {}, or in `/` for a folder", list.join(", ")),
             };
-            return Err(Error::usage(format!("`--out {shown}`: `{product}` makes no such file"), hint));
+            return Err(Error::usage(format!("`--out {shown}`: `{product}` writes no such file"), hint));
         }
         // by its name without the `/`, by which a file is not found
         let bare = out.components().as_path();
         if io::exists(bare) && (folder || !io::is_file(bare)) {
             let what = if folder { "folder" } else { "regular file" };
-            return Err(Error::cannot(format!("`--out {shown}` is no {what}"), "choose another name"));
+            return Err(Error::cannot(format!("`--out {shown}` is not a {what}"), "choose another name"));
         }
         writable(out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))?;
         Ok(Some(if folder { Out::Folder(out.into()) } else { Out::File(out.into(), ending) }))
     }
 
-    /// Refused for a command that makes nothing.
+    /// Refuses `--out` for a command without a product.
     pub fn none(out: Option<&Path>, command: &str) -> Result<()> {
         match out {
-            Some(_) => Err(Error::usage(format!("`{command}` makes nothing for `--out`"), "leave it out")),
+            Some(_) => Err(Error::usage(format!("`{command}` has no product for `--out`"), "leave it out")),
             None => Ok(()),
         }
     }
 
-    /// Refuses a folder inside the run that would be copied into it, and a mesh where none of these stages makes one.
+    /// Refuses a folder inside the run, which would be copied into itself, and a mesh file if none of these stages makes a mesh.
     pub fn check(&self, run: &Path, stages: &[Stage]) -> Result<()> {
         let mesh = matches!(self, Out::File(_, ending) if mesh_format(ending).is_some());
         if mesh && !stages.contains(&Stage::Mesh) {
             return Err(Error::usage(
-                "no mesh is made with these settings, so `--out` has none to write",
+                "these settings make no mesh that `--out` could write",
                 "use `tiface mesh --out head.glb`",
             ));
         }
         self.is_outside(run)
     }
 
-    /// Refuses a folder inside the run that would be copied into it.
+    /// Refuses a folder inside the run, which would be copied into itself.
     fn is_outside(&self, run: &Path) -> Result<()> {
         let Out::Folder(folder) = self else { return Ok(()) };
         let target = folder
@@ -89,15 +89,15 @@ impl Out {
             .find_map(|f| io::real_path(if f.as_os_str().is_empty() { Path::new(".") } else { f }).ok());
         match (target, io::real_path(run)) {
             (Some(target), Ok(run)) if target.starts_with(&run) => {
-                let text = format!("`--out {}` lies in the run itself", folder.display());
+                let text = format!("`--out {}` is inside the run", folder.display());
                 Err(Error::usage(text, "choose a folder beside the run"))
             }
             _ => Ok(()),
         }
     }
 
-    /// Makes the folder that is written into, and removes what killed commands left half-written in it: all of that in a
-    /// folder that was named, else what begins as the file does.
+    /// Creates the destination folder, and removes temporary files of killed commands from it: all of them in a folder that
+    /// was named, else those that begin with the file's name.
     pub fn prepare(&self) -> Result<()> {
         match self {
             Out::File(file, _) => {
@@ -108,7 +108,7 @@ impl Out {
         }
     }
 
-    /// Puts the command's product where `--out` says, and returns what was written.
+    /// Writes the command's product to the destination, and returns the paths of what was written.
     pub fn write(&self, product: &str, session: &Session, run: &Run) -> Result<Vec<PathBuf>> {
         self.prepare()?;
         match self {
@@ -117,7 +117,7 @@ impl Out {
                 let exported = export_head(session, format, stem)?;
                 exported.warnings.iter().for_each(|w| run.warn("mesh", w));
                 let files = exported.files;
-                // the mesh names its pictures: it comes last, and under the name that was asked for
+                // the mesh refers to its pictures, so it is written last, under the requested name
                 let mut written = vec![file.clone()];
                 for (name, bytes) in files.iter().skip(1).rev() {
                     written.push(file.with_file_name(name));
@@ -133,7 +133,7 @@ impl Out {
             // no stage makes another file: `Out::find` has refused it
             Out::File(file, _) => Ok(vec![file.clone()]),
             Out::Folder(folder) => {
-                // fields, and pictures that only another stage can read, stay where they are
+                // fields, and pictures that only another stage can read, are not copied
                 match product {
                     "run" => copy_folder(run.dir(), folder, &["baseline", "tface", "iface", DEMO_CAPTURE])?,
                     "render" => copy_folder(&run.path(session.views()), folder, &["float", "paths"])?,
@@ -147,7 +147,7 @@ impl Out {
         }
     }
 
-    /// The file to write: the one that was named, or `name` in the folder.
+    /// Returns the file to write: the one that was named, or `name` in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         match self {
             Out::File(file, _) => file.clone(),
@@ -156,7 +156,7 @@ impl Out {
     }
 }
 
-/// The format that an ending means.
+/// Returns the mesh format of a file ending.
 fn mesh_format(ending: &str) -> Option<MeshFormat> {
     match ending {
         "glb" => Some(MeshFormat::Glb),
@@ -179,8 +179,8 @@ fn copy_file(from: &Path, to: &Path) -> Result<()> {
     Ok(io::write_atomic(to, &io::read_maybe_empty(from, &io::Limits::default())?)?)
 }
 
-/// All files but those that tell of the work, and all folders but those named; deeper down none but
-/// the views kept in float is left out.
+/// Copies all files but the records of the stages, and all folders except those in `left`; in subfolders only the float
+/// views are left out.
 fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<()> {
     prepare(to, "")?;
     for name in io::list_files(from)? {
@@ -199,12 +199,12 @@ fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<()> {
 fn writable(folder: &Path) -> Result<()> {
     let shown = folder.display();
     if !io::is_folder(folder) {
-        return Err(Error::cannot(format!("there is no folder `{shown}` to write to"), "make it first"));
+        return Err(Error::cannot(format!("the folder `{shown}` does not exist"), "create it first"));
     }
     if !io::is_writable(folder) {
         return Err(Error::cannot(
-            format!("nothing may be written into the folder `{shown}`"),
-            "choose a folder you may write to",
+            format!("the folder `{shown}` is not writable"),
+            "choose a folder with write permission",
         ));
     }
     Ok(())

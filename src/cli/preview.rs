@@ -1,5 +1,5 @@
-//! `tiface preview`: pictures of a mesh to look at, on a sheet with their names in letters of 5 × 7 dots; `--page`: a head to
-//! turn in a browser; `--watch`: the page of a run while it works.
+//! `tiface preview`: pictures of a mesh, on a sheet labelled in a 5 × 7 bitmap font; `--page`: a viewer for the browser;
+//! `--watch`: a live page of a running run.
 
 use super::Invocation;
 use super::options::RunTarget;
@@ -23,47 +23,47 @@ use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
-/// How a preview is made.
+/// Options of `tiface preview`.
 #[derive(Args, Debug)]
 pub(super) struct PreviewOptions {
-    /// A run, or a .glb, .obj or .ply file; without one, the run in this folder, else the newest under runs/
+    /// Run, or .glb, .obj or .ply file [default: the run in this folder, else the newest under runs/]
     #[arg(value_name = "RUN|FILE")]
     path: Option<PathBuf>,
-    /// studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (a chequer) or wire [default: unlit where
-    /// there are colors, else studio]
+    /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (checkerboard) or wire [default:
+    /// unlit if the mesh has colors, else studio]
     #[arg(long, value_name = "LOOK")]
     #[arg(value_parser = PossibleValuesParser::new(Look::ALL.map(Look::word)).map(|word| look(&word)))]
     light: Option<Look>,
-    /// Frames all around instead: --out ends in .png (animated), .gif or / (a folder of pictures)
+    /// Render a turntable: --out ends in .png (animated), .gif or / (a folder of pictures)
     #[arg(long, conflicts_with_all = ["sheet", "cameras"])]
     turntable: bool,
-    /// Frames of a turntable
+    /// Number of frames of a turntable
     #[arg(long, value_name = "N", default_value_t = 36, value_parser = clap::value_parser!(u32).range(2..=3600))]
     #[arg(requires = "turntable")]
     frames: u32,
-    /// Front, both sides, back, top, wireframe, normals and texture coordinates on one sheet; of a run also a held-out
-    /// photograph and how far the mesh is from it
+    /// Render front, sides, back, top, wireframe, normals and texture coordinates on one sheet; for a run also a held-out
+    /// photograph and the error against it
     #[arg(long, conflicts_with = "cameras")]
     sheet: bool,
-    /// Seen by the cameras of a file (a nerfstudio camera path or a transforms.json), or those of a run's photographs:
-    /// train or test
+    /// Render from the cameras of a file (a nerfstudio camera path or a transforms.json), or from those of a run's
+    /// photographs: train or test
     #[arg(long, value_name = "WHICH")]
     cameras: Option<String>,
-    /// Pixels along each side of a picture [default: 1024; 512 of a turntable's or a sheet's; of --cameras their own]
+    /// Side of each picture, pixels [default: 1024; turntable and sheet: 512; --cameras: their own size]
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     size: Option<u32>,
-    /// black, white or none
+    /// Background: black, white or none
     #[arg(long, value_name = "COLOR", default_value = "none")]
     #[arg(value_parser = PossibleValuesParser::new(["black", "white", "none"]).map(|word| background(&word)))]
     background: ViewBackground,
-    /// Where up is in a file: x, -x, y, -y, z or -z [default: y]; a run knows it
+    /// Up axis of a mesh file: x, -x, y, -y, z or -z [default: y]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     #[arg(value_parser = PossibleValuesParser::new(["x", "-x", "y", "-y", "z", "-z"]).map(|word| axis(&word)))]
     up: Option<Vec3>,
-    /// Write a page to turn it in a browser: one file, no program or network needed
+    /// Write a self-contained page that shows the mesh in a browser
     #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras", "light", "size", "background", "frames"])]
     page: bool,
-    /// Keep RUN/watch.html up to date while the run works: stages, curves, newest views; until Ctrl-C
+    /// Update RUN/watch.html while the run works, until Ctrl-C: stages, curves, newest views
     #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras", "light", "size", "background", "frames"])]
     #[arg(conflicts_with_all = ["page", "up"])]
     watch: bool,
@@ -94,13 +94,13 @@ fn axis(word: &str) -> Vec3 {
 const THREE_QUARTERS: (f64, f64) = (0.6, 0.15);
 
 /// Elevation of a turntable's camera, radians.
-const ABOVE: f64 = 0.1;
+const TURNTABLE_ELEVATION: f64 = 0.1;
 
-/// Frames of an animation a second.
-const RATE: u16 = 12;
+/// Frame rate of animations.
+const FRAMES_PER_SECOND: u16 = 12;
 
-/// The sheet: what is called so, so far to the side of the front, so far above, and as what; `None` is as the colors are.
-const SHEET: [(&str, f64, f64, Option<Look>); 8] = [
+/// Pictures of the sheet: label, azimuth from the front, elevation, shading; `None` is the default shading.
+const SHEET_VIEWS: [(&str, f64, f64, Option<Look>); 8] = [
     ("FRONT", 0.0, 0.0, None),
     ("LEFT", FRAC_PI_2, 0.0, None),
     ("RIGHT", -FRAC_PI_2, 0.0, None),
@@ -111,16 +111,16 @@ const SHEET: [(&str, f64, f64, Option<Look>); 8] = [
     ("UV", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Uv)),
 ];
 
-/// Pixels along each side of a picture on a sheet, at most: all of them are held at once.
-const MOST_OF_SHEET: u32 = 2048;
+/// Maximum side of a picture on a sheet, pixels: all of them are in memory at once.
+const MAX_SHEET_PX: u32 = 2048;
 
-/// Columns of the sheet; one more where a photograph and the errors against it are on it.
-const COLUMNS: usize = 4;
+/// Columns of the sheet; one more with a photograph and the errors against it.
+const SHEET_COLUMNS: usize = 4;
 
-/// Pixels of pictures that are made side by side: 1 GiB while they are floats.
-const AT_ONCE_PX: u64 = 1 << 25;
+/// Pixels of the pictures rendered at a time: 1 GiB as floats.
+const BATCH_PX: u64 = 1 << 25;
 
-/// What is made, and its name in `--out`, in the name of a file of its own and in messages.
+/// The kind of output, and its name in `--out`, in file names and in messages.
 #[derive(Clone, Copy, PartialEq)]
 enum Kind {
     Picture,
@@ -143,15 +143,15 @@ impl Kind {
         matches!(self, Kind::Turntable | Kind::Cameras)
     }
 
-    /// Its file: from `--out`, or else in the working directory.
-    fn place(self, asked: Option<Out>, name: &str) -> Out {
+    /// Returns the output file: from `--out`, or else in the working directory.
+    fn destination(self, out: Option<Out>, name: &str) -> Out {
         let file = match self {
             Kind::Picture => format!("{name}_preview.png"),
             Kind::Sheet => format!("{name}_sheet.png"),
             Kind::Turntable => format!("{name}_turntable.png"),
             Kind::Cameras => format!("{name}_views/"),
         };
-        match asked {
+        match out {
             Some(Out::Folder(folder)) if !self.is_moving() => Out::File(folder.join(file), "png".into()),
             Some(out) => out,
             None if self == Kind::Cameras => Out::Folder(file.into()),
@@ -167,32 +167,32 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         return watch(invocation, options.path.as_deref());
     }
     if options.page {
-        let asked = Out::find(common.out.as_deref(), "page")?;
-        return page(invocation, options.path.as_deref(), options.up, asked.as_ref());
+        let out = Out::find(common.out.as_deref(), "page")?;
+        return page(invocation, options.path.as_deref(), options.up, out.as_ref());
     }
     let kind = Kind::of(options);
-    if kind == Kind::Sheet && options.size.is_some_and(|size| size > MOST_OF_SHEET) {
-        let what = format!("`--size` of a picture on a sheet is at most {MOST_OF_SHEET}");
-        return Err(Error::usage(what, "make larger pictures one by one"));
+    if kind == Kind::Sheet && options.size.is_some_and(|size| size > MAX_SHEET_PX) {
+        let what = format!("`--size` of a picture on a sheet is at most {MAX_SHEET_PX}");
+        return Err(Error::usage(what, "render larger pictures one by one"));
     }
-    let asked = Out::find(common.out.as_deref(), if kind.is_moving() { "turntable" } else { "preview" })?;
+    let out = Out::find(common.out.as_deref(), if kind.is_moving() { "turntable" } else { "preview" })?;
     let (preview, name) = open(invocation, options)?;
     preview.warnings.iter().for_each(|w| screen.note("preview: warning", w));
     let look = options.light.unwrap_or(preview.look());
     if look == Look::Uv && !preview.has_uvs() {
         let what = format!("`{name}` has no texture coordinates to show");
-        return Err(Error::cannot(what, "choose another --light, or unwrap it"));
+        return Err(Error::cannot(what, "choose another --light, or add texture coordinates"));
     }
     let (names, shots) = shots(&preview, options, kind, look)?;
-    let place = kind.place(asked, &name);
-    let (Out::File(shown, _) | Out::Folder(shown)) = &place;
+    let destination = kind.destination(out, &name);
+    let (Out::File(shown, _) | Out::Folder(shown)) = &destination;
     if common.dry_run {
         let count = shots.len();
-        screen.note("preview", &format!("would make pictures, {count} in all, for `{}`", shown.display()));
+        screen.note("preview", &format!("would render {count} pictures for `{}`", shown.display()));
         return Ok(());
     }
-    place.prepare()?;
-    let files = make(&preview, &place, kind, &names, &shots, options.background, invocation)?;
+    destination.prepare()?;
+    let files = make(&preview, &destination, kind, &names, &shots, options.background, invocation)?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "preview": files})))?;
     } else if !common.quiet {
@@ -201,7 +201,7 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
     Ok(())
 }
 
-/// Makes the pictures and writes them, few at once: as one, an animation, or a folder of pictures of these names. Returns
+/// Renders the pictures in batches and writes one picture, an animation, or a folder of pictures of these names. Returns
 /// the files.
 fn make(
     preview: &Preview,
@@ -224,10 +224,10 @@ fn make(
         }
         Ok(pictures)
     };
-    let at_once = (AT_ONCE_PX / largest.max(1)).clamp(1, 32) as usize;
+    let at_once = (BATCH_PX / largest.max(1)).clamp(1, 32) as usize;
     match place {
         Out::File(file, _) if kind == Kind::Sheet => {
-            let (mut pictures, mut names, mut columns) = (some(shots)?, names.to_vec(), COLUMNS);
+            let (mut pictures, mut names, mut columns) = (some(shots)?, names.to_vec(), SHEET_COLUMNS);
             match renderer.against_photograph(width) {
                 Ok(Some(more)) => {
                     pictures.extend(more);
@@ -251,7 +251,7 @@ fn make(
                 Ok(pictures) => pictures.into_iter().map(|p| Ok(p.rgba)).collect(),
                 Err(e) => vec![Err(e)],
             });
-            let animation = Animation { width, height, count: shots.len() as u32, rate: RATE };
+            let animation = Animation { width, height, count: shots.len() as u32, rate: FRAMES_PER_SECOND };
             io::write_animation(file, ending, &animation, &mut frames)?;
             Ok(vec![file.clone()])
         }
@@ -274,7 +274,7 @@ fn make(
     }
 }
 
-/// What is photographed, by name.
+/// Views to render, by name.
 fn shots(
     preview: &Preview,
     options: &PreviewOptions,
@@ -285,13 +285,13 @@ fn shots(
     let around = |turn, tilt, side: u32, count| preview.around(turn, tilt, side, count);
     let cameras = match kind {
         Kind::Picture => around(THREE_QUARTERS.0, THREE_QUARTERS.1, size.unwrap_or(1024), 1)?,
-        Kind::Turntable => around(0.0, ABOVE, size.unwrap_or(512), options.frames as usize)?,
+        Kind::Turntable => around(0.0, TURNTABLE_ELEVATION, size.unwrap_or(512), options.frames as usize)?,
         Kind::Cameras => {
             preview.cameras(options.cameras.as_deref().unwrap_or_default(), size.unwrap_or(1024))?
         }
         Kind::Sheet => {
             let (mut names, mut shots) = (Vec::new(), Vec::new());
-            for (name, turn, tilt, own) in SHEET {
+            for (name, turn, tilt, own) in SHEET_VIEWS {
                 // a mesh without texture coordinates shows its shape instead
                 let is_shape = own == Some(Look::Uv) && !preview.has_uvs();
                 let own = if is_shape { Look::Matcap } else { own.unwrap_or(look) };
@@ -313,7 +313,7 @@ fn shots(
     Ok((cameras.into_iter().map(|c| c.name).collect(), shots))
 }
 
-/// What is shown, and what it is called.
+/// Opens the mesh to show; returns it with its name.
 fn open(invocation: &Invocation, options: &PreviewOptions) -> Result<(Preview, String)> {
     let named = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     match options.path.as_deref().filter(|path| !io::is_folder(path)) {
@@ -330,7 +330,7 @@ fn open(invocation: &Invocation, options: &PreviewOptions) -> Result<(Preview, S
     }
 }
 
-/// Rows of a letter, five bits each, the left one first.
+/// Returns the rows of a letter, five bits each, the left one first.
 fn rows(letter: char) -> [u8; 7] {
     match letter {
         'A' => [0x0e, 0x11, 0x11, 0x1f, 0x11, 0x11, 0x11],
@@ -357,28 +357,29 @@ fn rows(letter: char) -> [u8; 7] {
     }
 }
 
-/// A letter with the space behind it, dots.
-const STEP: u32 = 6;
+/// Width of a letter with the space behind it, dots.
+const LETTER_WIDTH: u32 = 6;
 
-/// Writes a name of capital letters into the upper left corner of a picture: white on a dark field, so that it can be read
-/// over anything.
+/// Draws a label of capital letters into the upper left corner of a picture, white on a dark field.
 fn write_name(picture: &mut PreviewPicture, name: &str) {
     let dot = (picture.width / 256).max(1);
-    let (across, down) = (STEP * name.len() as u32 + 3, 11);
+    let (across, down) = (LETTER_WIDTH * name.len() as u32 + 3, 11);
     let letters: Vec<[u8; 7]> = name.chars().map(rows).collect();
     for y in 0..(down * dot).min(picture.height) {
         for x in 0..(across * dot).min(picture.width) {
             let (column, row) = ((x / dot).wrapping_sub(2), (y / dot).wrapping_sub(2));
-            let letter = letters.get((column / STEP) as usize).filter(|_| row < 7 && column % STEP < 5);
-            let is_on = letter.is_some_and(|rows| rows[row as usize] >> (4 - column % STEP) & 1 == 1);
+            let letter = letters
+                .get((column / LETTER_WIDTH) as usize)
+                .filter(|_| row < 7 && column % LETTER_WIDTH < 5);
+            let is_on = letter.is_some_and(|rows| rows[row as usize] >> (4 - column % LETTER_WIDTH) & 1 == 1);
             let shade = if is_on { 255 } else { 32 };
             picture.rgba[(y * picture.width + x) as usize] = [shade, shade, shade, 255];
         }
     }
 }
 
-/// Writes the page of a mesh file whose up is `up`, or of the head of a run with its photographs.
-fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, asked: Option<&Out>) -> Result<()> {
+/// Writes the page of a mesh file with the up axis `up`, or of a run's head with its photographs.
+fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, out: Option<&Out>) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
     let named = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let (name, html): (String, Box<dyn FnOnce() -> Result<String>>) =
@@ -403,13 +404,13 @@ fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, asked: O
             }
         };
     let file = format!("{name}_preview.html");
-    let file = asked.map_or_else(|| PathBuf::from(&file), |out| out.file(&file));
+    let file = out.map_or_else(|| PathBuf::from(&file), |out| out.file(&file));
     if common.dry_run {
         screen.note("preview", &format!("would write a page to `{}`", file.display()));
         return Ok(());
     }
     let html = html()?;
-    asked.into_iter().try_for_each(Out::prepare)?;
+    out.into_iter().try_for_each(Out::prepare)?;
     io::write_atomic(&file, html.as_bytes())?;
     if common.json {
         print(&format!("{}\n", json!({"event": "result", "preview": [file]})))?;
@@ -419,33 +420,35 @@ fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, asked: O
     Ok(())
 }
 
-/// Refuses an axis for a run, which knows where up is.
+/// Refuses an up axis for a run, which has its own.
 fn no_up(up: Option<Vec3>) -> Result<()> {
     match up {
-        Some(_) => Err(Error::usage("`--up` is of files: a run knows where up is", "leave it out")),
+        Some(_) => {
+            Err(Error::usage("`--up` applies to mesh files; a run has its own up axis", "leave it out"))
+        }
         None => Ok(()),
     }
 }
 
-/// The page of a run at work, in its folder.
-const WATCHED: &str = "watch.html";
+/// The live page in the run's folder.
+const WATCH_FILE: &str = "watch.html";
 
-/// How often a request to stop is looked for: its handler ends an idle command after half a second.
+/// Interval between checks for a stop request: the signal handler ends an idle command after half a second.
 const STOP_CHECK: Duration = Duration::from_millis(50);
 
-/// How often that is written.
-const EVERY: Duration = Duration::from_secs(2);
+/// Interval between updates of the live page.
+const REFRESH_INTERVAL: Duration = Duration::from_secs(2);
 
 /// Writes the page of a run repeatedly until the process is stopped.
 fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     let (common, stop) = (invocation.common, &invocation.stop);
     let (target, config) = target(invocation, path)?;
-    let page = target.run.join(WATCHED);
+    let page = target.run.join(WATCH_FILE);
     if common.dry_run {
         invocation.screen.note("preview", &format!("would keep a page up to date in `{}`", page.display()));
         return Ok(());
     }
-    // each view is made once for a checkpoint, whether or not that can be read
+    // each view is rendered once per checkpoint, whether or not that can be read
     let mut made: HashMap<Stage, (SystemTime, Option<Vec<u8>>)> = HashMap::new();
     let mut view = |stage: Stage, saved: SystemTime| -> Option<Vec<u8>> {
         if let Some((_, picture)) = made.get(&stage).filter(|(time, _)| *time == saved) {
@@ -471,7 +474,7 @@ fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     let mut written = Instant::now();
     while stop.requested().is_none() {
         std::thread::sleep(STOP_CHECK);
-        if written.elapsed() >= EVERY {
+        if written.elapsed() >= REFRESH_INTERVAL {
             write(true)?;
             written = Instant::now();
         }
@@ -481,11 +484,11 @@ fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     Err(stop.error("the page stays as it is"))
 }
 
-/// The run that is meant, and its configuration.
+/// Returns the run to show, and its configuration.
 fn target(invocation: &Invocation, path: Option<&Path>) -> Result<(RunTarget, crate::config::Config)> {
     let target = RunTarget::find(invocation.common, path)?;
     let Some(saved) = &target.saved else {
-        let what = format!("`{}` is no run", path.unwrap_or(Path::new(".")).display());
+        let what = format!("`{}` is not a run", path.unwrap_or(Path::new(".")).display());
         return Err(Error::usage(what, "name the folder of a run, or a .glb, .obj or .ply file"));
     };
     if target.guessed {

@@ -1,4 +1,4 @@
-//! `tiface report`: the page of a run made anew, or one page of many runs.
+//! `tiface report`: rewrites the page of a run, or writes one page of many runs.
 
 use super::Invocation;
 use super::options::RunTarget;
@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 
 pub(super) fn run(invocation: &Invocation, runs: &[PathBuf], table: bool) -> Result<()> {
     let common = invocation.common;
-    let asked = Out::find(common.out.as_deref(), "report")?;
+    let out = Out::find(common.out.as_deref(), "report")?;
     let all = match (runs, &common.run) {
         ([], Some(run)) => vec![run.clone()],
         ([], None) => io::list_folders(Path::new("runs"))?,
@@ -23,13 +23,13 @@ pub(super) fn run(invocation: &Invocation, runs: &[PathBuf], table: bool) -> Res
     };
     match &all[..] {
         [] => Err(Error::cannot("there are no runs under `runs/`", "name a run folder")),
-        [one] if !table => renew(invocation, one, asked.as_ref()),
-        all => many(invocation, all, asked.as_ref()),
+        [one] if !table => renew(invocation, one, out.as_ref()),
+        all => many(invocation, all, out.as_ref()),
     }
 }
 
-/// Writes the page of one run, and a copy where it was asked for.
-fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()> {
+/// Writes the page of one run, and a copy to `--out`.
+fn renew(invocation: &Invocation, path: &Path, out: Option<&Out>) -> Result<()> {
     let common = invocation.common;
     let target = RunTarget::find(common, Some(path))?;
     let Some(saved) = &target.saved else {
@@ -44,7 +44,7 @@ fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()
         return Ok(());
     }
     renew_report(&session)?;
-    if let Some(out) = asked {
+    if let Some(out) = out {
         let copy = out.file("report.html");
         out.prepare()?;
         io::write_atomic(&copy, &io::read_bytes(&page, &io::Limits::default())?)?;
@@ -54,8 +54,8 @@ fn renew(invocation: &Invocation, path: &Path, asked: Option<&Out>) -> Result<()
 }
 
 /// Writes the page of many runs, and their figures beside it as CSV.
-fn many(invocation: &Invocation, runs: &[PathBuf], asked: Option<&Out>) -> Result<()> {
-    let page = asked.map_or_else(|| PathBuf::from("runs.html"), |out| out.file("runs.html"));
+fn many(invocation: &Invocation, runs: &[PathBuf], out: Option<&Out>) -> Result<()> {
+    let page = out.map_or_else(|| PathBuf::from("runs.html"), |out| out.file("runs.html"));
     if let Some(wrong) = runs.iter().find(|run| !io::is_folder(run)) {
         return Err(Error::cannot(format!("`{}` is not a folder", wrong.display()), "name run folders"));
     }
@@ -75,7 +75,7 @@ fn many(invocation: &Invocation, runs: &[PathBuf], asked: Option<&Out>) -> Resul
     print_page_path(invocation, &page)
 }
 
-/// Says where the page is.
+/// Prints the path of the page.
 fn print_page_path(invocation: &Invocation, page: &Path) -> Result<()> {
     let common = invocation.common;
     match (common.json, common.quiet) {

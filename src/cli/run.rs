@@ -1,5 +1,5 @@
-//! `tiface run` and the commands of single stages: the pipeline up to a stage; what its result must reach (`--require`); and
-//! what is printed at the end: where everything is, and how good it is.
+//! `tiface run` and the commands of single stages: the pipeline up to a stage, requirements on its result (`--require`), and
+//! the printed summary of files and quality.
 
 use super::Invocation;
 use super::options::{Common, KeyOption, RunTarget};
@@ -15,21 +15,21 @@ use std::path::{Path, PathBuf};
 
 /// A command that runs stages.
 pub(super) struct StageCommand<'a> {
-    /// What it makes: `run` (all there is), or the stage.
+    /// What `--out` receives: the whole run, or the product of a stage.
     pub product: &'static str,
     /// The last stage that it needs.
     pub until: Stage,
     /// What it works on.
     pub target: RunTarget,
-    /// Bars that the result must reach.
+    /// Requirements on the result (`--require`).
     pub require: &'a [String],
-    /// Its own options that are keys of the configuration.
+    /// Options of this command that set keys of the configuration.
     pub keys: Vec<KeyOption>,
-    /// The preset where nothing names one, and settings on top of it, as TOML.
+    /// The preset if no other is named, and settings on top of it, as TOML.
     pub fallback: Option<(Preset, &'static str)>,
 }
 
-/// Completes the stages that a command needs, and puts its product where it was asked for.
+/// Completes the stages that a command needs, and writes its product to `--out`.
 pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()> {
     let Invocation { common, screen, stop } = invocation;
     let StageCommand { product, until, target, require, .. } = command;
@@ -38,18 +38,35 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
         screen.note("run", &format!("using `{}`", target.run.display()));
     }
     let mut config = configure(common, command)?;
-    // views of a path are made as asked for here; what the evaluation shows stays as it was
+    // these options set how the views of a path are rendered; the evaluation's views keep their settings
     let path = (*until == Stage::Render && config.render.cameras != "test").then(|| config.render.clone());
     if path.is_some() {
         config.render = evaluation(common, target)?;
     }
     let bars = require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>>>()?;
     let run = Run::open(&target.run, stop.clone(), screen.clone());
-    let session = ready(common, command, &config, &run, path, out.as_ref()).inspect_err(|e| {
-        // who runs many heads looks for what went wrong in their folders, not in logs; a run that is done stays as it is,
-        // what was asked for otherwise than before is no fault of one that has begun, and a wrong command makes no folder
+    // everything that can be refused is refused here, before the first stage
+    let open = || -> Result<Session> {
+        let mut session = Session::open(&config, &run)?;
+        if let Some(path) = path {
+            session = session.with_camera_path(path)?;
+        }
+        if let Some(out) = &out {
+            out.check(run.dir(), &session.order(*until))?;
+        }
+        if !common.dry_run {
+            if let Some(fresh) = common.fresh {
+                session.fresh(fresh, *until)?;
+            }
+            session.remember(*until)?;
+        }
+        Ok(session)
+    };
+    let session = open().inspect_err(|e| {
+        // failures of a batch are found in the run folders, not in logs; a finished run keeps its state, other settings
+        // are no failure of a run that has begun, and a wrong command creates no folder
         let is_named = io::is_folder(run.dir()) || common.run.is_some() && e.kind() == ErrorKind::Cannot;
-        let tells = match (e.kind(), saved_config(&run)) {
+        let is_recorded = match (e.kind(), saved_config(&run)) {
             (ErrorKind::Cannot | ErrorKind::Usage, None) => true,
             (ErrorKind::Cannot, Some(before)) => {
                 common.fresh.is_none()
@@ -58,7 +75,7 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
             }
             _ => false,
         };
-        if is_named && tells && !common.dry_run {
+        if is_named && is_recorded && !common.dry_run {
             run.failed(e);
         }
     })?;
@@ -81,43 +98,18 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
     bars.iter().try_for_each(|bar| bar.check(&done))
 }
 
-/// The settings that a run was last worked on with, as text; none if it has not begun.
+/// Returns the settings that a run was last worked on with, as text; `None` if it has not begun.
 fn saved_config(run: &Run) -> Option<String> {
     let bytes = io::read_bytes(&run.path("config.toml"), &io::Limits::default()).ok()?;
     Some(without_device(&String::from_utf8_lossy(&bytes)))
 }
 
-/// Stages of one run may be made on several devices.
+/// Returns settings without the device: stages of one run may be computed on several devices.
 fn without_device(settings: &str) -> String {
     settings.lines().filter(|line| !line.starts_with("device = ")).map(|line| format!("{line}\n")).collect()
 }
 
-/// Opens the session, and refuses here all that can be refused before the first stage.
-fn ready<'a>(
-    common: &Common,
-    command: &StageCommand,
-    config: &'a Config,
-    run: &'a Run,
-    path: Option<RenderConfig>,
-    out: Option<&Out>,
-) -> Result<Session<'a>> {
-    let mut session = Session::open(config, run)?;
-    if let Some(path) = path {
-        session = session.with_camera_path(path)?;
-    }
-    if let Some(out) = out {
-        out.check(run.dir(), &session.order(command.until))?;
-    }
-    if !common.dry_run {
-        if let Some(fresh) = common.fresh {
-            session.fresh(fresh, command.until)?;
-        }
-        session.remember(command.until)?;
-    }
-    Ok(session)
-}
-
-/// What would be done for `until`, a row for each stage, with what each may cost, and all together.
+/// Returns the plan up to `until`: a row for each stage with its estimated cost, and the total.
 fn plan_summary(session: &Session, until: Stage, common: &Common) -> Result<String> {
     let mut removed = common.fresh.map(|f| session.out_of_date(f)).transpose()?.unwrap_or_default();
     let mut text = String::new();
@@ -156,7 +148,7 @@ fn plan_summary(session: &Session, until: Stage, common: &Common) -> Result<Stri
     Ok(text)
 }
 
-/// What all of it may cost.
+/// Returns an estimated cost as a phrase.
 pub(super) fn in_words(cost: Cost) -> String {
     let gib = |bytes: u64| bytes as f64 / (1u64 << 30) as f64;
     let (memory, disk) = (gib(cost.memory_bytes), gib(cost.disk_bytes));
@@ -164,7 +156,7 @@ pub(super) fn in_words(cost: Cost) -> String {
     format!("about {time} on the processor, {memory:.1} GiB of memory, {disk:.1} GiB of disk")
 }
 
-/// The configuration that a target and the options amount to; it remembers its capture.
+/// Returns the effective configuration of a target and the options, with the capture's absolute path.
 fn configure(common: &Common, command: &StageCommand) -> Result<Config> {
     let StageCommand { target, fallback, keys, .. } = command;
     let mut keys = keys.clone();
@@ -176,7 +168,7 @@ fn configure(common: &Common, command: &StageCommand) -> Result<Config> {
         keys.push((format!("CAPTURE {path}"), "capture.path".into(), path.into()));
     }
     let mut config = common.resolve(target.saved.as_deref(), *fallback, &keys)?;
-    // the run remembers it from anywhere
+    // an absolute path, so that the run finds its capture from any working directory
     if let Some(path) = io::real_path(Path::new(&config.capture.path)).ok().as_deref().and_then(Path::to_str)
     {
         config.capture.path = path.into();
@@ -187,8 +179,8 @@ fn configure(common: &Common, command: &StageCommand) -> Result<Config> {
     Ok(config)
 }
 
-/// How the evaluation's views are made: as the run remembers it, else as it starts out, by `--set` but not by the options
-/// of this command.
+/// Returns how the evaluation's views are rendered: by the run's saved settings, else by the defaults and `--set`, but
+/// not by the options of this command.
 fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
     let kept = Some(target.run.join("config.toml")).filter(|file| io::is_file(file));
     let config = match kept {
@@ -198,7 +190,7 @@ fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
     Ok(RenderConfig { cameras: "test".into(), ..config.render })
 }
 
-/// A bar set by `--require`.
+/// A requirement of `--require`.
 #[derive(Debug, PartialEq)]
 enum Bar {
     Watertight,
@@ -213,7 +205,7 @@ impl Bar {
             _ => None,
         };
         bar.ok_or_else(|| {
-            Error::usage(format!("there is no requirement `{text}`"), "known are watertight and psnr=DB")
+            Error::usage(format!("there is no requirement `{text}`"), "use watertight or psnr=DB")
         })
     }
 
@@ -221,7 +213,7 @@ impl Bar {
         let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
         match self {
             Bar::Watertight if of(Stage::Mesh).is_some_and(|m| m["closed"] == true) => Ok(()),
-            Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check` says where")),
+            Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check` shows where")),
             Bar::Psnr(bar) => {
                 let metrics = of(Stage::Metrics).unwrap_or(&Value::Null);
                 let sets = metrics.as_object().into_iter().flat_map(|m| m.values());
@@ -233,16 +225,16 @@ impl Bar {
                 }
                 let found = if best.is_finite() { format!("{best:.2} dB") } else { "unknown".into() };
                 Err(Error::below(
-                    format!("PSNR is {found}, required are {bar} dB"),
-                    "train longer, or lower the bar",
+                    format!("PSNR is {found}, required is {bar} dB"),
+                    "train longer, or lower the requirement",
                 ))
             }
         }
     }
 }
 
-/// Where the result is, how good it is, and what was `written` for `--out`; `views` is the folder of the views below the
-/// run.
+/// Returns a summary of the result: its files, its quality and what was `written` to `--out`. `views` is the folder of the
+/// views, relative to the run.
 fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) -> String {
     let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
@@ -272,7 +264,7 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     text
 }
 
-/// What became of handles, after a comma; nothing where there were none.
+/// Returns how many handles were cut, filled and left, after a comma; empty if the surface had none.
 fn handles(figures: &Value) -> String {
     let count = |key: &str| figures[key].as_array().map_or(0, Vec::len) as u64;
     let all = [
@@ -285,7 +277,7 @@ fn handles(figures: &Value) -> String {
     if parts.is_empty() { String::new() } else { format!(", handles: {}", parts.join(", ")) }
 }
 
-/// How good the result is, one sentence per thing known.
+/// Returns a sentence for each figure of the result's quality.
 fn judgement(metrics: &Value) -> Vec<String> {
     let mut lines = Vec::new();
     for (set, _) in NAMES {
@@ -315,7 +307,7 @@ fn judgement(metrics: &Value) -> Vec<String> {
     lines
 }
 
-/// Where a set is right: one line of what is known.
+/// Returns a line of PSNR by part of the picture, as far as known.
 fn in_parts(mean: &Value) -> Option<String> {
     let of = |key: &str| mean[key].as_f64();
     let db = [("opaque", "psnr_opaque"), ("edge", "psnr_edge"), ("skin", "psnr_skin"), ("hair", "psnr_hair")];

@@ -1,6 +1,6 @@
-//! What a person (or a program) sees: events while stages run, and data on stdout.
+//! Output: events on stderr while stages run, and data on stdout.
 //!
-//! Names and messages out of files do on a terminal what text does, and nothing else ([`plain`]).
+//! Text from files cannot control the terminal: control characters are escaped ([`plain`]).
 
 use super::options::Common;
 use crate::pipeline::Stage;
@@ -15,7 +15,7 @@ use std::io::{self, IsTerminal, Write};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Shows events: a line that moves on a terminal, else one plain line every 30 s; with `--json` one
+/// Shows events: a progress line on a terminal, else a plain line every 30 s; with `--json` one
 /// object per event on stdout.
 pub(super) struct Screen {
     json: bool,
@@ -25,18 +25,18 @@ pub(super) struct Screen {
     moving: Mutex<MovingLine>,
 }
 
-/// The line that moves, and what it is made of.
+/// The progress line and its figures.
 #[derive(Default)]
 struct MovingLine {
     bar: Option<ProgressBar>,
-    /// When progress was shown last, where it does not move.
+    /// When a plain line or object was last printed.
     last: Option<Instant>,
-    /// The stages of the command that are to be worked on, in order, with the seconds that each may take.
+    /// The remaining stages of the command, in order, with the estimated seconds of each.
     ahead: Vec<(String, f64)>,
 }
 
-const PLAIN: Duration = Duration::from_secs(30);
-const OBJECTS: Duration = Duration::from_secs(1);
+const PLAIN_INTERVAL: Duration = Duration::from_secs(30);
+const JSON_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Screen {
     pub fn new(common: &Common) -> Arc<Screen> {
@@ -53,33 +53,33 @@ impl Screen {
         self.moving.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The stages that are to come, with the seconds that each may take: what is left of one is not what is left of all.
+    /// Sets the stages ahead with the estimated seconds of each, for the time left of the whole command.
     pub fn expect(&self, ahead: Vec<(String, f64)>) {
         self.moving().ahead = ahead;
     }
 
-    /// A remark for people: about what, and what.
+    /// Prints a note: its subject and its text.
     pub fn note(&self, head: &str, text: &str) {
         if !self.quiet {
             self.line(head, text);
         }
     }
 
-    /// The error and the suggested fix, once; who asked to stop gets no error.
+    /// Prints the error and the suggested fix; a requested stop is not an error.
     pub fn error(&self, error: &Error) {
         self.end();
         if error.is_printed() {
             return;
         }
         let (message, hint) = (error.to_string(), error.hint());
-        let asked = error.kind().is_stop();
+        let is_stop = error.kind().is_stop();
         if self.json {
-            let event = if asked { "stopped" } else { "error" };
+            let event = if is_stop { "stopped" } else { "error" };
             self.object(
                 &json!({"event": event, "exit": error.kind().code(), "message": message, "hint": hint}),
             );
         }
-        if asked {
+        if is_stop {
             let hint = if hint.is_empty() { String::new() } else { format!("; {hint}") };
             return self.note("stopped", &format!("{message}{hint}"));
         }
@@ -92,8 +92,7 @@ impl Screen {
         }
     }
 
-    /// Above the moving line, if there is one: a word of ours, and a text that may quote files. A closed stderr is
-    /// nothing to complain about.
+    /// Prints a label and a text, which may quote files, above the progress line. A closed stderr is ignored.
     fn line(&self, head: &str, text: &str) {
         let text = indented(text);
         let bar = self.moving().bar.clone();
@@ -130,20 +129,20 @@ impl Screen {
         }
     }
 
-    /// How many stages come after this one, and the seconds left of all together when of this one `eta_s` are left
-    /// and it takes `all_s`: the others are as much slower or faster than was estimated as this one is.
+    /// Returns the number of stages after this one, and the seconds left of the command, given `eta_s` left of the
+    /// `all_s` of this one: estimates of the others are scaled by this stage's ratio of time to estimate.
     fn after(&self, stage: &str, eta_s: Option<f64>, all_s: Option<f64>) -> (usize, Option<f64>) {
         let moving = self.moving();
         let Some(at) = moving.ahead.iter().position(|(s, _)| s == stage) else { return (0, eta_s) };
         let later = &moving.ahead[at + 1..];
-        // other stages count several things one after the other
+        // other stages count several things in turn
         let learns = stage.parse().is_ok_and(Stage::learns);
         let pace =
             all_s.filter(|_| learns).map_or(1.0, |s| s / moving.ahead[at].1.max(1.0)).clamp(0.02, 50.0);
         (later.len(), eta_s.map(|eta| eta + pace * later.iter().map(|(_, seconds)| seconds).sum::<f64>()))
     }
 
-    /// Is it time for the next plain line or object?
+    /// Returns whether the next plain line or object is due.
     fn due(&self, every: Duration, last_step: bool) -> bool {
         let mut moving = self.moving();
         let due = last_step || moving.last.is_none_or(|t| t.elapsed() >= every);
@@ -164,7 +163,7 @@ impl Observer for Screen {
             Event::Progress { stage, step, steps, rate, eta_s, values } => {
                 let all_s = rate.filter(|r| *r > 0.0).map(|r| steps as f64 / r);
                 let (after, run_eta_s) = self.after(stage, eta_s, all_s);
-                if self.json && self.due(OBJECTS, step >= steps) {
+                if self.json && self.due(JSON_INTERVAL, step >= steps) {
                     let mut object = json!(event);
                     object["stages_after"] = json!(after);
                     object["run_eta_s"] = json!(run_eta_s);
@@ -174,7 +173,9 @@ impl Observer for Screen {
                 let bar = self.moving().bar.clone();
                 match bar {
                     Some(bar) => bar.set_message(text),
-                    None if !self.quiet && !self.json && self.due(PLAIN, false) => self.line(stage, &text),
+                    None if !self.quiet && !self.json && self.due(PLAIN_INTERVAL, false) => {
+                        self.line(stage, &text)
+                    }
                     None => {}
                 }
                 return;
@@ -190,7 +191,7 @@ impl Observer for Screen {
         if self.json {
             self.object(&json!(event));
         }
-        // a warning is also for people, even if a program reads the objects
+        // warnings are also printed on stderr, even with --json
         if !text.is_empty() && (!self.json || matches!(event, Event::Warning { .. })) {
             self.note(&head, &text);
         }
@@ -228,7 +229,7 @@ fn progress(
     text
 }
 
-/// Four significant digits; counts as they are.
+/// Returns a figure with four significant digits; integers in full.
 pub(super) fn figure(value: f64) -> String {
     let size = value.abs();
     if value.fract() == 0.0 {
@@ -250,14 +251,14 @@ pub(super) fn print(text: &str) -> Result<()> {
     let written = out.write_all(plain(text).as_bytes()).and_then(|()| out.flush());
     match written {
         Err(e) if e.kind() != io::ErrorKind::BrokenPipe => {
-            Err(Error::cannot(format!("stdout cannot be written: {e}"), "check where it leads"))
+            Err(Error::cannot(format!("stdout cannot be written: {e}"), "check the redirection"))
         }
         _ => Ok(()),
     }
 }
 
-/// The text without what moves cursors, colors or turns lines around, as JSON would write it, so that JSON stays the
-/// same. Lines and tabs stay.
+/// Returns text with control and bidirectional characters escaped as in JSON, so that JSON is unchanged. Line breaks and
+/// tabs stay.
 fn plain(text: &str) -> Cow<'_, str> {
     escaped(text, |c| acts(c) && c != '\n' && c != '\t')
 }
@@ -267,7 +268,7 @@ pub(super) fn one_line(text: &str) -> Cow<'_, str> {
     escaped(text, acts)
 }
 
-/// The same, each line after the first indented: none looks like a line of our own.
+/// Returns the same with lines after the first indented, so that none can pass for a line of this program.
 fn indented(text: &str) -> String {
     let mut lines = String::with_capacity(text.len());
     for (i, line) in plain(text).split('\n').enumerate() {
@@ -279,7 +280,7 @@ fn indented(text: &str) -> String {
     lines
 }
 
-/// Controls, line separators, and what changes the direction of writing.
+/// Returns whether a character is a control, a line separator or a bidirectional mark.
 fn acts(c: char) -> bool {
     c.is_control() || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }

@@ -1,4 +1,4 @@
-//! `tiface status`: where runs stand; reads only what stages say of themselves.
+//! `tiface status`: the states of runs, read from the status files of their stages.
 
 use super::Invocation;
 use super::screen::{figure, one_line, print};
@@ -16,29 +16,29 @@ use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Which runs, and how long.
+/// Options of `tiface status`.
 #[derive(Args, Debug)]
 pub(super) struct StatusOptions {
-    /// Run folders; without any, all under runs/
+    /// Run folders [default: all under runs/]
     runs: Vec<PathBuf>,
-    /// Only runs that failed, were killed or cannot be read
+    /// Show only runs that failed, were killed or cannot be read
     #[arg(long)]
     failed: bool,
-    /// Again every two seconds, until all are done or failed, or Ctrl-C is pressed
+    /// Repeat every two seconds, until all runs are done or failed, or until Ctrl-C
     #[arg(long, conflicts_with = "json")]
     watch: bool,
 }
 
-const EVERY: Duration = Duration::from_secs(2);
-/// More runs than this: those with nothing to tell but that they are done, or not begun, share lines.
-const LINES: usize = 40;
-/// Columns of a shared line.
-const WIDTH: usize = 100;
+const REFRESH_INTERVAL: Duration = Duration::from_secs(2);
+/// From more runs than this, those that are done or have not begun share lines.
+const MAX_LINES: usize = 40;
+/// Maximum length of a shared line, characters.
+const LINE_WIDTH: usize = 100;
 
 pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()> {
     let common = invocation.common;
     loop {
-        // anew each time: runs may come while one looks
+        // listed each time: runs may be added meanwhile
         let all = match (options.runs.is_empty(), &common.run) {
             (false, _) => options.runs.clone(),
             (true, Some(run)) => vec![run.clone()],
@@ -60,7 +60,7 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
         };
         let may_change = [Phase::Waiting, Phase::Running, Phase::Begun, Phase::Killed, Phase::Stopped];
         if options.watch && is(&may_change) > 0 && invocation.stop.requested().is_none() {
-            std::thread::park_timeout(EVERY);
+            std::thread::park_timeout(REFRESH_INTERVAL);
             if invocation.stop.requested().is_none() {
                 continue;
             }
@@ -70,11 +70,11 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
             (0, 0) => Ok(()),
             (0, n) => Err(Error::below(
                 format!("{n} of {} runs failed", found.len()),
-                "`tiface status --failed` says why; mend the cause, then repeat the command on them",
+                "`tiface status --failed` shows why; remove the cause, then repeat the command for them",
             )),
             (n, _) => Err(Error::cannot(
                 format!("{n} of {} runs could not be read", found.len()),
-                "name run folders, and mend their config.toml; `tiface run RUN --fresh STAGE` makes a stage anew",
+                "name run folders, and correct their config.toml; `tiface run RUN --fresh STAGE` repeats a stage",
             )),
         };
     }
@@ -88,7 +88,7 @@ fn look(run: &Path) -> Result<RunStatus> {
     Ok(RunStatus::read(run))
 }
 
-/// Whether the run needs a user's attention.
+/// Returns whether the run needs a user's attention.
 fn has_failed(run: &Result<RunStatus>) -> bool {
     let wrong = [Phase::Failed, Phase::Killed, Phase::Unreadable];
     run.as_ref().map_or(true, |s| wrong.contains(&s.phase))
@@ -98,7 +98,7 @@ fn name(run: &Path) -> String {
     one_line(&run.file_name().unwrap_or(run.as_os_str()).to_string_lossy()).into_owned()
 }
 
-/// A line for each run, and one for all.
+/// Returns a line for each run, and one for all.
 fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> String {
     let mut text = String::new();
     let shown: Vec<_> = runs.iter().filter(|(_, run)| !failed || has_failed(run)).collect();
@@ -120,7 +120,7 @@ fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> Strin
             }
         };
         let settled = [Phase::Done, Phase::Waiting].contains(&standing.phase);
-        if settled && !each && runs.len() > LINES {
+        if settled && !each && runs.len() > MAX_LINES {
             shared.entry(word(standing.phase)).or_default().push(name(run));
             continue;
         }
@@ -130,7 +130,7 @@ fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> Strin
     for (word, names) in shared {
         let mut line = format!("{word}:");
         for name in names {
-            if line.len() + 1 + name.len() > WIDTH {
+            if line.len() + 1 + name.len() > LINE_WIDTH {
                 text += &format!("{line}\n");
                 line = "  ".into();
             }
@@ -188,7 +188,7 @@ fn described(run: &RunStatus) -> String {
     }
 }
 
-/// A JSON object for each run, without settings.
+/// Returns a JSON object for each run, without settings.
 fn objects(runs: &[(&Path, Result<RunStatus>)], failed: bool) -> String {
     let object = |(run, standing): &&(&Path, Result<RunStatus>)| {
         let value = match standing {
@@ -226,7 +226,7 @@ fn stage_object(s: &crate::run::StageStatus) -> Value {
     value
 }
 
-/// A row for each stage of one run, views of paths included, and what is left of all.
+/// Returns a row for each stage of one run, camera paths included, and the time left in total.
 fn stages(run: &Path, standing: &RunStatus) -> String {
     let mut text = String::new();
     let mut row = |stage: &str, words: &str| {

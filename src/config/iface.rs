@@ -106,7 +106,7 @@ table! {
         start_levels: usize => 6, 6, 16;
         /// Share of the steps after which all levels are active; they are activated at equal intervals.
         all_levels: f64 => 0.25, 0.25, 0.0;
-        /// Does the color network read the hash features beside the geometry network's outputs?
+        /// Whether the color network also reads the hash features.
         color_skip: bool => true, true, false;
         /// Half edge of the field's box.
         radius: f32 => 1.0, 1.0, 0.3;

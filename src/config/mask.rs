@@ -153,12 +153,12 @@ table! {
 }
 
 impl MaskConfig {
-    /// Are the masks made, from clicks or by a network?
-    pub fn made(&self) -> bool {
+    /// Returns whether the run makes the masks, from clicks or by a network.
+    pub fn makes_masks(&self) -> bool {
         self.clicked() || self.with_alpha_net()
     }
 
-    /// Are the masks made by the alpha network alone?
+    /// Returns whether the masks are made by the alpha network alone.
     pub fn with_alpha_net(&self) -> bool {
         match self.source {
             MaskSource::Network => true,
@@ -167,12 +167,12 @@ impl MaskConfig {
         }
     }
 
-    /// Is any network to run?
+    /// Returns whether any network is used.
     pub fn with_networks(&self) -> bool {
         self.with_sam() || self.with_vitmatte() || self.with_alpha_net()
     }
 
-    /// Are the masks made from clicks?
+    /// Returns whether the masks are made from clicks.
     pub fn clicked(&self) -> bool {
         match self.source {
             MaskSource::Clicks => true,
@@ -181,7 +181,7 @@ impl MaskConfig {
         }
     }
 
-    /// Is SAM to cut?
+    /// Returns whether SAM makes the hard masks.
     pub fn with_sam(&self) -> bool {
         match self.cut {
             CutMethod::Auto => !self.sam.is_empty(),
@@ -189,7 +189,7 @@ impl MaskConfig {
         }
     }
 
-    /// Is ViTMatte to find the alpha?
+    /// Returns whether ViTMatte makes the alpha.
     pub fn with_vitmatte(&self) -> bool {
         match self.matting {
             MattingMethod::Auto => !self.vitmatte.is_empty(),
@@ -197,7 +197,7 @@ impl MaskConfig {
         }
     }
 
-    /// What the ranges of single keys cannot say: a key, its problem, and a suggested fix.
+    /// Returns what the ranges of single keys cannot say: a key, its problem, and a suggested fix.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         let given = !self.prompts.is_empty() || !self.point.is_empty();
         let problem = |key, problem: &str, hint| Some((key, problem.to_owned(), hint));
@@ -227,7 +227,7 @@ impl MaskConfig {
             return problem("mask.alpha_net", "is named beside clicks", hint);
         }
         let networks = [&self.sam, &self.sam_decoder, &self.vitmatte, &self.alpha_net];
-        if !self.made() && networks.iter().any(|file| !file.is_empty()) {
+        if !self.makes_masks() && networks.iter().any(|file| !file.is_empty()) {
             let hint = "give clicks: `--prompts prompts.json`, or `--alpha-net FILE.onnx`";
             return problem(
                 "mask.sam",
@@ -235,7 +235,7 @@ impl MaskConfig {
                 hint,
             );
         }
-        if self.made() && self.meaning == MaskMeaning::Ignore {
+        if self.makes_masks() && self.meaning == MaskMeaning::Ignore {
             let hint = "set `mask.meaning` to empty: masks that are made say what is head";
             return problem("mask.meaning", "is ignore, but masks are made", hint);
         }
@@ -273,7 +273,7 @@ mod tests {
         assert_eq!(key(MaskConfig { source: MaskSource::Clicks, ..start() }), "mask.source");
         assert_eq!(key(MaskConfig { source: MaskSource::Folder, ..clicked.clone() }), "mask.source");
         let named = MaskConfig { alpha_net: "a.onnx".into(), ..start() };
-        assert!(named.made() && !named.clicked() && named.problem().is_none());
+        assert!(named.makes_masks() && !named.clicked() && named.problem().is_none());
         assert_eq!(key(MaskConfig { prompts: "p.json".into(), ..named }), "mask.alpha_net");
         assert_eq!(key(MaskConfig { source: MaskSource::Network, ..start() }), "mask.source");
         assert_eq!(key(MaskConfig { point: vec!["1,2,1".into()], ..clicked.clone() }), "mask.point");

@@ -139,7 +139,7 @@ impl MeshConfig {
         1 + u64::from(self.normal_map) + lobes
     }
 
-    /// What the ranges of single keys cannot say: a key, its problem, and a suggested fix.
+    /// Returns what the ranges of single keys cannot say: a key, its problem, and a suggested fix.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         let px = self.texture_px;
         if px == 0 {
@@ -160,7 +160,7 @@ impl MeshConfig {
         }
         // held as floats while they are baked
         let pictures = self.pictures();
-        // and what a fit knows of each texel
+        // and the sums of a fit for each texel
         let fit = if self.color == ColorSource::Photographs { 250 } else { 0 };
         let gib = (self.texels() * (21 * pictures + fit)) >> 30;
         (gib > 16).then(|| {

@@ -37,7 +37,7 @@ pub const NAMES: [(&str, &str); 7] = [
     ("ensemble", "blend"),
 ];
 
-/// What a person reads of pictures with this word: `I-Face (volume)`; the word itself where it is no other.
+/// Returns what a person reads of pictures with this word: `I-Face (volume)`; the word itself where it is no other.
 pub fn called(word: &str) -> String {
     match NAMES.iter().find(|(w, title)| *w == word && title != w) {
         Some((_, title)) => format!("{title} ({word})"),
@@ -46,12 +46,12 @@ pub fn called(word: &str) -> String {
 }
 
 impl Method {
-    /// The folder of its pictures below `render/`, and its word in the configuration.
+    /// Returns the folder of its pictures below `render/`, and its word in the configuration.
     pub fn folder(self) -> &'static str {
         NAMES[self as usize].0
     }
 
-    /// The stage whose result it shows.
+    /// Returns the stage whose result it shows.
     pub fn stage(self) -> Stage {
         match self {
             Method::Baseline => Stage::Baseline,
@@ -111,7 +111,7 @@ table! {
 }
 
 impl RenderConfig {
-    /// The stages whose results its views show.
+    /// Returns the stages whose results its views show.
     pub fn shows(&self) -> Vec<Stage> {
         let is_shown = |s: &Stage| *s == Stage::Mask || self.method.iter().any(|m| m.stage() == *s);
         Stage::ALL.into_iter().filter(is_shown).collect()

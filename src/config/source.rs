@@ -1,4 +1,4 @@
-//! From files and `--set` to a [`Config`]: which value wins, and what is wrong with one.
+//! Resolves files and `--set` to a [`Config`]: precedence and validation of values.
 
 use super::{Config, DeviceChoice, Key, Preset, all_keys, lookup, show};
 use crate::{Error, Result};
@@ -6,18 +6,18 @@ use serde::Deserialize;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-/// Where values come from, weakest first.
+/// Sources of values, weakest first.
 #[derive(Clone, Debug, Default)]
 pub struct Sources {
     /// `--preset`; beats the `preset` of any file.
     pub preset: Option<Preset>,
-    /// The preset where no other source names one, and settings that go with it, as TOML.
+    /// The preset if no other source names one, and settings on top of it, as TOML.
     pub fallback: Option<(Preset, String)>,
     /// Configuration files: name for messages, text.
     pub files: Vec<(String, String)>,
     /// `--set`: each `key=value`.
     pub set: Vec<String>,
-    /// Options with a name of their own: as typed, the key they set, its value. Strongest.
+    /// Options of commands: as typed, the key they set, its value. Strongest.
     pub options: Vec<(String, String, String)>,
 }
 
@@ -28,7 +28,7 @@ enum RawValue {
     Text(String),
 }
 
-/// A key, its value, and where that was given, as a message begins.
+/// A key, its value, and its source, as the start of a message.
 type Assignment = (String, RawValue, String);
 
 pub(super) fn resolve(sources: &Sources) -> Result<Config> {
@@ -74,13 +74,13 @@ fn not_toml(place: &str, problem: &str) -> Error {
     Error::usage(problem, "write `table.key = value`; words in double quotes").within(place)
 }
 
-/// There is no such key; the suggested fix is the known one most like it.
+/// Returns the error for an unknown key, which suggests the most similar known one.
 pub(super) fn unknown(key: &str) -> Error {
     let meant = nearest(key).map(|name| format!("did you mean `{name}`? ")).unwrap_or_default();
     Error::usage(format!("there is no key `{key}`"), format!("{meant}`tiface config` lists all keys"))
 }
 
-/// A value that the key cannot have.
+/// Returns the error for an invalid value of a key.
 fn wrong(key: &str, problem: &str) -> Error {
     Error::usage(format!("`{key}`{problem}"), format!("`tiface config --explain {key}` says what it means"))
 }
@@ -177,7 +177,7 @@ fn fit(old: &Value, given: RawValue) -> Option<Value> {
     }
 }
 
-/// A TOML value given alone.
+/// Returns a TOML value given alone.
 fn scalar(text: &str) -> Option<Value> {
     toml::from_str::<Table>(&format!("v = {text}")).ok()?.remove("v")
 }
@@ -221,7 +221,7 @@ fn put(root: &mut Table, dotted: &str, value: Value) {
     }
 }
 
-/// The known key most like `key`, by its full name or by its last word, if any is like it at all.
+/// Returns the known key most like `key`, by its full name or by its last word, if any is like it at all.
 fn nearest(key: &str) -> Option<String> {
     let last = |name: &str| name.rsplit('.').next().unwrap_or_default().to_string();
     all_keys()

@@ -1,4 +1,4 @@
-//! The words of the stages: each names a stage, its table in `config.toml`, its folder in the run and its command.
+//! The stages. The name of a stage is also its table in `config.toml`, its folder in the run and its command.
 
 use super::Config;
 use crate::{Error, Result};
@@ -38,17 +38,17 @@ impl Stage {
         ["mask", "baseline", "tface", "iface", "mesh", "render", "ensemble", "metrics"][self as usize]
     }
 
-    /// Does it learn a field, step by step?
+    /// Returns whether the stage trains a field.
     pub fn learns(self) -> bool {
         matches!(self, Baseline | Tface | Iface)
     }
 
-    /// Does it compute on the device, where that is a GPU?
+    /// Returns whether the stage computes on the configured device.
     pub fn uses_device(self) -> bool {
         self.learns() || matches!(self, Mesh | Render)
     }
 
-    /// The stages that it reads from. What views are made of decides what `render` needs.
+    /// Returns the stages that it reads from. What views are made of decides what `render` needs.
     pub fn needs(self, config: &Config) -> Vec<Stage> {
         match self {
             Mask => Vec::new(),
@@ -61,7 +61,7 @@ impl Stage {
         }
     }
 
-    /// The stages and all that they need, in order.
+    /// Returns the stages and all that they need, in order.
     pub fn with_needs(mut wanted: Vec<Stage>, config: &Config) -> Vec<Stage> {
         let mut next = 0;
         while next < wanted.len() {
@@ -72,7 +72,7 @@ impl Stage {
         Stage::ALL.into_iter().filter(|stage| wanted.contains(stage)).collect()
     }
 
-    /// The stage and all that build on it, in order: what is out of date when it is made anew.
+    /// Returns the stage and all that build on it, in order: what is out of date when it is made anew.
     pub fn followers(self, config: &Config) -> Vec<Stage> {
         Stage::ALL.into_iter().filter(|s| Stage::with_needs(vec![*s], config).contains(&self)).collect()
     }

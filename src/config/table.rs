@@ -54,7 +54,7 @@ macro_rules! table {
                 },)+
             ];
 
-            /// The values a preset starts with.
+            /// Returns the values a preset starts with.
             pub fn preset(preset: super::Preset) -> $name {
                 $name {
                     $($key: $crate::config::table::of_preset!(
@@ -82,7 +82,7 @@ macro_rules! table {
     };
 }
 
-/// The name of a field as it is written in TOML: without the mark of a word that is Rust's own.
+/// Returns the name of a field as it is written in TOML: without the mark of a word that is Rust's own.
 pub(super) const fn plain(field: &'static str) -> &'static str {
     match field.as_bytes() {
         [b'r', b'#', name @ ..] => match std::str::from_utf8(name) {

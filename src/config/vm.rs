@@ -51,7 +51,7 @@ pub enum VmBackground {
 pub enum VmStart {
     /// The whole box (published).
     Box,
-    /// The masks' visual hull; the box where there is none, or where masks are not used.
+    /// The visual hull of the masks; the box without a hull, or if masks are not used.
     #[default]
     Hull,
 }
@@ -181,7 +181,8 @@ impl VmConfig {
         self.box_half.map_or(1.0, |of| half / of)
     }
 
-    /// The settings of a field that starts in a box, all lengths in scene units; done once, before the box shrinks.
+    /// Returns the settings of a field that starts in a box, all lengths in scene units; done once, before the box
+    /// shrinks.
     ///
     /// ```
     /// # use tiface::config::{Preset, VmConfig};
@@ -232,7 +233,7 @@ impl VmConfig {
         early_steps * self.rays_at(0) as f64 + (self.steps as f64 - early_steps) * self.rays as f64
     }
 
-    /// How many fields there are in the end: at least one, and no more where it comes from a file.
+    /// Returns how many fields there are in the end: at least one, and no more where it comes from a file.
     pub fn learned(&self) -> usize {
         if self.import.is_empty() { self.fields.max(1) } else { 1 }
     }

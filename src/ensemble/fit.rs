@@ -254,10 +254,10 @@ fn on_face(h: &[f64], g: &[f64], on: &[usize]) -> Option<[f64; MAX_MEMBERS]> {
 }
 
 /// The side of a tile is this part of the shorter side of its photograph: a third of an eye.
-const PARTS: u32 = 16;
+const TILES_PER_SIDE: u32 = 16;
 
 /// The least side of a tile, pixels.
-const LEAST: u32 = 8;
+const MIN_TILE_PX: u32 = 8;
 
 /// A square of a photograph.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -282,7 +282,7 @@ impl Tile {
 /// position in its own cell of a grid; none if `share` is 0. The same arguments give the same tiles.
 pub fn tiles(width: u32, height: u32, share: f64, seed: u64, view: u64) -> Vec<Tile> {
     let shorter = width.min(height);
-    let side = (shorter / PARTS).max(LEAST).min(shorter);
+    let side = (shorter / TILES_PER_SIDE).max(MIN_TILE_PX).min(shorter);
     if share <= 0.0 || side == 0 {
         return Vec::new();
     }
@@ -418,7 +418,7 @@ mod blend_tests {
         Gray { width: SIZE, height: SIZE, values: vec![255; PIXELS] }
     }
 
-    /// A color from 0.3 to 0.7.
+    /// Returns a color from 0.3 to 0.7.
     fn color(seed: u64, i: usize, j: usize) -> f32 {
         0.3 + 0.4 * uniform(seed, j as u64, i as u64)
     }
@@ -522,7 +522,7 @@ mod blend_tests {
         assert!((a[0] - b[0]).abs() < 1e-6);
     }
 
-    /// A view of two members with errors of these sizes, in so many of its pixels.
+    /// Returns a view of two members with errors of these sizes, in so many of its pixels.
     fn noisy(seed: u64, sigmas: [f32; 2], pixels: usize) -> Fit {
         let views =
             [0, 1].map(|k| view(|i, j| color(seed, i, j) + noise(seed * 10 + k, sigmas[k as usize], i, j)));

@@ -26,13 +26,13 @@ use std::time::Duration;
 
 /// Rounding of the shear (2.5 ε of the distance) for distances up to five times the largest
 /// coordinate, and the 4 ε every coordinate gets.
-const GROWTH: f32 = 16.0 * f32::EPSILON;
+const BOX_PADDING: f32 = 16.0 * f32::EPSILON;
 
 /// Rays that start farther out than this many times the largest coordinate are moved closer.
-const FAR: f32 = 4.0;
+const FAR_ORIGIN: f32 = 4.0;
 
 /// Ize 2013: 1 + 2 γ₃, with γ₃ = 3 u / (1 − 3 u) and u = ε/2.
-const SLAB: f32 = 1.0 + 4.0 * f32::EPSILON;
+const SLAB_ROUNDING: f32 = 1.0 + 4.0 * f32::EPSILON;
 
 /// Set in a child reference that names a leaf.
 const LEAF: u32 = 1 << 31;
@@ -63,7 +63,7 @@ impl Leaf {
         Vec3::new(c[0][lane], c[1][lane], c[2][lane])
     }
 
-    /// How many lanes are not repetitions.
+    /// Returns how many lanes are not repetitions.
     fn len(&self) -> usize {
         1 + (1..4).filter(|&k| self.triangle[k] != self.triangle[0]).count()
     }
@@ -144,7 +144,7 @@ impl Bvh {
         bvh
     }
 
-    /// The box around all triangles.
+    /// Returns the box around all triangles.
     pub fn bounds(&self) -> Aabb {
         self.bounds
     }
@@ -154,7 +154,7 @@ impl Bvh {
         self.nodes.is_empty()
     }
 
-    /// The first triangle along the ray with `t_min <= t <= t_max`, from either side; of triangles
+    /// Returns the first triangle along the ray with `t_min <= t <= t_max`, from either side; of triangles
     /// at the same `t` (a shared edge), the one with the smallest index. A ray that starts on the
     /// surface meets it at `t = 0`, give or take rounding: pass a small `t_min` to leave it.
     /// `None` for rays with a component that is not finite, or without direction.
@@ -167,7 +167,7 @@ impl Bvh {
         self.cast::<true>(ray).is_some()
     }
 
-    /// The nearest point of the surface; the smallest triangle index among equals. `None` for an
+    /// Returns the nearest point of the surface; the smallest triangle index among equals. `None` for an
     /// empty mesh or a query that is not finite.
     pub fn closest_point(&self, query: Vec3) -> Option<Closest> {
         if self.is_empty() || !query.is_finite() {
@@ -216,7 +216,7 @@ impl Bvh {
         }
     }
 
-    /// A stack of the size this tree needs: on the machine's own unless the tree is degenerate.
+    /// Returns a stack of the size this tree needs: on the machine's own unless the tree is degenerate.
     fn stack_space<'a>(
         &self,
         fixed: &'a mut [(u32, f32); STACK],
@@ -289,7 +289,7 @@ impl Bvh {
                     .min((b[1 - near_side[1]][1] - oy) * iy)
                     .min((b[1 - near_side[2]][2] - oz) * iz);
                 let near = near.max(start);
-                let far = (far * SLAB).min(Vec4::splat(best.t));
+                let far = (far * SLAB_ROUNDING).min(Vec4::splat(best.t));
                 let hits = near.cmple(far).bitmask();
                 if hits != 0 && hits & (hits - 1) == 0 {
                     current = node.child[hits.trailing_zeros() as usize];
@@ -311,13 +311,13 @@ impl Bvh {
         finish(best, advanced)
     }
 
-    /// Where to start from, and how far along the ray that is. Only far rays move.
+    /// Returns where to start from, and how far along the ray that is. Only far rays move.
     fn approach(&self, ray: &Ray) -> Option<(Vec3, f64)> {
-        if ray.origin.abs().max_element() <= FAR * self.reach {
+        if ray.origin.abs().max_element() <= FAR_ORIGIN * self.reach {
             return Some((ray.origin, 0.0));
         }
         let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
-        let grown = (GROWTH * self.reach).max(f32::MIN_POSITIVE) as f64;
+        let grown = (BOX_PADDING * self.reach).max(f32::MIN_POSITIVE) as f64;
         let (low, high) = (self.bounds.min.as_dvec3() - grown, self.bounds.max.as_dvec3() + grown);
         let (mut enter, mut leave) = (0.0f64, f64::INFINITY);
         for axis in 0..3 {
@@ -432,7 +432,7 @@ impl Shear {
     }
 }
 
-/// The point of triangle abc nearest to `p` (Ericson 2004, §5.1.5), also for degenerate triangles.
+/// Returns the point of triangle abc nearest to `p` (Ericson 2004, §5.1.5), also for degenerate triangles.
 fn closest_on_triangle(p: DVec3, a: DVec3, b: DVec3, c: DVec3) -> DVec3 {
     let (ab, ac, ap) = (b - a, c - a, p - a);
     let normal = ab.cross(ac).length_squared();
@@ -506,7 +506,7 @@ impl Bvh {
                 Aabb { min: a.min.min(b.min), max: a.max.max(b.max) }
             };
         }
-        let grown = (GROWTH * self.reach).max(f32::MIN_POSITIVE);
+        let grown = (BOX_PADDING * self.reach).max(f32::MIN_POSITIVE);
         // Work: which of our nodes stands for which of theirs, and how deep it is.
         let mut work = vec![(0usize, 0usize, 1usize)];
         self.nodes.push(WideNode::EMPTY);

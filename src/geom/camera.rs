@@ -85,13 +85,13 @@ impl std::fmt::Debug for Distortion {
     }
 }
 
-/// What most lenses do not have is not written, so that their files stay as they were.
+/// Returns whether a value is the default, which is not written, so that files of most lenses stay short.
 fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
 
 /// Angles from here on count as 90°: the tangent would be too large to be of use.
-const WIDEST: f64 = std::f64::consts::FRAC_PI_2 - 1e-3;
+const MAX_ANGLE: f64 = std::f64::consts::FRAC_PI_2 - 1e-3;
 
 impl Distortion {
     /// Returns whether it does nothing.
@@ -131,7 +131,7 @@ impl Distortion {
         match self.projection {
             Projection::Perspective => Some(1.0),
             Projection::Fisheye if small => Some(1.0),
-            Projection::Fisheye => (radius < WIDEST).then(|| radius.tan() / radius),
+            Projection::Fisheye => (radius < MAX_ANGLE).then(|| radius.tan() / radius),
             Projection::Fov if self.omega.abs() < 1e-6 => Some(1.0),
             Projection::Fov => {
                 let spread = 2.0 * (0.5 * self.omega).tan();
@@ -139,12 +139,12 @@ impl Distortion {
                 if small {
                     return Some(self.omega / spread);
                 }
-                (angle < WIDEST).then(|| angle.tan() / (spread.abs() * radius))
+                (angle < MAX_ANGLE).then(|| angle.tan() / (spread.abs() * radius))
             }
         }
     }
 
-    /// The radial factor at r², and its derivative by r².
+    /// Returns the radial factor at r², and its derivative by r².
     fn radial(&self, r2: f64) -> (f64, f64) {
         if self.projection == Projection::Fisheye {
             let factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)));
@@ -159,7 +159,7 @@ impl Distortion {
         (factor, (over_slope - factor * under_slope) / under)
     }
 
-    /// What the coefficients do to a projected point.
+    /// Returns what the coefficients do to a projected point.
     fn bend(&self, x: f64, y: f64) -> (f64, f64) {
         let r2 = x * x + y * y;
         let (radial, _) = self.radial(r2);
@@ -229,7 +229,7 @@ impl Distortion {
             }
         }
         let (fx, fy) = self.bend(x, y);
-        if (fx - xd).abs() + (fy - yd).abs() >= RESIDUAL {
+        if (fx - xd).abs() + (fy - yd).abs() >= MAX_RESIDUAL {
             return None;
         }
         let scale = self.tangent_over_radius(x.hypot(y))?;
@@ -238,7 +238,7 @@ impl Distortion {
 }
 
 /// How near [`Distortion::undistort`] must come; at a focal length of 10 000 pixels, 1e-6 of a pixel.
-const RESIDUAL: f64 = 1e-10;
+const MAX_RESIDUAL: f64 = 1e-10;
 
 /// One camera: intrinsics in pixels of its own picture, pose in the dataset's world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -264,7 +264,7 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// The ray through a picture position (pixel centres at +0.5), in the camera's world;
+    /// Returns the ray through a picture position (pixel centres at +0.5), in the camera's world;
     /// `t` is distance from the camera centre. `None` where the lens model folds over.
     pub fn ray(&self, pixel: Vec2) -> Option<Ray> {
         let xd = (pixel.x as f64 - self.cx) / self.fx;
@@ -310,12 +310,12 @@ impl Camera {
         Some((pixel, -p.z as f32))
     }
 
-    /// The direction the camera looks in.
+    /// Returns the direction the camera looks in.
     pub fn forward(&self) -> Vec3 {
         (-self.rotation.z_axis).as_vec3()
     }
 
-    /// The same camera seen from another coordinate system.
+    /// Returns the same camera seen from another coordinate system.
     pub fn transformed(&self, b_from_a: &Similarity) -> Camera {
         Camera {
             rotation: b_from_a.rotation * self.rotation,
@@ -324,13 +324,13 @@ impl Camera {
         }
     }
 
-    /// The camera of a part of the picture, which begins in column `x` of row `y`.
+    /// Returns the camera of a part of the picture, which begins in column `x` of row `y`.
     pub fn part(&self, x: u32, y: u32, width: u32, height: u32) -> Camera {
         let (cx, cy) = (self.cx - x as f64, self.cy - y as f64);
         Camera { width, height, cx, cy, ..self.clone() }
     }
 
-    /// The camera of the same picture at another size.
+    /// Returns the camera of the same picture at another size.
     pub fn resized(&self, width: u32, height: u32) -> Camera {
         let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);
         Camera {
@@ -403,7 +403,7 @@ mod tests {
         assert!(c.project(Vec3::new(1.0, 2.0, 4.0)).is_none());
     }
 
-    /// A lens of each kind, bent about as far as real ones are.
+    /// Returns a lens of each kind, bent about as far as real ones are.
     fn lenses() -> Vec<Distortion> {
         let none = Distortion::default();
         let fisheye = Distortion { projection: Projection::Fisheye, ..none };

@@ -20,29 +20,29 @@ pub struct Mesh {
     pub triangles: Vec<[u32; 3]>,
 }
 
-/// Twice the area of a triangle along its normal.
+/// Returns twice the area of a triangle along its normal.
 pub(crate) fn area_vector([a, b, c]: [Vec3; 3]) -> Vec3 {
     (b - a).cross(c - a)
 }
 
-/// The shape of a triangle, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
+/// Returns the shape of a triangle, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
 pub(crate) fn shape([a, b, c]: [Vec3; 3]) -> f32 {
     let sum = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
     if sum > 0.0 { 2.0 * 3f32.sqrt() * area_vector([a, b, c]).length() / sum } else { 0.0 }
 }
 
 impl Mesh {
-    /// The box around all vertices.
+    /// Returns the box around all vertices.
     pub fn bounds(&self) -> Aabb {
         Aabb::around(self.positions.iter().copied())
     }
 
-    /// The three corners of a triangle.
+    /// Returns the three corners of a triangle.
     pub fn corners(&self, triangle: u32) -> [Vec3; 3] {
         self.triangles[triangle as usize].map(|i| self.positions[i as usize])
     }
 
-    /// The area of a triangle, in f64.
+    /// Returns the area of a triangle, in f64.
     pub fn area(&self, triangle: u32) -> f64 {
         let [a, b, c] = self.corners(triangle).map(|p| p.as_dvec3());
         0.5 * (b - a).cross(c - a).length()
@@ -121,7 +121,7 @@ impl Mesh {
         pick(&mut self.colors, &to);
     }
 
-    /// The same mesh in another coordinate system.
+    /// Returns the same mesh in another coordinate system.
     pub fn transformed(&self, b_from_a: &Similarity) -> Mesh {
         Mesh {
             positions: self.positions.iter().map(|&p| b_from_a.point(p)).collect(),
@@ -149,7 +149,7 @@ pub struct Atlas {
 }
 
 impl Atlas {
-    /// The corners of a triangle, in texels: (0, 0) is the top left corner of the top left texel.
+    /// Returns the corners of a triangle, in texels: (0, 0) is the top left corner of the top left texel.
     pub fn corners(&self, triangle: u32) -> [Vec2; 3] {
         let size = Vec2::new(self.width as f32, self.height as f32);
         self.triangles[triangle as usize].map(|i| self.uvs[i as usize] * size)

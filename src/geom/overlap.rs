@@ -13,7 +13,7 @@
 //!
 //! A triangle of a sound mesh has a few dozen neighbours, but a file may put all of its triangles into one place,
 //! and comparing all with all is quadratic. So every search here counts what it looks at: each item gets a share
-//! of an effort proportional to their number, what some leave over is dealt to those that need more, and who is
+//! of an effort proportional to their number, what some leave over is given to those that need more, and what is
 //! not done then is named. All of it is counted work, never time: the answer is the same on every machine.
 
 use glam::{DVec2, DVec3, Vec2};
@@ -37,7 +37,7 @@ fn separates<V: Copy>(a: [V; 3], b: [V; 3], turn: impl Fn(V, V, V) -> i32) -> bo
     (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * inner <= 0))
 }
 
-/// The area two triangles share, in the square of the coordinates' unit.
+/// Returns the area two triangles share, in the square of the coordinates' unit.
 pub(crate) fn shared_area(p: [DVec2; 3], q: [DVec2; 3]) -> f64 {
     // Sutherland and Hodgman 1974: the first one clipped by the sides of the second.
     let winding = (q[1] - q[0]).perp_dot(q[2] - q[0]).signum();
@@ -72,11 +72,11 @@ pub(crate) struct Overlaps {
 }
 
 /// Effort for an atlas in the making, which should know all of its overlaps.
-pub(crate) const THOROUGH: usize = 1 << 16;
+pub(crate) const THOROUGH_EFFORT: usize = 1 << 16;
 
 /// What deciding about a pair costs, in comparisons of boxes, and what keeping and measuring one costs.
-const DECIDING: usize = 12;
-const KEEPING: usize = 64;
+const PAIR_TEST_COST: usize = 12;
+const OVERLAP_COST: usize = 64;
 
 /// Finds the pairs among the triangles that `fit`, for so much effort a triangle; those must be finite and have
 /// area.
@@ -92,8 +92,8 @@ pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effor
             if b <= a {
                 return true;
             }
-            let meets = effort.spend(DECIDING) && share_area(corners(a), corners(b));
-            if meets && effort.spend(KEEPING) {
+            let meets = effort.spend(PAIR_TEST_COST) && share_area(corners(a), corners(b));
+            if meets && effort.spend(OVERLAP_COST) {
                 pairs.push((a, b));
             }
             true
@@ -121,7 +121,7 @@ pub(crate) fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effor
             let (a, mut known) = (rest[i], false);
             boxes.meeting(&span(a), effort, |j, effort| {
                 let b = listed[j as usize];
-                known = a != b && effort.spend(DECIDING) && share_area(corners(a), corners(b));
+                known = a != b && effort.spend(PAIR_TEST_COST) && share_area(corners(a), corners(b));
                 !known
             });
             known
@@ -156,7 +156,7 @@ pub(crate) fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u
     count < 2 && (crosses(p, in_p, q) || crosses(q, in_q, p))
 }
 
-/// Whether the segment goes from one side of the triangle to the other, through it or its border.
+/// Returns whether the segment goes from one side of the triangle to the other, through it or its border.
 fn pierces(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> bool {
     if orient(a, b, c, from) * orient(a, b, c, to) >= 0 {
         return false;
@@ -176,7 +176,7 @@ fn orient(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> i32 {
     if det.abs() <= 1e-15 * permanent { 0 } else { det.signum() as i32 }
 }
 
-/// Whether two triangles of one plane share area: not if a side of either separates them.
+/// Returns whether two triangles of one plane share area: not if a side of either separates them.
 fn overlap_in_plane(p: [DVec3; 3], q: [DVec3; 3]) -> bool {
     let normal = (p[1] - p[0]).cross(p[2] - p[0]).abs();
     let flat = |v: DVec3| {
@@ -216,7 +216,7 @@ pub(crate) struct ChartDistance {
     pub left: usize,
 }
 
-/// The smallest distance between sides of different charts, up to `farthest`, beyond which it is given as that.
+/// Returns the smallest distance between sides of different charts, up to `farthest`, beyond which it is given as that.
 pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDistance {
     if sides.iter().all(|s| s.chart == sides[0].chart) {
         return ChartDistance { distance: None, left: 0 };
@@ -227,18 +227,18 @@ pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDista
     // has a short way to go.
     let order: Vec<u32> = boxes.order().collect();
     let mut bound = farthest;
-    for near in order.windows(BESIDE) {
+    for near in order.windows(LEAF_NEIGHBOURS) {
         let side = &sides[near[0] as usize];
         let others = near[1..].iter().map(|&i| &sides[i as usize]).filter(|s| s.chart != side.chart);
         bound = others.fold(bound, |least, other| least.min(distance(side, other)));
     }
-    let shared = share_out(sides.len(), EFFORT / 2, |i, effort| {
+    let shared = share_out(sides.len(), DEFAULT_EFFORT / 2, |i, effort| {
         let (side, mut least) = (&sides[i], bound);
         if least > 0.0 {
             boxes.meeting(&span(side).grown(bound), effort, |j, effort| {
                 let other = &sides[j as usize];
                 if side.chart < other.chart {
-                    if !effort.spend(DISTANCE) {
+                    if !effort.spend(SIDE_DISTANCE_COST) {
                         return false;
                     }
                     least = least.min(distance(side, other));
@@ -254,10 +254,10 @@ pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDista
 }
 
 /// How many that follow each other in the tree are compared first.
-const BESIDE: usize = 8;
+const LEAF_NEIGHBOURS: usize = 8;
 
 /// What a distance of two sides costs, in comparisons of boxes.
-const DISTANCE: usize = 8;
+const SIDE_DISTANCE_COST: usize = 8;
 
 fn point_distance(p: DVec2, s: &OutlineSide) -> f64 {
     let along = s.to - s.from;
@@ -276,10 +276,10 @@ fn distance(a: &OutlineSide, b: &OutlineSide) -> f64 {
 
 /// What may be spent on each item on average, in comparisons of boxes of two or three nanoseconds. A triangle of a
 /// sound mesh takes half of it or less.
-pub(crate) const EFFORT: usize = 1024;
+pub(crate) const DEFAULT_EFFORT: usize = 1024;
 
 /// As many items' effort may be spent however few there are: two thousand triangles in one place are no reason.
-const ALWAYS: usize = 1 << 15;
+const MIN_EFFORT_ITEMS: usize = 1 << 15;
 
 /// What one item may still spend.
 pub(crate) struct Effort {
@@ -319,7 +319,7 @@ pub(crate) fn share_out<T: Send>(
     each: usize,
     work: impl Fn(usize, &mut Effort) -> T + Sync,
 ) -> Shared<T> {
-    let total = each.saturating_mul(items.max(ALWAYS));
+    let total = each.saturating_mul(items.max(MIN_EFFORT_ITEMS));
     let mut found: Vec<Option<T>> = (0..items).map(|_| None).collect();
     let (mut unfinished, mut share, mut spent): (Vec<usize>, _, _) = ((0..items).collect(), each, 0);
     // a second time from the start, with what the others left over
@@ -373,7 +373,7 @@ impl DBox {
         self.low.cmple(other.high).all() && other.low.cmple(self.high).all()
     }
 
-    /// Twice its middle.
+    /// Returns twice its middle.
     fn middle(&self) -> DVec3 {
         self.low + self.high
     }
@@ -400,7 +400,7 @@ impl Boxes {
         Boxes { items, nodes }
     }
 
-    /// The numbers of the boxes, neighbours mostly beside each other.
+    /// Returns the numbers of the boxes, neighbours mostly beside each other.
     pub(crate) fn order(&self) -> impl Iterator<Item = u32> {
         self.items.iter().map(|&(_, i)| i)
     }
@@ -460,7 +460,7 @@ fn part(items: &mut [(DBox, u32)], nodes: &mut [DBox]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::EFFORT;
+    use crate::geom::DEFAULT_EFFORT;
 
     fn at(p: [f32; 6]) -> [Vec2; 3] {
         [Vec2::new(p[0], p[1]), Vec2::new(p[2], p[3]), Vec2::new(p[4], p[5])]
@@ -514,14 +514,14 @@ mod tests {
                 triangles.push([at(i, j), at(i + 1, j + 1), at(i, j + 1)]);
             }
         }
-        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()], EFFORT);
+        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()], DEFAULT_EFFORT);
         assert!(all.pairs.is_empty() && all.left == 0);
         // across the diagonal of the quad (0, 0), within it
         let s = 1.0 / 60.0;
         uvs.extend([Vec2::new(0.4, 0.2) * s, Vec2::new(0.8, 0.6) * s, Vec2::new(0.2, 0.8) * s]);
         let first = uvs.len() as u32 - 3;
         triangles.push([first, first + 1, first + 2]);
-        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()], EFFORT);
+        let all = overlaps(&uvs, &triangles, &vec![true; triangles.len()], DEFAULT_EFFORT);
         assert_eq!(all.pairs, [(0, 1800), (1, 1800)]);
     }
 
@@ -529,8 +529,8 @@ mod tests {
     fn a_heap_of_texture_wide_triangles_ends() {
         let uvs = vec![Vec2::ZERO, Vec2::X, Vec2::Y];
         let triangles = vec![[0, 1, 2]; 40_000];
-        let found = overlaps(&uvs, &triangles, &vec![true; triangles.len()], EFFORT);
-        assert!(found.left > 39_000 && found.pairs.len() * KEEPING <= EFFORT * triangles.len());
+        let found = overlaps(&uvs, &triangles, &vec![true; triangles.len()], DEFAULT_EFFORT);
+        assert!(found.left > 39_000 && found.pairs.len() * OVERLAP_COST <= DEFAULT_EFFORT * triangles.len());
         // what each of them finds first is enough to know that it is covered, but not by how many
         assert_eq!(found.covered, triangles.len());
     }
@@ -626,7 +626,8 @@ mod box_tests {
         let shared = share_out(3, 10, work);
         assert_eq!(shared.unfinished, [0, 1, 2]);
         assert!(
-            shared.found.iter().sum::<usize>() <= 10 * ALWAYS && shared.found.iter().all(|&n| n > 100_000)
+            shared.found.iter().sum::<usize>() <= 10 * MIN_EFFORT_ITEMS
+                && shared.found.iter().all(|&n| n > 100_000)
         );
     }
 }

@@ -18,7 +18,7 @@ pub struct Ray {
 }
 
 impl Ray {
-    /// The point at parameter `t`.
+    /// Returns the point at parameter `t`.
     pub fn at(&self, t: f32) -> Vec3 {
         self.origin + t * self.direction
     }
@@ -82,7 +82,7 @@ impl Aabb {
     /// The cube [-1, 1]³ that every scene is fitted into.
     pub const SCENE: Aabb = Aabb { min: Vec3::NEG_ONE, max: Vec3::ONE };
 
-    /// The smallest box around `points`; [`Aabb::EMPTY`] without points.
+    /// Returns the smallest box around `points`; [`Aabb::EMPTY`] without points.
     pub fn around(points: impl IntoIterator<Item = Vec3>) -> Aabb {
         points.into_iter().fold(Aabb::EMPTY, Aabb::with)
     }
@@ -102,7 +102,7 @@ impl Aabb {
         self.max - self.min
     }
 
-    /// The middle.
+    /// Returns the middle.
     pub fn center(self) -> Vec3 {
         0.5 * (self.min + self.max)
     }
@@ -117,7 +117,7 @@ impl Aabb {
         point.cmpge(self.min).all() && point.cmple(self.max).all()
     }
 
-    /// The parameters at which the line `origin + t · direction` enters and leaves, if it meets the
+    /// Returns the parameters at which the line `origin + t · direction` enters and leaves, if it meets the
     /// box at any `t` (negative ones included). Zero direction components are handled.
     pub fn intersect(self, origin: Vec3, direction: Vec3) -> Option<(f32, f32)> {
         let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);

@@ -100,7 +100,7 @@ impl<'a> ShellCaster<'a> {
 mod tests {
     use super::*;
 
-    /// A square in z = 0 facing +z, vertices 0..4; its last vertex is transparent in both layers.
+    /// Returns a square in z = 0 facing +z, vertices 0..4; its last vertex is transparent in both layers.
     fn square() -> (Mesh, Shells) {
         let at = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
         let mesh = Mesh {

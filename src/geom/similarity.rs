@@ -42,22 +42,22 @@ impl Similarity {
         Similarity { scale, rotation: DMat3::IDENTITY, translation }
     }
 
-    /// Where a point goes.
+    /// Returns where a point goes.
     pub fn point(&self, p: Vec3) -> Vec3 {
         (self.scale * (self.rotation * p.as_dvec3()) + self.translation).as_vec3()
     }
 
-    /// Where a point goes, in f64.
+    /// Returns where a point goes, in f64.
     pub fn point_f64(&self, p: DVec3) -> DVec3 {
         self.scale * (self.rotation * p) + self.translation
     }
 
-    /// Where a direction goes; its length is kept, so unit stays unit (also right for normals).
+    /// Returns where a direction goes; its length is kept, so unit stays unit (also right for normals).
     pub fn direction(&self, d: Vec3) -> Vec3 {
         self.rotation.as_mat3() * d
     }
 
-    /// The rotation in f32.
+    /// Returns the rotation in f32.
     pub fn rotation_f32(&self) -> Mat3 {
         self.rotation.as_mat3()
     }
@@ -71,7 +71,7 @@ impl Similarity {
         }
     }
 
-    /// The way back.
+    /// Returns the way back.
     pub fn inverse(&self) -> Similarity {
         let rotation = self.rotation.transpose();
         let scale = 1.0 / self.scale;

@@ -9,14 +9,14 @@ use glam::{Mat3, Vec3};
 pub const Y0: f32 = 0.282_094_79;
 
 /// Functions up to degree 2.
-pub const MOST_OF_DEGREE_2: usize = 9;
+pub const COEFFICIENTS_OF_DEGREE_2: usize = 9;
 
 /// Returns how many functions there are up to a degree.
 pub fn functions(degree: u32) -> usize {
     ((degree + 1) * (degree + 1)) as usize
 }
 
-/// The 16 basis functions at the unit direction `d`, in the order and with the signs of
+/// Returns the 16 basis functions at the unit direction `d`, in the order and with the signs of
 /// tiny-cuda-nn's degree-4 encoding.
 #[inline(always)]
 pub fn sh16([x, y, z]: [f32; 3]) -> [f32; 16] {

@@ -72,7 +72,7 @@ impl Sets {
         sets
     }
 
-    /// The smallest member of `i`'s set.
+    /// Returns the smallest member of `i`'s set.
     pub(crate) fn find(&mut self, mut i: u32) -> u32 {
         while self.0[i as usize] != i {
             let up = self.0[self.0[i as usize] as usize];
@@ -88,7 +88,7 @@ impl Sets {
     }
 }
 
-/// The directed sides of all triangles, sorted by undirected edge: `(low << 32 | high, corner)`, where
+/// Returns the directed sides of all triangles, sorted by undirected edge: `(low << 32 | high, corner)`, where
 /// corner `3 t + k` starts the side from vertex k to k + 1 of triangle t.
 pub(crate) fn sorted_sides(triangles: &[[u32; 3]]) -> Vec<(u64, u32)> {
     let mut sides: Vec<(u64, u32)> = triangles
@@ -105,7 +105,7 @@ pub(crate) fn sorted_sides(triangles: &[[u32; 3]]) -> Vec<(u64, u32)> {
     sides
 }
 
-/// The vertices at which the side of a corner starts and ends.
+/// Returns the vertices at which the side of a corner starts and ends.
 pub(crate) fn side_ends(triangles: &[[u32; 3]], corner: u32) -> (u32, u32) {
     let (t, k) = (triangles[corner as usize / 3], corner as usize % 3);
     (t[k], t[(k + 1) % 3])
@@ -198,7 +198,7 @@ pub fn topology(positions: &[Vec3], triangles: &[[u32; 3]]) -> Topology {
     out
 }
 
-/// A repeated index, or corners on one line (in f64 from the f32 positions).
+/// Returns whether an index repeats or the corners are collinear (in f64 from the f32 positions).
 fn has_no_area(positions: &[Vec3], t: &[u32; 3]) -> bool {
     if t[0] == t[1] || t[1] == t[2] || t[2] == t[0] {
         return true;

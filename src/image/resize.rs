@@ -8,7 +8,7 @@
 use super::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use rayon::prelude::*;
 
-/// The size of a picture brought down to at most `side` pixels on its longest side; never larger than it is.
+/// Returns the size of a picture brought down to at most `side` pixels on its longest side; never larger than it is.
 pub fn working_size(width: u32, height: u32, side: u32) -> (u32, u32) {
     let longest = width.max(height);
     if longest <= side {
@@ -80,7 +80,7 @@ fn average(bytes: &[u8], channels: usize, from: (u32, u32), to: (u32, u32), codi
     out
 }
 
-/// A photograph averaged down to `size`, which is nowhere larger than its own.
+/// Returns a photograph averaged down to `size`, which is nowhere larger than its own.
 pub fn reduce_photo(photo: &Photo, size: (u32, u32)) -> Photo {
     let from = (photo.width, photo.height);
     if size == from {
@@ -92,7 +92,7 @@ pub fn reduce_photo(photo: &Photo, size: (u32, u32)) -> Photo {
     Photo { width: size.0, height: size.1, rgb, alpha }
 }
 
-/// The size of a picture of `size` brought down to at most `rows` rows.
+/// Returns the size of a picture of `size` brought down to at most `rows` rows.
 pub fn size_at_rows((width, height): (u32, u32), rows: u32) -> (u32, u32) {
     match height <= rows {
         true => (width, height),
@@ -100,8 +100,8 @@ pub fn size_at_rows((width, height): (u32, u32), rows: u32) -> (u32, u32) {
     }
 }
 
-/// A photograph averaged down in linear light to at most `rows` rows, without its alpha; the same photograph when it is
-/// small enough already.
+/// Returns a photograph averaged down in linear light to at most `rows` rows, without its alpha; the same photograph
+/// when it is small enough already.
 pub fn reduce_to_rows(photo: &Photo, rows: u32) -> Photo {
     let from = (photo.width, photo.height);
     let size = size_at_rows(from, rows);
@@ -112,7 +112,7 @@ pub fn reduce_to_rows(photo: &Photo, rows: u32) -> Photo {
     Photo { width: size.0, height: size.1, rgb: bytes.as_chunks::<3>().0.to_vec(), alpha: None }
 }
 
-/// A gray picture at another size: averaged where it is larger in both directions, else interpolated.
+/// Returns a gray picture at another size: averaged where it is larger in both directions, else interpolated.
 pub fn resize_gray(gray: &Gray, size: (u32, u32)) -> Gray {
     let from = (gray.width, gray.height);
     if size == from {
@@ -125,8 +125,8 @@ pub fn resize_gray(gray: &Gray, size: (u32, u32)) -> Gray {
     enlarge(&values, from, size, 0.0, 1.0)
 }
 
-/// A mask (head where it is 128 or more) at another size, 255 or 0: resized and cut at one half. Its outline is smooth
-/// where copied pixels would make stairs.
+/// Returns a mask (head where it is 128 or more) at another size, 255 or 0: resized and cut at one half. Its outline is
+/// smooth where copied pixels would make stairs.
 pub fn resize_hard(mask: &Gray, size: (u32, u32)) -> Gray {
     let mut resized = resize_gray(mask, size);
     resized.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
@@ -151,8 +151,8 @@ pub fn enlarge(alpha: &[f32], from: (u32, u32), size: (u32, u32), lowest: f32, h
     Gray { width: size.0, height: size.1, values: bilinear(alpha, from.0, from, size, coded) }
 }
 
-/// A field of `from` (width, height) at the pixel centers of `to`, each value given to `with`; edges are repeated. Rows
-/// of `values` are `stride` apart, so the upper left `from` of a larger field can be taken.
+/// Returns a field of `from` (width, height) at the pixel centers of `to`, each value given to `with`; edges are
+/// repeated. Rows of `values` are `stride` apart, so the upper left `from` of a larger field can be taken.
 pub fn bilinear<T: Copy + Default + Send>(
     values: &[f32],
     stride: u32,
@@ -175,7 +175,7 @@ pub fn bilinear<T: Copy + Default + Send>(
     out
 }
 
-/// The two neighbors of pixel `i` of `to` among `from`, and how far it is from the first to the second.
+/// Returns the two neighbors of pixel `i` of `to` among `from`, and how far it is from the first to the second.
 fn between(i: u32, from: u32, to: u32) -> (usize, usize, f32) {
     let at = ((i as f64 + 0.5) * from as f64 / to as f64 - 0.5).clamp(0.0, (from - 1) as f64);
     let first = at as usize;

@@ -23,7 +23,7 @@ pub struct Animation {
 pub type Frames<'a> = &'a mut dyn Iterator<Item = Result<Vec<[u8; 4]>>>;
 
 /// Frames of a GIF whose colors are chosen at once.
-const AT_ONCE: usize = 8;
+const PALETTE_FRAMES: usize = 8;
 
 /// The endings of [`write_animation`].
 pub const ANIMATIONS: [&str; 2] = ["png", "gif"];
@@ -83,7 +83,7 @@ fn gif_bytes(animation: &Animation, frames: Good) -> Result<Vec<u8>, gif::Encodi
     let mut encoder = gif::Encoder::new(&mut out, width, height, &[])?;
     encoder.set_repeat(gif::Repeat::Infinite)?;
     loop {
-        let some: Vec<Vec<[u8; 4]>> = frames.take(AT_ONCE).collect();
+        let some: Vec<Vec<[u8; 4]>> = frames.take(PALETTE_FRAMES).collect();
         if some.is_empty() {
             break;
         }

@@ -1,7 +1,7 @@
 //! OpenEXR: depth and normals in and out, scene-linear renders out.
 //!
-//! The data window is placed inside the display window; what lies outside it is dropped and what it
-//! leaves open is 0. Only the first layer that holds all channels asked for is used.
+//! The data window is placed inside the display window: pixels outside are dropped, uncovered ones are 0. The first layer
+//! with all requested channels is used.
 
 use super::read::{Limits, ReadError, read_bytes};
 use super::write::{WriteError, write_atomic};
@@ -15,13 +15,13 @@ use std::path::Path;
 /// Channels of an OpenEXR file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExrImage {
-    /// The channels in the order asked for, at the size of the display window.
+    /// The channels in the requested order, at the size of the display window.
     pub image: Image,
     /// How many values were NaN or infinite and became 0.
     pub replaced: usize,
 }
 
-/// The first of several sets of channel names that some layer holds completely.
+/// Returns the first of several sets of channel names that some layer holds completely.
 pub fn read_exr(path: &Path, sets: &[&[&str]], limits: &Limits) -> Result<ExrImage, ReadError> {
     let bytes = read_bytes(path, limits)?;
     let display = checked_window(path, &bytes, limits)?;
@@ -54,7 +54,7 @@ fn damaged(path: &Path, problem: impl ToString) -> ReadError {
     ReadError::damaged(path, "OpenEXR", None, problem.to_string())
 }
 
-/// The display window of a file whose header promises nothing that is over the limits or not read.
+/// Returns the display window of a file whose header promises nothing that is over the limits or not read.
 fn checked_window(path: &Path, bytes: &[u8], limits: &Limits) -> Result<ex::IntegerBounds, ReadError> {
     if !bytes.starts_with(&[0x76, 0x2F, 0x31, 0x01]) {
         return Err(ReadError::damaged(path, "OpenEXR", Some(0), "its first bytes are not those of OpenEXR"));

@@ -1,4 +1,4 @@
-//! Folders: making, clearing, listing and locking them, and how much room is left.
+//! Folders: creation, clearing, listing, locks and free space.
 
 use super::read::ReadError;
 use super::write::WriteError;
@@ -12,12 +12,12 @@ fn failed(path: &Path) -> impl Fn(std::io::Error) -> WriteError + '_ {
     move |source| WriteError::Io { path: path.into(), source }
 }
 
-/// Makes a folder and those above it; an existing one is fine.
+/// Creates a folder and its parents, if they do not exist.
 pub fn create_folder(path: &Path) -> Result<(), WriteError> {
     fs::create_dir_all(path).map_err(failed(path))
 }
 
-/// What is directly in a folder; nothing if it does not exist.
+/// Returns what is directly in a folder; nothing if it does not exist.
 fn entries(path: &Path) -> std::io::Result<Vec<DirEntry>> {
     match fs::read_dir(path) {
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
@@ -99,7 +99,7 @@ pub fn is_folder(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|m| m.is_dir())
 }
 
-/// Names of the regular files directly in a folder, sorted by bytes; hidden ones left out. A name that
+/// Returns the names of the regular files directly in a folder, sorted by bytes; hidden ones left out. A name that
 /// is not UTF-8 is an error that shows it as well as it can.
 pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
     let mut names = Vec::new();
@@ -120,7 +120,7 @@ pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
     Ok(names)
 }
 
-/// The same path without links, `.` and `..`; the file must exist.
+/// Returns the same path without links, `.` and `..`; the file must exist.
 pub fn real_path(path: &Path) -> Result<PathBuf, ReadError> {
     fs::canonicalize(path).map_err(|e| ReadError::io(path, e))
 }
@@ -144,7 +144,7 @@ pub fn list_folders(path: &Path) -> Result<Vec<PathBuf>, ReadError> {
     Ok(folders)
 }
 
-/// How many bytes a file has; `None` if it does not exist.
+/// Returns how many bytes a file has; `None` if it does not exist.
 pub fn file_size(path: &Path) -> Option<u64> {
     fs::metadata(path).ok().filter(|m| m.is_file()).map(|m| m.len())
 }
@@ -183,20 +183,20 @@ fn ends_with_newline(file: &mut File) -> std::io::Result<bool> {
     Ok(last[0] == b'\n')
 }
 
-/// May files be made in this folder, as far as can be known without making one?
+/// Returns whether files can be created in this folder, as far as is known without creating one.
 #[cfg(unix)]
 pub fn is_writable(folder: &Path) -> bool {
     use rustix::fs::{Access, access};
     access(folder, Access::WRITE_OK | Access::EXEC_OK).is_ok()
 }
 
-/// May files be made in this folder, as far as can be known without making one?
+/// Returns whether files can be created in this folder, as far as is known without creating one.
 #[cfg(not(unix))]
 pub fn is_writable(folder: &Path) -> bool {
     fs::metadata(folder).is_ok_and(|m| !m.permissions().readonly())
 }
 
-/// Bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
+/// Returns the bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
 /// does not tell.
 #[cfg(unix)]
 pub fn free_bytes(path: &Path) -> Option<u64> {
@@ -204,7 +204,7 @@ pub fn free_bytes(path: &Path) -> Option<u64> {
     disk.f_bavail.checked_mul(disk.f_frsize)
 }
 
-/// Bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
+/// Returns the bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
 /// does not tell.
 #[cfg(not(unix))]
 pub fn free_bytes(_: &Path) -> Option<u64> {

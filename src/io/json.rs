@@ -60,7 +60,7 @@ fn in_plain_words(serde: &str) -> String {
     .into()
 }
 
-/// The value in `bytes`; `path` is only for messages.
+/// Returns the value in `bytes`; `path` is only for messages.
 ///
 /// A byte order mark and CRLF are accepted. Refused with line and column: duplicate keys (a second
 /// `frames` would silently hide the first), `NaN` and `Infinity` literals, numbers that overflow f64,
@@ -85,7 +85,7 @@ pub fn parse_json(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Value, R
     })
 }
 
-/// The message for a Python-style literal near the place where parsing stopped.
+/// Returns the message for a Python-style literal near the place where parsing stopped.
 fn literal_at(bytes: &[u8], line: usize, column: usize) -> Option<String> {
     let text = bytes.split(|&b| b == b'\n').nth(line.checked_sub(1)?)?;
     let near = &text[column.saturating_sub(2).min(text.len())..];

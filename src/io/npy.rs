@@ -137,7 +137,7 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
     Ok(Npy { shape, values })
 }
 
-/// The bytes of a `.npy` file of values that are in row-major order and of this type (`<f8`, `|b1`).
+/// Returns the bytes of a `.npy` file of values that are in row-major order and of this type (`<f8`, `|b1`).
 pub fn npy_bytes(kind: &str, shape: &[usize], values: &[u8]) -> Vec<u8> {
     let extents: String = shape.iter().map(|n| format!("{n}, ")).collect();
     let header =
@@ -151,7 +151,7 @@ pub fn npy_bytes(kind: &str, shape: &[usize], values: &[u8]) -> Vec<u8> {
 }
 
 /// Are the header's numbers plain ones, and can their product be held, with 1 for an extent of 0? The parser
-/// also knows sums, signs, hexadecimals and `1_000`, which no array needs.
+/// also accepts sums, signs, hexadecimals and `1_000`, which no array needs.
 fn countable(header: &[u8]) -> bool {
     let words = header.split(|b| !(b.is_ascii_alphanumeric() || b"_+-".contains(b)));
     let mut numbers = words.filter(|w| w.first().is_some_and(|b| !(b.is_ascii_alphabetic() || *b == b'_')));
@@ -162,7 +162,7 @@ fn countable(header: &[u8]) -> bool {
     product.is_some()
 }
 
-/// Is it bool, an integer or a float of up to 64 bits?
+/// Returns whether the type is bool, an integer or a float of up to 64 bits.
 fn is_read(kind: &TypeStr) -> bool {
     match kind.type_char() {
         TypeChar::Bool | TypeChar::Int | TypeChar::Uint => true,
@@ -183,7 +183,7 @@ fn unsupported(path: &Path, dtype: &DType) -> ReadError {
     ReadError::unsupported(path, what, "save it as bool, an integer or a float type")
 }
 
-/// Every number in the order of the file; `None` for a type that is none.
+/// Returns every number in the order of the file; `None` for a type that is none.
 fn numbers(kind: &TypeStr, file: NpyFile<&[u8]>) -> Option<std::io::Result<Vec<f64>>> {
     fn each<T: Deserialize>(file: NpyFile<&[u8]>, to: fn(T) -> f64) -> Option<std::io::Result<Vec<f64>>> {
         Some(file.data::<T>().ok()?.map(|value| value.map(to)).collect())
@@ -204,7 +204,7 @@ fn numbers(kind: &TypeStr, file: NpyFile<&[u8]>) -> Option<std::io::Result<Vec<f
     }
 }
 
-/// Values in the order of the file brought into row-major order.
+/// Returns the values in the order of the file brought into row-major order.
 fn row_major<T: Copy>(values: Vec<T>, header: &NpyHeader) -> Vec<T> {
     if header.order() == Order::C {
         return values;
@@ -235,7 +235,8 @@ pub fn read_npz(path: &Path, limits: &Limits) -> Result<BTreeMap<String, Npy>, R
     Ok(arrays)
 }
 
-/// Every entry by its full name: inside the file, apart from the others, named once, of the sum it was stored with.
+/// Returns every entry by its full name: inside the file, apart from the others, named once, of the sum it was stored
+/// with.
 fn unpack(path: &Path, bytes: &[u8], limits: &Limits) -> Result<BTreeMap<String, Vec<u8>>, ReadError> {
     let bad = |problem: String| ReadError::damaged(path, "npz", None, problem);
     let too_large = |what, found, limit| Err(ReadError::TooLarge { path: path.into(), what, found, limit });
@@ -281,7 +282,7 @@ fn unpack(path: &Path, bytes: &[u8], limits: &Limits) -> Result<BTreeMap<String,
     Ok(entries)
 }
 
-/// A name from a file as it may stand in a message: short, and without control characters.
+/// Returns a name from a file as it may stand in a message: short, and without control characters.
 fn shown(name: &str) -> String {
     let text: String = name.chars().take(80).flat_map(char::escape_debug).collect();
     if name.chars().nth(80).is_some() { text + "…" } else { text }

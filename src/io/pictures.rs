@@ -23,21 +23,21 @@ pub struct PictureInfo {
     pub width: u32,
     /// Stored rows.
     pub height: u32,
-    /// Does it have an alpha channel?
+    /// Whether it has an alpha channel.
     pub alpha: bool,
     /// EXIF orientation, 1 (upright) to 8.
     pub exif: u8,
 }
 
 impl PictureInfo {
-    /// The size after the turn that `expected` calls for, as [`read_photo`] would return it.
+    /// Returns the size after the turn that `expected` calls for, as [`read_photo`] would return it.
     pub fn size(&self, expected: Option<(u32, u32)>) -> (u32, u32) {
         let stored = (self.width, self.height);
         if is_turned(self.exif, stored, expected) { (stored.1, stored.0) } else { stored }
     }
 }
 
-/// Is the turn that EXIF asks for applied? A quarter turn is, only when it is what makes the declared size true:
+/// Returns whether the EXIF rotation is applied. A quarter turn is, only when it is what makes the declared size true:
 /// else cameras were found for the stored pixels. Half turns and mirrors fit any size, so nothing can tell whether
 /// the cameras were found before or after them; like COLMAP they are left alone.
 fn is_turned(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> bool {
@@ -45,7 +45,7 @@ fn is_turned(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> bool
     (5..=8).contains(&exif) && expected == Some(turned) && stored != turned
 }
 
-/// The size, alpha and orientation of a PNG or JPEG file, from its header only.
+/// Returns the size, alpha and orientation of a PNG or JPEG file, from its header only.
 pub fn picture_info(path: &Path, limits: &Limits) -> Result<PictureInfo, ReadError> {
     let (file, length) = open(path)?;
     if length == 0 {
@@ -275,7 +275,7 @@ pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) ->
     PictureFile { path, bytes: &read_bytes(path, limits)?, limits }.decode(expected)
 }
 
-/// A picture that lies inside another file, as [`read_photo`] would read it from one of its own.
+/// Returns a picture that lies inside another file, as [`read_photo`] would read it from one of its own.
 /// `path` is for messages only.
 pub fn parse_photo(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Photo, ReadError> {
     PictureFile { path, bytes, limits }.decode(None)
@@ -323,7 +323,7 @@ fn write_png(
     write_atomic(path, &png(path, width, height, bytes, color)?)
 }
 
-/// A photograph as the bytes of a PNG file, without its alpha. `path` is for messages only.
+/// Returns a photograph as the bytes of a PNG file, without its alpha. `path` is for messages only.
 pub fn png_bytes(photo: &Photo, path: &Path) -> Result<Vec<u8>, WriteError> {
     png(path, photo.width, photo.height, photo.rgb.as_flattened(), ExtendedColorType::Rgb8)
 }
@@ -338,7 +338,7 @@ pub fn write_png_rgba(path: &Path, width: u32, height: u32, rgba: &[[u8; 4]]) ->
     write_png(path, width, height, rgba.as_flattened(), ExtendedColorType::Rgba8)
 }
 
-/// A gray picture as the bytes of an 8-bit PNG file. `path` is for messages only.
+/// Returns a gray picture as the bytes of an 8-bit PNG file. `path` is for messages only.
 pub fn png_gray_bytes(gray: &Gray, path: &Path) -> Result<Vec<u8>, WriteError> {
     png(path, gray.width, gray.height, &gray.values, ExtendedColorType::L8)
 }
@@ -354,7 +354,8 @@ pub fn write_png_gray16(path: &Path, width: u32, height: u32, values: &[u16]) ->
     write_png(path, width, height, bytemuck::cast_slice(values), ExtendedColorType::L16)
 }
 
-/// A photograph as the bytes of a JPEG file of `quality` 1 to 100, without its alpha. `path` is for messages only.
+/// Returns a photograph as the bytes of a JPEG file of `quality` 1 to 100, without its alpha. `path` is for messages
+/// only.
 pub fn jpeg_bytes(photo: &Photo, quality: u8, path: &Path) -> Result<Vec<u8>, WriteError> {
     let content = |problem: String| WriteError::content(path, problem);
     let (width, height) = (photo.width, photo.height);

@@ -26,7 +26,7 @@ pub fn peak_memory() -> Option<u64> {
     line.split_whitespace().next()?.parse::<u64>().ok().map(|kib| kib << 10)
 }
 
-/// Lets [`peak_memory`] begin anew, where the system can.
+/// Resets [`peak_memory`], if the system can.
 pub fn forget_peak_memory() {
     // 5: the peak becomes what is held now (proc_pid_clear_refs(5))
     let _ = std::fs::write("/proc/self/clear_refs", "5");

@@ -43,7 +43,7 @@ fn kind_of_special(_: &fs::Metadata) -> &'static str {
     "a special file"
 }
 
-/// All bytes of a regular file that is not empty and not over [`Limits::file_bytes`].
+/// Returns all bytes of a regular file that is not empty and not over [`Limits::file_bytes`].
 pub fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>, ReadError> {
     read_capped(path, limits.file_bytes, "the file's size in bytes")
 }
@@ -217,7 +217,7 @@ fn at(offset: Option<u64>) -> String {
 error_from!(ReadError, Cannot);
 
 impl ReadError {
-    /// The suggested fix.
+    /// Returns the suggested fix.
     pub fn hint(&self) -> String {
         match self {
             ReadError::Io { source, .. } => match source.kind() {

@@ -50,7 +50,7 @@ impl TensorValues {
         }
     }
 
-    /// The first value that is NaN or infinite.
+    /// Returns the first value that is NaN or infinite.
     fn not_finite(&self) -> Option<usize> {
         match self {
             TensorValues::F32(v) => v.iter().position(|x| !x.is_finite()),
@@ -83,7 +83,7 @@ pub fn write_tensors(
     write_atomic(path, &bytes)
 }
 
-/// The bytes [`write_tensors`] writes, or what is wrong with the content.
+/// Returns the bytes [`write_tensors`] writes, or what is wrong with the content.
 pub fn tensor_bytes(
     tensors: &[(String, Vec<usize>, TensorValues)],
     metadata: &BTreeMap<String, String>,

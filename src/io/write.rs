@@ -40,7 +40,7 @@ pub enum WriteError {
 crate::error::error_from!(WriteError, Cannot);
 
 impl WriteError {
-    /// The suggested fix.
+    /// Returns the suggested fix.
     pub fn hint(&self) -> String {
         match self {
             WriteError::Full { needed, .. } => format!("free at least {needed} bytes on that disk"),
@@ -170,7 +170,7 @@ fn sync_folder(_: &Path) -> std::io::Result<()> {
 }
 
 /// Removes what interrupted writes left directly in `folder`, as far as `is_over` says so of the file's name and the
-/// process, and says how many files that were. A holder of the lock for a file knows; for others see [`has_ended`](super::has_ended).
+/// process, and says how many files that were. The holder of a file's lock decides; for others see [`has_ended`](super::has_ended).
 pub fn remove_leftovers(folder: &Path, is_over: impl Fn(&str, u32) -> bool) -> Result<usize, WriteError> {
     let fail = |source| WriteError::Io { path: folder.into(), source };
     let mut removed = 0;
@@ -188,7 +188,7 @@ pub fn remove_leftovers(folder: &Path, is_over: impl Fn(&str, u32) -> bool) -> R
     Ok(removed)
 }
 
-/// The file that was being written and by which process, if a name is that of a file in progress.
+/// Returns the file that was being written and by which process, if a name is that of a file in progress.
 fn leftover_of(name: &str) -> Option<(&str, u32)> {
     let (rest, pid) = name.strip_prefix('.')?.strip_suffix(".tmp")?.rsplit_once('.')?;
     Some((rest, pid.parse().ok()?)).filter(|_| !rest.is_empty())

@@ -45,7 +45,7 @@ const THRESHOLD: f64 = 0.005;
 /// … and from which it always is.
 const CERTAIN_THRESHOLD: f64 = 0.05;
 /// Between the two it is named when its conflict is this many times the mean.
-const STAND_OUT: f64 = 4.0;
+const OUTLIER_RATIO: f64 = 4.0;
 
 /// A view with its mask.
 #[derive(Clone, Copy, Debug)]
@@ -124,7 +124,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
     }
 }
 
-/// The cube that some views look at, and what the mask of each claims.
+/// Returns the cube that some views look at, and what the mask of each claims.
 fn claims_of(
     views: &[ConsistencyView],
     used: &[usize],
@@ -219,7 +219,7 @@ impl Votes {
         cells.map(|cell| (ones(&cell[..self.words]), ones(&cell[self.words..]))).collect()
     }
 
-    /// Does a view rule a cell out?
+    /// Returns whether a view rules a cell out.
     fn rules_out(&self, view: usize, cell: usize) -> bool {
         self.bits[2 * cell * self.words + view / 64] & (1 << (view % 64)) != 0
     }
@@ -265,16 +265,16 @@ impl Conflicts {
         conflict
     }
 
-    /// Is a view's part in the conflict large, or at least unlike that of the others? Of `left` views a single
+    /// Returns whether a view's part in the conflict is large, or at least unlike that of the others. Of `left` views a single
     /// wrong one has half of all credit, so few views can stand out less.
     fn names(&self, i: usize, left: usize) -> bool {
         let mean = self.credit.iter().sum::<f64>() / left as f64;
-        let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).clamp(1.2, STAND_OUT) };
+        let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).clamp(1.2, OUTLIER_RATIO) };
         let own = self.credit[i];
         own > CERTAIN_THRESHOLD || (own > THRESHOLD && own > times * mean)
     }
 
-    /// Mean share that a view takes away from the others.
+    /// Returns the mean share that a view takes away from the others.
     fn too_little(&self, i: usize) -> f64 {
         self.taken[i] / self.others
     }
@@ -318,7 +318,7 @@ impl Opposition {
     }
 }
 
-/// The cells on a pixel's ray, from the camera on, each half a cell from the last.
+/// Returns the cells on a pixel's ray, from the camera on, each half a cell from the last.
 fn cells_on_ray<'a>(
     cube: &'a Cube,
     claims: &SilhouetteConstraints,
@@ -362,7 +362,7 @@ fn cells_on_ray<'a>(
     })
 }
 
-/// The cell on a pixel's ray that fewest views rule out, among those that another view has on the head, if any;
+/// Returns the cell on a pixel's ray that fewest views rule out, among those that another view has on the head, if any;
 /// of equals the one that most views have on the head. `None` when no other view looks at the ray within the cube.
 fn best_on_ray(
     cube: &Cube,
@@ -392,15 +392,15 @@ fn best_on_ray(
 const PROPOSAL_ROWS: u32 = 96;
 const PROPOSAL_CELLS: usize = 96;
 /// Share of the views that must see a cell for it to explain a claim: what lies below all frames explains everything.
-const SEEN: f64 = 0.75;
+const MIN_VISIBLE_SHARE: f64 = 0.75;
 /// Share of the views that see a cell which must have it on the head.
-const SUPPORT: f64 = 0.25;
+const MIN_SUPPORT_SHARE: f64 = 0.25;
 /// What an open claim weighs, in parts of one that is taken away.
-const OWN: f64 = 1.0 / 3.0;
+const OPEN_CLAIM_WEIGHT: f64 = 1.0 / 3.0;
 /// Mean share of the others' masks that a view may rule out.
-const MOST_RULED_OUT: f64 = 0.003;
+const MAX_RULED_OUT: f64 = 0.003;
 /// Share of its own claims that may stand open.
-const MOST_OPEN: f64 = 0.05;
+const MAX_OPEN: f64 = 0.05;
 
 /// The verdict on a proposed mask.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -442,21 +442,21 @@ pub fn verdicts(views: &[ConsistencyView]) -> Result<Vec<MaskVerdict>> {
     loop {
         let left = active.iter().filter(|a| **a).count();
         let blame = blame(&votes, &claims, &active);
-        let weight = |b: &Disagreement| OWN * b.open + b.taken;
+        let weight = |b: &Disagreement| OPEN_CLAIM_WEIGHT * b.open + b.taken;
         let mean = |b: &Disagreement| b.ruled_out / (left.max(2) - 1) as f64;
         // of equals the first
         let worst = (0..claims.len())
-            .filter(|&i| active[i] && (blame[i].open > MOST_OPEN || mean(&blame[i]) > MOST_RULED_OUT))
+            .filter(|&i| active[i] && (blame[i].open > MAX_OPEN || mean(&blame[i]) > MAX_RULED_OUT))
             .rev()
             .max_by(|&a, &b| weight(&blame[a]).total_cmp(&weight(&blame[b])));
         let Some(worst) = worst else { break };
         if left <= 2 {
-            // two that contradict each other say nothing of who is right
+            // of two masks that contradict each other, neither is known to be right
             active.iter().zip(&used).filter(|(a, _)| **a).for_each(|(_, &i)| out[i] = MaskVerdict::Unlike);
             break;
         }
         active[worst] = false;
-        let much = OWN * blame[worst].open > blame[worst].taken;
+        let much = OPEN_CLAIM_WEIGHT * blame[worst].open > blame[worst].taken;
         out[used[worst]] = if much { MaskVerdict::Unlike } else { MaskVerdict::LeavesOut };
     }
     Ok(out)
@@ -464,11 +464,11 @@ pub fn verdicts(views: &[ConsistencyView]) -> Result<Vec<MaskVerdict>> {
 
 fn blame(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Vec<Disagreement> {
     let costs = votes.costs(active);
-    let least_seen = SEEN * active.iter().filter(|a| **a).count() as f64;
+    let least_seen = MIN_VISIBLE_SHARE * active.iter().filter(|a| **a).count() as f64;
     // first whether it lacks support, then how many views are against it, then how many are for it
     let key = |&cell: &usize| {
         let (no, yes) = costs[cell];
-        let alone = yes < 2 || f64::from(yes) < SUPPORT * f64::from(no + yes);
+        let alone = yes < 2 || f64::from(yes) < MIN_SUPPORT_SHARE * f64::from(no + yes);
         (alone, no, u16::MAX - yes)
     };
     let best = |claims: &SilhouetteConstraints, pixel| {
@@ -519,7 +519,7 @@ mod tests {
             .collect()
     }
 
-    /// A snowman with a nose, seen by a camera.
+    /// Returns a snowman with a nose, seen by a camera.
     fn mask(camera: &Camera) -> Gray {
         let balls = [
             (DVec3::new(0.0, -0.6, 0.0), 0.8),
@@ -653,7 +653,7 @@ mod proposal_tests {
             .collect()
     }
 
-    /// A ball with a smaller one on top, or the ball alone.
+    /// Returns a ball with a smaller one on top, or the ball alone.
     fn mask(camera: &Camera, whole: bool) -> Gray {
         let balls = [(DVec3::new(0.0, -0.4, 0.0), 0.9), (DVec3::new(0.0, 0.9, 0.0), 0.6)];
         let hit = |i: u32| {

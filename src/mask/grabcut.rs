@@ -30,17 +30,17 @@ const GAUSSIANS: usize = 5;
 /// γ: what an edge between equal colors costs (§2.2 of the same).
 const SMOOTHNESS: f64 = 50.0;
 /// λ/γ: what contradicting a click or border margin costs.
-const CERTAINTY: f64 = 9.0;
+const SEED_WEIGHT: f64 = 9.0;
 /// Rounds of fitting and cutting from clicks.
 pub(super) const ROUNDS: usize = 8;
 /// Holes up to this share of the picture are filled.
-const HOLE: f64 = 0.01;
+const MAX_HOLE_SHARE: f64 = 0.01;
 /// Around the outline, what colors leave open counts as ambiguous within this share of the height.
-const OUTLINE: f32 = 0.023;
+const OUTLINE_BAND: f32 = 0.023;
 /// Seed of the k-means start.
 const SEED: u64 = 42;
 /// Whole-number capacities per unit of energy.
-const UNIT: f64 = 1000.0;
+const CAPACITY_SCALE: f64 = 1000.0;
 
 /// A hard mask at the working size.
 #[derive(Clone, Debug, PartialEq)]
@@ -95,7 +95,7 @@ fn cut_at(rows: u32, view: &str, photo: &Photo, clicks: &[Click]) -> Result<Hard
     Ok(HardMask { mask: gray(&head, grabcut.width, grabcut.height), ambiguous, warnings })
 }
 
-/// The error for a view in which nothing of the clicked head was left.
+/// Returns the error for a view in which nothing of the clicked head was left.
 pub(super) fn empty(view: &str) -> Error {
     Error::cannot(
         format!("view `{view}`: the cut left nothing of the head"),
@@ -119,7 +119,7 @@ impl Models {
         })
     }
 
-    /// Each side measured anew.
+    /// Returns each side, measured again.
     pub fn refit(&self, head: &[Rgb], background: &[Rgb]) -> Models {
         Models { head: self.head.refit(head), background: self.background.refit(background) }
     }
@@ -184,7 +184,7 @@ impl Grabcut {
         (head, models)
     }
 
-    /// Colors of the pixels inside and outside a mask.
+    /// Returns the colors of the pixels inside and outside a mask.
     pub fn colors(&self, head: &[bool]) -> (Vec<Rgb>, Vec<Rgb>) {
         let of =
             |side: bool| self.photo.rgb.iter().zip(head).filter(move |(_, h)| **h == side).map(|(c, _)| *c);
@@ -193,7 +193,7 @@ impl Grabcut {
 
     /// One smallest cut under given colors.
     pub fn min_cut(&self, models: &Models) -> Vec<bool> {
-        let certain = (CERTAINTY * SMOOTHNESS * UNIT) as i32;
+        let certain = (SEED_WEIGHT * SMOOTHNESS * CAPACITY_SCALE) as i32;
         let mut graph = PixelGraph::new(self.width, self.height);
         for (i, edge) in self.edges.iter().enumerate() {
             let (x, y) = (i % self.width, i / self.width);
@@ -201,7 +201,7 @@ impl Grabcut {
                 Seed::Head => (0, certain),
                 Seed::Background => (certain, 0),
                 Seed::Unknown => {
-                    let lean = (models.lean(&self.photo.rgb[i]) * UNIT).clamp(-1e8, 1e8) as i32;
+                    let lean = (models.lean(&self.photo.rgb[i]) * CAPACITY_SCALE).clamp(-1e8, 1e8) as i32;
                     ((-lean).max(0), lean.max(0))
                 }
             };
@@ -235,15 +235,15 @@ impl Grabcut {
     /// Small holes are filled, threads are opened.
     fn smooth(&self, mut head: Vec<bool>) -> Vec<bool> {
         let background: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Background).collect();
-        let largest = (HOLE * (self.width * self.height) as f64) as usize;
+        let largest = (MAX_HOLE_SHARE * (self.width * self.height) as f64) as usize;
         fill_holes(&mut head, &background, self.width, self.height, largest);
         open(&head, self.width, self.height)
     }
 
-    /// Share of the picture near the outline whose color does not tell the sides apart.
+    /// Returns the share of the picture near the outline whose color does not tell the sides apart.
     pub fn ambiguous(&self, head: &[bool], models: &Models) -> f64 {
         let (w, h) = (self.width, self.height);
-        let radius = OUTLINE * h as f32;
+        let radius = OUTLINE_BAND * h as f32;
         let near = |side: bool| {
             let marked: Vec<bool> = head.iter().map(|&m| m == side).collect();
             super::morphology::grow(&marked, w, h, radius)
@@ -259,7 +259,7 @@ impl Grabcut {
         open.count() as f64 / (w * h) as f64
     }
 
-    /// What looks wrong about a finished mask.
+    /// Returns what looks wrong about a finished mask.
     pub fn warnings(&self, view: &str, head: &[bool]) -> Vec<String> {
         let mut found = Vec::new();
         for (n, c) in self.clicks.iter().enumerate() {
@@ -302,7 +302,8 @@ fn edges(photo: &Photo) -> Vec<[i32; 4]> {
         .map(|i| {
             FORWARD.map(|step| {
                 let length = if step.1 != 0 && step.2 != 0 { std::f64::consts::SQRT_2 } else { 1.0 };
-                let weight = |d: u32| (UNIT * SMOOTHNESS * (-beta * d as f64).exp() / length) as i32;
+                let weight =
+                    |d: u32| (CAPACITY_SCALE * SMOOTHNESS * (-beta * d as f64).exp() / length) as i32;
                 square(i, step).map_or(0, weight)
             })
         })
@@ -312,7 +313,7 @@ fn edges(photo: &Photo) -> Vec<[i32; 4]> {
 /// Radius of what a click makes certain, share of the picture's height.
 const SEED_RADIUS: f32 = 0.012;
 /// … and at least this many working pixels.
-const LEAST_SEED_RADIUS_PX: f32 = 4.0;
+const MIN_SEED_RADIUS_PX: f32 = 4.0;
 /// Width of the border margins along top and sides that are certainly background, share of the height.
 pub(super) const BORDER_MARGIN: f32 = 0.012;
 /// How far down the border margins at the sides reach, share of the height; shoulders may touch the rest.
@@ -323,7 +324,7 @@ const START_RADIUS: f32 = 0.06;
 const START_LINE: f32 = 0.02;
 /// The background's first colors come from pixels this many times nearer to definite background than to the head's
 /// clicks; what lies between would teach it the colors of hair.
-const START_APART: f32 = 2.0;
+const START_DISTANCE_RATIO: f32 = 2.0;
 
 /// What is certain about a pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -365,8 +366,8 @@ fn draw(marked: &mut [bool], width: usize, height: usize, a: (f32, f32), b: (f32
     }
 }
 
-/// What is certain from the clicks, with a border margin of this share of the height: `[height · width]`, and warnings
-/// about clicks in each other's way.
+/// Returns what is certain from the clicks, with a border margin of this share of the height: `[height · width]`, and
+/// warnings about clicks in each other's way.
 fn from_clicks(
     view: &str,
     clicks: &[Click],
@@ -375,7 +376,7 @@ fn from_clicks(
     margin: f32,
 ) -> (Vec<Seed>, Vec<String>) {
     let mut seeds = border(width, height, margin);
-    let radius = (SEED_RADIUS * height as f32).max(LEAST_SEED_RADIUS_PX);
+    let radius = (SEED_RADIUS * height as f32).max(MIN_SEED_RADIUS_PX);
     let mut warnings = Vec::new();
     // where discs of both kinds overlap the nearer click is believed
     let mut nearest = vec![f32::INFINITY; width * height];
@@ -417,7 +418,7 @@ fn from_clicks(
     (seeds, warnings)
 }
 
-/// The margins along the borders where no head is expected.
+/// Returns the margins along the borders where no head is expected.
 fn border(width: usize, height: usize, margin: f32) -> Vec<Seed> {
     let margin = (margin * height as f32).ceil() as usize;
     let sides = (BORDER_SIDES * height as f32) as usize;
@@ -433,7 +434,7 @@ fn border(width: usize, height: usize, margin: f32) -> Vec<Seed> {
         .collect()
 }
 
-/// The head's clicks as discs, joined by a line in their order: what the start measures distances from.
+/// Returns the head's clicks as discs, joined by a line in their order: what the start measures distances from.
 fn skeleton(seeds: &[Seed], clicks: &[Click], width: usize, height: usize) -> Vec<bool> {
     let h = height as f32;
     let mut skeleton: Vec<bool> = seeds.iter().map(|k| *k == Seed::Head).collect();
@@ -447,13 +448,14 @@ fn skeleton(seeds: &[Seed], clicks: &[Click], width: usize, height: usize) -> Ve
     skeleton
 }
 
-/// The Voronoi start, twice `[height · width]`: whether a pixel is nearer to the skeleton than to definite background,
-/// and false where it is so much nearer to definite background that its color is taken for the background's.
+/// Returns the Voronoi start, twice `[height · width]`: whether a pixel is nearer to the skeleton than to definite
+/// background, and false where it is so much nearer to definite background that its color is taken for the
+/// background's.
 fn start(seeds: &[Seed], skeleton: &[bool], width: usize, height: usize) -> [Vec<bool>; 2] {
     let background: Vec<bool> = seeds.iter().map(|k| *k == Seed::Background).collect();
     let to_head = squared_distance(skeleton, width, height);
     let to_background = squared_distance(&background, width, height);
-    [1.0, START_APART].map(|times: f32| {
+    [1.0, START_DISTANCE_RATIO].map(|times: f32| {
         let nearer = |i: usize| match seeds[i] {
             Seed::Head => true,
             Seed::Background => false,
@@ -468,7 +470,8 @@ mod tests {
     use super::*;
     use crate::kernel::cpu::rng;
 
-    /// A noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges everything.
+    /// Returns a noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges
+    /// everything.
     fn head(scale: f32) -> (Photo, Vec<bool>) {
         let (width, height) = ((96.0 * scale) as u32, (128.0 * scale) as u32);
         let mut truth = Vec::new();
@@ -525,7 +528,7 @@ mod tests {
         let run = || grabcut("a", &photo, &clicks(1.0));
         assert_eq!(run(), run());
         let flat = Photo { rgb: vec![[9, 9, 9]; photo.rgb.len()], ..photo };
-        // nothing tells head from background: whatever comes, it holds the clicks or says so
+        // head and background have the same color: the mask satisfies the clicks, or the result has a warning
         if let Ok(cut) = grabcut("a", &flat, &clicks(1.0)) {
             assert!(cut.ambiguous > 0.0);
         }

@@ -18,13 +18,13 @@ pub(super) struct ViewFrame {
 }
 
 impl ViewFrame {
-    /// The camera's whole picture.
+    /// Returns the camera's whole picture.
     pub fn new(camera: &Camera) -> ViewFrame {
         let (width, height) = (camera.width as usize, camera.height as usize);
         ViewFrame { projector: Projector::new(camera), width, height }
     }
 
-    /// The pixel that shows a point; `None` outside the frame.
+    /// Returns the pixel that shows a point; `None` outside the frame.
     fn pixel(&self, point: DVec3) -> Option<usize> {
         let (x, y, _) = self.projector.project(point)?;
         let inside = x >= 0.0 && y >= 0.0 && x < self.width as f64 && y < self.height as f64;
@@ -74,18 +74,18 @@ impl Voter {
     }
 }
 
-/// How many masks vote against and for every cell: `[n, n, n]` with x outermost.
+/// Returns how many masks vote against and for every cell: `[n, n, n]` with x outermost.
 pub(super) fn count(cube: &Cube, voters: &[Voter]) -> Vec<[u16; 2]> {
     let frames: Vec<&ViewFrame> = voters.iter().map(|v| &v.frame).collect();
     vote(cube, &frames, 1, |cell: &mut [[u16; 2]], k, pixel| cell[0][voters[k].head[pixel] as usize] += 1)
 }
 
-/// The cells with at most `most_negative` votes against and at least `least_positive` for them.
+/// Returns the cells with at most `most_negative` votes against and at least `least_positive` for them.
 pub(super) fn cells(votes: &[[u16; 2]], most_negative: usize, least_positive: usize) -> Vec<bool> {
     votes.iter().map(|&[no, yes]| no as usize <= most_negative && yes as usize >= least_positive).collect()
 }
 
-/// The cube around the point the cameras look at, `margin` times as high as their frames at that point.
+/// Returns the cube around the point the cameras look at, `margin` times as high as their frames at that point.
 pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
     let alike = |how: &str| {
         Error::cannot(
@@ -106,7 +106,7 @@ pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
     Ok(Cube { center, half, n })
 }
 
-/// The pixels that a set of cells covers in a view.
+/// Returns the pixels that a set of cells covers in a view.
 pub(super) fn silhouette(cube: &Cube, cells: &[bool], camera: &Camera) -> Vec<bool> {
     let (w, h, n) = (camera.width as usize, camera.height as usize, cube.n);
     let projector = Projector::new(camera);
@@ -140,7 +140,7 @@ pub(super) fn silhouette(cube: &Cube, cells: &[bool], camera: &Camera) -> Vec<bo
     covered
 }
 
-/// The cells deeper inside than `share` of the deepest one. Depth counts peeled layers, in turn over faces and
+/// Returns the cells deeper inside than `share` of the deepest one. Depth counts peeled layers, in turn over faces and
 /// over corners, which is near to distance.
 pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
     let mut depth = vec![0u16; cells.len()];
@@ -186,7 +186,7 @@ mod tests {
         vec![front, side]
     }
 
-    /// A square of ± `half` pixels around the middle.
+    /// Returns a square of ± `half` pixels around the middle.
     fn square(half: usize) -> Gray {
         let inside = |v: usize| v >= 40 - half && v < 40 + half;
         let values = (0..6400).map(|i| if inside(i % 80) && inside(i / 80) { 255 } else { 0 }).collect();

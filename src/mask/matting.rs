@@ -26,11 +26,11 @@ use crate::image::{Gray, Photo, enlarge, reduce_photo, resize_hard, working_size
 use crate::{Error, Result};
 
 /// Alphas below become 0.
-const LOWEST: f32 = 0.02;
+const MIN_ALPHA: f32 = 0.02;
 /// Alphas above become 1.
-const HIGHEST: f32 = 0.98;
+const MAX_ALPHA: f32 = 0.98;
 /// A band that is a larger share of the picture is worth a warning.
-const MOST_UNKNOWN: f64 = 0.3;
+const MAX_UNKNOWN: f64 = 0.3;
 
 /// How a hard mask is made soft.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -48,7 +48,7 @@ impl Default for SoftenOptions {
 }
 
 impl SoftenOptions {
-    /// Bytes needed at most beside the photograph and the mask themselves, for one photograph of this size:
+    /// Returns the bytes needed at most beside the photograph and the mask themselves, for one photograph of this size:
     /// the alpha, the working pictures, and the equations if the whole working picture were unknown.
     pub fn memory_bytes(&self, width: u32, height: u32) -> u64 {
         let pixels = |(w, h): (u32, u32)| w as u64 * h as u64;
@@ -110,11 +110,11 @@ pub fn soften_with(
         }
         None => solved(&photo, &mask, &trimap, &ClosedFormOptions::default(), &mut warnings),
     };
-    let alpha = enlarge(&alpha, working, size, LOWEST, HIGHEST);
+    let alpha = enlarge(&alpha, working, size, MIN_ALPHA, MAX_ALPHA);
     Ok(SoftMask { alpha, trimap, warnings })
 }
 
-/// The alpha by closed-form matting, else the hard mask.
+/// Returns the alpha by closed-form matting, else the hard mask.
 fn solved(
     photo: &Photo,
     mask: &Gray,
@@ -139,7 +139,7 @@ fn solved(
 fn band_warnings(trimap: &Gray) -> Vec<String> {
     let mut warnings = Vec::new();
     let band = unknown_share(trimap);
-    if band > MOST_UNKNOWN {
+    if band > MAX_UNKNOWN {
         warnings.push(format!(
             "{:.0} % of the picture are unknown: the mask is ragged or full of holes; a click on what it missed helps",
             100.0 * band
@@ -186,7 +186,7 @@ impl Default for UnknownBand {
     }
 }
 
-/// The trimap of a mask, which is head where it is 128 or more.
+/// Returns the trimap of a mask, which is head where it is 128 or more.
 pub fn trimap(mask: &Gray, band: UnknownBand) -> Gray {
     let (width, height) = (mask.width as usize, mask.height as usize);
     let head: Vec<bool> = mask.values.iter().map(|&v| v >= 128).collect();
@@ -208,7 +208,7 @@ pub fn trimap(mask: &Gray, band: UnknownBand) -> Gray {
     Gray { values: definite.into_iter().zip(maybe).map(value).collect(), ..*mask }
 }
 
-/// Share of a trimap's pixels that are unknown.
+/// Returns the share of a trimap's pixels that are unknown.
 pub fn unknown_share(trimap: &Gray) -> f64 {
     let unknown = trimap.values.iter().filter(|&&v| v == UNKNOWN).count();
     unknown as f64 / trimap.values.len().max(1) as f64
@@ -266,7 +266,7 @@ mod tests {
     use crate::image::resize_gray;
     use crate::io::{Limits, read_gray, read_photo};
 
-    /// A bright disc on a dark background whose rim is soft over 6 pixels.
+    /// Returns a bright disc on a dark background whose rim is soft over 6 pixels.
     fn disc(width: u32, height: u32) -> (Photo, Vec<f32>) {
         let (cx, cy, r) = (0.5 * width as f32, 0.5 * height as f32, 0.3 * height as f32);
         let pixels = 0..width * height;
@@ -285,7 +285,7 @@ mod tests {
         Gray { width, height, values: truth.iter().map(|&a| if a >= 0.5 { 255 } else { 0 }).collect() }
     }
 
-    /// Mean squared error of an 8-bit alpha against 0..=1.
+    /// Returns the mean squared error of an 8-bit alpha against 0..=1.
     fn error(alpha: &[u8], truth: &[f32]) -> f64 {
         let squares = alpha.iter().zip(truth).map(|(&a, &t)| (a as f64 / 255.0 - t as f64).powi(2));
         squares.sum::<f64>() / truth.len() as f64

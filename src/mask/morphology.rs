@@ -10,7 +10,7 @@ use rayon::prelude::*;
 /// Far away: no pixel is marked. Larger than any squared distance in a picture, finite in arithmetic.
 const FAR: f32 = 1e12;
 
-/// Squared distance in pixels from every pixel to the nearest one that `marked` names; `f32::INFINITY`
+/// Returns the squared distance in pixels from every pixel to the nearest one that `marked` names; `f32::INFINITY`
 /// everywhere when none is. `marked`: `[height · width]`.
 pub fn squared_distance(marked: &[bool], width: usize, height: usize) -> Vec<f32> {
     assert_eq!(marked.len(), width * height);

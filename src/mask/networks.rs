@@ -61,7 +61,7 @@ impl Networks {
         Ok(Some(Networks { sam, vitmatte, alpha_net, files, memory_bytes }))
     }
 
-    /// The loaded files: SAM's encoder and decoder, ViTMatte, the alpha network.
+    /// Returns the loaded files: SAM's encoder and decoder, ViTMatte, the alpha network.
     pub fn files(&self) -> &[NetworkFile] {
         &self.files
     }
@@ -78,7 +78,7 @@ impl Networks {
         Ok(())
     }
 
-    /// The alpha, at `size`, that the alpha network gives a photograph by itself; `None` without one.
+    /// Returns the alpha, at `size`, that the alpha network gives a photograph by itself; `None` without one.
     ///
     /// # Errors
     /// For a photograph whose size is not that of its colors; when the network fails or gives what is no picture.
@@ -144,7 +144,7 @@ impl Networks {
         sam.max(vitmatte).max(alpha)
     }
 
-    /// How many photographs of this size may be run side by side within the memory and `threads`: at least one.
+    /// Returns how many photographs of this size may be run side by side within the memory and `threads`: at least one.
     pub fn photos_at_once(&self, width: u32, height: u32, threads: usize) -> usize {
         let fit = self.memory_bytes / self.bytes_per_photo(width, height).max(1);
         usize::try_from(fit).unwrap_or(usize::MAX).min(threads).max(1)

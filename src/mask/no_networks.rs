@@ -26,7 +26,7 @@ impl NoNetworks {
         ))
     }
 
-    /// What was loaded.
+    /// Returns what was loaded.
     pub fn files(&self) -> &[String] {
         match *self {}
     }
@@ -36,7 +36,7 @@ impl NoNetworks {
         match *self {}
     }
 
-    /// How many photographs may be run side by side.
+    /// Returns how many photographs may be run side by side.
     pub fn photos_at_once(&self, _width: u32, _height: u32, _threads: usize) -> usize {
         match *self {}
     }
@@ -46,7 +46,7 @@ impl NoNetworks {
         match *self {}
     }
 
-    /// The alpha network's alpha.
+    /// Returns the alpha network's alpha.
     pub fn propose(&self, _photo: &Photo, _size: (u32, u32)) -> Result<Option<Gray>> {
         match *self {}
     }

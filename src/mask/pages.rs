@@ -30,7 +30,7 @@ const SIDE_PX: u32 = 1024;
 /// JPEG quality of the photographs, 1 to 100.
 const QUALITY: u8 = 85;
 /// Photographs at most; of more, those with clicks and evenly spread ones are shown.
-const MOST_VIEWS: usize = 200;
+const MAX_VIEWS: usize = 200;
 
 /// A photograph in the page.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -59,7 +59,7 @@ impl PageView {
 pub fn page_of(capture: &Capture, prompts: &Prompts, limits: &Limits) -> Result<String> {
     let clicked = prompts.clicks("prompts.json", capture).unwrap_or_default();
     let clicked = |i: usize| clicked.get(i).is_some_and(|points| !points.is_empty());
-    let chosen = evenly(capture.views.len(), MOST_VIEWS, clicked);
+    let chosen = evenly(capture.views.len(), MAX_VIEWS, clicked);
     let read = |view: &View| {
         let photo = io::read_photo(&view.photo, Some(view.photo_size), limits)?;
         PageView::new(file_path(capture, view), view.declared, &photo, SIDE_PX)
@@ -79,13 +79,14 @@ pub fn page_of(capture: &Capture, prompts: &Prompts, limits: &Limits) -> Result<
 fn evenly(count: usize, most: usize, wanted: impl Fn(usize) -> bool) -> Vec<usize> {
     let named: Vec<usize> = (0..count).filter(|&i| wanted(i)).take(most).collect();
     let rest: Vec<usize> = (0..count).filter(|i| named.binary_search(i).is_err()).collect();
-    let room = (most - named.len()).min(rest.len());
-    let mut chosen: Vec<usize> = (0..room).map(|k| rest[k * rest.len() / room]).chain(named).collect();
+    let remaining = (most - named.len()).min(rest.len());
+    let mut chosen: Vec<usize> =
+        (0..remaining).map(|k| rest[k * rest.len() / remaining]).chain(named).collect();
     chosen.sort_unstable();
     chosen
 }
 
-/// The page.
+/// Returns the page.
 pub fn page(title: &str, views: &[PageView], prompts: &Prompts) -> String {
     let view = |v: &PageView| {
         let src = format!("data:image/jpeg;base64,{}", base64(&v.jpeg));
@@ -110,9 +111,9 @@ const BAND: [u8; 3] = [255, 200, 0];
 /// Longest side of a picture on the sheet, pixels: about 20 kB each.
 const PICTURE_PX: u32 = 320;
 /// Pictures on a sheet at most, about 10 MB of them.
-const MOST: usize = 500;
+const MAX_PICTURES: usize = 500;
 /// What encloses the sheet on a page of its own.
-const MARKS: [&str; 2] = ["<!-- sheet -->", "<!-- end of the sheet -->"];
+const SHEET_MARKERS: [&str; 2] = ["<!-- sheet -->", "<!-- end of the sheet -->"];
 
 /// One view of a sheet.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -142,7 +143,7 @@ impl SheetView {
     }
 }
 
-/// The reduced photograph with the mask's outline and the unknown band drawn into it.
+/// Returns the reduced photograph with the mask's outline and the unknown band drawn into it.
 fn overlaid(photo: &Photo, alpha: &Gray, trimap: Option<&Gray>, side: u32) -> Photo {
     let size = working_size(photo.width, photo.height, side);
     let mut picture = reduce_photo(photo, size);
@@ -185,7 +186,7 @@ fn outline(picture: &mut Photo, mask: &Gray) {
 /// Returns the sheet of these views, in their order, as a page of its own. When there are more than fit, suspicious
 /// ones and evenly spread others are shown, and a last line says so.
 pub fn sheet(views: &[SheetView]) -> Result<String> {
-    let shown = evenly(views.len(), MOST, |i| !views[i].suspicions.is_empty());
+    let shown = evenly(views.len(), MAX_PICTURES, |i| !views[i].suspicions.is_empty());
     let shown: Vec<&SheetView> = shown.into_iter().map(|i| &views[i]).collect();
     let mut pages = Environment::new();
     pages.set_trim_blocks(true);
@@ -194,16 +195,16 @@ pub fn sheet(views: &[SheetView]) -> Result<String> {
     page.map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
-/// What a [`sheet`] shows, without the page around it: for a page with more, in about `most` bytes. Where not all views
-/// have room, suspicious ones and evenly spread others stay.
+/// Returns what a [`sheet`] shows, without the page around it: for a page with more, in about `most` bytes. Where not
+/// all views fit, suspicious ones and evenly spread others stay.
 pub fn part(sheet: &str, most: usize) -> Option<String> {
-    let inside = sheet.split_once(MARKS[0])?.1.split_once(MARKS[1])?.0;
+    let inside = sheet.split_once(SHEET_MARKERS[0])?.1.split_once(SHEET_MARKERS[1])?.0;
     let (head, rest) = inside.split_once("<figure")?;
     let (figures, tail) = rest.rsplit_once("</figure>")?;
     let figures: Vec<&str> =
         figures.split("<figure").map(|f| f.trim_end().trim_end_matches("</figure>")).collect();
-    let room = most.saturating_mul(figures.len()) / inside.len();
-    let shown = evenly(figures.len(), room, |i| figures[i].starts_with(" class=\"odd\""));
+    let remaining = most.saturating_mul(figures.len()) / inside.len();
+    let shown = evenly(figures.len(), remaining, |i| figures[i].starts_with(" class=\"odd\""));
     let shown: Vec<String> = shown.into_iter().map(|i| format!("<figure{}</figure>\n", figures[i])).collect();
     Some(format!("{head}{}{}", shown.concat(), tail.trim_start()))
 }
@@ -220,7 +221,7 @@ mod tests {
         PageView { file_path: name.into(), size: (3000, 4096), jpeg: vec![0xFF, 0xD8, 1] }
     }
 
-    /// What the page's script will find.
+    /// Returns what the page's script will find.
     fn data(page: &str) -> Value {
         let text = page.split_once("id=\"data\">").unwrap().1.split_once("</script>").unwrap().0;
         serde_json::from_str(text).unwrap()
@@ -342,11 +343,11 @@ mod tests {
 
     #[test]
     fn a_sheet_of_very_many_views_says_what_it_leaves_out_and_keeps_the_suspicious() {
-        let mut views = vec![SheetView::new("a", &photo(6, 8), &bust(), None).unwrap(); MOST + 100];
+        let mut views = vec![SheetView::new("a", &photo(6, 8), &bust(), None).unwrap(); MAX_PICTURES + 100];
         views.iter_mut().for_each(|t| t.suspicions.clear());
-        views[MOST + 99].suspicions.push("odd".into());
+        views[MAX_PICTURES + 99].suspicions.push("odd".into());
         let page = sheet(&views).unwrap();
-        assert_eq!(page.matches("<figure").count(), MOST);
+        assert_eq!(page.matches("<figure").count(), MAX_PICTURES);
         assert!(page.contains("class=\"odd\"") && page.contains("<p>500 of 600 views.</p>"));
         assert!(!sheet(&[]).unwrap().contains("<figure"));
     }

@@ -6,7 +6,7 @@
 //! ```
 //!
 //! `x` runs right and `y` down, as pixel indices of the photograph at the size its camera was calibrated for,
-//! whatever it is reduced to later; label 1 is the head, 0 is not. The file is a stranger's: names are only
+//! whatever it is reduced to later; label 1 is the head, 0 is not. The file is untrusted: names are only
 //! compared with those of the capture, never opened, and every number is checked.
 //!
 //! What must hold of all clicks on one photograph stands here as well, wherever they come from.
@@ -24,11 +24,11 @@ use std::path::{Component, Path};
 const CONVENTION: &str =
     "x right, y down, pixel indices from the top left; label 1 = foreground, 0 = background";
 /// A person clicks a dozen times on a photograph.
-const MOST_POINTS: usize = 500;
+const MAX_POINTS: usize = 500;
 /// Longer names fit no file system.
-const LONGEST_NAME: usize = 4096;
+const MAX_NAME_BYTES: usize = 4096;
 /// As many views as a capture may have, with ten points each, stay below this.
-const MOST_BYTES: u64 = 64 << 20;
+const MAX_BYTES: u64 = 64 << 20;
 
 /// The suggested fix for a file of another shape.
 const SHAPE: &str = "write `{\"frames\": [{\"file_path\": …, \"points\": [{\"x\": …, \"y\": …, \"label\": 1}]}]}`, or \
@@ -67,7 +67,7 @@ pub fn parse_prompts(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Promp
 }
 
 fn at_most(limits: &Limits) -> Limits {
-    Limits { json_bytes: limits.json_bytes.min(MOST_BYTES), ..limits.clone() }
+    Limits { json_bytes: limits.json_bytes.min(MAX_BYTES), ..limits.clone() }
 }
 
 /// One click as written on a command line: `x,y,label`.
@@ -95,7 +95,7 @@ pub fn parse_point(text: &str) -> Result<Click> {
     Ok(Click { x: number("x", x)?, y: number("y", y)?, head })
 }
 
-/// A coordinate that some photograph may have.
+/// Returns a coordinate that some photograph may have.
 fn coordinate(value: f64) -> Result<f32, String> {
     match (-0.5..1e6).contains(&value) {
         true => Ok(value as f32),
@@ -103,14 +103,14 @@ fn coordinate(value: f64) -> Result<f32, String> {
     }
 }
 
-/// A text from a stranger, for a message: short and on one line.
+/// Returns a text from a stranger, for a message: short and on one line.
 fn shown(text: &str) -> String {
     let plain: String = text.chars().take(80).flat_map(char::escape_debug).collect();
     let cut = if text.chars().nth(80).is_some() { "…" } else { "" };
     plain.replace("\\'", "'").replace("\\\"", "\"") + cut
 }
 
-/// What is wrong at a place of a file.
+/// Returns what is wrong at a place of a file.
 fn wrong(file: &str, place: &str, problem: String, hint: &str) -> Error {
     Error::cannot(format!("`{file}`, {place}: {problem}"), hint)
 }
@@ -164,8 +164,8 @@ fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
             let problem = format!("`{}` was clicked on in `frames[{first}]` already", shown(&file_path));
             return Err(wrong(&place, problem, "put all points of a photograph into one frame"));
         }
-        if entry.points.len() > MOST_POINTS {
-            let problem = format!("it has {} points, the limit is {MOST_POINTS}", entry.points.len());
+        if entry.points.len() > MAX_POINTS {
+            let problem = format!("it has {} points, the limit is {MAX_POINTS}", entry.points.len());
             return Err(wrong(&place, problem, "a dozen clicks are enough"));
         }
         let click = |(j, point): (usize, &PointEntry)| -> Result<Click> {
@@ -186,10 +186,10 @@ fn parse(path: &Path, value: &Value, limits: &Limits) -> Result<Prompts> {
     Ok(prompts)
 }
 
-/// A name below the capture with `/` between its parts, or why it is none.
+/// Returns a name below the capture with `/` between its parts, or why it is none.
 fn below(name: &str) -> Result<String, &'static str> {
     let text = name.replace('\\', "/");
-    if text.len() > LONGEST_NAME {
+    if text.len() > MAX_NAME_BYTES {
         return Err("is too long for a name");
     }
     if text.contains('\0') {
@@ -209,14 +209,14 @@ fn below(name: &str) -> Result<String, &'static str> {
     if parts.is_empty() { Err("is empty") } else { Ok(parts.join("/")) }
 }
 
-/// The name of a view's photograph in `prompts.json` and camera files: its path below the capture.
+/// Returns the name of a view's photograph in `prompts.json` and camera files: its path below the capture.
 pub fn file_path(capture: &Capture, view: &View) -> String {
     let path = view.photo.strip_prefix(&capture.root).unwrap_or(&view.photo);
     let parts: Vec<_> = path.components().map(|c| c.as_os_str().to_string_lossy()).collect();
     parts.join("/")
 }
 
-/// A name without the ending of a picture.
+/// Returns a name without the ending of a picture.
 fn stem(name: &str) -> &str {
     match name.rsplit_once('.') {
         Some((stem, ending)) if ["png", "jpg", "jpeg"].iter().any(|e| ending.eq_ignore_ascii_case(e)) => stem,
@@ -236,7 +236,7 @@ struct Photographed<'a> {
 }
 
 impl Photographed<'_> {
-    /// Is it what a file of clicks calls `name`? With or without ending, with or without the folder common to all
+    /// Returns whether a file of clicks means this photograph by `name`: with or without ending, with or without the folder common to all
     /// photographs, and in the folder of pictures already reduced (`images_4/`) as well.
     fn is_called(&self, name: &str) -> bool {
         let bare = stem(name);
@@ -251,7 +251,7 @@ impl Photographed<'_> {
 }
 
 impl Prompts {
-    /// The clicks of each view of a capture, parallel to its `views`, in pixel indices of its camera's picture;
+    /// Returns the clicks of each view of a capture, parallel to its `views`, in pixel indices of its camera's picture;
     /// none where nothing was clicked. `file` is for messages.
     ///
     /// # Errors
@@ -347,14 +347,14 @@ pub struct Click {
 }
 
 impl Click {
-    /// Is it on a photograph of this size? Index 0 is a pixel's center, so a picture reaches from −½ to just before
+    /// Returns whether the click is on a photograph of this size. Index 0 is a pixel's center, so a picture reaches from −½ to just before
     /// `side` − ½, which rounds to the pixel behind the last.
     pub fn is_inside(&self, (width, height): (u32, u32)) -> bool {
         let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
         inside(self.x, width) && inside(self.y, height)
     }
 
-    /// The same point of the photograph on a picture of it at another size; sizes are width and height.
+    /// Returns the same point of the photograph on a picture of it at another size; sizes are width and height.
     pub fn moved(&self, from: (u32, u32), to: (u32, u32)) -> Click {
         let moved = |v: f32, from: u32, to: u32| ((v as f64 + 0.5) * to as f64 / from as f64 - 0.5) as f32;
         Click { x: moved(self.x, from.0, to.0), y: moved(self.y, from.1, to.1), head: self.head }
@@ -412,7 +412,7 @@ pub(super) fn check_places(subject: &str, clicks: &[Click], width: u32, height: 
     Ok(())
 }
 
-/// The error for a photograph without clicks.
+/// Returns the error for a photograph without clicks.
 pub(super) fn no_clicks(subject: &str) -> Error {
     Error::cannot(
         format!("{subject} has no clicks"),
@@ -509,7 +509,7 @@ mod tests {
 
     #[test]
     fn sizes_and_numbers_beyond_reason_are_refused_by_the_reader() {
-        let many = format!("[{}]", vec![r#"{"x":1,"y":1,"label":1}"#; MOST_POINTS + 1].join(","));
+        let many = format!("[{}]", vec![r#"{"x":1,"y":1,"label":1}"#; MAX_POINTS + 1].join(","));
         assert!(parsed(&one("a", &many)).unwrap_err().to_string().contains("the limit is 500"));
         let few = Limits { views: 1, ..Limits::default() };
         let two = format!("{{\"frames\": [{}, {}]}}", frame("a", POINT), frame("b", POINT));

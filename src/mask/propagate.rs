@@ -30,23 +30,23 @@ const CELLS: usize = 112;
 /// Half side of the cube, in half heights of the frames at the point they look at.
 const CUBE: f64 = 1.15;
 /// How far outside the hull's silhouette definite background begins, share of the picture's height.
-const OUTSIDE: f32 = 0.012;
+const BACKGROUND_MARGIN: f32 = 0.012;
 /// Cells deeper inside than this share of the deepest one are the core.
-const CORE: f64 = 0.55;
+const CORE_DEPTH: f64 = 0.55;
 /// By how much the core's silhouette is shrunk, share of the picture's height.
 const CORE_SHRINK: f32 = 0.008;
 /// Votes against a cell that are forgiven once all views have masks.
-const MOST_NEGATIVE: usize = 2;
+const MAX_NEGATIVE: usize = 2;
 /// Share of the views that must vote for a cell then.
-const LEAST_POSITIVE: f64 = 0.1;
+const MIN_POSITIVE: f64 = 0.1;
 /// Rounds of carving and cutting.
 const ROUNDS: usize = 3;
 /// Pieces of a mask below this share of the picture are left out, unless clicked or in the core.
-const PIECE: f64 = 0.002;
+const MIN_PIECE_SHARE: f64 = 0.002;
 /// Views loaded at once; bounds the memory.
-const AT_ONCE: usize = 8;
+const BATCH_VIEWS: usize = 8;
 /// Colors of one side that the common mixtures learn from, at most; more would only take time.
-const MOST_COLORS: usize = 600_000;
+const MAX_COLORS: usize = 600_000;
 
 /// One view to be masked.
 #[derive(Clone, Copy, Debug)]
@@ -57,7 +57,7 @@ pub struct PropagateView<'a> {
     pub camera: &'a Camera,
     /// Its clicks in pixels of the photograph; none for a view without clicks.
     pub clicks: &'a [Click],
-    /// May its photograph shape the masks of other views? Held-out views may not.
+    /// Whether its photograph affects the masks of other views; not for held-out views.
     pub votes: bool,
 }
 
@@ -84,7 +84,7 @@ pub fn propagate<F>(views: &[PropagateView], load: F) -> Result<HardMasks>
 where
     F: Fn(usize) -> Result<Photo> + Sync,
 {
-    propagate_in(CELLS, AT_ONCE, views, load)
+    propagate_in(CELLS, BATCH_VIEWS, views, load)
 }
 
 fn propagate_in<F>(cells: usize, at_once: usize, views: &[PropagateView], load: F) -> Result<HardMasks>
@@ -114,7 +114,7 @@ where
     Ok(propagation.run(start))
 }
 
-/// The photograph of a view at its working size, if it is one of its camera.
+/// Returns the photograph of a view at its working size, if it is one of its camera.
 fn reduced(view: &PropagateView, photo: Photo) -> Result<Photo> {
     let PropagateView { name, camera, .. } = view;
     let (w, h) = (photo.width, photo.height);
@@ -168,10 +168,10 @@ impl<'a> Propagation<'a> {
         Ok(Propagation { views, photos, cube, inside, warnings: Vec::new(), notes: Vec::new() })
     }
 
-    /// The colors of both sides.
+    /// Returns the colors of both sides.
     fn common(&self, mut inside: Vec<Rgb>, mut outside: Vec<Rgb>) -> Option<Models> {
         for side in [&mut inside, &mut outside] {
-            let every = side.len().div_ceil(MOST_COLORS).max(1);
+            let every = side.len().div_ceil(MAX_COLORS).max(1);
             *side = side.iter().step_by(every).copied().collect();
         }
         let mut models = Models::fit(&inside, &outside)?;
@@ -181,8 +181,8 @@ impl<'a> Propagation<'a> {
         Some(models)
     }
 
-    /// The clicks of a view brought to its working size. The border margins are a guess: once a hull says where the head
-    /// is, it may touch any border.
+    /// Returns the clicks of a view brought to its working size. The border margins are a guess: once a hull says where
+    /// the head is, it may touch any border.
     fn grabcut(&self, i: usize, margins: bool) -> (Grabcut, Vec<String>) {
         let (v, photo) = (&self.views[i], &self.photos[i]);
         let margin = if margins { grabcut::BORDER_MARGIN } else { 0.0 };
@@ -254,12 +254,12 @@ impl<'a> Propagation<'a> {
         HardMasks { masks, warnings: self.warnings, notes: self.notes }
     }
 
-    /// Does what was proposed stand for the clicks?
+    /// Returns whether a proposed mask replaces the clicks.
     fn is_proposed(&self) -> bool {
         self.inside.iter().any(|inside| !inside.is_empty())
     }
 
-    /// The cells where the head may be, and the core where it must be.
+    /// Returns the cells where the head may be, and the core where it must be.
     fn carve(&self, masks: &[Option<Gray>]) -> (Vec<bool>, Vec<bool>) {
         let voters: Vec<Voter> = (self.views.iter().zip(masks))
             .filter(|(v, _)| v.votes)
@@ -272,15 +272,15 @@ impl<'a> Propagation<'a> {
         let unmasked = self.views.iter().zip(masks).any(|(v, m)| v.votes && m.is_none());
         let (against, least) = match unmasked {
             // a person has looked at clicked ones
-            true if self.is_proposed() => (MOST_NEGATIVE.min(total / 6), 0),
+            true if self.is_proposed() => (MAX_NEGATIVE.min(total / 6), 0),
             true => (0, 0),
-            false => (MOST_NEGATIVE.min(total / 6), (LEAST_POSITIVE * total as f64).ceil() as usize),
+            false => (MAX_NEGATIVE.min(total / 6), (MIN_POSITIVE * total as f64).ceil() as usize),
         };
         let mut hull = hull::cells(&votes, against, least);
         drop_dust(&mut hull, n, 0.02);
         let mut solid = hull::cells(&votes, against, least.max(total.div_ceil(2)));
         solid.iter_mut().zip(&hull).for_each(|(s, h)| *s &= h);
-        let core = hull::core(&solid, n, CORE);
+        let core = hull::core(&solid, n, CORE_DEPTH);
         (hull, core)
     }
 
@@ -290,7 +290,7 @@ impl<'a> Propagation<'a> {
         let (w, h) = (grabcut.width, grabcut.height);
         let camera = self.views[i].camera.resized(w as u32, h as u32);
         let allowed = hull::silhouette(&self.cube, hull, &camera);
-        let allowed = grow(&allowed, w, h, OUTSIDE * h as f32);
+        let allowed = grow(&allowed, w, h, BACKGROUND_MARGIN * h as f32);
         let within = hull::silhouette(&self.cube, core, &camera);
         let within = shrink(&within, w, h, CORE_SHRINK * h as f32);
         for (p, seeds) in grabcut.seeds.iter_mut().enumerate() {
@@ -305,7 +305,7 @@ impl<'a> Propagation<'a> {
         }
         let head = grabcut.min_cut(models);
         // the hull has left only what can be head: large pieces need no click
-        let head = grabcut.finish(head, PIECE * (w * h) as f64);
+        let head = grabcut.finish(head, MIN_PIECE_SHARE * (w * h) as f64);
         let ambiguous = if round + 1 == ROUNDS { grabcut.ambiguous(&head, models) } else { 0.0 };
         (gray(&head, w, h), ambiguous)
     }
@@ -334,7 +334,7 @@ impl<'a> Propagation<'a> {
 }
 
 /// How far inside a proposed mask definite head begins, share of the picture's height.
-const INSIDE: f32 = 0.012;
+const HEAD_MARGIN: f32 = 0.012;
 
 /// Masks every view from what a network has proposed for each, at the size [`rows_size`] gives; head from 128. As
 /// [`propagate`], without any click.
@@ -354,7 +354,7 @@ where
         })
         .collect();
     let verdicts = verdicts(&asked)?;
-    let mut propagation = Propagation::new(CELLS, AT_ONCE, views, load)?;
+    let mut propagation = Propagation::new(CELLS, BATCH_VIEWS, views, load)?;
     let start = propagation.proposed(proposals, &verdicts)?;
     Ok(propagation.run(start))
 }
@@ -385,7 +385,7 @@ impl Propagation<'_> {
             let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
             // held-out views are not compared, and shape only their own masks
             if !view.votes || *verdict != MaskVerdict::Unlike {
-                self.inside[i] = shrink(&head, w, h, INSIDE * h as f32);
+                self.inside[i] = shrink(&head, w, h, HEAD_MARGIN * h as f32);
             }
             if *verdict != MaskVerdict::Agrees || !view.votes {
                 others.extend(view.votes.then_some(view.name));
@@ -440,7 +440,7 @@ mod tests {
             .collect()
     }
 
-    /// A ball of two colors before a dark background with lamps, and which pixels are the ball.
+    /// Returns a ball of two colors before a dark background with lamps, and which pixels are the ball.
     pub(super) fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
         let mut truth = Vec::new();
         let rgb = (0..72 * 96u32)

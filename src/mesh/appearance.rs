@@ -35,13 +35,13 @@ use solve::{Smoothness, System};
 use std::time::Instant;
 
 /// Pixels that colors are fitted to, about, at most: more hardly change the colors.
-const PIXELS: usize = 1_000_000;
+const MAX_PIXELS: usize = 1_000_000;
 
-/// Every so many photographs one is left out of the first fits, to judge them by.
-const LEFT_OUT: u32 = 6;
+/// One in this many photographs is left out of the first fits, to validate them.
+const VALIDATION_STRIDE: u32 = 6;
 
 /// Gains stay within this factor of their mean: more is no exposure.
-const MOST_GAIN: f32 = 1.25;
+const MAX_GAIN: f32 = 1.25;
 
 /// Smoothness of the diffuse color over texels.
 const TEXELS: Smoothness = Smoothness { constant: 0.25, others: 0.0, ridge: 0.0 };
@@ -112,7 +112,7 @@ pub fn fit(
 ) -> Result<Option<Appearance>> {
     let (begin, most) = (Instant::now(), most.min(2));
     let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
-    let stride = (head as f64 / PIXELS as f64).sqrt().ceil().max(1.0) as u32;
+    let stride = (head as f64 / MAX_PIXELS as f64).sqrt().ceil().max(1.0) as u32;
     let rows = Rows::new(mesh, &Bvh::new(mesh), photographs, stride, turned);
     if rows.is_empty() {
         return Ok(None);
@@ -195,7 +195,7 @@ fn choose(
     monitor: &dyn Monitor,
 ) -> Result<Choice> {
     let all = |_: u32| true;
-    let held = |v: u32| v % LEFT_OUT == LEFT_OUT / 2;
+    let held = |v: u32| v % VALIDATION_STRIDE == VALIDATION_STRIDE / 2;
     let ones = vec![[1f32; 3]; photographs];
     let (in_fine, in_vertices) = (rows.matrix(fine), rows.matrix(vertices));
     let (of_fine, of_vertices) = (
@@ -261,7 +261,7 @@ fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]
         (total / f64::from(n.max(1))).exp()
     });
     let gain = |s: &[[f64; 2]; 3]| {
-        std::array::from_fn(|k| ((raw(&s[k]) / mean[k]) as f32).clamp(1.0 / MOST_GAIN, MOST_GAIN))
+        std::array::from_fn(|k| ((raw(&s[k]) / mean[k]) as f32).clamp(1.0 / MAX_GAIN, MAX_GAIN))
     };
     sums.iter().map(gain).collect()
 }

@@ -16,9 +16,9 @@ mod divide;
 mod flatten;
 mod pack;
 
-use crate::geom::{Atlas, Mesh, THOROUGH, overlaps, turn};
+use crate::geom::{Atlas, Mesh, THOROUGH_EFFORT, overlaps, turn};
 use crate::mesh::files::{UvReport, seams_facing, uv_check};
-use crate::mesh::input::{check_indices, setting};
+use crate::mesh::{check_indices, setting};
 use crate::{Error, Monitor, Result};
 use chart::{Flat, height, neighbours, part, upright};
 use divide::{divide, divide_around, planar};
@@ -144,7 +144,7 @@ fn atlas_by(
     }
 }
 
-/// Steps that the monitor hears of.
+/// Number of steps reported to the monitor.
 const STEPS: u64 = 4;
 
 /// Options of an atlas.
@@ -299,7 +299,7 @@ fn faults(atlas: &Atlas) -> Vec<bool> {
         })
         .collect();
     let mut bad: Vec<bool> = upright.iter().map(|u| !u).collect();
-    for (a, b) in overlaps(&atlas.uvs, &atlas.triangles, &upright, THOROUGH).pairs {
+    for (a, b) in overlaps(&atlas.uvs, &atlas.triangles, &upright, THOROUGH_EFFORT).pairs {
         let (a, b) = (a as usize, b as usize);
         if !bad[a] && !bad[b] {
             let thin = |t: usize| height(corners(t).map(|v| v.as_dvec2())).abs();

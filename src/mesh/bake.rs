@@ -41,7 +41,7 @@ pub use seams::Seams;
 use crate::geom::sphharm::functions;
 use crate::geom::{Atlas, Bvh, Camera, Harmonics, Mesh, SdfField, area_vector};
 use crate::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
-use crate::mesh::input::setting;
+use crate::mesh::setting;
 use crate::{Monitor, Result};
 use cover::{Bands, Sample};
 use glam::{Mat3, Vec3, Vec4};
@@ -299,7 +299,7 @@ mod tests {
     use crate::geom::Painted;
     use glam::Vec2;
 
-    /// A latitude-longitude sphere of radius 0.5 (coarse), with a seam.
+    /// Returns a latitude-longitude sphere of radius 0.5 (coarse), with a seam.
     fn sphere(width: u32, height: u32) -> (Mesh, Atlas) {
         let (nu, nv) = (24u32, 12u32);
         let mut mesh = Mesh::default();

@@ -16,8 +16,8 @@ pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
 
-use super::input::{check_len, evaluate, setting};
 use super::moves::Polish;
+use super::{check_len, evaluate, setting};
 use crate::geom::{Aabb, Mesh, SdfField, Topology, topology};
 use crate::{Error, Monitor, Result};
 use glam::{DVec3, Vec3};
@@ -38,8 +38,8 @@ pub struct ExtractOptions {
 }
 
 /// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm long, which
-/// is a strand or a hole as thick as a thumb. A share, since not every capture knows its unit.
-pub const LONGEST_HANDLE: f32 = 0.15;
+/// is a strand or a hole as thick as a thumb. A share, because not every capture has a known unit.
+pub const MAX_HANDLE: f32 = 0.15;
 
 /// Most points in one call of a field.
 pub(super) const BATCH: usize = 1 << 16;
@@ -52,7 +52,7 @@ const RELAX: f32 = 0.5;
 
 impl Default for ExtractOptions {
     fn default() -> ExtractOptions {
-        ExtractOptions { resolution: 512, coarse_step: 8, longest_handle: LONGEST_HANDLE }
+        ExtractOptions { resolution: 512, coarse_step: 8, longest_handle: MAX_HANDLE }
     }
 }
 
@@ -141,7 +141,7 @@ impl MeshReport {
 /// as they are seen along their normals.
 ///
 /// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's zero,
-/// its normals the field's gradient. Handles with a loop no longer than `options.longest_handle` are gone.
+/// its normals the field's gradient. Handles with a loop no longer than `options.longest_handle` are removed.
 ///
 /// ```
 /// use glam::Vec3;
@@ -274,7 +274,7 @@ fn check_surface(found: &Sparse) -> Result<()> {
     Ok(())
 }
 
-/// Mean first-order distance to the surface, in cells, over vertices that are not capped.
+/// Returns the mean first-order distance to the surface, in cells, over vertices that are not capped.
 fn off_surface(values: &[f32], gradients: &[Vec3], capped: &[bool], cell: f32) -> f64 {
     let distances = (0..values.len())
         .filter(|&i| !capped[i])
@@ -319,7 +319,7 @@ impl NodeGrid {
         Ok(NodeGrid { dims: cells.map(|c| c + 1), origin, spacing })
     }
 
-    /// Where a node lies.
+    /// Returns where a node lies.
     pub fn point(&self, node: [usize; 3]) -> Vec3 {
         let n = DVec3::new(node[0] as f64, node[1] as f64, node[2] as f64);
         (self.origin.as_dvec3() + n * f64::from(self.spacing)).as_vec3()

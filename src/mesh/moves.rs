@@ -59,9 +59,9 @@ pub(super) fn move_vertices(
 }
 
 /// Below this shape a face counts as spoiled, unless it was no better before.
-const POOR: f32 = 0.02;
+const MIN_QUALITY: f32 = 0.02;
 /// A face may turn until this cosine against its direction at extraction.
-const TURN: f32 = 0.2;
+const MIN_TURN_COSINE: f32 = 0.2;
 
 /// Moving vertices, with their start positions.
 pub(super) struct Polish<'a> {
@@ -115,8 +115,8 @@ impl<'a> Polish<'a> {
         let spoiled = |t: usize, from: &[Vec3], to: &[Vec3]| {
             let [was, is] = [from, to].map(|p| self.triangles[t].map(|v| p[v as usize]));
             let now = area_vector(is);
-            let turned = now.dot(self.facing[t]) <= TURN * now.length() * self.facing[t].length();
-            turned || (shape(is) < POOR && shape(is) < shape(was))
+            let turned = now.dot(self.facing[t]) <= MIN_TURN_COSINE * now.length() * self.facing[t].length();
+            turned || (shape(is) < MIN_QUALITY && shape(is) < shape(was))
         };
         move_vertices(positions, self.triangles, at, spoiled)
     }

@@ -26,28 +26,28 @@ const LAYERS: [f32; 4] = [0.5, 1.5, 3.0, 5.0];
 
 /// Softness `1 / s` from which on a vertex has layers, in pixels of the nearest camera: antialiasing shows the rest.
 /// From twice as much on they have all of their opacity.
-const SOFT: f32 = 0.5;
+const MIN_SOFTNESS_PX: f32 = 0.5;
 
 /// Rounds in which the softness of vertices takes the mean with its neighbors.
 const ROUNDS: usize = 10;
 
 /// Pixels on both sides of a mask's outline that are looked at.
-const BAND: usize = 6;
+const BAND_PX: usize = 6;
 
 /// Pixels that are looked at, about, at most.
-const PIXELS: usize = 400_000;
+const MAX_PIXELS: usize = 400_000;
 
 /// Rays along each side of a pixel.
-const SIDE: usize = 2;
+const RAYS_PER_SIDE: usize = 2;
 
 /// Rays of a pixel.
-const RAYS: usize = SIDE * SIDE;
+const RAYS_PER_PIXEL: usize = RAYS_PER_SIDE * RAYS_PER_SIDE;
 
-/// Every so many photographs one is left out, to judge layers by.
-const LEFT_OUT: usize = 6;
+/// One in this many photographs is left out, to validate the layers.
+const VALIDATION_STRIDE: usize = 6;
 
 /// Share of the squared error of left-out outlines that layers must take away.
-const GAIN: f64 = 0.05;
+const MIN_GAIN: f64 = 0.05;
 
 /// Weights of squared logits, and of squared differences along an edge, against the square of one pixel's error.
 const RIDGE: f64 = 0.01;
@@ -93,13 +93,13 @@ pub fn fit(
         return Ok((None, report));
     }
     // of a few photographs the last
-    let every = LEFT_OUT.min(photographs.len());
+    let every = VALIDATION_STRIDE.min(photographs.len());
     let left_out = |view: u32| every > 1 && view as usize % every == every - 1;
     let first = outlines.fit(&field, &nodes, &|view| !left_out(view));
     let errors = [None, Some(&field), Some(&first)].map(|s| outlines.error(s, &left_out));
     report.left_out = errors;
     let best = errors[1].min(errors[2]);
-    report.kept = best * best < (1.0 - GAIN) * errors[0] * errors[0];
+    report.kept = best * best < (1.0 - MIN_GAIN) * errors[0] * errors[0];
     if !report.kept {
         return Ok((None, report));
     }
@@ -131,8 +131,11 @@ fn from_field(
         width = (0..width.len()).into_par_iter().map(mean).collect();
     }
     let pixels: Vec<f32> = (0..width.len()).into_par_iter().map(pixel).collect::<Option<_>>()?;
-    let share: Vec<f32> =
-        width.iter().zip(&pixels).map(|(w, p)| ((w / p - SOFT) / SOFT).clamp(0.0, 1.0)).collect();
+    let share: Vec<f32> = width
+        .iter()
+        .zip(&pixels)
+        .map(|(w, p)| ((w / p - MIN_SOFTNESS_PX) / MIN_SOFTNESS_PX).clamp(0.0, 1.0))
+        .collect();
     let mut soft: Vec<f32> =
         (0..width.len()).filter(|&v| share[v] > 0.0).map(|v| width[v] / pixels[v]).collect();
     if soft.is_empty() {
@@ -167,7 +170,7 @@ struct Outlines {
     /// Rays of each row that meet the mesh.
     whole: Vec<usize>,
     /// The other rays of each row: their layers in `met`, outermost first.
-    rays: Vec<[Layers; RAYS]>,
+    rays: Vec<[Layers; RAYS_PER_PIXEL]>,
     /// Vertices of the triangles of the mesh.
     triangles: Vec<[u32; 3]>,
 }
@@ -176,11 +179,18 @@ struct Outlines {
 type Layers = Vec<(usize, Hit)>;
 
 /// Returns the number of a pixel's rays that hit the mesh, and the layers that the others hit.
-fn look(camera: &Camera, (x, y): (usize, usize), bvh: &Bvh, caster: &ShellCaster) -> (usize, [Layers; RAYS]) {
-    let (mut whole, mut rays) = (0, [const { Layers::new() }; RAYS]);
+fn look(
+    camera: &Camera,
+    (x, y): (usize, usize),
+    bvh: &Bvh,
+    caster: &ShellCaster,
+) -> (usize, [Layers; RAYS_PER_PIXEL]) {
+    let (mut whole, mut rays) = (0, [const { Layers::new() }; RAYS_PER_PIXEL]);
     for (k, layers) in rays.iter_mut().enumerate() {
-        let sub = |at: usize, k: usize| at as f32 + (k as f32 + 0.5) / SIDE as f32;
-        let Some(ray) = camera.ray(Vec2::new(sub(x, k % SIDE), sub(y, k / SIDE))) else { continue };
+        let sub = |at: usize, k: usize| at as f32 + (k as f32 + 0.5) / RAYS_PER_SIDE as f32;
+        let Some(ray) = camera.ray(Vec2::new(sub(x, k % RAYS_PER_SIDE), sub(y, k / RAYS_PER_SIDE))) else {
+            continue;
+        };
         if bvh.any_hit(&ray) {
             whole += 1;
         } else {
@@ -199,8 +209,8 @@ impl Outlines {
     ) -> Result<Outlines> {
         let (bvh, caster) = (Bvh::new(mesh), ShellCaster::new(mesh, shells));
         let mut all = Outlines { triangles: mesh.triangles.clone(), ..Outlines::default() };
-        let bands: Vec<Vec<usize>> = photographs.par_iter().map(|p| p.outline(BAND)).collect();
-        let stride = bands.iter().map(Vec::len).sum::<usize>().div_ceil(PIXELS).max(1);
+        let bands: Vec<Vec<usize>> = photographs.par_iter().map(|p| p.outline(BAND_PX)).collect();
+        let stride = bands.iter().map(Vec::len).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
         for ((v, photograph), band) in photographs.iter().enumerate().zip(bands) {
             monitor.check_stop()?;
             let Some(mask) = photograph.mask else { continue };
@@ -210,7 +220,7 @@ impl Outlines {
                 let (x, y) = (at % mask.width as usize, at / mask.width as usize);
                 let (whole, rays) = look(photograph.camera, (x, y), &bvh, &caster);
                 // what neither is nor should be anything says nothing, nor does what is whole anyway
-                let says = whole < RAYS && (target > 0.0 || rays.iter().any(|l| !l.is_empty()));
+                let says = whole < RAYS_PER_PIXEL && (target > 0.0 || rays.iter().any(|l| !l.is_empty()));
                 says.then_some((target, whole, rays))
             };
             for (target, whole, rays) in some.par_iter().filter_map(row).collect::<Vec<_>>() {
@@ -250,7 +260,7 @@ impl Outlines {
                     let own = &shells.layers[*layer].alphas;
                     for (v, w) in self.triangles[hit.triangle as usize].into_iter().zip(hit.weights()) {
                         let alpha = own[v as usize];
-                        let slope = others * w * alpha * (1.0 - alpha) / RAYS as f32;
+                        let slope = others * w * alpha * (1.0 - alpha) / RAYS_PER_PIXEL as f32;
                         let at = (layer * own.len()) as u32 + v;
                         match slopes.iter_mut().find(|s| s.0 == at) {
                             Some(s) => s.1 += slope,
@@ -260,7 +270,7 @@ impl Outlines {
                 }
             }
         }
-        opacity / RAYS as f32
+        opacity / RAYS_PER_PIXEL as f32
     }
 
     /// Root mean square error of the opacity of the rows that `keep` names (by photograph).
@@ -334,7 +344,7 @@ mod tests {
 
     const SIZE: u32 = 48;
 
-    /// A ball of triangles of radius 0.5 around the origin.
+    /// Returns a ball of triangles of radius 0.5 around the origin.
     fn ball() -> Mesh {
         const N: usize = 33;
         let at = |i: usize| i as f32 / (N - 1) as f32 * 2.0 - 1.0;
@@ -360,8 +370,8 @@ mod tests {
         (0..12).map(camera).collect()
     }
 
-    /// The mask of a ball whose opacity falls from 1 to 0 as that of a field of this sharpness does, seen by a camera:
-    /// a ray that comes as near as `f` to the surface has σ(−f · sharpness).
+    /// Returns the mask of a ball whose opacity falls from 1 to 0 as that of a field of this sharpness does, seen by a
+    /// camera: a ray that comes as near as `f` to the surface has σ(−f · sharpness).
     fn mask(camera: &Camera, sharpness: f32) -> Gray {
         let value = |i: u32| {
             let ray = camera.ray(Vec2::new((i % SIZE) as f32 + 0.5, (i / SIZE) as f32 + 0.5)).unwrap();

@@ -16,7 +16,7 @@
 //! (`cargo bench --bench simplify`).
 //!
 //! Self-intersections are looked for once, at the end, which costs a tenth of the collapses. If there
-//! are any the work begins anew, and every collapse looks for crossings (`crossing`), at seven times the cost. So none is
+//! are any, the work starts over, and every collapse looks for crossings (`crossing`), at seven times the cost. So none is
 //! made, and those of the input do not become more.
 
 mod crossing;
@@ -24,7 +24,7 @@ mod rings;
 mod rounds;
 
 use crate::geom::{Mesh, SdfField};
-use crate::mesh::input::{check_count, check_indices, finite, setting};
+use crate::mesh::{check_count, check_indices, finite, setting};
 use crate::{Monitor, Result};
 use crossing::crossings;
 use rounds::{Task, bounded, counted};

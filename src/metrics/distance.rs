@@ -77,7 +77,7 @@ pub fn sample_triangles(mesh: &Mesh, count: usize) -> Vec<(Vec3, u32)> {
 
 /// Minimum cosine between a surface's normal and the direction to a camera that counts as seeing it (75°, the limit
 /// of texture baking too): flatter views carry little information.
-const LEAST_COSINE: f32 = 0.26;
+const MIN_COSINE: f32 = 0.26;
 
 /// Visibility of a point, and its label.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -115,7 +115,7 @@ pub fn sights(
         let distance = way.length();
         let direction = way / distance;
         let sees = inside
-            && direction.dot(normal) > LEAST_COSINE
+            && direction.dot(normal) > MIN_COSINE
             && !bvh.any_hit(&Ray { origin: p + lift * normal, direction, t_min: 0.0, t_max: distance });
         let last = [camera.width, camera.height].map(|n| n.saturating_sub(1));
         sees.then(|| [(q.x as u32).min(last[0]), (q.y as u32).min(last[1])])
@@ -165,7 +165,7 @@ pub fn kinds_one_way(
     })
 }
 
-/// Returns the distances from `from` to `to` over the parts seen by so many cameras, and each part's share of the
+/// Returns the distances from `from` to `to` over the parts seen by each number of cameras, and each part's share of the
 /// area, in the order of `views`. `None` for an empty part.
 pub fn seen_one_way(
     from: &Mesh,
@@ -190,7 +190,7 @@ mod tests {
     use super::*;
     use glam::DVec3;
 
-    /// A 2 × 1 rectangle at height z, of two triangles.
+    /// Returns a 2 × 1 rectangle at height z, of two triangles.
     fn sheet(z: f32) -> Mesh {
         Mesh {
             positions: vec![

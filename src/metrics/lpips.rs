@@ -19,15 +19,18 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Opens the network's file, whose arrays may take `memory_gib` each.
+    /// Opens the network's file, whose arrays may take `memory_gib` each; returns `None` for an empty path.
     ///
     /// # Errors
     /// Fails if a file cannot be read, is no valid ONNX file, or does not take two pictures.
-    pub fn open(path: &Path, memory_gib: f64) -> Result<Lpips> {
+    pub fn open(path: &Path, memory_gib: f64) -> Result<Option<Lpips>> {
+        if path.as_os_str().is_empty() {
+            return Ok(None);
+        }
         let array_bytes = (memory_gib * f64::from(1u32 << 30)) as u64;
         let session = NetworkSession::open(Role::LPIPS, path, array_bytes)?;
         let file = session.file.clone();
-        Ok(Lpips { session: Mutex::new(session), file })
+        Ok(Some(Lpips { session: Mutex::new(session), file }))
     }
 
     /// Returns the record of the loaded network.
@@ -108,7 +111,7 @@ mod tests {
     const W: [f32; 6] = [0.5, 0.25, 0.25, -0.3, 0.9, 0.2];
     const L: [f32; 2] = [0.7, 1.3];
 
-    /// The same in f64.
+    /// Returns the same in f64.
     fn expected(a: &[[u8; 3]], b: &[[u8; 3]]) -> f64 {
         let features = |color: &[u8; 3]| {
             let x = color.map(|v| 2.0 * f64::from(v) / 255.0 - 1.0);
@@ -140,7 +143,7 @@ mod tests {
         let photo = |rgb: &[[u8; 3]]| Photo { width: 20, height: 12, rgb: rgb.to_vec(), alpha: None };
         let expected = expected(&ours, &theirs);
         assert!(expected > 0.05);
-        let lpips = Lpips::open(&path, 1.0).unwrap();
+        let lpips = Lpips::open(&path, 1.0).unwrap().unwrap();
         let found = lpips.distance(&render, &photo(&theirs)).unwrap();
         assert!((found - expected).abs() < 1e-6 * expected.max(1.0), "{found} against {expected}");
         assert!(lpips.distance(&render, &photo(&ours)).unwrap() < 1e-9);

@@ -155,13 +155,13 @@ fn near(set: &[bool], width: usize, radius: usize) -> Vec<bool> {
 }
 
 /// Around a soft rim this many pixels of opaque head are the hair's, and along a hard rim the skin's.
-const SAMPLE_PX: usize = 6;
+const RIM_BAND_PX: usize = 6;
 
 /// An outline nearer than this to a soft rim does not count as skin's.
-const APART_PX: usize = 10;
+const RIM_CLEARANCE_PX: usize = 10;
 
 /// Minimum share of each kind among the samples for a classification.
-const LEAST_SHARE: f64 = 0.05;
+const MIN_SHARE: f64 = 0.05;
 
 /// Classifier of skin and hair by color, learned from the capture itself.
 ///
@@ -195,11 +195,11 @@ impl ToneSamples {
         let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
         let rest: Vec<bool> = head.iter().map(|h| !h).collect();
         let soft = soft_rim(masks.mask);
-        let [beside, far] = [SAMPLE_PX, APART_PX].map(|px| near(&soft, width, px));
+        let [beside, far] = [RIM_BAND_PX, RIM_CLEARANCE_PX].map(|px| near(&soft, width, px));
         let rim = near(&rest, width, 1);
         let hard: Vec<bool> =
             (0..rim.len()).map(|i| rim[i] && head[i] && !far[i] && region.values[i] >= INSIDE).collect();
-        let along = near(&hard, width, SAMPLE_PX);
+        let along = near(&hard, width, RIM_BAND_PX);
         let opaque = masks.all(|i, m| m == u8::MAX && region.values[i] >= INSIDE);
         let mut counts = [[[0; 256]; 3]; 2];
         for (i, rgb) in photo.rgb.iter().enumerate().filter(|(i, _)| opaque[*i]) {
@@ -221,7 +221,7 @@ impl ToneSamples {
     /// Returns the classifier, if these samples separate the kinds.
     fn tones(&self) -> Option<Tones> {
         let [skin, hair] = [0, 1].map(|kind| self.0[kind][0].iter().sum::<u64>());
-        if (skin.min(hair) as f64) <= LEAST_SHARE * (skin + hair) as f64 {
+        if (skin.min(hair) as f64) <= MIN_SHARE * (skin + hair) as f64 {
             return None;
         }
         let [skin, hair] = [0, 1].map(|kind| Tone::of(&self.0[kind]));
@@ -369,8 +369,8 @@ mod tests {
         assert!(near(&[true; 49], 7, 2).iter().all(|d| *d));
     }
 
-    /// A capture of one photograph, 40 × 20: background above, below it a soft rim of hair on the left half and a
-    /// hard outline of skin on the right; the lowest rows are neck.
+    /// Returns a capture of one photograph, 40 × 20: background above, below it a soft rim of hair on the left half and
+    /// a hard outline of skin on the right; the lowest rows are neck.
     fn head(hair: [u8; 3], skin: [u8; 3]) -> (Photo, Gray, Gray) {
         let (w, h) = (40, 20);
         let mask = |x: usize, y: usize| match (x < w / 2, y) {

@@ -33,12 +33,12 @@ pub enum Contract {
     SamEncoder,
     /// SAM's prompt encoder and mask decoder as transformers exports them.
     SamDecoder {
-        /// Does it take labels? The oldest exports call every point head.
+        /// Whether it takes labels; the oldest exports call every point head.
         labels: bool,
     },
     /// SAM's or MobileSAM's image encoder for the original decoder.
     OriginalEncoder {
-        /// Does it take the picture `[H,W,3]` in 0..255, and normalize and pad inside?
+        /// Whether it takes the picture `[H,W,3]` in 0..255, and normalizes and pads it itself.
         picture: bool,
     },
     /// The original SAM decoder export.
@@ -57,7 +57,7 @@ struct Form {
     name: &'static str,
     /// Name ("" for any), numbers and extents (0 for any) of each input.
     inputs: &'static [(&'static str, i32, &'static [usize])],
-    /// None by name: the first output is asked for, whatever it is called.
+    /// No name: the first output is used.
     outputs: &'static [&'static str],
 }
 
@@ -99,12 +99,12 @@ impl Contract {
         FORMS.iter().find(|f| f.contract == self).unwrap_or(&FORMS[0])
     }
 
-    /// What a network of this form can be named for.
+    /// Returns what a network of this form can be named for.
     pub(super) fn role(self) -> Role {
         self.form().role
     }
 
-    /// The outputs that are asked for of a file that has these, in order.
+    /// Returns the outputs that are asked for of a file that has these, in order.
     pub(super) fn outputs(self, given: &[Port]) -> Vec<String> {
         match self.form().outputs {
             [] => given.iter().take(1).map(|port| port.name.clone()).collect(),
@@ -161,7 +161,7 @@ pub(super) fn in_words(dims: impl Iterator<Item = Option<usize>>) -> String {
     format!("[{}]", each.join(", "))
 }
 
-/// The form of a file with these inputs and outputs, or why it is none.
+/// Returns the form of a file with these inputs and outputs, or why it is none.
 pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, String> {
     let mut near = None;
     let gives = |name: &&str| outputs.iter().any(|p| p.name == **name);
@@ -186,7 +186,7 @@ pub(super) fn recognize(inputs: &[Port], outputs: &[Port]) -> Result<Contract, S
     Err(format!("{why} ({} → {})", side(inputs), side(outputs)))
 }
 
-/// What keeps these from being exactly the inputs wanted.
+/// Returns what keeps these from being exactly the inputs wanted.
 fn misfit(inputs: &[Port], wanted: &[(&str, i32, &[usize])]) -> Option<String> {
     for (i, (name, kind, extents)) in wanted.iter().enumerate() {
         let any = inputs.get(i).filter(|_| name.is_empty());
@@ -291,7 +291,7 @@ pub(super) fn guarded<T>(piece: impl FnOnce() -> Result<T, String>) -> Result<T,
     })
 }
 
-/// What an engine or a file says: one line, no control characters, not endless.
+/// Returns what an engine or a file says: one line, no control characters, not endless.
 pub(super) fn one_line(said: &str) -> String {
     let line = said.split_whitespace().collect::<Vec<_>>().join(" ");
     let line: String = line.chars().filter(|c| !c.is_control()).collect();
@@ -301,7 +301,7 @@ pub(super) fn one_line(said: &str) -> String {
     }
 }
 
-/// The error for a file that is not what it was named for.
+/// Returns the error for a file that is not what it was named for.
 pub(crate) fn file_error(path: &Path, problem: &str, hint: impl Into<String>) -> Error {
     Error::cannot(format!("`{}` {problem}", path.display()), hint)
 }

@@ -194,9 +194,9 @@ impl Evaluator {
         for (view, loaded, expected) in &self.views {
             let camera = view.camera.transformed(&scene.scene_from_world);
             let mut rendered = renderer.view(method, &camera)?.ok_or_else(|| {
-                Error::cannot(format!("there is nothing to show for `{}`", method.folder()), "")
+                Error::cannot(format!("no view can be rendered for `{}`", method.folder()), "")
             })?;
-            if let Some(background) = pictures::behind(self.background) {
+            if let Some(background) = pictures::background_color(self.background) {
                 pictures::over(&mut rendered, background);
             }
             let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
@@ -208,11 +208,11 @@ impl Evaluator {
 }
 
 /// Shares of the training after which a field is evaluated.
-const SHARES: [f64; 5] = [0.125, 0.25, 0.5, 0.75, 1.0];
+const EVALUATED_SHARES: [f64; 5] = [0.125, 0.25, 0.5, 0.75, 1.0];
 
 /// Share of a whole training's steps at which trainings of different settings are compared: the setting that leads
 /// after so many steps leads at the end in most cases, and all sweeps should finish in reasonable time.
-const SHORT: f64 = 0.2;
+const COMPARED_SHARE: f64 = 0.2;
 
 /// Asks a training to stop at a step, or when the user asks.
 struct StopAt<'a> {
@@ -294,7 +294,7 @@ impl Bench<'_> {
         for (series, stage) in [("I-Face", Stage::Iface), ("T-Face", Stage::Tface)] {
             let all = steps(session.config, stage);
             let mut cost = WorkCost::default();
-            for share in SHARES {
+            for share in EVALUATED_SHARES {
                 let step = ((all as f64 * share) as u64).max(1);
                 cost = cost + timed(|| train_until(session, stage, step))?.1;
                 let figures = evaluate(session, stage, &self.evaluator)?;
@@ -337,7 +337,7 @@ impl Bench<'_> {
     /// Returns the configuration for a share of its steps.
     fn short(&self) -> Config {
         let mut config = self.config().clone();
-        config.iface.steps = ((config.iface.steps as f64 * SHORT) as u64).max(1);
+        config.iface.steps = ((config.iface.steps as f64 * COMPARED_SHARE) as u64).max(1);
         config
     }
 
@@ -349,7 +349,7 @@ impl Bench<'_> {
     fn row(&self, choice: String, config: &Config) -> Result<Row> {
         self.check_stop()?;
         let scratch = tempfile::tempdir_in(self.session.run.dir()).map_err(|e| {
-            Error::cannot(format!("no scratch folder: {e}"), "free space, or name another place in TMPDIR")
+            Error::cannot(format!("no scratch folder: {e}"), "free space, or set TMPDIR to another folder")
         })?;
         let run = Run::open(scratch.path(), self.session.run.stop().clone(), std::sync::Arc::new(Quiet));
         let session = Session::open(config, &run)?;

@@ -24,7 +24,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Memory that photographs processed in parallel may take without networks, bytes.
-const MOST_BYTES: u64 = 3 << 29;
+const MAX_BYTES: u64 = 3 << 29;
 
 /// The input of mask making: clicks, or none if a network proposes masks.
 #[derive(Clone, Debug, PartialEq)]
@@ -45,7 +45,7 @@ impl MaskPrompts {
     ///
     /// `kept` is the run's copy of the clicks, which is used if the original file was removed.
     pub fn open(config: &MaskConfig, capture: &Capture, kept: &Path) -> Result<Option<MaskPrompts>> {
-        if !config.made() {
+        if !config.makes_masks() {
             return Ok(None);
         }
         let mut file = Vec::new();
@@ -137,7 +137,7 @@ fn photos_at_once(
     let memory = (config.memory_gib * (1u64 << 30) as f64) as u64;
     // photograph, alpha and equations
     let bytes = soft.memory_bytes(width, height) + 8 * u64::from(width) * u64::from(height);
-    let built_in = (memory.min(MOST_BYTES) / bytes.max(1)).clamp(1, threads as u64) as usize;
+    let built_in = (memory.min(MAX_BYTES) / bytes.max(1)).clamp(1, threads as u64) as usize;
     let (w, h) = working_size(width, height, soft.side);
     networks.map_or(built_in, |n| n.photos_at_once(w, h, threads).min(built_in))
 }

@@ -52,7 +52,7 @@ pub(super) fn ensemble(
         let color = blend(&members(capture, config, &views)?, &weights)?;
         spent += begin.elapsed();
         let mut view = RenderedView { color, depth: Image::new(0, 0, 1), normal: Image::new(0, 0, 3) };
-        if let Some(background) = pictures::behind(render.background) {
+        if let Some(background) = pictures::background_color(render.background) {
             pictures::over(&mut view, background);
         }
         pictures::write(dir.folder(), &camera.name, &view, render.format, config.capture.unit_m)?;
@@ -172,7 +172,7 @@ fn members<'i>(capture: &Capture, config: &Config, views: &'i [Image]) -> Result
     if c.cut { Ok(members.cut(&shares(c))?) } else { Ok(members) }
 }
 
-/// Whether the field was trained with masks.
+/// Returns whether the field was trained with masks.
 fn trained_with_masks(capture: &Capture, config: &Config, method: Method) -> bool {
     let has_mask = |v: &View| v.mask != ViewMask::None && v.mask_meaning == MaskMeaning::Empty;
     let used = match method {

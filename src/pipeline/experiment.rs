@@ -96,7 +96,7 @@ pub fn runs(tables: &[&str]) -> Vec<&'static str> {
     out
 }
 
-/// Whether a run belongs to I-Face's table, which counts the pieces of the surface.
+/// Returns whether a run belongs to I-Face's table, which counts the pieces of the surface.
 fn has_surface(run: &str) -> bool {
     run.starts_with("iface") || run == "paper"
 }

@@ -331,7 +331,7 @@ mod tests {
         assert!(p.distance(Vec3::new(-0.5, 1.5, 1.0)) < 1e-5, "{p}");
     }
 
-    /// A wrinkled ball, closed, a scene of its own.
+    /// Returns a wrinkled ball, closed, a scene of its own.
     fn ball() -> Mesh {
         let (across, down) = (40u32, 20u32);
         let at = |i: u32, j: u32| {

@@ -160,7 +160,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
     let c = &config.capture;
     CaptureOptions {
         downscale: c.downscale,
-        masks: if config.mask.made() { MaskSource::Clicks } else { config.mask.source },
+        masks: if config.mask.makes_masks() { MaskSource::Clicks } else { config.mask.source },
         mask_dir: c.mask_dir.clone(),
         mask_meaning: config.mask.meaning,
         trust_masks: config.mask.trust,
@@ -239,7 +239,7 @@ fn restore_from_run(config: &Config, run: &Run, error: Error) -> Result<(Capture
         scene_file::read_capture(&run.path("cameras.json"), root).map_err(|_| missing_capture(&problem))?;
     let mut inputs = record.fingerprint.inputs;
     let digest = inputs.remove("capture").unwrap_or_default();
-    let clicks = config.mask.made().then(|| MaskPrompts::from_inputs(&inputs));
+    let clicks = config.mask.makes_masks().then(|| MaskPrompts::from_inputs(&inputs));
     Ok((capture, Inputs { digest, clicks, missing_capture: Some(problem), ..Inputs::default() }))
 }
 
@@ -247,6 +247,6 @@ fn restore_from_run(config: &Config, run: &Run, error: Error) -> Result<(Capture
 pub(super) fn missing_capture(problem: &str) -> Error {
     Error::cannot(
         format!("the capture of this run cannot be opened: {problem}"),
-        "say where it lies now: `--set capture.path=FOLDER`; the same photographs give the same run",
+        "name its current folder with `--set capture.path=FOLDER`; the same photographs continue the same run",
     )
 }

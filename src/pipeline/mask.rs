@@ -26,14 +26,14 @@ pub(super) const SHEET: &str = "sheet.html";
 pub(super) const CLICKS: &str = "prompts.json";
 
 /// Longest side of the masks that the head is located with; a hull is coarser still.
-const PLACED_PX: u32 = 1024;
+const SCENE_MASK_PX: u32 = 1024;
 
 /// Share of a mask that must contradict the other masks before it counts as wrong. Outlines that are off by six of
 /// 512 pixels contradict nothing; half a mask, the mask of another view or an empty one reach 0.1 to 1.
-const WRONG_SHARE: f64 = 0.1;
+const MIN_CONFLICT_SHARE: f64 = 0.1;
 
 /// Maximum number of masks compared with each other.
-const MOST_COMPARED: usize = 256;
+const MAX_COMPARED: usize = 256;
 
 /// The masks, whether read or made.
 #[derive(Default)]
@@ -72,8 +72,7 @@ pub(super) fn mask(
     let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
     if coverage.is_empty() {
         dir.warn(
-            "no head masks, as asked: nothing says which pixels are background, and the box learns whatever it \
-             holds",
+            "no head masks (`mask.source`): background is unknown, so everything inside the box is reconstructed",
         );
     }
     let silhouettes = config.meaning == MaskMeaning::Empty;
@@ -237,7 +236,7 @@ type MaskConflict = (usize, f64, String);
 /// compared.
 fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> (Vec<MaskConflict>, usize) {
     // if there are very many views, evenly spread ones: the check keeps bits of every cell for each
-    let every = capture.views.len().div_ceil(MOST_COMPARED);
+    let every = capture.views.len().div_ceil(MAX_COMPARED);
     let views: Vec<ConsistencyView> = (capture.views.iter().zip(masks).enumerate())
         .map(|(i, (v, mask))| ConsistencyView {
             name: &v.name,
@@ -255,7 +254,7 @@ fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> (Vec<MaskConflict>, u
 /// conflict, the cause is not a single mask, and one message says so.
 fn classify_conflicts(conflicts: &[MaskConflict], compared: usize) -> (Vec<Error>, Vec<String>) {
     let mut found: Vec<(bool, String)> =
-        conflicts.iter().map(|(_, share, text)| (*share >= WRONG_SHARE, text.clone())).collect();
+        conflicts.iter().map(|(_, share, text)| (*share >= MIN_CONFLICT_SHARE, text.clone())).collect();
     let n = found.len();
     if n > 3 && 2 * n > compared {
         let text = format!(
@@ -272,7 +271,7 @@ fn classify_conflicts(conflicts: &[MaskConflict], compared: usize) -> (Vec<Error
 
 /// Shrinks a mask to a size that is sufficient to locate the head and to compare masks.
 fn for_placing(mask: &Gray) -> Gray {
-    resize_gray(mask, working_size(mask.width, mask.height, PLACED_PX))
+    resize_gray(mask, working_size(mask.width, mask.height, SCENE_MASK_PX))
 }
 
 /// Returns the findings of [`inspect`] for a capture, and which of its masks contradict each other.

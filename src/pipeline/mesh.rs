@@ -19,7 +19,7 @@ use crate::image::Image;
 use crate::io::{self, Limits};
 use crate::mesh::bake::seen_colors;
 use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
-use crate::mesh::{self, Cap, HandleReport, LONGEST_HANDLE, MeshReport, Patches, Photograph};
+use crate::mesh::{self, Cap, HandleReport, MAX_HANDLE, MeshReport, Patches, Photograph};
 use crate::run::{Phase, Record, Run, StageDir, StageStatus, Status};
 use crate::{Error, Monitor, Result};
 use glam::{DVec3, Vec3};
@@ -142,7 +142,7 @@ pub(super) fn extract(
     }
     let options = mesh::ExtractOptions {
         resolution: c.resolution as usize,
-        longest_handle: if c.genus == Genus::Simple { LONGEST_HANDLE } else { 0.0 },
+        longest_handle: if c.genus == Genus::Simple { MAX_HANDLE } else { 0.0 },
         ..mesh::ExtractOptions::default()
     };
     let field = ClosedSurface { field, hull: scene.hull.as_ref(), cap: None, patches: None };

@@ -2,7 +2,6 @@
 //!
 //! A mesh of the demo head is compared with its exact surface ([`against_truth`]).
 
-use super::lpips::{Lpips, measure};
 use super::pictures;
 use crate::capture::synthetic::SyntheticHead;
 use crate::capture::{Capture, LoadedView, View};
@@ -10,7 +9,7 @@ use crate::config::{Config, Method, TruthPhoto, ViewBackground};
 use crate::geom::{Bvh, Mesh};
 use crate::image::Gray;
 use crate::io::{self, Limits};
-use crate::metrics::{Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
+use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
 use crate::run::{Run, StageDir};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -19,7 +18,7 @@ use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 
 /// Largest mask value that counts as empty.
-const NOTHING: u8 = 0;
+const MAX_EMPTY: u8 = 0;
 
 /// Rendered pictures of one method, one for each view.
 pub(super) struct PictureSet {
@@ -87,7 +86,7 @@ pub(super) fn metrics(
     let mut views: Vec<&View> = comparables.iter().flatten().map(|c| c.view).collect();
     views.sort_by(|a, b| a.name.cmp(&b.name));
     views.dedup_by(|a, b| a.name == b.name);
-    let lpips = measure(config)?;
+    let lpips = Lpips::open(config.metrics.lpips.as_ref(), config.mask.memory_gib)?;
     lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
     let tones = Tones::of(&views)?;
     for (i, (set, pictures)) in sets.iter().zip(&comparables).enumerate() {
@@ -151,7 +150,7 @@ fn figures(
     };
     let open = before.as_ref().or((background == ViewBackground::None).then_some(&render));
     let opacity = open.map(|image| image.channel(3));
-    let behind = pictures::behind(background).unwrap_or([0.0; 3]);
+    let behind = pictures::background_color(background).unwrap_or([0.0; 3]);
     let parts = Masks::of(&loaded).map(|m| parts(&render, &photo, m, opacity.as_deref(), behind, tones));
     let parts = parts.unwrap_or_default();
     let outside = opacity.and_then(|opacity| square_opacity_outside(&opacity, &loaded));
@@ -189,7 +188,7 @@ fn square_opacity_outside(opacity: &[f32], loaded: &LoadedView) -> Option<(f64, 
     let mask = loaded.mask.as_ref()?;
     let valid = |i: usize| loaded.valid.as_ref().is_none_or(|v| v.values[i] > 0);
     let counted =
-        opacity.iter().zip(&mask.values).enumerate().filter(|(i, (_, m))| **m == NOTHING && valid(*i));
+        opacity.iter().zip(&mask.values).enumerate().filter(|(i, (_, m))| **m == MAX_EMPTY && valid(*i));
     Some(counted.fold((0.0, 0), |(sum, n), (_, (a, _))| (sum + (*a as f64).powi(2), n + 1)))
 }
 

@@ -18,7 +18,7 @@ use serde_json::Value;
 use std::path::Path;
 
 /// Maximum size of a page without its fixed parts, bytes.
-const MOST_BYTES: usize = 7_600_000;
+const MAX_BYTES: usize = 7_600_000;
 /// The part of it that masks may take.
 const MASK_BYTES: usize = 800_000;
 
@@ -30,7 +30,7 @@ pub(super) fn write_report(session: &Session, idle: bool) -> Result<()> {
     session.write("report.html", page(session)?.as_bytes(), idle)
 }
 
-/// Whether the report is newer than every stage and the settings. Writing it again would open all pictures.
+/// Returns whether the report is newer than every stage and the settings. Writing it again would open all pictures.
 fn is_current(session: &Session) -> bool {
     let time = |name: &str| io::modified(&session.run.path(name));
     let report = time("report.html").filter(|_| io::is_file(&session.run.path("report.html")));
@@ -53,7 +53,7 @@ fn page(session: &Session) -> Result<String> {
     let masks = crate::mask::pages::part(&sheet, MASK_BYTES).unwrap_or_default();
     let found = views::viewer(session)?;
     let glb = found.as_ref().map_or(0, |(v, _)| v.glb.len().div_ceil(3) * 4);
-    let (views, left_out) = views::rows(session, MOST_BYTES.saturating_sub(masks.len() + glb))?;
+    let (views, left_out) = views::rows(session, MAX_BYTES.saturating_sub(masks.len() + glb))?;
     let viewer = found.map(|(viewer, file_from_world)| Viewer {
         cameras: views::cameras(session, &views, &file_from_world),
         ..viewer

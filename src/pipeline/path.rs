@@ -22,7 +22,7 @@ use std::path::Path;
 pub(super) const PATHS: &str = "render/paths";
 
 /// Number of characters of a file's name kept before its digest: a file name is limited to 255 bytes.
-const STEM: usize = 50;
+const MAX_STEM_CHARS: usize = 50;
 
 /// A set of cameras, and the settings of their views.
 pub(super) struct CameraPath {
@@ -49,7 +49,7 @@ impl CameraPath {
                 let cameras = cameras_of_file(file, &bytes, &capture.views[0].camera)
                     .map_err(|e| e.within("stage `render`"))?;
                 let stem = Path::new(file).file_stem().unwrap_or_default().to_string_lossy();
-                let stem: String = stem.chars().take(STEM).collect();
+                let stem: String = stem.chars().take(MAX_STEM_CHARS).collect();
                 let digest = digest.insert(Fingerprint::of_bytes(&bytes));
                 (format!("{stem}-{}", &digest[..8]), Some(cameras))
             }

@@ -7,8 +7,8 @@ use crate::io::{self, Limits, ReadError, WriteError};
 use crate::render::RenderedView;
 use std::path::{Path, PathBuf};
 
-/// Color behind the head, sRGB-coded; `None` leaves alpha.
-pub(super) fn behind(background: ViewBackground) -> Option<[f32; 3]> {
+/// Returns the color behind the head, sRGB-coded; `None` leaves alpha.
+pub(super) fn background_color(background: ViewBackground) -> Option<[f32; 3]> {
     match background {
         ViewBackground::Black => Some([0.0; 3]),
         ViewBackground::White => Some([1.0; 3]),
@@ -157,7 +157,7 @@ pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadErro
 /// Without a mask it is returned unchanged.
 pub(super) fn expected(photo: &Photo, mask: Option<&Gray>, background: ViewBackground) -> Photo {
     let Some(mask) = mask else { return photo.clone() };
-    let behind = behind(background).unwrap_or([0.0; 3]);
+    let behind = background_color(background).unwrap_or([0.0; 3]);
     let mix = |c: u8, b: f32, m: u8| {
         let a = m as f32 / 255.0;
         quantize(a * c as f32 / 255.0 + (1.0 - a) * b)

@@ -22,7 +22,7 @@ const FORMAT: u32 = 2;
 
 /// Keys of `[mask]` that do not affect the masks that are made: paths, whose contents are inputs of the stage
 /// instead, and checks of other masks.
-const PLACES: [&str; 9] = [
+const UNTRACKED_MASK_KEYS: [&str; 9] = [
     "mask.trust",
     "mask.prompts",
     "mask.point",
@@ -35,7 +35,7 @@ const PLACES: [&str; 9] = [
 ];
 
 /// Keys of `[mask]` that affect masks read from the capture.
-const FOUND: [&str; 2] = ["mask.source", "mask.meaning"];
+const CAPTURE_MASK_KEYS: [&str; 2] = ["mask.source", "mask.meaning"];
 
 /// Keys of `[mesh]` that affect files for other programs, but no rendered view.
 const FILE_KEYS: [&str; 4] = ["mesh.format", "mesh.material", "mesh.texture_format", "mesh.exr"];
@@ -267,16 +267,16 @@ impl Session<'_> {
                 match &self.inputs.clicks {
                     // the paths of clicks and networks do not matter either, nor does the memory limit
                     Some(clicks) => {
-                        settings.retain(|key, _| !PLACES.contains(&key.as_str()));
+                        settings.retain(|key, _| !UNTRACKED_MASK_KEYS.contains(&key.as_str()));
                         if !config.mask.with_alpha_net() {
                             settings.remove("mask.alpha_input"); // as in runs from before there was any
                         }
                         inputs.extend(clicks.inputs.iter().cloned());
                     }
                     // settings for making masks do not affect masks read from the capture
-                    None => {
-                        settings.retain(|key, _| !key.starts_with("mask.") || FOUND.contains(&key.as_str()))
-                    }
+                    None => settings.retain(|key, _| {
+                        !key.starts_with("mask.") || CAPTURE_MASK_KEYS.contains(&key.as_str())
+                    }),
                 }
             }
             Stage::Iface => {
@@ -405,8 +405,8 @@ impl Session<'_> {
     }
 }
 
-/// Whether the views in a path's folder show an outdated stage of this digest. Views with unreadable records count as
-/// such.
+/// Returns whether the views in a path's folder show an outdated stage of this digest. Views with unreadable records
+/// count as such.
 fn may_show(folder: &Path, is_old: &dyn Fn(&String, &String) -> bool) -> bool {
     let any = |f: &Fingerprint| f.inputs.iter().any(|(stage, digest)| is_old(stage, digest));
     match (read_status(folder), read_record(folder)) {

@@ -8,7 +8,7 @@ use super::learn::load_field;
 use super::mesh::finished_mesh;
 use super::page::views::{error, heat};
 use super::path::cameras_of_file;
-use super::pictures::{self, behind, expected, over, straight};
+use super::pictures::{self, background_color, expected, over, straight};
 use super::scene_file::{read_capture, read_scene};
 use crate::capture::{Split, View};
 use crate::config::{Config, Stage, ViewBackground};
@@ -86,7 +86,7 @@ impl Preview {
         if is_colored { Look::Unlit } else { Look::Studio }
     }
 
-    /// Whether the mesh has UV coordinates.
+    /// Returns whether the mesh has UV coordinates.
     pub fn has_uvs(&self) -> bool {
         self.head.texture.is_some() || self.bare_atlas.is_some()
     }
@@ -276,7 +276,7 @@ impl PreviewRenderer<'_> {
         background: ViewBackground,
     ) -> PreviewPicture {
         self.view(seen, camera, look);
-        if let Some(color) = behind(background) {
+        if let Some(color) = background_color(background) {
             over(&mut seen.view, color);
         }
         let Image { width, height, data, .. } = &seen.view.color;
@@ -326,7 +326,7 @@ pub fn field_view(run: &Path, config: &Config, stage: Stage) -> Result<Vec<u8>> 
     let side = |pixels: u32| (f64::from(pixels) * share.min(1.0)).round().max(1.0) as u32;
     let camera = camera.resized(side(camera.width), side(camera.height)).transformed(&scene.scene_from_world);
     let mut view = load_field(run, config, &scene, stage)?(&camera);
-    if let Some(black) = pictures::behind(ViewBackground::Black) {
+    if let Some(black) = pictures::background_color(ViewBackground::Black) {
         pictures::over(&mut view, black);
     }
     let rgb = view.color.data.as_chunks::<4>().0.iter().map(|p| [p[0], p[1], p[2]].map(quantize)).collect();

@@ -37,7 +37,7 @@ pub(super) fn render(
     unit_m: f64,
     dir: &StageDir,
 ) -> Result<Value> {
-    let background = pictures::behind(c.background);
+    let background = pictures::background_color(c.background);
     let total = cameras.len() * c.method.len();
     let mut done = 0;
     let mut seconds = Map::new();
@@ -97,7 +97,7 @@ pub(super) fn cameras(
     }
 }
 
-/// Whether some methods show the head mesh. Fitted colors lie on it; the network's colors are evaluated on the
+/// Returns whether some methods show the head mesh. Fitted colors lie on it; the network's colors are evaluated on the
 /// extracted surface.
 pub(super) fn shows_head(config: &Config, methods: &[Method]) -> bool {
     let fitted = config.mesh.color == ColorSource::Photographs;
@@ -233,11 +233,11 @@ impl<'a> Renderer<'a> {
             (Method::Baseline | Method::Tface, _) => {
                 let field = self.fields.radiance(method.stage())?;
                 // a large view takes minutes, so a stop request is checked within it
-                let see = |rays: &[Ray]| match self.monitor.stop() {
+                let render_rays = |rays: &[Ray]| match self.monitor.stop() {
                     true => Vec::new(),
                     false => field.render_rays(rays, camera.forward()),
                 };
-                Some(march(camera, &self.world_from_scene, false, see))
+                Some(march(camera, &self.world_from_scene, false, render_rays))
             }
             (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
             (Method::Raycast, Some((ExtractedSurface { mesh, cap }, bvh))) => {

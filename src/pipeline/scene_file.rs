@@ -12,7 +12,7 @@ use serde_json::json;
 use std::path::Path;
 
 /// Maximum number of cells along an axis of a hull; the stage makes 128.
-const MOST_CELLS: usize = 1024;
+const MAX_CELLS: usize = 1024;
 
 /// Writes a scene with its hull.
 pub(super) fn write_scene(path: &Path, scene: &Scene) -> Result<(), WriteError> {
@@ -34,8 +34,8 @@ pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
         return wrong("aabb", format!("{min} to {max}"), "a box within -2 and 2, its lowest corner first");
     }
     if let Some(Hull { resolution, bits }) = &scene.hull {
-        if !(2..=MOST_CELLS).contains(resolution) {
-            return wrong("hull.resolution", resolution.to_string(), &format!("2 to {MOST_CELLS}"));
+        if !(2..=MAX_CELLS).contains(resolution) {
+            return wrong("hull.resolution", resolution.to_string(), &format!("2 to {MAX_CELLS}"));
         }
         let words = resolution.pow(3).div_ceil(64);
         if bits.len() != words {

@@ -2,13 +2,13 @@
 
 use super::cameras::CameraCheck;
 use super::inputs::{Inputs, missing_capture};
-use super::lpips::measure;
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::{Scene, SceneBox};
 use crate::capture::{Capture, Split, ViewMask};
 use crate::config::{Config, RenderConfig, Stage};
 use crate::io;
+use crate::metrics::Lpips;
 use crate::run::Run;
 use crate::{Error, Result};
 use std::fmt::Display;
@@ -135,7 +135,7 @@ impl<'a> Session<'a> {
             .filter_map(|i| i.missing.clone());
         lost.next().map_or(Ok(()), Err)?;
         if stages.contains(&Stage::Metrics) {
-            measure(self.config)?;
+            Lpips::open(self.config.metrics.lpips.as_ref(), self.config.mask.memory_gib)?;
         }
         #[cfg(not(feature = "matting"))]
         if self.inputs.clicks.is_some() && stages.contains(&Stage::Mask) {
@@ -152,7 +152,7 @@ impl<'a> Session<'a> {
     pub(super) fn write(&self, name: &str, bytes: &[u8], idle: bool) -> Result<()> {
         match self.run.write(name, bytes) {
             Err(e) if idle => {
-                self.run.warn("run", &format!("{e}; all that was asked for is done"));
+                self.run.warn("run", &format!("{e}; all requested stages are done"));
                 Ok(())
             }
             other => other,
@@ -169,7 +169,7 @@ pub fn check_feasible(config: &Config) -> Result<()> {
     Ok(())
 }
 
-/// Whether the capture is the synthetic head of a demo, whose surface is known.
+/// Returns whether the capture is the synthetic head of a demo, whose surface is known.
 pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
     io::real_path(&run.path(DEMO_CAPTURE)).is_ok_and(|made| made == Path::new(&config.capture.path))
 }

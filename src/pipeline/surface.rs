@@ -43,7 +43,7 @@ impl SdfField for ClosedSurface<'_> {
         self.field.sdf(points)
     }
 
-    /// The closed surface also contains the opening of the field's own zero set.
+    /// Returns values and gradients; the closed surface includes the cap over the opening of the field's zero set.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let (mut values, mut gradients) = self.field.sdf_gradient(points);
         if let Some(cap) = self.cap {
@@ -55,7 +55,7 @@ impl SdfField for ClosedSurface<'_> {
         (values, gradients)
     }
 
-    /// The cap has its own color.
+    /// Returns colors; the cap has its own.
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], away: &[Vec3]) -> Vec<[f32; 3]> {
         let mut colors = self.field.colors(points, normals, counts, away);
         if let Some(cap) = self.cap {
@@ -181,7 +181,7 @@ mod tests {
     fn a_large_view_is_marched_in_bands_and_every_pixel_is_its_own() {
         let largest = Cell::new(0);
         // the plane z = 0, all opaque on the left, a quarter on the right
-        let see = |rays: &[Ray]| -> Vec<RayResult> {
+        let render_rays = |rays: &[Ray]| -> Vec<RayResult> {
             largest.set(largest.get().max(rays.len()));
             let one = |ray: &Ray| RayResult {
                 color: [0.5, 0.25, 0.0],
@@ -193,7 +193,7 @@ mod tests {
         };
         let world_from_scene = Similarity { scale: 2.0, ..Similarity::IDENTITY };
         let camera = camera(1000, 200);
-        let view = march(&camera, &world_from_scene, false, see);
+        let view = march(&camera, &world_from_scene, false, render_rays);
         assert!(largest.get() <= BAND && largest.get() > BAND / 2, "{}", largest.get());
         assert_eq!((view.normal.width, view.normal.data.len()), (0, 0));
         assert_eq!(view.color.pixel(10, 199), [0.5, 0.25, 0.0, 1.0]);
@@ -201,7 +201,7 @@ mod tests {
         // 3 scene units before the camera, 6 of the world; none where three quarters shine through
         assert!((view.depth.pixel(10, 199)[0] - 6.0).abs() < 1e-5);
         assert_eq!(view.depth.pixel(990, 0), [0.0]);
-        let upright = march(&camera, &world_from_scene, true, see);
+        let upright = march(&camera, &world_from_scene, true, render_rays);
         assert_eq!(upright.normal.pixel(10, 5), [0.0, 0.0, 1.0]);
     }
 }

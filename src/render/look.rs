@@ -10,7 +10,7 @@ use glam::{Vec2, Vec3};
 const GRAY: [f32; 3] = [0.8; 3];
 
 /// Squares of the chequer along each side of a texture.
-const SQUARES: f32 = 32.0;
+const CHEQUER_SQUARES: f32 = 32.0;
 
 /// Lamps that follow the camera: direction (right, up, to the viewer; not unit) and brightness. Key, fill and rim.
 const LAMPS: [([f32; 3], f32); 3] =
@@ -20,10 +20,10 @@ const LAMPS: [([f32; 3], f32); 3] =
 const AMBIENT: f32 = 0.18;
 
 /// Half the width of a line of the wireframe, pixels.
-const LINE: f32 = 0.4;
+const LINE_HALF_WIDTH_PX: f32 = 0.4;
 
-/// Triangles lower than so many pixels get fainter lines.
-const FADED: f32 = 8.0;
+/// Triangles lower than this many pixels get fainter lines.
+const FADE_HEIGHT_PX: f32 = 8.0;
 
 /// The display mode of a surface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,12 +46,12 @@ impl Look {
     /// All looks.
     pub const ALL: [Look; 6] = [Look::Studio, Look::Unlit, Look::Normals, Look::Matcap, Look::Uv, Look::Wire];
 
-    /// Whether the soft layers are shown too. They have a color and no shape of their own.
+    /// Returns whether the soft layers are shown too. They have a color and no shape of their own.
     pub fn has_layers(self) -> bool {
         matches!(self, Look::Studio | Look::Unlit)
     }
 
-    /// Whether the look needs only the color of a hit, not its point and normal.
+    /// Returns whether the look needs only the color of a hit, not its point and normal.
     pub fn is_bare(self) -> bool {
         matches!(self, Look::Unlit | Look::Uv)
     }
@@ -133,7 +133,7 @@ impl Surface<'_> {
     /// Returns a chequer that runs from red to green along u and from dark to light along v (down the texture).
     fn chequer(&self, hits: &RayHits, i: usize) -> [f32; 3] {
         let Some(uv) = self.uv(hits, i) else { return GRAY };
-        let square = (uv * SQUARES).floor();
+        let square = (uv * CHEQUER_SQUARES).floor();
         let dark = (square.x + square.y).rem_euclid(2.0) > 0.5;
         let c = [uv.x, 1.0 - uv.x, uv.y].map(|v| 0.35 + 0.6 * v.rem_euclid(1.0));
         c.map(|v| if dark { 0.55 * v } else { v })
@@ -152,7 +152,7 @@ impl Surface<'_> {
         let nearest = heights.iter().map(|(share, height)| share * height).fold(f32::INFINITY, f32::min);
         let low = heights.iter().map(|(_, height)| *height).fold(f32::INFINITY, f32::min);
         // lines of triangles as small as pixels would fill the picture
-        (LINE + 0.5 - nearest).clamp(0.0, 1.0) * (low / FADED).clamp(0.2, 1.0)
+        (LINE_HALF_WIDTH_PX + 0.5 - nearest).clamp(0.0, 1.0) * (low / FADE_HEIGHT_PX).clamp(0.2, 1.0)
     }
 }
 

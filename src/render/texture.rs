@@ -168,11 +168,6 @@ impl MeshTexture {
         }
     }
 
-    /// Whether the texture has lobes, so that directions matter.
-    pub fn has_lobes(&self) -> bool {
-        self.groups > 1
-    }
-
     /// Returns the sRGB-coded colors of a camera's visible hits, interpolated between two levels (trilinear).
     pub fn smooth_colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let mut colors = Vec::with_capacity(hits.hits.len());
@@ -376,7 +371,7 @@ mod tests {
     use super::*;
     use crate::geom::Bvh;
 
-    /// A square from −1 to 1 at z = 0, its texture 4 × 4 from red (left) to green (right).
+    /// Returns a square from −1 to 1 at z = 0, its texture 4 × 4 from red (left) to green (right).
     fn square() -> (Mesh, Atlas, Photo) {
         let at = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
         let mesh = Mesh {

@@ -34,7 +34,7 @@ pub struct Measure {
     pub name: &'static str,
     /// Digits after the point.
     pub digits: usize,
-    /// Is more better? `None` for what is only counted.
+    /// Whether more is better; `None` for counts.
     pub more_is_better: Option<bool>,
     /// Differences up to this one are noise: of the unit, and as a share of the value.
     pub noise: (f64, f64),
@@ -77,7 +77,8 @@ pub struct Sweep {
 }
 
 impl Sweep {
-    /// Which rows are better in the first measure, beyond its noise, than all that take less time: the Pareto front.
+    /// Returns which rows are better in the first measure, beyond its noise, than all that take less time: the Pareto
+    /// front.
     pub fn front(&self) -> Vec<bool> {
         let mut front = vec![false; self.rows.len()];
         let Some((measure, more)) = self.measures.first().and_then(|m| Some((m, m.more_is_better?))) else {
@@ -116,7 +117,7 @@ impl Sweep {
         (headings, rows.collect())
     }
 
-    /// The first measure over CPU seconds, a line for each series: a part of a page.
+    /// Returns the first measure over CPU seconds, a line for each series: a part of a page.
     fn drawing(&self) -> String {
         let mut curves: Vec<Curve> = Vec::new();
         for row in &self.rows {
@@ -167,7 +168,7 @@ impl BenchResult {
         format!("{:#}\n", serde_json::json!(self))
     }
 
-    /// The tables, for a terminal. A star marks what no other choice beats in time and error together.
+    /// Returns the tables, for a terminal. A star marks what no other choice beats in time and error together.
     pub fn text(&self) -> String {
         let mut out = String::new();
         for sweep in &self.sweeps {
@@ -184,7 +185,7 @@ impl BenchResult {
         out
     }
 
-    /// The page: drawings and tables.
+    /// Returns the page: drawings and tables.
     ///
     /// # Errors
     ///
@@ -200,7 +201,7 @@ impl BenchResult {
     }
 }
 
-/// Rows of cells in columns; the first `left` columns begin at the left.
+/// Returns the rows of cells in columns; the first `left` columns begin at the left.
 fn aligned(rows: &[Vec<String>], left: usize) -> Vec<String> {
     let columns = rows.first().map_or(0, Vec::len);
     let wide = |k: usize| rows.iter().map(|r| r[k].chars().count()).max().unwrap_or(0);

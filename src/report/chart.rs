@@ -22,9 +22,9 @@ pub struct Chart {
     pub curves: Vec<Curve>,
 }
 
-/// The named figures of a `log.jsonl` over its steps, one chart a figure and one curve for each field that a stage
-/// learns. Lines that are not JSON (cut short by a crash) are passed over; a step logged twice, before and after an
-/// interruption, counts the second time.
+/// Returns the named figures of a `log.jsonl` over its steps, one chart a figure and one curve for each field that a
+/// stage learns. Lines that are not JSON (cut short by a crash) are passed over; a step logged twice, before and after
+/// an interruption, counts the second time.
 pub fn charts(stage: &str, log: &str, names: &[&str]) -> Vec<Chart> {
     let title = |name: &&str| Chart { title: format!("{stage} {name}"), curves: Vec::new() };
     let mut charts: Vec<Chart> = names.iter().map(title).collect();
@@ -61,12 +61,12 @@ const HEIGHT: f64 = 170.0;
 const LEFT: f64 = 44.0;
 const BOTTOM: f64 = 18.0;
 /// Maximum number of points of a line: more cannot be distinguished.
-const MOST: usize = 240;
+const MAX_POINTS: usize = 240;
 /// A figure over more than this many times its least value is drawn by its logarithm.
-const WIDE: f64 = 30.0;
+const MIN_LOG_RANGE: f64 = 30.0;
 
 impl Chart {
-    /// The drawing with its title and what its lines are called: a part of a page.
+    /// Returns the drawing with its title and what its lines are called: a part of a page.
     pub fn html(&self) -> String {
         let points = || self.curves.iter().flat_map(|c| &c.points).filter(|p| p.1.is_finite());
         let span = |values: &mut dyn Iterator<Item = f64>| {
@@ -74,7 +74,7 @@ impl Chart {
         };
         let (x0, x1) = span(&mut points().map(|p| p.0));
         let (low, high) = span(&mut points().map(|p| p.1));
-        let by_log = low > 0.0 && high / low > WIDE;
+        let by_log = low > 0.0 && high / low > MIN_LOG_RANGE;
         let scaled = |v: f64| if by_log { v.log10() } else { v };
         let (y0, y1) = (scaled(low), scaled(high));
         let share = |v: f64, lo: f64, hi: f64| if hi > lo { (v - lo) / (hi - lo) } else { 0.5 };
@@ -112,7 +112,7 @@ impl Chart {
             );
         }
         for (k, curve) in self.curves.iter().enumerate() {
-            let step = curve.points.len().div_ceil(MOST);
+            let step = curve.points.len().div_ceil(MAX_POINTS);
             let kept = curve.points.iter().enumerate();
             let kept =
                 kept.filter(|(i, p)| (i % step == 0 || i + 1 == curve.points.len()) && p.1.is_finite());

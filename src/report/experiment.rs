@@ -20,7 +20,7 @@ pub const MEASURES: [(&str, &str, usize); 7] = [
 const OWN_MASKS: &str = " †";
 
 /// Resamplings of an interval.
-const DRAWS: u64 = 1000;
+const RESAMPLES: u64 = 1000;
 
 /// A row of a table: which run it comes from, and which of its pictures.
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -48,7 +48,7 @@ pub struct Ordering {
     pub worse: &'static str,
     /// The measure by which.
     pub by: &'static str,
-    /// May they be equal, within a twentieth of a decibel?
+    /// Whether they may be equal, within a twentieth of a decibel.
     pub or_equal: bool,
 }
 
@@ -165,8 +165,8 @@ pub struct Interval {
     pub high: f64,
 }
 
-/// Mean over groups of the mean of each, and its interval by resampling within each group (Efron 1979, percentiles). The
-/// draws are those of a fixed seed.
+/// Returns the mean over groups of the mean of each, and its interval by resampling within each group (Efron 1979,
+/// percentiles). The draws are those of a fixed seed.
 pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
     let groups: Vec<&Vec<f64>> = groups.iter().filter(|g| !g.is_empty()).collect();
     if groups.is_empty() {
@@ -176,7 +176,7 @@ pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
         groups.iter().enumerate().map(|(i, g)| mean_of(i, g)).sum::<f64>() / groups.len() as f64
     };
     let mean = over(&|_, g| g.iter().sum::<f64>() / g.len() as f64);
-    let mut drawn: Vec<f64> = (0..DRAWS)
+    let mut drawn: Vec<f64> = (0..RESAMPLES)
         .map(|draw| {
             over(&|i, g| {
                 let n = g.len() as u64;
@@ -186,11 +186,11 @@ pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
         })
         .collect();
     drawn.sort_by(f64::total_cmp);
-    let at = |share: f64| drawn[((DRAWS - 1) as f64 * share).round() as usize];
+    let at = |share: f64| drawn[((RESAMPLES - 1) as f64 * share).round() as usize];
     Some(Interval { mean, low: at(0.025), high: at(0.975) })
 }
 
-/// Does an ordering hold?
+/// Whether an ordering holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Holds {
@@ -210,7 +210,7 @@ impl Experiment {
         self.rows.iter().position(|r| r.table == table && r.row == row)
     }
 
-    /// Mean over the captures of a row.
+    /// Returns the mean over the captures of a row.
     fn mean(&self, row: usize, measure: usize) -> Option<f64> {
         let values: Vec<f64> = self.measured[row].iter().filter_map(|m| m.mean(measure)).collect();
         (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
@@ -227,8 +227,8 @@ impl Experiment {
         self.measured[row].iter().zip(&self.measured[from]).map(pair).collect()
     }
 
-    /// Whether an ordering holds, and by how much the better row is better: for each capture, and on average over those
-    /// that have both rows.
+    /// Returns whether an ordering holds, and by how much the better row is better: for each capture, and on average
+    /// over those that have both rows.
     pub fn holds(&self, ordering: &Ordering) -> (Vec<Verdict>, Verdict) {
         let measure = MEASURES.iter().position(|m| m.0 == ordering.by).unwrap_or(0);
         let rows = (self.index(ordering.table, ordering.better), self.index(ordering.table, ordering.worse));
@@ -257,12 +257,12 @@ impl Experiment {
         found.map(|p| p.value)
     }
 
-    /// Was a row judged by masks that its own run made, for a capture at least?
+    /// Returns whether, for at least one capture, a row was evaluated with masks that its own run made.
     fn judged_itself(&self, row: usize) -> bool {
         self.measured[row].iter().any(|m| m.masks.as_deref() == Some("run"))
     }
 
-    /// What a person reads of a row, marked where it was judged by its run's own masks.
+    /// Returns what a person reads of a row, marked where it was judged by its run's own masks.
     fn title(&self, row: usize) -> String {
         let mark = if self.judged_itself(row) { OWN_MASKS } else { "" };
         format!("{}{mark}", self.rows[row].title)
@@ -270,7 +270,7 @@ impl Experiment {
 }
 
 impl Experiment {
-    /// The measures that anything has, by their places in [`MEASURES`].
+    /// Returns the measures that anything has, by their places in [`MEASURES`].
     fn measures(&self) -> Vec<usize> {
         (0..MEASURES.len())
             .filter(|&k| k == 0 || (0..self.rows.len()).any(|i| self.mean(i, k).is_some()))
@@ -315,7 +315,7 @@ impl Experiment {
         out
     }
 
-    /// What is wrong with single runs, a sentence for each capture and problem.
+    /// Returns what is wrong with single runs, a sentence for each capture and problem.
     fn problems(&self) -> Vec<String> {
         let mut out: Vec<((&str, &str), Vec<&str>)> = Vec::new();
         for (k, capture) in self.captures.iter().enumerate() {
@@ -336,7 +336,7 @@ impl Experiment {
             .collect()
     }
 
-    /// The orderings as cells: the heading, then one line each.
+    /// Returns the orderings as cells: the heading, then one line each.
     fn verdicts(&self) -> Vec<Vec<String>> {
         let mut out = vec![vec!["as expected, by PSNR inside the mask".to_owned()]];
         out[0].extend(self.captures.iter().cloned());
@@ -372,7 +372,7 @@ impl Experiment {
             "{many} {captures} ({}), scale {} of the published effort. PSNR and SSIM are means over held-out photographs as \
              they were taken, then over captures; masks are the captures' own{own}. Seconds a view of an ensemble are \
              those of its members and of the blend. A row that some captures lack is the mean of the others; \
-             orderings on average are over the captures that have both rows. Intervals: {DRAWS} resamplings of the photographs.{}",
+             orderings on average are over the captures that have both rows. Intervals: {RESAMPLES} resamplings of the photographs.{}",
             self.captures.join(", "),
             self.scale,
             if self.published.is_empty() {
@@ -408,7 +408,7 @@ impl Experiment {
         out
     }
 
-    /// All of it, as JSON, with intervals and verdicts.
+    /// Returns all of it, as JSON, with intervals and verdicts.
     pub fn json(&self) -> String {
         let mut value = serde_json::json!(self);
         let rows: Vec<_> = (0..self.rows.len())

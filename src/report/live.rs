@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 /// Views on the page.
-const NEWEST: usize = 12;
+const MAX_VIEWS: usize = 12;
 
 /// A stage as the page shows it.
 #[derive(Serialize)]
@@ -46,7 +46,7 @@ pub fn live_html(
     let time = |name: &String| io::modified(&run.join(name)).unwrap_or(SystemTime::UNIX_EPOCH);
     let mut newest: Vec<(SystemTime, String)> = pictures(run).into_iter().map(|p| (time(&p), p)).collect();
     newest.sort_by(|a, b| b.cmp(a));
-    newest.truncate(NEWEST);
+    newest.truncate(MAX_VIEWS);
     // with the time, so that no browser shows an older picture of the same name
     let stamp =
         |time: SystemTime| time.duration_since(SystemTime::UNIX_EPOCH).map_or(0, |t| t.as_millis() as u64);
@@ -62,7 +62,7 @@ pub fn live_html(
     )
 }
 
-/// The fields that are being learned and have a checkpoint: the stage, and when that was saved.
+/// Returns the fields that are being learned and have a checkpoint: the stage, and when that was saved.
 fn learning(run: &Path) -> impl Iterator<Item = (Stage, SystemTime)> {
     LEARNED.into_iter().filter_map(move |(stage, _)| {
         let folder = run.join(stage);
@@ -72,7 +72,7 @@ fn learning(run: &Path) -> impl Iterator<Item = (Stage, SystemTime)> {
     })
 }
 
-/// The pictures of a run, relative to it.
+/// Returns the pictures of a run, relative to it.
 fn pictures(run: &Path) -> Vec<String> {
     // browsers show no EXR
     NAMES.iter().flat_map(|(word, _)| views(run, word)).filter(|name| !name.ends_with(".exr")).collect()

@@ -27,7 +27,7 @@ pub struct RunRow {
     pub state: String,
     /// Whether all stages are done.
     pub done: bool,
-    /// Did it end by an error?
+    /// Whether it ended with an error.
     pub failed: bool,
     /// The preset, if it can be read.
     pub preset: String,
@@ -39,7 +39,7 @@ pub struct RunRow {
     pub method: String,
     /// Masked PSNR of the mesh, as the best viewer of it shows.
     pub mesh_psnr: Option<f64>,
-    /// Is the mesh watertight?
+    /// Whether the mesh is watertight.
     pub watertight: Option<bool>,
     /// Of the mesh.
     pub triangles: Option<u64>,
@@ -130,13 +130,13 @@ fn state(run: &RunStatus) -> String {
     }
 }
 
-/// The first view of the best that a run shows, over black.
+/// Returns the first view of the best that a run shows, over black.
 fn picture(run: &Path) -> Option<String> {
     let file = NAMES.iter().rev().find_map(|(word, _)| views(run, word).into_iter().next())?;
     Some(picture_url(&small_view(&run.join(file), PICTURE_PX, 78)?))
 }
 
-/// The way from a folder to a file; the file itself if one of them does not exist.
+/// Returns the way from a folder to a file; the file itself if one of them does not exist.
 fn relative(file: &Path, folder: &Path) -> PathBuf {
     let (Ok(file), Ok(folder)) = (io::real_path(file), io::real_path(folder)) else { return file.into() };
     let shared = file.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
@@ -162,8 +162,8 @@ const DIGITS: [usize; FIGURES.len()] = [2, 4, 2, 2, 0, 1, 1, 1, 2, 0];
 /// Farther from the median than this many robust standard deviations is worth a look (Iglewicz and Hoaglin 1993).
 const OUTLIER: f64 = 3.5;
 
-/// Which of some values are far from the others, by the modified z-score: the distance from the median over 1.4826 times
-/// the median of all distances. Of fewer than five nothing is said.
+/// Returns which of some values are far from the others, by the modified z-score: the distance from the median over
+/// 1.4826 times the median of all distances. None of fewer than five.
 fn outliers(values: &[Option<f64>]) -> Vec<bool> {
     let median = |mut v: Vec<f64>| {
         v.sort_by(f64::total_cmp);

@@ -1,11 +1,11 @@
-//! What shaped a stage's result: settings, inputs, format version; and how two of them differ.
+//! Fingerprint of a stage's result: settings, inputs, format version; and the difference of two.
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Everything that shapes the result of a stage. Kept whole, not only hashed, so that a difference
-/// can be named key by key.
+/// Everything that affects the result of a stage. Stored in full, not only as a hash, so that a difference can be
+/// reported key by key.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Fingerprint {
     /// Version of the stage's files; raised when their meaning changes.
@@ -14,34 +14,34 @@ pub struct Fingerprint {
     pub settings: BTreeMap<String, String>,
     /// Name of an input to its own digest.
     pub inputs: BTreeMap<String, String>,
-    /// What of the input `capture` is not as it was, where that is known: for people, and no part of the digest.
+    /// The changed files of the input `capture`, if known; for messages, not part of the digest.
     #[serde(skip)]
     pub changed: Option<String>,
 }
 
 impl Fingerprint {
-    /// Settings alone.
+    /// Returns a fingerprint of settings.
     pub fn new(format: u32, settings: BTreeMap<String, String>) -> Fingerprint {
         Fingerprint { format, settings, ..Fingerprint::default() }
     }
 
-    /// With one more setting.
+    /// Adds a setting.
     pub fn setting(mut self, name: &str, value: impl ToString) -> Fingerprint {
         self.settings.insert(name.into(), value.to_string());
         self
     }
 
-    /// With one more input: the digest of the stage or file it comes from.
+    /// Adds an input: the digest of a stage or file.
     pub fn input(mut self, name: &str, digest: impl Into<String>) -> Fingerprint {
         self.inputs.insert(name.into(), digest.into());
         self
     }
 
-    /// SHA-256 over all of it, hexadecimal.
+    /// Returns the SHA-256 of the fingerprint, hexadecimal.
     pub fn digest(&self) -> String {
         let mut hash = Sha256::new();
         let mut part = |text: &str| {
-            // lengths between the texts: no two different lists run together into the same bytes
+            // lengths before the texts, so that different lists give different bytes
             hash.update((text.len() as u64).to_le_bytes());
             hash.update(text);
         };
@@ -57,12 +57,12 @@ impl Fingerprint {
         hex(&hash.finalize())
     }
 
-    /// SHA-256 of bytes, hexadecimal: the digest of a file.
+    /// Returns the SHA-256 of bytes, hexadecimal: the digest of a file.
     pub fn of_bytes(bytes: &[u8]) -> String {
         hex(&Sha256::digest(bytes))
     }
 
-    /// What differs from an `older` fingerprint, one line each; empty when nothing does.
+    /// Returns the differences from an `older` fingerprint, one line each.
     pub fn differences(&self, older: &Fingerprint) -> Vec<String> {
         let mut lines = Vec::new();
         if self.format != older.format {
@@ -79,8 +79,8 @@ impl Fingerprint {
         let names: BTreeSet<_> = self.inputs.keys().chain(older.inputs.keys()).collect();
         for name in names.into_iter().filter(|n| self.inputs.get(*n) != older.inputs.get(*n)) {
             lines.push(match (older.inputs.contains_key(name), self.inputs.contains_key(name)) {
-                (true, false) => format!("{name}: was part of it, is not asked for now"),
-                (false, true) => format!("{name}: is asked for now, was no part of it"),
+                (true, false) => format!("{name}: was an input, is none now"),
+                (false, true) => format!("{name}: is an input, was none before"),
                 _ => match &self.changed {
                     Some(changed) if name == "capture" => format!("{name}: {changed}"),
                     _ => format!("{name}: has changed since"),
@@ -108,11 +108,11 @@ mod tests {
             new.differences(&old),
             ["iface.rays: was not set, is 8", "iface.steps: was 20000, is 5000", "mask: has changed since"]
         );
-        // nothing about what is merely not asked for has changed
+        // an input that is no longer used is no changed input
         let other = Fingerprint::default().setting("iface.steps", 20000).input("tface", "cc");
         assert_eq!(
             other.differences(&old),
-            ["mask: was part of it, is not asked for now", "tface: is asked for now, was no part of it"]
+            ["mask: was an input, is none now", "tface: is an input, was none before"]
         );
         assert_ne!(new.digest(), old.digest());
         assert_eq!(old.digest(), old.clone().digest());

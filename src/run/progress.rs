@@ -1,7 +1,7 @@
-//! From a stage's steps to status, log and screen, each at its own pace; and a request to stop it, which knows what is
-//! at work.
+//! Reports a stage's progress to status, log and screen at different rates; and the stop request, which knows the running
+//! stage.
 //!
-//! All pacing is by the monotonic clock: setting the machine's time does not disturb it.
+//! All intervals use the monotonic clock, so that a change of the system time has no effect.
 
 use super::status::now;
 use super::{State, Status};
@@ -19,20 +19,20 @@ use std::time::{Duration, Instant};
 #[derive(Clone, Copy, Debug, Serialize)]
 #[serde(tag = "event", rename_all = "lowercase")]
 pub enum Event<'a> {
-    /// A stage begins, or goes on after an interruption.
+    /// A stage begins, or continues after an interruption.
     Started {
         /// Which.
         stage: &'a str,
     },
-    /// A stage's steps.
+    /// Progress of a stage.
     Progress {
         /// Which.
         stage: &'a str,
         /// Steps done.
         step: u64,
-        /// Steps in all.
+        /// Total number of steps.
         steps: u64,
-        /// Steps per second, of late.
+        /// Recent steps per second.
         rate: Option<f64>,
         /// Seconds left.
         eta_s: Option<f64>,
@@ -46,26 +46,26 @@ pub enum Event<'a> {
         stage: &'a str,
         /// Seconds of work.
         elapsed_s: f64,
-        /// Its figures.
+        /// Figures of the result.
         summary: &'a Value,
     },
-    /// A stage was complete already.
+    /// A stage was already complete.
     Skipped {
         /// Which.
         stage: &'a str,
     },
-    /// Something worth knowing.
+    /// A note.
     Note {
-        /// Which stage.
+        /// The stage.
         stage: &'a str,
-        /// A sentence.
+        /// The text, one sentence.
         text: &'a str,
     },
-    /// Something went differently than hoped.
+    /// A warning.
     Warning {
-        /// Where.
+        /// The stage, or the part of the run.
         stage: &'a str,
-        /// What.
+        /// The text.
         text: &'a str,
     },
 }
@@ -74,9 +74,9 @@ fn as_object<S: Serializer>(values: &[(&str, f64)], to: S) -> Result<S::Ok, S::E
     to.collect_map(values.iter().copied())
 }
 
-/// Shows or records events. Called from computing threads; must be quick.
+/// Receives events. Called from computing threads, so it must return quickly.
 pub trait Observer: Send + Sync {
-    /// Something happened.
+    /// Handles an event.
     fn event(&self, event: &Event);
 }
 
@@ -87,41 +87,41 @@ pub(super) struct Progress {
     stop: Stop,
     observer: Arc<dyn Observer>,
     start: Instant,
-    /// Seconds that earlier processes worked.
+    /// Seconds of work in earlier processes.
     before_s: f64,
     state: Mutex<(Status, Pace)>,
 }
 
 #[derive(Default)]
 struct Pace {
-    /// The step and moment the rate is measured from.
+    /// Step and time at the start of the current rate window.
     mark: Option<(u64, Instant)>,
     shown: Option<Instant>,
     logged: Option<Instant>,
     saved: Option<Instant>,
-    /// A status that cannot be written is reported once, not once a second.
+    /// Whether a failure to write the status was reported; it is reported once.
     complained: bool,
-    /// What was warned of.
+    /// Warnings so far.
     warnings: Vec<String>,
-    /// Has this process done a step?
+    /// Whether this process has completed a step.
     stepped: bool,
 }
 
 impl Pace {
     fn remember(&mut self, warning: &str) {
-        // once each, and as many as anybody reads
-        if self.warnings.len() < MOST_WARNINGS && !self.warnings.iter().any(|w| w == warning) {
+        // each text once, up to a limit
+        if self.warnings.len() < MAX_WARNINGS && !self.warnings.iter().any(|w| w == warning) {
             self.warnings.push(warning.to_owned());
         }
     }
 }
 
-const MOST_WARNINGS: usize = 50;
-const SHOW: Duration = Duration::from_millis(100);
-const LOG: Duration = Duration::from_secs(1);
-const SAVE: Duration = Duration::from_secs(2);
-/// The rate is renewed over windows of this length.
-const WINDOW: Duration = Duration::from_secs(3);
+const MAX_WARNINGS: usize = 50;
+const SHOW_INTERVAL: Duration = Duration::from_millis(100);
+const LOG_INTERVAL: Duration = Duration::from_secs(1);
+const SAVE_INTERVAL: Duration = Duration::from_secs(2);
+/// Length of the window over which the rate is measured.
+const RATE_WINDOW: Duration = Duration::from_secs(3);
 
 fn due(last: Option<Instant>, every: Duration) -> bool {
     last.is_none_or(|t| t.elapsed() >= every)
@@ -159,7 +159,7 @@ impl Progress {
         self.write(status, pace)
     }
 
-    /// The status of a stage that was stopped; failing to write it changes nothing about that.
+    /// Writes the status of a stopped stage; a failure to write is ignored.
     pub fn stopped(&self) {
         let _ = self.save(|s| {
             s.state = State::Stopped;
@@ -167,12 +167,12 @@ impl Progress {
         });
     }
 
-    /// Has this process done a step of the stage?
+    /// Returns whether this process has completed a step of the stage.
     pub fn has_stepped(&self) -> bool {
         self.state().1.stepped
     }
 
-    /// What was warned of, each once.
+    /// Returns the warnings, each once.
     pub fn warnings(&self) -> Vec<String> {
         self.state().1.warnings.clone()
     }
@@ -215,7 +215,7 @@ impl Monitor for Progress {
         let seconds = now.duration_since(since).as_secs_f64();
         if seconds > 0.2 && step > from {
             let fresh = (step - from) as f64 / seconds;
-            if status.rate.is_none() || now.duration_since(since) >= WINDOW {
+            if status.rate.is_none() || now.duration_since(since) >= RATE_WINDOW {
                 status.rate = Some(status.rate.map_or(fresh, |old| 0.5 * old + 0.5 * fresh));
                 pace.mark = Some((step, now));
             }
@@ -227,11 +227,11 @@ impl Monitor for Progress {
 
         let last = step >= steps;
         let mut trouble = None;
-        if last || due(pace.logged, LOG) {
+        if last || due(pace.logged, LOG_INTERVAL) {
             pace.logged = Some(now);
             trouble = self.log(step, steps, values).err();
         }
-        if due(pace.saved, SAVE) {
+        if due(pace.saved, SAVE_INTERVAL) {
             trouble = self.write(status, pace).err().or(trouble);
         }
         if let Some(e) = trouble
@@ -242,7 +242,7 @@ impl Monitor for Progress {
             pace.remember(&text);
             self.observer.event(&Event::Warning { stage: &self.stage, text: &text });
         }
-        if last || due(pace.shown, SHOW) {
+        if last || due(pace.shown, SHOW_INTERVAL) {
             pace.shown = Some(now);
             let (rate, eta_s) = (status.rate, status.eta_s);
             let stage = self.stage.as_str();
@@ -268,13 +268,13 @@ struct StopState {
 
 #[derive(Default)]
 struct CurrentStage {
-    /// The stage at work, and whether it saves what it has when asked to stop.
+    /// The running stage, and whether it saves a checkpoint on a stop request.
     stage: Option<(Arc<Progress>, bool)>,
-    /// When a stage began or ended last.
+    /// When a stage last began or ended.
     since: Option<Instant>,
 }
 
-/// A stage is at work as long as this lives.
+/// Marks a stage as running until it is dropped.
 pub(super) struct ActiveGuard<'a>(&'a Stop);
 
 impl Stop {
@@ -288,7 +288,7 @@ impl Stop {
         self.0.code.store(exit.code(), Ordering::SeqCst);
     }
 
-    /// The exit code to end with, if a stop was requested.
+    /// Returns the exit code to end with, if a stop was requested.
     pub fn requested(&self) -> Option<ErrorKind> {
         match self.0.code.load(Ordering::SeqCst) {
             0 => None,
@@ -297,14 +297,14 @@ impl Stop {
         }
     }
 
-    /// The error to end with, which says what is kept.
+    /// Returns the error to end with, which says what is kept.
     pub fn error(&self, kept: impl std::fmt::Display) -> Error {
         Error::stopped(kept).with_kind(self.requested().unwrap_or(ErrorKind::Interrupted))
     }
 
-    /// What to end the process with now, though nothing has come to its end. `None` while a stage that saves has
-    /// something to save, and within `patience` of a stage's beginning or end. The status of the stage then says that
-    /// it was stopped.
+    /// Returns what to end the process with now, though nothing has come to its end. `None` while a stage that saves
+    /// has something to save, and within `patience` of a stage's beginning or end. The status of the stage then says
+    /// that it was stopped.
     ///
     /// Nothing is lost by it that a stop would have kept: files are written aside and renamed, and only learning can
     /// go on in the middle of a stage.

@@ -10,9 +10,9 @@ use std::path::Path;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Phase {
-    /// Nothing was begun.
+    /// Not begun.
     Waiting,
-    /// A process works on it; on another machine: it was not heard to end.
+    /// A process is computing it; on another machine: no end was recorded.
     Running,
     /// Its process has ended without recording a reason.
     Killed,
@@ -20,9 +20,9 @@ pub enum Phase {
     Stopped,
     /// Ended by an error.
     Failed,
-    /// What it left cannot be read.
+    /// Its files cannot be read.
     Unreadable,
-    /// Of a run: some stages are done, none is at work.
+    /// For a run: some stages are done, none is running.
     Begun,
     /// Complete.
     Done,
@@ -31,7 +31,7 @@ pub enum Phase {
 /// A stage of a run.
 #[derive(Clone, Debug)]
 pub struct StageStatus {
-    /// Which.
+    /// The stage.
     pub stage: Stage,
     /// Its state.
     pub phase: Phase,
@@ -39,36 +39,36 @@ pub struct StageStatus {
     pub status: Option<Status>,
     /// Its `done.json`.
     pub record: Option<Record>,
-    /// What it failed with, or why it cannot be read.
+    /// Its error, or why it cannot be read.
     pub error: Option<String>,
-    /// Seconds by the clock that are left of it.
+    /// Estimated seconds left (wall clock).
     pub left_s: f64,
 }
 
-/// A run.
+/// The state of a run.
 #[derive(Clone, Debug)]
 pub struct RunStatus {
-    /// The stages that it is to have, in order; where it does not say, all of them.
+    /// The planned stages, in order; all stages if the run has no plan.
     pub stages: Vec<StageStatus>,
     /// Its state.
     pub phase: Phase,
-    /// The stage at work, else the one that ended last without being done.
+    /// The running stage, else the last one that ended unfinished.
     pub at: Option<Stage>,
-    /// What a command on it, or one of its stages, ended with.
+    /// The error of a command on it, or of one of its stages.
     pub error: Option<String>,
-    /// Seconds by the clock that are left of all stages, at the pace of those that are done; `None` where the run has
-    /// no estimate.
+    /// Estimated seconds left of all stages (wall clock), at the measured speed of those that are done; `None` without
+    /// an estimate.
     pub left_s: Option<f64>,
     /// Seconds of work so far.
     pub elapsed_s: f64,
 }
 
-/// `failed.json`: what a command ended with before any stage could say so.
+/// `failed.json`: the error of a command that ended before its first stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Failure {
-    /// What was wrong.
+    /// The problem.
     pub error: String,
-    /// What to do about it.
+    /// The suggested fix.
     pub hint: String,
     /// The exit code.
     pub exit: u8,
@@ -171,12 +171,12 @@ impl StageStatus {
     }
 }
 
-/// Does the process of a status still work on a stage? Of one on another machine nobody here can tell.
+/// Returns whether the process of a status still runs; unknown, so assumed, for one on another machine.
 fn is_alive(status: &Status, folder: &Path) -> bool {
     status.host != super::status::host() || io::has_open(status.pid, &folder.join(LOCK))
 }
 
-/// The `failed.json` of a run; nothing if it cannot be read, for it only tells of others.
+/// Returns the `failed.json` of a run; nothing if it cannot be read, for it only tells of others.
 pub fn read_failure(run: &Path) -> Option<Failure> {
     let path = run.join(FAILED);
     io::is_file(&path).then(|| io::read_typed(&path, &Limits::default()).ok()).flatten()

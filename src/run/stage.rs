@@ -1,4 +1,4 @@
-//! One stage of a run: skipped, refused, or worked on under its lock.
+//! One stage of a run: skipped, refused, or executed under its lock.
 
 use super::progress::Progress;
 use super::status::{TIMED, host, now};
@@ -14,19 +14,19 @@ use std::sync::Arc;
 /// What a stage is about to do.
 #[derive(Clone, Debug)]
 pub struct Plan<'a> {
-    /// Its name: the word of a stage.
+    /// Name of the stage.
     pub name: &'a str,
-    /// Everything that shapes its result.
+    /// Everything that affects the result.
     pub fingerprint: Fingerprint,
-    /// The device asked for, for `status.json`.
+    /// The requested device, for `status.json`.
     pub device: &'a str,
-    /// Bytes it will need on the disk, roughly.
+    /// Estimated disk space, bytes.
     pub needs_bytes: u64,
-    /// Whether it saves its progress on a request to stop, to resume from it. A stage that does not is not waited for.
+    /// Whether the stage saves its progress on a stop request. The process does not wait for a stage that does not.
     pub saves: bool,
 }
 
-/// The folder of a stage at work: where to put files, how to report.
+/// The folder of a running stage, and its progress reports.
 pub struct StageDir {
     folder: std::path::PathBuf,
     identity: String,
@@ -34,42 +34,42 @@ pub struct StageDir {
 }
 
 impl StageDir {
-    /// The folder.
+    /// Returns the folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Digest of everything that shapes the stage's result.
+    /// Digest of everything that affects the stage's result.
     pub fn identity(&self) -> &str {
         &self.identity
     }
 
-    /// Progress out, stop request in.
+    /// Returns the monitor: progress out, stop request in.
     pub fn monitor(&self) -> &dyn Monitor {
         self.progress.as_ref()
     }
 
-    /// `step` of `steps` is done.
+    /// Reports that `step` of `steps` is done.
     ///
     /// # Errors
     ///
-    /// A request to stop.
+    /// Fails after a stop request.
     pub fn step(&self, step: usize, steps: usize) -> Result<()> {
         self.progress.step(step as u64, steps as u64, &[]);
         self.check_stop()
     }
 
-    /// Fails after a request to stop.
+    /// Fails after a stop request.
     pub fn check_stop(&self) -> Result<()> {
         self.progress.check_stop()
     }
 
-    /// Reports something worth knowing.
+    /// Reports a note.
     pub fn note(&self, text: &str) {
         self.progress.note(text);
     }
 
-    /// Reports something that went differently than hoped.
+    /// Reports a warning.
     pub fn warn(&self, text: &str) {
         self.progress.warn(text);
     }
@@ -78,17 +78,16 @@ impl StageDir {
 /// A complete stage.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Done {
-    /// Digest of its fingerprint: an input of the stages that build on it.
+    /// Digest of its fingerprint: an input of the stages that depend on it.
     pub digest: String,
     /// Figures of the result.
     pub summary: Value,
-    /// It was complete already.
+    /// Whether it was already complete.
     pub skipped: bool,
 }
 
 impl Run {
-    /// Sees to it that a stage is complete: skips it if it is, else lets `work` do it and records
-    /// the figures it returns.
+    /// Completes a stage: skips it if it is complete, else calls `work` and records the returned figures.
     ///
     /// ```
     /// use tiface::run::{Fingerprint, Plan, Run};
@@ -102,14 +101,14 @@ impl Run {
     /// let done = run.stage(plan(5), |_| Ok(29.5.into()))?;
     /// assert_eq!((done.summary.as_f64(), done.skipped), (Some(29.5), false));
     /// assert!(run.stage(plan(5), |_| unreachable!())?.skipped);
-    /// // other settings are neither computed nor passed over in silence
+    /// // other settings are an error, neither computed nor ignored
     /// let error = run.stage(plan(6), |_| unreachable!()).unwrap_err();
     /// assert!(error.to_string().contains("iface.steps: was 5, is 6"));
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     ///
-    /// Exit code 75 if another process holds the stage, 1 if it was done or begun with another
-    /// fingerprint or if the disk has too little room. `work` leaves the stage's files in
+    /// Exit code 75 if another process holds the stage's lock, 1 if it was done or begun with another
+    /// fingerprint or if the disk has too little space. `work` leaves the stage's files in
     /// [`StageDir::folder`], complete and durable, before it returns.
     pub fn stage(&self, plan: Plan, work: impl FnOnce(&StageDir) -> Result<Value>) -> Result<Done> {
         let name = plan.name;
@@ -176,9 +175,8 @@ impl Run {
         }
     }
 
-    /// Checks that the content of the stage's folder was made, or begun, with this plan. An error that prints the
-    /// differences if not; an empty folder agrees with everything. An error, too, if what lies there was made by
-    /// no stage.
+    /// Checks that the content of the stage's folder was made, or begun, with this plan. Fails with the differences if
+    /// not, and if the files were made by no stage; an empty folder is accepted.
     pub fn agrees(&self, plan: &Plan) -> Result<()> {
         // a record that cannot be read counts as none, and is reported when the stage is worked on
         if let Ok(Some(record)) = read_record(&self.path(plan.name)) {
@@ -189,7 +187,7 @@ impl Run {
         self.begun(plan).map(|_| ())
     }
 
-    /// An error if a stage needs more room than its disk has with so many bytes `removed`.
+    /// Fails if a stage needs more space than its disk has after `removed` bytes are freed.
     pub fn require_room(&self, plan: &Plan, removed: u64) -> Result<()> {
         // a stage's folder may be a link to another disk
         let free = io::free_bytes(&self.path(plan.name)).or_else(|| io::free_bytes(&self.dir));
@@ -204,12 +202,13 @@ impl Run {
         ))
     }
 
-    /// Bytes of the files of a stage, by their path in its folder; of what has a record of its own below it none.
+    /// Returns the bytes of the files of a stage, by their path in its folder; of what has a record of its own below it
+    /// none.
     pub fn files(&self, stage: &str) -> Result<BTreeMap<String, u64>> {
         Ok(io::file_sizes(&self.path(stage), &has_record)?)
     }
 
-    /// Is the stage complete, as planned?
+    /// Returns whether the stage is complete, as planned.
     pub fn is_done(&self, plan: &Plan) -> bool {
         let record = read_record(&self.path(plan.name));
         record.is_ok_and(|r| r.is_some_and(|r| r.fingerprint == plan.fingerprint))
@@ -239,7 +238,7 @@ impl Run {
         Ok(Some(Done { digest, summary, skipped: true }))
     }
 
-    /// Seconds of work an earlier process left in the folder; an error if it had other settings.
+    /// Returns the seconds of work of earlier processes in the folder; fails if they had other settings.
     fn begun(&self, plan: &Plan) -> Result<f64> {
         let Ok(Some(status)) = read_status(&self.path(plan.name)) else { return Ok(0.0) };
         same(plan, &status.fingerprint, false)?;
@@ -308,8 +307,8 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
     ))
 }
 
-/// Removes half-written files in a stage's folder and the folders in it; not behind links, nor where another
-/// process may be writing.
+/// Removes temporary files in a stage's folder and its subfolders, except behind links and in folders that another process
+/// may be writing.
 fn sweep(folder: &Path) -> Result<usize> {
     if io::is_link(folder) {
         return Ok(0);

@@ -1,5 +1,4 @@
-//! `status.json` and `done.json`: what a stage says of itself; and `estimate.json`: what the stages of a run may cost,
-//! estimated before they run.
+//! `status.json` and `done.json`: progress and record of a stage; `estimate.json`: estimated cost of the stages of a run.
 
 use super::Fingerprint;
 use crate::io::{self, Limits, ReadError};
@@ -15,7 +14,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum State {
-    /// A process works on it, or was killed while it did.
+    /// A process is computing it, or was killed meanwhile.
     Running,
     /// Complete.
     Done,
@@ -32,30 +31,30 @@ pub struct Status {
     pub state: State,
     /// Steps done.
     pub step: u64,
-    /// Steps in all; 0 while unknown.
+    /// Total number of steps; 0 while unknown.
     pub steps: u64,
-    /// Steps per second, of late.
+    /// Recent steps per second.
     pub rate: Option<f64>,
     /// Seconds left at this rate.
     pub eta_s: Option<f64>,
-    /// Seconds of work so far, those of earlier, stopped processes included.
+    /// Seconds of work so far, including earlier, stopped processes.
     pub elapsed_s: f64,
-    /// The device asked for.
+    /// The requested device.
     pub device: String,
     /// The process.
     pub pid: u32,
     /// The machine.
     pub host: String,
-    /// What ended it.
+    /// The error that ended it.
     pub error: Option<String>,
-    /// Seconds since 1970 when this was written; for people, nothing is computed from it.
+    /// When this was written, in seconds since 1970; for users, nothing depends on it.
     pub updated: u64,
-    /// What shapes the result, so that a stage begun with other settings is noticed.
+    /// Fingerprint of the result, so that a stage begun with other settings is detected.
     pub fingerprint: Fingerprint,
 }
 
 impl Status {
-    /// Returns the steps done, in whole per cent; `None` while nobody knows how many there are.
+    /// Returns the steps done, in whole per cent; `None` while the total is unknown.
     pub fn percent(&self) -> Option<u64> {
         let share = self.step as f64 / self.steps as f64;
         (self.steps > 0).then_some((100.0 * share.min(1.0)) as u64)
@@ -65,39 +64,39 @@ impl Status {
 /// `done.json`: the stage is complete.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Record {
-    /// Which stage.
+    /// The stage.
     pub stage: String,
-    /// Everything that shaped the result.
+    /// Everything that affected the result.
     pub fingerprint: Fingerprint,
-    /// The same as one hexadecimal number, for stages that build on this one.
+    /// Digest of the fingerprint, an input of the stages that depend on this one.
     pub digest: String,
     /// Figures of the result.
     pub summary: Value,
     /// Seconds of work.
     pub elapsed_s: f64,
-    /// Seconds of all processor cores, of the process that finished it; `None` in older records.
+    /// CPU seconds of the process that finished it; `None` in older records.
     #[serde(default)]
     pub cpu_s: Option<f64>,
-    /// The most memory of the process meanwhile, bytes; `None` where the system does not say.
+    /// Peak memory of the process, bytes; `None` if the system does not report it.
     #[serde(default)]
     pub peak_bytes: Option<u64>,
-    /// What went differently than hoped.
+    /// Warnings.
     #[serde(default)]
     pub warnings: Vec<String>,
-    /// Bytes of each file that the stage left, by its path in the stage's folder; empty in older records.
+    /// Size of each file of the stage, bytes, by its path in the stage's folder; empty in older records.
     #[serde(default)]
     pub products: BTreeMap<String, u64>,
     /// Seconds since 1970.
     pub finished: u64,
-    /// The version of `tiface`.
+    /// Version of `tiface`.
     pub version: String,
 }
 
-/// Files that tell when things happened, and are no products of a stage.
+/// Files that record times, and are no products of a stage.
 pub(super) const TIMED: [&str; 3] = ["done.json", "status.json", "log.jsonl"];
 
-/// Files that no stage reads, for people and other programs: a run is whole without them. `tiface mesh --out` writes the
-/// head again from what the stage `mesh` keeps in `parts`.
+/// Files that no stage reads; a run is complete without them. `tiface mesh --out` writes the head again from the stage's
+/// folder `parts`.
 const EXPORTS: [&str; 10] = [
     "head.glb",
     "head.obj",
@@ -117,7 +116,7 @@ impl Record {
     ///
     /// # Errors
     ///
-    /// Another file is no longer in the folder, or one has another size.
+    /// Fails if another file is missing from the folder, or has another size.
     pub fn require_products(&self, folder: &Path) -> Result<Vec<&str>> {
         let mut moved = Vec::new();
         for (name, &bytes) in &self.products {
@@ -151,7 +150,7 @@ impl Record {
     }
 }
 
-/// The `status.json` of a stage folder; `None` if there is none.
+/// Returns the `status.json` of a stage folder; `None` if there is none.
 pub fn read_status(folder: &Path) -> Result<Option<Status>, ReadError> {
     let path = folder.join("status.json");
     let status: Option<Status> = read(&path)?;
@@ -162,7 +161,7 @@ pub fn read_status(folder: &Path) -> Result<Option<Status>, ReadError> {
     Ok(status)
 }
 
-/// The `done.json` of a stage folder; `None` if there is none.
+/// Returns the `done.json` of a stage folder; `None` if there is none.
 pub fn read_record(folder: &Path) -> Result<Option<Record>, ReadError> {
     let path = folder.join("done.json");
     let record: Option<Record> = read(&path)?;
@@ -180,7 +179,7 @@ pub fn read_record(folder: &Path) -> Result<Option<Record>, ReadError> {
     Ok(record)
 }
 
-/// Times and rates; JSON holds no number that is not finite.
+/// Serializes times and rates; JSON has no number that is not finite.
 fn not_negative(path: &Path, key: &str, value: Option<f64>) -> Result<(), ReadError> {
     match value.filter(|v| !(0.0..=1e15).contains(v)) {
         Some(v) => Err(ReadError::value(path, key, v, "a number from 0 to 1e15")),
@@ -200,7 +199,7 @@ pub(super) fn now() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs())
 }
 
-/// The machine's name, as far as it is known without asking the network.
+/// Returns the machine's name, as far as it is known without asking the network.
 pub(super) fn host() -> String {
     let kernel = io::read_bytes(Path::new("/proc/sys/kernel/hostname"), &Limits::default());
     match kernel.map(|b| String::from_utf8_lossy(&b).trim().to_string()) {
@@ -209,17 +208,17 @@ pub(super) fn host() -> String {
     }
 }
 
-/// Its name in a run.
+/// Its file name in a run.
 pub const ESTIMATE: &str = "estimate.json";
 
-/// Estimated cost of a stage; displays correct it by what is measured meanwhile.
+/// Estimated cost of a stage; displays correct it by measured times.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Cost {
-    /// Seconds of one processor core; the clock shows them divided by the cores at work.
+    /// CPU seconds.
     pub cpu_s: f64,
-    /// The most memory, bytes.
+    /// Peak memory, bytes.
     pub memory_bytes: u64,
-    /// Room for its files, checkpoints that are being written included, bytes.
+    /// Disk space for its files, including checkpoints being written, bytes.
     pub disk_bytes: u64,
 }
 
@@ -230,7 +229,7 @@ impl Cost {
     }
 }
 
-/// One after the other: times and files add up, memory is given back in between.
+/// Sums costs of stages that run one after the other: times and files add up, memory is the maximum.
 impl Add for Cost {
     type Output = Cost;
 
@@ -243,10 +242,10 @@ impl Add for Cost {
     }
 }
 
-/// Stages that a run is to have, by their words, with what each may cost.
+/// The planned stages of a run, by name, with the estimated cost of each.
 pub type Estimate = BTreeMap<String, Cost>;
 
-/// The `estimate.json` of a run; `None` if there is none.
+/// Returns the `estimate.json` of a run; `None` if there is none.
 pub fn read_estimate(run: &Path) -> Result<Option<Estimate>, ReadError> {
     let path = run.join(ESTIMATE);
     if !io::is_file(&path) {
@@ -266,7 +265,7 @@ mod tests {
     use super::*;
     use serde_json::json;
 
-    /// What reading `name` says after `change`.
+    /// Returns what reading `name` says after `change`.
     fn after(name: &str, change: &dyn Fn(&mut Value)) -> Option<ReadError> {
         let dir = tempfile::tempdir().unwrap();
         let folder = dir.path().join("iface");

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 type Source = (PathBuf, Vec<u8>);
 
 /// COLMAP's own limit is that of the file system.
-const LONGEST_NAME: usize = 4096;
+const MAX_NAME_BYTES: usize = 4096;
 
 /// Reads a model; the points are optional.
 pub(super) fn read(
@@ -99,9 +99,9 @@ impl<'b> Cursor<'b> {
     }
 
     fn name(&mut self) -> Result<String, ReadError> {
-        let window = &self.bytes[self.at..][..self.left().min(LONGEST_NAME + 1)];
+        let window = &self.bytes[self.at..][..self.left().min(MAX_NAME_BYTES + 1)];
         let Some(length) = window.iter().position(|&b| b == 0) else {
-            return Err(self.bad(format!("a name does not end within {LONGEST_NAME} bytes")));
+            return Err(self.bad(format!("a name does not end within {MAX_NAME_BYTES} bytes")));
         };
         let name = std::str::from_utf8(&window[..length]).map_err(|_| self.bad("a name is not UTF-8"))?;
         self.at += length + 1;

@@ -134,7 +134,7 @@ impl Studio {
         self.loose_hair(origin + closest.1 * direction, closest.0, direction)
     }
 
-    /// The crossing between `outside` and `inside` by halving, to some micrometres.
+    /// Returns the crossing between `outside` and `inside` by halving, to some micrometres.
     fn cross(&self, origin: Vec3, direction: Vec3, mut outside: f32, mut inside: f32) -> f32 {
         for _ in 0..8 {
             let middle = 0.5 * (outside + inside);
@@ -143,7 +143,7 @@ impl Studio {
         0.5 * (outside + inside)
     }
 
-    /// A ray that just missed the hair meets some of its fringe of single hairs.
+    /// Returns the color of the fringe of single hairs, for a ray that just misses the hair.
     fn loose_hair(&self, p: Vec3, miss: f32, direction: Vec3) -> RayLight {
         if miss > FUZZ {
             return RayLight::default();
@@ -196,7 +196,7 @@ impl Studio {
         (1.0 - 0.42 * closed).clamp(0.15, 1.0)
     }
 
-    /// Share of a lamp seen from `p`: 0 behind something, soft beside it.
+    /// Returns the share of a lamp seen from `p`: 0 behind something, soft beside it.
     fn clearance(&self, p: Vec3, towards: Vec3) -> f32 {
         let Some((_, leave)) = self.grid.bounds.intersect(p, towards) else { return 1.0 };
         let (mut t, mut open) = (0.006f32, 1.0f32);
@@ -247,7 +247,7 @@ impl DistanceGrid {
         })
     }
 
-    /// A stride that surely meets nothing: the slope is at most 1, so the trilinear value errs by
+    /// Returns a step that cannot cross the surface: the slope is at most 1, so the trilinear value errs by
     /// less than a cell's diagonal.
     fn air(&self, p: Vec3) -> f32 {
         self.distance(p) - 1.75 * CELL
@@ -261,7 +261,7 @@ struct Lamp {
     pub shadow: bool,
 }
 
-/// The lamps that light the head: key from the upper left, fill from the right, one from behind
+/// Returns the lamps that light the head: key from the upper left, fill from the right, one from behind
 /// and above, one from below in front.
 fn lamps() -> [Lamp; 4] {
     let lamp = |x: f32, y: f32, z: f32, light: [f32; 3], shadow| Lamp {
@@ -284,7 +284,7 @@ struct Reflectance {
     pub shine: (f32, f32),
 }
 
-/// The surface at `q` (head coordinates) made of `material`.
+/// Returns the surface at `q` (head coordinates) made of `material`.
 fn reflectance(q: Vec3, material: HeadMaterial) -> Reflectance {
     match material {
         HeadMaterial::Skin => Reflectance { albedo: skin(q), shine: (0.10, 22.0) },
@@ -373,7 +373,7 @@ fn garment(q: Vec3) -> Vec3 {
 /// Radius of the sphere of lamps around the head, metres.
 const LAMP_RADIUS: f32 = 1.7;
 
-/// What a ray that misses the head sees.
+/// Returns what a ray that misses the head sees.
 fn background(origin: Vec3, direction: Vec3) -> Vec3 {
     // the far wall: |o + t·d| = R
     let o = origin - OFFSET;

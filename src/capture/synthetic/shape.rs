@@ -87,13 +87,13 @@ impl SyntheticHead {
         (Vec3::from_array(rise).normalize_or_zero(), here.material())
     }
 
-    /// Distance from `p` to the surface, metres, ≥ 0, to first order: `|sdf| / |∇sdf|`. Good within
+    /// Returns the distance from `p` to the surface, metres, ≥ 0, to first order: `|sdf| / |∇sdf|`. Good within
     /// a few millimetres of the surface, where reconstructions are judged.
     pub fn distance(&self, p: Vec3) -> f32 {
         self.sdf(p).abs() / self.gradient(p).length().max(0.05)
     }
 
-    /// The box around the bust, world.
+    /// Returns the box around the bust, world.
     pub fn bounds(&self) -> Aabb {
         Aabb { min: OFFSET + Vec3::new(-0.122, -0.126, -0.193), max: OFFSET + Vec3::new(0.122, 0.126, 0.148) }
     }
@@ -127,7 +127,7 @@ impl SyntheticHead {
 }
 
 impl MaterialDistances {
-    /// The union of all materials; skin and hair meet without a crack.
+    /// Returns the union of all materials; skin and hair meet without a crack.
     pub fn whole(&self) -> f32 {
         union(self.skin.min(self.eye), self.hair, 0.002).min(self.garment)
     }
@@ -227,7 +227,7 @@ pub(super) fn lower_lip(s: Vec3) -> f32 {
 /// The middle of the ear on the +X side, head coordinates.
 const EAR: Vec3 = Vec3::new(0.0765, 0.020, -0.006);
 
-/// A flat leaf leaning back and out, hollowed from the side, with a lobe.
+/// Returns a flat leaf leaning back and out, hollowed from the side, with a lobe.
 fn ear(s: Vec3) -> f32 {
     let p = s - EAR;
     // u across the leaf, v back, z up; it leans out by 0.45 rad and back by 0.25
@@ -258,7 +258,7 @@ fn garment(q: Vec3) -> f32 {
     intersection(cloth, -0.190 - q.z, 0.012)
 }
 
-/// A ring of tube radius `tube` around an axis leaning forward like the neck.
+/// Returns a ring of tube radius `tube` around an axis leaning forward like the neck.
 fn ring(p: Vec3, radius: f32, tube: f32) -> f32 {
     let z = 0.96 * p.z - 0.28 * p.y;
     let y = 0.28 * p.z + 0.96 * p.y;
@@ -266,7 +266,7 @@ fn ring(p: Vec3, radius: f32, tube: f32) -> f32 {
     Vec2::new(out, 0.45 * z).length() - tube
 }
 
-/// The cap: the skull grown outward, ended by a ragged hairline, displaced along strands.
+/// Returns the cap: the skull grown outward, ended by a ragged hairline, displaced along strands.
 fn hair(q: Vec3, skull: f32) -> f32 {
     // hair above a plane rising from the nape over the ears to the forehead; sideburns before the
     // ears hang below it, the ears stay free
@@ -286,13 +286,14 @@ fn hair(q: Vec3, skull: f32) -> f32 {
     intersection(cap, line, 0.024)
 }
 
-/// How far the hairline is pushed back or let down, metres.
+/// Returns how far the hairline is pushed back or let down, metres.
 fn fringe(q: Vec3) -> f32 {
     let slant = noise(Vec3::new(q.x * 95.0 + 25.0 * q.z, q.y * 60.0, 3.0));
     0.011 * (slant - 0.5)
 }
 
-/// Where strands run from the whorl, as a unit vector that is the same along each, and the distance from it, metres.
+/// Returns where strands run from the whorl, as a unit vector that is the same along each, and the distance from it,
+/// metres.
 pub(super) fn combed(q: Vec3) -> (Vec2, f32) {
     let from_whorl = Vec2::new(q.x + 0.010, q.y - 0.055);
     let reach = from_whorl.length();
@@ -321,7 +322,7 @@ fn ellipsoid(p: Vec3, radii: Vec3) -> f32 {
     if k0 < 1e-3 { -radii.min_element() } else { k0 * (k0 - 1.0) / k1 }
 }
 
-/// A capsule from `a` to `b` whose radius goes linearly from `ra` to `rb`.
+/// Returns a capsule from `a` to `b` whose radius goes linearly from `ra` to `rb`.
 fn cone(p: Vec3, a: Vec3, b: Vec3, ra: f32, rb: f32) -> f32 {
     let (pa, ba) = (p - a, b - a);
     let h = (pa.dot(ba) / ba.length_squared()).clamp(0.0, 1.0);
@@ -350,7 +351,7 @@ pub(super) fn smooth(a: f32, b: f32, x: f32) -> f32 {
     t * t * (3.0 - 2.0 * t)
 }
 
-/// A uniform number in 0..1, a pure function of its three keys.
+/// Returns a uniform number in 0..1, a pure function of its three keys.
 pub(super) fn unit(seed: u64, a: u32, b: u32) -> f32 {
     let key = seed ^ ((a as u64) << 32 | b as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
     (mix(key) >> 40) as f32 / (1u64 << 24) as f32

@@ -50,7 +50,7 @@ pub struct PixelGraph {
 }
 
 impl PixelGraph {
-    /// A graph without any capacity.
+    /// Returns a graph without any capacity.
     pub fn new(width: usize, height: usize) -> PixelGraph {
         let row = width + 2;
         let n = row * (height + 2);
@@ -148,7 +148,7 @@ impl PixelGraph {
         }
     }
 
-    /// Can flow run between `p` and its neighbor in the sense of `p`'s tree, away from the root?
+    /// Returns whether flow can run between `p` and its neighbor in the sense of `p`'s tree, away from the root.
     fn open(&self, p: usize, direction: usize, q: usize) -> bool {
         if self.tree[p] == HEAD {
             self.residual[p][direction] > 0
@@ -185,7 +185,7 @@ impl PixelGraph {
         None
     }
 
-    /// The edge that carries flow between a node and its parent: the node it leaves, and in which direction.
+    /// Returns the edge that carries flow between a node and its parent: the node it leaves, and in which direction.
     fn edge_to_parent(&self, p: usize) -> (usize, usize) {
         let up = self.parent[p] as usize;
         if self.tree[p] == HEAD { (self.step(p, up), up ^ 1) } else { (p, up) }
@@ -282,7 +282,7 @@ impl PixelGraph {
         self.tree[p] = 0;
     }
 
-    /// May flow run between the root and `p` through its neighbor `q` in this direction?
+    /// Returns whether flow may run between the root and `p` through its neighbor `q` in this direction.
     fn feeds(&self, q: usize, p: usize, direction: usize) -> bool {
         if self.tree[p] == HEAD {
             self.residual[q][direction ^ 1] > 0

@@ -2,7 +2,7 @@
 //!
 //! `p(c) = Σ_k w_k · N(c; μ_k, Σ_k)`. It starts from seeded k-means (Arthur & Vassilvitskii 2007) and is refitted
 //! as in GrabCut (Rother, Kolmogorov, Blake 2004): every color goes to its likeliest Gaussian, whose mean and
-//! covariance are measured anew. A covariance always gains what 8-bit rounding and sensor noise leave at least,
+//! covariance are measured again. A covariance always gains the least that 8-bit rounding and sensor noise leave,
 //! so that one flat color is no singular Gaussian.
 
 use crate::geom::cofactors;
@@ -12,7 +12,7 @@ use crate::kernel::cpu::rng;
 pub type Rgb = [u8; 3];
 
 /// What every variance gains, in squared steps of 8 bit: a standard deviation of one step.
-const LEAST_VARIANCE: f64 = 1.0;
+const MIN_VARIANCE: f64 = 1.0;
 
 /// The stream of random numbers that the k-means start draws from.
 const STREAM: u64 = 0x6d_6978_7475_7265;
@@ -80,7 +80,7 @@ impl Mixture {
         Some(Mixture::measure(colors, &member, centers.len()))
     }
 
-    /// Sends every color to its likeliest Gaussian and measures these anew; unchanged without colors.
+    /// Sends every color to its likeliest Gaussian and measures these again; unchanged without colors.
     pub fn refit(&self, colors: &[Rgb]) -> Mixture {
         if colors.is_empty() {
             return self.clone();
@@ -128,14 +128,14 @@ impl Gaussian {
         let mean = [s[1] as f64 / n, s[2] as f64 / n, s[3] as f64 / n];
         let c = |k: usize, a: usize, b: usize| s[k] as f64 / n - mean[a] * mean[b];
         let (xx, yy, zz) = (
-            c(4, 0, 0).max(0.0) + LEAST_VARIANCE,
-            c(7, 1, 1).max(0.0) + LEAST_VARIANCE,
-            c(9, 2, 2).max(0.0) + LEAST_VARIANCE,
+            c(4, 0, 0).max(0.0) + MIN_VARIANCE,
+            c(7, 1, 1).max(0.0) + MIN_VARIANCE,
+            c(9, 2, 2).max(0.0) + MIN_VARIANCE,
         );
         let (xy, xz, yz) = (c(5, 0, 1), c(6, 0, 2), c(8, 1, 2));
         let (cofactors, det) = cofactors([xx, xy, xz, yy, yz, zz]);
-        // the floor on the diagonal keeps it above LEAST_VARIANCE³ up to rounding
-        let det = det.max(0.5 * LEAST_VARIANCE.powi(3));
+        // the floor on the diagonal keeps it above MIN_VARIANCE³ up to rounding
+        let det = det.max(0.5 * MIN_VARIANCE.powi(3));
         let precision = cofactors.map(|v| v / det);
         let weight = n / total as f64;
         let offset = weight.ln() - 0.5 * (det.ln() + 3.0 * std::f64::consts::TAU.ln());
@@ -151,7 +151,7 @@ impl Gaussian {
     }
 }
 
-/// Which value is the largest, of equals the first.
+/// Returns which value is the largest, of equals the first.
 fn first_largest(values: impl Iterator<Item = f64>) -> usize {
     let mut best = (f64::NEG_INFINITY, 0);
     for (k, value) in values.enumerate() {

@@ -242,7 +242,7 @@ pub fn closed_form(photo: &Photo, mask: &Gray, trimap: &Gray, options: &ClosedFo
     Ok(Matte { alpha, rounds, unknowns: pixels.len() })
 }
 
-/// The matting Laplacian of the windows that hold an unknown pixel, and which pixel each row is.
+/// Returns the matting Laplacian of the windows that hold an unknown pixel, and which pixel each row is.
 fn assemble(photo: &Photo, trimap: &Gray, epsilon: f64) -> (Stencil, Vec<u32>) {
     const NONE: u32 = u32::MAX;
     let (width, height) = (photo.width as usize, photo.height as usize);
@@ -304,7 +304,7 @@ fn assemble(photo: &Photo, trimap: &Gray, epsilon: f64) -> (Stencil, Vec<u32>) {
     (matrix, pixels)
 }
 
-/// Colors of a window less their mean, `d`, and `(Σ + ε/9 · 1)⁻¹ d`.
+/// Returns the colors of a window less their mean, `d`, and `(Σ + ε/9 · 1)⁻¹ d`.
 fn window(colors: &[[u8; 3]; 9], epsilon: f64) -> ([[f64; 3]; 9], [[f64; 3]; 9]) {
     let coded = colors.map(|c| c.map(|v| v as f64 / 255.0));
     let mean: [f64; 3] = std::array::from_fn(|k| coded.iter().map(|c| c[k]).sum::<f64>() / 9.0);
@@ -324,7 +324,7 @@ fn window(colors: &[[u8; 3]; 9], epsilon: f64) -> ([[f64; 3]; 9], [[f64; 3]; 9])
     (difference, difference.map(|d| product(&inverse, d)))
 }
 
-/// A symmetric matrix `xx xy xz yy yz zz` times a vector.
+/// Returns a symmetric matrix `xx xy xz yy yz zz` times a vector.
 fn product([xx, xy, xz, yy, yz, zz]: &[f64; 6], [x, y, z]: [f64; 3]) -> [f64; 3] {
     [xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z]
 }
@@ -390,7 +390,7 @@ mod tests {
         (Photo { width, height, rgb, alpha: None }, Gray { width, height, values })
     }
 
-    /// The head from the middle of the band on.
+    /// Returns the head from the middle of the band on.
     fn cut(trimap: &Gray) -> Gray {
         let head = |i: usize| 2 * (i as u32 % trimap.width) >= trimap.width;
         Gray { values: (0..trimap.values.len()).map(|i| if head(i) { 255 } else { 0 }).collect(), ..*trimap }
@@ -405,7 +405,7 @@ mod tests {
         rounds: 2000,
     };
 
-    /// The equations entry by entry over the whole picture, solved by elimination.
+    /// Returns the equations entry by entry over the whole picture, solved by elimination.
     fn dense(photo: &Photo, mask: &Gray, trimap: &Gray, options: &ClosedFormOptions) -> Vec<f64> {
         let (w, h) = (photo.width as usize, photo.height as usize);
         let n = w * h;

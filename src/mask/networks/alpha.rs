@@ -27,7 +27,7 @@ use std::path::Path;
 const ISNET: Normal = Normal { mean: [0.5; 3], std: [1.0; 3] };
 const MODNET: Normal = Normal { mean: [0.5; 3], std: [0.5; 3] };
 
-/// What a file's name tells, lower case, the first that is found in it: side of the square, colors. As the publishers' own
+/// Words in file names, lower case, the first match counts: side of the square, colors. As the publishers' own
 /// scripts have it.
 const KNOWN: [(&str, usize, Normal); 8] = [
     ("u2net", 320, IMAGENET),
@@ -55,7 +55,7 @@ impl AlphaNet {
         let name = path.file_name().map(|n| n.to_string_lossy().to_lowercase()).unwrap_or_default();
         let (side, normal) = if input != "auto" {
             parse(input)?
-        } else if let Some(beside) = processor::beside(path, "")? {
+        } else if let Some(beside) = processor::find(path, "")? {
             (beside.side.unwrap_or(1024), beside.normal)
         } else if let Some((_, side, normal)) = KNOWN.iter().find(|(known, ..)| name.contains(known)) {
             (*side, *normal)
@@ -79,7 +79,7 @@ impl AlphaNet {
         Ok(AlphaNet { session, size, normal })
     }
 
-    /// The alpha of a photograph, at `size`.
+    /// Returns the alpha of a photograph, at `size`.
     pub(super) fn alpha(&self, photo: &Photo, size: (u32, u32)) -> Result<Gray> {
         let (w, h) = self.size;
         let planes = self.normal.planes(&resized(photo, w, h), w, (w, h), 3);
@@ -125,7 +125,7 @@ const STEP: usize = 32;
 pub(super) struct VitMatte {
     pub(super) session: NetworkSession,
     normal: Normal,
-    /// Is it shown the thirds of the original code, or the trimap over 255?
+    /// Whether the input is the thirds of the original code, instead of the trimap divided by 255.
     thirds: bool,
 }
 
@@ -137,7 +137,7 @@ impl VitMatte {
         let normal = match colors {
             VitmatteColors::Imagenet => None,
             VitmatteColors::Half => Some(half),
-            VitmatteColors::Auto => processor::beside(path, "vitmatte")?.map(|p| p.normal),
+            VitmatteColors::Auto => processor::find(path, "vitmatte")?.map(|p| p.normal),
         };
         let thirds = normal.is_none();
         let how = if thirds { "as in the original code" } else { "as in transformers" };
@@ -164,7 +164,7 @@ impl VitMatte {
         }
     }
 
-    /// Colors and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
+    /// Returns the colors and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
     pub(super) fn pixels(&self, photo: &Photo, trimap: &Gray, padded: (usize, usize)) -> NetworkArray {
         let (w, h) = padded;
         let width = photo.width as usize;

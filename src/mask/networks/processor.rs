@@ -1,7 +1,7 @@
-//! `preprocessor_config.json`: how the picture is prepared, as the publisher of a network says beside its file.
+//! `preprocessor_config.json`: the preparation of pictures that a network's publisher declares next to its file.
 //!
-//! Looked for in the folder of the network's file, and in the folder above when that is called `onnx`, which is
-//! how public collections lie. A file of the other network's processor is not obeyed.
+//! It is searched in the folder of the network's file, and in the parent of a folder called `onnx`, as in public
+//! collections. A file of another network's processor is ignored.
 
 use crate::Result;
 use crate::io::{self, Limits};
@@ -49,7 +49,7 @@ impl Normal {
 pub(super) struct Processor {
     /// How it normalizes.
     pub normal: Normal,
-    /// Side of the square (`pad_size`, else `size.longest_edge`, `size.height` or `size.shortest_edge`), where it is said.
+    /// Side of the square (`pad_size`, else `size.longest_edge`, `size.height` or `size.shortest_edge`), if given.
     pub side: Option<usize>,
 }
 
@@ -63,9 +63,9 @@ struct ProcessorFile {
     size: Value,
 }
 
-/// The processor file of the network at `network`, `None` without one, or if it is of another network than
+/// Returns the processor file of the network at `network`, `None` without one, or if it is of another network than
 /// `kind` ("sam", "vitmatte", or empty for any).
-pub(super) fn beside(network: &Path, kind: &str) -> Result<Option<Processor>> {
+pub(super) fn find(network: &Path, kind: &str) -> Result<Option<Processor>> {
     const NAME: &str = "preprocessor_config.json";
     let folder = network.parent().unwrap_or(Path::new(""));
     let mut places = vec![folder.join(NAME)];
@@ -113,7 +113,7 @@ mod tests {
     fn at(text: &str, kind: &str) -> Result<Option<Processor>> {
         let dir = tempfile::tempdir().unwrap();
         fs::write(dir.path().join("preprocessor_config.json"), text).unwrap();
-        beside(&dir.path().join("x.onnx"), kind)
+        find(&dir.path().join("x.onnx"), kind)
     }
 
     #[test]
@@ -157,7 +157,7 @@ mod tests {
         fs::write(dir.path().join("preprocessor_config.json"), "{}").unwrap();
         for (folder, is_found) in [("onnx", true), ("weights", false)] {
             fs::create_dir(dir.path().join(folder)).unwrap();
-            let found = beside(&dir.path().join(folder).join("model.onnx"), "sam").unwrap();
+            let found = find(&dir.path().join(folder).join("model.onnx"), "sam").unwrap();
             assert_eq!(found.is_some(), is_found);
         }
     }

@@ -69,7 +69,7 @@ impl Sam {
         {
             return mismatch(format!("the decoder wants `{POSITION}`, which the encoder does not give"));
         }
-        let processor = processor::beside(&encoder.file.path, "sam")?;
+        let processor = processor::find(&encoder.file.path, "sam")?;
         let takes = &encoder.inputs[0];
         if takes.extent(2).zip(takes.extent(3)).is_some_and(|(rows, columns)| rows != columns) {
             return mismatch(format!("the encoder's input {} is not square", takes.shape_in_words()));
@@ -106,7 +106,7 @@ impl Sam {
         (fit(width), fit(height))
     }
 
-    /// The photograph as the encoder takes it.
+    /// Returns the photograph as the encoder takes it.
     pub(super) fn pixels(&self, photo: &Photo) -> NetworkArray {
         let (w, h) = self.fitted(photo.width as usize, photo.height as usize);
         let rgb = resized(photo, w, h);
@@ -128,7 +128,7 @@ impl Sam {
         Ok(Embedding { arrays, new: self.fitted(old.0, old.1), old })
     }
 
-    /// The decoder's inputs for these clicks.
+    /// Returns the decoder's inputs for these clicks.
     pub(super) fn prompt(
         &self,
         embedding: &Embedding,
@@ -196,7 +196,7 @@ impl Sam {
         enlarged(small, quarter, self.side, embedding.new, embedding.old)
     }
 
-    /// The hard mask (0 or 255) and its score.
+    /// Returns the hard mask (0 or 255) and its score.
     pub(super) fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<(Gray, f32)> {
         // before the slow part
         self.check(clicks, (photo.width as usize, photo.height as usize))?;
@@ -229,7 +229,7 @@ impl Sam {
     }
 }
 
-/// The photograph's colors at `width` × `height`, antialiased bilinear, as SAM's processors resize.
+/// Returns the photograph's colors at `width` × `height`, antialiased bilinear, as SAM's processors resize.
 pub(super) fn resized(photo: &Photo, width: usize, height: usize) -> Vec<[u8; 3]> {
     let picture = RgbImage::from_raw(photo.width, photo.height, photo.rgb.as_flattened().to_vec())
         .expect("as many colors as pixels, as checked");
@@ -257,12 +257,12 @@ pub(super) fn normalized(rgb: &[[u8; 3]], width: usize, side: usize, normal: &No
     NetworkArray::new(&[1, 3, side, side], normal.planes(rgb, width, (side, side), 3))
 }
 
-/// The first of the highest scores from `begin` on.
+/// Returns the first of the highest scores from `begin` on.
 fn highest(scores: &[f32], begin: usize) -> usize {
     (begin..scores.len()).fold(begin, |best, i| if scores[i] > scores[best] { i } else { best })
 }
 
-/// The original decoder gives one mask for several points and three for a single, ambiguous one: with two
+/// Returns the index of the mask to use. The original decoder gives one mask for several points and three for one: with two
 /// or more clicks the first is meant, with one the best of the others.
 fn best_of_original(scores: &[f32], clicks: usize) -> usize {
     match scores.len() {

@@ -1,7 +1,7 @@
 //! The normal equations of a fit, never formed, solved by conjugate gradients.
 
 use super::rows::{Matrix, Nodes, Rows};
-use crate::geom::sphharm::{MOST_OF_DEGREE_2, sh16};
+use crate::geom::sphharm::{COEFFICIENTS_OF_DEGREE_2, sh16};
 use crate::kernel::cpu::cg::{conjugate_gradients, dot};
 use rayon::prelude::*;
 
@@ -36,7 +36,7 @@ pub struct System<'a> {
 }
 
 /// Values of the functions in each direction: the first is 1, the others are [`sh16`]'s.
-pub type Functions = [f32; MOST_OF_DEGREE_2];
+pub type Functions = [f32; COEFFICIENTS_OF_DEGREE_2];
 
 impl System<'_> {
     /// Returns the values of the functions in the direction of a row.
@@ -47,7 +47,7 @@ impl System<'_> {
 
     /// Returns the product of a row with `x` `[nodes, count]`.
     pub fn shown(&self, row: usize, x: &[[f32; 3]], count: usize) -> [f32; 3] {
-        let y = if count > 1 { self.functions(row) } else { [1.0; MOST_OF_DEGREE_2] };
+        let y = if count > 1 { self.functions(row) } else { [1.0; COEFFICIENTS_OF_DEGREE_2] };
         self.sum(row, x, &y[..count])
     }
 
@@ -129,7 +129,7 @@ impl Normal<'_> {
         out: &mut [f64],
     ) {
         out.par_chunks_mut(3 * self.count).enumerate().with_min_len(256).for_each(|(node, out)| {
-            let mut own = [[0f32; 3]; MOST_OF_DEGREE_2];
+            let mut own = [[0f32; 3]; COEFFICIENTS_OF_DEGREE_2];
             for &(p, w) in self.system.matrix.column(node) {
                 let r = values[p as usize].map(|v| w * v);
                 for (own, y) in own.iter_mut().zip(self.y(p as usize)) {
@@ -166,7 +166,7 @@ impl Normal<'_> {
     fn inverse_diagonal(&self) -> Vec<f64> {
         let mut out = vec![0f64; self.system.nodes.len() * self.count];
         out.par_chunks_mut(self.count).enumerate().with_min_len(256).for_each(|(node, out)| {
-            let mut own = [0f32; MOST_OF_DEGREE_2];
+            let mut own = [0f32; COEFFICIENTS_OF_DEGREE_2];
             for &(p, w) in self.system.matrix.column(node) {
                 let w = w * w * self.weight[p as usize];
                 own.iter_mut().zip(self.y(p as usize)).for_each(|(own, y)| *own += w * y * y);

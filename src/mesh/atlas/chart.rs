@@ -3,7 +3,7 @@
 //! Patches of a surface: which triangles lie beside each other, parts as meshes of their own, how far a chart is
 //! from the sizes of its surface.
 //!
-//! The face stands upright in the texture: who paints there sees what it is.
+//! The face stands upright in the texture: so that it can be painted.
 
 use crate::geom::{Mesh, Sets, side_ends, sorted_sides};
 use glam::{DVec2, Vec3};
@@ -20,7 +20,7 @@ pub(super) struct Flat {
     pub points: Vec<DVec2>,
 }
 
-/// Twice the area, positive when counter-clockwise.
+/// Returns twice the area, positive when counter-clockwise.
 pub(super) fn twice_area([a, b, c]: [DVec2; 3]) -> f64 {
     (b - a).perp_dot(c - a)
 }
@@ -122,7 +122,7 @@ pub(super) fn part(mesh: &Mesh, wanted: impl Fn(u32) -> bool) -> (Mesh, Vec<u32>
     (part, number)
 }
 
-/// Mean of (r + 1/r) / 2 over a chart that has the area of its surface.
+/// Returns the mean of (r + 1/r) / 2 over a chart that has the area of its surface.
 pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
     let (mut sum, mut whole) = (0.0, 0.0);
     for (k, &t) in flat.triangles.iter().enumerate() {
@@ -166,10 +166,10 @@ pub(super) fn straighten<L: Copy + PartialEq>(beside: &[[u32; 3]], region: &mut 
 }
 
 /// Of the surface, a chart that is no more than a sliver of the face need not stand.
-const LEAST: f64 = 0.01;
+const MIN_UPRIGHT_SHARE: f64 = 0.01;
 
 /// Less than this share of the steepest rise says nothing of where up is.
-const LEAST_RISE: f64 = 0.1;
+const MIN_RISE: f64 = 0.1;
 
 /// For each chart where up is in it, of length 1, if it has to stand upright: the one that the foremost triangle, seen
 /// along `front`, is part of.
@@ -178,13 +178,14 @@ pub(super) fn upright(mesh: &Mesh, charts: &[Flat], front: Vec3, up: Vec3) -> Ve
     let foremost = (0..mesh.triangles.len() as u32).max_by(|&a, &b| depth(a).total_cmp(&depth(b)));
     let whole: f64 = charts.iter().map(Flat::area).sum();
     let stands = |chart: &Flat| {
-        let is_face = foremost.is_some_and(|t| chart.triangles.contains(&t)) && chart.area() > LEAST * whole;
+        let is_face = foremost.is_some_and(|t| chart.triangles.contains(&t))
+            && chart.area() > MIN_UPRIGHT_SHARE * whole;
         is_face.then(|| rising(mesh, chart, up)).flatten()
     };
     charts.iter().map(stands).collect()
 }
 
-/// Where in a chart the surface rises, on the mean over its area; `None` where it does not.
+/// Returns where in a chart the surface rises, on the mean over its area; `None` where it does not.
 fn rising(mesh: &Mesh, chart: &Flat, up: Vec3) -> Option<DVec2> {
     let mut sum = DVec2::ZERO;
     for (k, &t) in chart.triangles.iter().enumerate() {
@@ -197,7 +198,7 @@ fn rising(mesh: &Mesh, chart: &Flat, up: Vec3) -> Option<DVec2> {
             * twice_area([a, b, c]).signum();
     }
     // seen from below or above, up is nowhere in it; the gradient of what stands straight is 1 everywhere
-    (sum.length() > LEAST_RISE * 2.0 * chart.area()).then(|| sum.normalize())
+    (sum.length() > MIN_RISE * 2.0 * chart.area()).then(|| sum.normalize())
 }
 
 #[cfg(test)]
@@ -205,7 +206,7 @@ mod tests {
     use super::*;
     use glam::Vec3;
 
-    /// A strip of four triangles over the corners 0 1 2 above 3 4 5.
+    /// Returns a strip of four triangles over the corners 0 1 2 above 3 4 5.
     fn strip() -> Flat {
         let p = |x: f64, y: f64| DVec2::new(x, y);
         Flat {

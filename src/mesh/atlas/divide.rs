@@ -21,7 +21,7 @@
 
 use super::chart::{Flat, NONE, neighbours, part, straighten, stretch};
 use super::flatten::{ChartSet, STRETCHED, flatten, relax, smoothed};
-use crate::geom::{Mesh, THOROUGH, overlaps};
+use crate::geom::{Mesh, THOROUGH_EFFORT, overlaps};
 use crate::{Monitor, Result};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -32,7 +32,7 @@ use std::collections::HashMap;
 const SMOOTHING: usize = 30;
 
 /// Share of the surface below which a chart joins a neighbour.
-const SMALL: f64 = 0.008;
+const MIN_CHART_SHARE: f64 = 0.008;
 
 /// Times that regions are joined and laid flat.
 const JOINS: usize = 2;
@@ -51,11 +51,11 @@ const SPLITS: usize = 3;
 
 /// Divides a mesh and lays it flat.
 pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<ChartSet> {
-    let beside = neighbours(mesh);
+    let adjacent = neighbours(mesh);
     let smooth = smoothed(mesh, SMOOTHING);
     let mut best = flatten(&smooth, None, STRETCHED, monitor)?;
     for _ in 0..JOINS {
-        let labels = joined(mesh, &beside, &best);
+        let labels = joined(mesh, &adjacent, &best);
         let regions = labels.iter().max().map_or(0, |most| *most as usize + 1);
         if regions == best.charts.len() {
             break;
@@ -96,7 +96,7 @@ fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
 /// them meet, the smaller of the two strips that lie over each other becomes a chart of its own.
 fn uncovered(chart: Flat) -> Vec<Flat> {
     let points: Vec<Vec2> = chart.points.iter().map(|p| p.as_vec2()).collect();
-    let pairs = overlaps(&points, &chart.corners, &vec![true; chart.corners.len()], THOROUGH).pairs;
+    let pairs = overlaps(&points, &chart.corners, &vec![true; chart.corners.len()], THOROUGH_EFFORT).pairs;
     if pairs.is_empty() {
         return vec![chart];
     }
@@ -127,7 +127,7 @@ fn uncovered(chart: Flat) -> Vec<Flat> {
 }
 
 /// One number a triangle, from 0: its chart, or the neighbour that this joined.
-fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
+fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
     let count = mesh.triangles.len();
     // a triangle without a chart is a region of its own until it joins one
     let mut label = vec![NONE; count];
@@ -146,13 +146,13 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
         let p = mesh.corners(t as u32).map(|p| p.as_dvec3());
         area[own as usize] += mesh.area(t as u32);
         for k in 0..3 {
-            let n = beside[t][k];
+            let n = adjacent[t][k];
             if n != NONE && label[n as usize] != own {
                 *border[own as usize].entry(label[n as usize]).or_default() += p[k].distance(p[(k + 1) % 3]);
             }
         }
     }
-    let least = SMALL * area.iter().sum::<f64>();
+    let least = MIN_CHART_SHARE * area.iter().sum::<f64>();
     let mut into: Vec<u32> = (0..regions).collect();
     let mut open: Vec<u32> = (0..regions).filter(|&r| area[r as usize] < least).collect();
     // the smallest first, so that confetti becomes pieces before pieces are given away
@@ -182,7 +182,7 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
         r
     };
     label.iter_mut().for_each(|l| *l = root(*l));
-    straighten(beside, &mut label);
+    straighten(adjacent, &mut label);
     let mut number = HashMap::new();
     label
         .iter()
@@ -197,13 +197,13 @@ fn joined(mesh: &Mesh, beside: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
 const SHARE: f64 = 0.01;
 
 /// How far a vertex may be off the plane, in parts of the surface's extent.
-const OFF: f64 = 5e-4;
+const MAX_PLANE_DISTANCE: f64 = 5e-4;
 
 /// Cosine of the angle by which a triangle may lean.
-const LEAN: f64 = 0.999;
+const MIN_PLANE_COSINE: f64 = 0.999;
 
 /// Returns the flat pieces of at least a hundredth of the surface, the largest triangles looked at first.
-pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
+pub(super) fn planar(mesh: &Mesh, adjacent: &[[u32; 3]]) -> Vec<Flat> {
     let count = mesh.triangles.len();
     let corners = |t: u32| mesh.corners(t).map(|p| p.as_dvec3());
     let across: Vec<DVec3> = (0..count as u32)
@@ -215,7 +215,7 @@ pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
     let areas: Vec<f64> = across.iter().map(|n| n.length()).collect();
     let whole: f64 = areas.iter().sum();
     let extent = f64::from(mesh.bounds().size().max_element());
-    let off = OFF * extent;
+    let off = MAX_PLANE_DISTANCE * extent;
     let mut seeds: Vec<u32> = (0..count as u32).collect();
     seeds.sort_by(|&a, &b| areas[b as usize].total_cmp(&areas[a as usize]).then(a.cmp(&b)));
     let mut piece = vec![NONE; count];
@@ -232,12 +232,12 @@ pub(super) fn planar(mesh: &Mesh, beside: &[[u32; 3]]) -> Vec<Flat> {
         while let Some(t) = open.pop() {
             members.push(t);
             area += areas[t as usize];
-            for k in beside[t as usize] {
+            for k in adjacent[t as usize] {
                 if k == NONE || piece[k as usize] != NONE {
                     continue;
                 }
                 let lies = corners(k).iter().all(|p| (*p - at).dot(n).abs() <= off);
-                if lies && across[k as usize].dot(n) >= LEAN * areas[k as usize] {
+                if lies && across[k as usize].dot(n) >= MIN_PLANE_COSINE * areas[k as usize] {
                     piece[k as usize] = seed;
                     open.push(k);
                 }
@@ -274,11 +274,11 @@ fn projected(mesh: &Mesh, triangles: &[u32], n: DVec3) -> Flat {
 
 /// The deepest plane lies so far behind the foremost point, in parts of the mesh's depth; the others are closer by
 /// equal steps.
-const DEEPEST: f32 = 0.5;
-const PLANES: usize = 16;
+const MAX_CUT_DEPTH: f32 = 0.5;
+const CUT_PLANES: usize = 16;
 
 /// Flattenings that may fail.
-const TRIES: usize = 8;
+const MAX_FAILURES: usize = 8;
 
 /// Rounds of smoothing for the copy that is flattened. With 30 a nose still folds, with 120 the ears of other heads do.
 const FACE_SMOOTHING: usize = 60;
@@ -287,17 +287,17 @@ const FACE_SMOOTHING: usize = 60;
 const FACE_RELAXING: usize = 200;
 
 /// The share of the surface that a face may have.
-const LARGEST: f64 = 0.3;
+const MAX_FACE_SHARE: f64 = 0.3;
 
 /// How many times smaller or larger than the rest a triangle of the smooth copy may be: relaxing evens it out.
-const FACE_STRETCHED: f32 = 2.0 * STRETCHED;
+const MAX_FACE_STRETCH: f32 = 2.0 * STRETCHED;
 
 /// Divides a mesh, with its face in one chart if possible.
 pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> Result<ChartSet> {
-    for inside in caps(mesh, front.normalize()).take(TRIES) {
+    for inside in caps(mesh, front.normalize()).take(MAX_FAILURES) {
         let (face, number) = part(mesh, |t| inside[t as usize]);
         let whole = vec![0; face.triangles.len()];
-        let mut alone = flatten(&smoothed(&face, FACE_SMOOTHING), Some(&whole), FACE_STRETCHED, monitor)?;
+        let mut alone = flatten(&smoothed(&face, FACE_SMOOTHING), Some(&whole), MAX_FACE_STRETCH, monitor)?;
         let [chart] = &mut alone.charts[..] else { continue };
         relax(&face, chart, FACE_RELAXING);
         if stretch(&face, chart) > STRETCH {
@@ -316,7 +316,7 @@ pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> 
 /// Caps worth flattening, the deepest first: for each triangle whether it belongs.
 fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     let count = mesh.triangles.len();
-    let beside = neighbours(mesh);
+    let adjacent = neighbours(mesh);
     let depth: Vec<f32> = (0..count as u32)
         .map(|t| {
             let [a, b, c] = mesh.corners(t).map(|p| p.dot(front));
@@ -327,21 +327,21 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     let whole: f64 = areas.iter().sum();
     let foremost = (0..count).fold(0, |best, t| if depth[t] > depth[best] { t } else { best });
     let (high, low) = (depth[foremost], depth.iter().copied().fold(f32::INFINITY, f32::min));
-    (1..=PLANES).rev().filter_map(move |i| {
-        let plane = high - (high - low) * DEEPEST * i as f32 / PLANES as f32;
-        let mut inside = cap(&beside, &depth, foremost as u32, plane);
-        straighten(&beside, &mut inside);
+    (1..=CUT_PLANES).rev().filter_map(move |i| {
+        let plane = high - (high - low) * MAX_CUT_DEPTH * i as f32 / CUT_PLANES as f32;
+        let mut inside = cap(&adjacent, &depth, foremost as u32, plane);
+        straighten(&adjacent, &mut inside);
         let share = (0..count).filter(|&t| inside[t]).map(|t| areas[t]).sum::<f64>() / whole;
-        (share > 0.01 && share < LARGEST).then_some(inside)
+        (share > 0.01 && share < MAX_FACE_SHARE).then_some(inside)
     })
 }
 
 /// Gives `number` to the first triangle and all without one that hang together with it; how many they are.
-fn flood(beside: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usize {
+fn flood(adjacent: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usize {
     let (mut open, mut count) = (vec![first], 1);
     piece[first as usize] = number;
     while let Some(t) = open.pop() {
-        for n in beside[t as usize] {
+        for n in adjacent[t as usize] {
             if n != NONE && piece[n as usize] == NONE {
                 piece[n as usize] = number;
                 count += 1;
@@ -352,18 +352,19 @@ fn flood(beside: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usi
     count
 }
 
-/// What hangs together with the foremost triangle in front of the plane, and all it encloses: eye sockets are deep.
-fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<bool> {
+/// Returns what hangs together with the foremost triangle in front of the plane, and all it encloses: eye sockets are
+/// deep.
+fn cap(adjacent: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<bool> {
     // What is behind the plane has a number, so it is not flooded; then the rest takes its place.
     let behind = u32::MAX - 1;
     let mut piece: Vec<u32> = depth.iter().map(|&d| if d > plane { NONE } else { behind }).collect();
-    flood(beside, &mut piece, foremost, 0);
+    flood(adjacent, &mut piece, foremost, 0);
     piece.iter_mut().filter(|p| **p == behind).for_each(|p| *p = NONE);
     let (mut outside, mut most, mut number) = (NONE, 0, 0);
-    for t in 0..beside.len() {
+    for t in 0..adjacent.len() {
         if piece[t] == NONE {
             number += 1;
-            let count = flood(beside, &mut piece, t as u32, number);
+            let count = flood(adjacent, &mut piece, t as u32, number);
             if count > most {
                 (outside, most) = (number, count);
             }
@@ -371,7 +372,7 @@ fn cap(beside: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<boo
     }
     // only the component of the foremost triangle: other pieces have charts of their own
     let mut own: Vec<u32> = piece.iter().map(|&p| if p == outside { behind } else { NONE }).collect();
-    flood(beside, &mut own, foremost, 0);
+    flood(adjacent, &mut own, foremost, 0);
     own.iter().map(|&p| p == 0).collect()
 }
 
@@ -467,7 +468,7 @@ mod tests {
         assert!(divided.charts.iter().all(|c| stretch(&mesh, c) < STRETCH));
     }
 
-    /// A dome of latitude rings on a flat disc at z = 0, closed.
+    /// Returns a dome of latitude rings on a flat disc at z = 0, closed.
     fn bust() -> Mesh {
         let (rings, around) = (12u32, 40u32);
         let mut mesh = Mesh { positions: vec![Vec3::Z, Vec3::ZERO], ..Mesh::default() };
@@ -520,7 +521,7 @@ mod face_tests {
     use super::*;
     use crate::Quiet;
 
-    /// A closed ball around the origin, a bump like a nose at its front (+z) and a dent below it.
+    /// Returns a closed ball around the origin, a bump like a nose at its front (+z) and a dent below it.
     fn ball() -> Mesh {
         let (rings, around) = (40u32, 60u32);
         let mut mesh = Mesh { positions: vec![Vec3::Y], ..Mesh::default() };
@@ -574,12 +575,12 @@ mod face_tests {
         let sizes: Vec<usize> = found.iter().map(|c| c.iter().filter(|i| **i).count()).collect();
         assert!(sizes.is_sorted_by(|a, b| a > b), "{sizes:?}");
         // one piece within, one without: the rim is one line
-        let beside = neighbours(&mesh);
+        let adjacent = neighbours(&mesh);
         for inside in found {
             for side in [true, false] {
                 let first = inside.iter().position(|&i| i == side).unwrap();
                 let mut own: Vec<u32> = inside.iter().map(|&i| if i == side { NONE } else { 7 }).collect();
-                let count = flood(&beside, &mut own, first as u32, 1);
+                let count = flood(&adjacent, &mut own, first as u32, 1);
                 assert_eq!(count, inside.iter().filter(|&&i| i == side).count());
             }
         }
@@ -588,7 +589,7 @@ mod face_tests {
     #[test]
     fn a_dent_behind_the_plane_is_part_of_the_face() {
         // a strip: 0 in front, 1 behind, 2 in front, 3 to 6 behind
-        let beside = [
+        let adjacent = [
             [NONE, 1, 2],
             [0, 2, NONE],
             [1, 0, 3],
@@ -598,6 +599,6 @@ mod face_tests {
             [5, NONE, NONE],
         ];
         let depth = [1.0, 0.2, 0.9, 0.1, 0.0, 0.0, 0.0];
-        assert_eq!(cap(&beside, &depth, 0, 0.5), [true, true, true, false, false, false, false]);
+        assert_eq!(cap(&adjacent, &depth, 0, 0.5), [true, true, true, false, false, false, false]);
     }
 }

@@ -34,7 +34,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Degrees between a triangle and the mean of its chart. Lower than the library's own 70: rims come out straighter, so
 /// that seams are hardly longer and stretch is less, and small charts fill the texture better.
-const MOST_TILTED: f32 = 55.0;
+const MAX_TILTED: f32 = 55.0;
 
 /// How many times smaller or larger than the rest a triangle may be: the library's own.
 pub(super) const STRETCHED: f32 = 4.0;
@@ -83,7 +83,7 @@ pub(super) fn flatten(
         packing: uvunwrap::Packing::Fast,
         padding: 0,
         max_area_distortion: most_stretched,
-        max_chart_angle: MOST_TILTED,
+        max_chart_angle: MAX_TILTED,
         ..uvunwrap::Options::default()
     };
     let call = || uvunwrap::generate_with_progress(&[input], &options, |_| !monitor.stop());
@@ -223,11 +223,11 @@ pub(super) fn smoothed(mesh: &Mesh, rounds: usize) -> Mesh {
 }
 
 /// Steps that L-BFGS remembers.
-const MEMORY: usize = 5;
+const LBFGS_HISTORY: usize = 5;
 
 /// Energy over area at which a chart is good enough: 4 is an isometry, and 0.01 more a mean area stretch below half a
 /// percent.
-const REST: f64 = 4.01;
+const TARGET_ENERGY: f64 = 4.01;
 
 /// The surface's side of a triangle, as the energy needs it.
 struct RestTriangle {
@@ -343,14 +343,14 @@ fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: 
     let n = points.len();
     let mut slope = vec![DVec2::ZERO; n];
     let mut now = energy(rest, points, Some(&mut slope));
-    let mut past: VecDeque<(Vec<DVec2>, Vec<DVec2>, f64)> = VecDeque::with_capacity(MEMORY);
+    let mut past: VecDeque<(Vec<DVec2>, Vec<DVec2>, f64)> = VecDeque::with_capacity(LBFGS_HISTORY);
     let mut fallen = 0.0;
     for round in 0..rounds {
-        if now <= REST * area {
+        if now <= TARGET_ENERGY * area {
             return;
         }
         let mut step: Vec<DVec2> = slope.iter().map(|g| -*g).collect();
-        let mut along = [0.0; MEMORY];
+        let mut along = [0.0; LBFGS_HISTORY];
         for (m, (s, y, rho)) in past.iter().enumerate().rev() {
             along[m] = rho * dot(s, &step);
             step.iter_mut().zip(y).for_each(|(p, y)| *p -= along[m] * *y);
@@ -388,7 +388,7 @@ fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: 
         let y: Vec<DVec2> = new_slope.iter().zip(&slope).map(|(a, b)| *a - *b).collect();
         let sy = dot(&s, &y);
         if sy > 1e-12 * dot(&y, &y).sqrt() * dot(&s, &s).sqrt() {
-            if past.len() == MEMORY {
+            if past.len() == LBFGS_HISTORY {
                 past.pop_front();
             }
             past.push_back((s, y, 1.0 / sy));
@@ -478,7 +478,7 @@ mod tests {
         assert_eq!(smoothed(&sheet(), 0), sheet());
     }
 
-    /// A cylinder's quarter, 12 × 8 squares, and its coordinates seen from the front.
+    /// Returns a cylinder's quarter, 12 × 8 squares, and its coordinates seen from the front.
     fn quarter() -> (Mesh, Flat) {
         let mut mesh = Mesh::default();
         let mut flat = Flat::default();

@@ -23,16 +23,16 @@ use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
 /// Cells along the texture, about: between four and five texels each of 2048.
-const CELLS: f64 = 448.0;
+const GRID_CELLS: f64 = 448.0;
 
 /// Number of turns tried for each chart; smaller if there are many charts.
-const TURNS: usize = 16;
+const MAX_ROTATIONS: usize = 16;
 
 /// Orders tried, times charts.
-const PLACED: usize = 2400;
+const PLACEMENT_BUDGET: usize = 2400;
 
 /// The share of the texture that the first drawing is meant for.
-const USED: f64 = 0.62;
+const INITIAL_FILL: f64 = 0.62;
 
 /// Where a chart goes: turned by the angle whose cosine and sine these are, scaled, and moved.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -86,9 +86,9 @@ pub(super) fn pack(
     let sizes: Vec<f64> = outlines.iter().map(|o| size(bounds(o, DVec2::X))).collect();
     let mut order: Vec<usize> = (0..charts.len()).collect();
     order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
-    let turns = (16_000 / charts.len()).clamp(4, TURNS) / 4 * 4;
-    let cells = CELLS.min(inner_px);
-    let mut used = USED;
+    let turns = (16_000 / charts.len()).clamp(4, MAX_ROTATIONS) / 4 * 4;
+    let cells = GRID_CELLS.min(inner_px);
+    let mut used = INITIAL_FILL;
     while used > 1e-3 {
         // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a fifth wider.
         let scale = cells * (used / area).sqrt() * size_px / inner_px;
@@ -127,7 +127,7 @@ fn bounds(outline: &[[DVec2; 2]], turn: DVec2) -> (DVec2, DVec2) {
     ends.fold((DVec2::INFINITY, DVec2::NEG_INFINITY), |(low, high), p| (low.min(p), high.max(p)))
 }
 
-/// Each chart in each direction, `scale` cells a unit.
+/// Returns each chart in each direction, `scale` cells a unit.
 fn draw(
     outlines: &[Vec<[DVec2; 2]>],
     stands: &[Option<DVec2>],
@@ -175,7 +175,7 @@ fn smallest(
         state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
         (mix(state) % n as u64) as usize
     };
-    let tries = if count > 1 { (PLACED / count).clamp(8, 160) } else { 8 };
+    let tries = if count > 1 { (PLACEMENT_BUDGET / count).clamp(8, 160) } else { 8 };
     let mut step = (side / 40).max(1);
     for _ in 0..tries {
         monitor.check_stop()?;
@@ -434,7 +434,7 @@ impl Page {
 }
 
 /// The shortest leg worth having, in texels.
-const LEAST_LEG_PX: f64 = 1.0;
+const MIN_LEG_PX: f64 = 1.0;
 
 /// Gives each triangle a half square; the gutter becomes as wide as leaves a third of each square to its triangles.
 pub(super) fn half_squares(mesh: &Mesh, config: &AtlasConfig) -> Result<AtlasLayout> {
@@ -446,13 +446,13 @@ pub(super) fn half_squares(mesh: &Mesh, config: &AtlasConfig) -> Result<AtlasLay
     let side_with = |gap: f64| (size - 2.0 * gap) / rows as f64;
     let mut gap = f64::from(config.gutter_px);
     let leg_with = |gap: f64| side_with(gap) - spent * gap;
-    let least = (side_with(0.0) / 3.0).max(LEAST_LEG_PX);
+    let least = (side_with(0.0) / 3.0).max(MIN_LEG_PX);
     if leg_with(gap) < least {
         // linear in the gap: leg_with(gap) = size / rows − gap (2 / rows + spent)
         gap = ((size / rows as f64 - least) / (2.0 / rows as f64 + spent)).max(0.0);
     }
     let (side, leg) = (side_with(gap), leg_with(gap));
-    if leg < LEAST_LEG_PX {
+    if leg < MIN_LEG_PX {
         let px = config.size_px;
         let message = format!("{count} triangles do not fit into a texture of {px} × {px} texels");
         return Err(Error::cannot(message, "a larger texture, or a mesh simplified to fewer triangles"));
@@ -483,7 +483,7 @@ mod tests {
     use crate::monitor::{Quiet, Stopping};
     use glam::Vec3;
 
-    /// A rectangle of two triangles.
+    /// Returns a rectangle of two triangles.
     fn rectangle(width: f64, height: f64) -> Flat {
         let p = |x: f64, y: f64| DVec2::new(x, y);
         Flat {

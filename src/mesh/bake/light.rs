@@ -1,13 +1,13 @@
 //! Colors of surface points: their exact positions, the cameras that see them, and the field's colors.
 
-use crate::geom::sphharm::{MOST_OF_DEGREE_2 as MOST, sh16};
+use crate::geom::sphharm::{COEFFICIENTS_OF_DEGREE_2, sh16};
 use crate::geom::{Bvh, Camera, Mesh, Ray, SdfField};
 use crate::image::{linear_from_srgb, srgb_from_linear};
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Cosine of the steepest angle at which a camera still tells the color of a point: 75 degrees.
-const STEEPEST: f32 = 0.258_819;
+/// Cosine of the steepest angle at which a camera still shows the color of a point: 75 degrees.
+const MIN_COSINE: f32 = 0.258_819;
 
 /// Points of the surface with their unit normals.
 pub struct SurfacePoints {
@@ -64,7 +64,7 @@ pub struct Visibility<'a> {
 }
 
 /// Number of substitute cameras for a point that none sees.
-const STAND_INS: usize = 3;
+const FALLBACK_CAMERAS: usize = 3;
 
 /// Directions to the cameras that see each point, all in one list.
 #[derive(Default)]
@@ -113,7 +113,7 @@ impl Visibility<'_> {
                     })
                     .collect();
                 let sees = |(camera, &(direction, cos)): (&Camera, &(Vec3, f32))| {
-                    if cos < STEEPEST || !in_frame(camera, p) {
+                    if cos < MIN_COSINE || !in_frame(camera, p) {
                         return None;
                     }
                     let way = camera.position.as_vec3() - from;
@@ -135,7 +135,7 @@ impl Visibility<'_> {
                 }
                 let mut nearest = all;
                 nearest.sort_by(|a, b| b.1.total_cmp(&a.1));
-                nearest.truncate(STAND_INS);
+                nearest.truncate(FALLBACK_CAMERAS);
                 (false, nearest.into_iter().map(|(d, cos)| (d, cos.max(0.0).powi(2) + 1e-3)).collect())
             })
             .collect();
@@ -152,7 +152,7 @@ impl Visibility<'_> {
     }
 }
 
-/// Whether a point is within a camera's picture.
+/// Returns whether a point is within a camera's picture.
 fn in_frame(camera: &Camera, p: Vec3) -> bool {
     let (w, h) = (camera.width as f32, camera.height as f32);
     camera.project(p).is_some_and(|(at, _)| (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y))
@@ -240,7 +240,7 @@ const RIDGE: f64 = 0.02;
 /// # Shapes
 ///
 /// - directions, weights, colors: `[n]`; base and colors sRGB-coded
-/// - out: `[functions]`, at most [`MOST`]
+/// - out: `[functions]`, at most [`COEFFICIENTS_OF_DEGREE_2`]
 fn fit_lobes(
     base: [f32; 3],
     directions: &[Vec3],
@@ -251,11 +251,11 @@ fn fit_lobes(
     let n = out.len();
     out.fill([0.0; 3]);
     let total: f64 = weights.iter().map(|&w| f64::from(w)).sum();
-    if total <= 0.0 || n > MOST {
+    if total <= 0.0 || n > COEFFICIENTS_OF_DEGREE_2 {
         return;
     }
-    let mut a = [[0f64; MOST]; MOST];
-    let mut b = [[0f64; 3]; MOST];
+    let mut a = [[0f64; COEFFICIENTS_OF_DEGREE_2]; COEFFICIENTS_OF_DEGREE_2];
+    let mut b = [[0f64; 3]; COEFFICIENTS_OF_DEGREE_2];
     for ((d, &w), c) in directions.iter().zip(weights).zip(colors) {
         let y = sh16(d.to_array());
         let w = f64::from(w) / total;
@@ -281,7 +281,7 @@ fn fit_lobes(
         }
     }
     for k in 0..3 {
-        let mut x = [0f64; MOST];
+        let mut x = [0f64; COEFFICIENTS_OF_DEGREE_2];
         for i in 0..n {
             let sum: f64 = (0..i).map(|j| a[i][j] * x[j]).sum();
             x[i] = (b[i][k] - sum) / a[i][i];
@@ -422,7 +422,7 @@ mod tests {
         let d = directions(60);
         let colors: Vec<[f32; 3]> = d.iter().map(|d| [0.4 + 0.2 * d.x * d.y + 0.1 * d.z; 3]).collect();
         let error = |degree: u32| -> f32 {
-            let mut out = [[0f32; 3]; MOST];
+            let mut out = [[0f32; 3]; COEFFICIENTS_OF_DEGREE_2];
             let out = &mut out[..functions(degree)];
             fit_lobes([0.4; 3], &d, &vec![1.0; 60], &colors, out);
             d.iter().zip(&colors).map(|(d, c)| (0.4 + add(out, *d)[0] - c[0]).powi(2)).sum()

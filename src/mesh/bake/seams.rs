@@ -68,7 +68,7 @@ impl Seams {
         Seams { edges, width: atlas.width, height: atlas.height }
     }
 
-    /// Mean difference of the colors that both sides show at the same points of the surface, bilinear, in
+    /// Returns the mean difference of the colors that both sides show at the same points of the surface, bilinear, in
     /// 255ths of the coded range, over points and channels; 0 where there is no seam.
     ///
     /// `color` has the atlas's size.

@@ -135,7 +135,7 @@ mod tests {
     use crate::geom::Painted;
     use crate::mesh::{ExtractOptions, extract};
 
-    /// A column through the floor of the scene's box, red to the left and green to the right.
+    /// Returns a column through the floor of the scene's box, red to the left and green to the right.
     fn column() -> (Mesh, Cap) {
         let f = |p: Vec3| (p.x.hypot(p.z) - 0.3).max(p.y - 0.5);
         let paint = |p: &[Vec3], _: &[Vec3], _: &[u32], _: &[Vec3]| {

@@ -55,7 +55,7 @@ pub fn clean(mesh: &mut Mesh) -> Result<CleanReport> {
             format!("cleaning removed every one of the {count} pieces: none encloses a positive volume");
         return Err(Error::cannot(message, "the field may be inverted: negative must be inside"));
     };
-    // A hollow is smaller than the piece around it, so the largest volume tells which way is out.
+    // A hollow is smaller than the piece around it, so the largest volume decides which way is out.
     let turned = pieces[largest].0 < 0.0;
     if turned {
         mesh.triangles.iter_mut().for_each(|t| t.swap(1, 2));

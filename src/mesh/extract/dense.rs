@@ -7,7 +7,7 @@
 use super::marching::{Volume, marching};
 use super::{BATCH, MeshReport, NodeGrid, colors_along_normals, off_surface};
 use crate::geom::{Aabb, Mesh, SdfField};
-use crate::mesh::input::{check_len, evaluate, setting};
+use crate::mesh::{check_len, evaluate, setting};
 use crate::{Error, Monitor, Result};
 use glam::Vec3;
 use std::time::Instant;
@@ -97,7 +97,7 @@ mod tests {
     use crate::geom::Aabb;
     use glam::Vec3;
 
-    /// A ball of 0.3 at (0.2, 0, 0), and a crumb of 0.03 far from it.
+    /// Returns a ball of 0.3 at (0.2, 0, 0), and a crumb of 0.03 far from it.
     fn sdf(p: Vec3) -> f32 {
         let ball = (p - 0.2 * Vec3::X).length() - 0.3;
         ball.min((p - Vec3::new(-0.6, -0.6, 0.0)).length() - 0.03)

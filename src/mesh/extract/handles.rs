@@ -18,26 +18,26 @@
 use super::BATCH;
 use super::loops::{Loop, LoopFinder};
 use crate::geom::{Aabb, Boxes, Bvh, DBox, Effort, Mesh, SdfField, area_vector, intersect, topology};
-use crate::mesh::input::check_len;
+use crate::mesh::check_len;
 use crate::{Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// Maximum number of sides of a loop that is cut: the triangulation's cost grows with its cube.
-const MOST_SIDES: usize = 256;
+const MAX_SIDES: usize = 256;
 
 /// How far the rims are drawn back, as shares of the way to the vertices behind them; the first that fits.
-const DRAWN: [f32; 3] = [0.5, 0.25, 0.1];
+const RIM_RETRACTIONS: [f32; 3] = [0.5, 0.25, 0.1];
 
 /// Boxes compared for one triangle of a cap, at most: a sound surface takes hundreds.
-const EFFORT_OF_A_CAP: usize = 1 << 20;
+const CAP_EFFORT: usize = 1 << 20;
 
 /// A triangle with less area than this share of a side's square is flat.
-const FLAT: f64 = 1e-4;
+const MIN_AREA: f64 = 1e-4;
 
 /// A triangle may turn until this cosine when its rim is drawn back.
-const TURN: f64 = 0.3;
+const MIN_TURN_COSINE: f64 = 0.3;
 
 /// The result for a surface's handles. Lengths are of loops, in units of the positions.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -126,7 +126,7 @@ fn discs(loops: &LoopFinder, found: Vec<Loop>) -> Vec<Disc> {
         let mut key = rim.vertices.clone();
         key.sort_unstable();
         let n = rim.vertices.len();
-        if !(3..=MOST_SIDES).contains(&n) || !seen.insert(key) {
+        if !(3..=MAX_SIDES).contains(&n) || !seen.insert(key) {
             return None;
         }
         let places: HashMap<u32, usize> = rim.vertices.iter().enumerate().map(|(i, &v)| (v, i)).collect();
@@ -163,7 +163,7 @@ fn least_area(points: &[DVec3], taken: impl Fn(usize, usize) -> bool) -> Option<
                 let area = 0.5 * (points[k] - points[i]).cross(points[j] - points[i]).length();
                 // along a straight side a triangle without area would cost nothing: only if nothing else is left
                 let across = points[j].distance_squared(points[i]);
-                let flat = if area <= FLAT * across { across / FLAT } else { 0.0 };
+                let flat = if area <= MIN_AREA * across { across / MIN_AREA } else { 0.0 };
                 let sum = cost[at(i, k)] + cost[at(k, j)] + area + flat;
                 if sum < cost[at(i, j)] {
                     cost[at(i, j)] = sum;
@@ -248,7 +248,8 @@ impl<'a> HandleCutter<'a> {
         if class == 0 {
             return None;
         }
-        let cut = DRAWN.iter().find_map(|&share| self.cut(disc, share).filter(|cut| self.fits(cut)))?;
+        let cut =
+            RIM_RETRACTIONS.iter().find_map(|&share| self.cut(disc, share).filter(|cut| self.fits(cut)))?;
         let n = disc.rim.vertices.len();
         let copies = self.next.positions.len() as u32;
         self.next.positions.resize(copies as usize + n, Vec3::ZERO);
@@ -302,7 +303,7 @@ impl<'a> HandleCutter<'a> {
         Some(CutPlan { moved, at_rims, caps: left.chain(right).collect() })
     }
 
-    /// Whether no triangle is turned over, flat, or in the way of another.
+    /// Returns whether no triangle is turned over, flat, or in the way of another.
     fn fits(&self, cut: &CutPlan) -> bool {
         let corners = |t: [u32; 3]| {
             t.map(|v| cut.moved.get(&v).copied().unwrap_or_else(|| self.next.positions[v as usize]))
@@ -310,7 +311,7 @@ impl<'a> HandleCutter<'a> {
         let turned = cut.at_rims.iter().any(|(&t, &to)| {
             let was = area_vector(self.mesh.corners(t)).as_dvec3();
             let is = area_vector(corners(to)).as_dvec3();
-            was.dot(is) <= TURN * was.length() * is.length()
+            was.dot(is) <= MIN_TURN_COSINE * was.length() * is.length()
         });
         let taken = cut.at_rims.keys().any(|&t| self.changed[t as usize]);
         if turned || taken || cut.caps.iter().any(|&t| area_vector(corners(t)) == Vec3::ZERO) {
@@ -329,7 +330,7 @@ impl<'a> HandleCutter<'a> {
                 }
             };
             let mut free = true;
-            let mut effort = Effort::of(EFFORT_OF_A_CAP);
+            let mut effort = Effort::of(CAP_EFFORT);
             self.boxes.meeting(&span(p), &mut effort, |o, _| {
                 let replaced = self.changed[o as usize] || cut.at_rims.contains_key(&o);
                 free = replaced || !meets(self.mesh.triangles[o as usize]);

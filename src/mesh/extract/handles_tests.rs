@@ -110,7 +110,7 @@ fn a_long_slit_is_filled_before_the_rounder_strand_beside_it_is_cut() {
 fn a_ring_too_large_for_the_bound_stays_and_is_told() {
     // 2 π 0.2 = 1.257 around the ring, and the bound is 0.15 · 1.4 = 0.21
     let large = |p: Vec3| ring(p, Vec3::ZERO, 0.5, 0.2);
-    let (mesh, report) = mesh_of(large, super::LONGEST_HANDLE);
+    let (mesh, report) = mesh_of(large, super::MAX_HANDLE);
     assert_eq!(mesh, mesh_of(large, 0.0).0);
     assert_eq!((report.handles.left, report.handles.triangles), (1, 0));
     let length = report.handles.left_length.unwrap();

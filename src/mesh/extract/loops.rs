@@ -21,11 +21,11 @@ use std::collections::{BTreeMap, BinaryHeap};
 const NONE: u32 = u32::MAX;
 
 /// Classes looked at; more are left to the next round.
-const CLASSES: usize = 256;
+const MAX_CLASSES: usize = 256;
 
 /// Vertices of a loop from which a shorter one of its class is looked for, and how often.
-const TRIES: usize = 8;
-const PULLS: usize = 3;
+const SHORTENING_STARTS: usize = 8;
+const SHORTENING_ROUNDS: usize = 3;
 
 /// A simple closed walk along edges.
 #[derive(Clone, Debug, PartialEq)]
@@ -97,7 +97,7 @@ impl<'a> LoopFinder<'a> {
         self.around(self.first[vertex as usize])
     }
 
-    /// Where a vertex is.
+    /// Returns where a vertex is.
     pub(super) fn place(&self, vertex: u32) -> Vec3 {
         self.positions[vertex as usize]
     }
@@ -193,14 +193,14 @@ impl<'a> LoopFinder<'a> {
         }
         let mut classes: Vec<Loop> = best.into_values().filter(|l| l.length <= 2.0 * longest).collect();
         classes.sort_by(|a, b| a.length.total_cmp(&b.length));
-        classes.truncate(CLASSES);
+        classes.truncate(MAX_CLASSES);
         let mut out = Vec::new();
         for mut tight in classes {
             let mut found = Vec::new();
-            for _ in 0..PULLS {
+            for _ in 0..SHORTENING_ROUNDS {
                 monitor.check_stop()?;
                 let reach = 0.51 * tight.length.min(longest * 1.5);
-                let step = tight.vertices.len().div_ceil(TRIES);
+                let step = tight.vertices.len().div_ceil(SHORTENING_STARTS);
                 found.clear();
                 for &v in tight.vertices.iter().step_by(step) {
                     ball.grow(v, reach);
@@ -219,11 +219,11 @@ impl<'a> LoopFinder<'a> {
         Ok(out)
     }
 
-    /// Length of a loop that does not separate the surface: no longer one than the shortest through a few
+    /// Returns the length of a loop that does not separate the surface: no longer one than the shortest through a few
     /// places of its handles. `None` without handles.
     pub(super) fn some_length(&self) -> Option<f32> {
         let mut ball = Ball::new(self);
-        let lengths = self.seeds.iter().take(TRIES).filter_map(|&seed| {
+        let lengths = self.seeds.iter().take(SHORTENING_STARTS).filter_map(|&seed| {
             ball.grow(self.start(seed), f32::INFINITY);
             let closing = ball.closing();
             let side = closing.values().min_by(|a, b| a.0.total_cmp(&b.0))?.1;

@@ -10,7 +10,7 @@
 
 use super::marching_cell::{CASES, CellOutput, CellSurface, crossing, resolve};
 use crate::geom::Mesh;
-use crate::mesh::input::check_count;
+use crate::mesh::check_count;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -120,14 +120,14 @@ pub fn marching(volume: &Volume, closed: bool) -> Result<LevelSet> {
     Ok(out)
 }
 
-/// Where the vertex of a crossed edge lies: on the edge that leaves `node` along `axis`, at `t` cells.
+/// Returns where the vertex of a crossed edge lies: on the edge that leaves `node` along `axis`, at `t` cells.
 pub(super) fn edge_point(origin: Vec3, spacing: Vec3, node: [usize; 3], axis: usize, t: f64) -> Vec3 {
     let mut at = [0.0; 3];
     at[axis] = t;
     cell_point(origin, spacing, node, at)
 }
 
-/// Where an inner vertex of a cell lies.
+/// Returns where an inner vertex of a cell lies.
 pub(super) fn cell_point(origin: Vec3, spacing: Vec3, cell: [usize; 3], at: [f64; 3]) -> Vec3 {
     let p = DVec3::new(cell[0] as f64, cell[1] as f64, cell[2] as f64) + DVec3::from_array(at);
     (origin.as_dvec3() + p * spacing.as_dvec3()).as_vec3()
@@ -152,7 +152,7 @@ fn repair(volume: &Volume, out: &mut LevelSet) -> Vec<f32> {
     values
 }
 
-/// The size of the largest finite value among a node and its 26 neighbours; 1 without any.
+/// Returns the size of the largest finite value among a node and its 26 neighbours; 1 without any.
 pub(super) fn largest_neighbour(
     node: [usize; 3],
     dims: [usize; 3],
@@ -341,7 +341,7 @@ impl Bits {
         &self.words[start..start + self.per_row]
     }
 
-    /// Is this node inside?
+    /// Returns whether this node is inside.
     pub(super) fn get(&self, i: usize, j: usize, k: usize) -> bool {
         self.row(j, k)[i / 64] >> (i % 64) & 1 == 1
     }

@@ -31,7 +31,7 @@ const FACES: [[u8; 4]; 6] =
 /// First of the vertex codes that name inner vertices instead of edges.
 const INNER: u8 = 12;
 
-/// Where the surface crosses an edge, 0..=1 from the end with value `a`; one end is inside (< 0), the
+/// Returns where the surface crosses an edge, 0..=1 from the end with value `a`; one end is inside (< 0), the
 /// other outside (≥ 0). Kept off the nodes: vertices never coincide and no face loses its area when a
 /// node is exactly zero.
 pub(super) fn crossing(a: f32, b: f32) -> f64 {
@@ -107,7 +107,7 @@ fn bit(case: u8, corner: u8) -> bool {
     case >> corner & 1 == 1
 }
 
-/// Is this edge crossed?
+/// Returns whether this edge is crossed.
 pub(super) fn crossed(case: u8, edge: usize) -> bool {
     bit(case, EDGES[edge][0]) != bit(case, EDGES[edge][1])
 }
@@ -148,7 +148,7 @@ fn edge_between(a: u8, b: u8) -> u8 {
     }
 }
 
-/// Do two edges lie on one cube face? They do when they agree on a coordinate that is fixed for both.
+/// Returns whether two edges lie on one cube face: they do when they agree on a coordinate that is fixed for both.
 fn share_face(a: u8, b: u8) -> bool {
     let (ca, cb) = (EDGES[a as usize], EDGES[b as usize]);
     (0..3).any(|axis| {
@@ -235,7 +235,7 @@ pub(super) fn resolve(case: u8, values: &[f32; 8]) -> CellSurface {
     out
 }
 
-/// Which loops lie on one piece of the surface: equal numbers.
+/// Returns which loops lie on one piece of the surface: equal numbers.
 fn join(case: u8, v: &[f64; 8], loops: &Loops) -> [u8; 4] {
     let mut group = [0, 1, 2, 3];
     if loops.loops.len() < 2 {

@@ -23,7 +23,7 @@ use super::marching::{LevelSet, PartCounts, cell_point, edge_point, largest_neig
 use super::marching_cell::{CASES, CellOutput, CellSurface, EDGES, crossed, crossing, resolve};
 use super::{BATCH, NodeGrid};
 use crate::geom::SdfField;
-use crate::mesh::input::{check_len, setting};
+use crate::mesh::{check_len, setting};
 use crate::{Monitor, Result};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -95,7 +95,7 @@ struct Flood<'a> {
 }
 
 impl Flood<'_> {
-    /// Values at nodes, outside ones without evaluating them. Order as given.
+    /// Returns the values at nodes, outside ones without evaluating them. Order as given.
     fn evaluate(&mut self, nodes: &[[usize; 3]]) -> Result<Vec<f32>> {
         let mut values = Vec::with_capacity(nodes.len());
         for nodes in nodes.chunks(BATCH) {
@@ -142,7 +142,7 @@ impl Flood<'_> {
         Ok(())
     }
 
-    /// Whether a lattice node is inside. A node that was not evaluated is not.
+    /// Returns whether a lattice node is inside. A node that was not evaluated is not.
     fn coarse_inside(&self, at: [usize; 3]) -> bool {
         self.coarse[self.lattice_index(at)] < 0.0
     }
@@ -176,7 +176,7 @@ impl Flood<'_> {
             .then(|| self.coarse[self.lattice_index(node.map(|c| c / step))])
     }
 
-    /// Has a node evaluated with the next batch, unless it is known.
+    /// Adds a node to the next batch, unless its value is known.
     fn want(&mut self, node: [usize; 3]) {
         if self.blocks.claim(node) {
             self.wanted.push(node);
@@ -350,7 +350,7 @@ impl Blocks {
         }
     }
 
-    /// Is a known node inside?
+    /// Returns whether a known node is inside.
     fn inside(&self, node: [usize; 3]) -> bool {
         self.known(node) == Some(true)
     }
@@ -579,7 +579,7 @@ mod tests {
         (few, marching(&volume, true).unwrap())
     }
 
-    /// The triangles as sorted positions: equal for equal surfaces, however numbered.
+    /// Returns the triangles as sorted positions: equal for equal surfaces, however numbered.
     fn key(s: &LevelSet) -> Vec<[[u32; 3]; 3]> {
         let mut all: Vec<_> = s
             .mesh

@@ -26,7 +26,7 @@
 
 use super::file_mesh::places;
 use crate::geom::{
-    Aabb, Atlas, Boxes, DBox, EFFORT, Mesh, OutlineSide, Sets, intersect, nearest_charts, overlaps,
+    Aabb, Atlas, Boxes, DBox, DEFAULT_EFFORT, Mesh, OutlineSide, Sets, intersect, nearest_charts, overlaps,
     share_out, shared_area, side_ends, sorted_sides, topology, turn,
 };
 use crate::{Error, Result};
@@ -40,7 +40,7 @@ use std::fmt;
 const SLIVER: f64 = 0.05;
 
 /// How far from 1 a normal's length may be; the Khronos validator's own bound.
-const UNIT: f32 = 5e-4;
+const NORMAL_TOLERANCE: f32 = 5e-4;
 
 /// The result of [`check`]. Counts of triangles are of the mesh as given; topology is after welding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -107,7 +107,7 @@ pub struct CheckReport {
 pub const BARS: [&str; 5] = ["watertight", "manifold", "one-piece", "no-self-intersections", "sound-uv"];
 
 impl CheckReport {
-    /// Whether the mesh is closed and wound outward.
+    /// Returns whether the mesh is closed and wound outward.
     fn is_watertight(&self) -> bool {
         self.closed && self.orientation().is_empty()
     }
@@ -273,7 +273,7 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
     }
     let topology = topology(&welded, &faces);
     let closed = topology.closed && invalid == 0;
-    let bad_normal = |n: &&glam::Vec3| (n.length() - 1.0).abs() > UNIT || n.is_nan();
+    let bad_normal = |n: &&glam::Vec3| (n.length() - 1.0).abs() > NORMAL_TOLERANCE || n.is_nan();
     let [low, high] = [bounds.min, bounds.max].map(|p| if bounds.is_empty() { Vec3::ZERO } else { p });
     let [low, high] = [low, high].map(|p| p.as_dvec3() + origin);
     let count = mesh.positions.len();
@@ -309,7 +309,7 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
 }
 
 /// Cost of comparing two triangles, in comparisons of boxes.
-const COMPARING: usize = 16;
+const TRIANGLE_TEST_COST: usize = 16;
 
 /// Returns how many triangles pass through or lie on another one, and how many others were not compared with all
 /// candidates.
@@ -338,13 +338,13 @@ fn self_intersections(mesh: &Mesh, faces: &[[u32; 3]], sources: &[u32]) -> (usiz
         facets.push((mesh.corners(sources[face]).map(|p| p.as_dvec3()), faces[face]));
     }
     let boxes = Boxes::new(facets.iter().map(|f| DBox::around(f.0)));
-    let shared = share_out(alone.len(), EFFORT, |i, effort| {
+    let shared = share_out(alone.len(), DEFAULT_EFFORT, |i, effort| {
         let (own, mut meets) = (alone[i], false);
         let (p, ids) = facets[own];
         boxes.meeting(&DBox::around(p), effort, |other, effort| {
             let (q, other_ids) = facets[other as usize];
             if other as usize != own {
-                if !effort.spend(COMPARING) {
+                if !effort.spend(TRIANGLE_TEST_COST) {
                     return false;
                 }
                 meets = intersect(p, ids, q, other_ids);
@@ -358,7 +358,7 @@ fn self_intersections(mesh: &Mesh, faces: &[[u32; 3]], sources: &[u32]) -> (usiz
 }
 
 /// Triangles below this area, in texels, count as having none: rounding decides their shape.
-pub const NO_AREA_PX: f64 = 1e-6;
+pub const MIN_AREA_PX: f64 = 1e-6;
 
 /// The result of [`uv_check`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -397,12 +397,12 @@ pub struct UvReport {
     pub flipped: usize,
     /// Charts that show the surface mirrored: clockwise as seen in the image.
     pub mirrored_charts: usize,
-    /// Triangles below [`NO_AREA_PX`], though they have area on the surface or not.
+    /// Triangles below [`MIN_AREA_PX`], though they have area on the surface or not.
     pub zero_area: usize,
     /// Triangles that reach out of the texture.
     pub outside: usize,
     /// Smallest distance between two charts, in texels; none for a single chart. Up to
-    /// [`FARTHEST_PX`](UvReport::FARTHEST_PX).
+    /// [`MAX_CHART_DISTANCE_PX`](UvReport::MAX_CHART_DISTANCE_PX).
     pub chart_distance_px: Option<f64>,
     /// Sides of charts that were not compared with all that lie near them: then the distance is an upper bound.
     pub chart_distance_left: usize,
@@ -412,10 +412,10 @@ pub struct UvReport {
 
 impl UvReport {
     /// Charts farther apart than this are not measured.
-    pub const FARTHEST_PX: f64 = 128.0;
+    pub const MAX_CHART_DISTANCE_PX: f64 = 128.0;
 
-    /// Whether every point of the surface has its own texel: no triangle is invalid, overlapping, flipped, without
-    /// area or outside.
+    /// Returns whether every point of the surface has its own texel: no triangle is invalid, overlapping, flipped,
+    /// without area or outside.
     pub fn is_sound(&self) -> bool {
         self.overlaps_left == 0
             && self.invalid + self.overlapping + self.flipped + self.zero_area + self.outside == 0
@@ -460,7 +460,7 @@ apart                {apart}, from the border {border:.2} texels
     }
 }
 
-/// Returns the text before and after a figure that is a bound because so many candidates were not compared.
+/// Returns the text before and after a figure that is a bound because `left` candidates were not compared.
 pub(super) fn bound(which: &'static str, left: usize, of: &str) -> (&'static str, String) {
     if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not looked at further)")) }
 }
@@ -493,7 +493,7 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
     for t in each() {
         let area = area(t);
         texture += area.abs();
-        flat[t] = area.abs() < NO_AREA_PX;
+        flat[t] = area.abs() < MIN_AREA_PX;
         report.zero_area += usize::from(flat[t]);
         *winding.entry(joined.chart[t]).or_default() += area;
         let corners = px(t);
@@ -517,7 +517,7 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
             valid[t] && has_area(uv(t))
         })
         .collect();
-    let found = overlaps(&atlas.uvs, &atlas.triangles[..common], &fit, EFFORT);
+    let found = overlaps(&atlas.uvs, &atlas.triangles[..common], &fit, DEFAULT_EFFORT);
     report.overlapping = found.covered;
     report.overlaps_left = found.left;
     let shared: Vec<f64> =
@@ -534,7 +534,7 @@ pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
             OutlineSide { chart: joined.chart[t], from: p[k], to: p[(k + 1) % 3] }
         })
         .collect();
-    let apart = nearest_charts(&sides, UvReport::FARTHEST_PX);
+    let apart = nearest_charts(&sides, UvReport::MAX_CHART_DISTANCE_PX);
     (report.chart_distance_px, report.chart_distance_left) = (apart.distance, apart.left);
     stretches(&mut report, &each().filter(|&t| !flat[t]).map(|t| (points(t), px(t))).collect::<Vec<_>>());
     report
@@ -573,7 +573,7 @@ struct Joined {
 }
 
 impl Joined {
-    /// Length of the cuts between those sides, over √area.
+    /// Returns the length of the cuts between those sides, over √area.
     fn seam_length(&self, between: impl Fn(u32, u32) -> bool) -> f64 {
         let kept = self.cuts.iter().filter(|(a, b, _)| between(*a, *b));
         let length = kept.fold(0.0, |sum, cut| sum + cut.2);
@@ -667,7 +667,7 @@ fn stretches(report: &mut UvReport, triangles: &[([DVec3; 3], [DVec2; 3])]) {
     (report.angle_stretch_median, report.angle_stretch_p99) = quantiles(&mut angles);
 }
 
-/// Median and 99th percentile.
+/// Returns the median and 99th percentile.
 fn quantiles(values: &mut [f64]) -> (f64, f64) {
     let mut at = |share: f64| {
         let i = ((values.len() - 1) as f64 * share).round() as usize;
@@ -681,7 +681,7 @@ mod tests {
     use super::*;
     use crate::ErrorKind;
 
-    /// A box from `low` to `high`, wound outward.
+    /// Returns a box from `low` to `high`, wound outward.
     fn cuboid(low: Vec3, high: Vec3) -> Mesh {
         let at = |i: u32| Vec3::from([0, 1, 2].map(|k| if i >> k & 1 == 1 { high[k] } else { low[k] }));
         let quads = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];

@@ -25,7 +25,7 @@
 
 use crate::geom::{Atlas, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Photo;
-use crate::mesh::input::check_indices;
+use crate::mesh::check_indices;
 use crate::{Error, Result, io};
 use bevy_mikktspace::{Geometry, TangentSpace, generate_tangents};
 use glam::{DMat3, DVec3, Mat3, Vec2, Vec3, Vec4};
@@ -174,7 +174,7 @@ impl FileMesh {
         self.positions.len() as u32 - 1
     }
 
-    /// Whether f32 would lose visible precision at this mesh's position.
+    /// Returns whether f32 would lose visible precision at this mesh's position.
     pub fn is_far(&self) -> bool {
         self.translation != DVec3::ZERO
     }
@@ -243,7 +243,7 @@ impl FileMesh {
 
 /// Distance from the origin, in the mesh's own sizes, beyond which a mesh counts as far: up to it f32 rounds by less
 /// than a millionth of the size.
-const FAR_IN_SIZES: f64 = 15.0;
+const FAR_ORIGIN: f64 = 15.0;
 
 /// Returns the box of a mesh in the file's coordinates.
 fn placed_box(mesh: &Mesh, file_from_mesh: &Similarity) -> (DVec3, DVec3) {
@@ -255,7 +255,7 @@ fn placed_box(mesh: &Mesh, file_from_mesh: &Similarity) -> (DVec3, DVec3) {
 /// Returns center and size of a box, and whether it is far from the origin.
 pub(super) fn middle((low, high): (DVec3, DVec3)) -> (DVec3, f64, bool) {
     let (center, size) = (0.5 * (low + high), (high - low).max_element());
-    (center, size, center.abs().max_element() > FAR_IN_SIZES * size)
+    (center, size, center.abs().max_element() > FAR_ORIGIN * size)
 }
 
 /// Returns the warning for a mesh far from the origin in a format that keeps absolute positions: the files hold
@@ -675,7 +675,7 @@ pub(super) mod tests {
         assert!(text.contains("the .obj lies 5.000e6") && text.contains("to 5.0e-1, 2.0e0 of its"), "{text}");
     }
 
-    /// A tetrahedron of which every face has a corner of the texture to itself, and its pictures.
+    /// Returns a tetrahedron of which every face has a corner of the texture to itself, and its pictures.
     pub fn tetrahedron() -> (Mesh, HeadTexture) {
         let mesh = Mesh {
             positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z],
@@ -785,7 +785,7 @@ pub(super) mod tests {
         assert!(encode("x", &color, Some(0)).is_err());
     }
 
-    /// A square in the plane z = 0 that looks along +Z, with the picture upright or mirrored.
+    /// Returns a square in the plane z = 0 that looks along +Z, with the picture upright or mirrored.
     fn square(mirrored: bool) -> (Mesh, Atlas) {
         let positions = vec![Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y];
         // v runs down: the top of the picture, v = 0, is at y = 1

@@ -487,7 +487,7 @@ mod tests {
     use crate::mesh::files::{PictureSource, ReadOptions, read, read_with, weld};
     use std::path::Path;
 
-    /// A strip of `vertices` points on a helix, colored.
+    /// Returns a strip of `vertices` points on a helix, colored.
     fn strip(vertices: u32) -> Mesh {
         let at = |i: u32| Vec3::new((i as f32 * 0.1).cos(), i as f32 * 1e-3, (i as f32 * 0.1).sin());
         Mesh {

@@ -306,7 +306,8 @@ impl<'a> GlbReader<'a> {
         Ok(())
     }
 
-    /// All numbers of an accessor, flat, and how many an element has; normalized integers become −1..=1. Finite.
+    /// Returns all numbers of an accessor, flat, and how many an element has; normalized integers become −1..=1.
+    /// Finite.
     fn numbers(&self, index: u32, kinds: &[Type], components: &[C]) -> Result<(Vec<f64>, usize)> {
         let source = self.source;
         let accessor = self.get("accessor", &self.root.accessors, index)?;
@@ -439,9 +440,9 @@ fn names<T: std::fmt::Debug>(all: &[T]) -> String {
 }
 
 /// Most objects and arrays. One takes two bytes of JSON and up to 144 in memory, and twice that while a list grows.
-const MOST_NESTED: usize = 1 << 20;
+const MAX_NESTED: usize = 1 << 20;
 /// Most values. A key with an index takes six bytes of JSON and up to a hundred in memory.
-const MOST_VALUES: usize = 4 << 20;
+const MAX_VALUES: usize = 4 << 20;
 
 #[derive(Deserialize, Default)]
 #[serde(rename_all = "camelCase", default)]
@@ -466,8 +467,8 @@ impl GlbRoot {
         // brackets in strings count too, but a file has few unless it is an attack
         let count = |marks: &[u8]| json.iter().filter(|b| marks.contains(b)).count();
         let (nested, values) = (count(b"{["), count(b"{[,"));
-        if nested > MOST_NESTED || values > MOST_VALUES {
-            let most = format!("more than {MOST_NESTED} objects and arrays or {MOST_VALUES} values");
+        if nested > MAX_NESTED || values > MAX_VALUES {
+            let most = format!("more than {MAX_NESTED} objects and arrays or {MAX_VALUES} values");
             return Err(source.broken(at, format!("{nested} and {values}, {most}")));
         }
         serde_json::from_slice(json).map_err(|e| source.broken(at, e))
@@ -589,7 +590,7 @@ struct GlbMaterial {
 }
 
 impl GlbMaterial {
-    /// Whether the material says that it belongs to the soft layers around a mesh.
+    /// Returns whether the material says that it belongs to the soft layers around a mesh.
     fn is_soft_layer(&self) -> bool {
         self.extras["tiface"]["soft_layers"].is_u64()
     }

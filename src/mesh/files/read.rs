@@ -74,7 +74,7 @@ fn parse(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
     Ok(found)
 }
 
-/// Whether some early line starts with a keyword of OBJ.
+/// Returns whether some early line starts with a keyword of OBJ.
 fn looks_like_obj(bytes: &[u8]) -> bool {
     let start = &bytes[..bytes.len().min(1 << 16)];
     !start.contains(&0)

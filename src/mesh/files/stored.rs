@@ -115,7 +115,7 @@ impl StoredTensors {
         Ok(values.chunks_exact(count).map(<[f32]>::to_vec).collect())
     }
 
-    /// A matrix by its columns.
+    /// Returns a matrix by its columns.
     fn matrix(&mut self, name: &str) -> Result<Mat3> {
         let &[x, y, z] = &self.rows::<3>(name)?[..] else { return Err(self.missing(name)) };
         Ok(Mat3::from_cols(x.into(), y.into(), z.into()))
@@ -234,7 +234,7 @@ impl ExtractedSurface {
 const HEAD_FILE: &str = "geometry.safetensors";
 
 /// Maximum number of functions of a spherical-harmonic color.
-const MOST_LOBES: usize = 16;
+const MAX_LOBES: usize = 16;
 
 /// A simplified mesh with its texture.
 #[derive(Clone, Debug, PartialEq)]
@@ -335,7 +335,7 @@ fn load_texture(folder: &Path, stored: &mut StoredTensors, mesh: &Mesh) -> Resul
     if stored.contains("lobe_scale") {
         let scale = stored.rows::<1>("lobe_scale")?.into_flattened();
         let asset_from_world = stored.matrix("asset_from_world")?;
-        if scale.len() > MOST_LOBES {
+        if scale.len() > MAX_LOBES {
             return Err(stored.missing("lobe_scale"));
         }
         let pictures = (0..scale.len()).map(|k| load_photo(folder, &format!("lobe_{k}.png"), size));
@@ -345,7 +345,7 @@ fn load_texture(folder: &Path, stored: &mut StoredTensors, mesh: &Mesh) -> Resul
 }
 
 fn load_harmonics(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Harmonics> {
-    let fits = |shape: &[usize]| matches!(*shape, [n, count, 3] if n == mesh.positions.len() && (1..=MOST_LOBES).contains(&count));
+    let fits = |shape: &[usize]| matches!(*shape, [n, count, 3] if n == mesh.positions.len() && (1..=MAX_LOBES).contains(&count));
     let (shape, values) = stored.numbers("harmonics", fits)?;
     let turned = stored.matrix("harmonics_from_scene")?;
     Ok(Harmonics { functions: shape[1], coefficients: values.as_chunks::<3>().0.to_vec(), turned })
@@ -418,7 +418,7 @@ pub(super) mod tests {
         assert!(missing.hint().contains("--fresh mesh"), "{missing:?}");
     }
 
-    /// A tetrahedron far away, with everything.
+    /// Returns a tetrahedron far away, with everything.
     pub fn head() -> HeadMesh {
         let at = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)];
         let mesh = Mesh {
@@ -464,7 +464,7 @@ pub(super) mod tests {
         assert_eq!(HeadMesh::load(dir.path()).unwrap(), bare);
     }
 
-    /// A picture of another size than the texture.
+    /// Returns a picture of another size than the texture.
     fn odd() -> Photo {
         Photo { width: 3, height: 1, rgb: vec![[1, 2, 3]; 3], alpha: None }
     }

@@ -9,8 +9,8 @@ use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 
 /// Most cells along an axis, and most of all.
-const CELLS: f32 = 512.0;
-const ALL_CELLS: f32 = 4e6;
+const MAX_CELLS_PER_AXIS: f32 = 512.0;
+const MAX_CELLS: f32 = 4e6;
 
 /// A regular grid over a box.
 #[derive(Clone, Copy)]
@@ -36,10 +36,10 @@ impl Cells {
         }
         let extent = bounds.max - bounds.min;
         let mut size = (1.2 * sum / n as f64) as f32;
-        size = size.max(extent.max_element() / CELLS);
+        size = size.max(extent.max_element() / MAX_CELLS_PER_AXIS);
         // extents relative to the size, so that their product does not overflow
         let along = |size: f32| (extent / size).floor() + 1.0;
-        while size > 0.0 && along(size).element_product() > ALL_CELLS {
+        while size > 0.0 && along(size).element_product() > MAX_CELLS {
             size *= 1.3;
         }
         // a point, or a box too large or too small for numbers
@@ -53,7 +53,7 @@ impl Cells {
         self.dims.x as usize * self.dims.y as usize * self.dims.z as usize
     }
 
-    /// The conversion cuts off, which for points of the box is rounding down.
+    /// Returns the cell of a point in the box; the conversion truncates, which is rounding down for such points.
     fn cell(&self, p: Vec3) -> IVec3 {
         ((p - self.origin) * self.per_unit).as_ivec3().clamp(IVec3::ZERO, self.dims - 1)
     }
@@ -104,7 +104,7 @@ impl Facet {
             && intersect(self.p, self.ids, other.p, other.ids)
     }
 
-    /// Whether the other one lies strictly on one side, but for common corners.
+    /// Returns whether the other one lies strictly on one side, but for common corners.
     fn is_clear_of(&self, other: &Facet, unsure: f64) -> bool {
         let (mut above, mut below) = (false, false);
         for k in 0..3 {

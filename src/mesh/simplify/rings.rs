@@ -232,7 +232,7 @@ impl Rings {
             if self.slots[v].len > 0 {
                 number[v] = mesh.positions.len() as u32;
                 mesh.positions.push(self.positions[v]);
-                fixed.push(self.flags[v] & (BORDER | HELD) != 0);
+                fixed.push(self.flags[v] & (BORDER | FIXED) != 0);
                 if let Some(&color) = self.colors.get(v) {
                     mesh.colors.push(color);
                 }
@@ -247,10 +247,10 @@ impl Rings {
 /// Flag of a vertex at an edge with one triangle.
 pub(super) const BORDER: u8 = 1;
 /// Takes part in no collapse and does not move.
-pub(super) const HELD: u8 = 2;
+pub(super) const FIXED: u8 = 2;
 
-/// What a vertex is, [`BORDER`] or [`HELD`] or neither, by the sides opposite to it, each from one neighbour to the
-/// next: one closed walk through all of them is the inside of a surface, one open walk its border.
+/// Returns what a vertex is, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it, each from one neighbour
+/// to the next: one closed walk through all of them is the inside of a surface, one open walk its border.
 pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
     sides.sort_unstable();
     let after = |w: u32| sides.binary_search_by_key(&w, |side| side.0).ok();
@@ -258,7 +258,7 @@ pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
         return 0;
     }
     if sides.windows(2).any(|pair| pair[0].0 == pair[1].0) {
-        return HELD;
+        return FIXED;
     }
     // A walk from anywhere either comes back, or ends at a border.
     let walk = |start: usize| {
@@ -274,7 +274,7 @@ pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
     };
     match walk(0) {
         (steps, false) if steps == sides.len() => return 0,
-        (_, false) => return HELD,
+        (_, false) => return FIXED,
         (_, true) => {}
     }
     // The border begins at the one side whose first neighbour ends none.
@@ -283,21 +283,21 @@ pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
     let begin = (0..sides.len()).find(|&i| ends.binary_search(&sides[i].0).is_err());
     match begin.map(walk) {
         Some((steps, true)) if steps == sides.len() => BORDER,
-        _ => HELD,
+        _ => FIXED,
     }
 }
 
 /// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point there
 /// where the triangles do not say (flat or along a crease). More costs accuracy: on a head simplified to
 /// a fifth, 1e-5, 1e-4, 1e-3 leave it 0.0198, 0.0206, 0.0223 off (in 512ths of the cube).
-const PULL: f64 = 1e-5;
+const MIDPOINT_WEIGHT: f64 = 1e-5;
 
 /// Share of the trace, times the squared half edge, added to the cost: short edges go first where all is
 /// flat, which halves the slivers of 1e-5 and costs no accuracy.
-const SHORT: f64 = 3e-5;
+const LENGTH_WEIGHT: f64 = 3e-5;
 
 /// The best point lies at most this many edge lengths from the edge's middle.
-const REACH: f64 = 1.5;
+const MAX_OFFSET: f64 = 1.5;
 
 /// The symmetric matrix `Σ A n nᵀ`: xx, xy, xz, yy, yz, zz.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -371,9 +371,9 @@ pub(super) fn best(
     let sum = qa.plus(qb, 1.0);
     let slope = times(&qa.plus(qb, -1.0), half);
     let trace = sum[0] + sum[3] + sum[5];
-    let pull = PULL * trace;
+    let pull = MIDPOINT_WEIGHT * trace;
     let reach = half.length_squared();
-    let least = half.dot(times(&sum, half)) + SHORT * trace * reach;
+    let least = half.dot(times(&sum, half)) + LENGTH_WEIGHT * trace * reach;
     let cost = |y: DVec3| (y.dot(times(&sum, y)) + 2.0 * y.dot(slope) + least).max(0.0) as f32;
     match freedom {
         CollapseTarget::First => return (a, cost(-half)),
@@ -381,7 +381,7 @@ pub(super) fn best(
         CollapseTarget::Free => {}
     }
     if let Some(y) = solve([sum[0] + pull, sum[1], sum[2], sum[3] + pull, sum[4], sum[5] + pull], -slope)
-        && y.length_squared() <= 4.0 * REACH * REACH * reach
+        && y.length_squared() <= 4.0 * MAX_OFFSET * MAX_OFFSET * reach
     {
         // Since (A + B + pull) y = −slope: yᵀ (A + B) y = −y · slope − pull |y|².
         let cost = least + y.dot(slope) - pull * y.length_squared();
@@ -413,11 +413,11 @@ fn solve(m: [f64; 6], r: DVec3) -> Option<DVec3> {
 }
 
 /// Cosine of how far a triangle may turn: 60°.
-pub(super) const TURN: f32 = 0.5;
+pub(super) const MIN_TURN_COSINE: f32 = 0.5;
 /// Least quality `4 √3 area / Σ length²` of a triangle.
-pub(super) const POOR: f32 = 0.05;
+pub(super) const MIN_QUALITY: f32 = 0.05;
 /// No collapse leaves a vertex with more triangles than this, unless one of its ends had more.
-const CROWN: usize = 20;
+const MAX_VALENCE: usize = 20;
 
 /// A triangle that will have the new vertex for a corner, and its other two corners in order.
 #[derive(Clone, Copy)]
@@ -461,7 +461,7 @@ impl EdgeLink {
         self.dropped.clear();
         self.around.clear();
         let (va, vb) = (rings.valence(a), rings.valence(b));
-        if va + vb > (CROWN + 4).max(va.max(vb) + 4) {
+        if va + vb > (MAX_VALENCE + 4).max(va.max(vb) + 4) {
             return false;
         }
         for &t in rings.ring(a) {
@@ -526,11 +526,11 @@ impl EdgeLink {
             let sum = u.length_squared() + v.length_squared() + (q - p).length_squared();
             // Lengths, not their squares: the latter leave f32 where edges are shorter than 1e-7.
             let (size, old) = (area.length(), rings.leans[side.triangle as usize]);
-            if area.dot(old) <= TURN * size * old.length() && old != Vec3::ZERO {
+            if area.dot(old) <= MIN_TURN_COSINE * size * old.length() && old != Vec3::ZERO {
                 return false;
             }
             let quality = 2.0 * 3f32.sqrt() * size / sum;
-            if quality < POOR || quality.is_nan() {
+            if quality < MIN_QUALITY || quality.is_nan() {
                 let worst = *worst.get_or_insert_with(|| self.worst(rings));
                 if quality <= worst || quality.is_nan() {
                     return false;
@@ -615,7 +615,7 @@ impl EdgeLink {
 #[inline]
 pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);
-    if (fa | fb) & (HELD) != 0 {
+    if (fa | fb) & (FIXED) != 0 {
         return None;
     }
     let freedom = match (fa & BORDER != 0, fb & BORDER != 0) {
@@ -636,17 +636,17 @@ mod tests {
         assert_eq!(kind(&mut [(1, 2), (3, 1), (2, 3)]), 0);
         assert_eq!(kind(&mut [(3, 4), (1, 2), (2, 3)]), BORDER);
         assert_eq!(kind(&mut [(1, 2)]), BORDER);
-        assert_eq!(kind(&mut [(1, 2), (2, 3), (3, 1), (4, 5), (5, 6), (6, 4)]), HELD);
-        assert_eq!(kind(&mut [(1, 2), (3, 4)]), HELD);
+        assert_eq!(kind(&mut [(1, 2), (2, 3), (3, 1), (4, 5), (5, 6), (6, 4)]), FIXED);
+        assert_eq!(kind(&mut [(1, 2), (3, 4)]), FIXED);
         assert_eq!(kind(&mut []), 0);
     }
 
     #[test]
     fn a_third_triangle_on_an_edge_holds_it_whichever_way_it_runs() {
-        assert_eq!(kind(&mut [(1, 2), (2, 3), (3, 1), (1, 4)]), HELD);
-        assert_eq!(kind(&mut [(1, 2), (2, 3), (3, 1), (4, 1)]), HELD);
+        assert_eq!(kind(&mut [(1, 2), (2, 3), (3, 1), (1, 4)]), FIXED);
+        assert_eq!(kind(&mut [(1, 2), (2, 3), (3, 1), (4, 1)]), FIXED);
         // into a loop that does not hold the start
-        assert_eq!(kind(&mut [(0, 1), (1, 2), (2, 1)]), HELD);
+        assert_eq!(kind(&mut [(0, 1), (1, 2), (2, 1)]), FIXED);
     }
 
     #[test]
@@ -656,7 +656,7 @@ mod tests {
         sides.pop();
         assert_eq!(kind(&mut sides), BORDER);
         sides.push((7, 99));
-        assert_eq!(kind(&mut sides), HELD);
+        assert_eq!(kind(&mut sides), FIXED);
     }
 
     fn spread(s: &[Vec3]) -> PlaneQuadric {

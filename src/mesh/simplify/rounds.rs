@@ -31,26 +31,26 @@
 //! where they are: the caller recognises them by `stamp`.
 
 use super::crossing::{Sheets, crossings};
-use super::rings::{BORDER, EdgeLink, HELD, POOR, Rings, TURN, place};
+use super::rings::{BORDER, EdgeLink, FIXED, MIN_QUALITY, MIN_TURN_COSINE, Rings, place};
 use super::{SimplifyConfig, SimplifyReport};
 use crate::geom::{Aabb, Mesh, SdfField, area_vector, shape};
 use crate::kernel::cpu::cg::conjugate_gradients;
+use crate::mesh::evaluate;
 use crate::mesh::extract::BATCH;
-use crate::mesh::input::evaluate;
 use crate::mesh::moves::{move_vertices, newton};
 use crate::{Monitor, Result};
 use glam::Vec3;
 use rayon::prelude::*;
 
 /// Buckets that a cost may have grown since the edge was entered: a quarter of it.
-const SLACK: usize = 4;
+const COST_SLACK: usize = 4;
 
 /// Of the edges of a new vertex only this many, the cheapest, are entered. The vertices around have theirs
 /// from before; all seven would take a tenth longer and win a hundredth of the error.
-const OFFERS: usize = 3;
+const EDGES_PER_VERTEX: usize = 3;
 
 /// Asking whether to stop costs nothing this often.
-const BREATH: usize = 1 << 12;
+const STOP_CHECK_INTERVAL: usize = 1 << 12;
 
 /// The data shared by all rounds.
 #[derive(Clone, Copy)]
@@ -79,7 +79,7 @@ pub(super) fn counted(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
 fn prepare(mesh: &Mesh, report: &mut SimplifyReport) -> Rings {
     let rings = Rings::new(mesh);
     report.degenerate += mesh.triangles.len() - rings.triangles.len();
-    report.held = rings.flags.iter().filter(|&&f| f & HELD != 0).count();
+    report.held = rings.flags.iter().filter(|&&f| f & FIXED != 0).count();
     rings
 }
 
@@ -102,16 +102,16 @@ pub(super) fn reduce(
         let mut queue = fill(rings);
         while rings.count > target {
             breath += 1;
-            if breath % BREATH == 0 {
+            if breath % STOP_CHECK_INTERVAL == 0 {
                 task.monitor.check_stop()?;
             }
             let Some((bucket, Entry { a, b, stamp })) = queue.pop() else { break };
             if rings.stamp(a, b) != stamp {
-                continue; // an end is gone, or its edges were entered anew
+                continue; // an end was removed, or its edges were entered again
             }
             let Some((x, cost)) = place(rings, a, b) else { continue };
             let now = EdgeQueue::bucket(cost);
-            if now > bucket + SLACK {
+            if now > bucket + COST_SLACK {
                 queue.push(now, Entry { a, b, stamp });
                 continue;
             }
@@ -150,9 +150,9 @@ pub(super) fn reduce(
                     offers.push((EdgeQueue::bucket(cost) as u32, w));
                 }
             }
-            if offers.len() > OFFERS {
-                offers.select_nth_unstable(OFFERS - 1);
-                offers.truncate(OFFERS);
+            if offers.len() > EDGES_PER_VERTEX {
+                offers.select_nth_unstable(EDGES_PER_VERTEX - 1);
+                offers.truncate(EDGES_PER_VERTEX);
             }
             for &(bucket, w) in &offers {
                 queue.push(bucket as usize, Entry { a, b: w, stamp: rings.stamp(a, w) });
@@ -164,7 +164,7 @@ pub(super) fn reduce(
     }
 }
 
-/// All edges.
+/// Returns all edges.
 fn fill(rings: &Rings) -> EdgeQueue {
     let mut queue = EdgeQueue::new();
     for t in rings.alive() {
@@ -281,12 +281,12 @@ fn without_crossings(positions: &mut [Vec3], triangles: &[[u32; 3]], start: &[Ve
 }
 
 /// Most rounds, and most that may be undone.
-const ROUNDS: usize = 24;
-const UNDONE: usize = 5;
+const MAX_ROUNDS: usize = 24;
+const MAX_UNDONE_ROUNDS: usize = 5;
 /// A round gives up at most this share of the triangles: measuring often is cheaper than undoing.
-const SHARE: f64 = 0.5;
+const MAX_SHARE_PER_ROUND: f64 = 0.5;
 /// A round that takes less than this share was the last.
-const LITTLE: f64 = 0.03;
+const MIN_SHARE_PER_ROUND: f64 = 0.03;
 
 /// Simplifies until the error or the number of triangles is reached.
 pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh> {
@@ -301,11 +301,11 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
     let mut at = measure(&good, task, report)?;
     report.worst = Some(worst(&at));
     let (mut part, mut undone) = (1.0, 0);
-    for round in 0..ROUNDS {
+    for round in 0..MAX_ROUNDS {
         let before = good.triangles.len();
         let mut rings = prepare(&good, report);
         let mut budgets: Vec<f32> = at.iter().map(|e| part * (error - e)).collect();
-        let goal = target.max((SHARE * before as f64) as usize);
+        let goal = target.max((MAX_SHARE_PER_ROUND * before as f64) as usize);
         reduce(&mut rings, task, goal, Some(&mut budgets), report)?;
         let (mut next, fixed) = rings.into_mesh();
         if next.triangles.len() == before {
@@ -317,21 +317,21 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         let after = next.triangles.len();
         task.monitor.step(
             round as u64 + 1,
-            ROUNDS as u64,
+            MAX_ROUNDS as u64,
             &[("triangles", after as f64), ("worst", f64::from(found))],
         );
         // An input that is farther off than `error` may at least not become worse.
         if found > error.max(report.worst.unwrap_or(0.0)) {
             undone += 1;
             part *= 0.6;
-            if undone > UNDONE {
+            if undone > MAX_UNDONE_ROUNDS {
                 break;
             }
             continue;
         }
         (good, at) = (next, errors);
         report.worst = Some(found);
-        if after <= target || after as f64 > (1.0 - LITTLE) * before as f64 {
+        if after <= target || after as f64 > (1.0 - MIN_SHARE_PER_ROUND) * before as f64 {
             break;
         }
     }
@@ -352,7 +352,7 @@ fn worst(errors: &[f32]) -> f32 {
 fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<f32>> {
     let mut errors = vec![0.0f32; mesh.positions.len()];
     let Some(field) = task.field else { return Ok(errors) };
-    // Where, and for whom: each inner edge once.
+    // Each inner edge once, with its place.
     let mut points = mesh.positions.clone();
     let mut whom: Vec<[u32; 3]> = (0..points.len() as u32).map(|v| [v; 3]).collect();
     for t in &mesh.triangles {
@@ -381,7 +381,7 @@ fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<
 /// Conjugate gradients on a mass matrix gain a digit in about five steps; two digits are ample.
 const STEPS: usize = 12;
 
-/// Half the mean length of the edges at each vertex: how far it may go in a step.
+/// Returns half the mean length of the edges at each vertex: how far it may go in a step.
 fn reaches(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<f32> {
     let mut sums = vec![(0.0f32, 0.0f32); positions.len()];
     for t in triangles {
@@ -407,8 +407,8 @@ fn move_to(positions: &mut [Vec3], triangles: &[[u32; 3]], targets: &[Vec3]) -> 
         let [was, is] = [from, to].map(|p| triangles[t].map(|v| p[v as usize]));
         let (old, new) = (area_vector(was), area_vector(is));
         let along = old.dot(new);
-        let turned = along <= TURN * old.length() * new.length() || along.is_nan();
-        (turned && old != Vec3::ZERO) || (shape(is) < POOR && shape(is) < shape(was))
+        let turned = along <= MIN_TURN_COSINE * old.length() * new.length() || along.is_nan();
+        (turned && old != Vec3::ZERO) || (shape(is) < MIN_QUALITY && shape(is) < shape(was))
     };
     move_vertices(positions, triangles, at, spoiled)
 }

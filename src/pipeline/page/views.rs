@@ -15,7 +15,7 @@ use crate::pipeline::metrics::{Comparable, comparable, picture_sets};
 use crate::pipeline::pictures;
 use crate::pipeline::session::Session;
 use crate::report::{
-    HEAT, MOST_ERROR, ViewPicture, ViewRow, Viewer, ViewerCamera, link, picture_url, viewer_html,
+    HEAT, MAX_ERROR, ViewPicture, ViewRow, Viewer, ViewerCamera, link, picture_url, viewer_html,
 };
 use crate::run::{Record, read_record};
 use crate::{Error, Quiet, Result};
@@ -26,8 +26,8 @@ use std::path::Path;
 
 /// Longest side of a picture on the page: of few views, and of many.
 const SIDE_PX: (u32, u32) = (480, 320);
-/// Up to so many views count as few.
-const FEW: usize = 10;
+/// Maximum number of views that count as few.
+const FEW_VIEWS: usize = 10;
 /// JPEG quality: about 25 kB per picture.
 const QUALITY: u8 = 84;
 
@@ -51,7 +51,7 @@ pub(super) fn rows(session: &Session, most: usize) -> Result<(Vec<ViewRow>, Vec<
         .into_iter()
         .filter(|(v, p)| if evaluated { !p.is_empty() } else { v.split != Split::Train })
         .collect();
-    let side = if shown.len() > FEW { SIDE_PX.1 } else { SIDE_PX.0 };
+    let side = if shown.len() > FEW_VIEWS { SIDE_PX.1 } else { SIDE_PX.0 };
     let figures =
         io::read_json(&session.run.path("metrics/metrics.json"), &Limits::default()).unwrap_or_default();
     let (mut rows, mut left_out, mut bytes) = (Vec::new(), Vec::new(), 0);
@@ -128,10 +128,10 @@ fn row(
     Ok(ViewRow { name: view.name.clone(), width: size.0, height: size.1, photo: url(&photo)?, pictures })
 }
 
-/// Returns the mean difference of the channels as a share of [`MOST_ERROR`], in all three channels.
+/// Returns the mean difference of the channels as a share of [`MAX_ERROR`], in all three channels.
 pub(in crate::pipeline) fn error(a: [u8; 3], b: [u8; 3]) -> [u8; 3] {
     let sum: u32 = (0..3).map(|k| a[k].abs_diff(b[k]) as u32).sum();
-    [quantize(sum as f32 / 3.0 / 255.0 / MOST_ERROR); 3]
+    [quantize(sum as f32 / 3.0 / 255.0 / MAX_ERROR); 3]
 }
 
 /// Returns the color of an error, 0..=1.
@@ -172,14 +172,14 @@ fn straightened(picture: Photo, camera: &Camera) -> Photo {
 }
 
 /// Maximum size of a mesh inside a page, bytes: 100,000 triangles with a texture.
-const MOST_BYTES: usize = 4_600_000;
+const MAX_BYTES: usize = 4_600_000;
 /// Longest side of a base color in a page, and of a function of view-dependent color, which is smooth.
 const COLOR_PX: u32 = 2048;
 const LOBE_PX: u32 = 512;
 /// What marks a GLB as written by this program.
 const GENERATOR: &[u8] = b"\"generator\":\"tiface ";
 /// Number of triangles of a larger mesh's copy, which has colors at its vertices.
-const FEWER: usize = 100_000;
+const REDUCED_TRIANGLES: usize = 100_000;
 
 /// Returns the head of a run without cameras, and the transform from the dataset's world to its coordinates; `None`
 /// before the stage `mesh`.
@@ -243,7 +243,7 @@ pub(super) fn cameras(
 /// Fails if the run has no mesh yet, or if it is damaged.
 pub fn head_page(session: &Session) -> Result<String> {
     let (mut viewer, file_from_world) = shown(session, &finished_mesh(session.run.dir())?)?;
-    let most = super::MOST_BYTES.saturating_sub(viewer.glb.len().div_ceil(3) * 4);
+    let most = super::MAX_BYTES.saturating_sub(viewer.glb.len().div_ceil(3) * 4);
     // without photographs the page still shows the head
     let (mut rows, _) =
         if session.inputs.missing_capture.is_none() { rows(session, most)? } else { Default::default() };
@@ -272,7 +272,7 @@ pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
     };
     // a file of ours is shown unchanged, with soft layers and what depends on the view
     let is_ours = bytes.starts_with(b"glTF") && bytes.windows(GENERATOR.len()).any(|w| w == GENERATOR);
-    let (glb, note) = if is_ours && up == Vec3::Y && bytes.len() <= MOST_BYTES {
+    let (glb, note) = if is_ours && up == Vec3::Y && bytes.len() <= MAX_BYTES {
         (bytes, String::new())
     } else {
         if is_ours {
@@ -297,13 +297,13 @@ fn small(
 ) -> Result<(Vec<u8>, String)> {
     head.texture = head.texture.map(reduced);
     let copy = as_glb(&head)?;
-    if copy.len() <= MOST_BYTES {
+    if copy.len() <= MAX_BYTES {
         return Ok((copy, String::new()));
     }
     head.shells = None;
     head.texture.iter_mut().for_each(|texture| texture.lobes = None);
     let copy = as_glb(&head)?;
-    if copy.len() <= MOST_BYTES {
+    if copy.len() <= MAX_BYTES {
         return Ok((copy, "A copy without soft layers and what depends on the view.".into()));
     }
     let HeadMesh { mut mesh, texture, world_from_scene, .. } = head;
@@ -317,11 +317,16 @@ fn small(
     }
     let mut mesh = weld(&mesh);
     let before = mesh.triangles.len();
-    simplify(&mut mesh, None, &SimplifyConfig { triangles: FEWER, ..SimplifyConfig::default() }, &Quiet)?;
+    simplify(
+        &mut mesh,
+        None,
+        &SimplifyConfig { triangles: REDUCED_TRIANGLES, ..SimplifyConfig::default() },
+        &Quiet,
+    )?;
     let after = mesh.triangles.len();
     let head = HeadMesh { mesh, world_from_scene, texture: None, harmonics: None, shells: None };
     let copy = as_glb(&head)?;
-    if copy.len() > MOST_BYTES {
+    if copy.len() > MAX_BYTES {
         let hint = "simplify it first, and make its texture smaller";
         return Err(Error::cannot(format!("`{}` is too large for a page", path.display()), hint));
     }

@@ -12,23 +12,23 @@ pub(super) const TILE: usize = 32;
 pub(super) const UNIT: i32 = 256;
 
 /// The first and the last place of a sample in a row.
-const FIRST: i32 = 32;
-const LAST: i32 = 224;
+const FIRST_SAMPLE: i32 = 32;
+const LAST_SAMPLE: i32 = 224;
 
 /// Number of triangles that are binned together; fixed, so that the result does not depend on the number of threads.
 const CHUNK: usize = 4096;
 
 /// Farthest from the picture's corner, 1/256 pixels: products of two distances fit into 64 bits many times over.
-const FARTHEST: f64 = (1 << 23) as f64;
+const MAX_COORDINATE: f64 = (1 << 23) as f64;
 
 /// The same for a corner made by clipping, which is rounded.
-const CUT: f64 = FARTHEST + 8192.0;
+const MAX_CLIPPED_COORDINATE: f64 = MAX_COORDINATE + 8192.0;
 
 /// Nearest to the camera, as a share of the distance to the farthest corner of the mesh's box.
-const NEAREST: f32 = 1e-5;
+const MIN_DEPTH_SHARE: f32 = 1e-5;
 
 /// How far a straight line may lie from where the lens bends it to, pixels.
-const BENT: f64 = 1.0 / 64.0;
+const MAX_LENS_ERROR_PX: f64 = 1.0 / 64.0;
 
 /// Samples along each side of a picture whose rays determine the field of view of the lens.
 const LENS_GRID: usize = 33;
@@ -53,7 +53,7 @@ pub(super) struct Face {
     pub back: bool,
 }
 
-/// Twice the area of a triangle, 1/65,536 pixels; positive if it is clockwise.
+/// Returns twice the area of a triangle, 1/65,536 pixels; positive if it is clockwise.
 pub(super) fn area([a, b, c]: [Corner; 3]) -> i64 {
     let to = |p: Corner| (i64::from(p.x) - i64::from(a.x), i64::from(p.y) - i64::from(a.y));
     let ((bx, by), (cx, cy)) = (to(b), to(c));
@@ -123,8 +123,8 @@ impl<'a> Lens<'a> {
         let seen = if camera.distortion.is_none() {
             // as far as numbers go: an edge within is then cut in neither of its triangles
             let reach = |focal: f64, middle: f64| {
-                let [a, b] =
-                    [-1.0, 1.0].map(|side| ((side * FARTHEST / f64::from(UNIT) - middle) / focal) as f32);
+                let [a, b] = [-1.0, 1.0]
+                    .map(|side| ((side * MAX_COORDINATE / f64::from(UNIT) - middle) / focal) as f32);
                 (a.min(b), a.max(b))
             };
             let (x, y) = (reach(camera.fx, camera.cx), reach(camera.fy, camera.cy));
@@ -139,7 +139,7 @@ impl<'a> Lens<'a> {
             camera,
             camera_from_mesh,
             origin,
-            near: NEAREST * far,
+            near: MIN_DEPTH_SHARE * far,
             seen,
             mirrored: (camera.fx < 0.0) != (camera.fy < 0.0),
             across: tiles(camera.width),
@@ -154,7 +154,7 @@ impl<'a> Lens<'a> {
             all.positions
                 .par_iter()
                 .with_min_len(CHUNK)
-                .map(|&p| self.corner(self.ideal(p), FARTHEST))
+                .map(|&p| self.corner(self.ideal(p), MAX_COORDINATE))
                 .collect()
         } else {
             Vec::new()
@@ -210,7 +210,7 @@ impl<'a> Lens<'a> {
             return Corner::default();
         }
         // rounded to nearest: positive before the cast, which cuts off
-        let round = |v: f64| (v + (CUT + 0.5)) as i32 - CUT as i32;
+        let round = |v: f64| (v + (MAX_CLIPPED_COORDINATE + 0.5)) as i32 - MAX_CLIPPED_COORDINATE as i32;
         Corner { x: round(x), y: round(y), inverse_depth: ideal.z }
     }
 
@@ -267,14 +267,14 @@ impl<'a> Lens<'a> {
             let worst = (0..3).map(|k| (off(k), k)).max_by(|a, b| a.0.total_cmp(&b.0));
             match worst.filter(|_| !self.camera.distortion.is_none()) {
                 // an edge of ten pictures is bent by less than that after sixteen halvings
-                Some((most, k)) if most > BENT && depth < 48 => {
+                Some((most, k)) if most > MAX_LENS_ERROR_PX && depth < 48 => {
                     let [a, b, c] = [0, 1, 2].map(|i| piece[(k + i) % 3]);
                     let middle = 0.5 * (a + b);
                     pieces.push(([a, middle, c], depth + 1));
                     pieces.push(([middle, b, c], depth + 1));
                 }
                 _ => {
-                    let corners = piece.map(|p| self.corner(p, CUT));
+                    let corners = piece.map(|p| self.corner(p, MAX_CLIPPED_COORDINATE));
                     if corners.iter().all(|c| c.inverse_depth > 0.0) {
                         self.add(corners, id, cull, out);
                     }
@@ -336,7 +336,7 @@ pub(super) fn reach(face: &Face) -> ((i32, i32), (i32, i32)) {
     let [a, b, c] = face.corners;
     let span = |a: i32, b: i32, c: i32| {
         let (low, high) = (a.min(b).min(c), a.max(b).max(c));
-        ((low - LAST + UNIT - 1).div_euclid(UNIT), (high - FIRST).div_euclid(UNIT))
+        ((low - LAST_SAMPLE + UNIT - 1).div_euclid(UNIT), (high - FIRST_SAMPLE).div_euclid(UNIT))
     };
     (span(a.x, b.x, c.x), span(a.y, b.y, c.y))
 }

@@ -16,7 +16,7 @@ const LANES: usize = 8;
 const BLOCK: usize = 8;
 const BLOCKS: usize = TILE / BLOCK;
 
-/// After so many faces the farthest depths are looked up again.
+/// Number of faces after which the farthest depths are computed again.
 const REFRESH: usize = 256;
 
 /// Samples of a pixel's coverage.
