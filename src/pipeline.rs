@@ -25,6 +25,7 @@ mod cameras;
 mod clicks;
 mod ensemble;
 pub mod experiment;
+mod exposure;
 mod finish;
 mod inputs;
 mod learn;
@@ -38,6 +39,7 @@ mod pictures;
 mod plan;
 mod preview;
 mod render;
+mod rig_photos;
 mod scene_file;
 mod session;
 mod surface;
@@ -105,7 +107,8 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
             let surface = demo.then(|| mesh::surface_in_world(run)).transpose()?;
             let evaluated = session.evaluation_capture();
             let masks = session.mask_source(&evaluated);
-            metrics::metrics(&evaluated, config, run, masks, surface.as_ref(), dir)
+            let exposure = session.exposure()?;
+            metrics::metrics(&evaluated, config, run, masks, surface.as_ref(), exposure.as_ref(), dir)
         }
     };
     let done = run.stage(session.plan(stage), |dir| {

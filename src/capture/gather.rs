@@ -182,6 +182,7 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         photo_size,
         declared,
         declared_by: frame.file.clone(),
+        exposure: None,
     })
 }
 
