@@ -6,7 +6,7 @@
 mod exposure;
 mod resize;
 
-pub use exposure::{Exposure, corner_share};
+pub use exposure::Exposure;
 pub use resize::{
     bilinear, enlarge, reduce_photo, reduce_to_rows, resize_gray, resize_hard, size_at_rows, working_size,
 };

@@ -131,6 +131,8 @@ mod clicks_tests;
 #[cfg(test)]
 mod ensemble_tests;
 #[cfg(test)]
+mod exposure_tests;
+#[cfg(test)]
 mod path_tests;
 #[cfg(test)]
 mod session_tests;

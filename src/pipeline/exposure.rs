@@ -17,7 +17,7 @@ use std::path::Path;
 /// File name of the measurement, in the folder of the stage `mask`.
 pub(super) const EXPOSURE: &str = "exposure.json";
 
-/// Largest side of what an exposure can be: a factor, and its inverse.
+/// The largest gain that is believed; the least is its inverse.
 const LARGEST_GAIN: f32 = 100.0;
 
 /// A view is named alone if it differs this many times as much as the median view.
@@ -54,7 +54,7 @@ impl ExposureCheck {
         let RigPhotos { views, train, cameras, surface, .. } = photos;
         let prepared: Vec<ExposureView> =
             photos.pictures.par_iter().map(|(photo, head)| ExposureView::new(photo, head)).collect();
-        let fit = exposure::measure(&prepared, cameras, &lenses(views), *train, surface)?;
+        let fit = exposure::measure(&prepared, cameras, *train, surface)?;
         let (brightness, color) = (fit.brightness_differs(), fit.color_differs());
         let used = |e: &Exposure| {
             let own = |k: usize| match (brightness, color) {
@@ -63,9 +63,9 @@ impl ExposureCheck {
                 (false, true) => e.gain[k] / e.brightness(),
                 (false, false) => 1.0,
             };
-            Exposure { gain: [0, 1, 2].map(own), vignetting: e.vignetting }
+            Exposure { gain: [0, 1, 2].map(own) }
         };
-        let evened_out = brightness || color || fit.exposures.iter().any(|e| e.vignetting > 0.0);
+        let evened_out = brightness || color;
         let measured = |((view, &points), &measured): ((&&View, &usize), &Exposure)| MeasuredView {
             view: view.name.clone(),
             split: view.split,
@@ -113,10 +113,6 @@ impl ExposureCheck {
         if used.iter().any(|(_, e)| e.gain.iter().any(|g| *g != e.gain[0])) {
             parts.push(format!("white balance differs by {:.0} %", 100.0 * self.color_spread));
         }
-        let dark = used.iter().map(|(_, e)| e.vignetting).fold(0.0, f32::max);
-        if dark > 0.0 {
-            parts.push(format!("corners lose {:.0} % of the light", 100.0 * (1.0 - (-dark).exp())));
-        }
         parts.join("; ")
     }
 
@@ -154,7 +150,7 @@ impl ExposureCheck {
         }
         let check: ExposureCheck = io::read_typed(&path, &Limits::default())?;
         for (k, view) in check.views.iter().enumerate() {
-            let Some(Exposure { gain, vignetting }) = view.used else { continue };
+            let Some(Exposure { gain }) = view.used else { continue };
             if !gain.iter().all(|g| (1.0 / LARGEST_GAIN..=LARGEST_GAIN).contains(g)) {
                 let expected = format!("three numbers from {} to {LARGEST_GAIN}", 1.0 / LARGEST_GAIN);
                 return Err(ReadError::value(
@@ -163,10 +159,6 @@ impl ExposureCheck {
                     format!("{gain:?}"),
                     &expected,
                 ));
-            }
-            if !(0.0..=LARGEST_GAIN.ln()).contains(&vignetting) {
-                let key = format!("views[{k}].used.vignetting");
-                return Err(ReadError::value(&path, key, vignetting.to_string(), "0 to 4.6"));
             }
         }
         Ok(Some(check))
@@ -183,21 +175,4 @@ impl ExposureCheck {
     pub(super) fn used(&self, view: &str) -> Option<Exposure> {
         self.views.iter().find(|v| v.view == view)?.used
     }
-}
-
-/// Returns a number for each view, the same for views whose lenses have the same parameters.
-fn lenses(views: &[&View]) -> Vec<usize> {
-    let lens = |v: &View| {
-        let c = &v.camera;
-        (c.width, c.height, [c.fx, c.fy, c.cx, c.cy], c.distortion)
-    };
-    let mut known = Vec::new();
-    let number = |v: &&View| {
-        let lens = lens(v);
-        known.iter().position(|k| *k == lens).unwrap_or_else(|| {
-            known.push(lens);
-            known.len() - 1
-        })
-    };
-    views.iter().map(number).collect()
 }

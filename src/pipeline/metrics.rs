@@ -96,7 +96,8 @@ pub(super) fn metrics(
     lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
     let tones = Tones::of(&views)?;
     for (i, (set, pictures)) in sets.iter().zip(&comparables).enumerate() {
-        let figures = pictures.par_iter().map(|p| figures(config, p, tones.as_ref(), lpips.as_ref(), exposure));
+        let figures =
+            pictures.par_iter().map(|p| figures(config, p, tones.as_ref(), lpips.as_ref(), exposure));
         let figures = figures.collect::<Result<Vec<_>>>()?;
         if !figures.is_empty() {
             out.insert(set.name.clone(), entry(figures));
