@@ -167,10 +167,12 @@ fn samples(views: &[ExposureView], cameras: &[Camera], seed: &Seed) -> Vec<Sampl
 
 /// Returns the logarithms of the views' gains in one channel.
 fn fit_channel(points: &[Vec<Sample>], k: usize, views: usize, train: usize) -> Option<Vec<f64>> {
+    fn known(samples: &[Sample], train: usize) -> impl Iterator<Item = &Sample> {
+        samples.iter().filter(move |s| s.view < train)
+    }
     let mut x = vec![0.0; train];
     let mut offset = vec![0.0; points.len()];
     let mut scale = 1.0;
-    let known = |samples: &'_ [Sample]| samples.iter().filter(|s| s.view < train).collect::<Vec<_>>();
     for round in 0..ROUNDS {
         let (mut matrix, mut vector) = (vec![0.0; train * train], vec![0.0; train]);
         for (samples, offset) in points.iter().zip(&offset) {
@@ -178,7 +180,7 @@ fn fit_channel(points: &[Vec<Sample>], k: usize, views: usize, train: usize) -> 
                 0 => 1.0,
                 _ => 1.0 / (1.0 + ((s.light[k] - x[s.view] - offset) / scale).powi(2)),
             };
-            let weighted: Vec<(f64, &Sample)> = known(samples).into_iter().map(|s| (weight(&s), s)).collect();
+            let weighted: Vec<(f64, &Sample)> = known(samples, train).map(|s| (weight(&s), s)).collect();
             let total: f64 = weighted.iter().map(|(w, _)| w).sum();
             let mean = weighted.iter().map(|(w, s)| w * s.light[k]).sum::<f64>() / total;
             // every point's own constant is eliminated
@@ -193,7 +195,7 @@ fn fit_channel(points: &[Vec<Sample>], k: usize, views: usize, train: usize) -> 
         x = solve(matrix, &vector)?;
         let mut residuals = Vec::new();
         for (samples, offset) in points.iter().zip(&mut offset) {
-            let values: Vec<f64> = known(samples).iter().map(|s| s.light[k] - x[s.view]).collect();
+            let values: Vec<f64> = known(samples, train).map(|s| s.light[k] - x[s.view]).collect();
             *offset = median(&mut values.clone());
             residuals.extend(values.iter().map(|v| (v - *offset).abs()));
         }
