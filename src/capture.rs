@@ -244,6 +244,7 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         photo_size,
         declared,
         declared_by: frame.file.clone(),
+        exposure: None,
     })
 }
 

@@ -3,8 +3,10 @@
 //! The fields learn and render **sRGB-coded** color, as the published system does, so a render
 //! here is coded too and meets linear light only at the edge (EXR, glTF vertex colors, filtering).
 
+mod exposure;
 mod resize;
 
+pub use exposure::Exposure;
 pub use resize::{
     bilinear, enlarge, reduce_photo, reduce_to_rows, resize_gray, resize_hard, size_at_rows, working_size,
 };

@@ -25,6 +25,7 @@ mod cameras;
 mod clicks;
 mod ensemble;
 pub mod experiment;
+mod exposure;
 mod finish;
 mod inputs;
 mod learn;
@@ -37,6 +38,7 @@ mod pictures;
 mod plan;
 mod preview;
 mod render;
+mod rig_photos;
 mod scene_file;
 mod session;
 mod surface;
@@ -104,7 +106,8 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
             let surface = demo.then(|| mesh::surface_in_world(run)).transpose()?;
             let evaluated = session.evaluation_capture();
             let masks = session.mask_source(&evaluated);
-            metrics::metrics(&evaluated, config, run, masks, surface.as_ref(), dir)
+            let exposure = session.exposure()?;
+            metrics::metrics(&evaluated, config, run, masks, surface.as_ref(), exposure.as_ref(), dir)
         }
     };
     let done = run.stage(session.plan(stage), |dir| {
@@ -126,6 +129,8 @@ mod cameras_tests;
 mod clicks_tests;
 #[cfg(test)]
 mod ensemble_tests;
+#[cfg(test)]
+mod exposure_tests;
 #[cfg(test)]
 mod path_tests;
 #[cfg(test)]

@@ -13,6 +13,7 @@
 //! whatever the threads.
 
 mod adjust;
+pub mod exposure;
 mod gate;
 mod tracks;
 
@@ -58,7 +59,7 @@ pub struct Rig {
 /// are photographs and cameras of the same order. `all` asks for all cameras to be refined, whatever the gain.
 pub fn measure(views: &[RigView], given: &[Camera], surface: &Mesh, all: bool) -> Rig {
     let mut cameras = given.to_vec();
-    let mut seeds = tracks::seeds(surface, given, views, POINTS);
+    let mut seeds = tracks::seeds(surface, given, |v, pixel| views[v].is_usable(pixel), POINTS);
     let (mut tracks, mut expected) = (Vec::new(), Vec::new());
     for passes in ROUNDS {
         expected = tracks::looked_up(&cameras, &seeds);

@@ -138,6 +138,9 @@ pub struct Inspection {
     /// How well the cameras fit each other, measured on the photographs, and what a run does about it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fit: Option<String>,
+    /// How exposure and white balance differ, and what a run does about it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub exposure: Option<String>,
     /// The head's box and hull.
     #[serde(skip)]
     pub placed: Option<Scene>,
@@ -322,6 +325,9 @@ impl fmt::Display for Inspection {
         }
         if let Some(text) = &self.fit {
             writeln!(f, "            {text}")?;
+        }
+        if let Some(text) = &self.exposure {
+            writeln!(f, "  exposure  {text}")?;
         }
         if let Some(up) = self.up {
             writeln!(f, "            up is ({:.3}, {:.3}, {:.3})", up.x, up.y, up.z)?;

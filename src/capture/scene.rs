@@ -648,6 +648,7 @@ mod tests {
             photo_size: (1, 1),
             declared: (1, 1),
             declared_by: String::new(),
+            exposure: None,
         };
         let views: Vec<View> = cameras.iter().map(view).collect();
         let mut points: Vec<DVec3> =

@@ -5,9 +5,9 @@
 //! so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as a sensor
 //! with larger pixels would, weighted by alpha where there is one.
 
-use crate::config::{CameraPoses, MaskMeaning, MaskSource};
+use crate::config::{CameraPoses, Exposures, MaskMeaning, MaskSource};
 use crate::geom::{Aabb, Camera};
-use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
+use crate::image::{Exposure, Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::io::{self, Limits, NpyValues};
 use crate::{Error, Result};
 use glam::Vec3;
@@ -59,6 +59,8 @@ pub struct CaptureOptions {
     pub trust_masks: bool,
     /// Whether poses are to be measured.
     pub cameras: CameraPoses,
+    /// Whether exposures are to be measured.
+    pub exposure: Exposures,
     /// Metres per dataset unit.
     pub unit_m: f64,
     /// What is refused for its size.
@@ -74,6 +76,7 @@ impl Default for CaptureOptions {
             mask_meaning: MaskMeaning::Empty,
             trust_masks: false,
             cameras: CameraPoses::Auto,
+            exposure: Exposures::Auto,
             unit_m: 1.0,
             limits: Limits::default(),
         }
@@ -134,6 +137,9 @@ pub struct View {
     pub declared: (u32, u32),
     /// The file that declares it.
     pub declared_by: String,
+    /// The exposure that is divided out of the photograph when it is read.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub exposure: Option<Exposure>,
 }
 
 impl Capture {
@@ -157,8 +163,16 @@ pub struct LoadedView {
 }
 
 impl View {
-    /// Reads the photograph alone, at the size of its camera.
+    /// Reads the photograph alone, at the size of its camera, with its exposure divided out.
     pub fn load_photo(&self, limits: &Limits) -> Result<Photo> {
+        let photo = self.stored_photo(limits)?;
+        Ok(match &self.exposure {
+            Some(exposure) => exposure.divided_out(photo),
+            None => photo,
+        })
+    }
+
+    fn stored_photo(&self, limits: &Limits) -> Result<Photo> {
         let photo = io::read_photo(&self.photo, Some(self.photo_size), limits)?;
         let found = (photo.width, photo.height);
         if found != self.photo_size {

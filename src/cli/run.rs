@@ -291,6 +291,9 @@ fn judgement(metrics: &Value) -> Vec<String> {
                 "{} against held-out photographs: PSNR {psnr:.2} dB{ssim}, {region}",
                 called(set)
             ));
+            if let Some(own) = metrics[set]["own_exposure"]["mean"]["psnr_masked"].as_f64() {
+                lines.push(format!("  with each photograph's own exposure divided out: PSNR {own:.2} dB"));
+            }
             lines.extend(in_parts(&metrics[set]["parts"]["mean"]));
         }
     }

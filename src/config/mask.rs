@@ -14,6 +14,9 @@ table! {
         /// Poses of the training views: auto (measured on the photographs, and refined where they do not fit), refine
         /// (always) or given.
         cameras: CameraPoses => CameraPoses::Auto, CameraPoses::Auto, CameraPoses::Given;
+        /// Exposure and white balance of the photographs: auto (measured, and divided out of the training photographs where
+        /// they differ) or given (photographs are used as they are).
+        exposure: Exposures => Exposures::Auto, Exposures::Auto, Exposures::Given;
         /// Bounding box of the fields: head (found from cameras and masks), ilsh (published: ±0.45, ±0.501, ±0.3 dataset
         /// units for radiance, ±0.3 for I-Face; falls back to head if the head is elsewhere) or six numbers in dataset
         /// units, lowest corner first.
@@ -36,6 +39,16 @@ pub enum CameraPoses {
     /// Refined ones.
     Refine,
     /// Those given, unmeasured.
+    Given,
+}
+
+/// Which exposure training photographs have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Exposures {
+    /// The mean of all where a measurement says that they differ.
+    Auto,
+    /// Their own, unmeasured.
     Given,
 }
 

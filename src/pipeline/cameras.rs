@@ -3,29 +3,20 @@
 //! The measurement is [`crate::rig`]'s. It takes photographs of the training views and the hull of their masks; held-out
 //! views take no part. The stage `mask` makes it and writes `poses.json`, later stages read refined poses there.
 
-use crate::capture::scene::{Hull, Scene};
+use super::rig_photos::RigPhotos;
 use crate::capture::{Capture, Split, View};
 use crate::config::CameraPoses;
-use crate::geom::{Camera, Mesh, Similarity};
-use crate::image::{Gray, reduce_photo, resize_gray, working_size};
+use crate::geom::{Camera, Similarity};
 use crate::io::{self, Limits, ReadError};
-
-use crate::mesh::{Volume, marching};
 use crate::rig::{self, CameraState, LEAST_SIGHTINGS, RigView, Verdict};
 use crate::{Error, Result};
-use glam::{DMat3, DVec3, Vec3};
+use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// File name of the measurement, in the folder of the stage `mask`.
 pub(super) const POSES: &str = "poses.json";
-
-/// Longest side of the photographs that are searched, pixels.
-const SEARCHED_PX: u32 = 1024;
-
-/// Maximum number of training views; the system of their poses is solved densely.
-const MOST_VIEWS: usize = 256;
 
 /// What to do about a camera that does not fit.
 const HINT: &str = "was the camera moved, or are two photographs swapped? Correct its pose or photograph, or remove the frame; \
@@ -72,26 +63,14 @@ impl From<&Camera> for Pose {
     }
 }
 
-/// Measures how well the cameras of the training views fit each other. `None` where that cannot be measured: without a
-/// hull, with fewer than three masks, or with more views than can be solved at once.
-pub(super) fn check_cameras(
-    capture: &Capture,
-    scene: &Scene,
-    poses: CameraPoses,
-    limits: &Limits,
-) -> Result<Option<CameraCheck>> {
-    let train: Vec<&View> = capture.split(Split::Train).collect();
-    let Some(hull) = scene.hull.as_ref().filter(|_| train.len() <= MOST_VIEWS) else { return Ok(None) };
-    let loaded = train.par_iter().map(|view| searched(view, limits)).collect::<Result<Vec<_>>>()?;
-    let measured = train.iter().zip(loaded).filter_map(|(view, loaded)| Some((*view, loaded?)));
-    let (train, loaded): (Vec<&View>, Vec<(RigView, Camera)>) = measured.unzip();
-    if train.len() < 3 {
-        return Ok(None);
-    }
-    let (views, cameras): (Vec<RigView>, Vec<Camera>) = loaded.into_iter().unzip();
-    let given: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
-    let rig = rig::measure(&views, &given, &hull_surface(hull)?, poses == CameraPoses::Refine);
-    let world_from_scene = scene.scene_from_world.inverse();
+/// Measures how well the cameras of the training views fit each other.
+pub(super) fn check_cameras(photos: &RigPhotos, poses: CameraPoses) -> CameraCheck {
+    let RigPhotos { views: captured, train, cameras: given, scene_from_world, .. } = photos;
+    let (captured, given) = (&captured[..*train], &given[..*train]);
+    let views: Vec<RigView> =
+        photos.pictures[..*train].par_iter().map(|(p, head)| RigView::new(p, head)).collect();
+    let rig = rig::measure(&views, given, &photos.surface, poses == CameraPoses::Refine);
+    let world_from_scene = scene_from_world.inverse();
     let checked = |(view, (searched, fit)): (&&View, (&Camera, &rig::CameraFit))| {
         let pixels = f64::from(view.camera.width) / f64::from(searched.width);
         let refined = (fit.state == CameraState::Refined)
@@ -108,53 +87,13 @@ pub(super) fn check_cameras(
             refined,
         }
     };
-    let pixels = f64::from(train[0].camera.width) / f64::from(cameras[0].width);
-    Ok(Some(CameraCheck {
+    let pixels = f64::from(captured[0].camera.width) / f64::from(given[0].width);
+    CameraCheck {
         verdict: rig.verdict,
         given_px: pixels * rig.given_px,
         adjusted_px: pixels * rig.adjusted_px,
-        cameras: train.iter().zip(cameras.iter().zip(&rig.cameras)).map(checked).collect(),
-    }))
-}
-
-/// Returns a view's photograph ready to be searched, with its camera at that size; `None` without a mask.
-fn searched(view: &View, limits: &Limits) -> Result<Option<(RigView, Camera)>> {
-    let loaded = view.load(limits)?;
-    let Some(mut mask) = loaded.mask else { return Ok(None) };
-    if let Some(valid) = &loaded.valid {
-        mask.values.iter_mut().zip(&valid.values).for_each(|(m, v)| *m = (*m).min(*v));
+        cameras: captured.iter().zip(given.iter().zip(&rig.cameras)).map(checked).collect(),
     }
-    let size = working_size(view.camera.width, view.camera.height, SEARCHED_PX);
-    let head: Gray = resize_gray(&mask, size);
-    let picture = RigView::new(&reduce_photo(&loaded.photo, size), &head);
-    Ok(Some((picture, view.camera.resized(size.0, size.1))))
-}
-
-/// Returns the surface of a hull, smoothed and drawn in by about a cell, since a hull holds every cell that any mask may
-/// touch.
-fn hull_surface(hull: &Hull) -> Result<Mesh> {
-    /// Share of the smoothed cells' value where the surface lies; one half would be the hull's own.
-    const LEVEL: f32 = 0.8;
-    let r = hull.resolution;
-    // the hull's cells run along z first, the volume's nodes along x
-    let inside = |i: usize| hull.get((i % r * r + i / r % r) * r + i / (r * r));
-    let mut values: Vec<f32> = (0..r.pow(3)).map(|i| f32::from(u8::from(inside(i)))).collect();
-    for stride in [1, r, r * r, 1, r, r * r] {
-        let before = values.clone();
-        let smooth = |(i, value): (usize, &mut f32)| {
-            let place = i / stride % r;
-            let low = if place > 0 { before[i - stride] } else { 0.0 };
-            let high = if place + 1 < r { before[i + stride] } else { 0.0 };
-            *value = 0.25 * (low + high) + 0.5 * before[i];
-        };
-        values.par_iter_mut().enumerate().for_each(smooth);
-    }
-    values.iter_mut().for_each(|v| *v = LEVEL - *v);
-    let cell = 2.0 / r as f32;
-    let (origin, spacing) = (Vec3::splat(0.5 * cell - 1.0), Vec3::splat(cell));
-    let mut surface = marching(&Volume { dims: [r; 3], values: &values, origin, spacing }, true)?.mesh;
-    surface.normals = surface.angle_weighted_normals();
-    Ok(surface)
 }
 
 /// Returns `8,900` for 8900.

@@ -1,6 +1,7 @@
 //! Cameras of the demo head: exact ones, disturbed ones, one that was moved, and photographs that are swapped.
 
 use super::cameras::{CameraCheck, POSES, check_cameras};
+use super::rig_photos::RigPhotos;
 use super::tests::{NoFields, quiet};
 use super::{Session, Stage, complete};
 use crate::capture::scene::{self, Scene, SceneOptions};
@@ -25,12 +26,16 @@ fn train(capture: &Capture) -> Vec<&View> {
     capture.split(Split::Train).collect()
 }
 
-fn check(capture: &Capture, poses: CameraPoses) -> Option<CameraCheck> {
+fn measured<T>(capture: &Capture, of: impl FnOnce(&RigPhotos) -> T) -> Option<T> {
     let views = train(capture);
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
     let masks: Vec<_> = views.iter().map(|v| v.load_mask(&Limits::default()).unwrap()).collect();
     let (scene, _): (Scene, _) = scene::fit(&cameras, &masks, &SceneOptions::default()).unwrap();
-    check_cameras(capture, &scene, poses, &Limits::default()).unwrap()
+    RigPhotos::load(capture, &scene, &Limits::default()).unwrap().as_ref().map(of)
+}
+
+fn check(capture: &Capture, poses: CameraPoses) -> Option<CameraCheck> {
+    measured(capture, |photos| check_cameras(photos, poses))
 }
 
 /// Turns and moves a camera about so many pixels; neighbors in number move oppositely, so that the world stays.
@@ -149,8 +154,7 @@ fn without_masks_nothing_is_said() {
         &SceneOptions::default(),
     );
     bare.views.iter_mut().for_each(|v| v.mask = capture::ViewMask::None);
-    let found = check_cameras(&bare, &scene.unwrap().0, CameraPoses::Auto, &Limits::default()).unwrap();
-    assert!(found.is_none());
+    assert!(RigPhotos::load(&bare, &scene.unwrap().0, &Limits::default()).unwrap().is_none());
 }
 
 #[test]

@@ -165,6 +165,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
         mask_meaning: config.mask.meaning,
         trust_masks: config.mask.trust,
         cameras: c.cameras,
+        exposure: c.exposure,
         unit_m: c.unit_m,
         ..CaptureOptions::default()
     }

@@ -2,11 +2,13 @@
 
 use super::cameras::{CameraCheck, check_cameras};
 use super::clicks::{MaskPrompts, make_masks};
+use super::exposure::ExposureCheck;
+use super::rig_photos::RigPhotos;
 use super::scene_file;
 use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
 use crate::capture::scene::{self, Scene, SceneBox, SceneOptions, in_box};
 use crate::capture::{self, Capture, CaptureOptions, MASK_HINT, Split, View};
-use crate::config::{CameraPoses, Config, MaskConfig, MaskMeaning, Preset};
+use crate::config::{CameraPoses, Config, Exposures, MaskConfig, MaskMeaning, Preset};
 use crate::image::{Gray, Photo, resize_gray, working_size};
 use crate::io::{self, Limits};
 use crate::mask::consistency::{ConsistencyView, check_consistency};
@@ -98,13 +100,12 @@ pub(super) fn mask(
     // pixels that a mask marks as unknown may still show the head
     let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
-    let cameras = whole.capture.cameras;
-    let measured = silhouettes && cameras != CameraPoses::Given;
-    let check =
-        measured.then(|| check_cameras(capture, &scene, cameras, &Limits::default())).transpose()?.flatten();
-    if let Some(check) = &check {
-        require_cameras(check, dir)?;
-    }
+    let (cameras, exposure) = (whole.capture.cameras, whole.capture.exposure);
+    let found = match silhouettes {
+        true => RigCheck::measure(capture, &scene, cameras, exposure, &Limits::default())?,
+        false => RigCheck::default(),
+    };
+    found.require(dir)?;
     let height = scene::height(&scene, capture.up);
     height.and_then(|h| scene::doubtful_height(h, capture.unit_m)).iter().for_each(|text| dir.warn(text));
     let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
@@ -117,21 +118,60 @@ pub(super) fn mask(
         "box": scene::world_box(&scene),
         "height_m": height.map(|h| h * capture.unit_m),
     });
-    if let Some(check) = check {
+    if let Some(check) = &found.cameras {
         summary["cameras"] = check.summary();
+    }
+    if let Some(check) = &found.exposure {
+        summary["exposure"] = check.summary();
     }
     Ok(summary)
 }
 
-/// Refuses cameras that can be neither used nor refined, and keeps what was measured.
-fn require_cameras(check: &CameraCheck, dir: &StageDir) -> Result<()> {
-    if let Some(problem) = grouped(&check.problems()).first() {
-        return Err(problem.into());
+/// What was measured of cameras and exposures.
+#[derive(Default)]
+struct RigCheck {
+    cameras: Option<CameraCheck>,
+    exposure: Option<ExposureCheck>,
+}
+
+impl RigCheck {
+    /// Measures what is not to be used as given, where it can be measured.
+    fn measure(
+        capture: &Capture,
+        scene: &Scene,
+        poses: CameraPoses,
+        exposures: Exposures,
+        limits: &Limits,
+    ) -> Result<RigCheck> {
+        let (cameras, exposure) = (poses != CameraPoses::Given, exposures != Exposures::Given);
+        let photos =
+            (cameras || exposure).then(|| RigPhotos::load(capture, scene, limits)).transpose()?.flatten();
+        let photos = photos.as_ref();
+        Ok(RigCheck {
+            cameras: photos.filter(|_| cameras).map(|photos| check_cameras(photos, poses)),
+            exposure: photos.filter(|_| exposure).and_then(ExposureCheck::measure),
+        })
     }
-    if check.refines() {
-        dir.warn(&format!("{}: refined", check.sentence()));
+
+    /// Refuses cameras that can be neither used nor refined, and keeps what was measured.
+    fn require(&self, dir: &StageDir) -> Result<()> {
+        if let Some(check) = &self.cameras {
+            if let Some(problem) = grouped(&check.problems()).first() {
+                return Err(problem.into());
+            }
+            if check.refines() {
+                dir.warn(&format!("{}: refined", check.sentence()));
+            }
+            check.write(dir.folder())?;
+        }
+        if let Some(check) = &self.exposure {
+            if check.evens_out() {
+                dir.warn(&format!("{}: evened out", check.sentence()));
+            }
+            check.write(dir.folder())?;
+        }
+        Ok(())
     }
-    check.write(dir.folder())
 }
 
 /// Returns the path of a view's mask in the stage's folder.
@@ -289,15 +329,13 @@ pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     found.add_refused_masks(&wrong, options);
     found.warnings.extend(warnings);
     // a measurement says something only of cameras whose masks fit together
-    if let Some(scene) =
-        found.placed.take().filter(|_| found.is_usable() && options.cameras != CameraPoses::Given)
-    {
-        match check_cameras(&capture, &scene, options.cameras, &options.limits) {
-            Ok(Some(check)) => {
-                found.fit = Some(check.announcement());
-                found.problems.extend(grouped(&check.problems()));
+    if let Some(scene) = found.placed.take().filter(|_| found.is_usable()) {
+        match RigCheck::measure(&capture, &scene, options.cameras, options.exposure, &options.limits) {
+            Ok(RigCheck { cameras, exposure }) => {
+                found.fit = cameras.as_ref().map(CameraCheck::announcement);
+                found.exposure = exposure.map(|check| check.announcement());
+                found.problems.extend(cameras.iter().flat_map(|check| grouped(&check.problems())));
             }
-            Ok(None) => {}
             Err(e) => found.problems.extend(grouped(&[e])),
         }
     }

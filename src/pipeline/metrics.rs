@@ -2,12 +2,13 @@
 //!
 //! A mesh of the demo head is compared with its exact surface ([`against_truth`]).
 
+use super::exposure::ExposureCheck;
 use super::pictures;
 use crate::capture::synthetic::SyntheticHead;
 use crate::capture::{Capture, LoadedView, View};
 use crate::config::{Config, Method, TruthPhoto, ViewBackground};
 use crate::geom::{Bvh, Mesh};
-use crate::image::Gray;
+use crate::image::{Gray, Photo};
 use crate::io::{self, Limits};
 use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
 use crate::run::{Run, StageDir};
@@ -41,6 +42,8 @@ pub(super) struct Comparable<'a> {
 /// Metrics of one picture.
 struct ViewFigures {
     head: ViewMetrics,
+    /// The same where the photograph's own exposure is divided out.
+    own_exposure: Option<ViewMetrics>,
     region: Option<ViewMetrics>,
     parts: PartMetrics,
     /// Sum of opacity² over the pixels without any head, and the number of these pixels.
@@ -71,13 +74,15 @@ pub(super) fn comparable<'c>(capture: &'c Capture, config: &Config, set: &Pictur
 /// Writes `metrics.json`. Every rendered or blended view is compared with its photograph, inside the mask and inside
 /// the capture's region of interest, and part by part (opaque pixels, outline, skin, hair, coverage); opacity outside
 /// the head is measured. `capture` has the masks that the metrics use, from the source `masks`; `surface` is the demo's
-/// mesh, which is compared with the true surface.
+/// mesh, which is compared with the true surface. Where `exposure` was evened out, views have the mean exposure and
+/// photographs their own, so a second set of figures, `own_exposure`, divides that out of the photographs.
 pub(super) fn metrics(
     capture: &Capture,
     config: &Config,
     run: &Run,
     masks: &str,
     surface: Option<&Mesh>,
+    exposure: Option<&ExposureCheck>,
     dir: &StageDir,
 ) -> Result<Value> {
     let mut out = Map::new();
@@ -90,7 +95,8 @@ pub(super) fn metrics(
     lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
     let tones = Tones::of(&views)?;
     for (i, (set, pictures)) in sets.iter().zip(&comparables).enumerate() {
-        let figures = pictures.par_iter().map(|p| figures(config, p, tones.as_ref(), lpips.as_ref()));
+        let figures =
+            pictures.par_iter().map(|p| figures(config, p, tones.as_ref(), lpips.as_ref(), exposure));
         let figures = figures.collect::<Result<Vec<_>>>()?;
         if !figures.is_empty() {
             out.insert(set.name.clone(), entry(figures));
@@ -130,14 +136,21 @@ fn figures(
     picture: &Comparable,
     tones: Option<&Tones>,
     lpips: Option<&Lpips>,
+    exposure: Option<&ExposureCheck>,
 ) -> Result<ViewFigures> {
     let background = config.render.background;
     let loaded = picture.view.load(&Limits::default())?;
     let render = pictures::read(&picture.file, config.render.format)?;
-    let photo = match config.metrics.truth {
-        TruthPhoto::Photo => loaded.photo.clone(),
-        TruthPhoto::Masked => pictures::expected(&loaded.photo, loaded.mask.as_ref(), background),
+    let expected = |photo: &Photo| match config.metrics.truth {
+        TruthPhoto::Photo => photo.clone(),
+        TruthPhoto::Masked => pictures::expected(photo, loaded.mask.as_ref(), background),
     };
+    let photo = expected(&loaded.photo);
+    let own_exposure = exposure.and_then(|check| check.used(&picture.view.name)).map(|own| {
+        let photo = expected(&own.divided_out(loaded.photo.clone()));
+        compare(&picture.view.name, &render, &photo, loaded.mask.as_ref(), loaded.valid.as_ref())
+    });
+    let own_exposure = own_exposure.transpose()?;
     let against =
         |mask: Option<&Gray>| compare(&picture.view.name, &render, &photo, mask, loaded.valid.as_ref());
     let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;
@@ -154,21 +167,26 @@ fn figures(
     let parts = Masks::of(&loaded).map(|m| parts(&render, &photo, m, opacity.as_deref(), behind, tones));
     let parts = parts.unwrap_or_default();
     let outside = opacity.and_then(|opacity| square_opacity_outside(&opacity, &loaded));
-    Ok(ViewFigures { head, region, parts, outside })
+    Ok(ViewFigures { head, own_exposure, region, parts, outside })
 }
 
 /// Returns one set's part of the file.
 fn entry(figures: Vec<ViewFigures>) -> Value {
     let (mut heads, mut regions, mut parts, mut outside) = (Vec::new(), Vec::new(), Vec::new(), (0.0, 0));
+    let mut own_exposure = Vec::new();
     for f in figures {
         parts.push(f.parts);
         heads.push(f.head);
         regions.extend(f.region);
+        own_exposure.extend(f.own_exposure);
         let (sum, pixels) = f.outside.unwrap_or_default();
         outside = (outside.0 + sum, outside.1 + pixels);
     }
     let mut entry = Map::new();
     entry.insert("head".into(), json!(Metrics::new(heads)));
+    if !own_exposure.is_empty() {
+        entry.insert("own_exposure".into(), json!(Metrics::new(own_exposure)));
+    }
     if !regions.is_empty() {
         entry.insert("region".into(), json!(Metrics::new(regions)));
     }
@@ -247,7 +265,6 @@ pub fn against_truth(mesh: &Mesh, points: usize) -> Option<Truth> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::Photo;
 
     #[test]
     fn a_blend_that_is_below_its_best_member_is_told_by_how_much() {

@@ -11,7 +11,7 @@ use super::session::Session;
 use crate::capture::View;
 use crate::config::iface::FieldKind;
 use crate::config::{
-    CameraPoses, Config, MaskSource, Material, Method, Preset, Stage, VmBackground, VmConfig,
+    CameraPoses, Config, Exposures, MaskSource, Material, Method, Preset, Stage, VmBackground, VmConfig,
 };
 use crate::run::{Cost, ESTIMATE, Estimate, Fingerprint, Plan, read_record, read_status};
 use crate::{Error, Result, io};
@@ -259,6 +259,9 @@ impl Session<'_> {
                 settings.remove("capture.tiles"); // masks are of whole photographs
                 if config.capture.cameras == CameraPoses::Given {
                     settings.remove("capture.cameras"); // as in runs from before poses were measured
+                }
+                if config.capture.exposure == Exposures::Given {
+                    settings.remove("capture.exposure"); // as in runs from before exposures were measured
                 }
                 if config.capture.r#box == "head" {
                     settings.remove("capture.box"); // as in runs from before there was another

@@ -1,6 +1,7 @@
 //! `mask/scene.json` and `cameras.json`: where the head is, kept for later stages and for other programs.
 
 use super::cameras::CameraCheck;
+use super::exposure::ExposureCheck;
 use crate::Result;
 use crate::capture::scene::{Hull, Scene};
 use crate::capture::{Capture, View};
@@ -50,8 +51,13 @@ pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
 }
 
 /// Returns the text of `cameras.json`: every view with split, intrinsics and pose, and the transform from the world
-/// to the scene. `check` adds how well the poses fit, and the refined ones.
-pub(super) fn cameras_json(capture: &Capture, scene: &Scene, check: Option<&CameraCheck>) -> Vec<u8> {
+/// to the scene. `check` adds how well the poses fit, and the refined ones, and `exposure` how the exposures differ.
+pub(super) fn cameras_json(
+    capture: &Capture,
+    scene: &Scene,
+    check: Option<&CameraCheck>,
+    exposure: Option<&ExposureCheck>,
+) -> Vec<u8> {
     let mut value = json!({
         "capture": capture.name,
         "format": capture.format,
@@ -63,6 +69,9 @@ pub(super) fn cameras_json(capture: &Capture, scene: &Scene, check: Option<&Came
     });
     if let Some(check) = check {
         value["fit"] = json!(check);
+    }
+    if let Some(exposure) = exposure {
+        value["exposure"] = json!(exposure);
     }
     format!("{value:#}\n").into_bytes()
 }
@@ -196,6 +205,7 @@ mod tests {
                 photo_size: (4, 4),
                 declared: (4, 4),
                 declared_by: String::new(),
+                exposure: None,
             };
             let value =
                 json!({"capture": "a", "format": "b", "up": [0, 0, 1], "unit_m": 1.0, "views": [view]});

@@ -1,6 +1,7 @@
 //! A capture, its configuration and its run folder, which every stage works on.
 
 use super::cameras::CameraCheck;
+use super::exposure::ExposureCheck;
 use super::inputs::{Inputs, missing_capture};
 use super::path::CameraPath;
 use super::{mask, scene_file};
@@ -19,7 +20,7 @@ use std::sync::OnceLock;
 /// A capture, its configuration and its run folder.
 pub struct Session<'a> {
     pub(super) capture: Capture,
-    /// The capture with the poses that the stage `mask` refined, once they are used.
+    /// The capture with the poses that the stage `mask` refined and the exposures that it evened out, once they are used.
     refined: OnceLock<Capture>,
     pub(super) config: &'a Config,
     pub(super) run: &'a Run,
@@ -89,7 +90,13 @@ impl<'a> Session<'a> {
         &self.capture
     }
 
-    /// Returns the capture with the poses that the stage `mask` refined, for the stages after it.
+    /// Returns the exposures that the stage `mask` measured.
+    pub(super) fn exposure(&self) -> Result<Option<ExposureCheck>> {
+        ExposureCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))
+    }
+
+    /// Returns the capture with the poses that the stage `mask` refined and the exposures that it evened out, for the stages
+    /// after it.
     pub(super) fn refined_capture(&self) -> Result<&Capture> {
         if let Some(capture) = self.refined.get() {
             return Ok(capture);
@@ -97,6 +104,7 @@ impl<'a> Session<'a> {
         let mut capture = self.capture.clone();
         let check = CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
         check.iter().for_each(|check| check.apply(&mut capture));
+        self.exposure()?.iter().for_each(|check| check.apply(&mut capture));
         Ok(self.refined.get_or_init(|| capture))
     }
 
@@ -112,7 +120,8 @@ impl<'a> Session<'a> {
         }
         let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
         let check = CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
-        let cameras = scene_file::cameras_json(&self.capture, &scene, check.as_ref());
+        let cameras =
+            scene_file::cameras_json(&self.capture, &scene, check.as_ref(), self.exposure()?.as_ref());
         self.write("cameras.json", &cameras, idle)
     }
 

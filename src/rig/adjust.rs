@@ -251,7 +251,7 @@ fn orthonormal(m: DMat3) -> DMat3 {
 
 /// Factors a symmetric matrix, of which the lower half is given, as `L Lᵀ` and solves `matrix · x = −vector`. `None` if it
 /// is not positive definite.
-fn solve(mut matrix: Vec<f64>, vector: &[f64]) -> Option<Vec<f64>> {
+pub fn solve(mut matrix: Vec<f64>, vector: &[f64]) -> Option<Vec<f64>> {
     let n = vector.len();
     for i in 0..n {
         for k in 0..=i {

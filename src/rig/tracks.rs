@@ -23,7 +23,7 @@ const PATCH: usize = (2 * HALF as usize + 1).pow(2);
 const MAX_VIEWS: usize = 10;
 
 /// Minimum number of photographs that a point must be found in.
-const MIN_VIEWS: usize = 3;
+pub const MIN_VIEWS: usize = 3;
 
 /// Minimum cosine between the normal and the direction to the camera.
 const MIN_COSINE: f32 = 0.35;
@@ -35,7 +35,7 @@ const MIN_CORRELATION: f32 = 0.7;
 const MIN_CONTRAST: f32 = 0.8 / 255.0;
 
 /// Mask values from here on are head.
-const HEAD: u8 = 250;
+pub const HEAD: u8 = 250;
 
 /// A photograph as it is searched.
 pub struct RigView {
@@ -62,11 +62,16 @@ impl RigView {
     }
 
     /// Returns whether a patch around a position of the picture can be used.
-    fn is_usable(&self, pixel: Vec2) -> bool {
-        let height = self.usable.len() / self.width.max(1);
-        let inside = pixel.min_element() >= 0.0 && pixel.x < self.width as f32 && pixel.y < height as f32;
-        inside && self.usable[pixel.y as usize * self.width + pixel.x as usize]
+    pub fn is_usable(&self, pixel: Vec2) -> bool {
+        is_set(&self.usable, self.width, pixel)
     }
+}
+
+/// Returns whether the pixel at a position of a picture is set; none outside it is.
+pub fn is_set(set: &[bool], width: usize, pixel: Vec2) -> bool {
+    let height = set.len() / width.max(1);
+    let inside = pixel.min_element() >= 0.0 && pixel.x < width as f32 && pixel.y < height as f32;
+    inside && set[pixel.y as usize * width + pixel.x as usize]
 }
 
 /// A point to look up.
@@ -95,7 +100,7 @@ const LEVELS: [Level; 2] =
     [Level { blur: 0.7, spacing: 1.0, steps: 5 }, Level { blur: 1.5, spacing: 2.0, steps: 5 }];
 
 /// Returns a picture convolved with a Gaussian.
-fn blurred(picture: &[f32], w: usize, deviation: f32) -> Vec<f32> {
+pub fn blurred(picture: &[f32], w: usize, deviation: f32) -> Vec<f32> {
     let reach = (3.0 * deviation).ceil() as usize;
     let weight = |k: usize| (-0.5 * (k as f32 / deviation).powi(2)).exp();
     let total = weight(0) + 2.0 * (1..=reach).map(weight).sum::<f32>();
@@ -116,8 +121,14 @@ fn blurred(picture: &[f32], w: usize, deviation: f32) -> Vec<f32> {
     pass(&pass(picture, true), false)
 }
 
-/// Spreads `count` points evenly over a surface, and finds out which views see each.
-pub fn seeds(surface: &Mesh, cameras: &[Camera], views: &[RigView], count: usize) -> Vec<Seed> {
+/// Spreads `count` points evenly over a surface, and finds out which views see each. `is_usable` says whether a view can be
+/// used at a position of its picture.
+pub fn seeds(
+    surface: &Mesh,
+    cameras: &[Camera],
+    is_usable: impl Fn(usize, Vec2) -> bool + Sync,
+    count: usize,
+) -> Vec<Seed> {
     let bvh = Bvh::new(surface);
     let areas: Vec<f64> = (0..surface.triangles.len() as u32).map(|t| surface.area(t)).collect();
     let total: f64 = areas.iter().sum();
@@ -146,7 +157,7 @@ pub fn seeds(surface: &Mesh, cameras: &[Camera], views: &[RigView], count: usize
         let sees = |v: &usize| {
             let to_camera = cameras[*v].position.as_vec3() - position;
             let Some((pixel, _)) = cameras[*v].project(position) else { return false };
-            if to_camera.dot(normal) <= 0.0 || !views[*v].is_usable(pixel) {
+            if to_camera.dot(normal) <= 0.0 || !is_usable(*v, pixel) {
                 return false;
             }
             let ray = Ray {

@@ -1,0 +1,136 @@
+//! Exposures of the demo head: one for all, known gains, one photograph that is brighter.
+
+use super::exposure::{EXPOSURE, ExposureCheck};
+use super::rig_photos::RigPhotos;
+use super::tests::{NoFields, quiet};
+use super::{Session, Stage, complete};
+use crate::capture::scene::{self, SceneOptions};
+use crate::capture::synthetic::{SyntheticOptions, write_capture};
+use crate::capture::{self, Capture, CaptureOptions, Split};
+use crate::config::{CameraPoses, Config, Exposures, Preset};
+use crate::geom::Camera;
+use crate::image::{Exposure, Photo};
+use crate::io::{self, Limits};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+fn demo() -> (TempDir, Capture) {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 240, height: 300, train: 14, test: 1, seed: 1 };
+    write_capture(dir.path(), &options).unwrap();
+    let capture = capture::open(dir.path(), &CaptureOptions::default()).unwrap();
+    (dir, capture)
+}
+
+fn measure(capture: &Capture) -> ExposureCheck {
+    let train: Vec<_> = capture.split(Split::Train).collect();
+    let cameras: Vec<Camera> = train.iter().map(|v| v.camera.clone()).collect();
+    let masks: Vec<_> = train.iter().map(|v| v.load_mask(&Limits::default()).unwrap()).collect();
+    let (scene, _) = scene::fit(&cameras, &masks, &SceneOptions::default()).unwrap();
+    ExposureCheck::measure(&RigPhotos::load(capture, &scene, &Limits::default()).unwrap().unwrap()).unwrap()
+}
+
+/// Multiplies the light of photographs. A photograph that is read with the inverse exposure is brighter by it.
+fn expose(capture: &mut Capture, gains: &[[f32; 3]]) {
+    for (view, gain) in capture.views.iter_mut().zip(gains) {
+        view.exposure = Some(Exposure { gain: gain.map(|g| 1.0 / g) });
+    }
+}
+
+/// Returns gains of a geometric mean of 1 over the training views, which do not follow the viewing direction: neighbors
+/// differ.
+fn gains() -> Vec<[f32; 3]> {
+    let log = |v: usize, k: usize| {
+        let sign = if v.is_multiple_of(2) { 1.0 } else { -1.0 };
+        sign * (0.1 + 0.01 * (v / 2) as f32 - 0.03 * k as f32)
+    };
+    (0..15).map(|v| [0, 1, 2].map(|k| log(v, k).exp())).collect()
+}
+
+#[test]
+fn known_gains_are_found_within_a_hundredth() {
+    let (_dir, clean) = demo();
+    let found = measure(&clean);
+    assert!(!found.evens_out() && found.used("003").is_none(), "{found:?}");
+    assert!(found.sentence().contains("alike within 0."), "{}", found.sentence());
+
+    let mut exposed = clean.clone();
+    expose(&mut exposed, &gains());
+    let found = measure(&exposed);
+    assert!(found.evens_out() && found.sentence().contains("white balance differs"), "{}", found.sentence());
+    // the held-out view, the last one, is compared with the training views but does not shape what they share
+    for (view, gain) in exposed.views.iter().zip(gains()) {
+        let used = found.used(&view.name).unwrap().gain;
+        for (used, gain) in used.iter().zip(gain) {
+            assert!((used / gain - 1.0).abs() < 0.01, "{}: {used} for {gain}", view.name);
+        }
+    }
+}
+
+#[test]
+fn one_photograph_that_is_brighter_is_named() {
+    let (_dir, mut exposed) = demo();
+    let mut gains = [[1.0; 3]; 15];
+    gains[5] = [1.12; 3];
+    expose(&mut exposed, &gains);
+    let found = measure(&exposed).announcement();
+    assert!(found.contains("view `005` is 12 % brighter than the others; a run evens it out"), "{found}");
+}
+
+#[test]
+fn later_stages_read_photographs_with_the_mean_exposure_unless_given_ones_are_asked_for() {
+    let (dir, mut exposed) = demo();
+    expose(&mut exposed, &gains());
+    let photos = |capture: &Capture| -> Vec<_> {
+        capture.views.iter().map(|v| v.load_photo(&Limits::default()).unwrap()).collect()
+    };
+    let clean = photos(&capture::open(dir.path(), &CaptureOptions::default()).unwrap());
+    let run = |exposure: Exposures| {
+        let folder = tempfile::tempdir().unwrap();
+        let run = quiet(folder.path());
+        let mut config = Config::preset(Preset::Draft);
+        config.capture.path = dir.path().display().to_string();
+        (config.capture.cameras, config.capture.exposure) = (CameraPoses::Given, exposure);
+        let session = Session::open(&config, &run).unwrap();
+        complete(&session, Stage::Mask, &NoFields).unwrap();
+        let measured = io::is_file(&run.path("mask").join(EXPOSURE));
+        let cameras: Value = io::read_json(&run.path("cameras.json"), &Limits::default()).unwrap();
+        assert_eq!(cameras["exposure"]["views"][3]["measured"].is_object(), measured);
+        (measured, photos(session.refined_capture().unwrap()))
+    };
+    // photographs of one exposure stay as they are, to the byte
+    assert!(run(Exposures::Auto) == (true, clean.clone()));
+    for (view, photo) in exposed.views.iter().zip(photos(&exposed)) {
+        io::write_png_rgb(&view.photo, photo.width, photo.height, &photo.rgb).unwrap();
+    }
+    let (measured, given) = run(Exposures::Given);
+    assert!(!measured && given == photos(&capture::open(dir.path(), &CaptureOptions::default()).unwrap()));
+    let (_, even) = run(Exposures::Auto);
+    let off = |a: &[Photo], v: usize| {
+        let pairs = a[v].rgb.as_flattened().iter().zip(clean[v].rgb.as_flattened());
+        pairs.map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>()
+    };
+    assert!((0..14).all(|v| off(&even, v) < 0.2 * off(&given, v)));
+    // held-out photographs are never changed
+    assert!(even[14] == given[14]);
+}
+
+#[test]
+fn exposures_are_read_back_and_what_is_no_gain_is_refused_with_its_key() {
+    let (_dir, mut exposed) = demo();
+    expose(&mut exposed, &gains());
+    let found = measure(&exposed);
+    let dir = tempfile::tempdir().unwrap();
+    assert!(ExposureCheck::read(dir.path()).unwrap().is_none());
+    found.write(dir.path()).unwrap();
+    assert_eq!(json!(ExposureCheck::read(dir.path()).unwrap()), json!(found));
+    let path = dir.path().join(EXPOSURE);
+    let written: Value = io::read_json(&path, &Limits::default()).unwrap();
+    for value in [json!([1.0, 0.0, 1.0]), json!([1, 1]), json!([1, 1, null])] {
+        let mut bad = written.clone();
+        bad["views"][4]["used"]["gain"] = value;
+        std::fs::write(&path, bad.to_string()).unwrap();
+        let error = ExposureCheck::read(dir.path()).unwrap_err().to_string();
+        assert!(error.contains(EXPOSURE), "{error}");
+    }
+}
