@@ -32,25 +32,25 @@ const MARGIN: usize = 3;
 const EXPOSED: Range<u8> = 40..248;
 
 /// Minimum number of training views; with fewer, exposure and direction cannot be told apart.
-const LEAST_VIEWS: usize = 8;
+const MIN_TRAINING_VIEWS: usize = 8;
 
 /// Points that a view must show.
-const LEAST_POINTS: usize = 50;
+const MIN_POINTS: usize = 50;
 
 /// Minimum cosine between the normal and the direction to the camera.
 const MIN_COSINE: f32 = 0.35;
 
 /// Root mean square of logarithms from which on exposures or colors differ. Captures of one exposure reach 0.019 and 0.013.
-const LEAST_SPREAD: f64 = 0.025;
+const MIN_SPREAD: f64 = 0.025;
 
 /// Logarithm of a single view's brightness from which on exposures differ. Captures of one exposure reach 0.044.
-const LEAST_ALONE: f64 = 0.08;
+const MIN_ALONE: f64 = 0.08;
 
 /// Rounds of the robust fits.
 const ROUNDS: usize = 12;
 
 /// Least residual of half weight, of logarithms.
-const LEAST_SCALE: f64 = 0.005;
+const MIN_SCALE: f64 = 0.005;
 
 /// A photograph prepared for the measurement.
 pub struct ExposureView {
@@ -95,12 +95,12 @@ impl ExposureFit {
     pub fn brightness_differs(&self) -> bool {
         let train = self.exposures.iter().take(self.train);
         let most = train.map(|e| f64::from(e.brightness()).ln().abs()).fold(0.0, f64::max);
-        self.brightness_spread >= LEAST_SPREAD || most >= LEAST_ALONE
+        self.brightness_spread >= MIN_SPREAD || most >= MIN_ALONE
     }
 
     /// Returns whether colors differ enough to be evened out.
     pub fn color_differs(&self) -> bool {
-        self.color_spread >= LEAST_SPREAD
+        self.color_spread >= MIN_SPREAD
     }
 }
 
@@ -112,8 +112,7 @@ struct Sample {
 }
 
 /// Measures exposures. The first `train` views are the training views, which alone decide what is common; the others are
-/// compared with it one by one.  `None` where too
-/// little can be compared.
+/// compared with it one by one. `None` where too little can be compared.
 pub fn measure(
     views: &[ExposureView],
     cameras: &[Camera],
@@ -129,7 +128,7 @@ pub fn measure(
         .collect();
     let mut counts = vec![0; views.len()];
     points.iter().flatten().for_each(|s| counts[s.view] += 1);
-    if train < LEAST_VIEWS || counts[..train].iter().any(|&n| n < LEAST_POINTS) {
+    if train < MIN_TRAINING_VIEWS || counts[..train].iter().any(|&n| n < MIN_POINTS) {
         return None;
     }
     let fitted: Vec<Vec<f64>> =
@@ -199,7 +198,7 @@ fn fit_channel(points: &[Vec<Sample>], k: usize, views: usize, train: usize) -> 
             *offset = median(&mut values.clone());
             residuals.extend(values.iter().map(|v| (v - *offset).abs()));
         }
-        scale = (2.0 * median(&mut residuals)).max(LEAST_SCALE);
+        scale = (2.0 * median(&mut residuals)).max(MIN_SCALE);
     }
     let mut others = vec![Vec::new(); views - train];
     for (samples, offset) in points.iter().zip(&offset) {
@@ -242,7 +241,7 @@ fn without_direction(logs: &[[f64; 3]], cameras: &[Camera], train: usize) -> Vec
             .zip(logs)
             .take(train)
             .map(|(row, log)| (brightness(log) - fitted(&slopes, row)).abs());
-        scale = (2.0 * median(&mut off.collect::<Vec<f64>>())).max(LEAST_SCALE);
+        scale = (2.0 * median(&mut off.collect::<Vec<f64>>())).max(MIN_SCALE);
     }
     let mut left: Vec<[f64; 3]> =
         logs.iter().zip(&rows).map(|(log, row)| log.map(|l| l - fitted(&slopes, row))).collect();
