@@ -935,8 +935,8 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
             "transforms_all.json",
             "`transforms_all.json`: if it is such a file, rename it to `transforms.json`",
         ),
-        ("poses.npy", "call it `poses_bounds.npy`"),
-        ("cams.npz", "call it `cameras_sphere.npz`"),
+        ("poses.npy", "rename it to `poses_bounds.npy`"),
+        ("cams.npz", "rename it to `cameras_sphere.npz`"),
         ("list.csv", "does not begin with `#name,x,y,alt`"),
     ] {
         let (message, _) = unread(&[(name, b"x")]);
@@ -1189,7 +1189,10 @@ fn photographs_without_masks_do_not_pass_inspection() {
     assert_eq!(problem(&some, &default), None);
     let warnings = open(&some).unwrap().warnings;
     assert!(
-        warnings.iter().any(|w| w.contains("5 views have no mask") && w.contains("learns nothing")),
+        warnings
+            .iter()
+            .any(|w| w.contains("5 views have no mask")
+                && w.contains("stages that use masks ignore these views")),
         "{warnings:?}"
     );
     // told to go on without, or what is not masked is looked at as it is

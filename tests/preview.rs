@@ -192,7 +192,7 @@ fn what_cannot_be_shown_is_said() {
         // nothing is ignored in silence
         (&["preview", "a.obj", "--frames", "9"], 2, "--turntable"),
         (&["preview", "a.obj", "--page", "--size", "64"], 2, "--size"),
-        (&["preview", "empty", "--up", "z"], 2, "a run knows where up is"),
+        (&["preview", "empty", "--up", "z"], 2, "a run has its own up axis"),
         (&["preview", "a.obj", "--cameras", "test"], 1, "there are no cameras"),
         (&["preview", "empty"], 1, "has no mesh yet"),
         // shown all the same

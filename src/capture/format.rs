@@ -6,7 +6,7 @@ use super::colmap::ModelFiles;
 use super::folder::{FolderEntries, PHOTOGRAPHS, has_ending};
 use super::{neus, realitycapture};
 use crate::Error;
-use crate::config::Config;
+use crate::config::{Config, Stage};
 use crate::io;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -156,13 +156,16 @@ fn nerfstudio(kind: &str, data: impl Display) -> String {
     )
 }
 
-/// Returns whether a folder is a run: it has a run's configuration, and either a stage was completed in it or nothing else
-/// in it is a capture's, be it one that cannot be read (photographs without cameras, a project of another program).
+/// Returns whether a folder is a run: it has a run's configuration, and either a stage was begun in it or nothing else in it
+/// is a capture's, be it one that cannot be read (photographs without cameras, a project of another program).
 pub fn is_run(folder: &Path) -> bool {
-    let is_done = || io::is_file(&folder.join("mask/done.json"));
+    let has_record = |stage: &Stage| {
+        ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.word()).join(f)))
+    };
+    let is_begun = || Stage::ALL.iter().any(has_record);
     let is_capture =
         || CameraFiles::find(folder).is_some() || recognized(&FolderEntries::of(folder)).is_some();
-    io::is_file(&folder.join("config.toml")) && (is_done() || !is_capture())
+    io::is_file(&folder.join("config.toml")) && (is_begun() || !is_capture())
 }
 
 fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> Error {

@@ -326,11 +326,11 @@ impl fmt::Display for Inspection {
         if let Some(text) = &self.fit {
             writeln!(f, "            {text}")?;
         }
-        if let Some(text) = &self.exposure {
-            writeln!(f, "  exposure  {text}")?;
-        }
         if let Some(up) = self.up {
             writeln!(f, "            up is ({:.3}, {:.3}, {:.3})", up.x, up.y, up.z)?;
+        }
+        if let Some(text) = &self.exposure {
+            writeln!(f, "  exposure  {text}")?;
         }
         let percent = |r: Range| [r.min, r.max, r.median].map(|v| 100.0 * v);
         if let Some([min, max, median]) = self.coverage.map(percent) {

@@ -138,7 +138,7 @@ pub struct View {
     /// The file that declares it.
     pub declared_by: String,
     /// The exposure that is divided out of the photograph when it is read.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
+    #[serde(skip)]
     pub exposure: Option<Exposure>,
 }
 

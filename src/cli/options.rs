@@ -309,10 +309,10 @@ mod tests {
         // the demo's own photographs lie in its run
         ["config.toml", "capture/transforms.json", "capture/images/000.png"].into_iter().for_each(put);
         assert!(is_run(dir.path()));
-        // beside the settings it is a capture, until one of its stages is done
+        // beside the settings it is a capture, until one of its stages is begun
         put("transforms.json");
         assert!(!is_run(dir.path()));
-        put("mask/done.json");
+        put("mask/status.json");
         assert!(is_run(dir.path()));
     }
 

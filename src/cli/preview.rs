@@ -450,19 +450,21 @@ fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     }
     // each view is rendered once per checkpoint, whether or not that can be read
     let mut made: HashMap<Stage, (SystemTime, Option<Vec<u8>>)> = HashMap::new();
-    let mut view = |stage: Stage, saved: SystemTime| -> Option<Vec<u8>> {
-        if let Some((_, picture)) = made.get(&stage).filter(|(time, _)| *time == saved) {
-            return picture.clone();
-        }
-        let picture = field_view(&target.run, &config, stage);
-        if let Err(e) = &picture {
-            invocation.screen.note("watch", &format!("no view of `{stage}`: {e}"));
-        }
-        let picture = picture.ok();
-        made.insert(stage, (saved, picture.clone()));
-        picture
-    };
-    let mut write = |renewed| {
+    let mut write = |renewed: bool| {
+        let mut view = |stage: Stage, saved: SystemTime| -> Option<Vec<u8>> {
+            // the last page has to be written before the handler of signals ends the process: it shows what there is
+            let known = |(time, _): &&(SystemTime, _)| !renewed || *time == saved;
+            if let Some((_, picture)) = made.get(&stage).filter(known) {
+                return picture.clone();
+            }
+            let picture = renewed.then(|| field_view(&target.run, &config, stage))?;
+            if let Err(e) = &picture {
+                invocation.screen.note("watch", &format!("no view of `{stage}`: {e}"));
+            }
+            let picture = picture.ok();
+            made.insert(stage, (saved, picture.clone()));
+            picture
+        };
         io::write_atomic(&page, live_html(&target.run, &mut view, renewed)?.as_bytes()).map_err(Error::from)
     };
     write(true)?;

@@ -33,7 +33,7 @@ fn renew(invocation: &Invocation, path: &Path, out: Option<&Out>) -> Result<()> 
     let common = invocation.common;
     let target = RunTarget::find(common, Some(path))?;
     let Some(saved) = &target.saved else {
-        return Err(Error::usage(format!("`{}` is no run", path.display()), "name the folder of a run"));
+        return Err(Error::usage(format!("`{}` is not a run", path.display()), "name the folder of a run"));
     };
     let config = common.resolve(Some(saved), None, &[])?;
     let run = Run::open(&target.run, invocation.stop.clone(), invocation.screen.clone());

@@ -9,7 +9,7 @@ use crate::Result;
 use crate::capture::{Capture, Split, View};
 use crate::image::Exposure;
 use crate::io::{self, Limits, ReadError};
-use crate::rig::exposure::{self, ExposureView};
+use crate::rig::exposure::{self, ExposureView, MIN_POINTS};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -26,8 +26,9 @@ const STANDS_OUT: f64 = 4.0;
 /// The measurement of a capture's exposures.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct ExposureCheck {
-    /// Whether exposures are divided out of the training photographs.
-    evened_out: bool,
+    /// Whether differences in brightness, and in color, are divided out of the training photographs.
+    evens_brightness: bool,
+    evens_color: bool,
     /// Root mean square of the logarithms of the training views' brightness, and of their colors.
     brightness_spread: f64,
     color_spread: f64,
@@ -65,16 +66,18 @@ impl ExposureCheck {
             };
             Exposure { gain: [0, 1, 2].map(own) }
         };
-        let evened_out = brightness || color;
+        // a held-out view that shows little of what others show has no measurable exposure
+        let known = |view: &View, points: usize| view.split == Split::Train || points >= MIN_POINTS;
         let measured = |((view, &points), &measured): ((&&View, &usize), &Exposure)| MeasuredView {
             view: view.name.clone(),
             split: view.split,
             points,
             measured,
-            used: evened_out.then(|| used(&measured)),
+            used: ((brightness || color) && known(view, points)).then(|| used(&measured)),
         };
         Some(ExposureCheck {
-            evened_out,
+            evens_brightness: brightness,
+            evens_color: color,
             brightness_spread: fit.brightness_spread,
             color_spread: fit.color_spread,
             views: views.iter().zip(&fit.points).zip(&fit.exposures).map(measured).collect(),
@@ -83,7 +86,7 @@ impl ExposureCheck {
 
     /// Returns the finding in one sentence.
     pub(super) fn sentence(&self) -> String {
-        if !self.evened_out {
+        if !self.evens_out() {
             let alike = 100.0 * self.brightness_spread.max(self.color_spread);
             return format!("exposure and white balance are alike within {alike:.1} %");
         }
@@ -103,14 +106,14 @@ impl ExposureCheck {
         };
         let (darkest, brightest) = (bright[0], bright[bright.len() - 1]);
         let mut parts = Vec::new();
-        if last > 0.0 && last > STANDS_OUT * usual {
+        if self.evens_brightness && last > STANDS_OUT * usual {
             let alone = if (brightest.0 / middle).ln() >= last { brightest } else { darkest };
             parts.push(format!("view {} than the others", said(alone)));
-        } else if last > 0.0 {
+        } else if self.evens_brightness {
             let spread = 100.0 * self.brightness_spread;
             parts.push(format!("exposures differ by {spread:.0} % ({}, {})", said(brightest), said(darkest)));
         }
-        if used.iter().any(|(_, e)| e.gain.iter().any(|g| *g != e.gain[0])) {
+        if self.evens_color {
             parts.push(format!("white balance differs by {:.0} %", 100.0 * self.color_spread));
         }
         parts.join("; ")
@@ -118,19 +121,20 @@ impl ExposureCheck {
 
     /// Returns the finding with what a run does about it.
     pub(super) fn announcement(&self) -> String {
-        let will = if self.evened_out { "; a run evens it out" } else { "" };
+        let will = if self.evens_out() { "; a run evens it out" } else { "" };
         format!("{}{will}", self.sentence())
     }
 
     /// Returns whether exposures are divided out.
     pub(super) fn evens_out(&self) -> bool {
-        self.evened_out
+        self.evens_brightness || self.evens_color
     }
 
     /// Returns the finding for the stage's record.
     pub(super) fn summary(&self) -> serde_json::Value {
         serde_json::json!({
-            "evened_out": self.evened_out,
+            "evens_brightness": self.evens_brightness,
+            "evens_color": self.evens_color,
             "brightness_spread": self.brightness_spread,
             "color_spread": self.color_spread,
         })

@@ -69,6 +69,17 @@ fn known_gains_are_found() {
 }
 
 #[test]
+fn where_only_colors_differ_nothing_is_said_of_brightness() {
+    let (_dir, mut exposed) = demo();
+    let warm =
+        |v: usize| [0.08, 0.0, -0.08].map(|l: f32| if v.is_multiple_of(2) { l.exp() } else { (-l).exp() });
+    expose(&mut exposed, &(0..15).map(warm).collect::<Vec<_>>());
+    let found = measure(&exposed);
+    assert!(found.sentence().starts_with("white balance differs by "), "{}", found.sentence());
+    assert!((0..14).all(|v| (found.used(&exposed.views[v].name).unwrap().brightness() - 1.0).abs() < 1e-5));
+}
+
+#[test]
 fn one_photograph_that_is_brighter_is_named() {
     let (_dir, mut exposed) = demo();
     let mut gains = [[1.0; 3]; 15];
@@ -131,7 +142,8 @@ fn exposures_are_read_back_and_what_is_no_gain_is_refused_with_its_key() {
     assert_eq!(json!(ExposureCheck::read(dir.path()).unwrap()), json!(found));
     let path = dir.path().join(EXPOSURE);
     let written: Value = io::read_json(&path, &Limits::default()).unwrap();
-    for value in [json!([1.0, 0.0, 1.0]), json!([1, 1]), json!([1, 1, null])] {
+    for value in [json!([1, 0, 1]), json!([1, -1, 1]), json!([1, 1, 101]), json!([1, 1]), json!([1, 1, null])]
+    {
         let mut bad = written.clone();
         bad["views"][4]["used"]["gain"] = value;
         std::fs::write(&path, bad.to_string()).unwrap();

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 const SEARCHED_PX: u32 = 1024;
 
 /// Maximum number of training views; the system of their poses is solved densely.
-const MOST_VIEWS: usize = 256;
+const MAX_VIEWS: usize = 256;
 
 /// Photographs with masks, training views first.
 pub(super) struct RigPhotos<'c> {
@@ -33,14 +33,14 @@ pub(super) struct RigPhotos<'c> {
 }
 
 impl<'c> RigPhotos<'c> {
-    /// Reads what the training views show, and up to as many others. `None` where nothing can be measured: without a hull,
+    /// Reads what the training views show, and up to 256 held-out views. `None` where nothing can be measured: without a hull,
     /// with fewer than three training views that have a mask, or with more than can be solved at once.
     pub fn load(capture: &'c Capture, scene: &Scene, limits: &Limits) -> Result<Option<RigPhotos<'c>>> {
         let split = |train: bool| capture.views.iter().filter(move |v| (v.split == Split::Train) == train);
-        let Some(hull) = scene.hull.as_ref().filter(|_| split(true).count() <= MOST_VIEWS) else {
+        let Some(hull) = scene.hull.as_ref().filter(|_| split(true).count() <= MAX_VIEWS) else {
             return Ok(None);
         };
-        let wanted: Vec<&View> = split(true).chain(split(false).take(MOST_VIEWS)).collect();
+        let wanted: Vec<&View> = split(true).chain(split(false).take(MAX_VIEWS)).collect();
         let loaded = wanted.par_iter().map(|view| searched(view, limits)).collect::<Result<Vec<_>>>()?;
         let measured = wanted.iter().zip(loaded).filter_map(|(view, loaded)| Some((*view, loaded?)));
         let (views, pictures): (Vec<&View>, Vec<(Photo, Gray)>) = measured.unzip();

@@ -35,7 +35,7 @@ const EXPOSED: Range<u8> = 40..248;
 const MIN_TRAINING_VIEWS: usize = 8;
 
 /// Points that a view must show.
-const MIN_POINTS: usize = 50;
+pub const MIN_POINTS: usize = 50;
 
 /// Minimum cosine between the normal and the direction to the camera.
 const MIN_COSINE: f32 = 0.35;
