@@ -14,7 +14,7 @@ use crate::io::{self, Limits};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-fn demo() -> (TempDir, Capture) {
+pub(super) fn demo() -> (TempDir, Capture) {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 240, height: 300, train: 14, test: 1, seed: 1 };
     write_capture(dir.path(), &options).unwrap();
@@ -22,7 +22,7 @@ fn demo() -> (TempDir, Capture) {
     (dir, capture)
 }
 
-fn measure(capture: &Capture) -> ExposureCheck {
+pub(super) fn measure(capture: &Capture) -> ExposureCheck {
     let train: Vec<_> = capture.split(Split::Train).collect();
     let cameras: Vec<Camera> = train.iter().map(|v| v.camera.clone()).collect();
     let masks: Vec<_> = train.iter().map(|v| v.load_mask(&Limits::default()).unwrap()).collect();
@@ -31,7 +31,7 @@ fn measure(capture: &Capture) -> ExposureCheck {
 }
 
 /// Multiplies the light of photographs. A photograph that is read with the inverse exposure is brighter by it.
-fn expose(capture: &mut Capture, gains: &[[f32; 3]]) {
+pub(super) fn expose(capture: &mut Capture, gains: &[[f32; 3]]) {
     for (view, gain) in capture.views.iter_mut().zip(gains) {
         view.exposure = Some(Exposure { gain: gain.map(|g| 1.0 / g) });
     }
@@ -39,7 +39,7 @@ fn expose(capture: &mut Capture, gains: &[[f32; 3]]) {
 
 /// Returns gains of a geometric mean of 1 over the training views, which do not follow the viewing direction: neighbors
 /// differ.
-fn gains() -> Vec<[f32; 3]> {
+pub(super) fn gains() -> Vec<[f32; 3]> {
     let log = |v: usize, k: usize| {
         let sign = if v.is_multiple_of(2) { 1.0 } else { -1.0 };
         sign * (0.1 + 0.01 * (v / 2) as f32 - 0.05 * k as f32)

@@ -264,6 +264,7 @@ pub fn against_truth(mesh: &Mesh, points: usize) -> Option<Truth> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::exposure_tests;
     use super::*;
 
     #[test]
@@ -280,6 +281,30 @@ mod tests {
         assert_eq!((&above["gain_db"], crate::report::blend_verdict(&above)), (&json!(2.25), None));
         // one member alone is no blend
         assert_eq!(gain(&[Method::Tface]), None);
+    }
+
+    #[test]
+    fn a_view_at_the_mean_exposure_is_compared_with_the_photograph_and_with_its_own_exposure_divided_out() {
+        let (dir, clean) = exposure_tests::demo();
+        let mut exposed = clean.clone();
+        exposure_tests::expose(&mut exposed, &exposure_tests::gains());
+        let check = exposure_tests::measure(&exposed);
+        // the photograph at the mean exposure is the picture of a perfect renderer
+        let photo = clean.views[14].load_photo(&Limits::default()).unwrap();
+        let file = dir.path().join("view.png");
+        io::write_png_rgb(&file, photo.width, photo.height, &photo.rgb).unwrap();
+        let picture = Comparable { view: &exposed.views[14], file, float: dir.path().join("view.npy") };
+        let config = Config::preset(crate::config::Preset::Draft);
+        let plain = figures(&config, &picture, None, None, None).unwrap();
+        let found = figures(&config, &picture, None, None, Some(&check)).unwrap();
+        assert!(plain.own_exposure.is_none());
+        assert_eq!(found.head.psnr_masked, plain.head.psnr_masked);
+        let own = found.own_exposure.unwrap().psnr_masked.unwrap();
+        assert!(
+            own > plain.head.psnr_masked.unwrap() + 6.0,
+            "{own} dB, {:?} as it is",
+            plain.head.psnr_masked
+        );
     }
 
     #[test]
