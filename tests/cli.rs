@@ -494,7 +494,7 @@ fn an_out_or_a_device_that_cannot_be_is_refused_before_anything_begins() {
         (&["run", "head", "--out", "head.stl"], 2, ".json"),
         (&["metrics", "head", "--out", "m.glb"], 2, "end it in .json"),
         (&["render", "head", "--out", "turn"], 2, "with `/` at its end"),
-        (&["mesh", "head", "--out", "absent/head.glb"], 1, "no folder `absent`"),
+        (&["mesh", "head", "--out", "absent/head.glb"], 1, "the folder `absent` does not exist"),
         (
             &["run", "head", "--out", "h.glb", "--set", "render.method=tface", "--set", "ensemble.members="],
             2,
@@ -825,8 +825,8 @@ fn a_demo_that_cannot_be_is_refused_before_a_photograph_is_taken() {
     for (words, expected, said) in [
         (["--size", "9x9"], 1, "9 × 9 pixels"),
         (["--views", "2000"], 1, "1..=999 views"),
-        (["--views", "2"], 2, "`--views 2` leaves 1 to learn from"),
-        (["--border", "128"], 2, "`--border 128` leaves nothing"),
+        (["--views", "2"], 2, "`--views 2` leaves 1 to train on"),
+        (["--border", "128"], 2, "`--border 128` leaves no pixels"),
     ] {
         for dry in [&["--dry-run"][..], &[]] {
             let o = tiface(dir.path(), &[&["demo"], &words[..], dry].concat());
