@@ -217,7 +217,7 @@ impl VmConfig {
     }
 
     /// Returns the number of rays of a step. The steps up to the last upsampling, on coarse grids, have fewer, down to
-    /// `early_rays` of them, as long as they are [`EARLY_RAYS`] together: a short training needs all of its rays.
+    /// `early_rays` of them, as long as they are two million together: a short training needs all of its rays.
     pub fn rays_at(&self, step: u64) -> usize {
         let early_steps = self.early_steps();
         if early_steps == 0.0 || step as f64 > early_steps {
