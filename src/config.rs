@@ -79,7 +79,7 @@ impl Key {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// A look in two minutes on two cores: [`Preset::Draft`] with fewer steps.
+    /// A look in two to three minutes on two cores: [`Preset::Draft`] with fewer steps.
     Quick,
     /// A first result in minutes.
     Draft,
@@ -149,7 +149,7 @@ pub struct Config {
 const ROOT_KEYS: &[Key] = &[
     Key::word(
         "preset",
-        "Preset that all other keys default to: quick (a look in two minutes), draft (a first result), standard, paper (the \
+        "Preset that all other keys default to: quick (a look in minutes), draft (a first result), standard, paper (the \
          published recipe).",
     ),
     Key::number(
