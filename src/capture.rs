@@ -31,6 +31,7 @@ mod llff;
 mod masks;
 mod metashape;
 mod neus;
+mod photo_checks;
 mod realitycapture;
 pub mod scene;
 pub mod synthetic;

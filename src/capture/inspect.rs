@@ -3,6 +3,7 @@
 use super::frame::Agreement;
 use super::gather;
 use super::masks::{self, few};
+use super::photo_checks::{self, PhotoCheck};
 use super::scene::{self, Scene, SceneOptions};
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::Error;
@@ -237,15 +238,17 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
                 (mask, _) => mask,
             };
             let judged = mask.as_ref().map(|m| (refused, masks::findings(m), masks::coverage(m)));
-            Ok((mask, judged, loaded.valid.as_ref().map(masks::coverage)))
+            let photo = PhotoCheck::new(&loaded.photo, mask.as_ref());
+            Ok((mask, judged, loaded.valid.as_ref().map(masks::coverage), photo))
         })
         .collect();
     let mut kinds: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     let (mut unreadable, mut all_refused) = (Vec::new(), Vec::new());
-    let (mut all, mut covered, mut usable) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut all, mut covered, mut usable, mut photos) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for (view, loaded) in capture.views.iter().zip(loaded) {
         match loaded {
-            Ok((mask, judged, valid)) => {
+            Ok((mask, judged, valid, photo)) => {
+                photos.push((view.name.as_str(), photo));
                 if let Some((refused, findings, coverage)) = judged {
                     let findings = findings.into_iter().filter(|_| refused.is_none());
                     findings.for_each(|f| kinds.entry(f).or_default().push(&view.name));
@@ -267,6 +270,7 @@ fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> 
         let (n, list) = (views.len(), few(views));
         out.warnings.push(format!("the mask {finding} in {n} views: {list}"));
     }
+    out.warnings.extend(photo_checks::findings(&photos));
     out.masks = covered.len();
     out.coverage = Range::of(covered.into_iter());
     out.valid = usable.len();

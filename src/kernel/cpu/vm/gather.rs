@@ -182,6 +182,8 @@ struct Band<'a> {
     first: usize,
     width: usize,
     values: &'a mut [f32],
+    /// Samples that contribute to this part of a plane, in increasing order; of a line, none are listed, since all do.
+    samples: Vec<u32>,
 }
 
 /// Adds `weight · g` to `into`, for `n` channels.
@@ -222,12 +224,11 @@ fn band_body<const F: bool>(band: &mut Band, gradients: &FactorGradients) {
     let (a, b) = PLANE_AXES[band.term];
     let pitch = band.width * n;
     let rows = band.values.len() / pitch;
-    for (s, cell) in gradients.cells.iter().enumerate() {
+    for &s in &band.samples {
+        let s = s as usize;
+        let cell = &gradients.cells[s];
         // a sample contributes to this row and the next, either of which may belong to another band
         let row = (cell.index[b] as usize).wrapping_sub(band.row);
-        if row >= rows && row.wrapping_add(1) >= rows {
-            continue;
-        }
         let g = &gradients.planes[s * gradients.stride + band.first..][..n];
         let (x, y) = (cell.frac[a], cell.frac[b]);
         let at = cell.index[a] as usize * n;
@@ -258,8 +259,32 @@ pub(super) fn scatter(grid: &Grid, gradients: &FactorGradients, gradient: &mut [
         let first = grid.rank[..term].iter().sum();
         let rows = if line { 1 } else { height.div_ceil(BANDS) };
         for (i, values) in factor_gradient.chunks_mut((rows * width * channels).max(1)).enumerate() {
-            bands.push(Band { term, line, row: i * rows, channels, first, width, values });
+            bands.push(Band {
+                term,
+                line,
+                row: i * rows,
+                channels,
+                first,
+                width,
+                values,
+                samples: Vec::new(),
+            });
         }
     }
+    bands
+        .par_chunk_by_mut(|a, b| (a.term, a.line) == (b.term, b.line))
+        .filter(|bands| !bands[0].line)
+        .for_each(|bands| {
+            let axis = PLANE_AXES[bands[0].term].1;
+            let rows = bands.get(1).map_or(u32::MAX, |second| second.row as u32);
+            for (s, cell) in gradients.cells.iter().enumerate() {
+                let row = cell.index[axis];
+                let (band, next) = ((row / rows) as usize, ((row + 1) / rows) as usize);
+                bands[band].samples.push(s as u32);
+                if next != band {
+                    bands[next].samples.push(s as u32);
+                }
+            }
+        });
     bands.par_iter_mut().with_max_len(1).for_each(|band| scatter_band(band, gradients));
 }
