@@ -33,6 +33,7 @@ mod metashape;
 mod neus;
 mod realitycapture;
 pub mod scene;
+pub mod sfm;
 pub mod synthetic;
 mod transforms;
 mod view;
