@@ -195,7 +195,8 @@ fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     let folder = CaptureFolder::new(root, options)?;
     if let Some(files) = CameraFiles::find(root) {
         let what = format!("`{shown}` has cameras: `{}`", files.first());
-        let hint = "`tiface inspect` says what they are; to find others, give a folder with the photographs alone";
+        let hint =
+            "`tiface inspect` says what they are; to find others, give a folder with the photographs alone";
         return Err(Error::cannot(what, hint));
     }
     let none = || {
@@ -212,7 +213,13 @@ fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     for name in &names {
         let photo = folder.photo(name, &base.join(name).to_string_lossy())?;
         let intrinsics = Intrinsics { focal: [Some(1.0); 2], ..Intrinsics::default() };
-        listing.frames.push(CameraFrame::new("images", name, photo, intrinsics, (DMat3::IDENTITY, DVec3::ZERO)));
+        listing.frames.push(CameraFrame::new(
+            "images",
+            name,
+            photo,
+            intrinsics,
+            (DMat3::IDENTITY, DVec3::ZERO),
+        ));
     }
     let capture = build(&folder, "photographs", &mut listing);
     match (listing.problems.into_iter().next(), capture) {
@@ -225,7 +232,10 @@ fn require_enough(found: usize, place: &Path, hint: &str) -> Result<()> {
     if found >= MIN_VIEWS {
         return Ok(());
     }
-    let what = format!("`{}` has too few photographs: {found}, and at least {MIN_VIEWS} are needed", place.display());
+    let what = format!(
+        "`{}` has too few photographs: {found}, and at least {MIN_VIEWS} are needed",
+        place.display()
+    );
     Err(Error::cannot(what, hint))
 }
 
@@ -333,8 +343,11 @@ impl Work<'_> {
     fn arguments(&self, attempt: Attempt, folder: &Path, new_names: bool) -> [Vec<OsString>; 3] {
         let Attempt { masked, weak } = attempt;
         let threads = rayon::current_num_threads().to_string();
-        let [extraction, matching] =
-            if new_names { ["FeatureExtraction", "FeatureMatching"] } else { ["SiftExtraction", "SiftMatching"] };
+        let [extraction, matching] = if new_names {
+            ["FeatureExtraction", "FeatureMatching"]
+        } else {
+            ["SiftExtraction", "SiftMatching"]
+        };
         let database = folder.join("database.db");
         let images = self.sfm.out.join("images");
         let command = |name: &str, paths: &[(&str, &Path)], words: String| -> Vec<OsString> {
@@ -372,7 +385,11 @@ impl Work<'_> {
         let mapper = command(
             "mapper",
             &[database, images, ("--output_path", &models)],
-            if self.programs.glomap.is_some() { String::new() } else { format!("--Mapper.num_threads {threads}") },
+            if self.programs.glomap.is_some() {
+                String::new()
+            } else {
+                format!("--Mapper.num_threads {threads}")
+            },
         );
         [extractor, matcher, mapper]
     }
@@ -421,8 +438,12 @@ impl Work<'_> {
         let mut best: Option<Model> = None;
         for attempt in attempts {
             if attempt.weak {
-                let text = if attempt.masked == masked { "weak features are accepted" } else { "masks are ignored" };
-                (self.sfm.say)(&format!("{} of {n} photographs have a camera; once more: {text}", registered(&best)));
+                let text =
+                    if attempt.masked == masked { "weak features are accepted" } else { "masks are ignored" };
+                (self.sfm.say)(&format!(
+                    "{} of {n} photographs have a camera; once more: {text}",
+                    registered(&best)
+                ));
             }
             let model = self.attempt(attempt, new_names)?;
             if registered(&model) > registered(&best) {
@@ -435,7 +456,10 @@ impl Work<'_> {
         let found = registered(&best);
         let Some(model) = best.filter(|_| found >= MIN_VIEWS && 2 * found >= n) else {
             let log = self.folder("log.txt");
-            let what = format!("COLMAP found cameras for {found} of {n} photographs; its log is `{}`", log.display());
+            let what = format!(
+                "COLMAP found cameras for {found} of {n} photographs; its log is `{}`",
+                log.display()
+            );
             return Err(Error::cannot(what, MORE_OVERLAP));
         };
         self.finish(model)
@@ -449,7 +473,11 @@ impl Work<'_> {
         let registered = n - left_out.len();
         let mut warnings = Vec::new();
         if (registered as f64) < ENOUGH * n as f64 {
-            warnings.push(format!("{} of {n} photographs have no camera: {}", left_out.len(), few(&left_out)));
+            warnings.push(format!(
+                "{} of {n} photographs have no camera: {}",
+                left_out.len(),
+                few(&left_out)
+            ));
         }
         if model.pieces > 1 {
             let text = "COLMAP found pieces that it could not join, of which the largest is used";
@@ -457,10 +485,13 @@ impl Work<'_> {
         }
         if model.found.error_px > 2.0 {
             let error = model.found.error_px;
-            warnings.push(format!("the mean reprojection error is {error:.1} pixels: blurred, or not one still head"));
+            warnings.push(format!(
+                "the mean reprojection error is {error:.1} pixels: blurred, or not one still head"
+            ));
         }
         if self.masked && !model.attempt.masked {
-            warnings.push("the cameras were found from the background as well, which must not have moved".into());
+            warnings
+                .push("the cameras were found from the background as well, which must not have moved".into());
         }
         let refined = self.refined(&model)?.unwrap_or(model.folder);
         io::create_folder(&self.sfm.out.join("sparse"))?;

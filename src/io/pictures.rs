@@ -59,7 +59,8 @@ fn focal_length(exif: &[u8]) -> Option<(u32, u32)> {
     // an entry: tag, type, count, value or where it is
     let value = |directory: usize, tag: u32| -> Option<u32> {
         let entries = (0..number(directory, 2)? as usize).map(|k| directory + 2 + 12 * k);
-        let mut found = entries.take_while(|&at| bytes(at, 12).is_some()).filter(|&at| number(at, 2) == Some(tag));
+        let mut found =
+            entries.take_while(|&at| bytes(at, 12).is_some()).filter(|&at| number(at, 2) == Some(tag));
         number(found.next()? + 8, 4)
     };
     let camera = value(number(4, 4)? as usize, 0x8769)?;

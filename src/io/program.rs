@@ -108,8 +108,12 @@ impl Iterator for VideoFrames {
             Ok(None) => {
                 let wrong = self.program.take()?.wait(&|| false);
                 let explain = |wrong: String| {
-                    let what = format!("`{}`: FFmpeg cannot decode it to its end ({wrong})", self.video.display());
-                    Error::cannot(what, "its messages are in the log; convert the video, or cut it before that place")
+                    let what =
+                        format!("`{}`: FFmpeg cannot decode it to its end ({wrong})", self.video.display());
+                    Error::cannot(
+                        what,
+                        "its messages are in the log; convert the video, or cut it before that place",
+                    )
                 };
                 wrong.map(|wrong| wrong.map(|w| Err(explain(w)))).unwrap_or_else(|e| Some(Err(e)))
             }
@@ -132,7 +136,8 @@ fn read_ppm(input: &mut impl BufRead, video: &Path, limits: &Limits) -> Result<O
     }
     let words: Vec<&str> = std::str::from_utf8(&header).unwrap_or_default().split_whitespace().collect();
     let side = |k: usize| words.get(k).and_then(|w| w.parse::<u32>().ok()).filter(|&side| side > 0);
-    let (Some(&"P6"), Some(width), Some(height), Some(&"255")) = (words.first(), side(1), side(2), words.get(3))
+    let (Some(&"P6"), Some(width), Some(height), Some(&"255")) =
+        (words.first(), side(1), side(2), words.get(3))
     else {
         return Err(bad("FFmpeg's output is no sequence of 8-bit PPM pictures"));
     };
@@ -156,7 +161,9 @@ mod tests {
         assert_eq!((first.width, first.height, &first.rgb[..]), (2, 1, &[*b"abc", *b"def"][..]));
         assert_eq!(next().unwrap().unwrap().rgb, [*b"xyz"]);
         assert!(next().is_err());
-        for wrong in ["P5\n1 1\n255\nx", "P6\n0 1\n255\n", "P6\n1 1\n65535\nabcdef", "P6\n9999999 9999999\n255\n"] {
+        for wrong in
+            ["P5\n1 1\n255\nx", "P6\n0 1\n255\n", "P6\n1 1\n65535\nabcdef", "P6\n9999999 9999999\n255\n"]
+        {
             assert!(read_ppm(&mut wrong.as_bytes(), Path::new("v.mp4"), &limits).is_err(), "{wrong}");
         }
         assert!(read_ppm(&mut &b""[..], Path::new("v.mp4"), &limits).unwrap().is_none());

@@ -1,0 +1,283 @@
+//! Photographs without cameras: `tiface cameras` with COLMAP itself on real photographs, and with programs in its place that
+//! fail in every way. Without COLMAP or the shared captures, which lie beside the repository or where `TIFACE_SHARED` says,
+//! the first skips aloud.
+
+use glam::{DMat3, DVec3};
+use std::ffi::OsString;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use tempfile::TempDir;
+use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::capture::{self, CaptureOptions};
+use tiface::io::find_program;
+
+/// Runs `tiface` in a folder, with these programs before or instead of those of the system.
+fn tiface(folder: &Path, path: OsString, words: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
+    command.args(words).current_dir(folder).env("PATH", path).env("XDG_CONFIG_HOME", folder);
+    command.env_remove("RUST_LOG").env("NO_COLOR", "1").output().unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Nine photographs without cameras in `photographs/`.
+fn photographs() -> TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    let small = SyntheticOptions { width: 24, height: 30, train: 7, test: 2, seed: 1 };
+    write_capture(&dir.path().join("head"), &small).unwrap();
+    fs::rename(dir.path().join("head/images"), dir.path().join("photographs")).unwrap();
+    fs::create_dir(dir.path().join("programs")).unwrap();
+    dir
+}
+
+/// Runs `tiface cameras` with only the programs of this folder.
+fn cameras(dir: &TempDir, words: &[&str]) -> (i32, String) {
+    let output = tiface(dir.path(), dir.path().join("programs").into(), &[&["cameras"], words].concat());
+    (output.status.code().unwrap(), stderr(&output))
+}
+
+#[test]
+fn what_is_no_folder_of_photographs_is_refused_before_anything_is_written() {
+    let dir = photographs();
+    let at = |name: &str| dir.path().join(name);
+    let images: Vec<PathBuf> = fs::read_dir(at("photographs")).unwrap().map(|e| e.unwrap().path()).collect();
+    let with = |name: &str, n: usize| {
+        fs::create_dir(at(name)).unwrap();
+        for image in &images[..n] {
+            fs::copy(image, at(name).join(image.file_name().unwrap())).unwrap();
+        }
+    };
+    with("empty", 0);
+    with("one", 1);
+    with("cut", 9);
+    let cut = at("cut").join(images[4].file_name().unwrap());
+    let bytes = fs::read(&cut).unwrap();
+    fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    with("calibrated", 9);
+    fs::copy(at("head/transforms.json"), at("calibrated/transforms.json")).unwrap();
+    fs::write(at("turn.mp4"), "no video").unwrap();
+    let rows: &[(&[&str], i32, &str)] = &[
+        (&["empty"], 1, "`empty` has no photographs"),
+        (&["absent"], 1, "`absent`"),
+        (&["one"], 1, "too few photographs: 1, and at least 8 are needed"),
+        (&["cut"], 1, images[4].file_name().unwrap().to_str().unwrap()),
+        (&["calibrated"], 1, "has cameras: `transforms.json`"),
+        (&["turn.mp4"], 1, "`tiface cameras --video turn.mp4`"),
+        (&["--video", "absent.mp4"], 1, "there is no video `absent.mp4`"),
+        (&["--video", "turn.mp4"], 1, "`ffmpeg` is not installed"),
+        (&["photographs", "--video", "turn.mp4"], 2, "cannot be used with"),
+        (&["--video", "turn.mp4", "--every", "0"], 2, "--every"),
+        (&[], 2, "PHOTOGRAPHS"),
+    ];
+    for (words, code, text) in rows {
+        let (exit, said) = cameras(&dir, words);
+        assert!(exit == *code && said.contains(text), "{words:?}: {exit}, {said}");
+    }
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("`colmap` is not installed"), "{said}");
+    for way in ["apt-get install colmap", "brew install colmap", "github.com/colmap/colmap/releases"] {
+        assert!(said.contains(way), "{said}");
+    }
+    let left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert!(left.iter().all(|name| !name.to_string_lossy().ends_with("_cameras")), "{left:?}");
+}
+
+/// Puts a shell script in the place of a program.
+#[cfg(unix)]
+fn script(dir: &TempDir, program: &str, text: &str) {
+    use std::os::unix::fs::PermissionsExt;
+    let path = dir.path().join("programs").join(program);
+    fs::write(&path, format!("#!/bin/sh\n{text}\n")).unwrap();
+    fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+#[test]
+#[cfg(unix)]
+fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again() {
+    let dir = photographs();
+    let at = |name: &str| dir.path().join(name);
+    script(&dir, "colmap", "exit 1");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("`colmap feature_extractor` failed"), "{said}");
+    // an older version, and one that ends in the middle
+    script(&dir, "colmap", "echo ran \"$@\"; [ \"$1\" != exhaustive_matcher ]");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("`colmap exhaustive_matcher` failed"), "{said}");
+    assert!(
+        said.contains("photographs_cameras/colmap/log.txt") && said.contains("RAYON_NUM_THREADS"),
+        "{said}"
+    );
+    let log = fs::read_to_string(at("photographs_cameras/colmap/log.txt")).unwrap();
+    assert!(log.contains("ran feature_extractor") && log.contains("--SiftExtraction.use_gpu 0"), "{log}");
+    // no model: once more with weak features, and both attempts are shown
+    script(&dir, "colmap", "echo ran \"$@\"; echo FeatureExtraction.use_gpu; [ \"$1\" != mapper ]");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("found cameras for 0 of 9 photographs"), "{said}");
+    assert_eq!(said.matches("colmap mapper --database_path").count(), 2, "{said}");
+    assert_eq!(said.matches("--FeatureMatching.guided_matching 1").count(), 1, "{said}");
+    // a model that is none
+    script(
+        &dir,
+        "colmap",
+        "[ \"$1\" = mapper ] || exit 0\nmodel=photographs_cameras/colmap/1/models/0\nmkdir -p $model || exit\n\
+         for kind in cameras images points3D; do echo x > $model/$kind.bin; done",
+    );
+    script(&dir, "mkdir", "exec /bin/mkdir \"$@\"");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("models/0/") && said.contains("damaged COLMAP"), "{said}");
+    // GLOMAP takes the mapper's place, and only that
+    script(&dir, "colmap", "exit 0");
+    let (exit, said) = cameras(&dir, &["photographs", "--glomap"]);
+    assert!(exit == 1 && said.contains("`glomap` is not installed"), "{said}");
+    script(&dir, "glomap", "exit 0");
+    let (exit, said) = cameras(&dir, &["photographs", "--glomap"]);
+    assert!(
+        exit == 1 && said.contains("glomap mapper --database_path") && !said.contains("Mapper."),
+        "{said}"
+    );
+    // what is not an unfinished attempt stays as it is
+    fs::create_dir_all(at("kept/images")).unwrap();
+    fs::write(at("kept/images/mine.png"), "mine").unwrap();
+    let (exit, said) = cameras(&dir, &["photographs", "--out", "kept"]);
+    assert!(exit == 1 && said.contains("`kept` already exists"), "{said}");
+    assert_eq!(fs::read(at("kept/images/mine.png")).unwrap(), b"mine");
+    assert_eq!(fs::read_dir(at("kept")).unwrap().count(), 1);
+}
+
+#[test]
+#[cfg(unix)]
+fn masks_are_given_to_colmap_black_and_white_and_by_its_names() {
+    let dir = photographs();
+    let at = |name: &str| dir.path().join(name);
+    fs::create_dir(at("scan")).unwrap();
+    fs::rename(at("photographs"), at("scan/images")).unwrap();
+    fs::rename(at("head/masks"), at("scan/masks")).unwrap();
+    script(&dir, "colmap", "exit 0");
+    let (exit, said) = cameras(&dir, &["scan"]);
+    // the third attempt searches whole photographs
+    assert!(
+        exit == 1 && said.matches("--ImageReader.mask_path scan_cameras/colmap/masks").count() == 2,
+        "{said}"
+    );
+    assert_eq!(said.matches("colmap feature_extractor").count(), 3, "{said}");
+    let mask = at("scan_cameras/colmap/masks/000.png.png");
+    let mask = tiface::io::read_gray(&mask, None, &Default::default()).unwrap();
+    assert!(mask.values.contains(&0) && mask.values.contains(&255));
+    assert!(mask.values.iter().all(|v| [0, 255].contains(v)));
+    assert!(at("scan_cameras/masks/000.png.png").is_file() && at("scan/images/000.png").is_file());
+    let (_, said) = cameras(&dir, &["scan", "--set", "mask.source=none"]);
+    assert!(said.contains("colmap mapper") && !said.contains("mask_path"), "{said}");
+}
+
+/// The program, if it is installed; otherwise skips aloud.
+fn installed(program: &str) -> bool {
+    let found = find_program(program).is_some();
+    if !found {
+        eprintln!("skipped: `{program}` is not installed");
+    }
+    found
+}
+
+#[test]
+#[cfg(unix)]
+fn the_sharpest_frame_of_each_window_of_a_video_is_kept() {
+    if !installed("ffmpeg") {
+        return;
+    }
+    let dir = photographs();
+    // the brightness of a checkerboard rises and falls: frames 3, 11, 19, ... are the sharpest of each eight
+    let made = Command::new("ffmpeg")
+        .args("-loglevel error -f lavfi -i".split(' '))
+        .arg("nullsrc=s=64x48:d=2.4:r=30,geq=lum='128+4*(4-abs(mod(N,8)-3))*(2*mod(floor(X/4)+floor(Y/4),2)-1)':cb=128:cr=128")
+        .args("-c:v ffv1 turn.mkv".split(' '))
+        .current_dir(dir.path())
+        .status()
+        .unwrap();
+    assert!(made.success());
+    script(&dir, "colmap", "exit 1");
+    let ffmpeg = find_program("ffmpeg").unwrap();
+    std::os::unix::fs::symlink(ffmpeg, dir.path().join("programs/ffmpeg")).unwrap();
+    let (exit, said) = cameras(&dir, &["--video", "turn.mkv", "--every", "8"]);
+    assert!(exit == 1 && said.contains("9 frames, the sharpest of each 8"), "{said}");
+    let frames = fs::read_dir(dir.path().join("turn_cameras/images")).unwrap();
+    let mut names: Vec<_> = frames.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    let expected: Vec<_> = (0..9).map(|i| format!("{:06}.png", 8 * i + 3)).collect();
+    assert_eq!(names, expected);
+    let (exit, said) = cameras(&dir, &["--video", "turn.mkv", "--every", "72"]);
+    assert!(exit == 1 && said.contains("too few photographs: 1") && said.contains("`--every`"), "{said}");
+}
+
+/// The nearest rotation to a sum of rotations, by Newton's iteration for the polar decomposition.
+fn nearest_rotation(sum: DMat3, n: f64) -> DMat3 {
+    (0..20).fold(sum * (1.0 / n), |r, _| (r + r.inverse().transpose()) * 0.5)
+}
+
+#[test]
+fn twenty_real_photographs_get_the_cameras_that_they_came_with() {
+    let shared = std::env::var("TIFACE_SHARED")
+        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
+    let fox = PathBuf::from(shared).join("data/captures/fox");
+    if !fox.is_dir() {
+        eprintln!("skipped: the capture `fox` is not at {}", fox.display());
+        return;
+    }
+    if !installed("colmap") {
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let photographs = dir.path().join("photographs");
+    fs::create_dir(&photographs).unwrap();
+    let mut own = capture::open(&fox, &CaptureOptions::default()).unwrap().views;
+    own.sort_by(|a, b| a.name.cmp(&b.name));
+    own.truncate(20);
+    for view in &own {
+        fs::copy(&view.photo, photographs.join(view.photo.file_name().unwrap())).unwrap();
+    }
+    let path = std::env::var_os("PATH").unwrap();
+    let run = tiface(dir.path(), path.clone(), &["run", "photographs"]);
+    assert!(stderr(&run).contains("`tiface cameras photographs`"), "{}", stderr(&run));
+    let found = tiface(dir.path(), path.clone(), &["cameras", "photographs"]);
+    assert!(found.status.success(), "{}", stderr(&found));
+    let again = tiface(dir.path(), path, &["cameras", "photographs"]);
+    assert!(stderr(&again).contains("`photographs_cameras` already exists"), "{}", stderr(&again));
+
+    let capture = capture::open(&dir.path().join("photographs_cameras"), &CaptureOptions::default()).unwrap();
+    assert_eq!(capture.views.len(), 20, "{}", stderr(&found));
+    let pairs: Vec<_> = capture
+        .views
+        .iter()
+        .map(|view| (&view.camera, &own.iter().find(|o| o.name == view.name).unwrap().camera))
+        .collect();
+    // rotation from the rotations, scale and translation from the positions
+    let sum = pairs.iter().fold(DMat3::ZERO, |sum, (a, b)| sum + b.rotation * a.rotation.transpose());
+    let rotation = nearest_rotation(sum, 20.0);
+    let mean = |of: &dyn Fn(usize) -> DVec3| (0..20).map(of).sum::<DVec3>() / 20.0;
+    let (from, to) = (mean(&|i| pairs[i].0.position), mean(&|i| pairs[i].1.position));
+    let spread = |of: &dyn Fn(usize) -> DVec3| (0..20).map(|i| of(i).length_squared()).sum::<f64>().sqrt();
+    let scale = spread(&|i| pairs[i].1.position - to) / spread(&|i| pairs[i].0.position - from);
+    let size = |axis: usize| {
+        let all = pairs.iter().map(|(_, b)| b.position[axis]);
+        all.clone().fold(f64::MIN, f64::max) - all.fold(f64::MAX, f64::min)
+    };
+    let size = DVec3::new(size(0), size(1), size(2)).length();
+    let root_mean_square =
+        |of: &dyn Fn(usize) -> f64| ((0..20).map(|i| of(i).powi(2)).sum::<f64>() / 20.0).sqrt();
+    let moved = root_mean_square(&|i| {
+        let (a, b) = pairs[i];
+        (rotation * (a.position - from) * scale + to).distance(b.position) / size
+    });
+    let turned = root_mean_square(&|i| {
+        let (a, b) = pairs[i];
+        let apart = b.rotation.transpose() * rotation * a.rotation;
+        (0.5 * (apart.x_axis.x + apart.y_axis.y + apart.z_axis.z - 1.0)).clamp(-1.0, 1.0).acos().to_degrees()
+    });
+    eprintln!("positions {:.3} % of their extent, rotations {turned:.3}°", 100.0 * moved);
+    assert!(moved < 0.006 && turned < 0.4, "{moved} {turned}");
+    assert!(capture.focus.is_some(), "points bound the scene without masks");
+    let focal = capture.views[0].camera.fx / own[0].camera.fx;
+    assert!((focal - 1.0).abs() < 0.02, "{focal}");
+}
