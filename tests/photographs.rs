@@ -62,7 +62,7 @@ fn what_is_no_folder_of_photographs_is_refused_before_anything_is_written() {
     let rows: &[(&[&str], i32, &str)] = &[
         (&["empty"], 1, "`empty` has no photographs"),
         (&["absent"], 1, "`absent`"),
-        (&["one"], 1, "too few photographs: 1, and at least 8 are needed"),
+        (&["one"], 1, "`one` has 1 photographs, and at least 8 are needed"),
         (&["cut"], 1, images[4].file_name().unwrap().to_str().unwrap()),
         (&["calibrated"], 1, "has cameras: `transforms.json`"),
         (&["turn.mp4"], 1, "`tiface cameras --video turn.mp4`"),
@@ -138,7 +138,10 @@ fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again(
         exit == 1 && said.contains("glomap mapper --database_path") && !said.contains("Mapper."),
         "{said}"
     );
-    // what is not an unfinished attempt stays as it is
+    // neither the photographs' own folder nor what is no unfinished attempt is cleared
+    let (exit, said) = cameras(&dir, &["photographs_cameras/images", "--out", "photographs_cameras"]);
+    assert!(exit == 1 && said.contains("`photographs_cameras` already exists"), "{said}");
+    assert_eq!(fs::read_dir(at("photographs_cameras/images")).unwrap().count(), 9);
     fs::create_dir_all(at("kept/images")).unwrap();
     fs::write(at("kept/images/mine.png"), "mine").unwrap();
     let (exit, said) = cameras(&dir, &["photographs", "--out", "kept"]);
@@ -162,7 +165,7 @@ fn masks_are_given_to_colmap_black_and_white_and_by_its_names() {
         exit == 1 && said.matches("--ImageReader.mask_path scan_cameras/colmap/masks").count() == 2,
         "{said}"
     );
-    assert_eq!(said.matches("colmap feature_extractor").count(), 3, "{said}");
+    assert_eq!(said.matches("colmap feature_extractor --database_path").count(), 3, "{said}");
     let mask = at("scan_cameras/colmap/masks/000.png.png");
     let mask = tiface::io::read_gray(&mask, None, &Default::default()).unwrap();
     assert!(mask.values.contains(&0) && mask.values.contains(&255));
@@ -208,7 +211,10 @@ fn the_sharpest_frame_of_each_window_of_a_video_is_kept() {
     let expected: Vec<_> = (0..9).map(|i| format!("{:06}.png", 8 * i + 3)).collect();
     assert_eq!(names, expected);
     let (exit, said) = cameras(&dir, &["--video", "turn.mkv", "--every", "72"]);
-    assert!(exit == 1 && said.contains("too few photographs: 1") && said.contains("`--every`"), "{said}");
+    assert!(
+        exit == 1 && said.contains("has 1 photographs, and at least 8") && said.contains("`--every`"),
+        "{said}"
+    );
 }
 
 /// The nearest rotation to a sum of rotations, by Newton's iteration for the polar decomposition.

@@ -33,6 +33,9 @@ const MIN_VIEWS: usize = 8;
 /// Share of the photographs that ends the attempts, and below which those left out are named.
 const ENOUGH: f64 = 0.8;
 
+/// Reprojection errors above this are warned of. Those of sharp photographs are below one pixel.
+const MAX_ERROR_PX: f64 = 2.0;
+
 /// Most pictures of which each is matched with every other; frames of a longer video with those near in time.
 const MAX_EXHAUSTIVE: usize = 200;
 
@@ -110,7 +113,7 @@ pub fn from_photographs(root: &Path, options: &CaptureOptions, sfm: &SfmOptions)
     // everything is read once before the long work, and before anything is written
     capture.views.par_iter().try_for_each(|view| view.load(limits).map(drop))?;
     let programs = Programs::find(sfm)?;
-    let masks = prepare(sfm)?.join("masks");
+    let masks = prepare(sfm, root)?.join("masks");
     let names = convert::copy_for_colmap(&capture, &sfm.out)?;
     // COLMAP ignores what is black: half transparent hair is the head's outline, which shows the background as well
     capture.views.par_iter().zip(&names).try_for_each(|(view, name)| -> Result<()> {
@@ -136,7 +139,7 @@ pub fn from_video(video: &Path, every: usize, sfm: &SfmOptions) -> Result<Soluti
     let missing = || Error::cannot("`ffmpeg` is not installed", INSTALL_FFMPEG);
     let ffmpeg = io::find_program("ffmpeg").ok_or_else(missing)?;
     let programs = Programs::find(sfm)?;
-    let log = prepare(sfm)?.join("log.txt");
+    let log = prepare(sfm, video)?.join("log.txt");
     let images = sfm.out.join("images");
     io::create_folder(&images)?;
     (sfm.say)(&format!("ffmpeg decodes `{}`", video.display()));
@@ -210,16 +213,11 @@ fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     require_enough(names.len(), root, MORE_OVERLAP)?;
     let mut listing = Listing::default();
     let base = inside.strip_prefix(root).unwrap_or(Path::new(""));
+    let lens = Intrinsics { focal: [Some(1.0); 2], ..Intrinsics::default() };
+    let pose = (DMat3::IDENTITY, DVec3::ZERO);
     for name in &names {
         let photo = folder.photo(name, &base.join(name).to_string_lossy())?;
-        let intrinsics = Intrinsics { focal: [Some(1.0); 2], ..Intrinsics::default() };
-        listing.frames.push(CameraFrame::new(
-            "images",
-            name,
-            photo,
-            intrinsics,
-            (DMat3::IDENTITY, DVec3::ZERO),
-        ));
+        listing.frames.push(CameraFrame::new(name, name, photo, lens, pose));
     }
     let capture = build(&folder, "photographs", &mut listing);
     match (listing.problems.into_iter().next(), capture) {
@@ -232,22 +230,23 @@ fn require_enough(found: usize, place: &Path, hint: &str) -> Result<()> {
     if found >= MIN_VIEWS {
         return Ok(());
     }
-    let what = format!(
-        "`{}` has too few photographs: {found}, and at least {MIN_VIEWS} are needed",
-        place.display()
-    );
-    Err(Error::cannot(what, hint))
+    let place = place.display();
+    Err(Error::cannot(
+        format!("`{place}` has {found} photographs, and at least {MIN_VIEWS} are needed"),
+        hint,
+    ))
 }
 
 /// Creates the output folder, clears what an unfinished attempt left in it, and returns the folder that COLMAP works in.
-fn prepare(sfm: &SfmOptions) -> Result<PathBuf> {
+fn prepare(sfm: &SfmOptions, from: &Path) -> Result<PathBuf> {
     let work = sfm.out.join("colmap");
     if io::exists(&sfm.out) {
+        let is_inside = io::real_path(from)?.starts_with(io::real_path(&sfm.out)?);
         let is_empty = io::is_folder(&sfm.out)
             && io::list_files(&sfm.out)?.is_empty()
             && io::list_folders(&sfm.out)?.is_empty();
         let is_unfinished = io::is_file(&work.join("log.txt")) && !io::exists(&sfm.out.join("sparse/0"));
-        if !is_empty && !is_unfinished {
+        if is_inside || !is_empty && !is_unfinished {
             let message = format!("`{}` already exists", sfm.out.display());
             return Err(Error::cannot(message, "name a new folder with `--out`: nothing is overwritten"));
         }
@@ -311,30 +310,27 @@ impl Work<'_> {
         self.sfm.out.join("colmap").join(name)
     }
 
-    /// Runs a command of COLMAP or GLOMAP; returns what is wrong with its end, if anything.
+    /// Shows a command as a user would type it, and runs it; returns what is wrong with its end, if anything.
     fn run(&self, program: &Path, arguments: &[OsString], log: &Path) -> Result<Option<String>> {
+        let words: Vec<_> = arguments.iter().map(|word| word.to_string_lossy()).collect();
+        let name = program.file_stem().unwrap_or_default().to_string_lossy();
+        (self.sfm.say)(&format!("{name} {}", words.join(" ")));
         Program::start(program, arguments, log, false)?.wait(self.sfm.stop)
     }
 
-    /// Runs a command that has to succeed.
-    fn require(&self, program: &Path, arguments: &[OsString], log: &Path) -> Result<()> {
-        let Some(wrong) = self.run(program, arguments, log)? else { return Ok(()) };
-        let command = arguments[0].to_string_lossy();
-        let hint = match &*command {
-            "feature_extractor" | "exhaustive_matcher" | "sequential_matcher" => {
-                "the end of the log says why; if memory ran out, set RAYON_NUM_THREADS=1, which is COLMAP's number of \
-                 threads as well, or reduce the photographs"
-            }
-            _ => "the end of the log says why; COLMAP 3.8 and 3.13 are known to have these options",
-        };
-        let what = format!("`colmap {command}` failed ({wrong}); its log is `{}`", log.display());
-        Err(Error::cannot(what, hint))
+    /// Runs a command of COLMAP that has to succeed.
+    fn require(&self, arguments: &[OsString], log: &Path) -> Result<()> {
+        let Some(wrong) = self.run(&self.programs.colmap, arguments, log)? else { return Ok(()) };
+        let (command, log) = (arguments[0].to_string_lossy(), log.display());
+        let hint = "the end of the log says why; if memory ran out, set RAYON_NUM_THREADS=1, which is COLMAP's number of \
+                    threads as well, or reduce the photographs";
+        Err(Error::cannot(format!("`colmap {command}` failed ({wrong}); its log is `{log}`"), hint))
     }
 
     /// Returns whether COLMAP names options as since 3.13, which moved some from `Sift…` to `Feature…`.
     fn has_new_names(&self) -> Result<bool> {
         let help = self.folder("options.txt");
-        self.require(&self.programs.colmap, &["feature_extractor".into(), "-h".into()], &help)?;
+        self.require(&["feature_extractor".into(), "-h".into()], &help)?;
         let text = io::read_maybe_empty(&help, &self.sfm.limits)?;
         Ok(String::from_utf8_lossy(&text).contains("FeatureExtraction.use_gpu"))
     }
@@ -343,54 +339,31 @@ impl Work<'_> {
     fn arguments(&self, attempt: Attempt, folder: &Path, new_names: bool) -> [Vec<OsString>; 3] {
         let Attempt { masked, weak } = attempt;
         let threads = rayon::current_num_threads().to_string();
-        let [extraction, matching] = if new_names {
-            ["FeatureExtraction", "FeatureMatching"]
-        } else {
-            ["SiftExtraction", "SiftMatching"]
-        };
-        let database = folder.join("database.db");
-        let images = self.sfm.out.join("images");
+        let kind = if new_names { "Feature" } else { "Sift" };
+        let on_cpu = |task: &str| format!("--{kind}{task}.use_gpu 0 --{kind}{task}.num_threads {threads}");
+        let [database, models] = ["database.db", "models"].map(|name| folder.join(name));
+        let (images, masks) = (self.sfm.out.join("images"), self.folder("masks"));
         let command = |name: &str, paths: &[(&str, &Path)], words: String| -> Vec<OsString> {
             let paths = paths.iter().flat_map(|(option, path)| [OsString::from(option), path.into()]);
             let words = words.split_whitespace().map(OsString::from);
             [name.into()].into_iter().chain(paths).chain(words).collect()
         };
-        let (database, images) = (("--database_path", &*database), ("--image_path", &*images));
-        let masks = self.folder("masks");
-        let extractor = command(
-            "feature_extractor",
-            &[database, images, ("--ImageReader.mask_path", &masks)][..if masked { 3 } else { 2 }],
-            format!(
-                "--ImageReader.camera_model SIMPLE_RADIAL --ImageReader.single_camera {} --{extraction}.use_gpu 0 \
-                 --{extraction}.num_threads {threads}{}",
-                u8::from(self.shared),
-                if weak {
-                    " --SiftExtraction.peak_threshold 0.002 --SiftExtraction.estimate_affine_shape 1 \
-                     --SiftExtraction.domain_size_pooling 1"
-                } else {
-                    ""
-                }
-            ),
-        );
+        let database: (&str, &Path) = ("--database_path", &database);
+        let paths = [database, ("--image_path", &images), ("--ImageReader.mask_path", &masks)];
+        let mut words = on_cpu("Extraction") + " --ImageReader.camera_model SIMPLE_RADIAL";
+        words += if self.shared { " --ImageReader.single_camera 1" } else { "" };
+        if weak {
+            words += " --SiftExtraction.peak_threshold 0.002 --SiftExtraction.estimate_affine_shape 1 \
+                      --SiftExtraction.domain_size_pooling 1";
+        }
+        let extractor = command("feature_extractor", &paths[..if masked { 3 } else { 2 }], words);
         let is_long = self.is_video && self.names.len() > MAX_EXHAUSTIVE;
-        let matcher = command(
-            if is_long { "sequential_matcher" } else { "exhaustive_matcher" },
-            &[database],
-            format!(
-                "--{matching}.use_gpu 0 --{matching}.num_threads {threads}{}",
-                if weak { format!(" --{matching}.guided_matching 1") } else { String::new() }
-            ),
-        );
-        let models = folder.join("models");
-        let mapper = command(
-            "mapper",
-            &[database, images, ("--output_path", &models)],
-            if self.programs.glomap.is_some() {
-                String::new()
-            } else {
-                format!("--Mapper.num_threads {threads}")
-            },
-        );
+        let matcher = if is_long { "sequential_matcher" } else { "exhaustive_matcher" };
+        let guided = if weak { format!(" --{kind}Matching.guided_matching 1") } else { String::new() };
+        let matcher = command(matcher, &[database], on_cpu("Matching") + &guided);
+        let is_glomap = self.programs.glomap.is_some();
+        let words = if is_glomap { String::new() } else { format!("--Mapper.num_threads {threads}") };
+        let mapper = command("mapper", &[paths[0], paths[1], ("--output_path", &models)], words);
         [extractor, matcher, mapper]
     }
 
@@ -403,28 +376,17 @@ impl Work<'_> {
         });
         let (log, models) = (self.folder("log.txt"), folder.join("models"));
         io::create_folder(&models)?;
-        let colmap = &self.programs.colmap;
         let [extractor, matcher, mapper] = self.arguments(attempt, &folder, new_names);
-        for arguments in [extractor, matcher] {
-            self.say("colmap", &arguments);
-            self.require(colmap, &arguments, &log)?;
-        }
-        let (name, program) = self.programs.glomap.as_ref().map_or(("colmap", colmap), |g| ("glomap", g));
-        self.say(name, &mapper);
+        self.require(&extractor, &log)?;
+        self.require(&matcher, &log)?;
         // a mapper that finds no model fails as well
-        self.run(program, &mapper, &log)?;
+        self.run(self.programs.glomap.as_ref().unwrap_or(&self.programs.colmap), &mapper, &log)?;
         let folders = io::list_folders(&models)?;
         let all = folders.iter().map(|folder| Ok((folder, Found::read(folder, &self.sfm.limits)?)));
         let all = all.collect::<Result<Vec<_>>>()?;
         let pieces = all.len();
         let best = all.into_iter().rev().max_by_key(|(_, found)| found.names.len());
         Ok(best.map(|(folder, found)| Model { attempt, folder: folder.clone(), found, pieces }))
-    }
-
-    /// Shows a command, as a user would type it.
-    fn say(&self, program: &str, arguments: &[OsString]) {
-        let words: Vec<_> = arguments.iter().map(|word| word.to_string_lossy()).collect();
-        (self.sfm.say)(&format!("{program} {}", words.join(" ")));
     }
 
     fn solve(self) -> Result<Solution> {
@@ -438,12 +400,10 @@ impl Work<'_> {
         let mut best: Option<Model> = None;
         for attempt in attempts {
             if attempt.weak {
-                let text =
-                    if attempt.masked == masked { "weak features are accepted" } else { "masks are ignored" };
-                (self.sfm.say)(&format!(
-                    "{} of {n} photographs have a camera; once more: {text}",
-                    registered(&best)
-                ));
+                let how =
+                    if attempt.masked == masked { "with weak features as well" } else { "without masks" };
+                let found = registered(&best);
+                (self.sfm.say)(&format!("{found} of {n} photographs have a camera: once more, {how}"));
             }
             let model = self.attempt(attempt, new_names)?;
             if registered(&model) > registered(&best) {
@@ -455,11 +415,8 @@ impl Work<'_> {
         }
         let found = registered(&best);
         let Some(model) = best.filter(|_| found >= MIN_VIEWS && 2 * found >= n) else {
-            let log = self.folder("log.txt");
-            let what = format!(
-                "COLMAP found cameras for {found} of {n} photographs; its log is `{}`",
-                log.display()
-            );
+            let what = format!("COLMAP found cameras for {found} of {n} photographs");
+            let what = format!("{what}; its log is `{}`", self.folder("log.txt").display());
             return Err(Error::cannot(what, MORE_OVERLAP));
         };
         self.finish(model)
@@ -472,26 +429,21 @@ impl Work<'_> {
             self.names.iter().filter(|name| !model.found.names.contains(*name)).cloned().collect();
         let registered = n - left_out.len();
         let mut warnings = Vec::new();
-        if (registered as f64) < ENOUGH * n as f64 {
-            warnings.push(format!(
-                "{} of {n} photographs have no camera: {}",
-                left_out.len(),
-                few(&left_out)
-            ));
+        let Found { error_px, .. } = model.found;
+        if !left_out.is_empty() {
+            let (names, left) = (few(&left_out), left_out.len());
+            warnings.push(format!("{left} of {n} photographs have no camera, and are left out: {names}"));
         }
         if model.pieces > 1 {
-            let text = "COLMAP found pieces that it could not join, of which the largest is used";
-            warnings.push(format!("{} models: {text}", model.pieces));
+            let text = "pieces that COLMAP could not join, of which the largest is used";
+            warnings.push(format!("there are {} {text}", model.pieces));
         }
-        if model.found.error_px > 2.0 {
-            let error = model.found.error_px;
-            warnings.push(format!(
-                "the mean reprojection error is {error:.1} pixels: blurred, or not one still head"
-            ));
+        if error_px > MAX_ERROR_PX {
+            let text = "the photographs are blurred, or do not show one still head";
+            warnings.push(format!("the mean reprojection error is {error_px:.1} pixels: {text}"));
         }
         if self.masked && !model.attempt.masked {
-            warnings
-                .push("the cameras were found from the background as well, which must not have moved".into());
+            warnings.push("features of the background were used, too, so it must not have moved".into());
         }
         let refined = self.refined(&model)?.unwrap_or(model.folder);
         io::create_folder(&self.sfm.out.join("sparse"))?;
@@ -502,7 +454,7 @@ impl Work<'_> {
             photographs: n,
             registered,
             left_out,
-            error_px: model.found.error_px,
+            error_px,
             masked: model.attempt.masked,
             warnings,
         })
@@ -522,9 +474,10 @@ impl Work<'_> {
         let mut arguments: Vec<OsString> = vec!["bundle_adjuster".into(), "--input_path".into()];
         arguments.extend([OsString::from(&model.folder), "--output_path".into(), OsString::from(&refined)]);
         arguments.extend(["--BundleAdjustment.refine_principal_point", "1"].map(OsString::from));
-        self.say("colmap", &arguments);
-        self.require(&self.programs.colmap, &arguments, &self.folder("log.txt"))?;
-        let after = Found::read(&refined, &self.sfm.limits)?.shared_lens();
+        let wrong = self.run(&self.programs.colmap, &arguments, &self.folder("log.txt"))?;
+        // without a refined model the mapper's remains
+        let after = Found::read(&refined, &self.sfm.limits).ok().filter(|_| wrong.is_none());
+        let after = after.and_then(|found| found.shared_lens());
         let is_near = |(_, lens): &(f64, [f64; 3])| {
             lens.iter().zip(&before).all(|(after, before)| (after - before).abs() <= MAX_MOVE * side)
         };
