@@ -128,7 +128,7 @@ fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again(
     );
     script(&dir, "mkdir", "exec /bin/mkdir \"$@\"");
     let (exit, said) = cameras(&dir, &["photographs"]);
-    assert!(exit == 1 && said.contains("models/0/") && said.contains("damaged COLMAP"), "{said}");
+    assert!(exit == 1 && said.contains("models/0/") && said.contains("is not a valid COLMAP file"), "{said}");
     // GLOMAP takes the mapper's place, and only that
     script(&dir, "colmap", "exit 0");
     let (exit, said) = cameras(&dir, &["photographs", "--glomap"]);
@@ -149,6 +149,24 @@ fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again(
     assert!(exit == 1 && said.contains("`kept` already exists"), "{said}");
     assert_eq!(fs::read(at("kept/images/mine.png")).unwrap(), b"mine");
     assert_eq!(fs::read_dir(at("kept")).unwrap().count(), 1);
+}
+
+#[test]
+#[cfg(unix)]
+fn a_stop_ends_colmap_as_well() {
+    let dir = photographs();
+    script(&dir, "colmap", "echo $$ > started; exec /bin/sleep 60");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
+    command.args(["cameras", "photographs"]).current_dir(dir.path()).env("PATH", dir.path().join("programs"));
+    let mut running = command.env("XDG_CONFIG_HOME", dir.path()).spawn().unwrap();
+    let started = || fs::read_to_string(dir.path().join("started")).ok()?.trim().parse::<u32>().ok();
+    let pid = (0..600).find_map(|_| {
+        std::thread::sleep(std::time::Duration::from_millis(50));
+        started()
+    });
+    let killed = Command::new("/bin/kill").arg(running.id().to_string()).status().unwrap();
+    assert!(killed.success() && running.wait().unwrap().code() == Some(143));
+    assert!(tiface::io::has_ended(pid.expect("the script began")));
 }
 
 #[test]

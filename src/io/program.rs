@@ -53,10 +53,16 @@ impl Program {
 
     /// Waits for its end, and returns what is wrong with it, if anything. `stop` ends it.
     pub fn wait(mut self, stop: &dyn Fn() -> bool) -> Result<Option<String>> {
+        let stopped = || Err(Error::stopped("before its end").with_hint(""));
         loop {
             match self.0.try_wait() {
-                Ok(Some(status)) => return Ok((!status.success()).then(|| status.to_string())),
-                Ok(None) if stop() => return Err(Error::stopped("before its end").with_hint("")),
+                Ok(Some(status)) if status.success() => return Ok(None),
+                Ok(Some(status)) => {
+                    // Ctrl-C ends both; what asked for the stop may be heard of a little later
+                    std::thread::sleep(2 * POLL_INTERVAL);
+                    return if stop() { stopped() } else { Ok(Some(status.to_string())) };
+                }
+                Ok(None) if stop() => return stopped(),
                 Ok(None) => std::thread::sleep(POLL_INTERVAL),
                 Err(e) => return Err(Error::cannot(format!("a program cannot be waited for: {e}"), "")),
             }
