@@ -34,6 +34,7 @@ mod neus;
 mod photo_checks;
 mod realitycapture;
 pub mod scene;
+pub mod sfm;
 pub mod synthetic;
 mod transforms;
 mod view;

@@ -6,6 +6,7 @@
 
 mod about;
 mod bench;
+mod cameras;
 mod capture;
 mod check;
 mod demo;
@@ -23,6 +24,7 @@ use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
 use bench::BenchOptions;
+use cameras::CamerasOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use clap_complete::Shell;
 use experiment::ExperimentOptions;
@@ -171,6 +173,16 @@ enum Command {
         /// Folder of photographs with cameras
         capture: PathBuf,
     },
+    /// Find the cameras of photographs that have none, with COLMAP, which must be installed
+    #[command(after_long_help = "Examples:
+  tiface cameras photographs --out captures/002_00
+  tiface cameras --video turn.mp4 --every 15    keep the sharpest of every 15 frames
+  tiface cameras rig --lens-each                calibrate a lens for each photograph
+
+The new folder [default: PHOTOGRAPHS_cameras] has a copy of the photographs in images/, COLMAP's model in sparse/0
+and its log in colmap/log.txt. If the folder has head masks, features are searched inside them;
+--set mask.source=none uses whole photographs.")]
+    Cameras(CamerasOptions),
     /// Write a capture's cameras in another format: transforms.json or COLMAP
     #[command(after_long_help = "Examples:
   tiface convert captures/002_00 --to colmap
@@ -453,6 +465,7 @@ pub fn main() -> ExitCode {
         Command::Inspect { capture } => {
             makes_nothing("inspect").and_then(|()| capture::inspect(&common, capture))
         }
+        Command::Cameras(options) => cameras::run(&invocation, options),
         Command::Convert { capture, to } => capture::convert(&invocation, capture, to),
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),

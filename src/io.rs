@@ -11,6 +11,7 @@ mod json;
 mod npy;
 mod pictures;
 mod process;
+mod program;
 mod read;
 mod tensors;
 mod write;
@@ -28,6 +29,7 @@ pub use pictures::{
     read_gray, read_photo, write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
 pub use process::{cpu_seconds, forget_peak_memory, has_ended, has_open, peak_memory, processor};
+pub use program::{Program, VideoFrames, find_program};
 pub use read::{Limits, ReadError, read_bytes, read_maybe_empty};
 pub use tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
 pub use write::{WriteError, copy, remove, remove_leftovers, rename, write_atomic};

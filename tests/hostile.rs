@@ -900,10 +900,10 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
         (
             &[picture("b.JPG"), picture("a.jpg")],
             "photographs without cameras (`a.jpg`)",
-            "images --data ROOT --output",
+            "find them with COLMAP: `tiface cameras ROOT`",
         ),
-        (&[picture("input/1.png")], "photographs without cameras (`1.png`)", "--data ROOT/input"),
-        (&[("head.MOV", b"ftyp")], "a video (`head.MOV`)", "video --data ROOT/head.MOV"),
+        (&[picture("input/1.png")], "photographs without cameras (`1.png`)", "`tiface cameras ROOT`"),
+        (&[("head.MOV", b"ftyp")], "a video (`head.MOV`)", "`tiface cameras --video ROOT/head.MOV`"),
         (
             &[("scan/transforms.json", b"{}")],
             "its subfolder `scan` contains `transforms.json`",
@@ -955,7 +955,7 @@ fn a_file_in_the_place_of_a_folder_says_which_folder() {
     assert_eq!(of("transforms.json").1, "give its folder: `ROOT`");
     let (message, hint) = of("head.mp4");
     assert!(
-        message.contains("it is a video") && hint.contains("ns-process-data video --data ROOT/head.mp4"),
+        message.contains("it is a video") && hint.contains("tiface cameras --video ROOT/head.mp4"),
         "{hint}"
     );
 }

@@ -135,6 +135,16 @@ browser_is_here() {
   /usr/bin/chromium --version
 }
 
+# COLMAP and FFmpeg, which find the cameras of photographs and of videos; tests skip aloud where apt cannot install them.
+colmap_is_here() {
+  command -v colmap && command -v ffmpeg && return
+  command -v apt-get > /dev/null || return
+  local sudo=
+  [ "$(id -u)" = 0 ] || sudo=sudo
+  $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends colmap ffmpeg > /dev/null
+  command -v colmap && command -v ffmpeg
+}
+
 # Everything that reads files, on one export
 readers_agree() {
   local name=$1 glb=$2
@@ -190,6 +200,11 @@ need_vulkan() {
   fi
 }
 
+need_colmap() {
+  printf '\n== COLMAP and FFmpeg are installed\n'
+  colmap_is_here || results+=("SKIPPED COLMAP or FFmpeg, which find cameras: apt cannot install colmap and ffmpeg")
+}
+
 built=no
 need_program() {
   [ $built = yes ] && return
@@ -214,6 +229,7 @@ unit() {
 integration() {
   need_program
   need_vulkan
+  need_colmap
   step "integration tests" tests --test '*'
 }
 
@@ -247,6 +263,7 @@ shapes() {
 guides() {
   need_readers
   need_vulkan
+  need_colmap
   need_program
   step "the engine of many heads is installed" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
     -r tools/fleet/requirements.txt

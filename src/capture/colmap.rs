@@ -5,7 +5,8 @@
 //! images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12) are not read.
 //! Points are optional, and say where the head is if no masks do.
 //!
-//! A model is written back as binary files: one camera for each lens that differs, no points.
+//! A model is written back as binary files: one camera for each lens that differs, no points. [`Found`] sums up what
+//! COLMAP itself has just written.
 
 mod binary;
 mod text;
@@ -232,7 +233,7 @@ struct Model {
 }
 
 /// One lens, shared by images.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 struct Camera {
     pub model: &'static LensModel,
     pub width: u64,
@@ -263,33 +264,94 @@ impl From<[f64; 7]> for Rigid {
     }
 }
 
+/// What COLMAP has found: a binary model in a folder.
+#[derive(Clone, Debug)]
+pub(super) struct Found {
+    /// Registered photographs.
+    pub names: HashSet<String>,
+    /// Mean reprojection error of the points, pixels.
+    pub error_px: f64,
+    /// How many points a photograph shows, on average.
+    pub sightings: usize,
+    cameras: HashMap<u32, Camera>,
+}
+
+impl Found {
+    /// Reads the model in a folder.
+    pub fn read(folder: &Path, limits: &io::Limits) -> Result<Found> {
+        let file = |kind: &str| -> Result<(PathBuf, Vec<u8>)> {
+            let path = folder.join(format!("{kind}.bin"));
+            let bytes = io::read_bytes(&path, limits)?;
+            Ok((path, bytes))
+        };
+        let (cameras, images) = (file("cameras")?, file("images")?);
+        let images = binary::read_images(&images, limits)?;
+        let points = binary::read_points(&file("points3D")?)?;
+        Ok(Found {
+            sightings: points.sightings / images.len().max(1),
+            names: images.into_iter().map(|image| image.name).collect(),
+            error_px: points.error_px / points.positions.len().max(1) as f64,
+            cameras: binary::read_cameras(&cameras)?,
+        })
+    }
+
+    /// Returns the camera that all photographs share, if they do: its longest side and its focal length, x and y of its
+    /// principal point relative to the center, in pixels.
+    pub fn shared_lens(&self) -> Option<(f64, [f64; 3])> {
+        let mut cameras = self.cameras.values();
+        let (camera, None) = (cameras.next()?, cameras.next()) else { return None };
+        let size = (u32::try_from(camera.width).ok()?, u32::try_from(camera.height).ok()?);
+        let lens = camera.model.intrinsics(size, &camera.values).ok()?;
+        let ([f, _], [cx, cy]) = (lens.focal, lens.center);
+        let [w, h] = [size.0, size.1].map(f64::from);
+        Some((w.max(h), [f?, cx? - 0.5 * w, cy? - 0.5 * h]))
+    }
+
+    /// Returns the cameras file with the lens as OPENCV's model, which has two focal lengths and tangential distortion.
+    pub fn as_opencv(&self) -> Option<Vec<u8>> {
+        let model = LensModel::named("OPENCV").ok()?;
+        let widened = |(&id, camera): (&u32, &Camera)| -> Option<(u32, Camera)> {
+            let [f, cx, cy, k1] = camera.values[..] else { return None };
+            Some((id, Camera { model, values: vec![f, f, cx, cy, k1, 0.0, 0.0, 0.0], ..camera.clone() }))
+        };
+        Some(camera_bytes(&self.cameras.iter().map(widened).collect::<Option<Vec<_>>>()?))
+    }
+}
+
+/// Returns a binary cameras file of numbered cameras.
+fn camera_bytes(cameras: &[(u32, Camera)]) -> Vec<u8> {
+    let mut bytes = (cameras.len() as u64).to_le_bytes().to_vec();
+    for (id, Camera { model, width, height, values }) in cameras {
+        bytes.extend(id.to_le_bytes());
+        bytes.extend(model.id.to_le_bytes());
+        bytes.extend([*width, *height].iter().flat_map(|side| side.to_le_bytes()));
+        bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    }
+    bytes
+}
+
 /// Returns the files of a model as (name, bytes), or which lens COLMAP has no model for.
 pub(super) fn files(images: &[(String, &geom::Camera)]) -> Result<[(&'static str, Vec<u8>); 3], String> {
-    let mut lenses: Vec<(i32, u64, u64, Vec<f64>)> = Vec::new();
+    let mut lenses: Vec<(u32, Camera)> = Vec::new();
     let mut listed = (images.len() as u64).to_le_bytes().to_vec();
     for (i, (name, camera)) in images.iter().enumerate() {
         let (model, values) =
             LensModel::of(camera).ok_or_else(|| format!("no model of COLMAP's has the lens of `{name}`"))?;
-        let lens = (model.id, camera.width.into(), camera.height.into(), values);
-        let number = lenses.iter().position(|known| *known == lens).unwrap_or(lenses.len());
-        if number == lenses.len() {
-            lenses.push(lens);
+        let lens = Camera { model, width: camera.width.into(), height: camera.height.into(), values };
+        let known = lenses.iter().find(|(_, known)| *known == lens).map(|(id, _)| *id);
+        let number = known.unwrap_or(lenses.len() as u32 + 1);
+        if known.is_none() {
+            lenses.push((number, lens));
         }
         let (quaternion, t) = pose_of(camera.rotation, camera.position);
         listed.extend((i as u32 + 1).to_le_bytes());
         quaternion.iter().chain(&t.to_array()).for_each(|v| listed.extend(v.to_le_bytes()));
-        listed.extend((number as u32 + 1).to_le_bytes());
+        listed.extend(number.to_le_bytes());
         listed.extend(name.as_bytes());
         listed.push(0);
         listed.extend(0u64.to_le_bytes()); // no points are seen
     }
-    let mut cameras = (lenses.len() as u64).to_le_bytes().to_vec();
-    for (i, (model, width, height, values)) in lenses.iter().enumerate() {
-        cameras.extend((i as u32 + 1).to_le_bytes());
-        cameras.extend(model.to_le_bytes());
-        cameras.extend([*width, *height].iter().flat_map(|side| side.to_le_bytes()));
-        cameras.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-    }
+    let cameras = camera_bytes(&lenses);
     let none = 0u64.to_le_bytes().to_vec();
     Ok([("points3D.bin", none), ("images.bin", listed), ("cameras.bin", cameras)])
 }

@@ -109,13 +109,7 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
         return Err(Error::cannot(message, "name a new folder: nothing is overwritten"));
     }
     let mut out = Conversion { folder: folder.into(), views: capture.views.len(), ..Conversion::default() };
-    let places: Vec<ViewFiles> = capture.views.iter().map(|v| place(v, to)).collect();
-    let mut names: Vec<&str> = places.iter().map(|p| p.photo.as_str()).collect();
-    names.sort_unstable();
-    if let Some(twice) = names.windows(2).find(|n| n[0] == n[1]) {
-        let message = format!("two photographs would both be called `{}`", twice[0]);
-        return Err(Error::cannot(message, "rename one of them, or convert to another format"));
-    }
+    let places = places(capture, to)?;
     // readers hold out every 8th in the order of the new names, with their endings or without
     let splits: Vec<Split> = capture.views.iter().map(|v| v.split).collect();
     let named_splits = every_eighth(places.iter().map(|p| p.name.as_str())) != splits
@@ -133,6 +127,36 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
         CameraFormat::Transforms => transforms(capture, &places, named_splits)?,
         CameraFormat::Colmap => sparse(capture, &places, named_splits, &mut out.warnings)?,
     };
+    out.masks = copy_pictures(capture, &places, folder)?;
+    // the camera files come last, so that a folder with camera files is complete
+    let write = |(name, bytes): (String, Vec<u8>)| Content::Bytes(bytes).write(&folder.join(name));
+    files.into_iter().try_for_each(write)?;
+    Ok(out)
+}
+
+/// Copies photographs and masks as COLMAP names them, and returns the photographs' names below `images/`, in the order of
+/// the views.
+pub(super) fn copy_for_colmap(capture: &Capture, folder: &Path) -> Result<Vec<String>> {
+    let places = places(capture, CameraFormat::Colmap)?;
+    copy_pictures(capture, &places, folder)?;
+    Ok(places.into_iter().map(|place| place.name).collect())
+}
+
+/// Returns where the pictures of each view go.
+fn places(capture: &Capture, to: CameraFormat) -> Result<Vec<ViewFiles<'_>>> {
+    let places: Vec<ViewFiles> = capture.views.iter().map(|v| place(v, to)).collect();
+    let mut names: Vec<&str> = places.iter().map(|p| p.photo.as_str()).collect();
+    names.sort_unstable();
+    if let Some(twice) = names.windows(2).find(|n| n[0] == n[1]) {
+        let message = format!("two photographs would both be called `{}`", twice[0]);
+        return Err(Error::cannot(message, "rename one of them, or convert to another format"));
+    }
+    Ok(places)
+}
+
+/// Copies photographs, masks and regions; returns the number of head masks.
+fn copy_pictures(capture: &Capture, places: &[ViewFiles], folder: &Path) -> Result<usize> {
+    let mut masks = 0;
     let mut contents: Vec<(PathBuf, Content)> = Vec::new();
     // a link may point to anything: only pictures are copied
     capture.views.par_iter().try_for_each(|view| {
@@ -145,13 +169,13 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
         }
         .map_err(Error::from)
     })?;
-    for place in &places {
+    for place in places {
         let mut put = |name: &str, content| contents.push((folder.join(name), content));
         put(&place.photo, Content::File(&place.view.photo));
         if let (ViewMask::File(from), Some(name)) = (&place.view.mask, &place.mask) {
             let is_png = from.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
             put(name, if is_png { Content::File(from) } else { Content::Mask(from, place.view.photo_size) });
-            out.masks += 1;
+            masks += 1;
         }
         for (from, name) in [(&place.view.valid, &place.valid), (&place.view.region, &place.region)] {
             if let (Some(from), Some(name)) = (from, name) {
@@ -159,9 +183,8 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
             }
         }
     }
-    contents.extend(files.into_iter().map(|(name, bytes)| (folder.join(name), Content::Bytes(bytes))));
     contents.iter().try_for_each(|(target, content)| content.write(target))?;
-    Ok(out)
+    Ok(masks)
 }
 
 fn place(view: &View, to: CameraFormat) -> ViewFiles<'_> {

@@ -126,7 +126,8 @@ const OTHER_PROGRAMS: &[(&str, &[&str], &[&str], &str)] = &[
     ("a FaceScape tuple", &["params.json"], &[],
         "{BY_HAND}; it holds `I_K`, `I_Rt` (world to camera), `I_distortion` and `I_valid` of photograph I.jpg: leave \
          out what is not valid"),
-    ("a Polycam raw export", &["keyframes"], &[], "{polycam}"),
+    ("a Polycam raw export", &["keyframes"], &[],
+        "nerfstudio converts it: `ns-process-data polycam --data {root} --output-dir NEW`, then `tiface inspect NEW`"),
     ("a Metashape project", &[], &["psx", "psz"],
         "export its cameras as XML into this folder: File, Export, Export Cameras"),
     ("a RealityCapture project", &[], &["rcproj", "rsproj"],
@@ -148,13 +149,6 @@ const OTHER_PROGRAMS: &[(&str, &[&str], &[&str], &str)] = &[
         "its cameras and images files are missing: run `colmap mapper`, or copy `cameras.bin` and `images.bin` (or \
          `.txt`) into `sparse/0`"),
 ];
-
-/// Returns advice to convert data with nerfstudio.
-fn nerfstudio(kind: &str, data: impl Display) -> String {
-    format!(
-        "nerfstudio converts it: `ns-process-data {kind} --data {data} --output-dir NEW`, then `tiface inspect NEW`"
-    )
-}
 
 /// Returns whether a folder is a run: it has a run's configuration, and either a stage was begun in it or nothing else in it
 /// is a capture's, be it one that cannot be read (photographs without cameras, a project of another program).
@@ -245,7 +239,10 @@ pub(super) fn explain_file(file: &Path) -> Error {
 }
 
 fn from_video(file: &Path) -> String {
-    nerfstudio("video", file.display()) + " (it needs COLMAP; a head must hold still while the camera moves)"
+    format!(
+        "find the cameras of its frames with COLMAP: `tiface cameras --video {}`; the head must hold still in it",
+        file.display()
+    )
 }
 
 /// Returns a subfolder that is a capture, with its first camera file.
@@ -264,15 +261,14 @@ fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
         if let Some(file) = file {
             let root = found.root.display().to_string();
             let values = [("{BY_HAND}", BY_HAND), ("{TO_COLMAP}", TO_COLMAP), ("{root}", &root)];
-            let way =
-                way.replace("{polycam}", &nerfstudio("polycam", &root)).replace("{file}", &found.at(file));
+            let way = way.replace("{file}", &found.at(file));
             let way = values.iter().fold(way, |way, (key, value)| way.replace(key, value));
             return Some((what, file.into(), way));
         }
     }
     if let Some(folder) = photographs {
         let first = FolderEntries::of(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();
-        let way = nerfstudio("images", folder.display()) + " (it needs COLMAP)";
+        let way = format!("find them with COLMAP: `tiface cameras {}`", found.root.display());
         return Some(("photographs without cameras", first, way));
     }
     let video = found.ending(&VIDEOS)?;

@@ -27,6 +27,8 @@ pub struct PictureInfo {
     pub alpha: bool,
     /// EXIF orientation, 1 (upright) to 8.
     pub exif: u8,
+    /// EXIF focal length as stored, a fraction of millimetres.
+    pub focal: Option<(u32, u32)>,
 }
 
 impl PictureInfo {
@@ -45,7 +47,28 @@ fn is_turned(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> bool
     (5..=8).contains(&exif) && expected == Some(turned) && stored != turned
 }
 
-/// Returns the size, alpha and orientation of a PNG or JPEG file, from its header only.
+/// Returns the focal length in EXIF data, whose layout is that of a TIFF file (EXIF 2.3, 4.6).
+fn focal_length(exif: &[u8]) -> Option<(u32, u32)> {
+    let little = exif.starts_with(b"II");
+    let bytes = |at: usize, n: usize| exif.get(at..at.checked_add(n)?);
+    let number = |at: usize, n: usize| -> Option<u32> {
+        let digit = |sum: u32, byte: &u8| sum << 8 | u32::from(*byte);
+        let bytes = bytes(at, n)?;
+        Some(if little { bytes.iter().rev().fold(0, digit) } else { bytes.iter().fold(0, digit) })
+    };
+    // an entry: tag, type, count, value or where it is
+    let value = |directory: usize, tag: u32| -> Option<u32> {
+        let entries = (0..number(directory, 2)? as usize).map(|k| directory + 2 + 12 * k);
+        let mut found =
+            entries.take_while(|&at| bytes(at, 12).is_some()).filter(|&at| number(at, 2) == Some(tag));
+        number(found.next()? + 8, 4)
+    };
+    let camera = value(number(4, 4)? as usize, 0x8769)?;
+    let at = value(camera as usize, 0x920a)? as usize;
+    Some((number(at, 4)?, number(at.checked_add(4)?, 4)?)).filter(|(above, below)| *above > 0 && *below > 0)
+}
+
+/// Returns the size, alpha, orientation and focal length of a PNG or JPEG file, from its header only.
 pub fn picture_info(path: &Path, limits: &Limits) -> Result<PictureInfo, ReadError> {
     let (file, length) = open(path)?;
     if length == 0 {
@@ -131,7 +154,8 @@ impl<'a> PictureFile<'a> {
         let (width, height) = decoder.dimensions();
         let exif = decoder.orientation().map_or(1, Orientation::to_exif);
         let alpha = decoder.color_type().has_alpha();
-        Ok((decoder, PictureInfo { width, height, alpha, exif }))
+        let focal = decoder.exif_metadata().ok().flatten().and_then(|chunk| focal_length(&chunk));
+        Ok((decoder, PictureInfo { width, height, alpha, exif, focal }))
     }
 
     fn jpeg_decoder(self) -> Result<(Jpeg<'a>, PictureInfo), ReadError> {
@@ -158,7 +182,8 @@ impl<'a> PictureFile<'a> {
         decoder.set_options(options.jpeg_set_out_colorspace(out));
         let turn = decoder.exif().and_then(|chunk| Orientation::from_exif_chunk(chunk));
         let exif = turn.map_or(1, Orientation::to_exif);
-        Ok((decoder, PictureInfo { width, height, alpha: false, exif }))
+        let focal = decoder.exif().and_then(|chunk| focal_length(chunk));
+        Ok((decoder, PictureInfo { width, height, alpha: false, exif, focal }))
     }
 
     /// Walks the chunks of a PNG to `IEND` and returns the bytes of picture data.
@@ -426,6 +451,24 @@ mod tests {
             (1, (40, 30), Some((40, 30))),
         ] {
             assert!(!is_turned(exif, stored, expected), "{exif} {expected:?}");
+        }
+    }
+
+    #[test]
+    fn a_focal_length_is_read_in_both_byte_orders_and_from_no_cut_exif() {
+        for little in [true, false] {
+            let u16s = |v: u16| if little { v.to_le_bytes() } else { v.to_be_bytes() };
+            let u32s = |v: u32| if little { v.to_le_bytes() } else { v.to_be_bytes() };
+            let mut exif = if little { b"II*\0".to_vec() } else { b"MM\0*".to_vec() };
+            exif.extend(u32s(8));
+            // directories at 8 and 26, of one entry each; the fraction at 44
+            for (tag, kind, value) in [(0x8769, 4, 26), (0x920a, 5, 44)] {
+                exif.extend([u16s(1), u16s(tag), u16s(kind)].as_flattened());
+                exif.extend([u32s(1), u32s(value), u32s(0)].as_flattened());
+            }
+            exif.extend([u32s(85), u32s(10)].as_flattened());
+            assert_eq!(focal_length(&exif), Some((85, 10)), "8.5 mm");
+            assert!((0..exif.len()).all(|n| focal_length(&exif[..n]).is_none()));
         }
     }
 

@@ -100,12 +100,11 @@ def colmap(body, environment):
     if not photographs.is_dir():
         return "there are no photographs of something real"
     with tempfile.TemporaryDirectory() as folder:
-        images = Path(folder) / "head/images"
+        images = Path(folder) / "photographs"
         images.mkdir(parents=True)
         for i, photograph in enumerate(sorted(photographs.iterdir())):
             if i < 12:
                 shutil.copy(photograph, images)
-        environment = {**environment, "QT_QPA_PLATFORM": "offscreen"}
         done = subprocess.run(["bash", "-e", "-c", body], cwd=folder, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
         found = subprocess.run(["tiface", "inspect", "head"], cwd=folder, env=environment, capture_output=True, text=True)

@@ -24,7 +24,7 @@ pub(super) fn read(
 ) -> Result<Model> {
     let mut model = Model { cameras: read_cameras(cameras)?, ..Model::default() };
     model.images = read_images(images, limits)?;
-    model.points = points.map(read_points).transpose()?;
+    model.points = points.map(|points| Ok::<_, ReadError>(read_points(points)?.positions)).transpose()?;
     Ok(model)
 }
 
@@ -116,7 +116,7 @@ impl<'b> Cursor<'b> {
     }
 }
 
-fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, ReadError> {
+pub(super) fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, ReadError> {
     let mut c = Cursor::of(source);
     // number, model, width, height and three parameters at least
     let n = c.counted(4 + 4 + 16 + 3 * 8, "cameras")?;
@@ -136,7 +136,7 @@ fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, ReadError> {
     Ok(cameras)
 }
 
-fn read_images(source: &Source, limits: &Limits) -> Result<Vec<Image>, ReadError> {
+pub(super) fn read_images(source: &Source, limits: &Limits) -> Result<Vec<Image>, ReadError> {
     let mut c = Cursor::of(source);
     // number, pose, camera, an empty name, no points
     let n = c.counted(4 + 56 + 4 + 1 + 8, "images")?;
@@ -152,17 +152,29 @@ fn read_images(source: &Source, limits: &Limits) -> Result<Vec<Image>, ReadError
     Ok(images)
 }
 
-fn read_points(source: &Source) -> Result<Vec<DVec3>, ReadError> {
+/// The points of a model.
+#[derive(Debug, Default)]
+pub(super) struct Points {
+    pub positions: Vec<DVec3>,
+    /// Sum of their mean reprojection errors, pixels.
+    pub error_px: f64,
+    /// How often they are seen, in all.
+    pub sightings: usize,
+}
+
+pub(super) fn read_points(source: &Source) -> Result<Points, ReadError> {
     let mut c = Cursor::of(source);
     // number, position, color, error, no track
     let n = c.counted(8 + 24 + 3 + 8 + 8, "points")?;
-    let mut points = Vec::with_capacity(n);
+    let mut points = Points { positions: Vec::with_capacity(n), ..Points::default() };
     for _ in 0..n {
         c.u64()?;
-        points.push(DVec3::new(c.f64()?, c.f64()?, c.f64()?));
-        c.take::<11>()?;
+        points.positions.push(DVec3::new(c.f64()?, c.f64()?, c.f64()?));
+        c.take::<3>()?;
+        points.error_px += c.f64()?;
         let track = c.counted(8, "observations of a point")?;
         c.skip(track, 8);
+        points.sightings += track;
     }
     c.end()?;
     Ok(points)

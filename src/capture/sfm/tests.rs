@@ -1,0 +1,101 @@
+use super::*;
+
+fn photo(width: u32, height: u32, value: impl Fn(u32, u32) -> u8) -> Photo {
+    let rgb = (0..width * height).map(|i| [value(i % width, i / width); 3]).collect();
+    Photo { width, height, rgb, alpha: None }
+}
+
+#[test]
+fn sharpness_is_the_mean_squared_step_along_rows_and_columns() {
+    // 0 10   along rows 10² and 0², along columns 0² and 10²: 200 for four pixels
+    // 0  0
+    assert_eq!(sharpness(&photo(2, 2, |x, y| if (x, y) == (1, 0) { 10 } else { 0 })), 50.0);
+    assert_eq!(sharpness(&photo(3, 1, |_, _| 7)), 0.0);
+}
+
+#[test]
+fn the_sharpest_of_each_window_is_kept_the_first_of_equal_ones_and_one_of_the_rest() {
+    let steps = [3, 9, 1, /* */ 5, 5, 2, /* */ 0, 4];
+    let frames = || steps.iter().map(|&step| Ok(photo(2, 1, move |x, _| if x == 0 { 0 } else { step })));
+    let kept = |every: usize| {
+        let mut kept = Vec::new();
+        sharpest(frames(), every, |number, frame| {
+            kept.push((number, frame.rgb[1][0]));
+            Ok(())
+        })
+        .unwrap();
+        kept
+    };
+    assert_eq!(kept(3), [(1, 9), (3, 5), (7, 4)]);
+    assert_eq!(kept(1).len(), 8);
+    assert_eq!(kept(100), [(1, 9)]);
+    let cut = frames().take(2).chain([Err(Error::cannot("cut", ""))]);
+    assert_eq!(sharpest(cut, 1, |_, _| Ok(())).unwrap_err().to_string(), "cut");
+}
+
+/// Returns the arguments of the three commands, as typed.
+fn typed(n: usize, is_video: bool, shared: bool, glomap: bool, attempt: Attempt, new: bool) -> [String; 3] {
+    let sfm = SfmOptions {
+        out: "new".into(),
+        lens_each: false,
+        glomap,
+        limits: Limits::default(),
+        say: &|_| (),
+        stop: &|| false,
+    };
+    let programs = Programs { colmap: "colmap".into(), glomap: glomap.then(|| "glomap".into()) };
+    let names = vec![String::new(); n];
+    let work = Work { sfm: &sfm, programs, names, shared, masked: true, is_video };
+    work.arguments(attempt, Path::new("w"), new)
+        .map(|words| words.iter().map(|w| w.to_str().unwrap()).collect::<Vec<_>>().join(" "))
+}
+
+#[test]
+fn commands_follow_the_photographs_the_attempt_and_the_version() {
+    let threads = rayon::current_num_threads();
+    let plain = Attempt { masked: false, weak: false };
+    let [extractor, matcher, mapper] = typed(9, false, true, false, plain, false);
+    assert_eq!(
+        extractor,
+        format!(
+            "feature_extractor --database_path w/database.db --image_path new/images --SiftExtraction.use_gpu 0 \
+             --SiftExtraction.num_threads {threads} --ImageReader.camera_model SIMPLE_RADIAL --ImageReader.single_camera 1"
+        )
+    );
+    assert_eq!(
+        matcher,
+        format!(
+            "exhaustive_matcher --database_path w/database.db --SiftMatching.use_gpu 0 --SiftMatching.num_threads {threads}"
+        )
+    );
+    assert_eq!(
+        mapper,
+        format!(
+            "mapper --database_path w/database.db --image_path new/images --output_path w/models --Mapper.num_threads \
+             {threads}"
+        )
+    );
+
+    let weak = Attempt { masked: true, weak: true };
+    let [extractor, matcher, mapper] = typed(9, false, false, true, weak, true);
+    for option in [
+        "--ImageReader.mask_path new/colmap/masks",
+        "--FeatureExtraction.use_gpu 0",
+        "--SiftExtraction.peak_threshold 0.002",
+    ] {
+        assert!(extractor.contains(option), "{extractor}");
+    }
+    assert!(!extractor.contains("single_camera"), "{extractor}");
+    assert!(
+        matcher.contains("--FeatureMatching.guided_matching 1") && !matcher.contains("Sift"),
+        "{matcher}"
+    );
+    assert!(mapper.ends_with("--output_path w/models"), "{mapper}");
+
+    // only a long video is matched in its order
+    let matcher = |n, is_video| typed(n, is_video, true, false, plain, false)[1].clone();
+    assert!(matcher(MAX_EXHAUSTIVE + 1, true).starts_with("sequential_matcher "));
+    for (n, is_video) in [(MAX_EXHAUSTIVE, true), (MAX_EXHAUSTIVE + 1, false)] {
+        assert!(matcher(n, is_video).starts_with("exhaustive_matcher "), "{n}");
+    }
+}
