@@ -294,6 +294,13 @@ fn judgement(metrics: &Value) -> Vec<String> {
             if let Some(own) = metrics[set]["own_exposure"]["mean"]["psnr_masked"].as_f64() {
                 lines.push(format!("  with each photograph's own exposure divided out: PSNR {own:.2} dB"));
             }
+            if let Some(own) = metrics[set]["own_pose"]["mean"]["psnr_masked"].as_f64() {
+                let exposure = metrics[set]["own_exposure"].is_object();
+                let exposure = if exposure { ", its exposure divided out" } else { "" };
+                lines.push(format!(
+                    "  from the pose fitted to each photograph alone{exposure}: PSNR {own:.2} dB"
+                ));
+            }
             lines.extend(in_parts(&metrics[set]["parts"]["mean"]));
         }
     }

@@ -162,6 +162,7 @@ impl RigCheck {
             if check.refines() {
                 dir.warn(&format!("{}: refined", check.sentence()));
             }
+            check.not_fitted().iter().for_each(|text| dir.warn(text));
             check.write(dir.folder())?;
         }
         if let Some(check) = &self.exposure {
