@@ -23,7 +23,6 @@ pub use tracks::RigView;
 
 use crate::geom::{Camera, Mesh};
 use adjust::{Track, adjust, gauge, median, project, resected};
-use gate::{LOST_PX, LOST_SHARE};
 use glam::DVec3;
 
 /// Points spread over the surface. A third of them is found on skin with stubble and pores.
@@ -43,6 +42,10 @@ const FIRST_SCALE: f64 = 1.0;
 
 /// Least residual of half weight, pixels.
 const LEAST_SCALE: f64 = 0.1;
+
+/// Largest residual of a camera fitted alone, pixels. Points that stay have errors of their own, of up to 1.2; those found by
+/// chance lie anywhere within the reach of the search, some ten pixels.
+const MOST_ALONE_PX: f64 = 3.0;
 
 /// What was measured of a rig.
 #[derive(Clone, Debug)]
@@ -86,7 +89,7 @@ impl Rig {
             camera = resected(given, &camera, &found, residual(&camera).max(LEAST_SCALE));
         }
         let (sightings, fitted_px) = (found.len(), residual(&camera));
-        let fits = sightings >= LEAST_SIGHTINGS && fitted_px <= LOST_PX.max(LOST_SHARE * self.adjusted_px);
+        let fits = sightings >= LEAST_SIGHTINGS && fitted_px <= MOST_ALONE_PX;
         let moved_px = distance_px(given, &camera, &sampled(&self.tracks));
         LoneFit { sightings, given_px: residual(given), fitted_px, moved_px, camera: fits.then_some(camera) }
     }

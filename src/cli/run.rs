@@ -239,8 +239,9 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
     let mut row = |name: &str, value: &dyn std::fmt::Display| text += &format!("{name:<9} {value}\n");
-    if let Some(height) = of(Stage::Mask).and_then(|mask| mask["height_m"].as_f64()) {
-        row("head", &format!("{height:.3} m high"));
+    let height = |key: &str| of(Stage::Mask)?[key].as_f64();
+    if let (Some(units), Some(metres)) = (height("height_units"), height("height_m")) {
+        row("head", &format!("{units:.3} units high: {metres:.3} m"));
     }
     if let Some(mesh) = of(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };

@@ -18,10 +18,10 @@ const LEAST_TRACKS: usize = 100;
 const FARTHEST_PX: f64 = 10.0;
 
 /// Patches of a photograph fit somewhere by chance: its camera is lost if its residual stays above so many pixels …
-pub(super) const LOST_PX: f64 = 1.0;
+const LOST_PX: f64 = 1.0;
 
 /// … and above this many times that of all.
-pub(super) const LOST_SHARE: f64 = 4.0;
+const LOST_SHARE: f64 = 4.0;
 
 /// All cameras are refined if the residual falls below this share of what it is with the poses given.
 const GAIN: f64 = 0.8;
