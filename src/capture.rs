@@ -51,7 +51,7 @@ use crate::{Error, Result};
 use folder::{CaptureFolder, in_frame, no_views};
 use format::CameraFiles;
 use frame::{CameraFrame, Listing};
-use glam::{DVec3, Vec3};
+use glam::{DMat3, DVec3, Vec3};
 use masks::few;
 use rayon::prelude::*;
 use std::collections::HashMap;
@@ -280,15 +280,52 @@ fn every_eighth<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Split> {
     splits
 }
 
-/// Up in the world: as the dataset says, else the mean of the cameras' ups.
+/// Up in the world: as the dataset says, else as the cameras stand.
 fn up(views: &[View], named: Option<DVec3>) -> Vec3 {
     if let Some(up) = named {
         return up.normalize().as_vec3();
     }
-    let mean: DVec3 = views.iter().map(|v| v.camera.rotation.y_axis).sum();
-    // cameras whose ups cancel say nothing; +Y is what most formats mean
-    let mean = mean.try_normalize().unwrap_or(DVec3::Y);
+    let up = upward(views.iter().map(|v| v.camera.rotation));
     let axes = [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|a| [a, -a]);
-    let near = axes.into_iter().find(|a| a.dot(mean) > 20f64.to_radians().cos());
-    near.unwrap_or(mean).as_vec3()
+    let near = axes.into_iter().find(|a| a.dot(up) > 20f64.to_radians().cos());
+    near.unwrap_or(up).as_vec3()
+}
+
+/// Returns the direction perpendicular to the right axes of cameras: those of a level camera are horizontal, however much it
+/// looks down. Where all look the same way, it is the mean of their ups, which is tilted by how much they look down.
+fn upward(cameras: impl Iterator<Item = DMat3> + Clone) -> DVec3 {
+    /// Weight of the mean.
+    const MEAN: f64 = 0.01;
+    let mean: DVec3 = cameras.clone().map(|c| c.y_axis).sum();
+    let n = cameras.clone().count() as f64;
+    // cameras whose ups cancel say nothing; +Y is what most formats mean
+    let Some(mean) = mean.try_normalize().filter(|_| mean.length() > 1e-6 * n) else { return DVec3::Y };
+    let square =
+        |c: DMat3| DMat3::from_cols(c.x_axis * c.x_axis.x, c.x_axis * c.x_axis.y, c.x_axis * c.x_axis.z);
+    let spread = cameras.map(square).fold(MEAN * n * DMat3::IDENTITY, |sum, s| sum + s);
+    (spread.inverse() * mean).normalize()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn up_is_found_in_any_world_although_cameras_in_front_look_down() {
+        let world = DMat3::from_rotation_x(0.7) * DMat3::from_rotation_z(-0.5);
+        let looking_down = |azimuth: f64| {
+            world * DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-25f64.to_radians())
+        };
+        let off =
+            |cameras: &[DMat3]| upward(cameras.iter().copied()).angle_between(world * DVec3::Y).to_degrees();
+        let ring: Vec<DMat3> = (-8..=8).map(|i| looking_down(0.15 * f64::from(i))).collect();
+        assert!(off(&ring) < 1.0, "{}", off(&ring));
+        // the mean of their ups, where nothing else is known
+        assert!((off(&[looking_down(0.0); 3]) - 25.0).abs() < 1e-6);
+        // cameras that stand on their heads cancel the others
+        assert_eq!(
+            upward([DMat3::IDENTITY, DMat3::from_rotation_z(std::f64::consts::PI)].into_iter()),
+            DVec3::Y
+        );
+    }
 }

@@ -253,6 +253,9 @@ background twice. The masks of the other views follow from the cameras.")]
         /// Coordinate frame: dataset, or head (+Y up, face towards +Z)
         #[arg(long, value_name = "FRAME")]
         frame: Option<String>,
+        /// Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it
+        #[arg(long, value_name = "METRES")]
+        height: Option<String>,
         /// Number of triangles after simplification; 0 keeps all
         #[arg(long, value_name = "N")]
         triangles: Option<String>,
@@ -505,6 +508,7 @@ impl Command {
                 input,
                 format,
                 frame,
+                height,
                 triangles,
                 texture,
                 lobes,
@@ -516,6 +520,7 @@ impl Command {
                 let keys = key_options([
                     ("--format", "mesh.format", format.as_deref()),
                     ("--frame", "mesh.frame", frame.as_deref()),
+                    ("--height", "mesh.height_m", height.as_deref()),
                     ("--triangles", "mesh.triangles", triangles.as_deref()),
                     ("--texture", "mesh.texture_px", texture.as_deref()),
                     ("--lobes", "mesh.lobes", lobes.as_deref()),

@@ -93,9 +93,11 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
         Stage::Render => {
             let (scene, c) = (session.scene()?, session.render_config());
             let cameras = render::cameras(session.refined_capture()?, session.path.as_ref(), &scene)?;
+            let check = session.camera_check()?.filter(|_| session.path.is_none());
+            let fitted = check.map_or(Vec::new(), |check| check.fitted(&cameras));
             let meshes = Meshes::load(run, config, &c.method)?;
             let renderer = Renderer::new(&scene, fields, &meshes, c.samples, dir.monitor());
-            render::render(c, &renderer, &cameras, &scene, config.capture.unit_m, dir)
+            render::render(c, &renderer, &cameras, &fitted, &scene, config.capture.unit_m, dir)
         }
         Stage::Ensemble => {
             ensemble::ensemble(session.refined_capture()?, config, run, &session.scene()?, fields, dir)

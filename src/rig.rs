@@ -7,7 +7,8 @@
 //! was like.
 //!
 //! Exact cameras gain an error this way, since shading that moves with the view moves patches a little. `gate` therefore
-//! decides from the residuals which cameras are refined: none, those that stand out, or all.
+//! decides from the residuals which cameras are refined: none, those that stand out, or all. Held-out cameras take no part;
+//! each can then be fitted alone to the points, which stay.
 //!
 //! Everything is in scene coordinates and in pixels of the pictures searched, and a function of its arguments alone,
 //! whatever the threads.
@@ -21,7 +22,7 @@ pub use gate::{CameraFit, CameraState, LEAST_SIGHTINGS, Verdict};
 pub use tracks::RigView;
 
 use crate::geom::{Camera, Mesh};
-use adjust::{Track, adjust, gauge, median, project};
+use adjust::{Track, adjust, gauge, median, project, resected};
 use glam::DVec3;
 
 /// Points spread over the surface. A third of them is found on skin with stubble and pores.
@@ -42,6 +43,10 @@ const FIRST_SCALE: f64 = 1.0;
 /// Least residual of half weight, pixels.
 const LEAST_SCALE: f64 = 0.1;
 
+/// Largest residual of a camera fitted alone, pixels. Points that stay have errors of their own, of up to 1.2; those found by
+/// chance lie anywhere within the reach of the search, some ten pixels.
+const MOST_ALONE_PX: f64 = 3.0;
+
 /// What was measured of a rig.
 #[derive(Clone, Debug)]
 pub struct Rig {
@@ -53,6 +58,41 @@ pub struct Rig {
     pub given_px: f64,
     /// The same after the adjustment of all cameras.
     pub adjusted_px: f64,
+    /// The points found, in the world of the cameras with the poses to use.
+    tracks: Vec<Track>,
+}
+
+/// A camera that took no part in the measurement of its rig, fitted alone to the points that the rig found.
+#[derive(Clone, Debug)]
+pub struct LoneFit {
+    /// How many of the points were found in its photograph.
+    pub sightings: usize,
+    /// Median distance of these from the projections of the points with the pose given, pixels.
+    pub given_px: f64,
+    /// The same with the pose fitted.
+    pub fitted_px: f64,
+    /// How far the head moves in its picture from the pose given to the fitted one, pixels (root mean square).
+    pub moved_px: f64,
+    /// The camera with the pose fitted; `None` where too few points were found, or fit no pose.
+    pub camera: Option<Camera>,
+}
+
+impl Rig {
+    /// Fits a camera that took no part to the points, which stay. `views` are the photographs that were measured.
+    pub fn fit_alone(&self, views: &[RigView], photo: &RigView, given: &Camera) -> LoneFit {
+        let cameras: Vec<Camera> = self.cameras.iter().map(|fit| fit.camera.clone()).collect();
+        let found = tracks::find_in((photo, given), views, &cameras, &self.tracks);
+        let residual =
+            |camera: &Camera| median(&mut residuals(std::slice::from_ref(camera), &found).concat());
+        let mut camera = resected(given, given, &found, FIRST_SCALE);
+        for _ in 0..2 {
+            camera = resected(given, &camera, &found, residual(&camera).max(LEAST_SCALE));
+        }
+        let (sightings, fitted_px) = (found.len(), residual(&camera));
+        let fits = sightings >= LEAST_SIGHTINGS && fitted_px <= MOST_ALONE_PX;
+        let moved_px = distance_px(given, &camera, &sampled(&self.tracks));
+        LoneFit { sightings, given_px: residual(given), fitted_px, moved_px, camera: fits.then_some(camera) }
+    }
 }
 
 /// Measures how well cameras fit each other. `surface` is any rough surface of the head with normals; `views` and `given`

@@ -226,12 +226,9 @@ fn a_head_of_six_metres_is_doubted() {
     let dir = tempfile::tempdir().unwrap();
     head(dir.path());
     let (text, _) = inspected(dir.path(), &[]);
-    assert!(text.contains(" m high\n") && !text.contains("unit_m"), "{text}");
+    assert!(text.contains(" units high: 0.") && !text.contains("unit_m"), "{text}");
     let (text, sound) = inspected(dir.path(), &["capture.unit_m=20"]);
-    assert!(
-        sound && text.contains("warning   the head is 7.") && text.contains("capture.unit_m=METRES"),
-        "{text}"
-    );
+    assert!(sound && text.contains(" units high: 7.") && text.contains("capture.unit_m=METRES"), "{text}");
 }
 
 #[test]

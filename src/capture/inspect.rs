@@ -130,8 +130,8 @@ pub struct Inspection {
     pub regions: usize,
     /// How well two pose files agree.
     pub poses: Vec<Agreement>,
-    /// How high the head is, metres, where masks say it.
-    pub height_m: Option<f64>,
+    /// How high the head is, in dataset units and in metres, where masks say it.
+    pub height: Option<[f64; 2]>,
     /// The head's box in the world.
     pub scene: Option<Aabb>,
     /// The same in words.
@@ -293,7 +293,7 @@ fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
             let distance = |c: DVec3| c.distance(middle);
             out.distance = Range::of(capture.views.iter().map(|v| distance(v.camera.position)));
             if let Some(height) = scene::height(&scene, capture.up) {
-                out.height_m = Some(height * capture.unit_m);
+                out.height = Some([height, height * capture.unit_m]);
                 out.warnings.extend(scene::doubtful_height(height, capture.unit_m));
             }
             out.scene_text = Some(scene::describe(&scene));
@@ -351,8 +351,8 @@ impl fmt::Display for Inspection {
         if let Some(text) = &self.scene_text {
             writeln!(f, "  head      {text}")?;
         }
-        if let Some(height) = self.height_m {
-            writeln!(f, "            {height:.3} m high")?;
+        if let Some([units, metres]) = self.height {
+            writeln!(f, "            {units:.3} units high: {metres:.3} m")?;
         }
         for warning in &self.warnings {
             writeln!(f, "  warning   {warning}")?;

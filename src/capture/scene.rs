@@ -408,8 +408,9 @@ pub fn doubtful_height(height: f64, unit_m: f64) -> Option<String> {
     let height_m = height * unit_m;
     (!HEIGHTS_M.contains(&height_m)).then(|| {
         format!(
-            "the head is {height_m:.3} m high if a unit of the dataset is {unit_m} m, and a head is {} to {} m high: give \
-             the unit's length in metres, `--set capture.unit_m=METRES` (with {:.3} this head is 0.3 m high)",
+            "the head is {height:.3} units high: {height_m:.3} m if a unit of the dataset is {unit_m} m, and a head is {} to \
+             {} m high. Give the unit's length in metres, `--set capture.unit_m=METRES` (with {:.3} this head is 0.3 m high), \
+             or the height that exported meshes should have, `--set mesh.height_m=METRES`",
             HEIGHTS_M.start(),
             HEIGHTS_M.end(),
             0.3 / height
@@ -700,7 +701,10 @@ mod tests {
         }
         assert_eq!((doubtful_height(0.8, 0.4), doubtful_height(0.8, 0.5)), (None, None));
         let text = doubtful_height(6.0, 1.0).unwrap();
-        assert!(text.contains("6.000 m high") && text.contains("with 0.050 this head is 0.3 m"), "{text}");
+        assert!(
+            text.contains("6.000 units high: 6.000 m") && text.contains("with 0.050 this head is 0.3 m"),
+            "{text}"
+        );
         assert!(doubtful_height(0.3, 0.001).is_some());
         let (bare, _) = fit(&cameras, &[const { None }; 12], &small()).unwrap();
         assert_eq!(super::height(&bare, Vec3::Z), None);

@@ -239,8 +239,9 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
     let mut row = |name: &str, value: &dyn std::fmt::Display| text += &format!("{name:<9} {value}\n");
-    if let Some(height) = of(Stage::Mask).and_then(|mask| mask["height_m"].as_f64()) {
-        row("head", &format!("{height:.3} m high"));
+    let height = |key: &str| of(Stage::Mask)?[key].as_f64();
+    if let (Some(units), Some(metres)) = (height("height_units"), height("height_m")) {
+        row("head", &format!("{units:.3} units high: {metres:.3} m"));
     }
     if let Some(mesh) = of(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
@@ -293,6 +294,13 @@ fn judgement(metrics: &Value) -> Vec<String> {
             ));
             if let Some(own) = metrics[set]["own_exposure"]["mean"]["psnr_masked"].as_f64() {
                 lines.push(format!("  with each photograph's own exposure divided out: PSNR {own:.2} dB"));
+            }
+            if let Some(own) = metrics[set]["own_pose"]["mean"]["psnr_masked"].as_f64() {
+                let exposure = metrics[set]["own_exposure"].is_object();
+                let exposure = if exposure { ", its exposure divided out" } else { "" };
+                lines.push(format!(
+                    "  from the pose fitted to each photograph alone{exposure}: PSNR {own:.2} dB"
+                ));
             }
             lines.extend(in_parts(&metrics[set]["parts"]["mean"]));
         }

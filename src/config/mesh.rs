@@ -112,6 +112,9 @@ table! {
         format: Vec<MeshFormat> => vec![MeshFormat::Glb];
         /// Coordinate frame of the files: dataset, or head (+Y up, face towards +Z, centered).
         frame: MeshFrame => MeshFrame::Dataset;
+        /// Height of the head mesh in GLB and OBJ files, metres, from the crown to the end of what is shown of the body; 0:
+        /// as `capture.unit_m` says.
+        height_m: f64, 0.0..=10.0 => 0.0;
     }
     constants {
         /// Evaluate the whole grid, and keep every surface found (published).

@@ -1,13 +1,16 @@
 //! How well the cameras of a capture fit each other, in words, and the refined poses that a run keeps.
 //!
 //! The measurement is [`crate::rig`]'s. It takes photographs of the training views and the hull of their masks; held-out
-//! views take no part. The stage `mask` makes it and writes `poses.json`, later stages read refined poses there.
+//! views take no part. The stage `mask` makes it and writes `poses.json`, later stages read refined poses there. Where poses
+//! are refined, each held-out view is then fitted alone: the evaluation shows it from both poses.
 
 use super::rig_photos::RigPhotos;
 use crate::capture::{Capture, Split, View};
 use crate::config::CameraPoses;
 use crate::geom::{Camera, Similarity};
+use crate::image::{Gray, Photo};
 use crate::io::{self, Limits, ReadError};
+use crate::render::path::NamedCamera;
 use crate::rig::{self, CameraState, LEAST_SIGHTINGS, RigView, Verdict};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
@@ -30,6 +33,25 @@ pub(super) struct CameraCheck {
     given_px: f64,
     adjusted_px: f64,
     cameras: Vec<CheckedCamera>,
+    /// Held-out views, if poses are refined.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    held_out: Vec<FittedView>,
+}
+
+/// A held-out view, fitted alone to the points of the training views.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct FittedView {
+    view: String,
+    sightings: usize,
+    /// Median distance of its sightings, pixels of its photograph.
+    given_px: f64,
+    fitted_px: f64,
+    /// How far the head moves in its picture from the pose given to the fitted one, pixels.
+    moved_px: f64,
+    given: Pose,
+    /// Missing where too few points were found, or fit no pose.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    fitted: Option<Pose>,
 }
 
 /// The measurement of one camera.
@@ -63,10 +85,11 @@ impl From<&Camera> for Pose {
     }
 }
 
-/// Measures how well the cameras of the training views fit each other.
+/// Measures how well the cameras of the training views fit each other. If any is refined, the held-out views are then fitted
+/// one by one.
 pub(super) fn check_cameras(photos: &RigPhotos, poses: CameraPoses) -> CameraCheck {
     let RigPhotos { views: captured, train, cameras: given, scene_from_world, .. } = photos;
-    let (captured, given) = (&captured[..*train], &given[..*train]);
+    let ((captured, held_out), (given, given_held_out)) = (captured.split_at(*train), given.split_at(*train));
     let views: Vec<RigView> =
         photos.pictures[..*train].par_iter().map(|(p, head)| RigView::new(p, head)).collect();
     let rig = rig::measure(&views, given, &photos.surface, poses == CameraPoses::Refine);
@@ -87,13 +110,33 @@ pub(super) fn check_cameras(photos: &RigPhotos, poses: CameraPoses) -> CameraChe
             refined,
         }
     };
+    let fitted = |((view, searched), (photo, head)): ((&&View, &Camera), &(Photo, Gray))| {
+        let fit = rig.fit_alone(&views, &RigView::new(photo, head), searched);
+        let pixels = f64::from(view.camera.width) / f64::from(searched.width);
+        FittedView {
+            view: view.name.clone(),
+            sightings: fit.sightings,
+            given_px: pixels * fit.given_px,
+            fitted_px: pixels * fit.fitted_px,
+            moved_px: pixels * fit.moved_px,
+            given: Pose::from(&view.camera),
+            fitted: fit.camera.map(|camera| Pose::from(&camera.transformed(&world_from_scene))),
+        }
+    };
+    let refines = rig.cameras.iter().any(|c| c.state == CameraState::Refined);
+    let held_out = held_out.iter().zip(given_held_out).zip(&photos.pictures[*train..]).filter(|_| refines);
     let pixels = f64::from(captured[0].camera.width) / f64::from(given[0].width);
     CameraCheck {
         verdict: rig.verdict,
         given_px: pixels * rig.given_px,
         adjusted_px: pixels * rig.adjusted_px,
         cameras: captured.iter().zip(given.iter().zip(&rig.cameras)).map(checked).collect(),
+        held_out: held_out.map(fitted).collect(),
     }
+}
+
+fn root_mean_square(values: &[f64]) -> f64 {
+    (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
 /// Returns `8,900` for 8900.
@@ -123,8 +166,7 @@ impl CameraCheck {
                 )
             }
             Verdict::All => {
-                let squares: f64 = refined.iter().map(|c| c.moved_px * c.moved_px).sum();
-                let rms = (squares / refined.len().max(1) as f64).sqrt();
+                let rms = root_mean_square(&refined.iter().map(|c| c.moved_px).collect::<Vec<f64>>());
                 let worst = refined.iter().max_by(|a, b| a.moved_px.total_cmp(&b.moved_px));
                 let worst =
                     worst.map_or(String::new(), |c| format!(", `{}` most, by {:.1} px", c.view, c.moved_px));
@@ -161,6 +203,25 @@ impl CameraCheck {
         self.cameras.iter().filter_map(problem).map(|text| Error::cannot(text, HINT)).collect()
     }
 
+    /// Returns what is said of held-out views that could not be fitted, if there are any.
+    pub(super) fn not_fitted(&self) -> Option<String> {
+        let left = self.held_out.iter().filter(|v| v.fitted.is_none());
+        let left: Vec<String> = left.map(|v| format!("`{}` ({} sightings)", v.view, v.sightings)).collect();
+        (!left.is_empty()).then(|| {
+            let named = left.join(", ");
+            format!("too little was found again in held-out views to fit their poses: {named}; they are shown from the given ones alone")
+        })
+    }
+
+    /// Returns the cameras among these whose own poses were fitted, with these poses.
+    pub(super) fn fitted(&self, cameras: &[NamedCamera]) -> Vec<NamedCamera> {
+        let fitted = |NamedCamera { name, camera }: &NamedCamera| {
+            let Pose { rotation, position } = self.held_out.iter().find(|v| v.view == *name)?.fitted?;
+            Some(NamedCamera { name: name.clone(), camera: Camera { rotation, position, ..camera.clone() } })
+        };
+        cameras.iter().filter_map(fitted).collect()
+    }
+
     /// Returns whether any pose is refined.
     pub(super) fn refines(&self) -> bool {
         self.cameras.iter().any(|c| c.refined.is_some())
@@ -169,13 +230,20 @@ impl CameraCheck {
     /// Returns how many poses are refined, and how the cameras fit, for the stage's record.
     pub(super) fn summary(&self) -> serde_json::Value {
         let refined = self.cameras.iter().filter(|c| c.refined.is_some()).count();
-        serde_json::json!({
+        let mut summary = serde_json::json!({
             "verdict": self.verdict,
             "refined": refined,
             "sightings": self.cameras.iter().map(|c| c.sightings).sum::<usize>(),
             "given_px": self.given_px,
             "adjusted_px": self.adjusted_px,
-        })
+        });
+        if !self.held_out.is_empty() {
+            let fitted = self.held_out.iter().filter(|v| v.fitted.is_some());
+            let moved: Vec<f64> = fitted.map(|v| v.moved_px).collect();
+            summary["held_out"] =
+                serde_json::json!({"fitted": moved.len(), "moved_px": root_mean_square(&moved)});
+        }
+        summary
     }
 
     /// Writes the measurement into the folder of the stage `mask`.
@@ -191,12 +259,16 @@ impl CameraCheck {
             return Ok(None);
         }
         let check: CameraCheck = io::read_typed(&path, &Limits::default())?;
-        for (k, camera) in check.cameras.iter().enumerate() {
-            let Some(Pose { rotation, position }) = camera.refined else { continue };
+        let refined =
+            check.cameras.iter().enumerate().map(|(k, c)| (format!("cameras[{k}].refined"), c.refined));
+        let fitted =
+            check.held_out.iter().enumerate().map(|(k, v)| (format!("held_out[{k}].fitted"), v.fitted));
+        for (key, pose) in refined.chain(fitted) {
+            let Some(Pose { rotation, position }) = pose else { continue };
             let pose = Similarity { scale: 1.0, rotation, translation: position };
             if let Some((part, found, expected)) = pose.problem() {
                 let part = if part == "translation" { "position" } else { part };
-                return Err(ReadError::value(&path, format!("cameras[{k}].refined.{part}"), found, expected));
+                return Err(ReadError::value(&path, format!("{key}.{part}"), found, expected));
             }
         }
         Ok(Some(check))

@@ -10,6 +10,7 @@ use crate::capture::{self, Capture, CaptureOptions, Split, View};
 use crate::config::{CameraPoses, Config, Preset};
 use crate::geom::Camera;
 use crate::io::{self, Limits};
+use crate::render::path::NamedCamera;
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -50,11 +51,17 @@ fn disturb(capture: &mut Capture, view: usize, pixels: f64) {
 
 /// Returns the root mean square of how far the head lies from its true place in the pictures.
 fn error_px(capture: &Capture, exact: &Capture) -> f64 {
+    let cameras = train(capture).into_iter().zip(train(exact)).map(|(a, b)| [&a.camera, &b.camera]);
+    distance_px(&cameras.collect::<Vec<_>>())
+}
+
+/// Returns the root mean square of how far the head in the pictures of each pair of cameras lies apart.
+fn distance_px(pairs: &[[&Camera; 2]]) -> f64 {
     let points = SyntheticHead.surface_points(200, 1);
     let mut squares = Vec::new();
-    for (a, b) in train(capture).into_iter().zip(train(exact)) {
+    for pair in pairs {
         for p in &points {
-            let [a, b] = [a, b].map(|v| v.camera.project(*p).unwrap().0);
+            let [a, b] = pair.map(|camera| camera.project(*p).unwrap().0);
             squares.push(f64::from(a.distance_squared(b)));
         }
     }
@@ -106,6 +113,35 @@ fn one_camera_that_was_moved_is_named_and_refined_alone() {
 }
 
 #[test]
+fn a_held_out_view_is_fitted_alone_where_poses_are_refined_and_changes_nothing_else() {
+    let (_dir, exact) = demo();
+    let clean = check(&exact, CameraPoses::Refine).unwrap();
+    let mut wrong = exact.clone();
+    disturb(&mut wrong, 14, 1.5);
+    let found = check(&wrong, CameraPoses::Refine).unwrap();
+    assert_eq!(json!(found)["cameras"], json!(clean)["cameras"]);
+    let named =
+        |capture: &Capture| [NamedCamera { name: "014".into(), camera: capture.views[14].camera.clone() }];
+    let off = |cameras: &[NamedCamera]| distance_px(&[[&cameras[0].camera, &exact.views[14].camera]]);
+    let (before, stayed, mended) =
+        (off(&named(&wrong)), off(&clean.fitted(&named(&exact))), off(&found.fitted(&named(&wrong))));
+    assert!(before > 1.0 && mended < before / 3.0 && stayed < 0.3, "{before} {mended} {stayed}");
+    assert!(found.not_fitted().is_none());
+    // poses that stay leave held-out views alone, too
+    assert!(check(&wrong, CameraPoses::Auto).unwrap().fitted(&named(&wrong)).is_empty());
+
+    // a photograph of the back of the head shows few of the points that others see
+    let mut other = exact.clone();
+    let turned = DMat3::from_rotation_y(std::f64::consts::PI);
+    let camera = &mut other.views[14].camera;
+    *camera =
+        Camera { rotation: turned * camera.rotation, position: turned * camera.position, ..camera.clone() };
+    let lost = check(&other, CameraPoses::Refine).unwrap();
+    assert!(lost.fitted(&named(&other)).is_empty());
+    assert!(lost.not_fitted().unwrap().contains("`014`"));
+}
+
+#[test]
 fn swapped_photographs_are_refused_by_name() {
     let (_dir, exact) = demo();
     let mut swapped = exact.clone();
@@ -131,14 +167,15 @@ fn poses_are_read_back_and_what_is_no_pose_is_refused_with_its_key() {
     assert_eq!(json!(CameraCheck::read(dir.path()).unwrap()), json!(found));
     let path = dir.path().join(POSES);
     let written: Value = io::read_json(&path, &Limits::default()).unwrap();
-    for (key, value) in [
-        ("rotation", json!([0, 0, 0, 0, 0, 0, 0, 0, 0])),
-        ("rotation", json!([-1, 0, 0, 0, 1, 0, 0, 0, 1])),
-        ("position", json!([null, 0, 0])),
-        ("position", json!("here")),
+    for (place, key, value) in [
+        ("/cameras/4/refined", "rotation", json!([0, 0, 0, 0, 0, 0, 0, 0, 0])),
+        ("/cameras/4/refined", "rotation", json!([-1, 0, 0, 0, 1, 0, 0, 0, 1])),
+        ("/cameras/4/refined", "position", json!([null, 0, 0])),
+        ("/held_out/0/fitted", "rotation", json!([0, 0, 0, 0, 0, 0, 0, 0, 0])),
+        ("/held_out/0/fitted", "position", json!("here")),
     ] {
         let mut bad = written.clone();
-        bad["cameras"][4]["refined"][key] = value;
+        bad.pointer_mut(place).unwrap()[key] = value;
         std::fs::write(&path, bad.to_string()).unwrap();
         let error = CameraCheck::read(dir.path()).unwrap_err().to_string();
         assert!(error.contains(key) && error.contains(POSES), "{error}");

@@ -183,6 +183,8 @@ pub struct Export {
     pub up: Vec3,
     /// Metres per dataset unit.
     pub unit_m: f64,
+    /// Height of a mesh in its files, metres; 0 where `unit_m` decides.
+    pub height_m: f64,
     /// The coordinate frame of the files.
     pub frame: MeshFrame,
     /// How pictures are stored with the mesh.
@@ -200,6 +202,7 @@ impl Export {
             name: capture.name.clone(),
             up: capture.up,
             unit_m: config.capture.unit_m,
+            height_m: config.mesh.height_m,
             frame: config.mesh.frame,
             material: config.mesh.material,
             texture_format: config.mesh.texture_format,
@@ -238,7 +241,19 @@ impl Export {
             MeshFrame::Dataset => (self.up, *world_from_scene),
             MeshFrame::Head => (Vec3::Y, self.head_from_mesh(mesh, world_from_scene)),
         };
-        ExportOptions { up, unit_m: self.unit_m, world_from_mesh, ..ExportOptions::default() }
+        let unit_m = self.metres(mesh, world_from_scene);
+        ExportOptions { up, unit_m, world_from_mesh, ..ExportOptions::default() }
+    }
+
+    /// Returns the length of a dataset unit in the files of a mesh, metres.
+    pub(super) fn metres(&self, mesh: &Mesh, world_from_scene: &Similarity) -> f64 {
+        if self.height_m == 0.0 {
+            return self.unit_m;
+        }
+        let up = world_from_scene.inverse().direction(self.up.normalize_or(Vec3::Y));
+        let heights = mesh.positions.iter().map(|p| p.dot(up));
+        let (low, high) = heights.fold((f32::MAX, f32::MIN), |(low, high), h| (low.min(h), high.max(h)));
+        self.height_m / (f64::from(high - low) * world_from_scene.scale)
     }
 
     /// Returns the frames of a mesh, its scene, and its GLB and OBJ files.
@@ -310,6 +325,33 @@ mod tests {
     use std::f32::consts::PI;
 
     #[test]
+    fn a_head_of_a_given_height_has_it_in_every_frame_whatever_the_units_and_the_up_direction() {
+        let positions =
+            (0..8).map(|i| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32)).collect();
+        let mesh = Mesh { positions, ..Mesh::default() };
+        let turn = DMat3::from_rotation_x(0.7) * DMat3::from_rotation_z(0.4);
+        let world_from_scene = Similarity { scale: 40.0, rotation: turn, translation: DVec3::splat(900.0) };
+        for frame in [MeshFrame::Dataset, MeshFrame::Head] {
+            let export = Export {
+                name: "x".into(),
+                up: Vec3::new(0.6, 0.0, 0.8),
+                unit_m: 1.0,
+                height_m: 0.24,
+                frame,
+                material: Material::Unlit,
+                texture_format: TextureFormat::Png,
+                cameras: vec![DVec3::ZERO],
+            };
+            let file_from_scene = export.frames(&mesh, &world_from_scene).unwrap().file_from_scene;
+            let placed = mesh.transformed(&Similarity { translation: DVec3::ZERO, ..file_from_scene });
+            let height = placed.bounds().size().y;
+            assert!((height - 0.24).abs() < 1e-5, "{frame:?}: {height}");
+            let plain = Export { height_m: 0.0, ..export }.frames(&mesh, &world_from_scene).unwrap();
+            assert!((plain.file_from_scene.scale - 40.0).abs() < 1e-9);
+        }
+    }
+
+    #[test]
     fn in_the_head_frame_the_face_looks_along_z_and_the_crown_is_up() {
         // Z-up world, cameras at −Y: the corner of the box nearest to the cameras, at the top
         let corners: Vec<Vec3> = (0..8)
@@ -320,6 +362,7 @@ mod tests {
             name: "x".into(),
             up: Vec3::Z,
             unit_m: 1.0,
+            height_m: 0.0,
             frame: MeshFrame::Head,
             material: Material::Unlit,
             texture_format: TextureFormat::Png,
@@ -398,6 +441,7 @@ mod tests {
             name: "x".into(),
             up: Vec3::Z,
             unit_m: 1.0,
+            height_m: 0.0,
             frame: MeshFrame::Dataset,
             material: Material::Unlit,
             texture_format: TextureFormat::Png,
@@ -495,6 +539,7 @@ mod tests {
             name: "x".into(),
             up: Vec3::Z,
             unit_m: 1.0,
+            height_m: 0.0,
             frame: MeshFrame::Dataset,
             material: Material::Unlit,
             texture_format: TextureFormat::Png,

@@ -107,7 +107,9 @@ pub(super) fn mask(
     };
     found.require(dir)?;
     let height = scene::height(&scene, capture.up);
-    height.and_then(|h| scene::doubtful_height(h, capture.unit_m)).iter().for_each(|text| dir.warn(text));
+    let stated = whole.mesh.height_m > 0.0;
+    let doubt = height.filter(|_| !stated).and_then(|h| scene::doubtful_height(h, capture.unit_m));
+    doubt.iter().for_each(|text| dir.warn(text));
     let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
     let mut summary = json!({
         "views": capture.views.len(),
@@ -116,6 +118,7 @@ pub(super) fn mask(
         "suspicious": suspicious,
         "made": record,
         "box": scene::world_box(&scene),
+        "height_units": height,
         "height_m": height.map(|h| h * capture.unit_m),
     });
     if let Some(check) = &found.cameras {
@@ -162,6 +165,7 @@ impl RigCheck {
             if check.refines() {
                 dir.warn(&format!("{}: refined", check.sentence()));
             }
+            check.not_fitted().iter().for_each(|text| dir.warn(text));
             check.write(dir.folder())?;
         }
         if let Some(check) = &self.exposure {

@@ -37,9 +37,9 @@ pub(super) fn mesh(
 ) -> Result<Value> {
     let c = &config.mesh;
     let (world_from_scene, export) = (scene.scene_from_world.inverse(), Export::new(capture, config));
-    let mm = world_from_scene.scale * config.capture.unit_m * 1000.0;
     let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
     let (mut surface, report) = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
+    let mm = world_from_scene.scale * export.metres(&surface, &world_from_scene) * 1000.0;
     report.warnings(c.cap).iter().for_each(|w| dir.warn(w));
     report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
     let patches = Patches::of(&surface, &report.handles);
@@ -101,7 +101,8 @@ pub(super) fn mesh(
     }
     // without the translation, which f32 may not represent
     let in_place = Similarity { translation: DVec3::ZERO, ..world_from_scene };
-    let size = head.mesh.transformed(&in_place).bounds().size() * config.capture.unit_m as f32;
+    let metres = export.metres(&head.mesh, &world_from_scene);
+    let size = head.mesh.transformed(&in_place).bounds().size() * metres as f32;
     Ok(json!({
         "vertices": head.mesh.positions.len(),
         "triangles": head.mesh.triangles.len(),

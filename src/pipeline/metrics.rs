@@ -8,7 +8,7 @@ use crate::capture::synthetic::SyntheticHead;
 use crate::capture::{Capture, LoadedView, View};
 use crate::config::{Config, Method, TruthPhoto, ViewBackground};
 use crate::geom::{Bvh, Mesh};
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Image, Photo};
 use crate::io::{self, Limits};
 use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
 use crate::run::{Run, StageDir};
@@ -37,6 +37,8 @@ pub(super) struct Comparable<'a> {
     pub file: PathBuf,
     /// The float version of the picture, if it exists.
     float: PathBuf,
+    /// The picture from the pose fitted to the view alone, if there are such pictures; the same one where it has none.
+    own_pose: Option<PathBuf>,
 }
 
 /// Metrics of one picture.
@@ -44,6 +46,8 @@ struct ViewFigures {
     head: ViewMetrics,
     /// The same where the photograph's own exposure is divided out.
     own_exposure: Option<ViewMetrics>,
+    /// The same from the pose fitted to the view alone, and where the photograph's own exposure is divided out.
+    own_pose: Option<ViewMetrics>,
     region: Option<ViewMetrics>,
     parts: PartMetrics,
     /// Sum of opacity² over the pixels without any head, and the number of these pixels.
@@ -63,10 +67,13 @@ pub(super) fn picture_sets(config: &Config, run: &Run) -> Vec<PictureSet> {
 
 /// Returns the pictures of a set that have a photograph.
 pub(super) fn comparable<'c>(capture: &'c Capture, config: &Config, set: &PictureSet) -> Vec<Comparable<'c>> {
-    let floats = set.folder.join(pictures::FLOAT);
+    let [floats, own] = [pictures::FLOAT, pictures::OWN_POSE].map(|below| set.folder.join(below));
     let picture = |view: &'c View| {
-        let file = pictures::path(&set.folder, &view.name, config.render.format);
-        Comparable { view, file, float: pictures::float_path(&floats, &view.name) }
+        let [file, own_pose] =
+            [&set.folder, &own].map(|f| pictures::path(f, &view.name, config.render.format));
+        let own_pose = if io::is_file(&own_pose) { own_pose } else { file.clone() };
+        let own_pose = io::is_folder(&own).then_some(own_pose);
+        Comparable { view, file, float: pictures::float_path(&floats, &view.name), own_pose }
     };
     capture.views.iter().map(picture).filter(|c| io::is_file(&c.file)).collect()
 }
@@ -75,7 +82,8 @@ pub(super) fn comparable<'c>(capture: &'c Capture, config: &Config, set: &Pictur
 /// the capture's region of interest, and part by part (opaque pixels, outline, skin, hair, coverage); opacity outside
 /// the head is measured. `capture` has the masks that the metrics use, from the source `masks`; `surface` is the demo's
 /// mesh, which is compared with the true surface. Where `exposure` was evened out, views have the mean exposure and
-/// photographs their own, so a second set of figures, `own_exposure`, divides that out of the photographs.
+/// photographs their own, so a second set of figures, `own_exposure`, divides that out of the photographs. Where poses were
+/// refined, `own_pose` compares pictures from the poses that were fitted to each view alone, at its own exposure.
 pub(super) fn metrics(
     capture: &Capture,
     config: &Config,
@@ -146,15 +154,20 @@ fn figures(
         TruthPhoto::Masked => pictures::expected(photo, loaded.mask.as_ref(), background),
     };
     let photo = expected(&loaded.photo);
-    let own_exposure = exposure.and_then(|check| check.used(&picture.view.name)).map(|own| {
-        let photo = expected(&own.divided_out(loaded.photo.clone()));
-        compare(&picture.view.name, &render, &photo, loaded.mask.as_ref(), loaded.valid.as_ref())
+    let evened = exposure.and_then(|check| check.used(&picture.view.name));
+    let evened = evened.map(|own| expected(&own.divided_out(loaded.photo.clone())));
+    let against = |render: &Image, photo: &Photo, mask: Option<&Gray>| {
+        compare(&picture.view.name, render, photo, mask, loaded.valid.as_ref())
+    };
+    let own_exposure =
+        evened.as_ref().map(|photo| against(&render, photo, loaded.mask.as_ref())).transpose()?;
+    let own_pose = picture.own_pose.as_ref().map(|file| {
+        let render = pictures::read(file, config.render.format)?;
+        against(&render, evened.as_ref().unwrap_or(&photo), loaded.mask.as_ref())
     });
-    let own_exposure = own_exposure.transpose()?;
-    let against =
-        |mask: Option<&Gray>| compare(&picture.view.name, &render, &photo, mask, loaded.valid.as_ref());
-    let region = loaded.region.as_ref().map(|r| against(Some(r))).transpose()?;
-    let mut head = against(loaded.mask.as_ref())?;
+    let own_pose = own_pose.transpose()?;
+    let region = loaded.region.as_ref().map(|r| against(&render, &photo, Some(r))).transpose()?;
+    let mut head = against(&render, &photo, loaded.mask.as_ref())?;
     head.lpips = lpips.map(|network| network.distance(&render, &photo)).transpose()?;
     // a picture over a background is opaque; its original alpha is in the float view
     let before = match io::is_file(&picture.float) {
@@ -167,28 +180,28 @@ fn figures(
     let parts = Masks::of(&loaded).map(|m| parts(&render, &photo, m, opacity.as_deref(), behind, tones));
     let parts = parts.unwrap_or_default();
     let outside = opacity.and_then(|opacity| square_opacity_outside(&opacity, &loaded));
-    Ok(ViewFigures { head, own_exposure, region, parts, outside })
+    Ok(ViewFigures { head, own_exposure, own_pose, region, parts, outside })
 }
 
 /// Returns one set's part of the file.
 fn entry(figures: Vec<ViewFigures>) -> Value {
     let (mut heads, mut regions, mut parts, mut outside) = (Vec::new(), Vec::new(), Vec::new(), (0.0, 0));
-    let mut own_exposure = Vec::new();
+    let (mut own_exposure, mut own_pose) = (Vec::new(), Vec::new());
     for f in figures {
         parts.push(f.parts);
         heads.push(f.head);
         regions.extend(f.region);
         own_exposure.extend(f.own_exposure);
+        own_pose.extend(f.own_pose);
         let (sum, pixels) = f.outside.unwrap_or_default();
         outside = (outside.0 + sum, outside.1 + pixels);
     }
     let mut entry = Map::new();
     entry.insert("head".into(), json!(Metrics::new(heads)));
-    if !own_exposure.is_empty() {
-        entry.insert("own_exposure".into(), json!(Metrics::new(own_exposure)));
-    }
-    if !regions.is_empty() {
-        entry.insert("region".into(), json!(Metrics::new(regions)));
+    for (key, views) in [("own_exposure", own_exposure), ("own_pose", own_pose), ("region", regions)] {
+        if !views.is_empty() {
+            entry.insert(key.into(), json!(Metrics::new(views)));
+        }
     }
     if parts.iter().any(|p| *p != PartMetrics::default()) {
         // in the order of the head's views, which name them
@@ -293,17 +306,31 @@ mod tests {
         let photo = clean.views[14].load_photo(&Limits::default()).unwrap();
         let file = dir.path().join("view.png");
         io::write_png_rgb(&file, photo.width, photo.height, &photo.rgb).unwrap();
-        let picture = Comparable { view: &exposed.views[14], file, float: dir.path().join("view.npy") };
+        let float = dir.path().join("view.npy");
+        let picture = Comparable { view: &exposed.views[14], file, float, own_pose: None };
+        let black = dir.path().join("black.png");
+        io::write_png_rgb(&black, photo.width, photo.height, &vec![[0; 3]; photo.rgb.len()]).unwrap();
         let config = Config::preset(crate::config::Preset::Draft);
         let plain = figures(&config, &picture, None, None, None).unwrap();
         let found = figures(&config, &picture, None, None, Some(&check)).unwrap();
-        assert!(plain.own_exposure.is_none());
+        assert!(plain.own_exposure.is_none() && plain.own_pose.is_none());
         assert_eq!(found.head.psnr_masked, plain.head.psnr_masked);
         let own = found.own_exposure.unwrap().psnr_masked.unwrap();
         assert!(
             own > plain.head.psnr_masked.unwrap() + 6.0,
             "{own} dB, {:?} as it is",
             plain.head.psnr_masked
+        );
+        // from its own pose: at its own exposure, too, if that is known
+        let fitted = Comparable { file: black, own_pose: Some(picture.file), ..picture };
+        let psnr = |exposure| {
+            let figures = figures(&config, &fitted, None, None, exposure).unwrap();
+            (figures.head.psnr_masked.unwrap(), figures.own_pose.unwrap().psnr_masked)
+        };
+        let ((given, alone), (_, both)) = (psnr(None), psnr(Some(&check)));
+        assert!(
+            alone == plain.head.psnr_masked && both == Some(own) && given < own - 6.0,
+            "{given} {alone:?} {both:?}"
         );
     }
 

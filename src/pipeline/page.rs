@@ -169,11 +169,12 @@ const COLUMNS: [(&str, usize, Option<bool>); 8] = [
 ];
 
 /// Rows of the second table of pictures: heading, key in `metrics.json`, and number of digits.
-const QUALITY: [(&str, &str, usize); 13] = [
+const QUALITY: [(&str, &str, usize); 14] = [
     ("PSNR", "/head/mean/psnr_masked", 2),
     ("SSIM", "/head/mean/ssim_masked", 4),
     ("whole frame", "/head/mean/psnr", 2),
     ("own exposure", "/own_exposure/mean/psnr_masked", 2),
+    ("own pose", "/own_pose/mean/psnr_masked", 2),
     ("region", "/region/mean/psnr_masked", 2),
     ("opaque", "/parts/mean/psnr_opaque", 2),
     ("edge", "/parts/mean/psnr_edge", 2),

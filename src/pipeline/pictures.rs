@@ -19,6 +19,9 @@ pub(super) fn background_color(background: ViewBackground) -> Option<[f32; 3]> {
 /// Folder of the float views that `ensemble` reads, below a method's folder.
 pub(super) const FLOAT: &str = "float";
 
+/// Folder of the held-out views as seen from their own fitted poses, below a method's folder.
+pub(super) const OWN_POSE: &str = "own_pose";
+
 /// Returns the file of a view: `folder/NAME.png` or `.exr`.
 pub(super) fn path(folder: &Path, name: &str, format: PictureFormat) -> PathBuf {
     let ending = match format {

@@ -38,7 +38,8 @@ const UNTRACKED_MASK_KEYS: [&str; 9] = [
 const CAPTURE_MASK_KEYS: [&str; 2] = ["mask.source", "mask.meaning"];
 
 /// Keys of `[mesh]` that affect files for other programs, but no rendered view.
-const FILE_KEYS: [&str; 4] = ["mesh.format", "mesh.material", "mesh.texture_format", "mesh.exr"];
+const FILE_KEYS: [&str; 5] =
+    ["mesh.format", "mesh.material", "mesh.texture_format", "mesh.exr", "mesh.height_m"];
 
 /// Keys of `[mesh]` that affect the head mesh, but not the surface it is made from.
 const HEAD_KEYS: [&str; 7] = [
@@ -311,6 +312,9 @@ impl Session<'_> {
                 settings.insert("capture.unit_m".into(), config.capture.unit_m.to_string());
                 if config.mesh.material == Material::Unlit {
                     settings.remove("mesh.material"); // as in runs from before there was another
+                }
+                if config.mesh.height_m == 0.0 {
+                    settings.remove("mesh.height_m"); // as in runs from before files could be scaled
                 }
                 if !config.mesh.dense {
                     settings.remove("mesh.dense"); // as in runs from before there was another

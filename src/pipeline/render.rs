@@ -6,7 +6,9 @@
 //!        tface/float/     the same view for `ensemble`: float, coded, no background
 //! ```
 //!
-//! These are the held-out views. Views along a camera path are written to a folder of their own, `render/paths/`.
+//! These are the held-out views. Where poses were refined, T-Face and the ray-cast mesh are also shown from the poses fitted to
+//! each held-out view alone, in `own_pose/` below the method's folder. Views along a camera path are written to a folder of
+//! their own, `render/paths/`.
 
 use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
@@ -28,24 +30,29 @@ use crate::{Error, Monitor, Result};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
 
-/// Renders one folder per method and one picture per camera; `unit_m` is the number of metres in a dataset unit.
+/// Renders one folder per method and one picture per camera, and the `fitted` cameras by the methods that compare poses;
+/// `unit_m` is the number of metres in a dataset unit.
 pub(super) fn render(
     c: &RenderConfig,
     renderer: &Renderer,
     cameras: &[NamedCamera],
+    fitted: &[NamedCamera],
     scene: &Scene,
     unit_m: f64,
     dir: &StageDir,
 ) -> Result<Value> {
     let background = pictures::background_color(c.background);
-    let total = cameras.len() * c.method.len();
+    let own_poses = |m: Method| if matches!(m, Method::Tface | Method::Raycast) { fitted } else { &[] };
+    let total: usize = c.method.iter().map(|&m| cameras.len() + own_poses(m).len()).sum();
     let mut done = 0;
     let mut seconds = Map::new();
     for &method in &c.method {
         let (mut spent, mut made) = (Duration::ZERO, 0);
-        let folder = dir.folder().join(method.folder());
-        for NamedCamera { name, camera } in cameras {
-            let float = c.float.then(|| folder.join(pictures::FLOAT));
+        let whole = dir.folder().join(method.folder());
+        let own = own_poses(method).iter().map(|camera| (camera, whole.join(pictures::OWN_POSE), None));
+        let float = c.float.then(|| whole.join(pictures::FLOAT));
+        let given = cameras.iter().map(|camera| (camera, whole.clone(), float.clone()));
+        for (NamedCamera { name, camera }, folder, float) in given.chain(own) {
             let files = pictures::files(&folder, name, float.as_deref(), c.format);
             // an interrupted process left only complete files of the same settings
             if !files.iter().all(|file| io::is_file(file)) {
@@ -311,6 +318,37 @@ mod tests {
     }
 
     impl Surface for Red {}
+
+    #[test]
+    fn fitted_poses_are_shown_beside_the_given_ones_by_t_face_and_the_ray_cast_mesh() {
+        let corners = [(-0.5, -0.5), (0.5, -0.5), (0.0, 0.5)].map(|(x, y)| Vec3::new(x, y, 0.0));
+        let mesh = Mesh { positions: corners.to_vec(), triangles: vec![[0, 1, 2]], ..Mesh::default() };
+        let meshes =
+            Meshes { extracted: Some(ExtractedSurface { mesh, cap: None }), head: None, shown: [false; 2] };
+        let scene_from_world = Similarity::IDENTITY;
+        let scene = Scene { scene_from_world, aabb: Aabb::SCENE, hull: None };
+        let named = |height| NamedCamera { name: "a".into(), camera: Camera::above(16, 16, 16.0, height) };
+        let folder = tempfile::tempdir().unwrap();
+        let run = Run::quiet(folder.path());
+        let c = RenderConfig {
+            method: vec![Method::Raycast, Method::Textured],
+            float: true,
+            ..Config::preset(crate::config::Preset::Draft).render
+        };
+        let fingerprint = crate::run::Fingerprint::default();
+        let plan =
+            crate::run::Plan { name: "render", fingerprint, device: "cpu", needs_bytes: 0, saves: false };
+        run.stage(plan, |dir| {
+            let renderer = Renderer::new(&scene, &Red, &meshes, 1, &Quiet);
+            render(&c, &renderer, &[named(4.0)], &[named(3.0)], &scene, 1.0, dir)
+        })
+        .unwrap();
+        let picture = |place: &str| std::fs::read(run.path("render/raycast").join(place)).unwrap();
+        assert_ne!(picture("a.png"), picture("own_pose/a.png"));
+        assert!(io::is_file(&run.path("render/raycast/float/a.exr")));
+        assert!(!io::is_folder(&run.path("render/raycast/own_pose/float")));
+        assert!(!io::is_folder(&run.path("render/textured/own_pose")));
+    }
 
     #[test]
     fn rays_see_the_cap_painted_and_the_skin_as_the_field_has_it() {

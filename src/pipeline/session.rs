@@ -90,6 +90,11 @@ impl<'a> Session<'a> {
         &self.capture
     }
 
+    /// Returns what the stage `mask` measured of the cameras.
+    pub(super) fn camera_check(&self) -> Result<Option<CameraCheck>> {
+        CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))
+    }
+
     /// Returns the exposures that the stage `mask` measured.
     pub(super) fn exposure(&self) -> Result<Option<ExposureCheck>> {
         ExposureCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))
@@ -102,8 +107,7 @@ impl<'a> Session<'a> {
             return Ok(capture);
         }
         let mut capture = self.capture.clone();
-        let check = CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
-        check.iter().for_each(|check| check.apply(&mut capture));
+        self.camera_check()?.iter().for_each(|check| check.apply(&mut capture));
         self.exposure()?.iter().for_each(|check| check.apply(&mut capture));
         Ok(self.refined.get_or_init(|| capture))
     }
@@ -119,9 +123,8 @@ impl<'a> Session<'a> {
             return Ok(());
         }
         let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
-        let check = CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
-        let cameras =
-            scene_file::cameras_json(&self.capture, &scene, check.as_ref(), self.exposure()?.as_ref());
+        let (check, exposure) = (self.camera_check()?, self.exposure()?);
+        let cameras = scene_file::cameras_json(&self.capture, &scene, check.as_ref(), exposure.as_ref());
         self.write("cameras.json", &cameras, idle)
     }
 

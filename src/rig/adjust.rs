@@ -106,6 +106,8 @@ struct Setting<'a> {
     given: &'a [Camera],
     /// The place of each camera's six unknowns; `None` for a camera that stays.
     places: &'a [Option<usize>],
+    /// Whether points stay.
+    fixed_points: bool,
     /// Residual of half weight, pixels.
     scale: f64,
     damping: f64,
@@ -133,7 +135,8 @@ impl Setting<'_> {
         for k in 0..3 {
             normal.col_mut(k)[k] = normal.col(k)[k] * damp + 1e-6;
         }
-        Eliminated { inverse: normal.inverse(), gradient, free }
+        let inverse = if self.fixed_points { DMat3::ZERO } else { normal.inverse() };
+        Eliminated { inverse, gradient, free }
     }
 
     /// Returns the step of a track's point after its cameras have moved by `step`.
@@ -216,6 +219,41 @@ impl Setting<'_> {
         };
         parts.iter().sum::<f64>() + cameras.iter().zip(self.given).map(prior).sum::<f64>()
     }
+
+    /// Moves the free cameras and the points until they fit the sightings.
+    fn minimize(mut self, cameras: &mut [Camera], tracks: &mut [Track]) {
+        let mut cost = self.cost(cameras, tracks);
+        for _ in 0..STEPS {
+            let (matrix, vector) = self.system(cameras, tracks);
+            let candidate = solve(matrix, &vector).map(|step| {
+                let camera = |(camera, place): (&Camera, &Option<usize>)| match place {
+                    Some(place) => moved(camera, &step[*place..][..6]),
+                    None => camera.clone(),
+                };
+                let stepped: Vec<Camera> = cameras.iter().zip(self.places).map(camera).collect();
+                let point = |t: &Track| Track {
+                    position: t.position + self.point_step(cameras, t, &step),
+                    ..t.clone()
+                };
+                let points: Vec<Track> = tracks.par_iter().map(point).collect();
+                (self.cost(&stepped, &points), stepped, points)
+            });
+            match candidate {
+                Some((lower, stepped, points)) if lower < cost => {
+                    cameras.clone_from_slice(&stepped);
+                    tracks.clone_from_slice(&points);
+                    let gained = (cost - lower) / cost;
+                    cost = lower;
+                    self.damping = (0.2 * self.damping).max(1e-9);
+                    if gained < CONVERGED {
+                        break;
+                    }
+                }
+                _ if self.damping > 1e3 => break,
+                _ => self.damping *= 10.0,
+            }
+        }
+    }
 }
 
 fn pieces(tracks: &[Track]) -> impl IndexedParallelIterator<Item = &[Track]> {
@@ -286,38 +324,16 @@ pub fn adjust(given: &[Camera], cameras: &mut [Camera], tracks: &mut [Track], fr
         free.then(|| next - 6)
     };
     let places: Vec<Option<usize>> = free.iter().map(place).collect();
-    let mut setting = Setting { given, places: &places, scale, damping: 1e-4 };
-    let mut cost = setting.cost(cameras, tracks);
-    for _ in 0..STEPS {
-        let (matrix, vector) = setting.system(cameras, tracks);
-        let candidate = solve(matrix, &vector).map(|step| {
-            let camera = |(camera, place): (&Camera, &Option<usize>)| match place {
-                Some(place) => moved(camera, &step[*place..][..6]),
-                None => camera.clone(),
-            };
-            let stepped: Vec<Camera> = cameras.iter().zip(&places).map(camera).collect();
-            let point = |t: &Track| Track {
-                position: t.position + setting.point_step(cameras, t, &step),
-                ..t.clone()
-            };
-            let points: Vec<Track> = tracks.par_iter().map(point).collect();
-            (setting.cost(&stepped, &points), stepped, points)
-        });
-        match candidate {
-            Some((lower, stepped, points)) if lower < cost => {
-                cameras.clone_from_slice(&stepped);
-                tracks.clone_from_slice(&points);
-                let gained = (cost - lower) / cost;
-                cost = lower;
-                setting.damping = (0.2 * setting.damping).max(1e-9);
-                if gained < CONVERGED {
-                    break;
-                }
-            }
-            _ if setting.damping > 1e3 => break,
-            _ => setting.damping *= 10.0,
-        }
-    }
+    Setting { given, places: &places, fixed_points: false, scale, damping: 1e-4 }.minimize(cameras, tracks);
+}
+
+/// Returns the pose that fits points which stay best, seen by the camera of view 0 alone; the prior is the `given` pose.
+pub fn resected(given: &Camera, start: &Camera, tracks: &[Track], scale: f64) -> Camera {
+    let (given, mut camera, mut tracks) = ([given.clone()], [start.clone()], tracks.to_vec());
+    Setting { given: &given, places: &[Some(0)], fixed_points: true, scale, damping: 1e-4 }
+        .minimize(&mut camera, &mut tracks);
+    let [camera] = camera;
+    camera
 }
 
 /// Returns the similarity that brings adjusted cameras and points closest to the `given` cameras, in pixels: the
@@ -325,6 +341,9 @@ pub fn adjust(given: &[Camera], cameras: &mut [Camera], tracks: &mut [Track], fr
 /// is of the whole camera; one that is much farther off than the others has little weight.
 pub fn gauge(given: &[Camera], adjusted: &[Camera], points: &[DVec3]) -> Similarity {
     const ROUNDS: usize = 10;
+    /// Squared errors of half weight, of the median: errors of one kind, however they scatter, count nearly in full, since
+    /// the mean of them all is where the world is.
+    const USUAL: f64 = 16.0;
     let middle = points.iter().sum::<DVec3>() / points.len().max(1) as f64;
     let mut total = Similarity::IDENTITY;
     for _ in 0..ROUNDS {
@@ -334,7 +353,7 @@ pub fn gauge(given: &[Camera], adjusted: &[Camera], points: &[DVec3]) -> Similar
             .map(|(given, adjusted)| Equations::of(given, adjusted, points, middle, &total))
             .collect();
         let mut squares: Vec<f64> = equations.iter().map(|e| e.mean_square).collect();
-        let scale = 4.0 * median(&mut squares).max(1e-12);
+        let scale = USUAL * median(&mut squares).max(1e-12);
         let (mut matrix, mut vector) = (vec![0.0; 49], vec![0.0; 7]);
         for e in &equations {
             let w = 1.0 / (1.0 + (e.mean_square / scale).powi(2));
@@ -464,8 +483,13 @@ mod tests {
             sightings: vec![Sighting { view: 0, pixel: DVec2::new(200.0, 250.0) }],
         };
         let tracks: Vec<Track> = (0..9).map(track).collect();
-        let setting =
-            Setting { given: std::slice::from_ref(&given), places: &[Some(0)], scale: 40.0, damping: 0.0 };
+        let setting = Setting {
+            given: std::slice::from_ref(&given),
+            places: &[Some(0)],
+            fixed_points: true,
+            scale: 40.0,
+            damping: 0.0,
+        };
         let mut vector = vec![0.0; 6];
         for t in &tracks {
             let l = Linear::new(&camera, t.position, t.sightings[0].pixel).unwrap();

@@ -108,14 +108,14 @@ pub(super) fn decide(
         camera: given[v].clone(),
     };
     let cameras = (0..given.len()).map(fit).collect();
-    let mut rig = Rig { verdict: Verdict::Unchecked, cameras, given_px, adjusted_px };
+    let mut rig = Rig { verdict: Verdict::Unchecked, cameras, given_px, adjusted_px, tracks };
     let measured = counts.iter().filter(|&&n| n >= LEAST_SIGHTINGS).count();
-    if tracks.len() < LEAST_TRACKS || 2 * measured < given.len() {
+    if rig.tracks.len() < LEAST_TRACKS || 2 * measured < given.len() {
         return rig;
     }
     rig.verdict = judge(&mut rig.cameras, adjusted_px, all || adjusted_px < GAIN * given_px);
     let poses = match rig.verdict {
-        Verdict::Some => alone(given, adjusted, tracks, &rig.cameras, adjusted_px),
+        Verdict::Some => alone(given, adjusted, &mut rig.tracks, &rig.cameras, adjusted_px),
         _ => adjusted,
     };
     for (camera, pose) in rig.cameras.iter_mut().zip(poses) {
@@ -151,11 +151,11 @@ fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> Verdict {
     }
 }
 
-/// Returns the poses of the cameras to refine where all others keep theirs.
+/// Returns the poses of the cameras to refine where all others keep theirs, and moves the points of the tracks accordingly.
 fn alone(
     given: &[Camera],
     adjusted: Vec<Camera>,
-    mut tracks: Vec<Track>,
+    tracks: &mut [Track],
     fits: &[CameraFit],
     scale: f64,
 ) -> Vec<Camera> {
@@ -163,7 +163,7 @@ fn alone(
     let pick = |(v, pose): (usize, Camera)| if free[v] { pose } else { given[v].clone() };
     let mut cameras: Vec<Camera> = adjusted.into_iter().enumerate().map(pick).collect();
     for _ in 0..2 {
-        adjust(given, &mut cameras, &mut tracks, &free, scale.max(LEAST_SCALE));
+        adjust(given, &mut cameras, tracks, &free, scale.max(LEAST_SCALE));
     }
     cameras
 }

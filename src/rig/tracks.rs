@@ -85,6 +85,20 @@ pub struct Seed {
     pub views: Vec<usize>,
 }
 
+impl Seed {
+    /// Returns the cosine between the normal and the direction to a camera.
+    fn cosine(&self, camera: &Camera) -> f32 {
+        (camera.position.as_vec3() - self.position).normalize().dot(self.normal)
+    }
+
+    /// Returns the axes of its patch: in the tangent plane, as long as a pixel of this camera.
+    fn axes(&self, camera: &Camera) -> [Vec3; 2] {
+        let footprint = camera.position.as_vec3().distance(self.position) / camera.fx as f32;
+        let axis = self.normal.any_orthonormal_vector();
+        [footprint * axis, footprint * self.normal.cross(axis)]
+    }
+}
+
 /// One pass of the search.
 struct Level {
     /// Deviation of the blur, pixels.
@@ -178,6 +192,12 @@ pub fn seeds(
 struct Patch {
     value: [f32; PATCH],
     slope: [[f32; PATCH]; 2],
+}
+
+impl Default for Patch {
+    fn default() -> Patch {
+        Patch { value: [0.0; PATCH], slope: [[0.0; PATCH]; 2] }
+    }
 }
 
 /// The place of a patch in a photograph.
@@ -321,9 +341,8 @@ fn align(placed: &mut Vec<Placed>, level: usize, patch: &mut Patch) -> Vec<f32> 
 
 /// Returns the views that a point is looked up in, the most frontal one first.
 fn frontal(cameras: &[Camera], seed: &Seed) -> Vec<usize> {
-    let cosine = |v: usize| (cameras[v].position.as_vec3() - seed.position).normalize().dot(seed.normal);
     let mut views: Vec<(f32, usize)> =
-        seed.views.iter().map(|&v| (cosine(v), v)).filter(|(c, _)| *c >= MIN_COSINE).collect();
+        seed.views.iter().map(|&v| (seed.cosine(&cameras[v]), v)).filter(|(c, _)| *c >= MIN_COSINE).collect();
     views.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
     views.truncate(MAX_VIEWS);
     views.into_iter().map(|(_, v)| v).collect()
@@ -341,13 +360,10 @@ pub fn looked_up(cameras: &[Camera], seeds: &[Seed]) -> Vec<usize> {
 pub fn find(views: &[RigView], cameras: &[Camera], seeds: &[Seed], levels: usize) -> Vec<Option<Track>> {
     let look_up = |seed: &Seed| {
         let frontal = frontal(cameras, seed);
-        let first = &cameras[*frontal.first()?];
-        let footprint = first.position.as_vec3().distance(seed.position) / first.fx as f32;
-        let axis = seed.normal.any_orthonormal_vector();
-        let axes = [footprint * axis, footprint * seed.normal.cross(axis)];
+        let axes = seed.axes(&cameras[*frontal.first()?]);
         let place = |&v: &usize| Placed::new((v, &views[v]), &cameras[v], seed, axes);
         let mut placed: Vec<Placed> = frontal.iter().filter_map(place).collect();
-        let mut patch = Patch { value: [0.0; PATCH], slope: [[0.0; PATCH]; 2] };
+        let mut patch = Patch::default();
         let mut fits = Vec::new();
         for level in (0..levels).rev() {
             fits = align(&mut placed, level, &mut patch);
@@ -365,6 +381,46 @@ pub fn find(views: &[RigView], cameras: &[Camera], seeds: &[Seed], levels: usize
         })
     };
     seeds.par_iter().with_min_len(16).map(look_up).collect()
+}
+
+/// Looks up points in one more photograph, whose patches are moved until they fit the mean of those that the points were
+/// found in; these stay. Returns the points found, each with its sighting in view 0 alone.
+pub fn find_in(
+    (photo, camera): (&RigView, &Camera),
+    views: &[RigView],
+    cameras: &[Camera],
+    tracks: &[Track],
+) -> Vec<Track> {
+    let look_up = |track: &Track| {
+        let seed = Seed { position: track.position.as_vec3(), normal: track.normal, views: Vec::new() };
+        let axes = seed.axes(&cameras[track.sightings.first()?.view]);
+        let mut placed =
+            Placed::new((0, photo), camera, &seed, axes).filter(|_| seed.cosine(camera) >= MIN_COSINE)?;
+        let (mut patch, mut fit) = (Patch::default(), 0.0);
+        for (level, Level { spacing, steps, .. }) in LEVELS.iter().enumerate().rev() {
+            let mut target = [0f32; PATCH];
+            for s in &track.sightings {
+                let mut seen = Placed::new((s.view, &views[s.view]), &cameras[s.view], &seed, axes)?;
+                seen.shift = s.pixel.as_vec2() - seen.center;
+                if seen.sample(level, &mut patch) {
+                    (0..PATCH).for_each(|k| target[k] += patch.value[k]);
+                }
+            }
+            let length = dot(&target, &target).sqrt().max(f32::MIN_POSITIVE);
+            target.iter_mut().for_each(|t| *t /= length);
+            for step in 0..=*steps {
+                let moved = placed.sample(level, &mut patch).then(|| step_to(&patch, &target))??;
+                fit = dot(&patch.value, &target);
+                if step < *steps {
+                    placed.shift += moved.clamp_length_max(*spacing);
+                }
+            }
+        }
+        let pixel = (placed.center + placed.shift).as_dvec2();
+        let sightings = vec![Sighting { view: 0, pixel }];
+        (fit >= MIN_CORRELATION).then(|| Track { sightings, ..track.clone() })
+    };
+    tracks.par_iter().with_min_len(16).filter_map(look_up).collect()
 }
 
 /// Returns the seeds moved to the points of their tracks, with normals of the surface through their neighbors.

@@ -35,7 +35,7 @@ def row(copy, truth, mode):
                               text=True)
         cpu = spent() - before
         if done.returncode:
-            return f"| {copy.name} | {mode} | refused: {done.stderr.strip().splitlines()[0]} | | | |"
+            return f"| {copy.name} | {mode} | refused: {done.stderr.strip().splitlines()[0]} | | | | |"
         run = pathlib.Path(folder)
         figures = json.loads((run / "metrics/metrics.json").read_text())["raycast"]
         check = [program, "check", str(run / "mesh/surface.ply"), "--against", str(truth / "gt.ply"), "--seen-by", str(truth)]
@@ -43,12 +43,14 @@ def row(copy, truth, mode):
     median = [re.search(rf"{part} 3 cameras look .*?median ([\d.]+),", text) for part in ("skin,", "where")]
     skin = next(m.group(1) for m in median if m)
     own = figures.get("own_exposure", {}).get("mean", {}).get("psnr_masked")
-    own = f"{own:.2f}" if own else "–"
-    return f"| {copy.name} | {mode} | {figures['head']['mean']['psnr_masked']:.2f} | {own} | {float(skin):.3f} | {cpu:.0f} |"
+    pose = figures.get("own_pose", {}).get("mean", {}).get("psnr_masked")
+    own, pose = (f"{db:.2f}" if db else "–" for db in (own, pose))
+    return f"| {copy.name} | {mode} | {figures['head']['mean']['psnr_masked']:.2f} | {own} | {pose} | {float(skin):.3f} | {cpu:.0f} |"
 
 
 truth, *copies = map(pathlib.Path, sys.argv[1:])
-print("| capture | cameras, exposure | mesh, dB | at own exposure, dB | skin, mm | CPU s |\n| --- | --- | --- | --- | --- | --- |")
+print("| capture | cameras, exposure | mesh, dB | at own exposure, dB | from own pose, dB | skin, mm | CPU s |")
+print("| --- | --- | --- | --- | --- | --- | --- |")
 for copy in copies:
     for mode in ("given", "auto"):
         print(row(copy, truth, mode), flush=True)
