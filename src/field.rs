@@ -3,7 +3,6 @@
 //! A model ([`training::Model`]) defines what differs between fields. Its training step is written once, over
 //! operations ([`ops::Ops`]) that each device implements with its own kernels.
 
-pub mod background;
 #[cfg(any(test, feature = "wgpu"))]
 pub(crate) mod ball;
 pub mod checkpoint;
@@ -11,8 +10,6 @@ pub mod checkpoint;
 pub mod devices;
 #[cfg(feature = "wgpu")]
 pub mod drawing;
-#[cfg(feature = "wgpu")]
-pub mod memory;
 pub mod ops;
 pub mod parameters;
 pub mod pixels;

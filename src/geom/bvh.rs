@@ -144,11 +144,6 @@ impl Bvh {
         bvh
     }
 
-    /// Returns the box around all triangles.
-    pub fn bounds(&self) -> Aabb {
-        self.bounds
-    }
-
     /// Returns whether there are no triangles.
     pub fn is_empty(&self) -> bool {
         self.nodes.is_empty()

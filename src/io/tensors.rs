@@ -36,11 +36,6 @@ impl TensorValues {
         }
     }
 
-    /// Returns whether it has no values.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
     fn dtype(&self) -> (&'static str, usize) {
         match self {
             TensorValues::F32(_) => ("F32", 4),

@@ -8,6 +8,8 @@
 //! Many threads that add to one word use atomics, whose kind [`Atomics`] selects. All other sums have a fixed order.
 
 mod adam;
+#[cfg(test)]
+mod case_tests;
 mod color;
 mod density;
 mod device;
@@ -24,8 +26,6 @@ mod schedule;
 mod sdf;
 mod search;
 mod sum;
-#[cfg(test)]
-mod test_case;
 mod tile;
 mod vm;
 mod weight_norm;

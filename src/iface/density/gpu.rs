@@ -1,7 +1,7 @@
 //! A training step of the density on a GPU. The host never waits within a step.
 
-use super::ops::{DensityGroups, DensityOps, OCCUPIED};
 use super::shape;
+use super::{DensityGroups, DensityOps, OCCUPIED};
 use crate::config::iface::IfaceConfig;
 use crate::field::drawing::DeviceRays;
 use crate::field::ops::Ops;

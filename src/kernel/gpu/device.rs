@@ -447,7 +447,7 @@ pub(super) fn groups(count: usize) -> CubeCount {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use super::super::test_case::worst;
+    use super::super::case_tests::worst;
     use super::*;
     use burn::cubecl::{self, prelude::*};
     use std::cell::Cell;

@@ -152,8 +152,8 @@ impl Evaluator {
 
 #[cfg(test)]
 mod tests {
+    use super::super::case_tests::Case;
     use super::super::device::tests::{agree, device};
-    use super::super::test_case::Case;
     use super::*;
     use crate::kernel::cpu::mlp::Weights;
     use crate::kernel::cpu::{march, rng, sdf};

@@ -4,14 +4,14 @@
 //! those worth a color are listed and decoded. The rays that the CPU ends early are marched on here, but what lies
 //! behind has neither weight nor gradient either.
 
+#[cfg(test)]
+mod case_tests;
 mod decoder;
 mod grid;
 mod losses;
 mod march;
 mod rays;
 mod renderer;
-#[cfg(test)]
-mod test_case;
 
 pub use decoder::DeviceDecoder;
 pub use grid::DeviceGrid;

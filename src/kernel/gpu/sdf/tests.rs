@@ -1,5 +1,5 @@
+use super::super::case_tests::Case;
 use super::super::device::tests::{agree, device, devices, planes};
-use super::super::test_case::Case;
 use super::*;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::sdf;

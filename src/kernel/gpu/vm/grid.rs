@@ -353,11 +353,6 @@ impl DeviceGrid {
         self.padded.len()
     }
 
-    /// Returns whether the grid has no channels.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
     /// Returns the number of vectors of each term.
     pub(super) fn quads(&self) -> [usize; 3] {
         DeviceGrid::quads_of(self.grid)

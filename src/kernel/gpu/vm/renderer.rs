@@ -57,7 +57,7 @@ impl VmRenderer {
 #[cfg(test)]
 mod tests {
     use super::super::super::device::tests::{agree, device};
-    use super::super::test_case::{NARROW, case};
+    use super::super::case_tests::{NARROW, case};
     use super::*;
     use crate::kernel::cpu::vm::{DecoderWeights, render};
 

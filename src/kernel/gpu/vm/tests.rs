@@ -1,7 +1,7 @@
 use super::super::Atomics;
 use super::super::device::Words;
 use super::super::device::tests::{agree, device, devices, planes};
-use super::test_case::{DeviceCase, NARROW, Shape, case, on_cpu, room};
+use super::case_tests::{DeviceCase, NARROW, Shape, case, on_cpu, room};
 use super::*;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm};
 use crate::kernel::cpu::vm::mask::Walk;
