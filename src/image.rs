@@ -117,7 +117,7 @@ pub fn eroded(mut set: Vec<bool>, w: usize, h: usize, margin: usize) -> Vec<bool
     set
 }
 
-/// What the light of a photograph is multiplied with, relative to the mean of all photographs.
+/// Factors of a photograph's linear light relative to the mean of all photographs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Exposure {
     /// Factor of each channel in linear light.

@@ -85,7 +85,7 @@ pub struct MemoryNeed {
     /// Largest number of units that a step uses.
     pub wanted: u64,
     /// Smallest number of units that a step can run with.
-    pub least: u64,
+    pub minimum: u64,
 }
 
 impl MemoryNeed {
@@ -107,13 +107,13 @@ impl MemoryNeed {
         let resident = resident(pixels, device, left.saturating_sub(self.wanted.saturating_mul(bytes)));
         let by_buffer = device.limits().largest_buffer / widest;
         let fits = self.wanted.min(by_buffer).min((left - resident.unwrap_or(0)) / bytes);
-        if fits < self.least {
+        if fits < self.minimum {
             let problem = format!(
-                "the device `{}` has room for {fits} {} of a step beside {} MiB of {what}, {} are needed",
+                "the device `{}` has memory for {fits} {} of a step beside {} MiB of {what}, {} are needed",
                 device.name(),
                 self.unit,
                 fixed.div_ceil(1 << 20),
-                self.least,
+                self.minimum,
             );
             let hint = format!("lower {}, or give more with `--memory`", remedy(fits));
             return Err(Error::cannot(problem, hint));

@@ -482,7 +482,7 @@ impl SoftPixels {
 
 /// Removes the background's light from the soft pixels.
 ///
-/// No channel exceeds the mask's alpha, so that color never asks for more than the mask's opacity.
+/// No channel exceeds the mask's alpha, so that color never requires more than the mask's opacity.
 pub fn soft_pixels(photo: &Photo, mask: &Gray) -> SoftPixels {
     let (w, h) = (photo.width as usize, photo.height as usize);
     let linear: [f32; 256] = std::array::from_fn(|i| linear_from_srgb(i as f32 / 255.0));

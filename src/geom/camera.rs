@@ -8,7 +8,7 @@ use super::similarity::Similarity;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
-/// How a lens maps the angle θ from its axis to a radius, before coefficients bend it further.
+/// Projection of a lens: the radius of the angle θ from its axis, before the distortion coefficients.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Projection {
@@ -60,12 +60,12 @@ pub struct Distortion {
     /// ω of [`Projection::Fov`], radians, in 0..π.
     #[serde(default, skip_serializing_if = "is_default")]
     pub omega: f64,
-    /// What the coefficients bend.
+    /// The projection that the coefficients distort.
     #[serde(default, skip_serializing_if = "is_default")]
     pub projection: Projection,
 }
 
-/// As it is written: digests of cameras are made of this.
+/// Serialized form; digests of cameras depend on it.
 impl std::fmt::Debug for Distortion {
     fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
         let mut out = f.debug_struct("Distortion");
@@ -159,7 +159,7 @@ impl Distortion {
         (factor, (over_slope - factor * under_slope) / under)
     }
 
-    /// Returns what the coefficients do to a projected point.
+    /// Returns the distorted position of a projected point.
     fn bend(&self, x: f64, y: f64) -> (f64, f64) {
         let r2 = x * x + y * y;
         let (radial, _) = self.radial(r2);
@@ -237,7 +237,7 @@ impl Distortion {
     }
 }
 
-/// How near [`Distortion::undistort`] must come; at a focal length of 10 000 pixels, 1e-6 of a pixel.
+/// Tolerance of [`Distortion::undistort`]; at a focal length of 10 000 pixels, 1e-6 of a pixel.
 const MAX_RESIDUAL: f64 = 1e-10;
 
 /// One camera: intrinsics in pixels of its own picture, pose in the dataset's world.
@@ -259,7 +259,7 @@ pub struct Camera {
     pub distortion: Distortion,
     /// Columns right, up, backwards (the camera looks along minus the third), orthonormal.
     pub rotation: DMat3,
-    /// Where the camera is, dataset units.
+    /// Position, in dataset units.
     pub position: DVec3,
 }
 

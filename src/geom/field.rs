@@ -38,7 +38,7 @@ pub trait SdfField: Sync {
         vec![f32::INFINITY; points.len()]
     }
 
-    /// Returns whether a point is known to be outside, so that the field need not be evaluated there.
+    /// Returns whether a point is known to be outside, so that the field need not be evaluated.
     fn excludes(&self, _point: Vec3) -> bool {
         false
     }

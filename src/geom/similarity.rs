@@ -11,7 +11,7 @@ pub struct Similarity {
     pub scale: f64,
     /// Orthonormal, determinant +1.
     pub rotation: DMat3,
-    /// Where the origin goes.
+    /// Image of the origin.
     pub translation: DVec3,
 }
 
@@ -20,7 +20,7 @@ impl Similarity {
     pub const IDENTITY: Similarity =
         Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
-    /// Returns what is wrong with it, if anything: a part, what it is, and what it should be.
+    /// Returns the first invalid part, if any: its name, its value and the expected one.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         // beyond that the way back is lost in f64
         if !(1e-12..=1e12).contains(&self.scale) {

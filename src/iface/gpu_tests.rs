@@ -393,7 +393,7 @@ fn a_device_with_too_little_room_is_refused_before_the_first_step() {
     };
     let config = IfaceConfig { stereo: 0.0, ..config() };
     let e = room(&IfaceConfig { samples: 100_000_000, ..config.clone() }, &device).err().unwrap();
-    assert!(e.to_string().contains("has room for") && e.hint().contains("iface.samples to"), "{e}");
+    assert!(e.to_string().contains("has memory for") && e.hint().contains("iface.samples to"), "{e}");
     // what fits beside 512 MiB that are not to be had: nothing at all, or samples, or samples and photographs
     let of = |mib: u64| self::device().unwrap().with_memory(mib << 20);
     let some = IfaceConfig { samples: 4096, ..config.clone() };

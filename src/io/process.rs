@@ -62,7 +62,7 @@ fn is_running(_: u32) -> bool {
     true
 }
 
-/// Returns what the system calls its processor; empty where it does not say.
+/// Returns the processor's name as the system reports it; empty if unknown.
 pub fn processor() -> String {
     let all = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let line = all.lines().find_map(|l| l.strip_prefix("model name"));

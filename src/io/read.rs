@@ -74,7 +74,7 @@ pub(super) fn read_capped(path: &Path, limit: u64, what: &'static str) -> Result
     Ok(bytes)
 }
 
-/// What a reader refuses to exceed, whatever a file says about itself.
+/// Limits of readers, independent of what a file claims.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// Longest side of a picture, pixels.
@@ -162,7 +162,7 @@ pub enum ReadError {
         /// The limit.
         limit: u64,
     },
-    /// The bytes are not what the format demands.
+    /// The bytes violate the format.
     #[error("`{}` is not a valid {format} file: {problem}{}", path.display(), at(*offset))]
     Damaged {
         /// The file.

@@ -64,7 +64,7 @@ impl TensorValues {
     }
 }
 
-/// What a checkpoint holds: tensors by name, and `__metadata__`.
+/// The content of a checkpoint: tensors by name, and `__metadata__`.
 pub type Tensors = (BTreeMap<String, (Vec<usize>, TensorValues)>, BTreeMap<String, String>);
 
 /// Writes a safetensors file in one step; the same content gives the same bytes, in whatever order the

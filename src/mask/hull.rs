@@ -1,4 +1,4 @@
-//! What masks of several views say about space: votes for every cell of a cube, and their silhouettes.
+//! Visual hull of the masks of several views: votes for every cell of a cube, and silhouettes of cells.
 //!
 //! A mask votes for a cell when the cell's center falls on the head, against it when it falls beside, and not at
 //! all outside its frame. A set of cells is drawn back into any view by its surface.
@@ -65,7 +65,7 @@ pub(super) struct Voter {
 }
 
 impl Voter {
-    /// Takes a mask for the camera's whole picture, at whatever size it is; head from 128.
+    /// Takes a mask of any size for the camera's whole picture; head from 128.
     pub fn new(camera: &Camera, mask: &Gray) -> Voter {
         Voter {
             frame: ViewFrame::new(&camera.resized(mask.width, mask.height)),

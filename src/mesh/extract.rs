@@ -32,12 +32,12 @@ use handles::cut_handles;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// How the surface is extracted.
+/// Options of the extraction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExtractOptions {
     /// Cells along the longest side of the box; 2..=8192.
     pub resolution: usize,
-    /// Every how many cells the field is evaluated first: 2, 4 or 8. Smaller finds smaller loose pieces.
+    /// Cell step of the first evaluation of the field: 2, 4 or 8. Smaller steps find smaller loose pieces.
     pub coarse_step: usize,
     /// Handles are cut, or their holes filled, where they have a loop no longer than this share of the surface's
     /// longest side; 0..=1, 0 leaves them all.
@@ -48,13 +48,13 @@ pub struct ExtractOptions {
 /// is a strand or a hole as thick as a thumb. A share, because not every capture has a known unit.
 pub const MAX_HANDLE: f32 = 0.15;
 
-/// Most points in one call of a field.
+/// Maximum number of points in one call of a field.
 pub(super) const BATCH: usize = 1 << 16;
 
 /// Newton steps that move vertices onto the field's zero.
 const NEWTON_STEPS: usize = 2;
 
-/// How far vertices slide towards the middle of their neighbors with the first step.
+/// Share by which vertices move towards the mean of their neighbors in the first step.
 const RELAX: f32 = 0.5;
 
 impl Default for ExtractOptions {
@@ -63,7 +63,7 @@ impl Default for ExtractOptions {
     }
 }
 
-/// What [`extract`] found and did.
+/// A report of [`extract`].
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct MeshReport {
     /// Cells along x, y, z.
@@ -74,7 +74,7 @@ pub struct MeshReport {
     pub grid: [[f32; 3]; 2],
     /// Nodes at which the field was evaluated.
     pub nodes_evaluated: usize,
-    /// The same as a share of all nodes, 0..=1.
+    /// Share of all nodes at which the field was evaluated, 0..=1.
     pub share_evaluated: f64,
     /// Nodes outside the hull, taken as outside without being evaluated.
     pub nodes_outside_hull: usize,
@@ -82,13 +82,13 @@ pub struct MeshReport {
     pub non_finite: usize,
     /// Inside nodes on the faces of the box, where the surface was capped.
     pub capped: usize,
-    /// What cleaning removed.
+    /// The report of cleaning.
     pub clean: CleanReport,
     /// Mean |f| / |∇f| over vertices before they moved, in cells.
     pub off_surface_before: f64,
-    /// The same after.
+    /// Mean |f| / |∇f| after they moved, in cells.
     pub off_surface_after: f64,
-    /// Vertices that some step moved less than the field wanted, because a face would have been spoiled.
+    /// Number of vertices that a step moved less than the Newton step, because a face would have folded.
     pub held_back: usize,
     /// Handles that were cut, filled or left.
     #[serde(default)]
@@ -108,7 +108,7 @@ impl MeshReport {
         Aabb { min, max }
     }
 
-    /// Adds what is measured of the finished mesh.
+    /// Fills in the measurements of the finished mesh.
     fn measure(&mut self, mesh: &Mesh, begin: Instant) {
         self.topology = topology(&mesh.positions, &mesh.triangles);
         self.handles.left = self.topology.genus.map_or(0, |g| g as usize);
@@ -116,7 +116,7 @@ impl MeshReport {
         self.seconds = begin.elapsed().as_secs_f64();
     }
 
-    /// Returns what a person should know, one sentence each; `cap`: has the cap stayed?
+    /// Returns warnings for the user, one sentence each; `cap` says whether the cap was kept.
     pub fn warnings(&self, cap: bool) -> Vec<String> {
         let mut out = Vec::new();
         if self.capped > 0 {
@@ -241,7 +241,7 @@ pub fn extract(
     Ok((mesh, report))
 }
 
-/// Returns the colors of the vertices as they are seen along their normals; what is not finite is black.
+/// Returns the colors of the vertices as seen along their normals; non-finite values become 0.
 fn colors_along_normals(mesh: &Mesh, field: &dyn SdfField) -> Result<Vec<[f32; 3]>> {
     let mut out = Vec::with_capacity(mesh.positions.len());
     for (points, normals) in mesh.positions.chunks(BATCH).zip(mesh.normals.chunks(BATCH)) {
@@ -326,7 +326,7 @@ impl NodeGrid {
         Ok(NodeGrid { dims: cells.map(|c| c + 1), origin, spacing })
     }
 
-    /// Returns where a node lies.
+    /// Returns the position of a node.
     pub fn point(&self, node: [usize; 3]) -> Vec3 {
         let n = DVec3::new(node[0] as f64, node[1] as f64, node[2] as f64);
         (self.origin.as_dvec3() + n * f64::from(self.spacing)).as_vec3()
@@ -413,7 +413,7 @@ pub fn clean(mesh: &mut Mesh) -> Result<CleanReport> {
     Ok(report)
 }
 
-/// How much the surface's box grows on each side, as a share of its size.
+/// Margin around the surface's box on each side, as a share of its size.
 const MARGIN: f32 = 0.1;
 
 /// Meshes the zero level set of a field on all nodes of a grid of `resolution`³ nodes, first over `bounds` and then over

@@ -2,7 +2,7 @@
 //!
 //! Two kinds of JSON are read: nerfstudio's camera path (`camera_path`, made in its viewer) and
 //! `transforms.json` (`frames`). Both give camera-to-world matrices with OpenGL axes, as ours are, and
-//! must be in the dataset's own world. A path from nerfstudio's viewer is only if training there ran
+//! must be in the dataset's own world. A path from nerfstudio's viewer is only if its training ran
 //! with `--orientation-method none --center-method none --auto-scale-poses False`.
 
 use crate::capture::camera_like;

@@ -297,7 +297,7 @@ impl Stop {
         }
     }
 
-    /// Returns the error to end with, which says what is kept.
+    /// Returns the error to end with, which says which files are kept.
     pub fn error(&self, kept: impl std::fmt::Display) -> Error {
         Error::stopped(kept).with_kind(self.requested().unwrap_or(ErrorKind::Interrupted))
     }

@@ -134,13 +134,13 @@ impl VmOps for CpuVm<'_> {
         }
     }
 
-    fn forget(&mut self) {
+    fn reset_totals(&mut self) {
         self.figures = VmFigures { broken: self.figures.broken, ..VmFigures::default() };
     }
 
     fn figures(&mut self) -> Result<VmFigures> {
         let figures = self.figures;
-        self.forget();
+        self.reset_totals();
         Ok(figures)
     }
 }

@@ -283,7 +283,7 @@ fn a_device_with_too_little_memory_is_refused_before_the_first_step_and_told_wha
     };
     assert!(refused(&config(), 1024).unwrap(), "photographs lie there");
     let e = refused(&config(), 512).err().unwrap();
-    assert!(e.to_string().contains("has room for 0 rays") && e.hint().contains("voxels_final"), "{e:?}");
+    assert!(e.to_string().contains("has memory for 0 rays") && e.hint().contains("voxels_final"), "{e:?}");
     // what is told fits, and one ray more does not
     let many = VmConfig { rays: 1_000_000, ..config() };
     let e = refused(&many, 2048).err().unwrap();

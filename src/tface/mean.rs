@@ -92,7 +92,7 @@ fn folder(dir: &Path, i: usize) -> PathBuf {
 }
 
 /// Trains `config.fields` fields one after the other, saving checkpoints into the session's folder and continuing
-/// from those that lie there.
+/// from existing ones.
 ///
 /// `views` have their cameras in scene coordinates; `bounds` is the scene's tight box; `hull` the masks' visual hull
 /// over [-1, 1]³.
@@ -162,7 +162,7 @@ pub fn train(
 /// One field's share of the stage's steps.
 struct Part<'a> {
     monitor: &'a dyn Monitor,
-    /// From 1.
+    /// Number of the field, from 1.
     field: usize,
     fields: usize,
     /// Steps of the fields before it.

@@ -31,7 +31,7 @@ const TILE: usize = 64;
 /// The most samples of a pass through a field that does not learn: of rays that have more, fewer are taken.
 const SEEN: usize = 1 << 22;
 
-/// A field on a device, and room for a batch of rays.
+/// A field on a device, with buffers for a batch of rays.
 pub struct Vm {
     /// Planes and lines of the density.
     pub density: DeviceGrid,
@@ -46,43 +46,49 @@ pub struct Vm {
 /// The weights of a field on a device: planes and lines as [`DeviceGrid::upload`] lays them, the decoder's as the CPU's.
 #[derive(Clone, Copy)]
 pub struct VmValues<'a> {
-    /// Of the density.
+    /// Planes and lines of the density.
     pub density: &'a Buffer,
-    /// Of the appearance.
+    /// Planes and lines of the appearance.
     pub color: &'a Buffer,
-    /// Of the decoder.
+    /// Weights of the decoder.
     pub network: &'a Buffer,
 }
 
 impl Vm {
-    /// For so many rays, whatever they meet; with room for gradients where it learns. The decoder must be one that
+    /// Allocates buffers for `rays` rays with any number of samples, and for gradients if `learns`. The decoder must be one that
     /// [`DeviceDecoder::supports`].
     pub fn new(device: &Device, field: &VmField, rays: usize, learns: bool) -> Vm {
-        Vm::with_room(device, field, rays, if learns { usize::MAX } else { SEEN }, learns)
+        Vm::with_max_samples(device, field, rays, if learns { usize::MAX } else { SEEN }, learns)
     }
 
     /// Returns the bytes of a field that learns from batches of so many rays: with values, moments and gradients, and for
-    /// each ray of a batch. Rays have room for all samples that they can have.
+    /// each ray of a batch. Buffers hold all samples that rays can have.
     pub fn bytes(device: &Device, field: &VmField, rays: usize) -> [u64; 2] {
         let floats = |grid: Grid| DeviceGrid::padded(grid).len();
         let copies = if device.atomics() == Atomics::Fixed { 5 } else { 4 };
         let grids = copies * (floats(field.density) + floats(field.color));
-        let (most, quads) = (DeviceLattice::most(field), DeviceGrid::quads_of(field.color));
-        let gradients = DeviceDecoder::words_of_gradients(&field.decoder, quads, rays * most);
-        let samples = most * (VmSamples::WORDS + Along::WORDS);
+        let (max_samples, quads) = (DeviceLattice::max_samples(field), DeviceGrid::quads_of(field.color));
+        let gradients = DeviceDecoder::words_of_gradients(&field.decoder, quads, rays * max_samples);
+        let samples = max_samples * (VmSamples::WORDS + Along::WORDS);
         [4 * (grids + gradients) as u64, 4 * (samples + Along::OF_RAY) as u64]
     }
 
     /// Bytes of the largest buffer for each ray of a batch.
     pub fn widest(field: &VmField) -> u64 {
-        12 * DeviceLattice::most(field) as u64
+        12 * DeviceLattice::max_samples(field) as u64
     }
 
-    /// With room for `most` samples at most.
-    fn with_room(device: &Device, field: &VmField, rays: usize, most: usize, learns: bool) -> Vm {
+    /// Allocates buffers for at most `max_samples` samples.
+    fn with_max_samples(
+        device: &Device,
+        field: &VmField,
+        rays: usize,
+        max_samples: usize,
+        learns: bool,
+    ) -> Vm {
         assert_eq!(field.density.size, field.color.size);
         let lattice = DeviceLattice::new(device, field);
-        let capacity = rays.saturating_mul(lattice.most).min(most).next_multiple_of(TILE);
+        let capacity = rays.saturating_mul(lattice.max_samples).min(max_samples).next_multiple_of(TILE);
         let color = DeviceGrid::new(device, field.color);
         Vm {
             density: DeviceGrid::new(device, field.density),
@@ -94,7 +100,7 @@ impl Vm {
         }
     }
 
-    /// Renders rays, all that there is room for: planes `[5, rays]`, see [`crate::kernel::cpu::vm::RAY_WIDTH`].
+    /// Renders all rays whose samples fit into the buffers: planes `[5, rays]`, see [`crate::kernel::cpu::vm::RAY_WIDTH`].
     pub fn render(&self, device: &Device, values: VmValues, rays: &Batch) -> &Buffer {
         let (samples, along) = (&self.samples, &self.along);
         self.decoder.prepare(device, values.network);
@@ -106,7 +112,7 @@ impl Vm {
         &along.out
     }
 
-    /// What the last render composited, planes `[5, rays]`.
+    /// Returns the composited values of the last render, planes `[5, rays]`.
     pub fn output(&self) -> &Buffer {
         &self.along.out
     }
@@ -142,7 +148,7 @@ impl Vm {
         );
     }
 
-    /// How many samples were looked up, and would have been with more room, and how many decoded, `[2]` each; and lattice points of each ray, `[rays]`.
+    /// Returns the number of samples that were looked up and that would have been with larger buffers, the same of decoded ones, `[2]` each; and the lattice points of each ray, `[rays]`.
     pub fn counts(&self) -> [&Buffer; 3] {
         [&self.samples.count, &self.along.count, &self.samples.points]
     }

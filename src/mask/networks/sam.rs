@@ -36,7 +36,7 @@ pub(super) struct Sam {
     normal: Normal,
 }
 
-/// What the encoder makes of a photograph, and how the photograph lay in the square.
+/// The encoder's embedding of a photograph, and the photograph's position in the square.
 pub(super) struct Embedding {
     /// `image_embeddings`, and for the split export `image_positional_embeddings`.
     arrays: Vec<NetworkArray>,
@@ -209,7 +209,7 @@ impl Sam {
     }
 
     fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<()> {
-        // contradictions are looked for at the size that was clicked on: reduced, two clicks may share a pixel
+        // contradictions are searched at the size that was clicked on: reduced, two clicks may share a pixel
         prompts::check_places("the photograph", clicks, width as u32, height as u32)?;
         if clicks.len() > MAX_CLICKS {
             return Err(Error::cannot(

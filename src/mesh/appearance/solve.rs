@@ -13,8 +13,8 @@ const STEPS: usize = 30;
 
 /// Weights of the smoothness terms, relative to the squared error of one pixel.
 ///
-/// On a surface the sum of squared differences is the same however fine the nodes are: its weight says how many pixels
-/// there are, on average, in the area over which a fit is smoothed.
+/// On a surface the sum of squared differences is the same however fine the nodes are: its weight is the number of pixels that are
+/// on average in the area over which a fit is smoothed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Smoothness {
     /// Squares of differences between neighbors, of constant terms.

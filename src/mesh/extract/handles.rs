@@ -8,7 +8,7 @@
 //! Of the loops of a handle the field chooses: that over whose disc it is least to be overcome, `∫ |f|`. A thin
 //! strand has little matter to cut and a narrow slit little air to fill, however long the slit is. The
 //! field is not closed or opened itself and meshed again, as morphology would: how far that goes before a
-//! handle gives way is known only afterwards, it rounds off what is beside, and costs a second extraction. Here
+//! handle disappears is known only afterwards, it rounds off nearby surface, and costs a second extraction. Here
 //! every vertex stays on the zero set, and the new triangles become part of it for those who hold
 //! the mesh against the field later ([`Patches`]).
 //!
@@ -27,7 +27,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 /// Maximum number of sides of a loop that is cut: the triangulation's cost grows with its cube.
 const MAX_SIDES: usize = 256;
 
-/// How far the rims are drawn back, as shares of the way to the vertices behind them; the first that fits.
+/// Candidate distances by which the rims are drawn back, as shares of the way to the vertices behind them; the first that fits is used.
 const RIM_RETRACTIONS: [f32; 3] = [0.5, 0.25, 0.1];
 
 /// Boxes compared for one triangle of a cap, at most: a sound surface takes hundreds.
@@ -221,7 +221,7 @@ struct HandleCutter<'a> {
 
 /// The changes that a cut makes to the mesh.
 struct CutPlan {
-    /// Where vertices go, the copies included.
+    /// New positions of the vertices, including copies.
     moved: HashMap<u32, Vec3>,
     /// Triangles at the rims, with the copies on the right.
     at_rims: BTreeMap<u32, [u32; 3]>,

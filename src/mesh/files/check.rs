@@ -39,7 +39,7 @@ use std::fmt;
 /// Triangles worse than this are slivers; an equilateral one has 1.
 const SLIVER: f64 = 0.05;
 
-/// How far from 1 a normal's length may be; the Khronos validator's own bound.
+/// Maximum deviation of a normal's length from 1; the Khronos validator's own bound.
 const NORMAL_TOLERANCE: f32 = 5e-4;
 
 /// The result of [`check`]. Counts of triangles are of the mesh as given; topology is after welding.
@@ -462,7 +462,7 @@ apart                {apart}, from the border {border:.2} texels
 
 /// Returns the text before and after a figure that is a bound because `left` candidates were not compared.
 pub(super) fn bound(which: &'static str, left: usize, of: &str) -> (&'static str, String) {
-    if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not looked at further)")) }
+    if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not compared further)")) }
 }
 
 /// Measures an atlas. Never panics, whatever mesh and atlas; lengths are those of the mesh.
@@ -560,9 +560,9 @@ pub fn seams_facing(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
     joined.seam_length(|a, b| faces(normal(a) + normal(b)))
 }
 
-/// Which triangles the texture joins.
+/// Charts of an atlas: the triangles that the texture joins.
 struct Joined {
-    /// For each triangle the lowest one of its chart.
+    /// The lowest triangle of each triangle's chart.
     chart: Vec<u32>,
     /// Sides that border on no triangle of the chart: `3 t + k` for the side from corner k of triangle t.
     rims: Vec<u32>,

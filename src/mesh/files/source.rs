@@ -1,4 +1,4 @@
-//! What readers share: the mesh that they make, the file, its limits, and its errors.
+//! Types that all readers share: the mesh that they return, the file, its limits, and its errors.
 
 use crate::geom::{Atlas, Mesh};
 use crate::{Error, Result};
@@ -61,7 +61,7 @@ impl Source<'_> {
     pub fn broken(&self, at: impl Display, what: impl Display) -> Error {
         let hint = match self.format {
             "GLB" => "export it again; the Khronos validator explains a GLB in detail",
-            _ => "export it again, or open it in Blender or MeshLab and save it anew from there",
+            _ => "export it again, or open it in Blender or MeshLab and save it anew",
         };
         Error::cannot(format!("`{}`, {at}: {what}", self.path.display()), hint)
     }

@@ -245,7 +245,7 @@ fn fixed_point_scales(partial: &[f32], units: &mut [f32]) {
     }
 }
 
-/// Adds the fixed-point sums as floats to the gradient and resets them to zero, if there were samples from `from` on.
+/// Adds the fixed-point sums as floats to the gradient and resets them to zero, if the step had samples from `from` on.
 #[cube(launch)]
 fn flush_fixed_point(
     fixed_sums: &mut [i32],

@@ -16,12 +16,12 @@ pub struct VmRenderer {
     device: Arc<Device>,
     vm: Vm,
     values: [Buffer; 3],
-    /// Rays of a pass whose samples there was room for so far.
+    /// Number of rays of a pass; halved whenever their samples do not fit into the buffers.
     pass: usize,
 }
 
 impl VmRenderer {
-    /// Of flat planes and lines of density and appearance, and flat decoder weights. The decoder must be one that
+    /// Uploads flat planes and lines of density and appearance, and flat decoder weights. The decoder must be one that
     /// [`DeviceDecoder::supports`](super::DeviceDecoder::supports).
     pub fn new(device: Arc<Device>, field: &VmField, [density, color, network]: [&[f32]; 3]) -> VmRenderer {
         let vm = Vm::new(&device, field, PASS, false);
@@ -41,7 +41,7 @@ impl VmRenderer {
             let out = device.fetch::<f32>(out)?;
             let [count, ..] = self.vm.counts();
             let found = device.fetch::<u32>(count)?;
-            // some had no room: all once more, in smaller passes
+            // samples did not fit: render again, in smaller passes
             if found[0] < found[1] && own.len() > 1 {
                 self.pass = own.len() / 2;
                 continue;
@@ -72,7 +72,7 @@ mod tests {
         agree("rendered", renderer.render(&case.rays).unwrap().as_flattened(), &want, 1e-4);
         assert_eq!(renderer.pass, PASS);
         // room for a third of the samples
-        renderer.vm = Vm::with_room(&renderer.device, &case.field, PASS, 1600, false);
+        renderer.vm = Vm::with_max_samples(&renderer.device, &case.field, PASS, 1600, false);
         agree("rendered in passes", renderer.render(&case.rays).unwrap().as_flattened(), &want, 1e-4);
         assert_eq!(renderer.pass, 125);
     }
