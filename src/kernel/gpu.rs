@@ -8,8 +8,6 @@
 //! Many threads that add to one word use atomics, whose kind [`Atomics`] selects. All other sums have a fixed order.
 
 mod adam;
-#[cfg(test)]
-mod case_tests;
 mod color;
 mod density;
 mod device;
@@ -24,7 +22,6 @@ mod points;
 mod rng;
 mod schedule;
 mod sdf;
-mod search;
 mod sum;
 mod tile;
 mod vm;
@@ -46,5 +43,7 @@ pub use sdf::Sdf;
 pub use vm::{DeviceDecoder, DeviceGrid, Vm, VmLosses, VmRenderer, VmValues};
 pub use weight_norm::WeightNorm;
 
+#[cfg(test)]
+mod case_tests;
 #[cfg(test)]
 pub(crate) use device::tests;

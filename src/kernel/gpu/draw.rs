@@ -3,8 +3,7 @@
 //! The pixel of a ray depends on seed, step and the ray's index alone, as on the CPU.
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::rng::{Wide, below, permuted, stream, uniform, word};
-use super::search::{ranked, upper_bound};
+use super::rng::{Wide, below, permuted, ranked, stream, uniform, upper_bound, word};
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::rng;

@@ -2,8 +2,7 @@
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
-use super::super::rng::{self, Wide};
-use super::super::search::ranked;
+use super::super::rng::{self, Wide, ranked};
 use super::super::sum::group_sum;
 use super::{Occupancy, UNITS};
 use crate::Result;
