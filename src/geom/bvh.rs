@@ -526,7 +526,7 @@ impl Bvh {
                     self.nodes[ours].bounds[1][axis][lane] = b.max[axis];
                 }
                 self.nodes[ours].child[lane] = if tree.nodes[n].is_leaf() {
-                    // no more than the four that the builder was asked for
+                    // no more than the four that the builder was configured for
                     self.add_leaf(mesh, &members(n).collect::<Vec<u32>>())
                 } else {
                     self.nodes.push(WideNode::EMPTY);

@@ -29,7 +29,7 @@ pub enum Projection {
 /// - fisheye: radial `1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸`, where r is the angle θ;
 /// - both: tangential p1, p2 as in OpenCV and a thin prism (sx1, sy1) · r² (Weng, Cohen and Herniou).
 ///
-/// Half of a sphere is the most that is seen: beyond 90° from the axis no ray is given.
+/// At most half of a sphere is visible: no rays beyond 90° from the axis.
 #[derive(Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Distortion {
     /// r² coefficient.
@@ -94,7 +94,7 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 const MAX_ANGLE: f64 = std::f64::consts::FRAC_PI_2 - 1e-3;
 
 impl Distortion {
-    /// Returns whether it does nothing.
+    /// Returns whether all coefficients are zero.
     pub fn is_none(&self) -> bool {
         *self == Distortion::default()
     }

@@ -1,4 +1,4 @@
-//! A colored signed distance: what the extraction and the finishing of a mesh need to know of a learned field.
+//! A colored signed distance: the interface of a learned field to the extraction and finishing of meshes.
 
 use glam::Vec3;
 use rayon::prelude::*;

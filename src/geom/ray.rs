@@ -31,7 +31,7 @@ pub struct RayResult {
     pub color: [f32; 3],
     /// Sum of weights, 0..=1.
     pub opacity: f32,
-    /// Expected distance along the ray, scene units; 0 where nothing was met.
+    /// Expected distance along the ray, scene units; 0 without a surface.
     pub depth: f32,
     /// Expected normal in the scene, unit length or zero; zero if it was not requested.
     pub normal: Vec3,
@@ -76,7 +76,7 @@ pub struct Aabb {
 }
 
 impl Aabb {
-    /// The box that holds nothing; growing it by a point gives that point.
+    /// The empty box; growing it by a point gives that point.
     pub const EMPTY: Aabb = Aabb { min: Vec3::INFINITY, max: Vec3::NEG_INFINITY };
 
     /// The cube [-1, 1]³ that every scene is fitted into.

@@ -16,7 +16,7 @@ pub struct Similarity {
 }
 
 impl Similarity {
-    /// Changes nothing.
+    /// The identity.
     pub const IDENTITY: Similarity =
         Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
@@ -42,17 +42,17 @@ impl Similarity {
         Similarity { scale, rotation: DMat3::IDENTITY, translation }
     }
 
-    /// Returns where a point goes.
+    /// Transforms a point.
     pub fn point(&self, p: Vec3) -> Vec3 {
         (self.scale * (self.rotation * p.as_dvec3()) + self.translation).as_vec3()
     }
 
-    /// Returns where a point goes, in f64.
+    /// Transforms a point in f64.
     pub fn point_f64(&self, p: DVec3) -> DVec3 {
         self.scale * (self.rotation * p) + self.translation
     }
 
-    /// Returns where a direction goes; its length is kept, so unit stays unit (also right for normals).
+    /// Rotates a direction; its length is kept, so unit vectors and normals stay unit.
     pub fn direction(&self, d: Vec3) -> Vec3 {
         self.rotation.as_mat3() * d
     }

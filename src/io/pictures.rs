@@ -182,7 +182,7 @@ impl<'a> PictureFile<'a> {
         }
     }
 
-    /// Walks the segments of a JPEG to the end-of-image marker and returns the most pixels its picture data can hold:
+    /// Walks the segments of a JPEG to the end-of-image marker and returns the maximum number of pixels in its picture data:
     /// a block of 64 takes a bit at least, and without progression a second one for its end.
     fn walk_jpeg(self) -> Result<u64, ReadError> {
         let bytes = self.bytes;

@@ -1,4 +1,4 @@
-//! Cost of this process, its processor, and whether other processes run, as far as the system says.
+//! Cost of this process, its processor, and whether other processes run, as far as the system reports it.
 
 use std::path::Path;
 
@@ -18,7 +18,7 @@ pub fn cpu_seconds() -> f64 {
     }
 }
 
-/// Returns the most memory that this process has had since [`forget_peak_memory`], bytes; `None` where the system does
+/// Returns the peak memory of this process since [`forget_peak_memory`], bytes; `None` where the system does
 /// not say.
 pub fn peak_memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

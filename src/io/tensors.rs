@@ -135,7 +135,7 @@ pub fn parse_tensors(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Tenso
         return Err(bad(Some(bytes.len() as u64), "it ends inside its header length".into()));
     };
     if length > MAX_HEADER {
-        // what a flipped bit in the first bytes looks like: damage, not a large file
+        // a flipped bit in the first bytes gives such a length: damage, not a large file
         return Err(bad(Some(0), format!("its header claims {length} bytes, the limit is {MAX_HEADER}")));
     }
     let Some(header) = bytes.get(8..8 + length as usize) else {

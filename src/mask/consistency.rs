@@ -113,7 +113,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
             let total: f64 = (0..claims.len()).filter(|&i| active[i]).map(|i| conflict.too_much[i]).sum();
             return Ok(Consistency { masks: claims.len(), conflicts, left: total / left.max(1) as f64 });
         };
-        // of two masks nothing says which is wrong
+        // of two masks it is unknown which one is wrong
         let named = if left == 2 { (0..claims.len()).filter(|&i| active[i]).collect() } else { vec![worst] };
         for i in named {
             active[i] = false;
@@ -284,7 +284,7 @@ impl Conflicts {
 struct Opposition {
     /// Claims whose ray meets a cell in another view's frame.
     asked: usize,
-    /// Share of them that nothing explains.
+    /// Share of them that no cell explains.
     open: f64,
     /// Per view: the share of the claims that it rules out, divided among all views that do; and the same undivided.
     opposing: Vec<[f64; 2]>,
@@ -399,7 +399,7 @@ const MIN_SUPPORT_SHARE: f64 = 0.25;
 const OPEN_CLAIM_WEIGHT: f64 = 1.0 / 3.0;
 /// Mean share of the others' masks that a view may rule out.
 const MAX_RULED_OUT: f64 = 0.003;
-/// Share of its own claims that may stand open.
+/// Maximum share of its own claims that may be open.
 const MAX_OPEN: f64 = 0.05;
 
 /// The verdict on a proposed mask.

@@ -225,7 +225,7 @@ pub fn dilate(marked: &[bool], width: usize, height: usize, kernel: u32, iterati
     assert_eq!(marked.len(), width * height);
     let (kernel, iterations) = (kernel.max(1) as usize, iterations as usize);
     // squares applied in turn are one larger square, and a square is a row of columns; OpenCV does not
-    // mirror the kernel when it dilates, so both look as far before as behind
+    // mirror the kernel when it dilates, so both reach as far before as behind
     let before = (kernel / 2).saturating_mul(iterations);
     let behind = (kernel - 1 - kernel / 2).saturating_mul(iterations);
     let mut rows = vec![false; marked.len()];

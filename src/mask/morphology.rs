@@ -50,7 +50,7 @@ pub fn grow(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<bo
     squared_distance(marked, width, height).iter().map(|&d| d <= radius * radius).collect()
 }
 
-/// Marked pixels farther than `radius` pixels from every pixel that is not; beyond the border nothing is known,
+/// Marked pixels farther than `radius` pixels from every pixel that is not; pixels beyond the border are unknown,
 /// so the border does not shrink them.
 pub fn shrink(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<bool> {
     let outside: Vec<bool> = marked.iter().map(|m| !m).collect();

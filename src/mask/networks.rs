@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! photograph + clicks ── segment ── hard mask        photograph + trimap ── alpha ── soft alpha
-//! photograph ─────────── propose ── alpha of whatever the network takes for what is meant
+//! photograph ─────────── propose ── alpha of the network's foreground
 //! ```
 //!
 //! Files are recognized by their inputs and outputs, looked through before an engine sees them, and recorded

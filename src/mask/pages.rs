@@ -1,13 +1,13 @@
 //! Pages of masks, one HTML file each: the annotation page to click on, and the contact sheet.
 //!
 //! **Annotation page**: photographs in, `prompts.json` out.
-//! Nothing is loaded from elsewhere and nothing is sent: photographs lie inside as JPEG, reduced, while clicks
+//! The pages load and send no data: photographs lie inside as JPEG, reduced, while clicks
 //! are counted in pixels of the originals. The page's own text is `annotation.html`; names of files reach it only as
 //! JSON in which no character can end the element that holds it.
 //!
 //! **Contact sheet**: all masks over their photographs, to see at a glance which went wrong.
 //! The mask's outline is cyan, the unknown band yellow; below each picture stand the view's name, how much the mask
-//! covers and how much is unknown. Views that look suspicious have a red frame and say why. The sheet is HTML with
+//! covers and how much is unknown. Suspicious views have a red frame and list the reasons. The sheet is HTML with
 //! the pictures inside: a page of its own, and a part of the report.
 
 use super::matting::{UNKNOWN, unknown_share};

@@ -431,7 +431,7 @@ pub fn extract_dense(
 ) -> Result<(Mesh, MeshReport)> {
     let begin = Instant::now();
     setting((2..=2048).contains(&resolution), "mesh.resolution", "2..=2048", resolution)?;
-    NodeGrid::fit(bounds, resolution)?; // says what is wrong with the box
+    NodeGrid::fit(bounds, resolution)?; // refuses an invalid box
     let steps = 2 * resolution as u64;
     let layers = |pass: u64, inside: Aabb| -> Result<(Vec<f32>, Vec3)> {
         let spacing = inside.size() / (resolution - 1) as f32;

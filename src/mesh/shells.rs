@@ -46,14 +46,14 @@ const RAYS_PER_PIXEL: usize = RAYS_PER_SIDE * RAYS_PER_SIDE;
 /// Every n-th photograph is left out, to validate the layers.
 const VALIDATION_STRIDE: usize = 6;
 
-/// Share of the squared error of left-out outlines that layers must take away.
+/// Minimum share of the squared error of left-out outlines that layers must remove.
 const MIN_GAIN: f64 = 0.05;
 
 /// Weights of squared logits, and of squared differences along an edge, against the square of one pixel's error.
 const RIDGE: f64 = 0.01;
 const SMOOTH: f64 = 0.05;
 
-/// The most steps of conjugate gradients.
+/// Maximum number of steps of conjugate gradients.
 const STEPS: usize = 60;
 
 /// A report of the layers.
@@ -219,7 +219,7 @@ impl Outlines {
                 let target = f32::from(mask.values[at]) / 255.0;
                 let (x, y) = (at % mask.width as usize, at / mask.width as usize);
                 let (whole, rays) = look(photograph.camera, (x, y), &bvh, &caster);
-                // what neither is nor should be anything says nothing, nor does what is whole anyway
+                // pixels without opacity in render and mask, and opaque ones, carry no information
                 let says = whole < RAYS_PER_PIXEL && (target > 0.0 || rays.iter().any(|l| !l.is_empty()));
                 says.then_some((target, whole, rays))
             };

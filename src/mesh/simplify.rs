@@ -108,9 +108,9 @@ pub fn simplify(
 /// Options of simplification.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimplifyConfig {
-    /// Triangles to keep; 0 goes as far as `error` lets it.
+    /// Number of triangles to keep; 0 for as few as `error` allows.
     pub triangles: usize,
-    /// Most distance from the surface, in units of the positions; 0 goes as far as `triangles` says.
+    /// Maximum distance from the surface, in units of the positions; 0 if only `triangles` limits the simplification.
     pub error: f32,
 }
 

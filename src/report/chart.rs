@@ -1,4 +1,4 @@
-//! Lines over training steps, or over what else has numbers, as SVG inside a page.
+//! Line charts over training steps or another quantity, as SVG inside a page.
 
 use super::escape;
 use serde_json::Value;
@@ -66,7 +66,7 @@ const MAX_POINTS: usize = 240;
 const MIN_LOG_RANGE: f64 = 30.0;
 
 impl Chart {
-    /// Returns the drawing with its title and what its lines are called: a part of a page.
+    /// Returns the drawing with its title and legend: a part of a page.
     pub fn html(&self) -> String {
         let points = || self.curves.iter().flat_map(|c| &c.points).filter(|p| p.1.is_finite());
         let span = |values: &mut dyn Iterator<Item = f64>| {

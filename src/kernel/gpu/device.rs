@@ -213,7 +213,7 @@ fn memory_of(adapter: &wgpu::Adapter) -> Option<u64> {
     heaps.iter().filter(|heap| heap.flags.as_raw() & DEVICE_LOCAL != 0).map(|heap| heap.size).max()
 }
 
-/// Returns nothing: Metal states no size, but one that it recommends.
+/// Returns `None`: Metal states no size, but one that it recommends.
 #[cfg(target_vendor = "apple")]
 fn memory_of(_: &wgpu::Adapter) -> Option<u64> {
     None

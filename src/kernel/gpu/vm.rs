@@ -1,6 +1,6 @@
 //! TensoRF's field of [`crate::kernel::cpu::vm`], whose modules hold the formulas: rays through it, and their gradients.
 //!
-//! Samples are marched first, all that the mask leaves; then their densities are looked up, weights are composited, and
+//! Samples in occupied cells are marched first; then their densities are looked up, weights are composited, and
 //! those worth a color are listed and decoded. The rays that the CPU ends early are marched on here, but what lies
 //! behind has neither weight nor gradient either. [`VmRenderer`] renders a trained field along any number of rays.
 

@@ -291,7 +291,7 @@ impl PixelGraph {
         }
     }
 
-    /// Steps from a node to its terminal, or nothing when it hangs on an orphan; marks the way as known.
+    /// Returns the number of steps from a node to its terminal, or `None` if an orphan lies on the path; marks the path as known.
     fn depth_below_root(&mut self, start: usize) -> Option<u32> {
         let (mut q, mut steps) = (start, 0);
         let depth = loop {

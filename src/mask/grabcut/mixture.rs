@@ -2,7 +2,7 @@
 //!
 //! `p(c) = Σ_k w_k · N(c; μ_k, Σ_k)`. It starts from seeded k-means (Arthur & Vassilvitskii 2007) and is refitted
 //! as in GrabCut (Rother, Kolmogorov, Blake 2004): every color goes to its likeliest Gaussian, whose mean and
-//! covariance are measured again. A covariance always gains the least that 8-bit rounding and sensor noise leave,
+//! covariance are measured again. A covariance always gains the minimum that 8-bit rounding and sensor noise leave,
 //! so that one flat color is no singular Gaussian.
 
 use crate::geom::cofactors;

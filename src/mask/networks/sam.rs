@@ -20,7 +20,7 @@ use std::path::Path;
 
 /// Pixels of the photograph under one cell of the embedding.
 const CELL: usize = 16;
-/// The side of every public file, where neither network nor processor file says otherwise.
+/// The side of every public file, used if neither network nor processor file gives another one.
 const USUAL_SIDE: usize = 1024;
 /// Clicks on one photograph; each is a token of the decoder.
 const MAX_CLICKS: usize = 256;

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 /// The sum of squares left at which a fit ends, of that at its start.
 const TOLERANCE: f64 = 1e-8;
 
-/// The most steps of conjugate gradients.
+/// Maximum number of steps of conjugate gradients.
 const STEPS: usize = 30;
 
 /// Weights of the smoothness terms, relative to the squared error of one pixel.

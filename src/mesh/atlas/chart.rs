@@ -3,7 +3,7 @@
 //! Patches of a surface: which triangles lie beside each other, parts as meshes of their own, how far a chart is
 //! from the sizes of its surface.
 //!
-//! The face stands upright in the texture: so that it can be painted.
+//! The face stands upright in the texture, so that it can be painted.
 
 use crate::geom::{Mesh, Sets, side_ends, sorted_sides};
 use glam::{DVec2, Vec3};
@@ -60,7 +60,7 @@ impl Flat {
         alone.map(|run| side_ends(&self.corners, run[0].1)).collect()
     }
 
-    /// Returns the parts that hang together across sides, without the triangles that are not to be `kept`. Parts that
+    /// Returns the parts that are connected across sides, of the triangles that are `kept`. Parts that
     /// meet in a corner only no longer share it.
     pub fn parts(&self, kept: impl Fn(usize) -> bool) -> Vec<Flat> {
         let mut sets = Sets::new(self.corners.len());

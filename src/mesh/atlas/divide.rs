@@ -336,7 +336,7 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     })
 }
 
-/// Gives `number` to the first triangle and all without one that hang together with it; how many they are.
+/// Gives `number` to the first triangle and all connected ones without a number, and returns their count.
 fn flood(adjacent: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usize {
     let (mut open, mut count) = (vec![first], 1);
     piece[first as usize] = number;

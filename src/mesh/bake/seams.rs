@@ -150,7 +150,7 @@ impl Seams {
     }
 }
 
-/// x with the least ‖R (start + x)‖² + STIFFNESS ‖x‖², by conjugate gradients.
+/// Returns the x that minimizes ‖R (start + x)‖² + STIFFNESS ‖x‖², by conjugate gradients.
 fn changes(rows: &[[(u32, f64); 8]], start: &[f64]) -> Vec<f64> {
     // Rᵀ R v + stiffness v
     let normal = |v: &[f64], stiffness: f64, out: &mut [f64]| {

@@ -34,7 +34,7 @@ pub(super) struct Loop {
     pub vertices: Vec<u32>,
     /// Length along the edges.
     pub length: f32,
-    /// Which handles it goes around: independent words belong to loops that together do not separate.
+    /// The handles that it goes around: independent words belong to loops that together do not separate.
     pub class: u64,
 }
 

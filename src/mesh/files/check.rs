@@ -90,7 +90,7 @@ pub struct CheckReport {
     pub volume_l: Option<f64>,
     /// Whether every vertex has a color.
     pub has_colors: bool,
-    /// Whether a texture gives the mesh its colors; set by readers, because [`check`] knows only the mesh.
+    /// Whether a texture gives the mesh its colors; set by readers, because [`check`] receives only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub has_texture: Option<bool>,
     /// Whether every vertex has a normal.
@@ -213,7 +213,7 @@ normals              {normals} ({bad_normals} not of unit length)
     }
 }
 
-/// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, whatever the mesh.
+/// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, for any mesh.
 ///
 /// # Examples
 ///
@@ -465,7 +465,7 @@ pub(super) fn bound(which: &'static str, left: usize, of: &str) -> (&'static str
     if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not compared further)")) }
 }
 
-/// Measures an atlas. Never panics, whatever mesh and atlas; lengths are those of the mesh.
+/// Measures an atlas. Never panics, for any mesh and atlas; lengths are those of the mesh.
 pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
     let (count, listed) = (mesh.triangles.len(), atlas.triangles.len());
     let common = count.min(listed);
@@ -582,7 +582,7 @@ impl Joined {
 
     fn of(mesh: &Mesh, atlas: &Atlas, valid: &[bool]) -> Joined {
         let (weld, _) = places(mesh);
-        let welded = |i: u32| weld.get(i as usize).copied().unwrap_or(0); // of invalid triangles anything
+        let welded = |i: u32| weld.get(i as usize).copied().unwrap_or(0); // any value for invalid triangles
         let faces: Vec<[u32; 3]> = mesh.triangles[..valid.len()].iter().map(|t| t.map(welded)).collect();
         let mut sides = sorted_sides(&faces);
         sides.retain(|&(_, c)| valid[c as usize / 3]);

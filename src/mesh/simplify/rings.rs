@@ -9,7 +9,7 @@
 //! Vertices where the mesh is no manifold surface stay as they are.
 //!
 //! On an edge with more than two triangles, or with two that run the same way, and at a vertex whose
-//! triangles form more than one fan, the link condition says nothing. Such vertices stay as they are,
+//! triangles form more than one fan, the link condition does not apply. Such vertices stay as they are,
 //! so that a mesh with a flaw keeps the flaw and gets no others.
 //!
 //! # Quadrics

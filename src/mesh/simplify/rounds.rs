@@ -19,7 +19,7 @@
 //!   the surface and `φ` the hat functions: `M δ = −∫ d φᵢ`, `M` the mass matrix of the mesh, solved by
 //!   conjugate gradients. That takes out three quarters of the error on a sphere.
 //!
-//! A vertex whose move would turn or spoil a triangle, as no collapse may, goes half the way, a quarter, or stays.
+//! A vertex whose move would turn a triangle or make it a sliver, as no collapse may, moves half the way, a quarter, or stays.
 //!
 //! # The queue
 //!
@@ -49,7 +49,7 @@ const COST_SLACK: usize = 4;
 /// from before; all seven would take a tenth longer and win a hundredth of the error.
 const EDGES_PER_VERTEX: usize = 3;
 
-/// Asking whether to stop costs nothing this often.
+/// Number of collapses between two checks for a stop request.
 const STOP_CHECK_INTERVAL: usize = 1 << 12;
 
 /// The data shared by all rounds.
@@ -280,7 +280,7 @@ fn without_crossings(positions: &mut [Vec3], triangles: &[[u32; 3]], start: &[Ve
     back
 }
 
-/// Most rounds, and most that may be undone.
+/// Maximum numbers of rounds and of undone rounds.
 const MAX_ROUNDS: usize = 24;
 const MAX_UNDONE_ROUNDS: usize = 5;
 /// A round gives up at most this share of the triangles: measuring often is cheaper than undoing.
@@ -336,7 +336,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         }
     }
     if good.normals.is_empty() {
-        // nothing may go: the mesh as it came, with normals
+        // no collapse is possible: the input mesh, with normals
         let fixed = vec![true; good.positions.len()];
         settle(&mut good, &fixed, field, task, VertexPlacement::OnSurface, report)?;
     }
