@@ -509,7 +509,7 @@ impl Bvh {
         while let Some((ours, theirs, level)) = work.pop() {
             depth = depth.max(level);
             let mut children = vec![theirs];
-            // Open the largest box until there are four.
+            // Open the largest box until the node has four children.
             while children.len() < 4 {
                 let largest = (0..children.len())
                     .filter(|&k| !tree.nodes[children[k]].is_leaf())

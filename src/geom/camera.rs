@@ -207,8 +207,8 @@ impl Distortion {
     }
 
     /// Distorted normalized coordinates back to ideal ones: Newton on the coefficients with their exact Jacobian,
-    /// whose result is checked, then the projection's inverse. `None` where the model folds over (no ideal point
-    /// maps there) and from 90° on.
+    /// whose result is checked, then the projection's inverse. `None` where the model folds over (no ideal point has
+    /// this image) and from 90° on.
     pub fn undistort(&self, xd: f64, yd: f64) -> Option<(f64, f64)> {
         if self.is_none() {
             return Some((xd, yd));

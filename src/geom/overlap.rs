@@ -621,7 +621,7 @@ mod box_tests {
         let work = |i: usize, effort: &mut Effort| (0..need(i)).take_while(|_| effort.spend(1)).count();
         let shared = share_out(10, 10, work);
         assert_eq!((shared.found[3], shared.unfinished.len()), (100_000, 0));
-        // three of them are more than that: each is told what it has
+        // Three of them exceed the total: each receives its own limit.
         let work = |_: usize, effort: &mut Effort| (0..200_000).take_while(|_| effort.spend(1)).count();
         let shared = share_out(3, 10, work);
         assert_eq!(shared.unfinished, [0, 1, 2]);

@@ -77,7 +77,7 @@ impl<'a> ShellCaster<'a> {
     }
 
     /// Calls `meet` for each layer whose outside a ray meets before `end`, the outermost first: with its index, the
-    /// place of the mesh that it shows there, and its opacity.
+    /// source position on the mesh, and its opacity.
     pub fn cast(&self, ray: &Ray, end: f32, mut meet: impl FnMut(usize, Hit, f32)) {
         for (k, LayerCaster { layer, surface, bvh, source }) in self.layers.iter().enumerate().rev() {
             let mut ahead = *ray;

@@ -249,8 +249,8 @@ fn cells_are_those_that_the_cpu_keeps() {
 fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
     let Some(device) = device() else { return };
     let views = textured_views();
-    // a step has room for fewer samples than there are cells: they are looked at piece by piece; the last word of the
-    // mask is not full
+    // A step's capacity is below the number of cells: the cells are evaluated in pieces; the last word of the
+    // mask is partial.
     const SIDE: usize = 35;
     let config = IfaceConfig {
         occupancy: OccupancyRule::Nerfacc,
@@ -465,7 +465,7 @@ fn a_training_takes_the_memory_that_it_is_given() {
     }
 }
 
-/// As many samples as there is room for, which is a tenth of what is wanted.
+/// The number of samples equals the capacity, a tenth of the requested number.
 #[test]
 #[ignore = "run by the test above, in a process of its own"]
 fn memory_of_a_training() {

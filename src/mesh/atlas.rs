@@ -263,7 +263,7 @@ fn lay(
             return Ok(AtlasLayout { atlas, repaired: loose.len(), gutter_px: f64::from(config.gutter_px) });
         }
     }
-    Err(Error::cannot(format!("there were bad triangles after {ROUNDS} rounds of repair"), ""))
+    Err(Error::cannot(format!("bad triangles remain after {ROUNDS} rounds of repair"), ""))
 }
 
 fn placed(mesh: &Mesh, charts: &[Flat], poses: &[ChartPose], config: &AtlasConfig) -> Atlas {

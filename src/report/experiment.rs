@@ -538,7 +538,7 @@ mod tests {
         assert!(text.contains("+0.62 ("), "{text}");
         let verdict = "| second > first <b> | holds, +1.25 | does not hold, -0.01 | holds, +0.62 |";
         assert!(text.contains(verdict), "{text}");
-        // nobody measured it
+        // LPIPS was not measured
         assert!(!text.contains("LPIPS"), "{text}");
         let value: serde_json::Value = serde_json::from_str(&e.json()).unwrap();
         assert!((value["means"][1]["mean"]["masked"].as_f64().unwrap() - 26.12).abs() < 1e-9);

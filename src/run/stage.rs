@@ -408,7 +408,7 @@ mod tests {
         assert!(run.stage(mesh.clone(), never).unwrap().skipped);
         fs::remove_file(dir.path().join("mesh/parts/head")).unwrap();
         refused("mesh/parts/head` is missing");
-        // records from before there were sizes in them
+        // Records of older versions have no sizes.
         let mut record = serde_json::to_value(record).unwrap();
         record.as_object_mut().unwrap().remove("products");
         fs::write(dir.path().join("mesh/done.json"), record.to_string()).unwrap();

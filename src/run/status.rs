@@ -152,7 +152,7 @@ impl Record {
     }
 }
 
-/// Returns the `status.json` of a stage folder; `None` if there is none.
+/// Returns the `status.json` of a stage folder; `None` if it does not exist.
 pub fn read_status(folder: &Path) -> Result<Option<Status>, ReadError> {
     let path = folder.join("status.json");
     let status: Option<Status> = read(&path)?;
@@ -163,7 +163,7 @@ pub fn read_status(folder: &Path) -> Result<Option<Status>, ReadError> {
     Ok(status)
 }
 
-/// Returns the `done.json` of a stage folder; `None` if there is none.
+/// Returns the `done.json` of a stage folder; `None` if it does not exist.
 pub fn read_record(folder: &Path) -> Result<Option<Record>, ReadError> {
     let path = folder.join("done.json");
     let record: Option<Record> = read(&path)?;
@@ -247,7 +247,7 @@ impl Add for Cost {
 /// The planned stages of a run, by name, with the estimated cost of each.
 pub type Estimate = BTreeMap<String, Cost>;
 
-/// Returns the `estimate.json` of a run; `None` if there is none.
+/// Returns the `estimate.json` of a run; `None` if it does not exist.
 pub fn read_estimate(run: &Path) -> Result<Option<Estimate>, ReadError> {
     let path = run.join(ESTIMATE);
     if !io::is_file(&path) {

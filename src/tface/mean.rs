@@ -260,7 +260,7 @@ mod tests {
         let missing = FieldMean::load("tface", dir.path(), 3).err().unwrap().to_string();
         assert!(missing.contains("field_3") && missing.contains("cannot be read"), "{missing}");
 
-        // stopped in the second field, it goes on there
+        // A training stopped in the second field continues in that field.
         let again = temporary();
         let end = learn(again.path(), &StopAfter::new(50));
         assert!(end.unwrap_err().kind().is_stop());

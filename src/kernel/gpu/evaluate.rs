@@ -191,7 +191,7 @@ mod tests {
         let want = sdf::colors(&shape, &table, &weights, &x, &normal, None, &direction);
         agree("colors", &got.concat(), &planes(&want, x.len()), 1e-4);
 
-        // more samples than there is room for: 20,000 rays of up to some 100
+        // More samples than the capacity: 20,000 rays of up to about 100.
         let rays: Vec<MarchRay> = (0..20_000)
             .map(|i| {
                 let d = direction[i % 700];

@@ -21,7 +21,7 @@ pub struct Smoothness {
     pub constant: f32,
     /// The same of all other terms.
     pub others: f32,
-    /// Squares of all other terms themselves, for each pixel there is a node on average.
+    /// Squares of all other terms themselves, per pixel of a node on average.
     pub ridge: f32,
 }
 

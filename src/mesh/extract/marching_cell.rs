@@ -557,7 +557,7 @@ mod tests {
                 let on_face = a < INNER && b < INNER && share_face(a, b);
                 assert_eq!(inner, !on_face, "{v:?}: edge {a} {b}");
             }
-            // No piece carries three loops, and every tunnel found a strip: faces = vertices there.
+            // No piece carries three loops, and every tunnel found a strip, so faces = vertices.
             let loops = Loops::trace(case, |f| {
                 let [a, b, c, d] = f.map(|i| f64::from(v[i as usize]));
                 if bit(case, f[0]) { a * c > b * d } else { b * d > a * c }

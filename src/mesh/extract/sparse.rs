@@ -630,7 +630,7 @@ mod tests {
 
     #[test]
     fn a_face_in_a_block_border_and_a_tube_along_a_block_edge_survive() {
-        // 64 cells of 1/32: block borders lie at multiples of 1/4; the plane x = 0.25 is zero there.
+        // 64 cells of 1/32: block borders lie at multiples of 1/4; the field is zero on the plane x = 0.25.
         let slab = |p: Vec3| (p.x - 0.25).max(-0.5 - p.x).max(p.y.abs() - 0.5).max(p.z.abs() - 0.5);
         let (few, dense) = both(slab, Aabb::SCENE, 64);
         assert_eq!(key(&few.surface), key(&dense));

@@ -329,8 +329,8 @@ impl<'a> Lens<'a> {
     }
 }
 
-/// First and last column, first and last row of pixels in which a face may hold a sample; the first behind the last where
-/// there are none.
+/// First and last column, first and last row of pixels in which a face may hold a sample; the first exceeds the last if
+/// no such pixel exists.
 #[inline(always)]
 pub(super) fn reach(face: &Face) -> ((i32, i32), (i32, i32)) {
     let [a, b, c] = face.corners;
