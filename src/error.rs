@@ -1,11 +1,11 @@
-//! What went wrong, what to do about it, and how the process should end: one error for the whole crate.
+//! The error type of the crate: problem, suggested fix, and exit code.
 //!
 //! A caller acts on the kind (retry, correct the command, tell a person); a person reads the message and the
 //! suggested fix. Modules add no enums of their own unless a caller matches on the variants.
 
 use std::fmt::{self, Display};
 
-/// What a caller can do about an error; as a number, the exit code of `tiface`.
+/// Kind of an error, by what a caller can do; as a number, the exit code of `tiface`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum ErrorKind {

@@ -3,7 +3,6 @@
 //! A model ([`training::Model`]) defines what differs between fields. Its training step is written once, over
 //! operations ([`ops::Ops`]) that each device implements with its own kernels.
 
-pub mod background;
 #[cfg(any(test, feature = "wgpu"))]
 pub(crate) mod ball;
 pub mod checkpoint;
@@ -11,8 +10,6 @@ pub mod checkpoint;
 pub mod devices;
 #[cfg(feature = "wgpu")]
 pub mod drawing;
-#[cfg(feature = "wgpu")]
-pub mod memory;
 pub mod ops;
 pub mod parameters;
 pub mod pixels;
@@ -126,7 +123,7 @@ pub struct Found {
 }
 
 /// Returns the report on every GPU of this machine, software renderers included, and the device that `--device auto`
-/// selects for all fields. The self-tests run, whatever earlier verdicts say.
+/// selects for all fields. The self-tests run again, regardless of earlier verdicts.
 pub fn examine_devices(tests: &[SelfTest]) -> Result<(Vec<Found>, ComputeDevice)> {
     #[cfg(feature = "wgpu")]
     let found = devices::examine_adapters(tests);
@@ -171,7 +168,7 @@ fn parse_choice(name: &str) -> Result<DeviceChoice> {
     let choice = DeviceChoice::parse(name).ok_or_else(|| {
         Error::usage(format!("unknown device `{name}`"), "`tiface config --explain device` says which")
     })?;
-    let no_gpu = if cfg!(feature = "wgpu") { "the processor is none" } else { "this build knows none" };
+    let no_gpu = if cfg!(feature = "wgpu") { "the processor is none" } else { "this build supports none" };
     if choice.memory_gib.is_some() && (choice.name == "cpu" || cfg!(not(feature = "wgpu"))) {
         return Err(Error::usage(
             format!("device `{name}`: `--memory` limits what a training takes of a GPU, and {no_gpu}"),
@@ -211,7 +208,7 @@ impl<T> GpuField<T> {
         self.failure.get().map(String::as_str)
     }
 
-    /// Evaluates the field on the GPU. Returns `None` if there is no field or the GPU failed, so that the caller
+    /// Evaluates the field on the GPU. Returns `None` without a field or if the GPU failed, so that the caller
     /// evaluates it on the processor.
     pub fn ask<A>(&self, evaluate: impl FnOnce(&mut T) -> Result<A>) -> Option<A> {
         let mut field = self.field.lock().ok()?;

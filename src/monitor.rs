@@ -1,4 +1,4 @@
-//! How a long computation reports progress and learns that it should stop.
+//! Progress reports and stop requests of long computations.
 
 use crate::error::COMPLETE_IS_KEPT;
 use crate::{Error, Result};

@@ -1,4 +1,4 @@
-//! Pages to look at, one file each, nothing loaded from elsewhere: `report.html` of a run, a page of many runs, the head
+//! Self-contained HTML pages, one file each: `report.html` of a run, a page of many runs, the head
 //! to turn, a run while it works. Their markup is in `report/*.html`.
 //!
 //! Everything that comes from outside is escaped by the templates; only what this module made itself (drawings,
@@ -24,7 +24,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Of the page: what all of them share.
+/// Style that all pages share.
 const STYLE: &str = include_str!("report/style.css");
 
 /// The stages that learn, and what of their `log.jsonl` is drawn.
@@ -69,32 +69,32 @@ fn small_view(file: &Path, side: u32, quality: u8) -> Option<Vec<u8>> {
     io::jpeg_bytes(&small, quality, file).ok()
 }
 
-/// What a report shows.
+/// The content of a report.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Report {
-    /// Of the page: the capture's name.
+    /// Title of the page: the capture's name.
     pub title: String,
     /// The run in a line: preset, seed, time, version.
     pub facts: Vec<String>,
     /// The head to turn.
     pub viewer: Option<Viewer>,
-    /// How good and how costly each way to make a picture is.
+    /// Quality and cost of each rendering method.
     pub table: MethodTable,
-    /// How near each kind of picture is to the photographs, part by part: the heading, then a row each; may be empty.
+    /// Errors of each kind of picture by part of the head: the heading, then a row each; may be empty.
     pub quality: Vec<Vec<String>>,
     /// Photographs with what was rendered for them.
     pub views: Vec<ViewRow>,
-    /// Files of the views that found no room, relative to the page.
+    /// Files of the views that did not fit, relative to the page.
     pub left_out: Vec<String>,
     /// The masks over their photographs: a part of a page, already escaped.
     pub masks: String,
     /// Figures over training steps, each a part of a page.
     pub charts: Vec<String>,
-    /// Where time went: stage, words, share of the longest in percent.
+    /// Durations: stage, words, share of the longest in percent.
     pub times: Vec<(String, String, f64)>,
     /// Settings that are not the preset's: key, value, the preset's.
     pub changes: Vec<[String; 3]>,
-    /// What a person should know.
+    /// Warnings.
     pub warnings: Vec<String>,
     /// The command that repeats the run.
     pub repeat: String,
@@ -140,20 +140,20 @@ impl MethodTable {
 /// A head to turn.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Viewer {
-    /// What it is called.
+    /// Its name.
     pub name: String,
-    /// How it differs from the file: a sentence, or nothing.
+    /// Differences from the file: a sentence, or empty.
     pub note: String,
-    /// Where photographs were taken from.
+    /// Cameras of the photographs.
     pub cameras: Vec<ViewerCamera>,
-    /// Where the face looks, in the file's coordinates; any length.
+    /// Direction that the face looks in, in the file's coordinates; any length.
     pub front: [f32; 3],
     /// The bytes of a GLB.
     #[serde(skip)]
     pub glb: Vec<u8>,
 }
 
-/// Where a photograph was taken from, in the coordinates of the file; without distortion.
+/// Camera of a photograph, in the coordinates of the file; without distortion.
 #[derive(Clone, Debug, Serialize)]
 pub struct ViewerCamera {
     /// The view's name.
@@ -170,7 +170,7 @@ pub struct ViewerCamera {
     pub cx: f64,
     /// Principal point from the top edge.
     pub cy: f64,
-    /// Where it stood.
+    /// Its position.
     pub position: [f64; 3],
     /// Right, up and backwards.
     pub axes: [[f64; 3]; 3],
@@ -202,7 +202,7 @@ pub struct ViewRow {
     pub height: u32,
     /// The photograph: a `data:` address.
     pub photo: String,
-    /// What was made for it.
+    /// Pictures of the view.
     pub pictures: Vec<ViewPicture>,
 }
 
@@ -215,7 +215,7 @@ pub struct ViewPicture {
     pub title: String,
     /// The picture: a `data:` address.
     pub picture: String,
-    /// How far it is from the photograph, in the colors of [`HEAT`].
+    /// Error relative to the photograph, in the colors of [`HEAT`].
     pub error: String,
     /// Masked PSNR, words.
     pub psnr: String,
@@ -278,7 +278,7 @@ pub fn picture_url(file: &[u8]) -> String {
     format!("data:image/{kind};base64,{}", base64(file))
 }
 
-/// Returns a path as an address relative to the page: whatever could mean something else there is coded (RFC 3986).
+/// Returns a path as an address relative to the page: reserved characters are percent-encoded (RFC 3986).
 pub fn link(path: &str) -> String {
     let byte = |b: u8| match b {
         b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' | b'/' => (b as char).to_string(),

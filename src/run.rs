@@ -20,15 +20,16 @@
 use crate::{Error, ErrorKind, Quiet, Result};
 mod fingerprint;
 mod progress;
-mod run_status;
 mod stage;
 mod status;
 
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer, Stop};
-pub use run_status::{FAILED, Failure, Phase, RunStatus, StageStatus, read_failure};
 pub use stage::{Done, Plan, StageDir};
-pub use status::{Cost, ESTIMATE, Estimate, Record, State, Status, read_estimate, read_record, read_status};
+pub use status::{
+    Cost, ESTIMATE, Estimate, FAILED, Failure, Phase, Record, RunStatus, StageStatus, State, Status,
+    read_estimate, read_failure, read_record, read_status,
+};
 
 use crate::io::{self, Lock, LockError};
 use std::path::{Path, PathBuf};

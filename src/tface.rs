@@ -7,7 +7,6 @@
 mod cpu;
 #[cfg(feature = "wgpu")]
 mod gpu;
-mod import;
 mod infer;
 mod mean;
 mod ops;
@@ -18,8 +17,7 @@ mod self_test;
 mod state;
 mod train;
 
-pub use import::import;
-pub use infer::TFace;
+pub use infer::{TFace, import};
 pub use mean::{FieldMean, train};
 pub use train::TfaceReport;
 

@@ -59,7 +59,7 @@ pub fn open(choice: &DeviceChoice) -> Result<Gpu> {
     ))
 }
 
-/// Opens an adapter with the atomics and the memory limit that the choice asks for.
+/// Opens an adapter with the atomics and the memory limit of the choice.
 fn open_configured(adapter: &Adapter, choice: &DeviceChoice) -> Device {
     let mut device = Device::open(adapter);
     if choice.deterministic {
@@ -171,7 +171,7 @@ fn cache_verdict(file: Option<&Path>, key: String, passed: bool) {
     }
 }
 
-/// Tests a device, whatever the cache says, and stores the verdict.
+/// Tests a device, ignoring the cache, and stores the verdict.
 fn run_self_test(
     device: &Device,
     adapter: &Adapter,

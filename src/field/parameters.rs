@@ -78,7 +78,7 @@ impl HostGroup {
     }
 
     /// Reads parts of exactly these shapes from a checkpoint. Without `with_moments` the moments are zero. Memory is
-    /// allocated only for tensors that the file really holds, whatever the shapes promise.
+    /// allocated only for tensors that the file really holds, independent of the claimed shapes.
     pub fn restore(parts: Vec<Part>, from: &mut Checkpoint, with_moments: bool) -> Result<HostGroup> {
         let mut state = [Vec::new(), Vec::new(), Vec::new()];
         for part in &parts {

@@ -22,7 +22,7 @@ pub const CELLS_AT: u64 = STEP - 1;
 /// summation, or a sample more or less at the border of a cell, is not.
 const ALLOWED: f32 = 2e-3;
 
-/// Returns a session for a training that saves nothing.
+/// Returns a session for a training without checkpoints.
 pub fn session(stage: &'static str) -> TrainingSession<'static> {
     TrainingSession { stage, seed: SEED, device: "", dir: Path::new(""), identity: "", monitor: &Quiet }
 }

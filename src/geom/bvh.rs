@@ -1,4 +1,4 @@
-//! What a ray meets on a triangle mesh, and which point of a mesh is nearest, without leaks.
+//! Watertight ray intersection and nearest-point queries on triangle meshes.
 //!
 //! A ray aimed exactly at an edge or a vertex of a closed mesh must hit. Three things make it so:
 //!
@@ -8,7 +8,7 @@
 //!   the decision is repeated in f64, in which the products are exact;
 //! - boxes grown by a few ulps of the largest coordinate, which covers the rounding of that test, and
 //!   slabs widened after Ize 2013 (*Robust BVH Ray Traversal*, JCGT 2(2)), which covers their own;
-//! - a ray that starts far away is first moved to the mesh in f64, since its own rounding there
+//! - a ray that starts far away is first moved to the mesh in f64, since its own rounding near the mesh
 //!   would be larger than the triangles.
 //!
 //! `obvhs` finds the tree (PLOC with reinsertion). We store it four wide, as Embree does: four boxes
@@ -40,7 +40,7 @@ const LEAF: u32 = 1 << 31;
 /// Deep enough for 10⁷ triangles in a sane tree; deeper trees take their stack from the heap.
 const STACK: usize = 64;
 
-/// Four boxes and what is in them. An absent child has an inside-out box, which nothing meets.
+/// Four boxes and their children. An absent child has an inverted box, which no ray meets.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 struct WideNode {
@@ -72,11 +72,11 @@ impl Leaf {
 /// The nearest point of a mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Closest {
-    /// How far it is.
+    /// Its distance.
     pub distance: f32,
     /// Index into `Mesh::triangles`.
     pub triangle: u32,
-    /// Where it is.
+    /// Its position.
     pub point: Vec3,
 }
 
@@ -144,12 +144,7 @@ impl Bvh {
         bvh
     }
 
-    /// Returns the box around all triangles.
-    pub fn bounds(&self) -> Aabb {
-        self.bounds
-    }
-
-    /// Returns whether there are no triangles.
+    /// Returns whether the tree has no triangles.
     pub fn is_empty(&self) -> bool {
         self.nodes.is_empty()
     }
@@ -162,7 +157,7 @@ impl Bvh {
         self.cast::<false>(ray)
     }
 
-    /// Returns whether there is anything along the ray with `t_min <= t <= t_max`.
+    /// Returns whether the ray hits a triangle with `t_min <= t <= t_max`.
     pub fn any_hit(&self, ray: &Ray) -> bool {
         self.cast::<true>(ray).is_some()
     }
@@ -514,7 +509,7 @@ impl Bvh {
         while let Some((ours, theirs, level)) = work.pop() {
             depth = depth.max(level);
             let mut children = vec![theirs];
-            // Open the largest box until there are four.
+            // Open the largest box until the node has four children.
             while children.len() < 4 {
                 let largest = (0..children.len())
                     .filter(|&k| !tree.nodes[children[k]].is_leaf())
@@ -531,7 +526,7 @@ impl Bvh {
                     self.nodes[ours].bounds[1][axis][lane] = b.max[axis];
                 }
                 self.nodes[ours].child[lane] = if tree.nodes[n].is_leaf() {
-                    // no more than the four that the builder was asked for
+                    // no more than the four that the builder was configured for
                     self.add_leaf(mesh, &members(n).collect::<Vec<u32>>())
                 } else {
                     self.nodes.push(WideNode::EMPTY);

@@ -8,7 +8,7 @@ use super::similarity::Similarity;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
-/// How a lens maps the angle θ from its axis to a radius, before coefficients bend it further.
+/// Projection of a lens: the radius of the angle θ from its axis, before the distortion coefficients.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Projection {
@@ -29,7 +29,7 @@ pub enum Projection {
 /// - fisheye: radial `1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸`, where r is the angle θ;
 /// - both: tangential p1, p2 as in OpenCV and a thin prism (sx1, sy1) · r² (Weng, Cohen and Herniou).
 ///
-/// Half of a sphere is the most that is seen: beyond 90° from the axis no ray is given.
+/// At most half of a sphere is visible: no rays beyond 90° from the axis.
 #[derive(Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Distortion {
     /// r² coefficient.
@@ -60,12 +60,12 @@ pub struct Distortion {
     /// ω of [`Projection::Fov`], radians, in 0..π.
     #[serde(default, skip_serializing_if = "is_default")]
     pub omega: f64,
-    /// What the coefficients bend.
+    /// The projection that the coefficients distort.
     #[serde(default, skip_serializing_if = "is_default")]
     pub projection: Projection,
 }
 
-/// As it is written: digests of cameras are made of this.
+/// Serialized form; digests of cameras depend on it.
 impl std::fmt::Debug for Distortion {
     fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
         let mut out = f.debug_struct("Distortion");
@@ -94,7 +94,7 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 const MAX_ANGLE: f64 = std::f64::consts::FRAC_PI_2 - 1e-3;
 
 impl Distortion {
-    /// Returns whether it does nothing.
+    /// Returns whether all coefficients are zero.
     pub fn is_none(&self) -> bool {
         *self == Distortion::default()
     }
@@ -159,7 +159,7 @@ impl Distortion {
         (factor, (over_slope - factor * under_slope) / under)
     }
 
-    /// Returns what the coefficients do to a projected point.
+    /// Returns the distorted position of a projected point.
     fn bend(&self, x: f64, y: f64) -> (f64, f64) {
         let r2 = x * x + y * y;
         let (radial, _) = self.radial(r2);
@@ -207,8 +207,8 @@ impl Distortion {
     }
 
     /// Distorted normalized coordinates back to ideal ones: Newton on the coefficients with their exact Jacobian,
-    /// whose result is checked, then the projection's inverse. `None` where the model folds over (no ideal point
-    /// maps there) and from 90° on.
+    /// whose result is checked, then the projection's inverse. `None` where the model folds over (no ideal point has
+    /// this image) and from 90° on.
     pub fn undistort(&self, xd: f64, yd: f64) -> Option<(f64, f64)> {
         if self.is_none() {
             return Some((xd, yd));
@@ -237,7 +237,7 @@ impl Distortion {
     }
 }
 
-/// How near [`Distortion::undistort`] must come; at a focal length of 10 000 pixels, 1e-6 of a pixel.
+/// Tolerance of [`Distortion::undistort`]; at a focal length of 10 000 pixels, 1e-6 of a pixel.
 const MAX_RESIDUAL: f64 = 1e-10;
 
 /// One camera: intrinsics in pixels of its own picture, pose in the dataset's world.
@@ -259,7 +259,7 @@ pub struct Camera {
     pub distortion: Distortion,
     /// Columns right, up, backwards (the camera looks along minus the third), orthonormal.
     pub rotation: DMat3,
-    /// Where the camera is, dataset units.
+    /// Position, in dataset units.
     pub position: DVec3,
 }
 

@@ -1,4 +1,4 @@
-//! A colored signed distance: what the extraction and the finishing of a mesh need to know of a learned field.
+//! A colored signed distance: the interface of a learned field to the extraction and finishing of meshes.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -38,7 +38,7 @@ pub trait SdfField: Sync {
         vec![f32::INFINITY; points.len()]
     }
 
-    /// Returns whether a point is known to be outside, so that the field need not be evaluated there.
+    /// Returns whether a point is known to be outside, so that the field need not be evaluated.
     fn excludes(&self, _point: Vec3) -> bool {
         false
     }

@@ -12,8 +12,8 @@
 //! Which boxes meet, for a bounded effort.
 //!
 //! A triangle of a sound mesh has a few dozen neighbours, but a file may put all of its triangles into one place,
-//! and comparing all with all is quadratic. So every search here counts what it looks at: each item gets a share
-//! of an effort proportional to their number, what some leave over is given to those that need more, and what is
+//! and comparing all with all is quadratic. So every search counts its comparisons: each item gets a share
+//! of an effort proportional to their number, unused effort is given to items that need more, and items that
 //! not done then is named. All of it is counted work, never time: the answer is the same on every machine.
 
 use glam::{DVec2, DVec3, Vec2};
@@ -65,16 +65,16 @@ pub(crate) fn shared_area(p: [DVec2; 3], q: [DVec2; 3]) -> f64 {
 pub(crate) struct Overlaps {
     /// Each pair once, lower index first, in order.
     pub pairs: Vec<(u32, u32)>,
-    /// How many triangles share area with another one.
+    /// Number of triangles that share area with another one.
     pub covered: usize,
-    /// Triangles of which not all neighbours with a higher index were looked at: then there may be more of both.
+    /// Number of triangles that were not compared with all neighbours of higher index: then both numbers above are lower bounds.
     pub left: usize,
 }
 
-/// Effort for an atlas in the making, which should know all of its overlaps.
+/// Effort per triangle while an atlas is made, when all of its overlaps are needed.
 pub(crate) const THOROUGH_EFFORT: usize = 1 << 16;
 
-/// What deciding about a pair costs, in comparisons of boxes, and what keeping and measuring one costs.
+/// Cost of testing a pair, in comparisons of boxes, and of keeping and measuring one.
 const PAIR_TEST_COST: usize = 12;
 const OVERLAP_COST: usize = 64;
 
@@ -207,12 +207,12 @@ pub(crate) struct OutlineSide {
     pub to: DVec2,
 }
 
-/// How far charts are apart.
+/// Distance between charts.
 pub(crate) struct ChartDistance {
-    /// The smallest distance between sides of different charts, at most as far as was asked for; none when there
-    /// are no two charts.
+    /// The smallest distance between sides of different charts, up to the given limit; `None` with fewer than
+    /// two charts.
     pub distance: Option<f64>,
-    /// Sides of which not all neighbours were looked at: then the distance may be smaller.
+    /// Number of sides that were not compared with all neighbours: then the distance is an upper bound.
     pub left: usize,
 }
 
@@ -223,40 +223,40 @@ pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDista
     }
     let span = |s: &OutlineSide| DBox::around([s.from, s.to].map(|p| p.extend(0.0)));
     let boxes = Boxes::new(sides.iter().map(span));
-    // What lies beside each other in the tree mostly lies beside each other: a first bound, so that the search
+    // Neighbors in the tree are mostly neighbors in the plane: a first bound, so that the search
     // has a short way to go.
     let order: Vec<u32> = boxes.order().collect();
     let mut bound = farthest;
     for near in order.windows(LEAF_NEIGHBOURS) {
         let side = &sides[near[0] as usize];
         let others = near[1..].iter().map(|&i| &sides[i as usize]).filter(|s| s.chart != side.chart);
-        bound = others.fold(bound, |least, other| least.min(distance(side, other)));
+        bound = others.fold(bound, |nearest, other| nearest.min(distance(side, other)));
     }
     let shared = share_out(sides.len(), DEFAULT_EFFORT / 2, |i, effort| {
-        let (side, mut least) = (&sides[i], bound);
-        if least > 0.0 {
+        let (side, mut nearest) = (&sides[i], bound);
+        if nearest > 0.0 {
             boxes.meeting(&span(side).grown(bound), effort, |j, effort| {
                 let other = &sides[j as usize];
                 if side.chart < other.chart {
                     if !effort.spend(SIDE_DISTANCE_COST) {
                         return false;
                     }
-                    least = least.min(distance(side, other));
+                    nearest = nearest.min(distance(side, other));
                 }
-                least > 0.0
+                nearest > 0.0
             });
         }
-        least
+        nearest
     });
-    let least = shared.found.into_iter().fold(bound, f64::min);
+    let nearest = shared.found.into_iter().fold(bound, f64::min);
     // nothing is nearer than touching
-    ChartDistance { distance: Some(least), left: if least > 0.0 { shared.unfinished.len() } else { 0 } }
+    ChartDistance { distance: Some(nearest), left: if nearest > 0.0 { shared.unfinished.len() } else { 0 } }
 }
 
-/// How many that follow each other in the tree are compared first.
+/// Number of successive sides in the order of the tree that are compared first.
 const LEAF_NEIGHBOURS: usize = 8;
 
-/// What a distance of two sides costs, in comparisons of boxes.
+/// Cost of a distance of two sides, in comparisons of boxes.
 const SIDE_DISTANCE_COST: usize = 8;
 
 fn point_distance(p: DVec2, s: &OutlineSide) -> f64 {
@@ -274,14 +274,14 @@ fn distance(a: &OutlineSide, b: &OutlineSide) -> f64 {
     ends.into_iter().fold(point_distance(b.to, a), f64::min)
 }
 
-/// What may be spent on each item on average, in comparisons of boxes of two or three nanoseconds. A triangle of a
+/// Average effort per item, in comparisons of boxes of two or three nanoseconds. A triangle of a
 /// sound mesh takes half of it or less.
 pub(crate) const DEFAULT_EFFORT: usize = 1024;
 
-/// As many items' effort may be spent however few there are: two thousand triangles in one place are no reason.
+/// Minimum number of items that the total effort is computed for, so that small inputs are compared completely.
 const MIN_EFFORT_ITEMS: usize = 1 << 15;
 
-/// What one item may still spend.
+/// The remaining effort of one item.
 pub(crate) struct Effort {
     left: usize,
     short: bool,
@@ -292,7 +292,7 @@ impl Effort {
         Effort { left, short: false }
     }
 
-    /// Returns whether too little was left for something.
+    /// Returns whether the effort ran out.
     pub(crate) fn ran_short(&self) -> bool {
         self.short
     }
@@ -305,15 +305,15 @@ impl Effort {
     }
 }
 
-/// What [`share_out`] found.
+/// The result of [`share_out`].
 pub(crate) struct Shared<T> {
-    /// One for each item; of those that were not finished, what they have so far.
+    /// One result for each item; partial for unfinished ones.
     pub(crate) found: Vec<T>,
-    /// Who ran short, in order.
+    /// Items whose effort ran out, in order.
     pub(crate) unfinished: Vec<usize>,
 }
 
-/// Does `work` for each item, with `each` to spend on average and no more than that on all.
+/// Runs `work` for each item, with an effort of `each` per item on average; the total effort is bounded.
 pub(crate) fn share_out<T: Send>(
     items: usize,
     each: usize,
@@ -621,7 +621,7 @@ mod box_tests {
         let work = |i: usize, effort: &mut Effort| (0..need(i)).take_while(|_| effort.spend(1)).count();
         let shared = share_out(10, 10, work);
         assert_eq!((shared.found[3], shared.unfinished.len()), (100_000, 0));
-        // three of them are more than that: each is told what it has
+        // Three of them exceed the total: each receives its own limit.
         let work = |_: usize, effort: &mut Effort| (0..200_000).take_while(|_| effort.spend(1)).count();
         let shared = share_out(3, 10, work);
         assert_eq!(shared.unfinished, [0, 1, 2]);

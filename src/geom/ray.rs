@@ -7,7 +7,7 @@ use std::ops::{Add, Mul};
 /// A half line with the part of it that matters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
-    /// Where it starts: the camera centre.
+    /// Origin: the camera center.
     pub origin: Vec3,
     /// Unit direction, away from the camera.
     pub direction: Vec3,
@@ -24,20 +24,20 @@ impl Ray {
     }
 }
 
-/// What a ray through a radiance field or a scene came to; color is premultiplied by opacity (over black).
+/// Result of a ray through a radiance field or a scene; color is premultiplied by opacity (over black).
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RayResult {
     /// sRGB-coded color, premultiplied.
     pub color: [f32; 3],
     /// Sum of weights, 0..=1.
     pub opacity: f32,
-    /// Expected distance along the ray, scene units; 0 where nothing was met.
+    /// Expected distance along the ray, scene units; 0 without a surface.
     pub depth: f32,
-    /// Expected normal in the scene, unit length or zero; zero where nobody asks for one.
+    /// Expected normal in the scene, unit length or zero; zero if it was not requested.
     pub normal: Vec3,
 }
 
-/// What a ray met on a triangle mesh: `p = (1 − u − v)·a + u·b + v·c`.
+/// Intersection of a ray with a triangle mesh: `p = (1 − u − v)·a + u·b + v·c`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Ray parameter.
@@ -56,7 +56,7 @@ impl Hit {
         [1.0 - self.u - self.v, self.u, self.v]
     }
 
-    /// Returns what values at the triangle's vertices are at the hit.
+    /// Interpolates values at the triangle's vertices.
     pub fn mix<T: Add<Output = T>>(&self, [a, b, c]: [T; 3]) -> T
     where
         f32: Mul<T, Output = T>,
@@ -76,7 +76,7 @@ pub struct Aabb {
 }
 
 impl Aabb {
-    /// The box that holds nothing; growing it by a point gives that point.
+    /// The empty box; growing it by a point gives that point.
     pub const EMPTY: Aabb = Aabb { min: Vec3::INFINITY, max: Vec3::NEG_INFINITY };
 
     /// The cube [-1, 1]³ that every scene is fitted into.

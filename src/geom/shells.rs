@@ -1,4 +1,4 @@
-//! Translucent layers around a mesh: what is softer than a surface, as the outline of hair is.
+//! Translucent layers around a mesh, for parts that are softer than a surface, such as the outline of hair.
 
 use super::bvh::Bvh;
 use super::mesh::Mesh;
@@ -17,7 +17,7 @@ pub struct Shells {
 /// vertices. It has the mesh's colors.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ShellLayer {
-    /// How far along its normal each vertex of the mesh is moved, in the mesh's units.
+    /// Offset of each vertex of the mesh along its normal, in the mesh's units.
     pub offsets: Vec<f32>,
     /// Opacity at each vertex of the mesh, 0..=1.
     pub alphas: Vec<f32>,
@@ -77,7 +77,7 @@ impl<'a> ShellCaster<'a> {
     }
 
     /// Calls `meet` for each layer whose outside a ray meets before `end`, the outermost first: with its index, the
-    /// place of the mesh that it shows there, and its opacity.
+    /// source position on the mesh, and its opacity.
     pub fn cast(&self, ray: &Ray, end: f32, mut meet: impl FnMut(usize, Hit, f32)) {
         for (k, LayerCaster { layer, surface, bvh, source }) in self.layers.iter().enumerate().rev() {
             let mut ahead = *ray;

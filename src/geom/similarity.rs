@@ -11,16 +11,16 @@ pub struct Similarity {
     pub scale: f64,
     /// Orthonormal, determinant +1.
     pub rotation: DMat3,
-    /// Where the origin goes.
+    /// Image of the origin.
     pub translation: DVec3,
 }
 
 impl Similarity {
-    /// Changes nothing.
+    /// The identity.
     pub const IDENTITY: Similarity =
         Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
-    /// Returns what is wrong with it, if anything: a part, what it is, and what it should be.
+    /// Returns the first invalid part, if any: its name, its value and the expected one.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         // beyond that the way back is lost in f64
         if !(1e-12..=1e12).contains(&self.scale) {
@@ -42,17 +42,17 @@ impl Similarity {
         Similarity { scale, rotation: DMat3::IDENTITY, translation }
     }
 
-    /// Returns where a point goes.
+    /// Transforms a point.
     pub fn point(&self, p: Vec3) -> Vec3 {
         (self.scale * (self.rotation * p.as_dvec3()) + self.translation).as_vec3()
     }
 
-    /// Returns where a point goes, in f64.
+    /// Transforms a point in f64.
     pub fn point_f64(&self, p: DVec3) -> DVec3 {
         self.scale * (self.rotation * p) + self.translation
     }
 
-    /// Returns where a direction goes; its length is kept, so unit stays unit (also right for normals).
+    /// Rotates a direction; its length is kept, so unit vectors and normals stay unit.
     pub fn direction(&self, d: Vec3) -> Vec3 {
         self.rotation.as_mat3() * d
     }

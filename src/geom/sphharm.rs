@@ -11,7 +11,7 @@ pub const Y0: f32 = 0.282_094_79;
 /// Functions up to degree 2.
 pub const COEFFICIENTS_OF_DEGREE_2: usize = 9;
 
-/// Returns how many functions there are up to a degree.
+/// Returns the number of functions up to a degree.
 pub fn functions(degree: u32) -> usize {
     ((degree + 1) * (degree + 1)) as usize
 }

@@ -1,4 +1,4 @@
-//! What a triangle mesh is as a surface: closed, manifold, how many pieces, what genus.
+//! Topology of a triangle mesh: closed, manifold, number of pieces, genus.
 //!
 //! `V − E + F = Σ over closed pieces (2 − 2 · genus)`. Works on indices alone, except for areas.
 

@@ -272,6 +272,6 @@ mod on_gpus {
         let config = IfaceConfig { samples: 1 << 18, ..config() };
         let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
         let e = GpuDensity::fits(&config, &pixels, &device.with_memory(600 << 20)).err().unwrap();
-        assert!(e.to_string().contains("has room for") && e.hint().contains("iface.samples to"), "{e:?}");
+        assert!(e.to_string().contains("has memory for") && e.hint().contains("iface.samples to"), "{e:?}");
     }
 }

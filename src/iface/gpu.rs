@@ -12,7 +12,7 @@ use super::schedule;
 use super::stereo::SurfacePoint;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::drawing::DeviceRays;
-use crate::field::memory::MemoryNeed;
+use crate::field::drawing::MemoryNeed;
 use crate::field::ops::Ops;
 use crate::field::pixels::Pixels;
 use crate::field::training::StepAt;
@@ -174,18 +174,18 @@ pub(super) fn samples_that_fit(
         let levels = hash::levels(config.levels, config.base_resolution, config.growth, log2_table);
         32 * hash::entries(&levels) as u64 + 13 * cells + 4 * sums as u64
     };
-    let least = (config.samples + points) as u64;
+    let minimum = (config.samples + points) as u64;
     let wanted = wanted_samples(config, points) as u64;
     let need = MemoryNeed {
         fixed: (fixed(config.log2_table), "hash tables, cells and sums"),
         unit: "samples",
         each: [bytes, 4 * widest as u64],
         wanted,
-        least,
+        minimum,
     };
     let (capacity, resident) = need.plan(pixels, device, |fits| {
         let by_buffer = device.limits().largest_buffer / (4 * widest as u64);
-        let left = device.available_memory().checked_sub(least * bytes).filter(|_| by_buffer >= least);
+        let left = device.available_memory().checked_sub(minimum * bytes).filter(|_| by_buffer >= minimum);
         let smaller = left.and_then(|left| (4..config.log2_table).rev().find(|&log2| fixed(log2) <= left));
         match (fits.saturating_sub(points as u64), smaller) {
             (fits @ 64.., _) => format!("iface.samples to {fits}"),
@@ -237,7 +237,7 @@ impl SdfOps for GpuSdf<'_> {
         let budget = schedule::ray_budget(config);
         self.schedule = Schedule::new(device, schedule::step_length(config), budget, rays);
         self.broken = device.zeros::<u32>(1);
-        self.losses.forget(device);
+        self.losses.reset_sums(device);
         self.stepped = false;
         self.set_points(points);
     }
@@ -336,7 +336,7 @@ impl SdfOps for GpuSdf<'_> {
         let (device, count) = (&self.device, &self.samples.count);
         let sums = self.losses.sums();
         let figures = self.schedule.figures(device, sums, variance.value(), count, &self.broken);
-        self.losses.forget(device);
+        self.losses.reset_sums(device);
         figures
     }
 }

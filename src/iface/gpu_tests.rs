@@ -249,8 +249,8 @@ fn cells_are_those_that_the_cpu_keeps() {
 fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
     let Some(device) = device() else { return };
     let views = textured_views();
-    // a step has room for fewer samples than there are cells: they are looked at piece by piece; the last word of the
-    // mask is not full
+    // A step's capacity is below the number of cells: the cells are evaluated in pieces; the last word of the
+    // mask is partial.
     const SIDE: usize = 35;
     let config = IfaceConfig {
         occupancy: OccupancyRule::Nerfacc,
@@ -393,7 +393,7 @@ fn a_device_with_too_little_room_is_refused_before_the_first_step() {
     };
     let config = IfaceConfig { stereo: 0.0, ..config() };
     let e = room(&IfaceConfig { samples: 100_000_000, ..config.clone() }, &device).err().unwrap();
-    assert!(e.to_string().contains("has room for") && e.hint().contains("iface.samples to"), "{e}");
+    assert!(e.to_string().contains("has memory for") && e.hint().contains("iface.samples to"), "{e}");
     // what fits beside 512 MiB that are not to be had: nothing at all, or samples, or samples and photographs
     let of = |mib: u64| self::device().unwrap().with_memory(mib << 20);
     let some = IfaceConfig { samples: 4096, ..config.clone() };
@@ -465,7 +465,7 @@ fn a_training_takes_the_memory_that_it_is_given() {
     }
 }
 
-/// As many samples as there is room for, which is a tenth of what is wanted.
+/// The number of samples equals the capacity, a tenth of the requested number.
 #[test]
 #[ignore = "run by the test above, in a process of its own"]
 fn memory_of_a_training() {

@@ -1,7 +1,7 @@
 //! Search for surface points that several photographs agree on, starting from the current field.
 //!
 //! Rays are intersected with the field's zero set. Points spread over it are moved along their normals until all
-//! photographs in which they are visible match there ([`crate::kernel::cpu::stereo`]). Hair is excluded, because stereo
+//! photographs in which they are visible match ([`crate::kernel::cpu::stereo`]). Hair is excluded, because stereo
 //! places its strands some millimeters inside its outline.
 
 use super::occupancy::Occupancy;
@@ -193,7 +193,7 @@ struct Reduced {
 impl Reduced {
     fn new(view: &TrainView) -> Reduced {
         /// Longest side in pixels, up to twice: a surface that is half trained is right to a few of these, and a
-        /// tenth of one is all that is asked for.
+        /// tenth of one suffices.
         const SIDE: u32 = 512;
         let (w, h) = (view.camera.width, view.camera.height);
         let factor = (w.max(h) / SIDE).clamp(1, w.min(h).max(1));
@@ -220,7 +220,7 @@ impl Reduced {
     }
 }
 
-/// Returns points that photographs agree on: a function of these arguments alone, whatever the threads.
+/// Returns points that photographs agree on. The result does not depend on the number of threads.
 pub fn points(
     views: &[TrainView],
     config: &IfaceConfig,

@@ -3,7 +3,7 @@
 //! Smaller is the mean over the area of each new pixel: of coded values ([`reduce_photo`]), which is what networks were trained on,
 //! and keeps the matting equation `I = α F + (1 − α) B` true in the space it is solved in; or in linear light, for a cut, whose
 //! colors only distinguish two sides, and for a photograph that stands for one of a coarser sensor. Larger is bilinear between
-//! pixel centers: column `x` of `W` looks at `(x + ½) w / W − ½` of `w`.
+//! pixel centers: column `x` of `W` samples `(x + ½) w / W − ½` of `w`.
 
 use super::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use rayon::prelude::*;
@@ -39,7 +39,7 @@ fn shares(from: u32, to: u32) -> Vec<Share> {
         .collect()
 }
 
-/// What bytes stand for while they are averaged, and back.
+/// Conversion of bytes to the values that are averaged, and back.
 struct Coding {
     value: fn(u8) -> f32,
     byte: fn(f32) -> u8,
@@ -133,7 +133,7 @@ pub fn resize_hard(mask: &Gray, size: (u32, u32)) -> Gray {
     resized
 }
 
-/// Alpha within 0..=1, with what is nearly nothing made nothing and what is nearly full made full. First
+/// Clamps alpha to 0..=1, with values near 0 and 1 set to 0 and 1. First
 /// clamped, then hardened: a learner takes every value but 0 for head, so a stray 1 of 255 costs a pixel.
 pub fn harden(alpha: f32, lowest: f32, highest: f32) -> f32 {
     match alpha.clamp(0.0, 1.0) {

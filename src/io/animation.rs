@@ -18,17 +18,17 @@ pub struct Animation {
     pub rate: u16,
 }
 
-/// A frame after the other, so that few of them are in memory: `[height · width]` pixels each, sRGB-coded with straight
+/// Frames one after the other, so that few of them are in memory: `[height · width]` pixels each, sRGB-coded with straight
 /// alpha.
 pub type Frames<'a> = &'a mut dyn Iterator<Item = Result<Vec<[u8; 4]>>>;
 
-/// Frames of a GIF whose colors are chosen at once.
+/// Number of frames of a GIF whose palettes are computed in parallel.
 const PALETTE_FRAMES: usize = 8;
 
 /// The endings of [`write_animation`].
 pub const ANIMATIONS: [&str; 2] = ["png", "gif"];
 
-/// Writes an animated PNG, or a GIF (of 256 colors a frame, without half transparency), as `ending` says.
+/// Writes an animated PNG, or a GIF (of 256 colors a frame, without half transparency) if `ending` is `gif`.
 ///
 /// # Errors
 ///

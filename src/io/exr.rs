@@ -17,7 +17,7 @@ use std::path::Path;
 pub struct ExrImage {
     /// The channels in the requested order, at the size of the display window.
     pub image: Image,
-    /// How many values were NaN or infinite and became 0.
+    /// Number of values that were NaN or infinite and became 0.
     pub replaced: usize,
 }
 

@@ -17,7 +17,7 @@ pub fn create_folder(path: &Path) -> Result<(), WriteError> {
     fs::create_dir_all(path).map_err(failed(path))
 }
 
-/// Returns what is directly in a folder; nothing if it does not exist.
+/// Returns the entries of a folder; none if it does not exist.
 fn entries(path: &Path) -> std::io::Result<Vec<DirEntry>> {
     match fs::read_dir(path) {
         Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
@@ -51,8 +51,8 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
     Ok(())
 }
 
-/// Returns a file in a folder or below, but not in folders that are `apart`; `None` where there is none, and
-/// no folder.
+/// Returns a file in a folder or below, but not in folders that are `apart`; `None` without one, or without
+/// the folder.
 pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<PathBuf>, ReadError> {
     for entry in entries(path).map_err(|e| ReadError::io(path, e))? {
         let inside = entry.path();
@@ -89,7 +89,7 @@ pub fn is_file(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|m| m.is_file())
 }
 
-/// Returns whether anything has this name, even a dangling link.
+/// Returns whether the path exists, even as a dangling link.
 pub fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
@@ -155,7 +155,7 @@ pub fn modified(path: &Path) -> Option<SystemTime> {
 }
 
 /// Appends a line to a log. If the last writer was stopped in the middle of a line, that line is
-/// ended first, so that it spoils only itself. A link is an error: what it leads to is no log of ours.
+/// ended first, so that it spoils only itself. A link is an error, because its target may be any file.
 pub fn append(path: &Path, line: &str) -> Result<(), WriteError> {
     if is_link(path) {
         return Err(failed(path)(linked()));

@@ -150,7 +150,7 @@ pub fn npy_bytes(kind: &str, shape: &[usize], values: &[u8]) -> Vec<u8> {
     file
 }
 
-/// Are the header's numbers plain ones, and can their product be held, with 1 for an extent of 0? The parser
+/// Returns whether the header's numbers are plain decimals whose product, with 1 for an extent of 0, fits into 64 bits. The parser
 /// also accepts sums, signs, hexadecimals and `1_000`, which no array needs.
 fn countable(header: &[u8]) -> bool {
     let words = header.split(|b| !(b.is_ascii_alphanumeric() || b"_+-".contains(b)));

@@ -16,7 +16,7 @@ use std::io::{Cursor, Read};
 use std::path::Path;
 use zune_jpeg::zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions};
 
-/// What the header of a picture says.
+/// The header of a picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PictureInfo {
     /// Stored pixels per row.
@@ -91,7 +91,7 @@ pub fn parse_picture_info(bytes: &[u8], path: &Path, limits: &Limits) -> Result<
     if file.is_png()? { Ok(file.png_decoder()?.1) } else { Ok(file.jpeg_decoder()?.1) }
 }
 
-/// What to do with pictures of other formats.
+/// Suggested fix for pictures of other formats.
 const NOT_READ: &str = "convert it to PNG or JPEG (ImageMagick: `magick mogrify -format png FILES`); where another file \
                         names it with its ending, correct the name as well";
 
@@ -207,7 +207,7 @@ impl<'a> PictureFile<'a> {
         }
     }
 
-    /// Walks the segments of a JPEG to the end-of-image marker and returns the most pixels its picture data can hold:
+    /// Walks the segments of a JPEG to the end-of-image marker and returns the maximum number of pixels in its picture data:
     /// a block of 64 takes a bit at least, and without progression a second one for its end.
     fn walk_jpeg(self) -> Result<u64, ReadError> {
         let bytes = self.bytes;

@@ -1,4 +1,4 @@
-//! Cost of this process, its processor, and whether other processes run, as far as the system says.
+//! Cost of this process, its processor, and whether other processes run, as far as the system reports it.
 
 use std::path::Path;
 
@@ -18,7 +18,7 @@ pub fn cpu_seconds() -> f64 {
     }
 }
 
-/// Returns the most memory that this process has had since [`forget_peak_memory`], bytes; `None` where the system does
+/// Returns the peak memory of this process since [`forget_peak_memory`], bytes; `None` where the system does
 /// not say.
 pub fn peak_memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
@@ -62,7 +62,7 @@ fn is_running(_: u32) -> bool {
     true
 }
 
-/// Returns what the system calls its processor; empty where it does not say.
+/// Returns the processor's name as the system reports it; empty if unknown.
 pub fn processor() -> String {
     let all = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let line = all.lines().find_map(|l| l.strip_prefix("model name"));

@@ -6,7 +6,7 @@ use std::fs::{self, File};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Opens a regular file; looks before opening, since opening a pipe would wait for its writer.
+/// Opens a regular file; checks the type before opening, since opening a pipe would wait for its writer.
 pub(super) fn open(path: &Path) -> Result<(File, u64), ReadError> {
     let about = fs::metadata(path).map_err(|e| ReadError::io(path, e))?;
     regular(path, &about)?;
@@ -48,7 +48,7 @@ pub fn read_bytes(path: &Path, limits: &Limits) -> Result<Vec<u8>, ReadError> {
     read_capped(path, limits.file_bytes, "the file's size in bytes")
 }
 
-/// [`read_bytes`] of a format that may say nothing: no bytes are no damage.
+/// [`read_bytes`] for formats in which an empty file is valid.
 pub fn read_maybe_empty(path: &Path, limits: &Limits) -> Result<Vec<u8>, ReadError> {
     match read_bytes(path, limits) {
         Err(ReadError::Empty { .. }) => Ok(Vec::new()),
@@ -74,7 +74,7 @@ pub(super) fn read_capped(path: &Path, limit: u64, what: &'static str) -> Result
     Ok(bytes)
 }
 
-/// What a reader refuses to exceed, whatever a file says about itself.
+/// Limits of readers, independent of what a file claims.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// Longest side of a picture, pixels.
@@ -136,7 +136,7 @@ pub enum ReadError {
         /// What the system said.
         source: std::io::Error,
     },
-    /// A folder, a pipe, a device: nothing that holds a file's bytes.
+    /// A folder, a pipe or a device instead of a regular file.
     #[error("`{}` is {kind}, not a regular file", path.display())]
     NotAFile {
         /// The file.
@@ -162,7 +162,7 @@ pub enum ReadError {
         /// The limit.
         limit: u64,
     },
-    /// The bytes are not what the format demands.
+    /// The bytes violate the format.
     #[error("`{}` is not a valid {format} file: {problem}{}", path.display(), at(*offset))]
     Damaged {
         /// The file.

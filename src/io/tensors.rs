@@ -36,11 +36,6 @@ impl TensorValues {
         }
     }
 
-    /// Returns whether it has no values.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
     fn dtype(&self) -> (&'static str, usize) {
         match self {
             TensorValues::F32(_) => ("F32", 4),
@@ -69,7 +64,7 @@ impl TensorValues {
     }
 }
 
-/// What a checkpoint holds: tensors by name, and `__metadata__`.
+/// The content of a checkpoint: tensors by name, and `__metadata__`.
 pub type Tensors = (BTreeMap<String, (Vec<usize>, TensorValues)>, BTreeMap<String, String>);
 
 /// Writes a safetensors file in one step; the same content gives the same bytes, in whatever order the
@@ -140,7 +135,7 @@ pub fn parse_tensors(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Tenso
         return Err(bad(Some(bytes.len() as u64), "it ends inside its header length".into()));
     };
     if length > MAX_HEADER {
-        // what a flipped bit in the first bytes looks like: damage, not a large file
+        // a flipped bit in the first bytes gives such a length: damage, not a large file
         return Err(bad(Some(0), format!("its header claims {length} bytes, the limit is {MAX_HEADER}")));
     }
     let Some(header) = bytes.get(8..8 + length as usize) else {

@@ -73,7 +73,7 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     write_with(path, bytes.len(), |file| file.write_all(bytes))
 }
 
-/// Copies a file to a name that nothing has, in one step; `from` may be a link.
+/// Copies a file to a new name in one step; `from` may be a link.
 pub fn copy(from: &Path, to: &Path) -> Result<(), WriteError> {
     if fs::symlink_metadata(to).is_ok() {
         let source = std::io::Error::new(ErrorKind::AlreadyExists, "it already exists");
@@ -128,7 +128,7 @@ fn write_with(
         fs::rename(&aside, path)
     })();
     if let Err(e) = result {
-        let _ = fs::remove_file(&aside); // the first error is the one to tell
+        let _ = fs::remove_file(&aside); // the first error is reported
         return Err(fail(e));
     }
     sync_folder(folder).map_err(fail)

@@ -10,7 +10,6 @@ pub mod distance;
 pub mod hash;
 pub mod losses;
 pub mod march;
-pub mod matrix;
 pub mod mlp;
 pub mod neus;
 pub mod occupancy;

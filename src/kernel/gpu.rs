@@ -22,10 +22,7 @@ mod points;
 mod rng;
 mod schedule;
 mod sdf;
-mod search;
 mod sum;
-#[cfg(test)]
-mod test_case;
 mod tile;
 mod vm;
 mod weight_norm;
@@ -46,5 +43,7 @@ pub use sdf::Sdf;
 pub use vm::{DeviceDecoder, DeviceGrid, Vm, VmLosses, VmRenderer, VmValues};
 pub use weight_norm::WeightNorm;
 
+#[cfg(test)]
+mod case_tests;
 #[cfg(test)]
 pub(crate) use device::tests;

@@ -1,10 +1,10 @@
-//! Do the masks of all views fit one body? Silhouette consistency (Laurentini 1994; Boyer 2006).
+//! Silhouette consistency: whether the masks of all views fit one body (Laurentini 1994; Boyer 2006).
 //!
-//! Of masks that are right, every ray through a masked pixel meets the visual hull: somewhere along it lies a point
+//! With correct masks, every ray through a masked pixel meets the visual hull: somewhere along it lies a point
 //! that no other mask rules out. Where none does, masks contradict each other: either this view shows too much, or
 //! each view that rules out the best point of the ray shows too little. One such pixel cannot tell which; all of
-//! them together can. The view whose removal settles most of the conflict is named first, and the rest is asked
-//! again without it, until what is left is no more than discretisation.
+//! them together can. The view whose removal settles most of the conflict is named first, and the comparison is repeated
+//! without it, until the rest is no more than discretisation.
 //!
 //! Nothing but masks and cameras is needed, so the masks of a capture are checked in the same way.
 //!
@@ -36,15 +36,15 @@ use rayon::prelude::*;
 const ROWS: u32 = 160;
 /// Cells along each side of the cube.
 const CELLS: usize = 128;
-/// Half side of the cube, in half heights of the frames at the point they look at.
+/// Half side of the cube, in half heights of the frames at the point where the viewing axes meet.
 const CUBE: f64 = 1.6;
-/// How many reduced pixels beside a mask, beyond the footprint of a cell, nothing is ruled out yet.
+/// Margin around a mask, in reduced pixels beyond the footprint of a cell, within which no cell is ruled out.
 const SLACK_PX: f32 = 1.0;
 /// Conflicts of a view, in whole masks, below which it is never named …
 const THRESHOLD: f64 = 0.005;
 /// … and from which it always is.
 const CERTAIN_THRESHOLD: f64 = 0.05;
-/// Between the two it is named when its conflict is this many times the mean.
+/// Between the two, a view is named if its conflict is this many times the mean.
 const OUTLIER_RATIO: f64 = 4.0;
 
 /// A view with its mask.
@@ -71,18 +71,18 @@ pub struct Conflict {
     pub text: String,
 }
 
-/// What the check found.
+/// The result of the check.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Consistency {
-    /// How many masks were compared.
+    /// Number of compared masks.
     pub masks: usize,
-    /// The masks to look at, the worst first.
+    /// The conflicting masks, the worst first.
     pub conflicts: Vec<Conflict>,
     /// Share of all masks that is left unexplained once those are set aside.
     pub left: f64,
 }
 
-/// Compares the masks of all views. Fewer than two masks have nothing to disagree about.
+/// Compares the masks of all views. Fewer than two masks cannot conflict.
 ///
 /// # Errors
 /// When the cameras stand at one place or look in one direction.
@@ -113,7 +113,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
             let total: f64 = (0..claims.len()).filter(|&i| active[i]).map(|i| conflict.too_much[i]).sum();
             return Ok(Consistency { masks: claims.len(), conflicts, left: total / left.max(1) as f64 });
         };
-        // of two masks nothing says which is wrong
+        // of two masks it is unknown which one is wrong
         let named = if left == 2 { (0..claims.len()).filter(|&i| active[i]).collect() } else { vec![worst] };
         for i in named {
             active[i] = false;
@@ -124,7 +124,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
     }
 }
 
-/// Returns the cube that some views look at, and what the mask of each claims.
+/// Returns the cube in view of the cameras, and the constraints of each mask.
 fn claims_of(
     views: &[ConsistencyView],
     used: &[usize],
@@ -160,7 +160,7 @@ fn sentence(view: &str, much: f64, little: f64, taken: f64, two: bool) -> String
     format!("the mask of view `{view}` {parts}{which}")
 }
 
-/// What a reduced mask claims: where the head is, and where it cannot be.
+/// Constraints of a reduced mask: pixels that are head, and pixels that rule out the head.
 struct SilhouetteConstraints {
     camera: Camera,
     frame: ViewFrame,
@@ -208,7 +208,7 @@ impl Votes {
         Votes { cube, words, bits }
     }
 
-    /// Cells as what they cost: how many active views rule them out, and how many have them on the head.
+    /// Returns the costs of cells: how many active views rule each out, and how many have it on the head.
     fn costs(&self, active: &[bool]) -> Vec<(u16, u16)> {
         let mut mask = vec![0u64; self.words];
         for i in (0..active.len()).filter(|&i| active[i]) {
@@ -231,7 +231,7 @@ struct Conflicts {
     too_much: Vec<f64>,
     /// Per view: shares of other views' claims that it takes away, summed.
     taken: Vec<f64>,
-    /// How much of the conflict its removal settles, in whole masks.
+    /// Part of the conflict that removing the view settles, in whole masks.
     credit: Vec<f64>,
     others: f64,
 }
@@ -251,13 +251,13 @@ impl Conflicts {
         let zero = || vec![0.0; count];
         let mut conflict = Conflicts { too_much: zero(), taken: zero(), credit: zero(), others };
         for (j, open) in found.into_iter().enumerate() {
-            let Some(Opposition { asked, open, takers }) = open else { continue };
-            // where hardly a ray comes where another view looks, the camera is turned away from what its mask shows
+            let Some(Opposition { asked, open, opposing }) = open else { continue };
+            // if hardly any ray enters another view's frustum, the camera is turned away from the head that its mask shows
             let is_turned = 10 * asked < claims[j].inner.len();
             let own = if is_turned { 1.0 } else { open };
             conflict.too_much[j] = own;
             conflict.credit[j] += own;
-            for (i, [taken, _]) in takers.into_iter().enumerate().filter(|_| !is_turned) {
+            for (i, [taken, _]) in opposing.into_iter().enumerate().filter(|_| !is_turned) {
                 conflict.taken[i] += taken;
                 conflict.credit[i] += taken;
             }
@@ -280,14 +280,14 @@ impl Conflicts {
     }
 }
 
-/// How the claims of one view stand against the other views.
+/// Conflicts of one view's claims with the other views.
 struct Opposition {
-    /// Claims whose ray meets a cell that another view looks at.
+    /// Claims whose ray meets a cell in another view's frame.
     asked: usize,
-    /// Share of them that nothing explains.
+    /// Share of them that no cell explains.
     open: f64,
     /// Per view: the share of the claims that it rules out, divided among all views that do; and the same undivided.
-    takers: Vec<[f64; 2]>,
+    opposing: Vec<[f64; 2]>,
 }
 
 impl Opposition {
@@ -299,22 +299,22 @@ impl Opposition {
         active: &[bool],
         best: impl Fn(usize) -> Option<(bool, u16, usize)>,
     ) -> Opposition {
-        let mut takers = vec![[0.0; 2]; active.len()];
+        let mut opposing = vec![[0.0; 2]; active.len()];
         let (mut open, mut asked) = (0usize, 0usize);
-        for (alone, no, cell) in claims.inner.iter().filter_map(|&pixel| best(pixel)) {
+        for (unsupported, no, cell) in claims.inner.iter().filter_map(|&pixel| best(pixel)) {
             asked += 1;
-            open += (alone || no > 0) as usize;
-            if alone || no == 0 {
+            open += (unsupported || no > 0) as usize;
+            if unsupported || no == 0 {
                 continue;
             }
             for i in (0..active.len()).filter(|&i| active[i] && votes.rules_out(i, cell)) {
-                takers[i][0] += 1.0 / f64::from(no);
-                takers[i][1] += 1.0;
+                opposing[i][0] += 1.0 / f64::from(no);
+                opposing[i][1] += 1.0;
             }
         }
         let total = asked.max(1) as f64;
-        takers.iter_mut().flatten().for_each(|t| *t /= total);
-        Opposition { asked, open: open as f64 / total, takers }
+        opposing.iter_mut().flatten().for_each(|t| *t /= total);
+        Opposition { asked, open: open as f64 / total, opposing }
     }
 }
 
@@ -377,9 +377,9 @@ fn best_on_ray(
         if no == 0 && yes < 2 {
             continue; // no other view sees this cell, so it explains nothing
         }
-        let alone = yes < 2;
-        if best.is_none_or(|(a, cost, agreed, _)| (alone, no, agreed) < (a, cost, yes)) {
-            best = Some((alone, no, yes, i));
+        let unsupported = yes < 2;
+        if best.is_none_or(|(a, cost, agreed, _)| (unsupported, no, agreed) < (a, cost, yes)) {
+            best = Some((unsupported, no, yes, i));
             if no == 0 {
                 break;
             }
@@ -395,11 +395,11 @@ const PROPOSAL_CELLS: usize = 96;
 const MIN_VISIBLE_SHARE: f64 = 0.75;
 /// Share of the views that see a cell which must have it on the head.
 const MIN_SUPPORT_SHARE: f64 = 0.25;
-/// What an open claim weighs, in parts of one that is taken away.
+/// Weight of an open claim relative to one that is ruled out.
 const OPEN_CLAIM_WEIGHT: f64 = 1.0 / 3.0;
 /// Mean share of the others' masks that a view may rule out.
 const MAX_RULED_OUT: f64 = 0.003;
-/// Share of its own claims that may stand open.
+/// Maximum share of its own claims that may be open.
 const MAX_OPEN: f64 = 0.05;
 
 /// The verdict on a proposed mask.
@@ -407,20 +407,20 @@ const MAX_OPEN: f64 = 0.05;
 pub enum MaskVerdict {
     /// It agrees with the others.
     Agrees,
-    /// It leaves out what others show; what it shows is reliable.
+    /// It leaves out parts that others show; the rest of it is reliable.
     LeavesOut,
-    /// It shows what no other does, or nothing at all.
+    /// It shows parts that no other view shows, or no head at all.
     Unlike,
 }
 
-/// What speaks against one mask.
+/// The evidence against one mask.
 #[derive(Default)]
 struct Disagreement {
     /// Open share of its own claims.
     open: f64,
     /// Shares of the others' claims that it rules out, each divided among all views that do.
     taken: f64,
-    /// The same undivided.
+    /// Shares of the others' claims that it rules out, undivided.
     ruled_out: f64,
 }
 
@@ -468,8 +468,8 @@ fn blame(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Ve
     // first whether it lacks support, then how many views are against it, then how many are for it
     let key = |&cell: &usize| {
         let (no, yes) = costs[cell];
-        let alone = yes < 2 || f64::from(yes) < MIN_SUPPORT_SHARE * f64::from(no + yes);
-        (alone, no, u16::MAX - yes)
+        let unsupported = yes < 2 || f64::from(yes) < MIN_SUPPORT_SHARE * f64::from(no + yes);
+        (unsupported, no, u16::MAX - yes)
     };
     let best = |claims: &SilhouetteConstraints, pixel| {
         let cells = cells_on_ray(&votes.cube, claims, pixel);
@@ -482,9 +482,9 @@ fn blame(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Ve
         .collect();
     let mut out: Vec<Disagreement> = claims.iter().map(|_| Disagreement::default()).collect();
     for (j, opposition) in found.iter().enumerate() {
-        let Some(Opposition { open, takers, .. }) = opposition else { continue };
+        let Some(Opposition { open, opposing, .. }) = opposition else { continue };
         out[j].open = *open;
-        for (blame, [taken, ruled_out]) in out.iter_mut().zip(takers) {
+        for (blame, [taken, ruled_out]) in out.iter_mut().zip(opposing) {
             blame.taken += taken;
             blame.ruled_out += ruled_out;
         }
@@ -681,7 +681,7 @@ mod proposal_tests {
 
     #[test]
     fn two_masks_that_contradict_each_other_both_fail() {
-        // what one shows lies above everything that the other does
+        // all that one view shows lies above everything that the other shows
         let cameras = ring();
         let at = |y: f64, i: usize| {
             let c = DVec3::new(0.0, y, 0.0);

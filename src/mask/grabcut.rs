@@ -27,15 +27,15 @@ use crate::{Error, Result};
 pub(super) const ROWS: u32 = 512;
 /// Gaussians per mixture (Rother, Kolmogorov, Blake 2004, §3.1).
 const GAUSSIANS: usize = 5;
-/// γ: what an edge between equal colors costs (§2.2 of the same).
+/// γ: cost of a label change between equal colors (§2.2 of the same).
 const SMOOTHNESS: f64 = 50.0;
-/// λ/γ: what contradicting a click or border margin costs.
+/// λ/γ: cost of contradicting a click or border margin.
 const SEED_WEIGHT: f64 = 9.0;
 /// Rounds of fitting and cutting from clicks.
 pub(super) const ROUNDS: usize = 8;
 /// Holes up to this share of the picture are filled.
 const MAX_HOLE_SHARE: f64 = 0.01;
-/// Around the outline, what colors leave open counts as ambiguous within this share of the height.
+/// Distance from the outline, as a share of the height, within which undecided colors count as ambiguous.
 const OUTLINE_BAND: f32 = 0.023;
 /// Seed of the k-means start.
 const SEED: u64 = 42;
@@ -111,7 +111,7 @@ pub(super) struct Models {
 }
 
 impl Models {
-    /// From k-means over both sides; `None` when one has no pixel.
+    /// Fits both mixtures, starting from k-means; `None` if a side has no pixel.
     pub fn fit(head: &[Rgb], background: &[Rgb]) -> Option<Models> {
         Some(Models {
             head: Mixture::fit(head, GAUSSIANS, SEED)?,
@@ -119,7 +119,7 @@ impl Models {
         })
     }
 
-    /// Returns each side, measured again.
+    /// Returns both mixtures, refitted.
     pub fn refit(&self, head: &[Rgb], background: &[Rgb]) -> Models {
         Models { head: self.head.refit(head), background: self.background.refit(background) }
     }
@@ -130,7 +130,7 @@ impl Models {
     }
 }
 
-/// A photograph at its working size with what is certain about it.
+/// A photograph at its working size, with its definite labels.
 pub(super) struct Grabcut {
     pub photo: Photo,
     pub width: usize,
@@ -139,7 +139,7 @@ pub(super) struct Grabcut {
     pub clicks: Vec<Click>,
     /// `[height · width]`.
     pub seeds: Vec<Seed>,
-    /// What telling a pixel from its right, lower, lower right and lower left neighbor costs.
+    /// Costs of different labels of a pixel and its right, lower, lower right and lower left neighbor.
     edges: Vec<[i32; 4]>,
 }
 
@@ -191,7 +191,7 @@ impl Grabcut {
         (of(true).collect(), of(false).collect())
     }
 
-    /// One smallest cut under given colors.
+    /// Returns a minimum cut for given color models.
     pub fn min_cut(&self, models: &Models) -> Vec<bool> {
         let certain = (SEED_WEIGHT * SMOOTHNESS * CAPACITY_SCALE) as i32;
         let mut graph = PixelGraph::new(self.width, self.height);
@@ -216,14 +216,14 @@ impl Grabcut {
         graph.cut().0
     }
 
-    /// Pieces without a click that are smaller than `least` pixels go, small holes are filled, threads are opened.
-    pub fn finish(&self, mut head: Vec<bool>, least: f64) -> Vec<bool> {
+    /// Pieces without a click that are smaller than `min_size` pixels go, small holes are filled, threads are opened.
+    pub fn finish(&self, mut head: Vec<bool>, min_size: f64) -> Vec<bool> {
         let clicked: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Head).collect();
-        keep_pieces(&mut head, &clicked, least, self.width, self.height);
+        keep_pieces(&mut head, &clicked, min_size, self.width, self.height);
         self.smooth(head)
     }
 
-    /// As [`Grabcut::finish`], and every piece needs a click.
+    /// Finishes a mask like [`Grabcut::finish`], and keeps only pieces with a click.
     pub fn finish_clicked(&self, head: Vec<bool>) -> Vec<bool> {
         let mut smooth = self.finish(head, f64::INFINITY);
         let clicked: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Head).collect();
@@ -259,7 +259,7 @@ impl Grabcut {
         open.count() as f64 / (w * h) as f64
     }
 
-    /// Returns what looks wrong about a finished mask.
+    /// Returns warnings about a finished mask.
     pub fn warnings(&self, view: &str, head: &[bool]) -> Vec<String> {
         let mut found = Vec::new();
         for (n, c) in self.clicks.iter().enumerate() {
@@ -310,13 +310,13 @@ fn edges(photo: &Photo) -> Vec<[i32; 4]> {
         .collect()
 }
 
-/// Radius of what a click makes certain, share of the picture's height.
+/// Radius of the definite disc around a click, as a share of the picture's height.
 const SEED_RADIUS: f32 = 0.012;
 /// … and at least this many working pixels.
 const MIN_SEED_RADIUS_PX: f32 = 4.0;
 /// Width of the border margins along top and sides that are certainly background, share of the height.
 pub(super) const BORDER_MARGIN: f32 = 0.012;
-/// How far down the border margins at the sides reach, share of the height; shoulders may touch the rest.
+/// Height of the border margins at the sides, as a share of the picture's height; shoulders may touch the rest.
 const BORDER_SIDES: f32 = 0.6;
 /// Radius of the discs around head clicks in the start, share of the height.
 const START_RADIUS: f32 = 0.06;
@@ -326,7 +326,7 @@ const START_LINE: f32 = 0.02;
 /// clicks; what lies between would teach it the colors of hair.
 const START_DISTANCE_RATIO: f32 = 2.0;
 
-/// What is certain about a pixel.
+/// A definite label of a pixel, or none.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Seed {
     Unknown,

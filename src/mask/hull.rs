@@ -1,4 +1,4 @@
-//! What masks of several views say about space: votes for every cell of a cube, and their silhouettes.
+//! Visual hull of the masks of several views: votes for every cell of a cube, and silhouettes of cells.
 //!
 //! A mask votes for a cell when the cell's center falls on the head, against it when it falls beside, and not at
 //! all outside its frame. A set of cells is drawn back into any view by its surface.
@@ -65,7 +65,7 @@ pub(super) struct Voter {
 }
 
 impl Voter {
-    /// Takes a mask for the camera's whole picture, at whatever size it is; head from 128.
+    /// Takes a mask of any size for the camera's whole picture; head from 128.
     pub fn new(camera: &Camera, mask: &Gray) -> Voter {
         Voter {
             frame: ViewFrame::new(&camera.resized(mask.width, mask.height)),
@@ -85,7 +85,7 @@ pub(super) fn cells(votes: &[[u16; 2]], most_negative: usize, least_positive: us
     votes.iter().map(|&[no, yes]| no as usize <= most_negative && yes as usize >= least_positive).collect()
 }
 
-/// Returns the cube around the point the cameras look at, `margin` times as high as their frames at that point.
+/// Returns the cube around the point where the viewing axes meet, `margin` times as high as the frames at that point.
 pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
     let alike = |how: &str| {
         Error::cannot(
@@ -146,7 +146,7 @@ pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
     let mut depth = vec![0u16; cells.len()];
     let mut front = Vec::new();
     let at = |i: usize| [i / (n * n), i / n % n, i % n];
-    // cells beside something outside; beyond the cube nothing is known, so its walls do not peel
+    // cells beside an outside cell; cells beyond the cube are unknown, so its walls do not peel
     for i in (0..cells.len()).filter(|&i| cells[i]) {
         if around(at(i), n, false).any(|j| !cells[j]) {
             depth[i] = 1;

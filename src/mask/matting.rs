@@ -32,7 +32,7 @@ const MAX_ALPHA: f32 = 0.98;
 /// A band that is a larger share of the picture is worth a warning.
 const MAX_UNKNOWN: f64 = 0.3;
 
-/// How a hard mask is made soft.
+/// Options of softening a hard mask.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SoftenOptions {
     /// Longest side of the working picture at most, pixels.
@@ -57,7 +57,7 @@ impl SoftenOptions {
     }
 }
 
-/// A soft alpha, and what was unknown.
+/// A soft alpha and its trimap.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SoftMask {
     /// At the photograph's size.
@@ -161,14 +161,14 @@ pub const UNKNOWN: u8 = 128;
 /// Outside, in a trimap.
 pub const OUTSIDE: u8 = 0;
 
-/// How wide the unknown band is.
+/// Width of the unknown band.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum UnknownBand {
     /// `kernel × kernel` ones applied `iterations` times each way.
     Squares {
         /// Side of the square, pixels; with an even one the band lies half a pixel to the lower right.
         kernel: u32,
-        /// How many times.
+        /// Number of applications.
         iterations: u32,
     },
     /// Discs each way, of this radius as a share of the picture's height.
@@ -214,18 +214,18 @@ pub fn unknown_share(trimap: &Gray) -> f64 {
     unknown as f64 / trimap.values.len().max(1) as f64
 }
 
-/// Marked where the whole of the square is, as far as it lies inside the picture.
+/// Marks pixels whose square is entirely marked, as far as it lies inside the picture.
 pub fn erode(marked: &[bool], width: usize, height: usize, kernel: u32, iterations: u32) -> Vec<bool> {
     let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
     dilate(&outside, width, height, kernel, iterations).into_iter().map(|m| !m).collect()
 }
 
-/// Marked where anything under the square is.
+/// Marks pixels with a marked pixel under their square.
 pub fn dilate(marked: &[bool], width: usize, height: usize, kernel: u32, iterations: u32) -> Vec<bool> {
     assert_eq!(marked.len(), width * height);
     let (kernel, iterations) = (kernel.max(1) as usize, iterations as usize);
     // squares applied in turn are one larger square, and a square is a row of columns; OpenCV does not
-    // mirror the kernel when it dilates, so both look as far before as behind
+    // mirror the kernel when it dilates, so both reach as far before as behind
     let before = (kernel / 2).saturating_mul(iterations);
     let behind = (kernel - 1 - kernel / 2).saturating_mul(iterations);
     let mut rows = vec![false; marked.len()];
@@ -235,7 +235,7 @@ pub fn dilate(marked: &[bool], width: usize, height: usize, kernel: u32, iterati
     all
 }
 
-/// Along each of `lines` of `length` places: is anything marked from `before` places before to `behind` places behind?
+/// Marks each place of `lines` of `length` places that has a marked one from `before` places before to `behind` places behind it.
 /// Steps are those from line to line and from place to place.
 fn dilate_lines(
     marked: &[bool],

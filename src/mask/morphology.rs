@@ -17,7 +17,7 @@ pub fn squared_distance(marked: &[bool], width: usize, height: usize) -> Vec<f32
     if !marked.contains(&true) {
         return vec![f32::INFINITY; marked.len()];
     }
-    // along columns first: a plain two-pass scan is exact there
+    // along columns first, where a plain two-pass scan is exact
     let mut field: Vec<f32> = marked.iter().map(|&m| if m { 0.0 } else { FAR }).collect();
     let mut steps = vec![u32::MAX; width];
     for y in 0..height {
@@ -50,7 +50,7 @@ pub fn grow(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<bo
     squared_distance(marked, width, height).iter().map(|&d| d <= radius * radius).collect()
 }
 
-/// Marked pixels farther than `radius` pixels from every pixel that is not; beyond the border nothing is known,
+/// Marked pixels farther than `radius` pixels from every pixel that is not; pixels beyond the border are unknown,
 /// so the border does not shrink them.
 pub fn shrink(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<bool> {
     let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
@@ -69,10 +69,10 @@ fn pieces(marked: &[bool], width: usize, height: usize, corners: bool) -> Pieces
     })
 }
 
-/// Takes away every piece of less than `least` pixels without one of `seeds`.
-pub(super) fn keep_pieces(marked: &mut [bool], seeds: &[bool], least: f64, width: usize, height: usize) {
+/// Takes away every piece of less than `min_size` pixels without one of `seeds`.
+pub(super) fn keep_pieces(marked: &mut [bool], seeds: &[bool], min_size: f64, width: usize, height: usize) {
     let found = pieces(marked, width, height, true);
-    let mut wanted: Vec<bool> = found.size.iter().map(|&s| s as f64 >= least).collect();
+    let mut wanted: Vec<bool> = found.size.iter().map(|&s| s as f64 >= min_size).collect();
     for (i, &seed) in seeds.iter().enumerate() {
         wanted[found.label[i] as usize] |= seed;
     }
@@ -86,7 +86,7 @@ pub(super) fn gray(marked: &[bool], width: usize, height: usize) -> Gray {
     Gray { width: width as u32, height: height as u32, values }
 }
 
-/// Fills what is enclosed, does not touch the border, has at most `largest` pixels and none of `never`.
+/// Fills enclosed regions that do not touch the border, have at most `largest` pixels and none of `never`.
 pub(super) fn fill_holes(marked: &mut [bool], never: &[bool], width: usize, height: usize, largest: usize) {
     let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
     let found = pieces(&outside, width, height, false);
@@ -101,7 +101,7 @@ pub(super) fn fill_holes(marked: &mut [bool], never: &[bool], width: usize, heig
     marked.iter_mut().zip(&found.label).for_each(|(m, &l)| *m |= l != 0 && fill[l as usize]);
 }
 
-/// Takes away what no 3 × 3 square of marked pixels covers; pixels outside the picture are ignored.
+/// Unmarks pixels that no 3 × 3 square of marked pixels covers; pixels outside the picture are ignored.
 pub(super) fn open(marked: &[bool], width: usize, height: usize) -> Vec<bool> {
     let inner = square(marked, width, height, true);
     square(&inner, width, height, false)

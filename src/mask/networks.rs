@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! photograph + clicks ── segment ── hard mask        photograph + trimap ── alpha ── soft alpha
-//! photograph ─────────── propose ── alpha of whatever the network takes for what is meant
+//! photograph ─────────── propose ── alpha of the network's foreground
 //! ```
 //!
 //! Files are recognized by their inputs and outputs, looked through before an engine sees them, and recorded
@@ -66,8 +66,8 @@ impl Networks {
         &self.files
     }
 
-    /// Runs the networks once, on an empty photograph of this size, so that a file that cannot be run, or gives what
-    /// is no number, is refused before the first photograph. Costs what one photograph does.
+    /// Runs the networks once, on an empty photograph of this size, so that a file that cannot be run, or returns
+    /// values that are not finite, is refused before the first photograph. Costs as much as one photograph.
     pub fn prepare(&self, width: u32, height: u32) -> Result<()> {
         self.affordable(width, height)?;
         let pixels = width as usize * height as usize;
@@ -78,7 +78,7 @@ impl Networks {
         Ok(())
     }
 
-    /// Returns the alpha, at `size`, that the alpha network gives a photograph by itself; `None` without one.
+    /// Returns the alpha network's alpha of a photograph, at `size`, without clicks; `None` without such a network.
     ///
     /// # Errors
     /// For a photograph whose size is not that of its colors; when the network fails or gives what is no picture.

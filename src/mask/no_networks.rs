@@ -26,7 +26,7 @@ impl NoNetworks {
         ))
     }
 
-    /// Returns what was loaded.
+    /// Returns the loaded files.
     pub fn files(&self) -> &[String] {
         match *self {}
     }

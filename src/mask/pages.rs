@@ -1,13 +1,13 @@
 //! Pages of masks, one HTML file each: the annotation page to click on, and the contact sheet.
 //!
 //! **Annotation page**: photographs in, `prompts.json` out.
-//! Nothing is loaded from elsewhere and nothing is sent: photographs lie inside as JPEG, reduced, while clicks
+//! The pages load and send no data: photographs lie inside as JPEG, reduced, while clicks
 //! are counted in pixels of the originals. The page's own text is `annotation.html`; names of files reach it only as
 //! JSON in which no character can end the element that holds it.
 //!
 //! **Contact sheet**: all masks over their photographs, to see at a glance which went wrong.
 //! The mask's outline is cyan, the unknown band yellow; below each picture stand the view's name, how much the mask
-//! covers and how much is unknown. Views that look suspicious have a red frame and say why. The sheet is HTML with
+//! covers and how much is unknown. Suspicious views have a red frame and list the reasons. The sheet is HTML with
 //! the pictures inside: a page of its own, and a part of the report.
 
 use super::matting::{UNKNOWN, unknown_share};
@@ -75,11 +75,11 @@ pub fn page_of(capture: &Capture, prompts: &Prompts, limits: &Limits) -> Result<
     Ok(page(&capture.name, &views, prompts))
 }
 
-/// At most `most` of `count` indices in order: those that `wanted` names first, the others evenly.
-fn evenly(count: usize, most: usize, wanted: impl Fn(usize) -> bool) -> Vec<usize> {
-    let named: Vec<usize> = (0..count).filter(|&i| wanted(i)).take(most).collect();
+/// At most `max_count` of `count` indices in order: those that `wanted` names first, the others evenly.
+fn evenly(count: usize, max_count: usize, wanted: impl Fn(usize) -> bool) -> Vec<usize> {
+    let named: Vec<usize> = (0..count).filter(|&i| wanted(i)).take(max_count).collect();
     let rest: Vec<usize> = (0..count).filter(|i| named.binary_search(i).is_err()).collect();
-    let remaining = (most - named.len()).min(rest.len());
+    let remaining = (max_count - named.len()).min(rest.len());
     let mut chosen: Vec<usize> =
         (0..remaining).map(|k| rest[k * rest.len() / remaining]).chain(named).collect();
     chosen.sort_unstable();
@@ -112,7 +112,7 @@ const BAND: [u8; 3] = [255, 200, 0];
 const PICTURE_PX: u32 = 320;
 /// Pictures on a sheet at most, about 10 MB of them.
 const MAX_PICTURES: usize = 500;
-/// What encloses the sheet on a page of its own.
+/// Page around a sheet.
 const SHEET_MARKERS: [&str; 2] = ["<!-- sheet -->", "<!-- end of the sheet -->"];
 
 /// One view of a sheet.
@@ -122,14 +122,14 @@ pub struct SheetView {
     pub name: String,
     /// The photograph, reduced, with outline and band: a `data:` address.
     pub picture: String,
-    /// How much of the picture is head and, where that is known, unknown: in words.
+    /// Shares of the picture that are head and, if known, unknown: in words.
     pub shares: String,
-    /// Why a person should look.
+    /// Reasons for a manual check.
     pub suspicions: Vec<String>,
 }
 
 impl SheetView {
-    /// Draws the mask of a view over its photograph and says what makes the mask suspicious by itself; the mask and
+    /// Draws the mask of a view over its photograph and lists what makes the mask suspicious without comparison; the mask and
     /// the trimap may have other sizes than the photograph.
     pub fn new(name: &str, photo: &Photo, alpha: &Gray, trimap: Option<&Gray>) -> Result<SheetView> {
         let picture = io::jpeg_bytes(&overlaid(photo, alpha, trimap, PICTURE_PX), 85, Path::new(name))?;
@@ -183,7 +183,7 @@ fn outline(picture: &mut Photo, mask: &Gray) {
     }
 }
 
-/// Returns the sheet of these views, in their order, as a page of its own. When there are more than fit, suspicious
+/// Returns the sheet of these views, in their order, as a page of its own. If not all fit, suspicious
 /// ones and evenly spread others are shown, and a last line says so.
 pub fn sheet(views: &[SheetView]) -> Result<String> {
     let shown = evenly(views.len(), MAX_PICTURES, |i| !views[i].suspicions.is_empty());
@@ -195,15 +195,15 @@ pub fn sheet(views: &[SheetView]) -> Result<String> {
     page.map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
-/// Returns what a [`sheet`] shows, without the page around it: for a page with more, in about `most` bytes. Where not
+/// Returns what a [`sheet`] shows, without the page around it: for a page with more, in about `max_bytes` bytes. Where not
 /// all views fit, suspicious ones and evenly spread others stay.
-pub fn part(sheet: &str, most: usize) -> Option<String> {
+pub fn part(sheet: &str, max_bytes: usize) -> Option<String> {
     let inside = sheet.split_once(SHEET_MARKERS[0])?.1.split_once(SHEET_MARKERS[1])?.0;
     let (head, rest) = inside.split_once("<figure")?;
     let (figures, tail) = rest.rsplit_once("</figure>")?;
     let figures: Vec<&str> =
         figures.split("<figure").map(|f| f.trim_end().trim_end_matches("</figure>")).collect();
-    let remaining = most.saturating_mul(figures.len()) / inside.len();
+    let remaining = max_bytes.saturating_mul(figures.len()) / inside.len();
     let shown = evenly(figures.len(), remaining, |i| figures[i].starts_with(" class=\"odd\""));
     let shown: Vec<String> = shown.into_iter().map(|i| format!("<figure{}</figure>\n", figures[i])).collect();
     Some(format!("{head}{}{}", shown.concat(), tail.trim_start()))

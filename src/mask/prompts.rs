@@ -9,7 +9,7 @@
 //! whatever it is reduced to later; label 1 is the head, 0 is not. The file is untrusted: names are only
 //! compared with those of the capture, never opened, and every number is checked.
 //!
-//! What must hold of all clicks on one photograph stands here as well, wherever they come from.
+//! The conditions that all clicks on one photograph must meet are checked by this module, too.
 
 use crate::capture::{Capture, View};
 use crate::io::{self, Limits};
@@ -20,14 +20,14 @@ use serde_json::{Number, Value, json};
 use std::collections::BTreeMap;
 use std::path::{Component, Path};
 
-/// What the writer puts into `convention`.
+/// Value of `convention` that the writer uses.
 const CONVENTION: &str =
     "x right, y down, pixel indices from the top left; label 1 = foreground, 0 = background";
 /// A person clicks a dozen times on a photograph.
 const MAX_POINTS: usize = 500;
 /// Longer names fit no file system.
 const MAX_NAME_BYTES: usize = 4096;
-/// As many views as a capture may have, with ten points each, stay below this.
+/// Maximum size: more than the largest capture needs with ten points a view.
 const MAX_BYTES: u64 = 64 << 20;
 
 /// The suggested fix for a file of another shape.
@@ -110,7 +110,7 @@ fn shown(text: &str) -> String {
     plain.replace("\\'", "'").replace("\\\"", "\"") + cut
 }
 
-/// Returns what is wrong at a place of a file.
+/// Returns the error for a place of a file.
 fn wrong(file: &str, place: &str, problem: String, hint: &str) -> Error {
     Error::cannot(format!("`{file}`, {place}: {problem}"), hint)
 }

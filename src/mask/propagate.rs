@@ -27,9 +27,9 @@ use rayon::prelude::*;
 
 /// Cells along each side of the carved cube.
 const CELLS: usize = 112;
-/// Half side of the cube, in half heights of the frames at the point they look at.
+/// Half side of the cube, in half heights of the frames at the point where the viewing axes meet.
 const CUBE: f64 = 1.15;
-/// How far outside the hull's silhouette definite background begins, share of the picture's height.
+/// Distance from the hull's silhouette at which definite background begins, as a share of the picture's height.
 const BACKGROUND_MARGIN: f32 = 0.012;
 /// Cells deeper inside than this share of the deepest one are the core.
 const CORE_DEPTH: f64 = 0.55;
@@ -129,7 +129,7 @@ fn reduced(view: &PropagateView, photo: Photo) -> Result<Photo> {
     Ok(reduce_to_rows(&photo, grabcut::ROWS))
 }
 
-/// What the clicked views gave, or those that agree.
+/// Results of the clicked views, or of the views that agree.
 struct StartViews {
     /// Colors of all of them together.
     models: Models,
@@ -208,7 +208,7 @@ impl<'a> Propagation<'a> {
             let Some(models) = models else {
                 return Err(grabcut::empty(self.views[i].name));
             };
-            // what is held out teaches no other view its colors
+            // held-out views do not contribute to the colors of other views
             if self.views[i].votes {
                 for (color, &h) in self.photos[i].rgb.iter().zip(&head) {
                     if h { inside.push(*color) } else { outside.push(*color) }
@@ -270,21 +270,21 @@ impl<'a> Propagation<'a> {
         let (n, total) = (self.cube.n, voters.len());
         // while only the clicked views have masks they decide alone; an empty mask is one, too
         let unmasked = self.views.iter().zip(masks).any(|(v, m)| v.votes && m.is_none());
-        let (against, least) = match unmasked {
-            // a person has looked at clicked ones
+        let (against, support) = match unmasked {
+            // clicked masks were checked by the user
             true if self.is_proposed() => (MAX_NEGATIVE.min(total / 6), 0),
             true => (0, 0),
             false => (MAX_NEGATIVE.min(total / 6), (MIN_POSITIVE * total as f64).ceil() as usize),
         };
-        let mut hull = hull::cells(&votes, against, least);
+        let mut hull = hull::cells(&votes, against, support);
         drop_dust(&mut hull, n, 0.02);
-        let mut solid = hull::cells(&votes, against, least.max(total.div_ceil(2)));
+        let mut solid = hull::cells(&votes, against, support.max(total.div_ceil(2)));
         solid.iter_mut().zip(&hull).for_each(|(s, h)| *s &= h);
         let core = hull::core(&solid, n, CORE_DEPTH);
         (hull, core)
     }
 
-    /// Cuts one view under what the hull allows.
+    /// Cuts one view within the constraints of the hull.
     fn cut_one(&self, i: usize, models: &Models, hull: &[bool], core: &[bool], round: usize) -> (Gray, f64) {
         let (mut grabcut, _) = self.grabcut(i, round == 0 && !self.is_proposed());
         let (w, h) = (grabcut.width, grabcut.height);
@@ -294,7 +294,7 @@ impl<'a> Propagation<'a> {
         let within = hull::silhouette(&self.cube, core, &camera);
         let within = shrink(&within, w, h, CORE_SHRINK * h as f32);
         for (p, seeds) in grabcut.seeds.iter_mut().enumerate() {
-            // clicks count more than what follows from other views
+            // clicks override constraints from other views
             if *seeds == Seed::Unknown {
                 if !allowed[p] {
                     *seeds = Seed::Background;
@@ -304,13 +304,13 @@ impl<'a> Propagation<'a> {
             }
         }
         let head = grabcut.min_cut(models);
-        // the hull has left only what can be head: large pieces need no click
+        // the hull leaves only possible head: large pieces need no click
         let head = grabcut.finish(head, MIN_PIECE_SHARE * (w * h) as f64);
         let ambiguous = if round + 1 == ROUNDS { grabcut.ambiguous(&head, models) } else { 0.0 };
         (gray(&head, w, h), ambiguous)
     }
 
-    /// What looks wrong about the finished masks.
+    /// Returns warnings about the finished masks.
     fn warn(&mut self, masks: &[Gray], ambiguous: &[f64]) {
         for (i, mask) in masks.iter().enumerate().filter(|(i, _)| !self.views[*i].clicks.is_empty()) {
             let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
@@ -333,7 +333,7 @@ impl<'a> Propagation<'a> {
     }
 }
 
-/// How far inside a proposed mask definite head begins, share of the picture's height.
+/// Distance from the outline of a proposed mask at which definite head begins, as a share of the picture's height.
 const HEAD_MARGIN: f32 = 0.012;
 
 /// Masks every view from what a network has proposed for each, at the size [`rows_size`] gives; head from 128. As

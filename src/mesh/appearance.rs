@@ -13,7 +13,7 @@
 //! and surface where the head alone fills the pixel, by the mask and by all rays, and else 0: what is behind the head
 //! never bleeds in. All values are sRGB-coded, as the metrics are.
 //!
-//! It is solved twice. The diffuse color (one function) has the finest nodes there are, and is what every viewer
+//! It is solved twice. The diffuse color (one function) has the finest nodes available, and is what every viewer
 //! shows. What depends on the view is smooth over the surface, so that the vertices carry it, as a difference to the
 //! diffuse color. What no photograph shows follows its neighbors some nodes far, and keeps its color beyond.
 
@@ -34,10 +34,10 @@ use serde::Serialize;
 use solve::{Smoothness, System};
 use std::time::Instant;
 
-/// Pixels that colors are fitted to, about, at most: more hardly change the colors.
+/// Approximate maximum number of pixels that colors are fitted to: more hardly change the colors.
 const MAX_PIXELS: usize = 1_000_000;
 
-/// One in this many photographs is left out of the first fits, to validate them.
+/// Every n-th photograph is left out of the first fits, to validate them.
 const VALIDATION_STRIDE: u32 = 6;
 
 /// Gains stay within this factor of their mean: more is no exposure.
@@ -95,7 +95,7 @@ pub enum Colors<'a> {
 }
 
 /// Fits colors to photographs, whose masks have their sizes; vertices have colors. What depends on the view has degree
-/// `most` at most, and 2; the degree and its smoothness are those that show photographs best that were left out of a first fit.
+/// `max_degree` at most, and 2; the degree and its smoothness are those that show photographs best that were left out of a first fit.
 ///
 /// Returns `None` where no photograph shows the head.
 ///
@@ -106,11 +106,11 @@ pub fn fit(
     mesh: &Mesh,
     colors: Colors,
     photographs: &[Photograph],
-    most: u32,
+    max_degree: u32,
     turned: Mat3,
     monitor: &dyn Monitor,
 ) -> Result<Option<Appearance>> {
-    let (begin, most) = (Instant::now(), most.min(2));
+    let (begin, max_degree) = (Instant::now(), max_degree.min(2));
     let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
     let stride = (head as f64 / MAX_PIXELS as f64).sqrt().ceil().max(1.0) as u32;
     let rows = Rows::new(mesh, &Bvh::new(mesh), photographs, stride, turned);
@@ -132,7 +132,7 @@ pub fn fit(
     };
     monitor.check_stop()?;
     let fine_start = (&fine, &before[..], &smooth);
-    let choice = choose(&rows.quarter(), &vertices, fine_start, photographs.len(), most, monitor)?;
+    let choice = choose(&rows.quarter(), &vertices, fine_start, photographs.len(), max_degree, monitor)?;
     let Choice { degree, smoothness, gains, left_out } = choice;
     monitor.check_stop()?;
 
@@ -191,7 +191,7 @@ fn choose(
     vertices: &Nodes,
     (fine, before, smooth): (&Nodes, &[[f32; 3]], &Smoothness),
     photographs: usize,
-    most: u32,
+    max_degree: u32,
     monitor: &dyn Monitor,
 ) -> Result<Choice> {
     let all = |_: u32| true;
@@ -203,8 +203,8 @@ fn choose(
         System { rows, matrix: &in_vertices, nodes: vertices },
     );
     let start = of_fine.missing(&photo(rows, &ones), before, 1);
-    // how bright photographs are is what even a coarse fit of all tells; twice, since the fit follows them
-    let (count, mut gains) = (functions(most.min(1)), ones.clone());
+    // even a coarse fit to all photographs gives their brightness; twice, since the fit follows them
+    let (count, mut gains) = (functions(max_degree.min(1)), ones.clone());
     for _ in 0..2 {
         let target = of_fine.missing(&photo(rows, &gains), before, 1);
         monitor.check_stop()?;
@@ -221,7 +221,7 @@ fn choose(
     };
     let mut candidates: Vec<(u32, Smoothness, f64)> = Vec::new();
     candidates.push((0, VERTICES[1], judge(&rest)));
-    for (degree, smoothness) in (1..=most).flat_map(|d| VERTICES.map(|s| (d, s))) {
+    for (degree, smoothness) in (1..=max_degree).flat_map(|d| VERTICES.map(|s| (d, s))) {
         monitor.check_stop()?;
         let x = of_vertices.solve(&rest, functions(degree), &smoothness, &|v| !held(v));
         let error = of_vertices.missing(&rest, &x, functions(degree));
@@ -243,7 +243,7 @@ fn photo(rows: &Rows, gains: &[[f32; 3]]) -> Vec<[f32; 3]> {
     rows.iter().map(with).collect()
 }
 
-/// Returns the gain of each photograph that brings it closest to what a fit shows of it, which is the photograph less
+/// Returns the gain of each photograph that brings it closest to the fitted image, which is the photograph less
 /// `error` `[rows]`; relative to their mean.
 fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]> {
     let mut sums = vec![[[0f64; 2]; 3]; photographs];

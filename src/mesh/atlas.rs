@@ -6,7 +6,7 @@
 //! ```
 //!
 //! Every triangle of the result has area, none is flipped, no two share any, and charts keep their distance: that
-//! is looked at, exactly, before an atlas is returned.
+//! is checked exactly before an atlas is returned.
 //!
 //! Triangles that are flipped, cover others, or are too thin for 32-bit coordinates leave their chart and become
 //! half squares of their own. What is left of a chart is packed again, part by part.
@@ -37,7 +37,7 @@ pub struct AtlasReport {
     pub repaired: usize,
     /// Half the distance that charts keep, in texels: as configured, less only for the fall-back.
     pub gutter_px: f64,
-    /// Length of the seams that look along `front` within 45 degrees, over √area.
+    /// Length of the seams that face `front` within 45 degrees, over √area.
     pub seams_facing: Option<f64>,
     /// The atlas, measured.
     pub uv: UvReport,
@@ -90,7 +90,7 @@ impl AtlasReport {
 /// # Errors
 ///
 /// A configuration out of range; a mesh without triangles, with an index out of range or a vertex that is not
-/// finite; a texture too small for its triangles; a stop that the monitor asked for.
+/// finite; a texture too small for its triangles; a stop request.
 pub fn atlas(mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result<(Atlas, AtlasReport)> {
     atlas_by(by_charts, mesh, config, monitor)
 }
@@ -155,10 +155,10 @@ pub struct AtlasConfig {
     /// Charts are at least twice this far from each other and from the border; 0..=256 and at most an eighth of
     /// the texture.
     pub gutter_px: u32,
-    /// Where the face looks, in the mesh's coordinates: what lies there becomes one chart, with seams around it
+    /// Direction that the face looks in, in the mesh's coordinates: the surface in front becomes one chart, with seams around it
     /// and none across. That costs stretch: the nose is laid flat with the cheeks.
     pub front: Option<Vec3>,
-    /// Where up is there: what lies in front stands upright in the texture. With `front` alone.
+    /// Up direction in the mesh's coordinates: the chart in front stands upright in the texture. Only used with `front`.
     pub up: Option<Vec3>,
 }
 
@@ -263,7 +263,7 @@ fn lay(
             return Ok(AtlasLayout { atlas, repaired: loose.len(), gutter_px: f64::from(config.gutter_px) });
         }
     }
-    Err(Error::cannot(format!("there were bad triangles after {ROUNDS} rounds of repair"), ""))
+    Err(Error::cannot(format!("bad triangles remain after {ROUNDS} rounds of repair"), ""))
 }
 
 fn placed(mesh: &Mesh, charts: &[Flat], poses: &[ChartPose], config: &AtlasConfig) -> Atlas {

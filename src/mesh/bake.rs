@@ -1,6 +1,6 @@
-//! Learned color becomes texels: all of it, or what photographs are to improve on.
+//! Bakes the field's color into texels, either as the final texture or as the start of the fit to photographs.
 //!
-//! Every texel that a chart covers is looked at through several samples (`cover`); each sample moves onto the
+//! Every texel that a chart covers has several samples (`cover`); each sample moves onto the
 //! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
 //! they see in linear light (`light`), or those of them that look most directly. What the cameras see differently can be kept as a few lobes a texel
 //! (see below), and the field's normal as a picture of normals
@@ -22,7 +22,7 @@
 //! ```
 //!
 //! Cameras see a point from one side only, so that without the ridge term λ the functions would be free to grow
-//! where nobody looks.
+//! in directions without cameras.
 //!
 //! # Normals
 //!
@@ -59,7 +59,7 @@ pub struct BakeConfig {
     pub gutter_px: u32,
     /// Maximum distance of a sample from the true surface: the simplification's error and half a cell.
     pub reach: f32,
-    /// Maximum number of cameras per sample: those that look at it most directly.
+    /// Maximum number of cameras per sample: the ones that view it most directly.
     pub views: usize,
     /// Degree of the lobes, 1 or 2; 0 for none.
     pub lobes: u32,
@@ -89,7 +89,7 @@ pub struct BakeReport {
     pub size: [u32; 2],
     /// Share of texels that a chart covers, 0..=1.
     pub covered: f64,
-    /// Points of the surface that were looked at.
+    /// Number of samples on the surface.
     pub samples: usize,
     /// Share of the samples that at least one camera sees.
     pub seen: f64,
@@ -148,14 +148,15 @@ pub fn bake(
     let mut covered = vec![false; width as usize * height as usize];
     let (mut samples, mut visible, mut views, mut moved) = (0, 0, 0, 0.0);
     let bvh = Bvh::new(mesh);
-    let eyes = Visibility { cameras, bvh: &bvh, clearance: 0.5 * config.reach, most: config.views };
+    let visibility =
+        Visibility { cameras, bvh: &bvh, clearance: 0.5 * config.reach, max_cameras: config.views };
     let bands = Bands::new(atlas, config.side);
     for band in 0..bands.len() {
         let own = &bands.samples(atlas, band, config.side);
         monitor.check_stop()?;
         let flat = on_triangles(mesh, own);
         let points = settle(&flat, config.reach, field);
-        let seen = eyes.directions(&points, &flat);
+        let seen = visibility.directions(&points, &flat);
         samples += own.len();
         for (_, &count) in seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known) {
             visible += 1;

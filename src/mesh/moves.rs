@@ -22,7 +22,7 @@ pub(super) fn newton(f: f32, g: Vec3) -> Option<Vec3> {
 /// many were held back.
 ///
 /// `at(v, p, share)` is where vertex `v`, now at `p`, is after that share of its way. `spoiled(t, from, to)` is only
-/// asked for triangles of which a vertex moved.
+/// evaluated for triangles of which a vertex moved.
 pub(super) fn move_vertices(
     positions: &mut [Vec3],
     triangles: &[[u32; 3]],

@@ -10,8 +10,8 @@
 //! ```
 //!
 //! One Gauss-Newton step on the logits of the opacities, at the vertices of each layer, then brings the outline closer
-//! to the masks' ([`Photograph::mask`]). Both are judged on photographs that were left out, and there are no layers
-//! where they gain nothing. The mesh itself stays as it is: inside of it nothing is transparent.
+//! to the masks' ([`Photograph::mask`]). Both are evaluated on photographs that were left out, and the layers are dropped
+//! if they gain nothing. The mesh itself stays as it is: inside of it nothing is transparent.
 
 use super::appearance::{Nodes, Photograph};
 use crate::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, ShellLayer, Shells};
@@ -25,16 +25,16 @@ use serde::Serialize;
 const LAYERS: [f32; 4] = [0.5, 1.5, 3.0, 5.0];
 
 /// Softness `1 / s` from which on a vertex has layers, in pixels of the nearest camera: antialiasing shows the rest.
-/// From twice as much on they have all of their opacity.
+/// From twice this softness on they have their full opacity.
 const MIN_SOFTNESS_PX: f32 = 0.5;
 
 /// Rounds in which the softness of vertices takes the mean with its neighbors.
 const ROUNDS: usize = 10;
 
-/// Pixels on both sides of a mask's outline that are looked at.
+/// Width of the band on each side of a mask's outline whose pixels are compared.
 const BAND_PX: usize = 6;
 
-/// Pixels that are looked at, about, at most.
+/// Approximate maximum number of compared pixels.
 const MAX_PIXELS: usize = 400_000;
 
 /// Rays along each side of a pixel.
@@ -43,17 +43,17 @@ const RAYS_PER_SIDE: usize = 2;
 /// Rays of a pixel.
 const RAYS_PER_PIXEL: usize = RAYS_PER_SIDE * RAYS_PER_SIDE;
 
-/// One in this many photographs is left out, to validate the layers.
+/// Every n-th photograph is left out, to validate the layers.
 const VALIDATION_STRIDE: usize = 6;
 
-/// Share of the squared error of left-out outlines that layers must take away.
+/// Minimum share of the squared error of left-out outlines that layers must remove.
 const MIN_GAIN: f64 = 0.05;
 
 /// Weights of squared logits, and of squared differences along an edge, against the square of one pixel's error.
 const RIDGE: f64 = 0.01;
 const SMOOTH: f64 = 0.05;
 
-/// The most steps of conjugate gradients.
+/// Maximum number of steps of conjugate gradients.
 const STEPS: usize = 60;
 
 /// A report of the layers.
@@ -219,7 +219,7 @@ impl Outlines {
                 let target = f32::from(mask.values[at]) / 255.0;
                 let (x, y) = (at % mask.width as usize, at / mask.width as usize);
                 let (whole, rays) = look(photograph.camera, (x, y), &bvh, &caster);
-                // what neither is nor should be anything says nothing, nor does what is whole anyway
+                // pixels without opacity in render and mask, and opaque ones, carry no information
                 let says = whole < RAYS_PER_PIXEL && (target > 0.0 || rays.iter().any(|l| !l.is_empty()));
                 says.then_some((target, whole, rays))
             };

@@ -6,7 +6,7 @@
 //!
 //! The field is a network: thousands of points a call are cheap, single ones are not. So it is evaluated
 //! between rounds of collapses: at the vertices and in the middles of triangles, in one batch each (`rounds`).
-//! Vertices go to its zero, or where their triangles lie nearest to it, and from there the next round
+//! Vertices go to its zero, or where their triangles lie nearest to it; from these positions the next round
 //! measures its planes. With an error to keep, a batch at the middles of triangles and edges tells how
 //! much each place may still give.
 //!
@@ -15,8 +15,8 @@
 //! all vertices on its zero (chords lie on one side of a curve), and 0.0090 where they are nearest
 //! (`cargo bench --bench simplify`).
 //!
-//! Self-intersections are looked for once, at the end, which costs a tenth of the collapses. If there
-//! are any, the work starts over, and every collapse looks for crossings (`crossing`), at seven times the cost. So none is
+//! Self-intersections are searched once, at the end, which costs a tenth of the collapses. If the mesh
+//! has any, the work starts over, and every collapse checks for crossings (`crossing`), at seven times the cost. So none is
 //! made, and those of the input do not become more.
 
 mod crossing;
@@ -80,7 +80,7 @@ pub fn simplify(
     }
 
     let mut out = Mesh::default();
-    // the second attempt looks for crossings at every collapse
+    // the second attempt checks for crossings at every collapse
     for apart in [false, true] {
         let again = usize::from(apart);
         report = SimplifyReport { before, again, asked: report.asked, ..SimplifyReport::default() };
@@ -108,9 +108,9 @@ pub fn simplify(
 /// Options of simplification.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimplifyConfig {
-    /// Triangles to keep; 0 goes as far as `error` lets it.
+    /// Number of triangles to keep; 0 for as few as `error` allows.
     pub triangles: usize,
-    /// Most distance from the surface, in units of the positions; 0 goes as far as `triangles` says.
+    /// Maximum distance from the surface, in units of the positions; 0 if only `triangles` limits the simplification.
     pub error: f32,
 }
 

@@ -69,7 +69,7 @@ pub struct Surface<'a> {
     pub mesh: &'a Mesh,
     /// Its texture.
     pub texture: Option<&'a MeshTexture>,
-    /// The texture coordinates, whether or not there is a texture.
+    /// The texture coordinates, with or without a texture.
     pub atlas: Option<&'a Atlas>,
     /// View-dependent color at the vertices, for a surface without a texture.
     pub harmonics: Option<&'a Harmonics>,

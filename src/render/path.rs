@@ -2,7 +2,7 @@
 //!
 //! Two kinds of JSON are read: nerfstudio's camera path (`camera_path`, made in its viewer) and
 //! `transforms.json` (`frames`). Both give camera-to-world matrices with OpenGL axes, as ours are, and
-//! must be in the dataset's own world. A path from nerfstudio's viewer is only if training there ran
+//! must be in the dataset's own world. A path from nerfstudio's viewer is only if its training ran
 //! with `--orientation-method none --center-method none --auto-scale-poses False`.
 
 use crate::capture::camera_like;
@@ -331,7 +331,7 @@ mod tests {
             // a fortieth of the picture stays free, and no more
             assert!((nearest - 0.025).abs() < 1e-3, "{width} × {height}: {nearest}");
         }
-        // what is shown already is not moved away from
+        // a box that is visible already does not change the distance
         let small = Aabb { min: Vec3::splat(-0.1), max: Vec3::splat(0.1) };
         let path = orbit(&[like()], small, Vec3::Y, 3).unwrap();
         assert!((path[0].camera.position.length() - 5.0).abs() < 1e-12);

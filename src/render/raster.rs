@@ -1,6 +1,6 @@
 //! Rasterization of a mesh: the same view as the ray caster's, in a hundredth of the time.
 //!
-//! 1. Corners are projected and snapped to 1/256 of a pixel, triangles cut to what the camera sees, and sorted into tiles
+//! 1. Corners are projected and snapped to 1/256 of a pixel, triangles clipped to the frustum, and sorted into tiles
 //!    of 32 × 32 pixels (`project`). A lens that bends straight lines gets triangles halved until that no longer shows: so
 //!    edges stay shared, which a picture that is bent afterwards could not promise.
 //! 2. In each tile the nearest triangle is found at the center of every pixel and at four samples around it (`tile`).
@@ -11,7 +11,7 @@
 //! Translucent layers are drawn each into a tile of its own, where the mesh does not hide it, and blended sample by sample,
 //! the outermost first.
 //!
-//! Coverage is that of the four samples; what is not covered is transparent black. Every tile is made by one thread in the
+//! Coverage is that of the four samples; uncovered pixels are transparent black. Every tile is made by one thread in the
 //! order of the triangles: same mesh, same picture.
 
 mod paint;

@@ -43,7 +43,7 @@ pub struct RenderedView {
 }
 
 impl RenderedView {
-    /// Returns a view of nothing.
+    /// Returns an empty view.
     pub fn new(width: u32, height: u32, has_normals: bool) -> RenderedView {
         let [w, h] = if has_normals { [width, height] } else { [0, 0] };
         RenderedView {

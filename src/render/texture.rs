@@ -72,7 +72,7 @@ struct MipLevel {
     height: f32,
 }
 
-/// Number of hits that are looked up together.
+/// Number of hits whose texels are fetched together.
 const LANES: usize = 8;
 
 /// Returns the level for so many texels a pixel, and how far it is on the way to the next: the base-2 logarithm, its
@@ -237,7 +237,7 @@ fn smooth_all<const F: bool>(
     colors: &mut Vec<[f32; 3]>,
 ) {
     let (forward, per_pixel) = (camera.forward(), 1.0 / camera.fx.abs() as f32);
-    let table = srgb_table(); // asked for once
+    let table = srgb_table(); // read once, outside the loop
     let last = texture.levels.len() - 1;
     let mut values = vec![Vec4::ZERO; texture.groups];
     for (hits, directions) in hits.hits.chunks(LANES).zip(hits.directions.chunks(LANES)) {
@@ -339,7 +339,7 @@ fn around(level: &MipLevel, u: f32, v: f32) -> ([u32; 4], Vec2) {
 #[inline(always)]
 fn whole(v: f32) -> u32 {
     let v = v.max(0.0).min(1e9);
-    // SAFETY: it is a number in 0..2³¹: `max` makes 0 of what is none. A cast that asks for itself is no vector.
+    // SAFETY: the value is in 0..2³¹, because `max` turns NaN into 0. A checked cast would not be vectorized.
     unsafe { v.to_int_unchecked::<i32>() as u32 }
 }
 

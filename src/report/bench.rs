@@ -1,4 +1,4 @@
-//! What `tiface bench` measured: speed against error, as tables, as a page and as `bench.json`.
+//! The results of `tiface bench`: speed against error, as tables, as a page and as `bench.json`.
 
 use super::{Chart, Curve, STYLE, duration, fill};
 use crate::Result;
@@ -6,7 +6,7 @@ use minijinja::context;
 use serde::Serialize;
 use std::fmt::Write;
 
-/// What some work took.
+/// Cost of some work.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct WorkCost {
     /// Seconds by the clock.
@@ -30,7 +30,7 @@ impl std::ops::Add for WorkCost {
 /// A figure of the rows of a sweep.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Measure {
-    /// What a person calls it, with its unit: `PSNR, dB`.
+    /// Name for readers, with its unit: `PSNR, dB`.
     pub name: &'static str,
     /// Digits after the point.
     pub digits: usize,
@@ -47,14 +47,14 @@ impl Measure {
     }
 }
 
-/// One choice: what it costs and how good it is.
+/// One choice, with its cost and quality.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Row {
     /// Choices that are drawn as one line: a field, a method.
     pub series: &'static str,
     /// The choice, a few words.
     pub choice: String,
-    /// What it takes.
+    /// Its cost.
     #[serde(flatten)]
     pub cost: WorkCost,
     /// A figure for each measure of the sweep.
@@ -66,11 +66,11 @@ pub struct Row {
 pub struct Sweep {
     /// Its word on the command line.
     pub name: &'static str,
-    /// What is decided.
+    /// The decision.
     pub title: &'static str,
-    /// How it was measured.
+    /// Method of measurement.
     pub note: String,
-    /// What the rows' figures are; the first is drawn over time.
+    /// Names of the rows' figures; the first is drawn over time.
     pub measures: Vec<Measure>,
     /// The choices.
     pub rows: Vec<Row>,

@@ -1,4 +1,4 @@
-//! Lines over training steps, or over what else has numbers, as SVG inside a page.
+//! Line charts over training steps or another quantity, as SVG inside a page.
 
 use super::escape;
 use serde_json::Value;
@@ -16,7 +16,7 @@ pub struct Curve {
 /// Curves of one figure that are drawn together.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chart {
-    /// What is drawn.
+    /// Quantity that is drawn.
     pub title: String,
     /// One line each, the first in the page's own color.
     pub curves: Vec<Curve>,
@@ -35,7 +35,7 @@ pub fn charts(stage: &str, log: &str, names: &[&str]) -> Vec<Chart> {
         let own = field.map_or(String::new(), |f| format!("field {f}"));
         for (chart, name) in charts.iter_mut().zip(names) {
             let Some(value) = entry.get(*name).and_then(Value::as_f64) else { continue };
-            // what was learned after an interruption takes the place of what came before
+            // steps that were repeated after an interruption replace the earlier ones
             chart.curves.iter_mut().for_each(|c| c.points.retain(|(s, _)| *s < step));
             match chart.curves.iter_mut().find(|c| c.name == own) {
                 Some(curve) => curve.points.push((step, value)),
@@ -66,7 +66,7 @@ const MAX_POINTS: usize = 240;
 const MIN_LOG_RANGE: f64 = 30.0;
 
 impl Chart {
-    /// Returns the drawing with its title and what its lines are called: a part of a page.
+    /// Returns the drawing with its title and legend: a part of a page.
     pub fn html(&self) -> String {
         let points = || self.curves.iter().flat_map(|c| &c.points).filter(|p| p.1.is_finite());
         let span = |values: &mut dyn Iterator<Item = f64>| {
@@ -129,7 +129,7 @@ impl Chart {
     }
 }
 
-/// Two to five round numbers within a range: 1, 2 or 5 times a power of ten apart; whole numbers only if asked.
+/// Returns two to five round numbers within a range: 1, 2 or 5 times a power of ten apart; whole numbers only if `whole`.
 fn ticks(low: f64, high: f64, whole: bool) -> Vec<f64> {
     if high <= low || !(high - low).is_finite() {
         return if low.is_finite() { vec![low] } else { Vec::new() };

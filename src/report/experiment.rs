@@ -5,7 +5,7 @@ use crate::{Error, Result};
 use serde::Serialize;
 use std::fmt::Write;
 
-/// What is measured of a row, in the order of the columns: its word, its heading, and digits.
+/// Measures of a row, in the order of the columns: word, heading, and digits.
 pub const MEASURES: [(&str, &str, usize); 7] = [
     ("masked", "PSNR inside the mask, dB", 2),
     ("full", "PSNR of the whole photograph, dB", 2),
@@ -16,7 +16,7 @@ pub const MEASURES: [(&str, &str, usize); 7] = [
     ("seconds", "seconds a view", 2),
 ];
 
-/// Behind the title of a row that was judged by masks which its own run made.
+/// Mark of a row that was evaluated with masks made by its own run.
 const OWN_MASKS: &str = " †";
 
 /// Resamplings of an interval.
@@ -29,15 +29,15 @@ pub struct ExperimentRow {
     pub table: &'static str,
     /// Its own.
     pub row: &'static str,
-    /// What a person reads.
+    /// Title for readers.
     pub title: &'static str,
     /// The run that makes it.
     pub run: &'static str,
-    /// The pictures of that run that are judged.
+    /// The pictures of that run that are evaluated.
     pub pictures: &'static str,
 }
 
-/// One row of another is better, as the paper has it.
+/// An ordering of two rows by a measure, as the paper reports it.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Ordering {
     /// The table's word.
@@ -64,14 +64,14 @@ pub struct Measured {
     pub figures: Vec<ViewRow>,
     /// Time of a view.
     pub seconds: Option<f64>,
-    /// Mean square of what is seen where nothing is.
+    /// Mean squared opacity where the masks show no head.
     pub outside: Option<f64>,
     /// Pieces of the surface, where one was made.
     pub pieces: Option<u64>,
     /// Whose masks the figures count inside: `capture`, `run` (made by the run itself, for a photograph at least) or
     /// `none`.
     pub masks: Option<String>,
-    /// Why there are no figures, or no surface.
+    /// Why the figures or the surface are missing.
     pub problem: Option<String>,
 }
 
@@ -94,7 +94,7 @@ pub struct Published {
     pub row: String,
     /// The measure's.
     pub measure: String,
-    /// What it is.
+    /// Its value.
     pub value: f64,
 }
 
@@ -138,13 +138,13 @@ pub fn read_published(text: &str, rows: &[ExperimentRow], file: &str) -> Result<
 /// All that was measured.
 #[derive(Clone, Debug, Serialize)]
 pub struct Experiment {
-    /// Of the published effort.
+    /// Scale of the training effort, relative to the published one.
     pub scale: f64,
-    /// The tables that were asked for: their word and heading.
+    /// The requested tables: their word and heading.
     pub tables: Vec<(&'static str, &'static str)>,
     /// Their rows.
     pub rows: Vec<ExperimentRow>,
-    /// What the paper says of them.
+    /// The orderings that the paper reports.
     pub orderings: Vec<Ordering>,
     /// Names of the captures.
     pub captures: Vec<String>,
@@ -154,7 +154,7 @@ pub struct Experiment {
     pub published: Vec<Published>,
 }
 
-/// A mean with what 95 of 100 resamplings of the photographs keep within.
+/// A mean with its 95 % interval over resamplings of the photographs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Interval {
     /// Over captures, of the mean over photographs.
@@ -216,7 +216,7 @@ impl Experiment {
         (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
     }
 
-    /// How much a row has more than another, photograph by photograph: `[captures][photographs]`.
+    /// Returns the differences of two rows by photograph: `[captures][photographs]`.
     fn differences(&self, row: usize, from: usize, measure: usize) -> Vec<Vec<f64>> {
         let pair = |(a, b): (&Measured, &Measured)| {
             let value = |m: &Measured, name: &String| {
@@ -262,7 +262,7 @@ impl Experiment {
         self.measured[row].iter().any(|m| m.masks.as_deref() == Some("run"))
     }
 
-    /// Returns what a person reads of a row, marked where it was judged by its run's own masks.
+    /// Returns the title of a row, marked if it was evaluated with its run's own masks.
     fn title(&self, row: usize) -> String {
         let mark = if self.judged_itself(row) { OWN_MASKS } else { "" };
         format!("{}{mark}", self.rows[row].title)
@@ -315,7 +315,7 @@ impl Experiment {
         out
     }
 
-    /// Returns what is wrong with single runs, a sentence for each capture and problem.
+    /// Returns the problems of single runs, a sentence for each capture and problem.
     fn problems(&self) -> Vec<String> {
         let mut out: Vec<((&str, &str), Vec<&str>)> = Vec::new();
         for (k, capture) in self.captures.iter().enumerate() {
@@ -383,7 +383,7 @@ impl Experiment {
         )
     }
 
-    /// As Markdown.
+    /// Returns the tables as Markdown.
     pub fn markdown(&self) -> String {
         let table = |cells: &[Vec<String>]| {
             let mut out = String::new();
@@ -538,7 +538,7 @@ mod tests {
         assert!(text.contains("+0.62 ("), "{text}");
         let verdict = "| second > first <b> | holds, +1.25 | does not hold, -0.01 | holds, +0.62 |";
         assert!(text.contains(verdict), "{text}");
-        // nobody measured it
+        // LPIPS was not measured
         assert!(!text.contains("LPIPS"), "{text}");
         let value: serde_json::Value = serde_json::from_str(&e.json()).unwrap();
         assert!((value["means"][1]["mean"]["masked"].as_f64().unwrap() - 26.12).abs() < 1e-9);

@@ -117,7 +117,7 @@ mod tests {
         assert!(first.contains("iface psnr") && first.contains(&address) && !first.contains("<img src=x"));
         assert!(first.contains("href=\"report.html\"") && first.contains("location.reload()"));
         assert_eq!(first.matches("<polyline").count(), 1);
-        // a field is looked at while it is learned, and no other stage is asked for
+        // only stages that train have a picture, from their checkpoint
         assert!(!first.contains("as learned so far"));
         std::fs::write(run.join("iface/checkpoint.safetensors"), "c").unwrap();
         let last = page(false);

@@ -1,4 +1,4 @@
-//! One page of many runs: a row each, sorted by whatever one likes.
+//! One page of many runs, one row each, sortable by any column.
 
 use super::{STYLE, fill, link, picture_url, small_view, views};
 use crate::Result;
@@ -41,26 +41,26 @@ pub struct RunRow {
     pub mesh_psnr: Option<f64>,
     /// Whether the mesh is watertight.
     pub watertight: Option<bool>,
-    /// Of the mesh.
+    /// Number of triangles of the mesh.
     pub triangles: Option<u64>,
-    /// Of `head.glb`.
+    /// Size of `head.glb`.
     pub megabytes: Option<f64>,
     /// Mean distance of the mesh from the true surface, millimeters; where that is known, of the demo head.
     pub mm: Option<f64>,
     /// Work of all stages by the clock.
     pub seconds: f64,
-    /// The same of all processor cores.
+    /// CPU time of all stages.
     pub cpu_s: Option<f64>,
     /// The most memory of any stage, bytes.
     pub peak_bytes: Option<u64>,
-    /// What stages warned of.
+    /// Warnings of the stages.
     pub warnings: Vec<String>,
     /// When its last stage ended, in seconds since 1970.
     pub finished: u64,
 }
 
 impl RunRow {
-    /// Reads what the run in a folder says of itself; its page is linked from one in `beside`. A file that is missing or
+    /// Reads the state and figures of the run in a folder; its page is linked from one in `beside`. A file that is missing or
     /// damaged leaves its figures out: one run must not hide the others.
     pub fn read(run: &Path, beside: &Path) -> RunRow {
         let standing = RunStatus::read(run);
@@ -144,7 +144,7 @@ fn relative(file: &Path, folder: &Path) -> PathBuf {
     up.collect::<PathBuf>().join(file.components().skip(shared).collect::<PathBuf>())
 }
 
-/// What is compared over runs: its heading, also in the CSV, and its value.
+/// Figures that are compared over runs: heading, also in the CSV, and value.
 const FIGURES: [(&str, fn(&RunRow) -> Option<f64>); 10] = [
     ("PSNR", |r| r.psnr),
     ("SSIM", |r| r.ssim),
@@ -159,7 +159,7 @@ const FIGURES: [(&str, fn(&RunRow) -> Option<f64>); 10] = [
 ];
 const DIGITS: [usize; FIGURES.len()] = [2, 4, 2, 2, 0, 1, 1, 1, 2, 0];
 
-/// Farther from the median than this many robust standard deviations is worth a look (Iglewicz and Hoaglin 1993).
+/// Distance from the median, in robust standard deviations, from which a value is an outlier (Iglewicz and Hoaglin 1993).
 const OUTLIER: f64 = 3.5;
 
 /// Returns which of some values are far from the others, by the modified z-score: the distance from the median over
@@ -182,7 +182,7 @@ fn outliers(values: &[Option<f64>]) -> Vec<bool> {
 
 /// Returns the page of many runs.
 pub fn runs_html(rows: &[RunRow]) -> Result<String> {
-    // what is not done yet has figures of less than the others
+    // unfinished runs have incomplete figures
     let value = |row: &RunRow, of: fn(&RunRow) -> Option<f64>| of(row).filter(|_| row.done);
     let far: Vec<Vec<bool>> = FIGURES
         .iter()
@@ -209,7 +209,7 @@ pub fn runs_html(rows: &[RunRow]) -> Result<String> {
 /// Returns the figures of many runs as comma-separated values (RFC 4180), a heading first.
 pub fn runs_csv(rows: &[RunRow]) -> String {
     let quoted = |text: &str| {
-        // what begins like a formula is one to spreadsheets
+        // spreadsheets take text that begins like a formula for one
         let text = if text.starts_with(['=', '+', '-', '@']) { format!("'{text}") } else { text.to_owned() };
         format!("\"{}\"", text.replace('"', "\"\""))
     };

@@ -1,4 +1,4 @@
-//! Reports a stage's progress to status, log and screen at different rates; and the stop request, which knows the running
+//! Reports a stage's progress to status, log and screen at different rates; and the stop request, which keeps the running
 //! stage.
 //!
 //! All intervals use the monotonic clock, so that a change of the system time has no effect.
@@ -297,12 +297,12 @@ impl Stop {
         }
     }
 
-    /// Returns the error to end with, which says what is kept.
+    /// Returns the error to end with, which says which files are kept.
     pub fn error(&self, kept: impl std::fmt::Display) -> Error {
         Error::stopped(kept).with_kind(self.requested().unwrap_or(ErrorKind::Interrupted))
     }
 
-    /// Returns what to end the process with now, though nothing has come to its end. `None` while a stage that saves
+    /// Returns the error to end the process with before its stages end. `None` while a stage that saves
     /// has something to save, and within `patience` of a stage's beginning or end. The status of the stage then says
     /// that it was stopped.
     ///

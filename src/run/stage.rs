@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-/// What a stage is about to do.
+/// Plan of a stage.
 #[derive(Clone, Debug)]
 pub struct Plan<'a> {
     /// Name of the stage.
@@ -122,7 +122,7 @@ impl Run {
         self.is_ours(name)?;
         io::create_folder(&folder)?;
         let _lock = self.lock(name)?;
-        // another process may have finished between the look and the lock
+        // another process may have finished between the check and the lock
         if let Some(done) = self.complete(&plan)? {
             return Ok(done);
         }
@@ -408,7 +408,7 @@ mod tests {
         assert!(run.stage(mesh.clone(), never).unwrap().skipped);
         fs::remove_file(dir.path().join("mesh/parts/head")).unwrap();
         refused("mesh/parts/head` is missing");
-        // records from before there were sizes in them
+        // Records of older versions have no sizes.
         let mut record = serde_json::to_value(record).unwrap();
         record.as_object_mut().unwrap().remove("products");
         fs::write(dir.path().join("mesh/done.json"), record.to_string()).unwrap();

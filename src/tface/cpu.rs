@@ -3,9 +3,9 @@
 use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
 use crate::Result;
 use crate::config::VmConfig;
-use crate::field::background::ray_backgrounds;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
 use crate::field::parameters::{HostGroup, ParameterGroup};
+use crate::field::pixels::ray_backgrounds;
 use crate::field::pixels::{Batch, Pixels};
 use crate::field::training::StepAt;
 use crate::kernel::cpu::vm::losses::{self, BackgroundMode, Targets, VmFigures};
@@ -134,13 +134,13 @@ impl VmOps for CpuVm<'_> {
         }
     }
 
-    fn forget(&mut self) {
+    fn reset_totals(&mut self) {
         self.figures = VmFigures { broken: self.figures.broken, ..VmFigures::default() };
     }
 
     fn figures(&mut self) -> Result<VmFigures> {
         let figures = self.figures;
-        self.forget();
+        self.reset_totals();
         Ok(figures)
     }
 }

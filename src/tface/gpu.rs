@@ -7,7 +7,7 @@ use super::record::decoder;
 use super::state::VmState;
 use crate::config::VmConfig;
 use crate::field::drawing::DeviceRays;
-use crate::field::memory::MemoryNeed;
+use crate::field::drawing::MemoryNeed;
 use crate::field::ops::{ArrayDevice, Ops};
 use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::Pixels;
@@ -47,7 +47,7 @@ impl<'a> GpuVm<'a> {
         device: &Device,
     ) -> Result<bool> {
         DeviceDecoder::supports(&decoder(config)).map_err(|what| {
-            let problem = format!("the device `{}` knows no {what}", device.name());
+            let problem = format!("the device `{}` does not support {what}", device.name());
             Error::usage(problem, "train with `--device cpu`")
         })?;
         let fields = [start.size, start.last_size(config)].map(|size| start.field_of(config, size, true));
@@ -65,7 +65,7 @@ impl<'a> GpuVm<'a> {
             unit: "rays",
             each: [ray, widest.max(device.limits().largest_buffer.div_ceil(countable))],
             wanted: rays,
-            least: rays,
+            minimum: rays,
         };
         let plan = need.plan(pixels, device, |fits| match fits {
             0..64 => format!("{stage}.voxels_final ({})", config.voxels_final),
@@ -186,8 +186,8 @@ impl VmOps for GpuVm<'_> {
         }
     }
 
-    fn forget(&mut self) {
-        self.losses.forget(&self.device);
+    fn reset_totals(&mut self) {
+        self.losses.reset_totals(&self.device);
     }
 
     fn figures(&mut self) -> Result<VmFigures> {

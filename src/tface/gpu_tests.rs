@@ -48,7 +48,7 @@ fn begun<'a, O: VmOps>(ops: O, config: &'a VmConfig, session: &TrainingSession<'
     model
 }
 
-/// Operations on a device whose memory holds the photographs, if they can be drawn there.
+/// Operations on a device whose memory holds the photographs, if the device can draw from them.
 fn on_gpu<'a>(config: &'a VmConfig, pixels: &'a Pixels<'a>, device: Device) -> GpuVm<'a> {
     let resident = GpuVm::fits("tface", config, pixels, &start(config), &device).unwrap();
     GpuVm::new(config, pixels, device, resident)
@@ -227,7 +227,7 @@ fn rays_that_the_host_draws_in_order_give_the_losses_of_the_cpu() {
         let before = on_gpu.ops.device.counts();
         training::step(&mut on_gpu, session.seed, &progress, false).ok().unwrap();
         let after = on_gpu.ops.device.counts();
-        // what the host draws is sent there, and nothing is waited for
+        // The host's draws are uploaded, and the step does not wait for the device.
         assert!(after.0 - before.0 <= 40 && after.1 == before.1);
         let got = on_gpu.report(step).ok().unwrap().figures;
         for ((name, got), (_, want)) in got.iter().zip(&want).take(2) {
@@ -283,8 +283,8 @@ fn a_device_with_too_little_memory_is_refused_before_the_first_step_and_told_wha
     };
     assert!(refused(&config(), 1024).unwrap(), "photographs lie there");
     let e = refused(&config(), 512).err().unwrap();
-    assert!(e.to_string().contains("has room for 0 rays") && e.hint().contains("voxels_final"), "{e:?}");
-    // what is told fits, and one ray more does not
+    assert!(e.to_string().contains("has memory for 0 rays") && e.hint().contains("voxels_final"), "{e:?}");
+    // The reported number of rays fits, and one more does not.
     let many = VmConfig { rays: 1_000_000, ..config() };
     let e = refused(&many, 2048).err().unwrap();
     let most = e.hint().split(' ').find_map(|w| w.trim_end_matches(',').parse::<usize>().ok()).unwrap();

@@ -92,7 +92,7 @@ fn folder(dir: &Path, i: usize) -> PathBuf {
 }
 
 /// Trains `config.fields` fields one after the other, saving checkpoints into the session's folder and continuing
-/// from those that lie there.
+/// from existing ones.
 ///
 /// `views` have their cameras in scene coordinates; `bounds` is the scene's tight box; `hull` the masks' visual hull
 /// over [-1, 1]³.
@@ -162,7 +162,7 @@ pub fn train(
 /// One field's share of the stage's steps.
 struct Part<'a> {
     monitor: &'a dyn Monitor,
-    /// From 1.
+    /// Number of the field, from 1.
     field: usize,
     fields: usize,
     /// Steps of the fields before it.
@@ -260,7 +260,7 @@ mod tests {
         let missing = FieldMean::load("tface", dir.path(), 3).err().unwrap().to_string();
         assert!(missing.contains("field_3") && missing.contains("cannot be read"), "{missing}");
 
-        // stopped in the second field, it goes on there
+        // A training stopped in the second field continues in that field.
         let again = temporary();
         let end = learn(again.path(), &StopAfter::new(50));
         assert!(end.unwrap_err().kind().is_stop());

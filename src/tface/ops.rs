@@ -72,7 +72,7 @@ pub trait VmOps: Ops {
     fn penalize(&mut self, groups: &mut VmGroups<Self>, weights: [f32; 2]);
 
     /// Resets the accumulated figures.
-    fn forget(&mut self);
+    fn reset_totals(&mut self);
 
     /// Waits for the device, and returns and resets the figures accumulated since the last call.
     fn figures(&mut self) -> Result<VmFigures>;

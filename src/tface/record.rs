@@ -66,7 +66,7 @@ pub struct FieldRecord {
     pub far: f32,
     /// Threshold of the alpha mask.
     pub mask_threshold: f32,
-    /// Where its coordinates are not the scene's.
+    /// Placement in the scene, if its coordinates are not the scene's.
     pub placement: Option<Placement>,
 }
 
@@ -188,10 +188,10 @@ fn bounds(from: &mut Checkpoint, name: &str) -> Result<[[f32; 3]; 2]> {
     if sound { Ok(b) } else { Err(from.mismatch(format!("`{name}` is no box: {b:?}"))) }
 }
 
-fn size(from: &mut Checkpoint, name: &str, least: u64) -> Result<[usize; 3]> {
+fn size(from: &mut Checkpoint, name: &str, min: u64) -> Result<[usize; 3]> {
     let v = from.words(name)?;
     match v[..] {
-        [x, y, z] if [x, y, z].iter().all(|n| (least..=1 << 16).contains(n)) => {
+        [x, y, z] if [x, y, z].iter().all(|n| (min..=1 << 16).contains(n)) => {
             Ok([x as usize, y as usize, z as usize])
         }
         _ => Err(from.mismatch(format!("`{name}` is no grid size: {v:?}"))),

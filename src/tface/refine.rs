@@ -39,7 +39,8 @@ fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Ve
     let field = state.field(config, false);
     let density = state.groups[0].values();
     let [low, high] = state.bounds;
-    let least = -(1.0 - config.mask_threshold as f32).ln() / (field.lattice.step / config.alpha_unit as f32);
+    let min_density =
+        -(1.0 - config.mask_threshold as f32).ln() / (field.lattice.step / config.alpha_unit as f32);
     let slab = size[1] * size[2];
     let mut alive = vec![false; size[0] * slab];
     alive.par_chunks_mut(slab).enumerate().for_each(|(x, out)| {
@@ -55,7 +56,7 @@ fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Ve
             }
         }
         for (sigma, i) in density_at(&field, density, &points).into_iter().zip(index) {
-            out[i] = sigma >= least;
+            out[i] = sigma >= min_density;
         }
     });
     dilated(&alive, size)

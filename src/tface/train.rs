@@ -39,7 +39,7 @@ pub struct TfaceReport {
     pub rays: u64,
     /// Points of their lattices inside the box, were nothing skipped.
     pub lattice_samples: u64,
-    /// Those whose density was looked up.
+    /// Number of samples whose density was looked up.
     pub density_samples: u64,
     /// Those whose color was decoded.
     pub color_samples: u64,
@@ -50,7 +50,7 @@ pub struct TfaceReport {
 }
 
 impl TfaceReport {
-    /// Adds what the training of one more field did.
+    /// Adds the counts of another field's training.
     pub(super) fn add(&mut self, one: TfaceReport) {
         let fields = self.fields as f64;
         let mean = |all: f64, one: f64| (all * fields + one) / (fields + 1.0);
@@ -82,7 +82,7 @@ pub(super) struct VmModel<'a, O: VmOps> {
 }
 
 /// Trains one field in `bounds` until `config.steps`, saving checkpoints into the session's folder and continuing
-/// from the one that lies there; a finished one is left as it is.
+/// from the last one; a finished training is left as it is.
 pub(super) fn train_one(
     pixels: &Pixels,
     bounds: [[f32; 3]; 2],
@@ -166,7 +166,7 @@ fn learning_rate(config: &VmConfig, since: u64) -> f64 {
     config.lr_final.powf(since as f64 / config.steps as f64)
 }
 
-/// What is left of the TV weights at a step: they fade by the published 0.1 over the whole training and,
+/// Returns the factor of the TV weights at a step: they fade by the published 0.1 over the whole training and,
 /// unlike the learning rate, never start again.
 fn tv_fade(config: &VmConfig, step: u64) -> f64 {
     0.1f64.powf((step + 1) as f64 / config.steps as f64)
@@ -177,15 +177,15 @@ pub(super) const DETAIL: f32 = 0.25;
 
 /// Returns the views with their masks removed or binarized as configured.
 pub(super) fn masked_as_configured(mut views: Vec<TrainView>, masks: MaskUse) -> Vec<TrainView> {
-    let least = match masks {
+    let threshold = match masks {
         MaskUse::None | MaskUse::Soft => None,
         MaskUse::Binary => Some(1),
         MaskUse::Hard => Some(128),
     };
     for view in &mut views {
         view.mask = view.mask.take().filter(|_| masks != MaskUse::None);
-        if let (Some(mask), Some(least)) = (&mut view.mask, least) {
-            mask.values.iter_mut().for_each(|a| *a = if *a >= least { 255 } else { 0 });
+        if let (Some(mask), Some(threshold)) = (&mut view.mask, threshold) {
+            mask.values.iter_mut().for_each(|a| *a = if *a >= threshold { 255 } else { 0 });
         }
     }
     views
@@ -334,7 +334,7 @@ impl<O: VmOps> Model for VmModel<'_, O> {
             self.state.restore(self.config, from, progress.step, done)?;
             finished = done;
         }
-        self.ops.forget();
+        self.ops.reset_totals();
         self.unread = 0;
         // A finished checkpoint has no moments, and no training resumes from it.
         if !finished {

@@ -1,7 +1,7 @@
 //! A training step of the density on the processor.
 
-use super::ops::{DensityGroups, DensityOps, OCCUPIED};
 use super::shape;
+use super::{DensityGroups, DensityOps, OCCUPIED};
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};

@@ -1,7 +1,7 @@
 //! A training step of the density on a GPU. The host never waits within a step.
 
-use super::ops::{DensityGroups, DensityOps, OCCUPIED};
 use super::shape;
+use super::{DensityGroups, DensityOps, OCCUPIED};
 use crate::config::iface::IfaceConfig;
 use crate::field::drawing::DeviceRays;
 use crate::field::ops::Ops;
@@ -42,7 +42,7 @@ impl<'a> GpuDensity<'a> {
     /// Checks that a device supports the field and has enough memory for the training.
     pub fn fits(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<()> {
         if !Density::supports(&shape(config)) {
-            let problem = format!("a device has no room for {} levels in a tile", config.levels);
+            let problem = format!("a tile on a GPU cannot hold {} levels", config.levels);
             return Err(Error::usage(problem, "lower iface.levels, or train with `--device cpu`"));
         }
         max_samples(config, pixels, device).map(drop)
@@ -116,7 +116,7 @@ impl DensityOps for GpuDensity<'_> {
         let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         self.schedule = Schedule::new(device, length, budget, rays);
         self.broken = device.zeros::<u32>(1);
-        self.density.forget(device);
+        self.density.reset_sums(device);
         self.stepped = false;
     }
 
@@ -173,7 +173,7 @@ impl DensityOps for GpuDensity<'_> {
         let (device, count) = (&self.device, &self.samples.count);
         let sums = self.density.sums();
         let figures = self.schedule.figures(device, sums, &self.no_sharpness, count, &self.broken);
-        self.density.forget(device);
+        self.density.reset_sums(device);
         figures
     }
 }

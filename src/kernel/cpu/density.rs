@@ -14,8 +14,7 @@
 
 use super::hash::{self, Level};
 use super::march::Samples;
-use super::matrix::{Matrix, add_to, split};
-use super::simd::{exp, gemm, sigmoid};
+use super::simd::{Matrix, add_to, exp, gemm, sigmoid, split};
 use crate::dispatch;
 use crate::geom::sphharm::sh16;
 use rayon::prelude::*;
@@ -57,11 +56,6 @@ impl DensityShape {
     /// Returns the number of floats of all matrices.
     pub fn len(&self) -> usize {
         self.shapes().iter().map(|(o, i)| o * i).sum()
-    }
-
-    /// Returns false: a network always has weights. Clippy asks for this method next to `len`.
-    pub fn is_empty(&self) -> bool {
-        false
     }
 
     fn x01(&self, x: &[[f32; 3]]) -> Vec<[f32; 3]> {

@@ -5,7 +5,7 @@
 pub struct LowerEnvelope {
     /// Position of each parabola of the envelope.
     apex: Vec<usize>,
-    /// Where each parabola of the envelope takes over from the previous one.
+    /// Start of each parabola of the envelope.
     from: Vec<f64>,
     out: Vec<f32>,
 }

@@ -161,7 +161,7 @@ impl Blocks {
         Blocks { size, bits }
     }
 
-    /// Returns whether nothing is in a block.
+    /// Returns whether a block has no occupied cell.
     #[inline(always)]
     fn is_empty(&self, block: [usize; 3]) -> bool {
         let i = (block[0] * self.size + block[1]) * self.size + block[2];

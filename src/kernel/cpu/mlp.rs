@@ -9,7 +9,7 @@
 //! With the color skip (not published) the color network also reads the hash features: twelve outputs of a layer
 //! that is trained to represent the surface are a bottleneck for the appearance of a head.
 
-use super::matrix::{Matrix, split};
+use super::simd::{Matrix, split};
 
 /// Width of every hidden layer.
 pub const HIDDEN: usize = 64;

@@ -61,12 +61,7 @@ fn alpha_of(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> Alpha {
     Alpha { alpha: raw.clamp(0.0, 1.0), clipped: !(0.0..=1.0).contains(&raw), previous, next, ic, ic_by_cos }
 }
 
-/// Returns the opacity of one interval by the formula of this module. `inv_s` is clamped to [1e-6, 1e6].
-pub fn alpha(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> f32 {
-    alpha_of(sdf, cos, dt, inv_s.clamp(1e-6, 1e6), anneal).alpha
-}
-
-/// Returns the opacity of a cell of half size `half` for the occupancy grid: [`alpha`] of a ray that meets the surface
+/// Returns the opacity of a cell of half size `half` for the occupancy grid: that of a ray that meets the surface
 /// head-on.
 pub fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
     alpha_of(sdf, -1.0, 2.0 * half, inv_s.clamp(1e-6, 1e6), 1.0).alpha
@@ -224,7 +219,7 @@ mod tests {
             (-0.05, -1.0, 1000.0, 1.0, 1.0),
             (0.02, 0.5, 200.0, 0.5, 4.66413e-4),
         ] {
-            let got = alpha(sdf, cos, dt, s, a);
+            let got = alpha_of(sdf, cos, dt, s, a).alpha;
             assert!((got - want).abs() < 2e-6 * want.max(0.05), "{got} {want}");
         }
         for (sdf, s, want) in

@@ -27,7 +27,7 @@ pub struct BandRule {
 /// Updates the occupied and solid cells by a band around the zero level set.
 ///
 /// A cell of `allowed` is occupied if the band (`width` over the local sharpness) may reach it, for gradients up to
-/// about one, or if the sdf has the other sign at the center of a neighbor, however steep the field is there. All other
+/// about one, or if the sdf has the other sign at the center of a neighbor, however steep the field is in between. All other
 /// cells with a negative sdf are solid.
 ///
 /// `field` evaluates signed distances at points of `[-radius, radius]³`, and the logarithms of the local sharpness divided

@@ -322,7 +322,7 @@ fn visible_in(views: &[StereoView], s: &Surfel) -> Vec<usize> {
 }
 
 /// Returns the views in which a surfel is visible, the most frontal one first, and the length of a pixel of the first
-/// view at the surfel. Returns `None` if there are fewer than [`MIN_VIEWS`].
+/// view at the surfel. Returns `None` for fewer than [`MIN_VIEWS`].
 fn frontal(views: &[StereoView], s: &Surfel) -> Option<(Vec<usize>, f32)> {
     let visible = Some(visible_in(views, s)).filter(|visible| visible.len() >= MIN_VIEWS)?;
     let camera = &views[visible[0]].camera;

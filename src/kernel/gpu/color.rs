@@ -45,7 +45,7 @@ impl ColorPlan {
         ends([HIDDEN, HIDDEN, 3]).map(|row: usize| row + self.gradients[0])
     }
 
-    /// Returns the first channel of the normal, or the one after the harmonics where there is none.
+    /// Returns the first channel of the normal, or the one after the harmonics for a field without normals.
     fn normal(&self) -> usize {
         self.outputs + HARMONICS
     }

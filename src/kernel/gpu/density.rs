@@ -495,7 +495,7 @@ impl Density {
     }
 
     /// Resets the squared errors that are summed over steps.
-    pub fn forget(&mut self, device: &Device) {
+    pub fn reset_sums(&mut self, device: &Device) {
         self.sums = device.zeros::<f32>(TERMS + 2);
     }
 }

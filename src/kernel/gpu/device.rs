@@ -47,7 +47,7 @@ fn noted_error() -> Option<String> {
     WGPU_ERROR.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).take()
 }
 
-/// How threads add to one float.
+/// Method by which threads add to one float.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Atomics {
     /// The device has native atomic addition of floats.
@@ -71,7 +71,7 @@ pub struct Device {
     kernels: Mutex<BTreeSet<&'static str>>,
 }
 
-/// Memory of a device: burn's tensor there, which is one type for floats and words. Of one dimension, and of 32 bits an element.
+/// Memory of a device: burn's one-dimensional tensor of 32-bit elements, the same type for floats and words.
 pub type Buffer = FloatTensor<Cube>;
 
 /// A tensor as kernels see it.
@@ -126,7 +126,7 @@ const KINDS: [&str; 5] = ["discrete", "integrated", "virtual", "other", "softwar
 
 impl Adapter {
     /// Returns every adapter of this machine, the fastest kind first. A card that several APIs reach is listed once for
-    /// each. The drivers are asked by the first call of a process alone.
+    /// each. Only the first call of a process queries the drivers.
     pub fn all() -> &'static [Adapter] {
         static ALL: OnceLock<Vec<Adapter>> = OnceLock::new();
         ALL.get_or_init(Adapter::find)
@@ -183,8 +183,8 @@ impl Adapter {
         found.into_iter().map(|(_, adapter)| adapter).collect()
     }
 
-    /// The client of the adapter. wgpu's gives each large buffer memory of its own: by itself CubeCL carves all buffers
-    /// from pages as large as the largest of them, and takes up to such a page more than was asked for.
+    /// Returns the client of the adapter. On wgpu each large buffer gets memory of its own: by default CubeCL carves all buffers
+    /// from pages as large as the largest of them, and takes up to such a page more than requested.
     fn client(&self) -> Client {
         self.ready.call_once(|| {
             if let (CubeDevice::Wgpu(device), Ok(options)) = (&self.device, RuntimeOptions::try_default()) {
@@ -213,7 +213,7 @@ fn memory_of(adapter: &wgpu::Adapter) -> Option<u64> {
     heaps.iter().filter(|heap| heap.flags.as_raw() & DEVICE_LOCAL != 0).map(|heap| heap.size).max()
 }
 
-/// Returns nothing: Metal states no size, but one that it recommends.
+/// Returns `None`: Metal states no size, but one that it recommends.
 #[cfg(target_vendor = "apple")]
 fn memory_of(_: &wgpu::Adapter) -> Option<u64> {
     None
@@ -246,7 +246,7 @@ impl Device {
         &self.driver
     }
 
-    /// Returns the PCI address of the card, if there is one.
+    /// Returns the PCI address of the card, if known.
     pub fn card(&self) -> Option<String> {
         let physical = self.client.properties().identity.physical.as_ref()?;
         physical.pci_address.as_ref().map(|address| format!("{address:?}"))
@@ -339,7 +339,7 @@ impl Device {
     ///
     /// # Errors
     ///
-    /// Where the device does not answer, or could not do what was asked of it since the last call. Of kind
+    /// Fails if the device does not answer, or an operation since the last call failed. Of kind
     /// [`NotNow`](crate::ErrorKind::NotNow) where it is lost or has no memory left; of kind
     /// [`Cannot`](crate::ErrorKind::Cannot) where its driver refuses a kernel or a launch. Nothing on the host is harmed.
     pub fn fetch<T: Pod>(&self, buffer: &Buffer) -> Result<Vec<T>> {
@@ -436,18 +436,18 @@ macro_rules! launch {
 pub(super) use launch;
 
 /// Number of workgroups in one dimension that every adapter can launch.
-pub(super) const MOST_GROUPS: u32 = 65_535;
+pub(super) const MAX_GROUPS: u32 = 65_535;
 
 /// Returns the launch size for `count` workgroups, in two dimensions beyond 65,535. Kernels use their absolute position
 /// and ignore the excess.
 pub(super) fn groups(count: usize) -> CubeCount {
-    let rows = count.div_ceil(MOST_GROUPS as usize).max(1);
+    let rows = count.div_ceil(MAX_GROUPS as usize).max(1);
     CubeCount::Static(count.div_ceil(rows) as u32, rows as u32, 1)
 }
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use super::super::test_case::worst;
+    use super::super::case_tests::worst;
     use super::*;
     use burn::cubecl::{self, prelude::*};
     use std::cell::Cell;

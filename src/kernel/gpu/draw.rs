@@ -3,8 +3,7 @@
 //! The pixel of a ray depends on seed, step and the ray's index alone, as on the CPU.
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::rng::{Wide, below, permuted, stream, uniform, word};
-use super::search::{ranked, upper_bound};
+use super::rng::{Wide, below, permuted, ranked, stream, uniform, upper_bound, word};
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::rng;
@@ -390,7 +389,7 @@ fn keep(wanted: &[u32], alive: &mut [u32]) {
     }
 }
 
-/// Rays of a step, and what their pixels show.
+/// Rays of a step, and the colors of their pixels.
 pub struct Batch {
     /// Planes `[3, rays]`, where they start, in the field's coordinates.
     pub origin: Buffer,
@@ -400,11 +399,11 @@ pub struct Batch {
     pub jitter: Buffer,
     /// Planes `[3, rays]`: the head over black, sRGB-coded, 0 to 1.
     pub color: Buffer,
-    /// `[rays]`: soft alpha, 1 where there is no mask.
+    /// `[rays]`: soft alpha, 1 without a mask.
     pub alpha: Buffer,
     /// Planes `[3, rays]`: background color of render and target.
     pub background: Buffer,
-    /// `[rays]`: 1 where there is a ray; the others have no samples and no part in any mean.
+    /// `[rays]`: 1 for rays in use; the others have no samples and no part in any mean.
     pub alive: Buffer,
 }
 
@@ -423,14 +422,14 @@ impl Batch {
     }
 
     /// Uploads rays into a batch of the given capacity, with black colors.
-    pub fn of_rays(device: &Device, rays: &[MarchRay], room: usize) -> Batch {
-        assert!(rays.len() <= room);
-        let mut planes = [vec![0f32; 3 * room], vec![0f32; 3 * room]];
-        let (mut jitter, mut alive) = (vec![0f32; room], vec![0u32; room]);
+    pub fn of_rays(device: &Device, rays: &[MarchRay], capacity: usize) -> Batch {
+        assert!(rays.len() <= capacity);
+        let mut planes = [vec![0f32; 3 * capacity], vec![0f32; 3 * capacity]];
+        let (mut jitter, mut alive) = (vec![0f32; capacity], vec![0u32; capacity]);
         for (r, ray) in rays.iter().enumerate() {
             for a in 0..3 {
-                planes[0][a * room + r] = ray.origin[a];
-                planes[1][a * room + r] = ray.direction[a];
+                planes[0][a * capacity + r] = ray.origin[a];
+                planes[1][a * capacity + r] = ray.direction[a];
             }
             (jitter[r], alive[r]) = (ray.jitter, 1);
         }
@@ -439,7 +438,7 @@ impl Batch {
             direction: device.upload(&planes[1]),
             jitter: device.upload(&jitter),
             alive: device.upload(&alive),
-            ..Batch::new(device, room)
+            ..Batch::new(device, capacity)
         }
     }
 
@@ -502,11 +501,11 @@ pub struct Photographs {
 
 impl Photographs {
     /// Copies photographs to the device, one after the other, into buffers of so many pixels, each photograph into the first
-    /// that has room; the field's coordinates are the scene's times `radius`.
+    /// that it fits into; the field's coordinates are the scene's times `radius`.
     ///
     /// # Panics
     ///
-    /// Where no pixel is drawable, 2³² pixels are, or there are more than [`BUFFERS`] buffers.
+    /// Panics if no pixel is drawable, if 2³² pixels are, or with more than [`BUFFERS`] buffers.
     pub fn new(
         device: &Device,
         seen: impl Iterator<Item = DrawnView>,

@@ -33,14 +33,14 @@ pub(crate) fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<
 /// A field on a device, with the buffers for its evaluation.
 pub struct Evaluator {
     device: Device,
-    /// For [`CAPACITY`] samples, and for [`FEWER`].
+    /// Networks with buffers for [`CAPACITY`] samples, and for [`FEWER`].
     sdf: Sdf,
     fewer: [Sdf; 2],
     table: Buffer,
     flat: Buffer,
     inv_s: Buffer,
     occupancy: Occupancy,
-    /// For volume renders, made for the first one.
+    /// Buffers of volume renders, allocated by the first one.
     rays: Option<(Samples, Neus)>,
 }
 
@@ -50,7 +50,7 @@ impl Evaluator {
         Sdf::supports(shape)
     }
 
-    /// Of a field: its table, `[entries, 2]`, network weights, sharpness, and the cells to march through with those that
+    /// Uploads a field: its table, `[entries, 2]`, network weights, sharpness, and the cells to march through with those that
     /// are solid.
     pub fn new(
         device: Device,
@@ -79,13 +79,13 @@ impl Evaluator {
         }
     }
 
-    /// Sdf, gradient (3), color (3) and logarithm of the local sharpness of points: these channels of the eight, a plane
+    /// Evaluates `channels` of the eight outputs sdf, gradient (3), color (3) and logarithm of the local sharpness at points, a plane
     /// `[n]` each.
     ///
     /// # Shapes
     ///
-    /// - x, direction: `[n, 3]`; without directions color means nothing
-    /// - normal: `[n, 3]`, what color sees as normal; without it, that of the field
+    /// - x, direction: `[n, 3]`; without directions the colors are meaningless
+    /// - normal: `[n, 3]`, normals that replace the field's as inputs of the color network
     pub fn evaluate(
         &self,
         x: &[[f32; 3]],
@@ -101,14 +101,14 @@ impl Evaluator {
             let (capacity, sdf) = sizes.find(|(c, _)| *c >= span.len()).expect("no span is longer");
             let upload = |rows: &[[f32; 3]]| device.upload(&planes(&rows[span.clone()], capacity));
             let at = upload(x);
-            let toward = direction.map(upload);
+            let view_dir = direction.map(upload);
             let normal = normal.map(upload);
             let count = device.upload(&[span.len() as u32]);
             let seen = sdf.shade(
                 device,
                 [&self.table, &self.flat],
                 &at,
-                toward.as_ref().unwrap_or(&at),
+                view_dir.as_ref().unwrap_or(&at),
                 normal.as_ref(),
                 &count,
             );
@@ -120,19 +120,19 @@ impl Evaluator {
         Ok(out)
     }
 
-    /// Volume render with steps of `pitch`: see [`crate::kernel::cpu::neus::forward`]. `[rays, 9]`.
-    pub fn render(&mut self, rays: &[MarchRay], pitch: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
+    /// Renders rays with march steps of `step`, and returns `[rays, 9]`: see [`crate::kernel::cpu::neus::forward`].
+    pub fn render(&mut self, rays: &[MarchRay], step: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
         let device = &self.device;
-        let pitch = device.upload(&[pitch]);
+        let step = device.upload(&[step]);
         let made = || (Samples::new(device, RAYS, CAPACITY), Neus::new(device, RAYS, CAPACITY));
         let (samples, neus) = self.rays.get_or_insert_with(made);
         let mut out = Vec::with_capacity(rays.len());
         while out.len() < rays.len() {
             let own = &rays[out.len()..(out.len() + RAYS).min(rays.len())];
             let batch = Batch::of_rays(device, own, RAYS);
-            samples.march(device, &self.occupancy, &batch, &pitch, usize::MAX, 0);
-            let (x, toward, count) = (&samples.x, &samples.direction, &samples.count);
-            let field = self.sdf.forward(device, &self.table, &self.flat, x, toward, count);
+            samples.march(device, &self.occupancy, &batch, &step, usize::MAX, 0);
+            let (x, view_dir, count) = (&samples.x, &samples.direction, &samples.count);
+            let field = self.sdf.forward(device, &self.table, &self.flat, x, view_dir, count);
             let bundle = Rays {
                 offsets: &samples.offsets,
                 direction: &batch.direction,
@@ -143,7 +143,7 @@ impl Evaluator {
             let alive: Vec<u32> = device.fetch(&batch.alive)?;
             // Rays that exceeded the sample capacity are marched again with the next batch.
             let done = alive[..own.len()].iter().position(|&a| a == 0).unwrap_or(own.len());
-            assert!(done > 0, "one ray has more samples than there is room for");
+            assert!(done > 0, "one ray has more samples than the buffers hold");
             out.extend((0..done).map(|r| std::array::from_fn(|k| seen[k * RAYS + r])));
         }
         Ok(out)
@@ -152,8 +152,8 @@ impl Evaluator {
 
 #[cfg(test)]
 mod tests {
+    use super::super::case_tests::Case;
     use super::super::device::tests::{agree, device};
-    use super::super::test_case::Case;
     use super::*;
     use crate::kernel::cpu::mlp::Weights;
     use crate::kernel::cpu::{march, rng, sdf};
@@ -191,7 +191,7 @@ mod tests {
         let want = sdf::colors(&shape, &table, &weights, &x, &normal, None, &direction);
         agree("colors", &got.concat(), &planes(&want, x.len()), 1e-4);
 
-        // more samples than there is room for: 20,000 rays of up to some 100
+        // More samples than the capacity: 20,000 rays of up to about 100.
         let rays: Vec<MarchRay> = (0..20_000)
             .map(|i| {
                 let d = direction[i % 700];

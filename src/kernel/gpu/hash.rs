@@ -1,7 +1,7 @@
 //! The hash encoding of [`crate::kernel::cpu::hash`]: features with their Jacobian, and the scatter of
 //! their gradients.
 
-use super::device::{Atomics, Buffer, Device, MOST_GROUPS, Words, launch};
+use super::device::{Atomics, Buffer, Device, MAX_GROUPS, Words, launch};
 use super::sum::{Exchange, FIXED_POINT_RANGE, Fixed, Native, Sum, group_sum};
 use crate::kernel::cpu::hash::Level;
 use crate::kernel::cpu::mlp::TILE;
@@ -331,7 +331,7 @@ impl Grid {
             capacity as u32, self.world, slopes.is_some()
         );
         if fixed {
-            let groups = (2 * self.largest as u32).div_ceil(GROUP).min(MOST_GROUPS);
+            let groups = (2 * self.largest as u32).div_ceil(GROUP).min(MAX_GROUPS);
             let count = CubeCount::Static(groups, self.active as u32, 1);
             launch!(device, fixed_point_to_float::launch, count, GROUP; gradient, self.levels, self.units);
         }
@@ -450,7 +450,7 @@ mod tests {
         // the largest level of `log2_table` 24 that a buffer of 128 MiB holds, dense
         let levels = hash::levels(1, 250, 1.5, 24);
         let entries = hash::entries(&levels);
-        assert!(2 * entries > 256 * MOST_GROUPS as usize && entries < 1 << 24);
+        assert!(2 * entries > 256 * MAX_GROUPS as usize && entries < 1 << 24);
         let x = [[0.75f32; 3], [-1.5, 1.25, 0.5]];
         let g = [[1.0f32, -2.0], [0.5, 4.0]];
         let mut want = vec![[0f32; 2]; entries];

@@ -243,13 +243,13 @@ impl Losses {
 
     /// Returns the sums, `[8]`: the unweighted loss terms of the last step in the order of [`LossWeights`], with that of
     /// stereo points last; then the sum of the squared errors of all steps with samples since
-    /// [`forget`](Losses::forget), and the number of these steps.
+    /// [`reset_sums`](Losses::reset_sums), and the number of these steps.
     pub fn sums(&self) -> &Buffer {
         &self.sums
     }
 
     /// Resets the squared errors that are summed over steps.
-    pub fn forget(&mut self, device: &Device) {
+    pub fn reset_sums(&mut self, device: &Device) {
         self.sums = device.zeros::<f32>(TERMS + 2);
     }
 }

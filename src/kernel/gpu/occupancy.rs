@@ -94,7 +94,7 @@ fn decide(
 ) {
     let word = ABSOLUTE_POS;
     if word < mask.len() {
-        let least = reach_at(band, inv_s[0], 1.0f32, half);
+        let narrowest = reach_at(band, inv_s[0], 1.0f32, half);
         let cells = resolution * resolution * resolution;
         let mut kept = 0u32;
         let mut inside = 0u32;
@@ -102,7 +102,7 @@ fn decide(
             let i = u32::cast_from(word) * 32 + bit;
             if i < cells && (allowed[word] >> bit) & 1 == 1 {
                 let f = value[i as usize];
-                let mut widest = max(least, reach[i as usize]);
+                let mut widest = max(narrowest, reach[i as usize]);
                 let mut crossed = false;
                 let mut stride = 1u32;
                 for _ in 0..3u32 {
@@ -154,7 +154,7 @@ impl Occupancy {
     }
 
     /// Waits for the device and returns both masks: the occupied cells and the solid ones; the latter mask is empty if
-    /// there is none on the device.
+    /// the device holds none.
     pub fn read(&self, device: &Device) -> Result<[Bitmask; 2]> {
         let mut masks = [Bitmask::filled(self.resolution, false), Bitmask::filled(self.resolution, false)];
         for (mask, buffer) in masks.iter_mut().zip([Some(&self.mask), self.solid.as_ref()]) {

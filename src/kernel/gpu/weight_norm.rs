@@ -142,11 +142,6 @@ impl WeightNorm {
         WeightNorm { pieces: device.upload(&pieces), count, parameters }
     }
 
-    /// Returns the number of parameters.
-    pub fn parameters(&self) -> usize {
-        self.parameters
-    }
-
     /// Computes the weights `flat` and the sharpness `inv_s`, `[1]`, from the parameters `raw` and the variance, `[1]`, which
     /// is first clamped to `range`.
     pub fn forward(
@@ -218,11 +213,11 @@ mod tests {
         let Some(device) = device() else { return };
         let layout = Layout::new(5, true);
         let norm = WeightNorm::new(&device, layout);
-        assert_eq!(norm.parameters(), layout.len() + HIDDEN + OUTPUTS);
+        assert_eq!(norm.parameters, layout.len() + HIDDEN + OUTPUTS);
         let normal = |stream: u64, n: usize| -> Vec<f32> {
             (0..n as u64).map(|i| rng::normal(3, stream, i)).collect()
         };
-        let (raw, g) = (normal(1, norm.parameters()), normal(2, layout.len()));
+        let (raw, g) = (normal(1, norm.parameters), normal(2, layout.len()));
         let [device_raw, g_flat] = [&raw, &g].map(|v| device.upload(v));
         let (variance, g_inv_s) = (device.upload(&[0.3f32]), device.upload(&[0.7f32]));
         let (flat, inv_s) = (device.scratch::<f32>(layout.len()), device.scratch::<f32>(1));

@@ -32,9 +32,9 @@ pub struct PixelGraph {
     width: usize,
     height: usize,
     steps: [isize; 8],
-    /// What still flows from a node to each neighbor.
+    /// Residual capacity from a node to each neighbor.
     residual: Vec<[i32; 8]>,
-    /// Positive: what the head terminal still gives; negative: what the background terminal still takes.
+    /// Residual capacity to the terminals: positive from the head terminal, negative to the background terminal.
     terminal: Vec<i32>,
     tree: Vec<u8>,
     parent: Vec<u8>,
@@ -81,10 +81,10 @@ impl PixelGraph {
         node.wrapping_add_signed(self.steps[direction])
     }
 
-    /// What each label of a pixel costs; adds to what was said before. Costs are not negative.
+    /// Adds the costs of both labels of a pixel to its earlier costs. Costs are not negative.
     pub fn add_costs(&mut self, x: usize, y: usize, as_head: i32, as_background: i32) {
         let i = self.node(x, y);
-        // whatever both labels pay is paid anyway; the rest hangs on one terminal
+        // a cost that both labels share does not change the cut; the difference is the capacity to one terminal
         self.flow += as_head.min(as_background) as i64;
         let before = self.terminal[i];
         let give = as_background as i64 + before.max(0) as i64;
@@ -93,7 +93,7 @@ impl PixelGraph {
         self.terminal[i] = (give - take).clamp(-(i32::MAX as i64), i32::MAX as i64) as i32;
     }
 
-    /// What it costs to tell a pixel from its neighbor; `direction` 0 right, 2 below, 4 below right, 6 below
+    /// Sets the cost of different labels of a pixel and its neighbor; `direction` 0 right, 2 below, 4 below right, 6 below
     /// left. The neighbor must be in the picture.
     pub fn join(&mut self, x: usize, y: usize, direction: usize, weight: i32) {
         let (dx, dy) = STEPS[direction];
@@ -105,9 +105,9 @@ impl PixelGraph {
         self.residual[j][direction ^ 1] += weight;
     }
 
-    /// Finds the smallest cut. Labels `[height · width]`: is the pixel head? And what the cut costs.
+    /// Finds the minimum cut. Returns labels `[height · width]`, true for head, and the cost of the cut.
     ///
-    /// Of several smallest cuts it is the one with the least head.
+    /// Of several minimum cuts it is the one with the smallest head.
     pub fn cut(mut self) -> (Vec<bool>, i64) {
         for y in 0..self.height {
             for x in 0..self.width {
@@ -200,31 +200,31 @@ impl PixelGraph {
     /// Saturates the path through the edge from `head_end`, in the head's tree, to its neighbor in the background's.
     fn augment(&mut self, head_end: usize, direction: usize) {
         let ends = [head_end, self.step(head_end, direction)];
-        let mut least = self.residual[head_end][direction];
+        let mut bottleneck = self.residual[head_end][direction];
         for mut p in ends {
             while self.parent[p] != TERMINAL {
                 let (from, direction) = self.edge_to_parent(p);
-                least = least.min(self.residual[from][direction]);
+                bottleneck = bottleneck.min(self.residual[from][direction]);
                 p = self.step(p, self.parent[p] as usize);
             }
-            least = least.min(self.terminal[p].abs());
+            bottleneck = bottleneck.min(self.terminal[p].abs());
         }
-        self.push(head_end, direction, least);
+        self.push(head_end, direction, bottleneck);
         for mut p in ends {
             while self.parent[p] != TERMINAL {
                 let (from, direction) = self.edge_to_parent(p);
-                self.push(from, direction, least);
+                self.push(from, direction, bottleneck);
                 if self.residual[from][direction] == 0 {
                     self.tear(p);
                 }
                 p = self.step(p, self.parent[p] as usize);
             }
-            self.terminal[p] -= least * self.terminal[p].signum();
+            self.terminal[p] -= bottleneck * self.terminal[p].signum();
             if self.terminal[p] == 0 {
                 self.tear(p);
             }
         }
-        self.flow += least as i64;
+        self.flow += bottleneck as i64;
     }
 
     /// The path is still being walked by its parents, so they are marked only afterwards.
@@ -232,7 +232,7 @@ impl PixelGraph {
         self.orphans.push_front(p as u32);
     }
 
-    /// Finds a new parent for everything torn off, nearest to the root first choice; sets free what has none.
+    /// Finds a new parent for every orphan, preferably near the root; orphans without one become free.
     fn adopt(&mut self) {
         self.time += 1;
         for &p in &self.orphans {
@@ -254,7 +254,7 @@ impl PixelGraph {
                 continue;
             }
             if let Some(depth) = self.depth_below_root(q)
-                && best.is_none_or(|(least, _)| depth < least)
+                && best.is_none_or(|(nearest, _)| depth < nearest)
             {
                 best = Some((depth, direction));
             }
@@ -291,7 +291,7 @@ impl PixelGraph {
         }
     }
 
-    /// Steps from a node to its terminal, or nothing when it hangs on an orphan; marks the way as known.
+    /// Returns the number of steps from a node to its terminal, or `None` if an orphan lies on the path; marks the path as known.
     fn depth_below_root(&mut self, start: usize) -> Option<u32> {
         let (mut q, mut steps) = (start, 0);
         let depth = loop {
@@ -400,18 +400,18 @@ mod tests {
                 if from[t] == usize::MAX {
                     return flow;
                 }
-                let (mut least, mut q) = (i64::MAX, t);
+                let (mut bottleneck, mut q) = (i64::MAX, t);
                 while q != s {
-                    least = least.min(capacity[from[q]][q]);
+                    bottleneck = bottleneck.min(capacity[from[q]][q]);
                     q = from[q];
                 }
                 q = t;
                 while q != s {
-                    capacity[from[q]][q] -= least;
-                    capacity[q][from[q]] += least;
+                    capacity[from[q]][q] -= bottleneck;
+                    capacity[q][from[q]] += bottleneck;
                     q = from[q];
                 }
-                flow += least;
+                flow += bottleneck;
             }
         }
     }

@@ -2,7 +2,7 @@
 //!
 //! `p(c) = Σ_k w_k · N(c; μ_k, Σ_k)`. It starts from seeded k-means (Arthur & Vassilvitskii 2007) and is refitted
 //! as in GrabCut (Rother, Kolmogorov, Blake 2004): every color goes to its likeliest Gaussian, whose mean and
-//! covariance are measured again. A covariance always gains the least that 8-bit rounding and sensor noise leave,
+//! covariance are measured again. A covariance always gains the minimum that 8-bit rounding and sensor noise leave,
 //! so that one flat color is no singular Gaussian.
 
 use crate::geom::cofactors;
@@ -11,7 +11,7 @@ use crate::kernel::cpu::rng;
 /// A color in coded 0..=255.
 pub type Rgb = [u8; 3];
 
-/// What every variance gains, in squared steps of 8 bit: a standard deviation of one step.
+/// Added to every variance, in squared steps of 8 bit: a standard deviation of one step.
 const MIN_VARIANCE: f64 = 1.0;
 
 /// The stream of random numbers that the k-means start draws from.
@@ -118,7 +118,7 @@ impl Mixture {
 }
 
 impl Gaussian {
-    /// From the number of colors, their sums and the sums of their products.
+    /// Computes a Gaussian from the number of colors, their sums and the sums of their products.
     fn measure(s: &[u64; 10], total: usize) -> Gaussian {
         let n = s[0] as f64;
         if s[0] == 0 {

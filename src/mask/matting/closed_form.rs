@@ -29,7 +29,7 @@ use crate::image::{Gray, Photo};
 use crate::kernel::cpu::cg::{self, dot};
 use crate::{Error, Result};
 
-/// How the opacity of the band is solved for.
+/// Options of the solver.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClosedFormOptions {
     /// Noise of colors, added to their covariance; squared color differences of 0..=1.
@@ -56,7 +56,7 @@ impl Default for ClosedFormOptions {
     }
 }
 
-/// An alpha for every pixel, and what it took.
+/// An alpha for every pixel, and the effort of solving it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Matte {
     /// `[height · width]`, clamped to 0..=1, which the solution may overshoot.

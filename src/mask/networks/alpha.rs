@@ -43,7 +43,7 @@ const KNOWN: [(&str, usize, Normal); 8] = [
 /// A network from a picture to its alpha.
 pub(super) struct AlphaNet {
     pub(super) session: NetworkSession,
-    /// Width and height of what it is shown.
+    /// Width and height of the network's input.
     pub(super) size: (usize, usize),
     normal: Normal,
 }
@@ -130,7 +130,7 @@ pub(super) struct VitMatte {
 }
 
 impl VitMatte {
-    /// Opens the file; `colors` may override what lies beside it.
+    /// Opens the file; `colors` may override the configuration file beside it.
     pub(super) fn open(path: &Path, array_bytes: u64, colors: VitmatteColors) -> Result<VitMatte> {
         let mut session = NetworkSession::open(Role::VITMATTE, path, array_bytes)?;
         let half = Normal { mean: [0.5; 3], std: [0.5; 3] };

@@ -13,7 +13,7 @@ use std::path::Path;
 /// Mean and standard deviation of ImageNet's colors in 0..1: what SAM and ViTMatte were trained with.
 pub(super) const IMAGENET: Normal = Normal { mean: [0.485, 0.456, 0.406], std: [0.229, 0.224, 0.225] };
 
-/// How colors become numbers: `(c / 255 − mean) / std`.
+/// Normalization of colors: `(c / 255 − mean) / std`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Normal {
     /// Of red, green, blue in 0..1.
@@ -44,10 +44,10 @@ impl Normal {
     }
 }
 
-/// What a processor file says.
+/// The content of a processor file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Processor {
-    /// How it normalizes.
+    /// Its normalization.
     pub normal: Normal,
     /// Side of the square (`pad_size`, else `size.longest_edge`, `size.height` or `size.shortest_edge`), if given.
     pub side: Option<usize>,
@@ -85,9 +85,9 @@ pub(super) fn find(network: &Path, kind: &str) -> Result<Option<Processor>> {
     }
     let file: ProcessorFile = io::typed(&json)
         .map_err(|[key, found, expected]| wrong(format!("`{key}` is {found}, expected {expected}")))?;
-    let three = |key: &str, numbers: Option<[f64; 3]>, usual: [f64; 3], least: f64| {
+    let three = |key: &str, numbers: Option<[f64; 3]>, usual: [f64; 3], min: f64| {
         let numbers = numbers.unwrap_or(usual);
-        match numbers.iter().all(|v| (least..=1.0).contains(v)) {
+        match numbers.iter().all(|v| (min..=1.0).contains(v)) {
             true => Ok(numbers),
             false => Err(wrong(format!("`{key}` is {numbers:?}, expected three numbers of colors in 0..1"))),
         }

@@ -20,7 +20,7 @@ use std::path::Path;
 
 /// Pixels of the photograph under one cell of the embedding.
 const CELL: usize = 16;
-/// The side of every public file, where neither network nor processor file says otherwise.
+/// The side of every public file, used if neither network nor processor file gives another one.
 const USUAL_SIDE: usize = 1024;
 /// Clicks on one photograph; each is a token of the decoder.
 const MAX_CLICKS: usize = 256;
@@ -36,7 +36,7 @@ pub(super) struct Sam {
     normal: Normal,
 }
 
-/// What the encoder makes of a photograph, and how the photograph lay in the square.
+/// The encoder's embedding of a photograph, and the photograph's position in the square.
 pub(super) struct Embedding {
     /// `image_embeddings`, and for the split export `image_positional_embeddings`.
     arrays: Vec<NetworkArray>,
@@ -209,7 +209,7 @@ impl Sam {
     }
 
     fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<()> {
-        // contradictions are looked for at the size that was clicked on: reduced, two clicks may share a pixel
+        // contradictions are searched at the size that was clicked on: reduced, two clicks may share a pixel
         prompts::check_places("the photograph", clicks, width as u32, height as u32)?;
         if clicks.len() > MAX_CLICKS {
             return Err(Error::cannot(

@@ -2,7 +2,7 @@
 //!
 //! # Nodes
 //!
-//! Where fitted colors live: the vertices of a mesh, or the texels of its atlas.
+//! The nodes of fitted colors: the vertices of a mesh, or the texels of its atlas.
 
 use crate::geom::{Atlas, Bvh, Camera, Hit, Mesh, area_vector, bilinear_taps};
 use crate::image::{Gray, Image, Photo, eroded};
@@ -33,7 +33,7 @@ pub struct Photograph<'a> {
 }
 
 impl Photograph<'_> {
-    /// Returns whether a pixel shows the head alone. Soft pixels show what is behind the head, too, and would paint
+    /// Returns whether a pixel shows the head alone. Soft pixels also show the background, and would paint
     /// the outline with it.
     fn is_head(&self, at: usize) -> bool {
         self.mask.is_none_or(|m| m.values[at] >= OPAQUE) && self.valid.is_none_or(|v| v.values[at] > 0)
@@ -229,7 +229,7 @@ impl Matrix {
 pub struct Nodes {
     place: NodeLayout,
     count: usize,
-    /// Start of each node's neighbors in `near`; one more than there are nodes.
+    /// Start of each node's neighbors in `near`; one more entry than nodes.
     near_start: Vec<u32>,
     near: Vec<u32>,
 }
@@ -332,7 +332,7 @@ impl Nodes {
         texels.filter(|(_, n)| **n != u32::MAX).map(|(c, _)| *c).collect()
     }
 
-    /// Returns what `values` `[nodes]` are at the vertices of the mesh, of one of its triangles each.
+    /// Interpolates `values` `[nodes]` at the vertices of the mesh, in one of the triangles of each vertex.
     pub fn at_corners(&self, mesh: &Mesh, values: &[[f32; 3]]) -> Vec<[f32; 3]> {
         let mut out = vec![[0f32; 3]; mesh.positions.len()];
         for (t, triangle) in mesh.triangles.iter().enumerate() {

@@ -8,20 +8,20 @@ use rayon::prelude::*;
 /// The sum of squares left at which a fit ends, of that at its start.
 const TOLERANCE: f64 = 1e-8;
 
-/// The most steps of conjugate gradients.
+/// Maximum number of steps of conjugate gradients.
 const STEPS: usize = 30;
 
 /// Weights of the smoothness terms, relative to the squared error of one pixel.
 ///
-/// On a surface the sum of squared differences is the same however fine the nodes are: its weight says how many pixels
-/// there are, on average, in the area over which a fit is smoothed.
+/// On a surface the sum of squared differences is the same however fine the nodes are: its weight is the number of pixels that are
+/// on average in the area over which a fit is smoothed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Smoothness {
     /// Squares of differences between neighbors, of constant terms.
     pub constant: f32,
     /// The same of all other terms.
     pub others: f32,
-    /// Squares of all other terms themselves, for each pixel there is a node on average.
+    /// Squares of all other terms themselves, per pixel of a node on average.
     pub ridge: f32,
 }
 

@@ -3,7 +3,7 @@
 //! Patches of a surface: which triangles lie beside each other, parts as meshes of their own, how far a chart is
 //! from the sizes of its surface.
 //!
-//! The face stands upright in the texture: so that it can be painted.
+//! The face stands upright in the texture, so that it can be painted.
 
 use crate::geom::{Mesh, Sets, side_ends, sorted_sides};
 use glam::{DVec2, Vec3};
@@ -41,7 +41,7 @@ impl Flat {
         0.5 * (0..self.corners.len()).map(|k| twice_area(self.at(k))).sum::<f64>()
     }
 
-    /// One triangle as the half of a square, its largest angle in the right one.
+    /// Returns one triangle as half of a square, with its largest angle at the right angle.
     pub fn half_square(mesh: &Mesh, triangle: u32, leg: f64) -> Flat {
         let first = widest(mesh, triangle);
         let mut corner = [0, 1, 2];
@@ -60,7 +60,7 @@ impl Flat {
         alone.map(|run| side_ends(&self.corners, run[0].1)).collect()
     }
 
-    /// Returns the parts that hang together across sides, without the triangles that are not to be `kept`. Parts that
+    /// Returns the parts that are connected across sides, of the triangles that are `kept`. Parts that
     /// meet in a corner only no longer share it.
     pub fn parts(&self, kept: impl Fn(usize) -> bool) -> Vec<Flat> {
         let mut sets = Sets::new(self.corners.len());
@@ -101,7 +101,7 @@ pub(super) fn widest(mesh: &Mesh, triangle: u32) -> usize {
     (1..3).fold(0, |best, k| if opposite(k) > opposite(best) { k } else { best })
 }
 
-/// No triangle, no vertex, no number.
+/// Marks a missing triangle, vertex or number.
 pub(super) const NONE: u32 = u32::MAX;
 
 /// Returns the `wanted` triangles and their indices.
@@ -149,7 +149,7 @@ pub(super) fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
     beside
 }
 
-/// Takes teeth off the borders of regions: a triangle with two neighbours in one other region joins it.
+/// Smooths the borders of regions: a triangle with two neighbors in one other region joins it.
 pub(super) fn straighten<L: Copy + PartialEq>(beside: &[[u32; 3]], region: &mut [L]) {
     for _ in 0..4 {
         for t in 0..beside.len() {
@@ -165,13 +165,13 @@ pub(super) fn straighten<L: Copy + PartialEq>(beside: &[[u32; 3]], region: &mut 
     }
 }
 
-/// Of the surface, a chart that is no more than a sliver of the face need not stand.
+/// Minimum share of the surface for a chart to be turned upright.
 const MIN_UPRIGHT_SHARE: f64 = 0.01;
 
-/// Less than this share of the steepest rise says nothing of where up is.
+/// Minimum mean rise, as a share of the steepest, from which an up direction is derived.
 const MIN_RISE: f64 = 0.1;
 
-/// For each chart where up is in it, of length 1, if it has to stand upright: the one that the foremost triangle, seen
+/// Returns the unit up direction within each chart that has to stand upright: the one that the foremost triangle, seen
 /// along `front`, is part of.
 pub(super) fn upright(mesh: &Mesh, charts: &[Flat], front: Vec3, up: Vec3) -> Vec<Option<DVec2>> {
     let depth = |t: u32| mesh.corners(t).map(|p| p.dot(front)).iter().sum::<f32>();
@@ -185,7 +185,7 @@ pub(super) fn upright(mesh: &Mesh, charts: &[Flat], front: Vec3, up: Vec3) -> Ve
     charts.iter().map(stands).collect()
 }
 
-/// Returns where in a chart the surface rises, on the mean over its area; `None` where it does not.
+/// Returns the mean direction in a chart along which the surface rises; `None` if it has none.
 fn rising(mesh: &Mesh, chart: &Flat, up: Vec3) -> Option<DVec2> {
     let mut sum = DVec2::ZERO;
     for (k, &t) in chart.triangles.iter().enumerate() {

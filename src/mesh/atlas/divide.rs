@@ -14,7 +14,7 @@
 //!
 //! The face in one chart: what lies in front of a plane, as deep as it still lies flat.
 //!
-//! The library knows no costs of seams, so its charts meet anywhere, half of their seams where one looks first. Here
+//! The library has no cost of seams, so its charts meet anywhere, half of their seams in the face. Here
 //! the part of the surface around its foremost point, up to a plane across the direction the face looks, is taken out,
 //! flattened in one piece by a smooth copy, and relaxed to its true sizes; the rim is the plane's contour, short and
 //! out of the way. The rest is divided as any surface.
@@ -37,7 +37,7 @@ const MIN_CHART_SHARE: f64 = 0.008;
 /// Times that regions are joined and laid flat.
 const JOINS: usize = 2;
 
-/// Most steps of relaxing, and most triangles times steps: charts of very many triangles are smooth ones, whose
+/// Maximum number of steps of relaxing, and of triangles times steps: charts of very many triangles are smooth ones, whose
 /// sizes are nearly right after half of the steps.
 const RELAXING: usize = 100;
 const RELAXING_WORK: usize = 1_000_000;
@@ -126,7 +126,7 @@ fn uncovered(chart: Flat) -> Vec<Flat> {
     out
 }
 
-/// One number a triangle, from 0: its chart, or the neighbour that this joined.
+/// Returns the region of each triangle, numbered from 0: its chart, or the neighbor that the chart joined.
 fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
     let count = mesh.triangles.len();
     // a triangle without a chart is a region of its own until it joins one
@@ -196,13 +196,13 @@ fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
 /// Share of the surface from which a flat piece is worth a chart of its own.
 const SHARE: f64 = 0.01;
 
-/// How far a vertex may be off the plane, in parts of the surface's extent.
+/// Maximum distance of a vertex from the plane, relative to the surface's extent.
 const MAX_PLANE_DISTANCE: f64 = 5e-4;
 
 /// Cosine of the angle by which a triangle may lean.
 const MIN_PLANE_COSINE: f64 = 0.999;
 
-/// Returns the flat pieces of at least a hundredth of the surface, the largest triangles looked at first.
+/// Returns the flat pieces of at least a hundredth of the surface, starting from the largest triangles.
 pub(super) fn planar(mesh: &Mesh, adjacent: &[[u32; 3]]) -> Vec<Flat> {
     let count = mesh.triangles.len();
     let corners = |t: u32| mesh.corners(t).map(|p| p.as_dvec3());
@@ -289,7 +289,7 @@ const FACE_RELAXING: usize = 200;
 /// The share of the surface that a face may have.
 const MAX_FACE_SHARE: f64 = 0.3;
 
-/// How many times smaller or larger than the rest a triangle of the smooth copy may be: relaxing evens it out.
+/// Maximum ratio of areas within a chart of the smooth copy: relaxing evens it out.
 const MAX_FACE_STRETCH: f32 = 2.0 * STRETCHED;
 
 /// Divides a mesh, with its face in one chart if possible.
@@ -336,7 +336,7 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     })
 }
 
-/// Gives `number` to the first triangle and all without one that hang together with it; how many they are.
+/// Gives `number` to the first triangle and all connected ones without a number, and returns their count.
 fn flood(adjacent: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usize {
     let (mut open, mut count) = (vec![first], 1);
     piece[first as usize] = number;

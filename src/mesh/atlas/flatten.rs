@@ -36,7 +36,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 /// that seams are hardly longer and stretch is less, and small charts fill the texture better.
 const MAX_TILTED: f32 = 55.0;
 
-/// How many times smaller or larger than the rest a triangle may be: the library's own.
+/// Maximum ratio of areas within a chart: the library's default.
 pub(super) const STRETCHED: f32 = 4.0;
 
 /// The charts of a mesh, and the triangles that got none because they have no area.
@@ -57,7 +57,7 @@ impl ChartSet {
 
 /// Flattens the regions of `labels`, one number a triangle: a region becomes one chart, or several where it
 /// cannot be flat without a triangle's area changing more than `most_stretched` times against the others'. Without
-/// labels the library divides the surface by itself.
+/// labels the library chooses the regions.
 pub(super) fn flatten(
     mesh: &Mesh,
     labels: Option<&[u32]>,
@@ -198,7 +198,7 @@ pub(super) fn smoothed(mesh: &Mesh, rounds: usize) -> Mesh {
             sum[to as usize] += out.positions[from as usize];
             weight[to as usize] += 1.0;
         };
-        // a vertex of a border listens to the border alone
+        // border vertices depend on border neighbors only
         for &(a, b) in &inner {
             if !on_rim[a as usize] {
                 add(a, b);
@@ -222,7 +222,7 @@ pub(super) fn smoothed(mesh: &Mesh, rounds: usize) -> Mesh {
     out
 }
 
-/// Steps that L-BFGS remembers.
+/// Number of past steps that L-BFGS stores.
 const LBFGS_HISTORY: usize = 5;
 
 /// Energy over area at which a chart is good enough: 4 is an isometry, and 0.01 more a mean area stretch below half a

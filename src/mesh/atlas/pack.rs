@@ -25,7 +25,7 @@ use rayon::prelude::*;
 /// Cells along the texture, about: between four and five texels each of 2048.
 const GRID_CELLS: f64 = 448.0;
 
-/// Number of turns tried for each chart; smaller if there are many charts.
+/// Maximum number of rotations tried for each chart; fewer are tried if the atlas has many charts.
 const MAX_ROTATIONS: usize = 16;
 
 /// Orders tried, times charts.
@@ -34,7 +34,7 @@ const PLACEMENT_BUDGET: usize = 2400;
 /// The share of the texture that the first drawing is meant for.
 const INITIAL_FILL: f64 = 0.62;
 
-/// Where a chart goes: turned by the angle whose cosine and sine these are, scaled, and moved.
+/// Pose of a chart: turned by the angle with this cosine and sine, scaled, and moved.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct ChartPose {
     turn: DVec2,
@@ -57,7 +57,7 @@ struct TurnedMask {
     low: DVec2,
 }
 
-/// Which chart goes where: turn, column and row of each.
+/// Cells of the charts: turn, column and row of each.
 type CellPlaces = Vec<(usize, usize, usize)>;
 
 /// Places charts in a square texture: twice the gutter between any two of them and to the border. Where `stands` says
@@ -92,16 +92,16 @@ pub(super) fn pack(
     while used > 1e-3 {
         // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a fifth wider.
         let scale = cells * (used / area).sqrt() * size_px / inner_px;
-        let mut most = (1.2 * cells) as usize;
+        let mut max_side = (1.2 * cells) as usize;
         let mut start = cells as usize;
         let mut found = None;
         // The first time with the gutter that the widest needs, then with that of the size found.
         for _ in 0..2 {
-            let reach = gutter_px * most as f64 / inner_px;
+            let reach = gutter_px * max_side as f64 / inner_px;
             let drawn = draw(&outlines, stands, scale, reach, turns);
-            match smallest(&drawn, &mut order, start, most, monitor)? {
+            match smallest(&drawn, &mut order, start, max_side, monitor)? {
                 Some((side, layout)) => {
-                    (most, start) = (side, side);
+                    (max_side, start) = (side, side);
                     found = Some((drawn, layout, side, reach));
                 }
                 None => break,
@@ -149,13 +149,13 @@ fn draw(
     outlines.par_iter().zip(stands).map(one).collect()
 }
 
-/// Returns the smallest side found at which everything fits, from `start` on, at most `most`; `order` becomes the one
+/// Returns the smallest side found at which everything fits, from `start` on, at most `max_side`; `order` becomes the one
 /// that did it.
 fn smallest(
     drawn: &[Vec<TurnedMask>],
     order: &mut Vec<usize>,
     start: usize,
-    most: usize,
+    max_side: usize,
     monitor: &dyn Monitor,
 ) -> Result<Option<(usize, CellPlaces)>> {
     let mut side = start;
@@ -164,7 +164,7 @@ fn smallest(
             break layout;
         }
         side += side / 40 + 1;
-        if side > most {
+        if side > max_side {
             return Ok(None);
         }
     };

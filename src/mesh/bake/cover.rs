@@ -1,6 +1,6 @@
 //! Which texels a triangle covers, and where on the triangle their samples lie.
 //!
-//! Every texel is looked at through `side × side` regularly spaced points. A texel that a triangle touches
+//! Every texel is sampled at `side × side` regularly spaced points. A texel that a triangle touches
 //! without meeting any point still belongs to it (conservative rasterization): its one sample is the
 //! triangle's point nearest to the texel's centre. Triangles thinner than a texel are never lost.
 
@@ -8,7 +8,7 @@ use crate::geom::{Atlas, Hit};
 use glam::Vec2;
 use std::ops::Range;
 
-/// Most rows that are looked at together, and most samples, if a row has no more.
+/// Maximum numbers of rows and of samples in a band; a band has at least one row.
 const ROWS: u32 = 32;
 const SAMPLES: u32 = 1 << 17;
 
@@ -40,7 +40,7 @@ pub struct Bands {
 }
 
 impl Bands {
-    /// Sorts the triangles of an atlas into bands; each texel is looked at through `side` samples each way.
+    /// Sorts the triangles of an atlas into bands; each texel has `side` samples each way.
     pub fn new(atlas: &Atlas, side: u32) -> Bands {
         Bands::of_rows(atlas, (SAMPLES / (atlas.width * side * side).max(1)).clamp(1, ROWS))
     }

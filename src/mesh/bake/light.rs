@@ -59,8 +59,8 @@ pub struct Visibility<'a> {
     pub bvh: &'a Bvh,
     /// Offset of a line of sight from the flat triangle, so that it does not hit its own triangle.
     pub clearance: f32,
-    /// Maximum number of cameras of a point: those that look at it most directly.
-    pub most: usize,
+    /// Maximum number of cameras of a point: the ones that view it most directly.
+    pub max_cameras: usize,
 }
 
 /// Number of substitute cameras for a point that none sees.
@@ -86,7 +86,7 @@ impl Visibility<'_> {
     /// normals are rough, and a camera must not come and go from texel to texel. A point that no camera sees is
     /// looked at from where the cameras stand that face it most: those are directions that the field has
     /// learned colors for, unlike the one straight at it.
-    /// Without any camera, each point is looked at straight.
+    /// Without any camera, each point is viewed along its normal.
     pub fn directions(&self, points: &SurfacePoints, flat: &SurfacePoints) -> ViewDirections {
         let n = points.positions.len();
         if self.cameras.is_empty() {
@@ -126,9 +126,9 @@ impl Visibility<'_> {
                     (!self.bvh.any_hit(&ray)).then_some((direction, cos * cos))
                 };
                 let mut list: Vec<_> = self.cameras.iter().zip(&all).filter_map(sees).collect();
-                if list.len() > self.most {
+                if list.len() > self.max_cameras {
                     list.sort_by(|a, b| b.1.total_cmp(&a.1));
-                    list.truncate(self.most);
+                    list.truncate(self.max_cameras);
                 }
                 if !list.is_empty() || all.is_empty() {
                     return (!list.is_empty(), list);
@@ -224,7 +224,7 @@ pub fn seen_colors(
 ) -> Vec<[f32; 3]> {
     let points = SurfacePoints { positions: positions.to_vec(), normals: normals.to_vec() };
     let bvh = Bvh::new(mesh);
-    let seen = Visibility { cameras, bvh: &bvh, clearance: 0.5 * reach, most: usize::MAX }
+    let seen = Visibility { cameras, bvh: &bvh, clearance: 0.5 * reach, max_cameras: usize::MAX }
         .directions(&points, &points);
     let shades = shade(&points, seen, field, 0, glam::Mat3::IDENTITY);
     shades.linear.into_iter().map(|c| c.map(srgb_from_linear)).collect()
@@ -235,7 +235,7 @@ pub fn seen_colors(
 const RIDGE: f64 = 0.02;
 
 /// Coefficients `[functions][rgb]` that best turn `base` into `colors` seen from `directions` (unit, towards the
-/// viewer) with `weights`. Zero where there is nothing to fit.
+/// viewer) with `weights`. Zero if no camera sees the point.
 ///
 /// # Shapes
 ///
@@ -332,7 +332,7 @@ mod tests {
         };
         let bvh = Bvh::new(&hiding);
         let cameras = [Camera::above(100, 100, 100.0, 4.0)];
-        let eyes = Visibility { cameras: &cameras, bvh: &bvh, clearance: 1e-3, most: 8 };
+        let visibility = Visibility { cameras: &cameras, bvh: &bvh, clearance: 1e-3, max_cameras: 8 };
         let at = |x: f32, n: Vec3| (Vec3::new(x, 0.0, 0.0), n);
         let tilted = |degrees: f32| Vec3::new(degrees.to_radians().sin(), 0.0, degrees.to_radians().cos());
         // free, hidden, turned away, 80 degrees off, outside the frame (50 / 100 · 4 = 2)
@@ -351,7 +351,7 @@ mod tests {
             panic!("one color a point")
         };
         assert!((first[1] - 4.0 / 16.25f32.sqrt()).abs() < 1e-3 && first[2] > 0.999, "{first:?}");
-        let seen = eyes.directions(&points, &points);
+        let seen = visibility.directions(&points, &points);
         assert_eq!(seen.known, [true, false, false, false, false]);
         // the others are looked at from where the one camera stands
         assert_eq!(seen.counts, [1; 5]);
@@ -386,7 +386,7 @@ mod tests {
         assert!(towards(1.0) > 0.1 && towards(-1.0) < -0.3, "{} {}", towards(1.0), towards(-1.0));
         assert_eq!(shades.lobes[4..], [[0.0; 3]; 4]);
         let bvh = Bvh::new(&Mesh::default());
-        let no_cameras = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0, most: 8 };
+        let no_cameras = Visibility { cameras: &[], bvh: &bvh, clearance: 0.0, max_cameras: 8 };
         let straight = no_cameras.directions(&points, &points);
         let straight = shade(&points, straight, &learned, 0, glam::Mat3::IDENTITY);
         assert_eq!(straight.linear[0][0], 0.0);

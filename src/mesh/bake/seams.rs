@@ -19,17 +19,17 @@ use crate::kernel::cpu::cg::{conjugate_gradients, dot};
 use glam::Vec2;
 use std::collections::HashMap;
 
-/// What a texel's change costs beside a difference along one texel of a seam: little enough that what is left of a
+/// Weight of a texel's change relative to a difference along one texel of a seam: so low that the rest of a
 /// step is below the rounding to bytes, enough that a texel which hardly matters to a seam keeps its color.
 const STIFFNESS: f64 = 0.02;
 
-/// Points along each texel of a seam at which its sides are held together: each texel is looked at.
+/// Number of points along each texel of a seam at which its sides are held together.
 const DENSITY: f32 = 2.0;
 
 /// Most rounds of conjugate gradients; each texel of a seam hangs on a dozen others only, so errors fade fast.
 const ROUNDS: usize = 60;
 
-/// Points looked at along each edge of a seam by [`Seams::step`].
+/// Number of points along each edge of a seam that [`Seams::step`] compares.
 const POINTS: u32 = 4;
 
 /// Edges of a mesh whose two triangles lie apart in the atlas.
@@ -69,7 +69,7 @@ impl Seams {
     }
 
     /// Returns the mean difference of the colors that both sides show at the same points of the surface, bilinear, in
-    /// 255ths of the coded range, over points and channels; 0 where there is no seam.
+    /// 255ths of the coded range, over points and channels; 0 without seams.
     ///
     /// `color` has the atlas's size.
     pub fn step(&self, color: &Photo) -> f64 {
@@ -96,7 +96,7 @@ impl Seams {
     ///
     /// # Panics
     ///
-    /// Where the picture has not the atlas's size and 3 channels.
+    /// Panics if the picture does not have the atlas's size and 3 channels.
     pub fn even(&self, image: &mut Image, code: impl Fn(f32) -> f32, decode: impl Fn(f32) -> f32) {
         assert_eq!((image.width, image.height, image.channels), (self.width, self.height, 3));
         let (texels, rows) = self.system();
@@ -150,7 +150,7 @@ impl Seams {
     }
 }
 
-/// x with the least ‖R (start + x)‖² + STIFFNESS ‖x‖², by conjugate gradients.
+/// Returns the x that minimizes ‖R (start + x)‖² + STIFFNESS ‖x‖², by conjugate gradients.
 fn changes(rows: &[[(u32, f64); 8]], start: &[f64]) -> Vec<f64> {
     // Rᵀ R v + stiffness v
     let normal = |v: &[f64], stiffness: f64, out: &mut [f64]| {

@@ -12,12 +12,12 @@ use rayon::prelude::*;
 /// Skin vertices kept of a ring: enough for one every few millimetres.
 const RING: usize = 512;
 
-/// Where a surface is capped, and with which colors.
+/// The cap of a surface: its box and the colors of its rim.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cap {
     /// The box of the extraction.
     pub bounds: Aabb,
-    /// How near to the box's face the cap lies.
+    /// Maximum distance of the cap's vertices from the box's face.
     pub near: f32,
     /// Skin around the cap.
     pub ring: Vec<RimVertex>,
@@ -26,7 +26,7 @@ pub struct Cap {
 /// A point of the skin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RimVertex {
-    /// Where it is.
+    /// Its position.
     pub position: Vec3,
     /// Unit normal, pointing out; zero where none is known.
     pub normal: Vec3,

@@ -5,10 +5,10 @@
 //! changes nothing else: where the loop goes around matter it is cut, where it goes around air that is
 //! filled, and the two differ only in which side of the new triangles is out.
 //!
-//! Of the loops of a handle the field chooses: that over whose disc it is least to be overcome, `∫ |f|`. A thin
+//! The field chooses among the loops of a handle: the one whose disc has the smallest `∫ |f|`. A thin
 //! strand has little matter to cut and a narrow slit little air to fill, however long the slit is. The
 //! field is not closed or opened itself and meshed again, as morphology would: how far that goes before a
-//! handle gives way is known only afterwards, it rounds off what is beside, and costs a second extraction. Here
+//! handle disappears is known only afterwards, it rounds off nearby surface, and costs a second extraction. Here
 //! every vertex stays on the zero set, and the new triangles become part of it for those who hold
 //! the mesh against the field later ([`Patches`]).
 //!
@@ -27,7 +27,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 /// Maximum number of sides of a loop that is cut: the triangulation's cost grows with its cube.
 const MAX_SIDES: usize = 256;
 
-/// How far the rims are drawn back, as shares of the way to the vertices behind them; the first that fits.
+/// Candidate distances by which the rims are drawn back, as shares of the way to the vertices behind them; the first that fits is used.
 const RIM_RETRACTIONS: [f32; 3] = [0.5, 0.25, 0.1];
 
 /// Boxes compared for one triangle of a cap, at most: a sound surface takes hundreds.
@@ -161,7 +161,7 @@ fn least_area(points: &[DVec3], taken: impl Fn(usize, usize) -> bool) -> Option<
             }
             for k in i + 1..j {
                 let area = 0.5 * (points[k] - points[i]).cross(points[j] - points[i]).length();
-                // along a straight side a triangle without area would cost nothing: only if nothing else is left
+                // a triangle without area along a straight side would cost nothing: it is used only if no other is left
                 let across = points[j].distance_squared(points[i]);
                 let flat = if area <= MIN_AREA * across { across / MIN_AREA } else { 0.0 };
                 let sum = cost[at(i, k)] + cost[at(k, j)] + area + flat;
@@ -186,7 +186,7 @@ fn least_area(points: &[DVec3], taken: impl Fn(usize, usize) -> bool) -> Option<
     Some(out)
 }
 
-/// Those first over which the field is least to be overcome: `∫ |f|`, by the middles of the triangles.
+/// Sorts loops by the integral `∫ |f|` over their discs, sampled at the middles of the triangles.
 fn by_field(discs: Vec<Disc>, place: impl Fn(u32) -> Vec3, field: &dyn SdfField) -> Result<Vec<Disc>> {
     let (mut middles, mut areas) = (Vec::new(), Vec::new());
     for disc in &discs {
@@ -221,7 +221,7 @@ struct HandleCutter<'a> {
 
 /// The changes that a cut makes to the mesh.
 struct CutPlan {
-    /// Where vertices go, the copies included.
+    /// New positions of the vertices, including copies.
     moved: HashMap<u32, Vec3>,
     /// Triangles at the rims, with the copies on the right.
     at_rims: BTreeMap<u32, [u32; 3]>,
@@ -266,7 +266,7 @@ impl<'a> HandleCutter<'a> {
         self.fresh.extend(first..self.next.triangles.len() as u32);
         self.basis.push(class);
 
-        // the right cap looks towards the left one through air, or else away from it
+        // the right cap faces the left one through air, or else faces away from it
         let right = &cut.caps[cut.caps.len() / 2..];
         let out: Vec3 = right.iter().map(|t| area_vector(t.map(|v| cut.moved[&v]))).sum();
         let apart: Vec3 =

@@ -6,7 +6,7 @@
 //! - Every such loop has a random word, and an edge the exclusive or of the words of the loops that cross it. Along a
 //!   closed walk these add up to 0 if the walk separates the surface, and to the same word, its class, for
 //!   all walks that differ by separating ones.
-//! - So a loop that does not separate starts at some crossed edge. Shortest paths from there, as far as half
+//! - So a loop that does not separate starts at some crossed edge. Shortest paths from that edge, as far as half
 //!   the length allowed, and the edges that join two of them with a class other than 0 are all short loops.
 //!
 //! The words have 64 bits: two classes are taken for one by an accident of 1 in 10¹⁹, and then a handle stays.
@@ -20,10 +20,10 @@ use std::collections::{BTreeMap, BinaryHeap};
 
 const NONE: u32 = u32::MAX;
 
-/// Classes looked at; more are left to the next round.
+/// Maximum number of classes per round; the next round processes the others.
 const MAX_CLASSES: usize = 256;
 
-/// Vertices of a loop from which a shorter one of its class is looked for, and how often.
+/// Number of vertices of a loop from which a shorter loop of its class is searched, and number of such searches.
 const SHORTENING_STARTS: usize = 8;
 const SHORTENING_ROUNDS: usize = 3;
 
@@ -34,7 +34,7 @@ pub(super) struct Loop {
     pub vertices: Vec<u32>,
     /// Length along the edges.
     pub length: f32,
-    /// Which handles it goes around: independent words belong to loops that together do not separate.
+    /// The handles that it goes around: independent words belong to loops that together do not separate.
     pub class: u64,
 }
 
@@ -43,7 +43,7 @@ pub(super) struct Loop {
 pub(super) struct LoopFinder<'a> {
     positions: &'a [Vec3],
     triangles: &'a [[u32; 3]],
-    /// The same side from the other triangle.
+    /// Index of the same side in the other triangle.
     twin: Vec<u32>,
     /// A side that starts at each vertex.
     first: Vec<u32>,

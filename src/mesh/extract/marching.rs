@@ -23,7 +23,7 @@ pub struct Volume<'a> {
     pub dims: [usize; 3],
     /// `[z, y, x]`: x runs fastest.
     pub values: &'a [f32],
-    /// Where node (0, 0, 0) lies.
+    /// Position of node (0, 0, 0).
     pub origin: Vec3,
     /// Distance between nodes along each axis, > 0.
     pub spacing: Vec3,
@@ -34,13 +34,13 @@ pub struct Volume<'a> {
 pub struct LevelSet {
     /// The surface: first a vertex for each crossed grid edge, then those inside cells.
     pub mesh: Mesh,
-    /// How many values were not finite (`+inf`, `NaN` count as outside, `-inf` as inside).
+    /// Number of values that were not finite (`+inf`, `NaN` count as outside, `-inf` as inside).
     pub non_finite: usize,
     /// Inside nodes on the outer faces that were taken as outside to close the surface.
     pub capped: usize,
 }
 
-/// How much of a level set one part of a grid makes.
+/// Sizes of the part of a level set in one part of a grid.
 #[derive(Clone, Copy, Default)]
 pub(super) struct PartCounts {
     /// Vertices on edges.
@@ -50,7 +50,7 @@ pub(super) struct PartCounts {
     pub triangles: u64,
 }
 
-/// Where one part of a grid writes.
+/// Output slices of one part of a grid.
 pub(super) struct PartOutput<'a> {
     /// Index of the first of `vertices`.
     pub first: u32,
@@ -59,7 +59,7 @@ pub(super) struct PartOutput<'a> {
 }
 
 impl LevelSet {
-    /// Makes room for parts, and shares it out.
+    /// Allocates the arrays of all parts, and divides them.
     pub(super) fn share_out(&mut self, counts: &[PartCounts]) -> Result<Vec<PartOutput<'_>>> {
         let sum = |of: fn(&PartCounts) -> u64| counts.iter().map(of).sum::<u64>();
         let (edges, inside, triangles) = (sum(|c| c.vertices), sum(|c| c.inner), sum(|c| c.triangles));
@@ -88,8 +88,8 @@ impl LevelSet {
 
 /// Returns the zero level set of a volume.
 ///
-/// With `closed`, nodes on the outer faces count as outside, so that what runs off the box is capped
-/// within a thousandth of a cell of its faces; without, the surface is open there.
+/// With `closed`, nodes on the outer faces count as outside, so that a surface that leaves the box is capped
+/// within a thousandth of a cell of its faces; without, the surface is open at the faces.
 ///
 /// # Errors
 ///
@@ -197,7 +197,7 @@ impl Passes<'_> {
         Ok(())
     }
 
-    /// Counts what one plane of nodes and the layer of cells above it hold.
+    /// Counts vertices and triangles of one plane of nodes and the layer of cells above it.
     fn count(&self, k: usize, rows: &mut [[u32; 3]]) -> PartCounts {
         let mut vertices = 0u32;
         for (j, row) in rows.iter_mut().enumerate() {

@@ -48,7 +48,7 @@ pub(super) struct CellSurface {
     pub inner: Vec<[f64; 3]>,
 }
 
-/// Where the triangles and inner vertices of some cells are written, one cell after the other.
+/// Output of the triangles and inner vertices of some cells, one cell after the other.
 pub(super) struct CellOutput<'a> {
     pub triangles: &'a mut [[u32; 3]],
     pub inner: &'a mut [Vec3],
@@ -86,10 +86,10 @@ impl CellOutput<'_> {
     }
 }
 
-/// What the case alone says.
+/// The part of a cell's topology that depends on its case alone.
 #[derive(Clone, Copy)]
 pub(super) struct Case {
-    /// How many of `triangles` are used.
+    /// Number of used entries of `triangles`.
     pub count: u8,
     /// The values matter: see [`resolve`].
     pub ambiguous: bool,
@@ -557,7 +557,7 @@ mod tests {
                 let on_face = a < INNER && b < INNER && share_face(a, b);
                 assert_eq!(inner, !on_face, "{v:?}: edge {a} {b}");
             }
-            // No piece carries three loops, and every tunnel found a strip: faces = vertices there.
+            // No piece carries three loops, and every tunnel found a strip, so faces = vertices.
             let loops = Loops::trace(case, |f| {
                 let [a, b, c, d] = f.map(|i| f64::from(v[i as usize]));
                 if bit(case, f[0]) { a * c > b * d } else { b * d > a * c }

@@ -3,7 +3,7 @@
 //! 1. Every `coarse_step`-th node of the grid, along each axis, is evaluated (every 8th: 0.2 %).
 //! 2. So is every node along the coarse edges that change sign.
 //! 3. **Flood.** Whenever two evaluated neighbours differ in sign, all four cells around that edge are
-//!    evaluated, until none is left. The rule looks at evaluated nodes only, so the surface it leaves is
+//!    evaluated, until none is left. The rule depends on evaluated nodes only, so the surface it leaves is
 //!    closed by construction, and equal to the dense one on every piece it met.
 //!
 //! A piece that lies between coarse nodes is missed: take a finer coarse step for that. Nodes on the outer faces of the grid count as outside; so do nodes for
@@ -49,7 +49,7 @@ pub struct Sparse {
 /// # Errors
 ///
 /// A field that returns the wrong number of values, a coarse step other than 2, 4, 8, more vertices than 32-bit
-/// indices can name, a request to stop, which is looked for between batches.
+/// indices can name, a request to stop, which is checked between batches.
 pub fn sparse(
     field: &dyn SdfField,
     grid: &NodeGrid,
@@ -89,7 +89,7 @@ struct Flood<'a> {
     blocks: Blocks,
     /// Nodes marked as known whose value is still to come.
     wanted: Vec<[usize; 3]>,
-    /// Cells queued and not yet looked at.
+    /// Cells that are queued and not yet processed.
     cells: Vec<[usize; 3]>,
     out: Sparse,
 }
@@ -265,7 +265,7 @@ struct Block {
     values: [f32; 512],
 }
 
-/// Where the vertices of a block's edges are numbered.
+/// Numbers of the vertices on a block's edges.
 struct Owner {
     crossed: [[u64; 8]; 3],
     /// Vertices before each plane of each axis.
@@ -391,7 +391,7 @@ impl Blocks {
     fn surface(&mut self, grid: &NodeGrid) -> Result<LevelSet> {
         let mut out = LevelSet::default();
         self.repair(&mut out);
-        // Blocks in grid order, whatever order the flood met them in.
+        // Blocks in grid order, independent of the order in which the flood met them.
         let order: Vec<usize> = self.directory.iter().filter(|&&b| b != NONE).map(|&b| b as usize).collect();
         let mut owners: Vec<Owner> = Vec::with_capacity(self.blocks.len());
         self.blocks.par_iter().map(|b| self.owner(b)).collect_into_vec(&mut owners);
@@ -630,7 +630,7 @@ mod tests {
 
     #[test]
     fn a_face_in_a_block_border_and_a_tube_along_a_block_edge_survive() {
-        // 64 cells of 1/32: block borders lie at multiples of 1/4; the plane x = 0.25 is zero there.
+        // 64 cells of 1/32: block borders lie at multiples of 1/4; the field is zero on the plane x = 0.25.
         let slab = |p: Vec3| (p.x - 0.25).max(-0.5 - p.x).max(p.y.abs() - 0.5).max(p.z.abs() - 0.5);
         let (few, dense) = both(slab, Aabb::SCENE, 64);
         assert_eq!(key(&few.surface), key(&dense));

@@ -39,7 +39,7 @@ use std::fmt;
 /// Triangles worse than this are slivers; an equilateral one has 1.
 const SLIVER: f64 = 0.05;
 
-/// How far from 1 a normal's length may be; the Khronos validator's own bound.
+/// Maximum deviation of a normal's length from 1; the Khronos validator's own bound.
 const NORMAL_TOLERANCE: f32 = 5e-4;
 
 /// The result of [`check`]. Counts of triangles are of the mesh as given; topology is after welding.
@@ -90,7 +90,7 @@ pub struct CheckReport {
     pub volume_l: Option<f64>,
     /// Whether every vertex has a color.
     pub has_colors: bool,
-    /// Whether a texture gives the mesh its colors; set by readers, because [`check`] knows only the mesh.
+    /// Whether a texture gives the mesh its colors; set by readers, because [`check`] receives only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub has_texture: Option<bool>,
     /// Whether every vertex has a normal.
@@ -213,7 +213,7 @@ normals              {normals} ({bad_normals} not of unit length)
     }
 }
 
-/// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, whatever the mesh.
+/// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, for any mesh.
 ///
 /// # Examples
 ///
@@ -462,10 +462,10 @@ apart                {apart}, from the border {border:.2} texels
 
 /// Returns the text before and after a figure that is a bound because `left` candidates were not compared.
 pub(super) fn bound(which: &'static str, left: usize, of: &str) -> (&'static str, String) {
-    if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not looked at further)")) }
+    if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not compared further)")) }
 }
 
-/// Measures an atlas. Never panics, whatever mesh and atlas; lengths are those of the mesh.
+/// Measures an atlas. Never panics, for any mesh and atlas; lengths are those of the mesh.
 pub fn uv_check(mesh: &Mesh, atlas: &Atlas) -> UvReport {
     let (count, listed) = (mesh.triangles.len(), atlas.triangles.len());
     let common = count.min(listed);
@@ -560,9 +560,9 @@ pub fn seams_facing(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
     joined.seam_length(|a, b| faces(normal(a) + normal(b)))
 }
 
-/// Which triangles the texture joins.
+/// Charts of an atlas: the triangles that the texture joins.
 struct Joined {
-    /// For each triangle the lowest one of its chart.
+    /// The lowest triangle of each triangle's chart.
     chart: Vec<u32>,
     /// Sides that border on no triangle of the chart: `3 t + k` for the side from corner k of triangle t.
     rims: Vec<u32>,
@@ -582,7 +582,7 @@ impl Joined {
 
     fn of(mesh: &Mesh, atlas: &Atlas, valid: &[bool]) -> Joined {
         let (weld, _) = places(mesh);
-        let welded = |i: u32| weld.get(i as usize).copied().unwrap_or(0); // of invalid triangles anything
+        let welded = |i: u32| weld.get(i as usize).copied().unwrap_or(0); // any value for invalid triangles
         let faces: Vec<[u32; 3]> = mesh.triangles[..valid.len()].iter().map(|t| t.map(welded)).collect();
         let mut sides = sorted_sides(&faces);
         sides.retain(|&(_, c)| valid[c as usize / 3]);

@@ -9,7 +9,7 @@
 //!
 //! `Mesh` and [`Atlas`](crate::geom::Atlas) are indexed apart, as OBJ is: a vertex on a seam has one position and
 //! several texture coordinates, and the surface stays closed. GLB and textured PLY have one index for
-//! everything, so there vertices are split where corners disagree. The copies are bit-identical in
+//! everything, so vertices are split where corners disagree. The copies are bit-identical in
 //! position and normal: welding equal positions closes the surface again.
 //!
 //! All problems that prevent a mesh or a texture from being written are found before any bytes are produced.

@@ -20,7 +20,7 @@
 //! Tools may drop a texture that nothing refers to, and the Khronos validator warns about a texture that only
 //! `extras` refers to. So each lobe is the base color of a material of its own, which the primitive offers as a
 //! variant (`KHR_materials_variants`). Viewers show the first material unless the user selects a variant; viewers
-//! without support for variants always do. The first material says how to use the lobes:
+//! without support for variants always do. The first material describes how to use the lobes:
 //!
 //! ```json
 //! "extras": { "tiface": { "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ],

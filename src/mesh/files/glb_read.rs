@@ -439,9 +439,9 @@ fn names<T: std::fmt::Debug>(all: &[T]) -> String {
     if rest.is_empty() { last.clone() } else { format!("{} or {last}", rest.join(", ")) }
 }
 
-/// Most objects and arrays. One takes two bytes of JSON and up to 144 in memory, and twice that while a list grows.
+/// Maximum number of objects and arrays. One takes two bytes of JSON and up to 144 in memory, and twice that while a list grows.
 const MAX_NESTED: usize = 1 << 20;
-/// Most values. A key with an index takes six bytes of JSON and up to a hundred in memory.
+/// Maximum number of values. A key with an index takes six bytes of JSON and up to a hundred in memory.
 const MAX_VALUES: usize = 4 << 20;
 
 #[derive(Deserialize, Default)]
@@ -590,7 +590,7 @@ struct GlbMaterial {
 }
 
 impl GlbMaterial {
-    /// Returns whether the material says that it belongs to the soft layers around a mesh.
+    /// Returns whether the material is marked as one of the soft layers around a mesh.
     fn is_soft_layer(&self) -> bool {
         self.extras["tiface"]["soft_layers"].is_u64()
     }
@@ -600,7 +600,7 @@ impl GlbMaterial {
 #[serde(rename_all = "camelCase", default)]
 struct GlbPbr {
     base_color_texture: Option<GlbTextureUse>,
-    /// Factors of colors and texture, whatever the JSON contains.
+    /// Factors of colors and texture; any JSON value.
     base_color_factor: Value,
 }
 

@@ -126,7 +126,7 @@ impl std::fmt::Display for Short {
     }
 }
 
-/// A mesh and what is known of it until all lines are read.
+/// A mesh while the lines of its file are read.
 #[derive(Default)]
 struct Obj {
     out: ReadMesh,
@@ -303,7 +303,7 @@ fn floats<'w>(words: impl Iterator<Item = &'w str>, source: &Source, at: &dyn Di
     words.map(float).collect()
 }
 
-/// One-based from the start, or negative from the end, to zero-based.
+/// Converts an index, one-based from the start or negative from the end, to a zero-based one.
 fn resolve(text: &str, count: usize, what: &str, source: &Source, at: &dyn Display) -> Result<u32> {
     let index = match text.parse::<i64>() {
         Ok(i) if i > 0 => Some(i - 1),
@@ -315,7 +315,7 @@ fn resolve(text: &str, count: usize, what: &str, source: &Source, at: &dyn Displ
     })
 }
 
-/// As much of a word as a message can show.
+/// Returns the beginning of a word, for messages.
 fn start(word: &str) -> String {
     word.chars().take(40).collect()
 }

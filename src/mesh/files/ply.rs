@@ -1,6 +1,6 @@
 //! A mesh as PLY: binary little endian, in the dataset's own world.
 //!
-//! No turn and no unit: PLY says nothing of either, and Blender does not turn it (it does turn OBJ and
+//! Neither rotated nor scaled: PLY defines no axes and no unit, and Blender does not rotate it (it does turn OBJ and
 //! GLB). Colors are 8-bit and sRGB-coded, as every reader takes them. Positions are `float`, or `double` where
 //! the mesh lies so far from the origin that f32 would show.
 //!
@@ -284,7 +284,7 @@ struct Body<'a> {
 }
 
 impl Body<'_> {
-    /// Whether the remaining bytes can hold this element at all. Checked before any allocation.
+    /// Checks that the remaining bytes can hold this element, before any allocation.
     fn check(&self, element: &Element) -> Result<()> {
         let sizes = element.properties.iter().map(|p| match self.order {
             Order::Text => 1, // one digit; the spaces are extra

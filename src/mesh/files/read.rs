@@ -38,8 +38,8 @@ pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh> {
 ///
 /// # Errors
 ///
-/// Fails like [`read`], and when the texture is wanted but broken, lies outside the file and its folder, or when
-/// there are several textures.
+/// Fails like [`read`], and when the texture is wanted but broken, lies outside the file and its folder, or is one
+/// of several.
 pub fn read_with(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
     let mut out = parse(bytes, path, options)?;
     let places = std::mem::take(&mut out.places);

@@ -1,4 +1,4 @@
-//! What readers share: the mesh that they make, the file, its limits, and its errors.
+//! Types that all readers share: the mesh that they return, the file, its limits, and its errors.
 
 use crate::geom::{Atlas, Mesh};
 use crate::{Error, Result};
@@ -10,11 +10,11 @@ use std::path::Path;
 /// limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Most vertices.
+    /// Maximum number of vertices.
     pub vertices: usize,
-    /// Most triangles, after polygons are fanned.
+    /// Maximum number of triangles, after polygons are fanned.
     pub triangles: usize,
-    /// Most bytes of JSON in a GLB. Of them, at most 2²⁰ may be objects or arrays, and 2²² values.
+    /// Maximum number of bytes of JSON in a GLB. Of them, at most 2²⁰ may be objects or arrays, and 2²² values.
     pub json: usize,
     /// Whether to read the texture; otherwise it is skipped, valid or not.
     pub texture: bool,
@@ -39,7 +39,7 @@ impl Default for ReadOptions {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PictureSource {
     /// In the file: PNG or JPEG, for [`crate::io::parse_photo`]. Its header is within the limits for
-    /// pictures; nothing more is known.
+    /// pictures; the data is not checked.
     Inside(Vec<u8>),
     /// In a picture of this bare name, in the same folder.
     Beside(String),
@@ -61,7 +61,7 @@ impl Source<'_> {
     pub fn broken(&self, at: impl Display, what: impl Display) -> Error {
         let hint = match self.format {
             "GLB" => "export it again; the Khronos validator explains a GLB in detail",
-            _ => "export it again, or open it in Blender or MeshLab and save it anew from there",
+            _ => "export it again, or open it in Blender or MeshLab and save it anew",
         };
         Error::cannot(format!("`{}`, {at}: {what}", self.path.display()), hint)
     }
@@ -118,7 +118,7 @@ pub struct ReadMesh {
     pub atlas: Option<Atlas>,
     /// The base color.
     pub picture: Option<PictureSource>,
-    /// Linear red, green and blue that it is multiplied with, if the file says so.
+    /// Linear red, green and blue factors of the base color, if the file has them.
     pub tint: Option<[f32; 3]>,
     /// The positions in the file's coordinates while the file is read; then they move to `mesh`.
     pub(super) places: Vec<DVec3>,

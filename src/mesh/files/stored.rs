@@ -70,7 +70,7 @@ impl StoredTensors {
     fn open(path: &Path) -> Result<StoredTensors> {
         let wrong = |what: &str| Err(Error::cannot(format!("`{}`: {what}", path.display()), MAKE_AGAIN));
         if !io::is_file(path) {
-            return wrong("it is not there");
+            return wrong("the file is missing");
         }
         let (tensors, metadata) = io::read_tensors(path, &Limits::default()).map_err(damaged)?;
         match metadata.get("format").map(String::as_str) {

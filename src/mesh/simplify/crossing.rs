@@ -8,7 +8,7 @@ use crate::geom::{Aabb, Boxes, DBox, Effort, intersect};
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 
-/// Most cells along an axis, and most of all.
+/// Maximum numbers of cells along an axis and in total.
 const MAX_CELLS_PER_AXIS: f32 = 512.0;
 const MAX_CELLS: f32 = 4e6;
 

@@ -6,15 +6,15 @@
 //!
 //! # Held vertices
 //!
-//! What is not to be touched: vertices where the mesh is no surface.
+//! Vertices where the mesh is no manifold surface stay as they are.
 //!
 //! On an edge with more than two triangles, or with two that run the same way, and at a vertex whose
-//! triangles form more than one fan, the link condition says nothing. Such vertices stay as they are,
+//! triangles form more than one fan, the link condition does not apply. Such vertices stay as they are,
 //! so that a mesh with a flaw keeps the flaw and gets no others.
 //!
 //! # Quadrics
 //!
-//! How far a point lies from the planes of the triangles around it: Garland, Heckbert 1997, without
+//! Distance of a point from the planes of the triangles around a vertex: Garland, Heckbert 1997, without
 //! memory (Lindstrom, Turk 1998).
 //!
 //! Around a vertex `v` with triangles of unit normal `n` and area `A`, all of whose planes pass through
@@ -24,7 +24,7 @@
 //!
 //! # Collapses
 //!
-//! One collapse: may it be, and doing it.
+//! The conditions of an edge collapse, and the collapse itself.
 //!
 //! The link condition (Dey, Edelsbrunner, Guha, Nekhayev 1999): edge (a, b) may collapse without change
 //! of topology when every vertex joined to both is opposite to the edge in one of its triangles, and,
@@ -249,7 +249,7 @@ pub(super) const BORDER: u8 = 1;
 /// Takes part in no collapse and does not move.
 pub(super) const FIXED: u8 = 2;
 
-/// Returns what a vertex is, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it, each from one neighbour
+/// Returns the flags of a vertex, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it, each from one neighbour
 /// to the next: one closed walk through all of them is the inside of a surface, one open walk its border.
 pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
     sides.sort_unstable();
@@ -287,7 +287,7 @@ pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
     }
 }
 
-/// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point there
+/// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point to the middle
 /// where the triangles do not say (flat or along a crease). More costs accuracy: on a head simplified to
 /// a fifth, 1e-5, 1e-4, 1e-3 leave it 0.0198, 0.0206, 0.0223 off (in 512ths of the cube).
 const MIDPOINT_WEIGHT: f64 = 1e-5;
@@ -373,8 +373,8 @@ pub(super) fn best(
     let trace = sum[0] + sum[3] + sum[5];
     let pull = MIDPOINT_WEIGHT * trace;
     let reach = half.length_squared();
-    let least = half.dot(times(&sum, half)) + LENGTH_WEIGHT * trace * reach;
-    let cost = |y: DVec3| (y.dot(times(&sum, y)) + 2.0 * y.dot(slope) + least).max(0.0) as f32;
+    let constant = half.dot(times(&sum, half)) + LENGTH_WEIGHT * trace * reach;
+    let cost = |y: DVec3| (y.dot(times(&sum, y)) + 2.0 * y.dot(slope) + constant).max(0.0) as f32;
     match freedom {
         CollapseTarget::First => return (a, cost(-half)),
         CollapseTarget::Second => return (b, cost(half)),
@@ -384,7 +384,7 @@ pub(super) fn best(
         && y.length_squared() <= 4.0 * MAX_OFFSET * MAX_OFFSET * reach
     {
         // Since (A + B + pull) y = −slope: yᵀ (A + B) y = −y · slope − pull |y|².
-        let cost = least + y.dot(slope) - pull * y.length_squared();
+        let cost = constant + y.dot(slope) - pull * y.length_squared();
         return ((middle + y).as_vec3(), cost.max(0.0) as f32);
     }
     let mut best = (middle.as_vec3(), cost(DVec3::ZERO));
@@ -448,7 +448,7 @@ impl EdgeLink {
         EdgeLink { marks: vec![0; vertices], ..EdgeLink::default() }
     }
 
-    /// Looks around edge (a, b); false when its collapse would change the topology.
+    /// Collects the neighborhood of edge (a, b); false if its collapse would change the topology.
     pub(super) fn gather(&mut self, rings: &Rings, a: u32, b: u32) -> bool {
         if self.epoch >= u32::MAX - 2 {
             self.marks.fill(0);
@@ -611,7 +611,7 @@ impl EdgeLink {
     }
 }
 
-/// Returns the best place for the collapse of (a, b), and its cost; `None` where an end is not to be touched.
+/// Returns the best place for the collapse of (a, b), and its cost; `None` if an end is fixed.
 #[inline]
 pub(super) fn place(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);

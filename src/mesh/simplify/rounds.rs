@@ -4,7 +4,7 @@
 //!
 //! As few triangles as an error allows.
 //!
-//! Between two looks at the field a collapse is only believed to stray as far as its new vertex lies from
+//! Between two evaluations of the field a collapse is only believed to stray as far as its new vertex lies from
 //! the planes before it, added up. Each round may use what the measured error leaves at each vertex, and
 //! is measured: at corners, middles of edges and of triangles. A round that went too far is undone and
 //! repeated with a smaller part. A ball takes 2.2 to 2.4 times the fewest triangles that would do.
@@ -19,7 +19,7 @@
 //!   the surface and `φ` the hat functions: `M δ = −∫ d φᵢ`, `M` the mass matrix of the mesh, solved by
 //!   conjugate gradients. That takes out three quarters of the error on a sphere.
 //!
-//! A vertex whose move would turn or spoil a triangle, as no collapse may, goes half the way, a quarter, or stays.
+//! A vertex whose move would turn a triangle or make it a sliver, as no collapse may, moves half the way, a quarter, or stays.
 //!
 //! # The queue
 //!
@@ -45,11 +45,11 @@ use rayon::prelude::*;
 /// Buckets that a cost may have grown since the edge was entered: a quarter of it.
 const COST_SLACK: usize = 4;
 
-/// Of the edges of a new vertex only this many, the cheapest, are entered. The vertices around have theirs
+/// Maximum number of edges of a new vertex that are queued, the cheapest first. The vertices around have theirs
 /// from before; all seven would take a tenth longer and win a hundredth of the error.
 const EDGES_PER_VERTEX: usize = 3;
 
-/// Asking whether to stop costs nothing this often.
+/// Number of collapses between two checks for a stop request.
 const STOP_CHECK_INTERVAL: usize = 1 << 12;
 
 /// The data shared by all rounds.
@@ -62,7 +62,7 @@ pub(super) struct Task<'a> {
     pub monitor: &'a dyn Monitor,
 }
 
-/// Collapses down to the number of triangles asked for, then takes the vertices to the field.
+/// Collapses edges down to the requested number of triangles, then moves the vertices onto the field's zero.
 pub(super) fn counted(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh> {
     let mut rings = prepare(mesh, report);
     reduce(&mut rings, task, task.config.triangles, None, report)?;
@@ -183,7 +183,7 @@ fn fill(rings: &Rings) -> EdgeQueue {
     queue
 }
 
-/// Where vertices go.
+/// Placement of the vertices.
 #[derive(Clone, Copy)]
 enum VertexPlacement {
     /// On the field's zero. Between them the triangles are chords.
@@ -280,7 +280,7 @@ fn without_crossings(positions: &mut [Vec3], triangles: &[[u32; 3]], start: &[Ve
     back
 }
 
-/// Most rounds, and most that may be undone.
+/// Maximum numbers of rounds and of undone rounds.
 const MAX_ROUNDS: usize = 24;
 const MAX_UNDONE_ROUNDS: usize = 5;
 /// A round gives up at most this share of the triangles: measuring often is cheaper than undoing.
@@ -336,7 +336,7 @@ pub(super) fn bounded(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> 
         }
     }
     if good.normals.is_empty() {
-        // nothing may go: the mesh as it came, with normals
+        // no collapse is possible: the input mesh, with normals
         let fixed = vec![true; good.positions.len()];
         settle(&mut good, &fixed, field, task, VertexPlacement::OnSurface, report)?;
     }
@@ -347,7 +347,7 @@ fn worst(errors: &[f32]) -> f32 {
     errors.iter().copied().fold(0.0, f32::max)
 }
 
-/// For every vertex the largest distance to the surface at corners, middles of edges and middles of the
+/// Returns for every vertex the largest distance to the surface at corners, middles of edges and middles of the
 /// triangles around it.
 fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<f32>> {
     let mut errors = vec![0.0f32; mesh.positions.len()];
@@ -457,7 +457,7 @@ pub(super) fn middles(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<Vec3> {
     triangles.iter().map(|t| t.iter().map(|&v| positions[v as usize] / 3.0).sum()).collect()
 }
 
-/// Of the bits of a cost: sign and exponent, and four bits of its mantissa.
+/// Number of leading bits of a cost that select its bucket: sign and exponent, and four bits of the mantissa.
 const SHIFT: u32 = 19;
 
 /// A queued edge with the stamps of its ends.
@@ -486,7 +486,7 @@ impl EdgeQueue {
         EdgeQueue { buckets, lowest: usize::MAX, current: Vec::new(), done: 0, bucket: 0 }
     }
 
-    /// Returns the bucket of a cost ≥ 0; whatever is not a number goes last.
+    /// Returns the bucket of a cost ≥ 0; NaN goes last.
     fn bucket(cost: f32) -> usize {
         // + 0 makes −0 and 0 equal
         let cost = if cost.is_nan() { f32::INFINITY } else { cost.max(0.0) + 0.0 };

@@ -217,7 +217,7 @@ pub(super) struct Batch {
     /// Pixel in the tile.
     pixel: [u32; BATCH],
     triangle: [u32; BATCH],
-    /// One bit for each sample that gets this color.
+    /// A bit for each sample that gets this color.
     samples: [u8; BATCH],
     is_center: [bool; BATCH],
     direction: [[f32; BATCH]; 3],

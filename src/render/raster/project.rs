@@ -1,4 +1,4 @@
-//! Triangles on a picture: moved into the camera, cut to what it can see, snapped to 1/256 of a pixel, and sorted into
+//! Projection of triangles: transformed to the camera, clipped to its frustum, snapped to 1/256 of a pixel, and sorted into
 //! tiles.
 
 use crate::geom::{Camera, Mesh};
@@ -21,13 +21,13 @@ const CHUNK: usize = 4096;
 /// Farthest from the picture's corner, 1/256 pixels: products of two distances fit into 64 bits many times over.
 const MAX_COORDINATE: f64 = (1 << 23) as f64;
 
-/// The same for a corner made by clipping, which is rounded.
+/// Tolerance for a corner made by clipping, which is rounded.
 const MAX_CLIPPED_COORDINATE: f64 = MAX_COORDINATE + 8192.0;
 
 /// Nearest to the camera, as a share of the distance to the farthest corner of the mesh's box.
 const MIN_DEPTH_SHARE: f32 = 1e-5;
 
-/// How far a straight line may lie from where the lens bends it to, pixels.
+/// Maximum distance of a straight line from its distorted image, pixels.
 const MAX_LENS_ERROR_PX: f64 = 1.0 / 64.0;
 
 /// Samples along each side of a picture whose rays determine the field of view of the lens.
@@ -130,7 +130,7 @@ impl<'a> Lens<'a> {
             let (x, y) = (reach(camera.fx, camera.cx), reach(camera.fy, camera.cy));
             [x.0, x.1, y.0, y.1]
         } else {
-            // a tenth more for what a bent lens sees between those places; more would meet its fold
+            // a tenth more for directions between these samples of a distorted lens; more would reach its fold
             let border = 0.1 * (high - low);
             [low.x - border.x, high.x + border.x, low.y - border.y, high.y + border.y]
         };
@@ -214,7 +214,7 @@ impl<'a> Lens<'a> {
         Corner { x: round(x), y: round(y), inverse_depth: ideal.z }
     }
 
-    /// Cuts a triangle, given in the camera, to what the picture shows, and adds what is left.
+    /// Clips a triangle, given in camera coordinates, to the picture, and adds the rest.
     ///
     /// A new corner is computed from the end of its edge that is kept, so both triangles at an edge get the same one.
     fn cut(&self, triangle: [Vec3; 3], id: u32, cull: bool, out: &mut Vec<Face>) {
@@ -329,8 +329,8 @@ impl<'a> Lens<'a> {
     }
 }
 
-/// First and last column, first and last row of pixels in which a face may hold a sample; the first behind the last where
-/// there are none.
+/// First and last column, first and last row of pixels in which a face may hold a sample; the first exceeds the last if
+/// no such pixel exists.
 #[inline(always)]
 pub(super) fn reach(face: &Face) -> ((i32, i32), (i32, i32)) {
     let [a, b, c] = face.corners;

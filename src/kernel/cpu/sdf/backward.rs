@@ -3,13 +3,12 @@
 use super::{Activations, CHUNK, WIDTH};
 use crate::dispatch;
 use crate::kernel::cpu::hash::{self, JacobianBlock, LANES};
-use crate::kernel::cpu::matrix::add_to;
 use crate::kernel::cpu::mlp::{
     COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
 };
 use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
 use crate::kernel::cpu::pool::{Buffer, by_chunk};
-use crate::kernel::cpu::simd::{exp, fma, gemm, relu_gradient};
+use crate::kernel::cpu::simd::{add_to, exp, fma, gemm, relu_gradient};
 use rayon::prelude::*;
 
 /// The backward pass of a range of samples.

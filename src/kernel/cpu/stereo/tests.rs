@@ -5,7 +5,8 @@ use std::f32::consts::TAU;
 
 const SIZE: usize = 96;
 
-/// Returns a camera that looks at the origin from a direction, at distance 3: a pixel there is 3 / 150 = 0.02 long.
+/// Returns a camera that looks at the origin from a direction, at distance 3: a pixel at the origin
+/// is 3 / 150 = 0.02 long.
 fn camera_from(from: DVec3) -> Camera {
     let back = from.normalize();
     let right = DVec3::Y.cross(back).normalize();

@@ -9,9 +9,8 @@
 use super::gather::FactorGradients;
 use super::{Cell, Grid};
 use crate::dispatch;
-use crate::kernel::cpu::matrix::{Matrix, add_to, split};
 use crate::kernel::cpu::pool::{Buffer, pieces};
-use crate::kernel::cpu::simd::{gemm, relu_gradient, sigmoid};
+use crate::kernel::cpu::simd::{Matrix, add_to, gemm, relu_gradient, sigmoid, split};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -98,11 +97,6 @@ impl DecoderWeights {
             w3: Matrix::new(w3, shapes[5], (RGB, h)),
             b3: std::array::from_fn(|c| b3.get(c).copied().unwrap_or(0.0)),
         }
-    }
-
-    /// Returns the sizes of the decoder.
-    pub fn shape(&self) -> DecoderShape {
-        self.shape
     }
 }
 

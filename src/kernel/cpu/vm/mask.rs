@@ -59,7 +59,7 @@ impl BoxMask {
     }
 
     /// Creates a mask from marked vertices: a cell is occupied if one of its eight corners is marked. Vertex `(x, y, z)`
-    /// has index `(x · ny + y) · nz + z`; there are at least 2 along each axis, and the outer ones lie on the border of
+    /// has index `(x · ny + y) · nz + z`; each axis has at least 2, and the outer ones lie on the border of
     /// `min..max`.
     ///
     /// The cells extend beyond the vertices by one on every side. The published lookup pads with zeros, so a vertex on the

@@ -2,8 +2,7 @@
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
-use super::super::rng::{self, Wide};
-use super::super::search::ranked;
+use super::super::rng::{self, Wide, ranked};
 use super::super::sum::group_sum;
 use super::{Occupancy, UNITS};
 use crate::Result;
@@ -19,7 +18,7 @@ fn tally(mask: &[u32], counts: &mut [u32]) {
     }
 }
 
-/// Returns the cell of draw `k`, or `u32::MAX` if there is no such draw: see [`update_nerfacc`](crate::kernel::cpu::occupancy::update_nerfacc).
+/// Returns the cell of draw `k`, or `u32::MAX` if the draw does not exist: see [`update_nerfacc`](crate::kernel::cpu::occupancy::update_nerfacc).
 #[cube]
 fn drawn_cell(
     mask: &[u32],

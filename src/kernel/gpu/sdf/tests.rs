@@ -1,11 +1,11 @@
+use super::super::case_tests::Case;
 use super::super::device::tests::{agree, device, devices, planes};
-use super::super::test_case::Case;
 use super::*;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::sdf;
 
 const SAMPLES: usize = 1000;
-const CAPACITY: usize = 1088; // one tile more than there are samples for
+const CAPACITY: usize = 1088; // one tile more than the samples fill
 
 fn case(levels: usize, color_skip: bool, active: usize) -> Case {
     Case::new(SAMPLES, levels, color_skip, active)

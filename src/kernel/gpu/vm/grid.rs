@@ -245,7 +245,7 @@ fn fixed_point_scales(partial: &[f32], units: &mut [f32]) {
     }
 }
 
-/// Adds the fixed-point sums as floats to the gradient and resets them to zero, if there were samples from `from` on.
+/// Adds the fixed-point sums as floats to the gradient and resets them to zero, if the step had samples from `from` on.
 #[cube(launch)]
 fn flush_fixed_point(
     fixed_sums: &mut [i32],
@@ -351,11 +351,6 @@ impl DeviceGrid {
     /// Returns the number of floats on the device.
     pub fn len(&self) -> usize {
         self.padded.len()
-    }
-
-    /// Returns whether the grid has no channels.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 
     /// Returns the number of vectors of each term.

@@ -177,7 +177,7 @@ impl VmLosses {
     }
 
     /// Resets the totals.
-    pub fn forget(&mut self, device: &Device) {
+    pub fn reset_totals(&mut self, device: &Device) {
         self.totals = device.zeros::<u32>(TOTALS);
     }
 

@@ -177,7 +177,7 @@ pub struct DeviceLattice {
     sizes: Buffer,
     mask: Option<[Buffer; 2]>,
     /// Maximum number of samples of a ray.
-    pub most: usize,
+    pub max_samples: usize,
 }
 
 impl DeviceLattice {
@@ -196,12 +196,12 @@ impl DeviceLattice {
             sizes.extend(cells.map(|n| n.div_ceil(BLOCK) as u32));
             [mask.bits(), mask.blocks()].map(|bits| device.upload(&words(bits)))
         });
-        let most = DeviceLattice::most(field);
-        DeviceLattice { lattice: device.upload(&numbers), sizes: device.upload(&sizes), mask, most }
+        let max_samples = DeviceLattice::max_samples(field);
+        DeviceLattice { lattice: device.upload(&numbers), sizes: device.upload(&sizes), mask, max_samples }
     }
 
     /// Returns the maximum number of samples of a ray: those of the box's diagonal, and a few more for rounding.
-    pub fn most(field: &VmField) -> usize {
+    pub fn max_samples(field: &VmField) -> usize {
         let l = &field.lattice;
         let diagonal = (0..3).map(|a| (l.max[a] - l.min[a]).powi(2)).sum::<f32>().sqrt();
         l.samples.saturating_sub(1).min((diagonal / l.step) as usize + 3).max(1)

@@ -1,7 +1,7 @@
 use super::super::Atomics;
 use super::super::device::Words;
 use super::super::device::tests::{agree, device, devices, planes};
-use super::test_case::{DeviceCase, NARROW, Shape, case, on_cpu, room};
+use super::case_tests::{DeviceCase, NARROW, Shape, capacity, case, on_cpu};
 use super::*;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm};
 use crate::kernel::cpu::vm::mask::Walk;
@@ -55,7 +55,7 @@ fn rendered_rays_are_those_of_the_cpu() {
         let [looked_up, colored, _] = on_gpu.vm.counts().map(|b| device.read::<u32>(b)[0] as u64);
         assert_eq!(colored, want.color_samples);
         assert!(looked_up >= want.density_samples && colored > 1000, "{looked_up} {colored}");
-        agree("rendered", &got, &planes::<RAY_WIDTH>(want.out.as_chunks().0, room(&case)), 1e-4);
+        agree("rendered", &got, &planes::<RAY_WIDTH>(want.out.as_chunks().0, capacity(&case)), 1e-4);
     }
 }
 

@@ -89,7 +89,7 @@ pub(super) fn case(shape: Shape, count: u64) -> Case {
 }
 
 /// Some places more than rays.
-pub(super) fn room(case: &Case) -> usize {
+pub(super) fn capacity(case: &Case) -> usize {
     case.rays.len() + 3
 }
 
@@ -103,7 +103,7 @@ pub(super) struct DeviceCase {
 
 impl DeviceCase {
     pub fn new(device: &Device, case: &Case) -> DeviceCase {
-        let n = room(case);
+        let n = capacity(case);
         let vm = Vm::new(device, &case.field, n, true);
         DeviceCase {
             values: [
