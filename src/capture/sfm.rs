@@ -30,7 +30,7 @@ use std::path::{Path, PathBuf};
 /// Fewest photographs that a capture can have.
 const MIN_VIEWS: usize = 8;
 
-/// Share of the photographs that ends the attempts, and below which those left out are named.
+/// Share of the photographs with a camera that is enough: no other attempt is made.
 const ENOUGH: f64 = 0.8;
 
 /// Reprojection errors above this are warned of. Those of sharp photographs are below one pixel.
