@@ -45,7 +45,7 @@ const LEAST_SCALE: f64 = 0.1;
 
 /// Largest residual of a camera fitted alone, pixels. Points that stay have errors of their own, of up to 1.2; those found by
 /// chance lie anywhere within the reach of the search, some ten pixels.
-const MOST_ALONE_PX: f64 = 3.0;
+const MOST_ALONE_PX: f64 = 2.0;
 
 /// What was measured of a rig.
 #[derive(Clone, Debug)]

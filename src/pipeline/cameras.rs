@@ -209,7 +209,10 @@ impl CameraCheck {
         let left: Vec<String> = left.map(|v| format!("`{}` ({} sightings)", v.view, v.sightings)).collect();
         (!left.is_empty()).then(|| {
             let named = left.join(", ");
-            format!("too little was found again in held-out views to fit their poses: {named}; they are shown from the given ones alone")
+            format!(
+                "too little was found again in held-out views to fit their poses: {named}; they are shown from the given \
+                 ones alone"
+            )
         })
     }
 
