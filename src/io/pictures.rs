@@ -234,8 +234,9 @@ impl<'a> PictureFile<'a> {
         let (width, height) = (info.width, info.height);
         let claimed = u64::from(width) * u64::from(height);
         if claimed > max_pixels {
-            let problem =
-                format!("{width} × {height} pixels cannot come from its picture data, enough for {max_pixels}");
+            let problem = format!(
+                "{width} × {height} pixels cannot come from its picture data, enough for {max_pixels}"
+            );
             return Err(self.jpeg(None, problem));
         }
         let pixels = decoder.decode().map_err(|e| self.jpeg(None, format!("{e:?}")))?;

@@ -396,7 +396,8 @@ impl Propagation<'_> {
             }
             heads[i] = Some(head);
         }
-        let (agree, proposed) = (heads.iter().flatten().count(), self.views.iter().filter(|v| v.votes).count());
+        let (agree, proposed) =
+            (heads.iter().flatten().count(), self.views.iter().filter(|v| v.votes).count());
         let models = self.common(inside, outside).filter(|_| agree >= 2).ok_or_else(|| {
             Error::cannot(
                 format!("of the masks that the network proposes for {proposed} views only {agree} agree"),
