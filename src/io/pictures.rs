@@ -254,13 +254,14 @@ impl<'a> PictureFile<'a> {
     }
 
     fn decode_jpeg(self) -> Result<(DynamicImage, PictureInfo), ReadError> {
-        let most = self.walk_jpeg()?;
+        let max_pixels = self.walk_jpeg()?;
         let (mut decoder, info) = self.jpeg_decoder()?;
         let (width, height) = (info.width, info.height);
         let claimed = u64::from(width) * u64::from(height);
-        if claimed > most {
-            let problem =
-                format!("{width} × {height} pixels cannot come from its picture data, enough for {most}");
+        if claimed > max_pixels {
+            let problem = format!(
+                "{width} × {height} pixels cannot come from its picture data, enough for {max_pixels}"
+            );
             return Err(self.jpeg(None, problem));
         }
         let pixels = decoder.decode().map_err(|e| self.jpeg(None, format!("{e:?}")))?;

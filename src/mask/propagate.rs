@@ -346,14 +346,14 @@ pub fn propagate_proposals<F>(views: &[PropagateView], proposals: &[Gray], load:
 where
     F: Fn(usize) -> Result<Photo> + Sync,
 {
-    let asked: Vec<ConsistencyView> = (views.iter().zip(proposals))
+    let voters: Vec<ConsistencyView> = (views.iter().zip(proposals))
         .map(|(v, mask)| ConsistencyView {
             name: v.name,
             camera: v.camera,
             mask: Some(mask).filter(|_| v.votes),
         })
         .collect();
-    let verdicts = verdicts(&asked)?;
+    let verdicts = verdicts(&voters)?;
     let mut propagation = Propagation::new(CELLS, BATCH_VIEWS, views, load)?;
     let start = propagation.proposed(proposals, &verdicts)?;
     Ok(propagation.run(start))
@@ -396,16 +396,17 @@ impl Propagation<'_> {
             }
             heads[i] = Some(head);
         }
-        let (agree, asked) = (heads.iter().flatten().count(), self.views.iter().filter(|v| v.votes).count());
+        let (agree, proposed) =
+            (heads.iter().flatten().count(), self.views.iter().filter(|v| v.votes).count());
         let models = self.common(inside, outside).filter(|_| agree >= 2).ok_or_else(|| {
             Error::cannot(
-                format!("of the masks that the network proposes for {asked} views only {agree} agree"),
+                format!("of the masks that the network proposes for {proposed} views only {agree} agree"),
                 "try another network, see that `mask.alpha_input` is what it wants, or click: `tiface mask CAPTURE \
                  --page`",
             )
         })?;
         self.notes.push(format!(
-            "{agree} of {asked} proposed masks agree{}{}",
+            "{agree} of {proposed} proposed masks agree{}{}",
             if others.is_empty() { "" } else { "; made again by what those say: " },
             others.join(", ")
         ));

@@ -214,9 +214,9 @@ fn by_charts(mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result
     }
     .renumbered(&number);
     flattened.charts.extend(flat);
-    let (found, most) = (flattened.charts.len(), 64.max(mesh.triangles.len() / 20));
-    if found > most {
-        return Err(Error::cannot(format!("{found} charts, more than {most}, would be no better"), ""));
+    let (found, limit) = (flattened.charts.len(), 64.max(mesh.triangles.len() / 20));
+    if found > limit {
+        return Err(Error::cannot(format!("{found} charts, more than {limit}, would be no better"), ""));
     }
     monitor.step(2, STEPS, &[("charts", found as f64)]);
     lay(mesh, flattened.charts, flattened.without, config, monitor)
@@ -240,13 +240,13 @@ fn lay(
             bad[t as usize] = height(chart.at(k)) * scale < THIN_PX;
         }
     }
-    let most = 64.max(mesh.triangles.len() / 50);
+    let limit = 64.max(mesh.triangles.len() / 50);
     for _ in 0..ROUNDS {
         charts = charts.iter().flat_map(|c| c.parts(|k| !bad[c.triangles[k] as usize])).collect();
         loose.extend((0..mesh.triangles.len() as u32).filter(|&t| std::mem::take(&mut bad[t as usize])));
-        if loose.len() > most {
+        if loose.len() > limit {
             let found = loose.len();
-            return Err(Error::cannot(format!("{found} triangles, more than {most}, need repair"), ""));
+            return Err(Error::cannot(format!("{found} triangles, more than {limit}, need repair"), ""));
         }
         // as large as the triangle, but two texels at least
         let leg = |t: u32| (2.0 * mesh.area(t)).sqrt().max(2.0 / scale);

@@ -91,8 +91,8 @@ pub fn simplify(
             counted(mesh, &task, &mut report)?
         };
         report.self_intersections = crossings(&out.positions, &out.triangles).len();
-        let most = || crossings(&mesh.positions, &mesh.triangles).len();
-        if report.self_intersections == 0 || report.self_intersections <= most() {
+        let original = || crossings(&mesh.positions, &mesh.triangles).len();
+        if report.self_intersections == 0 || report.self_intersections <= original() {
             break;
         }
     }

@@ -562,8 +562,8 @@ pub(crate) mod tests {
         let device = device().unwrap();
         let pages = std::fs::read_to_string("/proc/self/statm").unwrap();
         let pages: u64 = pages.split(' ').next().unwrap().parse().unwrap();
-        let most = Some(4096 * pages + (1 << 30));
-        let limit = rustix::process::Rlimit { current: most, maximum: most };
+        let bytes = Some(4096 * pages + (1 << 30));
+        let limit = rustix::process::Rlimit { current: bytes, maximum: bytes };
         rustix::process::setrlimit(rustix::process::Resource::As, limit).unwrap();
         let words = device.limits().largest_buffer as usize / 4;
         let all: Vec<Buffer> = (0..64).map(|_| device.scratch::<f32>(words)).collect();
@@ -647,10 +647,10 @@ pub(crate) mod tests {
         let sizes = std::iter::once(30).chain([7; 20]).chain([1; 8]);
         let all: Vec<Buffer> = sizes.map(|mib| device.zeros::<f32>(mib * MIB)).collect();
         device.read::<f32>(&all[all.len() - 1]);
-        let asked: usize = all.iter().map(|buffer| 4 * buffer.words()).sum();
+        let requested: usize = all.iter().map(|buffer| 4 * buffer.words()).sum();
         let taken = device.reserved_memory() - before;
-        println!("{asked} bytes of buffers take {taken}");
-        assert!(taken as f64 <= 1.05 * asked as f64, "{taken} of {asked}");
+        println!("{requested} bytes of buffers take {taken}");
+        assert!(taken as f64 <= 1.05 * requested as f64, "{taken} of {requested}");
     }
 
     #[test]

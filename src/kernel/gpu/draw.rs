@@ -346,12 +346,12 @@ fn draw_rays(
             }
         }
         let kept = select(found, 1u32, 0u32);
-        let most = f32::cast_from(255 * sums.count);
+        let full = f32::cast_from(255 * sums.count);
         alive[r] = kept;
-        alpha[r] = f32::cast_from(kept * sums.alpha) / most;
-        color[r] = f32::cast_from(kept * sums.red) / (255.0f32 * most);
-        color[rays + r] = f32::cast_from(kept * sums.green) / (255.0f32 * most);
-        color[2 * rays + r] = f32::cast_from(kept * sums.blue) / (255.0f32 * most);
+        alpha[r] = f32::cast_from(kept * sums.alpha) / full;
+        color[r] = f32::cast_from(kept * sums.red) / (255.0f32 * full);
+        color[rays + r] = f32::cast_from(kept * sums.green) / (255.0f32 * full);
+        color[2 * rays + r] = f32::cast_from(kept * sums.blue) / (255.0f32 * full);
         // cameras look along −Z
         let mut over = 1.0f32;
         if comptime!(order != PixelOrder::Permuted { depth_directions: true }) {

@@ -107,13 +107,13 @@ impl Mixture {
 
     /// `ln p(color)`, per cubic step of 8 bit; always finite.
     pub fn log_likelihood(&self, color: &Rgb) -> f64 {
-        let mut most = f64::NEG_INFINITY;
+        let mut largest = f64::NEG_INFINITY;
         let mut logs = [f64::NEG_INFINITY; 16];
         for (l, g) in logs.iter_mut().zip(&self.gaussians) {
             *l = g.log_density(color);
-            most = most.max(*l);
+            largest = largest.max(*l);
         }
-        most + logs.iter().map(|l| (l - most).exp()).sum::<f64>().ln()
+        largest + logs.iter().map(|l| (l - largest).exp()).sum::<f64>().ln()
     }
 }
 

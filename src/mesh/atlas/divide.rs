@@ -152,9 +152,9 @@ fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
             }
         }
     }
-    let least = MIN_CHART_SHARE * area.iter().sum::<f64>();
+    let min_area = MIN_CHART_SHARE * area.iter().sum::<f64>();
     let mut into: Vec<u32> = (0..regions).collect();
-    let mut open: Vec<u32> = (0..regions).filter(|&r| area[r as usize] < least).collect();
+    let mut open: Vec<u32> = (0..regions).filter(|&r| area[r as usize] < min_area).collect();
     // the smallest first, so that confetti becomes pieces before pieces are given away
     while let Some(at) = (0..open.len()).min_by(|&a, &b| {
         area[open[a] as usize].total_cmp(&area[open[b] as usize]).then(open[a].cmp(&open[b]))
@@ -171,7 +171,7 @@ fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
                 *border[host as usize].entry(other).or_default() += length;
             }
         }
-        if area[host as usize] >= least {
+        if area[host as usize] >= min_area {
             open.retain(|&r| r != host);
         }
     }

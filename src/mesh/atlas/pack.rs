@@ -446,10 +446,10 @@ pub(super) fn half_squares(mesh: &Mesh, config: &AtlasConfig) -> Result<AtlasLay
     let side_with = |gap: f64| (size - 2.0 * gap) / rows as f64;
     let mut gap = f64::from(config.gutter_px);
     let leg_with = |gap: f64| side_with(gap) - spent * gap;
-    let least = (side_with(0.0) / 3.0).max(MIN_LEG_PX);
-    if leg_with(gap) < least {
+    let min_leg = (side_with(0.0) / 3.0).max(MIN_LEG_PX);
+    if leg_with(gap) < min_leg {
         // linear in the gap: leg_with(gap) = size / rows − gap (2 / rows + spent)
-        gap = ((size / rows as f64 - least) / (2.0 / rows as f64 + spent)).max(0.0);
+        gap = ((size / rows as f64 - min_leg) / (2.0 / rows as f64 + spent)).max(0.0);
     }
     let (side, leg) = (side_with(gap), leg_with(gap));
     if leg < MIN_LEG_PX {

@@ -66,9 +66,9 @@ fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
         return Err(source.broken("byte 8", format!("says {total} bytes, but the file has {}", bytes.len())));
     }
     let glb = Glb::from_slice(&bytes[..total as usize]).map_err(|e| source.broken("byte 12", e))?;
-    let (found, most) = (glb.json.len(), source.options.json);
-    if found > most {
-        return Err(source.broken("byte 12", format!("{found} bytes of JSON, more than {most}")));
+    let (found, limit) = (glb.json.len(), source.options.json);
+    if found > limit {
+        return Err(source.broken("byte 12", format!("{found} bytes of JSON, more than {limit}")));
     }
     Ok(glb)
 }
@@ -468,8 +468,8 @@ impl GlbRoot {
         let count = |marks: &[u8]| json.iter().filter(|b| marks.contains(b)).count();
         let (nested, values) = (count(b"{["), count(b"{[,"));
         if nested > MAX_NESTED || values > MAX_VALUES {
-            let most = format!("more than {MAX_NESTED} objects and arrays or {MAX_VALUES} values");
-            return Err(source.broken(at, format!("{nested} and {values}, {most}")));
+            let limit = format!("more than {MAX_NESTED} objects and arrays or {MAX_VALUES} values");
+            return Err(source.broken(at, format!("{nested} and {values}, {limit}")));
         }
         serde_json::from_slice(json).map_err(|e| source.broken(at, e))
     }

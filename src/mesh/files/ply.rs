@@ -344,9 +344,9 @@ impl Body<'_> {
             let at = self.at;
             let length = self.next(length)?;
             let size = if self.order == Order::Text { 1 } else { property.item.size() };
-            let most = ((self.bytes.len() - self.at) / size) as f64;
+            let max_length = ((self.bytes.len() - self.at) / size) as f64;
             // negative and fractional lengths fail here too
-            if length.fract() != 0.0 || !(0.0..=most).contains(&length) {
+            if length.fract() != 0.0 || !(0.0..=max_length).contains(&length) {
                 let what = format!("a list of {length} values does not fit");
                 return Err(self.source.broken(format!("byte {at}"), what));
             }
