@@ -285,7 +285,8 @@ fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
     let (views, masks): (Vec<&View>, Vec<Option<Gray>>) = train.unzip();
     let cameras: Vec<_> = views.iter().map(|v| v.camera.clone()).collect();
     let names = views.iter().map(|v| v.name.clone()).collect();
-    let options = SceneOptions { names, focus: capture.focus, ..SceneOptions::default() };
+    let options =
+        SceneOptions { names, focus: capture.focus, up: Some(capture.up), ..SceneOptions::default() };
     match scene::fit(&cameras, &masks, &options) {
         Ok((scene, warnings)) => {
             let b = scene::world_box(&scene);

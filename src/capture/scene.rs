@@ -28,13 +28,14 @@ use super::view::View;
 use crate::geom::{Aabb, Camera, Similarity};
 use crate::image::Gray;
 use crate::{Error, Result};
-use glam::{DVec3, Vec3};
+use glam::{DMat3, DQuat, DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
 /// The head's box and how it sits in the world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scene {
-    /// Scale and translation, no rotation: the box's longest side fills [-1, 1], to within a tenth.
+    /// The box's longest side fills [-1, 1], to within a tenth. Up is an axis of the scene where masks locate the head;
+    /// elsewhere the scene has the axes of the world.
     pub scene_from_world: Similarity,
     /// The tight box in scene coordinates, within [-1, 1]³.
     pub aabb: Aabb,
@@ -100,11 +101,13 @@ pub struct SceneOptions {
     pub names: Vec<String>,
     /// The dataset's own box of the head; used with fewer than two masks.
     pub focus: Option<Aabb>,
+    /// Up in the world, a unit vector: the scene is turned to have it as the nearest axis, so that the box ends level.
+    pub up: Option<Vec3>,
 }
 
 impl Default for SceneOptions {
     fn default() -> SceneOptions {
-        SceneOptions { resolution: 128, names: Vec::new(), focus: None }
+        SceneOptions { resolution: 128, names: Vec::new(), focus: None, up: None }
     }
 }
 
@@ -126,6 +129,33 @@ impl Default for SceneOptions {
 /// # Ok::<(), tiface::Error>(())
 /// ```
 pub fn fit(
+    cameras: &[Camera],
+    masks: &[Option<Gray>],
+    options: &SceneOptions,
+) -> Result<(Scene, Vec<String>)> {
+    if let Some(upright) = options.up.and_then(upright) {
+        let turned: Vec<Camera> = cameras.iter().map(|c| c.transformed(&upright)).collect();
+        let (mut scene, warnings) = fit_axes(&turned, masks, options)?;
+        if scene.hull.is_some() {
+            scene.scene_from_world = scene.scene_from_world.after(&upright);
+            return Ok((scene, warnings));
+        }
+    }
+    fit_axes(cameras, masks, options)
+}
+
+/// Returns the rotation that takes a direction to the nearest axis; `None` for an axis.
+fn upright(up: Vec3) -> Option<Similarity> {
+    let up = up.as_dvec3().try_normalize()?;
+    let axis = up.abs().max_position();
+    let mut nearest = DVec3::ZERO;
+    nearest[axis] = up[axis].signum();
+    let rotation = DMat3::from_quat(DQuat::from_rotation_arc(up, nearest));
+    (up.distance(nearest) > 1e-6).then_some(Similarity { rotation, ..Similarity::IDENTITY })
+}
+
+/// Returns the scene with the axes of the cameras' world.
+fn fit_axes(
     cameras: &[Camera],
     masks: &[Option<Gray>],
     options: &SceneOptions,
@@ -397,6 +427,7 @@ pub fn height(scene: &Scene, up: Vec3) -> Option<f64> {
     let hull = scene.hull.as_ref()?;
     let r = hull.resolution;
     let cells = (0..r.pow(3)).filter(|&i| hull.get(i));
+    let up = scene.scene_from_world.direction(up);
     let along = cells.map(|i| Vec3::new((i / (r * r)) as f32, (i / r % r) as f32, (i % r) as f32).dot(up));
     let (low, high) = along.fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
     let cell = 2.0 / (r as f64 * scene.scene_from_world.scale);
@@ -418,10 +449,13 @@ pub fn doubtful_height(height: f64, unit_m: f64) -> Option<String> {
     })
 }
 
-/// Returns the box in world coordinates.
+/// Returns the box in world coordinates, or one around it where the scene is turned.
 pub fn world_box(scene: &Scene) -> Aabb {
     let world_from_scene = scene.scene_from_world.inverse();
-    Aabb { min: world_from_scene.point(scene.aabb.min), max: world_from_scene.point(scene.aabb.max) }
+    let corner = |i: usize| Vec3::from([0, 1, 2].map(|k| [scene.aabb.min, scene.aabb.max][i >> k & 1][k]));
+    let corners = (0..8).map(|i| world_from_scene.point(corner(i)));
+    let none = Aabb { min: Vec3::INFINITY, max: Vec3::NEG_INFINITY };
+    corners.fold(none, |b, p| Aabb { min: b.min.min(p), max: b.max.max(p) })
 }
 
 /// Returns a line that describes a scene: its box in world units and the share of it that the hull fills.
@@ -580,7 +614,6 @@ mod tests {
     use crate::config::{Preset, VmConfig};
     use crate::geom::{Distortion, Similarity};
     use crate::kernel::cpu::vm::{samples_across, size_for, step_size};
-    use glam::DMat3;
 
     /// Returns a camera at `position` looking at `target`, 60 × 60 pixels, focal length 80.
     fn camera(position: DVec3, target: DVec3) -> Camera {
@@ -720,6 +753,33 @@ mod tests {
         let (a, _) = fit(&cameras, &masks, &small()).unwrap();
         let (b, _) = fit(&moved, &masks, &small()).unwrap();
         assert!((world_box(&b).center() - world_box(&a).center() - shift.as_vec3()).length() < 0.03);
+    }
+
+    #[test]
+    fn a_turned_world_has_the_scene_of_the_upright_one() {
+        let cameras = ring(12);
+        let masks: Vec<_> = cameras.iter().map(ball).collect();
+        let fitted = |cameras: &[Camera], up: Vec3| {
+            fit(cameras, &masks, &SceneOptions { up: Some(up), ..small() }).unwrap().0
+        };
+        let level = fitted(&cameras, Vec3::Z);
+        assert_eq!(level.scene_from_world.rotation, DMat3::IDENTITY);
+        let rotation = DMat3::from_rotation_x(0.5) * DMat3::from_rotation_y(-0.3);
+        let world = Similarity { rotation, ..Similarity::IDENTITY };
+        let moved: Vec<Camera> = cameras.iter().map(|c| c.transformed(&world)).collect();
+        let up = world.direction(Vec3::Z);
+        let turned = fitted(&moved, up);
+        assert!((turned.scene_from_world.direction(up) - Vec3::Z).length() < 1e-6);
+        assert!((turned.aabb.size() - level.aabb.size()).abs().max_element() < 0.1);
+        // one lies where the other does, and the box in the world's axes is around it
+        let center = |scene: &Scene| scene.scene_from_world.inverse().point(scene.aabb.center());
+        assert!(world.point(center(&level)).distance(center(&turned)) < 0.03);
+        assert!((height(&turned, up).unwrap() - height(&level, Vec3::Z).unwrap()).abs() < 0.04);
+        assert!(world_box(&turned).size().min_element() > 2.0 * RADIUS as f32);
+        // without masks the scene has the axes of the world
+        let options = SceneOptions { up: Some(up), ..small() };
+        let (bare, _) = fit(&moved, &[const { None }; 12], &options).unwrap();
+        assert_eq!(bare.scene_from_world.rotation, DMat3::IDENTITY);
     }
 
     #[test]

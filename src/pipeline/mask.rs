@@ -267,7 +267,8 @@ fn place(
             names.push(view.name.clone());
         }
     }
-    let options = SceneOptions { names, focus: capture.focus, ..SceneOptions::default() };
+    let options =
+        SceneOptions { names, focus: capture.focus, up: Some(capture.up), ..SceneOptions::default() };
     let (scene, warnings) = in_box(|| scene::fit(&cameras, &carving, &options), wanted)?;
     warnings.iter().for_each(|w| dir.warn(w));
     Ok(scene)

@@ -12,7 +12,7 @@ use crate::field::training::TrainingSession;
 use crate::geom::{Ray, RayResult, Similarity};
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
-use glam::Vec3;
+use glam::{DMat3, Vec3};
 use std::path::Path;
 
 /// Renders rays in the field's coordinates on a device. `[n]` rays → `[n]`.
@@ -117,6 +117,12 @@ pub fn import(
         let mut file = Checkpoint::read(path, session.stage, FORMAT)?;
         if file.text("frame")? != "world" {
             return Err(file.mismatch("its `frame` is not `world`".into()));
+        }
+        if scene_from_world.rotation != DMat3::IDENTITY {
+            return Err(file.mismatch(
+                "it has the axes of the world, but the scene is turned to be upright: set `capture.box=ilsh`"
+                    .into(),
+            ));
         }
         // field = scale · world = scale · (scene − t) / s
         let k = scale / scene_from_world.scale;
