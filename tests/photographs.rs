@@ -296,7 +296,7 @@ fn found_again(name: &str, photographs: usize, with_masks: bool, dir: &Path) -> 
     }
     let path = std::env::var_os("PATH").unwrap();
     let run = tiface(dir, path.clone(), &["run", "bare"]);
-    assert!(stderr(&run).contains("`tiface cameras bare`"), "{}", stderr(&run));
+    assert!(stderr(&run).contains("find them with COLMAP: `tiface cameras /"), "{}", stderr(&run));
     let found = tiface(dir, path.clone(), &["cameras", "bare"]);
     assert!(found.status.success(), "{}", stderr(&found));
     let again = tiface(dir, path, &["cameras", "bare"]);
