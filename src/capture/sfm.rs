@@ -4,7 +4,7 @@
 //! Photographs, or the sharpest frames of a video, are copied to `OUT/images/`, with masks to `OUT/masks/`; COLMAP works in
 //! `OUT/colmap/`, where its log stays, and the model is renamed to `OUT/sparse/0` at last, so that a folder that has it is
 //! complete. Features are searched inside the head masks where there are any: behind a turntable the background moves
-//! otherwise than the head. Where fewer than [`ENOUGH`] of the photographs are registered, a second attempt accepts weak
+//! otherwise than the head. Where fewer than 80 % of the photographs are registered, a second attempt accepts weak
 //! features as well, which smooth skin has more of, and a third one searches the whole photographs.
 //!
 //! The mapper fits one coefficient of distortion, because few views cannot tell more. A lens that all photographs share is
