@@ -108,10 +108,10 @@ fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again(
     let (exit, said) = cameras(&dir, &["photographs"]);
     assert!(exit == 1 && said.contains("`colmap exhaustive_matcher` failed"), "{said}");
     assert!(
-        said.contains("photographs_cameras/colmap/log.txt") && said.contains("RAYON_NUM_THREADS"),
+        said.contains("photographs_cameras/colmap/tiface_cameras.log") && said.contains("RAYON_NUM_THREADS"),
         "{said}"
     );
-    let log = fs::read_to_string(at("photographs_cameras/colmap/log.txt")).unwrap();
+    let log = fs::read_to_string(at("photographs_cameras/colmap/tiface_cameras.log")).unwrap();
     assert!(log.contains("ran feature_extractor") && log.contains("--SiftExtraction.use_gpu 0"), "{log}");
     // no model: once more with weak features, and both attempts are shown
     script(&dir, "colmap", "echo ran \"$@\"; echo FeatureExtraction.use_gpu; [ \"$1\" != mapper ]");

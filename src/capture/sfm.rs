@@ -27,6 +27,10 @@ use std::collections::HashSet;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
+/// File of the programs' messages. It marks a folder as an attempt of ours, whose pictures the next attempt clears, so its name
+/// is not one that other programs use.
+const LOG: &str = "tiface_cameras.log";
+
 /// Fewest photographs that a capture can have.
 const MIN_VIEWS: usize = 8;
 
@@ -139,7 +143,7 @@ pub fn from_video(video: &Path, every: usize, sfm: &SfmOptions) -> Result<Soluti
     let missing = || Error::cannot("`ffmpeg` is not installed", INSTALL_FFMPEG);
     let ffmpeg = io::find_program("ffmpeg").ok_or_else(missing)?;
     let programs = Programs::find(sfm)?;
-    let log = prepare(sfm, video)?.join("log.txt");
+    let log = prepare(sfm, video)?.join(LOG);
     let images = sfm.out.join("images");
     io::create_folder(&images)?;
     (sfm.say)(&format!("ffmpeg decodes `{}`", video.display()));
@@ -245,7 +249,7 @@ fn prepare(sfm: &SfmOptions, from: &Path) -> Result<PathBuf> {
         let is_empty = io::is_folder(&sfm.out)
             && io::list_files(&sfm.out)?.is_empty()
             && io::list_folders(&sfm.out)?.is_empty();
-        let is_unfinished = io::is_file(&work.join("log.txt")) && !io::exists(&sfm.out.join("sparse/0"));
+        let is_unfinished = io::is_file(&work.join(LOG)) && !io::exists(&sfm.out.join("sparse/0"));
         if is_inside || !is_empty && !is_unfinished {
             let message = format!("`{}` already exists", sfm.out.display());
             return Err(Error::cannot(message, "name a new folder with `--out`: nothing is overwritten"));
@@ -255,7 +259,7 @@ fn prepare(sfm: &SfmOptions, from: &Path) -> Result<PathBuf> {
         }
     }
     io::create_folder(&work)?;
-    io::write_atomic(&work.join("log.txt"), b"")?;
+    io::write_atomic(&work.join(LOG), b"")?;
     Ok(work)
 }
 
@@ -374,7 +378,7 @@ impl Work<'_> {
             Attempt { masked, .. } if masked == self.masked => "2",
             _ => "3",
         });
-        let (log, models) = (self.folder("log.txt"), folder.join("models"));
+        let (log, models) = (self.folder(LOG), folder.join("models"));
         io::create_folder(&models)?;
         let [extractor, matcher, mapper] = self.arguments(attempt, &folder, new_names);
         self.require(&extractor, &log)?;
@@ -416,7 +420,7 @@ impl Work<'_> {
         let found = registered(&best);
         let Some(model) = best.filter(|_| found >= MIN_VIEWS && 2 * found >= n) else {
             let what = format!("COLMAP found cameras for {found} of {n} photographs");
-            let what = format!("{what}; its log is `{}`", self.folder("log.txt").display());
+            let what = format!("{what}; its log is `{}`", self.folder(LOG).display());
             return Err(Error::cannot(what, MORE_OVERLAP));
         };
         self.finish(model)
@@ -448,7 +452,7 @@ impl Work<'_> {
         let refined = self.refined(&model)?.unwrap_or(model.folder);
         io::create_folder(&self.sfm.out.join("sparse"))?;
         io::rename(&refined, &self.sfm.out.join("sparse/0"))?;
-        io::clear_folder(&self.folder(""), "log.txt", &|_| false)?;
+        io::clear_folder(&self.folder(""), LOG, &|_| false)?;
         Ok(Solution {
             folder: self.sfm.out.clone(),
             photographs: n,
@@ -474,7 +478,7 @@ impl Work<'_> {
         let mut arguments: Vec<OsString> = vec!["bundle_adjuster".into(), "--input_path".into()];
         arguments.extend([OsString::from(&model.folder), "--output_path".into(), OsString::from(&refined)]);
         arguments.extend(["--BundleAdjustment.refine_principal_point", "1"].map(OsString::from));
-        let wrong = self.run(&self.programs.colmap, &arguments, &self.folder("log.txt"))?;
+        let wrong = self.run(&self.programs.colmap, &arguments, &self.folder(LOG))?;
         // without a refined model the mapper's remains
         let after = Found::read(&refined, &self.sfm.limits).ok().filter(|_| wrong.is_none());
         let after = after.and_then(|found| found.shared_lens());

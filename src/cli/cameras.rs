@@ -42,7 +42,7 @@ pub(super) fn run(invocation: &Invocation, options: &CamerasOptions) -> Result<(
     let out = common.out.clone().unwrap_or_else(|| PathBuf::from(format!("{name}_cameras")));
     let (shown, source) = (out.display().to_string(), from.display());
     if common.dry_run {
-        screen.note("cameras", &format!("would copy `{source}` to `{shown}`, and run COLMAP there"));
+        screen.note("cameras", &format!("would copy `{source}` to `{shown}`, and run COLMAP in it"));
         return Ok(());
     }
     let sfm = SfmOptions {

@@ -39,7 +39,7 @@ pub enum Genus {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ColorSource {
-    /// Fitted to the photographs; the network's where nobody looks.
+    /// Fitted to the photographs; the network's where no photograph shows the surface.
     Photographs,
     /// The color network's (published).
     Network,

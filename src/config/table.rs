@@ -15,7 +15,7 @@
 ///         masks: MaskUse => MaskUse::Soft;
 ///     }
 ///     constants {
-///         /// Part of a preset that nobody has a reason to change: no key, not written to `config.toml`.
+///         /// Part of a preset that users have no reason to change: no key, not written to `config.toml`.
 ///         lr_grid: f64 => 0.02;
 ///     }
 /// }
