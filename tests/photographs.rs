@@ -145,10 +145,13 @@ fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again(
     assert_eq!(fs::read_dir(at("photographs_cameras/images")).unwrap().count(), 9);
     fs::create_dir_all(at("kept/images")).unwrap();
     fs::write(at("kept/images/mine.png"), "mine").unwrap();
+    // as another program may leave it: a log, and no model
+    fs::create_dir_all(at("kept/colmap")).unwrap();
+    fs::write(at("kept/colmap/log.txt"), "").unwrap();
     let (exit, said) = cameras(&dir, &["photographs", "--out", "kept"]);
     assert!(exit == 1 && said.contains("`kept` already exists"), "{said}");
     assert_eq!(fs::read(at("kept/images/mine.png")).unwrap(), b"mine");
-    assert_eq!(fs::read_dir(at("kept")).unwrap().count(), 1);
+    assert_eq!(fs::read_dir(at("kept")).unwrap().count(), 2);
 }
 
 #[test]
