@@ -46,6 +46,7 @@ pub use scene::well_seen;
 pub(crate) use transforms::camera_like;
 pub use view::{Capture, CaptureOptions, LoadedView, Split, View, ViewMask};
 
+use crate::error::counted;
 use crate::io::{self, PictureInfo};
 use crate::{Error, Result};
 use folder::{CaptureFolder, in_frame, no_views};
@@ -120,7 +121,9 @@ fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(Captu
     if io::is_file(root) {
         return Err(format::explain_file(root));
     } else if !io::exists(root) {
+        let meant = io::similar(root).map(|found| format!("did you mean `{}`? ", found.display()));
         let hint = "check the path: a capture is a folder of photographs and cameras";
+        let hint = meant.unwrap_or_default() + hint;
         return Err(Error::cannot(format_args!("`{}` does not exist", root.display()), hint));
     } else if !io::is_folder(root) {
         io::read_bytes(root, &options.limits)?; // names what it is instead
@@ -171,8 +174,8 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
     }
     if !turned.is_empty() {
         listing.warnings.push(format!(
-            "{} photographs ask to be turned (EXIF) but are used as stored, as their cameras expect: {}",
-            turned.len(),
+            "EXIF asks to turn {}, used as stored, as the cameras expect: {}",
+            counted(turned.len(), "photograph"),
             few(turned)
         ));
     }

@@ -9,8 +9,10 @@ mod bench;
 mod cameras;
 mod capture;
 mod check;
+mod complete;
 mod demo;
 mod experiment;
+mod export;
 mod options;
 mod out;
 mod preview;
@@ -26,7 +28,7 @@ use crate::{Error, Result};
 use bench::BenchOptions;
 use cameras::CamerasOptions;
 use clap::{Args, CommandFactory, Parser, Subcommand};
-use clap_complete::Shell;
+use clap_complete::{ArgValueCompleter, Shell};
 use experiment::ExperimentOptions;
 use options::{Common, KeyOption, RunTarget};
 use out::Out;
@@ -35,7 +37,7 @@ use run::StageCommand;
 use screen::Screen;
 use status::StatusOptions;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 
@@ -44,7 +46,7 @@ Examples:
   tiface demo                                   reconstruct a synthetic head, from photographs to mesh
   tiface inspect captures/002_00                list what is in a folder of photographs, and what is wrong
   tiface run captures/002_00 --preset draft     reconstruct your own head quickly, into runs/002_00
-  tiface mesh --format glb,ply --out head.glb   write the mesh of the newest run to a file
+  tiface export --material lit --out head.glb   write the mesh of the newest run to a file
 
 Exit codes:
   0         success
@@ -129,6 +131,47 @@ impl ClickOptions {
     }
 }
 
+/// How the files of a mesh are written.
+#[derive(Args, Debug, Default)]
+struct FileOptions {
+    /// Formats to write: glb, obj, ply
+    #[arg(long, value_name = "LIST")]
+    format: Option<String>,
+    /// Coordinate frame: dataset, or head (+Y up, face towards +Z)
+    #[arg(long, value_name = "FRAME")]
+    frame: Option<String>,
+    /// Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it
+    #[arg(long, value_name = "METRES")]
+    height: Option<String>,
+    /// Number of triangles after simplification; 0 keeps all
+    #[arg(long, value_name = "N")]
+    triangles: Option<String>,
+    /// Side of the texture, texels; 0 stores colors at the vertices
+    #[arg(long, value_name = "PX")]
+    texture: Option<String>,
+    /// Hair and other soft outlines: shells (translucent layers, where they help) or none
+    #[arg(long, value_name = "KIND")]
+    hair: Option<String>,
+    /// Material in other programs: unlit (colors as photographed) or lit (shaded by lamps)
+    #[arg(long, value_name = "KIND")]
+    material: Option<String>,
+}
+
+impl FileOptions {
+    /// Returns the options as keys of the configuration.
+    fn keys(&self) -> Vec<KeyOption> {
+        key_options([
+            ("--format", "mesh.format", self.format.as_deref()),
+            ("--frame", "mesh.frame", self.frame.as_deref()),
+            ("--height", "mesh.height_m", self.height.as_deref()),
+            ("--triangles", "mesh.triangles", self.triangles.as_deref()),
+            ("--texture", "mesh.texture_px", self.texture.as_deref()),
+            ("--hair", "mesh.hair", self.hair.as_deref()),
+            ("--material", "mesh.material", self.material.as_deref()),
+        ])
+    }
+}
+
 #[derive(Subcommand, Debug)]
 enum Command {
     /// Run all stages, continuing where the last command stopped
@@ -170,7 +213,8 @@ enum Command {
   tiface inspect captures/002_00 --set capture.mask_dir=vit_mask
   tiface inspect captures/002_00 --json | jq .problems")]
     Inspect {
-        /// Folder of photographs with cameras
+        /// Folder of photographs with cameras, or a run, whose capture is checked
+        #[arg(value_name = "CAPTURE|RUN")]
         capture: PathBuf,
     },
     /// Find the cameras of photographs that have none, with COLMAP, which must be installed
@@ -242,35 +286,18 @@ background twice. The masks of the other views follow from the cameras.")]
     #[command(after_long_help = "Examples:
   tiface mesh runs/002_00
   tiface mesh runs/002_00 --out head.glb        the ending selects the format
-  tiface mesh runs/002_00 --fresh mesh --format glb,obj,ply --frame head
-  tiface mesh runs/002_00 --fresh mesh --triangles 20000 --texture 4096 --lobes 1 --normal-map")]
+  tiface mesh captures/002_00 --format glb,obj,ply --frame head
+  tiface mesh runs/002_00 --fresh mesh --triangles 200000 --texture 4096 --lobes 1 --normal-map
+
+`tiface export` writes a finished mesh in another format, material, frame or smaller size, without making it again.")]
     Mesh {
         #[command(flatten)]
         input: CaptureOrRun,
-        /// Formats to write: glb, obj, ply
-        #[arg(long, value_name = "LIST")]
-        format: Option<String>,
-        /// Coordinate frame: dataset, or head (+Y up, face towards +Z)
-        #[arg(long, value_name = "FRAME")]
-        frame: Option<String>,
-        /// Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it
-        #[arg(long, value_name = "METRES")]
-        height: Option<String>,
-        /// Number of triangles after simplification; 0 keeps all
-        #[arg(long, value_name = "N")]
-        triangles: Option<String>,
-        /// Side of the texture, texels; 0 stores colors at the vertices
-        #[arg(long, value_name = "PX")]
-        texture: Option<String>,
+        #[command(flatten)]
+        files: FileOptions,
         /// Degree of the view-dependent spherical harmonics in the GLB: 0, 1 or 2
         #[arg(long, value_name = "DEGREE")]
         lobes: Option<String>,
-        /// Hair and other soft outlines: shells (translucent layers, where they help) or none
-        #[arg(long, value_name = "KIND")]
-        hair: Option<String>,
-        /// Material in other programs: unlit (colors as photographed) or lit (shaded by lamps)
-        #[arg(long, value_name = "KIND")]
-        material: Option<String>,
         /// Store the detail that simplification removes in a normal map; makes the material lit
         #[arg(long)]
         normal_map: bool,
@@ -325,12 +352,41 @@ all trainings (capture.tiles).")]
         weights: Option<String>,
     },
     /// Stage: compare views and blends with held-out photographs
+    #[command(after_long_help = "Examples:
+  tiface metrics runs/002_00 --require psnr=30
+  tiface metrics captures/002_00 --views nerfstudio/renders/ --views brush/    judge other programs' pictures
+  tiface metrics captures/002_00 --mesh scan.ply --out judged/                 judge a mesh by its pictures
+
+Pictures are named like the held-out photographs, meshes are in the capture's world. metrics.json, a page and the
+pictures of meshes are written to CAPTURE_judged/ or to --out; no run is started or changed.")]
     Metrics {
         #[command(flatten)]
         input: CaptureOrRun,
+        /// Judge the pictures that another program made of the capture's held-out views; repeatable
+        #[arg(long, value_name = "FOLDER", conflicts_with = "require")]
+        views: Vec<PathBuf>,
+        /// Judge a .glb, .obj or .ply mesh by pictures from the held-out cameras; repeatable
+        #[arg(long, value_name = "FILE", conflicts_with = "require")]
+        mesh: Vec<PathBuf>,
         /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
+    },
+    /// Write the finished mesh of a run in another format, material, frame or smaller size
+    #[command(after_long_help = "Examples:
+  tiface export runs/002_00 --out head.obj      the ending selects the format
+  tiface export runs/002_00 --material lit --frame head --out lit.glb
+  tiface export runs/002_00 --format glb,ply --triangles 10000 --texture 1024 --out small/
+  tiface export runs/002_00 --hair none --height 0.3        write to 002_00.glb
+
+It takes seconds, opens no photograph, and changes nothing in the run: views, their blend and the metrics stay
+valid. Settings that are not given are the run's. More triangles or a larger texture need `tiface mesh RUN --fresh mesh`.")]
+    Export {
+        /// Run [default: the run in this folder, else the newest under runs/]
+        #[arg(value_name = "RUN")]
+        path: Option<PathBuf>,
+        #[command(flatten)]
+        files: FileOptions,
     },
     /// Render pictures of a run's mesh, or of any .glb, .obj or .ply
     #[command(after_long_help = "Examples:
@@ -364,11 +420,13 @@ experiment.json.")]
     /// Validate a mesh: watertight, manifold, self-intersections, texture coordinates
     #[command(after_long_help = "Examples:
   tiface check head.glb
+  tiface check runs/002_00 --require watertight
   tiface check scan.obj --require watertight --require one-piece
   tiface check head.ply --json
   tiface check runs/lps/mesh/surface.ply --against captures/lps/gt.ply --seen-by captures/lps")]
     Check {
-        /// .glb, .obj or .ply file
+        /// .glb, .obj or .ply file, or a run, whose exported mesh is checked
+        #[arg(value_name = "MESH|RUN")]
         mesh: PathBuf,
         /// Exit with 3 if not met: watertight, manifold, one-piece, no-self-intersections, sound-uv;
         /// repeatable
@@ -382,15 +440,19 @@ experiment.json.")]
         #[arg(long, value_name = "CAPTURE", requires = "against")]
         seen_by: Option<PathBuf>,
     },
-    /// Write the page of a run again, or one page of many runs
+    /// Write the page of a run again, or one page of two or many runs
     #[command(after_long_help = "Examples:
   tiface report runs/002_00                     write its report.html again
+  tiface report runs/a runs/b                   compare two finished runs of one capture
   tiface report runs/* --out fleet.html         write a table of all runs with links, and fleet.csv
-  tiface report runs/* --json                   print the same figures, an object for each run")]
+  tiface report runs/* --json                   print the same figures, an object for each run
+
+The comparison of two runs, compare.html, shows their views beside each other, their curves in one chart, the distance
+between their surfaces and the settings that differ; --table writes the table instead.")]
     Report {
         /// Run folders [default: all under runs/]
         runs: Vec<PathBuf>,
-        /// Write a table even of one run
+        /// Write a table even of one or two runs
         #[arg(long)]
         table: bool,
     },
@@ -405,6 +467,17 @@ experiment.json.")]
 Signs of stages: # done, > running, x failed, ! killed, = stopped, ? not readable, . to do. Of more than 40 runs, those
 that are done or have not begun are summed up; -v prints a line for each.")]
     Status(StatusOptions),
+    /// Compare the files of runs with the SHA-256 digests in their records
+    #[command(after_long_help = "Examples:
+  tiface verify                                 compare all runs under runs/
+  tiface verify runs/002_00                     exit with 3 if a file is missing or was changed
+  tiface verify runs/* --json | jq .differences
+
+Nothing is written. --json prints an object for each run, with the digest of every file: a manifest.")]
+    Verify {
+        /// Run folders [default: all under runs/]
+        runs: Vec<PathBuf>,
+    },
     /// Print the effective configuration, or explain a key
     #[command(after_long_help = "Examples:
   tiface config --preset paper
@@ -414,7 +487,7 @@ that are done or have not begun are summed up; -v prints a line for each.")]
         #[command(flatten)]
         input: CaptureOrRun,
         /// Explain a key or a table: meaning, range and value in every preset
-        #[arg(long, value_name = "KEY")]
+        #[arg(long, value_name = "KEY", add = ArgValueCompleter::new(complete::complete_key))]
         explain: Option<String>,
     },
     /// List GPUs, test them, and show which one `auto` uses
@@ -424,7 +497,7 @@ that are done or have not begun are summed up; -v prints a line for each.")]
 
 It exits with 1 if a device fails its self-test against the CPU. A build without the feature `wgpu` has no GPUs.")]
     Doctor,
-    /// Print shell completions
+    /// Print shell completions, which know settings and their values
     #[command(after_long_help = "Examples:
   tiface completions bash > /etc/bash_completion.d/tiface
   tiface completions zsh > ~/.zfunc/_tiface
@@ -449,11 +522,15 @@ pub fn out_of_memory(bytes: usize) -> ! {
 
 /// Parses the command line, runs the command and returns the exit code.
 pub fn main() -> ExitCode {
+    complete::answer(Cli::command);
     let Cli { command, common } = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
             // help and version end here too, with 0; a closed stdout is no error
             let _ = e.print();
+            if is_second_path(&e) {
+                let _ = writeln!(std::io::stderr(), "\n{ONE_HEAD}");
+            }
             return ExitCode::from(e.exit_code() as u8);
         }
     };
@@ -465,6 +542,9 @@ pub fn main() -> ExitCode {
         Command::Mask { input, clicks, page: true } => {
             capture::page(&invocation, input.path.as_deref(), clicks.prompts.as_deref())
         }
+        Command::Metrics { input, views, mesh, .. } if !(views.is_empty() && mesh.is_empty()) => {
+            capture::judge(&invocation, input.path.as_deref(), views, mesh)
+        }
         Command::Inspect { capture } => {
             makes_nothing("inspect").and_then(|()| capture::inspect(&common, capture))
         }
@@ -472,26 +552,59 @@ pub fn main() -> ExitCode {
         Command::Convert { capture, to } => capture::convert(&invocation, capture, to),
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
+        Command::Export { path, files } => {
+            export::run(&invocation, path.as_deref(), files.format.is_some(), &files.keys())
+        }
         Command::Preview(options) => preview::run(&invocation, options),
         Command::Bench(options) => bench::run(&invocation, options),
         Command::Experiment(options) => experiment::run(&invocation, options),
         Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
         Command::Report { runs, table } => report::run(&invocation, runs, *table),
+        Command::Verify { runs } => makes_nothing("verify").and_then(|()| status::verify(&invocation, runs)),
         Command::Config { input, explain } => makes_nothing("config")
             .and_then(|()| about::config(&common, input.path.as_deref(), explain.as_deref())),
         Command::Doctor => makes_nothing("doctor").and_then(|()| about::doctor(&common)),
         Command::Completions { shell } => {
-            makes_nothing("completions").and_then(|()| about::completions(*shell, Cli::command()))
+            makes_nothing("completions").and_then(|()| screen::print(&complete::script(*shell)))
         }
         stages => run::run(&invocation, &stages.on_stages(&common)?),
     });
     ExitCode::from(match ended {
         Ok(()) => 0,
         Err(error) => {
+            let error = suggest(error);
             invocation.screen.error(&error);
             error.kind().code()
         }
     })
+}
+
+/// Hint for a command with the paths of several heads.
+const ONE_HEAD: &str = "hint: this command takes one path; repeat it for each, as in \
+    `for head in captures/*; do tiface run \"$head\"; done`";
+
+/// Returns whether the command line names another path than the one that its command takes.
+fn is_second_path(error: &clap::Error) -> bool {
+    use clap::error::{ContextKind, ContextValue, ErrorKind};
+    let argument = error.get(ContextKind::InvalidArg);
+    let is_path = matches!(argument, Some(ContextValue::String(word)) if !word.starts_with('-') && crate::io::exists(Path::new(word)));
+    error.kind() == ErrorKind::UnknownArgument && is_path
+}
+
+/// Adds to an error about a path of the command line that does not exist the one that was probably meant.
+fn suggest(error: Error) -> Error {
+    let text = error.to_string();
+    let is_missing =
+        |word: &String| text.starts_with(&format!("`{word}`")) && !crate::io::exists(Path::new(word));
+    let mut words = std::env::args_os().skip(1).filter_map(|word| word.into_string().ok());
+    let missing = words.find(is_missing);
+    match missing.and_then(|word| crate::io::similar(Path::new(&word))) {
+        Some(found) if !error.hint().contains("did you mean") => {
+            let hint = format!("did you mean `{}`? {}", found.display(), error.hint());
+            error.with_hint(hint)
+        }
+        _ => error,
+    }
 }
 
 impl Command {
@@ -504,31 +617,13 @@ impl Command {
             Command::Baseline(input) => (input, Stage::Baseline, Vec::new()),
             Command::Tface(input) => (input, Stage::Tface, Vec::new()),
             Command::Iface(input) => (input, Stage::Iface, Vec::new()),
-            Command::Mesh {
-                input,
-                format,
-                frame,
-                height,
-                triangles,
-                texture,
-                lobes,
-                hair,
-                material,
-                normal_map,
-                no_cap,
-            } => {
-                let keys = key_options([
-                    ("--format", "mesh.format", format.as_deref()),
-                    ("--frame", "mesh.frame", frame.as_deref()),
-                    ("--height", "mesh.height_m", height.as_deref()),
-                    ("--triangles", "mesh.triangles", triangles.as_deref()),
-                    ("--texture", "mesh.texture_px", texture.as_deref()),
+            Command::Mesh { input, files, lobes, normal_map, no_cap } => {
+                let mut keys = files.keys();
+                keys.extend(key_options([
                     ("--lobes", "mesh.lobes", lobes.as_deref()),
-                    ("--hair", "mesh.hair", hair.as_deref()),
-                    ("--material", "mesh.material", material.as_deref()),
                     ("--normal-map", "mesh.normal_map", on(*normal_map, "true")),
                     ("--no-cap", "mesh.cap", on(*no_cap, "false")),
-                ]);
+                ]));
                 (input, Stage::Mesh, keys)
             }
             Command::Render { input, cameras, method, format, background } => {
@@ -622,7 +717,7 @@ mod tests {
     fn every_command_with_something_to_choose_shows_worked_examples() {
         for command in Cli::command().get_subcommands() {
             let shown = command.get_after_long_help().map(|h| h.to_string()).unwrap_or_default();
-            let plain = ["metrics", "doctor"].contains(&command.get_name());
+            let plain = ["doctor"].contains(&command.get_name());
             assert!(plain || shown.matches("tiface ").count() >= 3, "{}", command.get_name());
         }
     }

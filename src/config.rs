@@ -27,7 +27,7 @@ pub use render::{
     EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
     called,
 };
-pub use source::Sources;
+pub use source::{Sources, words};
 pub use stage::Stage;
 pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
@@ -179,6 +179,11 @@ const TABLES: &[(&str, &[Key])] = &[
     ("metrics", MetricsConfig::KEYS),
 ];
 
+/// Returns every key by its full, dotted name, with its documentation.
+pub fn keys() -> impl Iterator<Item = (String, &'static str)> {
+    all_keys().map(|(name, key)| (name, key.doc))
+}
+
 /// Returns every key with its full, dotted name.
 fn all_keys() -> impl Iterator<Item = (String, &'static Key)> {
     TABLES.iter().flat_map(|(table, keys)| keys.iter().map(|k| (dotted(table, k.name), k)))
@@ -286,10 +291,16 @@ impl Config {
 
     /// Returns the keys whose values are not those of the preset: full name, value, the preset's value, as in TOML.
     pub fn changes(&self) -> Vec<[String; 3]> {
-        let (own, preset) = (self.to_table(), Config::preset(self.preset).to_table());
+        self.differences(&Config::preset(self.preset))
+    }
+
+    /// Returns the keys whose values differ from those of another configuration: full name, value, the other's value, as in
+    /// TOML.
+    pub fn differences(&self, other: &Config) -> Vec<[String; 3]> {
+        let (own, other) = (self.to_table(), other.to_table());
         let change = |(name, _): (String, &Key)| {
-            let [own, preset] = [&own, &preset].map(|t| lookup(t, &name).map(show).unwrap_or_default());
-            (own != preset).then_some([name, own, preset])
+            let [own, other] = [&own, &other].map(|t| lookup(t, &name).map(show).unwrap_or_default());
+            (own != other).then_some([name, own, other])
         };
         all_keys().filter_map(change).collect()
     }

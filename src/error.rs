@@ -138,6 +138,11 @@ impl Display for Error {
 
 impl std::error::Error for Error {}
 
+/// Returns a number with its noun: `1 view`, `2 views`.
+pub fn counted(n: usize, noun: &str) -> String {
+    format!("{n} {noun}{}", if n == 1 { "" } else { "s" })
+}
+
 /// Lets `?` turn an error enum with a `hint` into an [`Error`] of a kind.
 macro_rules! error_from {
     ($enum:ty, $kind:ident) => {
@@ -153,6 +158,11 @@ pub(crate) use error_from;
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_is_not_a_plural() {
+        assert_eq!([0, 1, 2].map(|n| counted(n, "view")), ["0 views", "1 view", "2 views"]);
+    }
 
     #[test]
     fn an_error_keeps_kind_and_fix_and_gains_its_place() {

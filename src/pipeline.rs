@@ -23,8 +23,10 @@
 mod bench;
 mod cameras;
 mod clicks;
+mod compare;
 mod ensemble;
 pub mod experiment;
+mod export;
 mod exposure;
 mod finish;
 mod inputs;
@@ -46,12 +48,13 @@ mod surface;
 pub use crate::config::Stage;
 pub use crate::geom::RayResult;
 pub use bench::{Bench, SWEEPS};
+pub use compare::{Judged, compare_runs, judge};
+pub use export::KeptHead;
 pub use finish::Export;
 pub use inputs::capture_options;
 pub use mask::{click_page, inspect_capture};
-pub use mesh::export_head;
 pub use metrics::{Truth, against_truth};
-pub use page::{head_page, renew_report, viewer_of_file};
+pub use page::{curves, head_page, renew_report, viewer_of_file};
 pub use preview::{Preview, PreviewPicture, PreviewRenderer, field_view};
 pub use session::{DEMO_CAPTURE, Session, check_feasible, require_device};
 pub use surface::{Fields, Radiance, Surface};
@@ -97,6 +100,13 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
             let fitted = check.map_or(Vec::new(), |check| check.fitted(&cameras));
             let meshes = Meshes::load(run, config, &c.method)?;
             let renderer = Renderer::new(&scene, fields, &meshes, c.samples, dir.monitor());
+            let renderer = match c.shows_residuals(&c.method) {
+                true => {
+                    let leaves_out_own = session.path.is_none();
+                    renderer.with_residuals(session.refined_capture()?, &scene, config, leaves_out_own)?
+                }
+                false => renderer,
+            };
             render::render(c, &renderer, &cameras, &fitted, &scene, config.capture.unit_m, dir)
         }
         Stage::Ensemble => {

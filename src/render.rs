@@ -4,9 +4,11 @@ mod look;
 pub mod path;
 mod raster;
 mod raycast;
+mod residual;
 mod texture;
 
 pub use look::{Look, Surface};
 pub use raster::{RasterLayers, RasterOptions, RasterView, raster, raster_into};
 pub use raycast::{RayHits, RaycastOptions, RenderedView, raycast};
+pub use residual::{ResidualSource, ResidualView, Residuals};
 pub use texture::{LobePictures, MeshTexture};

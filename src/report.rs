@@ -10,7 +10,7 @@ pub mod experiment;
 mod live;
 mod runs;
 
-pub use chart::{Chart, Curve, charts};
+pub use chart::{Chart, Curve, charts, curves_csv};
 pub use live::live_html;
 pub use runs::{RunRow, runs_csv, runs_html};
 
@@ -22,7 +22,7 @@ use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::{Environment, context};
 use serde::Serialize;
 use serde_json::{Value, json};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Style that all pages share.
 const STYLE: &str = include_str!("report/style.css");
@@ -30,7 +30,7 @@ const STYLE: &str = include_str!("report/style.css");
 /// The stages that learn, and what of their `log.jsonl` is drawn.
 pub const LEARNED: [(Stage, &[&str]); 3] = [
     (Stage::Baseline, &["psnr", "samples"]),
-    (Stage::Tface, &["psnr", "mask", "outside"]),
+    (Stage::Tface, &["psnr", "mask"]),
     (Stage::Iface, &["psnr", "eikonal", "inv_s"]),
 ];
 
@@ -49,6 +49,13 @@ fn views(run: &Path, word: &str) -> Vec<String> {
     let is_beside = |path: &Path| ["depth", "float"].iter().any(|name| path == root.join(name));
     let files = io::file_sizes(&root, &is_beside).unwrap_or_default().into_keys();
     files.filter(|f| f.ends_with(".png") || f.ends_with(".exr")).map(|f| format!("{folder}/{f}")).collect()
+}
+
+/// Returns a text as a quoted field of comma-separated values.
+fn csv_text(text: &str) -> String {
+    // spreadsheets take text that begins like a formula for one
+    let text = if text.starts_with(['=', '+', '-', '@']) { format!("'{text}") } else { text.to_owned() };
+    format!("\"{}\"", text.replace('"', "\"\""))
 }
 
 /// Returns a view over black as a JPEG file of at most `side` pixels; `None` where it cannot be read.
@@ -92,8 +99,10 @@ pub struct Report {
     pub charts: Vec<String>,
     /// Durations: stage, words, share of the longest in percent.
     pub times: Vec<(String, String, f64)>,
-    /// Settings that are not the preset's: key, value, the preset's.
+    /// Settings that are not the preset's: key, value, the preset's; of two runs, those that differ.
     pub changes: Vec<[String; 3]>,
+    /// Names of the two runs that the page compares; else empty.
+    pub compared: Vec<String>,
     /// Warnings.
     pub warnings: Vec<String>,
     /// The command that repeats the run.
@@ -285,6 +294,17 @@ pub fn link(path: &str) -> String {
         other => format!("%{other:02X}"),
     };
     path.bytes().map(byte).collect()
+}
+
+/// Returns the address of a file, relative to the folder of a page; of the file itself if one of them does not exist.
+pub fn relative(file: &Path, folder: &Path) -> String {
+    let (Ok(file), Ok(folder)) = (io::real_path(file), io::real_path(folder)) else {
+        return link(&file.to_string_lossy());
+    };
+    let shared = file.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
+    let up = folder.components().skip(shared).map(|_| Path::new(".."));
+    let path: PathBuf = up.chain(file.components().skip(shared).map(|c| Path::new(c.as_os_str()))).collect();
+    link(&path.to_string_lossy())
 }
 
 /// Leaves of a JSON value with dotted names, as a person reads them; lists in one row.

@@ -28,7 +28,7 @@ pub use progress::{Event, Observer, Stop};
 pub use stage::{Done, Plan, StageDir};
 pub use status::{
     Cost, ESTIMATE, Estimate, FAILED, Failure, Phase, Record, RunStatus, StageStatus, State, Status,
-    read_estimate, read_failure, read_record, read_status,
+    Verification, read_estimate, read_failure, read_record, read_status, verify,
 };
 
 use crate::io::{self, Lock, LockError};

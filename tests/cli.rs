@@ -249,7 +249,11 @@ fn inspect_says_of_what_is_no_capture_what_it_is() {
     std::fs::create_dir(dir.path().join("a run")).unwrap();
     let settings = format!("[capture]\npath = \"{}\"\n", head.display());
     std::fs::write(dir.path().join("a run/config.toml"), settings).unwrap();
-    says("a run", &["it is the folder of a run", &format!("inspect its capture, `{}`", head.display())]);
+    let o = tiface(dir.path(), &["convert", "a run", "--to", "colmap"]);
+    assert!(code(&o) == 1 && err(&o).contains("it is the folder of a run"), "{}", err(&o));
+    assert!(err(&o).contains(&format!("inspect its capture, `{}`", head.display())), "{}", err(&o));
+    let o = tiface(dir.path(), &["inspect", "a run"]);
+    assert!(code(&o) == 0 && out(&o).starts_with(&head.display().to_string()), "{}", out(&o));
     std::fs::write(head.join("transforms_train.json"), "{\n\"frames\": [,\n").unwrap();
     says("head", &["format    transforms.json", "transforms_train.json`, line 2"]);
 }
@@ -373,6 +377,100 @@ fn shells_get_their_completions() {
         assert!(code(&o) == 0 && out(&o).contains("tiface"), "{shell}");
     }
     assert_eq!(code(&tiface(dir.path(), &["completions", "bash", "--out", "x/"])), 2);
+}
+
+/// What a shell is offered for the last of these words.
+fn offered(shell: &str, words: &[&str]) -> Vec<String> {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
+    command.env("TIFACE_COMPLETE", shell).args(["--", "tiface"]).args(words);
+    let index = words.len().to_string();
+    let o = command.env("_CLAP_COMPLETE_INDEX", index).env("_CLAP_IFS", "\n").output().unwrap();
+    assert_eq!((code(&o), err(&o)), (0, String::new()));
+    out(&o).lines().map(str::to_string).collect()
+}
+
+#[test]
+fn keys_and_values_of_settings_complete() {
+    let keys = offered("bash", &["mesh", "runs/a", "--set", "mesh.tex"]);
+    assert_eq!(keys, ["mesh.texture_px=", "mesh.texture_format="]);
+    assert_eq!(
+        offered("bash", &["run", "--set", "mesh.material="]),
+        ["mesh.material=unlit", "mesh.material=lit"]
+    );
+    assert_eq!(offered("bash", &["run", "--set", "mesh.cap=f"]), ["mesh.cap=false"]);
+    assert_eq!(offered("bash", &["run", "--set", "mesh.format=glb,p"]), ["mesh.format=glb,ply"]);
+    assert!(offered("bash", &["run", "--set", "mesh.resolution="]).is_empty());
+    assert!(offered("bash", &["run", "--set", "mesh.nothing="]).is_empty());
+    // the other shells show what a key means
+    for shell in ["zsh", "fish"] {
+        let keys = offered(shell, &["config", "--explain", "mesh.texture_p"]);
+        assert!(
+            keys.len() == 1 && keys[0].starts_with("mesh.texture_px") && keys[0].contains("texel"),
+            "{shell}: {keys:?}"
+        );
+    }
+    assert!(offered("bash", &["ru"]).contains(&"run".to_string()));
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn bash_completes_with_the_printed_script() {
+    let program = Path::new(env!("CARGO_BIN_EXE_tiface"));
+    let script = r#"
+        source <(tiface completions bash)
+        COMP_WORDS=(tiface run --set mesh.material=u) COMP_CWORD=3 COMP_TYPE=9
+        [[ $COMP_WORDBREAKS == *=* ]] && exit 3
+        _clap_complete_tiface tiface mesh.material=u --set
+        echo "${COMPREPLY[@]}""#;
+    let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
+    let o = Command::new("bash").args(["-c", script]).env("PATH", path).output().unwrap();
+    assert_eq!((code(&o), out(&o).trim()), (0, "mesh.material=unlit"), "{}", err(&o));
+}
+
+#[test]
+fn what_was_probably_meant_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 24, height: 30, train: 3, test: 1, seed: 1 };
+    write_capture(&dir.path().join("captures/002_00"), &options).unwrap();
+    let run = dir.path().join("runs/head");
+    std::fs::create_dir_all(&run).unwrap();
+    let saved = tiface(dir.path(), &["config", "--set", "capture.path=captures/002_00"]);
+    std::fs::write(run.join("config.toml"), &saved.stdout).unwrap();
+    std::fs::write(dir.path().join("scan.ply"), "").unwrap();
+    for (words, meant) in [
+        (&["run", "captures/002_0"][..], Some("`captures/002_00`")),
+        (&["mask", "capture/002_00", "--dry-run"], None),
+        (&["preview", "head"], Some("`runs/head`")),
+        (&["verify", "runs/haed"], Some("`runs/head`")),
+        (&["check", "scna.ply"], Some("`scan.ply`")),
+        (&["check", "quite_another.ply"], None),
+        (&["convert", "captures/02_00", "--to", "colmap"], Some("`captures/002_00`")),
+    ] {
+        let o = tiface(dir.path(), words);
+        let hint = err(&o).split_once("hint: ").unwrap().1.to_string();
+        assert!(code(&o) != 0, "{words:?}");
+        match meant {
+            Some(path) => assert!(hint.starts_with(&format!("did you mean {path}? ")), "{words:?}: {hint}"),
+            None => assert!(!hint.contains("did you mean"), "{words:?}: {hint}"),
+        }
+    }
+    let o = tiface(dir.path(), &["inspect", "captures/002_0"]);
+    assert!(out(&o).contains("did you mean `captures/002_00`?"), "{}", out(&o));
+    // two heads at once
+    let o = tiface(dir.path(), &["run", "captures/002_00", "runs/head"]);
+    assert!(code(&o) == 2 && err(&o).contains("for head in captures/*"), "{}", err(&o));
+    let o = tiface(dir.path(), &["run", "captures/002_00", "--nothing"]);
+    assert!(code(&o) == 2 && !err(&o).contains("for head in"), "{}", err(&o));
+    // a run stands for its capture, and for its mesh
+    let o = tiface(dir.path(), &["inspect", "runs/head"]);
+    assert!(code(&o) == 0 && out(&o).contains("002_00"), "{}{}", out(&o), err(&o));
+    let o = tiface(dir.path(), &["check", "runs/head"]);
+    assert!(code(&o) == 1 && err(&o).contains("`runs/head` has no exported mesh"), "{}", err(&o));
+    std::fs::create_dir(run.join("mesh")).unwrap();
+    let triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+    std::fs::write(run.join("mesh/head.obj"), triangle).unwrap();
+    assert_eq!(code(&tiface(dir.path(), &["check", "runs/head"])), 0);
+    assert_eq!(code(&tiface(dir.path(), &["check", "runs/head", "--require", "watertight"])), 3);
 }
 
 #[test]
@@ -727,10 +825,17 @@ fn what_a_stage_made_anew_puts_out_of_date_is_named_before_it_goes() {
     }
     let words = ["mask", "head", "--fresh", "mask"];
     let o = tiface(dir.path(), &[&words[..], &["--dry-run"]].concat());
-    assert!(code(&o) == 0 && out(&o).contains("mesh     would be removed"), "{}{}", out(&o), err(&o));
+    let said = out(&o);
+    assert!(code(&o) == 0 && said.contains("mesh     would be removed"), "{said}{}", err(&o));
+    // the lock is no content of the folder
+    assert!(said.contains("out of date: 1 file, 0.0 MB\n"), "{said}");
+    let masks = said.lines().find(|line| line.starts_with("mask     to do, afresh: removes "));
+    let masks = masks.and_then(|line| line.split_once("removes ")?.1.split("  ").next()).unwrap();
+    assert!(masks.ends_with(" MB") && masks.contains(" files, "), "{said}");
     assert!(mesh.join("surface.ply").is_file());
     let o = tiface(dir.path(), &words);
-    assert!(code(&o) == 0 && err(&o).contains("out of date: `mask`, `mesh`"), "{}", err(&o));
+    let named = format!("out of date: `mask` ({masks}), `mesh` (1 file, 0.0 MB)");
+    assert!(code(&o) == 0 && err(&o).contains(&named), "{}", err(&o));
     assert!(!mesh.join("surface.ply").exists());
 }
 

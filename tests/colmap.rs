@@ -552,7 +552,7 @@ fn splits_that_only_look_like_every_eighth_survive_every_format() {
         twins.views.iter_mut().skip(2).for_each(|v| v.name = format!("b{}", v.name));
         check(&twins, &at(&format!("twins {split}")));
     }
-    // the first of three is held out, though nobody holds out any of three
+    // the first of three views is held out, though a split by every eighth view would hold out none
     let mut three = opened(2, 1);
     three
         .views

@@ -12,7 +12,7 @@ use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 use tiface::kernel::gpu::Adapter;
 
 /// Ends in a minute on a software driver, which compiles the kernels for the most part of it.
-const SMALL: [&str; 15] = [
+const SMALL: [&str; 16] = [
     "iface.steps=120",
     "iface.rays=128",
     "iface.max_rays=256",
@@ -28,6 +28,7 @@ const SMALL: [&str; 15] = [
     "mesh.resolution=32",
     "mesh.texture_px=64",
     "render.samples=1",
+    "render.method=tface,volume,raycast",
 ];
 
 fn words<'a>(device: &'a str, more: &[&'a str]) -> Vec<&'a str> {

@@ -136,8 +136,9 @@ fn a_fault_in_any_write_of_any_stage_loses_nothing_and_the_repeated_command_comp
         let (after, count) = bench.try_faults(&place, &[stage.word(), capture, "--run", "HERE/run"]);
         (place, tried) = (after, tried + count);
     }
-    let words: [&[&str]; 5] = [
+    let words: [&[&str]; 6] = [
         &["report", "HERE/run", "--out", "HERE/page.html"],
+        &["export", "HERE/run", "--triangles", "200", "--out", "HERE/small.obj"],
         &["mesh", "HERE/run", "--out", "HERE/head.obj"],
         &["render", "HERE/run", "--out", "HERE/views/"],
         &["preview", "HERE/run", "--size", "64", "--out", "HERE/turn.png"],
@@ -147,10 +148,12 @@ fn a_fault_in_any_write_of_any_stage_loses_nothing_and_the_repeated_command_comp
         tried += bench.try_faults(&place, words).1;
     }
     // what is there already is replaced whole
-    for file in ["page.html", "head.obj", "head.mtl", "head.png", "turn.png"] {
+    for file in
+        ["page.html", "head.obj", "head.mtl", "head.png", "small.obj", "small.mtl", "small.png", "turn.png"]
+    {
         std::fs::write(place.join(file), "old").unwrap();
     }
-    for words in &words[..4] {
+    for words in &words[..5] {
         tried += bench.try_faults(&place, words).1;
     }
     eprintln!("{tried} faults, nothing lost");

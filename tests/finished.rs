@@ -160,3 +160,124 @@ fn a_product_that_was_cut_is_not_passed_over_as_done() {
     worked(&tiface(dir.path(), &["run", "runs/head", "--fresh", "ensemble"]));
     assert!(std::fs::read(&picture).unwrap() == whole);
 }
+
+#[test]
+fn verify_names_each_file_that_is_not_as_recorded() {
+    let dir = tempfile::tempdir().unwrap();
+    finished(dir.path());
+    let run = dir.path().join("runs/head");
+    assert!(worked(&tiface(dir.path(), &["verify"])).contains(", as recorded\n"));
+    let before = files(&run);
+    let manifest = tiface(dir.path(), &["verify", "runs/head", "--json"]);
+    assert_eq!(manifest.status.code(), Some(0), "{}", text(&manifest));
+    let manifest: serde_json::Value = serde_json::from_slice(&manifest.stdout).unwrap();
+    let digests = manifest["products"].as_object().unwrap();
+    let path = digests.keys().find(|path| path.starts_with("ensemble/") && path.ends_with(".png")).unwrap();
+    assert!(digests.values().all(|digest| digest.as_str().unwrap().len() == 64), "{manifest}");
+    assert!(before == files(&run), "verify has changed the run");
+
+    // one bit, so that the size stays
+    let mut bytes = std::fs::read(run.join(path)).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    std::fs::write(run.join(path), &bytes).unwrap();
+    let o = tiface(dir.path(), &["verify", "runs/head"]);
+    assert_eq!(o.status.code(), Some(3), "{}", text(&o));
+    assert!(text(&o).contains(&format!("`{path}` has other contents than were written")), "{}", text(&o));
+    std::fs::remove_file(run.join(path)).unwrap();
+    let o = tiface(dir.path(), &["verify", "runs/head"]);
+    assert!(o.status.code() == Some(3) && text(&o).contains(&format!("`{path}` is missing")), "{}", text(&o));
+    // a folder that is no run fails, and does not hide what was found in another
+    std::fs::create_dir(dir.path().join("empty")).unwrap();
+    let o = tiface(dir.path(), &["verify", "empty", "runs/head"]);
+    assert_eq!(o.status.code(), Some(1), "{}", text(&o));
+    assert!(text(&o).contains("no finished stage") && text(&o).contains("is missing"), "{}", text(&o));
+}
+
+#[test]
+fn pictures_and_meshes_of_other_programs_are_judged_by_the_held_out_photographs() {
+    let dir = tempfile::tempdir().unwrap();
+    finished(dir.path());
+    let run = dir.path().join("runs/head");
+    let before = files(&run);
+    // the run's own pictures have the run's own figures
+    let words = ["metrics", "head", "--views", "runs/head/render/tface", "--views", "runs/head/ensemble"];
+    let shown = worked(&tiface(dir.path(), &words));
+    assert!(shown.contains("tface ") && shown.contains("head_judged/report.html"), "{shown}");
+    assert!(before == files(&run), "the run was changed");
+    let read = |file: &str| -> serde_json::Value {
+        serde_json::from_slice(&std::fs::read(dir.path().join(file)).unwrap()).unwrap()
+    };
+    let (judged, own) = (read("head_judged/metrics.json"), read("runs/head/metrics/metrics.json"));
+    for set in ["tface", "ensemble"] {
+        assert_eq!(judged[set]["head"], own[set]["head"], "{set}");
+        assert_eq!(judged[set]["parts"]["mean"]["psnr_edge"], own[set]["parts"]["mean"]["psnr_edge"]);
+    }
+    let page = std::fs::read_to_string(dir.path().join("head_judged/report.html")).unwrap();
+    // the template escapes the slashes of addresses
+    let page = page.replace("&#x2f;", "/");
+    assert!(page.contains("href=\"../runs/head/render/tface/"), "no link to the picture");
+    assert!(!page.contains("This run again"), "the page has the settings of a run");
+
+    // a mesh far from every camera covers no pixel of the head: its pictures are black
+    let triangle = "v 90 90 90\nv 91 90 90\nv 90 91 90\nf 1 2 3\n";
+    std::fs::write(dir.path().join("far.obj"), triangle).unwrap();
+    let shown = worked(&tiface(dir.path(), &["metrics", "head", "--mesh", "far.obj", "--out", "judged/"]));
+    assert!(shown.contains("far: the mesh has no colors"), "{shown}");
+    let judged = read("judged/metrics.json");
+    assert_eq!(judged["far"]["mesh"]["triangles"], 1);
+    assert!(judged["far"]["parts"]["mean"]["missing"].as_f64().unwrap() > 20.0, "{judged}");
+
+    // never into a run, whose report it would replace
+    let o = tiface(dir.path(), &["metrics", "head", "--mesh", "far.obj", "--out", "runs/head/"]);
+    assert!(o.status.code() == Some(2) && text(&o).contains("would replace"), "{}", text(&o));
+    assert!(before == files(&run), "the run was changed");
+
+    // one picture is lacking, then all
+    let few = dir.path().join("few");
+    std::fs::create_dir(&few).unwrap();
+    let o = tiface(dir.path(), &["metrics", "head", "--views", "few"]);
+    assert!(o.status.code() == Some(1) && text(&o).contains("no picture of a held-out view"), "{}", text(&o));
+    let all = std::fs::read_dir(run.join("ensemble")).unwrap().map(|entry| entry.unwrap().path());
+    let one = all.filter(|path| path.extension().is_some_and(|e| e == "png")).min().unwrap();
+    std::fs::copy(&one, few.join(one.file_name().unwrap())).unwrap();
+    let shown = worked(&tiface(dir.path(), &["metrics", "head", "--views", "few"]));
+    assert!(shown.contains("few: no picture of 1 held-out view of 2"), "{shown}");
+}
+
+#[test]
+fn two_runs_of_a_capture_are_compared_on_one_page() {
+    let dir = tempfile::tempdir().unwrap();
+    finished(dir.path());
+    let copy = dir.path().join("runs/white");
+    let status =
+        std::process::Command::new("cp").arg("-r").arg(dir.path().join("runs/head")).arg(&copy).status();
+    assert!(status.unwrap().success());
+    let words =
+        ["render", "runs/white", "--fresh", "render", "--set", "render.samples=1", "--cameras", "test"];
+    worked(&tiface(dir.path(), &words));
+    worked(&tiface(dir.path(), &["run", "runs/white"]));
+    let before = (files(&dir.path().join("runs/head")), files(&copy));
+    let shown = worked(&tiface(dir.path(), &["report", "runs/head", "runs/white"]));
+    assert!(shown.contains("compare.html"), "{shown}");
+    assert!(before == (files(&dir.path().join("runs/head")), files(&copy)), "a run was changed");
+    let page = std::fs::read_to_string(dir.path().join("compare.html")).unwrap();
+    for part in [
+        "head: T-Face",
+        "white: T-Face",
+        "<code>render.samples</code>",
+        "value=\"a-tface\"",
+        "value=\"b-tface\"",
+    ] {
+        assert!(page.contains(part), "{part} is missing");
+    }
+    // with a run that has no metrics yet, or for the asking, it is a table
+    let part = dir.path().join("runs/part");
+    let status = std::process::Command::new("cp").arg("-r").arg(&copy).arg(&part).status();
+    assert!(status.unwrap().success());
+    std::fs::remove_dir_all(part.join("metrics")).unwrap();
+    for words in
+        [&["report", "runs/head", "runs/part"][..], &["report", "runs/head", "runs/white", "--table"]]
+    {
+        assert!(worked(&tiface(dir.path(), words)).contains("runs.html"));
+    }
+}

@@ -915,7 +915,7 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
         assert!(message.contains(what), "{what}: {message}");
         assert!(hint.contains(way), "{what}: {hint}");
     }
-    // other tools' XML and CSV are not theirs, and a list of parameters without photographs is nobody's
+    // other tools' XML and CSV are not theirs, and a list of parameters without photographs is of no format
     let (message, hint) =
         unread(&[("a.xml", b"<svg/>"), ("b.csv", b"a,b\n"), ("params.json", b"{}"), ("notes.txt", b"x")]);
     for format in ["transforms.json", "LLFF", "COLMAP", "NeuS", "H3DS", "Metashape", "RealityCapture"] {
@@ -1173,29 +1173,35 @@ fn photographs_without_masks_do_not_pass_inspection() {
         problem
     };
     let default = CaptureOptions::default();
-    // views 0 and 8 are held out: their masks help nobody, and nobody misses them
+    // views 0 and 8 are held out: training needs no masks of theirs
     for views in [&[][..], &[0, 8]] {
-        let told = problem(&masked(views), &default).unwrap();
-        assert!(told.what.contains("no photograph that is learned from has a head mask"), "{}", told.what);
+        let missing = problem(&masked(views), &default).unwrap();
+        assert!(
+            missing.what.contains("no photograph that is learned from has a head mask"),
+            "{}",
+            missing.what
+        );
         for way in
             ["tiface mask ", "--page", "masks/NAME.png", "mask_path", "rembg p -om", "--set mask.source=none"]
         {
-            assert!(told.hint.contains(way), "{way}: {}", told.hint);
+            assert!(missing.hint.contains(way), "{way}: {}", missing.hint);
         }
     }
-    let told = problem(&masked(&[1, 2, 3]), &default).unwrap();
-    assert!(told.what.contains("4 of 7") && told.what.contains("`4`, `5`, `6`, `7`"), "{}", told.what);
+    let missing = problem(&masked(&[1, 2, 3]), &default).unwrap();
+    assert!(
+        missing.what.contains("4 of 7") && missing.what.contains("`4`, `5`, `6`, `7`"),
+        "{}",
+        missing.what
+    );
     let some = masked(&[1, 2, 3, 4]);
     assert_eq!(problem(&some, &default), None);
     let warnings = open(&some).unwrap().warnings;
     assert!(
-        warnings
-            .iter()
-            .any(|w| w.contains("5 views have no mask")
-                && w.contains("stages that use masks ignore these views")),
+        warnings.iter().any(|w| w.contains("5 views without a mask")
+            && w.contains("stages that use masks ignore these views")),
         "{warnings:?}"
     );
-    // told to go on without, or what is not masked is looked at as it is
+    // no masks were asked for, or views without one are to be used whole
     assert_eq!(problem(&masked(&[]), &CaptureOptions { masks: MaskSource::None, ..default.clone() }), None);
     let ignore = CaptureOptions { mask_meaning: MaskMeaning::Ignore, ..default.clone() };
     assert_eq!(problem(&masked(&[1]), &ignore), None);

@@ -25,10 +25,11 @@ wanted() { [[ " ${parts[*]} " == *" $1 "* ]]; }
 
 target=${CARGO_TARGET_DIR:-target}
 scratch=$(mktemp -d)
-trap 'kill "${fuzzers[@]}" 2> /dev/null; rm -rf "$scratch"' EXIT
+trap 'kill "${fuzzers[@]}" $gpu_tests 2> /dev/null; rm -rf "$scratch"' EXIT
 results=()
 failed=0
 fuzzers=()
+gpu_tests=
 
 # step NAME COMMAND...: runs the command and records its result and time
 step() {
@@ -60,10 +61,28 @@ readers() {
 # Tests print what they skip; the summary repeats those lines, so that a skipped test is not taken for a passed one.
 # One build serves them all: with the networks and with the kernels of GPUs.
 tests() {
-  cargo test --release --features matting,wgpu --no-fail-fast "$@" -- --nocapture 2>&1 | tee "$scratch/tests.log"
+  local log
+  log=$(mktemp "$scratch/tests.XXXXXX")
+  cargo test --release --features matting,wgpu --no-fail-fast "$@" 2>&1 | tee "$log"
   local ended=${PIPESTATUS[0]}
-  grep -h '^skipped:' "$scratch/tests.log" | sort -u >> "$scratch/skipped"
+  grep -h '^skipped:' "$log" | sort -u >> "$scratch/skipped"
   return "$ended"
+}
+
+# Unit tests on a GPU, beside the steps that follow: a driver in software compiles kernels on one processor, for minutes.
+# The lock of the device is in the folder for temporary files.
+gpu_tests_begin() {
+  mkdir -p "$scratch/gpu"
+  TMPDIR=$scratch/gpu tests --lib gpu -- --nocapture > "$scratch/gpu.log" &
+  gpu_tests=$!
+}
+
+gpu_tests_end() {
+  local ended=0
+  wait "$gpu_tests" || ended=1
+  gpu_tests=
+  cat "$scratch/gpu.log"
+  return $ended
 }
 
 # A Vulkan driver in software for the kernels of GPUs, whatever adapters the machine has; the summary names it where apt
@@ -145,14 +164,15 @@ colmap_is_here() {
   command -v colmap && command -v ffmpeg
 }
 
-# Everything that reads files, on one export
+# Everything that reads files, on one export: readers_agree NAME GLB [--lit] OPTIONS...
 readers_agree() {
-  local name=$1 glb=$2
+  local name=$1 glb=$2 lit=
   shift 2
+  [ "${1:-}" != --lit ] || { lit=--lit; shift; }
   step "readers agree on $name" .venv/bin/python tools/readers/check_export.py "$glb" "$@"
   step "the Khronos validator accepts $name" node tools/readers/validate.mjs "$glb"
   if [ $blender = yes ]; then
-    step "Blender agrees on $name" .venv-blender/bin/python tools/readers/check_blender.py "$glb" "$@"
+    step "Blender agrees on $name" .venv-blender/bin/python tools/readers/check_blender.py "$glb" $lit "$@"
   fi
 }
 
@@ -160,6 +180,12 @@ train_demo() {
   "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps=600 \
     --set tface.steps=400 --set baseline.steps=200 --set mesh.resolution=128 --set mesh.format=glb,obj,ply \
     --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured
+}
+
+# The demo head again, with fewer triangles, another material and a smaller texture.
+export_demo() {
+  "$target/release/tiface" export "$scratch/demo" --material lit --triangles 3000 --texture 512 --format glb,obj,ply \
+    --out "$scratch/exported/"
 }
 
 # The pages of the demo head, as a person opens them.
@@ -222,15 +248,17 @@ lint() {
 
 unit() {
   need_vulkan
-  step "unit tests" tests --lib --bins
-  step "examples in the documentation" tests --doc
+  step "unit tests are built" cargo test --release --features matting,wgpu --lib --bins --no-run
+  gpu_tests_begin
+  step "unit tests" tests --lib --bins -- --nocapture --skip gpu
+  step "examples in the documentation" tests --doc -- --nocapture
 }
 
 integration() {
   need_program
   need_vulkan
   need_colmap
-  step "integration tests" tests --test '*'
+  step "integration tests" tests --test '*' -- --nocapture
 }
 
 shapes() {
@@ -280,11 +308,14 @@ demo() {
   step "the demo head is reconstructed" train_demo
   readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1
   step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$scratch/demo/mesh/head.glb"
+  step "the demo head is exported" export_demo
+  readers_agree "the exported head" "$scratch/exported/head.glb" --lit --up 0 0 1
   if [ $browser = yes ]; then
     step "a browser opens its pages" demo_pages
     step "three.js shows its lobes" node tools/readers/check_lobes.mjs "$scratch/demo"
   fi
   if [ $blender = yes ]; then
+    step "Blender imports the run" .venv-blender/bin/python tools/readers/check_addon.py "$scratch/demo"
     step "Blender shows its lobes" .venv-blender/bin/python tools/readers/check_lobes.py "$scratch/demo"
   fi
 }
@@ -296,6 +327,7 @@ wanted fuzz && fuzz_begins
 wanted readers && shapes
 wanted guides && guides
 wanted demo && demo
+wanted unit && step "unit tests of GPU kernels" gpu_tests_end
 wanted fuzz && step "no input makes a reader panic, hang or fill the memory" fuzz_ends
 
 # how long which step took, and what could not run

@@ -4,6 +4,7 @@ use super::folder::CaptureFolder;
 use super::frame::{CameraFrame, Listing};
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{MaskMeaning, MaskSource};
+use crate::error::counted;
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
@@ -79,7 +80,8 @@ pub(super) fn choose(
             }
             if n < views.len() {
                 let without = views.iter().filter(|v| v.mask == ViewMask::None).map(|v| v.name.as_str());
-                let mut text = format!("{} views have no mask: {}", views.len() - n, few(without));
+                let mut text =
+                    format!("{} without a mask: {}", counted(views.len() - n, "view"), few(without));
                 if folder.options.mask_meaning == MaskMeaning::Empty {
                     text += "; stages that use masks ignore these views";
                 }

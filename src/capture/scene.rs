@@ -25,6 +25,7 @@
 use super::carve::{self, Cube, Projector, SilhouetteTable};
 use super::masks::few;
 use super::view::View;
+use crate::error::counted;
 use crate::geom::{Aabb, Camera, Similarity};
 use crate::image::Gray;
 use crate::{Error, Result};
@@ -194,8 +195,8 @@ fn fit_axes(
     }
     for (views, what) in [(empty, "empty"), (white, "white everywhere")] {
         if !views.is_empty() {
-            let (n, named) = (views.len(), few(views.iter().map(String::as_str)));
-            warnings.push(format!("in {n} views the mask is {what} and does not place the head: {named}"));
+            let (n, named) = (counted(views.len(), "view"), few(views.iter().map(String::as_str)));
+            warnings.push(format!("in {n} the mask is {what} and does not place the head: {named}"));
         }
     }
     if used.len() < 2 {
@@ -829,7 +830,7 @@ mod tests {
         }
         let (_, warnings) = fit(&cameras, &masks, &small()).unwrap();
         assert!(
-            warnings.iter().any(|w| w.contains("in 1 views the mask is empty") && w.contains("`3`")),
+            warnings.iter().any(|w| w.contains("in 1 view the mask is empty") && w.contains("`3`")),
             "{warnings:?}"
         );
         assert!(warnings.iter().any(|w| w.contains("view `7` alone removes")), "{warnings:?}");
@@ -891,8 +892,8 @@ mod tests {
             b,
             SceneBox::Given(Aabb { min: Vec3::new(-1.0, 0.0, 2.0), max: Vec3::new(3.0, 2.0, 3.0) })
         );
-        let nobody = || -> Result<(Scene, Vec<String>)> { panic!("nothing is looked for") };
-        let (scene, _) = in_box(nobody, b).unwrap();
+        let search = || -> Result<(Scene, Vec<String>)> { panic!("nothing is looked for") };
+        let (scene, _) = in_box(search, b).unwrap();
         // 4 long: 2 units are one of the scene
         assert_eq!(scene.aabb.max, Vec3::new(1.0, 0.5, 0.25));
         let world = world_box(&scene);

@@ -1,13 +1,11 @@
 //! `tiface config`: the effective configuration, or the documentation of a key. `tiface doctor`: devices and features of this
-//! machine and build, for the choice of a device and for bug reports. `tiface completions`: shell completions.
+//! machine and build, for the choice of a device and for bug reports.
 
 use super::options::{Common, RunTarget};
 use super::screen::print;
 use crate::config::explain;
 use crate::field::{Found, examine_devices};
 use crate::{Error, ErrorKind, Result, io};
-use clap::Command;
-use clap_complete::{Shell, generate};
 use serde::Serialize;
 use std::fmt::{self, Display};
 use std::path::Path;
@@ -102,10 +100,4 @@ impl Display for Examination {
         }
         write!(f, "--device auto is {}", self.auto)
     }
-}
-
-pub(super) fn completions(shell: Shell, mut command: Command) -> Result<()> {
-    let mut script = Vec::new();
-    generate(shell, &mut command, "tiface", &mut script);
-    print(&String::from_utf8_lossy(&script))
 }

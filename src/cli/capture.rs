@@ -4,17 +4,18 @@
 use super::Invocation;
 use super::options::Common;
 use super::out::Out;
-use super::screen::print;
+use super::screen::{one_line, print};
 use crate::capture::convert::CameraFormat;
-use crate::pipeline::{capture_options, click_page, inspect_capture};
+use crate::config::Config;
+use crate::error::counted;
+use crate::pipeline::{self, capture_options, click_page, inspect_capture};
 use crate::{Error, ErrorKind, Result, capture, io};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
 pub(super) fn inspect(common: &Common, capture: &Path) -> Result<()> {
-    let config = common.resolve(None, None, &[])?;
-    let options = capture_options(&config);
-    let found = inspect_capture(capture, &options);
+    let (config, root) = capture_of(common, capture)?;
+    let found = inspect_capture(&root, &capture_options(&config));
     let text = if common.json {
         format!("{}\n", serde_json::to_string(&found).unwrap_or_default())
     } else {
@@ -35,8 +36,8 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
     let default = || PathBuf::from(format!("{}_{to}", capture.name));
     let folder = common.out.clone().unwrap_or_else(default);
     if common.dry_run {
-        let views = capture.views.len();
-        invocation.screen.note("convert", &format!("would write {views} views into `{}`", folder.display()));
+        let views = counted(capture.views.len(), "view");
+        invocation.screen.note("convert", &format!("would write {views} into `{}`", folder.display()));
         return Ok(());
     }
     let done = capture::convert::convert(&capture, format, &folder)?;
@@ -44,11 +45,71 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
     if common.json {
         return print(&format!("{}\n", serde_json::to_string(&done).unwrap_or_default()));
     }
-    let (views, masks, shown) = (done.views, done.masks, folder.display());
-    invocation
-        .screen
-        .note("convert", &format!("{views} views and {masks} masks from {} into `{shown}`", capture.format));
+    let (views, masks) = (counted(done.views, "view"), counted(done.masks, "mask"));
+    let shown = folder.display();
+    invocation.screen.note("convert", &format!("{views} and {masks} from {} into `{shown}`", capture.format));
     print(&format!("{shown}\n"))
+}
+
+/// Returns the settings for a capture and its folder; a run's configuration has its capture and the size of its photographs.
+fn capture_of(common: &Common, path: &Path) -> Result<(Config, PathBuf)> {
+    let saved = capture::is_run(path).then(|| path.join("config.toml"));
+    let config = common.resolve(saved.as_deref(), None, &[])?;
+    let root = match config.capture.path.as_str() {
+        known if saved.is_some() && !known.is_empty() => known.into(),
+        _ => path.into(),
+    };
+    Ok((config, root))
+}
+
+/// Judges pictures and meshes of other programs by a capture's held-out photographs.
+pub(super) fn judge(
+    invocation: &Invocation,
+    path: Option<&Path>,
+    views: &[PathBuf],
+    meshes: &[PathBuf],
+) -> Result<()> {
+    let (common, screen) = (invocation.common, &invocation.screen);
+    let out = Out::find(common.out.as_deref(), "metrics of other programs")?;
+    let Some(path) = path else {
+        return Err(Error::usage("no capture is named", "name one: `tiface metrics CAPTURE --views FOLDER`"));
+    };
+    let (config, root) = capture_of(common, path)?;
+    let capture = capture::open(&root, &capture_options(&config))?;
+    capture.warnings.iter().for_each(|text| screen.note("metrics: warning", text));
+    if let Some(wrong) = views.iter().find(|folder| !io::is_folder(folder)) {
+        let hint = "name a folder of pictures that are named like the photographs";
+        return Err(Error::cannot(format!("`{}` is not a folder", wrong.display()), hint));
+    }
+    let out = out.unwrap_or_else(|| Out::Folder(format!("{}_judged", capture.name).into()));
+    let page = out.file("report.html");
+    let folder = page.parent().unwrap_or(Path::new("."));
+    if capture::is_run(folder) || capture::has_cameras(folder) {
+        let problem =
+            format!("`--out {}` is a run or a capture, whose files it would replace", folder.display());
+        return Err(Error::usage(problem, "name a folder of its own, with `/` at its end"));
+    }
+    if common.dry_run {
+        screen.note("metrics", &format!("would write `{}`", page.display()));
+        return Ok(());
+    }
+    out.prepare()?;
+    let judged = pipeline::judge(&capture, &config, views, meshes, folder)?;
+    judged.warnings.iter().for_each(|text| screen.note("metrics: warning", text));
+    io::write_atomic(&out.file("metrics.json"), format!("{:#}\n", judged.metrics).as_bytes())?;
+    io::write_atomic(&page, judged.page.as_bytes())?;
+    if common.json {
+        let result = json!({"event": "result", "report": page, "metrics": judged.metrics});
+        return print(&format!("{result}\n"));
+    }
+    let decimal = |value: Option<f64>, digits: usize| value.map_or("–".into(), |v| format!("{v:.digits$}"));
+    let mut text = String::new();
+    for (title, psnr, ssim, count) in &judged.rows {
+        let (psnr, ssim) = (decimal(*psnr, 2), decimal(*ssim, 4));
+        text +=
+            &format!("{:<24} PSNR {psnr} dB, SSIM {ssim}, {}\n", one_line(title), counted(*count, "view"));
+    }
+    print(&format!("{text}report    {}\n", page.display()))
 }
 
 /// Writes the page for a capture, with existing clicks from `prompts` or the capture's own `prompts.json`.
@@ -58,17 +119,10 @@ pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option
     let Some(path) = path else {
         return Err(Error::usage("no capture is named", "name one: `tiface mask CAPTURE --page`"));
     };
-    // a run's configuration has its capture and the size of its photographs
-    let saved = capture::is_run(path).then(|| path.join("config.toml"));
-    let config = common.resolve(saved.as_deref(), None, &[])?;
-    let root = match config.capture.path.as_str() {
-        "" => path,
-        _ if saved.is_none() => path,
-        known => Path::new(known),
-    };
+    let (config, root) = capture_of(common, path)?;
     // masks are not needed to click
     let options = capture::CaptureOptions { masks: capture::MaskSource::None, ..capture_options(&config) };
-    let capture = capture::open(root, &options)?;
+    let capture = capture::open(&root, &options)?;
     // invalid clicks of the capture are a warning only
     let own = capture.root.join("prompts.json");
     let inside =

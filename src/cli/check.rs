@@ -15,7 +15,7 @@ use crate::{Error, ErrorKind, Result};
 use serde::Serialize;
 use std::fmt::{self, Display};
 use std::ops::RangeInclusive;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Points sampled on each surface.
 const SURFACE_SAMPLES: usize = 200_000;
@@ -109,6 +109,18 @@ struct CheckJson<'a> {
     against: Option<&'a Against>,
 }
 
+/// Returns the exported mesh of a run, or the file itself.
+fn mesh_of(path: &Path) -> Result<PathBuf> {
+    if !capture::is_run(path) {
+        return Ok(path.into());
+    }
+    let files = ["glb", "obj", "ply"].map(|ending| path.join("mesh").join(format!("head.{ending}")));
+    files.into_iter().find(|file| io::is_file(file)).ok_or_else(|| {
+        let run = path.display();
+        Error::cannot(format!("`{run}` has no exported mesh"), format!("`tiface run {run}` makes it"))
+    })
+}
+
 fn load(path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
     read_with(&io::read_bytes(path, &Limits::default())?, path, options)
 }
@@ -139,6 +151,7 @@ pub(super) fn run(
     seen_by: Option<&Path>,
 ) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
+    let path = &mesh_of(path)?;
     // the mesh is checked even if its texture cannot be read
     let (found, problem) = match load(path, &ReadOptions::default()) {
         Ok(found) => (found, None),

@@ -1,11 +1,13 @@
 //! Options that all commands share, the configuration that they result in, and the capture and run of a command.
 
+use super::complete::complete_setting;
 use crate::capture::is_run;
 use crate::config::{Config, Preset, Sources, Stage};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ColorChoice};
+use clap_complete::ArgValueCompleter;
 use std::path::{Path, PathBuf};
 
 /// An option of one command that sets a key of the configuration: as typed, the key, its value.
@@ -17,8 +19,9 @@ pub(super) struct Common {
     /// Run folder [default: runs/<capture name>]
     #[arg(short, long, global = true, value_name = "DIR", env = "TIFACE_RUN", hide_env = true)]
     pub run: Option<PathBuf>,
-    /// Also write the result to PATH: a file with the ending of its format (.glb, .obj, .ply; .json for metrics), or
-    /// a folder, which exists or ends with /
+    /// Also write the result to PATH, a file or a folder
+    ///
+    /// A file has the ending of its format: .glb, .obj or .ply, .json for metrics. A folder exists or ends with /.
     #[arg(short, long, global = true, value_name = "PATH")]
     pub out: Option<PathBuf>,
     /// Read a configuration file; repeatable, later files win
@@ -29,7 +32,7 @@ pub(super) struct Common {
     #[arg(value_parser = PossibleValuesParser::new(Preset::ALL.map(Preset::name)).try_map(|word| word.parse::<Preset>()))]
     pub preset: Option<Preset>,
     /// Set a configuration key; repeatable
-    #[arg(long, global = true, value_name = "KEY=VALUE")]
+    #[arg(long, global = true, value_name = "KEY=VALUE", add = ArgValueCompleter::new(complete_setting))]
     pub set: Vec<String>,
     /// Device to train and render on: auto, cpu, wgpu, vulkan, metal or dx12; :N selects an adapter by number
     #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
@@ -60,7 +63,7 @@ pub(super) struct Common {
     #[arg(short, long, global = true, action = clap::ArgAction::Count)]
     pub verbose: u8,
     /// Color messages
-    #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN")]
+    #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN", hide_short_help = true)]
     pub color: ColorChoice,
 }
 

@@ -5,7 +5,8 @@
 
 use crate::config::MeshFormat;
 use crate::io;
-use crate::pipeline::{DEMO_CAPTURE, Session, Stage, export_head};
+use crate::mesh::files::ExportedFiles;
+use crate::pipeline::{DEMO_CAPTURE, KeptHead, Session, Stage};
 use crate::run::Run;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -23,7 +24,7 @@ pub(super) enum Out {
 fn endings(product: &str) -> &'static [&'static str] {
     match product {
         "run" => &["glb", "obj", "ply", "json"],
-        "mesh" => &["glb", "obj", "ply"],
+        "mesh" | "export" => &["glb", "obj", "ply"],
         "metrics" => &["json"],
         "page" | "report" => &["html"],
         "preview" => &["png"],
@@ -69,30 +70,19 @@ impl Out {
         }
     }
 
-    /// Refuses a folder inside the run, which would be copied into itself, and a mesh file if none of these stages makes a mesh.
+    /// Refuses a folder inside the run, and a mesh file if none of these stages makes a mesh.
     pub fn check(&self, run: &Path, stages: &[Stage]) -> Result<()> {
-        let mesh = matches!(self, Out::File(_, ending) if mesh_format(ending).is_some());
+        let mesh = matches!(self, Out::File(_, ending) if MeshFormat::of_ending(ending).is_some());
         if mesh && !stages.contains(&Stage::Mesh) {
             return Err(Error::usage(
                 "these settings make no mesh that `--out` could write",
                 "use `tiface mesh --out head.glb`",
             ));
         }
-        self.is_outside(run)
-    }
-
-    /// Refuses a folder inside the run, which would be copied into itself.
-    fn is_outside(&self, run: &Path) -> Result<()> {
-        let Out::Folder(folder) = self else { return Ok(()) };
-        let target = folder
-            .ancestors()
-            .find_map(|f| io::real_path(if f.as_os_str().is_empty() { Path::new(".") } else { f }).ok());
-        match (target, io::real_path(run)) {
-            (Some(target), Ok(run)) if target.starts_with(&run) => {
-                let text = format!("`--out {}` is inside the run", folder.display());
-                Err(Error::usage(text, "choose a folder beside the run"))
-            }
-            _ => Ok(()),
+        match self {
+            // a folder would be copied into itself
+            Out::Folder(folder) => require_outside(folder, run),
+            Out::File(..) => Ok(()),
         }
     }
 
@@ -112,19 +102,9 @@ impl Out {
     pub fn write(&self, product: &str, session: &Session, run: &Run) -> Result<Vec<PathBuf>> {
         self.prepare()?;
         match self {
-            Out::File(file, ending) if let Some(format) = mesh_format(ending) => {
-                let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
-                let exported = export_head(session, format, stem)?;
-                exported.warnings.iter().for_each(|w| run.warn("mesh", w));
-                let files = exported.files;
-                // the mesh refers to its pictures, so it is written last, under the requested name
-                let mut written = vec![file.clone()];
-                for (name, bytes) in files.iter().skip(1).rev() {
-                    written.push(file.with_file_name(name));
-                    io::write_atomic(&written[written.len() - 1], bytes)?;
-                }
-                io::write_atomic(file, &files[0].1)?;
-                Ok(written)
+            Out::File(file, ending) if let Some(format) = MeshFormat::of_ending(ending) => {
+                let head = KeptHead::read(run.dir(), session.config())?;
+                write_head(file, &head, format, &mut |warning| run.warn("mesh", warning))
             }
             Out::File(file, ending) if ending == "json" => {
                 copy_file(&run.path("metrics/metrics.json"), file)?;
@@ -156,14 +136,38 @@ impl Out {
     }
 }
 
-/// Returns the mesh format of a file ending.
-fn mesh_format(ending: &str) -> Option<MeshFormat> {
-    match ending {
-        "glb" => Some(MeshFormat::Glb),
-        "obj" => Some(MeshFormat::Obj),
-        "ply" => Some(MeshFormat::Ply),
-        _ => None,
+/// Refuses a path inside a run.
+pub(super) fn require_outside(path: &Path, run: &Path) -> Result<()> {
+    let target = path
+        .ancestors()
+        .find_map(|f| io::real_path(if f.as_os_str().is_empty() { Path::new(".") } else { f }).ok());
+    match (target, io::real_path(run)) {
+        (Some(target), Ok(run)) if target.starts_with(&run) => {
+            let text = format!("`{}` is inside the run", path.display());
+            Err(Error::usage(text, "choose another place with `--out`, beside the run"))
+        }
+        _ => Ok(()),
     }
+}
+
+/// Writes a head to a file, and the files that it refers to beside it; returns their paths. Warnings go to `warn`.
+pub(super) fn write_head(
+    file: &Path,
+    head: &KeptHead,
+    format: MeshFormat,
+    warn: &mut dyn FnMut(&str),
+) -> Result<Vec<PathBuf>> {
+    let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
+    let ExportedFiles { files, warnings } = head.files(format, stem)?;
+    head.warnings.iter().chain(&warnings).for_each(|w| warn(w));
+    // the mesh refers to its pictures, so it is written last, under the requested name
+    let mut written = vec![file.to_path_buf()];
+    for (name, bytes) in files.iter().skip(1).rev() {
+        written.push(file.with_file_name(name));
+        io::write_atomic(&written[written.len() - 1], bytes)?;
+    }
+    io::write_atomic(file, &files[0].1)?;
+    Ok(written)
 }
 
 fn prepare(folder: &Path, start: &str) -> Result<()> {
@@ -234,8 +238,13 @@ mod tests {
             assert_eq!(code(name, product), 1, "{name}");
         }
         let run = dir.path().join("there.glb");
-        assert!(find("there.glb/", "run").unwrap().unwrap().is_outside(&run).is_err());
-        assert!(find("there.glb/new/", "run").unwrap().unwrap().is_outside(&run).is_err());
-        assert!(find("new/", "run").unwrap().unwrap().is_outside(&run).is_ok());
+        assert!(find("there.glb/", "run").unwrap().unwrap().check(&run, &[]).is_err());
+        assert!(find("there.glb/new/", "run").unwrap().unwrap().check(&run, &[]).is_err());
+        assert!(find("new/", "run").unwrap().unwrap().check(&run, &[]).is_ok());
+        assert!(
+            require_outside(&run.join("new/a.glb"), &run).is_err()
+                && require_outside(&run, dir.path()).is_err()
+        );
+        assert!(require_outside(&dir.path().join("a.glb"), &run).is_ok());
     }
 }

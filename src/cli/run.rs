@@ -81,6 +81,13 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
     })?;
     if common.dry_run {
         print(&plan_summary(&session, *until, common)?)?;
+        if common.fresh == Some(Stage::Mesh) && session.differs_in_files() {
+            let again = format!(
+                "`tiface export {}` writes the finished mesh with these settings",
+                run.dir().display()
+            );
+            screen.note("mesh", &format!("{again}, removes nothing and takes seconds"));
+        }
         return session.require(*until, common.fresh).map(|_| ());
     }
     run.not_failed();
@@ -115,10 +122,10 @@ fn plan_summary(session: &Session, until: Stage, common: &Common) -> Result<Stri
     let mut text = String::new();
     let mut sum = Cost::default();
     for (of, (stage, found)) in session.order(until).into_iter().zip(session.stage_states(until)?) {
-        let anew = removed.contains(&stage);
+        let goes = removed.contains(&stage).then(|| session.contents(&stage)).transpose()?;
         removed.retain(|name| *name != stage);
         let (outlook, differences) = match found {
-            _ if anew => ("to do, afresh", Vec::new()),
+            _ if goes.is_some() => ("to do, afresh", Vec::new()),
             None => ("to do", Vec::new()),
             Some(d) if d.is_empty() => ("done", d),
             Some(d) => ("would stop: it differs", d),
@@ -126,20 +133,24 @@ fn plan_summary(session: &Session, until: Stage, common: &Common) -> Result<Stri
         let cost = outlook.starts_with("to do").then(|| session.cost(of));
         sum = sum + cost.unwrap_or_default();
         if common.json {
-            let found =
+            let mut found =
                 json!({"stage": stage, "outlook": outlook, "differences": differences, "estimate": cost});
+            if let Some(goes) = goes {
+                found["removes"] = goes.into();
+            }
             text += &format!("{found}\n");
         } else {
+            let goes = goes.map_or(String::new(), |goes| format!(": removes {goes}"));
             let about = cost.map_or(String::new(), |cost| format!("  about {}", duration(cost.seconds())));
-            text += &format!("{stage:<8} {outlook}{about}\n");
+            text += &format!("{stage:<8} {outlook}{goes}{about}\n");
             text.extend(differences.iter().map(|d| format!("           {d}\n")));
         }
     }
     for stage in removed {
-        let outlook = "would be removed: out of date";
+        let (outlook, goes) = ("would be removed: out of date", session.contents(&stage)?);
         text += &match common.json {
-            true => format!("{}\n", json!({"stage": stage, "outlook": outlook})),
-            false => format!("{stage:<8} {outlook}\n"),
+            true => format!("{}\n", json!({"stage": stage, "outlook": outlook, "removes": goes})),
+            false => format!("{stage:<8} {outlook}: {goes}\n"),
         };
     }
     if !common.json && sum.cpu_s > 0.0 {
@@ -325,7 +336,9 @@ fn in_parts(mean: &Value) -> Option<String> {
     let known = db.into_iter().filter_map(|(word, key)| Some(format!("{word} {:.2}", of(key)?)));
     let mut parts: Vec<String> = known.collect();
     if let (Some(missing), Some(extra)) = (of("missing"), of("extra")) {
-        let cap = of("psnr_cap").map(|db| format!(" (at most {db:.1} dB)")).unwrap_or_default();
+        let cap = of("psnr_cap")
+            .map(|db| format!(", which alone limit the PSNR to {db:.1} dB"))
+            .unwrap_or_default();
         parts.push(format!("{missing:.0} pixels missing and {extra:.0} too many a view{cap}"));
     }
     (!parts.is_empty()).then(|| format!("  {}", parts.join(", ")))
@@ -371,7 +384,10 @@ mod tests {
         assert_eq!(lines.len(), 6);
         assert!(lines[0].starts_with("I-Face's mesh (raycast) against"), "{}", lines[0]);
         assert!(lines[0].contains("PSNR 28.12 dB, SSIM 0.9100"), "{}", lines[0]);
-        assert_eq!(lines[1], "  edge 21.02, 1416 pixels missing and 257 too many a view (at most 32.1 dB)");
+        assert_eq!(
+            lines[1],
+            "  edge 21.02, 1416 pixels missing and 257 too many a view, which alone limit the PSNR to 32.1 dB"
+        );
         assert!(lines[2].starts_with("blend (ensemble)") && lines[2].contains("30.00 dB"), "{}", lines[2]);
         assert!(lines[3].ends_with("1.88 dB below I-Face's mesh (raycast)"), "{}", lines[3]);
         assert_eq!(

@@ -3,9 +3,10 @@
 use super::Invocation;
 use super::screen::{figure, one_line, print};
 use crate::config::Stage;
+use crate::error::counted;
 use crate::io;
 use crate::report::duration;
-use crate::run::{Phase, Record, RunStatus, StageStatus, Status};
+use crate::run::{Phase, Record, RunStatus, StageStatus, Status, Verification};
 use crate::{Error, Result};
 use clap::Args;
 use rayon::prelude::*;
@@ -39,15 +40,10 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
     let common = invocation.common;
     loop {
         // listed each time: runs may be added meanwhile
-        let all = match (options.runs.is_empty(), &common.run) {
-            (false, _) => options.runs.clone(),
-            (true, Some(run)) => vec![run.clone()],
-            (true, None) => io::list_folders(Path::new("runs"))?,
-        };
+        let all = named_runs(invocation, &options.runs)?;
         let found: Vec<(&Path, Result<RunStatus>)> =
             all.par_iter().map(|run| (run.as_path(), look(run))).collect();
         let text = match &found[..] {
-            [] => return Err(Error::cannot("there are no runs under `runs/`", "name a run folder")),
             found if common.json => objects(found, options.failed),
             [(run, Ok(standing))] if !options.failed => stages(run, standing),
             found => heads(found, options.failed, common.verbose > 0),
@@ -78,6 +74,69 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
             )),
         };
     }
+}
+
+/// Returns the named runs, or all under `runs/`; an error if there are none.
+pub(super) fn named_runs(invocation: &Invocation, named: &[PathBuf]) -> Result<Vec<PathBuf>> {
+    let all = match (named, &invocation.common.run) {
+        ([], Some(run)) => vec![run.clone()],
+        ([], None) => io::list_folders(Path::new("runs"))?,
+        _ => named.to_vec(),
+    };
+    match all.is_empty() {
+        true => Err(Error::cannot("there are no runs under `runs/`", "name a run folder")),
+        false => Ok(all),
+    }
+}
+
+/// Compares the products of runs with their records.
+pub(super) fn verify(invocation: &Invocation, runs: &[PathBuf]) -> Result<()> {
+    let runs = named_runs(invocation, runs)?;
+    let all: Vec<_> = runs.par_iter().map(|run| look(run).and_then(|_| crate::run::verify(run))).collect();
+    let mut text = String::new();
+    let (mut changed, mut unreadable) = (0, None);
+    for (run, found) in runs.iter().zip(all) {
+        match found {
+            Ok(found) => {
+                changed += usize::from(!found.differences.is_empty());
+                text += &verification(invocation, run, &found);
+            }
+            Err(e) => {
+                invocation.screen.note(&name(run), &e.to_string());
+                unreadable.get_or_insert(e);
+            }
+        }
+    }
+    print(&text)?;
+    match unreadable {
+        Some(e) => Err(e),
+        None if changed > 0 => Err(Error::below(
+            format!("{changed} of {} differ from what was written", counted(runs.len(), "run")),
+            "put the files back, or make the stage again with `tiface run RUN --fresh STAGE`",
+        )),
+        None => Ok(()),
+    }
+}
+
+/// Returns what was found in a run: an object, or a line and one for each difference.
+fn verification(invocation: &Invocation, run: &Path, found: &Verification) -> String {
+    if invocation.common.json {
+        let mut value = json!(found);
+        value["run"] = json!(run);
+        return format!("{value}\n");
+    }
+    let by_size = found.products.values().filter(|digest| digest.is_empty()).count();
+    let mut text = format!("{}: {}", run.display(), counted(found.products.len(), "file"));
+    if by_size > 0 {
+        text += &format!(", {by_size} compared by size only, as an older version recorded no digests");
+    }
+    text += match found.differences.is_empty() {
+        true => ", as recorded\n",
+        false => "\n",
+    };
+    found.differences.iter().for_each(|line| text += &format!("  {}\n", one_line(line)));
+    found.moved.iter().for_each(|file| text += &format!("  `{}` was moved away\n", one_line(file)));
+    text
 }
 
 /// Returns the state of a run, if it is a folder.

@@ -15,6 +15,22 @@ pub enum MeshFormat {
     Ply,
 }
 
+impl MeshFormat {
+    /// Returns the ending of its files.
+    pub fn ending(self) -> &'static str {
+        match self {
+            MeshFormat::Glb => "glb",
+            MeshFormat::Obj => "obj",
+            MeshFormat::Ply => "ply",
+        }
+    }
+
+    /// Returns the format of a file ending.
+    pub fn of_ending(ending: &str) -> Option<MeshFormat> {
+        [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply].into_iter().find(|f| f.ending() == ending)
+    }
+}
+
 /// The coordinates a mesh is exported in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

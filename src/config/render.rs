@@ -94,13 +94,16 @@ table! {
         /// Methods, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with view-dependent color),
         /// textured (head.glb, as a viewer shows it) and raster (the same, rasterized, without soft layers).
         method: Vec<Method>
-            => vec![Method::Tface, Method::Volume, Method::Raycast],
-            vec![Method::Tface, Method::Volume, Method::Raycast],
+            => vec![Method::Tface, Method::Raycast],
+            vec![Method::Tface, Method::Raycast],
             vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
         /// Number of views of an orbit around the head.
         orbit_views: u32, 1.0..=10_000.0 => 36;
         /// Rays along each side of a pixel of the mesh; twice as many at its edges.
         samples: u32, 1.0..=8.0 => 2;
+        /// Add to views of raycast what the mesh misses of the nearest training photographs, which must be there: true or
+        /// false. No exported file has it.
+        residuals: bool => true, true, false;
         /// Picture format: png (8-bit sRGB) or exr (float, with depth and normals).
         format: PictureFormat => PictureFormat::Png;
         /// Background: black, white or none (alpha channel).
@@ -111,6 +114,11 @@ table! {
 }
 
 impl RenderConfig {
+    /// Returns whether views of these methods show residuals.
+    pub fn shows_residuals(&self, methods: &[Method]) -> bool {
+        self.residuals && methods.contains(&Method::Raycast)
+    }
+
     /// Returns the stages whose results its views show.
     pub fn shows(&self) -> Vec<Stage> {
         let is_shown = |s: &Stage| *s == Stage::Mask || self.method.iter().any(|m| m.stage() == *s);
@@ -125,8 +133,8 @@ table! {
         /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb);
         /// empty: no blend.
         members: Vec<Method>
-            => vec![Method::Tface, Method::Volume, Method::Raycast],
-            vec![Method::Tface, Method::Volume, Method::Raycast],
+            => vec![Method::Tface, Method::Raycast],
+            vec![Method::Tface, Method::Raycast],
             vec![Method::Baseline, Method::Tface, Method::Volume];
         /// Weights of the members, in their order, with sum 1; empty: fit them on capture.tiles.
         weights: Vec<f64>, 0.0..=1.0 => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
@@ -184,7 +192,7 @@ mod tests {
     #[test]
     fn weights_are_fitted_unless_they_are_given_and_iface_is_a_word_for_volume() {
         let c = set(&[]);
-        assert_eq!(c.ensemble.members, [Method::Tface, Method::Volume, Method::Raycast]);
+        assert_eq!(c.ensemble.members, [Method::Tface, Method::Raycast]);
         assert!(c.ensemble.weights.is_empty() && c.capture.tiles > 0.0);
         assert!(!c.render.method.contains(&Method::Baseline));
         let c = set(&["preset=paper"]);

@@ -152,6 +152,26 @@ fn assign(config: &Config, key: &str, given: RawValue) -> Result<Config> {
         .map_err(|e| wrong(key, &format!(": {}", e.message().lines().next().unwrap_or_default())))
 }
 
+/// Returns the words that a key takes, alone or in a list; none if it takes numbers or any text.
+pub fn words(key: &str) -> Vec<String> {
+    let config = Config::preset(Preset::Standard);
+    match lookup(&config.to_table(), key) {
+        Some(Value::Boolean(_)) => vec!["true".into(), "false".into()],
+        Some(Value::String(_) | Value::Array(_)) => {
+            // the error about an unknown word lists the known ones
+            let refused = assign(&config, key, RawValue::Text("?".into())).err().map(|e| e.to_string());
+            let known =
+                refused.as_deref().and_then(|text| text.split_once("expected ")).map(|(_, known)| known);
+            known
+                .into_iter()
+                .flat_map(|known| known.split('`').skip(1).step_by(2))
+                .map(str::to_string)
+                .collect()
+        }
+        _ => Vec::new(),
+    }
+}
+
 /// `given` as a value of the same type as `old`, if it can be one.
 fn fit(old: &Value, given: RawValue) -> Option<Value> {
     let parsed = match (&given, old) {

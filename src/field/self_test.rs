@@ -27,9 +27,10 @@ pub fn session(stage: &'static str) -> TrainingSession<'static> {
     TrainingSession { stage, seed: SEED, device: "", dir: Path::new(""), identity: "", monitor: &Quiet }
 }
 
-/// Opens an adapter once for each kind of atomics that trainings use on it.
-pub fn devices(adapter: &Adapter) -> [Device; 2] {
-    [Device::open(adapter), Device::open(adapter).with_atomics(Atomics::Fixed)]
+/// Opens an adapter once for each kind of atomics that trainings use on it. The second step is smaller by the returned
+/// divisor: only the kernels that add differ, and they are a small part of a step.
+pub fn devices(adapter: &Adapter) -> [(Device, usize); 2] {
+    [(Device::open(adapter), 1), (Device::open(adapter).with_atomics(Atomics::Fixed), 8)]
 }
 
 /// A field in training whose parameters can be read.

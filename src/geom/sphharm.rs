@@ -51,6 +51,27 @@ pub fn combine(coefficients: &[[f32; 3]], d: [f32; 3]) -> [f32; 3] {
     out
 }
 
+/// Returns the matrix `M` for which `Y_k(R d) = Σ_j M[k][j] Y_j(d)` with the rotation `R`, of up to
+/// [`COEFFICIENTS_OF_DEGREE_2`] functions: coefficients `c` of `R d` are the coefficients `Σ_k c_k M[k]` of `d`.
+pub fn rotated(functions: usize, rotation: Mat3) -> Vec<Vec<f32>> {
+    // the means over the corners of an icosahedron are those over the sphere up to degree 5, and products have degree 4
+    let golden = 0.5 * (1.0 + 5f32.sqrt());
+    let signs = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)];
+    let corners: Vec<Vec3> = signs
+        .into_iter()
+        .flat_map(|(s, t)| {
+            let (a, b) = (s, t * golden);
+            [Vec3::new(0.0, a, b), Vec3::new(b, 0.0, a), Vec3::new(a, b, 0.0)].map(Vec3::normalize)
+        })
+        .collect();
+    let area = 4.0 * std::f32::consts::PI / corners.len() as f32;
+    let integral = |k: usize, j: usize| {
+        let product = |d: &Vec3| sh16((rotation * *d).to_array())[k] * sh16(d.to_array())[j];
+        area * corners.iter().map(product).sum::<f32>()
+    };
+    (0..functions).map(|k| (0..functions).map(|j| integral(k, j)).collect()).collect()
+}
+
 /// Spherical harmonics of the direction to the viewer at the vertices of a mesh, to be added to its base color.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Harmonics {
@@ -86,6 +107,19 @@ mod tests {
         ];
         for (g, w) in got.iter().zip(golden) {
             assert!((g - w as f32).abs() < 2e-7, "{g} {w}");
+        }
+    }
+
+    #[test]
+    fn rotated_functions_are_sums_of_the_functions() {
+        let rotation = Mat3::from_euler(glam::EulerRot::XYZ, 0.4, -1.1, 2.5);
+        let matrix = rotated(COEFFICIENTS_OF_DEGREE_2, rotation);
+        for d in [Vec3::X, Vec3::new(0.6, 0.0, -0.8), Vec3::new(-0.48, 0.64, 0.6)] {
+            let (expected, own) = (sh16((rotation * d).to_array()), sh16(d.to_array()));
+            for (row, expected) in matrix.iter().zip(expected) {
+                let sum: f32 = row.iter().zip(own).map(|(m, y)| m * y).sum();
+                assert!((sum - expected).abs() < 1e-5, "{sum} {expected}");
+            }
         }
     }
 

@@ -181,7 +181,7 @@ mod on_gpus {
     use crate::kernel::gpu::{Atomics, Device};
 
     fn config() -> IfaceConfig {
-        IfaceConfig { steps: 300, ..super::config() }
+        IfaceConfig { steps: 300, rays: 100, max_rays: 200, samples: 1 << 11, ..super::config() }
     }
 
     fn learned(
@@ -223,7 +223,7 @@ mod on_gpus {
         }
         // past the step from which cells are drawn
         let moved = temporary();
-        for (device, steps) in [("cpu", 130), ("wgpu:0", 140)] {
+        for (device, steps) in [("cpu", 250), ("wgpu:0", 20)] {
             let stopped = learned(&config, device, moved.path(), &StopAfter::new(steps)).err().unwrap();
             assert!(stopped.to_string().contains("saved at step"), "{stopped}");
         }

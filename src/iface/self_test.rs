@@ -71,25 +71,31 @@ fn cells<O: SdfOps>(model: &mut SdfModel<O>) -> Result<Occupancy> {
 /// Compares a step of the signed distance.
 pub(super) fn sdf(adapter: &Adapter) -> Result<Vec<Check>> {
     const FIELD: &str = "signed distance";
-    let config = IfaceConfig { sparsity: 0.1, stereo: 0.1, ..config(Preset::Draft) };
+    let full = IfaceConfig { sparsity: 0.1, stereo: 0.1, ..config(Preset::Draft) };
     let (views, session) = (ball::views(), session("iface"));
-    let pixels = pixels(&views, None, &config)?;
-    let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);
-    let occupancy = cells(&mut on_cpu)?;
-    // Both keep the same cells up to rounding. The compared step uses the processor's on both.
-    let start = || SdfState { occupancy: occupancy.clone(), ..start(&config) };
-    on_cpu.load(start());
-    let want = run_step(&mut on_cpu)?;
+    let pixels = pixels(&views, None, &full)?;
     let mut checks = Vec::new();
-    for (way, device) in [FIELD, "signed distance in fixed point"].into_iter().zip(devices(adapter)) {
+    let mut kept = None;
+    for (way, (device, part)) in [FIELD, "signed distance in fixed point"].into_iter().zip(devices(adapter)) {
+        let rays = full.rays / part;
+        let config = IfaceConfig { rays, max_rays: rays, samples: full.samples / part, ..full.clone() };
+        let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);
         let mut on_gpu =
             SdfModel::new(GpuSdf::new(&config, &pixels, device)?, &pixels, None, &config, &session);
-        if way == FIELD {
-            let got = cells(&mut on_gpu)?;
-            checks.push(compare_cells(way, &got.occupied.bits, &occupancy.occupied.bits));
-        }
+        // Both keep the same cells up to rounding. The compared steps use the processor's.
+        let occupancy = match kept.take() {
+            Some(occupancy) => occupancy,
+            None => {
+                let [want, got] = [cells(&mut on_cpu)?, cells(&mut on_gpu)?];
+                checks.push(compare_cells(way, &got.occupied.bits, &want.occupied.bits));
+                want
+            }
+        };
+        let start = || SdfState { occupancy: occupancy.clone(), ..start(&config) };
+        on_cpu.load(start());
         on_gpu.load(start());
-        checks.extend(compare(way, &run_step(&mut on_gpu)?, &want));
+        checks.extend(compare(way, &run_step(&mut on_gpu)?, &run_step(&mut on_cpu)?));
+        kept = Some(occupancy);
     }
     Ok(checks)
 }

@@ -125,6 +125,23 @@ pub fn real_path(path: &Path) -> Result<PathBuf, ReadError> {
     fs::canonicalize(path).map_err(|e| ReadError::io(path, e))
 }
 
+/// Returns the path whose name is most like that of a path that does not exist: beside it, or the same name under `runs/`.
+pub fn similar(path: &Path) -> Option<PathBuf> {
+    let name = path.file_name()?.to_str()?;
+    let in_runs = Path::new("runs").join(path);
+    if path.components().count() == 1 && in_runs.exists() {
+        return Some(in_runs);
+    }
+    let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    let entries = fs::read_dir(parent.unwrap_or(Path::new("."))).ok()?;
+    let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+    let near =
+        names.filter(|other| !other.starts_with('.')).map(|other| (strsim::levenshtein(name, &other), other));
+    let (_, nearest) =
+        near.min().filter(|(distance, _)| *distance <= (name.len() / 2).min(1 + name.len() / 4))?;
+    Some(parent.map_or_else(|| PathBuf::from(&nearest), |parent| parent.join(&nearest)))
+}
+
 /// Returns whether the path is a link, dangling or not.
 pub fn is_link(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|m| m.is_symlink())

@@ -56,6 +56,18 @@ pub fn read_maybe_empty(path: &Path, limits: &Limits) -> Result<Vec<u8>, ReadErr
     }
 }
 
+/// Passes the bytes of a regular file on in pieces, whatever its size; an empty file has none.
+pub fn read_pieces(path: &Path, mut each: impl FnMut(&[u8])) -> Result<(), ReadError> {
+    let (mut file, _) = open(path)?;
+    let mut piece = vec![0; 1 << 16];
+    loop {
+        match file.read(&mut piece).map_err(|e| ReadError::io(path, e))? {
+            0 => return Ok(()),
+            n => each(&piece[..n]),
+        }
+    }
+}
+
 pub(super) fn read_capped(path: &Path, limit: u64, what: &'static str) -> Result<Vec<u8>, ReadError> {
     let (file, length) = open(path)?;
     let too_large = |found| ReadError::too_large(path, what, found, limit);

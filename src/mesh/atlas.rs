@@ -16,6 +16,7 @@ mod divide;
 mod flatten;
 mod pack;
 
+use crate::error::counted;
 use crate::geom::{Atlas, Mesh, THOROUGH_EFFORT, overlaps, turn};
 use crate::mesh::files::{UvReport, seams_facing, uv_check};
 use crate::mesh::{check_indices, setting};
@@ -56,10 +57,8 @@ impl AtlasReport {
             ));
         }
         if self.repaired > 0 {
-            out.push(format!(
-                "{} triangles could not stay in their chart and got one of their own",
-                self.repaired
-            ));
+            let repaired = counted(self.repaired, "triangle");
+            out.push(format!("{repaired} could not stay in a larger chart and got a chart of their own"));
         }
         out
     }
@@ -156,7 +155,8 @@ pub struct AtlasConfig {
     /// the texture.
     pub gutter_px: u32,
     /// Direction that the face looks in, in the mesh's coordinates: the surface in front becomes one chart, with seams around it
-    /// and none across. That costs stretch: the nose is laid flat with the cheeks.
+    /// and none across. That costs stretch: the nose is laid flat with the cheeks. Flat pieces, the caps of a head, then get
+    /// fewer texels.
     pub front: Option<Vec3>,
     /// Up direction in the mesh's coordinates: the chart in front stands upright in the texture. Only used with `front`.
     pub up: Option<Vec3>,
@@ -198,12 +198,15 @@ struct AtlasLayout {
 /// coordinates at 4096.
 const THIN_PX: f64 = 2e-3;
 
+/// Scale of flat pieces of a head relative to the rest: caps, where the photographs end, which have no detail.
+const CAP_SCALE: f64 = 0.3;
+
 /// Maximum number of rounds of repairing bad triangles.
 const ROUNDS: usize = 5;
 
 /// Lays a mesh out by `uvunwrap`, with a packer of our own.
 fn by_charts(mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result<AtlasLayout> {
-    let flat = planar(mesh, &neighbours(mesh));
+    let mut flat = planar(mesh, &neighbours(mesh));
     let mut taken = vec![false; mesh.triangles.len()];
     flat.iter().flat_map(|f| &f.triangles).for_each(|&t| taken[t as usize] = true);
     let (rest, number) = part(mesh, |t| !taken[t as usize]);
@@ -213,6 +216,9 @@ fn by_charts(mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result
         None => divide(&rest, monitor)?,
     }
     .renumbered(&number);
+    if config.front.is_some() && !rest.triangles.is_empty() {
+        flat.iter_mut().flat_map(|cap| &mut cap.points).for_each(|p| *p *= CAP_SCALE);
+    }
     flattened.charts.extend(flat);
     let (found, limit) = (flattened.charts.len(), 64.max(mesh.triangles.len() / 20));
     if found > limit {

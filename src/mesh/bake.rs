@@ -31,10 +31,14 @@
 //! A texel holds `(x, y, z)` with `n = x t + y b + z m`, where `m` is the mesh's interpolated normal, `t` its
 //! tangent along u and `b = w · m × t` its bitangent up the picture (MikkTSpace, Mikkelsen 2008; OpenGL's +Y).
 
+mod carry;
 mod cover;
 mod light;
 mod seams;
 
+#[cfg(test)]
+pub(crate) use carry::tests::ball as test_ball;
+pub use carry::{CarriedTexture, Original};
 pub use light::seen_colors;
 pub use seams::Seams;
 

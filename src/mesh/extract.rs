@@ -25,6 +25,7 @@ pub use sparse::{Sparse, sparse};
 
 use super::moves::Polish;
 use super::{check_len, evaluate, setting};
+use crate::error::counted;
 use crate::geom::{Aabb, Mesh, SdfField, Sets, Topology, topology};
 use crate::{Error, Monitor, Result};
 use glam::{DVec3, Vec3};
@@ -122,17 +123,22 @@ impl MeshReport {
         if self.capped > 0 {
             let state = if cap { "was closed by a cap" } else { "is open" };
             out.push(format!(
-                "the surface {state} where the kept region ends ({} nodes): the frames cut the body there, or the box is too small",
-                self.capped
+                "the surface {state} where the kept region ends ({}): the frames cut the body there, or the box is too small",
+                counted(self.capped, "node")
             ));
         }
         if self.non_finite > 0 {
-            out.push(format!("the field was NaN or infinite at {} nodes near the surface", self.non_finite));
+            out.push(format!(
+                "the field was NaN or infinite at {} near the surface",
+                counted(self.non_finite, "node")
+            ));
         }
         if self.clean.dropped_triangles > 0 {
             out.push(format!(
-                "{} small pieces and {} inner shells were removed ({} triangles)",
-                self.clean.dust, self.clean.inner_shells, self.clean.dropped_triangles
+                "removed {} and {} ({})",
+                counted(self.clean.dust, "small piece"),
+                counted(self.clean.inner_shells, "inner shell"),
+                counted(self.clean.dropped_triangles, "triangle")
             ));
         }
         if !self.topology.is_solid() {

@@ -41,6 +41,10 @@ pub(super) fn ensemble(
         true => {
             let meshes = Meshes::load(run, config, &c.members)?;
             let renderer = Renderer::new(scene, fields, &meshes, render.samples, dir.monitor());
+            let renderer = match render.shows_residuals(&c.members) {
+                true => renderer.with_residuals(capture, scene, config, true)?,
+                false => renderer,
+            };
             fit(capture, config, scene, &renderer, dir)?
         }
         false => (shares(c), Value::Null),

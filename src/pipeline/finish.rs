@@ -87,10 +87,8 @@ pub(super) fn finish(
         return Ok(FinishedHead { head, linear: None, report, warnings });
     }
 
-    let front = export.front(center(surface, &world_from_scene));
-    let front = front.map(|d| scene.scene_from_world.direction(d));
-    let up = front.map(|_| scene.scene_from_world.direction(export.up.normalize_or(Vec3::Y)));
-    let config = AtlasConfig { size_px: c.texture_px, gutter_px: c.gutter_px, front, up };
+    let center = center(surface, &world_from_scene);
+    let config = export.atlas_config(center, &scene.scene_from_world, c.texture_px, c.gutter_px);
     let (layout, done) = atlas(&mesh, &config, monitor)?;
     warnings.extend(done.warnings());
     report.insert("atlas".into(), json!(done));
@@ -145,7 +143,7 @@ pub(super) fn finish(
 }
 
 /// Returns linear color as an 8-bit picture, rounded to nearest.
-fn coded(image: &Image) -> Photo {
+pub(super) fn coded(image: &Image) -> Photo {
     let texel = |c: &[f32; 3]| c.map(|v| quantize(srgb_from_linear(v)));
     let rgb = image.data.as_chunks::<3>().0.iter().map(texel).collect();
     Photo { width: image.width, height: image.height, rgb, alpha: None }
@@ -153,7 +151,7 @@ fn coded(image: &Image) -> Photo {
 
 /// Returns the lobes as pictures. Each is scaled by the value that all but a thousandth of its texels stay below, so
 /// that a few outliers do not cost the others their precision.
-fn lobes(images: &[Image], asset_from_world: Mat3) -> Option<Lobes> {
+pub(super) fn lobes(images: &[Image], asset_from_world: Mat3) -> Option<Lobes> {
     if images.is_empty() {
         return None;
     }
@@ -265,6 +263,19 @@ impl Export {
     /// Returns the direction in which the face of a head at `center` looks; see `front`.
     pub fn front(&self, center: DVec3) -> Option<Vec3> {
         front(self.up, &self.cameras, center)
+    }
+
+    /// Returns the options for the atlas of a head at `center`, in scene coordinates: the face is one upright chart.
+    pub(super) fn atlas_config(
+        &self,
+        center: DVec3,
+        scene_from_world: &Similarity,
+        size_px: u32,
+        gutter_px: u32,
+    ) -> AtlasConfig {
+        let front = self.front(center).map(|d| scene_from_world.direction(d));
+        let up = front.map(|_| scene_from_world.direction(self.up.normalize_or(Vec3::Y)));
+        AtlasConfig { size_px, gutter_px, front, up }
     }
 
     /// Returns the rotation that brings up to +Y and the face of a head at `center` towards +Z.

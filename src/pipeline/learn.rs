@@ -204,17 +204,20 @@ pub(super) fn training_views(
     scene: &Scene,
     config: &Config,
 ) -> Result<Vec<(Camera, LoadedView)>> {
-    let view = |(view, tiles): &(&View, Vec<Tile>)| {
-        let mut loaded = view.load(&Limits::default())?;
-        let (width, height) = (loaded.photo.width, loaded.photo.height);
-        for tile in tiles {
-            let all = || Gray { width, height, values: vec![255; loaded.photo.rgb.len()] };
-            let values = &mut loaded.valid.get_or_insert_with(all).values;
-            tile.pixels(width).for_each(|i| values[i] = 0);
-        }
-        Ok((view.camera.transformed(&scene.scene_from_world), loaded))
-    };
-    held_out_tiles(capture, config).par_iter().map(view).collect()
+    let views = held_out_tiles(capture, config);
+    views.par_iter().map(|(view, tiles)| training_view(view, tiles, scene)).collect()
+}
+
+/// Returns a training photograph, with its camera in the scene. Pixels of the tiles count as not valid.
+pub(super) fn training_view(view: &View, tiles: &[Tile], scene: &Scene) -> Result<(Camera, LoadedView)> {
+    let mut loaded = view.load(&Limits::default())?;
+    let (width, height) = (loaded.photo.width, loaded.photo.height);
+    for tile in tiles {
+        let all = || Gray { width, height, values: vec![255; loaded.photo.rgb.len()] };
+        let values = &mut loaded.valid.get_or_insert_with(all).values;
+        tile.pixels(width).for_each(|i| values[i] = 0);
+    }
+    Ok((view.camera.transformed(&scene.scene_from_world), loaded))
 }
 
 #[cfg(test)]

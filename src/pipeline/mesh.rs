@@ -5,15 +5,15 @@
 //! mesh/surface.ply   the whole extraction with colors at its vertices, in the dataset's world
 //!      parts         the same and the head mesh, for the stages after this one
 //!      head.glb …    the head mesh as files
+//!      frames.json   the transform from the dataset's world to GLB and OBJ files
 //! ```
 
 use super::finish::{Export, FinishedHead, REACH, finish};
 use super::learn;
-use super::session::Session;
 use super::surface::{ClosedSurface, Surface};
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, LoadedView, Split};
-use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, MeshFormat, Stage};
+use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, Stage};
 use crate::geom::{Aabb, Camera, Mesh, Similarity};
 use crate::image::Image;
 use crate::io::{self, Limits};
@@ -87,6 +87,8 @@ pub(super) fn mesh(
     let FinishedHead { head, linear, report: steps, warnings } = finished;
     warnings.iter().for_each(|w| dir.warn(w));
 
+    let frames = json!({"file_from_world": export.frames(&head.mesh, &world_from_scene)?.file_from_world()});
+    io::write_atomic(&dir.folder().join("frames.json"), format!("{frames:#}\n").as_bytes())?;
     let parts = dir.folder().join("parts");
     head.save(&parts)?;
     let plain = Mesh { colors: Vec::new(), ..surface };
@@ -164,15 +166,6 @@ fn write_exr(linear: &Image, path: &Path) -> Result<()> {
     let [r, g, b] = [0, 1, 2].map(|k| linear.channel(k));
     let channels = [("R", &r[..]), ("G", &g[..]), ("B", &b[..])];
     Ok(io::write_exr(path, linear.width, linear.height, &channels)?)
-}
-
-/// Returns the files of a run's head mesh in a format, the mesh first. `stem` is their base name.
-///
-/// # Errors
-///
-/// Fails if the stage `mesh` has left no head mesh, or if it is damaged.
-pub fn export_head(session: &Session, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
-    Export::new(&session.capture, session.config).files(&head_mesh(session.run)?, format, stem)
 }
 
 /// Returns the stage's record in a run.

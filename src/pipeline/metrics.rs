@@ -35,10 +35,10 @@ pub(super) struct Comparable<'a> {
     pub view: &'a View,
     /// The picture.
     pub file: PathBuf,
-    /// The float version of the picture, if it exists.
-    float: PathBuf,
+    /// The float version of the picture.
+    pub float: Option<PathBuf>,
     /// The picture from the pose fitted to the view alone, if there are such pictures; the same one where it has none.
-    own_pose: Option<PathBuf>,
+    pub own_pose: Option<PathBuf>,
 }
 
 /// Metrics of one picture.
@@ -73,7 +73,8 @@ pub(super) fn comparable<'c>(capture: &'c Capture, config: &Config, set: &Pictur
             [&set.folder, &own].map(|f| pictures::path(f, &view.name, config.render.format));
         let own_pose = if io::is_file(&own_pose) { own_pose } else { file.clone() };
         let own_pose = io::is_folder(&own).then_some(own_pose);
-        Comparable { view, file, float: pictures::float_path(&floats, &view.name), own_pose }
+        let float = Some(pictures::float_path(&floats, &view.name)).filter(|float| io::is_file(float));
+        Comparable { view, file, float, own_pose }
     };
     capture.views.iter().map(picture).filter(|c| io::is_file(&c.file)).collect()
 }
@@ -96,19 +97,10 @@ pub(super) fn metrics(
     let mut out = Map::new();
     let sets = picture_sets(config, run);
     let comparables: Vec<Vec<Comparable>> = sets.iter().map(|set| comparable(capture, config, set)).collect();
-    let mut views: Vec<&View> = comparables.iter().flatten().map(|c| c.view).collect();
-    views.sort_by(|a, b| a.name.cmp(&b.name));
-    views.dedup_by(|a, b| a.name == b.name);
-    let lpips = Lpips::open(config.metrics.lpips.as_ref(), config.mask.memory_gib)?;
-    lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
-    let tones = Tones::of(&views)?;
+    let judge = Judge::new(config, comparables.iter().flatten(), exposure)?;
+    judge.lpips.iter().for_each(|network| dir.note(&network.file().to_string()));
     for (i, (set, pictures)) in sets.iter().zip(&comparables).enumerate() {
-        let figures =
-            pictures.par_iter().map(|p| figures(config, p, tones.as_ref(), lpips.as_ref(), exposure));
-        let figures = figures.collect::<Result<Vec<_>>>()?;
-        if !figures.is_empty() {
-            out.insert(set.name.clone(), entry(figures));
-        }
+        out.extend(judge.figures(pictures)?.map(|figures| (set.name.clone(), figures)));
         dir.step(i + 1, sets.len())?;
     }
     if out.is_empty() {
@@ -139,6 +131,37 @@ fn blend_gain(sets: &Map<String, Value>, members: &[Method]) -> Option<Value> {
     Some(json!({"best_member": best, "gain_db": psnr("ensemble")? - alone}))
 }
 
+/// What all pictures of some views are judged by.
+pub(super) struct Judge<'a> {
+    config: &'a Config,
+    tones: Option<Tones>,
+    lpips: Option<Lpips>,
+    exposure: Option<&'a ExposureCheck>,
+}
+
+impl<'a> Judge<'a> {
+    /// Returns the judge of these pictures, with the networks that `config` names; the photographs tell skin from hair.
+    pub fn new<'c>(
+        config: &'a Config,
+        pictures: impl Iterator<Item = &'c Comparable<'c>>,
+        exposure: Option<&'a ExposureCheck>,
+    ) -> Result<Judge<'a>> {
+        let mut views: Vec<&View> = pictures.map(|picture| picture.view).collect();
+        views.sort_by(|a, b| a.name.cmp(&b.name));
+        views.dedup_by(|a, b| a.name == b.name);
+        let lpips = Lpips::open(config.metrics.lpips.as_ref(), config.mask.memory_gib)?;
+        Ok(Judge { config, tones: Tones::of(&views)?, lpips, exposure })
+    }
+
+    /// Returns the figures of a set of pictures as in `metrics.json`; `None` without pictures.
+    pub fn figures(&self, pictures: &[Comparable]) -> Result<Option<Value>> {
+        let Judge { config, tones, lpips, exposure } = self;
+        let figures = |picture| figures(config, picture, tones.as_ref(), lpips.as_ref(), *exposure);
+        let all = pictures.par_iter().map(figures).collect::<Result<Vec<_>>>()?;
+        Ok((!all.is_empty()).then(|| entry(all)))
+    }
+}
+
 fn figures(
     config: &Config,
     picture: &Comparable,
@@ -148,7 +171,7 @@ fn figures(
 ) -> Result<ViewFigures> {
     let background = config.render.background;
     let loaded = picture.view.load(&Limits::default())?;
-    let render = pictures::read(&picture.file, config.render.format)?;
+    let render = pictures::read_like(&picture.file, &loaded.photo)?;
     let expected = |photo: &Photo| match config.metrics.truth {
         TruthPhoto::Photo => photo.clone(),
         TruthPhoto::Masked => pictures::expected(photo, loaded.mask.as_ref(), background),
@@ -162,7 +185,7 @@ fn figures(
     let own_exposure =
         evened.as_ref().map(|photo| against(&render, photo, loaded.mask.as_ref())).transpose()?;
     let own_pose = picture.own_pose.as_ref().map(|file| {
-        let render = pictures::read(file, config.render.format)?;
+        let render = pictures::read_like(file, &loaded.photo)?;
         against(&render, evened.as_ref().unwrap_or(&photo), loaded.mask.as_ref())
     });
     let own_pose = own_pose.transpose()?;
@@ -170,10 +193,7 @@ fn figures(
     let mut head = against(&render, &photo, loaded.mask.as_ref())?;
     head.lpips = lpips.map(|network| network.distance(&render, &photo)).transpose()?;
     // a picture over a background is opaque; its original alpha is in the float view
-    let before = match io::is_file(&picture.float) {
-        true => Some(pictures::read_float(&picture.float)?),
-        false => None,
-    };
+    let before = picture.float.as_ref().map(|float| pictures::read_float(float)).transpose()?;
     let open = before.as_ref().or((background == ViewBackground::None).then_some(&render));
     let opacity = open.map(|image| image.channel(3));
     let behind = pictures::background_color(background).unwrap_or([0.0; 3]);
@@ -224,7 +244,7 @@ fn square_opacity_outside(opacity: &[f32], loaded: &LoadedView) -> Option<(f64, 
 }
 
 /// Returns the summary of a metrics file: means without the single views.
-fn means(metrics: &Value) -> Value {
+pub(super) fn means(metrics: &Value) -> Value {
     match metrics {
         Value::Object(map) => {
             let kept = map.iter().filter(|(key, _)| *key != "views");
@@ -306,8 +326,7 @@ mod tests {
         let photo = clean.views[14].load_photo(&Limits::default()).unwrap();
         let file = dir.path().join("view.png");
         io::write_png_rgb(&file, photo.width, photo.height, &photo.rgb).unwrap();
-        let float = dir.path().join("view.npy");
-        let picture = Comparable { view: &exposed.views[14], file, float, own_pose: None };
+        let picture = Comparable { view: &exposed.views[14], file, float: None, own_pose: None };
         let black = dir.path().join("black.png");
         io::write_png_rgb(&black, photo.width, photo.height, &vec![[0; 3]; photo.rgb.len()]).unwrap();
         let config = Config::preset(crate::config::Preset::Draft);

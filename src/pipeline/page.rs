@@ -11,14 +11,15 @@ pub use views::{head_page, viewer_of_file};
 use super::session::Session;
 use crate::Result;
 use crate::config::{NAMES, Stage, called};
+use crate::error::counted;
 use crate::io::{self, Limits};
-use crate::report::{self, LEARNED, MethodTable, Report, Viewer, duration};
+use crate::report::{self, Chart, LEARNED, MethodTable, Report, Viewer, duration};
 use crate::run::{Record, read_record};
 use serde_json::Value;
 use std::path::Path;
 
 /// Maximum size of a page without its fixed parts, bytes.
-const MAX_BYTES: usize = 7_600_000;
+pub(super) const MAX_BYTES: usize = 7_600_000;
 /// The part of it that masks may take.
 const MASK_BYTES: usize = 800_000;
 
@@ -48,21 +49,36 @@ pub fn renew_report(session: &Session) -> Result<()> {
     session.run.write("report.html", page(session)?.as_bytes())
 }
 
+/// Returns the learning curves of runs, those of one figure in one chart; the name of a run is a part of its curves' names.
+pub fn curves(runs: &[(&Session, &str)]) -> Result<Vec<Chart>> {
+    let mut all: Vec<Chart> = Vec::new();
+    for (stage, figures) in LEARNED {
+        for (session, name) in runs {
+            let log = text(&session.run.path(stage).join("log.jsonl"))?;
+            for mut chart in report::charts(stage.word(), &log, figures) {
+                for curve in &mut chart.curves {
+                    curve.name = format!("{name} {}", curve.name).trim().to_string();
+                }
+                match all.iter_mut().find(|known| known.title == chart.title) {
+                    Some(known) => known.curves.append(&mut chart.curves),
+                    None => all.push(chart),
+                }
+            }
+        }
+    }
+    Ok(all)
+}
+
 fn page(session: &Session) -> Result<String> {
     let sheet = text(&session.run.path(Stage::Mask).join(super::mask::SHEET))?;
     let masks = crate::mask::pages::part(&sheet, MASK_BYTES).unwrap_or_default();
     let found = views::viewer(session)?;
     let glb = found.as_ref().map_or(0, |(v, _)| v.glb.len().div_ceil(3) * 4);
-    let (views, left_out) = views::rows(session, MAX_BYTES.saturating_sub(masks.len() + glb))?;
+    let (views, left_out) = views::rows_of_run(session, MAX_BYTES.saturating_sub(masks.len() + glb))?;
     let viewer = found.map(|(viewer, file_from_world)| Viewer {
         cameras: views::cameras(session, &views, &file_from_world),
         ..viewer
     });
-    let mut charts = Vec::new();
-    for (stage, names) in LEARNED {
-        let log = text(&session.run.path(stage).join("log.jsonl"))?;
-        charts.extend(report::charts(stage.word(), &log, names).iter().map(report::Chart::html));
-    }
     let records: Vec<(Stage, Record)> = Stage::ALL
         .into_iter()
         .filter_map(|stage| Some((stage, read_record(&session.run.path(stage)).ok()??)))
@@ -75,12 +91,12 @@ fn page(session: &Session) -> Result<String> {
         title: session.capture.name.clone(),
         facts: facts(session, &records),
         viewer,
-        table: table(session),
-        quality: quality(session),
+        table: MethodTable::new(&COLUMNS, methods(session)),
+        quality: quality(&judged(session)),
         views,
         left_out,
         masks,
-        charts,
+        charts: curves(&[(session, "")])?.iter().map(Chart::html).collect(),
         times: records.iter().map(time).collect(),
         changes: session.config.changes(),
         warnings: warnings(session, &records),
@@ -90,6 +106,7 @@ fn page(session: &Session) -> Result<String> {
         ),
         summaries: records.iter().filter_map(summary).collect(),
         settings: session.config.to_toml(),
+        compared: Vec::new(),
     })
 }
 
@@ -105,7 +122,7 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
     use crate::capture::Split::{Test, Train};
     let [train, test] = [Train, Test].map(|split| session.capture.split(split).count());
     let mut facts = vec![
-        format!("{train} photographs to learn from, {test} held out"),
+        format!("{} to learn from, {test} held out", counted(train, "photograph")),
         format!("preset {}", session.config.preset.name()),
         format!("seed {}", session.config.seed),
     ];
@@ -127,8 +144,7 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
 fn warnings(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
     let mut all = session.capture.warnings.clone();
     for (stage, record) in records {
-        let said = record.summary["warnings"].as_array().into_iter().flatten().filter_map(Value::as_str);
-        all.extend(said.map(|w| format!("{stage}: {w}")));
+        all.extend(record.warnings.iter().map(|w| format!("{stage}: {w}")));
         all.extend(report::blend_verdict(&record.summary["blend"]));
         if record.summary["closed"] == false {
             all.push(format!("{stage}: the surface is not watertight"));
@@ -157,14 +173,14 @@ fn quoted(word: &str) -> String {
 }
 
 /// Columns of the table: heading, number of digits, and whether more is better, less is, or neither.
-const COLUMNS: [(&str, usize, Option<bool>); 8] = [
+pub(super) const COLUMNS: [(&str, usize, Option<bool>); 8] = [
     ("PSNR, head", 2, Some(true)),
     ("SSIM, head", 4, Some(true)),
     ("PSNR, frame", 2, Some(true)),
     ("SSIM, frame", 4, Some(true)),
     ("s a view", 3, Some(false)),
     ("training s", 0, Some(false)),
-    ("MB", 1, Some(false)),
+    ("data MB", 1, Some(false)),
     ("triangles", 0, None),
 ];
 
@@ -182,14 +198,14 @@ const QUALITY: [(&str, &str, usize); 14] = [
     ("hair", "/parts/mean/psnr_hair", 2),
     ("missing", "/parts/mean/missing", 0),
     ("extra", "/parts/mean/extra", 0),
-    ("at most", "/parts/mean/psnr_cap", 2),
+    ("limit by outline", "/parts/mean/psnr_cap", 2),
     ("opacity² outside", "/mean_square_opacity_outside", 4),
 ];
 
-/// Returns the table of methods, in pipeline order; empty before the stage `metrics`.
-fn table(session: &Session) -> MethodTable {
+/// Returns the rows of the table of methods, in pipeline order; empty before the stage `metrics`.
+pub(super) fn methods(session: &Session) -> Vec<(String, Vec<Option<f64>>)> {
     let summary = |stage: Stage| read_record(&session.run.path(stage)).ok().flatten();
-    let Some(metrics) = summary(Stage::Metrics).map(|r| r.summary) else { return MethodTable::default() };
+    let Some(metrics) = summary(Stage::Metrics).map(|r| r.summary) else { return Vec::new() };
     let seconds = summary(Stage::Render).map_or(Value::Null, |r| r.summary["seconds_per_view"].clone());
     let triangles = summary(Stage::Mesh).and_then(|r| r.summary["triangles"].as_f64());
     let row = |(word, _): &(&str, &str)| {
@@ -210,7 +226,7 @@ fn table(session: &Session) -> MethodTable {
         ];
         Some((called(word), figures))
     };
-    MethodTable::new(&COLUMNS, NAMES.iter().filter_map(row).collect())
+    NAMES.iter().filter_map(row).collect()
 }
 
 /// Returns the stages that must have run before a picture of this method can be made, in order.
@@ -250,20 +266,29 @@ fn files_of(session: &Session, word: &str) -> Vec<std::path::PathBuf> {
     }
 }
 
-/// Returns a row for every evaluated kind of picture below the heading; empty if there is none.
-fn quality(session: &Session) -> Vec<Vec<String>> {
+/// Returns the figures of every evaluated kind of picture, with its title.
+pub(super) fn judged(session: &Session) -> Vec<(String, Value)> {
     let record = read_record(&session.run.path(Stage::Metrics)).ok().flatten();
     let Some(Value::Object(sets)) = record.map(|done| done.summary) else { return Vec::new() };
-    let row = |(set, figures): (&String, &Value)| {
+    sets.into_iter().map(|(set, figures)| (called(&set), figures)).collect()
+}
+
+/// Returns a row for every set of pictures below the heading; empty if there is none.
+pub(super) fn quality(sets: &[(String, Value)]) -> Vec<Vec<String>> {
+    let row = |(title, figures): &(String, Value)| {
         figures.get("head")?;
         let figure = |(_, path, digits): (&str, &str, usize)| {
             let value = figures.pointer(path).and_then(Value::as_f64);
             value.map_or("–".into(), |v| format!("{v:.digits$}"))
         };
-        Some([called(set)].into_iter().chain(QUALITY.map(figure)).collect())
+        Some([title.clone()].into_iter().chain(QUALITY.map(figure)).collect())
     };
+    let rows: Vec<Vec<String>> = sets.iter().filter_map(row).collect();
+    if rows.is_empty() {
+        return rows;
+    }
     let heading = [""].into_iter().chain(QUALITY.map(|(name, ..)| name)).map(String::from).collect();
-    [heading].into_iter().chain(sets.iter().filter_map(row)).collect()
+    [heading].into_iter().chain(rows).collect()
 }
 
 #[cfg(test)]

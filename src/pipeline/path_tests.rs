@@ -3,7 +3,7 @@
 use super::tests::{NoFields, quiet, words};
 use super::*;
 use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::config::{Config, Method, PictureFormat, Preset, RenderConfig, ViewBackground};
+use crate::config::{Config, Method, Preset, RenderConfig, ViewBackground};
 use crate::io;
 use crate::{ErrorKind, Result};
 use serde_json::Value;
@@ -50,7 +50,7 @@ fn turn(config: &Config, cameras: &str) -> RenderConfig {
     }
 }
 
-/// All stages, with fields that nobody has learned; were they skipped?
+/// Completes all stages with a constant field; returns whether each was skipped.
 fn evaluate(session: &Session) -> Vec<bool> {
     session.remember(Stage::Metrics).unwrap();
     let skipped = |stage| complete(session, stage, &Fog).unwrap().skipped;
@@ -116,7 +116,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
     assert!(run.path("render/paths/orbit/done.json").is_file());
     assert_eq!(io::list_folders(&run.path("render/paths")).unwrap().len(), 3);
     // half a gray of 0.5 over white
-    let shown = pictures::read(&run.path("render/paths/orbit/tface/0001.png"), PictureFormat::Png).unwrap();
+    let shown = pictures::read(&run.path("render/paths/orbit/tface/0001.png")).unwrap();
     assert_eq!(shown.pixel(3, 3)[0], 191.0 / 255.0);
 
     assert!(before == files(run.dir()), "the evaluation has changed");

@@ -130,30 +130,37 @@ pub(super) fn straight([r, g, b, a]: [f32; 4]) -> [f32; 4] {
     [r * k, g * k, b * k, a]
 }
 
-/// Reads a view as RGBA, coded color premultiplied over black.
-pub(super) fn read(file: &Path, format: PictureFormat) -> Result<Image, ReadError> {
+/// Reads a view as RGBA, coded color premultiplied over black: scene-linear if its name ends in `.exr`, else coded.
+pub(super) fn read(file: &Path) -> Result<Image, ReadError> {
     let limits = Limits::default();
-    match format {
-        PictureFormat::Png => {
-            let photo = io::read_photo(file, None, &limits)?;
-            let mut image = Image::new(photo.width, photo.height, 4);
-            for (i, p) in image.data.as_chunks_mut::<4>().0.iter_mut().enumerate() {
-                let a = photo.alpha.as_ref().map_or(1.0, |a| a[i] as f32 / 255.0);
-                let [r, g, b] = photo.rgb[i].map(|v| v as f32 / 255.0 * a);
-                *p = [r, g, b, a];
-            }
-            Ok(image)
+    if file.extension().is_some_and(|ending| ending == "exr") {
+        let mut image = io::read_exr(file, &[&["R", "G", "B", "A"]], &limits)?.image;
+        for p in image.data.as_chunks_mut::<4>().0 {
+            let [r, g, b, a] = straight(*p);
+            let coded = [r, g, b].map(|v| srgb_from_linear(v) * a);
+            *p = [coded[0], coded[1], coded[2], a];
         }
-        PictureFormat::Exr => {
-            let mut image = io::read_exr(file, &[&["R", "G", "B", "A"]], &limits)?.image;
-            for p in image.data.as_chunks_mut::<4>().0 {
-                let [r, g, b, a] = straight(*p);
-                let coded = [r, g, b].map(|v| srgb_from_linear(v) * a);
-                *p = [coded[0], coded[1], coded[2], a];
-            }
-            Ok(image)
-        }
+        return Ok(image);
     }
+    let photo = io::read_photo(file, None, &limits)?;
+    let mut image = Image::new(photo.width, photo.height, 4);
+    for (i, p) in image.data.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+        let a = photo.alpha.as_ref().map_or(1.0, |a| a[i] as f32 / 255.0);
+        let [r, g, b] = photo.rgb[i].map(|v| v as f32 / 255.0 * a);
+        *p = [r, g, b, a];
+    }
+    Ok(image)
+}
+
+/// [`read`] of a picture that must have the size of its photograph.
+pub(super) fn read_like(file: &Path, photo: &Photo) -> Result<Image, ReadError> {
+    let found = read(file)?;
+    if (found.width, found.height) != (photo.width, photo.height) {
+        let size = format!("{} × {} pixels", found.width, found.height);
+        let expected = format!("that of its photograph, {} × {}", photo.width, photo.height);
+        return Err(ReadError::value(file, "size", size, &expected));
+    }
+    Ok(found)
 }
 
 /// Returns the photograph as the render should look: cut out by its mask and composited over the same background.
@@ -191,7 +198,7 @@ mod tests {
         view.depth.pixel_mut(0, 0)[0] = 1.234;
         for format in [PictureFormat::Png, PictureFormat::Exr] {
             write(dir.path(), "left/a", &view, format, 1.0).unwrap();
-            let back = read(&path(dir.path(), "left/a", format), format).unwrap();
+            let back = read(&path(dir.path(), "left/a", format)).unwrap();
             for (a, b) in back.data.iter().zip(&view.color.data) {
                 assert!((a - b).abs() < 1.0 / 255.0, "{:?}", back.data);
             }
@@ -222,7 +229,7 @@ mod tests {
         view.depth = Image::new(0, 0, 1);
         for format in [PictureFormat::Png, PictureFormat::Exr] {
             write(dir.path(), "b", &view, format, 1.0).unwrap();
-            assert!(read(&path(dir.path(), "b", format), format).is_ok());
+            assert!(read(&path(dir.path(), "b", format)).is_ok());
         }
         assert!(!dir.path().join("depth/b.png").exists());
     }

@@ -3,6 +3,7 @@
 //! A cost is a number of rays, samples, cells or pixels times the measured time of one.
 
 use super::ensemble::can_blend;
+use super::export::is_file_key;
 use super::inputs::capture_options;
 use super::mask::inspect_capture;
 use super::path::{CameraPath, PATHS};
@@ -158,10 +159,26 @@ impl Session<'_> {
     pub fn fresh(&self, stage: Stage, until: Stage) -> Result<()> {
         let names = self.require(until, Some(stage))?;
         if !names.is_empty() {
-            self.run
-                .warn("run", &format!("removes what is made anew or out of date: `{}`", names.join("`, `")));
+            let each = names.iter().map(|name| Ok(format!("`{name}` ({})", self.contents(name)?)));
+            let each = each.collect::<Result<Vec<_>>>()?.join(", ");
+            self.run.warn("run", &format!("removes what is made anew or out of date: {each}"));
         }
         self.run.fresh(&names)
+    }
+
+    /// Returns the number and size of the files in a folder of the run that a stage made again would remove.
+    pub fn contents(&self, name: &str) -> Result<String> {
+        let files = self.run.files(name)?;
+        let plural = if files.len() == 1 { "" } else { "s" };
+        Ok(format!("{} file{plural}, {:.1} MB", files.len(), files.values().sum::<u64>() as f64 / 1e6))
+    }
+
+    /// Returns whether the finished mesh differs from the settings only in how its files are written.
+    pub fn differs_in_files(&self) -> bool {
+        let Ok(Some(record)) = read_record(&self.run.path(Stage::Mesh)) else { return false };
+        let differences = self.compared_plan(Stage::Mesh).fingerprint.differences(&record.fingerprint);
+        let is_file = |line: &String| line.split_once(": ").is_some_and(|(key, _)| is_file_key(key));
+        !differences.is_empty() && differences.iter().all(is_file)
     }
 
     /// Returns the folders that are out of date for `until`, if a stage is to be made again. Nothing is written.
@@ -201,7 +218,19 @@ impl Session<'_> {
         self.can_make(until)?;
         let plans = self.order(until).into_iter().map(|stage| self.compared_plan(stage));
         let mut kept = plans.filter(|plan| !cleared.iter().any(|name| name == plan.name));
-        kept.try_for_each(|plan| self.run.agrees(&plan))
+        kept.try_for_each(|plan| {
+            self.run.agrees(&plan).map_err(|e| match plan.name == Stage::Mesh.word() && self.differs_in_files() {
+                true => {
+                    let run = self.run.dir().display();
+                    let hint = format!(
+                        "`tiface export {run}` writes the finished mesh with such settings, and keeps the run; or {}",
+                        e.hint()
+                    );
+                    e.with_hint(hint)
+                }
+                false => e,
+            })
+        })
     }
 
     /// Checks, before any work, that the settings that `until` depends on are consistent.
@@ -330,6 +359,10 @@ impl Session<'_> {
                 // settings that only camera paths use do not affect held-out views
                 settings.remove("render.cameras");
                 settings.remove("render.orbit_views");
+                let render = &config.render;
+                if !render.shows_residuals(&render.method) {
+                    settings.remove("render.residuals"); // as in runs from before
+                }
                 let each = if config.render.float { 12 + 10 } else { 12 };
                 needs_bytes += self.pixels() * each * config.render.method.len().max(1) as u64 / 2;
             }
@@ -383,6 +416,9 @@ impl Session<'_> {
         let CameraPath { folder, render, cameras, digest } = path;
         let mut settings = Config { render: render.clone(), ..self.config.clone() }.values("render");
         settings.remove("render.float");
+        if !render.shows_residuals(&render.method) {
+            settings.remove("render.residuals"); // as in runs from before
+        }
         if cameras.is_some() {
             settings.remove("render.orbit_views");
         }
@@ -523,10 +559,17 @@ impl Session<'_> {
                     Method::Volume => 20e-6,
                     _ => 2.5e-6,
                 };
-                let cpu_s = 0.1 + shown * methods.iter().map(pixel).sum::<f64>();
+                let residuals = if self.render_config().shows_residuals(methods) { all } else { 0.0 };
+                let cpu_s = 0.1 + shown * methods.iter().map(pixel).sum::<f64>() + 1.6e-6 * residuals;
                 (cpu_s, 220.0 + 25e-6 * all + 1e-4 * (shown * methods.len() as f64 + mesh.texels() as f64))
             }
-            Stage::Ensemble => (0.2 + 3e-6 * held_out, 220.0 + 1e-4 * each),
+            Stage::Ensemble => {
+                let members = &self.config.ensemble.members;
+                let fits = self.config.ensemble.weights.is_empty();
+                let residuals = fits && self.config.render.shows_residuals(members);
+                let residuals = if residuals { all } else { 0.0 };
+                (0.2 + 3e-6 * held_out + 1.6e-6 * residuals, 220.0 + 1e-4 * each + 8e-6 * residuals)
+            }
             Stage::Metrics => (0.2 + 1.2e-6 * held_out * methods.len() as f64, 220.0 + 1e-4 * each),
         };
         let disk_bytes = self.plan(stage).needs_bytes;

@@ -10,6 +10,7 @@
 //! each held-out view alone, in `own_pose/` below the method's folder. Views along a camera path are written to a folder of
 //! their own, `render/paths/`.
 
+use super::learn;
 use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
 use super::pictures;
@@ -22,8 +23,8 @@ use crate::io;
 use crate::mesh::files::{ExtractedSurface, HeadMesh};
 use crate::render::path::{NamedCamera, orbit};
 use crate::render::{
-    LobePictures, MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView, Surface,
-    raster, raycast,
+    LobePictures, MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView,
+    ResidualSource, ResidualView, Residuals, Surface, raster, raycast,
 };
 use crate::run::{Run, StageDir};
 use crate::{Error, Monitor, Result};
@@ -145,7 +146,7 @@ impl Meshes {
 }
 
 /// The head mesh with its acceleration structure.
-struct VisibleHead<'a> {
+pub(super) struct VisibleHead<'a> {
     head: &'a HeadMesh,
     bvh: Bvh,
     shells: Option<ShellCaster<'a>>,
@@ -157,7 +158,8 @@ struct VisibleHead<'a> {
 }
 
 impl<'a> VisibleHead<'a> {
-    fn new(head: &'a HeadMesh, shown: [bool; 2]) -> VisibleHead<'a> {
+    /// Prepares a head to be shown as a viewer shows it, and with view-dependent color.
+    pub fn new(head: &'a HeadMesh, shown: [bool; 2]) -> VisibleHead<'a> {
         let (mesh, world_from_scene) = (&head.mesh, head.world_from_scene.rotation_f32());
         let texture = |lobes: bool| {
             let texture = head.texture.as_ref()?;
@@ -185,6 +187,20 @@ impl<'a> VisibleHead<'a> {
         raycast(&self.bvh, &self.head.mesh, self.shells.as_ref(), camera, options, color)
     }
 
+    /// Renders a view as a viewer shows the head: with its texture or the colors of its vertices, else in gray, lit from
+    /// the camera.
+    pub fn as_in_viewer(&self, camera: &Camera, options: &RaycastOptions) -> RenderedView {
+        let mesh = &self.head.mesh;
+        self.view(camera, options, |hits| match &self.shown {
+            Some(texture) => texture.colors(hits, camera, options.samples),
+            None if mesh.colors.is_empty() => {
+                let normals = hits.normals.iter().zip(&hits.directions);
+                normals.map(|(n, d)| [n.dot(*d).abs(); 3]).collect()
+            }
+            None => hits.hits.iter().map(|hit| mesh.color_at(hit)).collect(),
+        })
+    }
+
     /// Returns the sRGB-coded colors of hits, with view-dependent color.
     fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
         let mesh = &self.head.mesh;
@@ -209,6 +225,8 @@ pub(super) struct Renderer<'a> {
     head: Option<VisibleHead<'a>>,
     samples: u32,
     world_from_scene: Similarity,
+    /// What ray casting misses of the training photographs.
+    residuals: Option<Residuals>,
     monitor: &'a dyn Monitor,
 }
 
@@ -228,16 +246,73 @@ impl<'a> Renderer<'a> {
             head: meshes.head.as_ref().map(|head| VisibleHead::new(head, meshes.shown)),
             samples,
             world_from_scene: scene.scene_from_world.inverse(),
+            residuals: None,
             monitor,
         }
+    }
+
+    /// Returns the renderer with the residuals of the training views, which ray casting then adds to other views. With
+    /// `leaves_out_own`, a training view adds nothing to a view from its own position.
+    pub fn with_residuals(
+        mut self,
+        capture: &Capture,
+        scene: &Scene,
+        config: &Config,
+        leaves_out_own: bool,
+    ) -> Result<Renderer<'a>> {
+        let meshes =
+            [self.extracted.as_ref().map(|(s, _)| &s.mesh), self.head.as_ref().map(|h| &h.head.mesh)];
+        let Some(mesh) = meshes.into_iter().flatten().next() else { return Ok(self) };
+        // depth in the scene's units; colors are filtered over a pixel, whatever the number of rays
+        let options = RaycastOptions { samples: 1, ..RaycastOptions::default() };
+        let mut residuals = Vec::new();
+        // one photograph at a time: all of them with their views could fill the memory
+        for (view, tiles) in learn::held_out_tiles(capture, config) {
+            if self.monitor.stop() {
+                break; // what was made is not used then
+            }
+            let (camera, loaded) = learn::training_view(view, &tiles, scene)?;
+            let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
+            if let Some(view) = self.cast(&camera, &options)? {
+                let source = ResidualSource { camera: &camera, photo: &loaded.photo, mask, valid, view };
+                residuals.extend(ResidualView::new(source));
+            }
+        }
+        let center = mesh.bounds().center();
+        self.residuals = Residuals::new(residuals, center, leaves_out_own);
+        Ok(self)
+    }
+
+    /// Renders the mesh with all that is known of its color.
+    fn cast(&self, camera: &Camera, options: &RaycastOptions) -> Result<Option<RenderedView>> {
+        let residuals = &self.residuals;
+        let improved = |hits: &RayHits, mut colors: Vec<[f32; 3]>| {
+            residuals.iter().for_each(|residuals| residuals.add(hits, camera, &mut colors));
+            colors
+        };
+        if let Some((ExtractedSurface { mesh, cap }, bvh)) = &self.extracted {
+            let field = self.fields.surface()?;
+            return Ok(Some(raycast(bvh, mesh, None, camera, options, |hits| {
+                let mut colors = field.color(&hits.points, &hits.normals, &hits.directions);
+                // the field's color at the cap is that of the body's inside
+                if let Some(cap) = cap {
+                    cap.recolor(&hits.points, &mut colors);
+                }
+                improved(hits, colors)
+            })));
+        }
+        Ok(self.head.as_ref().map(|visible| {
+            visible
+                .view(camera, options, |hits| improved(hits, visible.colors(hits, camera, options.samples)))
+        }))
     }
 
     /// Renders the view of a camera in scene coordinates, over nothing.
     pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>> {
         let samples = self.samples;
         let options = RaycastOptions { samples, world_from_scene: self.world_from_scene };
-        Ok(match (method, &self.extracted) {
-            (Method::Baseline | Method::Tface, _) => {
+        Ok(match method {
+            Method::Baseline | Method::Tface => {
                 let field = self.fields.radiance(method.stage())?;
                 // a large view takes minutes, so a stop request is checked within it
                 let render_rays = |rays: &[Ray]| match self.monitor.stop() {
@@ -246,27 +321,13 @@ impl<'a> Renderer<'a> {
                 };
                 Some(march(camera, &self.world_from_scene, false, render_rays))
             }
-            (Method::Volume, _) => self.fields.surface()?.volume(camera, &self.world_from_scene),
-            (Method::Raycast, Some((ExtractedSurface { mesh, cap }, bvh))) => {
-                let field = self.fields.surface()?;
-                Some(raycast(bvh, mesh, None, camera, &options, |hits| {
-                    let mut colors = field.color(&hits.points, &hits.normals, &hits.directions);
-                    // the field's color at the cap is that of the body's inside
-                    if let Some(cap) = cap {
-                        cap.recolor(&hits.points, &mut colors);
-                    }
-                    colors
-                }))
+            Method::Volume => self.fields.surface()?.volume(camera, &self.world_from_scene),
+            Method::Raycast => self.cast(camera, &options)?,
+            Method::Textured => {
+                let textured = self.head.as_ref().filter(|visible| visible.shown.is_some());
+                textured.map(|visible| visible.as_in_viewer(camera, &options))
             }
-            (Method::Raycast, None) => self
-                .head
-                .as_ref()
-                .map(|visible| visible.view(camera, &options, |hits| visible.colors(hits, camera, samples))),
-            (Method::Textured, _) => self.head.as_ref().and_then(|visible| {
-                let texture = visible.shown.as_ref()?;
-                Some(visible.view(camera, &options, |hits| texture.colors(hits, camera, samples)))
-            }),
-            (Method::Raster, _) => self.head.as_ref().map(|VisibleHead { head, layers, shown, .. }| {
+            Method::Raster => self.head.as_ref().map(|VisibleHead { head, layers, shown, .. }| {
                 let options = RasterOptions {
                     world_from_scene: self.world_from_scene,
                     bare_hits: true,
@@ -374,6 +435,7 @@ mod tests {
                 head: None,
                 samples: 1,
                 world_from_scene: Similarity::IDENTITY,
+                residuals: None,
                 monitor: &Quiet,
             };
             let view = renderer.view(Method::Raycast, &camera).unwrap().unwrap();

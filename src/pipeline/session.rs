@@ -90,6 +90,11 @@ impl<'a> Session<'a> {
         &self.capture
     }
 
+    /// Returns the configuration.
+    pub fn config(&self) -> &Config {
+        self.config
+    }
+
     /// Returns what the stage `mask` measured of the cameras.
     pub(super) fn camera_check(&self) -> Result<Option<CameraCheck>> {
         CameraCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))

@@ -1,6 +1,6 @@
 //! Line charts over training steps or another quantity, as SVG inside a page.
 
-use super::escape;
+use super::{csv_text, escape};
 use serde_json::Value;
 use std::fmt::Write;
 
@@ -53,6 +53,18 @@ pub fn charts(stage: &str, log: &str, names: &[&str]) -> Vec<Chart> {
     }
     charts.retain(|c| !c.curves.is_empty());
     charts
+}
+
+/// Returns all points of curves as comma-separated values (RFC 4180), a heading first.
+pub fn curves_csv(charts: &[Chart]) -> String {
+    let mut csv = "figure,curve,step,value\n".to_string();
+    for chart in charts {
+        for Curve { name, points } in &chart.curves {
+            let [figure, name] = [&chart.title, name].map(|text| csv_text(text));
+            points.iter().for_each(|(step, value)| csv += &format!("{figure},{name},{step},{value}\n"));
+        }
+    }
+    csv
 }
 
 /// Sides of the drawing, and where its axes lie.
@@ -167,6 +179,10 @@ mod tests {
         let found = charts("iface", log, &["psnr", "absent"]);
         let curve = Curve { name: String::new(), points: vec![(1.0, 10.0), (5.0, 15.0)] };
         assert_eq!(found, [Chart { title: "iface psnr".into(), curves: vec![curve] }]);
+        assert_eq!(
+            curves_csv(&found),
+            "figure,curve,step,value\n\"iface psnr\",\"\",1,10\n\"iface psnr\",\"\",5,15\n"
+        );
     }
 
     #[test]

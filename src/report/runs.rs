@@ -1,14 +1,17 @@
-//! One page of many runs, one row each, sortable by any column.
+//! One page of many runs, one row each, that is searched, filtered and sorted by any column.
 
-use super::{STYLE, fill, link, picture_url, small_view, views};
+use super::{STYLE, csv_text, fill, picture_url, relative, small_view, views};
 use crate::Result;
 use crate::capture::synthetic::SyntheticHead;
 use crate::config::{Config, NAMES, Stage, called};
-use crate::io;
+use crate::error::counted;
+use crate::geom::Camera;
+use crate::io::{self, Limits};
 use crate::run::{Phase, Record, RunStatus};
+use glam::Vec3;
 use minijinja::context;
-use serde::Serialize;
-use std::path::{Path, PathBuf};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
 
 /// Longest side of a picture: about 4 kB each, so that two hundred are light.
 const PICTURE_PX: u32 = 120;
@@ -88,7 +91,7 @@ impl RunRow {
         };
         let page = run.join("report.html");
         if io::is_file(&page) {
-            row.link = link(&relative(&page, beside).to_string_lossy());
+            row.link = relative(&page, beside);
         }
         if let Some(mesh) = of(Stage::Mesh) {
             (row.watertight, row.triangles) = (mesh["closed"].as_bool(), mesh["triangles"].as_u64());
@@ -130,18 +133,34 @@ fn state(run: &RunStatus) -> String {
     }
 }
 
-/// Returns the first view of the best that a run shows, over black.
+/// Returns the most frontal view of the best method that a run shows, over black.
 fn picture(run: &Path) -> Option<String> {
-    let file = NAMES.iter().rev().find_map(|(word, _)| views(run, word).into_iter().next())?;
-    Some(picture_url(&small_view(&run.join(file), PICTURE_PX, 78)?))
+    let files = NAMES.iter().rev().map(|(word, _)| views(run, word)).find(|files| !files.is_empty())?;
+    let names = frontal_views(run);
+    let rank = |file: &&String| {
+        let stem = file.rsplit_once('.').map_or(file.as_str(), |(stem, _)| stem);
+        names.iter().position(|name| stem.ends_with(&format!("/{name}"))).unwrap_or(names.len())
+    };
+    Some(picture_url(&small_view(&run.join(files.iter().min_by_key(rank)?), PICTURE_PX, 78)?))
 }
 
-/// Returns the way from a folder to a file; the file itself if one of them does not exist.
-fn relative(file: &Path, folder: &Path) -> PathBuf {
-    let (Ok(file), Ok(folder)) = (io::real_path(file), io::real_path(folder)) else { return file.into() };
-    let shared = file.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
-    let up = folder.components().skip(shared).map(|_| Path::new(".."));
-    up.collect::<PathBuf>().join(file.components().skip(shared).collect::<PathBuf>())
+/// Returns the names of a run's views, first those that look as all cameras do in the mean; none if they cannot be read.
+fn frontal_views(run: &Path) -> Vec<String> {
+    #[derive(Deserialize)]
+    struct Cameras {
+        views: Vec<NamedCamera>,
+    }
+    #[derive(Deserialize)]
+    struct NamedCamera {
+        name: String,
+        camera: Camera,
+    }
+    let cameras = io::read_typed(&run.join("cameras.json"), &Limits::default());
+    let mut views = cameras.map_or(Vec::new(), |Cameras { views }| views);
+    let mean: Vec3 = views.iter().map(|view| view.camera.forward()).sum();
+    let alike = |view: &NamedCamera| view.camera.forward().dot(mean);
+    views.sort_by(|a, b| alike(b).total_cmp(&alike(a)));
+    views.into_iter().map(|view| view.name).collect()
 }
 
 /// Figures that are compared over runs: heading, also in the CSV, and value.
@@ -151,7 +170,7 @@ const FIGURES: [(&str, fn(&RunRow) -> Option<f64>); 10] = [
     ("mesh PSNR", |r| r.mesh_psnr),
     ("mm", |r| r.mm),
     ("triangles", |r| r.triangles.map(|n| n as f64)),
-    ("MB", |r| r.megabytes),
+    ("GLB MB", |r| r.megabytes),
     ("minutes", |r| Some(r.seconds / 60.0)),
     ("CPU minutes", |r| r.cpu_s.map(|s| s / 60.0)),
     ("GiB", |r| r.peak_bytes.map(|b| b as f64 / (1u64 << 30) as f64)),
@@ -180,15 +199,17 @@ fn outliers(values: &[Option<f64>]) -> Vec<bool> {
     values.iter().map(|v| v.is_some_and(|v| (v - middle).abs() > OUTLIER * spread)).collect()
 }
 
-/// Returns the page of many runs.
+/// Returns the page of many runs, those that failed first.
 pub fn runs_html(rows: &[RunRow]) -> Result<String> {
+    let mut rows: Vec<&RunRow> = rows.iter().collect();
+    rows.sort_by_key(|row| !row.failed);
     // unfinished runs have incomplete figures
     let value = |row: &RunRow, of: fn(&RunRow) -> Option<f64>| of(row).filter(|_| row.done);
     let far: Vec<Vec<bool>> = FIGURES
         .iter()
-        .map(|(_, of)| outliers(&rows.iter().map(|r| value(r, *of)).collect::<Vec<_>>()))
+        .map(|(_, of)| outliers(&rows.iter().map(|&r| value(r, *of)).collect::<Vec<_>>()))
         .collect();
-    let cells = |(i, row): (usize, &RunRow)| -> Vec<(String, bool)> {
+    let cells = |(i, row): (usize, &&RunRow)| -> Vec<(String, bool)> {
         let figure = |k: usize| {
             let (_, of) = FIGURES[k];
             (of(row).map_or("–".into(), |v| format!("{v:.*}", DIGITS[k])), far[k][i])
@@ -202,23 +223,18 @@ pub fn runs_html(rows: &[RunRow]) -> Result<String> {
     let script = include_str!("runs.js");
     fill(
         include_str!("runs.html"),
-        context! { style => STYLE, script, title => format!("{} runs", rows.len()), rows, cells, headings, done, failed },
+        context! { style => STYLE, script, title => counted(rows.len(), "run"), rows, cells, headings, done, failed },
     )
 }
 
 /// Returns the figures of many runs as comma-separated values (RFC 4180), a heading first.
 pub fn runs_csv(rows: &[RunRow]) -> String {
-    let quoted = |text: &str| {
-        // spreadsheets take text that begins like a formula for one
-        let text = if text.starts_with(['=', '+', '-', '@']) { format!("'{text}") } else { text.to_owned() };
-        format!("\"{}\"", text.replace('"', "\"\""))
-    };
     let mut csv = "run,state,best,watertight,preset".to_owned();
     FIGURES.iter().for_each(|(heading, _)| csv += &format!(",{heading}"));
     for row in rows {
         let closed = row.watertight.map_or("", |closed| if closed { "yes" } else { "no" });
         csv += "\n";
-        csv += &[&row.name, &row.state, &row.method].map(|text| quoted(text)).join(",");
+        csv += &[&row.name, &row.state, &row.method].map(|text| csv_text(text)).join(",");
         csv += &format!(",{closed},{}", row.preset);
         FIGURES.iter().for_each(|(_, of)| csv += &of(row).map_or(",".into(), |v| format!(",{v}")));
     }
@@ -228,6 +244,8 @@ pub fn runs_csv(rows: &[RunRow]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::DMat3;
+    use serde_json::json;
 
     #[test]
     fn a_row_says_what_is_known_and_hostile_names_stay_text() {
@@ -252,7 +270,30 @@ mod tests {
         assert!(RunRow::read(&run, dir.path()).picture.starts_with("data:image/jpeg;base64,"));
         let page = runs_html(&[row.clone(), RunRow { psnr: Some(31.25), ..row }]).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("&lt;img src=x") && page.contains("31.25"));
-        assert_eq!(page.matches("<tr>").count(), 3);
+        assert_eq!(page.matches("<tr").count(), 3);
+    }
+
+    #[test]
+    fn the_picture_of_a_run_is_its_most_frontal_view() {
+        let dir = tempfile::tempdir().unwrap();
+        let turned = |degrees: f64| Camera {
+            rotation: DMat3::from_rotation_y(degrees.to_radians()),
+            ..Camera::above(4, 4, 4.0, 2.0)
+        };
+        let views = [("a", 80.0), ("b", -10.0), ("c", -60.0)]
+            .map(|(name, degrees)| json!({"name": name, "camera": turned(degrees), "split": "test"}));
+        std::fs::write(dir.path().join("cameras.json"), json!({"views": views}).to_string()).unwrap();
+        // the mean looks 2 degrees to the side
+        assert_eq!(frontal_views(dir.path()), ["b", "c", "a"]);
+        std::fs::create_dir_all(dir.path().join("ensemble")).unwrap();
+        for (name, red) in [("a", 0), ("b", 255), ("c", 0)] {
+            let file = dir.path().join(format!("ensemble/{name}.png"));
+            io::write_png_rgba(&file, 1, 1, &[[red, 0, 0, 255]]).unwrap();
+        }
+        let shown = picture(dir.path());
+        std::fs::remove_file(dir.path().join("cameras.json")).unwrap();
+        // without cameras the first
+        assert!(shown.is_some() && shown != picture(dir.path()));
     }
 
     #[test]
@@ -282,7 +323,7 @@ mod tests {
         let lines: Vec<&str> = csv.lines().collect();
         assert_eq!(
             lines[0],
-            "run,state,best,watertight,preset,PSNR,SSIM,mesh PSNR,mm,triangles,MB,minutes,CPU minutes,GiB,warnings"
+            "run,state,best,watertight,preset,PSNR,SSIM,mesh PSNR,mm,triangles,GLB MB,minutes,CPU minutes,GiB,warnings"
         );
         assert_eq!(lines[1], "\"'=cmd|\"\"x\"\"\",\"a, b\",\"\",no,,31.25,,,,,,0,,,1");
     }
@@ -301,7 +342,7 @@ mod tests {
         std::fs::create_dir_all(dir.path().join("pages")).unwrap();
         std::fs::write(dir.path().join("runs/a/report.html"), "").unwrap();
         let file = dir.path().join("runs/a/report.html");
-        assert_eq!(relative(&file, &dir.path().join("pages")), Path::new("../runs/a/report.html"));
-        assert_eq!(relative(&file, &dir.path().join("runs")), Path::new("a/report.html"));
+        assert_eq!(relative(&file, &dir.path().join("pages")), "../runs/a/report.html");
+        assert_eq!(relative(&file, &dir.path().join("runs")), "a/report.html");
     }
 }

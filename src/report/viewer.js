@@ -304,6 +304,32 @@ class Painter {
     }));
   }
 
+  /** Points and triangles of the solid parts, with places of 32 bits; others cannot be measured. */
+  get shape() {
+    this.knownShape ??= this.solid.filter((p) => p.attributes.POSITION.componentType === 5126).map(({ placed, attributes, indices }) => {
+      const { bytes, offset, stride, count } = attributes.POSITION, read = new DataView(bytes.buffer, bytes.byteOffset + offset);
+      const points = Array.from({ length: count }, (_, i) => apply(placed, [0, 4, 8].map((k) => read.getFloat32(i * stride + k, true))));
+      const wide = indices && BYTES[indices.componentType], at = indices && new DataView(indices.bytes.buffer, indices.bytes.byteOffset + indices.offset);
+      const corner = (i) => !at ? i : wide === 4 ? at.getUint32(4 * i, true) : wide === 2 ? at.getUint16(2 * i, true) : at.getUint8(i);
+      return { points, corners: Array.from({ length: indices?.count ?? count }, (_, i) => corner(i)) };
+    });
+    return this.knownShape;
+  }
+
+  /** The first point of the surface along a ray (Moeller and Trumbore 1997). */
+  hit(eye, direction) {
+    let nearest = Infinity;
+    for (const { points, corners } of this.shape) {
+      for (let i = 0; i + 2 < corners.length; i += 3) {
+        const a = points[corners[i]], ab = add(points[corners[i + 1]], a, -1), ac = add(points[corners[i + 2]], a, -1);
+        const p = cross(direction, ac), det = dot(ab, p), from = add(eye, a, -1), q = cross(from, ab);
+        const u = dot(from, p) / det, v = dot(direction, q) / det, t = dot(ac, q) / det;
+        if (u >= 0 && v >= 0 && u + v <= 1 && t > 0 && t < nearest) nearest = t;
+      }
+    }
+    return nearest < Infinity ? add(eye, direction, nearest) : null;
+  }
+
   /** Draws what a camera sees; the photograph, if any, lies in its frame. */
   draw({ clipFromPlace, viewFromPlace, eye, mode, ground, photo, frame, fade, most }) {
     const { gl } = this;
@@ -371,7 +397,9 @@ async function viewer(root) {
   const $ = (selector) => root.querySelector(selector);
   const canvas = $("canvas"), say = (text) => { $(".message").textContent = text; };
   const { cameras, front, most, heat } = JSON.parse($(".viewer-data").textContent);
-  const controls = { mode: $(".modes"), camera: $(".camera"), fade: $(".fade"), reset: $(".reset"), full: $(".full") };
+  const controls = { mode: $(".modes"), camera: $(".camera"), fade: $(".fade"), reset: $(".reset"), full: $(".full"),
+    measure: $(".measure"), save: $(".save") };
+  const marks = [...root.querySelectorAll(".mark")];
   const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
   if (!gl) {
     root.classList.add("dead");
@@ -381,7 +409,7 @@ async function viewer(root) {
   const bytes = new Uint8Array(packed.length);
   for (let i = 0; i < packed.length; i++) bytes[i] = packed.charCodeAt(i);
   const file = parse(bytes.buffer);
-  let painter, photos, asked = false, drawn = 0;
+  let painter, photos, asked = false, drawn = 0, measured = null;
   const state = { mode: 0, camera: -1, fade: 0 };
 
   const start = () => {
@@ -431,6 +459,42 @@ async function viewer(root) {
     painter.draw({ clipFromPlace: times(clip, view), viewFromPlace: turned, eye, mode: state.mode, ground: css.slice(0, 3),
       photo: photos[state.camera], frame, fade: state.fade, most });
     drawn += 1;
+    // the measured points, through the head too
+    const ratio = width / (canvas.clientWidth || width);
+    marks.forEach((mark, k) => {
+      const point = measured?.[k], ray = point && add(point, eye, -1);
+      mark.hidden = !point || dot(ray, back) >= 0;
+      if (mark.hidden) return;
+      mark.style.left = `${(cx - fx * dot(ray, right) / dot(ray, back)) / ratio}px`;
+      mark.style.top = `${(cy + fy * dot(ray, up) / dot(ray, back)) / ratio}px`;
+    });
+  };
+  /** Measures from point to point, at a place on the canvas. */
+  const pick = (x, y) => {
+    const ratio = canvas.width / canvas.clientWidth, { right, up, back, eye, fx, fy, cx, cy } = camera(canvas.width, canvas.height);
+    const along = add(add(add([0, 0, 0], right, (x * ratio - cx) / fx), up, (cy - y * ratio) / fy), back, -1);
+    const point = painter?.hit(eye, along);
+    if (!point) {
+      $(".distance").textContent = painter?.shape.length ? "No surface there" : "The points of this file cannot be measured";
+      return;
+    }
+    measured = measured.length === 1 ? [...measured, point] : [point];
+    const [a, b] = measured;
+    $(".distance").textContent = b ? `${(1000 * Math.hypot(...add(b, a, -1))).toFixed(1)} mm` : "Click on the second point";
+    redraw();
+  };
+  const measure = () => {
+    measured = measured ? null : [];
+    controls.measure.setAttribute("aria-pressed", String(Boolean(measured)));
+    $(".distance").textContent = measured ? "Click on two points" : "";
+    redraw();
+  };
+  const save = () => {
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(new Blob([bytes], { type: "model/gltf-binary" }));
+    link.download = "head.glb";
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
   };
   const redraw = () => {
     if (asked || !painter) return;
@@ -500,13 +564,16 @@ async function viewer(root) {
   controls.camera.addEventListener("change", () => look(Number(controls.camera.value)));
   controls.fade.addEventListener("input", () => fade(Number(controls.fade.value)));
   controls.reset.addEventListener("click", reset);
+  controls.measure.addEventListener("click", measure);
+  controls.save.addEventListener("click", save);
   controls.full.addEventListener("click", () => document.fullscreenElement ? document.exitFullscreen() : root.requestFullscreen?.());
   const KEYS = {
     ArrowLeft: () => turn(-0.1, 0), ArrowRight: () => turn(0.1, 0), ArrowUp: () => turn(0, -0.1), ArrowDown: () => turn(0, 0.1),
     "Shift+ArrowLeft": () => pan(-20, 0), "Shift+ArrowRight": () => pan(20, 0), "Shift+ArrowUp": () => pan(0, -20),
     "Shift+ArrowDown": () => pan(0, 20), "+": () => zoom(1.1), "=": () => zoom(1.1), "-": () => zoom(1 / 1.1), 0: reset,
     Home: reset, "[": () => look(state.camera - 1), "]": () => look(state.camera + 1), ",": () => fade(state.fade - 0.25),
-    ".": () => fade(state.fade + 0.25), f: () => controls.full.click(),
+    ".": () => fade(state.fade + 0.25), f: () => controls.full.click(), m: measure,
+    Enter: () => { if (measured) pick(canvas.clientWidth / 2, canvas.clientHeight / 2); },
   };
   canvas.addEventListener("keydown", (e) => {
     if (e.ctrlKey || e.metaKey || e.altKey) return;
@@ -518,9 +585,16 @@ async function viewer(root) {
   });
 
   const pointers = new Map();
+  let pressed = null;
+  canvas.addEventListener("pointerup", (e) => {
+    const box = canvas.getBoundingClientRect();
+    const still = pressed && Math.hypot(e.clientX - pressed[0], e.clientY - pressed[1]) < 5;
+    if (measured && still) pick(e.clientX - box.left, e.clientY - box.top);
+  });
   canvas.addEventListener("pointerdown", (e) => {
     canvas.setPointerCapture(e.pointerId);
     pointers.set(e.pointerId, [e.clientX, e.clientY]);
+    pressed = pointers.size === 1 && e.button === 0 ? [e.clientX, e.clientY] : null;
   });
   canvas.addEventListener("pointermove", (e) => {
     const before = pointers.get(e.pointerId);

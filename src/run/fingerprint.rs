@@ -1,8 +1,10 @@
 //! Fingerprint of a stage's result: settings, inputs, format version; and the difference of two.
 
+use crate::io::{self, ReadError};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 /// Everything that affects the result of a stage. Stored in full, not only as a hash, so that a difference can be
 /// reported key by key.
@@ -60,6 +62,13 @@ impl Fingerprint {
     /// Returns the SHA-256 of bytes, hexadecimal: the digest of a file.
     pub fn of_bytes(bytes: &[u8]) -> String {
         hex(&Sha256::digest(bytes))
+    }
+
+    /// Returns the SHA-256 of a file of any size, hexadecimal; it may be empty.
+    pub fn of_file(path: &Path) -> Result<String, ReadError> {
+        let mut digest = Sha256::new();
+        io::read_pieces(path, |piece| digest.update(piece))?;
+        Ok(hex(&digest.finalize()))
     }
 
     /// Returns the differences from an `older` fingerprint, one line each.

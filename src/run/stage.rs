@@ -228,7 +228,7 @@ impl Run {
         for name in record.require_products(&self.path(plan.name))? {
             let (file, run) = (self.path(plan.name).join(name), self.dir.display());
             let again = match name.starts_with("head.") {
-                true => format!("`tiface mesh {run} --out FILE` writes the mesh again"),
+                true => format!("`tiface export {run} --out FILE` writes the mesh again"),
                 false => "no stage reads it".into(),
             };
             self.warn(plan.name, &format!("`{}` is no longer in its folder; {again}", file.display()));
@@ -254,6 +254,8 @@ impl Run {
         let digest = plan.fingerprint.digest();
         let mut products = self.files(plan.name)?;
         products.retain(|file, _| !TIMED.contains(&file.as_str()));
+        let digest_of = |file: &String| Ok((file.clone(), Fingerprint::of_file(&stage.folder.join(file))?));
+        let sha256 = products.keys().map(digest_of).collect::<Result<_>>()?;
         let record = Record {
             stage: plan.name.into(),
             fingerprint: plan.fingerprint.clone(),
@@ -264,6 +266,7 @@ impl Run {
             peak_bytes: io::peak_memory(),
             warnings: stage.progress.warnings(),
             products,
+            sha256,
             finished: now(),
             version: env!("CARGO_PKG_VERSION").into(),
         };

@@ -88,6 +88,9 @@ pub struct Record {
     /// Size of each file of the stage, bytes, by its path in the stage's folder; empty in older records.
     #[serde(default)]
     pub products: BTreeMap<String, u64>,
+    /// SHA-256 of the same files, hexadecimal; empty in older records.
+    #[serde(default)]
+    pub sha256: BTreeMap<String, String>,
     /// Seconds since 1970.
     pub finished: u64,
     /// Version of `tiface`.
@@ -97,7 +100,7 @@ pub struct Record {
 /// Files that record times, and are no products of a stage.
 pub(super) const TIMED: [&str; 3] = ["done.json", "status.json", "log.jsonl"];
 
-/// Files that no stage reads; a run is complete without them. `tiface mesh --out` writes the head again from the stage's
+/// Files that no stage reads; a run is complete without them. `tiface export` writes the head again from the stage's
 /// folder `parts`.
 const EXPORTS: [&str; 10] = [
     "head.glb",
@@ -150,6 +153,62 @@ impl Record {
         }
         Ok(moved)
     }
+}
+
+/// What [`verify`] found in a run.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Verification {
+    /// SHA-256 of each product as its record states it, by path in the run; empty if the record states only its size.
+    pub products: BTreeMap<String, String>,
+    /// A sentence for each product that is missing or is not the one that was written.
+    pub differences: Vec<String>,
+    /// Exported files that are no longer in the run; no stage reads them.
+    pub moved: Vec<String>,
+}
+
+/// Compares the products in a run's folder with the records of their stages, byte for byte. Products of older records are
+/// compared by size.
+///
+/// # Errors
+///
+/// Fails if a record cannot be read, or there is none.
+pub fn verify(run: &Path) -> Result<Verification> {
+    let mut found = Verification::default();
+    verify_folder(run, run, &mut found)?;
+    if found.products.is_empty() {
+        let problem = format!("`{}` has no finished stage", run.display());
+        return Err(Error::cannot(
+            problem,
+            "name the folder of a run; `tiface status` shows what is finished",
+        ));
+    }
+    Ok(found)
+}
+
+fn verify_folder(run: &Path, folder: &Path, found: &mut Verification) -> Result<()> {
+    for inner in io::list_folders(folder)?.into_iter().filter(|inner| !io::is_link(inner)) {
+        if let Some(record) = read_record(&inner)? {
+            for (name, &bytes) in &record.products {
+                let file = inner.join(name);
+                let path = file.strip_prefix(run).unwrap_or(&file).to_string_lossy().into_owned();
+                let digest = record.sha256.get(name).cloned().unwrap_or_default();
+                match io::file_size(&file) {
+                    None if EXPORTS.contains(&name.as_str()) => found.moved.push(path.clone()),
+                    None => found.differences.push(format!("`{path}` is missing")),
+                    Some(size) if size != bytes => {
+                        found.differences.push(format!("`{path}` has {size} bytes, expected {bytes}"));
+                    }
+                    Some(_) if !digest.is_empty() && Fingerprint::of_file(&file)? != digest => {
+                        found.differences.push(format!("`{path}` has other contents than were written"));
+                    }
+                    Some(_) => {}
+                }
+                found.products.insert(path, digest);
+            }
+        }
+        verify_folder(run, &inner, found)?;
+    }
+    Ok(())
 }
 
 /// Returns the `status.json` of a stage folder; `None` if it does not exist.
@@ -616,5 +675,38 @@ mod run_tests {
         Run::quiet(dir.path()).stage(plan("metrics"), |_| Ok(Value::Null)).unwrap();
         let now = RunStatus::read(dir.path());
         assert_eq!((now.phase, now.error), (Phase::Done, None));
+    }
+
+    #[test]
+    fn verify_compares_by_digest_then_by_size_and_lets_exports_move() {
+        let dir = tempfile::tempdir().unwrap();
+        let stage = dir.path().join("mesh");
+        std::fs::create_dir(&stage).unwrap();
+        let fingerprint = Fingerprint::default();
+        let write = |name: &str, text: &str| std::fs::write(stage.join(name), text).unwrap();
+        ["atlas.png", "head.glb", "mesh.ply"].iter().for_each(|name| write(name, "abcd"));
+        let digests: serde_json::Map<String, Value> = ["atlas.png", "head.glb"]
+            .map(|name| (name.to_string(), json!(Fingerprint::of_bytes(b"abcd"))))
+            .into_iter()
+            .collect();
+        let record = json!({
+            "stage": "mesh", "digest": fingerprint.digest(), "fingerprint": fingerprint, "summary": {}, "elapsed_s": 2.0,
+            "finished": 1, "version": "0", "products": {"atlas.png": 4, "head.glb": 4, "mesh.ply": 4}, "sha256": digests,
+        });
+        write("done.json", &record.to_string());
+        let found = verify(dir.path()).unwrap();
+        assert!(found.differences.is_empty() && found.moved.is_empty(), "{found:?}");
+        // the record states no digest of the third: an older version wrote it
+        assert!(found.products["mesh/mesh.ply"].is_empty() && found.products["mesh/atlas.png"].len() == 64);
+
+        write("atlas.png", "abce");
+        write("mesh.ply", "abce");
+        std::fs::remove_file(stage.join("head.glb")).unwrap();
+        let found = verify(dir.path()).unwrap();
+        assert_eq!(found.differences, ["`mesh/atlas.png` has other contents than were written"]);
+        assert_eq!(found.moved, ["mesh/head.glb"]);
+        write("mesh.ply", "abc");
+        assert_eq!(verify(dir.path()).unwrap().differences[1], "`mesh/mesh.ply` has 3 bytes, expected 4");
+        assert!(verify(&stage.join("none")).is_err());
     }
 }

@@ -36,9 +36,9 @@ pub const READERS: [(&str, Reader); 22] = [
     ("metashape", |dir, bytes| open(dir, "cameras.xml", bytes)),
     ("mtl", mtl),
     ("neus", |dir, bytes| open(dir, "cameras_sphere.npz", bytes)),
-    ("npy", |dir, bytes| told(io::parse_npy(dir, bytes, &limits()))),
+    ("npy", |dir, bytes| outcome(io::parse_npy(dir, bytes, &limits()))),
     ("photo", photo),
-    ("prompts", |dir, bytes| told(tiface::mask::prompts::parse_prompts(dir, bytes, &limits()))),
+    ("prompts", |dir, bytes| outcome(tiface::mask::prompts::parse_prompts(dir, bytes, &limits()))),
     ("published", published),
     ("realitycapture", realitycapture),
     ("run", run),
@@ -55,8 +55,8 @@ fn limits() -> Limits {
     Limits { side_px: 1024, decoded_bytes: 16 << 20, json_values: 1 << 16, ..Limits::default() }
 }
 
-/// What was said of the bytes.
-fn told<T, E: std::fmt::Display>(result: Result<T, E>) -> String {
+/// Returns the message of an error, or nothing.
+fn outcome<T, E: std::fmt::Display>(result: Result<T, E>) -> String {
     result.err().map(|e| e.to_string()).unwrap_or_default()
 }
 
@@ -86,7 +86,7 @@ pub fn prepare(dir: &Path) {
 fn open(dir: &Path, name: &str, bytes: &[u8]) -> String {
     put(dir, name, bytes);
     let options = CaptureOptions { limits: limits(), ..CaptureOptions::default() };
-    told(capture::open(dir, &options))
+    outcome(capture::open(dir, &options))
 }
 
 /// Parts of an input that stands for several files.
@@ -113,7 +113,7 @@ fn model(dir: &Path, bytes: &[u8], ending: &str) -> String {
         }
     }
     let options = CaptureOptions { limits: limits(), ..CaptureOptions::default() };
-    told(capture::open(dir, &options))
+    outcome(capture::open(dir, &options))
 }
 
 /// A table, or a sidecar of the first photograph.
@@ -124,7 +124,7 @@ fn realitycapture(dir: &Path, bytes: &[u8]) -> String {
     drop(fs::remove_file(other));
     fs::write(path, bytes).unwrap();
     let options = CaptureOptions { limits: limits(), ..CaptureOptions::default() };
-    told(capture::open(dir, &options))
+    outcome(capture::open(dir, &options))
 }
 
 fn photo(dir: &Path, bytes: &[u8]) -> String {
@@ -134,17 +134,17 @@ fn photo(dir: &Path, bytes: &[u8]) -> String {
         let sizes = [(info.width, info.height), (info.height, info.width)];
         assert!(sizes.contains(&(photo.width, photo.height)), "the header says another size");
     }
-    told(photo) + &told(info)
+    outcome(photo) + &outcome(info)
 }
 
 fn mask(dir: &Path, bytes: &[u8]) -> String {
     put(dir, "mask.png", bytes);
-    told(io::read_gray(&dir.join("mask.png"), None, &limits()))
+    outcome(io::read_gray(&dir.join("mask.png"), None, &limits()))
 }
 
 fn exr(dir: &Path, bytes: &[u8]) -> String {
     put(dir, "picture.exr", bytes);
-    let read = |channels: &[&[&str]]| told(io::read_exr(&dir.join("picture.exr"), channels, &limits()));
+    let read = |channels: &[&[&str]]| outcome(io::read_exr(&dir.join("picture.exr"), channels, &limits()));
     read(&[&["R", "G", "B"]]) + &read(&[&["Z"]])
 }
 
@@ -155,29 +155,29 @@ fn mesh(dir: &Path, bytes: &[u8]) -> String {
     if let Ok(found) = &found {
         check_around(&found.mesh, found.origin, 1.0);
     }
-    told(found)
+    outcome(found)
 }
 
 /// The material beside an OBJ.
 fn mtl(dir: &Path, bytes: &[u8]) -> String {
     put(dir, "a.obj", b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n");
     put(dir, "a.mtl", bytes);
-    told(open_mesh(&dir.join("a.obj")))
+    outcome(open_mesh(&dir.join("a.obj")))
 }
 
 /// A run's own surface, or head: each is read from files of its own.
 fn surface(dir: &Path, bytes: &[u8]) -> String {
     put(dir, "head/geometry.safetensors", bytes);
     put(dir, "head/surface.safetensors", bytes);
-    let tensors = told(io::parse_tensors(dir, bytes, &limits()));
+    let tensors = outcome(io::parse_tensors(dir, bytes, &limits()));
     let (surface, head) = (ExtractedSurface::load(&dir.join("head")), HeadMesh::load(&dir.join("head")));
-    if surface.is_ok() || head.is_ok() { tensors } else { tensors + &told(surface) + &told(head) }
+    if surface.is_ok() || head.is_ok() { tensors } else { tensors + &outcome(surface) + &outcome(head) }
 }
 
 /// A checkpoint of T-Face.
 fn tface(dir: &Path, bytes: &[u8]) -> String {
     put(dir, "head/checkpoint.safetensors", bytes);
-    told(TFace::load("tface", &dir.join("head")))
+    outcome(TFace::load("tface", &dir.join("head")))
 }
 
 /// A checkpoint of I-Face with the settings of its seeds.
@@ -185,7 +185,7 @@ fn iface(dir: &Path, bytes: &[u8]) -> String {
     put(dir, "head/checkpoint.safetensors", bytes);
     let mut config = Config::preset(Preset::Draft).iface;
     (config.steps, config.levels, config.log2_table, config.occupancy_resolution) = (2, 1, 4, 16);
-    told(IFace::load(&dir.join("head"), &config, None))
+    outcome(IFace::load(&dir.join("head"), &config, None))
 }
 
 fn config(_: &Path, bytes: &[u8]) -> String {
@@ -196,12 +196,12 @@ fn config(_: &Path, bytes: &[u8]) -> String {
         let again = Sources { files: vec![("again".into(), config.to_toml())], ..Sources::default() };
         assert_eq!(Config::resolve(&again).unwrap().to_toml(), config.to_toml());
     }
-    told(found)
+    outcome(found)
 }
 
 fn published(_: &Path, bytes: &[u8]) -> String {
     let row = ExperimentRow { table: "tface", row: "full", title: "", run: "", pictures: "" };
-    told(read_published(&text(bytes), &[row], "published.csv"))
+    outcome(read_published(&text(bytes), &[row], "published.csv"))
 }
 
 /// Records and statuses of a run, what it may cost, what it ended with, and what a page and a list say of it.
@@ -214,10 +214,10 @@ fn run(dir: &Path, bytes: &[u8]) -> String {
     put(&dir.join("run"), "failed.json", parts.next().unwrap_or_default());
     RunRow::read(&dir.join("run"), dir);
     RunStatus::read(&dir.join("run"));
-    told(read_record(&mask)) + &told(read_status(&mask)) + &told(read_estimate(&dir.join("run")))
+    outcome(read_record(&mask)) + &outcome(read_status(&mask)) + &outcome(read_estimate(&dir.join("run")))
 }
 
-/// What a run remembers of its photographs, once they are gone.
+/// The copies of its inputs that a run keeps, with the photographs removed.
 fn cameras(dir: &Path, bytes: &[u8]) -> String {
     let run = Run::quiet(&dir.join("run"));
     let mut parts = parts(bytes);
@@ -227,7 +227,7 @@ fn cameras(dir: &Path, bytes: &[u8]) -> String {
     let mut config = Config::preset(Preset::Draft);
     config.capture.path = dir.join("gone").display().to_string();
     config.device = "cpu".into();
-    told(Session::open(&config, &run))
+    outcome(Session::open(&config, &run))
 }
 
 fn camera_path(_: &Path, bytes: &[u8]) -> String {
@@ -242,5 +242,5 @@ fn camera_path(_: &Path, bytes: &[u8]) -> String {
         rotation: DMat3::IDENTITY,
         position: DVec3::ZERO,
     };
-    told(tiface::render::path::from_json(&text(bytes), &like))
+    outcome(tiface::render::path::from_json(&text(bytes), &like))
 }

@@ -26,7 +26,7 @@ pub fn capture(folder: &Path) -> PathBuf {
 pub fn tiface(folder: &Path, words: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
     command.args(words).current_dir(folder).env("XDG_CONFIG_HOME", folder).env_remove("RUST_LOG");
-    if !["report", "convert", "preview"].contains(&words[0]) {
+    if !["report", "convert", "preview", "export"].contains(&words[0]) {
         command.args(["--preset", "draft"]);
         for setting in SETTINGS.split_whitespace() {
             command.args(["--set", setting]);
@@ -84,7 +84,7 @@ pub fn is_timed(file: &Path) -> bool {
 
 /// Files of two folders with the same names and, but for times, the same bytes.
 pub fn same(new: &Files, found: &Files, what: &str) {
-    // beside a run, nobody may know whose it is; and no work ends because its log cannot be written
+    // a temporary file beside a run may belong to another process; and no work ends because its log cannot be written
     let counts =
         |f: &&PathBuf| (f.starts_with("run") || !name(f).ends_with(".tmp")) && name(f) != "log.jsonl";
     let names = |files: &Files| files.keys().filter(counts).cloned().collect::<Vec<_>>();

@@ -3,7 +3,7 @@
     python tools/fleet/check_fleet.py target/release/tiface [--kills 20] [--engine-kills 3]
 
 One head is broken on purpose, one has a stage that somebody else holds for a while. The others must come out with the
-bytes of runs that nobody disturbed, the broken one must be named with its cause, nothing that was done may be done
+bytes of undisturbed runs, the broken one must be named with its cause, nothing that was done may be done
 again.
 Before that the paper's tables are planned on a GPU, a head is mended between two plans, and a task waits for a GPU that
 somebody else holds.
@@ -99,10 +99,10 @@ def planned(engine, captures, runs, tiface, config):
     words = [*engine, "--resources", "gpu=1", "--dry-run", "--printshellcmds", "--config", f"captures={captures}"]
     words += [f"runs={runs}", f"tiface={tiface}", "gpus=1", "experiment=components", "scale=0.01"]
     words += [f"options=--preset draft --config {config}"]
-    told = subprocess.run(words, capture_output=True, text=True, cwd=captures.parent)
-    assert told.returncode == 0, told.stdout + told.stderr
-    rows = re.findall(r"^ *wildcards: row=(\S+)$", told.stdout + told.stderr, re.M)
-    devices = re.findall(r" (\w+) CAPTURE .*--device (\w+)", told.stdout + told.stderr)
+    plan = subprocess.run(words, capture_output=True, text=True, cwd=captures.parent)
+    assert plan.returncode == 0, plan.stdout + plan.stderr
+    rows = re.findall(r"^ *wildcards: row=(\S+)$", plan.stdout + plan.stderr, re.M)
+    devices = re.findall(r" (\w+) CAPTURE .*--device (\w+)", plan.stdout + plan.stderr)
     return sorted(rows), dict(devices)
 
 
@@ -187,7 +187,7 @@ def main():
     folder = options.keep or Path(tempfile.mkdtemp(prefix="fleet-"))
     folder.mkdir(parents=True, exist_ok=True)
     chance = random.Random(options.seed)
-    os.environ["XDG_CONFIG_HOME"] = str(folder)  # nobody's own settings
+    os.environ["XDG_CONFIG_HOME"] = str(folder)  # no settings of the user
     config = folder / "heads.toml"
     config.write_text(SETTINGS)
     words = ["--preset", "draft", "--config", str(config), "--set", "render.method=tface,volume,raycast"]
@@ -305,10 +305,10 @@ def main():
     look()
     print(f"{kills} tasks and {engine_kills} engines killed; the engine ended with {code}")
 
-    told = run("status", *[runs / head for head in HEADS], "--json", check=False)
-    objects = [o for o in map(json.loads, told.stdout.splitlines()) if "run" in o]  # and one for the exit code
+    listed = run("status", *[runs / head for head in HEADS], "--json", check=False)
+    objects = [o for o in map(json.loads, listed.stdout.splitlines()) if "run" in o]  # and one for the exit code
     states = {Path(o["run"]).name: o for o in objects}
-    assert told.returncode == 3, told.stderr
+    assert listed.returncode == 3, listed.stderr
     for head in good:
         assert states[head]["state"] == "done", states[head]
         ours, theirs = products(runs / head), products(alone / head)

@@ -28,7 +28,7 @@ def main():
     parser.add_argument("capture", type=Path)
     parser.add_argument("--heads", type=int, default=4)
     parser.add_argument("--jobs", type=int, nargs="+", default=[1, 2, 4])
-    # all after `--` is for the program: argparse would give what stands there to its own options, or to nobody
+    # all after `--` is for the program: argparse would take some of it for its own options
     words = sys.argv[1:]
     end = words.index("--") if "--" in words else len(words)
     arguments, options = parser.parse_args(words[:end]), words[end + 1 :]

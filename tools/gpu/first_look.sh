@@ -96,8 +96,9 @@ capture() {
 }
 
 photographs=(--size 256x320 --views 32)
-# Settings under which every stage takes seconds
-tiny=(--preset draft --set iface.steps=4 --set iface.samples=4096 --set iface.levels=6 --set iface.log2_table=12
+# Settings under which every stage takes seconds; an update of the occupancy grid evaluates the field in each of its cells.
+tiny=(--preset draft --set iface.steps=4 --set iface.samples=1024 --set iface.levels=6 --set iface.log2_table=12
+  --set iface.occupancy_resolution=32
   --set tface.steps=4 --set tface.fields=1 --set tface.rays=256 --set tface.voxels_start=4096 --set tface.voxels_final=13824
   --set baseline.steps=4 --set mesh.resolution=48
   --set mesh.texture_px=256 --set mesh.triangles=4000)

@@ -127,9 +127,9 @@ def cluster(guide, body, folder, environment):
             # that the recipe is asked for each task's threads, memory, time and words
             line = line.replace("=/data/", "=") + " --dry-run --forceall --printshellcmds"
             done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True)
-            told = done.stdout + done.stderr
-            assert done.returncode == 0, f"{guide.name}: `{line}` ended with {done.returncode}\n{told}"
-            assert " iface CAPTURE " in told and "--device wgpu" in told and "gpu=1" in told, told
+            answer = done.stdout + done.stderr
+            assert done.returncode == 0, f"{guide.name}: `{line}` ended with {done.returncode}\n{answer}"
+            assert " iface CAPTURE " in answer and "--device wgpu" in answer and "gpu=1" in answer, answer
         elif words[:3] == ["kubectl", "apply", "-f"]:
             import yaml  # comes with the engine, which a guide installs first
 

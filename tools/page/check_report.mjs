@@ -120,7 +120,7 @@ try {
     }));
   }
   const order = reached.map((r) => r.what);
-  for (const what of ["viewer-mode", "camera", "reset", "full", "CANVAS", "method", "what", "range", "SUMMARY", "A"]) {
+  for (const what of ["viewer-mode", "camera", "measure", "save", "reset", "full", "CANVAS", "method", "what", "range", "SUMMARY", "A"]) {
     check(`Tab reaches ${what}`, order.includes(what), order.join(" "));
   }
   same("the focus is always seen", reached.filter((r) => r.what !== "BODY" && !r.seen), []);
@@ -173,6 +173,36 @@ try {
   await page.waitForTimeout(500);
   same("nothing is drawn while nothing changes", await page.evaluate(() => document.querySelector(".viewer").viewer.drawn()), drawn);
 
+  // the distance between two points, by keys and by clicks
+  await page.click(".reset");
+  await canvas.focus();
+  const distance = page.locator(".viewer .distance");
+  await page.keyboard.press("m");
+  await page.keyboard.press("Enter");
+  same("a point is marked", await page.locator(".mark:visible").count(), 1);
+  await page.mouse.click(middle[0], middle[1] - box.height / 8);
+  await settled(page);
+  // the head fills 95 % of the canvas: an eighth of its height, on a surface that may slant
+  const millimetres = parseFloat(await distance.textContent()), tall = await page.evaluate(() => {
+    const { viewer } = document.querySelector(".viewer");
+    return 2000 * Math.tan(viewer.state.angle / 2) * viewer.state.distance / 8;
+  });
+  check(`two points are ${await distance.textContent()} apart`, millimetres > 0.5 * tall && millimetres < 3 * tall, `about ${tall.toFixed(1)}`);
+  same("both are marked", await page.locator(".mark:visible").count(), 2);
+  const marks = await page.locator(".mark").evaluateAll((all) => all.map((m) => {
+    const { left, top, width, height } = m.getBoundingClientRect();
+    return [left + width / 2, top + height / 2];
+  }));
+  check("marks lie on their points", Math.hypot(marks[0][0] - middle[0], marks[0][1] - middle[1]) < 2
+    && Math.hypot(marks[1][0] - middle[0], marks[1][1] - middle[1] + box.height / 8) < 2, JSON.stringify([marks, middle]));
+  await page.screenshot({ path: at("report_measure.png") });
+  await page.keyboard.press("m");
+  same("nothing is left of it", [await page.locator(".mark:visible").count(), await distance.textContent()], [0, ""]);
+  // the file of the page
+  const [download] = await Promise.all([page.waitForEvent("download"), page.click(".save")]);
+  const saved = await readFile(await download.path());
+  same("Save GLB saves a GLB", [download.suggestedFilename(), saved.subarray(0, 4).toString(), saved.readUInt32LE(8)], ["head.glb", "glTF", saved.length]);
+
   // the photographs and what is beside them
   const shownOf = () => page.evaluate(() => [...document.querySelectorAll(".view:first-child .over img")].filter((i) => !i.hidden)
     .map((i) => [i.dataset.method, i.dataset.what]));
@@ -180,6 +210,15 @@ try {
   for (const method of methods) {
     await page.check(`[name=method][value=${method}]`);
     same(`${method} is shown`, await shownOf(), [[method, "picture"]]);
+  }
+  if (methods.length > 1) {
+    const leftOf = () => page.locator(".pair .left").first().evaluate((i) => !i.hidden && i.alt.length > 0 && i.naturalWidth > 0);
+    same("the photograph is on the left", await leftOf(), false);
+    await page.selectOption("[name=left]", methods[0]);
+    await settled(page);
+    same("another picture is on the left", await leftOf(), true);
+    await page.selectOption("[name=left]", "");
+    same("the photograph is on the left again", await leftOf(), false);
   }
   if (methods.length) {
     await page.check("[name=what][value=error]");
@@ -243,6 +282,46 @@ try {
     same("nothing to scroll sideways", await many.page.evaluate(() => document.documentElement.scrollWidth <= innerWidth), true);
     await many.page.screenshot({ path: at("runs.png"), fullPage: true });
     await finish(many, "many runs");
+
+    // five hundred of them, with the names of failed ones
+    const page = (await readFile(at("runs.html"), "utf8")).replace(/<tbody>([\s\S]*?<\/tr>)[\s\S]*<\/tbody>/, (_, row) => {
+      const rows = Array.from({ length: 500 }, (_, i) => row.replace(/(<th scope="row">.*?>)[^<]+(<)/, `$1head ${i}$2`)
+        .replace(/data-state="\w+"/, `data-state="${i % 50 ? "done" : "failed"}"`));
+      return `<tbody>${rows.join("")}</tbody>`;
+    });
+    check(`500 runs have ${(page.length / 1e6).toFixed(2)} MB`, page.length < 6e6, "6 MB at most");
+    await writeFile(path.join(folder, "runs.html"), page);
+    for (const [width, scheme] of [[1400, "light"], [400, "dark"]]) {
+      const fleet = await open(`fleet ${width}`, { viewport: { width, height: 800 }, colorScheme: scheme });
+      const begin = Date.now();
+      await fleet.page.goto(pathToFileURL(path.join(folder, "runs.html")).href);
+      const rows = () => fleet.page.evaluate(() => [...document.querySelectorAll("tbody tr")].filter((r) => !r.hidden).map((r) => r.children[1].textContent));
+      const names = (from, to) => Array.from({ length: to - from }, (_, i) => `head ${from + i}`);
+      same("a page of runs", await rows(), names(0, 25));
+      console.log(`     500 runs, ${width} pixels: ready after ${Date.now() - begin} ms`);
+      check("at most three screens", await fleet.page.evaluate(() => document.documentElement.scrollHeight) <= 3 * 800);
+      same("nothing to scroll sideways", await fleet.page.evaluate(() => document.documentElement.scrollWidth <= innerWidth), true);
+      // keys alone
+      await fleet.page.locator(".next").focus();
+      await fleet.page.keyboard.press("Enter");
+      same("the next page", await rows(), names(25, 50));
+      await fleet.page.locator("[name=search]").focus();
+      await fleet.page.keyboard.type("head 49");
+      same("a search", await rows(), names(0, 500).filter((name) => name.includes("49")));
+      await fleet.page.keyboard.type(" nothing");
+      same("a search for nothing", [await rows(), await fleet.page.locator(".shown").textContent()], [[], "no run"]);
+      await fleet.page.locator("[name=search]").fill("");
+      await fleet.page.selectOption("[name=state]", "failed");
+      same("failed runs", await rows(), Array.from({ length: 10 }, (_, i) => `head ${50 * i}`));
+      const sticky = await fleet.page.evaluate(() => {
+        document.querySelector(".scroll").scrollTo(0, 300);
+        const [heading, scroll] = ["thead th", ".scroll"].map((q) => document.querySelector(q).getBoundingClientRect().top);
+        return Math.abs(heading - scroll) < 3;
+      });
+      same("the heading stays", sticky, true);
+      await fleet.page.screenshot({ path: at(`runs_500_${width}.png`) });
+      await finish(fleet, `500 runs, ${width} pixels`);
+    }
   }
 } finally {
   await close();

@@ -2,14 +2,14 @@
 
     cargo run --example textured_sphere -- DIR
     python3.11 -m venv .venv-blender && .venv-blender/bin/pip install -r tools/readers/requirements-blender.txt
-    .venv-blender/bin/python tools/readers/check_blender.py DIR/globe.glb [--up 0 0 1] [--unit-m 1]
+    .venv-blender/bin/python tools/readers/check_blender.py DIR/globe.glb [--up 0 0 1] [--unit-m 1] [--lit]
 
 The .obj and .ply are looked for beside the .glb; those that are not there are passed over aloud. Truth
 is the box that the GLB's own header gives, moved by its node. Blender is +Z up and turns GLB and OBJ,
 (x, y, z) to (x, -z, y), so heads stand upright; it does not turn PLY, which is in the dataset's world.
 Checked: the box to 1e-6 of its size, closed after welding equal positions, positive volume. With a
 texture: coordinates on every corner, the picture equal to the .png to the pixel, the material of the
-GLB unlit (Blender gives it emission). Exits 1 after printing every disagreement.
+GLB unlit (Blender gives it emission), or lit with --lit. Exits 1 after printing every disagreement.
 """
 
 import argparse
@@ -100,6 +100,7 @@ def main():
     arguments.add_argument("glb", type=pathlib.Path)
     arguments.add_argument("--up", type=float, nargs=3, default=[0, 0, 1])
     arguments.add_argument("--unit-m", type=float, default=1.0)
+    arguments.add_argument("--lit", action="store_true", help="the material of the GLB is lit")
     arguments.add_argument("--picture", type=pathlib.Path, help="instead of the .png beside the .glb")
     arguments = arguments.parse_args()
     header = header_of(arguments.glb)
@@ -138,8 +139,8 @@ def main():
             said += f"  picture equal {same}  unlit {unlit}"
             if not same:
                 bad.append(f"its picture is not that of {beside.name}")
-            if ending == ".glb" and not unlit:
-                bad.append("its material is lit")
+            if ending == ".glb" and unlit == arguments.lit:
+                bad.append("its material is unlit" if unlit else "its material is lit")
         print(f"{path.name:20} in Blender {bpy.app.version_string}: {said}  volume {volume:.9f}")
         wrong += [f"{path.name}: {line}" for line in bad]
     for line in wrong:

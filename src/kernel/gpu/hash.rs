@@ -13,6 +13,15 @@ const GROUP: u32 = 256;
 /// Number of groups of threads that compute the bound on the sums of a level.
 const BOUNDING: usize = 64;
 
+/// Largest number of groups of threads that interpolate a level, or add to it: enough to fill a large card. They step
+/// through the samples, since their capacity is several times their usual number, and idle groups cost time, too.
+const STEPPING: u32 = 128;
+
+/// Returns the groups that step through `capacity` samples of so many levels.
+fn stepping_groups(capacity: usize, levels: usize) -> CubeCount {
+    CubeCount::Static((capacity as u32).div_ceil(GROUP).min(STEPPING), levels as u32, 1)
+}
+
 /// Number of words that describe a level: scale, resolution, entries, offset, whether it is hashed.
 const LEVEL: usize = 5;
 
@@ -88,10 +97,10 @@ fn gather(
     #[comptime] slopes: bool,
 ) {
     let capacity = capacity as usize;
-    let s = ABSOLUTE_POS_X as usize;
     let level = CUBE_POS_Y as usize;
     let end = (count[0] as usize).div_ceil(TILE) * TILE;
-    if s < min(end, capacity) {
+    let step = CUBE_COUNT_X as usize * GROUP as usize;
+    for s in range_stepped(ABSOLUTE_POS_X as usize, min(end, capacity), step) {
         let mut v = Vector::<f32, Const<2>>::new(0.0f32);
         let mut jx = Vector::<f32, Const<2>>::new(0.0f32);
         let mut jy = Vector::<f32, Const<2>>::new(0.0f32);
@@ -141,9 +150,10 @@ fn scatter<S: Sum>(
     #[comptime] slopes: bool,
 ) {
     let capacity = capacity as usize;
-    let s = ABSOLUTE_POS_X as usize;
     let level = CUBE_POS_Y as usize;
-    if s < count[0] as usize {
+    let unit = units[level];
+    let step = CUBE_COUNT_X as usize * GROUP as usize;
+    for s in range_stepped(ABSOLUTE_POS_X as usize, min(count[0] as usize, capacity), step) {
         let cell = cell(levels, level, x, s, capacity, world);
         let plane = 2 * level * capacity + s;
         let (g0, g1) = (g_value[plane], g_value[plane + capacity]);
@@ -160,7 +170,6 @@ fn scatter<S: Sum>(
             q0 = q[plane];
             q1 = q[plane + capacity];
         }
-        let unit = units[level];
         #[unroll]
         for k in 0..8u32 {
             let (ux, uy, uz) = comptime!((k & 1 == 1, k & 2 == 2, k & 4 == 4));
@@ -285,7 +294,7 @@ impl Grid {
         jacobian: Option<&Buffer>,
     ) {
         let capacity = x.words() / 3;
-        let groups = CubeCount::Static((capacity as u32).div_ceil(GROUP), self.count as u32, 1);
+        let groups = stepping_groups(capacity, self.count);
         launch!(device, gather::launch, groups, GROUP;
             table, self.levels, x, count, value, jacobian.unwrap_or(value);
             capacity as u32, self.active as u32, self.world, jacobian.is_some()
@@ -325,7 +334,7 @@ impl Grid {
             Atomics::Exchange => scatter::launch::<Exchange>,
             Atomics::Fixed => scatter::launch::<Fixed>,
         };
-        let groups = CubeCount::Static((capacity as u32).div_ceil(GROUP), self.active as u32, 1);
+        let groups = stepping_groups(capacity, self.active);
         launch!(device, scatter, groups, GROUP;
             gradient, self.levels, x, count, g_value, q, g_normal, self.units;
             capacity as u32, self.world, slopes.is_some()

@@ -5,16 +5,13 @@
 //! The nodes of fitted colors: the vertices of a mesh, or the texels of its atlas.
 
 use crate::geom::{Atlas, Bvh, Camera, Hit, Mesh, area_vector, bilinear_taps};
-use crate::image::{Gray, Image, Photo, eroded};
+use crate::image::{Gray, Image, OPAQUE_ALPHA, Photo, eroded};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 use std::ops::Deref;
 
 /// Rays along each side of a pixel.
 const SIDE: u32 = 2;
-
-/// Mask from which on a pixel shows the head alone: matting and lossy masks rarely say 255 everywhere.
-const OPAQUE: u8 = 250;
 
 /// Rays of a pixel.
 const RAYS: usize = (SIDE * SIDE) as usize;
@@ -36,7 +33,7 @@ impl Photograph<'_> {
     /// Returns whether a pixel shows the head alone. Soft pixels also show the background, and would paint
     /// the outline with it.
     fn is_head(&self, at: usize) -> bool {
-        self.mask.is_none_or(|m| m.values[at] >= OPAQUE) && self.valid.is_none_or(|v| v.values[at] > 0)
+        self.mask.is_none_or(|m| m.values[at] >= OPAQUE_ALPHA) && self.valid.is_none_or(|v| v.values[at] > 0)
     }
 
     /// Returns the usable pixels within `margin` pixels of the mask's outline.

@@ -271,6 +271,31 @@ fn the_face_stands_upright_in_the_texture() {
     }
 }
 
+#[test]
+fn the_cap_of_a_head_takes_little_of_the_texture() {
+    // a sphere down to 120 degrees from its pole, on a fan: of the surface 0.75 pi of (3 + 0.75) pi is flat
+    let mut mesh = sphere(40, 80);
+    for p in &mut mesh.positions {
+        let polar = p.y.acos() * (40.0 / 39.0) * (2.0 / 3.0);
+        *p = Vec3::new(p.x, 0.0, p.z).normalize_or_zero() * polar.sin() + polar.cos() * Vec3::Y;
+    }
+    let last = mesh.positions.len() - 1;
+    mesh.positions[last] = Vec3::new(0.0, -0.5, 0.0);
+    let share = |config: &AtlasConfig| {
+        let (atlas, _) = laid(&mesh, config);
+        let area = |t: usize| {
+            let [a, b, c] = atlas.triangles[t].map(|i| atlas.uvs[i as usize]);
+            (b - a).perp_dot(c - a).abs()
+        };
+        let is_flat = |t: &usize| mesh.triangles[*t].contains(&(last as u32));
+        let count = mesh.triangles.len();
+        (0..count).filter(is_flat).map(area).sum::<f32>() / (0..count).map(area).sum::<f32>()
+    };
+    let whole = share(&config(512));
+    let head = share(&AtlasConfig { front: Some(Vec3::Z), up: Some(Vec3::Y), ..config(512) });
+    assert!((whole - 0.2).abs() < 0.02 && head < 0.03, "{whole} {head}");
+}
+
 /// A bumpy ball of 200,000 triangles.
 #[test]
 #[ignore = "slow: about four seconds"]

@@ -17,6 +17,7 @@
 
 use super::BATCH;
 use super::loops::{Loop, LoopFinder};
+use crate::error::counted;
 use crate::geom::{Aabb, Boxes, Bvh, DBox, Effort, Mesh, SdfField, area_vector, intersect, topology};
 use crate::mesh::check_len;
 use crate::{Monitor, Result};
@@ -63,11 +64,10 @@ impl HandleReport {
         };
         (!self.cut.is_empty() || !self.filled.is_empty()).then(|| {
             format!(
-                "the surface had loops: {} cut{}, {} hole{} filled{}, {} left; `mesh.genus = \"keep\"` keeps all",
+                "the surface had loops: {} cut{}, {} filled{}, {} left; `mesh.genus = \"keep\"` keeps all",
                 self.cut.len(),
                 list(&self.cut),
-                self.filled.len(),
-                if self.filled.len() == 1 { "" } else { "s" },
+                counted(self.filled.len(), "hole"),
                 list(&self.filled),
                 self.left
             )

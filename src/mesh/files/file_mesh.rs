@@ -23,8 +23,9 @@
 //! carries the same ones: `TANGENT` holds the direction of growing u and a sign w, and the bitangent
 //! `w · (n × t)` points up the picture (towards smaller v, since our v runs down).
 
+use crate::geom::sphharm::rotated;
 use crate::geom::{Atlas, Mesh, ShellLayer, Shells, Similarity};
-use crate::image::Photo;
+use crate::image::{Image, Photo, reduce_photo, reduce_to_rows, working_size};
 use crate::mesh::check_indices;
 use crate::{Error, Result, io};
 use bevy_mikktspace::{Geometry, TangentSpace, generate_tangents};
@@ -375,10 +376,42 @@ pub struct Lobes {
     pub asset_from_world: Mat3,
 }
 
+impl Lobes {
+    /// Returns the same lobes in the coordinates of other files, as sRGB-coded differences: one picture a function.
+    pub fn turned(&self, asset_from_world: Mat3) -> Vec<Image> {
+        let matrix = rotated(self.pictures.len(), self.asset_from_world * asset_from_world.transpose());
+        let turned = |j: usize| {
+            let Photo { width, height, .. } = self.pictures[j];
+            let mut image = Image::new(width, height, 3);
+            for (k, picture) in self.pictures.iter().enumerate() {
+                let step = matrix[k][j] * self.scale[k] / 127.0;
+                let bytes = picture.rgb.as_flattened();
+                image.data.iter_mut().zip(bytes).for_each(|(sum, &b)| *sum += step * (f32::from(b) - 128.0));
+            }
+            image
+        };
+        (0..self.pictures.len()).map(turned).collect()
+    }
+}
+
 impl HeadTexture {
     /// Returns a texture of a base color alone.
     pub fn new(atlas: Atlas, color: Photo) -> HeadTexture {
         HeadTexture { atlas, color, normal: None, lobes: None }
+    }
+
+    /// Returns the texture with pictures whose longest side is at most `px`, those of lobes at most `lobe_px`: averaged,
+    /// colors in linear light.
+    pub fn reduced(self, px: u32, lobe_px: u32) -> HeadTexture {
+        let smaller = |photo: &Photo, px| reduce_photo(photo, working_size(photo.width, photo.height, px));
+        let color = reduce_to_rows(&self.color, working_size(self.color.width, self.color.height, px).1);
+        let normal = self.normal.map(|normal| smaller(&normal, px));
+        let lobes = self.lobes.map(|lobes| Lobes {
+            pictures: lobes.pictures.iter().map(|picture| smaller(picture, lobe_px)).collect(),
+            ..lobes
+        });
+        let atlas = Atlas { width: color.width, height: color.height, ..self.atlas };
+        HeadTexture { atlas, color, normal, lobes }
     }
 
     /// Returns the pictures of the lobes, if the texture has any.
@@ -599,6 +632,29 @@ pub(super) mod tests {
 
     fn triangle() -> Mesh {
         Mesh { positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y], triangles: vec![[0, 1, 2]], ..Mesh::default() }
+    }
+
+    #[test]
+    fn a_smaller_texture_averages_light_and_other_values_as_they_are() {
+        // columns of black and white, and of lobes and normals of the same bytes
+        let photo = Photo {
+            width: 4,
+            height: 2,
+            rgb: (0..8).map(|i| [if i % 2 == 0 { 0 } else { 255 }; 3]).collect(),
+            alpha: None,
+        };
+        let lobes =
+            Lobes { pictures: vec![photo.clone()], scale: vec![0.5], asset_from_world: Mat3::IDENTITY };
+        let atlas = Atlas { width: 4, height: 2, ..Atlas::default() };
+        let texture =
+            HeadTexture { atlas, color: photo.clone(), normal: Some(photo.clone()), lobes: Some(lobes) };
+        let small = texture.clone().reduced(2, 2);
+        // half of the light is 188 in sRGB
+        assert_eq!((small.color.width, small.color.height, &small.color.rgb[..]), (2, 1, &[[188; 3]; 2][..]));
+        assert_eq!((small.atlas.width, small.atlas.height), (2, 1));
+        assert_eq!(small.normal.unwrap().rgb, [[128; 3]; 2]);
+        assert_eq!(small.lobes.unwrap().pictures[0].rgb, [[128; 3]; 2]);
+        assert_eq!(texture.clone().reduced(4, 9), texture);
     }
 
     #[test]

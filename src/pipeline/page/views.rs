@@ -3,19 +3,19 @@
 //! Also the 3D viewer of a page: a copy of the head that is small enough, and the cameras of the photographs.
 
 use crate::capture::{Split, View};
-use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, called};
-use crate::geom::{Atlas, Camera, Similarity};
+use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, ViewBackground, called};
+use crate::geom::{Camera, Similarity};
 use crate::image::{Photo, quantize, reduce_photo, working_size};
-use crate::io::{self, Limits, ReadError};
-use crate::mesh::files::{ExportOptions, HeadMesh, HeadTexture, Lobes, OpenedMesh, open_mesh, to_glb, weld};
+use crate::io::{self, Limits};
+use crate::mesh::files::{ExportOptions, HeadMesh, HeadTexture, OpenedMesh, open_mesh, to_glb, weld};
 use crate::mesh::{SimplifyConfig, simplify};
 use crate::pipeline::finish::{Export, center};
 use crate::pipeline::mesh::{finished_mesh, head_mesh};
-use crate::pipeline::metrics::{Comparable, comparable, picture_sets};
+use crate::pipeline::metrics::{Comparable, PictureSet, comparable, picture_sets};
 use crate::pipeline::pictures;
 use crate::pipeline::session::Session;
 use crate::report::{
-    HEAT, MAX_ERROR, ViewPicture, ViewRow, Viewer, ViewerCamera, link, picture_url, viewer_html,
+    HEAT, MAX_ERROR, ViewPicture, ViewRow, Viewer, ViewerCamera, picture_url, relative, viewer_html,
 };
 use crate::run::{Record, read_record};
 use crate::{Error, Quiet, Result};
@@ -31,39 +31,70 @@ const FEW_VIEWS: usize = 10;
 /// JPEG quality: about 25 kB per picture.
 const QUALITY: u8 = 84;
 
-/// Returns the views that have pictures, or else the held-out ones, in about `most` bytes; and the files of the
-/// omitted ones, relative to the run.
-pub(super) fn rows(session: &Session, most: usize) -> Result<(Vec<ViewRow>, Vec<String>)> {
+/// Pictures of one kind of the views of a capture.
+pub(in crate::pipeline) struct ShownSet<'c> {
+    /// Its name in the page, unlike the others'.
+    pub key: String,
+    /// What a person calls it.
+    pub title: String,
+    /// The pictures.
+    pub pictures: Vec<Comparable<'c>>,
+    /// Its figures, as in `metrics.json`; null if there are none.
+    pub figures: Value,
+}
+
+/// Returns the sets of pictures of a run, in pipeline order.
+pub(in crate::pipeline) fn shown_sets<'c>(session: &'c Session) -> Vec<ShownSet<'c>> {
     let Session { capture, config, run, .. } = session;
-    let sets: Vec<_> = picture_sets(config, run)
-        .into_iter()
-        .map(|set| (comparable(capture, config, &set), set.name))
-        .collect();
-    let pictures = |view: &View| -> Vec<(&Comparable, &str)> {
+    let figures =
+        io::read_json(&session.run.path("metrics/metrics.json"), &Limits::default()).unwrap_or_default();
+    let shown = |set: PictureSet| ShownSet {
+        title: called(&set.name),
+        pictures: comparable(capture, config, &set),
+        figures: figures[&set.name].clone(),
+        key: set.name,
+    };
+    picture_sets(config, run).into_iter().map(shown).collect()
+}
+
+/// Runs [`rows`] for the page in a run's folder.
+pub(super) fn rows_of_run(session: &Session, most: usize) -> Result<(Vec<ViewRow>, Vec<String>)> {
+    let background = session.config.render.background;
+    rows(&session.capture.views, background, &shown_sets(session), session.run.dir(), most)
+}
+
+/// Returns the views that have pictures, or else the held-out ones, in about `most` bytes; and the files of the
+/// omitted ones. Files are relative to `folder`, that of the page.
+pub(in crate::pipeline) fn rows(
+    views: &[View],
+    background: ViewBackground,
+    sets: &[ShownSet],
+    folder: &Path,
+    most: usize,
+) -> Result<(Vec<ViewRow>, Vec<String>)> {
+    let pictures = |view: &View| -> Vec<(&Comparable, &ShownSet)> {
         sets.iter()
-            .filter_map(|(set, name)| Some((set.iter().find(|c| c.view.name == view.name)?, name.as_str())))
+            .filter_map(|set| Some((set.pictures.iter().find(|c| c.view.name == view.name)?, set)))
             .collect()
     };
-    let all: Vec<(&View, Vec<(&Comparable, &str)>)> =
-        session.capture.views.iter().map(|view| (view, pictures(view))).collect();
+    let all: Vec<(&View, Vec<(&Comparable, &ShownSet)>)> =
+        views.iter().map(|view| (view, pictures(view))).collect();
     let evaluated = all.iter().any(|(_, p)| !p.is_empty());
     let shown: Vec<_> = all
         .into_iter()
         .filter(|(v, p)| if evaluated { !p.is_empty() } else { v.split != Split::Train })
         .collect();
     let side = if shown.len() > FEW_VIEWS { SIDE_PX.1 } else { SIDE_PX.0 };
-    let figures =
-        io::read_json(&session.run.path("metrics/metrics.json"), &Limits::default()).unwrap_or_default();
     let (mut rows, mut left_out, mut bytes) = (Vec::new(), Vec::new(), 0);
     // few at a time: large photographs fill the memory
     for part in shown.chunks(4) {
         if bytes >= most {
             left_out.extend(
-                part.iter().flat_map(|(_, pictures)| pictures).map(|(c, _)| relative(session, &c.file)),
+                part.iter().flat_map(|(_, pictures)| pictures).map(|(c, _)| relative(&c.file, folder)),
             );
             continue;
         }
-        let made = part.par_iter().map(|(view, pictures)| row(session, view, pictures, side, &figures));
+        let made = part.par_iter().map(|(view, pictures)| row(view, background, pictures, side, folder));
         for row in made.collect::<Result<Vec<_>>>()? {
             bytes += row.photo.len();
             bytes += row.pictures.iter().map(|p| p.picture.len() + p.error.len()).sum::<usize>();
@@ -80,49 +111,39 @@ pub(super) fn rows(session: &Session, most: usize) -> Result<(Vec<ViewRow>, Vec<
     Ok((rows, left_out))
 }
 
-/// Returns the URL of a file of the run.
-fn relative(session: &Session, file: &Path) -> String {
-    link(&file.strip_prefix(session.run.dir()).unwrap_or(file).to_string_lossy())
-}
-
 fn row(
-    session: &Session,
     view: &View,
-    files: &[(&Comparable, &str)],
+    background: ViewBackground,
+    files: &[(&Comparable, &ShownSet)],
     side: u32,
-    figures: &Value,
+    folder: &Path,
 ) -> Result<ViewRow> {
-    let render = &session.config.render;
     let loaded = view.load(&Limits::default())?;
-    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), render.background);
+    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), background);
     let size = working_size(photo.width, photo.height, side);
     let url = |picture: &Photo| -> Result<String> {
         let picture = straightened(reduce_photo(picture, size), &view.camera);
         Ok(picture_url(&io::jpeg_bytes(&picture, QUALITY, Path::new(&view.name))?))
     };
     let mut pictures = Vec::new();
-    for (file, method) in files {
-        let found = pictures::read(&file.file, render.format)?;
-        if (found.width, found.height) != (photo.width, photo.height) {
-            let size = format!("{} × {} pixels", found.width, found.height);
-            return Err(ReadError::value(&file.file, "size", size, "that of its photograph").into());
-        }
+    for (file, set) in files {
+        let found = pictures::read_like(&file.file, &photo)?;
         let shown = |p: &[f32; 4]| [p[0], p[1], p[2]].map(quantize);
         let rgb: Vec<[u8; 3]> = found.data.as_chunks::<4>().0.iter().map(shown).collect();
         let apart: Vec<[u8; 3]> = rgb.iter().zip(&photo.rgb).map(|(a, b)| error(*a, *b)).collect();
         let like = |rgb| Photo { rgb, alpha: None, ..photo };
         let mut error = reduce_photo(&like(apart), size);
         error.rgb.iter_mut().for_each(|p| *p = heat(p[0] as f32 / 255.0));
-        let views = figures[method].pointer("/head/views").and_then(Value::as_array);
+        let views = set.figures.pointer("/head/views").and_then(Value::as_array);
         let own = views.and_then(|views| views.iter().find(|v| v["name"] == view.name.as_str()));
         let psnr = own.and_then(|v| v["psnr_masked"].as_f64().or(v["psnr"].as_f64()));
         pictures.push(ViewPicture {
-            method: method.to_string(),
-            title: called(method),
+            method: set.key.clone(),
+            title: set.title.clone(),
             picture: url(&like(rgb))?,
             error: url(&error)?,
             psnr: psnr.map(|p| format!("{p:.1}")).unwrap_or_default(),
-            file: relative(session, &file.file),
+            file: relative(&file.file, folder),
         });
     }
     Ok(ViewRow { name: view.name.clone(), width: size.0, height: size.1, photo: url(&photo)?, pictures })
@@ -245,8 +266,10 @@ pub fn head_page(session: &Session) -> Result<String> {
     let (mut viewer, file_from_world) = shown(session, &finished_mesh(session.run.dir())?)?;
     let most = super::MAX_BYTES.saturating_sub(viewer.glb.len().div_ceil(3) * 4);
     // without photographs the page still shows the head
-    let (mut rows, _) =
-        if session.inputs.missing_capture.is_none() { rows(session, most)? } else { Default::default() };
+    let (mut rows, _) = match session.inputs.missing_capture {
+        None => rows_of_run(session, most)?,
+        Some(_) => Default::default(),
+    };
     rows.iter_mut().for_each(|row| row.pictures.clear());
     viewer.cameras = cameras(session, &rows, &file_from_world);
     viewer_html(&viewer, &rows)
@@ -295,7 +318,7 @@ fn small(
     path: &Path,
     as_glb: impl Fn(&HeadMesh) -> Result<Vec<u8>>,
 ) -> Result<(Vec<u8>, String)> {
-    head.texture = head.texture.map(reduced);
+    head.texture = head.texture.map(|t| HeadTexture { normal: None, ..t }.reduced(COLOR_PX, LOBE_PX));
     let copy = as_glb(&head)?;
     if copy.len() <= MAX_BYTES {
         return Ok((copy, String::new()));
@@ -331,18 +354,6 @@ fn small(
         return Err(Error::cannot(format!("`{}` is too large for a page", path.display()), hint));
     }
     Ok((copy, format!("A copy of {after} of the {before} triangles, with colors at its vertices.")))
-}
-
-/// Returns a texture with smaller pictures, and without a normal map.
-fn reduced(texture: HeadTexture) -> HeadTexture {
-    let smaller = |photo: &Photo, side| reduce_photo(photo, working_size(photo.width, photo.height, side));
-    let color = smaller(&texture.color, COLOR_PX);
-    let lobes = texture.lobes.map(|lobes| Lobes {
-        pictures: lobes.pictures.iter().map(|picture| smaller(picture, LOBE_PX)).collect(),
-        ..lobes
-    });
-    let atlas = Atlas { width: color.width, height: color.height, ..texture.atlas };
-    HeadTexture { atlas, color, normal: None, lobes }
 }
 
 /// Returns the nearest texel, coded.

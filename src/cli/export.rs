@@ -1,0 +1,95 @@
+//! `tiface export`: writes the finished mesh of a run again.
+
+use super::Invocation;
+use super::options::{KeyOption, RunTarget};
+use super::out::{Out, require_outside, write_head};
+use super::screen::print;
+use crate::config::{Config, MeshFormat};
+use crate::pipeline::KeptHead;
+use crate::{Error, Quiet, Result, io};
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+/// Writes the mesh of a run with the settings `keys`; `lists_formats` if they name formats.
+pub(super) fn run(
+    invocation: &Invocation,
+    path: Option<&Path>,
+    lists_formats: bool,
+    keys: &[KeyOption],
+) -> Result<()> {
+    let (common, screen) = (invocation.common, &invocation.screen);
+    let out = Out::find(common.out.as_deref(), "export")?;
+    let target = RunTarget::find(common, path)?;
+    let Some(saved) = &target.saved else {
+        let what = format!("`{}` is not a run", path.unwrap_or(&target.run).display());
+        return Err(Error::usage(what, "name the folder of a run"));
+    };
+    if target.guessed {
+        screen.note("run", &format!("using `{}`", target.run.display()));
+    }
+    let asked = common.resolve(Some(saved), None, keys)?;
+    let files = destinations(out.as_ref(), &target.run, lists_formats, &asked)?;
+    files.iter().try_for_each(|(file, _)| require_outside(file, &target.run))?;
+    let formats: Vec<MeshFormat> = files.iter().map(|(_, format)| *format).collect();
+    let mut head = KeptHead::read(&target.run, &Config::read(saved)?)?.changed(&asked, &formats, &Quiet)?;
+    let mut warn = |warning: &str| screen.note("export: warning", warning);
+    std::mem::take(&mut head.warnings).iter().for_each(|w| warn(w));
+    for (file, _) in &files {
+        let (shown, triangles) = (file.display(), head.triangles());
+        match (common.dry_run, io::exists(file)) {
+            (true, false) => screen.note("export", &format!("would write `{shown}`, {triangles} triangles")),
+            (true, true) => screen.note("export", &format!("would replace `{shown}`, {triangles} triangles")),
+            (false, true) => screen.note("export", &format!("replaces `{shown}`")),
+            (false, false) => {}
+        }
+    }
+    if common.dry_run {
+        return Ok(());
+    }
+    out.iter().try_for_each(Out::prepare)?;
+    let mut written = Vec::new();
+    for (file, format) in &files {
+        written.extend(write_head(file, &head, *format, &mut warn)?);
+    }
+    if common.json {
+        let result =
+            json!({"event": "result", "run": target.run, "out": written, "triangles": head.triangles()});
+        print(&format!("{result}\n"))?;
+    } else if !common.quiet {
+        print(&written.iter().map(|file| format!("export    {}\n", file.display())).collect::<String>())?;
+    }
+    Ok(())
+}
+
+/// Returns the files to write with their formats: `--out`, files in its folder, or else files in the working directory with
+/// the run's name.
+fn destinations(
+    out: Option<&Out>,
+    run: &Path,
+    lists_formats: bool,
+    asked: &Config,
+) -> Result<Vec<(PathBuf, MeshFormat)>> {
+    let formats = &asked.mesh.format;
+    let named = |folder: &Path, stem: &str| {
+        let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.ending())), *format);
+        formats.iter().map(file).collect()
+    };
+    match out {
+        Some(Out::File(file, ending)) => {
+            let format =
+                MeshFormat::of_ending(ending).filter(|format| !lists_formats || formats == &[*format]);
+            let format = format.ok_or_else(|| {
+                let what =
+                    format!("`--out {}` is one .{ending}, and `--format` lists others", file.display());
+                Error::usage(what, "leave out `--format`, or end `--out` in `/` for a folder")
+            })?;
+            Ok(vec![(file.clone(), format)])
+        }
+        Some(Out::Folder(folder)) => Ok(named(folder, "head")),
+        None => {
+            let name =
+                io::real_path(run).ok().and_then(|run| Some(run.file_name()?.to_string_lossy().into_owned()));
+            Ok(named(Path::new(""), &name.unwrap_or_else(|| "head".into())))
+        }
+    }
+}

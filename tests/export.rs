@@ -1,0 +1,309 @@
+//! `tiface export` as a user runs it: the finished mesh of a run in other files, and a run that stays as it is.
+
+mod command;
+
+use command::tiface;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::geom::topology;
+use tiface::io::{Limits, parse_picture_info, read_tensors};
+use tiface::mesh::files::{HeadMesh, PictureSource, ReadMesh, ReadOptions, read_with, weld};
+
+/// A head that is learned in a few steps, and views of it that need no radiance field.
+const SETTINGS: &str = "device=cpu iface.steps=4 iface.rays=64 iface.max_rays=128 iface.samples=1024 iface.levels=4 \
+    iface.log2_table=10 iface.occupancy_resolution=16 iface.stereo=0 mesh.resolution=32 mesh.triangles=600 \
+    mesh.texture_px=128 mesh.format=glb,obj,ply render.samples=1 render.method=textured ensemble.members=";
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
+}
+
+fn worked(folder: &Path, words: &[&str]) -> String {
+    let output = tiface(folder, words);
+    assert!(output.status.success(), "{words:?}: {}", said(&output));
+    said(&output)
+}
+
+/// Makes all stages of a run, up to its metrics.
+fn finished(folder: &Path, more: &[&str]) -> PathBuf {
+    let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
+    write_capture(&folder.join("head"), &options).unwrap();
+    let mut words = vec!["run", "head", "--preset", "draft"];
+    SETTINGS.split_whitespace().chain(more.iter().copied()).for_each(|s| words.extend(["--set", s]));
+    worked(folder, &words);
+    folder.join("runs/head")
+}
+
+/// All files of a folder with their bytes.
+fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(files(&path));
+        } else {
+            found.insert(path.clone(), std::fs::read(&path).unwrap());
+        }
+    }
+    found
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let names = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap());
+    let mut names: Vec<String> = names.collect();
+    names.sort();
+    names
+}
+
+fn mesh(file: &Path) -> ReadMesh {
+    read_with(&std::fs::read(file).unwrap(), file, &ReadOptions::default()).unwrap()
+}
+
+/// The JSON of a GLB.
+fn document(file: &Path) -> serde_json::Value {
+    let glb = std::fs::read(file).unwrap();
+    let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
+    serde_json::from_slice(&glb[20..20 + length]).unwrap()
+}
+
+#[test]
+fn with_the_settings_of_the_run_the_files_are_those_of_the_stage() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &["mesh.lobes=1", "mesh.frame=head"]);
+    let before = files(&run);
+    // photographs are not asked for
+    std::fs::rename(dir.path().join("head"), dir.path().join("moved")).unwrap();
+    let output = worked(dir.path(), &["export", "runs/head", "--out", "again/"]);
+    assert_eq!(
+        names(&dir.path().join("again")),
+        ["head.glb", "head.mtl", "head.obj", "head.ply", "head.png"]
+    );
+    for (file, bytes) in files(&dir.path().join("again")) {
+        let own = run.join("mesh").join(file.file_name().unwrap());
+        assert!(before[&own] == bytes, "{} differs from the stage's", file.display());
+    }
+    assert!(output.contains("export    again/head.glb\n"), "{output}");
+    // by the ending alone, under another name, and by no option at all
+    worked(dir.path(), &["export", "runs/head", "--out", "Other.GLB", "--quiet"]);
+    let json = worked(dir.path(), &["export", "runs/head", "--format", "glb", "--json"]);
+    let json: serde_json::Value = serde_json::from_str(json.lines().last().unwrap()).unwrap();
+    assert_eq!(json["out"], serde_json::json!(["head.glb"]));
+    let again = worked(dir.path(), &["export", "runs/head", "--format", "glb", "--dry-run"]);
+    assert!(again.contains("would replace `head.glb`"), "{again}");
+    let again = worked(dir.path(), &["export", "runs/head", "--format", "glb"]);
+    assert!(again.contains("replaces `head.glb`"), "{again}");
+    for file in ["Other.GLB", "head.glb"] {
+        assert!(
+            std::fs::read(dir.path().join(file)).unwrap() == before[&run.join("mesh/head.glb")],
+            "{file}"
+        );
+    }
+    worked(dir.path(), &["check", "Other.GLB", "--require", "watertight", "--require", "sound-uv"]);
+    assert!(worked(dir.path(), &["run", "runs/head"]).contains("metrics: already done"));
+    assert!(before == files(&run), "the export has changed the run");
+}
+
+#[test]
+fn other_settings_give_what_the_stage_gives_when_it_is_made_again_with_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &[]);
+    let before = files(&run);
+    let settings =
+        ["--material", "lit", "--frame", "head", "--height", "0.3", "--set", "mesh.texture_format=jpeg"];
+    worked(dir.path(), &[&["export", "runs/head", "--out", "new/"][..], &settings].concat());
+    assert_eq!(names(&dir.path().join("new")), ["head.glb", "head.jpg", "head.mtl", "head.obj", "head.ply"]);
+    assert!(before == files(&run));
+    assert!(document(&run.join("mesh/head.glb"))["extensionsUsed"].to_string().contains("unlit"));
+    assert!(document(&dir.path().join("new/head.glb")).get("extensionsUsed").is_none());
+    // the way that empties the stage names the other one, and how much it removes
+    let other = tiface(dir.path(), &[&["mesh", "runs/head"][..], &settings].concat());
+    assert!(other.status.code() == Some(1) && said(&other).contains("`tiface export runs/head` writes"));
+    let anew = [&["mesh", "runs/head", "--fresh", "mesh"][..], &settings].concat();
+    let plan = worked(dir.path(), &[&anew[..], &["--dry-run"]].concat());
+    let bytes: usize =
+        before.iter().filter(|(f, _)| f.starts_with(run.join("mesh"))).map(|(_, b)| b.len()).sum();
+    let size = format!(" files, {:.1} MB", bytes as f64 / 1e6);
+    assert!(plan.contains("mesh     to do, afresh: removes ") && plan.contains(&size), "{plan}");
+    assert!(plan.contains("`tiface export runs/head` writes the finished mesh"), "{plan}");
+    assert!(before == files(&run));
+    let anew = worked(dir.path(), &anew);
+    assert!(
+        anew.contains("removes what is made anew or out of date: `mesh` (") && anew.contains(&size),
+        "{anew}"
+    );
+    for (file, bytes) in files(&dir.path().join("new")) {
+        let made = std::fs::read(run.join("mesh").join(file.file_name().unwrap())).unwrap();
+        assert!(made == bytes, "{} differs from the stage's", file.display());
+    }
+}
+
+#[test]
+fn a_smaller_head_is_watertight_and_keeps_its_texture() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &["mesh.normal_map=true", "mesh.lobes=1"]);
+    let before = files(&run);
+    let words = ["export", "runs/head", "--triangles", "300", "--texture", "64"];
+    worked(dir.path(), &[&words[..], &["--format", "glb,obj", "--out", "small/"]].concat());
+    worked(dir.path(), &["export", "runs/head", "--texture", "64", "--out", "coarse.glb"]);
+    worked(dir.path(), &["export", "runs/head", "--triangles", "300", "--out", "few.ply"]);
+    assert!(before == files(&run));
+    for (file, triangles) in [("small/head.glb", 300), ("small/head.obj", 300), ("coarse.glb", 600)] {
+        let found = mesh(&dir.path().join(file));
+        let closed = weld(&found.mesh);
+        assert!(closed.triangles.len() <= triangles && closed.triangles.len() > triangles * 9 / 10, "{file}");
+        assert!(closed.is_closed() && topology(&closed.positions, &closed.triangles).is_solid(), "{file}");
+        if let Some(PictureSource::Inside(picture)) = &found.picture {
+            let info = parse_picture_info(picture, Path::new(file), &Limits::default()).unwrap();
+            assert_eq!(info.size(None), (64, 64), "{file}");
+        }
+        let bars = ["manifold", "no-self-intersections", "sound-uv"];
+        let bars: Vec<&str> = bars.iter().flat_map(|bar| ["--require", bar]).collect();
+        worked(dir.path(), &[&["check", file][..], &bars].concat());
+    }
+    // a normal map, its tangents and four lobes are there as before
+    for file in ["small/head.glb", "coarse.glb"] {
+        let document = document(&dir.path().join(file));
+        assert_eq!(document["images"].as_array().unwrap().len(), 6, "{file}");
+        let attributes = &document["meshes"][0]["primitives"][0]["attributes"];
+        assert!(attributes.get("TANGENT").is_some(), "{file}");
+    }
+    let few = mesh(&dir.path().join("few.ply")).mesh;
+    assert!(few.is_closed() && few.triangles.len() <= 300 && few.colors.len() == few.positions.len());
+    // both without a texture, too
+    worked(
+        dir.path(),
+        &[
+            &["export", "runs/head", "--texture", "0", "--out", "bare.glb"][..],
+            &["--set", "mesh.lobes=0", "--set", "mesh.normal_map=false"],
+        ]
+        .concat(),
+    );
+    let bare = mesh(&dir.path().join("bare.glb"));
+    assert!(bare.picture.is_none() && bare.mesh.is_closed() && !bare.mesh.colors.is_empty());
+}
+
+#[test]
+fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &["mesh.hair=none"]);
+    std::fs::create_dir(dir.path().join("began")).unwrap();
+    std::fs::copy(run.join("config.toml"), dir.path().join("began/config.toml")).unwrap();
+    let (before, here) = (files(&run), names(dir.path()));
+    for (words, code, texts) in [
+        (&["began"][..], 1, &["`began` has no mesh yet", "tiface mesh began"][..]),
+        (&["head"], 2, &["`head` is not a run"]),
+        (&["absent"], 1, &["`absent`"]),
+        (&["--out", "head.fbx"], 2, &["end it in .glb, .obj, .ply, or in `/`"]),
+        (&["--out", "absent/head.glb"], 1, &["the folder `absent` does not exist"]),
+        (&["--out", "runs/head/mesh/head.glb"], 2, &["is inside the run"]),
+        (&["--out", "runs/head/new/"], 2, &["is inside the run"]),
+        (&["--format", "stl"], 2, &["--format stl"]),
+        (&["--format", "ply", "--out", "a.glb"], 2, &["one .glb", "--format"]),
+        (&["--material", "matte"], 2, &["--material matte"]),
+        (
+            &["--material", "lit", "--out", "a.obj"],
+            2,
+            &[".obj has no material", "`mesh.material`", "write .glb"],
+        ),
+        (&["--frame", "head", "--out", "a.ply"], 2, &[".ply has no frame", "`mesh.frame`"]),
+        (&["--texture", "64", "--out", "a.ply"], 2, &[".ply has no texture"]),
+        (
+            &["--texture", "256"],
+            2,
+            &["`mesh.texture_px` is 256", "a texture of 128", "--fresh mesh --set mesh.texture_px=256"],
+        ),
+        (&["--triangles", "90000"], 2, &["`mesh.triangles` is 90000", "a mesh of ", "--fresh mesh"]),
+        (&["--triangles", "0"], 2, &["`mesh.triangles` is 0"]),
+        (&["--hair", "shells"], 2, &["no soft layers"]),
+        (&["--set", "mesh.lobes=2"], 2, &["lobes of degree 0"]),
+        (&["--set", "mesh.normal_map=true"], 2, &["no normal map"]),
+        (&["--set", "mesh.resolution=64"], 2, &["`mesh.resolution`", "tiface mesh runs/head --fresh mesh"]),
+        (&["--set", "iface.steps=9"], 2, &["`iface.steps` affects what is made"]),
+    ] {
+        let run = if ["began", "head", "absent"].contains(&words[0]) { &[][..] } else { &["runs/head"] };
+        for dry in [&["--dry-run"][..], &[]] {
+            let output = tiface(dir.path(), &[&["export"][..], run, words, dry].concat());
+            let text = said(&output);
+            assert_eq!(output.status.code(), Some(code), "{words:?}: {text}");
+            assert!(text.contains("error: ") && text.contains("hint: "), "{words:?}: {text}");
+            texts.iter().for_each(|said| assert!(text.contains(said), "{words:?}: {text}"));
+        }
+    }
+    let plan = worked(dir.path(), &["export", "runs/head", "--format", "obj", "--dry-run"]);
+    assert!(plan.contains("would write `head.obj`"), "{plan}");
+    // one of the formats shows it: the other is named, and written
+    let mixed = worked(
+        dir.path(),
+        &["export", "runs/head", "--format", "glb,ply", "--material", "lit", "--out", "mixed/"],
+    );
+    assert!(mixed.contains(".ply has no material"), "{mixed}");
+    std::fs::remove_dir_all(dir.path().join("mixed")).unwrap();
+    assert!(before == files(&run) && here == names(dir.path()), "{:?}", names(dir.path()));
+}
+
+#[test]
+fn a_mesh_that_was_cut_or_changed_is_not_exported() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &["mesh.hair=none"]);
+    let parts = run.join("mesh/parts");
+    let export = || tiface(dir.path(), &["export", "runs/head", "--out", "out.glb"]);
+    let good = std::fs::read(run.join("mesh/head.glb")).unwrap();
+    for file in ["mesh/parts/geometry.safetensors", "mesh/parts/color.png", "cameras.json", "mesh/done.json"]
+    {
+        let path = run.join(file);
+        let whole = std::fs::read(&path).unwrap();
+        let mut changed = whole.clone();
+        // a byte within the compressed picture, or within the names of tensors
+        let at = if file.ends_with("png") { whole.len() / 2 } else { 20 };
+        changed[at] ^= 0x55;
+        for bytes in [Some(&whole[..whole.len() / 2]), Some(&changed), None] {
+            match bytes {
+                Some(bytes) => std::fs::write(&path, bytes).unwrap(),
+                None => std::fs::remove_file(&path).unwrap(),
+            }
+            let output = export();
+            let text = said(&output);
+            assert_eq!(output.status.code(), Some(1), "{file}: {text}");
+            assert!(
+                text.contains("hint: ") && (text.contains(file) || file.ends_with("done.json")),
+                "{file}: {text}"
+            );
+            assert!(!dir.path().join("out.glb").exists());
+        }
+        std::fs::write(&path, &whole).unwrap();
+    }
+    // of the right size, and readable, but not what the stage left: a triangle is turned over
+    let geometry = parts.join("geometry.safetensors");
+    let whole = std::fs::read(&geometry).unwrap();
+    let mut head = HeadMesh::load(&parts).unwrap();
+    head.mesh.triangles[7].swap(0, 1);
+    head.save(&parts).unwrap();
+    assert_eq!(std::fs::read(&geometry).unwrap().len(), whole.len());
+    assert!(read_tensors(&geometry, &Limits::default()).is_ok());
+    let output = export();
+    assert!(
+        output.status.code() == Some(1)
+            && said(&output).contains("has other contents than the stage `mesh` left"),
+        "{}",
+        said(&output)
+    );
+    std::fs::write(&geometry, &whole).unwrap();
+    // files that the export does not read are only named
+    std::fs::write(run.join("mesh/head.glb"), "cut").unwrap();
+    let output = export();
+    assert!(output.status.success() && said(&output).contains("head.glb` has 3 bytes"), "{}", said(&output));
+    assert!(std::fs::read(dir.path().join("out.glb")).unwrap() == good);
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn a_place_that_cannot_be_written_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &["mesh.hair=none"]);
+    let before = files(&run);
+    let output = tiface(dir.path(), &["export", "runs/head", "--out", "/proc/head.glb"]);
+    assert!(output.status.code() == Some(1) && said(&output).contains("`/proc"), "{}", said(&output));
+    assert!(before == files(&run));
+}

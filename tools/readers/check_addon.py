@@ -1,0 +1,112 @@
+"""Imports a run with tools/blender/tiface_import.py, without a window, and compares what Blender then has with the run.
+
+    python3.11 -m venv .venv-blender && .venv-blender/bin/pip install -r tools/readers/requirements-blender.txt
+    .venv-blender/bin/python tools/readers/check_addon.py RUN
+
+Checked: every vertex of the head is seen where the run's own cameras see it, through `mesh/surface.ply`'s world, to 0.05
+pixels; each view has its photograph; colors are shown as stored; folders that are no runs are refused in a sentence. Exits 1
+after printing every disagreement.
+"""
+
+import json
+import pathlib
+import sys
+import tempfile
+
+import bpy
+import mathutils
+import numpy
+from bpy_extras.object_utils import world_to_camera_view
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "blender"))
+import tiface_import
+
+MOST_PX = 0.05
+
+
+def matrix(columns):
+    return numpy.reshape(columns, (3, 3)).T
+
+
+def main():
+    run = pathlib.Path(sys.argv[1])
+    wrong = []
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    tiface_import.register()
+    if bpy.ops.import_scene.tiface_run(directory=str(run)) != {"FINISHED"}:
+        wrong.append("the operator did not finish")
+    scene = bpy.context.scene
+    views = tiface_import.views_of(run)
+    frames = json.loads((run / "mesh/frames.json").read_text())["file_from_world"]
+    cameras = {found.name: found for found in scene.objects if found.type == "CAMERA"}
+    if sorted(cameras) != sorted(view["name"] for view in views):
+        wrong.append(f"cameras {sorted(cameras)}")
+    (head,) = [found for found in scene.objects if found.type == "MESH" and found.parent is None]
+    local = numpy.empty(3 * len(head.data.vertices), numpy.float32)
+    head.data.vertices.foreach_get("co", local)
+    picked = local.reshape(-1, 3)[:: max(1, len(local) // 3 // 50)]
+    bpy.context.view_layer.update()
+    farthest = 0.0
+    for view in views:
+        given, camera = view["camera"], cameras[view["name"]]
+        if any(given["distortion"].values()):
+            continue
+        width, height = given["width"], given["height"]
+        scene.render.resolution_x, scene.render.resolution_y = width, height
+        for point in picked:
+            in_blender = head.matrix_world @ mathutils.Vector(point)
+            seen = world_to_camera_view(scene, camera, in_blender)
+            found = numpy.array([seen.x * width, (1 - seen.y) * height])
+            # Blender (x, y, z) is (x, z, -y) in the file; then the run's world, and its camera
+            in_file = numpy.array([in_blender.x, in_blender.z, -in_blender.y])
+            world = matrix(frames["rotation"]).T @ (in_file - frames["translation"]) / frames["scale"]
+            x, y, z = matrix(given["rotation"]).T @ (world - given["position"])
+            expected = numpy.array([given["cx"] + given["fx"] * x / -z, given["cy"] - given["fy"] * y / -z])
+            farthest = max(farthest, numpy.abs(found - expected).max())
+            if not (-width < expected[0] < 2 * width and -height < expected[1] < 2 * height):
+                wrong.append(f"{view['name']} does not look at the head: {expected}")
+                break
+        shown = [background.image for background in camera.data.background_images]
+        if len(shown) != 1 or tuple(shown[0].size) != (width, height):
+            wrong.append(f"{view['name']} has the backgrounds {[tuple(image.size) for image in shown]}")
+    print(f"{len(cameras)} cameras; {farthest:.4f} pixels at most from where the run sees {len(picked)} vertices")
+    if not farthest <= MOST_PX:
+        wrong.append(f"vertices are {farthest} pixels off, at most {MOST_PX} expected")
+    if scene.view_settings.view_transform != "Standard":
+        wrong.append(f"view transform {scene.view_settings.view_transform}")
+    # what is no run, a run cut short
+    with tempfile.TemporaryDirectory() as scratch:
+        broken = pathlib.Path(scratch) / "broken"
+        (broken / "mesh").mkdir(parents=True)
+        (broken / "mesh/head.glb").write_bytes((run / "mesh/head.glb").read_bytes())
+        (broken / "cameras.json").write_text("{")
+        # and one from before `frames.json`; nothing of them is imported
+        old = pathlib.Path(scratch) / "old"
+        (old / "mesh").mkdir(parents=True)
+        (old / "mesh/head.glb").write_bytes((run / "mesh/head.glb").read_bytes())
+        (old / "cameras.json").write_text((run / "cameras.json").read_text())
+        before = len(bpy.data.objects)
+        for folder, words in ((scratch, "holds no mesh/head.glb"), (broken, "cameras.json"), (old, "frames.json")):
+            try:
+                tiface_import.import_run(folder)
+                wrong.append(f"{folder} was imported")
+            except RuntimeError as problem:
+                if words not in str(problem):
+                    wrong.append(f"{folder}: {problem}")
+        if len(bpy.data.objects) != before:
+            wrong.append("a refused folder was imported in part")
+        # refined and fitted poses count
+        moved = {"views": [{"name": "a", "camera": {"fx": 1, "position": [0, 0, 0]}}, {"name": "b", "camera": {"position": [0, 0, 0]}}],
+                 "fit": {"cameras": [{"view": "a", "refined": {"position": [1, 2, 3]}}], "held_out": [{"view": "b", "fitted": None}]}}
+        (broken / "cameras.json").write_text(json.dumps(moved))
+        found = [view["camera"] for view in tiface_import.views_of(broken)]
+        if found != [{"fx": 1, "position": [1, 2, 3]}, {"position": [0, 0, 0]}]:
+            wrong.append(f"poses {found}")
+    tiface_import.unregister()
+    for line in wrong:
+        print("WRONG", line)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
