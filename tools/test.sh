@@ -1,35 +1,66 @@
 #!/usr/bin/env bash
-# The whole check, as the README gives it: format, lints, documentation, tests, and what independent
-# readers say about our files. Nothing is skipped in silence; any failure fails the whole.
+# The check that the README gives: every claim once, in 25 minutes on two cores from an empty folder.
 #
-#     tools/test.sh              every part
-#     tools/test.sh lint unit    only these parts, of: lint unit integration readers guides demo fuzz
+#     tools/test.sh                    the check: lint unit integration readers demo fuzz
+#     tools/test.sh lint unit          only these parts
+#     tools/test.sh unit NAME...       only tests whose names contain one of these; likewise integration
+#     tools/test.sh all                the check, then every part below
 #
-# lint         format, clippy with all features and with none, documentation
+# lint         format, clippy with all features, a check without any, documentation
 # unit         unit tests, examples in the documentation
 # integration  the program as a user runs it: commands, hostile files, kills
-# readers      exported shapes in independent readers, and the annotation page in a browser
-# guides       the commands of the guides, many heads under kills, the first look at a GPU
-# demo         the demo head, trained for a few steps, in all readers and in a browser
-# fuzz         a minute for every reader of foreign bytes
+# readers      exported shapes in trimesh, open3d, three.js and the Khronos validator
+# demo         the demo head, from photographs to views, in all of these readers
+# fuzz         three seconds for every reader of foreign bytes
+#
+# `all` adds loops and breadth. Each claim has its test in the check, or is about a program of somebody else:
+#
+# long         tests marked `#[ignore = "long: …"]`: GPU trainings at full length and of every preset, kills by the dozen,
+#              every write that fails, sweeps of cases. The check makes the same claims on fewer steps, kills and cases.
+# fuzz         a minute for every reader instead of three seconds
+# gpu          `tools/gpu/first_look.sh`, eleven trainings on a driver in software, six minutes. The check trains each field
+#              on that driver once, beside the processor.
+# fleet        six heads under kills of tasks and of the engine, two and a half minutes. Only the recipe in `tools/fleet` is
+#              not in the check; the kills, waits and exit codes that it relies on are, in `resume`, `accidents` and `cli`.
+# guides       every command of three guides, five minutes. The commands themselves are in the check, in `cli`.
+# blender      exports, lobes and the import of a run in Blender: a download of 350 MB. The check reads the same files with
+#              five other readers.
+# browser      the annotation page, the report and the page of many runs in Chromium: a download of 90 MB and scripts of a
+#              minute. The check reads the pages' content in unit tests.
 set -u -o pipefail
 cd "$(dirname "$0")/.."
 
-known=(lint unit integration readers guides demo fuzz)
-parts=("$@")
-[ $# -gt 0 ] || parts=("${known[@]}")
+short=(lint unit integration readers demo fuzz)
+long=(long gpu fleet guides blender browser)
+known=("${short[@]}" "${long[@]}")
+names=()
+if [ "${1:-}" = all ]; then
+  [ $# = 1 ] || { echo "all takes nothing else" >&2; exit 2; }
+  parts=("${known[@]}")
+elif [ $# -gt 1 ] && [[ $1 =~ ^(unit|integration)$ ]] && [[ " ${known[*]} " != *" $2 "* ]]; then
+  parts=("$1")
+  names=("${@:2}")
+else
+  parts=("${@:-${short[@]}}")
+  [ $# -gt 0 ] || parts=("${short[@]}")
+fi
 for part in "${parts[@]}"; do
-  [[ " ${known[*]} " == *" $part "* ]] || { echo "unknown part $part; the parts are ${known[*]}" >&2; exit 2; }
+  [[ " ${known[*]} " == *" $part "* ]] || { echo "unknown part $part; the parts are ${known[*]}, or all" >&2; exit 2; }
 done
 wanted() { [[ " ${parts[*]} " == *" $1 "* ]]; }
+all=no
+[ "${1:-}" != all ] || all=yes
 
 target=${CARGO_TARGET_DIR:-target}
 scratch=$(mktemp -d)
-trap 'kill "${fuzzers[@]}" $gpu_tests 2> /dev/null; rm -rf "$scratch"' EXIT
+trap 'kill $fuzzer $installer 2> /dev/null; rm -rf "$scratch"' EXIT
 results=()
 failed=0
-fuzzers=()
-gpu_tests=
+fuzzer=
+installer=
+# devices have their locks there, and other processes of this machine theirs elsewhere
+mkdir "$scratch/tmp"
+export TMPDIR=$scratch/tmp
 
 # step NAME COMMAND...: runs the command and records its result and time
 step() {
@@ -37,84 +68,179 @@ step() {
   shift
   printf '\n== %s\n   %s\n' "$name" "$*"
   if "$@"; then
-    results+=("ok      $name ($((SECONDS - begin)) s)")
+    results+=("$(printf 'ok      %4d s  %s' $((SECONDS - begin)) "$name")")
   else
-    results+=("FAILED  $name ($((SECONDS - begin)) s)")
+    results+=("$(printf 'FAILED  %4d s  %s' $((SECONDS - begin)) "$name")")
     failed=1
   fi
 }
+skip() { results+=("SKIPPED         $*"); }
 
-readers() {
+## Tools of others, installed beside the first build.
+
+apt_installs() {
+  command -v apt-get > /dev/null || return
+  local sudo=
+  [ "$(id -u)" = 0 ] || sudo=sudo
+  [ -e "$scratch/apt" ] || $sudo apt-get update -qq
+  : > "$scratch/apt"
+  $sudo apt-get install -y -qq --no-install-recommends "$@" > /dev/null
+}
+
+python_readers() {
   [ -x .venv/bin/python ] || "${PYTHON:-python3}" -m venv .venv || return
   .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements.txt || return
   # open3d's wheel leaves four shared libraries to the system
-  if ! .venv/bin/python -c 'import open3d' 2> /dev/null && command -v apt-get > /dev/null; then
-    local sudo=
-    [ "$(id -u)" = 0 ] || sudo=sudo
-    $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends \
-      libusb-1.0-0 libgl1 libgomp1 libx11-6 > /dev/null || return
-  fi
+  .venv/bin/python -c 'import open3d' 2> /dev/null || apt_installs libusb-1.0-0 libgl1 libgomp1 libx11-6 || return
   .venv/bin/python -c 'import open3d, trimesh' &&
     npm ci --silent --no-audit --no-fund --prefix tools/readers
 }
 
-# Tests print what they skip; the summary repeats those lines, so that a skipped test is not taken for a passed one.
-# One build serves them all: with the networks and with the kernels of GPUs.
+# Blender as a module has its own environment, since it brings its own numpy. Its wheel leaves the libraries of a display
+# to the system, even where nothing is displayed.
+blender() {
+  [ -x .venv-blender/bin/python ] || "${PYTHON:-python3}" -m venv .venv-blender || return
+  .venv-blender/bin/python -m pip install --quiet --disable-pip-version-check \
+    -r tools/readers/requirements-blender.txt || return
+  .venv-blender/bin/python -c 'import bpy' 2> /dev/null && return
+  apt_installs libx11-6 libxi6 libxxf86vm1 libxfixes3 libxrender1 libsm6 libgl1 libegl1 libxkbcommon0
+  .venv-blender/bin/python -c 'import bpy'
+}
+
+# A Vulkan driver in software for the kernels of GPUs, whatever adapters the machine has.
+driver() { find /usr/share/vulkan/icd.d -name 'lvp_icd*.json' 2> /dev/null | head -n 1; }
+vulkan() { [ -n "$(driver)" ] || apt_installs mesa-vulkan-drivers; }
+
+browser() {
+  "${CHROMIUM:-/usr/bin/chromium}" --version 2> /dev/null && return
+  [ -z "${CHROMIUM:-}" ] && apt_installs chromium && /usr/bin/chromium --version
+}
+
+# COLMAP and FFmpeg find the cameras of photographs and of videos.
+colmap() { { command -v colmap && command -v ffmpeg; } > /dev/null || apt_installs colmap ffmpeg; }
+
+# The engine of many heads.
+fleet_engine() {
+  python_readers && .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/fleet/requirements.txt
+}
+
+# installs WORD...: runs these functions, one after the other, and records which failed
+installs() {
+  local word
+  for word in "$@"; do
+    "$word" > "$scratch/install.$word" 2>&1 || : > "$scratch/missing.$word"
+  done
+}
+has() { [ ! -e "$scratch/missing.$1" ]; }
+
+install_begins() {
+  local words=()
+  if wanted unit || wanted integration || wanted long || wanted gpu || wanted fleet; then words+=(vulkan); fi
+  if wanted integration || wanted long || wanted guides; then words+=(colmap); fi
+  if wanted readers || wanted demo || wanted browser || wanted guides; then words+=(python_readers); fi
+  if wanted fleet || wanted guides; then words+=(fleet_engine); fi
+  if wanted blender; then words+=(blender); fi
+  if wanted browser; then words+=(browser); fi
+  installs "${words[@]}" &
+  installer=$!
+}
+
+installed=no
+install_ends() {
+  [ $installed = no ] || return
+  installed=yes
+  wait "$installer"
+  installer=
+  cat "$scratch"/install.* 2> /dev/null
+  has vulkan || skip "a Vulkan in software for the kernels of GPUs: apt cannot install mesa-vulkan-drivers"
+  has colmap || skip "COLMAP or FFmpeg, which find cameras: apt cannot install colmap and ffmpeg"
+  has blender || skip "Blender: tools/readers/requirements-blender.txt could not be installed, or not be loaded"
+  has browser || skip "pages in a browser: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it"
+  if wanted readers || wanted demo; then step "independent readers are installed" has python_readers; fi
+  if wanted fleet; then step "the engine of many heads is installed" has fleet_engine; fi
+  VK_DRIVER_FILES=$(driver)
+  if [ -n "$VK_DRIVER_FILES" ]; then export VK_DRIVER_FILES; else unset VK_DRIVER_FILES; fi
+}
+
+## One build serves all parts: with the networks and with the kernels of GPUs.
+
+build() {
+  cargo test --release --features matting,wgpu --no-run 2>&1 | tee "$scratch/build.log"
+  return "${PIPESTATUS[0]}"
+}
+
+built=no
+need_build() {
+  [ $built = no ] || return
+  built=yes
+  step "build of program, examples and tests" build
+  install_ends
+}
+
+# executable WHAT: the path of a program of tests, as the build named it
+executable() { sed -n "s|.*Executable.*$1.* (\(.*\))$|\1|p" "$scratch/build.log" | tail -n 1; }
+
+# tests LOG PROGRAM OPTIONS...: runs a program of tests. Each test is shown as it ends, and what failing ones said; the
+# summary repeats what was skipped, so that a skipped test is not taken for a passed one. Times are an unstable option of
+# Rust's test harness, which the variable allows.
 tests() {
-  local log
-  log=$(mktemp "$scratch/tests.XXXXXX")
-  cargo test --release --features matting,wgpu --no-fail-fast "$@" 2>&1 | tee "$log"
-  local ended=${PIPESTATUS[0]}
+  local log=$scratch/$1.log program=$2
+  shift 2
+  [ -x "$program" ] || { echo "the tests were not built"; return 1; }
+  RUSTC_BOOTSTRAP=1 "$program" -Z unstable-options --report-time --show-output "$@" > "$log" 2>&1 &
+  local pid=$!
+  tail -n +1 --pid=$pid -f "$log" | grep -E --line-buffered '^test .* \.\.\. |^test result'
+  wait $pid
+  local ended=$?
+  [ $ended = 0 ] || sed -n '/^failures:/,$p' "$log"
   grep -h '^skipped:' "$log" | sort -u >> "$scratch/skipped"
-  return "$ended"
-}
-
-# Unit tests on a GPU, beside the steps that follow: a driver in software compiles kernels on one processor, for minutes.
-# The lock of the device is in the folder for temporary files.
-gpu_tests_begin() {
-  mkdir -p "$scratch/gpu"
-  TMPDIR=$scratch/gpu tests --lib gpu -- --nocapture > "$scratch/gpu.log" &
-  gpu_tests=$!
-}
-
-gpu_tests_end() {
-  local ended=0
-  wait "$gpu_tests" || ended=1
-  gpu_tests=
-  cat "$scratch/gpu.log"
+  sed -n 's/^test \(.*\) \.\.\. [a-zA-Z]* <\([0-9.]*\)s>$/\2 \1/p' "$log" >> "$scratch/times"
   return $ended
 }
 
-# A Vulkan driver in software for the kernels of GPUs, whatever adapters the machine has; the summary names it where apt
-# cannot install it.
-vulkan_is_here() {
-  driver() { find /usr/share/vulkan/icd.d -name 'lvp_icd*.json' 2> /dev/null | head -n 1; }
-  if [ -z "$(driver)" ] && command -v apt-get > /dev/null; then
-    local sudo=
-    [ "$(id -u)" = 0 ] || sudo=sudo
-    $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends mesa-vulkan-drivers > /dev/null
-  fi
-  [ -n "$(driver)" ] || return
-  VK_DRIVER_FILES=$(driver)
-  export VK_DRIVER_FILES
-  echo "$VK_DRIVER_FILES"
+unit_tests=src/lib.rs
+check_tests=tests/check/main.rs
+fuzz_tests=tests/fuzz.rs
+
+lint() {
+  step "format" cargo fmt --all -- --check
+  # once with all features, and once without any; then built once
+  step "lints" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
+  step "no features" cargo clippy --release --lib --bins -- -D warnings
+  step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting,wgpu --no-deps
 }
 
-# A minute for every reader of foreign bytes, a quarter of it from each of four seeds, at low priority beside the other
-# steps.
+unit() {
+  need_build
+  step "unit tests" tests unit "$(executable $unit_tests)" "${names[@]}"
+  [ ${#names[@]} -gt 0 ] ||
+    step "examples in the documentation" cargo test --release --features matting,wgpu --doc
+}
+
+integration() {
+  need_build
+  step "integration tests" tests check "$(executable $check_tests)" "${names[@]}"
+}
+
+# Low priority beside the other steps, and at `all` a quarter of a minute from each of four seeds.
 fuzz_begins() {
-  local seed
-  for seed in 1 2 3 4; do
-    TIFACE_FUZZ_S=15 TIFACE_FUZZ_SEED=$seed nice -n 19 \
-      cargo test --release --features matting,wgpu --test fuzz -- --nocapture > "$scratch/fuzz.$seed" 2>&1 &
-    fuzzers+=($!)
-  done
+  need_build
+  fuzz "$scratch/fuzz.log" &
+  fuzzer=$!
 }
-
+fuzz() {
+  local seed seeds=1 seconds=3 ended=0
+  [ $all = no ] || { seeds="1 2 3 4"; seconds=15; }
+  for seed in $seeds; do
+    TIFACE_FUZZ_S=$seconds TIFACE_FUZZ_SEED=$seed nice -n 19 "$(executable $fuzz_tests)" --nocapture || ended=1
+  done > "$1" 2>&1
+  return $ended
+}
 fuzz_ends() {
-  local ended=0 fuzzer
-  for fuzzer in "${fuzzers[@]}"; do wait "$fuzzer" || ended=1; done
-  cat "$scratch"/fuzz.*
+  local ended=0
+  wait "$fuzzer" || ended=1
+  fuzzer=
+  cat "$scratch/fuzz.log"
   return $ended
 }
 
@@ -128,64 +254,133 @@ check() {
 
 example() { "$target/release/examples/$1" "$2"; }
 
-# Blender as a module has its own environment, since it brings its own numpy. It is skipped, and the summary says so, only
-# if pip cannot install it (no wheel for this system, no network) or the system cannot load it.
-blender_is_here() {
-  [ -x .venv-blender/bin/python ] || "${PYTHON:-python3}" -m venv .venv-blender || return
-  .venv-blender/bin/python -m pip install --quiet --disable-pip-version-check \
-    -r tools/readers/requirements-blender.txt || return
-  .venv-blender/bin/python -c 'import bpy' 2> /dev/null && return
-  # its wheel leaves the libraries of a display to the system, even where nothing is displayed
-  command -v apt-get > /dev/null || return
-  local sudo=
-  [ "$(id -u)" = 0 ] || sudo=sudo
-  $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends \
-    libx11-6 libxi6 libxxf86vm1 libxfixes3 libxrender1 libsm6 libgl1 libegl1 libxkbcommon0 > /dev/null
-  .venv-blender/bin/python -c 'import bpy'
-}
-
-# A browser for the pages; skipped, and the summary says so, where apt cannot install one.
-browser_is_here() {
-  "${CHROMIUM:-/usr/bin/chromium}" --version 2> /dev/null && return
-  [ -z "${CHROMIUM:-}" ] && command -v apt-get > /dev/null || return
-  local sudo=
-  [ "$(id -u)" = 0 ] || sudo=sudo
-  $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends chromium > /dev/null
-  /usr/bin/chromium --version
-}
-
-# COLMAP and FFmpeg, which find the cameras of photographs and of videos; tests skip aloud where apt cannot install them.
-colmap_is_here() {
-  command -v colmap && command -v ffmpeg && return
-  command -v apt-get > /dev/null || return
-  local sudo=
-  [ "$(id -u)" = 0 ] || sudo=sudo
-  $sudo apt-get update -qq && $sudo apt-get install -y -qq --no-install-recommends colmap ffmpeg > /dev/null
-  command -v colmap && command -v ffmpeg
-}
-
-# Everything that reads files, on one export: readers_agree NAME GLB [--lit] OPTIONS...
+# readers_agree NAME GLB OPTIONS...: everything that reads files, on one export
 readers_agree() {
-  local name=$1 glb=$2 lit=
+  local name=$1 glb=$2
   shift 2
-  [ "${1:-}" != --lit ] || { lit=--lit; shift; }
   step "readers agree on $name" .venv/bin/python tools/readers/check_export.py "$glb" "$@"
   step "the Khronos validator accepts $name" node tools/readers/validate.mjs "$glb"
-  if [ $blender = yes ]; then
-    step "Blender agrees on $name" .venv-blender/bin/python tools/readers/check_blender.py "$glb" $lit "$@"
-  fi
 }
 
+shapes_made=no
+make_shapes() {
+  [ $shapes_made = no ] || return
+  shapes_made=yes
+  need_build
+  step "a sphere is written" example sphere_to_glb "$scratch/sphere"
+  step "a textured globe is written" example textured_sphere "$scratch/globe"
+}
+# check_export.py reads the texture beside a file: shares_texture GLB
+shares_texture() { cp "$scratch/globe/globe.png" "${1%.glb}.png"; }
+
+readers() {
+  make_shapes
+  local globe=$scratch/globe
+  readers_agree "the sphere" "$scratch/sphere/sphere.glb"
+  readers_agree "the globe" "$globe/globe.glb"
+  step "three.js agrees on the globe" node tools/readers/check_three.mjs "$globe/globe.glb"
+  # with a normal map and a second texture
+  shares_texture "$globe/globe_rich.glb"
+  readers_agree "the rich globe" "$globe/globe_rich.glb"
+  step "three.js agrees on the rich globe" node tools/readers/check_three.mjs "$globe/globe_rich.glb"
+  # with soft layers, which trimesh and open3d take for part of the surface
+  shares_texture "$globe/globe_soft.glb"
+  step "the Khronos validator accepts the soft globe" node tools/readers/validate.mjs "$globe/globe_soft.glb"
+  step "three.js agrees on the soft globe" node tools/readers/check_three.mjs "$globe/globe_soft.glb"
+  step "a published checkpoint is converted" .venv/bin/python tools/reference/tensorf_checkpoint.py --check tests/reference
+}
+
+# train_demo STEPS: the demo head, from photographs to views
 train_demo() {
-  "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps=600 \
-    --set tface.steps=400 --set baseline.steps=200 --set mesh.resolution=128 --set mesh.format=glb,obj,ply \
-    --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured
+  "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps="$1" \
+    --set tface.steps=$(($1 * 2 / 3)) --set baseline.steps=$(($1 / 3)) --set mesh.resolution=128 \
+    --set mesh.format=glb,obj,ply --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured
 }
-
+demo_made=no
+make_demo() {
+  [ $demo_made = no ] || return
+  demo_made=yes
+  need_build
+  # the browser and Blender compare pictures of a head that has learned its colors
+  local steps=150
+  if wanted browser || wanted blender; then steps=600; fi
+  step "the demo head is reconstructed" train_demo $steps
+  step "the demo head is exported" export_demo
+}
 # The demo head again, with fewer triangles, another material and a smaller texture.
 export_demo() {
   "$target/release/tiface" export "$scratch/demo" --material lit --triangles 3000 --texture 512 --format glb,obj,ply \
     --out "$scratch/exported/"
+}
+head=$scratch/demo/mesh/head.glb
+exported=$scratch/exported/head.glb
+
+demo() {
+  make_demo
+  readers_agree "the demo head" "$head" --up 0 0 1
+  step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$head"
+  readers_agree "the exported head" "$exported" --up 0 0 1
+}
+
+## Parts of `all` alone.
+
+long() {
+  need_build
+  step "long unit tests" long_tests unit "$(executable $unit_tests)" src
+  step "long integration tests" long_tests check "$(executable $check_tests)" tests/check
+}
+
+# Tests that are ignored because they are long; others are ignored because they measure, or are run by a test.
+long_tests() {
+  local log=long_$1 program=$2 marked
+  marked=$(grep -rh -A 4 '#\[ignore = "long: ' "$3" | sed -n 's/^ *fn \([a-z0-9_]*\)().*/\1/p')
+  [ -n "$marked" ] || { echo "no test is marked as long"; return 1; }
+  # shellcheck disable=SC2086
+  TIFACE_KILLS=40 tests "$log" "$program" --ignored $marked
+}
+
+gpu() {
+  need_build
+  [ -n "${VK_DRIVER_FILES:-}" ] || return
+  step "a first look at a GPU runs" env SHARE=1 CARGO_TARGET_DIR="$target" tools/gpu/first_look.sh vulkan:0 "$scratch/look"
+}
+
+fleet() {
+  need_build
+  step "many heads outlive kills" check tools/fleet/check_fleet.py
+}
+
+guides() {
+  need_build
+  step "the commands of the guides work" check tools/guides/check_guides.py
+}
+
+in_blender() { step "$1" .venv-blender/bin/python "${@:2}"; }
+blender_agrees() {
+  make_shapes
+  make_demo
+  has blender || return
+  local checks=tools/readers
+  in_blender "Blender agrees on the sphere" $checks/check_blender.py "$scratch/sphere/sphere.glb"
+  in_blender "Blender agrees on the globe" $checks/check_blender.py "$scratch/globe/globe.glb"
+  local kind
+  for kind in rich soft; do shares_texture "$scratch/globe/globe_$kind.glb"; done
+  in_blender "Blender agrees on the rich globe" $checks/check_blender.py "$scratch/globe/globe_rich.glb"
+  in_blender "Blender agrees on the soft globe" $checks/check_blender.py "$scratch/globe/globe_soft.glb" --up 0 0 1
+  in_blender "Blender agrees on the demo head" $checks/check_blender.py "$head" --up 0 0 1
+  in_blender "Blender agrees on the exported head" $checks/check_blender.py "$exported" --lit --up 0 0 1
+  in_blender "Blender imports the run" $checks/check_addon.py "$scratch/demo"
+  in_blender "Blender shows its lobes" $checks/check_lobes.py "$scratch/demo"
+}
+
+pages() {
+  make_demo
+  has browser || return
+  mkdir -p "$scratch/click"
+  step "the annotation page is written" example click_page "$scratch/click/page.html"
+  step "a browser clicks on the page" node tools/page/check_page.mjs "$scratch/click/page.html"
+  step "a browser opens the demo's pages" demo_pages
+  step "three.js shows its lobes" node tools/readers/check_lobes.mjs "$scratch/demo"
 }
 
 # The pages of the demo head, as a person opens them.
@@ -196,142 +391,28 @@ demo_pages() {
     node tools/page/check_watch.mjs "$target/release/tiface" "$scratch/demo"
 }
 
-# Tools of others, set up once by the first part that needs them.
-readers_ready=no
-need_readers() {
-  [ $readers_ready = yes ] && return
-  readers_ready=yes
-  step "independent readers are installed" readers
-  blender=yes
-  printf '\n== Blender is installed\n'
-  if ! blender_is_here; then
-    blender=no
-    results+=("SKIPPED Blender: tools/readers/requirements-blender.txt could not be installed, or not be loaded")
-  fi
-  browser=yes
-  printf '\n== a browser is installed\n'
-  if ! browser_is_here; then
-    browser=no
-    results+=("SKIPPED the annotation page, reports, and lobes in three.js: neither CHROMIUM nor /usr/bin/chromium runs, and apt cannot install it")
-  fi
-}
+install_begins
+if wanted lint; then lint; fi
+if wanted unit; then unit; fi
+if wanted integration; then integration; fi
+if wanted fuzz; then fuzz_begins; fi
+if wanted readers; then readers; fi
+if wanted demo; then demo; fi
+if wanted long; then long; fi
+if wanted gpu; then gpu; fi
+if wanted fleet; then fleet; fi
+if wanted guides; then guides; fi
+if wanted blender; then blender_agrees; fi
+if wanted browser; then pages; fi
+if wanted fuzz; then step "no input makes a reader panic, hang or fill the memory" fuzz_ends; fi
 
-vulkan_ready=no
-need_vulkan() {
-  [ $vulkan_ready = yes ] && return
-  vulkan_ready=yes
-  printf '\n== Vulkan in software is installed\n'
-  if ! vulkan_is_here; then
-    results+=("SKIPPED a Vulkan in software for the kernels of GPUs: apt cannot install mesa-vulkan-drivers")
-  fi
-}
-
-need_colmap() {
-  printf '\n== COLMAP and FFmpeg are installed\n'
-  colmap_is_here || results+=("SKIPPED COLMAP or FFmpeg, which find cameras: apt cannot install colmap and ffmpeg")
-}
-
-built=no
-need_program() {
-  [ $built = yes ] && return
-  built=yes
-  step "build" cargo build --release --features matting,wgpu --bins --examples
-}
-
-lint() {
-  step "format" cargo fmt --all -- --check
-  # Everything is checked once with all features, and once without any; then built once.
-  step "lints, all features" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
-  step "lints, no features" cargo clippy --release -- -D warnings
-  step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting,wgpu --no-deps
-}
-
-unit() {
-  need_vulkan
-  step "unit tests are built" cargo test --release --features matting,wgpu --lib --bins --no-run
-  gpu_tests_begin
-  step "unit tests" tests --lib --bins -- --nocapture --skip gpu
-  step "examples in the documentation" tests --doc -- --nocapture
-}
-
-integration() {
-  need_program
-  need_vulkan
-  need_colmap
-  step "integration tests" tests --test '*' -- --nocapture
-}
-
-shapes() {
-  need_readers
-  need_program
-  mkdir -p "$scratch/click"
-  step "the annotation page is written" example click_page "$scratch/click/page.html"
-  if [ $browser = yes ]; then
-    step "a browser clicks on the page" node tools/page/check_page.mjs "$scratch/click/page.html"
-  fi
-  step "a sphere is written" example sphere_to_glb "$scratch/sphere"
-  readers_agree "the sphere" "$scratch/sphere/sphere.glb"
-  step "a textured globe is written" example textured_sphere "$scratch/globe"
-  readers_agree "the globe" "$scratch/globe/globe.glb"
-  step "three.js agrees on the globe" node tools/readers/check_three.mjs "$scratch/globe/globe.glb"
-  # with a normal map and a second texture
-  cp "$scratch/globe/globe.png" "$scratch/globe/globe_rich.png"
-  readers_agree "the rich globe" "$scratch/globe/globe_rich.glb"
-  step "three.js agrees on the rich globe" node tools/readers/check_three.mjs "$scratch/globe/globe_rich.glb"
-  # with soft layers, which trimesh and open3d take for part of the surface
-  cp "$scratch/globe/globe.png" "$scratch/globe/globe_soft.png"
-  step "the Khronos validator accepts the soft globe" node tools/readers/validate.mjs "$scratch/globe/globe_soft.glb"
-  step "three.js agrees on the soft globe" node tools/readers/check_three.mjs "$scratch/globe/globe_soft.glb"
-  if [ $blender = yes ]; then
-    step "Blender agrees on the soft globe" .venv-blender/bin/python tools/readers/check_blender.py "$scratch/globe/globe_soft.glb" --up 0 0 1
-  fi
-  step "a published checkpoint is converted" .venv/bin/python tools/reference/tensorf_checkpoint.py --check tests/reference
-}
-
-guides() {
-  need_readers
-  need_vulkan
-  need_colmap
-  need_program
-  step "the engine of many heads is installed" .venv/bin/python -m pip install --quiet --disable-pip-version-check \
-    -r tools/fleet/requirements.txt
-  if [ -n "${VK_DRIVER_FILES:-}" ]; then
-    step "a first look at a GPU runs" env SHARE=1 CARGO_TARGET_DIR="$target" tools/gpu/first_look.sh vulkan:0 "$scratch/look"
-  fi
-  step "many heads outlive kills" check tools/fleet/check_fleet.py
-  step "the commands of the guides work" check tools/guides/check_guides.py
-}
-
-demo() {
-  need_readers
-  need_program
-  step "the demo head is reconstructed" train_demo
-  readers_agree "the demo head" "$scratch/demo/mesh/head.glb" --up 0 0 1
-  step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$scratch/demo/mesh/head.glb"
-  step "the demo head is exported" export_demo
-  readers_agree "the exported head" "$scratch/exported/head.glb" --lit --up 0 0 1
-  if [ $browser = yes ]; then
-    step "a browser opens its pages" demo_pages
-    step "three.js shows its lobes" node tools/readers/check_lobes.mjs "$scratch/demo"
-  fi
-  if [ $blender = yes ]; then
-    step "Blender imports the run" .venv-blender/bin/python tools/readers/check_addon.py "$scratch/demo"
-    step "Blender shows its lobes" .venv-blender/bin/python tools/readers/check_lobes.py "$scratch/demo"
-  fi
-}
-
-wanted lint && lint
-wanted unit && unit
-wanted integration && integration
-wanted fuzz && fuzz_begins
-wanted readers && shapes
-wanted guides && guides
-wanted demo && demo
-wanted unit && step "unit tests of GPU kernels" gpu_tests_end
-wanted fuzz && step "no input makes a reader panic, hang or fill the memory" fuzz_ends
-
-# how long which step took, and what could not run
-printf '\n== summary\n'
+# how long which part took, the slowest tests, and what could not run
+printf '\n== summary: %d s\n' "$SECONDS"
 printf '%s\n' "${results[@]}"
-[ -s "$scratch/skipped" ] && { printf 'tests that this machine could not run:\n'; cat "$scratch/skipped"; }
+if [ -s "$scratch/times" ]; then
+  printf 'the slowest of %d tests, which took %d s in all:\n' "$(wc -l < "$scratch/times")" \
+    "$(awk '{ sum += $1 } END { print int(sum) }' "$scratch/times")"
+  sort -rn "$scratch/times" | head -n 20
+fi
+[ -s "$scratch/skipped" ] && { printf 'tests that this machine could not run:\n'; sort -u "$scratch/skipped"; }
 exit $failed

@@ -127,7 +127,8 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
     match own {
         _ if !known => return Err(unknown(run)),
         "paper" => c.render.method = vec![Method::Baseline, Method::Tface, Method::Volume],
-        "standard" => {}
+        // Its blend has two members; the table shows the field between them too.
+        "standard" => c.render.method.push(Method::Volume),
         "baseline" => shows(&mut c, Method::Baseline),
         iface if iface.starts_with("iface") => {
             shows(&mut c, Method::Volume);
