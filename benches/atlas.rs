@@ -7,7 +7,7 @@
 //!
 //! CPU time (user + system of the process) does not depend on what else the machine does.
 
-#[path = "../tests/fields/mod.rs"]
+#[path = "../tests/support/fields.rs"]
 mod fields;
 mod process;
 

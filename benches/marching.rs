@@ -8,7 +8,7 @@
 //! `--write` leaves a raw little-endian f32 volume (x fastest) for `tools/reference/flying_edges.py`,
 //! and `--read 256 volume.f32` times one, a line a run, so that a script can interleave the two.
 
-#[path = "../tests/fields/mod.rs"]
+#[path = "../tests/support/fields.rs"]
 mod fields;
 
 use glam::Vec3;

@@ -7,7 +7,7 @@
 //!
 //! CPU time (user + system of the process) does not depend on what else the machine does.
 
-#[path = "../tests/clicked/mod.rs"]
+#[path = "../tests/support/clicked.rs"]
 mod clicked;
 mod process;
 

@@ -1,4 +1,4 @@
-//! CPU milliseconds and accuracy of simplification: the head of `tests/fields`, one thread.
+//! CPU milliseconds and accuracy of simplification: the head of `tests/support/fields.rs`, one thread.
 //!
 //! ```text
 //! cargo bench --bench simplify                           202 k to 40 k triangles, 506 k to 100 k
@@ -9,7 +9,7 @@
 //! Errors are distances of points of the triangles to the true surface, weighted by area, in 512ths of
 //! the cube's edge. Raw files are little-endian f32 and u32.
 
-#[path = "../tests/fields/mod.rs"]
+#[path = "../tests/support/fields.rs"]
 mod fields;
 mod process;
 

@@ -7,7 +7,7 @@ mod stability;
 
 fn main() -> tiface::Result<()> {
     let dir = tempfile::tempdir().expect("a scratch folder can be made");
-    for case in stability::stability(dir.path())? {
+    for case in stability::stability(dir.path(), stability::Breadth::All)? {
         println!("{} {case}", if case.holds() { ' ' } else { '!' });
     }
     Ok(())

@@ -128,7 +128,7 @@ pub fn write_photographs(
     seed: u64,
     readme: &str,
 ) -> Result<()> {
-    let studio = Studio::new();
+    let studio = Studio::shared();
     for folder in ["images", "masks", "face_masks"] {
         io::create_folder(&dir.join(folder))?;
     }
@@ -224,7 +224,7 @@ mod tests {
     #[test]
     fn the_mask_agrees_with_the_surface_and_pictures_repeat_byte_for_byte() {
         let camera = &cameras(&SMALL)[0].0;
-        let studio = Studio::new();
+        let studio = Studio::shared();
         let (a, b) = (studio.photograph(camera, 1), studio.photograph(camera, 1));
         assert_eq!((&a.photo, &a.mask), (&b.photo, &b.mask));
         assert_ne!(a.photo, studio.photograph(camera, 2).photo); // other grain

@@ -644,7 +644,7 @@ struct GlbImage {
     uri: Option<IgnoredAny>,
 }
 
-/// Tests node transforms; reading is tested in `tests/hostile_mesh.rs`.
+/// Tests node transforms; reading is tested in `tests/check/hostile_mesh.rs`.
 #[cfg(test)]
 mod tests {
     use super::*;

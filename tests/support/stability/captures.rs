@@ -1,6 +1,7 @@
 //! Hard captures: both fields learned for a short while from photographs of the demo head whose cameras or world are
 //! odd, beside the same of plain ones; or the error that names what is wrong.
 
+use super::Breadth;
 use super::case::{Cases, StabilityCase};
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use std::path::Path;
@@ -27,10 +28,11 @@ struct Hard {
 }
 
 /// Learns from the captures, the plain one first.
-pub(super) fn cases(scratch: &Path) -> Result<Vec<StabilityCase>> {
+pub(super) fn cases(scratch: &Path, breadth: Breadth) -> Result<Vec<StabilityCase>> {
     let mut cases = Cases::new("captures");
     let mut plain = None;
-    for (i, hard) in captures().into_iter().enumerate() {
+    let wanted = |hard: &Hard| breadth == Breadth::All || FEW.contains(&hard.name);
+    for (i, hard) in captures().into_iter().filter(wanted).enumerate() {
         let folder = scratch.join(format!("{i}"));
         write_photographs(&folder, &hard.cameras, &hard.world, 1, hard.name)?;
         let learned = learn(&folder, &hard.world, config(&folder));
@@ -54,6 +56,16 @@ pub(super) fn cases(scratch: &Path) -> Result<Vec<StabilityCase>> {
     variances(&mut cases, scratch)?;
     Ok(cases.done)
 }
+
+/// One capture of each kind.
+const FEW: [&str; 6] = [
+    "plain",
+    "a world 1e6 from its origin",
+    "a field of view of 0.1 degrees",
+    "three views",
+    "one view",
+    "one pose for all",
+];
 
 /// Photographs of 40 × 50 pixels.
 const SIZE: (u32, u32) = (40, 50);

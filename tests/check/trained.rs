@@ -1,29 +1,24 @@
 //! Short trainings from one end of the pipeline to the other: from photographs without masks to closed meshes at several
-//! resolutions, of one capture in two formats, and of photographs at full size.
+//! resolutions, of one capture in two formats, and of photographs with borders, up to full size.
 
-mod command;
-
-use command::tiface;
+use crate::clicked;
+use crate::command::{out, tiface, worked};
+use crate::kept::photographed;
 use serde_json::Value;
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Output;
-use tiface::capture::synthetic::{SyntheticOptions, write_borders, write_capture};
+use std::path::Path;
+use tiface::capture::synthetic::{SyntheticOptions, write_borders};
 use tiface::image::Gray;
 use tiface::io::{Limits, read_gray, read_photo, write_png_gray, write_png_rgb};
 use tiface::mask::Click;
 use tiface::mask::morphology::squared_distance;
 use tiface::mask::prompts::{PhotoPrompts, Prompts};
 
-fn worked(output: &Output) {
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-}
-
 /// A capture without any mask; beside it, clicks on three of its photographs: three in the head, two far outside.
 fn capture(folder: &Path) {
     let root = folder.join("head");
     let options = SyntheticOptions { width: 96, height: 128, train: 10, test: 2, seed: 3 };
-    write_capture(&root, &options).unwrap();
+    photographed(&root, &options);
     let deepest = |marked: &[bool], clicks: &mut Vec<Click>, head: bool| {
         let d = squared_distance(marked, 96, 128);
         let best = (0..d.len()).max_by(|&a, &b| d[a].total_cmp(&d[b])).unwrap();
@@ -55,8 +50,8 @@ fn capture(folder: &Path) {
     }
 }
 
-#[test]
-fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
+/// Learns a field from clicks and meshes it at these resolutions.
+fn meshes_from_clicks_are_closed(resolutions: &[&str]) {
     let dir = tempfile::tempdir().unwrap();
     capture(dir.path());
     let settings = [
@@ -67,7 +62,7 @@ fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
         "iface.levels=6",
         "iface.log2_table=12",
         "iface.occupancy_resolution=32",
-        "mesh.resolution=40",
+        "mesh.resolution=24",
         "mesh.triangles=0",
         "mesh.texture_px=0",
         "mesh.format=ply",
@@ -80,7 +75,7 @@ fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
     worked(&tiface(dir.path(), &words));
     assert!(dir.path().join("runs/head/mask/sheet.html").is_file());
     let mut found = Vec::new();
-    for resolution in ["40", "67", "96", "150"] {
+    for &resolution in resolutions {
         let set = format!("mesh.resolution={resolution}");
         worked(&tiface(dir.path(), &["mesh", "runs/head", "--fresh", "mesh", "--set", &set]));
         for mesh in ["surface.ply", "head.ply"] {
@@ -94,10 +89,21 @@ fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
         }
     }
     // it is the resolution that makes them, not one mesh looked at again
-    assert!(found.windows(3).all(|w| w[2].2 > w[0].2), "{found:?}");
+    assert!(found.len() > 2 && found.windows(3).all(|w| w[2].2 > w[0].2), "{found:?}");
     // sheets of a barely trained field lie closer than a cell and then may cross: a few triangles of ten thousand
     assert!(found.iter().all(|(_, _, triangles, crossing)| crossing * 200 < *triangles), "{found:?}");
     eprintln!("resolution, mesh, triangles, crossing: {found:?}");
+}
+
+#[test]
+fn clicks_become_a_trained_field_whose_meshes_are_closed() {
+    meshes_from_clicks_are_closed(&["40", "67"]);
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; the same at finer resolutions"]
+fn clicks_become_a_trained_field_whose_meshes_are_closed_at_every_resolution() {
+    meshes_from_clicks_are_closed(&["40", "67", "96", "150"]);
 }
 
 /// A few steps of everything.
@@ -130,19 +136,28 @@ fn checkpoint(path: &Path) -> (Value, Vec<u8>) {
     (serde_json::from_slice(&bytes[8..8 + head]).unwrap(), bytes[8 + head..].to_vec())
 }
 
-#[test]
-fn fox_written_as_colmap_and_read_again_trains_to_the_same_bytes() {
-    let shared = std::env::var("TIFACE_SHARED")
-        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
-    let fox = PathBuf::from(shared).join("data/captures/fox");
-    if !fox.is_dir() {
-        eprintln!("skipped: the capture `fox` is not at {}", fox.display());
-        return;
+/// Copies every so-manyth view of the capture `fox` to `folder/fox`.
+fn some_of_fox(folder: &Path, every: usize) -> Option<()> {
+    let fox = clicked::folder("fox")?;
+    let mut cameras: Value = serde_json::from_slice(&fs::read(fox.join("transforms.json")).unwrap()).unwrap();
+    let frames = cameras["frames"].as_array_mut().unwrap();
+    *frames = frames.iter().step_by(every).cloned().collect();
+    fs::create_dir_all(folder.join("fox/images")).unwrap();
+    for frame in frames {
+        let file = frame["file_path"].as_str().unwrap();
+        fs::copy(fox.join(file), folder.join("fox").join(file)).unwrap();
     }
+    fs::write(folder.join("fox/transforms.json"), cameras.to_string()).unwrap();
+    Some(())
+}
+
+/// Learns both fields from every so-manyth view of the capture `fox`, and from the same written as COLMAP's model.
+fn fox_trains_to_the_same_bytes(every: usize) {
     let dir = tempfile::tempdir().unwrap();
-    worked(&tiface(dir.path(), &["convert", fox.to_str().unwrap(), "--to", "colmap", "--out", "written"]));
+    let Some(()) = some_of_fox(dir.path(), every) else { return };
+    worked(&tiface(dir.path(), &["convert", "fox", "--to", "colmap", "--out", "written"]));
     let set = ["mask.source=none", "capture.downscale=8"];
-    for (run, from) in [("own", fox.to_str().unwrap()), ("read", "written")] {
+    for (run, from) in [("own", "fox"), ("read", "written")] {
         few(dir.path(), &["iface", from, "-r", run], &set);
         few(dir.path(), &["tface", from, "-r", run], &set);
     }
@@ -159,48 +174,59 @@ fn fox_written_as_colmap_and_read_again_trains_to_the_same_bytes() {
     }
 }
 
-/// Photographs of 3000 × 4096 with masks of borders, from small ones: every pixel becomes 8 × 8.
-fn full_size(root: &Path, border: u32) {
-    let small = root.with_extension("small");
-    let options = SyntheticOptions { width: 375, height: 512, train: 4, test: 1, seed: 3 };
-    write_capture(&small, &options).unwrap();
+#[test]
+fn a_third_of_fox_written_as_colmap_and_read_again_trains_to_the_same_bytes() {
+    fox_trains_to_the_same_bytes(3);
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; four trainings read fifty photographs each"]
+fn fox_written_as_colmap_and_read_again_trains_to_the_same_bytes() {
+    fox_trains_to_the_same_bytes(1);
+}
+
+/// Photographs with masks and borders from small ones: every pixel becomes `times` × `times`.
+fn enlarged(root: &Path, small: &SyntheticOptions, times: u32, border: u32) {
+    let folder = root.with_extension("small");
+    photographed(&folder, small);
     let limits = Limits::default();
-    let larger = |i: u32| (i / 3000 / 8 * 375 + i % 3000 / 8) as usize;
-    for i in 0..5 {
+    let (width, height) = (small.width * times, small.height * times);
+    let inside = |i: u32| (i / width / times * small.width + i % width / times) as usize;
+    for i in 0..small.train + small.test {
         let name = format!("{i:03}.png");
-        let photo = read_photo(&small.join("images").join(&name), None, &limits).unwrap();
-        let rgb: Vec<[u8; 3]> = (0..3000 * 4096).map(|i| photo.rgb[larger(i)]).collect();
+        let photo = read_photo(&folder.join("images").join(&name), None, &limits).unwrap();
+        let rgb: Vec<[u8; 3]> = (0..width * height).map(|i| photo.rgb[inside(i)]).collect();
         fs::create_dir_all(root.join("images")).unwrap();
-        write_png_rgb(&root.join("images").join(&name), 3000, 4096, &rgb).unwrap();
-        for folder in ["masks", "face_masks"] {
-            let mask = read_gray(&small.join(folder).join(&name), None, &limits).unwrap();
-            let values = (0..3000 * 4096).map(|i| mask.values[larger(i)]).collect();
-            fs::create_dir_all(root.join(folder)).unwrap();
-            write_png_gray(&root.join(folder).join(&name), &Gray { width: 3000, height: 4096, values })
-                .unwrap();
+        write_png_rgb(&root.join("images").join(&name), width, height, &rgb).unwrap();
+        for masks in ["masks", "face_masks"] {
+            let mask = read_gray(&folder.join(masks).join(&name), None, &limits).unwrap();
+            let values = (0..width * height).map(|i| mask.values[inside(i)]).collect();
+            fs::create_dir_all(root.join(masks)).unwrap();
+            write_png_gray(&root.join(masks).join(&name), &Gray { width, height, values }).unwrap();
         }
     }
-    write_borders(root, &SyntheticOptions { width: 3000, height: 4096, ..options }, border).unwrap();
+    write_borders(root, &SyntheticOptions { width, height, ..small.clone() }, border).unwrap();
     for name in ["transforms.json", "transforms_train.json", "transforms_test.json"] {
-        let mut cameras: Value = serde_json::from_slice(&fs::read(small.join(name)).unwrap()).unwrap();
+        let mut cameras: Value = serde_json::from_slice(&fs::read(folder.join(name)).unwrap()).unwrap();
         for key in ["fl_x", "fl_y", "cx", "cy", "w", "h"] {
             if let Some(v) = cameras.get(key).and_then(Value::as_f64) {
-                cameras[key] = if key.len() == 1 { (8 * v as u64).into() } else { (8.0 * v).into() };
+                let v = f64::from(times) * v;
+                cameras[key] = if key.len() == 1 { (v as u64).into() } else { v.into() };
             }
         }
         fs::write(root.join(name), cameras.to_string()).unwrap();
     }
 }
 
-/// A few steps of both fields and a coarse mesh; the photographs are what is large.
-#[test]
-fn photographs_of_full_size_with_borders_go_through_the_pipeline() {
+/// A few steps of both fields and a coarse mesh of photographs of this size; the views that are rendered have it too.
+fn goes_through_the_pipeline(small: &SyntheticOptions, times: u32, border: u32) {
     let dir = tempfile::tempdir().unwrap();
-    full_size(&dir.path().join("head"), 60);
+    enlarged(&dir.path().join("head"), small, times, border);
+    let size = (small.width * times, small.height * times);
     let inspected = tiface(dir.path(), &["inspect", "head", "--json"]);
     worked(&inspected);
-    let found = String::from_utf8_lossy(&inspected.stdout).into_owned();
-    assert!(found.contains("3000") && found.contains("4096"), "{found}");
+    let found = out(&inspected);
+    assert!(found.contains(&size.0.to_string()) && found.contains(&size.1.to_string()), "{found}");
     let set = [
         "mesh.resolution=24",
         "mesh.triangles=500",
@@ -214,7 +240,20 @@ fn photographs_of_full_size_with_borders_go_through_the_pipeline() {
     let metrics: Value = serde_json::from_str(&text).unwrap();
     let psnr = metrics["raster"]["head"]["mean"]["psnr_masked"].as_f64().unwrap();
     assert!(psnr > 5.0, "{text}");
-    let view = dir.path().join("runs/head/render/raster/004.png");
-    let photo = read_photo(&view, Some((3000, 4096)), &Limits::default()).unwrap();
-    assert_eq!((photo.width, photo.height), (3000, 4096));
+    let view = dir.path().join(format!("runs/head/render/raster/{:03}.png", small.train + small.test - 1));
+    let photo = read_photo(&view, Some(size), &Limits::default()).unwrap();
+    assert_eq!((photo.width, photo.height), size);
+}
+
+#[test]
+fn photographs_with_borders_go_through_the_pipeline_in_their_own_size() {
+    let small = SyntheticOptions { width: 94, height: 128, train: 4, test: 1, seed: 3 };
+    goes_through_the_pipeline(&small, 3, 22);
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; every stage decodes pictures of twelve megapixels"]
+fn photographs_of_full_size_with_borders_go_through_the_pipeline() {
+    let small = SyntheticOptions { width: 375, height: 512, train: 4, test: 1, seed: 3 };
+    goes_through_the_pipeline(&small, 8, 60);
 }

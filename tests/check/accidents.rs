@@ -1,16 +1,11 @@
 //! What happens around a run: two processes at once, a clock that jumps, a run that may not be written, a capture that
 //! changes, moves or comes along to another machine, few open files, little memory.
-#![cfg(target_os = "linux")]
 
-mod tiny;
-
+use crate::command::{command, err, worked};
+use crate::kept::copy;
+use crate::tiny::{capture, files, finished, kept, same, shim, tiface};
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
-use tiny::{capture, copy, files, said, same, shim, tiface};
-
-fn done(output: &Output) {
-    assert!(output.status.success(), "{:?}: {}", output.status, said(output));
-}
 
 /// The program under a shell's limit, such as `ulimit -n 32`.
 fn limited(limit: &str, command: &Command) -> Output {
@@ -27,7 +22,7 @@ fn two_processes_at_once_make_every_stage_once() {
     capture(dir.path());
     for stage in tiface::pipeline::Stage::ALL {
         let stage = stage.word();
-        done(&tiface(dir.path(), &[stage, "head", "--run", "calm"]).output().unwrap());
+        worked(&tiface(dir.path(), &[stage, "head", "--run", "calm"]).output().unwrap());
         let start = || {
             let mut command = tiface(dir.path(), &[stage, "head", "--run", "raced"]);
             command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
@@ -37,17 +32,17 @@ fn two_processes_at_once_make_every_stage_once() {
         assert!(
             both.iter().any(|o| o.status.success()),
             "{stage}: {}",
-            both.iter().map(said).collect::<String>()
+            both.iter().map(err).collect::<String>()
         );
         let gives_way =
-            |o: &Output| o.status.code() == Some(75) || said(o).contains(&format!("{stage}: already done"));
+            |o: &Output| o.status.code() == Some(75) || err(o).contains(&format!("{stage}: already done"));
         assert!(
             both.iter().any(gives_way),
             "{stage} was made twice: {}",
-            both.iter().map(said).collect::<String>()
+            both.iter().map(err).collect::<String>()
         );
         for output in &both {
-            assert!([Some(0), Some(75)].contains(&output.status.code()), "{stage}: {}", said(output));
+            assert!([Some(0), Some(75)].contains(&output.status.code()), "{stage}: {}", err(output));
         }
         same(&files(&dir.path().join("calm")), &files(&dir.path().join("raced")), stage);
     }
@@ -57,11 +52,10 @@ fn two_processes_at_once_make_every_stage_once() {
 fn a_clock_that_jumps_changes_no_product() {
     let dir = tempfile::tempdir().unwrap();
     let Some(shim) = shim(dir.path()) else { return };
-    capture(dir.path());
-    done(&tiface(dir.path(), &["run", "head", "--run", "calm"]).output().unwrap());
-    let mut command = tiface(dir.path(), &["run", "head", "--run", "jumped"]);
-    done(&command.env("LD_PRELOAD", shim).env("FAULT_CLOCK", "1").output().unwrap());
-    same(&files(&dir.path().join("calm")), &files(&dir.path().join("jumped")), "a jumping clock");
+    let head = kept().join("head");
+    let mut command = tiface(dir.path(), &["run", head.to_str().unwrap(), "--run", "jumped"]);
+    worked(&command.env("LD_PRELOAD", shim).env("FAULT_CLOCK", "1").output().unwrap());
+    same(&files(&kept().join("run")), &files(&dir.path().join("jumped")), "a jumping clock");
     let status = std::fs::read_to_string(dir.path().join("jumped/mask/status.json")).unwrap();
     let status: serde_json::Value = serde_json::from_str(&status).unwrap();
     let now = std::time::UNIX_EPOCH.elapsed().unwrap().as_secs();
@@ -74,7 +68,7 @@ fn a_clock_that_jumps_changes_no_product() {
 #[test]
 fn a_run_that_may_not_be_written_is_read_and_nothing_else() {
     let dir = tempfile::tempdir().unwrap();
-    let head = capture(dir.path());
+    let run = finished(dir.path(), "run");
     let nobody = |words: &[&str]| {
         let command = tiface(dir.path(), words);
         let mut user = Command::new("setpriv");
@@ -88,38 +82,34 @@ fn a_run_that_may_not_be_written_is_read_and_nothing_else() {
         eprintln!("skipped: the program cannot be run as another user here");
         return;
     }
-    done(&tiface(dir.path(), &["run", "head", "--run", "run"]).output().unwrap());
-    let before = files(&dir.path().join("run"));
+    let before = files(&run);
     for words in [&["run", "run"][..], &["status", "run"], &["preview", "run", "--size", "32"]] {
         let output = nobody(words).unwrap();
-        assert!(output.status.success() || words[0] == "preview", "{words:?}: {}", said(&output));
-        assert!([Some(0), Some(1)].contains(&output.status.code()), "{words:?}: {}", said(&output));
+        assert!(output.status.success() || words[0] == "preview", "{words:?}: {}", err(&output));
+        assert!([Some(0), Some(1)].contains(&output.status.code()), "{words:?}: {}", err(&output));
     }
     for words in [&["run", "run", "--fresh", "mesh"][..], &["mask", "head", "--run", "new"]] {
         let output = nobody(words).unwrap();
-        assert_eq!(output.status.code(), Some(1), "{words:?}: {}", said(&output));
-        assert!(said(&output).contains("ermission denied"), "{}", said(&output));
+        assert_eq!(output.status.code(), Some(1), "{words:?}: {}", err(&output));
+        assert!(err(&output).contains("ermission denied"), "{}", err(&output));
     }
-    assert!(before == files(&dir.path().join("run")) && head.is_dir());
+    assert!(before == files(&run) && dir.path().join("head").is_dir());
 }
 
 #[test]
 fn a_capture_that_changed_or_moved_under_a_run_is_named_with_its_key() {
     let dir = tempfile::tempdir().unwrap();
-    let head = capture(dir.path());
-    done(&tiface(dir.path(), &["iface", "head", "--run", "run"]).output().unwrap());
-    let mesh = |folder: &Path, more: &[&str]| {
-        let mut words = vec!["mesh", "run"];
-        words.extend(more);
-        Command::new(env!("CARGO_BIN_EXE_tiface"))
-            .args(words)
-            .current_dir(folder)
-            .env("XDG_CONFIG_HOME", folder)
-            .output()
-            .unwrap()
+    let run = finished(dir.path(), "run");
+    let head = dir.path().join("head");
+    // as far as its fields
+    for stage in ["mesh", "render", "ensemble", "metrics"] {
+        std::fs::remove_dir_all(run.join(stage)).unwrap();
+    }
+    let mesh = |folder: &Path, more: &[&str]| -> Output {
+        command(folder, &[&["mesh", "run"], more].concat()).output().unwrap()
     };
     let refused = |output: Output, what: &str| {
-        let text = said(&output);
+        let text = err(&output);
         assert_eq!(output.status.code(), Some(1), "{text}");
         assert!(text.contains(what) && text.contains("--set capture.path=FOLDER"), "{text}");
     };
@@ -133,38 +123,35 @@ fn a_capture_that_changed_or_moved_under_a_run_is_named_with_its_key() {
     let other = dir.path().join("other");
     std::fs::create_dir(&other).unwrap();
     std::fs::rename(old, other.join("photographs")).unwrap();
-    std::fs::rename(dir.path().join("run"), other.join("run")).unwrap();
+    std::fs::rename(run, other.join("run")).unwrap();
     refused(mesh(&other, &[]), "cannot be opened");
-    done(&mesh(&other, &["--set", "capture.path=photographs"]));
-    let output = Command::new(env!("CARGO_BIN_EXE_tiface"))
-        .args(["ensemble", "other/run", "--members", "baseline,tface", "--weights", "0.5,0.5"])
-        .args(["--set", "render.method=baseline,tface"])
-        .current_dir(dir.path())
-        .env("XDG_CONFIG_HOME", dir.path())
-        .output()
-        .unwrap();
-    done(&output);
+    worked(&mesh(&other, &["--set", "capture.path=photographs"]));
+    let words = ["ensemble", "other/run", "--members", "baseline,tface", "--weights", "0.5,0.5"];
+    let set = ["--set", "render.method=baseline,tface"];
+    worked(&command(dir.path(), &[&words[..], &set].concat()).output().unwrap());
 }
 
 #[test]
 fn few_open_files_and_little_memory_end_in_a_product_or_a_sentence() {
     let dir = tempfile::tempdir().unwrap();
-    capture(dir.path());
+    let head = kept().join("head");
     let run = |name: &str| {
-        let mut command = tiface(dir.path(), &["run", "head", "--run", name]);
+        let mut command = tiface(dir.path(), &["run", head.to_str().unwrap(), "--run", name]);
         command.env("RAYON_NUM_THREADS", "2");
         command
     };
-    done(&limited("ulimit -n 32", &run("calm")));
+    let calm = files(&kept().join("run"));
+    worked(&limited("ulimit -n 32", &run("few")));
+    same(&calm, &files(&dir.path().join("few")), "with 32 open files");
     let gib = |n: u32| format!("ulimit -v {}", n << 20);
     let output = limited(&gib(2), &run("two"));
-    done(&output);
-    same(&files(&dir.path().join("calm")), &files(&dir.path().join("two")), "in 2 GiB");
+    worked(&output);
+    same(&calm, &files(&dir.path().join("two")), "in 2 GiB");
     // so much more than there is: the sentence, and then all the same a run
     let large =
         limited(&gib(2), run("large").args(["--set", "iface.levels=16", "--set", "iface.log2_table=24"]));
-    let text = said(&large);
+    let text = err(&large);
     assert_eq!(large.status.code(), Some(75), "{text}");
     assert!(text.contains("error: out of memory: ") && text.contains("raise `capture.downscale`"), "{text}");
-    done(&limited(&gib(2), run("large").args(["--fresh", "iface"])));
+    worked(&limited(&gib(2), run("large").args(["--fresh", "iface"])));
 }

@@ -1,12 +1,13 @@
 //! COLMAP's models: every lens to the last digits, every format there and back, and every hostile file refused by name.
 
+use crate::kept::photographed;
 use glam::{DMat3, DQuat, DVec3, Vec2};
 use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
 use tiface::capture::convert::{CameraFormat, convert};
 use tiface::capture::inspect::inspect;
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::capture::synthetic::SyntheticOptions;
 use tiface::capture::{self, Capture, CaptureOptions, Split, ViewMask};
 use tiface::geom::Projection;
 use tiface::io::{self, Limits};
@@ -473,7 +474,7 @@ fn every_format_is_written_and_read_again() {
     let at = |name: &str| dir.path().join(name);
     let options = CaptureOptions::default();
     let small = SyntheticOptions { width: 24, height: 30, train: 6, test: 3, seed: 1 };
-    write_capture(&at("head"), &small).unwrap();
+    photographed(&at("head"), &small);
     let head = capture::open(&at("head"), &options).unwrap();
     let mut last = head.clone();
     for (step, format) in [CameraFormat::Colmap, CameraFormat::Transforms].into_iter().enumerate() {
@@ -509,7 +510,7 @@ fn a_held_out_name_that_a_format_cannot_carry_is_refused_not_learned() {
     let at = |name: &str| dir.path().join(name);
     let options = CaptureOptions::default();
     let small = SyntheticOptions { width: 24, height: 30, train: 6, test: 2, seed: 1 };
-    write_capture(&at("head"), &small).unwrap();
+    photographed(&at("head"), &small);
     let head = capture::open(&at("head"), &options).unwrap();
     let held_out = head.views.iter().rposition(|v| v.split == Split::Test).unwrap();
     let names = ["#a.png", "#d/a.png", " a.png", "a.png ", "a\nb.png", "a\rb.png", "c:a.png"];
@@ -539,7 +540,7 @@ fn splits_that_only_look_like_every_eighth_survive_every_format() {
     let options = CaptureOptions::default();
     let opened = |train, test| {
         let folder = at(&format!("head {train} {test}"));
-        write_capture(&folder, &SyntheticOptions { width: 24, height: 30, train, test, seed: 1 }).unwrap();
+        photographed(&folder, &SyntheticOptions { width: 24, height: 30, train, test, seed: 1 });
         capture::open(&folder, &options).unwrap()
     };
     // `a-1.png` comes before `a.png`, but `a` before `a-1`: readers differ on which of them is the first

@@ -1,58 +1,25 @@
 //! `tiface bench` as a user sees it, on a capture of a few small photographs.
 
-mod command;
-
-use command::tiface;
+use crate::command::{said, tiface};
+use crate::kept::photographed;
 use serde_json::Value;
 use std::path::Path;
 use std::process::Output;
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::capture::synthetic::SyntheticOptions;
 
 /// Sizes that end in seconds.
-const SMALL: [&str; 18] = [
-    "--set",
-    "iface.steps=40",
-    "--set",
-    "iface.rays=128",
-    "--set",
-    "iface.samples=2048",
-    "--set",
-    "iface.levels=8",
-    "--set",
-    "iface.log2_table=12",
-    "--set",
-    "tface.steps=20",
-    "--set",
-    "tface.rays=256",
-    "--set",
-    "tface.voxels_final=8000",
-    "--set",
-    "tface.voxels_start=8000",
-];
-
-const SMALL_MESH: [&str; 8] = [
-    "--set",
-    "mesh.resolution=48",
-    "--set",
-    "mesh.triangles=2000",
-    "--set",
-    "mesh.texture_px=128",
-    "--set",
-    "tface.upsample_at=[]",
-];
+const SMALL: &str = "iface.steps=40 iface.rays=64 iface.max_rays=128 iface.samples=1024 iface.levels=8 \
+    iface.log2_table=12 tface.steps=20 tface.rays=128 tface.voxels_start=4096 tface.voxels_final=4096 \
+    tface.upsample_at=[] mesh.resolution=48 mesh.triangles=1000 mesh.texture_px=64";
 
 fn capture(folder: &Path) {
-    let options = SyntheticOptions { width: 48, height: 60, train: 10, test: 2, seed: 1 };
-    std::fs::create_dir(folder.join("capture")).unwrap();
-    write_capture(&folder.join("capture"), &options).unwrap();
+    let options = SyntheticOptions { width: 24, height: 30, train: 8, test: 1, seed: 1 };
+    photographed(&folder.join("capture"), &options);
 }
 
 fn bench(folder: &Path, words: &[&str]) -> Output {
-    tiface(folder, &[&["bench", "capture"], &SMALL[..], &SMALL_MESH, words].concat())
-}
-
-fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
+    let settings: Vec<&str> = SMALL.split_whitespace().flat_map(|set| ["--set", set]).collect();
+    tiface(folder, &[&["bench", "capture"], &settings[..], words].concat())
 }
 
 fn results(folder: &Path, name: &str) -> Value {

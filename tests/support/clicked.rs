@@ -1,6 +1,6 @@
 //! The shared captures with the clicks that come with them and the masks they should give.
 
-// each test and bench takes what it needs
+// benches take what they need
 #![allow(dead_code)]
 
 use std::collections::HashMap;
@@ -19,15 +19,20 @@ pub struct Clicked {
     pub clicks: Vec<Vec<Click>>,
 }
 
-/// Reads a capture, or says aloud that it is not there.
-pub fn read(name: &str) -> Option<Clicked> {
+/// The folder of a shared capture, or says aloud that it is not there.
+pub fn folder(name: &str) -> Option<PathBuf> {
     let shared = std::env::var("TIFACE_SHARED")
         .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
     let root = PathBuf::from(shared).join("data/captures").join(name);
     if !root.is_dir() {
         eprintln!("skipped: the capture `{name}` is not at {}", root.display());
-        return None;
     }
+    root.is_dir().then_some(root)
+}
+
+/// Reads a capture, if it is there.
+pub fn read(name: &str) -> Option<Clicked> {
+    let root = folder(name)?;
     let capture: Capture = capture::open(&root, &CaptureOptions::default()).unwrap();
     let text = std::fs::read_to_string(root.join("prompts.json")).unwrap();
     let prompts: serde_json::Value = serde_json::from_str(&text).unwrap();

@@ -2,6 +2,7 @@
 //!
 //! They lie beside the repository, or where `TIFACE_SHARED` says; without them these tests skip, aloud.
 
+use crate::clicked::folder;
 use glam::{Vec2, Vec3};
 use std::collections::HashSet;
 use std::path::PathBuf;
@@ -11,17 +12,6 @@ use tiface::capture::{self, Capture, CaptureOptions, MaskMeaning, MaskSource, Sp
 use tiface::geom::Camera;
 use tiface::image::Gray;
 use tiface::io::Limits;
-
-fn folder(name: &str) -> Option<PathBuf> {
-    let shared = std::env::var("TIFACE_SHARED")
-        .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
-    let path = PathBuf::from(shared).join("data/captures").join(name);
-    if path.is_dir() {
-        return Some(path);
-    }
-    eprintln!("skipped: the capture `{name}` is not at {}", path.display());
-    None
-}
 
 fn count(c: &Capture, split: Split) -> usize {
     c.split(split).count()

@@ -1,12 +1,9 @@
 //! `tiface preview` as a user sees it, of files that others write.
 
-mod command;
-
-use command::tiface;
+use crate::command::{code, err, out, tiface};
 use image::{AnimationDecoder, RgbaImage};
 use std::io::Cursor;
 use std::path::Path;
-use std::process::Output;
 
 /// A tetrahedron without normals, texture coordinates and colors.
 const OBJ: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
@@ -66,14 +63,6 @@ fn materials_without_textures_give_their_colors() {
     assert!(has([255, 0, 0, 255]) && has([0, 188, 0, 255]));
 }
 
-fn code(output: &Output) -> i32 {
-    output.status.code().unwrap()
-}
-
-fn err(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
 fn folder() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("a.obj"), OBJ).unwrap();
@@ -90,7 +79,7 @@ fn a_file_becomes_a_picture_with_alpha_around_it() {
     let dir = folder();
     let o = tiface(dir.path(), &["preview", "b.ply", "--size", "64", "--json"]);
     assert_eq!(code(&o), 0, "{}", err(&o));
-    assert!(String::from_utf8_lossy(&o.stdout).contains("\"preview\":[\"b_preview.png\"]"));
+    assert!(out(&o).contains("\"preview\":[\"b_preview.png\"]"));
     let seen = picture(&dir.path().join("b_preview.png"));
     assert_eq!(seen.dimensions(), (64, 64));
     // its colors as they are, in the middle; nothing in the corner

@@ -1,10 +1,7 @@
 //! Zip archives that lie: each ends in a named error, and no memory is reserved for what they only claim.
 
-mod zips;
-
-use std::time::Instant;
+use crate::zips::{self, Entry};
 use tiface::io::{self, Limits, ReadError};
-use zips::Entry;
 
 fn read(bytes: &[u8]) -> Result<usize, ReadError> {
     let dir = tempfile::tempdir().unwrap();
@@ -58,7 +55,6 @@ fn archives_that_lie_are_errors() {
 
 #[test]
 fn small_archives_that_unpack_to_much_are_refused_before_they_are_unpacked() {
-    let begin = Instant::now();
     let zeros = Entry::deflated("a.npy", &vec![0; 64 << 20]);
     assert!(zeros.data.len() < 100 << 10);
     let error = read(&zips::archive(std::slice::from_ref(&zeros), |_, at| at));
@@ -67,5 +63,4 @@ fn small_archives_that_unpack_to_much_are_refused_before_they_are_unpacked() {
     let liar = Entry { size: 100, ..zeros };
     let error = read(&zips::archive(&[liar], |_, at| at));
     assert!(error.unwrap_err().to_string().contains("cannot be unpacked"));
-    assert!(begin.elapsed().as_secs() < 20);
 }

@@ -1,8 +1,9 @@
 //! The ray caster against depth and normals that other software rendered from the same scans.
 
+use crate::clicked::folder;
 use exr::prelude::*;
 use glam::{DMat3, DVec3};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use tiface::geom::{Bvh, Camera, Distortion};
 use tiface::mesh::files::read;
 use tiface::render::path::from_json;
@@ -25,17 +26,10 @@ fn channels(path: &Path, names: &[&str]) -> Vec<Vec<f32>> {
 
 #[test]
 fn depth_and_normals_of_the_scans_are_those_of_the_captures() {
-    let shared = std::env::var_os("TIFACE_SHARED")
-        .map_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared")), PathBuf::from);
     for capture in ["lps", "nefertiti"] {
-        let folder = shared.join("data/captures").join(capture);
-        let (Ok(ply), Ok(json)) = (
-            std::fs::read(folder.join("gt.ply")),
-            std::fs::read_to_string(folder.join("transforms_test.json")),
-        ) else {
-            eprintln!("skipped: there is no capture {}", folder.display());
-            continue;
-        };
+        let Some(folder) = folder(capture) else { continue };
+        let ply = std::fs::read(folder.join("gt.ply")).unwrap();
+        let json = std::fs::read_to_string(folder.join("transforms_test.json")).unwrap();
         let mesh = read(&ply, Path::new("gt.ply")).unwrap();
         let bvh = Bvh::new(&mesh);
         // every frame states its own lens; this one only fills gaps

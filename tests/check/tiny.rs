@@ -1,10 +1,11 @@
 //! The smallest run, its files, and the library that gets in the way of its writes.
-#![allow(dead_code)]
 
+use crate::command::{command, worked};
+use crate::kept::{copy_run, once, photographed};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use std::process::Command;
+use tiface::capture::synthetic::SyntheticOptions;
 
 const SETTINGS: &str = "device=cpu mask.source=none iface.steps=4 iface.rays=64 iface.max_rays=128 \
     iface.samples=1024 iface.levels=4 iface.log2_table=10 iface.occupancy_resolution=16 iface.stereo=0 \
@@ -18,14 +19,13 @@ pub type Files = BTreeMap<PathBuf, Vec<u8>>;
 /// Six photographs in `folder/head`.
 pub fn capture(folder: &Path) -> PathBuf {
     let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
-    write_capture(&folder.join("head"), &options).unwrap();
+    photographed(&folder.join("head"), &options);
     folder.join("head")
 }
 
 /// The program with these words in a folder, and the settings of the smallest run.
 pub fn tiface(folder: &Path, words: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
-    command.args(words).current_dir(folder).env("XDG_CONFIG_HOME", folder).env_remove("RUST_LOG");
+    let mut command = command(folder, words);
     if !["report", "convert", "preview", "export"].contains(&words[0]) {
         command.args(["--preset", "draft"]);
         for setting in SETTINGS.split_whitespace() {
@@ -33,6 +33,19 @@ pub fn tiface(folder: &Path, words: &[&str]) -> Command {
         }
     }
     command
+}
+
+/// The smallest capture and a finished run of it, `head` and `run` in a folder. They are made once a program, to be read.
+pub fn kept() -> PathBuf {
+    once("tiny", |folder| {
+        capture(folder);
+        worked(&tiface(folder, &["run", "head", "--run", "run"]).output().unwrap());
+    })
+}
+
+/// Copies the smallest capture to `folder/head` and its finished run to a folder of this name beside it.
+pub fn finished(folder: &Path, run: &str) -> PathBuf {
+    copy_run(&kept(), folder, run)
 }
 
 /// Compiles `fault/fault.c`; `None`, said aloud, without a compiler.
@@ -49,10 +62,6 @@ pub fn shim(folder: &Path) -> Option<PathBuf> {
             None
         }
     }
-}
-
-pub fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// All files with their bytes; what tells when things happened without it.
@@ -92,14 +101,4 @@ pub fn same(new: &Files, found: &Files, what: &str) {
     for (file, bytes) in new.iter().filter(|(file, _)| !is_timed(file)) {
         assert!(found[file] == *bytes, "{what}, repeated: {} differs", file.display());
     }
-}
-
-/// A copy of a folder in the place of whatever is there.
-pub fn copy(from: &Path, to: &Path) -> PathBuf {
-    if to.exists() {
-        std::fs::remove_dir_all(to).unwrap();
-    }
-    let status = Command::new("cp").arg("-r").arg(from).arg(to).status().unwrap();
-    assert!(status.success());
-    to.into()
 }

@@ -1,12 +1,10 @@
 //! `tiface export` as a user runs it: the finished mesh of a run in other files, and a run that stays as it is.
 
-mod command;
-
-use command::tiface;
+use crate::command::{said, tiface};
+use crate::kept::{copy_run, once, photographed};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::Output;
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::capture::synthetic::SyntheticOptions;
 use tiface::geom::topology;
 use tiface::io::{Limits, parse_picture_info, read_tensors};
 use tiface::mesh::files::{HeadMesh, PictureSource, ReadMesh, ReadOptions, read_with, weld};
@@ -14,11 +12,7 @@ use tiface::mesh::files::{HeadMesh, PictureSource, ReadMesh, ReadOptions, read_w
 /// A head that is learned in a few steps, and views of it that need no radiance field.
 const SETTINGS: &str = "device=cpu iface.steps=4 iface.rays=64 iface.max_rays=128 iface.samples=1024 iface.levels=4 \
     iface.log2_table=10 iface.occupancy_resolution=16 iface.stereo=0 mesh.resolution=32 mesh.triangles=600 \
-    mesh.texture_px=128 mesh.format=glb,obj,ply render.samples=1 render.method=textured ensemble.members=";
-
-fn said(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
-}
+    mesh.texture_px=128 mesh.format=glb,obj,ply render.samples=1 mesh.hair=none render.method=textured ensemble.members=";
 
 fn worked(folder: &Path, words: &[&str]) -> String {
     let output = tiface(folder, words);
@@ -26,14 +20,21 @@ fn worked(folder: &Path, words: &[&str]) -> String {
     said(&output)
 }
 
-/// Makes all stages of a run, up to its metrics.
+/// Makes all stages of a run, up to its metrics. The head is learned once; its mesh is made anew with these settings.
 fn finished(folder: &Path, more: &[&str]) -> PathBuf {
-    let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
-    write_capture(&folder.join("head"), &options).unwrap();
-    let mut words = vec!["run", "head", "--preset", "draft"];
-    SETTINGS.split_whitespace().chain(more.iter().copied()).for_each(|s| words.extend(["--set", s]));
-    worked(folder, &words);
-    folder.join("runs/head")
+    let kept = once("to export", |folder| {
+        let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
+        photographed(&folder.join("head"), &options);
+        let mut words = vec!["run", "head", "--run", "run", "--preset", "draft"];
+        SETTINGS.split_whitespace().for_each(|set| words.extend(["--set", set]));
+        worked(folder, &words);
+    });
+    let run = copy_run(&kept, folder, "runs/head");
+    if !more.is_empty() {
+        let settings: Vec<&str> = more.iter().flat_map(|set| ["--set", *set]).collect();
+        worked(folder, &[&["run", "runs/head", "--fresh", "mesh"], &settings[..]].concat());
+    }
+    run
 }
 
 /// All files of a folder with their bytes.
@@ -71,7 +72,7 @@ fn document(file: &Path) -> serde_json::Value {
 #[test]
 fn with_the_settings_of_the_run_the_files_are_those_of_the_stage() {
     let dir = tempfile::tempdir().unwrap();
-    let run = finished(dir.path(), &["mesh.lobes=1", "mesh.frame=head"]);
+    let run = finished(dir.path(), &["mesh.lobes=1", "mesh.frame=head", "mesh.hair=shells"]);
     let before = files(&run);
     // photographs are not asked for
     std::fs::rename(dir.path().join("head"), dir.path().join("moved")).unwrap();
@@ -108,7 +109,7 @@ fn with_the_settings_of_the_run_the_files_are_those_of_the_stage() {
 #[test]
 fn other_settings_give_what_the_stage_gives_when_it_is_made_again_with_them() {
     let dir = tempfile::tempdir().unwrap();
-    let run = finished(dir.path(), &[]);
+    let run = finished(dir.path(), &["mesh.hair=shells"]);
     let before = files(&run);
     let settings =
         ["--material", "lit", "--frame", "head", "--height", "0.3", "--set", "mesh.texture_format=jpeg"];
@@ -142,7 +143,7 @@ fn other_settings_give_what_the_stage_gives_when_it_is_made_again_with_them() {
 #[test]
 fn a_smaller_head_is_watertight_and_keeps_its_texture() {
     let dir = tempfile::tempdir().unwrap();
-    let run = finished(dir.path(), &["mesh.normal_map=true", "mesh.lobes=1"]);
+    let run = finished(dir.path(), &["mesh.normal_map=true", "mesh.lobes=1", "mesh.hair=shells"]);
     let before = files(&run);
     let words = ["export", "runs/head", "--triangles", "300", "--texture", "64"];
     worked(dir.path(), &[&words[..], &["--format", "glb,obj", "--out", "small/"]].concat());
@@ -187,7 +188,7 @@ fn a_smaller_head_is_watertight_and_keeps_its_texture() {
 #[test]
 fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
     let dir = tempfile::tempdir().unwrap();
-    let run = finished(dir.path(), &["mesh.hair=none"]);
+    let run = finished(dir.path(), &[]);
     std::fs::create_dir(dir.path().join("began")).unwrap();
     std::fs::copy(run.join("config.toml"), dir.path().join("began/config.toml")).unwrap();
     let (before, here) = (files(&run), names(dir.path()));
@@ -246,7 +247,7 @@ fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
 #[test]
 fn a_mesh_that_was_cut_or_changed_is_not_exported() {
     let dir = tempfile::tempdir().unwrap();
-    let run = finished(dir.path(), &["mesh.hair=none"]);
+    let run = finished(dir.path(), &[]);
     let parts = run.join("mesh/parts");
     let export = || tiface(dir.path(), &["export", "runs/head", "--out", "out.glb"]);
     let good = std::fs::read(run.join("mesh/head.glb")).unwrap();
@@ -301,7 +302,7 @@ fn a_mesh_that_was_cut_or_changed_is_not_exported() {
 #[cfg(target_os = "linux")]
 fn a_place_that_cannot_be_written_is_named() {
     let dir = tempfile::tempdir().unwrap();
-    let run = finished(dir.path(), &["mesh.hair=none"]);
+    let run = finished(dir.path(), &[]);
     let before = files(&run);
     let output = tiface(dir.path(), &["export", "runs/head", "--out", "/proc/head.glb"]);
     assert!(output.status.code() == Some(1) && said(&output).contains("`/proc"), "{}", said(&output));

@@ -1,38 +1,34 @@
 //! A finished run in its user's hands: turntables, single stages, a capture that has moved.
 
-mod command;
-
-use command::tiface;
+use crate::command::{said, tiface, worked};
+use crate::kept::{copy, copy_run, once, photographed};
 use std::path::{Path, PathBuf};
-use std::process::Output;
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::capture::synthetic::SyntheticOptions;
 
-fn text(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr)
-}
-
-fn worked(output: &Output) -> String {
-    assert!(output.status.success(), "{}", text(output));
-    text(output)
+/// A checkpoint of T-Face that was learned elsewhere.
+fn checkpoint() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.safetensors")
 }
 
 /// A run with an imported T-Face: nothing has to be learned.
 fn finished(folder: &Path) {
-    let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
-    write_capture(&folder.join("head"), &options).unwrap();
-    let import = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.safetensors");
-    let import = format!("tface.import={}", import.display());
-    let mut words = vec!["run", "head", "--preset", "draft"];
-    let settings = [
-        &import,
-        "render.method=tface",
-        "ensemble.members=tface",
-        "ensemble.weights=1",
-        "render.orbit_views=3",
-        "device=cpu",
-    ];
-    settings.iter().for_each(|s| words.extend(["--set", s]));
-    worked(&tiface(folder, &words));
+    let kept = once("imported", |folder| {
+        let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
+        photographed(&folder.join("head"), &options);
+        let import = format!("tface.import={}", checkpoint().display());
+        let mut words = vec!["run", "head", "--run", "run", "--preset", "draft"];
+        let settings = [
+            &import,
+            "render.method=tface",
+            "ensemble.members=tface",
+            "ensemble.weights=1",
+            "render.orbit_views=3",
+            "device=cpu",
+        ];
+        settings.iter().for_each(|s| words.extend(["--set", s]));
+        worked(&tiface(folder, &words));
+    });
+    copy_run(&kept, folder, "runs/head");
 }
 
 /// The files of a run with their bytes, those of camera paths left out.
@@ -68,8 +64,8 @@ fn a_turntable_leaves_the_finished_run_as_it_is() {
         "--out",
         "turn/",
     ];
-    let said = worked(&tiface(dir.path(), &words));
-    assert!(said.contains("render/paths/orbit"), "{said}");
+    let text = worked(&tiface(dir.path(), &words));
+    assert!(text.contains("render/paths/orbit"), "{text}");
     for view in ["0001", "0002", "0003"] {
         assert!(dir.path().join(format!("turn/tface/{view}.png")).is_file());
     }
@@ -77,7 +73,7 @@ fn a_turntable_leaves_the_finished_run_as_it_is() {
     assert!(worked(&tiface(dir.path(), &words)).contains("render/paths/orbit: already done"));
     let other = tiface(dir.path(), &["render", "runs/head", "--cameras", "orbit", "--format", "exr"]);
     assert_eq!(other.status.code(), Some(1));
-    assert!(text(&other).contains("`--fresh render` to make `render/paths/orbit` anew"), "{}", text(&other));
+    assert!(said(&other).contains("`--fresh render` to make `render/paths/orbit` anew"), "{}", said(&other));
     assert!(before == files(&run), "the turntable has changed the run");
     assert!(worked(&tiface(dir.path(), &["run", "runs/head"])).contains("metrics: already done"));
     assert!(before == files(&run));
@@ -105,7 +101,7 @@ fn a_finished_run_outlives_its_capture_and_single_stages() {
     assert!(worked(&tiface(dir.path(), &["run", "runs/head"])).contains("metrics: already done"));
     let o = tiface(dir.path(), &["mesh", "runs/head"]);
     assert_eq!(o.status.code(), Some(1));
-    assert!(text(&o).contains("--set capture.path="), "{}", text(&o));
+    assert!(said(&o).contains("--set capture.path="), "{}", said(&o));
     assert!(before == files(&run));
 }
 
@@ -113,10 +109,9 @@ fn a_finished_run_outlives_its_capture_and_single_stages() {
 fn a_finished_run_needs_its_imported_checkpoint_no_more() {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    photographed(&dir.path().join("head"), &options);
     let import = dir.path().join("official.safetensors");
-    std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference/vm_g5.safetensors"), &import)
-        .unwrap();
+    std::fs::copy(checkpoint(), &import).unwrap();
     let import = format!("tface.import={}", import.display());
     // the evaluation of a new run is as `--set` has it, whatever the first command renders
     let words = ["render", "head", "--preset", "draft", "--cameras", "train", "--with", "tface"];
@@ -132,10 +127,10 @@ fn a_finished_run_needs_its_imported_checkpoint_no_more() {
     let before = files(&run);
     // another file that does not exist is not what the stage took
     let typo = tiface(dir.path(), &["tface", "runs/head", "--set", "tface.import=typo.safetensors"]);
-    assert!(typo.status.code() == Some(1) && text(&typo).contains("typo.safetensors"), "{}", text(&typo));
+    assert!(typo.status.code() == Some(1) && said(&typo).contains("typo.safetensors"), "{}", said(&typo));
     assert!(before == files(&run), "the wrong path was written");
     let anew = tiface(dir.path(), &["tface", "runs/head", "--fresh", "tface"]);
-    assert!(anew.status.code() == Some(1) && text(&anew).contains("official.safetensors"), "{}", text(&anew));
+    assert!(anew.status.code() == Some(1) && said(&anew).contains("official.safetensors"), "{}", said(&anew));
     assert!(before == files(&run), "something was removed");
 }
 
@@ -152,9 +147,9 @@ fn a_product_that_was_cut_is_not_passed_over_as_done() {
     let name = picture.strip_prefix(dir.path()).unwrap().display().to_string();
     for words in [&["run", "runs/head"][..], &["run", "runs/head", "--dry-run"]] {
         let o = tiface(dir.path(), words);
-        assert_eq!(o.status.code(), Some(1), "{}", text(&o));
-        assert!(text(&o).contains(&format!("`{name}` has {} bytes", whole.len() / 2)), "{}", text(&o));
-        assert!(text(&o).contains("`--fresh ensemble`"), "{}", text(&o));
+        assert_eq!(o.status.code(), Some(1), "{}", said(&o));
+        assert!(said(&o).contains(&format!("`{name}` has {} bytes", whole.len() / 2)), "{}", said(&o));
+        assert!(said(&o).contains("`--fresh ensemble`"), "{}", said(&o));
     }
     assert!(before == files(&run), "a refused command has changed the run");
     worked(&tiface(dir.path(), &["run", "runs/head", "--fresh", "ensemble"]));
@@ -169,7 +164,7 @@ fn verify_names_each_file_that_is_not_as_recorded() {
     assert!(worked(&tiface(dir.path(), &["verify"])).contains(", as recorded\n"));
     let before = files(&run);
     let manifest = tiface(dir.path(), &["verify", "runs/head", "--json"]);
-    assert_eq!(manifest.status.code(), Some(0), "{}", text(&manifest));
+    assert_eq!(manifest.status.code(), Some(0), "{}", said(&manifest));
     let manifest: serde_json::Value = serde_json::from_slice(&manifest.stdout).unwrap();
     let digests = manifest["products"].as_object().unwrap();
     let path = digests.keys().find(|path| path.starts_with("ensemble/") && path.ends_with(".png")).unwrap();
@@ -181,16 +176,16 @@ fn verify_names_each_file_that_is_not_as_recorded() {
     *bytes.last_mut().unwrap() ^= 1;
     std::fs::write(run.join(path), &bytes).unwrap();
     let o = tiface(dir.path(), &["verify", "runs/head"]);
-    assert_eq!(o.status.code(), Some(3), "{}", text(&o));
-    assert!(text(&o).contains(&format!("`{path}` has other contents than were written")), "{}", text(&o));
+    assert_eq!(o.status.code(), Some(3), "{}", said(&o));
+    assert!(said(&o).contains(&format!("`{path}` has other contents than were written")), "{}", said(&o));
     std::fs::remove_file(run.join(path)).unwrap();
     let o = tiface(dir.path(), &["verify", "runs/head"]);
-    assert!(o.status.code() == Some(3) && text(&o).contains(&format!("`{path}` is missing")), "{}", text(&o));
+    assert!(o.status.code() == Some(3) && said(&o).contains(&format!("`{path}` is missing")), "{}", said(&o));
     // a folder that is no run fails, and does not hide what was found in another
     std::fs::create_dir(dir.path().join("empty")).unwrap();
     let o = tiface(dir.path(), &["verify", "empty", "runs/head"]);
-    assert_eq!(o.status.code(), Some(1), "{}", text(&o));
-    assert!(text(&o).contains("no finished stage") && text(&o).contains("is missing"), "{}", text(&o));
+    assert_eq!(o.status.code(), Some(1), "{}", said(&o));
+    assert!(said(&o).contains("no finished stage") && said(&o).contains("is missing"), "{}", said(&o));
 }
 
 #[test]
@@ -229,14 +224,14 @@ fn pictures_and_meshes_of_other_programs_are_judged_by_the_held_out_photographs(
 
     // never into a run, whose report it would replace
     let o = tiface(dir.path(), &["metrics", "head", "--mesh", "far.obj", "--out", "runs/head/"]);
-    assert!(o.status.code() == Some(2) && text(&o).contains("would replace"), "{}", text(&o));
+    assert!(o.status.code() == Some(2) && said(&o).contains("would replace"), "{}", said(&o));
     assert!(before == files(&run), "the run was changed");
 
     // one picture is lacking, then all
     let few = dir.path().join("few");
     std::fs::create_dir(&few).unwrap();
     let o = tiface(dir.path(), &["metrics", "head", "--views", "few"]);
-    assert!(o.status.code() == Some(1) && text(&o).contains("no picture of a held-out view"), "{}", text(&o));
+    assert!(o.status.code() == Some(1) && said(&o).contains("no picture of a held-out view"), "{}", said(&o));
     let all = std::fs::read_dir(run.join("ensemble")).unwrap().map(|entry| entry.unwrap().path());
     let one = all.filter(|path| path.extension().is_some_and(|e| e == "png")).min().unwrap();
     std::fs::copy(&one, few.join(one.file_name().unwrap())).unwrap();
@@ -248,18 +243,15 @@ fn pictures_and_meshes_of_other_programs_are_judged_by_the_held_out_photographs(
 fn two_runs_of_a_capture_are_compared_on_one_page() {
     let dir = tempfile::tempdir().unwrap();
     finished(dir.path());
-    let copy = dir.path().join("runs/white");
-    let status =
-        std::process::Command::new("cp").arg("-r").arg(dir.path().join("runs/head")).arg(&copy).status();
-    assert!(status.unwrap().success());
+    let white = copy(&dir.path().join("runs/head"), &dir.path().join("runs/white"));
     let words =
         ["render", "runs/white", "--fresh", "render", "--set", "render.samples=1", "--cameras", "test"];
     worked(&tiface(dir.path(), &words));
     worked(&tiface(dir.path(), &["run", "runs/white"]));
-    let before = (files(&dir.path().join("runs/head")), files(&copy));
+    let before = (files(&dir.path().join("runs/head")), files(&white));
     let shown = worked(&tiface(dir.path(), &["report", "runs/head", "runs/white"]));
     assert!(shown.contains("compare.html"), "{shown}");
-    assert!(before == (files(&dir.path().join("runs/head")), files(&copy)), "a run was changed");
+    assert!(before == (files(&dir.path().join("runs/head")), files(&white)), "a run was changed");
     let page = std::fs::read_to_string(dir.path().join("compare.html")).unwrap();
     for part in [
         "head: T-Face",
@@ -271,9 +263,7 @@ fn two_runs_of_a_capture_are_compared_on_one_page() {
         assert!(page.contains(part), "{part} is missing");
     }
     // with a run that has no metrics yet, or for the asking, it is a table
-    let part = dir.path().join("runs/part");
-    let status = std::process::Command::new("cp").arg("-r").arg(&copy).arg(&part).status();
-    assert!(status.unwrap().success());
+    let part = copy(&white, &dir.path().join("runs/part"));
     std::fs::remove_dir_all(part.join("metrics")).unwrap();
     for words in
         [&["report", "runs/head", "runs/part"][..], &["report", "runs/head", "runs/white", "--table"]]

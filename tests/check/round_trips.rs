@@ -1,13 +1,14 @@
 //! What is written is read again, whatever it is: every format that has both a writer and a reader here. COLMAP's text and
-//! `.npz` are only read, and `tests/colmap.rs` and `tests/readers` write those by hand.
+//! `.npz` are only read, and the tests of COLMAP and `tests/readers` write those by hand.
 
+use crate::kept::photographed;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use proptest::collection::{btree_map, vec};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use std::path::Path;
 use tiface::capture::convert::{CameraFormat, convert};
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::capture::synthetic::SyntheticOptions;
 use tiface::capture::{self, Capture, CaptureOptions, Split};
 use tiface::geom::{Camera, Distortion, Mesh, Projection};
 use tiface::image::{Gray, Photo};
@@ -116,7 +117,7 @@ proptest! {
     fn cameras_survive_transforms_and_colmap(views in views()) {
         let dir = tempfile::tempdir().unwrap();
         let small = SyntheticOptions { width: 16, height: 16, train: 6, test: 3, seed: 1 };
-        write_capture(&dir.path().join("head"), &small).unwrap();
+        photographed(&dir.path().join("head"), &small);
         let head = capture::open(&dir.path().join("head"), &CaptureOptions::default()).unwrap();
         for format in [CameraFormat::Transforms, CameraFormat::Colmap] {
             let from = with_cameras(&head, &views);

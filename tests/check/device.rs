@@ -1,41 +1,30 @@
 //! A whole run on a device, killed on the way and finished on the processor; on a software driver where nothing better
 //! is here.
-#![cfg(all(feature = "wgpu", unix))]
 
-mod command;
-
-use command::tiface;
+use crate::command::{code, command, err, worked};
+use crate::kept::photographed;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use tiface::capture::synthetic::SyntheticOptions;
 use tiface::kernel::gpu::Adapter;
 
-/// Ends in a minute on a software driver, which compiles the kernels for the most part of it.
-const SMALL: [&str; 16] = [
-    "iface.steps=120",
-    "iface.rays=128",
-    "iface.max_rays=256",
-    "iface.samples=2048",
-    "iface.levels=6",
-    "iface.log2_table=12",
-    "iface.occupancy_resolution=32",
-    "iface.checkpoint_s=1",
-    "tface.steps=40",
-    "tface.rays=256",
-    "tface.voxels_start=4096",
-    "tface.voxels_final=4096",
-    "mesh.resolution=32",
-    "mesh.texture_px=64",
-    "render.samples=1",
-    "render.method=tface,volume,raycast",
-];
+/// No more than what a driver in software does in seconds; it compiles the kernels for the most part of them.
+const SMALL: &str = "iface.steps=20 iface.rays=32 iface.max_rays=64 iface.samples=256 iface.levels=4 iface.log2_table=10 \
+    iface.occupancy_resolution=16 iface.stereo=0 iface.checkpoint_s=0.05 tface.steps=8 tface.rays=64 \
+    tface.voxels_start=512 tface.voxels_final=512 mesh.resolution=24 mesh.triangles=300 mesh.texture_px=64 \
+    mesh.format=glb mesh.hair=none render.samples=1 render.method=tface,volume,raycast";
+
+/// The program whose locks of devices are in its own folder: other tests use the devices of this machine, too.
+fn alone(folder: &Path, words: &[&str]) -> Command {
+    let mut command = command(folder, words);
+    command.env("TMPDIR", folder);
+    command
+}
 
 fn words<'a>(device: &'a str, more: &[&'a str]) -> Vec<&'a str> {
     let mut words = vec!["run", "capture", "--run", "run", "--device", device];
-    for setting in SMALL {
-        words.extend(["--set", setting]);
-    }
+    SMALL.split_whitespace().for_each(|setting| words.extend(["--set", setting]));
     words.extend_from_slice(more);
     words
 }
@@ -54,17 +43,11 @@ fn a_run_is_killed_on_the_device_goes_on_there_and_ends_on_the_processor() {
         return;
     }
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 48, height: 60, train: 8, test: 2, seed: 3 };
-    write_capture(&dir.path().join("capture"), &options).unwrap();
+    let options = SyntheticOptions { width: 24, height: 30, train: 6, test: 1, seed: 3 };
+    photographed(&dir.path().join("capture"), &options);
     let checkpoint = dir.path().join("run/iface/checkpoint.safetensors");
-    let mut child = Command::new(env!("CARGO_BIN_EXE_tiface"))
-        .args(words("wgpu:0", &[]))
-        .current_dir(dir.path())
-        .env("XDG_CONFIG_HOME", dir.path())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
+    let mut child =
+        alone(dir.path(), &words("wgpu:0", &[])).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     // killed as soon as there is something to lose
     let patience = Instant::now() + Duration::from_secs(900);
     while !checkpoint.is_file() && child.try_wait().unwrap().is_none() {
@@ -73,15 +56,11 @@ fn a_run_is_killed_on_the_device_goes_on_there_and_ends_on_the_processor() {
     }
     child.kill().unwrap();
     child.wait().unwrap();
-    let said = |output: std::process::Output| {
-        let text = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(output.status.success(), "{text}");
-        text
-    };
-    said(tiface(dir.path(), &words("wgpu:0", &[])));
+    let run = |words: &[&str]| -> Output { alone(dir.path(), words).output().unwrap() };
+    worked(&run(&words("wgpu:0", &[])));
     let (field, mesh) = (psnr(dir.path(), "volume"), psnr(dir.path(), "raycast"));
     // the same fields, meshed, rendered and judged by the processor
-    let text = said(tiface(dir.path(), &words("cpu", &["--fresh", "mesh"])));
+    let text = worked(&run(&words("cpu", &["--fresh", "mesh"])));
     let (by_cpu, mesh_by_cpu) = (psnr(dir.path(), "volume"), psnr(dir.path(), "raycast"));
     println!(
         "volume {field:.2} dB on the device, {by_cpu:.2} on the processor; mesh {mesh:.2}, {mesh_by_cpu:.2}"
@@ -94,9 +73,9 @@ fn a_run_is_killed_on_the_device_goes_on_there_and_ends_on_the_processor() {
 fn a_device_that_is_not_here_is_refused_before_anything_is_made() {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 24, height: 24, train: 4, test: 1, seed: 3 };
-    write_capture(&dir.path().join("capture"), &options).unwrap();
-    let refused = tiface(dir.path(), &words("vulkan:77", &[]));
-    let said = String::from_utf8_lossy(&refused.stderr).into_owned();
-    assert_eq!(refused.status.code(), Some(2), "{said}");
+    photographed(&dir.path().join("capture"), &options);
+    let refused = alone(dir.path(), &words("vulkan:77", &[])).output().unwrap();
+    let said = err(&refused);
+    assert_eq!(code(&refused), 2, "{said}");
     assert!(said.contains("vulkan:77") && said.contains("doctor") && !dir.path().join("run/tface").exists());
 }

@@ -1,24 +1,11 @@
 //! The command line as a user sees it: exit codes, messages, streams.
 
-mod command;
-
-use command::tiface;
+use crate::command::{code, command, err, out, tiface};
+use crate::kept::photographed;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
-use tiface::capture::synthetic::{SyntheticOptions, write_capture};
+use std::process::Command;
+use tiface::capture::synthetic::SyntheticOptions;
 use tiface::io::{Limits, read_gray, write_png_gray};
-
-fn code(output: &Output) -> i32 {
-    output.status.code().unwrap()
-}
-
-fn err(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
-fn out(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned()
-}
 
 #[test]
 fn help_and_version_end_with_0_and_nonsense_with_2() {
@@ -56,10 +43,7 @@ fn the_preset_of_the_environment_is_a_default_that_a_run_wins_over() {
     let saved = tiface(dir.path(), &["config", "--preset", "draft", "--set", "mesh.resolution=77"]);
     std::fs::write(dir.path().join("run/config.toml"), &saved.stdout).unwrap();
     let with = |preset: &str, words: &[&str]| {
-        let program = env!("CARGO_BIN_EXE_tiface");
-        let mut command = Command::new(program);
-        command.args(words).current_dir(dir.path()).env("XDG_CONFIG_HOME", dir.path());
-        command.env("TIFACE_PRESET", preset).output().unwrap()
+        command(dir.path(), words).env("TIFACE_PRESET", preset).output().unwrap()
     };
     assert_eq!(out(&with("paper", &["config", "run"])), out(&saved));
     let paper = tiface(dir.path(), &["config", "--preset", "paper"]);
@@ -99,8 +83,7 @@ fn a_folder_that_is_no_capture_ends_with_1_and_a_hint() {
 #[test]
 fn a_dry_run_names_only_the_stages_a_command_needs() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    small_head(dir.path());
     let stages = |words: &[&str]| {
         let o = tiface(dir.path(), &[words, &["head", "--dry-run"]].concat());
         assert_eq!(code(&o), 0, "{words:?}: {}", err(&o));
@@ -119,10 +102,16 @@ fn a_dry_run_names_only_the_stages_a_command_needs() {
     assert!(!dir.path().join("runs").exists());
 }
 
+/// A capture of eight photographs and a held-out one in `folder/head`.
+fn small_head(folder: &Path) {
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    photographed(&folder.join("head"), &options);
+}
+
 /// A capture of 24 + 1 photographs of the synthetic head.
 fn head(folder: &Path) -> PathBuf {
     let options = SyntheticOptions { width: 48, height: 60, train: 24, test: 1, seed: 1 };
-    write_capture(&folder.join("head"), &options).unwrap();
+    photographed(&folder.join("head"), &options);
     folder.join("head")
 }
 
@@ -261,8 +250,7 @@ fn inspect_says_of_what_is_no_capture_what_it_is() {
 #[test]
 fn a_blend_that_cannot_be_made_is_refused_before_anything_is_learned() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    small_head(dir.path());
     let o = tiface(dir.path(), &["ensemble", "head", "--set", "capture.tiles=0"]);
     assert_eq!(code(&o), 2);
     assert!(
@@ -431,7 +419,7 @@ fn bash_completes_with_the_printed_script() {
 fn what_was_probably_meant_is_named() {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 24, height: 30, train: 3, test: 1, seed: 1 };
-    write_capture(&dir.path().join("captures/002_00"), &options).unwrap();
+    photographed(&dir.path().join("captures/002_00"), &options);
     let run = dir.path().join("runs/head");
     std::fs::create_dir_all(&run).unwrap();
     let saved = tiface(dir.path(), &["config", "--set", "capture.path=captures/002_00"]);
@@ -477,7 +465,7 @@ fn what_was_probably_meant_is_named() {
 fn a_page_to_click_on_is_one_file_without_a_run() {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 32, height: 40, train: 3, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    photographed(&dir.path().join("head"), &options);
     let o = tiface(dir.path(), &["mask", "head", "--page"]);
     assert_eq!(code(&o), 0, "{}", err(&o));
     let page = std::fs::read_to_string(dir.path().join("head_clicks.html")).unwrap();
@@ -494,7 +482,7 @@ fn a_page_to_click_on_is_one_file_without_a_run() {
 fn clicks_that_cannot_be_used_are_named_with_the_way_out() {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 32, height: 40, train: 3, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    photographed(&dir.path().join("head"), &options);
     for (words, expected) in [
         (&["mask", "head", "--prompts", "none.json"][..], "none.json"),
         // as the option was spelled once
@@ -544,8 +532,7 @@ fn a_damaged_status_hides_no_other_run() {
 #[test]
 fn a_record_that_a_crash_left_empty_counts_as_none() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    small_head(dir.path());
     std::fs::create_dir_all(dir.path().join("runs/head/mask")).unwrap();
     for file in ["done.json", ".lock"] {
         std::fs::write(dir.path().join("runs/head/mask").join(file), "").unwrap();
@@ -582,8 +569,7 @@ fn escape_sequences_out_of_files_do_not_reach_the_terminal() {
 #[test]
 fn an_out_or_a_device_that_cannot_be_is_refused_before_anything_begins() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    small_head(dir.path());
     for (words, expected, said) in [
         (&["mesh", "head", "--out", "head.fbx"][..], 2, "end it in .glb, .obj, .ply, or in `/`"),
         (&["run", "head", "--out", "head.stl"], 2, ".json"),
@@ -622,8 +608,7 @@ fn an_out_or_a_device_that_cannot_be_is_refused_before_anything_begins() {
 #[test]
 fn the_tables_say_what_they_need_and_are_collected_without_making_it() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    small_head(dir.path());
     let experiment = |more: &[&str]| {
         let words = ["experiment", "head", "--tables", "components", "--scale", "0.01", "--out", "tables/"];
         tiface(dir.path(), &[&words[..], more].concat())
@@ -653,8 +638,7 @@ fn the_tables_say_what_they_need_and_are_collected_without_making_it() {
 #[test]
 fn what_out_received_is_told_and_nothing_else_is_written_there() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    small_head(dir.path());
     let o = tiface(dir.path(), &["mask", "head", "--out", "masks/"]);
     assert_eq!(code(&o), 0, "{}", err(&o));
     assert!(out(&o).contains("out       masks/\n"), "{}", out(&o));
@@ -666,10 +650,9 @@ fn what_out_received_is_told_and_nothing_else_is_written_there() {
 
 #[test]
 fn a_capture_is_converted_into_a_new_folder_only() {
-    use tiface::capture::synthetic::{SyntheticOptions, write_capture};
     let dir = tempfile::tempdir().unwrap();
     let small = SyntheticOptions { width: 16, height: 20, train: 4, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &small).unwrap();
+    photographed(&dir.path().join("head"), &small);
     let o = tiface(dir.path(), &["convert", "head", "--to", "colmap"]);
     assert_eq!((code(&o), out(&o).trim()), (0, "head_colmap"), "{}", err(&o));
     let o = tiface(dir.path(), &["convert", "head_colmap", "--to", "transforms", "--out", "back", "--json"]);
@@ -691,8 +674,7 @@ fn a_capture_is_converted_into_a_new_folder_only() {
 #[test]
 fn what_stopped_a_run_before_its_first_stage_is_told_by_its_folder_until_it_is_mended() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    small_head(dir.path());
     let frames = dir.path().join("head/transforms_train.json");
     let sound = std::fs::read_to_string(&frames).unwrap();
     std::fs::write(&frames, &sound[..sound.len() / 2]).unwrap();
@@ -734,8 +716,7 @@ fn what_stopped_a_run_before_its_first_stage_is_told_by_its_folder_until_it_is_m
 #[test]
 fn a_dry_run_says_about_how_long_and_how_much() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&dir.path().join("head"), &options).unwrap();
+    small_head(dir.path());
     let total = |more: &[&str]| {
         let o = tiface(dir.path(), &[&["run", "head", "--dry-run", "--json"], more].concat());
         assert_eq!(code(&o), 0, "{}", err(&o));
@@ -774,7 +755,6 @@ fn a_hundred_heads_stand_on_one_screen() {
     assert_eq!(out(&tiface(dir.path(), &["status", "-v"])).lines().count(), 101);
 }
 
-/// A capture of eight photographs and a held-out one in `folder/head`.
 #[test]
 fn masks_that_are_refused_clear_nothing_that_was_made_with_others() {
     let dir = tempfile::tempdir().unwrap();
@@ -788,11 +768,6 @@ fn masks_that_are_refused_clear_nothing_that_was_made_with_others() {
         assert!(err(&o).contains("inverted") && err(&o).contains("mask.trust"), "{}", err(&o));
         assert!(dir.path().join("runs/head/mask/done.json").is_file());
     }
-}
-
-fn small_head(folder: &Path) {
-    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
-    write_capture(&folder.join("head"), &options).unwrap();
 }
 
 #[test]

@@ -1,0 +1,42 @@
+//! Integration tests: what only the whole program can show, as a user runs it, and readers and files as others write them.
+//!
+//! What takes minutes is ignored with a reason that begins with `long:`, and run by `tools/test.sh all`.
+
+// what the tests share
+#[path = "../support/clicked.rs"]
+mod clicked;
+mod command;
+#[path = "../support/fields.rs"]
+mod fields;
+mod kept;
+mod tiny;
+mod zips;
+
+#[cfg(target_os = "linux")]
+mod accidents;
+mod bench;
+mod cameras;
+mod captures;
+mod cli;
+mod colmap;
+#[cfg(all(feature = "wgpu", unix))]
+mod device;
+mod export;
+mod extraction;
+#[cfg(target_os = "linux")]
+mod faults;
+mod finished;
+mod hostile;
+mod hostile_mesh;
+mod hostile_npz;
+mod house;
+mod masks;
+mod photographs;
+mod preview;
+mod raycast_truth;
+#[cfg(unix)]
+mod resume;
+mod round_trips;
+mod stability;
+mod supply;
+mod trained;
