@@ -150,7 +150,8 @@ fn rates_fall_to_a_third_at_the_published_milestones() {
 
 #[test]
 fn a_ball_is_learned_and_comes_back_from_its_checkpoint() {
-    let (dir, views, config) = (temporary(), views(), config());
+    let config = IfaceConfig { rays: 100, max_rays: 200, samples: 1 << 11, ..config() };
+    let (dir, views) = (temporary(), views());
     let (field, report) =
         train_density(&views, &config, &session("iface", dir.path(), "ball", &Quiet)).unwrap();
     assert!(report.train_psnr > 15.0 && report.occupied < 0.9, "{report:?}");
@@ -172,7 +173,8 @@ fn a_ball_is_learned_and_comes_back_from_its_checkpoint() {
 
 #[test]
 fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
-    let (views, config) = (views(), IfaceConfig { steps: 40, ..config() });
+    let config = IfaceConfig { steps: 40, rays: 50, max_rays: 100, samples: 1 << 10, ..config() };
+    let views = views();
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train_density(&views, &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
@@ -206,12 +208,7 @@ mod on_gpus {
     }
 
     /// Error of a view, dB, and share of the cells that is marched.
-    fn learned(
-        config: &IfaceConfig,
-        dir: &Path,
-        device: &str,
-        monitor: &dyn Monitor,
-    ) -> Result<(f64, f64)> {
+    fn learned(config: &IfaceConfig, dir: &Path, device: &str, monitor: &dyn Monitor) -> Result<(f64, f64)> {
         let views = textured_views();
         let session = TrainingSession { device, ..session("iface", dir, "ball", monitor) };
         let (field, report) = train_density(&views, config, &session)?;
