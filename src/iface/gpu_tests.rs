@@ -169,7 +169,9 @@ fn a_training_goes_on_there_and_back() {
     // The device updates the cells (step 42), looks for points (54), and goes on with those of a checkpoint.
     let parts = [("wgpu:0", 3), ("cpu", 9), ("wgpu:0", 4), ("cpu", 4), ("wgpu:0", 2)];
     let [(want, _), (got, points)] = alone_and_in_turn(&run, 41, &parts);
-    println!("{want:.2} dB alone, {got:.2} dB on the CPU and the device in turn, which found {points} points");
+    println!(
+        "{want:.2} dB alone, {got:.2} dB on the CPU and the device in turn, which found {points} points"
+    );
     assert!((want - got).abs() < 0.1 && points > 0, "{want} {got} {points}");
 }
 
@@ -313,7 +315,12 @@ fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
 
 /// Trains by the paper on the CPU, on both in turn, and, if asked for, on the device alone; compares a view, and the share
 /// of the cells that is marched, and returns those of the CPU.
-fn the_paper_follows_the_cpu(config: &IfaceConfig, on_device: u64, also_alone: bool, near: f64) -> (f64, f64) {
+fn the_paper_follows_the_cpu(
+    config: &IfaceConfig,
+    on_device: u64,
+    also_alone: bool,
+    near: f64,
+) -> (f64, f64) {
     let views = textured_views();
     let run = |dir: &Path, device: &str, monitor: &dyn Monitor| {
         let (face, report) = train(&views, None, config, &on(device, dir, monitor))?;
@@ -336,7 +343,9 @@ fn the_paper_goes_on_where_the_cpu_stopped_and_waits_for_nothing_either() {
     let (db, share) = the_paper_follows_the_cpu(&config, 5, false, 0.1);
     let dir = temporary();
     let session = on("wgpu:0", dir.path(), &Quiet);
-    let (face, _) = train(&views, None, &IfaceConfig { steps: 1, ..config.clone() }, &on("cpu", dir.path(), &Quiet)).unwrap();
+    let (face, _) =
+        train(&views, None, &IfaceConfig { steps: 1, ..config.clone() }, &on("cpu", dir.path(), &Quiet))
+            .unwrap();
     let start = psnr(&views[4], |rays| face.render(rays));
     assert!(db > start + 0.5 && share < 0.9, "{start} {db} {share}");
     // with three looks at cells that are drawn: one readback
