@@ -60,13 +60,18 @@ pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8
 
 /// Returns the cells that contain the ball, with a margin of 0.1.
 pub fn hull() -> Bitmask {
+    cells_within(BALL + 0.1)
+}
+
+/// Returns the cells whose centers lie within a radius.
+pub fn cells_within(radius: f32) -> Bitmask {
     let r = 32;
-    let mut hull = Bitmask::filled(r, false);
+    let mut cells = Bitmask::filled(r, false);
     for i in 0..r * r * r {
         let c = Vec3::from_array([i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) / 16.0 - 1.0));
-        hull.set(i, c.length() < BALL + 0.1);
+        cells.set(i, c.length() < radius);
     }
-    hull
+    cells
 }
 
 #[cfg(test)]

@@ -127,6 +127,7 @@ mod tests {
     use super::*;
     use crate::config::iface::Foreground;
     use crate::field::ball;
+    use crate::field::pixels::TrainView;
     use crate::kernel::gpu::tests::{agree, device};
 
     #[test]
@@ -182,8 +183,10 @@ mod tests {
     fn memory_of_photographs() {
         let device = device().unwrap();
         let count = std::env::var("TIFACE_PHOTOGRAPHS").map_or(5, |n| n.parse().unwrap());
-        let mut views: Vec<_> = (0..count).map(|i| ball::view(2000, i as f64, 0.0, |_| [90; 3])).collect();
-        views.iter_mut().for_each(|view| view.mask = None);
+        let one = ball::view(2000, 0.0, 0.0, |_| [90; 3]);
+        let again =
+            |_| TrainView { camera: one.camera.clone(), photo: one.photo.clone(), mask: None, valid: None };
+        let views: Vec<TrainView> = (0..count).map(again).collect();
         let pixels = Pixels::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
         let drawing = SamplingOptions { jitter: true, background: true, background_stream: 8 };
         let bytes = resident(&pixels, &device, u64::MAX).unwrap();

@@ -32,7 +32,14 @@ fn config() -> IfaceConfig {
 /// A step on every device that is here.
 #[test]
 fn a_step_is_the_one_of_its_formulas() {
-    let config = IfaceConfig { rays: 16, max_rays: 16, log2_table: 6, samples_per_ray: 30, ..config() };
+    let config = IfaceConfig {
+        rays: 16,
+        max_rays: 16,
+        samples: 1 << 9,
+        log2_table: 6,
+        samples_per_ray: 30,
+        ..config()
+    };
     let views = views();
     let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
     agrees_on(CpuDensity::new(&config, &pixels), &config, &pixels, [1e-5, 1e-3]);
@@ -143,7 +150,8 @@ fn rates_fall_to_a_third_at_the_published_milestones() {
 
 #[test]
 fn a_ball_is_learned_and_comes_back_from_its_checkpoint() {
-    let (dir, views, config) = (temporary(), views(), config());
+    let config = IfaceConfig { rays: 100, max_rays: 200, samples: 1 << 11, ..config() };
+    let (dir, views) = (temporary(), views());
     let (field, report) =
         train_density(&views, &config, &session("iface", dir.path(), "ball", &Quiet)).unwrap();
     assert!(report.train_psnr > 15.0 && report.occupied < 0.9, "{report:?}");
@@ -165,7 +173,8 @@ fn a_ball_is_learned_and_comes_back_from_its_checkpoint() {
 
 #[test]
 fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
-    let (views, config) = (views(), IfaceConfig { steps: 40, ..config() });
+    let config = IfaceConfig { steps: 40, rays: 50, max_rays: 100, samples: 1 << 10, ..config() };
+    let views = views();
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train_density(&views, &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
@@ -175,63 +184,81 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 #[cfg(feature = "wgpu")]
 mod on_gpus {
     use super::*;
-    use crate::field::ball::{StopAfter, textured_views};
+    use crate::field::ball::{alone_and_in_turn, psnr, textured_views};
     use crate::field::ops::Ops;
     use crate::kernel::gpu::tests::{device, devices};
     use crate::kernel::gpu::{Atomics, Device};
 
+    /// As small as a driver in software needs it, for which a step takes as long as it has samples.
     fn config() -> IfaceConfig {
-        IfaceConfig { steps: 300, rays: 100, max_rays: 200, samples: 1 << 11, ..super::config() }
+        IfaceConfig {
+            steps: 40,
+            rays: 16,
+            max_rays: 48,
+            samples: 384,
+            samples_per_ray: 48,
+            ..super::config()
+        }
     }
 
-    fn learned(
-        config: &IfaceConfig,
-        device: &str,
-        dir: &Path,
-        monitor: &dyn Monitor,
-    ) -> Result<(DensityField, IfaceReport)> {
-        let session = TrainingSession { device, ..session("iface", dir, "ball", monitor) };
-        train_density(&textured_views(), config, &session)
+    /// What a card does at ease.
+    fn long() -> IfaceConfig {
+        let config = config();
+        IfaceConfig { steps: 300, rays: 100, max_rays: 200, samples: 1 << 11, samples_per_ray: 64, ..config }
     }
 
-    /// PSNR of a view, dB.
-    fn psnr(field: &DensityField) -> f64 {
+    /// Error of a view, dB, and share of the cells that is marched.
+    fn learned(config: &IfaceConfig, dir: &Path, device: &str, monitor: &dyn Monitor) -> Result<(f64, f64)> {
         let views = textured_views();
-        let view = &views[4];
-        let (w, h) = (view.camera.width, view.camera.height);
-        let pixel = |i: u32| Vec2::new((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
-        let rays: Vec<_> = (0..w * h).map(|i| view.camera.ray(pixel(i)).unwrap()).collect();
-        let alpha = &view.mask.as_ref().unwrap().values;
-        let error = |(i, ray): (usize, &crate::geom::RayResult)| -> f64 {
-            let a = alpha[i] as f64 / 255.0;
-            (0..3).map(|c| (ray.color[c] as f64 - a * view.photo.rgb[i][c] as f64 / 255.0).powi(2)).sum()
-        };
-        let all: f64 = field.render(&rays).iter().enumerate().map(error).sum();
-        -10.0 * (all / (3 * w * h) as f64).log10()
+        let session = TrainingSession { device, ..session("iface", dir, "ball", monitor) };
+        let (field, report) = train_density(&views, config, &session)?;
+        Ok((psnr(&views[4], |rays| field.render(rays)), report.occupied))
+    }
+
+    /// Compares a training on the device with that on the CPU, which it returns.
+    fn follows_the_cpu(config: &IfaceConfig) -> (f64, f64) {
+        let train = |device: &str| learned(config, temporary().path(), device, &Quiet).unwrap();
+        let [cpu, gpu] = ["cpu", "wgpu:0"].map(train);
+        println!("dB and share of the cells: {cpu:.3?} on the CPU, {gpu:.3?} on the device");
+        assert!((cpu.0 - gpu.0).abs() < 0.3 && (cpu.1 - gpu.1).abs() < 0.03, "{cpu:?} {gpu:?}");
+        cpu
     }
 
     #[test]
-    fn a_gpu_learns_what_the_cpu_does_and_both_go_on_where_the_other_stopped() {
+    fn a_gpu_learns_what_the_cpu_does() {
         if device().is_none() {
             return;
         }
-        let config = config();
-        let mut all = Vec::new();
-        for device in ["cpu", "wgpu:0"] {
-            let (field, report) = learned(&config, device, temporary().path(), &Quiet).unwrap();
-            all.push((psnr(&field), report.occupied));
+        let (db, _) = follows_the_cpu(&config());
+        let one = IfaceConfig { steps: 1, ..config() };
+        let (start, _) = learned(&one, temporary().path(), "cpu", &Quiet).unwrap();
+        assert!(db > start + 1.0, "{start} {db}");
+    }
+
+    #[test]
+    #[ignore = "long: run by `tools/test.sh all`; over three hundred steps rounding adds up, and the cells are drawn"]
+    fn a_gpu_learns_in_many_steps_what_the_cpu_does() {
+        if device().is_some() {
+            let (db, share) = follows_the_cpu(&long());
+            assert!(db > 15.0 && share < 0.9, "{db} {share}");
         }
-        // past the step from which cells are drawn
-        let moved = temporary();
-        for (device, steps) in [("cpu", 250), ("wgpu:0", 20)] {
-            let stopped = learned(&config, device, moved.path(), &StopAfter::new(steps)).err().unwrap();
-            assert!(stopped.to_string().contains("saved at step"), "{stopped}");
+    }
+
+    /// Goes on past step 256, from which cells are drawn, on the device for some steps.
+    fn goes_on(config: &IfaceConfig, on_device: u64) {
+        if device().is_none() {
+            return;
         }
-        let (field, report) = learned(&config, "cpu", moved.path(), &Quiet).unwrap();
-        all.push((psnr(&field), report.occupied));
-        println!("dB and share of the cells, on the CPU, on the device, on both in turn: {all:.3?}");
-        assert!(all[0].0 > 15.0 && all[0].1 < 0.9, "{all:?}");
-        assert!(all.iter().all(|(db, share)| (all[0].0 - db).abs() < 0.3 && (all[0].1 - share).abs() < 0.03));
+        let run = |dir: &Path, device: &str, monitor: &dyn Monitor| learned(config, dir, device, monitor);
+        let [cpu, both] = alone_and_in_turn(&run, 254, &[("wgpu:0", on_device)]);
+        println!("dB and share of the cells: {cpu:.3?} on the CPU, {both:.3?} on both in turn");
+        assert!(cpu.0 > 15.0 && cpu.1 < 0.9, "{cpu:?}");
+        assert!((cpu.0 - both.0).abs() < 0.3 && (cpu.1 - both.1).abs() < 0.03, "{both:?}");
+    }
+
+    #[test]
+    fn both_go_on_where_the_other_stopped() {
+        goes_on(&IfaceConfig { steps: 264, ..config() }, 5);
     }
 
     #[test]
@@ -241,28 +268,35 @@ mod on_gpus {
         let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
         let dir = temporary();
         let session = session("iface", dir.path(), "ball", &Quiet);
-        let trained = |device: Device, steps: u64| {
+        // launches and readbacks of each step, and the table after them
+        let trained = |device: Device, steps: &[u64]| {
             let ops = GpuDensity::new(&config, &pixels, device).unwrap();
             let mut model = DensityModel::new(ops, &config, &session);
             model.restore(None).ok().unwrap();
-            let before = model.ops.device().counts();
-            for step in 250..250 + steps {
+            let mut step = |&step: &u64| {
+                let before = model.ops.device().counts();
                 let progress = TrainingProgress { step, ..TrainingProgress::default() };
                 let read = (step + 1).is_multiple_of(Device::READ_EVERY);
                 training::step(&mut model, session.seed, &progress, read).ok().unwrap();
-            }
-            let after = model.ops.device().counts();
+                let after = model.ops.device().counts();
+                (after.0 - before.0, after.1 - before.1)
+            };
+            let counts: Vec<(usize, usize)> = steps.iter().map(&mut step).collect();
             let table = model.state().unwrap().groups[0].values().to_vec();
             assert!(table.iter().all(|v| v.is_finite()));
-            (after.0 - before.0, after.1 - before.1, table)
+            (counts, table)
         };
         let Some(device) = device() else { return };
-        let (launches, readbacks, _) = trained(device, Device::READ_EVERY);
-        println!("{launches} launches and {readbacks} readbacks in {} steps", Device::READ_EVERY);
-        assert!(launches as u64 <= 40 * Device::READ_EVERY && readbacks <= 1);
-        // with a look at cells that are drawn
+        // like most, with a look at cells that are drawn, and with losses that are read
+        let (counts, _) = trained(device, &[255, 256, 299]);
+        let [plain, look, read] = [0, 1, 2].map(|i| counts[i]);
+        println!("launches and readbacks: {counts:?}");
+        assert_eq!([plain.1, look.1, read.1], [0, 0, 1]);
+        // of fifty steps, three look
+        assert!(46 * plain.0 + 3 * look.0 + read.0 <= 40 * 50, "{counts:?}");
         let fixed = || devices().pop().filter(|device| device.atomics() == Atomics::Fixed).unwrap();
-        assert!(trained(fixed(), 8) == trained(fixed(), 8), "the same steps give the same bytes");
+        let steps = [255, 256, 257];
+        assert!(trained(fixed(), &steps) == trained(fixed(), &steps), "the same steps give the same bytes");
     }
 
     #[test]

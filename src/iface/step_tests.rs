@@ -20,7 +20,7 @@ fn paper() -> IfaceConfig {
     IfaceConfig {
         rays: 24,
         max_rays: 24,
-        samples: 1 << 16,
+        samples: 1 << 10,
         levels: 3,
         start_levels: 3,
         base_resolution: 4,

@@ -28,6 +28,12 @@ fn config() -> IfaceConfig {
     }
 }
 
+/// Enough for what does not depend on what is learned; the fit to the hull alone takes seconds.
+fn small() -> IfaceConfig {
+    IfaceConfig { rays: 64, max_rays: 128, samples: 1024, start: Start::Sphere, ..config() }
+}
+
+/// Longer than a second: the fit to the hull makes 250 steps, and a surface within a pixel takes as many.
 #[test]
 fn a_ball_is_learned_from_eight_views() {
     let dir = temporary();
@@ -53,13 +59,14 @@ fn a_ball_is_learned_from_eight_views() {
 #[test]
 fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
     let (views, hull) = (views(), hull());
-    let config = IfaceConfig { steps: 40, ..config() };
+    let config = IfaceConfig { steps: 40, ..small() };
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train(&views, Some(&hull), &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
     resumes(&run, 3);
 }
 
+/// Longer than a second: points are found on a surface that is right to a few pixels, which begins with the hull.
 #[test]
 fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
     let (views, hull) = (textured_views(), hull());
@@ -91,7 +98,7 @@ fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
 #[test]
 fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
     let (views, hull) = (views(), hull());
-    let config = IfaceConfig { steps: 9, start: Start::Sphere, ..config() };
+    let config = IfaceConfig { steps: 9, ..small() };
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train(&views, Some(&hull), &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
@@ -121,7 +128,7 @@ fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
 fn a_checkpoint_of_other_settings_is_refused() {
     let (views, hull) = (views(), hull());
     let dir = temporary();
-    let config = IfaceConfig { steps: 2, ..config() };
+    let config = IfaceConfig { steps: 2, ..small() };
     train(&views, Some(&hull), &config, &session("iface", dir.path(), "one", &Quiet)).unwrap();
     let again = train(&views, Some(&hull), &config, &session("iface", dir.path(), "two", &Quiet));
     let message = again.err().unwrap().to_string();
@@ -132,7 +139,7 @@ fn a_checkpoint_of_other_settings_is_refused() {
 fn a_diverging_run_restores_once_and_then_names_step_term_and_rate() {
     let (views, hull) = (views(), hull());
     let dir = temporary();
-    let config = IfaceConfig { lr_table: 1e38, warmup: 0.0, ..config() };
+    let config = IfaceConfig { lr_table: 1e38, warmup: 0.0, ..small() };
     let end = train(&views, Some(&hull), &config, &session("iface", dir.path(), "ball", &Quiet));
     let e = end.err().unwrap();
     let message = e.to_string();
@@ -154,7 +161,7 @@ fn empty_masks_and_unseen_boxes_do_not_crash() {
     assert!(end.err().unwrap().to_string().starts_with("no training view has a pixel"));
     // a hull without a cell: no step meets a sample, and training says so instead of ending well
     let nothing = Bitmask::filled(32, false);
-    let config = IfaceConfig { start: Start::Sphere, ..config() };
+    let config = small();
     let views = views();
     let end = train(&views, Some(&nothing), &config, &session("iface", dir.path(), "nothing", &Quiet));
     let lost = "the surface is lost at step 19: no ray of 20 steps met a sample";

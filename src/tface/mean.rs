@@ -276,8 +276,9 @@ mod tests {
     fn a_field_in_another_ones_place_is_refused() {
         let dir = temporary();
         let hull = hull();
+        let config = VmConfig { steps: 2, upsample_at: vec![], mask_at: vec![], ..config() };
         let learn =
-            || train(views(), BOX, Some(&hull), &config(), &session("tface", dir.path(), "ball", &Quiet));
+            || train(views(), BOX, Some(&hull), &config, &session("tface", dir.path(), "ball", &Quiet));
         learn().unwrap();
         let name = "checkpoint.safetensors";
         std::fs::copy(dir.path().join(name), dir.path().join("field_2").join(name)).unwrap();

@@ -59,7 +59,8 @@ fn a_ball_is_learned_from_eight_views() {
 #[test]
 fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
     // two upsamplings, two masks and the shrinking box lie before, between and after the stops
-    let config = VmConfig { steps: 60, upsample_at: vec![0.17, 0.42], mask_at: vec![0.17, 0.5], ..config() };
+    let (upsample_at, mask_at) = (vec![0.17, 0.42], vec![0.17, 0.5]);
+    let config = VmConfig { steps: 60, rays: 128, upsample_at, mask_at, ..config() };
     resumes(&|dir, monitor| run(&config, dir, monitor).map(|r| r.warnings), 5);
 }
 

@@ -161,7 +161,7 @@ mod tests {
     #[test]
     fn what_is_asked_is_what_the_cpu_answers() {
         let Some(device) = device() else { return };
-        let Case { shape, table, flat, x, direction, .. } = Case::new(700, 6, true, 6);
+        let Case { shape, table, flat, x, direction, .. } = Case::new(700, 5, true, 5);
         let weights = Weights::new(shape.layout(), &flat);
         let flatten = |rows: Vec<[f32; 3]>| rows.into_flattened();
         let mut mask = Bitmask::filled(8, true);
@@ -191,23 +191,26 @@ mod tests {
         let want = sdf::colors(&shape, &table, &weights, &x, &normal, None, &direction);
         agree("colors", &got.concat(), &planes(&want, x.len()), 1e-4);
 
-        // More samples than the capacity: 20,000 rays of up to about 100.
-        let rays: Vec<MarchRay> = (0..20_000)
+        // More rays and more samples than the buffers hold: 17,000 of about 15.
+        let step = 0.16;
+        let rays: Vec<MarchRay> = (0..17_000)
             .map(|i| {
                 let d = direction[i % 700];
                 let origin = std::array::from_fn(|a| -3.0 * d[a] + rng::normal(1, 2, (3 * i + a) as u64));
                 MarchRay { origin, direction: d, jitter: 0.0 }
             })
             .collect();
-        let got = evaluator.render(&rays, 0.04).unwrap();
+        let marched = |rays: &[MarchRay]| march::march(&mask, None, shape.radius, step, rays, usize::MAX);
+        assert!(rays.len() > RAYS && marched(&rays[..RAYS]).t.len() > CAPACITY);
+        let got = evaluator.render(&rays, step).unwrap();
         assert_eq!(got.len(), rays.len());
-        let some: Vec<usize> = (0..rays.len()).step_by(97).collect();
+        let some: Vec<usize> = (0..rays.len()).step_by(29).collect();
         let few: Vec<MarchRay> = some.iter().map(|&r| rays[r]).collect();
-        let samples = march::march(&mask, None, shape.radius, 0.04, &few, usize::MAX);
+        let samples = marched(&few);
         let (x, d) = samples.points(&few);
         let field = sdf::forward(&shape, &table, &weights, &x, &d);
         let along: Vec<[f32; 3]> = few.iter().map(|r| r.direction).collect();
-        let dt = vec![0.04; x.len()];
+        let dt = vec![step; x.len()];
         let bundle = crate::kernel::cpu::neus::Rays {
             offsets: &samples.offsets,
             direction: &along,
