@@ -17,6 +17,7 @@ use crate::geom::{Aabb, Camera};
 use crate::image::{Gray, Photo, quantize, srgb_from_linear};
 use glam::{UVec3, Vec2, Vec3};
 use rayon::prelude::*;
+use std::sync::LazyLock;
 
 /// One picture with its masks.
 pub(super) struct SyntheticPhoto {
@@ -49,7 +50,13 @@ const FUZZ: f32 = 0.0013;
 const GRAIN: f32 = 0.004;
 
 impl Studio {
-    pub fn new() -> Studio {
+    /// Returns the studio, built once a process: its grid takes longer than a small photograph.
+    pub fn shared() -> &'static Studio {
+        static STUDIO: LazyLock<Studio> = LazyLock::new(Studio::new);
+        &STUDIO
+    }
+
+    fn new() -> Studio {
         Studio { head: SyntheticHead, grid: DistanceGrid::new(&SyntheticHead), lamps: lamps() }
     }
 
@@ -409,7 +416,7 @@ mod tests {
 
     #[test]
     fn strides_through_the_air_stop_short_of_the_surface() {
-        let studio = Studio::new();
+        let studio = Studio::shared();
         let bounds = studio.grid.bounds;
         let surface = SyntheticHead.surface_points(3000, 8);
         for i in 0..3000 {
@@ -421,7 +428,7 @@ mod tests {
 
     #[test]
     fn the_eye_is_a_material_seen_from_the_front() {
-        let studio = Studio::new();
+        let studio = Studio::shared();
         let eye = OFFSET + super::super::shape::EYE;
         let seen = studio.look(eye - Vec3::Y, Vec3::Y);
         assert_eq!((seen.alpha, seen.head), (1.0, 1.0));
