@@ -2,13 +2,19 @@
 
 use super::{Fields, Radiance, Session, Stage, Surface, complete};
 use crate::Result;
+use crate::capture::scene::{self, Scene, SceneOptions};
 use crate::capture::synthetic::SyntheticOptions;
 use crate::capture::synthetic::shared::{Files, write_capture};
+use crate::capture::{self, Capture, CaptureOptions, Split};
 use crate::config::{CameraPoses, Config, Exposures, Preset};
+use crate::geom::Camera;
+use crate::image::Gray;
+use crate::io::Limits;
 use crate::run::{Done, Run};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, OnceLock};
+use tempfile::TempDir;
 
 /// Fields that no stage may load.
 pub(super) struct NoFields;
@@ -46,6 +52,30 @@ pub(super) fn draft(root: &Path) -> Config {
     config.capture.path = root.to_str().unwrap().into();
     (config.capture.cameras, config.capture.exposure) = (CameraPoses::Given, Exposures::Given);
     config
+}
+
+/// The demo head on which cameras and exposures are measured: 14 training views, and a held-out one, the last.
+pub(super) fn measured_head() -> (TempDir, Capture) {
+    let dir = tempfile::tempdir().unwrap();
+    demo_head(dir.path(), (144, 180), (14, 1));
+    let capture = capture::open(dir.path(), &CaptureOptions::default()).unwrap();
+    (dir, capture)
+}
+
+/// The scene of the training views of a capture; that of the same cameras and masks is found once a test program.
+pub(super) fn scene_of(capture: &Capture) -> Scene {
+    type Views = (Vec<Camera>, Vec<Option<Gray>>);
+    static FOUND: Mutex<Vec<(Views, Scene)>> = Mutex::new(Vec::new());
+    let train: Vec<_> = capture.split(Split::Train).collect();
+    let masks = train.iter().map(|v| v.load_mask(&Limits::default()).unwrap()).collect();
+    let views: Views = (train.iter().map(|v| v.camera.clone()).collect(), masks);
+    let mut found = FOUND.lock().unwrap();
+    if let Some((_, scene)) = found.iter().find(|(of, _)| *of == views) {
+        return scene.clone();
+    }
+    let (scene, _) = scene::fit(&views.0, &views.1, &SceneOptions::default()).unwrap();
+    found.push((views, scene.clone()));
+    scene
 }
 
 /// Completes the stage `mask` as [`complete`] does, for tests of what follows. It is made once a test program for each plan; later
