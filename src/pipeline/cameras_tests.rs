@@ -16,8 +16,8 @@ use glam::{DMat3, DQuat, DVec3};
 use serde_json::{Value, json};
 use std::sync::OnceLock;
 
-/// Half of the points are enough for small photographs, and take half the time.
-const POINTS: usize = rig::POINTS / 2;
+/// A quarter of the points is enough for small photographs, and takes a quarter of the time.
+const POINTS: usize = rig::POINTS / 4;
 
 fn train(capture: &Capture) -> Vec<&View> {
     capture.split(Split::Train).collect()
@@ -70,7 +70,7 @@ fn state(check: &CameraCheck, key: &str) -> Vec<(String, Value)> {
 }
 
 #[test]
-fn exact_poses_stay_and_wrong_ones_fall_to_a_third_for_any_number_of_threads() {
+fn exact_poses_stay_and_wrong_ones_fall_to_a_third() {
     let (_dir, exact) = measured_head();
     let clean = of_exact(CameraPoses::Auto);
     assert!(!clean.refines() && clean.problems().is_empty(), "{clean:?}");
@@ -80,9 +80,6 @@ fn exact_poses_stay_and_wrong_ones_fall_to_a_third_for_any_number_of_threads() {
     (0..14).for_each(|v| disturb(&mut wrong, v, 1.5));
     let before = error_px(&wrong, &exact);
     let found = check(&wrong, CameraPoses::Auto);
-    let pool = |n: usize| rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap();
-    let again = pool(3).install(|| check(&wrong, CameraPoses::Auto));
-    assert_eq!(json!(found), json!(again));
     assert!(found.sentence().contains("off against each other"), "{}", found.sentence());
     let mut refined = wrong.clone();
     found.apply(&mut refined);
@@ -123,7 +120,9 @@ fn a_held_out_view_is_fitted_alone_where_poses_are_refined_and_changes_nothing_e
     let camera = &mut more.views[lost].camera;
     *camera =
         Camera { rotation: turned * camera.rotation, position: turned * camera.position, ..camera.clone() };
-    let found = check(&more, CameraPoses::Refine);
+    // nor does the number of threads
+    let threads = rayon::ThreadPoolBuilder::new().num_threads(3).build().unwrap();
+    let found = threads.install(|| check(&more, CameraPoses::Refine));
     let values = [clean, &found].map(|check| json!(check));
     assert_eq!(values[0]["cameras"], values[1]["cameras"]);
     assert_eq!(values[0]["held_out"][0], values[1]["held_out"][0]);

@@ -5,8 +5,8 @@ use super::*;
 use crate::capture::Split;
 use crate::capture::synthetic::SyntheticHead;
 use crate::config::{
-    CameraPoses, ColorSource, Config, Exposures, Genus, Hair, MaskSource, Material, MeshConfig, MeshFormat,
-    MeshFrame, Method, TextureFormat, ViewBackground,
+    ColorSource, Config, Genus, Hair, MaskSource, Material, MeshConfig, MeshFormat, MeshFrame, Method,
+    TextureFormat, ViewBackground,
 };
 use crate::geom::{SdfField, Similarity};
 use crate::io::{self, Limits};
@@ -103,7 +103,6 @@ fn the_stages_after_learning_keep_the_exact_head_exact() {
     let root = dir.path().join("run/capture");
     sharp_capture(&root);
     let mut config = draft(&root);
-    (config.capture.cameras, config.capture.exposure) = (CameraPoses::Auto, Exposures::Auto);
     config.mesh.resolution = 128;
     config.mesh.triangles = 8000;
     config.mesh.texture_px = 384;
