@@ -245,6 +245,8 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     config.mesh.triangles = 3000;
     config.mesh.texture_px = 0;
     config.mesh.cap = false;
+    // the photographs' colors, which nothing is asked about, take longest
+    (config.mesh.color, config.mesh.hair) = (ColorSource::Network, Hair::None);
     config.render.method = vec![Method::Textured];
     config.ensemble.members = Vec::new();
     let run = quiet(dir.path());
@@ -322,7 +324,6 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
         config.mesh.resolution = 64;
         config.mesh.triangles = 3000;
         config.mesh.texture_px = 0;
-        // nothing is asked about colors, which take longest
         (config.mesh.color, config.mesh.hair) = (ColorSource::Network, Hair::None);
         config.mesh.genus = genus;
         let run = Run::quiet(&dir.path().join(format!("{genus:?}")));
