@@ -25,8 +25,8 @@ use crate::geom::{Camera, Mesh};
 use adjust::{Track, adjust, gauge, median, project, resected};
 use glam::DVec3;
 
-/// Points spread over the surface. A third of them is found on skin with stubble and pores.
-const POINTS: usize = 8000;
+/// Points to spread over the surface. A third of them is found on skin with stubble and pores.
+pub const POINTS: usize = 8000;
 
 /// Maximum number of points that are looked up again.
 const MOST_AGAIN: usize = 3000;
@@ -95,11 +95,12 @@ impl Rig {
     }
 }
 
-/// Measures how well cameras fit each other. `surface` is any rough surface of the head with normals; `views` and `given`
-/// are photographs and cameras of the same order. `all` asks for all cameras to be refined, whatever the gain.
-pub fn measure(views: &[RigView], given: &[Camera], surface: &Mesh, all: bool) -> Rig {
+/// Measures how well cameras fit each other by so many points ([`POINTS`]). `surface` is any rough surface of the head with
+/// normals; `views` and `given` are photographs and cameras of the same order. `all` asks for all cameras to be refined,
+/// whatever the gain.
+pub fn measure(views: &[RigView], given: &[Camera], surface: &Mesh, points: usize, all: bool) -> Rig {
     let mut cameras = given.to_vec();
-    let mut seeds = tracks::seeds(surface, given, |v, pixel| views[v].is_usable(pixel), POINTS);
+    let mut seeds = tracks::seeds(surface, given, |v, pixel| views[v].is_usable(pixel), points);
     let (mut tracks, mut expected) = (Vec::new(), Vec::new());
     for passes in ROUNDS {
         expected = tracks::looked_up(&cameras, &seeds);

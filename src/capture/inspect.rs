@@ -371,14 +371,14 @@ impl fmt::Display for Inspection {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::synthetic::{SyntheticOptions, write_capture};
+    use crate::capture::synthetic::{SyntheticOptions, shared::write_capture};
     use crate::config::MaskSource;
 
     #[test]
     fn masks_that_say_what_was_not_looked_at_carve_no_head() {
         let dir = tempfile::tempdir().unwrap();
-        let options = SyntheticOptions { width: 48, height: 60, train: 8, test: 1, seed: 1 };
-        write_capture(dir.path(), &options).unwrap();
+        let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 2, seed: 1 };
+        write_capture(dir.path(), &options);
         let scene = |options: CaptureOptions| inspect(dir.path(), &options).scene.unwrap();
         let bare = scene(CaptureOptions { masks: MaskSource::None, ..CaptureOptions::default() });
         let ignore = CaptureOptions { mask_meaning: MaskMeaning::Ignore, ..CaptureOptions::default() };

@@ -339,10 +339,10 @@ mod tests {
 
     #[test]
     fn a_camera_model_without_distortion_is_warned_of_once() {
-        use crate::capture::synthetic::{SyntheticOptions, write_capture};
+        use crate::capture::synthetic::{SyntheticOptions, shared::write_capture};
         let dir = tempfile::tempdir().unwrap();
-        let options = SyntheticOptions { width: 24, height: 30, train: 3, test: 1, seed: 1 };
-        write_capture(dir.path(), &options).unwrap();
+        let options = SyntheticOptions { width: 16, height: 20, train: 4, test: 2, seed: 1 };
+        write_capture(dir.path(), &options);
         std::fs::remove_file(dir.path().join("transforms_train.json")).unwrap();
         let file = dir.path().join("transforms.json");
         let mut json: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();

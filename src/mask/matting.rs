@@ -363,50 +363,54 @@ mod tests {
         assert!(bytes < 2 << 30);
     }
 
-    #[test]
-    fn alphas_of_the_clicked_heads_are_forty_percent_better_than_hard_masks() {
+    /// Softens masks of a captured head cut as they are at half, too wide and too narrow by 2 pixels, as far as a share of the
+    /// error is given that must at least be gone.
+    fn alphas_are_better(capture: &str, views: &[&str], gains: [Option<f64>; 3]) {
         let shared = std::env::var("TIFACE_SHARED")
             .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
         let limits = Limits::default();
-        // photographs whose masks are cut as they are at half, too wide and too narrow by 2 pixels; at least so much
-        // of the error is gone. At half, a mask of a sharp outline is better than any cut can be.
-        let heads = [
-            ("lps", ["002", "006", "010"], [0.2, 0.7, 0.7]),
-            ("nefertiti", ["010", "013", "015"], [-2.0, 0.8, 0.8]),
-        ];
-        for (capture, views, gains) in heads {
-            let folder = std::path::Path::new(&shared).join("data/captures").join(capture);
-            if !folder.is_dir() {
-                eprintln!("skipped: the capture `{capture}` is not at {}", folder.display());
-                continue;
-            }
-            let (mut hard_error, mut soft_error) = ([0.0; 3], [0.0; 3]);
-            let start = std::time::Instant::now();
-            for view in views {
-                let picture = |kind: &str| folder.join(kind).join(format!("{view}.png"));
-                let photo = read_photo(&picture("images"), None, &limits).unwrap();
-                let truth = read_gray(&picture("masks"), None, &limits).unwrap();
-                let (w, h) = (truth.width as usize, truth.height as usize);
-                let soft_truth: Vec<f32> = truth.values.iter().map(|&v| v as f32 / 255.0).collect();
-                let cut: Vec<bool> = truth.values.iter().map(|&v| v >= 128).collect();
-                let masks =
-                    [cut.clone(), morphology::grow(&cut, w, h, 2.0), morphology::shrink(&cut, w, h, 2.0)];
-                for (k, mask) in masks.iter().enumerate() {
-                    let values = mask.iter().map(|&m| if m { 255 } else { 0 }).collect();
-                    let mask = Gray { values, ..truth };
-                    let soft = soften(&photo, &mask, &SoftenOptions::default()).unwrap();
-                    assert!(soft.warnings.is_empty(), "{:?}", soft.warnings);
-                    hard_error[k] += error(&mask.values, &soft_truth) / 3.0;
-                    soft_error[k] += error(&soft.alpha.values, &soft_truth) / 3.0;
-                }
-            }
-            let seconds = start.elapsed().as_secs_f64() / 9.0;
-            for k in 0..3 {
-                let (hard, soft) = (hard_error[k], soft_error[k]);
-                eprintln!("{capture}: {:.2} of 1000 became {:.2}, {seconds:.2} s", 1e3 * hard, 1e3 * soft);
-                assert!(soft <= (1.0 - gains[k]) * hard, "{capture} {k}: {soft:.2e} of {hard:.2e}");
+        let folder = std::path::Path::new(&shared).join("data/captures").join(capture);
+        if !folder.is_dir() {
+            eprintln!("skipped: the capture `{capture}` is not at {}", folder.display());
+            return;
+        }
+        let (mut hard_error, mut soft_error) = ([0.0; 3], [0.0; 3]);
+        for view in views {
+            let picture = |kind: &str| folder.join(kind).join(format!("{view}.png"));
+            let photo = read_photo(&picture("images"), None, &limits).unwrap();
+            let truth = read_gray(&picture("masks"), None, &limits).unwrap();
+            let (w, h) = (truth.width as usize, truth.height as usize);
+            let soft_truth: Vec<f32> = truth.values.iter().map(|&v| v as f32 / 255.0).collect();
+            let cut: Vec<bool> = truth.values.iter().map(|&v| v >= 128).collect();
+            let masks = [cut.clone(), morphology::grow(&cut, w, h, 2.0), morphology::shrink(&cut, w, h, 2.0)];
+            for (k, mask) in masks.iter().enumerate().filter(|(k, _)| gains[*k].is_some()) {
+                let values = mask.iter().map(|&m| if m { 255 } else { 0 }).collect();
+                let mask = Gray { values, ..truth };
+                let soft = soften(&photo, &mask, &SoftenOptions::default()).unwrap();
+                assert!(soft.warnings.is_empty(), "{:?}", soft.warnings);
+                hard_error[k] += error(&mask.values, &soft_truth) / views.len() as f64;
+                soft_error[k] += error(&soft.alpha.values, &soft_truth) / views.len() as f64;
             }
         }
+        for (k, gain) in gains.into_iter().enumerate().filter_map(|(k, gain)| Some((k, gain?))) {
+            let (hard, soft) = (hard_error[k], soft_error[k]);
+            eprintln!("{capture}: {:.2} of 1000 became {:.2}", 1e3 * hard, 1e3 * soft);
+            assert!(soft <= (1.0 - gain) * hard, "{capture} {k}: {soft:.2e} of {hard:.2e}");
+        }
+    }
+
+    #[test]
+    fn alphas_of_clicked_heads_take_most_of_the_error_of_masks_too_wide_or_too_narrow() {
+        alphas_are_better("lps", &["010"], [None, Some(0.7), Some(0.7)]);
+        alphas_are_better("nefertiti", &["010"], [None, Some(0.8), Some(0.8)]);
+    }
+
+    #[test]
+    #[ignore = "long: run by `tools/test.sh all`; softens 18 masks of whole photographs"]
+    fn alphas_of_all_clicked_heads_are_better_than_hard_masks() {
+        alphas_are_better("lps", &["002", "006", "010"], [0.2, 0.7, 0.7].map(Some));
+        // at half, a mask of a sharp outline is better than any cut can be
+        alphas_are_better("nefertiti", &["010", "013", "015"], [-2.0, 0.8, 0.8].map(Some));
     }
 
     /// As OpenCV's documentation says it, once per iteration.

@@ -95,27 +95,26 @@ fn a_valid_network_made_by_hand_gives_the_trimap() {
 }
 
 #[test]
-fn text_nothing_and_half_a_file_are_no_onnx() {
+fn text_and_nothing_are_no_onnx() {
     let page = b"<!DOCTYPE html><html><body>404</body></html>".as_slice();
     for bytes in [page, b"version https://git-lfs.github.com/spec/v1\n", &[0xff; 100], b"\n\x00\x12"] {
         refused_for("is not a valid ONNX file", bytes);
     }
     refused_for("it holds no graph", &Message::new().int(1, 7).0);
     assert!(tried(b"").is_err_and(|e| e.to_string().contains("is empty (0 bytes)")));
+}
+
+/// Ends a file at every so many bytes, and makes every so many of its bytes wrong.
+fn damaged(every: usize) {
     let whole = trimap_times(1.0);
-    for end in 1..whole.len() {
+    for end in (1..whole.len()).step_by(every) {
         // an end between two fields leaves a message that parses and lacks what comes later; the last one is the
         // opset, without which the rest still stands
         if let Err(error) = tried(&whole[..end]) {
             assert!(reason(&error).is_some(), "cut at {end}: {error}");
         }
     }
-}
-
-#[test]
-fn any_single_byte_may_be_wrong_without_a_crash() {
-    let whole = trimap_times(1.0);
-    for at in 0..whole.len() {
+    for at in (0..whole.len()).step_by(every) {
         for flip in [0x01, 0xff] {
             let mut bytes = whole.clone();
             bytes[at] ^= flip;
@@ -127,9 +126,20 @@ fn any_single_byte_may_be_wrong_without_a_crash() {
     }
 }
 
-/// Minutes long, for changes here: `cargo test --release --features matting --lib damage -- --ignored`.
 #[test]
-#[ignore = "300 damaged networks take minutes; run with --ignored after changes here"]
+fn half_a_file_and_a_wrong_byte_end_in_a_result_or_an_error() {
+    // in steps that fall on tags, lengths and contents alike
+    damaged(7);
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; opens some thousand damaged networks"]
+fn any_end_and_any_wrong_byte_end_in_a_result_or_an_error() {
+    damaged(1);
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; 300 damaged networks take minutes"]
 fn random_damage_to_a_whole_network_ends_in_a_result_or_an_error() {
     let Some(folder) = shared("vitmatte_tiny") else { return };
     let whole = fs::read(folder.join("model.onnx")).unwrap();

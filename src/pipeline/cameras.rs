@@ -88,11 +88,16 @@ impl From<&Camera> for Pose {
 /// Measures how well the cameras of the training views fit each other. If any is refined, the held-out views are then fitted
 /// one by one.
 pub(super) fn check_cameras(photos: &RigPhotos, poses: CameraPoses) -> CameraCheck {
+    check_by(rig::POINTS, photos, poses)
+}
+
+/// Does what [`check_cameras`] does, by so many points.
+pub(super) fn check_by(points: usize, photos: &RigPhotos, poses: CameraPoses) -> CameraCheck {
     let RigPhotos { views: captured, train, cameras: given, scene_from_world, .. } = photos;
     let ((captured, held_out), (given, given_held_out)) = (captured.split_at(*train), given.split_at(*train));
     let views: Vec<RigView> =
         photos.pictures[..*train].par_iter().map(|(p, head)| RigView::new(p, head)).collect();
-    let rig = rig::measure(&views, given, &photos.surface, poses == CameraPoses::Refine);
+    let rig = rig::measure(&views, given, &photos.surface, points, poses == CameraPoses::Refine);
     let world_from_scene = scene_from_world.inverse();
     let checked = |(view, (searched, fit)): (&&View, (&Camera, &rig::CameraFit))| {
         let pixels = f64::from(view.camera.width) / f64::from(searched.width);

@@ -1,9 +1,8 @@
 //! Masks from clicks, as a stage of the pipeline.
 
 use super::clicks::propagated_clicks;
-use super::tests::NoFields;
+use super::tests::{NoFields, demo_head, draft, masked};
 use super::*;
-use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::capture::{self, CaptureOptions, Split};
 use crate::config::{Config, MaskSource, Preset};
 use crate::image::Gray;
@@ -12,21 +11,25 @@ use crate::mask::prompts::{PhotoPrompts, Prompts, file_path};
 use crate::run::{Event, Observer, Run, Stop};
 use std::path::{Path, PathBuf};
 
+/// Photographs that masks are held against the truth on.
+const SHARP: (u32, u32) = (120, 160);
+
+/// Photographs that are only to be masked.
+const SMALL: (u32, u32) = (72, 96);
+
 /// A synthetic capture, clicks on three of its views at the deepest places of the true masks, and those masks.
-fn clicked(dir: &Path) -> (Config, Vec<Gray>) {
+fn clicked(dir: &Path, size: (u32, u32)) -> (Config, Vec<Gray>) {
     let root = dir.join("head");
-    let options = SyntheticOptions { width: 120, height: 160, train: 8, test: 2, seed: 1 };
-    write_capture(&root, &options).unwrap();
+    demo_head(&root, size, (8, 2));
     let capture = capture::open(&root, &CaptureOptions::default()).unwrap();
     let truth: Vec<Gray> =
         capture.views.iter().map(|v| v.load_mask(&Limits::default()).unwrap().unwrap()).collect();
     let frame = |i: usize| PhotoPrompts {
         file_path: file_path(&capture, &capture.views[i]),
-        points: propagated_clicks(&truth[i], (120, 160)),
+        points: propagated_clicks(&truth[i], size),
     };
     Prompts { frames: [0, 3, 5].map(frame).to_vec() }.write(&dir.join("prompts.json")).unwrap();
-    let mut config = Config::preset(Preset::Draft);
-    config.capture.path = root.to_str().unwrap().into();
+    let mut config = draft(&root);
     config.mask.prompts = dir.join("prompts.json").to_str().unwrap().into();
     (config, truth)
 }
@@ -46,11 +49,11 @@ fn iou(a: &Gray, b: &Gray) -> f64 {
 #[test]
 fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
     let dir = tempfile::tempdir().unwrap();
-    let (config, truth) = clicked(dir.path());
+    let (config, truth) = clicked(dir.path(), SHARP);
     let run = run(dir.path(), "run");
     let session = Session::open(&config, &run).unwrap();
     session.remember(Stage::Mask).unwrap();
-    let done = complete(&session, Stage::Mask, &NoFields).unwrap();
+    let done = masked(&session);
     assert_eq!(done.summary["masks"], 10);
     assert_eq!(done.summary["made"]["clicked_views"], 3);
     assert_eq!(done.summary["suspicious"], serde_json::json!([]));
@@ -85,10 +88,10 @@ fn clicks_on_three_views_mask_all_and_later_stages_read_those_masks() {
 #[test]
 fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_made() {
     let dir = tempfile::tempdir().unwrap();
-    let (config, truth) = clicked(dir.path());
+    let (config, truth) = clicked(dir.path(), SHARP);
     let run = run(dir.path(), "run");
     let session = Session::open(&config, &run).unwrap();
-    complete(&session, Stage::Mask, &NoFields).unwrap();
+    masked(&session);
     let evaluated = session.evaluation_capture();
     assert_eq!(session.mask_source(&evaluated), "capture");
     for ((view, own), truth) in session.capture().views.iter().zip(&evaluated.views).zip(&truth) {
@@ -119,7 +122,7 @@ fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_ma
 #[test]
 fn clicks_that_make_no_sense_end_before_anything_is_written() {
     let dir = tempfile::tempdir().unwrap();
-    let (good, _) = clicked(dir.path());
+    let (good, _) = clicked(dir.path(), SMALL);
     let refused = |change: &dyn Fn(&mut Config)| {
         let mut config = good.clone();
         change(&mut config);
@@ -158,7 +161,7 @@ fn clicks_that_make_no_sense_end_before_anything_is_written() {
 #[test]
 fn a_network_that_is_no_network_is_refused_in_one_sentence() {
     let dir = tempfile::tempdir().unwrap();
-    let (mut config, _) = clicked(dir.path());
+    let (mut config, _) = clicked(dir.path(), SMALL);
     config.mask.vitmatte = config.mask.prompts.clone();
     let run = run(dir.path(), "run");
     let error = complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
@@ -179,7 +182,7 @@ fn networks_cut_and_soften_and_are_recorded() {
         return;
     }
     let dir = tempfile::tempdir().unwrap();
-    let (mut config, _) = clicked(dir.path());
+    let (mut config, _) = clicked(dir.path(), SMALL);
     let file = |name: &str| models.join(name).to_str().unwrap().to_owned();
     config.mask.vitmatte = file("vitmatte_tiny/model.onnx");
     config.mask.sam = file("sam_tiny/vision_encoder.onnx");
@@ -202,7 +205,7 @@ fn networks_cut_and_soften_and_are_recorded() {
 #[test]
 fn a_network_masks_all_views_without_a_click() {
     let dir = tempfile::tempdir().unwrap();
-    let (mut config, truth) = clicked(dir.path());
+    let (mut config, truth) = clicked(dir.path(), SHARP);
     let capture = capture::open(Path::new(&config.capture.path), &CaptureOptions::default()).unwrap();
     for (view, mask) in capture.views.iter().zip(&truth) {
         let color = |(i, &m): (usize, &u8)| [if m >= 128 { 180 } else { 20 } + (i * 7919 % 13) as u8; 3];
@@ -234,25 +237,25 @@ fn a_network_masks_all_views_without_a_click() {
     assert!(other.to_string().contains("mask.alpha_input"), "{other}");
 }
 
-/// What the clicks that come with a capture are worth, against its true masks.
-#[test]
-fn three_clicked_photographs_of_a_light_stage_mask_them_all() {
+/// Masks a capture of a light stage from the clicks that come with it, once for each band around the cut, and holds the masks
+/// against its true ones: so much are their mean and least overlap. Returns the squared errors of the alphas of clicked views.
+fn masked_light_stage(downscale: u32, bands: &[f32], [mean_least, worst_least]: [f64; 2]) -> Vec<f64> {
     let shared =
         std::env::var("TIFACE_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
     let root = Path::new(&shared).join("data/captures/lps");
     if !root.is_dir() {
         eprintln!("skipped: masks of `lps` from clicks, it is not at {}", root.display());
-        return;
+        return Vec::new();
     }
     let dir = tempfile::tempdir().unwrap();
-    let truth = capture::open(&root, &CaptureOptions::default()).unwrap();
+    let truth = capture::open(&root, &CaptureOptions { downscale, ..CaptureOptions::default() }).unwrap();
     let mut errors = Vec::new();
-    for (name, band) in [("soft", 0.023), ("hard", 0.0)] {
-        let mut config = Config::preset(Preset::Draft);
-        config.capture.path = root.to_str().unwrap().into();
+    for &band in bands {
+        let mut config = draft(&root);
+        config.capture.downscale = downscale;
         config.mask.prompts = root.join("prompts.json").to_str().unwrap().into();
         config.mask.band = band;
-        let run = run(dir.path(), name);
+        let run = run(dir.path(), &band.to_string());
         let session = Session::open(&config, &run).unwrap();
         assert_eq!(
             complete(&session, Stage::Mask, &NoFields).unwrap().summary["suspicious"],
@@ -273,17 +276,31 @@ fn three_clicked_photographs_of_a_light_stage_mask_them_all() {
         }
         let mean = overlap.iter().sum::<f64>() / overlap.len() as f64;
         let worst = overlap.iter().copied().fold(1.0, f64::min);
-        eprintln!("lps, {name}: IoU {mean:.4}, worst {worst:.4}, squared error {error:.0}");
-        assert!(overlap.len() == 24 && mean > 0.979 && worst > 0.965, "{mean} {worst}");
+        eprintln!("lps, band {band}: IoU {mean:.4}, worst {worst:.4}, squared error {error:.0}");
+        assert!(overlap.len() == 24 && mean > mean_least && worst > worst_least, "{mean} {worst}");
         errors.push(error);
     }
-    assert!(errors[0] < 0.6 * errors[1], "{errors:?}");
+    errors
+}
+
+#[test]
+fn three_clicked_photographs_of_a_light_stage_mask_them_all() {
+    // a pixel of outline is twice as much of a photograph of half the size
+    masked_light_stage(2, &[0.023], [0.97, 0.95]);
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; masks 32 photographs twice at their full size"]
+fn three_clicked_photographs_mask_all_at_full_size_and_matting_takes_four_tenths_of_the_error() {
+    if let [soft, hard] = masked_light_stage(1, &[0.023, 0.0], [0.979, 0.965])[..] {
+        assert!(soft < 0.6 * hard, "{soft} {hard}");
+    }
 }
 
 #[test]
 fn held_out_photographs_shape_only_their_own_masks() {
     let dir = tempfile::tempdir().unwrap();
-    let (config, _) = clicked(dir.path());
+    let (config, _) = clicked(dir.path(), SMALL);
     let capture = capture::open(Path::new(&config.capture.path), &CaptureOptions::default()).unwrap();
     let held_out = capture.views.iter().find(|v| v.split == Split::Test).unwrap();
     // clicks on a test view as well: deep in its own true mask
@@ -292,7 +309,7 @@ fn held_out_photographs_shape_only_their_own_masks() {
         crate::mask::prompts::read_prompts(Path::new(&config.mask.prompts), &Limits::default()).unwrap();
     prompts.frames.push(PhotoPrompts {
         file_path: file_path(&capture, held_out),
-        points: propagated_clicks(&mask, (120, 160)),
+        points: propagated_clicks(&mask, SMALL),
     });
     prompts.write(Path::new(&config.mask.prompts)).unwrap();
     let masks = |name: &str| -> Vec<Vec<u8>> {
@@ -327,7 +344,7 @@ fn paper_masks_without_networks_are_a_warning() {
         }
     }
     let dir = tempfile::tempdir().unwrap();
-    let (draft, _) = clicked(dir.path());
+    let (draft, _) = clicked(dir.path(), SMALL);
     let mut paper = Config::preset(Preset::Paper);
     (paper.capture.path, paper.mask.prompts) = (draft.capture.path.clone(), draft.mask.prompts.clone());
     let warned = |config: &Config, name: &str| {

@@ -1,8 +1,7 @@
 //! The stage `ensemble` on pictures made by hand.
 
-use super::tests::{NoFields, quiet, words};
+use super::tests::{NoFields, demo_head, draft, masked, quiet, words};
 use super::*;
-use crate::capture::synthetic::{SyntheticOptions, write_capture};
 use crate::capture::{Split, View};
 use crate::config::{Config, Method, Preset, ViewBackground};
 use crate::geom::{Camera, Ray};
@@ -18,11 +17,8 @@ use std::path::{Path, PathBuf};
 const SIZE: (u32, u32) = (32, 40);
 
 fn config(root: &Path) -> Config {
-    let options = SyntheticOptions { width: SIZE.0, height: SIZE.1, train: 8, test: 2, seed: 1 };
-    write_capture(root, &options).unwrap();
-    let mut config = Config::preset(Preset::Draft);
-    config.capture.path = root.to_str().unwrap().into();
-    config
+    demo_head(root, SIZE, (8, 2));
+    draft(root)
 }
 
 fn flat(color: [f32; 4]) -> Image {
@@ -54,7 +50,7 @@ fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
     (config.ensemble, config.render.method) = (paper.ensemble, paper.render.method);
     let run = quiet(dir.path());
     let session = Session::open(&config, &run).unwrap();
-    complete(&session, Stage::Mask, &NoFields).unwrap();
+    masked(&session);
     let names: Vec<String> = session.capture().split(Split::Test).map(|v| v.name.clone()).collect();
     for name in &names {
         put(&run, "baseline", name, flat([0.2, 0.2, 0.2, 1.0]));
@@ -147,7 +143,7 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
         config.metrics.surface_points = 100;
         let run = quiet(dir.path());
         let session = Session::open(&config, &run).unwrap();
-        complete(&session, Stage::Mask, &NoFields).unwrap();
+        masked(&session);
         // what is rendered of test views says the opposite: had they a say, the worse member would win
         let names: Vec<String> = session.capture().split(Split::Test).map(|v| v.name.clone()).collect();
         for name in &names {
@@ -183,7 +179,7 @@ fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
     let blind = |config: &Config| -> Vec<usize> {
         let session = Session::open(config, &run).unwrap();
         if !run.path("mask/scene.json").exists() {
-            complete(&session, Stage::Mask, &NoFields).unwrap();
+            masked(&session);
         }
         let views = learn::train_views(&session.capture, &session.scene().unwrap(), config, true).unwrap();
         let tiles = learn::held_out_tiles(&session.capture, config);

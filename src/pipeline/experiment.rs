@@ -319,9 +319,9 @@ pub fn ahead(session: &Session, run: &str) -> Option<Cost> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::tests::demo_head;
     use super::*;
     use crate::Quiet;
-    use crate::capture::synthetic::{SyntheticOptions, write_capture};
     use crate::geom::Aabb;
     use crate::mesh::extract_dense;
     use crate::run::Run;
@@ -331,9 +331,7 @@ mod tests {
     /// Writes a tiny capture into a folder and returns its path.
     fn head(dir: &Path) -> String {
         let root = dir.join("head");
-        std::fs::create_dir_all(&root).unwrap();
-        write_capture(&root, &SyntheticOptions { width: 48, height: 64, train: 6, test: 2, seed: 1 })
-            .unwrap();
+        demo_head(&root, (32, 40), (8, 2));
         root.to_str().unwrap().into()
     }
 

@@ -2,32 +2,18 @@
 
 use super::exposure::{EXPOSURE, ExposureCheck};
 use super::rig_photos::RigPhotos;
-use super::tests::{NoFields, quiet};
+use super::tests::{NoFields, measured_head, quiet, scene_of};
 use super::{Session, Stage, complete};
-use crate::capture::scene::{self, SceneOptions};
-use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::capture::{self, Capture, CaptureOptions, Split, View};
+use crate::capture::{self, Capture, CaptureOptions, View};
 use crate::config::{CameraPoses, Config, Exposures, Preset};
-use crate::geom::Camera;
 use crate::image::{Exposure, Photo};
 use crate::io::{self, Limits};
 use serde_json::{Value, json};
-use tempfile::TempDir;
+use std::sync::OnceLock;
 
-pub(super) fn demo() -> (TempDir, Capture) {
-    let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 240, height: 300, train: 14, test: 1, seed: 1 };
-    write_capture(dir.path(), &options).unwrap();
-    let capture = capture::open(dir.path(), &CaptureOptions::default()).unwrap();
-    (dir, capture)
-}
-
-pub(super) fn measure(capture: &Capture) -> ExposureCheck {
-    let train: Vec<_> = capture.split(Split::Train).collect();
-    let cameras: Vec<Camera> = train.iter().map(|v| v.camera.clone()).collect();
-    let masks: Vec<_> = train.iter().map(|v| v.load_mask(&Limits::default()).unwrap()).collect();
-    let (scene, _) = scene::fit(&cameras, &masks, &SceneOptions::default()).unwrap();
-    ExposureCheck::measure(&RigPhotos::load(capture, &scene, &Limits::default()).unwrap().unwrap()).unwrap()
+fn measure(capture: &Capture) -> ExposureCheck {
+    let photos = RigPhotos::load(capture, &scene_of(capture), &Limits::default()).unwrap().unwrap();
+    ExposureCheck::measure(&photos).unwrap()
 }
 
 /// Multiplies the light of photographs. A photograph that is read with the inverse exposure is brighter by it.
@@ -47,30 +33,38 @@ pub(super) fn gains() -> Vec<[f32; 3]> {
     (0..15).map(|v| [0, 1, 2].map(|k| log(v, k).exp())).collect()
 }
 
+/// What is found where photographs have [`gains`], measured once a test program.
+pub(super) fn found_gains() -> &'static ExposureCheck {
+    static FOUND: OnceLock<ExposureCheck> = OnceLock::new();
+    FOUND.get_or_init(|| {
+        let (_dir, mut exposed) = measured_head();
+        expose(&mut exposed, &gains());
+        measure(&exposed)
+    })
+}
+
 #[test]
 fn known_gains_are_found() {
-    let (_dir, clean) = demo();
+    let (_dir, clean) = measured_head();
     let found = measure(&clean);
     assert!(!found.evens_out() && found.used("003").is_none(), "{found:?}");
     assert!(found.sentence().contains("alike within 0."), "{}", found.sentence());
 
-    let mut exposed = clean.clone();
-    expose(&mut exposed, &gains());
-    let found = measure(&exposed);
+    let found = found_gains();
     assert!(found.evens_out() && found.sentence().contains("white balance differs"), "{}", found.sentence());
     // the held-out view, the last one, is compared with the training views but does not shape what they share
     let error = |(view, gain): (&View, [f32; 3])| {
         let used = found.used(&view.name).unwrap().gain;
         used.iter().zip(gain).map(|(used, gain)| (used / gain - 1.0).abs()).fold(0.0, f32::max)
     };
-    let errors: Vec<f32> = exposed.views.iter().zip(gains()).map(error).collect();
+    let errors: Vec<f32> = clean.views.iter().zip(gains()).map(error).collect();
     // what is linear in the viewing direction cannot be told from shading: gains of 10 to 20 % have a little of it
     assert!(errors.iter().all(|&e| e < 0.03), "{errors:?}");
 }
 
 #[test]
 fn where_only_colors_differ_nothing_is_said_of_brightness() {
-    let (_dir, mut exposed) = demo();
+    let (_dir, mut exposed) = measured_head();
     let warm =
         |v: usize| [0.08, 0.0, -0.08].map(|l: f32| if v.is_multiple_of(2) { l.exp() } else { (-l).exp() });
     expose(&mut exposed, &(0..15).map(warm).collect::<Vec<_>>());
@@ -81,7 +75,7 @@ fn where_only_colors_differ_nothing_is_said_of_brightness() {
 
 #[test]
 fn one_photograph_that_is_brighter_is_named() {
-    let (_dir, mut exposed) = demo();
+    let (_dir, mut exposed) = measured_head();
     let mut gains = [[1.0; 3]; 15];
     gains[5] = [1.12; 3];
     expose(&mut exposed, &gains);
@@ -93,7 +87,7 @@ fn one_photograph_that_is_brighter_is_named() {
 
 #[test]
 fn later_stages_read_photographs_with_the_mean_exposure_unless_given_ones_are_asked_for() {
-    let (dir, mut exposed) = demo();
+    let (dir, mut exposed) = measured_head();
     expose(&mut exposed, &gains());
     let photos = |capture: &Capture| -> Vec<_> {
         capture.views.iter().map(|v| v.load_photo(&Limits::default()).unwrap()).collect()
@@ -133,9 +127,7 @@ fn later_stages_read_photographs_with_the_mean_exposure_unless_given_ones_are_as
 
 #[test]
 fn exposures_are_read_back_and_what_is_no_gain_is_refused_with_its_key() {
-    let (_dir, mut exposed) = demo();
-    expose(&mut exposed, &gains());
-    let found = measure(&exposed);
+    let found = found_gains();
     let dir = tempfile::tempdir().unwrap();
     assert!(ExposureCheck::read(dir.path()).unwrap().is_none());
     found.write(dir.path()).unwrap();

@@ -298,6 +298,7 @@ pub fn against_truth(mesh: &Mesh, points: usize) -> Option<Truth> {
 #[cfg(test)]
 mod tests {
     use super::super::exposure_tests;
+    use super::super::tests::measured_head;
     use super::*;
 
     #[test]
@@ -318,10 +319,10 @@ mod tests {
 
     #[test]
     fn a_view_at_the_mean_exposure_is_compared_with_the_photograph_and_with_its_own_exposure_divided_out() {
-        let (dir, clean) = exposure_tests::demo();
+        let (dir, clean) = measured_head();
         let mut exposed = clean.clone();
         exposure_tests::expose(&mut exposed, &exposure_tests::gains());
-        let check = exposure_tests::measure(&exposed);
+        let check = exposure_tests::found_gains();
         // the photograph at the mean exposure is the picture of a perfect renderer
         let photo = clean.views[14].load_photo(&Limits::default()).unwrap();
         let file = dir.path().join("view.png");
@@ -331,7 +332,7 @@ mod tests {
         io::write_png_rgb(&black, photo.width, photo.height, &vec![[0; 3]; photo.rgb.len()]).unwrap();
         let config = Config::preset(crate::config::Preset::Draft);
         let plain = figures(&config, &picture, None, None, None).unwrap();
-        let found = figures(&config, &picture, None, None, Some(&check)).unwrap();
+        let found = figures(&config, &picture, None, None, Some(check)).unwrap();
         assert!(plain.own_exposure.is_none() && plain.own_pose.is_none());
         assert_eq!(found.head.psnr_masked, plain.head.psnr_masked);
         let own = found.own_exposure.unwrap().psnr_masked.unwrap();
@@ -346,7 +347,7 @@ mod tests {
             let figures = figures(&config, &fitted, None, None, exposure).unwrap();
             (figures.head.psnr_masked.unwrap(), figures.own_pose.unwrap().psnr_masked)
         };
-        let ((given, alone), (_, both)) = (psnr(None), psnr(Some(&check)));
+        let ((given, alone), (_, both)) = (psnr(None), psnr(Some(check)));
         assert!(
             alone == plain.head.psnr_masked && both == Some(own) && given < own - 6.0,
             "{given} {alone:?} {both:?}"

@@ -1,9 +1,8 @@
 //! Views of camera paths, beside a finished evaluation.
 
-use super::tests::{NoFields, quiet, words};
+use super::tests::{NoFields, demo_head, draft, masked, quiet, words};
 use super::*;
-use crate::capture::synthetic::{SyntheticOptions, write_capture};
-use crate::config::{Config, Method, Preset, RenderConfig, ViewBackground};
+use crate::config::{Config, Method, RenderConfig, ViewBackground};
 use crate::io;
 use crate::{ErrorKind, Result};
 use serde_json::Value;
@@ -29,10 +28,8 @@ impl Fields for Fog {
 }
 
 fn config(root: &Path) -> Config {
-    let options = SyntheticOptions { width: 16, height: 20, train: 4, test: 2, seed: 1 };
-    write_capture(root, &options).unwrap();
-    let mut config = Config::preset(Preset::Draft);
-    config.capture.path = root.to_str().unwrap().into();
+    demo_head(root, (16, 20), (4, 2));
+    let mut config = draft(root);
     config.render.method = vec![Method::Baseline, Method::Tface];
     config.ensemble.members = vec![Method::Baseline, Method::Tface];
     config.ensemble.weights = vec![0.25, 0.75];
@@ -61,6 +58,12 @@ fn evaluate(session: &Session) -> Vec<bool> {
     let rest = [Stage::Render, Stage::Ensemble, Stage::Metrics].map(skipped);
     page::write_report(session, false).unwrap();
     [&[mask], &rest[..]].concat()
+}
+
+/// Completes all stages for tests of what follows.
+fn finished(session: &Session) {
+    masked(session);
+    evaluate(session);
 }
 
 /// Every file of a run with its bytes, those of paths left out.
@@ -130,7 +133,7 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
     let session = || Session::open(&config, &run).unwrap();
-    evaluate(&session());
+    finished(&session());
     let orbit = turn(&config, "orbit");
     complete(&session().with_camera_path(orbit.clone()).unwrap(), Stage::Render, &Fog).unwrap();
     complete(&session().with_camera_path(turn(&config, "train")).unwrap(), Stage::Render, &Fog).unwrap();
@@ -162,7 +165,7 @@ fn views_of_a_path_whose_records_cannot_be_read_are_made_anew_with_any_field() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Session::open(&config, &run).unwrap());
+    finished(&Session::open(&config, &run).unwrap());
     let session = Session::open(&config, &run).unwrap().with_camera_path(turn(&config, "orbit")).unwrap();
     complete(&session, Stage::Render, &Fog).unwrap();
     let orbit = "render/paths/orbit".to_string();
@@ -203,7 +206,7 @@ fn a_method_that_is_not_asked_for_is_not_called_changed() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Session::open(&config, &run).unwrap());
+    finished(&Session::open(&config, &run).unwrap());
     config.render.method = vec![Method::Tface];
     let e = Session::open(&config, &run).unwrap().remember(Stage::Render).unwrap_err().to_string();
     assert!(e.contains("render.method: was [\"baseline\", \"tface\"], is [\"tface\"]"), "{e}");
@@ -235,7 +238,7 @@ fn nothing_to_judge_is_an_error_and_no_empty_file() {
     config.ensemble.members.clear();
     let run = quiet(dir.path());
     let session = Session::open(&config, &run).unwrap();
-    complete(&session, Stage::Mask, &NoFields).unwrap();
+    masked(&session);
     complete(&session, Stage::Render, &Fog).unwrap();
     let e = complete(&session, Stage::Metrics, &NoFields).unwrap_err();
     assert!(e.hint().contains("`render.method`") && !run.path("metrics/metrics.json").exists(), "{e}");
@@ -247,7 +250,7 @@ fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
     let session = Session::open(&config, &run).unwrap();
-    evaluate(&session);
+    finished(&session);
     let page = || std::fs::read_to_string(run.path("report.html")).unwrap();
     let whole = page();
     assert!(whole.contains("<span>mask</span>") && whole.contains("<h2>Against the photographs</h2>"));
@@ -273,7 +276,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
     let config = config(&root);
     let run = quiet(dir.path());
     let first = Session::open(&config, &run).unwrap();
-    evaluate(&first);
+    finished(&first);
     let (before, export) = (files(run.dir()), Export::new(first.capture(), &config));
     std::fs::rename(&root, dir.path().join("moved")).unwrap();
 
@@ -316,7 +319,7 @@ fn a_finished_run_that_cannot_be_written_is_still_done() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Session::open(&config, &run).unwrap());
+    finished(&Session::open(&config, &run).unwrap());
     // a folder in the place of a file cannot be written by anybody
     for file in ["config.toml", "cameras.json", "report.html"] {
         std::fs::remove_file(run.path(file)).unwrap();
@@ -337,7 +340,7 @@ fn a_command_that_is_refused_clears_nothing_with_fresh() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
-    evaluate(&Session::open(&config, &run).unwrap());
+    finished(&Session::open(&config, &run).unwrap());
     let before = files(run.dir());
     let refused = |change: &dyn Fn(&mut Config)| {
         let mut config = config.clone();

@@ -1,9 +1,20 @@
 //! What the tests of the pipeline share.
 
-use super::{Fields, Radiance, Stage, Surface};
+use super::{Fields, Radiance, Session, Stage, Surface, complete};
 use crate::Result;
-use crate::run::Run;
+use crate::capture::scene::{self, Scene, SceneOptions};
+use crate::capture::synthetic::SyntheticOptions;
+use crate::capture::synthetic::shared::{Files, write_capture};
+use crate::capture::{self, Capture, CaptureOptions, Split};
+use crate::config::{CameraPoses, Config, Exposures, Preset};
+use crate::geom::Camera;
+use crate::image::Gray;
+use crate::io::Limits;
+use crate::run::{Done, Run};
+use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::{Arc, Mutex, OnceLock};
+use tempfile::TempDir;
 
 /// Fields that no stage may load.
 pub(super) struct NoFields;
@@ -26,4 +37,60 @@ pub(super) fn quiet(dir: &Path) -> Run {
 /// The words of stages, with spaces.
 pub(super) fn words(stages: &[Stage]) -> String {
     stages.iter().map(|s| s.word()).collect::<Vec<_>>().join(" ")
+}
+
+/// Writes the demo head, photographed at a size by so many training and held-out views, into a folder. A size of its own costs
+/// seconds, one that other tests have nothing.
+pub(super) fn demo_head(root: &Path, (width, height): (u32, u32), (train, test): (usize, usize)) {
+    write_capture(root, &SyntheticOptions { width, height, train, test, seed: 1 });
+}
+
+/// The configuration of a draft of the capture in a folder. Cameras and exposures are used as given: their measurement takes
+/// longer than all else of the stage `mask`, and has tests of its own.
+pub(super) fn draft(root: &Path) -> Config {
+    let mut config = Config::preset(Preset::Draft);
+    config.capture.path = root.to_str().unwrap().into();
+    (config.capture.cameras, config.capture.exposure) = (CameraPoses::Given, Exposures::Given);
+    config
+}
+
+/// The demo head on which cameras and exposures are measured: 14 training views, and a held-out one, the last.
+pub(super) fn measured_head() -> (TempDir, Capture) {
+    let dir = tempfile::tempdir().unwrap();
+    demo_head(dir.path(), (144, 180), (14, 1));
+    let capture = capture::open(dir.path(), &CaptureOptions::default()).unwrap();
+    (dir, capture)
+}
+
+/// The scene of the training views of a capture; that of the same cameras and masks is found once a test program.
+pub(super) fn scene_of(capture: &Capture) -> Scene {
+    type Views = (Vec<Camera>, Vec<Option<Gray>>);
+    static FOUND: Mutex<Vec<(Views, Scene)>> = Mutex::new(Vec::new());
+    let train: Vec<_> = capture.split(Split::Train).collect();
+    let masks = train.iter().map(|v| v.load_mask(&Limits::default()).unwrap()).collect();
+    let views: Views = (train.iter().map(|v| v.camera.clone()).collect(), masks);
+    let mut found = FOUND.lock().unwrap();
+    if let Some((_, scene)) = found.iter().find(|(of, _)| *of == views) {
+        return scene.clone();
+    }
+    let (scene, _) = scene::fit(&views.0, &views.1, &SceneOptions::default()).unwrap();
+    found.push((views, scene.clone()));
+    scene
+}
+
+/// Completes the stage `mask` as [`complete`] does, for tests of what follows. It is made once a test program for each plan; later
+/// its files are copied into the run, where they are found done.
+pub(super) fn masked(session: &Session) -> Done {
+    static MADE: Mutex<BTreeMap<String, Arc<OnceLock<Files>>>> = Mutex::new(BTreeMap::new());
+    let (folder, plan) = (session.run.path(Stage::Mask), session.plan(Stage::Mask));
+    let made = MADE.lock().unwrap().entry(plan.fingerprint.digest()).or_default().clone();
+    let make = || {
+        complete(session, Stage::Mask, &NoFields).unwrap();
+        Files::read(&folder)
+    };
+    let files = made.get_or_init(make);
+    if !session.run.is_done(&plan) {
+        files.write(&folder);
+    }
+    complete(session, Stage::Mask, &NoFields).unwrap()
 }

@@ -16,6 +16,7 @@ use crate::onnx::tests::{config, made, shared};
 use crate::onnx::{NetworkArray, NetworkSession, Role};
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 
 fn array(path: &Path) -> NetworkArray {
     let npy = read_npy(path, &Limits::default()).unwrap();
@@ -71,6 +72,12 @@ fn text(path: PathBuf) -> String {
     path.to_str().unwrap().into()
 }
 
+/// The network with the decoder of the reference, opened once a test program.
+fn reference_sam(folder: &Path) -> &'static Sam {
+    static SAM: OnceLock<Sam> = OnceLock::new();
+    SAM.get_or_init(|| sam(folder, DECODER).unwrap())
+}
+
 fn sam_files(folder: &Path, decoder: &str) -> MaskConfig {
     MaskConfig {
         sam: text(folder.join("vision_encoder.onnx")),
@@ -111,7 +118,7 @@ fn the_encoder_sees_the_pixels_of_the_reference() {
     let pixels = normalized(&resized.rgb, 192, 256, &IMAGENET);
     close("pixel_values", numbers(&pixels), numbers(&array(&folder.join("pixel_values.npy"))), 1e-6);
     // the file's own side and processor are obeyed: 256, not 1024
-    let sam = sam(&folder, DECODER).unwrap();
+    let sam = reference_sam(&folder);
     assert_eq!((sam.side, sam.fitted(150, 200)), (256, (192, 256)));
 }
 
@@ -230,7 +237,7 @@ fn a_decoder_without_labels_takes_clicks_on_the_head_and_no_others() {
 fn clicks_that_make_no_sense_are_named() {
     let Some(folder) = shared("sam_tiny") else { return };
     let photo = picture(&folder);
-    let sam = sam(&folder, DECODER).unwrap();
+    let sam = reference_sam(&folder);
     let head = |x: f32, y: f32| Click { x, y, head: true };
     for (clicks, word) in [
         (vec![], "the photograph has no clicks"),
@@ -406,7 +413,7 @@ fn the_record_names_each_file_with_its_size_and_its_hash() {
 fn photographs_side_by_side_get_what_they_get_alone() {
     let (Some(folder), Some(matte)) = (shared("sam_tiny"), shared("vitmatte_tiny")) else { return };
     let (photo, clicks, trimap) = (picture(&folder), clicks(&folder), gray(&matte.join("trimap.png")));
-    let sam = sam(&folder, DECODER).unwrap();
+    let sam = reference_sam(&folder);
     let vitmatte = VitMatte::open(&matte.join("model.onnx"), ARRAY_BYTES, VitmatteColors::Auto).unwrap();
     let both = || (sam.segment(&photo, &clicks).unwrap(), vitmatte.alpha(&photo, &trimap).unwrap());
     let alone = both();

@@ -298,7 +298,7 @@ fn the_cap_of_a_head_takes_little_of_the_texture() {
 
 /// A bumpy ball of 200,000 triangles.
 #[test]
-#[ignore = "slow: about four seconds"]
+#[ignore = "long: run by `tools/test.sh all`; a mesh of 200,000 triangles takes seconds"]
 fn two_hundred_thousand_triangles_are_laid() {
     let mut mesh = sphere(317, 317);
     for p in &mut mesh.positions {

@@ -45,13 +45,13 @@ fn drawn<'a>(tile: &mut Tile, faces: impl Iterator<Item = &'a Face>) -> Vec<u32>
     tile.triangle.as_flattened().to_vec()
 }
 
-#[test]
-fn a_million_shared_edges_leave_no_gap_and_hit_no_sample_twice() {
+/// Draws meshes until they have so many shared edges.
+fn draw_shared_edges(least: usize) {
     // a square over the tile with random corners inside, cut at each of them in turn: every edge within is shared by two
     // triangles, and every sample of the tile lies in exactly one of all
     let mut tile = Tile::new();
     let (mut edges, mut meshes, mut drawings) = (0, 0, 0);
-    while edges < 1_000_000 {
+    while edges < least {
         // from corners on samples and lines through them to a few far beyond the tile, which need 64 bits
         let step = [1, 32, 64, 256][meshes % 4];
         let reach = if meshes % 5 == 4 { 1 << 20 } else { 0 };
@@ -79,6 +79,17 @@ fn a_million_shared_edges_leave_no_gap_and_hit_no_sample_twice() {
         assert!(!first.contains(&NOTHING), "mesh {meshes} has a gap");
         assert!(first == last, "mesh {meshes} hits a sample twice");
     }
+}
+
+#[test]
+fn shared_edges_leave_no_gap_and_hit_no_sample_twice() {
+    draw_shared_edges(100_000);
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; a million edges take seconds"]
+fn a_million_shared_edges_leave_no_gap_and_hit_no_sample_twice() {
+    draw_shared_edges(1_000_000);
 }
 
 #[test]
