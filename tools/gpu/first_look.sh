@@ -15,7 +15,7 @@
 #
 # It needs bash, awk and this program, no network: TIFACE names the program (default: target/release/tiface) and CAPTURE a
 # capture (default: the demo head's, made on the way). SHARE is the share of the steps to make, in hundredths (default: 100;
-# `tools/test.sh` makes one hundredth on a driver in software).
+# `tools/test.sh all` makes one hundredth on a driver in software).
 set -u -o pipefail
 
 [ $# -ge 2 ] || { sed -n '2,20s/^# \{0,1\}//p' "$0" >&2; exit 2; }
