@@ -2,7 +2,7 @@
 
 use super::exposure::{EXPOSURE, ExposureCheck};
 use super::rig_photos::RigPhotos;
-use super::tests::{NoFields, measured_head, quiet, scene_of};
+use super::tests::{NoFields, exposed_head, quiet, scene_of};
 use super::{Session, Stage, complete};
 use crate::capture::{self, Capture, CaptureOptions, View};
 use crate::config::{CameraPoses, Config, Exposures, Preset};
@@ -37,7 +37,7 @@ pub(super) fn gains() -> Vec<[f32; 3]> {
 pub(super) fn found_gains() -> &'static ExposureCheck {
     static FOUND: OnceLock<ExposureCheck> = OnceLock::new();
     FOUND.get_or_init(|| {
-        let (_dir, mut exposed) = measured_head();
+        let (_dir, mut exposed) = exposed_head();
         expose(&mut exposed, &gains());
         measure(&exposed)
     })
@@ -45,7 +45,7 @@ pub(super) fn found_gains() -> &'static ExposureCheck {
 
 #[test]
 fn known_gains_are_found() {
-    let (_dir, clean) = measured_head();
+    let (_dir, clean) = exposed_head();
     let found = measure(&clean);
     assert!(!found.evens_out() && found.used("003").is_none(), "{found:?}");
     assert!(found.sentence().contains("alike within 0."), "{}", found.sentence());
@@ -64,7 +64,7 @@ fn known_gains_are_found() {
 
 #[test]
 fn where_only_colors_differ_nothing_is_said_of_brightness() {
-    let (_dir, mut exposed) = measured_head();
+    let (_dir, mut exposed) = exposed_head();
     let warm =
         |v: usize| [0.08, 0.0, -0.08].map(|l: f32| if v.is_multiple_of(2) { l.exp() } else { (-l).exp() });
     expose(&mut exposed, &(0..15).map(warm).collect::<Vec<_>>());
@@ -75,7 +75,7 @@ fn where_only_colors_differ_nothing_is_said_of_brightness() {
 
 #[test]
 fn one_photograph_that_is_brighter_is_named() {
-    let (_dir, mut exposed) = measured_head();
+    let (_dir, mut exposed) = exposed_head();
     let mut gains = [[1.0; 3]; 15];
     gains[5] = [1.12; 3];
     expose(&mut exposed, &gains);
@@ -87,7 +87,7 @@ fn one_photograph_that_is_brighter_is_named() {
 
 #[test]
 fn later_stages_read_photographs_with_the_mean_exposure_unless_given_ones_are_asked_for() {
-    let (dir, mut exposed) = measured_head();
+    let (dir, mut exposed) = exposed_head();
     expose(&mut exposed, &gains());
     let photos = |capture: &Capture| -> Vec<_> {
         capture.views.iter().map(|v| v.load_photo(&Limits::default()).unwrap()).collect()

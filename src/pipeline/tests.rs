@@ -54,10 +54,19 @@ pub(super) fn draft(root: &Path) -> Config {
     config
 }
 
-/// The demo head on which cameras and exposures are measured: 14 training views, and a held-out one, the last.
+/// The demo head on which cameras are measured: 14 training views, and a held-out one, the last.
 pub(super) fn measured_head() -> (TempDir, Capture) {
+    head_of((144, 180))
+}
+
+/// The same on which exposures are measured, which takes more pixels.
+pub(super) fn exposed_head() -> (TempDir, Capture) {
+    head_of((240, 300))
+}
+
+fn head_of(size: (u32, u32)) -> (TempDir, Capture) {
     let dir = tempfile::tempdir().unwrap();
-    demo_head(dir.path(), (192, 240), (14, 1));
+    demo_head(dir.path(), size, (14, 1));
     let capture = capture::open(dir.path(), &CaptureOptions::default()).unwrap();
     (dir, capture)
 }
