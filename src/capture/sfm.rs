@@ -553,16 +553,15 @@ impl Work<'_> {
             }
         }
         let enough = |found: &Found| found.names.len() as f64 >= ENOUGH * self.names.len() as f64;
-        match (best, crash) {
-            (Some((folder, found)), None) => Ok(Some(Model { attempt, folder, found, pieces, unreadable })),
-            (Some((folder, found)), Some(_)) if enough(&found) => {
-                Ok(Some(Model { attempt, folder, found, pieces, unreadable }))
-            }
-            (_, Some(failure)) => {
-                let program = if self.programs.glomap.is_some() { "glomap" } else { "colmap" };
-                Err(failed_command(program, &mapper, &failure, &log))
-            }
-            (None, None) => unreadable.into_iter().next().map_or(Ok(None), Err),
+        if let Some(failure) = crash
+            && !best.as_ref().is_some_and(|(_, found)| enough(found))
+        {
+            let program = if self.programs.glomap.is_some() { "glomap" } else { "colmap" };
+            return Err(failed_command(program, &mapper, &failure, &log));
+        }
+        match best {
+            Some((folder, found)) => Ok(Some(Model { attempt, folder, found, pieces, unreadable })),
+            None => unreadable.into_iter().next().map_or(Ok(None), Err),
         }
     }
 
