@@ -223,9 +223,10 @@ enum Command {
   tiface cameras --video turn.mp4 --every 15    keep the sharpest of every 15 frames
   tiface cameras rig --lens-each                calibrate a lens for each photograph
 
-The new folder [default: PHOTOGRAPHS_cameras] has a copy of the photographs in images/, COLMAP's model in sparse/0
-and its log in colmap/log.txt. If the folder has head masks, features are searched inside them;
---set mask.source=none uses whole photographs.")]
+The new folder [default: PHOTOGRAPHS_cameras, or HEAD_cameras for HEAD/images] has a copy of the photographs in
+images/, COLMAP's model in sparse/0 and its log in colmap/tiface_cameras.log. If the folder has head masks, features
+are searched inside them; --set mask.source=none uses whole photographs. A search that failed is repeated in its
+folder; one that is done is not.")]
     Cameras(CamerasOptions),
     /// Write a capture's cameras in another format: transforms.json or COLMAP
     #[command(after_long_help = "Examples:

@@ -134,12 +134,21 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
     Ok(out)
 }
 
-/// Copies photographs and masks as COLMAP names them, and returns the photographs' names below `images/`, in the order of
-/// the views.
-pub(super) fn copy_for_colmap(capture: &Capture, folder: &Path) -> Result<Vec<String>> {
+/// Copies photographs and masks as COLMAP names them.
+pub(super) fn copy_for_colmap(capture: &Capture, folder: &Path) -> Result<()> {
+    copy_pictures(capture, &places(capture, CameraFormat::Colmap)?, folder).map(drop)
+}
+
+/// Returns the photographs' names below `images/` as COLMAP has them, in the order of the views,
+/// and all files that [`copy_for_colmap`] writes.
+pub(super) fn names_for_colmap(capture: &Capture) -> Result<(Vec<String>, Vec<String>)> {
     let places = places(capture, CameraFormat::Colmap)?;
-    copy_pictures(capture, &places, folder)?;
-    Ok(places.into_iter().map(|place| place.name).collect())
+    let files = places.iter().flat_map(|place| {
+        let beside = [&place.mask, &place.valid, &place.region].into_iter().flatten();
+        [&place.photo].into_iter().chain(beside).cloned()
+    });
+    let files = files.collect();
+    Ok((places.into_iter().map(|place| place.name).collect(), files))
 }
 
 /// Returns where the pictures of each view go.

@@ -164,6 +164,26 @@ const READABLE_FORMATS: usize = 3;
 /// Usual folders of photographs.
 const IMAGE_FOLDERS: [&str; 5] = ["images", "image", "input", "rgb", "photos"];
 
+/// Returns whether a folder's name says nothing of what its photographs show.
+pub(super) fn is_common_name(name: &str) -> bool {
+    let others = [
+        "imgs",
+        "img",
+        "photo",
+        "photographs",
+        "pictures",
+        "pics",
+        "frames",
+        "color",
+        "png",
+        "jpg",
+        "jpeg",
+        "raw",
+        "dcim",
+    ];
+    IMAGE_FOLDERS.iter().chain(&others).any(|common| common.eq_ignore_ascii_case(name))
+}
+
 /// The entries of a folder.
 pub(super) struct FolderEntries {
     pub root: PathBuf,

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
+use std::process::Stdio;
 use std::time::SystemTime;
 
 fn failed(path: &Path) -> impl Fn(std::io::Error) -> WriteError + '_ {
@@ -49,6 +50,16 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
         removed.map_err(failed(&inside))?;
     }
     Ok(())
+}
+
+/// Removes a folder if it is there and has nothing in it.
+pub fn remove_empty_folder(path: &Path) -> Result<(), WriteError> {
+    match fs::remove_dir(path) {
+        Err(e) if !matches!(e.kind(), ErrorKind::NotFound | ErrorKind::DirectoryNotEmpty) => {
+            Err(failed(path)(e))
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Returns a file in a folder or below, but not in folders that are `apart`; `None` without one, or without
@@ -231,7 +242,7 @@ pub fn free_bytes(_: &Path) -> Option<u64> {
 /// An exclusive lock on a folder, freed when dropped, and by the kernel when the process dies.
 #[derive(Debug)]
 pub struct Lock {
-    _file: File,
+    file: File,
 }
 
 /// Why a lock was not taken.
@@ -260,7 +271,7 @@ impl Lock {
     pub fn take(path: &Path) -> Result<Lock, LockError> {
         let file = lock_file(path)?;
         match file.try_lock() {
-            Ok(()) => Ok(Lock { _file: file }),
+            Ok(()) => Ok(Lock { file }),
             Err(TryLockError::WouldBlock) => Err(LockError::Held { path: path.into() }),
             Err(TryLockError::Error(source)) => Err(LockError::Io { path: path.into(), source }),
         }
@@ -270,7 +281,15 @@ impl Lock {
     pub fn wait(path: &Path) -> Result<Lock, LockError> {
         let file = lock_file(path)?;
         file.lock().map_err(|source| LockError::Io { path: path.into(), source })?;
-        Ok(Lock { _file: file })
+        Ok(Lock { file })
+    }
+
+    /// Returns the lock file, which is empty, as the input of a program. The lock is then held
+    /// until that program and those that it starts have ended, too, even if this process is killed
+    /// before them; on Windows, until this process ends.
+    pub fn as_input(&self) -> std::io::Result<Stdio> {
+        // on Unix a lock belongs to what was opened, which its copies share
+        if cfg!(unix) { Ok(self.file.try_clone()?.into()) } else { Ok(Stdio::null()) }
     }
 }
 
@@ -300,6 +319,18 @@ mod tests {
         assert!(matches!(Lock::take(&path), Err(LockError::Held { .. })));
         drop(first);
         assert!(Lock::take(&path).is_ok());
+    }
+
+    #[test]
+    fn only_an_empty_folder_is_removed() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a/b");
+        fs::create_dir_all(&path).unwrap();
+        remove_empty_folder(&dir.path().join("a")).unwrap();
+        assert!(path.is_dir());
+        remove_empty_folder(&path).unwrap();
+        assert!(!path.exists());
+        remove_empty_folder(&path).unwrap();
     }
 
     #[test]
