@@ -19,7 +19,7 @@ mod write;
 pub use self::exr::{ExrImage, read_exr, write_exr};
 pub use animation::{ANIMATIONS, Animation, Frames, write_animation};
 pub use folder::{
-    Lock, LockError, any_file, append, clear_folder, create_folder, exists, file_size, file_sizes,
+    Lock, LockError, any_file, append, begins, clear_folder, create_folder, exists, file_size, file_sizes,
     free_bytes, is_file, is_folder, is_link, is_writable, list_files, list_folders, modified, real_path,
     similar,
 };

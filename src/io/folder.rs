@@ -4,7 +4,7 @@ use super::read::ReadError;
 use super::write::WriteError;
 use std::collections::BTreeMap;
 use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
-use std::io::{ErrorKind, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -51,17 +51,18 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
     Ok(())
 }
 
-/// Returns a file in a folder or below, but not in folders that are `apart`; `None` without one, or without
-/// the folder.
+/// Returns a file in a folder or below, but none of those, nor in one of the folders, that are `apart`; `None` without
+/// one, or without the folder.
 pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<PathBuf>, ReadError> {
     for entry in entries(path).map_err(|e| ReadError::io(path, e))? {
         let inside = entry.path();
+        if apart(&inside) {
+            continue;
+        }
         if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
             return Ok(Some(inside));
         }
-        if !apart(&inside)
-            && let Some(file) = any_file(&inside, apart)?
-        {
+        if let Some(file) = any_file(&inside, apart)? {
             return Ok(Some(file));
         }
     }
@@ -190,7 +191,7 @@ pub fn append(path: &Path, line: &str) -> Result<(), WriteError> {
 }
 
 fn ends_with_newline(file: &mut File) -> std::io::Result<bool> {
-    use std::io::{Read, Seek, SeekFrom};
+    use std::io::{Seek, SeekFrom};
     if file.metadata()?.len() == 0 {
         return Ok(true);
     }
@@ -231,7 +232,7 @@ pub fn free_bytes(_: &Path) -> Option<u64> {
 /// An exclusive lock on a folder, freed when dropped, and by the kernel when the process dies.
 #[derive(Debug)]
 pub struct Lock {
-    _file: File,
+    file: File,
 }
 
 /// Why a lock was not taken.
@@ -260,7 +261,7 @@ impl Lock {
     pub fn take(path: &Path) -> Result<Lock, LockError> {
         let file = lock_file(path)?;
         match file.try_lock() {
-            Ok(()) => Ok(Lock { _file: file }),
+            Ok(()) => Ok(Lock { file }),
             Err(TryLockError::WouldBlock) => Err(LockError::Held { path: path.into() }),
             Err(TryLockError::Error(source)) => Err(LockError::Io { path: path.into(), source }),
         }
@@ -270,8 +271,32 @@ impl Lock {
     pub fn wait(path: &Path) -> Result<Lock, LockError> {
         let file = lock_file(path)?;
         file.lock().map_err(|source| LockError::Io { path: path.into(), source })?;
-        Ok(Lock { _file: file })
+        Ok(Lock { file })
     }
+
+    /// [`Lock::take`], after which the file of the lock begins with `mark`, so that its content tells whose it is. The mark
+    /// is on the disk when this returns. A file with other content keeps it, and so does another user's.
+    pub fn take_marked(path: &Path, mark: &str) -> Result<Lock, LockError> {
+        let lock = Lock::take(path)?;
+        let is_ours_to_write = || OpenOptions::new().write(true).open(path).is_ok();
+        if begins(path, mark) == Some(false) && is_ours_to_write() {
+            let written = (&lock.file).write_all(mark.as_bytes()).and_then(|()| lock.file.sync_all());
+            written.map_err(|source| LockError::Io { path: path.into(), source })?;
+        }
+        Ok(lock)
+    }
+}
+
+/// Compares the first bytes of a file with `mark`: whether all of it is there, as opposed to some or none of it, which is what a
+/// process leaves that was killed before or while it wrote. `None` for other content, for a link, and if the file cannot be
+/// read.
+pub fn begins(path: &Path, mark: &str) -> Option<bool> {
+    if is_link(path) || !is_file(path) {
+        return None;
+    }
+    let mut found = Vec::new();
+    File::open(path).ok()?.take(mark.len() as u64).read_to_end(&mut found).ok()?;
+    mark.as_bytes().starts_with(&found).then_some(found.len() == mark.len())
 }
 
 fn lock_file(path: &Path) -> Result<File, LockError> {
@@ -300,6 +325,22 @@ mod tests {
         assert!(matches!(Lock::take(&path), Err(LockError::Held { .. })));
         drop(first);
         assert!(Lock::take(&path).is_ok());
+    }
+
+    #[test]
+    fn a_marked_lock_tells_whose_it_is_even_if_a_kill_cut_its_mark() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(".lock");
+        assert_eq!(begins(&path, "ours\n"), None);
+        for before in ["", "ou", "ours\n"] {
+            fs::write(&path, before).unwrap();
+            assert_eq!(begins(&path, "ours\n"), Some(before.len() == 5), "{before:?}");
+            drop(Lock::take_marked(&path, "ours\n").unwrap());
+            assert_eq!(fs::read(&path).unwrap(), b"ours\n", "{before:?}");
+        }
+        fs::write(&path, "theirs").unwrap();
+        drop(Lock::take_marked(&path, "ours\n").unwrap());
+        assert_eq!((begins(&path, "ours\n"), fs::read(&path).unwrap()), (None, b"theirs".to_vec()));
     }
 
     #[test]
