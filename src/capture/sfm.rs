@@ -11,12 +11,13 @@
 //! then refined as OPENCV's model with its principal point where that is observable: a wide lens and many points.
 
 use super::colmap::Found;
-use super::folder::{CaptureFolder, FolderEntries, photographs};
+use super::folder::{CaptureFolder, FolderEntries, is_nameable, photographs, unnameable};
 use super::format::{self, CameraFiles};
 use super::frame::{CameraFrame, Intrinsics, Listing};
 use super::masks::few;
 use super::view::{Capture, CaptureOptions, ViewMask};
 use super::{build, convert};
+use crate::error::counted;
 use crate::image::Photo;
 use crate::io::{self, Limits, Program, VideoFrames};
 use crate::{Error, Result};
@@ -128,7 +129,8 @@ pub fn from_photographs(root: &Path, options: &CaptureOptions, sfm: &SfmOptions)
     })?;
     let masked = capture.views.iter().any(|view| view.mask != ViewMask::None);
     let shared = lenses.len() == 1 && !sfm.lens_each;
-    Work { sfm, programs, names, shared, masked, is_video: false }.solve()
+    let found = Work { sfm, programs, names, shared, masked, is_video: false }.solve()?;
+    Ok(Solution { warnings: [capture.warnings, found.warnings].concat(), ..found })
 }
 
 /// Finds the cameras of the sharpest of each `every` frames of a video, and leaves a capture of these frames.
@@ -213,9 +215,18 @@ fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
         )
     };
     let inside = FolderEntries::of(root).photographs().ok_or_else(none)?;
-    let names = photographs(&inside)?;
-    require_enough(names.len(), root, MORE_OVERLAP)?;
-    let mut listing = Listing::default();
+    let mut names = photographs(&inside)?;
+    names.retain(|name| is_nameable(name));
+    let unnameable = unnameable(&inside)?;
+    let unnameable = (!unnameable.is_empty()).then(|| {
+        let (count, names) = (counted(unnameable.len(), "photograph"), few(&unnameable));
+        format!("{count} left out, whose name begins with a dot or has `\\` in it: {names}; rename what is to be used")
+    });
+    require_enough(names.len(), root, MORE_OVERLAP).map_err(|e| match &unnameable {
+        Some(text) => Error::cannot(format!("{e}; {text}"), e.hint()),
+        None => e,
+    })?;
+    let mut listing = Listing { warnings: Vec::from_iter(unnameable), ..Listing::default() };
     let base = inside.strip_prefix(root).unwrap_or(Path::new(""));
     let lens = Intrinsics { focal: [Some(1.0); 2], ..Intrinsics::default() };
     let pose = (DMat3::IDENTITY, DVec3::ZERO);

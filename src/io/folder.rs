@@ -103,6 +103,15 @@ pub fn is_folder(path: &Path) -> bool {
 /// Returns the names of the regular files directly in a folder, sorted by bytes; hidden ones left out. A name that
 /// is not UTF-8 is an error that shows it as well as it can.
 pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
+    listed(folder, |name| !name.starts_with('.'))
+}
+
+/// Returns the names of the hidden regular files directly in a folder, as [`list_files`] those of the others.
+pub fn list_hidden(folder: &Path) -> Result<Vec<String>, ReadError> {
+    listed(folder, |name| name.starts_with('.'))
+}
+
+fn listed(folder: &Path, is_wanted: impl Fn(&str) -> bool) -> Result<Vec<String>, ReadError> {
     let mut names = Vec::new();
     for entry in fs::read_dir(folder).map_err(|e| ReadError::io(folder, e))? {
         let entry = entry.map_err(|e| ReadError::io(folder, e))?;
@@ -113,7 +122,7 @@ pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
         let Ok(name) = entry.file_name().into_string() else {
             return Err(ReadError::unsupported(&path, "a file name that is not UTF-8", "rename the file"));
         };
-        if !name.starts_with('.') {
+        if is_wanted(&name) {
             names.push(name);
         }
     }
