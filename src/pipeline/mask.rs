@@ -37,6 +37,9 @@ const MIN_CONFLICT_SHARE: f64 = 0.1;
 /// Maximum number of masks compared with each other.
 const MAX_COMPARED: usize = 256;
 
+/// Why nothing is measured with masks of this meaning.
+const NO_SILHOUETTES: &str = "masks say what was not looked at, and not where the head ends";
+
 /// The masks, whether read or made.
 #[derive(Default)]
 struct CaptureMasks {
@@ -103,7 +106,7 @@ pub(super) fn mask(
     let (cameras, exposure) = (whole.capture.cameras, whole.capture.exposure);
     let found = match silhouettes {
         true => RigCheck::measure(capture, &scene, cameras, exposure, &Limits::default())?,
-        false => RigCheck::left_out(cameras, exposure, "masks tell only what was not looked at"),
+        false => RigCheck::left_out(cameras, exposure, NO_SILHOUETTES),
     };
     found.require(dir)?;
     let height = scene::height(&scene, capture.up);
@@ -369,7 +372,9 @@ fn for_placing(mask: &Gray) -> Gray {
 pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     let mut found = inspect(root, options);
     if options.mask_meaning == MaskMeaning::Ignore {
-        return found; // no silhouettes
+        let left = RigCheck::left_out(options.cameras, options.exposure, NO_SILHOUETTES);
+        [found.fit, found.exposure] = left.announcements();
+        return found;
     }
     // inputs that cannot be opened or read are already among the problems
     let Ok(capture) = capture::open(root, options) else { return found };
