@@ -269,9 +269,9 @@ fn heat() -> String {
     format!("linear-gradient(to right, {})", colors.join(", "))
 }
 
-/// Fills in a template. The policy of a page (`top.html`) lets a browser run `script` alone, by its digest, and load nothing
-/// but pictures inside the page, and, with `beside` in the context, pictures that lie beside it: so that what is not escaped by
-/// mistake still does nothing.
+/// Fills in a template. The policy of a page (`top.html`) lets a browser run `script` alone, by its
+/// digest, and load nothing but pictures inside the page, and, with `beside` in the context,
+/// pictures that lie beside it: so that what is not escaped by mistake still does nothing.
 fn fill(template: &str, script: &str, context: minijinja::Value) -> Result<String> {
     let context = context! { script, digest => base64(&Sha256::digest(script)), ..context };
     let mut pages = Environment::new();

@@ -48,19 +48,21 @@ pub struct Run {
 
 const LOCK: &str = ".lock";
 
-/// Content of a stage's lock, which is written before anything else in the folder: other programs have files called
-/// `.lock`, too.
+/// Content of a stage's lock, which is written before anything else in the folder: other programs
+/// have files called `.lock`, too.
 const LOCK_MARK: &str = "tiface holds this lock while it works on this stage\n";
 
-/// Returns whether this is the folder of a stage, or of a separate product inside one. The content of a file proves it, not
-/// its name: a lock that names us, or, as a copy may have lost it, a record or a status.
+/// Returns whether this is the folder of a stage, or of a separate product inside one. The content
+/// of a file proves it, not its name: a lock that names us, or, as a copy may have lost it, a
+/// record or a status.
 fn has_record(folder: &Path) -> bool {
     io::begins(&folder.join(LOCK), LOCK_MARK) == Some(true)
         || matches!(read_record(folder), Ok(Some(_)))
         || matches!(read_status(folder), Ok(Some(_)))
 }
 
-/// Returns whether this is an empty lock, whoever made it: alone in a folder it is nothing that could be lost.
+/// Returns whether this is an empty lock, whoever made it: alone in a folder it is nothing that
+/// could be lost.
 fn is_bare_lock(path: &Path) -> bool {
     path.ends_with(LOCK) && io::begins(path, LOCK_MARK) == Some(false)
 }

@@ -227,8 +227,8 @@ pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
     Ok(files)
 }
 
-/// Returns the pictures in a folder that no view can be named after: hidden files, and names with the separator of Windows. What
-/// macOS keeps beside files on foreign disks (`._NAME`) is none.
+/// Returns the pictures in a folder that no view can be named after: hidden files, and names with
+/// the separator of Windows. What macOS keeps beside files on foreign disks (`._NAME`) is none.
 pub(super) fn unnameable(folder: &Path) -> Result<Vec<String>, ReadError> {
     let mut names = io::list_hidden(folder)?;
     names.retain(|name| !name.starts_with("._"));

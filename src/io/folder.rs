@@ -51,8 +51,8 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
     Ok(())
 }
 
-/// Returns a file in a folder or below, but none of those, nor in one of the folders, that are `apart`; `None` without
-/// one, or without the folder.
+/// Returns a file in a folder or below, but none of those, nor in one of the folders, that are
+/// `apart`; `None` without one, or without the folder.
 pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<PathBuf>, ReadError> {
     for entry in entries(path).map_err(|e| ReadError::io(path, e))? {
         let inside = entry.path();
@@ -106,7 +106,8 @@ pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
     listed(folder, |name| !name.starts_with('.'))
 }
 
-/// Returns the names of the hidden regular files directly in a folder, as [`list_files`] those of the others.
+/// Returns the names of the hidden regular files directly in a folder, as [`list_files`] those of
+/// the others.
 pub fn list_hidden(folder: &Path) -> Result<Vec<String>, ReadError> {
     listed(folder, |name| name.starts_with('.'))
 }
@@ -283,8 +284,9 @@ impl Lock {
         Ok(Lock { file })
     }
 
-    /// [`Lock::take`], after which the file of the lock begins with `mark`, so that its content tells whose it is. The mark
-    /// is on the disk when this returns. A file with other content keeps it, and so does another user's.
+    /// [`Lock::take`], after which the file of the lock begins with `mark`, so that its content
+    /// tells whose it is. The mark is on the disk when this returns. A file with other content
+    /// keeps it, and so does another user's.
     pub fn take_marked(path: &Path, mark: &str) -> Result<Lock, LockError> {
         let lock = Lock::take(path)?;
         let is_ours_to_write = || OpenOptions::new().write(true).open(path).is_ok();
@@ -296,9 +298,9 @@ impl Lock {
     }
 }
 
-/// Compares the first bytes of a file with `mark`: whether all of it is there, as opposed to some or none of it, which is what a
-/// process leaves that was killed before or while it wrote. `None` for other content, for a link, and if the file cannot be
-/// read.
+/// Compares the first bytes of a file with `mark`: whether all of it is there, as opposed to some
+/// or none of it, which is what a process leaves that was killed before or while it wrote. `None`
+/// for other content, for a link, and if the file cannot be read.
 pub fn begins(path: &Path, mark: &str) -> Option<bool> {
     if is_link(path) || !is_file(path) {
         return None;

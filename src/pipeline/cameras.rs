@@ -216,7 +216,8 @@ impl CameraCheck {
         })
     }
 
-    /// Returns what is said of training views whose poses were not refined although all were to be, if there are any.
+    /// Returns what is said of training views whose poses were not refined although all were to be,
+    /// if there are any.
     pub(super) fn not_refined(&self) -> Option<String> {
         if !self.refines() {
             return Some(format!("`capture.cameras=refine` refines nothing: {}", self.sentence()));

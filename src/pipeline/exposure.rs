@@ -139,7 +139,8 @@ impl ExposureCheck {
         parts.join("; ")
     }
 
-    /// Returns what is said of training views whose exposure could not be measured, if there are any.
+    /// Returns what is said of training views whose exposure could not be measured, if there are
+    /// any.
     pub(super) fn not_measured(&self) -> Option<String> {
         let left = self.views.iter().filter(|v| v.split == Split::Train && v.measured.is_none());
         let left: Vec<String> = left.map(|v| format!("`{}`", v.view)).collect();

@@ -187,7 +187,8 @@ impl RigCheck {
         Ok(RigCheck { cameras, exposure, poses_left, exposures_left })
     }
 
-    /// Returns the findings about poses and about exposures in words, with what a run does about them and what it does not.
+    /// Returns the findings about poses and about exposures in words, with what a run does about
+    /// them and what it does not.
     fn announcements(&self) -> [Option<String>; 2] {
         let both = |found: Option<String>, left: &Option<String>| {
             let parts: Vec<String> = found.into_iter().chain(left.clone()).collect();

@@ -54,7 +54,7 @@ impl Preview {
     /// Fails if the run has no mesh yet, or if it is damaged, or being made anew.
     pub fn of_run(run: &Path) -> Result<Preview> {
         let (head, warnings) = read_finished(run, |record| {
-            // previews show `mesh/parts`, so a problem with other files of the stage does not matter
+            // previews show `mesh/parts`: a problem with other files of the stage does not matter
             let problem = record.require_products(&run.join(Stage::Mesh)).err();
             let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
             Ok((HeadMesh::load(&run.join("mesh/parts"))?, warnings))

@@ -37,9 +37,9 @@ pub(super) struct RigPhotos<'c> {
 }
 
 impl<'c> RigPhotos<'c> {
-    /// Reads what the training views show, and up to 256 held-out views. Returns the reason instead where nothing can be
-    /// measured: without a hull, with fewer than three training views that have a mask, or with more than can be solved at
-    /// once.
+    /// Reads what the training views show, and up to 256 held-out views. Returns the reason instead
+    /// where nothing can be measured: without a hull, with fewer than three training views that
+    /// have a mask, or with more than can be solved at once.
     pub fn load(
         capture: &'c Capture,
         scene: &Scene,

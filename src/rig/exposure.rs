@@ -31,8 +31,8 @@ const MARGIN: usize = 3;
 /// Coded values that are neither saturated nor as dark as hair, whose highlights move with the view.
 const EXPOSED: Range<u8> = 40..248;
 
-/// Minimum number of training views that can be measured. Four numbers describe what is linear in the viewing direction; with
-/// fewer views, these would take most of the exposures along.
+/// Minimum number of training views that can be measured. Four numbers describe what is linear in
+/// the viewing direction; with fewer views, these would take most of the exposures along.
 pub const MIN_TRAINING_VIEWS: usize = 7;
 
 /// Points that a view must show to be measured.
@@ -79,8 +79,8 @@ impl ExposureView {
 /// What was measured.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExposureFit {
-    /// Exposure of every view, `None` where it shows too little; those of training views have a geometric mean of 1 in each
-    /// channel.
+    /// Exposure of every view, `None` where it shows too little; those of training views have a
+    /// geometric mean of 1 in each channel.
     pub exposures: Vec<Option<Exposure>>,
     /// How many of the first are training views.
     pub train: usize,
@@ -123,8 +123,8 @@ struct Sample {
 }
 
 /// Measures exposures. The first `train` views are the training views, which alone decide what is common; the others are
-/// compared with it one by one. A training view that shows too little, for it is dark or saturated or sees the head from where
-/// no other does, takes no part.
+/// compared with it one by one. A training view that shows too little, for it is dark or saturated
+/// or sees the head from where no other does, takes no part.
 pub fn measure(
     views: &[ExposureView],
     cameras: &[Camera],
@@ -165,9 +165,9 @@ pub fn measure(
     })
 }
 
-/// Returns the points that enough training views show, which training views show enough of these, and how many of them each
-/// view shows. Views that show too few drop out one by one, the one with the fewest first: points that only they and two others
-/// show go with them.
+/// Returns the points that enough training views show, which training views show enough of these,
+/// and how many of them each view shows. Views that show too few drop out one by one, the one with
+/// the fewest first: points that only they and two others show go with them.
 fn comparable(
     points: Vec<Vec<Sample>>,
     views: usize,
@@ -312,7 +312,8 @@ mod tests {
 
     #[test]
     fn a_view_that_shows_too_little_drops_out_and_the_others_stay() {
-        // views 0 to 3 are training views, 4 is held out; view 2 shows 20 points, of which 10 with 0 and 3 alone
+        // views 0 to 3 are training views, 4 is held out; view 2 shows 20 points, of which 10 with
+        // 0 and 3 alone
         let both = (0..60).map(|_| samples(&[0, 1, 3, 4]));
         let few = (0..10).map(|_| samples(&[0, 1, 2, 3]));
         let alone = (0..10).map(|_| samples(&[0, 2, 3]));

@@ -66,7 +66,8 @@ impl TfaceReport {
     }
 }
 
-/// Entries of a checkpoint's header with the counts of all steps so far: rays, lattice points, densities and colors.
+/// Entries of a checkpoint's header with the counts of all steps so far: rays, lattice points,
+/// densities and colors.
 const COUNTS: [&str; 4] = ["rays", "lattice_samples", "density_samples", "color_samples"];
 
 /// Largest count that is read: larger numbers are not exact in JSON.
