@@ -22,6 +22,7 @@ use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::{Environment, context};
 use serde::Serialize;
 use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 
 /// Style that all pages share.
@@ -194,7 +195,7 @@ impl Viewer {
         // no name can end the script that holds it
         let data = data.to_string().replace('<', "\\u003c");
         let glb = base64(&self.glb);
-        fill(include_str!("report/viewer.html"), context! { viewer => self, data, glb })
+        fill(include_str!("report/viewer.html"), "", context! { viewer => self, data, glb })
     }
 }
 
@@ -241,11 +242,12 @@ pub fn html(report: &Report) -> Result<String> {
             methods.push((&picture.method, &picture.title));
         }
     }
+    let viewer_script = if viewer.is_some() { VIEWER_SCRIPT } else { "" };
     fill(
         include_str!("report/page.html"),
+        &format!("{}\n{viewer_script}", include_str!("report/page.js")),
         context! {
-            style => STYLE, script => include_str!("report/page.js"), viewer_script => VIEWER_SCRIPT,
-            viewer, methods, heat => heat(), most => (MAX_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
+            style => STYLE, viewer, methods, heat => heat(), most => (MAX_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
         },
     )
 }
@@ -254,8 +256,9 @@ pub fn html(report: &Report) -> Result<String> {
 pub fn viewer_html(viewer: &Viewer, views: &[ViewRow]) -> Result<String> {
     fill(
         include_str!("report/head.html"),
+        VIEWER_SCRIPT,
         context! {
-            style => STYLE, viewer_script => VIEWER_SCRIPT, title => viewer.name, viewer => viewer.html()?, views
+            style => STYLE, title => viewer.name, viewer => viewer.html()?, views
         },
     )
 }
@@ -266,7 +269,11 @@ fn heat() -> String {
     format!("linear-gradient(to right, {})", colors.join(", "))
 }
 
-fn fill(template: &str, context: minijinja::Value) -> Result<String> {
+/// Fills in a template. The policy of a page (`top.html`) lets a browser run `script` alone, by its
+/// digest, and load nothing but pictures inside the page, and, with `beside` in the context,
+/// pictures that lie beside it: so that what is not escaped by mistake still does nothing.
+fn fill(template: &str, script: &str, context: minijinja::Value) -> Result<String> {
+    let context = context! { script, digest => base64(&Sha256::digest(script)), ..context };
     let mut pages = Environment::new();
     pages.set_trim_blocks(true);
     let parts =
@@ -446,6 +453,69 @@ mod tests {
         assert!(page.contains("<figure>mask</figure>") && page.contains("<figure>chart</figure>"));
         assert!(page.contains("data:image/jpeg;base64,/9gB") && page.contains("data:image/png;base64,AQ=="));
         assert!(page.contains("<h1>&lt;img src=x onerror=alert(1)&gt;"));
+    }
+
+    /// Returns the scripts of a page that a browser would run, and their digests in its policy.
+    fn scripts(page: &str) -> (Vec<String>, Vec<String>) {
+        let run = page.split("<script>").skip(1).map(|rest| rest.split_once("</script>").unwrap().0);
+        let run = run.map(|script| base64(&Sha256::digest(script))).collect();
+        let policy = page.split_once("http-equiv=\"Content-Security-Policy\" content=\"").unwrap().1;
+        let policy = policy.split_once('"').unwrap().0;
+        assert!(policy.starts_with("default-src 'none'; img-src data:"), "{policy}");
+        assert!(!policy.contains("script-src 'unsafe") && !policy.contains("http"), "{policy}");
+        let digests = policy.split("'sha256-").skip(1).map(|rest| rest.split_once('\'').unwrap().0.into());
+        (run, digests.collect())
+    }
+
+    #[test]
+    fn every_page_runs_its_own_script_alone_and_loads_only_pictures() {
+        let report = report();
+        let dir = tempfile::tempdir().unwrap();
+        let live = |renewed| live_html(dir.path(), |_, _| None, renewed).unwrap();
+        let viewer = report.viewer.as_ref().unwrap();
+        for (page, count) in [
+            (html(&report).unwrap(), 1),
+            (html(&Report::default()).unwrap(), 1),
+            (viewer_html(viewer, &report.views).unwrap(), 1),
+            (runs_html(&[]).unwrap(), 1),
+            (live(true), 1),
+            (live(false), 0),
+            (bench::BenchResult::default().html().unwrap(), 0),
+        ] {
+            let (run, allowed) = scripts(&page);
+            assert_eq!(run, allowed);
+            assert_eq!(run.len(), count);
+            assert!(!page.contains(" onerror=\"") && !page.contains(" onclick=\""));
+        }
+        // pictures beside the page are those of the live page alone
+        assert!(live(true).contains("img-src data: 'self' file:;"));
+        assert!(!html(&report).unwrap().contains("file:;"));
+    }
+
+    #[test]
+    fn every_template_of_a_page_states_a_policy() {
+        fn walk(folder: &Path, pages: &mut Vec<PathBuf>) {
+            for path in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+                match path.extension().and_then(|ending| ending.to_str()) {
+                    _ if path.is_dir() => walk(&path, pages),
+                    Some("html") => pages.push(path),
+                    _ => {}
+                }
+            }
+        }
+        let mut pages = Vec::new();
+        walk(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"), &mut pages);
+        let mut whole = 0;
+        for path in pages {
+            let text = std::fs::read_to_string(&path).unwrap();
+            let (head, includes) = (text.contains("<head>"), text.contains("{% include \"top.html\" %}"));
+            whole += usize::from(head || includes);
+            let policy = "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none';";
+            assert!(!head || text.contains(policy), "{}", path.display());
+            // fragments are parts of such a page
+            assert!(head || includes || !text.contains("<body"), "{}", path.display());
+        }
+        assert!(whole >= 7, "{whole}");
     }
 
     #[test]

@@ -247,6 +247,21 @@ pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
     Ok(files)
 }
 
+/// Returns the pictures in a folder that no view can be named after: hidden files, and names with
+/// the separator of Windows. What macOS keeps beside files on foreign disks (`._NAME`) is none.
+pub(super) fn unnameable(folder: &Path) -> Result<Vec<String>, ReadError> {
+    let mut names = io::list_hidden(folder)?;
+    names.retain(|name| !name.starts_with("._"));
+    names.extend(io::list_files(folder)?.into_iter().filter(|name| !is_nameable(name)));
+    names.retain(|name| has_ending(name, &PHOTOGRAPHS));
+    Ok(names)
+}
+
+/// Returns whether a file's name is read as one name, not as folders in the manner of Windows.
+pub(super) fn is_nameable(name: &str) -> bool {
+    !name.contains('\\')
+}
+
 /// Returns whether a name has one of these endings, ignoring case.
 pub(super) fn has_ending(name: &str, endings: &[&str]) -> bool {
     let found = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();

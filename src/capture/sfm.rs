@@ -13,12 +13,13 @@
 //! then refined as OPENCV's model with its principal point where that is observable: a wide lens and many points.
 
 use super::colmap::{self, Found, ModelFiles};
-use super::folder::{CaptureFolder, FolderEntries, is_common_name, photographs};
+use super::folder::{CaptureFolder, FolderEntries, is_common_name, is_nameable, photographs, unnameable};
 use super::format::{self, CameraFiles};
 use super::frame::{CameraFrame, Intrinsics, Listing};
 use super::masks::few;
 use super::view::{Capture, CaptureOptions, ViewMask};
 use super::{MaskSource, build, convert};
+use crate::error::counted;
 use crate::image::Photo;
 use crate::io::{self, Limits, Lock, Program, ProgramFailure, VideoFrames};
 use crate::run::Fingerprint;
@@ -246,12 +247,15 @@ impl<'a> Search<'a> {
             Planned::Nothing(solution) => Ok(solution),
             Planned::Photographs { capture, names, files, shared, programs } => {
                 let masked = copy_photographs(sfm, &output, &capture, &names, files)?;
-                Work { sfm, output, request, lock, programs, names, shared, masked, is_video: false }.solve()
+                let (warnings, is_video) = (capture.warnings, false);
+                Work { sfm, output, request, lock, programs, names, warnings, shared, masked, is_video }
+                    .solve()
             }
             Planned::Video { video, every, ffmpeg, programs } => {
                 let names = copy_frames(sfm, &output, &lock, &ffmpeg, &video, every)?;
-                let shared = !sfm.lens_each;
-                Work { sfm, output, request, lock, programs, names, shared, masked: false, is_video: true }
+                let (shared, masked, is_video) = (!sfm.lens_each, false, true);
+                let warnings = Vec::new();
+                Work { sfm, output, request, lock, programs, names, warnings, shared, masked, is_video }
                     .solve()
             }
         }
@@ -375,9 +379,18 @@ fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
         )
     };
     let inside = FolderEntries::of(root).photographs().ok_or_else(none)?;
-    let names = photographs(&inside)?;
-    require_enough(names.len(), root, MORE_OVERLAP)?;
-    let mut listing = Listing::default();
+    let mut names = photographs(&inside)?;
+    names.retain(|name| is_nameable(name));
+    let unnameable = unnameable(&inside)?;
+    let unnameable = (!unnameable.is_empty()).then(|| {
+        let (count, names) = (counted(unnameable.len(), "photograph"), few(&unnameable));
+        format!("{count} left out, whose name begins with a dot or has `\\` in it: {names}; rename what is to be used")
+    });
+    require_enough(names.len(), root, MORE_OVERLAP).map_err(|e| match &unnameable {
+        Some(text) => Error::cannot(format!("{e}; {text}"), e.hint()),
+        None => e,
+    })?;
+    let mut listing = Listing { warnings: Vec::from_iter(unnameable), ..Listing::default() };
     let base = inside.strip_prefix(root).unwrap_or(Path::new(""));
     let lens = Intrinsics { focal: [Some(1.0); 2], ..Intrinsics::default() };
     let pose = (DMat3::IDENTITY, DVec3::ZERO);
@@ -454,6 +467,8 @@ struct Work<'a> {
     lock: Lock,
     programs: Programs,
     names: Vec<String>,
+    /// What a user should know of the photographs.
+    warnings: Vec<String>,
     /// All photographs are by one lens.
     shared: bool,
     masked: bool,
@@ -575,7 +590,7 @@ impl Work<'_> {
         }
         let registered = |model: &Option<Model>| model.as_ref().map_or(0, |m| m.found.names.len());
         let is_usable = |found: usize| found >= MIN_VIEWS && 2 * found >= n;
-        let (mut best, mut warnings) = (None::<Model>, Vec::new());
+        let (mut best, mut warnings) = (None::<Model>, self.warnings.clone());
         for attempt in attempts {
             if attempt.weak {
                 let how =

@@ -4,7 +4,7 @@ use super::read::ReadError;
 use super::write::WriteError;
 use std::collections::BTreeMap;
 use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
-use std::io::{ErrorKind, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::SystemTime;
@@ -62,17 +62,18 @@ pub fn remove_empty_folder(path: &Path) -> Result<(), WriteError> {
     }
 }
 
-/// Returns a file in a folder or below, but not in folders that are `apart`; `None` without one, or without
-/// the folder.
+/// Returns a file in a folder or below, but none of those, nor in one of the folders, that are
+/// `apart`; `None` without one, or without the folder.
 pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<PathBuf>, ReadError> {
     for entry in entries(path).map_err(|e| ReadError::io(path, e))? {
         let inside = entry.path();
+        if apart(&inside) {
+            continue;
+        }
         if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
             return Ok(Some(inside));
         }
-        if !apart(&inside)
-            && let Some(file) = any_file(&inside, apart)?
-        {
+        if let Some(file) = any_file(&inside, apart)? {
             return Ok(Some(file));
         }
     }
@@ -113,6 +114,16 @@ pub fn is_folder(path: &Path) -> bool {
 /// Returns the names of the regular files directly in a folder, sorted by bytes; hidden ones left out. A name that
 /// is not UTF-8 is an error that shows it as well as it can.
 pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
+    listed(folder, |name| !name.starts_with('.'))
+}
+
+/// Returns the names of the hidden regular files directly in a folder, as [`list_files`] those of
+/// the others.
+pub fn list_hidden(folder: &Path) -> Result<Vec<String>, ReadError> {
+    listed(folder, |name| name.starts_with('.'))
+}
+
+fn listed(folder: &Path, is_wanted: impl Fn(&str) -> bool) -> Result<Vec<String>, ReadError> {
     let mut names = Vec::new();
     for entry in fs::read_dir(folder).map_err(|e| ReadError::io(folder, e))? {
         let entry = entry.map_err(|e| ReadError::io(folder, e))?;
@@ -123,7 +134,7 @@ pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
         let Ok(name) = entry.file_name().into_string() else {
             return Err(ReadError::unsupported(&path, "a file name that is not UTF-8", "rename the file"));
         };
-        if !name.starts_with('.') {
+        if is_wanted(&name) {
             names.push(name);
         }
     }
@@ -201,7 +212,7 @@ pub fn append(path: &Path, line: &str) -> Result<(), WriteError> {
 }
 
 fn ends_with_newline(file: &mut File) -> std::io::Result<bool> {
-    use std::io::{Read, Seek, SeekFrom};
+    use std::io::{Seek, SeekFrom};
     if file.metadata()?.len() == 0 {
         return Ok(true);
     }
@@ -284,13 +295,38 @@ impl Lock {
         Ok(Lock { file })
     }
 
-    /// Returns the lock file, which is empty, as the input of a program. The lock is then held
-    /// until that program and those that it starts have ended, too, even if this process is killed
-    /// before them; on Windows, until this process ends.
+    /// Returns the lock file, which is empty without a mark, as the input of a program. The lock is
+    /// then held until that program and those that it starts have ended, too, even if this process
+    /// is killed before them; on Windows, until this process ends.
     pub fn as_input(&self) -> std::io::Result<Stdio> {
         // on Unix a lock belongs to what was opened, which its copies share
         if cfg!(unix) { Ok(self.file.try_clone()?.into()) } else { Ok(Stdio::null()) }
     }
+
+    /// [`Lock::take`], after which the file of the lock begins with `mark`, so that its content
+    /// tells whose it is. The mark is on the disk when this returns. A file with other content
+    /// keeps it, and so does another user's.
+    pub fn take_marked(path: &Path, mark: &str) -> Result<Lock, LockError> {
+        let lock = Lock::take(path)?;
+        let is_ours_to_write = || OpenOptions::new().write(true).open(path).is_ok();
+        if begins(path, mark) == Some(false) && is_ours_to_write() {
+            let written = (&lock.file).write_all(mark.as_bytes()).and_then(|()| lock.file.sync_all());
+            written.map_err(|source| LockError::Io { path: path.into(), source })?;
+        }
+        Ok(lock)
+    }
+}
+
+/// Compares the first bytes of a file with `mark`: whether all of it is there, as opposed to some
+/// or none of it, which is what a process leaves that was killed before or while it wrote. `None`
+/// for other content, for a link, and if the file cannot be read.
+pub fn begins(path: &Path, mark: &str) -> Option<bool> {
+    if is_link(path) || !is_file(path) {
+        return None;
+    }
+    let mut found = Vec::new();
+    File::open(path).ok()?.take(mark.len() as u64).read_to_end(&mut found).ok()?;
+    mark.as_bytes().starts_with(&found).then_some(found.len() == mark.len())
 }
 
 fn lock_file(path: &Path) -> Result<File, LockError> {
@@ -331,6 +367,22 @@ mod tests {
         remove_empty_folder(&path).unwrap();
         assert!(!path.exists());
         remove_empty_folder(&path).unwrap();
+    }
+
+    #[test]
+    fn a_marked_lock_tells_whose_it_is_even_if_a_kill_cut_its_mark() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(".lock");
+        assert_eq!(begins(&path, "ours\n"), None);
+        for before in ["", "ou", "ours\n"] {
+            fs::write(&path, before).unwrap();
+            assert_eq!(begins(&path, "ours\n"), Some(before.len() == 5), "{before:?}");
+            drop(Lock::take_marked(&path, "ours\n").unwrap());
+            assert_eq!(fs::read(&path).unwrap(), b"ours\n", "{before:?}");
+        }
+        fs::write(&path, "theirs").unwrap();
+        drop(Lock::take_marked(&path, "ours\n").unwrap());
+        assert_eq!((begins(&path, "ours\n"), fs::read(&path).unwrap()), (None, b"theirs".to_vec()));
     }
 
     #[test]

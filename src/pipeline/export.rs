@@ -6,7 +6,7 @@
 
 use super::cameras::CameraCheck;
 use super::finish::{Export, center, coded, lobes};
-use super::mesh::finished_mesh;
+use super::mesh::read_finished;
 use super::scene_file::read_capture;
 use super::session::{check_feasible, unusable};
 use crate::capture::Capture;
@@ -56,17 +56,18 @@ impl KeptHead {
     ///
     /// Fails if the run has no finished mesh, or if a file is missing, damaged, or not the one that the stage left.
     pub fn read(run: &Path, made: &Config) -> Result<KeptHead> {
-        let record = finished_mesh(run)?;
-        let folder = run.join(Stage::Mesh);
-        let (parts, others) =
-            record.products.clone().into_iter().partition(|(name, _)| name.starts_with("parts/"));
-        let parts = Record { products: parts, ..record.clone() };
-        parts.require_products(&folder)?;
-        require_digests(&parts, &folder)?;
-        // the other files are not read
-        let problem = Record { products: others, ..record }.require_products(&folder).err();
-        let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
-        let head = HeadMesh::load(&folder.join("parts"))?;
+        let (head, warnings) = read_finished(run, |record| {
+            let folder = run.join(Stage::Mesh);
+            let (parts, others) =
+                record.products.clone().into_iter().partition(|(name, _)| name.starts_with("parts/"));
+            let parts = Record { products: parts, ..record.clone() };
+            parts.require_products(&folder)?;
+            require_digests(&parts, &folder)?;
+            // the other files are not read
+            let problem = Record { products: others, ..record.clone() }.require_products(&folder).err();
+            let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
+            Ok((HeadMesh::load(&folder.join("parts"))?, warnings))
+        })?;
         let mut capture = read_capture(&run.join("cameras.json"), Path::new(&made.capture.path))
             .map_err(|e| Error::cannot(&e, format!("`tiface mask {}` writes it again", run.display())))?;
         let check = CameraCheck::read(&run.join(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;

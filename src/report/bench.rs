@@ -197,7 +197,7 @@ impl BenchResult {
         };
         let sweeps: Vec<_> = self.sweeps.iter().map(sweep).collect();
         let title = format!("{}: speed against error", self.capture);
-        fill(include_str!("bench/page.html"), context! { style => STYLE, title, result => self, sweeps })
+        fill(include_str!("bench/page.html"), "", context! { style => STYLE, title, result => self, sweeps })
     }
 }
 

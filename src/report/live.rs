@@ -56,9 +56,11 @@ pub fn live_html(
     let views = newest.into_iter().map(|(time, name)| (format!("{}?{}", link(&name), stamp(time)), name));
     let newest: Vec<(String, String)> = fields.chain(views).collect();
     let (report, now) = (io::is_file(&run.join("report.html")), stamp(SystemTime::now()));
+    let script = if renewed { include_str!("live.js") } else { "" };
     fill(
         include_str!("live.html"),
-        context! { style => STYLE, title, stages, charts => drawn, newest, report, now, renewed },
+        script,
+        context! { style => STYLE, title, stages, charts => drawn, newest, report, now, renewed, beside => true },
     )
 }
 

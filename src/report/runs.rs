@@ -220,10 +220,10 @@ pub fn runs_html(rows: &[RunRow]) -> Result<String> {
     let done = rows.iter().filter(|row| row.done).count();
     let failed = rows.iter().filter(|row| row.failed).count();
     let headings: Vec<&str> = FIGURES.iter().map(|(heading, _)| *heading).collect();
-    let script = include_str!("runs.js");
     fill(
         include_str!("runs.html"),
-        context! { style => STYLE, script, title => counted(rows.len(), "run"), rows, cells, headings, done, failed },
+        include_str!("runs.js"),
+        context! { style => STYLE, title => counted(rows.len(), "run"), rows, cells, headings, done, failed },
     )
 }
 

@@ -933,10 +933,14 @@ fn a_refused_command_leaves_nothing_in_somebodys_own_folder() {
     small_head(dir.path());
     std::fs::create_dir_all(dir.path().join("thesis/mask")).unwrap();
     std::fs::write(dir.path().join("thesis/mask/costume.png"), "mine").unwrap();
-    for more in [&["--fresh", "mask"][..], &[]] {
-        let o = tiface(dir.path(), &[&["mask", "head", "--run", "thesis"], more].concat());
-        assert!(code(&o) == 1 && err(&o).contains("mask/costume.png"), "{}", err(&o));
-        let left: Vec<_> = std::fs::read_dir(dir.path().join("thesis")).unwrap().collect();
-        assert_eq!(left.len(), 1, "{left:?}");
+    // nor is a folder ours for what a file is called
+    for lock in [None, Some("mask/.lock")] {
+        lock.iter().for_each(|lock| std::fs::write(dir.path().join("thesis").join(lock), "").unwrap());
+        for more in [&["--fresh", "mask"][..], &[]] {
+            let o = tiface(dir.path(), &[&["mask", "head", "--run", "thesis"], more].concat());
+            assert!(code(&o) == 1 && err(&o).contains("mask/costume.png"), "{}", err(&o));
+            let left: Vec<_> = std::fs::read_dir(dir.path().join("thesis")).unwrap().collect();
+            assert_eq!(left.len(), 1, "{left:?}");
+        }
     }
 }

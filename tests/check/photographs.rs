@@ -89,6 +89,23 @@ fn what_is_no_folder_of_photographs_is_refused_before_anything_is_written() {
     assert!(left.iter().all(|name| !name.to_string_lossy().ends_with("_cameras")), "{left:?}");
 }
 
+#[test]
+#[cfg(unix)]
+fn photographs_that_are_left_out_for_their_names_are_named() {
+    let dir = photographs();
+    let at = |name: &str| dir.path().join("photographs").join(name);
+    let images: Vec<PathBuf> = fs::read_dir(at("")).unwrap().map(|e| e.unwrap().path()).collect();
+    for (image, name) in images.iter().zip(["a\\b.png", "..png"]) {
+        fs::rename(image, at(name)).unwrap();
+    }
+    // what macOS leaves beside photographs is none
+    fs::write(at("._a.png"), "x").unwrap();
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("has 7 photographs, and at least 8 are needed"), "{said}");
+    assert!(said.contains("2 photographs left out, whose name begins with a dot"), "{said}");
+    assert!(said.contains("`..png`, `a\\b.png`"), "{said}");
+}
+
 /// Puts a shell script in the place of a program.
 #[cfg(unix)]
 fn script(dir: &TempDir, program: &str, text: &str) {

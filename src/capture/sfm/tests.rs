@@ -49,7 +49,8 @@ fn typed(n: usize, is_video: bool, shared: bool, glomap: bool, attempt: Attempt,
     let lock = Lock::take(&dir.path().join(".lock")).unwrap();
     let (output, request) =
         (Output::of(&sfm), Request { source: "photographs".into(), fingerprint: asked(&sfm) });
-    let work = Work { sfm: &sfm, output, request, lock, programs, names, shared, masked: true, is_video };
+    let (sfm, warnings, masked) = (&sfm, Vec::new(), true);
+    let work = Work { sfm, output, request, lock, programs, names, warnings, shared, masked, is_video };
     work.arguments(attempt, Path::new("w"), new)
         .map(|words| words.iter().map(|w| w.to_str().unwrap()).collect::<Vec<_>>().join(" "))
 }
