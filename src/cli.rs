@@ -462,19 +462,25 @@ between their surfaces and the settings that differ; --table writes the table in
   tiface status
   tiface status runs/002_00                     print a row for each stage
   tiface status runs/*                          print a line for each run, and one for all
-  tiface status runs/* --failed                 print only failed runs; exit with 3 if any failed
+  tiface status runs/* --failed                 print only runs that need attention
   tiface status runs/* --json                   print an object for each run
 
-Signs of stages: # done, > running, x failed, ! killed, = stopped, ? not readable, . to do. Of more than 40 runs, those
-that are done or have not begun are summed up; -v prints a line for each.")]
+Signs of stages, and the exit code of a run that stands there:
+  #  done             0      x  failed                                    3
+  >  running          0      %  damaged: a file was lost or cut           3
+  =  stopped          0      !  killed: repeat its command to continue    3
+  .  to do            0      ?  not readable                              1
+Of many runs, the worst state decides: failed, damaged, killed, not readable. Of more than 40 runs, those that are done
+or have not begun are summed up; -v prints a line for each.")]
     Status(StatusOptions),
     /// Compare the files of runs with the SHA-256 digests in their records
     #[command(after_long_help = "Examples:
   tiface verify                                 compare all runs under runs/
-  tiface verify runs/002_00                     exit with 3 if a file is missing or was changed
-  tiface verify runs/* --json | jq .differences
+  tiface verify runs/002_00                     exit with 3 if a file is gone, cut or changed
+  tiface verify runs/* --json | jq '.files[] | select(.state != \"recorded\")'
 
-Nothing is written. --json prints an object for each run, with the digest of every file: a manifest.")]
+Nothing is written. Each file that differs is printed with the command that makes it again. --json prints an object for
+each run, with size, SHA-256 and state (recorded, changed, cut or gone) of every file: a manifest.")]
     Verify {
         /// Run folders [default: all under runs/]
         runs: Vec<PathBuf>,

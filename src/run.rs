@@ -22,14 +22,16 @@ mod fingerprint;
 mod progress;
 mod stage;
 mod status;
+mod verify;
 
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer, Stop};
 pub use stage::{Done, Plan, StageDir};
 pub use status::{
-    Cost, ESTIMATE, Estimate, FAILED, Failure, Phase, Record, RunStatus, StageStatus, State, Status,
-    Verification, read_estimate, read_failure, read_record, read_status, verify,
+    Cost, ESTIMATE, Estimate, FAILED, Failure, Fault, Phase, ProductState, Record, RunStatus, StageStatus,
+    State, Status, read_estimate, read_failure, read_record, read_status,
 };
+pub use verify::{Verification, VerifiedFile, verify};
 
 use crate::io::{self, Lock, LockError};
 use std::path::{Path, PathBuf};

@@ -8,7 +8,7 @@ use super::screen::{figure, print};
 use crate::config::{Config, NAMES, Preset, RenderConfig, called};
 use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::{blend_verdict, duration, judged_by};
-use crate::run::{Cost, Done, Phase, Run, RunStatus};
+use crate::run::{Cost, Done, Phase, Run, RunStatus, read_record};
 use crate::{Error, ErrorKind, Result, io};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
@@ -71,7 +71,7 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
             (ErrorKind::Cannot, Some(before)) => {
                 common.fresh.is_none()
                     && before == without_device(&config.to_toml())
-                    && RunStatus::read(run.dir()).phase != Phase::Done
+                    && ![Phase::Done, Phase::Damaged].contains(&RunStatus::read(run.dir()).phase)
             }
             _ => false,
         };
@@ -257,9 +257,14 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     if let Some(mesh) = of(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
         let files = ["glb", "obj", "ply"].map(|e| run.path(format!("mesh/head.{e}")));
-        let first = files.iter().find(|f| io::is_file(f)).unwrap_or(&files[0]).display();
+        let found = files.iter().find(|f| io::is_file(f));
+        let first = found.map_or_else(|| "in no file".into(), |file| file.display().to_string());
         let handles = handles(&mesh["handles"]);
         row("mesh", &format!("{first} ({} triangles, {state}{handles})", mesh["triangles"]));
+        // exported files may be moved
+        let record = read_record(&run.path(Stage::Mesh)).ok().flatten();
+        let faults = record.map_or(Vec::new(), |record| record.faults(&run.path(Stage::Mesh)));
+        faults.iter().for_each(|fault| row("", fault));
     }
     for (stage, folder) in [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.word())] {
         if of(stage).is_some() {

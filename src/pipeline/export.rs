@@ -6,7 +6,7 @@
 
 use super::cameras::CameraCheck;
 use super::finish::{Export, center, coded, lobes};
-use super::mesh::read_finished;
+use super::mesh::{finished_mesh, read_finished};
 use super::scene_file::read_capture;
 use super::session::{check_feasible, unusable};
 use crate::capture::Capture;
@@ -117,6 +117,22 @@ impl KeptHead {
     /// Fails if the mesh is damaged.
     pub fn files(&self, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
         self.export.files(&self.head, format, stem)
+    }
+
+    /// Fails unless the files of a format are those that the stage `mesh` left in the run, by their recorded digests.
+    pub fn require_recorded(&self, format: MeshFormat) -> Result<()> {
+        let record = finished_mesh(&self.run)?;
+        let written = self.files(format, "head")?.files;
+        let is_own = |(name, bytes): &(String, Vec<u8>)| {
+            record.sha256.get(name).is_some_and(|digest| *digest == Fingerprint::of_bytes(bytes))
+        };
+        match written.iter().all(is_own) {
+            true => Ok(()),
+            false => Err(Error::usage(
+                format!("these settings write another `head.{}` than the run's", format.ending()),
+                "choose a place beside the run with `--out`, or leave the settings out",
+            )),
+        }
     }
 
     /// Returns the number of triangles.

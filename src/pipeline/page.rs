@@ -140,7 +140,7 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
     facts
 }
 
-/// Returns the warnings of the stages and of the capture.
+/// Returns the warnings of the stages and of the capture, and what is no longer as a stage left it.
 fn warnings(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
     let mut all = session.capture.warnings.clone();
     for (stage, record) in records {
@@ -149,6 +149,8 @@ fn warnings(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
         if record.summary["closed"] == false {
             all.push(format!("{stage}: the surface is not watertight"));
         }
+        let faults = record.faults(&session.run.path(stage));
+        all.extend(faults.iter().map(|fault| format!("{stage}: {fault}")));
     }
     all
 }

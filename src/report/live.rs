@@ -84,7 +84,9 @@ fn pictures(run: &Path) -> Vec<String> {
 fn row(run: &Path, stage: Stage) -> Option<StageRow> {
     let folder = run.join(stage);
     if let Ok(Some(record)) = read_record(&folder) {
-        let words = format!("done in {}", duration(record.elapsed_s));
+        let faults = record.faults(&folder);
+        let gone = faults.iter().map(|fault| format!("; {fault}")).collect::<String>();
+        let words = format!("done in {}{gone}", duration(record.elapsed_s));
         return Some(StageRow { name: stage.word(), words, share: 100 });
     }
     let s = read_status(&folder).ok()??;

@@ -7,7 +7,7 @@ use crate::config::{Config, NAMES, Stage, called};
 use crate::error::counted;
 use crate::geom::Camera;
 use crate::io::{self, Limits};
-use crate::run::{Phase, Record, RunStatus};
+use crate::run::{Fault, Phase, Record, RunStatus, StageStatus};
 use glam::Vec3;
 use minijinja::context;
 use serde::{Deserialize, Serialize};
@@ -30,7 +30,7 @@ pub struct RunRow {
     pub state: String,
     /// Whether all stages are done.
     pub done: bool,
-    /// Whether it ended with an error.
+    /// Whether it ended with an error, or has lost a file.
     pub failed: bool,
     /// The preset, if it can be read.
     pub preset: String,
@@ -42,9 +42,9 @@ pub struct RunRow {
     pub method: String,
     /// Masked PSNR of the mesh, as the best viewer of it shows.
     pub mesh_psnr: Option<f64>,
-    /// Whether the mesh is watertight.
+    /// Whether the mesh is watertight; unknown where its files are not those that were written.
     pub watertight: Option<bool>,
-    /// Number of triangles of the mesh.
+    /// Number of triangles of the mesh, if its files are there.
     pub triangles: Option<u64>,
     /// Size of `head.glb`.
     pub megabytes: Option<f64>,
@@ -71,11 +71,15 @@ impl RunRow {
             standing.stages.iter().filter_map(|s| Some((s.stage, s.record.as_ref()?))).collect();
         let of = |stage| records.iter().find(|(s, _)| *s == stage).map(|(_, r)| &r.summary);
         let name = io::real_path(run).unwrap_or(run.into());
+        let faults =
+            |s: &StageStatus| s.faults.iter().map(|fault| (s.stage, fault.clone())).collect::<Vec<_>>();
+        let lost: Vec<(Stage, Fault)> = standing.stages.iter().flat_map(faults).collect();
+        let has_mesh = lost.iter().all(|(stage, _)| *stage != Stage::Mesh);
         let mut row = RunRow {
             name: name.file_name().unwrap_or(run.as_os_str()).to_string_lossy().into_owned(),
             state: state(&standing),
             done: standing.phase == Phase::Done,
-            failed: standing.phase == Phase::Failed,
+            failed: matches!(standing.phase, Phase::Failed | Phase::Damaged),
             picture: picture(run).unwrap_or_default(),
             preset: Config::of_run(run).map_or(String::new(), |config| config.preset.name().into()),
             seconds: standing.elapsed_s,
@@ -84,16 +88,20 @@ impl RunRow {
             warnings: records
                 .iter()
                 .flat_map(|(s, r)| r.warnings.iter().map(move |w| format!("{s}: {w}")))
+                .chain(lost.iter().map(|(s, fault)| format!("{s}: {fault}")))
                 .collect(),
             finished: records.iter().map(|(_, r)| r.finished).max().unwrap_or(0),
-            megabytes: io::file_size(&run.join("mesh/head.glb")).map(|bytes| bytes as f64 / 1e6),
+            megabytes: io::file_size(&run.join("mesh/head.glb"))
+                .filter(|_| has_mesh)
+                .map(|bytes| bytes as f64 / 1e6),
             ..RunRow::default()
         };
         let page = run.join("report.html");
         if io::is_file(&page) {
             row.link = relative(&page, beside);
         }
-        if let Some(mesh) = of(Stage::Mesh) {
+        // figures of files that are gone or cut say nothing about what is there
+        if let Some(mesh) = of(Stage::Mesh).filter(|_| has_mesh) {
             (row.watertight, row.triangles) = (mesh["closed"].as_bool(), mesh["triangles"].as_u64());
         }
         if let Some(metrics) = of(Stage::Metrics) {
@@ -122,6 +130,7 @@ fn state(run: &RunStatus) -> String {
         Phase::Done => "done".into(),
         Phase::Failed => format!("{place}failed: {}", run.error.as_deref().unwrap_or_default()),
         Phase::Unreadable => format!("{place}cannot be read: {}", run.error.as_deref().unwrap_or_default()),
+        Phase::Damaged => format!("{place}damaged: {}", run.error.as_deref().unwrap_or_default()),
         Phase::Running => format!("{place}at work{share}"),
         Phase::Killed => format!("{place}killed{share}"),
         Phase::Stopped => format!("{place}stopped{share}"),
@@ -271,6 +280,34 @@ mod tests {
         let page = runs_html(&[row.clone(), RunRow { psnr: Some(31.25), ..row }]).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("&lt;img src=x") && page.contains("31.25"));
         assert_eq!(page.matches("<tr").count(), 3);
+    }
+
+    #[test]
+    fn a_mesh_that_was_cut_is_not_shown_as_watertight() {
+        let dir = tempfile::tempdir().unwrap();
+        let fingerprint = crate::run::Fingerprint::default();
+        let plan =
+            crate::run::Plan { name: "mesh", fingerprint, device: "cpu", needs_bytes: 0, saves: false };
+        let done = crate::run::Run::quiet(dir.path()).stage(plan, |stage| {
+            io::write_atomic(&stage.folder().join("head.glb"), b"triangles")?;
+            Ok(json!({"closed": true, "triangles": 12}))
+        });
+        assert!(!done.unwrap().skipped);
+        let row = RunRow::read(dir.path(), dir.path());
+        assert_eq!((row.watertight, row.triangles, row.failed), (Some(true), Some(12), false));
+        std::fs::write(dir.path().join("mesh/head.glb"), "tri").unwrap();
+        let row = RunRow::read(dir.path(), dir.path());
+        assert_eq!((row.watertight, row.triangles, row.megabytes, row.failed), (None, None, None, true));
+        assert!(
+            row.state.starts_with("mesh damaged: ") && row.state.contains("has 3 bytes"),
+            "{}",
+            row.state
+        );
+        assert!(row.warnings.len() == 1 && row.warnings[0].contains("tiface export"), "{:?}", row.warnings);
+        // a file that was moved away is told, but is no failure
+        std::fs::remove_file(dir.path().join("mesh/head.glb")).unwrap();
+        let row = RunRow::read(dir.path(), dir.path());
+        assert_eq!((row.watertight, row.failed, row.warnings.len()), (None, false, 1));
     }
 
     #[test]

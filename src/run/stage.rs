@@ -225,13 +225,8 @@ impl Run {
         };
         let Some(record) = record else { return Ok(None) };
         same(plan, &record.fingerprint, true)?;
-        for name in record.require_products(&self.path(plan.name))? {
-            let (file, run) = (self.path(plan.name).join(name), self.dir.display());
-            let again = match name.starts_with("head.") {
-                true => format!("`tiface export {run} --out FILE` writes the mesh again"),
-                false => "no stage reads it".into(),
-            };
-            self.warn(plan.name, &format!("`{}` is no longer in its folder; {again}", file.display()));
+        for fault in record.require_products(&self.path(plan.name))? {
+            self.warn(plan.name, &fault.to_string());
         }
         let Record { digest, summary, .. } = record;
         self.observer.event(&Event::Skipped { stage: plan.name });

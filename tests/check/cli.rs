@@ -4,7 +4,7 @@ use crate::command::{code, command, err, out, tiface};
 use crate::kept::photographed;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use tiface::capture::synthetic::SyntheticOptions;
+use tiface::capture::synthetic::{SyntheticOptions, write_borders};
 use tiface::io::{Limits, read_gray, write_png_gray};
 
 #[test]
@@ -530,6 +530,35 @@ fn a_damaged_status_hides_no_other_run() {
 }
 
 #[test]
+#[cfg(target_os = "linux")]
+fn status_fails_for_a_killed_run_and_an_unreadable_one_hides_no_failed_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let stage = |run: &str, status: &str| {
+        std::fs::create_dir_all(dir.path().join(run).join("mask")).unwrap();
+        std::fs::write(dir.path().join(run).join("mask/status.json"), status).unwrap();
+    };
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap();
+    // no process has this number
+    let killed = serde_json::json!({"state": "running", "step": 1, "steps": 2, "rate": null, "eta_s": null,
+        "elapsed_s": 1, "device": "cpu", "pid": u32::MAX, "host": host.trim(), "error": null, "updated": 0,
+        "fingerprint": {"format": 1, "settings": {}, "inputs": {}}});
+    let mut failed = killed.clone();
+    (failed["state"], failed["error"]) = ("failed".into(), "no light".into());
+    stage("killed", &killed.to_string());
+    stage("failed", &failed.to_string());
+    stage("bad", "{");
+    let o = tiface(dir.path(), &["status", "killed"]);
+    assert!(code(&o) == 3 && err(&o).contains("1 of 1 run was killed"), "{}", err(&o));
+    let o = tiface(dir.path(), &["status", "bad", "killed", "failed"]);
+    let all = "1 of 3 runs failed, 1 was killed, 1 could not be read";
+    assert!(code(&o) == 3 && err(&o).contains(all), "{}", err(&o));
+    let help = out(&tiface(dir.path(), &["status", "--help"]));
+    for state in ["done ", "failed ", "damaged: ", "killed: ", "not readable "] {
+        assert!(help.contains(state), "{state}: {help}");
+    }
+}
+
+#[test]
 fn a_record_that_a_crash_left_empty_counts_as_none() {
     let dir = tempfile::tempdir().unwrap();
     small_head(dir.path());
@@ -668,6 +697,52 @@ fn a_capture_is_converted_into_a_new_folder_only() {
     ] {
         let o = tiface(dir.path(), words);
         assert!(code(&o) == expected && err(&o).contains(text), "{words:?}: {} {}", code(&o), err(&o));
+    }
+}
+
+#[test]
+fn a_conversion_that_was_killed_is_completed_by_the_same_command() {
+    let dir = tempfile::tempdir().unwrap();
+    small_head(dir.path());
+    let words = ["convert", "head", "--to", "transforms", "--out", "copy"];
+    assert_eq!(code(&tiface(dir.path(), &words)), 0);
+    let whole = std::fs::read(dir.path().join("copy/transforms.json")).unwrap();
+    // the cameras are written last
+    std::fs::remove_file(dir.path().join("copy/transforms.json")).unwrap();
+    std::fs::remove_file(dir.path().join("copy/images/003.png")).unwrap();
+    let o = tiface(dir.path(), &words);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    assert!(std::fs::read(dir.path().join("copy/transforms.json")).unwrap() == whole);
+    assert!(dir.path().join("copy/images/003.png").is_file());
+    // a complete folder, and one with other files, are left as they are
+    assert_eq!(code(&tiface(dir.path(), &words)), 1);
+    std::fs::remove_file(dir.path().join("copy/transforms.json")).unwrap();
+    for (file, found) in [("copy/images/003.png", "mine"), ("copy/notes.txt", "mine")] {
+        let before = std::fs::read(dir.path().join(file)).unwrap_or_default();
+        std::fs::write(dir.path().join(file), found).unwrap();
+        let o = tiface(dir.path(), &words);
+        assert!(code(&o) == 1 && err(&o).contains("already exists"), "{file}: {}", err(&o));
+        assert_eq!(std::fs::read_to_string(dir.path().join(file)).unwrap(), found);
+        std::fs::write(dir.path().join(file), before).unwrap();
+    }
+}
+
+#[test]
+fn the_same_demo_command_continues_and_only_other_photographs_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let capture = dir.path().join("run/capture");
+    let options = SyntheticOptions { width: 32, height: 40, train: 6, test: 2, seed: 42 };
+    photographed(&capture, &options);
+    write_borders(&capture, &options, 4).unwrap();
+    let demo = |words: &[&str]| tiface(dir.path(), &[&["demo", "--run", "run", "--dry-run"], words].concat());
+    for words in [&["--size", "32x40", "--views", "8", "--border", "4"][..], &["--size", "32x40"], &[]] {
+        let o = demo(words);
+        assert!(code(&o) == 0 && out(&o).contains("to do"), "{words:?}: {}{}", out(&o), err(&o));
+    }
+    for words in [["--size", "40x32"], ["--views", "12"], ["--border", "5"]] {
+        let o = demo(&words);
+        let hint = format!("leave out {}", words[0]);
+        assert!(code(&o) == 2 && err(&o).contains(&hint), "{words:?}: {}", err(&o));
     }
 }
 
