@@ -25,7 +25,7 @@ use crate::io::{self, Limits, Lock, Program, ProgramFailure, VideoFrames};
 use crate::run::Fingerprint;
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
-use output::{LOG, Output, PHOTOGRAPHS, Request};
+use output::{LOG, NAMES, OPTIONS, Output, PHOTOGRAPHS, Request};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::HashSet;
@@ -33,9 +33,6 @@ use std::ffi::OsString;
 use std::path::{Component, Path, PathBuf};
 
 mod output;
-
-/// File that names the photographs to COLMAP, a line each.
-const NAMES: &str = "images.txt";
 
 /// Fewest photographs that a capture can have.
 const MIN_VIEWS: usize = 8;
@@ -492,7 +489,7 @@ impl Work<'_> {
 
     /// Returns whether COLMAP names options as since 3.13, which moved some from `Sift…` to `Feature…`.
     fn has_new_names(&self) -> Result<bool> {
-        let help = self.output.work("options.txt");
+        let help = self.output.work(OPTIONS);
         self.require(&["feature_extractor".into(), "-h".into()], &help)?;
         let text = io::read_maybe_empty(&help, &self.sfm.limits)?;
         Ok(String::from_utf8_lossy(&text).contains("FeatureExtraction.use_gpu"))

@@ -64,6 +64,12 @@ impl TfaceReport {
         self.color_samples += one.color_samples;
         self.warnings.extend(one.warnings);
     }
+
+    /// Returns the counts: rays, lattice points, densities and colors.
+    #[cfg(test)]
+    pub(super) fn counts(&self) -> [u64; 4] {
+        [self.rays, self.lattice_samples, self.density_samples, self.color_samples]
+    }
 }
 
 /// Entries of a checkpoint's header with the counts of all steps so far: rays, lattice points,

@@ -68,17 +68,14 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 #[test]
 fn rays_and_samples_of_a_training_that_was_stopped_are_those_of_all_its_steps() {
     let config = VmConfig { steps: 12, upsample_at: vec![0.5], mask_at: vec![0.5], ..config() };
-    let counts = |report: TfaceReport| {
-        [report.rays, report.lattice_samples, report.density_samples, report.color_samples]
-    };
     let whole = temporary();
-    let want = counts(run(&config, whole.path(), &Quiet).unwrap());
+    let want = run(&config, whole.path(), &Quiet).unwrap().counts();
     assert!(want.iter().all(|&n| n > 0), "{want:?}");
     // killed when all steps were saved, but not yet recorded
-    assert_eq!(counts(run(&config, whole.path(), &Quiet).unwrap()), want);
+    assert_eq!(run(&config, whole.path(), &Quiet).unwrap().counts(), want);
     let stopped = temporary();
     assert!(run(&config, stopped.path(), &StopAfter::new(5)).is_err());
-    assert_eq!(counts(run(&config, stopped.path(), &Quiet).unwrap()), want);
+    assert_eq!(run(&config, stopped.path(), &Quiet).unwrap().counts(), want);
     // checkpoints of earlier versions have no counts
     tampered(stopped.path(), |(_, metadata)| drop(metadata.remove("rays")));
     assert_eq!(run(&config, stopped.path(), &Quiet).unwrap().rays, 0);

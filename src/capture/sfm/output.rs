@@ -22,8 +22,7 @@ use std::path::{Component, Path, PathBuf};
 /// File of the programs' messages.
 pub(super) const LOG: &str = "tiface_cameras.log";
 
-/// File whose presence makes the folder one of ours, so its name is not one that other programs
-/// use.
+/// File that proves by its content that the folder is one of ours, and says of which photographs.
 const RECORD: &str = "tiface_cameras.json";
 
 /// File that lists files, a JSON string a line.
@@ -38,8 +37,11 @@ pub(super) const PHOTOGRAPHS: &str = "photographs";
 /// to be the result.
 const WORK_FOLDERS: [&str; 5] = ["1", "2", "3", "refined", "model"];
 
-/// Files beside them.
-const WORK_FILES: [&str; 2] = ["options.txt", "images.txt"];
+/// File that COLMAP writes its options to.
+pub(super) const OPTIONS: &str = "options.txt";
+
+/// File that names the photographs to COLMAP, a line each.
+pub(super) const NAMES: &str = "images.txt";
 
 /// Folders of listed files.
 const LISTED: [&str; 5] = ["images", "masks", "valid", "face_masks", "colmap"];
@@ -104,10 +106,11 @@ impl<'a> Output<'a> {
         }
         let record = self.work(RECORD);
         let is_ours = io::is_file(&record) && !io::is_link(&record) && !io::is_link(&self.out.join("colmap"));
+        // folders alone are what a search leaves that was killed when it began
+        let is_hidden =
+            |path: &Path| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
         let is_empty = || -> Result<bool> {
-            Ok(io::is_folder(self.out)
-                && io::list_files(self.out)?.is_empty()
-                && io::list_folders(self.out)?.is_empty())
+            Ok(io::is_folder(self.out) && io::any_file(self.out, &is_hidden)?.is_none())
         };
         if !is_ours && !is_empty()? {
             return Err(exists(String::new(), NEW_FOLDER));
@@ -151,11 +154,12 @@ impl<'a> Output<'a> {
         let found = self.result_of(request, Some(&lock))?;
         if found.is_none() {
             io::create_folder(&self.out.join("colmap"))?;
+            // first, so that the next search knows the folder
+            self.write_record(request, None)?;
             self.clear_listed(|_| true)?;
             self.clear_work()?;
             io::write_atomic(&self.work(LISTING), b"")?;
             io::write_atomic(&self.work(LOG), b"")?;
-            self.write_record(request, None)?;
         }
         Ok((lock, found))
     }
@@ -215,7 +219,7 @@ impl<'a> Output<'a> {
             io::clear_folder(&folder, "", &|_| false)?;
             io::remove_empty_folder(&folder)?;
         }
-        WORK_FILES.iter().try_for_each(|name| io::remove(&self.work(name)))?;
+        [OPTIONS, NAMES].iter().try_for_each(|name| io::remove(&self.work(name)))?;
         Ok(())
     }
 
@@ -259,6 +263,26 @@ mod tests {
         assert!(has_room(out, 100, Some(100)).is_ok() && has_room(out, 100, None).is_ok());
         let error = has_room(out, 100, Some(99)).unwrap_err();
         assert!(error.to_string().contains("about 100 bytes, but only 99 are free"), "{error}");
+    }
+
+    #[test]
+    fn a_search_killed_right_after_its_folder_was_made_goes_on() {
+        let dir = tempfile::tempdir().unwrap();
+        let limits = Limits::default();
+        let output = Output { out: dir.path(), limits: &limits };
+        let request = Request { source: "photographs".into(), fingerprint: Fingerprint::default() };
+        io::create_folder(&dir.path().join("colmap")).unwrap();
+        std::fs::write(dir.path().join(LOCK), "").unwrap();
+        assert!(output.begin(&request).unwrap().1.is_none());
+        // killed later, when it has written its record alone
+        for name in [LISTING, LOG] {
+            std::fs::remove_file(output.work(name)).unwrap();
+        }
+        assert!(output.begin(&request).unwrap().1.is_none());
+        // the files of another program prove nothing
+        std::fs::remove_file(output.work(RECORD)).unwrap();
+        let error = output.begin(&request).map(drop).unwrap_err();
+        assert!(error.to_string().contains("already exists"), "{error}");
     }
 
     #[test]
