@@ -520,8 +520,10 @@ pub fn out_of_memory(bytes: usize) -> ! {
     signal_hook::low_level::exit(crate::ErrorKind::NotNow.code().into())
 }
 
-/// Parses the command line, runs the command and returns the exit code.
-pub fn main() -> ExitCode {
+/// Parses the command line, runs the command and returns the exit code. `collect` gives the allocator's free memory back to
+/// the system.
+pub fn main(collect: fn()) -> ExitCode {
+    crate::io::set_memory_collector(collect);
     complete::answer(Cli::command);
     let Cli { command, common } = match Cli::try_parse() {
         Ok(cli) => cli,

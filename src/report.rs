@@ -17,6 +17,7 @@ pub use runs::{RunRow, runs_csv, runs_html};
 use crate::config::{Stage, called};
 use crate::image::{Photo, over_black, quantize, reduce_photo, srgb_from_linear, working_size};
 use crate::io::{self, Limits};
+use crate::run::Record;
 use crate::{Error, ErrorKind, Result};
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::{Environment, context};
@@ -350,6 +351,21 @@ pub fn blend_verdict(blend: &Value) -> Option<String> {
     ))
 }
 
+/// Returns the warnings of a run by its records: what its stages warned of, and what is wrong with their results, each with
+/// what to do. The reports of one run and of many have the same.
+pub fn warnings<'r>(records: impl IntoIterator<Item = (Stage, &'r Record)>) -> Vec<String> {
+    let mut all = Vec::new();
+    for (stage, record) in records {
+        all.extend(record.warnings.iter().map(|w| format!("{stage}: {w}")));
+        let verdict = blend_verdict(&record.summary["blend"]);
+        all.extend(verdict.map(|v| format!("{stage}: {v}; use its views, or give `ensemble.weights`")));
+        if record.summary["closed"] == false {
+            all.push(format!("{stage}: the surface is not watertight; `tiface check RUN` shows where"));
+        }
+    }
+    all
+}
+
 /// `8.2 s`, `2 min 25 s`, `3 h 07 min`.
 pub fn duration(seconds: f64) -> String {
     let s = seconds.max(0.0);
@@ -453,6 +469,27 @@ mod tests {
         let report = report();
         let page = viewer_html(report.viewer.as_ref().unwrap(), &report.views).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("id=\"photo-0\"") && page.contains("AQ=="));
+    }
+
+    #[test]
+    fn a_report_has_the_warnings_of_all_stages_with_what_to_do() {
+        let record = |summary: Value, warned: &[&str]| -> Record {
+            serde_json::from_value(json!({
+                "stage": "", "fingerprint": crate::run::Fingerprint::default(), "digest": "", "summary": summary,
+                "elapsed_s": 1.0, "warnings": warned, "finished": 0, "version": "",
+            }))
+            .unwrap()
+        };
+        let blend = json!({"blend": {"best_member": "tface", "gain_db": -0.5}});
+        let records = [
+            (Stage::Mask, record(json!({}), &["one mask is white"])),
+            (Stage::Mesh, record(json!({"closed": false}), &["the GPU failed"])),
+            (Stage::Metrics, record(blend, &[])),
+        ];
+        let all = warnings(records.iter().map(|(stage, record)| (*stage, record)));
+        assert_eq!(all[..2], ["mask: one mask is white", "mesh: the GPU failed"]);
+        assert!(all[2].starts_with("mesh: the surface is not watertight; `tiface check"), "{all:?}");
+        assert!(all[3].starts_with("metrics: the blend") && all[3].contains("`ensemble.weights`"), "{all:?}");
     }
 
     #[test]

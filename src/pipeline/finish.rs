@@ -66,7 +66,10 @@ pub(super) fn finish(
     let fits = c.color == ColorSource::Photographs;
     let photographs_say = fits && photographs.iter().any(|p| p.head_pixels() > 0);
     if fits && !photographs_say {
-        warnings.push("no photograph shows the head alone: the mesh has the colors of the network".into());
+        warnings.push(
+            "no photograph shows the head alone: the mesh has the colors of the network; look at `mask/sheet.html`"
+                .into(),
+        );
     }
     let mut shells = None;
     if c.hair == Hair::Shells {
@@ -130,7 +133,7 @@ pub(super) fn finish(
             Ok(tangents) => {
                 normal = Some(tangent_space(&mesh, &layout, &tangents, normals, c.gutter_px));
             }
-            Err(e) => warnings.push(format!("the mesh has no normal map: {e}")),
+            Err(e) => warnings.push(format!("the mesh has no normal map: {e}; leave out `mesh.normal_map`")),
         }
     }
     if let Some(harmonics) = harmonics.as_ref().filter(|_| c.lobes > 0) {

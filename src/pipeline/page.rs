@@ -99,7 +99,7 @@ fn page(session: &Session) -> Result<String> {
         charts: curves(&[(session, "")])?.iter().map(Chart::html).collect(),
         times: records.iter().map(time).collect(),
         changes: session.config.changes(),
-        warnings: warnings(session, &records),
+        warnings: report::warnings(records.iter().map(|(stage, record)| (*stage, record))),
         repeat: format!(
             "tiface run {} --config config.toml --run again",
             quoted(&session.config.capture.path)
@@ -138,19 +138,6 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
         facts.push(format!("tiface {}", last.version));
     }
     facts
-}
-
-/// Returns the warnings of the stages and of the capture.
-fn warnings(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
-    let mut all = session.capture.warnings.clone();
-    for (stage, record) in records {
-        all.extend(record.warnings.iter().map(|w| format!("{stage}: {w}")));
-        all.extend(report::blend_verdict(&record.summary["blend"]));
-        if record.summary["closed"] == false {
-            all.push(format!("{stage}: the surface is not watertight"));
-        }
-    }
-    all
 }
 
 /// Returns the metrics of a finished stage; those of pictures have a table of their own.
