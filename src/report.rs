@@ -351,6 +351,21 @@ pub fn blend_verdict(blend: &Value) -> Option<String> {
     ))
 }
 
+/// Returns the height of what a run shows, from the figures of its stages: the mesh's own, else that of the masks' hull.
+pub fn height(mask: Option<&Value>, mesh: Option<&Value>) -> Option<String> {
+    let of = |figures: &Value| Some((figures["height_units"].as_f64()?, figures["height_m"].as_f64()?));
+    let told = |what: &str, (units, metres): (f64, f64)| {
+        format!("{what} {metres:.3} m high ({units:.3} units of the dataset)")
+    };
+    let shown = mesh.and_then(|mesh| Some(told(mesh["shows"].as_str().unwrap_or("head"), of(mesh)?)));
+    shown.or_else(|| Some(told("by the masks", of(mask?)?)))
+}
+
+/// Returns the size of a run's `head.glb` in megabytes of 10⁶ bytes.
+pub fn glb_megabytes(run: &Path) -> Option<f64> {
+    io::file_size(&run.join("mesh/head.glb")).map(|bytes| bytes as f64 / 1e6)
+}
+
 /// Returns the warnings of a run by its records: what its stages warned of, and what is wrong with their results, each with
 /// what to do. The reports of one run and of many have the same.
 pub fn warnings<'r>(records: impl IntoIterator<Item = (Stage, &'r Record)>) -> Vec<String> {
@@ -469,6 +484,21 @@ mod tests {
         let report = report();
         let page = viewer_html(report.viewer.as_ref().unwrap(), &report.views).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("id=\"photo-0\"") && page.contains("AQ=="));
+    }
+
+    #[test]
+    fn the_height_told_is_that_of_the_mesh_where_there_is_one() {
+        let mask = json!({"height_units": 1.5, "height_m": 0.3});
+        let mesh = json!({"shows": "head and shoulders", "height_units": 1.4, "height_m": 0.28});
+        let said = |mask, mesh| height(mask, mesh).unwrap_or_default();
+        assert_eq!(
+            said(Some(&mask), Some(&mesh)),
+            "head and shoulders 0.280 m high (1.400 units of the dataset)"
+        );
+        assert_eq!(said(Some(&mask), None), "by the masks 0.300 m high (1.500 units of the dataset)");
+        // a mesh of a run from before tells none
+        assert!(said(Some(&mask), Some(&json!({}))).starts_with("by the masks"));
+        assert_eq!(height(Some(&json!({"height_units": null})), None), None);
     }
 
     #[test]

@@ -109,10 +109,19 @@ struct CheckJson<'a> {
     against: Option<&'a Against>,
 }
 
-/// Returns the exported mesh of a run, or the file itself.
-fn mesh_of(path: &Path) -> Result<PathBuf> {
+/// Returns the file itself, or the mesh of a run: the extracted surface, which lies in the dataset's world, if it is
+/// compared with another, and else the exported head.
+fn mesh_of(path: &Path, is_compared: bool) -> Result<PathBuf> {
+    if !capture::is_run(path) && io::is_folder(path) {
+        let text = format!("`{}` is a folder, but not that of a run", path.display());
+        return Err(Error::cannot(text, "name a .glb, .obj or .ply file, or the folder of a run"));
+    }
     if !capture::is_run(path) {
         return Ok(path.into());
+    }
+    let surface = path.join("mesh/surface.ply");
+    if is_compared && io::is_file(&surface) {
+        return Ok(surface);
     }
     let files = ["glb", "obj", "ply"].map(|ending| path.join("mesh").join(format!("head.{ending}")));
     files.into_iter().find(|file| io::is_file(file)).ok_or_else(|| {
@@ -151,7 +160,7 @@ pub(super) fn run(
     seen_by: Option<&Path>,
 ) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
-    let path = &mesh_of(path)?;
+    let path = &mesh_of(path, against.is_some())?;
     // the mesh is checked even if its texture cannot be read
     let (found, problem) = match load(path, &ReadOptions::default()) {
         Ok(found) => (found, None),

@@ -106,7 +106,11 @@ pub(super) fn mesh(
     let in_place = Similarity { translation: DVec3::ZERO, ..world_from_scene };
     let metres = export.metres(&head.mesh, &world_from_scene);
     let size = head.mesh.transformed(&in_place).bounds().size() * metres as f32;
+    let height = export.height(&head.mesh, &world_from_scene);
     Ok(json!({
+        "shows": export.shows(&head.mesh, &world_from_scene),
+        "height_units": height,
+        "height_m": height * metres,
         "vertices": head.mesh.positions.len(),
         "triangles": head.mesh.triangles.len(),
         "closed": head.mesh.is_closed(),

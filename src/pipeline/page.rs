@@ -127,8 +127,9 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
         format!("seed {}", session.config.seed),
     ];
     let of = |stage: Stage| records.iter().find(|(s, _)| *s == stage).map(|(_, record)| &record.summary);
-    if let Some(height) = of(Stage::Mask).and_then(|mask| mask["height_m"].as_f64()) {
-        facts.push(format!("head {height:.3} m high"));
+    facts.extend(report::height(of(Stage::Mask), of(Stage::Mesh)));
+    if let Some(megabytes) = report::glb_megabytes(session.run.dir()) {
+        facts.push(format!("head.glb {megabytes:.1} MB"));
     }
     if let Some(summary) = of(Stage::Metrics) {
         facts.extend(report::judged_by(&summary["truth"]));
@@ -167,7 +168,7 @@ pub(super) const COLUMNS: [(&str, usize, Option<bool>); 8] = [
     ("SSIM, frame", 4, Some(true)),
     ("s a view", 3, Some(false)),
     ("training s", 0, Some(false)),
-    ("data MB", 1, Some(false)),
+    ("MB of data read", 1, Some(false)),
     ("triangles", 0, None),
 ];
 

@@ -1,6 +1,6 @@
 //! One page of many runs, one row each, that is searched, filtered and sorted by any column.
 
-use super::{STYLE, csv_text, fill, picture_url, relative, small_view, views, warnings};
+use super::{STYLE, csv_text, fill, glb_megabytes, picture_url, relative, small_view, views, warnings};
 use crate::Result;
 use crate::config::{Config, NAMES, Stage, called};
 use crate::error::counted;
@@ -83,7 +83,7 @@ impl RunRow {
             peak_bytes: records.iter().filter_map(|(_, r)| r.peak_bytes).max(),
             warnings: warnings(records.iter().copied()),
             finished: records.iter().map(|(_, r)| r.finished).max().unwrap_or(0),
-            megabytes: io::file_size(&run.join("mesh/head.glb")).map(|bytes| bytes as f64 / 1e6),
+            megabytes: glb_megabytes(run),
             ..RunRow::default()
         };
         let page = run.join("report.html");

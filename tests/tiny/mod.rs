@@ -26,7 +26,7 @@ pub fn capture(folder: &Path) -> PathBuf {
 pub fn tiface(folder: &Path, words: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_tiface"));
     command.args(words).current_dir(folder).env("XDG_CONFIG_HOME", folder).env_remove("RUST_LOG");
-    if !["report", "convert", "preview", "export"].contains(&words[0]) {
+    if !["report", "convert", "preview", "export", "status"].contains(&words[0]) {
         command.args(["--preset", "draft"]);
         for setting in SETTINGS.split_whitespace() {
             command.args(["--set", setting]);
