@@ -225,7 +225,7 @@ enum Command {
   tiface cameras rig --lens-each                calibrate a lens for each photograph
 
 The new folder [default: PHOTOGRAPHS_cameras] has a copy of the photographs in images/, COLMAP's model in sparse/0
-and its log in colmap/log.txt. If the folder has head masks, features are searched inside them;
+and its log in colmap/tiface_cameras.log. If the folder has head masks, features are searched inside them;
 --set mask.source=none uses whole photographs.")]
     Cameras(CamerasOptions),
     /// Write a capture's cameras in another format: transforms.json or COLMAP

@@ -299,6 +299,7 @@ guides() {
     step "a first look at a GPU runs" env SHARE=1 CARGO_TARGET_DIR="$target" tools/gpu/first_look.sh vulkan:0 "$scratch/look"
   fi
   step "many heads outlive kills" check tools/fleet/check_fleet.py
+  step "the figures of the documents are those of runs" .venv/bin/python tools/reference/figures.py check
   step "the commands of the guides work" check tools/guides/check_guides.py
 }
 
