@@ -23,7 +23,6 @@ use serde::Serialize;
 use std::sync::{Mutex, OnceLock};
 
 /// The reason for the processor on a machine without GPUs.
-#[cfg_attr(not(feature = "wgpu"), allow(dead_code))]
 const NO_GPU: &str = "no GPU is here";
 
 /// The device that a field is trained on.

@@ -439,7 +439,8 @@ fn what_was_probably_meant_is_named() {
     std::fs::write(dir.path().join("scan.ply"), "").unwrap();
     for (words, meant) in [
         (&["run", "captures/002_0"][..], Some("`captures/002_00`")),
-        (&["mask", "capture/002_00", "--dry-run"], None),
+        (&["mask", "capture/002_00", "--dry-run"], Some("`captures/002_00`")),
+        (&["mask", "capture/003", "--dry-run"], None),
         (&["preview", "head"], Some("`runs/head`")),
         (&["verify", "runs/haed"], Some("`runs/head`")),
         (&["check", "scna.ply"], Some("`scan.ply`")),

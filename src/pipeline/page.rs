@@ -136,6 +136,8 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
     }
     if let Some((_, last)) = records.last() {
         facts.push(duration(records.iter().map(|(_, r)| r.elapsed_s).sum()));
+        let peak = records.iter().filter_map(|(_, r)| r.peak_bytes).max();
+        facts.extend(peak.map(|bytes| format!("{:.2} GiB of memory", bytes as f64 / (1u64 << 30) as f64)));
         facts.push(format!("tiface {}", last.version));
     }
     facts
