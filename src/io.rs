@@ -29,7 +29,10 @@ pub use pictures::{
     PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, png_gray_bytes,
     read_gray, read_photo, write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
-pub use process::{cpu_seconds, forget_peak_memory, has_ended, has_open, peak_memory, processor};
+pub use process::{
+    cpu_seconds, forget_peak_memory, give_memory_back, has_ended, has_open, peak_memory, processor,
+    set_memory_collector,
+};
 pub use program::{Program, ProgramFailure, VideoFrames, find_program};
 pub use read::{Limits, ReadError, read_bytes, read_maybe_empty, read_pieces};
 pub use tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};

@@ -111,15 +111,21 @@ struct CheckJson<'a> {
     against: Option<&'a Against>,
 }
 
-/// Returns the exported mesh of a run, or the file itself; and the error if it is not the one that the run recorded.
-fn mesh_of(path: &Path) -> Result<(PathBuf, Option<Error>)> {
+/// Returns the file itself, or the mesh of a run: the extracted surface, which lies in the dataset's world, if it is
+/// compared with another, and else the exported head; and the error if it is not the one that the run recorded.
+fn mesh_of(path: &Path, is_compared: bool) -> Result<(PathBuf, Option<Error>)> {
+    if !capture::is_run(path) && io::is_folder(path) {
+        let text = format!("`{}` is a folder, but not that of a run", path.display());
+        return Err(Error::cannot(text, "name a .glb, .obj or .ply file, or the folder of a run"));
+    }
     if !capture::is_run(path) {
         return Ok((path.into(), None));
     }
     let folder = path.join(Stage::Mesh);
-    let names = ["head.glb", "head.obj", "head.ply"];
+    let heads = ["head.glb", "head.obj", "head.ply"];
+    let names: Vec<&str> = is_compared.then_some("surface.ply").into_iter().chain(heads).collect();
     if let Some(record) = read_record(&folder)?
-        && let Some(name) = names.into_iter().find(|name| record.products.contains_key(*name))
+        && let Some(name) = names.iter().find(|name| record.products.contains_key(**name))
     {
         let fault = record.verify(&folder, name)?;
         let error = |fault: &Fault| record.error(fault).with_kind(ErrorKind::BelowBar);
@@ -128,11 +134,11 @@ fn mesh_of(path: &Path) -> Result<(PathBuf, Option<Error>)> {
             other => Ok((folder.join(name), other.as_ref().map(error))),
         };
     }
-    let files = names.map(|name| folder.join(name));
-    let file = files.into_iter().find(|file| io::is_file(file)).ok_or_else(|| {
-        let run = path.display();
-        Error::cannot(format!("`{run}` has no exported mesh"), format!("`tiface run {run}` makes it"))
-    })?;
+    let file =
+        names.iter().map(|name| folder.join(name)).find(|file| io::is_file(file)).ok_or_else(|| {
+            let run = path.display();
+            Error::cannot(format!("`{run}` has no exported mesh"), format!("`tiface run {run}` makes it"))
+        })?;
     Ok((file, None))
 }
 
@@ -166,7 +172,7 @@ pub(super) fn run(
     seen_by: Option<&Path>,
 ) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
-    let (path, fault) = mesh_of(path)?;
+    let (path, fault) = mesh_of(path, against.is_some())?;
     let path = &path;
     // the mesh is checked even if its texture cannot be read
     let (found, problem) = match load(path, &ReadOptions::default()) {

@@ -5,6 +5,7 @@ use super::demo::photograph;
 use super::out::Out;
 use super::run::in_words;
 use super::screen::print;
+use crate::capture::is_run;
 use crate::capture::synthetic::SyntheticOptions;
 use crate::config::Config;
 use crate::io::{self, Limits};
@@ -209,9 +210,10 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     failed.map_or(Ok(()), Err)
 }
 
-/// Returns the folder of a capture; `demo`, if no folder has this name, is the demo head, rendered into the experiment.
+/// Returns the folder of a capture; `demo`, if no capture has this name, is the demo head, rendered into the experiment.
 fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> {
-    if path != Path::new("demo") || io::is_folder(path) {
+    let is_capture = io::is_folder(path) && !is_run(path);
+    if path != Path::new("demo") || is_capture {
         return Ok(path.into());
     }
     let capture = folder.join("captures/demo");

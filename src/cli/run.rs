@@ -7,7 +7,7 @@ use super::out::Out;
 use super::screen::{figure, print};
 use crate::config::{Config, NAMES, Preset, RenderConfig, called};
 use crate::pipeline::{Session, Stage, reconstruct};
-use crate::report::{blend_verdict, duration, judged_by};
+use crate::report::{blend_verdict, duration, height, judged_by};
 use crate::run::{Cost, Done, Phase, Run, RunStatus, read_record};
 use crate::{Error, ErrorKind, Result, io};
 use serde_json::{Map, Value, json};
@@ -250,9 +250,8 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
     let mut row = |name: &str, value: &dyn std::fmt::Display| text += &format!("{name:<9} {value}\n");
-    let height = |key: &str| of(Stage::Mask)?[key].as_f64();
-    if let (Some(units), Some(metres)) = (height("height_units"), height("height_m")) {
-        row("head", &format!("{units:.3} units high: {metres:.3} m"));
+    if let Some(height) = height(of(Stage::Mask), of(Stage::Mesh)) {
+        row("height", &height);
     }
     if let Some(mesh) = of(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };

@@ -118,7 +118,7 @@ pub fn best(choice: &DeviceChoice, tests: &[SelfTest]) -> std::result::Result<Gp
             Err(why) => rejected.push(format!("{name} {why}")),
         }
     }
-    Err(if rejected.is_empty() { "no GPU is here".into() } else { rejected.join(", ") })
+    Err(if rejected.is_empty() { super::NO_GPU.into() } else { rejected.join(", ") })
 }
 
 /// Acquires the lock of a device, or shares it if this process holds it already: all fields of a process use the same

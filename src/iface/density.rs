@@ -105,7 +105,7 @@ pub fn train_density(
                 ComputeDevice::Gpu(gpu) => GpuDensity::fits(config, &pixels, &gpu.device),
             },
         )?;
-    let description = device.description();
+    let (description, refused) = (device.description(), device.warning());
     let (state, progress, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuDensity::new(config, &pixels), config, session)?,
         #[cfg(feature = "wgpu")]
@@ -118,7 +118,7 @@ pub fn train_density(
         train_psnr: progress.psnr(),
         occupied: state.occupancy.share(),
         device: description,
-        warnings,
+        warnings: refused.into_iter().chain(warnings).collect(),
     };
     Ok((DensityField::new(config, state), report))
 }

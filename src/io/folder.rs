@@ -147,7 +147,8 @@ pub fn real_path(path: &Path) -> Result<PathBuf, ReadError> {
     fs::canonicalize(path).map_err(|e| ReadError::io(path, e))
 }
 
-/// Returns the path whose name is most like that of a path that does not exist: beside it, or the same name under `runs/`.
+/// Returns the path whose name is most like that of a path that does not exist: beside it, in a folder of a similar name, or
+/// the same name under `runs/`.
 pub fn similar(path: &Path) -> Option<PathBuf> {
     let name = path.file_name()?.to_str()?;
     let in_runs = Path::new("runs").join(path);
@@ -155,6 +156,9 @@ pub fn similar(path: &Path) -> Option<PathBuf> {
         return Some(in_runs);
     }
     let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    if let Some(parent) = parent.filter(|parent| !parent.exists()) {
+        return similar(parent).map(|found| found.join(name)).filter(|found| found.exists());
+    }
     let entries = fs::read_dir(parent.unwrap_or(Path::new("."))).ok()?;
     let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
     let near =

@@ -77,7 +77,8 @@ pub(super) fn mask(
     let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
     if coverage.is_empty() {
         dir.warn(
-            "no head masks (`mask.source`): background is unknown, so everything inside the box is reconstructed",
+            "no head masks (`mask.source`): background is unknown, so everything inside the box is reconstructed; \
+             `tiface mask CAPTURE --page` makes masks from clicks",
         );
     }
     let silhouettes = config.meaning == MaskMeaning::Empty;
@@ -97,7 +98,8 @@ pub(super) fn mask(
     if let Some(problem) = wrong.first().filter(|_| prompts.is_none() && !config.trust) {
         return Err(problem.into());
     }
-    wrong.iter().map(Problem::to_string).chain(warnings).for_each(|text| dir.warn(&text));
+    let told = |problem: &Problem| format!("{problem}; {}", problem.hint);
+    wrong.iter().map(told).chain(warnings).for_each(|text| dir.warn(&text));
     let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
     let suspicious: Vec<&String> = suspicious.collect();
     // pixels that a mask marks as unknown may still show the head
@@ -208,14 +210,16 @@ impl RigCheck {
                 return Err(problem.into());
             }
             if check.refines() {
-                dir.warn(&format!("{}: refined", check.sentence()));
+                let kept = "`capture.cameras=given` keeps them as they are";
+                dir.warn(&format!("{}: refined; {kept}", check.sentence()));
             }
             check.not_fitted().iter().for_each(|text| dir.warn(text));
             check.write(dir.folder())?;
         }
         if let Some(check) = &self.exposure {
             if check.evens_out() {
-                dir.warn(&format!("{}: evened out", check.sentence()));
+                let kept = "`capture.exposure=given` keeps them as they are";
+                dir.warn(&format!("{}: evened out; {kept}", check.sentence()));
             }
             check.write(dir.folder())?;
         }

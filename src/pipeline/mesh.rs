@@ -40,7 +40,8 @@ pub(super) fn mesh(
     let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
     let (mut surface, report) = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
     let mm = world_from_scene.scale * export.metres(&surface, &world_from_scene) * 1000.0;
-    report.warnings(c.cap).iter().for_each(|w| dir.warn(w));
+    report.end(c.cap).iter().for_each(|text| dir.note(text));
+    report.warnings().iter().for_each(|w| dir.warn(w));
     report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
     let patches = Patches::of(&surface, &report.handles);
     let cap = (!c.dense).then(|| Cap::of(&surface, report.bounds(), report.cell_size));
@@ -105,7 +106,11 @@ pub(super) fn mesh(
     let in_place = Similarity { translation: DVec3::ZERO, ..world_from_scene };
     let metres = export.metres(&head.mesh, &world_from_scene);
     let size = head.mesh.transformed(&in_place).bounds().size() * metres as f32;
+    let height = export.height(&head.mesh, &world_from_scene);
     Ok(json!({
+        "shows": export.shows(&head.mesh, &world_from_scene),
+        "height_units": height,
+        "height_m": height * metres,
         "vertices": head.mesh.positions.len(),
         "triangles": head.mesh.triangles.len(),
         "closed": head.mesh.is_closed(),

@@ -1,13 +1,12 @@
 //! One page of many runs, one row each, that is searched, filtered and sorted by any column.
 
-use super::{STYLE, csv_text, fill, picture_url, relative, small_view, views};
+use super::{STYLE, csv_text, fill, glb_megabytes, picture_url, relative, small_view, views, warnings};
 use crate::Result;
-use crate::capture::synthetic::SyntheticHead;
 use crate::config::{Config, NAMES, Stage, called};
 use crate::error::counted;
 use crate::geom::Camera;
 use crate::io::{self, Limits};
-use crate::run::{Fault, Phase, Record, RunStatus, StageStatus};
+use crate::run::{Phase, Record, RunStatus};
 use glam::Vec3;
 use minijinja::context;
 use serde::{Deserialize, Serialize};
@@ -48,8 +47,9 @@ pub struct RunRow {
     pub triangles: Option<u64>,
     /// Size of `head.glb`.
     pub megabytes: Option<f64>,
-    /// Mean distance of the mesh from the true surface, millimeters; where that is known, of the demo head.
-    pub mm: Option<f64>,
+    /// Mean distance of the mesh from the true surface in per cent of the head's height; where that is known, of the demo
+    /// head.
+    pub truth_percent: Option<f64>,
     /// Work of all stages by the clock.
     pub seconds: f64,
     /// CPU time of all stages.
@@ -71,10 +71,7 @@ impl RunRow {
             standing.stages.iter().filter_map(|s| Some((s.stage, s.record.as_ref()?))).collect();
         let of = |stage| records.iter().find(|(s, _)| *s == stage).map(|(_, r)| &r.summary);
         let name = io::real_path(run).unwrap_or(run.into());
-        let faults =
-            |s: &StageStatus| s.faults.iter().map(|fault| (s.stage, fault.clone())).collect::<Vec<_>>();
-        let lost: Vec<(Stage, Fault)> = standing.stages.iter().flat_map(faults).collect();
-        let has_mesh = lost.iter().all(|(stage, _)| *stage != Stage::Mesh);
+        let has_mesh = standing.stages.iter().all(|s| s.stage != Stage::Mesh || s.faults.is_empty());
         let mut row = RunRow {
             name: name.file_name().unwrap_or(run.as_os_str()).to_string_lossy().into_owned(),
             state: state(&standing),
@@ -85,15 +82,9 @@ impl RunRow {
             seconds: standing.elapsed_s,
             cpu_s: records.iter().map(|(_, r)| r.cpu_s).sum::<Option<f64>>().filter(|s| *s > 0.0),
             peak_bytes: records.iter().filter_map(|(_, r)| r.peak_bytes).max(),
-            warnings: records
-                .iter()
-                .flat_map(|(s, r)| r.warnings.iter().map(move |w| format!("{s}: {w}")))
-                .chain(lost.iter().map(|(s, fault)| format!("{s}: {fault}")))
-                .collect(),
+            warnings: warnings(run, records.iter().copied()),
             finished: records.iter().map(|(_, r)| r.finished).max().unwrap_or(0),
-            megabytes: io::file_size(&run.join("mesh/head.glb"))
-                .filter(|_| has_mesh)
-                .map(|bytes| bytes as f64 / 1e6),
+            megabytes: glb_megabytes(run).filter(|_| has_mesh),
             ..RunRow::default()
         };
         let page = run.join("report.html");
@@ -111,9 +102,7 @@ impl RunRow {
                 (row.psnr, row.ssim, row.method) = (Some(psnr), mean(word, "ssim_masked"), called(word));
             }
             let meshes = ["raycast", "textured", "raster"].into_iter();
-            // per cent of the height of the one head whose surface is known
-            let percent = metrics["truth_percent_of_head"]["accuracy_mean"].as_f64();
-            row.mm = percent.map(|p| 10.0 * p * f64::from(SyntheticHead::HEAD_HEIGHT));
+            row.truth_percent = metrics["truth_percent_of_head"]["accuracy_mean"].as_f64();
             row.mesh_psnr = meshes.filter_map(|word| mean(word, "psnr_masked")).max_by(f64::total_cmp);
         }
         row
@@ -177,7 +166,7 @@ const FIGURES: [(&str, fn(&RunRow) -> Option<f64>); 10] = [
     ("PSNR", |r| r.psnr),
     ("SSIM", |r| r.ssim),
     ("mesh PSNR", |r| r.mesh_psnr),
-    ("mm", |r| r.mm),
+    ("% of head", |r| r.truth_percent),
     ("triangles", |r| r.triangles.map(|n| n as f64)),
     ("GLB MB", |r| r.megabytes),
     ("minutes", |r| Some(r.seconds / 60.0)),
@@ -277,6 +266,11 @@ mod tests {
         let channels: Vec<(&str, &[f32])> = ["B", "G", "R"].map(|c| (c, &[0.5][..])).into();
         io::write_exr(&run.join("render/raster/left/a.exr"), 1, 1, &channels).unwrap();
         assert!(RunRow::read(&run, dir.path()).picture.starts_with("data:image/jpeg;base64,"));
+        let warned = RunRow { warnings: vec!["mesh: <b>holes".into()], ..row.clone() };
+        let page = runs_html(&[warned]).unwrap();
+        // readable without a pointer, and sorted by their number
+        assert!(page.contains("<li>mesh: &lt;b&gt;holes</li>"), "{page}");
+        assert!(page.contains("data-value=\"1\"") && !page.contains("title=\"mesh"), "{page}");
         let page = runs_html(&[row.clone(), RunRow { psnr: Some(31.25), ..row }]).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("&lt;img src=x") && page.contains("31.25"));
         assert_eq!(page.matches("<tr").count(), 3);
@@ -360,7 +354,7 @@ mod tests {
         let lines: Vec<&str> = csv.lines().collect();
         assert_eq!(
             lines[0],
-            "run,state,best,watertight,preset,PSNR,SSIM,mesh PSNR,mm,triangles,GLB MB,minutes,CPU minutes,GiB,warnings"
+            "run,state,best,watertight,preset,PSNR,SSIM,mesh PSNR,% of head,triangles,GLB MB,minutes,CPU minutes,GiB,warnings"
         );
         assert_eq!(lines[1], "\"'=cmd|\"\"x\"\"\",\"a, b\",\"\",no,,31.25,,,,,,0,,,1");
     }

@@ -69,6 +69,11 @@ impl StageDir {
         self.progress.note(text);
     }
 
+    /// Keeps a warning for the record of the stage that was reported before it began.
+    pub fn keep_warning(&self, text: &str) {
+        self.progress.keep_warning(text);
+    }
+
     /// Reports a warning.
     pub fn warn(&self, text: &str) {
         self.progress.warn(text);

@@ -296,9 +296,9 @@ pub const ESTIMATE: &str = "estimate.json";
 pub struct Cost {
     /// CPU seconds.
     pub cpu_s: f64,
-    /// Peak memory, bytes.
+    /// Peak memory of the process, bytes.
     pub memory_bytes: u64,
-    /// Disk space for its files, including checkpoints being written, bytes.
+    /// Disk space of the files that it leaves, bytes.
     pub disk_bytes: u64,
 }
 

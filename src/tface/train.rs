@@ -113,7 +113,7 @@ pub(super) fn train_one(
                 GpuVm::fits(session.stage, config, pixels, &state, &gpu.device).map(drop)
             }
         })?;
-    let description = device.description();
+    let (description, refused) = (device.description(), device.warning());
     let (state, progress, counts, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuVm::new(config, pixels), state, config, session)?,
         #[cfg(feature = "wgpu")]
@@ -134,7 +134,7 @@ pub(super) fn train_one(
         density_samples: counts.density,
         color_samples: counts.color,
         device: description,
-        warnings,
+        warnings: refused.into_iter().chain(warnings).collect(),
     })
 }
 

@@ -427,7 +427,8 @@ fn what_was_probably_meant_is_named() {
     std::fs::write(dir.path().join("scan.ply"), "").unwrap();
     for (words, meant) in [
         (&["run", "captures/002_0"][..], Some("`captures/002_00`")),
-        (&["mask", "capture/002_00", "--dry-run"], None),
+        (&["mask", "capture/002_00", "--dry-run"], Some("`captures/002_00`")),
+        (&["mask", "capture/003", "--dry-run"], None),
         (&["preview", "head"], Some("`runs/head`")),
         (&["verify", "runs/haed"], Some("`runs/head`")),
         (&["check", "scna.ply"], Some("`scan.ply`")),
@@ -459,6 +460,57 @@ fn what_was_probably_meant_is_named() {
     std::fs::write(run.join("mesh/head.obj"), triangle).unwrap();
     assert_eq!(code(&tiface(dir.path(), &["check", "runs/head"])), 0);
     assert_eq!(code(&tiface(dir.path(), &["check", "runs/head", "--require", "watertight"])), 3);
+}
+
+#[test]
+fn the_configuration_as_json_is_json_and_a_key_is_explained_with_its_value_in_preset_quick() {
+    let dir = tempfile::tempdir().unwrap();
+    let json = |words: &[&str]| -> serde_json::Value {
+        let o = tiface(dir.path(), words);
+        assert_eq!(code(&o), 0, "{}", err(&o));
+        serde_json::from_str(&out(&o)).unwrap()
+    };
+    let config = json(&["config", "--preset", "draft", "--json"]);
+    assert_eq!((&config["preset"], &config["mesh"]["resolution"]), (&"draft".into(), &256.into()));
+    let explained = json(&["config", "--explain", "iface.steps", "--json"]);
+    assert_eq!(
+        (&explained[0]["key"], &explained[0]["values"]["quick"]),
+        (&"iface.steps".into(), &1200.into())
+    );
+    let text = out(&tiface(dir.path(), &["config", "--explain", "mesh.resolution"]));
+    assert!(text.contains("quick: 256   draft: 256   standard: 512"), "{text}");
+}
+
+#[test]
+fn what_a_command_cannot_do_is_answered_with_what_can_be_done() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 24, height: 30, train: 3, test: 1, seed: 1 };
+    photographed(&dir.path().join("captures/a"), &options);
+    // runs, one of them called as the demo head is
+    for name in ["runs/a", "demo"] {
+        std::fs::create_dir_all(dir.path().join(name).join("mesh")).unwrap();
+        std::fs::write(dir.path().join(name).join("config.toml"), "").unwrap();
+    }
+    for (words, expected, said) in [
+        (&["inspect", "captures/a", "--fresh", "mesh"][..], 2, "`--fresh` has no effect on `inspect`"),
+        (&["status", "--set", "iface.steps=5"], 2, "`--set` has no effect on `status`"),
+        (&["run", "captures/a", "--watch"], 2, "`tiface status --watch`"),
+        (&["preview", "captures/a", "--watch"], 2, "name its run, `runs/a`"),
+        (&["check", "captures/a"], 1, "`captures/a` is a folder, but not that of a run"),
+        (&["experiment", "demo", "--dry-run"], 2, "photographs of the demo head are not rendered yet"),
+    ] {
+        let o = tiface(dir.path(), words);
+        assert!(code(&o) == expected && err(&o).contains(said), "{words:?}: {} {}", code(&o), err(&o));
+    }
+    // the exported head of a run may be turned, so its surface is compared
+    let ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+        element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
+    std::fs::write(dir.path().join("runs/a/mesh/surface.ply"), ply).unwrap();
+    std::fs::write(dir.path().join("other.ply"), ply).unwrap();
+    let turned = "v 0 0 5\nv 1 0 5\nv 0 1 5\nf 1 2 3\n";
+    std::fs::write(dir.path().join("runs/a/mesh/head.obj"), turned).unwrap();
+    let o = tiface(dir.path(), &["check", "runs/a", "--against", "other.ply"]);
+    assert!(out(&o).contains("distance to the other   mean 0.000,"), "{}{}", out(&o), err(&o));
 }
 
 #[test]
