@@ -104,21 +104,21 @@ pub struct Found {
     pub driver: String,
     /// PCI address, if the device is a card.
     pub card: Option<String>,
-    /// Atomic addition of floats: `native` or `exchange`.
-    pub atomics: &'static str,
+    /// Atomic addition of floats: `native` or `exchange`; `None` if the device cannot be opened.
+    pub atomics: Option<&'static str>,
     /// Bytes of memory; `None` if the driver does not report it.
     pub memory: Option<u64>,
-    /// Bytes of the largest buffer.
-    pub largest_buffer: u64,
-    /// Bytes of shared memory of a workgroup.
-    pub shared: usize,
+    /// Bytes of the largest buffer; `None` if the device cannot be opened.
+    pub largest_buffer: Option<u64>,
+    /// Bytes of shared memory of a workgroup; `None` if the device cannot be opened.
+    pub shared: Option<usize>,
     /// Whether another training uses the device.
     pub in_use: bool,
     /// Comparisons of training steps with the processor's.
     pub checks: Vec<Check>,
     /// The error that prevented the comparison, if any.
     pub error: Option<String>,
-    /// Seconds that the self-test took, including the driver's compilation of kernels.
+    /// Seconds that opening and the self-test took, including the driver's compilation of kernels.
     pub seconds: f64,
 }
 

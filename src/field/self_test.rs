@@ -29,8 +29,8 @@ pub fn session(stage: &'static str) -> TrainingSession<'static> {
 
 /// Opens an adapter once for each kind of atomics that trainings use on it. The second step is smaller by the returned
 /// divisor: only the kernels that add differ, and they are a small part of a step.
-pub fn devices(adapter: &Adapter) -> [(Device, usize); 2] {
-    [(Device::open(adapter), 1), (Device::open(adapter).with_atomics(Atomics::Fixed), 8)]
+pub fn devices(adapter: &Adapter) -> Result<[(Device, usize); 2]> {
+    Ok([(Device::open(adapter)?, 1), (Device::open(adapter)?.with_atomics(Atomics::Fixed), 8)])
 }
 
 /// A field in training whose parameters can be read.

@@ -76,7 +76,8 @@ pub(super) fn sdf(adapter: &Adapter) -> Result<Vec<Check>> {
     let pixels = pixels(&views, None, &full)?;
     let mut checks = Vec::new();
     let mut kept = None;
-    for (way, (device, part)) in [FIELD, "signed distance in fixed point"].into_iter().zip(devices(adapter)) {
+    for (way, (device, part)) in [FIELD, "signed distance in fixed point"].into_iter().zip(devices(adapter)?)
+    {
         let rays = full.rays / part;
         let config = IfaceConfig { rays, max_rays: rays, samples: full.samples / part, ..full.clone() };
         let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);

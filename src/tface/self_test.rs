@@ -38,7 +38,7 @@ pub(super) fn vm(adapter: &Adapter) -> Result<Vec<Check>> {
     let pixels = Pixels::new(&views, 0.25, 1.0, full.foreground, full.whole_frame);
     let state = VmState::new(&full, SEED, BOUNDS, Some(&hull));
     let mut checks = Vec::new();
-    for (way, (device, part)) in [FIELD, "vector-matrix in fixed point"].into_iter().zip(devices(adapter)) {
+    for (way, (device, part)) in [FIELD, "vector-matrix in fixed point"].into_iter().zip(devices(adapter)?) {
         let config = VmConfig { rays: full.rays / part, ..full.clone() };
         let mut on_cpu = VmModel::new(CpuVm::new(&config, &pixels), state.clone(), &config, &session);
         on_cpu.load();
