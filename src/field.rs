@@ -154,14 +154,14 @@ pub fn compute_device(name: &str, test: &SelfTest) -> Result<ComputeDevice> {
     if choice.name == "auto" { Ok(select(&choice, &[*test])) } else { open_named(&choice) }
 }
 
-/// Refuses a device that [`compute_device`] would refuse. No GPU is opened unless one is named.
+/// Refuses a device that [`compute_device`] would refuse. Returns it if it is named; for `auto`, no GPU is opened.
 ///
 /// # Errors
 ///
 /// If this build or this machine has no such device.
-pub fn require_device(name: &str) -> Result<()> {
+pub fn require_device(name: &str) -> Result<Option<ComputeDevice>> {
     let choice = parse_choice(name)?;
-    if choice.name == "auto" { Ok(()) } else { open_named(&choice).map(drop) }
+    if choice.name == "auto" { Ok(None) } else { open_named(&choice).map(Some) }
 }
 
 fn parse_choice(name: &str) -> Result<DeviceChoice> {

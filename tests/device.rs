@@ -101,6 +101,26 @@ fn a_device_that_is_not_here_is_refused_before_anything_is_made() {
     assert!(said.contains("vulkan:77") && said.contains("doctor") && !dir.path().join("run/tface").exists());
 }
 
+#[test]
+fn a_dry_run_refuses_a_gpu_with_too_little_memory_as_the_command_would() {
+    if Adapter::all().is_empty() {
+        println!(
+            "skipped: memory of a device in a dry run, for no adapter is here (Mesa's lavapipe would do)"
+        );
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };
+    write_capture(&dir.path().join("capture"), &options).unwrap();
+    for (memory, more, code) in [("0.5", &["--dry-run"][..], 1), ("0.5", &[], 1), ("64", &["--dry-run"], 0)] {
+        let o = tiface(dir.path(), &words("wgpu:0", &[&["--memory", memory][..], more].concat()));
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert_eq!(o.status.code(), Some(code), "{memory} {more:?}: {said}");
+        assert!(code == 0 || said.contains("with `--memory`"), "{said}");
+    }
+    assert!(!dir.path().join("run/mask").exists());
+}
+
 /// In place of the program: lists a card that passes its self-test and a software driver that does not, and fails to train
 /// after its first kernels.
 const FAKE: &str = r#"#!/bin/sh

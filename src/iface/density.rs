@@ -34,7 +34,7 @@ use crate::kernel::gpu::Adapter;
 use crate::{Error, Result};
 use cpu::CpuDensity;
 #[cfg(feature = "wgpu")]
-use gpu::GpuDensity;
+pub(super) use gpu::GpuDensity;
 use std::time::Instant;
 
 /// Version of the checkpoints' layout.
