@@ -73,7 +73,7 @@ fn cells<O: SdfOps>(model: &mut SdfModel<O>) -> Result<Occupancy> {
 }
 
 /// Compares the colors of points that are given their normals, as where a mesh is textured.
-fn compare_colors<'a>(field: &str, on_gpu: &SdfModel<GpuSdf<'a>>) -> Result<Check> {
+fn compare_colors(field: &str, on_gpu: &SdfModel<GpuSdf>) -> Result<Check> {
     let [points, seen, normals] = [10, 11, 12].map(|stream| directions(stream, 500));
     let got = on_gpu.ops.colors(&on_gpu.groups, &points, &seen, &normals)?;
     let state = start(on_gpu.config);
