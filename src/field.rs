@@ -154,7 +154,8 @@ pub fn compute_device(name: &str, test: &SelfTest) -> Result<ComputeDevice> {
     if choice.name == "auto" { Ok(select(&choice, &[*test])) } else { open_named(&choice) }
 }
 
-/// Refuses a device that [`compute_device`] would refuse. Returns it if it is named; for `auto`, no GPU is opened.
+/// Refuses a device that [`compute_device`] would refuse. Returns it if it is named; for `auto`, no
+/// GPU is opened.
 ///
 /// # Errors
 ///

@@ -46,8 +46,11 @@ pub const DENSITY_TEST: SelfTest = SelfTest {
     run: self_test::density,
 };
 
-/// Refuses a GPU that cannot hold a training, before its photographs are known: they need no memory there.
+/// Refuses a GPU that cannot hold a training, before its photographs are known: they need no memory
+/// there.
 pub fn require_fit(config: &IfaceConfig, device: &ComputeDevice) -> Result<()> {
+    #[cfg(not(feature = "wgpu"))]
+    let _ = config;
     match device {
         ComputeDevice::Cpu(_) => Ok(()),
         #[cfg(feature = "wgpu")]

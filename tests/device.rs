@@ -121,8 +121,8 @@ fn a_dry_run_refuses_a_gpu_with_too_little_memory_as_the_command_would() {
     assert!(!dir.path().join("run/mask").exists());
 }
 
-/// In place of the program: lists a card that passes its self-test and a software driver that does not, and fails to train
-/// after its first kernels.
+/// In place of the program: lists a card that passes its self-test and a software driver that does
+/// not, and fails to train after its first kernels.
 const FAKE: &str = r#"#!/bin/sh
 device() {
   printf '{"name":"%s","adapter":"of a test","kind":"%s","driver":"1","card":null,"atomics":"native","memory":8,' "$1" "$2"

@@ -66,8 +66,8 @@ enum Refusal {
     Failed(Error),
 }
 
-/// Locks an adapter and opens it, with the atomics and the memory of the choice. The lock comes first: a process holds memory
-/// on every card that it opens, for as long as it lives.
+/// Locks an adapter and opens it, with the atomics and the memory of the choice. The lock comes
+/// first: a process holds memory on every card that it opens, for as long as it lives.
 fn take(
     adapter: &Adapter,
     choice: &DeviceChoice,
@@ -75,8 +75,8 @@ fn take(
     let lock = match acquire_lock(lock_file(adapter)) {
         Ok(lock) => Some(lock),
         Err(LockError::Held { .. }) if choice.number.is_none() => return Err(Refusal::InUse),
-        // A user who gives an adapter's index accepts sharing it with other processes. If no lock file can be created
-        // here, no other process holds one either.
+        // A user who gives an adapter's index accepts sharing it with other processes. If no lock
+        // file can be created here, no other process holds one either.
         Err(_) => None,
     };
     let mut device = Device::open(adapter).map_err(Refusal::Failed)?;

@@ -28,7 +28,8 @@ pub fn session(stage: &'static str) -> TrainingSession<'static> {
 }
 
 /// Opens an adapter once for each kind of atomics that trainings use on it. The second step is smaller by the returned
-/// divisor: the kernels that add differ, which are a small part of a step, and variants that the first step does not launch.
+/// divisor: the kernels that add differ, which are a small part of a step, and variants that the
+/// first step does not launch.
 pub fn devices(adapter: &Adapter) -> Result<[(Device, usize); 2]> {
     Ok([(Device::open(adapter)?, 1), (Device::open(adapter)?.with_atomics(Atomics::Fixed), 8)])
 }

@@ -35,7 +35,8 @@ pub(super) fn vm(adapter: &Adapter) -> Result<Vec<Check>> {
         ..VmConfig::preset(Preset::Draft)
     };
     let (views, hull, session) = (ball::views(), ball::hull(), session("tface"));
-    // The first step has rays that the host drew; the smaller one draws on the device, in the published order.
+    // The first step has rays that the host drew; the smaller one draws on the device, in the
+    // published order.
     let of_host = Pixels::new(&views, 0.25, 1.0, full.foreground, full.whole_frame);
     let published = Pixels::permuted(&views, full.foreground, BOUNDS, full.depth_directions);
     let state = VmState::new(&full, SEED, BOUNDS, Some(&hull));

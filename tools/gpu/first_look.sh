@@ -62,8 +62,8 @@ timed() {
 # number KEY FILE: the last number of that key in a file of JSON
 number() { grep -o "\"$1\": *[-0-9.e+]*" "$2" 2> /dev/null | tail -n 1 | sed 's/.*: *//'; }
 
-# own_test FILE: name, seconds and verdict of DEVICE in what `doctor --json` wrote; `doctor` tests all devices, and fails if
-# any of them does
+# own_test FILE: name, seconds and verdict of DEVICE in what `doctor --json` wrote; `doctor` tests
+# all devices, and fails if any of them does
 own_test() {
   awk -v device="${device%%+*}" '
     BEGIN { numbered = split(device, want, ":") > 1 }
@@ -87,8 +87,8 @@ own_test() {
     END { if (own != "") printf "%s %.1f %s\n", own, seconds, verdict }' "$1"
 }
 
-# The Vulkan loader, and the driver that each ICD file names: in a container one of them, or a library that the driver needs,
-# is often missing.
+# The Vulkan loader, and the driver that each ICD file names: in a container one of them, or a
+# library that the driver needs, is often missing.
 loader() {
   local known files file folder library lacks
   [ "$(uname)" = Linux ] || return 0

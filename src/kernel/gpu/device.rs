@@ -194,9 +194,9 @@ impl Adapter {
         found.into_iter().map(|(_, adapter)| adapter).collect()
     }
 
-    /// Returns the client of the adapter, which lives as long as the process. On wgpu each large buffer gets memory of its own:
-    /// by default CubeCL carves all buffers from pages as large as the largest of them, and takes up to such a page more than
-    /// requested.
+    /// Returns the client of the adapter, which lives as long as the process. On wgpu each large
+    /// buffer gets memory of its own: by default CubeCL carves all buffers from pages as large as
+    /// the largest of them, and takes up to such a page more than requested.
     ///
     /// A failure is returned here, since CubeCL panics where it has to open a device itself.
     fn client(&self) -> std::result::Result<Client, WgpuInitError> {
@@ -231,7 +231,8 @@ impl Adapter {
     }
 }
 
-/// Returns the bytes of an adapter's memory, which Vulkan states. WebGPU, whose shaders CubeCL compiles here, does not.
+/// Returns the bytes of an adapter's memory, which Vulkan states. WebGPU, whose shaders CubeCL
+/// compiles here, does not.
 #[cfg(not(target_vendor = "apple"))]
 fn memory_of(adapter: &wgpu::Adapter, integrated: bool) -> Option<u64> {
     const DEVICE_LOCAL: u32 = 1;
@@ -245,9 +246,9 @@ fn memory_of(adapter: &wgpu::Adapter, integrated: bool) -> Option<u64> {
     memory_of_heaps(heaps.iter().map(|heap| (heap.size, heap.flags.as_raw() & DEVICE_LOCAL != 0)), integrated)
 }
 
-/// Returns the memory in heaps, given the bytes of each and whether it is local to the device: the largest local one. An
-/// integrated GPU has the memory of the processor, and its local heap may be a small part that the firmware keeps for it; so
-/// it has all heaps.
+/// Returns the memory in heaps, given the bytes of each and whether it is local to the device: the
+/// largest local one. An integrated GPU has the memory of the processor, and its local heap may be
+/// a small part that the firmware keeps for it; so it has all heaps.
 #[cfg(any(test, not(target_vendor = "apple")))]
 fn memory_of_heaps(heaps: impl Iterator<Item = (u64, bool)>, integrated: bool) -> Option<u64> {
     if integrated {
@@ -267,8 +268,8 @@ impl Device {
     ///
     /// # Errors
     ///
-    /// If the driver refuses it: of kind [`NotNow`](crate::ErrorKind::NotNow) where its memory is used up, else of kind
-    /// [`Cannot`](crate::ErrorKind::Cannot).
+    /// If the driver refuses it: of kind [`NotNow`](crate::ErrorKind::NotNow) where its memory is
+    /// used up, else of kind [`Cannot`](crate::ErrorKind::Cannot).
     pub fn open(adapter: &Adapter) -> Result<Device> {
         note_errors();
         let client = adapter.client().map_err(|why| {
