@@ -117,21 +117,21 @@ pub struct Found {
     pub driver: String,
     /// PCI address, if the device is a card.
     pub card: Option<String>,
-    /// Atomic addition of floats: `native` or `exchange`.
-    pub atomics: &'static str,
+    /// Atomic addition of floats: `native` or `exchange`; `None` if the device cannot be opened.
+    pub atomics: Option<&'static str>,
     /// Bytes of memory; `None` if the driver does not report it.
     pub memory: Option<u64>,
-    /// Bytes of the largest buffer.
-    pub largest_buffer: u64,
-    /// Bytes of shared memory of a workgroup.
-    pub shared: usize,
+    /// Bytes of the largest buffer; `None` if the device cannot be opened.
+    pub largest_buffer: Option<u64>,
+    /// Bytes of shared memory of a workgroup; `None` if the device cannot be opened.
+    pub shared: Option<usize>,
     /// Whether another training uses the device.
     pub in_use: bool,
     /// Comparisons of training steps with the processor's.
     pub checks: Vec<Check>,
     /// The error that prevented the comparison, if any.
     pub error: Option<String>,
-    /// Seconds that the self-test took, including the driver's compilation of kernels.
+    /// Seconds that opening and the self-test took, including the driver's compilation of kernels.
     pub seconds: f64,
 }
 
@@ -167,14 +167,15 @@ pub fn compute_device(name: &str, test: &SelfTest) -> Result<ComputeDevice> {
     if choice.name == "auto" { Ok(select(&choice, &[*test])) } else { open_named(&choice) }
 }
 
-/// Refuses a device that [`compute_device`] would refuse. No GPU is opened unless one is named.
+/// Refuses a device that [`compute_device`] would refuse. Returns it if it is named; for `auto`, no
+/// GPU is opened.
 ///
 /// # Errors
 ///
 /// If this build or this machine has no such device.
-pub fn require_device(name: &str) -> Result<()> {
+pub fn require_device(name: &str) -> Result<Option<ComputeDevice>> {
     let choice = parse_choice(name)?;
-    if choice.name == "auto" { Ok(()) } else { open_named(&choice).map(drop) }
+    if choice.name == "auto" { Ok(None) } else { open_named(&choice).map(Some) }
 }
 
 fn parse_choice(name: &str) -> Result<DeviceChoice> {

@@ -89,9 +89,14 @@ impl Display for Examination {
             if let Some(card) = &d.card {
                 writeln!(f, "  card        {card}")?;
             }
-            let buffer = gib(d.largest_buffer);
-            writeln!(f, "  memory      {memory}; buffers up to {buffer}; {} KiB a group", d.shared / 1024)?;
-            writeln!(f, "  atomic adds {}", d.atomics)?;
+            write!(f, "  memory      {memory}")?;
+            if let (Some(buffer), Some(shared)) = (d.largest_buffer, d.shared) {
+                write!(f, "; buffers up to {}; {} KiB a group", gib(buffer), shared / 1024)?;
+            }
+            writeln!(f)?;
+            if let Some(atomics) = d.atomics {
+                writeln!(f, "  atomic adds {atomics}")?;
+            }
             match &d.error {
                 Some(error) => writeln!(f, "  self-test   FAILED: {error}")?,
                 None => {

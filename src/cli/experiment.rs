@@ -131,8 +131,12 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     for ((task, run), session) in
         tasks.iter().zip(&opened).zip(&mut sessions).filter(|((task, _), _)| chosen(task))
     {
-        let opened = match Session::open(&task.config, run) {
-            Ok(opened) => opened,
+        let planned = Session::open(&task.config, run).and_then(|opened| {
+            let cost = if common.dry_run { ahead(&opened, task.run)? } else { None };
+            Ok((opened, cost))
+        });
+        let (opened, cost) = match planned {
+            Ok(planned) => planned,
             // a capture may lack the inputs of one row (masks) and have those of others
             Err(e) if common.dry_run => {
                 match common.json {
@@ -149,7 +153,6 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         };
         let session = &*session.insert(opened);
         if common.dry_run {
-            let cost = ahead(session, task.run);
             sum = sum + cost.unwrap_or_default();
             if common.json {
                 let done = cost.is_none();

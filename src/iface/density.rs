@@ -34,7 +34,7 @@ use crate::kernel::gpu::Adapter;
 use crate::{Error, Result};
 use cpu::CpuDensity;
 #[cfg(feature = "wgpu")]
-use gpu::GpuDensity;
+pub(super) use gpu::GpuDensity;
 use std::time::Instant;
 
 /// Version of the checkpoints' layout.
@@ -272,7 +272,7 @@ pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<C
         Ok(model.state()?.occupancy)
     }
     let mut on_cpu = DensityModel::new(CpuDensity::new(config, &pixels), config, &session);
-    let device = crate::kernel::gpu::Device::open(adapter);
+    let device = crate::kernel::gpu::Device::open(adapter)?;
     let mut on_gpu = DensityModel::new(GpuDensity::new(config, &pixels, device)?, config, &session);
     let [want, got] = [cells(&mut on_cpu, start())?, cells(&mut on_gpu, start())?];
     let mut checks = vec![compare_cells(FIELD, &got.occupied.bits, &want.occupied.bits)];

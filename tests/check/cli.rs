@@ -704,6 +704,9 @@ fn the_tables_say_what_they_need_and_are_collected_without_making_it() {
     let run: serde_json::Value = serde_json::from_str(out(&o).trim()).unwrap();
     assert_eq!((&run["run"], &run["done"]), (&"head/paper".into(), &false.into()));
     assert!(run["estimate"]["cpu_s"].as_f64().unwrap() > 0.0);
+    // nor can its runs be made on a device that is not here
+    let o = experiment(&["--dry-run", "--device", "wgpu:99"]);
+    assert!(out(&o).contains("cannot be made: device `wgpu"), "{}{}", out(&o), err(&o));
     for wrong in [["--preset", "draft"], ["--run", "runs/other"], ["--fresh", "iface"]] {
         let o = experiment(&wrong);
         assert_eq!(code(&o), 2, "{}", err(&o));
