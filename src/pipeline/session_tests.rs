@@ -100,7 +100,7 @@ fn views_held_out_for_validation_cost_what_test_views_cost() {
 fn a_large_texture_is_told_the_memory_that_it_takes_and_no_three_times_of_it() {
     let dir = tempfile::tempdir().unwrap();
     let root = dir.path().join("head");
-    capture(&root, 6, 3);
+    capture(&root);
     let run = quiet(dir.path());
     let mib = |texture_px: u32| {
         let mut config = draft(&root);
@@ -117,7 +117,7 @@ fn a_large_texture_is_told_the_memory_that_it_takes_and_no_three_times_of_it() {
 fn the_disk_told_is_what_a_field_leaves_not_what_its_checkpoints_take_meanwhile() {
     let dir = tempfile::tempdir().unwrap();
     let root = dir.path().join("head");
-    capture(&root, 6, 3);
+    capture(&root);
     let (config, run) = (draft(&root), quiet(dir.path()));
     let session = Session::open(&config, &run).unwrap();
     // 96 channels of 192 x 193 floats, and a megabyte of logs
@@ -132,7 +132,7 @@ fn a_stage_gives_the_scratch_memory_of_its_kernels_back() {
     use crate::kernel::cpu::pool::{Buffer, keeps};
     let dir = tempfile::tempdir().unwrap();
     let root = dir.path().join("head");
-    capture(&root, 6, 3);
+    capture(&root);
     let (config, run) = (draft(&root), quiet(dir.path()));
     let session = Session::open(&config, &run).unwrap();
     // rounded up to 5 eighths of 2^20; nobody else has one of this size
