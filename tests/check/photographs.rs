@@ -174,6 +174,15 @@ fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again(
     assert_eq!(fs::read_dir(at("kept")).unwrap().count(), 2);
 }
 
+/// Returns the number that a script in the place of a program wrote to `started`: of a process. Waits five minutes at most.
+#[cfg(unix)]
+fn started(dir: &TempDir) -> Option<u32> {
+    (0..6000).find_map(|_| {
+        std::thread::sleep(std::time::Duration::from_millis(50));
+        fs::read_to_string(dir.path().join("started")).ok()?.trim().parse().ok()
+    })
+}
+
 #[test]
 #[cfg(unix)]
 fn a_stop_ends_colmap_as_well() {
@@ -181,11 +190,7 @@ fn a_stop_ends_colmap_as_well() {
     script(&dir, "colmap", "echo $$ > started; exec /bin/sleep 600");
     let mut command = command(dir.path(), &["cameras", "photographs"]);
     let mut running = command.env("PATH", dir.path().join("programs")).spawn().unwrap();
-    let started = || fs::read_to_string(dir.path().join("started")).ok()?.trim().parse::<u32>().ok();
-    let pid = (0..6000).find_map(|_| {
-        std::thread::sleep(std::time::Duration::from_millis(50));
-        started()
-    });
+    let pid = started(&dir);
     let killed = Command::new("/bin/kill").arg(running.id().to_string()).status().unwrap();
     assert!(killed.success() && running.wait().unwrap().code() == Some(143));
     assert!(tiface::io::has_ended(pid.expect("the script began")));
@@ -313,10 +318,7 @@ fn what_outlives_a_killed_search_keeps_the_next_one_from_its_folder() {
     script(&dir, "colmap", "exec 3<&0; /bin/sleep 600 & echo $! > started; wait");
     let mut command = command(dir.path(), &["cameras", "photographs"]);
     let mut running = command.env("PATH", dir.path().join("programs")).spawn().unwrap();
-    let pid = (0..600).find_map(|_| {
-        std::thread::sleep(std::time::Duration::from_millis(50));
-        fs::read_to_string(dir.path().join("started")).ok()?.trim().parse::<u32>().ok()
-    });
+    let pid = started(&dir);
     running.kill().unwrap();
     running.wait().unwrap();
     script(&dir, "colmap", "exit 1");
