@@ -187,6 +187,7 @@ tests() {
   local log=$scratch/$1.log program=$2
   shift 2
   [ -x "$program" ] || { echo "the tests were not built"; return 1; }
+  : > "$log"
   RUSTC_BOOTSTRAP=1 "$program" -Z unstable-options --report-time --show-output "$@" > "$log" 2>&1 &
   local pid=$!
   tail -n +1 --pid=$pid -f "$log" | grep -E --line-buffered '^test .* \.\.\. |^test result'

@@ -57,7 +57,7 @@ pub(super) fn draft(root: &Path) -> Config {
 /// The demo head on which cameras and exposures are measured: 14 training views, and a held-out one, the last.
 pub(super) fn measured_head() -> (TempDir, Capture) {
     let dir = tempfile::tempdir().unwrap();
-    demo_head(dir.path(), (144, 180), (14, 1));
+    demo_head(dir.path(), (192, 240), (14, 1));
     let capture = capture::open(dir.path(), &CaptureOptions::default()).unwrap();
     (dir, capture)
 }
