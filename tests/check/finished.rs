@@ -29,6 +29,8 @@ fn finished(folder: &Path) {
         worked(&tiface(folder, &words));
     });
     copy_run(&kept, folder, "runs/head");
+    // the report names the folder that it lies in
+    worked(&tiface(folder, &["run", "runs/head"]));
 }
 
 /// The files of a run with their bytes, those of camera paths left out.
