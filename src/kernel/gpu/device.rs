@@ -67,6 +67,7 @@ pub struct Device {
     driver: String,
     atomics: Atomics,
     memory: Option<u64>,
+    heap: Option<u64>,
     launches: AtomicUsize,
     readbacks: AtomicUsize,
     /// Names of the kernels that were launched.
@@ -124,6 +125,8 @@ pub struct Adapter {
     pub driver: String,
     /// Bytes of memory; `None` if the API does not report it.
     pub memory: Option<u64>,
+    /// Bytes of the largest heap of it that is local to the device, in which every buffer lies.
+    heap: Option<u64>,
     /// Whether CubeCL has a client of the adapter.
     opened: Mutex<bool>,
 }
@@ -177,6 +180,7 @@ impl Adapter {
             };
             // DX12 would give identical cards the address of the first one.
             let is_card = info.backend == wgpu::Backend::Vulkan && kind != 4;
+            let [memory, heap] = memory_of(&adapter, kind == 1);
             let adapter = Adapter {
                 device: CubeDevice::from(WgpuDevice::new(like).on(backend)),
                 card: Some(info.device_pci_bus_id).filter(|address| is_card && !address.is_empty()),
@@ -185,7 +189,8 @@ impl Adapter {
                 kind: KINDS[kind],
                 software: kind == 4,
                 driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
-                memory: memory_of(&adapter, kind == 1),
+                memory,
+                heap,
                 opened: Mutex::new(false),
             };
             found.push(((kind, api, number), adapter));
@@ -226,24 +231,26 @@ impl Adapter {
             software: false,
             driver: String::new(),
             memory: None,
+            heap: None,
             opened: Mutex::new(false),
         }
     }
 }
 
-/// Returns the bytes of an adapter's memory, which Vulkan states. WebGPU, whose shaders CubeCL
-/// compiles here, does not.
+/// Returns the bytes of an adapter's memory and of its largest local heap, which Vulkan states.
+/// WebGPU, whose shaders CubeCL compiles here, does not.
 #[cfg(not(target_vendor = "apple"))]
-fn memory_of(adapter: &wgpu::Adapter, integrated: bool) -> Option<u64> {
+fn memory_of(adapter: &wgpu::Adapter, integrated: bool) -> [Option<u64>; 2] {
     const DEVICE_LOCAL: u32 = 1;
     // SAFETY: nothing is created or destroyed through the handles, which the adapter outlives.
     let properties = unsafe {
-        let vulkan = adapter.as_hal::<wgpu::hal::api::Vulkan>()?;
+        let Some(vulkan) = adapter.as_hal::<wgpu::hal::api::Vulkan>() else { return [None; 2] };
         let instance = vulkan.shared_instance().raw_instance();
         instance.get_physical_device_memory_properties(vulkan.raw_physical_device())
     };
     let heaps = &properties.memory_heaps[..properties.memory_heap_count as usize];
-    memory_of_heaps(heaps.iter().map(|heap| (heap.size, heap.flags.as_raw() & DEVICE_LOCAL != 0)), integrated)
+    let heaps = || heaps.iter().map(|heap| (heap.size, heap.flags.as_raw() & DEVICE_LOCAL != 0));
+    [memory_of_heaps(heaps(), integrated), memory_of_heaps(heaps(), false)]
 }
 
 /// Returns the memory in heaps, given the bytes of each and whether it is local to the device: the
@@ -259,8 +266,8 @@ fn memory_of_heaps(heaps: impl Iterator<Item = (u64, bool)>, integrated: bool) -
 
 /// Returns `None`: Metal states no size, but one that it recommends.
 #[cfg(target_vendor = "apple")]
-fn memory_of(_: &wgpu::Adapter, _: bool) -> Option<u64> {
-    None
+fn memory_of(_: &wgpu::Adapter, _: bool) -> [Option<u64>; 2] {
+    [None; 2]
 }
 
 impl Device {
@@ -292,7 +299,8 @@ impl Device {
         let driver = driver.unwrap_or_default().to_owned();
         let (launches, readbacks) = (AtomicUsize::new(0), AtomicUsize::new(0));
         let kernels = Mutex::default();
-        Ok(Device { device, client, driver, atomics, memory, launches, readbacks, kernels })
+        let heap = adapter.heap;
+        Ok(Device { device, client, driver, atomics, memory, heap, launches, readbacks, kernels })
     }
 
     /// Returns the adapter's name.
@@ -310,7 +318,8 @@ impl Device {
         let properties = self.client.properties();
         DeviceLimits {
             memory: self.memory,
-            largest_buffer: properties.memory.max_page_size,
+            // wgpu allocates no buffer that is larger than the heap it lies in
+            largest_buffer: properties.memory.max_page_size.min(self.heap.unwrap_or(u64::MAX)),
             shared: properties.hardware.max_shared_memory_size,
         }
     }
@@ -732,6 +741,8 @@ pub(crate) mod tests {
         assert_eq!(memory(&[(8 * GIB, true), (GIB / 4, true), (32 * GIB, false)], false), Some(8 * GIB));
         assert_eq!(memory(&[(32 * GIB, false)], false), None);
         assert_eq!(memory(&[(GIB / 2, true), (15 * GIB, false)], true), Some(31 * GIB / 2));
+        // a single buffer lies in the local one
+        assert_eq!(memory(&[(GIB / 2, true), (15 * GIB, false)], false), Some(GIB / 2));
         assert_eq!(memory(&[], true), None);
     }
 
