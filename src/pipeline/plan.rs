@@ -581,9 +581,7 @@ impl Session<'_> {
         let m = &self.config.mask;
         let files = [&m.sam, &m.vitmatte, &m.alpha_net].into_iter().filter(|file| !file.is_empty()).count();
         let networks = 5.0 * (files * self.capture.views.len()) as f64;
-        let residuals = |methods: &[Method], fits: bool| {
-            if fits && self.render_config().shows_residuals(methods) { all } else { 0.0 }
-        };
+        let residuals = |shown: bool| if shown { all } else { 0.0 };
         // what views by these methods take beside the views themselves
         let renderers = |methods: &[Method], residuals: f64| {
             let shows_mesh = methods.iter().any(|method| method.stage() == Stage::Mesh);
@@ -661,14 +659,14 @@ impl Session<'_> {
                     Method::Volume => 20e-6,
                     _ => 2.5e-6,
                 };
-                let residuals = residuals(methods, true);
+                let residuals = residuals(self.render_config().shows_residuals(methods));
                 let cpu_s = 0.1 + shown * methods.iter().map(pixel).sum::<f64>() + 1.6e-6 * residuals;
                 (cpu_s, mib::VIEW_PIXEL * each + renderers(methods, residuals))
             }
             Stage::Ensemble => {
                 let members = &self.config.ensemble.members;
                 let fits = self.config.ensemble.weights.is_empty();
-                let residuals = residuals(members, fits);
+                let residuals = residuals(fits && self.config.render.shows_residuals(members));
                 let rendered = if fits { renderers(members, residuals) } else { 0.0 };
                 (0.2 + 3e-6 * held_out + 1.6e-6 * residuals, mib::VIEW_PIXEL * each + rendered)
             }
