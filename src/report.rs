@@ -382,7 +382,7 @@ pub fn warnings<'r>(run: &Path, records: impl IntoIterator<Item = (Stage, &'r Re
         let verdict = blend_verdict(&record.summary["blend"]);
         all.extend(verdict.map(|v| format!("{stage}: {v}; use its views, or give `ensemble.weights`")));
         if record.summary["closed"] == false {
-            all.push(format!("{stage}: the surface is not watertight; `tiface check RUN` shows where"));
+            all.push(format!("{stage}: the surface is not watertight; `tiface check RUN` says why"));
         }
         all.extend(record.faults(&run.join(stage)).iter().map(|fault| format!("{stage}: {fault}")));
     }

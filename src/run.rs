@@ -34,6 +34,7 @@ pub use status::{
 pub use verify::{Verification, VerifiedFile, verify};
 
 use crate::io::{self, Lock, LockError};
+use status::TIMED;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -63,10 +64,11 @@ fn has_record(folder: &Path) -> bool {
         || matches!(read_status(folder), Ok(Some(_)))
 }
 
-/// Returns whether this is an empty lock, whoever made it: alone in a folder it is nothing that
-/// could be lost.
-fn is_bare_lock(path: &Path) -> bool {
-    path.ends_with(LOCK) && io::begins(path, LOCK_MARK) == Some(false)
+/// Returns whether this is an empty lock, or a record that a crash left empty, whoever made it: alone
+/// in a folder it is nothing that could be lost.
+fn is_bare(path: &Path) -> bool {
+    let is_bare_lock = path.ends_with(LOCK) && io::begins(path, LOCK_MARK) == Some(false);
+    is_bare_lock || TIMED.iter().any(|name| path.ends_with(name)) && io::file_size(path) == Some(0)
 }
 
 impl Run {
@@ -142,7 +144,7 @@ impl Run {
         if has_record(&folder) {
             return Ok(());
         }
-        match io::any_file(&folder, &|path| has_record(path) || is_bare_lock(path))? {
+        match io::any_file(&folder, &|path| has_record(path) || is_bare(path))? {
             // another process began the stage between the two checks
             Some(_) if has_record(&folder) => Ok(()),
             Some(file) => Err(Error::cannot(

@@ -224,7 +224,7 @@ impl Bar {
         let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
         match self {
             Bar::Watertight if of(Stage::Mesh).is_some_and(|m| m["closed"] == true) => Ok(()),
-            Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check` shows where")),
+            Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check RUN` says why")),
             Bar::Psnr(bar) => {
                 let metrics = of(Stage::Metrics).unwrap_or(&Value::Null);
                 let sets = metrics.as_object().into_iter().flat_map(|m| m.values());

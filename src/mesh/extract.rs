@@ -143,7 +143,7 @@ impl MeshReport {
             ));
         }
         if !self.topology.is_solid() {
-            out.push("the mesh is not a closed manifold; `tiface check RUN` shows where".into());
+            out.push("the mesh is not a closed manifold; `tiface check RUN` says what is wrong".into());
         }
         out
     }

@@ -222,8 +222,10 @@ impl Record {
         let stage = self.stage.split('/').next().unwrap_or_default();
         let put_back = match fault.is_export {
             true if fault.again.starts_with("tiface export") => format!("`{}` puts it back", fault.again),
-            true => "put the file back, remove it, for no stage reads it".into(),
-            false => "put the file back".into(),
+            true if fault.state != ProductState::Gone => {
+                "put the file back, remove it, for no stage reads it".into()
+            }
+            _ => "put the file back".into(),
         };
         let hint = format!("{put_back}, or recompute the stage and what follows with `--fresh {stage}`");
         Error::cannot(&fault.problem, hint)

@@ -925,8 +925,10 @@ fn what_a_stage_made_anew_puts_out_of_date_is_named_before_it_goes() {
     // as if it had been begun
     let mesh = dir.path().join("runs/head/mesh");
     std::fs::create_dir(&mesh).unwrap();
-    for file in [".lock", "surface.ply"] {
-        std::fs::write(mesh.join(file), "x").unwrap();
+    for (file, found) in
+        [(".lock", "tiface holds this lock while it works on this stage\n"), ("surface.ply", "x")]
+    {
+        std::fs::write(mesh.join(file), found).unwrap();
     }
     let words = ["mask", "head", "--fresh", "mask"];
     let o = tiface(dir.path(), &[&words[..], &["--dry-run"]].concat());

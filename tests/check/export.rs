@@ -250,7 +250,7 @@ fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
         (&["absent"], 1, &["`absent`"]),
         (&["--out", "head.fbx"], 2, &["end it in .glb, .obj, .ply, or in `/`"]),
         (&["--out", "absent/head.glb"], 1, &["the folder `absent` does not exist"]),
-        (&["--out", "runs/head/mesh/head.glb"], 2, &["is inside the run"]),
+        (&["--out", "runs/head/head.glb"], 2, &["is inside the run"]),
         (&["--out", "runs/head/new/"], 2, &["is inside the run"]),
         (&["--format", "stl"], 2, &["--format stl"]),
         (&["--format", "ply", "--out", "a.glb"], 2, &["one .glb", "--format"]),
