@@ -14,7 +14,7 @@ use crate::config::{Config, Hair, Material, MeshFormat, Stage};
 use crate::mesh::bake::{Original, tangent_space};
 use crate::mesh::files::{ExportedFiles, HeadMesh, HeadTexture, tangents};
 use crate::mesh::{SimplifyConfig, atlas, simplify};
-use crate::run::{Fingerprint, Record};
+use crate::run::Fingerprint;
 use crate::{Error, Monitor, Result};
 use std::path::{Path, PathBuf};
 
@@ -58,13 +58,13 @@ impl KeptHead {
     pub fn read(run: &Path, made: &Config) -> Result<KeptHead> {
         let (head, warnings) = read_finished(run, |record| {
             let folder = run.join(Stage::Mesh);
-            let (parts, others) =
-                record.products.clone().into_iter().partition(|(name, _)| name.starts_with("parts/"));
-            let parts = Record { products: parts, ..record.clone() };
-            parts.require_products(&folder)?;
-            require_digests(&parts, &folder)?;
+            for name in record.products.keys().filter(|name| name.starts_with("parts/")) {
+                if let Some(fault) = record.verify(&folder, name)? {
+                    return Err(record.error(&fault));
+                }
+            }
             // the other files are not read
-            let problem = Record { products: others, ..record.clone() }.require_products(&folder).err();
+            let problem = record.require_products(&folder).err();
             let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
             Ok((HeadMesh::load(&folder.join("parts"))?, warnings))
         })?;
@@ -269,23 +269,6 @@ impl KeptHead {
         self.head = HeadMesh { mesh, world_from_scene: *world_from_scene, texture, harmonics: None, shells };
         Ok(())
     }
-}
-
-/// Fails if a file is not the one that the stage of the record left. Older records have no digests.
-fn require_digests(record: &Record, folder: &Path) -> Result<()> {
-    for (name, digest) in record.sha256.iter().filter(|(name, _)| record.products.contains_key(*name)) {
-        let file = folder.join(name);
-        if Fingerprint::of_file(&file)? != *digest {
-            let what =
-                format!("`{}` has other contents than the stage `{}` left", file.display(), record.stage);
-            let hint = format!(
-                "put the file back, or recompute the stage and what follows with `--fresh {}`",
-                record.stage
-            );
-            return Err(Error::cannot(what, hint));
-        }
-    }
-    Ok(())
 }
 
 /// Returns a warning for each of the formats that does not show a changed setting. Fails if none shows it.
