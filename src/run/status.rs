@@ -711,6 +711,23 @@ mod run_tests {
     }
 
     #[test]
+    fn a_file_that_is_gone_is_not_to_be_removed() {
+        let dir = tempfile::tempdir().unwrap();
+        let (folder, file) = (dir.path().join("mesh"), dir.path().join("mesh/surface.ply"));
+        let made = Run::quiet(dir.path()).stage(plan("mesh"), |_| {
+            io::write_atomic(&file, b"triangles")?;
+            Ok(Value::Null)
+        });
+        assert!(!made.unwrap().skipped);
+        let record = read_record(&folder).unwrap().unwrap();
+        let hint = || record.error(&record.faults(&folder)[0]).hint().to_string();
+        std::fs::write(&file, b"tri").unwrap();
+        assert!(hint().starts_with("put the file back, remove it, for no stage reads it, or"), "{}", hint());
+        std::fs::remove_file(&file).unwrap();
+        assert!(hint().starts_with("put the file back, or recompute"), "{}", hint());
+    }
+
+    #[test]
     fn a_stage_with_a_file_that_was_cut_or_lost_is_not_done() {
         let dir = tempfile::tempdir().unwrap();
         let run = Run::quiet(dir.path());
