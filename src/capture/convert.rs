@@ -6,6 +6,7 @@
 //! warning otherwise.
 
 use super::colmap;
+use super::folder::is_hidden;
 use super::frame::LensModel;
 use super::view::{Capture, Split, View, ViewMask};
 use super::{every_eighth, up};
@@ -104,10 +105,16 @@ type Contents<'v> = Vec<(PathBuf, Content<'v>)>;
 /// Returns whether a folder contains nothing but files of an unfinished conversion: `contents` but for the last one.
 fn is_unfinished(folder: &Path, contents: &Contents) -> Result<bool> {
     let Some((_, written)) = contents.split_last() else { return Ok(false) };
-    for name in io::file_sizes(folder, &|_| false)?.keys() {
-        let file = folder.join(name);
-        let Some((_, content)) = written.iter().find(|(target, _)| *target == file) else { return Ok(false) };
-        if io::read_maybe_empty(&file, &Limits::default())? != content.bytes(&file)? {
+    let targets: BTreeSet<&Path> = written.iter().map(|(target, _)| target.as_path()).collect();
+    // the first other file is enough: a large folder is not read to its end
+    if io::any_file(folder, &|path| targets.contains(path) || is_hidden(path))?.is_some() {
+        return Ok(false);
+    }
+    for (target, content) in written.iter().filter(|(target, _)| io::exists(target)) {
+        let is_same = || -> Result<bool> {
+            Ok(io::read_maybe_empty(target, &Limits::default())? == content.bytes(target)?)
+        };
+        if !io::is_file(target) || !is_same()? {
             return Ok(false);
         }
     }

@@ -257,6 +257,11 @@ pub(super) fn unnameable(folder: &Path) -> Result<Vec<String>, ReadError> {
     Ok(names)
 }
 
+/// Returns whether a file or folder is hidden by its name.
+pub(super) fn is_hidden(path: &Path) -> bool {
+    path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
+}
+
 /// Returns whether a file's name is read as one name, not as folders in the manner of Windows.
 pub(super) fn is_nameable(name: &str) -> bool {
     !name.contains('\\')

@@ -12,6 +12,7 @@
 //! A search that is repeated clears what is listed and COLMAP's own files: whatever else is in the
 //! folder is a user's.
 
+use super::super::folder::is_hidden;
 use super::{SfmOptions, Solution};
 use crate::io::{self, Limits, Lock, LockError};
 use crate::run::Fingerprint;
@@ -107,8 +108,6 @@ impl<'a> Output<'a> {
         let record = self.work(RECORD);
         let is_ours = io::is_file(&record) && !io::is_link(&record) && !io::is_link(&self.out.join("colmap"));
         // folders alone are what a search leaves that was killed when it began
-        let is_hidden =
-            |path: &Path| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
         let is_empty = || -> Result<bool> {
             Ok(io::is_folder(self.out) && io::any_file(self.out, &is_hidden)?.is_none())
         };
