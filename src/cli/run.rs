@@ -4,7 +4,7 @@
 use super::Invocation;
 use super::options::{Common, KeyOption, RunTarget};
 use super::out::Out;
-use super::screen::{figure, print};
+use super::screen::{figure, one_line, print};
 use crate::config::{Config, NAMES, Preset, RenderConfig, called};
 use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::{blend_verdict, duration, height, judged_by};
@@ -263,7 +263,7 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
         // exported files may be moved
         let record = read_record(&run.path(Stage::Mesh)).ok().flatten();
         let faults = record.map_or(Vec::new(), |record| record.faults(&run.path(Stage::Mesh)));
-        faults.iter().for_each(|fault| row("", fault));
+        faults.iter().for_each(|fault| row("", &one_line(&fault.to_string())));
     }
     for (stage, folder) in [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.word())] {
         if of(stage).is_some() {
