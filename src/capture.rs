@@ -209,6 +209,11 @@ fn check_names(frames: &[CameraFrame], names: &[String], listing: &mut Listing) 
                 format_args!("`{file}`: `{first}` and `{second}` would both be called `{name}`"),
                 "rename one of the photographs, or remove one frame",
             ));
+        } else if name.split('/').any(|part| part.starts_with('.')) {
+            listing.warnings.push(format!(
+                "the view `{name}` of `{second}` has a name that begins with a dot: its results are hidden files, which \
+                 reports leave out; rename the photograph"
+            ));
         } else if let Some(twin) = folded.insert(name.to_lowercase(), name) {
             listing.warnings.push(format!(
                 "the views `{twin}` and `{name}` differ only in case; on some disks their results would share a file"

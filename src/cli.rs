@@ -27,7 +27,8 @@ use crate::run::Stop;
 use crate::{Error, Result};
 use bench::BenchOptions;
 use cameras::CamerasOptions;
-use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap::parser::ValueSource;
+use clap::{ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use clap_complete::{ArgValueCompleter, Shell};
 use experiment::ExperimentOptions;
 use options::{Common, KeyOption, RunTarget};
@@ -223,9 +224,10 @@ enum Command {
   tiface cameras --video turn.mp4 --every 15    keep the sharpest of every 15 frames
   tiface cameras rig --lens-each                calibrate a lens for each photograph
 
-The new folder [default: PHOTOGRAPHS_cameras] has a copy of the photographs in images/, COLMAP's model in sparse/0
-and its log in colmap/log.txt. If the folder has head masks, features are searched inside them;
---set mask.source=none uses whole photographs.")]
+The new folder [default: PHOTOGRAPHS_cameras, or HEAD_cameras for HEAD/images] has a copy of the photographs in
+images/, COLMAP's model in sparse/0 and its log in colmap/tiface_cameras.log. If the folder has head masks, features
+are searched inside them; --set mask.source=none uses whole photographs. A search that failed is repeated in its
+folder; one that is done is not.")]
     Cameras(CamerasOptions),
     /// Write a capture's cameras in another format: transforms.json or COLMAP
     #[command(after_long_help = "Examples:
@@ -425,7 +427,7 @@ experiment.json.")]
   tiface check head.ply --json
   tiface check runs/lps/mesh/surface.ply --against captures/lps/gt.ply --seen-by captures/lps")]
     Check {
-        /// .glb, .obj or .ply file, or a run, whose exported mesh is checked
+        /// .glb, .obj or .ply file, or a run: its exported mesh, or with --against its extracted surface
         #[arg(value_name = "MESH|RUN")]
         mesh: PathBuf,
         /// Exit with 3 if not met: watertight, manifold, one-piece, no-self-intersections, sound-uv;
@@ -461,19 +463,25 @@ between their surfaces and the settings that differ; --table writes the table in
   tiface status
   tiface status runs/002_00                     print a row for each stage
   tiface status runs/*                          print a line for each run, and one for all
-  tiface status runs/* --failed                 print only failed runs; exit with 3 if any failed
+  tiface status runs/* --failed                 print only runs that need attention
   tiface status runs/* --json                   print an object for each run
 
-Signs of stages: # done, > running, x failed, ! killed, = stopped, ? not readable, . to do. Of more than 40 runs, those
-that are done or have not begun are summed up; -v prints a line for each.")]
+Signs of stages, and the exit code of a run that stands there:
+  #  done             0      x  failed                                    3
+  >  running          0      %  damaged: a file was lost or cut           3
+  =  stopped          0      !  killed: repeat its command to continue    3
+  .  to do            0      ?  not readable                              1
+Of many runs, the worst state decides: failed, damaged, killed, not readable. Of more than 40 runs, those that are done
+or have not begun are summed up; -v prints a line for each.")]
     Status(StatusOptions),
     /// Compare the files of runs with the SHA-256 digests in their records
     #[command(after_long_help = "Examples:
   tiface verify                                 compare all runs under runs/
-  tiface verify runs/002_00                     exit with 3 if a file is missing or was changed
-  tiface verify runs/* --json | jq .differences
+  tiface verify runs/002_00                     exit with 3 if a file is gone, cut or changed
+  tiface verify runs/* --json | jq '.files[] | select(.state != \"recorded\")'
 
-Nothing is written. --json prints an object for each run, with the digest of every file: a manifest.")]
+Nothing is written. Each file that differs is printed with the command that makes it again. --json prints an object for
+each run, with size, SHA-256 and state (recorded, changed, cut or gone) of every file: a manifest.")]
     Verify {
         /// Run folders [default: all under runs/]
         runs: Vec<PathBuf>,
@@ -482,7 +490,8 @@ Nothing is written. --json prints an object for each run, with the digest of eve
     #[command(after_long_help = "Examples:
   tiface config --preset paper
   tiface config runs/002_00 --set mesh.resolution=1024
-  tiface config --explain iface.steps           explain a key; --explain mesh explains a table")]
+  tiface config --explain iface.steps           explain a key; --explain mesh explains a table
+  tiface config --preset draft --json | jq .mesh.resolution")]
     Config {
         #[command(flatten)]
         input: CaptureOrRun,
@@ -520,16 +529,20 @@ pub fn out_of_memory(bytes: usize) -> ! {
     signal_hook::low_level::exit(crate::ErrorKind::NotNow.code().into())
 }
 
-/// Parses the command line, runs the command and returns the exit code.
-pub fn main() -> ExitCode {
+/// Parses the command line, runs the command and returns the exit code. `collect` gives the allocator's free memory back to
+/// the system.
+pub fn main(collect: fn()) -> ExitCode {
+    crate::io::set_memory_collector(collect);
     complete::answer(Cli::command);
-    let Cli { command, common } = match Cli::try_parse() {
-        Ok(cli) => cli,
+    let parsed =
+        Cli::command().try_get_matches().and_then(|found| Ok((Cli::from_arg_matches(&found)?, found)));
+    let (Cli { command, common }, found) = match parsed {
+        Ok(parsed) => parsed,
         Err(e) => {
             // help and version end here too, with 0; a closed stdout is no error
             let _ = e.print();
-            if is_second_path(&e) {
-                let _ = writeln!(std::io::stderr(), "\n{ONE_HEAD}");
+            if let Some(hint) = hint_for(&e) {
+                let _ = writeln!(std::io::stderr(), "\n{hint}");
             }
             return ExitCode::from(e.exit_code() as u8);
         }
@@ -537,7 +550,8 @@ pub fn main() -> ExitCode {
     let invocation = Invocation { common: &common, screen: Screen::new(&common), stop: Stop::new() };
     common.log();
     let makes_nothing = |command: &str| Out::none(common.out.as_deref(), command);
-    let ended = signals::listen(&invocation).and_then(|()| match &command {
+    let begun = refuse_ignored(&found).and_then(|()| signals::listen(&invocation));
+    let ended = begun.and_then(|()| match &command {
         Command::Demo { size, views, border } => demo::run(&invocation, size.as_deref(), *views, *border),
         Command::Mask { input, clicks, page: true } => {
             capture::page(&invocation, input.path.as_deref(), clicks.prompts.as_deref())
@@ -583,12 +597,53 @@ pub fn main() -> ExitCode {
 const ONE_HEAD: &str = "hint: this command takes one path; repeat it for each, as in \
     `for head in captures/*; do tiface run \"$head\"; done`";
 
-/// Returns whether the command line names another path than the one that its command takes.
-fn is_second_path(error: &clap::Error) -> bool {
+/// Hint for `--watch` of a command that works.
+const WATCH: &str = "hint: beside the working command, `tiface status --watch` shows its progress in a terminal, and \
+    `tiface preview RUN --watch` as a page";
+
+/// Returns the hint for a command line that clap refuses: one with another path than the one that its command takes, or
+/// with `--watch` of another command.
+fn hint_for(error: &clap::Error) -> Option<&'static str> {
     use clap::error::{ContextKind, ContextValue, ErrorKind};
-    let argument = error.get(ContextKind::InvalidArg);
-    let is_path = matches!(argument, Some(ContextValue::String(word)) if !word.starts_with('-') && crate::io::exists(Path::new(word)));
-    error.kind() == ErrorKind::UnknownArgument && is_path
+    let Some(ContextValue::String(word)) = error.get(ContextKind::InvalidArg) else { return None };
+    match error.kind() {
+        ErrorKind::UnknownArgument if word == "--watch" => Some(WATCH),
+        ErrorKind::UnknownArgument if !word.starts_with('-') && crate::io::exists(Path::new(word)) => {
+            Some(ONE_HEAD)
+        }
+        _ => None,
+    }
+}
+
+/// Returns the options of all commands that a command would ignore, by their identifiers.
+fn ignored(command: &str) -> &'static [&'static str] {
+    match command {
+        "status" | "verify" => {
+            &["fresh", "seed", "config", "preset", "set", "device", "deterministic", "memory"]
+        }
+        "doctor" | "completions" => {
+            &["run", "fresh", "seed", "config", "preset", "set", "device", "deterministic", "memory"]
+        }
+        "inspect" | "cameras" | "convert" | "check" => {
+            &["run", "fresh", "seed", "device", "deterministic", "memory"]
+        }
+        "preview" | "report" | "export" => &["fresh", "deterministic", "memory"],
+        "config" | "bench" => &["fresh"],
+        _ => &[],
+    }
+}
+
+/// Refuses an option on the command line that the command would ignore.
+fn refuse_ignored(found: &ArgMatches) -> Result<()> {
+    let Some((command, given)) = found.subcommand() else { return Ok(()) };
+    let typed = |id: &&&str| given.value_source(id) == Some(ValueSource::CommandLine);
+    match ignored(command).iter().find(typed) {
+        Some(id) => {
+            let text = format!("`--{id}` has no effect on `{command}`");
+            Err(Error::usage(text, format!("leave it out; `tiface {command} --help` lists what has one")))
+        }
+        None => Ok(()),
+    }
 }
 
 /// Adds to an error about a path of the command line that does not exist the one that was probably meant.
@@ -693,6 +748,26 @@ mod tests {
             assert_eq!(cli.common.seed, Some(7));
             assert!(matches!(cli.command, Command::Run { input, .. } if input.path.is_some()));
         }
+    }
+
+    #[test]
+    fn an_option_that_a_command_ignores_is_refused_and_known() {
+        let globals: Vec<String> = Cli::command().get_arguments().map(|a| a.get_id().to_string()).collect();
+        for command in Cli::command().get_subcommands() {
+            for id in ignored(command.get_name()) {
+                assert!(globals.iter().any(|g| g == id), "{id}");
+            }
+        }
+        let refused = |words: &[&str]| {
+            let found = Cli::command().try_get_matches_from([&["tiface"], words].concat()).unwrap();
+            refuse_ignored(&found).err().map(|e| (e.kind().code(), e.to_string()))
+        };
+        for words in [&["inspect", "a", "--fresh", "mesh"][..], &["--fresh", "mesh", "inspect", "a"]] {
+            assert_eq!(refused(words), Some((2, "`--fresh` has no effect on `inspect`".into())), "{words:?}");
+        }
+        assert!(refused(&["status", "--deterministic"]).is_some());
+        assert_eq!(refused(&["inspect", "a", "--set", "capture.unit_m=2", "--json"]), None);
+        assert_eq!(refused(&["run", "a", "--fresh", "mesh", "--deterministic"]), None);
     }
 
     #[test]

@@ -22,6 +22,9 @@ use crate::{Error, Result};
 use serde::Serialize;
 use std::sync::{Mutex, OnceLock};
 
+/// The reason for the processor on a machine without GPUs.
+const NO_GPU: &str = "no GPU is here";
+
 /// The device that a field is trained on.
 // A process holds one or two of these, so boxing the larger variant would save nothing.
 #[allow(clippy::large_enum_variant)]
@@ -41,6 +44,16 @@ impl ComputeDevice {
             ComputeDevice::Cpu(why) => format!("the processor: {why}"),
             #[cfg(feature = "wgpu")]
             ComputeDevice::Gpu(gpu) => format!("{}: {}", gpu.device.name(), gpu.why),
+        }
+    }
+
+    /// Returns what to tell the user if `auto` found a GPU and does not use it.
+    pub fn warning(&self) -> Option<String> {
+        match self {
+            ComputeDevice::Cpu(why) if !why.is_empty() && why != NO_GPU => {
+                Some(format!("trained on the processor: {why}; `tiface doctor` tests the GPUs"))
+            }
+            _ => None,
         }
     }
 
@@ -104,21 +117,21 @@ pub struct Found {
     pub driver: String,
     /// PCI address, if the device is a card.
     pub card: Option<String>,
-    /// Atomic addition of floats: `native` or `exchange`.
-    pub atomics: &'static str,
+    /// Atomic addition of floats: `native` or `exchange`; `None` if the device cannot be opened.
+    pub atomics: Option<&'static str>,
     /// Bytes of memory; `None` if the driver does not report it.
     pub memory: Option<u64>,
-    /// Bytes of the largest buffer.
-    pub largest_buffer: u64,
-    /// Bytes of shared memory of a workgroup.
-    pub shared: usize,
+    /// Bytes of the largest buffer; `None` if the device cannot be opened.
+    pub largest_buffer: Option<u64>,
+    /// Bytes of shared memory of a workgroup; `None` if the device cannot be opened.
+    pub shared: Option<usize>,
     /// Whether another training uses the device.
     pub in_use: bool,
     /// Comparisons of training steps with the processor's.
     pub checks: Vec<Check>,
     /// The error that prevented the comparison, if any.
     pub error: Option<String>,
-    /// Seconds that the self-test took, including the driver's compilation of kernels.
+    /// Seconds that opening and the self-test took, including the driver's compilation of kernels.
     pub seconds: f64,
 }
 
@@ -154,14 +167,15 @@ pub fn compute_device(name: &str, test: &SelfTest) -> Result<ComputeDevice> {
     if choice.name == "auto" { Ok(select(&choice, &[*test])) } else { open_named(&choice) }
 }
 
-/// Refuses a device that [`compute_device`] would refuse. No GPU is opened unless one is named.
+/// Refuses a device that [`compute_device`] would refuse. Returns it if it is named; for `auto`, no
+/// GPU is opened.
 ///
 /// # Errors
 ///
 /// If this build or this machine has no such device.
-pub fn require_device(name: &str) -> Result<()> {
+pub fn require_device(name: &str) -> Result<Option<ComputeDevice>> {
     let choice = parse_choice(name)?;
-    if choice.name == "auto" { Ok(()) } else { open_named(&choice).map(drop) }
+    if choice.name == "auto" { Ok(None) } else { open_named(&choice).map(Some) }
 }
 
 fn parse_choice(name: &str) -> Result<DeviceChoice> {
@@ -191,6 +205,9 @@ fn open_named(choice: &DeviceChoice) -> Result<ComputeDevice> {
     }
 }
 
+/// What to do about a GPU that failed.
+const GPU_HINT: &str = "`tiface doctor` tests the GPU, `--device cpu` leaves it out";
+
 /// A field on a GPU, which is evaluated in place of the processor's until the GPU fails.
 pub struct GpuField<T> {
     field: Mutex<Option<T>>,
@@ -214,7 +231,7 @@ impl<T> GpuField<T> {
         let mut field = self.field.lock().ok()?;
         let result = evaluate(field.as_mut()?);
         if let Err(e) = &result {
-            let text = self.failure.get_or_init(|| format!("{e}; the processor goes on"));
+            let text = self.failure.get_or_init(|| format!("{e}; the processor goes on. {GPU_HINT}"));
             tracing::warn!("{text}");
             *field = None;
         }
@@ -232,6 +249,15 @@ mod tests {
         assert_eq!((field.ask(|f| Ok(*f)), field.failure()), (Some(1), None));
         assert_eq!(field.ask(|_| Err::<i32, _>(Error::cannot("it is lost", ""))), None);
         assert_eq!(field.ask(|_| -> Result<i32> { panic!("asked again") }), None);
-        assert_eq!(field.failure(), Some("it is lost; the processor goes on"));
+        let said = field.failure().unwrap();
+        assert!(said.starts_with("it is lost; the processor goes on. `tiface doctor`"), "{said}");
+    }
+
+    #[test]
+    fn a_gpu_that_auto_refused_is_a_warning_and_a_machine_without_one_is_not() {
+        let warning = |why: &str| ComputeDevice::Cpu(why.into()).warning();
+        let said = warning("Big GPU failed the self-test").unwrap();
+        assert!(said.contains("Big GPU failed") && said.contains("`tiface doctor`"), "{said}");
+        assert_eq!((warning(""), warning(NO_GPU)), (None, None));
     }
 }

@@ -5,6 +5,7 @@ mod camera;
 mod field;
 mod mesh;
 mod overlap;
+mod pieces;
 mod ray;
 mod shells;
 mod similarity;
@@ -20,6 +21,7 @@ pub(crate) use overlap::{
     Boxes, DBox, DEFAULT_EFFORT, Effort, OutlineSide, THOROUGH_EFFORT, intersect, nearest_charts, overlaps,
     share_out, shared_area, turn,
 };
+pub(crate) use pieces::{WrongPiece, wrong_pieces};
 pub use ray::{Aabb, Hit, Ray, RayResult};
 pub use shells::{ShellCaster, ShellLayer, Shells};
 pub use similarity::Similarity;

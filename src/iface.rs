@@ -28,7 +28,9 @@ pub use density::{DensityField, train_density};
 pub use infer::IFace;
 pub use train::{IfaceReport, train};
 
-use crate::field::SelfTest;
+use crate::Result;
+use crate::config::iface::IfaceConfig;
+use crate::field::{ComputeDevice, SelfTest};
 
 /// Whether a GPU learns a signed distance as the processor does.
 pub const SDF_TEST: SelfTest = SelfTest {
@@ -43,3 +45,22 @@ pub const DENSITY_TEST: SelfTest = SelfTest {
     #[cfg(feature = "wgpu")]
     run: self_test::density,
 };
+
+/// Refuses a GPU that cannot hold a training, before its photographs are known: they need no memory
+/// there.
+pub fn require_fit(config: &IfaceConfig, device: &ComputeDevice) -> Result<()> {
+    #[cfg(not(feature = "wgpu"))]
+    let _ = config;
+    match device {
+        ComputeDevice::Cpu(_) => Ok(()),
+        #[cfg(feature = "wgpu")]
+        ComputeDevice::Gpu(found) => {
+            use crate::config::iface::{FieldKind, Foreground};
+            let none = crate::field::pixels::Pixels::new(&[], f32::INFINITY, 1.0, Foreground::Photo, false);
+            match config.field {
+                FieldKind::Sdf => gpu::GpuSdf::fits(config, &none, &found.device),
+                FieldKind::Density => density::GpuDensity::fits(config, &none, &found.device),
+            }
+        }
+    }
+}

@@ -19,9 +19,9 @@ mod write;
 pub use self::exr::{ExrImage, read_exr, write_exr};
 pub use animation::{ANIMATIONS, Animation, Frames, write_animation};
 pub use folder::{
-    Lock, LockError, any_file, append, clear_folder, create_folder, exists, file_size, file_sizes,
-    free_bytes, is_file, is_folder, is_link, is_writable, list_files, list_folders, modified, real_path,
-    similar,
+    Lock, LockError, any_file, append, begins, clear_folder, create_folder, exists, file_size, file_sizes,
+    free_bytes, is_file, is_folder, is_link, is_writable, list_files, list_folders, list_hidden, modified,
+    real_path, remove_empty_folder, similar,
 };
 pub use json::{parse_json, read_json, read_typed, typed};
 pub use npy::{Npy, NpyValues, npy_bytes, parse_npy, read_npy, read_npz};
@@ -29,8 +29,11 @@ pub use pictures::{
     PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, png_gray_bytes,
     read_gray, read_photo, write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
-pub use process::{cpu_seconds, forget_peak_memory, has_ended, has_open, peak_memory, processor};
-pub use program::{Program, VideoFrames, find_program};
+pub use process::{
+    cpu_seconds, forget_peak_memory, give_memory_back, has_ended, has_open, peak_memory, processor,
+    set_memory_collector,
+};
+pub use program::{Program, ProgramFailure, VideoFrames, find_program};
 pub use read::{Limits, ReadError, read_bytes, read_maybe_empty, read_pieces};
 pub use tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
 pub use write::{WriteError, copy, remove, remove_leftovers, rename, write_atomic};

@@ -59,8 +59,8 @@ pub use preview::{Preview, PreviewPicture, PreviewRenderer, field_view};
 pub use session::{DEMO_CAPTURE, Session, check_feasible, require_device};
 pub use surface::{Fields, Radiance, Surface};
 
-use crate::Result;
 use crate::run::{Done, StageDir};
+use crate::{Result, io, kernel};
 use render::{Meshes, Renderer};
 
 /// Completes `until` and every stage that it needs, and writes the report.
@@ -85,6 +85,7 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
     let work = |dir: &StageDir| match stage {
         Stage::Mask => {
             session.inputs.write(dir.folder())?;
+            capture.warnings.iter().for_each(|text| dir.keep_warning(text));
             mask::mask(capture, session.inputs.clicks.as_ref(), config, dir)
         }
         Stage::Baseline | Stage::Tface | Stage::Iface => {
@@ -129,10 +130,19 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
         }
         Ok(summary)
     })?;
+    if !done.skipped {
+        give_memory_back();
+    }
     if stage == Stage::Mask {
         session.write_cameras(done.skipped)?;
     }
     Ok(done)
+}
+
+/// Frees what a stage kept for its next step, so that the next stage begins with the memory that it needs itself.
+fn give_memory_back() {
+    kernel::cpu::pool::clear();
+    io::give_memory_back();
 }
 
 #[cfg(test)]

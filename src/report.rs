@@ -17,11 +17,13 @@ pub use runs::{RunRow, runs_csv, runs_html};
 use crate::config::{Stage, called};
 use crate::image::{Photo, over_black, quantize, reduce_photo, srgb_from_linear, working_size};
 use crate::io::{self, Limits};
+use crate::run::Record;
 use crate::{Error, ErrorKind, Result};
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::{Environment, context};
 use serde::Serialize;
 use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 
 /// Style that all pages share.
@@ -194,7 +196,7 @@ impl Viewer {
         // no name can end the script that holds it
         let data = data.to_string().replace('<', "\\u003c");
         let glb = base64(&self.glb);
-        fill(include_str!("report/viewer.html"), context! { viewer => self, data, glb })
+        fill(include_str!("report/viewer.html"), "", context! { viewer => self, data, glb })
     }
 }
 
@@ -241,11 +243,12 @@ pub fn html(report: &Report) -> Result<String> {
             methods.push((&picture.method, &picture.title));
         }
     }
+    let viewer_script = if viewer.is_some() { VIEWER_SCRIPT } else { "" };
     fill(
         include_str!("report/page.html"),
+        &format!("{}\n{viewer_script}", include_str!("report/page.js")),
         context! {
-            style => STYLE, script => include_str!("report/page.js"), viewer_script => VIEWER_SCRIPT,
-            viewer, methods, heat => heat(), most => (MAX_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
+            style => STYLE, viewer, methods, heat => heat(), most => (MAX_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
         },
     )
 }
@@ -254,8 +257,9 @@ pub fn html(report: &Report) -> Result<String> {
 pub fn viewer_html(viewer: &Viewer, views: &[ViewRow]) -> Result<String> {
     fill(
         include_str!("report/head.html"),
+        VIEWER_SCRIPT,
         context! {
-            style => STYLE, viewer_script => VIEWER_SCRIPT, title => viewer.name, viewer => viewer.html()?, views
+            style => STYLE, title => viewer.name, viewer => viewer.html()?, views
         },
     )
 }
@@ -266,7 +270,11 @@ fn heat() -> String {
     format!("linear-gradient(to right, {})", colors.join(", "))
 }
 
-fn fill(template: &str, context: minijinja::Value) -> Result<String> {
+/// Fills in a template. The policy of a page (`top.html`) lets a browser run `script` alone, by its
+/// digest, and load nothing but pictures inside the page, and, with `beside` in the context,
+/// pictures that lie beside it: so that what is not escaped by mistake still does nothing.
+fn fill(template: &str, script: &str, context: minijinja::Value) -> Result<String> {
+    let context = context! { script, digest => base64(&Sha256::digest(script)), ..context };
     let mut pages = Environment::new();
     pages.set_trim_blocks(true);
     let parts =
@@ -348,6 +356,37 @@ pub fn blend_verdict(blend: &Value) -> Option<String> {
         "the blend is not better than its best member on the views that are judged: {:.2} dB below {member}",
         -gain
     ))
+}
+
+/// Returns the height of what a run shows, from the figures of its stages: the mesh's own, else that of the masks' hull.
+pub fn height(mask: Option<&Value>, mesh: Option<&Value>) -> Option<String> {
+    let of = |figures: &Value| Some((figures["height_units"].as_f64()?, figures["height_m"].as_f64()?));
+    let told = |what: &str, (units, metres): (f64, f64)| {
+        format!("{what} {metres:.3} m high ({units:.3} units of the dataset)")
+    };
+    let shown = mesh.and_then(|mesh| Some(told(mesh["shows"].as_str().unwrap_or("head"), of(mesh)?)));
+    shown.or_else(|| Some(told("by the masks", of(mask?)?)))
+}
+
+/// Returns the size of a run's `head.glb` in megabytes of 10⁶ bytes.
+pub fn glb_megabytes(run: &Path) -> Option<f64> {
+    io::file_size(&run.join("mesh/head.glb")).map(|bytes| bytes as f64 / 1e6)
+}
+
+/// Returns the warnings of a run by its records: what its stages warned of, what is wrong with their results, and which
+/// files are no longer as a stage left them, each with what to do. The reports of one run and of many have the same.
+pub fn warnings<'r>(run: &Path, records: impl IntoIterator<Item = (Stage, &'r Record)>) -> Vec<String> {
+    let mut all = Vec::new();
+    for (stage, record) in records {
+        all.extend(record.warnings.iter().map(|w| format!("{stage}: {w}")));
+        let verdict = blend_verdict(&record.summary["blend"]);
+        all.extend(verdict.map(|v| format!("{stage}: {v}; use its views, or give `ensemble.weights`")));
+        if record.summary["closed"] == false {
+            all.push(format!("{stage}: the surface is not watertight; `tiface check RUN` says why"));
+        }
+        all.extend(record.faults(&run.join(stage)).iter().map(|fault| format!("{stage}: {fault}")));
+    }
+    all
 }
 
 /// `8.2 s`, `2 min 25 s`, `3 h 07 min`.
@@ -448,11 +487,111 @@ mod tests {
         assert!(page.contains("<h1>&lt;img src=x onerror=alert(1)&gt;"));
     }
 
+    /// Returns the scripts of a page that a browser would run, and their digests in its policy.
+    fn scripts(page: &str) -> (Vec<String>, Vec<String>) {
+        let run = page.split("<script>").skip(1).map(|rest| rest.split_once("</script>").unwrap().0);
+        let run = run.map(|script| base64(&Sha256::digest(script))).collect();
+        let policy = page.split_once("http-equiv=\"Content-Security-Policy\" content=\"").unwrap().1;
+        let policy = policy.split_once('"').unwrap().0;
+        assert!(policy.starts_with("default-src 'none'; img-src data:"), "{policy}");
+        assert!(!policy.contains("script-src 'unsafe") && !policy.contains("http"), "{policy}");
+        let digests = policy.split("'sha256-").skip(1).map(|rest| rest.split_once('\'').unwrap().0.into());
+        (run, digests.collect())
+    }
+
+    #[test]
+    fn every_page_runs_its_own_script_alone_and_loads_only_pictures() {
+        let report = report();
+        let dir = tempfile::tempdir().unwrap();
+        let live = |renewed| live_html(dir.path(), |_, _| None, renewed).unwrap();
+        let viewer = report.viewer.as_ref().unwrap();
+        for (page, count) in [
+            (html(&report).unwrap(), 1),
+            (html(&Report::default()).unwrap(), 1),
+            (viewer_html(viewer, &report.views).unwrap(), 1),
+            (runs_html(&[]).unwrap(), 1),
+            (live(true), 1),
+            (live(false), 0),
+            (bench::BenchResult::default().html().unwrap(), 0),
+        ] {
+            let (run, allowed) = scripts(&page);
+            assert_eq!(run, allowed);
+            assert_eq!(run.len(), count);
+            assert!(!page.contains(" onerror=\"") && !page.contains(" onclick=\""));
+        }
+        // pictures beside the page are those of the live page alone
+        assert!(live(true).contains("img-src data: 'self' file:;"));
+        assert!(!html(&report).unwrap().contains("file:;"));
+    }
+
+    #[test]
+    fn every_template_of_a_page_states_a_policy() {
+        fn walk(folder: &Path, pages: &mut Vec<PathBuf>) {
+            for path in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+                match path.extension().and_then(|ending| ending.to_str()) {
+                    _ if path.is_dir() => walk(&path, pages),
+                    Some("html") => pages.push(path),
+                    _ => {}
+                }
+            }
+        }
+        let mut pages = Vec::new();
+        walk(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"), &mut pages);
+        let mut whole = 0;
+        for path in pages {
+            let text = std::fs::read_to_string(&path).unwrap();
+            let (head, includes) = (text.contains("<head>"), text.contains("{% include \"top.html\" %}"));
+            whole += usize::from(head || includes);
+            let policy = "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none';";
+            assert!(!head || text.contains(policy), "{}", path.display());
+            // fragments are parts of such a page
+            assert!(head || includes || !text.contains("<body"), "{}", path.display());
+        }
+        assert!(whole >= 7, "{whole}");
+    }
+
     #[test]
     fn a_head_alone_has_its_page() {
         let report = report();
         let page = viewer_html(report.viewer.as_ref().unwrap(), &report.views).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("id=\"photo-0\"") && page.contains("AQ=="));
+    }
+
+    #[test]
+    fn the_height_told_is_that_of_the_mesh_where_there_is_one() {
+        let mask = json!({"height_units": 1.5, "height_m": 0.3});
+        let mesh = json!({"shows": "head and shoulders", "height_units": 1.4, "height_m": 0.28});
+        let said = |mask, mesh| height(mask, mesh).unwrap_or_default();
+        assert_eq!(
+            said(Some(&mask), Some(&mesh)),
+            "head and shoulders 0.280 m high (1.400 units of the dataset)"
+        );
+        assert_eq!(said(Some(&mask), None), "by the masks 0.300 m high (1.500 units of the dataset)");
+        // a mesh of a run from before tells none
+        assert!(said(Some(&mask), Some(&json!({}))).starts_with("by the masks"));
+        assert_eq!(height(Some(&json!({"height_units": null})), None), None);
+    }
+
+    #[test]
+    fn a_report_has_the_warnings_of_all_stages_with_what_to_do() {
+        let record = |summary: Value, warned: &[&str]| -> Record {
+            serde_json::from_value(json!({
+                "stage": "", "fingerprint": crate::run::Fingerprint::default(), "digest": "", "summary": summary,
+                "elapsed_s": 1.0, "warnings": warned, "finished": 0, "version": "",
+            }))
+            .unwrap()
+        };
+        let blend = json!({"blend": {"best_member": "tface", "gain_db": -0.5}});
+        let records = [
+            (Stage::Mask, record(json!({}), &["one mask is white"])),
+            (Stage::Mesh, record(json!({"closed": false}), &["the GPU failed"])),
+            (Stage::Metrics, record(blend, &[])),
+        ];
+        let run = Path::new("run");
+        let all = warnings(run, records.iter().map(|(stage, record)| (*stage, record)));
+        assert_eq!(all[..2], ["mask: one mask is white", "mesh: the GPU failed"]);
+        assert!(all[2].starts_with("mesh: the surface is not watertight; `tiface check"), "{all:?}");
+        assert!(all[3].starts_with("metrics: the blend") && all[3].contains("`ensemble.weights`"), "{all:?}");
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! A run directory: one folder per stage, with its status and its record.
 //!
 //! ```text
-//! runs/002_00/iface/.lock        held while a process works on the stage
+//! runs/002_00/iface/.lock        held while a process works on the stage; says whose the folder is
 //!                   status.json  live: state, step, rate, time left, error
 //!                   log.jsonl    one object per logged step
 //!                   …            the stage's own files
@@ -22,16 +22,19 @@ mod fingerprint;
 mod progress;
 mod stage;
 mod status;
+mod verify;
 
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer, Stop};
 pub use stage::{Done, Plan, StageDir};
 pub use status::{
-    Cost, ESTIMATE, Estimate, FAILED, Failure, Phase, Record, RunStatus, StageStatus, State, Status,
-    Verification, read_estimate, read_failure, read_record, read_status, verify,
+    Cost, ESTIMATE, Estimate, FAILED, Failure, Fault, Phase, ProductState, Record, RunStatus, StageStatus,
+    State, Status, read_estimate, read_failure, read_record, read_status,
 };
+pub use verify::{Verification, VerifiedFile, verify};
 
 use crate::io::{self, Lock, LockError};
+use status::TIMED;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -48,13 +51,24 @@ pub struct Run {
 
 const LOCK: &str = ".lock";
 
-/// Returns whether this is the folder of a stage, or of a separate product inside one: it has a lock, or, as a copy may
-/// have lost it, a record or a status.
+/// Content of a stage's lock, which is written before anything else in the folder: other programs
+/// have files called `.lock`, too.
+const LOCK_MARK: &str = "tiface holds this lock while it works on this stage\n";
+
+/// Returns whether this is the folder of a stage, or of a separate product inside one. The content
+/// of a file proves it, not its name: a lock that names us, or, as a copy may have lost it, a
+/// record or a status.
 fn has_record(folder: &Path) -> bool {
-    let lock = folder.join(LOCK);
-    (io::is_file(&lock) && !io::is_link(&lock))
+    io::begins(&folder.join(LOCK), LOCK_MARK) == Some(true)
         || matches!(read_record(folder), Ok(Some(_)))
         || matches!(read_status(folder), Ok(Some(_)))
+}
+
+/// Returns whether this is an empty lock, or a record that a crash left empty, whoever made it: alone
+/// in a folder it is nothing that could be lost.
+fn is_bare(path: &Path) -> bool {
+    let is_bare_lock = path.ends_with(LOCK) && io::begins(path, LOCK_MARK) == Some(false);
+    is_bare_lock || TIMED.iter().any(|name| path.ends_with(name)) && io::file_size(path) == Some(0)
 }
 
 impl Run {
@@ -124,13 +138,13 @@ impl Run {
         Ok(())
     }
 
-    /// Fails if a stage's folder contains files but no trace of a stage.
+    /// Fails if a stage's folder contains files but no proof of a stage.
     fn is_ours(&self, name: &str) -> Result<()> {
         let folder = self.path(name);
         if has_record(&folder) {
             return Ok(());
         }
-        match io::any_file(&folder, &has_record)? {
+        match io::any_file(&folder, &|path| has_record(path) || is_bare(path))? {
             // another process began the stage between the two checks
             Some(_) if has_record(&folder) => Ok(()),
             Some(file) => Err(Error::cannot(
@@ -176,7 +190,7 @@ impl Run {
     }
 
     fn lock(&self, stage: &str) -> Result<Lock> {
-        Lock::take(&self.path(stage).join(LOCK)).map_err(|e| match e {
+        Lock::take_marked(&self.path(stage).join(LOCK), LOCK_MARK).map_err(|e| match e {
             LockError::Held { .. } => {
                 let run = self.dir.display();
                 let problem = format!("stage `{stage}` of `{run}` is locked by another process");

@@ -6,7 +6,7 @@
 #     tools/test.sh unit NAME...       only tests whose names contain one of these; likewise integration
 #     tools/test.sh all                the check, then every part below
 #
-# lint         format, clippy with all features, a check without any, documentation
+# lint         format, clippy with all features, a check without any, documentation and its figures
 # unit         unit tests, examples in the documentation
 # integration  the program as a user runs it: commands, hostile files, kills
 # readers      exported shapes in trimesh, open3d, three.js and the Khronos validator
@@ -209,6 +209,7 @@ lint() {
   step "lints" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
   step "no features" cargo clippy --release --lib --bins -- -D warnings
   step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting,wgpu --no-deps
+  step "figures of the documents" "${PYTHON:-python3}" tools/reference/figures.py check
 }
 
 unit() {

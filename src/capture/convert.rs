@@ -1,10 +1,12 @@
 //! Writes a copy of a capture with its cameras in another format. Nothing is resampled, and no existing file is changed.
 //!
 //! Photographs are copied to `images/`, head masks to `masks/`, valid pixels to `valid/` and regions to `face_masks/`; the
-//! camera files are written last, so that a folder with camera files is complete. Data that the format cannot represent is
-//! an error if pictures would no longer match their cameras, and a warning otherwise.
+//! camera files are written last, so that a folder with camera files is complete. One that a killed process left without
+//! them is completed. Data that the format cannot represent is an error if pictures would no longer match their cameras, and a
+//! warning otherwise.
 
 use super::colmap;
+use super::folder::is_hidden;
 use super::frame::LensModel;
 use super::view::{Capture, Split, View, ViewMask};
 use super::{every_eighth, up};
@@ -14,6 +16,7 @@ use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// A format that cameras can be written in.
@@ -73,23 +76,53 @@ enum Content<'v> {
 }
 
 impl Content<'_> {
+    fn bytes(&self, target: &Path) -> Result<Vec<u8>> {
+        Ok(match self {
+            Content::File(from) => io::read_maybe_empty(from, &Limits::default())?,
+            Content::Mask(from, size) => {
+                io::png_gray_bytes(&io::read_gray(from, Some(*size), &Limits::default())?, target)?
+            }
+            Content::Bytes(bytes) => bytes.clone(),
+        })
+    }
+
     fn write(&self, target: &Path) -> Result<()> {
         if let Some(folder) = target.parent() {
             io::create_folder(folder)?;
         }
         match self {
             Content::File(from) => io::copy(from, target)?,
-            Content::Mask(from, size) => {
-                let mask = io::read_gray(from, Some(*size), &Limits::default())?;
-                io::write_atomic(target, &io::png_gray_bytes(&mask, target)?)?;
-            }
+            Content::Mask(..) => io::write_atomic(target, &self.bytes(target)?)?,
             Content::Bytes(bytes) => io::write_atomic(target, bytes)?,
         }
         Ok(())
     }
 }
 
-/// Writes `capture` into `folder`, which must be new or empty. Photographs and masks are copied.
+/// Files to write, by their paths.
+type Contents<'v> = Vec<(PathBuf, Content<'v>)>;
+
+/// Returns whether a folder contains nothing but files of an unfinished conversion: `contents` but for the last one.
+fn is_unfinished(folder: &Path, contents: &Contents) -> Result<bool> {
+    let Some((_, written)) = contents.split_last() else { return Ok(false) };
+    let targets: BTreeSet<&Path> = written.iter().map(|(target, _)| target.as_path()).collect();
+    // the first other file is enough: a large folder is not read to its end
+    if io::any_file(folder, &|path| targets.contains(path) || is_hidden(path))?.is_some() {
+        return Ok(false);
+    }
+    for (target, content) in written.iter().filter(|(target, _)| io::exists(target)) {
+        let is_same = || -> Result<bool> {
+            Ok(io::read_maybe_empty(target, &Limits::default())? == content.bytes(target)?)
+        };
+        if !io::is_file(target) || !is_same()? {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// Writes `capture` into `folder`, which must be new, empty, or left by a killed process that wrote the same. Photographs
+/// and masks are copied.
 ///
 /// # Errors
 ///
@@ -102,11 +135,12 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
             "convert with `--set capture.downscale=1`, which copies photographs unchanged",
         ));
     }
-    let is_empty =
-        || Ok::<_, Error>(io::list_files(folder)?.is_empty() && io::list_folders(folder)?.is_empty());
-    if io::exists(folder) && !(io::is_folder(folder) && is_empty()?) {
+    let exists = || {
         let message = format!("`{}` already exists", folder.display());
-        return Err(Error::cannot(message, "name a new folder: nothing is overwritten"));
+        Error::cannot(message, "name a new folder: nothing is overwritten")
+    };
+    if io::exists(folder) && !io::is_folder(folder) {
+        return Err(exists());
     }
     let mut out = Conversion { folder: folder.into(), views: capture.views.len(), ..Conversion::default() };
     let places = places(capture, to)?;
@@ -127,19 +161,42 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
         CameraFormat::Transforms => transforms(capture, &places, named_splits)?,
         CameraFormat::Colmap => sparse(capture, &places, named_splits, &mut out.warnings)?,
     };
-    out.masks = copy_pictures(capture, &places, folder)?;
     // the camera files come last, so that a folder with camera files is complete
-    let write = |(name, bytes): (String, Vec<u8>)| Content::Bytes(bytes).write(&folder.join(name));
-    files.into_iter().try_for_each(write)?;
+    let mut contents = pictures(capture, &places, folder)?;
+    out.masks = contents.1;
+    contents.0.extend(files.into_iter().map(|(name, bytes)| (folder.join(name), Content::Bytes(bytes))));
+    let contents = contents.0;
+    if io::is_folder(folder) {
+        if !is_unfinished(folder, &contents)? {
+            return Err(exists());
+        }
+        let folders: BTreeSet<&Path> = contents.iter().filter_map(|(target, _)| target.parent()).collect();
+        for inner in folders.into_iter().filter(|inner| io::is_folder(inner)) {
+            io::remove_leftovers(inner, |_, pid| io::has_ended(pid))?;
+        }
+    }
+    for (target, content) in contents.iter().filter(|(target, _)| !io::is_file(target)) {
+        content.write(target)?;
+    }
     Ok(out)
 }
 
-/// Copies photographs and masks as COLMAP names them, and returns the photographs' names below `images/`, in the order of
-/// the views.
-pub(super) fn copy_for_colmap(capture: &Capture, folder: &Path) -> Result<Vec<String>> {
+/// Copies photographs and masks as COLMAP names them.
+pub(super) fn copy_for_colmap(capture: &Capture, folder: &Path) -> Result<()> {
+    let (contents, _) = pictures(capture, &places(capture, CameraFormat::Colmap)?, folder)?;
+    contents.iter().try_for_each(|(target, content)| content.write(target))
+}
+
+/// Returns the photographs' names below `images/` as COLMAP has them, in the order of the views,
+/// and all files that [`copy_for_colmap`] writes.
+pub(super) fn names_for_colmap(capture: &Capture) -> Result<(Vec<String>, Vec<String>)> {
     let places = places(capture, CameraFormat::Colmap)?;
-    copy_pictures(capture, &places, folder)?;
-    Ok(places.into_iter().map(|place| place.name).collect())
+    let files = places.iter().flat_map(|place| {
+        let beside = [&place.mask, &place.valid, &place.region].into_iter().flatten();
+        [&place.photo].into_iter().chain(beside).cloned()
+    });
+    let files = files.collect();
+    Ok((places.into_iter().map(|place| place.name).collect(), files))
 }
 
 /// Returns where the pictures of each view go.
@@ -154,10 +211,10 @@ fn places(capture: &Capture, to: CameraFormat) -> Result<Vec<ViewFiles<'_>>> {
     Ok(places)
 }
 
-/// Copies photographs, masks and regions; returns the number of head masks.
-fn copy_pictures(capture: &Capture, places: &[ViewFiles], folder: &Path) -> Result<usize> {
+/// Returns photographs, masks and regions as they are copied to a folder, and the number of head masks.
+fn pictures<'v>(capture: &Capture, places: &[ViewFiles<'v>], folder: &Path) -> Result<(Contents<'v>, usize)> {
     let mut masks = 0;
-    let mut contents: Vec<(PathBuf, Content)> = Vec::new();
+    let mut contents: Contents = Vec::new();
     // a link may point to anything: only pictures are copied
     capture.views.par_iter().try_for_each(|view| {
         if view.valid.is_some() || matches!(view.mask, ViewMask::File(_)) {
@@ -170,21 +227,21 @@ fn copy_pictures(capture: &Capture, places: &[ViewFiles], folder: &Path) -> Resu
         .map_err(Error::from)
     })?;
     for place in places {
+        let view: &'v View = place.view;
         let mut put = |name: &str, content| contents.push((folder.join(name), content));
-        put(&place.photo, Content::File(&place.view.photo));
-        if let (ViewMask::File(from), Some(name)) = (&place.view.mask, &place.mask) {
+        put(&place.photo, Content::File(&view.photo));
+        if let (ViewMask::File(from), Some(name)) = (&view.mask, &place.mask) {
             let is_png = from.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
-            put(name, if is_png { Content::File(from) } else { Content::Mask(from, place.view.photo_size) });
+            put(name, if is_png { Content::File(from) } else { Content::Mask(from, view.photo_size) });
             masks += 1;
         }
-        for (from, name) in [(&place.view.valid, &place.valid), (&place.view.region, &place.region)] {
+        for (from, name) in [(&view.valid, &place.valid), (&view.region, &place.region)] {
             if let (Some(from), Some(name)) = (from, name) {
                 put(name, Content::File(from));
             }
         }
     }
-    contents.iter().try_for_each(|(target, content)| content.write(target))?;
-    Ok(masks)
+    Ok((contents, masks))
 }
 
 fn place(view: &View, to: CameraFormat) -> ViewFiles<'_> {

@@ -164,6 +164,26 @@ const READABLE_FORMATS: usize = 3;
 /// Usual folders of photographs.
 const IMAGE_FOLDERS: [&str; 5] = ["images", "image", "input", "rgb", "photos"];
 
+/// Returns whether a folder's name says nothing of what its photographs show.
+pub(super) fn is_common_name(name: &str) -> bool {
+    let others = [
+        "imgs",
+        "img",
+        "photo",
+        "photographs",
+        "pictures",
+        "pics",
+        "frames",
+        "color",
+        "png",
+        "jpg",
+        "jpeg",
+        "raw",
+        "dcim",
+    ];
+    IMAGE_FOLDERS.iter().chain(&others).any(|common| common.eq_ignore_ascii_case(name))
+}
+
 /// The entries of a folder.
 pub(super) struct FolderEntries {
     pub root: PathBuf,
@@ -225,6 +245,26 @@ pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
     let endings = if can_be_read { &PHOTOGRAPHS[..READABLE_FORMATS] } else { &PHOTOGRAPHS };
     files.retain(|f| has_ending(f, endings));
     Ok(files)
+}
+
+/// Returns the pictures in a folder that no view can be named after: hidden files, and names with
+/// the separator of Windows. What macOS keeps beside files on foreign disks (`._NAME`) is none.
+pub(super) fn unnameable(folder: &Path) -> Result<Vec<String>, ReadError> {
+    let mut names = io::list_hidden(folder)?;
+    names.retain(|name| !name.starts_with("._"));
+    names.extend(io::list_files(folder)?.into_iter().filter(|name| !is_nameable(name)));
+    names.retain(|name| has_ending(name, &PHOTOGRAPHS));
+    Ok(names)
+}
+
+/// Returns whether a file or folder is hidden by its name.
+pub(super) fn is_hidden(path: &Path) -> bool {
+    path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
+}
+
+/// Returns whether a file's name is read as one name, not as folders in the manner of Windows.
+pub(super) fn is_nameable(name: &str) -> bool {
+    !name.contains('\\')
 }
 
 /// Returns whether a name has one of these endings, ignoring case.

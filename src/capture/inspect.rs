@@ -353,7 +353,7 @@ impl fmt::Display for Inspection {
             writeln!(f, "  head      {text}")?;
         }
         if let Some([units, metres]) = self.height {
-            writeln!(f, "            {units:.3} units high: {metres:.3} m")?;
+            writeln!(f, "            by the masks {units:.3} units high: {metres:.3} m")?;
         }
         for warning in &self.warnings {
             writeln!(f, "  warning   {warning}")?;

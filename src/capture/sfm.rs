@@ -1,35 +1,38 @@
 //! Cameras of photographs that have none: structure from motion by COLMAP (Schönberger, Frahm 2016), a program that is
 //! installed beside this one.
 //!
-//! Photographs, or the sharpest frames of a video, are copied to `OUT/images/`, with masks to `OUT/masks/`; COLMAP works in
-//! `OUT/colmap/`, where its log stays, and the model is renamed to `OUT/sparse/0` at last, so that a folder that has it is
-//! complete. Features are searched inside the head masks where there are any: behind a turntable the background moves
-//! otherwise than the head. Where fewer than 80 % of the photographs are registered, a second attempt accepts weak
-//! features as well, which smooth skin has more of, and a third one searches the whole photographs.
+//! Photographs, or the sharpest frames of a video, are copied to `OUT/images/`, with masks to
+//! `OUT/masks/`; COLMAP works in `OUT/colmap/`, where its log stays. The model is opened as a
+//! capture is, and renamed to `OUT/sparse/0` at last, so that a folder that has it is complete.
+//! Features are searched inside the head masks where there are any: behind a turntable the
+//! background moves otherwise than the head. Where fewer than 80 % of the photographs are
+//! registered, a second attempt accepts weak features as well, which smooth skin has more of, and a
+//! third one searches the whole photographs.
 //!
 //! The mapper fits one coefficient of distortion, because few views cannot tell more. A lens that all photographs share is
 //! then refined as OPENCV's model with its principal point where that is observable: a wide lens and many points.
 
-use super::colmap::Found;
-use super::folder::{CaptureFolder, FolderEntries, photographs};
+use super::colmap::{self, Found, ModelFiles};
+use super::folder::{CaptureFolder, FolderEntries, is_common_name, is_nameable, photographs, unnameable};
 use super::format::{self, CameraFiles};
 use super::frame::{CameraFrame, Intrinsics, Listing};
 use super::masks::few;
 use super::view::{Capture, CaptureOptions, ViewMask};
-use super::{build, convert};
+use super::{MaskSource, build, convert};
+use crate::error::counted;
 use crate::image::Photo;
-use crate::io::{self, Limits, Program, VideoFrames};
+use crate::io::{self, Limits, Lock, Program, ProgramFailure, VideoFrames};
+use crate::run::Fingerprint;
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
+use output::{LOG, NAMES, OPTIONS, Output, PHOTOGRAPHS, Request};
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::collections::HashSet;
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
-/// File of the programs' messages. It marks a folder as an attempt of ours, whose pictures the next attempt clears, so its name
-/// is not one that other programs use.
-const LOG: &str = "tiface_cameras.log";
+mod output;
 
 /// Fewest photographs that a capture can have.
 const MIN_VIEWS: usize = 8;
@@ -51,6 +54,13 @@ const OBSERVABLE: (usize, usize, f64) = (20, 300, 1.5);
 /// How far refinement may move focal length and principal point to be believed, as a share of the longest side.
 const MAX_MOVE: f64 = 0.05;
 
+/// Bytes of COLMAP's database for a picture: 8192 features of 128 bytes, and six numbers for where
+/// each is.
+const PICTURE_BYTES: u64 = 8192 * (128 + 24);
+
+/// Bytes of the database for two pictures that are matched, on average.
+const PAIR_BYTES: u64 = 2 << 10;
+
 const INSTALL_COLMAP: &str = "install COLMAP: `apt-get install colmap` on Debian and Ubuntu, `brew install colmap` on macOS; on \
                               Windows, unpack the release from https://github.com/colmap/colmap/releases and add its folder \
                               to PATH";
@@ -59,6 +69,10 @@ const INSTALL_GLOMAP: &str = "leave out `--glomap`, or install GLOMAP: https://g
 
 const INSTALL_FFMPEG: &str = "install FFmpeg: `apt-get install ffmpeg` on Debian and Ubuntu, `brew install ffmpeg` on macOS, \
                               `winget install ffmpeg` on Windows";
+
+/// Advice where COLMAP ended otherwise than it should.
+const READ_LOG: &str = "the end of the log says why; if memory ran out, set RAYON_NUM_THREADS=1, which is COLMAP's number of \
+                        threads as well, or reduce the photographs";
 
 /// Advice where too few photographs were registered.
 const MORE_OVERLAP: &str = "photograph the head again, sharply and in even light, from all sides with 10° to 15° between \
@@ -81,7 +95,7 @@ pub struct SfmOptions<'a> {
 }
 
 /// Cameras that were found.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Solution {
     /// The new capture.
     pub folder: PathBuf,
@@ -99,67 +113,216 @@ pub struct Solution {
     pub warnings: Vec<String>,
 }
 
-/// Finds the cameras of a folder of photographs, and leaves a capture.
-///
-/// # Errors
-///
-/// Fails without COLMAP, if the folder has cameras or a picture cannot be read, if something finished would be overwritten,
-/// and if fewer than half of the photographs, or fewer than eight, are registered.
-pub fn from_photographs(root: &Path, options: &CaptureOptions, sfm: &SfmOptions) -> Result<Solution> {
-    let options = CaptureOptions { downscale: 1, ..options.clone() };
-    let capture = without_cameras(root, &options)?;
-    let lens = |view: &super::View| {
-        let info = io::picture_info(&view.photo, &sfm.limits)?;
-        Ok(((info.width, info.height), info.focal))
+/// Returns the folder of the new capture where none is named: that of the photographs with
+/// `_cameras`, or the nearest above it whose name is not one that all captures give their
+/// photographs; of a video, its name.
+pub fn default_folder(from: &Path, is_video: bool) -> PathBuf {
+    let above = from.components().rev().map_while(|part| match part {
+        Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
+        _ => None,
+    });
+    let name = match is_video {
+        true => from.file_stem().map(|stem| stem.to_string_lossy().into_owned()),
+        false => above.clone().find(|name| !is_common_name(name)).or(above.clone().next()),
     };
-    let lenses = capture.views.iter().map(lens).collect::<Result<HashSet<_>>>()?;
-    let limits = &sfm.limits;
-    // everything is read once before the long work, and before anything is written
-    capture.views.par_iter().try_for_each(|view| view.load(limits).map(drop))?;
-    let programs = Programs::find(sfm)?;
-    let masks = prepare(sfm, root)?.join("masks");
-    let names = convert::copy_for_colmap(&capture, &sfm.out)?;
-    // COLMAP ignores what is black: half transparent hair is the head's outline, which shows the background as well
-    capture.views.par_iter().zip(&names).try_for_each(|(view, name)| -> Result<()> {
-        let Some(mut mask) = view.load_mask(limits)? else { return Ok(()) };
-        mask.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
-        io::create_folder(&masks)?;
-        Ok(io::write_png_gray(&masks.join(format!("{name}.png")), &mask)?)
-    })?;
-    let masked = capture.views.iter().any(|view| view.mask != ViewMask::None);
-    let shared = lenses.len() == 1 && !sfm.lens_each;
-    Work { sfm, programs, names, shared, masked, is_video: false }.solve()
+    format!("{}_cameras", name.as_deref().unwrap_or("capture")).into()
 }
 
-/// Finds the cameras of the sharpest of each `every` frames of a video, and leaves a capture of these frames.
-///
-/// # Errors
-///
-/// As [`from_photographs`], and without FFmpeg.
-pub fn from_video(video: &Path, every: usize, sfm: &SfmOptions) -> Result<Solution> {
-    if !io::is_file(video) {
-        return Err(Error::cannot(format!("there is no video `{}`", video.display()), "check the path"));
+/// A search for cameras that can begin: what may refuse it has been asked, and nothing has been
+/// written.
+pub struct Search<'a> {
+    sfm: &'a SfmOptions<'a>,
+    request: Request,
+    work: Planned,
+}
+
+/// What a search has to do.
+enum Planned {
+    /// Nothing: the output folder has the result.
+    Nothing(Solution),
+    Photographs {
+        capture: Capture,
+        names: Vec<String>,
+        files: Vec<String>,
+        shared: bool,
+        programs: Programs,
+    },
+    Video {
+        video: PathBuf,
+        every: usize,
+        ffmpeg: PathBuf,
+        programs: Programs,
+    },
+}
+
+impl<'a> Search<'a> {
+    /// Plans to find the cameras of a folder of photographs. Every photograph is read.
+    ///
+    /// # Errors
+    ///
+    /// Fails without COLMAP, if the folder has cameras or a picture cannot be read, if something
+    /// would be overwritten, if the disk has too little room, and with
+    /// [`ErrorKind::NotNow`](crate::ErrorKind::NotNow) if another search works in the output
+    /// folder.
+    pub fn of_photographs(root: &Path, options: &CaptureOptions, sfm: &'a SfmOptions) -> Result<Search<'a>> {
+        let options = CaptureOptions { downscale: 1, ..options.clone() };
+        let capture = without_cameras(root, &options)?;
+        let limits = &sfm.limits;
+        let lens = |view: &super::View| {
+            let info = io::picture_info(&view.photo, limits)?;
+            Ok(((info.width, info.height), info.focal))
+        };
+        let lenses = capture.views.iter().map(lens).collect::<Result<HashSet<_>>>()?;
+        let shared = lenses.len() == 1 && !sfm.lens_each;
+        // everything is read once before the long work, and before anything is written
+        let digests = capture.views.par_iter().map(|view| {
+            view.load(limits)?;
+            let mask = match &view.mask {
+                ViewMask::File(file) => Fingerprint::of_file(file)?,
+                own => format!("{own:?}"),
+            };
+            Ok((format!("{} {}", view.name, Fingerprint::of_file(&view.photo)?), mask))
+        });
+        let (photographs, masks): (Vec<_>, Vec<_>) = digests.collect::<Result<Vec<_>>>()?.into_iter().unzip();
+        let digest = |parts: Vec<String>| Fingerprint::of_bytes(parts.join("\n").as_bytes());
+        let fingerprint = asked(sfm).input(PHOTOGRAPHS, digest(photographs)).input("masks", digest(masks));
+        let (output, request) = (Output::of(sfm), Request { source: io::real_path(root)?, fingerprint });
+        if let Some(solution) = output.result_of(&request, None)? {
+            return Ok(Search { sfm, request, work: Planned::Nothing(solution) });
+        }
+        let programs = Programs::find(sfm)?;
+        let (names, files) = convert::names_for_colmap(&capture)?;
+        let copied: u64 = capture.views.iter().filter_map(|view| io::file_size(&view.photo)).sum();
+        output.require_room(copied + database_bytes(names.len(), false))?;
+        Ok(Search { sfm, request, work: Planned::Photographs { capture, names, files, shared, programs } })
     }
-    let missing = || Error::cannot("`ffmpeg` is not installed", INSTALL_FFMPEG);
-    let ffmpeg = io::find_program("ffmpeg").ok_or_else(missing)?;
-    let programs = Programs::find(sfm)?;
-    let log = prepare(sfm, video)?.join(LOG);
+
+    /// Plans to find the cameras of the sharpest of each `every` frames of a video.
+    ///
+    /// # Errors
+    ///
+    /// As [`Search::of_photographs`], and without FFmpeg.
+    pub fn of_video(video: &Path, every: usize, sfm: &'a SfmOptions) -> Result<Search<'a>> {
+        if !io::is_file(video) {
+            return Err(Error::cannot(format!("there is no video `{}`", video.display()), "check the path"));
+        }
+        let fingerprint = asked(sfm).setting("every", every).input(PHOTOGRAPHS, Fingerprint::of_file(video)?);
+        let request = Request { source: io::real_path(video)?, fingerprint };
+        if let Some(solution) = Output::of(sfm).result_of(&request, None)? {
+            return Ok(Search { sfm, request, work: Planned::Nothing(solution) });
+        }
+        let missing = || Error::cannot("`ffmpeg` is not installed", INSTALL_FFMPEG);
+        let ffmpeg = io::find_program("ffmpeg").ok_or_else(missing)?;
+        let programs = Programs::find(sfm)?;
+        Output::of(sfm).require_room(database_bytes(MIN_VIEWS, true))?;
+        Ok(Search { sfm, request, work: Planned::Video { video: video.into(), every, ffmpeg, programs } })
+    }
+
+    /// Returns whether the cameras have been found before.
+    pub fn is_done(&self) -> bool {
+        matches!(self.work, Planned::Nothing(_))
+    }
+
+    /// Finds the cameras, and leaves a capture; if the search [is done](Self::is_done), returns what
+    /// was found before.
+    ///
+    /// # Errors
+    ///
+    /// Fails if a program does, if fewer than half of the photographs, or fewer than eight, are
+    /// registered, and as the functions that plan it.
+    pub fn run(self) -> Result<Solution> {
+        let Search { sfm, request, work } = self;
+        let output = Output::of(sfm);
+        if let Planned::Nothing(solution) = work {
+            return Ok(solution);
+        }
+        let (lock, found) = output.begin(&request)?;
+        if let Some(solution) = found {
+            return Ok(solution);
+        }
+        match work {
+            Planned::Nothing(solution) => Ok(solution),
+            Planned::Photographs { capture, names, files, shared, programs } => {
+                let masked = copy_photographs(sfm, &output, &capture, &names, files)?;
+                let (warnings, is_video) = (capture.warnings, false);
+                Work { sfm, output, request, lock, programs, names, warnings, shared, masked, is_video }
+                    .solve()
+            }
+            Planned::Video { video, every, ffmpeg, programs } => {
+                let names = copy_frames(sfm, &output, &lock, &ffmpeg, &video, every)?;
+                let (shared, masked, is_video) = (!sfm.lens_each, false, true);
+                let warnings = Vec::new();
+                Work { sfm, output, request, lock, programs, names, warnings, shared, masked, is_video }
+                    .solve()
+            }
+        }
+    }
+}
+
+/// Returns the fingerprint of the options.
+fn asked(sfm: &SfmOptions) -> Fingerprint {
+    Fingerprint::default().setting("lens_each", sfm.lens_each).setting("glomap", sfm.glomap)
+}
+
+/// Returns about how many bytes COLMAP's database of these pictures has.
+fn database_bytes(pictures: usize, is_video: bool) -> u64 {
+    let n = pictures as u64;
+    let pairs = if is_video && pictures > MAX_EXHAUSTIVE { 20 * n } else { n * n / 2 };
+    n * PICTURE_BYTES + pairs * PAIR_BYTES
+}
+
+/// Copies photographs, and masks for the capture and for COLMAP; returns whether there are masks.
+fn copy_photographs(
+    sfm: &SfmOptions,
+    output: &Output,
+    capture: &Capture,
+    names: &[String],
+    mut files: Vec<String>,
+) -> Result<bool> {
+    let is_masked = |view: &super::View| view.mask != ViewMask::None;
+    let masked = capture.views.iter().zip(names).filter(|(view, _)| is_masked(view));
+    files.extend(masked.map(|(_, name)| format!("colmap/masks/{name}.png")));
+    output.list(&files)?;
+    convert::copy_for_colmap(capture, &sfm.out)?;
+    let limits = &sfm.limits;
+    // COLMAP ignores what is black: half transparent hair is the head's outline, which shows the background as well
+    capture.views.par_iter().zip(names).try_for_each(|(view, name)| -> Result<()> {
+        let Some(mut mask) = view.load_mask(limits)? else { return Ok(()) };
+        mask.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
+        let file = output.work(&format!("masks/{name}.png"));
+        file.parent().map_or(Ok(()), io::create_folder)?;
+        Ok(io::write_png_gray(&file, &mask)?)
+    })?;
+    Ok(capture.views.iter().any(is_masked))
+}
+
+/// Writes the sharpest frames of a video, and returns their names.
+fn copy_frames(
+    sfm: &SfmOptions,
+    output: &Output,
+    lock: &Lock,
+    ffmpeg: &Path,
+    video: &Path,
+    every: usize,
+) -> Result<Vec<String>> {
     let images = sfm.out.join("images");
     io::create_folder(&images)?;
     (sfm.say)(&format!("ffmpeg decodes `{}`", video.display()));
     let mut names = Vec::new();
-    sharpest(VideoFrames::open(&ffmpeg, video, &log, &sfm.limits)?, every, |number, frame| {
+    let frames = VideoFrames::open(ffmpeg, video, &output.work(LOG), lock, &sfm.limits)?;
+    sharpest(frames, every, |number, frame| {
         if (sfm.stop)() {
             return Err(Error::stopped("before its end").with_hint(""));
         }
         let name = format!("{number:06}.png");
+        output.list(&[format!("images/{name}")])?;
         io::write_png_rgb(&images.join(&name), frame.width, frame.height, &frame.rgb)?;
         names.push(name);
         Ok(())
     })?;
     (sfm.say)(&format!("{} frames, the sharpest of each {every}", names.len()));
     require_enough(names.len(), video, "choose a smaller `--every`")?;
-    Work { sfm, programs, names, shared: !sfm.lens_each, masked: false, is_video: true }.solve()
+    Ok(names)
 }
 
 /// Hands on the sharpest of each `every` frames, with its number, and that of those left over at the end.
@@ -213,9 +376,18 @@ fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
         )
     };
     let inside = FolderEntries::of(root).photographs().ok_or_else(none)?;
-    let names = photographs(&inside)?;
-    require_enough(names.len(), root, MORE_OVERLAP)?;
-    let mut listing = Listing::default();
+    let mut names = photographs(&inside)?;
+    names.retain(|name| is_nameable(name));
+    let unnameable = unnameable(&inside)?;
+    let unnameable = (!unnameable.is_empty()).then(|| {
+        let (count, names) = (counted(unnameable.len(), "photograph"), few(&unnameable));
+        format!("{count} left out, whose name begins with a dot or has `\\` in it: {names}; rename what is to be used")
+    });
+    require_enough(names.len(), root, MORE_OVERLAP).map_err(|e| match &unnameable {
+        Some(text) => Error::cannot(format!("{e}; {text}"), e.hint()),
+        None => e,
+    })?;
+    let mut listing = Listing { warnings: Vec::from_iter(unnameable), ..Listing::default() };
     let base = inside.strip_prefix(root).unwrap_or(Path::new(""));
     let lens = Intrinsics { focal: [Some(1.0); 2], ..Intrinsics::default() };
     let pose = (DMat3::IDENTITY, DVec3::ZERO);
@@ -241,28 +413,6 @@ fn require_enough(found: usize, place: &Path, hint: &str) -> Result<()> {
     ))
 }
 
-/// Creates the output folder, clears what an unfinished attempt left in it, and returns the folder that COLMAP works in.
-fn prepare(sfm: &SfmOptions, from: &Path) -> Result<PathBuf> {
-    let work = sfm.out.join("colmap");
-    if io::exists(&sfm.out) {
-        let is_inside = io::real_path(from)?.starts_with(io::real_path(&sfm.out)?);
-        let is_empty = io::is_folder(&sfm.out)
-            && io::list_files(&sfm.out)?.is_empty()
-            && io::list_folders(&sfm.out)?.is_empty();
-        let is_unfinished = io::is_file(&work.join(LOG)) && !io::exists(&sfm.out.join("sparse/0"));
-        if is_inside || !is_empty && !is_unfinished {
-            let message = format!("`{}` already exists", sfm.out.display());
-            return Err(Error::cannot(message, "name a new folder with `--out`: nothing is overwritten"));
-        }
-        for folder in ["colmap", "images", "masks", "valid", "face_masks"] {
-            io::clear_folder(&sfm.out.join(folder), "", &|_| false)?;
-        }
-    }
-    io::create_folder(&work)?;
-    io::write_atomic(&work.join(LOG), b"")?;
-    Ok(work)
-}
-
 /// The programs that find cameras.
 struct Programs {
     colmap: PathBuf,
@@ -278,6 +428,12 @@ impl Programs {
         let glomap = sfm.glomap.then(|| find("glomap", INSTALL_GLOMAP)).transpose()?;
         Ok(Programs { colmap, glomap })
     }
+}
+
+/// Returns the error of a program's command that failed.
+fn failed_command(program: &str, arguments: &[OsString], failure: &ProgramFailure, log: &Path) -> Error {
+    let (command, status, log) = (arguments[0].to_string_lossy(), &failure.status, log.display());
+    Error::cannot(format!("`{program} {command}` failed ({status}); its log is `{log}`"), READ_LOG)
 }
 
 /// What an attempt does differently from others.
@@ -296,13 +452,20 @@ struct Model {
     found: Found,
     /// How many models there are.
     pieces: usize,
+    /// Models that cannot be read.
+    unreadable: Vec<Error>,
 }
 
 /// Photographs in the output folder whose cameras are being found.
 struct Work<'a> {
     sfm: &'a SfmOptions<'a>,
+    output: Output<'a>,
+    request: Request,
+    lock: Lock,
     programs: Programs,
     names: Vec<String>,
+    /// What a user should know of the photographs.
+    warnings: Vec<String>,
     /// All photographs are by one lens.
     shared: bool,
     masked: bool,
@@ -310,30 +473,23 @@ struct Work<'a> {
 }
 
 impl Work<'_> {
-    fn folder(&self, name: &str) -> PathBuf {
-        self.sfm.out.join("colmap").join(name)
-    }
-
-    /// Shows a command as a user would type it, and runs it; returns what is wrong with its end, if anything.
-    fn run(&self, program: &Path, arguments: &[OsString], log: &Path) -> Result<Option<String>> {
+    /// Shows a command as a user would type it, and runs it; returns how it failed, if it did.
+    fn run(&self, program: &Path, arguments: &[OsString], log: &Path) -> Result<Option<ProgramFailure>> {
         let words: Vec<_> = arguments.iter().map(|word| word.to_string_lossy()).collect();
         let name = program.file_stem().unwrap_or_default().to_string_lossy();
         (self.sfm.say)(&format!("{name} {}", words.join(" ")));
-        Program::start(program, arguments, log, false)?.wait(self.sfm.stop)
+        Program::start(program, arguments, log, &self.lock, false)?.wait(self.sfm.stop)
     }
 
     /// Runs a command of COLMAP that has to succeed.
     fn require(&self, arguments: &[OsString], log: &Path) -> Result<()> {
-        let Some(wrong) = self.run(&self.programs.colmap, arguments, log)? else { return Ok(()) };
-        let (command, log) = (arguments[0].to_string_lossy(), log.display());
-        let hint = "the end of the log says why; if memory ran out, set RAYON_NUM_THREADS=1, which is COLMAP's number of \
-                    threads as well, or reduce the photographs";
-        Err(Error::cannot(format!("`colmap {command}` failed ({wrong}); its log is `{log}`"), hint))
+        let failed = self.run(&self.programs.colmap, arguments, log)?;
+        failed.map_or(Ok(()), |failure| Err(failed_command("colmap", arguments, &failure, log)))
     }
 
     /// Returns whether COLMAP names options as since 3.13, which moved some from `Sift…` to `Feature…`.
     fn has_new_names(&self) -> Result<bool> {
-        let help = self.folder("options.txt");
+        let help = self.output.work(OPTIONS);
         self.require(&["feature_extractor".into(), "-h".into()], &help)?;
         let text = io::read_maybe_empty(&help, &self.sfm.limits)?;
         Ok(String::from_utf8_lossy(&text).contains("FeatureExtraction.use_gpu"))
@@ -346,21 +502,28 @@ impl Work<'_> {
         let kind = if new_names { "Feature" } else { "Sift" };
         let on_cpu = |task: &str| format!("--{kind}{task}.use_gpu 0 --{kind}{task}.num_threads {threads}");
         let [database, models] = ["database.db", "models"].map(|name| folder.join(name));
-        let (images, masks) = (self.sfm.out.join("images"), self.folder("masks"));
+        let (images, masks) = (self.sfm.out.join("images"), self.output.work("masks"));
+        let listed = self.output.work(NAMES);
         let command = |name: &str, paths: &[(&str, &Path)], words: String| -> Vec<OsString> {
             let paths = paths.iter().flat_map(|(option, path)| [OsString::from(option), path.into()]);
             let words = words.split_whitespace().map(OsString::from);
             [name.into()].into_iter().chain(paths).chain(words).collect()
         };
         let database: (&str, &Path) = ("--database_path", &database);
-        let paths = [database, ("--image_path", &images), ("--ImageReader.mask_path", &masks)];
+        let paths = [database, ("--image_path", &images)];
+        let read = [
+            (masked, ("--ImageReader.mask_path", masks.as_path())),
+            (io::is_file(&listed), ("--image_list_path", listed.as_path())),
+        ];
+        let read = read.into_iter().filter_map(|(is_given, path)| is_given.then_some(path));
+        let read: Vec<(&str, &Path)> = paths.into_iter().chain(read).collect();
         let mut words = on_cpu("Extraction") + " --ImageReader.camera_model SIMPLE_RADIAL";
         words += if self.shared { " --ImageReader.single_camera 1" } else { "" };
         if weak {
             words += " --SiftExtraction.peak_threshold 0.002 --SiftExtraction.estimate_affine_shape 1 \
                       --SiftExtraction.domain_size_pooling 1";
         }
-        let extractor = command("feature_extractor", &paths[..if masked { 3 } else { 2 }], words);
+        let extractor = command("feature_extractor", &read, words);
         let is_long = self.is_video && self.names.len() > MAX_EXHAUSTIVE;
         let matcher = if is_long { "sequential_matcher" } else { "exhaustive_matcher" };
         let guided = if weak { format!(" --{kind}Matching.guided_matching 1") } else { String::new() };
@@ -373,27 +536,49 @@ impl Work<'_> {
 
     /// Returns the largest model that an attempt finds.
     fn attempt(&self, attempt: Attempt, new_names: bool) -> Result<Option<Model>> {
-        let folder = self.folder(match attempt {
+        let folder = self.output.work(match attempt {
             Attempt { weak: false, .. } => "1",
             Attempt { masked, .. } if masked == self.masked => "2",
             _ => "3",
         });
-        let (log, models) = (self.folder(LOG), folder.join("models"));
+        let (log, models) = (self.output.work(LOG), folder.join("models"));
+        self.output.require_room(database_bytes(self.names.len(), self.is_video))?;
         io::create_folder(&models)?;
         let [extractor, matcher, mapper] = self.arguments(attempt, &folder, new_names);
         self.require(&extractor, &log)?;
         self.require(&matcher, &log)?;
-        // a mapper that finds no model fails as well
-        self.run(self.programs.glomap.as_ref().unwrap_or(&self.programs.colmap), &mapper, &log)?;
-        let folders = io::list_folders(&models)?;
-        let all = folders.iter().map(|folder| Ok((folder, Found::read(folder, &self.sfm.limits)?)));
-        let all = all.collect::<Result<Vec<_>>>()?;
-        let pieces = all.len();
-        let best = all.into_iter().rev().max_by_key(|(_, found)| found.names.len());
-        Ok(best.map(|(folder, found)| Model { attempt, folder: folder.clone(), found, pieces }))
+        // a mapper that finds no model fails as well, but ends itself
+        let program = self.programs.glomap.as_ref().unwrap_or(&self.programs.colmap);
+        let crash = self.run(program, &mapper, &log)?.filter(|failure| failure.is_crash);
+        let names: HashSet<&String> = self.names.iter().collect();
+        let (mut best, mut pieces, mut unreadable) = (None::<(PathBuf, Found)>, 0, Vec::new());
+        for folder in io::list_folders(&models)? {
+            match Found::read(&folder, &self.sfm.limits) {
+                Ok(mut found) => {
+                    found.names.retain(|name| names.contains(name));
+                    pieces += 1;
+                    if best.as_ref().is_none_or(|(_, other)| found.names.len() > other.names.len()) {
+                        best = Some((folder, found));
+                    }
+                }
+                Err(problem) => unreadable.push(problem),
+            }
+        }
+        let enough = |found: &Found| found.names.len() as f64 >= ENOUGH * self.names.len() as f64;
+        if let Some(failure) = crash
+            && !best.as_ref().is_some_and(|(_, found)| enough(found))
+        {
+            let program = if self.programs.glomap.is_some() { "glomap" } else { "colmap" };
+            return Err(failed_command(program, &mapper, &failure, &log));
+        }
+        match best {
+            Some((folder, found)) => Ok(Some(Model { attempt, folder, found, pieces, unreadable })),
+            None => unreadable.into_iter().next().map_or(Ok(None), Err),
+        }
     }
 
     fn solve(self) -> Result<Solution> {
+        self.list_names()?;
         let new_names = self.has_new_names()?;
         let (n, masked) = (self.names.len(), self.masked);
         let mut attempts = vec![Attempt { masked, weak: false }, Attempt { masked, weak: true }];
@@ -401,7 +586,8 @@ impl Work<'_> {
             attempts.push(Attempt { masked: false, weak: true });
         }
         let registered = |model: &Option<Model>| model.as_ref().map_or(0, |m| m.found.names.len());
-        let mut best: Option<Model> = None;
+        let is_usable = |found: usize| found >= MIN_VIEWS && 2 * found >= n;
+        let (mut best, mut warnings) = (None::<Model>, self.warnings.clone());
         for attempt in attempts {
             if attempt.weak {
                 let how =
@@ -409,30 +595,45 @@ impl Work<'_> {
                 let found = registered(&best);
                 (self.sfm.say)(&format!("{found} of {n} photographs have a camera: once more, {how}"));
             }
-            let model = self.attempt(attempt, new_names)?;
-            if registered(&model) > registered(&best) {
-                best = model;
+            match self.attempt(attempt, new_names) {
+                Ok(model) if registered(&model) > registered(&best) => best = model,
+                Ok(_) => {}
+                // what an earlier attempt found counts, whatever becomes of another one
+                Err(e) if is_usable(registered(&best)) && !e.kind().is_stop() => {
+                    warnings.push(format!("another attempt failed: {e}"));
+                    break;
+                }
+                Err(e) => return Err(e),
             }
             if registered(&best) as f64 >= ENOUGH * n as f64 {
                 break;
             }
         }
         let found = registered(&best);
-        let Some(model) = best.filter(|_| found >= MIN_VIEWS && 2 * found >= n) else {
+        let Some(model) = best.filter(|_| is_usable(found)) else {
             let what = format!("COLMAP found cameras for {found} of {n} photographs");
-            let what = format!("{what}; its log is `{}`", self.folder(LOG).display());
+            let what = format!("{what}; its log is `{}`", self.output.work(LOG).display());
             return Err(Error::cannot(what, MORE_OVERLAP));
         };
-        self.finish(model)
+        self.finish(model, warnings)
+    }
+
+    /// Names the photographs to COLMAP where a user has put other pictures beside them.
+    fn list_names(&self) -> Result<()> {
+        let names: HashSet<&String> = self.names.iter().collect();
+        let inside = io::file_sizes(&self.sfm.out.join("images"), &|_| false)?;
+        if inside.keys().any(|name| !names.contains(name)) {
+            io::write_atomic(&self.output.work(NAMES), (self.names.join("\n") + "\n").as_bytes())?;
+        }
+        Ok(())
     }
 
     /// Refines the lens, and moves the model to where captures have it.
-    fn finish(&self, model: Model) -> Result<Solution> {
+    fn finish(&self, model: Model, mut warnings: Vec<String>) -> Result<Solution> {
         let n = self.names.len();
         let left_out: Vec<String> =
             self.names.iter().filter(|name| !model.found.names.contains(*name)).cloned().collect();
         let registered = n - left_out.len();
-        let mut warnings = Vec::new();
         let Found { error_px, .. } = model.found;
         if !left_out.is_empty() {
             let (names, left) = (few(&left_out), left_out.len());
@@ -442,6 +643,7 @@ impl Work<'_> {
             let text = "pieces that COLMAP could not join, of which the largest is used";
             warnings.push(format!("there are {} {text}", model.pieces));
         }
+        warnings.extend(model.unreadable.iter().map(|problem| format!("a piece is left out: {problem}")));
         if error_px > MAX_ERROR_PX {
             let text = "the photographs are blurred, or do not show one still head";
             warnings.push(format!("the mean reprojection error is {error_px:.1} pixels: {text}"));
@@ -450,10 +652,9 @@ impl Work<'_> {
             warnings.push("features of the background were used, too, so it must not have moved".into());
         }
         let refined = self.refined(&model)?.unwrap_or(model.folder);
-        io::create_folder(&self.sfm.out.join("sparse"))?;
-        io::rename(&refined, &self.sfm.out.join("sparse/0"))?;
-        io::clear_folder(&self.folder(""), LOG, &|_| false)?;
-        Ok(Solution {
+        io::rename(&refined, &self.output.work("model"))?;
+        self.open_model(registered, error_px)?;
+        let solution = Solution {
             folder: self.sfm.out.clone(),
             photographs: n,
             registered,
@@ -461,7 +662,34 @@ impl Work<'_> {
             error_px,
             masked: model.attempt.masked,
             warnings,
-        })
+        };
+        self.output.finish(&self.request, &solution)?;
+        Ok(solution)
+    }
+
+    /// Opens the model as `inspect` and `run` will: poses and lenses may be nonsense all the same.
+    fn open_model(&self, registered: usize, error_px: f64) -> Result<()> {
+        let limits = self.sfm.limits.clone();
+        let options = CaptureOptions { masks: MaskSource::None, limits, ..CaptureOptions::default() };
+        let folder = CaptureFolder::new(&self.sfm.out, &options)?;
+        let files = ModelFiles { folder: "colmap/model", ending: "bin" };
+        let mut listing = Listing::default();
+        let problem = colmap::list(&folder, &files, &mut listing).err();
+        let capture = build(&folder, "COLMAP", &mut listing);
+        let views = capture.map_or(Vec::new(), |capture| capture.views);
+        let is_at = |view: &super::View| view.camera.position == views[0].camera.position;
+        let problem = problem.or_else(|| listing.problems.into_iter().next()).map(|e| e.to_string());
+        let problem = problem.or_else(|| match views.len() {
+            opened if opened < registered => {
+                Some(format!("only {opened} of {registered} views can be opened"))
+            }
+            _ if views.iter().all(is_at) => Some("all its cameras are in one place".into()),
+            _ => (!error_px.is_finite()).then(|| "its points have no reprojection error".into()),
+        });
+        let Some(problem) = problem else { return Ok(()) };
+        let log = self.output.work(LOG);
+        let what = format!("COLMAP's model cannot be used: {problem}; its log is `{}`", log.display());
+        Err(Error::cannot(what, "repeat the command: COLMAP does not find the same twice"))
     }
 
     /// Returns the folder of the model with the lens refined; `None` where its principal point is not observable.
@@ -471,16 +699,16 @@ impl Work<'_> {
         let is_observable =
             names.len() >= OBSERVABLE.0 && *sightings >= OBSERVABLE.1 && before[0] <= OBSERVABLE.2 * side;
         let Some(cameras) = model.found.as_opencv().filter(|_| is_observable) else { return Ok(None) };
-        let (file, refined) = (model.folder.join("cameras.bin"), self.folder("refined"));
+        let (file, refined) = (model.folder.join("cameras.bin"), self.output.work("refined"));
         let given = io::read_bytes(&file, &self.sfm.limits)?;
         io::create_folder(&refined)?;
         io::write_atomic(&file, &cameras)?;
         let mut arguments: Vec<OsString> = vec!["bundle_adjuster".into(), "--input_path".into()];
         arguments.extend([OsString::from(&model.folder), "--output_path".into(), OsString::from(&refined)]);
         arguments.extend(["--BundleAdjustment.refine_principal_point", "1"].map(OsString::from));
-        let wrong = self.run(&self.programs.colmap, &arguments, &self.folder(LOG))?;
+        let failed = self.run(&self.programs.colmap, &arguments, &self.output.work(LOG))?;
         // without a refined model the mapper's remains
-        let after = Found::read(&refined, &self.sfm.limits).ok().filter(|_| wrong.is_none());
+        let after = Found::read(&refined, &self.sfm.limits).ok().filter(|_| failed.is_none());
         let after = after.and_then(|found| found.shared_lens());
         let is_near = |(_, lens): &(f64, [f64; 3])| {
             lens.iter().zip(&before).all(|(after, before)| (after - before).abs() <= MAX_MOVE * side)

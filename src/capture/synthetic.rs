@@ -12,9 +12,11 @@ mod shape;
 pub use shape::SyntheticHead;
 
 use crate::geom::{Camera, Distortion, Similarity};
-use crate::{Error, Result, io};
+use crate::io::{self, Limits};
+use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use photograph::Studio;
+use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -155,15 +157,56 @@ pub fn write_photographs(
 /// Writes `valid/NAME.npy` for every view of a capture: a border of this width is not usable, as in the ILSH
 /// dataset, whose photographs are undistorted. To be written before the capture, whose cameras say that it is complete.
 pub fn write_borders(dir: &Path, options: &SyntheticOptions, border: u32) -> Result<()> {
-    let (w, h) = (options.width, options.height);
-    let inside = |v: u32, side: u32| v >= border && v < side.saturating_sub(border);
-    let usable = (0..h).flat_map(|y| (0..w).map(move |x| (inside(x, w) && inside(y, h)) as u8));
-    let bytes = io::npy_bytes("|b1", &[h as usize, w as usize], &usable.collect::<Vec<u8>>());
+    let bytes = border_bytes(options.width, options.height, border);
     io::create_folder(&dir.join("valid"))?;
     for i in 0..options.train + options.test {
         io::write_atomic(&dir.join(format!("valid/{i:03}.npy")), &bytes)?;
     }
     Ok(())
+}
+
+fn border_bytes(width: u32, height: u32, border: u32) -> Vec<u8> {
+    let inside = |v: u32, side: u32| v >= border && v < side.saturating_sub(border);
+    let usable =
+        (0..height).flat_map(|y| (0..width).map(move |x| (inside(x, width) && inside(y, height)) as u8));
+    io::npy_bytes("|b1", &[height as usize, width as usize], &usable.collect::<Vec<u8>>())
+}
+
+/// What a finished capture of [`write_capture`] was made with.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MadeCapture {
+    /// Picture width, pixels.
+    pub width: u32,
+    /// Picture height, pixels.
+    pub height: u32,
+    /// Views in all.
+    pub views: usize,
+    /// The border mask of the first view.
+    border: Option<Vec<u8>>,
+}
+
+impl MadeCapture {
+    /// Reads the capture in a folder; `None` if it was not finished.
+    pub fn read(dir: &Path) -> Result<Option<MadeCapture>> {
+        #[derive(Deserialize)]
+        struct Transforms {
+            w: u32,
+            h: u32,
+            frames: Vec<Value>,
+        }
+        let (cameras, border) = (dir.join("transforms.json"), dir.join("valid/000.npy"));
+        if !io::is_file(&cameras) {
+            return Ok(None);
+        }
+        let Transforms { w: width, h: height, frames } = io::read_typed(&cameras, &Limits::default())?;
+        let border = io::is_file(&border).then(|| io::read_bytes(&border, &Limits::default())).transpose()?;
+        Ok(Some(MadeCapture { width, height, views: frames.len(), border }))
+    }
+
+    /// Returns whether [`write_borders`] marked a border of this width.
+    pub fn has_border(&self, border: u32) -> bool {
+        self.border.as_ref().is_some_and(|found| *found == border_bytes(self.width, self.height, border))
+    }
 }
 
 /// Returns the frames of one split (`Some(train)`), or all with their split named.

@@ -3,25 +3,32 @@
 
 use super::options::{Common, RunTarget};
 use super::screen::print;
-use crate::config::explain;
+use crate::config::{explain, explained};
 use crate::field::{Found, examine_devices};
 use crate::{Error, ErrorKind, Result, io};
 use serde::Serialize;
+use serde_json::json;
 use std::fmt::{self, Display};
 use std::path::Path;
 
 pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) -> Result<()> {
     if let Some(key) = key {
-        print(&explain(key)?)?;
-        return Ok(());
+        return match common.json {
+            true => print(&format!("{}\n", json!(explained(key)?))),
+            false => print(&explain(key)?),
+        };
     }
     // without a capture or run, this is the configuration of a new run
     let saved = match path.or(common.run.as_deref()) {
         Some(path) => RunTarget::find(common, Some(path))?.saved,
         None => None,
     };
-    print(&common.resolve(saved.as_deref(), None, &[])?.to_toml())?;
-    Ok(())
+    let config = common.resolve(saved.as_deref(), None, &[])?;
+    match common.json {
+        // not by a `Value`, which would write an f32 with the digits of an f64
+        true => print(&format!("{}\n", serde_json::to_string(&config).unwrap_or_default())),
+        false => print(&config.to_toml()),
+    }
 }
 
 /// A machine's devices and features.
@@ -82,9 +89,14 @@ impl Display for Examination {
             if let Some(card) = &d.card {
                 writeln!(f, "  card        {card}")?;
             }
-            let buffer = gib(d.largest_buffer);
-            writeln!(f, "  memory      {memory}; buffers up to {buffer}; {} KiB a group", d.shared / 1024)?;
-            writeln!(f, "  atomic adds {}", d.atomics)?;
+            write!(f, "  memory      {memory}")?;
+            if let (Some(buffer), Some(shared)) = (d.largest_buffer, d.shared) {
+                write!(f, "; buffers up to {}; {} KiB a group", gib(buffer), shared / 1024)?;
+            }
+            writeln!(f)?;
+            if let Some(atomics) = d.atomics {
+                writeln!(f, "  atomic adds {atomics}")?;
+            }
             match &d.error {
                 Some(error) => writeln!(f, "  self-test   FAILED: {error}")?,
                 None => {

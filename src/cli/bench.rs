@@ -5,8 +5,9 @@ use super::options::{Common, RunTarget};
 use super::out::Out;
 use super::screen::print;
 use crate::config::{Config, Preset};
-use crate::io;
+use crate::io::{self, Limits};
 use crate::pipeline::{Bench, SWEEPS, Session, check_feasible, require_device};
+use crate::report::bench::BenchResult;
 use crate::report::duration;
 use crate::run::{Event, Observer, Run};
 use crate::{Error, Result};
@@ -31,6 +32,10 @@ pub(super) struct BenchOptions {
 /// Half the steps of the preset `draft`, so that all sweeps end within minutes.
 const BENCH_SETTINGS: &str = "iface.steps = 1500\n";
 
+/// Files in the folder of a bench.
+const RESULTS: &str = "bench.json";
+const PAGE: &str = "bench.html";
+
 /// Passes on warnings only: a bench prints its own progress.
 struct Warnings(Arc<super::screen::Screen>);
 
@@ -43,7 +48,7 @@ impl Observer for Warnings {
 }
 
 pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()> {
-    let Invocation { common, screen, stop } = invocation;
+    let Invocation { common, screen, .. } = invocation;
     let out = Out::find(common.out.as_deref(), "bench")?;
     let target = RunTarget::find(common, Some(&options.path))?;
     let config = configure(common, &target)?;
@@ -51,20 +56,52 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
     require_device(&config)?;
     let name = target.run.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
     let folder = out.map_or_else(|| Path::new("bench").join(name), |out| out.file(""));
-    let results = folder.join("bench.json");
-    if io::exists(&results) {
-        let what = format!("`{}` holds the results of another bench", folder.display());
-        return Err(Error::cannot(what, "name another folder: `--out bench/NAME/`"));
-    }
+    let results = folder.join(RESULTS);
     let chosen: Vec<&str> = SWEEPS
         .into_iter()
         .filter(|s| options.sweep.is_empty() || options.sweep.iter().any(|o| o == s))
         .collect();
+    let mut result = Bench::begin(&config, &chosen);
+    if io::exists(&results) {
+        // what was measured before a stop is kept, if this is the same bench
+        match io::read_typed::<BenchResult>(&results, &Limits::default()) {
+            Ok(found) if found.is_part_of(&result) => result = found,
+            _ => {
+                let what = format!("`{}` holds the results of another bench", folder.display());
+                return Err(Error::cannot(what, "name another folder: `--out bench/NAME/`"));
+            }
+        }
+    }
+    let is_measured = |sweep: &str| result.sweeps.iter().any(|measured| measured.name == sweep);
+    let left: Vec<&str> = chosen.iter().copied().filter(|sweep| !is_measured(sweep)).collect();
     if common.dry_run {
-        screen.note("bench", &format!("would measure {} into `{}`", chosen.join(", "), folder.display()));
+        screen.note("bench", &format!("would measure {} into `{}`", left.join(", "), folder.display()));
         return Ok(());
     }
-    io::create_folder(&folder)?;
+    let start = Instant::now();
+    if !left.is_empty() {
+        io::create_folder(&folder)?;
+        measure(invocation, &config, &target, &left, &mut result, &folder)?;
+    }
+    if common.json {
+        print(&format!("{}\n", json!({"event": "result", "bench": results})))?;
+    } else if !common.quiet {
+        let (page, took) = (folder.join(PAGE), duration(start.elapsed().as_secs_f64()));
+        print(&format!("{}\nbench     {} in {took}\n", result.text(), page.display()))?;
+    }
+    Ok(())
+}
+
+/// Adds these sweeps to a result, and writes it into the folder after each.
+fn measure(
+    invocation: &Invocation,
+    config: &Config,
+    target: &RunTarget,
+    sweeps: &[&str],
+    result: &mut BenchResult,
+    folder: &Path,
+) -> Result<()> {
+    let Invocation { screen, stop, .. } = invocation;
     // in the system's folder for temporary files, which is cleaned after a killed process
     let scratch = tempfile::tempdir().map_err(|e| {
         Error::cannot(format!("temporary files cannot be created: {e}"), "set TMPDIR to another folder")
@@ -73,13 +110,12 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
     let run = quiet(&scratch.path().join("run"));
     io::create_folder(run.dir())?;
     let saved = target.saved.as_ref().map(|_| quiet(&target.run));
-    let open = |run| Session::open(&config, run);
+    let open = |run| Session::open(config, run);
     let (session, finished) = (open(&run)?, saved.as_ref().map(open).transpose()?);
     let bench = Bench::new(&session, finished.as_ref())?;
-    let mut result = bench.begin();
-    let start = Instant::now();
-    for (i, sweep) in chosen.iter().enumerate() {
-        screen.note("bench", &format!("{sweep} ({} of {})", i + 1, chosen.len()));
+    result.capture = session.capture().name.clone();
+    for (i, sweep) in sweeps.iter().enumerate() {
+        screen.note("bench", &format!("{sweep} ({} of {})", i + 1, sweeps.len()));
         let measured = bench.measure(sweep).map_err(|e| match stop.requested() {
             Some(kind) if e.kind().is_stop() => {
                 Error::stopped("what was measured before is kept").with_kind(kind)
@@ -88,15 +124,8 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
         });
         result.sweeps.push(measured?);
         // the results are written last: a program may wait for them
-        let page = folder.join("bench.html");
-        io::write_atomic(&page, result.html()?.as_bytes())?;
-        io::write_atomic(&results, result.json().as_bytes())?;
-    }
-    if common.json {
-        print(&format!("{}\n", json!({"event": "result", "bench": results})))?;
-    } else if !common.quiet {
-        let (page, took) = (folder.join("bench.html"), duration(start.elapsed().as_secs_f64()));
-        print(&format!("{}\nbench     {} in {took}\n", result.text(), page.display()))?;
+        io::write_atomic(&folder.join(PAGE), result.html()?.as_bytes())?;
+        io::write_atomic(&folder.join(RESULTS), result.json().as_bytes())?;
     }
     Ok(())
 }

@@ -2,7 +2,7 @@
 
 use super::Invocation;
 use super::screen::print;
-use crate::capture::sfm::{SfmOptions, from_photographs, from_video};
+use crate::capture::sfm::{Search, SfmOptions, default_folder};
 use crate::pipeline::capture_options;
 use crate::{Error, Result};
 use clap::Args;
@@ -34,17 +34,8 @@ pub(super) fn run(invocation: &Invocation, options: &CamerasOptions) -> Result<(
     let capture = capture_options(&common.resolve(None, None, &[])?);
     let named = options.video.as_ref().or(options.photographs.as_ref());
     let from = named.ok_or_else(|| Error::usage("no photographs are named", "name their folder"))?;
-    let stem = match options.video {
-        Some(_) => from.file_stem(),
-        None => from.file_name(),
-    };
-    let name = stem.map_or("capture".into(), |stem| stem.to_string_lossy());
-    let out = common.out.clone().unwrap_or_else(|| PathBuf::from(format!("{name}_cameras")));
+    let out = common.out.clone().unwrap_or_else(|| default_folder(from, options.video.is_some()));
     let (shown, source) = (out.display().to_string(), from.display());
-    if common.dry_run {
-        screen.note("cameras", &format!("would copy `{source}` to `{shown}`, and run COLMAP in it"));
-        return Ok(());
-    }
     let sfm = SfmOptions {
         out,
         lens_each: options.lens_each,
@@ -53,11 +44,21 @@ pub(super) fn run(invocation: &Invocation, options: &CamerasOptions) -> Result<(
         say: &|line| screen.note("cameras", line),
         stop: &|| invocation.stop.requested().is_some(),
     };
-    let found = match &options.video {
-        Some(video) => from_video(video, options.every as usize, &sfm),
-        None => from_photographs(from, &capture, &sfm),
-    };
-    let found = found.map_err(|e| match invocation.stop.requested() {
+    let search = match &options.video {
+        Some(video) => Search::of_video(video, options.every as usize, &sfm),
+        None => Search::of_photographs(from, &capture, &sfm),
+    }?;
+    let is_done = search.is_done();
+    if common.dry_run {
+        let text = if is_done {
+            format!("`{shown}` is done: nothing would change")
+        } else {
+            format!("would copy `{source}` to `{shown}`, and run COLMAP in it")
+        };
+        screen.note("cameras", &text);
+        return Ok(());
+    }
+    let found = search.run().map_err(|e| match invocation.stop.requested() {
         Some(exit) => e.with_kind(exit),
         None => e,
     })?;
@@ -66,8 +67,9 @@ pub(super) fn run(invocation: &Invocation, options: &CamerasOptions) -> Result<(
         return print(&format!("{}\n", serde_json::to_string(&found).unwrap_or_default()));
     }
     let (registered, photographs, error) = (found.registered, found.photographs, found.error_px);
+    let done = if is_done { "done: " } else { "" };
     let text = format!(
-        "{registered} of {photographs} photographs, mean reprojection error {error:.2} pixels, scale unknown: \
+        "{done}{registered} of {photographs} photographs, mean reprojection error {error:.2} pixels, scale unknown: \
          next, `tiface inspect {shown}`"
     );
     screen.note("cameras", &text);

@@ -3,6 +3,7 @@
 use super::options::Common;
 use super::screen::{one_line, print};
 use crate::capture::{self, CaptureOptions, Split, View};
+use crate::config::Stage;
 use crate::geom::{Bvh, Camera};
 use crate::io::{self, Limits};
 use crate::mesh::files::{
@@ -11,6 +12,7 @@ use crate::mesh::files::{
 };
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
+use crate::run::{Fault, ProductState, read_record};
 use crate::{Error, ErrorKind, Result};
 use serde::Serialize;
 use std::fmt::{self, Display};
@@ -109,16 +111,35 @@ struct CheckJson<'a> {
     against: Option<&'a Against>,
 }
 
-/// Returns the exported mesh of a run, or the file itself.
-fn mesh_of(path: &Path) -> Result<PathBuf> {
-    if !capture::is_run(path) {
-        return Ok(path.into());
+/// Returns the file itself, or the mesh of a run: the extracted surface, which lies in the dataset's world, if it is
+/// compared with another, and else the exported head; and the error if it is not the one that the run recorded.
+fn mesh_of(path: &Path, is_compared: bool) -> Result<(PathBuf, Option<Error>)> {
+    if !capture::is_run(path) && io::is_folder(path) {
+        let text = format!("`{}` is a folder, but not that of a run", path.display());
+        return Err(Error::cannot(text, "name a .glb, .obj or .ply file, or the folder of a run"));
     }
-    let files = ["glb", "obj", "ply"].map(|ending| path.join("mesh").join(format!("head.{ending}")));
-    files.into_iter().find(|file| io::is_file(file)).ok_or_else(|| {
-        let run = path.display();
-        Error::cannot(format!("`{run}` has no exported mesh"), format!("`tiface run {run}` makes it"))
-    })
+    if !capture::is_run(path) {
+        return Ok((path.into(), None));
+    }
+    let folder = path.join(Stage::Mesh);
+    let heads = ["head.glb", "head.obj", "head.ply"];
+    let names: Vec<&str> = is_compared.then_some("surface.ply").into_iter().chain(heads).collect();
+    if let Some(record) = read_record(&folder)?
+        && let Some(name) = names.iter().find(|name| record.products.contains_key(**name))
+    {
+        let fault = record.verify(&folder, name)?;
+        let error = |fault: &Fault| record.error(fault).with_kind(ErrorKind::BelowBar);
+        return match fault {
+            Some(gone) if gone.state == ProductState::Gone => Err(record.error(&gone)),
+            other => Ok((folder.join(name), other.as_ref().map(error))),
+        };
+    }
+    let file =
+        names.iter().map(|name| folder.join(name)).find(|file| io::is_file(file)).ok_or_else(|| {
+            let run = path.display();
+            Error::cannot(format!("`{run}` has no exported mesh"), format!("`tiface run {run}` makes it"))
+        })?;
+    Ok((file, None))
 }
 
 fn load(path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
@@ -151,11 +172,16 @@ pub(super) fn run(
     seen_by: Option<&Path>,
 ) -> Result<()> {
     let config = common.resolve(None, None, &[])?;
-    let path = &mesh_of(path)?;
+    let (path, fault) = mesh_of(path, against.is_some())?;
+    let path = &path;
     // the mesh is checked even if its texture cannot be read
     let (found, problem) = match load(path, &ReadOptions::default()) {
         Ok(found) => (found, None),
-        Err(e) => (load(path, &ReadOptions::SURFACE)?, Some(e.to_string())),
+        Err(e) => match load(path, &ReadOptions::SURFACE) {
+            Ok(found) => (found, Some(e.to_string())),
+            // a file that is not the run's is not mended as other files are
+            Err(unread) => return Err(fault.unwrap_or(unread)),
+        },
     };
     let unit_m = config.capture.unit_m;
     let mut report = check_around(&found.mesh, found.origin, unit_m);
@@ -184,7 +210,7 @@ pub(super) fn run(
         format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
     };
     print(&text)?;
-    passed
+    passed.and(fault.map_or(Ok(()), Err))
 }
 
 fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against> {

@@ -4,7 +4,7 @@ use super::Invocation;
 use super::options::RunTarget;
 use super::out::Out;
 use super::run::{StageCommand, run as run_stages};
-use crate::capture::synthetic::{SyntheticOptions, check, write_borders, write_capture};
+use crate::capture::synthetic::{MadeCapture, SyntheticOptions, check, write_borders, write_capture};
 use crate::config::Preset;
 use crate::io;
 use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
@@ -29,27 +29,24 @@ pub(super) fn run(
 ) -> Result<()> {
     let common = invocation.common;
     let options = photographs(size, views)?;
-    check(&options)?;
-    check_border(&options, border)?;
     let run = common.run.clone().unwrap_or_else(|| PathBuf::from("runs/demo"));
     let capture = run.join(DEMO_CAPTURE);
-    // repeated without options, the demo continues with its saved settings
+    let made = MadeCapture::read(&capture)?;
+    match &made {
+        Some(made) => agree(made, &capture, &options, [size.is_some(), views.is_some()], border)?,
+        None => {
+            check(&options)?;
+            check_border(&options, border)?;
+        }
+    }
+    // repeated, the demo continues with its saved settings
     let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
     let fallback = Some((Preset::Draft, DEMO_SETTINGS));
     // command-line errors are reported before any photograph is rendered
     Out::find(common.out.as_deref(), "run")?;
     let config = common.resolve(saved.as_deref(), fallback, &[])?;
     check_feasible(&config)?;
-    // the cameras are written last: if they exist, the capture is complete
-    if io::is_file(&capture.join("transforms.json")) {
-        if size.is_some() || views.is_some() || border.is_some() {
-            let message = format!("`{}` already contains photographs of the head", capture.display());
-            return Err(Error::usage(
-                message,
-                "leave out --size, --views and --border, or name another --run",
-            ));
-        }
-    } else {
+    if made.is_none() {
         require_device(&config)?;
         if common.dry_run {
             let text = format!("would render photographs of a synthetic head into `{}`", capture.display());
@@ -61,6 +58,30 @@ pub(super) fn run(
     let target = RunTarget { capture: Some(io::real_path(&capture)?), saved, run, guessed: false };
     let (product, until) = ("run", Stage::Metrics);
     run_stages(invocation, &StageCommand { product, until, target, require: &[], keys: Vec::new(), fallback })
+}
+
+/// Refuses options that the finished photographs were not made with; `given` says whether size and number are.
+fn agree(
+    made: &MadeCapture,
+    capture: &Path,
+    asked: &SyntheticOptions,
+    given: [bool; 2],
+    border: Option<u32>,
+) -> Result<()> {
+    let MadeCapture { width, height, views, .. } = made;
+    let [size, number] = given;
+    let differs = if size && (asked.width, asked.height) != (*width, *height) {
+        Some(("--size", format!("photographs of {width} × {height} pixels")))
+    } else if number && asked.train + asked.test != *views {
+        Some(("--views", format!("{views} photographs")))
+    } else if border.is_some_and(|border| !made.has_border(border)) {
+        Some(("--border", "photographs of another border".into()))
+    } else {
+        None
+    };
+    let Some((option, found)) = differs else { return Ok(()) };
+    let message = format!("`{}` contains {found} of the head already", capture.display());
+    Err(Error::usage(message, format!("leave out {option} to continue with them, or name another --run")))
 }
 
 /// Returns the options of the photographs, with another size or number.

@@ -5,6 +5,7 @@ use super::demo::photograph;
 use super::out::Out;
 use super::run::in_words;
 use super::screen::print;
+use crate::capture::is_run;
 use crate::capture::synthetic::SyntheticOptions;
 use crate::config::Config;
 use crate::io::{self, Limits};
@@ -130,8 +131,12 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     for ((task, run), session) in
         tasks.iter().zip(&opened).zip(&mut sessions).filter(|((task, _), _)| chosen(task))
     {
-        let opened = match Session::open(&task.config, run) {
-            Ok(opened) => opened,
+        let planned = Session::open(&task.config, run).and_then(|opened| {
+            let cost = if common.dry_run { ahead(&opened, task.run)? } else { None };
+            Ok((opened, cost))
+        });
+        let (opened, cost) = match planned {
+            Ok(planned) => planned,
             // a capture may lack the inputs of one row (masks) and have those of others
             Err(e) if common.dry_run => {
                 match common.json {
@@ -148,7 +153,6 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         };
         let session = &*session.insert(opened);
         if common.dry_run {
-            let cost = ahead(session, task.run);
             sum = sum + cost.unwrap_or_default();
             if common.json {
                 let done = cost.is_none();
@@ -209,9 +213,10 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
     failed.map_or(Ok(()), Err)
 }
 
-/// Returns the folder of a capture; `demo`, if no folder has this name, is the demo head, rendered into the experiment.
+/// Returns the folder of a capture; `demo`, if no capture has this name, is the demo head, rendered into the experiment.
 fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> {
-    if path != Path::new("demo") || io::is_folder(path) {
+    let is_capture = io::is_folder(path) && !is_run(path);
+    if path != Path::new("demo") || is_capture {
         return Ok(path.into());
     }
     let capture = folder.join("captures/demo");

@@ -4,7 +4,7 @@ use super::Invocation;
 use super::options::{KeyOption, RunTarget};
 use super::out::{Out, require_outside, write_head};
 use super::screen::print;
-use crate::config::{Config, MeshFormat};
+use crate::config::{Config, MeshFormat, Stage};
 use crate::pipeline::KeptHead;
 use crate::{Error, Quiet, Result, io};
 use serde_json::json;
@@ -29,9 +29,12 @@ pub(super) fn run(
     }
     let asked = common.resolve(Some(saved), None, keys)?;
     let files = destinations(out.as_ref(), &target.run, lists_formats, &asked)?;
-    files.iter().try_for_each(|(file, _)| require_outside(file, &target.run))?;
+    // a file of the run may be put back, but not replaced by another
+    let (own, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| is_own(file, &target.run));
+    others.iter().try_for_each(|(file, _)| require_outside(file, &target.run))?;
     let formats: Vec<MeshFormat> = files.iter().map(|(_, format)| *format).collect();
     let mut head = KeptHead::read(&target.run, &Config::read(saved)?)?.changed(&asked, &formats, &Quiet)?;
+    own.iter().try_for_each(|(_, format)| head.require_recorded(*format))?;
     let mut warn = |warning: &str| screen.note("export: warning", warning);
     std::mem::take(&mut head.warnings).iter().for_each(|w| warn(w));
     for (file, _) in &files {
@@ -59,6 +62,14 @@ pub(super) fn run(
         print(&written.iter().map(|file| format!("export    {}\n", file.display())).collect::<String>())?;
     }
     Ok(())
+}
+
+/// Returns whether a file is one that the stage `mesh` of the run writes in this format.
+fn is_own((file, format): &(PathBuf, MeshFormat), run: &Path) -> bool {
+    let folder = file.parent().and_then(|folder| io::real_path(folder).ok());
+    let is_there =
+        folder.is_some_and(|folder| io::real_path(&run.join(Stage::Mesh)).is_ok_and(|own| own == folder));
+    is_there && file.file_name().is_some_and(|name| name == format!("head.{}", format.ending()).as_str())
 }
 
 /// Returns the files to write with their formats: `--out`, files in its folder, or else files in the working directory with

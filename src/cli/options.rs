@@ -40,7 +40,7 @@ pub(super) struct Common {
     /// Make training on a GPU bitwise reproducible, by fixed-point accumulation; on the CPU it always is
     #[arg(long, global = true, hide_short_help = true)]
     pub deterministic: bool,
-    /// Limit the GPU memory of a training, GiB [default: all of it]
+    /// GPU memory that a training may take, GiB [default: what the driver states]
     #[arg(long, global = true, value_name = "GIB", hide_short_help = true)]
     pub memory: Option<f64>,
     /// Random seed

@@ -5,6 +5,7 @@ use super::Invocation;
 use super::options::RunTarget;
 use super::out::Out;
 use super::screen::print;
+use crate::capture::is_run;
 use crate::config::ViewBackground;
 use crate::geom::Camera;
 use crate::io::{self, Animation};
@@ -490,8 +491,15 @@ fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
 fn target(invocation: &Invocation, path: Option<&Path>) -> Result<(RunTarget, crate::config::Config)> {
     let target = RunTarget::find(invocation.common, path)?;
     let Some(saved) = &target.saved else {
-        let what = format!("`{}` is not a run", path.unwrap_or(Path::new(".")).display());
-        return Err(Error::usage(what, "name the folder of a run, or a .glb, .obj or .ply file"));
+        let path = path.unwrap_or(Path::new("."));
+        let hint = match is_run(&target.run) {
+            true => format!("name its run, `{}`", target.run.display()),
+            false if io::is_folder(path) => {
+                format!("begin one, `tiface run {}`, then name it", path.display())
+            }
+            false => "name the folder of a run, or, without `--watch`, a .glb, .obj or .ply file".into(),
+        };
+        return Err(Error::usage(format!("`{}` is not a run", path.display()), hint));
     };
     if target.guessed {
         invocation.screen.note("run", &format!("using `{}`", target.run.display()));

@@ -4,11 +4,11 @@
 use super::Invocation;
 use super::options::{Common, KeyOption, RunTarget};
 use super::out::Out;
-use super::screen::{figure, print};
+use super::screen::{figure, one_line, print};
 use crate::config::{Config, NAMES, Preset, RenderConfig, called};
 use crate::pipeline::{Session, Stage, reconstruct};
-use crate::report::{blend_verdict, duration, judged_by};
-use crate::run::{Cost, Done, Phase, Run, RunStatus};
+use crate::report::{blend_verdict, duration, height, judged_by};
+use crate::run::{Cost, Done, Phase, Run, RunStatus, read_record};
 use crate::{Error, ErrorKind, Result, io};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
@@ -71,7 +71,7 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
             (ErrorKind::Cannot, Some(before)) => {
                 common.fresh.is_none()
                     && before == without_device(&config.to_toml())
-                    && RunStatus::read(run.dir()).phase != Phase::Done
+                    && ![Phase::Done, Phase::Damaged].contains(&RunStatus::read(run.dir()).phase)
             }
             _ => false,
         };
@@ -224,7 +224,7 @@ impl Bar {
         let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
         match self {
             Bar::Watertight if of(Stage::Mesh).is_some_and(|m| m["closed"] == true) => Ok(()),
-            Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check` shows where")),
+            Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check RUN` says why")),
             Bar::Psnr(bar) => {
                 let metrics = of(Stage::Metrics).unwrap_or(&Value::Null);
                 let sets = metrics.as_object().into_iter().flat_map(|m| m.values());
@@ -250,16 +250,20 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
     let mut row = |name: &str, value: &dyn std::fmt::Display| text += &format!("{name:<9} {value}\n");
-    let height = |key: &str| of(Stage::Mask)?[key].as_f64();
-    if let (Some(units), Some(metres)) = (height("height_units"), height("height_m")) {
-        row("head", &format!("{units:.3} units high: {metres:.3} m"));
+    if let Some(height) = height(of(Stage::Mask), of(Stage::Mesh)) {
+        row("height", &height);
     }
     if let Some(mesh) = of(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
         let files = ["glb", "obj", "ply"].map(|e| run.path(format!("mesh/head.{e}")));
-        let first = files.iter().find(|f| io::is_file(f)).unwrap_or(&files[0]).display();
+        let found = files.iter().find(|f| io::is_file(f));
+        let first = found.map_or_else(|| "in no file".into(), |file| file.display().to_string());
         let handles = handles(&mesh["handles"]);
         row("mesh", &format!("{first} ({} triangles, {state}{handles})", mesh["triangles"]));
+        // exported files may be moved
+        let record = read_record(&run.path(Stage::Mesh)).ok().flatten();
+        let faults = record.map_or(Vec::new(), |record| record.faults(&run.path(Stage::Mesh)));
+        faults.iter().for_each(|fault| row("", &one_line(&fault.to_string())));
     }
     for (stage, folder) in [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.word())] {
         if of(stage).is_some() {

@@ -6,7 +6,7 @@ use crate::config::Stage;
 use crate::error::counted;
 use crate::io;
 use crate::report::duration;
-use crate::run::{Phase, Record, RunStatus, StageStatus, Status, Verification};
+use crate::run::{Phase, Record, RunStatus, StageStatus, Status, Verification, VerifiedFile};
 use crate::{Error, Result};
 use clap::Args;
 use rayon::prelude::*;
@@ -22,7 +22,7 @@ use std::time::Duration;
 pub(super) struct StatusOptions {
     /// Run folders [default: all under runs/]
     runs: Vec<PathBuf>,
-    /// Show only runs that failed, were killed or cannot be read
+    /// Show only runs that failed, are damaged, were killed or cannot be read
     #[arg(long)]
     failed: bool,
     /// Repeat every two seconds, until all runs are done or failed, or until Ctrl-C
@@ -50,30 +50,64 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
         };
         let clear = if options.watch && std::io::stdout().is_terminal() { "\x1b[H\x1b[2J" } else { "" };
         print(&format!("{clear}{text}"))?;
-        let is = |phases: &[Phase]| {
-            let phase = |run: &Result<RunStatus>| run.as_ref().map_or(Phase::Unreadable, |s| s.phase);
-            found.iter().filter(|(_, run)| phases.contains(&phase(run))).count()
-        };
         let may_change = [Phase::Waiting, Phase::Running, Phase::Begun, Phase::Killed, Phase::Stopped];
-        if options.watch && is(&may_change) > 0 && invocation.stop.requested().is_none() {
+        let changes = found.iter().any(|(_, run)| may_change.contains(&phase(run)));
+        if options.watch && changes && invocation.stop.requested().is_none() {
             std::thread::park_timeout(REFRESH_INTERVAL);
             if invocation.stop.requested().is_none() {
                 continue;
             }
         }
-        let (unreadable, failed) = (is(&[Phase::Unreadable]), is(&[Phase::Failed]));
-        return match (unreadable, failed) {
-            (0, 0) => Ok(()),
-            (0, n) => Err(Error::below(
-                format!("{n} of {} runs failed", found.len()),
-                "`tiface status --failed` shows why; remove the cause, then repeat the command for them",
-            )),
-            (n, _) => Err(Error::cannot(
-                format!("{n} of {} runs could not be read", found.len()),
-                "name run folders, and correct their config.toml; `tiface run RUN --fresh STAGE` repeats a stage",
-            )),
-        };
+        let states = found.iter().map(|(_, run)| phase(run));
+        return worst(&states.collect::<Vec<_>>());
     }
+}
+
+/// The states that need a user's attention, the worst first: of one run and of several, and what to do about it.
+const WRONG: [(Phase, [&str; 2], &str); 4] = [
+    (
+        Phase::Failed,
+        ["failed", "failed"],
+        "`tiface status --failed` shows why; remove the cause, then repeat the command for them",
+    ),
+    (
+        Phase::Damaged,
+        ["is damaged", "are damaged"],
+        "`tiface verify` names the files, and the command that makes each again",
+    ),
+    (
+        Phase::Killed,
+        ["was killed", "were killed"],
+        "`tiface status --failed` shows which; repeat the command for them: it continues",
+    ),
+    (
+        Phase::Unreadable,
+        ["could not be read", "could not be read"],
+        "name run folders, and correct their config.toml; `tiface run RUN --fresh STAGE` repeats a stage",
+    ),
+];
+
+/// Fails with what is wrong with runs of these states. The worst decides about the exit code: 1 if runs could only not be
+/// read, else 3.
+fn worst(states: &[Phase]) -> Result<()> {
+    let count = |wrong: Phase| states.iter().filter(|state| **state == wrong).count();
+    let found: Vec<_> = WRONG.iter().map(|row| (count(row.0), row)).filter(|(n, _)| *n > 0).collect();
+    let Some((_, (phase, _, hint))) = found.first() else { return Ok(()) };
+    let total = states.len();
+    let mut of = format!(" of {}", counted(total, "run"));
+    let all = found.iter().map(|(n, (_, [one, many], _))| {
+        let verb = if *n == 1 { one } else { many };
+        format!("{n}{} {verb}", std::mem::take(&mut of))
+    });
+    let what = all.collect::<Vec<_>>().join(", ");
+    match phase {
+        Phase::Unreadable => Err(Error::cannot(what, *hint)),
+        _ => Err(Error::below(what, *hint)),
+    }
+}
+
+fn phase(run: &Result<RunStatus>) -> Phase {
+    run.as_ref().map_or(Phase::Unreadable, |s| s.phase)
 }
 
 /// Returns the named runs, or all under `runs/`; an error if there are none.
@@ -98,7 +132,7 @@ pub(super) fn verify(invocation: &Invocation, runs: &[PathBuf]) -> Result<()> {
     for (run, found) in runs.iter().zip(all) {
         match found {
             Ok(found) => {
-                changed += usize::from(!found.differences.is_empty());
+                changed += usize::from(found.differing().next().is_some());
                 text += &verification(invocation, run, &found);
             }
             Err(e) => {
@@ -112,7 +146,7 @@ pub(super) fn verify(invocation: &Invocation, runs: &[PathBuf]) -> Result<()> {
         Some(e) => Err(e),
         None if changed > 0 => Err(Error::below(
             format!("{changed} of {} differ from what was written", counted(runs.len(), "run")),
-            "put the files back, or make the stage again with `tiface run RUN --fresh STAGE`",
+            "put the files back, or make each again with the command beside it; a stage made again removes what follows",
         )),
         None => Ok(()),
     }
@@ -125,17 +159,27 @@ fn verification(invocation: &Invocation, run: &Path, found: &Verification) -> St
         value["run"] = json!(run);
         return format!("{value}\n");
     }
-    let by_size = found.products.values().filter(|digest| digest.is_empty()).count();
-    let mut text = format!("{}: {}", run.display(), counted(found.products.len(), "file"));
+    let by_size = found.files.iter().filter(|file| file.sha256.is_none()).count();
+    let mut text = format!("{}: {}", run.display(), counted(found.files.len(), "file"));
     if by_size > 0 {
         text += &format!(", {by_size} compared by size only, as an older version recorded no digests");
     }
-    text += match found.differences.is_empty() {
-        true => ", as recorded\n",
-        false => "\n",
+    if !found.unlisted.is_empty() {
+        let stages = found.unlisted.join(", ");
+        text += &format!(", and none of {stages}, as an older version recorded neither sizes nor digests");
+    }
+    text += match found.differing().next() {
+        None => ", as recorded\n",
+        Some(_) => "\n",
     };
-    found.differences.iter().for_each(|line| text += &format!("  {}\n", one_line(line)));
-    found.moved.iter().for_each(|file| text += &format!("  `{}` was moved away\n", one_line(file)));
+    for VerifiedFile { problem, again, .. } in found.differing() {
+        let line = format!(
+            "{}; `{}` makes it again",
+            problem.as_deref().unwrap_or_default(),
+            again.as_deref().unwrap_or_default()
+        );
+        text += &format!("  {}\n", one_line(&line));
+    }
     text
 }
 
@@ -149,8 +193,7 @@ fn look(run: &Path) -> Result<RunStatus> {
 
 /// Returns whether the run needs a user's attention.
 fn has_failed(run: &Result<RunStatus>) -> bool {
-    let wrong = [Phase::Failed, Phase::Killed, Phase::Unreadable];
-    run.as_ref().map_or(true, |s| wrong.contains(&s.phase))
+    WRONG.iter().any(|(wrong, ..)| *wrong == phase(run))
 }
 
 fn name(run: &Path) -> String {
@@ -166,7 +209,7 @@ fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> Strin
     let mut left_s = 0.0;
     let mut counts: BTreeMap<usize, (&str, usize)> = BTreeMap::new();
     for (_, run) in runs {
-        let phase = run.as_ref().map_or(Phase::Unreadable, |s| s.phase);
+        let phase = phase(run);
         counts.entry(phase as usize).or_insert((word(phase), 0)).1 += 1;
         left_s += run.as_ref().ok().and_then(|s| s.left_s).unwrap_or(0.0);
     }
@@ -214,6 +257,7 @@ fn word(phase: Phase) -> &'static str {
         Phase::Stopped => "stopped",
         Phase::Failed => "failed",
         Phase::Unreadable => "UNREADABLE",
+        Phase::Damaged => "DAMAGED",
         Phase::Begun => "begun",
         Phase::Done => "done",
     }
@@ -227,6 +271,7 @@ fn sign(phase: Phase) -> char {
         Phase::Stopped => '=',
         Phase::Failed => 'x',
         Phase::Unreadable => '?',
+        Phase::Damaged => '%',
         Phase::Done => '#',
     }
 }
@@ -281,6 +326,7 @@ fn stage_object(s: &crate::run::StageStatus) -> Value {
         value["peak_bytes"] = json!(record.peak_bytes);
         value["warnings"] = json!(record.warnings);
         value["summary"] = record.summary.clone();
+        value["faults"] = s.faults.iter().map(|fault| json!(fault.to_string())).collect();
     }
     value
 }
@@ -310,8 +356,13 @@ fn stages(run: &Path, standing: &RunStatus) -> String {
 /// Describes the state of a stage.
 fn of_stage(s: &StageStatus) -> String {
     match &s.error {
-        Some(error) if s.phase == Phase::Unreadable => format!("UNREADABLE: {error}"),
-        _ => words(s.phase, s.status.as_ref(), s.record.as_ref()),
+        Some(error) if matches!(s.phase, Phase::Unreadable | Phase::Damaged) => {
+            format!("{}: {error}", word(s.phase))
+        }
+        _ => {
+            let gone = s.faults.iter().map(|fault| format!("; {fault}"));
+            words(s.phase, s.status.as_ref(), s.record.as_ref()) + &gone.collect::<String>()
+        }
     }
 }
 
@@ -327,4 +378,24 @@ fn words(phase: Phase, status: Option<&Status>, record: Option<&Record>) -> Stri
     let rate = s.rate.map(|rate| format!(", {}/s", figure(rate))).unwrap_or_default();
     let left = s.eta_s.map(|eta| format!(", {} left of this stage", duration(eta))).unwrap_or_default();
     format!("{state}{step}{rate}{left} (process {} on {})", s.pid, s.host)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_worst_state_decides_and_hides_no_other() {
+        use Phase::{Begun, Damaged, Done, Failed, Killed, Running, Stopped, Unreadable, Waiting};
+        assert_eq!(worst(&[Done, Running, Waiting, Begun, Stopped]), Ok(()));
+        let ended = |states: &[Phase]| {
+            let error = worst(states).unwrap_err();
+            (error.kind().code(), error.to_string())
+        };
+        assert_eq!(ended(&[Killed, Done]), (3, "1 of 2 runs was killed".into()));
+        assert_eq!(ended(&[Unreadable]), (1, "1 of 1 run could not be read".into()));
+        let all = [Unreadable, Failed, Killed, Failed, Damaged, Done, Failed, Killed];
+        let expected = "3 of 8 runs failed, 1 is damaged, 2 were killed, 1 could not be read";
+        assert_eq!(ended(&all), (3, expected.into()));
+    }
 }

@@ -129,6 +129,11 @@ impl Checkpoint {
         })
     }
 
+    /// [`Checkpoint::number`] of an entry that early versions of a format lack.
+    pub fn number_or(&self, key: &str, missing: u64, range: RangeInclusive<u64>) -> Result<u64> {
+        if self.header.contains_key(key) { self.number(key, range) } else { Ok(missing) }
+    }
+
     fn unexpected(&self, key: &str, found: impl ToString, expected: impl Into<String>) -> Error {
         Error::cannot(ReadError::value(&self.path, key, found, expected), restart_hint(self.stage))
     }
@@ -199,7 +204,7 @@ impl TrainingProgress {
     /// Reads the progress from a checkpoint of a training of `steps` steps, and whether the training had finished.
     pub fn restore(from: &Checkpoint, steps: u64) -> Result<(TrainingProgress, bool)> {
         // Early versions of the format have no `finished` entry.
-        let finished = from.header.contains_key("finished") && from.number("finished", 0..=1)? == 1;
+        let finished = from.number_or("finished", 0, 0..=1)? == 1;
         // A finished checkpoint may lack moments, so it cannot be continued to more steps.
         let step = from.number("step", if finished { steps } else { 0 }..=steps)?;
         let key = "mean_square";

@@ -44,36 +44,55 @@ fn open_locked(choice: &DeviceChoice, locks: &Path) -> Result<Gpu> {
         Some(number) => adapters.get(number).copied().into_iter().collect(),
         None => adapters.iter().copied().filter(|adapter| !adapter.software).collect(),
     };
-    let mut in_use = Vec::new();
+    let (mut in_use, mut failure) = (Vec::new(), None);
     for adapter in chosen {
-        let device = open_configured(adapter, choice);
-        let lock = acquire_lock(lock_file(locks, &device));
-        // A user who gives an adapter's index accepts sharing it with other processes.
-        if number.is_none() && matches!(lock, Err(LockError::Held { .. })) {
-            in_use.push(device.name().to_string());
-            continue;
+        match take(adapter, choice, locks) {
+            Ok((device, lock)) => {
+                return Ok(Gpu { device, why: format!("named `{name}`"), lock, auto_selected: false });
+            }
+            Err(Refusal::InUse) => in_use.push(adapter.name.clone()),
+            Err(Refusal::Failed(e)) => failure = failure.or(Some(e)),
         }
-        return Ok(Gpu { device, why: format!("named `{name}`"), lock: lock.ok(), auto_selected: false });
     }
-    if in_use.is_empty() {
-        return Err(no_such_adapter(&name, api, &adapters));
+    if !in_use.is_empty() {
+        return Err(Error::not_now(
+            format!("device `{name}`: {} in use by other processes", in_use.join(", ")),
+            format!(
+                "wait for them, then repeat the command; a number, as in `{api}:0`, shares one with them"
+            ),
+        ));
     }
-    Err(Error::not_now(
-        format!("device `{name}`: {} in use by other processes", in_use.join(", ")),
-        format!("wait for them, then repeat the command; a number, as in `{api}:0`, shares one with them"),
-    ))
+    Err(failure.unwrap_or_else(|| no_such_adapter(&name, api, &adapters)))
 }
 
-/// Opens an adapter with the atomics and the memory limit of the choice.
-fn open_configured(adapter: &Adapter, choice: &DeviceChoice) -> Device {
-    let mut device = Device::open(adapter);
+/// Why an adapter was not taken.
+enum Refusal {
+    InUse,
+    Failed(Error),
+}
+
+/// Locks an adapter and opens it, with the atomics and the memory of the choice. The lock comes
+/// first: a process holds memory on every card that it opens, for as long as it lives.
+fn take(
+    adapter: &Adapter,
+    choice: &DeviceChoice,
+    locks: &Path,
+) -> std::result::Result<(Device, Option<Arc<Lock>>), Refusal> {
+    let lock = match acquire_lock(lock_file(locks, adapter)) {
+        Ok(lock) => Some(lock),
+        Err(LockError::Held { .. }) if choice.number.is_none() => return Err(Refusal::InUse),
+        // A user who gives an adapter's index accepts sharing it with other processes. If no lock
+        // file can be created here, no other process holds one either.
+        Err(_) => None,
+    };
+    let mut device = Device::open(adapter).map_err(Refusal::Failed)?;
     if choice.deterministic {
         device = device.with_atomics(gpu::Atomics::Fixed);
     }
     if let Some(gib) = choice.memory_gib {
         device = device.with_memory((gib * (1u64 << 30) as f64) as u64);
     }
-    device
+    Ok((device, lock))
 }
 
 fn no_such_adapter(name: &str, api: &str, adapters: &[&Adapter]) -> Error {
@@ -93,19 +112,28 @@ fn no_such_adapter(name: &str, api: &str, adapters: &[&Adapter]) -> Error {
 /// Opens the first GPU that is not a software renderer, is not in use and passes the tests. Otherwise returns why each
 /// adapter was rejected.
 pub fn best(choice: &DeviceChoice, tests: &[SelfTest]) -> std::result::Result<Gpu, String> {
+    best_of(Adapter::all().iter().filter(|a| !a.software), choice, tests, &lock_folder())
+}
+
+fn best_of<'a>(
+    adapters: impl Iterator<Item = &'a Adapter>,
+    choice: &DeviceChoice,
+    tests: &[SelfTest],
+    locks: &Path,
+) -> std::result::Result<Gpu, String> {
     let file = verdict_file();
     let mut rejected = Vec::new();
-    for adapter in Adapter::all().iter().filter(|a| !a.software) {
-        let device = open_configured(adapter, choice);
-        let name = device.name().to_string();
-        let lock = match acquire_lock(lock_file(&lock_folder(), &device)) {
-            Ok(lock) => Some(lock),
-            Err(LockError::Held { .. }) => {
-                rejected.push(format!("{name} is in use"));
+    for adapter in adapters {
+        let (device, lock) = match take(adapter, choice, locks) {
+            Ok(taken) => taken,
+            Err(Refusal::InUse) => {
+                rejected.push(format!("{} is in use", adapter.name));
                 continue;
             }
-            // If no lock file can be created here, no other process holds one either.
-            Err(LockError::Io { .. }) => None,
+            Err(Refusal::Failed(e)) => {
+                rejected.push(e.to_string());
+                continue;
+            }
         };
         match tests.iter().try_for_each(|test| require_passed(&device, adapter, test, file.as_deref())) {
             Ok(()) => {
@@ -115,10 +143,10 @@ pub fn best(choice: &DeviceChoice, tests: &[SelfTest]) -> std::result::Result<Gp
                 );
                 return Ok(Gpu { device, why, lock, auto_selected: true });
             }
-            Err(why) => rejected.push(format!("{name} {why}")),
+            Err(why) => rejected.push(format!("{} {why}", adapter.name)),
         }
     }
-    Err(if rejected.is_empty() { "no GPU is here".into() } else { rejected.join(", ") })
+    Err(if rejected.is_empty() { super::NO_GPU.into() } else { rejected.join(", ") })
 }
 
 /// Acquires the lock of a device, or shares it if this process holds it already: all fields of a process use the same
@@ -139,9 +167,9 @@ fn lock_folder() -> PathBuf {
     std::env::temp_dir()
 }
 
-/// Returns the lock file of a device, which is the same for every API that reaches the same card.
-fn lock_file(folder: &Path, device: &Device) -> PathBuf {
-    let card = device.card().unwrap_or_else(|| device.name().to_string());
+/// Returns the lock file of an adapter, which is the same for every API that reaches the same card.
+fn lock_file(folder: &Path, adapter: &Adapter) -> PathBuf {
+    let card = adapter.card.as_ref().unwrap_or(&adapter.name);
     let file_name: String = card.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
     folder.join(format!("tiface-{file_name}.lock"))
 }
@@ -218,33 +246,44 @@ pub fn examine_adapters(tests: &[SelfTest]) -> Vec<Found> {
 }
 
 fn examine_adapter(adapter: &Adapter, number: usize, tests: &[SelfTest]) -> Found {
-    let device = Device::open(adapter);
-    let limits = device.limits();
-    let in_use = matches!(Lock::take(&lock_file(&lock_folder(), &device)), Err(LockError::Held { .. }));
+    let in_use = matches!(Lock::take(&lock_file(&lock_folder(), adapter)), Err(LockError::Held { .. }));
+    let mut found = Found {
+        name: format!("{}:{number}", adapter.api),
+        adapter: adapter.name.clone(),
+        kind: adapter.kind,
+        driver: adapter.driver.clone(),
+        card: adapter.card.clone(),
+        atomics: None,
+        memory: adapter.memory,
+        largest_buffer: None,
+        shared: None,
+        in_use,
+        checks: Vec::new(),
+        error: None,
+        seconds: 0.0,
+    };
     let began = std::time::Instant::now();
+    let device = match Device::open(adapter) {
+        Ok(device) => device,
+        Err(e) => return Found { error: Some(e.to_string()), ..found },
+    };
+    let limits = device.limits();
+    found.driver = device.driver().into();
+    found.atomics = Some(match device.atomics() {
+        gpu::Atomics::Native => "native",
+        _ => "exchange",
+    });
+    found.memory = limits.memory;
+    (found.largest_buffer, found.shared) = (Some(limits.largest_buffer), Some(limits.shared));
     let file = verdict_file();
     let all: Result<Vec<Vec<Check>>> =
         tests.iter().map(|test| run_self_test(&device, adapter, test, file.as_deref())).collect();
-    let seconds = began.elapsed().as_secs_f64();
-    let error = all.as_ref().err().map(|e| e.to_string());
-    Found {
-        name: format!("{}:{number}", adapter.api),
-        adapter: device.name().into(),
-        kind: adapter.kind,
-        driver: device.driver().into(),
-        card: device.card(),
-        atomics: match device.atomics() {
-            gpu::Atomics::Native => "native",
-            _ => "exchange",
-        },
-        memory: limits.memory,
-        largest_buffer: limits.largest_buffer,
-        shared: limits.shared,
-        in_use,
-        checks: all.unwrap_or_default().into_iter().flatten().collect(),
-        error,
-        seconds,
+    found.seconds = began.elapsed().as_secs_f64();
+    match all {
+        Ok(checks) => found.checks = checks.into_iter().flatten().collect(),
+        Err(e) => found.error = Some(e.to_string()),
     }
+    found
 }
 
 #[cfg(test)]
@@ -282,12 +321,56 @@ mod tests {
         let open = |word: &str| open_locked(&named(word), folder.path()).unwrap();
         let (held, again) = (open("wgpu:0"), open("wgpu:0"));
         // All fields of a process share one lock, which another process cannot take.
-        let file = lock_file(folder.path(), &held.device);
+        let file = lock_file(folder.path(), &Adapter::all()[0]);
         assert!(held.lock.is_some() && again.lock.is_some());
         assert!(matches!(Lock::take(&file), Err(LockError::Held { .. })));
         // The options of the choice apply to the opened device.
         let asked = open("wgpu:0+deterministic+0.5GiB").device;
         assert_eq!((asked.atomics(), asked.limits().memory), (gpu::Atomics::Fixed, Some(1 << 29)));
+    }
+
+    /// Returns an adapter that cannot be opened, as no other test or process has.
+    fn absent(what: &str) -> Adapter {
+        Adapter::absent(&format!("{what} of process {}", std::process::id()))
+    }
+
+    #[test]
+    fn auto_goes_on_with_the_processor_where_an_adapter_cannot_be_opened_and_says_why() {
+        let absent = absent("a card without memory");
+        let locks = tempfile::tempdir().unwrap();
+        let why = best_of([&absent].into_iter(), &named("auto"), &[], locks.path()).err().unwrap();
+        assert!(why.contains(&absent.name) && why.contains("cannot be opened"), "{why}");
+        // nor does it end the examination
+        let found = examine_adapter(&absent, 3, &[]);
+        assert_eq!((found.name.as_str(), found.in_use, found.checks.len()), ("vulkan:3", false, 0));
+        assert!(found.error.unwrap().contains("cannot be opened"));
+    }
+
+    #[test]
+    fn a_card_that_another_process_uses_is_not_even_opened() {
+        let absent = absent("a card in use");
+        let locks = tempfile::tempdir().unwrap();
+        let lock = Lock::take(&lock_file(locks.path(), &absent)).unwrap();
+        let why = best_of([&absent].into_iter(), &named("auto"), &[], locks.path()).err().unwrap();
+        assert_eq!(why, format!("{} is in use", absent.name));
+        let take = |word: &str| take(&absent, &named(word), locks.path());
+        assert!(matches!(take("wgpu"), Err(Refusal::InUse)));
+        // a number shares it
+        assert!(matches!(take("wgpu:0"), Err(Refusal::Failed(_))));
+        drop(lock);
+        assert!(matches!(take("wgpu"), Err(Refusal::Failed(_))));
+    }
+
+    #[test]
+    fn one_card_has_one_lock_for_all_apis() {
+        let file = |name: &str, address: Option<&str>| {
+            let mut adapter = Adapter::absent(name);
+            adapter.card = address.map(str::to_owned);
+            lock_file(Path::new("locks"), &adapter)
+        };
+        assert_eq!(file("a card", Some("0000:01:00.0")), file("the card", Some("0000:01:00.0")));
+        assert_ne!(file("a card", Some("0000:01:00.0")), file("a card", Some("0000:02:00.0")));
+        assert_eq!(file("a card", None), file("a card", None));
     }
 
     /// The test function counts how often it runs.
@@ -305,7 +388,7 @@ mod tests {
         };
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("cache/devices.json");
-        let device = Device::open(adapter);
+        let device = Device::open(adapter).unwrap();
         for _ in 0..3 {
             assert!(require_passed(&device, adapter, &test, Some(&file)).is_ok());
         }

@@ -28,9 +28,10 @@ pub fn session(stage: &'static str) -> TrainingSession<'static> {
 }
 
 /// Opens an adapter once for each kind of atomics that trainings use on it. The second step is smaller by the returned
-/// divisor: only the kernels that add differ, and they are a small part of a step.
-pub fn devices(adapter: &Adapter) -> [(Device, usize); 2] {
-    [(Device::open(adapter), 1), (Device::open(adapter).with_atomics(Atomics::Fixed), 8)]
+/// divisor: the kernels that add differ, which are a small part of a step, and variants that the
+/// first step does not launch.
+pub fn devices(adapter: &Adapter) -> Result<[(Device, usize); 2]> {
+    Ok([(Device::open(adapter)?, 1), (Device::open(adapter)?.with_atomics(Atomics::Fixed), 8)])
 }
 
 /// A field in training whose parameters can be read.
@@ -99,6 +100,13 @@ pub fn compare(field: &str, got: &StepResult, want: &StepResult) -> Vec<Check> {
     checks
 }
 
+/// Compares values of any kind.
+pub fn compare_values(name: String, got: &[f32], want: &[f32]) -> Check {
+    assert_eq!(got.len(), want.len(), "{name}");
+    let pairs = got.iter().zip(want).map(|(&got, &want)| (got.into(), want.into()));
+    Check::new(name, error(pairs), ALLOWED)
+}
+
 /// Compares the cells to march through, by the share of cells that differ.
 pub fn compare_cells(field: &str, got: &[u64], want: &[u64]) -> Check {
     let differ: u32 = got.iter().zip(want).map(|(a, b)| (a ^ b).count_ones()).sum();
@@ -133,5 +141,7 @@ mod tests {
         let failed = StepResult { figures: Vec::new(), ..of(0.0, 0.0, 0.0) };
         assert_eq!(wrong(&failed).len(), 3);
         assert!(!compare_cells("", &[0b1011], &[0b1111]).passed && compare_cells("", &[7], &[7]).passed);
+        let same = |got: f32| compare_values("colors".into(), &[got, 0.5], &[0.5, 0.5]).passed;
+        assert!(same(0.5) && !same(0.51) && !same(f32::NAN));
     }
 }

@@ -204,7 +204,8 @@ pub fn train<M: Model>(
             Err(StepError::NotFinite { term, value }) if !went_back => {
                 went_back = true;
                 warnings.push(format!(
-                    "the {term} loss became {value} at step {}; went back to the last checkpoint once",
+                    "the {term} loss became {value} at step {}; went back to the last checkpoint once. If the result is \
+                     poor, train again with another `--seed`",
                     done - 1
                 ));
                 let Some((restored, notes)) = restore(model)? else {

@@ -166,7 +166,7 @@ fn pierces(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> bool {
 }
 
 /// Sign of the determinant of `(a − d, b − d, c − d)`; 0 where rounding could decide it.
-fn orient(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> i32 {
+pub(super) fn orient(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> i32 {
     let (a, b, c) = (a - d, b - d, c - d);
     let det = a.dot(b.cross(c));
     let (x, y, z) = (a.abs(), b.abs(), c.abs());

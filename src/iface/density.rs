@@ -34,7 +34,7 @@ use crate::kernel::gpu::Adapter;
 use crate::{Error, Result};
 use cpu::CpuDensity;
 #[cfg(feature = "wgpu")]
-use gpu::GpuDensity;
+pub(super) use gpu::GpuDensity;
 use std::time::Instant;
 
 /// Version of the checkpoints' layout.
@@ -105,7 +105,7 @@ pub fn train_density(
                 ComputeDevice::Gpu(gpu) => GpuDensity::fits(config, &pixels, &gpu.device),
             },
         )?;
-    let description = device.description();
+    let (description, refused) = (device.description(), device.warning());
     let (state, progress, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuDensity::new(config, &pixels), config, session)?,
         #[cfg(feature = "wgpu")]
@@ -118,7 +118,7 @@ pub fn train_density(
         train_psnr: progress.psnr(),
         occupied: state.occupancy.share(),
         device: description,
-        warnings,
+        warnings: refused.into_iter().chain(warnings).collect(),
     };
     Ok((DensityField::new(config, state), report))
 }
@@ -272,7 +272,7 @@ pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<C
         Ok(model.state()?.occupancy)
     }
     let mut on_cpu = DensityModel::new(CpuDensity::new(config, &pixels), config, &session);
-    let device = crate::kernel::gpu::Device::open(adapter);
+    let device = crate::kernel::gpu::Device::open(adapter)?;
     let mut on_gpu = DensityModel::new(GpuDensity::new(config, &pixels, device)?, config, &session);
     let [want, got] = [cells(&mut on_cpu, start())?, cells(&mut on_gpu, start())?];
     let mut checks = vec![compare_cells(FIELD, &got.occupied.bits, &want.occupied.bits)];

@@ -123,6 +123,24 @@ impl<'a> GpuSdf<'a> {
         })
     }
 
+    /// Evaluates the colors of points that are given their normals, planes `[3, points]`.
+    pub(super) fn colors(
+        &self,
+        [table, ..]: &SdfGroups<Self>,
+        points: &[[f32; 3]],
+        directions: &[[f32; 3]],
+        normals: &[[f32; 3]],
+    ) -> Result<Vec<f32>> {
+        let (device, capacity) = (&self.device, self.samples.t.words());
+        let [x, direction, normal] = [points, directions, normals]
+            .map(|rows| device.upload(&gpu::planes(&rows[..points.len()], capacity)));
+        let count = device.upload(&[points.len() as u32]);
+        let field = [table.value(), &self.flat];
+        let out: Vec<f32> =
+            device.fetch(self.sdf.shade(device, field, &x, &direction, Some(&normal), &count))?;
+        Ok((4..7).flat_map(|k| &out[k * capacity..][..points.len()]).copied().collect())
+    }
+
     fn rays(&self) -> Rays<'_> {
         let Samples { offsets, t, dt, .. } = &self.samples;
         Rays { offsets, direction: &self.batch.direction, t, dt }

@@ -3,7 +3,7 @@
 use super::cpu::CpuSdf;
 use super::density;
 use super::gpu::GpuSdf;
-use super::model::initial;
+use super::model::{initial, shape};
 use super::occupancy::Occupancy;
 use super::ops::SdfOps;
 use super::schedule;
@@ -12,16 +12,16 @@ use super::stereo::SurfacePoint;
 use super::train::{SdfModel, pixels};
 use crate::Result;
 use crate::config::Preset;
-use crate::config::iface::IfaceConfig;
+use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::Check;
 use crate::field::ball::{self, BALL};
 use crate::field::parameters::HostGroup;
 use crate::field::self_test::{
-    CELLS_AT, SEED, TestedModel, compare, compare_cells, devices, run_step, session,
+    CELLS_AT, SEED, TestedModel, compare, compare_cells, compare_values, devices, run_step, session,
 };
 use crate::field::training::StepAt;
-use crate::kernel::cpu::rng;
-use crate::kernel::gpu::Adapter;
+use crate::kernel::cpu::{rng, sdf as on_host};
+use crate::kernel::gpu::{Adapter, planes};
 
 impl<O: SdfOps> TestedModel for SdfModel<'_, O> {
     fn host_groups(&self) -> Result<Vec<HostGroup>> {
@@ -45,17 +45,21 @@ pub(super) fn config(preset: Preset) -> IfaceConfig {
     }
 }
 
+/// Returns so many random directions.
+fn directions(stream: u64, count: u64) -> Vec<[f32; 3]> {
+    let direction = |i| {
+        let d: [f32; 3] = std::array::from_fn(|a| rng::normal(SEED, stream, 3 * i + a as u64));
+        d.map(|c| c / d.iter().map(|c| c * c).sum::<f32>().sqrt())
+    };
+    (0..count).map(direction).collect()
+}
+
 /// Returns a field that varies in space, and points that its surface should pass through.
 fn start(config: &IfaceConfig) -> SdfState {
     let mut state = SdfState::start(initial(config, SEED), config, None);
     state.groups[0].state[0].iter_mut().for_each(|v| *v *= 100.0);
-    state.stereo = (0..100)
-        .map(|i| {
-            let p: [f32; 3] = std::array::from_fn(|a| rng::normal(SEED, 9, 3 * i + a as u64));
-            let length = p.iter().map(|c| c * c).sum::<f32>().sqrt();
-            SurfacePoint { position: p.map(|c| c * BALL / length), footprint: 0.02, weight: 0.5 }
-        })
-        .collect();
+    let point = |d: [f32; 3]| SurfacePoint { position: d.map(|c| c * BALL), footprint: 0.02, weight: 0.5 };
+    state.stereo = directions(9, 100).into_iter().map(point).collect();
     state
 }
 
@@ -66,6 +70,18 @@ fn cells<O: SdfOps>(model: &mut SdfModel<O>) -> Result<Occupancy> {
     model.ops.weights(&mut model.groups);
     model.ops.update_occupancy(&model.groups, schedule::active_levels(model.config, at.step), at);
     Ok(model.state()?.occupancy)
+}
+
+/// Compares the colors of points that are given their normals, as where a mesh is textured.
+fn compare_colors(field: &str, on_gpu: &SdfModel<GpuSdf>) -> Result<Check> {
+    let [points, seen, normals] = [10, 11, 12].map(|stream| directions(stream, 500));
+    let got = on_gpu.ops.colors(&on_gpu.groups, &points, &seen, &normals)?;
+    let state = start(on_gpu.config);
+    let mut shape = shape(on_gpu.config);
+    shape.active = schedule::active_levels(on_gpu.config, CELLS_AT);
+    let (_, weights) = state.weights(&shape);
+    let want = on_host::colors(&shape, state.table(), &weights, &points, &normals, None, &seen);
+    Ok(compare_values(format!("{field}: colors"), &got, &planes(&want, points.len())))
 }
 
 /// Compares a step of the signed distance.
@@ -79,27 +95,26 @@ fn compare_sdf(adapter: &Adapter, config: IfaceConfig) -> Result<Vec<Check>> {
     let (views, session) = (ball::views(), session("iface"));
     let pixels = pixels(&views, None, &full)?;
     let mut checks = Vec::new();
-    let mut kept = None;
-    for (way, (device, part)) in [FIELD, "signed distance in fixed point"].into_iter().zip(devices(adapter)) {
+    for (way, (device, part)) in [FIELD, "signed distance in fixed point"].into_iter().zip(devices(adapter)?)
+    {
         let rays = full.rays / part;
-        let config = IfaceConfig { rays, max_rays: rays, samples: full.samples / part, ..full.clone() };
+        // the published rule for cells is that of the smaller step
+        let occupancy = if part == 1 { full.occupancy } else { OccupancyRule::Nerfacc };
+        let samples = full.samples / part;
+        let config = IfaceConfig { occupancy, rays, max_rays: rays, samples, ..full.clone() };
         let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);
         let mut on_gpu =
             SdfModel::new(GpuSdf::new(&config, &pixels, device)?, &pixels, None, &config, &session);
         // Both keep the same cells up to rounding. The compared steps use the processor's.
-        let occupancy = match kept.take() {
-            Some(occupancy) => occupancy,
-            None => {
-                let [want, got] = [cells(&mut on_cpu)?, cells(&mut on_gpu)?];
-                checks.push(compare_cells(way, &got.occupied.bits, &want.occupied.bits));
-                want
-            }
-        };
-        let start = || SdfState { occupancy: occupancy.clone(), ..start(&config) };
+        let [want, got] = [cells(&mut on_cpu)?, cells(&mut on_gpu)?];
+        checks.push(compare_cells(way, &got.occupied.bits, &want.occupied.bits));
+        if part == 1 {
+            checks.push(compare_colors(way, &on_gpu)?);
+        }
+        let start = || SdfState { occupancy: want.clone(), ..start(&config) };
         on_cpu.load(start());
         on_gpu.load(start());
         checks.extend(compare(way, &run_step(&mut on_gpu)?, &run_step(&mut on_cpu)?));
-        kept = Some(occupancy);
     }
     Ok(checks)
 }

@@ -102,7 +102,7 @@ pub fn train(
             #[cfg(feature = "wgpu")]
             ComputeDevice::Gpu(gpu) => GpuSdf::fits(config, &pixels, &gpu.device),
         })?;
-    let description = device.description();
+    let (description, refused) = (device.description(), device.warning());
     let (state, progress, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuSdf::new(config, &pixels), &pixels, hull, config, session)?,
         #[cfg(feature = "wgpu")]
@@ -117,7 +117,7 @@ pub fn train(
         train_psnr: progress.psnr(),
         occupied: state.occupancy.share(),
         device: description,
-        warnings,
+        warnings: refused.into_iter().chain(warnings).collect(),
     };
     Ok((IFace::new(config, state), report))
 }

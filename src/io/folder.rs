@@ -4,8 +4,9 @@ use super::read::ReadError;
 use super::write::WriteError;
 use std::collections::BTreeMap;
 use std::fs::{self, DirEntry, File, OpenOptions, TryLockError};
-use std::io::{ErrorKind, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
+use std::process::Stdio;
 use std::time::SystemTime;
 
 fn failed(path: &Path) -> impl Fn(std::io::Error) -> WriteError + '_ {
@@ -51,17 +52,28 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
     Ok(())
 }
 
-/// Returns a file in a folder or below, but not in folders that are `apart`; `None` without one, or without
-/// the folder.
+/// Removes a folder if it is there and has nothing in it.
+pub fn remove_empty_folder(path: &Path) -> Result<(), WriteError> {
+    match fs::remove_dir(path) {
+        Err(e) if !matches!(e.kind(), ErrorKind::NotFound | ErrorKind::DirectoryNotEmpty) => {
+            Err(failed(path)(e))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Returns a file in a folder or below, but none of those, nor in one of the folders, that are
+/// `apart`; `None` without one, or without the folder.
 pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<PathBuf>, ReadError> {
     for entry in entries(path).map_err(|e| ReadError::io(path, e))? {
         let inside = entry.path();
+        if apart(&inside) {
+            continue;
+        }
         if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
             return Ok(Some(inside));
         }
-        if !apart(&inside)
-            && let Some(file) = any_file(&inside, apart)?
-        {
+        if let Some(file) = any_file(&inside, apart)? {
             return Ok(Some(file));
         }
     }
@@ -102,6 +114,16 @@ pub fn is_folder(path: &Path) -> bool {
 /// Returns the names of the regular files directly in a folder, sorted by bytes; hidden ones left out. A name that
 /// is not UTF-8 is an error that shows it as well as it can.
 pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
+    listed(folder, |name| !name.starts_with('.'))
+}
+
+/// Returns the names of the hidden regular files directly in a folder, as [`list_files`] those of
+/// the others.
+pub fn list_hidden(folder: &Path) -> Result<Vec<String>, ReadError> {
+    listed(folder, |name| name.starts_with('.'))
+}
+
+fn listed(folder: &Path, is_wanted: impl Fn(&str) -> bool) -> Result<Vec<String>, ReadError> {
     let mut names = Vec::new();
     for entry in fs::read_dir(folder).map_err(|e| ReadError::io(folder, e))? {
         let entry = entry.map_err(|e| ReadError::io(folder, e))?;
@@ -112,7 +134,7 @@ pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
         let Ok(name) = entry.file_name().into_string() else {
             return Err(ReadError::unsupported(&path, "a file name that is not UTF-8", "rename the file"));
         };
-        if !name.starts_with('.') {
+        if is_wanted(&name) {
             names.push(name);
         }
     }
@@ -125,7 +147,8 @@ pub fn real_path(path: &Path) -> Result<PathBuf, ReadError> {
     fs::canonicalize(path).map_err(|e| ReadError::io(path, e))
 }
 
-/// Returns the path whose name is most like that of a path that does not exist: beside it, or the same name under `runs/`.
+/// Returns the path whose name is most like that of a path that does not exist: beside it, in a folder of a similar name, or
+/// the same name under `runs/`.
 pub fn similar(path: &Path) -> Option<PathBuf> {
     let name = path.file_name()?.to_str()?;
     let in_runs = Path::new("runs").join(path);
@@ -133,6 +156,9 @@ pub fn similar(path: &Path) -> Option<PathBuf> {
         return Some(in_runs);
     }
     let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
+    if let Some(parent) = parent.filter(|parent| !parent.exists()) {
+        return similar(parent).map(|found| found.join(name)).filter(|found| found.exists());
+    }
     let entries = fs::read_dir(parent.unwrap_or(Path::new("."))).ok()?;
     let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
     let near =
@@ -190,7 +216,7 @@ pub fn append(path: &Path, line: &str) -> Result<(), WriteError> {
 }
 
 fn ends_with_newline(file: &mut File) -> std::io::Result<bool> {
-    use std::io::{Read, Seek, SeekFrom};
+    use std::io::{Seek, SeekFrom};
     if file.metadata()?.len() == 0 {
         return Ok(true);
     }
@@ -231,7 +257,7 @@ pub fn free_bytes(_: &Path) -> Option<u64> {
 /// An exclusive lock on a folder, freed when dropped, and by the kernel when the process dies.
 #[derive(Debug)]
 pub struct Lock {
-    _file: File,
+    file: File,
 }
 
 /// Why a lock was not taken.
@@ -260,7 +286,7 @@ impl Lock {
     pub fn take(path: &Path) -> Result<Lock, LockError> {
         let file = lock_file(path)?;
         match file.try_lock() {
-            Ok(()) => Ok(Lock { _file: file }),
+            Ok(()) => Ok(Lock { file }),
             Err(TryLockError::WouldBlock) => Err(LockError::Held { path: path.into() }),
             Err(TryLockError::Error(source)) => Err(LockError::Io { path: path.into(), source }),
         }
@@ -270,8 +296,41 @@ impl Lock {
     pub fn wait(path: &Path) -> Result<Lock, LockError> {
         let file = lock_file(path)?;
         file.lock().map_err(|source| LockError::Io { path: path.into(), source })?;
-        Ok(Lock { _file: file })
+        Ok(Lock { file })
     }
+
+    /// Returns the lock file, which is empty without a mark, as the input of a program. The lock is
+    /// then held until that program and those that it starts have ended, too, even if this process
+    /// is killed before them; on Windows, until this process ends.
+    pub fn as_input(&self) -> std::io::Result<Stdio> {
+        // on Unix a lock belongs to what was opened, which its copies share
+        if cfg!(unix) { Ok(self.file.try_clone()?.into()) } else { Ok(Stdio::null()) }
+    }
+
+    /// [`Lock::take`], after which the file of the lock begins with `mark`, so that its content
+    /// tells whose it is. The mark is on the disk when this returns. A file with other content
+    /// keeps it, and so does another user's.
+    pub fn take_marked(path: &Path, mark: &str) -> Result<Lock, LockError> {
+        let lock = Lock::take(path)?;
+        let is_ours_to_write = || OpenOptions::new().write(true).open(path).is_ok();
+        if begins(path, mark) == Some(false) && is_ours_to_write() {
+            let written = (&lock.file).write_all(mark.as_bytes()).and_then(|()| lock.file.sync_all());
+            written.map_err(|source| LockError::Io { path: path.into(), source })?;
+        }
+        Ok(lock)
+    }
+}
+
+/// Compares the first bytes of a file with `mark`: whether all of it is there, as opposed to some
+/// or none of it, which is what a process leaves that was killed before or while it wrote. `None`
+/// for other content, for a link, and if the file cannot be read.
+pub fn begins(path: &Path, mark: &str) -> Option<bool> {
+    if is_link(path) || !is_file(path) {
+        return None;
+    }
+    let mut found = Vec::new();
+    File::open(path).ok()?.take(mark.len() as u64).read_to_end(&mut found).ok()?;
+    mark.as_bytes().starts_with(&found).then_some(found.len() == mark.len())
 }
 
 fn lock_file(path: &Path) -> Result<File, LockError> {
@@ -300,6 +359,34 @@ mod tests {
         assert!(matches!(Lock::take(&path), Err(LockError::Held { .. })));
         drop(first);
         assert!(Lock::take(&path).is_ok());
+    }
+
+    #[test]
+    fn only_an_empty_folder_is_removed() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a/b");
+        fs::create_dir_all(&path).unwrap();
+        remove_empty_folder(&dir.path().join("a")).unwrap();
+        assert!(path.is_dir());
+        remove_empty_folder(&path).unwrap();
+        assert!(!path.exists());
+        remove_empty_folder(&path).unwrap();
+    }
+
+    #[test]
+    fn a_marked_lock_tells_whose_it_is_even_if_a_kill_cut_its_mark() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(".lock");
+        assert_eq!(begins(&path, "ours\n"), None);
+        for before in ["", "ou", "ours\n"] {
+            fs::write(&path, before).unwrap();
+            assert_eq!(begins(&path, "ours\n"), Some(before.len() == 5), "{before:?}");
+            drop(Lock::take_marked(&path, "ours\n").unwrap());
+            assert_eq!(fs::read(&path).unwrap(), b"ours\n", "{before:?}");
+        }
+        fs::write(&path, "theirs").unwrap();
+        drop(Lock::take_marked(&path, "ours\n").unwrap());
+        assert_eq!((begins(&path, "ours\n"), fs::read(&path).unwrap()), (None, b"theirs".to_vec()));
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Cost of this process, its processor, and whether other processes run, as far as the system reports it.
 
 use std::path::Path;
+use std::sync::OnceLock;
 
 /// Returns the seconds of all threads of this process, user and system; those by the clock where the system does not
 /// say.
@@ -30,6 +31,22 @@ pub fn peak_memory() -> Option<u64> {
 pub fn forget_peak_memory() {
     // 5: the peak becomes what is held now (proc_pid_clear_refs(5))
     let _ = std::fs::write("/proc/self/clear_refs", "5");
+}
+
+/// How the program's allocator gives its free memory back.
+static COLLECT: OnceLock<fn()> = OnceLock::new();
+
+/// Sets the function that gives the free memory of the program's allocator back to the system; only the first counts.
+pub fn set_memory_collector(collect: fn()) {
+    let _ = COLLECT.set(collect);
+}
+
+/// Gives free memory back to the system, if the program has said how. Allocators keep it for long otherwise, and a stage
+/// would be charged for the memory of the one before.
+pub fn give_memory_back() {
+    if let Some(collect) = COLLECT.get() {
+        collect();
+    }
 }
 
 /// Returns whether a process of this machine runs and has a file open. Where the system shows no open files (such as of
@@ -73,6 +90,18 @@ pub fn processor() -> String {
 mod tests {
     use super::*;
     use std::time::Instant;
+
+    #[test]
+    fn the_allocator_is_asked_for_its_free_memory() {
+        use std::sync::atomic::{AtomicUsize, Ordering};
+        static ASKED: AtomicUsize = AtomicUsize::new(0);
+        give_memory_back(); // without an allocator that can
+        set_memory_collector(|| {
+            ASKED.fetch_add(1, Ordering::Relaxed);
+        });
+        give_memory_back();
+        assert!(ASKED.load(Ordering::Relaxed) > 0);
+    }
 
     #[test]
     fn work_costs_cpu_time_and_memory_shows_as_a_peak() {

@@ -31,7 +31,7 @@ pub use adam::{Gate, adam};
 pub use density::Density;
 pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits, Words};
 pub use draw::{BUFFERS, Batch, DrawnView, Photographs, PixelOrder, SamplingOptions};
-pub use evaluate::Evaluator;
+pub use evaluate::{Evaluator, planes};
 pub use hash::Grid;
 pub use losses::Losses;
 pub use march::Samples;

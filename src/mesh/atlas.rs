@@ -53,12 +53,15 @@ impl AtlasReport {
         if let Some(reason) = &self.fallback {
             let gutter = self.gutter_px;
             out.push(format!(
-                "every triangle has a piece of the texture of its own, {gutter:.1} texels of gutter: {reason}"
+                "every triangle has a piece of the texture of its own, {gutter:.1} texels of gutter: {reason}; a larger \
+                 `mesh.texture_px` or fewer `mesh.triangles` help"
             ));
         }
         if self.repaired > 0 {
             let repaired = counted(self.repaired, "triangle");
-            out.push(format!("{repaired} could not stay in a larger chart and got a chart of their own"));
+            out.push(format!(
+                "{repaired} could not stay in a larger chart and got a chart of their own; fewer `mesh.triangles` help"
+            ));
         }
         out
     }

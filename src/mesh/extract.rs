@@ -117,32 +117,33 @@ impl MeshReport {
         self.seconds = begin.elapsed().as_secs_f64();
     }
 
-    /// Returns warnings for the user, one sentence each; `cap` says whether the cap was kept.
-    pub fn warnings(&self, cap: bool) -> Vec<String> {
+    /// Returns where the surface ends with the kept region, as every bust does; `cap` says whether the cap was kept.
+    pub fn end(&self, cap: bool) -> Option<String> {
+        let state = if cap { "is closed by a cap" } else { "is open" };
+        (self.capped > 0).then(|| {
+            format!("the surface {state} where the frames cut the body ({})", counted(self.capped, "node"))
+        })
+    }
+
+    /// Returns warnings for the user, one sentence each, with what to do.
+    pub fn warnings(&self) -> Vec<String> {
         let mut out = Vec::new();
-        if self.capped > 0 {
-            let state = if cap { "was closed by a cap" } else { "is open" };
-            out.push(format!(
-                "the surface {state} where the kept region ends ({}): the frames cut the body there, or the box is too small",
-                counted(self.capped, "node")
-            ));
-        }
         if self.non_finite > 0 {
             out.push(format!(
-                "the field was NaN or infinite at {} near the surface",
+                "the field was NaN or infinite at {} near the surface; train it again with another `--seed`",
                 counted(self.non_finite, "node")
             ));
         }
         if self.clean.dropped_triangles > 0 {
             out.push(format!(
-                "removed {} and {} ({})",
+                "removed {} and {} ({}); if a part of the head is missing, look for it in `mask/sheet.html`",
                 counted(self.clean.dust, "small piece"),
                 counted(self.clean.inner_shells, "inner shell"),
                 counted(self.clean.dropped_triangles, "triangle")
             ));
         }
         if !self.topology.is_solid() {
-            out.push("the mesh is not a closed manifold".into());
+            out.push("the mesh is not a closed manifold; `tiface check RUN` says what is wrong".into());
         }
         out
     }
@@ -530,7 +531,7 @@ mod tests {
         }
         // 4/3 π 0.7³ = 1.4368; inscribed, so a little less.
         assert!((1.43..1.4368).contains(&report.volume), "{}", report.volume);
-        assert!(report.warnings(true).is_empty(), "{:?}", report.warnings(true));
+        assert!(report.warnings().is_empty() && report.end(true).is_none(), "{:?}", report.warnings());
     }
 
     #[test]
@@ -559,7 +560,10 @@ mod tests {
         let f = |p: Vec3| (p.x.hypot(p.z) - 0.3).max(p.y - 0.5);
         let (mesh, report) = mesh_of(f, &coarse()).unwrap();
         assert!(report.topology.is_solid());
-        assert!(report.capped > 0 && report.warnings(true).len() == 1);
+        // the cut of a bust is told, and is no warning
+        assert!(report.capped > 0 && report.warnings().is_empty(), "{:?}", report.warnings());
+        assert!(report.end(true).unwrap().contains("closed by a cap"));
+        assert!(report.end(false).unwrap().contains("is open"));
         let low = mesh.bounds().min.y;
         assert!(low >= -1.0 && low < -1.0 + 1e-3 * report.cell_size);
         let middle = (0..mesh.positions.len())

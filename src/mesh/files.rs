@@ -14,7 +14,9 @@ mod read;
 mod source;
 mod stored;
 
-pub use check::{BARS, CheckReport, MIN_AREA_PX, UvReport, check, check_around, seams_facing, uv_check};
+pub use check::{
+    BARS, CheckReport, MIN_AREA_PX, PieceReport, UvReport, check, check_around, seams_facing, uv_check,
+};
 pub use file_mesh::{ExportOptions, ExportedFiles, HeadTexture, Lobes, tangents, weld};
 pub use glb::to_glb;
 pub use obj::{picture_of_mtl, to_obj};

@@ -175,15 +175,22 @@ impl SimplifyReport {
         let mut out = Vec::new();
         if config.triangles > 0 && self.after > config.triangles && config.error == 0.0 {
             out.push(format!(
-                "{} triangles are left instead of {}: fewer would change the topology, fold the surface or make it cross itself",
+                "{} triangles are left instead of {}: fewer would change the topology, fold the surface or make it cross \
+                 itself; `mesh.triangles` can be raised to that",
                 self.after, config.triangles
             ));
         }
         if self.held > 0 {
-            out.push(format!("{} vertices are not manifold and stayed as they are", self.held));
+            out.push(format!(
+                "{} vertices are not manifold and stayed as they are; another `mesh.resolution` may avoid them",
+                self.held
+            ));
         }
         if self.self_intersections > 0 {
-            out.push(format!("{} triangles cross others, as in the input", self.self_intersections));
+            out.push(format!(
+                "{} triangles cross others, as in the input; another `mesh.resolution` may avoid them",
+                self.self_intersections
+            ));
         }
         out
     }

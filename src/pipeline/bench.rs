@@ -23,6 +23,7 @@ use crate::metrics::{compare, distance};
 use crate::report::bench::{BenchResult, Measure, Row, Sweep, WorkCost};
 use crate::run::{Run, Stop};
 use crate::{Error, Monitor, Quiet, Result};
+use std::borrow::Cow;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
@@ -55,14 +56,16 @@ impl<'l> Bench<'l> {
         Ok(Bench { session, finished, scene, evaluator, watch })
     }
 
-    /// Returns an empty report: program, machine and capture.
-    pub fn begin(&self) -> BenchResult {
+    /// Returns an empty report of a bench with these settings: program, machine, and the sweeps that it is to have.
+    pub fn begin(config: &Config, sweeps: &[&str]) -> BenchResult {
         BenchResult {
-            version: env!("CARGO_PKG_VERSION"),
+            version: env!("CARGO_PKG_VERSION").into(),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
             processor: io::processor(),
             threads: rayon::current_num_threads(),
-            capture: self.session.capture.name.clone(),
+            capture: String::new(),
+            settings: config.to_toml(),
+            asked: sweeps.iter().map(|sweep| sweep.to_string()).collect(),
             sweeps: Vec::new(),
         }
     }
@@ -145,7 +148,8 @@ struct Extracted {
 
 /// The metric that views of fields are evaluated by: two trainings with the same settings and different seeds differ
 /// by as much as its noise.
-const PSNR: Measure = Measure { name: "PSNR, dB", digits: 2, more_is_better: Some(true), noise: (0.2, 0.0) };
+const PSNR: Measure =
+    Measure { name: Cow::Borrowed("PSNR, dB"), digits: 2, more_is_better: Some(true), noise: (0.2, 0.0) };
 
 /// Returns the result of `work`, and the time it took.
 fn timed<T>(work: impl FnOnce() -> Result<T>) -> Result<(T, WorkCost)> {
@@ -298,12 +302,18 @@ impl Bench<'_> {
                 let step = ((all as f64 * share) as u64).max(1);
                 cost = cost + timed(|| train_until(session, stage, step))?.1;
                 let figures = evaluate(session, stage, &self.evaluator)?;
-                rows.push(Row { series, choice: format!("{step} steps"), cost, figures });
+                rows.push(Row { series: series.into(), choice: format!("{step} steps"), cost, figures });
             }
         }
         let note = "One training of each field, looked at on its way; a time is that of all steps so far, with opening photographs and \
                     checkpoint once for each look.";
-        Ok(Sweep { name: "steps", title: "Training steps", note: note.into(), measures: vec![PSNR], rows })
+        Ok(Sweep {
+            name: "steps".into(),
+            title: "Training steps".into(),
+            note: note.into(),
+            measures: vec![PSNR],
+            rows,
+        })
     }
 
     /// Evaluates I-Face trained from smaller photographs on full-size ones.
@@ -316,7 +326,13 @@ impl Bench<'_> {
             rows.push(self.row(format!("{} × {}", camera.width / times, camera.height / times), &config)?);
         }
         let (note, measures) = (self.note("Judged on photographs of full size."), vec![PSNR]);
-        Ok(Sweep { name: "photographs", title: "Size of the photographs", note, measures, rows })
+        Ok(Sweep {
+            name: "photographs".into(),
+            title: "Size of the photographs".into(),
+            note,
+            measures,
+            rows,
+        })
     }
 
     /// Evaluates I-Face trained with different hash grids.
@@ -331,7 +347,7 @@ impl Bench<'_> {
             rows.push(self.row(format!("{levels} levels, 2^{}", config.iface.log2_table), &config)?);
         }
         let note = self.note("Levels, and entries of the largest table.");
-        Ok(Sweep { name: "hash", title: "Hash grid", note, measures: vec![PSNR], rows })
+        Ok(Sweep { name: "hash".into(), title: "Hash grid".into(), note, measures: vec![PSNR], rows })
     }
 
     /// Returns the configuration for a share of its steps.
@@ -356,7 +372,7 @@ impl Bench<'_> {
         complete(&session, Stage::Mask, &learn::trained_fields(&session))?;
         let ((), cost) = timed(|| train_until(&session, Stage::Iface, config.iface.steps))?;
         Ok(Row {
-            series: "I-Face",
+            series: "I-Face".into(),
             choice,
             cost,
             figures: evaluate(&session, Stage::Iface, &self.evaluator)?,
@@ -398,15 +414,21 @@ impl Bench<'_> {
             let config = SimplifyConfig { triangles, ..SimplifyConfig::default() };
             let (_, cost) = timed(|| simplify(&mut mesh, Some(&closed), &config, self.monitor()))?;
             let figures = vec![self.off_field(&mesh, &closed)];
-            rows.push(Row { series: "", choice: triangles.to_string(), cost, figures });
+            rows.push(Row { series: "".into(), choice: triangles.to_string(), cost, figures });
         }
         let measures = vec![Measure {
-            name: "off the field, mm",
+            name: "off the field, mm".into(),
             digits: 4,
             more_is_better: Some(false),
             noise: (0.0, 0.03),
         }];
-        Ok(Sweep { name: "triangles", title: "Triangles after simplification", note, measures, rows })
+        Ok(Sweep {
+            name: "triangles".into(),
+            title: "Triangles after simplification".into(),
+            note,
+            measures,
+            rows,
+        })
     }
 
     /// Measures the texture's size, the source of its colors, and their view dependence.
@@ -448,11 +470,11 @@ impl Bench<'_> {
             let renderer = Renderer::new(&self.scene, &fields, &meshes, 2, self.monitor());
             let psnr = self.evaluator.psnr(&self.scene, &renderer, Method::Textured)?;
             let figures = vec![psnr, Some(triangles)];
-            rows.push(Row { series, choice, cost, figures });
+            rows.push(Row { series: series.into(), choice, cost, figures });
         }
-        let count = Measure { name: "triangles", digits: 0, more_is_better: None, noise: (0.0, 0.0) };
+        let count = Measure { name: "triangles".into(), digits: 0, more_is_better: None, noise: (0.0, 0.0) };
         let measures = vec![Measure { noise: (0.05, 0.0), ..PSNR }, count];
-        Ok(Sweep { name: "texture", title: "Texture", note, measures, rows })
+        Ok(Sweep { name: "texture".into(), title: "Texture".into(), note, measures, rows })
     }
 }
 

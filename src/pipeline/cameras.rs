@@ -221,6 +221,22 @@ impl CameraCheck {
         })
     }
 
+    /// Returns what is said of training views whose poses were not refined although all were to be,
+    /// if there are any.
+    pub(super) fn not_refined(&self) -> Option<String> {
+        if !self.refines() {
+            return Some(format!("`capture.cameras=refine` refines nothing: {}", self.sentence()));
+        }
+        let left = self.cameras.iter().filter(|c| c.state == CameraState::Stays);
+        let left: Vec<String> = left.map(|c| format!("`{}` ({} sightings)", c.view, c.sightings)).collect();
+        (!left.is_empty()).then(|| {
+            let named = left.join(", ");
+            format!(
+                "too little was found again in training views to refine their poses: {named}; they are used as given"
+            )
+        })
+    }
+
     /// Returns the cameras among these whose own poses were fitted, with these poses.
     pub(super) fn fitted(&self, cameras: &[NamedCamera]) -> Vec<NamedCamera> {
         let fitted = |NamedCamera { name, camera }: &NamedCamera| {

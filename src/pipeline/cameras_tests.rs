@@ -3,15 +3,16 @@
 use super::cameras::{CameraCheck, POSES, check_by};
 use super::rig_photos::RigPhotos;
 use super::tests::{NoFields, measured_head, quiet, scene_of};
-use super::{Session, Stage, complete};
+use super::{Session, Stage, capture_options, complete, inspect_capture};
 use crate::capture::scene::{self, SceneOptions};
 use crate::capture::synthetic::SyntheticHead;
 use crate::capture::{self, Capture, Split, View};
-use crate::config::{CameraPoses, Config, Preset};
+use crate::config::{CameraPoses, Config, MaskSource, Preset};
 use crate::geom::Camera;
 use crate::io::{self, Limits};
 use crate::render::path::NamedCamera;
 use crate::rig;
+use crate::run::read_record;
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::{Value, json};
 use std::sync::OnceLock;
@@ -190,7 +191,43 @@ fn without_masks_nothing_is_said() {
         &SceneOptions::default(),
     );
     bare.views.iter_mut().for_each(|v| v.mask = capture::ViewMask::None);
-    assert!(RigPhotos::load(&bare, &scene.unwrap().0, &Limits::default()).unwrap().is_none());
+    let why = RigPhotos::load(&bare, &scene.unwrap().0, &Limits::default()).unwrap().err();
+    assert_eq!(why.unwrap(), "there is no hull of head masks");
+}
+
+#[test]
+fn refinement_that_cannot_be_done_is_told_with_its_reason() {
+    let (dir, whole) = measured_head();
+    let scene = scene_of(&whole);
+    let why = |views: usize| {
+        let mut capture = whole.clone();
+        capture.views = (0..views).map(|v| whole.views[v % 14].clone()).collect();
+        RigPhotos::load(&capture, &scene, &Limits::default()).unwrap().err().unwrap()
+    };
+    assert_eq!(why(2), "there are 2 training views, and at least 3 are needed");
+    assert_eq!(why(1), "there is 1 training view, and at least 3 are needed");
+    assert_eq!(why(257), "there are 257 training views, and at most 256 can be compared");
+
+    // the stage says so in its record, and the inspection in its place
+    for (poses, words) in [
+        (CameraPoses::Refine, "`capture.cameras=refine` refines nothing: there is no hull of head masks"),
+        (CameraPoses::Auto, "poses are not checked: there is no hull of head masks"),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let run = quiet(folder.path());
+        let mut config = Config::preset(Preset::Draft);
+        config.capture.path = dir.path().display().to_string();
+        config.capture.cameras = poses;
+        config.mask.source = MaskSource::None;
+        complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
+        let warnings = read_record(&run.path(Stage::Mask)).unwrap().unwrap().warnings;
+        assert!(warnings.iter().any(|w| w.starts_with(words)), "{warnings:?}");
+        let found = inspect_capture(dir.path(), &capture_options(&config));
+        assert!(found.fit.as_ref().is_some_and(|fit| fit.starts_with(words)), "{found}");
+        let words = "exposures are not compared: there is no hull of head masks";
+        assert!(warnings.iter().any(|w| w.starts_with(words)), "{warnings:?}");
+        assert!(found.exposure.as_ref().is_some_and(|text| text.starts_with(words)), "{found}");
+    }
 }
 
 #[test]

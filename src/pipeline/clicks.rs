@@ -269,11 +269,15 @@ fn soft_mask(
     let segmented = networks.segment(&reduce_photo(photo, size), &chosen)?;
     if let Some((found, score)) = &segmented {
         if !found.values.contains(&255) {
-            warnings.push("SAM found nothing of the head; the built-in cut stands in".into());
+            warnings.push(
+                "SAM found nothing of the head; the built-in cut stands in; click more on the head".into(),
+            );
         } else {
             mask = found;
             if *score < 0.7 {
-                warnings.push(format!("SAM gives its mask only {score:.2} of 1; look at it"));
+                warnings.push(format!(
+                    "SAM gives its mask only {score:.2} of 1; look at it in `mask/sheet.html`, and click more"
+                ));
             }
         }
     }

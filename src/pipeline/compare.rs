@@ -13,7 +13,7 @@ use crate::geom::Bvh;
 use crate::io;
 use crate::mesh::files::{HeadMesh, OpenedMesh, check, open_mesh, weld};
 use crate::metrics::distance::one_way;
-use crate::pipeline::mesh::{finished_mesh, surface_in_world};
+use crate::pipeline::mesh::{finished_mesh, read_finished, surface_in_world};
 use crate::render::RaycastOptions;
 use crate::report::{self, Chart, MethodTable, Report, duration, leaves, relative};
 use crate::run::read_record;
@@ -101,7 +101,8 @@ fn surfaces(runs: [&Session; 2], names: [&str; 2]) -> Result<Option<Value>> {
     if runs.iter().any(|session| finished_mesh(session.run.dir()).is_err()) {
         return Ok(None);
     }
-    let [a, b] = [surface_in_world(runs[0].run)?, surface_in_world(runs[1].run)?];
+    let surface = |session: &Session| read_finished(session.run.dir(), |_| surface_in_world(session.run));
+    let [a, b] = [surface(runs[0])?, surface(runs[1])?];
     let forward = one_way(&a, &Bvh::new(&b), SURFACE_SAMPLES);
     let back = one_way(&b, &Bvh::new(&a), SURFACE_SAMPLES);
     let [from_a, from_b] = names.map(|name| format!("from {name}, dataset units"));

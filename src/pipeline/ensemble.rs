@@ -230,7 +230,10 @@ fn fit(
         sums.push(sum);
     }
     let Some(weights) = ensemble::fit_weights(&sums)? else {
-        dir.warn("no square of capture.tiles shows the head: the members are blended alike");
+        dir.warn(
+            "no square of capture.tiles shows the head: the members are blended alike; raise capture.tiles, or give \
+             ensemble.weights",
+        );
         return Ok((shares(c), Value::Null));
     };
     let mut all = Fit::new(c.members.len())?;

@@ -312,9 +312,11 @@ fn figures(session: &Session, row: &ExperimentRow, value: &Value) -> Measured {
 }
 
 /// Returns the estimated cost of the unfinished stages of a run, one after the other; `None` if all are done.
-pub fn ahead(session: &Session, run: &str) -> Option<Cost> {
-    let stages = stages(session, run).into_iter().filter(|stage| !session.run.is_done(&session.plan(*stage)));
-    stages.map(|stage| session.cost(stage)).reduce(|sum, cost| sum + cost)
+pub fn ahead(session: &Session, run: &str) -> Result<Option<Cost>> {
+    let is_left = |stage: &Stage| !session.run.is_done(&session.plan(*stage));
+    let left: Vec<Stage> = stages(session, run).into_iter().filter(is_left).collect();
+    session.require_inputs(&left)?;
+    Ok(left.into_iter().map(|stage| session.cost(stage)).reduce(|sum, cost| sum + cost))
 }
 
 #[cfg(test)]
@@ -519,7 +521,7 @@ mod tests {
         let session = Session::open(&c, &run).unwrap();
         assert_eq!(measured(&session, &row).problem.as_deref(), Some("stage `mask` is not done yet"));
         work(&session, row.run).unwrap();
-        assert!(ahead(&session, row.run).is_none());
+        assert!(ahead(&session, row.run).unwrap().is_none());
         let found = measured(&session, &row);
         assert_eq!((found.views.len(), found.problem.clone()), (2, None));
         assert_eq!(found.masks.as_deref(), Some("capture"));

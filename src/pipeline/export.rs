@@ -6,7 +6,7 @@
 
 use super::cameras::CameraCheck;
 use super::finish::{Export, center, coded, lobes};
-use super::mesh::finished_mesh;
+use super::mesh::{finished_mesh, read_finished};
 use super::scene_file::read_capture;
 use super::session::{check_feasible, unusable};
 use crate::capture::Capture;
@@ -14,7 +14,7 @@ use crate::config::{Config, Hair, Material, MeshFormat, Stage};
 use crate::mesh::bake::{Original, tangent_space};
 use crate::mesh::files::{ExportedFiles, HeadMesh, HeadTexture, tangents};
 use crate::mesh::{SimplifyConfig, atlas, simplify};
-use crate::run::{Fingerprint, Record};
+use crate::run::Fingerprint;
 use crate::{Error, Monitor, Result};
 use std::path::{Path, PathBuf};
 
@@ -56,17 +56,18 @@ impl KeptHead {
     ///
     /// Fails if the run has no finished mesh, or if a file is missing, damaged, or not the one that the stage left.
     pub fn read(run: &Path, made: &Config) -> Result<KeptHead> {
-        let record = finished_mesh(run)?;
-        let folder = run.join(Stage::Mesh);
-        let (parts, others) =
-            record.products.clone().into_iter().partition(|(name, _)| name.starts_with("parts/"));
-        let parts = Record { products: parts, ..record.clone() };
-        parts.require_products(&folder)?;
-        require_digests(&parts, &folder)?;
-        // the other files are not read
-        let problem = Record { products: others, ..record }.require_products(&folder).err();
-        let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
-        let head = HeadMesh::load(&folder.join("parts"))?;
+        let (head, warnings) = read_finished(run, |record| {
+            let folder = run.join(Stage::Mesh);
+            for name in record.products.keys().filter(|name| name.starts_with("parts/")) {
+                if let Some(fault) = record.verify(&folder, name)? {
+                    return Err(record.error(&fault));
+                }
+            }
+            // the other files are not read
+            let problem = record.require_products(&folder).err();
+            let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
+            Ok((HeadMesh::load(&folder.join("parts"))?, warnings))
+        })?;
         let mut capture = read_capture(&run.join("cameras.json"), Path::new(&made.capture.path))
             .map_err(|e| Error::cannot(&e, format!("`tiface mask {}` writes it again", run.display())))?;
         let check = CameraCheck::read(&run.join(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
@@ -116,6 +117,24 @@ impl KeptHead {
     /// Fails if the mesh is damaged.
     pub fn files(&self, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
         self.export.files(&self.head, format, stem)
+    }
+
+    /// Fails unless the files of a format are those that the stage `mesh` left in the run, by their recorded digests; older
+    /// records have sizes alone.
+    pub fn require_recorded(&self, format: MeshFormat) -> Result<()> {
+        let record = finished_mesh(&self.run)?;
+        let written = self.files(format, "head")?.files;
+        let is_own = |(name, bytes): &(String, Vec<u8>)| match record.sha256.get(name) {
+            Some(digest) => *digest == Fingerprint::of_bytes(bytes),
+            None => record.products.get(name) == Some(&(bytes.len() as u64)),
+        };
+        match written.iter().all(is_own) {
+            true => Ok(()),
+            false => Err(Error::usage(
+                format!("these settings write another `head.{}` than the run's", format.ending()),
+                "choose a place beside the run with `--out`, or leave the settings out",
+            )),
+        }
     }
 
     /// Returns the number of triangles.
@@ -250,23 +269,6 @@ impl KeptHead {
         self.head = HeadMesh { mesh, world_from_scene: *world_from_scene, texture, harmonics: None, shells };
         Ok(())
     }
-}
-
-/// Fails if a file is not the one that the stage of the record left. Older records have no digests.
-fn require_digests(record: &Record, folder: &Path) -> Result<()> {
-    for (name, digest) in record.sha256.iter().filter(|(name, _)| record.products.contains_key(*name)) {
-        let file = folder.join(name);
-        if Fingerprint::of_file(&file)? != *digest {
-            let what =
-                format!("`{}` has other contents than the stage `{}` left", file.display(), record.stage);
-            let hint = format!(
-                "put the file back, or recompute the stage and what follows with `--fresh {}`",
-                record.stage
-            );
-            return Err(Error::cannot(what, hint));
-        }
-    }
-    Ok(())
 }
 
 /// Returns a warning for each of the formats that does not show a changed setting. Fails if none shows it.

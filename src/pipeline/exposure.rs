@@ -7,9 +7,10 @@
 use super::rig_photos::RigPhotos;
 use crate::Result;
 use crate::capture::{Capture, Split, View};
+use crate::error::counted;
 use crate::image::Exposure;
 use crate::io::{self, Limits, ReadError};
-use crate::rig::exposure::{self, ExposureView, MIN_POINTS};
+use crate::rig::exposure::{self, ExposureView, Incomparable, MIN_TRAINING_VIEWS};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -22,6 +23,25 @@ const LARGEST_GAIN: f32 = 100.0;
 
 /// A view is named alone if it differs this many times as much as the median view.
 const STANDS_OUT: f64 = 4.0;
+
+/// Returns the reason for which exposures of these training views are not compared.
+fn incomparable(why: Incomparable, train: &[&View]) -> String {
+    let Incomparable::TooFewViews(measured) = why else {
+        return "what the photographs share does not determine them".into();
+    };
+    let (count, needed) = (measured.iter().filter(|m| **m).count(), MIN_TRAINING_VIEWS);
+    let left = train.iter().zip(&measured).filter(|(_, measured)| !**measured);
+    let left: Vec<String> = left.map(|(view, _)| format!("`{}`", view.name)).collect();
+    let views = counted(train.len(), "training view");
+    match left.len() {
+        0 => format!("there are {views} with a head mask, and at least {needed} are needed"),
+        _ => format!(
+            "{count} of {views} can be measured, and at least {needed} are needed: too little of the head is neither dark \
+             nor saturated in {}",
+            left.join(", ")
+        ),
+    }
+}
 
 /// The measurement of a capture's exposures.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -42,20 +62,22 @@ struct MeasuredView {
     split: Split,
     /// How many points of the head it shows.
     points: usize,
-    /// Its exposure relative to the mean of the training views.
-    measured: Exposure,
+    /// Its exposure relative to the mean of the training views; missing where it shows too little.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    measured: Option<Exposure>,
     /// What is divided out of a training photograph, or out of a held-out one for figures at its own exposure.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     used: Option<Exposure>,
 }
 
 impl ExposureCheck {
-    /// Measures exposures; `None` where too little can be compared.
-    pub(super) fn measure(photos: &RigPhotos) -> Option<ExposureCheck> {
+    /// Measures exposures. Fails with the reason where too little can be compared.
+    pub(super) fn measure(photos: &RigPhotos) -> Result<ExposureCheck, String> {
         let RigPhotos { views, train, cameras, surface, .. } = photos;
         let prepared: Vec<ExposureView> =
             photos.pictures.par_iter().map(|(photo, head)| ExposureView::new(photo, head)).collect();
-        let fit = exposure::measure(&prepared, cameras, *train, surface)?;
+        let fit = exposure::measure(&prepared, cameras, *train, surface)
+            .map_err(|why| incomparable(why, &views[..*train]))?;
         let (brightness, color) = (fit.brightness_differs(), fit.color_differs());
         let used = |e: &Exposure| {
             let own = |k: usize| match (brightness, color) {
@@ -66,16 +88,14 @@ impl ExposureCheck {
             };
             Exposure { gain: [0, 1, 2].map(own) }
         };
-        // a held-out view that shows little of what others show has no measurable exposure
-        let known = |view: &View, points: usize| view.split == Split::Train || points >= MIN_POINTS;
-        let measured = |((view, &points), &measured): ((&&View, &usize), &Exposure)| MeasuredView {
+        let measured = |((view, &points), measured): ((&&View, &usize), &Option<Exposure>)| MeasuredView {
             view: view.name.clone(),
             split: view.split,
             points,
-            measured,
-            used: ((brightness || color) && known(view, points)).then(|| used(&measured)),
+            measured: *measured,
+            used: measured.as_ref().filter(|_| brightness || color).map(&used),
         };
-        Some(ExposureCheck {
+        Ok(ExposureCheck {
             evens_brightness: brightness,
             evens_color: color,
             brightness_spread: fit.brightness_spread,
@@ -117,6 +137,20 @@ impl ExposureCheck {
             parts.push(format!("white balance differs by {:.0} %", 100.0 * self.color_spread));
         }
         parts.join("; ")
+    }
+
+    /// Returns what is said of training views whose exposure could not be measured, if there are
+    /// any.
+    pub(super) fn not_measured(&self) -> Option<String> {
+        let left = self.views.iter().filter(|v| v.split == Split::Train && v.measured.is_none());
+        let left: Vec<String> = left.map(|v| format!("`{}`", v.view)).collect();
+        (!left.is_empty()).then(|| {
+            format!(
+                "exposure is not measured where too little of the head is neither dark nor saturated: {}; such photographs \
+                 are used as they are",
+                left.join(", ")
+            )
+        })
     }
 
     /// Returns the finding with what a run does about it.

@@ -12,8 +12,12 @@ use serde_json::{Value, json};
 use std::sync::OnceLock;
 
 fn measure(capture: &Capture) -> ExposureCheck {
+    tried(capture).unwrap()
+}
+
+fn tried(capture: &Capture) -> Result<ExposureCheck, String> {
     let photos = RigPhotos::load(capture, &scene_of(capture), &Limits::default()).unwrap().unwrap();
-    ExposureCheck::measure(&photos).unwrap()
+    ExposureCheck::measure(&photos)
 }
 
 /// Multiplies the light of photographs. A photograph that is read with the inverse exposure is brighter by it.
@@ -60,6 +64,51 @@ fn known_gains_are_found() {
     let errors: Vec<f32> = clean.views.iter().zip(gains()).map(error).collect();
     // what is linear in the viewing direction cannot be told from shading: gains of 10 to 20 % have a little of it
     assert!(errors.iter().all(|&e| e < 0.03), "{errors:?}");
+}
+
+#[test]
+fn one_dark_photograph_is_left_out_and_named_and_the_others_are_compared() {
+    let (_dir, mut exposed) = measured_head();
+    assert!(measure(&exposed).not_measured().is_none());
+    // 1/64 of the light leaves even white darker than what is compared
+    let mut gains = gains();
+    gains[5] = [1.0 / 64.0; 3];
+    expose(&mut exposed, &gains);
+    let found = measure(&exposed);
+    assert!(found.evens_out() && found.used("005").is_none(), "{found:?}");
+    let said = found.not_measured().unwrap();
+    assert!(said.contains("dark nor saturated: `005`; such photographs"), "{said}");
+    assert!(!found.sentence().contains("`005`"), "{}", found.sentence());
+    let error = |v: usize| {
+        let used = found.used(&exposed.views[v].name).unwrap().gain;
+        used.iter().zip(gains[v]).map(|(used, gain)| (used / gain - 1.0).abs()).fold(0.0, f32::max)
+    };
+    // the mean of the others is 1 % off that of all
+    let errors: Vec<f32> = (0..15).filter(|&v| v != 5).map(error).collect();
+    assert!(errors.iter().all(|&e| e < 0.05), "{errors:?}");
+    let dir = tempfile::tempdir().unwrap();
+    found.write(dir.path()).unwrap();
+    let read = ExposureCheck::read(dir.path()).unwrap().unwrap();
+    assert_eq!(json!(read), json!(found));
+    assert!(json!(read)["views"][5].get("measured").is_none());
+    // later stages read its photograph as it is
+    found.apply(&mut exposed);
+    assert!(exposed.views[5].exposure.is_none() && exposed.views[4].exposure.is_some());
+}
+
+#[test]
+fn exposures_of_few_views_are_not_compared_and_the_reason_is_told() {
+    let (_dir, mut exposed) = measured_head();
+    let mut gains = gains();
+    (0..8).for_each(|v| gains[v] = [1.0 / 64.0; 3]);
+    expose(&mut exposed, &gains);
+    let why = tried(&exposed).unwrap_err();
+    assert!(why.contains("of 14 training views can be measured, and at least 7 are needed"), "{why}");
+    assert!(why.contains("`000`, `001`") && why.contains("`007`"), "{why}");
+    exposed.views.truncate(6);
+    exposed.views.iter_mut().for_each(|view| view.exposure = None);
+    let why = tried(&exposed).unwrap_err();
+    assert!(why.contains("6 training views") && why.contains("at least 7 are needed"), "{why}");
 }
 
 #[test]

@@ -66,7 +66,10 @@ pub(super) fn finish(
     let fits = c.color == ColorSource::Photographs;
     let photographs_say = fits && photographs.iter().any(|p| p.head_pixels() > 0);
     if fits && !photographs_say {
-        warnings.push("no photograph shows the head alone: the mesh has the colors of the network".into());
+        warnings.push(
+            "no photograph shows the head alone: the mesh has the colors of the network; look at `mask/sheet.html`"
+                .into(),
+        );
     }
     let mut shells = None;
     if c.hair == Hair::Shells {
@@ -130,7 +133,7 @@ pub(super) fn finish(
             Ok(tangents) => {
                 normal = Some(tangent_space(&mesh, &layout, &tangents, normals, c.gutter_px));
             }
-            Err(e) => warnings.push(format!("the mesh has no normal map: {e}")),
+            Err(e) => warnings.push(format!("the mesh has no normal map: {e}; leave out `mesh.normal_map`")),
         }
     }
     if let Some(harmonics) = harmonics.as_ref().filter(|_| c.lobes > 0) {
@@ -171,6 +174,14 @@ pub(super) fn lobes(images: &[Image], asset_from_world: Mat3) -> Option<Lobes> {
 
 /// The quality of textures that are stored as JPEG.
 const JPEG_QUALITY: u8 = 92;
+
+/// Returns the least and the largest of some values.
+fn extent(values: impl Iterator<Item = f32>) -> (f32, f32) {
+    values.fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)))
+}
+
+/// Width over that of the head from which on the lower part of a mesh is shoulders.
+const SHOULDERS: f32 = 1.25;
 
 /// How a mesh is exported from the dataset's world.
 #[derive(Clone, Debug)]
@@ -248,10 +259,35 @@ impl Export {
         if self.height_m == 0.0 {
             return self.unit_m;
         }
+        self.height_m / self.height(mesh, world_from_scene)
+    }
+
+    /// Returns the height of a mesh along the up direction, dataset units.
+    pub(super) fn height(&self, mesh: &Mesh, world_from_scene: &Similarity) -> f64 {
         let up = world_from_scene.inverse().direction(self.up.normalize_or(Vec3::Y));
-        let heights = mesh.positions.iter().map(|p| p.dot(up));
-        let (low, high) = heights.fold((f32::MAX, f32::MIN), |(low, high), h| (low.min(h), high.max(h)));
-        self.height_m / (f64::from(high - low) * world_from_scene.scale)
+        let (low, high) = extent(mesh.positions.iter().map(|p| p.dot(up)));
+        f64::from(high - low) * world_from_scene.scale
+    }
+
+    /// Returns what a mesh shows: it has shoulders where its lowest quarter is wider than its upper half.
+    pub(super) fn shows(&self, mesh: &Mesh, world_from_scene: &Similarity) -> &'static str {
+        let up = world_from_scene.inverse().direction(self.up.normalize_or(Vec3::Y));
+        let (low, high) = extent(mesh.positions.iter().map(|p| p.dot(up)));
+        let share = |p: &Vec3| (p.dot(up) - low) / (high - low);
+        let (a, b) = up.any_orthonormal_pair();
+        let width = |is_part: &dyn Fn(f32) -> bool| {
+            let part: Vec<Vec3> = mesh.positions.iter().copied().filter(|p| is_part(share(p))).collect();
+            let along = |k: u8| {
+                let (sin, cos) = (f32::from(k) * std::f32::consts::PI / 8.0).sin_cos();
+                let (low, high) = extent(part.iter().map(|p| p.dot(cos * a + sin * b)));
+                high - low
+            };
+            (0..8).map(along).fold(0.0, f32::max)
+        };
+        match width(&|share| share < 0.25) > SHOULDERS * width(&|share| share > 0.5) {
+            true => "head and shoulders",
+            false => "head",
+        }
     }
 
     /// Returns the frames of a mesh, its scene, and its GLB and OBJ files.
@@ -334,6 +370,33 @@ mod tests {
     use super::*;
     use crate::mesh::files::test_head;
     use std::f32::consts::PI;
+
+    #[test]
+    fn a_mesh_that_widens_below_the_head_is_called_head_and_shoulders() {
+        // a ball of radius 1; and the same on a box of 4 x 4 x 1, whatever is up
+        let world_from_scene = Similarity { scale: 0.1, ..Similarity::IDENTITY };
+        for up in [Vec3::Y, Vec3::Z] {
+            let (a, b) = up.any_orthonormal_pair();
+            let export = Export {
+                name: String::new(),
+                up,
+                unit_m: 1.0,
+                height_m: 0.0,
+                frame: MeshFrame::Dataset,
+                material: Material::Unlit,
+                texture_format: TextureFormat::Png,
+                cameras: Vec::new(),
+            };
+            let mut positions: Vec<Vec3> = [a, -a, b, -b, up, -up].into();
+            let ball = Mesh { positions: positions.clone(), ..Mesh::default() };
+            assert_eq!(export.shows(&ball, &world_from_scene), "head");
+            positions.extend([-1.0, -2.0].iter().flat_map(|h| [a, -a, b, -b].map(|d| 2.0 * d + h * up)));
+            let bust = Mesh { positions, ..Mesh::default() };
+            assert_eq!(export.shows(&bust, &world_from_scene), "head and shoulders");
+            // from 1 to -2, of 0.1 units each
+            assert!((export.height(&bust, &world_from_scene) - 0.3).abs() < 1e-6);
+        }
+    }
 
     #[test]
     fn a_head_of_a_given_height_has_it_in_every_frame_whatever_the_units_and_the_up_direction() {

@@ -37,6 +37,9 @@ const MIN_CONFLICT_SHARE: f64 = 0.1;
 /// Maximum number of masks compared with each other.
 const MAX_COMPARED: usize = 256;
 
+/// Why nothing is measured with masks of this meaning.
+const NO_SILHOUETTES: &str = "masks say what was not looked at, and not where the head ends";
+
 /// The masks, whether read or made.
 #[derive(Default)]
 struct CaptureMasks {
@@ -74,7 +77,8 @@ pub(super) fn mask(
     let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
     if coverage.is_empty() {
         dir.warn(
-            "no head masks (`mask.source`): background is unknown, so everything inside the box is reconstructed",
+            "no head masks (`mask.source`): background is unknown, so everything inside the box is reconstructed; \
+             `tiface mask CAPTURE --page` makes masks from clicks",
         );
     }
     let silhouettes = config.meaning == MaskMeaning::Empty;
@@ -94,7 +98,8 @@ pub(super) fn mask(
     if let Some(problem) = wrong.first().filter(|_| prompts.is_none() && !config.trust) {
         return Err(problem.into());
     }
-    wrong.iter().map(Problem::to_string).chain(warnings).for_each(|text| dir.warn(&text));
+    let told = |problem: &Problem| format!("{problem}; {}", problem.hint);
+    wrong.iter().map(told).chain(warnings).for_each(|text| dir.warn(&text));
     let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
     let suspicious: Vec<&String> = suspicious.collect();
     // pixels that a mask marks as unknown may still show the head
@@ -103,7 +108,7 @@ pub(super) fn mask(
     let (cameras, exposure) = (whole.capture.cameras, whole.capture.exposure);
     let found = match silhouettes {
         true => RigCheck::measure(capture, &scene, cameras, exposure, &Limits::default())?,
-        false => RigCheck::default(),
+        false => RigCheck::left_out(cameras, exposure, NO_SILHOUETTES),
     };
     found.require(dir)?;
     let height = scene::height(&scene, capture.up);
@@ -135,9 +140,25 @@ pub(super) fn mask(
 struct RigCheck {
     cameras: Option<CameraCheck>,
     exposure: Option<ExposureCheck>,
+    /// What was to be done about poses, and about exposures, and was not.
+    poses_left: Option<String>,
+    exposures_left: Option<String>,
 }
 
 impl RigCheck {
+    /// Returns what is said where neither can be measured, for this reason.
+    fn left_out(poses: CameraPoses, exposures: Exposures, why: &str) -> RigCheck {
+        let poses_left = match poses {
+            CameraPoses::Given => None,
+            CameraPoses::Auto => Some(format!("poses are not checked: {why}; they are used as given")),
+            CameraPoses::Refine => {
+                Some(format!("`capture.cameras=refine` refines nothing: {why}; poses are used as given"))
+            }
+        };
+        let exposures_left = (exposures != Exposures::Given).then(|| not_compared(why));
+        RigCheck { poses_left, exposures_left, ..RigCheck::default() }
+    }
+
     /// Measures what is not to be used as given, where it can be measured.
     fn measure(
         capture: &Capture,
@@ -147,13 +168,39 @@ impl RigCheck {
         limits: &Limits,
     ) -> Result<RigCheck> {
         let (cameras, exposure) = (poses != CameraPoses::Given, exposures != Exposures::Given);
-        let photos =
-            (cameras || exposure).then(|| RigPhotos::load(capture, scene, limits)).transpose()?.flatten();
-        let photos = photos.as_ref();
-        Ok(RigCheck {
-            cameras: photos.filter(|_| cameras).map(|photos| check_cameras(photos, poses)),
-            exposure: photos.filter(|_| exposure).and_then(ExposureCheck::measure),
-        })
+        if !cameras && !exposure {
+            return Ok(RigCheck::default());
+        }
+        let photos = match RigPhotos::load(capture, scene, limits)? {
+            Ok(photos) => photos,
+            Err(why) => return Ok(RigCheck::left_out(poses, exposures, &why)),
+        };
+        let cameras = cameras.then(|| check_cameras(&photos, poses));
+        let asked = cameras.as_ref().filter(|_| poses == CameraPoses::Refine);
+        let poses_left = asked.and_then(CameraCheck::not_refined);
+        let (exposure, exposures_left) = match exposure.then(|| ExposureCheck::measure(&photos)) {
+            None => (None, None),
+            Some(Ok(check)) => {
+                let left = check.not_measured();
+                (Some(check), left)
+            }
+            Some(Err(why)) => (None, Some(not_compared(&why))),
+        };
+        Ok(RigCheck { cameras, exposure, poses_left, exposures_left })
+    }
+
+    /// Returns the findings about poses and about exposures in words, with what a run does about
+    /// them and what it does not.
+    fn announcements(&self) -> [Option<String>; 2] {
+        let both = |found: Option<String>, left: &Option<String>| {
+            let parts: Vec<String> = found.into_iter().chain(left.clone()).collect();
+            (!parts.is_empty()).then(|| parts.join("; "))
+        };
+        let (cameras, exposure) = (self.cameras.as_ref(), self.exposure.as_ref());
+        [
+            both(cameras.map(CameraCheck::announcement), &self.poses_left),
+            both(exposure.map(ExposureCheck::announcement), &self.exposures_left),
+        ]
     }
 
     /// Refuses cameras that can be neither used nor refined, and keeps what was measured.
@@ -163,19 +210,26 @@ impl RigCheck {
                 return Err(problem.into());
             }
             if check.refines() {
-                dir.warn(&format!("{}: refined", check.sentence()));
+                let kept = "`capture.cameras=given` keeps them as they are";
+                dir.warn(&format!("{}: refined; {kept}", check.sentence()));
             }
             check.not_fitted().iter().for_each(|text| dir.warn(text));
             check.write(dir.folder())?;
         }
         if let Some(check) = &self.exposure {
             if check.evens_out() {
-                dir.warn(&format!("{}: evened out", check.sentence()));
+                let kept = "`capture.exposure=given` keeps them as they are";
+                dir.warn(&format!("{}: evened out; {kept}", check.sentence()));
             }
             check.write(dir.folder())?;
         }
+        self.poses_left.iter().chain(&self.exposures_left).for_each(|text| dir.warn(text));
         Ok(())
     }
+}
+
+fn not_compared(why: &str) -> String {
+    format!("exposures are not compared: {why}; photographs are used as they are")
 }
 
 /// Returns the path of a view's mask in the stage's folder.
@@ -323,7 +377,9 @@ fn for_placing(mask: &Gray) -> Gray {
 pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     let mut found = inspect(root, options);
     if options.mask_meaning == MaskMeaning::Ignore {
-        return found; // no silhouettes
+        let left = RigCheck::left_out(options.cameras, options.exposure, NO_SILHOUETTES);
+        [found.fit, found.exposure] = left.announcements();
+        return found;
     }
     // inputs that cannot be opened or read are already among the problems
     let Ok(capture) = capture::open(root, options) else { return found };
@@ -336,10 +392,9 @@ pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     // a measurement says something only of cameras whose masks fit together
     if let Some(scene) = found.placed.take().filter(|_| found.is_usable()) {
         match RigCheck::measure(&capture, &scene, options.cameras, options.exposure, &options.limits) {
-            Ok(RigCheck { cameras, exposure }) => {
-                found.fit = cameras.as_ref().map(CameraCheck::announcement);
-                found.exposure = exposure.map(|check| check.announcement());
-                found.problems.extend(cameras.iter().flat_map(|check| grouped(&check.problems())));
+            Ok(check) => {
+                [found.fit, found.exposure] = check.announcements();
+                found.problems.extend(check.cameras.iter().flat_map(|check| grouped(&check.problems())));
             }
             Err(e) => found.problems.extend(grouped(&[e])),
         }

@@ -21,7 +21,7 @@ use crate::mesh::bake::seen_colors;
 use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use crate::mesh::{self, Cap, HandleReport, MAX_HANDLE, MeshReport, Patches, Photograph};
 use crate::run::{Phase, Record, Run, StageDir, StageStatus, Status};
-use crate::{Error, Monitor, Result};
+use crate::{Error, ErrorKind, Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -40,7 +40,8 @@ pub(super) fn mesh(
     let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
     let (mut surface, report) = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
     let mm = world_from_scene.scale * export.metres(&surface, &world_from_scene) * 1000.0;
-    report.warnings(c.cap).iter().for_each(|w| dir.warn(w));
+    report.end(c.cap).iter().for_each(|text| dir.note(text));
+    report.warnings().iter().for_each(|w| dir.warn(w));
     report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
     let patches = Patches::of(&surface, &report.handles);
     let cap = (!c.dense).then(|| Cap::of(&surface, report.bounds(), report.cell_size));
@@ -105,7 +106,11 @@ pub(super) fn mesh(
     let in_place = Similarity { translation: DVec3::ZERO, ..world_from_scene };
     let metres = export.metres(&head.mesh, &world_from_scene);
     let size = head.mesh.transformed(&in_place).bounds().size() * metres as f32;
+    let height = export.height(&head.mesh, &world_from_scene);
     Ok(json!({
+        "shows": export.shows(&head.mesh, &world_from_scene),
+        "height_units": height,
+        "height_m": height * metres,
         "vertices": head.mesh.positions.len(),
         "triangles": head.mesh.triangles.len(),
         "closed": head.mesh.is_closed(),
@@ -188,6 +193,28 @@ pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
     })
 }
 
+/// Reads what the stage left in a run, with its record.
+///
+/// # Errors
+///
+/// As [`finished_mesh`] and `read`. Files may be missing, or of two makings, if another process
+/// began the stage anew meanwhile; the error then says so instead.
+pub(super) fn read_finished<T>(run: &Path, read: impl FnOnce(&Record) -> Result<T>) -> Result<T> {
+    let record = finished_mesh(run)?;
+    let found = read(&record);
+    match finished_mesh(run) {
+        Ok(now) if now == record => found,
+        Err(e) if e.kind() == ErrorKind::NotNow => Err(e),
+        _ => {
+            let shown = run.display();
+            Err(Error::not_now(
+                format!("the mesh of the run `{shown}` was begun anew while it was read"),
+                format!("`tiface status {shown}` says how far it is; repeat the command when it is done"),
+            ))
+        }
+    }
+}
+
 /// Returns the head mesh that the stage wrote.
 pub(super) fn head_mesh(run: &Run) -> Result<HeadMesh> {
     HeadMesh::load(&run.path("mesh/parts"))
@@ -213,4 +240,43 @@ fn handles(report: &HandleReport, mm: f64) -> Value {
         "left": report.left,
         "left_mm": report.left_length.map(|l| f64::from(l) * mm),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::{Fingerprint, Plan};
+
+    #[test]
+    fn a_mesh_that_is_made_anew_is_not_read_half() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = Run::quiet(dir.path());
+        let plan = || Plan {
+            name: "mesh",
+            fingerprint: Fingerprint::default(),
+            device: "cpu",
+            needs_bytes: 0,
+            saves: false,
+        };
+        let read = |found: Result<()>| read_finished(dir.path(), |_| found).unwrap_err();
+        let damaged = || Err(Error::cannot("half a file", ""));
+        assert!(read(Ok(())).to_string().contains("has no mesh yet"));
+        run.stage(plan(), |_| Ok(Value::Null)).unwrap();
+        assert_eq!(read_finished(dir.path(), |record| Ok(record.stage.clone())).unwrap(), "mesh");
+        assert_eq!(read(damaged()).to_string(), "half a file");
+        // cleared while it is read
+        for found in [Ok(()), damaged()] {
+            let anew = |_: &Record| run.fresh(&["mesh".into()]).and(found);
+            let error = read_finished(dir.path(), anew).unwrap_err();
+            assert_eq!(error.kind().code(), 75, "{error}");
+            assert!(error.to_string().contains("was begun anew while it was read"), "{error}");
+            // at work on it
+            let work = |_: &StageDir| {
+                let error = read(damaged());
+                assert!(error.kind().code() == 75 && error.to_string().contains("right now"), "{error}");
+                Ok(Value::Null)
+            };
+            run.stage(plan(), work).unwrap();
+        }
+    }
 }

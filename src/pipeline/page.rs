@@ -99,7 +99,7 @@ fn page(session: &Session) -> Result<String> {
         charts: curves(&[(session, "")])?.iter().map(Chart::html).collect(),
         times: records.iter().map(time).collect(),
         changes: session.config.changes(),
-        warnings: warnings(session, &records),
+        warnings: report::warnings(session.run.dir(), records.iter().map(|(stage, record)| (*stage, record))),
         repeat: format!(
             "tiface run {} --config config.toml --run again",
             quoted(&session.config.capture.path)
@@ -127,30 +127,20 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
         format!("seed {}", session.config.seed),
     ];
     let of = |stage: Stage| records.iter().find(|(s, _)| *s == stage).map(|(_, record)| &record.summary);
-    if let Some(height) = of(Stage::Mask).and_then(|mask| mask["height_m"].as_f64()) {
-        facts.push(format!("head {height:.3} m high"));
+    facts.extend(report::height(of(Stage::Mask), of(Stage::Mesh)));
+    if let Some(megabytes) = report::glb_megabytes(session.run.dir()) {
+        facts.push(format!("head.glb {megabytes:.1} MB"));
     }
     if let Some(summary) = of(Stage::Metrics) {
         facts.extend(report::judged_by(&summary["truth"]));
     }
     if let Some((_, last)) = records.last() {
         facts.push(duration(records.iter().map(|(_, r)| r.elapsed_s).sum()));
+        let peak = records.iter().filter_map(|(_, r)| r.peak_bytes).max();
+        facts.extend(peak.map(|bytes| format!("{:.2} GiB of memory", bytes as f64 / (1u64 << 30) as f64)));
         facts.push(format!("tiface {}", last.version));
     }
     facts
-}
-
-/// Returns the warnings of the stages and of the capture.
-fn warnings(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
-    let mut all = session.capture.warnings.clone();
-    for (stage, record) in records {
-        all.extend(record.warnings.iter().map(|w| format!("{stage}: {w}")));
-        all.extend(report::blend_verdict(&record.summary["blend"]));
-        if record.summary["closed"] == false {
-            all.push(format!("{stage}: the surface is not watertight"));
-        }
-    }
-    all
 }
 
 /// Returns the metrics of a finished stage; those of pictures have a table of their own.
@@ -180,7 +170,7 @@ pub(super) const COLUMNS: [(&str, usize, Option<bool>); 8] = [
     ("SSIM, frame", 4, Some(true)),
     ("s a view", 3, Some(false)),
     ("training s", 0, Some(false)),
-    ("data MB", 1, Some(false)),
+    ("MB of data read", 1, Some(false)),
     ("triangles", 0, None),
 ];
 

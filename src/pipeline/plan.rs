@@ -12,8 +12,10 @@ use super::session::Session;
 use crate::capture::View;
 use crate::config::iface::FieldKind;
 use crate::config::{
-    CameraPoses, Config, Exposures, MaskSource, Material, Method, Preset, Stage, VmBackground, VmConfig,
+    CameraPoses, ColorSource, Config, Exposures, IfaceConfig, MaskSource, Material, Method, Preset, Stage,
+    VmBackground, VmConfig,
 };
+use crate::kernel::cpu::hash;
 use crate::run::{Cost, ESTIMATE, Estimate, Fingerprint, Plan, read_record, read_status};
 use crate::{Error, Result, io};
 use std::path::Path;
@@ -469,6 +471,72 @@ fn vm_bytes(c: &VmConfig) -> u64 {
 
 const MIB: f64 = (1u64 << 20) as f64;
 
+/// Memory that a stage takes on the CPU, MiB; each is that of the whole process while the stage works.
+///
+/// `tools/reference/estimates.py RUN...` compares what these say with the peaks that runs recorded.
+mod mib {
+    /// The program and what its libraries hold.
+    pub const PROGRAM: f64 = 50.0;
+    /// Stack and heap of a thread.
+    pub const THREAD: f64 = 10.0;
+    /// A pixel of a photograph in memory, with mask, validity and what is drawn from it.
+    pub const PIXEL: f64 = 25e-6;
+    /// A parameter of a radiance field in training: value, gradient, two moments, and a copy for a checkpoint.
+    pub const VM_PARAMETER: f64 = 24e-6;
+    /// A ray of a step of a radiance field, with its samples and their activations.
+    pub const VM_RAY: f64 = 0.049;
+    /// A float of the hash table in training.
+    pub const TABLE_FLOAT: f64 = 20e-6;
+    /// A sample of a step of I-Face.
+    pub const SDF_SAMPLE: f64 = 0.0105;
+    /// A cell of the largest slice through the box, per stage `mesh`: the grid near the surface, and the surface.
+    pub const CELL: f64 = 4.5e-3;
+    /// A texel while its color is fitted to photographs, while it is the network's, and that of each further picture.
+    pub const FITTED_TEXEL: f64 = 1.4e-4;
+    pub const TEXEL: f64 = 4e-5;
+    pub const PICTURE_TEXEL: f64 = 2e-5;
+    /// A head mesh with its tree, and a texel of it, in views.
+    pub const SHOWN_MESH: f64 = 60.0;
+    pub const SHOWN_TEXEL: f64 = 25e-6;
+    /// A pixel of a view.
+    pub const VIEW_PIXEL: f64 = 1.2e-4;
+    /// The rays of a radiance field and of I-Face that are marched together, and a parameter of a loaded field.
+    pub const RADIANCE: f64 = 280.0;
+    pub const VOLUME: f64 = 300.0;
+    pub const LOADED: f64 = 8e-6;
+    /// A pixel of a training photograph whose residuals are kept.
+    pub const RESIDUAL: f64 = 8e-6;
+    /// By how much runs differ from each other.
+    pub const MARGIN: f64 = 1.12;
+}
+
+/// Bytes that a stage leaves on the disk.
+mod kept {
+    /// Logs, records and small files of a stage.
+    pub const SMALL: f64 = 1e6;
+    /// A pixel of a mask, and the outline of a view on the sheet.
+    pub const MASK_PIXEL: f64 = 0.12;
+    pub const SHEET_VIEW: f64 = 25e3;
+    /// A cell of the largest slice through the box: the extracted surface, in the run and as a file.
+    pub const CELL: f64 = 300.0;
+    /// A triangle of the head mesh in a file.
+    pub const TRIANGLE: f64 = 120.0;
+    /// Triangles of the extracted surface for each cell of the largest slice.
+    pub const TRIANGLES_OF_CELL: f64 = 4.4;
+    /// A texel of a picture in a file, and of the float one.
+    pub const TEXEL: f64 = 2.7;
+    pub const FLOAT_TEXEL: f64 = 12.0;
+    /// A pixel of a view with its depth, and of a float one.
+    pub const VIEW_PIXEL: f64 = 3.0;
+    pub const FLOAT_PIXEL: f64 = 14.0;
+    /// A pixel of a blend.
+    pub const BLEND_PIXEL: f64 = 2.0;
+    /// The report.
+    pub const REPORT: f64 = 6e6;
+    /// By how much runs differ from each other.
+    pub const MARGIN: f64 = 1.15;
+}
+
 impl Session<'_> {
     /// Returns the folders of the unfinished stages that `until` needs, with the estimated cost of each on the CPU.
     pub fn ahead(&self, until: Stage) -> Vec<(String, Cost)> {
@@ -488,6 +556,9 @@ impl Session<'_> {
     }
 
     /// Returns the estimated cost of a stage on the CPU.
+    ///
+    /// Memory is that of the whole process, disk what the stage leaves: while a field is trained, its checkpoints take up
+    /// to nine times as much ([`Plan::needs_bytes`]).
     ///
     /// The constants were measured on runs of the synthetic head and of a bust, at 64 x 80 to 384 x 512 pixels and
     /// tiny to full settings; `docs/many-heads.md` says how far off other runs were.
@@ -510,8 +581,29 @@ impl Session<'_> {
         let m = &self.config.mask;
         let files = [&m.sam, &m.vitmatte, &m.alpha_net].into_iter().filter(|file| !file.is_empty()).count();
         let networks = 5.0 * (files * self.capture.views.len()) as f64;
-        let (cpu_s, mib) = match stage {
-            Stage::Mask => (0.7 + 3e-7 * all + clicked + networks, 115.0 + 5e-6 * all),
+        let residuals = |shown: bool| if shown { all } else { 0.0 };
+        // what views by these methods take beside the views themselves
+        let renderers = |methods: &[Method], residuals: f64| {
+            let shows_mesh = methods.iter().any(|method| method.stage() == Stage::Mesh);
+            let texels = (mesh.texels() * mesh.pictures()) as f64;
+            let shown = if shows_mesh { mib::SHOWN_MESH + mib::SHOWN_TEXEL * texels } else { 0.0 };
+            // of each field its parameters and what its rays take while they are marched; the next uses that again
+            let field = |method: &Method| match method.stage() {
+                Stage::Mesh => (0.0, 0.0),
+                Stage::Iface => (hash_floats(iface), mib::VOLUME),
+                stage => {
+                    let c = self.config.radiance(stage);
+                    (vm_parameters(&c) * c.learned() as f64, mib::RADIANCE)
+                }
+            };
+            let fields: Vec<(f64, f64)> = methods.iter().map(field).collect();
+            let loaded = fields.iter().map(|(parameters, _)| parameters).sum::<f64>();
+            let marched = fields.iter().map(|(_, mib)| *mib).fold(0.0, f64::max);
+            shown + mib::LOADED * loaded + marched + mib::RESIDUAL * residuals
+        };
+        let program = mib::PROGRAM + mib::THREAD * rayon::current_num_threads() as f64;
+        let (cpu_s, stage_mib) = match stage {
+            Stage::Mask => (0.7 + 3e-7 * all + clicked + networks, 65.0 + 5e-6 * all),
             Stage::Baseline | Stage::Tface => {
                 let c = self.config.radiance(stage);
                 let rays = c.training_rays() * c.learned() as f64;
@@ -526,21 +618,29 @@ impl Session<'_> {
                 // samples along a ray are as dense as the grid
                 let ray = outside * (3e-6 + 0.09e-6 * (c.voxels_final as f64).cbrt());
                 let cpu_s = 0.1 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
-                let mib = 45.0 + 25e-6 * all + 24e-6 * parameters + 0.07 * c.rays as f64;
-                if c.import.is_empty() { (cpu_s, mib) } else { (1.0, mib) }
+                let trained = mib::VM_PARAMETER * parameters + mib::VM_RAY * c.rays as f64;
+                match c.import.is_empty() {
+                    true => (cpu_s, mib::PIXEL * all + trained),
+                    false => (1.0, mib::VM_PARAMETER * parameters),
+                }
             }
             Stage::Iface => {
                 let samples = (iface.steps as usize * iface.samples) as f64;
                 let table = ((iface.levels as u64 * 2) << iface.log2_table.min(32)) as f64;
                 let cpu_s = 3.8 + 2.5e-6 * samples + 2e-9 * table * iface.steps as f64 + 1.8e-6 * all;
-                (cpu_s, 100.0 + 25e-6 * all + 20e-6 * table + 0.012 * iface.samples as f64)
+                let trained = mib::TABLE_FLOAT * table + mib::SDF_SAMPLE * iface.samples as f64;
+                (cpu_s, mib::PIXEL * all + trained)
             }
             Stage::Mesh => {
                 let cells = f64::from(mesh.resolution).powi(2);
-                let texels = (mesh.texels() * mesh.pictures()) as f64;
+                let (texels, pictures) = (mesh.texels() as f64, mesh.pictures() as f64);
+                let texel = match mesh.color {
+                    ColorSource::Photographs => mib::FITTED_TEXEL,
+                    ColorSource::Network => mib::TEXEL,
+                };
                 (
-                    0.5 + 1.3e-4 * cells + 5e-6 * texels + 1e-6 * all,
-                    110.0 + 25e-6 * all + 6e-3 * cells + 5e-4 * texels,
+                    0.5 + 1.3e-4 * cells + 5e-6 * texels * pictures + 1e-6 * all,
+                    mib::PIXEL * all + mib::CELL * cells + (texel + mib::PICTURE_TEXEL * pictures) * texels,
                 )
             }
             Stage::Render => {
@@ -559,22 +659,63 @@ impl Session<'_> {
                     Method::Volume => 20e-6,
                     _ => 2.5e-6,
                 };
-                let residuals = if self.render_config().shows_residuals(methods) { all } else { 0.0 };
+                let residuals = residuals(self.render_config().shows_residuals(methods));
                 let cpu_s = 0.1 + shown * methods.iter().map(pixel).sum::<f64>() + 1.6e-6 * residuals;
-                (cpu_s, 220.0 + 25e-6 * all + 1e-4 * (shown * methods.len() as f64 + mesh.texels() as f64))
+                (cpu_s, mib::VIEW_PIXEL * each + renderers(methods, residuals))
             }
             Stage::Ensemble => {
                 let members = &self.config.ensemble.members;
                 let fits = self.config.ensemble.weights.is_empty();
-                let residuals = fits && self.config.render.shows_residuals(members);
-                let residuals = if residuals { all } else { 0.0 };
-                (0.2 + 3e-6 * held_out + 1.6e-6 * residuals, 220.0 + 1e-4 * each + 8e-6 * residuals)
+                let residuals = residuals(fits && self.config.render.shows_residuals(members));
+                let rendered = if fits { renderers(members, residuals) } else { 0.0 };
+                (0.2 + 3e-6 * held_out + 1.6e-6 * residuals, mib::VIEW_PIXEL * each + rendered)
             }
-            Stage::Metrics => (0.2 + 1.2e-6 * held_out * methods.len() as f64, 220.0 + 1e-4 * each),
+            Stage::Metrics => {
+                (0.2 + 1.2e-6 * held_out * methods.len() as f64, 160.0 + mib::VIEW_PIXEL * each)
+            }
         };
-        let disk_bytes = self.plan(stage).needs_bytes;
-        Cost { cpu_s, memory_bytes: (mib * MIB) as u64, disk_bytes }
+        let memory_bytes = (mib::MARGIN * (program + stage_mib) * MIB) as u64;
+        let disk_bytes = (kept::MARGIN * self.kept_bytes(stage, [all, held_out, shown])) as u64;
+        Cost { cpu_s, memory_bytes, disk_bytes }
     }
+
+    /// Returns the bytes that a stage leaves on the disk; pixels are those of all photographs, of the held-out ones and of
+    /// the views that the stage `render` shows.
+    fn kept_bytes(&self, stage: Stage, [all, held_out, shown]: [f64; 3]) -> f64 {
+        let Config { iface, mesh, render, .. } = self.config;
+        kept::SMALL
+            + match stage {
+                Stage::Mask => kept::MASK_PIXEL * all + kept::SHEET_VIEW * self.capture.views.len() as f64,
+                Stage::Baseline | Stage::Tface => {
+                    let c = self.config.radiance(stage);
+                    4.0 * vm_parameters(&c) * c.learned() as f64
+                }
+                Stage::Iface => 4.0 * hash_floats(iface),
+                Stage::Mesh => {
+                    let (cells, texels) = (f64::from(mesh.resolution).powi(2), mesh.texels() as f64);
+                    let all = kept::TRIANGLES_OF_CELL * cells;
+                    let triangles = match mesh.triangles {
+                        0 => all,
+                        some => all.min(f64::from(some)),
+                    };
+                    let files = 1.0 + mesh.format.len() as f64; // with the parts
+                    let pictures = files * kept::TEXEL * mesh.pictures() as f64;
+                    let float = if mesh.exr { kept::FLOAT_TEXEL } else { 0.0 };
+                    kept::CELL * cells + files * kept::TRIANGLE * triangles + (pictures + float) * texels
+                }
+                Stage::Render => {
+                    let float = if render.float && self.path.is_none() { kept::FLOAT_PIXEL } else { 0.0 };
+                    shown * self.render_config().method.len() as f64 * (kept::VIEW_PIXEL + float)
+                }
+                Stage::Ensemble => kept::BLEND_PIXEL * held_out,
+                Stage::Metrics => kept::REPORT,
+            }
+    }
+}
+
+/// Returns the number of floats in the hash table of I-Face.
+fn hash_floats(c: &IfaceConfig) -> f64 {
+    2.0 * hash::entries(&hash::levels(c.levels, c.base_resolution, c.growth, c.log2_table)) as f64
 }
 
 /// Returns the number of parameters in the planes and lines of the final grid.

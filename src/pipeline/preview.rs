@@ -5,7 +5,7 @@
 
 use super::finish::{center as center_of, front as front_of};
 use super::learn::load_field;
-use super::mesh::finished_mesh;
+use super::mesh::read_finished;
 use super::page::views::{error, heat};
 use super::path::cameras_of_file;
 use super::pictures::{self, background_color, expected, over, straight};
@@ -51,12 +51,14 @@ impl Preview {
     ///
     /// # Errors
     ///
-    /// Fails if the run has no mesh yet, or if it is damaged.
+    /// Fails if the run has no mesh yet, or if it is damaged, or being made anew.
     pub fn of_run(run: &Path) -> Result<Preview> {
-        // previews show `mesh/parts`, so a problem with other files of the stage does not matter
-        let problem = finished_mesh(run)?.require_products(&run.join(Stage::Mesh)).err();
-        let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
-        let head = HeadMesh::load(&run.join("mesh/parts"))?;
+        let (head, warnings) = read_finished(run, |record| {
+            // previews show `mesh/parts`: a problem with other files of the stage does not matter
+            let problem = record.require_products(&run.join(Stage::Mesh)).err();
+            let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
+            Ok((HeadMesh::load(&run.join("mesh/parts"))?, warnings))
+        })?;
         let capture = read_capture(&run.join("cameras.json"), Path::new(""))?;
         let to_scene = head.world_from_scene.rotation_f32().transpose();
         let center = center_of(&head.mesh, &head.world_from_scene);

@@ -3,6 +3,7 @@
 use crate::Result;
 use crate::capture::scene::{Hull, Scene};
 use crate::capture::{Capture, Split, View};
+use crate::error::counted;
 use crate::geom::{Camera, Mesh, Similarity};
 use crate::image::{Gray, Photo, reduce_photo, resize_gray, working_size};
 use crate::io::Limits;
@@ -15,6 +16,9 @@ const SEARCHED_PX: u32 = 1024;
 
 /// Maximum number of training views; the system of their poses is solved densely.
 const MAX_VIEWS: usize = 256;
+
+/// Minimum number of training views: a point that two share says nothing of either.
+const MIN_VIEWS: usize = 3;
 
 /// Photographs with masks, training views first.
 pub(super) struct RigPhotos<'c> {
@@ -33,27 +37,48 @@ pub(super) struct RigPhotos<'c> {
 }
 
 impl<'c> RigPhotos<'c> {
-    /// Reads what the training views show, and up to 256 held-out views. `None` where nothing can be measured: without a hull,
-    /// with fewer than three training views that have a mask, or with more than can be solved at once.
-    pub fn load(capture: &'c Capture, scene: &Scene, limits: &Limits) -> Result<Option<RigPhotos<'c>>> {
+    /// Reads what the training views show, and up to 256 held-out views. Returns the reason instead
+    /// where nothing can be measured: without a hull, with fewer than three training views that
+    /// have a mask, or with more than can be solved at once.
+    pub fn load(
+        capture: &'c Capture,
+        scene: &Scene,
+        limits: &Limits,
+    ) -> Result<Result<RigPhotos<'c>, String>> {
         let split = |train: bool| capture.views.iter().filter(move |v| (v.split == Split::Train) == train);
-        let Some(hull) = scene.hull.as_ref().filter(|_| split(true).count() <= MAX_VIEWS) else {
-            return Ok(None);
+        let all = split(true).count();
+        if all > MAX_VIEWS {
+            return Ok(Err(format!(
+                "there are {all} training views, and at most {MAX_VIEWS} can be compared"
+            )));
+        }
+        let too_few = |found: usize, with: &str| {
+            let views = counted(found, "training view");
+            format!(
+                "there {} {views}{with}, and at least {MIN_VIEWS} are needed",
+                if found == 1 { "is" } else { "are" }
+            )
+        };
+        if all < MIN_VIEWS {
+            return Ok(Err(too_few(all, "")));
+        }
+        let Some(hull) = scene.hull.as_ref() else {
+            return Ok(Err("there is no hull of head masks".into()));
         };
         let wanted: Vec<&View> = split(true).chain(split(false).take(MAX_VIEWS)).collect();
         let loaded = wanted.par_iter().map(|view| searched(view, limits)).collect::<Result<Vec<_>>>()?;
         let measured = wanted.iter().zip(loaded).filter_map(|(view, loaded)| Some((*view, loaded?)));
         let (views, pictures): (Vec<&View>, Vec<(Photo, Gray)>) = measured.unzip();
         let train = views.iter().filter(|v| v.split == Split::Train).count();
-        if train < 3 {
-            return Ok(None);
+        if train < MIN_VIEWS {
+            return Ok(Err(too_few(train, " with a head mask")));
         }
         let camera = |(view, (photo, _)): (&&View, &(Photo, Gray))| {
             view.camera.resized(photo.width, photo.height).transformed(&scene.scene_from_world)
         };
         let cameras = views.iter().zip(&pictures).map(camera).collect();
         let (surface, scene_from_world) = (hull_surface(hull)?, scene.scene_from_world);
-        Ok(Some(RigPhotos { views, train, pictures, cameras, surface, scene_from_world }))
+        Ok(Ok(RigPhotos { views, train, pictures, cameras, surface, scene_from_world }))
     }
 }
 

@@ -158,9 +158,14 @@ impl<'a> Session<'a> {
         if self.inputs.clicks.is_some() && stages.contains(&Stage::Mask) {
             crate::mask::networks::Networks::open(&self.config.mask)?;
         }
-        match stages.iter().any(|stage| stage.uses_device()) {
-            true => require_device(self.config),
-            false => Ok(()),
+        if !stages.iter().any(|stage| stage.uses_device()) {
+            return Ok(());
+        }
+        match crate::field::require_device(&self.config.device)? {
+            Some(device) if stages.contains(&Stage::Iface) => {
+                crate::iface::require_fit(&self.config.iface, &device)
+            }
+            _ => Ok(()),
         }
     }
 
@@ -194,7 +199,7 @@ pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
 /// Refuses a device that this build or this machine does not have, or that another process uses. Finished stages need
 /// no device, so this is checked only if a stage that computes on it has work left.
 pub fn require_device(config: &Config) -> Result<()> {
-    crate::field::require_device(&config.device)
+    crate::field::require_device(&config.device).map(drop)
 }
 
 /// Returns the error for an unusable file that a stage of this run made: the hint is to make it again.

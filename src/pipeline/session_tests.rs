@@ -96,6 +96,51 @@ fn views_held_out_for_validation_cost_what_test_views_cost() {
     assert_eq!(costs(), of_test);
 }
 
+#[test]
+fn a_large_texture_is_told_the_memory_that_it_takes_and_no_three_times_of_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root);
+    let run = quiet(dir.path());
+    let mib = |texture_px: u32| {
+        let mut config = draft(&root);
+        config.mesh.texture_px = texture_px;
+        let bytes = Session::open(&config, &run).unwrap().cost(Stage::Mesh).memory_bytes;
+        bytes as f64 / f64::from(1 << 20)
+    };
+    // measured on a bust of 384 x 512 pixels: 651 MiB, and 3133 MiB
+    let ratio = (mib(4096) - mib(1024)) / (3133.0 - 651.0);
+    assert!((1.0..1.3).contains(&ratio), "{ratio}");
+}
+
+#[test]
+fn the_disk_told_is_what_a_field_leaves_not_what_its_checkpoints_take_meanwhile() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root);
+    let (config, run) = (draft(&root), quiet(dir.path()));
+    let session = Session::open(&config, &run).unwrap();
+    // 96 channels of 192 x 193 floats, and a megabyte of logs
+    let left = 4.0 * 96.0 * 192.0 * 193.0 + 1e6;
+    let told = session.cost(Stage::Tface).disk_bytes as f64;
+    assert!((1.0..1.3).contains(&(told / left)), "{told}");
+    assert!(session.plan(Stage::Tface).needs_bytes as f64 > 3.0 * told);
+}
+
+#[test]
+fn a_stage_gives_the_scratch_memory_of_its_kernels_back() {
+    use crate::kernel::cpu::pool::{Buffer, keeps};
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    capture(&root);
+    let (config, run) = (draft(&root), quiet(dir.path()));
+    let session = Session::open(&config, &run).unwrap();
+    // rounded up to 5 eighths of 2^20; nobody else has one of this size
+    drop(Buffer::scratch(640_001));
+    complete(&session, Stage::Mask, &NoFields).unwrap();
+    assert!(!keeps(5 << 17));
+}
+
 /// The pipeline with the head's formula in place of a trained field: any error is then not one of the training.
 #[test]
 fn the_stages_after_learning_keep_the_exact_head_exact() {

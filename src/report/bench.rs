@@ -3,11 +3,12 @@
 use super::{Chart, Curve, STYLE, duration, fill};
 use crate::Result;
 use minijinja::context;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::fmt::Write;
 
 /// Cost of some work.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct WorkCost {
     /// Seconds by the clock.
     pub wall_s: f64,
@@ -28,10 +29,10 @@ impl std::ops::Add for WorkCost {
 }
 
 /// A figure of the rows of a sweep.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Measure {
     /// Name for readers, with its unit: `PSNR, dB`.
-    pub name: &'static str,
+    pub name: Cow<'static, str>,
     /// Digits after the point.
     pub digits: usize,
     /// Whether more is better; `None` for counts.
@@ -48,10 +49,10 @@ impl Measure {
 }
 
 /// One choice, with its cost and quality.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Row {
     /// Choices that are drawn as one line: a field, a method.
-    pub series: &'static str,
+    pub series: Cow<'static, str>,
     /// The choice, a few words.
     pub choice: String,
     /// Its cost.
@@ -62,12 +63,12 @@ pub struct Row {
 }
 
 /// One decision and its choices.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Sweep {
     /// Its word on the command line.
-    pub name: &'static str,
+    pub name: Cow<'static, str>,
     /// The decision.
-    pub title: &'static str,
+    pub title: Cow<'static, str>,
     /// Method of measurement.
     pub note: String,
     /// Names of the rows' figures; the first is drawn over time.
@@ -100,16 +101,17 @@ impl Sweep {
     }
 
     /// Headings and cells of its table, and whether a row is on the front.
-    fn table(&self) -> (Vec<&'static str>, Vec<(bool, Vec<String>)>) {
+    fn table(&self) -> (Vec<&str>, Vec<(bool, Vec<String>)>) {
         let mut headings = vec!["", "choice", "CPU", "wall", "memory, MiB"];
-        headings.extend(self.measures.iter().map(|m| m.name));
+        headings.extend(self.measures.iter().map(|m| &*m.name));
         let rows = self.rows.iter().zip(self.front()).map(|(row, front)| {
             let WorkCost { wall_s, cpu_s, memory_mib } = row.cost;
             let figure = |(value, digits): (Option<f64>, usize)| {
                 value.map_or("–".into(), |value| format!("{value:.digits$}"))
             };
             let [cpu, wall] = [cpu_s, wall_s].map(short_time);
-            let mut cells = vec![row.series.into(), row.choice.clone(), cpu, wall, figure((memory_mib, 0))];
+            let mut cells =
+                vec![row.series.to_string(), row.choice.clone(), cpu, wall, figure((memory_mib, 0))];
             let figures = row.figures.iter().copied().zip(self.measures.iter().map(|m| m.digits));
             cells.extend(figures.map(figure));
             (front, cells)
@@ -124,7 +126,9 @@ impl Sweep {
             let Some(value) = row.figures.first().copied().flatten() else { continue };
             match curves.iter_mut().find(|curve| curve.name == row.series) {
                 Some(curve) => curve.points.push((row.cost.cpu_s, value)),
-                None => curves.push(Curve { name: row.series.into(), points: vec![(row.cost.cpu_s, value)] }),
+                None => {
+                    curves.push(Curve { name: row.series.to_string(), points: vec![(row.cost.cpu_s, value)] })
+                }
             }
         }
         for curve in &mut curves {
@@ -146,10 +150,10 @@ fn short_time(seconds: f64) -> String {
 }
 
 /// Everything that was measured, and where.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct BenchResult {
     /// Version of the program.
-    pub version: &'static str,
+    pub version: Cow<'static, str>,
     /// Operating system and processor family.
     pub system: String,
     /// The processor's own name, if the system says it.
@@ -158,11 +162,24 @@ pub struct BenchResult {
     pub threads: usize,
     /// The capture's name.
     pub capture: String,
+    /// The settings, as TOML; those of older results are not known.
+    #[serde(default)]
+    pub settings: String,
+    /// Words of the sweeps that were asked for.
+    #[serde(default)]
+    pub asked: Vec<String>,
     /// The sweeps, in order.
     pub sweeps: Vec<Sweep>,
 }
 
 impl BenchResult {
+    /// Returns whether these are results of the same bench, which may have been stopped: of the same program, machine, settings
+    /// and sweeps.
+    pub fn is_part_of(&self, begun: &BenchResult) -> bool {
+        let BenchResult { capture, sweeps, .. } = begun.clone();
+        BenchResult { capture, sweeps, ..self.clone() } == *begun
+    }
+
     /// `bench.json`.
     pub fn json(&self) -> String {
         format!("{:#}\n", serde_json::json!(self))
@@ -197,7 +214,7 @@ impl BenchResult {
         };
         let sweeps: Vec<_> = self.sweeps.iter().map(sweep).collect();
         let title = format!("{}: speed against error", self.capture);
-        fill(include_str!("bench/page.html"), context! { style => STYLE, title, result => self, sweeps })
+        fill(include_str!("bench/page.html"), "", context! { style => STYLE, title, result => self, sweeps })
     }
 }
 
@@ -218,16 +235,16 @@ mod tests {
     use super::*;
 
     const PSNR: Measure =
-        Measure { name: "PSNR, dB", digits: 2, more_is_better: Some(true), noise: (0.2, 0.0) };
+        Measure { name: Cow::Borrowed("PSNR, dB"), digits: 2, more_is_better: Some(true), noise: (0.2, 0.0) };
 
     fn row(choice: &str, seconds: f64, figure: f64) -> Row {
         let cost = WorkCost { wall_s: seconds / 2.0, cpu_s: seconds, memory_mib: None };
-        Row { series: "field", choice: choice.into(), cost, figures: vec![Some(figure)] }
+        Row { series: "field".into(), choice: choice.into(), cost, figures: vec![Some(figure)] }
     }
 
     fn sweep(rows: Vec<Row>) -> Sweep {
-        let (title, note) = ("Training <steps>", "As measured.".into());
-        Sweep { name: "steps", title, note, measures: vec![PSNR], rows }
+        let (title, note) = ("Training <steps>".into(), "As measured.".into());
+        Sweep { name: "steps".into(), title, note, measures: vec![PSNR], rows }
     }
 
     #[test]
@@ -263,6 +280,22 @@ mod tests {
         assert!(page.contains("PSNR, dB over CPU seconds") && page.contains("<polyline"), "{page}");
         let value: serde_json::Value = serde_json::from_str(&result.json()).unwrap();
         assert_eq!(value["sweeps"][0]["rows"][1]["cpu_s"], 100.0);
+    }
+
+    #[test]
+    fn results_that_were_read_again_belong_to_the_bench_that_wrote_them() {
+        let sweeps = vec![sweep(vec![row("a", 1.5, 30.0)])];
+        let begun = BenchResult {
+            asked: vec!["steps".into()],
+            settings: "seed = 1".into(),
+            ..BenchResult::default()
+        };
+        let stopped = BenchResult { capture: "head".into(), sweeps, ..begun.clone() };
+        let read: BenchResult = serde_json::from_str(&stopped.json()).unwrap();
+        assert_eq!(read, stopped);
+        assert!(read.is_part_of(&begun));
+        assert!(!read.is_part_of(&BenchResult { settings: "seed = 2".into(), ..begun.clone() }));
+        assert!(!read.is_part_of(&BenchResult { asked: vec!["hash".into()], ..begun }));
     }
 
     #[test]

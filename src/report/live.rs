@@ -56,9 +56,11 @@ pub fn live_html(
     let views = newest.into_iter().map(|(time, name)| (format!("{}?{}", link(&name), stamp(time)), name));
     let newest: Vec<(String, String)> = fields.chain(views).collect();
     let (report, now) = (io::is_file(&run.join("report.html")), stamp(SystemTime::now()));
+    let script = if renewed { include_str!("live.js") } else { "" };
     fill(
         include_str!("live.html"),
-        context! { style => STYLE, title, stages, charts => drawn, newest, report, now, renewed },
+        script,
+        context! { style => STYLE, title, stages, charts => drawn, newest, report, now, renewed, beside => true },
     )
 }
 
@@ -82,7 +84,9 @@ fn pictures(run: &Path) -> Vec<String> {
 fn row(run: &Path, stage: Stage) -> Option<StageRow> {
     let folder = run.join(stage);
     if let Ok(Some(record)) = read_record(&folder) {
-        let words = format!("done in {}", duration(record.elapsed_s));
+        let faults = record.faults(&folder);
+        let gone = faults.iter().map(|fault| format!("; {fault}")).collect::<String>();
+        let words = format!("done in {}{gone}", duration(record.elapsed_s));
         return Some(StageRow { name: stage.word(), words, share: 100 });
     }
     let s = read_status(&folder).ok()??;

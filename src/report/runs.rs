@@ -1,8 +1,7 @@
 //! One page of many runs, one row each, that is searched, filtered and sorted by any column.
 
-use super::{STYLE, csv_text, fill, picture_url, relative, small_view, views};
+use super::{STYLE, csv_text, fill, glb_megabytes, picture_url, relative, small_view, views, warnings};
 use crate::Result;
-use crate::capture::synthetic::SyntheticHead;
 use crate::config::{Config, NAMES, Stage, called};
 use crate::error::counted;
 use crate::geom::Camera;
@@ -30,7 +29,7 @@ pub struct RunRow {
     pub state: String,
     /// Whether all stages are done.
     pub done: bool,
-    /// Whether it ended with an error.
+    /// Whether it ended with an error, or has lost a file.
     pub failed: bool,
     /// The preset, if it can be read.
     pub preset: String,
@@ -42,14 +41,15 @@ pub struct RunRow {
     pub method: String,
     /// Masked PSNR of the mesh, as the best viewer of it shows.
     pub mesh_psnr: Option<f64>,
-    /// Whether the mesh is watertight.
+    /// Whether the mesh is watertight; unknown where its files are not those that were written.
     pub watertight: Option<bool>,
-    /// Number of triangles of the mesh.
+    /// Number of triangles of the mesh, if its files are there.
     pub triangles: Option<u64>,
     /// Size of `head.glb`.
     pub megabytes: Option<f64>,
-    /// Mean distance of the mesh from the true surface, millimeters; where that is known, of the demo head.
-    pub mm: Option<f64>,
+    /// Mean distance of the mesh from the true surface in per cent of the head's height; where that is known, of the demo
+    /// head.
+    pub truth_percent: Option<f64>,
     /// Work of all stages by the clock.
     pub seconds: f64,
     /// CPU time of all stages.
@@ -71,29 +71,28 @@ impl RunRow {
             standing.stages.iter().filter_map(|s| Some((s.stage, s.record.as_ref()?))).collect();
         let of = |stage| records.iter().find(|(s, _)| *s == stage).map(|(_, r)| &r.summary);
         let name = io::real_path(run).unwrap_or(run.into());
+        let has_mesh = standing.stages.iter().all(|s| s.stage != Stage::Mesh || s.faults.is_empty());
         let mut row = RunRow {
             name: name.file_name().unwrap_or(run.as_os_str()).to_string_lossy().into_owned(),
             state: state(&standing),
             done: standing.phase == Phase::Done,
-            failed: standing.phase == Phase::Failed,
+            failed: matches!(standing.phase, Phase::Failed | Phase::Damaged),
             picture: picture(run).unwrap_or_default(),
             preset: Config::of_run(run).map_or(String::new(), |config| config.preset.name().into()),
             seconds: standing.elapsed_s,
             cpu_s: records.iter().map(|(_, r)| r.cpu_s).sum::<Option<f64>>().filter(|s| *s > 0.0),
             peak_bytes: records.iter().filter_map(|(_, r)| r.peak_bytes).max(),
-            warnings: records
-                .iter()
-                .flat_map(|(s, r)| r.warnings.iter().map(move |w| format!("{s}: {w}")))
-                .collect(),
+            warnings: warnings(run, records.iter().copied()),
             finished: records.iter().map(|(_, r)| r.finished).max().unwrap_or(0),
-            megabytes: io::file_size(&run.join("mesh/head.glb")).map(|bytes| bytes as f64 / 1e6),
+            megabytes: glb_megabytes(run).filter(|_| has_mesh),
             ..RunRow::default()
         };
         let page = run.join("report.html");
         if io::is_file(&page) {
             row.link = relative(&page, beside);
         }
-        if let Some(mesh) = of(Stage::Mesh) {
+        // figures of files that are gone or cut say nothing about what is there
+        if let Some(mesh) = of(Stage::Mesh).filter(|_| has_mesh) {
             (row.watertight, row.triangles) = (mesh["closed"].as_bool(), mesh["triangles"].as_u64());
         }
         if let Some(metrics) = of(Stage::Metrics) {
@@ -103,9 +102,7 @@ impl RunRow {
                 (row.psnr, row.ssim, row.method) = (Some(psnr), mean(word, "ssim_masked"), called(word));
             }
             let meshes = ["raycast", "textured", "raster"].into_iter();
-            // per cent of the height of the one head whose surface is known
-            let percent = metrics["truth_percent_of_head"]["accuracy_mean"].as_f64();
-            row.mm = percent.map(|p| 10.0 * p * f64::from(SyntheticHead::HEAD_HEIGHT));
+            row.truth_percent = metrics["truth_percent_of_head"]["accuracy_mean"].as_f64();
             row.mesh_psnr = meshes.filter_map(|word| mean(word, "psnr_masked")).max_by(f64::total_cmp);
         }
         row
@@ -122,6 +119,7 @@ fn state(run: &RunStatus) -> String {
         Phase::Done => "done".into(),
         Phase::Failed => format!("{place}failed: {}", run.error.as_deref().unwrap_or_default()),
         Phase::Unreadable => format!("{place}cannot be read: {}", run.error.as_deref().unwrap_or_default()),
+        Phase::Damaged => format!("{place}damaged: {}", run.error.as_deref().unwrap_or_default()),
         Phase::Running => format!("{place}at work{share}"),
         Phase::Killed => format!("{place}killed{share}"),
         Phase::Stopped => format!("{place}stopped{share}"),
@@ -168,7 +166,7 @@ const FIGURES: [(&str, fn(&RunRow) -> Option<f64>); 10] = [
     ("PSNR", |r| r.psnr),
     ("SSIM", |r| r.ssim),
     ("mesh PSNR", |r| r.mesh_psnr),
-    ("mm", |r| r.mm),
+    ("% of head", |r| r.truth_percent),
     ("triangles", |r| r.triangles.map(|n| n as f64)),
     ("GLB MB", |r| r.megabytes),
     ("minutes", |r| Some(r.seconds / 60.0)),
@@ -220,10 +218,10 @@ pub fn runs_html(rows: &[RunRow]) -> Result<String> {
     let done = rows.iter().filter(|row| row.done).count();
     let failed = rows.iter().filter(|row| row.failed).count();
     let headings: Vec<&str> = FIGURES.iter().map(|(heading, _)| *heading).collect();
-    let script = include_str!("runs.js");
     fill(
         include_str!("runs.html"),
-        context! { style => STYLE, script, title => counted(rows.len(), "run"), rows, cells, headings, done, failed },
+        include_str!("runs.js"),
+        context! { style => STYLE, title => counted(rows.len(), "run"), rows, cells, headings, done, failed },
     )
 }
 
@@ -268,9 +266,42 @@ mod tests {
         let channels: Vec<(&str, &[f32])> = ["B", "G", "R"].map(|c| (c, &[0.5][..])).into();
         io::write_exr(&run.join("render/raster/left/a.exr"), 1, 1, &channels).unwrap();
         assert!(RunRow::read(&run, dir.path()).picture.starts_with("data:image/jpeg;base64,"));
+        let warned = RunRow { warnings: vec!["mesh: <b>holes".into()], ..row.clone() };
+        let page = runs_html(&[warned]).unwrap();
+        // readable without a pointer, and sorted by their number
+        assert!(page.contains("<li>mesh: &lt;b&gt;holes</li>"), "{page}");
+        assert!(page.contains("data-value=\"1\"") && !page.contains("title=\"mesh"), "{page}");
         let page = runs_html(&[row.clone(), RunRow { psnr: Some(31.25), ..row }]).unwrap();
         assert!(!page.contains("<img src=x") && page.contains("&lt;img src=x") && page.contains("31.25"));
         assert_eq!(page.matches("<tr").count(), 3);
+    }
+
+    #[test]
+    fn a_mesh_that_was_cut_is_not_shown_as_watertight() {
+        let dir = tempfile::tempdir().unwrap();
+        let fingerprint = crate::run::Fingerprint::default();
+        let plan =
+            crate::run::Plan { name: "mesh", fingerprint, device: "cpu", needs_bytes: 0, saves: false };
+        let done = crate::run::Run::quiet(dir.path()).stage(plan, |stage| {
+            io::write_atomic(&stage.folder().join("head.glb"), b"triangles")?;
+            Ok(json!({"closed": true, "triangles": 12}))
+        });
+        assert!(!done.unwrap().skipped);
+        let row = RunRow::read(dir.path(), dir.path());
+        assert_eq!((row.watertight, row.triangles, row.failed), (Some(true), Some(12), false));
+        std::fs::write(dir.path().join("mesh/head.glb"), "tri").unwrap();
+        let row = RunRow::read(dir.path(), dir.path());
+        assert_eq!((row.watertight, row.triangles, row.megabytes, row.failed), (None, None, None, true));
+        assert!(
+            row.state.starts_with("mesh damaged: ") && row.state.contains("has 3 bytes"),
+            "{}",
+            row.state
+        );
+        assert!(row.warnings.len() == 1 && row.warnings[0].contains("tiface export"), "{:?}", row.warnings);
+        // a file that was moved away is told, but is no failure
+        std::fs::remove_file(dir.path().join("mesh/head.glb")).unwrap();
+        let row = RunRow::read(dir.path(), dir.path());
+        assert_eq!((row.watertight, row.failed, row.warnings.len()), (None, false, 1));
     }
 
     #[test]
@@ -323,7 +354,7 @@ mod tests {
         let lines: Vec<&str> = csv.lines().collect();
         assert_eq!(
             lines[0],
-            "run,state,best,watertight,preset,PSNR,SSIM,mesh PSNR,mm,triangles,GLB MB,minutes,CPU minutes,GiB,warnings"
+            "run,state,best,watertight,preset,PSNR,SSIM,mesh PSNR,% of head,triangles,GLB MB,minutes,CPU minutes,GiB,warnings"
         );
         assert_eq!(lines[1], "\"'=cmd|\"\"x\"\"\",\"a, b\",\"\",no,,31.25,,,,,,0,,,1");
     }

@@ -31,11 +31,12 @@ const MARGIN: usize = 3;
 /// Coded values that are neither saturated nor as dark as hair, whose highlights move with the view.
 const EXPOSED: Range<u8> = 40..248;
 
-/// Minimum number of training views; with fewer, exposure and direction cannot be told apart.
-const MIN_TRAINING_VIEWS: usize = 8;
+/// Minimum number of training views that can be measured. Four numbers describe what is linear in
+/// the viewing direction; with fewer views, these would take most of the exposures along.
+pub const MIN_TRAINING_VIEWS: usize = 7;
 
-/// Points that a view must show.
-pub const MIN_POINTS: usize = 50;
+/// Points that a view must show to be measured.
+const MIN_POINTS: usize = 50;
 
 /// Minimum cosine between the normal and the direction to the camera.
 const MIN_COSINE: f32 = 0.35;
@@ -78,8 +79,9 @@ impl ExposureView {
 /// What was measured.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExposureFit {
-    /// Exposure of every view; those of training views have a geometric mean of 1 in each channel.
-    pub exposures: Vec<Exposure>,
+    /// Exposure of every view, `None` where it shows too little; those of training views have a
+    /// geometric mean of 1 in each channel.
+    pub exposures: Vec<Option<Exposure>>,
     /// How many of the first are training views.
     pub train: usize,
     /// How many points each view shows.
@@ -93,7 +95,7 @@ pub struct ExposureFit {
 impl ExposureFit {
     /// Returns whether brightness differs enough to be evened out.
     pub fn brightness_differs(&self) -> bool {
-        let train = self.exposures.iter().take(self.train);
+        let train = self.exposures.iter().take(self.train).flatten();
         let most = train.map(|e| f64::from(e.brightness()).ln().abs()).fold(0.0, f64::max);
         self.brightness_spread >= MIN_SPREAD || most >= MIN_ALONE
     }
@@ -104,6 +106,15 @@ impl ExposureFit {
     }
 }
 
+/// Why exposures are not compared.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Incomparable {
+    /// Too few training views show enough of what others show: those where this is true.
+    TooFewViews(Vec<bool>),
+    /// What the views show determines no exposures.
+    Undetermined,
+}
+
 /// What one view shows of one point.
 struct Sample {
     view: usize,
@@ -112,41 +123,80 @@ struct Sample {
 }
 
 /// Measures exposures. The first `train` views are the training views, which alone decide what is common; the others are
-/// compared with it one by one. `None` where too little can be compared.
+/// compared with it one by one. A training view that shows too little, for it is dark or saturated
+/// or sees the head from where no other does, takes no part.
 pub fn measure(
     views: &[ExposureView],
     cameras: &[Camera],
     train: usize,
     surface: &Mesh,
-) -> Option<ExposureFit> {
+) -> Result<ExposureFit, Incomparable> {
     let spread = seeds(surface, cameras, |v, pixel| is_set(&views[v].usable, views[v].width, pixel), POINTS);
     let points: Vec<Vec<Sample>> =
         spread.par_iter().with_min_len(64).map(|seed| samples(views, cameras, seed)).collect();
-    let points: Vec<Vec<Sample>> = points
-        .into_iter()
-        .filter(|samples| samples.iter().filter(|s| s.view < train).count() >= MIN_VIEWS)
-        .collect();
-    let mut counts = vec![0; views.len()];
-    points.iter().flatten().for_each(|s| counts[s.view] += 1);
-    if train < MIN_TRAINING_VIEWS || counts[..train].iter().any(|&n| n < MIN_POINTS) {
-        return None;
+    let (points, takes_part, counts) = comparable(points, views.len(), train);
+    let measured: Vec<usize> = (0..train).filter(|&v| takes_part[v]).collect();
+    let count = measured.len();
+    if count < MIN_TRAINING_VIEWS {
+        return Err(Incomparable::TooFewViews(takes_part));
     }
-    let fitted: Vec<Vec<f64>> =
-        (0..3).into_par_iter().map(|k| fit_channel(&points, k, views.len(), train)).collect::<Option<_>>()?;
-    let logs: Vec<[f64; 3]> = (0..views.len()).map(|v| [0, 1, 2].map(|k| fitted[k][v])).collect();
-    let logs = without_direction(&logs, cameras, train);
+    // the training views that take part, then all others
+    let order: Vec<usize> = measured.into_iter().chain(train..views.len()).collect();
+    let points = renumbered(points, &order, views.len());
+    let cameras: Vec<Camera> = order.iter().map(|&v| cameras[v].clone()).collect();
+    let fitted = (0..3).into_par_iter().map(|k| fit_channel(&points, k, order.len(), count));
+    let fitted: Vec<Vec<f64>> = fitted.collect::<Option<_>>().ok_or(Incomparable::Undetermined)?;
+    let logs: Vec<[f64; 3]> = (0..order.len()).map(|v| [0, 1, 2].map(|k| fitted[k][v])).collect();
+    let logs = without_direction(&logs, &cameras, count);
     let square = |v: f64| v * v;
     let brightness = |log: &[f64; 3]| log.iter().sum::<f64>() / 3.0;
-    let rms = |sum: f64| (sum / train as f64).sqrt();
+    let rms = |sum: f64| (sum / count as f64).sqrt();
     let color = |log: &[f64; 3]| log.iter().map(|l| square(l - brightness(log))).sum::<f64>() / 3.0;
-    let exposure = |log: &[f64; 3]| Exposure { gain: log.map(|l| l.exp() as f32) };
-    Some(ExposureFit {
-        exposures: logs.iter().map(exposure).collect(),
+    let mut exposures = vec![None; views.len()];
+    for (&v, log) in order.iter().zip(&logs).filter(|(v, _)| counts[**v] >= MIN_POINTS) {
+        exposures[v] = Some(Exposure { gain: log.map(|l| l.exp() as f32) });
+    }
+    Ok(ExposureFit {
+        exposures,
         train,
         points: counts,
-        brightness_spread: rms(logs[..train].iter().map(|log| square(brightness(log))).sum()),
-        color_spread: rms(logs[..train].iter().map(color).sum()),
+        brightness_spread: rms(logs[..count].iter().map(|log| square(brightness(log))).sum()),
+        color_spread: rms(logs[..count].iter().map(color).sum()),
     })
+}
+
+/// Returns the points that enough training views show, which training views show enough of these,
+/// and how many of them each view shows. Views that show too few drop out one by one, the one with
+/// the fewest first: points that only they and two others show go with them.
+fn comparable(
+    points: Vec<Vec<Sample>>,
+    views: usize,
+    train: usize,
+) -> (Vec<Vec<Sample>>, Vec<bool>, Vec<usize>) {
+    fn is_shown(samples: &[Sample], takes_part: &[bool]) -> bool {
+        let shown = |s: &&Sample| takes_part.get(s.view).is_some_and(|part| *part);
+        samples.iter().filter(shown).count() >= MIN_VIEWS
+    }
+    let mut takes_part = vec![true; train];
+    loop {
+        let mut counts = vec![0; views];
+        let shown = points.iter().filter(|samples| is_shown(samples, &takes_part));
+        shown.flatten().for_each(|s| counts[s.view] += 1);
+        let too_few = (0..train).filter(|&v| takes_part[v] && counts[v] < MIN_POINTS);
+        let Some(least) = too_few.min_by_key(|&v| counts[v]) else {
+            let points = points.into_iter().filter(|samples| is_shown(samples, &takes_part));
+            return (points.collect(), takes_part, counts);
+        };
+        takes_part[least] = false;
+    }
+}
+
+/// Returns the samples of the views in `order` alone, with their places there as views.
+fn renumbered(points: Vec<Vec<Sample>>, order: &[usize], views: usize) -> Vec<Vec<Sample>> {
+    let mut places = vec![None; views];
+    order.iter().enumerate().for_each(|(place, &v)| places[v] = Some(place));
+    let placed = |s: Sample| Some(Sample { view: places[s.view]?, light: s.light });
+    points.into_iter().map(|samples| samples.into_iter().filter_map(placed).collect()).collect()
 }
 
 /// Returns what the views show of a point.
@@ -250,4 +300,37 @@ fn without_direction(logs: &[[f64; 3]], cameras: &[Camera], train: usize) -> Vec
         left.iter_mut().for_each(|log| log[k] -= mean);
     }
     left
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn samples(views: &[usize]) -> Vec<Sample> {
+        views.iter().map(|&view| Sample { view, light: [view as f64; 3] }).collect()
+    }
+
+    #[test]
+    fn a_view_that_shows_too_little_drops_out_and_the_others_stay() {
+        // views 0 to 3 are training views, 4 is held out; view 2 shows 20 points, of which 10 with
+        // 0 and 3 alone
+        let both = (0..60).map(|_| samples(&[0, 1, 3, 4]));
+        let few = (0..10).map(|_| samples(&[0, 1, 2, 3]));
+        let alone = (0..10).map(|_| samples(&[0, 2, 3]));
+        let unseen = (0..10).map(|_| samples(&[1, 4]));
+        let points: Vec<_> = both.chain(few).chain(alone).chain(unseen).collect();
+        let (points, takes_part, counts) = comparable(points, 5, 4);
+        assert_eq!(takes_part, [true, true, false, true]);
+        assert_eq!((points.len(), &counts[..]), (70, &[70, 70, 10, 70, 60][..]));
+        let points = renumbered(points, &[0, 1, 3, 4], 5);
+        let [first, last] = [&points[0], &points[69]].map(|p| p.iter().map(|s| s.view).collect::<Vec<_>>());
+        assert_eq!((first, last), (vec![0, 1, 2, 3], vec![0, 1, 2]));
+        assert_eq!(points[69][2].light, [3.0; 3]);
+    }
+
+    #[test]
+    fn views_without_a_point_leave_nothing_to_compare() {
+        let (points, takes_part, counts) = comparable(Vec::new(), 3, 2);
+        assert!(points.is_empty() && takes_part == [false; 2] && counts == [0; 3]);
+    }
 }

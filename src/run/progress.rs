@@ -181,8 +181,13 @@ impl Progress {
         self.observer.event(&Event::Note { stage: &self.stage, text });
     }
 
-    pub fn warn(&self, text: &str) {
+    /// Keeps a warning for the record that the observer has had already.
+    pub fn keep_warning(&self, text: &str) {
         self.state().1.remember(text);
+    }
+
+    pub fn warn(&self, text: &str) {
+        self.keep_warning(text);
         self.observer.event(&Event::Warning { stage: &self.stage, text });
     }
 

@@ -69,6 +69,11 @@ impl StageDir {
         self.progress.note(text);
     }
 
+    /// Keeps a warning for the record of the stage that was reported before it began.
+    pub fn keep_warning(&self, text: &str) {
+        self.progress.keep_warning(text);
+    }
+
     /// Reports a warning.
     pub fn warn(&self, text: &str) {
         self.progress.warn(text);
@@ -225,13 +230,8 @@ impl Run {
         };
         let Some(record) = record else { return Ok(None) };
         same(plan, &record.fingerprint, true)?;
-        for name in record.require_products(&self.path(plan.name))? {
-            let (file, run) = (self.path(plan.name).join(name), self.dir.display());
-            let again = match name.starts_with("head.") {
-                true => format!("`tiface export {run} --out FILE` writes the mesh again"),
-                false => "no stage reads it".into(),
-            };
-            self.warn(plan.name, &format!("`{}` is no longer in its folder; {again}", file.display()));
+        for fault in record.require_products(&self.path(plan.name))? {
+            self.warn(plan.name, &fault.to_string());
         }
         let Record { digest, summary, .. } = record;
         self.observer.event(&Event::Skipped { stage: plan.name });
@@ -543,7 +543,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         fs::create_dir_all(dir.path().join("iface/views")).unwrap();
         fs::write(dir.path().join("iface/views/.a.png.99.tmp"), b"half").unwrap();
-        fs::write(dir.path().join("iface/.lock"), b"").unwrap();
+        fs::write(dir.path().join("iface/.lock"), crate::run::LOCK_MARK).unwrap();
         fs::write(dir.path().join("iface/done.json"), b"").unwrap(); // a crash before any sync
         let seen = Arc::new(Warnings(Mutex::new(Vec::new())));
         let run = Run::open(dir.path(), Stop::new(), seen.clone());
@@ -579,6 +579,51 @@ mod tests {
         assert!(dir.path().join("mask/done.json").is_file());
         fs::remove_dir_all(&own).unwrap();
         assert!(run.stage(plan(5), work).is_ok());
+    }
+
+    #[test]
+    fn somebodys_own_folder_with_an_empty_lock_is_not_cleared() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        run.stage(Plan { name: "mask", ..plan(5) }, work).unwrap();
+        fs::create_dir_all(dir.path().join("iface/keep")).unwrap();
+        for lock in [&b""[..], b"4711", b"tiface"] {
+            fs::write(dir.path().join("iface/.lock"), lock).unwrap();
+            fs::write(dir.path().join("iface/keep/scan.ply"), b"mine").unwrap();
+            for error in [
+                fresh(&run, &["mask", "iface"]).unwrap_err(),
+                run.agrees(&plan(5)).unwrap_err(),
+                run.stage(plan(5), never).unwrap_err(),
+            ] {
+                assert!(error.to_string().contains("is not a folder of a run"), "{error}");
+            }
+            assert_eq!(fs::read(dir.path().join("iface/keep/scan.ply")).unwrap(), b"mine");
+            assert_eq!(fs::read(dir.path().join("iface/.lock")).unwrap(), lock);
+            assert!(dir.path().join("mask/done.json").is_file());
+        }
+    }
+
+    #[test]
+    fn a_run_killed_right_after_its_folder_was_made_goes_on() {
+        for lock in [None, Some(0), Some(20), Some(crate::run::LOCK_MARK.len())] {
+            let dir = tempfile::tempdir().unwrap();
+            let run = open(dir.path());
+            let folder = dir.path().join("iface");
+            fs::create_dir(&folder).unwrap();
+            if let Some(bytes) = lock {
+                fs::write(folder.join(".lock"), &crate::run::LOCK_MARK[..bytes]).unwrap();
+            }
+            fresh(&run, &["iface"]).unwrap();
+            run.agrees(&plan(5)).unwrap();
+            assert!(!run.stage(plan(5), work).unwrap().skipped);
+            // killed later, before any other proof was written
+            for file in ["done.json", "status.json"] {
+                fs::remove_file(folder.join(file)).unwrap();
+            }
+            fresh(&run, &["iface"]).unwrap();
+            assert!(!folder.join("checkpoint").exists());
+            assert!(!run.stage(plan(5), work).unwrap().skipped);
+        }
     }
 
     #[test]

@@ -8,6 +8,7 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
+use std::fmt::{self, Display};
 use std::ops::Add;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -115,100 +116,120 @@ const EXPORTS: [&str; 10] = [
     "inputs.json",
 ];
 
+/// The state of a product, compared with its record.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ProductState {
+    /// As its stage left it, as far as was compared.
+    Recorded,
+    /// It has other contents, or more bytes.
+    Changed,
+    /// It has fewer bytes.
+    Cut,
+    /// It is not there.
+    Gone,
+}
+
+/// A product of a finished stage that is not as the stage left it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Fault {
+    /// Its state.
+    pub state: ProductState,
+    /// Whether no stage reads the file.
+    pub is_export: bool,
+    /// A sentence that names the file.
+    pub problem: String,
+    /// The command that makes the file again.
+    pub again: String,
+}
+
+impl Fault {
+    /// Returns whether the run is complete all the same: the file may have been moved by its user.
+    pub fn is_harmless(&self) -> bool {
+        self.is_export && self.state == ProductState::Gone
+    }
+}
+
+/// Shows the problem and the command that mends it.
+impl Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{}; `{}` makes it again", self.problem, self.again)
+    }
+}
+
 impl Record {
+    /// Returns the fault of one of the stage's files, if it is missing from the stage's folder or has another size.
+    pub fn fault(&self, folder: &Path, name: &str) -> Option<Fault> {
+        let (file, bytes) = (folder.join(name), *self.products.get(name)?);
+        let (state, problem) = match io::file_size(&file) {
+            Some(found) if found == bytes => return None,
+            Some(found) => (
+                if found < bytes { ProductState::Cut } else { ProductState::Changed },
+                format!("has {found} bytes, but the stage `{}` left {bytes}", self.stage),
+            ),
+            None => (ProductState::Gone, format!("is missing, though the stage `{}` is done", self.stage)),
+        };
+        Some(self.faulty(folder, name, state, &problem))
+    }
+
+    /// Returns the files of the stage that are missing from its folder or have another size.
+    pub fn faults(&self, folder: &Path) -> Vec<Fault> {
+        self.products.keys().filter_map(|name| self.fault(folder, name)).collect()
+    }
+
+    /// Returns a fault of a file of the stage; `problem` is what comes after its name.
+    pub(super) fn faulty(&self, folder: &Path, name: &str, state: ProductState, problem: &str) -> Fault {
+        let problem = format!("`{}` {problem}", folder.join(name).display());
+        Fault { state, is_export: EXPORTS.contains(&name), problem, again: self.again(folder, name) }
+    }
+
+    /// Returns the command that makes a file of the stage again.
+    fn again(&self, folder: &Path, name: &str) -> String {
+        let run = folder.ancestors().nth(self.stage.split('/').count()).unwrap_or(folder).display();
+        let exported = match name {
+            "head.glb" | "head.ply" => Some(name),
+            // an OBJ refers to the other files
+            "head.obj" | "head.mtl" | "head.png" | "head.jpg" => Some("head.obj"),
+            _ => None,
+        };
+        match (exported, self.stage.split_once('/')) {
+            (Some(name), None) => format!("tiface export {run} --out {}", folder.join(name).display()),
+            (_, Some((owner, _))) => {
+                let cameras = self.fingerprint.settings.get("render.cameras");
+                let cameras = cameras.map_or("FILE", |word| word.trim_matches('"'));
+                format!("tiface {owner} {run} --cameras {cameras} --fresh {owner}")
+            }
+            (None, None) => format!("tiface run {run} --fresh {}", self.stage),
+        }
+    }
+
     /// Compares the files in the stage's folder with those that the stage left. Returns the exported files that were moved
     /// away.
     ///
     /// # Errors
     ///
     /// Fails if another file is missing from the folder, or has another size.
-    pub fn require_products(&self, folder: &Path) -> Result<Vec<&str>> {
-        let mut moved = Vec::new();
-        for (name, &bytes) in &self.products {
-            let file = folder.join(name);
-            let is_export = EXPORTS.contains(&name.as_str());
-            let problem = match io::file_size(&file) {
-                Some(found) if found == bytes => continue,
-                Some(found) => format!("has {found} bytes, but the stage `{}` left {bytes}", self.stage),
-                None if is_export => {
-                    moved.push(name.as_str());
-                    continue;
-                }
-                None => format!("is missing, though the stage `{}` is done", self.stage),
-            };
-            let stage = self.stage.split('/').next().unwrap_or_default();
-            return Err(Error::cannot(
-                format!("`{}` {problem}", file.display()),
-                match is_export {
-                    true => format!(
-                        "put the file back, remove it, for no stage reads it, or recompute the stage with `--fresh {stage}`"
-                    ),
-                    false => {
-                        format!(
-                            "put the file back, or recompute the stage and what follows with `--fresh {stage}`"
-                        )
-                    }
-                },
-            ));
+    pub fn require_products(&self, folder: &Path) -> Result<Vec<Fault>> {
+        let faults = self.faults(folder);
+        match faults.iter().find(|fault| !fault.is_harmless()) {
+            Some(fault) => Err(self.error(fault)),
+            None => Ok(faults),
         }
-        Ok(moved)
     }
-}
 
-/// What [`verify`] found in a run.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Verification {
-    /// SHA-256 of each product as its record states it, by path in the run; empty if the record states only its size.
-    pub products: BTreeMap<String, String>,
-    /// A sentence for each product that is missing or is not the one that was written.
-    pub differences: Vec<String>,
-    /// Exported files that are no longer in the run; no stage reads them.
-    pub moved: Vec<String>,
-}
-
-/// Compares the products in a run's folder with the records of their stages, byte for byte. Products of older records are
-/// compared by size.
-///
-/// # Errors
-///
-/// Fails if a record cannot be read, or there is none.
-pub fn verify(run: &Path) -> Result<Verification> {
-    let mut found = Verification::default();
-    verify_folder(run, run, &mut found)?;
-    if found.products.is_empty() {
-        let problem = format!("`{}` has no finished stage", run.display());
-        return Err(Error::cannot(
-            problem,
-            "name the folder of a run; `tiface status` shows what is finished",
-        ));
-    }
-    Ok(found)
-}
-
-fn verify_folder(run: &Path, folder: &Path, found: &mut Verification) -> Result<()> {
-    for inner in io::list_folders(folder)?.into_iter().filter(|inner| !io::is_link(inner)) {
-        if let Some(record) = read_record(&inner)? {
-            for (name, &bytes) in &record.products {
-                let file = inner.join(name);
-                let path = file.strip_prefix(run).unwrap_or(&file).to_string_lossy().into_owned();
-                let digest = record.sha256.get(name).cloned().unwrap_or_default();
-                match io::file_size(&file) {
-                    None if EXPORTS.contains(&name.as_str()) => found.moved.push(path.clone()),
-                    None => found.differences.push(format!("`{path}` is missing")),
-                    Some(size) if size != bytes => {
-                        found.differences.push(format!("`{path}` has {size} bytes, expected {bytes}"));
-                    }
-                    Some(_) if !digest.is_empty() && Fingerprint::of_file(&file)? != digest => {
-                        found.differences.push(format!("`{path}` has other contents than were written"));
-                    }
-                    Some(_) => {}
-                }
-                found.products.insert(path, digest);
+    /// Returns a fault of one of the stage's files as an error.
+    pub fn error(&self, fault: &Fault) -> Error {
+        let stage = self.stage.split('/').next().unwrap_or_default();
+        let put_back = match fault.is_export {
+            true if fault.again.starts_with("tiface export") => format!("`{}` puts it back", fault.again),
+            true if fault.state != ProductState::Gone => {
+                "put the file back, remove it, for no stage reads it".into()
             }
-        }
-        verify_folder(run, &inner, found)?;
+            _ => "put the file back".into(),
+        };
+        let hint = format!("{put_back}, or recompute the stage and what follows with `--fresh {stage}`");
+        Error::cannot(&fault.problem, hint)
     }
-    Ok(())
 }
 
 /// Returns the `status.json` of a stage folder; `None` if it does not exist.
@@ -277,9 +298,9 @@ pub const ESTIMATE: &str = "estimate.json";
 pub struct Cost {
     /// CPU seconds.
     pub cpu_s: f64,
-    /// Peak memory, bytes.
+    /// Peak memory of the process, bytes.
     pub memory_bytes: u64,
-    /// Disk space for its files, including checkpoints being written, bytes.
+    /// Disk space of the files that it leaves, bytes.
     pub disk_bytes: u64,
 }
 
@@ -337,6 +358,8 @@ pub enum Phase {
     Failed,
     /// Its files cannot be read.
     Unreadable,
+    /// Complete, but a file that was left is missing or has another size.
+    Damaged,
     /// For a run: some stages are done, none is running.
     Begun,
     /// Complete.
@@ -356,6 +379,8 @@ pub struct StageStatus {
     pub record: Option<Record>,
     /// Its error, or why it cannot be read.
     pub error: Option<String>,
+    /// Files that are not as it left them, by their sizes.
+    pub faults: Vec<Fault>,
     /// Estimated seconds left (wall clock).
     pub left_s: f64,
 }
@@ -408,7 +433,7 @@ impl RunStatus {
         let pace = if estimated > 1.0 { (took / estimated).clamp(0.02, 50.0) } else { 1.0 };
         for s in &mut stages {
             s.left_s = match (s.phase, &s.status) {
-                (Phase::Done, _) => 0.0,
+                (Phase::Done | Phase::Damaged, _) => 0.0,
                 (Phase::Running, Some(Status { eta_s: Some(eta), .. })) => *eta,
                 (phase, status) => {
                     let all = cost(s).unwrap_or(0.0) * pace;
@@ -424,9 +449,13 @@ impl RunStatus {
         let has = |phase: Phase| stages.iter().rev().find(|s| s.phase == phase);
         let is_done = match &estimate {
             Some(_) => stages.iter().all(|s| s.phase == Phase::Done),
-            None => stages.iter().any(|s| s.stage == Stage::Metrics && s.phase == Phase::Done),
+            None => {
+                let is_last = |s: &StageStatus| s.stage == Stage::Metrics && s.phase == Phase::Done;
+                stages.iter().any(is_last) && has(Phase::Damaged).is_none()
+            }
         };
-        let worst = [Phase::Running, Phase::Unreadable, Phase::Failed, Phase::Killed, Phase::Stopped];
+        let worst =
+            [Phase::Running, Phase::Unreadable, Phase::Failed, Phase::Damaged, Phase::Killed, Phase::Stopped];
         let found = worst.into_iter().find_map(has).map(|s| (s.phase, Some(s.stage)));
         let (phase, at) = match found {
             _ if is_done && settings.is_none() => (Phase::Done, None),
@@ -465,8 +494,11 @@ impl StageStatus {
         let (record, status) = (read_record(folder), read_status(folder));
         let unreadable = record.as_ref().err().or(status.as_ref().err()).map(|e| e.to_string());
         let (record, status) = (record.unwrap_or_default(), status.unwrap_or_default());
+        let faults = record.as_ref().map_or(Vec::new(), |record| record.faults(folder));
+        let damage = faults.iter().find(|fault| !fault.is_harmless());
         // the record is the truth: it is written after the status that says "done"
         let phase = match (&record, &unreadable, &status) {
+            (Some(_), _, _) if damage.is_some() => Phase::Damaged,
             (Some(_), _, _) => Phase::Done,
             (None, Some(_), _) => Phase::Unreadable,
             (None, None, None) => Phase::Waiting,
@@ -479,10 +511,11 @@ impl StageStatus {
         };
         let error = match phase {
             Phase::Unreadable => unreadable,
+            Phase::Damaged => damage.map(Fault::to_string),
             Phase::Failed => Some(status.as_ref().and_then(|s| s.error.clone()).unwrap_or_default()),
             _ => None,
         };
-        StageStatus { stage, phase, status, record, error, left_s: 0.0 }
+        StageStatus { stage, phase, status, record, error, faults, left_s: 0.0 }
     }
 }
 
@@ -678,35 +711,55 @@ mod run_tests {
     }
 
     #[test]
-    fn verify_compares_by_digest_then_by_size_and_lets_exports_move() {
+    fn a_file_that_is_gone_is_not_to_be_removed() {
         let dir = tempfile::tempdir().unwrap();
-        let stage = dir.path().join("mesh");
-        std::fs::create_dir(&stage).unwrap();
-        let fingerprint = Fingerprint::default();
-        let write = |name: &str, text: &str| std::fs::write(stage.join(name), text).unwrap();
-        ["atlas.png", "head.glb", "mesh.ply"].iter().for_each(|name| write(name, "abcd"));
-        let digests: serde_json::Map<String, Value> = ["atlas.png", "head.glb"]
-            .map(|name| (name.to_string(), json!(Fingerprint::of_bytes(b"abcd"))))
-            .into_iter()
-            .collect();
-        let record = json!({
-            "stage": "mesh", "digest": fingerprint.digest(), "fingerprint": fingerprint, "summary": {}, "elapsed_s": 2.0,
-            "finished": 1, "version": "0", "products": {"atlas.png": 4, "head.glb": 4, "mesh.ply": 4}, "sha256": digests,
+        let (folder, file) = (dir.path().join("mesh"), dir.path().join("mesh/surface.ply"));
+        let made = Run::quiet(dir.path()).stage(plan("mesh"), |_| {
+            io::write_atomic(&file, b"triangles")?;
+            Ok(Value::Null)
         });
-        write("done.json", &record.to_string());
-        let found = verify(dir.path()).unwrap();
-        assert!(found.differences.is_empty() && found.moved.is_empty(), "{found:?}");
-        // the record states no digest of the third: an older version wrote it
-        assert!(found.products["mesh/mesh.ply"].is_empty() && found.products["mesh/atlas.png"].len() == 64);
+        assert!(!made.unwrap().skipped);
+        let record = read_record(&folder).unwrap().unwrap();
+        let hint = || record.error(&record.faults(&folder)[0]).hint().to_string();
+        std::fs::write(&file, b"tri").unwrap();
+        assert!(hint().starts_with("put the file back, remove it, for no stage reads it, or"), "{}", hint());
+        std::fs::remove_file(&file).unwrap();
+        assert!(hint().starts_with("put the file back, or recompute"), "{}", hint());
+    }
 
-        write("atlas.png", "abce");
-        write("mesh.ply", "abce");
-        std::fs::remove_file(stage.join("head.glb")).unwrap();
-        let found = verify(dir.path()).unwrap();
-        assert_eq!(found.differences, ["`mesh/atlas.png` has other contents than were written"]);
-        assert_eq!(found.moved, ["mesh/head.glb"]);
-        write("mesh.ply", "abc");
-        assert_eq!(verify(dir.path()).unwrap().differences[1], "`mesh/mesh.ply` has 3 bytes, expected 4");
-        assert!(verify(&stage.join("none")).is_err());
+    #[test]
+    fn a_stage_with_a_file_that_was_cut_or_lost_is_not_done() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = Run::quiet(dir.path());
+        let names = ["head.glb", "parts"];
+        run.stage(plan("mesh"), |stage| {
+            for name in names {
+                io::write_atomic(&stage.folder().join(name), b"triangles")?;
+            }
+            Ok(Value::Null)
+        })
+        .unwrap();
+        run.stage(plan("metrics"), |_| Ok(Value::Null)).unwrap();
+        assert_eq!(RunStatus::read(dir.path()).phase, Phase::Done);
+        let [head, parts] = names.map(|name| dir.path().join("mesh").join(name));
+        // a file that no stage reads may be moved, which is told
+        std::fs::remove_file(&head).unwrap();
+        let mesh = StageStatus::read(&dir.path().join("mesh"), Stage::Mesh);
+        assert_eq!((mesh.phase, mesh.faults.len()), (Phase::Done, 1));
+        assert_eq!(mesh.faults[0].state, ProductState::Gone);
+        let export = format!("tiface export {} --out {}", dir.path().display(), head.display());
+        assert_eq!(mesh.faults[0].again, export);
+        assert_eq!(RunStatus::read(dir.path()).phase, Phase::Done);
+        // but not cut
+        std::fs::write(&head, b"tri").unwrap();
+        let now = RunStatus::read(dir.path());
+        assert_eq!((now.phase, now.at), (Phase::Damaged, Some(Stage::Mesh)));
+        let error = now.error.unwrap_or_default();
+        assert!(error.contains("has 3 bytes") && error.contains(&export), "{error}");
+        std::fs::write(&head, b"triangles").unwrap();
+        std::fs::remove_file(&parts).unwrap();
+        let error = RunStatus::read(dir.path()).error.unwrap_or_default();
+        let again = format!("`tiface run {} --fresh mesh`", dir.path().display());
+        assert!(error.contains("is missing") && error.contains(&again), "{error}");
     }
 }

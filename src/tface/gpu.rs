@@ -190,7 +190,7 @@ impl VmOps for GpuVm<'_> {
         self.losses.reset_totals(&self.device);
     }
 
-    fn figures(&mut self) -> Result<VmFigures> {
+    fn figures(&self) -> Result<VmFigures> {
         self.losses.fetch(&self.device)
     }
 }

@@ -28,8 +28,9 @@ pub struct TFace {
     on_gpu: GpuField<Box<Renderer>>,
 }
 
-/// Number of rays rendered together, which keeps their memory in the low hundreds of megabytes.
-const PASS: usize = 1 << 13;
+/// Number of rays rendered together. A sample whose color is decoded takes two kilobytes, and a ray has dozens: this keeps
+/// them in the low hundreds of megabytes.
+const PASS: usize = 1 << 11;
 
 impl TFace {
     pub(super) fn from_parts(field: VmField, values: [Vec<f32>; 3], placement: Option<Placement>) -> TFace {

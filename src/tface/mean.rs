@@ -256,7 +256,9 @@ mod tests {
         // nothing is learned twice
         let files = ["checkpoint.safetensors", "field_2/checkpoint.safetensors"];
         let bytes = |dir: &Path| files.map(|f| std::fs::read(dir.join(f)).unwrap());
-        assert_eq!(learn(dir.path(), &Quiet).unwrap().rays, 0);
+        let again = Heard::default();
+        assert_eq!(learn(dir.path(), &again).unwrap().counts(), report.counts());
+        assert_eq!(again.0.into_inner().unwrap(), [(40, 80), (80, 80)]);
         let missing = FieldMean::load("tface", dir.path(), 3).err().unwrap().to_string();
         assert!(missing.contains("field_3") && missing.contains("cannot be read"), "{missing}");
 
@@ -265,7 +267,7 @@ mod tests {
         let end = learn(again.path(), &StopAfter::new(50));
         assert!(end.unwrap_err().kind().is_stop());
         let rest = Heard::default();
-        learn(again.path(), &rest).unwrap();
+        assert_eq!(learn(again.path(), &rest).unwrap().counts(), report.counts());
         let rest = rest.0.into_inner().unwrap();
         assert_eq!((rest[0], rest.last()), ((40, 80), Some(&(80, 80))));
         assert!(rest.len() <= 32, "{rest:?}");

@@ -74,6 +74,6 @@ pub trait VmOps: Ops {
     /// Resets the accumulated figures.
     fn reset_totals(&mut self);
 
-    /// Waits for the device, and returns and resets the figures accumulated since the last call.
-    fn figures(&mut self) -> Result<VmFigures>;
+    /// Waits for the device and returns the figures accumulated since they were reset.
+    fn figures(&self) -> Result<VmFigures>;
 }

@@ -35,7 +35,7 @@ pub struct TfaceReport {
     pub occupied: f64,
     /// Vertices of the first field's final grid along x, y, z.
     pub size: [usize; 3],
-    /// Rays of this process.
+    /// Rays of all steps, whichever process made them.
     pub rays: u64,
     /// Points of their lattices inside the box, were nothing skipped.
     pub lattice_samples: u64,
@@ -64,7 +64,20 @@ impl TfaceReport {
         self.color_samples += one.color_samples;
         self.warnings.extend(one.warnings);
     }
+
+    /// Returns the counts: rays, lattice points, densities and colors.
+    #[cfg(test)]
+    pub(super) fn counts(&self) -> [u64; 4] {
+        [self.rays, self.lattice_samples, self.density_samples, self.color_samples]
+    }
 }
+
+/// Entries of a checkpoint's header with the counts of all steps so far: rays, lattice points,
+/// densities and colors.
+const COUNTS: [&str; 4] = ["rays", "lattice_samples", "density_samples", "color_samples"];
+
+/// Largest count that is read: larger numbers are not exact in JSON.
+const MAX_COUNT: u64 = 1 << 53;
 
 /// A vector-matrix field in training on a device.
 pub(super) struct VmModel<'a, O: VmOps> {
@@ -77,7 +90,7 @@ pub(super) struct VmModel<'a, O: VmOps> {
     pub state: VmState,
     /// Steps since losses were read.
     unread: u64,
-    /// Samples of this process.
+    /// Rays and samples of all steps that losses were read of.
     pub counts: VmFigures,
 }
 
@@ -100,7 +113,7 @@ pub(super) fn train_one(
                 GpuVm::fits(session.stage, config, pixels, &state, &gpu.device).map(drop)
             }
         })?;
-    let description = device.description();
+    let (description, refused) = (device.description(), device.warning());
     let (state, progress, counts, warnings) = match device {
         ComputeDevice::Cpu(_) => train_on(CpuVm::new(config, pixels), state, config, session)?,
         #[cfg(feature = "wgpu")]
@@ -121,7 +134,7 @@ pub(super) fn train_one(
         density_samples: counts.density,
         color_samples: counts.color,
         device: description,
-        warnings,
+        warnings: refused.into_iter().chain(warnings).collect(),
     })
 }
 
@@ -279,11 +292,9 @@ impl<O: VmOps> Model for VmModel<'_, O> {
 
     fn report(&mut self, _: u64) -> Result<StepReport, StepError> {
         let found = self.ops.figures()?;
+        self.ops.reset_totals();
         let steps = std::mem::take(&mut self.unread).max(1) as f64;
-        self.counts.rays += found.rays;
-        self.counts.lattice += found.lattice;
-        self.counts.density += found.density;
-        self.counts.color += found.color;
+        self.counts.count(&found);
         let [rgb, mask, outside] = found.terms.map(|t| f64::from(t) / steps);
         StepError::check([("rgb", rgb as f32), ("mask", mask as f32)])?;
         if found.broken {
@@ -325,14 +336,30 @@ impl<O: VmOps> Model for VmModel<'_, O> {
 
     fn save(&self, into: &mut Checkpoint, finished: bool) -> Result<(), StepError> {
         self.state()?.save(self.config, into, finished);
+        let mut counts = self.counts;
+        if self.unread > 0 {
+            counts.count(&self.ops.figures()?);
+        }
+        let counts = [counts.rays, counts.lattice, counts.density, counts.color];
+        COUNTS.into_iter().zip(counts).for_each(|(key, count)| into.set(key, count));
         Ok(())
     }
 
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError> {
         let mut finished = false;
+        self.counts = VmFigures::default();
         if let Some((from, progress, done)) = from {
             self.state.restore(self.config, from, progress.step, done)?;
             finished = done;
+            let count = |key: &str| from.number_or(key, 0, 0..=MAX_COUNT);
+            let [rays, lattice, density, color] = COUNTS.map(count);
+            self.counts = VmFigures {
+                rays: rays?,
+                lattice: lattice?,
+                density: density?,
+                color: color?,
+                ..VmFigures::default()
+            };
         }
         self.ops.reset_totals();
         self.unread = 0;

@@ -3,7 +3,8 @@
 use super::*;
 use crate::config::{DensityActivation, Preset};
 use crate::field::ball::{
-    BALL, bytes, hull, negative, refuses, resumes, says, session, tampered, temporary, views, words,
+    BALL, StopAfter, bytes, hull, negative, refuses, resumes, says, session, tampered, temporary, views,
+    words,
 };
 use crate::field::checkpoint;
 use crate::geom::Aabb;
@@ -65,6 +66,22 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 }
 
 #[test]
+fn rays_and_samples_of_a_training_that_was_stopped_are_those_of_all_its_steps() {
+    let config = VmConfig { steps: 12, upsample_at: vec![0.5], mask_at: vec![0.5], ..config() };
+    let whole = temporary();
+    let want = run(&config, whole.path(), &Quiet).unwrap().counts();
+    assert!(want.iter().all(|&n| n > 0), "{want:?}");
+    // killed when all steps were saved, but not yet recorded
+    assert_eq!(run(&config, whole.path(), &Quiet).unwrap().counts(), want);
+    let stopped = temporary();
+    assert!(run(&config, stopped.path(), &StopAfter::new(5)).is_err());
+    assert_eq!(run(&config, stopped.path(), &Quiet).unwrap().counts(), want);
+    // checkpoints of earlier versions have no counts
+    tampered(stopped.path(), |(_, metadata)| drop(metadata.remove("rays")));
+    assert_eq!(run(&config, stopped.path(), &Quiet).unwrap().rays, 0);
+}
+
+#[test]
 fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
     let config = VmConfig { steps: 9, upsample_at: vec![0.55], mask_at: vec![0.55], ..config() };
     let infinite = f64::INFINITY.to_bits().to_string();
@@ -79,6 +96,7 @@ fn a_hostile_checkpoint_is_named_and_the_one_before_it_is_taken() {
             ("`moments_from`", &says("moments_from", "18446744073709551615")),
             ("second.color", &negative("second.color")),
             ("`masked`", &says("masked", "2")),
+            ("`rays`", &says("rays", "18446744073709551615")),
             // compared with what the file holds before anything of that size is reserved
             ("`model.density` has shape", &words("size", [1 << 16; 3])),
             ("`size`", &words("size", [1, 8, 8])),

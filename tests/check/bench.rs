@@ -62,6 +62,16 @@ fn sweeps_leave_a_page_and_results() {
     // a time is that of all steps so far
     let seconds: Vec<f64> = steps[..5].iter().map(|row| row["wall_s"].as_f64().unwrap()).collect();
     assert!(steps[0]["choice"] == "5 steps" && seconds.is_sorted(), "{seconds:?}");
+    // as if killed before the last sweep: the same command measures only that
+    let mut stopped = found.clone();
+    stopped["sweeps"].as_array_mut().unwrap().truncate(1);
+    std::fs::write(dir.path().join("first/bench.json"), stopped.to_string()).unwrap();
+    let again = bench(dir.path(), &["--sweep", "steps,triangles", "--out", "first/"]);
+    let text = said(&again);
+    assert!(again.status.success() && text.contains("triangles (1 of 1)"), "{text}");
+    let whole = results(dir.path(), "first/bench.json");
+    assert_eq!(whole["sweeps"][0], found["sweeps"][0]);
+    assert_eq!(whole["sweeps"][1]["name"], "triangles");
     // results are not written over
     let full = bench(dir.path(), &["--sweep", "hash", "--out", "first/"]);
     assert!(full.status.code() == Some(1) && said(&full).contains("holds the results of another bench"));

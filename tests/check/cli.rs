@@ -4,7 +4,7 @@ use crate::command::{code, command, err, out, tiface};
 use crate::kept::photographed;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use tiface::capture::synthetic::SyntheticOptions;
+use tiface::capture::synthetic::{SyntheticOptions, write_borders};
 use tiface::io::{Limits, read_gray, write_png_gray};
 
 #[test]
@@ -427,7 +427,8 @@ fn what_was_probably_meant_is_named() {
     std::fs::write(dir.path().join("scan.ply"), "").unwrap();
     for (words, meant) in [
         (&["run", "captures/002_0"][..], Some("`captures/002_00`")),
-        (&["mask", "capture/002_00", "--dry-run"], None),
+        (&["mask", "capture/002_00", "--dry-run"], Some("`captures/002_00`")),
+        (&["mask", "capture/003", "--dry-run"], None),
         (&["preview", "head"], Some("`runs/head`")),
         (&["verify", "runs/haed"], Some("`runs/head`")),
         (&["check", "scna.ply"], Some("`scan.ply`")),
@@ -459,6 +460,57 @@ fn what_was_probably_meant_is_named() {
     std::fs::write(run.join("mesh/head.obj"), triangle).unwrap();
     assert_eq!(code(&tiface(dir.path(), &["check", "runs/head"])), 0);
     assert_eq!(code(&tiface(dir.path(), &["check", "runs/head", "--require", "watertight"])), 3);
+}
+
+#[test]
+fn the_configuration_as_json_is_json_and_a_key_is_explained_with_its_value_in_preset_quick() {
+    let dir = tempfile::tempdir().unwrap();
+    let json = |words: &[&str]| -> serde_json::Value {
+        let o = tiface(dir.path(), words);
+        assert_eq!(code(&o), 0, "{}", err(&o));
+        serde_json::from_str(&out(&o)).unwrap()
+    };
+    let config = json(&["config", "--preset", "draft", "--json"]);
+    assert_eq!((&config["preset"], &config["mesh"]["resolution"]), (&"draft".into(), &256.into()));
+    let explained = json(&["config", "--explain", "iface.steps", "--json"]);
+    assert_eq!(
+        (&explained[0]["key"], &explained[0]["values"]["quick"]),
+        (&"iface.steps".into(), &1200.into())
+    );
+    let text = out(&tiface(dir.path(), &["config", "--explain", "mesh.resolution"]));
+    assert!(text.contains("quick: 256   draft: 256   standard: 512"), "{text}");
+}
+
+#[test]
+fn what_a_command_cannot_do_is_answered_with_what_can_be_done() {
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 24, height: 30, train: 3, test: 1, seed: 1 };
+    photographed(&dir.path().join("captures/a"), &options);
+    // runs, one of them called as the demo head is
+    for name in ["runs/a", "demo"] {
+        std::fs::create_dir_all(dir.path().join(name).join("mesh")).unwrap();
+        std::fs::write(dir.path().join(name).join("config.toml"), "").unwrap();
+    }
+    for (words, expected, said) in [
+        (&["inspect", "captures/a", "--fresh", "mesh"][..], 2, "`--fresh` has no effect on `inspect`"),
+        (&["status", "--set", "iface.steps=5"], 2, "`--set` has no effect on `status`"),
+        (&["run", "captures/a", "--watch"], 2, "`tiface status --watch`"),
+        (&["preview", "captures/a", "--watch"], 2, "name its run, `runs/a`"),
+        (&["check", "captures/a"], 1, "`captures/a` is a folder, but not that of a run"),
+        (&["experiment", "demo", "--dry-run"], 2, "photographs of the demo head are not rendered yet"),
+    ] {
+        let o = tiface(dir.path(), words);
+        assert!(code(&o) == expected && err(&o).contains(said), "{words:?}: {} {}", code(&o), err(&o));
+    }
+    // the exported head of a run may be turned, so its surface is compared
+    let ply = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+        element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
+    std::fs::write(dir.path().join("runs/a/mesh/surface.ply"), ply).unwrap();
+    std::fs::write(dir.path().join("other.ply"), ply).unwrap();
+    let turned = "v 0 0 5\nv 1 0 5\nv 0 1 5\nf 1 2 3\n";
+    std::fs::write(dir.path().join("runs/a/mesh/head.obj"), turned).unwrap();
+    let o = tiface(dir.path(), &["check", "runs/a", "--against", "other.ply"]);
+    assert!(out(&o).contains("distance to the other   mean 0.000,"), "{}{}", out(&o), err(&o));
 }
 
 #[test]
@@ -527,6 +579,35 @@ fn a_damaged_status_hides_no_other_run() {
         (code(&o), out(&o).lines().filter(|l| l.contains("\"state\":\"unreadable\"")).count()),
         (1, 1)
     );
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn status_fails_for_a_killed_run_and_an_unreadable_one_hides_no_failed_one() {
+    let dir = tempfile::tempdir().unwrap();
+    let stage = |run: &str, status: &str| {
+        std::fs::create_dir_all(dir.path().join(run).join("mask")).unwrap();
+        std::fs::write(dir.path().join(run).join("mask/status.json"), status).unwrap();
+    };
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap();
+    // no process has this number
+    let killed = serde_json::json!({"state": "running", "step": 1, "steps": 2, "rate": null, "eta_s": null,
+        "elapsed_s": 1, "device": "cpu", "pid": u32::MAX, "host": host.trim(), "error": null, "updated": 0,
+        "fingerprint": {"format": 1, "settings": {}, "inputs": {}}});
+    let mut failed = killed.clone();
+    (failed["state"], failed["error"]) = ("failed".into(), "no light".into());
+    stage("killed", &killed.to_string());
+    stage("failed", &failed.to_string());
+    stage("bad", "{");
+    let o = tiface(dir.path(), &["status", "killed"]);
+    assert!(code(&o) == 3 && err(&o).contains("1 of 1 run was killed"), "{}", err(&o));
+    let o = tiface(dir.path(), &["status", "bad", "killed", "failed"]);
+    let all = "1 of 3 runs failed, 1 was killed, 1 could not be read";
+    assert!(code(&o) == 3 && err(&o).contains(all), "{}", err(&o));
+    let help = out(&tiface(dir.path(), &["status", "--help"]));
+    for state in ["done ", "failed ", "damaged: ", "killed: ", "not readable "] {
+        assert!(help.contains(state), "{state}: {help}");
+    }
 }
 
 #[test]
@@ -623,6 +704,9 @@ fn the_tables_say_what_they_need_and_are_collected_without_making_it() {
     let run: serde_json::Value = serde_json::from_str(out(&o).trim()).unwrap();
     assert_eq!((&run["run"], &run["done"]), (&"head/paper".into(), &false.into()));
     assert!(run["estimate"]["cpu_s"].as_f64().unwrap() > 0.0);
+    // nor can its runs be made on a device that is not here
+    let o = experiment(&["--dry-run", "--device", "wgpu:99"]);
+    assert!(out(&o).contains("cannot be made: device `wgpu"), "{}{}", out(&o), err(&o));
     for wrong in [["--preset", "draft"], ["--run", "runs/other"], ["--fresh", "iface"]] {
         let o = experiment(&wrong);
         assert_eq!(code(&o), 2, "{}", err(&o));
@@ -668,6 +752,52 @@ fn a_capture_is_converted_into_a_new_folder_only() {
     ] {
         let o = tiface(dir.path(), words);
         assert!(code(&o) == expected && err(&o).contains(text), "{words:?}: {} {}", code(&o), err(&o));
+    }
+}
+
+#[test]
+fn a_conversion_that_was_killed_is_completed_by_the_same_command() {
+    let dir = tempfile::tempdir().unwrap();
+    small_head(dir.path());
+    let words = ["convert", "head", "--to", "transforms", "--out", "copy"];
+    assert_eq!(code(&tiface(dir.path(), &words)), 0);
+    let whole = std::fs::read(dir.path().join("copy/transforms.json")).unwrap();
+    // the cameras are written last
+    std::fs::remove_file(dir.path().join("copy/transforms.json")).unwrap();
+    std::fs::remove_file(dir.path().join("copy/images/003.png")).unwrap();
+    let o = tiface(dir.path(), &words);
+    assert_eq!(code(&o), 0, "{}", err(&o));
+    assert!(std::fs::read(dir.path().join("copy/transforms.json")).unwrap() == whole);
+    assert!(dir.path().join("copy/images/003.png").is_file());
+    // a complete folder, and one with other files, are left as they are
+    assert_eq!(code(&tiface(dir.path(), &words)), 1);
+    std::fs::remove_file(dir.path().join("copy/transforms.json")).unwrap();
+    for (file, found) in [("copy/images/003.png", "mine"), ("copy/notes.txt", "mine")] {
+        let before = std::fs::read(dir.path().join(file)).unwrap_or_default();
+        std::fs::write(dir.path().join(file), found).unwrap();
+        let o = tiface(dir.path(), &words);
+        assert!(code(&o) == 1 && err(&o).contains("already exists"), "{file}: {}", err(&o));
+        assert_eq!(std::fs::read_to_string(dir.path().join(file)).unwrap(), found);
+        std::fs::write(dir.path().join(file), before).unwrap();
+    }
+}
+
+#[test]
+fn the_same_demo_command_continues_and_only_other_photographs_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let capture = dir.path().join("run/capture");
+    let options = SyntheticOptions { width: 32, height: 40, train: 6, test: 2, seed: 42 };
+    photographed(&capture, &options);
+    write_borders(&capture, &options, 4).unwrap();
+    let demo = |words: &[&str]| tiface(dir.path(), &[&["demo", "--run", "run", "--dry-run"], words].concat());
+    for words in [&["--size", "32x40", "--views", "8", "--border", "4"][..], &["--size", "32x40"], &[]] {
+        let o = demo(words);
+        assert!(code(&o) == 0 && out(&o).contains("to do"), "{words:?}: {}{}", out(&o), err(&o));
+    }
+    for words in [["--size", "40x32"], ["--views", "12"], ["--border", "5"]] {
+        let o = demo(&words);
+        let hint = format!("leave out {}", words[0]);
+        assert!(code(&o) == 2 && err(&o).contains(&hint), "{words:?}: {}", err(&o));
     }
 }
 
@@ -795,8 +925,10 @@ fn what_a_stage_made_anew_puts_out_of_date_is_named_before_it_goes() {
     // as if it had been begun
     let mesh = dir.path().join("runs/head/mesh");
     std::fs::create_dir(&mesh).unwrap();
-    for file in [".lock", "surface.ply"] {
-        std::fs::write(mesh.join(file), "x").unwrap();
+    for (file, found) in
+        [(".lock", "tiface holds this lock while it works on this stage\n"), ("surface.ply", "x")]
+    {
+        std::fs::write(mesh.join(file), found).unwrap();
     }
     let words = ["mask", "head", "--fresh", "mask"];
     let o = tiface(dir.path(), &[&words[..], &["--dry-run"]].concat());
@@ -933,10 +1065,14 @@ fn a_refused_command_leaves_nothing_in_somebodys_own_folder() {
     small_head(dir.path());
     std::fs::create_dir_all(dir.path().join("thesis/mask")).unwrap();
     std::fs::write(dir.path().join("thesis/mask/costume.png"), "mine").unwrap();
-    for more in [&["--fresh", "mask"][..], &[]] {
-        let o = tiface(dir.path(), &[&["mask", "head", "--run", "thesis"], more].concat());
-        assert!(code(&o) == 1 && err(&o).contains("mask/costume.png"), "{}", err(&o));
-        let left: Vec<_> = std::fs::read_dir(dir.path().join("thesis")).unwrap().collect();
-        assert_eq!(left.len(), 1, "{left:?}");
+    // nor is a folder ours for what a file is called
+    for lock in [None, Some("mask/.lock")] {
+        lock.iter().for_each(|lock| std::fs::write(dir.path().join("thesis").join(lock), "").unwrap());
+        for more in [&["--fresh", "mask"][..], &[]] {
+            let o = tiface(dir.path(), &[&["mask", "head", "--run", "thesis"], more].concat());
+            assert!(code(&o) == 1 && err(&o).contains("mask/costume.png"), "{}", err(&o));
+            let left: Vec<_> = std::fs::read_dir(dir.path().join("thesis")).unwrap().collect();
+            assert_eq!(left.len(), 1, "{left:?}");
+        }
     }
 }

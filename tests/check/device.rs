@@ -79,3 +79,84 @@ fn a_device_that_is_not_here_is_refused_before_anything_is_made() {
     assert_eq!(code(&refused), 2, "{said}");
     assert!(said.contains("vulkan:77") && said.contains("doctor") && !dir.path().join("run/tface").exists());
 }
+
+#[test]
+fn a_dry_run_refuses_a_gpu_with_too_little_memory_as_the_command_would() {
+    if Adapter::all().is_empty() {
+        println!(
+            "skipped: memory of a device in a dry run, for no adapter is here (Mesa's lavapipe would do)"
+        );
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 24, height: 30, train: 6, test: 1, seed: 3 };
+    photographed(&dir.path().join("capture"), &options);
+    let rows = [("0.5", &["--dry-run"][..], 1), ("0.5", &[], 1), ("64", &["--dry-run"], 0)];
+    for (memory, more, expected) in rows {
+        let words = words("wgpu:0", &[&["--memory", memory][..], more].concat());
+        let o = alone(dir.path(), &words).output().unwrap();
+        let said = err(&o);
+        assert_eq!(code(&o), expected, "{memory} {more:?}: {said}");
+        assert!(expected == 0 || said.contains("with `--memory`"), "{said}");
+    }
+    assert!(!dir.path().join("run/mask").exists());
+}
+
+/// In place of the program: lists a card that passes its self-test and a software driver that does
+/// not, and fails to train after its first kernels.
+const FAKE: &str = r#"#!/bin/sh
+device() {
+  printf '{"name":"%s","adapter":"of a test","kind":"%s","driver":"1","card":null,"atomics":"native","memory":8,' "$1" "$2"
+  printf '"largest_buffer":8,"shared":8,"in_use":false,"checks":[{"name":"density: rgb","error":1e-6,"allowed":0.002,'
+  printf '"passed":true},{"name":"density: optimizer","error":null,"allowed":0.002,"passed":%s}],' "$3"
+  printf '"error":null,"seconds":%s}' "$4"
+}
+case $1 in
+  doctor)
+    printf '{"version":"0.1.0","devices":[%s,' "$(device vulkan:0 discrete true 2.5)"
+    printf '%s],"auto":"of a test"}\n' "$(device vulkan:1 software false 40.5)"
+    exit 1 ;;
+  iface)
+    echo '| 61.6µs | Forward' > "$(sed -n 's/.*file = "\([^"]*\)".*/\1/p' cubecl.toml)"
+    exit 1 ;;
+esac
+"#;
+
+#[test]
+fn a_first_look_judges_its_own_device_and_forgets_no_failure() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().unwrap();
+    let fake = dir.path().join("tiface");
+    std::fs::write(&fake, FAKE).unwrap();
+    std::fs::set_permissions(&fake, std::fs::Permissions::from_mode(0o755)).unwrap();
+    std::fs::create_dir(dir.path().join("capture")).unwrap();
+    let look = |device: &str, part: &str| {
+        let out = dir.path().join(format!("{}-{part}", device.replace(':', "-")));
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tools/gpu/first_look.sh");
+        let mut command = Command::new("bash");
+        command.arg(script).args([device, out.to_str().unwrap(), part]).current_dir(dir.path());
+        let envs = [("TIFACE", fake.as_path()), ("CAPTURE", Path::new("capture")), ("SHARE", Path::new("1"))];
+        let done = command.envs(envs).output().unwrap();
+        (done.status.code(), std::fs::read_to_string(out.join("figures.txt")).unwrap())
+    };
+    for (device, code, line) in [
+        ("wgpu", 0, "doctor_warm of vulkan:0: 2.5 s, passed\n"),
+        ("vulkan:0", 0, "doctor_cold of vulkan:0: 2.5 s, passed\n"),
+        ("vulkan:1", 1, "doctor_warm of vulkan:1: 40.5 s, FAILED\n"),
+        ("metal", 1, "doctor_warm of metal: no s, not listed\n"),
+    ] {
+        let (status, figures) = look(device, "doctor");
+        assert_eq!(status, Some(code), "{figures}");
+        assert!(figures.contains(line) && figures.contains("WRONG") == (code == 1), "{figures}");
+        assert!(
+            cfg!(not(target_os = "linux")) || figures.contains("loader: ") && figures.contains("ICD: "),
+            "{figures}"
+        );
+    }
+    let (status, figures) = look("vulkan:0", "kernels");
+    assert!(
+        figures.contains("launches") && figures.contains("WRONG: kernels_24576 did not train"),
+        "{figures}"
+    );
+    assert_eq!(status, Some(1), "{figures}");
+}

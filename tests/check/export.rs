@@ -141,6 +141,58 @@ fn other_settings_give_what_the_stage_gives_when_it_is_made_again_with_them() {
 }
 
 #[test]
+fn a_head_that_was_cut_lost_or_changed_is_noticed_and_put_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &[]);
+    let head = run.join("mesh/head.glb");
+    let whole = std::fs::read(&head).unwrap();
+    let put_back = ["export", "runs/head", "--out", "runs/head/mesh/head.glb"];
+    let named = format!("tiface {}", put_back.join(" "));
+    let ends = |words: &[&str], code: i32, what: &str| {
+        let output = tiface(dir.path(), words);
+        assert_eq!(output.status.code(), Some(code), "{words:?}: {}", said(&output));
+        assert!(said(&output).contains(what), "{words:?}: {}", said(&output));
+    };
+    std::fs::write(&head, &whole[..whole.len() / 2]).unwrap();
+    for (words, code) in [("run", 1), ("report", 1), ("check", 3), ("status", 3), ("verify", 3)] {
+        ends(&[words, "runs/head"], code, &named);
+    }
+    // another mesh does not take its place, and no other file is written into the run
+    let smaller = [&put_back[..], &["--triangles", "300"]].concat();
+    ends(&smaller, 2, "another `head.glb` than the run's");
+    ends(&["export", "runs/head", "--out", "runs/head/mesh/other.glb"], 2, "is inside the run");
+    worked(dir.path(), &put_back);
+    assert!(std::fs::read(&head).unwrap() == whole);
+    worked(dir.path(), &["verify", "runs/head"]);
+
+    // a user may move it away: the run is done, and the file is not shown as there
+    std::fs::remove_file(&head).unwrap();
+    for words in ["run", "status", "report"] {
+        worked(dir.path(), &[words, "runs/head"]);
+    }
+    for words in ["run", "status"] {
+        ends(&[words, "runs/head"], 0, &named);
+    }
+    assert!(!worked(dir.path(), &["run", "runs/head"]).contains("mesh      runs/head/mesh/head.glb"));
+    ends(&["check", "runs/head"], 1, &named);
+    ends(&["verify", "runs/head"], 3, &named);
+    let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+    assert!(page.contains("tiface export runs"), "the page says nothing about it");
+    worked(dir.path(), &put_back);
+
+    // what keeps its size shows by its digest only
+    let mut changed = whole.clone();
+    let middle = changed.len() - 9;
+    changed[middle] ^= 1;
+    std::fs::write(&head, &changed).unwrap();
+    ends(&["verify", "runs/head"], 3, "has other contents than the stage `mesh` left");
+    ends(&["check", "runs/head"], 3, "has other contents than the stage `mesh` left");
+    worked(dir.path(), &put_back);
+    assert!(std::fs::read(&head).unwrap() == whole);
+    worked(dir.path(), &["check", "runs/head"]);
+}
+
+#[test]
 fn a_smaller_head_is_watertight_and_keeps_its_texture() {
     let dir = tempfile::tempdir().unwrap();
     let run = finished(dir.path(), &["mesh.normal_map=true", "mesh.lobes=1", "mesh.hair=shells"]);
@@ -198,7 +250,7 @@ fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
         (&["absent"], 1, &["`absent`"]),
         (&["--out", "head.fbx"], 2, &["end it in .glb, .obj, .ply, or in `/`"]),
         (&["--out", "absent/head.glb"], 1, &["the folder `absent` does not exist"]),
-        (&["--out", "runs/head/mesh/head.glb"], 2, &["is inside the run"]),
+        (&["--out", "runs/head/head.glb"], 2, &["is inside the run"]),
         (&["--out", "runs/head/new/"], 2, &["is inside the run"]),
         (&["--format", "stl"], 2, &["--format stl"]),
         (&["--format", "ply", "--out", "a.glb"], 2, &["one .glb", "--format"]),

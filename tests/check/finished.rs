@@ -168,9 +168,14 @@ fn verify_names_each_file_that_is_not_as_recorded() {
     let manifest = tiface(dir.path(), &["verify", "runs/head", "--json"]);
     assert_eq!(manifest.status.code(), Some(0), "{}", said(&manifest));
     let manifest: serde_json::Value = serde_json::from_slice(&manifest.stdout).unwrap();
-    let digests = manifest["products"].as_object().unwrap();
-    let path = digests.keys().find(|path| path.starts_with("ensemble/") && path.ends_with(".png")).unwrap();
-    assert!(digests.values().all(|digest| digest.as_str().unwrap().len() == 64), "{manifest}");
+    let listed = manifest["files"].as_array().unwrap();
+    let mut paths = listed.iter().map(|file| file["file"].as_str().unwrap());
+    let path = paths.find(|path| path.starts_with("ensemble/") && path.ends_with(".png")).unwrap();
+    let is_whole = |file: &serde_json::Value| {
+        let size = std::fs::metadata(run.join(file["file"].as_str().unwrap())).unwrap().len();
+        file["sha256"].as_str().unwrap().len() == 64 && file["bytes"] == size && file["state"] == "recorded"
+    };
+    assert!(listed.iter().all(is_whole), "{manifest}");
     assert!(before == files(&run), "verify has changed the run");
 
     // one bit, so that the size stays
@@ -179,15 +184,26 @@ fn verify_names_each_file_that_is_not_as_recorded() {
     std::fs::write(run.join(path), &bytes).unwrap();
     let o = tiface(dir.path(), &["verify", "runs/head"]);
     assert_eq!(o.status.code(), Some(3), "{}", said(&o));
-    assert!(said(&o).contains(&format!("`{path}` has other contents than were written")), "{}", said(&o));
+    let changed = format!("/{path}` has other contents than the stage `ensemble` left");
+    assert!(said(&o).contains(&changed), "{}", said(&o));
+    assert!(said(&o).contains("`tiface run runs/head --fresh ensemble` makes it again"), "{}", said(&o));
+    let o = tiface(dir.path(), &["verify", "runs/head", "--json"]);
+    assert!(said(&o).contains("\"state\":\"changed\""), "{}", said(&o));
     std::fs::remove_file(run.join(path)).unwrap();
     let o = tiface(dir.path(), &["verify", "runs/head"]);
-    assert!(o.status.code() == Some(3) && said(&o).contains(&format!("`{path}` is missing")), "{}", said(&o));
+    assert!(o.status.code() == Some(3) && said(&o).contains(&format!("/{path}` is missing")), "{}", said(&o));
+    // which its size shows to other commands
+    let o = tiface(dir.path(), &["status", "runs/head"]);
+    assert!(o.status.code() == Some(3) && said(&o).contains("ensemble DAMAGED: "), "{}", said(&o));
     // a folder that is no run fails, and does not hide what was found in another
     std::fs::create_dir(dir.path().join("empty")).unwrap();
     let o = tiface(dir.path(), &["verify", "empty", "runs/head"]);
     assert_eq!(o.status.code(), Some(1), "{}", said(&o));
     assert!(said(&o).contains("no finished stage") && said(&o).contains("is missing"), "{}", said(&o));
+    // and the command that was printed makes it again
+    worked(&tiface(dir.path(), &["run", "runs/head", "--fresh", "ensemble"]));
+    worked(&tiface(dir.path(), &["verify", "runs/head"]));
+    worked(&tiface(dir.path(), &["status", "runs/head"]));
 }
 
 #[test]

@@ -11,6 +11,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use tempfile::TempDir;
+use tiface::capture::convert::{CameraFormat, convert};
 use tiface::capture::synthetic::SyntheticOptions;
 use tiface::capture::{self, Capture, CaptureOptions, View};
 use tiface::geom::Camera;
@@ -70,10 +71,15 @@ fn what_is_no_folder_of_photographs_is_refused_before_anything_is_written() {
         (&["--video", "turn.mp4", "--every", "0"], 2, "--every"),
         (&[], 2, "PHOTOGRAPHS"),
     ];
+    // and a dry run ends as the command would
     for (words, code, text) in rows {
-        let (exit, said) = cameras(&dir, words);
-        assert!(exit == *code && said.contains(text), "{words:?}: {exit}, {said}");
+        for words in [words.to_vec(), [*words, &["--dry-run"]].concat()] {
+            let (exit, said) = cameras(&dir, &words);
+            assert!(exit == *code && said.contains(text), "{words:?}: {exit}, {said}");
+        }
     }
+    let (exit, said) = cameras(&dir, &["photographs", "--dry-run"]);
+    assert!(exit == 1 && said.contains("`colmap` is not installed"), "{said}");
     let (exit, said) = cameras(&dir, &["photographs"]);
     assert!(exit == 1 && said.contains("`colmap` is not installed"), "{said}");
     for way in ["apt-get install colmap", "brew install colmap", "github.com/colmap/colmap/releases"] {
@@ -81,6 +87,23 @@ fn what_is_no_folder_of_photographs_is_refused_before_anything_is_written() {
     }
     let left: Vec<_> = fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
     assert!(left.iter().all(|name| !name.to_string_lossy().ends_with("_cameras")), "{left:?}");
+}
+
+#[test]
+#[cfg(unix)]
+fn photographs_that_are_left_out_for_their_names_are_named() {
+    let dir = photographs();
+    let at = |name: &str| dir.path().join("photographs").join(name);
+    let images: Vec<PathBuf> = fs::read_dir(at("")).unwrap().map(|e| e.unwrap().path()).collect();
+    for (image, name) in images.iter().zip(["a\\b.png", "..png"]) {
+        fs::rename(image, at(name)).unwrap();
+    }
+    // what macOS leaves beside photographs is none
+    fs::write(at("._a.png"), "x").unwrap();
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("has 7 photographs, and at least 8 are needed"), "{said}");
+    assert!(said.contains("2 photographs left out, whose name begins with a dot"), "{said}");
+    assert!(said.contains("`..png`, `a\\b.png`"), "{said}");
 }
 
 /// Puts a shell script in the place of a program.
@@ -151,6 +174,15 @@ fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again(
     assert_eq!(fs::read_dir(at("kept")).unwrap().count(), 2);
 }
 
+/// Returns the number that a script in the place of a program wrote to `started`: of a process. Waits five minutes at most.
+#[cfg(unix)]
+fn started(dir: &TempDir) -> Option<u32> {
+    (0..6000).find_map(|_| {
+        std::thread::sleep(std::time::Duration::from_millis(50));
+        fs::read_to_string(dir.path().join("started")).ok()?.trim().parse().ok()
+    })
+}
+
 #[test]
 #[cfg(unix)]
 fn a_stop_ends_colmap_as_well() {
@@ -158,11 +190,7 @@ fn a_stop_ends_colmap_as_well() {
     script(&dir, "colmap", "echo $$ > started; exec /bin/sleep 600");
     let mut command = command(dir.path(), &["cameras", "photographs"]);
     let mut running = command.env("PATH", dir.path().join("programs")).spawn().unwrap();
-    let started = || fs::read_to_string(dir.path().join("started")).ok()?.trim().parse::<u32>().ok();
-    let pid = (0..6000).find_map(|_| {
-        std::thread::sleep(std::time::Duration::from_millis(50));
-        started()
-    });
+    let pid = started(&dir);
     let killed = Command::new("/bin/kill").arg(running.id().to_string()).status().unwrap();
     assert!(killed.success() && running.wait().unwrap().code() == Some(143));
     assert!(tiface::io::has_ended(pid.expect("the script began")));
@@ -191,6 +219,258 @@ fn masks_are_given_to_colmap_black_and_white_and_by_its_names() {
     assert!(at("scan_cameras/masks/000.png.png").is_file() && at("scan/images/000.png").is_file());
     let (_, said) = cameras(&dir, &["scan", "--set", "mask.source=none"]);
     assert!(said.contains("colmap mapper") && !said.contains("mask_path"), "{said}");
+}
+
+/// Nine photographs without cameras in `photographs/`, and their model in `model/`, which a script
+/// in the place of COLMAP finds; then its mapper does what `then` says, with the folder of models
+/// in `$out`.
+#[cfg(unix)]
+fn found_by_script(then: &str) -> TempDir {
+    let dir = photographs();
+    let small = SyntheticOptions { width: 24, height: 30, train: 7, test: 2, seed: 1 };
+    photographed(&dir.path().join("whole"), &small);
+    let whole = capture::open(&dir.path().join("whole"), &CaptureOptions::default()).unwrap();
+    convert(&whole, CameraFormat::Colmap, &dir.path().join("converted")).unwrap();
+    fs::rename(dir.path().join("converted/sparse/0"), dir.path().join("model")).unwrap();
+    mapper(&dir, &format!("/bin/mkdir -p $out/0; /bin/cp model/*.bin $out/0; {then}"));
+    dir
+}
+
+/// Puts a script in the place of COLMAP, of which only the mapper does anything.
+#[cfg(unix)]
+fn mapper(dir: &TempDir, text: &str) {
+    let words = "command=$1; while [ $# -gt 0 ]; do [ \"$1\" = --output_path ] && out=$2; shift; done";
+    script(dir, "colmap", &format!("{words}\n[ $command = mapper ] || exit 0\n{text}\nexit 0"));
+}
+
+#[cfg(unix)]
+fn files_in(folder: &Path) -> usize {
+    fs::read_dir(folder).unwrap().count()
+}
+
+#[test]
+#[cfg(unix)]
+fn folders_of_photographs_of_one_name_give_captures_of_two_names_and_none_takes_the_others() {
+    let dir = found_by_script("");
+    let at = |name: &str| dir.path().join(name);
+    fs::create_dir_all(at("heads/a")).unwrap();
+    fs::create_dir_all(at("heads/b/images")).unwrap();
+    fs::rename(at("photographs"), at("heads/a/images")).unwrap();
+    for entry in fs::read_dir(at("heads/a/images")).unwrap().map(|e| e.unwrap()) {
+        if entry.file_name() != "008.png" {
+            fs::copy(entry.path(), at("heads/b/images").join(entry.file_name())).unwrap();
+        }
+    }
+    for (name, photographs) in [("a", 9), ("b", 8)] {
+        let (exit, said) = cameras(&dir, &[&format!("heads/{name}/images")]);
+        assert!(exit == 0, "{name}: {said}");
+        assert_eq!(files_in(&at(&format!("{name}_cameras/images"))), photographs);
+    }
+    for dry in [&[][..], &["--dry-run"]] {
+        let words = [&["heads/b/images", "--out", "a_cameras"][..], dry].concat();
+        let (exit, said) = cameras(&dir, &words);
+        assert!(exit == 1 && said.contains("`a_cameras` already exists"), "{exit}, {said}");
+        assert!(
+            said.contains("of other photographs") && said.contains("another folder with `--out`"),
+            "{said}"
+        );
+    }
+    assert_eq!(files_in(&at("a_cameras/images")), 9);
+}
+
+#[test]
+#[cfg(unix)]
+fn a_folder_that_another_search_works_in_is_not_cleared() {
+    let dir = photographs();
+    mapper(&dir, "exit 1");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("found cameras for 0 of 9"), "{said}");
+    let lock = tiface::io::Lock::take(&dir.path().join("photographs_cameras/.lock")).unwrap();
+    for words in [&["photographs"][..], &["photographs", "--dry-run"]] {
+        let (exit, said) = cameras(&dir, words);
+        assert!(exit == 75 && said.contains("`photographs_cameras` is locked by another"), "{exit}, {said}");
+    }
+    assert_eq!(files_in(&dir.path().join("photographs_cameras/images")), 9);
+    // as is a folder in which a search has only begun
+    fs::create_dir(dir.path().join("begun")).unwrap();
+    let begun = tiface::io::Lock::take(&dir.path().join("begun/.lock")).unwrap();
+    let (exit, said) = cameras(&dir, &["photographs", "--out", "begun"]);
+    assert!(exit == 75 && said.contains("`begun` is locked by another"), "{exit}, {said}");
+    drop((lock, begun));
+}
+
+/// Repeats `tiface cameras photographs` until it is not refused by a lock, for a minute at most.
+#[cfg(unix)]
+fn until_unlocked(dir: &TempDir) -> (i32, String) {
+    let tries = (0..600).map(|_| {
+        std::thread::sleep(std::time::Duration::from_millis(100));
+        cameras(dir, &["photographs"])
+    });
+    tries.take_while(|(exit, _)| *exit == 75).count();
+    cameras(dir, &["photographs"])
+}
+
+#[test]
+#[cfg(unix)]
+fn what_outlives_a_killed_search_keeps_the_next_one_from_its_folder() {
+    let dir = photographs();
+    // what the shell started remains when it is killed, and has its input
+    script(&dir, "colmap", "exec 3<&0; /bin/sleep 600 & echo $! > started; wait");
+    let mut command = command(dir.path(), &["cameras", "photographs"]);
+    let mut running = command.env("PATH", dir.path().join("programs")).spawn().unwrap();
+    let pid = started(&dir);
+    running.kill().unwrap();
+    running.wait().unwrap();
+    script(&dir, "colmap", "exit 1");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    let pid = pid.expect("the script began").to_string();
+    assert!(Command::new("/bin/kill").args(["-KILL", &pid]).status().unwrap().success());
+    assert!(exit == 75 && said.contains("or by its COLMAP"), "{exit}, {said}");
+    let (exit, said) = until_unlocked(&dir);
+    assert!(exit == 1 && said.contains("`colmap feature_extractor` failed"), "{exit}, {said}");
+}
+
+#[test]
+#[cfg(unix)]
+fn what_colmap_started_ends_with_it() {
+    let dir = photographs();
+    script(&dir, "colmap", "exec 3<&0; /bin/sleep 600 & exit 1");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("`colmap feature_extractor` failed"), "{exit}, {said}");
+    let (exit, said) = until_unlocked(&dir);
+    assert!(exit == 1, "{exit}, {said}");
+}
+
+#[test]
+#[cfg(unix)]
+fn what_a_user_puts_beside_an_unfinished_search_stays_and_a_finished_one_is_done() {
+    let dir = found_by_script("");
+    let at = |name: &str| dir.path().join("photographs_cameras").join(name);
+    let found = fs::read_to_string(dir.path().join("programs/colmap")).unwrap();
+    mapper(&dir, "exit 1");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("found cameras for 0 of 9"), "{said}");
+    fs::rename(dir.path().join("head/masks"), at("masks")).unwrap();
+    fs::copy(dir.path().join("photographs/000.png"), at("images/other.png")).unwrap();
+    for name in ["notes.txt", "colmap/notes.txt"] {
+        fs::write(at(name), "mine").unwrap();
+    }
+    fs::write(dir.path().join("programs/colmap"), found).unwrap();
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 0, "{said}");
+    // COLMAP is told which pictures are the photographs
+    assert!(said.contains("--image_list_path photographs_cameras/colmap/images.txt"), "{said}");
+    for name in ["masks/000.png", "images/other.png", "images/000.png", "notes.txt", "colmap/notes.txt"] {
+        assert!(at(name).is_file(), "{name}");
+    }
+    assert!(!at("colmap/1").exists() && !at("colmap/images.txt").exists());
+    assert_eq!(capture::open(&at(""), &CaptureOptions::default()).unwrap().views.len(), 9);
+    // asked for again, nothing is needed and nothing is done
+    script(&dir, "colmap", "exit 1");
+    for (words, text) in
+        [(&["photographs"][..], "done: 9 of 9"), (&["photographs", "--dry-run"][..], "is done")]
+    {
+        let (exit, said) = cameras(&dir, words);
+        assert!(exit == 0 && said.contains(text) && !said.contains("feature_extractor"), "{exit}, {said}");
+    }
+    let (exit, said) = cameras(&dir, &["photographs", "--lens-each"]);
+    assert!(exit == 1 && said.contains("with other cameras: lens_each: was false, is true"), "{said}");
+}
+
+#[test]
+#[cfg(unix)]
+fn a_file_that_no_search_wrote_is_neither_replaced_nor_cleared_by_the_next() {
+    let dir = photographs();
+    let at = |name: &str| dir.path().join(name);
+    mapper(&dir, "exit 1");
+    fs::create_dir(at("scan")).unwrap();
+    fs::rename(at("photographs"), at("scan/images")).unwrap();
+    assert_eq!(cameras(&dir, &["scan"]).0, 1);
+    fs::create_dir(at("scan_cameras/masks")).unwrap();
+    fs::write(at("scan_cameras/masks/000.png.png"), "mine").unwrap();
+    fs::rename(at("head/masks"), at("scan/masks")).unwrap();
+    for _ in 0..2 {
+        let (exit, said) = cameras(&dir, &["scan"]);
+        assert!(exit == 1 && said.contains("masks/000.png.png` already exists"), "{exit}, {said}");
+        assert_eq!(fs::read(at("scan_cameras/masks/000.png.png")).unwrap(), b"mine");
+    }
+}
+
+#[test]
+#[cfg(unix)]
+fn a_mapper_that_the_system_kills_is_named_and_no_photographs_are_asked_for() {
+    let dir = photographs();
+    mapper(&dir, "kill -KILL $$");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 1 && said.contains("`colmap mapper` failed (signal: 9"), "{exit}, {said}");
+    assert!(said.contains("if memory ran out") && !said.contains("photograph the head again"), "{said}");
+    assert_eq!(said.matches("colmap mapper --database_path").count(), 1, "{said}");
+}
+
+#[test]
+#[cfg(unix)]
+fn a_second_model_that_is_half_written_leaves_the_first() {
+    let dir = found_by_script("/bin/mkdir $out/1; /bin/cp model/cameras.bin $out/1");
+    let (exit, said) = cameras(&dir, &["photographs"]);
+    assert!(exit == 0 && said.contains("9 of 9 photographs"), "{exit}, {said}");
+    assert!(said.contains("a piece is left out") && said.contains("models/1/images.bin"), "{said}");
+}
+
+#[test]
+#[cfg(unix)]
+fn a_model_that_cannot_be_opened_is_no_result() {
+    let dir = found_by_script("");
+    let read = |name: &str| fs::read(dir.path().join("model").join(name)).unwrap();
+    let (images, cameras_file) = (read("images.bin"), read("cameras.bin"));
+    // a count, then for each image: number, pose of seven numbers, camera, `000.png` and 0, no
+    // points
+    let (first, length, pose) = (8, 4 + 56 + 4 + 8 + 8, 4..60);
+    let edited = |edit: &dyn Fn(usize, &mut [u8])| {
+        let mut bytes = images.clone();
+        bytes[first..].chunks_exact_mut(length).enumerate().for_each(|(i, image)| edit(i, image));
+        bytes
+    };
+    let nan: Vec<u8> = (0..7).flat_map(|_| f64::NAN.to_le_bytes()).collect();
+    let rows = [
+        ("images.bin", edited(&|_, image| image[64] = b'z'), "found cameras for 0 of 9"),
+        (
+            "images.bin",
+            edited(&|i, image| {
+                if i == 3 {
+                    image[pose.clone()].copy_from_slice(&nan)
+                }
+            }),
+            "not finite",
+        ),
+        (
+            "images.bin",
+            edited(&|_, image| image[pose.clone()].copy_from_slice(&images[first..][pose.clone()])),
+            "in one place",
+        ),
+        ("cameras.bin", 0u64.to_le_bytes().to_vec(), "is not in the cameras file"),
+    ];
+    for (name, bytes, text) in rows {
+        fs::write(dir.path().join("model/images.bin"), &images).unwrap();
+        fs::write(dir.path().join("model/cameras.bin"), &cameras_file).unwrap();
+        fs::write(dir.path().join("model").join(name), bytes).unwrap();
+        let (exit, said) = cameras(&dir, &["photographs"]);
+        assert!(exit == 1 && said.contains(text), "{text}: {exit}, {said}");
+        assert!(!dir.path().join("photographs_cameras/sparse/0").exists(), "{text}");
+    }
+}
+
+#[test]
+#[cfg(unix)]
+fn a_video_named_like_an_address_is_a_file_to_ffmpeg() {
+    let dir = photographs();
+    let at = |name: &str| dir.path().join(name);
+    fs::write(at("20260101-12:30.mp4"), "x").unwrap();
+    script(&dir, "colmap", "exit 1");
+    script(&dir, "ffmpeg", "echo \"$@\" > typed; printf 'P6\\n1 1\\n255\\nabc'");
+    let (exit, said) = cameras(&dir, &["--video", "20260101-12:30.mp4"]);
+    assert!(exit == 1 && said.contains("has 1 photographs, and at least 8"), "{exit}, {said}");
+    let typed = fs::read_to_string(at("typed")).unwrap();
+    assert!(typed.contains("-protocol_whitelist file -i file:20260101-12:30.mp4 "), "{typed}");
 }
 
 /// The program, if it is installed; otherwise skips aloud.
@@ -293,7 +573,7 @@ fn found_again(name: &str, photographs: usize, with_masks: bool, dir: &Path) -> 
     let found = tiface(dir, path.clone(), &["cameras", "bare"]);
     assert!(found.status.success(), "{}", err(&found));
     let again = tiface(dir, path, &["cameras", "bare"]);
-    assert!(err(&again).contains("`bare_cameras` already exists"), "{}", err(&again));
+    assert!(again.status.success() && err(&again).contains("done: "), "{}", err(&again));
     let capture = capture::open(&dir.join("bare_cameras"), &CaptureOptions::default()).unwrap();
     assert_eq!(capture.views.len(), photographs, "{}", err(&found));
     let camera = |view: &View| &own.iter().find(|o| o.name == view.name).unwrap().camera;

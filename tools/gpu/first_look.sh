@@ -23,6 +23,7 @@ device=$1
 out=$(mkdir -p "$2" && cd "$2" && pwd) || exit 2
 shift 2
 parts=("$@")
+[ -z "${CAPTURE:-}" ] || CAPTURE=$(cd "$CAPTURE" && pwd) || exit 2
 [ ${#parts[@]} -gt 0 ] || parts=(doctor kernels steps product resume)
 
 root=$(cd "$(dirname "$0")/../.." && pwd)
@@ -34,13 +35,12 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 # neither the user's settings nor verdicts of earlier self-tests
 export XDG_CONFIG_HOME=$work/none XDG_CACHE_HOME=$work/cache
-failed=0
 
 # say FIGURE WORDS...: one line, seen and kept
 say() { printf '%s\n' "$*" | tee -a "$out/figures.txt"; }
 
-# wrong WORDS...: the same; the script ends with an error
-wrong() { say "WRONG: $*"; failed=1; }
+# wrong WORDS...: the same; the script ends with an error, also where a subshell calls this
+wrong() { say "WRONG: $*"; : > "$work/failed"; }
 
 # some STEPS: the share of them, 4 at least
 some() { awk -v n="$1" -v share="$share" 'BEGIN { n = int(n * share / 100); print n < 4 ? 4 : n }'; }
@@ -61,6 +61,66 @@ timed() {
 
 # number KEY FILE: the last number of that key in a file of JSON
 number() { grep -o "\"$1\": *[-0-9.e+]*" "$2" 2> /dev/null | tail -n 1 | sed 's/.*: *//'; }
+
+# own_test FILE: name, seconds and verdict of DEVICE in what `doctor --json` wrote; `doctor` tests
+# all devices, and fails if any of them does
+own_test() {
+  awk -v device="${device%%+*}" '
+    BEGIN { numbered = split(device, want, ":") > 1 }
+    {
+      parts = split($0, part, /\{"name":"/)
+      for (p = 2; p <= parts; p++) {
+        # a device, or one of the checks of the device before it
+        if (match(part[p], /^[a-z0-9]+:[0-9]+","adapter":/)) {
+          name = substr(part[p], 1, index(part[p], "\"") - 1)
+          api = name; sub(/:.*/, "", api)
+          chosen = 0
+          if (want[1] == "wgpu" || want[1] == api)
+            chosen = numbered ? seen++ == want[2] : part[p] !~ /"kind":"software"/ && !seen++
+          if (chosen) { own = name; verdict = "passed" }
+        }
+        if (!chosen) continue
+        if (part[p] ~ /"passed":false/ || part[p] ~ /"error":"/) verdict = "FAILED"
+        if (match(part[p], /"seconds":[0-9.e+-]+/)) seconds = substr(part[p], RSTART + 10, RLENGTH - 10)
+      }
+    }
+    END { if (own != "") printf "%s %.1f %s\n", own, seconds, verdict }' "$1"
+}
+
+# The Vulkan loader, and the driver that each ICD file names: in a container one of them, or a
+# library that the driver needs, is often missing.
+loader() {
+  local known files file folder library lacks
+  [ "$(uname)" = Linux ] || return 0
+  known=$(PATH=$PATH:/usr/sbin:/sbin ldconfig -p 2> /dev/null)
+  library=$(awk '$1 == "libvulkan.so.1" { print $NF; exit }' <<< "$known")
+  say "loader: ${library:-no libvulkan.so.1 is known to ldconfig}"
+  files=${VK_DRIVER_FILES:-${VK_ICD_FILENAMES:-}}
+  if [ -n "$files" ]; then
+    files=${files//:/$'\n'}
+  else
+    for folder in /etc /usr/local/share /usr/share "${XDG_DATA_HOME:-$HOME/.local/share}"; do
+      for file in "$folder"/vulkan/icd.d/*.json; do [ ! -e "$file" ] || files+=$file$'\n'; done
+    done
+  fi
+  [ -n "$files" ] || say "ICD: no file names a driver"
+  while read -r file; do
+    [ -n "$file" ] || continue
+    library=$(sed -n 's/.*"library_path" *: *"\([^"]*\)".*/\1/p' "$file" 2> /dev/null | head -n 1)
+    case $library in
+      "") say "ICD: $file cannot be read, or names no driver"; continue ;;
+      /*) ;;
+      */*) library=$(dirname "$file")/$library ;;
+      *) library=$(awk -v name="$library" '$1 == name { print $NF; found = 1; exit } END { if (!found) print name }' <<< "$known") ;;
+    esac
+    if [ -e "$library" ]; then
+      lacks=$(ldd "$library" 2> /dev/null | awk '/not found/ { printf " %s", $1 }')
+      say "ICD: $file names $library${lacks:+, which lacks$lacks}"
+    else
+      say "ICD: $file names $library, which is not here"
+    fi
+  done <<< "$files"
+}
 
 # per_step NAME LOG: milliseconds of a step between reports, the first fifth left out
 per_step() {
@@ -89,9 +149,11 @@ train() {
 
 # The capture: the one that is named, or photographs of the demo head, whose fields are hardly trained here.
 capture() {
-  if [ -n "${CAPTURE:-}" ]; then (cd "$CAPTURE" && pwd); return; fi
+  if [ -n "${CAPTURE:-}" ]; then echo "$CAPTURE"; return; fi
+  # what this prints is the folder
   [ -d "$work/demo/capture" ] ||
-    "$program" demo --run "$work/demo" --device cpu --quiet "${photographs[@]}" "${tiny[@]}" > "$out/capture.txt" 2>&1
+    "$program" demo --run "$work/demo" --device cpu --quiet "${photographs[@]}" "${tiny[@]}" > "$out/capture.txt" 2>&1 ||
+    wrong "no photographs of the demo head, see capture.txt" >&2
   echo "$work/demo/capture"
 }
 
@@ -117,11 +179,16 @@ fi
 samples() { [ "$share" -ge 100 ] && echo "$1" || echo $(($1 / 64)); }
 
 part_doctor() {
-  timed doctor_cold "$program" doctor --json || wrong "the self-test failed, see doctor_cold.txt"
-  timed doctor_warm "$program" doctor --json
+  local of stage name seconds verdict
+  loader
+  for of in cold warm; do
+    timed "doctor_$of" "$program" doctor --json
+    read -r name seconds verdict <<< "$(own_test "$out/doctor_$of.txt")"
+    say "doctor_$of of ${name:-$device}: ${seconds:-no} s, ${verdict:-not listed}"
+    [ "$verdict" = passed ] || wrong "the self-test of $device, see doctor_$of.txt"
+  done
   timed demo_gpu "$program" demo --run "$work/demo_gpu" --device "$device" "${photographs[@]}" "${demo[@]}" || wrong "no demo on $device, see demo_gpu.txt"
   timed demo_cpu "$program" demo --run "$work/demo_cpu" --device cpu "${photographs[@]}" "${demo[@]}" || wrong "no demo on the CPU, see demo_cpu.txt"
-  local of stage
   for of in gpu cpu; do
     for stage in iface tface; do per_step "demo_$of $stage" "$work/demo_$of/$stage/log.jsonl"; done
     cp "$work/demo_$of/metrics/metrics.json" "$out/metrics_$of.json" 2> /dev/null
@@ -217,4 +284,4 @@ for part in "${parts[@]}"; do
   "part_$part"
   say "== $part: $((SECONDS - begin)) s"
 done
-exit $failed
+[ ! -e "$work/failed" ] || exit 1

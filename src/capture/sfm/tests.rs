@@ -45,7 +45,12 @@ fn typed(n: usize, is_video: bool, shared: bool, glomap: bool, attempt: Attempt,
     };
     let programs = Programs { colmap: "colmap".into(), glomap: glomap.then(|| "glomap".into()) };
     let names = vec![String::new(); n];
-    let work = Work { sfm: &sfm, programs, names, shared, masked: true, is_video };
+    let dir = tempfile::tempdir().unwrap();
+    let lock = Lock::take(&dir.path().join(".lock")).unwrap();
+    let (output, request) =
+        (Output::of(&sfm), Request { source: "photographs".into(), fingerprint: asked(&sfm) });
+    let (sfm, warnings, masked) = (&sfm, Vec::new(), true);
+    let work = Work { sfm, output, request, lock, programs, names, warnings, shared, masked, is_video };
     work.arguments(attempt, Path::new("w"), new)
         .map(|words| words.iter().map(|w| w.to_str().unwrap()).collect::<Vec<_>>().join(" "))
 }
@@ -98,4 +103,21 @@ fn commands_follow_the_photographs_the_attempt_and_the_version() {
     for (n, is_video) in [(MAX_EXHAUSTIVE, true), (MAX_EXHAUSTIVE + 1, false)] {
         assert!(matcher(n, is_video).starts_with("exhaustive_matcher "), "{n}");
     }
+}
+
+#[test]
+fn the_default_folder_is_named_after_the_capture_not_after_the_folder_of_its_photographs() {
+    let rows = [
+        ("heads/a", "a_cameras"),
+        ("heads/a/images", "a_cameras"),
+        ("heads/b/Photos/", "b_cameras"),
+        ("/heads/c/input/rgb", "c_cameras"),
+        ("images", "images_cameras"),
+        ("../images", "images_cameras"),
+        (".", "capture_cameras"),
+    ];
+    for (from, to) in rows {
+        assert_eq!(default_folder(Path::new(from), false), Path::new(to), "{from}");
+    }
+    assert_eq!(default_folder(Path::new("a/turn.mp4"), true), Path::new("turn_cameras"));
 }

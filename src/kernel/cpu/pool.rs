@@ -11,6 +11,20 @@ static FREE: Mutex<Vec<Vec<f32>>> = Mutex::new(Vec::new());
 /// Maximum number of free buffers that the pool keeps.
 const MAX_FREE: usize = 64;
 
+/// Frees the buffers that nobody uses. A stage needs others than the one before it.
+pub fn clear() {
+    // what a panic left locked stays
+    if let Ok(mut free) = FREE.lock() {
+        *free = Vec::new();
+    }
+}
+
+/// Returns whether the pool keeps a buffer of this capacity.
+#[cfg(test)]
+pub(crate) fn keeps(capacity: usize) -> bool {
+    FREE.lock().is_ok_and(|free| free.iter().any(|v| v.capacity() == capacity))
+}
+
 /// A float buffer that returns to the pool when dropped.
 #[derive(Debug, Default)]
 pub struct Buffer(Vec<f32>);
@@ -100,6 +114,14 @@ impl DerefMut for Buffer {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_cleared_pool_keeps_nothing() {
+        // rounded up to 6 eighths of 2^20; nobody else has one of this size
+        drop(Buffer::scratch(777_777));
+        clear();
+        assert!(!keeps(6 << 17));
+    }
 
     #[test]
     fn buffers_of_another_length_are_cut_to_it() {

@@ -2,8 +2,8 @@
 //! direction's spherical harmonics and, by field, the unit normal and the hash features.
 
 use super::tile::{
-    self, CHANNELS, LANES, Lane, at, ends, load_planes, outer, output_layer, product, relu, relu_backward,
-    sigmoid, store_block, store_planes,
+    self, Block, CHANNELS, LANES, Lane, at, ends, load_planes, outer_block, outer_row, output_layer, product,
+    relu, relu_backward, sigmoid, store_block, store_outer, store_planes, store_row,
 };
 use crate::kernel::cpu::density::MAX_EXP_GRADIENT;
 use crate::kernel::cpu::mlp::{HIDDEN, SOFTNESS, TILE};
@@ -212,11 +212,20 @@ pub(super) fn color_backward(
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let samples = tile::uniform_count(count, &mut a);
+    // the thread's sums of the gradients of C1, C2 and C3
+    let mut c1_0 = F4::new(0.0f32);
+    let mut c1_1 = F4::new(0.0f32);
+    let mut c1_2 = F4::new(0.0f32);
+    let mut c1_3 = F4::new(0.0f32);
+    let mut c2_0 = F4::new(0.0f32);
+    let mut c2_1 = F4::new(0.0f32);
+    let mut c2_2 = F4::new(0.0f32);
+    let mut c2_3 = F4::new(0.0f32);
+    let mut c3_0 = F4::new(0.0f32);
     for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
         let lane = tile::lane_of(tile, plane);
         let (row, column, here) = (lane.row, lane.column, lane.here);
         let first = 4 * here;
-        let fresh = tile == group;
         if column < 3 {
             let y = out[(comptime!(plan.colors) + column) * plane + here];
             let g = masked(g_out[(comptime!(plan.colors) + column) * plane + here], first, samples);
@@ -224,16 +233,20 @@ pub(super) fn color_backward(
         }
         load_planes(&mut b, c2, &lane);
         sync_cube();
-        let start = sum + comptime!(gradient_rows[2] * CHANNELS);
-        outer(&a, 0usize, &b, 3usize, HIDDEN, partial, start, fresh, row, column, LANES);
+        if row < 3 {
+            c3_0 += outer_row(&a, row, &b, column, LANES);
+        }
         let g_c2 = product(&a, 0usize, w, comptime!(rows[4]), 3usize, row, column, LANES);
         let g_c2 = relu_backward(&g_c2, &b, row, column, LANES);
         sync_cube();
         store_block(&mut a, &g_c2, row, column, LANES);
         load_planes(&mut b, c1, &lane);
         sync_cube();
-        let start = sum + comptime!(gradient_rows[1] * CHANNELS);
-        outer(&a, 0usize, &b, HIDDEN, HIDDEN, partial, start, fresh, row, column, LANES);
+        let of_c2 = outer_block(&a, &b, row, column);
+        c2_0 += of_c2.channel(0usize);
+        c2_1 += of_c2.channel(1usize);
+        c2_2 += of_c2.channel(2usize);
+        c2_3 += of_c2.channel(3usize);
         let g_c1 = product(&a, 0usize, w, comptime!(rows[3]), HIDDEN, row, column, LANES);
         let g_c1 = relu_backward(&g_c1, &b, row, column, LANES);
         sync_cube();
@@ -245,8 +258,11 @@ pub(super) fn color_backward(
         }
         color_inputs(&mut b, output, &n, direction, value, &lane, plan);
         sync_cube();
-        let start = sum + comptime!(gradient_rows[0] * CHANNELS);
-        outer(&a, 0usize, &b, HIDDEN, comptime!(plan.inputs), partial, start, fresh, row, column, LANES);
+        let of_c1 = outer_block(&a, &b, row, column);
+        c1_0 += of_c1.channel(0usize);
+        c1_1 += of_c1.channel(1usize);
+        c1_2 += of_c1.channel(2usize);
+        c1_3 += of_c1.channel(3usize);
         let g_c0 = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
         sync_cube();
         store_block(&mut a, &g_c0, row, column, LANES);
@@ -299,5 +315,24 @@ pub(super) fn color_backward(
             }
         }
         sync_cube();
+    }
+    if group < samples.div_ceil(TILE) {
+        let lane = tile::lane_of(group, plane);
+        let (row, column) = (lane.row, lane.column);
+        let sums = Block::of(c1_0, c1_1, c1_2, c1_3);
+        store_outer(
+            partial,
+            sum + comptime!(gradient_rows[0] * CHANNELS),
+            &sums,
+            comptime!(plan.inputs),
+            row,
+            column,
+        );
+        let sums = Block::of(c2_0, c2_1, c2_2, c2_3);
+        store_outer(partial, sum + comptime!(gradient_rows[1] * CHANNELS), &sums, HIDDEN, row, column);
+        if row < 3 {
+            let start = sum + (comptime!(gradient_rows[2]) + row) * CHANNELS;
+            store_row(partial, start, c3_0, HIDDEN, column);
+        }
     }
 }

@@ -7,11 +7,12 @@ use super::draw::Batch;
 use super::hash::Grid;
 use super::losses::{HIT, LAST, TALLY, sum, tally};
 use super::march::{Samples, prefix_sum};
-use super::sdf::kernels::{prepare, reduce};
+use super::sdf::kernels::{prepare, sum_groups};
 use super::sdf::{maps, summing};
 use super::tile::{
-    CHANNELS, LANES, Lane, UNITS, at, ends, lane_of, load_planes, outer, output_layer, product, relu,
-    relu_backward, store_block, store_planes, uniform_count,
+    Block, CHANNELS, LANES, Lane, UNITS, at, ends, lane_of, load_planes, outer_block, outer_row,
+    output_layer, product, relu, relu_backward, store_block, store_outer, store_planes, store_row,
+    uniform_count,
 };
 use super::weight_norm::finite;
 use crate::kernel::cpu::density::{
@@ -151,25 +152,40 @@ fn geometry_backward(
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let samples = uniform_count(count, &mut a);
+    // the thread's sums of the gradients of both matrices
+    let mut w1_0 = F4::new(0.0f32);
+    let mut w1_1 = F4::new(0.0f32);
+    let mut w1_2 = F4::new(0.0f32);
+    let mut w1_3 = F4::new(0.0f32);
+    let mut w2 = F4::new(0.0f32);
     for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
         let lane = lane_of(tile, plane);
         let (row, column, here) = (lane.row, lane.column, lane.here);
-        let fresh = tile == group;
         a[at(column, row, LANES)] = g_o[column * plane + here];
         load_planes(&mut b, h, &lane);
         sync_cube();
-        let start = sum + comptime!(HIDDEN * CHANNELS);
-        outer(&a, 0usize, &b, FEATURES, HIDDEN, partial, start, fresh, row, column, LANES);
+        w2 += outer_row(&a, row, &b, column, LANES);
         let g_h = product(&a, 0usize, w, comptime!(rows[2]), FEATURES, row, column, LANES);
         let g_h = relu_backward(&g_h, &b, row, column, LANES);
         sync_cube();
         store_block(&mut a, &g_h, row, column, LANES);
         features(&mut b, value, &lane, inputs);
         sync_cube();
-        outer(&a, 0usize, &b, HIDDEN, inputs, partial, sum, fresh, row, column, LANES);
+        let of_w1 = outer_block(&a, &b, row, column);
+        w1_0 += of_w1.channel(0usize);
+        w1_1 += of_w1.channel(1usize);
+        w1_2 += of_w1.channel(2usize);
+        w1_3 += of_w1.channel(3usize);
         let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
         store_planes(g_value, &g_u, &lane, inputs);
         sync_cube();
+    }
+    if group < samples.div_ceil(TILE) {
+        let lane = lane_of(group, plane);
+        let (row, column) = (lane.row, lane.column);
+        let sums = Block::of(w1_0, w1_1, w1_2, w1_3);
+        store_outer(partial, sum, &sums, inputs, row, column);
+        store_row(partial, sum + (row + HIDDEN) * CHANNELS, w2, HIDDEN, column);
     }
 }
 
@@ -320,6 +336,8 @@ pub struct Density {
     grid: Grid,
     dt: f32,
     capacity: usize,
+    /// Number of groups that sum gradients of weights.
+    summing: usize,
     prepared_map: Buffer,
     summed_map: Buffer,
     weights: Buffer,
@@ -352,6 +370,7 @@ impl Density {
             grid: Grid::new(device, &shape.levels, shape.levels.len(), shape.radius),
             dt,
             capacity,
+            summing: summing(capacity),
             weights: device.scratch::<f32>(prepared.len()),
             prepared_map: device.upload(&prepared),
             summed_map: device.upload(&summed),
@@ -467,7 +486,7 @@ impl Density {
     ) {
         let count = &samples.count;
         let (weights, partial, direction) = (&self.weights, &self.partial, &samples.direction);
-        let summing = summing(self.capacity);
+        let summing = self.summing;
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
             launch!(device, color_backward::launch_unchecked, groups(summing), UNITS;
@@ -479,12 +498,9 @@ impl Density {
                 weights, self.value, count, self.h, self.g_o, self.g_value, partial; self.plan
             );
         }
-        let over = groups(g_flat.words().div_ceil(UNITS as usize));
-        launch!(device, reduce::launch, over.clone(), UNITS;
-            partial, self.summed_map, count, g_flat;
-            (self.plan.color.gradients[1] * CHANNELS) as u32, TILE, summing, true
-        );
-        launch!(device, check::launch, over, UNITS; g_flat, broken);
+        let size = self.plan.color.gradients[1] * CHANNELS;
+        sum_groups(device, partial, Some(&self.summed_map), count, g_flat, (size, TILE, summing));
+        launch!(device, check::launch, groups(g_flat.words().div_ceil(UNITS as usize)), UNITS; g_flat, broken);
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
     }
 
@@ -497,5 +513,43 @@ impl Density {
     /// Resets the squared errors that are summed over steps.
     pub fn reset_sums(&mut self, device: &Device) {
         self.sums = device.zeros::<f32>(TERMS + 2);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::tests::{agree, device, planes};
+    use super::*;
+    use crate::kernel::cpu::{hash, rng};
+
+    #[test]
+    fn gradients_of_a_density_are_the_same_where_groups_sum_over_several_tiles() {
+        const SAMPLES: usize = 1000;
+        const CAPACITY: usize = 1024;
+        let Some(device) = device() else { return };
+        let shape = DensityShape { levels: hash::levels(4, 4, 1.4, 10), radius: 1.0 };
+        let normals = |stream: u64, count: usize, scale: f32| -> Vec<f32> {
+            (0..count).map(|i| scale * rng::normal(7, stream, i as u64)).collect()
+        };
+        let floats = shape.shapes().iter().map(|(outputs, inputs)| outputs * inputs).sum();
+        let entries = hash::entries(&shape.levels);
+        let table = device.upload(&normals(1, 2 * entries, 0.3));
+        let rows: Vec<[f32; 3]> = normals(2, 3 * SAMPLES, 0.2).as_chunks().0.to_vec();
+        let mut samples = Samples::new(&device, 1, CAPACITY);
+        samples.x = device.upload(&planes(&rows, CAPACITY));
+        samples.direction = device.upload(&planes(&rows, CAPACITY));
+        samples.count = device.upload(&[SAMPLES as u32]);
+        let mut on = Density::new(&device, &shape, 0.1, 1, CAPACITY);
+        on.prepare(&device, &device.upload(&normals(3, floats, 0.12)));
+        on.evaluate(&device, &table, &samples.x, Some(&samples.direction), &samples.count);
+        on.g_out = device.upload(&normals(4, WIDTH * CAPACITY, 1.0));
+        let [each, several] = [CAPACITY / TILE, 3].map(|summing| {
+            on.summing = summing;
+            let (g_table, g_flat) = (device.zeros::<f32>(2 * entries), device.zeros::<f32>(floats));
+            on.backward(&device, &samples, [&g_table, &g_flat], &device.zeros::<u32>(1));
+            device.read::<f32>(&g_flat)
+        });
+        assert!(each.iter().any(|&v| v != 0.0));
+        agree("weights of a density", &several, &each, 1e-4);
     }
 }

@@ -9,7 +9,9 @@ use burn::cubecl::future;
 use burn::cubecl::ir::{ElemType, FloatKind, Type};
 use burn::cubecl::prelude::{BufferArg, Client, CubeCount};
 use burn::cubecl::server::Handle;
-use burn::cubecl::wgpu::{AutoGraphicsApi, MemoryConfiguration, RuntimeOptions, try_init_setup, wgpu};
+use burn::cubecl::wgpu::{
+    AutoGraphicsApi, MemoryConfiguration, RuntimeOptions, WgpuInitError, try_init_setup, wgpu,
+};
 use burn::tensor::{DType, Element};
 use bytemuck::Pod;
 use std::collections::{BTreeMap, BTreeSet};
@@ -65,6 +67,7 @@ pub struct Device {
     driver: String,
     atomics: Atomics,
     memory: Option<u64>,
+    heap: Option<u64>,
     launches: AtomicUsize,
     readbacks: AtomicUsize,
     /// Names of the kernels that were launched.
@@ -108,6 +111,10 @@ pub struct DeviceLimits {
 /// A GPU as one API exposes it.
 pub struct Adapter {
     device: CubeDevice,
+    /// Name that the driver reports.
+    pub name: String,
+    /// PCI address of the card, if known.
+    pub card: Option<String>,
     /// `vulkan`, `metal` or `dx12`.
     pub api: &'static str,
     /// `discrete`, `integrated`, `virtual`, `other` (some virtual machines say no more) or `software`.
@@ -117,8 +124,11 @@ pub struct Adapter {
     /// Driver and version; empty if the API does not report them.
     pub driver: String,
     /// Bytes of memory; `None` if the API does not report it.
-    memory: Option<u64>,
-    ready: Once,
+    pub memory: Option<u64>,
+    /// Bytes of the largest heap of it that is local to the device, in which every buffer lies.
+    heap: Option<u64>,
+    /// Whether CubeCL has a client of the adapter.
+    opened: Mutex<bool>,
 }
 
 /// Names of the kinds of adapters, the fastest first.
@@ -168,14 +178,20 @@ impl Adapter {
                 _ if number > 0 => continue,
                 _ => Cpu,
             };
+            // DX12 would give identical cards the address of the first one.
+            let is_card = info.backend == wgpu::Backend::Vulkan && kind != 4;
+            let [memory, heap] = memory_of(&adapter, kind == 1);
             let adapter = Adapter {
                 device: CubeDevice::from(WgpuDevice::new(like).on(backend)),
+                card: Some(info.device_pci_bus_id).filter(|address| is_card && !address.is_empty()),
+                name: info.name,
                 api: word,
                 kind: KINDS[kind],
                 software: kind == 4,
                 driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
-                memory: memory_of(&adapter),
-                ready: Once::new(),
+                memory,
+                heap,
+                opened: Mutex::new(false),
             };
             found.push(((kind, api, number), adapter));
         }
@@ -183,47 +199,97 @@ impl Adapter {
         found.into_iter().map(|(_, adapter)| adapter).collect()
     }
 
-    /// Returns the client of the adapter. On wgpu each large buffer gets memory of its own: by default CubeCL carves all buffers
-    /// from pages as large as the largest of them, and takes up to such a page more than requested.
-    fn client(&self) -> Client {
-        self.ready.call_once(|| {
-            if let (CubeDevice::Wgpu(device), Ok(options)) = (&self.device, RuntimeOptions::try_default()) {
-                let memory_config = MemoryConfiguration::ExclusivePages;
-                // If this fails, the device opens with default options, and reports the cause itself.
-                let _ =
-                    try_init_setup::<AutoGraphicsApi>(device, RuntimeOptions { memory_config, ..options });
+    /// Returns the client of the adapter, which lives as long as the process. On wgpu each large
+    /// buffer gets memory of its own: by default CubeCL carves all buffers from pages as large as
+    /// the largest of them, and takes up to such a page more than requested.
+    ///
+    /// A failure is returned here, since CubeCL panics where it has to open a device itself.
+    fn client(&self) -> std::result::Result<Client, WgpuInitError> {
+        let mut opened = self.opened.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        if let (CubeDevice::Wgpu(device), false) = (&self.device, *opened) {
+            let memory_config = MemoryConfiguration::ExclusivePages;
+            let options = RuntimeOptions { memory_config, ..RuntimeOptions::try_default()? };
+            match try_init_setup::<AutoGraphicsApi>(device, options) {
+                // it has a client already
+                Ok(_) | Err(WgpuInitError::Registration { .. }) => *opened = true,
+                Err(e) => return Err(e),
             }
-        });
-        self.device.client()
+        }
+        Ok(self.device.client())
+    }
+
+    /// An adapter that is listed, but cannot be opened.
+    #[cfg(test)]
+    pub fn absent(name: &str) -> Adapter {
+        let like = WgpuDeviceKind::DiscreteGpu(4242);
+        Adapter {
+            device: CubeDevice::from(WgpuDevice::new(like).on(WgpuBackend::Vulkan)),
+            name: name.to_owned(),
+            card: None,
+            api: "vulkan",
+            kind: KINDS[0],
+            software: false,
+            driver: String::new(),
+            memory: None,
+            heap: None,
+            opened: Mutex::new(false),
+        }
     }
 }
 
-/// Returns the bytes of an adapter's largest heap of device-local memory, which Vulkan states. WebGPU, whose shaders CubeCL
-/// compiles here, does not.
+/// Returns the bytes of an adapter's memory and of its largest local heap, which Vulkan states.
+/// WebGPU, whose shaders CubeCL compiles here, does not.
 #[cfg(not(target_vendor = "apple"))]
-fn memory_of(adapter: &wgpu::Adapter) -> Option<u64> {
+fn memory_of(adapter: &wgpu::Adapter, integrated: bool) -> [Option<u64>; 2] {
     const DEVICE_LOCAL: u32 = 1;
     // SAFETY: nothing is created or destroyed through the handles, which the adapter outlives.
     let properties = unsafe {
-        let vulkan = adapter.as_hal::<wgpu::hal::api::Vulkan>()?;
+        let Some(vulkan) = adapter.as_hal::<wgpu::hal::api::Vulkan>() else { return [None; 2] };
         let instance = vulkan.shared_instance().raw_instance();
         instance.get_physical_device_memory_properties(vulkan.raw_physical_device())
     };
     let heaps = &properties.memory_heaps[..properties.memory_heap_count as usize];
-    heaps.iter().filter(|heap| heap.flags.as_raw() & DEVICE_LOCAL != 0).map(|heap| heap.size).max()
+    let heaps = || heaps.iter().map(|heap| (heap.size, heap.flags.as_raw() & DEVICE_LOCAL != 0));
+    [memory_of_heaps(heaps(), integrated), memory_of_heaps(heaps(), false)]
+}
+
+/// Returns the memory in heaps, given the bytes of each and whether it is local to the device: the
+/// largest local one. An integrated GPU has the memory of the processor, and its local heap may be
+/// a small part that the firmware keeps for it; so it has all heaps.
+#[cfg(any(test, not(target_vendor = "apple")))]
+fn memory_of_heaps(heaps: impl Iterator<Item = (u64, bool)>, integrated: bool) -> Option<u64> {
+    if integrated {
+        return heaps.map(|(bytes, _)| bytes).reduce(u64::saturating_add);
+    }
+    heaps.filter(|(_, is_local)| *is_local).map(|(bytes, _)| bytes).max()
 }
 
 /// Returns `None`: Metal states no size, but one that it recommends.
 #[cfg(target_vendor = "apple")]
-fn memory_of(_: &wgpu::Adapter) -> Option<u64> {
-    None
+fn memory_of(_: &wgpu::Adapter, _: bool) -> [Option<u64>; 2] {
+    [None; 2]
 }
 
 impl Device {
     /// Opens an adapter with the fastest atomics it supports.
-    pub fn open(adapter: &Adapter) -> Device {
+    ///
+    /// # Errors
+    ///
+    /// If the driver refuses it: of kind [`NotNow`](crate::ErrorKind::NotNow) where its memory is
+    /// used up, else of kind [`Cannot`](crate::ErrorKind::Cannot).
+    pub fn open(adapter: &Adapter) -> Result<Device> {
         note_errors();
-        let (device, client) = (adapter.device.clone(), adapter.client());
+        let client = adapter.client().map_err(|why| {
+            let problem =
+                format!("the device `{}` cannot be opened: {}", adapter.name, on_one_line(&why, 300));
+            match &why {
+                WgpuInitError::RequestDevice { message } if message.to_lowercase().contains("memory") => {
+                    Error::not_now(problem, "close what else uses the device, then repeat the command")
+                }
+                _ => Error::cannot(problem, "mend the GPU's driver, or use `--device cpu`"),
+            }
+        })?;
+        let device = adapter.device.clone();
         let float = Type::atomic(ElemType::Float(FloatKind::F32));
         let native = client.properties().atomic_type_usage(float).contains(AtomicUsage::Add);
         let atomics = if native { Atomics::Native } else { Atomics::Exchange };
@@ -233,7 +299,8 @@ impl Device {
         let driver = driver.unwrap_or_default().to_owned();
         let (launches, readbacks) = (AtomicUsize::new(0), AtomicUsize::new(0));
         let kernels = Mutex::default();
-        Device { device, client, driver, atomics, memory, launches, readbacks, kernels }
+        let heap = adapter.heap;
+        Ok(Device { device, client, driver, atomics, memory, heap, launches, readbacks, kernels })
     }
 
     /// Returns the adapter's name.
@@ -246,18 +313,13 @@ impl Device {
         &self.driver
     }
 
-    /// Returns the PCI address of the card, if known.
-    pub fn card(&self) -> Option<String> {
-        let physical = self.client.properties().identity.physical.as_ref()?;
-        physical.pci_address.as_ref().map(|address| format!("{address:?}"))
-    }
-
     /// Returns the device's limits.
     pub fn limits(&self) -> DeviceLimits {
         let properties = self.client.properties();
         DeviceLimits {
             memory: self.memory,
-            largest_buffer: properties.memory.max_page_size,
+            // wgpu allocates no buffer that is larger than the heap it lies in
+            largest_buffer: properties.memory.max_page_size.min(self.heap.unwrap_or(u64::MAX)),
             shared: properties.hardware.max_shared_memory_size,
         }
     }
@@ -283,9 +345,9 @@ impl Device {
         Device { atomics, ..self }
     }
 
-    /// Limits the device's memory to `bytes`.
+    /// Sets the device's memory to `bytes`, less or more than the driver reports.
     pub fn with_memory(self, bytes: u64) -> Device {
-        Device { memory: Some(self.memory.map_or(bytes, |all| all.min(bytes))), ..self }
+        Device { memory: Some(bytes), ..self }
     }
 
     /// Returns the bytes reserved in the device's memory, by all clients of this process.
@@ -375,9 +437,7 @@ impl Device {
     }
 
     fn failed(&self, why: impl Display) -> Error {
-        let why = why.to_string();
-        let words: Vec<&str> = why.split_whitespace().collect();
-        let why: String = words.join(" ").chars().take(600).collect();
+        let why = on_one_line(why, 600);
         let problem = format!("the device `{}` failed: {why}", self.name());
         let has = |all: &[&str]| all.iter().any(|word| why.to_lowercase().contains(word));
         if has(&["out of memory", "outofmemory"]) {
@@ -418,6 +478,13 @@ impl Device {
     }
 }
 
+/// Returns a text on one line, cut after so many characters.
+fn on_one_line(text: impl Display, limit: usize) -> String {
+    let text = text.to_string();
+    let words: Vec<&str> = text.split_whitespace().collect();
+    words.join(" ").chars().take(limit).collect()
+}
+
 /// Launches a kernel and counts it: `launch!(device, kernel::launch, groups, threads; buffers; scalars)`, with the threads
 /// of one group. Unsafe with `kernel::launch_unchecked`.
 macro_rules! launch {
@@ -456,7 +523,7 @@ pub(crate) mod tests {
 
     /// A device to test on, a software one too; without any, says so.
     pub fn device() -> Option<Device> {
-        let found = Adapter::all().first().map(Device::open);
+        let found = Adapter::all().first().map(|adapter| Device::open(adapter).expect("the adapter opens"));
         if found.is_none() {
             println!("skipped: kernels on a GPU, for no adapter is here (Mesa's lavapipe would do)");
         }
@@ -616,7 +683,7 @@ pub(crate) mod tests {
         let CubeDevice::Wgpu(wgpu_device) = &adapter.device else { panic!("not a device of wgpu") };
         let options = RuntimeOptions::try_default().unwrap();
         let setup = try_init_setup::<AutoGraphicsApi>(wgpu_device, options).unwrap();
-        let device = Device::open(adapter);
+        let device = Device::open(adapter).unwrap();
         let out = device.zeros::<f32>(64);
         let set = || launch!(device, set::launch, CubeCount::new_single(), 64; out);
         set();
@@ -651,6 +718,40 @@ pub(crate) mod tests {
         let taken = device.reserved_memory() - before;
         println!("{requested} bytes of buffers take {taken}");
         assert!(taken as f64 <= 1.05 * requested as f64, "{taken} of {requested}");
+    }
+
+    #[test]
+    fn an_adapter_that_cannot_be_opened_is_an_error_each_time() {
+        let absent = Adapter::absent("a card that fell out");
+        for _ in 0..2 {
+            let e = Device::open(&absent).err().unwrap();
+            println!("{e}: {}", e.hint());
+            assert!(
+                e.kind() as i32 == 1 && e.to_string().contains("`a card that fell out` cannot be opened"),
+                "{e}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_small_heap_of_an_integrated_gpu_is_not_all_of_its_memory() {
+        const GIB: u64 = 1 << 30;
+        let memory = |heaps: &[(u64, bool)], integrated| memory_of_heaps(heaps.iter().copied(), integrated);
+        // a card, the part of it that the processor sees, and the processor's memory
+        assert_eq!(memory(&[(8 * GIB, true), (GIB / 4, true), (32 * GIB, false)], false), Some(8 * GIB));
+        assert_eq!(memory(&[(32 * GIB, false)], false), None);
+        assert_eq!(memory(&[(GIB / 2, true), (15 * GIB, false)], true), Some(31 * GIB / 2));
+        // a single buffer lies in the local one
+        assert_eq!(memory(&[(GIB / 2, true), (15 * GIB, false)], false), Some(GIB / 2));
+        assert_eq!(memory(&[], true), None);
+    }
+
+    #[test]
+    fn a_user_gives_a_device_more_memory_than_its_driver_states() {
+        let Some(device) = device() else { return };
+        let device = device.with_memory(1 << 20);
+        assert_eq!(device.available_memory(), 0);
+        assert_eq!(device.with_memory(1 << 50).available_memory(), (1 << 50) - (512 << 20));
     }
 
     #[test]

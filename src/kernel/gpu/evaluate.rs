@@ -22,7 +22,7 @@ const FEWER: [usize; 2] = [1 << 10, 1 << 14];
 const RAYS: usize = 1 << 14;
 
 /// Transposes rows `[n, W]` to planes `[W, capacity]`.
-pub(crate) fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<f32> {
+pub fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<f32> {
     let mut out = vec![0.0; W * capacity];
     for (i, row) in rows.iter().enumerate() {
         (0..W).for_each(|k| out[k * capacity + i] = row[k]);

@@ -4,8 +4,9 @@
 //! A group of 256 threads evaluates all layers for 64 samples. Activations are kept in workgroup memory, channel by
 //! channel; a thread holds four samples of four channels. Weights, 90 kB, are read from global memory: all groups read
 //! the same ones, so they stay in the nearest cache, and workgroup memory is free for two tiles of activations (32 KiB).
-//! Gradients of weights are summed by group, then over the groups in a fixed order. The backward pass is two kernels, one
-//! per network, because a software driver takes ten times as long to compile a single one.
+//! Gradients of weights are summed by group, in registers, then over the groups in a fixed order.
+//! The backward pass is two kernels, one per network, because a software driver takes ten times as
+//! long to compile a single one.
 
 pub(super) mod kernels;
 
@@ -15,7 +16,7 @@ use super::hash::Grid;
 use super::tile::{CHANNELS, UNITS, ends};
 use crate::kernel::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
 use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
-use kernels::{forward, geometry_backward, prepare, reduce};
+use kernels::{forward, geometry_backward, prepare, sum_groups};
 
 /// Maximum number of groups that sum gradients of weights, each over its own tiles. wgpu states no number of
 /// multiprocessors; the largest cards run about a thousand groups of 256 threads with 32 KiB of workgroup memory at once.
@@ -136,6 +137,8 @@ pub struct Sdf {
     inv_radius: f32,
     soften: f32,
     capacity: usize,
+    /// Number of groups that sum gradients of weights.
+    summing: usize,
     prepared_map: Buffer,
     summed_map: Buffer,
     weights: Buffer,
@@ -173,6 +176,7 @@ impl Sdf {
             inv_radius: 1.0 / shape.radius,
             soften: shape.soften,
             capacity,
+            summing: summing(capacity),
             weights: device.scratch::<f32>(prepared.len()),
             prepared_map: device.upload(&prepared),
             summed_map: device.upload(&summed),
@@ -279,7 +283,7 @@ impl Sdf {
     ) {
         assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
         assert!(g_out.words() == WIDTH * self.capacity);
-        let summing_groups = groups(summing(self.capacity));
+        let summing_groups = groups(self.summing);
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
             launch!(device, color_backward::launch_unchecked, summing_groups.clone(), UNITS;
@@ -293,10 +297,8 @@ impl Sdf {
                 self.inv_radius, self.plan
             );
         }
-        launch!(device, reduce::launch, groups(g_flat.words().div_ceil(UNITS as usize)), UNITS;
-            self.partial, self.summed_map, count, g_flat;
-            (self.plan.color.gradients[1] * CHANNELS) as u32, TILE, summing(self.capacity), true
-        );
+        let sizes = (self.plan.color.gradients[1] * CHANNELS, TILE, self.summing);
+        sum_groups(device, &self.partial, Some(&self.summed_map), count, g_flat, sizes);
         let slopes = Some([&self.q, &self.g_normal]);
         self.grid.scatter(device, g_table, x, count, &self.g_value, slopes);
     }

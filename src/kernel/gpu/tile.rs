@@ -207,6 +207,111 @@ pub fn load_planes(a: &mut [F4], from: &[F4], lane: &Lane) {
     }
 }
 
+/// Returns the products of a vector with four others.
+#[cube]
+fn dots(v: F4, b0: F4, b1: F4, b2: F4, b3: F4) -> F4 {
+    let mut s = F4::new(v.dot(b0));
+    s.insert(1usize, v.dot(b1));
+    s.insert(2usize, v.dot(b2));
+    s.insert(3usize, v.dot(b3));
+    s
+}
+
+/// Returns `Σ_samples a[i] · b[j]` for the four channels `j` of tile `b` that a thread owns in a
+/// row of a gradient: `column` and every [`columns`]-th after it.
+#[cube]
+pub fn outer_row(a: &[F4], i: usize, b: &[F4], column: usize, #[comptime] lanes: usize) -> F4 {
+    let columns = comptime!(columns(lanes));
+    let mut sum = F4::new(0.0f32);
+    for r in 0..lanes {
+        sum += dots(
+            a[at(i, r, lanes)],
+            b[at(column, r, lanes)],
+            b[at(column + columns, r, lanes)],
+            b[at(column + 2 * columns, r, lanes)],
+            b[at(column + 3 * columns, r, lanes)],
+        );
+    }
+    sum
+}
+
+/// Returns [`outer_row`] for the four rows that a thread owns in a gradient of 64 rows: `row` and
+/// every 16th after it. A kernel sums them over its tiles in registers, and writes them once.
+#[cube]
+pub fn outer_block(a: &[F4], b: &[F4], row: usize, column: usize) -> Block {
+    let mut c0 = F4::new(0.0f32);
+    let mut c1 = F4::new(0.0f32);
+    let mut c2 = F4::new(0.0f32);
+    let mut c3 = F4::new(0.0f32);
+    for r in 0..LANES {
+        let b0 = b[at(column, r, LANES)];
+        let b1 = b[at(column + 16, r, LANES)];
+        let b2 = b[at(column + 32, r, LANES)];
+        let b3 = b[at(column + 48, r, LANES)];
+        c0 += dots(a[at(row, r, LANES)], b0, b1, b2, b3);
+        c1 += dots(a[at(row + 16, r, LANES)], b0, b1, b2, b3);
+        c2 += dots(a[at(row + 32, r, LANES)], b0, b1, b2, b3);
+        c3 += dots(a[at(row + 48, r, LANES)], b0, b1, b2, b3);
+    }
+    Block::of(c0, c1, c2, c3)
+}
+
+/// Writes what [`outer_row`] returns for a row, of a gradient with `n` columns, to the row that
+/// begins at `start`.
+#[cube]
+pub fn store_row(gradient: &mut [f32], start: usize, sums: F4, #[comptime] n: usize, column: usize) {
+    gradient[start + column] = sums.extract(0usize);
+    if comptime!(n > 16) {
+        gradient[start + column + 16] = sums.extract(1usize);
+    }
+    if comptime!(n > 32) {
+        gradient[start + column + 32] = sums.extract(2usize);
+    }
+    if comptime!(n > 48) {
+        gradient[start + column + 48] = sums.extract(3usize);
+    }
+}
+
+/// Writes what [`outer_block`] returns to a gradient of 64 rows and `n` columns.
+#[cube]
+pub fn store_outer(
+    gradient: &mut [f32],
+    start: usize,
+    sums: &Block,
+    #[comptime] n: usize,
+    row: usize,
+    column: usize,
+) {
+    #[unroll]
+    for k in 0..4usize {
+        store_row(gradient, start + (row + 16 * k) * CHANNELS, sums.channel(k), n, column);
+    }
+}
+
+/// Returns `Σ_samples a[j]` for the four channels `j` that a thread of the first row owns, as in
+/// [`outer_row`]; 0 to the others.
+#[cube]
+pub fn channel_sums(a: &[F4], row: usize, column: usize) -> F4 {
+    let mut sums = F4::new(0.0f32);
+    if row == 0 {
+        #[unroll]
+        for j in 0..4usize {
+            let mut sum = F4::new(0.0f32);
+            for r in 0..LANES {
+                sum += a[at(column + 16 * j, r, LANES)];
+            }
+            sums.insert(j, total(sum));
+        }
+    }
+    sums
+}
+
+/// Returns the sum of four samples.
+#[cube]
+pub fn total(v: F4) -> f32 {
+    v.extract(0usize) + v.extract(1usize) + (v.extract(2usize) + v.extract(3usize))
+}
+
 /// Adds `Σ_samples a[first + i] · b[j]`, for `i < m` and `j < n`, to a matrix of gradients whose rows have all channels. If
 /// `fresh` is set, it overwrites the matrix instead.
 #[cube]
@@ -227,27 +332,17 @@ pub fn outer(
     for ii in 0..comptime!(m.div_ceil(lanes)) {
         let i = row + lanes * ii;
         if i < m {
-            let mut s0 = 0.0f32;
-            let mut s1 = 0.0f32;
-            let mut s2 = 0.0f32;
-            let mut s3 = 0.0f32;
-            for r in 0..lanes {
-                let v = a[at(first + i, r, lanes)];
-                s0 += v.dot(b[at(column, r, lanes)]);
-                s1 += v.dot(b[at(column + columns, r, lanes)]);
-                s2 += v.dot(b[at(column + 2 * columns, r, lanes)]);
-                s3 += v.dot(b[at(column + 3 * columns, r, lanes)]);
-            }
+            let s = outer_row(a, first + i, b, column, lanes);
             let target = start + i * comptime!(channels(lanes)) + column;
-            add(gradient, target, s0, fresh);
+            add(gradient, target, s.extract(0usize), fresh);
             if n > columns {
-                add(gradient, target + columns, s1, fresh);
+                add(gradient, target + columns, s.extract(1usize), fresh);
             }
             if n > 2 * columns {
-                add(gradient, target + 2 * columns, s2, fresh);
+                add(gradient, target + 2 * columns, s.extract(2usize), fresh);
             }
             if n > 3 * columns {
-                add(gradient, target + 3 * columns, s3, fresh);
+                add(gradient, target + 3 * columns, s.extract(3usize), fresh);
             }
         }
     }
@@ -276,9 +371,7 @@ pub fn sample_sums(
                 for r in 0..lanes {
                     sum += a[at(first + j, r, lanes)];
                 }
-                let total =
-                    sum.extract(0usize) + sum.extract(1usize) + (sum.extract(2usize) + sum.extract(3usize));
-                add(gradient, start + j, total, fresh);
+                add(gradient, start + j, total(sum), fresh);
             }
         }
     }

@@ -1,6 +1,7 @@
 //! Validation of a mesh. Counts are on vertices welded by equal position, so texture seams do not matter.
 //!
 //! - closed: every edge in exactly two triangles, oppositely wound;
+//! - watertight: closed, and every piece wound outward, except cavities: pieces wound inward that lie inside another;
 //! - manifold: no edge in more than two triangles, no vertex with more than one fan;
 //! - Euler number `V − E + F`; genus = pieces − Euler/2 for a closed manifold;
 //! - self-intersection: an edge that runs from one side of another triangle to the other, through it
@@ -26,8 +27,8 @@
 
 use super::file_mesh::places;
 use crate::geom::{
-    Aabb, Atlas, Boxes, DBox, DEFAULT_EFFORT, Mesh, OutlineSide, Sets, intersect, nearest_charts, overlaps,
-    share_out, shared_area, side_ends, sorted_sides, topology, turn,
+    Aabb, Atlas, Boxes, DBox, DEFAULT_EFFORT, Mesh, OutlineSide, Sets, WrongPiece, intersect, nearest_charts,
+    overlaps, share_out, shared_area, side_ends, sorted_sides, topology, turn, wrong_pieces,
 };
 use crate::{Error, Result};
 use glam::{DVec2, DVec3, Vec2, Vec3};
@@ -88,6 +89,9 @@ pub struct CheckReport {
     pub size_m: [f64; 3],
     /// Enclosed volume in litres, negative when wound inward; an open mesh encloses none.
     pub volume_l: Option<f64>,
+    /// Pieces of a closed mesh that are inside out and no cavity of another piece, or that enclose nothing. A piece is what
+    /// edges connect.
+    pub wrong_pieces: Vec<PieceReport>,
     /// Whether every vertex has a color.
     pub has_colors: bool,
     /// Whether a texture gives the mesh its colors; set by readers, because [`check`] receives only the mesh.
@@ -103,17 +107,60 @@ pub struct CheckReport {
     pub uv: Option<UvReport>,
 }
 
+/// A piece of a closed mesh that is wound against the others.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PieceReport {
+    /// Triangles of it.
+    pub triangles: usize,
+    /// Middle of its box, in the file's units.
+    pub center: [f64; 3],
+    /// Enclosed volume in litres: negative when it is inside out, zero when it encloses nothing.
+    pub volume_l: f64,
+}
+
+impl PieceReport {
+    /// Returns the fault in words.
+    fn fault(&self) -> &'static str {
+        if self.volume_l < 0.0 { "inside out" } else { "without a volume" }
+    }
+}
+
+/// Pieces that a sentence names; of more, it states the number.
+const NAMED_PIECES: usize = 3;
+
 /// The requirements that [`CheckReport::require`] accepts.
 pub const BARS: [&str; 5] = ["watertight", "manifold", "one-piece", "no-self-intersections", "sound-uv"];
 
 impl CheckReport {
-    /// Returns whether the mesh is closed and wound outward.
+    /// Returns whether the mesh is closed and wound outward, but for cavities.
     fn is_watertight(&self) -> bool {
-        self.closed && self.orientation().is_empty()
+        self.closed && self.wrong_pieces.is_empty()
     }
 
-    fn orientation(&self) -> &'static str {
-        if self.volume_l.is_some_and(|volume| volume < 0.0) { ", inside out" } else { "" }
+    /// Returns the pieces that are wound against the others, after a comma.
+    fn orientation(&self) -> String {
+        match &self.wrong_pieces[..] {
+            [whole] if whole.triangles == self.triangles => format!(", {}", whole.fault()),
+            wrong => {
+                let digits = self.digits();
+                let named = wrong.iter().take(NAMED_PIECES).map(|piece| {
+                    let PieceReport { triangles, center: [x, y, z], .. } = piece;
+                    let fault = piece.fault();
+                    format!(
+                        ", a piece of {triangles} triangles around ({x:.digits$}, {y:.digits$}, {z:.digits$}) {fault}"
+                    )
+                });
+                let rest = wrong.len().saturating_sub(NAMED_PIECES);
+                let rest = (rest > 0).then(|| format!(", and {rest} more"));
+                named.chain(rest).collect()
+            }
+        }
+    }
+
+    /// Returns how many decimals show a millionth of the mesh's size.
+    fn digits(&self) -> usize {
+        let size = (DVec3::from(self.max) - DVec3::from(self.min)).max_element();
+        (6.0 - size.log10()).ceil().clamp(0.0, 45.0) as usize
     }
 
     /// Checks the named bars; see [`BARS`].
@@ -184,8 +231,7 @@ impl fmt::Display for CheckReport {
         let genus = self.genus.map_or("undefined".into(), |g| g.to_string());
         let (least, left) = bound("at least ", self.self_intersections_left, "triangles");
         let (low, high) = (DVec3::from(self.min), DVec3::from(self.max));
-        // a millionth of its size
-        let digits = (6.0 - (high - low).max_element().log10()).ceil().clamp(0.0, 45.0) as usize;
+        let digits = self.digits();
         let colors = match (self.has_texture, self.has_colors) {
             (Some(true), true) => "yes, a texture and at the vertices",
             (Some(true), false) => "yes, a texture",
@@ -277,6 +323,13 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
     let [low, high] = [bounds.min, bounds.max].map(|p| if bounds.is_empty() { Vec3::ZERO } else { p });
     let [low, high] = [low, high].map(|p| p.as_dvec3() + origin);
     let count = mesh.positions.len();
+    let litres = unit_m.powi(3) * 1000.0;
+    let wrong_pieces = if closed { wrong_pieces(&welded, &faces) } else { Vec::new() };
+    let reported = |piece: WrongPiece| PieceReport {
+        triangles: piece.triangles,
+        center: (piece.center + origin).to_array(),
+        volume_l: piece.volume * litres,
+    };
     let (self_intersections, self_intersections_left) = self_intersections(mesh, &faces, &sources);
     CheckReport {
         vertices: count,
@@ -299,7 +352,8 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
         min: low.to_array(),
         max: high.to_array(),
         size_m: ((high - low) * unit_m).to_array(),
-        volume_l: closed.then_some(volume * unit_m.powi(3) * 1000.0),
+        volume_l: closed.then_some(volume * litres),
+        wrong_pieces: wrong_pieces.into_iter().map(reported).collect(),
         has_colors: count > 0 && mesh.colors.len() == count,
         has_texture: None,
         has_normals: count > 0 && mesh.normals.len() == count,
@@ -762,6 +816,40 @@ mod tests {
         // a hollow in a box is wound towards the box's outside, and as it should be
         let hollow = both(cuboid(Vec3::splat(-1.0), Vec3::splat(2.0)), m);
         assert_eq!(check(&hollow, 1.0).require(&["watertight"]), Ok(()));
+    }
+
+    #[test]
+    fn a_piece_turned_inside_out_beside_another_is_not_watertight() {
+        let whole = cuboid(Vec3::splat(-1.0), Vec3::ONE);
+        let mut turned = cuboid(Vec3::new(2.0, -0.5, -0.5), Vec3::new(3.0, 0.5, 0.5));
+        turned.triangles.iter_mut().for_each(|t| t.swap(0, 1));
+        let r = check(&both(whole.clone(), turned), 1.0);
+        // 8 m³ − 1 m³: the volume of all does not show it
+        assert!(r.closed && r.volume_l.is_some_and(|v| v > 0.0));
+        let expected = PieceReport { triangles: 12, center: [2.5, 0.0, 0.0], volume_l: -1000.0 };
+        assert_eq!(r.wrong_pieces, [expected]);
+        let missed = r.require(&["watertight"]).unwrap_err();
+        let named = "a piece of 12 triangles around (2.500000, 0.000000, 0.000000) inside out";
+        assert!(missed.kind() == ErrorKind::BelowBar && missed.to_string().contains(named), "{missed}");
+        assert!(r.to_string().contains("watertight           NO"), "{r}");
+        // one that touches the other at a vertex, where they are welded
+        let mut touching = cuboid(Vec3::ONE, Vec3::splat(2.0));
+        let sound = check(&both(whole.clone(), touching.clone()), 1.0);
+        assert_eq!((sound.pieces, sound.require(&["watertight"])), (1, Ok(())));
+        touching.triangles.iter_mut().for_each(|t| t.swap(0, 1));
+        assert!(check(&both(whole, touching), 1.0).require(&["watertight"]).is_err());
+    }
+
+    #[test]
+    fn both_sides_of_a_flat_sheet_are_not_watertight() {
+        let m = Mesh {
+            positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
+            triangles: vec![[0, 1, 2], [0, 2, 1]],
+            ..Mesh::default()
+        };
+        let r = check(&m, 1.0);
+        let missed = r.require(&["watertight"]).unwrap_err();
+        assert!(r.closed && missed.to_string().ends_with(", without a volume"), "{missed}");
     }
 
     #[test]

@@ -10,7 +10,7 @@ use crate::io::{self, Limits};
 use crate::mesh::files::{ExportOptions, HeadMesh, HeadTexture, OpenedMesh, open_mesh, to_glb, weld};
 use crate::mesh::{SimplifyConfig, simplify};
 use crate::pipeline::finish::{Export, center};
-use crate::pipeline::mesh::{finished_mesh, head_mesh};
+use crate::pipeline::mesh::{head_mesh, read_finished};
 use crate::pipeline::metrics::{Comparable, PictureSet, comparable, picture_sets};
 use crate::pipeline::pictures;
 use crate::pipeline::session::Session;
@@ -261,9 +261,9 @@ pub(super) fn cameras(
 ///
 /// # Errors
 ///
-/// Fails if the run has no mesh yet, or if it is damaged.
+/// Fails if the run has no mesh yet, or if it is damaged, or being made anew.
 pub fn head_page(session: &Session) -> Result<String> {
-    let (mut viewer, file_from_world) = shown(session, &finished_mesh(session.run.dir())?)?;
+    let (mut viewer, file_from_world) = read_finished(session.run.dir(), |record| shown(session, record))?;
     let most = super::MAX_BYTES.saturating_sub(viewer.glb.len().div_ceil(3) * 4);
     // without photographs the page still shows the head
     let (mut rows, _) = match session.inputs.missing_capture {

@@ -117,3 +117,13 @@ pub struct VmFigures {
     /// Whether a gradient of the decoder was not finite.
     pub broken: bool,
 }
+
+impl VmFigures {
+    /// Adds the counts of other steps.
+    pub fn count(&mut self, other: &VmFigures) {
+        self.rays += other.rays;
+        self.lattice += other.lattice;
+        self.density += other.density;
+        self.color += other.color;
+    }
+}

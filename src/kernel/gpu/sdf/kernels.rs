@@ -2,9 +2,10 @@
 //! network.
 
 use super::super::color::{color_forward, color_inputs, unit};
+use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::tile::{
-    self, CHANNELS, LANES, Lane, at, load_planes, outer, output_layer, product, sample_sums, sigmoid,
-    store_block, store_planes,
+    self, Block, CHANNELS, LANES, Lane, UNITS, at, channel_sums, load_planes, outer_block, outer_row,
+    output_layer, product, sigmoid, store_block, store_outer, store_planes, store_row,
 };
 use super::Plan;
 use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS, SOFTNESS, TILE};
@@ -22,10 +23,41 @@ pub(in super::super) fn prepare(flat: &[f32], map: &[u32], out: &mut [f32]) {
     }
 }
 
-/// Sums the partial gradients of the groups, in the order of the groups. With `mapped`, `map` has the index in the gradients
-/// of each float of `flat`.
+/// Number of groups whose partial gradients one thread adds, one after the other.
+const SLICE: usize = 32;
+
+/// Returns the number of groups that have partial gradients of `count` samples.
+#[cube]
+fn summed_groups(count: &[u32], #[comptime] tile: usize, #[comptime] summing: usize) -> usize {
+    min((count[0] as usize).div_ceil(tile), summing)
+}
+
+/// Sums the partial gradients of each slice of groups, in the order of the groups, into those of
+/// the slice's first group. Slices lie in the second dimension of the launch.
 #[cube(launch)]
-pub(in super::super) fn reduce(
+fn sum_slices(
+    partial: &mut [f32],
+    count: &[u32],
+    size: u32,
+    #[comptime] tile: usize,
+    #[comptime] summing: usize,
+) {
+    let i = ABSOLUTE_POS_X as usize;
+    let first = CUBE_POS_Y as usize * SLICE;
+    let end = min(first + SLICE, summed_groups(count, tile, summing));
+    if i < size as usize && first < end {
+        let mut sum = 0.0f32;
+        for group in first..end {
+            sum += partial[group * size as usize + i];
+        }
+        partial[first * size as usize + i] = sum;
+    }
+}
+
+/// Sums the slices, in their order. With `mapped`, `map` has the index in the gradients of each
+/// float of `flat`.
+#[cube(launch)]
+fn reduce(
     partial: &[f32],
     map: &[u32],
     count: &[u32],
@@ -41,13 +73,32 @@ pub(in super::super) fn reduce(
         if mapped {
             from = map[i] as usize;
         }
-        let tiles = (count[0] as usize).div_ceil(tile);
         let mut sum = 0.0f32;
-        for group in 0..min(tiles, summing) {
-            sum += partial[group * size as usize + from];
+        for slice in 0..summed_groups(count, tile, summing).div_ceil(SLICE) {
+            sum += partial[slice * SLICE * size as usize + from];
         }
         flat[i] = sum;
     }
+}
+
+/// Writes the sums over groups of their partial gradients, in a fixed order: `size` floats of each
+/// of `summing` groups, which take a `tile` of samples at a time. `map` has the index in the
+/// gradients of each float of `flat`; without it they are the same. Overwrites the partial
+/// gradients.
+pub(in super::super) fn sum_groups(
+    device: &Device,
+    partial: &Buffer,
+    map: Option<&Buffer>,
+    count: &Buffer,
+    flat: &Buffer,
+    (size, tile, summing): (usize, usize, usize),
+) {
+    let over = |floats: usize| floats.div_ceil(UNITS as usize);
+    let slices = CubeCount::Static(over(size) as u32, summing.div_ceil(SLICE) as u32, 1);
+    launch!(device, sum_slices::launch, slices, UNITS; partial, count; size as u32, tile, summing);
+    launch!(device, reduce::launch, groups(over(flat.words())), UNITS;
+        partial, map.unwrap_or(count), count, flat; size as u32, tile, summing, map.is_some()
+    );
 }
 
 /// Writes the inputs of the geometry network to a tile.
@@ -198,10 +249,17 @@ pub(super) fn geometry_backward(
     let mut a = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let mut b = Shared::<[F4]>::new_slice(CHANNELS * LANES);
     let samples = tile::uniform_count(count, &mut a);
+    // the thread's sums of the gradients of W1, W2, b1 and b2
+    let mut w1_0 = F4::new(0.0f32);
+    let mut w1_1 = F4::new(0.0f32);
+    let mut w1_2 = F4::new(0.0f32);
+    let mut w1_3 = F4::new(0.0f32);
+    let mut w2 = F4::new(0.0f32);
+    let mut b1 = F4::new(0.0f32);
+    let mut b2 = 0.0f32;
     for tile in range_stepped(group, samples.div_ceil(TILE), CUBE_COUNT) {
         let lane = tile::lane_of(tile, plane);
         let (row, column, here) = (lane.row, lane.column, lane.here);
-        let fresh = tile == group;
         // g_q goes to the first channels, g_o to the channels after them
         for j in 0..4usize {
             let c = column + 16 * j;
@@ -223,25 +281,40 @@ pub(super) fn geometry_backward(
         let from_o = product(&b, padded, w, comptime!(rows[3]), OUTPUTS, row, column, LANES);
         let w0 = w[comptime!(rows[3] * LANES) + column];
         let s = tile::slope(&tile::load_block(&a, row, column, LANES));
-        let start = sum + comptime!(gradient_rows[2] * CHANNELS);
-        outer(&b, padded, &a, OUTPUTS, HIDDEN, partial, start, fresh, row, column, LANES);
-        let at_b2 = sum + comptime!(gradient_rows[3] * CHANNELS);
-        sample_sums(&b, padded, OUTPUTS, partial, at_b2, fresh, row, column, LANES);
+        if row < OUTPUTS {
+            w2 += outer_row(&b, padded + row, &a, column, LANES);
+        }
+        if row == 0 && column < OUTPUTS {
+            let mut of_output = F4::new(0.0f32);
+            for r in 0..LANES {
+                of_output += b[at(padded + column, r, LANES)];
+            }
+            b2 += tile::total(of_output);
+        }
         sync_cube();
         store_block(&mut a, &tile::times(&g_a, &s), row, column, LANES);
         sync_cube();
-        sample_sums(&a, 0usize, HIDDEN, partial, start, false, row, column, LANES);
+        // the first output is the distance, whose row of W2 has a second-order part; threads of the
+        // first row have it
+        w2 += channel_sums(&a, row, column);
         sync_cube();
         store_block(&mut a, &tile::weighted(&s, w0), row, column, LANES);
         sync_cube();
-        outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, fresh, row, column, LANES);
+        let second_order = outer_block(&a, &b, row, column);
+        w1_0 += second_order.channel(0usize);
+        w1_1 += second_order.channel(1usize);
+        w1_2 += second_order.channel(2usize);
+        w1_3 += second_order.channel(3usize);
         sync_cube();
         store_block(&mut a, &tile::softplus_backward(&s, &from_o, &g_a, w0), row, column, LANES);
         geometry_inputs(&mut b, value, x, inv_radius, &lane, features);
         sync_cube();
-        outer(&a, 0usize, &b, HIDDEN, padded, partial, sum, false, row, column, LANES);
-        let at_b1 = sum + comptime!(gradient_rows[1] * CHANNELS);
-        sample_sums(&a, 0usize, HIDDEN, partial, at_b1, fresh, row, column, LANES);
+        let first_order = outer_block(&a, &b, row, column);
+        w1_0 += first_order.channel(0usize);
+        w1_1 += first_order.channel(1usize);
+        w1_2 += first_order.channel(2usize);
+        w1_3 += first_order.channel(3usize);
+        b1 += channel_sums(&a, row, column);
         let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
         #[unroll]
         for j in 0..4usize {
@@ -256,5 +329,20 @@ pub(super) fn geometry_backward(
             }
         }
         sync_cube();
+    }
+    if group < samples.div_ceil(TILE) {
+        let lane = tile::lane_of(group, plane);
+        let (row, column) = (lane.row, lane.column);
+        let sums = Block::of(w1_0, w1_1, w1_2, w1_3);
+        store_outer(partial, sum, &sums, padded, row, column);
+        if row < OUTPUTS {
+            store_row(partial, sum + (comptime!(gradient_rows[2]) + row) * CHANNELS, w2, HIDDEN, column);
+        }
+        if row == 0 {
+            store_row(partial, sum + comptime!(gradient_rows[1] * CHANNELS), b1, HIDDEN, column);
+            if column < OUTPUTS {
+                partial[sum + comptime!(gradient_rows[3] * CHANNELS) + column] = b2;
+            }
+        }
     }
 }

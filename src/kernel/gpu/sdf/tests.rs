@@ -87,3 +87,48 @@ fn no_samples_give_no_gradient() {
     let (launches, readbacks) = device.counts();
     println!("{launches} launches and {readbacks} readbacks of a field, forward and backward");
 }
+
+#[test]
+fn the_gradients_are_those_of_the_cpu_where_groups_sum_over_several_tiles() {
+    let Some(device) = device() else { return };
+    let Case { shape, table, flat, x, direction, g_out } = case(5, true, 5);
+    let weights = Weights::new(shape.layout(), &flat);
+    let a = sdf::forward(&shape, &table, &weights, &x, &direction);
+    let mut g_table = vec![[0f32; 2]; table.len()];
+    let want = sdf::backward(&a, &weights, g_out.as_flattened(), &mut g_table);
+    let mut on = Sdf::new(&device, &shape, CAPACITY);
+    // five or six of sixteen tiles for each
+    on.summing = 3;
+    let [x, direction] = [&x, &direction].map(|v| device.upload(&planes(v, CAPACITY)));
+    let (table, flat) = (device.upload(table.as_flattened()), device.upload(&flat));
+    let count = device.upload(&[SAMPLES as u32]);
+    on.forward(&device, &table, &flat, &x, &direction, &count);
+    let (got_table, got) = (device.zeros::<f32>(2 * g_table.len()), device.zeros::<f32>(want.len()));
+    on.backward(&device, &x, &direction, &count, &device.upload(&planes(&g_out, CAPACITY)), &got_table, &got);
+    agree("weights", &device.read::<f32>(&got), &want, 1e-4);
+    agree("table", &device.read::<f32>(&got_table), g_table.as_flattened(), 1e-4);
+}
+
+#[test]
+fn partial_gradients_of_a_thousand_groups_are_added_whatever_the_number_of_samples() {
+    let Some(device) = device() else { return };
+    let (size, tile, summing) = (300, 64, 1000);
+    let partial: Vec<f32> =
+        (0..size * summing).map(|i| crate::kernel::cpu::rng::normal(1, 2, i as u64)).collect();
+    let map: Vec<u32> = (0..200).map(|i| i * 7 % 300).collect();
+    for samples in [0usize, 1, 64 * 33, 64 * 999 + 1, 64 * 5000] {
+        let groups = samples.div_ceil(tile).min(summing);
+        let sum = |i: usize| (0..groups).map(|g| f64::from(partial[g * size + i])).sum::<f64>() as f32;
+        let count = device.upload(&[samples as u32]);
+        for mapped in [true, false] {
+            let want: Vec<f32> = match mapped {
+                true => map.iter().map(|&i| sum(i as usize)).collect(),
+                false => (0..size).map(sum).collect(),
+            };
+            let (flat, map) = (device.upload(&vec![1f32; want.len()]), device.upload(&map));
+            let (own, map) = (device.upload(&partial), mapped.then_some(&map));
+            kernels::sum_groups(&device, &own, map, &count, &flat, (size, tile, summing));
+            agree("sums of groups", &device.read::<f32>(&flat), &want, 1e-5);
+        }
+    }
+}

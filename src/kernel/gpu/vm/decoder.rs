@@ -14,7 +14,7 @@ mod kernels;
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::Batch;
-use super::super::sdf::kernels::reduce;
+use super::super::sdf::kernels::sum_groups;
 use super::super::tile::{self, UNITS};
 use super::grid::{DeviceGrid, NONE};
 use super::march::VmSamples;
@@ -223,10 +223,8 @@ impl DeviceDecoder {
             let (place, count) = (&samples.place, &along.count);
             grid.scatter(device, g_values, values, place, part, count, &self.g_products);
         }
-        launch!(device, reduce::launch, groups(self.summed.words().div_ceil(UNITS as usize)), UNITS;
-            self.partial, self.real, along.count, self.summed;
-            self.summed.words() as u32, 4 * self.plan.lanes, self.summing(), false
-        );
+        let sizes = (self.summed.words(), 4 * self.plan.lanes, self.summing());
+        sum_groups(device, &self.partial, None, &along.count, &self.summed, sizes);
         launch!(device, chain::launch, groups(flat.words().div_ceil(UNITS as usize)), UNITS;
             flat, self.real, self.padded, self.summed, g_flat, broken; self.plan
         );

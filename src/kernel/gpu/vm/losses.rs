@@ -181,10 +181,9 @@ impl VmLosses {
         self.totals = device.zeros::<u32>(TOTALS);
     }
 
-    /// Waits for the device, returns the totals of the steps since the last call, and resets them.
-    pub fn fetch(&mut self, device: &Device) -> Result<VmFigures> {
+    /// Waits for the device and returns the totals of the steps since they were reset.
+    pub fn fetch(&self, device: &Device) -> Result<VmFigures> {
         let t = device.fetch::<u32>(&self.totals)?;
-        self.totals = device.zeros::<u32>(TOTALS);
         let [lattice, density, color, rays] = [3, 4, 5, 6].map(|i| t[i] as u64);
         let terms = [t[0], t[1], t[2]].map(f32::from_bits);
         Ok(VmFigures { terms, lattice, density, color, rays, broken: t[7] != 0 })

@@ -210,6 +210,7 @@ fn losses_and_gradients_agree_with_f64_finite_differences() {
         let figures = on.fetch(&device).unwrap();
         agree("losses", &figures.terms, &want.map(|t| 2.0 * t as f32), 1e-5);
         assert_eq!((figures.rays, figures.broken), (2 * 34, true));
+        on.reset_totals(&device);
         assert_eq!(on.fetch(&device).unwrap().terms, [0.0; 3]);
         let total = |x: &[f64]| {
             let t = losses(&shown, x, term, mode);

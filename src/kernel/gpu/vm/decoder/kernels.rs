@@ -334,8 +334,7 @@ pub(super) fn backward(
             for r in 0..lanes {
                 s += g_color(g_pre, c, tile * lanes + r, samples);
             }
-            let total = s.extract(0usize) + s.extract(1usize) + (s.extract(2usize) + s.extract(3usize));
-            add(partial, sum + comptime!(gradient_rows[5] * width) + c, total, fresh);
+            add(partial, sum + comptime!(gradient_rows[5] * width) + c, tile::total(s), fresh);
         }
         let g0 = g_color(g_pre, 0usize, here, samples);
         let g1 = g_color(g_pre, 1usize, here, samples);
