@@ -68,7 +68,7 @@ fn known_gains_are_found() {
 
 #[test]
 fn one_dark_photograph_is_left_out_and_named_and_the_others_are_compared() {
-    let (_dir, mut exposed) = measured_head();
+    let (_dir, mut exposed) = exposed_head();
     assert!(measure(&exposed).not_measured().is_none());
     // 1/64 of the light leaves even white darker than what is compared
     let mut gains = gains();
@@ -98,7 +98,7 @@ fn one_dark_photograph_is_left_out_and_named_and_the_others_are_compared() {
 
 #[test]
 fn exposures_of_few_views_are_not_compared_and_the_reason_is_told() {
-    let (_dir, mut exposed) = measured_head();
+    let (_dir, mut exposed) = exposed_head();
     let mut gains = gains();
     (0..8).for_each(|v| gains[v] = [1.0 / 64.0; 3]);
     expose(&mut exposed, &gains);
