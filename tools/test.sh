@@ -53,11 +53,10 @@ all=no
 
 target=${CARGO_TARGET_DIR:-target}
 scratch=$(mktemp -d)
-trap 'kill $fuzzer $installer 2> /dev/null; rm -rf "$scratch"' EXIT
+declare -A background=()
+trap 'kill "${background[@]}" 2> /dev/null; rm -rf "$scratch"' EXIT
 results=()
 failed=0
-fuzzer=
-installer=
 # devices have their locks there, and other processes of this machine theirs elsewhere
 mkdir "$scratch/tmp"
 export TMPDIR=$scratch/tmp
@@ -75,6 +74,21 @@ step() {
   fi
 }
 skip() { results+=("SKIPPED         $*"); }
+
+# begin WORD COMMAND...: runs the command beside the steps that follow; end WORD: waits for it and shows what it said
+begin() {
+  local word=$1
+  shift
+  "$@" > "$scratch/$word.said" 2>&1 &
+  background[$word]=$!
+}
+end() {
+  local ended=0
+  wait "${background[$1]}" || ended=1
+  unset "background[$1]"
+  cat "$scratch/$1.said"
+  return $ended
+}
 
 ## Tools of others, installed beside the first build.
 
@@ -128,7 +142,7 @@ fleet_engine() {
 installs() {
   local word
   for word in "$@"; do
-    "$word" > "$scratch/install.$word" 2>&1 || : > "$scratch/missing.$word"
+    "$word" > "$scratch/install.$word" 2>&1 < /dev/null || : > "$scratch/missing.$word"
   done
 }
 has() { [ ! -e "$scratch/missing.$1" ]; }
@@ -141,16 +155,14 @@ install_begins() {
   if wanted fleet || wanted guides; then words+=(fleet_engine); fi
   if wanted blender; then words+=(blender); fi
   if wanted browser; then words+=(browser); fi
-  installs "${words[@]}" &
-  installer=$!
+  begin install installs "${words[@]}"
 }
 
 installed=no
 install_ends() {
   [ $installed = no ] || return
   installed=yes
-  wait "$installer"
-  installer=
+  end install
   cat "$scratch"/install.* 2> /dev/null
   has vulkan || skip "a Vulkan in software for the kernels of GPUs: apt cannot install mesa-vulkan-drivers"
   has colmap || skip "COLMAP or FFmpeg, which find cameras: apt cannot install colmap and ffmpeg"
@@ -212,9 +224,13 @@ lint() {
   step "figures of the documents" "${PYTHON:-python3}" tools/reference/figures.py check
 }
 
-unit() {
+# Kernels are compiled for a driver in software on one processor, which leaves the other to the integration tests.
+unit_begins() {
   need_build
-  step "unit tests" tests unit "$(executable $unit_tests)" "${names[@]}"
+  begin unit tests unit "$(executable $unit_tests)" "${names[@]}"
+}
+unit_ends() {
+  step "unit tests" end unit
   [ ${#names[@]} -gt 0 ] ||
     step "examples in the documentation" cargo test --release --features matting,wgpu --doc
 }
@@ -224,25 +240,13 @@ integration() {
   step "integration tests" tests check "$(executable $check_tests)" "${names[@]}"
 }
 
-# Low priority beside the other steps, and at `all` a quarter of a minute from each of four seeds.
-fuzz_begins() {
-  need_build
-  fuzz "$scratch/fuzz.log" &
-  fuzzer=$!
-}
+# Low priority beside the other steps; for `all` a quarter of a minute from each of four seeds.
 fuzz() {
   local seed seeds=1 seconds=3 ended=0
   [ $all = no ] || { seeds="1 2 3 4"; seconds=15; }
   for seed in $seeds; do
     TIFACE_FUZZ_S=$seconds TIFACE_FUZZ_SEED=$seed nice -n 19 "$(executable $fuzz_tests)" --nocapture || ended=1
-  done > "$1" 2>&1
-  return $ended
-}
-fuzz_ends() {
-  local ended=0
-  wait "$fuzzer" || ended=1
-  fuzzer=
-  cat "$scratch/fuzz.log"
+  done
   return $ended
 }
 
@@ -292,21 +296,22 @@ readers() {
   step "a published checkpoint is converted" .venv/bin/python tools/reference/tensorf_checkpoint.py --check tests/reference
 }
 
-# train_demo STEPS: the demo head, from photographs to views
+# train_demo STEPS OPTIONS...: the demo head, from photographs to views
 train_demo() {
   "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps="$1" \
     --set tface.steps=$(($1 * 2 / 3)) --set baseline.steps=$(($1 / 3)) --set mesh.resolution=128 \
-    --set mesh.format=glb,obj,ply --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured
+    --set mesh.format=glb,obj,ply --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured "${@:2}"
 }
 demo_made=no
 make_demo() {
   [ $demo_made = no ] || return
   demo_made=yes
   need_build
-  # the browser and Blender compare pictures of a head that has learned its colors
-  local steps=150
-  if wanted browser || wanted blender; then steps=600; fi
-  step "the demo head is reconstructed" train_demo $steps
+  # A head that has learned its colors is compared as a picture by the browser and Blender. Before that its surface is soft,
+  # and would get layers, which some readers take for a part of it.
+  local size=(150 --size 128x160 --views 16 --set mesh.hair=none)
+  if wanted browser || wanted blender; then size=(600); fi
+  step "the demo head is reconstructed" train_demo "${size[@]}"
   step "the demo head is exported" export_demo
 }
 # The demo head again, with fewer triangles, another material and a smaller texture.
@@ -395,9 +400,10 @@ demo_pages() {
 
 install_begins
 if wanted lint; then lint; fi
-if wanted unit; then unit; fi
+if wanted unit; then unit_begins; fi
 if wanted integration; then integration; fi
-if wanted fuzz; then fuzz_begins; fi
+if wanted unit; then unit_ends; fi
+if wanted fuzz; then need_build; begin fuzz fuzz; fi
 if wanted readers; then readers; fi
 if wanted demo; then demo; fi
 if wanted long; then long; fi
@@ -406,7 +412,7 @@ if wanted fleet; then fleet; fi
 if wanted guides; then guides; fi
 if wanted blender; then blender_agrees; fi
 if wanted browser; then pages; fi
-if wanted fuzz; then step "no input makes a reader panic, hang or fill the memory" fuzz_ends; fi
+if wanted fuzz; then step "no input makes a reader panic, hang or fill the memory" end fuzz; fi
 
 # how long which part took, the slowest tests, and what could not run
 printf '\n== summary: %d s\n' "$SECONDS"
