@@ -336,7 +336,7 @@ mod tests {
         assert_eq!(page.matches("<figure class=\"odd\">").count(), 1);
         assert!(page.contains("<b>&lt;b&gt;&quot;&amp;</b>") && !page.contains("<b><b>"), "{page}");
         assert!(
-            page.contains("is white everywhere") && page.contains("head 16.7 %") && !page.contains("http")
+            page.contains("is white everywhere") && page.contains("head 16.7 %") && !page.contains("://")
         );
         assert_eq!(sheet(&[fine]).unwrap().matches("class=\"odd\"").count(), 0);
     }
