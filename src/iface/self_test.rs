@@ -128,18 +128,18 @@ pub(super) fn density(adapter: &Adapter) -> Result<Vec<Check>> {
 mod tests {
     use super::*;
 
-    /// A device passes the tests with so many times fewer samples.
-    fn passes(fewer: usize) {
+    /// A device passes the tests with so many times fewer samples, of fields with so many levels.
+    fn passes(fewer: usize, [of_sdf, of_density]: [usize; 2]) {
         let Some(adapter) = Adapter::all().first() else { return };
-        let of = |preset: Preset| {
+        let of = |preset: Preset, levels: usize| {
             let full = config(preset);
             let rays = full.rays / fewer;
-            IfaceConfig { rays, max_rays: rays, samples: full.samples / fewer, ..full }
+            IfaceConfig { rays, max_rays: rays, samples: full.samples / fewer, levels, ..full }
         };
         let began = std::time::Instant::now();
         for checks in [
-            compare_sdf(adapter, of(Preset::Draft)).unwrap(),
-            density::self_test(adapter, &of(Preset::Paper)).unwrap(),
+            compare_sdf(adapter, of(Preset::Draft, of_sdf)).unwrap(),
+            density::self_test(adapter, &of(Preset::Paper, of_density)).unwrap(),
         ] {
             println!("{:.1?}: {checks:#?}", began.elapsed());
             assert!(!checks.is_empty() && checks.iter().all(|check| check.passed));
@@ -148,12 +148,13 @@ mod tests {
 
     #[test]
     fn a_device_that_computes_right_passes_with_few_samples() {
-        passes(4);
+        // as many levels as other tests have, for which the kernels are compiled anyway
+        passes(4, [5, 4]);
     }
 
     #[test]
-    #[ignore = "long: run by `tools/test.sh all`; as many samples as `tiface doctor` has"]
+    #[ignore = "long: run by `tools/test.sh all`; as many samples and levels as `tiface doctor` has"]
     fn a_device_that_computes_right_passes() {
-        passes(1);
+        passes(1, [config(Preset::Draft).levels; 2]);
     }
 }

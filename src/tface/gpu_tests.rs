@@ -18,7 +18,9 @@ use std::path::Path;
 
 const BOUNDS: [[f32; 3]; 2] = [[-0.8; 3], [0.8; 3]];
 
-/// As small as a driver in software needs it, for which a step takes as long as it has samples.
+/// As small as a driver in software needs it, for which a step takes as long as it has samples. Color
+/// ranks and decoder are those of the preset, for which the kernels are compiled anyway; the density's
+/// channels are padded on a device.
 fn config() -> VmConfig {
     VmConfig {
         steps: 40,
@@ -27,9 +29,7 @@ fn config() -> VmConfig {
         voxels_final: 24 * 24 * 24,
         upsample_at: vec![0.2, 0.4],
         mask_at: vec![0.2, 0.5],
-        density_rank: vec![8, 8, 8],
-        color_rank: vec![8, 4, 9],
-        hidden: 32,
+        density_rank: vec![8, 7, 5],
         ..VmConfig::preset(Preset::Draft)
     }
 }
@@ -161,10 +161,17 @@ fn a_device_trains_as_the_cpu_does_and_a_checkpoint_goes_there_and_back() {
 }
 
 #[test]
-#[ignore = "long: run by `tools/test.sh all`; a device makes a hundred steps, and reads before its grids have all grown"]
+#[ignore = "long: run by `tools/test.sh all`; a device makes a hundred steps with another decoder, and reads before its grids have all grown"]
 fn a_device_trains_as_the_cpu_does_for_many_steps() {
-    let config =
-        VmConfig { steps: 100, rays: 128, upsample_at: vec![0.3, 0.6], mask_at: vec![0.3, 0.7], ..config() };
+    let config = VmConfig {
+        steps: 100,
+        rays: 128,
+        upsample_at: vec![0.3, 0.6],
+        mask_at: vec![0.3, 0.7],
+        color_rank: vec![8, 4, 9],
+        hidden: 32,
+        ..config()
+    };
     trainings_follow_the_cpu(&config, 40, 40);
 }
 
@@ -185,6 +192,8 @@ fn memory_of_a_training() {
         voxels_final: 40 * 40 * 40,
         upsample_at: vec![],
         mask_at: vec![],
+        color_rank: vec![8, 4, 9],
+        hidden: 32,
         ..config()
     };
     let pixels = pixels(&views, &config);

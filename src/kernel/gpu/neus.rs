@@ -434,27 +434,37 @@ mod tests {
     #[test]
     fn extreme_fields_have_finite_opacities_and_bounded_gradients() {
         let Some(device) = device() else { return };
-        let offsets = [0, 4];
-        let (direction, t, dt) = ([[0.6, 0.0, -0.8]], [1.0, 1.1, 1.2, 1.3], [1e-9, 0.05, 3.0, 1e3]);
-        let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
-        let g = [[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]];
-        for inv_s in [0.0, 1e-6, 1.0, 1e6, 1e9] {
-            for sdf in [0.0, -1e-6, 1.0, -1e3, 1e20] {
-                for slope in [0.0, 1e-12, 2e-6, 1.0, 1e6] {
-                    let sample = |k: usize| [sdf, slope, -0.5 * slope, 0.0, 0.5, 0.5, 0.5, -(k as f32)];
-                    let field: Vec<[f32; 8]> = (0..4).map(sample).collect();
-                    let [(out, g_field, g_s), _] = device_and_cpu(&device, rays, &field, inv_s, 1.0, &g);
-                    assert!(
-                        out.iter().all(|v| v.is_finite() && v.abs() < 2.0),
-                        "{inv_s} {sdf} {slope} {out:?}"
-                    );
-                    let bounded = |v: &f32| v.is_finite() && v.abs() < 1e10;
-                    assert!(
-                        g_field.iter().chain([&g_s]).all(bounded),
-                        "{inv_s} {sdf} {slope} {g_field:?} {g_s}"
-                    );
-                }
+        // a ray of four samples for each distance and slope
+        let mut field = Vec::new();
+        for sdf in [0.0, -1e-6, 1.0, -1e3, 1e20] {
+            for slope in [0.0, 1e-12, 2e-6, 1.0, 1e6] {
+                let sample = |k: usize| [sdf, slope, -0.5 * slope, 0.0, 0.5, 0.5, 0.5, -(k as f32)];
+                field.extend((0..4).map(sample));
             }
+        }
+        let count = field.len() / 4;
+        let offsets: Vec<i32> = (0..=count as i32).map(|r| 4 * r).collect();
+        let direction = vec![[0.6, 0.0, -0.8]; count];
+        let (t, dt) = ([1.0, 1.1, 1.2, 1.3].repeat(count), [1e-9, 0.05, 3.0, 1e3].repeat(count));
+        let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let g = vec![[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]; count];
+        for inv_s in [0.0, 1e-6, 1.0, 1e6, 1e9] {
+            let [(out, g_field, g_s), _] = device_and_cpu(&device, rays, &field, inv_s, 1.0, &g);
+            // sample i of all planes
+            let of = |values: &[f32], n: usize, i: usize| -> Vec<f32> {
+                values.iter().skip(i).step_by(n).copied().collect()
+            };
+            for r in 0..count {
+                let seen = of(&out, count, r);
+                let finite = seen.iter().all(|v| v.is_finite() && v.abs() < 2.0);
+                assert!(finite, "{inv_s} {:?} {seen:?}", field[4 * r]);
+            }
+            let bounded = |v: &f32| v.is_finite() && v.abs() < 1e10;
+            for (i, sample) in field.iter().enumerate() {
+                let slopes = of(&g_field, field.len(), i);
+                assert!(slopes.iter().all(bounded), "{inv_s} {sample:?} {slopes:?}");
+            }
+            assert!(bounded(&g_s), "{inv_s} {g_s}");
         }
     }
 }

@@ -28,20 +28,14 @@ const SLICE: usize = 32;
 
 /// Returns the number of groups that have partial gradients of `count` samples.
 #[cube]
-fn summed_groups(count: &[u32], #[comptime] tile: usize, #[comptime] summing: usize) -> usize {
-    min((count[0] as usize).div_ceil(tile), summing)
+fn summed_groups(count: &[u32], tile: u32, summing: u32) -> usize {
+    min((count[0] as usize).div_ceil(tile as usize), summing as usize)
 }
 
 /// Sums the partial gradients of each slice of groups, in the order of the groups, into those of
 /// the slice's first group. Slices lie in the second dimension of the launch.
 #[cube(launch)]
-fn sum_slices(
-    partial: &mut [f32],
-    count: &[u32],
-    size: u32,
-    #[comptime] tile: usize,
-    #[comptime] summing: usize,
-) {
+fn sum_slices(partial: &mut [f32], count: &[u32], size: u32, tile: u32, summing: u32) {
     let i = ABSOLUTE_POS_X as usize;
     let first = CUBE_POS_Y as usize * SLICE;
     let end = min(first + SLICE, summed_groups(count, tile, summing));
@@ -63,8 +57,8 @@ fn reduce(
     count: &[u32],
     flat: &mut [f32],
     size: u32,
-    #[comptime] tile: usize,
-    #[comptime] summing: usize,
+    tile: u32,
+    summing: u32,
     #[comptime] mapped: bool,
 ) {
     let i = ABSOLUTE_POS;
@@ -95,9 +89,11 @@ pub(in super::super) fn sum_groups(
 ) {
     let over = |floats: usize| floats.div_ceil(UNITS as usize);
     let slices = CubeCount::Static(over(size) as u32, summing.div_ceil(SLICE) as u32, 1);
-    launch!(device, sum_slices::launch, slices, UNITS; partial, count; size as u32, tile, summing);
+    // not known to the compiler, which would compile both kernels again for every capacity
+    let (size, tile, summing) = (size as u32, tile as u32, summing as u32);
+    launch!(device, sum_slices::launch, slices, UNITS; partial, count; size, tile, summing);
     launch!(device, reduce::launch, groups(over(flat.words())), UNITS;
-        partial, map.unwrap_or(count), count, flat; size as u32, tile, summing, map.is_some()
+        partial, map.unwrap_or(count), count, flat; size, tile, summing, map.is_some()
     );
 }
 

@@ -13,39 +13,50 @@ fn case(levels: usize, color_skip: bool, active: usize) -> Case {
 
 #[test]
 fn the_field_and_its_gradients_are_those_of_the_cpu() {
-    for (levels, skip, active) in [(16, false, 16), (5, true, 4)] {
-        let Case { shape, table, flat, x, direction, g_out } = case(levels, skip, active);
-        let weights = Weights::new(shape.layout(), &flat);
-        let a = sdf::forward(&shape, &table, &weights, &x, &direction);
-        let mut g_table = vec![[0f32; 2]; table.len()];
-        let g_flat = sdf::backward(&a, &weights, g_out.as_flattened(), &mut g_table);
-        for device in devices() {
-            let name = |what: &str| format!("{what}, {levels} levels, skip {skip}, {:?}", device.atomics());
-            let mut on = Sdf::new(&device, &shape, CAPACITY);
-            on.activate(active);
-            let [x, direction] = [&x, &direction].map(|v| device.upload(&planes(v, CAPACITY)));
-            let (table, flat) = (device.upload(table.as_flattened()), device.upload(&flat));
-            let count = device.upload(&[SAMPLES as u32]);
-            let out = device.read::<f32>(on.forward(&device, &table, &flat, &x, &direction, &count));
-            let rows: &[[f32; WIDTH]] = a.output().as_chunks().0;
-            for k in 0..WIDTH {
-                let want: Vec<f32> = rows.iter().map(|r| r[k]).collect();
-                agree(&name(&format!("output {k}")), &out[k * CAPACITY..][..SAMPLES], &want, 1e-4);
-            }
-            let mut g_planes = planes(&g_out, CAPACITY);
-            // behind the last sample nothing counts
-            (0..WIDTH).for_each(|k| g_planes[k * CAPACITY + SAMPLES] = f32::NAN);
-            let got_table = device.zeros::<f32>(2 * g_table.len());
-            let got_flat = device.zeros::<f32>(g_flat.len());
-            on.backward(&device, &x, &direction, &count, &device.upload(&g_planes), &got_table, &got_flat);
-            let mut start = 0;
-            for (o, i) in shape.layout().shapes() {
-                let span = start..start + o * i;
-                start += o * i;
-                agree(&name("weights"), &device.read::<f32>(&got_flat)[span.clone()], &g_flat[span], 1e-4);
-            }
-            agree(&name("table"), &device.read::<f32>(&got_table), g_table.as_flattened(), 1e-4);
+    agrees_with_the_cpu((5, true, 4), devices());
+    // more features than a tile has columns
+    agrees_with_the_cpu((14, true, 14), device().into_iter().collect());
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; compiles the published field, and its sums for each way to add"]
+fn the_published_field_and_its_gradients_are_those_of_the_cpu() {
+    agrees_with_the_cpu((16, false, 16), devices());
+}
+
+/// Compares a field with so many levels, with or without the color skip, of which so many levels are active.
+fn agrees_with_the_cpu((levels, skip, active): (usize, bool, usize), devices: Vec<Device>) {
+    let Case { shape, table, flat, x, direction, g_out } = case(levels, skip, active);
+    let weights = Weights::new(shape.layout(), &flat);
+    let a = sdf::forward(&shape, &table, &weights, &x, &direction);
+    let mut g_table = vec![[0f32; 2]; table.len()];
+    let g_flat = sdf::backward(&a, &weights, g_out.as_flattened(), &mut g_table);
+    for device in devices {
+        let name = |what: &str| format!("{what}, {levels} levels, skip {skip}, {:?}", device.atomics());
+        let mut on = Sdf::new(&device, &shape, CAPACITY);
+        on.activate(active);
+        let [x, direction] = [&x, &direction].map(|v| device.upload(&planes(v, CAPACITY)));
+        let (table, flat) = (device.upload(table.as_flattened()), device.upload(&flat));
+        let count = device.upload(&[SAMPLES as u32]);
+        let out = device.read::<f32>(on.forward(&device, &table, &flat, &x, &direction, &count));
+        let rows: &[[f32; WIDTH]] = a.output().as_chunks().0;
+        for k in 0..WIDTH {
+            let want: Vec<f32> = rows.iter().map(|r| r[k]).collect();
+            agree(&name(&format!("output {k}")), &out[k * CAPACITY..][..SAMPLES], &want, 1e-4);
         }
+        let mut g_planes = planes(&g_out, CAPACITY);
+        // behind the last sample nothing counts
+        (0..WIDTH).for_each(|k| g_planes[k * CAPACITY + SAMPLES] = f32::NAN);
+        let got_table = device.zeros::<f32>(2 * g_table.len());
+        let got_flat = device.zeros::<f32>(g_flat.len());
+        on.backward(&device, &x, &direction, &count, &device.upload(&g_planes), &got_table, &got_flat);
+        let mut start = 0;
+        for (o, i) in shape.layout().shapes() {
+            let span = start..start + o * i;
+            start += o * i;
+            agree(&name("weights"), &device.read::<f32>(&got_flat)[span.clone()], &g_flat[span], 1e-4);
+        }
+        agree(&name("table"), &device.read::<f32>(&got_table), g_table.as_flattened(), 1e-4);
     }
 }
 
