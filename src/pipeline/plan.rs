@@ -496,7 +496,7 @@ mod mib {
     pub const TEXEL: f64 = 4e-5;
     pub const PICTURE_TEXEL: f64 = 2e-5;
     /// A head mesh with its tree, and a texel of it, in views.
-    pub const SHOWN_MESH: f64 = 60.0;
+    pub const SHOWN_MESH: f64 = 85.0;
     pub const SHOWN_TEXEL: f64 = 25e-6;
     /// A pixel of a view.
     pub const VIEW_PIXEL: f64 = 1.2e-4;
