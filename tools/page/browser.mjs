@@ -24,6 +24,17 @@ export function checks() {
 }
 
 /**
+ * Waits until the predicate, a true or false, holds in the page, also while another page is opened. Playwright's own way
+ * evaluates text there, which the policy of our pages refuses.
+ */
+export async function holds(page, predicate) {
+  for (const end = Date.now() + 60_000; ; await page.waitForTimeout(50)) {
+    if (await page.evaluate(predicate).catch(() => false)) return;
+    if (Date.now() > end) throw new Error(`it never holds: ${predicate}`);
+  }
+}
+
+/**
  * A browser whose pages remember what they asked a network for, and their errors. `gl`: with WebGL, drawn by the
  * processor. `folder` is for files that are needed meanwhile.
  */

@@ -11,7 +11,7 @@
 import { readFile, writeFile } from "node:fs/promises";
 import path from "node:path";
 import { pathToFileURL } from "node:url";
-import { browser, checks } from "./browser.mjs";
+import { browser, checks, holds } from "./browser.mjs";
 
 const [given] = process.argv.slice(2);
 if (!given) {
@@ -117,14 +117,14 @@ try {
   const clicks = path.join(profile, "clicks.json");
   await writeFile(clicks, JSON.stringify(prompts));
   await page.setInputFiles("#open", clicks);
-  await page.waitForFunction(() => document.getElementById("status").textContent.includes("clicks.json"));
+  await holds(page, () => document.getElementById("status").textContent.includes("clicks.json"));
   check("what fits no photograph is said", (await status(page)).includes("images/of another capture.png"), await status(page));
   same("a file is opened", points(await saved(page)), [[second.file_path, [[1.25, 2, 1]]]]);
   for (const text of ["{", "[]", '{"frames": 3}', `{"frames": [null, {"file_path": 3}, {"file_path": "${first.file_path}", "points": [null]}]}`]) {
     await writeFile(clicks, text);
     await page.evaluate(() => { document.getElementById("status").textContent = ""; });
     await page.setInputFiles("#open", clicks);
-    await page.waitForFunction(() => document.getElementById("status").textContent !== "");
+    await holds(page, () => document.getElementById("status").textContent !== "");
     check(`a senseless file is named: ${text}`, await page.evaluate(() => document.getElementById("status").className === "wrong"),
       await status(page));
   }

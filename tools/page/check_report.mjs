@@ -15,7 +15,7 @@ import { access, readFile, readdir, stat, writeFile } from "node:fs/promises";
 import { createRequire } from "node:module";
 import path from "node:path";
 import { pathToFileURL } from "node:url";
-import { browser, checks } from "./browser.mjs";
+import { browser, checks, holds } from "./browser.mjs";
 
 const { PNG } = createRequire(new URL("../readers/package.json", import.meta.url))("pngjs");
 const LEAST_DB = 30;
@@ -44,10 +44,10 @@ function decibels(drawn, ours) {
   return -10 * Math.log10(sum / count / 255 ** 2);
 }
 const bytesOf = (url) => Buffer.from(url.split(",")[1], "base64");
-const ready = (page) => page.waitForFunction(() => {
+const ready = (page) => holds(page, () => {
   const root = document.querySelector(".viewer");
-  return root.viewer || root.classList.contains("dead");
-}, null, { timeout: 60_000 });
+  return Boolean(root.viewer) || root.classList.contains("dead");
+});
 /** What the page says of itself after an action. */
 const state = (page) => page.evaluate(() => {
   const { yaw, pitch, distance, target, mode, camera, fade } = document.querySelector(".viewer").viewer.state;
