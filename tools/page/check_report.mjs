@@ -197,6 +197,7 @@ try {
     && Math.hypot(marks[1][0] - middle[0], marks[1][1] - middle[1] + box.height / 8) < 2, JSON.stringify([marks, middle]));
   await page.screenshot({ path: at("report_measure.png") });
   await page.keyboard.press("m");
+  await settled(page);
   same("nothing is left of it", [await page.locator(".mark:visible").count(), await distance.textContent()], [0, ""]);
   // the file of the page
   const [download] = await Promise.all([page.waitForEvent("download"), page.click(".save")]);
