@@ -4,16 +4,16 @@ use super::options::Common;
 use super::screen::{one_line, print};
 use crate::capture::{self, CaptureOptions, Split, View};
 use crate::config::Stage;
-use crate::geom::{Bvh, Camera};
+use crate::geom::{Bvh, Camera, Mesh};
 use crate::io::{self, Limits};
 use crate::mesh::files::{
-    CheckReport, PictureSource, ReadMesh, ReadOptions, UvReport, check_around, picture_beside, read_with,
-    uv_check, weld,
+    CheckReport, OpenedMesh, ReadMesh, check_around, open_mesh, open_surface, uv_check, weld,
 };
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
 use crate::run::{Fault, ProductState, read_record};
 use crate::{Error, ErrorKind, Result};
+use glam::DVec3;
 use serde::Serialize;
 use std::fmt::{self, Display};
 use std::ops::RangeInclusive;
@@ -104,9 +104,12 @@ impl Display for Against {
 struct CheckJson<'a> {
     #[serde(flatten)]
     report: &'a CheckReport,
-    /// Why the texture was not checked.
+    /// Why the texture that the file names is not shown.
     #[serde(skip_serializing_if = "Option::is_none")]
     texture_problem: Option<&'a str>,
+    /// What was read otherwise than it is written, or left out.
+    #[serde(skip_serializing_if = "<[String]>::is_empty")]
+    notes: &'a [String],
     #[serde(skip_serializing_if = "Option::is_none")]
     against: Option<&'a Against>,
 }
@@ -116,7 +119,7 @@ struct CheckJson<'a> {
 fn mesh_of(path: &Path, is_compared: bool) -> Result<(PathBuf, Option<Error>)> {
     if !capture::is_run(path) && io::is_folder(path) {
         let text = format!("`{}` is a folder, but not that of a run", path.display());
-        return Err(Error::cannot(text, "name a .glb, .obj or .ply file, or the folder of a run"));
+        return Err(Error::cannot(text, "name a .glb, .obj, .ply or .stl file, or the folder of a run"));
     }
     if !capture::is_run(path) {
         return Ok((path.into(), None));
@@ -142,27 +145,8 @@ fn mesh_of(path: &Path, is_compared: bool) -> Result<(PathBuf, Option<Error>)> {
     Ok((file, None))
 }
 
-fn load(path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
-    read_with(&io::read_bytes(path, &Limits::default())?, path, options)
-}
-
 /// Side assumed for a texture of unknown size, texels.
 const DEFAULT_TEXTURE_PX: u32 = 1024;
-
-/// Returns whether the mesh has a texture, and the measured texture coordinates.
-fn check_texture(found: &ReadMesh, path: &Path) -> (bool, Option<UvReport>) {
-    let beside = picture_beside(found.picture.as_ref(), path).ok().flatten();
-    let is_there = beside.is_some() || matches!(found.picture, Some(PictureSource::Inside(_)));
-    let uv = found.atlas.clone().map(|mut atlas| {
-        if atlas.width == 0 || atlas.height == 0 {
-            let info = beside.and_then(|file| io::picture_info(&file, &Limits::default()).ok());
-            (atlas.width, atlas.height) =
-                info.map_or((DEFAULT_TEXTURE_PX, DEFAULT_TEXTURE_PX), |i| i.size(None));
-        }
-        uv_check(&weld(&found.mesh), &atlas)
-    });
-    (is_there, uv)
-}
 
 pub(super) fn run(
     common: &Common,
@@ -174,21 +158,21 @@ pub(super) fn run(
     let config = common.resolve(None, None, &[])?;
     let (path, fault) = mesh_of(path, against.is_some())?;
     let path = &path;
-    // the mesh is checked even if its texture cannot be read
-    let (found, problem) = match load(path, &ReadOptions::default()) {
-        Ok(found) => (found, None),
-        Err(e) => match load(path, &ReadOptions::SURFACE) {
-            Ok(found) => (found, Some(e.to_string())),
-            // a file that is not the run's is not mended as other files are
-            Err(unread) => return Err(fault.unwrap_or(unread)),
-        },
+    // a file that is not the run's is not mended as other files are
+    let opened = match (open_mesh(path), &fault) {
+        (Err(_), Some(fault)) => return Err(fault.clone()),
+        (opened, _) => opened?,
     };
-    let unit_m = config.capture.unit_m;
-    let mut report = check_around(&found.mesh, found.origin, unit_m);
-    if problem.is_none() {
-        let (is_there, uv) = check_texture(&found, path);
-        (report.has_texture, report.uv) = (Some(is_there), uv);
-    }
+    let OpenedMesh { head, bare_atlas, texture_problem: problem, notes } = opened;
+    let (mesh, origin, unit_m) = (head.mesh, head.world_from_scene.translation, config.capture.unit_m);
+    let mut report = check_around(&mesh, origin, unit_m);
+    report.has_texture = Some(head.texture.is_some());
+    report.uv = head.texture.map(|texture| texture.atlas).or(bare_atlas).map(|mut atlas| {
+        if atlas.width == 0 || atlas.height == 0 {
+            (atlas.width, atlas.height) = (DEFAULT_TEXTURE_PX, DEFAULT_TEXTURE_PX);
+        }
+        uv_check(&weld(&mesh), &atlas)
+    });
     let bars: Vec<&str> = require.iter().map(String::as_str).collect();
     let passed = report.require(&bars);
     if let Err(e) = &passed
@@ -196,26 +180,28 @@ pub(super) fn run(
     {
         return passed;
     }
-    let against = against.map(|other| compare(&found, other, seen_by, unit_m)).transpose()?;
+    let against = against.map(|other| compare(&mesh, origin, other, seen_by, unit_m)).transpose()?;
     let text = if common.json {
-        let whole =
-            CheckJson { report: &report, texture_problem: problem.as_deref(), against: against.as_ref() };
+        let whole = CheckJson {
+            report: &report,
+            texture_problem: problem.as_deref(),
+            notes: &notes,
+            against: against.as_ref(),
+        };
         format!("{}\n", serde_json::to_string(&whole).unwrap_or_default())
     } else {
-        let uv = match (&report.uv, &problem) {
-            (Some(uv), _) => format!("\ntexture\n{uv}"),
-            (None, Some(e)) => format!("texture              NOT CHECKED: {}\n", one_line(e)),
-            (None, None) => String::new(),
-        };
-        format!("{report}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
+        let problem = problem.map(|e| format!("texture              NOT SHOWN: {}\n", one_line(&e)));
+        let notes = notes.iter().map(|note| format!("note                 {}\n", one_line(note)));
+        let said: String = problem.into_iter().chain(notes).collect();
+        let uv = report.uv.as_ref().map_or(String::new(), |uv| format!("\ntexture\n{uv}"));
+        format!("{report}{said}{uv}\n{}", against.map(|a| a.to_string()).unwrap_or_default())
     };
     print(&text)?;
     passed.and(fault.map_or(Ok(()), Err))
 }
 
-fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against> {
-    let ReadMesh { mesh, origin, .. } = found;
-    let ReadMesh { mesh: mut truth, origin: elsewhere, .. } = load(other, &ReadOptions::SURFACE)?;
+fn compare(mesh: &Mesh, origin: DVec3, other: &Path, seen_by: Option<&Path>, unit_m: f64) -> Result<Against> {
+    let ReadMesh { mesh: mut truth, origin: elsewhere, .. } = open_surface(other)?;
     // both around one origin
     let way = elsewhere - origin;
     truth.positions.iter_mut().for_each(|p| *p = (p.as_dvec3() + way).as_vec3());

@@ -27,7 +27,7 @@ use std::time::{Duration, Instant, SystemTime};
 /// Options of `tiface preview`.
 #[derive(Args, Debug)]
 pub(super) struct PreviewOptions {
-    /// Run, or .glb, .obj or .ply file [default: the run in this folder, else the newest under runs/]
+    /// Run, or .glb, .obj, .ply or .stl file [default: the run in this folder, else the newest under runs/]
     #[arg(value_name = "RUN|FILE")]
     path: Option<PathBuf>,
     /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (checkerboard) or wire [default:
@@ -195,7 +195,7 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
     destination.prepare()?;
     let files = make(&preview, &destination, kind, &names, &shots, options.background, invocation)?;
     if common.json {
-        print(&format!("{}\n", json!({"event": "result", "preview": files})))?;
+        print(&format!("{}\n", json!({"event": "result", "preview": files, "warnings": preview.warnings})))?;
     } else if !common.quiet {
         print(&format!("preview   {}\n", shown.display()))?;
     }

@@ -1,27 +1,40 @@
-//! Mesh files: GLB, OBJ and PLY, written, read and checked.
+//! Mesh files: GLB, OBJ and PLY, written, read and checked; STL, read.
 //!
-//! [`to_glb`], [`to_obj`] and [`to_ply`] write; [`read()`] reads all three formats from any program. [`check()`]
+//! [`to_glb`], [`to_obj`] and [`to_ply`] write; [`open_mesh`] opens all formats from any program, with the pictures beside
+//! them, and [`read()`] the surface in bytes. [`check()`]
 //! examines a surface, [`uv_check()`] its texture coordinates. [`ExtractedSurface`] and [`HeadMesh`] are the meshes
 //! that later stages read.
 
+mod beside;
 mod check;
+mod color_range;
 mod file_mesh;
+mod foreign;
 mod glb;
 mod glb_read;
+mod gltf_document;
+mod gltf_text;
+mod mtl;
 mod obj;
+mod open;
 mod ply;
+mod ply_read;
 mod read;
 mod source;
+mod stl;
 mod stored;
+mod uri;
 
 pub use check::{
     BARS, CheckReport, MIN_AREA_PX, PieceReport, UvReport, check, check_around, seams_facing, uv_check,
 };
 pub use file_mesh::{ExportOptions, ExportedFiles, HeadTexture, Lobes, tangents, weld};
 pub use glb::to_glb;
-pub use obj::{picture_of_mtl, to_obj};
+pub use mtl::{Material, materials_of_mtl};
+pub use obj::to_obj;
+pub use open::{OpenedMesh, open_mesh, open_surface};
 pub use ply::to_ply;
-pub use read::{OpenedMesh, open_mesh, picture_beside, read, read_with};
+pub use read::{read, read_with};
 pub use source::{PictureSource, ReadMesh, ReadOptions};
 pub(crate) use stored::FORMAT;
 pub use stored::{ExtractedSurface, HeadMesh};

@@ -243,7 +243,9 @@ fn pictures_of<'c>(views: &[&'c View], folder: &Path) -> Result<Vec<Comparable<'
 
 /// Writes pictures of a mesh from the cameras of views into a folder, and returns figures of the mesh and its warnings.
 fn draw(views: &[&View], config: &Config, mesh: &Path, folder: &Path) -> Result<(Value, Vec<String>)> {
-    let OpenedMesh { head, mut warnings, .. } = open_mesh(mesh)?;
+    let opened = open_mesh(mesh)?;
+    let mut warnings = opened.warnings();
+    let OpenedMesh { head, .. } = opened;
     if head.texture.is_none() && head.mesh.colors.is_empty() {
         warnings.push("the mesh has no colors, so only its missing and extra pixels can be compared".into());
     }

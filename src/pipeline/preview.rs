@@ -69,14 +69,16 @@ impl Preview {
         Ok(Preview { head, bare_atlas: None, up, front, views: capture.views, warnings })
     }
 
-    /// Returns the mesh in a `.glb`, `.obj` or `.ply` file. `up` is its up direction, +Y for most files; the front is
+    /// Returns the mesh in a `.glb`, `.obj`, `.ply` or `.stl` file. `up` is its up direction, +Y for most files; the front is
     /// then +Z, or −Y if +Z is up, as in Blender.
     ///
     /// # Errors
     ///
     /// Fails if the file cannot be read or has no surface.
     pub fn of_file(path: &Path, up: Vec3) -> Result<Preview> {
-        let OpenedMesh { mut head, bare_atlas, warnings } = open_mesh(path)?;
+        let opened = open_mesh(path)?;
+        let warnings = opened.warnings();
+        let OpenedMesh { mut head, bare_atlas, .. } = opened;
         at_hand(&mut head, path)?;
         let front = if up.z.abs() > 0.5 { Vec3::NEG_Y } else { Vec3::Z };
         Ok(Preview { head, bare_atlas, up, front, views: Vec::new(), warnings })

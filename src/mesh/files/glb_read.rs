@@ -4,19 +4,20 @@
 //! may lie kilometres from the origin, where `gltf-json`'s f32 has steps of half a metre. The document's references are
 //! checked before they are used. Only data in the file is read: buffers with a URI are refused.
 
+use super::color_range::bring_into_range;
+use super::gltf_document::{GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};
 use super::source::{PictureSource, ReadMesh, Source};
+use super::uri::{data_of_uri, name_of_uri};
+use crate::error::counted;
 use crate::geom::Atlas;
 use crate::image::{linear_from_srgb, srgb_from_linear};
 use crate::{Result, io};
-use glam::{DMat3, DMat4, DQuat, DVec3, Vec2};
+use glam::{DMat3, DMat4, DVec3, Vec2};
 use gltf::Glb;
 use gltf::json::accessor::{ComponentType as C, GenericComponentType, Type};
 use gltf::json::mesh::{Mode, Semantic};
-use gltf::json::validation::Checked::{self, Invalid, Valid};
-use serde::Deserialize;
-use serde::de::IgnoredAny;
-use serde_json::Value;
-use std::collections::{BTreeMap, BTreeSet};
+use gltf::json::validation::Checked::{Invalid, Valid};
+use std::collections::BTreeSet;
 
 /// The extension that allows 8 and 16 bits in more attributes.
 const QUANTIZED: &str = "KHR_mesh_quantization";
@@ -26,14 +27,29 @@ const SHORTENED: [C; 5] = [C::F32, C::I8, C::U8, C::I16, C::U16];
 fn is_harmless(extension: &str) -> bool {
     extension.starts_with("KHR_materials_")
         || extension == QUANTIZED
-        || ["KHR_texture_transform", "EXT_texture_webp", "KHR_texture_basisu"].contains(&extension)
+        || ["KHR_texture_transform", "EXT_texture_webp", "KHR_texture_basisu", "KHR_node_visibility"]
+            .contains(&extension)
+}
+
+/// How to undo the compressions of meshes and pictures.
+fn way_without(extension: &str) -> Option<&'static str> {
+    match extension {
+        "KHR_draco_mesh_compression" => {
+            Some("open it in Blender, which decodes Draco, and export it as .glb without compression")
+        }
+        "EXT_meshopt_compression" | "KHR_meshopt_compression" => {
+            Some("open it in the editor of three.js, which decodes meshopt, and export it as GLB")
+        }
+        _ => None,
+    }
 }
 
 pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     let glb = chunks(bytes, source)?;
     let root = GlbRoot::parse(&glb.json, source)?;
     if let Some(extension) = root.extensions_required.iter().find(|e| !is_harmless(e)) {
-        return Err(source.unsupported("`extensionsRequired`", format!("`{extension}`")));
+        let error = source.unsupported("`extensionsRequired`", format!("`{extension}`"));
+        return Err(way_without(extension).map_or(error.clone(), |way| error.with_hint(way)));
     }
     let short = root.extensions_required.iter().any(|e| e == QUANTIZED);
     let mut reader = GlbReader {
@@ -76,7 +92,15 @@ fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
 /// The reachable nodes that are still to be read, with their parents' transforms. Each occurs once.
 struct NodeStack<'a> {
     reached: Vec<bool>,
-    nodes: Vec<(u32, &'a GlbNode, DMat4)>,
+    nodes: Vec<NodeToRead<'a>>,
+}
+
+struct NodeToRead<'a> {
+    index: u32,
+    node: &'a GlbNode,
+    parent: DMat4,
+    /// Whether it or a node above it is hidden.
+    is_hidden: bool,
 }
 
 /// A document and the mesh that is read from it. Normals, colors and texture coordinates are kept only if every part has
@@ -108,14 +132,14 @@ impl<'a> GlbReader<'a> {
     }
 
     /// Pushes nodes on the stack, the first on top.
-    fn push(&self, nodes: &[u32], parent: DMat4, tree: &mut NodeStack<'a>) -> Result<()> {
+    fn push(&self, nodes: &[u32], parent: DMat4, hidden: bool, tree: &mut NodeStack<'a>) -> Result<()> {
         for &index in nodes.iter().rev() {
             let node = self.get("node", &self.root.nodes, index)?;
             if std::mem::replace(&mut tree.reached[index as usize], true) {
                 let what = "is reached twice: nodes must form a tree";
                 return Err(self.source.broken(format!("node {index}"), what));
             }
-            tree.nodes.push((index, node, parent));
+            tree.nodes.push(NodeToRead { index, node, parent, is_hidden: hidden || node.is_hidden() });
         }
         Ok(())
     }
@@ -170,16 +194,33 @@ impl<'a> GlbReader<'a> {
             }
         }
         let mut tree = NodeStack { reached: vec![false; root.nodes.len()], nodes: Vec::new() };
-        self.push(&self.roots()?, DMat4::IDENTITY, &mut tree)?;
-        while let Some((index, node, parent)) = tree.nodes.pop() {
+        self.push(&self.roots()?, DMat4::IDENTITY, false, &mut tree)?;
+        let mut hidden = 0;
+        while let Some(NodeToRead { index, node, parent, is_hidden }) = tree.nodes.pop() {
             let matrix = parent * node.parent_from_node();
             if !matrix.is_finite() {
                 return Err(self.source.broken(format!("node {index}"), "its transform is not finite"));
             }
-            if let Some(mesh) = node.mesh {
-                self.parts_of(mesh, node, matrix)?;
+            match node.mesh {
+                Some(_) if is_hidden => hidden += 1,
+                Some(mesh) => self.parts_of(mesh, node, matrix)?,
+                None => {}
             }
-            self.push(&node.children, matrix, &mut tree)?;
+            self.push(&node.children, matrix, is_hidden, &mut tree)?;
+        }
+        let elsewhere =
+            root.nodes.iter().zip(&tree.reached).filter(|(node, reached)| node.mesh.is_some() && !*reached);
+        let elsewhere = elsewhere.count();
+        if hidden > 0 {
+            let hidden = counted(hidden, "hidden node");
+            self.out.note(format!("{hidden} left out (`KHR_node_visibility`)"));
+        }
+        if elsewhere > 0 {
+            let elsewhere = counted(elsewhere, "node");
+            self.out.note(format!("{elsewhere} outside the default scene left out"));
+        }
+        if hidden > 0 && self.out.mesh.triangles.is_empty() {
+            return Err(self.source.unsupported("`nodes`", "a scene whose meshes are all hidden"));
         }
         Ok(())
     }
@@ -269,29 +310,38 @@ impl<'a> GlbReader<'a> {
                 self.out.mesh.colors.resize(first + count, [1.0; 3]);
             }
             Some((colors, width)) => {
-                let coded = |c: &[f64]| [c[0], c[1], c[2]].map(|v| srgb_from_linear(v as f32));
-                self.out.mesh.colors.extend(colors.chunks_exact(width).map(coded));
+                let linear = |c: &[f64]| [c[0], c[1], c[2]].map(|v| v as f32);
+                let mut linear: Vec<[f32; 3]> = colors.chunks_exact(width).map(linear).collect();
+                bring_into_range(&mut linear, "`COLOR_0`").into_iter().for_each(|note| self.out.note(note));
+                if width == 4 && colors.chunks_exact(4).any(|c| c[3] < 1.0) {
+                    self.out.note("`COLOR_0` has an alpha below 1; it is shown opaque");
+                }
+                self.out.mesh.colors.extend(linear.into_iter().map(|c| c.map(srgb_from_linear)));
             }
         }
-        let pbr = material.map(|m| &m.pbr_metallic_roughness).filter(|pbr| pbr.base_color_texture.is_none());
-        if let Some(factors) = pbr.and_then(|pbr| pbr.tint()) {
+        let color = material.map(|m| m.color()).unwrap_or_default();
+        color.note.into_iter().for_each(|note| self.out.note(note));
+        if let Some(factors) = color.tint.filter(|_| color.texture.is_none()) {
             self.tinted = true;
             for (c, f) in self.out.mesh.colors[first..].iter_mut().flat_map(|c| c.iter_mut().zip(factors)) {
                 *c = srgb_from_linear(linear_from_srgb(*c) * f);
             }
         }
         if source.options.texture {
-            let info = self.base_color(primitive.material)?;
-            self.textures.insert(info.map(|i| i.index));
-            if info.is_some() {
-                self.tints.push(material.and_then(|m| m.pbr_metallic_roughness.tint()));
+            let used = self.texture_of(primitive.material)?;
+            self.textures.insert(used.map(|i| i.index));
+            if used.is_some() {
+                self.tints.push(color.tint);
             }
-            let set = info.map_or(0, |i| i.tex_coord);
-            match (attribute(self, Semantic::TexCoords(set), &[Type::Vec2], &SHORTENED)?, info) {
+            let set = used.map_or(0, GlbTextureUse::set);
+            match (attribute(self, Semantic::TexCoords(set), &[Type::Vec2], &SHORTENED)?, used) {
                 (Some((uvs, _)), _) => {
-                    let uv = |&[u, v]: &[f64; 2]| Vec2::new(u as f32, v as f32);
-                    let uvs = uvs.as_chunks::<2>().0.iter().map(uv);
-                    self.out.atlas.iter_mut().for_each(|atlas| atlas.uvs.extend(uvs.clone()));
+                    let placed = |uv: &[f64; 2]| used.map_or(*uv, |used| used.placed(*uv)).map(|v| v as f32);
+                    let uvs: Vec<Vec2> = uvs.as_chunks::<2>().0.iter().map(|uv| placed(uv).into()).collect();
+                    if uvs.iter().any(|uv| !uv.is_finite()) {
+                        return Err(source.broken(at, "a texture coordinate is not finite"));
+                    }
+                    self.out.atlas.iter_mut().for_each(|atlas| atlas.uvs.extend(&uvs));
                 }
                 (None, Some(_)) => {
                     return Err(source.broken(at, format!("there is no `TEXCOORD_{set}`")));
@@ -397,38 +447,52 @@ impl<'a> GlbReader<'a> {
         }
     }
 
-    /// Returns the base color texture of a material, if it has one.
-    fn base_color(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
+    /// Returns the texture that colors a material, if it has one.
+    fn texture_of(&self, material: Option<u32>) -> Result<Option<&'a GlbTextureUse>> {
         let Some(index) = material else { return Ok(None) };
-        let material = self.get("material", &self.root.materials, index)?;
-        let info = material.pbr_metallic_roughness.base_color_texture.as_ref();
-        if info.is_some_and(|i| i.extensions.transform.is_some()) {
-            return Err(self.source.unsupported(format!("material {index}"), "`KHR_texture_transform`"));
+        let texture = self.get("material", &self.root.materials, index)?.color().texture;
+        // programs do not agree on which way it turns
+        if texture.and_then(|t| t.extensions.transform.as_ref()).is_some_and(|to| to.rotation != 0.0) {
+            let feature = "`KHR_texture_transform` with a rotation";
+            return Err(self.source.unsupported(format!("material {index}"), feature));
         }
-        Ok(info)
+        Ok(texture)
     }
 
     /// Returns the picture behind a texture, and its size in the atlas. Its header is checked against the limits for
     /// pictures; it is not decoded.
     fn picture(&mut self, texture: u32) -> Result<PictureSource> {
         let source = self.source;
-        let Some(index) = self.get("texture", &self.root.textures, texture)?.source else {
-            let at = format!("texture {texture}");
-            return Err(source.unsupported(at, "a texture without a PNG or JPEG of its own"));
+        let texture_at = format!("texture {texture}");
+        let texture = self.get("texture", &self.root.textures, texture)?;
+        let Some(index) = texture.source else {
+            let feature = "a texture without a PNG or JPEG of its own";
+            let Some(format) = texture.extensions.name() else {
+                return Err(source.unsupported(texture_at, feature));
+            };
+            let error = source.unsupported(texture_at, format!("{feature}, but in {format},"));
+            return Err(error.with_hint(
+                "export it with PNG or JPEG; the editor of three.js reads KTX2 and WebP and exports PNG",
+            ));
         };
         let image = self.get("image", &self.root.images, index)?;
         let at = format!("image {index}");
-        if image.uri.is_some() {
-            return Err(source.unsupported(at, "a picture outside the file"));
-        }
-        let view = image.buffer_view.ok_or_else(|| source.broken(&at, "has no buffer view"))?;
-        let (bytes, _) = self.view(view)?;
-        let info = io::parse_picture_info(bytes, source.path, &io::Limits::default())
+        let bytes = match &image.uri {
+            None => {
+                let view = image.buffer_view.ok_or_else(|| source.broken(&at, "has no buffer view"))?;
+                self.view(view)?.0.to_vec()
+            }
+            Some(uri) => match data_of_uri(uri) {
+                None => return Ok(PictureSource::Beside(name_of_uri(uri))),
+                Some(data) => data.ok_or_else(|| source.broken(&at, "its data URI is not Base64"))?,
+            },
+        };
+        let info = io::parse_picture_info(&bytes, source.path, &io::Limits::default())
             .map_err(|e| source.broken(&at, e))?;
         if let Some(atlas) = &mut self.out.atlas {
             (atlas.width, atlas.height) = (info.width, info.height);
         }
-        Ok(PictureSource::Inside(bytes.to_vec()))
+        Ok(PictureSource::Inside(bytes))
     }
 }
 
@@ -437,243 +501,4 @@ fn names<T: std::fmt::Debug>(all: &[T]) -> String {
     let names: Vec<String> = all.iter().map(|v| format!("{v:?}")).collect();
     let (last, rest) = names.split_last().expect("something is always allowed");
     if rest.is_empty() { last.clone() } else { format!("{} or {last}", rest.join(", ")) }
-}
-
-/// Maximum number of objects and arrays. One takes two bytes of JSON and up to 144 in memory, and twice that while a list grows.
-const MAX_NESTED: usize = 1 << 20;
-/// Maximum number of values. A key with an index takes six bytes of JSON and up to a hundred in memory.
-const MAX_VALUES: usize = 4 << 20;
-
-#[derive(Deserialize, Default)]
-#[serde(rename_all = "camelCase", default)]
-struct GlbRoot {
-    accessors: Vec<GlbAccessor>,
-    buffer_views: Vec<GlbView>,
-    buffers: Vec<GlbBuffer>,
-    meshes: Vec<GlbMesh>,
-    nodes: Vec<GlbNode>,
-    scenes: Vec<GlbScene>,
-    scene: Option<u32>,
-    extensions_required: Vec<String>,
-    materials: Vec<GlbMaterial>,
-    textures: Vec<GlbTexture>,
-    images: Vec<GlbImage>,
-}
-
-impl GlbRoot {
-    /// Parses the document, after bounding the memory that it may take.
-    fn parse(json: &[u8], source: Source) -> Result<GlbRoot> {
-        let at = "the JSON chunk";
-        // brackets in strings count too, but a file has few unless it is an attack
-        let count = |marks: &[u8]| json.iter().filter(|b| marks.contains(b)).count();
-        let (nested, values) = (count(b"{["), count(b"{[,"));
-        if nested > MAX_NESTED || values > MAX_VALUES {
-            let limit = format!("more than {MAX_NESTED} objects and arrays or {MAX_VALUES} values");
-            return Err(source.broken(at, format!("{nested} and {values}, {limit}")));
-        }
-        serde_json::from_slice(json).map_err(|e| source.broken(at, e))
-    }
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct GlbAccessor {
-    buffer_view: Option<u32>,
-    #[serde(default)]
-    byte_offset: u64,
-    component_type: Checked<GenericComponentType>,
-    count: u64,
-    #[serde(rename = "type")]
-    kind: Checked<Type>,
-    #[serde(default)]
-    normalized: bool,
-    sparse: Option<IgnoredAny>,
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct GlbView {
-    buffer: u32,
-    #[serde(default)]
-    byte_offset: u64,
-    byte_length: u64,
-    byte_stride: Option<usize>,
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct GlbBuffer {
-    byte_length: u64,
-    uri: Option<IgnoredAny>,
-}
-
-#[derive(Deserialize)]
-struct GlbMesh {
-    primitives: Vec<GlbPrimitive>,
-    /// Weights of morph targets, for nodes that have none of their own.
-    #[serde(default)]
-    weights: Value,
-}
-
-#[derive(Deserialize)]
-struct GlbPrimitive {
-    attributes: BTreeMap<Checked<Semantic>, u32>,
-    indices: Option<u32>,
-    #[serde(default)]
-    mode: Checked<Mode>,
-    material: Option<u32>,
-    /// Morph targets.
-    targets: Option<IgnoredAny>,
-}
-
-#[derive(Deserialize, Default)]
-#[serde(default)]
-struct GlbNode {
-    mesh: Option<u32>,
-    children: Vec<u32>,
-    matrix: Option<Box<[f64; 16]>>,
-    translation: Option<[f64; 3]>,
-    rotation: Option<Box<[f64; 4]>>,
-    scale: Option<[f64; 3]>,
-    skin: Option<IgnoredAny>,
-    weights: Option<Box<Value>>,
-    extensions: GlbNodeExtensions,
-}
-
-#[derive(Deserialize, Default)]
-#[serde(default)]
-struct GlbNodeExtensions {
-    #[serde(rename = "EXT_mesh_gpu_instancing")]
-    instancing: Option<IgnoredAny>,
-}
-
-impl GlbNode {
-    /// Features that move the triangles of a mesh away from their accessors and the nodes' transforms.
-    fn deformation(&self, mesh: &GlbMesh) -> Option<&'static str> {
-        let weights = self.weights.as_deref().unwrap_or(&mesh.weights);
-        let is_morphed = mesh.primitives.iter().any(|p| p.targets.is_some())
-            && weights.as_array().into_iter().flatten().any(|w| w.as_f64().is_some_and(|w| w != 0.0));
-        let found = [
-            (self.skin.is_some(), "a skin"),
-            (is_morphed, "a morph target whose weight is not 0"),
-            (self.extensions.instancing.is_some(), "`EXT_mesh_gpu_instancing`"),
-        ];
-        found.into_iter().find_map(|(is_there, name)| is_there.then_some(name))
-    }
-
-    /// Returns the transform from the node's coordinates to its parent's.
-    fn parent_from_node(&self) -> DMat4 {
-        if let Some(matrix) = &self.matrix {
-            return DMat4::from_cols_array(matrix);
-        }
-        let q = self.rotation.as_deref().map_or(DQuat::IDENTITY, |q| DQuat::from_array(*q));
-        let q = if q.length() > 0.0 { q / q.length() } else { DQuat::IDENTITY };
-        DMat4::from_scale_rotation_translation(
-            self.scale.map_or(DVec3::ONE, DVec3::from),
-            q,
-            self.translation.map_or(DVec3::ZERO, DVec3::from),
-        )
-    }
-}
-
-#[derive(Deserialize, Default)]
-#[serde(default)]
-struct GlbScene {
-    nodes: Vec<u32>,
-}
-
-#[derive(Deserialize, Default)]
-#[serde(rename_all = "camelCase", default)]
-struct GlbMaterial {
-    pbr_metallic_roughness: GlbPbr,
-    extras: Value,
-}
-
-impl GlbMaterial {
-    /// Returns whether the material is marked as one of the soft layers around a mesh.
-    fn is_soft_layer(&self) -> bool {
-        self.extras["tiface"]["soft_layers"].is_u64()
-    }
-}
-
-#[derive(Deserialize, Default)]
-#[serde(rename_all = "camelCase", default)]
-struct GlbPbr {
-    base_color_texture: Option<GlbTextureUse>,
-    /// Factors of colors and texture; any JSON value.
-    base_color_factor: Value,
-}
-
-impl GlbPbr {
-    /// Returns the linear red, green and blue factors of colors, if they are not all 1.
-    fn tint(&self) -> Option<[f32; 3]> {
-        let [r, g, b] = [0, 1, 2].map(|k| self.base_color_factor[k].as_f64().map(|v| v as f32));
-        let tint = [r?, g?, b?];
-        (tint.iter().all(|v| v.is_finite()) && tint != [1.0; 3]).then_some(tint)
-    }
-}
-
-/// A material's reference to a texture.
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct GlbTextureUse {
-    index: u32,
-    #[serde(default)]
-    tex_coord: u32,
-    #[serde(default)]
-    extensions: GlbTextureExtensions,
-}
-
-#[derive(Deserialize, Default)]
-#[serde(default)]
-struct GlbTextureExtensions {
-    #[serde(rename = "KHR_texture_transform")]
-    transform: Option<IgnoredAny>,
-}
-
-#[derive(Deserialize, Default)]
-#[serde(default)]
-struct GlbTexture {
-    source: Option<u32>,
-}
-
-#[derive(Deserialize, Default)]
-#[serde(rename_all = "camelCase", default)]
-struct GlbImage {
-    buffer_view: Option<u32>,
-    uri: Option<IgnoredAny>,
-}
-
-/// Tests node transforms; reading is tested in `tests/check/hostile_mesh.rs`.
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn translation_rotation_and_scale_apply_in_gltf_order() {
-        let half = std::f64::consts::FRAC_1_SQRT_2;
-        let node = GlbNode {
-            translation: Some([10.0, 0.0, 0.0]),
-            rotation: Some(Box::new([0.0, 0.0, half, half])), // a quarter turn about z: x → y
-            scale: Some([2.0, 1.0, 1.0]),
-            ..GlbNode::default()
-        };
-        // (1, 0, 0) → scaled (2, 0, 0) → turned (0, 2, 0) → moved (10, 2, 0)
-        let p = node.parent_from_node().transform_point3(DVec3::X);
-        assert!(p.distance(DVec3::new(10.0, 2.0, 0.0)) < 1e-12);
-        assert_eq!(GlbNode::default().parent_from_node(), DMat4::IDENTITY);
-    }
-
-    #[test]
-    fn a_full_document_takes_a_few_hundred_megabytes() {
-        let largest = [
-            size_of::<GlbAccessor>(),
-            size_of::<GlbView>(),
-            size_of::<GlbMesh>(),
-            size_of::<GlbPrimitive>(),
-            size_of::<GlbNode>(),
-            size_of::<GlbMaterial>(),
-        ];
-        assert!(largest.iter().all(|&size| size <= 144), "{largest:?}");
-    }
 }

@@ -10,23 +10,26 @@
 //!
 //! # Reading
 //!
-//! OBJ → mesh: `v` with optional colors, `vt`, `vn`, `f` in all its spellings; the rest is passed over.
-//! And `map_Kd` of the `.mtl` beside it.
+//! OBJ → mesh: `v` with optional colors, `vt`, `vn`, `f` in all its spellings, the names of its materials, and the
+//! colors that ZBrush writes in comments (`#MRGB`, eight digits a vertex: mask, red, green, blue); the rest is passed
+//! over. Its `.mtl` is read apart.
 //!
 //! Written here because `tobj` 4 names no line in its errors, refuses lines that go on in the next and comments
-//! after a face, takes NaN for a number, passes over faces of two corners and splits vertices by object.
+//! after a face, takes NaN for a number, passes over faces of two corners and splits vertices by object; it knows no
+//! `#MRGB`, and keeps quotes as part of names.
 
+use super::beside::unquoted;
+use super::color_range::bring_into_range;
 use super::file_mesh::{
     ExportOptions, ExportedFiles, FileMesh, HeadTexture, distance_warning, encode, left_out, safe_name,
 };
-use super::source::{PictureSource, ReadMesh, ReadOptions, Source};
+use super::source::{PictureSource, ReadMesh, Source};
 use crate::Result;
 use crate::geom::{Aabb, Atlas, Mesh};
 use glam::{DVec3, Vec2, Vec3};
 use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::Write;
-use std::path::Path;
 
 /// Returns a mesh as an `.obj`, with a texture also its `.mtl` and its picture, which must lie in one folder; without
 /// one it is colored by its vertices.
@@ -138,7 +141,11 @@ struct Obj {
     creased: bool,
     /// Whether a face lacks texture coordinates.
     bare: bool,
+    /// The material of the faces that follow.
     material: Option<String>,
+    /// Colors of `#MRGB`, and whether one of its lines is damaged.
+    paint: Vec<[f32; 3]>,
+    is_paint_damaged: bool,
 }
 
 pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
@@ -146,10 +153,8 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     for (number, line) in lines(bytes) {
         obj.line(&line, &source, &format_args!("line {number}"))?;
     }
+    obj.finish_colors();
     let Obj { mut out, normals, normal_of, atlas, .. } = obj;
-    if out.mesh.colors.len() != out.places.len() {
-        out.mesh.colors.clear();
-    }
     if !obj.creased {
         let normals = normal_of.iter().map(|n| n.map(|n| normals[n as usize].normalize_or_zero()));
         out.mesh.normals = normals.collect::<Option<_>>().unwrap_or_default();
@@ -160,6 +165,9 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
 
 impl Obj {
     fn line(&mut self, line: &str, source: &Source, at: &dyn Display) -> Result<()> {
+        if let Some(code) = line.strip_prefix("#MRGB") {
+            return self.read_paint(code.trim(), source);
+        }
         let mut words = line.split_ascii_whitespace().take_while(|w| !w.starts_with('#'));
         let few = |numbers: &[f64], expected: &str| {
             source.broken(at, format!("{} numbers, expected {expected}", numbers.len()))
@@ -171,8 +179,11 @@ impl Obj {
                 source.allow(self.out.places.len() + 1, 0)?;
                 self.out.places.push(DVec3::new(*x, *y, *z));
                 self.normal_of.push(None);
-                if let [r, g, b] = rest {
-                    self.out.mesh.colors.push([*r, *g, *b].map(|c| c.clamp(0.0, 1.0) as f32));
+                if let [r, g, b] | [r, g, b, _] = rest {
+                    self.out.mesh.colors.push([*r, *g, *b].map(|c| c as f32));
+                }
+                if rest.len() == 4 {
+                    self.out.note("vertices have seven numbers: read as x y z, red, green, blue, and an alpha that is not shown");
                 }
             }
             "vn" => {
@@ -186,16 +197,18 @@ impl Obj {
                 source.allow(self.atlas.uvs.len() + 1, 0)?;
                 self.atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
             }
-            "mtllib" if source.options.texture && self.out.picture.is_none() => {
-                let name = line.strip_prefix("mtllib").unwrap_or("");
-                self.out.picture = Some(PictureSource::Material(source.bare_name(at, name)?));
+            "mtllib" if source.options.texture => {
+                let name = unquoted(line.strip_prefix("mtllib").unwrap_or(""));
+                match &self.out.picture {
+                    None => self.out.picture = Some(PictureSource::Material(name.into())),
+                    Some(PictureSource::Material(first)) if first == name => {}
+                    Some(_) => {
+                        self.out.note(format!("a second `mtllib` is not looked at: `{}`", start(name)))
+                    }
+                }
             }
             "usemtl" if source.options.texture => {
-                let name = words.collect::<Vec<_>>().join(" ");
-                if !self.out.mesh.triangles.is_empty() && self.material.as_ref() != Some(&name) {
-                    return Err(source.unsupported(at, "a mesh with several materials"));
-                }
-                self.material = Some(name);
+                self.material = Some(unquoted(line.strip_prefix("usemtl").unwrap_or("")).into());
             }
             "f" => self.face(words, source, at)?,
             _ => {}
@@ -235,7 +248,12 @@ impl Obj {
                 source.broken(at, format!("a face with {} corners, expected at least 3", corners.len()))
             );
         }
-        source.allow(0, self.out.mesh.triangles.len() + corners.len() - 2)?;
+        let first = self.out.mesh.triangles.len();
+        source.allow(0, first + corners.len() - 2)?;
+        let last = self.out.materials.last().map(|(_, name)| name);
+        if let Some(name) = self.material.take().filter(|name| last != Some(name)) {
+            self.out.materials.push((first as u32, name));
+        }
         let fan = |c: &[u32], out: &mut Vec<[u32; 3]>| {
             out.extend(c.windows(2).skip(1).map(|w| [c[0], w[0], w[1]]));
         };
@@ -245,6 +263,44 @@ impl Obj {
             fan(&mapped, &mut self.atlas.triangles);
         }
         Ok(())
+    }
+}
+
+impl Obj {
+    /// Adds the colors of a line of `#MRGB`.
+    fn read_paint(&mut self, code: &str, source: &Source) -> Result<()> {
+        source.allow(self.paint.len() + code.len() / 8, 0)?;
+        for block in code.as_bytes().chunks(8) {
+            let word = std::str::from_utf8(block).ok().filter(|word| word.len() == 8);
+            match word.and_then(|word| u32::from_str_radix(word, 16).ok()) {
+                Some(word) => {
+                    let [_, r, g, b] = word.to_be_bytes();
+                    self.paint.push([r, g, b].map(|c| f32::from(c) / 255.0));
+                }
+                None => self.is_paint_damaged = true,
+            }
+        }
+        Ok(())
+    }
+
+    /// Chooses the colors of the vertices, and brings them into range.
+    fn finish_colors(&mut self) {
+        let (vertices, painted) = (self.out.places.len(), self.paint.len());
+        let colors = &mut self.out.mesh.colors;
+        if painted == vertices && !self.is_paint_damaged {
+            *colors = std::mem::take(&mut self.paint);
+        } else if painted > 0 || self.is_paint_damaged {
+            self.out.note(format!("`#MRGB` is not shown: it has {painted} colors for {vertices} vertices"));
+        }
+        let colored = self.out.mesh.colors.len();
+        if colored != vertices {
+            self.out.mesh.colors.clear();
+            if colored > 0 {
+                self.out.note(format!("colors are not shown: {colored} of {vertices} vertices have one"));
+            }
+        }
+        let range = bring_into_range(&mut self.out.mesh.colors, "vertex colors");
+        range.into_iter().for_each(|note| self.out.note(note));
     }
 }
 
@@ -267,32 +323,6 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
         whole.extend(line);
         Some((number, String::from_utf8_lossy(&whole).into_owned().into()))
     })
-}
-
-/// Returns the bare name of the picture that a `.mtl` file gives as its base color (`map_Kd`), if any.
-///
-/// # Errors
-///
-/// Fails if the picture lies in another folder or behind a URL, has options, or is one of several.
-pub fn picture_of_mtl(bytes: &[u8], path: &Path) -> Result<Option<String>> {
-    let source = Source { path, format: "MTL", options: &ReadOptions::default() };
-    let mut found: Option<String> = None;
-    for (number, line) in bytes.split(|&b| b == b'\n').enumerate() {
-        let line = String::from_utf8_lossy(line.trim_ascii());
-        let Some(name) = line.strip_prefix("map_Kd").filter(|n| n.starts_with(char::is_whitespace)) else {
-            continue;
-        };
-        let at = format!("line {}", number + 1);
-        if name.trim_start().starts_with('-') {
-            return Err(source.unsupported(at, "a texture with options"));
-        }
-        let name = source.bare_name(at.as_str(), name)?;
-        if found.as_ref().is_some_and(|f| *f != name) {
-            return Err(source.unsupported(at, "a mesh with several base colors"));
-        }
-        found = Some(name);
-    }
-    Ok(found)
 }
 
 fn floats<'w>(words: impl Iterator<Item = &'w str>, source: &Source, at: &dyn Display) -> Result<Vec<f64>> {
@@ -324,7 +354,7 @@ fn start(word: &str) -> String {
 mod tests {
     use super::*;
     use crate::mesh::files::file_mesh::tests::tetrahedron;
-    use crate::mesh::files::{PictureSource, ReadOptions, picture_of_mtl, read, read_with};
+    use crate::mesh::files::{PictureSource, ReadOptions, materials_of_mtl, read, read_with};
     use glam::Vec3;
     use std::path::Path;
 
@@ -374,8 +404,8 @@ mod tests {
         let mtl = String::from_utf8(out.files[1].1.clone()).unwrap();
         assert!(mtl.contains("\nnewmtl B_ste_7\n"), "{mtl}");
         assert!(mtl.ends_with("Ka 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd my_head.png\n"));
-        let picture = picture_of_mtl(&out.files[1].1, Path::new("my_head.mtl")).unwrap();
-        assert_eq!(picture.as_deref(), Some("my_head.png"));
+        let materials = materials_of_mtl(&out.files[1].1, Path::new("my_head.mtl")).unwrap();
+        assert_eq!(materials[0].picture.as_deref(), Some("my_head.png"));
         let back = read_with(&out.files[0].1, Path::new("a.obj"), &ReadOptions::default()).unwrap();
         assert_eq!(back.picture, Some(PictureSource::Material("my_head.mtl".into())));
         assert!(back.mesh.is_closed() && back.mesh.colors.is_empty());

@@ -41,9 +41,9 @@ pub enum PictureSource {
     /// In the file: PNG or JPEG, for [`crate::io::parse_photo`]. Its header is within the limits for
     /// pictures; the data is not checked.
     Inside(Vec<u8>),
-    /// In a picture of this bare name, in the same folder.
+    /// In a picture of this name, as it is written, without quotes; it is looked for in the mesh's folder alone.
     Beside(String),
-    /// In the picture that [`super::picture_of_mtl`] finds in the `.mtl` of this bare name, in the same folder.
+    /// In the pictures and colors of the `.mtl` of this name, which [`super::materials_of_mtl`] reads.
     Material(String),
 }
 
@@ -51,7 +51,7 @@ pub enum PictureSource {
 #[derive(Clone, Copy)]
 pub(super) struct Source<'a> {
     pub path: &'a Path,
-    /// `GLB`, `PLY`, `OBJ` or `MTL`.
+    /// `GLB`, `PLY`, `OBJ`, `STL` or `MTL`.
     pub format: &'static str,
     pub options: &'a ReadOptions,
 }
@@ -78,16 +78,6 @@ impl Source<'_> {
         };
         let what = format!("`{}`, {at}: {feature} is not supported", self.path.display());
         Error::cannot(what, hint)
-    }
-
-    /// Returns the name of a file in the same folder: no path, no URL.
-    pub fn bare_name(&self, at: impl Display, name: &str) -> Result<String> {
-        let name = name.trim();
-        let name = name.strip_prefix("./").unwrap_or(name);
-        let is_bare = !name.is_empty()
-            && name != ".."
-            && !name.contains(|c: char| c.is_control() || "/\\:".contains(c));
-        if is_bare { Ok(name.into()) } else { Err(self.unsupported(at, "a texture outside the folder")) }
     }
 
     /// Checks the numbers of vertices and triangles against the limits.
@@ -120,6 +110,25 @@ pub struct ReadMesh {
     pub picture: Option<PictureSource>,
     /// Linear red, green and blue factors of the base color, if the file has them.
     pub tint: Option<[f32; 3]>,
+    /// The names of the materials that an OBJ uses, each with the triangle where it begins.
+    pub materials: Vec<(u32, String)>,
+    /// What was read otherwise than it is written, or left out; one sentence each.
+    pub notes: Vec<String>,
     /// The positions in the file's coordinates while the file is read; then they move to `mesh`.
     pub(super) places: Vec<DVec3>,
+}
+
+impl ReadMesh {
+    /// Adds a sentence, once.
+    pub(super) fn note(&mut self, text: impl Into<String>) {
+        let text = text.into();
+        if !self.notes.contains(&text) {
+            self.notes.push(text);
+        }
+    }
+}
+
+/// Returns a text without the byte order mark that some editors put before it.
+pub(super) fn without_byte_order_mark(bytes: &[u8]) -> &[u8] {
+    bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }

@@ -275,7 +275,7 @@ pub fn head_page(session: &Session) -> Result<String> {
     viewer_html(&viewer, &rows)
 }
 
-/// Returns a page with a 3D viewer of a GLB, OBJ or PLY file, and the features of it that cannot be shown. `up` is
+/// Returns a page with a 3D viewer of a GLB, OBJ, PLY or STL file, and the features of it that cannot be shown. `up` is
 /// its up direction.
 ///
 /// # Errors
@@ -283,7 +283,9 @@ pub fn head_page(session: &Session) -> Result<String> {
 /// Fails if the file cannot be read, or uses features that a page cannot show.
 pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
     let bytes = io::read_bytes(path, &Limits::default())?;
-    let OpenedMesh { head, mut warnings, .. } = open_mesh(path)?;
+    let opened = open_mesh(path)?;
+    let mut warnings = opened.warnings();
+    let OpenedMesh { head, .. } = opened;
     let as_glb = |head: &HeadMesh| {
         let options = ExportOptions {
             world_from_mesh: head.world_from_scene,

@@ -1,0 +1,135 @@
+//! Files that a mesh names: materials and pictures.
+//!
+//! Programs write them as they saw them: in quotes, with folders, with the drive of another machine. They are looked
+//! for in the mesh's own folder and the folders in it, and nowhere else: of `C:\scans\textures\head.png` first
+//! `textures/head.png`, then `head.png`. A file that is not found as it was written is told with the result.
+
+use crate::io;
+use crate::{Error, Result};
+use std::path::{Path, PathBuf};
+
+/// A file that was found, and a sentence if it is not where its name said.
+pub(super) struct Beside {
+    pub file: PathBuf,
+    pub note: Option<String>,
+}
+
+/// Folders of a name that are looked for, from its end.
+const MAX_PARTS: usize = 8;
+
+/// Returns a name without the quotes around it, and without blanks at its ends.
+pub(super) fn unquoted(name: &str) -> &str {
+    let name = name.trim();
+    let inner = ['"', '\''].into_iter().find_map(|q| name.strip_prefix(q)?.strip_suffix(q));
+    inner.unwrap_or(name).trim()
+}
+
+/// Finds a file in one of `folders` by the name that the file `by` writes.
+///
+/// # Errors
+///
+/// Fails if no such file is there, or if the name is none.
+pub(super) fn find(folders: &[&Path], by: &Path, written: &str) -> Result<Beside> {
+    let parts = inner_parts(written);
+    let shown = by.display();
+    let Some(name) = parts.last().filter(|_| !written.contains(char::is_control)) else {
+        let hint = "give it the name of a file in the folder of the mesh";
+        return Err(Error::cannot(format!("`{shown}` names no file: `{}`", written.escape_debug()), hint));
+    };
+    let mut seen: Vec<&Path> = folders.to_vec();
+    seen.dedup();
+    for folder in &seen {
+        for first in 0..parts.len() {
+            let inner: PathBuf = parts[first..].iter().collect();
+            let file = folder.join(&inner);
+            if io::is_file(&file) {
+                let is_as_written =
+                    written == inner.to_string_lossy() || written.strip_prefix("./") == inner.to_str();
+                let note =
+                    || format!("`{shown}` names `{written}`; `{}` in its folder is taken", inner.display());
+                return Ok(Beside { note: (!is_as_written).then(note), file });
+            }
+        }
+    }
+    if let Some((folder, other)) =
+        seen.iter().find_map(|folder| Some((folder, in_another_case(folder, name)?)))
+    {
+        let note = format!("`{shown}` names `{written}`; `{other}` in its folder is taken");
+        return Ok(Beside { file: folder.join(other), note: Some(note) });
+    }
+    let near = seen.iter().find_map(|folder| io::similar(&folder.join(name)));
+    let near = near.and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
+    let hint = match near {
+        Some(near) => format!("put it into the folder of the mesh, or rename `{near}`, which is there"),
+        None => "put it into the folder of the mesh".into(),
+    };
+    Err(Error::cannot(format!("`{shown}` names `{written}`, which is not there"), hint))
+}
+
+/// Returns the end of a path that leads into the folder: what follows the last `..`, without drive and root.
+fn inner_parts(written: &str) -> Vec<&str> {
+    let mut parts = Vec::new();
+    for part in written.split(['/', '\\', ':']).map(str::trim) {
+        match part {
+            "" | "." => {}
+            ".." => parts.clear(),
+            part => parts.push(part),
+        }
+    }
+    // `a/..` names a folder
+    let ends_above = written.trim_end_matches(['/', '\\']).ends_with("..") && parts.is_empty();
+    if ends_above { Vec::new() } else { parts.split_off(parts.len().saturating_sub(MAX_PARTS)) }
+}
+
+/// Returns the only file in a folder whose name differs from this one by capital letters alone.
+fn in_another_case(folder: &Path, name: &str) -> Option<String> {
+    // the folder of a bare file name is empty
+    let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+    let names = io::list_files(folder).ok()?;
+    let mut same = names.into_iter().filter(|other| other.to_lowercase() == name.to_lowercase());
+    same.next().filter(|_| same.next().is_none())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quotes_are_no_part_of_a_name() {
+        assert_eq!(unquoted(" \"my head.png\" "), "my head.png");
+        assert_eq!(unquoted("'a'"), "a");
+        assert_eq!(unquoted("a \"b\""), "a \"b\"");
+        assert_eq!(unquoted("\""), "\"");
+    }
+
+    #[test]
+    fn a_path_of_another_machine_is_cut_to_what_can_lie_in_the_folder() {
+        assert_eq!(inner_parts("C:\\scans\\head.png"), ["C", "scans", "head.png"]);
+        assert_eq!(inner_parts("..\\textures\\head.png"), ["textures", "head.png"]);
+        assert_eq!(inner_parts("/a/../../b.png"), ["b.png"]);
+        assert_eq!(inner_parts("./head.png"), ["head.png"]);
+        for name in ["", "..", "/", "a/..", ".", "c:"] {
+            assert!(inner_parts(name).len() < 2, "{name}");
+        }
+        assert!(inner_parts("a/..").is_empty());
+    }
+
+    #[test]
+    fn files_above_the_folder_are_never_found() {
+        let dir = tempfile::tempdir().unwrap();
+        let inside = dir.path().join("mesh");
+        std::fs::create_dir_all(inside.join("textures")).unwrap();
+        std::fs::write(dir.path().join("secret.png"), "s").unwrap();
+        std::fs::write(inside.join("textures/head.png"), "h").unwrap();
+        let secret = dir.path().join("secret.png");
+        for name in ["../secret.png", "..\\secret.png", secret.to_str().unwrap(), "x/../../secret.png"] {
+            let error = find(&[&inside], Path::new("a.mtl"), name).err().unwrap();
+            assert!(error.to_string().contains("which is not there"), "{name}: {error}");
+        }
+        let found = find(&[&inside], Path::new("a.mtl"), "C:\\x\\Textures\\..\\textures\\head.png").unwrap();
+        assert_eq!(found.file, inside.join("textures/head.png"));
+        assert!(found.note.unwrap().contains("`textures/head.png` in its folder is taken"));
+        let found = find(&[&inside], Path::new("a.mtl"), "textures/head.png").unwrap();
+        assert!(found.note.is_none());
+    }
+}

@@ -1,0 +1,218 @@
+//! Opening of mesh files with the materials and pictures beside them: the one reader of `check`, `preview` and `metrics`.
+//!
+//! A texture that cannot be shown never stops a mesh from being opened: why it is not shown, and what was read otherwise
+//! than it is written, is returned with the mesh.
+
+use super::beside;
+use super::color_range::{at_vertices, bring_into_range};
+use super::file_mesh::HeadTexture;
+use super::gltf_text::as_glb;
+use super::mtl::{Material, materials_of_mtl};
+use super::read::read_with;
+use super::source::{PictureSource, ReadMesh, ReadOptions, Source};
+use super::stored::HeadMesh;
+use crate::geom::{Atlas, Similarity};
+use crate::image::{Photo, linear_from_srgb, quantize, srgb_from_linear};
+use crate::io::{self, Limits};
+use crate::{Error, Result};
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// The content of a mesh file.
+#[derive(Debug)]
+pub struct OpenedMesh {
+    /// The mesh with its texture; the file's coordinates are taken for the world.
+    pub head: HeadMesh,
+    /// The texture coordinates of a missing texture.
+    pub bare_atlas: Option<Atlas>,
+    /// Why the texture that the file names is not shown.
+    pub texture_problem: Option<String>,
+    /// What was read otherwise than it is written, or left out.
+    pub notes: Vec<String>,
+}
+
+impl OpenedMesh {
+    /// Returns all that a user should know of what is shown.
+    pub fn warnings(&self) -> Vec<String> {
+        let problem = self.texture_problem.iter().map(|what| format!("{what}; shown without its texture"));
+        problem.chain(self.notes.iter().cloned()).collect()
+    }
+}
+
+/// Returns the surface in a mesh file, without its texture.
+///
+/// # Errors
+///
+/// Fails if the surface cannot be read.
+pub fn open_surface(path: &Path) -> Result<ReadMesh> {
+    read_with(&bytes_of(path)?, path, &ReadOptions::SURFACE)
+}
+
+/// Opens a `.glb`, `.obj`, `.ply` or `.stl` file with its texture, and says what cannot be shown.
+///
+/// # Errors
+///
+/// Fails if the surface itself cannot be read.
+pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
+    let bytes = bytes_of(path)?;
+    let (mut found, mut texture_problem) = match read_with(&bytes, path, &ReadOptions::DEFAULT) {
+        Ok(found) => (found, None),
+        Err(e) => (read_with(&bytes, path, &ReadOptions::SURFACE)?, Some(with_way(&e))),
+    };
+    drop(bytes);
+    let mut photo = open_picture(&mut found, path).unwrap_or_else(|e| {
+        texture_problem = Some(with_way(&e));
+        None
+    });
+    let ReadMesh { mesh, origin, atlas, tint, mut notes, .. } = found;
+    if let (Some(photo), Some(tint)) = (&mut photo, tint) {
+        multiply(photo, tint);
+    }
+    let (texture, bare_atlas) = match (atlas, photo) {
+        (Some(atlas), Some(color)) => {
+            let (width, height) = (color.width, color.height);
+            (Some(HeadTexture::new(Atlas { width, height, ..atlas }, color)), None)
+        }
+        (None, Some(_)) => {
+            let what = "has a texture, but does not say where in it all of its triangles lie";
+            texture_problem = Some(format!("`{}` {what}", path.display()));
+            (None, None)
+        }
+        (atlas, None) => (None, atlas),
+    };
+    if bare_atlas.is_some() && texture_problem.is_none() && mesh.colors.is_empty() {
+        notes.push(format!("`{}` has texture coordinates, but names no picture", path.display()));
+    }
+    let world_from_scene = Similarity { translation: origin, ..Similarity::IDENTITY };
+    let head = HeadMesh { mesh, world_from_scene, texture, harmonics: None, shells: None };
+    Ok(OpenedMesh { head, bare_atlas, texture_problem, notes })
+}
+
+/// Returns the bytes of a mesh file; those of a `.gltf` as the GLB that it would be.
+fn bytes_of(path: &Path) -> Result<Vec<u8>> {
+    let bytes = io::read_bytes(path, &Limits::default())?;
+    Ok(as_glb(&bytes, path)?.unwrap_or(bytes))
+}
+
+/// Returns an error with its suggested fix in one sentence.
+fn with_way(e: &Error) -> String {
+    if e.hint().is_empty() { e.to_string() } else { format!("{e} ({})", e.hint()) }
+}
+
+/// Multiplies the linear light of a picture.
+fn multiply(photo: &mut Photo, tint: [f32; 3]) {
+    let coded = |byte: u8, factor: f32| {
+        quantize(srgb_from_linear(linear_from_srgb(f32::from(byte) / 255.0) * factor))
+    };
+    for (channel, factor) in tint.into_iter().enumerate() {
+        let table: [u8; 256] = std::array::from_fn(|byte| coded(byte as u8, factor));
+        photo.rgb.iter_mut().for_each(|c| c[channel] = table[usize::from(c[channel])]);
+    }
+}
+
+/// Opens the picture that a mesh names, if it names one. Materials of one color become colors of vertices.
+fn open_picture(found: &mut ReadMesh, path: &Path) -> Result<Option<Photo>> {
+    let limits = Limits::default();
+    let folder = path.parent().unwrap_or(Path::new(""));
+    match found.picture.take() {
+        None => Ok(None),
+        Some(PictureSource::Inside(bytes)) => Ok(Some(io::parse_photo(&bytes, path, &limits)?)),
+        Some(PictureSource::Beside(name)) => open_beside(found, &[folder], path, &name),
+        Some(PictureSource::Material(name)) => {
+            let beside = beside::find(&[folder], path, &name)?;
+            beside.note.into_iter().for_each(|note| found.note(note));
+            let mtl = &beside.file;
+            let all = materials_of_mtl(&io::read_maybe_empty(mtl, &limits)?, mtl)?;
+            let used = used_materials(found, &all, mtl);
+            let Some(name) = picture_of(found, &used, mtl)? else {
+                color_by_materials(found, &all, &used);
+                return Ok(None);
+            };
+            open_beside(found, &[mtl.parent().unwrap_or(folder), folder], mtl, &name)
+        }
+    }
+}
+
+/// Opens a picture in one of these folders, by the name that the file `by` writes.
+fn open_beside(found: &mut ReadMesh, folders: &[&Path], by: &Path, name: &str) -> Result<Option<Photo>> {
+    let beside = beside::find(folders, by, name)?;
+    beside.note.into_iter().for_each(|note| found.note(note));
+    Ok(Some(io::read_photo(&beside.file, None, &Limits::default())?))
+}
+
+/// Returns the materials of the faces; all of the file if the mesh names none of them.
+fn used_materials<'m>(found: &mut ReadMesh, all: &'m [Material], mtl: &Path) -> Vec<&'m Material> {
+    let names: BTreeSet<&str> = found.materials.iter().map(|(_, name)| name.as_str()).collect();
+    let used: Vec<&Material> = all.iter().filter(|m| names.contains(m.name.as_str())).collect();
+    let unknown =
+        names.iter().find(|name| !all.iter().any(|m| m.name == **name)).map(|name| name.to_string());
+    if let Some(name) = unknown.filter(|_| !all.is_empty()) {
+        found.note(format!("`{}` has no material `{name}`, which the mesh uses", mtl.display()));
+    }
+    if used.is_empty() { all.iter().collect() } else { used }
+}
+
+/// Returns the name of the picture of these materials, if they have one.
+fn picture_of(found: &mut ReadMesh, used: &[&Material], mtl: &Path) -> Result<Option<String>> {
+    let source = Source { path: mtl, format: "MTL", options: &ReadOptions::DEFAULT };
+    if let Some(material) = used.iter().find(|m| m.transparent.is_some()) {
+        let (key, name) = (material.transparent.unwrap_or_default(), &material.name);
+        found.note(format!("`{key}` makes the material `{name}` transparent; it is shown opaque"));
+    }
+    let own: BTreeSet<&str> = used.iter().filter_map(|m| m.picture.as_deref()).collect();
+    let stand_ins: BTreeSet<&(&str, String)> = used.iter().filter_map(|m| m.stand_in.as_ref()).collect();
+    let names: Vec<&str> = if own.is_empty() {
+        stand_ins.iter().map(|(_, name)| name.as_str()).collect()
+    } else {
+        own.into_iter().collect()
+    };
+    if let [first, second, ..] = names[..] {
+        let feature = format!("a mesh with several base colors, `{first}` and `{second}`,");
+        return Err(source.unsupported("its materials", feature));
+    }
+    let Some(name) = names.first().map(|name| (*name).to_owned()) else { return Ok(None) };
+    if let Some((key, _)) = stand_ins.first().filter(|_| used.iter().all(|m| m.picture.is_none())) {
+        found.note(format!("there is no `map_Kd`; the picture of `{key}` is shown"));
+    } else if let Some(bare) = used.iter().find(|m| m.picture.is_none()) {
+        let without = &bare.name;
+        found.note(format!("the material `{without}` has no picture; its faces show that of the others"));
+    }
+    Ok(Some(name))
+}
+
+/// Colors the vertices by the `Kd` of their faces' materials, unless they have colors, or no material is colored: gray
+/// is what programs write for a mesh without color.
+fn color_by_materials(found: &mut ReadMesh, all: &[Material], used: &[&Material]) {
+    let is_colored = |m: &Material| m.color.is_some_and(|[r, g, b]| r != g || g != b);
+    if !found.mesh.colors.is_empty() || !used.iter().any(|m| is_colored(m)) {
+        return;
+    }
+    let color = |m: &Material| m.color.unwrap_or([1.0; 3]);
+    let named = |name: &str| all.iter().find(|m| m.name == name).map(color);
+    // of a mesh without `usemtl` the first
+    let first = color(used[0]);
+    let runs: Vec<(u32, [f32; 3])> =
+        found.materials.iter().map(|(from, name)| (*from, named(name).unwrap_or([1.0; 3]))).collect();
+    let (vertices, triangles) = (found.mesh.positions.len(), &found.mesh.triangles);
+    let of_face = |t: usize| match runs.partition_point(|(from, _)| *from as usize <= t) {
+        0 => first,
+        n => runs[n - 1].1,
+    };
+    found.mesh.colors = at_vertices(vertices, triangles, of_face);
+    found.note("the mesh has no picture; the colors `Kd` of its materials are shown, taken as sRGB");
+    let range = bring_into_range(&mut found.mesh.colors, "`Kd` of its materials");
+    range.into_iter().for_each(|note| found.note(note));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_tint_multiplies_light() {
+        let mut photo = Photo { width: 2, height: 1, rgb: vec![[255; 3], [188, 9, 0]], alpha: None };
+        multiply(&mut photo, [0.5, 1.0, 0.0]);
+        // linear 0.5 is 188, linear 0.25 is 137
+        assert_eq!(photo.rgb, [[188, 255, 0], [137, 9, 0]]);
+    }
+}
