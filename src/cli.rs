@@ -367,7 +367,7 @@ pictures of meshes are written to CAPTURE_judged/ or to --out; no run is started
         /// Judge the pictures that another program made of the capture's held-out views; repeatable
         #[arg(long, value_name = "FOLDER", conflicts_with = "require")]
         views: Vec<PathBuf>,
-        /// Judge a .glb, .obj or .ply mesh by pictures from the held-out cameras; repeatable
+        /// Judge a .glb, .gltf, .obj, .ply or .stl mesh by pictures from the held-out cameras; repeatable
         #[arg(long, value_name = "FILE", conflicts_with = "require")]
         mesh: Vec<PathBuf>,
         /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
@@ -390,7 +390,7 @@ valid. Settings that are not given are the run's. More triangles or a larger tex
         #[command(flatten)]
         files: FileOptions,
     },
-    /// Render pictures of a run's mesh, or of any .glb, .obj or .ply
+    /// Render pictures of a run's mesh, or of any .glb, .gltf, .obj, .ply or .stl
     #[command(after_long_help = "Examples:
   tiface preview runs/002_00                    draw a three-quarter view, 1024 pixels, as a PNG
   tiface preview scan.ply --light matcap --up z --out scan.png
@@ -427,7 +427,7 @@ experiment.json.")]
   tiface check head.ply --json
   tiface check runs/lps/mesh/surface.ply --against captures/lps/gt.ply --seen-by captures/lps")]
     Check {
-        /// .glb, .obj or .ply file, or a run: its exported mesh, or with --against its extracted surface
+        /// .glb, .gltf, .obj, .ply or .stl file, or a run: its exported mesh, or with --against its extracted surface
         #[arg(value_name = "MESH|RUN")]
         mesh: PathBuf,
         /// Exit with 3 if not met: watertight, manifold, one-piece, no-self-intersections, sound-uv;

@@ -119,7 +119,10 @@ struct CheckJson<'a> {
 fn mesh_of(path: &Path, is_compared: bool) -> Result<(PathBuf, Option<Error>)> {
     if !capture::is_run(path) && io::is_folder(path) {
         let text = format!("`{}` is a folder, but not that of a run", path.display());
-        return Err(Error::cannot(text, "name a .glb, .obj, .ply or .stl file, or the folder of a run"));
+        return Err(Error::cannot(
+            text,
+            "name a .glb, .gltf, .obj, .ply or .stl file, or the folder of a run",
+        ));
     }
     if !capture::is_run(path) {
         return Ok((path.into(), None));

@@ -27,7 +27,7 @@ use std::time::{Duration, Instant, SystemTime};
 /// Options of `tiface preview`.
 #[derive(Args, Debug)]
 pub(super) struct PreviewOptions {
-    /// Run, or .glb, .obj, .ply or .stl file [default: the run in this folder, else the newest under runs/]
+    /// Run, or .glb, .gltf, .obj, .ply or .stl file [default: the run in this folder, else the newest under runs/]
     #[arg(value_name = "RUN|FILE")]
     path: Option<PathBuf>,
     /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (checkerboard) or wire [default:
@@ -497,7 +497,10 @@ fn target(invocation: &Invocation, path: Option<&Path>) -> Result<(RunTarget, cr
             false if io::is_folder(path) => {
                 format!("begin one, `tiface run {}`, then name it", path.display())
             }
-            false => "name the folder of a run, or, without `--watch`, a .glb, .obj or .ply file".into(),
+            false => {
+                "name the folder of a run, or, without `--watch`, a .glb, .gltf, .obj, .ply or .stl file"
+                    .into()
+            }
         };
         return Err(Error::usage(format!("`{}` is not a run", path.display()), hint));
     };

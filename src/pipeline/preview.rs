@@ -69,7 +69,7 @@ impl Preview {
         Ok(Preview { head, bare_atlas: None, up, front, views: capture.views, warnings })
     }
 
-    /// Returns the mesh in a `.glb`, `.obj`, `.ply` or `.stl` file. `up` is its up direction, +Y for most files; the front is
+    /// Returns the mesh in a `.glb`, `.gltf`, `.obj`, `.ply` or `.stl` file. `up` is its up direction, +Y for most files; the front is
     /// then +Z, or −Y if +Z is up, as in Blender.
     ///
     /// # Errors

@@ -329,8 +329,10 @@ fn a_textured_mesh_has_its_colors_from_a_texture() {
     let dir = tempfile::tempdir().unwrap();
     let obj = "mtllib t.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n";
     std::fs::write(dir.path().join("t.obj"), obj).unwrap();
-    // a material of one color is no texture
+    image::RgbImage::new(2, 2).save(dir.path().join("t.png")).unwrap();
+    // a gray material is no color, and a picture that is not there no texture
     for (mtl, colors, json) in [
+        ("newmtl a\nmap_Kd gone.png\n", "colors               NO\n", "\"has_texture\":false"),
         ("newmtl a\nKd 1 1 1\n", "colors               NO\n", "\"has_texture\":false"),
         ("newmtl a\nmap_Kd t.png\n", "colors               yes, a texture\n", "\"has_texture\":true"),
     ] {

@@ -9,7 +9,7 @@ use tiface::geom::{Atlas, Mesh, Similarity};
 use tiface::image::Photo;
 use tiface::mesh::files::{
     CheckReport, ExportOptions, HeadTexture, PictureSource, ReadMesh, ReadOptions, check, check_around,
-    picture_of_mtl, read, read_with, to_glb, to_obj, to_ply, uv_check, weld,
+    open_mesh, read, read_with, to_glb, to_obj, to_ply, uv_check, weld,
 };
 
 fn tetrahedron() -> Mesh {
@@ -489,8 +489,8 @@ fn crooked_textures_are_named_errors_but_leave_the_surface_readable() {
         (info, json!({"index": 0, "texCoord": 1}), "there is no `TEXCOORD_1`"),
         (
             info,
-            json!({"index": 0, "extensions": {"KHR_texture_transform": {}}}),
-            "`KHR_texture_transform` is not supported",
+            json!({"index": 0, "extensions": {"KHR_texture_transform": {"rotation": 1.5}}}),
+            "`KHR_texture_transform` with a rotation is not supported",
         ),
         ("/textures/0/source", json!(4), "image 4: is named, but there are only 1"),
         ("/textures/0/source", Value::Null, "texture 0: a texture without a PNG or JPEG of its own"),
@@ -500,9 +500,10 @@ fn crooked_textures_are_named_errors_but_leave_the_surface_readable() {
         ("/images/0/bufferView", json!(0), "image 0: "), // positions are no picture
         ("/bufferViews/3/byteLength", json!(1 << 30), "do not fit into a buffer of"),
         ("/bufferViews/3/byteLength", json!(20), "image 0: "),
-        ("/images/0/uri", json!("../../etc/passwd"), "image 0: a picture outside the file is not supported"),
-        ("/images/0/uri", json!("http://example.com/a.png"), "a picture outside the file"),
-        ("/images/0/uri", json!("data:image/png;base64,AAAA"), "a picture outside the file"),
+        // names of files are only names until the mesh is opened
+        ("/images/0/uri", json!("../../etc/passwd"), "read, texture true"),
+        ("/images/0/uri", json!("data:image/png;base64,AAAA"), "image 0: "),
+        ("/images/0/uri", json!("data:image/png;base64,?"), "image 0: its data URI is not Base64"),
     ];
     for (pointer, value, expected) in cases {
         let mut d = d.clone();
@@ -562,20 +563,30 @@ fn pictures_that_claim_too_much_are_refused_before_they_are_decoded() {
 
 #[test]
 fn names_of_textures_never_leave_the_folder() {
-    for name in ["../a.mtl", "/etc/passwd", "a\\b.mtl", "http://example.com/a", "c:a.mtl", "..", ""] {
-        let obj = format!("mtllib {name}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
-        assert!(whole_message(obj.as_bytes()).contains("a texture outside the folder"), "{name}");
-        assert!(read(obj.as_bytes(), Path::new("a")).is_ok());
-        let mtl = format!("newmtl a\nmap_Kd  {name} \n");
-        let found = picture_of_mtl(mtl.as_bytes(), Path::new("a"));
-        // a line without a name names nothing
-        assert!(if name.is_empty() { matches!(found, Ok(None)) } else { found.is_err() }, "{name}");
+    let dir = tempfile::tempdir().unwrap();
+    let inside = dir.path().join("mesh");
+    std::fs::create_dir(&inside).unwrap();
+    let picture = png(1, 1);
+    // what must not be opened would be read
+    std::fs::write(dir.path().join("a.png"), &picture).unwrap();
+    std::fs::write(dir.path().join("a.mtl"), "newmtl a\nmap_Kd a.png\n").unwrap();
+    std::fs::write(inside.join("good.mtl"), "newmtl a\nKd 1 1 1\n").unwrap();
+    let above = dir.path().display().to_string();
+    let problem = |name: &str, text: String| {
+        std::fs::write(inside.join(name), text).unwrap();
+        open_mesh(&inside.join("head.obj")).unwrap().texture_problem.unwrap_or_default()
+    };
+    for name in
+        ["../a", "..\\a", &format!("{above}/a"), "x/../../a", "http://example.com/a", "c:a", "..", "/", ""]
+    {
+        let obj = |mtl: &str| format!("mtllib {mtl}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n");
+        let found = problem("head.obj", obj(&format!("{name}.mtl")));
+        assert!(found.contains("which is not there"), "{name}: {found}");
+        problem("head.obj", obj("good.mtl"));
+        let found = problem("good.mtl", format!("newmtl a\nmap_Kd \"{name}.png\"\n"));
+        assert!(found.contains("which is not there"), "{name}: {found}");
+        std::fs::remove_file(inside.join("head.obj")).unwrap();
     }
-    let mtl = |text: &str| picture_of_mtl(text.as_bytes(), Path::new("a")).map_err(|e| e.to_string());
-    assert_eq!(mtl("newmtl a\r\nmap_Kd ./my head.png\r\n"), Ok(Some("my head.png".into())));
-    assert_eq!(mtl("newmtl a\nmap_Kdx a.png"), Ok(None));
-    assert!(mtl("map_Kd -s 2 2 2 a.png").unwrap_err().contains("a texture with options"));
-    assert!(mtl("map_Kd a.png\nmap_Kd b.png").unwrap_err().contains("several base colors"));
 }
 
 #[test]
@@ -586,8 +597,9 @@ fn several_materials_have_no_single_atlas() {
     assert_eq!(whole_message(&glb(&d, &bin)), "read, texture true"); // one texture, twice
     d["meshes"][0]["primitives"][1]["material"] = Value::Null;
     assert!(whole_message(&glb(&d, &bin)).contains("a mesh with several base colors is not supported"));
-    let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\nusemtl b\nf 1 2 3\n";
-    assert!(whole_message(obj.as_bytes()).contains("line 6: a mesh with several materials"));
+    let obj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\nusemtl b\nf 1 2 3\nusemtl b\nf 1 2 3\n";
+    let found = read_whole(obj.as_bytes(), Path::new("a")).unwrap();
+    assert_eq!(found.materials, [(0, "a".to_owned()), (1, "b".to_owned())]);
 }
 
 #[test]
@@ -757,7 +769,10 @@ fn advice_fits_the_format() {
     for text in [obj, ply] {
         assert!(!hint(text).contains("GLB") && !hint(text).contains("Khronos"), "{}", hint(text));
     }
-    let several = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\nusemtl b\nf 1 2 3\n";
+    let header = "format ascii 1.0\ncomment TextureFile a.png\ncomment TextureFile b.png\nelement vertex 3\n\
+                  property float x\nproperty float y\nproperty float z\nelement face 1\n\
+                  property list uchar int vertex_indices\n";
+    let several = &ply_of(header, b"0 0 0 1 0 0 0 1 0\n3 0 1 2\n");
     assert!(hint(several).contains("one texture") && !hint(several).contains("compression"));
 }
 
@@ -990,11 +1005,11 @@ fn a_loose_vertex_does_not_move_the_origin_of_a_far_mesh() {
 
 #[test]
 fn what_is_no_mesh_at_all_is_said_so() {
-    for bytes in [&b""[..], b"\0\0\0\0", b"hello world", b"{\"asset\": {}}", &[0xff; 64]] {
+    for bytes in [&b""[..], b"\0\0\0\0", b"hello world", b"{\"a\": {}}", &[0xff; 64]] {
         let e = read(bytes, Path::new("a")).unwrap_err();
-        assert_eq!(e.to_string(), "`a` is neither GLB, PLY nor OBJ");
+        assert_eq!(e.to_string(), "`a` is neither GLB, PLY, OBJ nor STL");
     }
-    assert_eq!(message(b""), "`bad` is neither GLB, PLY nor OBJ");
+    assert_eq!(message(b""), "`bad` is neither GLB, PLY, OBJ nor STL");
 }
 
 #[test]

@@ -48,7 +48,7 @@ pub fn open_surface(path: &Path) -> Result<ReadMesh> {
     read_with(&bytes_of(path)?, path, &ReadOptions::SURFACE)
 }
 
-/// Opens a `.glb`, `.obj`, `.ply` or `.stl` file with its texture, and says what cannot be shown.
+/// Opens a `.glb`, `.gltf`, `.obj`, `.ply` or `.stl` file with its texture, and says what cannot be shown.
 ///
 /// # Errors
 ///
