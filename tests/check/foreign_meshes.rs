@@ -118,8 +118,7 @@ fn a_texture_is_shown_whatever_stands_around_its_name() {
     ] {
         let text = obj(&format!("mtllib {library}\nusemtl \"skin 1\"\n"));
         let materials = format!("{materials}{map}\n");
-        let files = [("h.obj", text.as_bytes()), (mtl, materials.as_bytes()), (file, &picture())];
-        let dir = folder(&files);
+        let dir = folder(&[("h.obj", text.as_bytes()), (mtl, materials.as_bytes()), (file, &picture())]);
         let found = shown(dir.path(), "h.obj");
         assert!(found.has_texture() && found.is(SKIN), "{library} {map}: {found:?}");
         // a file that is taken for another is told
@@ -203,7 +202,7 @@ fn a_byte_order_mark_hides_no_vertex_and_no_material() {
         assert!(found.check["vertices"] == 4 && found.has_texture() && found.is(SKIN), "{name} {found:?}");
     }
     let wide: Vec<u8> = obj("").encode_utf16().flat_map(u16::to_le_bytes).collect();
-    let dir = folder(&[("h.obj", &[&[0xff, 0xfe], &wide[..]].concat())]);
+    let dir = folder(&[("h.obj", &[&[0xff, 0xfe][..], &wide].concat())]);
     let o = tiface(dir.path(), &["check", "h.obj"]);
     assert!(code(&o) == 1 && err(&o).contains("UTF-16"), "{}", err(&o));
 }
@@ -276,13 +275,13 @@ fn texture_coordinates_of_a_ply_stand_at_vertices_or_at_corners() {
     let one = "comment TextureFile \"my tex.png\"\n";
     let two = "comment TextureFile other.png\ncomment TextureFile my tex.png\n";
     let wedge = "property list uchar float texcoord\n";
-    let page = "property int texnumber\n";
+    let paged = format!("{wedge}property int texnumber\n");
     for (comments, vertex, face) in [
         (one, [ST, "0.1 0.9"], ["", ""]),
         (one, ["property float u\nproperty float v\n", "0.1 0.9"], ["", ""]),
         (one, ["property float texture_u\nproperty float texture_v\n", "0.1 0.9"], ["", ""]),
         (one, ["", ""], [wedge, "6 0.1 0.1 0.9 0.1 0.1 0.9"]),
-        (two, ["", ""], [&format!("{wedge}{page}"), "6 0.1 0.1 0.9 0.1 0.1 0.9 1"]),
+        (two, ["", ""], [paged.as_str(), "6 0.1 0.1 0.9 0.1 0.1 0.9 1"]),
     ] {
         let text = ply(comments, vertex, face);
         let dir = folder(&[("h.ply", text.as_bytes()), ("my tex.png", &picture())]);
@@ -344,8 +343,155 @@ fn glb(document: &Value, bin: &[u8]) -> Vec<u8> {
 fn changed(change: impl Fn(&mut Value)) -> Shown {
     let (mut json, bin) = document();
     change(&mut json);
-    let files = [("h.glb", &glb(&json, &bin)[..]), ("my head.png", &picture())];
-    shown(folder(&files).path(), "h.glb")
+    let (text, ply) = (text.as_bytes(), ply.as_bytes());
+    let dir = folder(&[("h.obj", text), ("a.mtl", mtl), ("a.png", &picture()), ("p.ply", ply)]);
+    for name in ["h.obj", "p.ply"] {
+        let found = shown(dir.path(), name);
+        assert!(found.check["vertices"] == 4 && found.has_texture() && found.is(SKIN), "{name} {found:?}");
+    }
+    let wide: Vec<u8> = obj("").encode_utf16().flat_map(u16::to_le_bytes).collect();
+    let dir = folder(&[("h.obj", &[&[0xff, 0xfe][..], &wide].concat())]);
+    let o = tiface(dir.path(), &["check", "h.obj"]);
+    assert!(code(&o) == 1 && err(&o).contains("UTF-16"), "{}", err(&o));
+}
+
+#[test]
+fn the_color_of_materials_is_shown_if_it_is_one() {
+    let mtl = b"newmtl skin\nKd 0.7843 0.3922 0.1961\nd 0.5\nnewmtl eye\nKd 0.1 0.1 0.9\nnewmtl grey\nKd 0.8 0.8 0.8\n";
+    let dir =
+        |used: &str| folder(&[("h.obj", obj(&format!("mtllib a.mtl\n{used}")).as_bytes()), ("a.mtl", mtl)]);
+    let found = shown(dir("usemtl skin\n").path(), "h.obj");
+    assert!(
+        found.is(SKIN) && found.says("`Kd`") && found.says("`d` makes the material `skin` transparent"),
+        "{found:?}"
+    );
+    // gray is what programs write of a mesh without color
+    let found = shown(dir("usemtl grey\n").path(), "h.obj");
+    assert!(found.check["has_colors"] == false, "{found:?}");
+}
+
+#[test]
+fn several_materials_with_one_picture_have_one_texture() {
+    let text = obj("mtllib a.mtl\nusemtl a\n").replace("f 1/1 4/4 3/3", "usemtl b\nf 1/1 4/4 3/3");
+    let mtl =
+        |second: &str| format!("newmtl a\nmap_Kd a.png\nnewmtl b\nmap_Kd {second}\nnewmtl c\nmap_Kd c.png\n");
+    let one = mtl("a.png");
+    let dir = folder(&[("h.obj", text.as_bytes()), ("a.mtl", one.as_bytes()), ("a.png", &picture())]);
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.has_texture() && found.is(SKIN), "{found:?}");
+    // of two pictures both are named
+    std::fs::write(dir.path().join("a.mtl"), mtl("b.png")).unwrap();
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.says("`a.png` and `b.png`") && found.check["has_texture"] == false, "{found:?}");
+}
+
+const ST: &str = "property float s\nproperty float t\n";
+
+/// Properties of three names and a type.
+fn color(kind: &str, names: [&str; 3]) -> String {
+    names.map(|name| format!("property {kind} {name}\n")).concat()
+}
+
+#[test]
+fn colors_of_a_ply_are_known_by_their_names_and_their_range() {
+    let plain = ["red", "green", "blue"];
+    let diffuse = ["diffuse_red", "diffuse_green", "diffuse_blue"];
+    let alpha = "property uchar alpha\n";
+    for (properties, values, note) in [
+        (color("uchar", plain), "200 100 50", ""),
+        (color("uchar", diffuse), "200 100 50", ""),
+        (color("uchar", ["r", "g", "b"]), "200 100 50", ""),
+        (color("float", plain), "0.7843 0.3922 0.1961", ""),
+        (color("float", plain), "200 100 50", "divided by 255"),
+        (color("int", diffuse), "200 100 50", "divided by 255"),
+        (color("ushort", plain), "51400 25700 12850", ""),
+        (color("uchar", plain) + alpha, "200 100 50 255", ""),
+        (color("uchar", plain) + alpha, "200 100 50 51", "alpha down to 0.20"),
+    ] {
+        let text = ply("", [&properties, values], ["", ""]);
+        let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+        assert!(found.is(SKIN) && found.check["has_colors"] == true, "{properties}{values}: {found:?}");
+        assert!(if note.is_empty() { found.check["notes"].is_null() } else { found.says(note) }, "{found:?}");
+    }
+    let text = ply("", ["", ""], [&color("uchar", plain), "200 100 50"]);
+    let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+    assert!(found.is(SKIN) && found.says("faces have colors"), "{found:?}");
+}
+
+#[test]
+fn texture_coordinates_of_a_ply_stand_at_vertices_or_at_corners() {
+    let one = "comment TextureFile \"my tex.png\"\n";
+    let two = "comment TextureFile other.png\ncomment TextureFile my tex.png\n";
+    let wedge = "property list uchar float texcoord\n";
+    let paged = format!("{wedge}property int texnumber\n");
+    for (comments, vertex, face) in [
+        (one, [ST, "0.1 0.9"], ["", ""]),
+        (one, ["property float u\nproperty float v\n", "0.1 0.9"], ["", ""]),
+        (one, ["property float texture_u\nproperty float texture_v\n", "0.1 0.9"], ["", ""]),
+        (one, ["", ""], [wedge, "6 0.1 0.1 0.9 0.1 0.1 0.9"]),
+        (two, ["", ""], [paged.as_str(), "6 0.1 0.1 0.9 0.1 0.1 0.9 1"]),
+    ] {
+        let text = ply(comments, vertex, face);
+        let dir = folder(&[("h.ply", text.as_bytes()), ("my tex.png", &picture())]);
+        let found = shown(dir.path(), "h.ply");
+        assert!(found.has_texture() && found.is(SKIN), "{text}: {found:?}");
+    }
+    for (comments, face, problem) in [
+        (one, [wedge, "4 0.1 0.1 0.9 0.1"], "face 0: 4 numbers in `texcoord`, expected u and v of 3 corners"),
+        (one, [wedge, "6 0.1 0.1 0.9 nan 0.1 0.9"], "face 0: its texture coordinate is not finite"),
+        (one, [wedge, "0"], "does not say where in it all of its triangles lie"),
+        (two, [wedge, "6 0.1 0.1 0.9 0.1 0.1 0.9"], "a second texture, `my tex.png` beside `other.png`"),
+    ] {
+        let text = ply(comments, ["", ""], face);
+        let found = shown(folder(&[("h.ply", text.as_bytes()), ("my tex.png", &picture())]).path(), "h.ply");
+        assert!(found.says(problem) && found.check["has_texture"] == false, "{problem}: {found:?}");
+    }
+}
+
+/// Parts of a glTF of the tetrahedron with texture coordinates and a picture in it.
+fn document() -> (Value, Vec<u8>) {
+    let mut bin: Vec<u8> = CORNERS.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
+    bin.extend([0.1f32, 0.1, 0.9, 0.1, 0.1, 0.9, 0.9, 0.9].iter().flat_map(|v| v.to_le_bytes()));
+    bin.extend(FACES.as_flattened().iter().map(|&v| v as u8));
+    bin.extend([0; 4]); // colors from 92 on, if they are wanted
+    bin.extend(SKIN.repeat(4));
+    let (start, picture) = (bin.len(), picture());
+    bin.extend(&picture);
+    bin.resize(bin.len().next_multiple_of(4), 0);
+    let view = |at: usize, length: usize| json!({"buffer": 0, "byteOffset": at, "byteLength": length});
+    let json = json!({
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 2}, "indices": 1, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        "textures": [{"source": 0}], "images": [{"bufferView": 3, "mimeType": "image/png"}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 1]},
+            {"bufferView": 1, "componentType": 5121, "count": 12, "type": "SCALAR"},
+            {"bufferView": 2, "componentType": 5126, "count": 4, "type": "VEC2"},
+            {"bufferView": 4, "componentType": 5121, "count": 4, "type": "VEC3"}],
+        "bufferViews": [view(0, 48), view(80, 12), view(48, 32), view(start, picture.len()), view(96, 12)],
+        "buffers": [{"byteLength": bin.len()}],
+    });
+    (json, bin)
+}
+
+fn glb(document: &Value, bin: &[u8]) -> Vec<u8> {
+    let mut json = document.to_string().into_bytes();
+    json.resize(json.len().next_multiple_of(4), b' ');
+    let mut out = b"glTF".to_vec();
+    let total = 28 + json.len() + bin.len();
+    [2, total as u32, json.len() as u32].iter().for_each(|v| out.extend(v.to_le_bytes()));
+    [b"JSON", &json[..]].iter().for_each(|part| out.extend(*part));
+    out.extend((bin.len() as u32).to_le_bytes());
+    [b"BIN\0", bin].iter().for_each(|part| out.extend(*part));
+    out
+}
+
+/// What is shown of the document once it was changed.
+fn changed(change: impl Fn(&mut Value)) -> Shown {
+    let (mut json, bin) = document();
+    change(&mut json);
+    shown(folder(&[("h.glb", &glb(&json, &bin)), ("my head.png", &picture())]).path(), "h.glb")
 }
 
 #[test]
@@ -440,7 +586,7 @@ fn pictures_and_buffers_of_a_gltf_are_read_from_its_folder_and_from_its_text() {
     use base64::prelude::{BASE64_STANDARD, Engine};
     let data = |kind: &str, bytes: &[u8]| format!("data:{kind};base64,{}", BASE64_STANDARD.encode(bytes));
     let embedded = data("image/png", &picture());
-    for uri in ["my%20head.png", &embedded, "C:\\a\\my head.png"] {
+    for uri in ["my%20head.png", embedded.as_str(), "C:\\a\\my head.png"] {
         let found = changed(|d| d["images"] = json!([{"uri": uri}]));
         assert!(found.has_texture() && found.is(SKIN), "{uri}: {found:?}");
     }
@@ -448,7 +594,7 @@ fn pictures_and_buffers_of_a_gltf_are_read_from_its_folder_and_from_its_text() {
     assert!(found.says("gone.png") && found.says("which is not there"), "{found:?}");
     let (json, bin) = document();
     let inside = data("application/octet-stream", &bin);
-    for uri in ["the%20data.bin", &inside] {
+    for uri in ["the%20data.bin", inside.as_str()] {
         let mut json = json.clone();
         json["buffers"][0]["uri"] = json!(uri);
         let dir = folder(&[("h.gltf", json.to_string().as_bytes()), ("the data.bin", &bin)]);
@@ -492,14 +638,15 @@ fn both_kinds_of_stl_are_read_whatever_their_header_says() {
 
 #[test]
 fn formats_that_are_not_read_are_named_with_a_way_that_works() {
-    for (bytes, name, way) in [
-        (&b"Kaydara FBX Binary  \0\x1a\0"[..], "FBX", "Blender"),
+    let formats: [(&[u8], &str, &str); 6] = [
+        (b"Kaydara FBX Binary  \0\x1a\0", "FBX", "Blender"),
         (b"; FBX 7.3.0 project file\n", "FBX as text", "Blender"),
         (b"OFF\n4 4 0\n0 0 0\n", "OFF", "MeshLab"),
         (b"PK\x03\x04\x14\0\0\0", "USDZ, 3MF", "MeshLab"),
         (b"#usda 1.0\n", "USD", "Blender"),
         (b"<?xml version=\"1.0\"?>\n<COLLADA>", "COLLADA", "Blender"),
-    ] {
+    ];
+    for (bytes, name, way) in formats {
         let dir = folder(&[("h.bin", bytes)]);
         for command in ["check", "preview"] {
             let o = tiface(dir.path(), &[command, "h.bin"]);
