@@ -52,7 +52,7 @@ pub(super) fn find(folders: &[&Path], by: &Path, written: &str) -> Result<Beside
         }
     }
     if let Some((folder, other)) =
-        seen.iter().find_map(|folder| Some((folder, in_another_case(folder, name)?)))
+        seen.iter().find_map(|folder| Some((folder, nearly_the_same(folder, name)?)))
     {
         let note = format!("`{shown}` names `{written}`; `{other}` in its folder is taken");
         return Ok(Beside { file: folder.join(other), note: Some(note) });
@@ -81,13 +81,25 @@ fn inner_parts(written: &str) -> Vec<&str> {
     if ends_above { Vec::new() } else { parts.split_off(parts.len().saturating_sub(MAX_PARTS)) }
 }
 
-/// Returns the only file in a folder whose name differs from this one by capital letters alone.
-fn in_another_case(folder: &Path, name: &str) -> Option<String> {
+/// Endings of pictures that are read, and of those that programs convert to them.
+const READ: [&str; 3] = ["png", "jpg", "jpeg"];
+const CONVERTED: [&str; 6] = ["tif", "tiff", "tga", "bmp", "webp", "exr"];
+
+/// Returns the only file in a folder whose name differs from this one by capital letters alone, or else, of a picture,
+/// by its ending.
+fn nearly_the_same(folder: &Path, name: &str) -> Option<String> {
     // the folder of a bare file name is empty
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     let names = io::list_files(folder).ok()?;
-    let mut same = names.into_iter().filter(|other| other.to_lowercase() == name.to_lowercase());
-    same.next().filter(|_| same.next().is_none())
+    let only = |is_it: &dyn Fn(&str) -> bool| {
+        let mut same = names.iter().filter(|other| is_it(&other.to_lowercase()));
+        same.next().filter(|_| same.next().is_none()).cloned()
+    };
+    let name = name.to_lowercase();
+    let (stem, ending) = name.rsplit_once('.').unwrap_or((&name, ""));
+    let is_picture = READ.contains(&ending) || CONVERTED.contains(&ending);
+    let has_stem = |other: &str| other.rsplit_once('.').is_some_and(|(s, e)| s == stem && READ.contains(&e));
+    only(&|other| other == name).or_else(|| only(&has_stem).filter(|_| is_picture))
 }
 
 #[cfg(test)]
@@ -131,5 +143,19 @@ mod tests {
         assert!(found.note.unwrap().contains("`textures/head.png` in its folder is taken"));
         let found = find(&[&inside], Path::new("a.mtl"), "textures/head.png").unwrap();
         assert!(found.note.is_none());
+    }
+
+    #[test]
+    fn a_picture_that_was_converted_is_found_if_it_is_the_only_one() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("Head.jpg"), "h").unwrap();
+        let named =
+            |name: &str| find(&[dir.path()], Path::new("a.mtl"), name).map(|found| found.note.unwrap());
+        for name in ["head.jpg", "HEAD.JPG", "head.tif", "head.png"] {
+            assert!(named(name).unwrap().contains("`Head.jpg` in its folder is taken"), "{name}");
+        }
+        assert!(named("Head.mtl").is_err() && named("head2.jpg").is_err());
+        std::fs::write(dir.path().join("head.png"), "h").unwrap();
+        assert!(named("head.tif").unwrap_err().to_string().contains("which is not there"));
     }
 }
