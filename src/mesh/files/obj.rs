@@ -183,7 +183,8 @@ impl Obj {
                     self.out.mesh.colors.push([*r, *g, *b].map(|c| c as f32));
                 }
                 if rest.len() == 4 {
-                    self.out.note("vertices have seven numbers: read as x y z, red, green, blue, and an alpha that is not shown");
+                    let what = "vertices have seven numbers: x y z, red, green, blue, and an alpha that is not shown";
+                    self.out.note(what);
                 }
             }
             "vn" => {

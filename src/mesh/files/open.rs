@@ -15,7 +15,7 @@ use crate::geom::{Atlas, Similarity};
 use crate::image::{Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 use std::path::Path;
 
 /// The content of a mesh file.
@@ -144,8 +144,8 @@ fn open_beside(found: &mut ReadMesh, folders: &[&Path], by: &Path, name: &str) -
 fn used_materials<'m>(found: &mut ReadMesh, all: &'m [Material], mtl: &Path) -> Vec<&'m Material> {
     let names: BTreeSet<&str> = found.materials.iter().map(|(_, name)| name.as_str()).collect();
     let used: Vec<&Material> = all.iter().filter(|m| names.contains(m.name.as_str())).collect();
-    let unknown =
-        names.iter().find(|name| !all.iter().any(|m| m.name == **name)).map(|name| name.to_string());
+    let known: BTreeSet<&str> = all.iter().map(|m| m.name.as_str()).collect();
+    let unknown = names.difference(&known).next().map(|name| name.to_string());
     if let Some(name) = unknown.filter(|_| !all.is_empty()) {
         found.note(format!("`{}` has no material `{name}`, which the mesh uses", mtl.display()));
     }
@@ -188,11 +188,12 @@ fn color_by_materials(found: &mut ReadMesh, all: &[Material], used: &[&Material]
         return;
     }
     let color = |m: &Material| m.color.unwrap_or([1.0; 3]);
-    let named = |name: &str| all.iter().find(|m| m.name == name).map(color);
+    let named: HashMap<&str, [f32; 3]> = all.iter().map(|m| (m.name.as_str(), color(m))).collect();
     // of a mesh without `usemtl` the first
     let first = color(used[0]);
+    let color_of = |name: &String| named.get(name.as_str()).copied().unwrap_or([1.0; 3]);
     let runs: Vec<(u32, [f32; 3])> =
-        found.materials.iter().map(|(from, name)| (*from, named(name).unwrap_or([1.0; 3]))).collect();
+        found.materials.iter().map(|(from, name)| (*from, color_of(name))).collect();
     let (vertices, triangles) = (found.mesh.positions.len(), &found.mesh.triangles);
     let of_face = |t: usize| match runs.partition_point(|(from, _)| *from as usize <= t) {
         0 => first,
