@@ -148,8 +148,12 @@ fn exr(dir: &Path, bytes: &[u8]) -> String {
     read(&[&["R", "G", "B"]]) + &read(&[&["Z"]])
 }
 
-/// GLB, OBJ or PLY, as `check` looks at it.
+/// GLB, glTF, OBJ, PLY or STL, as `check` looks at it.
 fn mesh(dir: &Path, bytes: &[u8]) -> String {
+    if bytes.trim_ascii_start().starts_with(b"{") {
+        put(dir, "a.gltf", bytes);
+        return outcome(open_mesh(&dir.join("a.gltf")));
+    }
     let options = ReadOptions { vertices: 1 << 16, triangles: 1 << 16, json: 1 << 20, texture: true };
     let found = read_with(bytes, &dir.join("a.mesh"), &options);
     if let Ok(found) = &found {
