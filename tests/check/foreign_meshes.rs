@@ -200,6 +200,11 @@ fn a_byte_order_mark_hides_no_vertex_and_no_material() {
         let found = shown(dir.path(), name);
         assert!(found.check["vertices"] == 4 && found.has_texture() && found.is(SKIN), "{name} {found:?}");
     }
+    // as carriage returns alone hide no line
+    let returns = |text: &[u8]| String::from_utf8_lossy(text).replace('\n', "\r").into_bytes();
+    let dir = folder(&[("h.obj", &returns(text)), ("a.mtl", &returns(mtl)), ("a.png", &picture())]);
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.check["vertices"] == 4 && found.has_texture() && found.is(SKIN), "{found:?}");
     let wide: Vec<u8> = obj("").encode_utf16().flat_map(u16::to_le_bytes).collect();
     let dir = folder(&[("h.obj", &[&[0xff, 0xfe][..], &wide].concat())]);
     let o = tiface(dir.path(), &["check", "h.obj"]);

@@ -4,7 +4,7 @@
 //! `map_Kd`; programs that write none may have it as `map_Ke` or `map_Ka`.
 
 use super::beside::unquoted;
-use super::source::{ReadOptions, Source, without_byte_order_mark};
+use super::source::{ReadOptions, Source, line_end, without_byte_order_mark};
 use crate::Result;
 use std::path::Path;
 
@@ -36,7 +36,8 @@ pub struct Material {
 pub fn materials_of_mtl(bytes: &[u8], path: &Path) -> Result<Vec<Material>> {
     let source = Source { path, format: "MTL", options: &ReadOptions::DEFAULT };
     let mut all: Vec<Material> = Vec::new();
-    for (number, line) in (1..).zip(without_byte_order_mark(bytes).split(|&b| b == b'\n')) {
+    let (text, end) = (without_byte_order_mark(bytes), line_end(bytes));
+    for (number, line) in (1..).zip(text.split(|&b| b == end)) {
         let line = String::from_utf8_lossy(line.trim_ascii());
         let (key, value) = line.split_once(char::is_whitespace).unwrap_or((&line, ""));
         let (key, value) = (key.to_ascii_lowercase(), value.trim());

@@ -23,7 +23,7 @@ use super::color_range::bring_into_range;
 use super::file_mesh::{
     ExportOptions, ExportedFiles, FileMesh, HeadTexture, distance_warning, encode, left_out, safe_name,
 };
-use super::source::{PictureSource, ReadMesh, Source};
+use super::source::{PictureSource, ReadMesh, Source, line_end};
 use crate::Result;
 use crate::geom::{Aabb, Atlas, Mesh};
 use glam::{DVec3, Vec2, Vec3};
@@ -308,7 +308,8 @@ impl Obj {
 /// Returns the lines with their numbers. A line that ends with a backslash continues in the next, under its own
 /// number; a comment does not.
 fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
-    let mut lines = bytes.split(|&b| b == b'\n').map(|line| line.trim_ascii()).zip(1..);
+    let end = line_end(bytes);
+    let mut lines = bytes.split(move |&b| b == end).map(|line| line.trim_ascii()).zip(1..);
     std::iter::from_fn(move || {
         let (line, number) = lines.next()?;
         let open = |line: &[u8]| line.ends_with(b"\\") && !line.contains(&b'#');

@@ -10,7 +10,7 @@
 
 use super::file_mesh::middle;
 use super::foreign::refusal;
-use super::source::{ReadMesh, ReadOptions, Source, without_byte_order_mark};
+use super::source::{ReadMesh, ReadOptions, Source, line_end, without_byte_order_mark};
 use super::{glb_read, obj, ply_read, stl};
 use crate::geom::Mesh;
 use crate::{Error, Result};
@@ -79,8 +79,9 @@ fn parse(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
 /// Returns whether some early line starts with a keyword of OBJ.
 fn looks_like_obj(bytes: &[u8]) -> bool {
     let start = &bytes[..bytes.len().min(1 << 16)];
+    let end = line_end(bytes);
     !start.contains(&0)
-        && start.split(|&b| b == b'\n').any(|line| {
+        && start.split(|&b| b == end).any(|line| {
             let word = line.trim_ascii().split(|b| b.is_ascii_whitespace()).next().unwrap_or(b"");
             [&b"v"[..], b"f", b"o", b"g", b"vn", b"vt", b"mtllib"].contains(&word)
         })

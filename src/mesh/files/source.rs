@@ -132,3 +132,8 @@ impl ReadMesh {
 pub(super) fn without_byte_order_mark(bytes: &[u8]) -> &[u8] {
     bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }
+
+/// Returns what ends the lines of a text: a line feed, which may follow a carriage return, or that alone.
+pub(super) fn line_end(bytes: &[u8]) -> u8 {
+    if bytes.contains(&b'\n') { b'\n' } else { b'\r' }
+}
