@@ -147,12 +147,10 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     }
     let range = bring_into_range(&mut out.mesh.colors, "colors");
     range.into_iter().for_each(|note| out.note(note));
-    out.atlas = if is_mapped {
-        // coordinates at corners decide, and only if no face lacks them
-        Some(wedges).filter(|atlas| atlas.triangles.len() == out.mesh.triangles.len())
-    } else {
-        uvs.map(|uvs| Atlas { uvs, triangles: out.mesh.triangles.clone(), width: 0, height: 0 })
-    };
+    // coordinates at corners decide, unless a face lacks them
+    let at_corners = is_mapped.then_some(wedges).filter(|at| at.triangles.len() == out.mesh.triangles.len());
+    let at_vertices = |uvs| Atlas { uvs, triangles: out.mesh.triangles.clone(), width: 0, height: 0 };
+    out.atlas = at_corners.or_else(|| uvs.map(at_vertices));
     Ok(out)
 }
 
