@@ -230,8 +230,10 @@ impl GlbMaterial {
             return GlbColor { texture: specular.diffuse_texture.as_ref(), tint, note };
         }
         let is_dark = base.is_none_or(|f| f == [0.0; 3]);
-        let light = factors(&self.emissive_factor).filter(|f| is_dark && *f != [0.0; 3]);
         let texture = self.emissive_texture.as_deref();
+        // a picture without a factor is black by the letter of glTF, which nobody meant
+        let default = texture.filter(|_| self.emissive_factor.is_null()).map(|_| [1.0; 3]);
+        let light = factors(&self.emissive_factor).or(default).filter(|f| is_dark && *f != [0.0; 3]);
         match light {
             Some(light) if texture.is_some() || base.is_some() => {
                 let note = Some("there is no base color; the light that the material emits is shown");

@@ -35,6 +35,9 @@ pub struct Material {
 /// Fails if a picture has options that move, scale or brighten it, or if there are more than 65,536 materials.
 pub fn materials_of_mtl(bytes: &[u8], path: &Path) -> Result<Vec<Material>> {
     let source = Source { path, format: "MTL", options: &ReadOptions::DEFAULT };
+    if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
+        return Err(source.unsupported("byte 0", "text in UTF-16").with_hint("save it as UTF-8"));
+    }
     let mut all: Vec<Material> = Vec::new();
     let (text, end) = (without_byte_order_mark(bytes), line_end(bytes));
     for (number, line) in (1..).zip(text.split(|&b| b == end)) {

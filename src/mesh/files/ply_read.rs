@@ -149,8 +149,8 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     range.into_iter().for_each(|note| out.note(note));
     // coordinates at corners decide, unless a face lacks them
     let at_corners = is_mapped.then_some(wedges).filter(|at| at.triangles.len() == out.mesh.triangles.len());
-    let at_vertices = |uvs| Atlas { uvs, triangles: out.mesh.triangles.clone(), width: 0, height: 0 };
-    out.atlas = at_corners.or_else(|| uvs.map(at_vertices));
+    let of_vertices = |uvs| Atlas { uvs, triangles: out.mesh.triangles.clone(), width: 0, height: 0 };
+    out.atlas = at_corners.or_else(|| uvs.map(of_vertices));
     Ok(out)
 }
 
