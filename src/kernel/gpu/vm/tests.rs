@@ -82,8 +82,8 @@ fn gradients_like_the_cpu(shape: Shape, devices: Vec<Device>) {
         if device.atomics() == Atomics::Fixed {
             assert_eq!(on_gpu.gradients(&device).unwrap(), got, "whole numbers add to the same in any order");
         }
-        // in pieces, the same
-        on_gpu.vm.decoder.chunk = 16 * TILE;
+        // in pieces, and by groups with several tiles of each, the same
+        (on_gpu.vm.decoder.chunk, on_gpu.vm.decoder.groups) = (16 * TILE, 3);
         let pieces = on_gpu.gradients(&device).unwrap();
         agree("gradient of the color in pieces", &pieces[1], &got[1], 1e-4);
         agree("gradient of the decoder in pieces", &pieces[2], &got[2], 1e-4);
