@@ -21,6 +21,41 @@ pub use infer::{TFace, import};
 pub use mean::{FieldMean, train};
 pub use train::TfaceReport;
 
+use crate::Result;
+use crate::config::VmConfig;
+use crate::field::ComputeDevice;
+use crate::geom::Aabb;
+
+/// Refuses a GPU that cannot hold the training of a field, before its photographs are known: they need no memory there.
+/// Without `bounds`, the box that the masks give, refuses what fits in no box. An imported field is not trained.
+pub fn require_fit(
+    stage: &str,
+    config: &VmConfig,
+    bounds: Option<Aabb>,
+    device: &ComputeDevice,
+) -> Result<()> {
+    #[cfg(not(feature = "wgpu"))]
+    let _ = (stage, config, bounds);
+    match device {
+        ComputeDevice::Cpu(_) => Ok(()),
+        #[cfg(feature = "wgpu")]
+        ComputeDevice::Gpu(_) if !config.import.is_empty() => Ok(()),
+        #[cfg(feature = "wgpu")]
+        ComputeDevice::Gpu(found) => {
+            use crate::field::pixels::Pixels;
+            use gpu::GpuVm;
+            train::check(stage, config)?;
+            let (none, device) =
+                (Pixels::new(&[], f32::INFINITY, 1.0, config.foreground, false), &found.device);
+            let fits = match bounds.map(|bounds| [bounds.min.to_array(), bounds.max.to_array()]) {
+                Some(bounds) => GpuVm::fits(stage, config, &none, bounds, device),
+                None => GpuVm::fits_some_box(stage, config, &none, device),
+            };
+            fits.map(drop)
+        }
+    }
+}
+
 /// Whether a GPU learns a vector-matrix field as the processor does.
 pub const VM_TEST: crate::field::SelfTest = crate::field::SelfTest {
     field: "vector-matrix",

@@ -161,12 +161,17 @@ impl<'a> Session<'a> {
         if !stages.iter().any(|stage| stage.uses_device()) {
             return Ok(());
         }
-        match crate::field::require_device(&self.config.device)? {
-            Some(device) if stages.contains(&Stage::Iface) => {
-                crate::iface::require_fit(&self.config.iface, &device)
+        let Some(device) = crate::field::require_device(&self.config.device)? else { return Ok(()) };
+        // masks that are still to be made give another box than those of an earlier attempt
+        let scene = if stages.contains(&Stage::Mask) { None } else { self.scene().ok() };
+        let bounds = scene.map(|scene| scene.aabb);
+        stages.iter().try_for_each(|&stage| match stage {
+            Stage::Iface => crate::iface::require_fit(&self.config.iface, &device),
+            Stage::Baseline | Stage::Tface => {
+                crate::tface::require_fit(stage.word(), &self.config.radiance(stage), bounds, &device)
             }
             _ => Ok(()),
-        }
+        })
     }
 
     /// Writes a file of the run itself. A write error is ignored if no work is left, because a finished run may lie

@@ -4,7 +4,7 @@
 
 use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
 use super::record::decoder;
-use super::state::VmState;
+use super::state::first_and_last;
 use crate::config::VmConfig;
 use crate::field::drawing::DeviceRays;
 use crate::field::drawing::MemoryNeed;
@@ -19,6 +19,20 @@ use crate::kernel::gpu::{
 };
 use crate::{Error, Result};
 use std::sync::Arc;
+
+/// Returns the settings with so few voxels that a cube of them takes no more memory than a box of any shape does with
+/// those of `config`. A cube has the shortest diagonal, and the smallest planes if all have as many channels; else a box
+/// may have smaller ones, at least those of the geometric mean of the channels.
+fn with_fewest_voxels(config: &VmConfig) -> VmConfig {
+    let share = |ranks: &[usize]| {
+        let ranks = || ranks.iter().map(|rank| rank.next_multiple_of(4) as f64);
+        (3.0 * ranks().product::<f64>().cbrt() / ranks().sum::<f64>()).powf(1.5).min(1.0)
+    };
+    let share = share(&config.density_rank).min(share(&config.color_rank));
+    let [voxels_start, voxels_final] =
+        [config.voxels_start, config.voxels_final].map(|voxels| (voxels as f64 * share) as u64);
+    VmConfig { voxels_start, voxels_final, ..config.clone() }
+}
 
 /// The operations of [`VmOps`] on a GPU, with their device memory.
 pub struct GpuVm<'a> {
@@ -37,20 +51,35 @@ pub struct GpuVm<'a> {
 }
 
 impl<'a> GpuVm<'a> {
-    /// Checks that a device supports the field and has enough memory for the last grids. Returns whether the photographs
-    /// fit as well.
+    /// Checks that a device supports the field of a training in a box and has enough memory for its largest grids. Returns
+    /// whether the photographs fit as well.
     pub fn fits(
         stage: &str,
         config: &VmConfig,
         pixels: &Pixels,
-        start: &VmState,
+        bounds: [[f32; 3]; 2],
+        device: &Device,
+    ) -> Result<bool> {
+        Self::fits_fields(stage, config, pixels, &first_and_last(config, bounds), device)
+    }
+
+    /// The same before a box is known: refuses what fits in none.
+    pub fn fits_some_box(stage: &str, config: &VmConfig, pixels: &Pixels, device: &Device) -> Result<bool> {
+        let fields = first_and_last(&with_fewest_voxels(config), [[-1.0; 3], [1.0; 3]]);
+        Self::fits_fields(stage, config, pixels, &fields, device)
+    }
+
+    fn fits_fields(
+        stage: &str,
+        config: &VmConfig,
+        pixels: &Pixels,
+        fields: &[VmField; 2],
         device: &Device,
     ) -> Result<bool> {
         DeviceDecoder::supports(&decoder(config)).map_err(|what| {
             let problem = format!("the device `{}` does not support {what}", device.name());
             Error::usage(problem, "train with `--device cpu`")
         })?;
-        let fields = [start.size, start.last_size(config)].map(|size| start.field_of(config, size, true));
         let [fixed, ray] = fields
             .each_ref()
             .map(|f| Vm::bytes(device, f, config.rays))
@@ -67,8 +96,9 @@ impl<'a> GpuVm<'a> {
             wanted: rays,
             minimum: rays,
         };
+        // the grids of both stages are those of `tface`
         let plan = need.plan(pixels, device, |fits| match fits {
-            0..64 => format!("{stage}.voxels_final ({})", config.voxels_final),
+            0..64 => format!("tface.voxels_final ({})", config.voxels_final),
             _ => format!("{stage}.rays to {fits}"),
         });
         plan.map(|(_, resident)| resident)
@@ -191,7 +221,11 @@ impl VmOps for GpuVm<'_> {
     }
 
     fn figures(&self) -> Result<VmFigures> {
-        self.losses.fetch(&self.device)
+        let figures = self.losses.fetch(&self.device)?;
+        if let Some(vm) = self.vm.as_ref().filter(|_| figures.rays > 0) {
+            vm.expect_colors(figures.color * self.batch.rays() as u64 / figures.rays);
+        }
+        Ok(figures)
     }
 }
 

@@ -1,4 +1,5 @@
 use super::super::cpu::CpuVm;
+use super::super::state::VmState;
 use super::super::train::{VmModel, train_one};
 use super::*;
 use crate::config::Preset;
@@ -51,7 +52,7 @@ fn begun<'a, O: VmOps>(ops: O, config: &'a VmConfig, session: &TrainingSession<'
 
 /// Operations on a device whose memory holds the photographs, if the device can draw from them.
 fn on_gpu<'a>(config: &'a VmConfig, pixels: &'a Pixels<'a>, device: Device) -> GpuVm<'a> {
-    let resident = GpuVm::fits("tface", config, pixels, &start(config), &device).unwrap();
+    let resident = GpuVm::fits("tface", config, pixels, BOUNDS, &device).unwrap();
     GpuVm::new(config, pixels, device, resident)
 }
 
@@ -200,7 +201,7 @@ fn memory_of_a_training() {
     // The memory is for all points of the lattices, of which few lie in these cells.
     let start = VmState::new(&config, 3, BOUNDS, Some(&ball::cells_within(0.15)));
     let with = |mib: u64| device().unwrap().with_memory((512 + mib) << 20);
-    let fits = |mib: &u64| GpuVm::fits("tface", &config, &pixels, &start, &with(*mib)).is_ok_and(|r| r);
+    let fits = |mib: &u64| GpuVm::fits("tface", &config, &pixels, BOUNDS, &with(*mib)).is_ok_and(|r| r);
     let planned = (8..4096).step_by(4).find(fits).unwrap();
     let session = session("tface", dir.path(), "ball", &Quiet);
     let before = with(planned).reserved_memory();
@@ -276,7 +277,7 @@ fn a_device_with_too_little_memory_is_refused_before_the_first_step_and_told_wha
     let refused = |config: &VmConfig, mib: u64| {
         let pixels = pixels(&views, config);
         let device = self::device().unwrap().with_memory(mib << 20);
-        GpuVm::fits("tface", config, &pixels, &start(config), &device)
+        GpuVm::fits("tface", config, &pixels, BOUNDS, &device)
     };
     assert!(refused(&config(), 1024).unwrap(), "photographs lie there");
     let e = refused(&config(), 512).err().unwrap();
@@ -294,4 +295,32 @@ fn a_device_with_too_little_memory_is_refused_before_the_first_step_and_told_wha
     println!("{} KiB of grids and gradients, {ray} bytes a ray", fixed >> 10);
     // ‖(16, 16, 16)‖ = 27.7: 27 samples, of which the last is none, of 17 words each, and 34 words of the ray
     assert_eq!((ray, Vm::widest(&field)), (4 * (26 * 17 + 34), 12 * 26));
+}
+
+#[test]
+fn what_fits_in_some_box_is_not_refused_before_the_box_is_known() {
+    let Some(device) = device() else { return };
+    let needed = |config: &VmConfig, bounds: [[f32; 3]; 2]| {
+        let rays = config.rays as u64;
+        let of = |field: &VmField| Vm::bytes(&device, field, config.rays);
+        first_and_last(config, bounds).iter().map(of).map(|[fixed, ray]| fixed + rays * ray).max().unwrap()
+    };
+    let cube = [[-1.0; 3], [1.0; 3]];
+    for ranks in [[8, 8, 8], [16, 4, 4], [4, 16, 7], [5, 0, 9]] {
+        let config = VmConfig {
+            voxels_final: 96 * 96 * 96,
+            density_rank: ranks.to_vec(),
+            color_rank: ranks.map(|rank| 3 * rank).to_vec(),
+            ..config()
+        };
+        let least = needed(&with_fewest_voxels(&config), cube);
+        for size in [[1.0, 1.0, 1.0], [0.7, 1.0, 0.8], [0.25, 0.25, 1.0], [1.0, 0.5, 0.3]] {
+            let found = needed(&config, [size.map(|s: f32| -s), size]);
+            let share = least as f64 / found as f64;
+            println!("{ranks:?} in {size:?}: {share:.3} of {found} bytes");
+            // sizes are whole numbers
+            assert!(share <= 1.03, "{share}");
+            assert!(ranks != [8; 3] || size != [1.0; 3] || least == found);
+        }
+    }
 }

@@ -50,7 +50,7 @@ fn compare_vm(adapter: &Adapter, rays: usize) -> Result<Vec<Check>> {
         let pixels = if part == 1 { &of_host } else { &published };
         let mut on_cpu = VmModel::new(CpuVm::new(&config, pixels), state.clone(), &config, &session);
         on_cpu.load();
-        let resident = GpuVm::fits("tface", &config, pixels, &state, &device)? && part > 1;
+        let resident = GpuVm::fits("tface", &config, pixels, BOUNDS, &device)? && part > 1;
         let ops = GpuVm::new(&config, pixels, device, resident);
         let mut on_gpu = VmModel::new(ops, state.clone(), &config, &session);
         on_gpu.load();

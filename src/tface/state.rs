@@ -51,6 +51,32 @@ fn start_values(config: &VmConfig, size: [usize; 3], seed: u64) -> [Vec<f32>; 3]
     [noise(301, density.len()), noise(302, color.len()), network]
 }
 
+/// Returns the field that is trained in a box with grids of `size`.
+fn trained_field(
+    config: &VmConfig,
+    bounds: [[f32; 3]; 2],
+    size: [usize; 3],
+    mask: Option<BoxMask>,
+) -> VmField {
+    let mut field = FieldRecord::of(config).field(bounds, size, mask);
+    let vertices = size.iter().map(|&n| (n * n) as f32).sum::<f32>().sqrt();
+    field.lattice.samples = ((vertices / config.step_ratio as f32) as usize).min(1_000_000);
+    field
+}
+
+/// Returns the edge lengths of a box.
+fn extent(bounds: [[f32; 3]; 2]) -> [f32; 3] {
+    std::array::from_fn(|a| bounds[1][a] - bounds[0][a])
+}
+
+/// Returns the fields with the first and with the last grids of a training in a box that stays as it is.
+#[cfg(feature = "wgpu")]
+pub fn first_and_last(config: &VmConfig, bounds: [[f32; 3]; 2]) -> [VmField; 2] {
+    let last = if config.upsample_at.is_empty() { config.voxels_start } else { config.voxels_final };
+    [config.voxels_start, last]
+        .map(|voxels| trained_field(config, bounds, size_for(extent(bounds), voxels), None))
+}
+
 /// The hull as cells, one cell wider all around.
 fn hull_mask(hull: &Bitmask) -> Option<BoxMask> {
     BoxMask::from_bits([-1.0; 3], [1.0; 3], [hull.resolution; 3], hull.grown().bits)
@@ -59,8 +85,7 @@ fn hull_mask(hull: &Bitmask) -> Option<BoxMask> {
 impl VmState {
     /// Returns the state before the first step.
     pub fn new(config: &VmConfig, seed: u64, bounds: [[f32; 3]; 2], hull: Option<&Bitmask>) -> VmState {
-        let extent = std::array::from_fn(|a| bounds[1][a] - bounds[0][a]);
-        let size = size_for(extent, config.voxels_start);
+        let size = size_for(extent(bounds), config.voxels_start);
         let mut names = NAMES.into_iter();
         let groups = start_values(config, size, seed)
             .map(|values| HostGroup::flat(names.next().unwrap_or_default(), values));
@@ -77,27 +102,11 @@ impl VmState {
     /// Returns the field as the kernels see it. In training a ray has `‖size‖ / ratio` samples, else as many as the
     /// box's diagonal needs; both as published.
     pub fn field(&self, config: &VmConfig, training: bool) -> Arc<VmField> {
-        Arc::new(self.field_of(config, self.size, training))
-    }
-
-    /// The same with grids of `size`.
-    pub fn field_of(&self, config: &VmConfig, size: [usize; 3], training: bool) -> VmField {
-        let mut field = FieldRecord::of(config).field(self.bounds, size, self.mask.clone());
-        if training {
-            let vertices = size.iter().map(|&n| (n * n) as f32).sum::<f32>().sqrt();
-            field.lattice.samples = ((vertices / config.step_ratio as f32) as usize).min(1_000_000);
-        }
-        field
-    }
-
-    /// Vertices of the last grid, where the box stays as it is.
-    #[cfg(feature = "wgpu")]
-    pub fn last_size(&self, config: &VmConfig) -> [usize; 3] {
-        let extent = std::array::from_fn(|a| self.bounds[1][a] - self.bounds[0][a]);
-        size_for(
-            extent,
-            if config.upsample_at.is_empty() { config.voxels_start } else { config.voxels_final },
-        )
+        let mask = self.mask.clone();
+        Arc::new(match training {
+            true => trained_field(config, self.bounds, self.size, mask),
+            false => FieldRecord::of(config).field(self.bounds, self.size, mask),
+        })
     }
 
     /// Writes the state into a checkpoint. A finished checkpoint omits the optimizer's moments, because no training

@@ -110,7 +110,7 @@ pub(super) fn train_one(
             ComputeDevice::Cpu(_) => Ok(()),
             #[cfg(feature = "wgpu")]
             ComputeDevice::Gpu(gpu) => {
-                GpuVm::fits(session.stage, config, pixels, &state, &gpu.device).map(drop)
+                GpuVm::fits(session.stage, config, pixels, bounds, &gpu.device).map(drop)
             }
         })?;
     let (description, refused) = (device.description(), device.warning());
@@ -118,7 +118,7 @@ pub(super) fn train_one(
         ComputeDevice::Cpu(_) => train_on(CpuVm::new(config, pixels), state, config, session)?,
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(gpu) => {
-            let resident = GpuVm::fits(session.stage, config, pixels, &state, &gpu.device)?;
+            let resident = GpuVm::fits(session.stage, config, pixels, bounds, &gpu.device)?;
             train_on(GpuVm::new(config, pixels, gpu.device, resident), state, config, session)?
         }
     };

@@ -102,6 +102,40 @@ fn a_dry_run_refuses_a_gpu_with_too_little_memory_as_the_command_would() {
     assert!(!dir.path().join("run/mask").exists());
 }
 
+#[test]
+fn a_dry_run_refuses_a_gpu_that_cannot_hold_a_radiance_field_with_and_without_masks() {
+    if Adapter::all().is_empty() {
+        println!("skipped: memory of a radiance field, for no adapter is here (Mesa's lavapipe would do)");
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let options = SyntheticOptions { width: 24, height: 30, train: 6, test: 1, seed: 3 };
+    photographed(&dir.path().join("capture"), &options);
+    let words = |stage: &'static str, more: &[&'static str]| -> Vec<&'static str> {
+        let start = [stage, "capture", "--run", "run", "--set", "tface.rays=64"];
+        [&start[..], &["--set", "tface.voxels_start=512", "--set", "tface.voxels_final=512"], more].concat()
+    };
+    // where 512 MiB are kept for other programs, half a GiB leaves nothing
+    let little = |more: &[&'static str]| {
+        words("tface", &[&["--device", "wgpu:0", "--memory", "0.5"][..], more].concat())
+    };
+    let is_refused = |words: &[&str]| {
+        let o = alone(dir.path(), words).output().unwrap();
+        let said = err(&o);
+        assert_eq!(code(&o), 1, "{words:?}: {said}");
+        assert!(said.contains("rays of a step") && said.contains("lower tface.voxels_final (512)"), "{said}");
+        assert!(said.contains("with `--memory`") && !dir.path().join("run/tface").exists(), "{said}");
+    };
+    is_refused(&little(&["--dry-run"]));
+    is_refused(&little(&[]));
+    assert!(!dir.path().join("run/mask").exists());
+    worked(&alone(dir.path(), &words("mask", &[])).output().unwrap());
+    is_refused(&little(&["--dry-run"]));
+    is_refused(&little(&[]));
+    let enough = words("tface", &["--device", "wgpu:0", "--memory", "64", "--dry-run"]);
+    worked(&alone(dir.path(), &enough).output().unwrap());
+}
+
 /// In place of the program: lists a card that passes its self-test and a software driver that does
 /// not, and fails to train after its first kernels.
 const FAKE: &str = r#"#!/bin/sh

@@ -291,14 +291,15 @@ pub fn store_outer(
 /// Returns `Σ_samples a[j]` for the four channels `j` that a thread of the first row owns, as in
 /// [`outer_row`]; 0 to the others.
 #[cube]
-pub fn channel_sums(a: &[F4], row: usize, column: usize) -> F4 {
+pub fn channel_sums(a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> F4 {
+    let columns = comptime!(columns(lanes));
     let mut sums = F4::new(0.0f32);
     if row == 0 {
         #[unroll]
         for j in 0..4usize {
             let mut sum = F4::new(0.0f32);
-            for r in 0..LANES {
-                sum += a[at(column + 16 * j, r, LANES)];
+            for r in 0..lanes {
+                sum += a[at(column + columns * j, r, lanes)];
             }
             sums.insert(j, total(sum));
         }
@@ -312,68 +313,78 @@ pub fn total(v: F4) -> f32 {
     v.extract(0usize) + v.extract(1usize) + (v.extract(2usize) + v.extract(3usize))
 }
 
-/// Adds `Σ_samples a[first + i] · b[j]`, for `i < m` and `j < n`, to a matrix of gradients whose rows have all channels. If
-/// `fresh` is set, it overwrites the matrix instead.
+/// Returns so many zeros, the sums of a thread.
 #[cube]
-pub fn outer(
-    a: &[F4],
+pub fn zero_sums(#[comptime] count: usize) -> Array<F4> {
+    let mut sums = Array::<F4>::new(count);
+    #[unroll]
+    for i in 0..count {
+        sums[i] = F4::new(0.0f32);
+    }
+    sums
+}
+
+/// Adds [`outer_row`] of each row that a thread owns in a gradient, `row` and every `lanes`-th after
+/// it, to `sums[first..first + rows]`. Indices are constants, so the sums stay in registers.
+#[cube]
+pub fn add_outer(
+    sums: &mut Array<F4>,
     #[comptime] first: usize,
+    #[comptime] rows: usize,
+    a: &[F4],
     b: &[F4],
-    #[comptime] m: usize,
-    n: usize,
-    gradient: &mut [f32],
-    start: usize,
-    fresh: bool,
     row: usize,
     column: usize,
     #[comptime] lanes: usize,
 ) {
     let columns = comptime!(columns(lanes));
-    for ii in 0..comptime!(m.div_ceil(lanes)) {
-        let i = row + lanes * ii;
-        if i < m {
-            let s = outer_row(a, first + i, b, column, lanes);
-            let target = start + i * comptime!(channels(lanes)) + column;
-            add(gradient, target, s.extract(0usize), fresh);
-            if n > columns {
-                add(gradient, target + columns, s.extract(1usize), fresh);
-            }
-            if n > 2 * columns {
-                add(gradient, target + 2 * columns, s.extract(2usize), fresh);
-            }
-            if n > 3 * columns {
-                add(gradient, target + 3 * columns, s.extract(3usize), fresh);
-            }
+    for r in 0..lanes {
+        let b0 = b[at(column, r, lanes)];
+        let b1 = b[at(column + columns, r, lanes)];
+        let b2 = b[at(column + 2 * columns, r, lanes)];
+        let b3 = b[at(column + 3 * columns, r, lanes)];
+        #[unroll]
+        for k in 0..rows {
+            sums[first + k] += dots(a[at(row + lanes * k, r, lanes)], b0, b1, b2, b3);
         }
     }
 }
 
-/// Adds `Σ_samples a[first + j]`, for `j < n`, to a row of gradients, or overwrites it if `fresh` is set. The threads of
-/// the first row do this, which in [`outer`] own the first row of the matrix.
+/// Adds the sums of [`add_outer`] to a gradient whose rows have all channels of a tile, or overwrites
+/// it if `fresh` is set.
 #[cube]
-pub fn sample_sums(
-    a: &[F4],
-    #[comptime] first: usize,
-    #[comptime] n: usize,
+pub fn flush_outer(
     gradient: &mut [f32],
     start: usize,
+    sums: &Array<F4>,
+    #[comptime] first: usize,
+    #[comptime] rows: usize,
     fresh: bool,
     row: usize,
     column: usize,
     #[comptime] lanes: usize,
 ) {
-    if row == 0 {
-        let columns = comptime!(columns(lanes));
-        for jj in 0..comptime!(n.div_ceil(columns)) {
-            let j = column + columns * jj;
-            if j < n {
-                let mut sum = F4::new(0.0f32);
-                for r in 0..lanes {
-                    sum += a[at(first + j, r, lanes)];
-                }
-                add(gradient, start + j, total(sum), fresh);
-            }
-        }
+    #[unroll]
+    for k in 0..rows {
+        let at_row = start + (row + lanes * k) * comptime!(channels(lanes));
+        flush_row(gradient, at_row, sums[first + k], fresh, column, lanes);
+    }
+}
+
+/// Adds what [`outer_row`] or [`channel_sums`] return to the row of a gradient that begins at
+/// `start`, or overwrites it if `fresh` is set.
+#[cube]
+pub fn flush_row(
+    gradient: &mut [f32],
+    start: usize,
+    sums: F4,
+    fresh: bool,
+    column: usize,
+    #[comptime] lanes: usize,
+) {
+    #[unroll]
+    for j in 0..4usize {
+        add(gradient, start + column + comptime!(columns(lanes)) * j, sums.extract(j), fresh);
     }
 }
 

@@ -292,7 +292,7 @@ pub(super) fn geometry_backward(
         sync_cube();
         // the first output is the distance, whose row of W2 has a second-order part; threads of the
         // first row have it
-        w2 += channel_sums(&a, row, column);
+        w2 += channel_sums(&a, row, column, LANES);
         sync_cube();
         store_block(&mut a, &tile::weighted(&s, w0), row, column, LANES);
         sync_cube();
@@ -310,7 +310,7 @@ pub(super) fn geometry_backward(
         w1_1 += first_order.channel(1usize);
         w1_2 += first_order.channel(2usize);
         w1_3 += first_order.channel(3usize);
-        b1 += channel_sums(&a, row, column);
+        b1 += channel_sums(&a, row, column, LANES);
         let g_u = product(&a, 0usize, w, comptime!(rows[1]), HIDDEN, row, column, LANES);
         #[unroll]
         for j in 0..4usize {

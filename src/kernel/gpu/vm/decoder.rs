@@ -8,7 +8,8 @@
 //! ```
 //!
 //! A group of 256 threads evaluates all layers for 64 samples, or for 32 if hidden layers are wider than 64. The backward
-//! pass recomputes the activations, which costs less than storing and loading them.
+//! pass recomputes the activations, which costs less than storing and loading them. Gradients of weights are summed by
+//! group, in registers over its tiles, then over the groups in a fixed order.
 
 mod kernels;
 
@@ -21,10 +22,14 @@ use super::march::VmSamples;
 use super::rays::Along;
 use crate::kernel::cpu::vm::DecoderShape;
 use kernels::{backward, chain, forward, prepare};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Maximum number of groups that sum gradients of weights, each over its own tiles: four for each multiprocessor of the
-/// largest cards, since the sums of a group take 200 kB where hidden layers have 128 channels.
-const GROUPS: usize = 512;
+/// Maximum number of groups that sum gradients of weights, each over its own tiles. A thread keeps 50 to 200 sums in
+/// registers, which then suffice for one or two groups on a multiprocessor, and the largest cards have some 150.
+const GROUPS: usize = 256;
+
+/// Maximum number of groups that decode colors.
+const DECODING: usize = 4096;
 
 /// Sizes and offsets of the matrices of a decoder, in rows with as many floats as a tile has channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -81,6 +86,11 @@ impl Plan {
         std::array::from_fn(|i| counts[..i].iter().sum())
     }
 
+    /// Returns the number of groups that sum gradients of up to so many samples.
+    fn groups(&self, samples: usize) -> usize {
+        GROUPS.min(samples.div_ceil(4 * self.lanes))
+    }
+
     /// Returns the offsets of B, W1, b1, W2, b2, W3, b3 in the flat weights, and the end.
     fn parts(&self) -> [usize; 8] {
         let shape = DecoderShape {
@@ -107,6 +117,10 @@ pub struct DeviceDecoder {
     g_products: Buffer,
     pub(super) chunk: usize,
     capacity: usize,
+    /// Maximum number of samples of a batch with a color, whole chunks.
+    limit: AtomicUsize,
+    /// Maximum number of groups that sum gradients of weights.
+    pub(super) groups: usize,
     partial: Buffer,
     summed: Buffer,
 }
@@ -126,8 +140,8 @@ impl DeviceDecoder {
     /// Returns the memory of the gradients of products and weights in words, for up to `capacity` samples.
     pub fn words_of_gradients(shape: &DecoderShape, quads: [usize; 3], capacity: usize) -> usize {
         let plan = Plan::new(shape, quads);
-        let products = capacity.min(Self::CHUNK) * 4 * plan.products();
-        products + (GROUPS + 1) * plan.gradients()[6] * plan.width()
+        let chunk = capacity.min(Self::CHUNK);
+        chunk * 4 * plan.products() + (plan.groups(chunk) + 1) * plan.gradients()[6] * plan.width()
     }
 
     /// Creates a decoder of the products of a grid, for up to `capacity` samples; buffers for gradients are allocated only if
@@ -159,9 +173,25 @@ impl DeviceDecoder {
             g_products: learned(chunk * 4 * plan.products()),
             chunk,
             capacity,
-            partial: learned(GROUPS * gradients),
+            limit: AtomicUsize::new(usize::MAX),
+            partial: learned(plan.groups(chunk) * gradients),
+            groups: plan.groups(chunk),
             summed: learned(gradients),
         }
+    }
+
+    /// Returns the maximum number of samples of a batch that get a color: all, until some number is expected.
+    pub fn limit(&self) -> usize {
+        self.limit.load(Ordering::Relaxed).min(self.capacity)
+    }
+
+    /// Limits the samples of later batches that get a color to four times as many as `expected`, in whole chunks. Chunks
+    /// beyond are not launched, and rays that would need them are not alive. Only the device knows the number of a batch;
+    /// that of earlier ones, which is read now and then, stands for it, since a field changes slowly.
+    pub fn expect(&self, expected: u64) {
+        let chunk = self.chunk as u64;
+        let chunks = expected.saturating_mul(4).div_ceil(chunk).clamp(1, self.capacity as u64);
+        self.limit.store((chunks * chunk) as usize, Ordering::Relaxed);
     }
 
     /// Converts the flat weights, as on the CPU, to the layout of the kernels.
@@ -186,7 +216,7 @@ impl DeviceDecoder {
         let tiles = self.capacity.div_ceil(4 * self.plan.lanes);
         // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
         unsafe {
-            launch!(device, forward::launch_unchecked, groups(tiles.min(8 * GROUPS)), UNITS;
+            launch!(device, forward::launch_unchecked, groups(tiles.min(DECODING)), UNITS;
                 self.weights, values, grid.words(), samples.place, samples.ray, rays.direction, along.index,
                 along.count, along.rgb;
                 self.plan
@@ -210,7 +240,7 @@ impl DeviceDecoder {
         broken: &Buffer,
     ) {
         assert!(along.index.words() == self.capacity && values.words() == grid.len());
-        for from in (0..self.capacity).step_by(self.chunk) {
+        for from in (0..self.limit()).step_by(self.chunk) {
             // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
             unsafe {
                 launch!(device, backward::launch_unchecked, groups(self.summing()), UNITS;
@@ -231,6 +261,6 @@ impl DeviceDecoder {
     }
 
     fn summing(&self) -> usize {
-        GROUPS.min(self.chunk.div_ceil(4 * self.plan.lanes))
+        self.groups.min(self.plan.groups(self.chunk))
     }
 }

@@ -82,11 +82,75 @@ fn gradients_like_the_cpu(shape: Shape, devices: Vec<Device>) {
         if device.atomics() == Atomics::Fixed {
             assert_eq!(on_gpu.gradients(&device).unwrap(), got, "whole numbers add to the same in any order");
         }
-        // in pieces, the same
-        on_gpu.vm.decoder.chunk = 16 * TILE;
+        // in pieces, and by groups with several tiles of each, the same
+        (on_gpu.vm.decoder.chunk, on_gpu.vm.decoder.groups) = (16 * TILE, 3);
         let pieces = on_gpu.gradients(&device).unwrap();
         agree("gradient of the color in pieces", &pieces[1], &got[1], 1e-4);
         agree("gradient of the decoder in pieces", &pieces[2], &got[2], 1e-4);
+    }
+}
+
+#[test]
+fn a_step_launches_no_more_chunks_than_colors_are_expected_in() {
+    let Some(device) = device() else { return };
+    let case = case(NARROW, 200);
+    let mut on_gpu = DeviceCase::new(&device, &case);
+    let chunk = 16 * TILE;
+    on_gpu.vm.decoder.chunk = chunk;
+    on_gpu.render(&device).unwrap();
+    let colored = device.read::<u32>(on_gpu.vm.counts()[1])[0];
+    let gradients = |on_gpu: &DeviceCase| {
+        let before = device.counts().0;
+        let found = on_gpu.gradients(&device).unwrap();
+        (device.counts().0 - before, found)
+    };
+    let (all, want) = gradients(&on_gpu);
+    let expected = colored.div_ceil(4);
+    on_gpu.vm.expect_colors(expected.into());
+    on_gpu.render(&device).unwrap();
+    assert_eq!(device.read::<u32>(on_gpu.vm.counts()[1]), [colored; 2]);
+    let (few, got) = gradients(&on_gpu);
+    // of each chunk the backward pass and the scatter
+    let chunks = [on_gpu.vm.samples.t.words(), 4 * expected as usize].map(|samples| samples.div_ceil(chunk));
+    println!("{colored} colors in {} of {} chunks: {few} of {all} launches", chunks[1], chunks[0]);
+    assert!(chunks[1] < chunks[0] && all - few == 2 * (chunks[0] - chunks[1]));
+    for (what, (got, want)) in ["density", "color", "decoder"].iter().zip(got.iter().zip(&want)) {
+        agree(&format!("gradient of the {what} in fewer chunks"), got, want, 1e-4);
+    }
+}
+
+#[test]
+fn rays_with_more_colors_than_were_expected_are_left_out_of_a_step() {
+    let Some(device) = device() else { return };
+    const RAYS: usize = 200;
+    let mut case = case(NARROW, RAYS as u64);
+    let mut on_gpu = DeviceCase::new(&device, &case);
+    let want = on_gpu.render(&device).unwrap();
+    on_gpu.vm.decoder.chunk = 2 * TILE;
+    on_gpu.vm.expect_colors(1);
+    let got = on_gpu.render(&device).unwrap();
+    let [found, wanted] = device.read::<u32>(on_gpu.vm.counts()[1])[..] else { panic!("two counts") };
+    let alive = device.read::<u32>(&on_gpu.rays.alive);
+    let left = (0..RAYS).filter(|&r| alive[r] == 1).count();
+    println!("{found} of {wanted} colors, {left} of {RAYS} rays");
+    assert!(found > 0 && found as usize <= 2 * TILE && found < wanted && left > 0 && left < RAYS);
+    let rays = capacity(&case);
+    for (r, k) in (0..RAYS).flat_map(|r| (0..RAY_WIDTH).map(move |k| (r, k))) {
+        let seen = if alive[r] == 1 { want[k * rays + r] } else { 0.0 };
+        assert!(
+            (got[k * rays + r] - seen).abs() <= 1e-6 * seen.abs(),
+            "ray {r}: {} {seen}",
+            got[k * rays + r]
+        );
+    }
+    // the others' gradients are theirs
+    for (r, g) in case.g.chunks_exact_mut(RAY_WIDTH).enumerate() {
+        g.iter_mut().for_each(|g| *g *= alive[r] as f32);
+    }
+    let (_, want) = on_cpu(&case);
+    let got = on_gpu.gradients(&device).unwrap();
+    for (what, (got, want)) in ["density", "color", "decoder"].iter().zip(got.iter().zip(&want)) {
+        agree(&format!("gradient of the {what} of fewer rays"), got, want, 1e-4);
     }
 }
 

@@ -2,7 +2,8 @@
 //! weights.
 
 use super::super::super::tile::{
-    self, Block, add, at, outer, output_layer, product, relu_backward, sample_sums, store_block, transposed,
+    self, Block, add, add_outer, at, channel_sums, flush_outer, flush_row, output_layer, product,
+    relu_backward, store_block, transposed, zero_sums,
 };
 use super::super::super::weight_norm::finite;
 use super::super::grid::{NONE, looked_up, term};
@@ -277,8 +278,8 @@ fn from_colors(g0: F4, g1: F4, g2: F4, w0: F4, w1: F4, w2: F4, #[comptime] j: us
     g0 * broadcast(w0, j) + g1 * broadcast(w1, j) + g2 * broadcast(w2, j)
 }
 
-/// Writes the gradients with respect to products of samples `from..from + limit`, `[limit, channels]`, and partial sums by
-/// group of those with respect to the weights.
+/// Writes the gradients with respect to products of samples `from..from + limit`, `[limit, channels]`, and adds a group's
+/// sums of those with respect to the weights to its part of `partial`, or overwrites it with those of the first samples.
 #[cube(launch_unchecked)]
 pub(super) fn backward(
     w: &[F4],
@@ -301,13 +302,21 @@ pub(super) fn backward(
     let columns = comptime!(tile::columns(lanes));
     let (row, column) = (UNIT_POS as usize / columns, UNIT_POS as usize % columns);
     let sum = CUBE_POS * comptime!(gradient_rows[6] * width);
+    // what a thread owns of W2 and of each piece of [M, W1_direction]
+    let (own, pieces) = comptime!((hidden.div_ceil(lanes), plan.pieces()));
     let mut a = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let samples = tile::uniform_count(count, &mut a);
     let start = from as usize / comptime!(4 * lanes);
     let end = min(samples, from as usize + limit as usize).div_ceil(comptime!(4 * lanes));
+    let c = UNIT_POS as usize;
+    // the thread's sums of the gradients of W2 and then of the pieces; of b1, b2, W3 and b3
+    let mut sums = zero_sums(comptime!((1 + pieces) * own));
+    let mut b1 = F4::new(0.0f32);
+    let mut b2 = F4::new(0.0f32);
+    let mut w3 = F4::new(0.0f32);
+    let mut b3 = 0.0f32;
     for tile in range_stepped(start + CUBE_POS, end, CUBE_COUNT) {
-        let fresh = tile == CUBE_POS;
         let here = tile * lanes + row;
         let h1 = first_layer(
             &mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
@@ -317,24 +326,24 @@ pub(super) fn backward(
         let h2 = second_layer(&b, w, row, column, plan);
         store_block(&mut a, &h2, row, column, lanes);
         sync_cube();
-        // W3 and b3
-        let c = UNIT_POS as usize;
         if c < hidden {
+            let mut of_w3 = F4::new(0.0f32);
             #[unroll]
             for o in 0..3usize {
                 let mut s = 0.0f32;
                 for r in 0..lanes {
                     s += a[at(c, r, lanes)].dot(g_color(g_pre, o, tile * lanes + r, samples));
                 }
-                add(partial, sum + comptime!((gradient_rows[4] + o) * width) + c, s, fresh);
+                of_w3.insert(o, s);
             }
+            w3 += of_w3;
         }
         if c < 3 {
             let mut s = F4::new(0.0f32);
             for r in 0..lanes {
                 s += g_color(g_pre, c, tile * lanes + r, samples);
             }
-            add(partial, sum + comptime!(gradient_rows[5] * width) + c, tile::total(s), fresh);
+            b3 += tile::total(s);
         }
         let g0 = g_color(g_pre, 0usize, here, samples);
         let g1 = g_color(g_pre, 1usize, here, samples);
@@ -352,23 +361,23 @@ pub(super) fn backward(
         sync_cube();
         store_block(&mut a, &g_z2, row, column, lanes);
         sync_cube();
-        let at_w2 = sum + comptime!(gradient_rows[2] * width);
-        outer(&a, 0usize, &b, hidden, hidden, partial, at_w2, fresh, row, column, lanes);
-        let at_b2 = sum + comptime!(gradient_rows[3] * width);
-        sample_sums(&a, 0usize, hidden, partial, at_b2, fresh, row, column, lanes);
+        add_outer(&mut sums, 0usize, own, &a, &b, row, column, lanes);
+        b2 += channel_sums(&a, row, column, lanes);
         let g_h1 = product(&a, 0usize, w, comptime!(rows[7]), hidden, row, column, lanes);
         let g_z1 = relu_backward(&g_h1, &b, row, column, lanes);
         sync_cube();
         store_block(&mut b, &g_z1, row, column, lanes);
         sync_cube();
-        let at_b1 = sum + comptime!(gradient_rows[1] * width);
-        sample_sums(&b, 0usize, hidden, partial, at_b1, fresh, row, column, lanes);
-        for p in 0..comptime!(plan.pieces()) {
+        b1 += channel_sums(&b, row, column, lanes);
+        for p in 0..pieces {
             inputs(&mut a, values, words, place, ray, direction, index, tile, samples, row, column, p, plan);
             sync_cube();
-            let at_m = sum + p * comptime!(width * width);
-            let n = piece_inputs(p, plan);
-            outer(&b, 0usize, &a, hidden, n, partial, at_m, fresh, row, column, lanes);
+            #[unroll]
+            for j in 0..pieces {
+                if p == j {
+                    add_outer(&mut sums, comptime!((1 + j) * own), own, &b, &a, row, column, lanes);
+                }
+            }
             let (quad, products) = (p * columns + column, comptime!(plan.products()));
             if p * columns < products {
                 let from_m = comptime!(rows[6]) + p * width;
@@ -382,6 +391,29 @@ pub(super) fn backward(
                 }
             }
             sync_cube();
+        }
+    }
+    if start + CUBE_POS < end {
+        let fresh = from == 0;
+        #[unroll]
+        for j in 0..pieces {
+            let at_m = sum + comptime!(j * width * width);
+            flush_outer(partial, at_m, &sums, comptime!((1 + j) * own), own, fresh, row, column, lanes);
+        }
+        let at_w2 = sum + comptime!(gradient_rows[2] * width);
+        flush_outer(partial, at_w2, &sums, 0usize, own, fresh, row, column, lanes);
+        if row == 0 {
+            flush_row(partial, sum + comptime!(gradient_rows[1] * width), b1, fresh, column, lanes);
+            flush_row(partial, sum + comptime!(gradient_rows[3] * width), b2, fresh, column, lanes);
+        }
+        if c < hidden {
+            #[unroll]
+            for o in 0..3usize {
+                add(partial, sum + comptime!((gradient_rows[4] + o) * width) + c, w3.extract(o), fresh);
+            }
+        }
+        if c < 3 {
+            add(partial, sum + comptime!(gradient_rows[5] * width) + c, b3, fresh);
         }
     }
 }
