@@ -75,7 +75,9 @@ fn note_alone(file: &str, alone: &[usize]) -> Option<String> {
         1 => format!("the image in line {first} stands"),
         n => format!("{n} images in lines {first} to {last} stand"),
     };
-    Some(format!("`{file}`: {stand} without a second line, of points; what follows is read as the next image"))
+    Some(format!(
+        "`{file}`: {stand} without a second line, of points; what follows is read as the next image"
+    ))
 }
 
 /// One line, taken word by word.
