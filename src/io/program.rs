@@ -365,6 +365,15 @@ mod tests {
 
     #[test]
     #[cfg(unix)]
+    fn a_help_is_read_however_the_program_ends_and_not_waited_for_after_a_stop() {
+        let shell = |text: &str, stop: &dyn Fn() -> bool| help_of(Path::new("/bin/sh"), &["-c", text], stop);
+        assert_eq!(shell("echo a; echo b >&2; exit 3", &|| false).as_deref(), Some("a\nb\n"));
+        assert_eq!(shell("sleep 600 & sleep 600", &|| true), None);
+        assert_eq!(help_of(Path::new("/no/program"), &[], &|| false), None);
+    }
+
+    #[test]
+    #[cfg(unix)]
     fn a_program_that_a_signal_ends_is_told_from_one_that_fails() {
         use std::os::unix::process::ExitStatusExt;
         // as `waitpid` reports them: the exit code in the second byte, a signal in the first; 137

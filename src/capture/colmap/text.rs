@@ -210,11 +210,14 @@ fn read_images(
         limits.check_views(Path::new(&source.file), images.len())?;
         let second = lines.next_if(Line::is_points);
         is_open = second.as_ref().is_some_and(|line| line.text.is_empty());
-        if second.is_none()
-            && let Some(next) = lines.peek()
-        {
-            check_image(next, cameras)?;
-            alone.push(number);
+        match lines.peek() {
+            Some(next) if second.is_none() => {
+                check_image(next, cameras)?;
+                alone.push(number);
+            }
+            // the last of such a file
+            None if second.is_none() && !alone.is_empty() => alone.push(number),
+            _ => {}
         }
     }
     Ok((images, alone))
