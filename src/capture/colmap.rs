@@ -1,8 +1,8 @@
 //! COLMAP's sparse models: `sparse/0`, `sparse`, the same below `colmap/`, or the folder itself.
 //!
 //! A pose takes the world to a camera whose axes point right, down and ahead, as a quaternion (w, x, y, z) and a
-//! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are complete in the
-//! images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12 to 4.2) are not read.
+//! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are
+//! complete in the images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12 to 4.2) are not read.
 //! Points are optional, and say where the head is if no masks do.
 //!
 //! A model is written back as binary files: one camera for each lens that differs, no points. [`Found`] sums up what

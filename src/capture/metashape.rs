@@ -1,11 +1,12 @@
 //! Agisoft Metashape's exported cameras: an XML file with sensors, cameras and how the chunk sits in the world.
 //!
-//! Camera axes point right, down and ahead; principal points are offsets from the middle of the picture. Metashape's
-//! P1 and P2 are OpenCV's p2 and p1, B1 is added to the horizontal focal length, and K4 multiplies r⁸ (Metashape
-//! manual, appendix D). Of a perspective lens that coefficient is refused, as are P3 and P4, and skew that could be seen.
+//! Camera axes point right, down and ahead; principal points are offsets from the middle of the
+//! picture. Metashape's P1 and P2 are OpenCV's p2 and p1, B1 is added to the horizontal focal length,
+//! and K4 multiplies r⁸ (Metashape manual, appendix D). Of a perspective lens that coefficient is
+//! refused, as are P3 and P4, and skew that could be seen.
 //!
-//! The slaves of a rig have a master instead of a `transform`; their sensors have a rotation and a location in it, in the
-//! unit of the chunk: `chunk_from_slave = chunk_from_master · master_from_slave`.
+//! The slaves of a rig have a master instead of a `transform`; their sensors have a rotation and a
+//! location in it, in the unit of the chunk: `chunk_from_slave = chunk_from_master · master_from_slave`.
 
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join, parse_xml, shortened};
 use super::frame::{self, CameraFrame, Listing};
@@ -85,7 +86,8 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     Ok(())
 }
 
-/// Returns the chunk that is read: the enabled one; of several, the active one, or the first that was aligned.
+/// Returns the chunk that is read: the enabled one; of several, the active one, else the first that
+/// was aligned.
 fn choose_chunk<'a, 'i>(
     document: &'a Document<'i>,
     file: &str,
@@ -146,7 +148,7 @@ fn is_off(node: Node) -> bool {
     matches!(node.attribute("enabled"), Some("0" | "false"))
 }
 
-/// Returns the photographs' names: labels, which have no folders. Where labels are equal, a group is the folder.
+/// Returns the photographs' names: labels, which have no folders. Of equal ones, the group is the folder.
 fn labels(placed: &[Placed]) -> Vec<String> {
     let (mut seen, mut twice) = (HashSet::new(), HashSet::new());
     for placed in placed {
@@ -212,9 +214,9 @@ impl<'a, 'i> Rig<'a, 'i> {
         if !lost.is_empty() {
             let (slaves, names) = (counted(lost.len(), "slave camera"), few(lost));
             listing.warnings.push(format!(
-                "{slaves} of a rig left out, because no `rotation` and `location` of a sensor says where they are in \
-                 their masters: {names}; in Metashape, give the slave offset in Tools, Camera Calibration, optimize \
-                 the cameras, and export them again"
+                "{slaves} of a rig left out, because no `rotation` and `location` of a sensor says where \
+                 they are in their masters: {names}; in Metashape, give the slave offset in Tools, Camera \
+                 Calibration, optimize the cameras, and export them again"
             ));
         }
         let slaves = placed.iter().filter(|placed| placed.is_slave).count();
@@ -231,8 +233,8 @@ impl<'a, 'i> Rig<'a, 'i> {
         if rolling > 0 {
             let cameras = counted(rolling, "camera");
             listing.warnings.push(format!(
-                "rolling shutter of {cameras} was compensated in Metashape, and is not here: each photograph has one \
-                 pose; a head that was photographed in motion is blurred"
+                "rolling shutter of {cameras} was compensated in Metashape, and is not here: each photograph \
+                 has one pose; a head that was photographed in motion is blurred"
             ));
         }
         Ok(placed)

@@ -47,8 +47,8 @@ fn is_program(file: &Path) -> bool {
     super::is_file(file)
 }
 
-/// Returns what a program prints that does nothing else, such as its help, however it ends. `None` where it cannot be run,
-/// takes too long, or is to `stop`.
+/// Returns what a program prints that does nothing else, such as its help, however it ends; `None`
+/// where it cannot be run, takes too long, or is to `stop`.
 pub fn help_of(file: &Path, arguments: &[&str], stop: &dyn Fn() -> bool) -> Option<String> {
     let (printed, writer) = std::io::pipe().ok()?;
     let mut command = Command::new(file);

@@ -37,7 +37,7 @@ impl Sensor {
         }
     }
 
-    /// Returns the transform from a slave's sensor to that of its master; `None` where the file does not say it.
+    /// Returns the transform from a slave's sensor to that of its master, if the file says it.
     ///
     /// The master of a camera may be another one than the sensor in which the rig was calibrated.
     pub fn master_from_slave(master: &Sensor, slave: &Sensor) -> Result<Option<Pose>, String> {

@@ -2,12 +2,12 @@
 //!
 //! | COLMAP | options of features and matches | `--glomap` |
 //! |---|---|---|
-//! | 3.8 to 3.12 | `SiftExtraction.use_gpu`, `SiftMatching.guided_matching` | `glomap mapper`, a program of its own |
+//! | 3.8 to 3.12 | `SiftExtraction.use_gpu`, `SiftMatching.guided_matching` | `glomap mapper`, another program |
 //! | 3.13 | `FeatureExtraction.use_gpu`, `FeatureMatching.guided_matching` | the same |
 //! | 4.0 to 4.2 | the same | `colmap view_graph_calibrator`, then `colmap global_mapper` |
 //!
 //! The others have one name in all versions: `ImageReader`, `SiftExtraction.peak_threshold` and its kin,
-//! `Mapper.num_threads`, `BundleAdjustment.refine_principal_point`. The program's help says which names it knows.
+//! `Mapper.num_threads`, `BundleAdjustment.refine_principal_point`. The program's help says which it knows.
 
 use super::output::{NAMES, OPTIONS};
 use super::{Attempt, MAX_EXHAUSTIVE, SfmOptions, Work};
