@@ -54,6 +54,7 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
         cameras: cameras.iter().map(|camera| (id(*camera), *camera)).collect(),
     };
     let placed = rig.place(file, &cameras, listing)?;
+    let placed = of_one_world(placed, chunk, &components, listing);
     let labels = labels(&placed);
     let base = folder.image_folder(labels.iter().map(String::as_str));
     let mut far = false;
@@ -133,6 +134,36 @@ fn choose_chunk<'a, 'i>(
         ));
     }
     Ok(*chunk)
+}
+
+/// Returns the cameras of one component, where several were aligned apart and have no place in a common
+/// world: of the active one, else of the largest.
+fn of_one_world<'a, 'i>(
+    placed: Vec<Placed<'a, 'i>>,
+    chunk: Node<'a, 'i>,
+    components: &HashMap<&str, Option<Frame>>,
+    listing: &mut Listing,
+) -> Vec<Placed<'a, 'i>> {
+    let mut ids: Vec<&str> = placed.iter().filter_map(|placed| placed.component).collect();
+    ids.sort_unstable();
+    ids.dedup();
+    let has_place = |id: &&str| components.get(*id).is_some_and(|frame| frame.is_some());
+    if ids.len() < 2 || ids.iter().all(has_place) {
+        return placed;
+    }
+    let count = |id: &&str| placed.iter().filter(|placed| placed.component == Some(*id)).count();
+    let active = child(chunk, "components").and_then(|components| components.attribute("active_id"));
+    let largest = ids.iter().copied().max_by_key(count);
+    let read = active.filter(|id| ids.contains(id)).or(largest);
+    let is_read = |placed: &Placed| placed.component.is_none() || placed.component == read;
+    let (kept, others): (Vec<Placed>, Vec<Placed>) = placed.into_iter().partition(is_read);
+    let (cameras, names) = (counted(others.len(), "camera"), few(others.iter().map(|o| label(&o.camera))));
+    listing.warnings.push(format!(
+        "{cameras} left out, because Metashape aligned the chunk in {} components apart, of which one is read: \
+         {names}; align the photographs again until they are in one",
+        ids.len()
+    ));
+    kept
 }
 
 fn id<'a>(node: Node<'a, '_>) -> &'a str {
@@ -222,7 +253,7 @@ impl<'a, 'i> Rig<'a, 'i> {
         let slaves = placed.iter().filter(|placed| placed.is_slave).count();
         if slaves > 0 {
             let slaves = counted(slaves, "slave camera");
-            let text = "of a rig placed by its master and by the rotation and location of its sensor";
+            let text = "of a rig placed by the master's pose and the sensor's rotation and location";
             listing.reasons.push(format!("{slaves} {text}"));
         }
         let has_rows = |placed: &&Placed| {

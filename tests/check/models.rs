@@ -422,6 +422,27 @@ fn the_enabled_chunk_of_metashape_is_read_and_the_others_are_named() {
 }
 
 #[test]
+fn components_that_metashape_aligned_apart_are_not_taken_for_one_world() {
+    let dir = photographs(&names(3, |i| format!("{i}.png")));
+    let whole = document(&whole_chunk("enabled=\"true\"", 30.0));
+    let last = whole.rfind("component_id=\"0\"").unwrap();
+    let apart = format!("{}component_id=\"1\"{}", &whole[..last], &whole[last + 16..]);
+    // both have their place in the world
+    let place = "</component><component id=\"1\"><transform><translation>1 2 3</translation></transform></component></components>";
+    put(&dir, "cameras.xml", apart.replace("</component></components>", place));
+    assert_eq!(open(&dir).unwrap().views.len(), 3);
+    // one has none
+    let other = "</component><component id=\"1\"/></components>";
+    let without = apart.replace("</component></components>", other);
+    put(&dir, "cameras.xml", &without);
+    let c = open(&dir).unwrap();
+    assert_eq!(c.views.len(), 2);
+    says(&c.warnings, &["1 camera left out", "2 components apart", "`2`"]);
+    put(&dir, "cameras.xml", without.replace("<components>", "<components active_id=\"1\">"));
+    assert_eq!(open(&dir).unwrap().views.len(), 1);
+}
+
+#[test]
 fn what_a_metashape_lens_has_and_is_not_read_is_named() {
     let dir = photographs(&names(3, |i| format!("{i}.png")));
     let whole = document(&whole_chunk("enabled=\"true\"", 30.0));
