@@ -33,7 +33,7 @@ pub use process::{
     cpu_seconds, forget_peak_memory, give_memory_back, has_ended, has_open, peak_memory, processor,
     set_memory_collector,
 };
-pub use program::{Program, ProgramFailure, VideoFrames, find_program};
+pub use program::{Program, ProgramFailure, VideoFrames, find_program, help_of};
 pub use read::{Limits, ReadError, read_bytes, read_maybe_empty, read_pieces};
 pub use tensors::{TensorValues, Tensors, parse_tensors, read_tensors, tensor_bytes, write_tensors};
 pub use write::{WriteError, copy, remove, remove_leftovers, rename, write_atomic};

@@ -1,8 +1,8 @@
 //! COLMAP's sparse models: `sparse/0`, `sparse`, the same below `colmap/`, or the folder itself.
 //!
 //! A pose takes the world to a camera whose axes point right, down and ahead, as a quaternion (w, x, y, z) and a
-//! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are complete in the
-//! images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12) are not read.
+//! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are
+//! complete in the images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12 to 4.2) are not read.
 //! Points are optional, and say where the head is if no masks do.
 //!
 //! A model is written back as binary files: one camera for each lens that differs, no points. [`Found`] sums up what
@@ -67,12 +67,12 @@ impl ModelFiles {
         if self.ending == "bin" {
             return binary::read(&cameras, &images, points.as_ref(), limits);
         }
-        let as_text = |kind: &str, (path, bytes): (PathBuf, Vec<u8>)| -> Result<(String, String)> {
+        let as_text = |kind: &str, (path, bytes): (PathBuf, Vec<u8>)| -> Result<text::Source> {
             let text = String::from_utf8(bytes).map_err(|e| {
                 let offset = e.utf8_error().valid_up_to() as u64;
                 ReadError::damaged(&path, "COLMAP", offset, "it is not UTF-8 text")
             })?;
-            Ok((self.name(kind), text))
+            Ok(text::Source::new(self.name(kind), text))
         };
         let points = points.map(|file| as_text("points3D", file)).transpose()?;
         text::read(&as_text("cameras", cameras)?, &as_text("images", images)?, points.as_ref(), limits)
@@ -81,7 +81,8 @@ impl ModelFiles {
 
 /// Lists the images of a model, in the order of their numbers.
 pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Listing) -> Result<()> {
-    let Model { cameras, mut images, points } = files.read(folder)?;
+    let Model { cameras, mut images, points, notes } = files.read(folder)?;
+    listing.reasons.extend(notes);
     let name_of = files.name("images");
     if images.is_empty() {
         return Err(in_file(
@@ -230,6 +231,8 @@ struct Model {
     pub images: Vec<Image>,
     /// Those that were found, where they are given.
     pub points: Option<Vec<DVec3>>,
+    /// What a user should know of how the files were read.
+    pub notes: Vec<String>,
 }
 
 /// One lens, shared by images.

@@ -195,7 +195,7 @@ pub(super) struct LensModel {
 }
 
 /// Models with an inverse (COLMAP, `src/colmap/sensor/models.h`).
-pub(super) const MODELS: [LensModel; 11] = [
+pub(super) const MODELS: [LensModel; 13] = [
     model(0, "SIMPLE_PINHOLE", "f cx cy"),
     model(1, "PINHOLE", "fx fy cx cy"),
     model(2, "SIMPLE_RADIAL", "f cx cy k1"),
@@ -207,6 +207,8 @@ pub(super) const MODELS: [LensModel; 11] = [
     model(8, "SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
     model(9, "RADIAL_FISHEYE", "f cx cy k1 k2"),
     model(10, "THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    model(14, "SIMPLE_FISHEYE", "f cx cy"),
+    model(15, "FISHEYE", "fx fy cx cy"),
 ];
 
 const fn model(id: i32, name: &'static str, parameters: &'static str) -> LensModel {
@@ -218,8 +220,8 @@ const UNSUPPORTED_MODELS: [(i32, &str); 5] = [
     (11, "RAD_TAN_THIN_PRISM_FISHEYE"),
     (12, "SIMPLE_DIVISION"),
     (13, "DIVISION"),
-    (14, "SIMPLE_FISHEYE"),
-    (15, "FISHEYE"),
+    (16, "EUCM"),
+    (17, "EQUIRECTANGULAR"),
 ];
 
 /// Returns the projection of a lens model.

@@ -24,14 +24,16 @@ use crate::image::Photo;
 use crate::io::{self, Limits, Lock, Program, ProgramFailure, VideoFrames};
 use crate::run::Fingerprint;
 use crate::{Error, Result};
+use commands::{Programs, Spelling};
 use glam::{DMat3, DVec3};
-use output::{LOG, NAMES, OPTIONS, Output, PHOTOGRAPHS, Request};
+use output::{LOG, NAMES, Output, PHOTOGRAPHS, Request};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::HashSet;
 use std::ffi::OsString;
 use std::path::{Component, Path, PathBuf};
 
+mod commands;
 mod output;
 
 /// Fewest photographs that a capture can have.
@@ -61,12 +63,6 @@ const PICTURE_BYTES: u64 = 8192 * (128 + 24);
 /// Bytes of the database for two pictures that are matched, on average.
 const PAIR_BYTES: u64 = 2 << 10;
 
-const INSTALL_COLMAP: &str = "install COLMAP: `apt-get install colmap` on Debian and Ubuntu, `brew install colmap` on macOS; on \
-                              Windows, unpack the release from https://github.com/colmap/colmap/releases and add its folder \
-                              to PATH";
-
-const INSTALL_GLOMAP: &str = "leave out `--glomap`, or install GLOMAP: https://github.com/colmap/glomap";
-
 const INSTALL_FFMPEG: &str = "install FFmpeg: `apt-get install ffmpeg` on Debian and Ubuntu, `brew install ffmpeg` on macOS, \
                               `winget install ffmpeg` on Windows";
 
@@ -84,7 +80,7 @@ pub struct SfmOptions<'a> {
     pub out: PathBuf,
     /// Whether each photograph has a lens of its own, even if sizes and focal lengths agree.
     pub lens_each: bool,
-    /// Whether GLOMAP finds the poses from COLMAP's matches.
+    /// Whether GLOMAP, or the global mapper that it became, finds the poses from COLMAP's matches.
     pub glomap: bool,
     /// Limits of what is read.
     pub limits: Limits,
@@ -413,23 +409,6 @@ fn require_enough(found: usize, place: &Path, hint: &str) -> Result<()> {
     ))
 }
 
-/// The programs that find cameras.
-struct Programs {
-    colmap: PathBuf,
-    glomap: Option<PathBuf>,
-}
-
-impl Programs {
-    fn find(sfm: &SfmOptions) -> Result<Programs> {
-        let find = |name: &str, hint: &str| {
-            io::find_program(name).ok_or_else(|| Error::cannot(format!("`{name}` is not installed"), hint))
-        };
-        let colmap = find("colmap", INSTALL_COLMAP)?;
-        let glomap = sfm.glomap.then(|| find("glomap", INSTALL_GLOMAP)).transpose()?;
-        Ok(Programs { colmap, glomap })
-    }
-}
-
 /// Returns the error of a program's command that failed.
 fn failed_command(program: &str, arguments: &[OsString], failure: &ProgramFailure, log: &Path) -> Error {
     let (command, status, log) = (arguments[0].to_string_lossy(), &failure.status, log.display());
@@ -487,55 +466,8 @@ impl Work<'_> {
         failed.map_or(Ok(()), |failure| Err(failed_command("colmap", arguments, &failure, log)))
     }
 
-    /// Returns whether COLMAP names options as since 3.13, which moved some from `Sift…` to `Feature…`.
-    fn has_new_names(&self) -> Result<bool> {
-        let help = self.output.work(OPTIONS);
-        self.require(&["feature_extractor".into(), "-h".into()], &help)?;
-        let text = io::read_maybe_empty(&help, &self.sfm.limits)?;
-        Ok(String::from_utf8_lossy(&text).contains("FeatureExtraction.use_gpu"))
-    }
-
-    /// Returns the arguments of feature extraction, matching and mapping.
-    fn arguments(&self, attempt: Attempt, folder: &Path, new_names: bool) -> [Vec<OsString>; 3] {
-        let Attempt { masked, weak } = attempt;
-        let threads = rayon::current_num_threads().to_string();
-        let kind = if new_names { "Feature" } else { "Sift" };
-        let on_cpu = |task: &str| format!("--{kind}{task}.use_gpu 0 --{kind}{task}.num_threads {threads}");
-        let [database, models] = ["database.db", "models"].map(|name| folder.join(name));
-        let (images, masks) = (self.sfm.out.join("images"), self.output.work("masks"));
-        let listed = self.output.work(NAMES);
-        let command = |name: &str, paths: &[(&str, &Path)], words: String| -> Vec<OsString> {
-            let paths = paths.iter().flat_map(|(option, path)| [OsString::from(option), path.into()]);
-            let words = words.split_whitespace().map(OsString::from);
-            [name.into()].into_iter().chain(paths).chain(words).collect()
-        };
-        let database: (&str, &Path) = ("--database_path", &database);
-        let paths = [database, ("--image_path", &images)];
-        let read = [
-            (masked, ("--ImageReader.mask_path", masks.as_path())),
-            (io::is_file(&listed), ("--image_list_path", listed.as_path())),
-        ];
-        let read = read.into_iter().filter_map(|(is_given, path)| is_given.then_some(path));
-        let read: Vec<(&str, &Path)> = paths.into_iter().chain(read).collect();
-        let mut words = on_cpu("Extraction") + " --ImageReader.camera_model SIMPLE_RADIAL";
-        words += if self.shared { " --ImageReader.single_camera 1" } else { "" };
-        if weak {
-            words += " --SiftExtraction.peak_threshold 0.002 --SiftExtraction.estimate_affine_shape 1 \
-                      --SiftExtraction.domain_size_pooling 1";
-        }
-        let extractor = command("feature_extractor", &read, words);
-        let is_long = self.is_video && self.names.len() > MAX_EXHAUSTIVE;
-        let matcher = if is_long { "sequential_matcher" } else { "exhaustive_matcher" };
-        let guided = if weak { format!(" --{kind}Matching.guided_matching 1") } else { String::new() };
-        let matcher = command(matcher, &[database], on_cpu("Matching") + &guided);
-        let is_glomap = self.programs.glomap.is_some();
-        let words = if is_glomap { String::new() } else { format!("--Mapper.num_threads {threads}") };
-        let mapper = command("mapper", &[paths[0], paths[1], ("--output_path", &models)], words);
-        [extractor, matcher, mapper]
-    }
-
     /// Returns the largest model that an attempt finds.
-    fn attempt(&self, attempt: Attempt, new_names: bool) -> Result<Option<Model>> {
+    fn attempt(&self, attempt: Attempt, spelling: &Spelling) -> Result<Option<Model>> {
         let folder = self.output.work(match attempt {
             Attempt { weak: false, .. } => "1",
             Attempt { masked, .. } if masked == self.masked => "2",
@@ -544,12 +476,16 @@ impl Work<'_> {
         let (log, models) = (self.output.work(LOG), folder.join("models"));
         self.output.require_room(database_bytes(self.names.len(), self.is_video))?;
         io::create_folder(&models)?;
-        let [extractor, matcher, mapper] = self.arguments(attempt, &folder, new_names);
-        self.require(&extractor, &log)?;
-        self.require(&matcher, &log)?;
+        let commands = self.commands(attempt, &folder, spelling);
+        self.require(&commands.extractor, &log)?;
+        self.require(&commands.matcher, &log)?;
+        if let Some(calibrator) = &commands.calibrator {
+            // a lens that it cannot calibrate keeps the focal length that was guessed
+            self.run(&self.programs.colmap, calibrator, &log)?;
+        }
         // a mapper that finds no model fails as well, but ends itself
-        let program = self.programs.glomap.as_ref().unwrap_or(&self.programs.colmap);
-        let crash = self.run(program, &mapper, &log)?.filter(|failure| failure.is_crash);
+        let (program, name) = self.programs.mapper();
+        let crash = self.run(program, &commands.mapper, &log)?.filter(|failure| failure.is_crash);
         let names: HashSet<&String> = self.names.iter().collect();
         let (mut best, mut pieces, mut unreadable) = (None::<(PathBuf, Found)>, 0, Vec::new());
         for folder in io::list_folders(&models)? {
@@ -568,8 +504,7 @@ impl Work<'_> {
         if let Some(failure) = crash
             && !best.as_ref().is_some_and(|(_, found)| enough(found))
         {
-            let program = if self.programs.glomap.is_some() { "glomap" } else { "colmap" };
-            return Err(failed_command(program, &mapper, &failure, &log));
+            return Err(failed_command(name, &commands.mapper, &failure, &log));
         }
         match best {
             Some((folder, found)) => Ok(Some(Model { attempt, folder, found, pieces, unreadable })),
@@ -579,7 +514,7 @@ impl Work<'_> {
 
     fn solve(self) -> Result<Solution> {
         self.list_names()?;
-        let new_names = self.has_new_names()?;
+        let spelling = self.spelling()?;
         let (n, masked) = (self.names.len(), self.masked);
         let mut attempts = vec![Attempt { masked, weak: false }, Attempt { masked, weak: true }];
         if masked {
@@ -595,7 +530,7 @@ impl Work<'_> {
                 let found = registered(&best);
                 (self.sfm.say)(&format!("{found} of {n} photographs have a camera: once more, {how}"));
             }
-            match self.attempt(attempt, new_names) {
+            match self.attempt(attempt, &spelling) {
                 Ok(model) if registered(&model) > registered(&best) => best = model,
                 Ok(_) => {}
                 // what an earlier attempt found counts, whatever becomes of another one

@@ -24,7 +24,7 @@ pub(super) struct CamerasOptions {
     /// Calibrate a lens for each photograph, as for a rig [default: one, where sizes and EXIF focal lengths agree]
     #[arg(long)]
     lens_each: bool,
-    /// Map with GLOMAP instead of COLMAP's mapper; needs both
+    /// Map with GLOMAP instead of COLMAP's mapper: COLMAP 4 has it, an older one needs GLOMAP beside it
     #[arg(long)]
     glomap: bool,
 }

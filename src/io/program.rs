@@ -10,14 +10,20 @@ use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, ExitStatus, Stdio};
-use std::sync::mpsc::{self, Receiver};
-use std::time::Duration;
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant};
 
 /// How often a running program is polled.
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// How long the last messages of a program that has ended are waited for.
 const MESSAGES_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// How long a program may take to print its help.
+const HELP_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// Most bytes of a help that are read.
+const MAX_HELP_BYTES: u64 = 1 << 20;
 
 /// Most bytes of a log, whatever a program says, so that it cannot fill a disk.
 const MAX_LOG_BYTES: u64 = 32 << 20;
@@ -39,6 +45,39 @@ fn is_program(file: &Path) -> bool {
 #[cfg(not(unix))]
 fn is_program(file: &Path) -> bool {
     super::is_file(file)
+}
+
+/// Returns what a program prints that does nothing else, such as its help, however it ends; `None`
+/// where it cannot be run, takes too long, or is to `stop`.
+pub fn help_of(file: &Path, arguments: &[&str], stop: &dyn Fn() -> bool) -> Option<String> {
+    let (printed, writer) = std::io::pipe().ok()?;
+    let mut command = Command::new(file);
+    command.args(arguments).env("QT_QPA_PLATFORM", "offscreen");
+    command.stdin(Stdio::null()).stdout(writer.try_clone().ok()?).stderr(writer);
+    bind(&mut command);
+    let mut child = command.spawn().ok()?;
+    drop(command); // which has the pipe, so that it would not end
+    let (sender, received) = mpsc::channel();
+    let read = move || {
+        let mut bytes = Vec::new();
+        let whole = printed.take(MAX_HELP_BYTES).read_to_end(&mut bytes);
+        drop(sender.send(whole.map(|_| bytes)));
+    };
+    // without a thread the channel is closed
+    drop(std::thread::Builder::new().name("help".into()).spawn(read));
+    let deadline = Instant::now() + HELP_TIMEOUT;
+    let bytes = loop {
+        match received.recv_timeout(POLL_INTERVAL) {
+            Ok(read) => break read.ok(),
+            Err(RecvTimeoutError::Timeout) if Instant::now() < deadline && !stop() => {}
+            Err(_) => break None,
+        }
+    };
+    // all fail if it has ended
+    kill_group(&child);
+    let _ = child.kill();
+    let _ = child.wait();
+    bytes.map(|bytes| String::from_utf8_lossy(&bytes).into_owned())
 }
 
 /// A running program; it is killed when this is dropped, with those that it started.
@@ -322,6 +361,15 @@ mod tests {
         let kept = std::fs::read(&path).unwrap();
         assert!(kept.len() <= 50_000 && kept.len() > 25_000, "{}", kept.len());
         assert!(kept.starts_with(b"(older messages") && kept.ends_with(b"99998\n99999\n"));
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn a_help_is_read_however_the_program_ends_and_not_waited_for_after_a_stop() {
+        let shell = |text: &str, stop: &dyn Fn() -> bool| help_of(Path::new("/bin/sh"), &["-c", text], stop);
+        assert_eq!(shell("echo a; echo b >&2; exit 3", &|| false).as_deref(), Some("a\nb\n"));
+        assert_eq!(shell("sleep 600 & sleep 600", &|| true), None);
+        assert_eq!(help_of(Path::new("/no/program"), &[], &|| false), None);
     }
 
     #[test]

@@ -440,7 +440,11 @@ fn hostile_text_is_refused_with_its_line() {
         (camera, "1 1 0 0 0 0 0 2 1\n", &["images.txt`: line 1", "a photograph's name"]),
         (camera, "1 1 0 0 0 0 nan 2 1 a b.png\n", &["not finite"]),
         (camera, "1 1 0 0 x 0 0 2 1 a b.png\n", &["`x` is not a number of a pose"]),
-        (camera, "1 1 0 0 0 0 0 2 1 a b.png\n2 1 0 0 0 0 0 2 1 c.png\n", &["line 2", "takes two lines"]),
+        (
+            camera,
+            "1 1 0 0 0 0 0 2 1 a b.png\n2 1 0 0 0 0 0 2 9 c.png\n",
+            &["line 2", "takes two lines", "camera 9"],
+        ),
         (camera, "99999999999 1 0 0 0 0 0 2 1 a b.png\n", &["the number of an image"]),
     ] {
         with(cameras, images);

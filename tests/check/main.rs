@@ -32,6 +32,7 @@ mod hostile_mesh;
 mod hostile_npz;
 mod house;
 mod masks;
+mod models;
 mod photographs;
 mod preview;
 mod raycast_truth;

@@ -23,7 +23,7 @@ fn tiface(folder: &Path, path: OsString, words: &[&str]) -> Output {
 }
 
 /// Nine photographs without cameras in `photographs/`.
-fn photographs() -> TempDir {
+pub fn photographs() -> TempDir {
     let dir = tempfile::tempdir().unwrap();
     let small = SyntheticOptions { width: 24, height: 30, train: 7, test: 2, seed: 1 };
     photographed(&dir.path().join("head"), &small);
@@ -33,7 +33,7 @@ fn photographs() -> TempDir {
 }
 
 /// Runs `tiface cameras` with only the programs of this folder.
-fn cameras(dir: &TempDir, words: &[&str]) -> (i32, String) {
+pub fn cameras(dir: &TempDir, words: &[&str]) -> (i32, String) {
     let output = tiface(dir.path(), dir.path().join("programs").into(), &[&["cameras"], words].concat());
     (code(&output), err(&output))
 }
@@ -108,7 +108,7 @@ fn photographs_that_are_left_out_for_their_names_are_named() {
 
 /// Puts a shell script in the place of a program.
 #[cfg(unix)]
-fn script(dir: &TempDir, program: &str, text: &str) {
+pub fn script(dir: &TempDir, program: &str, text: &str) {
     use std::os::unix::fs::PermissionsExt;
     let path = dir.path().join("programs").join(program);
     fs::write(&path, format!("#!/bin/sh\n{text}\n")).unwrap();
@@ -225,7 +225,7 @@ fn masks_are_given_to_colmap_black_and_white_and_by_its_names() {
 /// in the place of COLMAP finds; then its mapper does what `then` says, with the folder of models
 /// in `$out`.
 #[cfg(unix)]
-fn found_by_script(then: &str) -> TempDir {
+pub fn found_by_script(then: &str) -> TempDir {
     let dir = photographs();
     let small = SyntheticOptions { width: 24, height: 30, train: 7, test: 2, seed: 1 };
     photographed(&dir.path().join("whole"), &small);

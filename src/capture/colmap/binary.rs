@@ -118,8 +118,8 @@ impl<'b> Cursor<'b> {
 
 pub(super) fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, ReadError> {
     let mut c = Cursor::of(source);
-    // number, model, width, height and three parameters at least
-    let n = c.counted(4 + 4 + 16 + 3 * 8, "cameras")?;
+    // number, model, width, height and two parameters at least: those of EQUIRECTANGULAR, to be refused by name
+    let n = c.counted(4 + 4 + 16 + 2 * 8, "cameras")?;
     let mut cameras = HashMap::with_capacity(n);
     for _ in 0..n {
         let start = c.at;
