@@ -104,15 +104,10 @@ impl Vm {
         self.decoder.prepare(device, values.network);
         samples.march(device, &self.lattice, rays);
         self.density.gather(device, values.density, &samples.place, &samples.count, &along.feature);
-        along.compute_weights(device, samples, rays, self.decoder.limit());
+        along.compute_weights(device, samples);
         self.decoder.forward(device, &self.color, values.color, rays, samples, along);
         along.composite(device, samples);
         &along.out
-    }
-
-    /// Tells how many samples of a batch are expected to get a color: see [`DeviceDecoder::expect`].
-    pub fn expect_colors(&self, samples: u64) {
-        self.decoder.expect(samples);
     }
 
     /// Returns the composited values of the last render, planes `[5, rays]`.
@@ -151,8 +146,7 @@ impl Vm {
         );
     }
 
-    /// Returns the number of samples that were looked up and that would have been with larger buffers, the same of decoded
-    /// ones, `[2]` each; and the lattice points of each ray, `[rays]`.
+    /// Returns the number of samples that were looked up and that would have been with larger buffers, the same of decoded ones, `[2]` each; and the lattice points of each ray, `[rays]`.
     pub fn counts(&self) -> [&Buffer; 3] {
         [&self.samples.count, &self.along.count, &self.samples.points]
     }

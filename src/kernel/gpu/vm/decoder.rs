@@ -22,7 +22,6 @@ use super::march::VmSamples;
 use super::rays::Along;
 use crate::kernel::cpu::vm::DecoderShape;
 use kernels::{backward, chain, forward, prepare};
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Maximum number of groups that sum gradients of weights, each over its own tiles. A thread keeps 50 to 200 sums in
 /// registers, which then suffice for one or two groups on a multiprocessor, and the largest cards have some 150.
@@ -117,8 +116,6 @@ pub struct DeviceDecoder {
     g_products: Buffer,
     pub(super) chunk: usize,
     capacity: usize,
-    /// Maximum number of samples of a batch with a color, whole chunks.
-    limit: AtomicUsize,
     /// Maximum number of groups that sum gradients of weights.
     pub(super) groups: usize,
     partial: Buffer,
@@ -173,25 +170,10 @@ impl DeviceDecoder {
             g_products: learned(chunk * 4 * plan.products()),
             chunk,
             capacity,
-            limit: AtomicUsize::new(usize::MAX),
             partial: learned(plan.groups(chunk) * gradients),
             groups: plan.groups(chunk),
             summed: learned(gradients),
         }
-    }
-
-    /// Returns the maximum number of samples of a batch that get a color: all, until some number is expected.
-    pub fn limit(&self) -> usize {
-        self.limit.load(Ordering::Relaxed).min(self.capacity)
-    }
-
-    /// Limits the samples of later batches that get a color to four times as many as `expected`, in whole chunks. Chunks
-    /// beyond are not launched, and rays that would need them are not alive. Only the device knows the number of a batch;
-    /// that of earlier ones, which is read now and then, stands for it, since a field changes slowly.
-    pub fn expect(&self, expected: u64) {
-        let chunk = self.chunk as u64;
-        let chunks = expected.saturating_mul(4).div_ceil(chunk).clamp(1, self.capacity as u64);
-        self.limit.store((chunks * chunk) as usize, Ordering::Relaxed);
     }
 
     /// Converts the flat weights, as on the CPU, to the layout of the kernels.
@@ -240,7 +222,7 @@ impl DeviceDecoder {
         broken: &Buffer,
     ) {
         assert!(along.index.words() == self.capacity && values.words() == grid.len());
-        for from in (0..self.limit()).step_by(self.chunk) {
+        for from in (0..self.capacity).step_by(self.chunk) {
             // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
             unsafe {
                 launch!(device, backward::launch_unchecked, groups(self.summing()), UNITS;

@@ -2,7 +2,6 @@
 //! [`crate::kernel::cpu::vm`], whose module has the formulas.
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::draw::Batch;
 use super::super::march::prefix_sum;
 use super::super::neus::sigmoid;
 use super::march::VmSamples;
@@ -58,24 +57,11 @@ fn compute_weights(
     }
 }
 
-/// Lists the samples whose weight is above the threshold. A ray whose own exceed the list has no samples, and is not alive.
+/// Lists the samples whose weight is above the threshold.
 #[cube(launch)]
-fn list(
-    offsets: &[u32],
-    counts: &[u32],
-    weight: &[f32],
-    firsts: &[u32],
-    ends: &mut [u32],
-    index: &mut [u32],
-    alive: &mut [u32],
-    threshold: f32,
-) {
+fn list(offsets: &[u32], ends: &[u32], weight: &[f32], firsts: &[u32], index: &mut [u32], threshold: f32) {
     let r = ABSOLUTE_POS;
     if r < ends.len() {
-        if firsts[r + 1] - firsts[r] < counts[r] {
-            ends[r] = offsets[r];
-            alive[r] = 0;
-        }
         let mut next = firsts[r] as usize;
         for s in (offsets[r] as usize)..(ends[r] as usize) {
             if weight[s] > threshold {
@@ -190,7 +176,7 @@ pub struct Along {
     pub feature: Buffer,
     /// `[capacity]`: gradients with respect to features.
     pub g_feature: Buffer,
-    /// `[2]`: number of samples with a color, and the number with an unlimited list.
+    /// `[2]`: number of samples with a color, in both words.
     pub count: Buffer,
     /// `[capacity]`: list of the samples with a color.
     pub index: Buffer,
@@ -251,17 +237,15 @@ impl Along {
         groups(self.ends.words().div_ceil(UNITS as usize))
     }
 
-    /// Computes the weights of samples from their features, and lists the samples that need a color, at most `limit`. Rays
-    /// whose samples exceed that are marked as not alive.
-    pub fn compute_weights(&self, device: &Device, samples: &VmSamples, rays: &Batch, limit: usize) {
+    /// Computes the weights of samples from their features, and lists the samples that need a color.
+    pub fn compute_weights(&self, device: &Device, samples: &VmSamples) {
         launch!(device, compute_weights::launch, self.groups(), UNITS;
             samples.offsets, self.feature, self.alpha, self.light, self.weight, self.ends, self.counts;
             self.shift, self.length, self.threshold, self.stop, self.softplus
         );
-        prefix_sum(device, &self.counts, &self.firsts, &self.count, limit.min(self.index.words()));
+        prefix_sum(device, &self.counts, &self.firsts, &self.count, self.index.words());
         launch!(device, list::launch, self.groups(), UNITS;
-            samples.offsets, self.counts, self.weight, self.firsts, self.ends, self.index, rays.alive;
-            self.threshold
+            samples.offsets, self.ends, self.weight, self.firsts, self.index; self.threshold
         );
     }
 
