@@ -153,7 +153,7 @@ impl Intrinsics {
         for (k, name) in ["fl_x", "fl_y"].into_iter().enumerate() {
             let Some(f) = self.focal[k].filter(|f| *f < 0.1 * longest) else { continue };
             let unit = if f < 10.0 {
-                format!("as a share of the picture's side (normalized) it is {} pixels", f * side[k])
+                format!("as a share of the picture's side (normalized) it is {:.1} pixels", f * side[k])
             } else {
                 "millimeters are multiplied by the picture's width and divided by the sensor's".into()
             };
@@ -169,9 +169,17 @@ impl Intrinsics {
         {
             let ([w, h], is_share) = (side, cx > 0.0 && cy > 0.0);
             let unit = if is_share {
-                format!("as shares of the picture (normalized) `cx` is {} and `cy` is {}", cx * w, cy * h)
+                format!(
+                    "as shares of the picture (normalized) `cx` is {:.1} and `cy` is {:.1}",
+                    cx * w,
+                    cy * h
+                )
             } else {
-                format!("counted from the middle, `cx` is {} and `cy` is {}", cx + 0.5 * w, cy + 0.5 * h)
+                format!(
+                    "counted from the middle, `cx` is {:.2} and `cy` is {:.2}",
+                    cx + 0.5 * w,
+                    cy + 0.5 * h
+                )
             };
             return Err(format!(
                 "the principal point ({cx}, {cy}) is in the corner of its {w} × {h} pixels; `cx` and `cy` must be pixels \
@@ -394,10 +402,10 @@ mod tests {
         let says = |focal, center, size| of(focal, center, size).unwrap_err();
         let middle = [None; 2];
         // 1.2 · 96
-        assert!(says(1.2, middle, (96, 128)).contains("(normalized) it is 115.19"));
+        assert!(says(1.2, middle, (96, 128)).contains("(normalized) it is 115.2 pixels"));
         assert!(says(50.0, middle, (4000, 3000)).contains("millimeters"));
-        assert!(says(330.0, [Some(0.5); 2], (96, 128)).contains("`cx` is 48 and `cy` is 64"));
-        assert!(says(330.0, [Some(0.0), Some(-0.25)], (96, 128)).contains("`cx` is 48 and `cy` is 63.75"));
+        assert!(says(330.0, [Some(0.5); 2], (96, 128)).contains("`cx` is 48.0 and `cy` is 64.0"));
+        assert!(says(330.0, [Some(0.0), Some(-0.25)], (96, 128)).contains("`cx` is 48.00 and `cy` is 63.75"));
         // a fisheye of 180° on 96 pixels, and a picture cut from the corner of another
         assert_eq!(of(30.6, middle, (96, 96)), Ok((30.6, 48.0)));
         assert_eq!(of(330.0, [Some(0.5), Some(40.0)], (96, 128)), Ok((330.0, 0.5)));

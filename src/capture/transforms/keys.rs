@@ -230,7 +230,8 @@ impl KeyLog {
                 Some((_, Use::Read)) => {}
                 Some((key, Use::Ignored)) => _ = self.ignored.insert(key),
                 Some((key, Use::Changes(change))) => {
-                    let is_redundant = change.unless.split(' ').any(|key| object.contains_key(key));
+                    let says_so = |key| object.get(key).is_some_and(|v| is_nonzero(v) || v.is_string());
+                    let is_redundant = change.unless.split(' ').any(says_so);
                     if !is_redundant && (change.has_effect)(value) {
                         let first = || (*change, place.to_string(), 0);
                         self.changes.entry(key).or_insert_with(first).2 += 1;
