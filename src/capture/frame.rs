@@ -146,8 +146,8 @@ impl Intrinsics {
         Ok(Camera { width, height, fx, fy, cx, cy, distortion, rotation, position })
     }
 
-    /// Refuses a focal length and a principal point that cannot be pixels of a picture of this size: a lens of more than
-    /// 157°, and a principal point in the corner.
+    /// Refuses a focal length and a principal point that cannot be pixels of a picture of this size:
+    /// a lens of more than 157°, and a principal point in the corner.
     fn check_pixels(&self, side: [f64; 2]) -> Result<(), String> {
         let longest = side[0].max(side[1]);
         for (k, name) in ["fl_x", "fl_y"].into_iter().enumerate() {

@@ -1,8 +1,9 @@
-//! `transforms.json` and its split forms: the dialects of NeRF-Blender, instant-ngp, nerfstudio and their descendants.
+//! `transforms.json` and its split forms: the dialects of NeRF-Blender, instant-ngp, nerfstudio and their
+//! descendants.
 //!
-//! Poses are camera-to-world with OpenGL axes in all of them. Intrinsics may stand at the top or in each frame; a
-//! frame's own win. Every key is read, known to change nothing, or named ([`keys`]); `null` counts as absent. Keys of the
-//! wrong type are errors, but for some that count as absent as well, as `up` does.
+//! Poses are camera-to-world with OpenGL axes in all of them. Intrinsics may stand at the top or in each
+//! frame; a frame's own win. Every key is read, known to change nothing, or named ([`keys`]); `null` counts
+//! as absent. Keys of the wrong type are errors, but for some that count as absent as well, as `up` does.
 
 mod keys;
 mod lens;
@@ -51,8 +52,8 @@ impl From<Error> for Fault {
     }
 }
 
-/// Keys of a frame's mask, the first of which counts. VHAP's `fg_mask_path` shows the person with shoulders; INSTA's
-/// `seg_mask_path` may show labels, which the values tell.
+/// Keys of a frame's mask, the first of which counts. VHAP's `fg_mask_path` shows the person with
+/// shoulders; INSTA's `seg_mask_path` may show labels, which the values tell.
 const MASK_KEYS: [&str; 3] = ["mask_path", "fg_mask_path", "seg_mask_path"];
 
 /// What is known only once all files are read.
@@ -152,8 +153,8 @@ impl<'v> Entry<'v> {
     }
 }
 
-/// Returns the top of a file and its frames, which may be an object of named ones, or stand alone or with the whole file
-/// in a list.
+/// Returns the top of a file and its frames, which may be an object of named ones, or stand alone or with
+/// the whole file in a list.
 fn parts<'v>(
     file: &str,
     value: &'v Value,
@@ -214,7 +215,8 @@ fn read_top(folder: &CaptureFolder, file: &str, top: &Object, frames: usize, lis
     }
     if let Some(n) = top.get("n_frames").and_then(Value::as_u64).filter(|n| *n < frames as u64) {
         listing.warnings.push(format!(
-            "`{file}` asks instant-ngp to take the first {n} of its {frames} frames (`n_frames`); all are used here"
+            "`{file}` asks instant-ngp to take the first {n} of its {frames} frames (`n_frames`); all are \
+             used here"
         ));
     }
 }

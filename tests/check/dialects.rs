@@ -1,4 +1,5 @@
-//! `transforms.json` as other programs write it: read like the plain file, or refused with a word on what is there.
+//! `transforms.json` as other programs write it: read like the plain file, or refused with a word on what
+//! is there.
 
 use crate::kept::photographed;
 use serde_json::{Value, json};

@@ -1,8 +1,8 @@
-//! The keys of `transforms.json`, by the programs that write them: which are read, which change nothing here, and
-//! which change what a file means although they are not supported.
+//! The keys of `transforms.json`, by the programs that write them: which are read, which change nothing
+//! here, and which change what a file means although they are not supported.
 //!
-//! No key is passed over in silence: those that change nothing are a reason, unknown ones a warning, and those that
-//! change the meaning a warning or a problem of their own.
+//! No key is passed over in silence: those that change nothing are a reason, unknown ones a warning, and
+//! those that change the meaning a warning or a problem of their own.
 
 use super::{Object, lens, pose};
 use crate::capture::folder::{in_file, shortened};
@@ -21,7 +21,8 @@ struct Dialect {
     harmless: &'static str,
 }
 
-/// All known keys, at the top of a file or in a frame. Those in [`CHANGES`] and the spellings in [`lens`] come on top.
+/// All known keys, at the top of a file or in a frame. Those in [`CHANGES`] and the spellings in [`lens`]
+/// come on top.
 const DIALECTS: [Dialect; 8] = [
     Dialect {
         program: "NeRF-Blender and D-NeRF",
@@ -33,14 +34,14 @@ const DIALECTS: [Dialect; 8] = [
         read: "w h fl_x fl_y x_fov y_fov cx cy k1 k2 k3 k4 p1 p2 is_fisheye up n_frames",
         // `scale`, `offset` and the boxes say how instant-ngp fits the world into its own cube
         harmless: "aabb_scale aabb render_aabb render_aabb_to_local scale offset sharpness \
-                   sharpness_discard_threshold sharpen importance_sampling n_extra_learnable_dims enable_depth_loading \
-                   enable_ray_loading integer_depth_scale depth_path envmap fix_premult normal_mts_args \
-                   driver_parameters background_color",
+                   sharpness_discard_threshold sharpen importance_sampling n_extra_learnable_dims \
+                   enable_depth_loading enable_ray_loading integer_depth_scale depth_path envmap fix_premult \
+                   normal_mts_args driver_parameters background_color",
     },
     Dialect {
         program: "nerfstudio",
-        read: "camera_model distortion_params applied_transform applied_scale mask_path train_filenames val_filenames \
-               test_filenames",
+        read: "camera_model distortion_params applied_transform applied_scale mask_path train_filenames \
+               val_filenames test_filenames",
         harmless: "ply_file_path depth_file_path depth_unit_scale_factor normal_file_path semantic_file_path \
                    orientation_override colmap_im_id auto_scale_poses_override",
     },
@@ -57,14 +58,15 @@ const DIALECTS: [Dialect; 8] = [
     },
     Dialect {
         program: "INSTA, NerFace and HyperNeRF",
-        read: "seg_mask_path exp_path mesh_path expression frame_time timestep time_step time_id time_index warp_id",
+        read: "seg_mask_path exp_path mesh_path expression frame_time timestep time_step time_id time_index \
+               warp_id",
         harmless: "bbox lms_path landmarks appearance_id exp bg_path",
     },
     Dialect {
         program: "sdfstudio",
         read: "",
-        harmless: "mono_depth_path mono_normal_path has_mono_prior has_sensor_depth has_foreground_mask pairs worldtogt \
-                   scene_box index",
+        harmless: "mono_depth_path mono_normal_path has_mono_prior has_sensor_depth has_foreground_mask \
+                   pairs worldtogt scene_box index",
     },
     Dialect {
         program: "tiface, and COLMAP's lens models",
@@ -112,8 +114,8 @@ const CHANGES: [Change; 10] = [
         keys: "fisheye_crop_radius",
         has_effect: is_nonzero,
         unless: "",
-        says: "nerfstudio uses a circle of each photograph; here all of it is used, unless `valid/NAME.npy` says \
-               which pixels are usable",
+        says: "nerfstudio uses a circle of each photograph; here all of it is used, unless `valid/NAME.npy` \
+               says which pixels are usable",
         hint: "",
     },
     Change {
@@ -121,8 +123,8 @@ const CHANGES: [Change; 10] = [
         has_effect: is_true,
         unless: "",
         says: "such a lens is not supported",
-        hint: "undistort the photographs first (panoramas: cut perspective views out of them), and write the lens \
-               that is left",
+        hint: "undistort the photographs first (panoramas: cut perspective views out of them), and write the \
+               lens that is left",
     },
     Change {
         keys: "camera_type",
@@ -132,7 +134,8 @@ const CHANGES: [Change; 10] = [
         hint: "write `camera_model`: `OPENCV`, `OPENCV_FISHEYE` or another of COLMAP's names",
     },
     Change {
-        keys: "distortion distortions distortion_coefficients distortion_coeffs dist_coeffs dist radial_distortion",
+        keys: "distortion distortions distortion_coefficients distortion_coeffs dist_coeffs dist \
+               radial_distortion",
         has_effect: is_nonzero,
         unless: "k1 distortion_params",
         says: "the order of its coefficients is not known",
@@ -151,7 +154,8 @@ const CHANGES: [Change; 10] = [
         has_effect: is_opencv,
         unless: "",
         says: "cameras look along +Z with +Y down there, and along -Z with +Y up here",
-        hint: "negate the second and third column of each `transform_matrix` (camera to world), and remove the key",
+        hint: "negate the second and third column of each `transform_matrix` (camera to world), and remove \
+               the key",
     },
     Change {
         keys: "tangential_distortion",
@@ -243,7 +247,8 @@ impl KeyLog {
         }
     }
 
-    /// Says what was not looked at, spellings that were `skipped` included, and refuses what changes the meaning.
+    /// Says what was not looked at, spellings that were `skipped` included, and refuses what changes the
+    /// meaning.
     pub fn report(mut self, file: &str, skipped: &BTreeSet<&'static str>, listing: &mut Listing) {
         self.ignored.extend(skipped);
         if !self.ignored.is_empty() {
@@ -255,8 +260,8 @@ impl KeyLog {
         if !self.unknown.is_empty() {
             let names = few(&self.unknown);
             listing.warnings.push(format!(
-                "`{file}` has keys that are not known and not looked at: {names}; if one says how cameras stand or \
-                 see, the result will be wrong"
+                "`{file}` has keys that are not known and not looked at: {names}; if one says how cameras \
+                 stand or see, the result will be wrong"
             ));
         }
         for (key, (change, place, count)) in self.changes {

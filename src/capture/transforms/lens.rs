@@ -1,4 +1,5 @@
-//! The lens of a frame: its own keys and those for all frames, in the spellings of several programs, as intrinsics.
+//! The lens of a frame: its own keys and those for all frames, in the spellings of several programs, as
+//! intrinsics.
 
 use super::{Fault, Object};
 use crate::capture::frame::{self, Intrinsics, LensModel};
@@ -9,8 +10,8 @@ use serde::Deserialize;
 use serde_json::Value;
 use std::collections::BTreeSet;
 
-/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would be overruled by
-/// the whole file's focal length.
+/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would
+/// be overruled by the whole file's focal length.
 pub(super) const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// The other keys that may stand at the top for all frames.
@@ -106,7 +107,8 @@ pub(super) struct LensNotes {
     pub skipped: BTreeSet<&'static str>,
 }
 
-/// Returns what is read of an object, with one spelling of each key. Keys that `beyond` has are not taken from others.
+/// Returns what is read of an object, with one spelling of each key. Keys that `beyond` has are not taken
+/// from others.
 pub(super) fn canonical(
     object: &Object,
     beyond: Option<&Object>,
@@ -177,8 +179,9 @@ fn degrees(key: &str, value: &Value) -> Result<f64, String> {
     }
 }
 
-/// Returns fx, fy, cx, cy of a matrix of intrinsics as rows or as one list, row by row or column by column, which its
-/// zeros tell apart; or of an object of that name. `None` for anything else, such as a list of four numbers.
+/// Returns fx, fy, cx, cy of a matrix of intrinsics as rows or as one list, row by row or column by column,
+/// which its zeros tell apart; or of an object of that name. `None` for anything else, such as a list of
+/// four numbers.
 fn matrix(key: &str, value: &Value) -> Result<Option<[f64; 4]>, String> {
     if let Value::Object(named) = value {
         let of = |names: [&str; 2]| names.iter().find_map(|name| named.get(*name)?.as_f64());
@@ -211,8 +214,9 @@ fn matrix(key: &str, value: &Value) -> Result<Option<[f64; 4]>, String> {
     Ok(Some([m[0][0], m[1][1], m[0][2], m[1][2]]))
 }
 
-/// Returns the coefficients in nerfstudio's `distortion_params`. Its loader takes six, k1 k2 k3 k4 p1 p2; OpenCV's lists
-/// of four and five have p1 in the third place, so that those are read only where both orders mean the same.
+/// Returns the coefficients in nerfstudio's `distortion_params`. Its loader takes six, k1 k2 k3 k4 p1 p2;
+/// OpenCV's lists of four and five have p1 in the third place, so that those are read only where both
+/// orders mean the same.
 fn distortion_params(value: &Value, is_fisheye: bool) -> Result<Vec<(&'static str, f64)>, String> {
     const ORDER: [&str; 6] = ["k1", "k2", "k3", "k4", "p1", "p2"];
     let values: Vec<f64> = io::typed(value).map_err(|[key, found, expected]| {
@@ -226,8 +230,8 @@ fn distortion_params(value: &Value, is_fisheye: bool) -> Result<Vec<(&'static st
     };
     if !is_clear {
         return Err(format!(
-            "its `distortion_params` holds {} numbers, expected the 6 of nerfstudio: k1, k2, k3, k4, p1, p2 (OpenCV's \
-             order is k1, k2, p1, p2, k3)",
+            "its `distortion_params` holds {} numbers, expected the 6 of nerfstudio: k1, k2, k3, k4, p1, p2 \
+             (OpenCV's order is k1, k2, p1, p2, k3)",
             values.len()
         ));
     }
@@ -292,8 +296,8 @@ impl FrameKeys {
     }
 }
 
-/// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the lens is as
-/// `like` has it.
+/// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the
+/// lens is as `like` has it.
 pub(crate) fn camera_like(
     top: &Object,
     own: &Object,
@@ -314,14 +318,16 @@ pub(crate) fn camera_like(
     Ok(Camera { cx, cy, distortion, rotation, position, ..like })
 }
 
-/// Returns the mistake of a frame that has no focal length, with the keys of it or of its file that may hold one.
+/// Returns the mistake of a frame that has no focal length, with the keys of it or of its file that may
+/// hold one.
 pub(super) fn no_focal(top: &Object, own: &Object) -> Fault {
     let words = MATRICES.iter().chain(&FOCAL_WORDS);
     let has = |key: &&&str| [own, top].iter().any(|object| object.get(**key).is_some_and(|v| !v.is_null()));
     let there: Vec<String> = words.filter(has).map(|key| format!("`{key}`")).collect();
     let text = "it has neither `fl_x` nor `camera_angle_x`, nor has the whole file";
-    let hint = "write `fl_x` and `fl_y`, the focal length in pixels (in millimeters it is multiplied by the picture's \
-                width and divided by the sensor's), or `camera_angle_x`, the full horizontal angle of view in radians";
+    let hint = "write `fl_x` and `fl_y`, the focal length in pixels (in millimeters it is multiplied by the \
+                picture's width and divided by the sensor's), or `camera_angle_x`, the full horizontal angle \
+                of view in radians";
     match there.is_empty() {
         true => Fault::File { text: text.into(), hint: hint.into() },
         false => Fault::File {
@@ -359,8 +365,8 @@ pub(super) fn intrinsics(keys: &FrameKeys, notes: &mut LensNotes) -> Result<Intr
     Ok(Intrinsics { size: w.zip(h), focal, angle, center, distortion })
 }
 
-/// Returns the lens model by COLMAP's name, in capital letters. COLMAP's FISHEYE is OPENCV_FISHEYE without coefficients,
-/// and other programs say it of that one.
+/// Returns the lens model by COLMAP's name, in capital letters. COLMAP's FISHEYE is OPENCV_FISHEYE without
+/// coefficients, and other programs say it of that one.
 fn model(keys: &FrameKeys) -> String {
     let name = keys.camera_model.as_deref().unwrap_or("OPENCV");
     let name = name.trim().to_ascii_uppercase().replace(['-', ' '], "_");
@@ -371,8 +377,8 @@ fn model(keys: &FrameKeys) -> String {
     }
 }
 
-/// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as well, and
-/// nerfstudio's perspective k4 exists in no other program.
+/// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as
+/// well, and nerfstudio's perspective k4 exists in no other program.
 fn distortion(keys: &FrameKeys, model: &str, notes: &mut LensNotes) -> Result<Distortion, String> {
     let &FrameKeys { k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1, omega, .. } = keys;
     let given = Distortion { k1, k2, k3, p1, p2, k4, k5, k6, sx1, sy1, omega, ..Distortion::default() };
@@ -393,7 +399,8 @@ fn distortion(keys: &FrameKeys, model: &str, notes: &mut LensNotes) -> Result<Di
         if *frame::coefficient(&mut { given }, key) != 0.0 {
             let list = if keys.distortion_params.is_some() { " (in `distortion_params`)" } else { "" };
             return Err(format!(
-                "its lens has `{key}`{list}, which its camera model `{model}` has not; undistort the photographs first"
+                "its lens has `{key}`{list}, which its camera model `{model}` has not; undistort the \
+                 photographs first"
             ));
         }
     }

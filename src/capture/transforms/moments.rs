@@ -1,9 +1,10 @@
-//! Several moments of a moving head in one capture: VHAP, GaussianAvatars, D-NeRF, HyperNeRF, INSTA and NerFace write
-//! them, and one shape learned from all of them is none of them.
+//! Several moments of a moving head in one capture: VHAP, GaussianAvatars, D-NeRF, HyperNeRF, INSTA and
+//! NerFace write them, and one shape learned from all of them is none of them.
 //!
-//! Frames of several moments are refused where cameras stand still from one moment to another, for half of the frames
-//! or more: nothing but the head can have moved then. Where every photograph is from another place, as in a video of a
-//! head that holds still, the times of frames prove nothing, and there is only a warning.
+//! Frames of several moments are refused where cameras stand still from one moment to another, for half of
+//! the frames or more: nothing but the head can have moved then. Where every photograph is from another
+//! place, as in a video of a head that holds still, the times of frames prove nothing, and there is only a
+//! warning.
 
 use super::Object;
 use crate::Error;
@@ -15,8 +16,8 @@ use serde_json::Value;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
 
-/// Keys that tell one moment from another, the best first, and whether each is worth a word where cameras move: all
-/// photographs have times.
+/// Keys that tell one moment from another, the best first, and whether each is worth a word where cameras
+/// move: all photographs have times.
 const KEYS: [(&str, bool); 14] = [
     ("timestep_index", true),
     ("timestep_id", true),
@@ -34,7 +35,8 @@ const KEYS: [(&str, bool); 14] = [
     ("timestamp", false),
 ];
 
-/// How far a camera may be off, as a share of the cameras' extent and of a rotation's entries, to stand where another does.
+/// How far a camera may be off, as a share of the cameras' extent and of a rotation's entries, to stand
+/// where another does.
 const SAME_PLACE: f64 = 1e-3;
 
 /// The moments of all frames of a capture.
@@ -98,8 +100,8 @@ impl Moments {
             }
             if *is_telling {
                 listing.warnings.push(format!(
-                    "`{}`: the photographs are of {} moments (`{key}`), from places that differ; if the head moved \
-                     meanwhile, one shape is learned from all of them",
+                    "`{}`: the photographs are of {} moments (`{key}`), from places that differ; if the head \
+                     moved meanwhile, one shape is learned from all of them",
                     files.join("`, `"),
                     order.len()
                 ));
@@ -112,8 +114,8 @@ impl Moments {
         let shown = few(order.iter().map(|moment| self.shown[moment].0.as_str()));
         let (n, (name, python)) = (order.len(), &self.shown[&most]);
         let message = format!(
-            "`{}` holds {n} moments (`{key}`: {shown}), seen by cameras that stand still: a head that moved between \
-             them would be learned as one shape",
+            "`{}` holds {n} moments (`{key}`: {shown}), seen by cameras that stand still: a head that moved \
+             between them would be learned as one shape",
             files.join("`, `")
         );
         let way = match python {
@@ -121,8 +123,8 @@ impl Moments {
             None => format!("keep only the frames of one `{key}`"),
         };
         let hint = format!(
-            "take one moment, such as `{name}` with {photographs} photographs: {way}; if the head held still, remove \
-             `{key}` from the frames"
+            "take one moment, such as `{name}` with {photographs} photographs: {way}; if the head held \
+             still, remove `{key}` from the frames"
         );
         Error::cannot(message, hint)
     }
@@ -132,13 +134,15 @@ impl Moments {
 fn keep(files: &[&str], key: &str, value: &str) -> String {
     let files: Vec<String> = files.iter().map(|file| format!("'{file}'")).collect();
     format!(
-        "python3 -c \"import json, os; [open(p, 'w').write(json.dumps(dict(t, frames=f))) if f else os.remove(p) for p \
-         in [{}] for t in [json.load(open(p))] for f in [[f for f in t['frames'] if f.get('{key}') == {value}]]]\"",
+        "python3 -c \"import json, os; [open(p, 'w').write(json.dumps(dict(t, frames=f))) if f else \
+         os.remove(p) for p in [{}] for t in [json.load(open(p))] for f in [[f for f in t['frames'] if \
+         f.get('{key}') == {value}]]]\"",
         files.join(", ")
     )
 }
 
-/// Returns a moment for a message, and as Python writes it if it is a number or a plain word, which is safe in a command.
+/// Returns a moment for a message, and as Python writes it if it is a number or a plain word, which is safe
+/// in a command.
 fn show(value: &Value) -> (String, Option<String>) {
     let is_plain = |text: &str| {
         text.len() <= 40

@@ -1,12 +1,13 @@
-//! The pose of a frame: `transform_matrix`, however its sixteen numbers are written, and what is there in its place.
+//! The pose of a frame: `transform_matrix`, however its sixteen numbers are written, and what is there in
+//! its place.
 
 use super::{Fault, Object};
 use crate::io;
 use serde_json::Value;
 
 /// How a pose has to be written.
-const WRITTEN: &str = "camera to world, row by row, its last column the position; the camera has +X right, +Y up and \
-                       looks along -Z";
+const WRITTEN: &str = "camera to world, row by row, its last column the position; the camera has +X right, \
+                       +Y up and looks along -Z";
 
 /// Keys of poses of other programs, which are not read: they say neither the direction nor the axes.
 const FROM_CAMERA: &[&str] = &[
@@ -96,8 +97,8 @@ fn missing(own: &Object) -> Fault {
     Fault::File {
         text: format!("{text}, and `{key}` is not read, which does not say its axes"),
         hint: format!(
-            "write `transform_matrix`: {WRITTEN}. From `{key}`: {way}; if the camera looks along +Z with +Y down (OpenCV, \
-             COLMAP), then negate the second and third column"
+            "write `transform_matrix`: {WRITTEN}. From `{key}`: {way}; if the camera looks along +Z with +Y \
+             down (OpenCV, COLMAP), then negate the second and third column"
         ),
     }
 }
@@ -132,8 +133,8 @@ fn transposed(how: &str) -> Fault {
     Fault::File {
         text: format!("its `transform_matrix` is transposed, columns in the place of rows: {how}"),
         hint: format!(
-            "write the transposed matrices (`numpy.array(matrix).T.tolist()`): {WRITTEN}; ARKit's are that, once \
-             transposed"
+            "write the transposed matrices (`numpy.array(matrix).T.tolist()`): {WRITTEN}; ARKit's are that, \
+             once transposed"
         ),
     }
 }
