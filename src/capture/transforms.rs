@@ -204,6 +204,11 @@ fn read_top(folder: &CaptureFolder, file: &str, top: &Object, frames: usize, lis
         &[x, y, z, ..] => DVec3::new(x, y, z).try_normalize(),
         _ => None,
     });
+    if up.is_none() && top.get("up").is_some_and(|up| !up.is_null()) {
+        listing
+            .warnings
+            .push(format!("`{file}`: `up` is not a direction of three numbers, and not looked at"));
+    }
     listing.up = listing.up.or(up);
     if let Some((name, metres)) = keys::unit_m(top)
         && (folder.options.unit_m / metres - 1.0).abs() > 0.01
@@ -298,7 +303,7 @@ impl<'a> Reading<'a> {
 
     /// Says how the file was read.
     fn report(self, listing: &mut Listing) {
-        let (file, LensNotes { ignored, taken, skipped }) = (self.file, self.notes);
+        let (file, LensNotes { ignored, taken, skipped, misread }) = (self.file, self.notes);
         let spelled = |(key, of): &(&str, &str)| match lens::ALIASES.contains(&(key, of)) {
             true => format!("`{key}` as `{of}`"),
             false => format!("`{key}` as {of}"),
@@ -306,6 +311,12 @@ impl<'a> Reading<'a> {
         if !taken.is_empty() {
             let all: Vec<String> = taken.iter().map(spelled).collect();
             listing.reasons.push(format!("`{file}` is read with {}", all.join(", ")));
+        }
+        if !misread.is_empty() {
+            let names = few(&misread);
+            listing
+                .warnings
+                .push(format!("`{file}`: of another type than they must be, and not looked at: {names}"));
         }
         for model in ignored {
             listing.warnings.push(format!(

@@ -326,11 +326,14 @@ fn no_key_is_passed_over_in_silence() {
         json["n_frames"] = 3.into();
         json["units"] = "millimeters".into();
         json["white_transparent"] = true.into();
+        json["is_fisheye"] = 0.into();
+        json["height"] = 1.7.into();
         frames(json).iter_mut().for_each(|frame| frame["lens_id"] = 7.into());
     });
     let capture = open(&dir);
     assert!(capture.reasons.iter().any(|r| r.contains("`aabb_scale`")), "{:?}", capture.reasons);
-    for word in ["`lens_id`", "`n_frames`", "capture.unit_m = 0.001", "`white_transparent`"] {
+    assert!(capture.reasons.iter().any(|r| r.contains("`height`")), "{:?}", capture.reasons);
+    for word in ["`lens_id`", "`n_frames`", "capture.unit_m = 0.001", "`white_transparent`", "`is_fisheye`"] {
         assert!(capture.warnings.iter().any(|w| w.contains(word)), "{word}: {:?}", capture.warnings);
     }
     assert!(open(&made(|_| {})).warnings.is_empty());

@@ -105,6 +105,8 @@ pub(super) struct LensNotes {
     pub taken: BTreeSet<(&'static str, &'static str)>,
     /// Spellings that were not read, because the usual one is there or they cannot be understood.
     pub skipped: BTreeSet<&'static str>,
+    /// Keys whose value is of another type than it must be.
+    pub misread: BTreeSet<&'static str>,
 }
 
 /// Returns what is read of an object, with one spelling of each key. Keys that `beyond` has are not taken
@@ -121,11 +123,19 @@ pub(super) fn canonical(
     let keys = SHARED_KEYS.split(' ').chain(FRAME_KEYS.split(' ')).chain(FOCAL_KEYS);
     let given = keys.filter_map(|key| object.get_key_value(key)).filter(|(key, value)| is_given(key, value));
     let mut out: Object = given.map(|(key, value)| (key.clone(), value.clone())).collect();
+    let misread = LENIENT_KEYS.into_iter().filter(|(key, is_usable)| {
+        object.get(*key).is_some_and(|value| !value.is_null() && !is_usable(value))
+    });
+    notes.misread.extend(misread.map(|(key, _)| key));
     let is_known =
         |out: &Object, key: &str| out.contains_key(key) || beyond.is_some_and(|top| top.contains_key(key));
     for (alias, key) in ALIASES {
         let Some(value) = object.get(alias) else { continue };
-        let fits = if key == "file_path" { value.is_string() } else { value.is_number() };
+        let fits = match key {
+            "file_path" => value.is_string(),
+            "w" | "h" => value.is_u64() && object.get(&partner(alias)).is_some_and(Value::is_u64),
+            _ => value.is_number(),
+        };
         if fits && !is_known(&out, key) {
             out.insert(key.into(), value.clone());
             notes.taken.insert((alias, key));
@@ -165,6 +175,16 @@ pub(super) fn canonical(
         notes.taken.insert(("distortion_params", "k1, k2, k3, k4, p1, p2"));
     }
     Ok(out)
+}
+
+/// Returns the other side's spelling of a width or height: a height alone may be one of anything.
+fn partner(side: &str) -> String {
+    match side {
+        "W" => "H".into(),
+        "H" => "W".into(),
+        width if width.ends_with("width") => width.replace("width", "height"),
+        height => height.replace("height", "width"),
+    }
 }
 
 /// Returns the radians of instant-ngp's `x_fov` and `y_fov`, which are degrees.
