@@ -87,16 +87,9 @@ fn list_file(
     together: &mut Together,
     listing: &mut Listing,
 ) -> Result<()> {
-    let limits = &folder.options.limits;
-    let path = folder.root.join(file);
-    let value = io::read_json(&path, limits)?;
+    let value = io::read_json(&folder.root.join(file), &folder.options.limits)?;
     let nothing = Object::new();
-    let (top, entries) = parts(file, &value, &nothing, listing)?;
-    if entries.is_empty() {
-        let hint = "it must describe at least one photograph";
-        return Err(in_file(file, "its list `frames` is empty", hint));
-    }
-    limits.check_views(&path, entries.len())?;
+    let (top, entries) = parts(folder, file, &value, &nothing, listing)?;
     read_top(folder, file, top, entries.len(), listing);
     let mut reading = Reading::new(folder, file, top)?;
     let read: Vec<Result<FrameKeys, Fault>> = entries.iter().map(|entry| reading.keys(entry)).collect();
@@ -156,6 +149,7 @@ impl<'v> Entry<'v> {
 /// Returns the top of a file and its frames, which may be an object of named ones, or stand alone or with
 /// the whole file in a list.
 fn parts<'v>(
+    folder: &CaptureFolder,
     file: &str,
     value: &'v Value,
     nothing: &'v Object,
@@ -179,15 +173,27 @@ fn parts<'v>(
         },
         _ => return Err(in_file(file, "it is not a JSON object", "it must begin with `{`")),
     };
+    let count = match frames {
+        Some(Value::Array(list)) => list.len(),
+        Some(Value::Object(named)) => named.len(),
+        _ => {
+            let hint = "each entry of `frames` describes one photograph";
+            return Err(in_file(file, "it has no list `frames`", hint));
+        }
+    };
+    if count == 0 {
+        let hint = "it must describe at least one photograph";
+        return Err(in_file(file, "its list `frames` is empty", hint));
+    }
+    folder.options.limits.check_views(&folder.root.join(file), count)?;
     let entries = match frames {
-        Some(Value::Array(list)) => list.iter().enumerate().map(|(i, v)| Entry::new(i, None, v)).collect(),
         Some(Value::Object(named)) => {
             say("has an object of `frames`: its keys are photographs where there is no `file_path`");
             named.iter().enumerate().map(|(i, (key, v))| Entry::new(i, Some(key), v)).collect()
         }
-        _ => {
-            let hint = "each entry of `frames` describes one photograph";
-            return Err(in_file(file, "it has no list `frames`", hint));
+        frames => {
+            let list = frames.and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
+            list.iter().enumerate().map(|(i, v)| Entry::new(i, None, v)).collect()
         }
     };
     Ok((top, entries))
