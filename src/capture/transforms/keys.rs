@@ -13,7 +13,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// The keys of one program, separated by blanks.
 struct Dialect {
-    /// The program.
+    /// The programs, for messages.
     program: &'static str,
     /// Keys that are read.
     read: &'static str,
@@ -43,7 +43,7 @@ const DIALECTS: [Dialect; 8] = [
         read: "camera_model distortion_params applied_transform applied_scale mask_path train_filenames \
                val_filenames test_filenames",
         harmless: "ply_file_path depth_file_path depth_unit_scale_factor normal_file_path semantic_file_path \
-                   orientation_override colmap_im_id auto_scale_poses_override",
+                   orientation_override colmap_im_id auto_scale_poses_override has_mask",
     },
     Dialect {
         program: "Polycam, Record3D, KIRI and Luma, through nerfstudio",
@@ -88,7 +88,7 @@ struct Change {
     hint: &'static str,
 }
 
-const CHANGES: [Change; 10] = [
+const CHANGES: [Change; 11] = [
     Change {
         keys: "rolling_shutter",
         has_effect: is_nonzero,
@@ -108,6 +108,13 @@ const CHANGES: [Change; 10] = [
         has_effect: is_true,
         unless: "",
         says: "instant-ngp takes pixels of that color for background; here only masks say what is background",
+        hint: "",
+    },
+    Change {
+        keys: "is_bad",
+        has_effect: is_true,
+        unless: "",
+        says: "ScanNet++ marks blurred photographs so and leaves them out; here they are used",
         hint: "",
     },
     Change {
@@ -198,7 +205,8 @@ fn is_opencv(value: &Value) -> bool {
 #[derive(Clone, Copy)]
 enum Use {
     Read,
-    Ignored,
+    /// By this program, if it is one's alone.
+    Ignored(&'static str),
     Changes(&'static Change),
 }
 
@@ -206,6 +214,8 @@ enum Use {
 pub(super) struct KeyLog {
     known: HashMap<&'static str, Use>,
     ignored: BTreeSet<&'static str>,
+    /// The programs that write these.
+    programs: BTreeSet<&'static str>,
     unknown: BTreeSet<String>,
     /// By key: the change, where it was first met, and how often.
     changes: BTreeMap<&'static str, (&'static Change, String, usize)>,
@@ -217,14 +227,16 @@ const MAX_UNKNOWN: usize = 1000;
 impl KeyLog {
     pub fn new() -> KeyLog {
         let words = |text: &'static str, is: Use| text.split_whitespace().map(move |key| (key, is));
-        let dialects =
-            DIALECTS.iter().flat_map(|d| words(d.read, Use::Read).chain(words(d.harmless, Use::Ignored)));
+        let dialects = DIALECTS
+            .iter()
+            .flat_map(|d| words(d.read, Use::Read).chain(words(d.harmless, Use::Ignored(d.program))));
         let spellings = lens::ALIASES.iter().map(|(key, _)| (*key, Use::Read));
         let matrices = lens::MATRICES.iter().map(|key| (*key, Use::Read));
-        let named = lens::FOCAL_WORDS.iter().copied().chain(pose::names()).map(|key| (key, Use::Ignored));
+        let named = lens::FOCAL_WORDS.iter().copied().chain(pose::names()).map(|key| (key, Use::Ignored("")));
         let changes = CHANGES.iter().flat_map(|change| words(change.keys, Use::Changes(change)));
         let known = named.chain(dialects).chain(spellings).chain(matrices).chain(changes).collect();
-        KeyLog { known, ignored: BTreeSet::new(), unknown: BTreeSet::new(), changes: BTreeMap::new() }
+        let [ignored, programs] = [BTreeSet::new(), BTreeSet::new()];
+        KeyLog { known, ignored, programs, unknown: BTreeSet::new(), changes: BTreeMap::new() }
     }
 
     /// Looks at the keys of the top of a file (`place` is empty) or of a frame.
@@ -232,7 +244,10 @@ impl KeyLog {
         for (key, value) in object {
             match self.known.get_key_value(key.as_str()) {
                 Some((_, Use::Read)) => {}
-                Some((key, Use::Ignored)) => _ = self.ignored.insert(key),
+                Some((key, Use::Ignored(program))) => {
+                    self.ignored.insert(key);
+                    self.programs.extend(Some(*program).filter(|program| !program.is_empty()));
+                }
                 Some((key, Use::Changes(change))) => {
                     let says_so = |key| object.get(key).is_some_and(|v| is_nonzero(v) || v.is_string());
                     let is_redundant = change.unless.split(' ').any(says_so);
@@ -252,10 +267,12 @@ impl KeyLog {
     pub fn report(mut self, file: &str, skipped: &BTreeSet<&'static str>, listing: &mut Listing) {
         self.ignored.extend(skipped);
         if !self.ignored.is_empty() {
+            let programs: Vec<&str> = self.programs.into_iter().collect();
+            let of = if programs.is_empty() { String::new() } else { format!(" ({})", programs.join("; ")) };
             let names = few(&self.ignored);
             listing
                 .reasons
-                .push(format!("not looked at in `{file}`, since nothing here depends on it: {names}"));
+                .push(format!("not looked at in `{file}`, since nothing here depends on it: {names}{of}"));
         }
         if !self.unknown.is_empty() {
             let names = few(&self.unknown);
