@@ -46,7 +46,7 @@ const DIALECTS: [Dialect; 8] = [
                    orientation_override colmap_im_id auto_scale_poses_override has_mask",
     },
     Dialect {
-        program: "Polycam, Record3D, KIRI and Luma, through nerfstudio",
+        program: "scanners on phones",
         read: "timestamp",
         harmless: "blur_score confidence_path depth_confidence_path exposure_time iso_speed",
     },
@@ -205,7 +205,7 @@ fn is_opencv(value: &Value) -> bool {
 #[derive(Clone, Copy)]
 enum Use {
     Read,
-    /// By this program, if it is one's alone.
+    /// With the programs that write it; empty for spellings of several.
     Ignored(&'static str),
     Changes(&'static Change),
 }
