@@ -111,6 +111,11 @@ pub(super) struct Intrinsics {
 }
 
 impl Intrinsics {
+    /// Returns whether a focal length or an angle is declared.
+    pub fn has_focal(&self) -> bool {
+        self.focal.iter().chain(&self.angle).any(Option::is_some)
+    }
+
     /// Returns the camera of a picture of `size`. A single focal length is used for both axes.
     pub fn camera(&self, size: (u32, u32), rotation: DMat3, position: DVec3) -> Result<Camera, String> {
         let side = [size.0 as f64, size.1 as f64];
@@ -128,6 +133,7 @@ impl Intrinsics {
                 return Err(format!("the focal length `{name}` is {f}, it must be positive"));
             }
         }
+        self.check_pixels(side)?;
         let [cx, cy] = [0, 1].map(|k| self.center[k].unwrap_or(0.5 * side[k]));
         let (width, height) = size;
         // a principal point farther outside than a whole picture belongs to another size
@@ -138,6 +144,49 @@ impl Intrinsics {
         }
         let distortion = self.distortion;
         Ok(Camera { width, height, fx, fy, cx, cy, distortion, rotation, position })
+    }
+
+    /// Refuses a focal length and a principal point that cannot be pixels of a picture of this size:
+    /// a lens of more than 157°, and a principal point in the corner.
+    fn check_pixels(&self, side: [f64; 2]) -> Result<(), String> {
+        let longest = side[0].max(side[1]);
+        for (k, name) in ["fl_x", "fl_y"].into_iter().enumerate() {
+            let Some(f) = self.focal[k].filter(|f| *f < 0.1 * longest) else { continue };
+            let unit = if f < 10.0 {
+                format!("as a share of the picture's side (normalized) it is {:.1} pixels", f * side[k])
+            } else {
+                "millimeters are multiplied by the picture's width and divided by the sensor's".into()
+            };
+            return Err(format!(
+                "the focal length `{name}` is {f} of a picture with {longest} pixels, which no lens has; it must be in \
+                 pixels: {unit}"
+            ));
+        }
+        if let [Some(cx), Some(cy)] = self.center
+            && cx.abs() <= 1.0
+            && cy.abs() <= 1.0
+            && side[0].min(side[1]) > 4.0
+        {
+            let ([w, h], is_share) = (side, cx > 0.0 && cy > 0.0);
+            let unit = if is_share {
+                format!(
+                    "as shares of the picture (normalized) `cx` is {:.1} and `cy` is {:.1}",
+                    cx * w,
+                    cy * h
+                )
+            } else {
+                format!(
+                    "counted from the middle, `cx` is {:.2} and `cy` is {:.2}",
+                    cx + 0.5 * w,
+                    cy + 0.5 * h
+                )
+            };
+            return Err(format!(
+                "the principal point ({cx}, {cy}) is in the corner of its {w} × {h} pixels; `cx` and `cy` must be pixels \
+                 from the top left corner: {unit}; the middle is meant where both are absent"
+            ));
+        }
+        Ok(())
     }
 }
 
@@ -344,6 +393,25 @@ mod tests {
         assert!((c.fx - 100.0).abs() < 1e-9 && c.fy == c.fx);
         assert_eq!((c.cx, c.cy), (100.0, 50.0));
         assert!(Intrinsics::default().camera((2, 2), DMat3::IDENTITY, DVec3::ZERO).is_err());
+    }
+
+    #[test]
+    fn lens_parameters_that_are_not_pixels_are_refused_with_their_value_in_pixels() {
+        let of = |focal: f64, center: [Option<f64>; 2], size| {
+            let intrinsics = Intrinsics { focal: [Some(focal); 2], center, ..Intrinsics::default() };
+            intrinsics.camera(size, DMat3::IDENTITY, DVec3::ZERO).map(|camera| (camera.fx, camera.cx))
+        };
+        let says = |focal, center, size| of(focal, center, size).unwrap_err();
+        let middle = [None; 2];
+        // 1.2 · 96
+        assert!(says(1.2, middle, (96, 128)).contains("(normalized) it is 115.2 pixels"));
+        assert!(says(50.0, middle, (4000, 3000)).contains("millimeters"));
+        assert!(says(330.0, [Some(0.5); 2], (96, 128)).contains("`cx` is 48.0 and `cy` is 64.0"));
+        assert!(says(330.0, [Some(0.0), Some(-0.25)], (96, 128)).contains("`cx` is 48.00 and `cy` is 63.75"));
+        // a fisheye of 180° on 96 pixels, and a picture cut from the corner of another
+        assert_eq!(of(30.6, middle, (96, 96)), Ok((30.6, 48.0)));
+        assert_eq!(of(330.0, [Some(0.5), Some(40.0)], (96, 128)), Ok((330.0, 0.5)));
+        assert_eq!(of(330.0, [Some(-40.0), Some(0.5)], (96, 128)), Ok((330.0, -40.0)));
     }
 
     fn rows(m: DMat3) -> [[f64; 4]; 3] {

@@ -385,7 +385,7 @@ fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     })?;
     let mut listing = Listing { warnings: Vec::from_iter(unnameable), ..Listing::default() };
     let base = inside.strip_prefix(root).unwrap_or(Path::new(""));
-    let lens = Intrinsics { focal: [Some(1.0); 2], ..Intrinsics::default() };
+    let lens = Intrinsics { angle: [Some(1.0), None], ..Intrinsics::default() };
     let pose = (DMat3::IDENTITY, DVec3::ZERO);
     for name in &names {
         let photo = folder.photo(name, &base.join(name).to_string_lossy())?;

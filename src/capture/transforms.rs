@@ -1,150 +1,206 @@
-//! `transforms.json` and its split forms: the dialects of NeRF-Blender, instant-ngp and nerfstudio.
+//! `transforms.json` and its split forms: the dialects of NeRF-Blender, instant-ngp, nerfstudio and their
+//! descendants.
 //!
-//! Poses are camera-to-world with OpenGL axes in all three. Intrinsics may stand at the top or in each
-//! frame; a frame's own win. Unknown keys are ignored, `null` counts as absent; known ones of the wrong type are
-//! errors, but for [`LENIENT_KEYS`] and `up`, which count as absent as well.
+//! Poses are camera-to-world with OpenGL axes in all of them. Intrinsics may stand at the top or in each
+//! frame; a frame's own win. Every key is read, known to change nothing, or named ([`keys`]); `null` counts
+//! as absent. Keys of the wrong type are errors, but for some that count as absent as well, as `up` does.
+
+mod keys;
+mod lens;
+mod moments;
+mod pose;
+mod splits;
+
+pub(crate) use lens::camera_like;
 
 use super::folder::{CaptureFolder, in_file, in_frame};
-use super::frame::{self, CameraFrame, Intrinsics, LensModel, Listing};
+use super::frame::{self, CameraFrame, Listing};
+use super::masks::few;
 use super::view::Split;
-use crate::Result;
-use crate::geom::{Camera, Distortion};
 use crate::io;
-use glam::{DMat3, DVec3};
-use serde::Deserialize;
+use crate::{Error, Result};
+use glam::DVec3;
+use keys::KeyLog;
+use lens::{FrameKeys, LensNotes};
+use moments::Moments;
 use serde_json::{Map, Value};
-use std::collections::HashSet;
+use splits::Listed;
+use std::path::PathBuf;
 
 type Object = Map<String, Value>;
 
-/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would be overruled by
-/// the whole file's focal length.
-const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
-
-/// The other keys that may stand at the top for all frames.
-const SHARED_KEYS: &str = "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega is_fisheye camera_model";
-
-/// Keys that count as absent where their value is of another type, and whether it is of theirs.
-const LENIENT_KEYS: [(&str, fn(&Value) -> bool); 3] = [
-    ("is_fisheye", Value::is_boolean),
-    ("camera_model", Value::is_string),
-    ("face_mask_path", Value::is_string),
-];
-
-/// What is read at the top of a file, besides frames, intrinsics and `up`.
-#[derive(Default, Deserialize)]
-#[serde(default)]
-struct TopKeys {
-    // nerfstudio's splits
-    train_filenames: Option<HashSet<String>>,
-    val_filenames: Option<HashSet<String>>,
-    test_filenames: Option<HashSet<String>>,
+/// A mistake of a frame.
+#[derive(Debug)]
+enum Fault {
+    /// Of this frame alone.
+    Frame(String),
+    /// Of the program that wrote the file: reported once, with the number of frames and a way out.
+    File { text: String, hint: String },
+    /// An error that names its place.
+    Error(Error),
 }
 
-impl TopKeys {
-    fn split(&self, name: &str) -> Option<Split> {
-        let lists = [
-            (&self.train_filenames, Split::Train),
-            (&self.val_filenames, Split::Val),
-            (&self.test_filenames, Split::Test),
-        ];
-        let has = |names: &Option<HashSet<String>>| names.as_ref().is_some_and(|names| names.contains(name));
-        lists.iter().find(|(names, _)| has(names)).map(|(_, split)| *split)
+impl From<String> for Fault {
+    fn from(text: String) -> Fault {
+        Fault::Frame(text)
     }
 }
 
-/// What is read of a frame, intrinsics from the top included.
-#[derive(Default, Deserialize)]
-#[serde(default)]
-struct FrameKeys {
-    file_path: String,
-    transform_matrix: Vec<Vec<f64>>,
-    split: Option<String>,
-    mask_path: Option<String>,
-    face_mask_path: Option<String>,
-    w: Option<f64>,
-    h: Option<f64>,
-    fl_x: Option<f64>,
-    fl_y: Option<f64>,
-    camera_angle_x: Option<f64>,
-    camera_angle_y: Option<f64>,
-    cx: Option<f64>,
-    cy: Option<f64>,
-    k1: f64,
-    k2: f64,
-    k3: f64,
-    k4: f64,
-    k5: f64,
-    k6: f64,
-    p1: f64,
-    p2: f64,
-    sx1: f64,
-    sy1: f64,
-    omega: f64,
-    is_fisheye: bool,
-    camera_model: Option<String>,
+impl From<Error> for Fault {
+    fn from(error: Error) -> Fault {
+        Fault::Error(error)
+    }
 }
 
-impl FrameKeys {
-    fn read(top: &Object, entry: &Value) -> Result<FrameKeys, String> {
-        let own = entry.as_object().ok_or("it is not a JSON object")?;
-        for key in ["file_path", "transform_matrix"] {
-            if own.get(key).is_none_or(Value::is_null) {
-                return Err(format!("it has no `{key}`"));
-            }
-        }
-        FrameKeys::merged(top, own)
-    }
+/// Keys of a frame's mask, the first of which counts. VHAP's `fg_mask_path` shows the person with
+/// shoulders; INSTA's `seg_mask_path` may show labels, which the values tell.
+const MASK_KEYS: [&str; 3] = ["mask_path", "fg_mask_path", "seg_mask_path"];
 
-    fn merged(top: &Object, own: &Object) -> Result<FrameKeys, String> {
-        let own_focal = FOCAL_KEYS.iter().any(|key| own.contains_key(*key));
-        let shared = SHARED_KEYS.split(' ').chain(FOCAL_KEYS.into_iter().filter(|_| !own_focal));
-        let shared = shared.filter_map(|key| top.get_key_value(key));
-        let is_given =
-            |(key, value): &(&String, &Value)| match LENIENT_KEYS.iter().find(|(name, _)| key == name) {
-                Some((_, is_usable)) => is_usable(value),
-                None => !value.is_null(),
-            };
-        let merged: Object = (shared.filter(is_given).chain(own.iter().filter(is_given)))
-            .map(|(key, value)| (key.clone(), value.clone()))
-            .collect();
-        io::typed(&Value::Object(merged))
-            .map_err(|[key, found, expected]| format!("its `{key}` is {found}, expected {expected}"))
-    }
+/// What is known only once all files are read.
+#[derive(Default)]
+struct Together {
+    moments: Moments,
+    /// Which of [`MASK_KEYS`] named a mask.
+    masks: [bool; 3],
 }
 
 /// Lists the frames of `files`, in order; everything wrong goes to the listing's problems.
 pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) {
+    let mut together = Together::default();
     for file in files {
-        if let Err(problem) = list_file(folder, file, listing) {
+        if let Err(problem) = list_file(folder, file, &mut together, listing) {
             listing.problems.push(problem);
         }
     }
+    together.moments.report(files, listing);
+    listing.masks_named = match together.masks {
+        [_, false, false] => listing.masks_named,
+        [false, true, false] => "`fg_mask_path` of each frame",
+        [false, false, true] => "`seg_mask_path` of each frame",
+        _ => "`mask_path`, `fg_mask_path` or `seg_mask_path` of each frame",
+    };
 }
 
-fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
-    let limits = &folder.options.limits;
-    let path = folder.root.join(file);
-    let value = io::read_json(&path, limits)?;
-    let Some(top) = value.as_object() else {
-        return Err(in_file(file, "it is not a JSON object", "it must begin with `{`"));
+fn list_file(
+    folder: &CaptureFolder,
+    file: &str,
+    together: &mut Together,
+    listing: &mut Listing,
+) -> Result<()> {
+    let value = io::read_json(&folder.root.join(file), &folder.options.limits)?;
+    let nothing = Object::new();
+    let (top, entries) = parts(folder, file, &value, &nothing, listing)?;
+    read_top(folder, file, top, entries.len(), listing);
+    let mut reading = Reading::new(folder, file, top)?;
+    let read: Vec<Result<FrameKeys, Fault>> = entries.iter().map(|entry| reading.keys(entry)).collect();
+    let splits = match file {
+        "transforms_train.json" => vec![Listed::In(Some(Split::Train)); entries.len()],
+        "transforms_val.json" => vec![Listed::In(Some(Split::Val)); entries.len()],
+        "transforms_test.json" => vec![Listed::In(Some(Split::Test)); entries.len()],
+        _ => {
+            let names: Vec<Option<&str>> =
+                entries.iter().zip(&read).map(|(entry, keys)| entry.photograph(keys.as_ref().ok())).collect();
+            let has_split = |keys: &Result<FrameKeys, _>| keys.as_ref().is_ok_and(|k| k.split.is_some());
+            let settled: Vec<bool> = read.iter().map(has_split).collect();
+            splits::assign(file, top, &names, &settled, listing)?
+        }
     };
-    let Some(frames) = top.get("frames").and_then(Value::as_array) else {
-        let hint = "each entry of `frames` describes one photograph";
-        return Err(in_file(file, "it has no list `frames`", hint));
+    let mut faults = Faults { file, total: entries.len(), kinds: Vec::new() };
+    for ((entry, keys), listed) in entries.iter().zip(read).zip(splits) {
+        let Listed::In(split) = listed else { continue };
+        match keys.and_then(|keys| reading.frame(entry, &keys, split, listing)) {
+            Ok((frame, mask_key)) => {
+                if let Some(own) = entry.value.as_object() {
+                    together.moments.add(own, (frame.rotation, frame.position));
+                }
+                mask_key.into_iter().for_each(|k| together.masks[k] = true);
+                listing.frames.push(frame);
+            }
+            Err(fault) => faults.add(&entry.label, fault, listing),
+        }
+    }
+    faults.report(listing);
+    reading.report(listing);
+    Ok(())
+}
+
+/// A frame in its file.
+struct Entry<'v> {
+    /// Its key, where `frames` is an object.
+    key: Option<&'v str>,
+    value: &'v Value,
+    /// What messages call it.
+    label: String,
+}
+
+impl<'v> Entry<'v> {
+    fn new(i: usize, key: Option<&'v str>, value: &'v Value) -> Entry<'v> {
+        let name = value.get("file_path").and_then(Value::as_str).or(key);
+        Entry { key, value, label: name.map_or_else(|| format!("#{i}"), str::to_owned) }
+    }
+
+    /// Returns the name of its photograph, as far as it is known.
+    fn photograph<'a>(&'a self, keys: Option<&'a FrameKeys>) -> Option<&'a str> {
+        let written = || self.value.get("file_path").and_then(Value::as_str).or(self.key);
+        keys.map(|keys| keys.file_path.as_str()).or_else(written)
+    }
+}
+
+/// Returns the top of a file and its frames, which may be an object of named ones, or stand alone or with
+/// the whole file in a list.
+fn parts<'v>(
+    folder: &CaptureFolder,
+    file: &str,
+    value: &'v Value,
+    nothing: &'v Object,
+    listing: &mut Listing,
+) -> Result<(&'v Object, Vec<Entry<'v>>)> {
+    let mut say = |text: &str| listing.reasons.push(format!("`{file}` {text}"));
+    let is_frame =
+        |value: &Value| ["file_path", "transform_matrix"].iter().all(|key| value.get(key).is_some());
+    let (top, frames) = match value {
+        Value::Object(top) => (top, top.get("frames")),
+        Value::Array(list) => match &list[..] {
+            [Value::Object(top)] if top.contains_key("frames") => {
+                say("has a list around its object, which is read all the same");
+                (top, top.get("frames"))
+            }
+            [first, ..] if is_frame(first) => {
+                say("is a list, which is read as its `frames`");
+                (nothing, Some(value))
+            }
+            _ => return Err(in_file(file, "it is not a JSON object", "it must begin with `{`")),
+        },
+        _ => return Err(in_file(file, "it is not a JSON object", "it must begin with `{`")),
     };
-    if frames.is_empty() {
+    let count = match frames {
+        Some(Value::Array(list)) => list.len(),
+        Some(Value::Object(named)) => named.len(),
+        _ => {
+            let hint = "each entry of `frames` describes one photograph";
+            return Err(in_file(file, "it has no list `frames`", hint));
+        }
+    };
+    if count == 0 {
         let hint = "it must describe at least one photograph";
         return Err(in_file(file, "its list `frames` is empty", hint));
     }
-    limits.check_views(&path, frames.len())?;
-    let about: TopKeys = io::typed(&value).map_err(|[key, found, expected]| {
-        in_file(
-            file,
-            format_args!("`{key}` is {found}, expected {expected}"),
-            "it must be a list of file names",
-        )
-    })?;
+    folder.options.limits.check_views(&folder.root.join(file), count)?;
+    let entries = match frames {
+        Some(Value::Object(named)) => {
+            say("has an object of `frames`: its keys are photographs where there is no `file_path`");
+            named.iter().enumerate().map(|(i, (key, v))| Entry::new(i, Some(key), v)).collect()
+        }
+        frames => {
+            let list = frames.and_then(Value::as_array).map(Vec::as_slice).unwrap_or_default();
+            list.iter().enumerate().map(|(i, v)| Entry::new(i, None, v)).collect()
+        }
+    };
+    Ok((top, entries))
+}
+
+/// Reads what the top of a file says besides lenses and splits.
+fn read_top(folder: &CaptureFolder, file: &str, top: &Object, frames: usize, listing: &mut Listing) {
     if top.contains_key("applied_transform") || top.contains_key("applied_scale") {
         listing.reasons.push(format!(
             "`{file}` says its world was moved (`applied_transform`): results come out in the moved world"
@@ -154,68 +210,172 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
         &[x, y, z, ..] => DVec3::new(x, y, z).try_normalize(),
         _ => None,
     });
-    listing.up = listing.up.or(up);
-    let split_of_file = match file {
-        "transforms_train.json" => Some(Split::Train),
-        "transforms_val.json" => Some(Split::Val),
-        "transforms_test.json" => Some(Split::Test),
-        _ => None,
-    };
-    let mut ignored = Vec::new();
-    for (i, entry) in frames.iter().enumerate() {
-        let name = entry.get("file_path").and_then(Value::as_str);
-        let number = format!("#{i}");
-        let problem = |text: String| in_frame(file, name.unwrap_or(&number), text);
-        let frame = FrameKeys::read(top, entry).map_err(problem).and_then(|keys| {
-            let split = split_of_file.or(about.split(&keys.file_path));
-            let pose =
-                upper_rows(&keys.transform_matrix).and_then(|rows| frame::pose(&rows)).map_err(problem)?;
-            let split = named_split(keys.split.as_deref(), split).map_err(problem)?;
-            let intrinsics = intrinsics(&keys, &mut ignored).map_err(problem)?;
-            let photo = folder.photo(file, &keys.file_path)?;
-            let beside = |name: &Option<String>| -> Result<_> {
-                let named = name.as_ref().map(|name| folder.relative(file, name)).transpose()?;
-                Ok(named.and_then(|name| folder.file(&name)))
-            };
-            let (mask, region) = (beside(&keys.mask_path)?, beside(&keys.face_mask_path)?);
-            if keys.mask_path.is_some() && mask.is_none() && photo.1.is_some() {
-                listing.problems.push(problem("the mask it names is missing".into()));
-            }
-            let frame = CameraFrame::new(file, &keys.file_path, photo, intrinsics, pose);
-            Ok(CameraFrame { split, mask, region, ..frame })
-        });
-        match frame {
-            Ok(frame) => listing.frames.push(frame),
-            Err(problem) => listing.problems.push(problem),
-        }
+    if up.is_none() && top.get("up").is_some_and(|up| !up.is_null()) {
+        listing
+            .warnings
+            .push(format!("`{file}`: `up` is not a direction of three numbers, and not looked at"));
     }
-    ignored.sort();
-    ignored.dedup();
-    for model in ignored {
+    listing.up = listing.up.or(up);
+    if let Some((name, metres)) = keys::unit_m(top)
+        && (folder.options.unit_m / metres - 1.0).abs() > 0.01
+    {
         listing.warnings.push(format!(
-            "`{file}` gives distortion for the camera model `{model}`, which has none; it is not used"
+            "`{file}` counts in {name}, and `capture.unit_m` is {}: set `capture.unit_m = {metres}`",
+            folder.options.unit_m
         ));
     }
-    Ok(())
+    if let Some(n) = top.get("n_frames").and_then(Value::as_u64).filter(|n| *n < frames as u64) {
+        listing.warnings.push(format!(
+            "`{file}` asks instant-ngp to take the first {n} of its {frames} frames (`n_frames`); all are \
+             used here"
+        ));
+    }
 }
 
-/// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the lens is as
-/// `like` has it.
-pub(crate) fn camera_like(
-    top: &Object,
-    own: &Object,
-    like: &Camera,
-    (rotation, position): (DMat3, DVec3),
-) -> Result<Camera, String> {
-    let lens = intrinsics(&FrameKeys::merged(top, own)?, &mut Vec::new())?;
-    let size = lens.size.unwrap_or((like.width, like.height));
-    if lens.focal.iter().chain(&lens.angle).any(Option::is_some) {
-        return lens.camera(size, rotation, position);
+/// A file that is being read.
+struct Reading<'a> {
+    folder: &'a CaptureFolder<'a>,
+    file: &'a str,
+    /// The top as written, and what is read of it for each frame.
+    written: &'a Object,
+    shared: Object,
+    notes: LensNotes,
+    log: KeyLog,
+    /// Masks by other keys that are missing: the key, and the name.
+    missing: Vec<(&'static str, String)>,
+}
+
+impl<'a> Reading<'a> {
+    fn new(folder: &'a CaptureFolder, file: &'a str, written: &'a Object) -> Result<Reading<'a>> {
+        let (mut notes, mut log) = (LensNotes::default(), KeyLog::new());
+        log.look(written, "");
+        let hint = "correct what the file says of all its photographs";
+        let shared = lens::canonical(written, None, &mut notes).map_err(|text| in_file(file, text, hint))?;
+        Ok(Reading { folder, file, written, shared, notes, log, missing: Vec::new() })
     }
-    let like = like.resized(size.0, size.1);
-    let [cx, cy] = [lens.center[0].unwrap_or(like.cx), lens.center[1].unwrap_or(like.cy)];
-    let distortion = if lens.distortion.is_none() { like.distortion } else { lens.distortion };
-    Ok(Camera { cx, cy, distortion, rotation, position, ..like })
+
+    /// Returns what is read of a frame, its pose and photograph not looked at.
+    fn keys(&mut self, entry: &Entry) -> Result<FrameKeys, Fault> {
+        let own = entry.value.as_object().ok_or_else(|| "it is not a JSON object".to_string())?;
+        self.log.look(own, &entry.label);
+        let mut read = lens::canonical(own, Some(&self.shared), &mut self.notes)?;
+        if !read.contains_key("file_path") {
+            let key = entry.key.ok_or_else(|| "it has no `file_path`".to_string())?;
+            read.insert("file_path".into(), key.into());
+        }
+        Ok(FrameKeys::merged(&self.shared, read)?)
+    }
+
+    /// Returns a frame, and which of [`MASK_KEYS`] named its mask.
+    fn frame(
+        &mut self,
+        entry: &Entry,
+        keys: &FrameKeys,
+        split: Option<Split>,
+        listing: &mut Listing,
+    ) -> Result<(CameraFrame, Option<usize>), Fault> {
+        let (folder, file) = (self.folder, self.file);
+        let own = entry.value.as_object().unwrap_or(self.written);
+        let pose = frame::pose(&pose::rows(own)?)?;
+        let split = named_split(keys.split.as_deref(), split)?;
+        let intrinsics = lens::intrinsics(keys, &mut self.notes)?;
+        let photo = folder.photo(file, &keys.file_path)?;
+        let is_there = photo.1.is_some();
+        if is_there && !intrinsics.has_focal() {
+            return Err(lens::no_focal(self.written, own));
+        }
+        let beside = |name: &String| Ok::<_, Error>(folder.file(&folder.relative(file, name)?));
+        let region = keys.face_mask_path.as_ref().map(beside).transpose()?.flatten();
+        let mut mask: Option<(usize, PathBuf)> = None;
+        if let Some(name) = &keys.mask_path {
+            mask = beside(name)?.map(|path| (0, path));
+            if mask.is_none() && is_there {
+                let text = "the mask it names is missing";
+                listing.problems.push(in_frame(file, &entry.label, text));
+            }
+        } else {
+            for (k, name) in [(1, &keys.fg_mask_path), (2, &keys.seg_mask_path)] {
+                let Some(name) = name.as_ref().filter(|_| mask.is_none()) else { continue };
+                match beside(name).ok().flatten() {
+                    Some(path) => mask = Some((k, path)),
+                    None => self.missing.push((MASK_KEYS[k], name.clone())),
+                }
+            }
+        }
+        let (mask_key, mask) = mask.unzip();
+        let frame = CameraFrame::new(file, &keys.file_path, photo, intrinsics, pose);
+        Ok((CameraFrame { split, mask, region, ..frame }, mask_key))
+    }
+
+    /// Says how the file was read.
+    fn report(self, listing: &mut Listing) {
+        let (file, LensNotes { ignored, taken, skipped, misread }) = (self.file, self.notes);
+        let spelled = |(key, of): &(&str, &str)| match lens::ALIASES.contains(&(key, of)) {
+            true => format!("`{key}` as `{of}`"),
+            false => format!("`{key}` as {of}"),
+        };
+        if !taken.is_empty() {
+            let all: Vec<String> = taken.iter().map(spelled).collect();
+            listing.reasons.push(format!("`{file}` is read with {}", all.join(", ")));
+        }
+        if !misread.is_empty() {
+            let names = few(&misread);
+            listing
+                .warnings
+                .push(format!("`{file}`: of another type than they must be, and not looked at: {names}"));
+        }
+        for model in ignored {
+            listing.warnings.push(format!(
+                "`{file}` gives distortion for the camera model `{model}`, which has none; it is not used"
+            ));
+        }
+        for key in MASK_KEYS {
+            let names: Vec<&str> = self.missing.iter().filter(|m| m.0 == key).map(|m| m.1.as_str()).collect();
+            if !names.is_empty() {
+                let (n, names) = (names.len(), few(names));
+                listing.warnings.push(format!("`{file}`: {n} masks that `{key}` names are missing: {names}"));
+            }
+        }
+        self.log.report(file, &skipped, listing);
+    }
+}
+
+/// Mistakes of all frames of a file, one of each kind.
+struct Faults<'a> {
+    file: &'a str,
+    total: usize,
+    kinds: Vec<Kind>,
+}
+
+/// A [`Fault::File`], with the first frame that has it and how many do.
+struct Kind {
+    text: String,
+    hint: String,
+    first: String,
+    count: usize,
+}
+
+impl Faults<'_> {
+    fn add(&mut self, frame: &str, fault: Fault, listing: &mut Listing) {
+        match fault {
+            Fault::Frame(text) => listing.problems.push(in_frame(self.file, frame, text)),
+            Fault::Error(error) => listing.problems.push(error),
+            Fault::File { text, hint } => match self.kinds.iter_mut().find(|kind| kind.hint == hint) {
+                Some(kind) => kind.count += 1,
+                None => self.kinds.push(Kind { text, hint, first: frame.into(), count: 1 }),
+            },
+        }
+    }
+
+    fn report(self, listing: &mut Listing) {
+        for Kind { text, hint, first, count } in self.kinds {
+            let place = match count {
+                1 => format!("`{}`, frame `{first}`", self.file),
+                n => format!("`{}`, in {n} of {} frames, the first `{first}`", self.file, self.total),
+            };
+            listing.problems.push(Error::cannot(text, hint).within(place));
+        }
+    }
 }
 
 /// Returns the split a frame names, else the one it is in otherwise.
@@ -229,113 +389,9 @@ fn named_split(name: Option<&str>, otherwise: Option<Split>) -> Result<Option<Sp
     }
 }
 
-/// Returns the upper three rows of a 3×4 or 4×4 matrix.
-fn upper_rows(matrix: &[Vec<f64>]) -> Result<[[f64; 4]; 3], String> {
-    let rows: Option<Vec<[f64; 4]>> = matrix.iter().map(|row| row.as_slice().try_into().ok()).collect();
-    let ([a, b, c], last) = match rows.as_deref() {
-        Some(&[a, b, c]) => ([a, b, c], [0.0, 0.0, 0.0, 1.0]),
-        Some(&[a, b, c, last]) => ([a, b, c], last),
-        _ => return Err("its `transform_matrix` is not 4 × 4 or 3 × 4 numbers".into()),
-    };
-    if last[..3].iter().any(|v| v.abs() > 1e-6) || (last[3] - 1.0).abs() > 1e-6 {
-        return Err(format!("the last row of its `transform_matrix` is {last:?}, not 0 0 0 1"));
-    }
-    Ok([a, b, c])
-}
-
-fn intrinsics(keys: &FrameKeys, ignored: &mut Vec<String>) -> Result<Intrinsics, String> {
-    let side = |key: &str, value: Option<f64>| match value {
-        Some(v) if v.fract() != 0.0 || !(1.0..=1e6).contains(&v) => {
-            Err(format!("`{key}` is {v}, not a whole number of pixels"))
-        }
-        _ => Ok(value.map(|v| v as u32)),
-    };
-    let model = keys.camera_model.as_deref().unwrap_or("OPENCV");
-    let model = if keys.is_fisheye { "OPENCV_FISHEYE" } else { model };
-    let distortion = distortion(keys, model, ignored)?;
-    let (w, h) = (side("w", keys.w)?, side("h", keys.h)?);
-    if w.is_some() != h.is_some() {
-        return Err("it has only one of `w` and `h`".into());
-    }
-    let angle = [keys.camera_angle_x, keys.camera_angle_y];
-    for (key, angle) in ["camera_angle_x", "camera_angle_y"].into_iter().zip(angle) {
-        if let Some(a) = angle.filter(|a| !(*a > 0.0 && *a < std::f64::consts::PI)) {
-            return Err(format!("`{key}` is {a}, not an angle between 0 and π"));
-        }
-    }
-    let (focal, center) = ([keys.fl_x, keys.fl_y], [keys.cx, keys.cy]);
-    Ok(Intrinsics { size: w.zip(h), focal, angle, center, distortion })
-}
-
-/// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as well, and
-/// nerfstudio's perspective k4 exists in no other program.
-fn distortion(keys: &FrameKeys, model: &str, ignored: &mut Vec<String>) -> Result<Distortion, String> {
-    let &FrameKeys { k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1, omega, .. } = keys;
-    let given = Distortion { k1, k2, k3, p1, p2, k4, k5, k6, sx1, sy1, omega, ..Distortion::default() };
-    let parameters = match model {
-        "PERSPECTIVE" | "PINHOLE" | "SIMPLE_PINHOLE" => {
-            if !given.is_none() {
-                ignored.push(model.into());
-            }
-            return Ok(Distortion::default());
-        }
-        "OPENCV" | "RADIAL" | "SIMPLE_RADIAL" => "k1 k2 k3 p1 p2",
-        "FULL_OPENCV" => "k1 k2 k3 k4 k5 k6 p1 p2",
-        "OPENCV_FISHEYE" | "RADIAL_FISHEYE" | "SIMPLE_RADIAL_FISHEYE" => "k1 k2 k3 k4",
-        other => LensModel::named(other)?.parameters,
-    };
-    let all = "k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega".split(' ');
-    for key in all.filter(|key| !parameters.split(' ').any(|p| p == *key)) {
-        if *frame::coefficient(&mut { given }, key) != 0.0 {
-            return Err(format!(
-                "its lens has `{key}`, which its camera model `{model}` has not; undistort the photographs first"
-            ));
-        }
-    }
-    let distortion = Distortion { projection: frame::projection(model), ..given };
-    frame::check_distortion(&distortion)?;
-    Ok(distortion)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn object(text: &str) -> Object {
-        serde_json::from_str(text).unwrap()
-    }
-
-    fn intrinsics_of(top: &str, entry: &str) -> Result<Intrinsics, String> {
-        let mut entry = object(entry);
-        entry.extend(object(r#"{"file_path": "a", "transform_matrix": []}"#));
-        intrinsics(&FrameKeys::read(&object(top), &entry.into())?, &mut Vec::new())
-    }
-
-    #[test]
-    fn a_frames_own_intrinsics_win_over_the_files() {
-        let top = r#"{"fl_x": 10, "fl_y": 11, "cx": 5, "cy": 6, "w": 20, "h": 12, "k1": 0.1}"#;
-        let l = intrinsics_of(top, r#"{"camera_angle_x": 1.0, "cx": 7, "k1": 0.2}"#).unwrap();
-        assert_eq!((l.focal, l.angle), ([None, None], [Some(1.0), None]));
-        assert_eq!((l.center, l.size), ([Some(7.0), Some(6.0)], Some((20, 12))));
-        assert_eq!(l.distortion.k1, 0.2);
-        assert_eq!(intrinsics_of(top, "{}").unwrap().focal, [Some(10.0), Some(11.0)]);
-    }
-
-    #[test]
-    fn lenses_that_are_not_supported_are_named() {
-        for (top, word) in [
-            (r#"{"camera_model": "OPENCV_FISHEYE", "p1": 0.1}"#, "OPENCV_FISHEYE"),
-            (r#"{"is_fisheye": true, "k5": 0.1}"#, "k5"),
-            (r#"{"camera_model": "FOV", "omega": 4.0}"#, "omega"),
-            (r#"{"camera_model": "EQUIRECTANGULAR"}"#, "EQUIRECTANGULAR"),
-            (r#"{"k4": 0.1}"#, "k4"),
-            (r#"{"w": 10.5, "h": 3}"#, "10.5"),
-            (r#"{"fl_x": "wide"}"#, "fl_x"),
-            (r#"{"camera_angle_x": 4.0}"#, "camera_angle_x"),
-        ] {
-            assert!(intrinsics_of(top, "{}").unwrap_err().contains(word), "{top}");
-        }
-    }
 
     #[test]
     fn a_camera_model_without_distortion_is_warned_of_once() {
@@ -354,19 +410,5 @@ mod tests {
         let capture = crate::capture::open(dir.path(), &Default::default()).unwrap();
         let warned = capture.warnings.iter().filter(|w| w.contains("it is not used"));
         assert_eq!(warned.count(), 2, "{:?}", capture.warnings);
-    }
-
-    #[test]
-    fn matrices_of_three_and_four_rows_are_read() {
-        let three = vec![vec![1., 0., 0., 5.], vec![0., 1., 0., 6.], vec![0., 0., 1., 7.]];
-        let with = |last: [f64; 4]| [three.clone(), vec![last.to_vec()]].concat();
-        assert_eq!(upper_rows(&three).unwrap(), upper_rows(&with([0., 0., 0., 1.])).unwrap());
-        assert!(upper_rows(&with([0., 0., 1., 1.])).unwrap_err().contains("last row"));
-        assert!(upper_rows(&[]).is_err());
-        let text = FrameKeys::read(
-            &Object::new(),
-            &serde_json::json!({"file_path": "a", "transform_matrix": [[1, "x"]]}),
-        );
-        assert_eq!(text.err().unwrap(), "its `transform_matrix[0][1]` is \"x\", expected a number");
     }
 }

@@ -21,6 +21,7 @@ mod cli;
 mod colmap;
 #[cfg(all(feature = "wgpu", unix))]
 mod device;
+mod dialects;
 mod export;
 mod extraction;
 #[cfg(target_os = "linux")]

@@ -1,0 +1,542 @@
+//! The lens of a frame: its own keys and those for all frames, in the spellings of several programs, as
+//! intrinsics.
+
+use super::{Fault, Object};
+use crate::capture::frame::{self, Intrinsics, LensModel};
+use crate::geom::{Camera, Distortion};
+use crate::io;
+use glam::{DMat3, DVec3};
+use serde::Deserialize;
+use serde_json::Value;
+use std::collections::BTreeSet;
+
+/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would
+/// be overruled by the whole file's focal length.
+pub(super) const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
+
+/// The other keys that may stand at the top for all frames.
+pub(super) const SHARED_KEYS: &str =
+    "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega is_fisheye camera_model distortion_params";
+
+/// Keys of one frame only.
+const FRAME_KEYS: &str = "file_path split mask_path fg_mask_path seg_mask_path face_mask_path";
+
+/// Keys that count as absent where their value is of another type, and whether it is of theirs.
+const LENIENT_KEYS: [(&str, fn(&Value) -> bool); 5] = [
+    ("is_fisheye", Value::is_boolean),
+    ("camera_model", Value::is_string),
+    ("face_mask_path", Value::is_string),
+    ("fg_mask_path", Value::is_string),
+    ("seg_mask_path", Value::is_string),
+];
+
+/// Other spellings that can mean one thing only, and the key that each stands for.
+pub(super) const ALIASES: [(&str, &str); 22] = [
+    ("fx", "fl_x"),
+    ("fy", "fl_y"),
+    ("focal_x", "fl_x"),
+    ("focal_y", "fl_y"),
+    ("c_x", "cx"),
+    ("c_y", "cy"),
+    ("W", "w"),
+    ("H", "h"),
+    ("width", "w"),
+    ("height", "h"),
+    ("image_width", "w"),
+    ("image_height", "h"),
+    ("img_width", "w"),
+    ("img_height", "h"),
+    ("image_path", "file_path"),
+    ("img_path", "file_path"),
+    ("rgb_path", "file_path"),
+    ("image_name", "file_path"),
+    ("img_name", "file_path"),
+    ("image_file", "file_path"),
+    ("filename", "file_path"),
+    ("file_name", "file_path"),
+];
+
+/// Keys of matrices of intrinsics: fx 0 cx, 0 fy cy, 0 0 1.
+pub(super) const MATRICES: [&str; 8] = [
+    "intrinsic_matrix",
+    "intrinsics_matrix",
+    "camera_matrix",
+    "camera_intrinsics",
+    "camera_intrinsic",
+    "intrinsics",
+    "intrinsic",
+    "K",
+];
+
+/// Keys that may be a focal length or an angle, of a unit that is not known; named where there is no other.
+pub(super) const FOCAL_WORDS: [&str; 24] = [
+    "focal",
+    "focal_length",
+    "focal_length_x",
+    "focal_length_y",
+    "focal_length_mm",
+    "focal_mm",
+    "focal_px",
+    "flx",
+    "fl",
+    "f",
+    "fov",
+    "fov_x",
+    "fov_y",
+    "fovx",
+    "fovy",
+    "FovX",
+    "FovY",
+    "FoVx",
+    "FoVy",
+    "hfov",
+    "vfov",
+    "cam_angle_x",
+    "camera_angle",
+    "camera_fov",
+];
+
+/// What else was found in the lenses of a file.
+#[derive(Default)]
+pub(super) struct LensNotes {
+    /// Camera models without distortion whose frames have some.
+    pub ignored: BTreeSet<String>,
+    /// Spellings that were read, with what they were read as.
+    pub taken: BTreeSet<(&'static str, &'static str)>,
+    /// Spellings that were not read, because the usual one is there or they cannot be understood.
+    pub skipped: BTreeSet<&'static str>,
+    /// Keys whose value is of another type than it must be.
+    pub misread: BTreeSet<&'static str>,
+}
+
+/// Returns what is read of an object, with one spelling of each key. Keys that `beyond` has are not taken
+/// from others.
+pub(super) fn canonical(
+    object: &Object,
+    beyond: Option<&Object>,
+    notes: &mut LensNotes,
+) -> Result<Object, String> {
+    let is_given = |key: &str, value: &Value| match LENIENT_KEYS.iter().find(|(name, _)| key == *name) {
+        Some((_, is_usable)) => is_usable(value),
+        None => !value.is_null(),
+    };
+    let keys = SHARED_KEYS.split(' ').chain(FRAME_KEYS.split(' ')).chain(FOCAL_KEYS);
+    let given = keys.filter_map(|key| object.get_key_value(key)).filter(|(key, value)| is_given(key, value));
+    let mut out: Object = given.map(|(key, value)| (key.clone(), value.clone())).collect();
+    let misread = LENIENT_KEYS.into_iter().filter(|(key, is_usable)| {
+        object.get(*key).is_some_and(|value| !value.is_null() && !is_usable(value))
+    });
+    notes.misread.extend(misread.map(|(key, _)| key));
+    let is_known =
+        |out: &Object, key: &str| out.contains_key(key) || beyond.is_some_and(|top| top.contains_key(key));
+    for (alias, key) in ALIASES {
+        let Some(value) = object.get(alias) else { continue };
+        let fits = match key {
+            "file_path" => value.is_string(),
+            "w" | "h" => value.is_u64() && object.get(&partner(alias)).is_some_and(Value::is_u64),
+            _ => value.is_number(),
+        };
+        if fits && !is_known(&out, key) {
+            out.insert(key.into(), value.clone());
+            notes.taken.insert((alias, key));
+        } else {
+            notes.skipped.insert(alias);
+        }
+    }
+    let has_focal = |out: &Object| FOCAL_KEYS.iter().any(|key| is_known(out, key));
+    for (key, angle, focal) in [("x_fov", "camera_angle_x", "fl_x"), ("y_fov", "camera_angle_y", "fl_y")] {
+        let Some(value) = object.get(key).filter(|v| !v.is_null()) else { continue };
+        if [angle, focal].iter().any(|key| is_known(&out, key)) {
+            notes.skipped.insert(key);
+            continue;
+        }
+        out.insert(angle.into(), degrees(key, value)?.into());
+        notes.taken.insert((key, "an angle in degrees"));
+    }
+    for key in MATRICES {
+        let Some(value) = object.get(key) else { continue };
+        let found = if has_focal(&out) { None } else { matrix(key, value)? };
+        let Some(found) = found else {
+            notes.skipped.insert(key);
+            continue;
+        };
+        for (key, value) in ["fl_x", "fl_y", "cx", "cy"].into_iter().zip(found) {
+            out.entry(key).or_insert_with(|| value.into());
+        }
+        notes.taken.insert((key, "intrinsics in pixels"));
+    }
+    if let Some(value) = out.get("distortion_params") {
+        let of = |key: &str| out.get(key).or_else(|| beyond?.get(key));
+        let model = of("camera_model").and_then(Value::as_str).unwrap_or_default().to_ascii_uppercase();
+        let is_fisheye = of("is_fisheye") == Some(&Value::Bool(true)) || model.contains("FISHEYE");
+        for (key, value) in distortion_params(value, is_fisheye)? {
+            out.insert(key.into(), value.into());
+        }
+        notes.taken.insert(("distortion_params", "k1, k2, k3, k4, p1, p2"));
+    }
+    Ok(out)
+}
+
+/// Returns the other side's spelling of a width or height: a height alone may be one of anything.
+fn partner(side: &str) -> String {
+    match side {
+        "W" => "H".into(),
+        "H" => "W".into(),
+        width if width.ends_with("width") => width.replace("width", "height"),
+        height => height.replace("height", "width"),
+    }
+}
+
+/// Returns the radians of instant-ngp's `x_fov` and `y_fov`, which are degrees.
+fn degrees(key: &str, value: &Value) -> Result<f64, String> {
+    match value.as_f64() {
+        Some(degrees) if degrees > std::f64::consts::PI && degrees < 180.0 => Ok(degrees.to_radians()),
+        _ => Err(format!(
+            "`{key}` is {}, expected degrees between 4 and 180 (radians are called `camera_angle_{}`)",
+            short(value),
+            &key[..1]
+        )),
+    }
+}
+
+/// Returns fx, fy, cx, cy of a matrix of intrinsics as rows or as one list, row by row or column by column,
+/// which its zeros tell apart; or of an object of that name. `None` for anything else, such as a list of
+/// four numbers.
+fn matrix(key: &str, value: &Value) -> Result<Option<[f64; 4]>, String> {
+    if let Value::Object(named) = value {
+        let of = |names: [&str; 2]| names.iter().find_map(|name| named.get(*name)?.as_f64());
+        let found = [of(["fl_x", "fx"]), of(["fl_y", "fy"]), of(["cx", "c_x"]), of(["cy", "c_y"])];
+        let [Some(fx), Some(fy), Some(cx), Some(cy)] = found else { return Ok(None) };
+        return Ok(Some([fx, fy, cx, cy]));
+    }
+    let Some(list) = value.as_array() else { return Ok(None) };
+    let rows: Option<Vec<Vec<f64>>> =
+        list.iter().take(5).map(|row| row.as_array()?.iter().take(5).map(Value::as_f64).collect()).collect();
+    let flat: Option<Vec<f64>> = list.iter().take(17).map(Value::as_f64).collect();
+    let m: [[f64; 3]; 3] = match (rows, flat) {
+        (Some(rows), _)
+            if [3, 4].contains(&rows.len()) && rows.iter().all(|row| [3, 4].contains(&row.len())) =>
+        {
+            [0, 1, 2].map(|r| [rows[r][0], rows[r][1], rows[r][2]])
+        }
+        (_, Some(v)) if v.len() == 9 => [0, 1, 2].map(|r| [v[3 * r], v[3 * r + 1], v[3 * r + 2]]),
+        _ => return Ok(None),
+    };
+    let ends = |m: [[f64; 3]; 3]| m[2] == [0.0, 0.0, 1.0] && m[1][0] == 0.0;
+    let columns = [0, 1, 2].map(|r| [m[0][r], m[1][r], m[2][r]]);
+    let m = if ends(m) { m } else { columns };
+    if !ends(m) {
+        return Ok(None);
+    }
+    if m[0][1] != 0.0 {
+        return Err(format!("its `{key}` shears pixels, by {}: undistort the photographs first", m[0][1]));
+    }
+    Ok(Some([m[0][0], m[1][1], m[0][2], m[1][2]]))
+}
+
+/// Returns the coefficients in nerfstudio's `distortion_params`. Its loader takes six, k1 k2 k3 k4 p1 p2;
+/// OpenCV's lists of four and five have p1 in the third place, so that those are read only where both
+/// orders mean the same.
+fn distortion_params(value: &Value, is_fisheye: bool) -> Result<Vec<(&'static str, f64)>, String> {
+    const ORDER: [&str; 6] = ["k1", "k2", "k3", "k4", "p1", "p2"];
+    let values: Vec<f64> = io::typed(value).map_err(|[key, found, expected]| {
+        format!("its `distortion_params{}` is {found}, expected {expected}", key.trim_start_matches('.'))
+    })?;
+    let is_clear = match values.len() {
+        6 => true,
+        4 if is_fisheye => true,
+        0..=5 => values.iter().skip(2).all(|v| *v == 0.0),
+        _ => values.iter().skip(6).all(|v| *v == 0.0),
+    };
+    if !is_clear {
+        return Err(format!(
+            "its `distortion_params` holds {} numbers, expected the 6 of nerfstudio: k1, k2, k3, k4, p1, p2 \
+             (OpenCV's order is k1, k2, p1, p2, k3)",
+            values.len()
+        ));
+    }
+    let values = values.into_iter().chain(std::iter::repeat(0.0));
+    Ok(ORDER.into_iter().zip(values).collect())
+}
+
+/// Returns the beginning of a value, for a message.
+fn short(value: &Value) -> String {
+    match value {
+        Value::Array(_) => "a list".into(),
+        Value::Object(_) => "an object".into(),
+        value => crate::capture::folder::shortened(&value.to_string()),
+    }
+}
+
+/// What is read of a frame, intrinsics from the top included.
+#[derive(Default, Deserialize)]
+#[serde(default)]
+pub(super) struct FrameKeys {
+    pub file_path: String,
+    pub split: Option<String>,
+    pub mask_path: Option<String>,
+    pub fg_mask_path: Option<String>,
+    pub seg_mask_path: Option<String>,
+    pub face_mask_path: Option<String>,
+    w: Option<f64>,
+    h: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    k1: f64,
+    k2: f64,
+    k3: f64,
+    k4: f64,
+    k5: f64,
+    k6: f64,
+    p1: f64,
+    p2: f64,
+    sx1: f64,
+    sy1: f64,
+    omega: f64,
+    is_fisheye: bool,
+    camera_model: Option<String>,
+    /// There for messages only: [`canonical`] names its coefficients.
+    distortion_params: Option<Vec<f64>>,
+}
+
+impl FrameKeys {
+    /// Returns the keys of a frame, with those from the top that it lacks; both are [`canonical`].
+    pub fn merged(top: &Object, own: Object) -> Result<FrameKeys, String> {
+        let own_focal = FOCAL_KEYS.iter().any(|key| own.contains_key(*key));
+        let shared = SHARED_KEYS.split(' ').chain(FOCAL_KEYS.into_iter().filter(|_| !own_focal));
+        let shared = shared.filter_map(|key| top.get_key_value(key));
+        let mut merged: Object = shared.map(|(key, value)| (key.clone(), value.clone())).collect();
+        merged.extend(own);
+        io::typed(&Value::Object(merged))
+            .map_err(|[key, found, expected]| format!("its `{key}` is {found}, expected {expected}"))
+    }
+}
+
+/// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the
+/// lens is as `like` has it.
+pub(crate) fn camera_like(
+    top: &Object,
+    own: &Object,
+    like: &Camera,
+    (rotation, position): (DMat3, DVec3),
+) -> Result<Camera, String> {
+    let mut notes = LensNotes::default();
+    let top = canonical(top, None, &mut notes)?;
+    let own = canonical(own, Some(&top), &mut notes)?;
+    let lens = intrinsics(&FrameKeys::merged(&top, own)?, &mut notes)?;
+    let size = lens.size.unwrap_or((like.width, like.height));
+    if lens.has_focal() {
+        return lens.camera(size, rotation, position);
+    }
+    let like = like.resized(size.0, size.1);
+    let [cx, cy] = [lens.center[0].unwrap_or(like.cx), lens.center[1].unwrap_or(like.cy)];
+    let distortion = if lens.distortion.is_none() { like.distortion } else { lens.distortion };
+    Ok(Camera { cx, cy, distortion, rotation, position, ..like })
+}
+
+/// Returns the mistake of a frame that has no focal length, with the keys of it or of its file that may
+/// hold one.
+pub(super) fn no_focal(top: &Object, own: &Object) -> Fault {
+    let words = MATRICES.iter().chain(&FOCAL_WORDS);
+    let has = |key: &&&str| [own, top].iter().any(|object| object.get(**key).is_some_and(|v| !v.is_null()));
+    let there: Vec<String> = words.filter(has).map(|key| format!("`{key}`")).collect();
+    let text = "it has neither `fl_x` nor `camera_angle_x`, nor has the whole file";
+    let hint = "write `fl_x` and `fl_y`, the focal length in pixels (in millimeters it is multiplied by the \
+                picture's width and divided by the sensor's), or `camera_angle_x`, the full horizontal angle \
+                of view in radians";
+    match there.is_empty() {
+        true => Fault::File { text: text.into(), hint: hint.into() },
+        false => Fault::File {
+            text: format!(
+                "{text}; {} may hold it, in a unit or an order that is not known",
+                there.join(", ")
+            ),
+            hint: hint.into(),
+        },
+    }
+}
+
+pub(super) fn intrinsics(keys: &FrameKeys, notes: &mut LensNotes) -> Result<Intrinsics, String> {
+    let side = |key: &str, value: Option<f64>| match value {
+        Some(v) if v.fract() != 0.0 || !(1.0..=1e6).contains(&v) => {
+            Err(format!("`{key}` is {v}, not a whole number of pixels"))
+        }
+        _ => Ok(value.map(|v| v as u32)),
+    };
+    let distortion = distortion(keys, &model(keys), notes)?;
+    let (w, h) = (side("w", keys.w)?, side("h", keys.h)?);
+    if w.is_some() != h.is_some() {
+        return Err("it has only one of `w` and `h`".into());
+    }
+    let angle = [keys.camera_angle_x, keys.camera_angle_y];
+    for (key, angle) in ["camera_angle_x", "camera_angle_y"].into_iter().zip(angle) {
+        if let Some(a) = angle.filter(|a| !(*a > 0.0 && *a < std::f64::consts::PI)) {
+            let text = format!("`{key}` is {a}, not an angle between 0 and π");
+            let radians =
+                if a > 0.0 && a < 180.0 { format!("; {a}° are {:.6}", a.to_radians()) } else { "".into() };
+            return Err(text + &radians);
+        }
+    }
+    let (focal, center) = ([keys.fl_x, keys.fl_y], [keys.cx, keys.cy]);
+    Ok(Intrinsics { size: w.zip(h), focal, angle, center, distortion })
+}
+
+/// Returns the lens model by COLMAP's name, in capital letters. COLMAP's FISHEYE is OPENCV_FISHEYE without
+/// coefficients, and other programs say it of that one.
+fn model(keys: &FrameKeys) -> String {
+    let name = keys.camera_model.as_deref().unwrap_or("OPENCV");
+    let name = name.trim().to_ascii_uppercase().replace(['-', ' '], "_");
+    match name.as_str() {
+        _ if keys.is_fisheye => "OPENCV_FISHEYE".into(),
+        "FISHEYE" | "SIMPLE_FISHEYE" => "OPENCV_FISHEYE".into(),
+        _ => name,
+    }
+}
+
+/// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as
+/// well, and nerfstudio's perspective k4 exists in no other program.
+fn distortion(keys: &FrameKeys, model: &str, notes: &mut LensNotes) -> Result<Distortion, String> {
+    let &FrameKeys { k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1, omega, .. } = keys;
+    let given = Distortion { k1, k2, k3, p1, p2, k4, k5, k6, sx1, sy1, omega, ..Distortion::default() };
+    let parameters = match model {
+        "PERSPECTIVE" | "PINHOLE" | "SIMPLE_PINHOLE" => {
+            if !given.is_none() {
+                notes.ignored.insert(model.into());
+            }
+            return Ok(Distortion::default());
+        }
+        "OPENCV" | "RADIAL" | "SIMPLE_RADIAL" => "k1 k2 k3 p1 p2",
+        "FULL_OPENCV" => "k1 k2 k3 k4 k5 k6 p1 p2",
+        "OPENCV_FISHEYE" | "RADIAL_FISHEYE" | "SIMPLE_RADIAL_FISHEYE" => "k1 k2 k3 k4",
+        other => LensModel::named(other)?.parameters,
+    };
+    let all = "k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega".split(' ');
+    for key in all.filter(|key| !parameters.split(' ').any(|p| p == *key)) {
+        if *frame::coefficient(&mut { given }, key) != 0.0 {
+            let list = if keys.distortion_params.is_some() { " (in `distortion_params`)" } else { "" };
+            return Err(format!(
+                "its lens has `{key}`{list}, which its camera model `{model}` has not; undistort the \
+                 photographs first"
+            ));
+        }
+    }
+    let distortion = Distortion { projection: frame::projection(model), ..given };
+    frame::check_distortion(&distortion)?;
+    Ok(distortion)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(top: &str, entry: &str) -> Result<(Intrinsics, LensNotes), String> {
+        let mut notes = LensNotes::default();
+        let object = |text: &str| -> Object { serde_json::from_str(text).unwrap() };
+        let top = canonical(&object(top), None, &mut notes)?;
+        let own = canonical(&object(entry), Some(&top), &mut notes)?;
+        let found = intrinsics(&FrameKeys::merged(&top, own)?, &mut notes)?;
+        Ok((found, notes))
+    }
+
+    fn intrinsics_of(top: &str, entry: &str) -> Result<Intrinsics, String> {
+        Ok(read(top, entry)?.0)
+    }
+
+    #[test]
+    fn a_frames_own_intrinsics_win_over_the_files() {
+        let top = r#"{"fl_x": 10, "fl_y": 11, "cx": 5, "cy": 6, "w": 20, "h": 12, "k1": 0.1}"#;
+        let l = intrinsics_of(top, r#"{"camera_angle_x": 1.0, "cx": 7, "k1": 0.2}"#).unwrap();
+        assert_eq!((l.focal, l.angle), ([None, None], [Some(1.0), None]));
+        assert_eq!((l.center, l.size), ([Some(7.0), Some(6.0)], Some((20, 12))));
+        assert_eq!(l.distortion.k1, 0.2);
+        assert_eq!(intrinsics_of(top, "{}").unwrap().focal, [Some(10.0), Some(11.0)]);
+    }
+
+    #[test]
+    fn lenses_that_are_not_supported_are_named() {
+        for (top, word) in [
+            (r#"{"camera_model": "OPENCV_FISHEYE", "p1": 0.1}"#, "OPENCV_FISHEYE"),
+            (r#"{"is_fisheye": true, "k5": 0.1}"#, "k5"),
+            (r#"{"camera_model": "FOV", "omega": 4.0}"#, "omega"),
+            (r#"{"camera_model": "EQUIRECTANGULAR"}"#, "EQUIRECTANGULAR"),
+            (r#"{"k4": 0.1}"#, "k4"),
+            (r#"{"w": 10.5, "h": 3}"#, "10.5"),
+            (r#"{"fl_x": "wide"}"#, "fl_x"),
+            (r#"{"camera_angle_x": 4.0}"#, "camera_angle_x"),
+            (r#"{"camera_angle_x": 40}"#, "40° are 0.698132"),
+            (r#"{"x_fov": 0.7}"#, "camera_angle_x"),
+            (r#"{"K": [[9, 1, 5], [0, 9, 6], [0, 0, 1]]}"#, "shears"),
+        ] {
+            assert!(intrinsics_of(top, "{}").unwrap_err().contains(word), "{top}");
+        }
+    }
+
+    #[test]
+    fn distortion_params_are_read_in_nerfstudios_order_and_others_refused() {
+        let k = |text: &str| {
+            intrinsics_of(&format!(r#"{{"fl_x": 9, "k1": 0.5, "distortion_params": {text}}}"#), "{}")
+        };
+        let d = k("[0.1, 0.2, 0.3, 0, 0.4, 0.5]").unwrap().distortion;
+        assert_eq!((d.k1, d.k2, d.k3, d.k4, d.p1, d.p2), (0.1, 0.2, 0.3, 0.0, 0.4, 0.5));
+        // both orders of four and five mean this
+        for text in ["[0.1, 0.2, 0, 0]", "[0.1, 0.2, 0, 0, 0]", "[0.1, 0.2]"] {
+            let d = k(text).unwrap().distortion;
+            assert_eq!((d.k1, d.k2, d.k3, d.p1), (0.1, 0.2, 0.0, 0.0), "{text}");
+        }
+        for text in ["[0.1, 0.2, 0.3, 0]", "[0, 0, 0, 0, 0.1]", "[0, 0, 0, 0.1, 0, 0]", "[\"a\"]", "3"] {
+            assert!(k(text).unwrap_err().contains("distortion_params"), "{text}");
+        }
+        let fisheye = r#"{"camera_model": "OPENCV_FISHEYE", "distortion_params": [0.1, 0.2, 0.3, 0.4]}"#;
+        assert_eq!(intrinsics_of(fisheye, "{}").unwrap().distortion.k4, 0.4);
+        // a frame's own win over those of the file
+        let both = intrinsics_of(r#"{"k1": 0.1}"#, r#"{"distortion_params": [0.3, 0, 0, 0, 0, 0]}"#);
+        assert_eq!(both.unwrap().distortion.k1, 0.3);
+    }
+
+    #[test]
+    fn models_in_small_letters_are_those_in_capitals() {
+        for (small, large) in [("opencv", "OPENCV"), ("simple_radial", "SIMPLE_RADIAL"), ("fov", "FOV")] {
+            let of = |name: &str| intrinsics_of(&format!(r#"{{"camera_model": "{name}"}}"#), "{}").unwrap();
+            assert_eq!(of(small), of(large));
+        }
+        let fisheye = intrinsics_of(r#"{"camera_model": "fisheye", "k4": 0.1}"#, "{}").unwrap();
+        assert_eq!(fisheye.distortion.projection, crate::geom::Projection::Fisheye);
+        assert!(
+            intrinsics_of(r#"{"camera_model": "pinhole", "k1": 0.1}"#, "{}").unwrap().distortion.is_none()
+        );
+    }
+
+    #[test]
+    fn other_spellings_are_read_where_they_mean_one_thing() {
+        for text in [
+            r#"{"fx": 9, "fy": 8, "cx": 5, "cy": 6, "width": 10, "height": 12}"#,
+            r#"{"K": [[9, 0, 5], [0, 8, 6], [0, 0, 1]], "w": 10, "h": 12}"#,
+            r#"{"intrinsic_matrix": [9, 0, 0, 0, 8, 0, 5, 6, 1], "w": 10, "h": 12}"#,
+            r#"{"intrinsics": {"fx": 9, "fy": 8, "cx": 5, "cy": 6}, "w": 10, "h": 12}"#,
+            r#"{"intrinsics": [[9, 0, 5, 0], [0, 8, 6, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "w": 10, "h": 12}"#,
+        ] {
+            for (top, own) in [(text, "{}"), ("{}", text)] {
+                let (l, notes) = read(top, own).unwrap();
+                assert_eq!((l.focal, l.center), ([Some(9.0), Some(8.0)], [Some(5.0), Some(6.0)]), "{text}");
+                assert!(l.size == Some((10, 12)) && !notes.taken.is_empty(), "{text}");
+            }
+        }
+        let l = intrinsics_of(r#"{"x_fov": 90}"#, "{}").unwrap();
+        assert!((l.angle[0].unwrap() - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
+        // what is there by its own name is not replaced
+        let l = intrinsics_of(r#"{"fl_x": 10, "fl_y": 10, "x_fov": 20}"#, r#"{"fx": 9, "K": [1, 2, 3]}"#)
+            .unwrap();
+        assert_eq!((l.focal, l.angle), ([Some(10.0), Some(10.0)], [None, None]));
+    }
+
+    #[test]
+    fn a_focal_length_that_is_not_read_is_named_by_its_key() {
+        let top: Object = serde_json::from_str(r#"{"fov": 40, "intrinsics": [9, 9, 5, 5]}"#).unwrap();
+        let Fault::File { text, hint } = no_focal(&top, &Object::new()) else { panic!("of one frame") };
+        assert!(text.contains("`intrinsics`, `fov` may hold it") && hint.contains("`fl_x`"), "{text}");
+    }
+}
