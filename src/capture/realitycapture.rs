@@ -24,7 +24,8 @@ pub(super) const HEADER: &str = "#name,x,y,alt";
 /// Its first columns.
 const COLUMNS: [&str; 4] = ["name", "x", "y", "alt"];
 const EXPORT: &str = "export the registration again, `Internal/External camera parameters`";
-const POINTS: &str = "export it with a decimal point, or with `;` between the columns; names with commas need quotes";
+const POINTS: &str =
+    "export it with a decimal point, or with `;` between the columns; names with commas need quotes";
 /// What an XMP file holds.
 pub(super) const NAMESPACE: &str = "capturingreality.com/ns/xcr";
 
@@ -59,7 +60,7 @@ pub(super) fn list_csv(folder: &CaptureFolder, file: &str, listing: &mut Listing
     for (line, row) in heading.rows(&text) {
         let wrong = |(text, hint): (String, &str)| in_file(file, format_args!("line {line}: {text}"), hint);
         let values = heading.values(row).map_err(|text| wrong((text, POINTS)))?;
-        for value in values.iter().skip(1) {
+        for value in values.iter().skip(1).filter(|v| table::number(v).is_some()) {
             (commas, points) = (commas || value.contains(','), points || value.contains('.'));
         }
         entries.push(entry(&heading, &values).map_err(|text| wrong((text, EXPORT)))?);
@@ -89,7 +90,8 @@ fn spelling(file: &str, bytes: &[u8], heading: &Heading, commas: bool) -> Option
         _ => Some("columns separated by `;`"),
     };
     let encoded = table::is_utf16(bytes).then_some("text in UTF-16");
-    let all: Vec<&str> = [encoded, separated, commas.then_some("decimal commas")].into_iter().flatten().collect();
+    let all: Vec<&str> =
+        [encoded, separated, commas.then_some("decimal commas")].into_iter().flatten().collect();
     (!all.is_empty()).then(|| format!("`{file}` is read with {}", all.join(", ")))
 }
 

@@ -28,6 +28,9 @@ fn from_bytes(bytes: &[u8]) -> String {
     std::str::from_utf8(bytes).map_or_else(|_| latin1(), str::to_owned)
 }
 
+/// Columns are looked up by name for every row.
+const MAX_COLUMNS: usize = 256;
+
 /// The heading of a table.
 #[derive(Debug)]
 pub(super) struct Heading {
@@ -47,7 +50,9 @@ impl Heading {
             let name = |field: String| field.trim_start_matches('#').trim().to_lowercase();
             let without_mark = line.trim_start().trim_start_matches('#');
             let columns: Vec<String> = fields(without_mark, separator).into_iter().map(name).collect();
-            if columns.len() >= first.len() && columns.iter().zip(first).all(|(a, b)| a == b) {
+            if (first.len()..MAX_COLUMNS).contains(&columns.len())
+                && columns.iter().zip(first).all(|(a, b)| a == b)
+            {
                 return Some(Heading { columns, separator, lines: i + 1 });
             }
             let is_before = line.trim_start().starts_with('#') || line.to_lowercase().starts_with("sep=");
@@ -161,7 +166,10 @@ mod tests {
 
     #[test]
     fn numbers_have_a_point_or_one_comma() {
-        assert_eq!(["1.5", "1,5", "-0,5e-1", "7"].map(number), [Some(1.5), Some(1.5), Some(-0.05), Some(7.0)]);
+        assert_eq!(
+            ["1.5", "1,5", "-0,5e-1", "7"].map(number),
+            [Some(1.5), Some(1.5), Some(-0.05), Some(7.0)]
+        );
         assert_eq!(["1.234,5", "1,2,3", "inf", "", "x"].map(number), [None; 5]);
     }
 }

@@ -26,6 +26,7 @@ mod extraction;
 #[cfg(target_os = "linux")]
 mod faults;
 mod finished;
+mod formats;
 mod hostile;
 mod hostile_mesh;
 mod hostile_npz;
