@@ -235,7 +235,8 @@ fn from_video(file: &Path) -> String {
 }
 
 fn from_archive(file: &Path) -> String {
-    let (name, shown) = (file.to_string_lossy().to_lowercase(), file.display());
+    let name = file.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let shown = file.display();
     let command = if name.ends_with(".zip") {
         format!(": `unzip {shown} -d NEW`")
     } else if name.contains(".tar") || name.ends_with(".tgz") {

@@ -62,6 +62,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Lis
     let info = first.and_then(|path| io::picture_info(&path, &folder.options.limits).ok());
     let size = info.map_or((1, 1), |info| (info.width, info.height));
     let lens = read_intrinsics(folder, files.intrinsics, size)?;
+    listing.warnings.extend(doubtful_center(files.intrinsics, &lens, size));
     let mut lost = Vec::new();
     for ((name, stem), split) in poses.iter().zip(&stems).zip(splits(&stems)) {
         let file = format!("{POSES}/{name}");
@@ -115,7 +116,7 @@ fn splits(stems: &[String]) -> Vec<Option<Split>> {
     digits.iter().map(|digit| split(*digit).filter(|_| is_said)).collect()
 }
 
-/// Returns the numbers of a file by lines, with which one it failed on.
+/// Returns the numbers of a file by its lines.
 fn numbers(folder: &CaptureFolder, file: &str) -> Result<Vec<Vec<f64>>> {
     let limits = io::Limits { file_bytes: 1 << 16, ..folder.options.limits.clone() };
     let text = table::decoded(&io::read_bytes(&folder.root.join(file), &limits)?);
@@ -183,6 +184,19 @@ fn read_intrinsics(folder: &CaptureFolder, file: &str, photo: (u32, u32)) -> Res
         focal: [Some(fx), Some(fy)],
         center: [Some(center(cx, size.0)), Some(center(cy, size.1))],
         ..Intrinsics::default()
+    })
+}
+
+/// Returns a warning of a principal point that is far from the middle of a photograph: the photographs may be reduced.
+fn doubtful_center(file: &str, lens: &Intrinsics, (width, height): (u32, u32)) -> Option<String> {
+    let [Some(x), Some(y)] = lens.center else { return None };
+    let is_off = |c: f64, side: u32| (c / f64::from(side) - 0.5).abs() > 0.2;
+    let is_doubtful = lens.size.is_none() && width > 1 && (is_off(x, width) || is_off(y, height));
+    is_doubtful.then(|| {
+        format!(
+            "the principal point of `{file}` is ({x}, {y}), far from the middle of {width} × {height} pixels: are \
+             the photographs of the size that it is of?"
+        )
     })
 }
 

@@ -131,8 +131,8 @@ const PROGRAMS: &[Program] = &[
          photographs of BlendedMVS must be in `images/`, not `blended_images/`"),
     program("an OpenMVS scene", &[Ending("mvs")], "`InterfaceCOLMAP -i {file} -o NEW` {TO_COLMAP}"),
     program("a MeshLab project", &[Ending("mlp")],
-        "MeshLab's filter `Export active rasters cameras to file`, as Agisoft xml into this folder, writes cameras that are \
-         read"),
+        "MeshLab's filter `Export active rasters cameras to file`, as Agisoft xml into this folder, writes them as Metashape \
+         does"),
     program("a Blender scene", &[Ending("blend")],
         "render its views, and export their cameras with the add-on BlenderNeRF, which writes `transforms_train.json`"),
     program("a ContextCapture export", &[AnyWords("xml", "<BlocksExchange")],

@@ -89,7 +89,7 @@ fn spelling(file: &str, bytes: &[u8], heading: &Heading, commas: bool) -> Option
         ' ' => Some("columns separated by blanks"),
         _ => Some("columns separated by `;`"),
     };
-    let encoded = table::is_utf16(bytes).then_some("text in UTF-16");
+    let encoded = table::utf16(bytes).map(|_| "text in UTF-16");
     let all: Vec<&str> =
         [encoded, separated, commas.then_some("decimal commas")].into_iter().flatten().collect();
     (!all.is_empty()).then(|| format!("`{file}` is read with {}", all.join(", ")))

@@ -3,19 +3,23 @@
 /// Returns the text of a file: UTF-8 or UTF-16, with a byte order mark or without, else Latin-1. Lines end as
 /// [`str::lines`] has it, those of old Macs, too.
 pub(super) fn decoded(bytes: &[u8]) -> String {
-    let text = match bytes {
-        [0xFF, 0xFE, rest @ ..] => from_utf16(rest, u16::from_le_bytes),
-        [0xFE, 0xFF, rest @ ..] => from_utf16(rest, u16::from_be_bytes),
-        [1.., 0, 1.., 0, ..] => from_utf16(bytes, u16::from_le_bytes),
-        [0, 1.., 0, 1.., ..] => from_utf16(bytes, u16::from_be_bytes),
-        _ => from_bytes(bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes)),
+    let text = match utf16(bytes) {
+        Some((units, unit)) => from_utf16(units, unit),
+        None => from_bytes(bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes)),
     };
     if text.contains('\n') { text } else { text.replace('\r', "\n") }
 }
 
-/// Returns whether bytes begin as UTF-16 does.
-pub(super) fn is_utf16(bytes: &[u8]) -> bool {
-    matches!(bytes, [0xFF, 0xFE, ..] | [0xFE, 0xFF, ..] | [1.., 0, 1.., 0, ..] | [0, 1.., 0, 1.., ..])
+/// Returns the bytes of UTF-16 without their mark, and how two of them make a unit; `None` for other text.
+pub(super) fn utf16(bytes: &[u8]) -> Option<(&[u8], fn([u8; 2]) -> u16)> {
+    match bytes {
+        [0xFF, 0xFE, rest @ ..] => Some((rest, u16::from_le_bytes)),
+        [0xFE, 0xFF, rest @ ..] => Some((rest, u16::from_be_bytes)),
+        // two letters of ASCII
+        [1..=0x7F, 0, 1..=0x7F, 0, ..] => Some((bytes, u16::from_le_bytes)),
+        [0, 1..=0x7F, 0, 1..=0x7F, ..] => Some((bytes, u16::from_be_bytes)),
+        _ => None,
+    }
 }
 
 fn from_utf16(bytes: &[u8], unit: fn([u8; 2]) -> u16) -> String {

@@ -40,7 +40,7 @@ const OTHER_PLACES: [&str; 17] = [
 pub(in super::super) struct ModelFiles {
     pub folder: String,
     pub ending: &'static str,
-    /// Files whose names differ from COLMAP's in capitals.
+    /// Its files as they are spelled, if not as COLMAP does.
     pub spelled: Vec<String>,
 }
 
@@ -119,10 +119,10 @@ fn places(root: &Path) -> Vec<String> {
     all
 }
 
-/// Returns a model that [`ModelFiles::find`] does not find, up to three folders deep: in a folder of another name.
+/// Returns a model that [`ModelFiles::find`] does not find, up to four folders deep: in a folder of another name.
 pub(in super::super) fn model_elsewhere(root: &Path) -> Option<ModelFiles> {
     let mut level = vec![String::new()];
-    for _ in 0..3 {
+    for _ in 0..4 {
         let below = |place: &String| -> Vec<String> {
             let folders = io::list_folders(&root.join(place)).unwrap_or_default();
             let names = folders.iter().filter_map(|path| path.file_name()?.to_str());
