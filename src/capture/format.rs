@@ -101,14 +101,9 @@ impl CameraFiles {
             CameraFiles::Metashape(file) => ("Metashape", format!("cameras from `{file}`")),
             CameraFiles::RealityCapture(file) => ("RealityCapture", format!("cameras from `{file}`")),
             CameraFiles::Xmp(_) => ("RealityCapture", format!("cameras from `{}`", self.first())),
-            CameraFiles::Poses(files) => (
-                "NSVF",
-                format!(
-                    "cameras from `{}` (camera to world, OpenCV's axes) and `{}`",
-                    self.first(),
-                    files.intrinsics
-                ),
-            ),
+            CameraFiles::Poses(files) => {
+                ("NSVF", format!("cameras from `{}` and `{}`", self.first(), files.intrinsics))
+            }
         }
     }
 }

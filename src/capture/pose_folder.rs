@@ -91,6 +91,11 @@ pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Lis
         let text = format!("{} photographs have no pose in `{POSES}/`", without.len());
         listing.warnings.push(format!("{text}; they are left out: {}", few(without)));
     }
+    listing.warnings.push(format!(
+        "`{}` does not say what it means: it is taken for NSVF's, from the camera to the world, with axes right, down \
+         and ahead",
+        files.poses()
+    ));
     listing.focus = head_box(folder, listing);
     Ok(())
 }

@@ -13,10 +13,12 @@ enum Sign {
     Words(&'static str, &'static str),
     /// The same of the first files with this ending.
     AnyWords(&'static str, &'static str),
+    /// The same of those in the folder or in one directly below.
+    WordsBelow(&'static str, &'static str),
     /// In this folder, a file whose name ends like this.
     Inside(&'static str, &'static str),
 }
-use Sign::{AnyWords, Ending, Entry, Inside, Words};
+use Sign::{AnyWords, Ending, Entry, Inside, Words, WordsBelow};
 
 impl Sign {
     /// Returns the file or folder that shows it.
@@ -31,12 +33,23 @@ impl Sign {
                 only.holding(ending, words).cloned()
             }
             AnyWords(ending, words) => found.holding(ending, words).cloned(),
+            WordsBelow(ending, words) => below(found, ending, |text| text.contains(words)),
             Inside(folder, end) => {
                 let files = io::list_files(&found.root.join(folder)).unwrap_or_default();
                 files.iter().find(|f| f.ends_with(end)).map(|f| join(folder, f))
             }
         }
     }
+}
+
+/// Returns the first file with this ending, in the folder or in one directly below, whose beginning is as asked for.
+fn below(found: &FolderEntries, ending: &str, is_wanted: impl Fn(&str) -> bool) -> Option<String> {
+    let inside = |folder: &String| {
+        let inner = FolderEntries::of(&found.root.join(folder));
+        inner.beginning(ending, &is_wanted).map(|file| join(folder, file))
+    };
+    let here = found.beginning(ending, &is_wanted).cloned();
+    here.or_else(|| found.folders.iter().take(16).find_map(inside))
 }
 
 /// A kind of folder, and the way from there: `{root}` stands for the folder, `{file}` for what shows the kind.
@@ -75,10 +88,10 @@ const PROGRAMS: &[Program] = &[
         "nerfstudio converts it: unpack `.r3d` (a ZIP archive), let the folder of its photographs be called `rgb`, not \
          `rgbd`, and that of its poses `metadata.json`; then `ns-process-data record3d --data {root} --output-dir NEW` and \
          `tiface inspect NEW`"),
-    program("a scan of 3D Scanner App", &[AnyWords("json", "\"cameraPoseARFrame\"")],
+    program("a scan of 3D Scanner App (ARKit)", &[WordsBelow("json", "\"cameraPoseARFrame\"")],
         "{BY_HAND}; of each photograph's JSON, `cameraPoseARFrame` is `transform_matrix` by rows as it is, and `intrinsics` \
          is K by rows"),
-    program("an sdfstudio scene", &[Words("meta_data.json", "\"camtoworld\"")],
+    program("an sdfstudio scene", &[Words("meta_data.json", "\"camtoworld\""), Words("meta_data.json", "\"worldtogt\"")],
         "{BY_HAND}; it holds `camtoworld` (OpenCV axes) and `intrinsics` (K) of each frame"),
     program("an EyefulTower scene", &[Words("cameras.json", "\"KRT\"")],
         "put its `cameras.xml` (Metashape's, for photographs of full size) beside the photographs; or \
@@ -212,17 +225,32 @@ const NAMES: [&str; 15] = [
     "metadata",
 ];
 
-/// Returns a file or folder that may hold the cameras of photographs, by its name.
+/// Words in JSON files of cameras.
+const KEYS: [&str; 12] = [
+    "ntrinsic",
+    "xtrinsic",
+    "camera_to_world",
+    "world_to_camera",
+    "cam2world",
+    "world2cam",
+    "c2w",
+    "\"transform",
+    "ransformMatrix",
+    "ransform_matrix",
+    "\"pose",
+    "iewMatrix",
+];
+
+/// Returns a file that may hold the cameras of photographs, by its name or by words in it.
 pub(super) fn cameras_of_unknown_kind(found: &FolderEntries) -> Option<String> {
     let is_one = |name: &str| NAMES.iter().any(|word| name.to_lowercase().contains(word));
-    let file = found.files.iter().find(|name| is_one(name) && has_ending(name, &ENDINGS));
-    file.cloned().or_else(|| {
-        let named = found.folders.iter().filter(|name| is_one(name)).take(16);
-        named.into_iter().find_map(|folder| {
-            let inside = FolderEntries::of(&found.root.join(folder));
-            inside.ending(&ENDINGS).map(|file| format!("{folder}/{file}"))
-        })
-    })
+    let here = || found.files.iter().find(|name| is_one(name) && has_ending(name, &ENDINGS)).cloned();
+    let inside = |folder: &String| {
+        FolderEntries::of(&found.root.join(folder)).ending(&ENDINGS).map(|file| join(folder, file))
+    };
+    let in_folder = || found.folders.iter().filter(|name| is_one(name)).take(16).find_map(inside);
+    let by_words = || below(found, "json", |text| KEYS.iter().any(|key| text.contains(key)));
+    here().or_else(in_folder).or_else(by_words)
 }
 
 /// Returns the advice for cameras whose axes and units are not known.

@@ -361,6 +361,11 @@ fn folders_of_poses_of_nsvf_srn_and_scannet_are_read() {
         assert_eq!(c.format, "NSVF");
         sees(&c, [12.0, 16.0]);
         assert!(
+            c.warnings.iter().any(|w| w.contains("`pose/*.txt`") && w.contains("to the world")),
+            "{:?}",
+            c.warnings
+        );
+        assert!(
             c.reasons[0].contains("`pose/*.txt`") && c.reasons[0].contains(intrinsics),
             "{:?}",
             c.reasons
@@ -426,7 +431,7 @@ fn poses_that_are_no_cameras_are_refused_by_their_file() {
 
 #[test]
 fn known_cameras_of_other_programs_are_never_called_photographs_without_cameras() {
-    let rows: [(&str, &[(&str, &str)], &str, &str); 22] = [
+    let rows: [(&str, &[(&str, &str)], &str, &str); 24] = [
         (
             "rgbd",
             &[("metadata.json", r#"{"h": 32, "w": 24, "K": [1], "poses": [[0]]}"#)],
@@ -438,6 +443,18 @@ fn known_cameras_of_other_programs_are_never_called_photographs_without_cameras(
             &[("frame_00000.json", r#"{"cameraPoseARFrame": [1]}"#)],
             "a scan of 3D Scanner App",
             "`cameraPoseARFrame` is `transform_matrix`",
+        ),
+        (
+            "images",
+            &[("images/00.json", r#"{"intrinsics": [1], "cameraPoseARFrame": [1]}"#)],
+            "a scan of 3D Scanner App (ARKit) (`images/00.json`)",
+            "`cameraPoseARFrame` is `transform_matrix`",
+        ),
+        (
+            "images",
+            &[("frames/00.json", r#"{"cameraIntrinsics": [1], "transform": [1]}"#)],
+            "axes are not known (`frames/00.json`)",
+            "`transform_matrix`",
         ),
         (
             "images",
