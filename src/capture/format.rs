@@ -347,8 +347,9 @@ fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
         let way = format!("find them with COLMAP: {cameras}{nearest}");
         return Some(("photographs without cameras", first, way));
     }
-    let video = found.ending(&VIDEOS)?;
-    Some(("a video", video.clone(), from_video(&found.root.join(video))))
+    let video = found.ending(&VIDEOS);
+    let video = video.map(|video| ("a video", video.clone(), from_video(&found.root.join(video))));
+    video.or_else(|| programs::scene(found))
 }
 
 /// Returns the same of a folder with nothing but an archive.

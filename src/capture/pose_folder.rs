@@ -1,11 +1,12 @@
-//! Folders of poses: `pose/NAME.txt` has the camera-to-world matrix of an OpenCV camera for each photograph, one more file the
-//! intrinsics. NSVF and SRN call it `intrinsics.txt`, beside `rgb/`; ScanNet's exports
-//! `intrinsic/intrinsic_color.txt`, beside `color/`.
+//! Folders of poses: `pose/NAME.txt` has the camera-to-world matrix of an OpenCV camera for each
+//! photograph, one more file the intrinsics. NSVF and SRN call it `intrinsics.txt`, beside `rgb/`;
+//! ScanNet's exports `intrinsic/intrinsic_color.txt`, beside `color/`.
 //!
-//! Intrinsics are a matrix, or begin with a line `f cx cy 0` (SRN, `util.parse_intrinsics`), which a line `height width`
-//! may follow. Rays go through whole numbers as the centers of pixels (NSVF, `data_utils.get_uv`), so that principal points
-//! move by half a pixel; one at exactly half the size is the middle, as Blender's is. NSVF's names begin with 0 for
-//! training, 1 for validation (testing, if there is no 2) and 2 for testing.
+//! Intrinsics are a matrix, or begin with a line `f cx cy 0` (SRN, `util.parse_intrinsics`), which
+//! a line `height width` may follow. Rays go through whole numbers as the centers of pixels (NSVF,
+//! `data_utils.get_uv`), so that principal points move by half a pixel; one at exactly half the
+//! size is the middle, as Blender's is. NSVF's names begin with 0 for training, 1 for validation
+//! (testing, if there is no 2) and 2 for testing.
 
 use super::folder::{
     CaptureFolder, FLIP, FolderEntries, PHOTOGRAPHS, has_ending, in_file, in_frame, shortened,
@@ -92,8 +93,8 @@ pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Lis
         listing.warnings.push(format!("{text}; they are left out: {}", few(without)));
     }
     listing.warnings.push(format!(
-        "`{}` does not say what it means: it is taken for NSVF's, from the camera to the world, with axes right, down \
-         and ahead",
+        "`{}` does not say what it means: it is taken for NSVF's, from the camera to the world, with axes right, \
+         down and ahead",
         files.poses()
     ));
     listing.focus = head_box(folder, listing);
@@ -192,15 +193,16 @@ fn read_intrinsics(folder: &CaptureFolder, file: &str, photo: (u32, u32)) -> Res
     })
 }
 
-/// Returns a warning of a principal point that is far from the middle of a photograph: the photographs may be reduced.
+/// Returns a warning of a principal point that is far from the middle of a photograph: the
+/// photographs may be reduced.
 fn doubtful_center(file: &str, lens: &Intrinsics, (width, height): (u32, u32)) -> Option<String> {
     let [Some(x), Some(y)] = lens.center else { return None };
     let is_off = |c: f64, side: u32| (c / f64::from(side) - 0.5).abs() > 0.2;
     let is_doubtful = lens.size.is_none() && width > 1 && (is_off(x, width) || is_off(y, height));
     is_doubtful.then(|| {
         format!(
-            "the principal point of `{file}` is ({x}, {y}), far from the middle of {width} × {height} pixels: are \
-             the photographs of the size that it is of?"
+            "the principal point of `{file}` is ({x}, {y}), far from the middle of {width} × {height} pixels: \
+             are the photographs of the size that it is of?"
         )
     })
 }

@@ -1,4 +1,5 @@
-//! Tables of text as other programs export them: their encoding, what separates their columns, and decimal commas.
+//! Tables of text as other programs export them: their encoding, what separates their columns, and
+//! decimal commas.
 
 /// Returns the text of a file: UTF-8 or UTF-16, with a byte order mark or without, else Latin-1. Lines end as
 /// [`str::lines`] has it, those of old Macs, too.
@@ -96,7 +97,8 @@ impl Heading {
     }
 }
 
-/// Returns the values of a line, without the quotes around those that hold separators; `""` inside is a quote (RFC 4180).
+/// Returns the values of a line, without the quotes around those that hold separators; `""` inside
+/// is a quote (RFC 4180).
 fn fields(line: &str, separator: char) -> Vec<String> {
     let (mut all, mut quoted) = (vec![String::new()], false);
     let mut chars = line.chars().peekable();

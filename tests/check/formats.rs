@@ -1,5 +1,5 @@
-//! Camera files that are nearly right, models in other places, and the known cameras of other programs: read, or named with
-//! a way that works.
+//! Camera files that are nearly right, models in other places, and the known cameras of other
+//! programs: read, or named with a way that works.
 
 use crate::command::{code, err, out, tiface};
 use glam::{DMat3, DQuat, DVec3, Vec3};
@@ -499,10 +499,10 @@ fn known_cameras_of_other_programs_are_never_called_photographs_without_cameras(
             "a trained scene of nerfstudio",
             "`data` in `config.yml`",
         ),
-        ("images", &[("base.ingp", "x")], "a snapshot of instant-ngp (`base.ingp`)", "`transforms.json`"),
+        ("other", &[("base.ingp", "x")], "a snapshot of instant-ngp (`base.ingp`)", "`transforms.json`"),
         ("images", &[("head.mlp", "<x>")], "a MeshLab project (`head.mlp`)", "Agisoft xml"),
-        ("images", &[("head.blend", "BLENDER")], "a Blender scene (`head.blend`)", "BlenderNeRF"),
-        ("images", &[("head.psht", "x")], "a PostShot project (`head.psht`)", "tiface cameras"),
+        ("other", &[("head.blend", "BLENDER")], "a Blender scene (`head.blend`)", "BlenderNeRF"),
+        ("other", &[("head.psht", "x")], "a PostShot project (`head.psht`)", "tiface cameras"),
         (
             "images",
             &[("a.xml", "<BlocksExchange version=\"3\">")],
@@ -552,6 +552,7 @@ fn known_cameras_of_other_programs_are_never_called_photographs_without_cameras(
     // what is beside them and is none does not hide the way
     let dir = photographs("images");
     put(&dir, "notes.csv", "a,b\n");
+    put(&dir, "head.blend", "BLENDER");
     says(
         &dir,
         "",

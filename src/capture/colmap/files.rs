@@ -1,8 +1,8 @@
 //! Where the files of a model lie, and the photographs that it is of.
 //!
-//! `sparse/0` is COLMAP's own place; `dense/0` is that of its undistorted photographs, `distorted` that of 3D Gaussian
-//! splatting's `convert.py`, whose photographs are in `input/`. RealityCapture has written the files with
-//! capitals.
+//! `sparse/0` is COLMAP's own place; `dense/0` is that of its undistorted photographs, `distorted`
+//! that of 3D Gaussian splatting's `convert.py`, whose photographs are in `input/`. RealityCapture
+//! has written the files with capitals.
 
 use super::super::folder::{CaptureFolder, join};
 use crate::io;
@@ -74,8 +74,8 @@ impl ModelFiles {
         join(&self.folder, name)
     }
 
-    /// Returns the folder that the photographs' names are relative to: of a model in a folder of its own, the one beside it
-    /// that contains most of the first names; else as for any capture.
+    /// Returns the folder that the photographs' names are relative to: of a model in a folder of
+    /// its own, the one beside it that contains most of the first names; else as for any capture.
     pub fn image_folder<'n>(&self, folder: &CaptureFolder, names: impl Iterator<Item = &'n str>) -> String {
         let names: Vec<&str> = names.take(64).collect();
         let is_in = |base: &str, name: &&&str| {
@@ -119,7 +119,8 @@ fn places(root: &Path) -> Vec<String> {
     all
 }
 
-/// Returns a model that [`ModelFiles::find`] does not find, up to four folders deep: in a folder of another name.
+/// Returns a model that [`ModelFiles::find`] does not find, up to four folders deep: in a folder of
+/// another name.
 pub(in super::super) fn model_elsewhere(root: &Path) -> Option<ModelFiles> {
     let mut level = vec![String::new()];
     for _ in 0..4 {
