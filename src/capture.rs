@@ -32,10 +32,13 @@ mod masks;
 mod metashape;
 mod neus;
 mod photo_checks;
+mod pose_folder;
+mod programs;
 mod realitycapture;
 pub mod scene;
 pub mod sfm;
 pub mod synthetic;
+mod table;
 mod transforms;
 mod view;
 
@@ -101,6 +104,7 @@ fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>, Listing) {
         CameraFiles::Metashape(file) => metashape::list(&folder, file, &mut listing),
         CameraFiles::RealityCapture(file) => realitycapture::list_csv(&folder, file, &mut listing),
         CameraFiles::Xmp(inside) => realitycapture::list_xmp(&folder, inside, &mut listing),
+        CameraFiles::Poses(files) => pose_folder::list(&folder, files, &mut listing),
     };
     listing.problems.extend(listed.err());
     if let Err(problem) = options.limits.check_views(root, listing.frames.len()) {
@@ -129,6 +133,9 @@ fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(Captu
         io::read_bytes(root, &options.limits)?; // names what it is instead
     }
     let files = CameraFiles::find(root).ok_or_else(|| format::explain(root))?;
+    if let Some(error) = format::without_photographs(root, &files) {
+        return Err(error);
+    }
     Ok((CaptureFolder::new(root, options)?, files))
 }
 

@@ -1,4 +1,4 @@
-//! COLMAP's sparse models: `sparse/0`, `sparse`, the same below `colmap/`, or the folder itself.
+//! COLMAP's sparse models, in the places of [`files`].
 //!
 //! A pose takes the world to a camera whose axes point right, down and ahead, as a quaternion (w, x, y, z) and a
 //! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are
@@ -9,7 +9,10 @@
 //! COLMAP itself has just written.
 
 mod binary;
+mod files;
 mod text;
+
+pub(super) use files::{ModelFiles, mixed_model, model_elsewhere};
 
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join};
 use super::frame::{CameraFrame, LensModel, Listing};
@@ -21,30 +24,7 @@ use glam::{DMat3, DQuat, DVec3};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-/// Where models lie.
-const FOLDERS: [&str; 5] = ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ""];
-
-/// A model's folder below the capture, and how its files end.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct ModelFiles {
-    pub folder: &'static str,
-    pub ending: &'static str,
-}
-
 impl ModelFiles {
-    /// Returns the first model of a folder.
-    pub fn find(root: &Path) -> Option<ModelFiles> {
-        let mut all =
-            FOLDERS.iter().flat_map(|&folder| ["bin", "txt"].map(|ending| ModelFiles { folder, ending }));
-        all.find(|m| ["cameras", "images"].iter().all(|kind| io::is_file(&root.join(m.name(kind)))))
-    }
-
-    /// Returns the path of one of its files below the capture.
-    pub fn name(&self, kind: &str) -> String {
-        let slash = if self.folder.is_empty() { "" } else { "/" };
-        format!("{}{slash}{kind}.{}", self.folder, self.ending)
-    }
-
     fn read(&self, folder: &CaptureFolder) -> Result<Model> {
         let limits = &folder.options.limits;
         let bytes = |kind: &str| -> Result<Option<(PathBuf, Vec<u8>)>> {
@@ -112,9 +92,12 @@ pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Lis
         listing.warnings.push(format!("{text}: there are also {}", few(others)));
     }
     let held_out = held_out(folder, files)?;
-    let base = folder.image_folder(images.iter().map(|image| image.name.as_str()));
+    let base = files.image_folder(folder, images.iter().map(|image| image.name.as_str()));
+    if base.contains('/') || files.folder.starts_with("distorted") {
+        listing.reasons.push(format!("photographs from `{base}/`, which this model is of"));
+    }
     for image in &images {
-        match frame(folder, &name_of, base, image, &cameras, held_out.as_ref()) {
+        match frame(folder, &name_of, &base, image, &cameras, held_out.as_ref()) {
             Ok(frame) => listing.frames.push(frame),
             Err(problem) => listing.problems.push(problem),
         }
@@ -135,11 +118,13 @@ pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Lis
 }
 
 fn other_models(root: &Path, files: &ModelFiles) -> Vec<String> {
-    let Some(parent) = files.folder.strip_suffix("/0") else { return Vec::new() };
+    let is_number = |name: &str| name.bytes().all(|b| b.is_ascii_digit());
+    let Some((parent, own)) = files.folder.rsplit_once('/').filter(|(_, own)| is_number(own)) else {
+        return Vec::new();
+    };
     let numbered = |path: &PathBuf| {
         let name = path.file_name()?.to_str()?;
-        let is_other = name != "0" && name.bytes().all(|b| b.is_ascii_digit());
-        is_other.then(|| format!("{parent}/{name}"))
+        (name != own && is_number(name)).then(|| format!("{parent}/{name}"))
     };
     io::list_folders(&root.join(parent)).unwrap_or_default().iter().filter_map(numbered).collect()
 }

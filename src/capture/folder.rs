@@ -2,8 +2,9 @@
 //! No file outside the capture is opened.
 
 use super::frame::CameraFrame;
+use super::table;
 use super::view::CaptureOptions;
-use crate::io::{self, Limits, ReadError};
+use crate::io::{self, ReadError};
 use crate::{Error, Result};
 use glam::DMat3;
 use roxmltree::{Document, ParsingOptions};
@@ -215,12 +216,16 @@ impl FolderEntries {
 
     /// Returns the first file with this ending whose beginning contains `words`.
     pub fn holding(&self, ending: &str, words: &str) -> Option<&String> {
-        let limits = Limits { file_bytes: 64 << 20, ..Limits::default() };
-        let holds = |name: &&String| {
-            let bytes = io::read_bytes(&self.root.join(name), &limits).unwrap_or_default();
-            String::from_utf8_lossy(&bytes[..bytes.len().min(1 << 16)]).contains(words)
+        self.beginning(ending, |text| text.contains(words))
+    }
+
+    /// Returns the first file with this ending whose beginning is as asked for.
+    pub fn beginning(&self, ending: &str, is_wanted: impl Fn(&str) -> bool) -> Option<&String> {
+        let is_it = |name: &&String| {
+            let bytes = io::read_beginning(&self.root.join(name), 1 << 16).unwrap_or_default();
+            is_wanted(&table::decoded(&bytes))
         };
-        self.files.iter().filter(|f| has_ending(f, &[ending])).take(16).find(holds)
+        self.files.iter().filter(|f| has_ending(f, &[ending])).take(16).find(is_it)
     }
 
     pub fn at(&self, name: &str) -> String {

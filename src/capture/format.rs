@@ -2,9 +2,10 @@
 //!
 //! A folder of another program is recognized by its files, and the error explains how to convert it.
 
-use super::colmap::ModelFiles;
-use super::folder::{FolderEntries, PHOTOGRAPHS, has_ending};
-use super::{neus, realitycapture};
+use super::colmap::{ModelFiles, mixed_model, model_elsewhere};
+use super::folder::{FolderEntries, PHOTOGRAPHS, has_ending, is_common_name};
+use super::pose_folder::PoseFolder;
+use super::{neus, programs, realitycapture};
 use crate::Error;
 use crate::config::{Config, Stage};
 use crate::io;
@@ -27,6 +28,8 @@ pub(super) enum CameraFiles {
     RealityCapture(String),
     /// `.xmp` files beside the photographs in this folder.
     Xmp(PathBuf),
+    /// `pose/*.txt`.
+    Poses(PoseFolder),
 }
 
 impl CameraFiles {
@@ -56,8 +59,10 @@ impl CameraFiles {
         }
         let found = FolderEntries::of(root);
         let metashape = || found.holding("xml", "<chunk").cloned().map(CameraFiles::Metashape);
-        let csv = || found.holding("csv", realitycapture::HEADER).cloned().map(CameraFiles::RealityCapture);
-        metashape().or_else(csv).or_else(|| realitycapture::xmp_folder(root).map(CameraFiles::Xmp))
+        let table = |ending| found.beginning(ending, realitycapture::is_table).cloned();
+        let csv = || ["csv", "tsv", "txt"].into_iter().find_map(table).map(CameraFiles::RealityCapture);
+        let xmp = || realitycapture::xmp_folder(root).map(CameraFiles::Xmp);
+        metashape().or_else(csv).or_else(xmp).or_else(|| PoseFolder::find(root).map(CameraFiles::Poses))
     }
 
     /// Returns the name of one of the files, for messages.
@@ -68,6 +73,7 @@ impl CameraFiles {
             CameraFiles::Neus(file) => file.to_string(),
             CameraFiles::Metashape(file) | CameraFiles::RealityCapture(file) => file.clone(),
             CameraFiles::Xmp(folder) => folder.join("*.xmp").to_string_lossy().into_owned(),
+            CameraFiles::Poses(files) => files.poses(),
         }
     }
 
@@ -95,60 +101,23 @@ impl CameraFiles {
             CameraFiles::Metashape(file) => ("Metashape", format!("cameras from `{file}`")),
             CameraFiles::RealityCapture(file) => ("RealityCapture", format!("cameras from `{file}`")),
             CameraFiles::Xmp(_) => ("RealityCapture", format!("cameras from `{}`", self.first())),
+            CameraFiles::Poses(files) => {
+                ("NSVF", format!("cameras from `{}` and `{}`", self.first(), files.intrinsics))
+            }
         }
     }
 }
 
-/// Names of camera files; a path to one of them is answered with its folder.
-const CAMERA_FILES: [&str; 4] =
-    ["transforms.json", "transforms_train.json", "poses_bounds.npy", "poses_bounds_train.npy"];
+/// How files of cameras end; a path to one of them is answered with its folder.
+const CAMERA_ENDINGS: [&str; 7] = ["json", "npy", "npz", "xml", "csv", "bin", "txt"];
+
+/// How archives end.
+const ARCHIVES: [&str; 9] = ["zip", "tar", "tgz", "gz", "bz2", "xz", "zst", "7z", "rar"];
+
+/// How meshes and clouds of points end.
+const MESHES: [&str; 11] = ["glb", "gltf", "obj", "ply", "stl", "fbx", "usdz", "dae", "las", "laz", "e57"];
 
 const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
-
-/// Advice for datasets with cameras that no common tool converts.
-const BY_HAND: &str = "no common tool converts it: write `transforms.json` with `file_path`, `w`, `h`, `fl_x`, `fl_y`, \
-                       `cx`, `cy` and `transform_matrix` for each photograph (camera to world, +Y up and looking along \
-                       -Z: the second and third column of an OpenCV pose, negated)";
-
-/// Advice for cameras that another program exports to COLMAP.
-const TO_COLMAP: &str = "writes its cameras as COLMAP's: put `cameras`, `images` and `points3D` (`.bin` or `.txt`) into \
-                         `sparse/0`, the photographs beside it into `images/`";
-
-/// Folders of other programs: description; the files or folders, else the endings, that identify them; how to convert
-/// them, where `{root}` is the folder and `{file}` the file that was found.
-#[rustfmt::skip]
-const OTHER_PROGRAMS: &[(&str, &[&str], &[&str], &str)] = &[
-    ("a Multiface recording", &["KRT"], &[],
-        "{BY_HAND}; it holds K, distortion and [R|t] of each camera; take one frame of one expression of `images/`"),
-    ("a NeRSemble participant", &["calibration/camera_params.json", "camera_params.json"], &[],
-        "{BY_HAND}; it holds `world_2_cam` of each camera and one `intrinsics`; take one moment of one sequence, its \
-         `alpha_maps` are masks"),
-    ("a FaceScape tuple", &["params.json"], &[],
-        "{BY_HAND}; it holds `I_K`, `I_Rt` (world to camera), `I_distortion` and `I_valid` of photograph I.jpg: leave \
-         out what is not valid"),
-    ("a Polycam raw export", &["keyframes"], &[],
-        "nerfstudio converts it: `ns-process-data polycam --data {root} --output-dir NEW`, then `tiface inspect NEW`"),
-    ("a Metashape project", &[], &["psx", "psz"],
-        "export its cameras as XML into this folder: File, Export, Export Cameras"),
-    ("a RealityCapture project", &[], &["rcproj", "rsproj"],
-        "export its registration as CSV (`Internal/External camera parameters`) into this folder, or its metadata as \
-         XMP beside the photographs"),
-    ("a Meshroom project", &["MeshroomCache"], &["mg", "sfm"],
-        "its node `ExportColmap` (or `aliceVision_exportColmap --input cameras.sfm --output NEW`) {TO_COLMAP}"),
-    ("an OpenSfM project", &["reconstruction.json"], &[], "`opensfm export_colmap {root}` {TO_COLMAP}"),
-    ("an OpenMVG scene", &["sfm_data.json", "sfm_data.bin"], &[],
-        "`openMVG_main_openMVG2Colmap -i {file} -o NEW` {TO_COLMAP}"),
-    ("a VisualSFM scene", &[], &["nvm"],
-        "OpenMVS (`InterfaceVisualSFM -i {file} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`) {TO_COLMAP}"),
-    ("a Bundler scene", &["bundle.out", "bundle/bundle.out"], &[],
-        "OpenMVS (`InterfaceVisualSFM -i {file} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`) {TO_COLMAP}"),
-    ("an MVSNet scene", &["cams/00000000_cam.txt", "Cameras/00000000_cam.txt", "pair.txt"], &[],
-        "OpenMVS (`InterfaceMVSNet -i {root} -o scene.mvs`, then `InterfaceCOLMAP -i scene.mvs -o NEW`) {TO_COLMAP}"),
-    ("an incomplete COLMAP project",
-        &["sparse", "colmap", "cameras.bin", "cameras.txt", "images.bin", "images.txt", "database.db"], &[],
-        "its cameras and images files are missing: run `colmap mapper`, or copy `cameras.bin` and `images.bin` (or \
-         `.txt`) into `sparse/0`"),
-];
 
 /// Returns whether a folder is a run: it has a run's configuration, and either a stage was begun in it or nothing else in it
 /// is a capture's, be it one that cannot be read (photographs without cameras, a project of another program).
@@ -157,8 +126,11 @@ pub fn is_run(folder: &Path) -> bool {
         ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.word()).join(f)))
     };
     let is_begun = || Stage::ALL.iter().any(has_record);
-    let is_capture =
-        || CameraFiles::find(folder).is_some() || recognized(&FolderEntries::of(folder)).is_some();
+    let is_capture = || {
+        let found = FolderEntries::of(folder);
+        let is_recognized = programs::recognized(&found).is_some() || found.photographs().is_some();
+        CameraFiles::find(folder).is_some() || is_recognized || found.ending(&VIDEOS).is_some()
+    };
     io::is_file(&folder.join("config.toml")) && (is_begun() || !is_capture())
 }
 
@@ -175,17 +147,18 @@ pub(super) fn explain(root: &Path) -> Error {
         let hint = format!("inspect its capture, `{path}`; `tiface status` shows the state of the run");
         return not_a_capture(root, "it is the folder of a run", hint);
     }
-    if let Some((inner, file)) = nested(&found) {
-        let what = format!("its subfolder `{inner}` contains `{file}`");
-        return not_a_capture(root, what, format!("give that folder: `{}`", found.at(inner)));
+    let near = above(root).or_else(|| nested(&found)).or_else(|| misplaced_model(&found));
+    if let Some(error) = near {
+        return error;
     }
-    match recognized(&found) {
+    match recognized(&found).or_else(|| packed(&found)) {
         Some((what, telltale, hint)) => {
             not_a_capture(root, format!("it looks like {what} (`{telltale}`), which is not supported"), hint)
         }
         None => {
             let nearest = nearest(&found).map_or(String::new(), |n| format!("; nearest is {n}"));
-            let others = "Meshroom, OpenSfM, OpenMVG, Bundler, NVM, MVSNet, Polycam, NeRSemble, Multiface, FaceScape, \
+            let others = "Record3D, 3D Scanner App, Polycam, sdfstudio, EyefulTower, Nerfies, Meshroom, OpenSfM, OpenMVG, \
+                          OpenMVS, Bundler, NVM, MVSNet, NeRSemble, Multiface, FaceScape, EasyMocap, trained scenes, \
                           photographs alone or a video are recognized, with advice on how to convert them";
             not_a_capture(
                 root,
@@ -199,8 +172,8 @@ pub(super) fn explain(root: &Path) -> Error {
 /// The supported camera files, for messages.
 const CAMERA_FILES_TEXT: &str = "`transforms.json`, `transforms_train.json`, `poses_bounds*.npy` (LLFF), `cameras` and `images` as \
                           `.bin` or `.txt` in `sparse/0`, `sparse` or here (COLMAP), `cameras_sphere.npz` or `cameras.npz` \
-                          (NeuS, IDR, H3DS), an `.xml` with `<chunk` (Metashape), a `.csv` that begins with `#name,x,y,alt` \
-                          or `.xmp` files with a pose (RealityCapture)";
+                          (NeuS, IDR, H3DS), an `.xml` with `<chunk` (Metashape), `pose/*.txt` with `intrinsics.txt` (NSVF), \
+                          a `.csv` that begins with `#name,x,y,alt` or `.xmp` files with a pose (RealityCapture)";
 
 /// Returns the file most similar to a supported camera file, and what it lacks.
 fn nearest(found: &FolderEntries) -> Option<String> {
@@ -226,13 +199,24 @@ fn nearest(found: &FolderEntries) -> Option<String> {
 pub(super) fn explain_file(file: &Path) -> Error {
     let name = file.file_name().and_then(|n| n.to_str()).unwrap_or_default();
     let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let (root, shown) = (folder.display().to_string(), file.display().to_string());
     if has_ending(name, &VIDEOS) {
         not_a_capture(file, "it is a video", from_video(file))
-    } else if CAMERA_FILES.contains(&name)
-        || name.starts_with("transforms_")
-        || name.starts_with("poses_bounds")
-    {
-        not_a_capture(file, "it is a file", format!("give its folder: `{}`", folder.display()))
+    } else if let Some((what, way)) = programs::of_file(name, &root, &shown) {
+        not_a_capture(file, format!("it is a file of {what}"), way)
+    } else if has_ending(name, &ARCHIVES) {
+        not_a_capture(file, "it is an archive", from_archive(file))
+    } else if has_ending(name, &MESHES) {
+        let hint = format!(
+            "`tiface check {shown}` looks at GLB, OBJ and PLY; a capture is a folder of photographs and cameras"
+        );
+        not_a_capture(file, "it is a mesh or a cloud of points", hint)
+    } else if has_ending(name, &CAMERA_ENDINGS) {
+        let hint = match above(folder) {
+            Some(error) => error.hint().to_string(),
+            None => format!("give its folder: `{root}`"),
+        };
+        not_a_capture(file, "it is a file", hint)
     } else {
         not_a_capture(file, "it is a file", "give the folder that contains the photographs and cameras")
     }
@@ -245,32 +229,131 @@ fn from_video(file: &Path) -> String {
     )
 }
 
-/// Returns a subfolder that is a capture, with its first camera file.
-fn nested(found: &FolderEntries) -> Option<(&str, String)> {
+fn from_archive(file: &Path) -> String {
+    let name = file.file_name().unwrap_or_default().to_string_lossy().to_lowercase();
+    let shown = file.display();
+    let command = if name.ends_with(".zip") {
+        format!(": `unzip {shown} -d NEW`")
+    } else if name.contains(".tar") || name.ends_with(".tgz") {
+        format!(": `mkdir NEW && tar -xf {shown} -C NEW`")
+    } else {
+        " into a folder NEW".into()
+    };
+    format!("unpack it{command}, then `tiface inspect NEW`")
+}
+
+/// Returns the error for a folder of which a subfolder is a capture, or has its cameras.
+fn nested(found: &FolderEntries) -> Option<Error> {
     let of = |name: &String| CameraFiles::find(&found.root.join(name)).map(|files| files.first());
-    found.folders.iter().take(1000).find_map(|name| Some((name.as_str(), of(name)?)))
+    let (inner, file) = found.folders.iter().take(1000).find_map(|name| Some((name, of(name)?)))?;
+    let (root, folder) = (found.root.display(), found.at(inner));
+    let what = format!("its subfolder `{inner}` contains `{file}`");
+    Some(if has_pictures(Path::new(&folder)) {
+        not_a_capture(&found.root, what, format!("give that folder: `{folder}`"))
+    } else if found.photographs().is_some() {
+        let hint =
+            format!("move what is in `{folder}` to `{root}`, beside the photographs, and give `{root}`");
+        not_a_capture(&found.root, what + ", but no photographs", hint)
+    } else {
+        let hint =
+            format!("put the photographs there, as the cameras name them, and give that folder: `{folder}`");
+        not_a_capture(&found.root, what + ", but no photographs", hint)
+    })
+}
+
+/// Returns whether a folder or one below has a picture.
+fn has_pictures(root: &Path) -> bool {
+    let is_other = |path: &Path| {
+        io::is_file(path)
+            && !path.file_name().and_then(|n| n.to_str()).is_some_and(|n| has_ending(n, &PHOTOGRAPHS))
+    };
+    io::any_file(root, &is_other).is_ok_and(|found| found.is_some())
+}
+
+/// Returns the error for a folder inside a capture: that of its photographs, or, up to three levels deep, that of its
+/// model or poses.
+fn above(root: &Path) -> Option<Error> {
+    let real = io::real_path(root).ok()?;
+    let is_photographs = real.file_name().and_then(|n| n.to_str()).is_some_and(is_common_name)
+        && FolderEntries::of(root).ending(&PHOTOGRAPHS).is_some();
+    real.ancestors().enumerate().skip(1).take(3).find_map(|(level, folder)| {
+        let is_inside = |place: &str| folder.join(place).starts_with(&real);
+        let model =
+            || ModelFiles::find(folder).filter(|files| is_inside(&files.folder)).map(CameraFiles::Colmap);
+        let poses = || PoseFolder::find(folder).filter(|_| is_inside("pose")).map(CameraFiles::Poses);
+        let files =
+            if level == 1 && is_photographs { CameraFiles::find(folder) } else { model().or_else(poses) }?;
+        let given = root.ancestors().nth(level).filter(|_| !root.ends_with("..") && !root.ends_with("."));
+        let shown = given.filter(|path| !path.as_os_str().is_empty()).unwrap_or(folder).display();
+        let what = format!("it is a part of one: `{shown}` has the cameras `{}`", files.first());
+        Some(not_a_capture(root, what, format!("give the folder above: `{shown}`")))
+    })
+}
+
+/// Returns the error for the folder of a model whose photographs are above.
+pub(super) fn without_photographs(root: &Path, files: &CameraFiles) -> Option<Error> {
+    let is_model = matches!(files, CameraFiles::Colmap(files) if files.folder.is_empty());
+    if is_model && !has_pictures(root) { above(root) } else { None }
+}
+
+/// Returns the error for a model of COLMAP's in a place or of a kind that is not read.
+fn misplaced_model(found: &FolderEntries) -> Option<Error> {
+    let root = found.root.display();
+    if let Some([cameras, images]) = mixed_model(&found.root) {
+        let what = format!("of its COLMAP model, `{cameras}` and `{images}` are not of one kind");
+        let hint = "export both the same way: `colmap model_converter --input_path MODEL --output_path NEW \
+                    --output_type BIN`";
+        return Some(not_a_capture(&found.root, what, hint));
+    }
+    let model = model_elsewhere(&found.root)?;
+    let what = format!("its COLMAP model is in `{}`, where none is looked for", model.folder);
+    let owners = Path::new(&model.folder).ancestors().map(|inner| found.root.join(inner));
+    let is_capture = |owner: &PathBuf| ModelFiles::find(owner).is_some() && has_pictures(owner);
+    if let Some(owner) = owners.filter(|owner| *owner != found.root).find(is_capture) {
+        let hint = format!("give the folder of that capture: `{}`", owner.display());
+        return Some(not_a_capture(&found.root, what, hint));
+    }
+    let from = found.at(&model.folder);
+    let hint = format!(
+        "copy it beside its photographs: `mkdir -p {root}/sparse && cp -r {from} {root}/sparse/0`, with the \
+         photographs in `{root}/images`"
+    );
+    Some(not_a_capture(&found.root, what, hint))
 }
 
 /// Returns what the folder looks like, the file that shows it, and how to get to `transforms.json`.
 fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
+    if let Some(program) = programs::recognized(found) {
+        return Some(program);
+    }
+    let cameras = format!("`tiface cameras {}`", found.root.display());
+    let is_folder_of_pictures =
+        |name: &String| FolderEntries::of(&found.root.join(name)).ending(&PHOTOGRAPHS).is_some();
     let photographs = found.photographs();
-    // `params.json` is too common a name to identify anything without photographs
-    let is_candidate = |files: &[&str]| photographs.is_some() || files != ["params.json"];
-    for (what, files, endings, way) in OTHER_PROGRAMS.iter().filter(|(_, files, ..)| is_candidate(files)) {
-        let file = found.any(files).or_else(|| found.ending(endings).map(String::as_str));
-        if let Some(file) = file {
-            let root = found.root.display().to_string();
-            let values = [("{BY_HAND}", BY_HAND), ("{TO_COLMAP}", TO_COLMAP), ("{root}", &root)];
-            let way = way.replace("{file}", &found.at(file));
-            let way = values.iter().fold(way, |way, (key, value)| way.replace(key, value));
-            return Some((what, file.into(), way));
-        }
+    if (photographs.is_some() || found.folders.iter().take(64).any(is_folder_of_pictures))
+        && let Some(file) = programs::cameras_of_unknown_kind(found)
+    {
+        let nearest = nearest(found).map_or(String::new(), |n| format!("; nearest to what is read is {n}"));
+        let way = format!(
+            "if it holds cameras, {}{nearest}; if it does not, find them with COLMAP: {cameras}",
+            programs::by_hand()
+        );
+        return Some(("photographs with cameras in a form whose axes are not known", file, way));
     }
     if let Some(folder) = photographs {
         let first = FolderEntries::of(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();
-        let way = format!("find them with COLMAP: `tiface cameras {}`", found.root.display());
+        let nearest =
+            nearest(found).map_or(String::new(), |n| format!("; nearest to a file of cameras is {n}"));
+        let way = format!("find them with COLMAP: {cameras}{nearest}");
         return Some(("photographs without cameras", first, way));
     }
-    let video = found.ending(&VIDEOS)?;
-    Some(("a video", video.clone(), from_video(&found.root.join(video))))
+    let video = found.ending(&VIDEOS);
+    let video = video.map(|video| ("a video", video.clone(), from_video(&found.root.join(video))));
+    video.or_else(|| programs::scene(found))
+}
+
+/// Returns the same of a folder with nothing but an archive.
+fn packed(found: &FolderEntries) -> Option<(&'static str, String, String)> {
+    let archive = found.ending(&ARCHIVES)?;
+    Some(("a packed capture", archive.clone(), from_archive(&found.root.join(archive))))
 }

@@ -11,6 +11,7 @@ use super::folder::{
     shortened,
 };
 use super::frame::{self, CameraFrame, Intrinsics, Listing};
+use super::table::{self, Heading};
 use crate::geom::Distortion;
 use crate::io;
 use crate::{Error, Result};
@@ -20,6 +21,11 @@ use std::path::{Path, PathBuf};
 
 /// How a CSV file begins.
 pub(super) const HEADER: &str = "#name,x,y,alt";
+/// Its first columns.
+const COLUMNS: [&str; 4] = ["name", "x", "y", "alt"];
+const EXPORT: &str = "export the registration again, `Internal/External camera parameters`";
+const POINTS: &str =
+    "export it with a decimal point, or with `;` between the columns; names with commas need quotes";
 /// What an XMP file holds.
 pub(super) const NAMESPACE: &str = "capturingreality.com/ns/xcr";
 
@@ -39,49 +45,33 @@ struct Entry {
     coefficients: [f64; 6],
 }
 
+/// Returns whether a text begins as a table of RealityCapture's cameras does.
+pub(super) fn is_table(text: &str) -> bool {
+    Heading::find(text, &COLUMNS).is_some()
+}
+
 /// Lists the cameras of a CSV file.
 pub(super) fn list_csv(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
     let bytes = io::read_bytes(&folder.root.join(file), &folder.options.limits)?;
-    let hint = "export the registration again, `Internal/External camera parameters`";
-    let wrong = |line: usize, text: String| in_file(file, format_args!("line {line}: {text}"), hint);
-    let text = String::from_utf8_lossy(&bytes);
-    let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-    let headers = fields(lines.next().map_or("", |(_, line)| line.trim_start_matches('\u{FEFF}')));
-    let column = |name: &str| headers.iter().position(|h| h == name);
-    let mut entries = Vec::new();
-    for (i, line) in lines {
-        let (line, record) = (i + 1, fields(line));
-        let name = column("#name").and_then(|i| record.get(i)).cloned().unwrap_or_default();
-        let value = |name: &str, needed: bool| -> Result<f64> {
-            match column(name).and_then(|i| record.get(i)).map(String::as_str) {
-                None | Some("") if !needed => Ok(0.0),
-                Some(text) => match text.parse::<f64>() {
-                    Ok(v) if v.is_finite() => Ok(v),
-                    _ => Err(wrong(line, format!("`{name}` is `{}`", shortened(text)))),
-                },
-                None => Err(wrong(line, format!("it has no `{name}`"))),
-            }
-        };
-        let angle = |name| value(name, true).map(f64::to_radians);
-        let (heading, pitch, roll) = (angle("heading")?, angle("pitch")?, angle("roll")?);
-        let mut coefficients = [0.0; 6];
-        for (coefficient, name) in coefficients.iter_mut().zip(["k1", "k2", "k3", "k4", "t1", "t2"]) {
-            *coefficient = value(name, false)?;
+    let text = table::decoded(&bytes);
+    let no_heading = || in_file(file, format_args!("it does not begin with `{HEADER}`"), EXPORT);
+    let heading = Heading::find(&text, &COLUMNS).ok_or_else(no_heading)?;
+    let (mut entries, mut commas, mut points) = (Vec::new(), false, false);
+    for (line, row) in heading.rows(&text) {
+        let wrong = |(text, hint): (String, &str)| in_file(file, format_args!("line {line}: {text}"), hint);
+        let values = heading.values(row).map_err(|text| wrong((text, POINTS)))?;
+        for value in values.iter().skip(1).filter(|v| table::number(v).is_some()) {
+            (commas, points) = (commas || value.contains(','), points || value.contains('.'));
         }
-        let turned = DMat3::from_rotation_z(-heading) * DMat3::from_rotation_x(pitch);
-        entries.push(Entry {
-            name,
-            rotation: turned * DMat3::from_rotation_y(roll),
-            position: DVec3::new(value("x", true)?, value("y", true)?, value("alt", true)?),
-            focal: value("f", true)?,
-            center: [value("px", false)?, value("py", false)?],
-            coefficients,
-        });
+        entries.push(entry(&heading, &values).map_err(|text| wrong((text, EXPORT)))?);
         folder.options.limits.check_views(Path::new(file), entries.len())?;
     }
     if entries.is_empty() {
-        return Err(in_file(file, "it lists no photographs", hint));
+        return Err(in_file(file, "it lists no photographs", EXPORT));
+    } else if commas && points {
+        return Err(in_file(file, "some of its numbers have a comma, others a point", POINTS));
     }
+    listing.reasons.extend(spelling(file, &bytes, &heading, commas));
     let base = folder.image_folder(entries.iter().map(|e| e.name.as_str()));
     for entry in entries {
         let name = join(base, &entry.name);
@@ -91,18 +81,42 @@ pub(super) fn list_csv(folder: &CaptureFolder, file: &str, listing: &mut Listing
     Ok(())
 }
 
-/// Returns the values of a line, without the quotes around those that hold commas; `""` inside is a quote (RFC 4180).
-fn fields(line: &str) -> Vec<String> {
-    let (mut all, mut quoted) = (vec![String::new()], false);
-    let mut chars = line.chars().peekable();
-    while let Some(c) = chars.next() {
-        match c {
-            '"' if !quoted || chars.next_if_eq(&'"').is_none() => quoted = !quoted,
-            ',' if !quoted => all.push(String::new()),
-            c => all.last_mut().into_iter().for_each(|field| field.push(c)),
-        }
+/// Returns in what a table differs from those that RealityCapture writes with its own settings.
+fn spelling(file: &str, bytes: &[u8], heading: &Heading, commas: bool) -> Option<String> {
+    let separated = match heading.separator {
+        ',' => None,
+        '\t' => Some("columns separated by tabs"),
+        ' ' => Some("columns separated by blanks"),
+        _ => Some("columns separated by `;`"),
+    };
+    let encoded = table::utf16(bytes).map(|_| "text in UTF-16");
+    let all: Vec<&str> =
+        [encoded, separated, commas.then_some("decimal commas")].into_iter().flatten().collect();
+    (!all.is_empty()).then(|| format!("`{file}` is read with {}", all.join(", ")))
+}
+
+/// Returns the camera of a row.
+fn entry(heading: &Heading, values: &[String]) -> Result<Entry, String> {
+    let value = |name: &str, needed: bool| match heading.value(values, name) {
+        None | Some("") if !needed => Ok(0.0),
+        Some(text) => table::number(text).ok_or_else(|| format!("`{name}` is `{}`", shortened(text))),
+        None => Err(format!("it has no `{name}`")),
+    };
+    let angle = |name| value(name, true).map(f64::to_radians);
+    let (heading_angle, pitch, roll) = (angle("heading")?, angle("pitch")?, angle("roll")?);
+    let mut coefficients = [0.0; 6];
+    for (coefficient, name) in coefficients.iter_mut().zip(["k1", "k2", "k3", "k4", "t1", "t2"]) {
+        *coefficient = value(name, false)?;
     }
-    all.iter().map(|field| field.trim().to_string()).collect()
+    let turned = DMat3::from_rotation_z(-heading_angle) * DMat3::from_rotation_x(pitch);
+    Ok(Entry {
+        name: heading.value(values, "name").unwrap_or_default().into(),
+        rotation: turned * DMat3::from_rotation_y(roll),
+        position: DVec3::new(value("x", true)?, value("y", true)?, value("alt", true)?),
+        focal: value("f", true)?,
+        center: [value("px", false)?, value("py", false)?],
+        coefficients,
+    })
 }
 
 /// Returns the folder below the capture whose photographs have XMP files of RealityCapture beside them.
@@ -228,15 +242,5 @@ fn frame(folder: &CaptureFolder, file: &str, name: &str, entry: Entry, listing: 
     match framed() {
         Ok(frame) => listing.frames.push(frame),
         Err(problem) => listing.problems.push(problem),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn quoted_fields_hold_commas_and_doubled_quotes() {
-        assert_eq!(fields(r#""a ""b"", c.png",1,"", 2"#), [r#"a "b", c.png"#, "1", "", "2"]);
     }
 }

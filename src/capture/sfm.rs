@@ -607,7 +607,7 @@ impl Work<'_> {
         let limits = self.sfm.limits.clone();
         let options = CaptureOptions { masks: MaskSource::None, limits, ..CaptureOptions::default() };
         let folder = CaptureFolder::new(&self.sfm.out, &options)?;
-        let files = ModelFiles { folder: "colmap/model", ending: "bin" };
+        let files = ModelFiles::new("colmap/model", "bin");
         let mut listing = Listing::default();
         let problem = colmap::list(&folder, &files, &mut listing).err();
         let capture = build(&folder, "COLMAP", &mut listing);

@@ -56,6 +56,14 @@ pub fn read_maybe_empty(path: &Path, limits: &Limits) -> Result<Vec<u8>, ReadErr
     }
 }
 
+/// Returns the first bytes of a regular file, at most `count`; an empty file has none.
+pub fn read_beginning(path: &Path, count: u64) -> Result<Vec<u8>, ReadError> {
+    let (file, _) = open(path)?;
+    let mut bytes = Vec::new();
+    file.take(count).read_to_end(&mut bytes).map_err(|e| ReadError::io(path, e))?;
+    Ok(bytes)
+}
+
 /// Passes the bytes of a regular file on in pieces, whatever its size; an empty file has none.
 pub fn read_pieces(path: &Path, mut each: impl FnMut(&[u8])) -> Result<(), ReadError> {
     let (mut file, _) = open(path)?;
@@ -307,5 +315,7 @@ mod tests {
         let error = read_bytes(&path, &limits).unwrap_err();
         assert!(matches!(error, ReadError::TooLarge { found: 5, limit: 4, .. }), "{error}");
         assert_eq!(read_bytes(&path, &Limits { file_bytes: 5, ..Limits::default() }).unwrap(), b"12345");
+        assert_eq!(read_beginning(&path, 3).unwrap(), b"123");
+        assert_eq!(read_beginning(&path, 9).unwrap(), b"12345");
     }
 }

@@ -28,6 +28,7 @@ mod extraction;
 mod faults;
 mod finished;
 mod foreign_meshes;
+mod formats;
 mod hostile;
 mod hostile_mesh;
 mod hostile_npz;

@@ -22,7 +22,7 @@ use tiface::tface::TFace;
 pub type Reader = fn(&Path, &[u8]) -> String;
 
 /// By the name of their seeds.
-pub const READERS: [(&str, Reader); 22] = [
+pub const READERS: [(&str, Reader); 23] = [
     ("camera_path", camera_path),
     ("cameras", cameras),
     ("colmap_binary", |dir, bytes| model(dir, bytes, "bin")),
@@ -38,6 +38,7 @@ pub const READERS: [(&str, Reader); 22] = [
     ("neus", |dir, bytes| open(dir, "cameras_sphere.npz", bytes)),
     ("npy", |dir, bytes| outcome(io::parse_npy(dir, bytes, &limits()))),
     ("photo", photo),
+    ("pose_folder", pose_folder),
     ("prompts", |dir, bytes| outcome(tiface::mask::prompts::parse_prompts(dir, bytes, &limits()))),
     ("published", published),
     ("realitycapture", realitycapture),
@@ -110,6 +111,20 @@ fn model(dir: &Path, bytes: &[u8], ending: &str) -> String {
         match parts.next() {
             Some(part) => fs::write(path, part).unwrap(),
             None => drop(fs::remove_file(path)),
+        }
+    }
+    let options = CaptureOptions { limits: limits(), ..CaptureOptions::default() };
+    outcome(capture::open(dir, &options))
+}
+
+/// Intrinsics, one pose and a box of NSVF.
+fn pose_folder(dir: &Path, bytes: &[u8]) -> String {
+    fs::create_dir_all(dir.join("pose")).unwrap();
+    let mut parts = parts(bytes);
+    for name in ["intrinsics.txt", "pose/00.txt", "bbox.txt"] {
+        match parts.next() {
+            Some(part) => put(dir, name, part),
+            None => drop(fs::remove_file(dir.join(name))),
         }
     }
     let options = CaptureOptions { limits: limits(), ..CaptureOptions::default() };
