@@ -8,6 +8,7 @@
 use super::folder;
 use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, Agreement, CameraFrame, Intrinsics, Listing};
+use super::order;
 use super::view::Split;
 use crate::io::{self, NpyValues};
 use crate::{Error, Result};
@@ -156,7 +157,7 @@ fn difference(row: &PoseRow, frame: &CameraFrame) -> [f64; 3] {
     [row.position.distance(frame.position), angle, focal]
 }
 
-/// Lists the frames of LLFF files alone, pairing rows with photographs in name order.
+/// Lists the frames of LLFF files alone, pairing rows with photographs in the order that is read.
 pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) -> Result<()> {
     let mut sets = Vec::new();
     for &file in files {
@@ -167,7 +168,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
             "put one photograph per row into `images/` (or `images_train/`, `images_test/`), in name order";
         in_file(file, text, hint)
     };
-    let named = |suffix| photographs(folder, suffix);
+    let mut named = |suffix| photographs(folder, suffix, listing);
 
     // folders per split first; else one folder whose count says which files it belongs to
     let (shared, train, test) = (named("")?.unwrap_or_default(), named("_train")?, named("_test")?);
@@ -177,10 +178,11 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
     } else if shared.len() == total {
         if let [(_, first), _] = &sets[..] {
             listing.warnings.push(format!(
-                "the rows of {} carry no names: the first {} photographs in name order are taken for training, \
-                 the others for testing",
+                "the rows of {} carry no names: the first {} photographs {} are taken for training, the others for \
+                 testing",
                 files.join(" and "),
-                first.len()
+                first.len(),
+                if folder.reading().by_number { "by number" } else { "in name order" }
             ));
         }
         let mut rest = shared.into_iter();
@@ -212,9 +214,9 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
     Ok(())
 }
 
-/// Returns the photographs in `images` + `suffix`, or in that folder of pictures already reduced, in name order; `None`
-/// without such a folder.
-fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String>>> {
+/// Returns the photographs in `images` + `suffix`, or in that folder of pictures already reduced, in the order that is read;
+/// `None` without such a folder.
+fn photographs(folder: &CaptureFolder, suffix: &str, listing: &mut Listing) -> Result<Option<Vec<String>>> {
     let downscale = folder.options.downscale;
     let mut names = vec![format!("images{suffix}")];
     if downscale > 1 {
@@ -223,9 +225,11 @@ fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String
     let Some(name) = names.into_iter().find(|n| io::is_folder(&folder.root.join(n))) else {
         return Ok(None);
     };
-    Ok(Some(
-        folder::photographs(&folder.root.join(&name))?.into_iter().map(|n| format!("{name}/{n}")).collect(),
-    ))
+    let plain = folder::photographs(&folder.root.join(&name))?;
+    let numbered = order::by_number(&plain);
+    listing.order_is_open |= numbered != plain;
+    let photos = if folder.reading().by_number { numbered } else { plain };
+    Ok(Some(photos.into_iter().map(|n| format!("{name}/{n}")).collect()))
 }
 
 #[cfg(test)]

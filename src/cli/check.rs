@@ -226,7 +226,7 @@ fn compare(found: &ReadMesh, other: &Path, seen_by: Option<&Path>, unit_m: f64) 
     let back = one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
     let (mut seen, mut by_views, mut parts) = (None, Vec::new(), Vec::new());
     if let Some(root) = seen_by {
-        let capture = capture::open(root, &CaptureOptions::default())?;
+        let capture = open_capture(root, &CaptureOptions::default())?;
         let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
         let views: Vec<&View> = capture.split(Split::Train).collect();
         let cameras: Vec<Camera> = views.iter().map(|v| moved(&v.camera)).collect();

@@ -14,7 +14,6 @@ use crate::render::path::NamedCamera;
 use crate::rig::{self, CameraState, LEAST_SIGHTINGS, RigView, Verdict};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -95,9 +94,7 @@ pub(super) fn check_cameras(photos: &RigPhotos, poses: CameraPoses) -> CameraChe
 pub(super) fn check_by(points: usize, photos: &RigPhotos, poses: CameraPoses) -> CameraCheck {
     let RigPhotos { views: captured, train, cameras: given, scene_from_world, .. } = photos;
     let ((captured, held_out), (given, given_held_out)) = (captured.split_at(*train), given.split_at(*train));
-    let views: Vec<RigView> =
-        photos.pictures[..*train].par_iter().map(|(p, head)| RigView::new(p, head)).collect();
-    let rig = rig::measure(&views, given, &photos.surface, points, poses == CameraPoses::Refine);
+    let (views, rig) = photos.measure(points, poses == CameraPoses::Refine);
     let world_from_scene = scene_from_world.inverse();
     let checked = |(view, (searched, fit)): (&&View, (&Camera, &rig::CameraFit))| {
         let pixels = f64::from(view.camera.width) / f64::from(searched.width);
@@ -145,7 +142,7 @@ fn root_mean_square(values: &[f64]) -> f64 {
 }
 
 /// Returns `8,900` for 8900.
-fn grouped(n: usize) -> String {
+pub(super) fn grouped(n: usize) -> String {
     if n < 1000 { n.to_string() } else { format!("{},{:03}", grouped(n / 1000), n % 1000) }
 }
 
