@@ -43,9 +43,9 @@ mod view;
 pub use crate::config::{MaskMeaning, MaskSource};
 pub use format::is_run;
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
+pub use order::by_number;
 pub use scene::well_seen;
 pub(crate) use transforms::camera_like;
-pub use order::by_number;
 pub use view::{Capture, CaptureOptions, LoadedView, Reading, Split, View, ViewMask};
 
 use crate::error::counted;
@@ -202,9 +202,10 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
     if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, listing) {
         listing.problems.push(problem);
     }
-    let has_files = views.iter().zip(&kept).any(|(view, (_, info))| {
-        info.is_turn_open() && matches!(view.mask, ViewMask::File(_))
-    });
+    let has_files = views
+        .iter()
+        .zip(&kept)
+        .any(|(view, (_, info))| info.is_turn_open() && matches!(view.mask, ViewMask::File(_)));
     let readings = match options.reading {
         Some(_) => Vec::new(),
         None => readings(listing, !open_turns.is_empty(), has_files),

@@ -56,8 +56,8 @@ pub use inputs::capture_options;
 pub use mask::{click_page, inspect_capture};
 pub use metrics::{Truth, against_truth};
 pub use page::{curves, head_page, renew_report, viewer_of_file};
-pub use readings::open_capture;
 pub use preview::{Preview, PreviewPicture, PreviewRenderer, field_view};
+pub use readings::open_capture;
 pub use session::{DEMO_CAPTURE, Session, check_feasible, require_device};
 pub use surface::{Fields, Radiance, Surface};
 

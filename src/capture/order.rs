@@ -64,7 +64,10 @@ mod tests {
             ("a10b2 a10b10 a9b1", "a9b1 a10b2 a10b10"),
             ("000.png 001.png 010.png", "000.png 001.png 010.png"),
             // more digits than any integer has
-            ("99999999999999999999999 100000000000000000000000", "99999999999999999999999 100000000000000000000000"),
+            (
+                "99999999999999999999999 100000000000000000000000",
+                "99999999999999999999999 100000000000000000000000",
+            ),
             // one number written twice keeps the order of bytes
             ("1 01 x", "01 1 x"),
             // what has no number stays where its bytes have it

@@ -12,6 +12,7 @@ use crate::mesh::files::{
 };
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
+use crate::pipeline::open_capture;
 use crate::run::{Fault, ProductState, read_record};
 use crate::{Error, ErrorKind, Result};
 use serde::Serialize;

@@ -24,6 +24,14 @@ pub(super) const POSES: &str = "poses.json";
 const HINT: &str = "was the camera moved, or are two photographs swapped? Correct its pose or photograph, or remove the frame; \
                     `--set capture.cameras=given` goes on with all poses as they are";
 
+/// What to do about cameras that fit in no pose.
+const APART_HINT: &str = "are the photographs those of this capture, in the order of its cameras, and is none turned or mirrored? \
+                          Did the head or the rig move between them, or does the shutter roll? Correct photographs or poses; \
+                          `--set capture.cameras=given` goes on with all poses as they are";
+
+/// Views that are named as the worst ones.
+const WORST: usize = 3;
+
 /// The measurement of a capture's cameras.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct CameraCheck {
@@ -158,6 +166,10 @@ impl CameraCheck {
                 "poses are not checked: too little of the head was found again in other photographs {sightings}; they \
                  are used as given"
             ),
+            Verdict::Apart => format!(
+                "poses are {:.1} px off against each other, and stay {:.1} px off when they are refined {sightings}",
+                self.given_px, self.adjusted_px
+            ),
             Verdict::Fit => format!("poses fit within {:.1} px {sightings}", self.given_px),
             Verdict::Some => {
                 let each = refined.iter().map(|c| format!("camera `{}` by {:.1} px", c.view, c.moved_px));
@@ -202,7 +214,29 @@ impl CameraCheck {
             )),
             _ => None,
         };
+        if self.verdict == Verdict::Apart {
+            return vec![Error::cannot(self.apart(), APART_HINT)];
+        }
         self.cameras.iter().filter_map(problem).map(|text| Error::cannot(text, HINT)).collect()
+    }
+
+    /// Returns how cameras that fit in no pose show it.
+    fn apart(&self) -> String {
+        let total = |count: fn(&CheckedCamera) -> usize| grouped(self.cameras.iter().map(count).sum());
+        let mut worst: Vec<&CheckedCamera> = self.cameras.iter().collect();
+        worst.sort_by(|a, b| b.adjusted_px.total_cmp(&a.adjusted_px));
+        let named = |c: &&CheckedCamera| {
+            format!("`{}` ({:.1} px, {} of {})", c.view, c.adjusted_px, c.sightings, c.expected)
+        };
+        let worst: Vec<String> = worst.iter().take(WORST).map(named).collect();
+        format!(
+            "the photographs do not show what their cameras should see: {} of {} points that other photographs share are \
+             found again, and stay {:.1} px off in every pose; worst are {}",
+            total(|c| c.sightings),
+            total(|c| c.expected),
+            self.adjusted_px,
+            worst.join(", ")
+        )
     }
 
     /// Returns what is said of held-out views that could not be fitted, if there are any.

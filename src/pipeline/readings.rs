@@ -95,7 +95,8 @@ fn left_open(mut capture: Capture, options: &CaptureOptions, why: &str) -> Resul
     }
     let paired = if photographs { "photographs with cameras" } else { "masks with photographs" };
     if options.cameras == CameraPoses::Given {
-        let doubt = format!("nothing but name order pairs {paired}, and nothing shows that it is right: {why}");
+        let doubt =
+            format!("nothing but name order pairs {paired}, and nothing shows that it is right: {why}");
         capture.warnings.push(doubt.clone());
         return Ok(Settled { doubt: Some(doubt), ..Settled::left(capture) });
     }

@@ -80,7 +80,8 @@ impl<'c> RigPhotos<'c> {
             return Ok(Err("there is no hull of head masks".into()));
         };
         let wanted: Vec<&View> = split(true).chain(split(false).take(MAX_VIEWS)).collect();
-        let loaded = wanted.par_iter().map(|view| searched(view, side, limits)).collect::<Result<Vec<_>>>()?;
+        let loaded =
+            wanted.par_iter().map(|view| searched(view, side, limits)).collect::<Result<Vec<_>>>()?;
         let measured = wanted.iter().zip(loaded).filter_map(|(view, loaded)| Some((*view, loaded?)));
         let (views, pictures): (Vec<&View>, Vec<(Photo, Gray)>) = measured.unzip();
         let train = views.iter().filter(|v| v.split == Split::Train).count();

@@ -26,6 +26,17 @@ const LOST_SHARE: f64 = 4.0;
 /// All cameras are refined if the residual falls below this share of what it is with the poses given.
 const GAIN: f64 = 0.8;
 
+/// Photographs do not show what their cameras should see if the residual of all stays above so many pixels, and those of
+/// disturbed cameras fall to 0.4 …
+const APART_PX: f64 = 1.0;
+
+/// … or above so many …
+const DOUBTFUL_PX: f64 = 0.4;
+
+/// … where less than this share of the points that other photographs share is found: nine of ten are where cameras and
+/// photographs belong together, and a third to six of ten in a wrong order.
+const LEAST_SHARE: f64 = 0.65;
+
 /// A single camera is refined if it has to move at least so far, pixels …
 const LEAST_MOVE_PX: f64 = 0.8;
 
@@ -44,6 +55,8 @@ pub enum Verdict {
     Some,
     /// All are refined.
     All,
+    /// They fit in no pose: they belong to other photographs, or what these show has changed.
+    Apart,
 }
 
 /// What is to be done about one camera.
@@ -114,6 +127,12 @@ pub(super) fn decide(
         return rig;
     }
     rig.verdict = judge(&mut rig.cameras, adjusted_px, all || adjusted_px < GAIN * given_px);
+    if is_apart(&rig.cameras, adjusted_px) {
+        rig.verdict = Verdict::Apart;
+        let refined = rig.cameras.iter_mut().filter(|c| c.state == CameraState::Refined);
+        refined.for_each(|c| c.state = CameraState::Stays);
+        return rig;
+    }
     let poses = match rig.verdict {
         Verdict::Some => alone(given, adjusted, &mut rig.tracks, &rig.cameras, adjusted_px),
         _ => adjusted,
@@ -149,6 +168,13 @@ fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> Verdict {
         true => Verdict::Some,
         false => Verdict::Fit,
     }
+}
+
+/// Returns whether cameras fit in no pose, given the residual of all after the adjustment.
+fn is_apart(cameras: &[CameraFit], residual: f64) -> bool {
+    let total = |count: fn(&CameraFit) -> usize| cameras.iter().map(count).sum::<usize>() as f64;
+    let few = total(|c| c.sightings) < LEAST_SHARE * total(|c| c.expected);
+    residual > APART_PX || (residual > DOUBTFUL_PX && few)
 }
 
 /// Returns the poses of the cameras to refine where all others keep theirs, and moves the points of the tracks accordingly.
