@@ -167,7 +167,7 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         match view {
             Ok((info, view)) => {
                 let is_stored = info.size(Some(view.declared)) == (info.width, info.height);
-                if info.is_turn_open() {
+                if is_turn_open(&frame, &info) {
                     open_turns.push(view.name.clone());
                 } else if info.exif > 1 && is_stored {
                     kept_turns.push(view.name.clone());
@@ -188,9 +188,9 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
     }
     if !open_turns.is_empty() && options.reading.is_none() {
         listing.warnings.push(format!(
-            "{}; nothing shows whether the cameras expect that, since it leaves the size as it is: they are used as \
-             stored; look at them, and if they are upside down, mirrored or on their side, store them turned, without \
-             EXIF (ImageMagick: `magick mogrify -auto-orient FILES`): {}",
+            "{}; nothing shows whether the cameras expect that, and they are used as stored: {}; look at them in the \
+             page of the masks, and if they are upside down, mirrored or on their side, store them turned, without EXIF \
+             (ImageMagick: `magick mogrify -auto-orient FILES`)",
             asks(&open_turns),
             few(&open_turns)
         ));
@@ -275,9 +275,19 @@ fn check_names(frames: &[CameraFrame], names: &[String], listing: &mut Listing) 
     }
 }
 
+/// Returns whether the size of a photograph does not say whether its cameras expect the turn that EXIF asks for.
+fn is_turn_open(frame: &CameraFrame, info: &PictureInfo) -> bool {
+    info.is_turn_open() || (info.exif > 4 && frame.intrinsics.size.is_none())
+}
+
 fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &PictureInfo) -> Result<View> {
     let d = folder.options.downscale;
-    let (w, h) = frame.intrinsics.size.unwrap_or((info.width, info.height));
+    let Reading { turned, masks_turned, .. } = folder.reading();
+    let (w, h) = match frame.intrinsics.size {
+        Some(size) => size,
+        None if turned && info.exif > 4 => (info.height, info.width),
+        None => (info.width, info.height),
+    };
     let declared = (w, h);
     let target = (w / d, h / d);
     let problem = |problem: String| in_frame(&frame.file, &frame.name, problem);
@@ -286,7 +296,6 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
     }
     let photo = frame.photo.clone().unwrap_or_default();
     let turn = |is_turned: bool| (is_turned && info.is_turn_open()).then_some(info.exif);
-    let Reading { turned, masks_turned, .. } = folder.reading();
     let full = frame.intrinsics.camera(declared, frame.rotation, frame.position).map_err(problem)?;
     let (camera, photo_size) = if info.size(Some(declared)) == declared {
         (downscaled(&full, d), declared)

@@ -66,7 +66,7 @@ fn split_of(file: &str) -> Option<Split> {
 }
 
 /// Compares each LLFF file with the frames of its split. Rows carry no names, so they are paired with the
-/// frames in the JSON's order or in name order, whichever fits better.
+/// frames in the JSON's order, in name order or by number, whichever fits best.
 pub(super) fn check(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) {
     for &file in files {
         let split = split_of(file);
@@ -102,8 +102,9 @@ fn compare(file: &str, rows: &[PoseRow], frames: &[&CameraFrame]) -> Result<Agre
     }
     let mean = frames.iter().map(|f| f.position).sum::<DVec3>() / frames.len() as f64;
     let spread = frames.iter().map(|f| f.position.distance(mean)).fold(0.0, f64::max).max(1e-12);
-    let mut by_name = frames.to_vec();
+    let (mut by_name, mut by_number) = (frames.to_vec(), frames.to_vec());
     by_name.sort_by(|a, b| a.name.cmp(&b.name));
+    by_number.sort_by(|a, b| order::compare(&a.name, &b.name));
     let worst = |order: &[&CameraFrame]| -> Vec<[f64; 3]> {
         rows.iter().zip(order).map(|(row, frame)| difference(row, frame)).collect()
     };
@@ -112,8 +113,9 @@ fn compare(file: &str, rows: &[PoseRow], frames: &[&CameraFrame]) -> Result<Agre
         (d[0] / (POSITION_TOLERANCE * spread)).max(d[1] / ROTATION_TOLERANCE).max(d[2] / FOCAL_TOLERANCE)
     };
     let total = |ds: &[[f64; 3]]| ds.iter().map(excess).fold(0.0, f64::max);
-    let (a, b) = (worst(frames), worst(&by_name));
-    let (differences, order) = if total(&b) < total(&a) { (b, &by_name[..]) } else { (a, frames) };
+    let mut orders = [frames, &by_name, &by_number].map(|order| (worst(order), order));
+    orders.sort_by(|(a, _), (b, _)| total(a).total_cmp(&total(b)));
+    let [(differences, order), ..] = orders;
     let most = (0..rows.len()).max_by(|&i, &j| excess(&differences[i]).total_cmp(&excess(&differences[j])));
     if let Some(i) = most
         && excess(&differences[i]) > 1.0

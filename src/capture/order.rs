@@ -8,7 +8,7 @@ fn digits(text: &str) -> (&str, &str) {
 }
 
 /// Compares names by their bytes, but where both have a number by its value.
-fn compare(a: &str, b: &str) -> Ordering {
+pub(super) fn compare(a: &str, b: &str) -> Ordering {
     let (mut left, mut right) = (a, b);
     loop {
         let ((m, behind_m), (n, behind_n)) = (digits(left), digits(right));

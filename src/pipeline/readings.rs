@@ -228,6 +228,9 @@ impl Tried {
     /// Returns why nothing is decided.
     fn undecided(&self) -> String {
         let counts: Vec<String> = self.0.iter().map(|(_, found)| grouped(found.sightings)).collect();
+        if counts.is_empty() {
+            return "with its masks the capture cannot be opened".into();
+        }
         format!("points of the head are found again {} times, which does not decide it", counts.join(" and "))
     }
 }

@@ -26,16 +26,11 @@ const LOST_SHARE: f64 = 4.0;
 /// All cameras are refined if the residual falls below this share of what it is with the poses given.
 const GAIN: f64 = 0.8;
 
-/// Photographs do not show what their cameras should see if the residual of all stays above so many pixels, and those of
-/// disturbed cameras fall to 0.4 …
-const APART_PX: f64 = 1.0;
-
-/// … or above so many …
-const DOUBTFUL_PX: f64 = 0.4;
-
-/// … where less than this share of the points that other photographs share is found: nine of ten are where cameras and
-/// photographs belong together, and a third to six of ten in a wrong order.
-const LEAST_SHARE: f64 = 0.65;
+/// Cameras fit in no pose if the residual of all stays above so many pixels, and less than this share of the points that
+/// other photographs share is found. Nine of ten are found where photographs and cameras belong together, blurred ones (whose
+/// residual is above a pixel) and poses that are 4 px off included; a third to six of ten in a wrong order, and up to eight
+/// where every photograph is a neighbor's.
+const APART: [(f64, f64); 2] = [(1.0, 0.8), (0.4, 0.65)];
 
 /// A single camera is refined if it has to move at least so far, pixels …
 const LEAST_MOVE_PX: f64 = 0.8;
@@ -173,8 +168,8 @@ fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> Verdict {
 /// Returns whether cameras fit in no pose, given the residual of all after the adjustment.
 fn is_apart(cameras: &[CameraFit], residual: f64) -> bool {
     let total = |count: fn(&CameraFit) -> usize| cameras.iter().map(count).sum::<usize>() as f64;
-    let few = total(|c| c.sightings) < LEAST_SHARE * total(|c| c.expected);
-    residual > APART_PX || (residual > DOUBTFUL_PX && few)
+    let share = total(|c| c.sightings) / total(|c| c.expected).max(1.0);
+    APART.iter().any(|&(most_px, least_share)| residual > most_px && share < least_share)
 }
 
 /// Returns the poses of the cameras to refine where all others keep theirs, and moves the points of the tracks accordingly.
