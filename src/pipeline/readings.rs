@@ -22,10 +22,10 @@ use std::path::Path;
 const SIDE_PX: u32 = 256;
 
 /// Points that are looked up.
-const POINTS: usize = rig::POINTS / 4;
+const POINTS: usize = rig::POINTS / 6;
 
 /// Maximum number of training views that are compared.
-const MAX_VIEWS: usize = 32;
+const MAX_VIEWS: usize = 24;
 
 /// Cells along each axis of the hull.
 const HULL_CELLS: usize = 64;

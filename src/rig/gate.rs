@@ -188,3 +188,34 @@ fn alone(
     }
     cameras
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cameras_of_other_photographs_are_apart_and_those_of_blurred_ones_are_not() {
+        let camera = Camera::above(4, 4, 4.0, 3.0);
+        let fit = |sightings: usize| CameraFit {
+            state: CameraState::Stays,
+            sightings,
+            expected: 100,
+            given_px: 0.0,
+            adjusted_px: 0.0,
+            moved_px: 0.0,
+            camera: camera.clone(),
+        };
+        // measured: residual in pixels and sightings of 100 points
+        for (residual, found, apart) in [
+            (0.3, 90, false), // poses that are off by 4 px, refined
+            (0.5, 91, false), // noise, blur and wrong masks besides
+            (1.2, 90, false), // blurred photographs
+            (0.2, 40, false), // hair
+            (1.8, 57, true),  // name order instead of order by number
+            (0.6, 58, true),  // the same of small photographs
+            (1.65, 77, true), // every photograph its neighbor's
+        ] {
+            assert_eq!(is_apart(&[fit(found), fit(found)], residual), apart, "{residual} {found}");
+        }
+    }
+}
