@@ -43,7 +43,7 @@ mod view;
 pub use crate::config::{MaskMeaning, MaskSource};
 pub use format::is_run;
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
-pub use order::by_number;
+pub(crate) use order::by_number;
 pub use scene::well_seen;
 pub(crate) use transforms::camera_like;
 pub use view::{Capture, CaptureOptions, LoadedView, Reading, Split, View, ViewMask};
@@ -229,7 +229,7 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
 fn readings(listing: &Listing, turn_is_open: bool, has_masks: bool) -> Vec<Reading> {
     /// Of more, masks have the order and the turn of their photographs.
     const MOST: usize = 4;
-    let choices = |is_open: bool| if is_open { &[false, true][..] } else { &[false] };
+    let choices = |is_open: bool| if is_open { &[false, true][..] } else { &[false][..] };
     let mut all = Vec::new();
     for &turned in choices(turn_is_open) {
         for &masks_turned in choices(turn_is_open && has_masks) {

@@ -29,11 +29,11 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     let plain = pictures(folder, &["image", "images", "rgb"])?;
     let numbered = order::by_number(&plain);
     let mask_files = pictures(folder, &["mask", "masks"])?;
-    let masks = paired_masks(&plain, &numbered, &mask_files);
+    let pairings = paired_masks(&plain, &numbered, &mask_files);
     let Reading { by_number, masks_by_number, .. } = folder.reading();
-    let masks = &masks[usize::from(masks_by_number).min(masks.len() - 1)];
+    let masks = &pairings[usize::from(masks_by_number).min(pairings.len() - 1)];
     listing.order_is_open = plain != numbered;
-    listing.mask_order_is_open = masks.len() > 1;
+    listing.mask_order_is_open = pairings.len() > 1;
     let photos = if by_number { &numbered } else { &plain };
     let known = (0..).take_while(|i| arrays.contains_key(&format!("world_mat_{i}"))).count();
     let hint = "it must have `world_mat_0`, `world_mat_1` and so on, one for each photograph in `image/`";
