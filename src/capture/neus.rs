@@ -164,6 +164,34 @@ mod tests {
     use super::*;
 
     #[test]
+    fn masks_follow_their_photographs_by_name_by_number_or_by_order() {
+        let names = |text: &str| -> Vec<String> { text.split(' ').map(|n| format!("m/{n}.png")).collect() };
+        let pairings = |photos: &str, masks: &str| -> Vec<Vec<String>> {
+            let (plain, masks) = (names(photos), names(masks));
+            let numbered = order::by_number(&plain);
+            let found = paired_masks(&plain, &numbered, &masks);
+            let masks = |pairs: &BTreeMap<&str, &str>| -> Vec<String> {
+                plain
+                    .iter()
+                    .filter_map(|p| pairs.get(p.as_str()).map(|m| order::stem(m).to_string()))
+                    .collect()
+            };
+            found.iter().map(masks).collect()
+        };
+        let text = |text: &str| -> Vec<String> { text.split(' ').map(str::to_string).collect() };
+        // one more mask than photographs
+        assert_eq!(pairings("0 1 10 2", "0 1 10 2 all"), [text("0 1 10 2")]);
+        // names differ, numbers do not
+        assert_eq!(pairings("0 1 10 2", "000 001 002 010"), [text("000 001 010 002")]);
+        assert_eq!(pairings("000 001 002 010", "0 1 10 2"), [text("0 1 2 10")]);
+        // numbers differ, orders do not
+        assert_eq!(pairings("0 1 2", "1 2 3"), [text("1 2 3")]);
+        // both differ
+        assert_eq!(pairings("008 009 010", "10 11 9"), [text("10 11 9"), text("9 10 11")]);
+        assert_eq!(pairings("0 1 2", "1 2"), [Vec::<String>::new()]);
+    }
+
+    #[test]
     fn a_projection_is_taken_apart_whatever_its_sign_and_scale() {
         let k = DMat3::from_cols_array(&[300.0, 0.0, 0.0, 0.0, 310.0, 0.0, 80.0, 60.0, 1.0]);
         let rotation = DMat3::from_rotation_x(0.4) * DMat3::from_rotation_z(-2.0);

@@ -22,7 +22,7 @@ use std::path::Path;
 const SIDE_PX: u32 = 256;
 
 /// Points that are looked up.
-const POINTS: usize = rig::POINTS / 6;
+const POINTS: usize = rig::POINTS / 4;
 
 /// Maximum number of training views that are compared.
 const MAX_VIEWS: usize = 24;
@@ -36,6 +36,12 @@ const CLEARLY: f64 = 2.0;
 
 /// The same of a reading that differs in its masks alone: these say where points are looked up, not whether they are there.
 const CLEARLY_BY_MASKS: f64 = 1.2;
+
+/// Sightings that a reading needs to be taken.
+const LEAST_SIGHTINGS: usize = 150;
+
+/// Largest distance of sightings from their points, once poses are adjusted, pixels.
+const MOST_PX: f64 = 1.0;
 
 /// Distances below this are alike, pixels.
 const LEAST_PX: f64 = 0.5;
@@ -258,7 +264,8 @@ impl Found {
         let photos = RigPhotos::load_at(SIDE_PX, &capture, &scene, limits).map_err(said)??;
         let (_, rig) = photos.measure(POINTS, false);
         let sightings = rig.cameras.iter().map(|camera| camera.sightings).sum();
-        let fits = matches!(rig.verdict, Verdict::Fit | Verdict::Some | Verdict::All);
+        let fits =
+            sightings >= LEAST_SIGHTINGS && rig.adjusted_px <= MOST_PX && rig.verdict != Verdict::Apart;
         Ok(Found { sightings, weight: sightings as f64 / rig.given_px.max(LEAST_PX), fits })
     }
 }
