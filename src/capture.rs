@@ -188,9 +188,9 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
     }
     if !open_turns.is_empty() && options.reading.is_none() {
         listing.warnings.push(format!(
-            "{}; nothing shows whether the cameras expect that, and they are used as stored: {}; look at them in the \
-             page of the masks, and if they are upside down, mirrored or on their side, store them turned, without EXIF \
-             (ImageMagick: `magick mogrify -auto-orient FILES`)",
+            "{}; nothing shows whether the cameras expect that, and they are used as stored: {}; look at them (`tiface \
+             mask CAPTURE --page`), and if they are upside down, mirrored or on their side, store them turned, without \
+             EXIF (ImageMagick: `magick mogrify -auto-orient FILES`)",
             asks(&open_turns),
             few(&open_turns)
         ));
