@@ -227,8 +227,6 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
 /// Returns the ways in which a capture can be read, that of its files' order and without turns first; none where only that
 /// one is possible. `has_masks` says whether there are files of masks that may be turned.
 fn readings(listing: &Listing, turn_is_open: bool, has_masks: bool) -> Vec<Reading> {
-    /// Of more, masks have the order and the turn of their photographs.
-    const MOST: usize = 4;
     let choices = |is_open: bool| if is_open { &[false, true][..] } else { &[false][..] };
     let mut all = Vec::new();
     for &turned in choices(turn_is_open) {
@@ -239,15 +237,6 @@ fn readings(listing: &Listing, turn_is_open: bool, has_masks: bool) -> Vec<Readi
                 }
             }
         }
-    }
-    if all.len() > MOST {
-        let follows = |own: bool, is_open: bool, photographs: bool, theirs_is_open: bool| {
-            !is_open || !theirs_is_open || own == photographs
-        };
-        all.retain(|r| {
-            follows(r.masks_turned, has_masks, r.turned, turn_is_open)
-                && follows(r.masks_by_number, listing.mask_order_is_open, r.by_number, listing.order_is_open)
-        });
     }
     if all.len() > 1 { all } else { Vec::new() }
 }

@@ -13,6 +13,8 @@ use crate::capture::{self, Capture, CaptureOptions, Reading, Split, View, by_num
 use crate::config::{CameraPoses, MaskMeaning, MaskSource};
 use crate::geom::Camera;
 use crate::image::{Gray, resize_gray, working_size};
+use crate::io::Limits;
+use crate::mask::consistency::{ConsistencyView, check_consistency};
 use crate::rig::{self, Verdict};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -34,8 +36,8 @@ const HULL_CELLS: usize = 64;
 /// that of the right one, and those of neighbors on a ring, whose own turn explains most of it, a third.
 const CLEARLY: f64 = 2.0;
 
-/// The same of a reading that differs in its masks alone: these say where points are looked up, not whether they are there.
-const CLEARLY_BY_MASKS: f64 = 1.2;
+/// Masks that contradict each other less than this, in whole masks, cannot be told to be wrong; right ones do by nothing.
+const LEAST_CONFLICT: f64 = 0.01;
 
 /// Sightings that a reading needs to be taken.
 const LEAST_SIGHTINGS: usize = 150;
@@ -81,16 +83,14 @@ pub(super) fn settle(capture: Capture, options: &CaptureOptions) -> Result<Settl
     if capture.readings.is_empty() {
         return Ok(Settled::left(capture));
     }
-    let tried = Tried::all(&capture, options);
-    let Some(reading) = tried.as_ref().ok().and_then(Tried::clearest) else {
-        let why = tried.map_or_else(|why| why, |tried| tried.undecided());
-        return left_open(capture, options, &why);
+    let (reading, reason) = match decide(&capture, options) {
+        Ok(decided) => decided,
+        Err(why) => return left_open(capture, options, &why),
     };
     let options = CaptureOptions { reading: Some(reading), ..options.clone() };
     let mut capture = capture::open(&capture.root, &options)?;
-    let reason = tried.map(|tried| tried.reason(reading, &capture)).ok();
-    capture.reasons.extend(reason.clone());
-    Ok(Settled { capture, reading: Some(reading), reason, doubt: None })
+    capture.reasons.push(reason.clone());
+    Ok(Settled { capture, reading: Some(reading), reason: Some(reason), doubt: None })
 }
 
 /// Returns a capture as its files order it, with a doubt that says why nothing was decided, or refuses it.
@@ -138,120 +138,161 @@ struct Found {
     fits: bool,
 }
 
-/// The readings that are possible, each with what is found.
-struct Tried(Vec<(Reading, Found)>);
-
-impl Tried {
-    /// Tries all readings of a capture that was opened with these options. Returns the reason instead if nothing can be
-    /// measured.
-    fn all(capture: &Capture, options: &CaptureOptions) -> Result<Tried, String> {
-        if options.mask_meaning == MaskMeaning::Ignore {
-            return Err(NO_SILHOUETTES.into());
-        }
-        // masks of the capture decide even where others are used
-        let masks = match options.masks {
-            MaskSource::None | MaskSource::Clicks => MaskSource::Auto,
-            source => source,
-        };
-        let options = CaptureOptions { masks, ..options.clone() };
-        let with_masks = capture::open(&capture.root, &options);
-        let readings = with_masks.as_ref().map_or(&capture.readings, |with_masks| &with_masks.readings);
-        let open = |&reading: &Reading| {
-            let options = CaptureOptions { reading: Some(reading), ..options.clone() };
-            // where another order leads to photographs of another size, there is but one
-            Some((reading, capture::open(&capture.root, &options).ok()?))
-        };
-        let opened: Vec<(Reading, Capture)> = readings.iter().filter_map(open).collect();
-        if let [(only, _)] = opened[..] {
-            return Ok(Tried(vec![(only, Found { fits: true, ..Found::default() })]));
-        }
-        let found = |(reading, capture): (Reading, Capture)| {
-            Ok((reading, Found::of(capture, &options).map_err(|why| format!("it is not measured: {why}"))?))
-        };
-        Ok(Tried(opened.into_iter().map(found).collect::<Result<_, String>>()?))
+/// Decides on the reading of a capture that was opened with these options. Returns it with what was decided and by what, or
+/// the reason for which nothing is.
+fn decide(capture: &Capture, options: &CaptureOptions) -> Result<(Reading, String), String> {
+    if options.mask_meaning == MaskMeaning::Ignore {
+        return Err(NO_SILHOUETTES.into());
     }
-
-    /// Returns the reading that fits, and clearly better than all others.
-    fn clearest(&self) -> Option<Reading> {
-        let (best, found) = self.0.iter().max_by(|a, b| a.1.weight.total_cmp(&b.1.weight))?;
-        let is_worse = |(other, theirs): &(Reading, Found)| {
-            let same_photographs = (other.by_number, other.turned) == (best.by_number, best.turned);
-            let clearly = if same_photographs { CLEARLY_BY_MASKS } else { CLEARLY };
-            other == best || found.weight >= clearly * theirs.weight
+    // masks of the capture decide even where others are used
+    let masks = match options.masks {
+        MaskSource::None | MaskSource::Clicks => MaskSource::Auto,
+        source => source,
+    };
+    let options = CaptureOptions { masks, ..options.clone() };
+    let with_masks = capture::open(&capture.root, &options).map_err(|e| e.to_string())?;
+    let (readings, names) = (&with_masks.readings, &with_masks.views);
+    let names: Vec<String> = names.iter().map(|view| view.name.clone()).collect();
+    let open = |&reading: &Reading| {
+        let options = CaptureOptions { reading: Some(reading), ..options.clone() };
+        // where another order leads to photographs of another size, there is but one
+        Some((reading, capture::open(&capture.root, &options).ok()?))
+    };
+    let photographs = readings.iter().filter(|r| !r.masks_by_number && !r.masks_turned).filter_map(open);
+    let photographs: Vec<(Reading, Capture)> = photographs.collect();
+    let (mut reading, mut parts) = match &photographs[..] {
+        [(only, _)] => (*only, Vec::new()),
+        all => {
+            let found = |(reading, capture): &(Reading, Capture)| {
+                Ok((*reading, Found::of(capture.clone(), &options.limits)?))
+            };
+            let found = all.iter().map(found).collect::<Result<Vec<_>, String>>()?;
+            let best = clearest(&found)?;
+            (best, reasons(best, &found, &names))
+        }
+    };
+    let same = |r: &&Reading| (r.by_number, r.turned) == (reading.by_number, reading.turned);
+    let masks: Vec<(Reading, Capture)> = readings.iter().filter(same).filter_map(open).collect();
+    if masks.len() > 1 {
+        let conflict = |(reading, capture): &(Reading, Capture)| {
+            conflict(capture, &options.limits).map(|conflict| (*reading, conflict)).map_err(|e| e.to_string())
         };
-        (found.fits && self.0.iter().all(is_worse)).then_some(*best)
+        let found = masks.iter().map(conflict).collect::<Result<Vec<_>, String>>()?;
+        let part;
+        (reading, part) = masks_that_agree(reading, found)?;
+        parts.extend(part);
     }
-
-    /// Returns how many points are found again by a reading, and by the best one that is like it but for what `differs`.
-    fn against(&self, reading: Reading, differs: fn(&Reading) -> bool) -> Option<(String, String)> {
-        let others = self.0.iter().filter(|(other, _)| differs(other) != differs(&reading));
-        let other = others.max_by(|a, b| a.1.weight.total_cmp(&b.1.weight))?;
-        let own = self.0.iter().find(|(own, _)| *own == reading)?;
-        Some((grouped(own.1.sightings), grouped(other.1.sightings)))
+    if parts.is_empty() {
+        parts.push("the sizes of photographs fit their cameras in one order alone".into());
     }
+    Ok((reading, parts.join("; ")))
+}
 
-    /// Returns why a capture is read in this way.
-    fn reason(&self, reading: Reading, capture: &Capture) -> String {
-        let names: Vec<String> = capture.views.iter().map(|view| view.name.clone()).collect();
-        let orders = |is_numbered: bool| match is_numbered {
-            true => ["by number", "in name order"],
-            false => ["in name order", "by number"],
-        };
-        let mut parts = Vec::new();
-        if let Some((own, other)) = self.against(reading, |r| r.by_number) {
-            let [order, other_order] = orders(reading.by_number);
-            parts.push(format!(
-                "photographs are paired with cameras {order}, {}: so {own} points are found again, {other_order} {other}",
-                first(&names)
-            ));
-        } else if let Some((own, other)) = self.against(reading, |r| r.masks_by_number) {
-            let [order, other_order] = orders(reading.masks_by_number);
-            parts.push(format!(
-                "masks are paired with photographs {order}: so {own} points are found again, {other_order} {other}"
-            ));
-        }
-        if let Some((own, other)) = self.against(reading, |r| r.turned) {
-            let count = capture.views.iter().filter(|view| view.turn.is_some()).count();
-            parts.push(match reading.turned {
-                true => format!(
-                    "{count} of {} photographs are turned as EXIF asks{}: so {own} points are found again, as stored \
-                     {other}",
-                    names.len(),
-                    if reading.masks_turned { ", and their masks" } else { "" }
-                ),
-                false => format!(
-                    "photographs are used as stored, not turned as EXIF asks: so {own} points are found again, turned \
-                     {other}"
-                ),
-            });
-        }
-        match parts.is_empty() {
-            true => "photographs fit the sizes of their cameras in one order alone".into(),
-            false => parts.join("; "),
-        }
-    }
-
-    /// Returns why nothing is decided.
-    fn undecided(&self) -> String {
-        let counts: Vec<String> = self.0.iter().map(|(_, found)| grouped(found.sightings)).collect();
-        if counts.is_empty() {
-            return "with its masks the capture cannot be opened".into();
-        }
+/// Returns the reading that fits, and clearly better than all others.
+fn clearest(all: &[(Reading, Found)]) -> Result<Reading, String> {
+    let best = all.iter().max_by(|a, b| a.1.weight.total_cmp(&b.1.weight));
+    let is_clear = |(best, found): &&(Reading, Found)| {
+        let is_worse =
+            |(other, theirs): &(Reading, Found)| found.weight >= CLEARLY * theirs.weight || other == best;
+        found.fits && all.iter().all(is_worse)
+    };
+    best.filter(is_clear).map(|(reading, _)| *reading).ok_or_else(|| {
+        let counts: Vec<String> = all.iter().map(|(_, found)| grouped(found.sightings)).collect();
         format!("points of the head are found again {} times, which does not decide it", counts.join(" and "))
+    })
+}
+
+/// Returns what is said of the reading of photographs that was decided on.
+fn reasons(best: Reading, all: &[(Reading, Found)], names: &[String]) -> Vec<String> {
+    // how often points are found again by a reading, and by the best one that differs in this
+    let against = |differs: fn(&Reading) -> bool| {
+        let others = all.iter().filter(|(other, _)| differs(other) != differs(&best));
+        let (_, other) = others.max_by(|a, b| a.1.weight.total_cmp(&b.1.weight))?;
+        let (_, own) = all.iter().find(|(own, _)| *own == best)?;
+        Some((grouped(own.sightings), grouped(other.sightings)))
+    };
+    let order = against(|r| r.by_number).map(|(own, other)| match best.by_number {
+        true => format!(
+            "photographs are paired with cameras by number, {}: so {own} points are found again, in name order {other}",
+            first(&by_number(names))
+        ),
+        false => format!(
+            "photographs are paired with cameras in name order, {}: so {own} points are found again, by number {other}",
+            first(names)
+        ),
+    });
+    let turn = against(|r| r.turned).map(|(own, other)| match best.turned {
+        true => format!(
+            "photographs are turned as EXIF asks: so {own} points are found again, as stored {other}"
+        ),
+        false => format!(
+            "photographs are used as stored, not turned as EXIF asks: so {own} points are found again, turned {other}"
+        ),
+    });
+    order.into_iter().chain(turn).collect()
+}
+
+/// Returns the reading whose masks contradict each other clearly less than by all others, and what is said of it. Where
+/// none does, masks that need not be paired stay as they are stored: `photographs` is the reading without turned masks.
+fn masks_that_agree(
+    photographs: Reading,
+    mut all: Vec<(Reading, f64)>,
+) -> Result<(Reading, Option<String>), String> {
+    all.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let (best, least) = all[0];
+    let others = all[1].1;
+    let percent = |conflict: f64| format!("{:.1} %", 100.0 * conflict);
+    if others < LEAST_CONFLICT || others < 2.0 * least {
+        let is_paired = all.iter().any(|(reading, _)| reading.masks_by_number);
+        return match is_paired {
+            true => Err(format!("masks contradict each other by {} and {}", percent(least), percent(others))),
+            false => Ok((photographs, None)),
+        };
     }
+    let mut parts = Vec::new();
+    if all.iter().any(|(other, _)| other.masks_by_number != best.masks_by_number) {
+        let order = if best.masks_by_number { "by number" } else { "in name order" };
+        parts.push(format!("masks are paired with photographs {order}"));
+    }
+    if all.iter().any(|(other, _)| other.masks_turned != best.masks_turned) {
+        let turned =
+            if best.masks_turned { "turned as EXIF asks of their photographs" } else { "used as stored" };
+        parts.push(format!("masks are {turned}"));
+    }
+    let [least, others] = [least, others].map(percent);
+    let parts = parts.join(" and ");
+    Ok((best, Some(format!("{parts}: so they contradict each other by {least} of a mask, else by {others}"))))
+}
+
+/// Returns how much the masks of a capture contradict each other, in whole masks.
+fn conflict(capture: &Capture, limits: &Limits) -> Result<f64> {
+    let every = capture.views.len().div_ceil(MAX_VIEWS).max(1);
+    let views: Vec<View> = capture.views.iter().step_by(every).cloned().collect();
+    let masks = small_masks(&views, limits)?;
+    let shown = views.iter().zip(&masks).map(|(view, mask)| ConsistencyView {
+        name: &view.name,
+        camera: &view.camera,
+        mask: mask.as_ref(),
+    });
+    let found = check_consistency(&shown.collect::<Vec<_>>())?;
+    let named: f64 = found.conflicts.iter().map(|c| c.too_much.max(c.too_little)).sum();
+    Ok(named + found.left)
+}
+
+/// Reads masks, reduced as the photographs are.
+fn small_masks(views: &[View], limits: &Limits) -> Result<Vec<Option<Gray>>> {
+    let small = |mask: Gray| resize_gray(&mask, working_size(mask.width, mask.height, SIDE_PX));
+    views.par_iter().map(|view| Ok(view.load_mask(limits)?.map(small))).collect()
 }
 
 impl Found {
     /// Measures the training views of a capture. Returns the reason instead if that is not possible.
-    fn of(mut capture: Capture, options: &CaptureOptions) -> Result<Found, String> {
-        let limits = &options.limits;
+    fn of(mut capture: Capture, limits: &Limits) -> Result<Found, String> {
         let said = |e: Error| e.to_string();
         capture.views.retain(|view| view.split == Split::Train);
         let every = capture.views.len().div_ceil(MAX_VIEWS).max(1);
         capture.views = capture.views.into_iter().step_by(every).collect();
-        let small = |mask: Gray| resize_gray(&mask, working_size(mask.width, mask.height, SIDE_PX));
-        let mask = |view: &View| Ok(view.load_mask(limits)?.map(small));
-        let masks = capture.views.par_iter().map(mask).collect::<Result<Vec<_>>>().map_err(said)?;
+        let masks = small_masks(&capture.views, limits).map_err(said)?;
         let cameras: Vec<Camera> = capture.views.iter().map(|view| view.camera.clone()).collect();
         let placing = SceneOptions {
             resolution: HULL_CELLS,
@@ -263,7 +304,7 @@ impl Found {
         let Ok((scene, _)) = scene::fit(&cameras, &masks, &placing) else { return Ok(Found::default()) };
         let photos = RigPhotos::load_at(SIDE_PX, &capture, &scene, limits).map_err(said)??;
         let (_, rig) = photos.measure(POINTS, false);
-        let sightings = rig.cameras.iter().map(|camera| camera.sightings).sum();
+        let sightings: usize = rig.cameras.iter().map(|camera| camera.sightings).sum();
         let fits =
             sightings >= LEAST_SIGHTINGS && rig.adjusted_px <= MOST_PX && rig.verdict != Verdict::Apart;
         Ok(Found { sightings, weight: sightings as f64 / rig.given_px.max(LEAST_PX), fits })
