@@ -39,6 +39,13 @@ const CLEARLY: f64 = 2.0;
 /// Masks that contradict each other less than this, in whole masks, cannot be told to be wrong; right ones do by nothing.
 const LEAST_CONFLICT: f64 = 0.01;
 
+/// Where masks alone say which photograph belongs to which camera, those of the other order contradict each other by so much
+/// at least, a third of what is usual …
+const SURE_CONFLICT: f64 = 0.05;
+
+/// … and so many times as much.
+const SURELY: f64 = 4.0;
+
 /// Sightings that a reading needs to be taken.
 const LEAST_SIGHTINGS: usize = 150;
 
@@ -167,19 +174,18 @@ fn decide(capture: &Capture, options: &CaptureOptions) -> Result<(Reading, Strin
                 Ok((*reading, Found::of(capture.clone(), &options.limits)?))
             };
             let found = all.iter().map(found).collect::<Result<Vec<_>, String>>()?;
-            let best = clearest(&found)?;
-            (best, reasons(best, &found, &names))
+            match clearest(&found) {
+                Ok(best) => (best, reasons(best, &found, &names)),
+                Err(why) => by_silhouettes(all, &options.limits, &names).ok_or(why)?,
+            }
         }
     };
     let same = |r: &&Reading| (r.by_number, r.turned) == (reading.by_number, reading.turned);
     let masks: Vec<(Reading, Capture)> = readings.iter().filter(same).filter_map(open).collect();
     if masks.len() > 1 {
-        let conflict = |(reading, capture): &(Reading, Capture)| {
-            conflict(capture, &options.limits).map(|conflict| (*reading, conflict)).map_err(|e| e.to_string())
-        };
-        let found = masks.iter().map(conflict).collect::<Result<Vec<_>, String>>()?;
+        let conflicts = conflicts(&masks, &options.limits).map_err(|e| e.to_string())?;
         let part;
-        (reading, part) = masks_that_agree(reading, found)?;
+        (reading, part) = masks_that_agree(reading, &conflicts)?;
         parts.extend(part);
     }
     if parts.is_empty() {
@@ -236,19 +242,15 @@ fn reasons(best: Reading, all: &[(Reading, Found)], names: &[String]) -> Vec<Str
 /// none does, masks that need not be paired stay as they are stored: `photographs` is the reading without turned masks.
 fn masks_that_agree(
     photographs: Reading,
-    mut all: Vec<(Reading, f64)>,
+    all: &[(Reading, f64)],
 ) -> Result<(Reading, Option<String>), String> {
-    all.sort_by(|a, b| a.1.total_cmp(&b.1));
-    let (best, least) = all[0];
-    let others = all[1].1;
-    let percent = |conflict: f64| format!("{:.1} %", 100.0 * conflict);
-    if others < LEAST_CONFLICT || others < 2.0 * least {
+    let Some((best, least, others)) = agreeing(all, LEAST_CONFLICT, CLEARLY) else {
         let is_paired = all.iter().any(|(reading, _)| reading.masks_by_number);
         return match is_paired {
-            true => Err(format!("masks contradict each other by {} and {}", percent(least), percent(others))),
+            true => Err("masks contradict each other about as much in both orders".into()),
             false => Ok((photographs, None)),
         };
-    }
+    };
     let mut parts = Vec::new();
     if all.iter().any(|(other, _)| other.masks_by_number != best.masks_by_number) {
         let order = if best.masks_by_number { "by number" } else { "in name order" };
@@ -259,9 +261,46 @@ fn masks_that_agree(
             if best.masks_turned { "turned as EXIF asks of their photographs" } else { "used as stored" };
         parts.push(format!("masks are {turned}"));
     }
-    let [least, others] = [least, others].map(percent);
     let parts = parts.join(" and ");
     Ok((best, Some(format!("{parts}: so they contradict each other by {least} of a mask, else by {others}"))))
+}
+
+/// Returns the reading whose masks contradict each other the least, if those of all others do at least so much and so many
+/// times as much, and how much both do, in words.
+fn agreeing(all: &[(Reading, f64)], least: f64, times: f64) -> Option<(Reading, String, String)> {
+    let mut sorted = all.to_vec();
+    sorted.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let &[(best, own), (_, other), ..] = &sorted[..] else { return None };
+    let percent = |conflict: f64| format!("{:.1} %", 100.0 * conflict);
+    (other >= least.max(times * own)).then(|| (best, percent(own), percent(other)))
+}
+
+/// Decides on the order of photographs whose heads are too smooth for points to be found again, if only that is open: masks
+/// move along with their photographs, and those of other cameras contradict each other. Returns what is said of it as well.
+fn by_silhouettes(
+    all: &[(Reading, Capture)],
+    limits: &Limits,
+    names: &[String],
+) -> Option<(Reading, Vec<String>)> {
+    if all.iter().any(|(reading, _)| reading.turned) {
+        return None;
+    }
+    let conflicts = conflicts(all, limits).ok()?;
+    let (best, own, other) = agreeing(&conflicts, SURE_CONFLICT, SURELY)?;
+    let (order, shown) = match best.by_number {
+        true => ("by number", first(&by_number(names))),
+        false => ("in name order", first(names)),
+    };
+    let reason = format!(
+        "photographs are paired with cameras {order}, {shown}: so their masks contradict each other by {own} of a mask, \
+         in the other order by {other}"
+    );
+    Some((best, vec![reason]))
+}
+
+/// Returns how much the masks of each reading contradict each other.
+fn conflicts(all: &[(Reading, Capture)], limits: &Limits) -> Result<Vec<(Reading, f64)>> {
+    all.iter().map(|(reading, capture)| Ok((*reading, conflict(capture, limits)?))).collect()
 }
 
 /// Returns how much the masks of a capture contradict each other, in whole masks.

@@ -176,6 +176,24 @@ fn masks_that_only_order_pairs_are_paired_by_what_fits() {
 }
 
 #[test]
+fn photographs_of_a_smooth_head_are_paired_by_their_masks() {
+    let dir = tempfile::tempdir().unwrap();
+    pictures(dir.path(), ["images", "masks"], [&plain, &plain]);
+    for i in 0..COUNT {
+        let path = dir.path().join(format!("images/{i}.png"));
+        let pixels = vec![[120, 110, 100]; (HEAD.width * HEAD.height) as usize];
+        io::write_png_rgb(&path, HEAD.width, HEAD.height, &pixels).unwrap();
+    }
+    for (cameras, order) in [(cameras(), "by number"), (in_name_order(&cameras()), "in name order")] {
+        write_llff(dir.path(), &cameras);
+        let capture = opened(dir.path());
+        assert!(has_own_cameras(&capture, ""), "{:?}", capture.reasons);
+        let words = ["paired with cameras", order, "so their masks contradict each other by 0.0 %"];
+        assert!(says(&capture.reasons, &words), "{:?}", capture.reasons);
+    }
+}
+
+#[test]
 fn an_order_that_nothing_decides_is_refused_with_both_and_a_way_on() {
     let dir = tempfile::tempdir().unwrap();
     fs::create_dir(dir.path().join("images")).unwrap();
