@@ -31,6 +31,7 @@ mod llff;
 mod masks;
 mod metashape;
 mod neus;
+mod order;
 mod photo_checks;
 mod pose_folder;
 mod programs;
@@ -45,9 +46,10 @@ mod view;
 pub use crate::config::{MaskMeaning, MaskSource};
 pub use format::is_run;
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
+pub(crate) use order::by_number;
 pub use scene::well_seen;
 pub(crate) use transforms::camera_like;
-pub use view::{Capture, CaptureOptions, LoadedView, Split, View, ViewMask};
+pub use view::{Capture, CaptureOptions, LoadedView, Reading, Split, View, ViewMask};
 
 use crate::error::counted;
 use crate::io::{self, PictureInfo};
@@ -165,13 +167,17 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         .par_iter()
         .map(|f| io::picture_info(f.photo.as_deref().unwrap_or(Path::new("")), &options.limits))
         .collect();
-    let (mut turned, mut views, mut kept) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut kept_turns, mut open_turns) = (Vec::new(), Vec::new());
+    let (mut views, mut kept) = (Vec::new(), Vec::new());
     for ((frame, name), info) in frames.into_iter().zip(names).zip(infos) {
         let view = info.map_err(Error::from).and_then(|i| Ok((i, view(folder, &frame, name, &i)?)));
         match view {
             Ok((info, view)) => {
-                if info.exif > 1 && info.size(Some(view.declared)) == (info.width, info.height) {
-                    turned.push(view.name.clone());
+                let is_stored = info.size(Some(view.declared)) == (info.width, info.height);
+                if is_turn_open(&frame, &info) {
+                    open_turns.push(view.name.clone());
+                } else if info.exif > 1 && is_stored {
+                    kept_turns.push(view.name.clone());
                 }
                 views.push(view);
                 kept.push((frame, info));
@@ -179,11 +185,21 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
             Err(problem) => listing.problems.push(problem),
         }
     }
-    if !turned.is_empty() {
+    let asks = |views: &[String]| format!("EXIF asks to turn {}", counted(views.len(), "photograph"));
+    if !kept_turns.is_empty() {
         listing.warnings.push(format!(
-            "EXIF asks to turn {}, used as stored, as the cameras expect: {}",
-            counted(turned.len(), "photograph"),
-            few(turned)
+            "{}, used as stored, since the cameras are for that size: {}",
+            asks(&kept_turns),
+            few(&kept_turns)
+        ));
+    }
+    if !open_turns.is_empty() && options.reading.is_none() {
+        listing.warnings.push(format!(
+            "{}; nothing shows whether the cameras expect that, and they are used as stored: {}; look at them (`tiface \
+             mask CAPTURE --page`), and if they are upside down, mirrored or on their side, store them turned, without \
+             EXIF (ImageMagick: `magick mogrify -auto-orient FILES`)",
+            asks(&open_turns),
+            few(&open_turns)
         ));
     }
     if views.is_empty() {
@@ -193,6 +209,14 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
     if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, listing) {
         listing.problems.push(problem);
     }
+    let has_files = views
+        .iter()
+        .zip(&kept)
+        .any(|(view, (_, info))| info.is_turn_open() && matches!(view.mask, ViewMask::File(_)));
+    let readings = match options.reading {
+        Some(_) => Vec::new(),
+        None => readings(listing, !open_turns.is_empty(), has_files),
+    };
     Some(Capture {
         root: root.into(),
         name: root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned()),
@@ -203,7 +227,25 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         views,
         unit_m: options.unit_m,
         warnings: std::mem::take(&mut listing.warnings),
+        readings,
     })
+}
+
+/// Returns the ways in which a capture can be read, that of its files' order and without turns first; none where only that
+/// one is possible. `has_masks` says whether there are files of masks that may be turned.
+fn readings(listing: &Listing, turn_is_open: bool, has_masks: bool) -> Vec<Reading> {
+    let choices = |is_open: bool| if is_open { &[false, true][..] } else { &[false][..] };
+    let mut all = Vec::new();
+    for &turned in choices(turn_is_open) {
+        for &masks_turned in choices(turn_is_open && has_masks) {
+            for &by_number in choices(listing.order_is_open) {
+                for &masks_by_number in choices(listing.mask_order_is_open) {
+                    all.push(Reading { by_number, masks_by_number, turned, masks_turned });
+                }
+            }
+        }
+    }
+    if all.len() > 1 { all } else { Vec::new() }
 }
 
 /// Views of one name are a problem, names that differ only in case a warning.
@@ -229,9 +271,19 @@ fn check_names(frames: &[CameraFrame], names: &[String], listing: &mut Listing) 
     }
 }
 
+/// Returns whether the size of a photograph does not say whether its cameras expect the turn that EXIF asks for.
+fn is_turn_open(frame: &CameraFrame, info: &PictureInfo) -> bool {
+    info.is_turn_open() || (info.exif > 4 && frame.intrinsics.size.is_none())
+}
+
 fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &PictureInfo) -> Result<View> {
     let d = folder.options.downscale;
-    let (w, h) = frame.intrinsics.size.unwrap_or((info.width, info.height));
+    let Reading { turned, masks_turned, .. } = folder.reading();
+    let (w, h) = match frame.intrinsics.size {
+        Some(size) => size,
+        None if turned && info.exif > 4 => (info.height, info.width),
+        None => (info.width, info.height),
+    };
     let declared = (w, h);
     let target = (w / d, h / d);
     let problem = |problem: String| in_frame(&frame.file, &frame.name, problem);
@@ -239,6 +291,7 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         return Err(problem(format!("nothing is left of {w} × {h} pixels after dividing by {d}")));
     }
     let photo = frame.photo.clone().unwrap_or_default();
+    let turn = |is_turned: bool| (is_turned && info.is_turn_open()).then_some(info.exif);
     let full = frame.intrinsics.camera(declared, frame.rotation, frame.position).map_err(problem)?;
     let (camera, photo_size) = if info.size(Some(declared)) == declared {
         (downscaled(&full, d), declared)
@@ -261,6 +314,8 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         photo_size,
         declared,
         declared_by: frame.file.clone(),
+        turn: turn(turned),
+        mask_turn: turn(masks_turned),
         exposure: None,
     })
 }

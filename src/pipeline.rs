@@ -39,6 +39,7 @@ mod path;
 mod pictures;
 mod plan;
 mod preview;
+mod readings;
 mod render;
 mod rig_photos;
 mod scene_file;
@@ -56,6 +57,7 @@ pub use mask::{click_page, inspect_capture};
 pub use metrics::{Truth, against_truth};
 pub use page::{curves, head_page, renew_report, viewer_of_file};
 pub use preview::{Preview, PreviewPicture, PreviewRenderer, field_view};
+pub use readings::open_capture;
 pub use session::{DEMO_CAPTURE, Session, check_feasible, require_device};
 pub use surface::{Fields, Radiance, Surface};
 

@@ -3,7 +3,7 @@
 
 use super::frame::CameraFrame;
 use super::table;
-use super::view::CaptureOptions;
+use super::view::{CaptureOptions, Reading};
 use crate::io::{self, ReadError};
 use crate::{Error, Result};
 use glam::DMat3;
@@ -39,6 +39,11 @@ pub(super) struct CaptureFolder<'a> {
 impl CaptureFolder<'_> {
     pub fn new<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<CaptureFolder<'a>> {
         Ok(CaptureFolder { root, real: io::real_path(root)?, options })
+    }
+
+    /// Returns how what the files leave open is read.
+    pub fn reading(&self) -> Reading {
+        self.options.reading.unwrap_or_default()
     }
 
     /// Returns a path relative to the capture, for messages.

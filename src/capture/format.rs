@@ -96,7 +96,7 @@ impl CameraFiles {
                 ("COLMAP", format!("cameras from {}", quote(&[&names[0], &names[1]])))
             }
             CameraFiles::Neus(file) => {
-                ("NeuS", format!("cameras from `{file}`, one for each photograph in name order"))
+                ("NeuS", format!("cameras from `{file}`, one for each photograph in order"))
             }
             CameraFiles::Metashape(file) => ("Metashape", format!("cameras from `{file}`")),
             CameraFiles::RealityCapture(file) => ("RealityCapture", format!("cameras from `{file}`")),

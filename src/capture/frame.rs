@@ -28,6 +28,10 @@ pub(super) struct Listing {
     pub focus: Option<Aabb>,
     /// Points on the photographed surface.
     pub points: Vec<DVec3>,
+    /// Whether only their order pairs photographs with cameras, and by number it is another one.
+    pub order_is_open: bool,
+    /// Likewise of masks with photographs.
+    pub mask_order_is_open: bool,
 }
 
 impl Default for Listing {
@@ -43,6 +47,8 @@ impl Default for Listing {
             masks_named: "`mask_path` of each frame",
             focus: None,
             points: Vec::new(),
+            order_is_open: false,
+            mask_order_is_open: false,
         }
     }
 }

@@ -8,6 +8,7 @@
 use super::folder;
 use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, Agreement, CameraFrame, Intrinsics, Listing};
+use super::order;
 use super::view::Split;
 use crate::io::{self, NpyValues};
 use crate::{Error, Result};
@@ -65,7 +66,7 @@ fn split_of(file: &str) -> Option<Split> {
 }
 
 /// Compares each LLFF file with the frames of its split. Rows carry no names, so they are paired with the
-/// frames in the JSON's order or in name order, whichever fits better.
+/// frames in the JSON's order, in name order or by number, whichever fits best.
 pub(super) fn check(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) {
     for &file in files {
         let split = split_of(file);
@@ -101,8 +102,9 @@ fn compare(file: &str, rows: &[PoseRow], frames: &[&CameraFrame]) -> Result<Agre
     }
     let mean = frames.iter().map(|f| f.position).sum::<DVec3>() / frames.len() as f64;
     let spread = frames.iter().map(|f| f.position.distance(mean)).fold(0.0, f64::max).max(1e-12);
-    let mut by_name = frames.to_vec();
+    let (mut by_name, mut by_number) = (frames.to_vec(), frames.to_vec());
     by_name.sort_by(|a, b| a.name.cmp(&b.name));
+    by_number.sort_by(|a, b| order::compare(&a.name, &b.name));
     let worst = |order: &[&CameraFrame]| -> Vec<[f64; 3]> {
         rows.iter().zip(order).map(|(row, frame)| difference(row, frame)).collect()
     };
@@ -111,8 +113,9 @@ fn compare(file: &str, rows: &[PoseRow], frames: &[&CameraFrame]) -> Result<Agre
         (d[0] / (POSITION_TOLERANCE * spread)).max(d[1] / ROTATION_TOLERANCE).max(d[2] / FOCAL_TOLERANCE)
     };
     let total = |ds: &[[f64; 3]]| ds.iter().map(excess).fold(0.0, f64::max);
-    let (a, b) = (worst(frames), worst(&by_name));
-    let (differences, order) = if total(&b) < total(&a) { (b, &by_name[..]) } else { (a, frames) };
+    let mut orders = [frames, &by_name, &by_number].map(|order| (worst(order), order));
+    orders.sort_by(|(a, _), (b, _)| total(a).total_cmp(&total(b)));
+    let [(differences, order), ..] = orders;
     let most = (0..rows.len()).max_by(|&i, &j| excess(&differences[i]).total_cmp(&excess(&differences[j])));
     if let Some(i) = most
         && excess(&differences[i]) > 1.0
@@ -156,7 +159,7 @@ fn difference(row: &PoseRow, frame: &CameraFrame) -> [f64; 3] {
     [row.position.distance(frame.position), angle, focal]
 }
 
-/// Lists the frames of LLFF files alone, pairing rows with photographs in name order.
+/// Lists the frames of LLFF files alone, pairing rows with photographs in the order that is read.
 pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) -> Result<()> {
     let mut sets = Vec::new();
     for &file in files {
@@ -167,7 +170,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
             "put one photograph per row into `images/` (or `images_train/`, `images_test/`), in name order";
         in_file(file, text, hint)
     };
-    let named = |suffix| photographs(folder, suffix);
+    let mut named = |suffix| photographs(folder, suffix, listing);
 
     // folders per split first; else one folder whose count says which files it belongs to
     let (shared, train, test) = (named("")?.unwrap_or_default(), named("_train")?, named("_test")?);
@@ -177,10 +180,11 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
     } else if shared.len() == total {
         if let [(_, first), _] = &sets[..] {
             listing.warnings.push(format!(
-                "the rows of {} carry no names: the first {} photographs in name order are taken for training, \
-                 the others for testing",
+                "the rows of {} carry no names: the first {} photographs {} are taken for training, the others for \
+                 testing",
                 files.join(" and "),
-                first.len()
+                first.len(),
+                if folder.reading().by_number { "by number" } else { "in name order" }
             ));
         }
         let mut rest = shared.into_iter();
@@ -212,9 +216,9 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
     Ok(())
 }
 
-/// Returns the photographs in `images` + `suffix`, or in that folder of pictures already reduced, in name order; `None`
-/// without such a folder.
-fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String>>> {
+/// Returns the photographs in `images` + `suffix`, or in that folder of pictures already reduced, in the order that is read;
+/// `None` without such a folder.
+fn photographs(folder: &CaptureFolder, suffix: &str, listing: &mut Listing) -> Result<Option<Vec<String>>> {
     let downscale = folder.options.downscale;
     let mut names = vec![format!("images{suffix}")];
     if downscale > 1 {
@@ -223,9 +227,11 @@ fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String
     let Some(name) = names.into_iter().find(|n| io::is_folder(&folder.root.join(n))) else {
         return Ok(None);
     };
-    Ok(Some(
-        folder::photographs(&folder.root.join(&name))?.into_iter().map(|n| format!("{name}/{n}")).collect(),
-    ))
+    let plain = folder::photographs(&folder.root.join(&name))?;
+    let numbered = order::by_number(&plain);
+    listing.order_is_open |= numbered != plain;
+    let photos = if folder.reading().by_number { numbered } else { plain };
+    Ok(Some(photos.into_iter().map(|n| format!("{name}/{n}")).collect()))
 }
 
 #[cfg(test)]

@@ -8,6 +8,8 @@
 use super::folder;
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
+use super::order;
+use super::view::Reading;
 use crate::Result;
 use crate::geom::Aabb;
 use crate::io::{self, Npy, NpyValues};
@@ -24,8 +26,15 @@ const SKEW: f64 = 1e-3;
 /// Lists one frame for each photograph.
 pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
     let arrays = io::read_npz(&folder.root.join(file), &folder.options.limits)?;
-    let photos = pictures(folder, &["image", "images", "rgb"])?;
-    let masks = pictures(folder, &["mask", "masks"])?;
+    let plain = pictures(folder, &["image", "images", "rgb"])?;
+    let numbered = order::by_number(&plain);
+    let mask_files = pictures(folder, &["mask", "masks"])?;
+    let pairings = paired_masks(&plain, &numbered, &mask_files);
+    let Reading { by_number, masks_by_number, .. } = folder.reading();
+    let masks = &pairings[usize::from(masks_by_number).min(pairings.len() - 1)];
+    listing.order_is_open = plain != numbered;
+    listing.mask_order_is_open = pairings.len() > 1;
+    let photos = if by_number { &numbered } else { &plain };
     let known = (0..).take_while(|i| arrays.contains_key(&format!("world_mat_{i}"))).count();
     let hint = "it must have `world_mat_0`, `world_mat_1` and so on, one for each photograph in `image/`";
     if known == 0 {
@@ -40,13 +49,11 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
             matrix(&arrays, &format!("world_mat_{i}")).and_then(|m| decompose(&m)).map_err(problem)?;
         let (intrinsics, rotation, position) = camera;
         let photo = folder.photo(file, name)?;
-        // masks have names of their own: they are paired in order, as NeuS does
-        let mask = masks.get(i).filter(|_| masks.len() == photos.len());
-        let mask = mask.and_then(|mask| folder.file(Path::new(mask)));
+        let mask = masks.get(name.as_str()).and_then(|mask| folder.file(Path::new(mask)));
         let frame = CameraFrame::new(file, name, photo, intrinsics, (rotation, position));
         listing.frames.push(CameraFrame { mask, ..frame });
     }
-    listing.masks_named = "`mask/`, in the order of the photographs";
+    listing.masks_named = "`mask/`, by name or in the order of the photographs";
     if arrays.contains_key("scale_mat_0") {
         let problem = |text| in_file(file, text, "save it again with `numpy.savez`");
         let m = matrix(&arrays, "scale_mat_0").map_err(problem)?;
@@ -70,6 +77,40 @@ fn pictures(folder: &CaptureFolder, names: &[&str]) -> Result<Vec<String>> {
         return Ok(Vec::new());
     };
     Ok(folder::photographs(&folder.root.join(name))?.into_iter().map(|f| format!("{name}/{f}")).collect())
+}
+
+/// Returns the mask of each photograph: that of its name or its number where all have one, else the one at its place in
+/// order, as NeuS pairs them. Where the orders of both by name and by number pair them otherwise, both pairings are
+/// returned, that by name first.
+fn paired_masks<'m>(
+    plain: &'m [String],
+    numbered: &'m [String],
+    masks: &'m [String],
+) -> Vec<BTreeMap<&'m str, &'m str>> {
+    let pairs = |photos: &'m [String], masks: Vec<&'m str>| -> BTreeMap<&'m str, &'m str> {
+        photos.iter().map(String::as_str).zip(masks).collect()
+    };
+    let named: BTreeMap<&str, &str> = masks.iter().map(|mask| (order::stem(mask), mask.as_str())).collect();
+    let of_name: Option<Vec<&str>> = plain.iter().map(|p| named.get(order::stem(p)).copied()).collect();
+    if let Some(of_name) = of_name {
+        return vec![pairs(plain, of_name)];
+    } else if masks.len() != plain.len() {
+        return vec![BTreeMap::new()];
+    }
+    let in_number = order::by_number(masks);
+    let same = |(photo, mask): (&String, &String)| {
+        order::last_number(photo).is_some_and(|number| order::last_number(mask) == Some(number))
+    };
+    let have_same_numbers = numbered.iter().zip(&in_number).all(same);
+    let place: BTreeMap<&str, usize> = masks.iter().map(String::as_str).zip(0..).collect();
+    let in_number = in_number.iter().map(|mask| masks[place[mask.as_str()]].as_str()).collect();
+    let by_number = pairs(numbered, in_number);
+    if have_same_numbers {
+        return vec![by_number];
+    }
+    let mut all = vec![pairs(plain, masks.iter().map(String::as_str).collect()), by_number];
+    all.dedup();
+    all
 }
 
 /// Returns the upper three rows of a 4×4 or 3×4 array, finite.
@@ -121,6 +162,34 @@ fn decompose(p: &[f64; 12]) -> Result<(Intrinsics, DMat3, DVec3), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn masks_follow_their_photographs_by_name_by_number_or_by_order() {
+        let names = |text: &str| -> Vec<String> { text.split(' ').map(|n| format!("m/{n}.png")).collect() };
+        let pairings = |photos: &str, masks: &str| -> Vec<Vec<String>> {
+            let (plain, masks) = (names(photos), names(masks));
+            let numbered = order::by_number(&plain);
+            let found = paired_masks(&plain, &numbered, &masks);
+            let masks = |pairs: &BTreeMap<&str, &str>| -> Vec<String> {
+                plain
+                    .iter()
+                    .filter_map(|p| pairs.get(p.as_str()).map(|m| order::stem(m).to_string()))
+                    .collect()
+            };
+            found.iter().map(masks).collect()
+        };
+        let text = |text: &str| -> Vec<String> { text.split(' ').map(str::to_string).collect() };
+        // one more mask than photographs
+        assert_eq!(pairings("0 1 10 2", "0 1 10 2 all"), [text("0 1 10 2")]);
+        // names differ, numbers do not
+        assert_eq!(pairings("0 1 10 2", "000 001 002 010"), [text("000 001 010 002")]);
+        assert_eq!(pairings("000 001 002 010", "0 1 10 2"), [text("0 1 2 10")]);
+        // numbers differ, orders do not
+        assert_eq!(pairings("0 1 2", "1 2 3"), [text("1 2 3")]);
+        // both differ
+        assert_eq!(pairings("008 009 010", "10 11 9"), [text("10 11 9"), text("9 10 11")]);
+        assert_eq!(pairings("0 1 2", "1 2"), [Vec::<String>::new()]);
+    }
 
     #[test]
     fn a_projection_is_taken_apart_whatever_its_sign_and_scale() {

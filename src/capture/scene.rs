@@ -683,6 +683,8 @@ mod tests {
             photo_size: (1, 1),
             declared: (1, 1),
             declared_by: String::new(),
+            turn: None,
+            mask_turn: None,
             exposure: None,
         };
         let views: Vec<View> = cameras.iter().map(view).collect();

@@ -44,6 +44,19 @@ impl From<Option<PathBuf>> for ViewMask {
     }
 }
 
+/// How what the files of a capture leave open is read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Reading {
+    /// Photographs that the camera file does not name follow by number (2 before 10), not by the bytes of their names.
+    pub by_number: bool,
+    /// So do masks that are paired with photographs by their order.
+    pub masks_by_number: bool,
+    /// Photographs are turned as EXIF asks, where their size does not say whether they are to be.
+    pub turned: bool,
+    /// Masks beside these photographs are turned likewise.
+    pub masks_turned: bool,
+}
+
 /// How to open a capture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureOptions {
@@ -63,6 +76,8 @@ pub struct CaptureOptions {
     pub exposure: Exposures,
     /// Metres per dataset unit.
     pub unit_m: f64,
+    /// How what the files leave open is read, where that has been decided.
+    pub reading: Option<Reading>,
     /// What is refused for its size.
     pub limits: Limits,
 }
@@ -78,6 +93,7 @@ impl Default for CaptureOptions {
             cameras: CameraPoses::Auto,
             exposure: Exposures::Auto,
             unit_m: 1.0,
+            reading: None,
             limits: Limits::default(),
         }
     }
@@ -107,6 +123,9 @@ pub struct Capture {
     pub unit_m: f64,
     /// Warnings, none of which stops the work.
     pub warnings: Vec<String>,
+    /// All ways in which it can be read where its files leave something open, this one first; else none.
+    #[serde(skip)]
+    pub readings: Vec<Reading>,
 }
 
 /// One photograph with its camera.
@@ -137,6 +156,12 @@ pub struct View {
     pub declared: (u32, u32),
     /// The file that declares it.
     pub declared_by: String,
+    /// The EXIF orientation by which the stored photograph is turned although its size does not ask for it.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub turn: Option<u8>,
+    /// That by which the pictures of its mask, its usable pixels and its region are.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub mask_turn: Option<u8>,
     /// The exposure that is divided out of the photograph when it is read.
     #[serde(skip)]
     pub exposure: Option<Exposure>,
@@ -172,8 +197,17 @@ impl View {
         })
     }
 
-    fn stored_photo(&self, limits: &Limits) -> Result<Photo> {
+    /// Reads the photograph at its own size, turned as the camera sees it.
+    pub fn whole_photo(&self, limits: &Limits) -> Result<Photo> {
         let photo = io::read_photo(&self.photo, Some(self.photo_size), limits)?;
+        Ok(match self.turn {
+            Some(exif) => io::turned_photo(photo, exif),
+            None => photo,
+        })
+    }
+
+    fn stored_photo(&self, limits: &Limits) -> Result<Photo> {
+        let photo = self.whole_photo(limits)?;
         let found = (photo.width, photo.height);
         if found != self.photo_size {
             return Err(self.size_error(&self.photo, found)); // it was replaced since the capture was opened
@@ -254,6 +288,10 @@ impl View {
     }
 
     fn reduced(&self, path: &Path, gray: Gray, average: Average) -> Result<Gray> {
+        let gray = match self.mask_turn {
+            Some(exif) => io::turned_gray(gray, exif),
+            None => gray,
+        };
         let found = (gray.width, gray.height);
         if found == (self.camera.width, self.camera.height) {
             Ok(gray)

@@ -6,9 +6,9 @@ use super::options::Common;
 use super::out::Out;
 use super::screen::{one_line, print};
 use crate::capture::convert::CameraFormat;
-use crate::config::Config;
+use crate::config::{CameraPoses, Config};
 use crate::error::counted;
-use crate::pipeline::{self, capture_options, click_page, inspect_capture};
+use crate::pipeline::{self, capture_options, click_page, inspect_capture, open_capture};
 use crate::{Error, ErrorKind, Result, capture, io};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -31,7 +31,7 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
         Error::usage(format_args!("`--to {to}` is not a camera format"), "choose transforms or colmap")
     })?;
     let options = capture_options(&common.resolve(None, None, &[])?);
-    let capture = capture::open(from, &options)?;
+    let capture = open_capture(from, &options)?;
     capture.warnings.iter().for_each(|text| invocation.screen.note("convert: warning", text));
     let default = || PathBuf::from(format!("{}_{to}", capture.name));
     let folder = common.out.clone().unwrap_or_else(default);
@@ -75,7 +75,7 @@ pub(super) fn judge(
         return Err(Error::usage("no capture is named", "name one: `tiface metrics CAPTURE --views FOLDER`"));
     };
     let (config, root) = capture_of(common, path)?;
-    let capture = capture::open(&root, &capture_options(&config))?;
+    let capture = open_capture(&root, &capture_options(&config))?;
     capture.warnings.iter().for_each(|text| screen.note("metrics: warning", text));
     if let Some(wrong) = views.iter().find(|folder| !io::is_folder(folder)) {
         let hint = "name a folder of pictures that are named like the photographs";
@@ -121,8 +121,11 @@ pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option
     };
     let (config, root) = capture_of(common, path)?;
     // masks are not needed to click
-    let options = capture::CaptureOptions { masks: capture::MaskSource::None, ..capture_options(&config) };
-    let capture = capture::open(&root, &options)?;
+    let masks = capture::MaskSource::None;
+    // nor poses: which way a photograph is turned matters, and not which camera took it
+    let cameras = CameraPoses::Given;
+    let options = capture::CaptureOptions { masks, cameras, ..capture_options(&config) };
+    let capture = open_capture(&root, &options)?;
     // invalid clicks of the capture are a warning only
     let own = capture.root.join("prompts.json");
     let inside =

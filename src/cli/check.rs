@@ -11,6 +11,7 @@ use crate::mesh::files::{
 };
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
+use crate::pipeline::open_capture;
 use crate::run::{Fault, ProductState, read_record};
 use crate::{Error, ErrorKind, Result};
 use glam::DVec3;
@@ -215,7 +216,7 @@ fn compare(mesh: &Mesh, origin: DVec3, other: &Path, seen_by: Option<&Path>, uni
     let back = one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
     let (mut seen, mut by_views, mut parts) = (None, Vec::new(), Vec::new());
     if let Some(root) = seen_by {
-        let capture = capture::open(root, &CaptureOptions::default())?;
+        let capture = open_capture(root, &CaptureOptions::default())?;
         let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
         let views: Vec<&View> = capture.split(Split::Train).collect();
         let cameras: Vec<Camera> = views.iter().map(|v| moved(&v.camera)).collect();

@@ -37,11 +37,16 @@ impl PictureInfo {
         let stored = (self.width, self.height);
         if is_turned(self.exif, stored, expected) { (stored.1, stored.0) } else { stored }
     }
+
+    /// Returns whether EXIF asks for a turn that leaves the size as it is, so that no size says whether it is expected.
+    pub fn is_turn_open(&self) -> bool {
+        (2..=4).contains(&self.exif) || ((5..=8).contains(&self.exif) && self.width == self.height)
+    }
 }
 
 /// Returns whether the EXIF rotation is applied. A quarter turn is, only when it is what makes the declared size true:
-/// else cameras were found for the stored pixels. Half turns and mirrors fit any size, so nothing can tell whether
-/// the cameras were found before or after them; like COLMAP they are left alone.
+/// else cameras were found for the stored pixels. Half turns, mirrors and turns of squares fit any size, which therefore
+/// does not say whether the cameras were found before or after them: [`turned_photo`] applies these.
 fn is_turned(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> bool {
     let turned = (stored.1, stored.0);
     (5..=8).contains(&exif) && expected == Some(turned) && stored != turned
@@ -275,10 +280,8 @@ impl<'a> PictureFile<'a> {
 
     fn decode(self, expected: Option<(u32, u32)>) -> Result<Photo, ReadError> {
         let (mut picture, info) = if self.is_png()? { self.decode_png()? } else { self.decode_jpeg()? };
-        if is_turned(info.exif, (info.width, info.height), expected)
-            && let Some(orientation) = Orientation::from_exif(info.exif)
-        {
-            picture.apply_orientation(orientation);
+        if is_turned(info.exif, (info.width, info.height), expected) {
+            picture = oriented(picture, info.exif);
         }
         let (width, height, color) = (picture.width(), picture.height(), picture.color());
         let pixels: Vec<[u8; 4]> = if color.has_color() {
@@ -299,6 +302,31 @@ impl<'a> PictureFile<'a> {
 /// applied only if it leads to that size. Another size is not an error here.
 pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Photo, ReadError> {
     PictureFile { path, bytes: &read_bytes(path, limits)?, limits }.decode(expected)
+}
+
+/// Returns a photograph turned, or mirrored, as an EXIF orientation asks.
+pub fn turned_photo(photo: Photo, exif: u8) -> Photo {
+    let Photo { width, height, rgb, alpha } = photo;
+    let alpha = alpha.map(|values| turned_gray(Gray { width, height, values }, exif).values);
+    let picture = image::RgbImage::from_raw(width, height, rgb.into_flattened());
+    let turned = oriented(picture.unwrap_or_default().into(), exif).into_rgb8();
+    let (width, height) = turned.dimensions();
+    Photo { width, height, rgb: turned.pixels().map(|pixel| pixel.0).collect(), alpha }
+}
+
+/// Returns a mask turned, or mirrored, as an EXIF orientation asks.
+pub fn turned_gray(gray: Gray, exif: u8) -> Gray {
+    let picture = image::GrayImage::from_raw(gray.width, gray.height, gray.values);
+    let turned = oriented(picture.unwrap_or_default().into(), exif).into_luma8();
+    let (width, height) = turned.dimensions();
+    Gray { width, height, values: turned.into_raw() }
+}
+
+fn oriented(mut picture: DynamicImage, exif: u8) -> DynamicImage {
+    if let Some(orientation) = Orientation::from_exif(exif) {
+        picture.apply_orientation(orientation);
+    }
+    picture
 }
 
 /// Returns a picture that lies inside another file, as [`read_photo`] would read it from one of its own.
@@ -452,6 +480,30 @@ mod tests {
             (1, (40, 30), Some((40, 30))),
         ] {
             assert!(!is_turned(exif, stored, expected), "{exif} {expected:?}");
+        }
+    }
+
+    #[test]
+    fn a_picture_is_turned_and_mirrored_as_exif_asks() {
+        // rows 1 2 3 and 4 5 6
+        let gray = |width, values: &[u8]| Gray { width, height: 6 / width, values: values.to_vec() };
+        let stored = gray(3, &[1, 2, 3, 4, 5, 6]);
+        for (exif, turned) in [
+            (1, gray(3, &[1, 2, 3, 4, 5, 6])),
+            (2, gray(3, &[3, 2, 1, 6, 5, 4])),
+            (3, gray(3, &[6, 5, 4, 3, 2, 1])),
+            (4, gray(3, &[4, 5, 6, 1, 2, 3])),
+            (6, gray(2, &[4, 1, 5, 2, 6, 3])),
+            (8, gray(2, &[3, 6, 2, 5, 1, 4])),
+            (99, gray(3, &[1, 2, 3, 4, 5, 6])),
+        ] {
+            assert_eq!(turned_gray(stored.clone(), exif), turned, "{exif}");
+            let rgb = stored.values.iter().map(|&v| [v, 0, 9]).collect();
+            let photo = Photo { width: 3, height: 2, rgb, alpha: Some(stored.values.clone()) };
+            let photo = turned_photo(photo, exif);
+            assert_eq!(photo.alpha.as_ref(), Some(&turned.values));
+            assert_eq!(photo.rgb.iter().map(|c| c[0]).collect::<Vec<u8>>(), turned.values);
+            assert_eq!((photo.width, photo.height), (turned.width, turned.height));
         }
     }
 

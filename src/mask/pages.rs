@@ -61,7 +61,7 @@ pub fn page_of(capture: &Capture, prompts: &Prompts, limits: &Limits) -> Result<
     let clicked = |i: usize| clicked.get(i).is_some_and(|points| !points.is_empty());
     let chosen = evenly(capture.views.len(), MAX_VIEWS, clicked);
     let read = |view: &View| {
-        let photo = io::read_photo(&view.photo, Some(view.photo_size), limits)?;
+        let photo = view.whole_photo(limits)?;
         PageView::new(file_path(capture, view), view.declared, &photo, SIDE_PX)
     };
     let mut views = Vec::with_capacity(chosen.len());

@@ -14,7 +14,6 @@ use crate::render::path::NamedCamera;
 use crate::rig::{self, CameraState, LEAST_SIGHTINGS, RigView, Verdict};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -24,6 +23,14 @@ pub(super) const POSES: &str = "poses.json";
 /// What to do about a camera that does not fit.
 const HINT: &str = "was the camera moved, or are two photographs swapped? Correct its pose or photograph, or remove the frame; \
                     `--set capture.cameras=given` goes on with all poses as they are";
+
+/// What to do about cameras that fit in no pose.
+const APART_HINT: &str = "are the photographs those of this capture, in the order of its cameras, and is none turned or mirrored? \
+                          Did the head or the rig move between them, or does the shutter roll? Correct photographs or poses; \
+                          `--set capture.cameras=given` goes on with all poses as they are";
+
+/// Views that are named as the worst ones.
+const WORST: usize = 3;
 
 /// The measurement of a capture's cameras.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -95,9 +102,7 @@ pub(super) fn check_cameras(photos: &RigPhotos, poses: CameraPoses) -> CameraChe
 pub(super) fn check_by(points: usize, photos: &RigPhotos, poses: CameraPoses) -> CameraCheck {
     let RigPhotos { views: captured, train, cameras: given, scene_from_world, .. } = photos;
     let ((captured, held_out), (given, given_held_out)) = (captured.split_at(*train), given.split_at(*train));
-    let views: Vec<RigView> =
-        photos.pictures[..*train].par_iter().map(|(p, head)| RigView::new(p, head)).collect();
-    let rig = rig::measure(&views, given, &photos.surface, points, poses == CameraPoses::Refine);
+    let (views, rig) = photos.measure(points, poses == CameraPoses::Refine);
     let world_from_scene = scene_from_world.inverse();
     let checked = |(view, (searched, fit)): (&&View, (&Camera, &rig::CameraFit))| {
         let pixels = f64::from(view.camera.width) / f64::from(searched.width);
@@ -145,7 +150,7 @@ fn root_mean_square(values: &[f64]) -> f64 {
 }
 
 /// Returns `8,900` for 8900.
-fn grouped(n: usize) -> String {
+pub(super) fn grouped(n: usize) -> String {
     if n < 1000 { n.to_string() } else { format!("{},{:03}", grouped(n / 1000), n % 1000) }
 }
 
@@ -160,6 +165,10 @@ impl CameraCheck {
             Verdict::Unchecked => format!(
                 "poses are not checked: too little of the head was found again in other photographs {sightings}; they \
                  are used as given"
+            ),
+            Verdict::Apart => format!(
+                "poses are {:.1} px off against each other, and stay {:.1} px off when they are refined {sightings}",
+                self.given_px, self.adjusted_px
             ),
             Verdict::Fit => format!("poses fit within {:.1} px {sightings}", self.given_px),
             Verdict::Some => {
@@ -205,7 +214,29 @@ impl CameraCheck {
             )),
             _ => None,
         };
+        if self.verdict == Verdict::Apart {
+            return vec![Error::cannot(self.apart(), APART_HINT)];
+        }
         self.cameras.iter().filter_map(problem).map(|text| Error::cannot(text, HINT)).collect()
+    }
+
+    /// Returns how cameras that fit in no pose show it.
+    fn apart(&self) -> String {
+        let total = |count: fn(&CheckedCamera) -> usize| grouped(self.cameras.iter().map(count).sum());
+        let mut worst: Vec<&CheckedCamera> = self.cameras.iter().collect();
+        worst.sort_by(|a, b| b.adjusted_px.total_cmp(&a.adjusted_px));
+        let named = |c: &&CheckedCamera| {
+            format!("`{}` ({:.1} px, {} of {})", c.view, c.adjusted_px, c.sightings, c.expected)
+        };
+        let worst: Vec<String> = worst.iter().take(WORST).map(named).collect();
+        format!(
+            "the photographs do not show what their cameras should see: {} of {} points that other photographs share are \
+             found again, and stay {:.1} px off in every pose; worst are {}",
+            total(|c| c.sightings),
+            total(|c| c.expected),
+            self.adjusted_px,
+            worst.join(", ")
+        )
     }
 
     /// Returns what is said of held-out views that could not be fitted, if there are any.

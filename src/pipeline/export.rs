@@ -318,6 +318,7 @@ mod tests {
             focus: None,
             unit_m: 1.0,
             warnings: Vec::new(),
+            readings: Vec::new(),
         };
         let export = Export::new(&capture, &made);
         KeptHead { run: "run".into(), made, capture, head, export, warnings: Vec::new() }

@@ -3,8 +3,9 @@
 //! A finished run no longer needs these files: the digests of those that have been moved are restored from its records.
 
 use super::clicks::MaskPrompts;
+use super::readings::{Settled, settle};
 use super::{mask, scene_file};
-use crate::capture::{self, Capture, CaptureOptions, View, ViewMask};
+use crate::capture::{self, Capture, CaptureOptions, Reading, View, ViewMask};
 use crate::config::{Config, MaskSource, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
@@ -39,6 +40,8 @@ pub(super) struct Inputs {
 pub(super) struct OwnMasks {
     /// One for each view.
     pub masks: Vec<ViewMask>,
+    /// The turn of each.
+    pub turns: Vec<Option<u8>>,
     /// Digest of all these masks.
     pub digest: String,
 }
@@ -59,10 +62,14 @@ const INPUTS: &str = "inputs.json";
 impl Inputs {
     /// Opens the capture and reads every file that the stages will read, to compute its digest.
     pub fn read(config: &Config, run: &Run) -> Result<(Capture, Inputs)> {
-        let options = capture_options(config);
-        let (capture, mut inputs) = match capture::open(Path::new(&config.capture.path), &options) {
+        let mut options = capture_options(config);
+        let opened = capture::open(Path::new(&config.capture.path), &options);
+        let (capture, mut inputs) = match opened.and_then(|capture| settle(capture, &options)) {
             Err(e) => restore_from_run(config, run, e)?,
-            Ok(capture) => {
+            Ok(Settled { mut capture, reading, reason, .. }) => {
+                options.reading = reading;
+                // who trains is told of what the files do not say
+                capture.warnings.extend(reason.filter(|_| reading != Some(Reading::default())));
                 capture::require_masks(&capture, &options)?;
                 let (digest, files) = capture_digest(&capture)?;
                 let kept = run.path(Stage::Mask).join(mask::CLICKS);
@@ -110,16 +117,18 @@ fn own_masks(capture: &Capture, options: &CaptureOptions) -> Result<OwnMasks> {
     let options = CaptureOptions { masks: MaskSource::Auto, ..options.clone() };
     // a capture that cannot be opened with its masks can still be used without them
     let found = capture::open(&capture.root, &options).map_or(Vec::new(), |c| c.views);
-    let mask =
-        |view: &View| found.iter().find(|v| v.name == view.name).map_or(ViewMask::None, |v| v.mask.clone());
-    let masks: Vec<ViewMask> = capture.views.iter().map(mask).collect();
+    let mask = |view: &View| {
+        let found = found.iter().find(|v| v.name == view.name);
+        found.map_or((ViewMask::None, None), |v| (v.mask.clone(), v.mask_turn))
+    };
+    let (masks, turns): (Vec<ViewMask>, Vec<Option<u8>>) = capture.views.iter().map(mask).unzip();
     let digests = masks.par_iter().map(|mask| match mask {
         ViewMask::File(path) => Ok(file_digest(path)?),
         // the photograph is already part of the capture's digest
         other => Ok(format!("{other:?}")),
     });
     let digests = digests.collect::<Result<Vec<String>>>()?;
-    Ok(OwnMasks { masks, digest: Fingerprint::of_bytes(digests.join(" ").as_bytes()) })
+    Ok(OwnMasks { masks, turns, digest: Fingerprint::of_bytes(digests.join(" ").as_bytes()) })
 }
 
 /// Returns the digest of the whole capture (cameras, splits and the bytes of every picture), and that of each part.
@@ -129,6 +138,9 @@ fn capture_digest(capture: &Capture) -> Result<(String, BTreeMap<String, String>
         .par_iter()
         .map(|view| {
             let mut text = format!("{} {:?} {:?} {}", view.name, view.split, view.camera, view.downscale);
+            if view.turn.is_some() || view.mask_turn.is_some() {
+                text += &format!(" {:?} {:?}", view.turn, view.mask_turn);
+            }
             let camera = Fingerprint::of_bytes(text.as_bytes());
             let mut inputs = vec![(format!("the camera of view `{}`", view.name), camera)];
             let mask = match &view.mask {

@@ -3,7 +3,8 @@
 use super::cameras::{CameraCheck, check_cameras};
 use super::clicks::{MaskPrompts, make_masks};
 use super::exposure::ExposureCheck;
-use super::rig_photos::RigPhotos;
+use super::readings::{Settled, settle};
+use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
 use super::scene_file;
 use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
 use crate::capture::scene::{self, Scene, SceneBox, SceneOptions, in_box};
@@ -36,9 +37,6 @@ const MIN_CONFLICT_SHARE: f64 = 0.1;
 
 /// Maximum number of masks compared with each other.
 const MAX_COMPARED: usize = 256;
-
-/// Why nothing is measured with masks of this meaning.
-const NO_SILHOUETTES: &str = "masks say what was not looked at, and not where the head ends";
 
 /// The masks, whether read or made.
 #[derive(Default)]
@@ -375,7 +373,17 @@ fn for_placing(mask: &Gray) -> Gray {
 
 /// Returns the findings of [`inspect`] for a capture, and which of its masks contradict each other.
 pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
+    // what cannot be opened is inspected all the same
+    let settled = capture::open(root, options).ok().map(|capture| settle(capture, options));
+    let (settled, refused) = settled.transpose().map_or_else(|e| (None, Some(e)), |settled| (settled, None));
+    let reading = settled.as_ref().and_then(|settled| settled.reading);
+    let options = &CaptureOptions { reading, ..options.clone() };
     let mut found = inspect(root, options);
+    if let Some(Settled { reason, doubt, .. }) = settled {
+        found.reasons.extend(reason);
+        found.warnings.extend(doubt);
+    }
+    found.problems.extend(grouped(refused.as_slice()));
     if options.mask_meaning == MaskMeaning::Ignore {
         let left = RigCheck::left_out(options.cameras, options.exposure, NO_SILHOUETTES);
         [found.fit, found.exposure] = left.announcements();

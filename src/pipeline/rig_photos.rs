@@ -8,6 +8,7 @@ use crate::geom::{Camera, Mesh, Similarity};
 use crate::image::{Gray, Photo, reduce_photo, resize_gray, working_size};
 use crate::io::Limits;
 use crate::mesh::{Volume, marching};
+use crate::rig::{self, Rig, RigView};
 use glam::Vec3;
 use rayon::prelude::*;
 
@@ -19,6 +20,9 @@ const MAX_VIEWS: usize = 256;
 
 /// Minimum number of training views: a point that two share says nothing of either.
 const MIN_VIEWS: usize = 3;
+
+/// Why nothing is measured with masks of this meaning.
+pub(super) const NO_SILHOUETTES: &str = "masks say what was not looked at, and not where the head ends";
 
 /// Photographs with masks, training views first.
 pub(super) struct RigPhotos<'c> {
@@ -45,6 +49,16 @@ impl<'c> RigPhotos<'c> {
         scene: &Scene,
         limits: &Limits,
     ) -> Result<Result<RigPhotos<'c>, String>> {
+        RigPhotos::load_at(SEARCHED_PX, capture, scene, limits)
+    }
+
+    /// Does what [`RigPhotos::load`] does, with photographs whose longest side has at most so many pixels.
+    pub fn load_at(
+        side: u32,
+        capture: &'c Capture,
+        scene: &Scene,
+        limits: &Limits,
+    ) -> Result<Result<RigPhotos<'c>, String>> {
         let split = |train: bool| capture.views.iter().filter(move |v| (v.split == Split::Train) == train);
         let all = split(true).count();
         if all > MAX_VIEWS {
@@ -66,7 +80,8 @@ impl<'c> RigPhotos<'c> {
             return Ok(Err("there is no hull of head masks".into()));
         };
         let wanted: Vec<&View> = split(true).chain(split(false).take(MAX_VIEWS)).collect();
-        let loaded = wanted.par_iter().map(|view| searched(view, limits)).collect::<Result<Vec<_>>>()?;
+        let loaded =
+            wanted.par_iter().map(|view| searched(view, side, limits)).collect::<Result<Vec<_>>>()?;
         let measured = wanted.iter().zip(loaded).filter_map(|(view, loaded)| Some((*view, loaded?)));
         let (views, pictures): (Vec<&View>, Vec<(Photo, Gray)>) = measured.unzip();
         let train = views.iter().filter(|v| v.split == Split::Train).count();
@@ -80,16 +95,25 @@ impl<'c> RigPhotos<'c> {
         let (surface, scene_from_world) = (hull_surface(hull)?, scene.scene_from_world);
         Ok(Ok(RigPhotos { views, train, pictures, cameras, surface, scene_from_world }))
     }
+
+    /// Measures how well the cameras of the training views fit each other, by so many points. Returns their
+    /// photographs as they were searched, and what was found. `all` asks for all poses to be refined.
+    pub fn measure(&self, points: usize, all: bool) -> (Vec<RigView>, Rig) {
+        let pictures = self.pictures[..self.train].par_iter();
+        let views: Vec<RigView> = pictures.map(|(photo, head)| RigView::new(photo, head)).collect();
+        let rig = rig::measure(&views, &self.cameras[..self.train], &self.surface, points, all);
+        (views, rig)
+    }
 }
 
 /// Returns a view's photograph and its mask at the size that is searched; `None` without a mask.
-fn searched(view: &View, limits: &Limits) -> Result<Option<(Photo, Gray)>> {
+fn searched(view: &View, side: u32, limits: &Limits) -> Result<Option<(Photo, Gray)>> {
     let loaded = view.load(limits)?;
     let Some(mut mask) = loaded.mask else { return Ok(None) };
     if let Some(valid) = &loaded.valid {
         mask.values.iter_mut().zip(&valid.values).for_each(|(m, v)| *m = (*m).min(*v));
     }
-    let size = working_size(view.camera.width, view.camera.height, SEARCHED_PX);
+    let size = working_size(view.camera.width, view.camera.height, side);
     Ok(Some((reduce_photo(&loaded.photo, size), resize_gray(&mask, size))))
 }
 

@@ -109,6 +109,7 @@ pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadErro
         focus: None, // the scene is placed by now
         unit_m: file.unit_m,
         warnings: Vec::new(),
+        readings: Vec::new(),
     })
 }
 
@@ -205,6 +206,8 @@ mod tests {
                 photo_size: (4, 4),
                 declared: (4, 4),
                 declared_by: String::new(),
+                turn: None,
+                mask_turn: None,
                 exposure: None,
             };
             let value =

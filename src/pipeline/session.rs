@@ -46,6 +46,7 @@ impl<'a> Session<'a> {
             // later stages read the masks that the stage `mask` makes
             for view in &mut capture.views {
                 view.mask = ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
+                view.mask_turn = None;
             }
         }
         if is_demo(config, run) {
@@ -64,9 +65,11 @@ impl<'a> Session<'a> {
     /// Returns the capture as the metrics use it: each view with the capture's own mask, if it has one.
     pub(super) fn evaluation_capture(&self) -> Capture {
         let mut capture = self.capture.clone();
-        let own = self.inputs.own_masks.iter().flat_map(|own| &own.masks);
-        for (view, own) in capture.views.iter_mut().zip(own).filter(|(_, own)| **own != ViewMask::None) {
-            view.mask = own.clone();
+        let own = self.inputs.own_masks.iter().flat_map(|own| own.masks.iter().zip(&own.turns));
+        for (view, (own, turn)) in capture.views.iter_mut().zip(own) {
+            if *own != ViewMask::None {
+                (view.mask, view.mask_turn) = (own.clone(), *turn);
+            }
         }
         capture
     }

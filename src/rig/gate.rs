@@ -26,6 +26,12 @@ const LOST_SHARE: f64 = 4.0;
 /// All cameras are refined if the residual falls below this share of what it is with the poses given.
 const GAIN: f64 = 0.8;
 
+/// Cameras fit in no pose if the residual of all stays above so many pixels, and less than this share of the points that
+/// other photographs share is found. Nine of ten are found where photographs and cameras belong together, blurred ones (whose
+/// residual is above a pixel) and poses that are 4 px off included; a third to six of ten in a wrong order, and up to eight
+/// where every photograph is a neighbor's.
+const APART: [(f64, f64); 2] = [(1.0, 0.8), (0.4, 0.65)];
+
 /// A single camera is refined if it has to move at least so far, pixels …
 const LEAST_MOVE_PX: f64 = 0.8;
 
@@ -44,6 +50,8 @@ pub enum Verdict {
     Some,
     /// All are refined.
     All,
+    /// They fit in no pose: they belong to other photographs, or what these show has changed.
+    Apart,
 }
 
 /// What is to be done about one camera.
@@ -114,6 +122,12 @@ pub(super) fn decide(
         return rig;
     }
     rig.verdict = judge(&mut rig.cameras, adjusted_px, all || adjusted_px < GAIN * given_px);
+    if is_apart(&rig.cameras, adjusted_px) {
+        rig.verdict = Verdict::Apart;
+        let refined = rig.cameras.iter_mut().filter(|c| c.state == CameraState::Refined);
+        refined.for_each(|c| c.state = CameraState::Stays);
+        return rig;
+    }
     let poses = match rig.verdict {
         Verdict::Some => alone(given, adjusted, &mut rig.tracks, &rig.cameras, adjusted_px),
         _ => adjusted,
@@ -151,6 +165,13 @@ fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> Verdict {
     }
 }
 
+/// Returns whether cameras fit in no pose, given the residual of all after the adjustment.
+fn is_apart(cameras: &[CameraFit], residual: f64) -> bool {
+    let total = |count: fn(&CameraFit) -> usize| cameras.iter().map(count).sum::<usize>() as f64;
+    let share = total(|c| c.sightings) / total(|c| c.expected).max(1.0);
+    APART.iter().any(|&(most_px, least_share)| residual > most_px && share < least_share)
+}
+
 /// Returns the poses of the cameras to refine where all others keep theirs, and moves the points of the tracks accordingly.
 fn alone(
     given: &[Camera],
@@ -166,4 +187,35 @@ fn alone(
         adjust(given, &mut cameras, tracks, &free, scale.max(LEAST_SCALE));
     }
     cameras
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cameras_of_other_photographs_are_apart_and_those_of_blurred_ones_are_not() {
+        let camera = Camera::above(4, 4, 4.0, 3.0);
+        let fit = |sightings: usize| CameraFit {
+            state: CameraState::Stays,
+            sightings,
+            expected: 100,
+            given_px: 0.0,
+            adjusted_px: 0.0,
+            moved_px: 0.0,
+            camera: camera.clone(),
+        };
+        // measured: residual in pixels and sightings of 100 points
+        for (residual, found, apart) in [
+            (0.3, 90, false), // poses that are off by 4 px, refined
+            (0.5, 91, false), // noise, blur and wrong masks besides
+            (1.2, 90, false), // blurred photographs
+            (0.2, 40, false), // hair
+            (1.8, 57, true),  // name order instead of order by number
+            (0.6, 58, true),  // the same of small photographs
+            (1.65, 77, true), // every photograph its neighbor's
+        ] {
+            assert_eq!(is_apart(&[fit(found), fit(found)], residual), apart, "{residual} {found}");
+        }
+    }
 }

@@ -41,6 +41,7 @@ mod raycast_truth;
 #[cfg(unix)]
 mod resume;
 mod round_trips;
+mod sightings;
 mod stability;
 mod supply;
 mod trained;
