@@ -61,7 +61,7 @@ use glam::{DMat3, DVec3, Vec3};
 use masks::few;
 use rayon::prelude::*;
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use view::{downscaled, wrong_size};
 
 /// Opens a capture, or returns the first thing that is wrong with it; [`inspect::inspect`] returns all.
@@ -81,6 +81,7 @@ pub fn has_cameras(root: &Path) -> bool {
 
 /// Returns the usable part of a capture, and everything that was found: problems, warnings, reasons.
 fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>, Listing) {
+    let root = &root.components().collect::<PathBuf>(); // messages join names to it: no `/` at its end
     let mut listing = Listing::default();
     let (folder, files) = match open_folder(root, options) {
         Ok(opened) => opened,
