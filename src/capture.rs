@@ -28,6 +28,7 @@ mod format;
 mod frame;
 pub mod inspect;
 mod llff;
+mod mask_values;
 mod masks;
 mod metashape;
 mod neus;
@@ -41,13 +42,15 @@ mod view;
 
 pub use crate::config::{MaskMeaning, MaskSource};
 pub use format::is_run;
+pub use mask_values::MaskReading;
+pub(crate) use mask_values::MaskSurvey;
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
 pub use scene::well_seen;
 pub(crate) use transforms::camera_like;
 pub use view::{Capture, CaptureOptions, LoadedView, Split, View, ViewMask};
 
 use crate::error::counted;
-use crate::io::{self, PictureInfo};
+use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
 use folder::{CaptureFolder, in_frame, no_views};
 use format::CameraFiles;
@@ -57,7 +60,7 @@ use masks::few;
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::Path;
-use view::{downscaled, wrong_size};
+use view::{downscaled, undone, wrong_size};
 
 /// Opens a capture, or returns the first thing that is wrong with it; [`inspect::inspect`] returns all.
 pub fn open(root: &Path, options: &CaptureOptions) -> Result<Capture> {
@@ -186,12 +189,15 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
     if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, listing) {
         listing.problems.push(problem);
     }
+    name_turned_masks(&views, &options.limits, listing);
+    let (up, rolled) = up(&views, listing.up);
+    listing.warnings.extend(rolled);
     Some(Capture {
         root: root.into(),
         name: root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned()),
         format: format.into(),
         reasons: std::mem::take(&mut listing.reasons),
-        up: up(&views, listing.up),
+        up,
         focus: listing.focus.or_else(|| scene::around_points(&views, &listing.points)),
         views,
         unit_m: options.unit_m,
@@ -241,6 +247,8 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         let found = info.size(Some(declared));
         return Err(wrong_size(&folder.shown(&photo), found, declared, &frame.file, d));
     };
+    let is_turned = photo_size != (info.width, info.height);
+    let mask_turn = (5..=8).contains(&info.exif).then(|| if is_turned { info.exif } else { undone(info.exif) });
     Ok(View {
         name,
         camera,
@@ -248,14 +256,35 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         photo,
         mask: ViewMask::None,
         mask_meaning: folder.options.mask_meaning,
+        mask_reading: MaskReading::asked(&folder.options.head),
         valid: None,
         region: None,
         downscale: d,
         photo_size,
+        mask_turn,
         declared,
         declared_by: frame.file.clone(),
         exposure: None,
     })
+}
+
+/// Says which masks lie on their side against a photograph that EXIF turns: they are turned when they are read.
+fn name_turned_masks(views: &[View], limits: &Limits, listing: &mut Listing) {
+    let is_turned = |view: &&View| match &view.mask {
+        ViewMask::File(path) if view.mask_turn.is_some() => {
+            let info = io::picture_info(path, limits); // what cannot be read is said when it is read
+            info.is_ok_and(|info| view.turns(info.size(Some(view.photo_size))))
+        }
+        _ => false,
+    };
+    let turned: Vec<&str> = views.iter().filter(is_turned).map(|view| view.name.as_str()).collect();
+    if !turned.is_empty() {
+        listing.reasons.push(format!(
+            "{} lie on their side against their photographs, and are turned as EXIF says of these: {}",
+            counted(turned.len(), "mask"),
+            few(turned)
+        ));
+    }
 }
 
 /// Named splits are kept; otherwise [`every_eighth`] view is held out.

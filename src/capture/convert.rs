@@ -11,6 +11,7 @@ use super::frame::LensModel;
 use super::view::{Capture, Split, View, ViewMask};
 use super::{every_eighth, up};
 use crate::geom::Camera;
+use crate::image::Photo;
 use crate::io::{self, Limits};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -80,7 +81,16 @@ impl Content<'_> {
         Ok(match self {
             Content::File(from) => io::read_maybe_empty(from, &Limits::default())?,
             Content::Mask(from, size) => {
-                io::png_gray_bytes(&io::read_gray(from, Some(*size), &Limits::default())?, target)?
+                let mask = io::read_mask(from, Some(*size), &Limits::default())?;
+                let is_gray = mask.alpha.is_some() || mask.rgb.iter().all(|[r, g, b]| r == g && g == b);
+                match is_gray {
+                    true => io::png_gray_bytes(&mask.gray(), target)?,
+                    // which of its colors are the head is said by whoever opens the new capture
+                    false => {
+                        let (width, height, rgb) = (mask.width, mask.height, mask.rgb);
+                        io::png_bytes(&Photo { width, height, rgb, alpha: None }, target)?
+                    }
+                }
             }
             Content::Bytes(bytes) => bytes.clone(),
         })

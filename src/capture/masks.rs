@@ -2,6 +2,7 @@
 
 use super::folder::CaptureFolder;
 use super::frame::{CameraFrame, Listing};
+use super::mask_values::MAX_BLACK;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{MaskMeaning, MaskSource};
 use crate::error::counted;
@@ -9,9 +10,6 @@ use crate::image::{Gray, Photo};
 use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
-
-/// Maximum value of a pixel that counts as black.
-const MAX_BLACK: u8 = 16;
 
 /// Returns names for a message: at most six, then the number of others.
 pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {
