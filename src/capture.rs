@@ -38,6 +38,7 @@ pub mod scene;
 pub mod sfm;
 pub mod synthetic;
 mod transforms;
+mod upright;
 mod view;
 
 pub use crate::config::{MaskMeaning, MaskSource};
@@ -248,7 +249,8 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         return Err(wrong_size(&folder.shown(&photo), found, declared, &frame.file, d));
     };
     let is_turned = photo_size != (info.width, info.height);
-    let mask_turn = (5..=8).contains(&info.exif).then(|| if is_turned { info.exif } else { undone(info.exif) });
+    let mask_turn =
+        (5..=8).contains(&info.exif).then(|| if is_turned { info.exif } else { undone(info.exif) });
     Ok(View {
         name,
         camera,
@@ -317,52 +319,19 @@ fn every_eighth<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Split> {
     splits
 }
 
-/// Up in the world: as the dataset says, else as the cameras stand.
-fn up(views: &[View], named: Option<DVec3>) -> Vec3 {
+/// Up in the world, as the dataset says, else as the cameras stand; and a warning if the cameras are rolled.
+fn up(views: &[View], named: Option<DVec3>) -> (Vec3, Option<String>) {
     if let Some(up) = named {
-        return up.normalize().as_vec3();
+        return (up.normalize().as_vec3(), None);
     }
-    let up = upward(views.iter().map(|v| v.camera.rotation));
+    let cameras: Vec<DMat3> = views.iter().map(|v| v.camera.rotation).collect();
+    let (up, rolled) = upright::upward(&cameras);
     let axes = [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|a| [a, -a]);
     let near = axes.into_iter().find(|a| a.dot(up) > 20f64.to_radians().cos());
-    near.unwrap_or(up).as_vec3()
-}
-
-/// Returns the direction perpendicular to the right axes of cameras: those of a level camera are horizontal, however much it
-/// looks down. Where all look the same way, it is the mean of their ups, which is tilted by how much they look down.
-fn upward(cameras: impl Iterator<Item = DMat3> + Clone) -> DVec3 {
-    /// Weight of the mean.
-    const MEAN: f64 = 0.01;
-    let mean: DVec3 = cameras.clone().map(|c| c.y_axis).sum();
-    let n = cameras.clone().count() as f64;
-    // cameras whose ups cancel say nothing; +Y is what most formats mean
-    let Some(mean) = mean.try_normalize().filter(|_| mean.length() > 1e-6 * n) else { return DVec3::Y };
-    let square =
-        |c: DMat3| DMat3::from_cols(c.x_axis * c.x_axis.x, c.x_axis * c.x_axis.y, c.x_axis * c.x_axis.z);
-    let spread = cameras.map(square).fold(MEAN * n * DMat3::IDENTITY, |sum, s| sum + s);
-    (spread.inverse() * mean).normalize()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn up_is_found_in_any_world_although_cameras_in_front_look_down() {
-        let world = DMat3::from_rotation_x(0.7) * DMat3::from_rotation_z(-0.5);
-        let looking_down = |azimuth: f64| {
-            world * DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-25f64.to_radians())
-        };
-        let off =
-            |cameras: &[DMat3]| upward(cameras.iter().copied()).angle_between(world * DVec3::Y).to_degrees();
-        let ring: Vec<DMat3> = (-8..=8).map(|i| looking_down(0.15 * f64::from(i))).collect();
-        assert!(off(&ring) < 1.0, "{}", off(&ring));
-        // the mean of their ups, where nothing else is known
-        assert!((off(&[looking_down(0.0); 3]) - 25.0).abs() < 1e-6);
-        // cameras that stand on their heads cancel the others
-        assert_eq!(
-            upward([DMat3::IDENTITY, DMat3::from_rotation_z(std::f64::consts::PI)].into_iter()),
-            DVec3::Y
-        );
-    }
+    let warning = (rolled > 0).then(|| {
+        let (n, all) = (rolled, views.len());
+        let half = if 2 * n > all { "; should it be upside down, name it with `up` in `transforms.json`" } else { "" };
+        format!("{n} of {all} cameras are rolled by a quarter turn or more; up is where most image axes are level{half}")
+    });
+    (near.unwrap_or(up).as_vec3(), warning)
 }

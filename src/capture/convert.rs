@@ -323,7 +323,7 @@ fn transforms(capture: &Capture, places: &[ViewFiles], named_splits: bool) -> Re
     };
     let mut top = if shared { lenses[0].clone() } else { Map::new() };
     // the reader derives it from the cameras, unless the dataset names another
-    if up(&capture.views, None) != capture.up {
+    if up(&capture.views, None).0 != capture.up {
         top.insert("up".into(), json!(capture.up.as_dvec3()));
     }
     top.insert("frames".into(), places.iter().zip(&lenses).map(frame).collect());
@@ -336,7 +336,7 @@ fn sparse(
     named_splits: bool,
     warnings: &mut Vec<String>,
 ) -> Result<Files> {
-    let guessed = up(&capture.views, None);
+    let (guessed, _) = up(&capture.views, None);
     if guessed != capture.up {
         let taken = format!("readers will use {guessed} instead of {}", capture.up);
         warnings.push(format!("COLMAP has no up direction: {taken}"));

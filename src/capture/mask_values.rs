@@ -192,7 +192,8 @@ impl MaskValues {
                 run = Tally::default();
             }
             run.color = color;
-            (run.pixels, run.votes, run.even) = (run.pixels + 1, run.votes + 1, run.even + u64::from(is_even));
+            (run.pixels, run.votes, run.even) =
+                (run.pixels + 1, run.votes + 1, run.even + u64::from(is_even));
         }
         if run.pixels > 0 {
             tallies[usize::from(key(run.color))].add(run);
@@ -259,7 +260,8 @@ impl MaskSurvey {
         }
         let black = max_black(&all);
         let seen: Vec<Tally> = all.iter().filter(|t| brightest(t.color) > black).copied().collect();
-        let count = |is: &dyn Fn(&Tally) -> bool| seen.iter().filter(|t| is(t)).map(|t| t.pixels).sum::<u64>();
+        let count =
+            |is: &dyn Fn(&Tally) -> bool| seen.iter().filter(|t| is(t)).map(|t| t.pixels).sum::<u64>();
         let (visible, colored) = (count(&|_| true), count(&|t| chroma(t.color) > MAX_CHROMA));
         if visible == 0 {
             return Ok(MaskReading::White); // that they are empty is said elsewhere
@@ -295,9 +297,13 @@ impl MaskSurvey {
         match reading {
             MaskReading::Drawn(color) => {
                 let shown = color_text(*color);
-                said.push(format!("masks are drawn in {shown} on black, without white: {shown} is taken for white"));
+                said.push(format!(
+                    "masks are drawn in {shown} on black, without white: {shown} is taken for white"
+                ));
             }
-            MaskReading::Above(_) => said.push("all that is not black in masks is head, by `mask.head`".into()),
+            MaskReading::Above(_) => {
+                said.push("all that is not black in masks is head, by `mask.head`".into())
+            }
             MaskReading::Values(values) => {
                 let values = String::from(MaskHead::Values(values.clone()));
                 said.push(format!("mask values {values} are head, by `mask.head`"));

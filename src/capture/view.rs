@@ -365,7 +365,8 @@ impl View {
         } else {
             format!("make masks at the size of their photographs, {pw} × {ph} pixels")
         };
-        let problem = format_args!("the mask `{picture}` is {w} × {h} pixels, its photograph `{photo}` {pw} × {ph}");
+        let problem =
+            format_args!("the mask `{picture}` is {w} × {h} pixels, its photograph `{photo}` {pw} × {ph}");
         Error::cannot(problem, hint)
     }
 }

@@ -157,9 +157,7 @@ impl From<MaskHead> for String {
         match head {
             MaskHead::White => "white".into(),
             MaskHead::NotBlack => "not-black".into(),
-            MaskHead::Values(values) => {
-                values.iter().map(HeadValue::to_string).collect::<Vec<_>>().join(",")
-            }
+            MaskHead::Values(values) => values.iter().map(HeadValue::to_string).collect::<Vec<_>>().join(","),
         }
     }
 }

@@ -12,8 +12,8 @@ use super::session::Session;
 use crate::capture::View;
 use crate::config::iface::FieldKind;
 use crate::config::{
-    CameraPoses, ColorSource, Config, Exposures, IfaceConfig, MaskHead, MaskSource, Material, Method, Preset, Stage,
-    VmBackground, VmConfig,
+    CameraPoses, ColorSource, Config, Exposures, IfaceConfig, MaskHead, MaskSource, Material, Method, Preset,
+    Stage, VmBackground, VmConfig,
 };
 use crate::kernel::cpu::hash;
 use crate::run::{Cost, ESTIMATE, Estimate, Fingerprint, Plan, read_record, read_status};
