@@ -367,8 +367,12 @@ fn shown(file: &Path, root: &Path) -> String {
     file.strip_prefix(root).unwrap_or(file).display().to_string()
 }
 
+/// Returns whether any white shows, more than the noise of JPEG makes of an almost white gray.
 fn has_white(tallies: &[Tally]) -> bool {
-    tallies.iter().any(|t| brightest(t.color) >= OPAQUE_ALPHA && chroma(t.color) <= MAX_CHROMA)
+    let is_white = |t: &&Tally| brightest(t.color) >= OPAQUE_ALPHA && chroma(t.color) <= MAX_CHROMA;
+    let white: u64 = tallies.iter().filter(is_white).map(|t| t.pixels).sum();
+    let visible: u64 = tallies.iter().filter(|t| brightest(t.color) > MAX_BLACK).map(|t| t.pixels).sum();
+    white > 0 && 1000 * white >= visible
 }
 
 /// Returns the gray that one file is drawn in instead of white, if it covers a hundredth of the picture.
@@ -419,9 +423,115 @@ fn drawn_in(tallies: &[Tally], black: u8) -> Option<[u8; 3]> {
     if pixels(&same) < share * all || even(&same) < MIN_PLATEAU * all_even {
         return None;
     }
-    let is_second = |t: &&Tally| {
-        let share = if t.is_exact() && off_line(t.color, color) > OFF_LINE { 0.005 } else { 0.04 };
-        t.even as f64 > share * all_even
-    };
-    (!others.iter().any(is_second)).then_some(color)
+    let (beside, along): (Vec<&Tally>, Vec<&Tally>) =
+        others.into_iter().partition(|t| off_line(t.color, color) > OFF_LINE);
+    let is_area = |t: &Tally, share: f64| t.even as f64 > share * all_even;
+    let has_second = beside.iter().any(|t| t.is_exact() && is_area(t, 0.005))
+        || even(&beside) > 0.03 * all_even
+        || along.iter().any(|t| is_area(t, 0.04));
+    (!has_second).then_some(color)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A file of 40 × 40 pixels: a frame of black, then rows of these colors.
+    fn file(rows: &[[u8; 3]]) -> MaskPicture {
+        let color = |i: usize| {
+            let (x, y) = (i % 40, i / 40);
+            if (8..32).contains(&x) && (8..32).contains(&y) {
+                rows[(y - 8) * rows.len() / 24]
+            } else {
+                [0; 3]
+            }
+        };
+        let rgb = (0..1600).map(color).collect();
+        MaskPicture { width: 40, height: 40, rgb, alpha: None, palette: Vec::new() }
+    }
+
+    fn surveyed(files: &[MaskPicture]) -> MaskSurvey {
+        let mut survey = MaskSurvey::default();
+        for (i, picture) in files.iter().enumerate() {
+            survey.add(Path::new(&format!("/a/masks/{i}.png")), MaskValues::of(picture), None);
+        }
+        survey
+    }
+
+    fn reading(files: &[MaskPicture]) -> Result<MaskReading> {
+        surveyed(files).reading(&MaskHead::White, Path::new("/a"))
+    }
+
+    fn refusal(files: &[MaskPicture]) -> String {
+        reading(files).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn pixels_of_nearly_one_color_vote_for_the_most_frequent_one() {
+        let values = MaskValues::of(&file(&[[9; 3], [80, 0, 255], [81, 1, 254], [80, 0, 255]]));
+        // 24 columns of 6 rows each: 12 rows of (80, 0, 255), 6 of (81, 1, 254) in one tally
+        let (_, color) = values.tallies.iter().find(|(_, t)| brightest(t.color) > 200).unwrap();
+        assert_eq!((color.pixels, color.votes, color.color), (24 * 18, 24 * 6, [80, 0, 255]));
+        assert!(!color.is_exact() && values.tallies.iter().any(|(key, t)| *key == 9 && t.is_exact()));
+    }
+
+    #[test]
+    fn one_label_in_each_file_is_no_mask_drawn_in_one_gray() {
+        let (one, two) = (file(&[[1; 3]]), file(&[[2; 3]]));
+        assert_eq!(reading(std::slice::from_ref(&one)).unwrap(), MaskReading::Drawn([1; 3]));
+        assert!(refusal(&[one, two]).contains("gray 1, gray 2"));
+    }
+
+    #[test]
+    fn grays_and_colors_beside_each_other_are_values_and_soft_edges_are_not() {
+        let drawn = |color| Ok(MaskReading::Drawn(color));
+        for color in [[80, 0, 255], [128, 128, 128], [0, 64, 0]] {
+            let soft: Vec<[u8; 3]> =
+                (0..24).map(|y: u16| color.map(|c| (u16::from(c) * (y + 1).min(6) / 6) as u8)).collect();
+            assert_eq!(reading(&[file(&[color]), file(&soft)]), drawn(color));
+        }
+        for rows in [[[128; 3], [200; 3]], [[128, 0, 0], [0, 128, 0]], [[255; 3], [80, 0, 255]]] {
+            assert!(refusal(&[file(&rows)]).contains("`masks/0.png` and others hold"), "{rows:?}");
+        }
+        let shades: Vec<[u8; 3]> = (0..24).map(|y| [200 - 6 * y, 120 - 3 * y, 90 - 2 * y]).collect();
+        assert!(refusal(&[file(&shades)]).contains("as photographs have"));
+    }
+
+    #[test]
+    fn opacity_beside_white_stays_opacity() {
+        let soft: Vec<[u8; 3]> = (0..24).map(|y| [255 - 10 * y; 3]).collect();
+        assert_eq!(reading(&[file(&soft), file(&[[255; 3]]), file(&[[0; 3]])]), Ok(MaskReading::White));
+        let trimap = [file(&[[255; 3], [128; 3]])];
+        assert_eq!(reading(&trimap), Ok(MaskReading::White));
+        let said = surveyed(&trimap).reasons(&MaskReading::White);
+        assert!(matches!(&said[..], [text] if text.contains("gray 128")), "{said:?}");
+        assert_eq!(reading(&[]), Ok(MaskReading::White));
+        assert!(
+            refusal(&[file(&[[255; 3]]), file(&[[128; 3]])]).contains("`masks/1.png` is drawn in gray 128")
+        );
+    }
+
+    #[test]
+    fn opacity_is_how_far_a_color_lies_towards_the_one_taken_for_white() {
+        // (40, 0, 127) · (80, 0, 255) = 35,585 of 71,425: 0.4982 of 255 is 127.04
+        assert_eq!(projected([40, 0, 127], [80, 0, 255]), 127);
+        assert_eq!(projected([80, 0, 255], [80, 0, 255]), 255);
+        assert_eq!((projected([12, 0, 14], [80, 0, 255]), projected([1; 3], [1; 3])), (0, 255));
+        assert_eq!(projected([255; 3], [128; 3]), 255);
+    }
+
+    #[test]
+    fn numbers_are_indices_of_colored_palettes_and_grays_elsewhere() {
+        let mut picture = file(&[[128, 0, 0], [0, 128, 0], [1; 3], [7; 3]]);
+        let count = |picture: &MaskPicture, values: &str| {
+            let asked = MaskReading::asked(&MaskHead::try_from(values.to_string()).unwrap());
+            asked.read(picture.clone()).values.iter().filter(|&&v| v == 255).count() / (24 * 6)
+        };
+        assert_eq!((count(&picture, "1"), count(&picture, "1,7"), count(&picture, "#800000")), (1, 2, 1));
+        picture.palette = vec![[0; 3], [128, 0, 0], [0, 128, 0]];
+        assert_eq!((count(&picture, "1"), count(&picture, "1,2,9"), count(&picture, "not-black")), (1, 2, 2));
+        // what is transparent is no head
+        picture.alpha = Some(vec![0; 1600]);
+        assert_eq!((count(&picture, "1"), count(&picture, "not-black")), (0, 0));
+    }
 }

@@ -149,8 +149,8 @@ impl<'a> Session<'a> {
         }
         let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
         let (check, exposure) = (self.camera_check()?, self.exposure()?);
-        let cameras =
-            scene_file::cameras_json(&self.read_capture()?, &scene, check.as_ref(), exposure.as_ref());
+        let capture = self.read_capture()?;
+        let cameras = scene_file::cameras_json(&capture, &scene, check.as_ref(), exposure.as_ref());
         self.write("cameras.json", &cameras, idle)
     }
 
