@@ -484,11 +484,10 @@ mod tests {
 
     #[test]
     fn grays_and_colors_beside_each_other_are_values_and_soft_edges_are_not() {
-        let drawn = |color| Ok(MaskReading::Drawn(color));
         for color in [[80, 0, 255], [128, 128, 128], [0, 64, 0]] {
             let soft: Vec<[u8; 3]> =
                 (0..24).map(|y: u16| color.map(|c| (u16::from(c) * (y + 1).min(6) / 6) as u8)).collect();
-            assert_eq!(reading(&[file(&[color]), file(&soft)]), drawn(color));
+            assert_eq!(reading(&[file(&[color]), file(&soft)]).unwrap(), MaskReading::Drawn(color));
         }
         for rows in [[[128; 3], [200; 3]], [[128, 0, 0], [0, 128, 0]], [[255; 3], [80, 0, 255]]] {
             assert!(refusal(&[file(&rows)]).contains("`masks/0.png` and others hold"), "{rows:?}");
@@ -500,12 +499,13 @@ mod tests {
     #[test]
     fn opacity_beside_white_stays_opacity() {
         let soft: Vec<[u8; 3]> = (0..24).map(|y| [255 - 10 * y; 3]).collect();
-        assert_eq!(reading(&[file(&soft), file(&[[255; 3]]), file(&[[0; 3]])]), Ok(MaskReading::White));
+        let files = [file(&soft), file(&[[255; 3]]), file(&[[0; 3]])];
+        assert_eq!(reading(&files).unwrap(), MaskReading::White);
         let trimap = [file(&[[255; 3], [128; 3]])];
-        assert_eq!(reading(&trimap), Ok(MaskReading::White));
+        assert_eq!(reading(&trimap).unwrap(), MaskReading::White);
         let said = surveyed(&trimap).reasons(&MaskReading::White);
         assert!(matches!(&said[..], [text] if text.contains("gray 128")), "{said:?}");
-        assert_eq!(reading(&[]), Ok(MaskReading::White));
+        assert_eq!(reading(&[]).unwrap(), MaskReading::White);
         assert!(
             refusal(&[file(&[[255; 3]]), file(&[[128; 3]])]).contains("`masks/1.png` is drawn in gray 128")
         );
