@@ -290,6 +290,9 @@ impl MaskSurvey {
     /// Returns what is worth saying of masks that are read in this way.
     pub fn reasons(&self, reading: &MaskReading) -> Vec<String> {
         let mut said = Vec::new();
+        if self.files == 0 {
+            return said;
+        }
         if self.with_alpha > 0 {
             let files = counted(self.with_alpha, "mask file");
             said.push(format!("the alpha channel of {files} is the mask; colors are ignored"));

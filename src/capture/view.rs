@@ -173,7 +173,9 @@ impl Capture {
     pub fn settle_masks(&mut self, head: &MaskHead, limits: &Limits) -> Result<()> {
         self.read_masks_as(&MaskReading::asked(head));
         let mut survey = MaskSurvey::default();
-        for views in self.views.chunks(8) {
+        let is_file = |view: &&View| matches!(view.mask, ViewMask::File(_));
+        let masked: Vec<&View> = self.views.iter().filter(is_file).collect();
+        for views in masked.chunks(8) {
             let found = views.par_iter().map(|view| -> Result<_> {
                 let mut values = None;
                 let mask = view.load_mask_examined(limits, Some(&mut values))?;
