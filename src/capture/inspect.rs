@@ -253,14 +253,17 @@ fn load_all(capture: &Capture, options: &CaptureOptions) -> (Vec<Result<ViewPixe
         let valid_share = loaded.valid.as_ref().map(masks::coverage);
         Ok((ViewPixels { mask, judged, valid_share, photo }, values))
     };
-    let loaded: Vec<Result<_, Error>> = capture.views.par_iter().map(load).collect();
-    let mut survey = MaskSurvey::default();
-    let views = capture.views.iter().zip(loaded).map(|(view, loaded)| {
-        let (pixels, values) = loaded?;
-        view.survey(values, pixels.mask.as_ref(), &mut survey);
-        Ok(pixels)
-    });
-    (views.collect(), survey)
+    let (mut all, mut survey) = (Vec::new(), MaskSurvey::default());
+    // the values of a few masks at a time: those of noise are many
+    for views in capture.views.chunks(64) {
+        let loaded: Vec<Result<_, Error>> = views.par_iter().map(load).collect();
+        all.extend(views.iter().zip(loaded).map(|(view, loaded)| {
+            let (pixels, values) = loaded?;
+            view.survey(values, pixels.mask.as_ref(), &mut survey);
+            Ok(pixels)
+        }));
+    }
+    (all, survey)
 }
 
 /// Loads every view as its mask is to be read; returns the masks at a size that is enough to place the head.
