@@ -28,6 +28,7 @@ mod format;
 mod frame;
 pub mod inspect;
 mod llff;
+mod mask_values;
 mod masks;
 mod metashape;
 mod neus;
@@ -41,10 +42,13 @@ pub mod sfm;
 pub mod synthetic;
 mod table;
 mod transforms;
+mod upright;
 mod view;
 
 pub use crate::config::{MaskMeaning, MaskSource};
 pub use format::is_run;
+pub use mask_values::MaskReading;
+pub(crate) use mask_values::MaskSurvey;
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
 pub(crate) use order::by_number;
 pub use scene::well_seen;
@@ -52,7 +56,7 @@ pub(crate) use transforms::camera_like;
 pub use view::{Capture, CaptureOptions, LoadedView, Reading, Split, View, ViewMask};
 
 use crate::error::counted;
-use crate::io::{self, PictureInfo};
+use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
 use folder::{CaptureFolder, in_frame, no_views};
 use format::CameraFiles;
@@ -62,7 +66,7 @@ use masks::few;
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use view::{downscaled, wrong_size};
+use view::{downscaled, undone, wrong_size};
 
 /// Opens a capture, or returns the first thing that is wrong with it; [`inspect::inspect`] returns all.
 pub fn open(root: &Path, options: &CaptureOptions) -> Result<Capture> {
@@ -218,12 +222,15 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         Some(_) => Vec::new(),
         None => readings(listing, !open_turns.is_empty(), has_files),
     };
+    name_turned_masks(&views, &options.limits, listing);
+    let (up, rolled) = up(&views, listing.up);
+    listing.warnings.extend(rolled);
     Some(Capture {
         root: root.into(),
         name: root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned()),
         format: format.into(),
         reasons: std::mem::take(&mut listing.reasons),
-        up: up(&views, listing.up),
+        up,
         focus: listing.focus.or_else(|| scene::around_points(&views, &listing.points)),
         views,
         unit_m: options.unit_m,
@@ -302,6 +309,9 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         let found = info.size(Some(declared));
         return Err(wrong_size(&folder.shown(&photo), found, declared, &frame.file, d));
     };
+    let is_turned = photo_size != (info.width, info.height);
+    let side_turn =
+        (5..=8).contains(&info.exif).then(|| if is_turned { info.exif } else { undone(info.exif) });
     Ok(View {
         name,
         camera,
@@ -309,16 +319,37 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         photo,
         mask: ViewMask::None,
         mask_meaning: folder.options.mask_meaning,
+        mask_reading: MaskReading::asked(&folder.options.head),
         valid: None,
         region: None,
         downscale: d,
         photo_size,
+        side_turn,
         declared,
         declared_by: frame.file.clone(),
         turn: turn(turned),
         mask_turn: turn(masks_turned),
         exposure: None,
     })
+}
+
+/// Says which masks lie on their side against a photograph that EXIF turns: they are turned when they are read.
+fn name_turned_masks(views: &[View], limits: &Limits, listing: &mut Listing) {
+    let is_turned = |view: &&View| match &view.mask {
+        ViewMask::File(path) if view.side_turn.is_some() => {
+            let info = io::picture_info(path, limits); // what cannot be read is said when it is read
+            info.is_ok_and(|info| view.turns(info.size(Some(view.photo_size))))
+        }
+        _ => false,
+    };
+    let turned: Vec<&str> = views.iter().filter(is_turned).map(|view| view.name.as_str()).collect();
+    if !turned.is_empty() {
+        listing.reasons.push(format!(
+            "{} lie on their side against their photographs, and are turned as EXIF says of these: {}",
+            counted(turned.len(), "mask"),
+            few(turned)
+        ));
+    }
 }
 
 /// Named splits are kept; otherwise [`every_eighth`] view is held out.
@@ -351,52 +382,19 @@ fn every_eighth<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Split> {
     splits
 }
 
-/// Up in the world: as the dataset says, else as the cameras stand.
-fn up(views: &[View], named: Option<DVec3>) -> Vec3 {
+/// Up in the world, as the dataset says, else as the cameras stand; and a warning if the cameras are rolled.
+fn up(views: &[View], named: Option<DVec3>) -> (Vec3, Option<String>) {
     if let Some(up) = named {
-        return up.normalize().as_vec3();
+        return (up.normalize().as_vec3(), None);
     }
-    let up = upward(views.iter().map(|v| v.camera.rotation));
+    let cameras: Vec<DMat3> = views.iter().map(|v| v.camera.rotation).collect();
+    let (up, rolled) = upright::upward(&cameras);
     let axes = [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|a| [a, -a]);
     let near = axes.into_iter().find(|a| a.dot(up) > 20f64.to_radians().cos());
-    near.unwrap_or(up).as_vec3()
-}
-
-/// Returns the direction perpendicular to the right axes of cameras: those of a level camera are horizontal, however much it
-/// looks down. Where all look the same way, it is the mean of their ups, which is tilted by how much they look down.
-fn upward(cameras: impl Iterator<Item = DMat3> + Clone) -> DVec3 {
-    /// Weight of the mean.
-    const MEAN: f64 = 0.01;
-    let mean: DVec3 = cameras.clone().map(|c| c.y_axis).sum();
-    let n = cameras.clone().count() as f64;
-    // cameras whose ups cancel say nothing; +Y is what most formats mean
-    let Some(mean) = mean.try_normalize().filter(|_| mean.length() > 1e-6 * n) else { return DVec3::Y };
-    let square =
-        |c: DMat3| DMat3::from_cols(c.x_axis * c.x_axis.x, c.x_axis * c.x_axis.y, c.x_axis * c.x_axis.z);
-    let spread = cameras.map(square).fold(MEAN * n * DMat3::IDENTITY, |sum, s| sum + s);
-    (spread.inverse() * mean).normalize()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn up_is_found_in_any_world_although_cameras_in_front_look_down() {
-        let world = DMat3::from_rotation_x(0.7) * DMat3::from_rotation_z(-0.5);
-        let looking_down = |azimuth: f64| {
-            world * DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-25f64.to_radians())
-        };
-        let off =
-            |cameras: &[DMat3]| upward(cameras.iter().copied()).angle_between(world * DVec3::Y).to_degrees();
-        let ring: Vec<DMat3> = (-8..=8).map(|i| looking_down(0.15 * f64::from(i))).collect();
-        assert!(off(&ring) < 1.0, "{}", off(&ring));
-        // the mean of their ups, where nothing else is known
-        assert!((off(&[looking_down(0.0); 3]) - 25.0).abs() < 1e-6);
-        // cameras that stand on their heads cancel the others
-        assert_eq!(
-            upward([DMat3::IDENTITY, DMat3::from_rotation_z(std::f64::consts::PI)].into_iter()),
-            DVec3::Y
-        );
-    }
+    let warning = (rolled > 0).then(|| {
+        let (n, all) = (rolled, views.len());
+        let half = if 2 * n > all { "; should it be upside down, name it with `up` in `transforms.json`" } else { "" };
+        format!("{n} of {all} cameras are rolled by a quarter turn or more; up is where most image axes are level{half}")
+    });
+    (near.unwrap_or(up).as_vec3(), warning)
 }

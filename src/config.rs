@@ -19,8 +19,8 @@ mod vm;
 
 pub use iface::IfaceConfig;
 pub use mask::{
-    CameraPoses, CaptureConfig, CutMethod, Exposures, MaskConfig, MaskMeaning, MaskSource, MattingMethod,
-    VitmatteColors,
+    CameraPoses, CaptureConfig, CutMethod, Exposures, HeadValue, MaskConfig, MaskHead, MaskMeaning,
+    MaskSource, MattingMethod, VitmatteColors,
 };
 pub use mesh::{ColorSource, Genus, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use render::{

@@ -8,6 +8,7 @@ mod animation;
 mod exr;
 mod folder;
 mod json;
+mod mask_picture;
 mod npy;
 mod pictures;
 mod process;
@@ -24,11 +25,11 @@ pub use folder::{
     real_path, remove_empty_folder, similar,
 };
 pub use json::{parse_json, read_json, read_typed, typed};
+pub use mask_picture::{MaskPicture, read_gray, read_mask};
 pub use npy::{Npy, NpyValues, npy_bytes, parse_npy, read_npy, read_npz};
 pub use pictures::{
     PictureInfo, jpeg_bytes, parse_photo, parse_picture_info, picture_info, png_bytes, png_gray_bytes,
-    read_gray, read_photo, turned_gray, turned_photo, write_png_gray, write_png_gray16, write_png_rgb,
-    write_png_rgba,
+    read_photo, turned_gray, turned_photo, write_png_gray, write_png_gray16, write_png_rgb, write_png_rgba,
 };
 pub use process::{
     cpu_seconds, forget_peak_memory, give_memory_back, has_ended, has_open, peak_memory, processor,

@@ -119,7 +119,7 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
             let has_mesh = session.order(Stage::Metrics).contains(&Stage::Mesh);
             let demo = has_mesh && session::is_demo(config, run);
             let surface = demo.then(|| mesh::surface_in_world(run)).transpose()?;
-            let evaluated = session.evaluation_capture();
+            let evaluated = session.evaluation_capture()?;
             let masks = session.mask_source(&evaluated);
             let exposure = session.exposure()?;
             metrics::metrics(&evaluated, config, run, masks, surface.as_ref(), exposure.as_ref(), dir)

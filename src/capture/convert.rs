@@ -11,6 +11,7 @@ use super::frame::LensModel;
 use super::view::{Capture, Split, View, ViewMask};
 use super::{every_eighth, up};
 use crate::geom::Camera;
+use crate::image::Photo;
 use crate::io::{self, Limits};
 use crate::{Error, Result};
 use rayon::prelude::*;
@@ -80,7 +81,16 @@ impl Content<'_> {
         Ok(match self {
             Content::File(from) => io::read_maybe_empty(from, &Limits::default())?,
             Content::Mask(from, size) => {
-                io::png_gray_bytes(&io::read_gray(from, Some(*size), &Limits::default())?, target)?
+                let mask = io::read_mask(from, Some(*size), &Limits::default())?;
+                let is_gray = mask.alpha.is_some() || mask.rgb.iter().all(|[r, g, b]| r == g && g == b);
+                match is_gray {
+                    true => io::png_gray_bytes(&mask.gray(), target)?,
+                    // which of its colors are the head is said by whoever opens the new capture
+                    false => {
+                        let (width, height, rgb) = (mask.width, mask.height, mask.rgb);
+                        io::png_bytes(&Photo { width, height, rgb, alpha: None }, target)?
+                    }
+                }
             }
             Content::Bytes(bytes) => bytes.clone(),
         })
@@ -313,7 +323,7 @@ fn transforms(capture: &Capture, places: &[ViewFiles], named_splits: bool) -> Re
     };
     let mut top = if shared { lenses[0].clone() } else { Map::new() };
     // the reader derives it from the cameras, unless the dataset names another
-    if up(&capture.views, None) != capture.up {
+    if up(&capture.views, None).0 != capture.up {
         top.insert("up".into(), json!(capture.up.as_dvec3()));
     }
     top.insert("frames".into(), places.iter().zip(&lenses).map(frame).collect());
@@ -326,7 +336,7 @@ fn sparse(
     named_splits: bool,
     warnings: &mut Vec<String>,
 ) -> Result<Files> {
-    let guessed = up(&capture.views, None);
+    let (guessed, _) = up(&capture.views, None);
     if guessed != capture.up {
         let taken = format!("readers will use {guessed} instead of {}", capture.up);
         warnings.push(format!("COLMAP has no up direction: {taken}"));

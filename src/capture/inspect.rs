@@ -2,6 +2,7 @@
 
 use super::frame::Agreement;
 use super::gather;
+use super::mask_values::{MaskReading, MaskSurvey};
 use super::masks::{self, few};
 use super::photo_checks::{self, PhotoCheck};
 use super::scene::{self, Scene, SceneOptions};
@@ -145,6 +146,9 @@ pub struct Inspection {
     /// The head's box and hull.
     #[serde(skip)]
     pub placed: Option<Scene>,
+    /// How the mask files are read; `None` if they do not say what is head, or nothing was read.
+    #[serde(skip)]
+    pub mask_reading: Option<MaskReading>,
     /// What stops the work.
     pub problems: Vec<Problem>,
     /// Warnings, which do not stop the work.
@@ -179,12 +183,12 @@ pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
         problems: grouped(&listing.problems),
         ..Inspection::default()
     };
-    let Some(capture) = capture else { return out };
+    let Some(mut capture) = capture else { return out };
     out.reasons = capture.reasons.clone();
     out.warnings = capture.warnings.clone();
     out.up = Some(capture.up);
     cameras(&capture, &mut out);
-    let mut masks = pixels(&capture, options, &mut out);
+    let mut masks = pixels(&mut capture, options, &mut out);
     if options.mask_meaning == MaskMeaning::Ignore {
         masks.fill(None); // what a mask calls "not looked at" may still hold head
     }
@@ -223,40 +227,76 @@ fn cameras(capture: &Capture, out: &mut Inspection) {
     }
 }
 
-/// Loads every view; returns the masks at a size that is enough to place the head.
-fn pixels(capture: &Capture, options: &CaptureOptions, out: &mut Inspection) -> Vec<Option<Gray>> {
-    let loaded: Vec<Result<_, Error>> = capture
-        .views
-        .par_iter()
-        .map(|view| {
-            let loaded = view.load(&options.limits)?;
-            let refused =
-                loaded.mask.as_ref().and_then(|m| masks::refuse(&view.name, &loaded.photo, m).err());
-            let mask = match (loaded.mask, &view.mask) {
-                (None, ViewMask::None) => None,
-                (None, _) => view.load_mask(&options.limits)?, // "not looked at": judged all the same
-                (mask, _) => mask,
-            };
-            let judged = mask.as_ref().map(|m| (refused, masks::findings(m), masks::coverage(m)));
-            let photo = PhotoCheck::new(&loaded.photo, mask.as_ref());
-            Ok((mask, judged, loaded.valid.as_ref().map(masks::coverage), photo))
-        })
-        .collect();
+/// What one view shows.
+struct ViewPixels {
+    mask: Option<Gray>,
+    /// Why the mask is refused, what is suspicious of it, and its coverage.
+    judged: Option<(Option<Error>, Vec<&'static str>, f64)>,
+    valid_share: Option<f64>,
+    photo: PhotoCheck,
+}
+
+/// Loads every view, and counts the values of their masks.
+fn load_all(capture: &Capture, options: &CaptureOptions) -> (Vec<Result<ViewPixels, Error>>, MaskSurvey) {
+    let limits = &options.limits;
+    let load = |view: &View| {
+        let mut values = None;
+        let loaded = view.load_examined(limits, Some(&mut values))?;
+        let refused = loaded.mask.as_ref().and_then(|m| masks::refuse(&view.name, &loaded.photo, m).err());
+        let mask = match (loaded.mask, &view.mask) {
+            (None, ViewMask::None) => None,
+            (None, _) => view.load_mask(limits)?, // "not looked at": judged all the same
+            (mask, _) => mask,
+        };
+        let judged = mask.as_ref().map(|m| (refused, masks::findings(m), masks::coverage(m)));
+        let photo = PhotoCheck::new(&loaded.photo, mask.as_ref());
+        let valid_share = loaded.valid.as_ref().map(masks::coverage);
+        Ok((ViewPixels { mask, judged, valid_share, photo }, values))
+    };
+    let (mut all, mut survey) = (Vec::new(), MaskSurvey::default());
+    // the values of a few masks at a time: those of noise are many
+    for views in capture.views.chunks(64) {
+        let loaded: Vec<Result<_, Error>> = views.par_iter().map(load).collect();
+        all.extend(views.iter().zip(loaded).map(|(view, loaded)| {
+            let (pixels, values) = loaded?;
+            view.survey(values, pixels.mask.as_ref(), &mut survey);
+            Ok(pixels)
+        }));
+    }
+    (all, survey)
+}
+
+/// Loads every view as its mask is to be read; returns the masks at a size that is enough to place the head.
+fn pixels(capture: &mut Capture, options: &CaptureOptions, out: &mut Inspection) -> Vec<Option<Gray>> {
+    let (mut loaded, survey) = load_all(capture, options);
+    match survey.reading(&options.head, &capture.root) {
+        Ok(reading) => {
+            if capture.views.iter().any(|view| view.mask_reading != reading) {
+                capture.read_masks_as(&reading);
+                loaded = load_all(capture, options).0;
+            }
+            out.reasons.extend(survey.reasons(&reading));
+            out.mask_reading = Some(reading);
+        }
+        // whatever else they look like is no news
+        Err(problem) => out.problems.extend(grouped(&[problem])),
+    }
+    let is_read = out.mask_reading.is_some();
     let mut kinds: BTreeMap<&str, Vec<&str>> = BTreeMap::new();
     let (mut unreadable, mut all_refused) = (Vec::new(), Vec::new());
     let (mut all, mut covered, mut usable, mut photos) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for (view, loaded) in capture.views.iter().zip(loaded) {
         match loaded {
-            Ok((mask, judged, valid, photo)) => {
+            Ok(ViewPixels { mask, judged, valid_share, photo }) => {
                 photos.push((view.name.as_str(), photo));
                 if let Some((refused, findings, coverage)) = judged {
-                    let findings = findings.into_iter().filter(|_| refused.is_none());
+                    let findings = findings.into_iter().filter(|_| refused.is_none() && is_read);
                     findings.for_each(|f| kinds.entry(f).or_default().push(&view.name));
-                    all_refused.extend(refused);
+                    all_refused.extend(refused.filter(|_| is_read));
                     covered.push(coverage);
                 }
-                usable.extend(valid);
-                all.push(mask);
+                usable.extend(valid_share);
+                all.push(mask.filter(|_| is_read));
             }
             Err(e) => {
                 unreadable.push(e);

@@ -2,16 +2,14 @@
 
 use super::folder::CaptureFolder;
 use super::frame::{CameraFrame, Listing};
+use super::mask_values::MAX_BLACK;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{MaskMeaning, MaskSource};
 use crate::error::counted;
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, OPAQUE_ALPHA, Photo};
 use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
-
-/// Maximum value of a pixel that counts as black.
-const MAX_BLACK: u8 = 16;
 
 /// Returns names for a message: at most six, then the number of others.
 pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {
@@ -230,7 +228,7 @@ pub fn findings(mask: &Gray) -> Vec<&'static str> {
     if brightest < 128 {
         return vec!["is empty but for faint traces"];
     }
-    if darkest >= 250 {
+    if darkest >= OPAQUE_ALPHA {
         return vec!["is white everywhere"];
     }
     // mean over columns x0..x1 of rows y0..y1, 0..=1
@@ -245,6 +243,9 @@ pub fn findings(mask: &Gray) -> Vec<&'static str> {
     let (high_left, high_right) = (mean(0, 1, 0, upper), mean(w - 1, w, 0, upper));
     let middle = mean(w / 3, w - w / 3, h / 3, h - h / 3);
     let mut found = Vec::new();
+    if brightest < OPAQUE_ALPHA {
+        found.push("is nowhere white");
+    }
     // shoulders may fill the bottom in either case
     if (top + high_left + high_right) / 3.0 > 0.75 && middle < 0.5 {
         found.push(INVERTED);
@@ -305,6 +306,7 @@ mod tests {
         assert_eq!(findings(&disc(0, 0, (0.0, 0.0))), ["is empty"]);
         assert_eq!(findings(&disc(255, 255, (0.0, 0.0))), ["is white everywhere"]);
         assert!(findings(&disc(1, 0, (20.0, 15.0)))[0].contains("0 and 1"));
+        assert_eq!(findings(&disc(200, 0, (20.0, 15.0))), ["is nowhere white"]);
     }
 
     #[test]

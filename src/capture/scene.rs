@@ -677,6 +677,8 @@ mod tests {
             photo: Default::default(),
             mask: super::super::view::ViewMask::None,
             mask_meaning: crate::config::MaskMeaning::Empty,
+            mask_reading: Default::default(),
+            side_turn: None,
             valid: None,
             region: None,
             downscale: 1,

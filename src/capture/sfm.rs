@@ -19,6 +19,7 @@ use super::frame::{CameraFrame, Intrinsics, Listing};
 use super::masks::few;
 use super::view::{Capture, CaptureOptions, ViewMask};
 use super::{MaskSource, build, convert};
+use crate::config::MaskHead;
 use crate::error::counted;
 use crate::image::Photo;
 use crate::io::{self, Limits, Lock, Program, ProgramFailure, VideoFrames};
@@ -162,7 +163,7 @@ impl<'a> Search<'a> {
     /// folder.
     pub fn of_photographs(root: &Path, options: &CaptureOptions, sfm: &'a SfmOptions) -> Result<Search<'a>> {
         let options = CaptureOptions { downscale: 1, ..options.clone() };
-        let capture = without_cameras(root, &options)?;
+        let mut capture = without_cameras(root, &options)?;
         let limits = &sfm.limits;
         let lens = |view: &super::View| {
             let info = io::picture_info(&view.photo, limits)?;
@@ -179,13 +180,18 @@ impl<'a> Search<'a> {
             };
             Ok((format!("{} {}", view.name, Fingerprint::of_file(&view.photo)?), mask))
         });
-        let (photographs, masks): (Vec<_>, Vec<_>) = digests.collect::<Result<Vec<_>>>()?.into_iter().unzip();
+        let (photographs, mut masks): (Vec<_>, Vec<_>) =
+            digests.collect::<Result<Vec<_>>>()?.into_iter().unzip();
+        if options.head != MaskHead::White {
+            masks.push(options.head.clone().into());
+        }
         let digest = |parts: Vec<String>| Fingerprint::of_bytes(parts.join("\n").as_bytes());
         let fingerprint = asked(sfm).input(PHOTOGRAPHS, digest(photographs)).input("masks", digest(masks));
         let (output, request) = (Output::of(sfm), Request { source: io::real_path(root)?, fingerprint });
         if let Some(solution) = output.result_of(&request, None)? {
             return Ok(Search { sfm, request, work: Planned::Nothing(solution) });
         }
+        capture.settle_masks(&options.head, limits)?;
         let programs = Programs::find(sfm)?;
         let (names, files) = convert::names_for_colmap(&capture)?;
         let copied: u64 = capture.views.iter().filter_map(|view| io::file_size(&view.photo)).sum();

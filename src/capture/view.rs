@@ -5,12 +5,14 @@
 //! so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as a sensor
 //! with larger pixels would, weighted by alpha where there is one.
 
-use crate::config::{CameraPoses, Exposures, MaskMeaning, MaskSource};
+use super::mask_values::{MaskReading, MaskSurvey, MaskValues};
+use crate::config::{CameraPoses, Exposures, MaskHead, MaskMeaning, MaskSource};
 use crate::geom::{Aabb, Camera};
 use crate::image::{Exposure, Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::io::{self, Limits, NpyValues};
 use crate::{Error, Result};
 use glam::Vec3;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -68,6 +70,8 @@ pub struct CaptureOptions {
     pub mask_dir: String,
     /// What they mean.
     pub mask_meaning: MaskMeaning,
+    /// Which pixels of mask files are the head.
+    pub head: MaskHead,
     /// Whether masks that cannot be right are reported as warnings only.
     pub trust_masks: bool,
     /// Whether poses are to be measured.
@@ -89,6 +93,7 @@ impl Default for CaptureOptions {
             masks: MaskSource::Auto,
             mask_dir: String::new(),
             mask_meaning: MaskMeaning::Empty,
+            head: MaskHead::White,
             trust_masks: false,
             cameras: CameraPoses::Auto,
             exposure: Exposures::Auto,
@@ -143,6 +148,9 @@ pub struct View {
     pub mask: ViewMask,
     /// What the mask means.
     pub mask_meaning: MaskMeaning,
+    /// How the pixels of its file are read.
+    #[serde(default, skip_serializing_if = "MaskReading::is_white")]
+    pub mask_reading: MaskReading,
     /// Which pixels are usable (`.npy` or picture).
     pub valid: Option<PathBuf>,
     /// The region that metrics look at (`face_masks/NAME.png`).
@@ -152,6 +160,10 @@ pub struct View {
     /// Size of the stored photograph after any EXIF turn: `declared`, or the camera's if it is already
     /// reduced.
     pub photo_size: (u32, u32),
+    /// EXIF orientation, 5 to 8, that takes a mask which lies on its side to the photograph as it is read: the turn of
+    /// the photograph's EXIF for a mask of the stored pixels, else its inverse.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub side_turn: Option<u8>,
     /// Size the cameras were calibrated for, before downscaling.
     pub declared: (u32, u32),
     /// The file that declares it.
@@ -171,6 +183,37 @@ impl Capture {
     /// Returns the views of one split.
     pub fn split(&self, split: Split) -> impl Iterator<Item = &View> {
         self.views.iter().filter(move |v| v.split == split)
+    }
+
+    /// Reads all mask files in this way from here on.
+    pub(crate) fn read_masks_as(&mut self, reading: &MaskReading) {
+        self.views.iter_mut().for_each(|view| view.mask_reading = reading.clone());
+    }
+
+    /// Reads every mask file once and decides how all are read, for what uses a capture without the stage `mask`.
+    ///
+    /// # Errors
+    ///
+    /// Fails if a mask cannot be read, or if the values of the masks do not say what is head.
+    pub fn settle_masks(&mut self, head: &MaskHead, limits: &Limits) -> Result<()> {
+        self.read_masks_as(&MaskReading::asked(head));
+        let mut survey = MaskSurvey::default();
+        let is_file = |view: &&View| matches!(view.mask, ViewMask::File(_));
+        let masked: Vec<&View> = self.views.iter().filter(is_file).collect();
+        for views in masked.chunks(8) {
+            let found = views.par_iter().map(|view| -> Result<_> {
+                let mut values = None;
+                let mask = view.load_mask_examined(limits, Some(&mut values))?;
+                Ok((mask, values))
+            });
+            for (view, (mask, values)) in views.iter().zip(found.collect::<Result<Vec<_>>>()?) {
+                view.survey(values, mask.as_ref(), &mut survey);
+            }
+        }
+        let reading = survey.reading(head, &self.root)?;
+        self.reasons.extend(survey.reasons(&reading));
+        self.read_masks_as(&reading);
+        Ok(())
     }
 }
 
@@ -220,8 +263,17 @@ impl View {
 
     /// Reads the photograph, mask, valid mask and region of this view.
     pub fn load(&self, limits: &Limits) -> Result<LoadedView> {
+        self.load_examined(limits, None)
+    }
+
+    /// [`View::load`], which also counts the values of the mask's file, if there is one.
+    pub(crate) fn load_examined(
+        &self,
+        limits: &Limits,
+        values: Option<&mut Option<MaskValues>>,
+    ) -> Result<LoadedView> {
         let photo = self.load_photo(limits)?;
-        let mask = self.head_mask(photo.alpha.as_deref(), limits)?;
+        let mask = self.head_mask(photo.alpha.as_deref(), limits, values)?;
         let valid = self
             .valid
             .as_deref()
@@ -237,31 +289,58 @@ impl View {
             }
             (mask, _) => mask,
         };
-        let region = self.region.as_deref().map(|path| self.read_mask(path, limits)).transpose()?;
+        let region = self.region.as_deref().map(|path| {
+            let region = io::read_gray(path, Some(self.photo_size), limits)?;
+            self.reduced(path, region, Average::Mean)
+        });
+        let region = region.transpose()?;
         Ok(LoadedView { photo, mask, valid, region })
     }
 
     /// Returns the mask of this view at the camera's size, without its meaning; `None` without one.
     pub fn load_mask(&self, limits: &Limits) -> Result<Option<Gray>> {
+        self.load_mask_examined(limits, None)
+    }
+
+    /// [`View::load_mask`], which also counts the values of the mask's file, if there is one.
+    pub(crate) fn load_mask_examined(
+        &self,
+        limits: &Limits,
+        values: Option<&mut Option<MaskValues>>,
+    ) -> Result<Option<Gray>> {
         let alpha = match self.mask {
             ViewMask::Alpha => self.load_photo(limits)?.alpha,
             _ => None,
         };
-        self.head_mask(alpha.as_deref(), limits)
+        self.head_mask(alpha.as_deref(), limits, values)
     }
 
-    fn head_mask(&self, alpha: Option<&[u8]>, limits: &Limits) -> Result<Option<Gray>> {
+    /// Adds the values of this view's mask file, and the mask that was read of it, to those of other views.
+    pub(crate) fn survey(&self, values: Option<MaskValues>, mask: Option<&Gray>, all: &mut MaskSurvey) {
+        if let (ViewMask::File(path), Some(values)) = (&self.mask, values) {
+            all.add(path, values, mask);
+        }
+    }
+
+    /// Returns the soft mask at the camera's size.
+    fn head_mask(
+        &self,
+        alpha: Option<&[u8]>,
+        limits: &Limits,
+        values: Option<&mut Option<MaskValues>>,
+    ) -> Result<Option<Gray>> {
         let (width, height) = (self.camera.width, self.camera.height);
         match &self.mask {
             ViewMask::None => Ok(None),
             ViewMask::Alpha => Ok(alpha.map(|a| Gray { width, height, values: a.to_vec() })),
-            ViewMask::File(path) => self.read_mask(path, limits).map(Some),
+            ViewMask::File(path) => {
+                let picture = io::read_mask(path, Some(self.photo_size), limits)?;
+                if let Some(values) = values {
+                    *values = Some(MaskValues::of(&picture));
+                }
+                self.reduced(path, self.mask_reading.read(picture), Average::Mean).map(Some)
+            }
         }
-    }
-
-    /// Returns a soft mask at the camera's size.
-    fn read_mask(&self, path: &Path, limits: &Limits) -> Result<Gray> {
-        self.reduced(path, io::read_gray(path, Some(self.photo_size), limits)?, Average::Mean)
     }
 
     /// Returns a valid mask as 0 or 255; `.npy` of shape (h, w) or (h, w, 1), or a picture.
@@ -287,6 +366,13 @@ impl View {
         Ok(Gray { width: width as u32, height: height as u32, values })
     }
 
+    /// Returns whether a picture of this size beside the photograph, such as a mask, has to be turned as
+    /// [`View::side_turn`] says.
+    pub(super) fn turns(&self, (width, height): (u32, u32)) -> bool {
+        let fits = |size| size == self.declared || size == (self.camera.width, self.camera.height);
+        self.side_turn.is_some() && !fits((width, height)) && fits((height, width))
+    }
+
     fn reduced(&self, path: &Path, gray: Gray, average: Average) -> Result<Gray> {
         let gray = match self.mask_turn {
             Some(exif) => io::turned_gray(gray, exif),
@@ -297,13 +383,40 @@ impl View {
             Ok(gray)
         } else if found == self.declared {
             Ok(average_gray(&gray, self.downscale, average))
+        } else if let Some(turn) = self.side_turn.filter(|_| self.turns(found)) {
+            self.reduced(path, io::turned_gray(gray, turn), average)
         } else {
-            Err(self.size_error(path, found))
+            Err(self.mask_size_error(path, found))
         }
     }
 
     fn size_error(&self, path: &Path, found: (u32, u32)) -> Error {
         wrong_size(&path.to_string_lossy(), found, self.declared, &self.declared_by, self.downscale)
+    }
+
+    /// Returns the error for a mask, or another picture beside the photograph, of another size.
+    fn mask_size_error(&self, path: &Path, found: (u32, u32)) -> Error {
+        let ((w, h), (pw, ph)) = (found, self.photo_size);
+        let (picture, photo) = (path.display(), self.photo.display());
+        let hint = if (h, w) == self.declared || (h, w) == self.photo_size {
+            "the mask is turned by a quarter against its photograph: turn the mask (ImageMagick: `magick mogrify -rotate 90 \
+             FILES`, or -90), or make masks from photographs that are stored upright, without an EXIF turn"
+                .to_string()
+        } else {
+            format!("make masks at the size of their photographs, {pw} × {ph} pixels")
+        };
+        let problem =
+            format_args!("the mask `{picture}` is {w} × {h} pixels, its photograph `{photo}` {pw} × {ph}");
+        Error::cannot(problem, hint)
+    }
+}
+
+/// Returns the EXIF orientation that undoes another one, of those that swap the sides.
+pub(super) fn undone(exif: u8) -> u8 {
+    match exif {
+        6 => 8,
+        8 => 6,
+        other => other, // transposing twice changes nothing
     }
 }
 
@@ -413,6 +526,18 @@ mod tests {
         let rgb = vec![[0; 3], [255; 3], [0; 3], [255; 3]];
         let half = average_photo(&Photo { width: 2, height: 2, rgb, alpha: None }, 2);
         assert_eq!((half.width, half.height, half.rgb[0]), (1, 1, [188; 3]));
+    }
+
+    #[test]
+    fn quarter_turns_are_undone() {
+        // 1 2 3
+        // 4 5 6
+        let gray = Gray { width: 3, height: 2, values: vec![1, 2, 3, 4, 5, 6] };
+        for exif in 5..=8 {
+            let turned = io::turned_gray(gray.clone(), exif);
+            assert_eq!((turned.width, turned.height), (2, 3));
+            assert_eq!(io::turned_gray(turned, undone(exif)), gray, "{exif}");
+        }
     }
 
     #[test]

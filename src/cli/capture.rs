@@ -8,6 +8,7 @@ use super::screen::{one_line, print};
 use crate::capture::convert::CameraFormat;
 use crate::config::{CameraPoses, Config};
 use crate::error::counted;
+use crate::io::Limits;
 use crate::pipeline::{self, capture_options, click_page, inspect_capture, open_capture};
 use crate::{Error, ErrorKind, Result, capture, io};
 use serde_json::json;
@@ -75,7 +76,8 @@ pub(super) fn judge(
         return Err(Error::usage("no capture is named", "name one: `tiface metrics CAPTURE --views FOLDER`"));
     };
     let (config, root) = capture_of(common, path)?;
-    let capture = open_capture(&root, &capture_options(&config))?;
+    let mut capture = open_capture(&root, &capture_options(&config))?;
+    capture.settle_masks(&config.mask.head, &Limits::default())?;
     capture.warnings.iter().for_each(|text| screen.note("metrics: warning", text));
     if let Some(wrong) = views.iter().find(|folder| !io::is_folder(folder)) {
         let hint = "name a folder of pictures that are named like the photographs";

@@ -2,6 +2,7 @@
 
 use super::table::table;
 use serde::{Deserialize, Serialize};
+use std::fmt;
 
 table! {
     /// How a capture is read.
@@ -81,6 +82,86 @@ pub enum MaskMeaning {
     Ignore,
 }
 
+/// Which pixels of the capture's mask files are the head.
+///
+/// ```
+/// use tiface::config::{HeadValue, MaskHead};
+///
+/// assert_eq!(MaskHead::try_from("not-black".to_string())?, MaskHead::NotBlack);
+/// let listed = MaskHead::try_from("1, 17, #5000ff".to_string())?;
+/// let values = [HeadValue::Number(1), HeadValue::Number(17), HeadValue::Color([80, 0, 255])];
+/// assert_eq!((String::from(listed.clone()), listed), ("1,17,#5000ff".into(), MaskHead::Values(values.into())));
+/// assert!(MaskHead::try_from("blue".to_string()).unwrap_err().contains("`white`"));
+/// # Ok::<(), String>(())
+/// ```
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum MaskHead {
+    /// White ones; gray is opacity. Masks in one other color are read with it for white.
+    #[default]
+    White,
+    /// All that are not black; of a file with transparency, those that are not transparent.
+    NotBlack,
+    /// Those with one of these values.
+    Values(Vec<HeadValue>),
+}
+
+/// A value of mask files that means head.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum HeadValue {
+    /// A gray value, or a label: in an indexed file with a palette of colors, an index.
+    Number(u8),
+    /// A color.
+    Color([u8; 3]),
+}
+
+impl HeadValue {
+    fn parse(text: &str) -> Option<HeadValue> {
+        let Some(digits) = text.strip_prefix('#') else { return text.parse().ok().map(HeadValue::Number) };
+        let is_color = digits.len() == 6 && digits.bytes().all(|b| b.is_ascii_hexdigit());
+        let [_, r, g, b] = u32::from_str_radix(digits, 16).ok().filter(|_| is_color)?.to_be_bytes();
+        Some(HeadValue::Color([r, g, b]))
+    }
+}
+
+impl fmt::Display for HeadValue {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            HeadValue::Number(value) => write!(f, "{value}"),
+            HeadValue::Color([r, g, b]) => write!(f, "#{r:02x}{g:02x}{b:02x}"),
+        }
+    }
+}
+
+impl TryFrom<String> for MaskHead {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<MaskHead, String> {
+        match text.trim() {
+            "white" => return Ok(MaskHead::White),
+            "not-black" => return Ok(MaskHead::NotBlack),
+            _ => {}
+        }
+        let value = |part: &str| {
+            let expected = "expected `white`, `not-black`, or values from 0 to 255 and colors as in 1,2,17 or \
+                            #5000ff,#ff0000";
+            HeadValue::parse(part.trim()).ok_or_else(|| format!("unknown value `{part}`, {expected}"))
+        };
+        text.split(',').map(value).collect::<Result<_, _>>().map(MaskHead::Values)
+    }
+}
+
+impl From<MaskHead> for String {
+    fn from(head: MaskHead) -> String {
+        match head {
+            MaskHead::White => "white".into(),
+            MaskHead::NotBlack => "not-black".into(),
+            MaskHead::Values(values) => values.iter().map(HeadValue::to_string).collect::<Vec<_>>().join(","),
+        }
+    }
+}
+
 /// Method that makes a hard mask from clicks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -128,6 +209,9 @@ table! {
         trust: bool => false;
         /// Meaning of pixels outside a mask: empty (no head) or ignore (unknown).
         meaning: MaskMeaning => MaskMeaning::Empty;
+        /// Pixels of the capture's mask files that are the head: white (gray is opacity; a single other color on black is
+        /// taken for white), not-black, or values and colors, as 1,2,17 (labels) or #5000ff,#ff0000.
+        head: MaskHead => MaskHead::White;
         /// File of clicks to make masks from: a prompts.json, as `tiface mask --page` saves it.
         prompts: String => String::new();
         /// List of clicks x,y,label on one photograph (label 1: head, 0: background), for a quick try.

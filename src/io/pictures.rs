@@ -102,10 +102,10 @@ const NOT_READ: &str = "convert it to PNG or JPEG (ImageMagick: `magick mogrify 
 
 /// The bytes of a picture that is being read.
 #[derive(Clone, Copy)]
-struct PictureFile<'a> {
-    path: &'a Path,
-    bytes: &'a [u8],
-    limits: &'a Limits,
+pub(super) struct PictureFile<'a> {
+    pub path: &'a Path,
+    pub bytes: &'a [u8],
+    pub limits: &'a Limits,
 }
 
 type Png<'a> = PngDecoder<Cursor<&'a [u8]>>;
@@ -278,21 +278,47 @@ impl<'a> PictureFile<'a> {
         Ok((picture.ok_or_else(|| self.jpeg(None, problem))?, info))
     }
 
-    fn decode(self, expected: Option<(u32, u32)>) -> Result<Photo, ReadError> {
+    /// Returns the decoded picture, turned as [`is_turned`] says.
+    pub(super) fn decode(self, expected: Option<(u32, u32)>) -> Result<DynamicImage, ReadError> {
         let (mut picture, info) = if self.is_png()? { self.decode_png()? } else { self.decode_jpeg()? };
         if is_turned(info.exif, (info.width, info.height), expected) {
             picture = oriented(picture, info.exif);
         }
-        let (width, height, color) = (picture.width(), picture.height(), picture.color());
-        let pixels: Vec<[u8; 4]> = if color.has_color() {
-            picture.into_rgba8().pixels().map(|p| p.0).collect()
-        } else {
-            picture.into_luma_alpha8().pixels().map(|p| [p[0], p[0], p[0], p[1]]).collect()
-        };
-        let alpha = color.has_alpha().then(|| pixels.iter().map(|p| p[3]).collect());
-        let rgb = pixels.into_iter().map(|[r, g, b, _]| [r, g, b]).collect();
-        Ok(Photo { width, height, rgb, alpha })
+        Ok(picture)
     }
+
+    /// Returns the palette of an indexed PNG; empty for every other file.
+    pub(super) fn palette(self) -> Vec<[u8; 3]> {
+        /// Place of the color type in `IHDR`, and its value for indexed colors.
+        const COLOR_TYPE: (usize, u8) = (25, 3);
+        if self.is_png().ok() != Some(true) || self.bytes.get(COLOR_TYPE.0) != Some(&COLOR_TYPE.1) {
+            return Vec::new();
+        }
+        let mut at = 8;
+        while let Some([a, b, c, d, kind @ ..]) = self.bytes.get(at..at + 8) {
+            let length = u32::from_be_bytes([*a, *b, *c, *d]) as usize;
+            let Some(data) = self.bytes.get(at + 8..).and_then(|rest| rest.get(..length)) else { break };
+            match kind {
+                b"PLTE" => return data.as_chunks::<3>().0.iter().take(256).copied().collect(),
+                b"IDAT" => break,
+                _ => at += 12 + length,
+            }
+        }
+        Vec::new()
+    }
+}
+
+/// Returns a decoded picture as a photograph, 16 bits rounded to 8.
+pub(super) fn photo_of(picture: DynamicImage) -> Photo {
+    let (width, height, color) = (picture.width(), picture.height(), picture.color());
+    let pixels: Vec<[u8; 4]> = if color.has_color() {
+        picture.into_rgba8().pixels().map(|p| p.0).collect()
+    } else {
+        picture.into_luma_alpha8().pixels().map(|p| [p[0], p[0], p[0], p[1]]).collect()
+    };
+    let alpha = color.has_alpha().then(|| pixels.iter().map(|p| p[3]).collect());
+    let rgb = pixels.into_iter().map(|[r, g, b, _]| [r, g, b]).collect();
+    Photo { width, height, rgb, alpha }
 }
 
 /// Reads a photograph: PNG (gray, palette, color, 8 or 16 bit, with or without alpha) or JPEG (gray or
@@ -301,7 +327,7 @@ impl<'a> PictureFile<'a> {
 /// `expected` is the size its cameras were calibrated for, if declared: a quarter turn that EXIF asks for is
 /// applied only if it leads to that size. Another size is not an error here.
 pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Photo, ReadError> {
-    PictureFile { path, bytes: &read_bytes(path, limits)?, limits }.decode(expected)
+    PictureFile { path, bytes: &read_bytes(path, limits)?, limits }.decode(expected).map(photo_of)
 }
 
 /// Returns a photograph turned, or mirrored, as an EXIF orientation asks.
@@ -332,19 +358,7 @@ fn oriented(mut picture: DynamicImage, exif: u8) -> DynamicImage {
 /// Returns a picture that lies inside another file, as [`read_photo`] would read it from one of its own.
 /// `path` is for messages only.
 pub fn parse_photo(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Photo, ReadError> {
-    PictureFile { path, bytes, limits }.decode(None)
-}
-
-/// Reads a mask: the gray channel; of a picture with alpha that is not opaque everywhere, the alpha;
-/// of a colored one the luma (Rec. 601).
-pub fn read_gray(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Gray, ReadError> {
-    let Photo { width, height, rgb, alpha } = read_photo(path, expected, limits)?;
-    let luma = |[r, g, b]: [u8; 3]| (299 * r as u32 + 587 * g as u32 + 114 * b as u32 + 500) / 1000;
-    let values = match alpha {
-        Some(alpha) if alpha.iter().any(|&a| a != 255) => alpha,
-        _ => rgb.into_iter().map(|c| luma(c) as u8).collect(), // of a gray one its gray
-    };
-    Ok(Gray { width, height, values })
+    PictureFile { path, bytes, limits }.decode(None).map(photo_of)
 }
 
 fn png(
@@ -439,7 +453,6 @@ mod tests {
         assert_eq!(p.rgb, [[1, 2, 3], [250, 251, 252]]);
         write_png_rgba(&path, 1, 2, &[[1, 2, 3, 4], [5, 6, 7, 8]]).unwrap();
         assert_eq!(read_photo(&path, None, &limits).unwrap().alpha, Some(vec![4, 8]));
-        assert_eq!(read_gray(&path, None, &limits).unwrap().values, [4, 8]); // alpha says what is the head
         let info = picture_info(&path, &limits).unwrap();
         assert_eq!((info.width, info.height, info.alpha, info.exif), (1, 2, true, 1));
         let bytes = std::fs::read(&path).unwrap();
@@ -448,24 +461,6 @@ mod tests {
         let small = Limits { side_px: 1, ..limits };
         assert!(parse_photo(&bytes, &path, &small).is_err());
         assert!(parse_picture_info(&bytes, &path, &small).is_err());
-    }
-
-    #[test]
-    fn sixteen_bits_are_rounded_to_eight() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a.png");
-        // 257 · 7 = 1799 is exactly 7; 1799 + 128 = 1927 is 7.498 → 7; 1928 is 7.502 → 8
-        write_png_gray16(&path, 4, 1, &[1799, 1927, 1928, 65_535]).unwrap();
-        let gray = read_gray(&path, None, &Limits::default()).unwrap();
-        assert_eq!(gray.values, [7, 7, 8, 255]);
-    }
-
-    #[test]
-    fn a_mask_with_an_opaque_alpha_channel_is_read_from_its_color() {
-        let dir = tempfile::tempdir().unwrap();
-        let path = dir.path().join("a.png");
-        write_png_rgba(&path, 2, 1, &[[255, 255, 255, 255], [0, 0, 0, 255]]).unwrap();
-        assert_eq!(read_gray(&path, None, &Limits::default()).unwrap().values, [255, 0]);
     }
 
     #[test]

@@ -173,7 +173,7 @@ struct Evaluator {
 impl Evaluator {
     /// Loads some of a session's.
     pub fn new(session: &Session) -> Result<Evaluator> {
-        let capture = session.evaluation_capture();
+        let capture = session.evaluation_capture()?;
         let held_out = [Split::Test, Split::Val].map(|s| capture.split(s).collect::<Vec<_>>());
         let Some(all) = held_out.into_iter().find(|views| !views.is_empty()) else {
             return Err(Error::cannot(

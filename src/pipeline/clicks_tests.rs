@@ -92,7 +92,7 @@ fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_ma
     let run = run(dir.path(), "run");
     let session = Session::open(&config, &run).unwrap();
     masked(&session);
-    let evaluated = session.evaluation_capture();
+    let evaluated = session.evaluation_capture().unwrap();
     assert_eq!(session.mask_source(&evaluated), "capture");
     for ((view, own), truth) in session.capture().views.iter().zip(&evaluated.views).zip(&truth) {
         let judged = own.load_mask(&Limits::default()).unwrap();
@@ -115,7 +115,7 @@ fn views_are_judged_by_the_masks_of_the_capture_and_not_by_those_that_the_run_ma
     }
     let bare = Session::open(&config, &run).unwrap();
     let view = &bare.capture().views[0];
-    let evaluated = bare.evaluation_capture();
+    let evaluated = bare.evaluation_capture().unwrap();
     assert_eq!((bare.mask_source(&evaluated), &evaluated.views[0].mask), ("run", &view.mask));
 }
 

@@ -8,10 +8,10 @@ use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
 use super::scene_file;
 use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
 use crate::capture::scene::{self, Scene, SceneBox, SceneOptions, in_box};
-use crate::capture::{self, Capture, CaptureOptions, MASK_HINT, Split, View};
+use crate::capture::{self, Capture, CaptureOptions, MASK_HINT, MaskReading, MaskSurvey, Split, View};
 use crate::config::{CameraPoses, Config, Exposures, MaskConfig, MaskMeaning, Preset};
 use crate::image::{Gray, Photo, resize_gray, working_size};
-use crate::io::{self, Limits};
+use crate::io::{self, Limits, ReadError};
 use crate::mask::consistency::{ConsistencyView, check_consistency};
 use crate::mask::matting::unknown_share;
 use crate::mask::pages::{SheetView, page_of, sheet};
@@ -20,6 +20,7 @@ use crate::run::StageDir;
 use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Value, json};
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 /// File name of the contact sheet, in the stage's folder.
@@ -27,6 +28,9 @@ pub(super) const SHEET: &str = "sheet.html";
 
 /// File name of the clicks, in the stage's folder: the run keeps a copy because it may outlive the original file.
 pub(super) const CLICKS: &str = "prompts.json";
+
+/// File name of how the mask files of the capture are read, in the stage's folder; none where white is the head.
+const READING: &str = "reading.json";
 
 /// Longest side of the masks that the head is located with; a hull is coarser still.
 const SCENE_MASK_PX: u32 = 1024;
@@ -49,6 +53,8 @@ struct CaptureMasks {
     record: Value,
     /// Contradictions in masks read from the capture.
     refused: Vec<Error>,
+    /// How the files of masks read from the capture are read.
+    reading: MaskReading,
 }
 
 /// Reads the masks beside the photographs, or makes them from clicks. Writes the masks as pictures, a contact sheet,
@@ -68,10 +74,14 @@ pub(super) fn mask(
              `mask.vitmatte` they are cut and softened by built-in methods",
         );
     }
-    let CaptureMasks { masks, sheet: mut views, record, refused } = match prompts {
+    let CaptureMasks { masks, sheet: mut views, record, refused, reading } = match prompts {
         Some(prompts) => masks_from_clicks(capture, prompts, config, dir)?,
-        None => masks_of_capture(capture, dir)?,
+        None => masks_of_capture(capture, config, dir)?,
     };
+    write_reading(dir.folder(), &reading)?;
+    let mut capture = Cow::Borrowed(capture);
+    apply_reading(dir.folder(), &mut capture)?;
+    let capture = &*capture;
     let coverage: Vec<f64> = masks.iter().flatten().map(capture::coverage).collect();
     if coverage.is_empty() {
         dir.warn(
@@ -243,27 +253,64 @@ fn write_mask(folder: &Path, view: &str, mask: &Gray) -> Result<()> {
     Ok(io::write_png_gray(&file, mask)?)
 }
 
-/// Reads the masks beside the photographs.
-fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<CaptureMasks> {
+/// Writes how mask files are read, where it is not as they always were.
+fn write_reading(folder: &Path, reading: &MaskReading) -> Result<()> {
+    let file = folder.join(READING);
+    if *reading == MaskReading::White {
+        return Ok(io::remove(&file)?);
+    }
+    let text = serde_json::to_string_pretty(reading).unwrap_or_default();
+    Ok(io::write_atomic(&file, format!("{text}\n").as_bytes())?)
+}
+
+/// Lets a capture read its mask files as the stage `mask` found that they are to be read; `folder` is the stage's.
+pub(super) fn apply_reading(folder: &Path, capture: &mut Cow<Capture>) -> Result<(), ReadError> {
+    let file = folder.join(READING);
+    if io::is_file(&file) {
+        let reading = io::read_typed(&file, &Limits::default())?;
+        capture.to_mut().read_masks_as(&reading);
+    }
+    Ok(())
+}
+
+/// Reads the masks beside the photographs. Their values are known only when all have been read: if these ask for another
+/// reading than that of white masks, they are read once more.
+fn masks_of_capture(capture: &Capture, config: &MaskConfig, dir: &StageDir) -> Result<CaptureMasks> {
+    let (mut out, survey) = read_masks(capture, dir)?;
+    out.reading = survey.reading(&config.head, &capture.root)?;
+    if capture.views.iter().any(|view| view.mask_reading != out.reading) {
+        let mut capture = capture.clone();
+        capture.read_masks_as(&out.reading);
+        out = CaptureMasks { reading: out.reading, ..read_masks(&capture, dir)?.0 };
+    }
+    if out.reading != MaskReading::White {
+        survey.reasons(&out.reading).iter().for_each(|text| dir.warn(text));
+    }
+    Ok(out)
+}
+
+fn read_masks(capture: &Capture, dir: &StageDir) -> Result<(CaptureMasks, MaskSurvey)> {
     let limits = Limits::default();
     let total = capture.views.len();
-    let mut out = CaptureMasks::default();
+    let (mut out, mut survey) = (CaptureMasks::default(), MaskSurvey::default());
     // a few at a time: decoding dominates, and photographs are large
     for (i, views) in capture.views.chunks(8).enumerate() {
         let loaded: Vec<Result<_>> = views
             .par_iter()
             .map(|v| {
-                let Some(mask) = v.load_mask(&limits)? else { return Ok(None) };
+                let mut values = None;
+                let Some(mask) = v.load_mask_examined(&limits, Some(&mut values))? else { return Ok(None) };
                 let photo = v.load_photo(&limits)?;
                 let refused = capture::refuse(&v.name, &photo, &mask).err();
-                Ok(Some((SheetView::new(&v.name, &photo, &mask, None)?, mask, refused)))
+                Ok(Some((SheetView::new(&v.name, &photo, &mask, None)?, mask, refused, values)))
             })
             .collect();
         for (k, found) in loaded.into_iter().enumerate() {
-            let Some((view, mask, refused)) = found? else {
+            let Some((view, mask, refused, values)) = found? else {
                 out.masks.push(None);
                 continue;
             };
+            views[k].survey(values, Some(&mask), &mut survey);
             out.refused.extend(refused);
             write_mask(dir.folder(), &view.name, &mask)?;
             out.sheet.push((8 * i + k, view));
@@ -271,7 +318,7 @@ fn masks_of_capture(capture: &Capture, dir: &StageDir) -> Result<CaptureMasks> {
         }
         dir.step((8 * (i + 1)).min(total), total)?;
     }
-    Ok(out)
+    Ok((out, survey))
 }
 
 /// Makes masks from clicks.
@@ -390,7 +437,9 @@ pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
         return found;
     }
     // inputs that cannot be opened or read are already among the problems
-    let Ok(capture) = capture::open(root, options) else { return found };
+    let Ok(mut capture) = capture::open(root, options) else { return found };
+    let Some(reading) = &found.mask_reading else { return found };
+    capture.read_masks_as(reading);
     let load = |v: &View| Some(for_placing(&v.load_mask(&options.limits).ok().flatten()?));
     let masks: Vec<Option<Gray>> = capture.views.par_iter().map(load).collect();
     let (conflicts, compared) = conflicts(&capture, &masks);

@@ -12,8 +12,8 @@ use super::session::Session;
 use crate::capture::View;
 use crate::config::iface::FieldKind;
 use crate::config::{
-    CameraPoses, ColorSource, Config, Exposures, IfaceConfig, MaskSource, Material, Method, Preset, Stage,
-    VmBackground, VmConfig,
+    CameraPoses, ColorSource, Config, Exposures, IfaceConfig, MaskHead, MaskSource, Material, Method, Preset,
+    Stage, VmBackground, VmConfig,
 };
 use crate::kernel::cpu::hash;
 use crate::run::{Cost, ESTIMATE, Estimate, Fingerprint, Plan, read_record, read_status};
@@ -25,8 +25,9 @@ const FORMAT: u32 = 2;
 
 /// Keys of `[mask]` that do not affect the masks that are made: paths, whose contents are inputs of the stage
 /// instead, and checks of other masks.
-const UNTRACKED_MASK_KEYS: [&str; 9] = [
+const UNTRACKED_MASK_KEYS: [&str; 10] = [
     "mask.trust",
+    "mask.head",
     "mask.prompts",
     "mask.point",
     "mask.view",
@@ -38,7 +39,7 @@ const UNTRACKED_MASK_KEYS: [&str; 9] = [
 ];
 
 /// Keys of `[mask]` that affect masks read from the capture.
-const CAPTURE_MASK_KEYS: [&str; 2] = ["mask.source", "mask.meaning"];
+const CAPTURE_MASK_KEYS: [&str; 3] = ["mask.source", "mask.meaning", "mask.head"];
 
 /// Keys of `[mesh]` that affect files for other programs, but no rendered view.
 const FILE_KEYS: [&str; 5] =
@@ -297,6 +298,9 @@ impl Session<'_> {
                 }
                 if config.capture.r#box == "head" {
                     settings.remove("capture.box"); // as in runs from before there was another
+                }
+                if config.mask.head == MaskHead::White {
+                    settings.remove("mask.head"); // as in runs from before there was another
                 }
                 inputs.push(("capture", self.inputs.digest.clone()));
                 match &self.inputs.clicks {

@@ -200,6 +200,8 @@ mod tests {
                 photo: "photo.png".into(),
                 mask: crate::capture::ViewMask::None,
                 mask_meaning: crate::config::MaskMeaning::Empty,
+                mask_reading: Default::default(),
+                side_turn: None,
                 valid: None,
                 region: None,
                 downscale: 1,

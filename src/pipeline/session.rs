@@ -6,12 +6,13 @@ use super::inputs::{Inputs, missing_capture};
 use super::path::CameraPath;
 use super::{mask, scene_file};
 use crate::capture::scene::{Scene, SceneBox};
-use crate::capture::{Capture, Split, ViewMask};
+use crate::capture::{Capture, MaskReading, Split, View, ViewMask};
 use crate::config::{Config, RenderConfig, Stage};
-use crate::io;
+use crate::io::{self, Limits};
 use crate::metrics::Lpips;
 use crate::run::Run;
 use crate::{Error, Result};
+use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::ErrorKind::NotFound;
 use std::path::Path;
@@ -20,7 +21,7 @@ use std::sync::OnceLock;
 /// A capture, its configuration and its run folder.
 pub struct Session<'a> {
     pub(super) capture: Capture,
-    /// The capture with the poses that the stage `mask` refined and the exposures that it evened out, once they are used.
+    /// The capture as the stage `mask` read its masks, refined its poses and evened out its exposures, once it is used.
     refined: OnceLock<Capture>,
     pub(super) config: &'a Config,
     pub(super) run: &'a Run,
@@ -47,6 +48,7 @@ impl<'a> Session<'a> {
             for view in &mut capture.views {
                 view.mask = ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
                 view.mask_turn = None;
+                view.mask_reading = MaskReading::White; // whatever the capture's own masks are drawn in
             }
         }
         if is_demo(config, run) {
@@ -62,16 +64,32 @@ impl<'a> Session<'a> {
         Ok(Session { path, ..self })
     }
 
-    /// Returns the capture as the metrics use it: each view with the capture's own mask, if it has one.
-    pub(super) fn evaluation_capture(&self) -> Capture {
-        let mut capture = self.capture.clone();
-        let own = self.inputs.own_masks.iter().flat_map(|own| own.masks.iter().zip(&own.turns));
-        for (view, (own, turn)) in capture.views.iter_mut().zip(own) {
-            if *own != ViewMask::None {
-                (view.mask, view.mask_turn) = (own.clone(), *turn);
-            }
+    /// Returns the capture with its mask files read as the stage `mask` found that they are to be read.
+    pub(super) fn read_capture(&self) -> Result<Cow<'_, Capture>> {
+        let mut capture = Cow::Borrowed(&self.capture);
+        let applied = mask::apply_reading(&self.run.path(Stage::Mask), &mut capture);
+        applied.map_err(|e| unusable(e, Stage::Mask))?;
+        Ok(capture)
+    }
+
+    /// Returns the capture as the metrics use it: each view with the capture's own mask, if it has one. Own masks that do
+    /// not say what is head are left out, with a warning.
+    pub(super) fn evaluation_capture(&self) -> Result<Capture> {
+        let mut capture = self.read_capture()?.into_owned();
+        let Some(own) = &self.inputs.own_masks else { return Ok(capture) };
+        let masked = |(view, (own, turn)): (&View, (&ViewMask, &Option<u8>))| {
+            (*own != ViewMask::None).then(|| View { mask: own.clone(), mask_turn: *turn, ..view.clone() })
+        };
+        let views = capture.views.iter().zip(own.masks.iter().zip(&own.turns)).filter_map(masked).collect();
+        let mut evaluated = Capture { views, ..capture.clone() };
+        if let Err(e) = evaluated.settle_masks(&self.config.mask.head, &Limits::default()) {
+            let text = format!("the capture's own masks are not used for the figures: {e}; {}", e.hint());
+            self.run.warn(Stage::Metrics.word(), &text);
+            return Ok(capture);
         }
-        capture
+        let has_own = capture.views.iter_mut().zip(&own.masks).filter(|(_, own)| **own != ViewMask::None);
+        has_own.zip(evaluated.views).for_each(|((view, _), own)| *view = own);
+        Ok(capture)
     }
 
     /// Returns the source of the masks that the figures of held-out views are restricted to: `capture`, `run` (this
@@ -114,7 +132,7 @@ impl<'a> Session<'a> {
         if let Some(capture) = self.refined.get() {
             return Ok(capture);
         }
-        let mut capture = self.capture.clone();
+        let mut capture = self.read_capture()?.into_owned();
         self.camera_check()?.iter().for_each(|check| check.apply(&mut capture));
         self.exposure()?.iter().for_each(|check| check.apply(&mut capture));
         Ok(self.refined.get_or_init(|| capture))
@@ -132,7 +150,8 @@ impl<'a> Session<'a> {
         }
         let scene = self.scene().map_err(|e| e.within("stage `mask`"))?;
         let (check, exposure) = (self.camera_check()?, self.exposure()?);
-        let cameras = scene_file::cameras_json(&self.capture, &scene, check.as_ref(), exposure.as_ref());
+        let capture = self.read_capture()?;
+        let cameras = scene_file::cameras_json(&capture, &scene, check.as_ref(), exposure.as_ref());
         self.write("cameras.json", &cameras, idle)
     }
 

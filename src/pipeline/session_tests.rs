@@ -759,3 +759,35 @@ fn a_stage_that_the_disk_has_no_room_for_is_refused_before_the_old_one_is_cleare
         assert!(run.path(stage).join("done.json").is_file(), "{stage} was cleared");
     }
 }
+
+#[test]
+fn later_stages_read_masks_in_a_color_as_the_stage_mask_found_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    demo_head(&root, (32, 40), (8, 2));
+    let config = draft(&root);
+    let load = |views: &[crate::capture::View]| -> Vec<Vec<u8>> {
+        views.iter().map(|view| view.load_mask(&Limits::default()).unwrap().unwrap().values).collect()
+    };
+    let capture = crate::capture::open(&root, &capture_options(&config)).unwrap();
+    let truth = load(&capture.views);
+    for (view, mask) in capture.views.iter().zip(&truth) {
+        let crate::capture::ViewMask::File(file) = &view.mask else { panic!("{:?}", view.mask) };
+        let blue: Vec<[u8; 3]> = mask.iter().map(|&m| [0, 0, m]).collect();
+        io::write_png_rgb(file, view.camera.width, view.camera.height, &blue).unwrap();
+    }
+    let run = quiet(dir.path());
+    complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
+    // another process goes on
+    let session = Session::open(&config, &run).unwrap();
+    assert!(complete(&session, Stage::Mask, &NoFields).unwrap().skipped);
+    let close = |found: Vec<Vec<u8>>| {
+        found.iter().flatten().zip(truth.iter().flatten()).all(|(found, truth)| found.abs_diff(*truth) <= 16)
+    };
+    assert!(close(load(&session.refined_capture().unwrap().views)));
+    assert!(close(load(&session.evaluation_capture().unwrap().views)));
+    assert!(!close(load(&session.capture().views)), "blue is an eighth of luma");
+    // and what restores the capture from the run alone
+    let restored = scene_file::read_capture(&run.path("cameras.json"), &root).unwrap();
+    assert!(close(load(&restored.views)));
+}

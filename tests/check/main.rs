@@ -33,6 +33,7 @@ mod hostile;
 mod hostile_mesh;
 mod hostile_npz;
 mod house;
+mod mask_values;
 mod masks;
 mod models;
 mod photographs;

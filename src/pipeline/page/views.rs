@@ -60,7 +60,7 @@ pub(in crate::pipeline) fn shown_sets<'c>(session: &'c Session) -> Vec<ShownSet<
 /// Runs [`rows`] for the page in a run's folder.
 pub(super) fn rows_of_run(session: &Session, most: usize) -> Result<(Vec<ViewRow>, Vec<String>)> {
     let background = session.config.render.background;
-    rows(&session.capture.views, background, &shown_sets(session), session.run.dir(), most)
+    rows(&session.read_capture()?.views, background, &shown_sets(session), session.run.dir(), most)
 }
 
 /// Returns the views that have pictures, or else the held-out ones, in about `most` bytes; and the files of the
