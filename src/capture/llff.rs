@@ -228,9 +228,8 @@ fn photographs(folder: &CaptureFolder, suffix: &str, listing: &mut Listing) -> R
         return Ok(None);
     };
     let plain = folder::photographs(&folder.root.join(&name))?;
-    let numbered = order::by_number(&plain);
-    listing.order_is_open |= numbered != plain;
-    let photos = if folder.reading().by_number { numbered } else { plain };
+    listing.order_is_open |= order::is_open(&plain);
+    let photos = if folder.reading().by_number { order::by_number(&plain) } else { plain };
     Ok(Some(photos.into_iter().map(|n| format!("{name}/{n}")).collect()))
 }
 

@@ -32,7 +32,7 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     let pairings = paired_masks(&plain, &numbered, &mask_files);
     let Reading { by_number, masks_by_number, .. } = folder.reading();
     let masks = &pairings[usize::from(masks_by_number).min(pairings.len() - 1)];
-    listing.order_is_open = plain != numbered;
+    listing.order_is_open = order::is_open(&plain);
     listing.mask_order_is_open = pairings.len() > 1;
     let photos = if by_number { &numbered } else { &plain };
     let known = (0..).take_while(|i| arrays.contains_key(&format!("world_mat_{i}"))).count();
@@ -97,6 +97,10 @@ fn paired_masks<'m>(
     } else if masks.len() != plain.len() {
         return vec![BTreeMap::new()];
     }
+    let in_order = pairs(plain, masks.iter().map(String::as_str).collect());
+    if !order::is_open(plain) && !order::is_open(masks) {
+        return vec![in_order];
+    }
     let in_number = order::by_number(masks);
     let same = |(photo, mask): (&String, &String)| {
         order::last_number(photo).is_some_and(|number| order::last_number(mask) == Some(number))
@@ -108,7 +112,7 @@ fn paired_masks<'m>(
     if have_same_numbers {
         return vec![by_number];
     }
-    let mut all = vec![pairs(plain, masks.iter().map(String::as_str).collect()), by_number];
+    let mut all = vec![in_order, by_number];
     all.dedup();
     all
 }

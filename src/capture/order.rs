@@ -1,6 +1,7 @@
 //! The order of pictures that a camera file does not name: by the bytes of their names, or by number.
 
 use std::cmp::Ordering;
+use std::collections::BTreeMap;
 
 /// Splits the digits off that a text begins with.
 fn digits(text: &str) -> (&str, &str) {
@@ -34,6 +35,30 @@ pub fn by_number(names: &[String]) -> Vec<String> {
     let mut sorted = names.to_vec();
     sorted.sort_by(|a, b| compare(a, b));
     sorted
+}
+
+/// Returns whether files in the order of their names have another one by number, which takes names that differ in their numbers
+/// alone: those of a quarter of the files at least, such as one of four rings. Random names have no order by number.
+pub(super) fn is_open(sorted: &[String]) -> bool {
+    let mut alike: BTreeMap<String, Vec<&str>> = BTreeMap::new();
+    for name in sorted {
+        alike.entry(without_numbers(stem(name))).or_default().push(name);
+    }
+    let differs = |names: &Vec<&str>| !names.is_sorted_by(|a, b| compare(a, b).is_le());
+    alike.values().any(|names| 4 * names.len() >= sorted.len() && differs(names))
+}
+
+/// Returns a name with `#` for each number.
+fn without_numbers(name: &str) -> String {
+    let mut text = String::new();
+    for c in name.chars() {
+        match c {
+            '0'..='9' if text.ends_with('#') => {}
+            '0'..='9' => text.push('#'),
+            c => text.push(c),
+        }
+    }
+    text
 }
 
 /// Returns the last number in the name of a file without its ending; leading zeros do not count.
@@ -74,6 +99,21 @@ mod tests {
             ("a.png a1.png a b", "a a.png a1.png b"),
         ] {
             assert_eq!(by_number(&names(bytes)), names(number));
+        }
+    }
+
+    #[test]
+    fn an_order_by_number_is_another_one_only_where_names_differ_by_numbers() {
+        for (sorted, open) in [
+            ("0.jpg 1.jpg 10.jpg 2.jpg", true),
+            ("cover.jpg view1.png view10.png view2.png", true),
+            ("l1 l10 l2 r1 r10 r2", true),
+            ("00.jpg 01.jpg 02.jpg 10.jpg", false),
+            ("8.png 9.png", false),
+            ("1a2f 1b3 10c 2d", false),
+            ("", false),
+        ] {
+            assert_eq!(is_open(&names(sorted)), open, "{sorted}");
         }
     }
 
