@@ -5,9 +5,10 @@
 //! (column 1, −column 0, column 2). The published loader divides positions by 0.3; here the world stays
 //! as the dataset has it.
 
-use super::folder;
 use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, Agreement, CameraFrame, Intrinsics, Listing};
+use super::missing;
+use super::near::names::IMAGE_FOLDERS;
 use super::view::Split;
 use crate::io::{self, NpyValues};
 use crate::{Error, Result};
@@ -193,7 +194,15 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
         vec![shared]
     } else {
         let text = format!("its {total} rows do not fit the {} photographs in `images/`", shared.len());
-        return Err(problem(sets[0].0, text));
+        let (there, hint) = match shared.is_empty() {
+            true => missing::no_folder(folder, "images"),
+            false => Default::default(),
+        };
+        let problem = problem(sets[0].0, text + &there);
+        return Err(match hint {
+            Some(hint) => problem.with_hint(hint),
+            None => problem,
+        });
     };
 
     for ((file, rows), names) in sets.into_iter().zip(photos) {
@@ -220,12 +229,8 @@ fn photographs(folder: &CaptureFolder, suffix: &str) -> Result<Option<Vec<String
     if downscale > 1 {
         names.extend([format!("images{suffix}_{downscale}"), format!("images{suffix}_{downscale}x")]);
     }
-    let Some(name) = names.into_iter().find(|n| io::is_folder(&folder.root.join(n))) else {
-        return Ok(None);
-    };
-    Ok(Some(
-        folder::photographs(&folder.root.join(&name))?.into_iter().map(|n| format!("{name}/{n}")).collect(),
-    ))
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    folder.pictures(&names, if suffix.is_empty() { &IMAGE_FOLDERS } else { &[] })
 }
 
 #[cfg(test)]

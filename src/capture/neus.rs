@@ -5,9 +5,12 @@
 //! dataset's own do. NeuS sends its rays through whole numbers as the centers of pixels, so principal points move
 //! by half a pixel (NeuS, `models/dataset.py`, `gen_rays_at`).
 
-use super::folder;
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
+use super::masks::few;
+use super::missing;
+use super::near::names::{IMAGE_FOLDERS, without_ending};
+use super::near::pairs::pair;
 use crate::Result;
 use crate::geom::Aabb;
 use crate::io::{self, Npy, NpyValues};
@@ -24,29 +27,32 @@ const SKEW: f64 = 1e-3;
 /// Lists one frame for each photograph.
 pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
     let arrays = io::read_npz(&folder.root.join(file), &folder.options.limits)?;
-    let photos = pictures(folder, &["image", "images", "rgb"])?;
-    let masks = pictures(folder, &["mask", "masks"])?;
+    let photos = folder.pictures(&["image", "images", "rgb"], &IMAGE_FOLDERS)?.unwrap_or_default();
+    let masks = folder.pictures(&["mask", "masks"], &[])?.unwrap_or_default();
     let known = (0..).take_while(|i| arrays.contains_key(&format!("world_mat_{i}"))).count();
     let hint = "it must have `world_mat_0`, `world_mat_1` and so on, one for each photograph in `image/`";
     if known == 0 {
         return Err(in_file(file, "it has no array `world_mat_0`", hint));
     } else if known != photos.len() {
-        let problem = format!("it has {known} cameras for the {} photographs in `image/`", photos.len());
-        return Err(in_file(file, problem, hint));
+        let (there, other_hint) = match photos.is_empty() {
+            true => missing::no_folder(folder, "image"),
+            false => Default::default(),
+        };
+        let problem =
+            format!("it has {known} cameras for the {} photographs in `image/`{there}", photos.len());
+        return Err(in_file(file, problem, other_hint.unwrap_or(hint.into())));
     }
-    for (i, name) in photos.iter().enumerate() {
+    let masks = paired(&photos, masks, listing);
+    for (i, (name, mask)) in photos.iter().zip(masks).enumerate() {
         let problem = |text: String| in_frame(file, name, text);
         let camera =
             matrix(&arrays, &format!("world_mat_{i}")).and_then(|m| decompose(&m)).map_err(problem)?;
         let (intrinsics, rotation, position) = camera;
         let photo = folder.photo(file, name)?;
-        // masks have names of their own: they are paired in order, as NeuS does
-        let mask = masks.get(i).filter(|_| masks.len() == photos.len());
-        let mask = mask.and_then(|mask| folder.file(Path::new(mask)));
+        let mask = mask.and_then(|mask| folder.file(Path::new(&mask)));
         let frame = CameraFrame::new(file, name, photo, intrinsics, (rotation, position));
         listing.frames.push(CameraFrame { mask, ..frame });
     }
-    listing.masks_named = "`mask/`, in the order of the photographs";
     if arrays.contains_key("scale_mat_0") {
         let problem = |text| in_file(file, text, "save it again with `numpy.savez`");
         let m = matrix(&arrays, "scale_mat_0").map_err(problem)?;
@@ -64,12 +70,37 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     Ok(())
 }
 
-/// Pictures in the first of these folders that exists, in name order.
-fn pictures(folder: &CaptureFolder, names: &[&str]) -> Result<Vec<String>> {
-    let Some(name) = names.iter().find(|n| io::is_folder(&folder.root.join(n))) else {
-        return Ok(Vec::new());
+/// Returns the mask of each photograph. Masks have names of their own, so they are paired in order, as NeuS does; by name where they
+/// are not as many.
+fn paired(photos: &[String], masks: Vec<String>, listing: &mut Listing) -> Vec<Option<String>> {
+    listing.masks_named = "`mask/`, in the order of the photographs";
+    if masks.len() == photos.len() {
+        return masks.into_iter().map(Some).collect();
+    }
+    let Some((place, _)) = masks.first().and_then(|mask| mask.rsplit_once('/')) else {
+        return vec![None; photos.len()];
     };
-    Ok(folder::photographs(&folder.root.join(name))?.into_iter().map(|f| format!("{name}/{f}")).collect())
+    let last = |path: &String| path.rsplit('/').next().unwrap_or_default().to_string();
+    let names: Vec<String> = photos.iter().map(|photo| without_ending(&last(photo)).0.to_string()).collect();
+    let files: Vec<String> = masks.iter().map(last).collect();
+    let pairs = pair(&names, &files);
+    let mut text = format!("`{place}/` has {} masks for {} photographs", masks.len(), photos.len());
+    if 2 * pairs.count() < photos.len() {
+        text += &format!(
+            ", and only {} have their names: none is used; leave one for each photograph, in name order",
+            pairs.count()
+        );
+        listing.warnings.push(text);
+        return vec![None; photos.len()];
+    }
+    text += ": they are paired by name";
+    let strangers = pairs.strangers(&files);
+    if !strangers.is_empty() {
+        text += &format!(", and no photograph is called {}", few(strangers));
+    }
+    listing.warnings.push(text);
+    listing.masks_named = "`mask/`, named as the photographs";
+    pairs.files.into_iter().map(|file| file.map(|file| masks[file].clone())).collect()
 }
 
 /// Returns the upper three rows of a 4×4 or 3×4 array, finite.
@@ -141,5 +172,23 @@ mod tests {
         assert!(decompose(&[0.0; 12]).unwrap_err().contains("flattens"));
         let skewed = [1.0, 0.1, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
         assert!(decompose(&skewed).unwrap_err().contains("skewed"));
+    }
+
+    #[test]
+    fn masks_are_paired_in_order_or_by_name_if_there_are_more_or_fewer() {
+        let of =
+            |folder: &str, names: &[&str]| names.iter().map(|n| format!("{folder}/{n}")).collect::<Vec<_>>();
+        let photos = of("image", &["000.jpg", "001.jpg"]);
+        let mask = |name: &str| Some(format!("mask/{name}"));
+        let mut listing = Listing::default();
+        let same = paired(&photos, of("mask", &["a.png", "b.png"]), &mut listing);
+        assert!(same == [mask("a.png"), mask("b.png")] && listing.warnings.is_empty());
+        let more = paired(&photos, of("mask", &["000.png", "001.png", "overview.png"]), &mut listing);
+        assert_eq!(more, [mask("000.png"), mask("001.png")]);
+        assert!(listing.warnings[0].contains("3 masks for 2 photographs"), "{:?}", listing.warnings);
+        assert!(listing.warnings[0].contains("`overview.png`"), "{:?}", listing.warnings);
+        let others = paired(&photos, of("mask", &["a.png", "b.png", "c.png"]), &mut listing);
+        assert!(others == [None, None] && listing.warnings[1].contains("only 0"), "{:?}", listing.warnings);
+        assert_eq!(paired(&photos, Vec::new(), &mut listing), [None, None]);
     }
 }

@@ -177,7 +177,8 @@ fn list_file(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Resul
                 let named = name.as_ref().map(|name| folder.relative(file, name)).transpose()?;
                 Ok(named.and_then(|name| folder.file(&name)))
             };
-            let (mask, region) = (beside(&keys.mask_path)?, beside(&keys.face_mask_path)?);
+            let mask = keys.mask_path.as_ref().map(|name| folder.mask(file, name)).transpose()?.flatten();
+            let region = beside(&keys.face_mask_path)?;
             if keys.mask_path.is_some() && mask.is_none() && photo.1.is_some() {
                 listing.problems.push(problem("the mask it names is missing".into()));
             }
