@@ -103,7 +103,9 @@ impl CaptureFolder<'_> {
         let stem =
             if has_ending(name, &PHOTOGRAPHS) { Path::new(name).with_extension("") } else { name.into() };
         for name in [format!("masks/{name}.png"), format!("masks/{}.png", stem.to_string_lossy())] {
-            if let Some(path) = self.file(&self.relative(file, &name)?) {
+            // a photograph of another computer's name may be found where its mask is not
+            let Ok(relative) = self.relative(file, &name) else { continue };
+            if let Some(path) = self.file(&relative) {
                 return Ok(Some(path));
             }
         }

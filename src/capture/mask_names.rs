@@ -14,7 +14,8 @@ use std::path::{Path, PathBuf};
 /// Folders in the order in which they are taken; others follow by name.
 const STANDING: [&str; 3] = ["vit_mask", "masks", "mask"];
 
-/// Folders of valid masks, and whether these may be pictures: `valid/` may as well have photographs to validate with.
+/// Folders of valid masks, and whether these may be pictures: `valid/` may as well have photographs
+/// to validate with.
 const VALID_FOLDERS: [(&str, bool); 3] = [("valid", false), ("valid_mask", true), ("valid_masks", true)];
 
 /// Pictures that may be masks, paired with the views.
@@ -33,7 +34,8 @@ impl Group {
         Group { place: place.into(), files, pairs }
     }
 
-    /// Returns whether these are the masks: no view has two, and at least half of the views or of the pictures have the other.
+    /// Returns whether these are the masks: no view has two, and at least half of the views or of
+    /// the pictures have the other.
     pub fn is_usable(&self) -> bool {
         let (n, all) = (self.pairs.count(), self.pairs.files.len().min(self.files.len()));
         n > 0 && self.pairs.doubtful.is_empty() && 2 * n >= all
@@ -94,8 +96,9 @@ fn names(views: &[View]) -> Vec<String> {
     views.iter().map(|view| view.name.clone()).collect()
 }
 
-/// Returns the groups of pictures that may be masks in the order in which they are to be taken: those of folders that are called like
-/// masks, then those beside the photographs with a word of masks in their names.
+/// Returns the groups of pictures that may be masks in the order in which they are to be taken:
+/// those of folders that are called like masks, then those beside the photographs with a word of
+/// masks in their names.
 pub(super) fn groups(folder: &CaptureFolder, views: &[View]) -> Vec<Group> {
     let photos = photographs(views);
     let mut found: BTreeMap<String, Vec<String>> = BTreeMap::new();
@@ -131,8 +134,8 @@ pub(super) fn groups(folder: &CaptureFolder, views: &[View]) -> Vec<Group> {
     groups
 }
 
-/// Returns the pictures in one folder, without photographs of views; where those lie there as well, only pictures with a word of
-/// masks in their names count.
+/// Returns the pictures in one folder, without photographs of views; where those lie there as well,
+/// only pictures with a word of masks in their names count.
 pub(super) fn within(folder: &CaptureFolder, place: &str, views: &[View]) -> Group {
     let photos = photographs(views);
     let has_photos = holds_photographs(folder, place, views);
@@ -150,8 +153,9 @@ pub(super) fn holds_photographs(folder: &CaptureFolder, place: &str, views: &[Vi
     views.iter().any(|view| view.photo.parent() == Some(&place))
 }
 
-/// Returns the folder that `capture.mask_dir` means: the one of that name, else the only one that is called so in other letters, or
-/// whose path is the end of that name, such as `masks` of `head/masks`.
+/// Returns the folder that `capture.mask_dir` means: the one of that name, else the only one that
+/// is called so in other letters, or whose path is the end of that name, such as `masks` of
+/// `head/masks`.
 pub(super) fn folder_named(folder: &CaptureFolder, name: &str) -> Option<String> {
     let exact =
         folder.relative("mask folder", name).ok().filter(|path| io::is_folder(&folder.root.join(path)));
@@ -176,7 +180,8 @@ pub(super) fn folder_named(folder: &CaptureFolder, name: &str) -> Option<String>
     (near.last().is_none_or(|(length, _)| *length < longest)).then(|| path.into())
 }
 
-/// Returns what is said where no mask is used: the pictures that may be masks, and why they are not taken for such.
+/// Returns what is said where no mask is used: the pictures that may be masks, and why they are not
+/// taken for such.
 pub(super) fn stray(folder: &CaptureFolder, groups: &[Group], views: &[View]) -> Option<String> {
     let in_folder = groups.iter().find(|group| !group.place.is_empty());
     if let Some(group) = in_folder {
@@ -205,8 +210,8 @@ pub(super) fn stray(folder: &CaptureFolder, groups: &[Group], views: &[View]) ->
     ))
 }
 
-/// Returns masks of views that have none, in the folder of the others, under the view's own name in other letters, Unicode form or
-/// format.
+/// Returns masks of views that have none, in the folder of the others, under the view's own name in
+/// other letters, Unicode form or format.
 pub(super) fn others_there(
     folder: &CaptureFolder,
     views: &[View],
@@ -227,7 +232,8 @@ pub(super) fn others_there(
     views.iter().zip(&group.pairs.files).map(is_same).collect()
 }
 
-/// Returns the valid masks of the first folder for such that has any by near names, and that folder.
+/// Returns the valid masks of the first folder for such that has any by near names, and that
+/// folder.
 pub(super) fn valid(
     folder: &CaptureFolder,
     bases: &[&Path],

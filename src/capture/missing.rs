@@ -1,5 +1,5 @@
-//! Photographs and masks that are not where a capture's files say they are: which near ones are read in their place, and what is
-//! said of the others.
+//! Photographs and masks that are not where a capture's files say they are: which near ones are
+//! read in their place, and what is said of the others.
 
 use super::folder::{CaptureFolder, in_frame};
 use super::frame::{CameraFrame, Listing};
@@ -24,8 +24,9 @@ pub(super) struct Missing {
     shared: Vec<String>,
 }
 
-/// Confirms the near files of a listing, and says so once. A frame loses its file if another one has it as well, and a file in
-/// another folder if the folder that is named has photographs of other frames: then it is missing, whatever lies elsewhere.
+/// Confirms the near files of a listing, and says so once. A frame loses its file if another one
+/// has it as well, and a file in another folder if the folder that is named has photographs of
+/// other frames: then it is missing, whatever lies elsewhere.
 pub(super) fn settle(folder: &CaptureFolder, listing: &mut Listing) -> Missing {
     let (answers, notes) = folder.search.taken();
     listing.reasons.extend(notes);
@@ -137,8 +138,8 @@ fn said(pairs: Vec<(String, String)>, noun: &str) -> Option<String> {
 }
 
 impl Missing {
-    /// Returns what is there in the place of these missing photographs, as the end of a sentence, and what to do about it
-    /// where that is known.
+    /// Returns what is there in the place of these missing photographs, as the end of a sentence,
+    /// and what to do about it where that is known.
     pub fn explain(
         &self,
         folder: &CaptureFolder,
@@ -197,9 +198,13 @@ fn reduced_instead(
     let text = format!("; `{path}` is there, reduced by {factor}");
     let size =
         io::picture_info(&folder.root.join(path), &folder.options.limits).ok().map(|i| (i.width, i.height));
-    let declared = missing.iter().find_map(|frame| frame.intrinsics.size);
-    let hint = if size.is_some() && size == declared {
-        format!("rename `{place}/` to `{whole}/`: its pictures have the size that the cameras are for")
+    let lens = missing.first().map(|frame| frame.intrinsics).unwrap_or_default();
+    // an opening angle fits pictures of any size
+    let is_free = lens.size.is_none() && lens.focal == [None; 2];
+    let hint = if is_free || size.is_some() && size == lens.size {
+        format!("rename `{place}/` to `{whole}/`: the cameras fit pictures of that size")
+    } else if lens.size.is_none() {
+        format!("add the whole photographs as `{whole}/`: the camera file does not say which size it is for")
     } else {
         format!(
             "use the photographs in `{place}/`: `--set capture.downscale={factor}`; or add the whole ones"
@@ -208,8 +213,8 @@ fn reduced_instead(
     (text, hint)
 }
 
-/// Returns what to say where a list of cameras without names has no photographs: which folders have pictures, and a hint
-/// where they are reduced.
+/// Returns what to say where a list of cameras without names has no photographs: which folders have
+/// pictures, and a hint where they are reduced.
 pub(super) fn no_folder(folder: &CaptureFolder, name: &str) -> (String, Option<String>) {
     let folders = folder.search.folders(folder.root);
     let factor = |folder: &str| reduced(&fold(folder)).filter(|(_, whole)| *whole == name).map(|(f, _)| f);

@@ -1,9 +1,11 @@
-//! Names that are nearly those of files: the one search behind every file that a capture names and does not have.
+//! Names that are nearly those of files: the one search behind every file that a capture names and
+//! does not have.
 //!
-//! Names are compared folded, in small letters and in one Unicode form (macOS writes `é` as two characters). A file in
-//! the folder that is named comes first, then the one that has the most folders in common with the name, counted from
-//! its end, which finds absolute names of other computers. A file is read only if no other fits as well. The files of a
-//! capture are listed once, when the first of them is missing.
+//! Names are compared folded, in small letters and in one Unicode form (macOS writes `é` as two
+//! characters). A file in the folder that is named comes first, then the one that has the most
+//! folders in common with the name, counted from its end, which finds absolute names of other
+//! computers. A file is read only if no other fits as well. The files of a capture are listed once,
+//! when the first of them is missing.
 
 pub(super) mod names;
 pub(super) mod pairs;
@@ -34,8 +36,8 @@ struct Wanted {
     folders: Vec<String>,
     stem: String,
     ending: String,
-    /// Least number of folders that a file elsewhere must have in common with it: a name that climbs out of the capture may
-    /// mean any file there.
+    /// Least number of folders that a file elsewhere must have in common with it: a name that
+    /// climbs out of the capture may mean any file there.
     least: usize,
     is_absolute: bool,
 }
@@ -58,8 +60,8 @@ impl Wanted {
         Some(Wanted { folders: parts, stem, ending, least: climbs as usize, is_absolute })
     }
 
-    /// Folders, joined, whose files have the name that was given, all but for their own names: that folder, and the one of
-    /// pictures that are reduced as it is asked for.
+    /// Folders, joined, whose files have the name that was given, all but for their own names: that
+    /// folder, and the one of pictures that are reduced as it is asked for.
     fn homes(&self, downscale: u32) -> Vec<String> {
         if self.is_absolute || self.least > 0 {
             return Vec::new();

@@ -34,13 +34,11 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     if known == 0 {
         return Err(in_file(file, "it has no array `world_mat_0`", hint));
     } else if known != photos.len() {
-        let (there, other_hint) = match photos.is_empty() {
-            true => missing::no_folder(folder, "image"),
-            false => Default::default(),
-        };
+        // reduced photographs would not say what the cameras are for
+        let there = if photos.is_empty() { missing::no_folder(folder, "image").0 } else { String::new() };
         let problem =
             format!("it has {known} cameras for the {} photographs in `image/`{there}", photos.len());
-        return Err(in_file(file, problem, other_hint.unwrap_or(hint.into())));
+        return Err(in_file(file, problem, hint));
     }
     let masks = paired(&photos, masks, listing);
     for (i, (name, mask)) in photos.iter().zip(masks).enumerate() {
@@ -70,13 +68,10 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     Ok(())
 }
 
-/// Returns the mask of each photograph. Masks have names of their own, so they are paired in order, as NeuS does; by name where they
-/// are not as many.
+/// Returns the mask of each photograph: by name if each has one of its name, else in order, as NeuS pairs them, if they are as
+/// many, else again by name if most have one.
 fn paired(photos: &[String], masks: Vec<String>, listing: &mut Listing) -> Vec<Option<String>> {
     listing.masks_named = "`mask/`, in the order of the photographs";
-    if masks.len() == photos.len() {
-        return masks.into_iter().map(Some).collect();
-    }
     let Some((place, _)) = masks.first().and_then(|mask| mask.rsplit_once('/')) else {
         return vec![None; photos.len()];
     };
@@ -84,21 +79,32 @@ fn paired(photos: &[String], masks: Vec<String>, listing: &mut Listing) -> Vec<O
     let names: Vec<String> = photos.iter().map(|photo| without_ending(&last(photo)).0.to_string()).collect();
     let files: Vec<String> = masks.iter().map(last).collect();
     let pairs = pair(&names, &files);
-    let mut text = format!("`{place}/` has {} masks for {} photographs", masks.len(), photos.len());
-    if 2 * pairs.count() < photos.len() {
-        text += &format!(
-            ", and only {} have their names: none is used; leave one for each photograph, in name order",
-            pairs.count()
-        );
-        listing.warnings.push(text);
+    let (n, is_same_count) = (pairs.count(), masks.len() == photos.len());
+    let counts = format!("`{place}/` has {} masks for {} photographs", masks.len(), photos.len());
+    if n < photos.len() && is_same_count {
+        let is_other = |(i, file): (usize, &Option<usize>)| file.is_some_and(|file| file != i);
+        if let Some(i) = pairs.files.iter().enumerate().position(is_other).filter(|_| 2 * n >= photos.len()) {
+            listing.warnings.push(format!(
+                "masks are paired in the order of the photographs, not by name: `{}` is that of `{}`",
+                masks[i], photos[i]
+            ));
+        }
+        return masks.into_iter().map(Some).collect();
+    }
+    if 2 * n < photos.len() {
+        listing.warnings.push(format!(
+            "{counts}, and only {n} have their names: none is used; leave one for each photograph, in name order"
+        ));
         return vec![None; photos.len()];
     }
-    text += ": they are paired by name";
-    let strangers = pairs.strangers(&files);
-    if !strangers.is_empty() {
-        text += &format!(", and no photograph is called {}", few(strangers));
+    if !is_same_count {
+        let strangers = pairs.strangers(&files);
+        let others = match strangers.is_empty() {
+            true => String::new(),
+            false => format!(", and no photograph is called {}", few(strangers)),
+        };
+        listing.warnings.push(format!("{counts}: they are paired by name{others}"));
     }
-    listing.warnings.push(text);
     listing.masks_named = "`mask/`, named as the photographs";
     pairs.files.into_iter().map(|file| file.map(|file| masks[file].clone())).collect()
 }

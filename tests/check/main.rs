@@ -31,6 +31,7 @@ mod hostile_mesh;
 mod hostile_npz;
 mod house;
 mod masks;
+mod names;
 mod photographs;
 mod preview;
 mod raycast_truth;

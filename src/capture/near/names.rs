@@ -1,4 +1,5 @@
-//! What names say: their endings, what folders are for, and the words that turn a photograph's name into its mask's.
+//! What names say: their endings, what folders are for, and the words that turn a photograph's name
+//! into its mask's.
 
 use icu_normalizer::ComposingNormalizerBorrowed;
 use std::path::Path;
@@ -12,7 +13,8 @@ pub const READABLE_FORMATS: usize = 3;
 /// Usual folders of photographs.
 pub const IMAGE_FOLDERS: [&str; 5] = ["images", "image", "input", "rgb", "photos"];
 
-/// Words that a mask's name has besides the photograph's, longer ones before those that they end with.
+/// Words that a mask's name has besides the photograph's, longer ones before those that they end
+/// with.
 const MASK_WORDS: [&str; 10] =
     ["segmentation", "silhouette", "masks", "mask", "mattes", "matte", "matting", "alpha", "seg", "pha"];
 
@@ -63,7 +65,8 @@ pub fn has_ending(name: &str, endings: &[&str]) -> bool {
     endings.iter().any(|e| e.eq_ignore_ascii_case(found))
 }
 
-/// Returns a name without the ending of a picture, and that ending; all of it and nothing where it has none.
+/// Returns a name without the ending of a picture, and that ending; all of it and nothing where it
+/// has none.
 pub fn without_ending(name: &str) -> (&str, &str) {
     match name.rsplit_once('.') {
         Some((stem, ending)) if !stem.is_empty() && has_ending(name, &PHOTOGRAPHS) => (stem, ending),
@@ -125,8 +128,8 @@ pub fn is_aside(folded: &str) -> bool {
     is_like_masks(folded) || words(folded).any(|word| ASIDE.iter().any(|aside| word.starts_with(aside)))
 }
 
-/// Returns the factor of a folder of reduced pictures, and what the folder of the whole ones is called: 4 and `images` of
-/// `images_4` and `images_4x`.
+/// Returns the factor of a folder of reduced pictures, and what the folder of the whole ones is
+/// called: 4 and `images` of `images_4` and `images_4x`.
 pub fn reduced(folded: &str) -> Option<(u32, &str)> {
     let (whole, digits) = folded.rsplit_once('_')?;
     let digits = digits.strip_suffix('x').unwrap_or(digits);
@@ -135,8 +138,8 @@ pub fn reduced(folded: &str) -> Option<(u32, &str)> {
     Some((factor, whole))
 }
 
-/// Returns a folded name without ending and without one of these words before or behind it. Words of two letters or three
-/// need something between.
+/// Returns a folded name without ending and without one of these words before or behind it. Words
+/// of two letters or three need something between.
 fn without_word<'n>(stem: &'n str, all: &[&str]) -> Option<&'n str> {
     const BETWEEN: [char; 5] = ['_', '-', '.', ' ', '+'];
     all.iter().find_map(|word| {
@@ -148,8 +151,9 @@ fn without_word<'n>(stem: &'n str, all: &[&str]) -> Option<&'n str> {
     })
 }
 
-/// Returns the folded name of the photograph that a mask of this folded name, without ending, belongs to, and whether the name has a
-/// word of masks: `000` and true of `000_mask` and `mask-000.jpg`.
+/// Returns the folded name of the photograph that a mask of this folded name, without ending,
+/// belongs to, and whether the name has a word of masks: `000` and true of `000_mask` and
+/// `mask-000.jpg`.
 pub fn bare(stem: &str) -> (&str, bool) {
     let (mut rest, mut is_named) = (stem, false);
     loop {
@@ -163,7 +167,8 @@ pub fn bare(stem: &str) -> (&str, bool) {
     }
 }
 
-/// Returns the folded name of the view that a file of valid pixels, `.npy` or a picture, belongs to.
+/// Returns the folded name of the view that a file of valid pixels, `.npy` or a picture, belongs
+/// to.
 pub fn without_valid(name: &str) -> &str {
     let stem = name.strip_suffix(".npy").unwrap_or(without_ending(name).0);
     without_word(stem, &["valid"]).unwrap_or(stem)

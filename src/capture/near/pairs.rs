@@ -25,16 +25,18 @@ impl Pairs {
     }
 }
 
-/// Ways to compare, the strictest first: the folded name, the name without what makes it a mask's with folders written in
-/// any way, and the last part alone without words of photographs and zeros before a number.
+/// Ways to compare, the strictest first: the folded name, the name without what makes it a mask's
+/// with folders written in any way, and the last part alone without words of photographs and zeros
+/// before a number.
 const KEYS: [fn(&str) -> String; 3] = [
     |stem| stem.into(),
     |stem| bare(&stem.replace('/', "_")).0.into(),
     |stem| plain(stem.rsplit('/').next().unwrap_or_default()).into(),
 ];
 
-/// Pairs names without ending, such as `left/07`, with files below a folder, such as `left/07_mask.png`. Each name takes
-/// the strictest way in which any file fits; a PNG is preferred to other formats.
+/// Pairs names without ending, such as `left/07`, with files below a folder, such as
+/// `left/07_mask.png`. Each name takes the strictest way in which any file fits; a PNG is preferred
+/// to other formats.
 pub fn pair(names: &[String], files: &[String]) -> Pairs {
     let stems: Vec<String> = files.iter().map(|file| fold(without_ending(file).0)).collect();
     let by_key = KEYS.map(|key| {
