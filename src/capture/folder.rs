@@ -112,8 +112,9 @@ impl CaptureFolder<'_> {
         Ok(None)
     }
 
-    /// Returns the photograph that `name` refers to, with its path below the capture: that of [`CaptureFolder::exact_photo`], else
-    /// the only one near the name, which [`missing::settle`](super::missing::settle) has yet to confirm.
+    /// Returns the photograph that `name` refers to, with its path below the capture: that of
+    /// [`CaptureFolder::exact_photo`], else the only one near the name, which
+    /// [`missing::settle`](super::missing::settle) has yet to confirm.
     pub fn photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
         let exact = self.exact_photo(file, name);
         if matches!(exact, Ok((_, Some(_)))) {
@@ -125,7 +126,8 @@ impl CaptureFolder<'_> {
         }
     }
 
-    /// Returns the mask that `name` refers to, if it exists: the exact name, else the only mask near it.
+    /// Returns the mask that `name` refers to, if it exists: the exact name, else the only mask
+    /// near it.
     pub fn mask(&self, file: &str, name: &str) -> Result<Option<PathBuf>> {
         let exact = self.relative(file, name).map(|relative| self.file(&relative));
         match exact {
@@ -144,7 +146,8 @@ impl CaptureFolder<'_> {
         Some((found.into(), path))
     }
 
-    /// Returns whether the photograph of a frame has the name that its file gives, in one of the usual folders.
+    /// Returns whether the photograph of a frame has the name that its file gives, in one of the
+    /// usual folders.
     pub fn is_exact(&self, frame: &CameraFrame) -> bool {
         let mut bases = IMAGE_FOLDERS.into_iter().chain([""]);
         bases.any(|base| {
@@ -153,9 +156,9 @@ impl CaptureFolder<'_> {
         })
     }
 
-    /// Returns the pictures in the first of these folders that exists, in name order, as paths below the capture; `None` without
-    /// such a folder. Where none exists, the only folder counts that is called like one of them in other letters or has a usual
-    /// name of `others`.
+    /// Returns the pictures in the first of these folders that exists, in name order, as paths
+    /// below the capture; `None` without such a folder. Where none exists, the only folder counts
+    /// that is called like one of them in other letters or has a usual name of `others`.
     pub fn pictures(&self, names: &[&str], others: &[&str]) -> Result<Option<Vec<String>>> {
         let listed = |name: &str| -> Result<Option<Vec<String>>> {
             let files = photographs(&self.root.join(name))?;
@@ -282,7 +285,8 @@ impl FolderEntries {
     }
 }
 
-/// Returns the photographs in a folder, in name order, without masks beside them; if none is supported, those of other formats, to be refused by name.
+/// Returns the photographs in a folder, in name order, without masks beside them; if none is
+/// supported, those of other formats, to be refused by name.
 pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
     let mut files = io::list_files(folder)?;
     let can_be_read = files.iter().any(|f| has_ending(f, &PHOTOGRAPHS[..READABLE_FORMATS]));

@@ -150,7 +150,7 @@ pub(super) fn within(folder: &CaptureFolder, place: &str, views: &[View]) -> Gro
 /// Returns whether a folder has photographs of views.
 pub(super) fn holds_photographs(folder: &CaptureFolder, place: &str, views: &[View]) -> bool {
     let place = folder.root.join(place);
-    views.iter().any(|view| view.photo.parent() == Some(&place))
+    views.iter().any(|view| view.photo.parent() == Some(place.as_path()))
 }
 
 /// Returns the folder that `capture.mask_dir` means: the one of that name, else the only one that

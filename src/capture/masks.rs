@@ -22,8 +22,8 @@ pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {
     if names.len() > 6 { format!("{text} and {} more", names.len() - 6) } else { text }
 }
 
-/// Selects the source of the masks, once for the whole capture, and finds valid masks and regions. Returns, where there are no
-/// masks, what may be some and is not used.
+/// Selects the source of the masks, once for the whole capture, and finds valid masks and regions.
+/// Returns, where there are no masks, what may be some and is not used.
 ///
 /// `common` is the common folder of all photographs; mask folders are next to it, or in the root.
 pub(super) fn choose(
@@ -174,7 +174,8 @@ fn say_none(folder: &CaptureFolder, stray: Option<&str>, listing: &mut Listing) 
     }
 }
 
-/// Returns masks by near names where none has the name that is looked for, else what may be masks and is not used.
+/// Returns masks by near names where none has the name that is looked for, else what may be masks
+/// and is not used.
 fn near_masks(
     folder: &CaptureFolder,
     views: &[View],
@@ -222,7 +223,8 @@ fn near_masks(
     Ok((usable.iter().map(source).collect(), None))
 }
 
-/// Adds masks in the folder of the others that have the view's name in other letters or another format.
+/// Adds masks in the folder of the others that have the view's name in other letters or another
+/// format.
 fn complete(folder: &CaptureFolder, views: &[View], source: &mut Source, listing: &mut Listing) {
     let files = source.1.iter().filter_map(|mask| match mask {
         ViewMask::File(path) => Some(path.clone()),
@@ -285,7 +287,8 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
     Err(Error::cannot(format_args!("`{shown}`: {problem}"), hint))
 }
 
-/// Returns the first of these files that exists and is no photograph, below the first base with any.
+/// Returns the first of these files that exists and is no photograph, below the first base with
+/// any.
 fn first_of(
     folder: &CaptureFolder,
     photos: &HashSet<PathBuf>,

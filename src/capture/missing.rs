@@ -116,13 +116,13 @@ fn settle_masks(folder: &CaptureFolder, listing: &mut Listing, answers: &[Answer
 
 /// Files that were found, with one name that led there and whether they lie elsewhere.
 fn by_path(answers: &[Answer]) -> HashMap<&Path, (&Answer, bool)> {
-    let one = |answer| match &answer {
-        Answer { found: Found::One { path, is_elsewhere }, .. } => {
-            Some((Path::new(path.as_str()), (answer, *is_elsewhere)))
+    let mut found = HashMap::new();
+    for answer in answers {
+        if let Found::One { path, is_elsewhere } = &answer.found {
+            found.insert(Path::new(path), (answer, *is_elsewhere));
         }
-        _ => None,
-    };
-    answers.iter().filter_map(one).collect()
+    }
+    found
 }
 
 /// Returns a sentence on files that were read in the place of others.

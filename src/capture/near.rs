@@ -151,7 +151,7 @@ impl Index {
 
     fn nearest(&self, wanted: &Wanted, kind: Kind, downscale: u32) -> Found {
         let homes = wanted.homes(downscale);
-        let (mut best, mut reduced) = (Vec::new(), None);
+        let (mut best, mut reduced): (Vec<usize>, Option<(u32, usize)>) = (Vec::new(), None);
         let mut best_rank = None;
         for &i in self.by_name.get(bare(&wanted.stem).0).into_iter().flatten() {
             let picture = &self.pictures[i];

@@ -68,8 +68,8 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     Ok(())
 }
 
-/// Returns the mask of each photograph: by name if each has one of its name, else in order, as NeuS pairs them, if they are as
-/// many, else again by name if most have one.
+/// Returns the mask of each photograph: by name if each has one of its name, else in order, as NeuS
+/// pairs them, if they are as many, else again by name if most have one.
 fn paired(photos: &[String], masks: Vec<String>, listing: &mut Listing) -> Vec<Option<String>> {
     listing.masks_named = "`mask/`, in the order of the photographs";
     let Some((place, _)) = masks.first().and_then(|mask| mask.rsplit_once('/')) else {

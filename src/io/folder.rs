@@ -80,9 +80,9 @@ pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<Pat
     Ok(None)
 }
 
-/// Returns the files in a folder and below as sorted paths in it, separated by `/`. Links are followed; hidden entries, names
-/// that are not UTF-8, folders that are `apart` or deeper than `depth`, and what cannot be listed are left out. `None`
-/// if there are more than `most` entries.
+/// Returns the files in a folder and below as sorted paths in it, separated by `/`. Links are
+/// followed; hidden entries, names that are not UTF-8, folders that are `apart` or deeper than
+/// `depth`, and what cannot be listed are left out. `None` if there are more than `most` entries.
 pub fn files_below(
     root: &Path,
     depth: usize,

@@ -1,4 +1,5 @@
-//! Photographs and masks under names that are nearly those of the camera files: read where only one fits, else named.
+//! Photographs and masks under names that are nearly those of the camera files: read where only one
+//! fits, else named.
 
 use std::fs;
 use std::io::Write;
@@ -439,7 +440,7 @@ fn neus_masks_that_are_not_as_many_as_the_photographs_are_paired_by_name_or_name
     fs::remove_file(dir.path().join("mask/000.png")).unwrap();
     let c = open(&dir).unwrap();
     assert_eq!(masks(&dir, &c)[0], "mask/001.png");
-    assert!(says(&c.warnings, &["in the order of the photographs", "`mask/001.png`"]), "{:?}", c.warnings);
+    assert!(says(&c.warnings, &["in the order of the photographs", "`mask/002.png`"]), "{:?}", c.warnings);
     let dir = neus("image");
     (0..VIEWS + 1).for_each(|i| mask(&dir, &named("mask/x{}y.png", i)));
     let c = open(&dir).unwrap();
