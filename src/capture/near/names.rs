@@ -138,17 +138,23 @@ pub fn reduced(folded: &str) -> Option<(u32, &str)> {
     Some((factor, whole))
 }
 
-/// Returns a folded name without ending and without one of these words before or behind it. Words
-/// of two letters or three need something between.
+/// Returns a folded name without ending and without one of these words before or behind it. A word
+/// of three letters or more may stand directly at a digit.
 fn without_word<'n>(stem: &'n str, all: &[&str]) -> Option<&'n str> {
     const BETWEEN: [char; 5] = ['_', '-', '.', ' ', '+'];
-    all.iter().find_map(|word| {
-        let is_rest = |rest: &&str| !rest.is_empty() && (word.len() > 3 || rest.ends_with(BETWEEN));
-        let before = stem.strip_suffix(word).filter(is_rest).map(|rest| rest.trim_end_matches(BETWEEN));
-        let is_rest = |rest: &&str| !rest.is_empty() && (word.len() > 3 || rest.starts_with(BETWEEN));
-        let behind = || stem.strip_prefix(word).filter(is_rest).map(|rest| rest.trim_start_matches(BETWEEN));
-        before.or_else(behind).filter(|rest| !rest.is_empty())
-    })
+    let is_apart = |word: &str, next: Option<char>| {
+        next.is_some_and(|c| BETWEEN.contains(&c) || word.len() > 2 && c.is_ascii_digit())
+    };
+    let before = |word: &str| {
+        let rest = stem.strip_suffix(word).filter(|rest| is_apart(word, rest.chars().next_back()))?;
+        Some(rest.trim_end_matches(BETWEEN))
+    };
+    let behind = |word: &str| {
+        let rest = stem.strip_prefix(word).filter(|rest| is_apart(word, rest.chars().next()))?;
+        Some(rest.trim_start_matches(BETWEEN))
+    };
+    let rests = all.iter().flat_map(|word| [before(word), behind(word)]);
+    rests.flatten().find(|rest| !rest.is_empty())
 }
 
 /// Returns the folded name of the photograph that a mask of this folded name, without ending,
@@ -208,12 +214,9 @@ mod tests {
         ] {
             assert_eq!(bare(name), ("000", true), "{name}");
         }
-        for name in ["000", "000.jpg"] {
-            assert_eq!(bare(name), ("000", false), "{name}");
-        }
         // words alone, and words that are parts of others, are names
-        for name in ["mask", "offseg", "alphabet_1"] {
-            assert_eq!(bare(name).0 == name, name != "alphabet_1", "{name}");
+        for name in ["000", "000.jpg", "mask", "offseg", "alphabet_1", "000_fg"] {
+            assert_eq!(bare(name), (without_ending(name).0, false), "{name}");
         }
         assert_eq!(
             (plain("rgb_0010"), plain("mask_10"), plain("000"), plain("left")),
