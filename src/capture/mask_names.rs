@@ -14,6 +14,9 @@ use std::path::{Path, PathBuf};
 /// Folders in the order in which they are taken; others follow by name.
 const STANDING: [&str; 3] = ["vit_mask", "masks", "mask"];
 
+/// Maximum number of folders that are compared with the views.
+const MAX_FOLDERS: usize = 16;
+
 /// Folders of valid masks, and whether these may be pictures: `valid/` may as well have photographs
 /// to validate with.
 const VALID_FOLDERS: [(&str, bool); 3] = [("valid", false), ("valid_mask", true), ("valid_masks", true)];
@@ -118,14 +121,16 @@ pub(super) fn groups(folder: &CaptureFolder, views: &[View]) -> Vec<Group> {
             beside.push(picture.path.clone());
         }
     }
-    let mut groups: Vec<Group> =
-        found.into_iter().map(|(p, files)| Group::new(&p, files, &names(views))).collect();
-    let order = |group: &Group| {
-        let last = fold(group.place.rsplit('/').next().unwrap_or_default());
+    let order = |(place, _): &(String, Vec<String>)| {
+        let last = fold(place.rsplit('/').next().unwrap_or_default());
         let standing = STANDING.iter().position(|name| *name == last).unwrap_or(STANDING.len());
-        (standing, group.place.matches('/').count(), group.place.clone())
+        (standing, place.matches('/').count(), place.clone())
     };
-    groups.sort_by_cached_key(order);
+    let mut found: Vec<(String, Vec<String>)> = found.into_iter().collect();
+    found.sort_by_cached_key(order);
+    let view_names = names(views);
+    let found = found.into_iter().take(MAX_FOLDERS);
+    let mut groups: Vec<Group> = found.map(|(place, files)| Group::new(&place, files, &view_names)).collect();
     if !beside.is_empty() {
         let relative = |view: &View| without_ending(&folder.shown(&view.photo)).0.replace('\\', "/");
         let names: Vec<String> = views.iter().map(relative).collect();
@@ -201,7 +206,7 @@ pub(super) fn stray(folder: &CaptureFolder, groups: &[Group], views: &[View]) ->
     };
     let folders = folder.search.folders(folder.root).into_keys();
     let mut folders = folders.filter(|name| !name.is_empty() && is_other(name));
-    let place = folders.find(|place| {
+    let place = folders.by_ref().take(MAX_FOLDERS).find(|place| {
         let group = within(folder, place, views);
         !holds_photographs(folder, place, views) && group.pairs.count() == views.len()
     })?;

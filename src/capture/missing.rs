@@ -151,7 +151,7 @@ impl Missing {
             return (text, Some(hint));
         }
         if let Some((name, files)) = self.several.first() {
-            let shown: Vec<String> = files.iter().take(3).map(|file| format!("`{file}`")).collect();
+            let shown: Vec<String> = files.iter().map(|file| format!("`{file}`")).collect();
             let text = format!("; `{name}` fits {}", shown.join(" as well as "));
             return (text, Some("keep one photograph of each name, where the camera file says it is".into()));
         }

@@ -23,6 +23,10 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 const MAX_ENTRIES: usize = 100_000;
 /// Maximum depth of folders.
 const MAX_DEPTH: usize = 5;
+/// Maximum number of files of one name that are compared.
+const MAX_ALIKE: usize = 1000;
+/// Number of files that fit a name that are remembered.
+const MAX_SHOWN: usize = 3;
 
 /// What is looked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -153,7 +157,8 @@ impl Index {
         let homes = wanted.homes(downscale);
         let (mut best, mut reduced): (Vec<usize>, Option<(u32, usize)>) = (Vec::new(), None);
         let mut best_rank = None;
-        for &i in self.by_name.get(bare(&wanted.stem).0).into_iter().flatten() {
+        let alike = self.by_name.get(bare(&wanted.stem).0).filter(|alike| alike.len() <= MAX_ALIKE);
+        for &i in alike.into_iter().flatten() {
             let picture = &self.pictures[i];
             let is_same = picture.stem == wanted.stem;
             let is_home = homes.contains(&picture.folder);
@@ -202,7 +207,7 @@ impl Index {
             }
             ([], Some((factor, i))) => Found::Reduced { factor, path: path(i) },
             ([], None) => Found::Nothing,
-            (several, _) => Found::Several(several.iter().map(|&i| path(i)).collect()),
+            (several, _) => Found::Several(several.iter().take(MAX_SHOWN).map(|&i| path(i)).collect()),
         }
     }
 }
