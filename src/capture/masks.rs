@@ -83,7 +83,7 @@ pub(super) fn choose(
     let mut found: Vec<_> = candidates.into_iter().filter(|(_, sources)| count(sources) > 0).collect();
     let mut stray = None;
     if found.is_empty() && is_in_files {
-        (found, stray) = near_masks(folder, views, listing)?;
+        (found, stray) = near_masks(folder, views)?;
     } else if is_in_files {
         complete(folder, views, &mut found[0], listing);
     }
@@ -176,11 +176,7 @@ fn say_none(folder: &CaptureFolder, stray: Option<&str>, listing: &mut Listing) 
 
 /// Returns masks by near names where none has the name that is looked for, else what may be masks
 /// and is not used.
-fn near_masks(
-    folder: &CaptureFolder,
-    views: &[View],
-    listing: &mut Listing,
-) -> Result<(Vec<Source>, Option<String>)> {
+fn near_masks(folder: &CaptureFolder, views: &[View]) -> Result<(Vec<Source>, Option<String>)> {
     let mask_dir = &folder.options.mask_dir;
     let groups = if mask_dir.is_empty() {
         mask_names::groups(folder, views)
@@ -204,12 +200,11 @@ fn near_masks(
         };
         return Ok((Vec::new(), Some(text)));
     };
-    let usable: Vec<_> = groups.iter().filter(|group| group.is_usable()).collect();
-    if usable.is_empty() {
+    if !groups.iter().any(mask_names::Group::is_usable) {
         let groups: Vec<_> = groups.into_iter().filter(|group| !group.is_empty()).collect();
         return Ok((Vec::new(), mask_names::stray(folder, &groups, views)));
     }
-    let source = |group: &&mask_names::Group| -> Source {
+    let source = |group: &mask_names::Group| -> Source {
         let place = if group.place.is_empty() {
             "beside the photographs".into()
         } else {
@@ -220,7 +215,7 @@ fn near_masks(
         });
         (place + &example, group.masks(folder.root).into_iter().map(ViewMask::from).collect())
     };
-    Ok((usable.iter().map(source).collect(), None))
+    Ok((groups.iter().filter(|group| group.is_usable()).map(source).collect(), None))
 }
 
 /// Adds masks in the folder of the others that have the view's name in other letters or another
