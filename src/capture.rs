@@ -194,10 +194,9 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         return None;
     }
     name_splits(&mut views, &kept, listing);
-    let stray_masks = masks::choose(folder, &common, &mut views, &kept, listing).unwrap_or_else(|problem| {
+    if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, listing) {
         listing.problems.push(problem);
-        None
-    });
+    }
     Some(Capture {
         root: root.into(),
         name: root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned()),
@@ -207,7 +206,7 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         focus: listing.focus.or_else(|| scene::around_points(&views, &listing.points)),
         views,
         unit_m: options.unit_m,
-        stray_masks,
+        stray_masks: listing.stray_masks.take(),
         warnings: std::mem::take(&mut listing.warnings),
     })
 }

@@ -23,7 +23,6 @@ pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {
 }
 
 /// Selects the source of the masks, once for the whole capture, and finds valid masks and regions.
-/// Returns, where there are no masks, what may be some and is not used.
 ///
 /// `common` is the common folder of all photographs; mask folders are next to it, or in the root.
 pub(super) fn choose(
@@ -32,7 +31,7 @@ pub(super) fn choose(
     views: &mut [View],
     kept: &[(CameraFrame, PictureInfo)],
     listing: &mut Listing,
-) -> Result<Option<String>> {
+) -> Result<()> {
     let root = Path::new("");
     let beside = [common.parent().unwrap_or(root), root];
     let photos: HashSet<PathBuf> = views.iter().map(|view| view.photo.clone()).collect();
@@ -81,14 +80,13 @@ pub(super) fn choose(
     };
     let is_in_files = !matches!(masks, MaskSource::None | MaskSource::Clicks | MaskSource::Alpha);
     let mut found: Vec<_> = candidates.into_iter().filter(|(_, sources)| count(sources) > 0).collect();
-    let mut stray = None;
     if found.is_empty() && is_in_files {
-        (found, stray) = near_masks(folder, views)?;
+        (found, listing.stray_masks) = near_masks(folder, views)?;
     } else if is_in_files {
         complete(folder, views, &mut found[0], listing);
     }
     if found.is_empty() {
-        say_none(folder, stray.as_deref(), listing);
+        say_none(folder, listing);
     } else {
         take(folder, views, found, listing);
     }
@@ -120,7 +118,7 @@ pub(super) fn choose(
     if region > 0 {
         listing.reasons.push(format!("face regions for the metrics, for {region} of {} views", views.len()));
     }
-    Ok(stray)
+    Ok(())
 }
 
 /// A source of masks in words, and the mask of each view.
@@ -159,9 +157,9 @@ fn take(folder: &CaptureFolder, views: &mut [View], found: Vec<Source>, listing:
 }
 
 /// Says that no masks are used, and why.
-fn say_none(folder: &CaptureFolder, stray: Option<&str>, listing: &mut Listing) {
+fn say_none(folder: &CaptureFolder, listing: &mut Listing) {
     let CaptureOptions { masks, mask_dir, .. } = folder.options;
-    let stray = stray.map_or(String::new(), |text| format!("; {text}"));
+    let stray = listing.stray_masks.as_ref().map_or(String::new(), |text| format!("; {text}"));
     match masks {
         MaskSource::None | MaskSource::Clicks => {
             listing.reasons.push("masks are not used, by `mask.source`".into());
