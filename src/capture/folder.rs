@@ -321,12 +321,6 @@ pub(super) fn is_nameable(name: &str) -> bool {
     !name.contains('\\')
 }
 
-/// Returns whether a name has one of these endings, ignoring case.
-pub(super) fn has_ending(name: &str, endings: &[&str]) -> bool {
-    let found = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
-    endings.iter().any(|e| e.eq_ignore_ascii_case(found))
-}
-
 /// Parses an XML file with at most `nodes` nodes. A DTD is refused, because its entities could grow without bound.
 pub(super) fn parse_xml<'t>(
     path: &Path,
