@@ -28,9 +28,12 @@ mod format;
 mod frame;
 pub mod inspect;
 mod llff;
+mod mask_names;
 mod mask_values;
 mod masks;
 mod metashape;
+mod missing;
+mod near;
 mod neus;
 mod order;
 mod photo_checks;
@@ -150,20 +153,28 @@ fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(Captu
 fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<Capture> {
     let CaptureFolder { root, options, .. } = *folder;
     let total = listing.frames.len();
+    let near = missing::settle(folder, listing);
     let (frames, missing): (Vec<CameraFrame>, Vec<CameraFrame>) =
         std::mem::take(&mut listing.frames).into_iter().partition(|f| f.photo.is_some());
-    let mut found = "the camera files list no frames".to_string();
+    let (mut found, mut there, mut hint) =
+        ("the camera files list no frames".to_string(), String::new(), None);
     if !missing.is_empty() {
         let names = few(missing.iter().map(|f| &f.name));
         found = format!("{} of {total} photographs are missing: {names}", missing.len());
+        (there, hint) = near.explain(folder, &missing, frames.is_empty());
     }
     if frames.is_empty() {
         if !missing.is_empty() || listing.problems.is_empty() {
-            listing.problems.push(no_views(root, &found));
+            let problem = no_views(root, &(found + &there));
+            listing.problems.push(match hint {
+                Some(hint) => problem.with_hint(hint),
+                None => problem,
+            });
         }
         return None;
     } else if !missing.is_empty() {
-        listing.warnings.push(format!("{found}; their views are left out"));
+        let hint = hint.map_or(String::new(), |hint| format!("; {hint}"));
+        listing.warnings.push(format!("{found}; their views are left out{there}{hint}"));
     }
 
     let (common, names) = folder::view_names(&frames);
@@ -234,6 +245,7 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         focus: listing.focus.or_else(|| scene::around_points(&views, &listing.points)),
         views,
         unit_m: options.unit_m,
+        stray_masks: listing.stray_masks.take(),
         warnings: std::mem::take(&mut listing.warnings),
         readings,
     })

@@ -21,8 +21,8 @@ pub use self::exr::{ExrImage, read_exr, write_exr};
 pub use animation::{ANIMATIONS, Animation, Frames, write_animation};
 pub use folder::{
     Lock, LockError, any_file, append, begins, clear_folder, create_folder, exists, file_size, file_sizes,
-    free_bytes, is_file, is_folder, is_link, is_writable, list_files, list_folders, list_hidden, modified,
-    real_path, remove_empty_folder, similar,
+    files_below, free_bytes, is_file, is_folder, is_link, is_writable, list_files, list_folders, list_hidden,
+    modified, real_path, remove_empty_folder, similar,
 };
 pub use json::{parse_json, read_json, read_typed, typed};
 pub use mask_picture::{MaskPicture, read_gray, read_mask};

@@ -2,12 +2,16 @@
 //! No file outside the capture is opened.
 
 use super::frame::CameraFrame;
+use super::near::names::{IMAGE_FOLDERS, READABLE_FORMATS, bare, fold, without_ending};
+pub(super) use super::near::names::{PHOTOGRAPHS, has_ending, is_common_name};
+use super::near::{Kind, Search};
 use super::table;
 use super::view::{CaptureOptions, Reading};
 use crate::io::{self, ReadError};
 use crate::{Error, Result};
 use glam::DMat3;
 use roxmltree::{Document, ParsingOptions};
+use std::collections::HashSet;
 use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
 
@@ -34,11 +38,13 @@ pub(super) struct CaptureFolder<'a> {
     /// The path without links.
     real: PathBuf,
     pub options: &'a CaptureOptions,
+    /// Finds what is missing under a near name.
+    pub search: Search,
 }
 
 impl CaptureFolder<'_> {
     pub fn new<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<CaptureFolder<'a>> {
-        Ok(CaptureFolder { root, real: io::real_path(root)?, options })
+        Ok(CaptureFolder { root, real: io::real_path(root)?, options, search: Search::default() })
     }
 
     /// Returns how what the files leave open is read.
@@ -91,7 +97,7 @@ impl CaptureFolder<'_> {
     pub fn image_folder<'n>(&self, names: impl Iterator<Item = &'n str>) -> &'static str {
         let names: Vec<&str> = names.take(64).collect();
         let is_in = |base: &str, name: &str| {
-            self.photo("", &join(base, name)).is_ok_and(|(_, photo)| photo.is_some())
+            self.exact_photo("", &join(base, name)).is_ok_and(|(_, photo)| photo.is_some())
         };
         let bases = IMAGE_FOLDERS.into_iter().chain([""]);
         let counted = bases.map(|base| (base, names.iter().filter(|name| is_in(base, name)).count()));
@@ -103,17 +109,87 @@ impl CaptureFolder<'_> {
         let stem =
             if has_ending(name, &PHOTOGRAPHS) { Path::new(name).with_extension("") } else { name.into() };
         for name in [format!("masks/{name}.png"), format!("masks/{}.png", stem.to_string_lossy())] {
-            if let Some(path) = self.file(&self.relative(file, &name)?) {
+            // a photograph of another computer's name may be found where its mask is not
+            let Ok(relative) = self.relative(file, &name) else { continue };
+            if let Some(path) = self.file(&relative) {
                 return Ok(Some(path));
             }
         }
         Ok(None)
     }
 
+    /// Returns the photograph that `name` refers to, with its path below the capture: that of
+    /// [`CaptureFolder::exact_photo`], else the only one near the name, which
+    /// [`missing::settle`](super::missing::settle) has yet to confirm.
+    pub fn photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
+        let exact = self.exact_photo(file, name);
+        if matches!(exact, Ok((_, Some(_)))) {
+            return exact;
+        }
+        match self.near(Kind::Photograph, name) {
+            Some((relative, path)) => Ok((relative, Some(path))),
+            None => exact,
+        }
+    }
+
+    /// Returns the mask that `name` refers to, if it exists: the exact name, else the only mask
+    /// near it.
+    pub fn mask(&self, file: &str, name: &str) -> Result<Option<PathBuf>> {
+        let exact = self.relative(file, name).map(|relative| self.file(&relative));
+        match exact {
+            Ok(Some(_)) => exact,
+            missing => match self.near(Kind::Mask, name) {
+                Some((_, path)) => Ok(Some(path)),
+                None => missing,
+            },
+        }
+    }
+
+    /// Returns the only file near a name: its path below the capture, and its path.
+    fn near(&self, kind: Kind, name: &str) -> Option<(PathBuf, PathBuf)> {
+        let found = self.search.nearest(self.root, kind, name, self.options.downscale)?;
+        let path = self.file(Path::new(&found))?;
+        Some((found.into(), path))
+    }
+
+    /// Returns whether the photograph of a frame has the name that its file gives, in one of the
+    /// usual folders.
+    pub fn is_exact(&self, frame: &CameraFrame) -> bool {
+        let mut bases = IMAGE_FOLDERS.into_iter().chain([""]);
+        bases.any(|base| {
+            let exact = self.exact_photo(&frame.file, &join(base, &frame.name));
+            exact.is_ok_and(|(relative, photo)| photo.is_some() && relative == frame.relative)
+        })
+    }
+
+    /// Returns the pictures in the first of these folders that exists, in name order, as paths
+    /// below the capture; `None` without such a folder. Where none exists, the only folder counts
+    /// that is called like one of them in other letters or has a usual name of `others`.
+    pub fn pictures(&self, names: &[&str], others: &[&str]) -> Result<Option<Vec<String>>> {
+        let listed = |name: &str| -> Result<Option<Vec<String>>> {
+            let files = photographs(&self.root.join(name))?;
+            Ok(Some(files.into_iter().map(|file| format!("{name}/{file}")).collect()))
+        };
+        if let Some(name) = names.iter().find(|name| io::is_folder(&self.root.join(name))) {
+            return listed(name);
+        }
+        let folders = FolderEntries::of(self.root).folders;
+        let among = |names: &[&str]| -> Vec<&String> {
+            let is_there = |name: &&String| names.contains(&fold(name).as_str());
+            let has_photographs =
+                |name: &&String| photographs(&self.root.join(name)).is_ok_and(|p| !p.is_empty());
+            folders.iter().filter(is_there).filter(has_photographs).collect()
+        };
+        let near = Some(among(names)).filter(|near| !near.is_empty()).unwrap_or_else(|| among(others));
+        let [name] = near[..] else { return Ok(None) };
+        self.search.note(format!("`{name}/` is read, as there is no `{}/`", names[0]));
+        listed(name)
+    }
+
     /// Returns the photograph that `name` refers to, with its path below the capture: the exact name, else with a
     /// usual ending, else in the folder of pictures already reduced by `options.downscale`
     /// (`images_4/`, `images_4x/`).
-    pub fn photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
+    fn exact_photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
         let downscale = self.options.downscale;
         let wanted = self.relative(file, name)?;
         let mut candidates = vec![wanted.clone()];
@@ -159,35 +235,6 @@ pub(super) fn view_names(frames: &[CameraFrame]) -> (PathBuf, Vec<String>) {
         })
         .collect();
     (folder, names)
-}
-
-/// Endings of photographs, supported ones first.
-pub(super) const PHOTOGRAPHS: [&str; 8] = ["png", "jpg", "jpeg", "tif", "tiff", "heic", "webp", "bmp"];
-
-/// Number of supported endings in [`PHOTOGRAPHS`].
-const READABLE_FORMATS: usize = 3;
-
-/// Usual folders of photographs.
-const IMAGE_FOLDERS: [&str; 5] = ["images", "image", "input", "rgb", "photos"];
-
-/// Returns whether a folder's name says nothing of what its photographs show.
-pub(super) fn is_common_name(name: &str) -> bool {
-    let others = [
-        "imgs",
-        "img",
-        "photo",
-        "photographs",
-        "pictures",
-        "pics",
-        "frames",
-        "color",
-        "png",
-        "jpg",
-        "jpeg",
-        "raw",
-        "dcim",
-    ];
-    IMAGE_FOLDERS.iter().chain(&others).any(|common| common.eq_ignore_ascii_case(name))
 }
 
 /// The entries of a folder.
@@ -248,12 +295,19 @@ impl FolderEntries {
     }
 }
 
-/// Returns the photographs in a folder, in name order; if none is supported, those of other formats, to be refused by name.
+/// Returns the photographs in a folder, in name order, without masks beside them; if none is
+/// supported, those of other formats, to be refused by name.
 pub(super) fn photographs(folder: &Path) -> Result<Vec<String>, ReadError> {
     let mut files = io::list_files(folder)?;
     let can_be_read = files.iter().any(|f| has_ending(f, &PHOTOGRAPHS[..READABLE_FORMATS]));
     let endings = if can_be_read { &PHOTOGRAPHS[..READABLE_FORMATS] } else { &PHOTOGRAPHS };
     files.retain(|f| has_ending(f, endings));
+    // `000_mask.png` beside `000.jpg` is no photograph
+    let stems: Vec<String> = files.iter().map(|file| fold(without_ending(file).0)).collect();
+    let known: HashSet<&str> = stems.iter().map(String::as_str).collect();
+    let is_mask = |stem: &String| matches!(bare(stem), (photo, true) if known.contains(photo));
+    let mut are_masks = stems.iter().map(is_mask);
+    files.retain(|_| !are_masks.next().unwrap_or_default());
     Ok(files)
 }
 
@@ -275,12 +329,6 @@ pub(super) fn is_hidden(path: &Path) -> bool {
 /// Returns whether a file's name is read as one name, not as folders in the manner of Windows.
 pub(super) fn is_nameable(name: &str) -> bool {
     !name.contains('\\')
-}
-
-/// Returns whether a name has one of these endings, ignoring case.
-pub(super) fn has_ending(name: &str, endings: &[&str]) -> bool {
-    let found = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
-    endings.iter().any(|e| e.eq_ignore_ascii_case(found))
 }
 
 /// Parses an XML file with at most `nodes` nodes. A DTD is refused, because its entities could grow without bound.

@@ -24,6 +24,8 @@ pub(super) struct Listing {
     pub up: Option<DVec3>,
     /// Source of the frames' own masks, for messages.
     pub masks_named: &'static str,
+    /// Where no mask is found, what may be masks and is not used, in a sentence.
+    pub stray_masks: Option<String>,
     /// The dataset's own box of the head.
     pub focus: Option<Aabb>,
     /// Points on the photographed surface.
@@ -45,6 +47,7 @@ impl Default for Listing {
             agreements: Vec::new(),
             up: None,
             masks_named: "`mask_path` of each frame",
+            stray_masks: None,
             focus: None,
             points: Vec::new(),
             order_is_open: false,

@@ -5,9 +5,10 @@
 //! (column 1, −column 0, column 2). The published loader divides positions by 0.3; here the world stays
 //! as the dataset has it.
 
-use super::folder;
 use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, Agreement, CameraFrame, Intrinsics, Listing};
+use super::missing;
+use super::near::names::IMAGE_FOLDERS;
 use super::order;
 use super::view::Split;
 use crate::io::{self, NpyValues};
@@ -197,7 +198,15 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
         vec![shared]
     } else {
         let text = format!("its {total} rows do not fit the {} photographs in `images/`", shared.len());
-        return Err(problem(sets[0].0, text));
+        let (there, hint) = match shared.is_empty() {
+            true => missing::no_folder(folder, "images"),
+            false => Default::default(),
+        };
+        let problem = problem(sets[0].0, text + &there);
+        return Err(match hint {
+            Some(hint) => problem.with_hint(hint),
+            None => problem,
+        });
     };
 
     for ((file, rows), names) in sets.into_iter().zip(photos) {
@@ -224,13 +233,12 @@ fn photographs(folder: &CaptureFolder, suffix: &str, listing: &mut Listing) -> R
     if downscale > 1 {
         names.extend([format!("images{suffix}_{downscale}"), format!("images{suffix}_{downscale}x")]);
     }
-    let Some(name) = names.into_iter().find(|n| io::is_folder(&folder.root.join(n))) else {
+    let names: Vec<&str> = names.iter().map(String::as_str).collect();
+    let Some(plain) = folder.pictures(&names, if suffix.is_empty() { &IMAGE_FOLDERS } else { &[] })? else {
         return Ok(None);
     };
-    let plain = folder::photographs(&folder.root.join(&name))?;
     listing.order_is_open |= order::is_open(&plain);
-    let photos = if folder.reading().by_number { order::by_number(&plain) } else { plain };
-    Ok(Some(photos.into_iter().map(|n| format!("{name}/{n}")).collect()))
+    Ok(Some(if folder.reading().by_number { order::by_number(&plain) } else { plain }))
 }
 
 #[cfg(test)]

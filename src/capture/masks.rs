@@ -2,6 +2,7 @@
 
 use super::folder::CaptureFolder;
 use super::frame::{CameraFrame, Listing};
+use super::mask_names;
 use super::mask_values::MAX_BLACK;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{MaskMeaning, MaskSource};
@@ -9,6 +10,7 @@ use crate::error::counted;
 use crate::image::{Gray, OPAQUE_ALPHA, Photo};
 use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 /// Returns names for a message: at most six, then the number of others.
@@ -30,8 +32,9 @@ pub(super) fn choose(
 ) -> Result<()> {
     let root = Path::new("");
     let beside = [common.parent().unwrap_or(root), root];
+    let photos: HashSet<PathBuf> = views.iter().map(|view| view.photo.clone()).collect();
     let files = |bases: &[&Path], names: &dyn Fn(&View) -> Vec<String>| -> Vec<ViewMask> {
-        views.iter().map(|v| first_of(folder, bases, &names(v)).into()).collect()
+        views.iter().map(|v| first_of(folder, &photos, bases, &names(v)).into()).collect()
     };
     let alpha = |listing: &mut Listing| -> Result<(String, Vec<ViewMask>)> {
         let is_mask = kept.iter().any(|(_, info)| info.alpha)
@@ -46,13 +49,18 @@ pub(super) fn choose(
         MaskSource::None | MaskSource::Clicks => Vec::new(),
         MaskSource::Alpha => vec![alpha(listing)?],
         _ if *masks == MaskSource::Folder || !mask_dir.is_empty() => {
-            let inside = folder.relative("mask folder", mask_dir)?;
+            let inside: PathBuf = match mask_names::folder_named(folder, mask_dir) {
+                Some(place) => place.into(),
+                None => folder.relative("mask folder", mask_dir)?,
+            };
             let names = |v: &View| {
                 let stem = &v.name;
                 [format!("{stem}.png"), full_name(v) + ".png", format!("{stem}.jpg"), format!("{stem}.jpeg")]
                     .into()
             };
-            vec![(format!("`{mask_dir}/`"), files(&[&inside], &names))]
+            let place =
+                if inside.as_os_str().is_empty() { mask_dir.into() } else { inside.to_string_lossy() };
+            vec![(format!("`{place}/`"), files(&[&inside], &names))]
         }
         _ => {
             let named = kept.iter().map(|(f, _)| f.mask.clone().into()).collect();
@@ -68,54 +76,165 @@ pub(super) fn choose(
             ]
         }
     };
-    let has = |s: &[ViewMask]| s.iter().filter(|m| **m != ViewMask::None).count();
-    match candidates.into_iter().find(|(_, sources)| has(sources) > 0) {
-        Some((text, sources)) => {
-            let n = has(&sources);
-            listing.reasons.push(format!("head masks from {text}, for {n} of {} views", views.len()));
-            for (view, source) in views.iter_mut().zip(sources) {
-                view.mask = source;
-            }
-            if n < views.len() {
-                let without = views.iter().filter(|v| v.mask == ViewMask::None).map(|v| v.name.as_str());
-                let mut text =
-                    format!("{} without a mask: {}", counted(views.len() - n, "view"), few(without));
-                if folder.options.mask_meaning == MaskMeaning::Empty {
-                    text += "; stages that use masks ignore these views";
-                }
-                listing.warnings.push(text);
-            }
-        }
-        None => match masks {
-            MaskSource::None | MaskSource::Clicks => {
-                listing.reasons.push("masks are not used, by `mask.source`".into())
-            }
-            MaskSource::Alpha => {
-                listing.warnings.push("no photograph has a mask in its alpha channel".into())
-            }
-            _ if mask_dir.is_empty() => listing.reasons.push("the capture has no masks".into()),
-            _ => listing.warnings.push(format!("the mask folder `{mask_dir}` has no mask of any view")),
-        },
+    let is_in_files = !matches!(masks, MaskSource::None | MaskSource::Clicks | MaskSource::Alpha);
+    let mut found: Vec<_> = candidates.into_iter().filter(|(_, sources)| count(sources) > 0).collect();
+    if found.is_empty() && is_in_files {
+        (found, listing.stray_masks) = near_masks(folder, views)?;
+    } else if is_in_files {
+        complete(folder, views, &mut found[0], listing);
+    }
+    if found.is_empty() {
+        say_none(folder, listing);
+    } else {
+        take(folder, views, found, listing);
     }
 
-    let (mut valid, mut region) = (0, 0);
+    let (mut valid, mut region, mut from) = (0, 0, "`.npy` files".to_string());
     for (view, (frame, _)) in views.iter_mut().zip(kept) {
         let name = &view.name;
-        view.valid = first_of(folder, &beside, &[format!("masks/{name}.npy"), format!("valid/{name}.npy")]);
+        view.valid =
+            first_of(folder, &photos, &beside, &[format!("masks/{name}.npy"), format!("valid/{name}.npy")]);
         view.region = match &frame.region {
             Some(path) => Some(path.clone()),
-            None => first_of(folder, &beside, &[format!("face_masks/{name}.png")]),
+            None => first_of(folder, &photos, &beside, &[format!("face_masks/{name}.png")]),
         };
         valid += view.valid.is_some() as usize;
         region += view.region.is_some() as usize;
     }
+    if valid == 0
+        && let Some((place, masks)) = mask_names::valid(folder, &beside, views)
+    {
+        from = format!("`{place}/`, under near names");
+        for (view, mask) in views.iter_mut().zip(masks) {
+            valid += mask.is_some() as usize;
+            view.valid = mask;
+        }
+    }
     if valid > 0 {
-        listing.reasons.push(format!("valid pixels from `.npy` files, for {valid} of {} views", views.len()));
+        listing.reasons.push(format!("valid pixels from {from}, for {valid} of {} views", views.len()));
     }
     if region > 0 {
         listing.reasons.push(format!("face regions for the metrics, for {region} of {} views", views.len()));
     }
     Ok(())
+}
+
+/// A source of masks in words, and the mask of each view.
+type Source = (String, Vec<ViewMask>);
+
+/// Returns how many views have a mask.
+fn count(sources: &[ViewMask]) -> usize {
+    sources.iter().filter(|m| **m != ViewMask::None).count()
+}
+
+/// Gives the views the masks of the first source, and names the others that there are.
+fn take(folder: &CaptureFolder, views: &mut [View], found: Vec<Source>, listing: &mut Listing) {
+    let mut found = found.into_iter();
+    let Some((text, sources)) = found.next() else { return };
+    let n = count(&sources);
+    listing.reasons.push(format!("head masks from {text}, for {n} of {} views", views.len()));
+    // one file may be found in several ways
+    let is_other = |(_, others): &Source| {
+        others.iter().zip(&sources).any(|(a, b)| *a != ViewMask::None && *b != ViewMask::None && a != b)
+    };
+    let others: Vec<String> = found.filter(is_other).map(|(text, _)| text).collect();
+    if !others.is_empty() {
+        listing.reasons.push(format!("other masks are not used: {}", others.join("; ")));
+    }
+    for (view, source) in views.iter_mut().zip(sources) {
+        view.mask = source;
+    }
+    if n < views.len() {
+        let without = views.iter().filter(|v| v.mask == ViewMask::None).map(|v| v.name.as_str());
+        let mut text = format!("{} without a mask: {}", counted(views.len() - n, "view"), few(without));
+        if folder.options.mask_meaning == MaskMeaning::Empty {
+            text += "; stages that use masks ignore these views";
+        }
+        listing.warnings.push(text);
+    }
+}
+
+/// Says that no masks are used, and why.
+fn say_none(folder: &CaptureFolder, listing: &mut Listing) {
+    let CaptureOptions { masks, mask_dir, .. } = folder.options;
+    let stray = listing.stray_masks.as_ref().map_or(String::new(), |text| format!("; {text}"));
+    match masks {
+        MaskSource::None | MaskSource::Clicks => {
+            listing.reasons.push("masks are not used, by `mask.source`".into());
+        }
+        MaskSource::Alpha => {
+            listing.warnings.push("no photograph has a mask in its alpha channel".into());
+        }
+        _ if mask_dir.is_empty() => listing.reasons.push(format!("the capture has no masks{stray}")),
+        _ => listing.warnings.push(format!("the mask folder `{mask_dir}` has no mask of any view{stray}")),
+    }
+}
+
+/// Returns masks by near names where none has the name that is looked for, else what may be masks
+/// and is not used.
+fn near_masks(folder: &CaptureFolder, views: &[View]) -> Result<(Vec<Source>, Option<String>)> {
+    let mask_dir = &folder.options.mask_dir;
+    let groups = if mask_dir.is_empty() {
+        mask_names::groups(folder, views)
+    } else if let Some(place) = mask_names::folder_named(folder, mask_dir) {
+        let group = mask_names::within(folder, &place, views);
+        if !group.is_usable() && mask_names::holds_photographs(folder, &place, views) {
+            return Err(Error::cannot(
+                format!("`capture.mask_dir`: `{place}/` holds the photographs, and no masks of them"),
+                "name masks there `NAME_mask.png`, or put them into a folder of their own; those in the photographs' \
+                 alpha channels are read with `--set mask.source=alpha`",
+            ));
+        }
+        vec![group]
+    } else {
+        let others = mask_names::groups(folder, views);
+        let others: Vec<String> =
+            others.into_iter().map(|g| g.place + "/").filter(|place| place != "/").collect();
+        let text = match others.is_empty() {
+            true => format!("there is no folder `{mask_dir}`"),
+            false => format!("there is no folder `{mask_dir}`; there is {}", few(others)),
+        };
+        return Ok((Vec::new(), Some(text)));
+    };
+    if !groups.iter().any(mask_names::Group::is_usable) {
+        let groups: Vec<_> = groups.into_iter().filter(|group| !group.is_empty()).collect();
+        return Ok((Vec::new(), mask_names::stray(folder, &groups, views)));
+    }
+    let source = |group: &mask_names::Group| -> Source {
+        let place = if group.place.is_empty() {
+            "beside the photographs".into()
+        } else {
+            format!("`{}/`", group.place)
+        };
+        let example = group.example().map_or(String::new(), |(mask, view)| {
+            format!(", where `{mask}` is that of `{}`", views[view].name)
+        });
+        (place + &example, group.masks(folder.root).into_iter().map(ViewMask::from).collect())
+    };
+    Ok((groups.iter().filter(|group| group.is_usable()).map(source).collect(), None))
+}
+
+/// Adds masks in the folder of the others that have the view's name in other letters or another
+/// format.
+fn complete(folder: &CaptureFolder, views: &[View], source: &mut Source, listing: &mut Listing) {
+    let files = source.1.iter().filter_map(|mask| match mask {
+        ViewMask::File(path) => Some(path.clone()),
+        _ => None,
+    });
+    let files: Vec<PathBuf> = files.collect();
+    if files.is_empty() || count(&source.1) == views.len() {
+        return;
+    }
+    let mut added = Vec::new();
+    for (mask, other) in source.1.iter_mut().zip(mask_names::others_there(folder, views, &files)) {
+        if let Some(path) = other.filter(|_| *mask == ViewMask::None) {
+            added.push(folder.shown(&path));
+            *mask = ViewMask::File(path);
+        }
+    }
+    if !added.is_empty() {
+        listing.reasons.push(format!("masks of other letters or formats are read as well: {}", few(added)));
+    }
 }
 
 /// Checks that the head masks exist that `options` require. Without masks, everything in view would be reconstructed as part
@@ -129,10 +248,12 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
     let without: Vec<&str> =
         train.iter().filter(|v| v.mask == ViewMask::None).map(|v| v.name.as_str()).collect();
     let (total, missing) = (train.len(), without.len());
+    let stray = capture.stray_masks.as_ref().map_or(String::new(), |text| format!("; {text}"));
     let problem = if missing == total {
-        "no photograph that is learned from has a head mask: nothing says which pixels are background, and there is \
-         no visual hull to start from"
-            .into()
+        format!(
+            "no photograph that is learned from has a head mask: nothing says which pixels are background, and there is \
+             no visual hull to start from{stray}"
+        )
     } else if options.mask_meaning == MaskMeaning::Empty && 2 * missing > total {
         let named = few(without);
         format!("{missing} of {total} photographs that are learned from have no head mask: {named}")
@@ -157,9 +278,16 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
     Err(Error::cannot(format_args!("`{shown}`: {problem}"), hint))
 }
 
-/// Returns the first of these files that exists, below the first base with any.
-fn first_of(folder: &CaptureFolder, bases: &[&Path], names: &[String]) -> Option<PathBuf> {
-    bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name))).find_map(|p| folder.file(&p))
+/// Returns the first of these files that exists and is no photograph, below the first base with
+/// any.
+fn first_of(
+    folder: &CaptureFolder,
+    photos: &HashSet<PathBuf>,
+    bases: &[&Path],
+    names: &[String],
+) -> Option<PathBuf> {
+    let mut paths = bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name)));
+    paths.find_map(|path| folder.file(&path).filter(|path| !photos.contains(path)))
 }
 
 /// Returns a view's name with its photograph's ending.

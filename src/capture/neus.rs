@@ -5,9 +5,12 @@
 //! dataset's own do. NeuS sends its rays through whole numbers as the centers of pixels, so principal points move
 //! by half a pixel (NeuS, `models/dataset.py`, `gen_rays_at`).
 
-use super::folder;
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
+use super::masks::few;
+use super::missing;
+use super::near::names::{IMAGE_FOLDERS, without_ending};
+use super::near::pairs::pair;
 use super::order;
 use super::view::Reading;
 use crate::Result;
@@ -26,23 +29,26 @@ const SKEW: f64 = 1e-3;
 /// Lists one frame for each photograph.
 pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) -> Result<()> {
     let arrays = io::read_npz(&folder.root.join(file), &folder.options.limits)?;
-    let plain = pictures(folder, &["image", "images", "rgb"])?;
+    let plain = folder.pictures(&["image", "images", "rgb"], &IMAGE_FOLDERS)?.unwrap_or_default();
     let numbered = order::by_number(&plain);
-    let mask_files = pictures(folder, &["mask", "masks"])?;
-    let pairings = paired_masks(&plain, &numbered, &mask_files);
     let Reading { by_number, masks_by_number, .. } = folder.reading();
-    let masks = &pairings[usize::from(masks_by_number).min(pairings.len() - 1)];
-    listing.order_is_open = order::is_open(&plain);
-    listing.mask_order_is_open = pairings.len() > 1;
     let photos = if by_number { &numbered } else { &plain };
+    listing.order_is_open = order::is_open(&plain);
     let known = (0..).take_while(|i| arrays.contains_key(&format!("world_mat_{i}"))).count();
     let hint = "it must have `world_mat_0`, `world_mat_1` and so on, one for each photograph in `image/`";
     if known == 0 {
         return Err(in_file(file, "it has no array `world_mat_0`", hint));
     } else if known != photos.len() {
-        let problem = format!("it has {known} cameras for the {} photographs in `image/`", photos.len());
+        // reduced photographs would not say what the cameras are for
+        let there = if photos.is_empty() { missing::no_folder(folder, "image").0 } else { String::new() };
+        let problem =
+            format!("it has {known} cameras for the {} photographs in `image/`{there}", photos.len());
         return Err(in_file(file, problem, hint));
     }
+    let mask_files = folder.pictures(&["mask", "masks"], &[])?.unwrap_or_default();
+    let pairings = paired_masks(&plain, &numbered, &mask_files, listing);
+    let masks = &pairings[usize::from(masks_by_number).min(pairings.len() - 1)];
+    listing.mask_order_is_open = pairings.len() > 1;
     for (i, name) in photos.iter().enumerate() {
         let problem = |text: String| in_frame(file, name, text);
         let camera =
@@ -53,7 +59,6 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
         let frame = CameraFrame::new(file, name, photo, intrinsics, (rotation, position));
         listing.frames.push(CameraFrame { mask, ..frame });
     }
-    listing.masks_named = "`mask/`, by name or in the order of the photographs";
     if arrays.contains_key("scale_mat_0") {
         let problem = |text| in_file(file, text, "save it again with `numpy.savez`");
         let m = matrix(&arrays, "scale_mat_0").map_err(problem)?;
@@ -71,33 +76,62 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     Ok(())
 }
 
-/// Pictures in the first of these folders that exists, in name order.
-fn pictures(folder: &CaptureFolder, names: &[&str]) -> Result<Vec<String>> {
-    let Some(name) = names.iter().find(|n| io::is_folder(&folder.root.join(n))) else {
-        return Ok(Vec::new());
-    };
-    Ok(folder::photographs(&folder.root.join(name))?.into_iter().map(|f| format!("{name}/{f}")).collect())
-}
+/// Masks by the paths of their photographs.
+type Masks<'m> = BTreeMap<&'m str, &'m str>;
 
-/// Returns the mask of each photograph: that of its name or its number where all have one, else the one at its place in
-/// order, as NeuS pairs them. Where the orders of both by name and by number pair them otherwise, both pairings are
-/// returned, that by name first.
+/// Returns the mask of each photograph: by name if each has one of its name; else in order, as NeuS pairs them, if they are
+/// as many; else again by name if most have one. Where the orders by name and by number pair them otherwise, both pairings
+/// are returned, that by name first.
 fn paired_masks<'m>(
     plain: &'m [String],
     numbered: &'m [String],
     masks: &'m [String],
-) -> Vec<BTreeMap<&'m str, &'m str>> {
-    let pairs = |photos: &'m [String], masks: Vec<&'m str>| -> BTreeMap<&'m str, &'m str> {
-        photos.iter().map(String::as_str).zip(masks).collect()
+    listing: &mut Listing,
+) -> Vec<Masks<'m>> {
+    let Some((place, _)) = masks.first().and_then(|mask| mask.rsplit_once('/')) else {
+        return vec![Masks::new()];
     };
-    let named: BTreeMap<&str, &str> = masks.iter().map(|mask| (order::stem(mask), mask.as_str())).collect();
-    let of_name: Option<Vec<&str>> = plain.iter().map(|p| named.get(order::stem(p)).copied()).collect();
-    if let Some(of_name) = of_name {
-        return vec![pairs(plain, of_name)];
-    } else if masks.len() != plain.len() {
-        return vec![BTreeMap::new()];
+    let last = |path: &String| path.rsplit('/').next().unwrap_or_default().to_string();
+    let names: Vec<String> = plain.iter().map(|photo| without_ending(&last(photo)).0.to_string()).collect();
+    let files: Vec<String> = masks.iter().map(last).collect();
+    let pairs = pair(&names, &files);
+    let (n, all) = (pairs.count(), plain.len());
+    if n < all && masks.len() == all {
+        listing.masks_named = "`mask/`, in the order of the photographs";
+        let is_other = |(i, file): (usize, &Option<usize>)| file.is_some_and(|file| file != i);
+        if let Some(i) = pairs.files.iter().enumerate().position(is_other).filter(|_| 2 * n >= all) {
+            listing.warnings.push(format!(
+                "masks are paired in the order of the photographs, not by name: `{}` is that of `{}`",
+                masks[i], plain[i]
+            ));
+        }
+        return paired_in_order(plain, numbered, masks);
     }
-    let in_order = pairs(plain, masks.iter().map(String::as_str).collect());
+    let counts = format!("`{place}/` has {} masks for {all} photographs", masks.len());
+    if 2 * n < all {
+        listing.warnings.push(format!(
+            "{counts}, and only {n} have their names: none is used; leave one for each photograph, in name order"
+        ));
+        return vec![Masks::new()];
+    }
+    if masks.len() != all {
+        let strangers = pairs.strangers(&files);
+        let others = match strangers.is_empty() {
+            true => String::new(),
+            false => format!(", and no photograph is called {}", few(strangers)),
+        };
+        listing.warnings.push(format!("{counts}: they are paired by name{others}"));
+    }
+    listing.masks_named = "`mask/`, named as the photographs";
+    let of_name =
+        |(photo, file): (&'m String, &Option<usize>)| Some((photo.as_str(), masks[(*file)?].as_str()));
+    vec![plain.iter().zip(&pairs.files).filter_map(of_name).collect()]
+}
+
+/// Returns the pairs of as many photographs and masks whose names differ: by number where all have the same numbers, else by
+/// their places in order.
+fn paired_in_order<'m>(plain: &'m [String], numbered: &'m [String], masks: &'m [String]) -> Vec<Masks<'m>> {
+    let in_order: Masks = plain.iter().map(String::as_str).zip(masks.iter().map(String::as_str)).collect();
     if !order::is_open(plain) && !order::is_open(masks) {
         return vec![in_order];
     }
@@ -107,8 +141,8 @@ fn paired_masks<'m>(
     };
     let have_same_numbers = numbered.iter().zip(&in_number).all(same);
     let place: BTreeMap<&str, usize> = masks.iter().map(String::as_str).zip(0..).collect();
-    let in_number = in_number.iter().map(|mask| masks[place[mask.as_str()]].as_str()).collect();
-    let by_number = pairs(numbered, in_number);
+    let in_number = in_number.iter().map(|mask| masks[place[mask.as_str()]].as_str());
+    let by_number: Masks = numbered.iter().map(String::as_str).zip(in_number).collect();
     if have_same_numbers {
         return vec![by_number];
     }
@@ -173,7 +207,7 @@ mod tests {
         let pairings = |photos: &str, masks: &str| -> Vec<Vec<String>> {
             let (plain, masks) = (names(photos), names(masks));
             let numbered = order::by_number(&plain);
-            let found = paired_masks(&plain, &numbered, &masks);
+            let found = paired_masks(&plain, &numbered, &masks, &mut Listing::default());
             let masks = |pairs: &BTreeMap<&str, &str>| -> Vec<String> {
                 plain
                     .iter()
@@ -214,5 +248,29 @@ mod tests {
         assert!(decompose(&[0.0; 12]).unwrap_err().contains("flattens"));
         let skewed = [1.0, 0.1, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
         assert!(decompose(&skewed).unwrap_err().contains("skewed"));
+    }
+
+    #[test]
+    fn masks_are_paired_in_order_or_by_name_if_there_are_more_or_fewer() {
+        let of =
+            |folder: &str, names: &[&str]| names.iter().map(|n| format!("{folder}/{n}")).collect::<Vec<_>>();
+        let photos = of("image", &["000.jpg", "001.jpg"]);
+        let mut listing = Listing::default();
+        let mut paired = |masks: &[&str]| -> (Vec<String>, Vec<String>) {
+            let masks = of("mask", masks);
+            let pairings = paired_masks(&photos, &photos, &masks, &mut listing);
+            (
+                pairings[0].values().map(|mask| mask.to_string()).collect(),
+                std::mem::take(&mut listing.warnings),
+            )
+        };
+        assert_eq!(paired(&["a.png", "b.png"]), (of("mask", &["a.png", "b.png"]), vec![]));
+        let (more, warnings) = paired(&["000.png", "001.png", "overview.png"]);
+        assert_eq!(more, of("mask", &["000.png", "001.png"]));
+        assert!(warnings[0].contains("3 masks for 2 photographs"), "{warnings:?}");
+        assert!(warnings[0].contains("`overview.png`"), "{warnings:?}");
+        let (others, warnings) = paired(&["a.png", "b.png", "c.png"]);
+        assert!(others.is_empty() && warnings[0].contains("only 0"), "{warnings:?}");
+        assert_eq!(paired(&[]), (vec![], vec![]));
     }
 }

@@ -288,7 +288,7 @@ impl<'a> Reading<'a> {
         let region = keys.face_mask_path.as_ref().map(beside).transpose()?.flatten();
         let mut mask: Option<(usize, PathBuf)> = None;
         if let Some(name) = &keys.mask_path {
-            mask = beside(name)?.map(|path| (0, path));
+            mask = folder.mask(file, name)?.map(|path| (0, path));
             if mask.is_none() && is_there {
                 let text = "the mask it names is missing";
                 listing.problems.push(in_frame(file, &entry.label, text));
@@ -296,7 +296,7 @@ impl<'a> Reading<'a> {
         } else {
             for (k, name) in [(1, &keys.fg_mask_path), (2, &keys.seg_mask_path)] {
                 let Some(name) = name.as_ref().filter(|_| mask.is_none()) else { continue };
-                match beside(name).ok().flatten() {
+                match folder.mask(file, name).ok().flatten() {
                     Some(path) => mask = Some((k, path)),
                     None => self.missing.push((MASK_KEYS[k], name.clone())),
                 }

@@ -126,6 +126,9 @@ pub struct Capture {
     pub focus: Option<Aabb>,
     /// Metres per dataset unit.
     pub unit_m: f64,
+    /// Where no mask is found: pictures that may be masks, and why they are not used, in a sentence.
+    #[serde(skip)]
+    pub stray_masks: Option<String>,
     /// Warnings, none of which stops the work.
     pub warnings: Vec<String>,
     /// All ways in which it can be read where its files leave something open, this one first; else none.

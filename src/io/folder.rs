@@ -80,6 +80,38 @@ pub fn any_file(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<Option<Pat
     Ok(None)
 }
 
+/// Returns the files in a folder and below as sorted paths in it, separated by `/`. Links are
+/// followed; hidden entries, names that are not UTF-8, folders that are `apart` or deeper than
+/// `depth`, and what cannot be listed are left out. `None` if there are more than `most` entries.
+pub fn files_below(
+    root: &Path,
+    depth: usize,
+    most: usize,
+    apart: &dyn Fn(&Path) -> bool,
+) -> Option<Vec<String>> {
+    let (mut files, mut folders, mut left) = (Vec::new(), vec![(String::new(), 0)], most);
+    while let Some((folder, level)) = folders.pop() {
+        let Ok(listed) = fs::read_dir(root.join(&folder)) else { continue };
+        for entry in listed.map_while(Result::ok) {
+            left = left.checked_sub(1)?;
+            let name = entry.file_name();
+            let Some(name) = name.to_str().filter(|name| !name.starts_with('.')) else { continue };
+            let path = if folder.is_empty() { name.into() } else { format!("{folder}/{name}") };
+            let kind = entry.file_type().ok().filter(|kind| !kind.is_symlink());
+            let kind = kind.or_else(|| fs::metadata(entry.path()).ok().map(|m| m.file_type()));
+            match kind {
+                Some(kind) if kind.is_file() => files.push(path),
+                Some(kind) if kind.is_dir() && level < depth && !apart(&entry.path()) => {
+                    folders.push((path, level + 1));
+                }
+                _ => {}
+            }
+        }
+    }
+    files.sort();
+    Some(files)
+}
+
 /// Returns how many bytes the files in a folder and below have, by their path in it; hidden ones and folders that are
 /// `apart` left out. No folder has no files.
 pub fn file_sizes(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<BTreeMap<String, u64>, ReadError> {

@@ -317,6 +317,7 @@ mod tests {
             up: Vec3::Z,
             focus: None,
             unit_m: 1.0,
+            stray_masks: None,
             warnings: Vec::new(),
             readings: Vec::new(),
         };

@@ -108,6 +108,7 @@ pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadErro
         up: file.up,
         focus: None, // the scene is placed by now
         unit_m: file.unit_m,
+        stray_masks: None,
         warnings: Vec::new(),
         readings: Vec::new(),
     })

@@ -36,6 +36,7 @@ mod house;
 mod mask_values;
 mod masks;
 mod models;
+mod names;
 mod photographs;
 mod preview;
 mod raycast_truth;
