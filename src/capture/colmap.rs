@@ -93,11 +93,17 @@ pub(super) fn list(folder: &CaptureFolder, files: &ModelFiles, listing: &mut Lis
     }
     let held_out = held_out(folder, files)?;
     let base = files.image_folder(folder, images.iter().map(|image| image.name.as_str()));
-    if base.contains('/') || files.folder.starts_with("distorted") {
+    // pictures elsewhere have another lens
+    let is_own = base.contains('/') || files.folder.starts_with("distorted");
+    if is_own {
         listing.reasons.push(format!("photographs from `{base}/`, which this model is of"));
     }
+    let photo = |name: &str| {
+        let name = join(&base, name);
+        if is_own { folder.exact_photo(&name_of, &name) } else { folder.photo(&name_of, &name) }
+    };
     for image in &images {
-        match frame(folder, &name_of, &base, image, &cameras, held_out.as_ref()) {
+        match frame(folder, &name_of, &photo, image, &cameras, held_out.as_ref()) {
             Ok(frame) => listing.frames.push(frame),
             Err(problem) => listing.problems.push(problem),
         }
@@ -150,7 +156,7 @@ pub(super) fn can_name(name: &str, in_test: bool) -> bool {
 fn frame(
     folder: &CaptureFolder,
     file: &str,
-    base: &str,
+    photo: &dyn Fn(&str) -> Result<(PathBuf, Option<PathBuf>)>,
     image: &Image,
     cameras: &HashMap<u32, Camera>,
     held_out: Option<&HashSet<String>>,
@@ -170,7 +176,7 @@ fn frame(
     let intrinsics = camera.model.intrinsics((width, height), &camera.values);
     let intrinsics = intrinsics.map_err(|text| problem(format!("camera {}: {text}", image.camera)))?;
     let pose = image.pose.camera_in_world().map_err(|text| problem(text.into()))?;
-    let photo = folder.photo(file, &join(base, &image.name))?;
+    let photo = photo(&image.name)?;
     let split = held_out.map(|names| if names.contains(&image.name) { Split::Test } else { Split::Train });
     let mask = folder.mask_of(file, &image.name)?;
     Ok(CameraFrame { split, mask, ..CameraFrame::new(file, &image.name, photo, intrinsics, pose) })

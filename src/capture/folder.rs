@@ -152,16 +152,6 @@ impl CaptureFolder<'_> {
         Some((found.into(), path))
     }
 
-    /// Returns whether the photograph of a frame has the name that its file gives, in one of the
-    /// usual folders.
-    pub fn is_exact(&self, frame: &CameraFrame) -> bool {
-        let mut bases = IMAGE_FOLDERS.into_iter().chain([""]);
-        bases.any(|base| {
-            let exact = self.exact_photo(&frame.file, &join(base, &frame.name));
-            exact.is_ok_and(|(relative, photo)| photo.is_some() && relative == frame.relative)
-        })
-    }
-
     /// Returns the pictures in the first of these folders that exists, in name order, as paths
     /// below the capture; `None` without such a folder. Where none exists, the only folder counts
     /// that is called like one of them in other letters or has a usual name of `others`.
@@ -189,7 +179,7 @@ impl CaptureFolder<'_> {
     /// Returns the photograph that `name` refers to, with its path below the capture: the exact name, else with a
     /// usual ending, else in the folder of pictures already reduced by `options.downscale`
     /// (`images_4/`, `images_4x/`).
-    fn exact_photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
+    pub fn exact_photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
         let downscale = self.options.downscale;
         let wanted = self.relative(file, name)?;
         let mut candidates = vec![wanted.clone()];

@@ -59,10 +59,22 @@ fn settle_photographs(
     missing: &mut Missing,
 ) -> Vec<bool> {
     let found = by_path(answers);
+    let mut sought: HashMap<&Path, Vec<&str>> = HashMap::new();
+    for answer in answers {
+        if let Found::One { path, .. } = &answer.found {
+            sought.entry(Path::new(path)).or_default().push(&answer.name);
+        }
+    }
+    // formats look for a frame's photograph by its name alone, or in a folder of photographs
+    let is_of = |sought: &str, frame: &CameraFrame| {
+        sought.strip_suffix(&frame.name).is_some_and(|base| base.is_empty() || base.ends_with('/'))
+    };
     let is_near: Vec<bool> = listing
         .frames
         .iter()
-        .map(|f| found.contains_key(f.relative.as_path()) && !folder.is_exact(f))
+        .map(|f| {
+            sought.get(f.relative.as_path()).is_some_and(|names| names.iter().any(|name| is_of(name, f)))
+        })
         .collect();
     let mut users: HashMap<PathBuf, HashSet<String>> = HashMap::new();
     let mut homes: HashSet<String> = HashSet::new();

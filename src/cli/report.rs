@@ -41,7 +41,7 @@ fn renew(invocation: &Invocation, path: &Path, out: Option<&Out>) -> Result<()> 
     }
     renew_report(&session)?;
     let curves = curves_csv(&curves(&[(&session, "")])?);
-    io::write_atomic(&page.with_extension("csv"), curves.as_bytes())?;
+    run.write("report.csv", curves.as_bytes())?;
     if let Some(out) = out {
         let copy = out.file("report.html");
         out.prepare()?;

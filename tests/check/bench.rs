@@ -81,7 +81,7 @@ fn sweeps_leave_a_page_and_results() {
 #[ignore = "long: run by `tools/test.sh all`; trains five fields with large tables"]
 fn a_sweep_of_hash_grids_has_a_row_for_each() {
     let dir = tempfile::tempdir().unwrap();
-    let found = swept(dir.path(), "hash", &["Hash grid", "off the field"]);
+    let found = swept(dir.path(), "hash", &["Hash grid", "PSNR"]);
     assert_eq!(rows(&found, 0).len(), 5);
 }
 
