@@ -226,7 +226,9 @@ mod tests {
         assert_eq!(pairings("0 1 2", "1 2 3"), [text("1 2 3")]);
         // both differ
         assert_eq!(pairings("008 009 010", "10 11 9"), [text("10 11 9"), text("9 10 11")]);
-        assert_eq!(pairings("0 1 2", "1 2"), [Vec::<String>::new()]);
+        // fewer masks
+        assert_eq!(pairings("0 1 2", "1 2"), [text("1 2")]);
+        assert_eq!(pairings("0 1 2", "7 8"), [Vec::<String>::new()]);
     }
 
     #[test]
