@@ -63,8 +63,8 @@ fn without_numbers(name: &str) -> String {
 
 /// Returns the last number in the name of a file without its ending; leading zeros do not count.
 pub(super) fn last_number(path: &str) -> Option<&str> {
-    let numbers = stem(path).split(|c: char| !c.is_ascii_digit()).filter(|number| !number.is_empty());
-    Some(numbers.last()?.trim_start_matches('0'))
+    let mut numbers = stem(path).split(|c: char| !c.is_ascii_digit()).filter(|number| !number.is_empty());
+    Some(numbers.next_back()?.trim_start_matches('0'))
 }
 
 /// Returns the name of a file without its folder and its ending.

@@ -138,7 +138,7 @@ enum Planned {
     /// Nothing: the output folder has the result.
     Nothing(Solution),
     Photographs {
-        capture: Capture,
+        capture: Box<Capture>,
         names: Vec<String>,
         files: Vec<String>,
         shared: bool,
@@ -196,6 +196,7 @@ impl<'a> Search<'a> {
         let (names, files) = convert::names_for_colmap(&capture)?;
         let copied: u64 = capture.views.iter().filter_map(|view| io::file_size(&view.photo)).sum();
         output.require_room(copied + database_bytes(names.len(), false))?;
+        let capture = Box::new(capture);
         Ok(Search { sfm, request, work: Planned::Photographs { capture, names, files, shared, programs } })
     }
 

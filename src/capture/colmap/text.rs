@@ -102,7 +102,7 @@ impl<'s> Line<'s> {
     /// Returns whether it holds points in an image: triples of numbers.
     fn is_points(&self) -> bool {
         let count = self.words.clone().try_fold(0, |n, word| decimal(word).map(|_| n + 1));
-        count.is_some_and(|n: usize| n % 3 == 0)
+        count.is_some_and(|n: usize| n.is_multiple_of(3))
     }
 
     fn bad(&self, problem: impl std::fmt::Display) -> Error {
