@@ -179,6 +179,7 @@ try {
   const distance = page.locator(".viewer .distance");
   await page.keyboard.press("m");
   await page.keyboard.press("Enter");
+  await settled(page);
   same("a point is marked", await page.locator(".mark:visible").count(), 1);
   await page.mouse.click(middle[0], middle[1] - box.height / 8);
   await settled(page);
