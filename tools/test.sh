@@ -16,7 +16,8 @@
 # `all` adds loops and breadth. Each claim has its test in the check, or is about a program of somebody else:
 #
 # long         tests marked `#[ignore = "long: …"]`: GPU trainings at full length and of every preset, kills by the dozen,
-#              every write that fails, sweeps of cases. The check makes the same claims on fewer steps, kills and cases.
+#              every write that fails, sweeps of cases, inputs of `../shared`, gradients of the device against f64. The check
+#              makes the same claims on fewer steps, kills and cases, and compares the device with the CPU.
 # fuzz         a minute for every reader instead of three seconds
 # gpu          `tools/gpu/first_look.sh`, eleven trainings on a driver in software, six minutes. The check trains each field
 #              on that driver once, beside the processor.
@@ -335,6 +336,12 @@ long() {
   need_build
   step "long unit tests" long_tests unit "$(executable $unit_tests)" src
   step "long integration tests" long_tests check "$(executable $check_tests)" tests/check
+  if [ -f ../shared/tools/cases.py ]; then
+    step "inputs of many shapes are read or named" "${PYTHON:-python3}" ../shared/tools/cases.py "$target/release/tiface" \
+      ../shared/data/cases
+  else
+    skip "inputs of many shapes: ../shared/tools/cases.py is absent"
+  fi
 }
 
 # Tests that are ignored because they are long; others are ignored because they measure, or are run by a test.

@@ -91,6 +91,7 @@ fn gradients_like_the_cpu(shape: Shape, devices: Vec<Device>) {
 }
 
 #[test]
+#[ignore = "long: run by `tools/test.sh all`; device and CPU are compared in the check, and the CPU with f64"]
 fn gradients_agree_with_f64_finite_differences() {
     gradients_agree_with_differences(&[WIDE, Shape { softplus: false, ..WIDE }]);
 }
