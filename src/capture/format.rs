@@ -173,7 +173,7 @@ pub(super) fn explain(root: &Path) -> Error {
 const CAMERA_FILES_TEXT: &str = "`transforms.json`, `transforms_train.json`, `poses_bounds*.npy` (LLFF), `cameras` and `images` as \
                           `.bin` or `.txt` in `sparse/0`, `sparse` or here (COLMAP), `cameras_sphere.npz` or `cameras.npz` \
                           (NeuS, IDR, H3DS), an `.xml` with `<chunk` (Metashape), `pose/*.txt` with `intrinsics.txt` (NSVF), \
-                          a `.csv` that begins with `#name,x,y,alt` or `.xmp` files with a pose (RealityCapture)";
+                          a `.csv` with the columns `name`, `x`, `y`, `alt` or `.xmp` files with a pose (RealityCapture)";
 
 /// Returns the file most similar to a supported camera file, and what it lacks.
 fn nearest(found: &FolderEntries) -> Option<String> {
@@ -208,7 +208,7 @@ pub(super) fn explain_file(file: &Path) -> Error {
         not_a_capture(file, "it is an archive", from_archive(file))
     } else if has_ending(name, &MESHES) {
         let hint = format!(
-            "`tiface check {shown}` looks at GLB, OBJ and PLY; a capture is a folder of photographs and cameras"
+            "`tiface check {shown}` looks at GLB, glTF, OBJ, PLY and STL; a capture is a folder of photographs and cameras"
         );
         not_a_capture(file, "it is a mesh or a cloud of points", hint)
     } else if has_ending(name, &CAMERA_ENDINGS) {
