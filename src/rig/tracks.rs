@@ -119,20 +119,30 @@ pub fn blurred(picture: &[f32], w: usize, deviation: f32) -> Vec<f32> {
     let weight = |k: usize| (-0.5 * (k as f32 / deviation).powi(2)).exp();
     let total = weight(0) + 2.0 * (1..=reach).map(weight).sum::<f32>();
     let weights: Vec<f32> = (0..=reach).map(|k| weight(k) / total).collect();
-    let h = picture.len() / w.max(1);
-    let pass = |from: &[f32], across: bool| -> Vec<f32> {
-        let (last, stride) = if across { (w - 1, 1) } else { (h - 1, w) };
-        let value = |i: usize| {
-            let at = if across { i % w } else { i / w };
-            let line = i - at * stride;
-            let both = |k: usize| {
-                from[line + at.saturating_sub(k) * stride] + from[line + (at + k).min(last) * stride]
-            };
-            weights[0] * from[i] + (1..=reach).map(|k| weights[k] * both(k)).sum::<f32>()
-        };
-        (0..from.len()).map(value).collect()
+    if picture.is_empty() {
+        return Vec::new();
+    }
+    // whole rows are added, which fills the lanes of the processor
+    let add = |out: &mut [f32], weight: f32, one: &[f32], other: &[f32]| {
+        out.iter_mut().zip(one).zip(other).for_each(|((sum, a), b)| *sum += weight * (a + b));
     };
-    pass(&pass(picture, true), false)
+    let mut across = vec![0f32; picture.len()];
+    let mut padded = vec![0f32; w + 2 * reach];
+    for (row, out) in picture.chunks_exact(w).zip(across.chunks_exact_mut(w)) {
+        padded[..reach].fill(row[0]);
+        padded[reach..][..w].copy_from_slice(row);
+        padded[reach + w..].fill(row[w - 1]);
+        (1..=reach).for_each(|k| add(out, weights[k], &padded[reach - k..][..w], &padded[reach + k..][..w]));
+        out.iter_mut().zip(row).for_each(|(sum, v)| *sum += weights[0] * v);
+    }
+    let rows: Vec<&[f32]> = across.chunks_exact(w).collect();
+    let mut blurred = vec![0f32; picture.len()];
+    for (y, out) in blurred.chunks_exact_mut(w).enumerate() {
+        let below = |k: usize| rows[(y + k).min(rows.len() - 1)];
+        (1..=reach).for_each(|k| add(out, weights[k], rows[y.saturating_sub(k)], below(k)));
+        out.iter_mut().zip(rows[y]).for_each(|(sum, v)| *sum += weights[0] * v);
+    }
+    blurred
 }
 
 /// Spreads `count` points evenly over a surface, and finds out which views see each. `is_usable` says whether a view can be
@@ -248,9 +258,10 @@ impl<'a> Placed<'a> {
         for j in -HALF..=HALF {
             for i in -HALF..=HALF {
                 let at = center - 0.5 + i as f32 * a + j as f32 * b;
-                let (x, y) = (at.x as usize, at.y as usize);
+                let (x, y) = (at.x as i32, at.y as i32); // conversions to 64 bits take longer
                 let (fx, fy) = (at.x - x as f32, at.y - y as f32);
-                let (top, bottom) = (&picture[y * w + x..][..2], &picture[(y + 1) * w + x..][..2]);
+                let first = y as usize * w + x as usize;
+                let (top, bottom) = (&picture[first..][..2], &picture[first + w..][..2]);
                 let (across, across_below) = (top[1] - top[0], bottom[1] - bottom[0]);
                 let (t, u) = (top[0] + fx * across, bottom[0] + fx * across_below);
                 out.value[k] = t + fy * (u - t);
