@@ -129,9 +129,14 @@ impl SilhouetteTable {
         let (rx, ry) = (reach(c.fx), reach(c.fy));
         let (x0, x1, y0, y1) = (x - rx, x + rx, y - ry, y + ry);
         let (w, h) = (self.width as f64, self.height as f64);
-        let clip = |v: f64, end: f64| v.clamp(0.0, end);
-        let (u0, v0) = (clip(x0.floor(), w) as usize, clip(y0.floor(), h) as usize);
-        let (u1, v1) = (clip(x1.ceil(), w) as usize, clip(y1.ceil(), h) as usize);
+        // inside the frame, where truncation rounds down, without a call of `floor` or `ceil`
+        let down = |v: f64, end: f64| v.clamp(0.0, end) as u32;
+        let up = |v: f64, end: f64| {
+            let v = v.clamp(0.0, end);
+            v as u32 + u32::from(v > f64::from(v as u32))
+        };
+        let (u0, v0) = (down(x0, w) as usize, down(y0, h) as usize);
+        let (u1, v1) = (up(x1, w) as usize, up(y1, h) as usize);
         let leaves = [x0 < 0.0, y0 < 0.0, x1 > w, y1 > h];
         if self.any(u0, v0, u1, v1) {
             Verdict::Kept
