@@ -276,6 +276,7 @@ fn pixels(capture: &mut Capture, options: &CaptureOptions, out: &mut Inspection)
                 loaded = load_all(capture, options).0;
             }
             out.reasons.extend(survey.reasons(&reading));
+            out.warnings.extend(survey.warnings(&reading));
             out.mask_reading = Some(reading);
         }
         // whatever else they look like is no news

@@ -138,6 +138,8 @@ struct Tally {
     pixels: u64,
     /// Those like the pixels left of them and above, which soft edges are not.
     even: u64,
+    /// Neighbors left of them and above that are black, where they are not.
+    edges: u64,
     /// The most frequent exact color, by the vote of Boyer and Moore.
     color: [u8; 3],
     votes: u64,
@@ -146,6 +148,7 @@ struct Tally {
 impl Tally {
     fn add(&mut self, other: Tally) {
         (self.pixels, self.even) = (self.pixels + other.pixels, self.even + other.even);
+        self.edges += other.edges;
         if self.color == other.color {
             self.votes += other.votes;
         } else if self.votes < other.votes {
@@ -185,8 +188,11 @@ impl MaskValues {
         let mut run = Tally::default();
         for i in 0..picture.rgb.len() {
             let color = picture.drawn(i);
-            let even = |neighbor: usize| apart(picture.drawn(neighbor), color) <= EVEN;
-            let is_even = i >= width && i % width > 0 && even(i - 1) && even(i - width);
+            let is_inner = i >= width && i % width > 0;
+            let beside = if is_inner { [i - 1, i - width].map(|i| picture.drawn(i)) } else { [color; 2] };
+            let is_even = is_inner && beside.iter().all(|other| apart(*other, color) <= EVEN);
+            let is_edge = |other: &&[u8; 3]| brightest(color) > MAX_BLACK && brightest(**other) <= MAX_BLACK;
+            let edges = if is_even { 0 } else { beside.iter().filter(is_edge).count() as u64 };
             if run.pixels > 0 && run.color != color {
                 tallies[usize::from(key(run.color))].add(run);
                 run = Tally::default();
@@ -194,6 +200,7 @@ impl MaskValues {
             run.color = color;
             (run.pixels, run.votes, run.even) =
                 (run.pixels + 1, run.votes + 1, run.even + u64::from(is_even));
+            run.edges += edges;
         }
         if run.pixels > 0 {
             tallies[usize::from(key(run.color))].add(run);
@@ -267,13 +274,16 @@ impl MaskSurvey {
             return Ok(MaskReading::White); // that they are empty is said elsewhere
         }
         if has_white(&seen) && 50 * colored <= visible {
-            let labels = levels(&seen).len() > 1 || black == 0;
-            return match (&self.gray_file, labels) {
-                (_, true) => Err(self.refusal(&all, "masks have several values, as labels have", root)),
-                (Some((file, gray)), _) => {
+            let grays = levels(&seen);
+            let are_several = grays.len() > 1 || black == 0;
+            return match &self.gray_file {
+                Some((file, gray)) if !are_several => {
                     let file = shown(file, root);
                     let problem = format!("masks differ: `{file}` is drawn in gray {gray}, others in white");
                     Err(self.refusal(&all, &problem, root))
+                }
+                _ if are_several || is_area(&grays, &seen) => {
+                    Err(self.refusal(&all, "masks have several values, as labels have", root))
                 }
                 _ => Ok(MaskReading::White),
             };
@@ -311,15 +321,22 @@ impl MaskSurvey {
                 let values = String::from(MaskHead::Values(values.clone()));
                 said.push(format!("mask values {values} are head, by `mask.head`"));
             }
-            MaskReading::White => {
-                let seen: Vec<Tally> = self.tallies.values().copied().collect();
-                said.extend(levels(&seen).first().map(|t| {
-                    let gray = color_text(t.color);
-                    format!("large parts of the masks are {gray}, which is read as that opacity")
-                }));
-            }
+            MaskReading::White => {}
         }
         said
+    }
+
+    /// Returns what may be wrong with masks that are read in this way.
+    pub fn warnings(&self, reading: &MaskReading) -> Vec<String> {
+        let seen: Vec<Tally> = self.tallies.values().copied().collect();
+        let gray = levels(&seen).first().filter(|_| reading.is_white()).map(|t| color_text(t.color));
+        let text = |gray| {
+            format!(
+                "large parts of the masks are {gray}, which is read as that opacity; if it means something else, say \
+                 what is head: `--set mask.head=255` or `--set mask.head=not-black`"
+            )
+        };
+        gray.map(text).into_iter().collect()
     }
 
     fn refusal(&self, all: &[Tally], problem: &str, root: &Path) -> Error {
@@ -337,9 +354,13 @@ impl MaskSurvey {
         let file = shown(&self.example.0, root);
         let message = format!("{problem}: `{file}` and others hold {}{more}{kind}", named.join(", "));
         let wanted = few.iter().take(2).map(|t| self.setting_text(t.color)).collect::<Vec<_>>().join(",");
+        // two of very many values are next to nothing
+        let values = match kind.is_empty() {
+            true => format!("`--set mask.head={wanted}` (those of the values that are head) or "),
+            false => String::new(),
+        };
         let hint = format!(
-            "say what is head: `--set mask.head={wanted}` (those of the values that are head) or \
-             `--set mask.head=not-black`; or give masks in black and white"
+            "say what is head: {values}`--set mask.head=not-black`; or give masks in black and white"
         );
         Error::cannot(message, hint)
     }
@@ -405,6 +426,18 @@ fn levels(tallies: &[Tally]) -> Vec<Tally> {
     let even: u64 = tallies.iter().filter(|t| brightest(t.color) > MAX_BLACK).map(|t| t.even).sum();
     let large = tallies.iter().filter(between).filter(|t| t.is_exact() && 20 * t.even > even);
     large.copied().collect()
+}
+
+/// Returns whether grays between black and white are labels of an area. Unknown pixels of a trimap are a band around
+/// all white, which then does not touch black.
+fn is_area(grays: &[Tally], seen: &[Tally]) -> bool {
+    let white = seen.iter().filter(|t| brightest(t.color) >= ALMOST_WHITE);
+    let [gray_edges, white_edges] =
+        [grays.iter().map(|t| t.edges).sum::<u64>(), white.map(|t| t.edges).sum::<u64>()];
+    let is_band = gray_edges > 10 * white_edges;
+    let even = |all: &[Tally]| all.iter().map(|t| t.even).sum::<u64>();
+    let least = if is_band { 2 } else { 4 };
+    least * even(grays) > even(seen)
 }
 
 /// Returns the one gray or color that these are drawn in on black, soft edges and the noise of JPEG allowed.
@@ -499,15 +532,51 @@ mod tests {
         assert!(refusal(&[file(&shades)]).contains("as photographs have"));
     }
 
+    /// A white square within a frame of gray so wide, on black.
+    fn framed(width: usize) -> MaskPicture {
+        let mut picture = file(&[[255; 3]]);
+        let depth = |i: usize| (i % 40 - 8).min(31 - i % 40).min((i / 40 - 8).min(31 - i / 40));
+        for i in 0..picture.rgb.len() {
+            if picture.rgb[i] != [0; 3] && depth(i) < width {
+                picture.rgb[i] = [128; 3];
+            }
+        }
+        picture
+    }
+
+    #[test]
+    fn a_gray_beside_white_that_fills_an_area_is_a_label() {
+        // part of the head that is gray, beside one that is white
+        for rows in [1, 2, 3] {
+            let mut colors = [[128; 3]; 4];
+            colors[..rows].fill([255; 3]);
+            let is_refused = reading(&[file(&colors)]).is_err();
+            assert_eq!(is_refused, rows < 3, "{rows} of 4 are white");
+        }
+        let text = refusal(&[file(&[[255; 3], [128; 3], [128; 3]])]);
+        assert!(text.contains("as labels have") && text.contains("gray 128, gray 255"), "{text}");
+        // a part within one that is gray
+        assert!(reading(&[framed(8)]).is_err());
+    }
+
+    #[test]
+    fn of_very_many_values_none_is_offered_as_the_head() {
+        let shades: Vec<[u8; 3]> = (0..24).map(|y| [200 - 6 * y, 120 - 3 * y, 90 - 2 * y]).collect();
+        let error = reading(&[file(&shades)]).unwrap_err();
+        let hint = error.hint();
+        assert!(hint.contains("mask.head=not-black") && hint.matches("mask.head").count() == 1, "{hint}");
+    }
+
     #[test]
     fn opacity_beside_white_stays_opacity() {
         let soft: Vec<[u8; 3]> = (0..24).map(|y| [255 - 10 * y; 3]).collect();
         let files = [file(&soft), file(&[[255; 3]]), file(&[[0; 3]])];
         assert_eq!(reading(&files).unwrap(), MaskReading::White);
-        let trimap = [file(&[[255; 3], [128; 3]])];
+        let trimap = [framed(3)];
         assert_eq!(reading(&trimap).unwrap(), MaskReading::White);
-        let said = surveyed(&trimap).reasons(&MaskReading::White);
-        assert!(matches!(&said[..], [text] if text.contains("gray 128")), "{said:?}");
+        let said = surveyed(&trimap).warnings(&MaskReading::White);
+        assert!(matches!(&said[..], [text] if text.contains("gray 128") && text.contains("=255`")), "{said:?}");
+        assert!(surveyed(&trimap).reasons(&MaskReading::White).is_empty());
         assert_eq!(reading(&[]).unwrap(), MaskReading::White);
         assert!(
             refusal(&[file(&[[255; 3]]), file(&[[128; 3]])]).contains("`masks/1.png` is drawn in gray 128")

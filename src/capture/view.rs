@@ -215,6 +215,7 @@ impl Capture {
         }
         let reading = survey.reading(head, &self.root)?;
         self.reasons.extend(survey.reasons(&reading));
+        self.warnings.extend(survey.warnings(&reading));
         self.read_masks_as(&reading);
         Ok(())
     }

@@ -286,6 +286,7 @@ fn masks_of_capture(capture: &Capture, config: &MaskConfig, dir: &StageDir) -> R
     if out.reading != MaskReading::White {
         survey.reasons(&out.reading).iter().for_each(|text| dir.warn(text));
     }
+    survey.warnings(&out.reading).iter().for_each(|text| dir.warn(text));
     Ok(out)
 }
 

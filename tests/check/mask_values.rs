@@ -166,6 +166,17 @@ fn labels_are_never_trained_on_in_silence() {
 }
 
 #[test]
+fn a_gray_part_of_a_head_beside_a_white_one_is_no_half_transparent_head() {
+    for grays in [[0, 255, 128], [0, 128, 255]] {
+        let dir = drawn(|file, mask| label_grays(file, mask, grays));
+        let (what, hint) = refused(&found(&dir, "white"));
+        assert!(what.contains("as labels have") && what.contains("gray 128"), "{grays:?}: {what}");
+        assert!(hint.contains("mask.head=") && hint.contains("not-black"), "{hint}");
+        assert!((coverage(&found(&dir, "128,255")) - white()).abs() < 0.03);
+    }
+}
+
+#[test]
 fn labels_beside_a_value_for_nothing_are_no_white_masks() {
     // 255 is a thin border that counts for nothing
     let dir = drawn(|file, mask| {
