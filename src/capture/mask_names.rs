@@ -4,7 +4,7 @@ use super::folder::{CaptureFolder, PHOTOGRAPHS, has_ending};
 use super::near::names::{
     fold, is_aside, is_common_name, is_mask_folder, reduced, without_ending, without_valid,
 };
-use super::near::pairs::{Pairs, pair};
+use super::near::pairs::{Pairs, pair, pair_below};
 use super::view::View;
 use crate::error::counted;
 use crate::io;
@@ -31,17 +31,18 @@ pub(super) struct Group {
 }
 
 impl Group {
-    fn new(place: &str, mut files: Vec<String>, names: &[String]) -> Group {
+    /// Pairs files below a folder with views of these names, and of these paths below the capture.
+    fn new(place: &str, mut files: Vec<String>, names: &[String], paths: &[String]) -> Group {
         files.sort();
-        let pairs = pair(names, &files);
+        let pairs = pair_below(names, paths, &files);
         Group { place: place.into(), files, pairs }
     }
 
-    /// Returns whether these are the masks: no view has two, and at least half of the views or of
-    /// the pictures have the other.
+    /// Returns whether these are the masks: no view has two, at least half of the views or of the
+    /// pictures have the other, and their names are more than numbers that some happen to share.
     pub fn is_usable(&self) -> bool {
         let (n, all) = (self.pairs.count(), self.pairs.files.len().min(self.files.len()));
-        n > 0 && self.pairs.doubtful.is_empty() && 2 * n >= all
+        n > 0 && self.pairs.is_sure() && 2 * n >= all
     }
 
     /// Returns whether there is no picture.
@@ -82,6 +83,10 @@ impl Group {
                 let example = self.path(0);
                 format!("`{place}/` has {count} that no view is named after, such as `{example}`: {way}")
             }
+            n if self.pairs.by_number.is_some() => format!(
+                "`{place}/` has {count} for {}, but only {n} have the same number, which may be chance: {way}",
+                counted(views.len(), "view")
+            ),
             n => format!(
                 "`{place}/` has {count}, but only {n} of {} views are named alike: {way}",
                 views.len()
@@ -97,6 +102,12 @@ fn photographs(views: &[View]) -> HashSet<&Path> {
 
 fn names(views: &[View]) -> Vec<String> {
     views.iter().map(|view| view.name.clone()).collect()
+}
+
+/// Returns the paths of photographs below the capture, without ending and separated by `/`.
+fn paths(folder: &CaptureFolder, views: &[View]) -> Vec<String> {
+    let path = |view: &View| without_ending(&folder.shown(&view.photo)).0.replace('\\', "/");
+    views.iter().map(path).collect()
 }
 
 /// Returns the groups of pictures that may be masks in the order in which they are to be taken:
@@ -128,13 +139,12 @@ pub(super) fn groups(folder: &CaptureFolder, views: &[View]) -> Vec<Group> {
     };
     let mut found: Vec<(String, Vec<String>)> = found.into_iter().collect();
     found.sort_by_cached_key(order);
-    let view_names = names(views);
+    let (view_names, paths) = (names(views), paths(folder, views));
     let found = found.into_iter().take(MAX_FOLDERS);
-    let mut groups: Vec<Group> = found.map(|(place, files)| Group::new(&place, files, &view_names)).collect();
+    let group = |(place, files): (String, Vec<String>)| Group::new(&place, files, &view_names, &paths);
+    let mut groups: Vec<Group> = found.map(group).collect();
     if !beside.is_empty() {
-        let relative = |view: &View| without_ending(&folder.shown(&view.photo)).0.replace('\\', "/");
-        let names: Vec<String> = views.iter().map(relative).collect();
-        groups.push(Group::new("", beside, &names));
+        groups.push(Group::new("", beside, &paths, &paths));
     }
     groups
 }
@@ -149,7 +159,8 @@ pub(super) fn within(folder: &CaptureFolder, place: &str, views: &[View]) -> Gro
     let pictures = pictures.filter(|picture| picture.path.starts_with(&below));
     let pictures = pictures.filter(|picture| !has_photos || picture.is_named_mask());
     let pictures = pictures.filter(|picture| !photos.contains(folder.root.join(&picture.path).as_path()));
-    Group::new(place, pictures.map(|picture| picture.path[below.len()..].into()).collect(), &names(views))
+    let files = pictures.map(|picture| picture.path[below.len()..].into()).collect();
+    Group::new(place, files, &names(views), &paths(folder, views))
 }
 
 /// Returns whether a folder has photographs of views.
@@ -256,6 +267,6 @@ pub(super) fn valid(
         let stems: Vec<String> = files.iter().map(|file| without_valid(&fold(file)).to_string()).collect();
         let pairs = pair(&names(views), &stems);
         let all = pairs.files.iter().map(|file| file.map(|file| place.join(&files[file]))).collect();
-        (pairs.count() > 0 && pairs.doubtful.is_empty()).then(|| (folder.shown(&place), all))
+        (pairs.count() > 0 && pairs.is_sure()).then(|| (folder.shown(&place), all))
     })
 }

@@ -575,7 +575,10 @@ mod tests {
         let trimap = [framed(3)];
         assert_eq!(reading(&trimap).unwrap(), MaskReading::White);
         let said = surveyed(&trimap).warnings(&MaskReading::White);
-        assert!(matches!(&said[..], [text] if text.contains("gray 128") && text.contains("=255`")), "{said:?}");
+        assert!(
+            matches!(&said[..], [text] if text.contains("gray 128") && text.contains("=255`")),
+            "{said:?}"
+        );
         assert!(surveyed(&trimap).reasons(&MaskReading::White).is_empty());
         assert_eq!(reading(&[]).unwrap(), MaskReading::White);
         assert!(

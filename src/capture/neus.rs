@@ -108,7 +108,7 @@ fn paired_masks<'m>(
         return paired_in_order(plain, numbered, masks);
     }
     let counts = format!("`{place}/` has {} masks for {all} photographs", masks.len());
-    if 2 * n < all {
+    if 2 * n < all || pairs.doubtful.is_empty() && !pairs.is_sure() {
         listing.warnings.push(format!(
             "{counts}, and only {n} have their names: none is used; leave one for each photograph, in name order"
         ));

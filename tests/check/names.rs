@@ -305,6 +305,41 @@ fn a_folder_of_masks_that_no_view_is_named_after_is_named_with_an_example_and_a_
 }
 
 #[test]
+fn masks_that_are_counted_on_their_own_are_not_those_of_the_numbers() {
+    // every second photograph, and masks from 1: half of the numbers are those of other views
+    let dir = tempfile::tempdir().unwrap();
+    let frames: Vec<String> = (0..VIEWS).map(|i| frame(i, &named("images/{}.png", 2 * i), "")).collect();
+    write_frames(&dir, &frames);
+    for i in 0..VIEWS {
+        picture(&dir, &named("images/{}.png", 2 * i));
+        mask(&dir, &format!("masks/{:05}.png", i + 1));
+    }
+    let found = inspected(&dir);
+    let words = ["`masks/` has 9 pictures for 9 views, but only 4 have the same number", "`masks/000.png`"];
+    assert!(found.masks == 0 && says(&found.reasons, &words), "{found}");
+    // the numbers of all views, written without zeros
+    (0..VIEWS).for_each(|i| fs::remove_file(dir.path().join(format!("masks/{:05}.png", i + 1))).unwrap());
+    (0..VIEWS).for_each(|i| mask(&dir, &format!("masks/{}.png", 2 * i)));
+    let c = open(&dir).unwrap();
+    let own: Vec<String> = (0..VIEWS).map(|i| format!("masks/{}.png", 2 * i)).collect();
+    assert_eq!(masks(&dir, &c), own);
+}
+
+#[test]
+fn masks_of_another_side_or_of_a_part_of_the_head_are_not_the_heads() {
+    for place in ["masks/left", "lip_masks", "dynamic_masks"] {
+        let dir = capture_of("images/right/{}.png", "images/right/{}.png", &format!("{place}/{{}}.png"));
+        let found = inspected(&dir);
+        assert!(found.masks == 0 && says(&found.reasons, &["the capture has no masks"]), "{place}: {found}");
+    }
+    for place in ["masks/right", "masks/head", "handmade_masks"] {
+        let name = format!("{place}/{{}}.png");
+        let dir = capture_of("images/right/{}.png", "images/right/{}.png", &name);
+        assert_eq!(masks(&dir, &open(&dir).unwrap()), all(&name), "{place}");
+    }
+}
+
+#[test]
 fn a_mask_folder_that_is_named_is_found_in_other_letters_and_from_outside() {
     let dir = capture_of("images/{}.png", "images/{}.png", "cutouts/{}_mask.PNG");
     for mask_dir in ["cutouts", "Cutouts", "head/cutouts", "/home/me/head/cutouts/"] {

@@ -25,9 +25,35 @@ const MASK_DETAILS: [&str; 9] =
 /// Words that may stand in a photograph's name only, or in both.
 const PHOTO_WORDS: [&str; 7] = ["rgb", "image", "img", "color", "photo", "frame", "im"];
 
-/// Words of masks of something else than the whole head; `masked` pictures are photographs.
-const OTHER_MASKS: [&str; 11] =
-    ["face", "facial", "hair", "skin", "bg", "background", "valid", "eye", "mouth", "parsing", "masked"];
+/// Beginnings of words of masks of something else than the whole head; `masked` pictures are
+/// photographs.
+const OTHER_MASKS: [&str; 22] = [
+    "face",
+    "facial",
+    "hair",
+    "skin",
+    "bg",
+    "background",
+    "valid",
+    "eye",
+    "mouth",
+    "parsing",
+    "masked",
+    "beard",
+    "cloth",
+    "dynamic",
+    "glasses",
+    "ignore",
+    "invalid",
+    "motion",
+    "nose",
+    "occlu",
+    "teeth",
+    "tooth",
+];
+
+/// Such words that are the beginnings of others, as whole words.
+const OTHER_PARTS: [&str; 6] = ["body", "brow", "hand", "lip", "neck", "sky"];
 
 /// Beginnings of the names of folders whose pictures are made from photographs, or were put aside.
 const ASIDE: [&str; 20] = [
@@ -109,7 +135,15 @@ fn words(folded: &str) -> impl Iterator<Item = &str> {
 
 /// Returns whether a folder with this folded name has masks of heads.
 pub fn is_mask_folder(folded: &str) -> bool {
-    is_like_masks(folded) && !words(folded).any(|w| OTHER_MASKS.iter().any(|other| w.starts_with(other)))
+    is_like_masks(folded) && !words(folded).any(is_other)
+}
+
+/// Returns whether a folded word, such as `face`, `lips` or `lipmask`, says of something else than a
+/// head.
+fn is_other(word: &str) -> bool {
+    let part = ["masks", "mask"].iter().find_map(|end| word.strip_suffix(end)).unwrap_or(word);
+    let is_part = |other: &&str| part == **other || part.strip_suffix('s') == Some(**other);
+    OTHER_MASKS.iter().any(|other| word.starts_with(other)) || OTHER_PARTS.iter().any(|other| is_part(&other))
 }
 
 /// Returns whether a folder with this folded name has masks, be they of heads or of something else.
@@ -179,11 +213,21 @@ pub fn without_valid(name: &str) -> &str {
     without_word(stem, &["valid"]).unwrap_or(stem)
 }
 
-/// Returns what is left of [`bare`] without words of photographs and leading zeros.
-pub fn plain(stem: &str) -> &str {
+/// Returns what is left of [`bare`] without words of photographs.
+pub fn without_words(stem: &str) -> &str {
     let bare = bare(stem).0;
-    let plain = without_word(bare, &PHOTO_WORDS).unwrap_or(bare);
-    if plain.is_empty() || !plain.bytes().all(|b| b.is_ascii_digit()) {
+    without_word(bare, &PHOTO_WORDS).unwrap_or(bare)
+}
+
+/// Returns whether there are digits and nothing else.
+pub fn is_number(name: &str) -> bool {
+    !name.is_empty() && name.bytes().all(|b| b.is_ascii_digit())
+}
+
+/// Returns what is left of [`without_words`] without leading zeros of a number.
+pub fn plain(stem: &str) -> &str {
+    let plain = without_words(stem);
+    if !is_number(plain) {
         return plain;
     }
     let digits = plain.trim_start_matches('0');
@@ -232,6 +276,12 @@ mod tests {
         }
         for name in ["face_masks", "bg_masks", "images", "masked", "unmasked", "left"] {
             assert!(!is_mask_folder(name), "{name}");
+        }
+        for name in ["lip_masks", "lipmask", "masks_hands", "dynamic_masks", "neck-mask", "occlusion_masks"] {
+            assert!(!is_mask_folder(name) && is_aside(name), "{name}");
+        }
+        for name in ["somebody_masks", "handmade_masks", "clip_masks", "brown_masks", "skyler_mask"] {
+            assert!(is_mask_folder(name), "{name}");
         }
         for (name, is) in [("depth_maps", true), ("normals", true), ("images", false), ("cam 01", false)] {
             assert_eq!(is_aside(name), is, "{name}");
