@@ -9,7 +9,7 @@
 use super::cameras::grouped;
 use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
 use crate::capture::scene::{self, SceneOptions};
-use crate::capture::{self, Capture, CaptureOptions, Reading, Split, View, by_number};
+use crate::capture::{self, Capture, CaptureOptions, Reading, Split, View, ViewMask, by_number};
 use crate::config::{CameraPoses, MaskMeaning, MaskSource};
 use crate::geom::Camera;
 use crate::image::{Gray, resize_gray, working_size};
@@ -107,15 +107,20 @@ fn left_open(mut capture: Capture, options: &CaptureOptions, why: &str) -> Resul
         return Ok(Settled::left(capture)); // a warning of the capture says so
     }
     let paired = if photographs { "photographs with cameras" } else { "masks with photographs" };
-    if options.cameras == CameraPoses::Given {
-        let doubt =
-            format!("nothing but name order pairs {paired}, and nothing shows that it is right: {why}");
+    let names: Vec<String> = capture.views.iter().map(|view| view.name.clone()).collect();
+    let [named, numbered] = [first(&names), first(&by_number(&names))];
+    if options.cameras == CameraPoses::Given || is_without_masks(&capture, options) {
+        let orders =
+            if photographs { format!(": {named}, not by number: {numbered}") } else { String::new() };
+        let doubt = format!(
+            "nothing but name order pairs {paired}{orders}; nothing shows that it is right ({why}): if they follow each \
+             other by number, give their names leading zeros"
+        );
         capture.warnings.push(doubt.clone());
         return Ok(Settled { doubt: Some(doubt), ..Settled::left(capture) });
     }
-    let names: Vec<String> = capture.views.iter().map(|view| view.name.clone()).collect();
     let orders = match photographs {
-        true => format!(": {} or, by number, {}", first(&names), first(&by_number(&names))),
+        true => format!(": {named} or, by number, {numbered}"),
         false => ", by name or by number".into(),
     };
     let problem = format!(
@@ -123,9 +128,16 @@ fn left_open(mut capture: Capture, options: &CaptureOptions, why: &str) -> Resul
         capture.root.display()
     );
     let hint = "rename the photographs, and masks likewise, with leading zeros in the order of the cameras (`000`, `001`, \
-                `002`, …), so that both orders are one; where the order of the names is known to be right, \
-                `--set capture.cameras=given` keeps it";
+                `002`, …), so that both orders are one; as long as nothing shows another order, \
+                `--set capture.cameras=given` keeps that of the names";
     Err(Error::cannot(problem, hint))
+}
+
+/// Returns whether a capture has no masks that an order could be measured with, and none are wanted.
+fn is_without_masks(capture: &Capture, options: &CaptureOptions) -> bool {
+    let with_masks = CaptureOptions { masks: MaskSource::Auto, ..options.clone() };
+    let has_masks = |capture: Capture| capture.views.iter().any(|view| view.mask != ViewMask::None);
+    options.masks == MaskSource::None && !capture::open(&capture.root, &with_masks).is_ok_and(has_masks)
 }
 
 /// Returns the first names of an order.

@@ -9,7 +9,7 @@ use std::io::Write;
 use std::path::Path;
 use tempfile::TempDir;
 use tiface::capture::synthetic::{self, SyntheticOptions};
-use tiface::capture::{Capture, CaptureOptions, ViewMask};
+use tiface::capture::{Capture, CaptureOptions, MaskSource, ViewMask};
 use tiface::config::CameraPoses;
 use tiface::geom::Camera;
 use tiface::image::Photo;
@@ -208,9 +208,14 @@ fn an_order_that_nothing_decides_is_refused_with_both_and_a_way_on() {
     let text = error.to_string();
     assert!(text.contains("0, 1, 10, 11, …") && text.contains("0, 1, 2, 3, …"), "{text}");
     assert!(error.hint().contains("leading zeros") && error.hint().contains("capture.cameras=given"));
-    let found = tiface(dir.path(), &["inspect", ".", "--set", "mask.source=none"]);
+    let found = tiface(dir.path(), &["inspect", "."]);
     assert!(code(&found) == 1 && out(&found).contains("0, 1, 10, 11, …"), "{}", said(&found));
     assert!(!out(&found).contains("no problems found"));
+    // without masks nothing can be measured, and LLFF's own order is kept with a word on the other
+    let bare = CaptureOptions { masks: MaskSource::None, ..CaptureOptions::default() };
+    let capture = open_capture(dir.path(), &bare).unwrap();
+    let words = ["nothing but name order pairs", "0, 1, 10, 11, …", "0, 1, 2, 3, …", "leading zeros"];
+    assert!(says(&capture.warnings, &words), "{:?}", capture.warnings);
     // the way on: names stay in their order, with a word
     let given = CaptureOptions { cameras: CameraPoses::Given, ..CaptureOptions::default() };
     let capture = open_capture(dir.path(), &given).unwrap();
