@@ -2,7 +2,8 @@
 
 use super::folder::{CaptureFolder, PHOTOGRAPHS, has_ending};
 use super::near::names::{
-    fold, is_aside, is_common_name, is_mask_folder, reduced, without_ending, without_valid,
+    fold, is_aside, is_common_name, is_like_masks, is_mask_folder, is_measured, reduced, without_ending,
+    without_valid,
 };
 use super::near::pairs::{Pairs, pair, pair_below};
 use super::view::View;
@@ -205,24 +206,61 @@ pub(super) fn stray(folder: &CaptureFolder, groups: &[Group], views: &[View]) ->
     }
     if let Some(group) = groups.first() {
         let (file, n) = (group.path(0), group.pairs.count());
-        return Some(format!(
-            "{n} of {} views have a mask beside the photograph, such as `{file}`",
-            views.len()
-        ));
+        return Some(match n {
+            0 => {
+                format!("`{file}` is called as a mask, but no view is called so: name masks `NAME_mask.png`")
+            }
+            n => format!("{n} of {} views have a mask beside the photograph, such as `{file}`", views.len()),
+        });
     }
+    other_folder(folder, views).or_else(|| beside_photographs(folder, views))
+}
+
+/// Returns what is said of a folder that is not called like masks of heads and has a picture of each
+/// view.
+fn other_folder(folder: &CaptureFolder, views: &[View]) -> Option<String> {
     let is_other = |name: &str| {
         name.split('/')
             .map(fold)
-            .all(|part| !is_aside(&part) && !is_common_name(&part) && reduced(&part).is_none())
+            .all(|part| !is_measured(&part) && !is_common_name(&part) && reduced(&part).is_none())
     };
     let folders = folder.search.folders(folder.root).into_keys();
-    let mut folders = folders.filter(|name| !name.is_empty() && is_other(name));
-    let place = folders.by_ref().take(MAX_FOLDERS).find(|place| {
+    let mut folders: Vec<&str> = folders.filter(|name| !name.is_empty() && is_other(name)).collect();
+    folders.sort_by_key(|name| name.split('/').any(|part| is_aside(&fold(part))));
+    let place = folders.into_iter().take(MAX_FOLDERS).find(|place| {
         let group = within(folder, place, views);
         !holds_photographs(folder, place, views) && group.pairs.count() == views.len()
     })?;
+    let but = match place.split('/').any(|part| is_like_masks(&fold(part))) {
+        true => ", but its name says of something else than the whole head",
+        false => "",
+    };
     Some(format!(
-        "`{place}/` has pictures named as the views: if they are masks, `--set capture.mask_dir={place}`"
+        "`{place}/` has pictures named as the views{but}: if they are masks, `--set capture.mask_dir={place}`"
+    ))
+}
+
+/// Returns what is said of pictures beside the photographs whose names begin with those of at least
+/// half of the views.
+fn beside_photographs(folder: &CaptureFolder, views: &[View]) -> Option<String> {
+    let photos = photographs(views);
+    let known: HashSet<String> = paths(folder, views).iter().map(|path| fold(path)).collect();
+    let mut found: BTreeMap<String, &str> = BTreeMap::new();
+    for picture in folder.search.pictures(folder.root) {
+        if photos.contains(folder.root.join(&picture.path).as_path()) {
+            continue;
+        }
+        let stem = fold(without_ending(&picture.path).0);
+        let ends = stem.match_indices(|c: char| !c.is_alphanumeric()).map(|(at, _)| at);
+        let begins = ends.chain([stem.len()]).map(|end| &stem[..end]).filter(|name| known.contains(*name));
+        if let Some(name) = begins.last() {
+            found.entry(name.into()).or_insert(&picture.path);
+        }
+    }
+    let example = found.values().next().filter(|_| 2 * found.len() >= views.len())?;
+    Some(format!(
+        "`{example}` and others lie beside the photographs and are not used: if they are masks, name them \
+         `NAME_mask.png`, or put them into `masks/`"
     ))
 }
 

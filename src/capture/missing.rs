@@ -3,7 +3,7 @@
 
 use super::folder::{CaptureFolder, in_frame};
 use super::frame::{CameraFrame, Listing};
-use super::near::names::{fold, is_aside, reduced};
+use super::near::names::{fold, is_aside, is_common_name, is_number, reduced};
 use super::near::{Answer, Found, Kind};
 use crate::error::counted;
 use crate::io;
@@ -22,6 +22,8 @@ pub(super) struct Missing {
     reduced: Vec<(u32, String)>,
     /// Files that several frames would share.
     shared: Vec<String>,
+    /// Photographs whose file lies elsewhere, by name, while others lie where they should.
+    elsewhere: Vec<(String, String)>,
 }
 
 /// Confirms the near files of a listing, and says so once. A frame loses its file if another one
@@ -38,9 +40,17 @@ pub(super) fn settle(folder: &CaptureFolder, listing: &mut Listing) -> Missing {
         answers.into_iter().partition(|answer| answer.kind == Kind::Photograph);
     let is_near = settle_photographs(folder, listing, &photos, &mut missing);
     settle_masks(folder, listing, &masks);
-    let pairs = listing.frames.iter().zip(is_near).filter(|(frame, near)| *near && frame.photo.is_some());
-    let pairs = pairs.map(|(frame, _)| (frame.name.clone(), folder.shown(&frame.relative)));
-    listing.reasons.extend(said(pairs.collect(), "photograph"));
+    let near = listing.frames.iter().zip(is_near).filter(|(frame, near)| *near && frame.photo.is_some());
+    let found = by_path(&photos);
+    let (foreign, usual): (Vec<&CameraFrame>, Vec<&CameraFrame>) = near
+        .map(|(frame, _)| frame)
+        .partition(|frame| is_foreign(&frame.relative, found[frame.relative.as_path()].0));
+    let pairs = |frames: Vec<&CameraFrame>| {
+        frames.into_iter().map(|frame| (frame.name.clone(), folder.shown(&frame.relative))).collect()
+    };
+    let (foreign, usual) = (said(pairs(foreign), "photograph"), said(pairs(usual), "photograph"));
+    listing.reasons.extend(usual);
+    listing.warnings.extend(foreign.map(|text| text + ": these must be the very photographs of the cameras"));
     for answer in photos {
         match answer.found {
             Found::Several(files) => missing.several.push((answer.name, files)),
@@ -95,10 +105,20 @@ fn settle_photographs(
             missing.shared.push(folder.shown(&frame.relative));
             frame.photo = None;
         } else if is_elsewhere && homes.contains(&answer.folder) {
+            missing.elsewhere.push((answer.name.clone(), folder.shown(&frame.relative)));
             frame.photo = None;
         }
     }
     is_near
+}
+
+/// Returns whether a file lies in a folder whose name says something that the name it was sought by
+/// does not: not a usual name of photographs, nor a number.
+fn is_foreign(file: &Path, answer: &Answer) -> bool {
+    let last = file.parent().and_then(Path::file_name).map(|name| fold(&name.to_string_lossy()));
+    last.is_some_and(|last| {
+        !is_common_name(&last) && !is_number(&last) && answer.folder.split('/').all(|part| part != last)
+    })
 }
 
 fn settle_masks(folder: &CaptureFolder, listing: &mut Listing, answers: &[Answer]) {
@@ -171,6 +191,11 @@ impl Missing {
             let text = format!("; `{file}` is there, but several frames would share it");
             return (text, Some("give each photograph the name that the camera file says".into()));
         }
+        if let Some((name, file)) = self.elsewhere.first() {
+            let text = format!("; `{file}` is there, but `{name}` is looked for where others are");
+            let hint = "move such files beside the others if they are the photographs of these cameras";
+            return (text, Some(hint.into()));
+        }
         if let Some(limit) = folder.search.limit(folder.root) {
             return (
                 format!(
@@ -186,7 +211,10 @@ impl Missing {
 /// Returns which folders have pictures that could be photographs, as the end of a sentence.
 pub(super) fn pictures_there(folder: &CaptureFolder) -> String {
     let mut folders: Vec<_> = folder.search.folders(folder.root).into_iter().collect();
-    folders.retain(|(name, _)| !name.split('/').any(|part| is_aside(&fold(part))));
+    let is_shown = |name: &str| !name.split('/').any(|part| is_aside(&fold(part)));
+    if folders.iter().any(|(name, _)| is_shown(name)) {
+        folders.retain(|(name, _)| is_shown(name)); // else better those than none
+    }
     folders.sort_by_key(|(_, pictures)| std::cmp::Reverse(pictures.len()));
     let shown = folders.iter().take(EXAMPLES).map(|(name, pictures)| {
         let place = if name.is_empty() { "the capture itself".into() } else { format!("`{name}/`") };

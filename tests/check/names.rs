@@ -147,6 +147,32 @@ fn a_photograph_that_was_put_aside_stays_missing() {
 }
 
 #[test]
+fn photographs_that_are_missing_in_part_are_named_where_they_lie() {
+    let dir = capture_of("images/{}.png", "images/{}.png", "");
+    fs::create_dir(dir.path().join("images2")).unwrap();
+    for i in [3, 4] {
+        let name = named("{}.png", i);
+        fs::rename(dir.path().join("images").join(&name), dir.path().join("images2").join(&name)).unwrap();
+    }
+    let c = open(&dir).unwrap();
+    let words = ["2 of 9 photographs are missing", "`images2/003.png` is there", "move such files"];
+    assert!(says(&c.warnings, &words), "{:?}", c.warnings);
+}
+
+#[test]
+fn photographs_in_a_folder_that_says_of_others_are_a_warning_or_not_read() {
+    let dir = capture_of("images/{}.png", "other_person/{}.png", "");
+    let c = open(&dir).unwrap();
+    assert_eq!(photos(&dir, &c), all("other_person/{}.png"));
+    assert!(says(&c.warnings, &["near names", "`other_person/000.png`"]), "{:?}", c.warnings);
+    for aside in ["images_distorted", "cropped", "old"] {
+        let dir = capture_of("images/{}.png", &format!("{aside}/{{}}.png"), "");
+        let e = open(&dir).unwrap_err().to_string();
+        assert!(e.contains("missing") && e.contains(&format!("`{aside}/` has 9 pictures")), "{e}");
+    }
+}
+
+#[test]
 fn two_frames_never_share_a_photograph_that_was_found_nearby() {
     let dir = capture_of("images/{}.png", "images/{}.png", "");
     let mut frames: Vec<String> = (0..VIEWS).map(|i| frame(i, &format!("a/{i:03}.png"), "")).collect();
@@ -302,6 +328,23 @@ fn a_folder_of_masks_that_no_view_is_named_after_is_named_with_an_example_and_a_
     assert!(says(&inspected(&dir).reasons, &["`bw/`", "--set capture.mask_dir=bw"]));
     let c = capture::open(dir.path(), &in_folder("bw")).unwrap();
     assert_eq!(masks(&dir, &c), all("bw/{}.png"));
+}
+
+#[test]
+fn pictures_that_may_be_masks_are_named_where_there_are_no_others() {
+    let rows = [
+        ("parsing_masks/{}.png", "`parsing_masks/` has pictures named as the views, but its name"),
+        ("output/{}.png", "--set capture.mask_dir=output"),
+        ("images/{}-removebg-preview.png", "`images/000-removebg-preview.png` and others lie beside"),
+        ("images/{}.png", "`images/000.png` and others lie beside"),
+    ];
+    for (name, words) in rows {
+        let dir = capture_of("images/{}.jpg", "images/{}.jpg", name);
+        let found = inspected(&dir);
+        assert!(says(&found.reasons, &["the capture has no masks", words]), "{name}: {found}");
+    }
+    let dir = capture_of("images/{}.jpg", "images/{}.jpg", "depth/{}.png");
+    assert!(!says(&inspected(&dir).reasons, &["depth"]));
 }
 
 #[test]

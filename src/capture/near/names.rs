@@ -56,7 +56,7 @@ const OTHER_MASKS: [&str; 22] = [
 const OTHER_PARTS: [&str; 6] = ["body", "brow", "hand", "lip", "neck", "sky"];
 
 /// Beginnings of the names of folders whose pictures are made from photographs, or were put aside.
-const ASIDE: [&str; 20] = [
+const ASIDE: [&str; 26] = [
     "foreground",
     "fg",
     "depth",
@@ -77,7 +77,17 @@ const ASIDE: [&str; 20] = [
     "reject",
     "trash",
     "backup",
+    "distort",
+    "crop",
+    "resiz",
+    "aligned",
+    "warp",
+    "blur",
 ];
+
+/// Beginnings of the names of folders whose pictures show neither photographs nor opacity.
+const MEASURED: [&str; 10] =
+    ["depth", "normal", "disp", "flow", "thumb", "preview", "albedo", "confidence", "landmark", "uncertain"];
 
 /// Returns a name as names are compared: in small letters and composed.
 pub fn fold(name: &str) -> String {
@@ -147,7 +157,7 @@ fn is_other(word: &str) -> bool {
 }
 
 /// Returns whether a folder with this folded name has masks, be they of heads or of something else.
-fn is_like_masks(folded: &str) -> bool {
+pub fn is_like_masks(folded: &str) -> bool {
     words(folded).any(|word| {
         let is_short = ["seg", "segs", "pha", "matting"].contains(&word);
         let begins = ["mask", "matte", "alpha", "silhouette", "segment"];
@@ -158,7 +168,13 @@ fn is_like_masks(folded: &str) -> bool {
 
 /// Returns whether no photographs are looked for in a folder with this folded name.
 pub fn is_aside(folded: &str) -> bool {
-    is_like_masks(folded) || words(folded).any(|word| ASIDE.iter().any(|aside| word.starts_with(aside)))
+    let is_aside = |word: &str| word == "old" || ASIDE.iter().any(|aside| word.starts_with(aside));
+    is_like_masks(folded) || words(folded).any(is_aside)
+}
+
+/// Returns whether the pictures of a folder with this folded name are depths, normals and the like.
+pub fn is_measured(folded: &str) -> bool {
+    words(folded).any(|word| MEASURED.iter().any(|other| word.starts_with(other)))
 }
 
 /// Returns the factor of a folder of reduced pictures, and what the folder of the whole ones is
@@ -286,6 +302,11 @@ mod tests {
         for (name, is) in [("depth_maps", true), ("normals", true), ("images", false), ("cam 01", false)] {
             assert_eq!(is_aside(name), is, "{name}");
         }
+        for (name, is) in [("images_distorted", true), ("undistorted", false), ("old", true), ("gold", false)]
+        {
+            assert_eq!(is_aside(name), is, "{name}");
+        }
+        assert!(is_measured("depth_maps") && !is_measured("output") && !is_measured("parsing_masks"));
         assert_eq!((reduced("images_4"), reduced("images_8x")), (Some((4, "images")), Some((8, "images"))));
         assert_eq!((reduced("cam_01"), reduced("images"), reduced("a_1")), (None, None, None));
     }
