@@ -252,8 +252,8 @@ fn beside_photographs(folder: &CaptureFolder, views: &[View]) -> Option<String> 
         }
         let stem = fold(without_ending(&picture.path).0);
         let ends = stem.match_indices(|c: char| !c.is_alphanumeric()).map(|(at, _)| at);
-        let begins = ends.chain([stem.len()]).map(|end| &stem[..end]).filter(|name| known.contains(*name));
-        if let Some(name) = begins.last() {
+        let mut begins = ends.chain([stem.len()]).rev().map(|end| &stem[..end]);
+        if let Some(name) = begins.find(|name| known.contains(*name)) {
             found.entry(name.into()).or_insert(&picture.path);
         }
     }

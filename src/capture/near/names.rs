@@ -152,8 +152,8 @@ pub fn is_mask_folder(folded: &str) -> bool {
 /// head.
 fn is_other(word: &str) -> bool {
     let part = ["masks", "mask"].iter().find_map(|end| word.strip_suffix(end)).unwrap_or(word);
-    let is_part = |other: &&str| part == **other || part.strip_suffix('s') == Some(**other);
-    OTHER_MASKS.iter().any(|other| word.starts_with(other)) || OTHER_PARTS.iter().any(|other| is_part(&other))
+    let single = part.strip_suffix('s').unwrap_or(part);
+    OTHER_MASKS.iter().any(|other| word.starts_with(other)) || OTHER_PARTS.contains(&single)
 }
 
 /// Returns whether a folder with this folded name has masks, be they of heads or of something else.

@@ -60,7 +60,7 @@ fn folders(stem: &str) -> Vec<&str> {
 /// Returns whether folders say that two pictures of the same last name are not of one view.
 fn are_apart(a: &str, b: &str) -> bool {
     let [a, b] = [folders(a), folders(b)];
-    let is_alike = |a: &&str| b.iter().any(|b| a.contains(b) || b.contains(*a));
+    let is_alike = |a: &&str| b.iter().any(|b| a.contains(*b) || b.contains(*a));
     !a.is_empty() && !b.is_empty() && !a.iter().any(is_alike)
 }
 
