@@ -65,14 +65,15 @@ struct Together {
 }
 
 /// Lists the frames of `files`, in order; everything wrong goes to the listing's problems.
-pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) {
+pub(super) fn list(folder: &CaptureFolder, files: &[String], listing: &mut Listing) {
+    let files: Vec<&str> = files.iter().map(String::as_str).collect();
     let mut together = Together::default();
-    for file in files {
+    for file in &files {
         if let Err(problem) = list_file(folder, file, &mut together, listing) {
             listing.problems.push(problem);
         }
     }
-    together.moments.report(files, listing);
+    together.moments.report(&files, listing);
     listing.masks_named = match together.masks {
         [_, false, false] => listing.masks_named,
         [false, true, false] => "`fg_mask_path` of each frame",
@@ -93,7 +94,7 @@ fn list_file(
     read_top(folder, file, top, entries.len(), listing);
     let mut reading = Reading::new(folder, file, top)?;
     let read: Vec<Result<FrameKeys, Fault>> = entries.iter().map(|entry| reading.keys(entry)).collect();
-    let splits = match file {
+    let splits = match file.to_ascii_lowercase().as_str() {
         "transforms_train.json" => vec![Listed::In(Some(Split::Train)); entries.len()],
         "transforms_val.json" => vec![Listed::In(Some(Split::Val)); entries.len()],
         "transforms_test.json" => vec![Listed::In(Some(Split::Test)); entries.len()],

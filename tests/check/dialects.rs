@@ -348,3 +348,25 @@ fn no_key_is_passed_over_in_silence() {
         assert!(is_said, "{key}: {found}");
     }
 }
+
+#[test]
+fn one_normalized_coordinate_of_the_principal_point_is_no_longer_taken_for_a_pixel() {
+    let dir = made(|json| json["cx"] = json!(0.5));
+    assert_refused(&dir, &["`cx` of the principal point is 0.5", "normalized", "`cx` is 12.0"], &[]);
+}
+
+#[test]
+fn files_with_other_capitals_are_read_and_those_of_another_name_are_told_to_be_renamed() {
+    let plain = open(&made(|_| {}));
+    let renamed = |to: &str| {
+        let dir = made(|_| {});
+        fs::rename(dir.path().join("transforms.json"), dir.path().join(to)).unwrap();
+        dir
+    };
+    for name in ["Transforms.json", "transforms.JSON"] {
+        assert_same(&open(&renamed(name)), &plain);
+    }
+    for name in ["transforms_all.json", "head.json"] {
+        assert_refused(&renamed(name), &[name, "by another name"], &["rename it to `transforms.json`"]);
+    }
+}

@@ -620,3 +620,11 @@ fn glomap_is_its_own_program_beside_an_older_colmap() {
     let (exit, said) = cameras(&dir, &["photographs", "--glomap"]);
     assert!(exit == 0 && said.contains("glomap mapper --database_path"), "{said}");
 }
+
+#[test]
+fn lens_models_of_colmap_in_small_letters_are_those_in_capitals() {
+    let text = six_images(|_| "\n");
+    for name in ["pinhole", "Pinhole"] {
+        six_stand(&open(&six(&CAMERA.replace("PINHOLE", name), &text)).unwrap());
+    }
+}
