@@ -300,7 +300,8 @@ fn above(root: &Path) -> Option<Error> {
         let is_inside = |place: &str| folder.join(place).starts_with(&real);
         let model =
             || ModelFiles::find(folder).filter(|files| is_inside(&files.folder)).map(CameraFiles::Colmap);
-        let poses = || PoseFolder::find(folder).filter(|_| is_inside("pose")).map(CameraFiles::Poses);
+        let poses =
+            || PoseFolder::find(folder).filter(|files| is_inside(files.folder)).map(CameraFiles::Poses);
         let files =
             if level == 1 && is_photographs { CameraFiles::find(folder) } else { model().or_else(poses) }?;
         let given = root.ancestors().nth(level).filter(|_| !root.ends_with("..") && !root.ends_with("."));

@@ -5,6 +5,7 @@
 //! frame; a frame's own win. Every key is read, known to change nothing, or named ([`keys`]); `null` counts
 //! as absent. Keys of the wrong type are errors, but for some that count as absent as well, as `up` does.
 
+mod agreement;
 mod keys;
 mod lens;
 mod moments;
