@@ -191,8 +191,8 @@ impl Intrinsics {
             _ => format!("the principal point ({}, {}) is in the corner", value(0), value(1)),
         };
         Err(format!(
-            "{place} of its {w} × {h} pixels; `cx` and `cy` must be pixels from the top left corner: {unit} {told}; \
-             the middle is meant where both are absent"
+            "{place} of its {w} × {h} pixels; `cx` and `cy` must be pixels from the top left corner: {unit} \
+             {told}; the middle is meant where both are absent"
         ))
     }
 }

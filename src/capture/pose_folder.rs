@@ -1,5 +1,5 @@
-//! Folders of poses: `pose/NAME.txt` (or `poses/`) has the camera-to-world matrix of an OpenCV camera for each
-//! photograph, one more file the intrinsics. NSVF and SRN call it `intrinsics.txt`, beside `rgb/`;
+//! Folders of poses: `pose/NAME.txt` (or `poses/`) has the camera-to-world matrix of an OpenCV camera for
+//! each photograph, one more file the intrinsics. NSVF and SRN call it `intrinsics.txt`, beside `rgb/`;
 //! ScanNet's exports `intrinsic/intrinsic_color.txt`, beside `color/`.
 //!
 //! Intrinsics are a matrix, or begin with a line `f cx cy 0` (SRN, `util.parse_intrinsics`), which
@@ -131,8 +131,8 @@ fn check_axes(files: &PoseFolder, size: (u32, u32), listing: &mut Listing) -> Re
             "the point that the cameras aim at is inside the frame of only {seen} of {n}: they look away from it"
         ),
         "the matrices must take the camera to the world, with axes right, down and ahead (OpenCV): if their axes \
-         are right, up and back (OpenGL, Blender), negate their second and third columns; if they take the world to \
-         the camera, invert them (`numpy.linalg.inv`)",
+         are right, up and back (OpenGL, Blender), negate their second and third columns; if they take the world \
+         to the camera, invert them (`numpy.linalg.inv`)",
     ))
 }
 

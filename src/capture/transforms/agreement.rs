@@ -47,7 +47,8 @@ impl Known<'_> {
         (value.abs() - known.abs()).abs() <= most
     }
 
-    /// Refuses a spelling beside the usual one that says something else; photographs tell which size is right.
+    /// Refuses a spelling beside the usual one that says something else. Which size is right, photographs
+    /// tell.
     pub fn check_alias(
         &self,
         alias: &str,
@@ -86,8 +87,8 @@ impl Known<'_> {
                     None => format!("without `{name}` it would be {known:.2}"),
                 };
                 return Err(format!(
-                    "`{key}` has {value} for `{name}`, but {says}: remove what is wrong, or write `fl_x`, `fl_y`, \
-                     `cx` and `cy`"
+                    "`{key}` has {value} for `{name}`, but {says}: remove what is wrong, or write `fl_x`, \
+                     `fl_y`, `cx` and `cy`"
                 ));
             }
         }
@@ -111,8 +112,9 @@ impl Known<'_> {
             return Ok(());
         }
         Err(format!(
-            "`{key}` is a list of four numbers, whose order is not known, and they are not those of the focal length, \
-             the angle and the principal point beside it: write `fl_x`, `fl_y`, `cx` and `cy` (in pixels), and remove it"
+            "`{key}` is a list of four numbers, whose order is not known, and they are not those of the focal \
+             length, the angle and the principal point beside it: write `fl_x`, `fl_y`, `cx` and `cy` (in \
+             pixels), and remove it"
         ))
     }
 }

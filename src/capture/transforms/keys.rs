@@ -214,7 +214,8 @@ fn axes(key: &str, value: &Value) -> Option<Word> {
     } else if has("w2c world2cam world_to_cam worldtocam") && !has("c2w") {
         Some((
             "each `transform_matrix` must take the camera to the world, and this says the opposite",
-            "invert each matrix (`numpy.linalg.inv`) and remove the key; if they are camera to world, just remove it",
+            "invert each matrix (`numpy.linalg.inv`) and remove the key; if they are camera to world already, only \
+             remove it",
         ))
     } else if has("left_hand lefthand") {
         Some((
@@ -230,12 +231,12 @@ fn axes(key: &str, value: &Value) -> Option<Word> {
     } else if key == "camera_convention" {
         Some((
             "its value is not known, and poses depend on it",
-            "write `transform_matrix` as camera to world, the camera with +X right, +Y up and looking along -Z, and \
-             `opengl` here",
+            "write `transform_matrix` as camera to world, the camera with +X right, +Y up and looking along -Z, \
+             and `opengl` here",
         ))
     } else {
-        let says = "its value is not known and not looked at; poses are taken as camera to world, with cameras that \
-                    have +X right, +Y up and look along -Z";
+        let says = "its value is not known and not looked at; poses are taken as camera to world, with cameras \
+                    that have +X right, +Y up and look along -Z";
         Some((says, ""))
     }
 }
@@ -473,7 +474,8 @@ mod tests {
     #[test]
     fn keys_in_the_wrong_place_and_those_that_others_stand_for_have_a_word() {
         let mut log = KeyLog::new();
-        let top = r#"{"split": {"train": []}, "mask_path": "x.png", "timestep_index": 3, "timestamp": 1, "up": [0]}"#;
+        let top =
+            r#"{"split": {"train": []}, "mask_path": "x", "timestep_index": 3, "timestamp": 1, "up": [0]}"#;
         log.look(&serde_json::from_str(top).unwrap(), "");
         let own =
             r#"{"split": "train", "up": [0, 1, 0], "applied_scale": 3, "fov": 40, "pose": [1], "time": 0.5}"#;
