@@ -9,13 +9,14 @@ use super::{neus, programs, realitycapture};
 use crate::Error;
 use crate::config::{Config, Stage};
 use crate::io;
+use std::cell::OnceCell;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 /// The files that describe the cameras.
 pub(super) enum CameraFiles {
     /// `transforms*.json`, and `poses_bounds*.npy` to check them against.
-    Transforms { json: Vec<&'static str>, poses: Vec<&'static str> },
+    Transforms { json: Vec<String>, poses: Vec<&'static str> },
     /// `poses_bounds*.npy` alone.
     Llff(Vec<&'static str>),
     /// A sparse model.
@@ -37,10 +38,7 @@ impl CameraFiles {
         let found_of = |names: &[&'static str]| -> Vec<&'static str> {
             names.iter().copied().filter(|n| io::is_file(&root.join(n))).collect()
         };
-        let mut json = found_of(&["transforms_train.json", "transforms_val.json", "transforms_test.json"]);
-        if !json.contains(&"transforms_train.json") {
-            json = found_of(&["transforms.json"]);
-        }
+        let json = transforms(root);
         let mut poses = found_of(&["poses_bounds_train.npy", "poses_bounds_test.npy"]);
         if poses.is_empty() {
             poses = found_of(&["poses_bounds.npy"]);
@@ -68,7 +66,8 @@ impl CameraFiles {
     /// Returns the name of one of the files, for messages.
     pub fn first(&self) -> String {
         match self {
-            CameraFiles::Transforms { json: files, .. } | CameraFiles::Llff(files) => files[0].into(),
+            CameraFiles::Transforms { json: files, .. } => files[0].clone(),
+            CameraFiles::Llff(files) => files[0].into(),
             CameraFiles::Colmap(files) => files.name("cameras"),
             CameraFiles::Neus(file) => file.to_string(),
             CameraFiles::Metashape(file) | CameraFiles::RealityCapture(file) => file.clone(),
@@ -84,13 +83,17 @@ impl CameraFiles {
             CameraFiles::Llff(poses) => {
                 ("LLFF poses", format!("cameras from {}, no JSON beside", quote(poses)))
             }
-            CameraFiles::Transforms { json, poses } if poses.is_empty() => {
-                ("transforms.json", format!("cameras from {}", quote(json)))
+            CameraFiles::Transforms { json, poses } => {
+                let json: Vec<&str> = json.iter().map(String::as_str).collect();
+                let text = format!("cameras from {}", quote(&json));
+                match poses.is_empty() {
+                    true => ("transforms.json", text),
+                    false => (
+                        "transforms.json with LLFF poses",
+                        format!("{text}, checked against {}", quote(poses)),
+                    ),
+                }
             }
-            CameraFiles::Transforms { json, poses } => (
-                "transforms.json with LLFF poses",
-                format!("cameras from {}, checked against {}", quote(json), quote(poses)),
-            ),
             CameraFiles::Colmap(files) => {
                 let names = [files.name("cameras"), files.name("images")];
                 ("COLMAP", format!("cameras from {}", quote(&[&names[0], &names[1]])))
@@ -106,6 +109,23 @@ impl CameraFiles {
             }
         }
     }
+}
+
+/// Returns the split files, if there are some to learn from, else `transforms.json`, as they are spelled.
+/// Other capitals count only where none of both is spelled as usual.
+fn transforms(root: &Path) -> Vec<String> {
+    let [train, plain] = ["transforms_train.json", "transforms.json"];
+    let files = OnceCell::new();
+    let usual = |name: &str| io::is_file(&root.join(name)).then(|| name.to_string());
+    let spelled = |name: &str| {
+        let files: &Vec<String> = files.get_or_init(|| io::list_files(root).unwrap_or_default());
+        usual(name).or_else(|| files.iter().find(|file| file.eq_ignore_ascii_case(name)).cloned())
+    };
+    let first = usual(train).or_else(|| usual(plain)).or_else(|| spelled(train)).or_else(|| spelled(plain));
+    let is_split = first.as_ref().is_some_and(|file| file.eq_ignore_ascii_case(train));
+    let others = ["transforms_val.json", "transforms_test.json"].into_iter().filter(|_| is_split);
+    let others: Vec<String> = others.filter_map(spelled).collect();
+    first.into_iter().chain(others).collect()
 }
 
 /// How files of cameras end; a path to one of them is answered with its folder.
@@ -280,7 +300,8 @@ fn above(root: &Path) -> Option<Error> {
         let is_inside = |place: &str| folder.join(place).starts_with(&real);
         let model =
             || ModelFiles::find(folder).filter(|files| is_inside(&files.folder)).map(CameraFiles::Colmap);
-        let poses = || PoseFolder::find(folder).filter(|_| is_inside("pose")).map(CameraFiles::Poses);
+        let poses =
+            || PoseFolder::find(folder).filter(|files| is_inside(files.folder)).map(CameraFiles::Poses);
         let files =
             if level == 1 && is_photographs { CameraFiles::find(folder) } else { model().or_else(poses) }?;
         let given = root.ancestors().nth(level).filter(|_| !root.ends_with("..") && !root.ends_with("."));
@@ -325,6 +346,15 @@ fn misplaced_model(found: &FolderEntries) -> Option<Error> {
 fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
     if let Some(program) = programs::recognized(found) {
         return Some(program);
+    }
+    let is_transforms = |text: &str| text.contains("\"frames\"") && text.contains("\"transform_matrix\"");
+    if let Some(file) = found.beginning("json", is_transforms) {
+        let way = format!(
+            "rename it to `transforms.json`: `mv {} {}`",
+            found.at(file),
+            found.at("transforms.json")
+        );
+        return Some(("cameras in the form of `transforms.json` by another name", file.clone(), way));
     }
     let cameras = format!("`tiface cameras {}`", found.root.display());
     let is_folder_of_pictures =

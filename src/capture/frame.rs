@@ -156,7 +156,7 @@ impl Intrinsics {
     }
 
     /// Refuses a focal length and a principal point that cannot be pixels of a picture of this size:
-    /// a lens of more than 157°, and a principal point in the corner.
+    /// a lens of more than 157°, and a principal point in the corner or on the edge.
     fn check_pixels(&self, side: [f64; 2]) -> Result<(), String> {
         let longest = side[0].max(side[1]);
         for (k, name) in ["fl_x", "fl_y"].into_iter().enumerate() {
@@ -171,31 +171,29 @@ impl Intrinsics {
                  pixels: {unit}"
             ));
         }
-        if let [Some(cx), Some(cy)] = self.center
-            && cx.abs() <= 1.0
-            && cy.abs() <= 1.0
-            && side[0].min(side[1]) > 4.0
-        {
-            let ([w, h], is_share) = (side, cx > 0.0 && cy > 0.0);
-            let unit = if is_share {
-                format!(
-                    "as shares of the picture (normalized) `cx` is {:.1} and `cy` is {:.1}",
-                    cx * w,
-                    cy * h
-                )
-            } else {
-                format!(
-                    "counted from the middle, `cx` is {:.2} and `cy` is {:.2}",
-                    cx + 0.5 * w,
-                    cy + 0.5 * h
-                )
-            };
-            return Err(format!(
-                "the principal point ({cx}, {cy}) is in the corner of its {w} × {h} pixels; `cx` and `cy` must be pixels \
-                 from the top left corner: {unit}; the middle is meant where both are absent"
-            ));
+        let is_off = |k: &usize| self.center[*k].is_some_and(|c| c.abs() <= 1.0);
+        let off: Vec<usize> = [0, 1].into_iter().filter(is_off).collect();
+        if off.is_empty() || side[0].min(side[1]) <= 4.0 {
+            return Ok(());
         }
-        Ok(())
+        let [w, h] = side;
+        let value = |k: usize| self.center[k].unwrap_or(0.0);
+        let is_share = off.iter().all(|k| value(*k) > 0.0);
+        let told = |k: &usize| match (["cx", "cy"][*k], is_share) {
+            (name, true) => format!("`{name}` is {:.1}", value(*k) * side[*k]),
+            (name, false) => format!("`{name}` is {:.2}", value(*k) + 0.5 * side[*k]),
+        };
+        let told = off.iter().map(told).collect::<Vec<_>>().join(" and ");
+        let unit =
+            if is_share { "as a share of the picture (normalized)" } else { "counted from the middle," };
+        let place = match off[..] {
+            [k] => format!("`{}` of the principal point is {}, on the edge", ["cx", "cy"][k], value(k)),
+            _ => format!("the principal point ({}, {}) is in the corner", value(0), value(1)),
+        };
+        Err(format!(
+            "{place} of its {w} × {h} pixels; `cx` and `cy` must be pixels from the top left corner: {unit} \
+             {told}; the middle is meant where both are absent"
+        ))
     }
 }
 
@@ -292,9 +290,9 @@ pub(super) fn projection(model: &str) -> Projection {
 }
 
 impl LensModel {
-    /// Returns the model of this name.
+    /// Returns the model of this name, be it in small letters.
     pub fn named(name: &str) -> Result<&'static LensModel, String> {
-        MODELS.iter().find(|m| m.name == name).ok_or_else(|| unknown(name))
+        MODELS.iter().find(|m| m.name.eq_ignore_ascii_case(name)).ok_or_else(|| unknown(name))
     }
 
     /// Returns the model of this number.
@@ -419,8 +417,24 @@ mod tests {
         assert!(says(330.0, [Some(0.0), Some(-0.25)], (96, 128)).contains("`cx` is 48.00 and `cy` is 63.75"));
         // a fisheye of 180° on 96 pixels, and a picture cut from the corner of another
         assert_eq!(of(30.6, middle, (96, 96)), Ok((30.6, 48.0)));
-        assert_eq!(of(330.0, [Some(0.5), Some(40.0)], (96, 128)), Ok((330.0, 0.5)));
-        assert_eq!(of(330.0, [Some(-40.0), Some(0.5)], (96, 128)), Ok((330.0, -40.0)));
+        assert_eq!(of(330.0, [Some(1.5), Some(40.0)], (96, 128)), Ok((330.0, 1.5)));
+        assert_eq!(of(330.0, [Some(-40.0), Some(2.5)], (96, 128)), Ok((330.0, -40.0)));
+    }
+
+    #[test]
+    fn one_coordinate_of_the_principal_point_that_is_no_pixel_is_refused_alone() {
+        let says = |center| {
+            let intrinsics = Intrinsics { focal: [Some(330.0); 2], center, ..Intrinsics::default() };
+            intrinsics.camera((96, 128), DMat3::IDENTITY, DVec3::ZERO).unwrap_err()
+        };
+        for (center, name, there) in [
+            ([Some(0.5), Some(64.0)], "`cx` of the principal point is 0.5", "(normalized) `cx` is 48.0;"),
+            ([None, Some(0.5)], "`cy` of the principal point is 0.5", "(normalized) `cy` is 64.0;"),
+            ([Some(48.0), Some(-0.25)], "`cy` of the principal point is -0.25", "the middle, `cy` is 63.75;"),
+        ] {
+            let text = says(center);
+            assert!(text.contains(name) && text.contains(there), "{text}");
+        }
     }
 
     fn rows(m: DMat3) -> [[f64; 4]; 3] {
@@ -471,6 +485,7 @@ mod tests {
     fn models_without_an_inverse_are_named() {
         assert!(LensModel::numbered(11).unwrap_err().contains("RAD_TAN_THIN_PRISM_FISHEYE"));
         assert!(LensModel::numbered(-7).unwrap_err().contains("number -7"));
+        assert_eq!(LensModel::named("Simple_pinhole").unwrap().name, "SIMPLE_PINHOLE");
         assert!(LensModel::named("EQUIRECTANGULAR").unwrap_err().contains("image_undistorter"));
         let fov = LensModel::named("FOV").unwrap();
         assert!(fov.intrinsics((9, 9), &[1.0, 1.0, 4.0, 4.0, 4.0]).unwrap_err().contains("omega"));

@@ -1,5 +1,5 @@
-//! Folders of poses: `pose/NAME.txt` has the camera-to-world matrix of an OpenCV camera for each
-//! photograph, one more file the intrinsics. NSVF and SRN call it `intrinsics.txt`, beside `rgb/`;
+//! Folders of poses: `pose/NAME.txt` (or `poses/`) has the camera-to-world matrix of an OpenCV camera for
+//! each photograph, one more file the intrinsics. NSVF and SRN call it `intrinsics.txt`, beside `rgb/`;
 //! ScanNet's exports `intrinsic/intrinsic_color.txt`, beside `color/`.
 //!
 //! Intrinsics are a matrix, or begin with a line `f cx cy 0` (SRN, `util.parse_intrinsics`), which
@@ -8,6 +8,7 @@
 //! size is the middle, as Blender's is. NSVF's names begin with 0 for training, 1 for validation
 //! (testing, if there is no 2) and 2 for testing.
 
+use super::carve;
 use super::folder::{
     CaptureFolder, FLIP, FolderEntries, PHOTOGRAPHS, has_ending, in_file, in_frame, shortened,
 };
@@ -22,18 +23,20 @@ use glam::{DMat3, DVec3, Vec3};
 use std::collections::HashSet;
 use std::path::Path;
 
-/// Where the poses are.
-const POSES: &str = "pose";
+/// Where the poses are, in this order.
+const POSES: [&str; 2] = ["pose", "poses"];
 /// Files of intrinsics, in this order.
 const INTRINSICS: [&str; 4] =
     ["intrinsics.txt", "intrinsic.txt", "intrinsic/intrinsic_color.txt", "intrinsic_color.txt"];
 /// Folders of photographs, in this order.
-const PHOTOS: [&str; 4] = ["rgb", "images", "image", "color"];
+const PHOTOS: [&str; 5] = ["rgb", "images", "image", "color", "imgs"];
 /// Skew beyond this share of the focal length is no pinhole's.
 const SKEW: f64 = 1e-3;
 
 /// The parts of such a capture.
 pub(super) struct PoseFolder {
+    /// The folder of the poses.
+    pub folder: &'static str,
     pub intrinsics: &'static str,
     pub photos: &'static str,
 }
@@ -42,21 +45,22 @@ impl PoseFolder {
     pub fn find(root: &Path) -> Option<PoseFolder> {
         let intrinsics = INTRINSICS.into_iter().find(|name| io::is_file(&root.join(name)))?;
         let photos = PHOTOS.into_iter().find(|name| io::is_folder(&root.join(name)))?;
-        let poses = FolderEntries::of(&root.join(POSES));
-        poses.ending(&["txt"]).map(|_| PoseFolder { intrinsics, photos })
+        let has_poses = |name: &&str| FolderEntries::of(&root.join(name)).ending(&["txt"]).is_some();
+        let folder = POSES.into_iter().find(has_poses)?;
+        Some(PoseFolder { folder, intrinsics, photos })
     }
 
     /// Returns the name of its poses, for messages.
     pub fn poses(&self) -> String {
-        format!("{POSES}/*.txt")
+        format!("{}/*.txt", self.folder)
     }
 }
 
 /// Lists one frame for each pose.
 pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Listing) -> Result<()> {
-    let mut poses = FolderEntries::of(&folder.root.join(POSES)).files;
+    let mut poses = FolderEntries::of(&folder.root.join(files.folder)).files;
     poses.retain(|name| has_ending(name, &["txt"]));
-    folder.options.limits.check_views(&folder.root.join(POSES), poses.len())?;
+    folder.options.limits.check_views(&folder.root.join(files.folder), poses.len())?;
     let stems: Vec<String> = poses.iter().map(|name| stem(name)).collect();
     let photo_of = |stem: &str| folder.photo(files.intrinsics, &format!("{}/{stem}", files.photos));
     let first = stems.iter().find_map(|stem| photo_of(stem).ok()?.1);
@@ -66,7 +70,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Lis
     listing.warnings.extend(doubtful_center(files.intrinsics, &lens, size));
     let mut lost = Vec::new();
     for ((name, stem), split) in poses.iter().zip(&stems).zip(splits(&stems)) {
-        let file = format!("{POSES}/{name}");
+        let file = format!("{}/{name}", files.folder);
         match read_pose(folder, &file) {
             Ok(Some((rotation, position))) => {
                 let photo = photo_of(stem)?;
@@ -89,7 +93,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Lis
     let photos = photos.iter().filter(|f| has_ending(f, &PHOTOGRAPHS));
     let without: Vec<&String> = photos.filter(|photo| !known.contains(stem(photo).as_str())).collect();
     if !without.is_empty() {
-        let text = format!("{} photographs have no pose in `{POSES}/`", without.len());
+        let text = format!("{} photographs have no pose in `{}/`", without.len(), files.folder);
         listing.warnings.push(format!("{text}; they are left out: {}", few(without)));
     }
     listing.warnings.push(format!(
@@ -98,7 +102,38 @@ pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Lis
         files.poses()
     ));
     listing.focus = head_box(folder, listing);
-    Ok(())
+    check_axes(files, size, listing)
+}
+
+/// Refuses cameras that do not see the point that they aim at, or their box: they are not NSVF's.
+fn check_axes(files: &PoseFolder, size: (u32, u32), listing: &mut Listing) -> Result<()> {
+    let ray = |frame: &CameraFrame| (frame.position, -frame.rotation.z_axis);
+    let rays: Vec<(DVec3, DVec3)> = listing.frames.iter().map(ray).collect();
+    let focus = listing.focus.map(|focus| focus.center().as_dvec3());
+    let Some(center) = focus.or_else(|| carve::meeting_point(&rays)) else { return Ok(()) };
+    let sees = |frame: &&CameraFrame| {
+        let at = frame.rotation.transpose() * (center - frame.position);
+        let (width, height) = frame.intrinsics.size.unwrap_or(size);
+        // with room for a principal point that is off the middle
+        let reach = |k: usize, side: u32| {
+            frame.intrinsics.focal[k].map_or(f64::INFINITY, |focal| 0.75 * f64::from(side) / focal)
+        };
+        at.z < 0.0 && at.x.abs() <= reach(0, width) * -at.z && at.y.abs() <= reach(1, height) * -at.z
+    };
+    let (seen, n) = (listing.frames.iter().filter(sees).count(), listing.frames.len());
+    if seen >= n.min(3) {
+        return Ok(());
+    }
+    listing.frames.clear();
+    Err(in_file(
+        &files.poses(),
+        format_args!(
+            "the point that the cameras aim at is inside the frame of only {seen} of {n}: they look away from it"
+        ),
+        "the matrices must take the camera to the world, with axes right, down and ahead (OpenCV): if their axes \
+         are right, up and back (OpenGL, Blender), negate their second and third columns; if they take the world \
+         to the camera, invert them (`numpy.linalg.inv`)",
+    ))
 }
 
 fn stem(name: &str) -> String {

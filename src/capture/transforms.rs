@@ -5,6 +5,7 @@
 //! frame; a frame's own win. Every key is read, known to change nothing, or named ([`keys`]); `null` counts
 //! as absent. Keys of the wrong type are errors, but for some that count as absent as well, as `up` does.
 
+mod agreement;
 mod keys;
 mod lens;
 mod moments;
@@ -40,6 +41,16 @@ enum Fault {
     Error(Error),
 }
 
+impl Fault {
+    /// Returns its words, without a way out.
+    fn into_text(self) -> String {
+        match self {
+            Fault::Frame(text) | Fault::File { text, .. } => text,
+            Fault::Error(error) => error.to_string(),
+        }
+    }
+}
+
 impl From<String> for Fault {
     fn from(text: String) -> Fault {
         Fault::Frame(text)
@@ -65,14 +76,15 @@ struct Together {
 }
 
 /// Lists the frames of `files`, in order; everything wrong goes to the listing's problems.
-pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) {
+pub(super) fn list(folder: &CaptureFolder, files: &[String], listing: &mut Listing) {
+    let files: Vec<&str> = files.iter().map(String::as_str).collect();
     let mut together = Together::default();
-    for file in files {
+    for file in &files {
         if let Err(problem) = list_file(folder, file, &mut together, listing) {
             listing.problems.push(problem);
         }
     }
-    together.moments.report(files, listing);
+    together.moments.report(&files, listing);
     listing.masks_named = match together.masks {
         [_, false, false] => listing.masks_named,
         [false, true, false] => "`fg_mask_path` of each frame",
@@ -87,13 +99,14 @@ fn list_file(
     together: &mut Together,
     listing: &mut Listing,
 ) -> Result<()> {
+    let before = listing.problems.len();
     let value = io::read_json(&folder.root.join(file), &folder.options.limits)?;
     let nothing = Object::new();
     let (top, entries) = parts(folder, file, &value, &nothing, listing)?;
     read_top(folder, file, top, entries.len(), listing);
     let mut reading = Reading::new(folder, file, top)?;
     let read: Vec<Result<FrameKeys, Fault>> = entries.iter().map(|entry| reading.keys(entry)).collect();
-    let splits = match file {
+    let splits = match file.to_ascii_lowercase().as_str() {
         "transforms_train.json" => vec![Listed::In(Some(Split::Train)); entries.len()],
         "transforms_val.json" => vec![Listed::In(Some(Split::Val)); entries.len()],
         "transforms_test.json" => vec![Listed::In(Some(Split::Test)); entries.len()],
@@ -120,7 +133,8 @@ fn list_file(
         }
     }
     faults.report(listing);
-    reading.report(listing);
+    let has_failed = listing.problems.len() > before;
+    reading.report(has_failed, listing);
     Ok(())
 }
 
@@ -249,8 +263,8 @@ impl<'a> Reading<'a> {
     fn new(folder: &'a CaptureFolder, file: &'a str, written: &'a Object) -> Result<Reading<'a>> {
         let (mut notes, mut log) = (LensNotes::default(), KeyLog::new());
         log.look(written, "");
-        let hint = "correct what the file says of all its photographs";
-        let shared = lens::canonical(written, None, &mut notes).map_err(|text| in_file(file, text, hint))?;
+        let refused = |text: String| in_file(file, text, lens::OF_ALL);
+        let shared = lens::canonical(written, None, &mut notes).map_err(refused)?;
         Ok(Reading { folder, file, written, shared, notes, log, missing: Vec::new() })
     }
 
@@ -263,7 +277,7 @@ impl<'a> Reading<'a> {
             let key = entry.key.ok_or_else(|| "it has no `file_path`".to_string())?;
             read.insert("file_path".into(), key.into());
         }
-        Ok(FrameKeys::merged(&self.shared, read)?)
+        FrameKeys::merged(&self.shared, read)
     }
 
     /// Returns a frame, and which of [`MASK_KEYS`] named its mask.
@@ -278,11 +292,14 @@ impl<'a> Reading<'a> {
         let own = entry.value.as_object().unwrap_or(self.written);
         let pose = frame::pose(&pose::rows(own)?)?;
         let split = named_split(keys.split.as_deref(), split)?;
-        let intrinsics = lens::intrinsics(keys, &mut self.notes)?;
+        let intrinsics = lens::intrinsics(keys, &mut self.notes).map_err(|text| keys.fault(text))?;
         let photo = folder.photo(file, &keys.file_path)?;
         let is_there = photo.1.is_some();
         if is_there && !intrinsics.has_focal() {
             return Err(lens::no_focal(self.written, own));
+        }
+        if let Some(size) = intrinsics.size.filter(|_| is_there) {
+            intrinsics.camera(size, pose.0, pose.1).map_err(|text| keys.fault(text))?;
         }
         let beside = |name: &String| Ok::<_, Error>(folder.file(&folder.relative(file, name)?));
         let region = keys.face_mask_path.as_ref().map(beside).transpose()?.flatten();
@@ -307,9 +324,9 @@ impl<'a> Reading<'a> {
         Ok((CameraFrame { split, mask, region, ..frame }, mask_key))
     }
 
-    /// Says how the file was read.
-    fn report(self, listing: &mut Listing) {
-        let (file, LensNotes { ignored, taken, skipped, misread }) = (self.file, self.notes);
+    /// Says how the file was read; what was not, only if all else was.
+    fn report(self, has_failed: bool, listing: &mut Listing) {
+        let (file, LensNotes { ignored, taken, skipped, doubts, misread }) = (self.file, self.notes);
         let spelled = |(key, of): &(&str, &str)| match lens::ALIASES.contains(&(key, of)) {
             true => format!("`{key}` as `{of}`"),
             false => format!("`{key}` as {of}"),
@@ -324,6 +341,7 @@ impl<'a> Reading<'a> {
                 .warnings
                 .push(format!("`{file}`: of another type than they must be, and not looked at: {names}"));
         }
+        listing.warnings.extend(doubts.iter().map(|text| format!("`{file}`: {text}")));
         for model in ignored {
             listing.warnings.push(format!(
                 "`{file}` gives distortion for the camera model `{model}`, which has none; it is not used"
@@ -336,7 +354,7 @@ impl<'a> Reading<'a> {
                 listing.warnings.push(format!("`{file}`: {n} masks that `{key}` names are missing: {names}"));
             }
         }
-        self.log.report(file, &skipped, listing);
+        self.log.report(file, skipped, has_failed, listing);
     }
 }
 

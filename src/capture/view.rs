@@ -512,7 +512,10 @@ pub(super) fn wrong_size(
     } else if downscale > 1 {
         format!("use photographs of that size, or smaller by exactly `capture.downscale = {downscale}`")
     } else if (found.1, found.0) == declared {
-        "the photograph lies on its side: store it upright, without an EXIF turn".into()
+        format!(
+            "if the photograph lies on its side, store it upright, without an EXIF turn; if it is upright, `{file}` has \
+             its width and height (`w` and `h`) exchanged: correct them"
+        )
     } else {
         format!("use photographs of that size, or correct `w` and `h` in `{file}`")
     };

@@ -227,9 +227,13 @@ fn a_pose_by_another_name_is_one_problem_that_names_it() {
 #[test]
 fn normalized_principal_points_and_focal_lengths_are_told_in_pixels() {
     let dir = made(|json| (json["cx"], json["cy"]) = (json!(0.5), json!(0.5)));
-    assert_refused(&dir, &["8 times", "principal point", "normalized", "`cx` is 12.0 and `cy` is 16.0"], &[]);
+    assert_refused(
+        &dir,
+        &["8 of 8 frames", "principal point", "normalized", "`cx` is 12.0 and `cy` is 16.0"],
+        &[],
+    );
     let dir = made(|json| (json["fl_x"], json["fl_y"]) = (json!(1.2), json!(1.2)));
-    assert_refused(&dir, &["8 times", "`fl_x` is 1.2", "normalized", "28.8 pixels"], &[]);
+    assert_refused(&dir, &["8 of 8 frames", "`fl_x` is 1.2", "normalized", "28.8 pixels"], &[]);
 }
 
 #[test]
@@ -326,7 +330,7 @@ fn no_key_is_passed_over_in_silence() {
         json["n_frames"] = 3.into();
         json["units"] = "millimeters".into();
         json["white_transparent"] = true.into();
-        json["is_fisheye"] = 0.into();
+        json["is_fisheye"] = "no".into();
         json["height"] = 1.7.into();
         frames(json).iter_mut().for_each(|frame| frame["lens_id"] = 7.into());
     });
@@ -347,4 +351,92 @@ fn no_key_is_passed_over_in_silence() {
             found.problems.iter().any(|p| p.what.contains(&format!("`{key}`")) && p.what.contains(word));
         assert!(is_said, "{key}: {found}");
     }
+}
+
+#[test]
+fn one_normalized_coordinate_of_the_principal_point_is_no_longer_taken_for_a_pixel() {
+    let dir = made(|json| json["cx"] = json!(0.5));
+    assert_refused(&dir, &["`cx` of the principal point is 0.5", "normalized", "`cx` is 12.0"], &[]);
+}
+
+#[test]
+fn files_with_other_capitals_are_read_and_those_of_another_name_are_told_to_be_renamed() {
+    let plain = open(&made(|_| {}));
+    let renamed = |to: &str| {
+        let dir = made(|_| {});
+        fs::rename(dir.path().join("transforms.json"), dir.path().join(to)).unwrap();
+        dir
+    };
+    for name in ["Transforms.json", "transforms.JSON"] {
+        assert_same(&open(&renamed(name)), &plain);
+    }
+    for name in ["transforms_all.json", "head.json"] {
+        assert_refused(&renamed(name), &[name, "by another name"], &["rename it to `transforms.json`"]);
+    }
+}
+
+#[test]
+fn a_spelling_that_says_something_else_than_the_one_that_is_read_is_a_problem() {
+    let edits: [fn(&mut Value); 3] = [
+        |json| json["fx"] = json!(2.0 * json["fl_x"].as_f64().unwrap()),
+        |json| json["K"] = json!([[2.0 * json["fl_x"].as_f64().unwrap(), 0, 12], [0, 900, 16], [0, 0, 1]]),
+        |json| {
+            let f = json["fl_x"].as_f64().unwrap();
+            json["camera_angle_x"] = (2.0 * (12.0 / f).atan()).into();
+            without(json, &["fl_x", "fl_y", "cx", "cy"]);
+            json["intrinsics"] = json!([f, f, 20, 16]);
+        },
+    ];
+    for (edit, key) in edits.into_iter().zip(["`fx`", "`K`", "`intrinsics`"]) {
+        assert_refused(&made(edit), &[key], &["all its photographs"]);
+    }
+    // those that agree are only named
+    let same = open(&made(|json| {
+        json["fx"] = json["fl_x"].clone();
+        json["fov"] = 40.into();
+    }));
+    for words in ["since `fl_x` is there: `fx`", "since a focal length or an angle is there: `fov`"] {
+        assert!(same.reasons.iter().any(|r| r.contains(words)), "{words}: {:?}", same.reasons);
+    }
+    assert_same(&same, &open(&made(|_| {})));
+}
+
+#[test]
+fn keys_in_the_wrong_place_and_unknown_axes_are_no_longer_silent() {
+    let found = open(&made(|json| {
+        json["timestep_index"] = 3.into();
+        json["image_name"] = "head".into();
+        json["coordinate_system"] = "EPSG:4326".into();
+        frames(json).iter_mut().for_each(|frame| frame["applied_scale"] = 3.into());
+    }));
+    for word in ["`timestep_index`", "`image_name`", "(`EPSG:4326`)", "`applied_scale`"] {
+        assert!(found.warnings.iter().any(|w| w.contains(word)), "{word}: {:?}", found.warnings);
+    }
+    let dir = made(|json| json["camera_convention"] = "w2c".into());
+    assert_refused(&dir, &["`camera_convention` (`w2c`)", "camera to the world"], &["numpy.linalg.inv"]);
+}
+
+#[test]
+fn what_the_top_of_a_file_says_wrongly_is_a_problem_of_the_file() {
+    let edits: [fn(&mut Value); 3] = [
+        |json| json["fl_x"] = "330".into(),
+        |json| json["k1"] = json!([0.1]),
+        |json| {
+            without(json, &["fl_x", "fl_y"]);
+            json["camera_angle_x"] = 16.55.into();
+        },
+    ];
+    for edit in edits {
+        assert_refused(&made(edit), &["8 of 8 frames"], &["all its photographs"]);
+    }
+    let dir = made(|json| frames(json)[2]["fl_x"] = "330".into());
+    assert_refused(&dir, &["frame `images/"], &["that frame"]);
+}
+
+#[test]
+fn an_upright_photograph_is_not_said_to_lie_on_its_side() {
+    let dir = made(|json| {
+        (json["w"], json["h"], json["cx"], json["cy"]) = (json!(32), json!(24), json!(16), json!(12));
+    });
+    assert_refused(&dir, &["24 × 32", "32 × 24"], &["`w` and `h`", "exchanged"]);
 }

@@ -427,6 +427,39 @@ fn poses_that_are_no_cameras_are_refused_by_their_file() {
     }
 }
 
+#[test]
+fn folders_of_poses_and_photographs_of_other_names_are_read() {
+    let k = "40 0 11.5 0\n0 40 15.5 0\n0 0 1 0\n0 0 0 1\n";
+    for (photos, poses) in [("rgb", "poses"), ("imgs", "pose"), ("imgs", "poses")] {
+        let dir = pose_folder(photos, "intrinsics.txt", k);
+        fs::rename(dir.path().join("pose"), dir.path().join(poses)).unwrap();
+        let c = open(dir.path()).unwrap();
+        sees(&c, [12.0, 16.0]);
+        assert!(c.reasons[0].contains(&format!("`{poses}/*.txt`")), "{:?}", c.reasons);
+    }
+}
+
+#[test]
+fn poses_in_a_folder_with_other_axes_are_told_how_to_turn_them() {
+    let k = "40 0 11.5 0\n0 40 15.5 0\n0 0 1 0\n0 0 0 1\n";
+    let rows = |r: DMat3, t: DVec3| {
+        let row = |k: usize| format!("{} {} {} {}\n", r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]);
+        (0..3).map(row).collect::<String>() + "0 0 0 1\n"
+    };
+    let edits: [fn((DMat3, DVec3)) -> (DMat3, DVec3); 2] = [
+        |(r, t)| (r * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)), t),
+        |(r, t)| (r.transpose(), -(r.transpose() * t)),
+    ];
+    for edit in edits {
+        let dir = pose_folder("rgb", "intrinsics.txt", k);
+        for i in 0..VIEWS {
+            let (r, t) = edit(pose(i));
+            put(&dir, &format!("pose/{i:02}.txt"), rows(r, t));
+        }
+        says(&dir, "", &["`pose/*.txt`", "look away", "second and third columns", "invert them"]);
+    }
+}
+
 // ---------------------------------------------------------------------------------------- other programs
 
 #[test]

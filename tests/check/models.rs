@@ -620,3 +620,26 @@ fn glomap_is_its_own_program_beside_an_older_colmap() {
     let (exit, said) = cameras(&dir, &["photographs", "--glomap"]);
     assert!(exit == 0 && said.contains("glomap mapper --database_path"), "{said}");
 }
+
+#[test]
+fn lens_models_of_colmap_in_small_letters_are_those_in_capitals() {
+    let text = six_images(|_| "\n");
+    for name in ["pinhole", "Pinhole"] {
+        six_stand(&open(&six(&CAMERA.replace("PINHOLE", name), &text)).unwrap());
+    }
+}
+
+#[test]
+fn commas_between_the_values_of_a_model_are_named_with_a_command_that_writes_blanks() {
+    let text = six_images(|_| "\n");
+    for by in [",", ", "] {
+        let with = |text: &str| text.replace(' ', by);
+        for (cameras, images, file) in
+            [(CAMERA.into(), with(&text), "images.txt"), (with(CAMERA), text.clone(), "cameras.txt")]
+        {
+            let e = open(&six(&cameras, &images)).unwrap_err();
+            assert!(e.to_string().contains(file) && e.to_string().contains("commas separate"), "{e}");
+            assert!(e.hint().contains("sed -i") && e.hint().contains(file), "{}", e.hint());
+        }
+    }
+}

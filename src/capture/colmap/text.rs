@@ -105,7 +105,20 @@ impl<'s> Line<'s> {
         count.is_some_and(|n: usize| n.is_multiple_of(3))
     }
 
+    /// Returns whether commas separate its values, as in a table; decimal commas are single.
+    fn is_of_commas(&self) -> bool {
+        let first = self.text.split_whitespace().next().unwrap_or_default();
+        let is_joined = first.ends_with(',') || first.matches(',').count() > 1;
+        is_joined && self.text.matches(',').count() >= 4
+    }
+
     fn bad(&self, problem: impl std::fmt::Display) -> Error {
+        if self.is_of_commas() {
+            let (file, number) = (&self.source.file, self.number);
+            let hint = format!("write blanks in place of the commas: `sed -i 's/, */ /g' {file}`");
+            let text = format!("line {number}: commas separate its values, where COLMAP has blanks");
+            return in_file(file, text, hint);
+        }
         let hint = "export the model again as text, or correct that line";
         in_file(&self.source.file, format_args!("line {}: {problem}", self.number), hint)
     }

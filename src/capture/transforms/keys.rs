@@ -1,10 +1,11 @@
 //! The keys of `transforms.json`, by the programs that write them: which are read, which change nothing
 //! here, and which change what a file means although they are not supported.
 //!
-//! No key is passed over in silence: those that change nothing are a reason, unknown ones a warning, and
-//! those that change the meaning a warning or a problem of their own.
+//! No key is passed over in silence: those that change nothing, or are not read because another one is, are
+//! a reason, unknown ones and those in the wrong place a warning, and those that change the meaning a
+//! warning or a problem of their own.
 
-use super::{Object, lens, pose};
+use super::{Object, lens, moments, pose};
 use crate::capture::folder::{in_file, shortened};
 use crate::capture::frame::Listing;
 use crate::capture::masks::few;
@@ -75,6 +76,10 @@ const DIALECTS: [Dialect; 8] = [
     },
 ];
 
+/// Keys that are read at the top of a file only, besides those of [`lens`].
+const OF_FILES: &str = "frames up n_frames applied_transform applied_scale units unit train_filenames \
+                        val_filenames test_filenames";
+
 /// Keys that change what a file means, and are not supported.
 struct Change {
     /// The spellings, separated by blanks.
@@ -88,7 +93,7 @@ struct Change {
     hint: &'static str,
 }
 
-const CHANGES: [Change; 11] = [
+const CHANGES: [Change; 10] = [
     Change {
         keys: "rolling_shutter",
         has_effect: is_nonzero,
@@ -157,14 +162,6 @@ const CHANGES: [Change; 11] = [
         hint: "write `cx` and `cy` in pixels from the top left corner",
     },
     Change {
-        keys: "coordinate_system coordinate_convention camera_convention convention",
-        has_effect: is_opencv,
-        unless: "",
-        says: "cameras look along +Z with +Y down there, and along -Z with +Y up here",
-        hint: "negate the second and third column of each `transform_matrix` (camera to world), and remove \
-               the key",
-    },
-    Change {
         keys: "tangential_distortion",
         has_effect: is_nonzero,
         unless: "p1 distortion_params",
@@ -196,18 +193,73 @@ fn is_other_camera(value: &Value) -> bool {
     !["", "perspective", "pinhole"].contains(&name.as_str())
 }
 
-fn is_opencv(value: &Value) -> bool {
-    let name = value.as_str().unwrap_or_default().to_ascii_lowercase();
-    ["opencv", "colmap", "rdf", "open_cv"].iter().any(|word| name.contains(word))
+/// What a key changes, and what to do about it, which is empty for what is only warned of.
+type Word = (&'static str, &'static str);
+
+/// Keys of the axes of cameras, or of the world.
+const AXES: &str = "coordinate_system coordinate_convention camera_convention convention";
+
+/// Returns what a value of one of [`AXES`] changes; nothing for the axes that are taken here.
+fn axes(key: &str, value: &Value) -> Option<Word> {
+    let name = value.as_str().unwrap_or_default().to_ascii_lowercase().replace([' ', '-'], "_");
+    let has = |words: &str| words.split(' ').any(|word| name.contains(word));
+    let opencv = (
+        "cameras look along +Z with +Y down there, and along -Z with +Y up here",
+        "negate the second and third column of each `transform_matrix` (camera to world), and remove the key",
+    );
+    if value.is_null() || value.as_str().is_some_and(|text| text.trim().is_empty()) || name == "gl" {
+        None
+    } else if has("opencv open_cv colmap rdf") {
+        Some(opencv)
+    } else if has("w2c world2cam world_to_cam worldtocam") && !has("c2w") {
+        Some((
+            "each `transform_matrix` must take the camera to the world, and this says the opposite",
+            "invert each matrix (`numpy.linalg.inv`) and remove the key; if they are camera to world already, only \
+             remove it",
+        ))
+    } else if has("left_hand lefthand") {
+        Some((
+            "axes are right-handed here",
+            "write right-handed poses: camera to world, the camera with +X right, +Y up and looking along -Z",
+        ))
+    } else if has("opengl open_gl blender nerf ngp arkit rub right_up_back right_hand righthand")
+        || has("c2w cam2world cam_to_world camera_to_world camtoworld z_up y_up")
+    {
+        None
+    } else if has("down") {
+        Some(opencv)
+    } else if key == "camera_convention" {
+        Some((
+            "its value is not known, and poses depend on it",
+            "write `transform_matrix` as camera to world, the camera with +X right, +Y up and looking along -Z, \
+             and `opengl` here",
+        ))
+    } else {
+        let says = "its value is not known and not looked at; poses are taken as camera to world, with cameras \
+                    that have +X right, +Y up and look along -Z";
+        Some((says, ""))
+    }
+}
+
+/// Where a key is read.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Place {
+    Anywhere,
+    Top,
+    Frame,
 }
 
 /// How a known key is used.
 #[derive(Clone, Copy)]
 enum Use {
-    Read,
+    Read(Place),
+    /// With what is read instead.
+    Beaten(&'static str),
     /// With the programs that write it; empty for spellings of several.
     Ignored(&'static str),
     Changes(&'static Change),
+    /// One of [`AXES`].
+    Axes,
 }
 
 /// The keys of a file, as they are met.
@@ -216,9 +268,13 @@ pub(super) struct KeyLog {
     ignored: BTreeSet<&'static str>,
     /// The programs that write these.
     programs: BTreeSet<&'static str>,
+    /// What is not read because something else is, and the reason.
+    beaten: BTreeSet<(String, &'static str)>,
+    /// What is read elsewhere only, at the top and in frames.
+    misplaced: [BTreeSet<&'static str>; 2],
     unknown: BTreeSet<String>,
-    /// By key: the change, where it was first met, and how often.
-    changes: BTreeMap<&'static str, (&'static Change, String, usize)>,
+    /// By key: the change, its value where that is a word, where it was first met, and how often.
+    changes: BTreeMap<&'static str, (Word, String, String, usize)>,
 }
 
 /// Maximum number of unknown keys that are remembered.
@@ -227,52 +283,112 @@ const MAX_UNKNOWN: usize = 1000;
 impl KeyLog {
     pub fn new() -> KeyLog {
         let words = |text: &'static str, is: Use| text.split_whitespace().map(move |key| (key, is));
-        let dialects = DIALECTS
-            .iter()
-            .flat_map(|d| words(d.read, Use::Read).chain(words(d.harmless, Use::Ignored(d.program))));
-        let spellings = lens::ALIASES.iter().map(|(key, _)| (*key, Use::Read));
-        let matrices = lens::MATRICES.iter().map(|key| (*key, Use::Read));
-        let named = lens::FOCAL_WORDS.iter().copied().chain(pose::names()).map(|key| (key, Use::Ignored("")));
+        let read = |place| Use::Read(place);
+        let dialects = DIALECTS.iter().flat_map(|d| {
+            words(d.read, read(Place::Anywhere)).chain(words(d.harmless, Use::Ignored(d.program)))
+        });
+        let spellings = lens::ALIASES.iter().map(|(key, of)| match *of {
+            "file_path" => (*key, Use::Read(Place::Frame)),
+            _ => (*key, Use::Read(Place::Anywhere)),
+        });
+        let matrices = lens::MATRICES.iter().map(|key| (*key, Use::Read(Place::Anywhere)));
+        let focal =
+            lens::FOCAL_WORDS.iter().map(|key| (*key, Use::Beaten("a focal length or an angle is there")));
+        let poses = pose::names().map(|key| (key, Use::Beaten("`transform_matrix` is there")));
         let changes = CHANGES.iter().flat_map(|change| words(change.keys, Use::Changes(change)));
-        let known = named.chain(dialects).chain(spellings).chain(matrices).chain(changes).collect();
-        let [ignored, programs] = [BTreeSet::new(), BTreeSet::new()];
-        KeyLog { known, ignored, programs, unknown: BTreeSet::new(), changes: BTreeMap::new() }
+        let axes = words(AXES, Use::Axes);
+        let moments = moments::KEYS.iter().filter(|(_, is_telling)| *is_telling);
+        let frames = moments.map(|(key, _)| (*key, Use::Read(Place::Frame)));
+        let frames = frames.chain(words(lens::FRAME_KEYS, read(Place::Frame)));
+        let frames = frames.chain([("transform_matrix", Use::Read(Place::Frame))]);
+        let files = words(OF_FILES, read(Place::Top));
+        // what comes later counts
+        let known = focal.chain(poses).chain(dialects).chain(spellings).chain(matrices);
+        let known = known.chain(changes).chain(axes).chain(frames).chain(files).collect();
+        KeyLog {
+            known,
+            ignored: BTreeSet::new(),
+            programs: BTreeSet::new(),
+            beaten: BTreeSet::new(),
+            misplaced: [BTreeSet::new(), BTreeSet::new()],
+            unknown: BTreeSet::new(),
+            changes: BTreeMap::new(),
+        }
     }
 
     /// Looks at the keys of the top of a file (`place` is empty) or of a frame.
     pub fn look(&mut self, object: &Object, place: &str) {
+        let here = if place.is_empty() { Place::Top } else { Place::Frame };
         for (key, value) in object {
-            match self.known.get_key_value(key.as_str()) {
-                Some((_, Use::Read)) => {}
+            let word = match self.known.get_key_value(key.as_str()) {
+                Some((key, Use::Read(there))) => {
+                    if ![Place::Anywhere, here].contains(there) && !value.is_null() {
+                        self.misplaced[usize::from(here == Place::Frame)].insert(*key);
+                    }
+                    None
+                }
+                Some((key, Use::Beaten(by))) => {
+                    if !value.is_null() {
+                        self.beaten.insert((by.to_string(), *key));
+                    }
+                    None
+                }
                 Some((key, Use::Ignored(program))) => {
-                    self.ignored.insert(key);
-                    self.programs.extend(Some(*program).filter(|program| !program.is_empty()));
+                    self.ignored.insert(*key);
+                    self.programs.insert(*program);
+                    None
                 }
                 Some((key, Use::Changes(change))) => {
                     let says_so = |key| object.get(key).is_some_and(|v| is_nonzero(v) || v.is_string());
                     let is_redundant = change.unless.split(' ').any(says_so);
-                    if !is_redundant && (change.has_effect)(value) {
-                        let first = || (*change, place.to_string(), 0);
-                        self.changes.entry(key).or_insert_with(first).2 += 1;
-                    }
+                    let has_effect = !is_redundant && (change.has_effect)(value);
+                    has_effect.then_some((*key, (change.says, change.hint)))
                 }
-                None if self.unknown.len() < MAX_UNKNOWN => _ = self.unknown.insert(shortened(key)),
-                None => {}
+                Some((key, Use::Axes)) => axes(key, value).map(|word| (*key, word)),
+                None => {
+                    if self.unknown.len() < MAX_UNKNOWN {
+                        self.unknown.insert(shortened(key));
+                    }
+                    None
+                }
+            };
+            if let Some((key, word)) = word {
+                let shown = value.as_str().map_or(String::new(), |text| format!(" (`{}`)", shortened(text)));
+                let first = || (word, shown, place.to_string(), 0);
+                self.changes.entry(key).or_insert_with(first).3 += 1;
             }
         }
     }
 
     /// Says what was not looked at, spellings that were `skipped` included, and refuses what changes the
-    /// meaning.
-    pub fn report(mut self, file: &str, skipped: &BTreeSet<&'static str>, listing: &mut Listing) {
-        self.ignored.extend(skipped);
+    /// meaning. What something else stands for is named only where that could be read.
+    pub fn report(
+        mut self,
+        file: &str,
+        skipped: BTreeSet<(String, &'static str)>,
+        has_failed: bool,
+        listing: &mut Listing,
+    ) {
         if !self.ignored.is_empty() {
             let programs: Vec<&str> = self.programs.into_iter().collect();
-            let of = if programs.is_empty() { String::new() } else { format!(" ({})", programs.join("; ")) };
-            let names = few(&self.ignored);
+            let (names, of) = (few(&self.ignored), programs.join("; "));
             listing
                 .reasons
-                .push(format!("not looked at in `{file}`, since nothing here depends on it: {names}{of}"));
+                .push(format!("not looked at in `{file}`, since nothing here depends on it: {names} ({of})"));
+        }
+        self.beaten.extend(skipped);
+        let mut beaten: BTreeMap<String, Vec<&str>> = BTreeMap::new();
+        for (by, key) in self.beaten.into_iter().filter(|_| !has_failed) {
+            beaten.entry(by).or_default().push(key);
+        }
+        let not_read =
+            |(by, keys): (String, Vec<&str>)| format!("not read in `{file}`, since {by}: {}", few(keys));
+        listing.reasons.extend(beaten.into_iter().map(not_read));
+        let places = ["at the top, but they belong into frames", "in frames, but they belong to the top"];
+        for (place, keys) in places.into_iter().zip(&self.misplaced).filter(|(_, keys)| !keys.is_empty()) {
+            listing
+                .warnings
+                .push(format!("`{file}` has keys {place}, and they are not looked at there: {}", few(keys)));
         }
         if !self.unknown.is_empty() {
             let names = few(&self.unknown);
@@ -281,17 +397,16 @@ impl KeyLog {
                  stand or see, the result will be wrong"
             ));
         }
-        for (key, (change, place, count)) in self.changes {
+        for (key, ((says, hint), shown, place, count)) in self.changes {
             let frames = match (place.as_str(), count) {
                 ("", _) => String::new(),
                 (first, 1) => format!(" of frame `{first}`"),
                 (first, n) => format!(" of {n} frames, the first `{first}`"),
             };
-            let says = change.says;
-            if change.hint.is_empty() {
-                listing.warnings.push(format!("`{file}`: `{key}`{frames}: {says}"));
+            if hint.is_empty() {
+                listing.warnings.push(format!("`{file}`: `{key}`{shown}{frames}: {says}"));
             } else {
-                listing.problems.push(in_file(file, format_args!("`{key}`{frames}: {says}"), change.hint));
+                listing.problems.push(in_file(file, format_args!("`{key}`{shown}{frames}: {says}"), hint));
             }
         }
     }
@@ -325,10 +440,13 @@ mod tests {
         }
         let log = KeyLog::new();
         for key in lens::SHARED_KEYS.split(' ').chain(lens::FOCAL_KEYS) {
-            assert!(matches!(log.known.get(key), Some(Use::Read)), "`{key}`");
+            assert!(matches!(log.known.get(key), Some(Use::Read(_))), "`{key}`");
         }
         for (alias, key) in lens::ALIASES {
-            assert!(matches!(log.known.get(alias), Some(Use::Read)) && seen.contains_key(key), "`{alias}`");
+            assert!(
+                matches!(log.known.get(alias), Some(Use::Read(_))) && seen.contains_key(key),
+                "`{alias}`"
+            );
         }
     }
 
@@ -340,7 +458,7 @@ mod tests {
         log.look(&serde_json::from_str(r#"{"dist": [0.1, 0, 0, 0]}"#).unwrap(), "a.png");
         log.look(&serde_json::from_str(r#"{"dist": [0.1, 0, 0, 0], "k1": 0.1}"#).unwrap(), "b.png");
         let mut listing = Listing::default();
-        log.report("t.json", &BTreeSet::new(), &mut listing);
+        log.report("t.json", BTreeSet::new(), false, &mut listing);
         assert!(matches!(&listing.reasons[..], [r] if r.contains("`aabb_scale`")), "{:?}", listing.reasons);
         assert!(matches!(&listing.warnings[..], [w] if w.contains("`lens_id`")), "{:?}", listing.warnings);
         let problems: Vec<String> = listing.problems.iter().map(crate::Error::to_string).collect();
@@ -350,6 +468,57 @@ mod tests {
                 "`t.json`: `dist` of frame `a.png`: the order of its coefficients is not known",
                 "`t.json`: `latlong`: such a lens is not supported"
             ]
+        );
+    }
+
+    #[test]
+    fn keys_in_the_wrong_place_and_those_that_others_stand_for_have_a_word() {
+        let mut log = KeyLog::new();
+        let top =
+            r#"{"split": {"train": []}, "mask_path": "x", "timestep_index": 3, "timestamp": 1, "up": [0]}"#;
+        log.look(&serde_json::from_str(top).unwrap(), "");
+        let own =
+            r#"{"split": "train", "up": [0, 1, 0], "applied_scale": 3, "fov": 40, "pose": [1], "time": 0.5}"#;
+        log.look(&serde_json::from_str(own).unwrap(), "a.png");
+        let mut listing = Listing::default();
+        log.report("t.json", BTreeSet::from([("`fl_x` is there".to_string(), "fx")]), false, &mut listing);
+        let has = |texts: &[String], words: &[&str]| {
+            assert!(
+                texts.iter().any(|text| words.iter().all(|word| text.contains(word))),
+                "{words:?}: {texts:?}"
+            );
+        };
+        has(&listing.warnings, &["at the top", "`mask_path`", "`split`", "`timestep_index`"]);
+        has(&listing.warnings, &["in frames", "`applied_scale`", "`up`"]);
+        assert!(listing.warnings.len() == 2 && listing.problems.is_empty(), "{listing:?}");
+        has(&listing.reasons, &["a focal length or an angle is there", "`fov`"]);
+        has(&listing.reasons, &["`transform_matrix` is there", "`pose`"]);
+        has(&listing.reasons, &["`fl_x` is there", "`fx`"]);
+        assert!(listing.reasons.iter().all(|r| !r.contains("depends on it")), "{:?}", listing.reasons);
+    }
+
+    #[test]
+    fn only_known_words_for_the_axes_that_are_taken_pass() {
+        let word = |key: &str, name: &str| axes(key, &Value::from(name));
+        for name in ["", "OpenGL", "opengl_c2w", "Blender", "nerfstudio", "c2w", "gl", "right-handed", "RUB"]
+        {
+            assert_eq!(word("camera_convention", name), None, "{name}");
+        }
+        for (name, hint) in [
+            ("OpenCV", "negate"),
+            ("colmap", "negate"),
+            ("x right, y down, z forward", "negate"),
+            ("w2c", "numpy.linalg.inv"),
+            ("world-to-camera", "numpy.linalg.inv"),
+            ("RUB_left_handed", "right-handed"),
+        ] {
+            let found = word("coordinate_system", name).unwrap();
+            assert!(found.1.contains(hint), "{name}: {found:?}");
+        }
+        assert!(word("camera_convention", "xyz").unwrap().1.contains("`opengl`"));
+        assert!(word("coordinate_system", "EPSG:4326").unwrap().1.is_empty());
+        assert!(
+            axes("convention", &serde_json::json!(3)).is_some() && axes("convention", &Value::Null).is_none()
         );
     }
 

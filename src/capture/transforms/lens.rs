@@ -1,6 +1,7 @@
 //! The lens of a frame: its own keys and those for all frames, in the spellings of several programs, as
 //! intrinsics.
 
+use super::agreement::{Known, PINHOLE, numbers};
 use super::{Fault, Object};
 use crate::capture::frame::{self, Intrinsics, LensModel};
 use crate::geom::{Camera, Distortion};
@@ -19,16 +20,21 @@ pub(super) const SHARED_KEYS: &str =
     "w h cx cy k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega is_fisheye camera_model distortion_params";
 
 /// Keys of one frame only.
-const FRAME_KEYS: &str = "file_path split mask_path fg_mask_path seg_mask_path face_mask_path";
+pub(super) const FRAME_KEYS: &str = "file_path split mask_path fg_mask_path seg_mask_path face_mask_path";
 
 /// Keys that count as absent where their value is of another type, and whether it is of theirs.
 const LENIENT_KEYS: [(&str, fn(&Value) -> bool); 5] = [
-    ("is_fisheye", Value::is_boolean),
+    ("is_fisheye", is_switch),
     ("camera_model", Value::is_string),
     ("face_mask_path", Value::is_string),
     ("fg_mask_path", Value::is_string),
     ("seg_mask_path", Value::is_string),
 ];
+
+/// Returns whether a value is true or false, or 1 or 0 as some programs write these.
+fn is_switch(value: &Value) -> bool {
+    value.is_boolean() || [Some(0), Some(1)].contains(&value.as_u64())
+}
 
 /// Other spellings that can mean one thing only, and the key that each stands for.
 pub(super) const ALIASES: [(&str, &str); 22] = [
@@ -103,11 +109,16 @@ pub(super) struct LensNotes {
     pub ignored: BTreeSet<String>,
     /// Spellings that were read, with what they were read as.
     pub taken: BTreeSet<(&'static str, &'static str)>,
-    /// Spellings that were not read, because the usual one is there or they cannot be understood.
-    pub skipped: BTreeSet<&'static str>,
+    /// Spellings that were not read, by the reason.
+    pub skipped: BTreeSet<(String, &'static str)>,
+    /// What those say otherwise than what is read, and cannot decide.
+    pub doubts: BTreeSet<String>,
     /// Keys whose value is of another type than it must be.
     pub misread: BTreeSet<&'static str>,
 }
+
+/// Why what is not understood is not read.
+const UNCLEAR: &str = "what is meant is not known";
 
 /// Returns what is read of an object, with one spelling of each key. Keys that `beyond` has are not taken
 /// from others.
@@ -127,10 +138,17 @@ pub(super) fn canonical(
         object.get(*key).is_some_and(|value| !value.is_null() && !is_usable(value))
     });
     notes.misread.extend(misread.map(|(key, _)| key));
-    let is_known =
-        |out: &Object, key: &str| out.contains_key(key) || beyond.is_some_and(|top| top.contains_key(key));
+    if let Some(value) = out.get_mut("is_fisheye").filter(|value| value.is_number()) {
+        let is_on = *value == 1;
+        *value = is_on.into();
+        notes.taken.insert(("is_fisheye", if is_on { "true" } else { "false" }));
+    }
+    let is_of_file = |key: &str| beyond.is_some_and(|top| key != "file_path" && top.contains_key(key));
+    let is_known = |out: &Object, key: &str| out.contains_key(key) || is_of_file(key);
+    let other = |key: &str| object.get(key).filter(|value| !value.is_null());
     for (alias, key) in ALIASES {
-        let Some(value) = object.get(alias) else { continue };
+        // the top of a file has no photograph
+        let Some(value) = other(alias).filter(|_| key != "file_path" || beyond.is_some()) else { continue };
         let fits = match key {
             "file_path" => value.is_string(),
             "w" | "h" => value.is_u64() && object.get(&partner(alias)).is_some_and(Value::is_u64),
@@ -139,28 +157,41 @@ pub(super) fn canonical(
         if fits && !is_known(&out, key) {
             out.insert(key.into(), value.clone());
             notes.taken.insert((alias, key));
+        } else if fits {
+            Known { own: &out, top: beyond }.check_alias(alias, key, value, notes)?;
+            notes.skipped.insert((format!("`{key}` is there"), alias));
         } else {
-            notes.skipped.insert(alias);
+            notes.skipped.insert((UNCLEAR.into(), alias));
         }
     }
     let has_focal = |out: &Object| FOCAL_KEYS.iter().any(|key| is_known(out, key));
     for (key, angle, focal) in [("x_fov", "camera_angle_x", "fl_x"), ("y_fov", "camera_angle_y", "fl_y")] {
-        let Some(value) = object.get(key).filter(|v| !v.is_null()) else { continue };
-        if [angle, focal].iter().any(|key| is_known(&out, key)) {
-            notes.skipped.insert(key);
+        let Some(value) = other(key) else { continue };
+        if let Some(known) = [focal, angle].into_iter().find(|key| is_known(&out, key)) {
+            notes.skipped.insert((format!("`{known}` is there"), key));
             continue;
         }
         out.insert(angle.into(), degrees(key, value)?.into());
         notes.taken.insert((key, "an angle in degrees"));
     }
     for key in MATRICES {
-        let Some(value) = object.get(key) else { continue };
-        let found = if has_focal(&out) { None } else { matrix(key, value)? };
+        let Some(value) = other(key) else { continue };
+        let found = matrix(key, value)?;
+        if has_focal(&out) {
+            let known = Known { own: &out, top: beyond };
+            match (found, numbers(value)) {
+                (Some(found), _) => known.check_matrix(key, found, notes)?,
+                (None, Some(four)) => known.check_list(key, four)?,
+                (None, None) => {}
+            }
+            notes.skipped.insert(("a focal length or an angle is there".into(), key));
+            continue;
+        }
         let Some(found) = found else {
-            notes.skipped.insert(key);
+            notes.skipped.insert((UNCLEAR.into(), key));
             continue;
         };
-        for (key, value) in ["fl_x", "fl_y", "cx", "cy"].into_iter().zip(found) {
+        for (key, value) in PINHOLE.into_iter().zip(found) {
             out.entry(key).or_insert_with(|| value.into());
         }
         notes.taken.insert((key, "intrinsics in pixels"));
@@ -199,6 +230,9 @@ fn degrees(key: &str, value: &Value) -> Result<f64, String> {
     }
 }
 
+/// Skew beyond this share of the focal length is no pinhole's.
+const SKEW: f64 = 1e-3;
+
 /// Returns fx, fy, cx, cy of a matrix of intrinsics as rows or as one list, row by row or column by column,
 /// which its zeros tell apart; or of an object of that name. `None` for anything else, such as a list of
 /// four numbers.
@@ -228,7 +262,7 @@ fn matrix(key: &str, value: &Value) -> Result<Option<[f64; 4]>, String> {
     if !ends(m) {
         return Ok(None);
     }
-    if m[0][1] != 0.0 {
+    if m[0][1].abs() > SKEW * m[0][0].abs() {
         return Err(format!("its `{key}` shears pixels, by {}: undistort the photographs first", m[0][1]));
     }
     Ok(Some([m[0][0], m[1][1], m[0][2], m[1][2]]))
@@ -301,20 +335,45 @@ pub(super) struct FrameKeys {
     camera_model: Option<String>,
     /// There for messages only: [`canonical`] names its coefficients.
     distortion_params: Option<Vec<f64>>,
+    /// Whether the frame itself says something of its lens.
+    #[serde(skip)]
+    has_own_lens: bool,
 }
 
 impl FrameKeys {
     /// Returns the keys of a frame, with those from the top that it lacks; both are [`canonical`].
-    pub fn merged(top: &Object, own: Object) -> Result<FrameKeys, String> {
+    pub fn merged(top: &Object, own: Object) -> Result<FrameKeys, Fault> {
         let own_focal = FOCAL_KEYS.iter().any(|key| own.contains_key(*key));
+        let has_own_lens = own_focal || SHARED_KEYS.split(' ').any(|key| own.contains_key(key));
         let shared = SHARED_KEYS.split(' ').chain(FOCAL_KEYS.into_iter().filter(|_| !own_focal));
-        let shared = shared.filter_map(|key| top.get_key_value(key));
-        let mut merged: Object = shared.map(|(key, value)| (key.clone(), value.clone())).collect();
-        merged.extend(own);
-        io::typed(&Value::Object(merged))
-            .map_err(|[key, found, expected]| format!("its `{key}` is {found}, expected {expected}"))
+        let (mut merged, mut from_top) = (own, Vec::new());
+        for (key, value) in shared.filter_map(|key| top.get_key_value(key)) {
+            if !merged.contains_key(key) {
+                merged.insert(key.clone(), value.clone());
+                from_top.push(key.as_str());
+            }
+        }
+        let keys = io::typed::<FrameKeys>(&Value::Object(merged)).map_err(|[key, found, expected]| {
+            let text = format!("its `{key}` is {found}, expected {expected}");
+            let name = key.trim_start_matches('.').split(['.', '[']).next().unwrap_or_default();
+            if from_top.contains(&name) { of_all(text) } else { Fault::Frame(text) }
+        })?;
+        Ok(FrameKeys { has_own_lens, ..keys })
+    }
+
+    /// Returns the fault of its lens: of the whole file where the frame says nothing of it.
+    pub fn fault(&self, text: String) -> Fault {
+        if self.has_own_lens { Fault::Frame(text) } else { of_all(text) }
     }
 }
+
+/// Returns the fault of what a file says of all its photographs.
+fn of_all(text: String) -> Fault {
+    Fault::File { text, hint: OF_ALL.into() }
+}
+
+/// What to do about what the top of a file says.
+pub(super) const OF_ALL: &str = "correct what the file says of all its photographs";
 
 /// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the
 /// lens is as `like` has it.
@@ -327,7 +386,8 @@ pub(crate) fn camera_like(
     let mut notes = LensNotes::default();
     let top = canonical(top, None, &mut notes)?;
     let own = canonical(own, Some(&top), &mut notes)?;
-    let lens = intrinsics(&FrameKeys::merged(&top, own)?, &mut notes)?;
+    let keys = FrameKeys::merged(&top, own).map_err(Fault::into_text)?;
+    let lens = intrinsics(&keys, &mut notes)?;
     let size = lens.size.unwrap_or((like.width, like.height));
     if lens.has_focal() {
         return lens.camera(size, rotation, position);
@@ -438,7 +498,8 @@ mod tests {
         let object = |text: &str| -> Object { serde_json::from_str(text).unwrap() };
         let top = canonical(&object(top), None, &mut notes)?;
         let own = canonical(&object(entry), Some(&top), &mut notes)?;
-        let found = intrinsics(&FrameKeys::merged(&top, own)?, &mut notes)?;
+        let keys = FrameKeys::merged(&top, own).map_err(Fault::into_text)?;
+        let found = intrinsics(&keys, &mut notes)?;
         Ok((found, notes))
     }
 
@@ -528,9 +589,56 @@ mod tests {
         let l = intrinsics_of(r#"{"x_fov": 90}"#, "{}").unwrap();
         assert!((l.angle[0].unwrap() - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
         // what is there by its own name is not replaced
-        let l = intrinsics_of(r#"{"fl_x": 10, "fl_y": 10, "x_fov": 20}"#, r#"{"fx": 9, "K": [1, 2, 3]}"#)
+        let l = intrinsics_of(r#"{"fl_x": 10, "fl_y": 10, "x_fov": 20}"#, r#"{"fx": 10, "K": [1, 2, 3]}"#)
             .unwrap();
         assert_eq!((l.focal, l.angle), ([Some(10.0), Some(10.0)], [None, None]));
+    }
+
+    #[test]
+    fn what_is_not_read_and_says_something_else_than_what_is_read_is_refused() {
+        let top = r#"{"fl_x": 500, "fl_y": 500, "cx": 48, "cy": 64, "w": 96, "h": 128}"#;
+        for own in [
+            r#"{"fx": 330}"#,
+            r#"{"K": [[330, 0, 48], [0, 330, 64], [0, 0, 1]]}"#,
+            r#"{"K": [[500, 0, 58], [0, 500, 64], [0, 0, 1]]}"#,
+            r#"{"intrinsics": [500, 500, 58, 64]}"#,
+        ] {
+            let text = intrinsics_of(top, own).unwrap_err();
+            assert!(text.contains("remove"), "{own}: {text}");
+        }
+        for own in [
+            r#"{"fx": 500.1, "fy": 500}"#,
+            r#"{"K": [[500, 0, 47.5], [0, 500, 63.5], [0, 0, 1]], "fov": 40}"#,
+            r#"{"intrinsics": [500, 500, 48, 64]}"#,
+            r#"{"intrinsics": [500, 48, 500, 64], "K": null}"#,
+        ] {
+            assert_eq!(intrinsics_of(top, own), intrinsics_of(top, "{}"), "{own}");
+        }
+        // 2 atan(48 / 330)
+        let angle = |more: &str| intrinsics_of(&format!(r#"{{"camera_angle_x": 0.28888, {more}}}"#), "{}");
+        let size = r#""w": 96, "h": 128"#;
+        for more in ["[330, 330, 48, 64]", "[[330, 0, 48], [0, 330, 64], [0, 0, 1]]"] {
+            assert!(angle(&format!(r#""intrinsics": {more}, {size}"#)).is_ok(), "{more}");
+            assert!(angle(&format!(r#""intrinsics": {more}"#)).is_ok(), "{more}");
+            let moved = more.replace("48", "58");
+            assert!(
+                angle(&format!(r#""intrinsics": {moved}, {size}"#)).unwrap_err().contains("`cx`"),
+                "{moved}"
+            );
+        }
+        // the photographs tell which size is theirs
+        let (found, notes) = read(top, r#"{"width": 960, "height": 1280}"#).unwrap();
+        assert_eq!(found.size, Some((96, 128)));
+        assert!(notes.doubts.contains("`width` is 960, but `w` is 96, which is read"), "{:?}", notes.doubts);
+    }
+
+    #[test]
+    fn a_fisheye_lens_may_be_told_by_a_number() {
+        for (value, is_one) in [("1", true), ("0", false), ("true", true), ("2", false)] {
+            let (found, notes) = read(&format!(r#"{{"is_fisheye": {value}, "fl_x": 9}}"#), "{}").unwrap();
+            assert_eq!(found.distortion.projection == crate::geom::Projection::Fisheye, is_one, "{value}");
+            assert_eq!(notes.misread.is_empty(), value != "2");
+        }
     }
 
     #[test]

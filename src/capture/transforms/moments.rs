@@ -18,7 +18,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 
 /// Keys that tell one moment from another, the best first, and whether each is worth a word where cameras
 /// move: all photographs have times.
-const KEYS: [(&str, bool); 14] = [
+pub(super) const KEYS: [(&str, bool); 14] = [
     ("timestep_index", true),
     ("timestep_id", true),
     ("timestep", true),
