@@ -512,3 +512,22 @@ fn formats_that_are_not_read_are_named_with_a_way_that_works() {
         }
     }
 }
+
+#[test]
+fn decimal_commas_are_named_with_the_way_to_points() {
+    let text = obj("").replacen("v 1 0 0", "v 1,5 0,0 0,0", 1);
+    let rows = ply("", ["", ""], ["", ""]).replacen("1 0 0", "1,5 0,0 0,0", 1);
+    let facet =
+        "solid a\nfacet normal 0 0 1\nouter loop\nvertex 1,5 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n";
+    for (name, text) in [("h.obj", text.as_str()), ("h.ply", &rows), ("h.stl", facet)] {
+        let o = tiface(folder(&[(name, text.as_bytes())]).path(), &["check", name]);
+        assert_eq!(code(&o), 1, "{name}");
+        assert!(err(&o).contains("`1,5`") && err(&o).contains("decimal points: `1.5`"), "{}", err(&o));
+    }
+    // a texture coordinate alone does not stop the mesh
+    let text = obj("mtllib a.mtl\n").replacen("vt 0.1", "vt 0,1", 1);
+    let dir =
+        folder(&[("h.obj", text.as_bytes()), ("a.mtl", b"newmtl a\nmap_Kd a.png\n"), ("a.png", &picture())]);
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.says("decimal points: `0.1`") && found.check["has_texture"] == false, "{found:?}");
+}

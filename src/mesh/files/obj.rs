@@ -330,7 +330,7 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
 fn floats<'w>(words: impl Iterator<Item = &'w str>, source: &Source, at: &dyn Display) -> Result<Vec<f64>> {
     let float = |w: &str| match w.parse::<f64>() {
         Ok(v) if (v as f32).is_finite() => Ok(v),
-        _ => Err(source.broken(at, format!("`{}` is not a finite number", start(w)))),
+        _ => Err(source.no_number(at, format!("`{}` is not a finite number", start(w)), &start(w))),
     };
     words.map(float).collect()
 }

@@ -287,7 +287,8 @@ impl Body<'_> {
                 rest[start..].iter().position(|b| b.is_ascii_whitespace()).unwrap_or(rest.len() - start);
             let word = String::from_utf8_lossy(&rest[start..start + length.min(64)]);
             self.at += start + length;
-            return word.parse().map_err(|_| broken(format!("expected a number, found `{word}`")));
+            let what = || format!("expected a number, found `{word}`");
+            return word.parse().map_err(|_| self.source.no_number(format!("byte {at}"), what(), &word));
         }
         let size = scalar.size();
         let Some(slice) = self.bytes.get(at..at + size) else {

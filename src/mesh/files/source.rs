@@ -66,6 +66,17 @@ impl Source<'_> {
         Error::cannot(format!("`{}`, {at}: {what}", self.path.display()), hint)
     }
 
+    /// Returns the error for a word that is no number. A decimal comma is told with the way to a point.
+    pub fn no_number(&self, at: impl Display, what: impl Display, word: &str) -> Error {
+        let error = self.broken(at, what);
+        let pointed = word.replacen(',', ".", 1);
+        let has_decimal_comma = word.contains(',')
+            && pointed.ends_with(|c: char| c.is_ascii_digit())
+            && pointed.parse::<f64>().is_ok();
+        let way = || format!("export it with decimal points: `{pointed}`, not `{word}`");
+        if has_decimal_comma { error.with_hint(way()) } else { error }
+    }
+
     /// Returns the error for a valid file that this reader does not support.
     pub fn unsupported(&self, at: impl Display, feature: impl Display) -> Error {
         let hint = match self.format {
