@@ -259,6 +259,13 @@ fn colors_of_a_ply_are_known_by_their_names_and_their_range() {
         (color("uchar", plain), "200 100 50", ""),
         (color("uchar", diffuse), "200 100 50", ""),
         (color("uchar", ["r", "g", "b"]), "200 100 50", ""),
+        (color("uchar", ["Red", "Green", "Blue"]), "200 100 50", ""),
+        (color("uchar", ["ambient_red", "ambient_green", "ambient_blue"]), "200 100 50", ""),
+        // 0x00C86432, also behind an alpha of 255, and as the bits of a float
+        ("property uint rgb\n".into(), "13132850", ""),
+        ("property uint rgba\n".into(), "4291322930", ""),
+        ("property int rgb\n".into(), "-3644366", ""),
+        ("property float rgb\n".into(), "1.8403042e-38", ""),
         (color("float", plain), "0.7843 0.3922 0.1961", ""),
         (color("float", plain), "200 100 50", "divided by 255"),
         (color("int", diffuse), "200 100 50", "divided by 255"),
@@ -530,4 +537,24 @@ fn decimal_commas_are_named_with_the_way_to_points() {
         folder(&[("h.obj", text.as_bytes()), ("a.mtl", b"newmtl a\nmap_Kd a.png\n"), ("a.png", &picture())]);
     let found = shown(dir.path(), "h.obj");
     assert!(found.says("decimal points: `0.1`") && found.check["has_texture"] == false, "{found:?}");
+}
+
+#[test]
+fn colors_of_a_ply_under_other_names_are_not_white_in_silence() {
+    for (properties, values) in [
+        ("property float intensity\n", "0.5"),
+        ("property uchar vertex_color\n", "7"),
+        (color("float", ["f_dc_0", "f_dc_1", "f_dc_2"]).as_str(), "0 0 0"),
+        ("property float rgb\n", "13132850"),
+        ("property float rgb\n", "nan"),
+    ] {
+        let text = ply("", [properties, values], ["", ""]);
+        let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+        let name = properties.split_whitespace().nth(2).unwrap();
+        let problem = format!("the property `{name}` is not shown");
+        assert!(found.says(&problem) && found.check["has_colors"] == false, "{properties}: {found:?}");
+    }
+    let text = ply("", ["property float scattered\n", "0.5"], ["", ""]);
+    let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+    assert!(found.check["notes"].is_null(), "{found:?}");
 }

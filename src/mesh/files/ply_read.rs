@@ -82,6 +82,22 @@ struct Element {
 }
 
 impl Property {
+    /// Returns the color that a number packs, `0xAARRGGBB` with an alpha of 0 or 255; that of a float by its bits, as
+    /// PCL does, with an alpha of 0.
+    fn unpacked(&self, value: f64) -> Option<[f32; 3]> {
+        let code = match self.item {
+            Scalar::U32 => Some(value as u32),
+            Scalar::I32 => Some(value as i32 as u32),
+            Scalar::F32 => Some((value as f32).to_bits()).filter(|bits| *bits < 1 << 24),
+            _ => None,
+        };
+        match code?.to_be_bytes() {
+            [0 | 255, r, g, b] => Some([r, g, b].map(|c| f32::from(c) / 255.0)),
+            // bytes in another order
+            _ => None,
+        }
+    }
+
     /// Returns a color's value, 0..=1 if its type counts to white.
     fn coded(&self, value: f64) -> f32 {
         (value / self.item.white()) as f32
@@ -89,9 +105,10 @@ impl Property {
 }
 
 impl Element {
-    /// Returns where properties of these names stand, if all of them do; lists are none.
+    /// Returns where properties of these names stand, in any letters, if all of them do; lists are none.
     fn slots<const N: usize>(&self, names: [&str; N]) -> Option<[usize; N]> {
-        let slot = |name: &str| self.properties.iter().position(|p| p.name == name && p.length.is_none());
+        let is_it = |p: &Property, name: &str| p.name.eq_ignore_ascii_case(name) && p.length.is_none();
+        let slot = |name: &str| self.properties.iter().position(|p| is_it(p, name));
         let mut slots = [0; N];
         for (slot_of, name) in slots.iter_mut().zip(names) {
             *slot_of = slot(name)?;
@@ -105,9 +122,26 @@ impl Element {
             ["red", "green", "blue"],
             ["diffuse_red", "diffuse_green", "diffuse_blue"],
             ["r", "g", "b"],
-            ["R", "G", "B"],
+            ["ambient_red", "ambient_green", "ambient_blue"],
         ];
         spellings.into_iter().find_map(|names| self.slots(names))
+    }
+
+    /// Returns the property that holds whole colors, as PCL packs them, if there are no others.
+    fn packed_color(&self) -> Option<usize> {
+        let found = ["rgb", "rgba"].into_iter().find_map(|name| self.slots([name]));
+        found.map(|[k]| k).filter(|_| self.color().is_none())
+    }
+
+    /// Returns the name of a property that seems to hold colors.
+    fn like_a_color(&self) -> Option<&str> {
+        let is_one = |name: &str| {
+            let name = name.to_ascii_lowercase();
+            let whole = ["red", "rgb", "rgba", "intensity", "luminance", "gray", "grey"];
+            ["color", "colour", "f_dc"].iter().any(|part| name.contains(part))
+                || name.split(|c: char| !c.is_ascii_alphanumeric()).any(|word| whole.contains(&word))
+        };
+        self.properties.iter().map(|p| p.name.as_str()).find(|name| is_one(name))
     }
 }
 
@@ -144,6 +178,14 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     if out.mesh.colors.is_empty() && !colors.is_empty() && colors.len() == out.mesh.triangles.len() {
         out.mesh.colors = at_vertices(count, &out.mesh.triangles, |t| colors[t]);
         out.note("its faces have colors; vertices show the mean of those around them");
+    }
+    if out.mesh.colors.is_empty() && out.picture.is_none() {
+        let colored =
+            elements.iter().filter(|e| e.count > 0 && ["vertex", "face"].contains(&e.name.as_str()));
+        for name in colored.filter_map(Element::like_a_color) {
+            let ways = "colors are read from `red`, `green` and `blue`";
+            out.note(format!("the property `{}` is not shown: {ways}", shown(name)));
+        }
     }
     let range = bring_into_range(&mut out.mesh.colors, "colors");
     range.into_iter().for_each(|note| out.note(note));
@@ -235,14 +277,16 @@ fn header(bytes: &[u8], source: Source) -> Result<Header> {
                 return Ok(Header { order, elements, start: at, pictures });
             }
             _ => {
-                return Err(broken(format!(
-                    "`{}` is not understood",
-                    line.chars().take(60).collect::<String>()
-                )));
+                return Err(broken(format!("`{}` is not understood", shown(&line))));
             }
         }
     }
     unreachable!("the loop over line numbers only returns")
+}
+
+/// Returns the beginning of a text, for messages.
+fn shown(text: &str) -> String {
+    text.chars().take(60).collect()
 }
 
 /// Returns whether a comment begins with a key that names a picture.
@@ -347,6 +391,7 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
         return Err(source.broken("element `vertex`", "has no x, y, z"));
     };
     let (normal, color) = (element.slots(["nx", "ny", "nz"]), element.color());
+    let packed = element.packed_color();
     let alpha = color
         .and_then(|_| ["alpha", "diffuse_alpha", "a"].into_iter().find_map(|name| element.slots([name])));
     let mut opacity = f64::INFINITY;
@@ -379,6 +424,7 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
             }
             out.mesh.colors.push(coded);
         }
+        out.mesh.colors.extend(packed.and_then(|k| element.properties[k].unpacked(row[k])));
         if let Some([k]) = alpha {
             opacity = opacity.min(f64::from(element.properties[k].coded(row[k])));
         }
@@ -390,6 +436,10 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
             }
             uvs.push(uv);
         }
+    }
+    // a color that is none makes all of them unsure
+    if out.mesh.colors.len() != element.count {
+        out.mesh.colors.clear();
     }
     if opacity < 1.0 {
         out.note(format!("colors have an alpha down to {opacity:.2}; they are shown opaque"));
@@ -447,7 +497,8 @@ impl Faces {
 fn triangles(body: &mut Body, element: &Element, out: &mut Faces) -> Result<()> {
     let (source, strips) = (body.source, element.name == "tristrips");
     let list_of = |names: &[&str]| {
-        element.properties.iter().position(|p| p.length.is_some() && names.contains(&p.name.as_str()))
+        let is_it = |p: &Property| names.iter().any(|name| p.name.eq_ignore_ascii_case(name));
+        element.properties.iter().position(|p| p.length.is_some() && is_it(p))
     };
     let Some(list) = list_of(&["vertex_indices", "vertex_index"]) else {
         let what = "has no list `vertex_indices`";
