@@ -558,3 +558,41 @@ fn colors_of_a_ply_under_other_names_are_not_white_in_silence() {
     let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
     assert!(found.check["notes"].is_null(), "{found:?}");
 }
+
+#[test]
+fn materials_of_several_files_are_all_looked_at() {
+    let (picture, red) = (picture(), b"newmtl b\nKd 1 0 0\n");
+    let seen = |libraries: &str| {
+        let text = obj(&format!("{libraries}\nusemtl a\n"));
+        let textured = b"newmtl a\nmap_Kd a.png\nnewmtl b\nmap_Kd other.png\n";
+        let files: [(&str, &[u8]); 5] = [
+            ("h.obj", text.as_bytes()),
+            ("b.mtl", red),
+            ("t/a.mtl", textured),
+            ("t/a.png", &picture),
+            ("b c.mtl", red),
+        ];
+        shown(folder(&files).path(), "h.obj")
+    };
+    for libraries in [
+        "mtllib b.mtl t/a.mtl",
+        "mtllib b.mtl\nmtllib t/a.mtl",
+        "mtllib \"b c.mtl\" t/a.mtl",
+        "mtllib b c.mtl\nmtllib t/a.mtl\nmtllib b.mtl",
+    ] {
+        let found = seen(libraries);
+        assert!(found.has_texture() && found.is(SKIN), "{libraries}: {found:?}");
+        assert!(found.check["notes"].is_null(), "{libraries}: {found:?}");
+    }
+    // of two files one is not there
+    let found = seen("mtllib gone.mtl t/a.mtl");
+    assert!(
+        found.has_texture() && found.is(SKIN) && found.says("names `gone.mtl`, which is not"),
+        "{found:?}"
+    );
+    let found = seen("mtllib b.mtl gone.mtl");
+    assert!(found.says("gone.mtl") && found.says("`b.mtl` has no material `a`"), "{found:?}");
+    assert!(found.check["has_colors"] == false, "white is no color of materials: {found:?}");
+    let found = seen("mtllib no such.mtl");
+    assert!(found.says("names `no such.mtl`, which is not there"), "{found:?}");
+}

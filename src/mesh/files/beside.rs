@@ -24,6 +24,22 @@ pub(super) fn unquoted(name: &str) -> &str {
     inner.unwrap_or(name).trim()
 }
 
+/// Returns the names between blanks, each without the quotes around it.
+pub(super) fn names_between_blanks(text: &str) -> Vec<&str> {
+    let (mut rest, mut names) = (text.trim(), Vec::new());
+    while let Some(first) = rest.chars().next() {
+        let quoted = rest[first.len_utf8()..].find(first).filter(|_| ['"', '\''].contains(&first));
+        let end = match quoted {
+            Some(length) => length + 2,
+            None => rest.find(char::is_whitespace).unwrap_or(rest.len()),
+        };
+        let (name, behind) = rest.split_at(end);
+        names.push(unquoted(name));
+        rest = behind.trim_start();
+    }
+    names
+}
+
 /// Finds a file in one of `folders` by the name that the file `by` writes.
 ///
 /// # Errors
@@ -112,6 +128,9 @@ mod tests {
         assert_eq!(unquoted("'a'"), "a");
         assert_eq!(unquoted("a \"b\""), "a \"b\"");
         assert_eq!(unquoted("\""), "\"");
+        assert_eq!(names_between_blanks(" a.mtl  \"b c.mtl\"\t'd.mtl' "), ["a.mtl", "b c.mtl", "d.mtl"]);
+        assert_eq!(names_between_blanks("\"a b"), ["\"a", "b"]);
+        assert!(names_between_blanks(" ").is_empty());
     }
 
     #[test]

@@ -59,6 +59,9 @@ pub fn to_obj(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOption
     Ok(ExportedFiles { files, warnings })
 }
 
+/// Files of materials of one mesh; more are an attack.
+pub(super) const MAX_LIBRARIES: usize = 64;
+
 const GENERATOR: &str = concat!("# tiface ", env!("CARGO_PKG_VERSION"));
 
 fn write(out: &mut Vec<u8>, file: &FileMesh, stem: &str, name: &str) -> std::io::Result<()> {
@@ -199,13 +202,16 @@ impl Obj {
                 self.atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
             }
             "mtllib" if source.options.texture => {
-                let name = unquoted(line.strip_prefix("mtllib").unwrap_or(""));
-                match &self.out.picture {
-                    None => self.out.picture = Some(PictureSource::Material(name.into())),
-                    Some(PictureSource::Material(first)) if first == name => {}
+                let names = line.strip_prefix("mtllib").unwrap_or("").trim().to_owned();
+                match &mut self.out.picture {
+                    Some(PictureSource::Materials(all)) if all.contains(&names) => {}
+                    Some(PictureSource::Materials(all)) if all.len() < MAX_LIBRARIES => all.push(names),
                     Some(_) => {
-                        self.out.note(format!("a second `mtllib` is not looked at: `{}`", start(name)))
+                        return Err(
+                            source.broken(at, format!("more than {MAX_LIBRARIES} files of materials"))
+                        );
                     }
+                    None => self.out.picture = Some(PictureSource::Materials(vec![names])),
                 }
             }
             "usemtl" if source.options.texture => {
@@ -409,7 +415,7 @@ mod tests {
         let materials = materials_of_mtl(&out.files[1].1, Path::new("my_head.mtl")).unwrap();
         assert_eq!(materials[0].picture.as_deref(), Some("my_head.png"));
         let back = read_with(&out.files[0].1, Path::new("a.obj"), &ReadOptions::default()).unwrap();
-        assert_eq!(back.picture, Some(PictureSource::Material("my_head.mtl".into())));
+        assert_eq!(back.picture, Some(PictureSource::Materials(vec!["my_head.mtl".into()])));
         assert!(back.mesh.is_closed() && back.mesh.colors.is_empty());
         let read_atlas = back.atlas.unwrap();
         assert_eq!((&read_atlas.uvs, &read_atlas.triangles), (&texture.atlas.uvs, &texture.atlas.triangles));

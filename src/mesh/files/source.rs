@@ -43,8 +43,9 @@ pub enum PictureSource {
     Inside(Vec<u8>),
     /// In a picture of this name, as it is written, without quotes; it is looked for in the mesh's folder alone.
     Beside(String),
-    /// In the pictures and colors of the `.mtl` of this name, which [`super::materials_of_mtl`] reads.
-    Material(String),
+    /// In the pictures and colors of `.mtl` files, which [`super::materials_of_mtl`] reads: what stands behind each
+    /// `mtllib`, a name, or several between blanks.
+    Materials(Vec<String>),
 }
 
 /// The file being read, its format, and its limits.
