@@ -596,3 +596,18 @@ fn materials_of_several_files_are_all_looked_at() {
     let found = seen("mtllib no such.mtl");
     assert!(found.says("names `no such.mtl`, which is not there"), "{found:?}");
 }
+
+#[test]
+fn a_picture_of_another_format_is_named_and_read_once_it_is_converted() {
+    let text = obj("mtllib h.mtl\n");
+    let tga = [&[0u8, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 1, 0, 24, 0][..], &[50, 100, 200]].concat();
+    let files: [(&str, &[u8]); 3] =
+        [("h.obj", text.as_bytes()), ("h.mtl", b"newmtl a\nmap_Kd tex.tga\n"), ("tex.tga", &tga)];
+    let dir = folder(&files);
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.says("tex.tga") && found.says("convert it to PNG"), "{found:?}");
+    std::fs::write(dir.path().join("Tex.png"), picture()).unwrap();
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.has_texture() && found.is(SKIN), "{found:?}");
+    assert!(found.says("`tex.tga` is not read; `Tex.png` beside it is taken"), "{found:?}");
+}

@@ -101,6 +101,15 @@ fn inner_parts(written: &str) -> Vec<&str> {
 const READ: [&str; 3] = ["png", "jpg", "jpeg"];
 const CONVERTED: [&str; 6] = ["tif", "tiff", "tga", "bmp", "webp", "exr"];
 
+/// Returns the picture that a file of a format that is not read was converted to, if it lies beside it: `Some(None)` if
+/// there is none, or more than one, `None` if the ending of the file is that of no such format.
+pub(super) fn converted(file: &Path) -> Option<Option<PathBuf>> {
+    let ending = file.extension()?.to_str()?.to_lowercase();
+    let (folder, stem) = (file.parent()?, file.file_stem()?.to_str()?);
+    let other = || nearly_the_same(folder, &format!("{stem}.{}", READ[0]));
+    CONVERTED.contains(&ending.as_str()).then(|| Some(folder.join(other()?)))
+}
+
 /// Returns the only file in a folder whose name differs from this one by capital letters alone, or else, of a picture,
 /// by its ending.
 fn nearly_the_same(folder: &Path, name: &str) -> Option<String> {

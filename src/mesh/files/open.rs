@@ -190,7 +190,24 @@ fn materials_in(libraries: &[Library]) -> Vec<Placed<'_>> {
 fn open_beside(found: &mut ReadMesh, folders: &[&Path], by: &Path, name: &str) -> Result<Option<Photo>> {
     let beside = beside::find(folders, by, name)?;
     beside.note.into_iter().for_each(|note| found.note(note));
-    Ok(Some(io::read_photo(&beside.file, None, &Limits::default())?))
+    let error = match io::read_photo(&beside.file, None, &Limits::default()) {
+        Ok(photo) => return Ok(Some(photo)),
+        Err(e) => Error::from(e),
+    };
+    // a picture of a format that is not read, perhaps with what it was converted to
+    match beside::converted(&beside.file) {
+        None => Err(error),
+        Some(None) => {
+            let way = "convert it to PNG, with the same name but for the ending, in the same folder";
+            Err(error.with_hint(way))
+        }
+        Some(Some(other)) => {
+            let name = |file: &Path| file.file_name().unwrap_or_default().display().to_string();
+            let (written, taken) = (name(&beside.file), name(&other));
+            found.note(format!("`{written}` is not read; `{taken}` beside it is taken"));
+            Ok(Some(io::read_photo(&other, None, &Limits::default())?))
+        }
+    }
 }
 
 /// Returns the materials of the faces; all of the files if the mesh names none of them.
