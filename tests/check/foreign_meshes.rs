@@ -466,6 +466,30 @@ fn pictures_and_buffers_of_a_gltf_are_read_from_its_folder_and_from_its_text() {
         let found = shown(dir.path(), "h.gltf");
         assert!(found.has_texture() && found.is(SKIN), "{uri}: {found:?}");
     }
+    // several buffers: the picture lies in the second
+    let mut several = json.clone();
+    let second = several["bufferViews"][3]["byteOffset"].as_u64().unwrap() as usize;
+    several["buffers"] = json!([
+        {"uri": "a.bin", "byteLength": second},
+        {"uri": data("application/octet-stream", &bin[second..]), "byteLength": bin.len() - second}]);
+    several["bufferViews"][3]["buffer"] = json!(1);
+    several["bufferViews"][3]["byteOffset"] = json!(0);
+    let with =
+        |document: &Value| folder(&[("h.gltf", document.to_string().as_bytes()), ("a.bin", &bin[..second])]);
+    let found = shown(with(&several).path(), "h.gltf");
+    assert!(found.has_texture() && found.is(SKIN), "{found:?}");
+    for (place, wrong, expected) in [
+        ("/bufferViews/1/buffer", json!(2), "view 1 does not lie in one of them"),
+        ("/bufferViews/1/byteLength", json!(second), "view 1 does not lie in one of them"),
+        ("/bufferViews/1/byteOffset", json!(u64::MAX), "view 1 does not lie in one of them"),
+        ("/buffers/0/byteLength", json!(second + 1), "but its data has"),
+        ("/buffers/1/uri", Value::Null, "1 has no `uri` that can be read"),
+    ] {
+        let mut broken = several.clone();
+        *broken.pointer_mut(place).unwrap() = wrong;
+        let o = tiface(with(&broken).path(), &["check", "h.gltf"]);
+        assert!(code(&o) == 1 && err(&o).contains(expected), "{place}: {}", err(&o));
+    }
     let mut json = json;
     json["buffers"][0]["uri"] = json!("gone.bin");
     let dir = folder(&[("h.gltf", json.to_string().as_bytes())]);
