@@ -575,9 +575,14 @@ fn colors_of_a_ply_under_other_names_are_not_white_in_silence() {
         let text = ply("", [properties, values], ["", ""]);
         let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
         let name = properties.split_whitespace().nth(2).unwrap();
-        let problem = format!("the property `{name}` is not shown");
+        let problem = format!("the property `{name}` of `vertex` is not shown");
         assert!(found.says(&problem) && found.check["has_colors"] == false, "{properties}: {found:?}");
     }
+    // colors of both vertices and faces: one is named
+    let colors = color("uchar", ["red", "green", "blue"]);
+    let text = ply("", [&colors, "200 100 50"], [&colors, "1 2 3"]);
+    let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+    assert!(found.is(SKIN) && found.says("those of its vertices are shown"), "{found:?}");
     let text = ply("", ["property float scattered\n", "0.5"], ["", ""]);
     let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
     assert!(found.check["notes"].is_null(), "{found:?}");
@@ -599,7 +604,7 @@ fn materials_of_several_files_are_all_looked_at() {
         shown(folder(&files).path(), "h.obj")
     };
     for libraries in [
-        "mtllib b.mtl t/a.mtl",
+        "mtllib b.mtl t/a.mtl # both",
         "mtllib b.mtl\nmtllib t/a.mtl",
         "mtllib \"b c.mtl\" t/a.mtl",
         "mtllib b c.mtl\nmtllib t/a.mtl\nmtllib b.mtl",
@@ -634,4 +639,33 @@ fn a_picture_of_another_format_is_named_and_read_once_it_is_converted() {
     let found = shown(dir.path(), "h.obj");
     assert!(found.has_texture() && found.is(SKIN), "{found:?}");
     assert!(found.says("`tex.tga` is not read; `Tex.png` beside it is taken"), "{found:?}");
+}
+
+#[test]
+fn vertex_colors_of_a_part_of_a_glb_are_not_dropped_in_silence() {
+    let found = changed(|d| {
+        let bare = json!({"attributes": {"POSITION": 0}, "indices": 1});
+        let mut colored = bare.clone();
+        colored["attributes"]["COLOR_0"] = json!(3);
+        d["meshes"][0]["primitives"] = json!([bare, colored]);
+    });
+    assert!(found.says("some parts of the mesh have no `COLOR_0`"), "{found:?}");
+    let found = changed(|d| {
+        d["meshes"][0]["primitives"] = json!([{"attributes": {"POSITION": 0, "COLOR_1": 3}, "indices": 1}]);
+    });
+    assert!(found.says("they are not in `COLOR_0`"), "{found:?}");
+}
+
+#[test]
+fn an_obj_is_read_with_comments_behind_names_keys_in_capitals_and_normals_that_are_no_numbers() {
+    let mtl = b"newmtl a\nmap_Kd a.png # of the left side\n";
+    for head in
+        ["mtllib a.mtl # mine\n", "MTLLIB a.mtl\nUseMtl a\n", "mtllib a.mtl\nvn nan -nan(ind) 1.#QNAN\n"]
+    {
+        let text = obj(head);
+        let dir = folder(&[("h.obj", text.as_bytes()), ("a.mtl", mtl), ("a.png", &picture())]);
+        let found = shown(dir.path(), "h.obj");
+        assert!(found.has_texture() && found.is(SKIN), "{head}: {found:?}");
+        assert_eq!(found.says("normals are not read"), head.contains("nan"), "{head}: {found:?}");
+    }
 }

@@ -40,12 +40,20 @@ pub(super) fn names_between_blanks(text: &str) -> Vec<&str> {
     names
 }
 
-/// Finds a file in one of `folders` by the name that the file `by` writes.
+/// Finds a file in one of `folders` by the name that the file `by` writes, perhaps with a comment behind it.
 ///
 /// # Errors
 ///
 /// Fails if no such file is there, or if the name is none.
 pub(super) fn find(folders: &[&Path], by: &Path, written: &str) -> Result<Beside> {
+    let found = find_whole(folders, by, written);
+    match written.split_once(" #") {
+        Some((name, _)) if found.is_err() => find_whole(folders, by, unquoted(name)),
+        _ => found,
+    }
+}
+
+fn find_whole(folders: &[&Path], by: &Path, written: &str) -> Result<Beside> {
     let parts = inner_parts(written);
     let shown = by.display();
     let Some(name) = parts.last().filter(|_| !written.contains(char::is_control)) else {
@@ -169,8 +177,9 @@ mod tests {
         let found = find(&[&inside], Path::new("a.mtl"), "C:\\x\\Textures\\..\\textures\\head.png").unwrap();
         assert_eq!(found.file, inside.join("textures/head.png"));
         assert!(found.note.unwrap().contains("`textures/head.png` in its folder is taken"));
-        let found = find(&[&inside], Path::new("a.mtl"), "textures/head.png").unwrap();
-        assert!(found.note.is_none());
+        for name in ["textures/head.png", "textures/head.png # of the left side"] {
+            assert!(find(&[&inside], Path::new("a.mtl"), name).unwrap().note.is_none(), "{name}");
+        }
     }
 
     #[test]

@@ -190,6 +190,12 @@ impl Obj {
                     self.out.note(what);
                 }
             }
+            // programs write them for triangles without an area
+            "vn" if words.clone().any(is_no_number) => {
+                self.creased = true;
+                self.normals.push(Vec3::ZERO);
+                self.out.note("normals are not read: some are no numbers (NaN)");
+            }
             "vn" => {
                 let numbers = floats(words, source, at)?;
                 let [x, y, z] = numbers[..] else { return Err(few(&numbers, "x y z")) };
@@ -201,8 +207,9 @@ impl Obj {
                 source.allow(self.atlas.uvs.len() + 1, 0)?;
                 self.atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
             }
-            "mtllib" if source.options.texture => {
-                let names = line.strip_prefix("mtllib").unwrap_or("").trim().to_owned();
+            "f" => self.face(words, source, at)?,
+            key if source.options.texture && key.eq_ignore_ascii_case("mtllib") => {
+                let names = line[key.len()..].trim().to_owned();
                 match &mut self.out.picture {
                     Some(PictureSource::Materials(all)) if all.contains(&names) => {}
                     Some(PictureSource::Materials(all)) if all.len() < MAX_LIBRARIES => all.push(names),
@@ -214,10 +221,9 @@ impl Obj {
                     None => self.out.picture = Some(PictureSource::Materials(vec![names])),
                 }
             }
-            "usemtl" if source.options.texture => {
-                self.material = Some(unquoted(line.strip_prefix("usemtl").unwrap_or("")).into());
+            key if source.options.texture && key.eq_ignore_ascii_case("usemtl") => {
+                self.material = Some(unquoted(&line[key.len()..]).into());
             }
-            "f" => self.face(words, source, at)?,
             _ => {}
         }
         Ok(())
@@ -331,6 +337,13 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
         whole.extend(line);
         Some((number, String::from_utf8_lossy(&whole).into_owned().into()))
     })
+}
+
+/// Returns whether a word is NaN, as any compiler writes it: `nan`, `-nan(ind)`, `1.#QNAN`, `-1.#IND`.
+fn is_no_number(word: &str) -> bool {
+    let word = word.trim_start_matches(['-', '+']);
+    let begins = |with: &str| word.get(..with.len()).is_some_and(|start| start.eq_ignore_ascii_case(with));
+    ["nan", "1.#qnan", "1.#ind"].into_iter().any(begins)
 }
 
 fn floats<'w>(words: impl Iterator<Item = &'w str>, source: &Source, at: &dyn Display) -> Result<Vec<f64>> {

@@ -147,7 +147,9 @@ fn libraries(found: &mut ReadMesh, folder: &Path, path: &Path, lines: &[String])
     let limits = Limits::default();
     let mut files = Vec::new();
     for line in lines {
-        let names = beside::names_between_blanks(line);
+        let mut names = beside::names_between_blanks(line);
+        let comment = names.iter().position(|name| name.starts_with('#'));
+        names.truncate(comment.unwrap_or(names.len()));
         let whole = beside::find(&[folder], path, unquoted(line));
         let is_list = names.len() > 1 && names.iter().all(|name| name.to_lowercase().ends_with(".mtl"));
         let is_as_written = whole.as_ref().is_ok_and(|file| file.note.is_none());

@@ -152,7 +152,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     let mut uvs = None;
     for element in &elements {
         body.check(element)?;
-        match element.name.as_str() {
+        match element.name.to_ascii_lowercase().as_str() {
             "vertex" => uvs = vertices(&mut body, element, &mut out)?,
             "face" | "tristrips" => triangles(&mut body, element, &mut faces)?,
             name => {
@@ -175,17 +175,20 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     out.picture = picture(&pictures, &faces, source)?.map(PictureSource::Beside);
     let Faces { triangles, colors, wedges, is_mapped, .. } = faces;
     out.mesh.triangles = triangles;
-    if out.mesh.colors.is_empty() && !colors.is_empty() && colors.len() == out.mesh.triangles.len() {
+    let has_face_colors = out.mesh.colors.is_empty() && !colors.is_empty();
+    if has_face_colors && colors.len() == out.mesh.triangles.len() {
         out.mesh.colors = at_vertices(count, &out.mesh.triangles, |t| colors[t]);
         out.note("its faces have colors; vertices show the mean of those around them");
     }
     if out.mesh.colors.is_empty() && out.picture.is_none() {
-        let colored =
-            elements.iter().filter(|e| e.count > 0 && ["vertex", "face"].contains(&e.name.as_str()));
-        for name in colored.filter_map(Element::like_a_color) {
-            let ways = "colors are read from `red`, `green` and `blue`";
-            out.note(format!("the property `{}` is not shown: {ways}", shown(name)));
+        for element in elements.iter().filter(|e| e.count > 0) {
+            let Some(name) = element.like_a_color() else { continue };
+            let (name, of) = (shown(name), shown(&element.name));
+            let ways = "colors are read from `red`, `green` and `blue` of vertices or faces";
+            out.note(format!("the property `{name}` of `{of}` is not shown: {ways}"));
         }
+    } else if !colors.is_empty() && out.picture.is_none() && !has_face_colors {
+        out.note("its faces have colors, too; those of its vertices are shown");
     }
     let range = bring_into_range(&mut out.mesh.colors, "colors");
     range.into_iter().for_each(|note| out.note(note));
@@ -495,7 +498,7 @@ impl Faces {
 /// Adds the triangles of polygons, which are fanned, or of strips, where each corner forms a triangle with the two
 /// before it, with alternating winding, and −1 starts a new strip.
 fn triangles(body: &mut Body, element: &Element, out: &mut Faces) -> Result<()> {
-    let (source, strips) = (body.source, element.name == "tristrips");
+    let (source, strips) = (body.source, element.name.eq_ignore_ascii_case("tristrips"));
     let list_of = |names: &[&str]| {
         let is_it = |p: &Property| names.iter().any(|name| p.name.eq_ignore_ascii_case(name));
         element.properties.iter().position(|p| p.length.is_some() && is_it(p))
