@@ -7,6 +7,7 @@
 
 use super::beside::unquoted;
 use super::color_range::{at_vertices, bring_into_range};
+use super::ply_element::{Element, Property, Scalar};
 use super::source::{PictureSource, ReadMesh, Source};
 use crate::Result;
 use crate::geom::Atlas;
@@ -20,129 +21,6 @@ enum Order {
     Text,
     Little,
     Big,
-}
-
-#[derive(Clone, Copy, PartialEq)]
-enum Scalar {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    F32,
-    F64,
-}
-
-impl Scalar {
-    fn named(name: &str) -> Option<Scalar> {
-        Some(match name {
-            "char" | "int8" => Scalar::I8,
-            "uchar" | "uint8" => Scalar::U8,
-            "short" | "int16" => Scalar::I16,
-            "ushort" | "uint16" => Scalar::U16,
-            "int" | "int32" => Scalar::I32,
-            "uint" | "uint32" => Scalar::U32,
-            "float" | "float32" => Scalar::F32,
-            "double" | "float64" => Scalar::F64,
-            _ => return None,
-        })
-    }
-
-    fn size(self) -> usize {
-        match self {
-            Scalar::I8 | Scalar::U8 => 1,
-            Scalar::I16 | Scalar::U16 => 2,
-            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
-            Scalar::F64 => 8,
-        }
-    }
-
-    /// Returns the value of white, for colors.
-    fn white(self) -> f64 {
-        match self {
-            Scalar::U8 => 255.0,
-            Scalar::U16 => 65535.0,
-            _ => 1.0,
-        }
-    }
-}
-
-struct Property {
-    name: String,
-    item: Scalar,
-    /// The type of a list's length.
-    length: Option<Scalar>,
-}
-
-struct Element {
-    name: String,
-    count: usize,
-    properties: Vec<Property>,
-}
-
-impl Property {
-    /// Returns the color that a number packs, `0xAARRGGBB` with an alpha of 0 or 255; that of a float by its bits, as
-    /// PCL does, with an alpha of 0.
-    fn unpacked(&self, value: f64) -> Option<[f32; 3]> {
-        let code = match self.item {
-            Scalar::U32 => Some(value as u32),
-            Scalar::I32 => Some(value as i32 as u32),
-            Scalar::F32 => Some((value as f32).to_bits()).filter(|bits| *bits < 1 << 24),
-            _ => None,
-        };
-        match code?.to_be_bytes() {
-            [0 | 255, r, g, b] => Some([r, g, b].map(|c| f32::from(c) / 255.0)),
-            // bytes in another order
-            _ => None,
-        }
-    }
-
-    /// Returns a color's value, 0..=1 if its type counts to white.
-    fn coded(&self, value: f64) -> f32 {
-        (value / self.item.white()) as f32
-    }
-}
-
-impl Element {
-    /// Returns where properties of these names stand, in any letters, if all of them do; lists are none.
-    fn slots<const N: usize>(&self, names: [&str; N]) -> Option<[usize; N]> {
-        let is_it = |p: &Property, name: &str| p.name.eq_ignore_ascii_case(name) && p.length.is_none();
-        let slot = |name: &str| self.properties.iter().position(|p| is_it(p, name));
-        let mut slots = [0; N];
-        for (slot_of, name) in slots.iter_mut().zip(names) {
-            *slot_of = slot(name)?;
-        }
-        Some(slots)
-    }
-
-    /// Returns where red, green and blue stand, under any of their names.
-    fn color(&self) -> Option<[usize; 3]> {
-        let spellings = [
-            ["red", "green", "blue"],
-            ["diffuse_red", "diffuse_green", "diffuse_blue"],
-            ["r", "g", "b"],
-            ["ambient_red", "ambient_green", "ambient_blue"],
-        ];
-        spellings.into_iter().find_map(|names| self.slots(names))
-    }
-
-    /// Returns the property that holds whole colors, as PCL packs them, if there are no others.
-    fn packed_color(&self) -> Option<usize> {
-        let found = ["rgb", "rgba"].into_iter().find_map(|name| self.slots([name]));
-        found.map(|[k]| k).filter(|_| self.color().is_none())
-    }
-
-    /// Returns the name of a property that seems to hold colors.
-    fn like_a_color(&self) -> Option<&str> {
-        let is_one = |name: &str| {
-            let name = name.to_ascii_lowercase();
-            let whole = ["red", "rgb", "rgba", "intensity", "luminance", "gray", "grey"];
-            ["color", "colour", "f_dc"].iter().any(|part| name.contains(part))
-                || name.split(|c: char| !c.is_ascii_alphanumeric()).any(|word| whole.contains(&word))
-        };
-        self.properties.iter().map(|p| p.name.as_str()).find(|name| is_one(name))
-    }
 }
 
 pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
@@ -181,8 +59,8 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
         out.note("its faces have colors; vertices show the mean of those around them");
     }
     if out.mesh.colors.is_empty() && out.picture.is_none() {
-        for element in elements.iter().filter(|e| e.count > 0) {
-            let Some(name) = element.like_a_color() else { continue };
+        let mut others = elements.iter().filter(|e| e.count > 0);
+        if let Some((element, name)) = others.find_map(|e| Some((e, e.like_a_color()?))) {
             let (name, of) = (shown(name), shown(&element.name));
             let ways = "colors are read from `red`, `green` and `blue` of vertices or faces";
             out.note(format!("the property `{name}` of `{of}` is not shown: {ways}"));
