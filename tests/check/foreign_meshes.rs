@@ -669,3 +669,12 @@ fn an_obj_is_read_with_comments_behind_names_keys_in_capitals_and_normals_that_a
         assert_eq!(found.says("normals are not read"), head.contains("nan"), "{head}: {found:?}");
     }
 }
+
+#[test]
+fn a_ply_with_normals_that_are_no_numbers_is_read_without_them() {
+    let normals = "property float nx\nproperty float ny\nproperty float nz\n".to_owned();
+    let colored = normals + &color("uchar", ["red", "green", "blue"]);
+    let text = ply("", [&colored, "nan nan nan 200 100 50"], ["", ""]);
+    let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+    assert!(found.is(SKIN) && found.says("normals are not read"), "{found:?}");
+}

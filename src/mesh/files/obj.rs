@@ -23,7 +23,7 @@ use super::color_range::bring_into_range;
 use super::file_mesh::{
     ExportOptions, ExportedFiles, FileMesh, HeadTexture, distance_warning, encode, left_out, safe_name,
 };
-use super::source::{PictureSource, ReadMesh, Source, line_end};
+use super::source::{NO_NORMALS, PictureSource, ReadMesh, Source, line_end};
 use crate::Result;
 use crate::geom::{Aabb, Atlas, Mesh};
 use glam::{DVec3, Vec2, Vec3};
@@ -194,7 +194,7 @@ impl Obj {
             "vn" if words.clone().any(is_no_number) => {
                 self.creased = true;
                 self.normals.push(Vec3::ZERO);
-                self.out.note("normals are not read: some are no numbers (NaN)");
+                self.out.note(NO_NORMALS);
             }
             "vn" => {
                 let numbers = floats(words, source, at)?;

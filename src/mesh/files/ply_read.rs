@@ -8,7 +8,7 @@
 use super::beside::unquoted;
 use super::color_range::{at_vertices, bring_into_range};
 use super::ply_element::{Element, Property, Scalar};
-use super::source::{PictureSource, ReadMesh, Source};
+use super::source::{NO_NORMALS, PictureSource, ReadMesh, Source};
 use crate::Result;
 use crate::geom::Atlas;
 use glam::{DVec3, Vec2, Vec3};
@@ -291,11 +291,11 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
         let vector = |at: [usize; 3]| DVec3::from(at.map(|k| row[k]));
         let position = vector(xyz);
         let direction = normal.map_or(Vec3::ZERO, |n| vector(n).as_vec3());
-        if !position.as_vec3().is_finite() || !direction.is_finite() {
-            return Err(source.broken(format!("vertex {i}"), format!("{position} {direction} is not finite")));
+        if !position.as_vec3().is_finite() {
+            return Err(source.broken(format!("vertex {i}"), format!("{position} is not finite")));
         }
         out.places.push(position);
-        if normal.is_some() {
+        if normal.is_some() && direction.is_finite() {
             out.mesh.normals.push(direction.normalize_or_zero());
         }
         if let Some(color) = color {
@@ -317,6 +317,11 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
             }
             uvs.push(uv);
         }
+    }
+    // programs write NaN for vertices of triangles without an area
+    if normal.is_some() && out.mesh.normals.len() != element.count {
+        out.mesh.normals.clear();
+        out.note(NO_NORMALS);
     }
     // a color that is none makes all of them unsure
     if out.mesh.colors.len() != element.count {

@@ -130,6 +130,9 @@ pub struct ReadMesh {
     pub(super) places: Vec<DVec3>,
 }
 
+/// The sentence about normals of which some are NaN.
+pub(super) const NO_NORMALS: &str = "normals are not read: some are no numbers (NaN)";
+
 impl ReadMesh {
     /// Adds a sentence, once.
     pub(super) fn note(&mut self, text: impl Into<String>) {
