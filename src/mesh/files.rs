@@ -18,6 +18,7 @@ mod mtl;
 mod obj;
 mod open;
 mod ply;
+mod ply_element;
 mod ply_read;
 mod read;
 mod source;

@@ -259,6 +259,13 @@ fn colors_of_a_ply_are_known_by_their_names_and_their_range() {
         (color("uchar", plain), "200 100 50", ""),
         (color("uchar", diffuse), "200 100 50", ""),
         (color("uchar", ["r", "g", "b"]), "200 100 50", ""),
+        (color("uchar", ["Red", "Green", "Blue"]), "200 100 50", ""),
+        (color("uchar", ["ambient_red", "ambient_green", "ambient_blue"]), "200 100 50", ""),
+        // 0x00C86432, also behind an alpha of 255, and as the bits of a float
+        ("property uint rgb\n".into(), "13132850", ""),
+        ("property uint rgba\n".into(), "4291322930", ""),
+        ("property int rgb\n".into(), "-3644366", ""),
+        ("property float rgb\n".into(), "1.8403042e-38", ""),
         (color("float", plain), "0.7843 0.3922 0.1961", ""),
         (color("float", plain), "200 100 50", "divided by 255"),
         (color("int", diffuse), "200 100 50", "divided by 255"),
@@ -459,6 +466,30 @@ fn pictures_and_buffers_of_a_gltf_are_read_from_its_folder_and_from_its_text() {
         let found = shown(dir.path(), "h.gltf");
         assert!(found.has_texture() && found.is(SKIN), "{uri}: {found:?}");
     }
+    // several buffers: the picture lies in the second
+    let mut several = json.clone();
+    let second = several["bufferViews"][3]["byteOffset"].as_u64().unwrap() as usize;
+    several["buffers"] = json!([
+        {"uri": "a.bin", "byteLength": second},
+        {"uri": data("application/octet-stream", &bin[second..]), "byteLength": bin.len() - second}]);
+    several["bufferViews"][3]["buffer"] = json!(1);
+    several["bufferViews"][3]["byteOffset"] = json!(0);
+    let with =
+        |document: &Value| folder(&[("h.gltf", document.to_string().as_bytes()), ("a.bin", &bin[..second])]);
+    let found = shown(with(&several).path(), "h.gltf");
+    assert!(found.has_texture() && found.is(SKIN), "{found:?}");
+    for (place, wrong, expected) in [
+        ("/bufferViews/1/buffer", json!(2), "view 1 does not lie in one of them"),
+        ("/bufferViews/1/byteLength", json!(second), "view 1 does not lie in one of them"),
+        ("/bufferViews/1/byteOffset", json!(u64::MAX), "view 1 does not lie in one of them"),
+        ("/buffers/0/byteLength", json!(second + 1), "but its data has"),
+        ("/buffers/1/uri", Value::Null, "1 has no `uri` that can be read"),
+    ] {
+        let mut broken = several.clone();
+        *broken.pointer_mut(place).unwrap() = wrong;
+        let o = tiface(with(&broken).path(), &["check", "h.gltf"]);
+        assert!(code(&o) == 1 && err(&o).contains(expected), "{place}: {}", err(&o));
+    }
     let mut json = json;
     json["buffers"][0]["uri"] = json!("gone.bin");
     let dir = folder(&[("h.gltf", json.to_string().as_bytes())]);
@@ -511,4 +542,139 @@ fn formats_that_are_not_read_are_named_with_a_way_that_works() {
             assert!(code(&o) == 1 && err(&o).contains(name) && err(&o).contains(way), "{}", err(&o));
         }
     }
+}
+
+#[test]
+fn decimal_commas_are_named_with_the_way_to_points() {
+    let text = obj("").replacen("v 1 0 0", "v 1,5 0,0 0,0", 1);
+    let rows = ply("", ["", ""], ["", ""]).replacen("1 0 0", "1,5 0,0 0,0", 1);
+    let facet =
+        "solid a\nfacet normal 0 0 1\nouter loop\nvertex 1,5 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n";
+    for (name, text) in [("h.obj", text.as_str()), ("h.ply", &rows), ("h.stl", facet)] {
+        let o = tiface(folder(&[(name, text.as_bytes())]).path(), &["check", name]);
+        assert_eq!(code(&o), 1, "{name}");
+        assert!(err(&o).contains("`1,5`") && err(&o).contains("decimal points: `1.5`"), "{}", err(&o));
+    }
+    // a texture coordinate alone does not stop the mesh
+    let text = obj("mtllib a.mtl\n").replacen("vt 0.1", "vt 0,1", 1);
+    let dir =
+        folder(&[("h.obj", text.as_bytes()), ("a.mtl", b"newmtl a\nmap_Kd a.png\n"), ("a.png", &picture())]);
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.says("decimal points: `0.1`") && found.check["has_texture"] == false, "{found:?}");
+}
+
+#[test]
+fn colors_of_a_ply_under_other_names_are_not_white_in_silence() {
+    for (properties, values) in [
+        ("property float intensity\n", "0.5"),
+        ("property uchar vertex_color\n", "7"),
+        (color("float", ["f_dc_0", "f_dc_1", "f_dc_2"]).as_str(), "0 0 0"),
+        ("property float rgb\n", "13132850"),
+        ("property float rgb\n", "nan"),
+    ] {
+        let text = ply("", [properties, values], ["", ""]);
+        let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+        let name = properties.split_whitespace().nth(2).unwrap();
+        let problem = format!("the property `{name}` of `vertex` is not shown");
+        assert!(found.says(&problem) && found.check["has_colors"] == false, "{properties}: {found:?}");
+    }
+    // colors of both vertices and faces: one is named
+    let colors = color("uchar", ["red", "green", "blue"]);
+    let text = ply("", [&colors, "200 100 50"], [&colors, "1 2 3"]);
+    let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+    assert!(found.is(SKIN) && found.says("those of its vertices are shown"), "{found:?}");
+    let text = ply("", ["property float scattered\n", "0.5"], ["", ""]);
+    let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+    assert!(found.check["notes"].is_null(), "{found:?}");
+}
+
+#[test]
+fn materials_of_several_files_are_all_looked_at() {
+    let (picture, red) = (picture(), b"newmtl b\nKd 1 0 0\n");
+    let seen = |libraries: &str| {
+        let text = obj(&format!("{libraries}\nusemtl a\n"));
+        let textured = b"newmtl a\nmap_Kd a.png\nnewmtl b\nmap_Kd other.png\n";
+        let files: [(&str, &[u8]); 5] = [
+            ("h.obj", text.as_bytes()),
+            ("b.mtl", red),
+            ("t/a.mtl", textured),
+            ("t/a.png", &picture),
+            ("b c.mtl", red),
+        ];
+        shown(folder(&files).path(), "h.obj")
+    };
+    for libraries in [
+        "mtllib b.mtl t/a.mtl # both",
+        "mtllib b.mtl\nmtllib t/a.mtl",
+        "mtllib \"b c.mtl\" t/a.mtl",
+        "mtllib b c.mtl\nmtllib t/a.mtl\nmtllib b.mtl",
+    ] {
+        let found = seen(libraries);
+        assert!(found.has_texture() && found.is(SKIN), "{libraries}: {found:?}");
+        assert!(found.check["notes"].is_null(), "{libraries}: {found:?}");
+    }
+    // of two files one is not there
+    let found = seen("mtllib gone.mtl t/a.mtl");
+    assert!(
+        found.has_texture() && found.is(SKIN) && found.says("names `gone.mtl`, which is not"),
+        "{found:?}"
+    );
+    let found = seen("mtllib b.mtl gone.mtl");
+    assert!(found.says("gone.mtl") && found.says("`b.mtl` has no material `a`"), "{found:?}");
+    assert!(found.check["has_colors"] == false, "white is no color of materials: {found:?}");
+    let found = seen("mtllib no such.mtl");
+    assert!(found.says("names `no such.mtl`, which is not there"), "{found:?}");
+}
+
+#[test]
+fn a_picture_of_another_format_is_named_and_read_once_it_is_converted() {
+    let text = obj("mtllib h.mtl\n");
+    let tga = [&[0u8, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 1, 0, 24, 0][..], &[50, 100, 200]].concat();
+    let files: [(&str, &[u8]); 3] =
+        [("h.obj", text.as_bytes()), ("h.mtl", b"newmtl a\nmap_Kd tex.tga\n"), ("tex.tga", &tga)];
+    let dir = folder(&files);
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.says("tex.tga") && found.says("convert it to PNG"), "{found:?}");
+    std::fs::write(dir.path().join("Tex.png"), picture()).unwrap();
+    let found = shown(dir.path(), "h.obj");
+    assert!(found.has_texture() && found.is(SKIN), "{found:?}");
+    assert!(found.says("`tex.tga` is not read; `Tex.png` beside it is taken"), "{found:?}");
+}
+
+#[test]
+fn vertex_colors_of_a_part_of_a_glb_are_not_dropped_in_silence() {
+    let found = changed(|d| {
+        let bare = json!({"attributes": {"POSITION": 0}, "indices": 1});
+        let mut colored = bare.clone();
+        colored["attributes"]["COLOR_0"] = json!(3);
+        d["meshes"][0]["primitives"] = json!([bare, colored]);
+    });
+    assert!(found.says("some parts of the mesh have no `COLOR_0`"), "{found:?}");
+    let found = changed(|d| {
+        d["meshes"][0]["primitives"] = json!([{"attributes": {"POSITION": 0, "COLOR_1": 3}, "indices": 1}]);
+    });
+    assert!(found.says("they are not in `COLOR_0`"), "{found:?}");
+}
+
+#[test]
+fn an_obj_is_read_with_comments_behind_names_keys_in_capitals_and_normals_that_are_no_numbers() {
+    let mtl = b"newmtl a\nmap_Kd a.png # of the left side\n";
+    for head in
+        ["mtllib a.mtl # mine\n", "MTLLIB a.mtl\nUseMtl a\n", "mtllib a.mtl\nvn nan -nan(ind) 1.#QNAN\n"]
+    {
+        let text = obj(head);
+        let dir = folder(&[("h.obj", text.as_bytes()), ("a.mtl", mtl), ("a.png", &picture())]);
+        let found = shown(dir.path(), "h.obj");
+        assert!(found.has_texture() && found.is(SKIN), "{head}: {found:?}");
+        assert_eq!(found.says("normals are not read"), head.contains("nan"), "{head}: {found:?}");
+    }
+}
+
+#[test]
+fn a_ply_with_normals_that_are_no_numbers_is_read_without_them() {
+    let normals = "property float nx\nproperty float ny\nproperty float nz\n".to_owned();
+    let colored = normals + &color("uchar", ["red", "green", "blue"]);
+    let text = ply("", [&colored, "nan nan nan 200 100 50"], ["", ""]);
+    let found = shown(folder(&[("h.ply", text.as_bytes())]).path(), "h.ply");
+    assert!(found.is(SKIN) && found.says("normals are not read"), "{found:?}");
 }

@@ -24,12 +24,36 @@ pub(super) fn unquoted(name: &str) -> &str {
     inner.unwrap_or(name).trim()
 }
 
-/// Finds a file in one of `folders` by the name that the file `by` writes.
+/// Returns the names between blanks, each without the quotes around it.
+pub(super) fn names_between_blanks(text: &str) -> Vec<&str> {
+    let (mut rest, mut names) = (text.trim(), Vec::new());
+    while let Some(first) = rest.chars().next() {
+        let quoted = rest[first.len_utf8()..].find(first).filter(|_| ['"', '\''].contains(&first));
+        let end = match quoted {
+            Some(length) => length + 2,
+            None => rest.find(char::is_whitespace).unwrap_or(rest.len()),
+        };
+        let (name, behind) = rest.split_at(end);
+        names.push(unquoted(name));
+        rest = behind.trim_start();
+    }
+    names
+}
+
+/// Finds a file in one of `folders` by the name that the file `by` writes, perhaps with a comment behind it.
 ///
 /// # Errors
 ///
 /// Fails if no such file is there, or if the name is none.
 pub(super) fn find(folders: &[&Path], by: &Path, written: &str) -> Result<Beside> {
+    let found = find_whole(folders, by, written);
+    match written.split_once(" #") {
+        Some((name, _)) if found.is_err() => find_whole(folders, by, unquoted(name)),
+        _ => found,
+    }
+}
+
+fn find_whole(folders: &[&Path], by: &Path, written: &str) -> Result<Beside> {
     let parts = inner_parts(written);
     let shown = by.display();
     let Some(name) = parts.last().filter(|_| !written.contains(char::is_control)) else {
@@ -85,6 +109,15 @@ fn inner_parts(written: &str) -> Vec<&str> {
 const READ: [&str; 3] = ["png", "jpg", "jpeg"];
 const CONVERTED: [&str; 6] = ["tif", "tiff", "tga", "bmp", "webp", "exr"];
 
+/// Returns the picture that a file of a format that is not read was converted to, if it lies beside it: `Some(None)` if
+/// there is none, or more than one, `None` if the ending of the file is that of no such format.
+pub(super) fn converted(file: &Path) -> Option<Option<PathBuf>> {
+    let ending = file.extension()?.to_str()?.to_lowercase();
+    let (folder, stem) = (file.parent()?, file.file_stem()?.to_str()?);
+    let other = || nearly_the_same(folder, &format!("{stem}.{}", READ[0]));
+    CONVERTED.contains(&ending.as_str()).then(|| Some(folder.join(other()?)))
+}
+
 /// Returns the only file in a folder whose name differs from this one by capital letters alone, or else, of a picture,
 /// by its ending.
 fn nearly_the_same(folder: &Path, name: &str) -> Option<String> {
@@ -112,6 +145,9 @@ mod tests {
         assert_eq!(unquoted("'a'"), "a");
         assert_eq!(unquoted("a \"b\""), "a \"b\"");
         assert_eq!(unquoted("\""), "\"");
+        assert_eq!(names_between_blanks(" a.mtl  \"b c.mtl\"\t'd.mtl' "), ["a.mtl", "b c.mtl", "d.mtl"]);
+        assert_eq!(names_between_blanks("\"a b"), ["\"a", "b"]);
+        assert!(names_between_blanks(" ").is_empty());
     }
 
     #[test]
@@ -141,8 +177,9 @@ mod tests {
         let found = find(&[&inside], Path::new("a.mtl"), "C:\\x\\Textures\\..\\textures\\head.png").unwrap();
         assert_eq!(found.file, inside.join("textures/head.png"));
         assert!(found.note.unwrap().contains("`textures/head.png` in its folder is taken"));
-        let found = find(&[&inside], Path::new("a.mtl"), "textures/head.png").unwrap();
-        assert!(found.note.is_none());
+        for name in ["textures/head.png", "textures/head.png # of the left side"] {
+            assert!(find(&[&inside], Path::new("a.mtl"), name).unwrap().note.is_none(), "{name}");
+        }
     }
 
     #[test]

@@ -149,6 +149,9 @@ impl<'a> GlbReader<'a> {
             self.out.mesh.normals.clear();
         }
         if self.bare_colors && !self.tinted {
+            if self.out.mesh.colors.iter().any(|c| *c != [1.0; 3]) {
+                self.out.note("vertex colors are not shown: some parts of the mesh have no `COLOR_0`");
+            }
             self.out.mesh.colors.clear();
         }
         if !self.source.options.texture || self.out.mesh.triangles.is_empty() {
@@ -307,6 +310,10 @@ impl<'a> GlbReader<'a> {
         match attribute(self, Semantic::Colors(0), &[Type::Vec3, Type::Vec4], &[C::F32, C::U8, C::U16])? {
             None => {
                 self.bare_colors = true;
+                if primitive.attributes.keys().any(|key| matches!(key, Valid(Semantic::Colors(_)))) {
+                    let what = "vertex colors are not shown: they are not in `COLOR_0`, but in another set";
+                    self.out.note(what);
+                }
                 self.out.mesh.colors.resize(first + count, [1.0; 3]);
             }
             Some((colors, width)) => {

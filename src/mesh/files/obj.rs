@@ -23,7 +23,7 @@ use super::color_range::bring_into_range;
 use super::file_mesh::{
     ExportOptions, ExportedFiles, FileMesh, HeadTexture, distance_warning, encode, left_out, safe_name,
 };
-use super::source::{PictureSource, ReadMesh, Source, line_end};
+use super::source::{NO_NORMALS, PictureSource, ReadMesh, Source, line_end};
 use crate::Result;
 use crate::geom::{Aabb, Atlas, Mesh};
 use glam::{DVec3, Vec2, Vec3};
@@ -58,6 +58,9 @@ pub fn to_obj(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOption
     warnings.extend(distance_warning(mesh, &file_from_mesh, "obj"));
     Ok(ExportedFiles { files, warnings })
 }
+
+/// Files of materials of one mesh; more are an attack.
+pub(super) const MAX_LIBRARIES: usize = 64;
 
 const GENERATOR: &str = concat!("# tiface ", env!("CARGO_PKG_VERSION"));
 
@@ -187,6 +190,12 @@ impl Obj {
                     self.out.note(what);
                 }
             }
+            // programs write them for triangles without an area
+            "vn" if words.clone().any(is_no_number) => {
+                self.creased = true;
+                self.normals.push(Vec3::ZERO);
+                self.out.note(NO_NORMALS);
+            }
             "vn" => {
                 let numbers = floats(words, source, at)?;
                 let [x, y, z] = numbers[..] else { return Err(few(&numbers, "x y z")) };
@@ -198,20 +207,23 @@ impl Obj {
                 source.allow(self.atlas.uvs.len() + 1, 0)?;
                 self.atlas.uvs.push(Vec2::new(u as f32, 1.0 - v as f32));
             }
-            "mtllib" if source.options.texture => {
-                let name = unquoted(line.strip_prefix("mtllib").unwrap_or(""));
-                match &self.out.picture {
-                    None => self.out.picture = Some(PictureSource::Material(name.into())),
-                    Some(PictureSource::Material(first)) if first == name => {}
+            "f" => self.face(words, source, at)?,
+            key if source.options.texture && key.eq_ignore_ascii_case("mtllib") => {
+                let names = line[key.len()..].trim().to_owned();
+                match &mut self.out.picture {
+                    Some(PictureSource::Materials(all)) if all.contains(&names) => {}
+                    Some(PictureSource::Materials(all)) if all.len() < MAX_LIBRARIES => all.push(names),
                     Some(_) => {
-                        self.out.note(format!("a second `mtllib` is not looked at: `{}`", start(name)))
+                        return Err(
+                            source.broken(at, format!("more than {MAX_LIBRARIES} files of materials"))
+                        );
                     }
+                    None => self.out.picture = Some(PictureSource::Materials(vec![names])),
                 }
             }
-            "usemtl" if source.options.texture => {
-                self.material = Some(unquoted(line.strip_prefix("usemtl").unwrap_or("")).into());
+            key if source.options.texture && key.eq_ignore_ascii_case("usemtl") => {
+                self.material = Some(unquoted(&line[key.len()..]).into());
             }
-            "f" => self.face(words, source, at)?,
             _ => {}
         }
         Ok(())
@@ -327,10 +339,17 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     })
 }
 
+/// Returns whether a word is NaN, as any compiler writes it: `nan`, `-nan(ind)`, `1.#QNAN`, `-1.#IND`.
+fn is_no_number(word: &str) -> bool {
+    let word = word.trim_start_matches(['-', '+']);
+    let begins = |with: &str| word.get(..with.len()).is_some_and(|start| start.eq_ignore_ascii_case(with));
+    ["nan", "1.#qnan", "1.#ind"].into_iter().any(begins)
+}
+
 fn floats<'w>(words: impl Iterator<Item = &'w str>, source: &Source, at: &dyn Display) -> Result<Vec<f64>> {
     let float = |w: &str| match w.parse::<f64>() {
         Ok(v) if (v as f32).is_finite() => Ok(v),
-        _ => Err(source.broken(at, format!("`{}` is not a finite number", start(w)))),
+        _ => Err(source.no_number(at, format!("`{}` is not a finite number", start(w)), &start(w))),
     };
     words.map(float).collect()
 }
@@ -409,7 +428,7 @@ mod tests {
         let materials = materials_of_mtl(&out.files[1].1, Path::new("my_head.mtl")).unwrap();
         assert_eq!(materials[0].picture.as_deref(), Some("my_head.png"));
         let back = read_with(&out.files[0].1, Path::new("a.obj"), &ReadOptions::default()).unwrap();
-        assert_eq!(back.picture, Some(PictureSource::Material("my_head.mtl".into())));
+        assert_eq!(back.picture, Some(PictureSource::Materials(vec!["my_head.mtl".into()])));
         assert!(back.mesh.is_closed() && back.mesh.colors.is_empty());
         let read_atlas = back.atlas.unwrap();
         assert_eq!((&read_atlas.uvs, &read_atlas.triangles), (&texture.atlas.uvs, &texture.atlas.triangles));

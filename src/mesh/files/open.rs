@@ -3,11 +3,12 @@
 //! A texture that cannot be shown never stops a mesh from being opened: why it is not shown, and what was read otherwise
 //! than it is written, is returned with the mesh.
 
-use super::beside;
+use super::beside::{self, Beside, unquoted};
 use super::color_range::{at_vertices, bring_into_range};
 use super::file_mesh::HeadTexture;
 use super::gltf_text::as_glb;
 use super::mtl::{Material, materials_of_mtl};
+use super::obj::MAX_LIBRARIES;
 use super::read::read_with;
 use super::source::{PictureSource, ReadMesh, ReadOptions, Source};
 use super::stored::HeadMesh;
@@ -15,8 +16,8 @@ use crate::geom::{Atlas, Similarity};
 use crate::image::{Photo, linear_from_srgb, quantize, srgb_from_linear};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
-use std::collections::{BTreeSet, HashMap};
-use std::path::Path;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::path::{Path, PathBuf};
 
 /// The content of a mesh file.
 #[derive(Debug)]
@@ -118,13 +119,11 @@ fn open_picture(found: &mut ReadMesh, path: &Path) -> Result<Option<Photo>> {
         None => Ok(None),
         Some(PictureSource::Inside(bytes)) => Ok(Some(io::parse_photo(&bytes, path, &limits)?)),
         Some(PictureSource::Beside(name)) => open_beside(found, &[folder], path, &name),
-        Some(PictureSource::Material(name)) => {
-            let beside = beside::find(&[folder], path, &name)?;
-            beside.note.into_iter().for_each(|note| found.note(note));
-            let mtl = &beside.file;
-            let all = materials_of_mtl(&io::read_maybe_empty(mtl, &limits)?, mtl)?;
-            let used = used_materials(found, &all, mtl);
-            let Some(name) = picture_of(found, &used, mtl)? else {
+        Some(PictureSource::Materials(lines)) => {
+            let libraries = libraries(found, folder, path, &lines)?;
+            let all = materials_in(&libraries);
+            let used = used_materials(found, &all, &libraries);
+            let Some((name, mtl)) = picture_of(found, &used)? else {
                 color_by_materials(found, &all, &used);
                 return Ok(None);
             };
@@ -133,64 +132,148 @@ fn open_picture(found: &mut ReadMesh, path: &Path) -> Result<Option<Photo>> {
     }
 }
 
+/// A `.mtl` file and its materials.
+struct Library {
+    file: PathBuf,
+    materials: Vec<Material>,
+}
+
+/// A material and the file that it stands in.
+type Placed<'m> = (&'m Material, &'m Path);
+
+/// Opens the files behind each `mtllib`: of one name, which may have blanks, or else of several between blanks. Files
+/// that are not there are noted if others are.
+fn libraries(found: &mut ReadMesh, folder: &Path, path: &Path, lines: &[String]) -> Result<Vec<Library>> {
+    let limits = Limits::default();
+    let mut files = Vec::new();
+    for line in lines {
+        let mut names = beside::names_between_blanks(line);
+        let comment = names.iter().position(|name| name.starts_with('#'));
+        names.truncate(comment.unwrap_or(names.len()));
+        let whole = beside::find(&[folder], path, unquoted(line));
+        let is_list = names.len() > 1 && names.iter().all(|name| name.to_lowercase().ends_with(".mtl"));
+        let is_as_written = whole.as_ref().is_ok_and(|file| file.note.is_none());
+        if is_list && !is_as_written {
+            let first = names.iter().take(MAX_LIBRARIES);
+            files.extend(first.map(|name| beside::find(&[folder], path, name)));
+        } else {
+            files.push(whole);
+        }
+    }
+    let (there, missing): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| file.is_ok());
+    let mut missing = missing.into_iter().filter_map(|file| file.err());
+    if there.is_empty() {
+        return missing.next().map_or(Ok(Vec::new()), Err);
+    }
+    missing.for_each(|e| found.note(with_way(&e)));
+    let mut libraries: Vec<Library> = Vec::new();
+    for Beside { file, note } in there.into_iter().flatten() {
+        note.into_iter().for_each(|note| found.note(note));
+        if libraries.iter().all(|known| known.file != file) {
+            let materials = materials_of_mtl(&io::read_maybe_empty(&file, &limits)?, &file)?;
+            libraries.push(Library { file, materials });
+        }
+    }
+    Ok(libraries)
+}
+
+/// Returns the materials of all files; of a name that several files have, those of the first.
+fn materials_in(libraries: &[Library]) -> Vec<Placed<'_>> {
+    let mut first: HashMap<&str, usize> = HashMap::new();
+    let mut all = Vec::new();
+    for (k, Library { file, materials }) in libraries.iter().enumerate() {
+        let own = materials.iter().filter(|m| *first.entry(m.name.as_str()).or_insert(k) == k);
+        all.extend(own.map(|m| (m, file.as_path())));
+    }
+    all
+}
+
 /// Opens a picture in one of these folders, by the name that the file `by` writes.
 fn open_beside(found: &mut ReadMesh, folders: &[&Path], by: &Path, name: &str) -> Result<Option<Photo>> {
     let beside = beside::find(folders, by, name)?;
     beside.note.into_iter().for_each(|note| found.note(note));
-    Ok(Some(io::read_photo(&beside.file, None, &Limits::default())?))
+    let error = match io::read_photo(&beside.file, None, &Limits::default()) {
+        Ok(photo) => return Ok(Some(photo)),
+        Err(e) => Error::from(e),
+    };
+    // a picture of a format that is not read, perhaps with what it was converted to
+    match beside::converted(&beside.file) {
+        None => Err(error),
+        Some(None) => {
+            let way = "convert it to PNG, with the same name but for the ending, in the same folder";
+            Err(error.with_hint(way))
+        }
+        Some(Some(other)) => {
+            let name = |file: &Path| file.file_name().unwrap_or_default().display().to_string();
+            let (written, taken) = (name(&beside.file), name(&other));
+            found.note(format!("`{written}` is not read; `{taken}` beside it is taken"));
+            Ok(Some(io::read_photo(&other, None, &Limits::default())?))
+        }
+    }
 }
 
-/// Returns the materials of the faces; all of the file if the mesh names none of them.
-fn used_materials<'m>(found: &mut ReadMesh, all: &'m [Material], mtl: &Path) -> Vec<&'m Material> {
+/// Returns the materials of the faces; all of the files if the mesh names none of them.
+fn used_materials<'m>(found: &mut ReadMesh, all: &[Placed<'m>], libraries: &[Library]) -> Vec<Placed<'m>> {
     let names: BTreeSet<&str> = found.materials.iter().map(|(_, name)| name.as_str()).collect();
-    let used: Vec<&Material> = all.iter().filter(|m| names.contains(m.name.as_str())).collect();
-    let known: BTreeSet<&str> = all.iter().map(|m| m.name.as_str()).collect();
+    let used: Vec<Placed> = all.iter().copied().filter(|(m, _)| names.contains(m.name.as_str())).collect();
+    let known: BTreeSet<&str> = all.iter().map(|(m, _)| m.name.as_str()).collect();
     let unknown = names.difference(&known).next().map(|name| name.to_string());
     if let Some(name) = unknown.filter(|_| !all.is_empty()) {
-        found.note(format!("`{}` has no material `{name}`, which the mesh uses", mtl.display()));
+        let files: Vec<String> = libraries.iter().map(|l| format!("`{}`", l.file.display())).collect();
+        let verb = if files.len() == 1 { "has" } else { "have" };
+        found.note(format!("{} {verb} no material `{name}`, which the mesh uses", files.join(", ")));
     }
-    if used.is_empty() { all.iter().collect() } else { used }
+    if used.is_empty() { all.to_vec() } else { used }
 }
 
-/// Returns the name of the picture of these materials, if they have one.
-fn picture_of(found: &mut ReadMesh, used: &[&Material], mtl: &Path) -> Result<Option<String>> {
-    let source = Source { path: mtl, format: "MTL", options: &ReadOptions::DEFAULT };
-    if let Some(material) = used.iter().find(|m| m.transparent.is_some()) {
+/// Returns the name of the picture of these materials, if they have one, and the file that names it.
+fn picture_of<'m>(found: &mut ReadMesh, used: &[Placed<'m>]) -> Result<Option<(String, &'m Path)>> {
+    if let Some((material, _)) = used.iter().find(|(m, _)| m.transparent.is_some()) {
         let (key, name) = (material.transparent.unwrap_or_default(), &material.name);
         found.note(format!("`{key}` makes the material `{name}` transparent; it is shown opaque"));
     }
-    let own: BTreeSet<&str> = used.iter().filter_map(|m| m.picture.as_deref()).collect();
-    let stand_ins: BTreeSet<&(&str, String)> = used.iter().filter_map(|m| m.stand_in.as_ref()).collect();
-    let names: Vec<&str> = if own.is_empty() {
-        stand_ins.iter().map(|(_, name)| name.as_str()).collect()
-    } else {
-        own.into_iter().collect()
-    };
-    if let [first, second, ..] = names[..] {
-        let feature = format!("a mesh with several base colors, `{first}` and `{second}`,");
+    let own = used.iter().filter_map(|(m, file)| Some((m.picture.as_deref()?, (*file, None))));
+    let mut pictures: BTreeMap<&str, (&Path, Option<&str>)> = own.collect();
+    let has_own = !pictures.is_empty();
+    if !has_own {
+        pictures.extend(used.iter().filter_map(|(m, file)| {
+            let (key, name) = m.stand_in.as_ref()?;
+            Some((name.as_str(), (*file, Some(*key))))
+        }));
+    }
+    let mut pictures = pictures.into_iter();
+    let Some((name, (file, key))) = pictures.next() else { return Ok(None) };
+    if let Some((second, _)) = pictures.next() {
+        let source = Source { path: file, format: "MTL", options: &ReadOptions::DEFAULT };
+        let feature = format!("a mesh with several base colors, `{name}` and `{second}`,");
         return Err(source.unsupported("its materials", feature));
     }
-    let Some(name) = names.first().map(|name| (*name).to_owned()) else { return Ok(None) };
-    if let Some((key, _)) = stand_ins.first().filter(|_| used.iter().all(|m| m.picture.is_none())) {
+    if let Some(key) = key {
         found.note(format!("there is no `map_Kd`; the picture of `{key}` is shown"));
-    } else if let Some(bare) = used.iter().find(|m| m.picture.is_none()) {
+    } else if let Some((bare, _)) = used.iter().find(|(m, _)| m.picture.is_none()) {
         let without = &bare.name;
         found.note(format!("the material `{without}` has no picture; its faces show that of the others"));
     }
-    Ok(Some(name))
+    Ok(Some((name.to_owned(), file)))
 }
 
 /// Colors the vertices by the `Kd` of their faces' materials, unless they have colors, or no material is colored: gray
 /// is what programs write for a mesh without color.
-fn color_by_materials(found: &mut ReadMesh, all: &[Material], used: &[&Material]) {
+fn color_by_materials(found: &mut ReadMesh, all: &[Placed], used: &[Placed]) {
     let is_colored = |m: &Material| m.color.is_some_and(|[r, g, b]| r != g || g != b);
-    if !found.mesh.colors.is_empty() || !used.iter().any(|m| is_colored(m)) {
+    if !found.mesh.colors.is_empty() || !used.iter().any(|(m, _)| is_colored(m)) {
         return;
     }
     let color = |m: &Material| m.color.unwrap_or([1.0; 3]);
-    let named: HashMap<&str, [f32; 3]> = all.iter().map(|m| (m.name.as_str(), color(m))).collect();
+    let named: HashMap<&str, [f32; 3]> = all.iter().map(|(m, _)| (m.name.as_str(), color(m))).collect();
     // of a mesh without `usemtl` the first
-    let first = color(used[0]);
+    let first = color(used[0].0);
+    // of none of the names that the mesh uses a color is known
+    if !found.materials.is_empty()
+        && !found.materials.iter().any(|(_, name)| named.contains_key(name.as_str()))
+    {
+        return;
+    }
     let color_of = |name: &String| named.get(name.as_str()).copied().unwrap_or([1.0; 3]);
     let runs: Vec<(u32, [f32; 3])> =
         found.materials.iter().map(|(from, name)| (*from, color_of(name))).collect();

@@ -7,7 +7,8 @@
 
 use super::beside::unquoted;
 use super::color_range::{at_vertices, bring_into_range};
-use super::source::{PictureSource, ReadMesh, Source};
+use super::ply_element::{Element, Property, Scalar};
+use super::source::{NO_NORMALS, PictureSource, ReadMesh, Source};
 use crate::Result;
 use crate::geom::Atlas;
 use glam::{DVec3, Vec2, Vec3};
@@ -22,95 +23,6 @@ enum Order {
     Big,
 }
 
-#[derive(Clone, Copy, PartialEq)]
-enum Scalar {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    F32,
-    F64,
-}
-
-impl Scalar {
-    fn named(name: &str) -> Option<Scalar> {
-        Some(match name {
-            "char" | "int8" => Scalar::I8,
-            "uchar" | "uint8" => Scalar::U8,
-            "short" | "int16" => Scalar::I16,
-            "ushort" | "uint16" => Scalar::U16,
-            "int" | "int32" => Scalar::I32,
-            "uint" | "uint32" => Scalar::U32,
-            "float" | "float32" => Scalar::F32,
-            "double" | "float64" => Scalar::F64,
-            _ => return None,
-        })
-    }
-
-    fn size(self) -> usize {
-        match self {
-            Scalar::I8 | Scalar::U8 => 1,
-            Scalar::I16 | Scalar::U16 => 2,
-            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
-            Scalar::F64 => 8,
-        }
-    }
-
-    /// Returns the value of white, for colors.
-    fn white(self) -> f64 {
-        match self {
-            Scalar::U8 => 255.0,
-            Scalar::U16 => 65535.0,
-            _ => 1.0,
-        }
-    }
-}
-
-struct Property {
-    name: String,
-    item: Scalar,
-    /// The type of a list's length.
-    length: Option<Scalar>,
-}
-
-struct Element {
-    name: String,
-    count: usize,
-    properties: Vec<Property>,
-}
-
-impl Property {
-    /// Returns a color's value, 0..=1 if its type counts to white.
-    fn coded(&self, value: f64) -> f32 {
-        (value / self.item.white()) as f32
-    }
-}
-
-impl Element {
-    /// Returns where properties of these names stand, if all of them do; lists are none.
-    fn slots<const N: usize>(&self, names: [&str; N]) -> Option<[usize; N]> {
-        let slot = |name: &str| self.properties.iter().position(|p| p.name == name && p.length.is_none());
-        let mut slots = [0; N];
-        for (slot_of, name) in slots.iter_mut().zip(names) {
-            *slot_of = slot(name)?;
-        }
-        Some(slots)
-    }
-
-    /// Returns where red, green and blue stand, under any of their names.
-    fn color(&self) -> Option<[usize; 3]> {
-        let spellings = [
-            ["red", "green", "blue"],
-            ["diffuse_red", "diffuse_green", "diffuse_blue"],
-            ["r", "g", "b"],
-            ["R", "G", "B"],
-        ];
-        spellings.into_iter().find_map(|names| self.slots(names))
-    }
-}
-
 pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     let Header { order, elements, start, pictures } = header(bytes, source)?;
     let mut body = Body { bytes, at: start, order, source };
@@ -118,7 +30,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     let mut uvs = None;
     for element in &elements {
         body.check(element)?;
-        match element.name.as_str() {
+        match element.name.to_ascii_lowercase().as_str() {
             "vertex" => uvs = vertices(&mut body, element, &mut out)?,
             "face" | "tristrips" => triangles(&mut body, element, &mut faces)?,
             name => {
@@ -141,9 +53,20 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     out.picture = picture(&pictures, &faces, source)?.map(PictureSource::Beside);
     let Faces { triangles, colors, wedges, is_mapped, .. } = faces;
     out.mesh.triangles = triangles;
-    if out.mesh.colors.is_empty() && !colors.is_empty() && colors.len() == out.mesh.triangles.len() {
+    let has_face_colors = out.mesh.colors.is_empty() && !colors.is_empty();
+    if has_face_colors && colors.len() == out.mesh.triangles.len() {
         out.mesh.colors = at_vertices(count, &out.mesh.triangles, |t| colors[t]);
         out.note("its faces have colors; vertices show the mean of those around them");
+    }
+    if out.mesh.colors.is_empty() && out.picture.is_none() {
+        let mut others = elements.iter().filter(|e| e.count > 0);
+        if let Some((element, name)) = others.find_map(|e| Some((e, e.like_a_color()?))) {
+            let (name, of) = (shown(name), shown(&element.name));
+            let ways = "colors are read from `red`, `green` and `blue` of vertices or faces";
+            out.note(format!("the property `{name}` of `{of}` is not shown: {ways}"));
+        }
+    } else if !colors.is_empty() && out.picture.is_none() && !has_face_colors {
+        out.note("its faces have colors, too; those of its vertices are shown");
     }
     let range = bring_into_range(&mut out.mesh.colors, "colors");
     range.into_iter().for_each(|note| out.note(note));
@@ -235,14 +158,16 @@ fn header(bytes: &[u8], source: Source) -> Result<Header> {
                 return Ok(Header { order, elements, start: at, pictures });
             }
             _ => {
-                return Err(broken(format!(
-                    "`{}` is not understood",
-                    line.chars().take(60).collect::<String>()
-                )));
+                return Err(broken(format!("`{}` is not understood", shown(&line))));
             }
         }
     }
     unreachable!("the loop over line numbers only returns")
+}
+
+/// Returns the beginning of a text, for messages.
+fn shown(text: &str) -> String {
+    text.chars().take(60).collect()
 }
 
 /// Returns whether a comment begins with a key that names a picture.
@@ -287,7 +212,8 @@ impl Body<'_> {
                 rest[start..].iter().position(|b| b.is_ascii_whitespace()).unwrap_or(rest.len() - start);
             let word = String::from_utf8_lossy(&rest[start..start + length.min(64)]);
             self.at += start + length;
-            return word.parse().map_err(|_| broken(format!("expected a number, found `{word}`")));
+            let what = || format!("expected a number, found `{word}`");
+            return word.parse().map_err(|_| self.source.no_number(format!("byte {at}"), what(), &word));
         }
         let size = scalar.size();
         let Some(slice) = self.bytes.get(at..at + size) else {
@@ -346,6 +272,7 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
         return Err(source.broken("element `vertex`", "has no x, y, z"));
     };
     let (normal, color) = (element.slots(["nx", "ny", "nz"]), element.color());
+    let packed = element.packed_color();
     let alpha = color
         .and_then(|_| ["alpha", "diffuse_alpha", "a"].into_iter().find_map(|name| element.slots([name])));
     let mut opacity = f64::INFINITY;
@@ -364,11 +291,11 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
         let vector = |at: [usize; 3]| DVec3::from(at.map(|k| row[k]));
         let position = vector(xyz);
         let direction = normal.map_or(Vec3::ZERO, |n| vector(n).as_vec3());
-        if !position.as_vec3().is_finite() || !direction.is_finite() {
-            return Err(source.broken(format!("vertex {i}"), format!("{position} {direction} is not finite")));
+        if !position.as_vec3().is_finite() {
+            return Err(source.broken(format!("vertex {i}"), format!("{position} is not finite")));
         }
         out.places.push(position);
-        if normal.is_some() {
+        if normal.is_some() && direction.is_finite() {
             out.mesh.normals.push(direction.normalize_or_zero());
         }
         if let Some(color) = color {
@@ -378,6 +305,7 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
             }
             out.mesh.colors.push(coded);
         }
+        out.mesh.colors.extend(packed.and_then(|k| element.properties[k].unpacked(row[k])));
         if let Some([k]) = alpha {
             opacity = opacity.min(f64::from(element.properties[k].coded(row[k])));
         }
@@ -389,6 +317,15 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
             }
             uvs.push(uv);
         }
+    }
+    // programs write NaN for vertices of triangles without an area
+    if normal.is_some() && out.mesh.normals.len() != element.count {
+        out.mesh.normals.clear();
+        out.note(NO_NORMALS);
+    }
+    // a color that is none makes all of them unsure
+    if out.mesh.colors.len() != element.count {
+        out.mesh.colors.clear();
     }
     if opacity < 1.0 {
         out.note(format!("colors have an alpha down to {opacity:.2}; they are shown opaque"));
@@ -444,9 +381,10 @@ impl Faces {
 /// Adds the triangles of polygons, which are fanned, or of strips, where each corner forms a triangle with the two
 /// before it, with alternating winding, and −1 starts a new strip.
 fn triangles(body: &mut Body, element: &Element, out: &mut Faces) -> Result<()> {
-    let (source, strips) = (body.source, element.name == "tristrips");
+    let (source, strips) = (body.source, element.name.eq_ignore_ascii_case("tristrips"));
     let list_of = |names: &[&str]| {
-        element.properties.iter().position(|p| p.length.is_some() && names.contains(&p.name.as_str()))
+        let is_it = |p: &Property| names.iter().any(|name| p.name.eq_ignore_ascii_case(name));
+        element.properties.iter().position(|p| p.length.is_some() && is_it(p))
     };
     let Some(list) = list_of(&["vertex_indices", "vertex_index"]) else {
         let what = "has no list `vertex_indices`";

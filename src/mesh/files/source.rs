@@ -43,8 +43,9 @@ pub enum PictureSource {
     Inside(Vec<u8>),
     /// In a picture of this name, as it is written, without quotes; it is looked for in the mesh's folder alone.
     Beside(String),
-    /// In the pictures and colors of the `.mtl` of this name, which [`super::materials_of_mtl`] reads.
-    Material(String),
+    /// In the pictures and colors of `.mtl` files, which [`super::materials_of_mtl`] reads: what stands behind each
+    /// `mtllib`, a name, or several between blanks.
+    Materials(Vec<String>),
 }
 
 /// The file being read, its format, and its limits.
@@ -64,6 +65,17 @@ impl Source<'_> {
             _ => "export it again, or open it in Blender or MeshLab and save it anew",
         };
         Error::cannot(format!("`{}`, {at}: {what}", self.path.display()), hint)
+    }
+
+    /// Returns the error for a word that is no number. A decimal comma is told with the way to a point.
+    pub fn no_number(&self, at: impl Display, what: impl Display, word: &str) -> Error {
+        let error = self.broken(at, what);
+        let pointed = word.replacen(',', ".", 1);
+        let has_decimal_comma = word.contains(',')
+            && pointed.ends_with(|c: char| c.is_ascii_digit())
+            && pointed.parse::<f64>().is_ok();
+        let way = || format!("export it with decimal points: `{pointed}`, not `{word}`");
+        if has_decimal_comma { error.with_hint(way()) } else { error }
     }
 
     /// Returns the error for a valid file that this reader does not support.
@@ -117,6 +129,9 @@ pub struct ReadMesh {
     /// The positions in the file's coordinates while the file is read; then they move to `mesh`.
     pub(super) places: Vec<DVec3>,
 }
+
+/// The sentence about normals of which some are NaN.
+pub(super) const NO_NORMALS: &str = "normals are not read: some are no numbers (NaN)";
 
 impl ReadMesh {
     /// Adds a sentence, once.

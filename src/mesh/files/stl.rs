@@ -3,7 +3,7 @@
 //! A binary file is known by its length, 84 bytes and 50 for each triangle, since its header may begin with `solid`,
 //! too. Each triangle keeps three vertices of its own; normals of facets follow from them and are passed over.
 
-use super::source::{ReadMesh, Source};
+use super::source::{ReadMesh, Source, line_end};
 use crate::Result;
 use glam::DVec3;
 
@@ -62,13 +62,19 @@ fn read_binary(bytes: &[u8], source: Source, out: &mut ReadMesh) -> Result<()> {
 
 fn read_text(bytes: &[u8], source: Source, out: &mut ReadMesh) -> Result<()> {
     let mut corners = 0;
-    for (number, line) in (1..).zip(bytes.split(|&b| b == b'\n')) {
+    let end = line_end(bytes);
+    for (number, line) in (1..).zip(bytes.split(|&b| b == end)) {
         let line = String::from_utf8_lossy(line.trim_ascii());
         let mut words = line.split_ascii_whitespace();
         let at = format!("line {number}");
         match words.next().unwrap_or("").to_ascii_lowercase().as_str() {
             "vertex" => {
-                let numbers: Vec<f64> = words.filter_map(|word| word.parse().ok()).collect();
+                let number = |word: &str| {
+                    let word: String = word.chars().take(40).collect();
+                    let what = || format!("`{word}` is not a number");
+                    word.parse::<f64>().map_err(|_| source.no_number(&at, what(), &word))
+                };
+                let numbers = words.map(number).collect::<Result<Vec<f64>>>()?;
                 let [x, y, z] = numbers[..] else {
                     return Err(source.broken(at, format!("{} numbers, expected x y z", numbers.len())));
                 };
