@@ -446,18 +446,13 @@ fn poses_in_a_folder_with_other_axes_are_told_how_to_turn_them() {
         let row = |k: usize| format!("{} {} {} {}\n", r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]);
         (0..3).map(row).collect::<String>() + "0 0 0 1\n"
     };
-    let edits: [fn((DMat3, DVec3)) -> (DMat3, DVec3); 2] = [
-        |(r, t)| (r * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)), t),
-        |(r, t)| (r.transpose(), -(r.transpose() * t)),
-    ];
-    for edit in edits {
-        let dir = pose_folder("rgb", "intrinsics.txt", k);
-        for i in 0..VIEWS {
-            let (r, t) = edit(pose(i));
-            put(&dir, &format!("pose/{i:02}.txt"), rows(r, t));
-        }
-        says(&dir, "", &["`pose/*.txt`", "look away", "second and third columns", "invert them"]);
+    let dir = pose_folder("rgb", "intrinsics.txt", k);
+    for i in 0..VIEWS {
+        let (r, t) = pose(i);
+        let opengl = r * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+        put(&dir, &format!("pose/{i:02}.txt"), rows(opengl, t));
     }
+    says(&dir, "", &["`pose/*.txt`", "look away", "second and third columns", "invert them"]);
 }
 
 // ---------------------------------------------------------------------------------------- other programs

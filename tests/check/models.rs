@@ -183,7 +183,10 @@ fn colmap_text_of_other_editors_is_read_and_decimal_commas_are_said() {
     assert_eq!(c.views[0].camera.fx, 30.5);
     says(&c.reasons, &["`sparse/0/images.txt` has decimal commas"]);
     says(&c.reasons, &["`sparse/0/cameras.txt` has decimal commas"]);
-    refused(&six("1, PINHOLE, 24, 32, 30.5, 30.5, 12, 16\n", &images), &["cameras.txt`: line 1", "`1,`"]);
+    refused(
+        &six("1, PINHOLE, 24, 32, 30.5, 30.5, 12, 16\n", &images),
+        &["cameras.txt`: line 1", "commas separate its values"],
+    );
     refused(&six(&CAMERA.replace("30.5", "1,030.5"), &images), &["`1,030.5` is not a parameter of the lens"]);
 }
 

@@ -1,8 +1,12 @@
 //! Whether what is not read of a lens, since something else is, says the same.
 
 use super::Object;
-use super::lens::{FOCAL_KEYS, LensNotes};
 use serde_json::Value;
+use std::collections::BTreeSet;
+
+/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would
+/// be overruled by the whole file's focal length.
+pub(super) const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// What is read of a lens, its file's included, to compare what is not read with.
 pub(super) struct Known<'a> {
@@ -54,14 +58,14 @@ impl Known<'_> {
         alias: &str,
         key: &str,
         value: &Value,
-        notes: &mut LensNotes,
+        doubts: &mut BTreeSet<String>,
     ) -> Result<(), String> {
         let Some((found, known)) = value.as_f64().zip(self.number(key)) else { return Ok(()) };
         let text = format!("`{alias}` is {found}, but `{key}` is {known}");
         match PINHOLE.iter().position(|name| *name == key) {
             Some(k) if !self.is_same(k, found, known) => Err(text + ": remove the one that is wrong"),
             None if found != known => {
-                notes.doubts.insert(text + ", which is read");
+                doubts.insert(text + ", which is read");
                 Ok(())
             }
             _ => Ok(()),
@@ -69,12 +73,17 @@ impl Known<'_> {
     }
 
     /// Refuses a matrix beside a focal length or an angle that says something else.
-    pub fn check_matrix(&self, key: &str, found: [f64; 4], notes: &mut LensNotes) -> Result<(), String> {
+    pub fn check_matrix(
+        &self,
+        key: &str,
+        found: [f64; 4],
+        doubts: &mut BTreeSet<String>,
+    ) -> Result<(), String> {
         for (k, (name, known)) in PINHOLE.into_iter().zip(self.pinhole()).enumerate() {
             let value = found[k];
             let Some(known) = known else {
                 if k > 1 {
-                    notes.doubts.insert(format!(
+                    doubts.insert(format!(
                         "the principal point of `{key}` is not read, since a focal length or an angle is there; \
                          without `cx` and `cy` the middle is taken"
                     ));

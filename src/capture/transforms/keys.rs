@@ -428,6 +428,7 @@ pub(super) fn unit_m(top: &Object) -> Option<(&str, f64)> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::agreement::FOCAL_KEYS;
     use super::*;
 
     #[test]
@@ -439,7 +440,7 @@ mod tests {
             }
         }
         let log = KeyLog::new();
-        for key in lens::SHARED_KEYS.split(' ').chain(lens::FOCAL_KEYS) {
+        for key in lens::SHARED_KEYS.split(' ').chain(FOCAL_KEYS) {
             assert!(matches!(log.known.get(key), Some(Use::Read(_))), "`{key}`");
         }
         for (alias, key) in lens::ALIASES {

@@ -1,7 +1,7 @@
 //! The lens of a frame: its own keys and those for all frames, in the spellings of several programs, as
 //! intrinsics.
 
-use super::agreement::{Known, PINHOLE, numbers};
+use super::agreement::{FOCAL_KEYS, Known, PINHOLE, numbers};
 use super::{Fault, Object};
 use crate::capture::frame::{self, Intrinsics, LensModel};
 use crate::geom::{Camera, Distortion};
@@ -10,10 +10,6 @@ use glam::{DMat3, DVec3};
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::BTreeSet;
-
-/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would
-/// be overruled by the whole file's focal length.
-pub(super) const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// The other keys that may stand at the top for all frames.
 pub(super) const SHARED_KEYS: &str =
@@ -158,7 +154,7 @@ pub(super) fn canonical(
             out.insert(key.into(), value.clone());
             notes.taken.insert((alias, key));
         } else if fits {
-            Known { own: &out, top: beyond }.check_alias(alias, key, value, notes)?;
+            Known { own: &out, top: beyond }.check_alias(alias, key, value, &mut notes.doubts)?;
             notes.skipped.insert((format!("`{key}` is there"), alias));
         } else {
             notes.skipped.insert((UNCLEAR.into(), alias));
@@ -180,7 +176,7 @@ pub(super) fn canonical(
         if has_focal(&out) {
             let known = Known { own: &out, top: beyond };
             match (found, numbers(value)) {
-                (Some(found), _) => known.check_matrix(key, found, notes)?,
+                (Some(found), _) => known.check_matrix(key, found, &mut notes.doubts)?,
                 (None, Some(four)) => known.check_list(key, four)?,
                 (None, None) => {}
             }
