@@ -1,4 +1,4 @@
-# tiface with every feature, for processors and for GPUs by Vulkan:
+# tiface with every feature, for CPUs and for GPUs by Vulkan:
 #
 #     docker build -t tiface .
 #     docker run --rm -v "$PWD:/data" -w /data tiface run captures/002_00

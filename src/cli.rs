@@ -142,7 +142,7 @@ struct FileOptions {
     #[arg(long, value_name = "FRAME")]
     frame: Option<String>,
     /// Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it
-    #[arg(long, value_name = "METRES")]
+    #[arg(long, value_name = "METERS")]
     height: Option<String>,
     /// Number of triangles after simplification; 0 keeps all
     #[arg(long, value_name = "N")]

@@ -308,7 +308,7 @@ impl Config {
     fn to_table(&self) -> Table {
         match Value::try_from(self) {
             Ok(Value::Table(table)) => table,
-            // a struct of numbers, words and lists always is a table; a test serialises every preset
+            // a struct of numbers, words and lists always is a table; a test serializes every preset
             _ => Table::new(),
         }
     }

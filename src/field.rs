@@ -22,14 +22,14 @@ use crate::{Error, Result};
 use serde::Serialize;
 use std::sync::{Mutex, OnceLock};
 
-/// The reason for the processor on a machine without GPUs.
+/// The reason for the CPU on a machine without GPUs.
 const NO_GPU: &str = "no GPU is here";
 
 /// The device that a field is trained on.
 // A process holds one or two of these, so boxing the larger variant would save nothing.
 #[allow(clippy::large_enum_variant)]
 pub enum ComputeDevice {
-    /// The processor, with the reason if `auto` found no usable GPU.
+    /// The CPU, with the reason if `auto` found no usable GPU.
     Cpu(String),
     /// A GPU.
     #[cfg(feature = "wgpu")]
@@ -40,8 +40,8 @@ impl ComputeDevice {
     /// Returns the device's name and the reason for choosing it, for reports.
     pub fn description(&self) -> String {
         match self {
-            ComputeDevice::Cpu(why) if why.is_empty() => "the processor".into(),
-            ComputeDevice::Cpu(why) => format!("the processor: {why}"),
+            ComputeDevice::Cpu(why) if why.is_empty() => "the CPU".into(),
+            ComputeDevice::Cpu(why) => format!("the CPU: {why}"),
             #[cfg(feature = "wgpu")]
             ComputeDevice::Gpu(gpu) => format!("{}: {}", gpu.device.name(), gpu.why),
         }
@@ -51,13 +51,13 @@ impl ComputeDevice {
     pub fn warning(&self) -> Option<String> {
         match self {
             ComputeDevice::Cpu(why) if !why.is_empty() && why != NO_GPU => {
-                Some(format!("trained on the processor: {why}; `tiface doctor` tests the GPUs"))
+                Some(format!("trained on the CPU: {why}; `tiface doctor` tests the GPUs"))
             }
             _ => None,
         }
     }
 
-    /// Falls back to the processor if `check` refuses a GPU that `auto` selected.
+    /// Falls back to the CPU if `check` refuses a GPU that `auto` selected.
     ///
     /// # Errors
     ///
@@ -74,17 +74,17 @@ impl ComputeDevice {
     }
 }
 
-/// A comparison of a GPU with the processor: one training step of a field.
+/// A comparison of a GPU with the CPU: one training step of a field.
 #[derive(Clone, Copy)]
 pub struct SelfTest {
     /// The name of the field.
     pub field: &'static str,
-    /// Runs the step on an adapter and on the processor, and compares the results.
+    /// Runs the step on an adapter and on the CPU, and compares the results.
     #[cfg(feature = "wgpu")]
     pub run: fn(&crate::kernel::gpu::Adapter) -> Result<Vec<Check>>,
 }
 
-/// One quantity of a training step, and its deviation from the processor's value.
+/// One quantity of a training step, and its deviation from the CPU's value.
 #[derive(Debug, Serialize)]
 pub struct Check {
     /// Field and quantity.
@@ -127,7 +127,7 @@ pub struct Found {
     pub shared: Option<usize>,
     /// Whether another training uses the device.
     pub in_use: bool,
-    /// Comparisons of training steps with the processor's.
+    /// Comparisons of training steps with the CPU's.
     pub checks: Vec<Check>,
     /// The error that prevented the comparison, if any.
     pub error: Option<String>,
@@ -145,7 +145,7 @@ pub fn examine_devices(tests: &[SelfTest]) -> Result<(Vec<Found>, ComputeDevice)
     Ok((found, select(&parse_choice("auto")?, tests)))
 }
 
-/// Returns the GPU that `auto` selects, or else the processor, with the reason.
+/// Returns the GPU that `auto` selects, or else the CPU, with the reason.
 fn select(choice: &DeviceChoice, tests: &[SelfTest]) -> ComputeDevice {
     #[cfg(feature = "wgpu")]
     return devices::best(choice, tests).map_or_else(ComputeDevice::Cpu, ComputeDevice::Gpu);
@@ -182,7 +182,7 @@ fn parse_choice(name: &str) -> Result<DeviceChoice> {
     let choice = DeviceChoice::parse(name).ok_or_else(|| {
         Error::usage(format!("unknown device `{name}`"), "`tiface config --explain device` says which")
     })?;
-    let no_gpu = if cfg!(feature = "wgpu") { "the processor is none" } else { "this build supports none" };
+    let no_gpu = if cfg!(feature = "wgpu") { "the CPU is none" } else { "this build supports none" };
     if choice.memory_gib.is_some() && (choice.name == "cpu" || cfg!(not(feature = "wgpu"))) {
         return Err(Error::usage(
             format!("device `{name}`: `--memory` limits what a training takes of a GPU, and {no_gpu}"),
@@ -199,7 +199,7 @@ fn open_named(choice: &DeviceChoice) -> Result<ComputeDevice> {
         _ => Ok(ComputeDevice::Gpu(devices::open(choice)?)),
         #[cfg(not(feature = "wgpu"))]
         other => {
-            let problem = format!("device `{other}`: this build learns on the processor alone");
+            let problem = format!("device `{other}`: this build learns on the CPU alone");
             Err(Error::usage(problem, "build with `--features wgpu`, or leave `--device` out"))
         }
     }
@@ -208,7 +208,7 @@ fn open_named(choice: &DeviceChoice) -> Result<ComputeDevice> {
 /// What to do about a GPU that failed.
 const GPU_HINT: &str = "`tiface doctor` tests the GPU, `--device cpu` leaves it out";
 
-/// A field on a GPU, which is evaluated in place of the processor's until the GPU fails.
+/// A field on a GPU, which is evaluated in place of the CPU's until the GPU fails.
 pub struct GpuField<T> {
     field: Mutex<Option<T>>,
     failure: OnceLock<String>,
@@ -226,12 +226,12 @@ impl<T> GpuField<T> {
     }
 
     /// Evaluates the field on the GPU. Returns `None` without a field or if the GPU failed, so that the caller
-    /// evaluates it on the processor.
+    /// evaluates it on the CPU.
     pub fn ask<A>(&self, evaluate: impl FnOnce(&mut T) -> Result<A>) -> Option<A> {
         let mut field = self.field.lock().ok()?;
         let result = evaluate(field.as_mut()?);
         if let Err(e) = &result {
-            let text = self.failure.get_or_init(|| format!("{e}; the processor goes on. {GPU_HINT}"));
+            let text = self.failure.get_or_init(|| format!("{e}; the CPU goes on. {GPU_HINT}"));
             tracing::warn!("{text}");
             *field = None;
         }
@@ -250,7 +250,7 @@ mod tests {
         assert_eq!(field.ask(|_| Err::<i32, _>(Error::cannot("it is lost", ""))), None);
         assert_eq!(field.ask(|_| -> Result<i32> { panic!("asked again") }), None);
         let said = field.failure().unwrap();
-        assert!(said.starts_with("it is lost; the processor goes on. `tiface doctor`"), "{said}");
+        assert!(said.starts_with("it is lost; the CPU goes on. `tiface doctor`"), "{said}");
     }
 
     #[test]

@@ -32,14 +32,14 @@ use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::{ComputeDevice, SelfTest};
 
-/// Whether a GPU learns a signed distance as the processor does.
+/// Whether a GPU learns a signed distance as the CPU does.
 pub const SDF_TEST: SelfTest = SelfTest {
     field: "signed distance",
     #[cfg(feature = "wgpu")]
     run: self_test::sdf,
 };
 
-/// Whether a GPU learns a density as the processor does.
+/// Whether a GPU learns a density as the CPU does.
 pub const DENSITY_TEST: SelfTest = SelfTest {
     field: "density",
     #[cfg(feature = "wgpu")]

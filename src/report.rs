@@ -361,8 +361,8 @@ pub fn blend_verdict(blend: &Value) -> Option<String> {
 /// Returns the height of what a run shows, from the figures of its stages: the mesh's own, else that of the masks' hull.
 pub fn height(mask: Option<&Value>, mesh: Option<&Value>) -> Option<String> {
     let of = |figures: &Value| Some((figures["height_units"].as_f64()?, figures["height_m"].as_f64()?));
-    let told = |what: &str, (units, metres): (f64, f64)| {
-        format!("{what} {metres:.3} m high ({units:.3} units of the dataset)")
+    let told = |what: &str, (units, meters): (f64, f64)| {
+        format!("{what} {meters:.3} m high ({units:.3} units of the dataset)")
     };
     let shown = mesh.and_then(|mesh| Some(told(mesh["shows"].as_str().unwrap_or("head"), of(mesh)?)));
     shown.or_else(|| Some(told("by the masks", of(mask?)?)))

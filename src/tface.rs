@@ -56,7 +56,7 @@ pub fn require_fit(
     }
 }
 
-/// Whether a GPU learns a vector-matrix field as the processor does.
+/// Whether a GPU learns a vector-matrix field as the CPU does.
 pub const VM_TEST: crate::field::SelfTest = crate::field::SelfTest {
     field: "vector-matrix",
     #[cfg(feature = "wgpu")]

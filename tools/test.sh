@@ -20,7 +20,7 @@
 #              makes the same claims on fewer steps, kills and cases, and compares the device with the CPU.
 # fuzz         a minute for every reader instead of three seconds
 # gpu          `tools/gpu/first_look.sh`, eleven trainings on a driver in software, six minutes. The check trains each field
-#              on that driver once, beside the processor.
+#              on that driver once, beside the CPU.
 # fleet        six heads under kills of tasks and of the engine, two and a half minutes. Only the recipe in `tools/fleet` is
 #              not in the check; the kills, waits and exit codes that it relies on are, in `resume`, `accidents` and `cli`.
 # guides       every command of three guides, five minutes. The commands themselves are in the check, in `cli`.
@@ -225,7 +225,7 @@ lint() {
   step "figures of the documents" "${PYTHON:-python3}" tools/reference/figures.py check
 }
 
-# Kernels are compiled for a driver in software on one processor, which leaves the other to the integration tests.
+# Kernels are compiled for a driver in software on one CPU, which leaves the other to the integration tests.
 unit_begins() {
   need_build
   begin unit tests unit "$(executable $unit_tests)" "${names[@]}"

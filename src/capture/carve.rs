@@ -148,7 +148,7 @@ impl SilhouetteTable {
     }
 }
 
-/// A cube of `n³` cells around a centre.
+/// A cube of `n³` cells around a center.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Cube {
     pub center: DVec3,

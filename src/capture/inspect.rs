@@ -131,7 +131,7 @@ pub struct Inspection {
     pub regions: usize,
     /// How well two pose files agree.
     pub poses: Vec<Agreement>,
-    /// How high the head is, in dataset units and in metres, where masks say it.
+    /// How high the head is, in dataset units and in meters, where masks say it.
     pub height: Option<[f64; 2]>,
     /// The head's box in the world.
     pub scene: Option<Aabb>,
@@ -393,8 +393,8 @@ impl fmt::Display for Inspection {
         if let Some(text) = &self.scene_text {
             writeln!(f, "  head      {text}")?;
         }
-        if let Some([units, metres]) = self.height {
-            writeln!(f, "            by the masks {units:.3} units high: {metres:.3} m")?;
+        if let Some([units, meters]) = self.height {
+            writeln!(f, "            by the masks {units:.3} units high: {meters:.3} m")?;
         }
         for warning in &self.warnings {
             writeln!(f, "  warning   {warning}")?;

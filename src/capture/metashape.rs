@@ -24,7 +24,7 @@ mod sensor;
 
 /// Elements and attributes of one file; a project of ten thousand photographs has half as many.
 const MAX_NODES: u32 = 2_000_000;
-/// A longer translation is geocentric: single precision resolves half a metre at that distance.
+/// A longer translation is geocentric: single precision resolves half a meter at that distance.
 const GEOCENTRIC: f64 = 1e5;
 
 const EXPORT: &str = "export the cameras again: File, Export, Export Cameras, as Agisoft XML";

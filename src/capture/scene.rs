@@ -419,7 +419,7 @@ fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Scene> {
     })
 }
 
-/// Plausible heights of a head, metres: with or without neck and shoulders, of a child or an adult.
+/// Plausible heights of a head, meters: with or without neck and shoulders, of a child or an adult.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.15..=0.6;
 
 /// Returns the height of the hull along `up`, in dataset units; `None` without a hull, because the end of the head is then
@@ -441,8 +441,8 @@ pub fn doubtful_height(height: f64, unit_m: f64) -> Option<String> {
     (!HEIGHTS_M.contains(&height_m)).then(|| {
         format!(
             "the head is {height:.3} units high: {height_m:.3} m if a unit of the dataset is {unit_m} m, and a head is {} to \
-             {} m high. Give the unit's length in metres, `--set capture.unit_m=METRES` (with {:.3} this head is 0.3 m high), \
-             or the height that exported meshes should have, `--set mesh.height_m=METRES`",
+             {} m high. Give the unit's length in meters, `--set capture.unit_m=METERS` (with {:.3} this head is 0.3 m high), \
+             or the height that exported meshes should have, `--set mesh.height_m=METERS`",
             HEIGHTS_M.start(),
             HEIGHTS_M.end(),
             0.3 / height
@@ -729,7 +729,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ball_is_as_high_as_it_is_wide_and_one_of_six_metres_is_doubted() {
+    fn a_ball_is_as_high_as_it_is_wide_and_one_of_six_meters_is_doubted() {
         let cameras = ring(12);
         let masks: Vec<_> = cameras.iter().map(ball).collect();
         let (scene, _) = fit(&cameras, &masks, &small()).unwrap();

@@ -69,7 +69,7 @@ pub fn cameras(options: &SyntheticOptions) -> Vec<(Camera, bool)> {
 
 /// Returns a camera on the dome, looking at the middle of the bust, rolled by `roll` radians.
 fn aim(options: &SyntheticOptions, azimuth: f64, elevation: f64, distance: f64, roll: f64) -> Camera {
-    let centre = SyntheticHead.bounds().center().as_dvec3();
+    let center = SyntheticHead.bounds().center().as_dvec3();
     let (sin, cos) = elevation.sin_cos();
     let backwards = DVec3::new(azimuth.sin() * cos, -azimuth.cos() * cos, sin);
     let right = DVec3::Z.cross(backwards).normalize();
@@ -87,7 +87,7 @@ fn aim(options: &SyntheticOptions, azimuth: f64, elevation: f64, distance: f64, 
         cy: 0.5 * h,
         distortion: Distortion::default(),
         rotation: level * DMat3::from_rotation_z(roll),
-        position: centre + distance * backwards,
+        position: center + distance * backwards,
     }
 }
 

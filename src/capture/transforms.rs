@@ -230,11 +230,11 @@ fn read_top(folder: &CaptureFolder, file: &str, top: &Object, frames: usize, lis
             .push(format!("`{file}`: `up` is not a direction of three numbers, and not looked at"));
     }
     listing.up = listing.up.or(up);
-    if let Some((name, metres)) = keys::unit_m(top)
-        && (folder.options.unit_m / metres - 1.0).abs() > 0.01
+    if let Some((name, meters)) = keys::unit_m(top)
+        && (folder.options.unit_m / meters - 1.0).abs() > 0.01
     {
         listing.warnings.push(format!(
-            "`{file}` counts in {name}, and `capture.unit_m` is {}: set `capture.unit_m = {metres}`",
+            "`{file}` counts in {name}, and `capture.unit_m` is {}: set `capture.unit_m = {meters}`",
             folder.options.unit_m
         ));
     }

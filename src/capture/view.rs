@@ -78,7 +78,7 @@ pub struct CaptureOptions {
     pub cameras: CameraPoses,
     /// Whether exposures are to be measured.
     pub exposure: Exposures,
-    /// Metres per dataset unit.
+    /// Meters per dataset unit.
     pub unit_m: f64,
     /// How what the files leave open is read, where that has been decided.
     pub reading: Option<Reading>,
@@ -124,7 +124,7 @@ pub struct Capture {
     /// Where the dataset says the head is, in the world; of use where no masks say it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub focus: Option<Aabb>,
-    /// Metres per dataset unit.
+    /// Meters per dataset unit.
     pub unit_m: f64,
     /// Where no mask is found: pictures that may be masks, and why they are not used, in a sentence.
     #[serde(skip)]
@@ -583,7 +583,7 @@ mod tests {
         };
         let half = downscaled(&c, 2);
         assert_eq!((half.width, half.height), (3, 2));
-        // the centre of the first block is (1, 1) before and (0.5, 0.5) after
+        // the center of the first block is (1, 1) before and (0.5, 0.5) after
         let (a, b) = (c.ray(Vec2::ONE).unwrap(), half.ray(Vec2::splat(0.5)).unwrap());
         assert!(a.direction.distance(b.direction) < 1e-6);
     }

@@ -23,19 +23,19 @@ use std::path::{Path, PathBuf};
 /// Points sampled on each surface.
 const SURFACE_SAMPLES: usize = 200_000;
 
-/// Distances between the mesh and another surface, millimetres.
+/// Distances between the mesh and another surface, millimeters.
 #[derive(Serialize)]
 struct Against {
     /// From every part of the mesh, caps included.
-    whole: Millimetres,
+    whole: Millimeters,
     /// From the part that three or more training cameras see, and its share of the area.
     #[serde(skip_serializing_if = "Option::is_none")]
-    seen: Option<(Millimetres, f64)>,
+    seen: Option<(Millimeters, f64)>,
     /// From the parts seen by each number of training cameras, and their shares of the area.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     by_views: Vec<ByViews>,
     /// From the other surface to the mesh: what the mesh misses.
-    back: Millimetres,
+    back: Millimeters,
     /// ... and back from its skin and its hair where three or more training cameras look, with the signed median
     /// (negative where the mesh is inside); only for photographs that separate the two.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -47,7 +47,7 @@ struct Part {
     part: &'static str,
     signed_median: f64,
     #[serde(flatten)]
-    distance: Millimetres,
+    distance: Millimeters,
 }
 
 /// The parts of a surface by how many cameras see them.
@@ -59,27 +59,27 @@ struct ByViews {
     views: &'static str,
     share: f64,
     #[serde(flatten)]
-    distance: Millimetres,
+    distance: Millimeters,
 }
 
 #[derive(Serialize)]
-struct Millimetres {
+struct Millimeters {
     mean: f64,
     median: f64,
     p90: f64,
     max: f64,
 }
 
-impl Millimetres {
-    fn new(d: Distances, unit_m: f64) -> Millimetres {
+impl Millimeters {
+    fn new(d: Distances, unit_m: f64) -> Millimeters {
         let mm = |v: f64| 1e3 * unit_m * v;
-        Millimetres { mean: mm(d.mean), median: mm(d.median), p90: mm(d.p90), max: mm(d.max) }
+        Millimeters { mean: mm(d.mean), median: mm(d.median), p90: mm(d.p90), max: mm(d.max) }
     }
 }
 
-impl Display for Millimetres {
+impl Display for Millimeters {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Millimetres { mean, median, p90, max } = self;
+        let Millimeters { mean, median, p90, max } = self;
         write!(f, "mean {mean:.3}, median {median:.3}, 90 % below {p90:.3}, worst {max:.2} mm")
     }
 }
@@ -211,7 +211,7 @@ fn compare(mesh: &Mesh, origin: DVec3, other: &Path, seen_by: Option<&Path>, uni
     truth.positions.iter_mut().for_each(|p| *p = (p.as_dvec3() + way).as_vec3());
     let empty = |e: &Path| Error::cannot(format!("`{}` has no surface to measure", e.display()), "");
     let bvh = Bvh::new(&truth);
-    let mm = |d| Millimetres::new(d, unit_m);
+    let mm = |d| Millimeters::new(d, unit_m);
     let whole = one_way(mesh, &bvh, SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
     let back = one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
     let (mut seen, mut by_views, mut parts) = (None, Vec::new(), Vec::new());

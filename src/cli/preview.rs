@@ -1,4 +1,4 @@
-//! `tiface preview`: pictures of a mesh, on a sheet labelled in a 5 × 7 bitmap font; `--page`: a viewer for the browser;
+//! `tiface preview`: pictures of a mesh, on a sheet labeled in a 5 × 7 bitmap font; `--page`: a viewer for the browser;
 //! `--watch`: a live page of a running run.
 
 use super::Invocation;

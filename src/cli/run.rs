@@ -164,7 +164,7 @@ pub(super) fn in_words(cost: Cost) -> String {
     let gib = |bytes: u64| bytes as f64 / (1u64 << 30) as f64;
     let (memory, disk) = (gib(cost.memory_bytes), gib(cost.disk_bytes));
     let time = duration(cost.seconds());
-    format!("about {time} on the processor, {memory:.1} GiB of memory, {disk:.1} GiB of disk")
+    format!("about {time} on the CPU, {memory:.1} GiB of memory, {disk:.1} GiB of disk")
 }
 
 /// Returns the effective configuration of a target and the options, with the capture's absolute path.
@@ -272,7 +272,7 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     }
     if let Some(metrics) = of(Stage::Metrics) {
         row("report", &run.path("report.html").display());
-        judgement(metrics).iter().for_each(|line| row("quality", line));
+        judgment(metrics).iter().for_each(|line| row("quality", line));
     } else if of(Stage::Mesh).is_none() && of(Stage::Render).is_none() {
         row("run", &run.dir().display());
     }
@@ -294,7 +294,7 @@ fn handles(figures: &Value) -> String {
 }
 
 /// Returns a sentence for each figure of the result's quality.
-fn judgement(metrics: &Value) -> Vec<String> {
+fn judgment(metrics: &Value) -> Vec<String> {
     let mut lines = Vec::new();
     for (set, _) in NAMES {
         let mean = &metrics[set]["head"]["mean"];
@@ -374,8 +374,8 @@ mod tests {
     }
 
     #[test]
-    fn the_judgement_names_what_was_measured() {
-        let lines = judgement(&json!({
+    fn the_judgment_names_what_was_measured() {
+        let lines = judgment(&json!({
             "raycast": {
                 "head": {"mean": {"psnr_masked": 28.123, "ssim_masked": 0.91}},
                 "parts": {"mean": {"psnr_edge": 21.016, "missing": 1416.4, "extra": 257.0, "psnr_cap": 32.1}},

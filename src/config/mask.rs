@@ -22,7 +22,7 @@ table! {
         /// units for radiance, ±0.3 for I-Face; falls back to head if the head is elsewhere) or six numbers in dataset
         /// units, lowest corner first.
         r#box: String => "head".into(), "head".into(), "ilsh".into();
-        /// Length of one dataset unit, metres.
+        /// Length of one dataset unit, meters.
         unit_m: f64, 1e-6..=1e6 => 1.0;
         /// Folder of masks inside the capture, named like the photographs; empty: search for one.
         mask_dir: String => String::new();

@@ -37,7 +37,7 @@ impl MeshFormat {
 pub enum MeshFrame {
     /// The dataset's own world, turned to +Y up where the format demands it.
     Dataset,
-    /// +Y up through the crown, face towards +Z, origin at the centre of the box.
+    /// +Y up through the crown, face towards +Z, origin at the center of the box.
     Head,
 }
 
@@ -128,7 +128,7 @@ table! {
         format: Vec<MeshFormat> => vec![MeshFormat::Glb];
         /// Coordinate frame of the files: dataset, or head (+Y up, face towards +Z, centered).
         frame: MeshFrame => MeshFrame::Dataset;
-        /// Height of the head mesh in GLB and OBJ files, metres, from the crown to the end of what is shown of the body; 0:
+        /// Height of the head mesh in GLB and OBJ files, meters, from the crown to the end of what is shown of the body; 0:
         /// as `capture.unit_m` says.
         height_m: f64, 0.0..=10.0 => 0.0;
     }

@@ -101,7 +101,7 @@ table! {
             => vec![0.1, 0.2, 0.33], vec![0.1, 0.2, 0.325, 0.5], vec![0.04, 0.06, 0.08, 0.11, 0.14];
         /// Shares of the steps after which the alpha mask is rebuilt, an increasing list.
         mask_at: Vec<f64>, 0.0..=1.0 => vec![0.1, 0.33], vec![0.1, 0.325], vec![0.04, 0.08];
-        /// Channels of the density's planes xy, xz, yz. The published ranks favour one axis of one light stage; a
+        /// Channels of the density's planes xy, xz, yz. The published ranks favor one axis of one light stage; a
         /// head may face any way.
         density_rank: Vec<usize>, 0.0..=1024.0 => vec![8, 8, 8], vec![8, 8, 8], vec![16, 4, 4];
         /// Channels of the appearance's planes xy, xz, yz.

@@ -1,7 +1,7 @@
 //! The GPUs of this machine: enumeration, selection and self-tests.
 //!
 //! One training uses a device at a time, which a lock file in the temporary folder enforces. Before `auto` selects a
-//! device, it compares a training step on the device with the processor's. The verdict is stored in the user's cache, so
+//! device, it compares a training step on the device with the CPU's. The verdict is stored in the user's cache, so
 //! the test runs once for each adapter, driver, program and field.
 
 use super::{Check, Found, SelfTest};
@@ -137,10 +137,8 @@ fn best_of<'a>(
         };
         match tests.iter().try_for_each(|test| require_passed(&device, adapter, test, file.as_deref())) {
             Ok(()) => {
-                let why = format!(
-                    "the first GPU that is free and computes what the processor does ({})",
-                    adapter.api
-                );
+                let why =
+                    format!("the first GPU that is free and computes what the CPU does ({})", adapter.api);
                 return Ok(Gpu { device, why, lock, auto_selected: true });
             }
             Err(why) => rejected.push(format!("{} {why}", adapter.name)),
@@ -335,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn auto_goes_on_with_the_processor_where_an_adapter_cannot_be_opened_and_says_why() {
+    fn auto_goes_on_with_the_cpu_where_an_adapter_cannot_be_opened_and_says_why() {
         let absent = absent("a card without memory");
         let locks = tempfile::tempdir().unwrap();
         let why = best_of([&absent].into_iter(), &named("auto"), &[], locks.path()).err().unwrap();

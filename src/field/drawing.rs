@@ -1,6 +1,6 @@
 //! Sampling of training rays for a device, from photographs in device or host memory.
 //!
-//! Photographs that fit are copied to the device, and kernels sample them. Otherwise the processor samples the same rays
+//! Photographs that fit are copied to the device, and kernels sample them. Otherwise the CPU samples the same rays
 //! from host memory while the device computes the previous step, and uploads rays and colors: about half a megabyte per
 //! step.
 //!
@@ -13,7 +13,7 @@ use crate::{Error, Result};
 
 /// Source of the rays of a training on a device.
 pub struct DeviceRays {
-    /// Photographs in device memory; `None` if the processor samples the rays.
+    /// Photographs in device memory; `None` if the CPU samples the rays.
     resident: Option<Photographs>,
     drawing: SamplingOptions,
 }

@@ -1,7 +1,7 @@
 //! Operations that every field needs from the device it trains on.
 //!
 //! A model's training step is written once, over traits of operations ([`Ops`] and one for each model); each device
-//! implements them with its own kernels. The processor computes on burn's Flex tensors and completes each step. A GPU
+//! implements them with its own kernels. The CPU computes on burn's Flex tensors and completes each step. A GPU
 //! computes on burn's CubeCL tensors; the host queues the launches of many steps and reads results back once in
 //! [`ArrayDevice::READ_EVERY`] steps.
 
@@ -60,7 +60,7 @@ pub trait Ops: Sized {
     fn gate(&self) -> <Self::Device as ArrayDevice>::Gate<'_>;
 }
 
-/// The processor.
+/// The CPU.
 pub struct Cpu;
 
 /// An array in host memory.

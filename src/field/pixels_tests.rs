@@ -1,4 +1,4 @@
-//! Tests of pixel sampling on the processor and on a device.
+//! Tests of pixel sampling on the CPU and on a device.
 
 use super::*;
 

@@ -1,4 +1,4 @@
-//! Self-tests of GPUs: one training step of a field on the GPU and on the processor, compared before `auto` trusts an
+//! Self-tests of GPUs: one training step of a field on the GPU and on the CPU, compared before `auto` trusts an
 //! adapter and its driver.
 
 use super::Check;
@@ -68,7 +68,7 @@ fn error(pairs: impl Iterator<Item = (f64, f64)>) -> f32 {
     if errors == 0.0 { 0.0 } else { (errors / all) as f32 }
 }
 
-/// Compares the result of a step on a GPU with the processor's: each loss, the gradient of each parameter, and the
+/// Compares the result of a step on a GPU with the CPU's: each loss, the gradient of each parameter, and the
 /// optimizer's updates.
 pub fn compare(field: &str, got: &StepResult, want: &StepResult) -> Vec<Check> {
     let mut checks = Vec::new();

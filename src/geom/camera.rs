@@ -1,6 +1,6 @@
 //! Cameras with a lens: pixel → ray and back.
 //!
-//! Camera axes are OpenGL's (+X right, +Y up, looking along −Z). A pixel's centre is at +0.5 and
+//! Camera axes are OpenGL's (+X right, +Y up, looking along −Z). A pixel's center is at +0.5 and
 //! (0, 0) is the top-left corner of the picture.
 
 use super::ray::Ray;
@@ -264,8 +264,8 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Returns the ray through a picture position (pixel centres at +0.5), in the camera's world;
-    /// `t` is distance from the camera centre. `None` where the lens model folds over.
+    /// Returns the ray through a picture position (pixel centers at +0.5), in the camera's world;
+    /// `t` is distance from the camera center. `None` where the lens model folds over.
     pub fn ray(&self, pixel: Vec2) -> Option<Ray> {
         let xd = (pixel.x as f64 - self.cx) / self.fx;
         let yd = (pixel.y as f64 - self.cy) / self.fy;

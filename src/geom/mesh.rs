@@ -134,7 +134,7 @@ impl Mesh {
 
 /// Texture coordinates, indexed apart from the vertices: a vertex on a seam has several.
 ///
-/// glTF's convention: the origin is the texture's top left corner, v runs down, and the centre of the texel
+/// glTF's convention: the origin is the texture's top left corner, v runs down, and the center of the texel
 /// in column i and row j is at ((i + 0.5) / width, (j + 0.5) / height).
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Atlas {

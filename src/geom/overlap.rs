@@ -11,7 +11,7 @@
 //!
 //! Which boxes meet, for a bounded effort.
 //!
-//! A triangle of a sound mesh has a few dozen neighbours, but a file may put all of its triangles into one place,
+//! A triangle of a sound mesh has a few dozen neighbors, but a file may put all of its triangles into one place,
 //! and comparing all with all is quadratic. So every search counts its comparisons: each item gets a share
 //! of an effort proportional to their number, unused effort is given to items that need more, and items that
 //! not done then is named. All of it is counted work, never time: the answer is the same on every machine.
@@ -67,7 +67,7 @@ pub(crate) struct Overlaps {
     pub pairs: Vec<(u32, u32)>,
     /// Number of triangles that share area with another one.
     pub covered: usize,
-    /// Number of triangles that were not compared with all neighbours of higher index: then both numbers above are lower bounds.
+    /// Number of triangles that were not compared with all neighbors of higher index: then both numbers above are lower bounds.
     pub left: usize,
 }
 
@@ -212,7 +212,7 @@ pub(crate) struct ChartDistance {
     /// The smallest distance between sides of different charts, up to the given limit; `None` with fewer than
     /// two charts.
     pub distance: Option<f64>,
-    /// Number of sides that were not compared with all neighbours: then the distance is an upper bound.
+    /// Number of sides that were not compared with all neighbors: then the distance is an upper bound.
     pub left: usize,
 }
 
@@ -227,7 +227,7 @@ pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDista
     // has a short way to go.
     let order: Vec<u32> = boxes.order().collect();
     let mut bound = farthest;
-    for near in order.windows(LEAF_NEIGHBOURS) {
+    for near in order.windows(LEAF_NEIGHBORS) {
         let side = &sides[near[0] as usize];
         let others = near[1..].iter().map(|&i| &sides[i as usize]).filter(|s| s.chart != side.chart);
         bound = others.fold(bound, |nearest, other| nearest.min(distance(side, other)));
@@ -254,7 +254,7 @@ pub(crate) fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDista
 }
 
 /// Number of successive sides in the order of the tree that are compared first.
-const LEAF_NEIGHBOURS: usize = 8;
+const LEAF_NEIGHBORS: usize = 8;
 
 /// Cost of a distance of two sides, in comparisons of boxes.
 const SIDE_DISTANCE_COST: usize = 8;
@@ -400,7 +400,7 @@ impl Boxes {
         Boxes { items, nodes }
     }
 
-    /// Returns the numbers of the boxes, neighbours mostly beside each other.
+    /// Returns the numbers of the boxes, neighbors mostly beside each other.
     pub(crate) fn order(&self) -> impl Iterator<Item = u32> {
         self.items.iter().map(|&(_, i)| i)
     }
@@ -479,7 +479,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_touch_and_do_not_overlap() {
+    fn neighbors_touch_and_do_not_overlap() {
         let t = at([0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);
         assert!(!share_area(t, at([1.0, 0.0, 1.0, 1.0, 0.0, 1.0]))); // a common side
         assert!(!share_area(t, at([0.5, 0.5, 1.0, 1.0, 0.9, 1.0]))); // a corner on a side

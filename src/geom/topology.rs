@@ -131,7 +131,7 @@ fn fans(triangles: &[[u32; 3]], sides: &[(u64, u32)]) -> Sets {
     fans
 }
 
-/// Analyses a mesh. Indices must lie below `positions.len()`.
+/// Analyzes a mesh. Indices must lie below `positions.len()`.
 ///
 /// ```
 /// use glam::Vec3;

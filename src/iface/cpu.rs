@@ -1,4 +1,4 @@
-//! A training step of the signed-distance field on the processor.
+//! A training step of the signed-distance field on the CPU.
 
 use super::model::shape;
 use super::occupancy::Occupancy;
@@ -22,7 +22,7 @@ use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::sdf::{self, Activations, FieldShape, WIDTH};
 use crate::kernel::cpu::{rng, weight_norm};
 
-/// The operations of [`SdfOps`] on the processor.
+/// The operations of [`SdfOps`] on the CPU.
 pub struct CpuSdf<'a> {
     config: &'a IfaceConfig,
     pixels: &'a Pixels<'a>,

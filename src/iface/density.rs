@@ -251,7 +251,7 @@ impl<O: DensityOps> TestedModel for DensityModel<'_, O> {
     }
 }
 
-/// Compares a training step on a GPU with one on the processor.
+/// Compares a training step on a GPU with one on the CPU.
 #[cfg(feature = "wgpu")]
 pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<Check>> {
     use crate::field::self_test::{CELLS_AT, SEED, compare, compare_cells, run_step, session};

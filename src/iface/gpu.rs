@@ -152,7 +152,7 @@ fn stereo_points(config: &IfaceConfig) -> usize {
     if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 }
 }
 
-/// Returns the sample capacity of a step, which equals the processor's if the device's memory and buffers are large
+/// Returns the sample capacity of a step, which equals the CPU's if the device's memory and buffers are large
 /// enough, and whether the photographs fit on the device as well.
 pub(super) fn max_samples(
     config: &IfaceConfig,
@@ -169,7 +169,7 @@ pub(super) fn max_samples(
     samples_that_fit(config, [words + EXTRA_WORDS, widest], sums, points, pixels, device)
 }
 
-/// Returns the sample capacity of a step that the processor has, with `points` besides its samples.
+/// Returns the sample capacity of a step that the CPU has, with `points` besides its samples.
 pub(super) fn wanted_samples(config: &IfaceConfig, points: usize) -> usize {
     MAX_BUDGETS * config.samples + points
 }

@@ -1,6 +1,6 @@
 //! Initialization of the signed distance from the visual hull.
 //!
-//! The hull is known before training and lies within millimetres of most of the head. Fitting the field
+//! The hull is known before training and lies within millimeters of most of the head. Fitting the field
 //! to its distance for a few hundred cheap steps replaces the thousands that carve a sphere, and gives
 //! the occupancy grid a band from the first training step.
 
@@ -19,7 +19,7 @@ use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
 use crate::kernel::cpu::{rng, weight_norm};
 use rayon::prelude::*;
 
-/// Signed distance to a hull's boundary at cell centres, in units of the box's half edge; negative inside.
+/// Signed distance to a hull's boundary at cell centers, in units of the box's half edge; negative inside.
 pub struct HullDistance {
     resolution: usize,
     values: Vec<f32>,
@@ -90,7 +90,7 @@ impl HullDistance {
     }
 }
 
-/// Fits the geometry of the field to the hull's distance, on the processor. Half of the points lie in a band around the
+/// Fits the geometry of the field to the hull's distance, on the CPU. Half of the points lie in a band around the
 /// hull's boundary.
 pub fn fit_hull(
     state: &mut SdfState,
@@ -182,7 +182,7 @@ mod tests {
         (0..r * r * r).for_each(|i| hull.set(i, norm(center(i)) < 0.6));
         let d = HullDistance::new(&hull);
         let cell = 2.0 / r as f32;
-        // (not at the very centre, where the eight neighbours all lie nearer to the boundary)
+        // (not at the very center, where the eight neighbors all lie nearer to the boundary)
         for p in [[0.2, 0.1, 0.0], [0.3, -0.2, 0.4], [0.0, 0.61, 0.0], [0.7, 0.7, 0.0], [-0.9, 0.1, 0.1]] {
             assert!((d.at(p) - (norm(p) - 0.6)).abs() < cell, "{p:?}: {} {}", d.at(p), norm(p) - 0.6);
         }

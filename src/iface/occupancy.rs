@@ -227,7 +227,7 @@ mod tests {
 
     #[test]
     fn a_steep_wall_is_kept_although_its_values_are_large() {
-        // slope 40: every centre is far from zero in value, the wall at x = 0.01 is crossed all the same
+        // slope 40: every center is far from zero in value, the wall at x = 0.01 is crossed all the same
         let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::preset(Preset::Draft) };
         let mut o = Occupancy::new(&config, None);
         o.update(&config, (1, 0), 600.0, 0.0, even(|p| 40.0 * (p[0] - 0.01)));
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn soft_places_are_kept_wider_and_their_neighbours_with_them() {
+    fn soft_places_are_kept_wider_and_their_neighbors_with_them() {
         let config =
             IfaceConfig { occupancy_resolution: 32, band: 4.0, ..IfaceConfig::preset(Preset::Draft) };
         // one side of the sphere is eight times softer

@@ -1,4 +1,4 @@
-//! Self-tests that compare a training step of a signed distance, and of a density, on a GPU with the processor's.
+//! Self-tests that compare a training step of a signed distance, and of a density, on a GPU with the CPU's.
 
 use super::cpu::CpuSdf;
 use super::density;
@@ -105,7 +105,7 @@ fn compare_sdf(adapter: &Adapter, config: IfaceConfig) -> Result<Vec<Check>> {
         let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);
         let mut on_gpu =
             SdfModel::new(GpuSdf::new(&config, &pixels, device)?, &pixels, None, &config, &session);
-        // Both keep the same cells up to rounding. The compared steps use the processor's.
+        // Both keep the same cells up to rounding. The compared steps use the CPU's.
         let [want, got] = [cells(&mut on_cpu)?, cells(&mut on_gpu)?];
         checks.push(compare_cells(way, &got.occupied.bits, &want.occupied.bits));
         if part == 1 {

@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn doubling_puts_new_centres_a_quarter_from_the_old() {
+    fn doubling_puts_new_centers_a_quarter_from_the_old() {
         // centers of the four at −¼, ¼, ¾, 5/4 of the two: 0, ¼, ¾, 1
         let large = enlarge(&[0.0, 1.0], (2, 1), (4, 1), 0.0, 1.0);
         assert_eq!(large.values, [0, 64, 191, 255]);

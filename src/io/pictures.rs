@@ -27,7 +27,7 @@ pub struct PictureInfo {
     pub alpha: bool,
     /// EXIF orientation, 1 (upright) to 8.
     pub exif: u8,
-    /// EXIF focal length as stored, a fraction of millimetres.
+    /// EXIF focal length as stored, a fraction of millimeters.
     pub focal: Option<(u32, u32)>,
 }
 
@@ -416,7 +416,7 @@ pub fn write_png_gray(path: &Path, gray: &Gray) -> Result<(), WriteError> {
     write_atomic(path, &png_gray_bytes(gray, path)?)
 }
 
-/// Writes a 16-bit gray PNG (depth in millimetres).
+/// Writes a 16-bit gray PNG (depth in millimeters).
 pub fn write_png_gray16(path: &Path, width: u32, height: u32, values: &[u16]) -> Result<(), WriteError> {
     // the encoder takes native byte order and swaps itself
     write_png(path, width, height, bytemuck::cast_slice(values), ExtendedColorType::L16)

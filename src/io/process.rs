@@ -1,4 +1,4 @@
-//! Cost of this process, its processor, and whether other processes run, as far as the system reports it.
+//! Cost of this process, its CPU, and whether other processes run, as far as the system reports it.
 
 use std::path::Path;
 use std::sync::OnceLock;
@@ -79,7 +79,7 @@ fn is_running(_: u32) -> bool {
     true
 }
 
-/// Returns the processor's name as the system reports it; empty if unknown.
+/// Returns the CPU's name as the system reports it; empty if unknown.
 pub fn processor() -> String {
     let all = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let line = all.lines().find_map(|l| l.strip_prefix("model name"));

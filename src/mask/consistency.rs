@@ -4,7 +4,7 @@
 //! that no other mask rules out. Where none does, masks contradict each other: either this view shows too much, or
 //! each view that rules out the best point of the ray shows too little. One such pixel cannot tell which; all of
 //! them together can. The view whose removal settles most of the conflict is named first, and the comparison is repeated
-//! without it, until the rest is no more than discretisation.
+//! without it, until the rest is no more than discretization.
 //!
 //! Nothing but masks and cameras is needed, so the masks of a capture are checked in the same way.
 //!

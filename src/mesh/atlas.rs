@@ -21,7 +21,7 @@ use crate::geom::{Atlas, Mesh, THOROUGH_EFFORT, overlaps, turn};
 use crate::mesh::files::{UvReport, seams_facing, uv_check};
 use crate::mesh::{check_indices, setting};
 use crate::{Error, Monitor, Result};
-use chart::{Flat, height, neighbours, part, upright};
+use chart::{Flat, height, neighbors, part, upright};
 use divide::{divide, divide_around, planar};
 use flatten::ChartSet;
 use glam::{DVec2, Vec2, Vec3};
@@ -209,7 +209,7 @@ const ROUNDS: usize = 5;
 
 /// Lays a mesh out by `uvunwrap`, with a packer of our own.
 fn by_charts(mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result<AtlasLayout> {
-    let mut flat = planar(mesh, &neighbours(mesh));
+    let mut flat = planar(mesh, &neighbors(mesh));
     let mut taken = vec![false; mesh.triangles.len()];
     flat.iter().flat_map(|f| &f.triangles).for_each(|&t| taken[t as usize] = true);
     let (rest, number) = part(mesh, |t| !taken[t as usize]);

@@ -4,7 +4,7 @@
 //!
 //! A Newton step `p −= f g / |g|²` takes out most of the error of linear interpolation; what two steps
 //! leave is the chord error of flat triangles. With the first step each vertex also slides along the
-//! surface towards the middle of its neighbours, which turns the slivers of marching cubes into fair
+//! surface towards the middle of its neighbors, which turns the slivers of marching cubes into fair
 //! triangles at no further evaluation.
 
 use crate::geom::{area_vector, shape};
@@ -87,7 +87,7 @@ impl<'a> Polish<'a> {
     }
 
     /// Makes one Newton step with values and gradients at `positions`, plus the share `relax` of the way along the
-    /// surface to the mean of the neighbours. Steps that would spoil a face are shortened or undone; returns the
+    /// surface to the mean of the neighbors. Steps that would spoil a face are shortened or undone; returns the
     /// number of such vertices.
     pub(super) fn step(
         &self,
@@ -121,12 +121,12 @@ impl<'a> Polish<'a> {
         move_vertices(positions, self.triangles, at, spoiled)
     }
 
-    /// Returns the mean of each vertex's neighbours.
+    /// Returns the mean of each vertex's neighbors.
     fn middles(&self, positions: &[Vec3]) -> Vec<Vec3> {
         let mut sums = vec![(Vec3::ZERO, 0.0f32); positions.len()];
         for t in self.triangles {
             for k in 0..3 {
-                // Around a closed fan every neighbour follows the vertex exactly once.
+                // Around a closed fan every neighbor follows the vertex exactly once.
                 let sum = &mut sums[t[k] as usize];
                 sum.0 += positions[t[(k + 1) % 3] as usize];
                 sum.1 += 1.0;

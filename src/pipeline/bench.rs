@@ -132,7 +132,7 @@ impl<'l> Bench<'l> {
         Ok(Extracted { mesh, report, cap, patches })
     }
 
-    /// Returns the number of millimetres in a scene unit.
+    /// Returns the number of millimeters in a scene unit.
     fn mm(&self) -> f64 {
         1000.0 * self.config().capture.unit_m / self.scene.scene_from_world.scale
     }

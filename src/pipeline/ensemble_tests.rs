@@ -27,7 +27,7 @@ fn flat(color: [f32; 4]) -> Image {
     image
 }
 
-/// As `render` would have left it, one metre before the camera.
+/// As `render` would have left it, one meter before the camera.
 fn put(run: &Run, member: &str, name: &str, color: Image) -> PathBuf {
     let mut depth = Image::new(SIZE.0, SIZE.1, 1);
     depth.data.fill(1.0);

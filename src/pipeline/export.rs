@@ -23,8 +23,8 @@ const FILE_KEYS: [(&str, &str, &[MeshFormat]); 6] = [
     ("mesh.format", "format", &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply]),
     ("mesh.material", "material", &[MeshFormat::Glb]),
     ("mesh.frame", "frame but the dataset's", &[MeshFormat::Glb, MeshFormat::Obj]),
-    ("mesh.height_m", "height in metres", &[MeshFormat::Glb, MeshFormat::Obj]),
-    ("capture.unit_m", "length in metres", &[MeshFormat::Glb, MeshFormat::Obj]),
+    ("mesh.height_m", "height in meters", &[MeshFormat::Glb, MeshFormat::Obj]),
+    ("capture.unit_m", "length in meters", &[MeshFormat::Glb, MeshFormat::Obj]),
     ("mesh.texture_format", "picture", &[MeshFormat::Glb, MeshFormat::Obj]),
 ];
 

@@ -190,9 +190,9 @@ pub struct Export {
     pub name: String,
     /// The up direction in the world.
     pub up: Vec3,
-    /// Metres per dataset unit.
+    /// Meters per dataset unit.
     pub unit_m: f64,
-    /// Height of a mesh in its files, metres; 0 where `unit_m` decides.
+    /// Height of a mesh in its files, meters; 0 where `unit_m` decides.
     pub height_m: f64,
     /// The coordinate frame of the files.
     pub frame: MeshFrame,
@@ -250,12 +250,12 @@ impl Export {
             MeshFrame::Dataset => (self.up, *world_from_scene),
             MeshFrame::Head => (Vec3::Y, self.head_from_mesh(mesh, world_from_scene)),
         };
-        let unit_m = self.metres(mesh, world_from_scene);
+        let unit_m = self.meters(mesh, world_from_scene);
         ExportOptions { up, unit_m, world_from_mesh, ..ExportOptions::default() }
     }
 
-    /// Returns the length of a dataset unit in the files of a mesh, metres.
-    pub(super) fn metres(&self, mesh: &Mesh, world_from_scene: &Similarity) -> f64 {
+    /// Returns the length of a dataset unit in the files of a mesh, meters.
+    pub(super) fn meters(&self, mesh: &Mesh, world_from_scene: &Similarity) -> f64 {
         if self.height_m == 0.0 {
             return self.unit_m;
         }
@@ -340,7 +340,7 @@ impl Export {
 pub(super) struct Frames {
     /// From the scene to the dataset's world.
     pub world_from_scene: Similarity,
-    /// From the scene to the coordinates of GLB and OBJ files: metres, +Y up.
+    /// From the scene to the coordinates of GLB and OBJ files: meters, +Y up.
     pub file_from_scene: Similarity,
 }
 
@@ -497,7 +497,7 @@ mod tests {
         (corners, DVec3::new(k(0), k(1), k(2)))
     }
 
-    /// A head of a quarter of a metre, six thousand kilometres from the origin: where f32 has steps of half a metre.
+    /// A head of a quarter of a meter, six thousand kilometers from the origin: where f32 has steps of half a meter.
     #[test]
     fn a_head_at_the_end_of_the_world_keeps_its_shape_in_every_file() {
         let mesh = ball();
@@ -553,8 +553,8 @@ mod tests {
             let glb = export.files(head, MeshFormat::Glb, "head").unwrap();
             let (corners, translation) = corners_of(&glb.files[0].1);
             assert_eq!(translation, DVec3::ZERO);
-            let centre = exact(mesh.bounds().center());
-            let front = ((export.cameras[0] - centre) * DVec3::new(1.0, 1.0, 0.0)).normalize();
+            let center = exact(mesh.bounds().center());
+            let front = ((export.cameras[0] - center) * DVec3::new(1.0, 1.0, 0.0)).normalize();
             let axes = [DVec3::Z.cross(front), DVec3::Z, front];
             let turned = |p: Vec3| DVec3::from(axes.map(|a| a.dot(exact(p) - place.translation)));
             let file_from_world =

@@ -39,7 +39,7 @@ pub(super) fn mesh(
     let (world_from_scene, export) = (scene.scene_from_world.inverse(), Export::new(capture, config));
     let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
     let (mut surface, report) = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
-    let mm = world_from_scene.scale * export.metres(&surface, &world_from_scene) * 1000.0;
+    let mm = world_from_scene.scale * export.meters(&surface, &world_from_scene) * 1000.0;
     report.end(c.cap).iter().for_each(|text| dir.note(text));
     report.warnings().iter().for_each(|w| dir.warn(w));
     report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
@@ -104,13 +104,13 @@ pub(super) fn mesh(
     }
     // without the translation, which f32 may not represent
     let in_place = Similarity { translation: DVec3::ZERO, ..world_from_scene };
-    let metres = export.metres(&head.mesh, &world_from_scene);
-    let size = head.mesh.transformed(&in_place).bounds().size() * metres as f32;
+    let meters = export.meters(&head.mesh, &world_from_scene);
+    let size = head.mesh.transformed(&in_place).bounds().size() * meters as f32;
     let height = export.height(&head.mesh, &world_from_scene);
     Ok(json!({
         "shows": export.shows(&head.mesh, &world_from_scene),
         "height_units": height,
-        "height_m": height * metres,
+        "height_m": height * meters,
         "vertices": head.mesh.positions.len(),
         "triangles": head.mesh.triangles.len(),
         "closed": head.mesh.is_closed(),
@@ -231,7 +231,7 @@ pub(super) fn surface_in_world(run: &Run) -> Result<Mesh> {
     read(&io::read_bytes(&path, &Limits::default())?, &path)
 }
 
-/// Describes how many handles were cut, filled or left, with lengths in millimetres.
+/// Describes how many handles were cut, filled or left, with lengths in millimeters.
 fn handles(report: &HandleReport, mm: f64) -> Value {
     let each = |lengths: &[f32]| lengths.iter().map(|&l| f64::from(l) * mm).collect::<Vec<_>>();
     json!({

@@ -48,7 +48,7 @@ pub(super) fn over(view: &mut RenderedView, background: [f32; 3]) {
 }
 
 /// Writes a view. PNG: 8-bit sRGB with straight alpha, and depth beside it in `depth/`, 16-bit
-/// millimetres, 0 = nothing. EXR: scene-linear, premultiplied, with `Z` and `N.X N.Y N.Z`. Depth and
+/// millimeters, 0 = nothing. EXR: scene-linear, premultiplied, with `Z` and `N.X N.Y N.Z`. Depth and
 /// normals only where the view has them.
 pub(super) fn write(
     folder: &Path,

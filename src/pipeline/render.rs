@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! render/tface/NAME.png   as asked for: 8-bit or EXR, over the background
-//!        tface/depth/     16-bit millimetres beside 8-bit views
+//!        tface/depth/     16-bit millimeters beside 8-bit views
 //!        tface/float/     the same view for `ensemble`: float, coded, no background
 //! ```
 //!
@@ -32,7 +32,7 @@ use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
 
 /// Renders one folder per method and one picture per camera, and the `fitted` cameras by the methods that compare poses;
-/// `unit_m` is the number of metres in a dataset unit.
+/// `unit_m` is the number of meters in a dataset unit.
 pub(super) fn render(
     c: &RenderConfig,
     renderer: &Renderer,

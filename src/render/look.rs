@@ -9,8 +9,8 @@ use glam::{Vec2, Vec3};
 /// sRGB-coded color of a surface that has no color of its own.
 const GRAY: [f32; 3] = [0.8; 3];
 
-/// Squares of the chequer along each side of a texture.
-const CHEQUER_SQUARES: f32 = 32.0;
+/// Squares of the checker along each side of a texture.
+const CHECKER_SQUARES: f32 = 32.0;
 
 /// Lamps that follow the camera: direction (right, up, to the viewer; not unit) and brightness. Key, fill and rim.
 const LAMPS: [([f32; 3], f32); 3] =
@@ -36,7 +36,7 @@ pub enum Look {
     Normals,
     /// Shape, shaded as clay.
     Matcap,
-    /// Texture coordinates, as a chequer.
+    /// Texture coordinates, as a checker.
     Uv,
     /// Triangles, as a wireframe.
     Wire,
@@ -113,7 +113,7 @@ impl Surface<'_> {
             }
             Look::Normals => normals().map(|n| (0.5 + 0.5 * n).to_array()).collect(),
             Look::Matcap => normals().map(clay).collect(),
-            Look::Uv => (0..hits.hits.len()).map(|i| self.chequer(hits, i)).collect(),
+            Look::Uv => (0..hits.hits.len()).map(|i| self.checker(hits, i)).collect(),
             Look::Wire => {
                 let on_line = |(i, n): (usize, Vec3)| {
                     let shade = 0.75 + 0.25 * n.z;
@@ -130,10 +130,10 @@ impl Surface<'_> {
         Some(hit.mix(atlas.triangles[hit.triangle as usize].map(|i| atlas.uvs[i as usize])))
     }
 
-    /// Returns a chequer that runs from red to green along u and from dark to light along v (down the texture).
-    fn chequer(&self, hits: &RayHits, i: usize) -> [f32; 3] {
+    /// Returns a checker that runs from red to green along u and from dark to light along v (down the texture).
+    fn checker(&self, hits: &RayHits, i: usize) -> [f32; 3] {
         let Some(uv) = self.uv(hits, i) else { return GRAY };
-        let square = (uv * CHEQUER_SQUARES).floor();
+        let square = (uv * CHECKER_SQUARES).floor();
         let dark = (square.x + square.y).rem_euclid(2.0) > 0.5;
         let c = [uv.x, 1.0 - uv.x, uv.y].map(|v| 0.35 + 0.6 * v.rem_euclid(1.0));
         c.map(|v| if dark { 0.55 * v } else { v })

@@ -154,9 +154,9 @@ fn short_time(seconds: f64) -> String {
 pub struct BenchResult {
     /// Version of the program.
     pub version: Cow<'static, str>,
-    /// Operating system and processor family.
+    /// Operating system and CPU family.
     pub system: String,
-    /// The processor's own name, if the system says it.
+    /// The CPU's own name, if the system says it.
     pub processor: String,
     /// Threads that were used.
     pub threads: usize,

@@ -5,7 +5,7 @@
 //! Levenberg–Marquardt with weights `1 / (1 + ‖r‖² / c²)`; points are eliminated, so that the system to solve has six
 //! unknowns for each camera (the Schur complement: Triggs, McLauchlan, Hartley, Fitzgibbon 2000, "Bundle Adjustment — A
 //! Modern Synthesis"). A camera moves by `R ← R exp(ω)`, `C ← C + t`. The matrix is small and dense, and the plain
-//! Cholesky factorization below gives the same bits on every processor, which libraries that choose instructions at run
+//! Cholesky factorization below gives the same bits on every CPU, which libraries that choose instructions at run
 //! time do not.
 
 use crate::geom::{Camera, Similarity};

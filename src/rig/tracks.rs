@@ -122,7 +122,7 @@ pub fn blurred(picture: &[f32], w: usize, deviation: f32) -> Vec<f32> {
     if picture.is_empty() {
         return Vec::new();
     }
-    // whole rows are added, which fills the lanes of the processor
+    // whole rows are added, which fills the lanes of the CPU
     let add = |out: &mut [f32], weight: f32, one: &[f32], other: &[f32]| {
         out.iter_mut().zip(one).zip(other).for_each(|((sum, a), b)| *sum += weight * (a + b));
     };

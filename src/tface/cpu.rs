@@ -1,4 +1,4 @@
-//! A training step of the vector-matrix field on the processor.
+//! A training step of the vector-matrix field on the CPU.
 
 use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
 use crate::Result;
@@ -12,7 +12,7 @@ use crate::kernel::cpu::vm::losses::{self, BackgroundMode, Targets, VmFigures};
 use crate::kernel::cpu::vm::{self, DecoderWeights, Rendered, VmField};
 use std::sync::Arc;
 
-/// The operations of [`VmOps`] on the processor.
+/// The operations of [`VmOps`] on the CPU.
 pub struct CpuVm<'a> {
     config: &'a VmConfig,
     pixels: &'a Pixels<'a>,

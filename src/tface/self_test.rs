@@ -1,4 +1,4 @@
-//! Self-test that compares a training step of the vector-matrix field on a GPU with the processor's.
+//! Self-test that compares a training step of the vector-matrix field on a GPU with the CPU's.
 
 use super::cpu::CpuVm;
 use super::gpu::GpuVm;

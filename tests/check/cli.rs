@@ -211,13 +211,13 @@ fn a_black_photograph_under_a_mask_that_shows_the_head_is_named() {
 }
 
 #[test]
-fn a_head_of_six_metres_is_doubted() {
+fn a_head_of_six_meters_is_doubted() {
     let dir = tempfile::tempdir().unwrap();
     head(dir.path());
     let (text, _) = inspected(dir.path(), &[]);
     assert!(text.contains(" units high: 0.") && !text.contains("unit_m"), "{text}");
     let (text, sound) = inspected(dir.path(), &["capture.unit_m=20"]);
-    assert!(sound && text.contains(" units high: 7.") && text.contains("capture.unit_m=METRES"), "{text}");
+    assert!(sound && text.contains(" units high: 7.") && text.contains("capture.unit_m=METERS"), "{text}");
 }
 
 #[test]
@@ -292,7 +292,7 @@ fn a_head_far_from_the_origin_is_checked_and_measured_like_one_near_it() {
             obj += &format!("f {a} {b} {c} {d}\n");
         });
         std::fs::write(dir.path().join("head.obj"), obj).unwrap();
-        // a millimetre larger on all sides
+        // a millimeter larger on all sides
         let (corners, quads) = cube(center, 0.101);
         let mut ply = String::from(
             "ply\nformat ascii 1.0\nelement vertex 8\nproperty double x\nproperty double y\nproperty double z\n\
@@ -304,10 +304,10 @@ fn a_head_far_from_the_origin_is_checked_and_measured_like_one_near_it() {
         let args = ["check", "head.obj", "--against", "truth.ply", "--require", "watertight"];
         let o = tiface(dir.path(), &args);
         assert_eq!(code(&o), 0, "{center:?} {}{}", out(&o), err(&o));
-        // from every point of the cube it is a millimetre to the other
+        // from every point of the cube it is a millimeter to the other
         let expected = "distance to the other   mean 1.000, median 1.000, 90 % below 1.000, worst 1.00 mm";
         assert!(out(&o).contains(expected), "{center:?} {}", out(&o));
-        assert!(out(&o).contains("8.0000 litres") && out(&o).contains("0.2000 × 0.2000 × 0.2000 m"));
+        assert!(out(&o).contains("8.0000 liters") && out(&o).contains("0.2000 × 0.2000 × 0.2000 m"));
     }
 }
 

@@ -1,4 +1,4 @@
-//! A whole run on a device, killed on the way and finished on the processor; on a software driver where nothing better
+//! A whole run on a device, killed on the way and finished on the CPU; on a software driver where nothing better
 //! is here.
 
 use crate::command::{code, command, err, worked};
@@ -37,7 +37,7 @@ fn psnr(folder: &Path, method: &str) -> f64 {
 }
 
 #[test]
-fn a_run_is_killed_on_the_device_goes_on_there_and_ends_on_the_processor() {
+fn a_run_is_killed_on_the_device_goes_on_there_and_ends_on_the_cpu() {
     if Adapter::all().is_empty() {
         println!("skipped: a run on a device, for no adapter is here (Mesa's lavapipe would do)");
         return;
@@ -59,12 +59,10 @@ fn a_run_is_killed_on_the_device_goes_on_there_and_ends_on_the_processor() {
     let run = |words: &[&str]| -> Output { alone(dir.path(), words).output().unwrap() };
     worked(&run(&words("wgpu:0", &[])));
     let (field, mesh) = (psnr(dir.path(), "volume"), psnr(dir.path(), "raycast"));
-    // the same fields, meshed, rendered and judged by the processor
+    // the same fields, meshed, rendered and judged by the CPU
     let text = worked(&run(&words("cpu", &["--fresh", "mesh"])));
     let (by_cpu, mesh_by_cpu) = (psnr(dir.path(), "volume"), psnr(dir.path(), "raycast"));
-    println!(
-        "volume {field:.2} dB on the device, {by_cpu:.2} on the processor; mesh {mesh:.2}, {mesh_by_cpu:.2}"
-    );
+    println!("volume {field:.2} dB on the device, {by_cpu:.2} on the CPU; mesh {mesh:.2}, {mesh_by_cpu:.2}");
     assert!((field - by_cpu).abs() < 0.01, "{field} {by_cpu}: {text}");
     assert!((mesh - mesh_by_cpu).abs() < 0.2, "{mesh} {mesh_by_cpu}: {text}");
 }

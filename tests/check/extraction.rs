@@ -15,7 +15,7 @@ fn surface(dims: [usize; 3], values: &[f32], closed: bool) -> Mesh {
     marching(&Volume { dims, values, origin: Vec3::ZERO, spacing: Vec3::ONE }, closed).unwrap().mesh
 }
 
-fn analysed(s: &Mesh) -> Topology {
+fn analyzed(s: &Mesh) -> Topology {
     topology(&s.positions, &s.triangles)
 }
 
@@ -36,7 +36,7 @@ fn padded(n: usize, outside: f32, mut value: impl FnMut() -> f32) -> ([usize; 3]
 /// Sound as a surface: closed, manifold, finite, no face without area. Nothing at all is sound too.
 fn assert_sound(name: &str, dims: [usize; 3], values: &[f32], closed: bool) -> Topology {
     let s = surface(dims, values, closed);
-    let t = analysed(&s);
+    let t = analyzed(&s);
     assert!(s.triangles.is_empty() || t.is_solid(), "{name}: {t:?}\n{values:?}");
     assert_eq!(t.unused_vertices, 0, "{name}");
     let top = Vec3::from(dims.map(|d| (d - 1) as f32));
@@ -105,14 +105,14 @@ fn a_six_cubed_board_of_ties_is_sound() {
         let (dims, v) = padded(6, 1.0, || if noise.bits() & 1 == 0 { 1.0 } else { -1.0 });
         assert_sound("ties", dims, &v, false);
     }
-    // The chequerboard: every face of every cell ambiguous and tied, so every inside node stands alone.
+    // The checkerboard: every face of every cell ambiguous and tied, so every inside node stands alone.
     let mut i = 0;
     let (dims, v) = padded(6, 1.0, || {
         let (x, y, z) = (i % 6, i / 6 % 6, i / 36);
         i += 1;
         if (x + y + z) % 2 == 0 { 1.0 } else { -1.0 }
     });
-    let t = assert_sound("chequerboard", dims, &v, false);
+    let t = assert_sound("checkerboard", dims, &v, false);
     assert_eq!((t.pieces, t.euler), (108, 216));
 }
 
@@ -267,7 +267,7 @@ fn sampled_topology(dims: [usize; 3], values: &[f32], fine: usize) -> (usize, i6
                         euler += if axes.count_ones() % 2 == 0 { 1 } else { -1 };
                     }
                 }
-                // Outside: all 26 neighbours, inside: 6. Half of each, the other half sees us.
+                // Outside: all 26 neighbors, inside: 6. Half of each, the other half sees us.
                 for dz in 0..=1isize {
                     for dy in -1..=1isize {
                         for dx in -1..=1isize {
@@ -315,7 +315,7 @@ fn right_topology(volumes: u64, volume: impl Fn(u64) -> ([usize; 3], Vec<f32>) +
         .into_par_iter()
         .map(|seed| {
             let (dims, v) = volume(seed);
-            let t = analysed(&surface(dims, &v, false));
+            let t = analyzed(&surface(dims, &v, false));
             let found = Some((t.pieces, t.euler));
             // Coarse samples miss necks and gaps; where we differ, finer ones decide.
             if [[8, 13], [16, 25]].iter().any(|fine| settled(dims, &v, fine) == found) {
@@ -509,7 +509,7 @@ fn a_head_at_1024_fits_in_half_a_gigabyte() {
 
 #[test]
 fn fields_of_any_slope_and_offset_lose_nothing() {
-    // Gradient norm 0.3 and 3; a field whose values are not centred on zero; a constant one.
+    // Gradient norm 0.3 and 3; a field whose values are not centered on zero; a constant one.
     let ball = |p: Vec3| p.distance(Vec3::new(0.1, 0.0, 0.0)) - 0.55;
     let soft: fn(Vec3) -> f32 = |p| 0.3 * (p.distance(Vec3::new(0.1, 0.0, 0.0)) - 0.55);
     let steep: fn(Vec3) -> f32 = |p| 3.0 * (p.distance(Vec3::new(0.1, 0.0, 0.0)) - 0.55);

@@ -960,7 +960,7 @@ fn ball() -> (Mesh, Atlas) {
     (mesh, atlas)
 }
 
-/// A thousand and ten thousand kilometres from the origin, where f32 has steps of 6 cm and a metre.
+/// A thousand and ten thousand kilometers from the origin, where f32 has steps of 6 cm and a meter.
 #[test]
 fn a_head_far_from_the_origin_is_watertight_in_every_format() {
     let (mesh, atlas) = ball();

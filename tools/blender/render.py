@@ -3,7 +3,7 @@
     python3.11 -m venv .venv-blender && .venv-blender/bin/pip install -r tools/readers/requirements-blender.txt
     .venv-blender/bin/python tools/blender/render.py head.glb camera.json out.png [--samples 16] [--lobes]
 
-camera.json, lengths in metres and pixels:
+camera.json, lengths in meters and pixels:
 
     { "world_from_camera": [[4 rows of 4]], "fl_x": 1200, "fl_y": 1200, "cx": 512, "cy": 512,
       "w": 1024, "h": 1024 }

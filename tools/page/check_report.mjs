@@ -184,11 +184,11 @@ try {
   await page.mouse.click(middle[0], middle[1] - box.height / 8);
   await settled(page);
   // the head fills 95 % of the canvas: an eighth of its height, on a surface that may slant
-  const millimetres = parseFloat(await distance.textContent()), tall = await page.evaluate(() => {
+  const millimeters = parseFloat(await distance.textContent()), tall = await page.evaluate(() => {
     const { viewer } = document.querySelector(".viewer");
     return 2000 * Math.tan(viewer.state.angle / 2) * viewer.state.distance / 8;
   });
-  check(`two points are ${await distance.textContent()} apart`, millimetres > 0.5 * tall && millimetres < 3 * tall, `about ${tall.toFixed(1)}`);
+  check(`two points are ${await distance.textContent()} apart`, millimeters > 0.5 * tall && millimeters < 3 * tall, `about ${tall.toFixed(1)}`);
   same("both are marked", await page.locator(".mark:visible").count(), 2);
   const marks = await page.locator(".mark").evaluateAll((all) => all.map((m) => {
     const { left, top, width, height } = m.getBoundingClientRect();

@@ -4,7 +4,7 @@
     python tools/readers/check_export.py DIR/globe.glb [--up 0 0 1]
 
 The .obj and .ply are looked for beside the .glb. GLB and OBJ are +Y up; PLY is in the dataset's world,
-whose up direction is --up and whose unit is --unit-m metres. In every reader and every file: the same
+whose up direction is --up and whose unit is --unit-m meters. In every reader and every file: the same
 bounds to 1e-6 of the size, closed after welding equal positions, positive volume. Files without a
 texture: colors present and alike. Files with one: its pixels are those of the .png beside them, and
 texture coordinates agree corner by corner, save where a reader drops them (open3d does in PLY), which

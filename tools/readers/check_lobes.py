@@ -26,7 +26,7 @@ LEAST = 35.0
 
 
 def in_file(camera, described):
-    """A camera of the run in the file's axes and metres: +Y up."""
+    """A camera of the run in the file's axes and meters: +Y up."""
     turn = turn_to_y_up(described["up"])
     pose = numpy.eye(4)
     pose[:3, :3] = turn @ numpy.reshape(camera["rotation"], (3, 3)).T  # columns are stored

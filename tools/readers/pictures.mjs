@@ -11,7 +11,7 @@ export const launch = () => chromium.launch({
     "--disable-background-networking", "--disable-component-update", "--disable-sync"],
 });
 
-/** A camera of the run in the file's axes and metres: +Y up. */
+/** A camera of the run in the file's axes and meters: +Y up. */
 export function inFile(camera, { up, unit_m: unit }) {
   const turn = new Matrix4().makeRotationFromQuaternion(
     new Quaternion().setFromUnitVectors(new Vector3(...up).normalize(), new Vector3(0, 1, 0)));

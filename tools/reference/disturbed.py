@@ -6,7 +6,7 @@
 CAPTURE is undisturbed and holds the true surface, `gt.ply`; each COPY is the same capture whose training photographs and poses
 were disturbed. Trains I-Face for 1,500 steps on each (TIFACE names the program), with poses and exposures as given and
 with `auto`, and prints a row of `perturb.md` for each: PSNR of the ray-cast mesh against held-out photographs, the median
-distance from the true skin (or surface, where there is no hair), and processor seconds. Runs one training at a time.
+distance from the true skin (or surface, where there is no hair), and CPU seconds. Runs one training at a time.
 """
 
 import json

@@ -319,7 +319,7 @@ class Truth:
         self.parts = {name: (self.seen >= 3) & (vote > self.seen / 2) for name, vote in votes.items()}
 
     def distances(self, surface, train):
-        """In thousandths of the capture's unit: millimetres of a capture in metres."""
+        """In thousandths of the capture's unit: millimeters of a capture in meters."""
         points, normals = surface.sample()
         seen = numpy.zeros(POINTS, int)
         for v in train:

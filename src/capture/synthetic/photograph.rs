@@ -141,7 +141,7 @@ impl Studio {
         self.loose_hair(origin + closest.1 * direction, closest.0, direction)
     }
 
-    /// Returns the crossing between `outside` and `inside` by halving, to some micrometres.
+    /// Returns the crossing between `outside` and `inside` by halving, to some micrometers.
     fn cross(&self, origin: Vec3, direction: Vec3, mut outside: f32, mut inside: f32) -> f32 {
         for _ in 0..8 {
             let middle = 0.5 * (outside + inside);
@@ -348,9 +348,9 @@ fn skin(q: Vec3) -> Vec3 {
 
 fn eye(q: Vec3) -> Vec3 {
     // both eyes look straight ahead, the pupils a little towards each other
-    let centre = Vec3::new(EYE.x * q.x.signum(), EYE.y, EYE.z);
+    let center = Vec3::new(EYE.x * q.x.signum(), EYE.y, EYE.z);
     let gaze = Vec3::new(-0.06 * q.x.signum(), -1.0, 0.02).normalize();
-    let d = (q - centre).normalize_or_zero();
+    let d = (q - center).normalize_or_zero();
     let off = d.dot(gaze).clamp(-1.0, 1.0).acos() * EYE_RADIUS;
     let veins = 0.10 * smooth(0.45, 0.8, cloud(q * 500.0));
     let white = Vec3::new(0.66, 0.62 - veins, 0.58 - veins);
@@ -377,7 +377,7 @@ fn garment(q: Vec3) -> Vec3 {
     Vec3::new(0.030, 0.048, 0.105) * weave * worn * 1.15 + 0.05 * seam
 }
 
-/// Radius of the sphere of lamps around the head, metres.
+/// Radius of the sphere of lamps around the head, meters.
 const LAMP_RADIUS: f32 = 1.7;
 
 /// Returns what a ray that misses the head sees.

@@ -1,7 +1,7 @@
 //! The form of the demo head: a bust as one signed-distance function.
 //!
 //! Ellipsoids, capsules and spheres joined by quadratic smooth unions and cuts (Quilez, "Smooth
-//! minimum"), with a hair cap whose surface is displaced along combed strands. World: metres,
+//! minimum"), with a hair cap whose surface is displaced along combed strands. World: meters,
 //! +Z up, the face looks along −Y. Chin to crown is [`SyntheticHead::HEAD_HEIGHT`].
 //!
 //! Displacements, and everything else that is drawn, come from smooth value noise and hashed random numbers: the same bits
@@ -45,14 +45,14 @@ const LIPSCHITZ: f32 = 1.75;
 
 /// The middle of an eyeball on the +X side, head coordinates.
 pub(super) const EYE: Vec3 = Vec3::new(0.0315, -0.0765, 0.004);
-/// Radius of an eyeball, metres.
+/// Radius of an eyeball, meters.
 pub(super) const EYE_RADIUS: f32 = 0.0125;
 
 impl SyntheticHead {
-    /// Chin to crown without hair, metres: the yardstick for "per cent of head height".
+    /// Chin to crown without hair, meters: the yardstick for "per cent of head height".
     pub const HEAD_HEIGHT: f32 = 0.25;
 
-    /// Signed distance, metres, negative inside, scaled to a slope of at most 1: never more than
+    /// Signed distance, meters, negative inside, scaled to a slope of at most 1: never more than
     /// the true distance, about half of it in places. For measuring use [`SyntheticHead::distance`].
     pub fn sdf(&self, p: Vec3) -> f32 {
         let parts = parts(p - OFFSET);
@@ -82,8 +82,8 @@ impl SyntheticHead {
         (Vec3::from_array(rise).normalize_or_zero(), here.material())
     }
 
-    /// Returns the distance from `p` to the surface, metres, ≥ 0, to first order: `|sdf| / |∇sdf|`. Good within
-    /// a few millimetres of the surface, where reconstructions are judged.
+    /// Returns the distance from `p` to the surface, meters, ≥ 0, to first order: `|sdf| / |∇sdf|`. Good within
+    /// a few millimeters of the surface, where reconstructions are judged.
     pub fn distance(&self, p: Vec3) -> f32 {
         self.sdf(p).abs() / self.gradient(p).length().max(0.05)
     }
@@ -281,14 +281,14 @@ fn hair(q: Vec3, skull: f32) -> f32 {
     intersection(cap, line, 0.024)
 }
 
-/// Returns how far the hairline is pushed back or let down, metres.
+/// Returns how far the hairline is pushed back or let down, meters.
 fn fringe(q: Vec3) -> f32 {
     let slant = noise(Vec3::new(q.x * 95.0 + 25.0 * q.z, q.y * 60.0, 3.0));
     0.011 * (slant - 0.5)
 }
 
 /// Returns where strands run from the whorl, as a unit vector that is the same along each, and the distance from it,
-/// metres.
+/// meters.
 pub(super) fn combed(q: Vec3) -> (Vec2, f32) {
     let from_whorl = Vec2::new(q.x + 0.010, q.y - 0.055);
     let reach = from_whorl.length();
@@ -297,7 +297,7 @@ pub(super) fn combed(q: Vec3) -> (Vec2, f32) {
     (Vec2::new(cos, sin).rotate(from_whorl / reach.max(1e-4)), reach)
 }
 
-/// Clumps of hair running away from the whorl, metres outward, 0 at the whorl itself.
+/// Clumps of hair running away from the whorl, meters outward, 0 at the whorl itself.
 fn strands(q: Vec3) -> f32 {
     let (turned, reach) = combed(q);
     let amount = (reach / 0.05).min(1.0);
@@ -427,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn the_head_is_a_quarter_of_a_metre_from_chin_to_crown() {
+    fn the_head_is_a_quarter_of_a_meter_from_chin_to_crown() {
         // down the middle of the skull, bald: q = (0, 0.02, z) leaves the skull at 0.043 + 0.085 = 0.128
         assert!(parts(Vec3::new(0.0, 0.02, 0.128)).skin.abs() < 2e-3);
         // under the chin: 0.128 − 0.25 = −0.122
@@ -436,7 +436,7 @@ mod tests {
     }
 
     #[test]
-    fn distance_is_half_a_millimetre_half_a_millimetre_off_the_surface() {
+    fn distance_is_half_a_millimeter_half_a_millimeter_off_the_surface() {
         let points = SyntheticHead.surface_points(1000, 5);
         let mut errors: Vec<f32> = points
             .iter()

@@ -98,14 +98,14 @@ const CHANGES: [Change; 10] = [
         keys: "rolling_shutter",
         has_effect: is_nonzero,
         unless: "",
-        says: "the rows of a photograph were seen at different moments, which is not modelled",
+        says: "the rows of a photograph were seen at different moments, which is not modeled",
         hint: "",
     },
     Change {
         keys: "transform_matrix_start transform_matrix_end",
         has_effect: is_given,
         unless: "",
-        says: "the camera moved during the exposure, which is not modelled",
+        says: "the camera moved during the exposure, which is not modeled",
         hint: "",
     },
     Change {
@@ -412,10 +412,10 @@ impl KeyLog {
     }
 }
 
-/// Returns the metres of the unit that a file names, if that is a known unit of length.
+/// Returns the meters of the unit that a file names, if that is a known unit of length.
 pub(super) fn unit_m(top: &Object) -> Option<(&str, f64)> {
     let name = ["units", "unit"].iter().find_map(|key| top.get(*key)?.as_str())?;
-    let metres = match name.trim().to_ascii_lowercase().trim_end_matches('s') {
+    let meters = match name.trim().to_ascii_lowercase().trim_end_matches('s') {
         "m" | "metre" | "meter" => 1.0,
         "dm" | "decimetre" | "decimeter" => 0.1,
         "cm" | "centimetre" | "centimeter" => 0.01,
@@ -423,7 +423,7 @@ pub(super) fn unit_m(top: &Object) -> Option<(&str, f64)> {
         "in" | "inch" | "inche" => 0.0254,
         _ => return None,
     };
-    Some((name, metres))
+    Some((name, meters))
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! A training step of the density on the processor.
+//! A training step of the density on the CPU.
 
 use super::shape;
 use super::{DensityGroups, DensityOps, OCCUPIED};
@@ -27,7 +27,7 @@ pub fn march(
     density::cut(&all, &density::evaluate(shape, table, weights, &x, None).density, dt)
 }
 
-/// The operations of [`DensityOps`] on the processor.
+/// The operations of [`DensityOps`] on the CPU.
 pub struct CpuDensity<'a> {
     config: &'a IfaceConfig,
     pixels: &'a Pixels<'a>,

@@ -125,7 +125,7 @@ fn block(x: &[[f32; 3]]) -> [[f32; 3]; LANES] {
     x.first_chunk().copied().unwrap_or_else(padded)
 }
 
-/// Returns the [`cells`] of the first block of samples, and has the processor fetch their entries of `table`: the finer
+/// Returns the [`cells`] of the first block of samples, and has the CPU fetch their entries of `table`: the finer
 /// tables are larger than its second-level cache.
 #[inline(always)]
 fn fetched_cells<const F: bool>(

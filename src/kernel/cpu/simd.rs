@@ -138,7 +138,7 @@ pub fn ln_1p<const F: bool>(e: f32) -> f32 {
 }
 
 /// Returns `g` if `h` is positive, else 0: the gradient of a relu whose output is `h`. A branch would become a masked store,
-/// which takes tens of cycles on some processors.
+/// which takes tens of cycles on some CPUs.
 #[inline(always)]
 pub fn relu_gradient(g: f32, h: f32) -> f32 {
     f32::from_bits(g.to_bits() & u32::from(h > 0.0).wrapping_neg())

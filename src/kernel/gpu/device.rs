@@ -254,7 +254,7 @@ fn memory_of(adapter: &wgpu::Adapter, integrated: bool) -> [Option<u64>; 2] {
 }
 
 /// Returns the memory in heaps, given the bytes of each and whether it is local to the device: the
-/// largest local one. An integrated GPU has the memory of the processor, and its local heap may be
+/// largest local one. An integrated GPU has the memory of the CPU, and its local heap may be
 /// a small part that the firmware keeps for it; so it has all heaps.
 #[cfg(any(test, not(target_vendor = "apple")))]
 fn memory_of_heaps(heaps: impl Iterator<Item = (u64, bool)>, integrated: bool) -> Option<u64> {
@@ -737,7 +737,7 @@ pub(crate) mod tests {
     fn a_small_heap_of_an_integrated_gpu_is_not_all_of_its_memory() {
         const GIB: u64 = 1 << 30;
         let memory = |heaps: &[(u64, bool)], integrated| memory_of_heaps(heaps.iter().copied(), integrated);
-        // a card, the part of it that the processor sees, and the processor's memory
+        // a card, the part of it that the CPU sees, and the CPU's memory
         assert_eq!(memory(&[(8 * GIB, true), (GIB / 4, true), (32 * GIB, false)], false), Some(8 * GIB));
         assert_eq!(memory(&[(32 * GIB, false)], false), None);
         assert_eq!(memory(&[(GIB / 2, true), (15 * GIB, false)], true), Some(31 * GIB / 2));

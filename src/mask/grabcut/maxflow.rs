@@ -1,12 +1,12 @@
 //! The smallest cut of a picture's pixels into two sets (Boykov & Kolmogorov 2004).
 //!
-//! Pixels are nodes joined to their 8 neighbors and to two terminals, *head* and *background*. A labelling costs
+//! Pixels are nodes joined to their 8 neighbors and to two terminals, *head* and *background*. A labeling costs
 //!
 //! ```text
 //! E = Σ_p cost of p's label + Σ_pq w_pq · [p and q have different labels]
 //! ```
 //!
-//! and the smallest cut is the labelling that costs least. Two search trees grow from the terminals until they
+//! and the smallest cut is the labeling that costs least. Two search trees grow from the terminals until they
 //! touch; the path is saturated; what that tears off is adopted by another parent or set free, and the trees are
 //! reused for the next path. Capacities are whole numbers: sums are exact and the result is the same everywhere.
 
@@ -432,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn every_small_grid_is_cut_as_cheaply_as_trying_all_labellings() {
+    fn every_small_grid_is_cut_as_cheaply_as_trying_all_labelings() {
         for (k, (w, h)) in [(1, 1), (4, 1), (1, 5), (3, 3), (4, 3), (3, 4), (2, 6)].into_iter().enumerate() {
             for seed in 0..12 {
                 let (graph, plain) = random(w, h, 100 * k as u64 + seed);

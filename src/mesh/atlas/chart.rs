@@ -138,7 +138,7 @@ pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
 
 /// Returns the triangle across the side from corner k to k + 1 of each triangle; [`NONE`] if not exactly one other
 /// shares it.
-pub(super) fn neighbours(mesh: &Mesh) -> Vec<[u32; 3]> {
+pub(super) fn neighbors(mesh: &Mesh) -> Vec<[u32; 3]> {
     let mut beside = vec![[NONE; 3]; mesh.triangles.len()];
     for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {
         if let [(_, a), (_, b)] = *run {

@@ -1,4 +1,4 @@
-//! A surface divided into few charts: along the lines of a smooth copy, what is too small joined to a neighbour,
+//! A surface divided into few charts: along the lines of a smooth copy, what is too small joined to a neighbor,
 //! laid flat, and relaxed to the sizes of the true surface.
 //!
 //! ```text
@@ -19,7 +19,7 @@
 //! flattened in one piece by a smooth copy, and relaxed to its true sizes; the rim is the plane's contour, short and
 //! out of the way. The rest is divided as any surface.
 
-use super::chart::{Flat, NONE, neighbours, part, straighten, stretch};
+use super::chart::{Flat, NONE, neighbors, part, straighten, stretch};
 use super::flatten::{ChartSet, STRETCHED, flatten, relax, smoothed};
 use crate::geom::{Mesh, THOROUGH_EFFORT, overlaps};
 use crate::{Monitor, Result};
@@ -31,7 +31,7 @@ use std::collections::HashMap;
 /// 19 with 30; with 60, limbs become strings.
 const SMOOTHING: usize = 30;
 
-/// Share of the surface below which a chart joins a neighbour.
+/// Share of the surface below which a chart joins a neighbor.
 const MIN_CHART_SHARE: f64 = 0.008;
 
 /// Times that regions are joined and laid flat.
@@ -51,7 +51,7 @@ const SPLITS: usize = 3;
 
 /// Divides a mesh and lays it flat.
 pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<ChartSet> {
-    let adjacent = neighbours(mesh);
+    let adjacent = neighbors(mesh);
     let smooth = smoothed(mesh, SMOOTHING);
     let mut best = flatten(&smooth, None, STRETCHED, monitor)?;
     for _ in 0..JOINS {
@@ -316,7 +316,7 @@ pub(super) fn divide_around(mesh: &Mesh, front: Vec3, monitor: &dyn Monitor) -> 
 /// Caps worth flattening, the deepest first: for each triangle whether it belongs.
 fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     let count = mesh.triangles.len();
-    let adjacent = neighbours(mesh);
+    let adjacent = neighbors(mesh);
     let depth: Vec<f32> = (0..count as u32)
         .map(|t| {
             let [a, b, c] = mesh.corners(t).map(|p| p.dot(front));
@@ -378,7 +378,7 @@ fn cap(adjacent: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<b
 
 #[cfg(test)]
 mod tests {
-    use super::super::chart::{neighbours, twice_area};
+    use super::super::chart::{neighbors, twice_area};
     use super::*;
     use crate::Quiet;
     use glam::Vec3;
@@ -404,12 +404,12 @@ mod tests {
     }
 
     #[test]
-    fn a_crumb_joins_the_neighbour_with_the_longest_border() {
+    fn a_crumb_joins_the_neighbor_with_the_longest_border() {
         // 20 × 20 squares: left and right half, and one square on the left of the line between them
         let mesh = sheet(20, |_, _| 0.0);
         let crumb = |q: u32| q % 20 == 9 && q / 20 == 10;
         let flat = charts(&mesh, |t| if crumb(t / 2) { 2 } else { u32::from(t / 2 % 20 >= 10) });
-        let labels = joined(&mesh, &neighbours(&mesh), &flat);
+        let labels = joined(&mesh, &neighbors(&mesh), &flat);
         // three of its sides are the left half's
         assert!((0..800).all(|t: u32| labels[t as usize] == u32::from(t / 2 % 20 >= 10)));
     }
@@ -422,7 +422,7 @@ mod tests {
         mesh.triangles.push([island, island + 1, island + 2]);
         let mut flat = charts(&mesh, |t| u32::from(t == 800));
         flat.charts[0].triangles.retain(|t| !(300..303).contains(t));
-        let labels = joined(&mesh, &neighbours(&mesh), &flat);
+        let labels = joined(&mesh, &neighbors(&mesh), &flat);
         assert!((0..800).all(|t| labels[t] == 0) && labels[800] == 1);
     }
 
@@ -501,7 +501,7 @@ mod tests {
     fn the_disc_under_a_dome_is_one_chart_of_its_own_size() {
         let mesh = bust();
         assert!(mesh.is_closed());
-        let found = planar(&mesh, &neighbours(&mesh));
+        let found = planar(&mesh, &neighbors(&mesh));
         assert_eq!(found.iter().map(|f| f.triangles.len()).collect::<Vec<_>>(), [40]);
         assert!((0..40).all(|k| twice_area(found[0].at(k)) > 0.0));
         // 40 triangles of a regular polygon: 20 · sin(2π / 40)
@@ -512,7 +512,7 @@ mod tests {
     fn a_round_surface_has_no_flat_piece() {
         let mut mesh = bust();
         mesh.triangles.retain(|t| !t.contains(&1));
-        assert!(planar(&mesh, &neighbours(&mesh)).is_empty());
+        assert!(planar(&mesh, &neighbors(&mesh)).is_empty());
     }
 }
 
@@ -575,7 +575,7 @@ mod face_tests {
         let sizes: Vec<usize> = found.iter().map(|c| c.iter().filter(|i| **i).count()).collect();
         assert!(sizes.is_sorted_by(|a, b| a > b), "{sizes:?}");
         // one piece within, one without: the rim is one line
-        let adjacent = neighbours(&mesh);
+        let adjacent = neighbors(&mesh);
         for inside in found {
             for side in [true, false] {
                 let first = inside.iter().position(|&i| i == side).unwrap();

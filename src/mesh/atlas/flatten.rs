@@ -3,7 +3,7 @@
 //!
 //! # Smoothing
 //!
-//! A smoothed copy of a surface: every vertex moves to the mean of its neighbours (uniform Laplacian; Taubin 1995
+//! A smoothed copy of a surface: every vertex moves to the mean of its neighbors (uniform Laplacian; Taubin 1995
 //! without the step back, since here the shrinking is wanted).
 //!
 //! A chart is a way to number the corners of triangles: coordinates that fold nowhere on the smooth copy fold
@@ -457,9 +457,9 @@ mod tests {
     }
 
     #[test]
-    fn a_spike_becomes_the_mean_of_its_neighbours() {
+    fn a_spike_becomes_the_mean_of_its_neighbors() {
         let smooth = smoothed(&sheet(), 1);
-        // its six neighbours lie in the plane, and each has six of which it is one
+        // its six neighbors lie in the plane, and each has six of which it is one
         assert_eq!(smooth.positions[12].z, 0.0);
         assert!((smooth.positions[7].z - 8.0 / 6.0).abs() < 1e-6);
     }
@@ -467,7 +467,7 @@ mod tests {
     #[test]
     fn a_border_is_smoothed_along_itself() {
         let smooth = smoothed(&sheet(), 1);
-        // halfway from y = -1 to the mean of its two neighbours on the border, 0; the inside has no say
+        // halfway from y = -1 to the mean of its two neighbors on the border, 0; the inside has no say
         assert_eq!(smooth.positions[2], Vec3::new(2.0, -0.5, 0.0));
         let long = smoothed(&sheet(), 50);
         assert!(long.positions.iter().all(|p| p.is_finite() && p.z.abs() < 0.01));

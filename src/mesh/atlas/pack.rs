@@ -246,7 +246,7 @@ impl Mask {
         for &[a, b] in outline {
             let (a, b) = (a + reach, b + reach);
             grown_side(&mut near, a, b, reach, [width, height]);
-            // even-odd filling at the cells' centres: a side turns over all that is right of it
+            // even-odd filling at the cells' centers: a side turns over all that is right of it
             let (low, high) = if a.y < b.y { (a, b) } else { (b, a) };
             let (from, to) =
                 ((low.y - 0.5).ceil().max(0.0) as usize, (high.y - 0.5).ceil().max(0.0) as usize);

@@ -2,7 +2,7 @@
 //!
 //! Every texel is sampled at `side × side` regularly spaced points. A texel that a triangle touches
 //! without meeting any point still belongs to it (conservative rasterization): its one sample is the
-//! triangle's point nearest to the texel's centre. Triangles thinner than a texel are never lost.
+//! triangle's point nearest to the texel's center. Triangles thinner than a texel are never lost.
 
 use crate::geom::{Atlas, Hit};
 use glam::Vec2;

@@ -188,7 +188,7 @@ pub fn fill(image: &mut Image, covered: &[bool], gutter: u32) {
 /// Copies the nearest covered texel into every texel within `gutter` of one (Euclidean); which are known now.
 fn grow(image: &mut Image, covered: &[bool], gutter: u32) -> Vec<bool> {
     let (w, h) = (image.width as usize, image.height as usize);
-    // the nearest covered texel, found ring by ring through the neighbours' (a chamfer propagation: exact but
+    // the nearest covered texel, found ring by ring through the neighbors' (a chamfer propagation: exact but
     // for rare ties a fraction of a texel apart)
     let mut source: Vec<u32> =
         covered.iter().enumerate().map(|(i, &c)| if c { i as u32 } else { u32::MAX }).collect();
@@ -197,7 +197,7 @@ fn grow(image: &mut Image, covered: &[bool], gutter: u32) -> Vec<bool> {
         dx * dx + dy * dy
     };
     let mut front: Vec<u32> = Vec::new();
-    let neighbours = |i: usize| {
+    let neighbors = |i: usize| {
         let (x, y) = ((i % w) as isize, (i / w) as isize);
         (0..9).filter(|&k| k != 4).filter_map(move |k| {
             let (x, y) = (x + k % 3 - 1, y + k / 3 - 1);
@@ -205,7 +205,7 @@ fn grow(image: &mut Image, covered: &[bool], gutter: u32) -> Vec<bool> {
         })
     };
     for i in (0..w * h).filter(|&i| covered[i]) {
-        if neighbours(i).any(|j| !covered[j]) {
+        if neighbors(i).any(|j| !covered[j]) {
             front.push(i as u32);
         }
     }
@@ -214,7 +214,7 @@ fn grow(image: &mut Image, covered: &[bool], gutter: u32) -> Vec<bool> {
         let mut next = Vec::new();
         for &i in &front {
             let s = source[i as usize];
-            for j in neighbours(i as usize) {
+            for j in neighbors(i as usize) {
                 let d = distance(j, s);
                 if d <= reach && !covered[j] && (source[j] == u32::MAX || distance(j, source[j]) > d) {
                     source[j] = s;

@@ -9,7 +9,7 @@ use crate::geom::{Aabb, Mesh};
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Skin vertices kept of a ring: enough for one every few millimetres.
+/// Skin vertices kept of a ring: enough for one every few millimeters.
 const RING: usize = 512;
 
 /// The cap of a surface: its box and the colors of its rim.

@@ -56,7 +56,7 @@ pub struct HandleReport {
 }
 
 impl HandleReport {
-    /// Returns a sentence if handles were cut or filled; `mm` is the unit of the positions in millimetres.
+    /// Returns a sentence if handles were cut or filled; `mm` is the unit of the positions in millimeters.
     pub fn warning(&self, mm: f64) -> Option<String> {
         let list = |lengths: &[f32]| {
             let each: Vec<String> = lengths.iter().map(|&l| format!("{:.0}", f64::from(l) * mm)).collect();

@@ -138,7 +138,7 @@ pub(super) fn sided(value: f32, inside: bool) -> f32 {
     if inside { value } else { value.max(0.0) }
 }
 
-/// Finite stand-ins: the sign as documented, the size that of the largest finite neighbour. One value per node, not
+/// Finite stand-ins: the sign as documented, the size that of the largest finite neighbor. One value per node, not
 /// per cell, so that cells agree on their common edges.
 fn repair(volume: &Volume, out: &mut LevelSet) -> Vec<f32> {
     let [nx, ny, _] = volume.dims;
@@ -146,18 +146,14 @@ fn repair(volume: &Volume, out: &mut LevelSet) -> Vec<f32> {
     for (i, &v) in volume.values.iter().enumerate().filter(|(_, v)| !v.is_finite()) {
         let node = [i % nx, i / nx % ny, i / nx / ny];
         out.non_finite += 1;
-        let size = largest_neighbour(node, volume.dims, |[x, y, z]| volume.values[(z * ny + y) * nx + x]);
+        let size = largest_neighbor(node, volume.dims, |[x, y, z]| volume.values[(z * ny + y) * nx + x]);
         values[i] = if v == f32::NEG_INFINITY { -size } else { size };
     }
     values
 }
 
-/// Returns the size of the largest finite value among a node and its 26 neighbours; 1 without any.
-pub(super) fn largest_neighbour(
-    node: [usize; 3],
-    dims: [usize; 3],
-    value: impl Fn([usize; 3]) -> f32,
-) -> f32 {
+/// Returns the size of the largest finite value among a node and its 26 neighbors; 1 without any.
+pub(super) fn largest_neighbor(node: [usize; 3], dims: [usize; 3], value: impl Fn([usize; 3]) -> f32) -> f32 {
     let around = |axis: usize| node[axis].saturating_sub(1)..(node[axis] + 2).min(dims[axis]);
     let mut size = 0.0f32;
     for z in around(2) {
@@ -426,7 +422,7 @@ fn for_each_active(bits: &Bits, j: usize, k: usize, mut visit: impl FnMut(usize,
         while active != 0 {
             let i = active.trailing_zeros();
             active &= active - 1;
-            // Two neighbouring bits of each row; the second may be the next word's first.
+            // Two neighboring bits of each row; the second may be the next word's first.
             let pair = |r: usize| ((now[r] >> i | next[r] << 1 << (63 - i)) & 3) as u8;
             visit(64 * w + i as usize, pair(0) | pair(1) << 2 | pair(2) << 4 | pair(3) << 6);
         }
@@ -513,7 +509,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finite_is_counted_and_takes_the_size_of_its_neighbours() {
+    fn what_is_not_finite_is_counted_and_takes_the_size_of_its_neighbors() {
         let mut v = vec![2.0; 27];
         v[13] = f32::NEG_INFINITY;
         v[4] = f32::NAN;

@@ -14,7 +14,7 @@
 //!    together. This decides all cases of Chernyaev 1995, those corrected by Custodio et al. 2013
 //!    included (10, 12, 13), from one axis: a trilinear surface has no piece that meets no side face.
 //! 3. **Triangles.** A disk spans each lone loop, a strip joins two. No inner edge joins two vertices on
-//!    one cube face, because the neighbour may use the same pair and the edge would have four faces. A
+//!    one cube face, because the neighbor may use the same pair and the edge would have four faces. A
 //!    loop that allows no such triangulation gets a vertex in its middle.
 
 use glam::Vec3;
@@ -366,10 +366,10 @@ fn disk(list: &[u8], at: &[[f64; 3]; 12], out: &mut CellSurface) {
         }
         return;
     }
-    let centre = INNER + out.inner.len() as u8;
+    let center = INNER + out.inner.len() as u8;
     let mean = |axis: usize| list.iter().map(|&e| at[e as usize][axis]).sum::<f64>() / n as f64;
     out.inner.push([mean(0), mean(1), mean(2)]);
-    out.triangles.extend((0..n).map(|i| [list[i], list[(i + 1) % n], centre]));
+    out.triangles.extend((0..n).map(|i| [list[i], list[(i + 1) % n], center]));
 }
 
 /// Joins two loops by a closed strip of triangles with the shortest allowed rungs; where the faces

@@ -2,7 +2,7 @@
 //!
 //! 1. Every `coarse_step`-th node of the grid, along each axis, is evaluated (every 8th: 0.2 %).
 //! 2. So is every node along the coarse edges that change sign.
-//! 3. **Flood.** Whenever two evaluated neighbours differ in sign, all four cells around that edge are
+//! 3. **Flood.** Whenever two evaluated neighbors differ in sign, all four cells around that edge are
 //!    evaluated, until none is left. The rule depends on evaluated nodes only, so the surface it leaves is
 //!    closed by construction, and equal to the dense one on every piece it met.
 //!
@@ -19,7 +19,7 @@
 //! vertex on a block's border has one owner and one index: the block's first plus a count of bits before
 //! it. Nothing is merged by distance.
 
-use super::marching::{LevelSet, PartCounts, cell_point, edge_point, largest_neighbour, sided};
+use super::marching::{LevelSet, PartCounts, cell_point, edge_point, largest_neighbor, sided};
 use super::marching_cell::{CASES, CellOutput, CellSurface, EDGES, crossed, crossing, resolve};
 use super::{BATCH, NodeGrid};
 use crate::geom::SdfField;
@@ -367,14 +367,14 @@ impl Blocks {
         self.find(node).map_or(f32::NAN, |b| b.values[64 * plane + bit.trailing_zeros() as usize])
     }
 
-    /// As in the dense volume: the size of the largest finite known neighbour, 1 without any.
+    /// As in the dense volume: the size of the largest finite known neighbor, 1 without any.
     fn repair(&mut self, out: &mut LevelSet) {
         let nodes = std::mem::take(&mut self.non_finite);
         out.non_finite = nodes.len();
         let sizes: Vec<f32> = nodes
             .iter()
             .map(|&n| {
-                largest_neighbour(n, self.dims, |m| match self.known(m) {
+                largest_neighbor(n, self.dims, |m| match self.known(m) {
                     Some(_) => self.value(m),
                     None => f32::NAN,
                 })

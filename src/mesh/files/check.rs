@@ -85,9 +85,9 @@ pub struct CheckReport {
     pub min: [f64; 3],
     /// Highest corner.
     pub max: [f64; 3],
-    /// Size of the box in metres.
+    /// Size of the box in meters.
     pub size_m: [f64; 3],
-    /// Enclosed volume in litres, negative when wound inward; an open mesh encloses none.
+    /// Enclosed volume in liters, negative when wound inward; an open mesh encloses none.
     pub volume_l: Option<f64>,
     /// Pieces of a closed mesh that are inside out and no cavity of another piece, or that enclose nothing. A piece is what
     /// edges connect.
@@ -114,7 +114,7 @@ pub struct PieceReport {
     pub triangles: usize,
     /// Middle of its box, in the file's units.
     pub center: [f64; 3],
-    /// Enclosed volume in litres: negative when it is inside out, zero when it encloses nothing.
+    /// Enclosed volume in liters: negative when it is inside out, zero when it encloses nothing.
     pub volume_l: f64,
 }
 
@@ -227,7 +227,7 @@ impl fmt::Display for CheckReport {
         let [watertight, manifold, normals] =
             [self.is_watertight(), self.manifold, self.has_normals].map(yes);
         let orientation = self.orientation();
-        let volume = volume_l.map_or("undefined: the mesh is open".into(), |v| format!("{v:.4} litres"));
+        let volume = volume_l.map_or("undefined: the mesh is open".into(), |v| format!("{v:.4} liters"));
         let genus = self.genus.map_or("undefined".into(), |g| g.to_string());
         let (least, left) = bound("at least ", self.self_intersections_left, "triangles");
         let (low, high) = (DVec3::from(self.min), DVec3::from(self.max));
@@ -259,7 +259,7 @@ normals              {normals} ({bad_normals} not of unit length)
     }
 }
 
-/// Examines a mesh whose coordinates are `unit_m` metres each. Never panics, for any mesh.
+/// Examines a mesh whose coordinates are `unit_m` meters each. Never panics, for any mesh.
 ///
 /// # Examples
 ///
@@ -323,12 +323,12 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
     let [low, high] = [bounds.min, bounds.max].map(|p| if bounds.is_empty() { Vec3::ZERO } else { p });
     let [low, high] = [low, high].map(|p| p.as_dvec3() + origin);
     let count = mesh.positions.len();
-    let litres = unit_m.powi(3) * 1000.0;
+    let liters = unit_m.powi(3) * 1000.0;
     let wrong_pieces = if closed { wrong_pieces(&welded, &faces) } else { Vec::new() };
     let reported = |piece: WrongPiece| PieceReport {
         triangles: piece.triangles,
         center: (piece.center + origin).to_array(),
-        volume_l: piece.volume * litres,
+        volume_l: piece.volume * liters,
     };
     let (self_intersections, self_intersections_left) = self_intersections(mesh, &faces, &sources);
     CheckReport {
@@ -352,7 +352,7 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
         min: low.to_array(),
         max: high.to_array(),
         size_m: ((high - low) * unit_m).to_array(),
-        volume_l: closed.then_some(volume * litres),
+        volume_l: closed.then_some(volume * liters),
         wrong_pieces: wrong_pieces.into_iter().map(reported).collect(),
         has_colors: count > 0 && mesh.colors.len() == count,
         has_texture: None,
@@ -755,7 +755,7 @@ mod tests {
 
     #[test]
     fn a_box_is_sound() {
-        // 2 × 3 × 4 dm: 24 litres; V − E + F = 8 − 18 + 12 = 2
+        // 2 × 3 × 4 dm: 24 liters; V − E + F = 8 − 18 + 12 = 2
         let r = check(&cuboid(Vec3::ZERO, Vec3::new(2.0, 3.0, 4.0)), 0.1);
         assert!(r.closed && r.manifold);
         assert_eq!((r.pieces, r.euler, r.genus), (1, 2, Some(0)));

@@ -4,7 +4,7 @@
 //! The dataset's world stays untouched until here. glTF and OBJ are right-handed with +Y up, so a
 //! capture with another `up` is turned once, in the vertices: `(x, y, z) → (x, z, −y)` for +Z up.
 //!
-//! A scene may lie kilometres from its origin, where f32 steps over a whole head. So meshes come in
+//! A scene may lie kilometers from its origin, where f32 steps over a whole head. So meshes come in
 //! coordinates of their own with the way into the world in f64, and are prepared around their own middle.
 //!
 //! `Mesh` and [`Atlas`](crate::geom::Atlas) are indexed apart, as OBJ is: a vertex on a seam has one position and
@@ -43,7 +43,7 @@ pub struct ExportOptions {
     pub stem: String,
     /// The up direction in the dataset's world; any length but 0.
     pub up: Vec3,
-    /// Metres per dataset unit.
+    /// Meters per dataset unit.
     pub unit_m: f64,
     /// Whether the colors already contain the light, so that viewers should not light them again.
     pub unlit: bool,
@@ -69,10 +69,10 @@ impl Default for ExportOptions {
 }
 
 impl ExportOptions {
-    /// Returns the transform from the mesh's own coordinates to metres with +Y up.
+    /// Returns the transform from the mesh's own coordinates to meters with +Y up.
     pub(crate) fn file_from_mesh(&self) -> Result<Similarity> {
         if !(self.unit_m.is_finite() && self.unit_m > 0.0) {
-            return Err(wrong_option("unit_m", self.unit_m, "metres per unit, above 0"));
+            return Err(wrong_option("unit_m", self.unit_m, "meters per unit, above 0"));
         }
         let rotation = turn_to_y_up(self.up)?;
         let turned = Similarity { scale: self.unit_m, rotation, translation: DVec3::ZERO };
@@ -264,7 +264,7 @@ pub(super) fn middle((low, high): (DVec3, DVec3)) -> (DVec3, f64, bool) {
 pub(super) fn distance_warning(mesh: &Mesh, file_from_mesh: &Similarity, ending: &str) -> Option<String> {
     let (center, size, far) = middle(placed_box(mesh, file_from_mesh));
     let away = center.abs().max_element();
-    // the distance between neighbouring f32 values
+    // the distance between neighboring f32 values
     let step = 2f64.powf(away.log2().floor() - 23.0);
     (far && away.is_finite()).then(|| {
         format!(
@@ -710,7 +710,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_scene_ten_kilometres_away_keeps_its_millimetres() {
+    fn a_scene_ten_kilometers_away_keeps_its_millimeters() {
         let far = Vec3::new(10_000.0, 0.0, -10_000.0);
         let mut m = triangle();
         m.positions = vec![far, far + Vec3::X, far + Vec3::new(0.0, 0.25, 0.0)];

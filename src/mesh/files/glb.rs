@@ -1,6 +1,6 @@
 //! A mesh as GLB: glTF 2.0, binary, one file (Khronos, *glTF 2.0 Specification*).
 //!
-//! Right-handed, +Y up, metres, counter-clockwise. Colors that already hold the light are marked
+//! Right-handed, +Y up, meters, counter-clockwise. Colors that already hold the light are marked
 //! `KHR_materials_unlit`, beside a rough non-metal for viewers that do not know it.
 //!
 //! Color is either the vertices' own or a texture's, never both, since viewers multiply them:
@@ -455,7 +455,7 @@ impl GlbDocument {
                 serde_json::to_vec(&json)
             }),
         };
-        let json = json.expect("a document of plain numbers and names serialises");
+        let json = json.expect("a document of plain numbers and names serializes");
         let bytes = 12 + 8 + json.len().next_multiple_of(4) as u64 + 8 + bin.len() as u64;
         let length = u32::try_from(bytes).map_err(|_| {
             let what = format!("the file would have {bytes} bytes, but a GLB holds at most {}", u32::MAX);
@@ -661,7 +661,7 @@ mod tests {
                 "VEC4"
             );
         }
-        // vertex 2 stands at y = 1, which is half a metre here, its normal is +z and the first layer lies 0.3 before it
+        // vertex 2 stands at y = 1, which is half a meter here, its normal is +z and the first layer lies 0.3 before it
         let part = FileMesh::new(&head.mesh, None, &options.file_from_mesh().unwrap())
             .unwrap()
             .under(head.shells.as_ref().unwrap());

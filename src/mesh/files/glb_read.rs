@@ -1,7 +1,7 @@
 //! Reads a GLB: all triangles of the default scene, transformed by their nodes, and their base color.
 //!
 //! `gltf` takes the container apart. Of its JSON only what is read here can cause an error, and numbers are f64: a node
-//! may lie kilometres from the origin, where `gltf-json`'s f32 has steps of half a metre. The document's references are
+//! may lie kilometers from the origin, where `gltf-json`'s f32 has steps of half a meter. The document's references are
 //! checked before they are used. Only data in the file is read: buffers with a URI are refused.
 
 use super::color_range::bring_into_range;

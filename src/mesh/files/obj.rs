@@ -1,4 +1,4 @@
-//! A mesh as Wavefront OBJ: text, +Y up, metres.
+//! A mesh as Wavefront OBJ: text, +Y up, meters.
 //!
 //! Numbers are the shortest that read back as the same f32, which is never more than nine
 //! significant digits. `v`, `vt` and `vn` are indexed apart, so a surface that is closed stays closed

@@ -249,7 +249,7 @@ pub(super) const BORDER: u8 = 1;
 /// Takes part in no collapse and does not move.
 pub(super) const FIXED: u8 = 2;
 
-/// Returns the flags of a vertex, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it, each from one neighbour
+/// Returns the flags of a vertex, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it, each from one neighbor
 /// to the next: one closed walk through all of them is the inside of a surface, one open walk its border.
 pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
     sides.sort_unstable();
@@ -277,7 +277,7 @@ pub(super) fn kind(sides: &mut [(u32, u32)]) -> u8 {
         (_, false) => return FIXED,
         (_, true) => {}
     }
-    // The border begins at the one side whose first neighbour ends none.
+    // The border begins at the one side whose first neighbor ends none.
     let mut ends: Vec<u32> = sides.iter().map(|side| side.1).collect();
     ends.sort_unstable();
     let begin = (0..sides.len()).find(|&i| ends.binary_search(&sides[i].0).is_err());
@@ -435,7 +435,7 @@ pub(super) struct EdgeLink {
     of_a: usize,
     /// Triangles that hold the edge, with the vertex opposite to it.
     dropped: Vec<(u32, u32)>,
-    /// Neighbours of the vertex to be.
+    /// Neighbors of the vertex to be.
     pub around: Vec<u32>,
     leans: Vec<Vec3>,
     ring: Vec<u32>,
@@ -455,7 +455,7 @@ impl EdgeLink {
             self.epoch = 0;
         }
         self.epoch += 2;
-        // marks for neighbours of a, and for those of b alone
+        // marks for neighbors of a, and for those of b alone
         let (near_a, near_b) = (self.epoch, self.epoch + 1);
         self.sides.clear();
         self.dropped.clear();
@@ -738,7 +738,7 @@ mod collapse_tests {
 
     #[test]
     fn the_waist_of_a_double_pyramid_must_not_close() {
-        // Over and under the triangle 0, 1, 2, which is no face: 0 and 1 have 2 for a common neighbour.
+        // Over and under the triangle 0, 1, 2, which is no face: 0 and 1 have 2 for a common neighbor.
         let waist = [[0, 1, 3], [1, 2, 3], [2, 0, 3], [1, 0, 4], [2, 1, 4], [0, 2, 4]];
         assert!(!may(&waist, 0, 1));
         assert!(may(&waist, 0, 3)); // leaves the tetrahedron 0, 1, 2, 4

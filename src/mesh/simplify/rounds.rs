@@ -27,8 +27,8 @@
 //!
 //! A heap would order exactly, at a cache miss a level. Here an edge falls into a bucket by the upper
 //! bits of its cost (positive floats are ordered as their bits), and a bucket is worked through first
-//! in, first out, which also visits neighbours in memory one after another. Outdated entries stay
-//! where they are: the caller recognises them by `stamp`.
+//! in, first out, which also visits neighbors in memory one after another. Outdated entries stay
+//! where they are: the caller recognizes them by `stamp`.
 
 use super::crossing::{Sheets, crossings};
 use super::rings::{BORDER, EdgeLink, FIXED, MIN_QUALITY, MIN_TURN_COSINE, Rings, place};

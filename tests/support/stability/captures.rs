@@ -103,8 +103,8 @@ fn captures() -> Vec<Hard> {
     vec![
         hard("plain", plain.clone(), still, Ok([30.0, 30.0])),
         hard("a world 1e6 from its origin", plain.clone(), moved(1.0, 1e6), Ok([0.1, 0.1])),
-        hard("a world in kilometres", plain.clone(), moved(1e-3, 0.0), Ok([0.1, 0.1])),
-        hard("a world in millimetres", plain.clone(), moved(1e3, 0.0), Ok([0.1, 0.1])),
+        hard("a world in kilometers", plain.clone(), moved(1e-3, 0.0), Ok([0.1, 0.1])),
+        hard("a world in millimeters", plain.clone(), moved(1e3, 0.0), Ok([0.1, 0.1])),
         hard("a field of view of 0.1 degrees", plain.iter().map(far).collect(), still, Ok([1.5, 3.0])),
         hard(
             "a camera that sees nothing but head",
@@ -136,7 +136,7 @@ fn config(folder: &Path) -> Config {
 }
 
 /// Learns both fields. Returns the PSNR of the held-out view inside its mask, dB, and the mean distance of the learned
-/// zero from the head's surface, millimetres.
+/// zero from the head's surface, millimeters.
 fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> {
     let run = Run::quiet(&folder.join("run"));
     let session = Session::open(&config, &run)?;
