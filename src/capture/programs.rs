@@ -193,7 +193,7 @@ const SCENES: &[Program] = &[
     program("a snapshot of instant-ngp", &[Ending("ingp"), Ending("msgpack")],
         "it is a trained scene: {RESULT}, with its `transforms.json`"),
     program("a PostShot project", &[Ending("psht")],
-        "{RESULT}; if PostShot found the cameras, find them anew with `tiface cameras PHOTOGRAPHS`"),
+        "{RESULT}; if PostShot found the cameras, find them again with `tiface cameras PHOTOGRAPHS`"),
     program("a scene of Gaussian splats", &[Ending("splat"), Ending("spz"), Ending("ksplat"), Ending("sog")],
         "it is a result without photographs: {RESULT}"),
     program("a Blender scene", &[Ending("blend")],

@@ -125,7 +125,7 @@ fn plan_summary(session: &Session, until: Stage, common: &Common) -> Result<Stri
         let goes = removed.contains(&stage).then(|| session.contents(&stage)).transpose()?;
         removed.retain(|name| *name != stage);
         let (outlook, differences) = match found {
-            _ if goes.is_some() => ("to do, afresh", Vec::new()),
+            _ if goes.is_some() => ("to do again", Vec::new()),
             None => ("to do", Vec::new()),
             Some(d) if d.is_empty() => ("done", d),
             Some(d) => ("would stop: it differs", d),

@@ -72,7 +72,7 @@ impl Stage {
         Stage::ALL.into_iter().filter(|stage| wanted.contains(stage)).collect()
     }
 
-    /// Returns the stage and all that build on it, in order: what is out of date when it is made anew.
+    /// Returns the stage and all that build on it, in order: what is out of date when it is made again.
     pub fn followers(self, config: &Config) -> Vec<Stage> {
         Stage::ALL.into_iter().filter(|s| Stage::with_needs(vec![*s], config).contains(&self)).collect()
     }

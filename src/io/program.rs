@@ -277,7 +277,7 @@ impl VideoFrames {
         lock: &Lock,
         limits: &Limits,
     ) -> Result<VideoFrames> {
-        // counted anew and at a fixed rate, so that FFmpeg neither repeats frames nor leaves any out
+        // counted again and at a fixed rate, so that FFmpeg neither repeats frames nor leaves any out
         let words = "-vf settb=1/25,setpts=N -r 25 -pix_fmt rgb24 -c:v ppm -f image2pipe -";
         let before = "-nostdin -hide_banner -loglevel warning -protocol_whitelist file -i";
         let mut arguments: Vec<OsString> = before.split(' ').map(OsString::from).collect();

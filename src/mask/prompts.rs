@@ -32,7 +32,7 @@ const MAX_BYTES: u64 = 64 << 20;
 
 /// The suggested fix for a file of another shape.
 const SHAPE: &str = "write `{\"frames\": [{\"file_path\": …, \"points\": [{\"x\": …, \"y\": …, \"label\": 1}]}]}`, or \
-                     click anew on the page that `tiface mask CAPTURE --page` writes";
+                     click again on the page that `tiface mask CAPTURE --page` writes";
 
 /// The suggested fix for a point that is none.
 const POINT_HINT: &str = "correct that point, or remove it";

@@ -198,7 +198,7 @@ pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
 /// # Errors
 ///
 /// As [`finished_mesh`] and `read`. Files may be missing, or of two makings, if another process
-/// began the stage anew meanwhile; the error then says so instead.
+/// began the stage again meanwhile; the error then says so instead.
 pub(super) fn read_finished<T>(run: &Path, read: impl FnOnce(&Record) -> Result<T>) -> Result<T> {
     let record = finished_mesh(run)?;
     let found = read(&record);
@@ -208,7 +208,7 @@ pub(super) fn read_finished<T>(run: &Path, read: impl FnOnce(&Record) -> Result<
         _ => {
             let shown = run.display();
             Err(Error::not_now(
-                format!("the mesh of the run `{shown}` was begun anew while it was read"),
+                format!("the mesh of the run `{shown}` was begun again while it was read"),
                 format!("`tiface status {shown}` says how far it is; repeat the command when it is done"),
             ))
         }
@@ -248,7 +248,7 @@ mod tests {
     use crate::run::{Fingerprint, Plan};
 
     #[test]
-    fn a_mesh_that_is_made_anew_is_not_read_half() {
+    fn a_mesh_that_is_made_again_is_not_read_half() {
         let dir = tempfile::tempdir().unwrap();
         let run = Run::quiet(dir.path());
         let plan = || Plan {
@@ -269,7 +269,7 @@ mod tests {
             let anew = |_: &Record| run.fresh(&["mesh".into()]).and(found);
             let error = read_finished(dir.path(), anew).unwrap_err();
             assert_eq!(error.kind().code(), 75, "{error}");
-            assert!(error.to_string().contains("was begun anew while it was read"), "{error}");
+            assert!(error.to_string().contains("was begun again while it was read"), "{error}");
             // at work on it
             let work = |_: &StageDir| {
                 let error = read(damaged());

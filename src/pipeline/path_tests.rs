@@ -128,7 +128,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
 }
 
 #[test]
-fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
+fn views_of_a_path_are_made_again_alone_and_never_in_silence() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
@@ -151,7 +151,7 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
             .unwrap()
             .skipped
     );
-    // the held-out views made anew are no reason to make others anew, another field is one
+    // the held-out views made again are no reason to make others again, another field is one
     session().fresh(Stage::Render, Stage::Metrics).unwrap();
     assert!(run.path("render/paths/orbit/done.json").is_file() && !run.path("render/done.json").is_file());
     session().fresh(Stage::Baseline, Stage::Metrics).unwrap();
@@ -161,7 +161,7 @@ fn views_of_a_path_are_made_anew_alone_and_never_in_silence() {
 }
 
 #[test]
-fn views_of_a_path_whose_records_cannot_be_read_are_made_anew_with_any_field() {
+fn views_of_a_path_whose_records_cannot_be_read_are_made_again_with_any_field() {
     let dir = tempfile::tempdir().unwrap();
     let config = config(&dir.path().join("head"));
     let run = quiet(dir.path());
@@ -348,7 +348,7 @@ fn a_command_that_is_refused_clears_nothing_with_fresh() {
         let session = Session::open(&config, &run).unwrap();
         session.fresh(Stage::Render, Stage::Metrics).unwrap_err().to_string()
     };
-    // what has no member, other cameras, and a field of other settings that is not made anew
+    // what has no member, other cameras, and a field of other settings that is not made again
     assert!(refused(&|c| c.render.method = vec![Method::Tface]).contains("`ensemble.members`"));
     assert!(refused(&|c| c.render.cameras = "orbit".into()).contains("`render.cameras`"));
     assert!(refused(&|c| c.tface.steps += 1).contains("tface.steps"));

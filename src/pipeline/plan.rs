@@ -164,7 +164,7 @@ impl Session<'_> {
         if !names.is_empty() {
             let each = names.iter().map(|name| Ok(format!("`{name}` ({})", self.contents(name)?)));
             let each = each.collect::<Result<Vec<_>>>()?.join(", ");
-            self.run.warn("run", &format!("removes what is made anew or out of date: {each}"));
+            self.run.warn("run", &format!("removes what is made again or out of date: {each}"));
         }
         self.run.fresh(&names)
     }

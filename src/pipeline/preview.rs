@@ -51,7 +51,7 @@ impl Preview {
     ///
     /// # Errors
     ///
-    /// Fails if the run has no mesh yet, or if it is damaged, or being made anew.
+    /// Fails if the run has no mesh yet, or if it is damaged, or being made again.
     pub fn of_run(run: &Path) -> Result<Preview> {
         let (head, warnings) = read_finished(run, |record| {
             // previews show `mesh/parts`: a problem with other files of the stage does not matter

@@ -686,7 +686,7 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
         let fewer = Config { mesh: MeshConfig { triangles: 100, ..config.mesh.clone() }, ..config.clone() };
         let session = Session::open(&fewer, &run).unwrap();
         assert_eq!(session.out_of_date(Stage::Mesh).unwrap(), expected, "{color:?} {method:?}");
-        // what is made anew as it was is made anew with all that follows
+        // what is made again as it was is made again with all that follows
         let session = Session::open(&config, &run).unwrap();
         assert_eq!(session.out_of_date(Stage::Mesh).unwrap(), follow);
     }

@@ -301,7 +301,7 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
         match stage.split_once('/') {
             // a product of its own: nothing follows it
             Some((owner, _)) => format!(
-                "repeat with the old settings, or add `--fresh {owner}` to make `{stage}` anew, and nothing else"
+                "repeat with the old settings, or add `--fresh {owner}` to make `{stage}` again, and nothing else"
             ),
             None => format!(
                 "repeat with the old settings, choose another folder with `--run DIR`, or recompute this stage and what follows with `--fresh {stage}`"
@@ -522,7 +522,7 @@ mod tests {
         assert!(!now(Duration::from_secs(99)) && now(Duration::ZERO), "what comes next has time to tell");
         run.stage(Plan { name: "mesh", saves: false, ..plan(5) }, |stage| {
             let done = work(stage);
-            assert!(now(Duration::ZERO), "it begins anew in any case");
+            assert!(now(Duration::ZERO), "it begins again in any case");
             assert_eq!(state("mesh"), State::Stopped);
             done
         })
@@ -646,7 +646,7 @@ mod tests {
     }
 
     #[test]
-    fn a_product_with_a_record_of_its_own_outlives_its_stage_and_is_made_anew_alone() {
+    fn a_product_with_a_record_of_its_own_outlives_its_stage_and_is_made_again_alone() {
         let dir = tempfile::tempdir().unwrap();
         let run = open(dir.path());
         let (stage, own) = (Plan { name: "render", ..plan(5) }, Plan { name: "render/paths/a", ..plan(5) });
@@ -659,7 +659,7 @@ mod tests {
         assert!(run.stage(own.clone(), never).unwrap().skipped);
         run.stage(stage.clone(), work).unwrap();
         let error = run.stage(Plan { name: own.name, ..plan(7) }, never).unwrap_err();
-        assert!(error.hint().contains("`--fresh render` to make `render/paths/a` anew"), "{}", error.hint());
+        assert!(error.hint().contains("`--fresh render` to make `render/paths/a` again"), "{}", error.hint());
         fresh(&run, &["render/paths/a"]).unwrap();
         assert!(!run.stage(Plan { name: own.name, ..plan(7) }, work).unwrap().skipped);
         assert!(run.stage(stage, never).unwrap().skipped);

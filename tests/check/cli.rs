@@ -916,11 +916,11 @@ fn a_dry_run_ends_as_the_command_itself_would() {
     }
     let afresh = [&other[..], &["--fresh", "mask", "--dry-run"]].concat();
     let o = tiface(dir.path(), &afresh);
-    assert!(code(&o) == 0 && out(&o).contains("to do, afresh"), "{}{}", out(&o), err(&o));
+    assert!(code(&o) == 0 && out(&o).contains("to do again"), "{}{}", out(&o), err(&o));
 }
 
 #[test]
-fn what_a_stage_made_anew_puts_out_of_date_is_named_before_it_goes() {
+fn what_a_stage_made_again_puts_out_of_date_is_named_before_it_goes() {
     let dir = tempfile::tempdir().unwrap();
     small_head(dir.path());
     assert_eq!(code(&tiface(dir.path(), &["mask", "head"])), 0);
@@ -938,7 +938,7 @@ fn what_a_stage_made_anew_puts_out_of_date_is_named_before_it_goes() {
     assert!(code(&o) == 0 && said.contains("mesh     would be removed"), "{said}{}", err(&o));
     // the lock is no content of the folder
     assert!(said.contains("out of date: 1 file, 0.0 MB\n"), "{said}");
-    let masks = said.lines().find(|line| line.starts_with("mask     to do, afresh: removes "));
+    let masks = said.lines().find(|line| line.starts_with("mask     to do again: removes "));
     let masks = masks.and_then(|line| line.split_once("removes ")?.1.split("  ").next()).unwrap();
     assert!(masks.ends_with(" MB") && masks.contains(" files, "), "{said}");
     assert!(mesh.join("surface.ply").is_file());

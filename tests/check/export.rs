@@ -20,7 +20,7 @@ fn worked(folder: &Path, words: &[&str]) -> String {
     said(&output)
 }
 
-/// Makes all stages of a run, up to its metrics. The head is learned once; its mesh is made anew with these settings.
+/// Makes all stages of a run, up to its metrics. The head is learned once; its mesh is made again with these settings.
 fn finished(folder: &Path, more: &[&str]) -> PathBuf {
     let kept = once("to export", |folder| {
         let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
@@ -126,12 +126,12 @@ fn other_settings_give_what_the_stage_gives_when_it_is_made_again_with_them() {
     let bytes: usize =
         before.iter().filter(|(f, _)| f.starts_with(run.join("mesh"))).map(|(_, b)| b.len()).sum();
     let size = format!(" files, {:.1} MB", bytes as f64 / 1e6);
-    assert!(plan.contains("mesh     to do, afresh: removes ") && plan.contains(&size), "{plan}");
+    assert!(plan.contains("mesh     to do again: removes ") && plan.contains(&size), "{plan}");
     assert!(plan.contains("`tiface export runs/head` writes the finished mesh"), "{plan}");
     assert!(before == files(&run));
     let anew = worked(dir.path(), &anew);
     assert!(
-        anew.contains("removes what is made anew or out of date: `mesh` (") && anew.contains(&size),
+        anew.contains("removes what is made again or out of date: `mesh` (") && anew.contains(&size),
         "{anew}"
     );
     for (file, bytes) in files(&dir.path().join("new")) {

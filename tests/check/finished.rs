@@ -75,16 +75,14 @@ fn a_turntable_leaves_the_finished_run_as_it_is() {
     assert!(worked(&tiface(dir.path(), &words)).contains("render/paths/orbit: already done"));
     let other = tiface(dir.path(), &["render", "runs/head", "--cameras", "orbit", "--format", "exr"]);
     assert_eq!(other.status.code(), Some(1));
-    assert!(said(&other).contains("`--fresh render` to make `render/paths/orbit` anew"), "{}", said(&other));
+    assert!(said(&other).contains("`--fresh render` to make `render/paths/orbit` again"), "{}", said(&other));
     assert!(before == files(&run), "the turntable has changed the run");
     assert!(worked(&tiface(dir.path(), &["run", "runs/head"])).contains("metrics: already done"));
     assert!(before == files(&run));
     // and what has been made of other cameras is reported
     assert!(worked(&tiface(dir.path(), &["status", "runs/head"])).contains("render/paths/orbit done in"));
     let anew = ["render", "runs/head", "--cameras", "orbit", "--format", "exr", "--fresh", "render"];
-    assert!(
-        worked(&tiface(dir.path(), &[&anew[..], &["--dry-run"]].concat())).contains("orbit to do, afresh")
-    );
+    assert!(worked(&tiface(dir.path(), &[&anew[..], &["--dry-run"]].concat())).contains("orbit to do again"));
     worked(&tiface(dir.path(), &anew));
     assert!(run.join("render/paths/orbit/tface/0001.exr").is_file());
     assert!(!run.join("render/paths/orbit/tface/0001.png").exists() && before == files(&run));

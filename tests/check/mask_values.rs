@@ -15,7 +15,7 @@ use tiface::io::{
     write_png_rgba,
 };
 
-/// A capture of eight photographs and a held-out one in `head`, of which `draw` writes each mask anew: the file, and the
+/// A capture of eight photographs and a held-out one in `head`, of which `draw` writes each mask again: the file, and the
 /// opacity of the head.
 fn drawn(draw: impl Fn(&Path, &Gray)) -> TempDir {
     let dir = tempfile::tempdir().unwrap();

@@ -266,7 +266,7 @@ def main():
         assert time.monotonic() < deadline, "the fleet does not come to its end"
         if engine.poll() is not None:
             assert finished, f"nothing works: {folder / 'engine.txt'}"
-            # all is done before enough was killed: begin one head anew
+            # all is done before enough was killed: begin one head again
             head = chance.choice(good)
             for record in [r for r in finished if f"/{head}/" in str(r)]:
                 del finished[record]

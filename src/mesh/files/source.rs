@@ -62,7 +62,7 @@ impl Source<'_> {
     pub fn broken(&self, at: impl Display, what: impl Display) -> Error {
         let hint = match self.format {
             "GLB" => "export it again; the Khronos validator explains a GLB in detail",
-            _ => "export it again, or open it in Blender or MeshLab and save it anew",
+            _ => "export it again, or open it in Blender or MeshLab and save it again",
         };
         Error::cannot(format!("`{}`, {at}: {what}", self.path.display()), hint)
     }

@@ -261,7 +261,7 @@ pub(super) fn cameras(
 ///
 /// # Errors
 ///
-/// Fails if the run has no mesh yet, or if it is damaged, or being made anew.
+/// Fails if the run has no mesh yet, or if it is damaged, or being made again.
 pub fn head_page(session: &Session) -> Result<String> {
     let (mut viewer, file_from_world) = read_finished(session.run.dir(), |record| shown(session, record))?;
     let most = super::MAX_BYTES.saturating_sub(viewer.glb.len().div_ceil(3) * 4);
