@@ -18,23 +18,26 @@
 //! so differ from run to run.
 
 use crate::{Error, ErrorKind, Quiet, Result};
+mod estimate;
+mod failure;
 mod fingerprint;
 mod progress;
+mod record;
 mod stage;
 mod status;
 mod verify;
 
+pub use estimate::{Cost, ESTIMATE, Estimate, read_estimate};
+pub use failure::{FAILED, Failure, read_failure};
 pub use fingerprint::Fingerprint;
 pub use progress::{Event, Observer, Stop};
+pub use record::{Fault, ProductState, Record, read_record};
 pub use stage::{Done, Plan, StageDir};
-pub use status::{
-    Cost, ESTIMATE, Estimate, FAILED, Failure, Fault, Phase, ProductState, Record, RunStatus, StageStatus,
-    State, Status, read_estimate, read_failure, read_record, read_status,
-};
+pub use status::{Phase, RunStatus, StageStatus, State, Status, read_status};
 pub use verify::{Verification, VerifiedFile, verify};
 
 use crate::io::{self, Lock, LockError};
-use status::TIMED;
+use record::TIMED;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -1,7 +1,8 @@
 //! One stage of a run: skipped, refused, or executed under its lock.
 
 use super::progress::Progress;
-use super::status::{TIMED, host, now};
+use super::record::TIMED;
+use super::status::{host, now};
 use super::{Event, Fingerprint, Record, Run, State, Status};
 use super::{has_record, read_record, read_status};
 use crate::io;

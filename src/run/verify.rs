@@ -1,7 +1,7 @@
 //! Comparison of a run's products with the records of its stages, byte for byte.
 
 use super::Fingerprint;
-use super::status::{Fault, ProductState, Record, read_record};
+use super::record::{Fault, ProductState, Record, read_record};
 use crate::io;
 use crate::{Error, Result};
 use serde::Serialize;
