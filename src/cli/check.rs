@@ -177,8 +177,8 @@ pub(super) fn run(
         }
         uv_check(&weld(&mesh), &atlas)
     });
-    let bars: Vec<&str> = require.iter().map(String::as_str).collect();
-    let passed = report.require(&bars);
+    let requirements: Vec<&str> = require.iter().map(String::as_str).collect();
+    let passed = report.require(&requirements);
     if let Err(e) = &passed
         && e.kind() == ErrorKind::Usage
     {

@@ -43,7 +43,7 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
     if path.is_some() {
         config.render = evaluation(common, target)?;
     }
-    let bars = require.iter().map(|r| Bar::parse(r)).collect::<Result<Vec<_>>>()?;
+    let requirements = require.iter().map(|r| Requirement::parse(r)).collect::<Result<Vec<_>>>()?;
     let run = Run::open(&target.run, stop.clone(), screen.clone());
     // everything that can be refused is refused here, before the first stage
     let open = || -> Result<Session> {
@@ -102,7 +102,7 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
     } else if !common.quiet {
         print(&summary(&run, session.views(), &done, &written))?;
     }
-    bars.iter().try_for_each(|bar| bar.check(&done))
+    requirements.iter().try_for_each(|requirement| requirement.check(&done))
 }
 
 /// Returns the settings that a run was last worked on with, as text; `None` if it has not begun.
@@ -203,40 +203,42 @@ fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
 
 /// A requirement of `--require`.
 #[derive(Debug, PartialEq)]
-enum Bar {
+enum Requirement {
     Watertight,
     Psnr(f64),
 }
 
-impl Bar {
-    pub fn parse(text: &str) -> Result<Bar> {
-        let bar = match text.split_once('=') {
-            Some(("psnr", db)) => db.parse().ok().filter(|v: &f64| v.is_finite()).map(Bar::Psnr),
-            None if text == "watertight" => Some(Bar::Watertight),
+impl Requirement {
+    pub fn parse(text: &str) -> Result<Requirement> {
+        let requirement = match text.split_once('=') {
+            Some(("psnr", db)) => db.parse().ok().filter(|v: &f64| v.is_finite()).map(Requirement::Psnr),
+            None if text == "watertight" => Some(Requirement::Watertight),
             _ => None,
         };
-        bar.ok_or_else(|| {
+        requirement.ok_or_else(|| {
             Error::usage(format!("there is no requirement `{text}`"), "use watertight or psnr=DB")
         })
     }
 
     pub fn check(&self, done: &[(Stage, Done)]) -> Result<()> {
-        let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
+        let summary = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
         match self {
-            Bar::Watertight if of(Stage::Mesh).is_some_and(|m| m["closed"] == true) => Ok(()),
-            Bar::Watertight => Err(Error::below("the mesh is not watertight", "`tiface check RUN` says why")),
-            Bar::Psnr(bar) => {
-                let metrics = of(Stage::Metrics).unwrap_or(&Value::Null);
+            Requirement::Watertight if summary(Stage::Mesh).is_some_and(|m| m["closed"] == true) => Ok(()),
+            Requirement::Watertight => {
+                Err(Error::below("the mesh is not watertight", "`tiface check RUN` says why"))
+            }
+            Requirement::Psnr(least) => {
+                let metrics = summary(Stage::Metrics).unwrap_or(&Value::Null);
                 let sets = metrics.as_object().into_iter().flat_map(|m| m.values());
                 let best = sets
                     .filter_map(|set| set["head"]["mean"]["psnr_masked"].as_f64())
                     .fold(f64::NEG_INFINITY, f64::max);
-                if best >= *bar {
+                if best >= *least {
                     return Ok(());
                 }
                 let found = if best.is_finite() { format!("{best:.2} dB") } else { "unknown".into() };
                 Err(Error::below(
-                    format!("PSNR is {found}, required is {bar} dB"),
+                    format!("PSNR is {found}, required is {least} dB"),
                     "train longer, or lower the requirement",
                 ))
             }
@@ -247,7 +249,7 @@ impl Bar {
 /// Returns a summary of the result: its files, its quality and what was `written` to `--out`. `views` is the folder of the
 /// views, relative to the run.
 fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) -> String {
-    let of = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
+    let summary = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
     let mut row = |name: &str, value: &dyn std::fmt::Display| text += &format!("{name:<9} {value}\n");
     if let Some(height) = height(of(Stage::Mask), of(Stage::Mesh)) {
@@ -270,10 +272,10 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
             row("pictures", &run.path(folder).display());
         }
     }
-    if let Some(metrics) = of(Stage::Metrics) {
+    if let Some(metrics) = summary(Stage::Metrics) {
         row("report", &run.path("report.html").display());
         judgment(metrics).iter().for_each(|line| row("quality", line));
-    } else if of(Stage::Mesh).is_none() && of(Stage::Render).is_none() {
+    } else if summary(Stage::Mesh).is_none() && of(Stage::Render).is_none() {
         row("run", &run.dir().display());
     }
     written.iter().for_each(|path| row("out", &path.display()));
@@ -359,18 +361,20 @@ mod tests {
 
     #[test]
     fn bars_are_parsed_and_missed_with_exit_code_3() {
-        assert_eq!(Bar::parse("psnr=28").unwrap(), Bar::Psnr(28.0));
-        assert_eq!(Bar::parse("psnr=nan").unwrap_err().kind().code(), 2);
-        assert_eq!(Bar::parse("beauty").unwrap_err().kind().code(), 2);
+        assert_eq!(Requirement::parse("psnr=28").unwrap(), Requirement::Psnr(28.0));
+        assert_eq!(Requirement::parse("psnr=nan").unwrap_err().kind().code(), 2);
+        assert_eq!(Requirement::parse("beauty").unwrap_err().kind().code(), 2);
         let metrics = json!({
             "tface": {"head": {"mean": {"psnr_masked": 25.0}}},
             "ensemble": {"head": {"mean": {"psnr_masked": 27.5}}},
             "truth_percent_of_head": {"accuracy_mean": 99.0},
         });
         let stages = [(Stage::Mesh, done(json!({"closed": true}))), (Stage::Metrics, done(metrics))];
-        assert!(Bar::Watertight.check(&stages).is_ok() && Bar::Psnr(27.0).check(&stages).is_ok());
-        assert_eq!(Bar::Psnr(28.0).check(&stages).unwrap_err().kind().code(), 3);
-        assert_eq!(Bar::Psnr(1.0).check(&[]).unwrap_err().kind().code(), 3);
+        assert!(
+            Requirement::Watertight.check(&stages).is_ok() && Requirement::Psnr(27.0).check(&stages).is_ok()
+        );
+        assert_eq!(Requirement::Psnr(28.0).check(&stages).unwrap_err().kind().code(), 3);
+        assert_eq!(Requirement::Psnr(1.0).check(&[]).unwrap_err().kind().code(), 3);
     }
 
     #[test]

@@ -7,6 +7,7 @@
 
 mod beside;
 mod check;
+mod check_report;
 mod color_range;
 mod file_mesh;
 mod foreign;
@@ -25,10 +26,10 @@ mod source;
 mod stl;
 mod stored;
 mod uri;
+mod uv_check;
 
-pub use check::{
-    BARS, CheckReport, MIN_AREA_PX, PieceReport, UvReport, check, check_around, seams_facing, uv_check,
-};
+pub use check::{check, check_around};
+pub use check_report::{CheckReport, PieceReport, REQUIREMENTS};
 pub use file_mesh::{ExportOptions, ExportedFiles, HeadTexture, Lobes, tangents, weld};
 pub use glb::to_glb;
 pub use mtl::{Material, materials_of_mtl};
@@ -39,6 +40,7 @@ pub use read::{read, read_with};
 pub use source::{PictureSource, ReadMesh, ReadOptions};
 pub(crate) use stored::FORMAT;
 pub use stored::{ExtractedSurface, HeadMesh};
+pub use uv_check::{MIN_AREA_PX, UvReport, seams_facing, uv_check};
 
 #[cfg(test)]
 pub(crate) use stored::tests::head as test_head;
