@@ -275,7 +275,7 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     if let Some(metrics) = summary(Stage::Metrics) {
         row("report", &run.path("report.html").display());
         judgment(metrics).iter().for_each(|line| row("quality", line));
-    } else if summary(Stage::Mesh).is_none() && of(Stage::Render).is_none() {
+    } else if summary(Stage::Mesh).is_none() && summary(Stage::Render).is_none() {
         row("run", &run.dir().display());
     }
     written.iter().for_each(|path| row("out", &path.display()));
