@@ -4,7 +4,7 @@
 use super::options::{Common, RunTarget};
 use super::screen::print;
 use crate::config::{explain, explained};
-use crate::field::{Found, examine_devices};
+use crate::field::{DeviceReport, examine_devices};
 use crate::{Error, ErrorKind, Result, io};
 use serde::Serialize;
 use serde_json::json;
@@ -39,7 +39,7 @@ struct Examination {
     system: String,
     processor: String,
     threads: usize,
-    devices: Vec<Found>,
+    devices: Vec<DeviceReport>,
     /// The device that `--device auto` selects.
     auto: String,
 }

@@ -252,10 +252,10 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     let summary = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
     let mut row = |name: &str, value: &dyn std::fmt::Display| text += &format!("{name:<9} {value}\n");
-    if let Some(height) = height(of(Stage::Mask), of(Stage::Mesh)) {
+    if let Some(height) = height(summary(Stage::Mask), summary(Stage::Mesh)) {
         row("height", &height);
     }
-    if let Some(mesh) = of(Stage::Mesh) {
+    if let Some(mesh) = summary(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
         let files = ["glb", "obj", "ply"].map(|e| run.path(format!("mesh/head.{e}")));
         let found = files.iter().find(|f| io::is_file(f));

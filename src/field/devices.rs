@@ -4,7 +4,7 @@
 //! device, it compares a training step on the device with the CPU's. The verdict is stored in the user's cache, so
 //! the test runs once for each adapter, driver, program and field.
 
-use super::{Check, Found, SelfTest};
+use super::device_report::{Check, DeviceReport, NO_GPU, SelfTest};
 use crate::config::DeviceChoice;
 use crate::io::{self, Limits, Lock, LockError};
 use crate::kernel::gpu::{self, Adapter, Device};
@@ -144,7 +144,7 @@ fn best_of<'a>(
             Err(why) => rejected.push(format!("{} {why}", adapter.name)),
         }
     }
-    Err(if rejected.is_empty() { super::NO_GPU.into() } else { rejected.join(", ") })
+    Err(if rejected.is_empty() { NO_GPU.into() } else { rejected.join(", ") })
 }
 
 /// Acquires the lock of a device, or shares it if this process holds it already: all fields of a process use the same
@@ -237,15 +237,15 @@ fn require_passed(
 }
 
 /// Tests every adapter of this machine, including software renderers.
-pub fn examine_adapters(tests: &[SelfTest]) -> Vec<Found> {
+pub fn examine_adapters(tests: &[SelfTest]) -> Vec<DeviceReport> {
     let all = Adapter::all();
     let number = |i: usize| all[..i].iter().filter(|a| a.api == all[i].api).count();
     (0..all.len()).map(|i| examine_adapter(&all[i], number(i), tests)).collect()
 }
 
-fn examine_adapter(adapter: &Adapter, number: usize, tests: &[SelfTest]) -> Found {
+fn examine_adapter(adapter: &Adapter, number: usize, tests: &[SelfTest]) -> DeviceReport {
     let in_use = matches!(Lock::take(&lock_file(&lock_folder(), adapter)), Err(LockError::Held { .. }));
-    let mut found = Found {
+    let mut found = DeviceReport {
         name: format!("{}:{number}", adapter.api),
         adapter: adapter.name.clone(),
         kind: adapter.kind,
@@ -263,7 +263,7 @@ fn examine_adapter(adapter: &Adapter, number: usize, tests: &[SelfTest]) -> Foun
     let began = std::time::Instant::now();
     let device = match Device::open(adapter) {
         Ok(device) => device,
-        Err(e) => return Found { error: Some(e.to_string()), ..found },
+        Err(e) => return DeviceReport { error: Some(e.to_string()), ..found },
     };
     let limits = device.limits();
     found.driver = device.driver().into();
