@@ -1,6 +1,6 @@
 //! Fewer triangles for the same surface: edge collapse by quadrics, checked against the field itself.
 //!
-//! Garland, Heckbert 1997 with the memoryless quadrics of Lindstrom, Turk 1998; see `rings`. Every
+//! Garland, Heckbert 1997 with the memoryless quadrics of Lindstrom, Turk 1998; see `quadric`. Every
 //! collapse keeps the link condition, turns no triangle by more than 60° and leaves none thinner than
 //! the thinnest it found, so a closed manifold stays one, of the same genus.
 //!
@@ -19,17 +19,30 @@
 //! has any, the work starts over, and every collapse checks for crossings (`crossing`), at seven times the cost. So none is
 //! made, and those of the input do not become more.
 
+mod collapse;
 mod crossing;
+mod quadric;
 mod rings;
 mod rounds;
+mod to_field;
 
 use crate::geom::{Mesh, SdfField};
 use crate::mesh::{check_count, check_indices, finite, setting};
 use crate::{Monitor, Result};
 use crossing::crossings;
-use rounds::{Task, bounded, counted};
+use rounds::{bounded, counted};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
+
+/// The data shared by all rounds.
+#[derive(Clone, Copy)]
+struct Task<'a> {
+    field: Option<&'a dyn SdfField>,
+    config: &'a SimplifyConfig,
+    /// Whether collapses are tested for crossings.
+    apart: bool,
+    monitor: &'a dyn Monitor,
+}
 
 /// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colors
 /// follow their vertices. A mesh that has no more triangles than `config.triangles` stays as it is.

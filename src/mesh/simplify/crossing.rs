@@ -145,7 +145,7 @@ pub(super) fn crossings(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<u32> 
 }
 
 /// An index of the triangles of a shrinking mesh, used to refuse collapses that cause crossings.
-pub(super) struct Sheets {
+pub(super) struct CrossingIndex {
     cells: Cells,
     /// Per cell the last link of its chain.
     heads: Vec<u32>,
@@ -156,18 +156,18 @@ pub(super) struct Sheets {
     query: u32,
 }
 
-impl Sheets {
-    pub(super) fn new(rings: &Rings) -> Sheets {
+impl CrossingIndex {
+    pub(super) fn new(rings: &Rings) -> CrossingIndex {
         let cells = Cells::fit(&rings.positions, &rings.triangles);
-        let mut sheets = Sheets {
+        let mut index = CrossingIndex {
             cells,
             heads: vec![NONE; cells.len()],
             links: Vec::new(),
             seen: vec![0; rings.triangles.len()],
             query: 0,
         };
-        rings.alive().for_each(|t| sheets.enter(t, Aabb::around(rings.corners(t)), None));
-        sheets
+        rings.alive().for_each(|t| index.enter(t, Aabb::around(rings.corners(t)), None));
+        index
     }
 
     /// Enters a triangle with this box, which had that one.
