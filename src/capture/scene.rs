@@ -9,26 +9,24 @@
 //!   farther out, too few cameras see the body to reconstruct it;
 //! - the *hull* is everything inside that box that touches three masks: the space in which the head may still be.
 //!
-//! Without masks: the box of the region that 40 % of the cameras have in their frame, no farther from the
-//! meeting point of the viewing axes than 0.6 of the cameras' median distance to it; drawn tighter around the
-//! dataset's points within it, or the dataset's own box.
-//!
-//! A given box, and the published one, override the masks. TI-Face's code
-//! has two worlds for its captures: T-Face's and the baseline's is the dataset's divided by 0.3, their box
-//! ±(1.5, 1.67, 1.0) in it; I-Face's is the dataset's, its box ±0.3. So a scene whose unit is 0.3 of the dataset's has
-//! I-Face in [-1, 1]³, as every scene has, and T-Face in its published numbers.
-//!
-//! A body that the frames cut continues where hardly any camera sees it; a field can only guess that part.
-//! Training still needs that part (rays of good pixels pass through it), the mesh does not: it is closed by
-//! a flat cap where too few cameras see the body ([`well_seen`]).
+//! Without masks, the frames of the cameras and the dataset's points or box decide (`frusta`); a given box, and the
+//! published one, override both ([`SceneBox`]).
+
+mod frusta;
+mod scene_box;
+mod well_seen;
+
+pub(super) use frusta::around_points;
+pub use scene_box::{SceneBox, in_box};
+pub use well_seen::well_seen;
 
 use super::carve::{self, Cube, Projector, SilhouetteTable};
 use super::masks::few;
-use super::view::View;
 use crate::error::counted;
 use crate::geom::{Aabb, Camera, Similarity};
 use crate::image::Gray;
 use crate::{Error, Result};
+use frusta::from_frusta;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 
@@ -345,80 +343,6 @@ fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
     (1.2 * wide.fold(0.0, f64::max)).min(0.95 * nearest)
 }
 
-/// Minimum number of points for a box around them.
-const MIN_POINTS: usize = 100;
-
-/// Returns the box of the points that the cameras see, without one percent on each side, enlarged by a twentieth; `None`
-/// for too few points.
-pub(super) fn around_points(views: &[View], points: &[DVec3]) -> Option<Aabb> {
-    if points.len() < MIN_POINTS {
-        return None;
-    }
-    let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
-    let seen = world_box(&from_frusta(&cameras, None).ok()?);
-    let within: Vec<Vec3> = points.iter().map(|p| p.as_vec3()).filter(|p| seen.contains(*p)).collect();
-    if within.len() < MIN_POINTS {
-        return None;
-    }
-    let [x, y, z] = [0, 1, 2].map(|k| {
-        let mut along: Vec<f32> = within.iter().map(|p| p[k]).collect();
-        along.sort_by(f32::total_cmp);
-        (along[along.len() / 100], along[along.len() - 1 - along.len() / 100])
-    });
-    let (min, max) = (Vec3::new(x.0, y.0, z.0), Vec3::new(x.1, y.1, z.1));
-    let more = 0.05 * (max - min);
-    Some(Aabb { min: (min - more).max(seen.min), max: (max + more).min(seen.max) })
-}
-
-/// Returns the scene of a box in the world, without a hull; `None` for a flat box.
-fn from_box(b: Aabb) -> Option<Scene> {
-    let (size, middle) = (b.size().as_dvec3(), b.center().as_dvec3());
-    let half = 0.5 * size.max_element();
-    if !(half.is_finite() && size.min_element() > 1e-3 * half) {
-        return None;
-    }
-    let reach = (0.5 * size / half).as_vec3();
-    let aabb = Aabb { min: -reach, max: reach };
-    Some(Scene { scene_from_world: scene_from(middle, half), aabb, hull: None })
-}
-
-/// Returns the scene without masks, as described in the module documentation.
-fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Scene> {
-    if let Some(scene) = focus.and_then(from_box) {
-        return Ok(scene);
-    }
-    let some: Vec<&Camera> = cameras.iter().collect();
-    let axes: Vec<_> = cameras.iter().map(|c| carve::ray_to(c, None)).collect();
-    let center = aim(&some, &axes)?;
-    let mut distances: Vec<f64> = cameras.iter().map(|c| c.position.distance(center)).collect();
-    distances.sort_by(f64::total_cmp);
-    let half = 0.6 * distances[distances.len() / 2];
-    let cube = Cube { center, half, n: 48 };
-    let projectors: Vec<Projector> = cameras.iter().map(Projector::new).collect();
-    let least = (2 * cameras.len()).div_ceil(5).max(2);
-    let mut kept = vec![false; cube.n.pow(3)];
-    for (i, cell) in kept.iter_mut().enumerate() {
-        let p = cube.cell_center(i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n);
-        *cell = p.distance(center) <= half && projectors.iter().filter(|c| c.sees(p)).count() >= least;
-    }
-    carve::drop_dust(&mut kept, cube.n, 1.0);
-    let Some(extent) = carve::extent(&kept, cube.n) else {
-        let seen = projectors.iter().filter(|c| c.sees(center)).count();
-        return Err(head_outside(seen, cameras.len()));
-    };
-    let lo = DVec3::from(extent.map(|(lo, _)| lo as f64));
-    let hi = DVec3::from(extent.map(|(_, hi)| hi as f64 + 1.0));
-    let middle = center - half + 0.5 * (lo + hi) * cube.cell();
-    let size = (hi - lo) * cube.cell();
-    let half = 0.5 * size.max_element();
-    let reach = (0.5 * size / half).as_vec3();
-    Ok(Scene {
-        scene_from_world: scene_from(middle, half),
-        aabb: Aabb { min: -reach, max: reach },
-        hull: None,
-    })
-}
-
 /// Plausible heights of a head, meters: with or without neck and shoulders, of a child or an adult.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.15..=0.6;
 
@@ -472,149 +396,9 @@ pub fn describe(scene: &Scene) -> String {
     )
 }
 
-/// Half of the sides of T-Face's published box, in units of 0.3 of the dataset's.
-const ILSH_HALF: Vec3 = Vec3::new(1.5, 1.67, 1.0);
-
-/// Dataset units in a unit of T-Face's published world.
-const ILSH_UNIT: f64 = 0.3;
-
-/// The box in which fields are trained: `capture.box`.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum SceneBox {
-    /// The box located by cameras and masks.
-    Head,
-    /// The published box of the ILSH captures, if it contains the head.
-    Ilsh,
-    /// Any box, in dataset units.
-    Given(Aabb),
-}
-
-impl SceneBox {
-    /// Parses `capture.box`.
-    pub fn parse(text: &str) -> Result<SceneBox> {
-        let wrong = |why: String| {
-            let hint = "write head, ilsh or the lowest and the highest corner: `-0.4,-0.5,-0.3,0.4,0.5,0.3`";
-            Err(Error::usage(format!("`capture.box` {why}"), hint))
-        };
-        match text.trim() {
-            "head" | "" => return Ok(SceneBox::Head),
-            "ilsh" => return Ok(SceneBox::Ilsh),
-            _ => {}
-        }
-        let numbers: Vec<&str> = text.split([',', ' ']).filter(|word| !word.is_empty()).collect();
-        let values: Vec<f32> = numbers.iter().filter_map(|n| n.parse().ok()).collect();
-        let [x0, y0, z0, x1, y1, z1] = values[..] else {
-            return wrong(format!("is `{text}`: neither a word nor six numbers"));
-        };
-        let (min, max) = (Vec3::new(x0, y0, z0), Vec3::new(x1, y1, z1));
-        if !(min.is_finite() && max.is_finite() && min.cmplt(max).all()) {
-            return wrong(format!("is `{text}`, which is not a box with its lowest corner first"));
-        }
-        Ok(SceneBox::Given(Aabb { min, max }))
-    }
-}
-
-/// Returns the scene of the published box: its unit is 0.3 dataset units, its origin the dataset's.
-fn ilsh() -> Scene {
-    Scene {
-        scene_from_world: Similarity::scale_translate(1.0 / ILSH_UNIT, DVec3::ZERO),
-        aabb: Aabb { min: -ILSH_HALF, max: ILSH_HALF },
-        hull: None,
-    }
-}
-
-/// Returns the scene of the configured box, and a warning if it cannot be used.
-///
-/// `found` locates the head by cameras and masks, and is not called for a given box, which has no hull.
-pub fn in_box(
-    found: impl FnOnce() -> Result<(Scene, Vec<String>)>,
-    wanted: SceneBox,
-) -> Result<(Scene, Vec<String>)> {
-    if let SceneBox::Given(b) = wanted {
-        let (middle, half) = (b.center().as_dvec3(), 0.5 * b.size());
-        let longest = half.max_element();
-        let aabb = Aabb { min: -half / longest, max: half / longest };
-        let scale = 1.0 / f64::from(longest);
-        let scene =
-            Scene { scene_from_world: Similarity::scale_translate(scale, -middle * scale), aabb, hull: None };
-        return Ok((scene, Vec::new()));
-    }
-    let (scene, mut warnings) = found()?;
-    if wanted == SceneBox::Head {
-        return Ok((scene, warnings));
-    }
-    let head = world_box(&scene);
-    let cube = ILSH_UNIT as f32;
-    let (middle, half) = (head.center(), 0.5 * head.size().max_element());
-    if middle.abs().max_element() < cube && (0.5 * cube..2.5 * cube).contains(&half) {
-        return Ok((ilsh(), warnings));
-    }
-    warnings.push(format!(
-        "the published box, ±{cube} dataset units around the origin, does not hold the head, which is around \
-         {middle:.2} and {:.2} units long: its own box is taken",
-        2.0 * half
-    ));
-    Ok((scene, warnings))
-}
-
-/// Returns the part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
-/// median, inside the frames of a `share` of the cameras, 0..=1 (three at least). `cameras` are in the world;
-/// only the face that looks most downward moves (`up` is a world direction): frames cut heads below, and a body
-/// whose shoulders end in walls left and right looks like a box.
-///
-/// Without a hull, and where every slab is seen, the whole box.
-pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3, share: f64) -> Aabb {
-    let Some(hull) = &scene.hull else { return scene.aabb };
-    let least = ((share * cameras.len() as f64).ceil() as usize).max(3).min(cameras.len());
-    let projectors: Vec<Projector> = cameras.iter().map(Projector::new).collect();
-    let world_from_scene = scene.scene_from_world.inverse();
-    let r = hull.resolution;
-    let cell = 2.0 / r as f64;
-    let middle = |i: usize| (i as f64 + 0.5) * cell - 1.0;
-    // how many cameras see each cell of a slab across an axis; the median decides
-    let seen_enough = |axis: usize, slab: usize| -> Option<bool> {
-        let mut seen: Vec<usize> = Vec::new();
-        for a in 0..r {
-            for b in 0..r {
-                let mut c = [a, b, slab];
-                c.rotate_left(2 - axis); // the slab's index goes to its axis, (a, b) to the others in turn
-                if hull.get((c[0] * r + c[1]) * r + c[2]) {
-                    let p = world_from_scene.point_f64(DVec3::from_array(c.map(middle)));
-                    seen.push(projectors.iter().filter(|q| q.sees(p)).count());
-                }
-            }
-        }
-        if seen.is_empty() {
-            return None;
-        }
-        let half = seen.len() / 2;
-        Some(*seen.select_nth_unstable(half).1 >= least)
-    };
-    let mut low = scene.aabb.min;
-    let mut high = scene.aabb.max;
-    let up = scene.scene_from_world.direction(up);
-    let axis = up.abs().max_position();
-    let good: Vec<usize> = (0..r).filter(|&s| seen_enough(axis, s) == Some(true)).collect();
-    let poor: Vec<usize> = (0..r).filter(|&s| seen_enough(axis, s) == Some(false)).collect();
-    let (Some(&first), Some(&last)) = (good.first(), good.last()) else { return scene.aabb };
-    // it moves only where a poorly seen slab lies beyond the last good one
-    let below = poor.iter().filter(|&&s| s < first).max();
-    let above = poor.iter().filter(|&&s| s > last).min();
-    match (up[axis] > 0.0, below, above) {
-        (true, Some(&edge), _) => low[axis] = low[axis].max(((edge + 1) as f64 * cell - 1.0) as f32),
-        (false, _, Some(&edge)) => high[axis] = high[axis].min((edge as f64 * cell - 1.0) as f32),
-        _ => {}
-    }
-    Aabb { min: low, max: high.max(low + Vec3::splat(cell as f32)) }
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::synthetic;
     use super::*;
-    use crate::config::{Preset, VmConfig};
-    use crate::geom::{Distortion, Similarity};
-    use crate::kernel::cpu::vm::{samples_across, size_for, step_size};
 
     /// Returns a camera at `position` looking at `target`, 60 × 60 pixels, focal length 80.
     fn camera(position: DVec3, target: DVec3) -> Camera {
@@ -663,46 +447,6 @@ mod tests {
 
     fn small() -> SceneOptions {
         SceneOptions { resolution: 64, ..SceneOptions::default() }
-    }
-
-    #[test]
-    fn points_draw_the_box_tighter_and_a_flat_box_is_no_scene() {
-        let options = synthetic::SyntheticOptions::default();
-        let cameras: Vec<Camera> =
-            synthetic::cameras(&options).into_iter().map(|(camera, _)| camera).collect();
-        let view = |camera: &Camera| View {
-            name: String::new(),
-            camera: camera.clone(),
-            split: super::super::view::Split::Train,
-            photo: Default::default(),
-            mask: super::super::view::ViewMask::None,
-            mask_meaning: crate::config::MaskMeaning::Empty,
-            mask_reading: Default::default(),
-            side_turn: None,
-            valid: None,
-            region: None,
-            downscale: 1,
-            photo_size: (1, 1),
-            declared: (1, 1),
-            declared_by: String::new(),
-            turn: None,
-            mask_turn: None,
-            exposure: None,
-        };
-        let views: Vec<View> = cameras.iter().map(view).collect();
-        let mut points: Vec<DVec3> =
-            synthetic::SyntheticHead.surface_points(2000, 3).iter().map(|p| p.as_dvec3()).collect();
-        points.push(DVec3::splat(500.0)); // what else is in the pictures
-        points.push(DVec3::splat(f64::NAN));
-        let found = around_points(&views, &points).unwrap();
-        let truth = synthetic::SyntheticHead.bounds();
-        let off = (found.min - truth.min).abs().max((found.max - truth.max).abs());
-        assert!(off.max_element() < 0.1 * truth.size().max_element(), "{found:?} {truth:?}");
-        assert_eq!(around_points(&views, &points[..99]), None);
-        let options = SceneOptions { focus: Some(found), ..SceneOptions::default() };
-        let (scene, _) = fit(&cameras, &vec![None; cameras.len()], &options).unwrap();
-        assert!((world_box(&scene).min - found.min).abs().max_element() < 1e-3);
-        assert!(from_box(Aabb { min: Vec3::ZERO, max: Vec3::new(1.0, 1.0, 0.0) }).is_none());
     }
 
     #[test]
@@ -839,129 +583,5 @@ mod tests {
         );
         assert!(warnings.iter().any(|w| w.contains("view `7` alone removes")), "{warnings:?}");
         assert_eq!(warnings.len(), 2, "{warnings:?}");
-    }
-
-    fn found(center: f32, half: f32) -> impl FnOnce() -> Result<(Scene, Vec<String>)> {
-        let scale = 1.0 / f64::from(half);
-        let middle = DVec3::splat(f64::from(center));
-        let scene_from_world = Similarity::scale_translate(scale, -middle * scale);
-        move || Ok((Scene { scene_from_world, aabb: Aabb::SCENE, hull: None }, Vec::new()))
-    }
-
-    #[test]
-    fn the_published_box_has_the_published_numbers_in_both_worlds() {
-        let (scene, warnings) = in_box(found(0.02, 0.3), SceneBox::Ilsh).unwrap();
-        assert!(warnings.is_empty());
-        // ±(0.45, 0.501, 0.3) dataset units
-        let world = world_box(&scene);
-        assert!((world.max - Vec3::new(0.45, 0.501, 0.3)).abs().max_element() < 1e-6, "{world:?}");
-        assert!((world.min + world.max).abs().max_element() < 1e-6);
-        // I-Face's cube is [-1, 1]³ of every scene
-        let corner = scene.scene_from_world.inverse().point(Vec3::ONE);
-        assert!((corner - 0.3).abs().max_element() < 1e-7, "{corner}");
-        // T-Face's own numbers: 25 per unit, entry between 3.5 and 7, 141 × 157 × 94 vertices, 459 samples
-        let bounds = [scene.aabb.min.to_array(), scene.aabb.max.to_array()];
-        let c = VmConfig::preset(Preset::Paper).placed(bounds);
-        assert!((c.distance_scale - 25.0).abs() < 1e-5 && (c.alpha_unit - 1.0).abs() < 1e-6, "{c:?}");
-        assert_eq!((c.near, c.far), (3.5, 7.0));
-        // 83.3 per dataset unit
-        assert!((c.distance_scale * scene.scene_from_world.scale - 83.333).abs() < 1e-2);
-        let extent = scene.aabb.size().to_array();
-        let size = size_for(extent, c.voxels_start);
-        assert_eq!(size, [141, 157, 94]);
-        let step = step_size(extent, size, c.step_ratio as f32);
-        assert_eq!(samples_across(extent, step), 459);
-    }
-
-    #[test]
-    fn another_box_has_the_same_optics_for_its_size_and_no_near_nor_far() {
-        let (scene, warnings) = in_box(found(3.0, 0.3), SceneBox::Ilsh).unwrap();
-        assert!(warnings[0].contains("its own box is taken"), "{warnings:?}");
-        let bounds = [scene.aabb.min.to_array(), scene.aabb.max.to_array()];
-        let c = VmConfig::preset(Preset::Paper).placed(bounds);
-        // 25 · 1.67 / 1: as thick across the box as in the published one
-        assert!((c.distance_scale - 41.75).abs() < 1e-9 && c.near == 0.0, "{c:?}");
-        // alpha of a step: 1 − exp(−σ step), the step in units of 1 / 1.67
-        assert!((c.alpha_unit * 1.67 - 1.0).abs() < 1e-9);
-        assert_eq!(in_box(found(0.0, 3.0), SceneBox::Ilsh).unwrap().1.len(), 1);
-        // and the others' constants are of the scene, whatever the box
-        let c = VmConfig::preset(Preset::Draft).placed(bounds);
-        assert_eq!((c.distance_scale, c.alpha_unit, c.near, c.far), (100.0, 1.0, 0.0, 1e6));
-    }
-
-    #[test]
-    fn a_given_box_is_taken_as_it_is_and_what_is_none_is_refused() {
-        let b = SceneBox::parse("-1, 0 2  3,2,3").unwrap();
-        assert_eq!(
-            b,
-            SceneBox::Given(Aabb { min: Vec3::new(-1.0, 0.0, 2.0), max: Vec3::new(3.0, 2.0, 3.0) })
-        );
-        let search = || -> Result<(Scene, Vec<String>)> { panic!("nothing is looked for") };
-        let (scene, _) = in_box(search, b).unwrap();
-        // 4 long: 2 units are one of the scene
-        assert_eq!(scene.aabb.max, Vec3::new(1.0, 0.5, 0.25));
-        let world = world_box(&scene);
-        assert!((world.min - Vec3::new(-1.0, 0.0, 2.0)).abs().max_element() < 1e-6);
-        assert_eq!(SceneBox::parse("head").unwrap(), SceneBox::Head);
-        for bad in ["1,2,3", "body", "0,0,0,1,1,nan", "0,0,0,1,0,1"] {
-            let e = SceneBox::parse(bad).unwrap_err();
-            assert!(e.to_string().contains("capture.box") && e.to_string().contains(bad), "{e}");
-        }
-    }
-
-    /// Eight cameras around the y axis at distance 4, looking at the middle from `height` above.
-    fn cameras(height: f64) -> Vec<Camera> {
-        (0..8)
-            .map(|i| {
-                let turn = DMat3::from_rotation_y(i as f64 * std::f64::consts::TAU / 8.0);
-                Camera {
-                    width: 100,
-                    height: 100,
-                    fx: 200.0,
-                    fy: 200.0,
-                    cx: 50.0,
-                    cy: 50.0,
-                    distortion: Distortion::default(),
-                    rotation: turn,
-                    position: turn * DVec3::new(0.0, height, 4.0),
-                }
-            })
-            .collect()
-    }
-
-    fn scene() -> Scene {
-        let bits = vec![u64::MAX; 16 * 16 * 16 / 64];
-        Scene {
-            scene_from_world: Similarity::IDENTITY,
-            aabb: Aabb::SCENE,
-            hull: Some(Hull { resolution: 16, bits }),
-        }
-    }
-
-    #[test]
-    fn what_every_frame_holds_is_kept_whole() {
-        // half the frame at distance 3, the nearest: 50 / 200 · 3 = 0.75; at 4: 1.0; median cells are in
-        let wide: Vec<Camera> =
-            cameras(0.0).into_iter().map(|c| Camera { fx: 80.0, fy: 80.0, ..c }).collect();
-        assert_eq!(well_seen(&scene(), &wide, Vec3::Y, 1.0 / 3.0), Aabb::SCENE);
-    }
-
-    #[test]
-    fn a_body_that_the_frames_cut_below_ends_where_they_end() {
-        // one unit up: the frame reaches from about 0 to 2 on the axis, so the lower half is not seen
-        let part = well_seen(&scene(), &cameras(1.0), Vec3::Y, 1.0 / 3.0);
-        assert_eq!((part.max, part.min.x, part.min.z), (Vec3::ONE, -1.0, -1.0));
-        assert!(part.min.y > -0.3 && part.min.y < 0.3, "{part:?}");
-    }
-
-    #[test]
-    fn fewer_cameras_keep_more_of_a_body() {
-        // five cameras look one unit higher than the other three, whose frames reach farther down
-        let split: Vec<Camera> =
-            cameras(1.5).into_iter().take(5).chain(cameras(0.5).into_iter().skip(5)).collect();
-        let low = |share: f64| well_seen(&scene(), &split, Vec3::Y, share).min.y;
-        // three of eight are the least of either share; more than half are those that look higher
-        assert_eq!(low(0.25), low(0.375));
-        assert!(low(0.25) + 0.5 < low(0.6), "{} {}", low(0.25), low(0.6));
     }
 }
