@@ -15,6 +15,7 @@ mod glb;
 mod glb_read;
 mod gltf_document;
 mod gltf_text;
+mod head_texture;
 mod mtl;
 mod obj;
 mod open;
@@ -25,13 +26,16 @@ mod read;
 mod source;
 mod stl;
 mod stored;
+mod tangents;
 mod uri;
 mod uv_check;
+mod weld;
 
 pub use check::{check, check_around};
 pub use check_report::{CheckReport, PieceReport, REQUIREMENTS};
-pub use file_mesh::{ExportOptions, ExportedFiles, HeadTexture, Lobes, tangents, weld};
+pub use file_mesh::{ExportOptions, ExportedFiles};
 pub use glb::to_glb;
+pub use head_texture::{HeadTexture, Lobes};
 pub use mtl::{Material, materials_of_mtl};
 pub use obj::to_obj;
 pub use open::{OpenedMesh, open_mesh, open_surface};
@@ -40,7 +44,19 @@ pub use read::{read, read_with};
 pub use source::{PictureSource, ReadMesh, ReadOptions};
 pub(crate) use stored::FORMAT;
 pub use stored::{ExtractedSurface, HeadMesh};
+pub use tangents::tangents;
 pub use uv_check::{MIN_AREA_PX, UvReport, seams_facing, uv_check};
+pub use weld::weld;
 
 #[cfg(test)]
 pub(crate) use stored::tests::head as test_head;
+
+use crate::Error;
+
+/// Hint for a mesh whose parts do not fit each other.
+const DAMAGED: &str = "the mesh is damaged; extract it again";
+
+/// Returns an error if only some vertices have normals or colors.
+fn wrong_length(found: usize, what: &str, vertices: usize) -> Error {
+    Error::cannot(format!("{found} {what} for {vertices} vertices"), DAMAGED)
+}

@@ -11,7 +11,7 @@
 //! - sliver: quality `4 √3 · area / Σ edge²` below 0.05 (1 for an equilateral triangle).
 
 use super::check_report::{CheckReport, PieceReport};
-use super::file_mesh::places;
+use super::weld::weld_map;
 use crate::geom::{
     Aabb, Boxes, DBox, DEFAULT_EFFORT, Mesh, WrongPiece, intersect, share_out, topology, wrong_pieces,
 };
@@ -52,7 +52,7 @@ pub fn check(mesh: &Mesh, unit_m: f64) -> CheckReport {
 
 /// [`check`] of a mesh whose positions are relative to `origin`.
 pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
-    let (weld, welded) = places(mesh);
+    let (weld, welded) = weld_map(mesh);
     let valid =
         |t: &[u32; 3]| t.iter().all(|&i| mesh.positions.get(i as usize).is_some_and(|p| p.is_finite()));
     // triangles that remain triangles after welding: their welded corners and their indices

@@ -13,23 +13,15 @@
 //! position and normal: welding equal positions closes the surface again.
 //!
 //! All problems that prevent a mesh or a texture from being written are found before any bytes are produced.
-//!
-//! # Tangents
-//!
-//! Tangents for normal maps, as Mikkelsen's program gives them to Blender, Unreal and every baker:
-//! *Simulation of Wrinkled Surfaces Revisited*, 2008, chapter 3.
-//!
-//! A normal map means nothing without the tangents it was baked for. Bake with these, and the file
-//! carries the same ones: `TANGENT` holds the direction of growing u and a sign w, and the bitangent
-//! `w · (n × t)` points up the picture (towards smaller v, since our v runs down).
 
-use crate::geom::sphharm::rotated;
-use crate::geom::{Atlas, Mesh, ShellLayer, Shells, Similarity};
-use crate::image::{Image, Photo, reduce_photo, reduce_to_rows, working_size};
+use super::head_texture::{HeadTexture, check_atlas};
+use super::tangents::tangents_of;
+use super::{DAMAGED, wrong_length};
+use crate::geom::{Mesh, ShellLayer, Shells, Similarity};
+use crate::image::Photo;
 use crate::mesh::check_indices;
 use crate::{Error, Result, io};
-use bevy_mikktspace::{Geometry, TangentSpace, generate_tangents};
-use glam::{DMat3, DVec3, Mat3, Vec2, Vec3, Vec4};
+use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -351,130 +343,6 @@ pub(super) fn left_out(texture: Option<&HeadTexture>, ending: &str) -> Vec<Strin
     warnings
 }
 
-/// The texture of a mesh: its texture coordinates and pictures.
-#[derive(Clone, Debug, PartialEq)]
-pub struct HeadTexture {
-    /// The texture coordinates.
-    pub atlas: Atlas,
-    /// Base color, sRGB-coded; its alpha is not written.
-    pub color: Photo,
-    /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents of
-    /// [`tangents()`]. GLB only.
-    pub normal: Option<Photo>,
-    /// View-dependent color. GLB only.
-    pub lobes: Option<Lobes>,
-}
-
-/// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Lobes {
-    /// One picture per spherical-harmonic function; a byte `b` stands for `(b − 128) / 127 · scale`.
-    pub pictures: Vec<Photo>,
-    /// Scale of each, sRGB-coded.
-    pub scale: Vec<f32>,
-    /// Rotates directions of the dataset's world to those of the exported files.
-    pub asset_from_world: Mat3,
-}
-
-impl Lobes {
-    /// Returns the same lobes in the coordinates of other files, as sRGB-coded differences: one picture a function.
-    pub fn turned(&self, asset_from_world: Mat3) -> Vec<Image> {
-        let matrix = rotated(self.pictures.len(), self.asset_from_world * asset_from_world.transpose());
-        let turned = |j: usize| {
-            let Photo { width, height, .. } = self.pictures[j];
-            let mut image = Image::new(width, height, 3);
-            for (k, picture) in self.pictures.iter().enumerate() {
-                let step = matrix[k][j] * self.scale[k] / 127.0;
-                let bytes = picture.rgb.as_flattened();
-                image.data.iter_mut().zip(bytes).for_each(|(sum, &b)| *sum += step * (f32::from(b) - 128.0));
-            }
-            image
-        };
-        (0..self.pictures.len()).map(turned).collect()
-    }
-}
-
-impl HeadTexture {
-    /// Returns a texture of a base color alone.
-    pub fn new(atlas: Atlas, color: Photo) -> HeadTexture {
-        HeadTexture { atlas, color, normal: None, lobes: None }
-    }
-
-    /// Returns the texture with pictures whose longest side is at most `px`, those of lobes at most `lobe_px`: averaged,
-    /// colors in linear light.
-    pub fn reduced(self, px: u32, lobe_px: u32) -> HeadTexture {
-        let smaller = |photo: &Photo, px| reduce_photo(photo, working_size(photo.width, photo.height, px));
-        let color = reduce_to_rows(&self.color, working_size(self.color.width, self.color.height, px).1);
-        let normal = self.normal.map(|normal| smaller(&normal, px));
-        let lobes = self.lobes.map(|lobes| Lobes {
-            pictures: lobes.pictures.iter().map(|picture| smaller(picture, lobe_px)).collect(),
-            ..lobes
-        });
-        let atlas = Atlas { width: color.width, height: color.height, ..self.atlas };
-        HeadTexture { atlas, color, normal, lobes }
-    }
-
-    /// Returns the pictures of the lobes, if the texture has any.
-    pub(super) fn lobe_pictures(&self) -> &[Photo] {
-        self.lobes.as_ref().map_or(&[], |l| &l.pictures)
-    }
-
-    /// Checks that every picture is complete and has the atlas's aspect ratio; its scale is free.
-    fn check_pictures(&self) -> Result<()> {
-        self.check("base color", &self.color)?;
-        self.normal.as_ref().map_or(Ok(()), |normal| self.check("normal map", normal))?;
-        let mut lobes = self.lobe_pictures().iter().enumerate();
-        lobes.try_for_each(|(k, picture)| self.check(&format!("texture `lobe {k}`"), picture))
-    }
-
-    fn check(&self, what: &str, picture: &Photo) -> Result<()> {
-        let (w, h) = (u64::from(picture.width), u64::from(picture.height));
-        if w * h == 0 || w * h != picture.rgb.len() as u64 {
-            let found = format!("{} pixels for {w} × {h}", picture.rgb.len());
-            return Err(wrong_picture(what, found, "one for each, and at least one"));
-        }
-        if w * u64::from(self.atlas.height) != h * u64::from(self.atlas.width) {
-            let expected = format!("the shape of its atlas, {} × {}", self.atlas.width, self.atlas.height);
-            return Err(wrong_picture(what, format!("{w} × {h} pixels"), &expected));
-        }
-        Ok(())
-    }
-}
-
-const DAMAGED: &str = "the mesh is damaged; extract it again";
-
-/// Checks that the atlas belongs to this mesh and lies within its texture.
-fn check_atlas(mesh: &Mesh, atlas: &Atlas) -> Result<()> {
-    let wrong = |what: String| {
-        Err(Error::cannot(what, "the atlas is damaged or belongs to another mesh; unwrap it again"))
-    };
-    let (found, expected) = (atlas.triangles.len(), mesh.triangles.len());
-    if found != expected {
-        return wrong(format!("the atlas has {found} triangles, the mesh {expected}"));
-    }
-    let uvs = atlas.uvs.len();
-    for (triangle, t) in atlas.triangles.iter().enumerate() {
-        if let Some(index) = t.iter().find(|&&i| i as usize >= uvs) {
-            return wrong(format!(
-                "triangle {triangle} uses texture coordinate {index}, but there are only {uvs}"
-            ));
-        }
-    }
-    let outside = |v: &f32| !(0.0..=1.0).contains(v);
-    match atlas.uvs.iter().position(|uv| uv.to_array().iter().any(outside)) {
-        Some(index) => wrong(format!(
-            "texture coordinate {index} is {}, expected 0 to 1 in both directions",
-            atlas.uvs[index]
-        )),
-        None => Ok(()),
-    }
-}
-
-/// Returns an error if only some vertices have normals or colors.
-pub(super) fn wrong_length(found: usize, what: &str, vertices: usize) -> Error {
-    Error::cannot(format!("{found} {what} for {vertices} vertices"), DAMAGED)
-}
-
 /// Returns an error if a coordinate is NaN or infinite, before or after turning and scaling.
 fn not_finite(vertex: usize, what: &str, found: String) -> Error {
     let what = format!("vertex {vertex} has the {what} {found}, which is not finite in single precision");
@@ -487,144 +355,6 @@ fn wrong_option(what: &str, found: impl ToString, expected: &str) -> Error {
     Error::cannot(format!("`{what}` is {}, expected {expected}", found.to_string()), hint)
 }
 
-/// Returns an error if a picture does not fit its own size or the atlas.
-fn wrong_picture(what: &str, found: String, expected: &str) -> Error {
-    let hint = "bake it again, for this atlas";
-    Error::cannot(format!("the {what} is {found}, expected {expected}"), hint)
-}
-
-/// Returns the tangent at each corner of each triangle: `xyz` unit, `w` ±1. Corners of a vertex agree within a chart.
-///
-/// # Errors
-///
-/// Fails if the atlas does not belong to the mesh, or if the mesh has no normals.
-pub fn tangents(mesh: &Mesh, atlas: &Atlas) -> Result<Vec<[Vec4; 3]>> {
-    check_atlas(mesh, atlas)?;
-    let (found, vertices) = (mesh.normals.len(), mesh.positions.len());
-    if found != vertices {
-        return Err(wrong_length(found, "normals", vertices));
-    }
-    check_indices(mesh)?;
-    Ok(tangents_of(&mesh.positions, &mesh.normals, &mesh.triangles, &atlas.uvs, &atlas.triangles))
-}
-
-/// Computes [`tangents`] of parts whose indices have been checked.
-fn tangents_of(
-    positions: &[Vec3],
-    normals: &[Vec3],
-    triangles: &[[u32; 3]],
-    uvs: &[Vec2],
-    corners: &[[u32; 3]],
-) -> Vec<[Vec4; 3]> {
-    let found = vec![[Vec4::ZERO; 3]; triangles.len()];
-    let mut input = TangentInput { positions, normals, triangles, uvs, corners, found };
-    // this fails only if no triangle has an area; remaining zeros are repaired below
-    let _ = generate_tangents(&mut input);
-    let mut found = input.found;
-    for (tangents, vertices) in found.iter_mut().zip(triangles) {
-        for (tangent, &vertex) in tangents.iter_mut().zip(vertices) {
-            *tangent = repaired(*tangent, normals[vertex as usize]);
-        }
-    }
-    found
-}
-
-/// Makes tangents unit and perpendicular to the normal. Triangles without area in the texture have no direction of
-/// their own.
-fn repaired(tangent: Vec4, normal: Vec3) -> Vec4 {
-    let across = tangent.truncate().reject_from(normal);
-    let unit = if tangent.is_finite() && across.length() > 1e-4 {
-        // twice: the first leaves rounding of the f32 that `reject_from` divides by
-        across.normalize().reject_from(normal).normalize()
-    } else {
-        normal.try_normalize().unwrap_or(Vec3::Y).any_orthonormal_vector()
-    };
-    (unit + Vec3::ZERO).extend(if tangent.w < 0.0 { -1.0 } else { 1.0 })
-}
-
-struct TangentInput<'a> {
-    positions: &'a [Vec3],
-    normals: &'a [Vec3],
-    triangles: &'a [[u32; 3]],
-    uvs: &'a [Vec2],
-    corners: &'a [[u32; 3]],
-    found: Vec<[Vec4; 3]>,
-}
-
-impl Geometry for TangentInput<'_> {
-    fn num_faces(&self) -> usize {
-        self.triangles.len()
-    }
-
-    fn num_vertices_of_face(&self, _: usize) -> usize {
-        3
-    }
-
-    fn position(&self, face: usize, corner: usize) -> [f32; 3] {
-        self.positions[self.triangles[face][corner] as usize].to_array()
-    }
-
-    fn normal(&self, face: usize, corner: usize) -> [f32; 3] {
-        self.normals[self.triangles[face][corner] as usize].to_array()
-    }
-
-    /// With v up, as Mikkelsen's program and OpenGL normal maps take it.
-    fn tex_coord(&self, face: usize, corner: usize) -> [f32; 2] {
-        let uv = self.uvs[self.corners[face][corner] as usize];
-        [uv.x, 1.0 - uv.y]
-    }
-
-    fn set_tangent(&mut self, tangent: Option<TangentSpace>, face: usize, corner: usize) {
-        self.found[face][corner] = tangent.map_or(Vec4::ZERO, |t| Vec4::from_array(t.tangent_encoded()));
-    }
-}
-
-/// Returns for each vertex the index of its unique position, in order of first use, and these positions: files with a
-/// texture repeat vertices at seams. −0 equals 0.
-pub(super) fn places(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
-    let mut numbers: HashMap<[u32; 3], u32> = HashMap::with_capacity(mesh.positions.len());
-    let mut welded = Vec::new();
-    let place = |p: &Vec3| {
-        let p = p + Vec3::ZERO; // −0 + 0 is 0
-        *numbers.entry(p.to_array().map(f32::to_bits)).or_insert_with(|| {
-            welded.push(p);
-            welded.len() as u32 - 1
-        })
-    };
-    let places = mesh.positions.iter().map(place).collect();
-    (places, welded)
-}
-
-/// Returns the mesh with equal positions merged, where −0 equals 0. Triangles keep their number and order, so an
-/// atlas stays parallel to them; degenerate ones are kept too.
-///
-/// A merged vertex has the color of its first copy, and their common normal; copies that disagree, as
-/// on creases, get the unit of their sum.
-pub fn weld(mesh: &Mesh) -> Mesh {
-    let (new, positions) = places(mesh);
-    let mut creased = vec![false; positions.len()];
-    let mut out = Mesh { positions, ..Mesh::default() };
-    let mut first = 0;
-    for (i, &number) in new.iter().enumerate() {
-        let number = number as usize;
-        if number == first {
-            first += 1;
-            out.colors.extend(mesh.colors.get(i));
-            out.normals.extend(mesh.normals.get(i));
-        } else if let Some(&n) = mesh.normals.get(i)
-            && (creased[number] || out.normals[number] != n)
-        {
-            out.normals[number] += n;
-            creased[number] = true;
-        }
-    }
-    for (normal, _) in out.normals.iter_mut().zip(creased).filter(|(_, creased)| *creased) {
-        *normal = normal.normalize_or_zero();
-    }
-    out.triangles = mesh.triangles.iter().map(|t| t.map(|i| new[i as usize])).collect();
-    out
-}
-
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
@@ -632,29 +362,6 @@ pub(super) mod tests {
 
     fn triangle() -> Mesh {
         Mesh { positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y], triangles: vec![[0, 1, 2]], ..Mesh::default() }
-    }
-
-    #[test]
-    fn a_smaller_texture_averages_light_and_other_values_as_they_are() {
-        // columns of black and white, and of lobes and normals of the same bytes
-        let photo = Photo {
-            width: 4,
-            height: 2,
-            rgb: (0..8).map(|i| [if i % 2 == 0 { 0 } else { 255 }; 3]).collect(),
-            alpha: None,
-        };
-        let lobes =
-            Lobes { pictures: vec![photo.clone()], scale: vec![0.5], asset_from_world: Mat3::IDENTITY };
-        let atlas = Atlas { width: 4, height: 2, ..Atlas::default() };
-        let texture =
-            HeadTexture { atlas, color: photo.clone(), normal: Some(photo.clone()), lobes: Some(lobes) };
-        let small = texture.clone().reduced(2, 2);
-        // half of the light is 188 in sRGB
-        assert_eq!((small.color.width, small.color.height, &small.color.rgb[..]), (2, 1, &[[188; 3]; 2][..]));
-        assert_eq!((small.atlas.width, small.atlas.height), (2, 1));
-        assert_eq!(small.normal.unwrap().rgb, [[128; 3]; 2]);
-        assert_eq!(small.lobes.unwrap().pictures[0].rgb, [[128; 3]; 2]);
-        assert_eq!(texture.clone().reduced(4, 9), texture);
     }
 
     #[test]
@@ -839,64 +546,5 @@ pub(super) mod tests {
         assert_eq!(ending, "jpg");
         assert_eq!(crate::io::parse_photo(&jpeg, path, &limits).unwrap().width, 8);
         assert!(encode("x", &color, Some(0)).is_err());
-    }
-
-    /// Returns a square in the plane z = 0 that looks along +Z, with the picture upright or mirrored.
-    fn square(mirrored: bool) -> (Mesh, Atlas) {
-        let positions = vec![Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y];
-        // v runs down: the top of the picture, v = 0, is at y = 1
-        let uv = |p: &Vec3| Vec2::new(if mirrored { 1.0 - p.x } else { p.x }, 1.0 - p.y);
-        let uvs = positions.iter().map(uv).collect();
-        let triangles = vec![[0, 1, 2], [0, 2, 3]];
-        let atlas = Atlas { uvs, triangles: triangles.clone(), width: 4, height: 4 };
-        (Mesh { normals: vec![Vec3::Z; 4], positions, triangles, colors: vec![] }, atlas)
-    }
-
-    #[test]
-    fn an_upright_picture_has_its_tangent_right_and_its_bitangent_up() {
-        for (mirrored, right, w) in [(false, Vec3::X, 1.0), (true, -Vec3::X, -1.0)] {
-            let (mesh, atlas) = square(mirrored);
-            for tangent in tangents(&mesh, &atlas).unwrap().into_iter().flatten() {
-                assert_eq!(tangent, right.extend(w));
-                // up the picture is +Y of the square
-                assert_eq!(w * Vec3::Z.cross(tangent.truncate()), Vec3::Y);
-            }
-        }
-    }
-
-    #[test]
-    fn a_chart_without_area_still_gets_unit_tangents() {
-        let (mesh, mut atlas) = square(false);
-        atlas.uvs = vec![Vec2::splat(0.5); 4];
-        for tangent in tangents(&mesh, &atlas).unwrap().into_iter().flatten() {
-            assert!((tangent.truncate().length() - 1.0).abs() < 1e-6 && tangent.w.abs() == 1.0);
-            assert!(tangent.truncate().dot(Vec3::Z).abs() < 1e-6);
-        }
-    }
-
-    #[test]
-    fn a_mesh_without_normals_has_no_tangents() {
-        let (mut mesh, atlas) = square(false);
-        mesh.normals.clear();
-        assert_eq!(tangents(&mesh, &atlas).unwrap_err().to_string(), "0 normals for 4 vertices");
-    }
-
-    #[test]
-    fn copies_become_one_and_creases_share_a_normal() {
-        let mesh = Mesh {
-            positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, -Vec3::ZERO, Vec3::Y, Vec3::X],
-            normals: vec![Vec3::Z, Vec3::Z, Vec3::X, Vec3::Z, Vec3::Y, Vec3::Z],
-            colors: (0..6).map(|i| [i as f32; 3]).collect(),
-            triangles: vec![[0, 1, 2], [3, 4, 5]],
-        };
-        let welded = weld(&mesh);
-        assert_eq!(welded.positions, [Vec3::ZERO, Vec3::X, Vec3::Y]);
-        assert_eq!(welded.triangles, [[0, 1, 2], [0, 2, 1]]);
-        assert_eq!(welded.colors, [[0.0; 3], [1.0; 3], [2.0; 3]]);
-        // x + y, normalized
-        let half = std::f32::consts::FRAC_1_SQRT_2;
-        assert_eq!(&welded.normals[..2], [Vec3::Z; 2]);
-        assert!(welded.normals[2].distance(Vec3::new(half, half, 0.0)) < 1e-6);
-        assert!(welded.is_closed());
     }
 }

@@ -34,7 +34,9 @@
 //! Every accessor has a view of its own, at a multiple of four bytes; `min` and `max` are the stored
 //! numbers themselves. Views of pictures carry neither target nor stride.
 
-use super::file_mesh::{ExportOptions, FileMesh, HeadTexture, Lobes, encode, wrong_length};
+use super::file_mesh::{ExportOptions, FileMesh, encode};
+use super::head_texture::{HeadTexture, Lobes};
+use super::wrong_length;
 use crate::geom::{Aabb, Mesh, Shells};
 use crate::image::{Photo, linear_from_srgb, quantize};
 use crate::{Error, Result};

@@ -21,8 +21,9 @@
 use super::beside::unquoted;
 use super::color_range::bring_into_range;
 use super::file_mesh::{
-    ExportOptions, ExportedFiles, FileMesh, HeadTexture, distance_warning, encode, left_out, safe_name,
+    ExportOptions, ExportedFiles, FileMesh, distance_warning, encode, left_out, safe_name,
 };
+use super::head_texture::HeadTexture;
 use super::source::{NO_NORMALS, PictureSource, ReadMesh, Source, line_end};
 use crate::Result;
 use crate::geom::{Aabb, Atlas, Mesh};

@@ -5,8 +5,8 @@
 
 use super::beside::{self, Beside, unquoted};
 use super::color_range::{at_vertices, bring_into_range};
-use super::file_mesh::HeadTexture;
 use super::gltf_text::as_glb;
+use super::head_texture::HeadTexture;
 use super::mtl::{Material, materials_of_mtl};
 use super::obj::MAX_LIBRARIES;
 use super::read::read_with;

@@ -10,8 +10,9 @@
 //! does; weld equal positions to close it again.
 
 use super::file_mesh::{
-    ExportOptions, ExportedFiles, FileMesh, HeadTexture, distance_warning, encode, left_out, safe_name,
+    ExportOptions, ExportedFiles, FileMesh, distance_warning, encode, left_out, safe_name,
 };
+use super::head_texture::HeadTexture;
 use crate::Result;
 use crate::geom::Mesh;
 use crate::image::quantize;

@@ -9,7 +9,7 @@
 //! color.png normal.png lobe_K.png  the pictures of its texture
 //! ```
 
-use super::file_mesh::{HeadTexture, Lobes};
+use super::head_texture::{HeadTexture, Lobes};
 use crate::geom::{Aabb, Atlas, Harmonics, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Photo;
 use crate::io::{self, Limits, ReadError, TensorValues};

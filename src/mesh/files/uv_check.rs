@@ -11,7 +11,7 @@
 //!
 //! Texels are square even if the texture is not: all lengths are measured in texels.
 
-use super::file_mesh::places;
+use super::weld::weld_map;
 use crate::geom::{
     Atlas, DEFAULT_EFFORT, Mesh, OutlineSide, Sets, nearest_charts, overlaps, shared_area, side_ends,
     sorted_sides, turn,
@@ -246,7 +246,7 @@ impl AtlasCharts {
     }
 
     fn new(mesh: &Mesh, atlas: &Atlas, valid: &[bool]) -> AtlasCharts {
-        let (weld, _) = places(mesh);
+        let (weld, _) = weld_map(mesh);
         let welded = |i: u32| weld.get(i as usize).copied().unwrap_or(0); // any value for invalid triangles
         let faces: Vec<[u32; 3]> = mesh.triangles[..valid.len()].iter().map(|t| t.map(welded)).collect();
         let mut sides = sorted_sides(&faces);
