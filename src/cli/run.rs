@@ -268,7 +268,7 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
         faults.iter().for_each(|fault| row("", &one_line(&fault.to_string())));
     }
     for (stage, folder) in [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.word())] {
-        if of(stage).is_some() {
+        if summary(stage).is_some() {
             row("pictures", &run.path(folder).display());
         }
     }

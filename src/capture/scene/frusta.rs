@@ -86,6 +86,7 @@ pub(super) fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Sce
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::scene::{SceneOptions, fit};
     use crate::capture::synthetic;
 
     #[test]

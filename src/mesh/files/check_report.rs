@@ -6,7 +6,7 @@ use glam::DVec3;
 use serde::Serialize;
 use std::fmt;
 
-/// The result of [`check`]. Counts of triangles are of the mesh as given; topology is after welding.
+/// The result of [`check`](super::check()). Counts of triangles are of the mesh as given; topology is after welding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CheckReport {
     /// Vertices as stored.
@@ -57,15 +57,15 @@ pub struct CheckReport {
     pub wrong_pieces: Vec<PieceReport>,
     /// Whether every vertex has a color.
     pub has_colors: bool,
-    /// Whether a texture gives the mesh its colors; set by readers, because [`check`] receives only the mesh.
+    /// Whether a texture gives the mesh its colors; set by readers, because [`check`](super::check()) receives only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub has_texture: Option<bool>,
     /// Whether every vertex has a normal.
     pub has_normals: bool,
     /// Normals whose length is not 1 within 5e-4.
     pub bad_normals: usize,
-    /// The report on its texture coordinates; set by callers of [`uv_check`](super::uv_check()), because [`check`]
-    /// sees only the mesh.
+    /// The report on its texture coordinates; set by callers of [`uv_check`](super::uv_check()), because
+    /// [`check`](super::check()) sees only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub uv: Option<UvReport>,
 }
