@@ -88,7 +88,8 @@ pub fn has_cameras(root: &Path) -> bool {
 
 /// Returns the usable part of a capture, and everything that was found: problems, warnings, reasons.
 fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>, Listing) {
-    let root = &root.components().collect::<PathBuf>(); // messages join names to it: no `/` at its end
+    // messages join names to it: no `/` at its end
+    let root = &root.components().collect::<PathBuf>();
     let mut listing = Listing::default();
     let (folder, files) = match open_folder(root, options) {
         Ok(opened) => opened,
@@ -349,7 +350,8 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
 fn name_turned_masks(views: &[View], limits: &Limits, listing: &mut Listing) {
     let is_turned = |view: &&View| match &view.mask {
         ViewMask::File(path) if view.side_turn.is_some() => {
-            let info = io::picture_info(path, limits); // what cannot be read is said when it is read
+            // what cannot be read is said when it is read
+            let info = io::picture_info(path, limits);
             info.is_ok_and(|info| view.turns(info.size(Some(view.photo_size))))
         }
         _ => false,

@@ -6,7 +6,7 @@
 #     tools/test.sh unit NAME...       only tests whose names contain one of these; likewise integration
 #     tools/test.sh all                the check, then every part below
 #
-# lint         format, clippy with all features, a check without any, documentation and its figures
+# lint         format, width of comments, clippy with all features, a check without any, documentation and its figures
 # unit         unit tests, examples in the documentation
 # integration  the program as a user runs it: commands, hostile files, kills
 # readers      exported shapes in trimesh, open3d, three.js and the Khronos validator
@@ -218,6 +218,7 @@ fuzz_tests=tests/fuzz.rs
 
 lint() {
   step "format" cargo fmt --all -- --check
+  step "comments of at most 100 columns" "${PYTHON:-python3}" tools/reference/wrap_comments.py --check
   # once with all features, and once without any; then built once
   step "lints" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
   step "no features" cargo clippy --release --lib --bins -- -D warnings

@@ -120,8 +120,10 @@ impl Default for SceneOptions {
 /// use tiface::capture::synthetic::{SyntheticHead, SyntheticOptions, cameras};
 ///
 /// // without masks: where the cameras look
-/// let cameras: Vec<_> = cameras(&SyntheticOptions::default()).into_iter().map(|(camera, _)| camera).collect();
-/// let (scene, warnings) = scene::fit(&cameras, &vec![None; cameras.len()], &SceneOptions::default())?;
+/// let cameras = cameras(&SyntheticOptions::default());
+/// let cameras: Vec<_> = cameras.into_iter().map(|(camera, _)| camera).collect();
+/// let masks = vec![None; cameras.len()];
+/// let (scene, warnings) = scene::fit(&cameras, &masks, &SceneOptions::default())?;
 /// assert!(warnings.is_empty() && scene.hull.is_none());
 /// let (found, head) = (scene::world_box(&scene), SyntheticHead.bounds());
 /// assert!(found.contains(head.min) && found.contains(head.max));

@@ -257,7 +257,8 @@ impl View {
         let photo = self.whole_photo(limits)?;
         let found = (photo.width, photo.height);
         if found != self.photo_size {
-            return Err(self.size_error(&self.photo, found)); // it was replaced since the capture was opened
+            // it was replaced since the capture was opened
+            return Err(self.size_error(&self.photo, found));
         }
         if found == (self.camera.width, self.camera.height) {
             return Ok(photo);

@@ -29,7 +29,8 @@ fn later_wins_default_preset_file_set() {
     assert_eq!((c.preset, c.mesh.resolution), (Preset::Draft, 301));
     let c = from("[mesh]\nresolution = 300\npreset_is_below = 1", &[]);
     assert!(c.is_err());
-    let c = from("mesh.resolution = 300\npreset = \"draft\"", &[]).unwrap(); // the order of lines is no matter
+    // the order of lines is no matter
+    let c = from("mesh.resolution = 300\npreset = \"draft\"", &[]).unwrap();
     assert_eq!((c.mesh.resolution, c.iface), (300, Config::preset(Preset::Draft).iface));
     let c = Config::resolve(&Sources {
         preset: Some(Preset::Paper),

@@ -186,7 +186,8 @@ impl VmConfig {
     ///
     /// ```
     /// # use tiface::config::{Preset, VmConfig};
-    /// // a box of the published shape, 1.002 dataset units long, in a scene whose unit that is: 25 / 0.3 = 83.3
+    /// // a box of the published shape, 1.002 dataset units long, in a scene of that unit:
+    /// // 25 / 0.3 = 83.3
     /// let c = VmConfig::preset(Preset::Paper).placed([[-0.45, -0.501, -0.3], [0.45, 0.501, 0.3]]);
     /// assert!((c.distance_scale - 25.0 / 0.3).abs() < 1e-4);
     /// ```

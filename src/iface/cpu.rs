@@ -198,7 +198,8 @@ impl SdfOps for CpuSdf<'_> {
         let step = &self.step;
         let (mut x, mut d) = step.samples.points(&step.batch.rays);
         x.extend(step.points.iter().map(|p| p.position));
-        d.resize(x.len(), [0.0, 0.0, 1.0]); // any direction will do: the color of points has no loss
+        // any direction will do: the color of points has no loss
+        d.resize(x.len(), [0.0, 0.0, 1.0]);
         let table = bytemuck::cast_slice(slice(table.value()));
         let activations = sdf::forward(&self.shape, table, self.prepared(), &x, &d);
         self.step.activations = Some(activations);

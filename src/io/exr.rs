@@ -154,7 +154,8 @@ mod tests {
         let (x, y, z) = ([1.0, 2.0], [3.0, 4.0], [5.0, f32::NAN]);
         write_exr(&path, 2, 1, &[("N.Z", &z), ("N.X", &x), ("N.Y", &y)]).unwrap();
         let read = read_exr(&path, &[&["N.X", "N.Y", "N.Z"]], &Limits::default()).unwrap();
-        assert_eq!(read.image.data, [1.0, 3.0, 5.0, 2.0, 4.0, 0.0]); // NaN became 0, and was counted
+        // NaN became 0, and was counted
+        assert_eq!(read.image.data, [1.0, 3.0, 5.0, 2.0, 4.0, 0.0]);
         assert_eq!(read.replaced, 1);
         let error = read_exr(&path, &[&["Z"]], &Limits::default()).unwrap_err();
         assert!(error.to_string().contains("N.X") && error.hint().contains("`Z`"), "{error}");

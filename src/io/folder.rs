@@ -39,7 +39,8 @@ pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> R
         let removed = if is_folder && !apart(&inside) {
             clear_folder(&inside, keep, apart)?;
             match fs::remove_dir(&inside) {
-                Err(e) if e.kind() == ErrorKind::DirectoryNotEmpty => Ok(()), // something apart is in it
+                // something apart is in it
+                Err(e) if e.kind() == ErrorKind::DirectoryNotEmpty => Ok(()),
                 other => other,
             }
         } else if is_folder || entry.file_name() == keep {

@@ -240,7 +240,8 @@ mod tests {
     #[test]
     fn the_number_of_values_is_bounded() {
         let limits = Limits { json_values: 4, ..Limits::default() };
-        assert!(parse_json(Path::new("t"), b"[1,2,3]", &limits).is_ok()); // the array itself is the fourth
+        // the array itself is the fourth
+        assert!(parse_json(Path::new("t"), b"[1,2,3]", &limits).is_ok());
         assert!(parse_json(Path::new("t"), b"[1,2,3,4]", &limits).is_err());
     }
 }

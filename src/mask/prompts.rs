@@ -2,7 +2,8 @@
 //!
 //! ```json
 //! {"convention": "…", "frames": [
-//!   {"file_path": "images/010.png", "points": [{"x": 181, "y": 288, "label": 1}, {"x": 32, "y": 51, "label": 0}]}]}
+//!   {"file_path": "images/010.png", "points": [
+//!     {"x": 181, "y": 288, "label": 1}, {"x": 32, "y": 51, "label": 0}]}]}
 //! ```
 //!
 //! `x` runs right and `y` down, as pixel indices of the photograph at the size its camera was calibrated for,

@@ -4,7 +4,8 @@
 //! surface: texels of an atlas, or vertices.
 //!
 //! ```text
-//! min_c  Σ_p D_p ‖ g y_p − b_p − Σ_k Y_k(d_p) Σ_t W_pt c_tk ‖² + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖²
+//! min_c  Σ_p D_p ‖ g y_p − b_p − Σ_k Y_k(d_p) Σ_t W_pt c_tk ‖²
+//!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖²
 //! ```
 //!
 //! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before the fit, `W` the

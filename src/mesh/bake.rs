@@ -121,11 +121,13 @@ pub struct BakeReport {
 ///     ],
 ///     ..Mesh::default()
 /// };
-/// let (atlas, _) = atlas(&mesh, &AtlasConfig { size_px: 64, gutter_px: 2, ..AtlasConfig::default() }, &tiface::Quiet)?;
+/// let config = AtlasConfig { size_px: 64, gutter_px: 2, ..AtlasConfig::default() };
+/// let (atlas, _) = atlas(&mesh, &config, &tiface::Quiet)?;
 /// // a ball that shows sRGB-coded 0.5 from everywhere
 /// let ball = |p: Vec3| p.length() - 1.0;
-/// let config =
-///     BakeConfig { side: 2, gutter_px: 2, reach: 0.5, views: 8, lobes: 0, normals: false, turned: Mat3::IDENTITY };
+/// let config = BakeConfig {
+///     side: 2, gutter_px: 2, reach: 0.5, views: 8, lobes: 0, normals: false, turned: Mat3::IDENTITY,
+/// };
 /// let baked = bake(&mesh, &atlas, &ball, &[], &config, &tiface::Quiet)?;
 /// assert!(baked.color.data.iter().all(|v| (v - 0.2140).abs() < 1e-3)); // linear
 /// # Ok::<(), tiface::Error>(())

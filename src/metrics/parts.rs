@@ -3,7 +3,7 @@
 //! | part | pixels |
 //! | --- | --- |
 //! | opaque | the mask is 1 (alpha ≥ 0.999): neither background nor partial coverage has an influence |
-//! | edge | within 3 pixels of the mask's 0.5 contour, on either side of it; the frame's border is no contour |
+//! | edge | within 3 pixels of the mask's 0.5 contour, on either side; the frame's border is none |
 //! | skin, hair | pixels of the region of interest, as [`Tones`] classifies them |
 //!
 //! Pixels are covered if the render's opacity is at least 0.5. Head pixels that are not covered are missing, covered

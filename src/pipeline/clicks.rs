@@ -2,8 +2,8 @@
 //! network's proposals for each view replace them, as far as the views agree.
 //!
 //! ```text
-//! clicks → cut (GrabCut, or SAM) ─┬─ propagated through the cameras → band → matting (closed form, ViTMatte) → alpha
-//! proposals → those that agree ───┘
+//! clicks → cut (GrabCut, or SAM) ─┬─ propagated through the cameras
+//! proposals → those that agree ───┘    → band → matting (closed form, ViTMatte) → alpha
 //! ```
 
 use crate::capture::{Capture, Split};

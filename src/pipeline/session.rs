@@ -48,7 +48,8 @@ impl<'a> Session<'a> {
             for view in &mut capture.views {
                 view.mask = ViewMask::File(mask::mask_file(&run.path(Stage::Mask), &view.name));
                 view.mask_turn = None;
-                view.mask_reading = MaskReading::White; // whatever the capture's own masks are drawn in
+                // whatever the capture's own masks are drawn in
+                view.mask_reading = MaskReading::White;
             }
         }
         if is_demo(config, run) {

@@ -64,7 +64,7 @@ fn sees(c: &Capture, focal: [f64; 2], center: [f64; 2]) {
     }
 }
 
-// ------------------------------------------------------------------------------------------------ NeuS
+// -------------------------------------------------------------------------------------------- NeuS
 
 fn npy(shape: &str, values: &[f64]) -> Vec<u8> {
     let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n");
@@ -153,7 +153,7 @@ fn neus_scenes_keep_their_world_and_know_their_sphere() {
     }
 }
 
-// ------------------------------------------------------------------------------------------------ Metashape
+// --------------------------------------------------------------------------------------- Metashape
 
 fn list(values: &[f64]) -> String {
     values.iter().map(|v| v.to_string()).collect::<Vec<_>>().join(" ")
@@ -261,7 +261,7 @@ fn hostile_metashape_files_are_refused_by_name() {
     refused(&dir, &["not UTF-8"]);
 }
 
-// ------------------------------------------------------------------------------------------------ RealityCapture
+// ---------------------------------------------------------------------------------- RealityCapture
 
 #[test]
 fn more_views_than_are_allowed_are_refused_whatever_lists_them() {
@@ -316,7 +316,8 @@ fn realitycapture_tables_and_sidecars_say_the_same() {
 
     let xmp = |i: usize| {
         let (rotation, at) = pose(i);
-        let camera_from_world: Vec<f64> = rotation.to_cols_array().to_vec(); // columns of one are rows of the other
+        // columns of one are rows of the other
+        let camera_from_world: Vec<f64> = rotation.to_cols_array().to_vec();
         format!(
             r#"<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
 <rdf:Description xcr:Version="3" xcr:PosePrior="locked" xcr:Coordinates="absolute" xcr:DistortionModel="brown3t2"

@@ -77,7 +77,7 @@ fn sees(c: &Capture, center: [f64; 2]) {
     }
 }
 
-// ---------------------------------------------------------------------------------------- RealityCapture
+// ---------------------------------------------------------------------------------- RealityCapture
 
 const HEADER: &str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n";
 
@@ -167,7 +167,7 @@ fn positions_without_a_lens_are_named_as_such() {
     }
 }
 
-// ------------------------------------------------------------------------------------------------ COLMAP
+// ------------------------------------------------------------------------------------------ COLMAP
 
 /// Cameras and images of a model as text.
 fn model() -> [String; 2] {
@@ -330,7 +330,7 @@ fn a_model_in_an_unknown_place_or_of_two_kinds_is_named_with_its_place() {
     );
 }
 
-// -------------------------------------------------------------------------------------- folders of poses
+// -------------------------------------------------------------------------------- folders of poses
 
 /// Rows of the camera-to-world matrix.
 fn matrix(i: usize) -> String {
@@ -455,7 +455,7 @@ fn poses_in_a_folder_with_other_axes_are_told_how_to_turn_them() {
     says(&dir, "", &["`pose/*.txt`", "look away", "second and third columns", "invert them"]);
 }
 
-// ---------------------------------------------------------------------------------------- other programs
+// ---------------------------------------------------------------------------------- other programs
 
 #[test]
 fn known_cameras_of_other_programs_are_never_called_photographs_without_cameras() {

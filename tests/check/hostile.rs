@@ -107,7 +107,7 @@ fn exr(width: u32, height: u32) -> Vec<u8> {
     fs::read(path).unwrap()
 }
 
-// ---------------------------------------------------------------------------------------------- any
+// --------------------------------------------------------------------------------------------- any
 
 #[test]
 fn an_empty_file_is_empty_for_every_reader() {
@@ -256,7 +256,7 @@ fn no_flipped_byte_makes_a_reader_panic() {
     }
 }
 
-// ---------------------------------------------------------------------------------------- PNG · JPEG
+// -------------------------------------------------------------------------------------- PNG · JPEG
 
 /// Replaces the size in a PNG's header, with a correct checksum.
 fn resized_png(width: u32, height: u32) -> Vec<u8> {
@@ -406,7 +406,7 @@ fn an_exif_turn_is_applied_only_when_the_declared_size_agrees() {
     assert_eq!(upright.rgb[0], stored.rgb[7 * 16]);
 }
 
-// ---------------------------------------------------------------------------------------------- EXR
+// --------------------------------------------------------------------------------------------- EXR
 
 fn layer(
     names: &[&str],
@@ -485,7 +485,7 @@ fn values_that_are_not_finite_become_zero_and_are_counted() {
     assert_eq!((read.image.data.as_slice(), read.replaced), (&[0.0, 2.0, 0.0][..], 2));
 }
 
-// ---------------------------------------------------------------------------------------------- npy
+// --------------------------------------------------------------------------------------------- npy
 
 #[test]
 fn hostile_npy_headers_are_refused_and_unusual_ones_are_read() {
@@ -525,7 +525,7 @@ fn hostile_npy_headers_are_refused_and_unusual_ones_are_read() {
     assert_eq!(numbers(&npy("'|u1'", "False", "()", &[5])), [5.0]);
 }
 
-// -------------------------------------------------------------------------------------- safetensors
+// ------------------------------------------------------------------------------------- safetensors
 
 #[test]
 fn hostile_safetensors_are_refused_whole() {
@@ -575,7 +575,7 @@ fn hostile_safetensors_are_refused_whole() {
     }
 }
 
-// ------------------------------------------------------------------------------ JSON and names: captures
+// ------------------------------------------------------------------------ JSON and names: captures
 
 /// Identity pose on a ring, looking at the origin.
 fn matrix(i: usize) -> String {
@@ -976,7 +976,7 @@ fn a_folder_without_cameras_says_what_was_looked_for() {
     assert!(capture::open(&path.join("none"), &CaptureOptions::default()).is_err());
 }
 
-// --------------------------------------------------------------------------------- masks, poses, inspect
+// --------------------------------------------------------------------------- masks, poses, inspect
 
 /// LLFF rows of the same ring as [`matrix`].
 fn poses(n: usize, height: f64, width: f64) -> Vec<u8> {

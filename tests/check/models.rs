@@ -70,7 +70,7 @@ fn stands(view: &View, rotation: DMat3, position: DVec3) {
     assert!(view.camera.position.distance(position) < 1e-9, "{}", view.name);
 }
 
-// ------------------------------------------------------------------------------------------------ COLMAP's text
+// ----------------------------------------------------------------------------------- COLMAP's text
 
 const CAMERA: &str = "1 PINHOLE 24 32 30.5 30.5 12 16\n";
 
@@ -239,7 +239,7 @@ fn the_lenses_that_colmap_4_added_are_read_or_named() {
     }
 }
 
-// ------------------------------------------------------------------------------------------------ Metashape
+// --------------------------------------------------------------------------------------- Metashape
 
 /// Calibration of a sensor with this focal length.
 fn calibrated(f: f64) -> String {
@@ -495,7 +495,7 @@ fn equal_labels_of_metashape_are_told_apart_by_their_groups() {
     }
 }
 
-// ------------------------------------------------------------------------------------------------ COLMAP's commands
+// ------------------------------------------------------------------------------- COLMAP's commands
 
 /// The commands of a version, and the options that it has of those that are used here.
 #[cfg(unix)]

@@ -16,6 +16,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("src", "tests", "benches", "examples", "crates")
 WIDTH = 100
+# blocks of code, tables and drawings may be as wide as code
+CODE_WIDTH = 110
 
 COMMENT = re.compile(r"^( *)(///|//!|//)(?!/)( ?)(.*)$")
 ITEM = re.compile(r"^( *)([-*+]|\d+[.)]) +(?=\S)")
@@ -23,7 +25,7 @@ KEPT = re.compile(r"^(#{1,6} |#!?\[|\||>|<|={3,}|-{3,}|\[[^\]]*\]:( |$))")
 # a line that began with one of these would be another block of Markdown
 GLUED = re.compile(r"^([-*+>|=]+|#+|\d+[.)]|\[[^\]]*\]:.*)$")
 DRAWING = re.compile(r"\S {2,}\S")
-RAW = re.compile(r'(?:b|c|br|cr|r)?(#*)"')
+RAW = re.compile(r'(?:br|cr|r)(#*)"')
 CHARACTER = re.compile(r"b?'(?:\\(?:u\{[0-9a-fA-F_]+\}|x[0-9a-fA-F]{2}|.)|[^\\'\n])'")
 
 
@@ -64,7 +66,7 @@ def comments(text):
 
 def raw(text, i):
     """Where a raw string that begins at `i` ends; nothing if none does."""
-    begin = re.compile(r'(?:br|cr|r)(#*)"').match(text, i)
+    begin = RAW.match(text, i)
     if not begin:
         return None
     end = text.find('"' + begin.group(1), begin.end())
@@ -137,10 +139,7 @@ def wrapped(lines):
             close()
             out.append(line)
         else:
-            begins = not paragraph or indent not in (depth, 0) or bare.startswith("SAFETY:")
-            if paragraph and indent != depth:
-                begins = True
-            if begins:
+            if not paragraph or indent != depth or bare.startswith("SAFETY:"):
                 close()
                 depth = indent
             paragraph.append((line, text))
@@ -148,28 +147,39 @@ def wrapped(lines):
     return out
 
 
-def rewrap(text):
-    """A source with its comments wrapped."""
+def blocks(text):
+    """The ranges of lines: blocks of comments of one marker and one indent."""
     lines = text.split("\n")
     starts, at = {}, 0
     for number, line in enumerate(lines):
         starts[at + len(line) - len(line.lstrip(" "))] = number
         at += len(line) + 1
     whole = {starts[begin] for begin, _ in comments(text) if begin in starts}
-    out, i = [], 0
-    while i < len(lines):
-        found = COMMENT.match(lines[i]) if i in whole else None
-        if not found:
-            out.append(lines[i])
-            i += 1
-            continue
-        same = lambda line: (m := COMMENT.match(line)) and m.group(1, 2) == found.group(1, 2)
-        end = i
-        while end in whole and same(lines[end]):
+    kinds = {number: COMMENT.match(lines[number]) for number in whole}
+    begin = 0
+    while begin < len(lines):
+        end, kind = begin + 1, kinds.get(begin)
+        while kind and kinds.get(end) and kinds[end].group(1, 2) == kind.group(1, 2):
             end += 1
-        out.extend(wrapped(lines[i:end]))
-        i = end
+        yield begin, end, bool(kind)
+        begin = end
+
+
+def rewrap(text):
+    """A source with its comments wrapped."""
+    lines, out = text.split("\n"), []
+    for begin, end, is_comment in blocks(text):
+        out.extend(wrapped(lines[begin:end]) if is_comment else lines[begin:end])
     return "\n".join(out)
+
+
+def changed(text):
+    """The numbers of the lines that wrapping would change."""
+    lines, found = text.split("\n"), set()
+    for begin, end, is_comment in blocks(text):
+        if is_comment and (new := set(wrapped(lines[begin:end]))) != set(lines[begin:end]):
+            found.update(number for number in range(begin, end) if lines[number] not in new)
+    return found
 
 
 def code(text):
@@ -189,6 +199,7 @@ def prose(text):
 def too_long(text):
     """The lines with a comment that are too long and could be shorter, by number."""
     lines, found = text.split("\n"), []
+    shorter = changed(text)
     at = [0]
     for line in lines:
         at.append(at[-1] + len(line) + 1)
@@ -197,9 +208,10 @@ def too_long(text):
         line = lines[number]
         if len(line) <= WIDTH:
             continue
-        is_whole = not line[: begin - at[number]].strip()
-        match = COMMENT.match(line)
-        if not (is_whole and match and len(words([match.group(4).strip()])) == 1):
+        is_behind = line[: begin - at[number]].strip()
+        match = None if is_behind else COMMENT.match(line)
+        is_one_word = match and len(words([match.group(4).strip()])) == 1
+        if not is_one_word and (is_behind or len(line) > CODE_WIDTH or number in shorter):
             found.append(number + 1)
     return found
 

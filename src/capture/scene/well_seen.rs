@@ -29,7 +29,8 @@ pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3, share: f64) -> Aab
         for a in 0..r {
             for b in 0..r {
                 let mut c = [a, b, slab];
-                c.rotate_left(2 - axis); // the slab's index goes to its axis, (a, b) to the others in turn
+                // the slab's index goes to its axis, (a, b) to the others in turn
+                c.rotate_left(2 - axis);
                 if hull.get((c[0] * r + c[1]) * r + c[2]) {
                     let p = world_from_scene.point_f64(DVec3::from_array(c.map(middle)));
                     seen.push(projectors.iter().filter(|q| q.sees(p)).count());

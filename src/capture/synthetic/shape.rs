@@ -412,7 +412,8 @@ mod tests {
             })
             .collect();
         slopes.sort_by(f32::total_cmp);
-        assert!(slopes[7999] <= 1.0 && slopes[7999] > 0.8, "{}", slopes[7999]); // far below wastes steps
+        // far below wastes steps
+        assert!(slopes[7999] <= 1.0 && slopes[7999] > 0.8, "{}", slopes[7999]);
         assert!(slopes[80] > 0.2, "{}", slopes[80]); // all but the creases: 0.28
     }
 

@@ -341,7 +341,8 @@ mod tests {
         let (mask, _, rays) = scene();
         let whole = march(&mask, None, RADIUS, STEP, &rays, 1000).offsets;
         let occupancy = Occupancy::new(&device, &mask, None, RADIUS);
-        let capacity = whole[300] + 1; // rays from 300 on do not fit, except empty ones that directly follow
+        // rays from 300 on do not fit, except empty ones that directly follow
+        let capacity = whole[300] + 1;
         let (got, alive) = on_device(&device, &occupancy, &rays, capacity as usize, 1000);
         let fits = *whole.iter().filter(|&&o| o <= capacity).max().unwrap();
         let want: Vec<i32> = whole.iter().map(|&o| o.min(fits)).collect();

@@ -221,7 +221,8 @@ mod tests {
         assert_eq!(strip().parts(|_| true).len(), 1);
         let parts = strip().parts(|k| k != 2);
         assert_eq!(parts.iter().map(|p| p.triangles.clone()).collect::<Vec<_>>(), [vec![10, 11], vec![13]]);
-        assert_eq!(parts[0].points.len() + parts[1].points.len(), 7); // the corner they meet in, twice
+        // the corner they meet in, twice
+        assert_eq!(parts[0].points.len() + parts[1].points.len(), 7);
         assert!((parts[0].area() - 1.0).abs() < 1e-12);
     }
 

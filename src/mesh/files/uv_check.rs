@@ -247,7 +247,8 @@ impl AtlasCharts {
 
     fn new(mesh: &Mesh, atlas: &Atlas, valid: &[bool]) -> AtlasCharts {
         let (weld, _) = weld_map(mesh);
-        let welded = |i: u32| weld.get(i as usize).copied().unwrap_or(0); // any value for invalid triangles
+        // any value for invalid triangles
+        let welded = |i: u32| weld.get(i as usize).copied().unwrap_or(0);
         let faces: Vec<[u32; 3]> = mesh.triangles[..valid.len()].iter().map(|t| t.map(welded)).collect();
         let mut sides = sorted_sides(&faces);
         sides.retain(|&(_, c)| valid[c as usize / 3]);

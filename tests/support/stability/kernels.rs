@@ -305,7 +305,8 @@ fn cameras(cases: &mut Cases) {
     ];
     for (name, distortion) in bends {
         for (lens, focal, far, bound) in [
-            ("0.1 degrees", 5.7e5, 0.0, 0.2), // a step of f32 in the direction is 6e-8 · 5.7e5 = 0.03 pixels
+            // a step of f32 in the direction is 6e-8 · 5.7e5 = 0.03 pixels
+            ("0.1 degrees", 5.7e5, 0.0, 0.2),
             ("60 degrees", 870.0, 0.0, 2e-3),
             ("90 degrees", 500.0, 0.0, 2e-3),
             ("60 degrees, 1e4 away", 870.0, 1e4, 2.0),

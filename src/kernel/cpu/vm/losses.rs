@@ -4,7 +4,8 @@
 //! background of both, and means over the rays:
 //!
 //! ```text
-//! ⟨(clamp(C + (1 − O) b) − h − (1 − a) b)²⟩ + mask · ⟨O²⟩ over rays with a = 0, or mask · ⟨−m ln O − (1 − m) ln(1 − O)⟩
+//! ⟨(clamp(C + (1 − O) b) − h − (1 − a) b)²⟩
+//!     + mask · ⟨O²⟩ over rays with a = 0, or mask · ⟨−m ln O − (1 − m) ln(1 − O)⟩
 //! ```
 //!
 //! where m is 1 for every pixel with a > 0.

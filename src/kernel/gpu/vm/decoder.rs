@@ -3,7 +3,8 @@
 //! Only two matrices lie between the products and the first activation; here they are merged into one:
 //!
 //! ```text
-//! M = W1_features B     h1 = relu(M products + W1_direction d + b1)     h2 = relu(W2 h1 + b2)     rgb = sigmoid(W3 h2 + b3)
+//! M = W1_features B     h1 = relu(M products + W1_direction d + b1)
+//! h2 = relu(W2 h1 + b2)     rgb = sigmoid(W3 h2 + b3)
 //! g_B = W1_featuresᵀ g_M     g_W1_features = g_M Bᵀ
 //! ```
 //!
