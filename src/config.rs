@@ -1,12 +1,12 @@
-//! Every knob: defaults, presets, files, `--set`; checked before anything is computed.
+//! All settings: defaults, presets, files, `--set`; checked before anything is computed.
 //!
 //! Later wins: defaults, then the preset, then each file, then `--set`. A key that is not known, of
 //! the wrong type or out of range is an error that names the line, the key and a suggested fix. The
 //! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
 //!
 //! Each stage owns its table, declared by `table!`: a key, its documentation, range and the values of the presets
-//! stand once, on its field. Everything here works on what serde says about them. What no user has a reason to
-//! change is no key but a constant of the preset, in the same place.
+//! stand once, on its field. Everything here works on what serde says about them. A
+//! value that no user has a reason to change is a constant of the preset instead of a key, in the same place.
 
 pub mod iface;
 mod mask;
@@ -25,7 +25,7 @@ pub use mask::{
 pub use mesh::{ColorSource, Genus, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
 pub use render::{
     EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
-    called,
+    display_name,
 };
 pub use source::{Sources, words};
 pub use stage::Stage;
@@ -47,9 +47,9 @@ pub struct Key {
     pub name: &'static str,
     /// What it means, with its unit.
     pub doc: &'static str,
-    /// Least number allowed; `f64::NEG_INFINITY` where any is, and for what is no number.
+    /// Minimum; `f64::NEG_INFINITY` if unbounded or not numeric.
     pub min: f64,
-    /// Largest number allowed; `f64::INFINITY` where any is, and for what is no number.
+    /// Maximum; `f64::INFINITY` if unbounded or not numeric.
     pub max: f64,
 }
 

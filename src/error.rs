@@ -40,7 +40,7 @@ impl ErrorKind {
 /// A result whose error is [`Error`] unless said otherwise.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// What a stop leaves that comes between steps, for [`Error::stopped`].
+/// Hint for a stop between steps, for [`Error::stopped`].
 pub(crate) const COMPLETE_IS_KEPT: &str = "what is complete is kept";
 
 /// An error: its kind, a message that names file and place, and a suggested fix.

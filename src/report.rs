@@ -14,7 +14,7 @@ pub use chart::{Chart, Curve, charts, curves_csv};
 pub use live::live_html;
 pub use runs::{RunRow, runs_csv, runs_html};
 
-use crate::config::{Stage, called};
+use crate::config::{Stage, display_name};
 use crate::image::{Photo, over_black, quantize, reduce_photo, srgb_from_linear, working_size};
 use crate::io::{self, Limits};
 use crate::run::Record;
@@ -348,10 +348,11 @@ pub fn judged_by(truth: &Value) -> Option<String> {
     Some(format!("judged {photographs}, {masks}"))
 }
 
-/// That a blend is no better than the best of its members, from the `blend` of `metrics.json`; nothing where it is.
+/// Returns the statement that a blend is no better than the best of its members, from the `blend` of `metrics.json`;
+/// `None` if the blend is better.
 pub fn blend_verdict(blend: &Value) -> Option<String> {
     let gain = blend["gain_db"].as_f64().filter(|gain| *gain <= 0.0)?;
-    let member = called(blend["best_member"].as_str()?);
+    let member = display_name(blend["best_member"].as_str()?);
     Some(format!(
         "the blend is not better than its best member on the views that are judged: {:.2} dB below {member}",
         -gain

@@ -18,7 +18,7 @@ pub mod exposure;
 mod gate;
 mod tracks;
 
-pub use gate::{CameraFit, CameraState, LEAST_SIGHTINGS, Verdict};
+pub use gate::{CameraFit, CameraState, LEAST_SIGHTINGS, PoseDecision};
 pub use tracks::RigView;
 
 use crate::geom::{Camera, Mesh};
@@ -47,11 +47,11 @@ const LEAST_SCALE: f64 = 0.1;
 /// chance lie anywhere within the reach of the search, some ten pixels.
 const MOST_ALONE_PX: f64 = 2.0;
 
-/// What was measured of a rig.
+/// Result of the adjustment of a rig.
 #[derive(Clone, Debug)]
 pub struct Rig {
-    /// What is to be done.
-    pub verdict: Verdict,
+    /// Which poses are to be refined.
+    pub verdict: PoseDecision,
     /// Every camera, in the order given.
     pub cameras: Vec<CameraFit>,
     /// Median distance of a sighting from its point's projection with the poses given and free points, pixels.
@@ -64,7 +64,7 @@ pub struct Rig {
 
 /// A camera that took no part in the measurement of its rig, fitted alone to the points that the rig found.
 #[derive(Clone, Debug)]
-pub struct LoneFit {
+pub struct HeldOutFit {
     /// How many of the points were found in its photograph.
     pub sightings: usize,
     /// Median distance of these from the projections of the points with the pose given, pixels.
@@ -79,7 +79,7 @@ pub struct LoneFit {
 
 impl Rig {
     /// Fits a camera that took no part to the points, which stay. `views` are the photographs that were measured.
-    pub fn fit_alone(&self, views: &[RigView], photo: &RigView, given: &Camera) -> LoneFit {
+    pub fn fit_held_out(&self, views: &[RigView], photo: &RigView, given: &Camera) -> HeldOutFit {
         let cameras: Vec<Camera> = self.cameras.iter().map(|fit| fit.camera.clone()).collect();
         let found = tracks::find_in((photo, given), views, &cameras, &self.tracks);
         let residual =
@@ -91,7 +91,13 @@ impl Rig {
         let (sightings, fitted_px) = (found.len(), residual(&camera));
         let fits = sightings >= LEAST_SIGHTINGS && fitted_px <= MOST_ALONE_PX;
         let moved_px = distance_px(given, &camera, &sampled(&self.tracks));
-        LoneFit { sightings, given_px: residual(given), fitted_px, moved_px, camera: fits.then_some(camera) }
+        HeldOutFit {
+            sightings,
+            given_px: residual(given),
+            fitted_px,
+            moved_px,
+            camera: fits.then_some(camera),
+        }
     }
 }
 

@@ -81,7 +81,8 @@ pub(super) struct SilhouetteTable {
     cut: [bool; 4],
 }
 
-enum Verdict {
+/// State of a cell's footprint in a silhouette.
+enum FootprintState {
     /// A masked pixel is in the footprint.
     Kept,
     /// The footprint is empty, and where it leaves the frame the subject does not.
@@ -118,11 +119,11 @@ impl SilhouetteTable {
         at(x1, y1) + at(x0, y0) > at(x0, y1) + at(x1, y0)
     }
 
-    fn judge(&self, center: DVec3, radius: f64) -> Verdict {
-        let Some((x, y, depth)) = self.projector.project(center) else { return Verdict::Undecided };
+    fn footprint(&self, center: DVec3, radius: f64) -> FootprintState {
+        let Some((x, y, depth)) = self.projector.project(center) else { return FootprintState::Undecided };
         let c = &self.projector.camera;
         if depth <= 1.01 * radius {
-            return Verdict::Kept; // the camera stands in the cell
+            return FootprintState::Kept; // the camera stands in the cell
         }
         // the sphere around the cell, with 5 % for what perspective and lens do to its outline
         let reach = |f: f64| 1.05 * f * radius / (depth - radius) + 0.5;
@@ -139,11 +140,11 @@ impl SilhouetteTable {
         let (u1, v1) = (up(x1, w) as usize, up(y1, h) as usize);
         let leaves = [x0 < 0.0, y0 < 0.0, x1 > w, y1 > h];
         if self.any(u0, v0, u1, v1) {
-            Verdict::Kept
+            FootprintState::Kept
         } else if leaves.iter().zip(&self.cut).any(|(l, c)| *l && *c) {
-            Verdict::Undecided
+            FootprintState::Undecided
         } else {
-            Verdict::Removed
+            FootprintState::Removed
         }
     }
 }
@@ -200,10 +201,10 @@ pub(super) fn carve(cube: &Cube, silhouettes: &[SilhouetteTable]) -> Carved {
                     let center = cube.cell_center(x, y, z);
                     let (mut seen, mut removed, mut by) = (0u16, 0, 0);
                     for (i, s) in silhouettes.iter().enumerate() {
-                        match s.judge(center, radius) {
-                            Verdict::Undecided => {}
-                            Verdict::Kept => seen += 1,
-                            Verdict::Removed => {
+                        match s.footprint(center, radius) {
+                            FootprintState::Undecided => {}
+                            FootprintState::Kept => seen += 1,
+                            FootprintState::Removed => {
                                 removed += 1;
                                 by = i;
                                 if removed == 2 {

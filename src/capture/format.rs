@@ -140,7 +140,7 @@ const MESHES: [&str; 11] = ["glb", "gltf", "obj", "ply", "stl", "fbx", "usdz", "
 const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
 
 /// Returns whether a folder is a run: it has a run's configuration, and either a stage was begun in it or nothing else in it
-/// is a capture's, be it one that cannot be read (photographs without cameras, a project of another program).
+/// is a capture's, even an unreadable one (photographs without cameras, a project of another program).
 pub fn is_run(folder: &Path) -> bool {
     let has_record = |stage: &Stage| {
         ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.word()).join(f)))

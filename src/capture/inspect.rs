@@ -44,7 +44,7 @@ impl From<&Problem> for Error {
     }
 }
 
-/// One entry for all that have the same problem but for the frame or picture, and the numbers in it.
+/// Groups errors that differ only in the frame, the picture or the numbers that they name.
 pub fn grouped(all: &[Error]) -> Vec<Problem> {
     let mut problems: Vec<Problem> = Vec::new();
     let mut first: HashMap<(String, String), usize> = HashMap::new();

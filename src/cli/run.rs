@@ -5,7 +5,7 @@ use super::Invocation;
 use super::options::{Common, KeyOption, RunTarget};
 use super::out::Out;
 use super::screen::{figure, one_line, print};
-use crate::config::{Config, NAMES, Preset, RenderConfig, called};
+use crate::config::{Config, NAMES, Preset, RenderConfig, display_name};
 use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::{blend_verdict, duration, height, judged_by};
 use crate::run::{Cost, Done, Phase, Run, RunStatus, read_record};
@@ -307,7 +307,7 @@ fn judgment(metrics: &Value) -> Vec<String> {
             let region = if masked { "inside the mask" } else { "whole frame (no masks)" };
             lines.push(format!(
                 "{} against held-out photographs: PSNR {psnr:.2} dB{ssim}, {region}",
-                called(set)
+                display_name(set)
             ));
             if let Some(own) = metrics[set]["own_exposure"]["mean"]["psnr_masked"].as_f64() {
                 lines.push(format!("  with each photograph's own exposure divided out: PSNR {own:.2} dB"));

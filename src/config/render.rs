@@ -37,8 +37,8 @@ pub const NAMES: [(&str, &str); 7] = [
     ("ensemble", "blend"),
 ];
 
-/// Returns what a person reads of pictures with this word: `I-Face (volume)`; the word itself where it is no other.
-pub fn called(word: &str) -> String {
+/// Returns the display name of a method: `I-Face (volume)`; the word itself if it is the same, or of no method.
+pub fn display_name(word: &str) -> String {
     match NAMES.iter().find(|(w, title)| *w == word && title != w) {
         Some((_, title)) => format!("{title} ({word})"),
         None => word.into(),
@@ -180,8 +180,8 @@ mod tests {
             // the word of the folder is the word of the configuration
             assert_eq!((serde_json::json!(method), method.folder()), (serde_json::json!(word), word));
         }
-        assert_eq!(called("volume"), "I-Face (volume)");
-        assert_eq!((called("baseline"), called("truth")), ("baseline".into(), "truth".into()));
+        assert_eq!(display_name("volume"), "I-Face (volume)");
+        assert_eq!((display_name("baseline"), display_name("truth")), ("baseline".into(), "truth".into()));
     }
 
     fn set(set: &[&str]) -> Config {

@@ -225,7 +225,7 @@ fn stem(name: &str) -> &str {
     }
 }
 
-/// A photograph of a capture, as far as clicks care.
+/// Name and size of a photograph.
 struct Photographed<'a> {
     path: String,
     name: &'a str,

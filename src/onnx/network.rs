@@ -276,8 +276,8 @@ impl NetworkArray {
     }
 }
 
-/// Every input of a network, in the file's order, with what it is fed.
-pub(super) type Fed<'a> = [(&'a Port, &'a NetworkArray)];
+/// Every input of a network, in the file's order, with its array.
+pub(super) type NetworkInputs<'a> = [(&'a Port, &'a NetworkArray)];
 
 /// Runs a piece of an engine; a panic inside becomes its message.
 ///
@@ -287,7 +287,7 @@ pub(super) fn guarded<T>(piece: impl FnOnce() -> Result<T, String>) -> Result<T,
     catch_unwind(AssertUnwindSafe(piece)).unwrap_or_else(|panic| {
         let said = panic.downcast_ref::<String>().map(String::as_str);
         let said = said.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("it gave no reason");
-        Err(format!("it broke down: {said}"))
+        Err(format!("inference failed: {said}"))
     })
 }
 

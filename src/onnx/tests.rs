@@ -162,7 +162,7 @@ fn random_damage_to_a_whole_network_ends_in_a_result_or_an_error() {
         }
         let end = match opened_with(&bytes).and_then(|n| n.alpha(&photo, &trimap)) {
             Ok(_) => "an alpha".to_string(),
-            Err(e) if e.to_string().contains("broke down") => format!("a panic caught: {e}"),
+            Err(e) if e.to_string().contains("inference failed") => format!("a panic caught: {e}"),
             Err(e) => reason(&e).unwrap_or("takes only another size").to_string(),
         };
         *ends.entry(end).or_insert(0) += 1;
@@ -354,7 +354,7 @@ fn unknown_operators_are_an_error_of_the_engine_with_a_fix() {
 #[test]
 fn a_panic_inside_the_engine_becomes_its_message() {
     let said = guarded::<()>(|| panic!("index {} of {}", 3, 2)).unwrap_err();
-    assert_eq!(said, "it broke down: index 3 of 2");
+    assert_eq!(said, "inference failed: index 3 of 2");
 }
 
 #[test]

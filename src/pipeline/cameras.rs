@@ -11,7 +11,7 @@ use crate::geom::{Camera, Similarity};
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits, ReadError};
 use crate::render::path::NamedCamera;
-use crate::rig::{self, CameraState, LEAST_SIGHTINGS, RigView, Verdict};
+use crate::rig::{self, CameraState, LEAST_SIGHTINGS, PoseDecision, RigView};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
@@ -35,7 +35,7 @@ const WORST: usize = 3;
 /// The measurement of a capture's cameras.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct CameraCheck {
-    verdict: Verdict,
+    verdict: PoseDecision,
     /// Median distance of sightings from their points, pixels, with the poses given and the adjusted ones.
     given_px: f64,
     adjusted_px: f64,
@@ -121,7 +121,7 @@ pub(super) fn check_by(points: usize, photos: &RigPhotos, poses: CameraPoses) ->
         }
     };
     let fitted = |((view, searched), (photo, head)): ((&&View, &Camera), &(Photo, Gray))| {
-        let fit = rig.fit_alone(&views, &RigView::new(photo, head), searched);
+        let fit = rig.fit_held_out(&views, &RigView::new(photo, head), searched);
         let pixels = f64::from(view.camera.width) / f64::from(searched.width);
         FittedView {
             view: view.name.clone(),
@@ -162,16 +162,16 @@ impl CameraCheck {
         let moved = |c: &&CheckedCamera| c.state == CameraState::Refined;
         let refined: Vec<&CheckedCamera> = self.cameras.iter().filter(moved).collect();
         match self.verdict {
-            Verdict::Unchecked => format!(
+            PoseDecision::Unchecked => format!(
                 "poses are not checked: too little of the head was found again in other photographs {sightings}; they \
                  are used as given"
             ),
-            Verdict::Apart => format!(
+            PoseDecision::Apart => format!(
                 "poses are {:.1} px off against each other, and stay {:.1} px off when they are refined {sightings}",
                 self.given_px, self.adjusted_px
             ),
-            Verdict::Fit => format!("poses fit within {:.1} px {sightings}", self.given_px),
-            Verdict::Some => {
+            PoseDecision::Fit => format!("poses fit within {:.1} px {sightings}", self.given_px),
+            PoseDecision::Some => {
                 let each = refined.iter().map(|c| format!("camera `{}` by {:.1} px", c.view, c.moved_px));
                 format!(
                     "poses fit within {:.1} px {sightings}, except {}",
@@ -179,7 +179,7 @@ impl CameraCheck {
                     each.collect::<Vec<_>>().join(", ")
                 )
             }
-            Verdict::All => {
+            PoseDecision::All => {
                 let rms = root_mean_square(&refined.iter().map(|c| c.moved_px).collect::<Vec<f64>>());
                 let worst = refined.iter().max_by(|a, b| a.moved_px.total_cmp(&b.moved_px));
                 let worst =
@@ -214,7 +214,7 @@ impl CameraCheck {
             )),
             _ => None,
         };
-        if self.verdict == Verdict::Apart {
+        if self.verdict == PoseDecision::Apart {
             return vec![Error::cannot(self.apart(), APART_HINT)];
         }
         self.cameras.iter().filter_map(problem).map(|text| Error::cannot(text, HINT)).collect()

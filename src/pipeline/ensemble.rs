@@ -13,7 +13,7 @@ use super::surface::Fields;
 use super::{learn, pictures};
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, MaskMeaning, View, ViewMask};
-use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, called};
+use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, display_name};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::image::{Gray, Image, Photo};
 use crate::io::{self, Limits};
@@ -244,7 +244,7 @@ fn fit(
         alone.insert(name.into(), json!(all.psnr(&one)?));
     }
     let each = words(&c.members).into_iter().zip(&weights);
-    let shares: Vec<String> = each.map(|(name, w)| format!("{} {w:.3}", called(name))).collect();
+    let shares: Vec<String> = each.map(|(name, w)| format!("{} {w:.3}", display_name(name))).collect();
     dir.note(&format!("fitted weights: {}", shares.join(", ")));
     let record = json!({"pixels": all.pixels(), "psnr": all.psnr(&weights)?, "psnr_alone": alone});
     Ok((weights, record))

@@ -143,7 +143,7 @@ pub(super) fn mask(
     Ok(summary)
 }
 
-/// What was measured of cameras and exposures.
+/// Results of the checks of cameras and exposures.
 #[derive(Default)]
 struct RigCheck {
     cameras: Option<CameraCheck>,

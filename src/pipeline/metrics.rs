@@ -105,7 +105,7 @@ pub(super) fn metrics(
     }
     if out.is_empty() {
         return Err(Error::cannot(
-            "there is no view to be judged",
+            "no rendered views to compare",
             "name methods in `render.method`, and make their views with `--fresh render`",
         ));
     }

@@ -10,7 +10,7 @@ pub use views::{head_page, viewer_of_file};
 
 use super::session::Session;
 use crate::Result;
-use crate::config::{NAMES, Stage, called};
+use crate::config::{NAMES, Stage, display_name};
 use crate::error::counted;
 use crate::io::{self, Limits};
 use crate::report::{self, Chart, LEARNED, MethodTable, Report, Viewer, duration};
@@ -214,7 +214,7 @@ pub(super) fn methods(session: &Session) -> Vec<(String, Vec<Option<f64>>)> {
             (bytes > 0).then_some(bytes as f64 / 1e6),
             triangles.filter(|_| stages.last() == Some(&Stage::Mesh)),
         ];
-        Some((called(word), figures))
+        Some((display_name(word), figures))
     };
     NAMES.iter().filter_map(row).collect()
 }
@@ -260,7 +260,7 @@ fn files_of(session: &Session, word: &str) -> Vec<std::path::PathBuf> {
 pub(super) fn judged(session: &Session) -> Vec<(String, Value)> {
     let record = read_record(&session.run.path(Stage::Metrics)).ok().flatten();
     let Some(Value::Object(sets)) = record.map(|done| done.summary) else { return Vec::new() };
-    sets.into_iter().map(|(set, figures)| (called(&set), figures)).collect()
+    sets.into_iter().map(|(set, figures)| (display_name(&set), figures)).collect()
 }
 
 /// Returns a row for every set of pictures below the heading; empty if there is none.

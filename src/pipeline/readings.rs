@@ -15,7 +15,7 @@ use crate::geom::Camera;
 use crate::image::{Gray, resize_gray, working_size};
 use crate::io::Limits;
 use crate::mask::consistency::{ConsistencyView, check_consistency};
-use crate::rig::{self, Verdict};
+use crate::rig::{self, PoseDecision};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::path::Path;
@@ -357,7 +357,7 @@ impl Found {
         let (_, rig) = photos.measure(POINTS, false);
         let sightings: usize = rig.cameras.iter().map(|camera| camera.sightings).sum();
         let fits =
-            sightings >= LEAST_SIGHTINGS && rig.adjusted_px <= MOST_PX && rig.verdict != Verdict::Apart;
+            sightings >= LEAST_SIGHTINGS && rig.adjusted_px <= MOST_PX && rig.verdict != PoseDecision::Apart;
         Ok(Found { sightings, weight: sightings as f64 / rig.given_px.max(LEAST_PX), fits })
     }
 }

@@ -193,7 +193,7 @@ pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
 /// Whether an ordering holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Holds {
+pub enum Answer {
     /// It does.
     Yes,
     /// It does not.
@@ -203,7 +203,7 @@ pub enum Holds {
 }
 
 /// Whether an ordering holds, and the better row's figure less the worse one's.
-pub type Verdict = (Holds, Option<f64>);
+pub type OrderingResult = (Answer, Option<f64>);
 
 impl Experiment {
     fn index(&self, table: &str, row: &str) -> Option<usize> {
@@ -229,16 +229,16 @@ impl Experiment {
 
     /// Returns whether an ordering holds, and by how much the better row is better: for each capture, and on average
     /// over those that have both rows.
-    pub fn holds(&self, ordering: &Ordering) -> (Vec<Verdict>, Verdict) {
+    pub fn holds(&self, ordering: &Ordering) -> (Vec<OrderingResult>, OrderingResult) {
         let measure = MEASURES.iter().position(|m| m.0 == ordering.by).unwrap_or(0);
         let rows = (self.index(ordering.table, ordering.better), self.index(ordering.table, ordering.worse));
         let (Some(better), Some(worse)) = rows else {
-            return (vec![(Holds::Unknown, None); self.captures.len()], (Holds::Unknown, None));
+            return (vec![(Answer::Unknown, None); self.captures.len()], (Answer::Unknown, None));
         };
         let slack = if ordering.or_equal { 0.05 } else { 0.0 };
         let judge = |a: Option<f64>, b: Option<f64>| match (a, b) {
-            (Some(a), Some(b)) => (if a + slack > b { Holds::Yes } else { Holds::No }, Some(a - b)),
-            _ => (Holds::Unknown, None),
+            (Some(a), Some(b)) => (if a + slack > b { Answer::Yes } else { Answer::No }, Some(a - b)),
+            _ => (Answer::Unknown, None),
         };
         let pairs = self.measured[better].iter().zip(&self.measured[worse]);
         let pairs: Vec<_> = pairs.map(|(a, b)| (a.mean(measure), b.mean(measure))).collect();
@@ -341,7 +341,7 @@ impl Experiment {
         let mut out = vec![vec!["as expected, by PSNR inside the mask".to_owned()]];
         out[0].extend(self.captures.iter().cloned());
         out[0].push("on average".into());
-        let word = |(holds, by): &Verdict| {
+        let word = |(holds, by): &OrderingResult| {
             let word = ["holds", "does not hold", "–"][*holds as usize];
             by.map_or(word.to_owned(), |by| format!("{word}, {by:+.2}"))
         };
@@ -483,17 +483,17 @@ mod tests {
             (each.into_iter().map(|v| v.0).collect::<Vec<_>>(), mean.0)
         };
         // 22.25 > 21, 29.99 < 30; 26.12 > 25.5
-        assert_eq!(words(&e, 0), (vec![Holds::Yes, Holds::No], Holds::Yes));
+        assert_eq!(words(&e, 0), (vec![Answer::Yes, Answer::No], Answer::Yes));
         assert!((e.holds(&e.orderings[0]).0[0].1.unwrap() - 1.25).abs() < 1e-9);
         // a twentieth is as good
-        assert_eq!(words(&e, 1), (vec![Holds::No, Holds::Yes], Holds::No));
+        assert_eq!(words(&e, 1), (vec![Answer::No, Answer::Yes], Answer::No));
         let mut missing = e.clone();
         missing.measured[1][0].figures.clear();
         missing.measured[1][0].views.clear();
         // on average over the second alone, where the first row is better: 29.99 < 30, though 29.99 > 25.5
-        assert_eq!(words(&missing, 0), (vec![Holds::Unknown, Holds::No], Holds::No));
+        assert_eq!(words(&missing, 0), (vec![Answer::Unknown, Answer::No], Answer::No));
         missing.measured[0][1].figures.clear();
-        assert_eq!(words(&missing, 0), (vec![Holds::Unknown; 2], Holds::Unknown));
+        assert_eq!(words(&missing, 0), (vec![Answer::Unknown; 2], Answer::Unknown));
     }
 
     #[test]

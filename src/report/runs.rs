@@ -2,7 +2,7 @@
 
 use super::{STYLE, csv_text, fill, glb_megabytes, picture_url, relative, small_view, views, warnings};
 use crate::Result;
-use crate::config::{Config, NAMES, Stage, called};
+use crate::config::{Config, NAMES, Stage, display_name};
 use crate::error::counted;
 use crate::geom::Camera;
 use crate::io::{self, Limits};
@@ -99,7 +99,8 @@ impl RunRow {
             let mean = |word: &str, key: &str| metrics[word]["head"]["mean"][key].as_f64();
             let judged = NAMES.iter().filter_map(|(word, _)| Some((mean(word, "psnr_masked")?, *word)));
             if let Some((psnr, word)) = judged.max_by(|a, b| a.0.total_cmp(&b.0)) {
-                (row.psnr, row.ssim, row.method) = (Some(psnr), mean(word, "ssim_masked"), called(word));
+                (row.psnr, row.ssim, row.method) =
+                    (Some(psnr), mean(word, "ssim_masked"), display_name(word));
             }
             let meshes = ["raycast", "textured", "raster"].into_iter();
             row.truth_percent = metrics["truth_percent_of_head"]["accuracy_mean"].as_f64();

@@ -76,7 +76,7 @@ impl ExposureView {
     }
 }
 
-/// What was measured.
+/// Result of the fit of exposures.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExposureFit {
     /// Exposure of every view, `None` where it shows too little; those of training views have a

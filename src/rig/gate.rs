@@ -1,4 +1,4 @@
-//! Which cameras are to be refined, from what an adjustment of all found.
+//! Decides which cameras are to be refined, from the result of an adjustment of all.
 
 use super::adjust::{Track, adjust, median};
 use super::{LEAST_SCALE, Rig, distance_px, residuals, sampled, sightings};
@@ -38,10 +38,10 @@ const LEAST_MOVE_PX: f64 = 0.8;
 /// … and this many times as far as the median camera.
 const STANDS_OUT: f64 = 3.0;
 
-/// What is to be done about the cameras of a rig.
+/// Which poses of a rig are to be refined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Verdict {
+pub enum PoseDecision {
     /// Too little of the head was found again: poses stay as they are.
     Unchecked,
     /// They fit: poses stay as they are.
@@ -54,7 +54,7 @@ pub enum Verdict {
     Apart,
 }
 
-/// What is to be done about one camera.
+/// Whether the pose of a camera is refined.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CameraState {
@@ -69,10 +69,10 @@ pub enum CameraState {
     Far,
 }
 
-/// What was measured of one camera.
+/// Result of the adjustment for one camera.
 #[derive(Clone, Debug)]
 pub struct CameraFit {
-    /// What is to be done about it.
+    /// Whether its pose is refined.
     pub state: CameraState,
     /// How many points were found in its photograph.
     pub sightings: usize,
@@ -88,7 +88,7 @@ pub struct CameraFit {
     pub camera: Camera,
 }
 
-/// Decides what to do, given the cameras and tracks of an adjustment of all. `expected` is how many points each camera was
+/// Decides which poses to refine, given the cameras and tracks of an adjustment of all. `expected` is how many points each camera was
 /// expected to see, and `all` asks for all cameras to be refined.
 pub(super) fn decide(
     given: &[Camera],
@@ -116,20 +116,20 @@ pub(super) fn decide(
         camera: given[v].clone(),
     };
     let cameras = (0..given.len()).map(fit).collect();
-    let mut rig = Rig { verdict: Verdict::Unchecked, cameras, given_px, adjusted_px, tracks };
+    let mut rig = Rig { verdict: PoseDecision::Unchecked, cameras, given_px, adjusted_px, tracks };
     let measured = counts.iter().filter(|&&n| n >= LEAST_SIGHTINGS).count();
     if rig.tracks.len() < LEAST_TRACKS || 2 * measured < given.len() {
         return rig;
     }
     rig.verdict = judge(&mut rig.cameras, adjusted_px, all || adjusted_px < GAIN * given_px);
     if is_apart(&rig.cameras, adjusted_px) {
-        rig.verdict = Verdict::Apart;
+        rig.verdict = PoseDecision::Apart;
         let refined = rig.cameras.iter_mut().filter(|c| c.state == CameraState::Refined);
         refined.for_each(|c| c.state = CameraState::Stays);
         return rig;
     }
     let poses = match rig.verdict {
-        Verdict::Some => alone(given, adjusted, &mut rig.tracks, &rig.cameras, adjusted_px),
+        PoseDecision::Some => refine_selected(given, adjusted, &mut rig.tracks, &rig.cameras, adjusted_px),
         _ => adjusted,
     };
     for (camera, pose) in rig.cameras.iter_mut().zip(poses) {
@@ -141,9 +141,9 @@ pub(super) fn decide(
     rig
 }
 
-/// Sets the state of each camera and returns the verdict. `residual` is that of all after the adjustment, and `gains` says
+/// Sets the state of each camera and returns the decision for all. `residual` is that of all after the adjustment, and `gains` says
 /// whether it falls enough.
-fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> Verdict {
+fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> PoseDecision {
     let moves = cameras.iter().filter(|c| c.sightings >= LEAST_SIGHTINGS).map(|c| c.moved_px);
     let usual_move = median(&mut moves.collect::<Vec<f64>>());
     for c in cameras.iter_mut() {
@@ -159,9 +159,9 @@ fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> Verdict {
         };
     }
     match cameras.iter().any(|c| c.state == CameraState::Refined) {
-        _ if gains => Verdict::All,
-        true => Verdict::Some,
-        false => Verdict::Fit,
+        _ if gains => PoseDecision::All,
+        true => PoseDecision::Some,
+        false => PoseDecision::Fit,
     }
 }
 
@@ -173,7 +173,7 @@ fn is_apart(cameras: &[CameraFit], residual: f64) -> bool {
 }
 
 /// Returns the poses of the cameras to refine where all others keep theirs, and moves the points of the tracks accordingly.
-fn alone(
+fn refine_selected(
     given: &[Camera],
     adjusted: Vec<Camera>,
     tracks: &mut [Track],

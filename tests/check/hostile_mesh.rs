@@ -1,4 +1,4 @@
-//! Mesh files made to hurt, and the message each must produce. Nothing here may panic, hang or
+//! Malformed and malicious mesh files, and the message each must produce. Nothing here may panic, hang or
 //! reserve memory for what a file merely claims.
 
 use crate::clicked;

@@ -1,7 +1,7 @@
 """Wraps the comments of Rust files at 100 columns.
 
-    tools/reference/wrap_comments.py            wraps in place
-    tools/reference/wrap_comments.py --check    lists what is too long, and exits with 1 if anything is
+    python tools/reference/wrap_comments.py            wraps in place
+    python tools/reference/wrap_comments.py --check    lists what is too long, and exits with 1 if anything is
 
 A paragraph of `//`, `///` or `//!` is filled again if one of its lines is longer than 100 columns; all others stay as they
 are, so a second run changes nothing. Blocks of code, tables, headings, definitions of links, drawings (lines with two spaces

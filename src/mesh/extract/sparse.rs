@@ -6,15 +6,12 @@
 //!    evaluated, until none is left. The rule depends on evaluated nodes only, so the surface it leaves is
 //!    closed by construction, and equal to the dense one on every piece it met.
 //!
-//! A piece that lies between coarse nodes is missed: take a finer coarse step for that. Nodes on the outer faces of the grid count as outside; so do nodes for
-//! outside the hull, without evaluating the field. Waves of a flood that starts everywhere are few
-//! and large, so that the field is evaluated at thousands of points at a time.
+//! A piece that lies between coarse nodes is missed: a finer coarse step finds it. Nodes on the outer
+//! faces of the grid count as outside. Nodes outside the hull count as outside too, and are not
+//! evaluated. The flood starts everywhere at once, so its waves are few and large, and the field is
+//! evaluated at thousands of points at a time.
 //!
-//! # Blocks
-//!
-//! The evaluated nodes of a sparse grid, in blocks of 8³ nodes kept only near the surface, and the
-//! surface through them.
-//!
+//! Evaluated nodes are kept in blocks of 8³ nodes, near the surface only.
 //! A plane of a block is one word, bit `x + 8 y`. An edge belongs to the block of its lower node, so a
 //! vertex on a block's border has one owner and one index: the block's first plus a count of bits before
 //! it. Nothing is merged by distance.

@@ -21,7 +21,7 @@ pub struct ReadOptions {
 }
 
 impl ReadOptions {
-    /// Everything, of a file that a machine can hold.
+    /// Reads the whole file, if it fits in memory.
     pub const DEFAULT: ReadOptions =
         ReadOptions { vertices: 30_000_000, triangles: 30_000_000, json: 64 << 20, texture: true };
 

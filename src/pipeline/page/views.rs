@@ -3,7 +3,7 @@
 //! Also the 3D viewer of a page: a copy of the head that is small enough, and the cameras of the photographs.
 
 use crate::capture::{Split, View};
-use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, ViewBackground, called};
+use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, ViewBackground, display_name};
 use crate::geom::{Camera, Similarity};
 use crate::image::{Photo, quantize, reduce_photo, working_size};
 use crate::io::{self, Limits};
@@ -49,7 +49,7 @@ pub(in crate::pipeline) fn shown_sets<'c>(session: &'c Session) -> Vec<ShownSet<
     let figures =
         io::read_json(&session.run.path("metrics/metrics.json"), &Limits::default()).unwrap_or_default();
     let shown = |set: PictureSet| ShownSet {
-        title: called(&set.name),
+        title: display_name(&set.name),
         pictures: comparable(capture, config, &set),
         figures: figures[&set.name].clone(),
         key: set.name,
