@@ -154,7 +154,7 @@ fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(Captu
 fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<Capture> {
     let CaptureFolder { root, options, .. } = *folder;
     let total = listing.frames.len();
-    let near = missing::settle(folder, listing);
+    let near = missing::confirm_near(folder, listing);
     let (frames, missing): (Vec<CameraFrame>, Vec<CameraFrame>) =
         std::mem::take(&mut listing.frames).into_iter().partition(|f| f.photo.is_some());
     let (mut found, mut there, mut hint) =

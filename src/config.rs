@@ -27,7 +27,7 @@ pub use render::{
     EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
     display_name,
 };
-pub use source::{Sources, words};
+pub use source::{Sources, known_words};
 pub use stage::Stage;
 pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 

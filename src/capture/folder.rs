@@ -120,7 +120,7 @@ impl CaptureFolder<'_> {
 
     /// Returns the photograph that `name` refers to, with its path below the capture: that of
     /// [`CaptureFolder::exact_photo`], else the only one near the name, which
-    /// [`missing::settle`](super::missing::settle) has yet to confirm.
+    /// [`missing::confirm_near`](super::missing::confirm_near) has yet to confirm.
     pub fn photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
         let exact = self.exact_photo(file, name);
         if matches!(exact, Ok((_, Some(_)))) {

@@ -192,7 +192,7 @@ pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
     if options.mask_meaning == MaskMeaning::Ignore {
         masks.fill(None); // what a mask calls "not looked at" may still hold head
     }
-    place(&capture, masks, &mut out);
+    locate_head(&capture, masks, &mut out);
     out.problems.extend(grouped(masks::require_masks(&capture, options).err().as_slice()));
     out
 }
@@ -321,7 +321,7 @@ fn pixels(capture: &mut Capture, options: &CaptureOptions, out: &mut Inspection)
 }
 
 /// Places the head from the views that are learned from.
-fn place(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
+fn locate_head(capture: &Capture, masks: Vec<Option<Gray>>, out: &mut Inspection) {
     let train = capture.views.iter().zip(masks).filter(|(view, _)| view.split == Split::Train);
     let (views, masks): (Vec<&View>, Vec<Option<Gray>>) = train.unzip();
     let cameras: Vec<_> = views.iter().map(|v| v.camera.clone()).collect();

@@ -29,7 +29,7 @@ pub(super) struct Missing {
 /// Confirms the near files of a listing, and says so once. A frame loses its file if another one
 /// has it as well, and a file in another folder if the folder that is named has photographs of
 /// other frames: then it is missing, whatever lies elsewhere.
-pub(super) fn settle(folder: &CaptureFolder, listing: &mut Listing) -> Missing {
+pub(super) fn confirm_near(folder: &CaptureFolder, listing: &mut Listing) -> Missing {
     let (answers, notes) = folder.search.taken();
     listing.reasons.extend(notes);
     if answers.is_empty() {
@@ -38,8 +38,8 @@ pub(super) fn settle(folder: &CaptureFolder, listing: &mut Listing) -> Missing {
     let mut missing = Missing::default();
     let (photos, masks): (Vec<Answer>, Vec<Answer>) =
         answers.into_iter().partition(|answer| answer.kind == Kind::Photograph);
-    let is_near = settle_photographs(folder, listing, &photos, &mut missing);
-    settle_masks(folder, listing, &masks);
+    let is_near = confirm_photographs(folder, listing, &photos, &mut missing);
+    confirm_masks(folder, listing, &masks);
     let near = listing.frames.iter().zip(is_near).filter(|(frame, near)| *near && frame.photo.is_some());
     let found = by_path(&photos);
     let (foreign, usual): (Vec<&CameraFrame>, Vec<&CameraFrame>) = near
@@ -62,7 +62,7 @@ pub(super) fn settle(folder: &CaptureFolder, listing: &mut Listing) -> Missing {
 }
 
 /// Returns for each frame whether its photograph has a near name.
-fn settle_photographs(
+fn confirm_photographs(
     folder: &CaptureFolder,
     listing: &mut Listing,
     answers: &[Answer],
@@ -121,7 +121,7 @@ fn is_foreign(file: &Path, answer: &Answer) -> bool {
     })
 }
 
-fn settle_masks(folder: &CaptureFolder, listing: &mut Listing, answers: &[Answer]) {
+fn confirm_masks(folder: &CaptureFolder, listing: &mut Listing, answers: &[Answer]) {
     let found = by_path(answers);
     let mut users: HashMap<&Path, HashSet<&str>> = HashMap::new();
     for answer in answers {

@@ -39,11 +39,11 @@ struct Against {
     /// ... and back from its skin and its hair where three or more training cameras look, with the signed median
     /// (negative where the mesh is inside); only for photographs that separate the two.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    parts: Vec<Part>,
+    parts: Vec<PartDistance>,
 }
 
 #[derive(Serialize)]
-struct Part {
+struct PartDistance {
     part: &'static str,
     signed_median: f64,
     #[serde(flatten)]
@@ -94,7 +94,7 @@ impl Display for Against {
             writeln!(f, "  seen by {views:<9}     {distance} ({:.0} %)", 100.0 * share)?;
         }
         writeln!(f, "distance back           {}", self.back)?;
-        for Part { part, signed_median, distance } in &self.parts {
+        for PartDistance { part, signed_median, distance } in &self.parts {
             writeln!(f, "  {part}, 3 cameras look  {distance}, signed median {signed_median:+.3} mm")?;
         }
         Ok(())
@@ -232,8 +232,11 @@ fn compare(mesh: &Mesh, origin: DVec3, other: &Path, seen_by: Option<&Path>, uni
             };
             let found = kinds_one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES, &cameras, kind);
             let named = found.into_iter().zip(["skin", "hair"]).filter_map(|(d, part)| Some((d?, part)));
-            let part =
-                |((d, signed), part)| Part { part, signed_median: 1e3 * unit_m * signed, distance: mm(d) };
+            let part = |((d, signed), part)| PartDistance {
+                part,
+                signed_median: 1e3 * unit_m * signed,
+                distance: mm(d),
+            };
             parts = named.map(part).collect();
         }
     }

@@ -40,7 +40,7 @@ pub(super) fn complete_setting(typed: &OsStr) -> Vec<CompletionCandidate> {
     let typed = typed.to_str().unwrap_or_default();
     let Some((key, _)) = typed.split_once('=') else { return candidates(OsStr::new(typed), "=") };
     let begun = &typed[..=typed.rfind(['=', ',']).unwrap_or(key.len())];
-    let settings = config::words(key).into_iter().map(|word| format!("{begun}{word}"));
+    let settings = config::known_words(key).into_iter().map(|word| format!("{begun}{word}"));
     settings.filter(|setting| setting.starts_with(typed)).map(CompletionCandidate::new).collect()
 }
 

@@ -45,7 +45,7 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
             all.par_iter().map(|run| (run.as_path(), look(run))).collect();
         let text = match &found[..] {
             found if common.json => objects(found, options.failed),
-            [(run, Ok(standing))] if !options.failed => stages(run, standing),
+            [(run, Ok(status))] if !options.failed => stages(run, status),
             found => heads(found, options.failed, common.verbose > 0),
         };
         let clear = if options.watch && std::io::stdout().is_terminal() { "\x1b[H\x1b[2J" } else { "" };
@@ -213,21 +213,21 @@ fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> Strin
         counts.entry(phase as usize).or_insert((word(phase), 0)).1 += 1;
         left_s += run.as_ref().ok().and_then(|s| s.left_s).unwrap_or(0.0);
     }
-    for (run, standing) in shown {
-        let standing = match standing {
-            Ok(standing) => standing,
+    for (run, status) in shown {
+        let status = match status {
+            Ok(status) => status,
             Err(e) => {
                 let _ = writeln!(text, "{:<width$}  UNREADABLE: {}", name(run), one_line(&e.to_string()));
                 continue;
             }
         };
-        let settled = [Phase::Done, Phase::Waiting].contains(&standing.phase);
+        let settled = [Phase::Done, Phase::Waiting].contains(&status.phase);
         if settled && !each && runs.len() > MAX_LINES {
-            shared.entry(word(standing.phase)).or_default().push(name(run));
+            shared.entry(word(status.phase)).or_default().push(name(run));
             continue;
         }
-        let bar: String = standing.stages.iter().map(|s| sign(s.phase)).collect();
-        let _ = writeln!(text, "{:<width$}  {bar}  {}", name(run), one_line(&described(standing)));
+        let bar: String = status.stages.iter().map(|s| sign(s.phase)).collect();
+        let _ = writeln!(text, "{:<width$}  {bar}  {}", name(run), one_line(&described(status)));
     }
     for (word, names) in shared {
         let mut line = format!("{word}:");
@@ -294,8 +294,8 @@ fn described(run: &RunStatus) -> String {
 
 /// Returns a JSON object for each run, without settings.
 fn objects(runs: &[(&Path, Result<RunStatus>)], failed: bool) -> String {
-    let object = |(run, standing): &&(&Path, Result<RunStatus>)| {
-        let value = match standing {
+    let object = |(run, status): &&(&Path, Result<RunStatus>)| {
+        let value = match status {
             Err(e) => json!({"run": run, "state": Phase::Unreadable, "error": e.to_string()}),
             Ok(s) => {
                 let stages: Vec<Value> = s.stages.iter().map(stage_object).collect();
@@ -332,22 +332,22 @@ fn stage_object(s: &crate::run::StageStatus) -> Value {
 }
 
 /// Returns a row for each stage of one run, camera paths included, and the time left in total.
-fn stages(run: &Path, standing: &RunStatus) -> String {
+fn stages(run: &Path, status: &RunStatus) -> String {
     let mut text = String::new();
     let mut row = |stage: &str, words: &str| {
         let _ = writeln!(text, "{:<24} {stage:<8} {}", one_line(&run.display().to_string()), one_line(words));
     };
-    for s in &standing.stages {
+    for s in &status.stages {
         row(s.stage.word(), &of_stage(s));
     }
     for path in io::list_folders(&run.join("render/paths")).unwrap_or_default() {
         let name = format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy());
         row(&name, &of_stage(&StageStatus::read(&path, Stage::Render)));
     }
-    if standing.at.is_none() && standing.error.is_some() {
-        row("–", &described(standing));
+    if status.at.is_none() && status.error.is_some() {
+        row("–", &described(status));
     }
-    if let Some(left) = standing.left_s.filter(|s| *s > 0.0) {
+    if let Some(left) = status.left_s.filter(|s| *s > 0.0) {
         row("all", &format!("about {} left", duration(left)));
     }
     text
@@ -361,12 +361,12 @@ fn of_stage(s: &StageStatus) -> String {
         }
         _ => {
             let gone = s.faults.iter().map(|fault| format!("; {fault}"));
-            words(s.phase, s.status.as_ref(), s.record.as_ref()) + &gone.collect::<String>()
+            state_text(s.phase, s.status.as_ref(), s.record.as_ref()) + &gone.collect::<String>()
         }
     }
 }
 
-fn words(phase: Phase, status: Option<&Status>, record: Option<&Record>) -> String {
+fn state_text(phase: Phase, status: Option<&Status>, record: Option<&Record>) -> String {
     let Some(s) = status.filter(|_| phase != Phase::Done) else {
         return record.map_or("–".into(), |r| format!("done in {}", duration(r.elapsed_s)));
     };

@@ -153,7 +153,7 @@ fn assign(config: &Config, key: &str, given: RawValue) -> Result<Config> {
 }
 
 /// Returns the words that a key takes, alone or in a list; none if it takes numbers or any text.
-pub fn words(key: &str) -> Vec<String> {
+pub fn known_words(key: &str) -> Vec<String> {
     let config = Config::preset(Preset::Standard);
     match lookup(&config.to_table(), key) {
         Some(Value::Boolean(_)) => vec!["true".into(), "false".into()],

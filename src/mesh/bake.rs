@@ -49,7 +49,7 @@ use crate::mesh::setting;
 use crate::{Monitor, Result};
 use cover::{Bands, Sample};
 use glam::{Mat3, Vec3, Vec4};
-use light::{SurfacePoints, Visibility, settle, shade};
+use light::{SurfacePoints, Visibility, shade, snap_to_surface};
 use seams::fill;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -161,7 +161,7 @@ pub fn bake(
         let own = &bands.samples(atlas, band, config.side);
         monitor.check_stop()?;
         let flat = on_triangles(mesh, own);
-        let points = settle(&flat, config.reach, field);
+        let points = snap_to_surface(&flat, config.reach, field);
         let seen = visibility.directions(&points, &flat);
         samples += own.len();
         for (_, &count) in seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known) {

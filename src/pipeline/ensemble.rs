@@ -62,7 +62,7 @@ pub(super) fn ensemble(
         pictures::write(dir.folder(), &camera.name, &view, render.format, config.capture.unit_m)?;
         dir.step(i + 1, cameras.len())?;
     }
-    let mut summary = json!({"members": words(&c.members), "weights": weights, "fitted": fitted});
+    let mut summary = json!({"members": method_names(&c.members), "weights": weights, "fitted": fitted});
     io::write_atomic(&dir.folder().join("weights.json"), format!("{summary:#}\n").as_bytes())?;
     summary["views"] = json!(cameras.len());
     // warnings about the blend alone: its members' warnings are in the stage `render`
@@ -120,7 +120,7 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
 }
 
 /// Returns the names of methods.
-fn words(methods: &[Method]) -> Vec<&'static str> {
+fn method_names(methods: &[Method]) -> Vec<&'static str> {
     methods.iter().map(|m| m.folder()).collect()
 }
 
@@ -128,7 +128,7 @@ fn words(methods: &[Method]) -> Vec<&'static str> {
 fn shown_with_members(config: &Config) -> String {
     let mut methods = config.render.method.clone();
     methods.extend(config.ensemble.members.iter().filter(|m| !config.render.method.contains(m)));
-    words(&methods).join(",")
+    method_names(&methods).join(",")
 }
 
 /// Returns the weights of the settings, or equal ones if there are none.
@@ -239,11 +239,11 @@ fn fit(
     let mut all = Fit::new(c.members.len())?;
     sums.iter().try_for_each(|sum| all.merge(sum))?;
     let mut alone = Map::new();
-    for (k, name) in words(&c.members).into_iter().enumerate() {
+    for (k, name) in method_names(&c.members).into_iter().enumerate() {
         let one: Vec<f32> = (0..c.members.len()).map(|l| if l == k { 1.0 } else { 0.0 }).collect();
         alone.insert(name.into(), json!(all.psnr(&one)?));
     }
-    let each = words(&c.members).into_iter().zip(&weights);
+    let each = method_names(&c.members).into_iter().zip(&weights);
     let shares: Vec<String> = each.map(|(name, w)| format!("{} {w:.3}", display_name(name))).collect();
     dir.note(&format!("fitted weights: {}", shares.join(", ")));
     let record = json!({"pixels": all.pixels(), "psnr": all.psnr(&weights)?, "psnr_alone": alone});

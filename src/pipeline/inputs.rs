@@ -3,7 +3,7 @@
 //! A finished run no longer needs these files: the digests of those that have been moved are restored from its records.
 
 use super::clicks::MaskPrompts;
-use super::readings::{Settled, settle};
+use super::readings::{Settled, decide_reading};
 use super::{mask, scene_file};
 use crate::capture::{self, Capture, CaptureOptions, Reading, View, ViewMask};
 use crate::config::{Config, MaskHead, MaskSource, Stage};
@@ -64,7 +64,7 @@ impl Inputs {
     pub fn read(config: &Config, run: &Run) -> Result<(Capture, Inputs)> {
         let mut options = capture_options(config);
         let opened = capture::open(Path::new(&config.capture.path), &options);
-        let (capture, mut inputs) = match opened.and_then(|capture| settle(capture, &options)) {
+        let (capture, mut inputs) = match opened.and_then(|capture| decide_reading(capture, &options)) {
             Err(e) => restore_from_run(config, run, e)?,
             Ok(Settled { mut capture, reading, reason, .. }) => {
                 options.reading = reading;

@@ -3,7 +3,7 @@
 use super::cameras::{CameraCheck, check_cameras};
 use super::clicks::{MaskPrompts, make_masks};
 use super::exposure::ExposureCheck;
-use super::readings::{Settled, settle};
+use super::readings::{Settled, decide_reading};
 use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
 use super::scene_file;
 use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
@@ -111,7 +111,7 @@ pub(super) fn mask(
     let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
     let suspicious: Vec<&String> = suspicious.collect();
     // pixels that a mask marks as unknown may still show the head
-    let scene = place(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
+    let scene = locate_head(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
     let (cameras, exposure) = (whole.capture.cameras, whole.capture.exposure);
     let found = match silhouettes {
@@ -353,7 +353,7 @@ fn masks_from_clicks(
 }
 
 /// Locates the head from the training views; held-out views do not take part.
-fn place(
+fn locate_head(
     capture: &Capture,
     silhouettes: impl Iterator<Item = Option<Gray>>,
     wanted: SceneBox,
@@ -422,7 +422,7 @@ fn for_placing(mask: &Gray) -> Gray {
 /// Returns the findings of [`inspect`] for a capture, and which of its masks contradict each other.
 pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     // what cannot be opened is inspected all the same
-    let settled = capture::open(root, options).ok().map(|capture| settle(capture, options));
+    let settled = capture::open(root, options).ok().map(|capture| decide_reading(capture, options));
     let (settled, refused) = settled.transpose().map_or_else(|e| (None, Some(e)), |settled| (settled, None));
     let reading = settled.as_ref().and_then(|settled| settled.reading);
     let options = &CaptureOptions { reading, ..options.clone() };

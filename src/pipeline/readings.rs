@@ -78,7 +78,7 @@ impl Settled {
 
 /// Opens a capture as [`capture::open`] does, and decides by its photographs what its files leave open.
 pub fn open_capture(root: &Path, options: &CaptureOptions) -> Result<Capture> {
-    Ok(settle(capture::open(root, options)?, options)?.capture)
+    Ok(decide_reading(capture::open(root, options)?, options)?.capture)
 }
 
 /// Decides how a capture is read that was opened with these options.
@@ -86,7 +86,7 @@ pub fn open_capture(root: &Path, options: &CaptureOptions) -> Result<Capture> {
 /// # Errors
 ///
 /// Nothing decides which photograph belongs to which camera, and poses are not to be used as given.
-pub(super) fn settle(capture: Capture, options: &CaptureOptions) -> Result<Settled> {
+pub(super) fn decide_reading(capture: Capture, options: &CaptureOptions) -> Result<Settled> {
     if capture.readings.is_empty() {
         return Ok(Settled::left(capture));
     }

@@ -22,7 +22,7 @@ use super::raycast::{RayHits, RenderedView};
 use crate::geom::{Camera, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Image;
 use bytemuck::Zeroable;
-use paint::{Band, Batch, Painter, Part, Sheet, straight_rays};
+use paint::{Layer, Painter, PictureRows, SampleBatch, TileArea, straight_rays};
 use project::{Bins, Faces, Lens, TILE};
 use rayon::prelude::*;
 use tile::{NOTHING, SAMPLES, Tile};
@@ -155,7 +155,7 @@ pub fn raster_into(
         }
     }
     triangles.resize(width as usize * height as usize, NOTHING);
-    let clear = |out: &mut Band| {
+    let clear = |out: &mut PictureRows| {
         if !is_clear {
             out.rgba.fill([0.0; 4]);
             out.depth.fill(0.0);
@@ -175,7 +175,7 @@ pub fn raster_into(
         .zip(normal_rows)
         .zip(triangles.par_chunks_mut((TILE * w).max(1)))
         .enumerate()
-        .map(|(row, (((rgba, depth), normal), triangles))| Band {
+        .map(|(row, (((rgba, depth), normal), triangles))| PictureRows {
             top: row * TILE,
             rgba: rgba.as_chunks_mut().0,
             depth,
@@ -186,11 +186,11 @@ pub fn raster_into(
     let Some(lens) = lens else { return rows.for_each(|mut out| clear(&mut out)) };
     let core =
         Faces { positions: &mesh.positions, triangles: &mesh.triangles, ids: None, cull: options.cull };
-    let mut sheets = vec![(lens.bin(&core), Sheet { positions: &mesh.positions, layer: None })];
+    let mut layers = vec![(lens.bin(&core), Layer { positions: &mesh.positions, shell: None })];
     for layer in layers.iter().flat_map(|l| &l.layers) {
         let RasterLayer { layer, surface: Mesh { positions, triangles, .. }, ids } = layer;
         let faces = Faces { positions, triangles, ids: Some(ids), cull: true };
-        sheets.push((lens.bin(&faces), Sheet { positions, layer: Some(layer) }));
+        layers.push((lens.bin(&faces), Layer { positions, shell: Some(layer) }));
     }
     let painter = Painter {
         mesh,
@@ -204,7 +204,7 @@ pub fn raster_into(
         bare: options.bare_hits,
         color,
     };
-    let start = || (Tile::new(), Vec::new(), Box::<Batch>::new(Zeroable::zeroed()), RayHits::default());
+    let start = || (Tile::new(), Vec::new(), Box::<SampleBatch>::new(Zeroable::zeroed()), RayHits::default());
     rows.for_each_init(start, |(tile, over, batch, queue), mut out| {
         let out = &mut out;
         clear(out);
@@ -212,24 +212,24 @@ pub fn raster_into(
         for column in 0..across {
             let index = out.top / TILE * across + column;
             let has = |bins: &[Bins]| bins.iter().any(|b| b.of(index).len() > 0);
-            if !sheets.iter().any(|(bins, _)| has(bins)) {
+            if !layers.iter().any(|(bins, _)| has(bins)) {
                 continue;
             }
-            let part = Part { left: column * TILE, width: TILE.min(w - column * TILE), height };
-            tile.move_to(part.left, out.top, part.width, part.height);
-            let (core, own) = &sheets[0];
+            let area = TileArea { left: column * TILE, width: TILE.min(w - column * TILE), height };
+            tile.move_to(area.left, out.top, area.width, area.height);
+            let (core, own) = &layers[0];
             draw(tile, core, index);
             let mut light = Vec::new();
-            for (bins, sheet) in sheets[1..].iter().rev().filter(|(bins, _)| has(bins)) {
+            for (bins, layer) in layers[1..].iter().rev().filter(|(bins, _)| has(bins)) {
                 if over.is_empty() {
                     over.push(Tile::new());
                 }
                 light.resize(TILE * TILE, [1.0; SAMPLES]);
                 over[0].behind(tile);
                 draw(&mut over[0], bins, index);
-                painter.paint(&over[0], sheet, &mut light, part, out, batch, queue);
+                painter.paint(&over[0], layer, &mut light, area, out, batch, queue);
             }
-            painter.paint(tile, own, &mut light, part, out, batch, queue);
+            painter.paint(tile, own, &mut light, area, out, batch, queue);
         }
     });
 }

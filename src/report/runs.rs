@@ -66,20 +66,20 @@ impl RunRow {
     /// Reads the state and figures of the run in a folder; its page is linked from one in `beside`. A file that is missing or
     /// damaged leaves its figures out: one run must not hide the others.
     pub fn read(run: &Path, beside: &Path) -> RunRow {
-        let standing = RunStatus::read(run);
+        let status = RunStatus::read(run);
         let records: Vec<(Stage, &Record)> =
-            standing.stages.iter().filter_map(|s| Some((s.stage, s.record.as_ref()?))).collect();
+            status.stages.iter().filter_map(|s| Some((s.stage, s.record.as_ref()?))).collect();
         let of = |stage| records.iter().find(|(s, _)| *s == stage).map(|(_, r)| &r.summary);
         let name = io::real_path(run).unwrap_or(run.into());
-        let has_mesh = standing.stages.iter().all(|s| s.stage != Stage::Mesh || s.faults.is_empty());
+        let has_mesh = status.stages.iter().all(|s| s.stage != Stage::Mesh || s.faults.is_empty());
         let mut row = RunRow {
             name: name.file_name().unwrap_or(run.as_os_str()).to_string_lossy().into_owned(),
-            state: state(&standing),
-            done: standing.phase == Phase::Done,
-            failed: matches!(standing.phase, Phase::Failed | Phase::Damaged),
+            state: state(&status),
+            done: status.phase == Phase::Done,
+            failed: matches!(status.phase, Phase::Failed | Phase::Damaged),
             picture: picture(run).unwrap_or_default(),
             preset: Config::of_run(run).map_or(String::new(), |config| config.preset.name().into()),
-            seconds: standing.elapsed_s,
+            seconds: status.elapsed_s,
             cpu_s: records.iter().map(|(_, r)| r.cpu_s).sum::<Option<f64>>().filter(|s| *s > 0.0),
             peak_bytes: records.iter().filter_map(|(_, r)| r.peak_bytes).max(),
             warnings: warnings(run, records.iter().copied()),

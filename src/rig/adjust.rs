@@ -102,7 +102,7 @@ struct Eliminated {
 
 /// Cameras, tracks and which cameras move.
 #[derive(Clone, Copy)]
-struct Setting<'a> {
+struct Problem<'a> {
     given: &'a [Camera],
     /// The place of each camera's six unknowns; `None` for a camera that stays.
     places: &'a [Option<usize>],
@@ -113,7 +113,7 @@ struct Setting<'a> {
     damping: f64,
 }
 
-impl Setting<'_> {
+impl Problem<'_> {
     fn weight(&self, residual: DVec2) -> f64 {
         1.0 / (1.0 + residual.length_squared() / (self.scale * self.scale))
     }
@@ -324,13 +324,13 @@ pub fn adjust(given: &[Camera], cameras: &mut [Camera], tracks: &mut [Track], fr
         free.then(|| next - 6)
     };
     let places: Vec<Option<usize>> = free.iter().map(place).collect();
-    Setting { given, places: &places, fixed_points: false, scale, damping: 1e-4 }.minimize(cameras, tracks);
+    Problem { given, places: &places, fixed_points: false, scale, damping: 1e-4 }.minimize(cameras, tracks);
 }
 
 /// Returns the pose that fits points which stay best, seen by the camera of view 0 alone; the prior is the `given` pose.
 pub fn resected(given: &Camera, start: &Camera, tracks: &[Track], scale: f64) -> Camera {
     let (given, mut camera, mut tracks) = ([given.clone()], [start.clone()], tracks.to_vec());
-    Setting { given: &given, places: &[Some(0)], fixed_points: true, scale, damping: 1e-4 }
+    Problem { given: &given, places: &[Some(0)], fixed_points: true, scale, damping: 1e-4 }
         .minimize(&mut camera, &mut tracks);
     let [camera] = camera;
     camera
@@ -483,7 +483,7 @@ mod tests {
             sightings: vec![Sighting { view: 0, pixel: DVec2::new(200.0, 250.0) }],
         };
         let tracks: Vec<Track> = (0..9).map(track).collect();
-        let setting = Setting {
+        let problem = Problem {
             given: std::slice::from_ref(&given),
             places: &[Some(0)],
             fixed_points: true,
@@ -493,15 +493,15 @@ mod tests {
         let mut vector = vec![0.0; 6];
         for t in &tracks {
             let l = Linear::new(&camera, t.position, t.sightings[0].pixel).unwrap();
-            (0..6).for_each(|k| vector[k] += setting.weight(l.residual) * l.camera[k].dot(l.residual));
+            (0..6).for_each(|k| vector[k] += problem.weight(l.residual) * l.camera[k].dot(l.residual));
         }
-        setting.add_prior(std::slice::from_ref(&camera), &mut [0.0; 36], &mut vector);
+        problem.add_prior(std::slice::from_ref(&camera), &mut [0.0; 36], &mut vector);
         for k in 0..6 {
             const STEP: f64 = 1e-6;
             let mut step = [0.0; 6];
             let mut cost = |d: f64| {
                 step[k] = d;
-                setting.cost(&[moved(&camera, &step)], &tracks)
+                problem.cost(&[moved(&camera, &step)], &tracks)
             };
             let measured = (cost(STEP) - cost(-STEP)) / (4.0 * STEP);
             assert!(

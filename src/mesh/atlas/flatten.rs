@@ -91,7 +91,7 @@ pub(super) fn flatten(
         Ok(Ok(answer)) => answer,
         Ok(Err(uvunwrap::Error::Cancelled)) => return Err(Error::stopped(COMPLETE_IS_KEPT)),
         Ok(Err(error)) => return Err(unusable(format!("uvunwrap: {error}"))),
-        Err(panic) => return Err(unusable(format!("uvunwrap panicked: {}", words(&*panic)))),
+        Err(panic) => return Err(unusable(format!("uvunwrap panicked: {}", panic_message(&*panic)))),
     };
     let out = match &answer.meshes[..] {
         [one] if one.indices.len() == indices.len() => one,
@@ -169,9 +169,10 @@ fn unusable(reason: impl Display) -> Error {
     Error::cannot(reason, "")
 }
 
-fn words(panic: &(dyn std::any::Any + Send)) -> String {
+/// Returns the message of a panic.
+fn panic_message(panic: &(dyn std::any::Any + Send)) -> String {
     let text = panic.downcast_ref::<&str>().copied();
-    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("without a word").into()
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("without a message").into()
 }
 
 /// Returns the same triangles after `rounds` of smoothing; a border is smoothed along itself.

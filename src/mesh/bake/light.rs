@@ -20,7 +20,7 @@ pub struct SurfacePoints {
 /// Moves points of the flat triangles onto the field's zero along their interpolated normals, at most `reach`
 /// far, and gives them the field's normals. A point from where the field's zero is not met stays as it is, with
 /// its interpolated normal.
-pub fn settle(flat: &SurfacePoints, reach: f32, field: &dyn SdfField) -> SurfacePoints {
+pub fn snap_to_surface(flat: &SurfacePoints, reach: f32, field: &dyn SdfField) -> SurfacePoints {
     let n = flat.positions.len();
     let mut offset = vec![0f32; n];
     let mut start = vec![f32::INFINITY; n];
@@ -313,7 +313,7 @@ mod tests {
     #[test]
     fn points_move_onto_the_sphere_unless_it_is_out_of_reach() {
         let start = flat(&[Vec3::new(0.0, 0.0, 0.51), Vec3::new(0.0, 0.485, 0.0), Vec3::new(0.3, 0.0, 0.0)]);
-        let moved = settle(&start, 0.02, &sphere);
+        let moved = snap_to_surface(&start, 0.02, &sphere);
         assert!(moved.positions[0].distance(Vec3::Z * 0.5) < 1e-6);
         assert!(moved.positions[1].distance(Vec3::Y * 0.5) < 1e-6);
         // 0.2 deep, as a cap is: stays

@@ -68,8 +68,8 @@ pub fn sparse(
         out: Sparse { range: (f32::INFINITY, f32::NEG_INFINITY), ..Sparse::default() },
     };
     flood.evaluate_coarse()?;
-    flood.cross()?;
-    flood.spread()?;
+    flood.evaluate_crossed_edges()?;
+    flood.flood()?;
     let Flood { mut blocks, mut out, .. } = flood;
     out.surface = blocks.surface(grid)?;
     Ok(out)
@@ -145,7 +145,7 @@ impl Flood<'_> {
     }
 
     /// Evaluates every node along the coarse edges that change sign.
-    fn cross(&mut self) -> Result<()> {
+    fn evaluate_crossed_edges(&mut self) -> Result<()> {
         let step = self.coarse_step;
         for l in self.lattice_points() {
             for axis in 0..3 {
@@ -163,7 +163,7 @@ impl Flood<'_> {
                 }
             }
         }
-        self.settle()
+        self.evaluate_wanted()
     }
 
     /// Returns the lattice's value of a node, where it has been evaluated.
@@ -181,7 +181,7 @@ impl Flood<'_> {
     }
 
     /// Evaluates the wanted nodes and queues the cells around every crossed edge.
-    fn settle(&mut self) -> Result<()> {
+    fn evaluate_wanted(&mut self) -> Result<()> {
         let nodes = std::mem::take(&mut self.wanted);
         let (old, new): (Vec<_>, Vec<_>) = nodes.iter().partition(|&&n| self.lattice_value(n).is_some());
         for &n in &old {
@@ -234,14 +234,14 @@ impl Flood<'_> {
     }
 
     /// Floods until no crossed edge has a cell that was not evaluated.
-    fn spread(&mut self) -> Result<()> {
+    fn flood(&mut self) -> Result<()> {
         while !self.cells.is_empty() {
             for cell in std::mem::take(&mut self.cells) {
                 for c in 0..8 {
                     self.want([cell[0] + (c & 1), cell[1] + (c >> 1 & 1), cell[2] + (c >> 2)]);
                 }
             }
-            self.settle()?;
+            self.evaluate_wanted()?;
         }
         Ok(())
     }

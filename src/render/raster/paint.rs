@@ -18,14 +18,14 @@ const QUEUE: usize = 4 * BATCH;
 const FULL: u8 = (1 << SAMPLES) - 1;
 
 /// Triangles that share their vertices, the mesh's own or those of a layer around it.
-pub(super) struct Sheet<'a> {
+pub(super) struct Layer<'a> {
     pub positions: &'a [Vec3],
-    /// The layer; `None` for the mesh itself.
-    pub layer: Option<&'a ShellLayer>,
+    /// The shell; `None` for the mesh itself.
+    pub shell: Option<&'a ShellLayer>,
 }
 
 /// Some rows of the rendered pictures.
-pub(super) struct Band<'a> {
+pub(super) struct PictureRows<'a> {
     pub top: usize,
     pub rgba: &'a mut [[f32; 4]],
     pub depth: &'a mut [f32],
@@ -35,7 +35,7 @@ pub(super) struct Band<'a> {
 
 /// The part of the picture under a tile.
 #[derive(Clone, Copy)]
-pub(super) struct Part {
+pub(super) struct TileArea {
     pub left: usize,
     pub width: usize,
     pub height: usize,
@@ -78,15 +78,15 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
     pub fn paint(
         &self,
         tile: &Tile,
-        sheet: &Sheet,
+        layer: &Layer,
         light: &mut [[f32; SAMPLES]],
-        part: Part,
-        out: &mut Band,
-        batch: &mut Batch,
+        area: TileArea,
+        out: &mut PictureRows,
+        batch: &mut SampleBatch,
         queue: &mut RayHits,
     ) {
-        for y in 0..part.height {
-            for x in 0..part.width {
+        for y in 0..area.height {
+            for x in 0..area.width {
                 let i = y * TILE + x;
                 let (depths, seen) = (&tile.inverse_depth[i], &tile.triangle[i]);
                 let present = (0..SAMPLES).fold(0, |bits, s| bits | u8::from(seen[s] != NOTHING) << s);
@@ -102,38 +102,38 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                 if seen[CENTER] != NOTHING {
                     let samples = rest & same(depths[CENTER]);
                     rest &= !samples;
-                    self.add(batch, [x, y], CENTER, seen[CENTER], samples, part, out.top);
+                    self.add(batch, [x, y], CENTER, seen[CENTER], samples, area, out.top);
                 }
                 while rest != 0 {
                     let s = rest.trailing_zeros() as usize;
                     let samples = rest & (same(depths[s]) | 1 << s);
                     rest &= !samples;
-                    self.add(batch, [x, y], s, seen[s], samples, part, out.top);
+                    self.add(batch, [x, y], s, seen[s], samples, area, out.top);
                 }
                 // a pixel has no further samples
                 if batch.count > BATCH - SAMPLES - 1 {
-                    self.finish(sheet, light, part, out, batch, queue);
+                    self.finish(layer, light, area, out, batch, queue);
                 }
             }
         }
-        self.finish(sheet, light, part, out, batch, queue);
+        self.finish(layer, light, area, out, batch, queue);
         queue.shade(out.rgba, &self.color);
     }
 
     #[inline(always)]
     fn add(
         &self,
-        batch: &mut Batch,
+        batch: &mut SampleBatch,
         [x, y]: [usize; 2],
         place: usize,
         triangle: u32,
         samples: u8,
-        part: Part,
+        area: TileArea,
         top: usize,
     ) {
         let k = batch.count;
         let [px, py] = [GRID[place].0, GRID[place].1].map(|v| v as f32 / UNIT as f32);
-        (batch.x[k], batch.y[k]) = ((part.left + x) as f32 + px, (top + y) as f32 + py);
+        (batch.x[k], batch.y[k]) = ((area.left + x) as f32 + px, (top + y) as f32 + py);
         if self.straight.is_none() {
             // no ray exists where the lens model folds over
             let Some(ray) = self.camera.ray(Vec2::new(batch.x[k], batch.y[k])) else { return };
@@ -147,18 +147,18 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
     /// Intersects the rays of a batch.
     fn finish(
         &self,
-        sheet: &Sheet,
+        layer: &Layer,
         light: &mut [[f32; SAMPLES]],
-        part: Part,
-        out: &mut Band,
-        batch: &mut Batch,
+        area: TileArea,
+        out: &mut PictureRows,
+        batch: &mut SampleBatch,
         queue: &mut RayHits,
     ) {
         let count = std::mem::take(&mut batch.count);
         for k in 0..count {
             let corners = self.mesh.triangles[batch.triangle[k] as usize];
             for (corner, v) in batch.corners.iter_mut().zip(corners) {
-                let p = sheet.positions[v as usize];
+                let p = layer.positions[v as usize];
                 (corner[0][k], corner[1][k], corner[2][k]) = (p.x, p.y, p.z);
             }
         }
@@ -169,8 +169,8 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
             let hit = Hit { t: batch.t[k], triangle, u: batch.u[k], v: batch.v[k] };
             let direction = Vec3::from(batch.direction.each_ref().map(|d| d[k]));
             let i = batch.pixel[k] as usize;
-            let pixel = i / TILE * w + part.left + i % TILE;
-            if batch.is_center[k] && sheet.layer.is_none() {
+            let pixel = i / TILE * w + area.left + i % TILE;
+            if batch.is_center[k] && layer.shell.is_none() {
                 out.depth[pixel] = hit.t * direction.dot(self.forward) * self.scale;
                 out.triangles[pixel] = triangle;
                 if let Some(own) = out.normal.get_mut(pixel) {
@@ -182,7 +182,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                 (None, samples) => samples.count_ones() as f32 / SAMPLES as f32,
                 (Some(light), samples) => {
                     let alpha =
-                        sheet.layer.map_or(1.0, |l| l.alpha(&hit, self.mesh.triangles[triangle as usize]));
+                        layer.shell.map_or(1.0, |l| l.alpha(&hit, self.mesh.triangles[triangle as usize]));
                     let mut share = 0.0;
                     for s in (0..SAMPLES).filter(|s| samples >> s & 1 == 1) {
                         share += light[s] * alpha / SAMPLES as f32;
@@ -210,7 +210,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
 
 /// Samples on the picture and the triangles to intersect at them.
 #[derive(Zeroable)]
-pub(super) struct Batch {
+pub(super) struct SampleBatch {
     count: usize,
     x: [f32; BATCH],
     y: [f32; BATCH],
@@ -231,11 +231,11 @@ pub(super) struct Batch {
 crate::dispatch! {
     /// Returns the intersections of rays with their triangles, or the nearest points: samples lie in snapped
     /// triangles.
-    fn meet / meet_all(batch: &mut Batch, straight: Option<[DVec3; 3]>, origin: Vec3)
+    fn meet / meet_all(batch: &mut SampleBatch, straight: Option<[DVec3; 3]>, origin: Vec3)
 }
 
 #[inline(always)]
-fn meet_all<const F: bool>(batch: &mut Batch, straight: Option<[DVec3; 3]>, origin: Vec3) {
+fn meet_all<const F: bool>(batch: &mut SampleBatch, straight: Option<[DVec3; 3]>, origin: Vec3) {
     let origin = origin.as_dvec3().to_array();
     for k in 0..BATCH {
         if let Some([corner, right, down]) = straight {
