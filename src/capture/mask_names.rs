@@ -135,8 +135,8 @@ pub(super) fn groups(folder: &CaptureFolder, views: &[View]) -> Vec<Group> {
     }
     let order = |(place, _): &(String, Vec<String>)| {
         let last = fold(place.rsplit('/').next().unwrap_or_default());
-        let standing = STANDING.iter().position(|name| *name == last).unwrap_or(STANDING.len());
-        (standing, place.matches('/').count(), place.clone())
+        let rank = STANDING.iter().position(|name| *name == last).unwrap_or(STANDING.len());
+        (rank, place.matches('/').count(), place.clone())
     };
     let mut found: Vec<(String, Vec<String>)> = found.into_iter().collect();
     found.sort_by_cached_key(order);

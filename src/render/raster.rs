@@ -22,7 +22,7 @@ use super::raycast::{RayHits, RenderedView};
 use crate::geom::{Camera, Mesh, ShellLayer, Shells, Similarity};
 use crate::image::Image;
 use bytemuck::Zeroable;
-use paint::{Layer, Painter, PictureRows, SampleBatch, TileArea, straight_rays};
+use paint::{Painter, PictureRows, RasterSurface, SampleBatch, TileArea, straight_rays};
 use project::{Bins, Faces, Lens, TILE};
 use rayon::prelude::*;
 use tile::{NOTHING, SAMPLES, Tile};
@@ -186,11 +186,11 @@ pub fn raster_into(
     let Some(lens) = lens else { return rows.for_each(|mut out| clear(&mut out)) };
     let core =
         Faces { positions: &mesh.positions, triangles: &mesh.triangles, ids: None, cull: options.cull };
-    let mut layers = vec![(lens.bin(&core), Layer { positions: &mesh.positions, shell: None })];
+    let mut surfaces = vec![(lens.bin(&core), RasterSurface { positions: &mesh.positions, shell: None })];
     for layer in layers.iter().flat_map(|l| &l.layers) {
         let RasterLayer { layer, surface: Mesh { positions, triangles, .. }, ids } = layer;
         let faces = Faces { positions, triangles, ids: Some(ids), cull: true };
-        layers.push((lens.bin(&faces), Layer { positions, shell: Some(layer) }));
+        surfaces.push((lens.bin(&faces), RasterSurface { positions, shell: Some(layer) }));
     }
     let painter = Painter {
         mesh,
@@ -212,15 +212,15 @@ pub fn raster_into(
         for column in 0..across {
             let index = out.top / TILE * across + column;
             let has = |bins: &[Bins]| bins.iter().any(|b| b.of(index).len() > 0);
-            if !layers.iter().any(|(bins, _)| has(bins)) {
+            if !surfaces.iter().any(|(bins, _)| has(bins)) {
                 continue;
             }
             let area = TileArea { left: column * TILE, width: TILE.min(w - column * TILE), height };
             tile.move_to(area.left, out.top, area.width, area.height);
-            let (core, own) = &layers[0];
+            let (core, own) = &surfaces[0];
             draw(tile, core, index);
             let mut light = Vec::new();
-            for (bins, layer) in layers[1..].iter().rev().filter(|(bins, _)| has(bins)) {
+            for (bins, layer) in surfaces[1..].iter().rev().filter(|(bins, _)| has(bins)) {
                 if over.is_empty() {
                     over.push(Tile::new());
                 }

@@ -92,7 +92,7 @@ impl Moments {
             if order.len() < 2 {
                 continue;
             }
-            if 2 * standing(&frames, moment) >= frames.len() {
+            if 2 * still_count(&frames, moment) >= frames.len() {
                 // the first of those with the most photographs
                 let most = order.iter().rev().max_by_key(|moment| counts[*moment]).unwrap_or(&order[0]);
                 listing.problems.push(self.refuse(files, key, &order, (*most, counts[most])));
@@ -157,7 +157,7 @@ fn show(value: &Value) -> (String, Option<String>) {
 }
 
 /// Returns the number of frames whose camera stands in the same place at another moment.
-fn standing(frames: &[&Moment], moment: impl Fn(&Moment) -> u64) -> usize {
+fn still_count(frames: &[&Moment], moment: impl Fn(&Moment) -> u64) -> usize {
     let mean = frames.iter().map(|f| f.position).sum::<DVec3>() / frames.len() as f64;
     let extent = frames.iter().map(|f| f.position.distance(mean)).fold(0.0, f64::max);
     let step = SAME_PLACE * if extent > 1e-9 * (1.0 + mean.length()) { extent } else { 1.0 + mean.length() };

@@ -69,7 +69,7 @@ pub fn sparse(
     };
     flood.evaluate_coarse()?;
     flood.evaluate_crossed_edges()?;
-    flood.flood()?;
+    flood.fill()?;
     let Flood { mut blocks, mut out, .. } = flood;
     out.surface = blocks.surface(grid)?;
     Ok(out)
@@ -234,7 +234,7 @@ impl Flood<'_> {
     }
 
     /// Floods until no crossed edge has a cell that was not evaluated.
-    fn flood(&mut self) -> Result<()> {
+    fn fill(&mut self) -> Result<()> {
         while !self.cells.is_empty() {
             for cell in std::mem::take(&mut self.cells) {
                 for c in 0..8 {

@@ -18,7 +18,7 @@ const QUEUE: usize = 4 * BATCH;
 const FULL: u8 = (1 << SAMPLES) - 1;
 
 /// Triangles that share their vertices, the mesh's own or those of a layer around it.
-pub(super) struct Layer<'a> {
+pub(super) struct RasterSurface<'a> {
     pub positions: &'a [Vec3],
     /// The shell; `None` for the mesh itself.
     pub shell: Option<&'a ShellLayer>,
@@ -78,7 +78,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
     pub fn paint(
         &self,
         tile: &Tile,
-        layer: &Layer,
+        surface: &RasterSurface,
         light: &mut [[f32; SAMPLES]],
         area: TileArea,
         out: &mut PictureRows,
@@ -112,11 +112,11 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                 }
                 // a pixel has no further samples
                 if batch.count > BATCH - SAMPLES - 1 {
-                    self.finish(layer, light, area, out, batch, queue);
+                    self.finish(surface, light, area, out, batch, queue);
                 }
             }
         }
-        self.finish(layer, light, area, out, batch, queue);
+        self.finish(surface, light, area, out, batch, queue);
         queue.shade(out.rgba, &self.color);
     }
 
@@ -147,7 +147,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
     /// Intersects the rays of a batch.
     fn finish(
         &self,
-        layer: &Layer,
+        surface: &RasterSurface,
         light: &mut [[f32; SAMPLES]],
         area: TileArea,
         out: &mut PictureRows,
@@ -158,7 +158,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
         for k in 0..count {
             let corners = self.mesh.triangles[batch.triangle[k] as usize];
             for (corner, v) in batch.corners.iter_mut().zip(corners) {
-                let p = layer.positions[v as usize];
+                let p = surface.positions[v as usize];
                 (corner[0][k], corner[1][k], corner[2][k]) = (p.x, p.y, p.z);
             }
         }
@@ -170,7 +170,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
             let direction = Vec3::from(batch.direction.each_ref().map(|d| d[k]));
             let i = batch.pixel[k] as usize;
             let pixel = i / TILE * w + area.left + i % TILE;
-            if batch.is_center[k] && layer.shell.is_none() {
+            if batch.is_center[k] && surface.shell.is_none() {
                 out.depth[pixel] = hit.t * direction.dot(self.forward) * self.scale;
                 out.triangles[pixel] = triangle;
                 if let Some(own) = out.normal.get_mut(pixel) {
@@ -182,7 +182,7 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                 (None, samples) => samples.count_ones() as f32 / SAMPLES as f32,
                 (Some(light), samples) => {
                     let alpha =
-                        layer.shell.map_or(1.0, |l| l.alpha(&hit, self.mesh.triangles[triangle as usize]));
+                        surface.shell.map_or(1.0, |l| l.alpha(&hit, self.mesh.triangles[triangle as usize]));
                     let mut share = 0.0;
                     for s in (0..SAMPLES).filter(|s| samples >> s & 1 == 1) {
                         share += light[s] * alpha / SAMPLES as f32;
