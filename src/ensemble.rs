@@ -11,13 +11,19 @@
 //! taken in bands of fixed size and fixed order: any number of threads gives the same bits.
 
 mod fit;
+mod least_squares;
+mod tiles;
 
-pub use fit::{Fit, MAX_MEMBERS, Tile, fit_weights, tiles};
+pub use fit::{Fit, fit_weights};
+pub use tiles::{Tile, tiles};
 
 use crate::image::{Gray, Image, Photo};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::ops::Range;
+
+/// Maximum number of members in a fit.
+pub const MAX_MEMBERS: usize = 8;
 
 /// The paper's §5: baseline, T-Face, I-Face.
 pub const PAPER_WEIGHTS: [f32; 3] = [0.1, 0.6, 0.3];

@@ -1,5 +1,6 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
+mod boxes;
 mod bvh;
 mod camera;
 mod field;
@@ -12,14 +13,14 @@ mod similarity;
 pub mod sphharm;
 mod topology;
 
+pub(crate) use boxes::{Boxes, DBox, DEFAULT_EFFORT, Effort, share_out};
 pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion, Projection};
 pub use field::SdfField;
 pub use mesh::{Atlas, Mesh};
 pub(crate) use mesh::{area_vector, bilinear_taps, shape};
 pub(crate) use overlap::{
-    Boxes, DBox, DEFAULT_EFFORT, Effort, OutlineSide, THOROUGH_EFFORT, intersect, nearest_charts, overlaps,
-    share_out, shared_area, turn,
+    OutlineSide, THOROUGH_EFFORT, intersect, nearest_charts, overlaps, shared_area, turn,
 };
 pub(crate) use pieces::{WrongPiece, wrong_pieces};
 pub use ray::{Aabb, Hit, Ray, RayResult};

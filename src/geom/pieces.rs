@@ -6,7 +6,8 @@
 //! A ray through an edge or a corner meets one of the triangles there: in the plane, a point on a side counts as left of
 //! it, and a side spans its lower end but not its upper one (as in simulation of simplicity, Edelsbrunner, Mücke 1990).
 
-use super::overlap::{Boxes, DBox, DEFAULT_EFFORT, Effort, orient, share_out, turn};
+use super::boxes::{Boxes, DBox, DEFAULT_EFFORT, Effort, share_out};
+use super::overlap::{orient, turn};
 use super::topology::{Sets, sorted_sides};
 use glam::{DVec3, Vec2, Vec3};
 

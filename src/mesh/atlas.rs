@@ -13,8 +13,11 @@
 
 mod chart;
 mod divide;
+mod face;
 mod flatten;
 mod pack;
+mod relax;
+mod smooth;
 
 use crate::error::counted;
 use crate::geom::{Atlas, Mesh, THOROUGH_EFFORT, overlaps, turn};
@@ -22,7 +25,8 @@ use crate::mesh::files::{UvReport, seams_facing, uv_check};
 use crate::mesh::{check_indices, setting};
 use crate::{Error, Monitor, Result};
 use chart::{Flat, height, neighbors, part, upright};
-use divide::{divide, divide_around, planar};
+use divide::{divide, planar};
+use face::divide_around;
 use flatten::ChartSet;
 use glam::{DVec2, Vec2, Vec3};
 use pack::{ChartPose, half_squares, pack};

@@ -33,6 +33,7 @@
 
 mod carry;
 mod cover;
+mod fill;
 mod light;
 mod seams;
 
@@ -48,9 +49,9 @@ use crate::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
 use crate::mesh::setting;
 use crate::{Monitor, Result};
 use cover::{Bands, Sample};
+use fill::fill;
 use glam::{Mat3, Vec3, Vec4};
 use light::{SurfacePoints, Visibility, shade, snap_to_surface};
-use seams::fill;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 

@@ -4,7 +4,8 @@
 //! layers; a texel the texture, with colors averaged in linear light, lobes in their own values and normals as vectors.
 
 use super::cover::Bands;
-use super::seams::{Seams, fill};
+use super::fill::fill;
+use super::seams::Seams;
 use super::{complete, on_triangles};
 use crate::geom::{Atlas, Bvh, Hit, Mesh, ShellLayer, Shells, bilinear_taps};
 use crate::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
