@@ -18,6 +18,7 @@ pub mod parameters;
 pub mod pixels;
 #[cfg(feature = "wgpu")]
 pub(crate) mod self_test;
+pub mod soft_pixels;
 pub mod training;
 
 pub use compute_device::{ComputeDevice, compute_device, examine_devices, require_device};

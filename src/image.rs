@@ -11,8 +11,6 @@ pub use resize::{
     bilinear, enlarge, reduce_photo, reduce_to_rows, resize_gray, resize_hard, size_at_rows, working_size,
 };
 
-use serde::{Deserialize, Serialize};
-
 /// sRGB-coded from linear (IEC 61966-2-1), any value clamped to 0..=1.
 pub fn srgb_from_linear(c: f32) -> f32 {
     let c = c.clamp(0.0, 1.0);

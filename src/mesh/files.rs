@@ -18,6 +18,7 @@ mod gltf_text;
 mod head_texture;
 mod mtl;
 mod obj;
+mod obj_read;
 mod open;
 mod ply;
 mod ply_element;

@@ -8,7 +8,7 @@ use super::color_range::{at_vertices, bring_into_range};
 use super::gltf_text::as_glb;
 use super::head_texture::HeadTexture;
 use super::mtl::{Material, materials_of_mtl};
-use super::obj::MAX_LIBRARIES;
+use super::obj_read::MAX_LIBRARIES;
 use super::read::read_with;
 use super::source::{PictureSource, ReadMesh, ReadOptions, Source};
 use super::stored::HeadMesh;

@@ -11,7 +11,7 @@
 use super::file_mesh::middle;
 use super::foreign::refusal;
 use super::source::{ReadMesh, ReadOptions, Source, line_end, without_byte_order_mark};
-use super::{glb_read, obj, ply_read, stl};
+use super::{glb_read, obj_read, ply_read, stl};
 use crate::geom::Mesh;
 use crate::{Error, Result};
 use glam::{DVec3, Vec3};
@@ -64,7 +64,7 @@ fn parse(bytes: &[u8], path: &Path, options: &ReadOptions) -> Result<ReadMesh> {
     } else if let Some(named) = refusal(bytes, path) {
         return Err(named);
     } else if looks_like_obj(bytes) {
-        obj::read(bytes, source("OBJ"))?
+        obj_read::read(bytes, source("OBJ"))?
     } else {
         let hint = "export it as .glb, .ply or .obj";
         return Err(Error::cannot(format!("`{}` is neither GLB, PLY, OBJ nor STL", path.display()), hint));
