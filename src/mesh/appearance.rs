@@ -18,10 +18,11 @@
 //! shows. What depends on the view is smooth over the surface, so that the vertices carry it, as a difference to the
 //! diffuse color. What no photograph shows follows its neighbors some nodes far, and keeps its color beyond.
 
+mod nodes;
 mod rows;
 mod solve;
 
-pub(super) use rows::Nodes;
+pub(super) use nodes::Nodes;
 pub use rows::Photograph;
 
 use crate::geom::sphharm::{Y0, functions};

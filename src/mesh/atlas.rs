@@ -15,6 +15,7 @@ mod chart;
 mod divide;
 mod face;
 mod flatten;
+mod half_squares;
 mod pack;
 mod relax;
 mod smooth;
@@ -29,7 +30,8 @@ use divide::{divide, planar};
 use face::divide_around;
 use flatten::ChartSet;
 use glam::{DVec2, Vec2, Vec3};
-use pack::{ChartPose, half_squares, pack};
+use half_squares::half_squares;
+use pack::{ChartPose, pack};
 use serde::Serialize;
 use std::time::Instant;
 

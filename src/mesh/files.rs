@@ -12,6 +12,7 @@ mod color_range;
 mod file_mesh;
 mod foreign;
 mod glb;
+mod glb_document;
 mod glb_read;
 mod gltf_document;
 mod gltf_text;

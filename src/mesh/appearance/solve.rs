@@ -1,6 +1,7 @@
 //! The normal equations of a fit, never formed, solved by conjugate gradients.
 
-use super::rows::{Matrix, Nodes, Rows};
+use super::nodes::Nodes;
+use super::rows::{Matrix, Rows};
 use crate::geom::sphharm::{COEFFICIENTS_OF_DEGREE_2, sh16};
 use crate::kernel::cpu::cg::{conjugate_gradients, dot};
 use rayon::prelude::*;

@@ -1,4 +1,17 @@
 //! Colors of surface points: their exact positions, the cameras that see them, and the field's colors.
+//!
+//! View-dependent color in a few numbers a texel: real spherical harmonics of the direction to the viewer.
+//!
+//! A texel's color seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to degree 1 (4
+//! functions) or 2 (9) in the order and signs of [`crate::geom::sphharm::sh16`]; [`crate::geom::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
+//! coefficients minimize, over the cameras that see the point,
+//!
+//! ```text
+//! Σ_i w_i ‖base + Σ_k L_k Y_k(d_i) − c_i‖² + λ Σ_i w_i Σ_k ‖L_k‖²
+//! ```
+//!
+//! Cameras see a point from one side only, so that without the ridge term λ the functions would be free to grow
+//! in directions without cameras.
 
 use crate::geom::sphharm::{COEFFICIENTS_OF_DEGREE_2, sh16};
 use crate::geom::{Bvh, Camera, Mesh, Ray, SdfField};
