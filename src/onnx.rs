@@ -19,7 +19,7 @@ mod network;
 pub use self::network::NetworkFile;
 pub(crate) use self::network::{Contract, NetworkArray, Role, file_error};
 
-use self::network::{Fed, I64, Port, guarded, in_words, one_line};
+use self::network::{I64, NetworkInputs, Port, guarded, in_words, one_line};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
 use std::collections::HashMap;
@@ -198,7 +198,7 @@ impl TractModel {
     }
 
     /// Returns the plan for these shapes, made on the first call.
-    fn plan(&self, fed: &Fed) -> TractResult<Runnable> {
+    fn plan(&self, fed: &NetworkInputs) -> TractResult<Runnable> {
         let key: Vec<Vec<usize>> = fed.iter().map(|(_, array)| array.shape.clone()).collect();
         // held while planning: photographs that come together wait for the one plan they share
         let mut plans = self.plans.lock().unwrap_or_else(PoisonError::into_inner);
@@ -253,7 +253,7 @@ impl TractModel {
     }
 
     /// One run.
-    fn run(&self, fed: &Fed) -> Result<Vec<NetworkArray>, String> {
+    fn run(&self, fed: &NetworkInputs) -> Result<Vec<NetworkArray>, String> {
         let run = || -> TractResult<Vec<NetworkArray>> {
             let plan = self.plan(fed)?;
             let value = |(port, array): &(&Port, &NetworkArray)| -> TractResult<TValue> {

@@ -10,13 +10,13 @@
 //!
 //! Flat pieces of a surface, such as the cap under a bust: laid out as they are, in one chart each.
 
-use super::chart::{Flat, NONE, neighbors, part, straighten, stretch};
+use super::chart::{Flat, NONE, neighbors, straighten, stretch};
 use super::flatten::{ChartSet, STRETCHED, flatten};
 use super::relax::relax;
 use super::smooth::smoothed;
 use crate::geom::{Mesh, THOROUGH_EFFORT, overlaps};
 use crate::{Monitor, Result};
-use glam::{DVec2, DVec3, Vec2, Vec3};
+use glam::{DVec2, DVec3, Vec2};
 use rayon::prelude::*;
 use std::collections::HashMap;
 

@@ -155,7 +155,6 @@ fn panic_message(panic: &(dyn std::any::Any + Send)) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::chart::twice_area;
     use super::*;
     use crate::Quiet;
     use glam::Vec3;
