@@ -1,4 +1,4 @@
-//! The command line: a file per command, with its name; small commands share `about` and `capture`. The only module that
+//! The command line: a file per command, with its name; small commands share `about`, `capture` and `status`. The only module that
 //! prints.
 //!
 //! Data goes to stdout, everything else to stderr; the exit code distinguishes errors worth a retry

@@ -29,13 +29,13 @@
 //!
 //! The pipeline, one word per stage: **capture** (what was photographed, from where) → **mask** (which
 //! pixels are the head) → **baseline**, **tface** (radiance fields without and with masks), **iface** (a
-//! learned signed distance) → **mesh** (its zero level set, closed) → **render** (views by volume rendering and by
-//! ray casting) → **ensemble** (they become one) → **metrics**. [`pipeline`] runs them; every stage
+//! learned signed distance) → **mesh** (its zero level set, closed) → **render** (views by volume rendering, ray
+//! casting and rasterization) → **ensemble** (they become one) → **metrics**. [`pipeline`] runs them; every stage
 //! leaves a folder of plain files in the [`run`], and is skipped when it is done.
 //!
 //! Modules are declared in pipeline order, after the modules that they share. The parts can be used alone:
-//! [`mesh`] meshes any signed distance and needs no field, [`capture`] reads `transforms*.json` and LLFF and says of other datasets what they are, [`io`] opens every
-//! file within limits. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file and
+//! [`mesh`] meshes any signed distance and needs no field, [`capture`] reads seven kinds of camera files and names
+//! the others, [`io`] opens every file within limits. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file and
 //! place, and a suggested fix.
 //!
 //! [ARCHITECTURE.md](../../../ARCHITECTURE.md) shows components, data flow, coordinate frames and tensor layouts on one page.

@@ -1,4 +1,4 @@
-//! Stage `mask`: which pixels are the head, from a few clicks.
+//! Stage `mask`: which pixels are the head, from a few clicks or from what a network proposes.
 //!
 //! A click says "this is head" or "this is not". From clicks a hard mask is cut, a band around its
 //! outline is unknown (the trimap), and the band's opacity is estimated from the photograph:

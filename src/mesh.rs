@@ -1,10 +1,10 @@
 //! Stage: extraction of a signed distance's zero level set as a closed mesh, and its preparation for artists.
 //!
-//! - `extract`: [`marching`] meshes a dense grid, [`sparse`] evaluates a field only near its surface, [`clean`] keeps
-//!   the head and drops loose pieces; [`extract`] runs all of this, adds normals and colors, and removes small handles.
-//!   [`Cap`] closes the surface where the frames cut it.
+//! - `extract`: [`sparse`] evaluates a field only near its surface, [`clean`] keeps the head and drops loose pieces;
+//!   [`extract`] runs both, adds normals and colors, and removes small handles. [`Cap`] closes the surface where the
+//!   frames cut it. [`extract_dense`] evaluates a field at all nodes of a grid, which [`marching`] meshes.
 //! - [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured head mesh.
-//! - [`files`]: reads, writes and checks GLB, OBJ and PLY.
+//! - [`files`]: writes, reads and checks GLB, OBJ and PLY, and reads glTF and STL.
 
 mod appearance;
 mod atlas;

@@ -1,4 +1,4 @@
-//! Locates the head: a box from cameras and masks, which gives near, far and radius.
+//! Locates the head: a box from cameras and masks, and with masks its visual hull.
 //!
 //! With masks: the rays through the masks' centroids meet near the head. A cube around that point, wide
 //! enough for every frame, is carved by the silhouettes at a coarse resolution, shrunk to the remaining cells, and

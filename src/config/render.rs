@@ -21,7 +21,7 @@ pub enum Method {
     Raycast,
     /// Rays cast at the product, color from its texture: what a viewer of `head.glb` sees.
     Textured,
-    /// The same, rasterized in a hundredth of the time, without soft layers.
+    /// The same, rasterized in a fraction of the time, without soft layers.
     Raster,
 }
 

@@ -144,7 +144,7 @@ pub fn refuses(run: Run, stop_after: u64, stage: &str, rows: &[(&str, &dyn Fn(&m
             std::fs::remove_file(dir.path().join("checkpoint.previous.safetensors")).unwrap();
             let e = run(dir.path(), &Quiet).unwrap_err();
             assert!(e.to_string().contains(key) && e.to_string().contains("checkpoint.safetensors"), "{e}");
-            assert_eq!(e.hint(), format!("start the stage afresh with `--fresh {stage}`"));
+            assert_eq!(e.hint(), format!("start the stage again with `--fresh {stage}`"));
         }
     }
 }

@@ -38,7 +38,7 @@ pub fn finish(dir: &Path) -> Result<()> {
 
 /// Returns the hint for errors that no checkpoint of a stage can recover from.
 fn restart_hint(stage: &str) -> String {
-    format!("start the stage afresh with `--fresh {stage}`")
+    format!("start the stage again with `--fresh {stage}`")
 }
 
 fn unreadable(e: ReadError, stage: &str) -> Error {

@@ -1,4 +1,4 @@
-//! OpenEXR: depth and normals in and out, scene-linear renders out.
+//! OpenEXR: float channels by name, in and out: colors, depth, normals.
 //!
 //! The data window is placed inside the display window: pixels outside are dropped, uncovered ones are 0. The first layer
 //! with all requested channels is used.

@@ -1,4 +1,4 @@
-//! Photographs and masks: PNG and JPEG in, PNG out.
+//! Photographs and masks: PNG and JPEG, in and out.
 //!
 //! The content decides the format. Sizes are checked before anything is decoded, and the frame of the
 //! file (PNG chunks, JPEG segments) is walked to its end first: decoders forgive a missing tail and

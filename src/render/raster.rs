@@ -1,4 +1,4 @@
-//! Rasterization of a mesh: the same view as the ray caster's, in a hundredth of the time.
+//! Rasterization of a mesh: the same view as the ray caster's, in a fraction of the time.
 //!
 //! 1. Corners are projected and snapped to 1/256 of a pixel, triangles clipped to the frustum, and sorted into tiles
 //!    of 32 × 32 pixels (`project`). A lens that bends straight lines gets triangles halved until that no longer shows: so

@@ -103,7 +103,7 @@ fn is_whole(file: &Path, bytes: &[u8]) -> bool {
 /// What was there is there, and every file is the old one, the new one, or whole.
 fn never_worse(old: &Files, new: &Files, found: &Files, killed: bool, what: &str) {
     for file in old.keys() {
-        // what was asked to be made afresh goes first
+        // what was asked to be made again goes first
         let afresh =
             ["mesh", "render", "ensemble", "metrics"].iter().any(|s| file.starts_with(format!("run/{s}")));
         let goes = !new.contains_key(file) || what.contains("--fresh mesh") && afresh;

@@ -1,7 +1,7 @@
 //! Random numbers without state: a hash of (seed, stream, index).
 //!
 //! A step's draws depend on the step's number alone, so resuming needs no generator state and any
-//! number of threads draws the same numbers. SplitMix64's finaliser (Steele, Lea, Flood 2014).
+//! number of threads draws the same numbers. SplitMix64's finalizer (Steele, Lea, Flood 2014).
 
 /// Returns 64 random bits for number `index` of a stream.
 #[inline]

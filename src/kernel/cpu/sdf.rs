@@ -7,8 +7,8 @@
 //! s = sigmoid(100 z)     a = w ⊙ s     q = W1ᵀ a              n = ∇sdf = q_x + Jᵀ q_F
 //! ```
 //!
-//! Autodiff is first order only, so `n` is an *output* and the backward includes everything that used
-//! it (NeuS alpha, color, eikonal). Given `g_o` and `g_n`:
+//! `n` is an *output*, since NeuS alpha, color and eikonal loss use it; the backward pass is second order. Given the
+//! gradients `g_o` and `g_n`:
 //!
 //! ```text
 //! g_q = [J g_n, g_n]     g_a = W1 g_q     g_W1 += a g_qᵀ + g_z uᵀ     g_w += g_a ⊙ s

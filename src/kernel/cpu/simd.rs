@@ -1,6 +1,6 @@
 //! One body, compiled per CPU level: dispatch, matrix blocks and a few transcendental functions.
 //!
-//! Fixed-width arrays are left to the autovectoriser. Each hot body is `#[inline(always)]` and
+//! Fixed-width arrays are left to the autovectorizer. Each hot body is `#[inline(always)]` and
 //! generic over `F` ("has fused multiply-add"), instantiated inside a `#[target_feature]` wrapper
 //! that [`crate::dispatch!`] chooses at run time. `f32::mul_add` without hardware FMA is a library
 //! call, hence [`fma`].
@@ -104,7 +104,7 @@ pub fn gemm<const F: bool>(
     }
 }
 
-/// eˣ, relative error below 2e-7 on [-87, 88]; clamped outside. Branch-free, so loops vectorise.
+/// eˣ, relative error below 2e-7 on [-87, 88]; clamped outside. Branch-free, so loops vectorize.
 #[inline(always)]
 pub fn exp<const F: bool>(x: f32) -> f32 {
     let x = x.clamp(-87.0, 88.0);
