@@ -36,7 +36,7 @@ const MAX_FILE_BYTES: u64 = 2 << 30;
 pub(crate) struct NetworkSession {
     /// Its file.
     pub file: NetworkFile,
-    /// What it takes, in the file's order.
+    /// Inputs, in the file's order.
     pub inputs: Vec<Port>,
     /// Which network it is.
     pub contract: Contract,

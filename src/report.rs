@@ -222,7 +222,7 @@ pub struct ViewRow {
 pub struct ViewPicture {
     /// The name of the method that made it.
     pub method: String,
-    /// What a person calls that.
+    /// Display name.
     pub title: String,
     /// The picture: a `data:` address.
     pub picture: String,

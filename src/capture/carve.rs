@@ -173,7 +173,7 @@ impl Cube {
     }
 }
 
-/// What is left of a [`Cube`].
+/// Remaining cells of a [`Cube`].
 pub(super) struct Carved {
     /// How many masks each cell touches; 0 where some view removes it. `[n, n, n]`, x outermost.
     pub support: Vec<u16>,

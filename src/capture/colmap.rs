@@ -222,7 +222,7 @@ struct Model {
     pub images: Vec<Image>,
     /// Those that were found, where they are given.
     pub points: Option<Vec<DVec3>>,
-    /// What a user should know of how the files were read.
+    /// Warnings about the files.
     pub notes: Vec<String>,
 }
 
@@ -258,7 +258,7 @@ impl From<[f64; 7]> for Rigid {
     }
 }
 
-/// What COLMAP has found: a binary model in a folder.
+/// A model that COLMAP has found: binary files in a folder.
 #[derive(Clone, Debug)]
 pub(super) struct Found {
     /// Registered photographs.

@@ -21,9 +21,9 @@ use std::path::{Path, PathBuf};
 /// A problem and its suggested fix.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Problem {
-    /// What is wrong, and where.
+    /// The problem and its place.
     pub what: String,
-    /// What to do about it.
+    /// Suggested fix.
     pub hint: String,
     /// How many frames or files have it; `what` names the first.
     pub count: usize,

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// Number of examples in a sentence.
 const EXAMPLES: usize = 2;
 
-/// What the search said of the photographs that were left out.
+/// Results of the search for photographs that were left out.
 #[derive(Debug, Default)]
 pub(super) struct Missing {
     /// Photographs that several files fit, by name.

@@ -28,7 +28,7 @@ const MAX_ALIKE: usize = 1000;
 /// Number of files that fit a name that are remembered.
 const MAX_SHOWN: usize = 3;
 
-/// What is looked for.
+/// Kind of the file that is looked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Kind {
     Photograph,
@@ -212,7 +212,7 @@ impl Index {
     }
 }
 
-/// What is near a name.
+/// Files near a name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Found {
     Nothing,
@@ -229,7 +229,7 @@ pub(super) enum Found {
     },
 }
 
-/// What was looked for, and what was found.
+/// A name that was looked for, and the files found.
 #[derive(Clone, Debug)]
 pub(super) struct Answer {
     pub kind: Kind,
@@ -304,7 +304,7 @@ impl Search {
 mod tests {
     use super::*;
 
-    /// What is near a name in a capture of these files.
+    /// Returns the files near a name in a capture of these files.
     fn near(files: &[&str], kind: Kind, name: &str) -> Found {
         let dir = tempfile::tempdir().unwrap();
         for file in files {

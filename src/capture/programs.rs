@@ -3,7 +3,7 @@
 use super::folder::{FolderEntries, has_ending, join};
 use crate::io;
 
-/// What shows that a folder is a program's.
+/// Signs that a folder is a program's.
 enum Sign {
     /// A file or folder, whose path may contain `/`.
     Entry(&'static str),
@@ -201,7 +201,7 @@ const SCENES: &[Program] = &[
          `transforms_train.json`"),
 ];
 
-/// What comes last, since other programs leave it as well.
+/// Signs that are tried last, since other programs leave the same files.
 #[rustfmt::skip]
 const UNFINISHED: Program = program("an incomplete COLMAP project",
     &[Entry("sparse"), Entry("colmap"), Entry("cameras.bin"), Entry("cameras.txt"), Entry("images.bin"),

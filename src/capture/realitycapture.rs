@@ -26,7 +26,7 @@ const COLUMNS: [&str; 4] = ["name", "x", "y", "alt"];
 const EXPORT: &str = "export the registration again, `Internal/External camera parameters`";
 const POINTS: &str =
     "export it with a decimal point, or with `;` between the columns; names with commas need quotes";
-/// What an XMP file holds.
+/// Content of an XMP file.
 pub(super) const NAMESPACE: &str = "capturingreality.com/ns/xcr";
 
 /// Of 35 mm film.

@@ -106,7 +106,7 @@ pub struct Solution {
     pub error_px: f64,
     /// Whether features were searched inside head masks only.
     pub masked: bool,
-    /// What a user should know.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
 }
 
@@ -133,9 +133,9 @@ pub struct Search<'a> {
     work: Planned,
 }
 
-/// What a search has to do.
+/// Work that a search has to do.
 enum Planned {
-    /// Nothing: the output folder has the result.
+    /// No work: the output folder has the result.
     Nothing(Solution),
     Photographs {
         capture: Box<Capture>,
@@ -204,7 +204,7 @@ impl<'a> Search<'a> {
     ///
     /// # Errors
     ///
-    /// As [`Search::of_photographs`], and without FFmpeg.
+    /// Returns an error as [`Search::of_photographs`] does, and without FFmpeg.
     pub fn of_video(video: &Path, every: usize, sfm: &'a SfmOptions) -> Result<Search<'a>> {
         if !io::is_file(video) {
             return Err(Error::cannot(format!("there is no video `{}`", video.display()), "check the path"));
@@ -422,7 +422,7 @@ fn failed_command(program: &str, arguments: &[OsString], failure: &ProgramFailur
     Error::cannot(format!("`{program} {command}` failed ({status}); its log is `{log}`"), READ_LOG)
 }
 
-/// What an attempt does differently from others.
+/// Differences of an attempt from the first one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Attempt {
     /// Features are searched inside the masks.
@@ -450,7 +450,7 @@ struct Work<'a> {
     lock: Lock,
     programs: Programs,
     names: Vec<String>,
-    /// What a user should know of the photographs.
+    /// Warnings about the photographs.
     warnings: Vec<String>,
     /// All photographs are by one lens.
     shared: bool,

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// What a view is for.
+/// Use of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
@@ -68,7 +68,7 @@ pub struct CaptureOptions {
     pub masks: MaskSource,
     /// The only folder of masks, relative to the capture; empty to look beside the photographs.
     pub mask_dir: String,
-    /// What they mean.
+    /// Meaning of the masks' values.
     pub mask_meaning: MaskMeaning,
     /// Which pixels of mask files are the head.
     pub head: MaskHead,
@@ -82,7 +82,7 @@ pub struct CaptureOptions {
     pub unit_m: f64,
     /// How what the files leave open is read, where that has been decided.
     pub reading: Option<Reading>,
-    /// What is refused for its size.
+    /// Limits of files.
     pub limits: Limits,
 }
 
@@ -143,13 +143,13 @@ pub struct View {
     pub name: String,
     /// Its camera, at the size after downscaling.
     pub camera: Camera,
-    /// What it is for.
+    /// Use of the view.
     pub split: Split,
     /// The photograph.
     pub photo: PathBuf,
     /// Where its head mask is.
     pub mask: ViewMask,
-    /// What the mask means.
+    /// Meaning of the mask's values.
     pub mask_meaning: MaskMeaning,
     /// How the pixels of its file are read.
     #[serde(default, skip_serializing_if = "MaskReading::is_white")]
@@ -174,7 +174,7 @@ pub struct View {
     /// The EXIF orientation by which the stored photograph is turned although its size does not ask for it.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub turn: Option<u8>,
-    /// That by which the pictures of its mask, its usable pixels and its region are.
+    /// Orientation of the pictures of its mask, its usable pixels and its region.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub mask_turn: Option<u8>,
     /// The exposure that is divided out of the photograph when it is read.

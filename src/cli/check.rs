@@ -108,7 +108,7 @@ struct CheckJson<'a> {
     /// Why the texture that the file names is not shown.
     #[serde(skip_serializing_if = "Option::is_none")]
     texture_problem: Option<&'a str>,
-    /// What was read otherwise than it is written, or left out.
+    /// Values that were read otherwise than they are written, or left out.
     #[serde(skip_serializing_if = "<[String]>::is_empty")]
     notes: &'a [String],
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -9,7 +9,7 @@ use std::ffi::OsStr;
 /// Variable by which a shell asks for completions.
 const COMPLETE: &str = "TIFACE_COMPLETE";
 
-/// What bash needs to complete the values of `--set key=value`.
+/// Bash code that completes the values of `--set key=value`.
 const WHOLE_WORDS: &str = "# `key=value` is one word\nCOMP_WORDBREAKS=${COMP_WORDBREAKS//=}\n";
 
 /// Returns the script that makes a shell ask this program for completions.

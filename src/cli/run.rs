@@ -15,11 +15,11 @@ use std::path::{Path, PathBuf};
 
 /// A command that runs stages.
 pub(super) struct StageCommand<'a> {
-    /// What `--out` receives: the whole run, or the product of a stage.
+    /// Content of `--out`: the whole run, or the product of a stage.
     pub product: &'static str,
     /// The last stage that it needs.
     pub until: Stage,
-    /// What it works on.
+    /// Capture or run to work on.
     pub target: RunTarget,
     /// Requirements on the result (`--require`).
     pub require: &'a [String],

@@ -3,7 +3,7 @@
 use crate::Result;
 use std::sync::{Mutex, OnceLock};
 
-/// What to do about a GPU that failed.
+/// Advice for a GPU that failed.
 const GPU_HINT: &str = "`tiface doctor` tests the GPU, `--device cpu` leaves it out";
 
 /// A field on a GPU, which is evaluated in place of the CPU's until the GPU fails.

@@ -14,7 +14,7 @@ const F32: i32 = 1;
 /// ONNX's number for 64-bit integers.
 pub(super) const I64: i32 = 7;
 
-/// What a file is named for: the setting that names it, and the words for it.
+/// Purpose of a file: the setting that names it, and a description.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Role(pub(super) &'static str, pub(super) &'static str);
 
@@ -223,7 +223,7 @@ pub struct NetworkFile {
     pub bytes: u64,
     /// Its SHA-256 in hexadecimal.
     pub sha256: String,
-    /// What it was recognized as, and how it is fed.
+    /// Recognized kind, and the layout of its inputs.
     pub contract: String,
     /// The engine that runs it, with its version.
     pub engine: String,
@@ -261,7 +261,7 @@ impl Display for NetworkFile {
 pub(crate) struct NetworkArray {
     /// Extents.
     pub shape: Vec<usize>,
-    /// As many values as the extents' product; whole numbers where the network takes integers.
+    /// Values, one for each element of the shape; whole numbers where the network takes integers.
     pub values: Vec<f32>,
 }
 

@@ -20,11 +20,11 @@ use std::path::Path;
 /// File name of the measurement, in the folder of the stage `mask`.
 pub(super) const POSES: &str = "poses.json";
 
-/// What to do about a camera that does not fit.
+/// Advice for a camera that does not fit.
 const HINT: &str = "was the camera moved, or are two photographs swapped? Correct its pose or photograph, or remove the frame; \
                     `--set capture.cameras=given` goes on with all poses as they are";
 
-/// What to do about cameras that fit in no pose.
+/// Advice for cameras that fit in no pose.
 const APART_HINT: &str = "are the photographs those of this capture, in the order of its cameras, and is none turned or mirrored? \
                           Did the head or the rig move between them, or does the shutter roll? Correct photographs or poses; \
                           `--set capture.cameras=given` goes on with all poses as they are";

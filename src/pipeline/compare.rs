@@ -109,7 +109,7 @@ fn surfaces(runs: [&Session; 2], names: [&str; 2]) -> Result<Option<Value>> {
     Ok(Some(json!({from_a: forward, from_b: back})))
 }
 
-/// What other programs made of a capture, judged like a run.
+/// Results of other programs for a capture, judged like a run.
 pub struct Judged {
     /// `metrics.json`, with an entry for each folder and mesh.
     pub metrics: Value,

@@ -45,7 +45,7 @@ pub struct KeptHead {
     capture: Capture,
     head: HeadMesh,
     export: Export,
-    /// What users should know.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
 }
 

@@ -65,7 +65,7 @@ struct MeasuredView {
     /// Its exposure relative to the mean of the training views; missing where it shows too little.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     measured: Option<Exposure>,
-    /// What is divided out of a training photograph, or out of a held-out one for figures at its own exposure.
+    /// Exposure that is divided out of a training photograph, or out of a held-out one for figures at its own exposure.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     used: Option<Exposure>,
 }

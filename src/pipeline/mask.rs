@@ -148,7 +148,7 @@ pub(super) fn mask(
 struct RigCheck {
     cameras: Option<CameraCheck>,
     exposure: Option<ExposureCheck>,
-    /// What was to be done about poses, and about exposures, and was not.
+    /// Corrections of poses, and of exposures, that were asked for and not made.
     poses_left: Option<String>,
     exposures_left: Option<String>,
 }

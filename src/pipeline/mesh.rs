@@ -197,7 +197,7 @@ pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
 ///
 /// # Errors
 ///
-/// As [`finished_mesh`] and `read`. Files may be missing, or of two makings, if another process
+/// Returns the same as [`finished_mesh`] and `read`. Files may be missing, or of two makings, if another process
 /// began the stage again meanwhile; the error then says so instead.
 pub(super) fn read_finished<T>(run: &Path, read: impl FnOnce(&Record) -> Result<T>) -> Result<T> {
     let record = finished_mesh(run)?;

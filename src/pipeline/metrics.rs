@@ -131,7 +131,7 @@ fn blend_gain(sets: &Map<String, Value>, members: &[Method]) -> Option<Value> {
     Some(json!({"best_member": best, "gain_db": psnr("ensemble")? - alone}))
 }
 
-/// What all pictures of some views are judged by.
+/// Photograph, masks and networks that all pictures of some views are judged by.
 pub(super) struct Judge<'a> {
     config: &'a Config,
     tones: Option<Tones>,

@@ -63,9 +63,9 @@ pub(super) struct Settled {
     pub capture: Capture,
     /// The reading that was decided on.
     pub reading: Option<Reading>,
-    /// What was decided, and by what; one of the capture's reasons.
+    /// The decision and its reason; one of the capture's reasons.
     pub reason: Option<String>,
-    /// What was not decided although the work goes on; one of the capture's warnings.
+    /// The open question, if the work goes on without an answer; one of the capture's warnings.
     pub doubt: Option<String>,
 }
 
@@ -146,7 +146,7 @@ fn first(names: &[String]) -> String {
     format!("{}{}", shown.join(", "), if names.len() > SHOWN { ", …" } else { "" })
 }
 
-/// What is found of a reading.
+/// Measurements of a reading.
 #[derive(Clone, Copy, Default)]
 struct Found {
     /// How often points are found again in other photographs.

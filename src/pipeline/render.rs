@@ -225,7 +225,7 @@ pub(super) struct Renderer<'a> {
     head: Option<VisibleHead<'a>>,
     samples: u32,
     world_from_scene: Similarity,
-    /// What ray casting misses of the training photographs.
+    /// Residuals of ray casting in the training photographs.
     residuals: Option<Residuals>,
     monitor: &'a dyn Monitor,
 }

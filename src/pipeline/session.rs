@@ -25,7 +25,7 @@ pub struct Session<'a> {
     refined: OnceLock<Capture>,
     pub(super) config: &'a Config,
     pub(super) run: &'a Run,
-    /// What the fingerprints of the stages depend on besides the settings.
+    /// Inputs of the fingerprints of the stages besides the settings.
     pub(super) inputs: Inputs,
     /// The camera path that `render` shows instead of the held-out views.
     pub(super) path: Option<CameraPath>,

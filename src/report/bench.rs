@@ -149,7 +149,7 @@ fn short_time(seconds: f64) -> String {
     }
 }
 
-/// Everything that was measured, and where.
+/// All measurements, and the machine that made them.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct BenchResult {
     /// Version of the program.

@@ -111,11 +111,11 @@ impl ExposureFit {
 pub enum Incomparable {
     /// Too few training views show enough of what others show: those where this is true.
     TooFewViews(Vec<bool>),
-    /// What the views show determines no exposures.
+    /// The views do not determine exposures.
     Undetermined,
 }
 
-/// What one view shows of one point.
+/// Light of one point in one view.
 struct Sample {
     view: usize,
     /// Logarithm of the light of each channel.

@@ -28,14 +28,14 @@ pub(super) struct SyntheticPhoto {
     pub region: Gray,
 }
 
-/// Everything that does not change from picture to picture.
+/// Data shared by all pictures.
 pub(super) struct Studio {
     head: SyntheticHead,
     grid: DistanceGrid,
     lamps: [Lamp; 4],
 }
 
-/// What one ray brings back.
+/// Result of one ray.
 #[derive(Clone, Copy, Default)]
 struct RayLight {
     /// Linear light, multiplied by `alpha`.

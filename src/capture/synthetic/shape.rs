@@ -14,7 +14,7 @@ use glam::{IVec3, Vec2, Vec3};
 #[derive(Clone, Copy, Debug, Default)]
 pub struct SyntheticHead;
 
-/// What the surface is made of at a point.
+/// Material of the surface at a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum HeadMaterial {
     /// Face, ears, neck.

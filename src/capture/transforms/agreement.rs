@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 /// be overruled by the whole file's focal length.
 pub(super) const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
-/// What is read of a lens, its file's included, to compare what is not read with.
+/// Values read of a lens, its file's included, to compare unread values with.
 pub(super) struct Known<'a> {
     pub own: &'a Object,
     pub top: Option<&'a Object>,

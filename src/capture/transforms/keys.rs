@@ -89,7 +89,7 @@ struct Change {
     /// Keys of which one beside it makes this one redundant, separated by blanks.
     unless: &'static str,
     says: &'static str,
-    /// What to do about it; empty for what is only warned of.
+    /// Advice; empty for a warning.
     hint: &'static str,
 }
 
@@ -193,7 +193,7 @@ fn is_other_camera(value: &Value) -> bool {
     !["", "perspective", "pinhole"].contains(&name.as_str())
 }
 
-/// What a key changes, and what to do about it, which is empty for what is only warned of.
+/// The effect of a key, and the advice, which is empty for a warning.
 type Word = (&'static str, &'static str);
 
 /// Keys of the axes of cameras, or of the world.
@@ -268,9 +268,9 @@ pub(super) struct KeyLog {
     ignored: BTreeSet<&'static str>,
     /// The programs that write these.
     programs: BTreeSet<&'static str>,
-    /// What is not read because something else is, and the reason.
+    /// Keys that are not read because others are, and the reason.
     beaten: BTreeSet<(String, &'static str)>,
-    /// What is read elsewhere only, at the top and in frames.
+    /// Keys that are read elsewhere only, at the top and in frames.
     misplaced: [BTreeSet<&'static str>; 2],
     unknown: BTreeSet<String>,
     /// By key: the change, its value where that is a word, where it was first met, and how often.

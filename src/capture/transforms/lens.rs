@@ -98,7 +98,7 @@ pub(super) const FOCAL_WORDS: [&str; 24] = [
     "camera_fov",
 ];
 
-/// What else was found in the lenses of a file.
+/// Other findings in the lenses of a file.
 #[derive(Default)]
 pub(super) struct LensNotes {
     /// Camera models without distortion whose frames have some.
@@ -107,7 +107,7 @@ pub(super) struct LensNotes {
     pub taken: BTreeSet<(&'static str, &'static str)>,
     /// Spellings that were not read, by the reason.
     pub skipped: BTreeSet<(String, &'static str)>,
-    /// What those say otherwise than what is read, and cannot decide.
+    /// Keys that disagree with the values read, and cannot decide.
     pub doubts: BTreeSet<String>,
     /// Keys whose value is of another type than it must be.
     pub misread: BTreeSet<&'static str>,
@@ -298,7 +298,7 @@ fn short(value: &Value) -> String {
     }
 }
 
-/// What is read of a frame, intrinsics from the top included.
+/// Values read of a frame, intrinsics from the top included.
 #[derive(Default, Deserialize)]
 #[serde(default)]
 pub(super) struct FrameKeys {
@@ -368,7 +368,7 @@ fn of_all(text: String) -> Fault {
     Fault::File { text, hint: OF_ALL.into() }
 }
 
-/// What to do about what the top of a file says.
+/// Advice for keys at the top of a file.
 pub(super) const OF_ALL: &str = "correct what the file says of all its photographs";
 
 /// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the

@@ -19,7 +19,7 @@ const LISTS: [(&str, Split); 3] =
 /// Maximum number of folders in front of a name that are compared.
 const MAX_FOLDERS: usize = 8;
 
-/// What the lists say about one frame.
+/// Entry of one frame in the lists.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Listed {
     /// Its split, if any.

@@ -8,7 +8,7 @@ use crate::image::Image;
 
 /// Fills uncovered texels. `covered` has one flag per texel; values of covered texels are kept.
 ///
-/// Nothing happens where no texel is covered.
+/// Without a covered texel the image stays as it is.
 pub fn fill(image: &mut Image, covered: &[bool], gutter: u32) {
     if !covered.contains(&true) {
         return;

@@ -364,7 +364,7 @@ impl Blocks {
         self.find(node).map_or(f32::NAN, |b| b.values[64 * plane + bit.trailing_zeros() as usize])
     }
 
-    /// As in the dense volume: the size of the largest finite known neighbor, 1 without any.
+    /// Returns the size of the largest finite known neighbor, as in the dense volume; 1 without any.
     fn repair(&mut self, out: &mut LevelSet) {
         let nodes = std::mem::take(&mut self.non_finite);
         out.non_finite = nodes.len();

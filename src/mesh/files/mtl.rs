@@ -11,7 +11,7 @@ use std::path::Path;
 /// Materials of a file; more are an attack.
 const MAX_MATERIALS: usize = 1 << 16;
 
-/// What colors the faces of one material.
+/// Color of the faces of one material.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Material {
     /// Its name, as `usemtl` writes it.

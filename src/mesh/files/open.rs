@@ -28,7 +28,7 @@ pub struct OpenedMesh {
     pub bare_atlas: Option<Atlas>,
     /// Why the texture that the file names is not shown.
     pub texture_problem: Option<String>,
-    /// What was read otherwise than it is written, or left out.
+    /// Values that were read otherwise than they are written, or left out.
     pub notes: Vec<String>,
 }
 

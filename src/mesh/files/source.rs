@@ -124,7 +124,7 @@ pub struct ReadMesh {
     pub tint: Option<[f32; 3]>,
     /// The names of the materials that an OBJ uses, each with the triangle where it begins.
     pub materials: Vec<(u32, String)>,
-    /// What was read otherwise than it is written, or left out; one sentence each.
+    /// Values that were read otherwise than they are written, or left out; one sentence each.
     pub notes: Vec<String>,
     /// The positions in the file's coordinates while the file is read; then they move to `mesh`.
     pub(super) places: Vec<DVec3>,

@@ -35,7 +35,7 @@ const QUALITY: u8 = 84;
 pub(in crate::pipeline) struct ShownSet<'c> {
     /// Its name in the page, unlike the others'.
     pub key: String,
-    /// What a person calls it.
+    /// Display name.
     pub title: String,
     /// The pictures.
     pub pictures: Vec<Comparable<'c>>,
@@ -197,7 +197,7 @@ const MAX_BYTES: usize = 4_600_000;
 /// Longest side of a base color in a page, and of a function of view-dependent color, which is smooth.
 const COLOR_PX: u32 = 2048;
 const LOBE_PX: u32 = 512;
-/// What marks a GLB as written by this program.
+/// Mark of a GLB that this program wrote.
 const GENERATOR: &[u8] = b"\"generator\":\"tiface ";
 /// Number of triangles of a larger mesh's copy, which has colors at its vertices.
 const REDUCED_TRIANGLES: usize = 100_000;
