@@ -23,6 +23,7 @@
 pub(crate) mod carve;
 mod colmap;
 pub mod convert;
+mod downscale;
 mod folder;
 mod format;
 mod frame;
@@ -61,6 +62,7 @@ pub use view::{Capture, CaptureOptions, LoadedView, Reading, Split, View, ViewMa
 use crate::error::counted;
 use crate::io::{self, Limits, PictureInfo};
 use crate::{Error, Result};
+use downscale::downscaled;
 use folder::{CaptureFolder, in_frame, no_views};
 use format::CameraFiles;
 use frame::{CameraFrame, Listing};
@@ -69,7 +71,7 @@ use masks::few;
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use view::{downscaled, undone, wrong_size};
+use view::{undone, wrong_size};
 
 /// Opens a capture, or returns the first thing that is wrong with it; [`inspect::inspect`] returns all.
 pub fn open(root: &Path, options: &CaptureOptions) -> Result<Capture> {

@@ -1,5 +1,6 @@
 //! The stage `mesh`, first part: from a signed distance to a closed mesh with normals and colors.
 
+mod blocks;
 mod cap;
 mod clean;
 mod dense;
