@@ -101,7 +101,7 @@ impl Rig {
     }
 }
 
-/// Measures how well cameras fit each other by so many points ([`POINTS`]). `surface` is any rough surface of the head with
+/// Measures how well cameras fit each other by this many points ([`POINTS`]). `surface` is any rough surface of the head with
 /// normals; `views` and `given` are photographs and cameras of the same order. `all` asks for all cameras to be refined,
 /// whatever the gain.
 pub fn measure(views: &[RigView], given: &[Camera], surface: &Mesh, points: usize, all: bool) -> Rig {

@@ -96,7 +96,7 @@ impl Random {
         list[self.below(list.len())]
     }
 
-    /// A short range inside so many bytes.
+    /// A short range inside this many bytes.
     fn range(&mut self, len: usize) -> std::ops::Range<usize> {
         let start = self.below(len + 1);
         let most = [1, 4, 16, 64, 1024][self.below(5)];

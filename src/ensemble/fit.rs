@@ -278,7 +278,7 @@ mod tests {
         assert!((a[0] - b[0]).abs() < 1e-6);
     }
 
-    /// Returns a view of two members with errors of these sizes, in so many of its pixels.
+    /// Returns a view of two members with errors of these sizes, in this many of its pixels.
     fn noisy(seed: u64, sigmas: [f32; 2], pixels: usize) -> Fit {
         let views =
             [0, 1].map(|k| view(|i, j| color(seed, i, j) + noise(seed * 10 + k, sigmas[k as usize], i, j)));

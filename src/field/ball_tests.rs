@@ -169,8 +169,8 @@ pub fn psnr(view: &TrainView, render: impl FnOnce(&[Ray]) -> Vec<RayResult>) -> 
 #[cfg(feature = "wgpu")]
 pub type RunOn<'a, T> = &'a dyn Fn(&Path, &str, &dyn Monitor) -> Result<T>;
 
-/// Trains for so many steps on the CPU, and from there in two ways: on the CPU to the end; and in parts, each on a device
-/// for so many steps, before the CPU goes on to the end.
+/// Trains for this many steps on the CPU, and from there in two ways: on the CPU to the end; and in parts, each on a device
+/// for this many steps, before the CPU goes on to the end.
 #[cfg(feature = "wgpu")]
 pub fn alone_and_in_turn<T>(run: RunOn<T>, first: u64, parts: &[(&str, u64)]) -> [T; 2] {
     let stops = |dir: &Path, device: &str, steps: u64| {

@@ -128,7 +128,7 @@ pub(super) fn density(adapter: &Adapter) -> Result<Vec<Check>> {
 mod tests {
     use super::*;
 
-    /// A device passes the tests with so many times fewer samples, of fields with so many levels.
+    /// A device passes the tests with this many times fewer samples, of fields with this many levels.
     fn passes(fewer: usize, [of_sdf, of_density]: [usize; 2]) {
         let Some(adapter) = Adapter::all().first() else { return };
         let of = |preset: Preset, levels: usize| {

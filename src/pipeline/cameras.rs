@@ -98,7 +98,7 @@ pub(super) fn check_cameras(photos: &RigPhotos, poses: CameraPoses) -> CameraChe
     check_by(rig::POINTS, photos, poses)
 }
 
-/// Does what [`check_cameras`] does, by so many points.
+/// Does what [`check_cameras`] does, by this many points.
 pub(super) fn check_by(points: usize, photos: &RigPhotos, poses: CameraPoses) -> CameraCheck {
     let RigPhotos { views: captured, train, cameras: given, scene_from_world, .. } = photos;
     let ((captured, held_out), (given, given_held_out)) = (captured.split_at(*train), given.split_at(*train));

@@ -35,7 +35,7 @@ fn of_exact(poses: CameraPoses) -> &'static CameraCheck {
     FOUND[usize::from(poses == CameraPoses::Refine)].get_or_init(|| check(&measured_head().1, poses))
 }
 
-/// Turns and moves a camera about so many pixels; neighbors in number move oppositely, so that the world stays.
+/// Turns and moves a camera about this many pixels; neighbors in number move oppositely, so that the world stays.
 fn disturb(capture: &mut Capture, view: usize, pixels: f64) {
     let camera = &mut capture.views[view].camera;
     let sign = if view.is_multiple_of(2) { 1.0 } else { -1.0 };

@@ -175,7 +175,7 @@ pub struct PreviewPicture {
 }
 
 impl PreviewPicture {
-    /// Arranges pictures of one size in a grid of so many columns.
+    /// Arranges pictures of one size in a grid of this many columns.
     pub fn sheet(pictures: &[PreviewPicture], columns: usize) -> PreviewPicture {
         let Some(PreviewPicture { width, height, .. }) = pictures.first() else {
             return PreviewPicture { width: 0, height: 0, rgba: Vec::new() };

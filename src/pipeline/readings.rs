@@ -32,7 +32,7 @@ const MAX_VIEWS: usize = 24;
 /// Cells along each axis of the hull.
 const HULL_CELLS: usize = 64;
 
-/// The reading that is taken has at least so many times the weight of all others. Photographs in a wrong order reach a fifth of
+/// The reading that is taken has at least this many times the weight of all others. Photographs in a wrong order reach a fifth of
 /// that of the right one, and those of neighbors on a ring, whose own turn explains most of it, a third.
 const CLEARLY: f64 = 2.0;
 
@@ -43,7 +43,7 @@ const LEAST_CONFLICT: f64 = 0.01;
 /// at least, a third of what is usual …
 const SURE_CONFLICT: f64 = 0.05;
 
-/// … and so many times as much.
+/// … and this many times as much.
 const SURELY: f64 = 4.0;
 
 /// Sightings that a reading needs to be taken.

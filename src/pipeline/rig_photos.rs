@@ -52,7 +52,7 @@ impl<'c> RigPhotos<'c> {
         RigPhotos::load_at(SEARCHED_PX, capture, scene, limits)
     }
 
-    /// Does what [`RigPhotos::load`] does, with photographs whose longest side has at most so many pixels.
+    /// Does what [`RigPhotos::load`] does, with photographs whose longest side has at most this many pixels.
     pub fn load_at(
         side: u32,
         capture: &'c Capture,
@@ -96,7 +96,7 @@ impl<'c> RigPhotos<'c> {
         Ok(Ok(RigPhotos { views, train, pictures, cameras, surface, scene_from_world }))
     }
 
-    /// Measures how well the cameras of the training views fit each other, by so many points. Returns their
+    /// Measures how well the cameras of the training views fit each other, by this many points. Returns their
     /// photographs as they were searched, and what was found. `all` asks for all poses to be refined.
     pub fn measure(&self, points: usize, all: bool) -> (Vec<RigView>, Rig) {
         let pictures = self.pictures[..self.train].par_iter();

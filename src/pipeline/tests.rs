@@ -39,7 +39,7 @@ pub(super) fn words(stages: &[Stage]) -> String {
     stages.iter().map(|s| s.word()).collect::<Vec<_>>().join(" ")
 }
 
-/// Writes the demo head, photographed at a size by so many training and held-out views, into a folder. A size of its own costs
+/// Writes the demo head, photographed at a size by this many training and held-out views, into a folder. A size of its own costs
 /// seconds, one that other tests have nothing.
 pub(super) fn demo_head(root: &Path, (width, height): (u32, u32), (train, test): (usize, usize)) {
     write_capture(root, &SyntheticOptions { width, height, train, test, seed: 1 });

@@ -75,7 +75,7 @@ struct MipLevel {
 /// Number of hits whose texels are fetched together.
 const LANES: usize = 8;
 
-/// Returns the level for so many texels a pixel, and how far it is on the way to the next: the base-2 logarithm, its
+/// Returns the level for this many texels a pixel, and how far it is on the way to the next: the base-2 logarithm, its
 /// fraction by the chord's parabola (off by 0.009).
 #[inline(always)]
 fn mip_level(texels: f32, levels: usize) -> (usize, f32) {
@@ -296,7 +296,7 @@ fn floats(t: Texel) -> Vec4 {
     Vec4::new(f32::from(t[0]), f32::from(t[1]), f32::from(t[2]), f32::from(t[3]))
 }
 
-/// Returns the next level of a picture of so many texels across and down: half as many each way.
+/// Returns the next level of a picture of this many texels across and down: half as many each way.
 fn halved(texels: &[Texel], [across, down]: [usize; 2], groups: usize) -> Vec<Texel> {
     let (width, height) = ((across / 2).max(1), (down / 2).max(1));
     let (columns, rows) = (shares(across, width), shares(down, height));

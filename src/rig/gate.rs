@@ -17,7 +17,7 @@ const LEAST_TRACKS: usize = 100;
 /// A camera is not repaired but reported if it has to move farther, pixels: the patches would hardly be found.
 const FARTHEST_PX: f64 = 10.0;
 
-/// Patches of a photograph fit somewhere by chance: its camera is lost if its residual stays above so many pixels …
+/// Patches of a photograph fit somewhere by chance: its camera is lost if its residual stays above this many pixels …
 const LOST_PX: f64 = 1.0;
 
 /// … and above this many times that of all.
@@ -26,7 +26,7 @@ const LOST_SHARE: f64 = 4.0;
 /// All cameras are refined if the residual falls below this share of what it is with the poses given.
 const GAIN: f64 = 0.8;
 
-/// Cameras fit in no pose if the residual of all stays above so many pixels, and less than this share of the points that
+/// Cameras fit in no pose if the residual of all stays above this many pixels, and less than this share of the points that
 /// other photographs share is found. Nine of ten are found where photographs and cameras belong together, blurred ones (whose
 /// residual is above a pixel) and poses that are 4 px off included; a third to six of ten in a wrong order, and up to eight
 /// where every photograph is a neighbor's.

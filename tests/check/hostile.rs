@@ -92,7 +92,7 @@ fn tensors() -> Vec<u8> {
     io::tensor_bytes(&list, &[("step".to_string(), "3".to_string())].into()).unwrap()
 }
 
-/// A safetensors file with this header and so many bytes of data.
+/// A safetensors file with this header and this many bytes of data.
 fn tensor_file(header: &str, data: usize) -> Vec<u8> {
     let mut b = (header.len() as u64).to_le_bytes().to_vec();
     b.extend(header.as_bytes());

@@ -225,7 +225,7 @@ fn when_a_way_fails_every_triangle_becomes_a_half_square() {
     assert!(r.uv.is_sound() && r.fallback.unwrap().contains("did not pass"));
 }
 
-/// Stops after so many questions.
+/// Stops after this many questions.
 struct Patience(AtomicU64);
 
 impl Monitor for Patience {
