@@ -104,7 +104,7 @@ fn text_and_nothing_are_no_onnx() {
     assert!(tried(b"").is_err_and(|e| e.to_string().contains("is empty (0 bytes)")));
 }
 
-/// Ends a file after every multiple of a number of bytes, and damages every byte at a multiple of another.
+/// Ends a file after every multiple of `every` bytes, and damages each of these bytes.
 fn damaged(every: usize) {
     let whole = trimap_times(1.0);
     for end in (1..whole.len()).step_by(every) {
