@@ -36,7 +36,7 @@ export async function holds(page, predicate) {
 
 /**
  * A browser whose pages remember what they asked a network for, and their errors. `gl`: with WebGL, drawn by the
- * processor. `folder` is for files that are needed meanwhile.
+ * CPU. `folder` is for files that are needed meanwhile.
  */
 export async function browser({ gl = false } = {}) {
   const profile = await mkdtemp(path.join(tmpdir(), "page-"));
