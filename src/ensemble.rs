@@ -4,7 +4,7 @@
 //! 0.3 I-Face. Which member is the better one differs from capture to capture, and fixed weights that suit
 //! one make the blend of another worse than its best member. So weights are fitted ([`fit_weights`]): those of
 //! least squared error, `w ≥ 0`, `Σ w = 1`, on squares of the training photographs that nothing learned
-//! from ([`tiles`]), never on test views.
+//! from ([`tiles()`]), never on test views.
 //!
 //! A fit gathers sums view by view, so a capture never has to be in memory. Everything is
 //! sRGB-coded color over black (premultiplied), and nothing is rounded to 8 bits here. Sums are

@@ -5,7 +5,7 @@
 //! complete in the images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12 to 4.2) are not read.
 //! Points are optional, and say where the head is if no masks do.
 //!
-//! A model is written back as binary files: one camera for each lens that differs, no points. [`Found`] sums up what
+//! A model is written back as binary files: one camera for each lens that differs, no points. [`SparseModel`] sums up what
 //! COLMAP itself has just written.
 
 mod binary;
@@ -260,7 +260,7 @@ impl From<[f64; 7]> for Rigid {
 
 /// A model that COLMAP has found: binary files in a folder.
 #[derive(Clone, Debug)]
-pub(super) struct Found {
+pub(super) struct SparseModel {
     /// Registered photographs.
     pub names: HashSet<String>,
     /// Mean reprojection error of the points, pixels.
@@ -270,9 +270,9 @@ pub(super) struct Found {
     cameras: HashMap<u32, Camera>,
 }
 
-impl Found {
+impl SparseModel {
     /// Reads the model in a folder.
-    pub fn read(folder: &Path, limits: &io::Limits) -> Result<Found> {
+    pub fn read(folder: &Path, limits: &io::Limits) -> Result<SparseModel> {
         let file = |kind: &str| -> Result<(PathBuf, Vec<u8>)> {
             let path = folder.join(format!("{kind}.bin"));
             let bytes = io::read_bytes(&path, limits)?;
@@ -281,7 +281,7 @@ impl Found {
         let (cameras, images) = (file("cameras")?, file("images")?);
         let images = binary::read_images(&images, limits)?;
         let points = binary::read_points(&file("points3D")?)?;
-        Ok(Found {
+        Ok(SparseModel {
             sightings: points.sightings / images.len().max(1),
             names: images.into_iter().map(|image| image.name).collect(),
             error_px: points.error_px / points.positions.len().max(1) as f64,

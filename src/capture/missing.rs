@@ -4,7 +4,7 @@
 use super::folder::{CaptureFolder, in_frame};
 use super::frame::{CameraFrame, Listing};
 use super::near::names::{fold, is_aside, is_common_name, is_number, reduced};
-use super::near::{Answer, Found, Kind};
+use super::near::{Answer, Kind, NearMatch};
 use crate::error::counted;
 use crate::io;
 use std::collections::{HashMap, HashSet};
@@ -53,8 +53,8 @@ pub(super) fn confirm_near(folder: &CaptureFolder, listing: &mut Listing) -> Mis
     listing.warnings.extend(foreign.map(|text| text + ": these must be the very photographs of the cameras"));
     for answer in photos {
         match answer.found {
-            Found::Several(files) => missing.several.push((answer.name, files)),
-            Found::Reduced { factor, path } => missing.reduced.push((factor, path)),
+            NearMatch::Several(files) => missing.several.push((answer.name, files)),
+            NearMatch::Reduced { factor, path } => missing.reduced.push((factor, path)),
             _ => {}
         }
     }
@@ -71,7 +71,7 @@ fn confirm_photographs(
     let found = by_path(answers);
     let mut sought: HashMap<&Path, Vec<&str>> = HashMap::new();
     for answer in answers {
-        if let Found::One { path, .. } = &answer.found {
+        if let NearMatch::One { path, .. } = &answer.found {
             sought.entry(Path::new(path)).or_default().push(&answer.name);
         }
     }
@@ -97,7 +97,7 @@ fn confirm_photographs(
         }
     }
     // where one name fits several files, no other name of its folder is sure
-    let doubtful = answers.iter().filter(|answer| matches!(answer.found, Found::Several(_)));
+    let doubtful = answers.iter().filter(|answer| matches!(answer.found, NearMatch::Several(_)));
     homes.extend(doubtful.map(|answer| answer.folder.clone()));
     for (frame, _) in listing.frames.iter_mut().zip(&is_near).filter(|(_, near)| **near) {
         let (answer, is_elsewhere) = found[frame.relative.as_path()];
@@ -125,7 +125,7 @@ fn confirm_masks(folder: &CaptureFolder, listing: &mut Listing, answers: &[Answe
     let found = by_path(answers);
     let mut users: HashMap<&Path, HashSet<&str>> = HashMap::new();
     for answer in answers {
-        if let Found::One { path, .. } = &answer.found {
+        if let NearMatch::One { path, .. } = &answer.found {
             users.entry(Path::new(path)).or_default().insert(&answer.name);
         }
     }
@@ -150,7 +150,7 @@ fn confirm_masks(folder: &CaptureFolder, listing: &mut Listing, answers: &[Answe
 fn by_path(answers: &[Answer]) -> HashMap<&Path, (&Answer, bool)> {
     let mut found = HashMap::new();
     for answer in answers {
-        if let Found::One { path, is_elsewhere } = &answer.found {
+        if let NearMatch::One { path, is_elsewhere } = &answer.found {
             found.insert(Path::new(path), (answer, *is_elsewhere));
         }
     }

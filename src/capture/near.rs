@@ -153,7 +153,7 @@ impl Index {
         Index { pictures, by_name, is_whole: true }
     }
 
-    fn nearest(&self, wanted: &Wanted, kind: Kind, downscale: u32) -> Found {
+    fn nearest(&self, wanted: &Wanted, kind: Kind, downscale: u32) -> NearMatch {
         let homes = wanted.homes(downscale);
         let (mut best, mut reduced): (Vec<usize>, Option<(u32, usize)>) = (Vec::new(), None);
         let mut best_rank = None;
@@ -203,18 +203,18 @@ impl Index {
         let path = |i: usize| self.pictures[i].path.clone();
         match (&best[..], reduced) {
             (&[i], _) => {
-                Found::One { path: path(i), is_elsewhere: !homes.contains(&self.pictures[i].folder) }
+                NearMatch::One { path: path(i), is_elsewhere: !homes.contains(&self.pictures[i].folder) }
             }
-            ([], Some((factor, i))) => Found::Reduced { factor, path: path(i) },
-            ([], None) => Found::Nothing,
-            (several, _) => Found::Several(several.iter().take(MAX_SHOWN).map(|&i| path(i)).collect()),
+            ([], Some((factor, i))) => NearMatch::Reduced { factor, path: path(i) },
+            ([], None) => NearMatch::Nothing,
+            (several, _) => NearMatch::Several(several.iter().take(MAX_SHOWN).map(|&i| path(i)).collect()),
         }
     }
 }
 
 /// Files near a name.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Found {
+pub(super) enum NearMatch {
     Nothing,
     /// The only file that fits, and whether it lies in another folder than the name says.
     One {
@@ -237,7 +237,7 @@ pub(super) struct Answer {
     pub name: String,
     /// Its folder, folded.
     pub folder: String,
-    pub found: Found,
+    pub found: NearMatch,
 }
 
 /// The search in one capture, and its answers.
@@ -262,7 +262,7 @@ impl Search {
         let wanted = Wanted::of(name)?;
         let found = self.index(root).nearest(&wanted, kind, downscale);
         let path = match &found {
-            Found::One { path, .. } => Some(path.clone()),
+            NearMatch::One { path, .. } => Some(path.clone()),
             _ => None,
         };
         let (name, folder) = (name.to_string(), wanted.folders.join("/"));
@@ -305,7 +305,7 @@ mod tests {
     use super::*;
 
     /// Returns the files near a name in a capture of these files.
-    fn near(files: &[&str], kind: Kind, name: &str) -> Found {
+    fn near(files: &[&str], kind: Kind, name: &str) -> NearMatch {
         let dir = tempfile::tempdir().unwrap();
         for file in files {
             let path = dir.path().join(file);
@@ -314,12 +314,12 @@ mod tests {
         }
         let search = Search::default();
         search.nearest(dir.path(), kind, name, 1);
-        search.taken().0.pop().map_or(Found::Nothing, |answer| answer.found)
+        search.taken().0.pop().map_or(NearMatch::Nothing, |answer| answer.found)
     }
 
     fn photo(files: &[&str], name: &str) -> Option<String> {
         match near(files, Kind::Photograph, name) {
-            Found::One { path, .. } => Some(path),
+            NearMatch::One { path, .. } => Some(path),
             _ => None,
         }
     }
@@ -350,7 +350,7 @@ mod tests {
         none(&["images/000.jpg"], "");
         none(&["passwd"], "/etc/passwd");
         let reduced = near(&["images_8/000.jpg", "images_4/000.jpg"], Kind::Photograph, "images/000.jpg");
-        assert_eq!(reduced, Found::Reduced { factor: 4, path: "images_4/000.jpg".into() });
+        assert_eq!(reduced, NearMatch::Reduced { factor: 4, path: "images_4/000.jpg".into() });
         // the named folder comes first, then the named format
         let files = ["images/000.JPG", "images/000.png", "other/000.jpg"];
         assert_eq!(photo(&files, "images/000.jpg").as_deref(), Some("images/000.JPG"));
@@ -359,7 +359,7 @@ mod tests {
     #[test]
     fn a_mask_is_found_by_its_word_and_is_never_a_photograph() {
         let mask = |files: &[&str], name: &str| match near(files, Kind::Mask, name) {
-            Found::One { path, .. } => Some(path),
+            NearMatch::One { path, .. } => Some(path),
             _ => None,
         };
         let photo = "images/000.png";

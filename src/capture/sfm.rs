@@ -12,7 +12,7 @@
 //! The mapper fits one coefficient of distortion, because few views cannot tell more. A lens that all photographs share is
 //! then refined as OPENCV's model with its principal point where that is observable: a wide lens and many points.
 
-use super::colmap::{self, Found, ModelFiles};
+use super::colmap::{self, ModelFiles, SparseModel};
 use super::folder::{CaptureFolder, FolderEntries, is_common_name, is_nameable, photographs, unnameable};
 use super::format::{self, CameraFiles};
 use super::frame::{CameraFrame, Intrinsics, Listing};
@@ -435,7 +435,7 @@ struct Attempt {
 struct Model {
     attempt: Attempt,
     folder: PathBuf,
-    found: Found,
+    found: SparseModel,
     /// How many models there are.
     pieces: usize,
     /// Models that cannot be read.
@@ -494,9 +494,9 @@ impl Work<'_> {
         let (program, name) = self.programs.mapper();
         let crash = self.run(program, &commands.mapper, &log)?.filter(|failure| failure.is_crash);
         let names: HashSet<&String> = self.names.iter().collect();
-        let (mut best, mut pieces, mut unreadable) = (None::<(PathBuf, Found)>, 0, Vec::new());
+        let (mut best, mut pieces, mut unreadable) = (None::<(PathBuf, SparseModel)>, 0, Vec::new());
         for folder in io::list_folders(&models)? {
-            match Found::read(&folder, &self.sfm.limits) {
+            match SparseModel::read(&folder, &self.sfm.limits) {
                 Ok(mut found) => {
                     found.names.retain(|name| names.contains(name));
                     pieces += 1;
@@ -507,7 +507,7 @@ impl Work<'_> {
                 Err(problem) => unreadable.push(problem),
             }
         }
-        let enough = |found: &Found| found.names.len() as f64 >= ENOUGH * self.names.len() as f64;
+        let enough = |found: &SparseModel| found.names.len() as f64 >= ENOUGH * self.names.len() as f64;
         if let Some(failure) = crash
             && !best.as_ref().is_some_and(|(_, found)| enough(found))
         {
@@ -576,7 +576,7 @@ impl Work<'_> {
         let left_out: Vec<String> =
             self.names.iter().filter(|name| !model.found.names.contains(*name)).cloned().collect();
         let registered = n - left_out.len();
-        let Found { error_px, .. } = model.found;
+        let SparseModel { error_px, .. } = model.found;
         if !left_out.is_empty() {
             let (names, left) = (few(&left_out), left_out.len());
             warnings.push(format!("{left} of {n} photographs have no camera, and are left out: {names}"));
@@ -636,7 +636,7 @@ impl Work<'_> {
 
     /// Returns the folder of the model with the lens refined; `None` where its principal point is not observable.
     fn refined(&self, model: &Model) -> Result<Option<PathBuf>> {
-        let Found { names, sightings, .. } = &model.found;
+        let SparseModel { names, sightings, .. } = &model.found;
         let Some((side, before)) = model.found.shared_lens().filter(|_| self.shared) else { return Ok(None) };
         let is_observable =
             names.len() >= OBSERVABLE.0 && *sightings >= OBSERVABLE.1 && before[0] <= OBSERVABLE.2 * side;
@@ -650,7 +650,7 @@ impl Work<'_> {
         arguments.extend(["--BundleAdjustment.refine_principal_point", "1"].map(OsString::from));
         let failed = self.run(&self.programs.colmap, &arguments, &self.output.work(LOG))?;
         // without a refined model the mapper's remains
-        let after = Found::read(&refined, &self.sfm.limits).ok().filter(|_| failed.is_none());
+        let after = SparseModel::read(&refined, &self.sfm.limits).ok().filter(|_| failed.is_none());
         let after = after.and_then(|found| found.shared_lens());
         let is_near = |(_, lens): &(f64, [f64; 3])| {
             lens.iter().zip(&before).all(|(after, before)| (after - before).abs() <= MAX_MOVE * side)

@@ -148,7 +148,7 @@ fn first(names: &[String]) -> String {
 
 /// Measurements of a reading.
 #[derive(Clone, Copy, Default)]
-struct Found {
+struct ReadingFit {
     /// How often points are found again in other photographs.
     sightings: usize,
     /// Sightings for each pixel by which they miss.
@@ -183,7 +183,7 @@ fn decide(capture: &Capture, options: &CaptureOptions) -> Result<(Reading, Strin
         [(only, _)] => (*only, Vec::new()),
         all => {
             let found = |(reading, capture): &(Reading, Capture)| {
-                Ok((*reading, Found::of(capture.clone(), &options.limits)?))
+                Ok((*reading, ReadingFit::of(capture.clone(), &options.limits)?))
             };
             let found = all.iter().map(found).collect::<Result<Vec<_>, String>>()?;
             match clearest(&found) {
@@ -207,11 +207,12 @@ fn decide(capture: &Capture, options: &CaptureOptions) -> Result<(Reading, Strin
 }
 
 /// Returns the reading that fits, and clearly better than all others.
-fn clearest(all: &[(Reading, Found)]) -> Result<Reading, String> {
+fn clearest(all: &[(Reading, ReadingFit)]) -> Result<Reading, String> {
     let best = all.iter().max_by(|a, b| a.1.weight.total_cmp(&b.1.weight));
-    let is_clear = |(best, found): &&(Reading, Found)| {
-        let is_worse =
-            |(other, theirs): &(Reading, Found)| found.weight >= CLEARLY * theirs.weight || other == best;
+    let is_clear = |(best, found): &&(Reading, ReadingFit)| {
+        let is_worse = |(other, theirs): &(Reading, ReadingFit)| {
+            found.weight >= CLEARLY * theirs.weight || other == best
+        };
         found.fits && all.iter().all(is_worse)
     };
     best.filter(is_clear).map(|(reading, _)| *reading).ok_or_else(|| {
@@ -221,7 +222,7 @@ fn clearest(all: &[(Reading, Found)]) -> Result<Reading, String> {
 }
 
 /// Returns what is said of the reading of photographs that was decided on.
-fn reasons(best: Reading, all: &[(Reading, Found)], names: &[String]) -> Vec<String> {
+fn reasons(best: Reading, all: &[(Reading, ReadingFit)], names: &[String]) -> Vec<String> {
     // how often points are found again by a reading, and by the best one that differs in this
     let against = |differs: fn(&Reading) -> bool| {
         let others = all.iter().filter(|(other, _)| differs(other) != differs(&best));
@@ -336,9 +337,9 @@ fn small_masks(views: &[View], limits: &Limits) -> Result<Vec<Option<Gray>>> {
     views.par_iter().map(|view| Ok(view.load_mask(limits)?.map(small))).collect()
 }
 
-impl Found {
+impl ReadingFit {
     /// Measures the training views of a capture. Returns the reason instead if that is not possible.
-    fn of(mut capture: Capture, limits: &Limits) -> Result<Found, String> {
+    fn of(mut capture: Capture, limits: &Limits) -> Result<ReadingFit, String> {
         let said = |e: Error| e.to_string();
         capture.views.retain(|view| view.split == Split::Train);
         let every = capture.views.len().div_ceil(MAX_VIEWS).max(1);
@@ -352,12 +353,12 @@ impl Found {
             ..SceneOptions::default()
         };
         // silhouettes that have nothing in common belong to other cameras
-        let Ok((scene, _)) = scene::fit(&cameras, &masks, &placing) else { return Ok(Found::default()) };
+        let Ok((scene, _)) = scene::fit(&cameras, &masks, &placing) else { return Ok(ReadingFit::default()) };
         let photos = RigPhotos::load_at(SIDE_PX, &capture, &scene, limits).map_err(said)??;
         let (_, rig) = photos.measure(POINTS, false);
         let sightings: usize = rig.cameras.iter().map(|camera| camera.sightings).sum();
         let fits =
             sightings >= LEAST_SIGHTINGS && rig.adjusted_px <= MOST_PX && rig.verdict != PoseDecision::Apart;
-        Ok(Found { sightings, weight: sightings as f64 / rig.given_px.max(LEAST_PX), fits })
+        Ok(ReadingFit { sightings, weight: sightings as f64 / rig.given_px.max(LEAST_PX), fits })
     }
 }

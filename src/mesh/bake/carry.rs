@@ -152,7 +152,7 @@ struct NormalMap<'a> {
 
 impl NormalMap<'_> {
     /// Returns a normal of the map at a point of the mesh, in the mesh's coordinates; the opposite of
-    /// [`super::tangent_space`].
+    /// [`super::tangent_space()`].
     fn bent(&self, mesh: &Mesh, hit: &Hit, local: Vec3) -> Vec3 {
         let m = mesh.shading_normal(hit);
         let corners = self.tangents[hit.triangle as usize];
