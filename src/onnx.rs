@@ -149,7 +149,7 @@ impl NetworkSession {
     }
 }
 
-/// Could an engine open another file for this one's sake? Weights elsewhere are named by an entry with the key
+/// Returns whether an engine could open another file for this one's sake. Weights elsewhere are named by an entry with the key
 /// `location`, and pieces compiled for a device by the operator `EPContext`. Whatever the message around them, in
 /// functions or training graphs too, the key's eight letters stand behind their length: 8, or 8 spelled longer.
 fn names_another_file(bytes: &[u8]) -> bool {

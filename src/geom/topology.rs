@@ -44,7 +44,8 @@ pub struct Topology {
 }
 
 impl Topology {
-    /// Closed, manifold, finite, and no triangle degenerate or doubled: fit to be printed or simulated.
+    /// Returns whether the mesh is closed, manifold, finite, and without degenerate or doubled triangles: fit to be
+    /// printed or simulated.
     pub fn is_solid(&self) -> bool {
         self.closed
             && self.manifold

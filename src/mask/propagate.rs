@@ -310,7 +310,7 @@ impl<'a> Propagation<'a> {
         (gray(&head, w, h), ambiguous)
     }
 
-    /// Returns warnings about the finished masks.
+    /// Adds warnings about the finished masks.
     fn warn(&mut self, masks: &[Gray], ambiguous: &[f64]) {
         for (i, mask) in masks.iter().enumerate().filter(|(i, _)| !self.views[*i].clicks.is_empty()) {
             let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();

@@ -159,7 +159,7 @@ pub(super) fn extract(
     mesh::extract(&field, kept, &options, monitor)
 }
 
-/// The mesh file refers to the others, so it is written last.
+/// Writes files; the mesh file comes last, because it refers to the others.
 fn write_files(exported: &ExportedFiles, folder: &Path) -> Result<()> {
     for (name, bytes) in exported.files.iter().rev() {
         io::write_atomic(&folder.join(name), bytes)?;

@@ -93,7 +93,7 @@ impl SyntheticHead {
         Aabb { min: OFFSET + Vec3::new(-0.122, -0.126, -0.193), max: OFFSET + Vec3::new(0.122, 0.126, 0.148) }
     }
 
-    /// Is `p` in the part worth judging: the head above the line from jaw to nape, without neck
+    /// Returns whether `p` is in the part worth judging: the head above the line from jaw to nape, without neck
     /// and shoulders?
     pub fn is_head(&self, p: Vec3) -> bool {
         above_jaw(p - OFFSET)
@@ -142,7 +142,7 @@ impl MaterialDistances {
     }
 }
 
-/// Above the line from under the chin to the nape; `q` in head coordinates.
+/// Returns whether `q`, in head coordinates, is above the line from under the chin to the nape.
 fn above_jaw(q: Vec3) -> bool {
     q.z > -0.128 + 0.55 * (q.y + 0.07).max(0.0)
 }

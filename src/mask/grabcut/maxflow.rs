@@ -227,7 +227,7 @@ impl PixelGraph {
         self.flow += bottleneck as i64;
     }
 
-    /// The path is still being walked by its parents, so they are marked only afterwards.
+    /// Queues a pixel as an orphan. It is marked only later, because the path is still being walked by its parents.
     fn tear(&mut self, p: usize) {
         self.orphans.push_front(p as u32);
     }

@@ -99,7 +99,7 @@ impl Blocks {
         fresh
     }
 
-    /// A node's value; it is inside when below zero and `may_be_inside`.
+    /// Stores the value of a node, which is inside if the value is below zero and `may_be_inside`.
     pub fn set(&mut self, node: [usize; 3], value: f32, may_be_inside: bool) {
         if !value.is_finite() {
             self.non_finite.push(node);
@@ -129,7 +129,8 @@ impl Blocks {
         self.find(node).map_or(f32::NAN, |b| b.values[64 * plane + bit.trailing_zeros() as usize])
     }
 
-    /// Returns the size of the largest finite known neighbor, as in the dense volume; 1 without any.
+    /// Gives nodes whose value is not finite the size of their largest finite known neighbor, as in the dense volume,
+    /// or 1 without any; −∞ stays negative.
     fn repair(&mut self, out: &mut LevelSet) {
         let nodes = std::mem::take(&mut self.non_finite);
         out.non_finite = nodes.len();

@@ -230,7 +230,7 @@ impl Passes<'_> {
         resolve(case, &values)
     }
 
-    /// The vertices of one plane's rows, in the order `count` counted them.
+    /// Writes the vertices of one plane's rows, in the order in which `count` counted them.
     fn place(&self, k: usize, mut vertices: &mut [Vec3]) {
         let [nx, ny, _] = self.dims;
         let step = [1, nx, nx * ny];
@@ -255,7 +255,7 @@ impl Passes<'_> {
         }
     }
 
-    /// The triangles of one layer of cells, and their inner vertices.
+    /// Writes the triangles of one layer of cells, and their inner vertices.
     fn connect(&self, k: usize, rows: &[[u32; 3]], mut out: CellOutput) {
         let [_, ny, nz] = self.dims;
         if k + 1 == nz {

@@ -23,7 +23,7 @@ use std::collections::BTreeSet;
 const QUANTIZED: &str = "KHR_mesh_quantization";
 const SHORTENED: [C; 5] = [C::F32, C::I8, C::U8, C::I16, C::U16];
 
-/// Extensions that leave shape and color attributes alone, or that are read.
+/// Returns whether an extension leaves shape and color attributes alone, or is read.
 fn is_harmless(extension: &str) -> bool {
     extension.starts_with("KHR_materials_")
         || extension == QUANTIZED

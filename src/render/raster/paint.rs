@@ -229,7 +229,7 @@ pub(super) struct SampleBatch {
 }
 
 crate::dispatch! {
-    /// Returns the intersections of rays with their triangles, or the nearest points: samples lie in snapped
+    /// Computes the intersections of the rays with their triangles, or the nearest points: samples lie in snapped
     /// triangles.
     fn meet / meet_all(batch: &mut SampleBatch, straight: Option<[DVec3; 3]>, origin: Vec3)
 }
