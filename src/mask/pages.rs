@@ -165,7 +165,7 @@ fn mixed(a: [u8; 3], b: [u8; 3], share: f32) -> [u8; 3] {
     [0, 1, 2].map(|k| (a[k] as f32 + share * (b[k] as f32 - a[k] as f32) + 0.5) as u8)
 }
 
-/// The rim of the mask in color, and the pixels next to it outside darker, so that it shows on any ground.
+/// Draws the rim of the mask in color, and the pixels next to it outside darker, so that it shows on any ground.
 fn outline(picture: &mut Photo, mask: &Gray) {
     let (w, h) = (mask.width as i64, mask.height as i64);
     let head = |x: i64, y: i64| {

@@ -94,7 +94,7 @@ impl SyntheticHead {
     }
 
     /// Returns whether `p` is in the part worth judging: the head above the line from jaw to nape, without neck
-    /// and shoulders?
+    /// and shoulders.
     pub fn is_head(&self, p: Vec3) -> bool {
         above_jaw(p - OFFSET)
     }

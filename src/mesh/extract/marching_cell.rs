@@ -404,7 +404,7 @@ fn tunnel(p: &[u8], q: &[u8], at: &[[f64; 3]; 12], out: &mut CellSurface) {
     strip(&ring, &q, &steps, start, out);
 }
 
-/// The triangles of a strip: each step goes on along p or along q.
+/// Adds the triangles of a strip: each step goes on along p or along q.
 fn strip(p: &[u8], q: &[u8], steps: &[bool], start: usize, out: &mut CellSurface) {
     let (mut i, mut j) = (0, start);
     for &along_p in steps {
