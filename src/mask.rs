@@ -9,6 +9,7 @@
 //!
 //! Masks, trimaps and alphas are [`Gray`](crate::image::Gray): 0 outside, 255 head, 128 unknown in a trimap.
 
+mod clicks;
 mod hull;
 pub mod morphology;
 
@@ -26,4 +27,4 @@ pub mod matting;
 #[cfg_attr(not(feature = "matting"), path = "mask/no_networks.rs")]
 pub mod networks;
 
-pub use prompts::Click;
+pub use clicks::Click;

@@ -18,8 +18,8 @@ pub mod mixture;
 
 use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
+use super::clicks::{self, Click};
 use super::morphology::{fill_holes, gray, keep_pieces, open, squared_distance};
-use super::prompts::{self, Click};
 use crate::image::{Gray, Photo, reduce_to_rows};
 use crate::{Error, Result};
 
@@ -81,7 +81,7 @@ pub fn grabcut(view: &str, photo: &Photo, clicks: &[Click]) -> Result<HardMask> 
 
 fn cut_at(rows: u32, view: &str, photo: &Photo, clicks: &[Click]) -> Result<HardMask> {
     check_size(view, photo.width, photo.height)?;
-    prompts::check(&format!("view `{view}`"), clicks, photo.width, photo.height)?;
+    clicks::check(&format!("view `{view}`"), clicks, photo.width, photo.height)?;
     let small = reduce_to_rows(photo, rows);
     let (grabcut, mut warnings) =
         Grabcut::new(view, small, (photo.width, photo.height), clicks, BORDER_MARGIN);

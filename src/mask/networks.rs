@@ -16,7 +16,7 @@ pub use crate::onnx::NetworkFile;
 
 use self::alpha::{AlphaNet, VitMatte};
 use self::sam::Sam;
-use super::prompts::Click;
+use super::clicks::Click;
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::onnx::Contract;

@@ -1,6 +1,6 @@
 //! A stub of the networks for builds without the feature `matting`: none can be opened.
 
-use super::prompts::Click;
+use super::clicks::Click;
 use crate::config::MaskConfig;
 use crate::image::{Gray, Photo};
 use crate::{Error, Result};

@@ -12,12 +12,12 @@
 //! Where a network has proposed a mask for every view ([`propagate_proposals`]), those that agree
 //! ([`verdicts`]) stand for the clicked ones: they teach the colors and carve the hull. What lies well inside a proposal that is not unlike the others is definite head.
 
+use super::clicks::{self, Click};
 use super::consistency::{ConsistencyView, MaskVerdict, verdicts};
 use super::grabcut::mixture::Rgb;
 use super::grabcut::{self, Grabcut, Models, Seed};
 use super::hull::{self, Voter};
 use super::morphology::{gray, grow, shrink};
-use super::prompts::{self, Click};
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
 use crate::geom::Camera;
@@ -93,7 +93,7 @@ where
 {
     let clicked: Vec<usize> = (0..views.len()).filter(|&i| !views[i].clicks.is_empty()).collect();
     if clicked.is_empty() {
-        return Err(prompts::no_clicks(&format!("view `{}`", views.first().map_or("", |v| v.name))));
+        return Err(clicks::no_clicks(&format!("view `{}`", views.first().map_or("", |v| v.name))));
     }
     if !clicked.iter().any(|&i| views[i].votes) {
         let names: Vec<&str> = clicked.iter().map(|&i| views[i].name).collect();
@@ -107,7 +107,7 @@ where
     }
     for &i in &clicked {
         let v = &views[i];
-        prompts::check(&format!("view `{}`", v.name), v.clicks, v.camera.width, v.camera.height)?;
+        clicks::check(&format!("view `{}`", v.name), v.clicks, v.camera.width, v.camera.height)?;
     }
     let mut propagation = Propagation::new(cells, at_once, views, load)?;
     let start = propagation.clicked(&clicked)?;

@@ -11,7 +11,7 @@
 
 use super::processor::{self, IMAGENET, Normal};
 use crate::image::{Gray, Photo, bilinear};
-use crate::mask::prompts::{self, Click};
+use crate::mask::clicks::{self, Click};
 use crate::onnx::{Contract, NetworkArray, NetworkSession, Role, file_error};
 use crate::{Error, Result};
 use image::RgbImage;
@@ -210,7 +210,7 @@ impl Sam {
 
     fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<()> {
         // contradictions are searched at the size that was clicked on: reduced, two clicks may share a pixel
-        prompts::check_places("the photograph", clicks, width as u32, height as u32)?;
+        clicks::check_places("the photograph", clicks, width as u32, height as u32)?;
         if clicks.len() > MAX_CLICKS {
             return Err(Error::cannot(
                 format!("the photograph has {} clicks, the limit is {MAX_CLICKS}", clicks.len()),
