@@ -153,26 +153,26 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
         return Err(exists());
     }
     let mut out = Conversion { folder: folder.into(), views: capture.views.len(), ..Conversion::default() };
-    let places = places(capture, to)?;
+    let files_of_views = files_of_views(capture, to)?;
     // readers hold out every 8th in the order of the new names, with their endings or without
     let splits: Vec<Split> = capture.views.iter().map(|v| v.split).collect();
-    let named_splits = every_eighth(places.iter().map(|p| p.name.as_str())) != splits
-        || every_eighth(places.iter().map(|p| p.stem.as_str())) != splits;
+    let named_splits = every_eighth(files_of_views.iter().map(|p| p.name.as_str())) != splits
+        || every_eighth(files_of_views.iter().map(|p| p.stem.as_str())) != splits;
     let can_name = |p: &ViewFiles| match to {
         CameraFormat::Transforms => true,
         CameraFormat::Colmap => colmap::can_name(&p.name, named_splits && p.view.split != Split::Train),
     };
-    if let Some(place) = places.iter().find(|p| !can_name(p)) {
-        let message = format!("the photograph `{}` has a name that this format cannot represent", place.name);
+    if let Some(files) = files_of_views.iter().find(|p| !can_name(p)) {
+        let message = format!("the photograph `{}` has a name that this format cannot represent", files.name);
         return Err(Error::cannot(message, "rename it, or choose `--to transforms`"));
     }
     // data that the format cannot represent is found before anything is written
     let files = match to {
-        CameraFormat::Transforms => transforms(capture, &places, named_splits)?,
-        CameraFormat::Colmap => sparse(capture, &places, named_splits, &mut out.warnings)?,
+        CameraFormat::Transforms => transforms(capture, &files_of_views, named_splits)?,
+        CameraFormat::Colmap => sparse(capture, &files_of_views, named_splits, &mut out.warnings)?,
     };
     // the camera files come last, so that a folder with camera files is complete
-    let mut contents = pictures(capture, &places, folder)?;
+    let mut contents = pictures(capture, &files_of_views, folder)?;
     out.masks = contents.1;
     contents.0.extend(files.into_iter().map(|(name, bytes)| (folder.join(name), Content::Bytes(bytes))));
     let contents = contents.0;
@@ -193,36 +193,40 @@ pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Con
 
 /// Copies photographs and masks as COLMAP names them.
 pub(super) fn copy_for_colmap(capture: &Capture, folder: &Path) -> Result<()> {
-    let (contents, _) = pictures(capture, &places(capture, CameraFormat::Colmap)?, folder)?;
+    let (contents, _) = pictures(capture, &files_of_views(capture, CameraFormat::Colmap)?, folder)?;
     contents.iter().try_for_each(|(target, content)| content.write(target))
 }
 
 /// Returns the photographs' names below `images/` as COLMAP has them, in the order of the views,
 /// and all files that [`copy_for_colmap`] writes.
 pub(super) fn names_for_colmap(capture: &Capture) -> Result<(Vec<String>, Vec<String>)> {
-    let places = places(capture, CameraFormat::Colmap)?;
-    let files = places.iter().flat_map(|place| {
-        let beside = [&place.mask, &place.valid, &place.region].into_iter().flatten();
-        [&place.photo].into_iter().chain(beside).cloned()
+    let files_of_views = files_of_views(capture, CameraFormat::Colmap)?;
+    let files = files_of_views.iter().flat_map(|files| {
+        let beside = [&files.mask, &files.valid, &files.region].into_iter().flatten();
+        [&files.photo].into_iter().chain(beside).cloned()
     });
     let files = files.collect();
-    Ok((places.into_iter().map(|place| place.name).collect(), files))
+    Ok((files_of_views.into_iter().map(|files| files.name).collect(), files))
 }
 
-/// Returns where the pictures of each view go.
-fn places(capture: &Capture, to: CameraFormat) -> Result<Vec<ViewFiles<'_>>> {
-    let places: Vec<ViewFiles> = capture.views.iter().map(|v| place(v, to)).collect();
-    let mut names: Vec<&str> = places.iter().map(|p| p.photo.as_str()).collect();
+/// Returns the files that the pictures of each view are copied to.
+fn files_of_views(capture: &Capture, to: CameraFormat) -> Result<Vec<ViewFiles<'_>>> {
+    let files_of_views: Vec<ViewFiles> = capture.views.iter().map(|v| view_files(v, to)).collect();
+    let mut names: Vec<&str> = files_of_views.iter().map(|p| p.photo.as_str()).collect();
     names.sort_unstable();
     if let Some(twice) = names.windows(2).find(|n| n[0] == n[1]) {
         let message = format!("two photographs would both be called `{}`", twice[0]);
         return Err(Error::cannot(message, "rename one of them, or convert to another format"));
     }
-    Ok(places)
+    Ok(files_of_views)
 }
 
 /// Returns photographs, masks and regions as they are copied to a folder, and the number of head masks.
-fn pictures<'v>(capture: &Capture, places: &[ViewFiles<'v>], folder: &Path) -> Result<(Contents<'v>, usize)> {
+fn pictures<'v>(
+    capture: &Capture,
+    files_of_views: &[ViewFiles<'v>],
+    folder: &Path,
+) -> Result<(Contents<'v>, usize)> {
     let mut masks = 0;
     let mut contents: Contents = Vec::new();
     // a link may point to anything: only pictures are copied
@@ -236,16 +240,16 @@ fn pictures<'v>(capture: &Capture, places: &[ViewFiles<'v>], folder: &Path) -> R
         }
         .map_err(Error::from)
     })?;
-    for place in places {
-        let view: &'v View = place.view;
+    for files in files_of_views {
+        let view: &'v View = files.view;
         let mut put = |name: &str, content| contents.push((folder.join(name), content));
-        put(&place.photo, Content::File(&view.photo));
-        if let (ViewMask::File(from), Some(name)) = (&view.mask, &place.mask) {
+        put(&files.photo, Content::File(&view.photo));
+        if let (ViewMask::File(from), Some(name)) = (&view.mask, &files.mask) {
             let is_png = from.extension().is_some_and(|e| e.eq_ignore_ascii_case("png"));
             put(name, if is_png { Content::File(from) } else { Content::Mask(from, view.photo_size) });
             masks += 1;
         }
-        for (from, name) in [(&view.valid, &place.valid), (&view.region, &place.region)] {
+        for (from, name) in [(&view.valid, &files.valid), (&view.region, &files.region)] {
             if let (Some(from), Some(name)) = (from, name) {
                 put(name, Content::File(from));
             }
@@ -254,7 +258,7 @@ fn pictures<'v>(capture: &Capture, places: &[ViewFiles<'v>], folder: &Path) -> R
     Ok((contents, masks))
 }
 
-fn place(view: &View, to: CameraFormat) -> ViewFiles<'_> {
+fn view_files(view: &View, to: CameraFormat) -> ViewFiles<'_> {
     let ending =
         |path: &Path| path.extension().map_or(String::new(), |e| format!(".{}", e.to_string_lossy()));
     let stem = view.name.clone();
@@ -281,10 +285,10 @@ fn place(view: &View, to: CameraFormat) -> ViewFiles<'_> {
 type Files = Vec<(String, Vec<u8>)>;
 
 /// Returns COLMAP's name of the lens model, and its parameters.
-fn lens(place: &ViewFiles) -> Result<Map<String, Value>> {
-    let camera = &place.camera;
+fn lens(files: &ViewFiles) -> Result<Map<String, Value>> {
+    let camera = &files.camera;
     let unknown = || {
-        let message = format!("no camera model has the lens of `{}`", place.view.name);
+        let message = format!("no camera model has the lens of `{}`", files.view.name);
         Error::cannot(message, "undistort the photographs first")
     };
     let (model, values) = LensModel::of(camera).ok_or_else(unknown)?;
@@ -299,21 +303,21 @@ fn lens(place: &ViewFiles) -> Result<Map<String, Value>> {
     Ok(keys)
 }
 
-fn transforms(capture: &Capture, places: &[ViewFiles], named_splits: bool) -> Result<Files> {
-    let lenses: Vec<Map<String, Value>> = places.iter().map(lens).collect::<Result<_>>()?;
+fn transforms(capture: &Capture, files_of_views: &[ViewFiles], named_splits: bool) -> Result<Files> {
+    let lenses: Vec<Map<String, Value>> = files_of_views.iter().map(lens).collect::<Result<_>>()?;
     // readers that support only one lens read it from the top level
     let shared = lenses.iter().all(|l| *l == lenses[0]);
-    let frame = |(place, lens): (&ViewFiles, &Map<String, Value>)| {
-        let (r, p) = (place.camera.rotation, place.camera.position);
+    let frame = |(files, lens): (&ViewFiles, &Map<String, Value>)| {
+        let (r, p) = (files.camera.rotation, files.camera.position);
         let row = |k: usize| json!([r.x_axis[k], r.y_axis[k], r.z_axis[k], p[k]]);
         let mut frame = Map::new();
-        frame.insert("file_path".into(), place.photo.clone().into());
-        let pictures = [("mask_path", &place.mask), ("face_mask_path", &place.region)];
+        frame.insert("file_path".into(), files.photo.clone().into());
+        let pictures = [("mask_path", &files.mask), ("face_mask_path", &files.region)];
         for (key, path) in pictures.into_iter().filter_map(|(key, path)| Some((key, path.clone()?))) {
             frame.insert(key.into(), path.into());
         }
         if named_splits {
-            frame.insert("split".into(), json!(place.view.split));
+            frame.insert("split".into(), json!(files.view.split));
         }
         if !shared {
             frame.extend(lens.clone());
@@ -326,13 +330,13 @@ fn transforms(capture: &Capture, places: &[ViewFiles], named_splits: bool) -> Re
     if up(&capture.views, None).0 != capture.up {
         top.insert("up".into(), json!(capture.up.as_dvec3()));
     }
-    top.insert("frames".into(), places.iter().zip(&lenses).map(frame).collect());
+    top.insert("frames".into(), files_of_views.iter().zip(&lenses).map(frame).collect());
     Ok(vec![("transforms.json".into(), format!("{:#}\n", Value::Object(top)).into_bytes())])
 }
 
 fn sparse(
     capture: &Capture,
-    places: &[ViewFiles],
+    files_of_views: &[ViewFiles],
     named_splits: bool,
     warnings: &mut Vec<String>,
 ) -> Result<Files> {
@@ -341,12 +345,12 @@ fn sparse(
         let taken = format!("readers will use {guessed} instead of {}", capture.up);
         warnings.push(format!("COLMAP has no up direction: {taken}"));
     }
-    let images: Vec<(String, &Camera)> = places.iter().map(|p| (p.name.clone(), &p.camera)).collect();
+    let images: Vec<(String, &Camera)> = files_of_views.iter().map(|p| (p.name.clone(), &p.camera)).collect();
     let hint = "undistort the photographs first";
     let model = colmap::files(&images).map_err(|problem| Error::cannot(problem, hint))?;
     let mut files: Files = Vec::new();
     if named_splits {
-        let held_out = places.iter().filter(|p| p.view.split != Split::Train);
+        let held_out = files_of_views.iter().filter(|p| p.view.split != Split::Train);
         let names: String = held_out.map(|p| format!("{}\n", p.name)).collect();
         if capture.split(Split::Val).next().is_some() {
             warnings.push("COLMAP has no validation views: they become test views".into());

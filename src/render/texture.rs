@@ -180,7 +180,7 @@ impl MeshTexture {
         let forward = camera.forward();
         let mut values = vec![Vec4::ZERO; self.groups];
         let one = |(i, hit): (usize, &Hit)| {
-            let (uv, density) = self.place(hit);
+            let (uv, density) = self.coordinates(hit);
             // a ray's share of a pixel on a plane across the view; slanted surfaces stay sharp rather than blur
             let footprint =
                 hit.t * hits.directions[i].dot(forward) / (camera.fx.abs() as f32 * samples as f32);
@@ -195,7 +195,7 @@ impl MeshTexture {
 
     /// Returns the texture coordinates of a hit, and the number of texels per unit of length at it.
     #[inline(always)]
-    fn place(&self, hit: &Hit) -> (Vec2, f32) {
+    fn coordinates(&self, hit: &Hit) -> (Vec2, f32) {
         let TexturedTriangle { first, right, down, density } = self.triangles[hit.triangle as usize];
         let uv = first + hit.u * right + hit.v * down;
         (if self.repeats { uv - uv.floor() } else { uv }, density)
@@ -243,7 +243,7 @@ fn smooth_all<const F: bool>(
     for (hits, directions) in hits.hits.chunks(LANES).zip(hits.directions.chunks(LANES)) {
         let (mut u, mut v, mut texels) = ([0f32; LANES], [0f32; LANES], [1f32; LANES]);
         for (l, (hit, direction)) in hits.iter().zip(directions).enumerate() {
-            let (uv, density) = texture.place(hit);
+            let (uv, density) = texture.coordinates(hit);
             (u[l], v[l]) = (uv.x, uv.y);
             texels[l] = hit.t * direction.dot(forward) * per_pixel * density;
         }

@@ -165,7 +165,7 @@ impl Blocks {
         let mut firsts = vec![0u32; self.blocks.len()];
         order.iter().zip(&parts).for_each(|(&b, part)| firsts[b] = part.first);
         order.par_iter().zip(parts).for_each(|(&b, part)| {
-            self.place(b, &owners[b], grid, part.vertices);
+            self.write_vertices(b, &owners[b], grid, part.vertices);
             self.connect(b, &owners, &firsts, grid, part.cells);
         });
         out.capped = self
@@ -261,7 +261,7 @@ impl Blocks {
         counts
     }
 
-    fn place(&self, b: usize, owner: &Owner, grid: &NodeGrid, vertices: &mut [Vec3]) {
+    fn write_vertices(&self, b: usize, owner: &Owner, grid: &NodeGrid, vertices: &mut [Vec3]) {
         let block = &self.blocks[b];
         let next = [0, 1, 2].map(|axis| self.after(block, axis));
         let mut at = 0;

@@ -92,7 +92,7 @@ pub(super) fn cut_handles(
     while topology(&mesh.positions, &mesh.triangles).genus.is_some_and(|handles| handles > 0) {
         let Some(loops) = LoopFinder::new(&mesh.positions, &mesh.triangles) else { break };
         let found = loops.short(longest, monitor)?;
-        let discs = by_field(discs(&loops, found), |v| loops.place(v), field)?;
+        let discs = by_field(discs(&loops, found), |v| loops.position(v), field)?;
         let mut work = HandleCutter::new(mesh, &loops);
         for disc in &discs {
             if let Some(cut) = work.along(disc) {
@@ -136,7 +136,7 @@ fn discs(loops: &LoopFinder, found: Vec<Loop>) -> Vec<Disc> {
                 taken[i * n + j] = (i + 1) % n != j && (j + 1) % n != i;
             }
         }
-        let points: Vec<DVec3> = rim.vertices.iter().map(|&v| loops.place(v).as_dvec3()).collect();
+        let points: Vec<DVec3> = rim.vertices.iter().map(|&v| loops.position(v).as_dvec3()).collect();
         let triangles = least_area(&points, |i, j| taken[i * n + j])?;
         Some(Disc { rim, triangles })
     };
@@ -288,13 +288,13 @@ impl<'a> HandleCutter<'a> {
                 let (mut sum, mut count) = (Vec3::ZERO, 0.0);
                 for side in loops.around(from).take_while(|&side| side != to) {
                     if side != from {
-                        sum += loops.place(loops.end(side));
+                        sum += loops.position(loops.end(side));
                         count += 1.0;
                     }
                     let corners = at_rims.entry(side / 3).or_insert(self.mesh.triangles[side as usize / 3]);
                     corners[side as usize % 3] = name;
                 }
-                let p = loops.place(v);
+                let p = loops.position(v);
                 moved.insert(name, if count > 0.0 { p.lerp(sum / count, share) } else { p });
             }
         }

@@ -97,13 +97,13 @@ impl<'a> LoopFinder<'a> {
         self.around(self.first[vertex as usize])
     }
 
-    /// Returns where a vertex is.
-    pub(super) fn place(&self, vertex: u32) -> Vec3 {
+    /// Returns the position of a vertex.
+    pub(super) fn position(&self, vertex: u32) -> Vec3 {
         self.positions[vertex as usize]
     }
 
     fn length(&self, side: u32) -> f32 {
-        self.place(self.start(side)).distance(self.place(self.end(side)))
+        self.position(self.start(side)).distance(self.position(self.end(side)))
     }
 
     /// Gives every side its word.
@@ -328,7 +328,7 @@ impl<'a> Ball<'a> {
         }
         let class = self.word[v as usize] ^ self.word[w as usize] ^ loops.word[side as usize];
         let vertices: Vec<u32> = to_v.into_iter().chain(common).chain(to_w.into_iter().rev()).collect();
-        let place = |i: usize| loops.place(vertices[i % vertices.len()]);
+        let place = |i: usize| loops.position(vertices[i % vertices.len()]);
         let length = (0..vertices.len()).map(|i| place(i).distance(place(i + 1))).sum();
         Loop { vertices, length, class }
     }

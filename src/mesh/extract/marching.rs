@@ -187,7 +187,7 @@ impl Passes<'_> {
             rows.iter_mut().flatten().for_each(|r| *r += part.first);
         });
         parts.into_par_iter().enumerate().for_each(|(k, part)| {
-            self.place(k, part.vertices);
+            self.write_vertices(k, part.vertices);
             self.connect(k, &rows, part.cells);
         });
         Ok(())
@@ -231,7 +231,7 @@ impl Passes<'_> {
     }
 
     /// Writes the vertices of one plane's rows, in the order in which `count` counted them.
-    fn place(&self, k: usize, mut vertices: &mut [Vec3]) {
+    fn write_vertices(&self, k: usize, mut vertices: &mut [Vec3]) {
         let [nx, ny, _] = self.dims;
         let step = [1, nx, nx * ny];
         for j in 0..ny {

@@ -173,7 +173,7 @@ impl FileMesh {
     }
 
     /// Returns a position with the translation added.
-    pub fn place(&self, position: Vec3) -> DVec3 {
+    pub fn translated(&self, position: Vec3) -> DVec3 {
         self.translation + position.as_dvec3()
     }
 
@@ -425,7 +425,7 @@ pub(super) mod tests {
         // the middle of the box
         assert_eq!(r.translation, DVec3::new(10_000.5, 0.125, -10_000.0));
         assert_eq!(r.positions[0], Vec3::new(-0.5, -0.125, 0.0));
-        assert_eq!(r.place(r.positions[1]), (far + Vec3::X).as_dvec3());
+        assert_eq!(r.translated(r.positions[1]), (far + Vec3::X).as_dvec3());
     }
 
     #[test]

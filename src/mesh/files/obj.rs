@@ -84,7 +84,7 @@ fn write_vertices(out: &mut Vec<u8>, mesh: &FileMesh) -> std::io::Result<()> {
     let digits = (9.0 - size.log10()).ceil().clamp(0.0, 45.0) as usize;
     for (i, p) in mesh.positions.iter().enumerate() {
         if mesh.is_far() {
-            let p = mesh.place(*p);
+            let p = mesh.translated(*p);
             write!(out, "v {:.digits$} {:.digits$} {:.digits$}", p.x, p.y, p.z)?;
         } else {
             write!(out, "v {} {} {}", Short(p.x), Short(p.y), Short(p.z))?;

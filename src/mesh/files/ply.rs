@@ -70,7 +70,7 @@ fn bytes(mesh: &FileMesh, picture: Option<&str>) -> Vec<u8> {
     out.reserve(mesh.positions.len() * if far { 47 } else { 35 } + mesh.triangles.len() * 13);
     for (i, p) in mesh.positions.iter().enumerate() {
         if far {
-            out.extend(mesh.place(*p).to_array().iter().flat_map(|v| v.to_le_bytes()));
+            out.extend(mesh.translated(*p).to_array().iter().flat_map(|v| v.to_le_bytes()));
         } else {
             out.extend(p.to_array().iter().flat_map(|v| v.to_le_bytes()));
         }
