@@ -1,5 +1,6 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
+mod bit_grid;
 mod bvh;
 mod camera;
 mod field;
@@ -12,6 +13,7 @@ mod similarity;
 pub mod sphharm;
 mod topology;
 
+pub use bit_grid::{BitGrid, dilated_cells};
 pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion, Projection};
 pub use field::SdfField;

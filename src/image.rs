@@ -3,8 +3,10 @@
 //! The fields learn and render **sRGB-coded** color, as the published system does, so a render
 //! here is coded too and meets linear light only at the edge (EXR, glTF vertex colors, filtering).
 
+mod morphology;
 mod resize;
 
+pub use morphology::{dilated, eroded, grow, shrink};
 pub use resize::{
     bilinear, enlarge, reduce_photo, reduce_to_rows, resize_gray, resize_hard, size_at_rows, working_size,
 };
@@ -100,26 +102,6 @@ pub fn quantize(c: f32) -> u8 {
     (c.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }
 
-/// Returns where a whole square of half edge `margin` is set, of a picture `w × h`; none at its border is.
-pub fn eroded(mut set: Vec<bool>, w: usize, h: usize, margin: usize) -> Vec<bool> {
-    for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
-        for first in (0..lines).map(|line| line * step) {
-            // length of the run of set values that ends here
-            let mut run = 0;
-            let runs: Vec<usize> = (0..n)
-                .map(|i| {
-                    run = if set[first + i * stride] { run + 1 } else { 0 };
-                    run
-                })
-                .collect();
-            for i in 0..n {
-                set[first + i * stride] = runs.get(i + margin).is_some_and(|&r| r > 2 * margin);
-            }
-        }
-    }
-    set
-}
-
 /// Factors of a photograph's linear light relative to the mean of all photographs.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Exposure {
@@ -156,17 +138,6 @@ mod tests {
             let s = i as f32 / 255.0;
             assert_eq!(quantize(srgb_from_linear(linear_from_srgb(s))), i);
         }
-    }
-
-    #[test]
-    fn eroding_leaves_pixels_whose_whole_square_is_set() {
-        // 7 × 5, one hole at (1, 2): with a margin of 1 columns 3 to 5 of rows 1 to 3 are left
-        let mut set = vec![true; 35];
-        set[2 * 7 + 1] = false;
-        let left = eroded(set, 7, 5, 1);
-        let expected = |i: usize| (3..=5).contains(&(i % 7)) && (1..=3).contains(&(i / 7));
-        assert!((0..35).all(|i| left[i] == expected(i)), "{left:?}");
-        assert!(eroded(vec![true; 6], 3, 2, 2).iter().all(|set| !set));
     }
 }
 

@@ -16,7 +16,8 @@
 //! same skin. The squares are large enough that their content cannot be guessed from the pixels around.
 
 use super::{BlendTarget, Members, in_bands, no_members, normalized};
-use crate::kernel::cpu::rng;
+use crate::math::cholesky::{factor, substitute};
+use crate::math::rng;
 use crate::{Error, Result};
 
 /// Sums over the pixels seen so far: `members²` numbers, so each view may keep its own.
@@ -160,39 +161,6 @@ pub fn fit_weights(views: &[Fit]) -> Result<Option<Vec<f32>>> {
 /// Maximum number of members in a fit.
 pub const MAX_MEMBERS: usize = 8;
 
-/// Factors the symmetric positive definite `a` (`[n · n]`, its lower half is read) in place, A = LLᵀ.
-/// False where it is not positive definite.
-fn factor(a: &mut [f64], n: usize) -> bool {
-    for j in 0..n {
-        for i in j..n {
-            let dot: f64 = (0..j).map(|k| a[i * n + k] * a[j * n + k]).sum();
-            let rest = a[i * n + j] - dot;
-            if i == j {
-                // also false for NaN
-                if !(rest > 0.0 && rest.is_finite()) {
-                    return false;
-                }
-                a[i * n + j] = rest.sqrt();
-            } else {
-                a[i * n + j] = rest / a[j * n + j];
-            }
-        }
-    }
-    true
-}
-
-/// Solves A x = b in place with the factor of A.
-fn substitute(l: &[f64], n: usize, x: &mut [f64]) {
-    for i in 0..n {
-        let dot: f64 = (0..i).map(|k| l[i * n + k] * x[k]).sum();
-        x[i] = (x[i] - dot) / l[i * n + i];
-    }
-    for i in (0..n).rev() {
-        let dot: f64 = (i + 1..n).map(|k| l[k * n + i] * x[k]).sum();
-        x[i] = (x[i] - dot) / l[i * n + i];
-    }
-}
-
 /// `argmin ½ wᵀHw − gᵀw` with `w ≥ 0`, `Σ w = 1`; H `[n · n]` symmetric positive definite, n ≤ 8.
 ///
 /// The least value lies inside the face of some members that are above 0. There are at most 255
@@ -244,8 +212,8 @@ fn on_face(h: &[f64], g: &[f64], on: &[usize]) -> Option<[f64; MAX_MEMBERS]> {
     if !factor(&mut a, m) {
         return None;
     }
-    substitute(&a, m, &mut x[..m]);
-    substitute(&a, m, &mut y[..m]);
+    substitute(&a, &mut x[..m]);
+    substitute(&a, &mut y[..m]);
     let nu = (1.0 - x[..m].iter().sum::<f64>()) / y[..m].iter().sum::<f64>();
     for i in 0..m {
         x[i] += nu * y[i];
@@ -306,18 +274,7 @@ pub fn tiles(width: u32, height: u32, share: f64, seed: u64, view: u64) -> Vec<T
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::cpu::rng::uniform;
-
-    #[test]
-    fn cholesky_solves_a_system_worked_by_hand() {
-        // [4 2; 2 5] x = [8; 14]  →  x = (12/16, 40/16) = (0.75, 2.5)
-        let mut a = [4.0, 2.0, 2.0, 5.0];
-        assert!(factor(&mut a, 2));
-        let mut x = [8.0, 14.0];
-        substitute(&a, 2, &mut x);
-        assert!((x[0] - 0.75).abs() < 1e-14 && (x[1] - 2.5).abs() < 1e-14);
-        assert!(!factor(&mut [1.0, 2.0, 2.0, 1.0], 2)); // determinant −3
-    }
+    use crate::math::rng::uniform;
 
     #[test]
     fn the_nearest_point_of_the_simplex_is_found_inside_on_an_edge_and_in_a_corner() {
@@ -396,7 +353,7 @@ mod blend_tests {
     use super::*;
     use crate::ensemble::{Member, PAPER_WEIGHTS, blend};
     use crate::image::{Gray, Image, Photo, quantize};
-    use crate::kernel::cpu::rng::{normal, uniform};
+    use crate::math::rng::{normal, uniform};
 
     const SIZE: u32 = 64;
     const PIXELS: usize = (SIZE * SIZE) as usize;

@@ -16,12 +16,12 @@ use super::consistency::{ConsistencyView, MaskVerdict, verdicts};
 use super::grabcut::mixture::Rgb;
 use super::grabcut::{self, Grabcut, Models, Seed};
 use super::hull::{self, Voter};
-use super::morphology::{gray, grow, shrink};
+use super::morphology::gray;
 use super::prompts::{self, Click};
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
 use crate::geom::Camera;
-use crate::image::{Gray, Photo, reduce_to_rows, size_at_rows};
+use crate::image::{Gray, Photo, grow, reduce_to_rows, shrink, size_at_rows};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -419,7 +419,7 @@ impl Propagation<'_> {
 mod tests {
     use super::*;
     use crate::geom::Distortion;
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
     use glam::{DMat3, DVec3, Vec2};
 
     pub(super) fn ring() -> Vec<Camera> {

@@ -4,9 +4,8 @@
 //! memory holds the picture, but not a ray and its result for every pixel.
 
 use crate::Result;
-use crate::capture::scene::Hull;
 use crate::config::Stage;
-use crate::geom::{Camera, Ray, RayResult, SdfField, Similarity};
+use crate::geom::{BitGrid, Camera, Ray, RayResult, SdfField, Similarity};
 use crate::mesh::{Cap, Patches};
 use crate::render::RenderedView;
 use glam::{Vec2, Vec3};
@@ -31,7 +30,7 @@ pub trait Surface: SdfField {
 pub(super) struct ClosedSurface<'a> {
     pub field: &'a dyn Surface,
     /// What lies outside of it is outside of the surface.
-    pub hull: Option<&'a Hull>,
+    pub hull: Option<&'a BitGrid>,
     /// The cap where the frames cut the body.
     pub cap: Option<&'a Cap>,
     /// The patches where handles were cut.

@@ -17,7 +17,7 @@
 use super::chart::{Flat, widest};
 use super::{AtlasConfig, AtlasLayout};
 use crate::geom::{Atlas, Mesh};
-use crate::kernel::cpu::rng::mix;
+use crate::math::rng::mix;
 use crate::{Error, Monitor, Result};
 use glam::{DVec2, Vec2};
 use rayon::prelude::*;

@@ -299,7 +299,7 @@ mod tests {
     use super::*;
     use crate::geom::Painted;
     use crate::geom::sphharm::{combine, functions};
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
 
     fn sphere(p: Vec3) -> f32 {
         p.length() - 0.5

@@ -30,6 +30,7 @@ use crate::geom::{
     Aabb, Atlas, Boxes, DBox, DEFAULT_EFFORT, Mesh, OutlineSide, Sets, WrongPiece, intersect, nearest_charts,
     overlaps, share_out, shared_area, side_ends, sorted_sides, topology, turn, wrong_pieces,
 };
+use crate::math::rank::nearest;
 use crate::{Error, Result};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -721,13 +722,10 @@ fn stretches(report: &mut UvReport, triangles: &[([DVec3; 3], [DVec2; 3])]) {
     (report.angle_stretch_median, report.angle_stretch_p99) = quantiles(&mut angles);
 }
 
-/// Returns the median and 99th percentile.
+/// Returns the median and 99th percentile of some values, of which there is one at least.
 fn quantiles(values: &mut [f64]) -> (f64, f64) {
-    let mut at = |share: f64| {
-        let i = ((values.len() - 1) as f64 * share).round() as usize;
-        *values.select_nth_unstable_by(i, f64::total_cmp).1
-    };
-    (at(0.5), at(0.99))
+    let [median, high] = [0.5, 0.99].map(|share| nearest(values, share, f64::total_cmp).unwrap_or(f64::NAN));
+    (median, high)
 }
 
 #[cfg(test)]

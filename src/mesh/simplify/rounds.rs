@@ -34,7 +34,7 @@ use super::crossing::{Sheets, crossings};
 use super::rings::{BORDER, EdgeLink, FIXED, MIN_QUALITY, MIN_TURN_COSINE, Rings, place};
 use super::{SimplifyConfig, SimplifyReport};
 use crate::geom::{Aabb, Mesh, SdfField, area_vector, shape};
-use crate::kernel::cpu::cg::conjugate_gradients;
+use crate::math::cg::conjugate_gradients;
 use crate::mesh::evaluate;
 use crate::mesh::extract::BATCH;
 use crate::mesh::moves::{move_vertices, newton};

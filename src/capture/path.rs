@@ -5,7 +5,7 @@
 //! must be in the dataset's own world. A path from nerfstudio's viewer is only if its training ran
 //! with `--orientation-method none --center-method none --auto-scale-poses False`.
 
-use crate::capture::camera_like;
+use super::transforms::camera_like;
 use crate::geom::{Aabb, Camera, Distortion};
 use crate::{Error, Result};
 use glam::{BVec3, DMat3, DVec3, Vec3};
@@ -64,7 +64,7 @@ const FILLED: f64 = 0.95;
 /// ```
 /// use glam::{DMat3, DVec3, Vec3};
 /// use tiface::geom::{Aabb, Camera, Distortion};
-/// use tiface::render::path::orbit;
+/// use tiface::capture::path::orbit;
 ///
 /// let front = Camera {
 ///     width: 400, height: 300, fx: 500.0, fy: 500.0, cx: 200.0, cy: 150.0,
