@@ -14,12 +14,14 @@ pub use resize::{
 use serde::{Deserialize, Serialize};
 
 /// sRGB-coded from linear (IEC 61966-2-1), any value clamped to 0..=1.
+#[inline]
 pub fn srgb_from_linear(c: f32) -> f32 {
     let c = c.clamp(0.0, 1.0);
     if c <= 0.003_130_8 { 12.92 * c } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 }
 }
 
 /// Linear from sRGB-coded, any value clamped to 0..=1.
+#[inline]
 pub fn linear_from_srgb(s: f32) -> f32 {
     let s = s.clamp(0.0, 1.0);
     if s <= 0.040_45 { s / 12.92 } else { ((s + 0.055) / 1.055).powf(2.4) }
@@ -77,12 +79,14 @@ impl Image {
     }
 
     /// Returns the values of one pixel.
+    #[inline]
     pub fn pixel(&self, x: u32, y: u32) -> &[f32] {
         let i = (y as usize * self.width as usize + x as usize) * self.channels;
         &self.data[i..i + self.channels]
     }
 
     /// Returns the values of one pixel, to write.
+    #[inline]
     pub fn pixel_mut(&mut self, x: u32, y: u32) -> &mut [f32] {
         let i = (y as usize * self.width as usize + x as usize) * self.channels;
         &mut self.data[i..i + self.channels]
@@ -90,6 +94,7 @@ impl Image {
 }
 
 /// Returns a pixel with straight alpha as it is over black.
+#[inline]
 pub fn over_black([r, g, b, a]: [u8; 4]) -> [u8; 3] {
     [r, g, b].map(|v| ((u16::from(v) * u16::from(a) + 127) / 255) as u8)
 }
@@ -98,6 +103,7 @@ pub fn over_black([r, g, b, a]: [u8; 4]) -> [u8; 3] {
 pub const OPAQUE_ALPHA: u8 = 250;
 
 /// Coded 0..=1 to 8 bit, rounded to nearest (the published code truncates).
+#[inline]
 pub fn quantize(c: f32) -> u8 {
     (c.clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }

@@ -20,6 +20,7 @@ use glam::{DVec2, DVec3, Vec2};
 use rayon::prelude::*;
 
 /// On which side of the line a → b is c: 1 where (b − a) × (c − a) is positive, −1 where negative, 0 on it.
+#[inline]
 pub(crate) fn turn(a: Vec2, b: Vec2, c: Vec2) -> i32 {
     let coord = |v: Vec2| robust::Coord { x: f64::from(v.x), y: f64::from(v.y) };
     let area = robust::orient2d(coord(a), coord(b), coord(c));
@@ -298,6 +299,7 @@ impl Effort {
     }
 
     /// Spends, or returns false from the first time that too little is left.
+    #[inline]
     pub(crate) fn spend(&mut self, cost: usize) -> bool {
         self.short |= self.left < cost;
         self.left = if self.short { 0 } else { self.left - cost };
@@ -361,6 +363,7 @@ impl DBox {
         points.into_iter().fold(DBox::EMPTY, |s, p| DBox { low: s.low.min(p), high: s.high.max(p) })
     }
 
+    #[inline]
     pub(crate) fn grown(self, margin: f64) -> DBox {
         DBox { low: self.low - margin, high: self.high + margin }
     }

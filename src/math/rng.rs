@@ -65,6 +65,7 @@ impl Permutation {
     }
 
     /// Returns number `i` of the step, or `None` past the end of the permutation.
+    #[inline]
     pub fn get(&self, i: u64) -> Option<u64> {
         let mut x = Some(self.first + i).filter(|&x| x < self.n)?;
         let lower = (1u64 << self.half_bits) - 1;
@@ -84,6 +85,7 @@ impl Permutation {
 }
 
 /// Returns a standard normal number (Box, Muller 1958).
+#[inline]
 pub fn normal(seed: u64, stream: u64, index: u64) -> f32 {
     let (u, v) = (uniform(seed, stream, 2 * index), uniform(seed, stream, 2 * index + 1));
     (-2.0 * (1.0 - u as f64).ln()).sqrt() as f32 * (std::f32::consts::TAU * v).cos()

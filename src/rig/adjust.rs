@@ -46,14 +46,9 @@ pub struct Track {
     pub sightings: Vec<Sighting>,
 }
 
-/// Returns the picture position of a point, in f64; `None` behind the camera.
+/// Returns the picture position of a point; `None` behind the camera.
 pub fn project(camera: &Camera, point: DVec3) -> Option<DVec2> {
-    let p = camera.rotation.transpose() * (point - camera.position);
-    if p.z >= -1e-9 {
-        return None;
-    }
-    let (x, y) = camera.distortion.apply(p.x / -p.z, -p.y / -p.z);
-    Some(DVec2::new(camera.fx * x + camera.cx, camera.fy * y + camera.cy))
+    camera.project_f64(point).map(|(pixel, _)| pixel)
 }
 
 /// The residual of a sighting in pixels with its derivatives: columns by ω, t and the point's position.
@@ -65,14 +60,8 @@ struct Linear {
 
 impl Linear {
     fn new(camera: &Camera, point: DVec3, pixel: DVec2) -> Option<Linear> {
-        let p = camera.rotation.transpose() * (point - camera.position);
-        let depth = -p.z;
-        if depth <= 1e-9 {
-            return None;
-        }
-        // the picture's y axis points down
-        let (x, y) = (p.x / depth, -p.y / depth);
-        let (u, v) = camera.distortion.apply(x, y);
+        let p = camera.local(point);
+        let (DVec2 { x, y }, depth) = Camera::ideal(p)?;
         let [[ux, uy], [vx, vy]] = camera.distortion.slopes(x, y);
         // of (x, y) by the three coordinates of p
         let ideal =
@@ -84,8 +73,8 @@ impl Linear {
         let point = axes.map(|e| along(camera.rotation.transpose() * e));
         let [a, b, c] = axes.map(|e| along(p.cross(e)));
         let camera_slopes = [a, b, c, -point[0], -point[1], -point[2]];
-        let found = DVec2::new(camera.fx * u + camera.cx, camera.fy * v + camera.cy);
-        Some(Linear { residual: found - pixel, camera: camera_slopes, point })
+        let residual = camera.pixel(DVec2::new(x, y)) - pixel;
+        Some(Linear { residual, camera: camera_slopes, point })
     }
 }
 
