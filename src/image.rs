@@ -51,6 +51,16 @@ pub struct Gray {
     pub values: Vec<u8>,
 }
 
+/// Value of a mask from which on a pixel is inside: half.
+pub const INSIDE: u8 = 128;
+
+impl Gray {
+    /// Returns which pixels are inside the mask, from [`INSIDE`] on.
+    pub fn inside(&self) -> Vec<bool> {
+        self.values.iter().map(|&v| v >= INSIDE).collect()
+    }
+}
+
 /// A float picture with `channels` interleaved values a pixel, row-major, top row first.
 ///
 /// Renders are RGBA: sRGB-coded color over black (premultiplied), alpha = opacity. Depth has one

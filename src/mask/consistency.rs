@@ -28,7 +28,7 @@ use super::morphology::squared_distance;
 use crate::Result;
 use crate::capture::carve::Cube;
 use crate::geom::Camera;
-use crate::image::{Gray, resize_hard};
+use crate::image::{Gray, INSIDE, resize_hard};
 use glam::{DVec3, Vec2};
 use rayon::prelude::*;
 
@@ -176,7 +176,7 @@ impl SilhouetteConstraints {
         let height = rows.clamp(16, mask.height.max(16));
         let width = ((mask.width as f64 * height as f64 / mask.height as f64).round() as u32).max(1);
         let camera = camera.resized(width, height);
-        let on: Vec<bool> = resize_hard(mask, (width, height)).values.iter().map(|&v| v > 127).collect();
+        let on = resize_hard(mask, (width, height)).inside();
         let (w, h) = (width as usize, height as usize);
         let off: Vec<bool> = on.iter().map(|o| !o).collect();
         // half the diagonal of a cell where the cube's middle is
@@ -430,7 +430,7 @@ struct Disagreement {
 /// When the cameras stand at one place or look in one direction.
 pub fn verdicts(views: &[ConsistencyView]) -> Result<Vec<MaskVerdict>> {
     let mut out = vec![MaskVerdict::Unlike; views.len()];
-    let shows = |v: &ConsistencyView| v.mask.is_some_and(|m| m.values.iter().any(|&v| v > 127));
+    let shows = |v: &ConsistencyView| v.mask.is_some_and(|m| m.values.iter().any(|&v| v >= INSIDE));
     let used: Vec<usize> = (0..views.len()).filter(|&i| shows(&views[i])).collect();
     used.iter().for_each(|&i| out[i] = MaskVerdict::Agrees);
     if used.len() < 2 {

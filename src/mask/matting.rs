@@ -21,7 +21,9 @@
 pub mod closed_form;
 
 use self::closed_form::{ClosedFormOptions, closed_form};
-use crate::image::{Gray, Photo, dilated, enlarge, grow, reduce_photo, resize_hard, shrink, working_size};
+use crate::image::{
+    Gray, INSIDE, Photo, dilated, enlarge, grow, reduce_photo, resize_hard, shrink, working_size,
+};
 use crate::{Error, Result};
 
 /// Alphas below become 0.
@@ -131,7 +133,7 @@ fn solved(
             }
         }
     }
-    mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect()
+    mask.values.iter().map(|&v| if v >= INSIDE { 1.0 } else { 0.0 }).collect()
 }
 
 /// Warnings about the band, by whichever method its opacity is found.
@@ -188,7 +190,7 @@ impl Default for UnknownBand {
 /// Returns the trimap of a mask, which is head where it is 128 or more.
 pub fn trimap(mask: &Gray, band: UnknownBand) -> Gray {
     let (width, height) = (mask.width as usize, mask.height as usize);
-    let head: Vec<bool> = mask.values.iter().map(|&v| v >= 128).collect();
+    let head = mask.inside();
     let (definite, maybe) = match band {
         UnknownBand::Squares { kernel, iterations } => (
             erode(&head, width, height, kernel, iterations),
@@ -351,7 +353,7 @@ mod tests {
             let truth = read_gray(&picture("masks"), None, &limits).unwrap();
             let (w, h) = (truth.width as usize, truth.height as usize);
             let soft_truth: Vec<f32> = truth.values.iter().map(|&v| v as f32 / 255.0).collect();
-            let cut: Vec<bool> = truth.values.iter().map(|&v| v >= 128).collect();
+            let cut = truth.inside();
             let masks = [cut.clone(), grow(&cut, w, h, 2.0), shrink(&cut, w, h, 2.0)];
             for (k, mask) in masks.iter().enumerate().filter(|(k, _)| gains[*k].is_some()) {
                 let values = mask.iter().map(|&m| if m { 255 } else { 0 }).collect();

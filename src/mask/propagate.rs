@@ -313,7 +313,7 @@ impl<'a> Propagation<'a> {
     /// Returns warnings about the finished masks.
     fn warn(&mut self, masks: &[Gray], ambiguous: &[f64]) {
         for (i, mask) in masks.iter().enumerate().filter(|(i, _)| !self.views[*i].clicks.is_empty()) {
-            let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
+            let head = mask.inside();
             let found = self.grabcut(i, false).0.warnings(self.views[i].name, &head);
             self.warnings.extend(found);
         }
@@ -382,7 +382,7 @@ impl Propagation<'_> {
                     format!("propose one of {w} × {h}"),
                 ));
             }
-            let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
+            let head = mask.inside();
             // held-out views are not compared, and shape only their own masks
             if !view.votes || *verdict != MaskVerdict::Unlike {
                 self.inside[i] = shrink(&head, w, h, HEAD_MARGIN * h as f32);

@@ -10,10 +10,10 @@
 //! pixels without head are extra; [`PartMetrics::psnr_cap`] is the masked PSNR of a picture with the photograph's own
 //! colors in every covered pixel.
 
-use super::{INSIDE, picture, rounded};
+use super::{picture, rounded};
 use crate::Result;
 use crate::capture::{LoadedView, View};
-use crate::image::{Gray, Image, Photo, grow};
+use crate::image::{Gray, INSIDE, Image, Photo, grow};
 use crate::io::Limits;
 use crate::math::rank::median_of_counts;
 use rayon::prelude::*;
@@ -132,7 +132,7 @@ pub fn parts(
 
 /// Returns the band around the mask's contour.
 fn edge(masks: Masks) -> Vec<bool> {
-    let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
+    let head = masks.mask.inside();
     let rest: Vec<bool> = head.iter().map(|h| !h).collect();
     let (width, height) = masks.size();
     let [to_head, to_rest] = [&head, &rest].map(|set| grow(set, width, height, EDGE_PX));
@@ -177,7 +177,7 @@ impl ToneSamples {
     /// Collects the samples of one photograph (not cut out); `None` without a region of interest.
     fn of(photo: &Photo, masks: Masks) -> Option<ToneSamples> {
         let (region, (width, height)) = (masks.region?, masks.size());
-        let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
+        let head = masks.mask.inside();
         let rest: Vec<bool> = head.iter().map(|h| !h).collect();
         let soft = soft_rim(masks.mask);
         let [beside, far] = [RIM_BAND_PX, RIM_CLEARANCE_PX].map(|px| grow(&soft, width, height, px));
