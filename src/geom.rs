@@ -31,9 +31,6 @@ pub use sphharm::Harmonics;
 pub(crate) use topology::{Sets, side_ends, sorted_sides};
 pub use topology::{Topology, topology};
 
-#[cfg(test)]
-pub(crate) use field::Painted;
-
 /// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of entries
 /// `xx xy xz yy yz zz`: their quotient is the inverse.
 #[inline]

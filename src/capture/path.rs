@@ -62,14 +62,11 @@ const FILLED: f64 = 0.95;
 /// # Examples
 ///
 /// ```
-/// use glam::{DMat3, DVec3, Vec3};
-/// use tiface::geom::{Aabb, Camera, Distortion};
+/// use glam::Vec3;
 /// use tiface::capture::path::orbit;
+/// use tiface::geom::{Aabb, Camera};
 ///
-/// let front = Camera {
-///     width: 400, height: 300, fx: 500.0, fy: 500.0, cx: 200.0, cy: 150.0,
-///     distortion: Distortion::default(), rotation: DMat3::IDENTITY, position: DVec3::new(0.0, 0.0, 4.0),
-/// };
+/// let front = Camera::above(400, 300, 500.0, 4.0);
 /// let head = Aabb { min: Vec3::splat(-0.5), max: Vec3::splat(0.5) };
 /// let path = orbit(&[front], head, Vec3::Y, 8)?;
 /// assert_eq!((path.len(), path[0].name.as_str()), (8, "0001"));

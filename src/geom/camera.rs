@@ -288,14 +288,11 @@ impl Camera {
     /// camera.
     ///
     /// ```
-    /// use glam::{DMat3, DVec3, Vec2, Vec3};
-    /// use tiface::geom::{Camera, Distortion};
+    /// use glam::{Vec2, Vec3};
+    /// use tiface::geom::Camera;
     ///
     /// // two units before the origin, looking along -Z
-    /// let (rotation, position) = (DMat3::IDENTITY, DVec3::new(0.0, 0.0, 2.0));
-    /// let (fx, fy, cx, cy) = (100.0, 100.0, 40.0, 30.0);
-    /// let distortion = Distortion::default();
-    /// let camera = Camera { width: 80, height: 60, fx, fy, cx, cy, distortion, rotation, position };
+    /// let camera = Camera::above(80, 60, 100.0, 2.0);
     ///
     /// let (pixel, depth) = camera.project(Vec3::new(0.5, 0.25, 0.0)).unwrap();
     /// assert_eq!((pixel, depth), (Vec2::new(65.0, 17.5), 2.0)); // y points down in pictures
@@ -383,10 +380,10 @@ impl Camera {
     }
 }
 
-#[cfg(test)]
 impl Camera {
-    /// For tests: at (0, 0, z), looking along −Z, up +Y, without distortion.
-    pub(crate) fn above(width: u32, height: u32, focal: f64, z: f64) -> Camera {
+    /// Returns a camera at (0, 0, z) that looks along −Z, with +Y up, without distortion and with the middle of the picture
+    /// as principal point.
+    pub fn above(width: u32, height: u32, focal: f64, z: f64) -> Camera {
         Camera {
             width,
             height,

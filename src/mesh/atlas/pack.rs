@@ -479,8 +479,9 @@ pub(super) fn half_squares(mesh: &Mesh, config: &AtlasConfig) -> Result<AtlasLay
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Quiet;
     use crate::mesh::files::uv_check;
-    use crate::monitor::{Quiet, Stopping};
+    use crate::mesh::fixtures::Stopping;
     use glam::Vec3;
 
     /// Returns a rectangle of two triangles.

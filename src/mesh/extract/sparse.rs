@@ -553,9 +553,10 @@ fn locate(cell: [usize; 3], corner: u8) -> (usize, usize, usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Quiet;
     use crate::geom::Aabb;
+    use crate::mesh::fixtures::Stopping;
     use crate::mesh::{Volume, marching};
-    use crate::monitor::{Quiet, Stopping};
 
     fn ball(center: Vec3, radius: f32) -> impl Fn(Vec3) -> f32 + Sync {
         move |p| p.distance(center) - radius

@@ -2,9 +2,10 @@
 
 use super::crossing::crossings;
 use super::*;
+use crate::Quiet;
 use crate::geom::{Topology, topology};
+use crate::mesh::fixtures::Stopping;
 use crate::mesh::{Volume, marching};
-use crate::monitor::{Quiet, Stopping};
 use glam::Vec3;
 
 type Answer = (Vec<f32>, Vec<Vec3>);
