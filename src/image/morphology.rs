@@ -67,6 +67,7 @@ pub fn shrink(set: &[bool], w: usize, h: usize, radius: f32) -> Vec<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::math::rng::below;
 
     #[test]
     fn dilating_marks_the_square_around_a_pixel_which_need_not_be_in_its_middle() {
@@ -110,14 +111,8 @@ mod tests {
 
     #[test]
     fn discs_hold_the_pixels_that_a_search_over_all_finds() {
-        let mut state = 7u64;
         for (w, h, every) in [(17, 11, 9), (1, 13, 4), (23, 1, 6), (31, 29, 200), (12, 9, 2)] {
-            let set: Vec<bool> = (0..w * h)
-                .map(|_| {
-                    state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
-                    (state >> 33).is_multiple_of(every)
-                })
-                .collect();
+            let set: Vec<bool> = (0..w * h).map(|i| below(7, every, i as u64, every) == 0).collect();
             for radius in [0.5f32, 1.0, 2.3, 6.144] {
                 let distance = |i: usize, j: usize| {
                     ((i % w).abs_diff(j % w).pow(2) + (i / w).abs_diff(j / w).pow(2)) as f32
