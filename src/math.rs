@@ -1,4 +1,5 @@
-//! Arithmetic that knows no pictures, no geometry and no devices: slices of numbers in, numbers out.
+//! Arithmetic that knows no pictures, no geometry and no devices: slices of numbers in, numbers
+//! out.
 //!
 //! Everything gives the same bits on any number of threads.
 

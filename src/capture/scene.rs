@@ -41,7 +41,8 @@ pub struct Scene {
     pub scene_from_world: Similarity,
     /// The tight box in scene coordinates, within [-1, 1]³.
     pub aabb: Aabb,
-    /// The visual hull as cells over [-1, 1]³ of the scene, which contains the whole head; `None` without masks.
+    /// The visual hull as cells over [-1, 1]³ of the scene, which contains the whole head; `None`
+    /// without masks.
     pub hull: Option<BitGrid>,
 }
 

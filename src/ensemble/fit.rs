@@ -6,7 +6,7 @@
 //!
 //! # Least squares
 //!
-//! Small dense least squares: Cholesky, and the quadratic of least value on the simplex.
+//! Small and dense: the quadratic of least value on the simplex.
 //!
 //! # Tiles
 //!

@@ -5,8 +5,8 @@ use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// A set of the cells of a cubic grid, one bit per cell. Cell `(x, y, z)` of a grid of `R³` cells has index
-/// `(x · R + y) · R + z`; bits of a word are counted from the lowest.
+/// A set of the cells of a cubic grid, one bit per cell. Cell `(x, y, z)` of a grid of `R³` cells
+/// has index `(x · R + y) · R + z`; bits of a word are counted from the lowest.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BitGrid {
     /// Cells per axis.
@@ -22,7 +22,8 @@ impl BitGrid {
         BitGrid { resolution, bits: vec![if marked { u64::MAX } else { 0 }; words] }.with_padding_cleared()
     }
 
-    /// Creates a grid from its words, one bit per cell. Returns `None` if their number does not fit the resolution.
+    /// Creates a grid from its words, one bit per cell. Returns `None` if their number does not fit
+    /// the resolution.
     pub fn from_words(resolution: usize, bits: Vec<u64>) -> Option<BitGrid> {
         let fits = bits.len() == resolution.pow(3).div_ceil(64);
         fits.then(|| BitGrid { resolution, bits }.with_padding_cleared())
@@ -74,7 +75,8 @@ impl BitGrid {
         self.get((x * r + y) * r + z)
     }
 
-    /// Returns a grid in which every cell that touches a marked one, at a face, edge or corner, is marked too.
+    /// Returns a grid in which every cell that touches a marked one, at a face, edge or corner, is
+    /// marked too.
     pub fn grown(&self) -> BitGrid {
         let n = self.resolution;
         let cells: Vec<bool> = (0..n * n * n).map(|i| self.get(i)).collect();
@@ -87,8 +89,9 @@ impl BitGrid {
     }
 }
 
-/// Returns a copy in which every cell with a marked cell among its 26 neighbors is marked too. Cell `(x, y, z)` has
-/// index `(x · ny + y) · nz + z`. The axes are dilated one after the other, which is equivalent.
+/// Returns a copy in which every cell with a marked cell among its 26 neighbors is marked too. Cell
+/// `(x, y, z)` has index `(x · ny + y) · nz + z`. The axes are dilated one after the other, which
+/// is equivalent.
 pub fn dilated_cells(cells: &[bool], size: [usize; 3]) -> Vec<bool> {
     let strides = [size[1] * size[2], size[2], 1];
     let mut marked = cells.to_vec();

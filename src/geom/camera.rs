@@ -321,8 +321,8 @@ impl Camera {
         self.rotation.transpose() * (point - self.position)
     }
 
-    /// Returns the ideal normalized coordinates (y down) of a point in the axes of a camera, and its distance along the
-    /// viewing axis; `None` behind the camera.
+    /// Returns the ideal normalized coordinates (y down) of a point in the axes of a camera, and its
+    /// distance along the viewing axis; `None` behind the camera.
     #[inline]
     pub fn ideal(local: DVec3) -> Option<(DVec2, f64)> {
         let depth = -local.z;
@@ -378,11 +378,9 @@ impl Camera {
             ..self.clone()
         }
     }
-}
 
-impl Camera {
-    /// Returns a camera at (0, 0, z) that looks along −Z, with +Y up, without distortion and with the middle of the picture
-    /// as principal point.
+    /// Returns a camera at (0, 0, z) that looks along −Z, with +Y up, without distortion and with the
+    /// middle of the picture as principal point.
     pub fn above(width: u32, height: u32, focal: f64, z: f64) -> Camera {
         Camera {
             width,

@@ -1,7 +1,8 @@
-//! Sets of pixels grown and shrunk, by squares or by discs. A picture of `w × h` pixels is stored row by row.
+//! Sets of pixels grown and shrunk, by squares or by discs. A picture of `w × h` pixels is stored
+//! row by row.
 
-/// Returns the pixels with a set one at most `before` pixels before and `behind` pixels behind them along both axes: the set
-/// dilated by a square. Two one-dimensional passes are equivalent.
+/// Returns the pixels with a set one at most `before` pixels before and `behind` pixels behind them
+/// along both axes: the set dilated by a square. Two one-dimensional passes are equivalent.
 pub fn dilated(mut set: Vec<bool>, w: usize, h: usize, before: usize, behind: usize) -> Vec<bool> {
     let mut marked = Vec::new();
     for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
@@ -20,7 +21,8 @@ pub fn dilated(mut set: Vec<bool>, w: usize, h: usize, before: usize, behind: us
     set
 }
 
-/// Returns the pixels whose whole square of half edge `margin` is set; none at the picture's border is.
+/// Returns the pixels whose whole square of half edge `margin` is set; none at the picture's border
+/// is.
 pub fn eroded(mut set: Vec<bool>, w: usize, h: usize, margin: usize) -> Vec<bool> {
     set.iter_mut().for_each(|s| *s = !*s);
     let mut set = dilated(set, w, h, margin, margin);
@@ -57,8 +59,8 @@ pub fn grow(set: &[bool], w: usize, h: usize, radius: f32) -> Vec<bool> {
     out
 }
 
-/// Returns the set pixels that are farther than `radius` pixels from every pixel that is not set. Pixels beyond the
-/// picture's border are unknown, so the border does not shrink the set.
+/// Returns the set pixels that are farther than `radius` pixels from every pixel that is not set.
+/// Pixels beyond the picture's border are unknown, so the border does not shrink the set.
 pub fn shrink(set: &[bool], w: usize, h: usize, radius: f32) -> Vec<bool> {
     let outside: Vec<bool> = set.iter().map(|s| !s).collect();
     grow(&outside, w, h, radius).into_iter().map(|s| !s).collect()

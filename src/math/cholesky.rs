@@ -1,8 +1,8 @@
-//! Small dense symmetric systems by Cholesky's factorization. Plain loops give the same bits on every processor, which
-//! libraries that choose instructions at run time do not.
+//! Small dense symmetric systems by Cholesky's factorization. Plain loops give the same bits on
+//! every processor, which libraries that choose instructions at run time do not.
 
-/// Factors a symmetric matrix as `L Lᵀ` in place. Only its lower half is read and written. Returns whether it is positive
-/// definite; if not, the matrix is left half factored.
+/// Factors a symmetric matrix as `L Lᵀ` in place. Only its lower half is read and written. Returns
+/// whether it is positive definite; if not, the matrix is left half factored.
 ///
 /// # Shapes
 ///
@@ -38,8 +38,8 @@ pub fn substitute(factor: &[f64], x: &mut [f64]) {
     }
 }
 
-/// Solves `matrix · x = right` for a symmetric positive definite matrix, of which the lower half is given. `None` for any
-/// other one, and where the solution is not finite.
+/// Solves `matrix · x = right` for a symmetric positive definite matrix, of which the lower half is
+/// given. `None` for any other one, and where the solution is not finite.
 pub fn solve(mut matrix: Vec<f64>, mut right: Vec<f64>) -> Option<Vec<f64>> {
     if !factor(&mut matrix, right.len()) {
         return None;

@@ -4,7 +4,7 @@
 //! other are found. Both directions are needed: missing parts show in one, superfluous parts in the other.
 
 use crate::geom::{Bvh, Camera, Mesh, Ray};
-use crate::math::rank::reached;
+use crate::math::rank::nearest_rank;
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -38,7 +38,7 @@ fn distances(points: Vec<Vec3>, to: &Bvh) -> Option<Distances> {
     }
     let mean = distances.iter().map(|&d| d as f64).sum::<f64>() / distances.len() as f64;
     distances.par_sort_unstable_by(f32::total_cmp);
-    let rank = |share: f64| reached(&distances, share).map(f64::from);
+    let rank = |share: f64| nearest_rank(&distances, share).map(f64::from);
     Some(Distances { samples: distances.len(), mean, median: rank(0.5)?, p90: rank(0.9)?, max: rank(1.0)? })
 }
 
@@ -160,7 +160,7 @@ pub fn kinds_one_way(
         };
         let mut signed: Vec<f32> = part.par_iter().filter_map(signed).collect();
         signed.par_sort_unstable_by(f32::total_cmp);
-        let median = f64::from(reached(&signed, 0.5)?);
+        let median = f64::from(nearest_rank(&signed, 0.5)?);
         Some((distances(part.into_iter().map(|(p, _)| p).collect(), to)?, median))
     })
 }

@@ -1,4 +1,5 @@
-//! Arithmetic of bodies that are compiled per CPU level: matrix blocks and a few transcendental functions.
+//! Arithmetic of bodies that are compiled per CPU level: matrix blocks and a few transcendental
+//! functions.
 //!
 //! Fixed-width arrays are left to the autovectoriser. Each hot body is `#[inline(always)]` and
 //! generic over `F` ("has fused multiply-add"), instantiated inside a `#[target_feature]` wrapper

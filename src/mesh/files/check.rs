@@ -30,7 +30,7 @@ use crate::geom::{
     Aabb, Atlas, Boxes, DBox, DEFAULT_EFFORT, Mesh, OutlineSide, Sets, WrongPiece, intersect, nearest_charts,
     overlaps, share_out, shared_area, side_ends, sorted_sides, topology, turn, wrong_pieces,
 };
-use crate::math::rank::nearest;
+use crate::math::rank::quantile;
 use crate::{Error, Result};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -724,7 +724,7 @@ fn stretches(report: &mut UvReport, triangles: &[([DVec3; 3], [DVec2; 3])]) {
 
 /// Returns the median and 99th percentile of some values, of which there is one at least.
 fn quantiles(values: &mut [f64]) -> (f64, f64) {
-    let [median, high] = [0.5, 0.99].map(|share| nearest(values, share, f64::total_cmp).unwrap_or(f64::NAN));
+    let [median, high] = [0.5, 0.99].map(|share| quantile(values, share, f64::total_cmp).unwrap_or(f64::NAN));
     (median, high)
 }
 
