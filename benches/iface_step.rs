@@ -19,8 +19,8 @@ use tiface::kernel::cpu::hash;
 use tiface::kernel::cpu::losses::{self, LossWeights, Targets};
 use tiface::kernel::cpu::mlp::Weights;
 use tiface::kernel::cpu::neus::{self, Rays};
-use tiface::kernel::cpu::rng;
 use tiface::kernel::cpu::sdf::{self, FieldShape};
+use tiface::math::rng;
 
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;

@@ -37,6 +37,7 @@ mod missing;
 mod near;
 mod neus;
 mod order;
+pub mod path;
 mod photo_checks;
 mod pose_folder;
 mod programs;
@@ -56,7 +57,6 @@ pub(crate) use mask_values::MaskSurvey;
 pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
 pub(crate) use order::by_number;
 pub use scene::well_seen;
-pub(crate) use transforms::camera_like;
 pub use view::{Capture, CaptureOptions, LoadedView, Reading, Split, View, ViewMask};
 
 use crate::error::counted;

@@ -1,5 +1,6 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
+mod bit_grid;
 mod boxes;
 mod bvh;
 mod camera;
@@ -13,6 +14,7 @@ mod similarity;
 pub mod sphharm;
 mod topology;
 
+pub use bit_grid::{BitGrid, dilated_cells};
 pub(crate) use boxes::{Boxes, DBox, DEFAULT_EFFORT, Effort, share_out};
 pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion, Projection};
@@ -29,9 +31,6 @@ pub use similarity::Similarity;
 pub use sphharm::Harmonics;
 pub(crate) use topology::{Sets, side_ends, sorted_sides};
 pub use topology::{Topology, topology};
-
-#[cfg(test)]
-pub(crate) use field::Painted;
 
 /// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of entries
 /// `xx xy xz yy yz zz`: their quotient is the inverse.

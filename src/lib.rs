@@ -49,6 +49,7 @@ pub mod geom;
 pub mod image;
 pub mod io;
 pub mod kernel;
+pub mod math;
 pub mod monitor;
 
 pub use error::{Error, ErrorKind, Result};

@@ -11,6 +11,8 @@ mod atlas;
 pub mod bake;
 mod extract;
 pub mod files;
+#[cfg(test)]
+mod fixtures;
 mod moves;
 mod shells;
 mod simplify;

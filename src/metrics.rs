@@ -28,12 +28,9 @@ pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr_ssim::{psnr, ssim_reflect_map, ssim_valid};
 
-use crate::image::{Gray, Image, Photo, quantize};
+use crate::image::{Gray, INSIDE, Image, Photo, quantize};
 use crate::{Error, Result};
 use serde::Serialize;
-
-/// Threshold from which a mask counts: half.
-const INSIDE: u8 = 128;
 
 /// Metrics of one view.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -29,15 +29,3 @@ impl Monitor for Quiet {
         false
     }
 }
-
-/// Reports nothing, asks to stop from the start.
-#[cfg(test)]
-pub(crate) struct Stopping;
-
-#[cfg(test)]
-impl Monitor for Stopping {
-    fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {}
-    fn stop(&self) -> bool {
-        true
-    }
-}

@@ -1,7 +1,6 @@
 //! Stage: the ways to render a view.
 
 mod look;
-pub mod path;
 mod raster;
 mod raycast;
 mod residual;

@@ -22,5 +22,5 @@ LLVM_PROFILE_FILE=$scratch/%p.profraw "$tests" --nocapture
 "$bin/llvm-profdata" merge -sparse "$scratch"/*.profraw -o "$scratch/fuzz.profdata"
 "$bin/llvm-cov" report "$tests" --instr-profile "$scratch/fuzz.profdata" \
   src/io src/capture src/mesh/files src/mask/prompts.rs src/field/checkpoint.rs \
-  src/render/path.rs src/config src/config.rs |
+  src/config src/config.rs |
   awk '/^Filename|TOTAL|\.rs/ { printf "%-44s %9s lines %9s reached\n", $1, $8, $10 }'

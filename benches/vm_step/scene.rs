@@ -1,9 +1,9 @@
 //! A field with the content of a head, and rays of cameras around it; everything from fixed seeds.
 
 use tiface::kernel::cpu::march::MarchRay;
-use tiface::kernel::cpu::rng;
 use tiface::kernel::cpu::vm::mask::{BoxMask, Lattice};
 use tiface::kernel::cpu::vm::{self, DecoderShape, Grid, PLANE_AXES, Shading, VmField};
+use tiface::math::rng;
 
 /// Extent of the published box, world units.
 const EXTENT: [f32; 3] = [3.0, 3.34, 2.0];

@@ -14,8 +14,6 @@ use rayon::prelude::*;
 
 /// A camera prepared for many projections.
 pub(crate) struct Projector {
-    camera_from_world: DMat3,
-    position: DVec3,
     camera: Camera,
     /// Squared ideal radius beyond which the lens model is not trusted: a polynomial folds back.
     reach: f64,
@@ -35,30 +33,18 @@ impl Projector {
                 camera.distortion.undistort(x, y).map(|(x, y)| x * x + y * y)
             })
             .fold(0.0, f64::max);
-        Projector {
-            camera_from_world: camera.rotation.transpose(),
-            position: camera.position,
-            camera: camera.clone(),
-            reach: 1.1 * reach,
-            plain: camera.distortion.is_none(),
-        }
+        Projector { camera: camera.clone(), reach: 1.1 * reach, plain: camera.distortion.is_none() }
     }
 
     /// Picture position and depth; `None` behind the camera or beyond the lens model's reach.
     pub fn project(&self, point: DVec3) -> Option<(f64, f64, f64)> {
-        let p = self.camera_from_world * (point - self.position);
-        let depth = -p.z;
-        if depth <= 1e-9 {
-            return None;
-        }
-        let (mut x, mut y) = (p.x / depth, -p.y / depth);
-        if !self.plain {
-            if x * x + y * y > self.reach {
-                return None;
-            }
-            (x, y) = self.camera.distortion.apply(x, y);
-        }
-        Some((self.camera.fx * x + self.camera.cx, self.camera.fy * y + self.camera.cy, depth))
+        let (ideal, depth) = Camera::ideal(self.camera.local(point))?;
+        let pixel = match self.plain {
+            true => self.camera.pixel_behind_lens(ideal.into()),
+            false if ideal.length_squared() > self.reach => return None,
+            false => self.camera.pixel(ideal),
+        };
+        Some((pixel.x, pixel.y, depth))
     }
 
     /// Returns whether the point is inside the frame.

@@ -11,6 +11,7 @@ use crate::Error;
 use crate::config::MaskMeaning;
 use crate::geom::Aabb;
 use crate::image::Gray;
+use crate::math::rank::median;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -89,8 +90,9 @@ pub struct Range {
 impl Range {
     fn of(values: impl Iterator<Item = f64>) -> Option<Range> {
         let mut v: Vec<f64> = values.collect();
+        let median = median(&mut v, f64::total_cmp)?;
         v.sort_by(f64::total_cmp);
-        Some(Range { min: *v.first()?, median: v[v.len() / 2], max: *v.last()? })
+        Some(Range { min: *v.first()?, median, max: *v.last()? })
     }
 }
 

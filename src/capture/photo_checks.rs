@@ -124,7 +124,7 @@ pub(super) fn findings(photos: &[(&str, PhotoCheck)]) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::cpu::rng::uniform;
+    use crate::math::rng::uniform;
 
     /// A pattern of 96 × 96 pixels with detail at every scale, or a mean of its neighborhoods.
     fn photo(seed: u64, blur: usize) -> Photo {

@@ -23,8 +23,9 @@ pub use well_seen::well_seen;
 use super::carve::{self, Cube, Projector, SilhouetteTable};
 use super::masks::few;
 use crate::error::counted;
-use crate::geom::{Aabb, Camera, Similarity};
+use crate::geom::{Aabb, BitGrid, Camera, Similarity};
 use crate::image::Gray;
+use crate::math::rank::median;
 use crate::{Error, Result};
 use frusta::from_frusta;
 use glam::{DMat3, DQuat, DVec3, Vec3};
@@ -38,48 +39,9 @@ pub struct Scene {
     pub scene_from_world: Similarity,
     /// The tight box in scene coordinates, within [-1, 1]³.
     pub aabb: Aabb,
-    /// The visual hull; `None` without masks.
-    pub hull: Option<Hull>,
-}
-
-/// The visual hull as cells over [-1, 1]³ of the scene; it contains the whole head.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Hull {
-    /// Cells per axis.
-    pub resolution: usize,
-    /// One bit per cell, cell `(x · R + y) · R + z`, lowest bit first.
-    pub bits: Vec<u64>,
-}
-
-impl Hull {
-    fn new(resolution: usize, kept: &[bool]) -> Hull {
-        let mut bits = vec![0u64; kept.len().div_ceil(64)];
-        for (i, _) in kept.iter().enumerate().filter(|(_, k)| **k) {
-            bits[i / 64] |= 1 << (i % 64);
-        }
-        Hull { resolution, bits }
-    }
-
-    /// Returns whether cell `i = (x · R + y) · R + z` is part of the hull.
-    pub fn get(&self, i: usize) -> bool {
-        self.bits[i / 64] >> (i % 64) & 1 == 1
-    }
-
-    /// Returns the number of cells in the hull.
-    pub fn count(&self) -> usize {
-        self.bits.iter().map(|b| b.count_ones() as usize).sum()
-    }
-
-    /// Returns whether a point in scene coordinates is in a cell of the hull.
-    pub fn contains(&self, point: Vec3) -> bool {
-        if !Aabb::SCENE.contains(point) {
-            return false;
-        }
-        let r = self.resolution;
-        let cell = (point + 1.0) * 0.5 * r as f32;
-        let [x, y, z] = cell.to_array().map(|c| (c as usize).min(r - 1));
-        self.get((x * r + y) * r + z)
-    }
+    /// The visual hull as cells over [-1, 1]³ of the scene, which contains the whole head; `None`
+    /// without masks.
+    pub hull: Option<BitGrid>,
 }
 
 /// Mask values above this may be head; low, so that soft hair is not carved away.
@@ -269,9 +231,7 @@ fn fit_axes(
     };
 
     let (alone, total) = word;
-    let mut sorted = alone.clone();
-    sorted.sort_unstable();
-    let median = sorted[sorted.len() / 2];
+    let median = median(&mut alone.clone(), u64::cmp).unwrap_or(0);
     for (s, &count) in silhouettes.iter().zip(&alone) {
         // with few views each one rightly removes a lot; a wrong one stands out from the others too
         if 4 * count > total && count > 4 * median {
@@ -289,7 +249,7 @@ fn fit_axes(
         let at = [i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n];
         *cell &= at.iter().zip(&extent).all(|(&v, &(lo, hi))| v + air >= lo && v <= hi + air);
     }
-    let hull = Hull::new(cube.n, &kept);
+    let hull = BitGrid::from_cells(cube.n, &kept);
     let scene_coordinate = |cells: f64| (2.0 * cells / cube.n as f64 - 1.0).clamp(-1.0, 1.0) as f32;
     let aabb = Aabb {
         min: Vec3::from(extent.map(|(lo, _)| scene_coordinate(lo as f64 - margin))),

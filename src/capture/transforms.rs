@@ -12,7 +12,7 @@ mod moments;
 mod pose;
 mod splits;
 
-pub(crate) use lens::camera_like;
+pub(super) use lens::camera_like;
 
 use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, CameraFrame, Listing};

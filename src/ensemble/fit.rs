@@ -152,7 +152,7 @@ mod tests {
     use super::*;
     use crate::ensemble::{Member, PAPER_WEIGHTS, blend};
     use crate::image::{Gray, Image, Photo, quantize};
-    use crate::kernel::cpu::rng::{normal, uniform};
+    use crate::math::rng::{normal, uniform};
 
     const SIZE: u32 = 64;
     const PIXELS: usize = (SIZE * SIZE) as usize;

@@ -1,39 +1,7 @@
-//! Small dense least squares: Cholesky, and the quadratic of least value on the simplex.
+//! The quadratic of least value on the simplex.
 
 use super::MAX_MEMBERS;
-
-/// Factors the symmetric positive definite `a` (`[n · n]`, its lower half is read) in place, A = LLᵀ.
-/// False where it is not positive definite.
-fn factor(a: &mut [f64], n: usize) -> bool {
-    for j in 0..n {
-        for i in j..n {
-            let dot: f64 = (0..j).map(|k| a[i * n + k] * a[j * n + k]).sum();
-            let rest = a[i * n + j] - dot;
-            if i == j {
-                // also false for NaN
-                if !(rest > 0.0 && rest.is_finite()) {
-                    return false;
-                }
-                a[i * n + j] = rest.sqrt();
-            } else {
-                a[i * n + j] = rest / a[j * n + j];
-            }
-        }
-    }
-    true
-}
-
-/// Solves A x = b in place with the factor of A.
-fn substitute(l: &[f64], n: usize, x: &mut [f64]) {
-    for i in 0..n {
-        let dot: f64 = (0..i).map(|k| l[i * n + k] * x[k]).sum();
-        x[i] = (x[i] - dot) / l[i * n + i];
-    }
-    for i in (0..n).rev() {
-        let dot: f64 = (i + 1..n).map(|k| l[k * n + i] * x[k]).sum();
-        x[i] = (x[i] - dot) / l[i * n + i];
-    }
-}
+use crate::math::cholesky::{factor, substitute};
 
 /// `argmin ½ wᵀHw − gᵀw` with `w ≥ 0`, `Σ w = 1`; H `[n · n]` symmetric positive definite, n ≤ 8.
 ///
@@ -86,8 +54,8 @@ fn on_face(h: &[f64], g: &[f64], on: &[usize]) -> Option<[f64; MAX_MEMBERS]> {
     if !factor(&mut a, m) {
         return None;
     }
-    substitute(&a, m, &mut x[..m]);
-    substitute(&a, m, &mut y[..m]);
+    substitute(&a, &mut x[..m]);
+    substitute(&a, &mut y[..m]);
     let nu = (1.0 - x[..m].iter().sum::<f64>()) / y[..m].iter().sum::<f64>();
     for i in 0..m {
         x[i] += nu * y[i];
@@ -98,18 +66,7 @@ fn on_face(h: &[f64], g: &[f64], on: &[usize]) -> Option<[f64; MAX_MEMBERS]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::cpu::rng::uniform;
-
-    #[test]
-    fn cholesky_solves_a_system_worked_by_hand() {
-        // [4 2; 2 5] x = [8; 14]  →  x = (12/16, 40/16) = (0.75, 2.5)
-        let mut a = [4.0, 2.0, 2.0, 5.0];
-        assert!(factor(&mut a, 2));
-        let mut x = [8.0, 14.0];
-        substitute(&a, 2, &mut x);
-        assert!((x[0] - 0.75).abs() < 1e-14 && (x[1] - 2.5).abs() < 1e-14);
-        assert!(!factor(&mut [1.0, 2.0, 2.0, 1.0], 2)); // determinant −3
-    }
+    use crate::math::rng::uniform;
 
     #[test]
     fn the_nearest_point_of_the_simplex_is_found_inside_on_an_edge_and_in_a_corner() {

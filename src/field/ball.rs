@@ -1,9 +1,8 @@
 //! Photographs of an analytic ball, the training data of self-tests and tests.
 
 use super::pixels::TrainView;
-use crate::geom::{Camera, Distortion};
+use crate::geom::{BitGrid, Camera, Distortion};
 use crate::image::{Gray, Photo};
-use crate::kernel::cpu::march::Bitmask;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 
 /// Radius of the ball, scene units.
@@ -59,14 +58,14 @@ pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8
 }
 
 /// Returns the cells that contain the ball, with a margin of 0.1.
-pub fn hull() -> Bitmask {
+pub fn hull() -> BitGrid {
     cells_within(BALL + 0.1)
 }
 
 /// Returns the cells whose centers lie within a radius.
-pub fn cells_within(radius: f32) -> Bitmask {
+pub fn cells_within(radius: f32) -> BitGrid {
     let r = 32;
-    let mut cells = Bitmask::filled(r, false);
+    let mut cells = BitGrid::filled(r, false);
     for i in 0..r * r * r {
         let c = Vec3::from_array([i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) / 16.0 - 1.0));
         cells.set(i, c.length() < radius);

@@ -7,7 +7,7 @@ use crate::field::training::TrainingSession;
 #[cfg(feature = "wgpu")]
 use crate::geom::{Ray, RayResult};
 use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 use crate::{Monitor, Quiet, Result};
 #[cfg(feature = "wgpu")]
 use glam::Vec2;

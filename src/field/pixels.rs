@@ -11,12 +11,12 @@ use super::soft_pixels::{SoftPixels, soft_pixels};
 use super::training::StepAt;
 use crate::config::iface::Foreground;
 use crate::geom::{Camera, Ray};
-use crate::image::{Gray, Photo};
+use crate::image::{Gray, Photo, dilated};
 use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::rng;
 use crate::kernel::cpu::vm::mask::crossing;
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu;
+use crate::math::rng;
 use glam::Vec2;
 use rayon::prelude::*;
 
@@ -412,7 +412,7 @@ fn drawable(view: &TrainView, reach: Option<f32>) -> Drawable {
         // The reach in pixels is largest at the nearest part of the box, at most one unit closer than its center.
         let distance = (view.camera.position.length() - 1.0).max(0.2);
         let margin = (reach as f64 * view.camera.fx.max(view.camera.fy) / distance).ceil() as usize + 1;
-        in_reach = dilated(&mask.values, w, h, margin);
+        in_reach = dilated(mask.values.iter().map(|&v| v > 0).collect(), w, h, margin, margin);
     }
     if let Some(valid) = &view.valid {
         in_reach.iter_mut().zip(&valid.values).for_each(|(n, &v)| *n &= v != 0);
@@ -425,24 +425,6 @@ fn drawable(view: &TrainView, reach: Option<f32>) -> Drawable {
         (x0, y0, x1, y1) = (x0.min(x), y0.min(y), x1.max(x), y1.max(y));
     }
     (x0, y0, x1, y1, bits)
-}
-
-/// Returns the pixels with a non-zero value within a square of half edge `margin`, by two one-dimensional passes.
-fn dilated(values: &[u8], w: usize, h: usize, margin: usize) -> Vec<bool> {
-    let mut in_reach: Vec<bool> = values.iter().map(|&v| v > 0).collect();
-    for (lines, step, n, stride) in [(h, w, w, 1), (w, 1, h, w)] {
-        for first in (0..lines).map(|line| line * step) {
-            // A marked pixel marks `margin` pixels on both sides; starting at `done` avoids marking any twice.
-            let marked: Vec<usize> = (0..n).filter(|i| in_reach[first + i * stride]).collect();
-            let mut done = 0;
-            for i in marked {
-                let end = (i + margin + 1).min(n);
-                (i.saturating_sub(margin).max(done)..end).for_each(|k| in_reach[first + k * stride] = true);
-                done = end;
-            }
-        }
-    }
-    in_reach
 }
 
 /// Returns the background color of each ray, used for both target and render: random colors from the given random

@@ -32,6 +32,7 @@ impl Effort {
     }
 
     /// Spends, or returns false from the first time that too little is left.
+    #[inline]
     pub(crate) fn spend(&mut self, cost: usize) -> bool {
         self.short |= self.left < cost;
         self.left = if self.short { 0 } else { self.left - cost };
@@ -95,6 +96,7 @@ impl DBox {
         points.into_iter().fold(DBox::EMPTY, |s, p| DBox { low: s.low.min(p), high: s.high.max(p) })
     }
 
+    #[inline]
     pub(crate) fn grown(self, margin: f64) -> DBox {
         DBox { low: self.low - margin, high: self.high + margin }
     }

@@ -5,7 +5,7 @@
 
 use super::ray::Ray;
 use super::similarity::Similarity;
-use glam::{DMat3, DVec3, Vec2, Vec3};
+use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
 /// Projection of a lens: the radius of the angle θ from its axis, before the distortion coefficients.
@@ -95,11 +95,13 @@ const MAX_ANGLE: f64 = std::f64::consts::FRAC_PI_2 - 1e-3;
 
 impl Distortion {
     /// Returns whether all coefficients are zero.
+    #[inline]
     pub fn is_none(&self) -> bool {
         *self == Distortion::default()
     }
 
     /// Ideal normalized coordinates (OpenCV: y down) to distorted ones.
+    #[inline]
     pub fn apply(&self, x: f64, y: f64) -> (f64, f64) {
         match self.projection {
             Projection::Perspective => self.bend(x, y),
@@ -111,6 +113,7 @@ impl Distortion {
     }
 
     /// r / tan θ of a projection.
+    #[inline]
     fn radius_over_tangent(&self, projection: Projection, tangent: f64) -> f64 {
         let small = tangent < 1e-9;
         match projection {
@@ -145,6 +148,7 @@ impl Distortion {
     }
 
     /// Returns the radial factor at r², and its derivative by r².
+    #[inline]
     fn radial(&self, r2: f64) -> (f64, f64) {
         if self.projection == Projection::Fisheye {
             let factor = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)));
@@ -160,6 +164,7 @@ impl Distortion {
     }
 
     /// Returns the distorted position of a projected point.
+    #[inline]
     fn bend(&self, x: f64, y: f64) -> (f64, f64) {
         let r2 = x * x + y * y;
         let (radial, _) = self.radial(r2);
@@ -283,14 +288,11 @@ impl Camera {
     /// camera.
     ///
     /// ```
-    /// use glam::{DMat3, DVec3, Vec2, Vec3};
-    /// use tiface::geom::{Camera, Distortion};
+    /// use glam::{Vec2, Vec3};
+    /// use tiface::geom::Camera;
     ///
     /// // two units before the origin, looking along -Z
-    /// let (rotation, position) = (DMat3::IDENTITY, DVec3::new(0.0, 0.0, 2.0));
-    /// let (fx, fy, cx, cy) = (100.0, 100.0, 40.0, 30.0);
-    /// let distortion = Distortion::default();
-    /// let camera = Camera { width: 80, height: 60, fx, fy, cx, cy, distortion, rotation, position };
+    /// let camera = Camera::above(80, 60, 100.0, 2.0);
     ///
     /// let (pixel, depth) = camera.project(Vec3::new(0.5, 0.25, 0.0)).unwrap();
     /// assert_eq!((pixel, depth), (Vec2::new(65.0, 17.5), 2.0)); // y points down in pictures
@@ -300,17 +302,50 @@ impl Camera {
     /// let t = 2.0 / -ray.direction.z;
     /// assert!((ray.origin + t * ray.direction).distance(Vec3::new(0.5, 0.25, 0.0)) < 1e-6);
     /// ```
+    #[inline]
     pub fn project(&self, point: Vec3) -> Option<(Vec2, f32)> {
-        let p = self.rotation.transpose() * (point.as_dvec3() - self.position);
-        if p.z >= -1e-9 {
+        let (pixel, depth) = self.project_f64(point.as_dvec3())?;
+        Some((pixel.as_vec2(), depth as f32))
+    }
+
+    /// Returns what [`Self::project`] returns, in f64.
+    #[inline]
+    pub fn project_f64(&self, point: DVec3) -> Option<(DVec2, f64)> {
+        let (ideal, depth) = Camera::ideal(self.local(point))?;
+        Some((self.pixel(ideal), depth))
+    }
+
+    /// Returns a point of the world in the axes of the camera: right, up, backwards.
+    #[inline]
+    pub fn local(&self, point: DVec3) -> DVec3 {
+        self.rotation.transpose() * (point - self.position)
+    }
+
+    /// Returns the ideal normalized coordinates (y down) of a point in the axes of a camera, and its
+    /// distance along the viewing axis; `None` behind the camera.
+    #[inline]
+    pub fn ideal(local: DVec3) -> Option<(DVec2, f64)> {
+        let depth = -local.z;
+        if depth <= 1e-9 {
             return None;
         }
-        let (x, y) = self.distortion.apply(p.x / -p.z, -p.y / -p.z);
-        let pixel = Vec2::new((self.fx * x + self.cx) as f32, (self.fy * y + self.cy) as f32);
-        Some((pixel, -p.z as f32))
+        Some((DVec2::new(local.x / depth, -local.y / depth), depth))
+    }
+
+    /// Returns the picture position of ideal normalized coordinates.
+    #[inline]
+    pub fn pixel(&self, ideal: DVec2) -> DVec2 {
+        self.pixel_behind_lens(self.distortion.apply(ideal.x, ideal.y))
+    }
+
+    /// Returns the picture position of normalized coordinates that the lens has distorted.
+    #[inline]
+    pub fn pixel_behind_lens(&self, (x, y): (f64, f64)) -> DVec2 {
+        DVec2::new(self.fx * x + self.cx, self.fy * y + self.cy)
     }
 
     /// Returns the direction the camera looks in.
+    #[inline]
     pub fn forward(&self) -> Vec3 {
         (-self.rotation.z_axis).as_vec3()
     }
@@ -343,12 +378,10 @@ impl Camera {
             ..self.clone()
         }
     }
-}
 
-#[cfg(test)]
-impl Camera {
-    /// For tests: at (0, 0, z), looking along −Z, up +Y, without distortion.
-    pub(crate) fn above(width: u32, height: u32, focal: f64, z: f64) -> Camera {
+    /// Returns a camera at (0, 0, z) that looks along −Z, with +Y up, without distortion and with the
+    /// middle of the picture as principal point.
+    pub fn above(width: u32, height: u32, focal: f64, z: f64) -> Camera {
         Camera {
             width,
             height,

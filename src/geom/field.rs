@@ -63,31 +63,3 @@ impl<F: Fn(Vec3) -> f32 + Sync> SdfField for F {
         vec![[0.5; 3]; directions.len()]
     }
 }
-
-/// A shape with colors of its own, for tests.
-#[cfg(test)]
-pub(crate) struct Painted<S, C> {
-    /// The signed distance.
-    pub shape: S,
-    /// As [`SdfField::colors`].
-    pub paint: C,
-}
-
-#[cfg(test)]
-impl<S, C> SdfField for Painted<S, C>
-where
-    S: SdfField,
-    C: Fn(&[Vec3], &[Vec3], &[u32], &[Vec3]) -> Vec<[f32; 3]> + Sync,
-{
-    fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
-        self.shape.sdf(points)
-    }
-
-    fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
-        self.shape.sdf_gradient(points)
-    }
-
-    fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], d: &[Vec3]) -> Vec<[f32; 3]> {
-        (self.paint)(points, normals, counts, d)
-    }
-}

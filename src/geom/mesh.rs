@@ -21,11 +21,13 @@ pub struct Mesh {
 }
 
 /// Returns twice the area of a triangle along its normal.
+#[inline]
 pub(crate) fn area_vector([a, b, c]: [Vec3; 3]) -> Vec3 {
     (b - a).cross(c - a)
 }
 
 /// Returns the shape of a triangle, 1 for equilateral, 0 for none: `4 √3 area / Σ length²`.
+#[inline]
 pub(crate) fn shape([a, b, c]: [Vec3; 3]) -> f32 {
     let sum = (b - a).length_squared() + (c - b).length_squared() + (a - c).length_squared();
     if sum > 0.0 { 2.0 * 3f32.sqrt() * area_vector([a, b, c]).length() / sum } else { 0.0 }
@@ -38,6 +40,7 @@ impl Mesh {
     }
 
     /// Returns the three corners of a triangle.
+    #[inline]
     pub fn corners(&self, triangle: u32) -> [Vec3; 3] {
         self.triangles[triangle as usize].map(|i| self.positions[i as usize])
     }
@@ -83,22 +86,26 @@ impl Mesh {
 
     /// Returns the unit normal of a point of a triangle, interpolated between its vertices; `None` without normals, or where
     /// they cancel.
+    #[inline]
     pub fn normal_at(&self, hit: &Hit) -> Option<Vec3> {
         let corners = self.triangles[hit.triangle as usize];
         hit.mix(corners.map(|v| self.normals.get(v as usize).copied().unwrap_or_default())).try_normalize()
     }
 
     /// Returns the same, or the triangle's own normal.
+    #[inline]
     pub fn shading_normal(&self, hit: &Hit) -> Vec3 {
         self.normal_at(hit).unwrap_or_else(|| area_vector(self.corners(hit.triangle)).normalize_or_zero())
     }
 
     /// Returns the position of a point of a triangle.
+    #[inline]
     pub fn point_at(&self, hit: &Hit) -> Vec3 {
         hit.mix(self.corners(hit.triangle))
     }
 
     /// Returns the color of a point of a triangle, interpolated between its vertices; black without colors.
+    #[inline]
     pub fn color_at(&self, hit: &Hit) -> [f32; 3] {
         let color = |v: u32| Vec3::from(self.colors.get(v as usize).copied().unwrap_or_default());
         hit.mix(self.triangles[hit.triangle as usize].map(color)).to_array()
@@ -150,6 +157,7 @@ pub struct Atlas {
 
 impl Atlas {
     /// Returns the corners of a triangle, in texels: (0, 0) is the top left corner of the top left texel.
+    #[inline]
     pub fn corners(&self, triangle: u32) -> [Vec2; 3] {
         let size = Vec2::new(self.width as f32, self.height as f32);
         self.triangles[triangle as usize].map(|i| self.uvs[i as usize] * size)
@@ -158,6 +166,7 @@ impl Atlas {
 
 /// Returns the texels that a bilinear look-up mixes, row-major, and their weights. `at` is in texels, whose centers are at
 /// whole numbers here; beyond the border the picture continues.
+#[inline]
 pub(crate) fn bilinear_taps(at: Vec2, [width, height]: [u32; 2]) -> [(u32, f32); 4] {
     let along = |p: f32, n: u32| {
         let p = p.clamp(0.0, (n - 1) as f32);

@@ -12,6 +12,7 @@ use glam::{DVec2, DVec3, Vec2};
 use rayon::prelude::*;
 
 /// On which side of the line a → b is c: 1 where (b − a) × (c − a) is positive, −1 where negative, 0 on it.
+#[inline]
 pub(crate) fn turn(a: Vec2, b: Vec2, c: Vec2) -> i32 {
     let coord = |v: Vec2| robust::Coord { x: f64::from(v.x), y: f64::from(v.y) };
     let area = robust::orient2d(coord(a), coord(b), coord(c));

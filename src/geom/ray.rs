@@ -19,6 +19,7 @@ pub struct Ray {
 
 impl Ray {
     /// Returns the point at parameter `t`.
+    #[inline]
     pub fn at(&self, t: f32) -> Vec3 {
         self.origin + t * self.direction
     }
@@ -52,11 +53,13 @@ pub struct Hit {
 
 impl Hit {
     /// Returns the weights of the triangle's vertices.
+    #[inline]
     pub fn weights(&self) -> [f32; 3] {
         [1.0 - self.u - self.v, self.u, self.v]
     }
 
     /// Interpolates values at the triangle's vertices.
+    #[inline]
     pub fn mix<T: Add<Output = T>>(&self, [a, b, c]: [T; 3]) -> T
     where
         f32: Mul<T, Output = T>,
@@ -88,37 +91,44 @@ impl Aabb {
     }
 
     /// This box, grown to hold `point`.
+    #[inline]
     pub fn with(self, point: Vec3) -> Aabb {
         Aabb { min: self.min.min(point), max: self.max.max(point) }
     }
 
     /// Grown by `margin` on every side.
+    #[inline]
     pub fn grown(self, margin: f32) -> Aabb {
         Aabb { min: self.min - margin, max: self.max + margin }
     }
 
     /// Edge lengths.
+    #[inline]
     pub fn size(self) -> Vec3 {
         self.max - self.min
     }
 
     /// Returns the middle.
+    #[inline]
     pub fn center(self) -> Vec3 {
         0.5 * (self.min + self.max)
     }
 
     /// Returns whether it holds no point.
+    #[inline]
     pub fn is_empty(self) -> bool {
         self.min.cmpgt(self.max).any()
     }
 
     /// Returns whether `point` is inside or on the border.
+    #[inline]
     pub fn contains(self, point: Vec3) -> bool {
         point.cmpge(self.min).all() && point.cmple(self.max).all()
     }
 
     /// Returns the parameters at which the line `origin + t · direction` enters and leaves, if it meets the
     /// box at any `t` (negative ones included). Zero direction components are handled.
+    #[inline]
     pub fn intersect(self, origin: Vec3, direction: Vec3) -> Option<(f32, f32)> {
         let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
         for axis in 0..3 {

@@ -25,11 +25,13 @@ pub struct ShellLayer {
 
 impl ShellLayer {
     /// Returns whether a triangle of these vertices belongs to the layer.
+    #[inline]
     pub fn has(&self, triangle: &[u32; 3]) -> bool {
         triangle.iter().any(|&v| self.alphas[v as usize] > 0.0)
     }
 
     /// Returns the opacity at a point of a triangle of these vertices.
+    #[inline]
     pub fn alpha(&self, hit: &Hit, triangle: [u32; 3]) -> f32 {
         hit.mix(triangle.map(|v| self.alphas[v as usize]))
     }

@@ -43,16 +43,19 @@ impl Similarity {
     }
 
     /// Transforms a point.
+    #[inline]
     pub fn point(&self, p: Vec3) -> Vec3 {
         (self.scale * (self.rotation * p.as_dvec3()) + self.translation).as_vec3()
     }
 
     /// Transforms a point in f64.
+    #[inline]
     pub fn point_f64(&self, p: DVec3) -> DVec3 {
         self.scale * (self.rotation * p) + self.translation
     }
 
     /// Rotates a direction; its length is kept, so unit vectors and normals stay unit.
+    #[inline]
     pub fn direction(&self, d: Vec3) -> Vec3 {
         self.rotation.as_mat3() * d
     }

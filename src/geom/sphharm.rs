@@ -12,6 +12,7 @@ pub const Y0: f32 = 0.282_094_79;
 pub const COEFFICIENTS_OF_DEGREE_2: usize = 9;
 
 /// Returns the number of functions up to a degree.
+#[inline]
 pub fn functions(degree: u32) -> usize {
     ((degree + 1) * (degree + 1)) as usize
 }
@@ -43,6 +44,7 @@ pub fn sh16([x, y, z]: [f32; 3]) -> [f32; 16] {
 }
 
 /// `Σ_k c_k Y_k(d)` of up to 16 coefficients, per channel.
+#[inline]
 pub fn combine(coefficients: &[[f32; 3]], d: [f32; 3]) -> [f32; 3] {
     let mut out = [0f32; 3];
     for (c, y) in coefficients.iter().zip(sh16(d)) {
@@ -86,6 +88,7 @@ pub struct Harmonics {
 impl Harmonics {
     /// Returns what is added where a ray along the unit `direction`, away from the camera, met the triangle of these
     /// vertices.
+    #[inline]
     pub fn seen_along(&self, direction: Vec3, hit: &Hit, triangle: [u32; 3]) -> [f32; 3] {
         let d = (self.turned * -direction).to_array();
         let of = |v: u32| &self.coefficients[v as usize * self.functions..][..self.functions];

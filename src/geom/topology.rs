@@ -74,6 +74,7 @@ impl Sets {
     }
 
     /// Returns the smallest member of `i`'s set.
+    #[inline]
     pub(crate) fn find(&mut self, mut i: u32) -> u32 {
         while self.0[i as usize] != i {
             let up = self.0[self.0[i as usize] as usize];
@@ -83,6 +84,7 @@ impl Sets {
         i
     }
 
+    #[inline]
     pub(crate) fn join(&mut self, a: u32, b: u32) {
         let (a, b) = (self.find(a), self.find(b));
         self.0[a.max(b) as usize] = a.min(b);
@@ -107,6 +109,7 @@ pub(crate) fn sorted_sides(triangles: &[[u32; 3]]) -> Vec<(u64, u32)> {
 }
 
 /// Returns the vertices at which the side of a corner starts and ends.
+#[inline]
 pub(crate) fn side_ends(triangles: &[[u32; 3]], corner: u32) -> (u32, u32) {
     let (t, k) = (triangles[corner as usize / 3], corner as usize % 3);
     (t[k], t[(k + 1) % 3])

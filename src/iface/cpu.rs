@@ -20,7 +20,8 @@ use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::neus::{self, Rays};
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::sdf::{self, Activations, FieldShape, WIDTH};
-use crate::kernel::cpu::{rng, weight_norm};
+use crate::kernel::cpu::weight_norm;
+use crate::math::rng;
 
 /// The operations of [`SdfOps`] on the CPU.
 pub struct CpuSdf<'a> {

@@ -26,11 +26,12 @@ use crate::field::{self as fields, ComputeDevice};
 use crate::field::{Check, self_test::TestedModel};
 use crate::kernel::cpu::adam::AdamStep;
 use crate::kernel::cpu::density::DensityShape;
+use crate::kernel::cpu::hash;
 use crate::kernel::cpu::losses::TERMS;
 use crate::kernel::cpu::schedule::Figures;
-use crate::kernel::cpu::{hash, rng};
 #[cfg(feature = "wgpu")]
 use crate::kernel::gpu::Adapter;
+use crate::math::rng;
 use crate::{Error, Result};
 use cpu::CpuDensity;
 #[cfg(feature = "wgpu")]

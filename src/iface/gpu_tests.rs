@@ -14,8 +14,8 @@ use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::field::ops::ArrayDevice;
 use crate::field::pixels::TrainView;
 use crate::field::training::{self, Model, TrainingSession};
+use crate::geom::BitGrid;
 use crate::iface::{IFace, IfaceReport, train};
-use crate::kernel::cpu::march::Bitmask;
 use crate::kernel::gpu::tests::{device, devices};
 use crate::{Monitor, Quiet};
 use std::path::Path;
@@ -75,7 +75,7 @@ fn on<'a>(device: &'a str, dir: &'a Path, monitor: &'a dyn Monitor) -> TrainingS
 fn begun<'a, O: SdfOps>(
     ops: O,
     pixels: &'a Pixels<'a>,
-    hull: Option<&'a Bitmask>,
+    hull: Option<&'a BitGrid>,
     config: &'a IfaceConfig,
     session: &TrainingSession<'a>,
 ) -> SdfModel<'a, O> {
@@ -247,7 +247,7 @@ fn cells_are_those_that_the_cpu_keeps() {
     on_gpu.ops.update_occupancy(&on_gpu.groups, schedule::active_levels(&config, 7), at);
     assert_eq!(on_gpu.ops.device.counts().1, before, "something was read back");
     let Occupancy { occupied, solid, .. } = on_gpu.state().unwrap().occupancy;
-    let differ = |a: &Bitmask, b: &Bitmask| (0..64_000).filter(|&i| a.get(i) != b.get(i)).count();
+    let differ = |a: &BitGrid, b: &BitGrid| (0..64_000).filter(|&i| a.get(i) != b.get(i)).count();
     println!("{} cells to march, {} solid", want.occupied.count(), want.solid.count());
     assert!(want.occupied.count() > 1000 && want.solid.count() > 100);
     // those whose distance is the band's but for rounding

@@ -11,12 +11,13 @@ use crate::Error;
 use crate::config::iface::IfaceConfig;
 use crate::field::parameters::Part;
 use crate::field::training::{StepError, TrainingSession};
+use crate::geom::BitGrid;
 use crate::kernel::cpu::adam::adam;
-use crate::kernel::cpu::distance::LowerEnvelope;
 use crate::kernel::cpu::losses::{self, LossWeights};
-use crate::kernel::cpu::march::Bitmask;
 use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
-use crate::kernel::cpu::{rng, weight_norm};
+use crate::kernel::cpu::weight_norm;
+use crate::math::distance::LowerEnvelope;
+use crate::math::rng;
 use rayon::prelude::*;
 
 /// Signed distance to a hull's boundary at cell centers, in units of the box's half edge; negative inside.
@@ -55,7 +56,7 @@ fn distance(resolution: usize, seeds: impl Fn(usize) -> bool + Sync) -> Vec<f32>
 
 impl HullDistance {
     /// Computes the distance from a hull; everything beyond the box counts as outside.
-    pub fn new(hull: &Bitmask) -> HullDistance {
+    pub fn new(hull: &BitGrid) -> HullDistance {
         let r = hull.resolution;
         let border = |i: usize| [i / (r * r), i / r % r, i % r].iter().any(|&c| c == 0 || c == r - 1);
         let inside = |i: usize| hull.get(i) && !border(i);
@@ -94,7 +95,7 @@ impl HullDistance {
 /// hull's boundary.
 pub fn fit_hull(
     state: &mut SdfState,
-    hull: &Bitmask,
+    hull: &BitGrid,
     config: &IfaceConfig,
     session: &TrainingSession,
 ) -> Result<(), StepError> {
@@ -175,7 +176,7 @@ mod tests {
     #[test]
     fn the_distance_to_a_ball_of_cells_is_that_of_the_ball() {
         let r = 48;
-        let mut hull = Bitmask::filled(r, false);
+        let mut hull = BitGrid::filled(r, false);
         let center =
             |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) / (0.5 * r as f32) - 1.0);
         let norm = |p: [f32; 3]| (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt();

@@ -8,9 +8,9 @@ use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::field::{ComputeDevice, GpuField};
-use crate::geom::{Ray, RayResult, SdfField};
+use crate::geom::{BitGrid, Ray, RayResult, SdfField};
 use crate::io::Lock;
-use crate::kernel::cpu::march::{Bitmask, MarchRay};
+use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::neus::{self, Rays};
 use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
@@ -81,7 +81,7 @@ impl IFace {
     }
 
     /// Loads the field from the checkpoint in a stage folder. `config` and `hull` must be the training's.
-    pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&Bitmask>) -> Result<IFace> {
+    pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&BitGrid>) -> Result<IFace> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
         TrainingProgress::restore(&file, config.steps)?;
         let state = SdfState::restore(parts(config), config, hull, &mut file)?;

@@ -15,8 +15,8 @@ use crate::config::iface::IfaceConfig;
 use crate::field::parameters::{HostGroup, Part};
 use crate::kernel::cpu::hash;
 use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS};
-use crate::kernel::cpu::rng;
 use crate::kernel::cpu::sdf::FieldShape;
+use crate::math::rng;
 
 /// Returns the shape of the field that a configuration describes.
 pub fn shape(config: &IfaceConfig) -> FieldShape {

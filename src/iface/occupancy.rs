@@ -3,7 +3,8 @@
 use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::Checkpoint;
-use crate::kernel::cpu::march::{self, Bitmask, MarchRay, Samples};
+use crate::geom::BitGrid;
+use crate::kernel::cpu::march::{self, MarchRay, Samples};
 use crate::kernel::cpu::neus;
 use crate::kernel::cpu::occupancy::{self, BandRule};
 use rayon::prelude::*;
@@ -12,11 +13,11 @@ use rayon::prelude::*;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Occupancy {
     /// Cells to march through.
-    pub occupied: Bitmask,
+    pub occupied: BitGrid,
     /// Cells deep inside, where rays end (`band` rule only; empty under `nerfacc`).
-    pub solid: Bitmask,
+    pub solid: BitGrid,
     /// Cells that may ever be occupied: the visual hull, or all.
-    allowed: Bitmask,
+    allowed: BitGrid,
     /// Decaying maximum of the opacity (`nerfacc` rule), `[cells]`.
     pub history: Vec<f32>,
 }
@@ -27,8 +28,8 @@ pub fn band(config: &IfaceConfig) -> BandRule {
 }
 
 /// Resamples `hull` to another resolution: a cell is set if it overlaps a set cell.
-fn resampled(hull: &Bitmask, resolution: usize) -> Bitmask {
-    let mut out = Bitmask::filled(resolution, false);
+fn resampled(hull: &BitGrid, resolution: usize) -> BitGrid {
+    let mut out = BitGrid::filled(resolution, false);
     let n = hull.resolution;
     // the range of hull cells that overlap cell i of the new grid
     let span = |i: usize| (i * n / resolution)..=(((i + 1) * n).div_ceil(resolution) - 1).min(n - 1);
@@ -46,14 +47,14 @@ fn resampled(hull: &Bitmask, resolution: usize) -> Bitmask {
 impl Occupancy {
     /// Marks all cells of the hull as occupied, or all cells without a hull. The `band` rule adds one layer of cells:
     /// rays would otherwise enter a surface learned slightly outside the hull from its inside, which renders as a hole.
-    pub fn new(config: &IfaceConfig, hull: Option<&Bitmask>) -> Occupancy {
+    pub fn new(config: &IfaceConfig, hull: Option<&BitGrid>) -> Occupancy {
         let r = config.occupancy_resolution;
         // The published system does not use a hull.
         let hull = hull.filter(|_| config.occupancy == OccupancyRule::Band);
         let allowed = match hull {
             Some(hull) if hull.resolution == r => hull.clone(),
             Some(hull) => resampled(hull, r),
-            None => Bitmask::filled(r, true),
+            None => BitGrid::filled(r, true),
         };
         let allowed = match config.occupancy {
             OccupancyRule::Band => allowed.grown(),
@@ -63,7 +64,7 @@ impl Occupancy {
             OccupancyRule::Band => Vec::new(),
             OccupancyRule::Nerfacc => vec![0.0; r * r * r],
         };
-        Occupancy { occupied: allowed.clone(), solid: Bitmask::filled(r, false), allowed, history }
+        Occupancy { occupied: allowed.clone(), solid: BitGrid::filled(r, false), allowed, history }
     }
 
     /// Writes cells and their history into a checkpoint.
@@ -87,7 +88,7 @@ impl Occupancy {
                 continue;
             }
             let bits = from.words(name)?;
-            *mask = Bitmask::from_words(mask.resolution, bits)
+            *mask = BitGrid::from_words(mask.resolution, bits)
                 .ok_or_else(|| from.mismatch(format!("tensor `{name}` has another size")))?;
         }
         Ok(())
@@ -95,7 +96,7 @@ impl Occupancy {
 
     /// Returns the cells that may ever be marched through.
     #[cfg(feature = "wgpu")]
-    pub fn allowed(&self) -> &Bitmask {
+    pub fn allowed(&self) -> &BitGrid {
         &self.allowed
     }
 
@@ -181,7 +182,7 @@ mod tests {
     #[test]
     fn cells_outside_the_hull_never_come_back() {
         let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::preset(Preset::Draft) };
-        let mut hull = Bitmask::filled(8, true);
+        let mut hull = BitGrid::filled(8, true);
         (0..512).filter(|i| i / 64 < 4).for_each(|i| hull.set(i, false));
         let mut o = Occupancy::new(&config, Some(&hull));
         // half of the box is hull, and one layer more is kept

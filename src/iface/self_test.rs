@@ -20,8 +20,9 @@ use crate::field::self_test::{
     CELLS_AT, SEED, TestedModel, compare, compare_cells, compare_values, devices, run_step, session,
 };
 use crate::field::training::StepAt;
-use crate::kernel::cpu::{rng, sdf as on_host};
+use crate::kernel::cpu::sdf as on_host;
 use crate::kernel::gpu::{Adapter, planes};
+use crate::math::rng;
 
 impl<O: SdfOps> TestedModel for SdfModel<'_, O> {
     fn host_groups(&self) -> Result<Vec<HostGroup>> {

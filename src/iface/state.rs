@@ -6,7 +6,7 @@ use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::Checkpoint;
 use crate::field::parameters::{HostGroup, Part};
-use crate::kernel::cpu::march::Bitmask;
+use crate::geom::BitGrid;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::sdf::FieldShape;
 use crate::kernel::cpu::weight_norm;
@@ -31,7 +31,7 @@ pub type SdfState = FieldState<3>;
 
 impl<const GROUPS: usize> FieldState<GROUPS> {
     /// Returns the state before the first step, with the given groups.
-    pub fn start(groups: [HostGroup; GROUPS], config: &IfaceConfig, hull: Option<&Bitmask>) -> Self {
+    pub fn start(groups: [HostGroup; GROUPS], config: &IfaceConfig, hull: Option<&BitGrid>) -> Self {
         let occupancy = Occupancy::new(config, hull);
         FieldState { groups, occupancy, rays: config.rays, stereo: Vec::new() }
     }
@@ -51,7 +51,7 @@ impl<const GROUPS: usize> FieldState<GROUPS> {
     pub fn restore(
         parts: [Vec<Part>; GROUPS],
         config: &IfaceConfig,
-        hull: Option<&Bitmask>,
+        hull: Option<&BitGrid>,
         from: &mut Checkpoint,
     ) -> Result<Self> {
         let mut state =

@@ -13,7 +13,7 @@ use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::neus::Rays;
 use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
 use crate::kernel::cpu::reference::{Real, neus, sdf, wide};
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 
 /// As published, but for the sizes.
 fn paper() -> IfaceConfig {

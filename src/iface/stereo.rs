@@ -13,6 +13,7 @@ use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::sdf::{self, FieldShape};
 use crate::kernel::cpu::stereo::{self, StereoPoint, StereoView, Surfel};
+use crate::math::rank::median;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 
@@ -231,11 +232,7 @@ pub fn points(
     let found = stereo::matches(&stereo_views, &surfels);
     // The median is robust against a few photographs taken from close up.
     let mut footprints: Vec<f32> = found.iter().map(|p| p.footprint).collect();
-    let middle = footprints.len() / 2;
-    if footprints.is_empty() {
-        return Vec::new();
-    }
-    let footprint = *footprints.select_nth_unstable_by(middle, f32::total_cmp).1;
+    let Some(footprint) = median(&mut footprints, f32::total_cmp) else { return Vec::new() };
     let point = |p: StereoPoint| SurfacePoint {
         position: (p.position * config.radius).to_array(),
         footprint: p.footprint * config.radius,

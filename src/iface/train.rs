@@ -18,7 +18,7 @@ use crate::field::parameters::ParameterGroup;
 use crate::field::pixels::{LARGE, Pixels, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self, ComputeDevice};
-use crate::kernel::cpu::march::Bitmask;
+use crate::geom::BitGrid;
 use crate::kernel::cpu::schedule::Figures;
 use crate::{Error, Result};
 use serde::Serialize;
@@ -53,7 +53,7 @@ pub(super) const TERMS: [&str; 5] = ["rgb", "mask", "eikonal", "sparsity", "ster
 pub(super) struct SdfModel<'a, O: SdfOps> {
     pub config: &'a IfaceConfig,
     session: TrainingSession<'a>,
-    hull: Option<&'a Bitmask>,
+    hull: Option<&'a BitGrid>,
     pub pixels: &'a Pixels<'a>,
     pub ops: O,
     pub groups: SdfGroups<O>,
@@ -66,7 +66,7 @@ pub(super) struct SdfModel<'a, O: SdfOps> {
 /// Collects the pixels that training rays are drawn from.
 pub(super) fn pixels<'a>(
     views: &'a [TrainView],
-    hull: Option<&Bitmask>,
+    hull: Option<&BitGrid>,
     config: &IfaceConfig,
 ) -> Result<Pixels<'a>> {
     // Without a hull every ray may meet a sample; with one, occupied cells reach about four cells beyond the outline.
@@ -90,7 +90,7 @@ pub(super) fn pixels<'a>(
 /// `views` have their cameras in scene coordinates; `hull` is the masks' visual hull over the scene's box.
 pub fn train(
     views: &[TrainView],
-    hull: Option<&Bitmask>,
+    hull: Option<&BitGrid>,
     config: &IfaceConfig,
     session: &TrainingSession,
 ) -> Result<(IFace, IfaceReport)> {
@@ -125,7 +125,7 @@ pub fn train(
 fn train_on<O: SdfOps>(
     ops: O,
     pixels: &Pixels,
-    hull: Option<&Bitmask>,
+    hull: Option<&BitGrid>,
     config: &IfaceConfig,
     session: &TrainingSession,
 ) -> Result<(SdfState, TrainingProgress, Vec<String>)> {
@@ -139,7 +139,7 @@ impl<'a, O: SdfOps> SdfModel<'a, O> {
     pub fn new(
         ops: O,
         pixels: &'a Pixels<'a>,
-        hull: Option<&'a Bitmask>,
+        hull: Option<&'a BitGrid>,
         config: &'a IfaceConfig,
         session: &TrainingSession<'a>,
     ) -> SdfModel<'a, O> {

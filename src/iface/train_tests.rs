@@ -160,7 +160,7 @@ fn empty_masks_and_unseen_boxes_do_not_crash() {
     let end = train(&empty, Some(&hull), &config(), &session("iface", dir.path(), "empty", &Quiet));
     assert!(end.err().unwrap().to_string().starts_with("no training view has a pixel"));
     // a hull without a cell: no step meets a sample, and training says so instead of ending well
-    let nothing = Bitmask::filled(32, false);
+    let nothing = BitGrid::filled(32, false);
     let config = small();
     let views = views();
     let end = train(&views, Some(&nothing), &config, &session("iface", dir.path(), "nothing", &Quiet));

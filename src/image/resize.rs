@@ -135,6 +135,7 @@ pub fn resize_hard(mask: &Gray, size: (u32, u32)) -> Gray {
 
 /// Clamps alpha to 0..=1, with values near 0 and 1 set to 0 and 1. First
 /// clamped, then hardened: a learner takes every value but 0 for head, so a stray 1 of 255 costs a pixel.
+#[inline]
 pub fn harden(alpha: f32, lowest: f32, highest: f32) -> f32 {
     match alpha.clamp(0.0, 1.0) {
         a if a < lowest => 0.0,

@@ -4,9 +4,7 @@
 //! owns the memory it writes, and sums over pieces are taken in a fixed order.
 
 pub mod adam;
-pub mod cg;
 pub mod density;
-pub mod distance;
 pub mod hash;
 pub mod losses;
 pub mod march;
@@ -17,7 +15,6 @@ pub mod pool;
 #[cfg(test)]
 #[path = "../../tests/support/reference/mod.rs"]
 pub(crate) mod reference;
-pub mod rng;
 pub mod schedule;
 pub mod sdf;
 pub mod simd;

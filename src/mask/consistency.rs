@@ -165,7 +165,7 @@ impl SilhouetteConstraints {
         let height = rows.clamp(16, mask.height.max(16));
         let width = ((mask.width as f64 * height as f64 / mask.height as f64).round() as u32).max(1);
         let camera = camera.resized(width, height);
-        let on: Vec<bool> = resize_hard(mask, (width, height)).values.iter().map(|&v| v > 127).collect();
+        let on = resize_hard(mask, (width, height)).inside();
         let (w, h) = (width as usize, height as usize);
         let off: Vec<bool> = on.iter().map(|o| !o).collect();
         // half the diagonal of a cell where the cube's middle is

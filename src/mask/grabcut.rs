@@ -20,7 +20,7 @@ use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
 use super::clicks::{self, Click};
 use super::morphology::{fill_holes, gray, keep_pieces, open, squared_distance};
-use crate::image::{Gray, Photo, reduce_to_rows};
+use crate::image::{Gray, Photo, grow, reduce_to_rows};
 use crate::{Error, Result};
 
 /// Rows of the working size; larger photographs are averaged down to it.
@@ -246,7 +246,7 @@ impl Grabcut {
         let radius = OUTLINE_BAND * h as f32;
         let near = |side: bool| {
             let marked: Vec<bool> = head.iter().map(|&m| m == side).collect();
-            super::morphology::grow(&marked, w, h, radius)
+            grow(&marked, w, h, radius)
         };
         let (near_head, near_background) = (near(true), near(false));
         let open = (0..w * h).filter(|&i| {
@@ -468,7 +468,7 @@ fn start(seeds: &[Seed], skeleton: &[bool], width: usize, height: usize) -> [Vec
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
 
     /// Returns a noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges
     /// everything.

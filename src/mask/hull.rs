@@ -67,10 +67,7 @@ pub(super) struct Voter {
 impl Voter {
     /// Takes a mask of any size for the camera's whole picture; head from 128.
     pub fn new(camera: &Camera, mask: &Gray) -> Voter {
-        Voter {
-            frame: ViewFrame::new(&camera.resized(mask.width, mask.height)),
-            head: mask.values.iter().map(|&v| v > 127).collect(),
-        }
+        Voter { frame: ViewFrame::new(&camera.resized(mask.width, mask.height)), head: mask.inside() }
     }
 }
 

@@ -21,8 +21,9 @@
 pub mod closed_form;
 
 use self::closed_form::{ClosedFormOptions, closed_form};
-use super::morphology;
-use crate::image::{Gray, Photo, enlarge, reduce_photo, resize_hard, working_size};
+use crate::image::{
+    Gray, INSIDE, Photo, dilated, enlarge, grow, reduce_photo, resize_hard, shrink, working_size,
+};
 use crate::{Error, Result};
 
 /// Alphas below become 0.
@@ -132,7 +133,7 @@ fn solved(
             }
         }
     }
-    mask.values.iter().map(|&v| if v >= 128 { 1.0 } else { 0.0 }).collect()
+    mask.values.iter().map(|&v| if v >= INSIDE { 1.0 } else { 0.0 }).collect()
 }
 
 /// Warnings about the band, by whichever method its opacity is found.
@@ -189,7 +190,7 @@ impl Default for UnknownBand {
 /// Returns the trimap of a mask, which is head where it is 128 or more.
 pub fn trimap(mask: &Gray, band: UnknownBand) -> Gray {
     let (width, height) = (mask.width as usize, mask.height as usize);
-    let head: Vec<bool> = mask.values.iter().map(|&v| v >= 128).collect();
+    let head = mask.inside();
     let (definite, maybe) = match band {
         UnknownBand::Squares { kernel, iterations } => (
             erode(&head, width, height, kernel, iterations),
@@ -197,7 +198,7 @@ pub fn trimap(mask: &Gray, band: UnknownBand) -> Gray {
         ),
         UnknownBand::Discs { share } => {
             let radius = share * height as f32;
-            (morphology::shrink(&head, width, height, radius), morphology::grow(&head, width, height, radius))
+            (shrink(&head, width, height, radius), grow(&head, width, height, radius))
         }
     };
     let value = |(s, m)| match (s, m) {
@@ -224,44 +225,15 @@ pub fn erode(marked: &[bool], width: usize, height: usize, kernel: u32, iteratio
 pub fn dilate(marked: &[bool], width: usize, height: usize, kernel: u32, iterations: u32) -> Vec<bool> {
     assert_eq!(marked.len(), width * height);
     let (kernel, iterations) = (kernel.max(1) as usize, iterations as usize);
-    // squares applied in turn are one larger square, and a square is a row of columns; OpenCV does not
-    // mirror the kernel when it dilates, so both reach as far before as behind
+    // squares applied in turn are one larger square; OpenCV does not mirror the kernel when it dilates, so both
+    // reach as far before as behind
     let before = (kernel / 2).saturating_mul(iterations);
     let behind = (kernel - 1 - kernel / 2).saturating_mul(iterations);
-    let mut rows = vec![false; marked.len()];
-    dilate_lines(marked, &mut rows, (height, width), (width, 1), before, behind);
-    let mut all = vec![false; marked.len()];
-    dilate_lines(&rows, &mut all, (width, height), (1, width), before, behind);
-    all
-}
-
-/// Marks each place of `lines` of `length` places that has a marked one from `before` places before to `behind` places behind it.
-/// Steps are those from line to line and from place to place.
-fn dilate_lines(
-    marked: &[bool],
-    out: &mut [bool],
-    (lines, length): (usize, usize),
-    (line_step, step): (usize, usize),
-    before: usize,
-    behind: usize,
-) {
-    let mut seen = vec![0u32; length + 1];
-    for line in 0..lines {
-        let at = |i: usize| line * line_step + i * step;
-        for i in 0..length {
-            seen[i + 1] = seen[i] + marked[at(i)] as u32;
-        }
-        for i in 0..length {
-            let (from, to) =
-                (i.saturating_sub(before), i.saturating_add(behind).saturating_add(1).min(length));
-            out[at(i)] = seen[to] > seen[from];
-        }
-    }
+    dilated(marked.to_vec(), width, height, before, behind)
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::morphology;
     use super::*;
     use crate::image::resize_gray;
     use crate::io::{Limits, read_gray, read_photo};
@@ -381,8 +353,8 @@ mod tests {
             let truth = read_gray(&picture("masks"), None, &limits).unwrap();
             let (w, h) = (truth.width as usize, truth.height as usize);
             let soft_truth: Vec<f32> = truth.values.iter().map(|&v| v as f32 / 255.0).collect();
-            let cut: Vec<bool> = truth.values.iter().map(|&v| v >= 128).collect();
-            let masks = [cut.clone(), morphology::grow(&cut, w, h, 2.0), morphology::shrink(&cut, w, h, 2.0)];
+            let cut = truth.inside();
+            let masks = [cut.clone(), grow(&cut, w, h, 2.0), shrink(&cut, w, h, 2.0)];
             for (k, mask) in masks.iter().enumerate().filter(|(k, _)| gains[*k].is_some()) {
                 let values = mask.iter().map(|&m| if m { 255 } else { 0 }).collect();
                 let mask = Gray { values, ..truth };

@@ -1,10 +1,9 @@
-//! Binary pictures: the exact Euclidean distance to the nearest marked pixel (Felzenszwalb & Huttenlocher 2012) and what
-//! follows from it, growing and shrinking by discs, nearest of two sets; and connected pieces: keeping some, filling holes,
-//! smoothing with a 3 × 3 square.
+//! Binary pictures: the exact Euclidean distance to the nearest marked pixel (Felzenszwalb & Huttenlocher 2012), and
+//! connected pieces: keeping some, filling holes, smoothing with a 3 × 3 square.
 
 use crate::capture::carve::{self, Pieces};
-use crate::image::Gray;
-use crate::kernel::cpu::distance::LowerEnvelope;
+use crate::image::{Gray, dilated};
+use crate::math::distance::LowerEnvelope;
 use rayon::prelude::*;
 
 /// Far away: no pixel is marked. Larger than any squared distance in a picture, finite in arithmetic.
@@ -43,18 +42,6 @@ pub fn squared_distance(marked: &[bool], width: usize, height: usize) -> Vec<f32
 
 fn squared(steps: u32) -> f32 {
     if steps == u32::MAX { FAR } else { (steps as f32) * (steps as f32) }
-}
-
-/// Pixels within `radius` pixels of a marked one.
-pub fn grow(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<bool> {
-    squared_distance(marked, width, height).iter().map(|&d| d <= radius * radius).collect()
-}
-
-/// Marked pixels farther than `radius` pixels from every pixel that is not; pixels beyond the border are unknown,
-/// so the border does not shrink them.
-pub fn shrink(marked: &[bool], width: usize, height: usize, radius: f32) -> Vec<bool> {
-    let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
-    squared_distance(&outside, width, height).iter().map(|&d| d > radius * radius).collect()
 }
 
 /// Connected pieces, over edges only (`corners` false) or over corners too.
@@ -103,22 +90,9 @@ pub(super) fn fill_holes(marked: &mut [bool], never: &[bool], width: usize, heig
 
 /// Unmarks pixels that no 3 × 3 square of marked pixels covers; pixels outside the picture are ignored.
 pub(super) fn open(marked: &[bool], width: usize, height: usize) -> Vec<bool> {
-    let inner = square(marked, width, height, true);
-    square(&inner, width, height, false)
-}
-
-/// Over each 3 × 3 square: are all marked (`all`), or is any?
-fn square(marked: &[bool], width: usize, height: usize, all: bool) -> Vec<bool> {
-    (0..marked.len())
-        .map(|i| {
-            let (x, y) = (i % width, i / width);
-            let hit = (y.saturating_sub(1)..(y + 2).min(height)).any(|v| {
-                let row = &marked[v * width + x.saturating_sub(1)..v * width + (x + 2).min(width)];
-                row.iter().any(|&m| m != all)
-            });
-            hit != all
-        })
-        .collect()
+    let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
+    let inner = dilated(outside, width, height, 1, 1).into_iter().map(|m| !m).collect();
+    dilated(inner, width, height, 1, 1)
 }
 
 #[cfg(test)]
@@ -156,18 +130,6 @@ mod tests {
     #[test]
     fn nothing_marked_is_infinitely_far() {
         assert!(squared_distance(&[false; 6], 3, 2).iter().all(|d| d.is_infinite()));
-    }
-
-    #[test]
-    fn growing_makes_discs_and_shrinking_takes_the_rim_but_not_at_the_border() {
-        let mut one = vec![false; 49];
-        one[24] = true;
-        // within 2 pixels of the center: 13 lattice points
-        assert_eq!(grow(&one, 7, 7, 2.0).iter().filter(|&&m| m).count(), 13);
-        // the left half of 6 x 4 loses its right column only
-        let half: Vec<bool> = (0..24).map(|i| i % 6 < 3).collect();
-        let less = shrink(&half, 6, 4, 1.0);
-        assert!((0..24).all(|i| less[i] == (i % 6 < 2)));
     }
 
     fn picture(rows: &[&str]) -> (Vec<bool>, usize, usize) {

@@ -17,11 +17,11 @@ use super::consistency::{ConsistencyView, MaskVerdict, verdicts};
 use super::grabcut::mixture::Rgb;
 use super::grabcut::{self, Grabcut, Models, Seed};
 use super::hull::{self, Voter};
-use super::morphology::{gray, grow, shrink};
+use super::morphology::gray;
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
 use crate::geom::Camera;
-use crate::image::{Gray, Photo, reduce_to_rows, size_at_rows};
+use crate::image::{Gray, Photo, grow, reduce_to_rows, shrink, size_at_rows};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -313,7 +313,7 @@ impl<'a> Propagation<'a> {
     /// Adds warnings about the finished masks.
     fn warn(&mut self, masks: &[Gray], ambiguous: &[f64]) {
         for (i, mask) in masks.iter().enumerate().filter(|(i, _)| !self.views[*i].clicks.is_empty()) {
-            let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
+            let head = mask.inside();
             let found = self.grabcut(i, false).0.warnings(self.views[i].name, &head);
             self.warnings.extend(found);
         }
@@ -382,7 +382,7 @@ impl Propagation<'_> {
                     format!("propose one of {w} × {h}"),
                 ));
             }
-            let head: Vec<bool> = mask.values.iter().map(|&v| v > 127).collect();
+            let head = mask.inside();
             // held-out views are not compared, and shape only their own masks
             if !view.votes || *verdict != MaskVerdict::Unlike {
                 self.inside[i] = shrink(&head, w, h, HEAD_MARGIN * h as f32);
@@ -419,7 +419,7 @@ impl Propagation<'_> {
 mod tests {
     use super::*;
     use crate::geom::Distortion;
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
     use glam::{DMat3, DVec3, Vec2};
 
     pub(super) fn ring() -> Vec<Camera> {

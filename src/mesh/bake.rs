@@ -243,7 +243,7 @@ fn on_triangles(mesh: &Mesh, samples: &[Sample]) -> SurfacePoints {
 mod tests {
     use super::*;
     use crate::Quiet;
-    use crate::geom::Painted;
+    use crate::mesh::fixtures::Painted;
     use glam::Vec2;
 
     /// Returns a latitude-longitude sphere of radius 0.5 (coarse), with a seam.

@@ -351,7 +351,7 @@ mod handles_tests;
 mod tests {
     use super::*;
     use crate::Quiet;
-    use crate::geom::Painted;
+    use crate::mesh::fixtures::Painted;
 
     fn mesh_of(f: impl Fn(Vec3) -> f32 + Sync, config: &ExtractOptions) -> Result<(Mesh, MeshReport)> {
         let paint = |_: &[Vec3], n: &[Vec3], _: &[u32], _: &[Vec3]| {

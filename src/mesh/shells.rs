@@ -15,7 +15,8 @@
 
 use super::appearance::{Nodes, Photograph};
 use crate::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, ShellLayer, Shells};
-use crate::kernel::cpu::cg::{conjugate_gradients, dot};
+use crate::math::cg::{conjugate_gradients, dot};
+use crate::math::rank::median;
 use crate::{Monitor, Result};
 use glam::Vec2;
 use rayon::prelude::*;
@@ -138,11 +139,7 @@ fn from_field(
         .collect();
     let mut soft: Vec<f32> =
         (0..width.len()).filter(|&v| share[v] > 0.0).map(|v| width[v] / pixels[v]).collect();
-    if soft.is_empty() {
-        return None;
-    }
-    let middle = soft.len() / 2;
-    let median = *soft.select_nth_unstable_by(middle, f32::total_cmp).1;
+    let median = median(&mut soft, f32::total_cmp)?;
     let mut layers = Vec::new();
     for (k, q) in LAYERS.into_iter().enumerate() {
         let low = 0.5 * (q + if k == 0 { 0.0 } else { LAYERS[k - 1] });

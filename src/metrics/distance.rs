@@ -4,6 +4,7 @@
 //! other are found. Both directions are needed: missing parts show in one, superfluous parts in the other.
 
 use crate::geom::{Bvh, Camera, Mesh, Ray};
+use crate::math::rank::nearest_rank;
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -37,9 +38,8 @@ fn distances(points: Vec<Vec3>, to: &Bvh) -> Option<Distances> {
     }
     let mean = distances.iter().map(|&d| d as f64).sum::<f64>() / distances.len() as f64;
     distances.par_sort_unstable_by(f32::total_cmp);
-    // nearest rank: the smallest value with at least this share at or below it
-    let rank = |share: f64| distances[((share * distances.len() as f64).ceil() as usize).max(1) - 1] as f64;
-    Some(Distances { samples: distances.len(), mean, median: rank(0.5), p90: rank(0.9), max: rank(1.0) })
+    let rank = |share: f64| nearest_rank(&distances, share).map(f64::from);
+    Some(Distances { samples: distances.len(), mean, median: rank(0.5)?, p90: rank(0.9)?, max: rank(1.0)? })
 }
 
 /// Returns `count` points spread evenly by area: equal steps through the summed areas choose the triangle, the R2
@@ -160,7 +160,7 @@ pub fn kinds_one_way(
         };
         let mut signed: Vec<f32> = part.par_iter().filter_map(signed).collect();
         signed.par_sort_unstable_by(f32::total_cmp);
-        let median = *signed.get(signed.len().div_ceil(2).checked_sub(1)?)? as f64;
+        let median = f64::from(nearest_rank(&signed, 0.5)?);
         Some((distances(part.into_iter().map(|(p, _)| p).collect(), to)?, median))
     })
 }

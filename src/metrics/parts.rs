@@ -10,16 +10,17 @@
 //! pixels without head are extra; [`PartMetrics::psnr_cap`] is the masked PSNR of a picture with the photograph's own
 //! colors in every covered pixel.
 
-use super::{INSIDE, picture, rounded};
+use super::{picture, rounded};
 use crate::Result;
 use crate::capture::{LoadedView, View};
-use crate::image::{Gray, Image, Photo};
+use crate::image::{Gray, INSIDE, Image, Photo, grow};
 use crate::io::Limits;
+use crate::math::rank::median_of_counts;
 use rayon::prelude::*;
 use serde::Serialize;
 
 /// Half of the band around the mask's contour, pixels.
-const EDGE_PX: usize = 3;
+const EDGE_PX: f32 = 3.0;
 
 /// The masks of one photograph; all of one size.
 #[derive(Clone, Copy)]
@@ -37,6 +38,11 @@ impl Masks<'_> {
     pub fn of(view: &LoadedView) -> Option<Masks<'_>> {
         let (valid, region) = (view.valid.as_ref(), view.region.as_ref());
         view.mask.as_ref().map(|mask| Masks { mask, valid, region })
+    }
+
+    /// Returns width and height.
+    fn size(&self) -> (usize, usize) {
+        (self.mask.width as usize, self.mask.height as usize)
     }
 
     fn is_valid(&self, i: usize) -> bool {
@@ -126,39 +132,18 @@ pub fn parts(
 
 /// Returns the band around the mask's contour.
 fn edge(masks: Masks) -> Vec<bool> {
-    let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
+    let head = masks.mask.inside();
     let rest: Vec<bool> = head.iter().map(|h| !h).collect();
-    let [to_head, to_rest] = [&head, &rest].map(|set| near(set, masks.mask.width as usize, EDGE_PX));
+    let (width, height) = masks.size();
+    let [to_head, to_rest] = [&head, &rest].map(|set| grow(set, width, height, EDGE_PX));
     masks.all(|i, _| to_head[i] && to_rest[i])
 }
 
-/// Returns the pixels of a set and those whose centers are within `radius` of one of its centers.
-fn near(set: &[bool], width: usize, radius: usize) -> Vec<bool> {
-    let mut out = set.to_vec();
-    let height = set.len() / width.max(1);
-    for (i, _) in set.iter().enumerate().filter(|(_, s)| **s) {
-        let (x, y) = (i % width, i / width);
-        // inner pixels of the set add none that its border does not
-        let rim = (x > 0 && !set[i - 1])
-            || (x + 1 < width && !set[i + 1])
-            || (y > 0 && !set[i - width])
-            || (y + 1 < height && !set[i + width]);
-        if !rim {
-            continue;
-        }
-        for v in y.saturating_sub(radius)..(y + radius + 1).min(height) {
-            let half = (radius * radius - v.abs_diff(y).pow(2)).isqrt();
-            out[v * width + x.saturating_sub(half)..v * width + (x + half + 1).min(width)].fill(true);
-        }
-    }
-    out
-}
-
 /// Around a soft rim this many pixels of opaque head are the hair's, and along a hard rim the skin's.
-const RIM_BAND_PX: usize = 6;
+const RIM_BAND_PX: f32 = 6.0;
 
 /// An outline nearer than this to a soft rim does not count as skin's.
-const RIM_CLEARANCE_PX: usize = 10;
+const RIM_CLEARANCE_PX: f32 = 10.0;
 
 /// Minimum share of each kind among the samples for a classification.
 const MIN_SHARE: f64 = 0.05;
@@ -191,15 +176,15 @@ struct ToneSamples([[[u64; 256]; 3]; 2]);
 impl ToneSamples {
     /// Collects the samples of one photograph (not cut out); `None` without a region of interest.
     fn of(photo: &Photo, masks: Masks) -> Option<ToneSamples> {
-        let (region, width) = (masks.region?, masks.mask.width as usize);
-        let head: Vec<bool> = masks.mask.values.iter().map(|&m| m >= INSIDE).collect();
+        let (region, (width, height)) = (masks.region?, masks.size());
+        let head = masks.mask.inside();
         let rest: Vec<bool> = head.iter().map(|h| !h).collect();
         let soft = soft_rim(masks.mask);
-        let [beside, far] = [RIM_BAND_PX, RIM_CLEARANCE_PX].map(|px| near(&soft, width, px));
-        let rim = near(&rest, width, 1);
+        let [beside, far] = [RIM_BAND_PX, RIM_CLEARANCE_PX].map(|px| grow(&soft, width, height, px));
+        let rim = grow(&rest, width, height, 1.0);
         let hard: Vec<bool> =
             (0..rim.len()).map(|i| rim[i] && head[i] && !far[i] && region.values[i] >= INSIDE).collect();
-        let along = near(&hard, width, RIM_BAND_PX);
+        let along = grow(&hard, width, height, RIM_BAND_PX);
         let opaque = masks.all(|i, m| m == u8::MAX && region.values[i] >= INSIDE);
         let mut counts = [[[0; 256]; 3]; 2];
         for (i, rgb) in photo.rgb.iter().enumerate().filter(|(i, _)| opaque[*i]) {
@@ -233,12 +218,12 @@ impl ToneSamples {
 
 impl Tone {
     fn of(counts: &[[u64; 256]; 3]) -> Tone {
-        let median = counts.each_ref().map(median);
+        let median = counts.each_ref().map(|counts| median_of_counts(counts));
         let deviation = std::array::from_fn(|c| {
             let mut away = [0; 256];
             let distance = |v: usize| v.abs_diff(median[c]);
             counts[c].iter().enumerate().for_each(|(v, n)| away[distance(v)] += n);
-            self::median(&away).max(1) as f64
+            median_of_counts(&away).max(1) as f64
         });
         Tone { median: median.map(|m| m as f64), deviation }
     }
@@ -246,16 +231,6 @@ impl Tone {
     fn distance(&self, rgb: [u8; 3]) -> f64 {
         (0..3).map(|c| (rgb[c] as f64 - self.median[c]).abs() / self.deviation[c]).sum()
     }
-}
-
-/// Returns the least value that half of the samples do not exceed.
-fn median(counts: &[u64; 256]) -> usize {
-    let (total, mut sum) = (counts.iter().sum::<u64>(), 0);
-    let at = |n: &u64| {
-        sum += n;
-        2 * sum >= total
-    };
-    counts.iter().position(at).unwrap_or(0)
 }
 
 impl Tones {
@@ -273,7 +248,8 @@ impl Tones {
     /// Returns skin and hair of one photograph, in whole or cut out; `None` without a region.
     pub fn split(&self, photo: &Photo, masks: Masks) -> Option<(Vec<bool>, Vec<bool>)> {
         let region = masks.region?;
-        let fringe = near(&soft_rim(masks.mask), masks.mask.width as usize, 1);
+        let (width, height) = masks.size();
+        let fringe = grow(&soft_rim(masks.mask), width, height, 1.0);
         let dark = |i: usize| self.hair.distance(photo.rgb[i]) < self.skin.distance(photo.rgb[i]);
         let of = |i: usize, m: u8| region.values[i] >= INSIDE && m == u8::MAX;
         let skin = masks.all(|i, m| of(i, m) && !dark(i));
@@ -356,17 +332,6 @@ mod tests {
         close(over_white.psnr_cap, 10.4576);
         let whole = parts(&render, &photo, only(&mask), Some(&[1.0; 5]), [0.0; 3], None);
         assert_eq!((whole.missing, whole.psnr_cap), (Some(0.0), None));
-    }
-
-    #[test]
-    fn near_is_a_disc() {
-        let mut set = vec![false; 49];
-        set[24] = true; // (3, 3) of 7 × 7
-        let disc = near(&set, 7, 2);
-        // radius 2: 1 + 3 + 5 + 3 + 1
-        assert_eq!(disc.iter().filter(|d| **d).count(), 13);
-        assert!(disc[22] && disc[10] && !disc[9], "(1, 3) and (3, 1), not (2, 1)");
-        assert!(near(&[true; 49], 7, 2).iter().all(|d| *d));
     }
 
     /// Returns a capture of one photograph, 40 × 20: background above, below it a soft rim of hair on the left half and

@@ -17,6 +17,7 @@ use crate::field::training::TrainingSession;
 use crate::geom::{Camera, Mesh, SdfField};
 use crate::image::Photo;
 use crate::io::{self, Limits};
+use crate::math::rank::median;
 use crate::mesh::files::HeadMesh;
 use crate::mesh::{Cap, MeshReport, Patches, SimplifyConfig, simplify};
 use crate::metrics::{compare, distance};
@@ -392,8 +393,7 @@ impl Bench<'_> {
         let (values, gradients) = field.sdf_gradient(&distance::sample(mesh, POINTS));
         let mut off: Vec<f32> =
             values.iter().zip(&gradients).map(|(f, g)| f.abs() / g.length().max(0.05)).collect();
-        off.sort_by(f32::total_cmp);
-        off.get(off.len() / 2).map(|d| f64::from(*d) * self.mm())
+        median(&mut off, f32::total_cmp).map(|d| f64::from(d) * self.mm())
     }
 
     /// Measures decreasing numbers of triangles.

@@ -5,12 +5,12 @@
 //! are refined, each held-out view is then fitted alone: the evaluation shows it from both poses.
 
 use super::rig_photos::RigPhotos;
+use crate::capture::path::NamedCamera;
 use crate::capture::{Capture, Split, View};
 use crate::config::CameraPoses;
 use crate::geom::{Camera, Similarity};
 use crate::image::{Gray, Photo};
 use crate::io::{self, Limits, ReadError};
-use crate::render::path::NamedCamera;
 use crate::rig::{self, CameraState, LEAST_SIGHTINGS, PoseDecision, RigView};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};

@@ -15,16 +15,13 @@ use crate::capture::scene::Scene;
 use crate::capture::{Capture, MaskMeaning, View, ViewMask};
 use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, display_name};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
-use crate::image::{Gray, Image, Photo};
+use crate::image::{Gray, INSIDE, Image, Photo};
 use crate::io::{self, Limits};
 use crate::render::RenderedView;
 use crate::run::{Run, StageDir};
 use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
-
-/// Threshold from which mask and valid mask count, as in `metrics`.
-const INSIDE: u8 = 128;
 
 /// Blends one picture per camera of `render`. `fields` are evaluated only if weights are to be fitted.
 pub(super) fn ensemble(

@@ -17,7 +17,6 @@ use crate::geom::Camera;
 use crate::iface::{self, DensityField, IFace, SDF_TEST};
 use crate::image::Gray;
 use crate::io::Limits;
-use crate::kernel::cpu::march::Bitmask;
 use crate::render::RenderedView;
 use crate::run::StageDir;
 use crate::tface::{self, FieldMean, VM_TEST};
@@ -65,14 +64,14 @@ pub(super) fn train(
     config: &Config,
     session: &TrainingSession,
 ) -> Result<(Value, Vec<String>)> {
-    let hull = bitmask(scene);
+    let hull = scene.hull.as_ref();
     if stage == Stage::Iface {
         let views = train_views(capture, scene, config, true)?;
         if config.iface.field == FieldKind::Density {
             let (_, report) = iface::train_density(&views, &config.iface, session)?;
             return Ok((json!(report), report.warnings));
         }
-        let (_, report) = iface::train(&views, hull.as_ref(), &config.iface, session)?;
+        let (_, report) = iface::train(&views, hull, &config.iface, session)?;
         return Ok((json!(report), report.warnings));
     }
     // `baseline` and `tface` run the same training with different settings
@@ -84,7 +83,7 @@ pub(super) fn train(
     // without masks the training must use neither the head's outline nor the hull carved from it; only the box stays
     let masked = c.masks != MaskUse::None;
     let views = train_views(capture, scene, config, masked)?;
-    let report = tface::train(views, scene.aabb, hull.as_ref().filter(|_| masked), &c, session)?;
+    let report = tface::train(views, scene.aabb, hull.filter(|_| masked), &c, session)?;
     Ok((json!(report), report.warnings))
 }
 
@@ -103,11 +102,6 @@ pub(super) fn train_views(
         valid: loaded.valid,
     };
     Ok(views.map(view).collect())
-}
-
-fn bitmask(scene: &Scene) -> Option<Bitmask> {
-    let hull = scene.hull.as_ref()?;
-    Bitmask::from_words(hull.resolution, hull.bits.clone())
 }
 
 /// The trained fields of a run, each loaded when it is first used.
@@ -131,8 +125,8 @@ impl Fields for TrainedFields<'_> {
             if config.iface.field == FieldKind::Density {
                 return Ok(Box::new(DensityField::load(&folder, &config.iface)?));
             }
-            let hull = bitmask(&self.session.scene()?);
-            let field = IFace::load(&folder, &config.iface, hull.as_ref())?;
+            let scene = self.session.scene()?;
+            let field = IFace::load(&folder, &config.iface, scene.hull.as_ref())?;
             let field = field.on(compute_device(&config.device, &SDF_TEST)?);
             Ok(Box::new(field))
         };
@@ -171,7 +165,7 @@ pub(super) fn load_field(run: &Path, config: &Config, scene: &Scene, stage: Stag
         }));
     }
     if stage == Stage::Iface {
-        let field = IFace::load(&folder, &config.iface, bitmask(scene).as_ref())?;
+        let field = IFace::load(&folder, &config.iface, scene.hull.as_ref())?;
         return Ok(Box::new(move |camera| {
             march(camera, &world_from_scene, false, |rays| field.render(rays))
         }));

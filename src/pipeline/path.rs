@@ -9,11 +9,11 @@
 //! No stage reads these views, so making or removing them does not affect the evaluation's views, their blend or the
 //! metrics.
 
+use crate::capture::path::{NamedCamera, from_json};
 use crate::capture::{Capture, Split, View};
 use crate::config::RenderConfig;
 use crate::geom::Camera;
 use crate::io::{self, Limits};
-use crate::render::path::{NamedCamera, from_json};
 use crate::run::Fingerprint;
 use crate::{Error, Result};
 use std::path::Path;

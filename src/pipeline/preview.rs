@@ -10,13 +10,13 @@ use super::page::views::{error, heat};
 use super::path::cameras_of_file;
 use super::pictures::{self, background_color, expected, over, straight};
 use super::scene_file::{read_capture, read_scene};
+use crate::capture::path::{NamedCamera, orbit};
 use crate::capture::{Split, View};
 use crate::config::{Config, Stage, ViewBackground};
 use crate::geom::{Atlas, Camera, Distortion, Similarity};
 use crate::image::{Image, Photo, quantize, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::mesh::files::{HeadMesh, OpenedMesh, open_mesh};
-use crate::render::path::{NamedCamera, orbit};
 use crate::render::{
     LobePictures, Look, MeshTexture, RasterLayers, RasterOptions, RasterView, Surface, raster_into,
 };

@@ -15,13 +15,13 @@ use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
 use super::pictures;
 use super::surface::{Fields, march};
+use crate::capture::path::{NamedCamera, orbit};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Capture, Split};
 use crate::config::{ColorSource, Config, Method, RenderConfig};
 use crate::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
 use crate::io;
 use crate::mesh::files::{ExtractedSurface, HeadMesh};
-use crate::render::path::{NamedCamera, orbit};
 use crate::render::{
     LobePictures, MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView,
     ResidualSource, ResidualView, Residuals, Surface, raster, raycast,

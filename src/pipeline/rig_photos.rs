@@ -1,10 +1,10 @@
 //! What cameras and exposures are measured on: photographs at a moderate size, their masks, and the surface of the hull.
 
 use crate::Result;
-use crate::capture::scene::{Hull, Scene};
+use crate::capture::scene::Scene;
 use crate::capture::{Capture, Split, View};
 use crate::error::counted;
-use crate::geom::{Camera, Mesh, Similarity};
+use crate::geom::{BitGrid, Camera, Mesh, Similarity};
 use crate::image::{Gray, Photo, reduce_photo, resize_gray, working_size};
 use crate::io::Limits;
 use crate::mesh::{Volume, marching};
@@ -119,7 +119,7 @@ fn searched(view: &View, side: u32, limits: &Limits) -> Result<Option<(Photo, Gr
 
 /// Returns the surface of a hull, smoothed and drawn in by about a cell, since a hull holds every cell that any mask may
 /// touch.
-fn hull_surface(hull: &Hull) -> Result<Mesh> {
+fn hull_surface(hull: &BitGrid) -> Result<Mesh> {
     /// Share of the smoothed cells' value where the surface lies; one half would be the hull's own.
     const LEVEL: f32 = 0.8;
     let r = hull.resolution;

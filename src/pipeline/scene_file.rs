@@ -3,9 +3,9 @@
 use super::cameras::CameraCheck;
 use super::exposure::ExposureCheck;
 use crate::Result;
-use crate::capture::scene::{Hull, Scene};
+use crate::capture::scene::Scene;
 use crate::capture::{Capture, View};
-use crate::geom::Aabb;
+use crate::geom::{Aabb, BitGrid};
 use crate::io::{self, Limits, ReadError, WriteError};
 use glam::Vec3;
 use serde::Deserialize;
@@ -23,7 +23,7 @@ pub(super) fn write_scene(path: &Path, scene: &Scene) -> Result<(), WriteError> 
 
 /// Reads the file of [`write_scene`]; content that it cannot have written is refused with its key.
 pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
-    let scene: Scene = io::read_typed(path, &Limits::default())?;
+    let mut scene: Scene = io::read_typed(path, &Limits::default())?;
     let wrong = |key: &str, found: String, expected: &str| Err(ReadError::value(path, key, found, expected));
     if let Some((part, found, expected)) = scene.scene_from_world.problem() {
         return wrong(&format!("scene_from_world.{part}"), found, expected);
@@ -34,18 +34,19 @@ pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
     {
         return wrong("aabb", format!("{min} to {max}"), "a box within -2 and 2, its lowest corner first");
     }
-    if let Some(Hull { resolution, bits }) = &scene.hull {
-        if !(2..=MAX_CELLS).contains(resolution) {
+    if let Some(BitGrid { resolution, bits }) = scene.hull.take() {
+        if !(2..=MAX_CELLS).contains(&resolution) {
             return wrong("hull.resolution", resolution.to_string(), &format!("2 to {MAX_CELLS}"));
         }
-        let words = resolution.pow(3).div_ceil(64);
-        if bits.len() != words {
-            let expected = format!("{words}, for {resolution}³ cells");
-            return wrong("hull.bits", format!("{} words", bits.len()), &expected);
-        }
-        if bits.iter().all(|b| *b == 0) {
+        let found = bits.len();
+        let Some(hull) = BitGrid::from_words(resolution, bits) else {
+            let expected = format!("{}, for {resolution}³ cells", resolution.pow(3).div_ceil(64));
+            return wrong("hull.bits", format!("{found} words"), &expected);
+        };
+        if hull.count() == 0 {
             return wrong("hull.bits", "0 everywhere".into(), "at least one cell of the head");
         }
+        scene.hull = Some(hull);
     }
     Ok(scene)
 }
@@ -131,7 +132,7 @@ mod tests {
                 translation: DVec3::new(1.0, -2.0, 5e6),
             },
             aabb: Aabb { min: Vec3::new(-1.0, -0.5, -0.7), max: Vec3::new(1.0, 0.6, 0.8) },
-            hull: Some(Hull { resolution: 8, bits }),
+            hull: BitGrid::from_words(8, bits),
         }
     }
 

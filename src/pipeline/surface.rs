@@ -4,9 +4,8 @@
 //! memory holds the picture, but not a ray and its result for every pixel.
 
 use crate::Result;
-use crate::capture::scene::Hull;
 use crate::config::Stage;
-use crate::geom::{Camera, Ray, RayResult, SdfField, Similarity};
+use crate::geom::{BitGrid, Camera, Ray, RayResult, SdfField, Similarity};
 use crate::mesh::{Cap, Patches};
 use crate::render::RenderedView;
 use glam::{Vec2, Vec3};
@@ -30,8 +29,8 @@ pub trait Surface: SdfField {
 #[derive(Clone, Copy)]
 pub(super) struct ClosedSurface<'a> {
     pub field: &'a dyn Surface,
-    /// Visual hull of the masks; points outside it are outside the surface.
-    pub hull: Option<&'a Hull>,
+    /// What lies outside of it is outside of the surface.
+    pub hull: Option<&'a BitGrid>,
     /// The cap where the frames cut the body.
     pub cap: Option<&'a Cap>,
     /// The patches where handles were cut.

@@ -98,16 +98,13 @@ impl RayHits {
 /// A triangle before a camera at the origin's front, painted by its normal:
 ///
 /// ```
-/// use glam::{DMat3, DVec3, Vec3};
-/// use tiface::geom::{Bvh, Camera, Distortion, Mesh};
+/// use glam::Vec3;
+/// use tiface::geom::{Bvh, Camera, Mesh};
 /// use tiface::render::{RaycastOptions, raycast};
 ///
 /// let positions = vec![Vec3::new(-3.0, -3.0, 0.0), Vec3::new(3.0, -3.0, 0.0), Vec3::new(0.0, 3.0, 0.0)];
 /// let mesh = Mesh { positions, triangles: vec![[0, 1, 2]], ..Mesh::default() };
-/// let camera = Camera {
-///     width: 20, height: 10, fx: 10.0, fy: 10.0, cx: 10.0, cy: 5.0,
-///     distortion: Distortion::default(), rotation: DMat3::IDENTITY, position: DVec3::new(0.0, 0.0, 2.0),
-/// };
+/// let camera = Camera::above(20, 10, 10.0, 2.0);
 /// let view = raycast(&Bvh::new(&mesh), &mesh, None, &camera, &RaycastOptions::default(), |hits| {
 ///     hits.normals.iter().map(|n| n.to_array().map(|v| v.abs())).collect()
 /// });

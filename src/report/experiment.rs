@@ -1,6 +1,6 @@
 //! The paper's tables beside our figures: Markdown and JSON.
 
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 use crate::{Error, Result};
 use serde::Serialize;
 use std::fmt::Write;

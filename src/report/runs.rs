@@ -6,6 +6,7 @@ use crate::config::{Config, NAMES, Stage, display_name};
 use crate::error::counted;
 use crate::geom::Camera;
 use crate::io::{self, Limits};
+use crate::math::rank::mean_of_middle;
 use crate::run::{Phase, Record, RunStatus};
 use glam::Vec3;
 use minijinja::context;
@@ -183,10 +184,7 @@ const OUTLIER: f64 = 3.5;
 /// Returns which of some values are far from the others, by the modified z-score: the distance from the median over
 /// 1.4826 times the median of all distances. None of fewer than five.
 fn outliers(values: &[Option<f64>]) -> Vec<bool> {
-    let median = |mut v: Vec<f64>| {
-        v.sort_by(f64::total_cmp);
-        (v[(v.len() - 1) / 2] + v[v.len() / 2]) / 2.0
-    };
+    let median = |mut v: Vec<f64>| mean_of_middle(&mut v).unwrap_or(0.0);
     let known: Vec<f64> = values.iter().flatten().copied().collect();
     if known.len() < 5 {
         return vec![false; values.len()];

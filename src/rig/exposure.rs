@@ -11,10 +11,11 @@
 //! Vignetting is not measured: one number for each lens in the same equations came out between −0.24 and +0.11 on captures
 //! without any, since grazing skin lies at the outline.
 
-use super::adjust::{median, solve};
+use super::adjust::median;
 use super::tracks::{HEAD, MIN_VIEWS, Seed, blurred, is_set, seeds};
 use crate::geom::{Camera, Mesh};
 use crate::image::{Exposure, Gray, Photo, eroded, linear_from_srgb};
+use crate::math::cholesky::solve;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::ops::Range;
@@ -236,12 +237,12 @@ fn fit_channel(points: &[Vec<Sample>], k: usize, views: usize, train: usize) -> 
             for (a, s) in &weighted {
                 matrix[train * s.view + s.view] += a;
                 weighted.iter().for_each(|(b, t)| matrix[train * s.view + t.view] -= a * b / total);
-                vector[s.view] -= a * (s.light[k] - mean);
+                vector[s.view] += a * (s.light[k] - mean);
             }
         }
         // the mean of all views is open
         matrix.iter_mut().for_each(|m| *m += 1.0);
-        x = solve(matrix, &vector)?;
+        x = solve(matrix, vector)?;
         let mut residuals = Vec::new();
         for (samples, offset) in points.iter().zip(&mut offset) {
             let values: Vec<f64> = known(samples, train).map(|s| s.light[k] - x[s.view]).collect();
@@ -280,11 +281,11 @@ fn without_direction(logs: &[[f64; 3]], cameras: &[Camera], train: usize) -> Vec
             let w = 1.0 / (1.0 + ((brightness(log) - fitted(&slopes, row)) / scale).powi(2));
             for i in 0..4 {
                 (0..4).for_each(|j| matrix[4 * i + j] += w * row[i] * row[j]);
-                vector[i] -= w * row[i] * brightness(log);
+                vector[i] += w * row[i] * brightness(log);
             }
         }
         (1..4).for_each(|i| matrix[5 * i] += RIDGE);
-        let Some(found) = solve(matrix, &vector) else { break };
+        let Some(found) = solve(matrix, vector) else { break };
         slopes = found;
         let off = rows
             .iter()

@@ -20,9 +20,8 @@ use crate::config::{MaskUse, VmConfig, VmStart};
 use crate::field::ComputeDevice;
 use crate::field::pixels::{LARGE, Pixels, TrainView};
 use crate::field::training::{self, TrainingSession};
-use crate::geom::{Aabb, Ray, RayResult};
+use crate::geom::{Aabb, BitGrid, Ray, RayResult};
 use crate::io::Lock;
-use crate::kernel::cpu::march::Bitmask;
 use crate::{Monitor, Result, io};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
@@ -99,7 +98,7 @@ fn folder(dir: &Path, i: usize) -> PathBuf {
 pub fn train(
     views: Vec<TrainView>,
     bounds: Aabb,
-    hull: Option<&Bitmask>,
+    hull: Option<&BitGrid>,
     config: &VmConfig,
     session: &TrainingSession,
 ) -> Result<TfaceReport> {

@@ -6,9 +6,9 @@ use crate::field::ops::Ops;
 use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::Pixels;
 use crate::field::training::StepAt;
-use crate::kernel::cpu::rng;
 use crate::kernel::cpu::vm::VmField;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm, VmFigures};
+use crate::math::rng;
 use std::sync::Arc;
 
 /// Random stream of a step's background colors.

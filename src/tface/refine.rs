@@ -4,7 +4,7 @@ use super::record::{NAMES, grids};
 use super::state::VmState;
 use crate::config::VmConfig;
 use crate::field::parameters::HostGroup;
-use crate::kernel::cpu::march::dilated;
+use crate::geom::dilated_cells;
 use crate::kernel::cpu::vm::mask::BoxMask;
 use crate::kernel::cpu::vm::{cropped, density_at, resized, size_for, voxel_schedule};
 use rayon::prelude::*;
@@ -59,7 +59,7 @@ fn occupied_vertices(state: &VmState, config: &VmConfig, size: [usize; 3]) -> Ve
             out[i] = sigma >= min_density;
         }
     });
-    dilated(&alive, size)
+    dilated_cells(&alive, size)
 }
 
 fn extent(kept: &[bool], size: [usize; 3]) -> Option<([usize; 3], [usize; 3])> {

@@ -5,10 +5,10 @@ use crate::Result;
 use crate::config::VmConfig;
 use crate::field::checkpoint::Checkpoint;
 use crate::field::parameters::{HostGroup, Part};
-use crate::kernel::cpu::march::Bitmask;
-use crate::kernel::cpu::rng;
+use crate::geom::BitGrid;
 use crate::kernel::cpu::vm::mask::BoxMask;
 use crate::kernel::cpu::vm::{VmField, size_for};
+use crate::math::rng;
 use std::sync::Arc;
 
 /// State of a training between two steps.
@@ -78,13 +78,13 @@ pub fn first_and_last(config: &VmConfig, bounds: [[f32; 3]; 2]) -> [VmField; 2] 
 }
 
 /// The hull as cells, one cell wider all around.
-fn hull_mask(hull: &Bitmask) -> Option<BoxMask> {
+fn hull_mask(hull: &BitGrid) -> Option<BoxMask> {
     BoxMask::from_bits([-1.0; 3], [1.0; 3], [hull.resolution; 3], hull.grown().bits)
 }
 
 impl VmState {
     /// Returns the state before the first step.
-    pub fn new(config: &VmConfig, seed: u64, bounds: [[f32; 3]; 2], hull: Option<&Bitmask>) -> VmState {
+    pub fn new(config: &VmConfig, seed: u64, bounds: [[f32; 3]; 2], hull: Option<&BitGrid>) -> VmState {
         let size = size_for(extent(bounds), config.voxels_start);
         let mut names = NAMES.into_iter();
         let groups = start_values(config, size, seed)

@@ -9,9 +9,9 @@ use crate::field::ball::{session, temporary, views};
 use crate::field::parameters::HostGroup;
 use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
 use crate::kernel::cpu::reference::{Real, vm, wide};
-use crate::kernel::cpu::rng;
 use crate::kernel::cpu::vm::Grid;
 use crate::kernel::cpu::vm::losses::{Targets, of_rays};
+use crate::math::rng;
 use std::path::Path;
 
 const BOX: [[f32; 3]; 2] = [[-0.8, -0.7, -0.75], [0.8, 0.7, 0.75]];

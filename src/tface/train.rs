@@ -13,8 +13,8 @@ use crate::field::ops::ArrayDevice;
 use crate::field::pixels::{Pixels, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self, ComputeDevice};
+use crate::geom::BitGrid;
 use crate::kernel::cpu::adam::AdamStep;
-use crate::kernel::cpu::march::Bitmask;
 use crate::kernel::cpu::vm::losses::VmFigures;
 use crate::{Error, Result};
 use serde::Serialize;
@@ -99,7 +99,7 @@ pub(super) struct VmModel<'a, O: VmOps> {
 pub(super) fn train_one(
     pixels: &Pixels,
     bounds: [[f32; 3]; 2],
-    hull: Option<&Bitmask>,
+    hull: Option<&BitGrid>,
     config: &VmConfig,
     session: &TrainingSession,
 ) -> Result<TfaceReport> {

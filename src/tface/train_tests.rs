@@ -189,7 +189,7 @@ fn impossible_settings_and_empty_masks_are_named() {
     let end = train(empty, BOX, Some(&hull()), &config(), &session("tface", dir.path(), "e", &Quiet));
     assert!(end.unwrap_err().to_string().starts_with("no training view has a pixel"));
     // a hull without a cell: the first alpha mask has nothing to keep
-    let nothing = Bitmask::filled(32, false);
+    let nothing = BitGrid::filled(32, false);
     let end = train(views(), BOX, Some(&nothing), &config(), &session("tface", dir.path(), "n", &Quiet));
     let e = end.unwrap_err();
     assert!(e.to_string().starts_with("the field is empty at step 40"), "{e}");

@@ -6,16 +6,16 @@ use std::path::{Path, PathBuf};
 
 /// Layers from the ground up; a module may know those below its own layer.
 const LAYERS: &[(&str, &[&str])] = &[
-    ("vocabulary", &["error", "monitor", "geom", "image"]),
-    ("ground", &["io", "config", "kernel"]),
-    ("shared", &["capture", "field", "onnx", "run", "report"]),
-    ("stages", &["mask", "rig", "tface", "iface", "mesh", "render", "ensemble", "metrics"]),
+    ("ground", &["error", "monitor", "geom", "image", "io", "math"]),
+    ("parts", &["mesh", "render", "kernel"]),
+    ("shared", &["config", "capture", "field", "onnx", "run", "report"]),
+    ("stages", &["mask", "rig", "tface", "iface", "ensemble", "metrics"]),
     ("pipeline", &["pipeline"]),
     ("cli", &["cli"]),
 ];
 
-/// Modules of these layers may know each other; stages never.
-const SOCIABLE: &[&str] = &["vocabulary", "ground", "shared", "pipeline", "cli"];
+/// Modules of these layers may know each other; parts that can be used alone, and stages, never.
+const SOCIABLE: &[&str] = &["ground", "shared", "pipeline", "cli"];
 
 struct Source {
     module: String,

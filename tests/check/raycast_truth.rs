@@ -4,9 +4,9 @@ use crate::clicked::folder;
 use exr::prelude::*;
 use glam::{DMat3, DVec3};
 use std::path::Path;
+use tiface::capture::path::from_json;
 use tiface::geom::{Bvh, Camera, Distortion};
 use tiface::mesh::files::read;
-use tiface::render::path::from_json;
 use tiface::render::{RaycastOptions, raycast};
 
 /// Channels of a flat EXR by name, each row-major from the top.

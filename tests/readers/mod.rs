@@ -261,5 +261,5 @@ fn camera_path(_: &Path, bytes: &[u8]) -> String {
         rotation: DMat3::IDENTITY,
         position: DVec3::ZERO,
     };
-    outcome(tiface::render::path::from_json(&text(bytes), &like))
+    outcome(tiface::capture::path::from_json(&text(bytes), &like))
 }

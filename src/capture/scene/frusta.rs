@@ -7,6 +7,7 @@ use crate::Result;
 use crate::capture::carve::{self, Cube, Projector};
 use crate::capture::view::View;
 use crate::geom::{Aabb, Camera};
+use crate::math::rank::median;
 use glam::{DVec3, Vec3};
 
 /// Minimum number of points for a box around them.
@@ -55,8 +56,7 @@ pub(super) fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Sce
     let axes: Vec<_> = cameras.iter().map(|c| carve::ray_to(c, None)).collect();
     let center = aim(&some, &axes)?;
     let mut distances: Vec<f64> = cameras.iter().map(|c| c.position.distance(center)).collect();
-    distances.sort_by(f64::total_cmp);
-    let half = 0.6 * distances[distances.len() / 2];
+    let half = 0.6 * median(&mut distances, f64::total_cmp).unwrap_or(0.0);
     let cube = Cube { center, half, n: 48 };
     let projectors: Vec<Projector> = cameras.iter().map(Projector::new).collect();
     let least = (2 * cameras.len()).div_ceil(5).max(2);

@@ -7,6 +7,7 @@
 use super::Scene;
 use crate::capture::carve::Projector;
 use crate::geom::{Aabb, Camera};
+use crate::math::rank::median;
 use glam::{DVec3, Vec3};
 
 /// Returns the part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
@@ -37,11 +38,7 @@ pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3, share: f64) -> Aab
                 }
             }
         }
-        if seen.is_empty() {
-            return None;
-        }
-        let half = seen.len() / 2;
-        Some(*seen.select_nth_unstable(half).1 >= least)
+        Some(median(&mut seen, usize::cmp)? >= least)
     };
     let mut low = scene.aabb.min;
     let mut high = scene.aabb.max;
@@ -64,8 +61,7 @@ pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3, share: f64) -> Aab
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::scene::Hull;
-    use crate::geom::{Distortion, Similarity};
+    use crate::geom::{BitGrid, Distortion, Similarity};
     use glam::DMat3;
 
     /// Eight cameras around the y axis at distance 4, looking at the middle from `height` above.
@@ -89,11 +85,10 @@ mod tests {
     }
 
     fn scene() -> Scene {
-        let bits = vec![u64::MAX; 16 * 16 * 16 / 64];
         Scene {
             scene_from_world: Similarity::IDENTITY,
             aabb: Aabb::SCENE,
-            hull: Some(Hull { resolution: 16, bits }),
+            hull: Some(BitGrid::filled(16, true)),
         }
     }
 

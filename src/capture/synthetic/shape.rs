@@ -8,6 +8,7 @@
 //! on every machine.
 
 use crate::geom::Aabb;
+use crate::math::rng::mix;
 use glam::{IVec3, Vec2, Vec3};
 
 /// The demo head. It has one shape; a capture's seed moves cameras and grain, never the surface.
@@ -349,15 +350,7 @@ pub(super) fn smooth(a: f32, b: f32, x: f32) -> f32 {
 /// Returns a uniform number in 0..1, a pure function of its three keys.
 pub(super) fn unit(seed: u64, a: u32, b: u32) -> f32 {
     let key = seed ^ ((a as u64) << 32 | b as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
-    (mix(key) >> 40) as f32 / (1u64 << 24) as f32
-}
-
-/// SplitMix64's finalizer (Steele, Lea and Flood 2014).
-fn mix(mut z: u64) -> u64 {
-    z = z.wrapping_add(0x9E37_79B9_7F4A_7C15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
+    (mix(key.wrapping_add(0x9E37_79B9_7F4A_7C15)) >> 40) as f32 / (1u64 << 24) as f32
 }
 
 fn lattice(x: i32, y: i32, z: i32) -> f32 {

@@ -373,7 +373,7 @@ pub(super) const OF_ALL: &str = "correct what the file says of all its photograp
 
 /// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the
 /// lens is as `like` has it.
-pub(crate) fn camera_like(
+pub(in crate::capture) fn camera_like(
     top: &Object,
     own: &Object,
     like: &Camera,

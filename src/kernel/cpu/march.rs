@@ -3,91 +3,8 @@
 //! All samples of a ray lie on one lattice of pitch `step` (as in nerfacc 0.3.3): empty cells are
 //! skipped by whole steps, so that positions do not depend on which cells happen to be empty.
 
-use crate::geom::Ray;
+use crate::geom::{BitGrid, Ray};
 use rayon::prelude::*;
-
-/// The cells of a cubic grid over `[-radius, radius]³` that may contain surface, one bit per cell. Cell
-/// `(ix, iy, iz)` of a grid of `R³` cells has index `(ix · R + iy) · R + iz`.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Bitmask {
-    /// Cells per axis.
-    pub resolution: usize,
-    /// `⌈R³ / 64⌉` words; bits after the last cell are zero.
-    pub bits: Vec<u64>,
-}
-
-impl Bitmask {
-    /// Returns a mask whose cells are all occupied or all empty.
-    pub fn filled(resolution: usize, occupied: bool) -> Bitmask {
-        let words = resolution.pow(3).div_ceil(64);
-        Bitmask { resolution, bits: vec![if occupied { u64::MAX } else { 0 }; words] }.with_padding_cleared()
-    }
-
-    /// Creates a mask from its words, one bit per cell. Returns `None` if their number does not fit the resolution.
-    pub fn from_words(resolution: usize, bits: Vec<u64>) -> Option<Bitmask> {
-        let fits = bits.len() == resolution.pow(3).div_ceil(64);
-        fits.then(|| Bitmask { resolution, bits }.with_padding_cleared())
-    }
-
-    /// Clears the bits after the last cell.
-    fn with_padding_cleared(mut self) -> Bitmask {
-        let used_bits = self.resolution.pow(3) % 64;
-        if let (Some(last), 1..) = (self.bits.last_mut(), used_bits) {
-            *last &= (1 << used_bits) - 1;
-        }
-        self
-    }
-
-    /// Returns whether cell `i` is occupied.
-    #[inline(always)]
-    pub fn get(&self, i: usize) -> bool {
-        self.bits[i >> 6] >> (i & 63) & 1 == 1
-    }
-
-    /// Sets whether cell `i` is occupied.
-    pub fn set(&mut self, i: usize, occupied: bool) {
-        let bit = 1 << (i & 63);
-        if occupied {
-            self.bits[i >> 6] |= bit;
-        } else {
-            self.bits[i >> 6] &= !bit;
-        }
-    }
-
-    /// Returns a mask in which every cell that touches an occupied one, at a face, edge or corner, is occupied too.
-    pub fn grown(&self) -> Bitmask {
-        let n = self.resolution;
-        let cells: Vec<bool> = (0..n * n * n).map(|i| self.get(i)).collect();
-        let mut out = self.clone();
-        dilated(&cells, [n; 3]).into_iter().enumerate().for_each(|(i, marked)| out.set(i, marked));
-        out
-    }
-
-    /// Returns the number of occupied cells.
-    pub fn count(&self) -> usize {
-        self.bits.iter().map(|word| word.count_ones() as usize).sum()
-    }
-}
-
-/// Returns a copy in which every cell with a marked cell among its 26 neighbors is marked too. Cell `(x, y, z)` has
-/// index `(x · ny + y) · nz + z`. The axes are dilated one after the other, which is equivalent.
-pub fn dilated(cells: &[bool], size: [usize; 3]) -> Vec<bool> {
-    let strides = [size[1] * size[2], size[2], 1];
-    let mut marked = cells.to_vec();
-    for a in 0..3 {
-        let previous = marked.clone();
-        marked.par_chunks_mut(strides[0]).enumerate().for_each(|(x, out)| {
-            for (i, v) in out.iter_mut().enumerate() {
-                let at = x * strides[0] + i;
-                let k = [x, i / size[2], i % size[2]][a];
-                *v = previous[at]
-                    || k > 0 && previous[at - strides[a]]
-                    || k + 1 < size[a] && previous[at + strides[a]];
-            }
-        });
-    }
-    marked
-}
 
 /// A ray in a field's coordinates, for marching.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -141,7 +58,7 @@ struct Blocks {
 
 impl Blocks {
     /// Marks the blocks with an occupied or a solid cell.
-    fn new(mask: &Bitmask, solid: Option<&Bitmask>) -> Blocks {
+    fn new(mask: &BitGrid, solid: Option<&BitGrid>) -> Blocks {
         let n = mask.resolution;
         let size = n.div_ceil(BLOCK);
         let mut bits = vec![0u64; size.pow(3).div_ceil(64)];
@@ -174,8 +91,8 @@ impl Blocks {
 /// visible.
 #[inline]
 fn march_one(
-    mask: &Bitmask,
-    solid: Option<&Bitmask>,
+    mask: &BitGrid,
+    solid: Option<&BitGrid>,
     blocks: &Blocks,
     radius: f32,
     step: f32,
@@ -249,8 +166,8 @@ fn march_one(
 /// Marches a batch of rays and keeps the nearest `limit` samples of each. `solid` must have the resolution of `mask`;
 /// `radius` and `step` are in field units.
 pub fn march(
-    mask: &Bitmask,
-    solid: Option<&Bitmask>,
+    mask: &BitGrid,
+    solid: Option<&BitGrid>,
     radius: f32,
     step: f32,
     rays: &[MarchRay],
@@ -290,21 +207,11 @@ pub fn march(
 mod tests {
     use super::*;
 
-    #[test]
-    fn masks_have_no_bits_after_the_last_cell() {
-        // 27 cells in a word of 64
-        let full = Bitmask::filled(3, true);
-        assert_eq!((full.count(), full.bits[0]), (27, (1 << 27) - 1));
-        assert_eq!(Bitmask::from_words(3, vec![u64::MAX]), Some(full));
-        assert_eq!(Bitmask::from_words(4, vec![u64::MAX]).unwrap().count(), 64);
-        assert!(Bitmask::from_words(3, vec![0; 2]).is_none() && Bitmask::from_words(5, vec![0]).is_none());
-    }
-
     const RAY: MarchRay = MarchRay { origin: [0.03, 0.01, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
 
     #[test]
     fn a_full_box_of_edge_two_holds_twenty_steps_of_a_tenth() {
-        let mask = Bitmask::filled(8, true);
+        let mask = BitGrid::filled(8, true);
         let s = march(&mask, None, 1.0, 0.1, &[RAY], 1000);
         assert_eq!(s.offsets, [0, 20]);
         assert!((s.t[0] - 1.05).abs() < 1e-5 && (s.t[19] - 2.95).abs() < 1e-5);
@@ -312,7 +219,7 @@ mod tests {
 
     #[test]
     fn emptying_cells_removes_samples_and_moves_none() {
-        let full = Bitmask::filled(8, true);
+        let full = BitGrid::filled(8, true);
         let mut holes = full.clone();
         for i in 0..512 {
             if i % 3 == 0 || i % 8 == 5 {
@@ -339,7 +246,7 @@ mod tests {
     #[test]
     fn blocks_are_empty_where_no_cell_is_occupied_or_solid() {
         // 20 cells, so 3 blocks an axis, the last of 4; words begin anywhere in a row
-        let (mut mask, mut solid) = (Bitmask::filled(20, false), Bitmask::filled(20, false));
+        let (mut mask, mut solid) = (BitGrid::filled(20, false), BitGrid::filled(20, false));
         mask.set((7 * 20 + 8) * 20 + 19, true);
         mask.set((7 * 20 + 9) * 20, true);
         solid.set((19 * 20 + 15) * 20 + 9, true);
@@ -357,7 +264,7 @@ mod tests {
     #[test]
     fn skipping_empty_blocks_loses_no_sample() {
         // 3 % of 37³ cells, so that most blocks of 8³ have one, some have none; rays through all of the box
-        let mut mask = Bitmask::filled(37, false);
+        let mut mask = BitGrid::filled(37, false);
         let draw = |i: usize| (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
         (0..37usize.pow(3)).filter(|&i| draw(i) % 1000 < 30 && i % 37 > 12).for_each(|i| mask.set(i, true));
         let mut kept = 0;
@@ -368,7 +275,7 @@ mod tests {
             let way: [f32; 3] = std::array::from_fn(|a| to[a] - from[a]);
             let length = way.iter().map(|d| d * d).sum::<f32>().sqrt();
             let ray = MarchRay { origin: from, direction: way.map(|d| d / length), jitter: unit(6) };
-            let all = march(&Bitmask::filled(37, true), None, 1.0, 0.01, &[ray], 1000).t;
+            let all = march(&BitGrid::filled(37, true), None, 1.0, 0.01, &[ray], 1000).t;
             let cell = |t: f32| {
                 let c = |a: usize| ((ray.origin[a] + t * ray.direction[a] + 1.0) * 18.5) as i32;
                 [0, 1, 2].iter().fold(0, |i, &a| i * 37 + c(a).clamp(0, 36) as usize)
@@ -383,8 +290,8 @@ mod tests {
     #[test]
     fn a_ray_ends_at_the_first_solid_cell() {
         // the ray comes down along z through cell column (4, 4): z cells 7, 6, 5 kept, 4 solid
-        let mut mask = Bitmask::filled(8, true);
-        let mut solid = Bitmask::filled(8, false);
+        let mut mask = BitGrid::filled(8, true);
+        let mut solid = BitGrid::filled(8, false);
         mask.set((4 * 8 + 4) * 8 + 4, false);
         solid.set((4 * 8 + 4) * 8 + 4, true);
         let s = march(&mask, Some(&solid), 1.0, 0.1, &[RAY], 1000);
@@ -394,7 +301,7 @@ mod tests {
 
     #[test]
     fn rays_that_miss_own_nothing() {
-        let mask = Bitmask::filled(8, true);
+        let mask = BitGrid::filled(8, true);
         let miss = MarchRay { origin: [0.0, 0.0, 2.0], direction: [0.0, 0.0, 1.0], jitter: 0.0 };
         let outside = MarchRay { origin: [1.5, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
         assert_eq!(march(&mask, None, 1.0, 0.1, &[miss, RAY, outside], 5).offsets, [0, 0, 5, 5]);

@@ -1,8 +1,8 @@
 //! Updates of the occupancy grid, by a band around the zero level set or by nerfacc's rule. The update functions take the
 //! field as a function of points.
 
-use super::march::Bitmask;
-use super::rng;
+use crate::geom::BitGrid;
+use crate::math::rng;
 use rayon::prelude::*;
 
 /// Number of warm-up steps, in which nerfacc's rule evaluates every cell. Later updates evaluate a random quarter of all
@@ -33,8 +33,8 @@ pub struct BandRule {
 /// `field` evaluates signed distances at points of `[-radius, radius]³`, and the logarithms of the local sharpness divided
 /// by `inv_s`.
 pub fn update_band(
-    [occupied, solid]: [&mut Bitmask; 2],
-    allowed: &Bitmask,
+    [occupied, solid]: [&mut BitGrid; 2],
+    allowed: &BitGrid,
     radius: f32,
     rule: BandRule,
     inv_s: f32,
@@ -91,8 +91,8 @@ pub fn update_band(
 /// occupied ones. `history` holds the maximum of each cell, `[cells]`; `seed` and the step `n` determine the draws, and
 /// `opacity` evaluates points of `[-radius, radius]³`.
 pub fn update_nerfacc(
-    (occupied, history): (&mut Bitmask, &mut [f32]),
-    allowed: &Bitmask,
+    (occupied, history): (&mut BitGrid, &mut [f32]),
+    allowed: &BitGrid,
     radius: f32,
     (seed, n): (u64, u64),
     threshold: f32,

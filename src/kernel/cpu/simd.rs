@@ -1,4 +1,5 @@
-//! One body, compiled per CPU level: dispatch, matrix blocks and a few transcendental functions.
+//! Arithmetic of bodies that are compiled per CPU level: matrix blocks and a few transcendental
+//! functions.
 //!
 //! Fixed-width arrays are left to the autovectorizer. Each hot body is `#[inline(always)]` and
 //! generic over `F` ("has fused multiply-add"), instantiated inside a `#[target_feature]` wrapper
@@ -6,29 +7,6 @@
 //! call, hence [`fma`].
 //!
 //! [`Matrix`] holds the weights of small networks, zero-padded to the size of the matrix blocks, with their transpose.
-
-/// Declares `fn name(args)` that runs `body::<HAS_FMA>(args)` compiled for the best level this CPU has.
-#[macro_export]
-macro_rules! dispatch {
-    ($(#[$meta:meta])* $vis:vis fn $name:ident / $body:ident ( $($a:ident : $t:ty),* $(,)? )) => {
-        $(#[$meta])*
-        $vis fn $name($($a: $t),*) {
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = "avx2,fma,bmi2")]
-                fn v3($($a: $t),*) { $body::<true>($($a),*) }
-                if std::is_x86_feature_detected!("avx2")
-                    && std::is_x86_feature_detected!("fma")
-                    && std::is_x86_feature_detected!("bmi2")
-                {
-                    // SAFETY: the features were found on this CPU at run time.
-                    return unsafe { v3($($a),*) };
-                }
-            }
-            $body::<{ cfg!(target_arch = "aarch64") }>($($a),*)
-        }
-    };
-}
 
 /// `a · b + c`, fused where the hardware can.
 #[inline(always)]

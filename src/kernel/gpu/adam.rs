@@ -61,7 +61,8 @@ pub fn adam(device: &Device, [p, m, v]: [&Buffer; 3], g: &Buffer, step: &AdamSte
 mod tests {
     use super::super::device::tests::{agree, device};
     use super::*;
-    use crate::kernel::cpu::{adam, rng};
+    use crate::kernel::cpu::adam;
+    use crate::math::rng;
 
     #[test]
     fn steps_are_those_of_the_cpu_with_and_without_idle_weights() {

@@ -1,7 +1,8 @@
 //! A signed-distance field to test kernels on.
 
+use crate::kernel::cpu::hash;
 use crate::kernel::cpu::sdf::{FieldShape, WIDTH};
-use crate::kernel::cpu::{hash, rng};
+use crate::math::rng;
 
 /// The largest error of an array, of the larger of a value and the mean magnitude.
 pub(super) fn worst(got: &[f32], want: &[f32]) -> f32 {

@@ -520,7 +520,8 @@ impl Density {
 mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::*;
-    use crate::kernel::cpu::{hash, rng};
+    use crate::kernel::cpu::hash;
+    use crate::math::rng;
 
     #[test]
     fn gradients_of_a_density_are_the_same_where_groups_sum_over_several_tiles() {

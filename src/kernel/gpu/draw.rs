@@ -6,7 +6,7 @@ use super::device::{Buffer, Device, Words, groups, launch};
 use super::rng::{Wide, below, permuted, ranked, stream, uniform, upper_bound, word};
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;

@@ -7,7 +7,8 @@ use super::neus::{Neus, Rays};
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
 use crate::Result;
-use crate::kernel::cpu::march::{Bitmask, MarchRay};
+use crate::geom::BitGrid;
+use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::neus::RAY_WIDTH;
 use crate::kernel::cpu::sdf::FieldShape;
 use std::ops::Range;
@@ -58,7 +59,7 @@ impl Evaluator {
         table: &[f32],
         flat: &[f32],
         inv_s: f32,
-        [occupied, solid]: [Option<&Bitmask>; 2],
+        [occupied, solid]: [Option<&BitGrid>; 2],
     ) -> Evaluator {
         let of = |capacity: usize| {
             let mut sdf = Sdf::new(&device, shape, capacity);
@@ -66,7 +67,7 @@ impl Evaluator {
             sdf
         };
         let (sdf, fewer) = (of(CAPACITY), FEWER.map(of));
-        let everywhere = Bitmask::filled(2, true);
+        let everywhere = BitGrid::filled(2, true);
         Evaluator {
             table: device.upload(table),
             flat: device.upload(flat),
@@ -156,7 +157,8 @@ mod tests {
     use super::super::device::tests::{agree, device};
     use super::*;
     use crate::kernel::cpu::mlp::Weights;
-    use crate::kernel::cpu::{march, rng, sdf};
+    use crate::kernel::cpu::{march, sdf};
+    use crate::math::rng;
 
     #[test]
     fn what_is_asked_is_what_the_cpu_answers() {
@@ -164,7 +166,7 @@ mod tests {
         let Case { shape, table, flat, x, direction, .. } = Case::new(700, 5, true, 5);
         let weights = Weights::new(shape.layout(), &flat);
         let flatten = |rows: Vec<[f32; 3]>| rows.into_flattened();
-        let mut mask = Bitmask::filled(8, true);
+        let mut mask = BitGrid::filled(8, true);
         (0..512).step_by(3).for_each(|i| mask.set(i, false));
         let mut evaluator =
             Evaluator::new(device, &shape, table.as_flattened(), &flat, 20.0, [Some(&mask), None]);

@@ -352,7 +352,7 @@ mod tests {
     use super::super::device::tests::{agree, device, devices, planes};
     use super::*;
     use crate::kernel::cpu::hash;
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
 
     const SAMPLES: usize = 1000;
     const CAPACITY: usize = 1024;

@@ -259,7 +259,7 @@ mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::super::neus::{Neus, Rays};
     use super::*;
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
 
     const WEIGHTS: LossWeights = LossWeights {
         rgb_mse: 10.0,

@@ -268,17 +268,18 @@ impl Samples {
 mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::*;
-    use crate::kernel::cpu::march::{Bitmask, MarchRay, march};
-    use crate::kernel::cpu::rng;
+    use crate::geom::BitGrid;
+    use crate::kernel::cpu::march::{MarchRay, march};
+    use crate::math::rng;
 
     const RADIUS: f32 = 1.1;
     const STEP: f32 = 0.02;
 
     /// Returns a mask with holes, solid cells, and rays from all around towards the center, one along an axis and one that
     /// misses.
-    fn scene() -> (Bitmask, Bitmask, Vec<MarchRay>) {
+    fn scene() -> (BitGrid, BitGrid, Vec<MarchRay>) {
         let resolution = 24;
-        let mut mask = Bitmask::filled(resolution, false);
+        let mut mask = BitGrid::filled(resolution, false);
         let mut solid = mask.clone();
         for i in 0..resolution * resolution * resolution {
             let at = |stride: usize| (i / stride % resolution) as f32 / 12.0 - 0.95;

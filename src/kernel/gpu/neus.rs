@@ -344,7 +344,8 @@ impl Neus {
 mod tests {
     use super::super::device::tests::{agree, device, planes};
     use super::*;
-    use crate::kernel::cpu::{neus, rng};
+    use crate::kernel::cpu::neus;
+    use crate::math::rng;
 
     /// Composited values, gradient by the field's output, gradient by `inv_s`.
     type Results = (Vec<f32>, Vec<f32>, f32);

@@ -3,7 +3,7 @@
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::sdf::Sdf;
 use crate::Result;
-use crate::kernel::cpu::march::Bitmask;
+use crate::geom::BitGrid;
 use crate::kernel::cpu::occupancy::BandRule;
 use burn::cubecl::{self, prelude::*};
 
@@ -147,16 +147,16 @@ pub(super) fn words(bits: &[u64]) -> Vec<u32> {
 
 impl Occupancy {
     /// Uploads masks.
-    pub fn new(device: &Device, mask: &Bitmask, solid: Option<&Bitmask>, radius: f32) -> Occupancy {
+    pub fn new(device: &Device, mask: &BitGrid, solid: Option<&BitGrid>, radius: f32) -> Occupancy {
         assert!(solid.is_none_or(|s| s.resolution == mask.resolution));
-        let upload = |mask: &Bitmask| device.upload(&words(&mask.bits));
+        let upload = |mask: &BitGrid| device.upload(&words(&mask.bits));
         Occupancy { mask: upload(mask), solid: solid.map(upload), resolution: mask.resolution, radius }
     }
 
     /// Waits for the device and returns both masks: the occupied cells and the solid ones; the latter mask is empty if
     /// the device holds none.
-    pub fn read(&self, device: &Device) -> Result<[Bitmask; 2]> {
-        let mut masks = [Bitmask::filled(self.resolution, false), Bitmask::filled(self.resolution, false)];
+    pub fn read(&self, device: &Device) -> Result<[BitGrid; 2]> {
+        let mut masks = [BitGrid::filled(self.resolution, false), BitGrid::filled(self.resolution, false)];
         for (mask, buffer) in masks.iter_mut().zip([Some(&self.mask), self.solid.as_ref()]) {
             let Some(buffer) = buffer else { continue };
             let words = device.fetch::<u32>(buffer)?;
@@ -178,7 +178,7 @@ pub struct Band {
 
 impl Band {
     /// Creates the rule; cells outside `allowed` are never occupied.
-    pub fn new(device: &Device, allowed: &Bitmask, rule: BandRule) -> Band {
+    pub fn new(device: &Device, allowed: &BitGrid, rule: BandRule) -> Band {
         let total = allowed.resolution.pow(3);
         let cells: Vec<u32> = (0..total).filter(|&i| allowed.get(i)).map(|i| i as u32).collect();
         Band {

@@ -159,7 +159,7 @@ impl SurfacePoints {
 mod tests {
     use super::super::device::tests::{agree, device};
     use super::*;
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
 
     #[test]
     fn points_follow_the_samples_and_have_the_gradients_of_their_loss() {

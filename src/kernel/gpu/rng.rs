@@ -1,9 +1,9 @@
-//! The random numbers of [`crate::kernel::cpu::rng`], with the same bits. 64-bit words are pairs of 32-bit words, because not
+//! The random numbers of [`crate::math::rng`], with the same bits. 64-bit words are pairs of 32-bit words, because not
 //! every adapter has 64-bit integers.
 //!
 //! [`upper_bound`] and [`ranked`] select the item of a random number, by binary search in running counts.
 
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 use burn::cubecl::{self, prelude::*};
 
 /// A word of 64 bits.

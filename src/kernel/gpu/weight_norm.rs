@@ -182,7 +182,7 @@ mod tests {
     use super::super::device::tests::{agree, device};
     use super::*;
     use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS};
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
 
     /// Returns the weights of parameters in f64, derived from the shapes alone.
     fn weights(layout: Layout, raw: &[f64]) -> Vec<f64> {

@@ -15,6 +15,7 @@
 
 use super::{ConsistencyView, Opposition, SilhouetteConstraints, Votes, cells_on_ray, claims_of};
 use crate::Result;
+use crate::image::INSIDE;
 use rayon::prelude::*;
 
 /// Rows and cells of [`verdicts`], which compares masks that a network proposes.
@@ -59,7 +60,7 @@ struct Disagreement {
 /// When the cameras stand at one place or look in one direction.
 pub fn verdicts(views: &[ConsistencyView]) -> Result<Vec<MaskVerdict>> {
     let mut out = vec![MaskVerdict::Unlike; views.len()];
-    let shows = |v: &ConsistencyView| v.mask.is_some_and(|m| m.values.iter().any(|&v| v > 127));
+    let shows = |v: &ConsistencyView| v.mask.is_some_and(|m| m.values.iter().any(|&v| v >= INSIDE));
     let used: Vec<usize> = (0..views.len()).filter(|&i| shows(&views[i])).collect();
     used.iter().for_each(|&i| out[i] = MaskVerdict::Agrees);
     if used.len() < 2 {

@@ -323,7 +323,7 @@ impl PixelGraph {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
 
     struct Random(u64, u64);
 

@@ -6,7 +6,7 @@
 //! so that one flat color is no singular Gaussian.
 
 use crate::geom::cofactors;
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 
 /// A color in coded 0..=255.
 pub type Rgb = [u8; 3];

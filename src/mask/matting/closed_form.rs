@@ -26,7 +26,7 @@
 use super::{HEAD, UNKNOWN};
 use crate::geom::cofactors;
 use crate::image::{Gray, Photo};
-use crate::kernel::cpu::cg::{self, dot};
+use crate::math::cg::{self, dot};
 use crate::{Error, Result};
 
 /// Options of the solver.

@@ -3,7 +3,7 @@
 use super::nodes::Nodes;
 use super::rows::{Matrix, Rows};
 use crate::geom::sphharm::{COEFFICIENTS_OF_DEGREE_2, sh16};
-use crate::kernel::cpu::cg::{conjugate_gradients, dot};
+use crate::math::cg::{conjugate_gradients, dot};
 use rayon::prelude::*;
 
 /// The sum of squares left at which a fit ends, of that at its start.

@@ -2,7 +2,7 @@ use super::*;
 use crate::Quiet;
 use crate::geom::Camera;
 use crate::image::{Gray, Photo};
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 
 /// A square of 24 × 24 cells from −1 to 1 at z = 0 that faces +z, and an atlas of 48 × 48 texels over it.

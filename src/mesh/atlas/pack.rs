@@ -8,7 +8,7 @@
 //! Shapes of charts on a grid of cells: every cell that a chart grown by its gutter touches.
 
 use super::chart::Flat;
-use crate::kernel::cpu::rng::mix;
+use crate::math::rng::mix;
 use crate::{Error, Monitor, Result};
 use glam::DVec2;
 use rayon::prelude::*;
@@ -427,7 +427,8 @@ impl Page {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::monitor::{Quiet, Stopping};
+    use crate::Quiet;
+    use crate::mesh::fixtures::Stopping;
 
     /// Returns a rectangle of two triangles.
     fn rectangle(width: f64, height: f64) -> Flat {

@@ -310,9 +310,9 @@ fn fit_lobes(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Painted;
     use crate::geom::sphharm::{combine, functions};
-    use crate::kernel::cpu::rng;
+    use crate::math::rng;
+    use crate::mesh::fixtures::Painted;
 
     fn sphere(p: Vec3) -> f32 {
         p.length() - 0.5

@@ -7,7 +7,7 @@
 
 use crate::geom::{Atlas, Mesh, bilinear_taps};
 use crate::image::{Image, Photo};
-use crate::kernel::cpu::cg::{conjugate_gradients, dot};
+use crate::math::cg::{conjugate_gradients, dot};
 use glam::Vec2;
 use std::collections::HashMap;
 

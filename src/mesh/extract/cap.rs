@@ -132,7 +132,7 @@ impl Cap {
 mod tests {
     use super::*;
     use crate::Quiet;
-    use crate::geom::Painted;
+    use crate::mesh::fixtures::Painted;
     use crate::mesh::{ExtractOptions, extract};
 
     /// Returns a column through the floor of the scene's box, red to the left and green to the right.

@@ -12,7 +12,7 @@
 //! The words have 64 bits: two classes are taken for one by an accident of 1 in 10¹⁹, and then a handle stays.
 
 use crate::geom::{Sets, side_ends, sorted_sides};
-use crate::kernel::cpu::rng::mix;
+use crate::math::rng::mix;
 use crate::{Monitor, Result};
 use glam::Vec3;
 use std::cmp::Reverse;

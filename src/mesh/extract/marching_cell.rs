@@ -473,15 +473,13 @@ impl StripSearch<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::math::rng::mix;
     use std::collections::HashMap;
 
     /// Uniform in -1..1, from a counter: SplitMix64.
     fn noise(seed: &mut u64) -> f32 {
         *seed = seed.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = *seed;
-        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ z >> 31) >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+        (mix(*seed) >> 40) as f32 / (1u64 << 23) as f32 - 1.0
     }
 
     fn case_of(values: &[f32; 8]) -> u8 {

@@ -246,9 +246,10 @@ impl Flood<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Quiet;
     use crate::geom::Aabb;
+    use crate::mesh::fixtures::Stopping;
     use crate::mesh::{Volume, marching};
-    use crate::monitor::{Quiet, Stopping};
 
     fn ball(center: Vec3, radius: f32) -> impl Fn(Vec3) -> f32 + Sync {
         move |p| p.distance(center) - radius

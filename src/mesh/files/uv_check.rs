@@ -16,6 +16,7 @@ use crate::geom::{
     Atlas, DEFAULT_EFFORT, Mesh, OutlineSide, Sets, nearest_charts, overlaps, shared_area, side_ends,
     sorted_sides, turn,
 };
+use crate::math::rank::quantile;
 use glam::{DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -335,11 +336,8 @@ fn stretches(report: &mut UvReport, triangles: &[([DVec3; 3], [DVec2; 3])]) {
 
 /// Returns the median and 99th percentile.
 fn quantiles(values: &mut [f64]) -> (f64, f64) {
-    let mut at = |share: f64| {
-        let i = ((values.len() - 1) as f64 * share).round() as usize;
-        *values.select_nth_unstable_by(i, f64::total_cmp).1
-    };
-    (at(0.5), at(0.99))
+    let [median, high] = [0.5, 0.99].map(|share| quantile(values, share, f64::total_cmp).unwrap_or(f64::NAN));
+    (median, high)
 }
 
 #[cfg(test)]

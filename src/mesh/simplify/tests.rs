@@ -2,9 +2,11 @@
 
 use super::crossing::crossings;
 use super::*;
+use crate::Quiet;
 use crate::geom::{Topology, topology};
+use crate::math::rng::mix;
+use crate::mesh::fixtures::Stopping;
 use crate::mesh::{Volume, marching};
-use crate::monitor::{Quiet, Stopping};
 use glam::Vec3;
 
 type Answer = (Vec<f32>, Vec<Vec3>);
@@ -54,10 +56,7 @@ struct Noise(u64);
 impl Noise {
     fn next(&mut self) -> f32 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ z >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ z >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ z >> 31) >> 40) as f32 / (1u64 << 24) as f32
+        (mix(self.0) >> 40) as f32 / (1u64 << 24) as f32
     }
 }
 

@@ -14,7 +14,7 @@ use super::crossing::crossings;
 use super::{SimplifyReport, Task};
 use crate::Result;
 use crate::geom::{Mesh, SdfField, area_vector, shape};
-use crate::kernel::cpu::cg::conjugate_gradients;
+use crate::math::cg::conjugate_gradients;
 use crate::mesh::evaluate;
 use crate::mesh::extract::BATCH;
 use crate::mesh::moves::{move_vertices, newton};

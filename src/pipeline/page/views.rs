@@ -19,7 +19,7 @@ use crate::report::{
 };
 use crate::run::{Record, read_record};
 use crate::{Error, Quiet, Result};
-use glam::Vec3;
+use glam::{DVec2, Vec3};
 use rayon::prelude::*;
 use serde_json::Value;
 use std::path::Path;
@@ -172,8 +172,7 @@ fn straightened(picture: Photo, camera: &Camera) -> Photo {
     let c = camera.resized(w, h);
     let from = |i: u32| {
         let (x, y) = ((i % w) as f64 + 0.5, (i / w) as f64 + 0.5);
-        let (x, y) = c.distortion.apply((x - c.cx) / c.fx, (y - c.cy) / c.fy);
-        let (x, y) = (x * c.fx + c.cx - 0.5, y * c.fy + c.cy - 0.5);
+        let DVec2 { x, y } = c.pixel(DVec2::new((x - c.cx) / c.fx, (y - c.cy) / c.fy)) - 0.5;
         if !(x > -1.0 && y > -1.0 && x < w as f64 && y < h as f64) {
             return [0; 3];
         }

@@ -193,12 +193,12 @@ impl<'a> Lens<'a> {
 
     /// Returns the pixel position after distortion.
     fn bent(&self, ideal: Vec3) -> (f64, f64) {
-        let c = self.camera;
-        let (x, y) = match c.distortion.is_none() {
-            true => (f64::from(ideal.x), f64::from(ideal.y)),
-            false => c.distortion.apply(ideal.x.into(), ideal.y.into()),
+        let at = ideal.truncate().as_dvec2();
+        let pixel = match self.camera.distortion.is_none() {
+            true => self.camera.pixel_behind_lens(at.into()),
+            false => self.camera.pixel(at),
         };
-        (c.fx * x + c.cx, c.fy * y + c.cy)
+        pixel.into()
     }
 
     /// Snapped; not on the picture where it is too far away from it.

@@ -2,7 +2,7 @@ use super::project::UNIT;
 use super::project::{Corner, Face, area};
 use super::*;
 use crate::geom::{Bvh, Distortion, ShellCaster};
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 use crate::render::{RaycastOptions, raycast};
 use glam::{DMat3, DVec3, Vec2, Vec3};
 

@@ -12,7 +12,6 @@ use tiface::config::{Config, Preset, Stage, iface::Start};
 use tiface::geom::{Camera, Ray, SdfField, Similarity};
 use tiface::iface::IFace;
 use tiface::io::Limits;
-use tiface::kernel::cpu::march::Bitmask;
 use tiface::pipeline::{Session, reconstruct};
 use tiface::run::Run;
 use tiface::tface::FieldMean;
@@ -144,8 +143,7 @@ fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> 
     reconstruct(&session, Stage::Iface)?;
     let scene = session.scene()?;
     let radiance = FieldMean::load("tface", &run.path(Stage::Tface), config.tface.learned())?;
-    let hull = scene.hull.as_ref().and_then(|h| Bitmask::from_words(h.resolution, h.bits.clone()));
-    let surface = IFace::load(&run.path(Stage::Iface), &config.iface, hull.as_ref())?;
+    let surface = IFace::load(&run.path(Stage::Iface), &config.iface, scene.hull.as_ref())?;
     let (mut error, mut count) = (0.0, 0.0);
     for view in session.capture().split(Split::Test) {
         let loaded = view.load(&Limits::default())?;

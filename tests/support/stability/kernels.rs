@@ -12,9 +12,10 @@ use tiface::kernel::cpu::hash::{self, Level};
 use tiface::kernel::cpu::march::MarchRay;
 use tiface::kernel::cpu::mlp::Weights;
 use tiface::kernel::cpu::sdf::{self, FieldShape};
+use tiface::kernel::cpu::simd;
 use tiface::kernel::cpu::vm::mask::Lattice;
 use tiface::kernel::cpu::vm::{self, DecoderShape, DecoderWeights, Grid, Shading, VmField};
-use tiface::kernel::cpu::{rng, simd};
+use tiface::math::rng;
 use tiface::metrics::{ssim_reflect_map, ssim_valid};
 
 pub(super) fn cases() -> Vec<StabilityCase> {

@@ -3,11 +3,12 @@
 
 use super::case::{Cases, StabilityCase, worst};
 use glam::{DMat3, DVec3, Vec2, Vec3};
-use tiface::geom::{Bvh, Camera, Distortion, Mesh, Ray};
-use tiface::kernel::cpu::march::{Bitmask, MarchRay, march};
+use tiface::geom::{BitGrid, Bvh, Camera, Distortion, Mesh, Ray};
+use tiface::kernel::cpu::hash;
+use tiface::kernel::cpu::march::{MarchRay, march};
 use tiface::kernel::cpu::neus::{self, Rays};
 use tiface::kernel::cpu::vm::mask::{Lattice, Walk};
-use tiface::kernel::cpu::{hash, rng};
+use tiface::math::rng;
 use tiface::mesh::{Volume, marching};
 use tiface::render::{RasterOptions, RasterView, raster};
 
@@ -168,7 +169,7 @@ fn rasterizer(cases: &mut Cases) {
 /// Rays of a box: through its middle, along its faces, edges and the walls of its cells, and through its corners.
 fn boxes(cases: &mut Cases) {
     let step = 0.013f32;
-    let full = Bitmask::filled(16, true);
+    let full = BitGrid::filled(16, true);
     let lattice = Lattice { min: [-1.0; 3], max: [1.0; 3], step, samples: 4096, near: 0.0, far: 100.0 };
     let (mut cubic, mut vm) = (Vec::new(), Vec::new());
     for i in 0..3000u64 {
@@ -207,7 +208,7 @@ fn chord(origin: DVec3, direction: DVec3) -> f64 {
 
 /// NeuS through a sphere of radius 0.5, ever nearer to its outline: where a ray ends, and that one beside it does not.
 fn spheres(cases: &mut Cases) {
-    let full = Bitmask::filled(16, true);
+    let full = BitGrid::filled(16, true);
     for (inv_s, step) in [(200.0f32, 0.004f32), (2000.0, 0.001), (1e6, 0.001)] {
         let see = |height: f32| {
             let r = MarchRay { origin: [height, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.37 };

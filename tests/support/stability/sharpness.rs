@@ -4,8 +4,8 @@ use super::case::{Cases, StabilityCase, relative, worst};
 use super::reference::{neus::composite, wide};
 use std::array::from_fn;
 use tiface::kernel::cpu::neus::{self, Rays};
-use tiface::kernel::cpu::rng;
 use tiface::kernel::cpu::sdf::WIDTH;
+use tiface::math::rng;
 
 pub(super) fn cases() -> Vec<StabilityCase> {
     let mut cases = Cases::new("sharpness");

@@ -5,7 +5,7 @@ use glam::{DVec3, Vec3};
 use std::collections::BTreeMap;
 use tiface::Quiet;
 use tiface::geom::{Aabb, Mesh, SdfField, topology};
-use tiface::kernel::cpu::rng;
+use tiface::math::rng;
 use tiface::mesh::{ExtractOptions, SimplifyConfig, Volume, extract, marching, simplify};
 
 pub(super) fn cases() -> Vec<StabilityCase> {

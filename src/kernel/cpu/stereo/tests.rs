@@ -1,5 +1,5 @@
 use super::*;
-use crate::kernel::cpu::rng;
+use crate::math::rng;
 use glam::{DMat3, DVec3};
 use std::f32::consts::TAU;
 

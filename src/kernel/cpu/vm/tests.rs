@@ -3,7 +3,8 @@ use super::mask::{BoxMask, Lattice, Walk};
 use super::penalty::tv_factors;
 use super::*;
 use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::{reference, rng};
+use crate::kernel::cpu::reference;
+use crate::math::rng;
 
 /// Returns the position of a point with coordinates -1..=1 along each axis of the fixture's box.
 fn at(u: [f32; 3]) -> [f32; 3] {

@@ -125,8 +125,7 @@ fn the_gradients_are_those_of_the_cpu_where_groups_sum_over_several_tiles() {
 fn partial_gradients_of_a_thousand_groups_are_added_whatever_the_number_of_samples() {
     let Some(device) = device() else { return };
     let (size, tile, summing) = (300, 64, 1000);
-    let partial: Vec<f32> =
-        (0..size * summing).map(|i| crate::kernel::cpu::rng::normal(1, 2, i as u64)).collect();
+    let partial: Vec<f32> = (0..size * summing).map(|i| crate::math::rng::normal(1, 2, i as u64)).collect();
     let map: Vec<u32> = (0..200).map(|i| i * 7 % 300).collect();
     for samples in [0usize, 1, 64 * 33, 64 * 999 + 1, 64 * 5000] {
         let groups = samples.div_ceil(tile).min(summing);

@@ -6,9 +6,9 @@ use super::super::evaluate::planes;
 use super::{Vm, VmValues};
 use crate::Result;
 use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::rng;
 use crate::kernel::cpu::vm::mask::{BoxMask, Lattice};
 use crate::kernel::cpu::vm::{self, DecoderShape, DecoderWeights, Grid, RAY_WIDTH, Rendered, VmField};
+use crate::math::rng;
 
 /// A field, its values, rays, and gradients of what they see.
 pub(super) struct Case {

@@ -3,10 +3,11 @@ use super::super::device::Words;
 use super::super::device::tests::{agree, device, devices, planes};
 use super::case_tests::{DeviceCase, NARROW, Shape, capacity, case, on_cpu};
 use super::*;
+use crate::kernel::cpu::reference;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm};
 use crate::kernel::cpu::vm::mask::Walk;
 use crate::kernel::cpu::vm::{Grid, RAY_WIDTH, penalize};
-use crate::kernel::cpu::{reference, rng};
+use crate::math::rng;
 
 /// Hidden layers of a wide tile, ranks of any kind, nothing left out. Vectors of the density as
 /// [`NARROW`] has them.

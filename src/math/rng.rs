@@ -11,13 +11,13 @@ pub fn bits(seed: u64, stream: u64, index: u64) -> u64 {
 
 /// Returns the key of a stream, which all of its numbers share.
 #[inline]
-pub(crate) fn stream_key(seed: u64, stream: u64) -> u64 {
+pub fn stream_key(seed: u64, stream: u64) -> u64 {
     mix(mix(seed ^ 0x9e37_79b9_7f4a_7c15) ^ stream)
 }
 
 /// Returns SplitMix64's finalizer of a word, a bijective hash.
 #[inline]
-pub(crate) fn mix(mut z: u64) -> u64 {
+pub fn mix(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     z ^ (z >> 31)
@@ -41,11 +41,11 @@ pub fn below(seed: u64, stream: u64, index: u64, n: u64) -> u64 {
 #[derive(Clone, Copy, Debug)]
 pub struct Permutation {
     /// Key that the streams of all rounds are derived from.
-    pub(crate) key: u64,
+    pub key: u64,
     /// Number of bits of each half of the Feistel network.
-    pub(crate) half_bits: u32,
+    pub half_bits: u32,
     /// Position of the first number of the current step.
-    pub(crate) first: u64,
+    pub first: u64,
     n: u64,
 }
 
@@ -65,6 +65,7 @@ impl Permutation {
     }
 
     /// Returns number `i` of the step, or `None` past the end of the permutation.
+    #[inline]
     pub fn get(&self, i: u64) -> Option<u64> {
         let mut x = Some(self.first + i).filter(|&x| x < self.n)?;
         let lower = (1u64 << self.half_bits) - 1;
@@ -84,6 +85,7 @@ impl Permutation {
 }
 
 /// Returns a standard normal number (Box, Muller 1958).
+#[inline]
 pub fn normal(seed: u64, stream: u64, index: u64) -> f32 {
     let (u, v) = (uniform(seed, stream, 2 * index), uniform(seed, stream, 2 * index + 1));
     (-2.0 * (1.0 - u as f64).ln()).sqrt() as f32 * (std::f32::consts::TAU * v).cos()

@@ -5,7 +5,7 @@
 //! must be in the dataset's own world. A path from nerfstudio's viewer is only if its training ran
 //! with `--orientation-method none --center-method none --auto-scale-poses False`.
 
-use crate::capture::camera_like;
+use super::transforms::camera_like;
 use crate::geom::{Aabb, Camera, Distortion};
 use crate::{Error, Result};
 use glam::{BVec3, DMat3, DVec3, Vec3};
@@ -62,14 +62,11 @@ const FILLED: f64 = 0.95;
 /// # Examples
 ///
 /// ```
-/// use glam::{DMat3, DVec3, Vec3};
-/// use tiface::geom::{Aabb, Camera, Distortion};
-/// use tiface::render::path::orbit;
+/// use glam::Vec3;
+/// use tiface::capture::path::orbit;
+/// use tiface::geom::{Aabb, Camera};
 ///
-/// let front = Camera {
-///     width: 400, height: 300, fx: 500.0, fy: 500.0, cx: 200.0, cy: 150.0,
-///     distortion: Distortion::default(), rotation: DMat3::IDENTITY, position: DVec3::new(0.0, 0.0, 4.0),
-/// };
+/// let front = Camera::above(400, 300, 500.0, 4.0);
 /// let head = Aabb { min: Vec3::splat(-0.5), max: Vec3::splat(0.5) };
 /// let path = orbit(&[front], head, Vec3::Y, 8)?;
 /// assert_eq!((path.len(), path[0].name.as_str()), (8, "0001"));

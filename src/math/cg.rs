@@ -1,6 +1,7 @@
 //! Conjugate gradients for symmetric positive definite systems (Hestenes, Stiefel 1952), preconditioned.
 
 /// Returns the scalar product of two vectors.
+#[inline]
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>()
 }

@@ -1,0 +1,11 @@
+//! Arithmetic that knows no pictures, no geometry and no devices: slices of numbers in, numbers
+//! out.
+//!
+//! Everything gives the same bits on any number of threads.
+
+pub mod cg;
+pub mod cholesky;
+mod dispatch;
+pub mod distance;
+pub mod rank;
+pub mod rng;
