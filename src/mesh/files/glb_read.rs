@@ -89,6 +89,18 @@ fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
     Ok(glb)
 }
 
+/// Returns a number of an accessor, and the one that stands for 1 if it is normalized.
+fn number(component: C, b: &[u8]) -> (f64, f64) {
+    match component {
+        C::U8 => (f64::from(b[0]), 255.0),
+        C::I8 => (f64::from(b[0] as i8), 127.0),
+        C::I16 => (f64::from(i16::from_le_bytes([b[0], b[1]])), 32767.0),
+        C::U16 => (f64::from(u16::from_le_bytes([b[0], b[1]])), 65535.0),
+        C::U32 => (f64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])), 1.0),
+        C::F32 => (f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]])), 1.0),
+    }
+}
+
 /// The reachable nodes that are still to be read, with their parents' transforms. Each occurs once.
 struct NodeStack<'a> {
     reached: Vec<bool>,
@@ -466,14 +478,7 @@ impl<'a> GlbReader<'a> {
         for i in 0..count as usize {
             let start = offset as usize + i * stride;
             for b in bytes[start..start + element].chunks_exact(component.size()) {
-                let (value, top) = match component {
-                    C::U8 => (f64::from(b[0]), 255.0),
-                    C::I8 => (f64::from(b[0] as i8), 127.0),
-                    C::I16 => (f64::from(i16::from_le_bytes([b[0], b[1]])), 32767.0),
-                    C::U16 => (f64::from(u16::from_le_bytes([b[0], b[1]])), 65535.0),
-                    C::U32 => (f64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])), 1.0),
-                    C::F32 => (f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]])), 1.0),
-                };
+                let (value, top) = number(component, b);
                 if !value.is_finite() {
                     return Err(
                         source.broken(at, format!("element {i} is {value}, expected a finite number"))
