@@ -144,14 +144,8 @@ pub fn bake(
 ) -> Result<Baked> {
     let begin = Instant::now();
     setting((1..=8).contains(&config.side), "BakeConfig::side", "1..=8", config.side)?;
-    let (width, height) = (atlas.width, atlas.height);
     let count = if config.lobes == 0 { 0 } else { functions(config.lobes.min(2)) };
-    let mut texels = Texels {
-        color: Image::new(width, height, 3),
-        lobes: vec![Image::new(width, height, 3); count],
-        normal: config.normals.then(|| Image::new(width, height, 3)),
-        covered: vec![false; width as usize * height as usize],
-    };
+    let mut texels = Texels::new(atlas, count, config.normals);
     let mut totals = SampleTotals::default();
     let bvh = Bvh::new(mesh);
     let visibility =
@@ -173,7 +167,7 @@ pub fn bake(
     let Texels { color, lobes, normal, covered } = texels;
     let SampleTotals { samples, visible, views, moved } = totals;
     let report = BakeReport {
-        size: [width, height],
+        size: [atlas.width, atlas.height],
         covered: share(covered.iter().filter(|&&c| c).count() as f64, covered.len()),
         samples,
         seen: share(visible as f64, samples),
@@ -209,7 +203,7 @@ impl SampleTotals {
     }
 }
 
-/// The baked pictures, as [`Baked`].
+/// The pictures of an atlas while they are made, as in [`Baked`].
 struct Texels {
     color: Image,
     lobes: Vec<Image>,
@@ -219,6 +213,16 @@ struct Texels {
 }
 
 impl Texels {
+    fn new(atlas: &Atlas, lobes: usize, has_normals: bool) -> Texels {
+        let (width, height) = (atlas.width, atlas.height);
+        Texels {
+            color: Image::new(width, height, 3),
+            lobes: vec![Image::new(width, height, 3); lobes],
+            normal: has_normals.then(|| Image::new(width, height, 3)),
+            covered: vec![false; width as usize * height as usize],
+        }
+    }
+
     /// Gives texels the mean of their samples, which are sorted by texel. If some samples of a texel
     /// are visible, the invisible ones are ignored.
     fn put_means(&mut self, samples: &[Sample], points: &SurfacePoints, shades: &Shades) {
