@@ -236,9 +236,9 @@ fn sheets<'a>(
 
 /// Memory of a thread, reused from band to band.
 struct Scratch {
-    tile: Tile,
+    tile: Box<Tile>,
     /// The tile of the layers, once there are any.
-    over: Vec<Tile>,
+    over: Vec<Box<Tile>>,
     batch: Box<Batch>,
     queue: RayHits,
 }

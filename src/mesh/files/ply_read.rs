@@ -472,7 +472,7 @@ fn triangles(body: &mut Body, element: &Element, out: &mut Faces) -> Result<()> 
             out.has_pages |= *out.page.get_or_insert(row[k]) != row[k];
         }
         if coordinates.is_some() && out.triangles.len() > first {
-            out.add_wedges(&format_args!("face {i}"), &coords, corners, source)?;
+            out.add_wedges(&format_args!("face {i}"), &coords, polygon.corners, source)?;
         }
     }
     Ok(())
