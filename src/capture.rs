@@ -155,6 +155,45 @@ fn open_folder<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<(Captu
 /// Frames with a photograph become views; what is wrong goes to the listing.
 fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<Capture> {
     let CaptureFolder { root, options, .. } = *folder;
+    let frames = frames_with_photographs(folder, listing)?;
+    let (common, names) = folder::view_names(&frames);
+    check_names(&frames, &names, listing);
+    let UsableViews { mut views, kept, turn_is_open } = usable_views(folder, frames, names, listing);
+    if views.is_empty() {
+        return None;
+    }
+    name_splits(&mut views, &kept, listing);
+    if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, listing) {
+        listing.problems.push(problem);
+    }
+    let has_files = views
+        .iter()
+        .zip(&kept)
+        .any(|(view, (_, info))| info.is_turn_open() && matches!(view.mask, ViewMask::File(_)));
+    let readings = match options.reading {
+        Some(_) => Vec::new(),
+        None => readings(listing, turn_is_open, has_files),
+    };
+    name_turned_masks(&views, &options.limits, listing);
+    let (up, rolled) = up(&views, listing.up);
+    listing.warnings.extend(rolled);
+    Some(Capture {
+        root: root.into(),
+        name: root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned()),
+        format: format.into(),
+        reasons: std::mem::take(&mut listing.reasons),
+        up,
+        focus: listing.focus.or_else(|| scene::around_points(&views, &listing.points)),
+        views,
+        unit_m: options.unit_m,
+        stray_masks: listing.stray_masks.take(),
+        warnings: std::mem::take(&mut listing.warnings),
+        readings,
+    })
+}
+
+/// Returns the frames whose photograph is there, `None` if there are none; the listing tells of the others.
+fn frames_with_photographs(folder: &CaptureFolder, listing: &mut Listing) -> Option<Vec<CameraFrame>> {
     let total = listing.frames.len();
     let near = missing::confirm_near(folder, listing);
     let (frames, missing): (Vec<CameraFrame>, Vec<CameraFrame>) =
@@ -168,7 +207,7 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
     }
     if frames.is_empty() {
         if !missing.is_empty() || listing.problems.is_empty() {
-            let problem = no_views(root, &(found + &there));
+            let problem = no_views(folder.root, &(found + &there));
             listing.problems.push(match hint {
                 Some(hint) => problem.with_hint(hint),
                 None => problem,
@@ -179,12 +218,27 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
         let hint = hint.map_or(String::new(), |hint| format!("; {hint}"));
         listing.warnings.push(format!("{found}; their views are left out{there}{hint}"));
     }
+    Some(frames)
+}
 
-    let (common, names) = folder::view_names(&frames);
-    check_names(&frames, &names, listing);
+/// The views that can be used, each with its frame and photograph.
+struct UsableViews {
+    views: Vec<View>,
+    kept: Vec<(CameraFrame, PictureInfo)>,
+    /// Whether nothing shows if some of the photographs are to be turned.
+    turn_is_open: bool,
+}
+
+/// Makes a view of each frame whose photograph fits its camera; `names` are those of the views.
+fn usable_views(
+    folder: &CaptureFolder,
+    frames: Vec<CameraFrame>,
+    names: Vec<String>,
+    listing: &mut Listing,
+) -> UsableViews {
     let infos: Vec<_> = frames
         .par_iter()
-        .map(|f| io::picture_info(f.photo.as_deref().unwrap_or(Path::new("")), &options.limits))
+        .map(|f| io::picture_info(f.photo.as_deref().unwrap_or(Path::new("")), &folder.options.limits))
         .collect();
     let (mut kept_turns, mut open_turns) = (Vec::new(), Vec::new());
     let (mut views, mut kept) = (Vec::new(), Vec::new());
@@ -204,54 +258,31 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
             Err(problem) => listing.problems.push(problem),
         }
     }
+    let is_read_as_asked = folder.options.reading.is_some();
+    warn_of_turns(&kept_turns, if is_read_as_asked { &[] } else { &open_turns }, listing);
+    UsableViews { views, kept, turn_is_open: !open_turns.is_empty() }
+}
+
+/// Warns of photographs that are used as stored although EXIF asks to turn them: those whose size
+/// shows that this is right, and those of which nothing does.
+fn warn_of_turns(kept: &[String], open: &[String], listing: &mut Listing) {
     let asks = |views: &[String]| format!("EXIF asks to turn {}", counted(views.len(), "photograph"));
-    if !kept_turns.is_empty() {
+    if !kept.is_empty() {
         listing.warnings.push(format!(
             "{}, used as stored, since the cameras are for that size: {}",
-            asks(&kept_turns),
-            few(&kept_turns)
+            asks(kept),
+            few(kept)
         ));
     }
-    if !open_turns.is_empty() && options.reading.is_none() {
+    if !open.is_empty() {
         listing.warnings.push(format!(
             "{}; nothing shows whether the cameras expect that, and they are used as stored: {}; look at them (`tiface \
              mask CAPTURE --page`), and if they are upside down, mirrored or on their side, store them turned, without \
              EXIF (ImageMagick: `magick mogrify -auto-orient FILES`)",
-            asks(&open_turns),
-            few(&open_turns)
+            asks(open),
+            few(open)
         ));
     }
-    if views.is_empty() {
-        return None;
-    }
-    name_splits(&mut views, &kept, listing);
-    if let Err(problem) = masks::choose(folder, &common, &mut views, &kept, listing) {
-        listing.problems.push(problem);
-    }
-    let has_files = views
-        .iter()
-        .zip(&kept)
-        .any(|(view, (_, info))| info.is_turn_open() && matches!(view.mask, ViewMask::File(_)));
-    let readings = match options.reading {
-        Some(_) => Vec::new(),
-        None => readings(listing, !open_turns.is_empty(), has_files),
-    };
-    name_turned_masks(&views, &options.limits, listing);
-    let (up, rolled) = up(&views, listing.up);
-    listing.warnings.extend(rolled);
-    Some(Capture {
-        root: root.into(),
-        name: root.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned()),
-        format: format.into(),
-        reasons: std::mem::take(&mut listing.reasons),
-        up,
-        focus: listing.focus.or_else(|| scene::around_points(&views, &listing.points)),
-        views,
-        unit_m: options.unit_m,
-        stray_masks: listing.stray_masks.take(),
-        warnings: std::mem::take(&mut listing.warnings),
-        readings,
-    })
 }
 
 /// Returns the ways in which a capture can be read, that of its files' order and without turns first; none where only that

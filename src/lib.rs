@@ -60,7 +60,7 @@ pub mod run;
 
 pub mod capture;
 pub mod field;
-#[cfg(feature = "matting")]
+#[cfg_attr(not(feature = "matting"), path = "onnx/absent.rs")]
 mod onnx;
 pub mod report;
 

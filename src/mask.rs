@@ -24,7 +24,13 @@ pub mod propagate;
 pub mod consistency;
 
 pub mod matting;
-#[cfg_attr(not(feature = "matting"), path = "mask/no_networks.rs")]
+#[cfg(feature = "matting")]
 pub mod networks;
+
+/// Networks in a build without them.
+#[cfg(not(feature = "matting"))]
+pub mod networks {
+    pub use crate::onnx::Networks;
+}
 
 pub use clicks::Click;

@@ -19,7 +19,7 @@
 //! ```
 
 pub mod distance;
-#[cfg_attr(not(feature = "matting"), path = "metrics/no_lpips.rs")]
+#[cfg(feature = "matting")]
 mod lpips;
 mod parts;
 mod psnr_ssim;
@@ -29,6 +29,8 @@ pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr_ssim::{psnr, ssim_reflect_map, ssim_valid};
 
 use crate::image::{Gray, INSIDE, Image, Photo, quantize};
+#[cfg(not(feature = "matting"))]
+use crate::onnx as lpips;
 use crate::{Error, Result};
 use serde::Serialize;
 

@@ -24,6 +24,7 @@ mod bench;
 mod cameras;
 mod clicks;
 mod compare;
+mod cost;
 mod ensemble;
 pub mod experiment;
 mod export;

@@ -30,52 +30,9 @@ pub(super) fn choose(
     kept: &[(CameraFrame, PictureInfo)],
     listing: &mut Listing,
 ) -> Result<()> {
-    let root = Path::new("");
-    let beside = [common.parent().unwrap_or(root), root];
-    let photos: HashSet<PathBuf> = views.iter().map(|view| view.photo.clone()).collect();
-    let files = |bases: &[&Path], names: &dyn Fn(&View) -> Vec<String>| -> Vec<ViewMask> {
-        views.iter().map(|v| first_of(folder, &photos, bases, &names(v)).into()).collect()
-    };
-    let alpha = |listing: &mut Listing| -> Result<(String, Vec<ViewMask>)> {
-        let is_mask = kept.iter().any(|(_, info)| info.alpha)
-            && !all_opaque(views, kept, &folder.options.limits, listing)?;
-        let source =
-            |info: &PictureInfo| if is_mask && info.alpha { ViewMask::Alpha } else { ViewMask::None };
-        let sources = kept.iter().map(|(_, info)| source(info)).collect();
-        Ok(("the alpha channel of the photographs".into(), sources))
-    };
-    let CaptureOptions { masks, mask_dir, .. } = folder.options;
-    let candidates = match masks {
-        MaskSource::None | MaskSource::Clicks => Vec::new(),
-        MaskSource::Alpha => vec![alpha(listing)?],
-        _ if *masks == MaskSource::Folder || !mask_dir.is_empty() => {
-            let inside: PathBuf = match mask_names::folder_named(folder, mask_dir) {
-                Some(place) => place.into(),
-                None => folder.relative("mask folder", mask_dir)?,
-            };
-            let names = |v: &View| {
-                let stem = &v.name;
-                [format!("{stem}.png"), full_name(v) + ".png", format!("{stem}.jpg"), format!("{stem}.jpeg")]
-                    .into()
-            };
-            let place =
-                if inside.as_os_str().is_empty() { mask_dir.into() } else { inside.to_string_lossy() };
-            vec![(format!("`{place}/`"), files(&[&inside], &names))]
-        }
-        _ => {
-            let named = kept.iter().map(|(f, _)| f.mask.clone().into()).collect();
-            let in_folder = |text: &str, name: &dyn Fn(&View) -> String| {
-                (format!("`{text}`"), files(&beside, &|v| vec![name(v)]))
-            };
-            vec![
-                alpha(listing)?,
-                (listing.masks_named.into(), named),
-                in_folder("vit_mask/NAME.png", &|v| format!("vit_mask/{}.png", v.name)),
-                in_folder("masks/NAME.png", &|v| format!("masks/{}.png", v.name)),
-                in_folder("masks/NAME.jpg.png", &|v| format!("masks/{}.png", full_name(v))),
-            ]
-        }
-    };
+    let files = FileSearch::new(folder, common, views);
+    let masks = &folder.options.masks;
+    let candidates = candidates(&files, views, kept, listing)?;
     let is_in_files = !matches!(masks, MaskSource::None | MaskSource::Clicks | MaskSource::Alpha);
     let mut found: Vec<_> = candidates.into_iter().filter(|(_, sources)| count(sources) > 0).collect();
     if found.is_empty() && is_in_files {
@@ -88,21 +45,119 @@ pub(super) fn choose(
     } else {
         take(folder, views, found, listing);
     }
+    valid_and_regions(&files, views, kept, listing);
+    Ok(())
+}
 
+/// Looks for files that belong to photographs.
+struct FileSearch<'a> {
+    folder: &'a CaptureFolder<'a>,
+    /// The photographs, which are no masks.
+    photos: HashSet<PathBuf>,
+    /// Folders that folders of masks may be in.
+    beside: [&'a Path; 2],
+}
+
+impl<'a> FileSearch<'a> {
+    fn new(folder: &'a CaptureFolder<'a>, common: &'a Path, views: &[View]) -> FileSearch<'a> {
+        let root = Path::new("");
+        FileSearch {
+            folder,
+            photos: views.iter().map(|view| view.photo.clone()).collect(),
+            beside: [common.parent().unwrap_or(root), root],
+        }
+    }
+
+    /// Returns the first of these files that exists and is no photograph, below the first base with
+    /// any.
+    fn first_of(&self, bases: &[&Path], names: &[String]) -> Option<PathBuf> {
+        let mut paths = bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name)));
+        paths.find_map(|path| self.folder.file(&path).filter(|path| !self.photos.contains(path)))
+    }
+
+    /// Returns the mask of each view, by the names that its file may have.
+    fn masks(&self, views: &[View], bases: &[&Path], names: impl Fn(&View) -> Vec<String>) -> Vec<ViewMask> {
+        views.iter().map(|v| self.first_of(bases, &names(v)).into()).collect()
+    }
+}
+
+/// Returns the sources that may have masks, by the setting, in the order of preference.
+fn candidates(
+    files: &FileSearch,
+    views: &[View],
+    kept: &[(CameraFrame, PictureInfo)],
+    listing: &mut Listing,
+) -> Result<Vec<Source>> {
+    let folder = files.folder;
+    let CaptureOptions { masks, mask_dir, .. } = folder.options;
+    Ok(match masks {
+        MaskSource::None | MaskSource::Clicks => Vec::new(),
+        MaskSource::Alpha => vec![alpha(folder, views, kept, listing)?],
+        _ if *masks == MaskSource::Folder || !mask_dir.is_empty() => {
+            let inside: PathBuf = match mask_names::folder_named(folder, mask_dir) {
+                Some(place) => place.into(),
+                None => folder.relative("mask folder", mask_dir)?,
+            };
+            let names = |v: &View| {
+                let stem = &v.name;
+                [format!("{stem}.png"), full_name(v) + ".png", format!("{stem}.jpg"), format!("{stem}.jpeg")]
+                    .into()
+            };
+            let place =
+                if inside.as_os_str().is_empty() { mask_dir.into() } else { inside.to_string_lossy() };
+            vec![(format!("`{place}/`"), files.masks(views, &[&inside], names))]
+        }
+        _ => {
+            let named = kept.iter().map(|(f, _)| f.mask.clone().into()).collect();
+            let in_folder = |text: &str, name: &dyn Fn(&View) -> String| {
+                (format!("`{text}`"), files.masks(views, &files.beside, |v| vec![name(v)]))
+            };
+            vec![
+                alpha(folder, views, kept, listing)?,
+                (listing.masks_named.into(), named),
+                in_folder("vit_mask/NAME.png", &|v| format!("vit_mask/{}.png", v.name)),
+                in_folder("masks/NAME.png", &|v| format!("masks/{}.png", v.name)),
+                in_folder("masks/NAME.jpg.png", &|v| format!("masks/{}.png", full_name(v))),
+            ]
+        }
+    })
+}
+
+/// Returns the alpha channels of the photographs, unless all of them are opaque.
+fn alpha(
+    folder: &CaptureFolder,
+    views: &[View],
+    kept: &[(CameraFrame, PictureInfo)],
+    listing: &mut Listing,
+) -> Result<Source> {
+    let is_mask =
+        kept.iter().any(|(_, info)| info.alpha) && !all_opaque(views, kept, &folder.options.limits, listing)?;
+    let source = |info: &PictureInfo| if is_mask && info.alpha { ViewMask::Alpha } else { ViewMask::None };
+    let sources = kept.iter().map(|(_, info)| source(info)).collect();
+    Ok(("the alpha channel of the photographs".into(), sources))
+}
+
+/// Gives the views the files of their valid pixels and of the face region.
+fn valid_and_regions(
+    files: &FileSearch,
+    views: &mut [View],
+    kept: &[(CameraFrame, PictureInfo)],
+    listing: &mut Listing,
+) {
     let (mut valid, mut region, mut from) = (0, 0, "`.npy` files".to_string());
     for (view, (frame, _)) in views.iter_mut().zip(kept) {
         let name = &view.name;
         view.valid =
-            first_of(folder, &photos, &beside, &[format!("masks/{name}.npy"), format!("valid/{name}.npy")]);
+            files.first_of(&files.beside, &[format!("masks/{name}.npy"), format!("valid/{name}.npy")]);
         view.region = match &frame.region {
             Some(path) => Some(path.clone()),
-            None => first_of(folder, &photos, &beside, &[format!("face_masks/{name}.png")]),
+            None => files.first_of(&files.beside, &[format!("face_masks/{name}.png")]),
         };
         valid += view.valid.is_some() as usize;
         region += view.region.is_some() as usize;
     }
     if valid == 0
-        && let Some((place, masks)) = mask_names::valid(folder, &beside, views)
+        && let Some((place, masks)) = mask_names::valid(files.folder, &files.beside, views)
     {
         from = format!("`{place}/`, under near names");
         for (view, mask) in views.iter_mut().zip(masks) {
@@ -116,7 +171,6 @@ pub(super) fn choose(
     if region > 0 {
         listing.reasons.push(format!("face regions for the metrics, for {region} of {} views", views.len()));
     }
-    Ok(())
 }
 
 /// A source of masks in words, and the mask of each view.
@@ -276,18 +330,6 @@ pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> 
          `--set mask.source=none`"
     );
     Err(Error::cannot(format_args!("`{shown}`: {problem}"), hint))
-}
-
-/// Returns the first of these files that exists and is no photograph, below the first base with
-/// any.
-fn first_of(
-    folder: &CaptureFolder,
-    photos: &HashSet<PathBuf>,
-    bases: &[&Path],
-    names: &[String],
-) -> Option<PathBuf> {
-    let mut paths = bases.iter().flat_map(|base| names.iter().map(move |name| base.join(name)));
-    paths.find_map(|path| folder.file(&path).filter(|path| !photos.contains(path)))
 }
 
 /// Returns a view's name with its photograph's ending.

@@ -131,15 +131,50 @@ fn fit_axes(
         let message = format!("{} cameras cannot place a head, two are needed at least", cameras.len());
         return Err(Error::cannot(message, "photograph the head from more sides"));
     }
-    let name = |i: usize| options.names.get(i).cloned().unwrap_or_else(|| i.to_string());
     let mut warnings = Vec::new();
+    let used = locating_views(masks, options, &mut warnings)?;
+    if used.len() < 2 {
+        // a single silhouette gives no bound in depth
+        let scene = from_frusta(cameras, options.focus)?;
+        return Ok((scene, warnings));
+    }
+    let aims: Vec<_> = used.iter().map(|&i| carve::ray_to(&cameras[i], masks[i].as_ref())).collect();
+    let some: Vec<&Camera> = used.iter().map(|&i| &cameras[i]).collect();
+    let center = aim(&some, &aims)?;
+    let silhouettes: Vec<SilhouetteTable> = used
+        .iter()
+        .filter_map(|&i| Some(SilhouetteTable::new(i, &cameras[i], masks[i].as_ref()?, THRESHOLD)))
+        .collect();
+    let cube = Cube { center, half: first_half(&some, center), n: 64.min(options.resolution) };
+    let head = carve_tightly(cube, &silhouettes, options, &mut warnings)?;
+    warnings.extend(head.contradictions(&silhouettes, options));
+    Ok((head.scene(), warnings))
+}
+
+impl SceneOptions {
+    /// Returns the name of view `i` for messages.
+    fn name(&self, i: usize) -> String {
+        self.names.get(i).cloned().unwrap_or_else(|| i.to_string())
+    }
+}
+
+/// Returns the views whose masks are neither empty nor white everywhere, and warns of the others.
+///
+/// # Errors
+///
+/// Fails if there are masks but none of them locates the head.
+fn locating_views(
+    masks: &[Option<Gray>],
+    options: &SceneOptions,
+    warnings: &mut Vec<String>,
+) -> Result<Vec<usize>> {
     let (mut white, mut empty, mut used) = (Vec::new(), Vec::new(), Vec::new());
     for (i, mask) in masks.iter().enumerate() {
         let Some(mask) = mask else { continue };
         if mask.values.iter().all(|&v| v <= THRESHOLD) {
-            empty.push(name(i));
+            empty.push(options.name(i));
         } else if mask.values.iter().all(|&v| v > THRESHOLD) {
-            white.push(name(i));
+            white.push(options.name(i));
         } else {
             used.push(i);
         }
@@ -161,45 +196,44 @@ fn fit_axes(
             warnings.push(format!("in {n} the mask is {what} and does not place the head: {named}"));
         }
     }
-    if used.len() < 2 {
-        // a single silhouette gives no bound in depth
-        let scene = from_frusta(cameras, options.focus)?;
-        return Ok((scene, warnings));
-    }
+    Ok(used)
+}
 
-    let aims: Vec<_> = used.iter().map(|&i| carve::ray_to(&cameras[i], masks[i].as_ref())).collect();
-    let some: Vec<&Camera> = used.iter().map(|&i| &cameras[i]).collect();
-    let center = aim(&some, &aims)?;
-    let silhouettes: Vec<SilhouetteTable> = used
-        .iter()
-        .filter_map(|&i| Some(SilhouetteTable::new(i, &cameras[i], masks[i].as_ref()?, THRESHOLD)))
-        .collect();
-    let least = MIN_VIEWS.min(used.len());
-    let core = used.len().div_ceil(3).max(least);
-    let margin = MARGIN_CELLS as f64;
+/// The carved head in a cube that it fills, but for the margin.
+struct CarvedHead {
+    cube: Cube,
+    /// First and last cell of the box on each axis.
+    extent: [(usize, usize); 3],
+    /// Cells that enough masks touch for the hull, in the box and outside it.
+    kept: Vec<bool>,
+    /// Cells of the coarse cube, which contains everything, that each view alone removes.
+    alone: Vec<u64>,
+    /// Cells of the coarse cube that all views keep.
+    total: u64,
+}
 
-    let mut cube = Cube { center, half: first_half(&some, center), n: 64.min(options.resolution) };
-    let mut grown = 0;
-    let mut shrunk = 0;
-    // cells that each view alone removes, and cells that all keep: from the coarse cube, which contains everything
-    let mut word: (Vec<u64>, u64) = Default::default();
-    let (extent, mut kept) = loop {
-        let carved = carve::carve(&cube, &silhouettes);
+/// Carves a cube, grows it if it cuts the head, and shrinks it to the remaining cells until it no
+/// longer shrinks.
+fn carve_tightly(
+    mut cube: Cube,
+    silhouettes: &[SilhouetteTable],
+    options: &SceneOptions,
+    warnings: &mut Vec<String>,
+) -> Result<CarvedHead> {
+    let least = MIN_VIEWS.min(silhouettes.len());
+    let core = silhouettes.len().div_ceil(3).max(least);
+    let (mut grown, mut shrunk) = (0, 0);
+    let (mut alone, mut coarse_total) = (Vec::new(), 0);
+    loop {
+        let carved = carve::carve(&cube, silhouettes);
         let mut kept = carved.touching(core);
         let dropped = carve::drop_dust(&mut kept, cube.n, 0.02);
         let total = kept.iter().filter(|k| **k).count() as u64;
         if shrunk == 0 {
-            word = (carved.alone.clone(), total);
+            (alone, coarse_total) = (carved.alone.clone(), total);
         }
         let Some(extent) = carve::extent(&kept, cube.n) else {
-            let most = (0..silhouettes.len()).max_by_key(|&i| word.0[i]);
-            let culprit = most.filter(|&i| word.0[i] > 0).map_or(String::new(), |i| {
-                format!("; the mask of view `{}` contradicts the others most", name(silhouettes[i].view))
-            });
-            return Err(Error::cannot(
-                format_args!("no point in space is inside all {} masks{culprit}", used.len()),
-                "look at that view's mask and pose; are masks inverted, or poses of another capture?",
-            ));
+            return Err(no_common_point(silhouettes, &alone, options));
         };
         let (first, last) = (cube.n == options.resolution, shrunk == 4);
         let cut = extent.iter().any(|&(lo, hi)| lo == 0 || hi == cube.n - 1);
@@ -211,51 +245,82 @@ fn fit_axes(
         if cut && shrunk == 0 {
             warnings.push("the cameras hardly bound the head in depth, so the box was cut off".into());
         }
-        // center and half side of the remaining cells, with the margin
-        let lo = DVec3::from(extent.map(|(lo, _)| lo as f64));
-        let hi = DVec3::from(extent.map(|(_, hi)| hi as f64 + 1.0));
-        let middle = cube.center - cube.half + 0.5 * (lo + hi) * cube.cell();
-        let cells = (hi - lo).max_element();
-        // the margin is counted in cells of the next cube, of which `resolution` make its side
-        let share = 1.0 - 2.0 * margin / options.resolution as f64;
-        let half = 0.5 * cells * cube.cell() / share.max(0.5);
-        if first && (half > 0.93 * cube.half || last) {
+        let tight = around_cells(&cube, &extent, options.resolution);
+        if first && (tight.half > 0.93 * cube.half || last) {
             if dropped as u64 * 20 > total {
                 let share = 100.0 * dropped as f64 / total as f64;
                 warnings.push(format!("pieces apart from the head, {share:.0} % of its size, were left out"));
             }
-            break (extent, carved.touching(least));
+            return Ok(CarvedHead { cube, extent, kept: carved.touching(least), alone, total: coarse_total });
         }
-        cube = Cube { center: middle, half, n: options.resolution };
+        cube = tight;
         shrunk += 1;
-    };
+    }
+}
 
-    let (alone, total) = word;
-    let median = median(&mut alone.clone(), u64::cmp).unwrap_or(0);
-    for (s, &count) in silhouettes.iter().zip(&alone) {
+/// Returns the error for masks that keep no cell together; `alone` counts the cells that each view
+/// alone removes.
+fn no_common_point(silhouettes: &[SilhouetteTable], alone: &[u64], options: &SceneOptions) -> Error {
+    let most = (0..silhouettes.len()).max_by_key(|&i| alone[i]);
+    let culprit = most.filter(|&i| alone[i] > 0).map_or(String::new(), |i| {
+        let name = options.name(silhouettes[i].view);
+        format!("; the mask of view `{name}` contradicts the others most")
+    });
+    Error::cannot(
+        format_args!("no point in space is inside all {} masks{culprit}", silhouettes.len()),
+        "look at that view's mask and pose; are masks inverted, or poses of another capture?",
+    )
+}
+
+/// Returns the cube of `resolution` cells a side around cells of another, with the margin.
+fn around_cells(cube: &Cube, extent: &[(usize, usize); 3], resolution: usize) -> Cube {
+    let lo = DVec3::from(extent.map(|(lo, _)| lo as f64));
+    let hi = DVec3::from(extent.map(|(_, hi)| hi as f64 + 1.0));
+    let center = cube.center - cube.half + 0.5 * (lo + hi) * cube.cell();
+    let cells = (hi - lo).max_element();
+    // the margin is counted in cells of the next cube, of which `resolution` make its side
+    let share = 1.0 - 2.0 * MARGIN_CELLS as f64 / resolution as f64;
+    Cube { center, half: 0.5 * cells * cube.cell() / share.max(0.5), n: resolution }
+}
+
+impl CarvedHead {
+    /// Returns a warning for each view whose mask removes much more space than the others' do.
+    fn contradictions(&self, silhouettes: &[SilhouetteTable], options: &SceneOptions) -> Vec<String> {
+        let median = median(&mut self.alone.clone(), u64::cmp).unwrap_or(0);
+        let total = self.total;
         // with few views each one rightly removes a lot; a wrong one stands out from the others too
-        if 4 * count > total && count > 4 * median {
-            warnings.push(format!(
+        let stands_out = |count: u64| 4 * count > total && count > 4 * median;
+        let suspects = silhouettes.iter().zip(&self.alone).filter(|(_, count)| stands_out(**count));
+        let warning = |(s, &count): (&SilhouetteTable, &u64)| {
+            format!(
                 "the mask of view `{}` alone removes {:.0} % as much space as all masks together keep; look at \
                  its mask and pose",
-                name(s.view),
+                options.name(s.view),
                 100.0 * count as f64 / total as f64
-            ));
+            )
+        };
+        suspects.map(warning).collect()
+    }
+
+    /// Returns the scene of the cube; its hull ends with the box and the margin.
+    fn scene(self) -> Scene {
+        let CarvedHead { cube, extent, mut kept, .. } = self;
+        for (i, cell) in kept.iter_mut().enumerate() {
+            let at = [i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n];
+            *cell &= at
+                .iter()
+                .zip(&extent)
+                .all(|(&v, &(lo, hi))| v + MARGIN_CELLS >= lo && v <= hi + MARGIN_CELLS);
         }
+        let hull = BitGrid::from_cells(cube.n, &kept);
+        let margin = MARGIN_CELLS as f64;
+        let scene_coordinate = |cells: f64| (2.0 * cells / cube.n as f64 - 1.0).clamp(-1.0, 1.0) as f32;
+        let aabb = Aabb {
+            min: Vec3::from(extent.map(|(lo, _)| scene_coordinate(lo as f64 - margin))),
+            max: Vec3::from(extent.map(|(_, hi)| scene_coordinate(hi as f64 + 1.0 + margin))),
+        };
+        Scene { scene_from_world: scene_from(cube.center, cube.half), aabb, hull: Some(hull) }
     }
-    // the hull is restricted to the box with its margin
-    let air = MARGIN_CELLS;
-    for (i, cell) in kept.iter_mut().enumerate() {
-        let at = [i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n];
-        *cell &= at.iter().zip(&extent).all(|(&v, &(lo, hi))| v + air >= lo && v <= hi + air);
-    }
-    let hull = BitGrid::from_cells(cube.n, &kept);
-    let scene_coordinate = |cells: f64| (2.0 * cells / cube.n as f64 - 1.0).clamp(-1.0, 1.0) as f32;
-    let aabb = Aabb {
-        min: Vec3::from(extent.map(|(lo, _)| scene_coordinate(lo as f64 - margin))),
-        max: Vec3::from(extent.map(|(_, hi)| scene_coordinate(hi as f64 + 1.0 + margin))),
-    };
-    Ok((Scene { scene_from_world: scene_from(cube.center, cube.half), aabb, hull: Some(hull) }, warnings))
 }
 
 fn scene_from(center: DVec3, half: f64) -> Similarity {

@@ -2,9 +2,10 @@
 
 use super::Invocation;
 use super::demo::photograph;
+use super::options::Common;
 use super::out::Out;
 use super::run::in_words;
-use super::screen::print;
+use super::screen::{Screen, print};
 use crate::capture::is_run;
 use crate::capture::synthetic::SyntheticOptions;
 use crate::config::Config;
@@ -14,7 +15,7 @@ use crate::pipeline::experiment::{
     ORDERINGS, ROWS, TABLES, ahead, config, measured, runs, without_masks, work,
 };
 use crate::report::duration;
-use crate::report::experiment::{Experiment, ExperimentRow, Measured, read_published};
+use crate::report::experiment::{Experiment, ExperimentRow, Measured, Published, read_published};
 use crate::run::{Cost, Run};
 use crate::{Error, Result};
 use clap::Args;
@@ -45,16 +46,46 @@ pub(super) struct ExperimentOptions {
     published: Option<PathBuf>,
 }
 
+/// The captures, tables and runs of an experiment.
+struct Plan {
+    folder: PathBuf,
+    /// The name and heading of each table.
+    tables: Vec<(&'static str, &'static str)>,
+    published: Vec<Published>,
+    captures: Vec<String>,
+    /// Every capture has the same runs in the same order.
+    tasks: Vec<Task>,
+}
+
 /// A run of a capture.
 struct Task {
     /// `capture/run`, also its folder below the experiment's.
     name: String,
     run: &'static str,
     config: Config,
+    /// Whether it is to be made, or planned with `--dry-run`.
+    is_chosen: bool,
 }
 
 pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Result<()> {
     let Invocation { common, screen, stop } = invocation;
+    refuse(common, options)?;
+    let plan = Plan::new(invocation, options)?;
+    let open = |task: &Task| Run::open(&plan.folder.join(&task.name), stop.clone(), screen.clone());
+    let runs: Vec<Run> = plan.tasks.iter().map(open).collect();
+    if common.dry_run {
+        return print_costs(&plan, &runs, common.json);
+    }
+    let (sessions, failed) = make(&plan, &runs, screen)?;
+    // with --only, no tables: every task of a cluster would read all captures
+    if options.only.is_empty() {
+        tell(&plan.folder, &collect(&plan, &sessions, options.scale), common)?;
+    }
+    failed.map_or(Ok(()), Err)
+}
+
+/// Refuses options that have no meaning for an experiment.
+fn refuse(common: &Common, options: &ExperimentOptions) -> Result<()> {
     if !(0.001..=1.0).contains(&options.scale) {
         let found = format!("`--scale {}` is not between 0.001 and 1", options.scale);
         return Err(Error::usage(
@@ -75,32 +106,52 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
             "change a setting of all rows with `--set KEY=VALUE`; `--out FOLDER` sets the folder",
         ));
     }
-    let folder = match Out::find(common.out.as_deref(), "experiment")? {
-        Some(out) => out.file(""),
-        None => PathBuf::from("experiment"),
-    };
-    let is_asked =
-        |table: &&(&str, &str)| options.tables.is_empty() || options.tables.iter().any(|t| t == table.0);
-    let tables: Vec<(&str, &str)> = TABLES.iter().filter(is_asked).copied().collect();
-    let words: Vec<&str> = tables.iter().map(|t| t.0).collect();
-    let published = match &options.published {
-        Some(file) => {
-            let bytes = io::read_maybe_empty(file, &Limits { file_bytes: 1 << 20, ..Limits::default() })?;
-            read_published(&String::from_utf8_lossy(&bytes), &ROWS, &file.display().to_string())?
+    Ok(())
+}
+
+impl Plan {
+    fn new(invocation: &Invocation, options: &ExperimentOptions) -> Result<Plan> {
+        let folder = match Out::find(invocation.common.out.as_deref(), "experiment")? {
+            Some(out) => out.file(""),
+            None => PathBuf::from("experiment"),
+        };
+        let is_asked =
+            |table: &&(&str, &str)| options.tables.is_empty() || options.tables.iter().any(|t| t == table.0);
+        let tables = TABLES.iter().filter(is_asked).copied().collect();
+        let published = match &options.published {
+            Some(file) => {
+                let limits = Limits { file_bytes: 1 << 20, ..Limits::default() };
+                let bytes = io::read_maybe_empty(file, &limits)?;
+                read_published(&String::from_utf8_lossy(&bytes), &ROWS, &file.display().to_string())?
+            }
+            None => Vec::new(),
+        };
+        let mut plan = Plan { folder, tables, published, captures: Vec::new(), tasks: Vec::new() };
+        for path in &options.captures {
+            plan.add_capture(path, invocation, options)?;
         }
-        None => Vec::new(),
-    };
-    let mut set = common.set.clone();
-    set.extend(common.device_word().iter().map(|d| format!("device={d}")));
-    set.extend(common.seed.iter().map(|s| format!("seed={s}")));
-    let mut captures: Vec<String> = Vec::new();
-    let mut tasks = Vec::new();
-    for path in &options.captures {
-        let real = io::real_path(&demo(path, &folder, invocation)?)?;
-        let name = real.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned());
-        if captures.contains(&name) {
+        let is_unknown = |name: &&String| !plan.tasks.iter().any(|task| task.name == **name);
+        if let Some(wrong) = options.only.iter().find(is_unknown) {
+            let known: Vec<&str> = plan.tasks.iter().map(|t| t.name.as_str()).collect();
+            let hint = format!("runs are {}", known.join(", "));
+            return Err(Error::usage(format!("unknown run `{wrong}`"), hint));
+        }
+        Ok(plan)
+    }
+
+    /// Adds the runs of a capture.
+    fn add_capture(
+        &mut self,
+        path: &Path,
+        invocation: &Invocation,
+        options: &ExperimentOptions,
+    ) -> Result<()> {
+        let common = invocation.common;
+        let real = io::real_path(&demo(path, &self.folder, invocation)?)?;
+        let capture = real.file_name().map_or("capture".into(), |n| n.to_string_lossy().into_owned());
+        if self.captures.contains(&capture) {
             return Err(Error::usage(
-                format!("two captures are called `{name}`"),
+                format!("two captures are called `{capture}`"),
                 "rename one of the folders",
             ));
         }
@@ -110,107 +161,120 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
                 "rename the folder",
             )
         })?;
-        for run in runs(&words) {
+        let mut set = common.set.clone();
+        set.extend(common.device_word().iter().map(|d| format!("device={d}")));
+        set.extend(common.seed.iter().map(|s| format!("seed={s}")));
+        for run in runs(&self.table_names()) {
             let mut config = config(run, options.scale, &set)?;
             config.capture.path = text.into();
             without_masks(run, &mut config);
-            tasks.push(Task { name: format!("{name}/{run}"), run, config });
+            let name = format!("{capture}/{run}");
+            let is_named = options.only.is_empty() || options.only.contains(&name);
+            self.tasks.push(Task { name, run, config, is_chosen: is_named && !options.collect });
         }
-        captures.push(name);
+        self.captures.push(capture);
+        Ok(())
     }
-    if let Some(wrong) = options.only.iter().find(|o| !tasks.iter().any(|t| t.name == **o)) {
-        let known: Vec<&str> = tasks.iter().map(|t| t.name.as_str()).collect();
-        return Err(Error::usage(format!("unknown run `{wrong}`"), format!("runs are {}", known.join(", "))));
+
+    fn table_names(&self) -> Vec<&'static str> {
+        self.tables.iter().map(|table| table.0).collect()
     }
-    let all = options.only.is_empty();
-    let chosen = |task: &&Task| !options.collect && (all || options.only.contains(&task.name));
-    let open = |task: &Task| Run::open(&folder.join(&task.name), stop.clone(), screen.clone());
-    let opened: Vec<Run> = tasks.iter().map(open).collect();
-    let mut sessions: Vec<Option<Session>> = tasks.iter().map(|_| None).collect();
-    let (mut failed, mut sum) = (None, Cost::default());
-    for ((task, run), session) in
-        tasks.iter().zip(&opened).zip(&mut sessions).filter(|((task, _), _)| chosen(task))
-    {
-        let planned = Session::open(&task.config, run).and_then(|opened| {
-            let cost = if common.dry_run { ahead(&opened, task.run)? } else { None };
-            Ok((opened, cost))
-        });
-        let (opened, cost) = match planned {
-            Ok(planned) => planned,
+
+    /// Returns the chosen tasks, each with its run.
+    fn chosen<'r>(&'r self, runs: &'r [Run]) -> impl Iterator<Item = (&'r Task, &'r Run)> {
+        self.tasks.iter().zip(runs).filter(|(task, _)| task.is_chosen)
+    }
+}
+
+/// Prints the state of the chosen runs and the estimated cost of those that are not done.
+fn print_costs(plan: &Plan, runs: &[Run], json: bool) -> Result<()> {
+    let mut sum = Cost::default();
+    for (task, run) in plan.chosen(runs) {
+        let cost = match Session::open(&task.config, run).and_then(|session| ahead(&session, task.run)) {
+            Ok(cost) => cost,
             // a capture may lack the inputs of one row (masks) and have those of others
-            Err(e) if common.dry_run => {
-                match common.json {
+            Err(e) => {
+                match json {
                     true => print(&format!("{}\n", json!({"run": task.name, "error": e.to_string()})))?,
                     false => print(&format!("{:<32} cannot be made: {e}\n", task.name))?,
                 }
                 continue;
             }
-            Err(e) => {
-                screen.note("experiment", &format!("{}: {e}", task.name));
-                failed.get_or_insert(e.within(&task.name));
-                continue;
-            }
         };
-        let session = &*session.insert(opened);
-        if common.dry_run {
-            sum = sum + cost.unwrap_or_default();
-            if common.json {
-                let done = cost.is_none();
-                print(&format!("{}\n", json!({"run": task.name, "done": done, "estimate": cost})))?;
-                continue;
-            }
+        sum = sum + cost.unwrap_or_default();
+        if json {
+            let done = cost.is_none();
+            print(&format!("{}\n", json!({"run": task.name, "done": done, "estimate": cost})))?;
+        } else {
             let state = cost.map_or("done".into(), |c| format!("to do  about {}", duration(c.seconds())));
             print(&format!("{:<32} {state}\n", task.name))?;
-            continue;
         }
-        io::create_folder(run.dir())?;
-        screen.note("experiment", &task.name);
-        match work(session, task.run) {
-            Err(e) if e.kind().is_stop() => {
-                failed = Some(e);
-                break;
+    }
+    if sum.cpu_s > 0.0 && !json {
+        print(&format!("{:<32} {}\n", "all", in_words(sum)))?;
+    }
+    Ok(())
+}
+
+/// Completes the chosen runs. Returns the sessions of all tasks, `None` for one that was not opened,
+/// and the first error.
+fn make<'r>(
+    plan: &'r Plan,
+    runs: &'r [Run],
+    screen: &Screen,
+) -> Result<(Vec<Option<Session<'r>>>, Option<Error>)> {
+    let mut sessions: Vec<Option<Session>> = plan.tasks.iter().map(|_| None).collect();
+    let mut failed = None;
+    let chosen = plan.tasks.iter().zip(runs).zip(&mut sessions).filter(|((task, _), _)| task.is_chosen);
+    for ((task, run), session) in chosen {
+        let done = match Session::open(&task.config, run) {
+            Ok(opened) => {
+                io::create_folder(run.dir())?;
+                screen.note("experiment", &task.name);
+                work(session.insert(opened), task.run)
             }
-            // a failed row is a result, and does not stop the others
-            Err(e) => {
-                screen.note("experiment", &format!("{}: {e}", task.name));
-                failed.get_or_insert(e.within(&task.name));
-            }
-            Ok(()) => {}
+            Err(e) => Err(e),
+        };
+        let Err(e) = done else { continue };
+        if e.kind().is_stop() {
+            failed = Some(e);
+            break;
         }
+        // a failed row is a result, and does not stop the others
+        screen.note("experiment", &format!("{}: {e}", task.name));
+        failed.get_or_insert(e.within(&task.name));
     }
-    if common.dry_run {
-        if sum.cpu_s > 0.0 && !common.json {
-            print(&format!("{:<32} {}\n", "all", in_words(sum)))?;
-        }
-        return Ok(());
-    }
-    // with --only, no tables: every task of a cluster would read all captures
-    if !all {
-        return failed.map_or(Ok(()), Err);
-    }
-    let rows: Vec<_> = ROWS.into_iter().filter(|row| words.contains(&row.table)).collect();
+    Ok((sessions, failed))
+}
+
+/// Returns the tables with the figures of all runs, of which those without a session are only read.
+fn collect(plan: &Plan, sessions: &[Option<Session>], scale: f64) -> Experiment {
+    let names = plan.table_names();
+    let rows: Vec<_> = ROWS.into_iter().filter(|row| names.contains(&row.table)).collect();
     let mut measured: Vec<Vec<Measured>> = vec![Vec::new(); rows.len()];
     // every capture has the same runs in the same order, so each row has one of each capture
-    for (task, session) in tasks.iter().zip(&sessions) {
+    for (task, session) in plan.tasks.iter().zip(sessions) {
         let (own, places): (Vec<&ExperimentRow>, Vec<&mut Vec<Measured>>) =
             rows.iter().zip(&mut measured).filter(|(row, _)| row.run == task.run).unzip();
-        places.into_iter().zip(found(&folder, task, session.as_ref(), &own)).for_each(|(to, m)| to.push(m));
+        let figures = found(&plan.folder, task, session.as_ref(), &own);
+        places.into_iter().zip(figures).for_each(|(to, m)| to.push(m));
     }
-    let orderings = ORDERINGS.into_iter().filter(|o| words.contains(&o.table)).collect();
-    let experiment =
-        Experiment { scale: options.scale, tables, rows, orderings, captures, measured, published };
-    write(&folder, &experiment)?;
+    let orderings = ORDERINGS.into_iter().filter(|o| names.contains(&o.table)).collect();
+    let (tables, captures, published) = (plan.tables.clone(), plan.captures.clone(), plan.published.clone());
+    Experiment { scale, tables, rows, orderings, captures, measured, published }
+}
+
+/// Writes the tables, and prints them.
+fn tell(folder: &Path, experiment: &Experiment, common: &Common) -> Result<()> {
+    write(folder, experiment)?;
     if common.json {
         let result = json!({"event": "result", "out": folder.join("experiment.json")});
         print(&format!("{result}\n"))?;
     } else if !common.quiet {
-        print(&format!(
-            "{}\nexperiment {}\n",
-            experiment.markdown(),
-            folder.join("experiment.md").display()
-        ))?;
+        let (table, file) = (experiment.markdown(), folder.join("experiment.md"));
+        print(&format!("{table}\nexperiment {}\n", file.display()))?;
     }
-    failed.map_or(Ok(()), Err)
+    Ok(())
 }
 
 /// Returns the folder of a capture; `demo`, if no capture has this name, is the demo head, rendered into the experiment.

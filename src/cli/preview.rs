@@ -1,5 +1,5 @@
-//! `tiface preview`: pictures of a mesh, on a sheet labeled in a 5 × 7 bitmap font; `--page`: a viewer for the browser;
-//! `--watch`: a live page of a running run.
+//! `tiface preview`: pictures of a mesh, one by one or on a sheet whose rows are named in the answer;
+//! `--page`: a viewer for the browser; `--watch`: a live page of a running run.
 
 use super::Invocation;
 use super::options::RunTarget;
@@ -100,16 +100,16 @@ const TURNTABLE_ELEVATION: f64 = 0.1;
 /// Frame rate of animations.
 const FRAMES_PER_SECOND: u16 = 12;
 
-/// Pictures of the sheet: label, azimuth from the front, elevation, shading; `None` is the default shading.
+/// Pictures of the sheet: name, azimuth from the front, elevation, shading; `None` is the default shading.
 const SHEET_VIEWS: [(&str, f64, f64, Option<Look>); 8] = [
-    ("FRONT", 0.0, 0.0, None),
-    ("LEFT", FRAC_PI_2, 0.0, None),
-    ("RIGHT", -FRAC_PI_2, 0.0, None),
-    ("BACK", PI, 0.0, None),
-    ("TOP", 0.0, FRAC_PI_2, None),
-    ("WIRE", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Wire)),
-    ("NORMALS", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Normals)),
-    ("UV", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Uv)),
+    ("front", 0.0, 0.0, None),
+    ("left", FRAC_PI_2, 0.0, None),
+    ("right", -FRAC_PI_2, 0.0, None),
+    ("back", PI, 0.0, None),
+    ("top", 0.0, FRAC_PI_2, None),
+    ("wireframe", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Wire)),
+    ("normals", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Normals)),
+    ("texture coordinates", THREE_QUARTERS.0, THREE_QUARTERS.1, Some(Look::Uv)),
 ];
 
 /// Maximum side of a picture on a sheet, pixels: all of them are in memory at once.
@@ -193,17 +193,31 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         return Ok(());
     }
     destination.prepare()?;
-    let files = make(&preview, &destination, kind, &names, &shots, options.background, invocation)?;
+    let made = make(&preview, &destination, kind, &names, &shots, options.background, invocation)?;
     if common.json {
-        print(&format!("{}\n", json!({"event": "result", "preview": files, "warnings": preview.warnings})))?;
+        let mut result = json!({"event": "result", "preview": made.files, "warnings": preview.warnings});
+        if !made.rows.is_empty() {
+            result["rows"] = json!(made.rows);
+        }
+        print(&format!("{result}\n"))?;
     } else if !common.quiet {
         print(&format!("preview   {}\n", shown.display()))?;
+        for (number, row) in (1..).zip(&made.rows) {
+            print(&format!("row {number}     {}\n", row.join(", ")))?;
+        }
     }
     Ok(())
 }
 
-/// Renders the pictures in batches and writes one picture, an animation, or a folder of pictures of these names. Returns
-/// the files.
+/// What was written.
+struct Made {
+    files: Vec<PathBuf>,
+    /// Names of the pictures of a sheet, row by row; empty for other pictures.
+    rows: Vec<Vec<String>>,
+}
+
+/// Renders the pictures in batches and writes one picture, a sheet, an animation, or a folder of
+/// pictures of these names.
 fn make(
     preview: &Preview,
     place: &Out,
@@ -212,7 +226,7 @@ fn make(
     shots: &[(Camera, Look)],
     background: ViewBackground,
     invocation: &Invocation,
-) -> Result<Vec<PathBuf>> {
+) -> Result<Made> {
     let is_stopped = || invocation.stop.requested().is_some();
     let renderer = preview.renderer();
     let size = |(camera, _): &(Camera, Look)| (camera.width, camera.height);
@@ -232,16 +246,16 @@ fn make(
             match renderer.against_photograph(width) {
                 Ok(Some(more)) => {
                     pictures.extend(more);
-                    names.extend(["PHOTO", "ERROR"].map(String::from));
+                    names.extend(["photograph", "error"].map(String::from));
                     columns += 1;
                 }
                 Ok(None) => {}
                 Err(e) => invocation.screen.note("preview", &format!("no errors against a photograph: {e}")),
             }
-            pictures.iter_mut().zip(&names).for_each(|(picture, name)| write_name(picture, name));
             let sheet = PreviewPicture::sheet(&pictures, columns);
             io::write_png_rgba(file, sheet.width, sheet.height, &sheet.rgba)?;
-            Ok(vec![file.clone()])
+            let rows = names.chunks(columns).map(<[String]>::to_vec).collect();
+            Ok(Made { files: vec![file.clone()], rows })
         }
         Out::File(file, ending) if shots.len() > 1 || ending != "png" => {
             if shots.iter().any(|shot| size(shot) != (width, height)) {
@@ -254,12 +268,12 @@ fn make(
             });
             let animation = Animation { width, height, count: shots.len() as u32, rate: FRAMES_PER_SECOND };
             io::write_animation(file, ending, &animation, &mut frames)?;
-            Ok(vec![file.clone()])
+            Ok(Made { files: vec![file.clone()], rows: Vec::new() })
         }
         Out::File(file, _) => {
             let picture = some(shots)?.swap_remove(0);
             io::write_png_rgba(file, width, height, &picture.rgba)?;
-            Ok(vec![file.clone()])
+            Ok(Made { files: vec![file.clone()], rows: Vec::new() })
         }
         Out::Folder(folder) => {
             let files: Vec<PathBuf> = names.iter().map(|name| folder.join(format!("{name}.png"))).collect();
@@ -270,7 +284,7 @@ fn make(
                     io::write_png_rgba(file, picture.width, picture.height, &picture.rgba)
                 })?;
             }
-            Ok(files)
+            Ok(Made { files, rows: Vec::new() })
         }
     }
 }
@@ -297,7 +311,7 @@ fn shots(
                 let is_shape = own == Some(Look::Uv) && !preview.has_uvs();
                 let own = if is_shape { Look::Matcap } else { own.unwrap_or(look) };
                 shots.push((around(turn, tilt, size.unwrap_or(512), 1)?.remove(0).camera, own));
-                names.push(if is_shape { "SHAPE" } else { name }.to_string());
+                names.push(if is_shape { "shape" } else { name }.to_string());
             }
             return Ok((names, shots));
         }
@@ -327,54 +341,6 @@ fn open(invocation: &Invocation, options: &PreviewOptions) -> Result<(Preview, S
             }
             let name = io::real_path(&target.run).map_or_else(|_| "run".into(), |run| named(&run));
             Ok((Preview::of_run(&target.run)?, name))
-        }
-    }
-}
-
-/// Returns the rows of a letter, five bits each, the left one first.
-fn rows(letter: char) -> [u8; 7] {
-    match letter {
-        'A' => [0x0e, 0x11, 0x11, 0x1f, 0x11, 0x11, 0x11],
-        'B' => [0x1e, 0x11, 0x11, 0x1e, 0x11, 0x11, 0x1e],
-        'C' => [0x0e, 0x11, 0x10, 0x10, 0x10, 0x11, 0x0e],
-        'E' => [0x1f, 0x10, 0x10, 0x1e, 0x10, 0x10, 0x1f],
-        'F' => [0x1f, 0x10, 0x10, 0x1e, 0x10, 0x10, 0x10],
-        'G' => [0x0e, 0x11, 0x10, 0x17, 0x11, 0x11, 0x0f],
-        'H' => [0x11, 0x11, 0x11, 0x1f, 0x11, 0x11, 0x11],
-        'I' => [0x0e, 0x04, 0x04, 0x04, 0x04, 0x04, 0x0e],
-        'K' => [0x11, 0x12, 0x14, 0x18, 0x14, 0x12, 0x11],
-        'L' => [0x10, 0x10, 0x10, 0x10, 0x10, 0x10, 0x1f],
-        'M' => [0x11, 0x1b, 0x15, 0x15, 0x11, 0x11, 0x11],
-        'N' => [0x11, 0x19, 0x15, 0x13, 0x11, 0x11, 0x11],
-        'O' => [0x0e, 0x11, 0x11, 0x11, 0x11, 0x11, 0x0e],
-        'P' => [0x1e, 0x11, 0x11, 0x1e, 0x10, 0x10, 0x10],
-        'R' => [0x1e, 0x11, 0x11, 0x1e, 0x14, 0x12, 0x11],
-        'S' => [0x0f, 0x10, 0x10, 0x0e, 0x01, 0x01, 0x1e],
-        'T' => [0x1f, 0x04, 0x04, 0x04, 0x04, 0x04, 0x04],
-        'U' => [0x11, 0x11, 0x11, 0x11, 0x11, 0x11, 0x0e],
-        'V' => [0x11, 0x11, 0x11, 0x11, 0x0a, 0x0a, 0x04],
-        'W' => [0x11, 0x11, 0x11, 0x15, 0x15, 0x1b, 0x11],
-        _ => [0; 7],
-    }
-}
-
-/// Width of a letter with the space behind it, dots.
-const LETTER_WIDTH: u32 = 6;
-
-/// Draws a label of capital letters into the upper left corner of a picture, white on a dark field.
-fn write_name(picture: &mut PreviewPicture, name: &str) {
-    let dot = (picture.width / 256).max(1);
-    let (across, down) = (LETTER_WIDTH * name.len() as u32 + 3, 11);
-    let letters: Vec<[u8; 7]> = name.chars().map(rows).collect();
-    for y in 0..(down * dot).min(picture.height) {
-        for x in 0..(across * dot).min(picture.width) {
-            let (column, row) = ((x / dot).wrapping_sub(2), (y / dot).wrapping_sub(2));
-            let letter = letters
-                .get((column / LETTER_WIDTH) as usize)
-                .filter(|_| row < 7 && column % LETTER_WIDTH < 5);
-            let is_on = letter.is_some_and(|rows| rows[row as usize] >> (4 - column % LETTER_WIDTH) & 1 == 1);
-            let shade = if is_on { 255 } else { 32 };
-            picture.rgba[(y * picture.width + x) as usize] = [shade, shade, shade, 255];
         }
     }
 }
@@ -509,20 +475,4 @@ fn target(invocation: &Invocation, path: Option<&Path>) -> Result<(RunTarget, cr
     }
     let config = invocation.common.resolve(Some(saved), None, &[])?;
     Ok((target, config))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_letter_stands_in_the_corner() {
-        let mut picture = PreviewPicture { width: 20, height: 20, rgba: vec![[9; 4]; 400] };
-        write_name(&mut picture, "L");
-        let at = |x: usize, y: usize| picture.rgba[y * 20 + x];
-        // seven dots down, five along its foot; a field of 9 × 11 around it
-        assert!((2..9).all(|y| at(2, y) == [255; 4]) && (2..7).all(|x| at(x, 8) == [255; 4]));
-        assert!(at(3, 7) == [32, 32, 32, 255] && at(8, 10) == [32, 32, 32, 255]);
-        assert!(at(9, 5) == [9; 4] && at(5, 11) == [9; 4]);
-    }
 }

@@ -49,6 +49,27 @@ pub struct StepReport {
     pub figures: Vec<(&'static str, f64)>,
 }
 
+impl StepReport {
+    /// Returns the report of a step with these loss terms, which are shown before `others`.
+    ///
+    /// # Errors
+    ///
+    /// Fails if a term is not finite, or if a gradient is not, which `broken` says.
+    pub fn checked<const N: usize>(
+        terms: [(&'static str, f32); N],
+        broken: bool,
+        square_error: Option<f32>,
+        others: impl IntoIterator<Item = (&'static str, f64)>,
+    ) -> Result<StepReport, StepError> {
+        StepError::check(terms)?;
+        if broken {
+            return Err(StepError::gradient());
+        }
+        let terms = terms.map(|(name, value)| (name, f64::from(value)));
+        Ok(StepReport { square_error, figures: terms.into_iter().chain(others).collect() })
+    }
+}
+
 /// Reason for which training cannot go on to the next step.
 pub enum StepError {
     /// A loss or gradient is NaN or infinite; nothing was updated.
@@ -145,81 +166,118 @@ pub fn train<M: Model>(
     steps: u64,
     checkpoint_s: f64,
 ) -> Result<(TrainingProgress, Vec<String>)> {
+    let mut training = Training::start(model, session, steps)?;
+    if training.progress.step == steps {
+        session.monitor.step(steps, steps, &[]);
+    }
     let every = Duration::from_secs_f64(checkpoint_s);
-    let &TrainingSession { stage, identity, dir, monitor, .. } = session;
-    let save = |model: &M, progress: &TrainingProgress, finished: bool| -> Result<(), StepError> {
-        let mut into = Checkpoint::new(stage, M::FORMAT, identity);
-        progress.save(&mut into, finished);
+    let mut saved = Instant::now();
+    while training.progress.step < steps {
+        let step = training.progress.step;
+        match training.advance(every, &mut saved) {
+            Ok(false) => {}
+            Ok(true) => return Err(stopped(training.progress.step, steps)),
+            Err(StepError::NotFinite { term, value }) if !training.went_back => {
+                training.warnings.push(format!(
+                    "the {term} loss became {value} at step {step}; went back to the last checkpoint once. If the result is \
+                     poor, train again with another `--seed`"
+                ));
+                training.go_back()?;
+            }
+            Err(e) => return Err(failure(training.model, e, session.stage, step, training.went_back)),
+        }
+    }
+    checkpoint::finish(session.dir)?;
+    Ok((training.progress, training.warnings))
+}
+
+/// A model that is being trained.
+struct Training<'a, M> {
+    model: &'a mut M,
+    session: &'a TrainingSession<'a>,
+    /// Total number of steps.
+    steps: u64,
+    progress: TrainingProgress,
+    /// Whether training returned to a checkpoint, which it does once.
+    went_back: bool,
+    warnings: Vec<String>,
+}
+
+impl<'a, M: Model> Training<'a, M> {
+    /// Restores a training, or starts and saves it.
+    fn start(model: &'a mut M, session: &'a TrainingSession, steps: u64) -> Result<Training<'a, M>> {
+        let (progress, warnings) = (TrainingProgress::default(), Vec::new());
+        let mut training = Training { model, session, steps, progress, went_back: false, warnings };
+        match training.restore()? {
+            Some((progress, warnings)) => {
+                training.went_back = progress.salt > 0;
+                (training.progress, training.warnings) = (progress, warnings);
+            }
+            None => {
+                // A training that diverges early goes back to this checkpoint.
+                let started = training.model.restore(None).and_then(|()| training.save(false));
+                started.map_err(|e| failure(training.model, e, session.stage, 0, false))?;
+            }
+        }
+        Ok(training)
+    }
+
+    fn save(&self, finished: bool) -> Result<(), StepError> {
+        let mut into = Checkpoint::new(self.session.stage, M::FORMAT, self.session.identity);
+        self.progress.save(&mut into, finished);
         // A model with non-finite values returns an error here, so that it does not replace a good checkpoint.
-        model.save(&mut into, finished)?;
-        Ok(into.save(dir)?)
-    };
-    let restore = |model: &mut M| {
+        self.model.save(&mut into, finished)?;
+        Ok(into.save(self.session.dir)?)
+    }
+
+    /// Restores the model from the newest checkpoint, and returns its progress with warnings; `None`
+    /// without a checkpoint.
+    fn restore(&mut self) -> Result<Option<(TrainingProgress, Vec<String>)>> {
+        let &TrainingSession { stage, identity, dir, .. } = self.session;
         checkpoint::restore(dir, stage, M::FORMAT, identity, |file| {
-            let (progress, finished) = TrainingProgress::restore(file, steps)?;
-            let taken = model.restore(Some((file, &progress, finished)));
-            taken.map_err(|e| failure(model, e, stage, progress.step, false))?;
+            let (progress, finished) = TrainingProgress::restore(file, self.steps)?;
+            let taken = self.model.restore(Some((file, &progress, finished)));
+            taken.map_err(|e| failure(self.model, e, stage, progress.step, false))?;
             Ok(progress)
         })
-    };
-    let (mut progress, mut warnings) = match restore(model)? {
-        Some(restored) => restored,
-        None => {
-            let progress = TrainingProgress::default();
-            // A training that diverges early goes back to this checkpoint.
-            let started = model.restore(None).and_then(|()| save(model, &progress, false));
-            started.map_err(|e| failure(model, e, stage, 0, false))?;
-            (progress, Vec::new())
-        }
-    };
-    if progress.step == steps {
-        monitor.step(steps, steps, &[]);
     }
-    let mut went_back = progress.salt > 0;
-    let mut saved = Instant::now();
-    while progress.step < steps {
-        let done = progress.step + 1;
+
+    /// Returns to the last checkpoint.
+    fn go_back(&mut self) -> Result<()> {
+        self.went_back = true;
+        let Some((restored, notes)) = self.restore()? else {
+            return Err(Error::cannot("the checkpoint of the start is gone", "start again"));
+        };
+        self.warnings.extend(notes);
+        // The salt draws other rays; the same ones would make the step diverge again.
+        self.progress = TrainingProgress { salt: 1, ..restored };
+        Ok(())
+    }
+
+    /// Makes a step, reports it, and saves a checkpoint when one is due. Returns whether a stop is
+    /// asked for before the last step.
+    fn advance(&mut self, every: Duration, saved: &mut Instant) -> Result<bool, StepError> {
+        let (steps, done) = (self.steps, self.progress.step + 1);
         let read = done.is_multiple_of(M::READ_EVERY) || done == steps;
-        let result = step(model, session.seed, &progress, read).and_then(|report| {
-            progress.step = done;
-            let report = report.unwrap_or(StepReport { square_error: None, figures: Vec::new() });
-            if let Some(error) = report.square_error {
-                let new = (done - 1) % M::READ_EVERY + 1;
-                progress.mean_square = running_mean(progress.mean_square, done - new, error.into(), new);
-            }
-            // The error is unknown until the first readback, which a GPU makes once in many steps.
-            let psnr = (progress.mean_square > 0.0).then(|| ("psnr", progress.psnr()));
-            let figures: Vec<_> = psnr.into_iter().chain(report.figures).collect();
-            monitor.step(done, steps, &figures);
-            let (last, stop) = (done == steps, monitor.stop());
-            if last || stop || saved.elapsed() > every {
-                save(model, &progress, last)?;
-                saved = Instant::now();
-            }
-            Ok(stop && !last)
-        });
-        match result {
-            Ok(false) => {}
-            Ok(true) => return Err(stopped(progress.step, steps)),
-            Err(StepError::NotFinite { term, value }) if !went_back => {
-                went_back = true;
-                warnings.push(format!(
-                    "the {term} loss became {value} at step {}; went back to the last checkpoint once. If the result is \
-                     poor, train again with another `--seed`",
-                    done - 1
-                ));
-                let Some((restored, notes)) = restore(model)? else {
-                    return Err(Error::cannot("the checkpoint of the start is gone", "start again"));
-                };
-                warnings.extend(notes);
-                // The salt draws other rays; the same ones would make the step diverge again.
-                progress = TrainingProgress { salt: 1, ..restored };
-            }
-            Err(e) => return Err(failure(model, e, stage, done - 1, went_back)),
+        let report = step(self.model, self.session.seed, &self.progress, read)?;
+        let progress = &mut self.progress;
+        progress.step = done;
+        let report = report.unwrap_or(StepReport { square_error: None, figures: Vec::new() });
+        if let Some(error) = report.square_error {
+            let new = (done - 1) % M::READ_EVERY + 1;
+            progress.mean_square = running_mean(progress.mean_square, done - new, error.into(), new);
         }
+        // The error is unknown until the first readback, which a GPU makes once in many steps.
+        let psnr = (progress.mean_square > 0.0).then(|| ("psnr", progress.psnr()));
+        let figures: Vec<_> = psnr.into_iter().chain(report.figures).collect();
+        self.session.monitor.step(done, steps, &figures);
+        let (last, stop) = (done == steps, self.session.monitor.stop());
+        if last || stop || saved.elapsed() > every {
+            self.save(last)?;
+            *saved = Instant::now();
+        }
+        Ok(stop && !last)
     }
-    checkpoint::finish(dir)?;
-    Ok((progress, warnings))
 }
 
 /// Returns the running mean over all steps, each weighted 2 % less than the next, from the mean of the first `old` steps

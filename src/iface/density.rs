@@ -217,14 +217,9 @@ impl<O: DensityOps> Model for DensityModel<'_, O> {
     fn report(&mut self, _: u64) -> Result<StepReport, StepError> {
         let Figures { losses, mean_square, samples, rays, broken, .. } = self.ops.figures()?;
         let [square, smooth, distortion, ..] = if samples > 0 { losses } else { [0.0; TERMS] };
-        let terms = ["rgb", "smooth", "distortion"].into_iter().zip([square, smooth, distortion]);
-        StepError::check(terms.clone())?;
-        if broken {
-            return Err(StepError::gradient());
-        }
-        let mut figures: Vec<_> = terms.map(|(name, value)| (name, f64::from(value))).collect();
-        figures.extend([("rays", rays as f64), ("samples", samples as f64)]);
-        Ok(StepReport { square_error: mean_square, figures })
+        let terms = [("rgb", square), ("smooth", smooth), ("distortion", distortion)];
+        let counts = [("rays", rays as f64), ("samples", samples as f64)];
+        StepReport::checked(terms, broken, mean_square, counts)
     }
 
     fn save(&self, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {

@@ -243,20 +243,13 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
             weighted(config.sparsity, sparsity),
             weighted(config.stereo, stereo),
         ];
-        if samples > 0 {
-            StepError::check(TERMS.into_iter().zip(terms))?;
-        }
-        if broken {
-            return Err(StepError::gradient());
-        }
-        let terms = if samples > 0 { terms } else { [0.0; 5] };
-        let mut figures: Vec<_> = TERMS.into_iter().zip(terms.map(f64::from)).collect();
-        figures.extend([
+        let terms: [_; 5] = std::array::from_fn(|k| (TERMS[k], if samples > 0 { terms[k] } else { 0.0 }));
+        let others = [
             ("inv_s", (10.0 * f64::from(variance)).exp()),
             ("rays", rays as f64),
             ("samples", samples as f64),
-        ]);
-        Ok(StepReport { square_error: mean_square, figures })
+        ];
+        StepReport::checked(terms, broken, mean_square, others)
     }
 
     fn save(&self, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {

@@ -31,7 +31,7 @@ use crate::{Monitor, Result};
 use cover::{Bands, Sample};
 use fill::fill;
 use glam::{Mat3, Vec3};
-use light::{SurfacePoints, Visibility, shade, snap_to_surface};
+use light::{Shades, SurfacePoints, ViewDirections, Visibility, shade, snap_to_surface};
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -127,13 +127,9 @@ pub fn bake(
 ) -> Result<Baked> {
     let begin = Instant::now();
     setting((1..=8).contains(&config.side), "BakeConfig::side", "1..=8", config.side)?;
-    let (width, height) = (atlas.width, atlas.height);
     let count = if config.lobes == 0 { 0 } else { functions(config.lobes.min(2)) };
-    let mut color = Image::new(width, height, 3);
-    let mut lobes = vec![Image::new(width, height, 3); count];
-    let mut normal = config.normals.then(|| Image::new(width, height, 3));
-    let mut covered = vec![false; width as usize * height as usize];
-    let (mut samples, mut visible, mut views, mut moved) = (0, 0, 0, 0.0);
+    let mut texels = Texels::new(atlas, count, config.normals);
+    let mut totals = SampleTotals::default();
     let bvh = Bvh::new(mesh);
     let visibility =
         Visibility { cameras, bvh: &bvh, clearance: 0.5 * config.reach, max_cameras: config.views };
@@ -144,20 +140,81 @@ pub fn bake(
         let flat = on_triangles(mesh, own);
         let points = snap_to_surface(&flat, config.reach, field);
         let seen = visibility.directions(&points, &flat);
-        samples += own.len();
+        totals.add(&flat, &points, &seen);
+        let shades = shade(&points, seen, field, count, config.turned);
+        texels.put_means(own, &points, &shades);
+        monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", totals.samples as f64)]);
+    }
+    texels.fill(&Seams::new(mesh, atlas), config.gutter_px);
+    let share = |a: f64, b: usize| if b > 0 { a / b as f64 } else { 0.0 };
+    let Texels { color, lobes, normal, covered } = texels;
+    let SampleTotals { samples, visible, views, moved } = totals;
+    let report = BakeReport {
+        size: [atlas.width, atlas.height],
+        covered: share(covered.iter().filter(|&&c| c).count() as f64, covered.len()),
+        samples,
+        seen: share(visible as f64, samples),
+        views: share(views as f64, visible),
+        moved: share(moved, samples),
+        seconds: begin.elapsed().as_secs_f64(),
+    };
+    Ok(Baked { color, lobes, normal, report })
+}
+
+/// Sums over all samples.
+#[derive(Default)]
+struct SampleTotals {
+    samples: usize,
+    /// Samples that some camera sees.
+    visible: usize,
+    /// Cameras that see a sample.
+    views: usize,
+    /// Distances by which samples moved.
+    moved: f64,
+}
+
+impl SampleTotals {
+    /// Adds the samples of a band, on the triangles and on the surface.
+    fn add(&mut self, flat: &SurfacePoints, points: &SurfacePoints, seen: &ViewDirections) {
+        self.samples += flat.positions.len();
         for (_, &count) in seen.known.iter().zip(&seen.counts).filter(|(known, _)| **known) {
-            visible += 1;
-            views += count as usize;
+            self.visible += 1;
+            self.views += count as usize;
         }
         let ways = flat.positions.iter().zip(&points.positions).map(|(a, b)| f64::from(a.distance(*b)));
-        moved += ways.sum::<f64>();
-        let shades = shade(&points, seen, field, count, config.turned);
+        self.moved += ways.sum::<f64>();
+    }
+}
+
+/// The pictures of an atlas while they are made, as in [`Baked`].
+struct Texels {
+    color: Image,
+    lobes: Vec<Image>,
+    normal: Option<Image>,
+    /// Which of the texels have samples.
+    covered: Vec<bool>,
+}
+
+impl Texels {
+    fn new(atlas: &Atlas, lobes: usize, has_normals: bool) -> Texels {
+        let (width, height) = (atlas.width, atlas.height);
+        Texels {
+            color: Image::new(width, height, 3),
+            lobes: vec![Image::new(width, height, 3); lobes],
+            normal: has_normals.then(|| Image::new(width, height, 3)),
+            covered: vec![false; width as usize * height as usize],
+        }
+    }
+
+    /// Gives texels the mean of their samples, which are sorted by texel. If some samples of a texel
+    /// are visible, the invisible ones are ignored.
+    fn put_means(&mut self, samples: &[Sample], points: &SurfacePoints, shades: &Shades) {
+        let count = self.lobes.len();
         let mut i = 0;
-        for texel in own.chunk_by(|a, b| a.texel == b.texel) {
+        for texel in samples.chunk_by(|a, b| a.texel == b.texel) {
             let at = texel[0].texel as usize;
-            covered[at] = true;
+            self.covered[at] = true;
             let all = i..i + texel.len();
-            // if some samples of a texel are visible, the invisible ones are ignored
             let any = shades.seen[all.clone()].contains(&true);
             let counts = |s: usize| if any && !shades.seen[s] { 0.0 } else { 1.0 };
             let total: f32 = all.clone().map(counts).sum();
@@ -170,36 +227,27 @@ pub fn bake(
                 sum
             };
             let put = |image: &mut Image, v: [f32; 3]| image.data[3 * at..3 * at + 3].copy_from_slice(&v);
-            put(&mut color, mean(&|s| shades.linear[s]));
-            for (k, image) in lobes.iter_mut().enumerate() {
+            put(&mut self.color, mean(&|s| shades.linear[s]));
+            for (k, image) in self.lobes.iter_mut().enumerate() {
                 put(image, mean(&|s| shades.lobes[s * count + k]));
             }
-            if let Some(image) = &mut normal {
+            if let Some(image) = &mut self.normal {
                 let n = Vec3::from(mean(&|s| points.normals[s].to_array()));
                 put(image, n.normalize_or(points.normals[all.start]).to_array());
             }
             i = all.end;
         }
-        monitor.step(band as u64 + 1, bands.len() as u64, &[("texels", samples as f64)]);
     }
-    let seams = Seams::new(mesh, atlas);
-    fill(&mut color, &covered, config.gutter_px);
-    seams.even(&mut color, srgb_from_linear, linear_from_srgb);
-    lobes.iter_mut().for_each(|l| complete(l, &covered, config.gutter_px, &seams));
-    if let Some(normal) = &mut normal {
-        fill(normal, &covered, config.gutter_px);
+
+    /// Fills the pictures between the charts, and makes color and lobes agree along the seams.
+    fn fill(&mut self, seams: &Seams, gutter_px: u32) {
+        fill(&mut self.color, &self.covered, gutter_px);
+        seams.even(&mut self.color, srgb_from_linear, linear_from_srgb);
+        self.lobes.iter_mut().for_each(|l| complete(l, &self.covered, gutter_px, seams));
+        if let Some(normal) = &mut self.normal {
+            fill(normal, &self.covered, gutter_px);
+        }
     }
-    let share = |a: f64, b: usize| if b > 0 { a / b as f64 } else { 0.0 };
-    let report = BakeReport {
-        size: [width, height],
-        covered: share(covered.iter().filter(|&&c| c).count() as f64, covered.len()),
-        samples,
-        seen: share(visible as f64, samples),
-        views: share(views as f64, visible),
-        moved: share(moved, samples),
-        seconds: begin.elapsed().as_secs_f64(),
-    };
-    Ok(Baked { color, lobes, normal, report })
 }
 
 /// Fills a picture of 3 channels between its charts, of which the `known` texels lie in one, and makes it agree along

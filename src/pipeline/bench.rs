@@ -4,11 +4,11 @@
 //! masked PSNR of some held-out views. Some sweeps vary the cost of training (steps, photographs' size, the hash
 //! grid), others the path from a surface to the head mesh (simplification, texture).
 
-use super::finish::{Export, finish};
-use super::mesh::photographs;
+use super::finish::{Export, Finish};
+use super::mesh::{Extraction, extract, photographs};
 use super::render::{Meshes, Renderer};
 use super::session::Session;
-use super::surface::{ClosedSurface, Fields, Surface};
+use super::surface::Fields;
 use super::{complete, learn, pictures};
 use crate::capture::scene::Scene;
 use crate::capture::{LoadedView, Split, View};
@@ -19,7 +19,7 @@ use crate::image::Photo;
 use crate::io::{self, Limits};
 use crate::math::rank::median;
 use crate::mesh::files::HeadMesh;
-use crate::mesh::{Cap, MeshReport, Patches, SimplifyConfig, simplify};
+use crate::mesh::{SimplifyConfig, simplify};
 use crate::metrics::{compare, distance};
 use crate::report::bench::{BenchResult, Measure, Row, Sweep, WorkCost};
 use crate::run::{Run, Stop};
@@ -122,29 +122,16 @@ impl<'l> Bench<'l> {
     }
 
     /// Returns the extracted surface with its cap and patches.
-    fn extracted(&self, fields: &dyn Fields, c: &MeshConfig) -> Result<Extracted> {
+    fn extracted(&self, fields: &dyn Fields, c: &MeshConfig) -> Result<Extraction> {
         let capture = self.session.refined_capture()?;
         let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
-        let field = fields.surface()?;
-        let (mesh, report) =
-            super::mesh::extract(&self.scene, field, &cameras, capture.up, c, self.monitor())?;
-        let (cap, patches) =
-            (Cap::of(&mesh, report.bounds(), report.cell_size), Patches::of(&mesh, &report.handles));
-        Ok(Extracted { mesh, report, cap, patches })
+        extract(&self.scene, fields.surface()?, &cameras, capture.up, c, self.monitor())
     }
 
     /// Returns the number of millimeters in a scene unit.
     fn mm(&self) -> f64 {
         1000.0 * self.config().capture.unit_m / self.scene.scene_from_world.scale
     }
-}
-
-/// The whole surface of a field.
-struct Extracted {
-    mesh: Mesh,
-    report: MeshReport,
-    cap: Option<Cap>,
-    patches: Option<Patches>,
 }
 
 /// The metric that views of fields are evaluated by: two trainings with the same settings and different seeds differ
@@ -481,7 +468,7 @@ impl Bench<'_> {
 /// A simplified surface that is baked repeatedly.
 struct Finisher<'f> {
     mesh: Mesh,
-    extracted: Extracted,
+    extracted: Extraction,
     fields: &'f dyn Fields,
     views: Vec<(Camera, LoadedView)>,
 }
@@ -506,16 +493,17 @@ impl<'f> Finisher<'f> {
         let (export, cell) = (Export::new(capture, config), self.extracted.report.cell_size);
         let (closed, cameras) = (self.extracted.closed(self.fields.surface()?), bench.cameras());
         let photographs = photographs(&self.views);
-        let c = MeshConfig { triangles: 0, max_error: 0.0, ..c.clone() };
-        let scene = &bench.scene;
-        let done =
-            finish(&self.mesh, cell, &closed, &cameras, &photographs, scene, &export, &c, bench.monitor())?;
-        Ok(done.head)
-    }
-}
-
-impl Extracted {
-    fn closed<'a>(&'a self, field: &'a dyn Surface) -> ClosedSurface<'a> {
-        ClosedSurface { field, hull: None, cap: self.cap.as_ref(), patches: self.patches.as_ref() }
+        let finish = Finish {
+            surface: &self.mesh,
+            cell,
+            field: &closed,
+            cameras: &cameras,
+            photographs: &photographs,
+            scene: &bench.scene,
+            export: &export,
+            config: &MeshConfig { triangles: 0, max_error: 0.0, ..c.clone() },
+            monitor: bench.monitor(),
+        };
+        Ok(finish.run()?.head)
     }
 }

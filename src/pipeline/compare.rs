@@ -143,30 +143,8 @@ pub fn judge(
             "hold some out: `--set capture.test=...` (see `tiface config --explain capture`)",
         ));
     }
-    let mut warnings = Vec::new();
-    // the entry of the whole file
-    let mut names = vec!["truth".to_string()];
-    let mut sets: Vec<Vec<Comparable>> = Vec::new();
-    let mut shapes = Map::new();
-    for path in views.iter().chain(meshes) {
-        let name = unique(path, &names);
-        names.push(name);
-    }
-    names.remove(0);
-    for (folder, name) in views.iter().zip(&names) {
-        let set = pictures_of(&held_out, folder)?;
-        if set.len() < held_out.len() {
-            let lacking = counted(held_out.len() - set.len(), "held-out view");
-            warnings.push(format!("{name}: no picture of {lacking} of {}", held_out.len()));
-        }
-        sets.push(set);
-    }
-    for (mesh, name) in meshes.iter().zip(&names[views.len()..]) {
-        let (shape, found) = draw(&held_out, config, mesh, &out.join(DRAWN).join(name))?;
-        shapes.insert(name.clone(), shape);
-        warnings.extend(found.into_iter().map(|warning| format!("{name}: {warning}")));
-        sets.push(pictures_of(&held_out, &out.join(DRAWN).join(name))?);
-    }
+    let Entries { names, sets, mut shapes, warnings } =
+        Entries::read(&held_out, config, views, meshes, &out.join(DRAWN))?;
     let judge = Judge::new(config, sets.iter().flatten(), None)?;
     let (mut metrics, mut shown) = (Map::new(), Vec::new());
     for (k, (name, pictures)) in names.into_iter().zip(sets).enumerate() {
@@ -177,8 +155,79 @@ pub fn judge(
     }
     let masks = if held_out.iter().any(|view| view.mask != ViewMask::None) { "capture" } else { "none" };
     let truth = json!({"photographs": config.metrics.truth, "masks": masks});
+    let facts = [Some(counted(held_out.len(), "held-out photograph")), report::judged_by(&truth)];
     let (views, left_out) = rows(&capture.views, config.render.background, &shown, out, MAX_BYTES)?;
-    let mean = |figures: &Value, key: &str| figures["head"]["mean"][key].as_f64();
+    let page = report::html(&Report {
+        title: format!("{}: views of other programs", capture.name),
+        facts: facts.into_iter().flatten().collect(),
+        views,
+        left_out,
+        warnings: warnings.clone(),
+        ..tables(&shown)
+    })?;
+    let row = |set: &ShownSet| {
+        let one =
+            |masked: &str, frame: &str| mean(&set.figures, masked).or_else(|| mean(&set.figures, frame));
+        let (psnr, ssim) = (one("psnr_masked", "psnr"), one("ssim_masked", "ssim"));
+        (set.title.clone(), psnr, ssim, set.pictures.len())
+    };
+    let rows = shown.iter().map(row).collect();
+    metrics.insert("truth".into(), truth);
+    Ok(Judged { metrics: Value::Object(metrics), rows, page, warnings })
+}
+
+/// Folders and meshes of other programs, with pictures of the held-out views.
+struct Entries<'c> {
+    names: Vec<String>,
+    /// The pictures of each name.
+    sets: Vec<Vec<Comparable<'c>>>,
+    /// Figures of the meshes, by name.
+    shapes: Map<String, Value>,
+    warnings: Vec<String>,
+}
+
+impl<'c> Entries<'c> {
+    /// Reads the folders, and draws the meshes into folders in `drawn`.
+    fn read(
+        held_out: &[&'c View],
+        config: &Config,
+        views: &[PathBuf],
+        meshes: &[PathBuf],
+        drawn: &Path,
+    ) -> Result<Entries<'c>> {
+        // the entry of the whole file
+        let mut names = vec!["truth".to_string()];
+        for path in views.iter().chain(meshes) {
+            let name = unique(path, &names);
+            names.push(name);
+        }
+        names.remove(0);
+        let (mut sets, mut shapes, mut warnings) = (Vec::new(), Map::new(), Vec::new());
+        for (folder, name) in views.iter().zip(&names) {
+            let set = pictures_of(held_out, folder)?;
+            if set.len() < held_out.len() {
+                let lacking = counted(held_out.len() - set.len(), "held-out view");
+                warnings.push(format!("{name}: no picture of {lacking} of {}", held_out.len()));
+            }
+            sets.push(set);
+        }
+        for (mesh, name) in meshes.iter().zip(&names[views.len()..]) {
+            let (shape, found) = draw(held_out, config, mesh, &drawn.join(name))?;
+            shapes.insert(name.clone(), shape);
+            warnings.extend(found.into_iter().map(|warning| format!("{name}: {warning}")));
+            sets.push(pictures_of(held_out, &drawn.join(name))?);
+        }
+        Ok(Entries { names, sets, shapes, warnings })
+    }
+}
+
+/// Returns a figure of the whole head, the mean of its views.
+fn mean(figures: &Value, key: &str) -> Option<f64> {
+    figures["head"]["mean"][key].as_f64()
+}
+
+/// Returns a report with the tables of these sets alone.
+fn tables(shown: &[ShownSet]) -> Report {
     let all: Vec<(String, Value)> =
         shown.iter().map(|set| (set.title.clone(), means(&set.figures))).collect();
     let columns = [COLUMNS[0], COLUMNS[1], COLUMNS[2], COLUMNS[3], COLUMNS[7]];
@@ -186,32 +235,13 @@ pub fn judge(
         let head = ["psnr_masked", "ssim_masked", "psnr", "ssim"].map(|key| mean(figures, key));
         (title.clone(), [&head[..], &[figures["mesh"]["triangles"].as_f64()]].concat())
     };
-    let page = report::html(&Report {
-        title: format!("{}: views of other programs", capture.name),
-        facts: [Some(counted(held_out.len(), "held-out photograph")), report::judged_by(&truth)]
-            .into_iter()
-            .flatten()
-            .collect(),
+    let meshes = all.iter().filter(|(_, figures)| figures["mesh"].is_object());
+    Report {
         table: MethodTable::new(&columns, all.iter().map(cells).collect()),
         quality: quality(&all),
-        summaries: all
-            .iter()
-            .filter(|(_, figures)| figures["mesh"].is_object())
-            .map(|(title, figures)| (title.clone(), leaves(&figures["mesh"])))
-            .collect(),
-        views,
-        left_out,
-        warnings: warnings.clone(),
+        summaries: meshes.map(|(title, figures)| (title.clone(), leaves(&figures["mesh"]))).collect(),
         ..Report::default()
-    })?;
-    let row = |set: &ShownSet| {
-        let one = |masked: &str, frame: &str| mean(&set.figures, masked).or(mean(&set.figures, frame));
-        let (psnr, ssim) = (one("psnr_masked", "psnr"), one("ssim_masked", "ssim"));
-        (set.title.clone(), psnr, ssim, set.pictures.len())
-    };
-    let rows = shown.iter().map(row).collect();
-    metrics.insert("truth".into(), truth);
-    Ok(Judged { metrics: Value::Object(metrics), rows, page, warnings })
+    }
 }
 
 /// Returns the name of a folder or file that none of the others has.

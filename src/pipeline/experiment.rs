@@ -111,8 +111,23 @@ fn has_surface(run: &str) -> bool {
 ///
 /// Fails for an unknown run or for settings that are not allowed.
 pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
-    let preset = if run == "standard" { Preset::Standard } else { Preset::Paper };
-    let mut c = Config::preset(preset);
+    let mut c = full_scale(run)?;
+    if scale < 1.0 {
+        shrink(&mut c, scale);
+    }
+    // parsed from text, as the user's settings are, so that ranges are checked and explicit settings win
+    let sources = Sources {
+        preset: Some(c.preset),
+        files: vec![(format!("run `{run}`"), c.to_toml())],
+        set: set.to_vec(),
+        ..Sources::default()
+    };
+    Config::resolve(&sources)
+}
+
+/// Returns the settings of a run at the published effort.
+fn full_scale(run: &str) -> Result<Config> {
+    let mut c = Config::preset(if run == "standard" { Preset::Standard } else { Preset::Paper });
     c.metrics.truth = TruthPhoto::Photo;
     let shows = |c: &mut Config, method: Method| {
         c.render.method = vec![method];
@@ -161,17 +176,7 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
         }
         _ => {}
     }
-    if scale < 1.0 {
-        shrink(&mut c, scale);
-    }
-    // parsed from text, as the user's settings are, so that ranges are checked and explicit settings win
-    let sources = Sources {
-        preset: Some(preset),
-        files: vec![(format!("run `{run}`"), c.to_toml())],
-        set: set.to_vec(),
-        ..Sources::default()
-    };
-    Config::resolve(&sources)
+    Ok(c)
 }
 
 /// Adapts the settings of a run to a capture without masks, if the run needs none; returns them unchanged otherwise.

@@ -5,14 +5,14 @@
 use crate::capture::Capture;
 use crate::capture::scene::Scene;
 use crate::config::{ColorSource, Config, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
-use crate::geom::{Camera, Mesh, SdfField, Similarity};
+use crate::geom::{Atlas, Camera, Harmonics, Mesh, SdfField, Shells, Similarity};
 use crate::image::{Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
-use crate::mesh::bake::{BakeConfig, Seams, bake, bake_harmonics, complete, tangent_space};
+use crate::mesh::bake::{BakeConfig, Baked, Seams, bake, bake_harmonics, complete, tangent_space};
 use crate::mesh::files::{
     ExportOptions, ExportedFiles, HeadMesh, HeadTexture, Lobes, tangents, to_glb, to_obj, to_ply,
 };
 use crate::mesh::{
-    AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
+    Appearance, AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
 };
 use crate::{Monitor, Result};
 use glam::{DMat3, DVec3, Mat3, Vec3};
@@ -36,113 +36,207 @@ pub(super) struct FinishedHead {
 /// Number of cameras that the network's colors are sampled from, where photographs give the rest.
 const FALLBACK_VIEWS: usize = 3;
 
-/// Finishes a surface in scene coordinates, extracted with cells of `cell`; cameras are in scene coordinates, too.
-pub(super) fn finish(
-    surface: &Mesh,
-    cell: f32,
-    field: &dyn SdfField,
-    cameras: &[Camera],
-    photographs: &[Photograph],
-    scene: &Scene,
-    export: &Export,
-    c: &MeshConfig,
-    monitor: &dyn Monitor,
-) -> Result<FinishedHead> {
-    let (mut report, mut warnings) = (Map::new(), Vec::new());
-    let mut mesh = surface.clone();
-    let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
-    if fewer || c.max_error > 0.0 {
-        let config = SimplifyConfig { triangles: c.triangles as usize, error: c.max_error * cell };
-        let done = simplify(&mut mesh, Some(field), &config, monitor)?;
-        warnings.extend(done.warnings(&config));
-        report.insert("simplify".into(), json!(done));
+/// A surface to be finished, and what its colors and its files come from. All is in scene coordinates.
+pub(super) struct Finish<'a> {
+    pub surface: &'a Mesh,
+    /// Size of the cells that the surface was extracted with.
+    pub cell: f32,
+    pub field: &'a dyn SdfField,
+    pub cameras: &'a [Camera],
+    pub photographs: &'a [Photograph<'a>],
+    pub scene: &'a Scene,
+    pub export: &'a Export,
+    pub config: &'a MeshConfig,
+    pub monitor: &'a dyn Monitor,
+}
+
+/// Reports and warnings of the steps made so far.
+#[derive(Default)]
+struct StepLog {
+    report: Map<String, Value>,
+    warnings: Vec<String>,
+}
+
+/// The photographs that colors are fitted to, and how.
+struct ColorFit<'a> {
+    /// `None` if the colors are the network's.
+    photographs: Option<&'a [Photograph<'a>]>,
+    /// Maximum degree of view-dependent color.
+    max_degree: u32,
+    /// Turns directions of the scene into those that harmonics are kept in.
+    turned: Mat3,
+}
+
+impl Finish<'_> {
+    /// Simplifies the surface, and colors the vertices or bakes a texture.
+    pub fn run(&self) -> Result<FinishedHead> {
+        let mut log = StepLog::default();
+        let mut mesh = self.simplify(&mut log)?;
+        let world_from_scene = self.scene.scene_from_world.inverse();
+        let frames = self.lobe_frames(&mesh, &world_from_scene)?;
+        let fit = self.color_fit(&frames, &mut log);
+        let shells = self.shells(&mesh, &mut log)?;
+        let (texture, harmonics, linear) = if self.config.texture_px == 0 {
+            let fitted = self.fit_colors(&mut mesh, Colors::Vertices, &fit, &mut log)?;
+            (None, fitted.and_then(|fitted| fitted.harmonics), None)
+        } else {
+            let layout = self.unwrap(&mesh, &mut log)?;
+            let (mut baked, harmonics) = self.bake(&mut mesh, &layout, &fit, &mut log)?;
+            let file_from_world = frames.file_from_world().rotation_f32();
+            let texture =
+                self.texture(&mesh, layout, &mut baked, harmonics.as_ref(), file_from_world, &mut log);
+            (Some(texture), harmonics, self.config.exr.then_some(baked.color))
+        };
+        let head = HeadMesh { mesh, world_from_scene, texture, harmonics, shells };
+        Ok(FinishedHead { head, linear, report: log.report, warnings: log.warnings })
     }
-    let world_from_scene = scene.scene_from_world.inverse();
-    // the lobes are turned as `Export::files` turns the file; data that is in no file is the same in all formats
-    let frame = if c.lobes > 0 { export.frame } else { MeshFrame::Dataset };
-    let frames = Export { frame, ..export.clone() }.frames(&mesh, &world_from_scene)?;
-    let turned = frames.file_from_scene.rotation_f32();
-    let most = if c.lobes > 0 { c.lobes } else { 2 };
-    let fits = c.color == ColorSource::Photographs;
-    let photographs_say = fits && photographs.iter().any(|p| p.head_pixels() > 0);
-    if fits && !photographs_say {
-        warnings.push(
-            "no photograph shows the head alone: the mesh has the colors of the network; look at `mask/sheet.html`"
-                .into(),
-        );
-    }
-    let mut shells = None;
-    if c.hair == Hair::Shells {
-        let (found, done) = fit_shells(&mesh, &field.sharpness(&mesh.positions), photographs, monitor)?;
-        report.insert("shells".into(), json!(done));
-        shells = found;
-    }
-    if c.texture_px == 0 {
-        let mut harmonics = None;
-        if photographs_say
-            && let Some(fitted) = fit_appearance(&mesh, Colors::Vertices, photographs, most, turned, monitor)?
-        {
-            report.insert("appearance".into(), json!(fitted.report));
-            mesh.colors = fitted.vertices;
-            harmonics = fitted.harmonics;
+
+    /// Returns the surface with at most the configured number of triangles and error.
+    fn simplify(&self, log: &mut StepLog) -> Result<Mesh> {
+        let c = self.config;
+        let mut mesh = self.surface.clone();
+        let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
+        if fewer || c.max_error > 0.0 {
+            let config = SimplifyConfig { triangles: c.triangles as usize, error: c.max_error * self.cell };
+            let done = simplify(&mut mesh, Some(self.field), &config, self.monitor)?;
+            log.warnings.extend(done.warnings(&config));
+            log.report.insert("simplify".into(), json!(done));
         }
-        let head = HeadMesh { mesh, world_from_scene, texture: None, harmonics, shells };
-        return Ok(FinishedHead { head, linear: None, report, warnings });
+        Ok(mesh)
     }
 
-    let center = center(surface, &world_from_scene);
-    let config = export.atlas_config(center, &scene.scene_from_world, c.texture_px, c.gutter_px);
-    let (layout, done) = atlas(&mesh, &config, monitor)?;
-    warnings.extend(done.warnings());
-    report.insert("atlas".into(), json!(done));
+    /// Returns the frames that lobes are kept in: turned as [`Export::files`] turns the file. Data
+    /// that is in no file is the same in all formats.
+    fn lobe_frames(&self, mesh: &Mesh, world_from_scene: &Similarity) -> Result<Frames> {
+        let frame = if self.config.lobes > 0 { self.export.frame } else { MeshFrame::Dataset };
+        Export { frame, ..self.export.clone() }.frames(mesh, world_from_scene)
+    }
 
-    let config = BakeConfig {
-        // colors that are then fitted to photographs need no exact baking
-        side: if photographs_say { 1 } else { c.texture_samples },
-        views: if photographs_say { FALLBACK_VIEWS } else { usize::MAX },
-        gutter_px: c.gutter_px,
-        reach: REACH * cell,
-        lobes: if photographs_say { 0 } else { c.lobes },
-        normals: c.normal_map,
-        turned,
-    };
-    let mut baked = bake(&mesh, &layout, field, cameras, &config, monitor)?;
-    report.insert("bake".into(), json!(baked.report));
-    let mut harmonics = None;
-    if photographs_say {
+    /// Decides whether colors are fitted to photographs; warns if they should be, but cannot.
+    fn color_fit(&self, frames: &Frames, log: &mut StepLog) -> ColorFit<'_> {
+        let c = self.config;
+        let fits = c.color == ColorSource::Photographs;
+        let photographs_say = fits && self.photographs.iter().any(|p| p.head_pixels() > 0);
+        if fits && !photographs_say {
+            log.warnings.push(
+                "no photograph shows the head alone: the mesh has the colors of the network; look at `mask/sheet.html`"
+                    .into(),
+            );
+        }
+        ColorFit {
+            photographs: photographs_say.then_some(self.photographs),
+            max_degree: if c.lobes > 0 { c.lobes } else { 2 },
+            turned: frames.file_from_scene.rotation_f32(),
+        }
+    }
+
+    /// Returns the soft layers of the hair, if they are asked for and show more of the head.
+    fn shells(&self, mesh: &Mesh, log: &mut StepLog) -> Result<Option<Shells>> {
+        if self.config.hair != Hair::Shells {
+            return Ok(None);
+        }
+        let sharpness = self.field.sharpness(&mesh.positions);
+        let (shells, done) = fit_shells(mesh, &sharpness, self.photographs, self.monitor)?;
+        log.report.insert("shells".into(), json!(done));
+        Ok(shells)
+    }
+
+    /// Fits colors to the photographs, if there are any to fit to, and gives them to the vertices.
+    fn fit_colors(
+        &self,
+        mesh: &mut Mesh,
+        colors: Colors,
+        fit: &ColorFit,
+        log: &mut StepLog,
+    ) -> Result<Option<Appearance>> {
+        let Some(photographs) = fit.photographs else { return Ok(None) };
+        let fitted = fit_appearance(mesh, colors, photographs, fit.max_degree, fit.turned, self.monitor)?;
+        let Some(mut fitted) = fitted else { return Ok(None) };
+        log.report.insert("appearance".into(), json!(fitted.report));
+        mesh.colors = std::mem::take(&mut fitted.vertices);
+        Ok(Some(fitted))
+    }
+
+    /// Lays the mesh out in an atlas.
+    fn unwrap(&self, mesh: &Mesh, log: &mut StepLog) -> Result<Atlas> {
+        let (c, scene_from_world) = (self.config, &self.scene.scene_from_world);
+        let center = center(self.surface, &scene_from_world.inverse());
+        let config = self.export.atlas_config(center, scene_from_world, c.texture_px, c.gutter_px);
+        let (layout, done) = atlas(mesh, &config, self.monitor)?;
+        log.warnings.extend(done.warnings());
+        log.report.insert("atlas".into(), json!(done));
+        Ok(layout)
+    }
+
+    /// Bakes the field into the atlas, and fits the color to photographs.
+    fn bake(
+        &self,
+        mesh: &mut Mesh,
+        layout: &Atlas,
+        fit: &ColorFit,
+        log: &mut StepLog,
+    ) -> Result<(Baked, Option<Harmonics>)> {
+        let (c, fits) = (self.config, fit.photographs.is_some());
+        let config = BakeConfig {
+            // colors that are then fitted to photographs need no exact baking
+            side: if fits { 1 } else { c.texture_samples },
+            views: if fits { FALLBACK_VIEWS } else { usize::MAX },
+            gutter_px: c.gutter_px,
+            reach: REACH * self.cell,
+            lobes: if fits { 0 } else { c.lobes },
+            normals: c.normal_map,
+            turned: fit.turned,
+        };
+        let mut baked = bake(mesh, layout, self.field, self.cameras, &config, self.monitor)?;
+        log.report.insert("bake".into(), json!(baked.report));
+        if !fits {
+            return Ok((baked, None));
+        }
         let mut image = baked.color.clone();
         image.data.iter_mut().for_each(|v| *v = srgb_from_linear(*v));
-        let colors = Colors::Texels(&layout, &image);
-        if let Some(fitted) = fit_appearance(&mesh, colors, photographs, most, turned, monitor)? {
-            report.insert("appearance".into(), json!(fitted.report));
-            let (texels, known) = fitted.texels;
-            image.data = texels.into_flattened();
-            complete(&mut image, &known, c.gutter_px, &Seams::new(&mesh, &layout));
-            image.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
-            baked.color = image;
-            mesh.colors = fitted.vertices;
-            harmonics = fitted.harmonics;
-        }
+        let Some(fitted) = self.fit_colors(mesh, Colors::Texels(layout, &image), fit, log)? else {
+            return Ok((baked, None));
+        };
+        let (texels, known) = fitted.texels;
+        image.data = texels.into_flattened();
+        complete(&mut image, &known, c.gutter_px, &Seams::new(mesh, layout));
+        image.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
+        baked.color = image;
+        Ok((baked, fitted.harmonics))
     }
-    let color = coded(&baked.color);
-    report.insert("seam_step_255".into(), json!(Seams::new(&mesh, &layout).step(&color)));
 
-    let mut normal = None;
-    if let Some(normals) = &baked.normal {
-        match tangents(&mesh, &layout) {
-            Ok(tangents) => {
-                normal = Some(tangent_space(&mesh, &layout, &tangents, normals, c.gutter_px));
+    /// Returns the pictures of a texture, coded as in files. Harmonics that were fitted replace baked
+    /// lobes.
+    fn texture(
+        &self,
+        mesh: &Mesh,
+        layout: Atlas,
+        baked: &mut Baked,
+        harmonics: Option<&Harmonics>,
+        file_from_world: Mat3,
+        log: &mut StepLog,
+    ) -> HeadTexture {
+        let c = self.config;
+        let color = coded(&baked.color);
+        log.report.insert("seam_step_255".into(), json!(Seams::new(mesh, &layout).step(&color)));
+        let mut normal = None;
+        if let Some(normals) = &baked.normal {
+            match tangents(mesh, &layout) {
+                Ok(tangents) => {
+                    normal = Some(tangent_space(mesh, &layout, &tangents, normals, c.gutter_px));
+                }
+                Err(e) => {
+                    let problem = format!("the mesh has no normal map: {e}; leave out `mesh.normal_map`");
+                    log.warnings.push(problem);
+                }
             }
-            Err(e) => warnings.push(format!("the mesh has no normal map: {e}; leave out `mesh.normal_map`")),
         }
+        if let Some(harmonics) = harmonics.filter(|_| c.lobes > 0) {
+            baked.lobes = bake_harmonics(mesh, &layout, harmonics, c.gutter_px);
+        }
+        let lobes = lobes(&baked.lobes, file_from_world);
+        HeadTexture { atlas: layout, color, normal, lobes }
     }
-    if let Some(harmonics) = harmonics.as_ref().filter(|_| c.lobes > 0) {
-        baked.lobes = bake_harmonics(&mesh, &layout, harmonics, c.gutter_px);
-    }
-    let lobes = lobes(&baked.lobes, frames.file_from_world().rotation_f32());
-    let texture = Some(HeadTexture { atlas: layout, color, normal, lobes });
-    let head = HeadMesh { mesh, world_from_scene, texture, harmonics, shells };
-    Ok(FinishedHead { head, linear: c.exr.then_some(baked.color), report, warnings })
 }
 
 /// Returns linear color as an 8-bit picture, rounded to nearest.

@@ -74,7 +74,7 @@ pub(super) fn mask(
              `mask.vitmatte` they are cut and softened by built-in methods",
         );
     }
-    let CaptureMasks { masks, sheet: mut views, record, refused, reading } = match prompts {
+    let CaptureMasks { masks, sheet, record, refused, reading } = match prompts {
         Some(prompts) => masks_from_clicks(capture, prompts, config, dir)?,
         None => masks_of_capture(capture, config, dir)?,
     };
@@ -90,26 +90,11 @@ pub(super) fn mask(
         );
     }
     let silhouettes = config.meaning == MaskMeaning::Empty;
-    let (conflicts, compared) = if silhouettes { conflicts(capture, &masks) } else { (Vec::new(), 0) };
-    let mut wrong = if silhouettes { refused } else { Vec::new() };
-    let (contradicting, warnings) = classify_conflicts(&conflicts, compared);
-    wrong.extend(contradicting);
-    for (_, view) in views.iter_mut().filter(|(i, _)| conflicts.iter().any(|(view, ..)| view == i)) {
-        view.suspicions.push("disagrees with the others".into());
-    }
-    let views: Vec<SheetView> = views.into_iter().map(|(_, view)| view).collect();
-    if !views.is_empty() {
-        io::write_atomic(&dir.folder().join(SHEET), sheet(&views)?.as_bytes())?;
-    }
-    let wrong = grouped(&wrong);
+    let wrong = if silhouettes { refused } else { Vec::new() };
+    let compared = silhouettes.then_some(&masks[..]);
     // masks that the stage made only cause warnings: the user reviews them before training
-    if let Some(problem) = wrong.first().filter(|_| prompts.is_none() && !config.trust) {
-        return Err(problem.into());
-    }
-    let told = |problem: &Problem| format!("{problem}; {}", problem.hint);
-    wrong.iter().map(told).chain(warnings).for_each(|text| dir.warn(&text));
-    let suspicious = views.iter().filter(|v| !v.suspicions.is_empty()).map(|v| &v.name);
-    let suspicious: Vec<&String> = suspicious.collect();
+    let refuses = prompts.is_none() && !config.trust;
+    let suspicious = review(capture, compared, wrong, sheet, refuses, dir)?;
     // pixels that a mask marks as unknown may still show the head
     let scene = locate_head(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
@@ -143,7 +128,40 @@ pub(super) fn mask(
     Ok(summary)
 }
 
-/// Results of the checks of cameras and exposures.
+/// Writes the contact sheet, and compares masks with each other if they are given; `wrong` are
+/// contradictions within masks. Returns the names of suspicious views.
+///
+/// # Errors
+///
+/// Fails at a contradiction if `refuses`; it is a warning otherwise.
+fn review(
+    capture: &Capture,
+    masks: Option<&[Option<Gray>]>,
+    mut wrong: Vec<Error>,
+    mut views: Vec<(usize, SheetView)>,
+    refuses: bool,
+    dir: &StageDir,
+) -> Result<Vec<String>> {
+    let (conflicts, compared) = masks.map_or((Vec::new(), 0), |masks| conflicts(capture, masks));
+    let (contradicting, warnings) = classify_conflicts(&conflicts, compared);
+    wrong.extend(contradicting);
+    for (_, view) in views.iter_mut().filter(|(i, _)| conflicts.iter().any(|(view, ..)| view == i)) {
+        view.suspicions.push("disagrees with the others".into());
+    }
+    let views: Vec<SheetView> = views.into_iter().map(|(_, view)| view).collect();
+    if !views.is_empty() {
+        io::write_atomic(&dir.folder().join(SHEET), sheet(&views)?.as_bytes())?;
+    }
+    let wrong = grouped(&wrong);
+    if let Some(problem) = wrong.first().filter(|_| refuses) {
+        return Err(problem.into());
+    }
+    let told = |problem: &Problem| format!("{problem}; {}", problem.hint);
+    wrong.iter().map(told).chain(warnings).for_each(|text| dir.warn(&text));
+    Ok(views.into_iter().filter(|v| !v.suspicions.is_empty()).map(|v| v.name).collect())
+}
+
+/// What was measured of cameras and exposures.
 #[derive(Default)]
 struct RigCheck {
     cameras: Option<CameraCheck>,

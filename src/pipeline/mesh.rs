@@ -8,7 +8,7 @@
 //!      frames.json   the transform from the dataset's world to GLB and OBJ files
 //! ```
 
-use super::finish::{Export, FinishedHead, REACH, finish};
+use super::finish::{Export, Finish, FinishedHead, REACH};
 use super::learn;
 use super::surface::{ClosedSurface, Surface};
 use crate::capture::scene::Scene;
@@ -38,29 +38,17 @@ pub(super) fn mesh(
     let c = &config.mesh;
     let (world_from_scene, export) = (scene.scene_from_world.inverse(), Export::new(capture, config));
     let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
-    let (mut surface, report) = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
-    let mm = world_from_scene.scale * export.meters(&surface, &world_from_scene) * 1000.0;
-    report.end(c.cap).iter().for_each(|text| dir.note(text));
-    report.warnings().iter().for_each(|w| dir.warn(w));
-    report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
-    let patches = Patches::of(&surface, &report.handles);
-    let cap = (!c.dense).then(|| Cap::of(&surface, report.bounds(), report.cell_size));
-    let mut cap = cap.flatten();
-    if let Some(cap) = &cap {
-        if c.cap {
-            cap.paint(&mut surface);
-        } else {
-            cap.open(&mut surface);
-        }
-    }
+    let mut extracted = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
+    let mm = world_from_scene.scale * export.meters(&extracted.mesh, &world_from_scene) * 1000.0;
+    extracted.announce(c.cap, mm, dir);
+    extracted.end(c.cap);
     // the extraction took longest, so it is kept even if a later step fails
     let in_world = ExportOptions {
         stem: "surface".into(),
         world_from_mesh: world_from_scene,
         ..ExportOptions::default()
     };
-    write_files(&to_ply(&surface, None, &in_world)?, dir.folder())?;
-    let surface_triangles = surface.triangles.len();
+    write_files(&to_ply(&extracted.mesh, None, &in_world)?, dir.folder())?;
     // vertices have the color seen along the normal; textures and rays, and so their cap, have the color that cameras
     // see
     let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
@@ -68,59 +56,74 @@ pub(super) fn mesh(
         ColorSource::Network if c.hair == Hair::None => Vec::new(),
         _ => learn::training_views(capture, scene, config)?,
     };
-    if let Some(cap) = cap.as_mut() {
-        let reach = REACH * report.cell_size;
-        cap.shade(|p, n| seen_colors(&surface, p, n, field, &cameras, reach));
-    }
-    let photographs = photographs(&views);
-    let closed = ClosedSurface { field, hull: None, cap: cap.as_ref(), patches: patches.as_ref() };
-    let finished = finish(
-        &surface,
-        report.cell_size,
-        &closed,
-        &cameras,
-        &photographs,
+    extracted.shade_cap(field, &cameras);
+    let finish = Finish {
+        surface: &extracted.mesh,
+        cell: extracted.report.cell_size,
+        field: &extracted.closed(field),
+        cameras: &cameras,
+        photographs: &photographs(&views),
         scene,
-        &export,
-        c,
-        dir.monitor(),
-    )?;
-    let FinishedHead { head, linear, report: steps, warnings } = finished;
+        export: &export,
+        config: c,
+        monitor: dir.monitor(),
+    };
+    let FinishedHead { head, linear, report: steps, warnings } = finish.run()?;
     warnings.iter().for_each(|w| dir.warn(w));
-
-    let frames = json!({"file_from_world": export.frames(&head.mesh, &world_from_scene)?.file_from_world()});
-    io::write_atomic(&dir.folder().join("frames.json"), format!("{frames:#}\n").as_bytes())?;
-    let parts = dir.folder().join("parts");
-    head.save(&parts)?;
+    let Extraction { mesh: surface, report, cap, .. } = extracted;
+    let surface_triangles = surface.triangles.len();
     let plain = Mesh { colors: Vec::new(), ..surface };
-    ExtractedSurface { mesh: plain, cap: cap.filter(|_| c.cap) }.save(&parts)?;
+    ExtractedSurface { mesh: plain, cap: cap.filter(|_| c.cap) }.save(&dir.folder().join("parts"))?;
+    write_head(&head, linear, &export, c, dir)?;
+    let mut summary = shape(&head, &export);
+    summary["surface_triangles"] = json!(surface_triangles);
+    summary["handles"] = handles(&report.handles, mm);
+    summary["report"] = json!(report);
+    summary["steps"] = Value::Object(steps);
+    Ok(summary)
+}
+
+/// Writes the head mesh, its frames, its linear color, and its files in the configured formats.
+fn write_head(
+    head: &HeadMesh,
+    linear: Option<Image>,
+    export: &Export,
+    c: &MeshConfig,
+    dir: &StageDir,
+) -> Result<()> {
+    let frames = export.frames(&head.mesh, &head.world_from_scene)?;
+    let frames = json!({"file_from_world": frames.file_from_world()});
+    io::write_atomic(&dir.folder().join("frames.json"), format!("{frames:#}\n").as_bytes())?;
+    head.save(&dir.folder().join("parts"))?;
     if let Some(linear) = linear {
         write_exr(&linear, &dir.folder().join("head.exr"))?;
     }
     for &format in &c.format {
-        let exported = export.files(&head, format, "head")?;
+        let exported = export.files(head, format, "head")?;
         exported.warnings.iter().for_each(|w| dir.warn(w));
         write_files(&exported, dir.folder())?;
     }
+    Ok(())
+}
+
+/// Returns the figures of a head mesh for the stage's record.
+fn shape(head: &HeadMesh, export: &Export) -> Value {
+    let HeadMesh { mesh, world_from_scene, texture, .. } = head;
     // without the translation, which f32 may not represent
-    let in_place = Similarity { translation: DVec3::ZERO, ..world_from_scene };
-    let meters = export.meters(&head.mesh, &world_from_scene);
-    let size = head.mesh.transformed(&in_place).bounds().size() * meters as f32;
-    let height = export.height(&head.mesh, &world_from_scene);
-    Ok(json!({
-        "shows": export.shows(&head.mesh, &world_from_scene),
+    let in_place = Similarity { translation: DVec3::ZERO, ..*world_from_scene };
+    let meters = export.meters(mesh, world_from_scene);
+    let size = mesh.transformed(&in_place).bounds().size() * meters as f32;
+    let height = export.height(mesh, world_from_scene);
+    json!({
+        "shows": export.shows(mesh, world_from_scene),
         "height_units": height,
         "height_m": height * meters,
-        "vertices": head.mesh.positions.len(),
-        "triangles": head.mesh.triangles.len(),
-        "closed": head.mesh.is_closed(),
-        "texture_px": head.texture.as_ref().map_or(0, |t| t.color.width),
+        "vertices": mesh.positions.len(),
+        "triangles": mesh.triangles.len(),
+        "closed": mesh.is_closed(),
+        "texture_px": texture.as_ref().map_or(0, |t| t.color.width),
         "size_m": size.to_array(),
-        "surface_triangles": surface_triangles,
-        "handles": handles(&report.handles, mm),
-        "report": report,
-        "steps": steps,
-    }))
+    })
 }
 
 /// Returns loaded views in the form that colors are fitted to.
@@ -136,6 +139,50 @@ pub(super) fn photographs(views: &[(Camera, LoadedView)]) -> Vec<Photograph<'_>>
         .collect()
 }
 
+/// The whole surface of a field, in scene coordinates.
+pub(super) struct Extraction {
+    pub mesh: Mesh,
+    pub report: MeshReport,
+    /// The cap where the frames cut the body; `None` for a dense extraction.
+    pub cap: Option<Cap>,
+    /// The patches where handles were cut.
+    pub patches: Option<Patches>,
+}
+
+impl Extraction {
+    /// Returns the field whose zero set is the surface with its cap and patches.
+    pub fn closed<'a>(&'a self, field: &'a dyn Surface) -> ClosedSurface<'a> {
+        ClosedSurface { field, hull: None, cap: self.cap.as_ref(), patches: self.patches.as_ref() }
+    }
+
+    /// Tells how the surface ends and what is doubtful of it; `mm` is the number of millimeters in a
+    /// scene unit.
+    fn announce(&self, capped: bool, mm: f64, dir: &StageDir) {
+        self.report.end(capped).iter().for_each(|text| dir.note(text));
+        self.report.warnings().iter().for_each(|w| dir.warn(w));
+        self.report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
+    }
+
+    /// Paints the cap, or opens the surface where it is.
+    fn end(&mut self, capped: bool) {
+        match &self.cap {
+            Some(cap) if capped => cap.paint(&mut self.mesh),
+            Some(cap) => {
+                cap.open(&mut self.mesh);
+            }
+            None => {}
+        }
+    }
+
+    /// Gives the cap the colors that cameras see of the surface; the cameras are in the scene.
+    fn shade_cap(&mut self, field: &dyn Surface, cameras: &[Camera]) {
+        let reach = REACH * self.report.cell_size;
+        if let Some(cap) = &mut self.cap {
+            cap.shade(|p, n| seen_colors(&self.mesh, p, n, field, cameras, reach));
+        }
+    }
+}
+
 /// Extracts the whole surface with colors at its vertices, closed where the training cameras' frames end.
 pub(super) fn extract(
     scene: &Scene,
@@ -144,19 +191,23 @@ pub(super) fn extract(
     up: Vec3,
     c: &MeshConfig,
     monitor: &dyn Monitor,
-) -> Result<(Mesh, MeshReport)> {
-    if c.dense {
-        return mesh::extract_dense(field, Aabb::SCENE, c.resolution as usize, monitor);
-    }
-    let options = mesh::ExtractOptions {
-        resolution: c.resolution as usize,
-        longest_handle: if c.genus == Genus::Simple { MAX_HANDLE } else { 0.0 },
-        ..mesh::ExtractOptions::default()
+) -> Result<Extraction> {
+    let (mesh, report) = if c.dense {
+        mesh::extract_dense(field, Aabb::SCENE, c.resolution as usize, monitor)?
+    } else {
+        let options = mesh::ExtractOptions {
+            resolution: c.resolution as usize,
+            longest_handle: if c.genus == Genus::Simple { MAX_HANDLE } else { 0.0 },
+            ..mesh::ExtractOptions::default()
+        };
+        let field = ClosedSurface { field, hull: scene.hull.as_ref(), cap: None, patches: None };
+        // below the frames' border the surface is a guess: close the mesh where enough cameras see it
+        let kept = capture::well_seen(scene, cameras, up, c.seen_by);
+        mesh::extract(&field, kept, &options, monitor)?
     };
-    let field = ClosedSurface { field, hull: scene.hull.as_ref(), cap: None, patches: None };
-    // below the frames' border the surface is a guess: close the mesh where enough cameras see it
-    let kept = capture::well_seen(scene, cameras, up, c.seen_by);
-    mesh::extract(&field, kept, &options, monitor)
+    let patches = Patches::of(&mesh, &report.handles);
+    let cap = (!c.dense).then(|| Cap::of(&mesh, report.bounds(), report.cell_size));
+    Ok(Extraction { mesh, report, cap: cap.flatten(), patches })
 }
 
 /// Writes files; the mesh file comes last, because it refers to the others.

@@ -135,9 +135,43 @@ pub fn raster_into(
     options: &RasterOptions,
     color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
 ) {
+    let is_clear = resize(seen, camera, options.normals);
+    let clear = |out: &mut PictureRows| {
+        if !is_clear {
+            out.rgba.fill([0.0; 4]);
+            out.depth.fill(0.0);
+            out.normal.fill([0.0; 3]);
+        }
+        out.triangles.fill(NOTHING);
+    };
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let rows = bands(seen, width, height);
+    let lens = if width == 0 || height == 0 { None } else { Lens::new(camera, mesh) };
+    let Some(lens) = lens else { return rows.for_each(|mut out| clear(&mut out)) };
+    let surfaces = surfaces(&lens, mesh, layers, options.cull);
+    let painter = Painter {
+        mesh,
+        camera,
+        origin: camera.position.as_vec3(),
+        forward: camera.forward(),
+        scale: options.world_from_scene.scale as f32,
+        world_from_mesh: options.world_from_scene.rotation_f32(),
+        straight: straight_rays(camera),
+        jump: JUMP / camera.fx.abs() as f32,
+        bare: options.bare_hits,
+        color,
+    };
+    rows.for_each_init(Scratch::new, |scratch, mut out| {
+        clear(&mut out);
+        draw_band(&painter, &surfaces, width, &mut out, scratch);
+    });
+}
+
+/// Gives the pictures the size of a camera's, and returns whether all their pixels are 0.
+fn resize(seen: &mut RasterView, camera: &Camera, has_normals: bool) -> bool {
     let (width, height) = (camera.width, camera.height);
     let RasterView { view, triangles } = seen;
-    let normals = if options.normals { [width, height] } else { [0, 0] };
+    let normals = if has_normals { [width, height] } else { [0, 0] };
     // every pixel of a new picture is 0
     let mut is_clear = true;
     for (image, [width, height], channels) in [
@@ -152,25 +186,25 @@ pub fn raster_into(
         }
     }
     triangles.resize(width as usize * height as usize, NOTHING);
-    let clear = |out: &mut PictureRows| {
-        if !is_clear {
-            out.rgba.fill([0.0; 4]);
-            out.depth.fill(0.0);
-            out.normal.fill([0.0; 3]);
-        }
-        out.triangles.fill(NOTHING);
-    };
-    let w = width as usize;
+    is_clear
+}
+
+/// Returns the pictures in bands as high as a tile.
+fn bands(
+    seen: &mut RasterView,
+    width: usize,
+    height: usize,
+) -> impl ParallelIterator<Item = PictureRows<'_>> {
+    let RasterView { view, triangles } = seen;
     // a picture that is not rendered has no rows
-    let mut normal_rows: Vec<&mut [f32]> = view.normal.data.chunks_mut((TILE * w * 3).max(1)).collect();
-    normal_rows.resize_with((height as usize).div_ceil(TILE), Default::default);
-    let rows = view
-        .color
+    let mut normal_rows: Vec<&mut [f32]> = view.normal.data.chunks_mut((TILE * width * 3).max(1)).collect();
+    normal_rows.resize_with(height.div_ceil(TILE), Default::default);
+    view.color
         .data
-        .par_chunks_mut((TILE * w * 4).max(1))
-        .zip(view.depth.data.par_chunks_mut((TILE * w).max(1)))
+        .par_chunks_mut((TILE * width * 4).max(1))
+        .zip(view.depth.data.par_chunks_mut((TILE * width).max(1)))
         .zip(normal_rows)
-        .zip(triangles.par_chunks_mut((TILE * w).max(1)))
+        .zip(triangles.par_chunks_mut((TILE * width).max(1)))
         .enumerate()
         .map(|(row, (((rgba, depth), normal), triangles))| PictureRows {
             top: row * TILE,
@@ -178,57 +212,81 @@ pub fn raster_into(
             depth,
             normal: normal.as_chunks_mut().0,
             triangles,
-        });
-    let lens = if w == 0 || height == 0 { None } else { Lens::new(camera, mesh) };
-    let Some(lens) = lens else { return rows.for_each(|mut out| clear(&mut out)) };
-    let core =
-        Faces { positions: &mesh.positions, triangles: &mesh.triangles, ids: None, cull: options.cull };
+        })
+}
+
+/// Triangles that share their vertices, sorted into tiles.
+type BinnedSurface<'a> = (Vec<Bins>, RasterSurface<'a>);
+
+/// Returns the mesh, and the layers around it from the innermost.
+fn surfaces<'a>(
+    lens: &Lens,
+    mesh: &'a Mesh,
+    layers: Option<&'a RasterLayers>,
+    cull: bool,
+) -> Vec<BinnedSurface<'a>> {
+    let core = Faces { positions: &mesh.positions, triangles: &mesh.triangles, ids: None, cull };
     let mut surfaces = vec![(lens.bin(&core), RasterSurface { positions: &mesh.positions, shell: None })];
     for layer in layers.iter().flat_map(|l| &l.layers) {
         let RasterLayer { layer, surface: Mesh { positions, triangles, .. }, ids } = layer;
         let faces = Faces { positions, triangles, ids: Some(ids), cull: true };
         surfaces.push((lens.bin(&faces), RasterSurface { positions, shell: Some(layer) }));
     }
-    let painter = Painter {
-        mesh,
-        camera,
-        origin: camera.position.as_vec3(),
-        forward: camera.forward(),
-        scale: options.world_from_scene.scale as f32,
-        world_from_mesh: options.world_from_scene.rotation_f32(),
-        straight: straight_rays(camera),
-        jump: JUMP / camera.fx.abs() as f32,
-        bare: options.bare_hits,
-        color,
-    };
-    let start = || (Tile::new(), Vec::new(), Box::<SampleBatch>::new(Zeroable::zeroed()), RayHits::default());
-    rows.for_each_init(start, |(tile, over, batch, queue), mut out| {
-        let out = &mut out;
-        clear(out);
-        let (across, height) = (w.div_ceil(TILE), out.depth.len() / w);
-        for column in 0..across {
-            let index = out.top / TILE * across + column;
-            let has = |bins: &[Bins]| bins.iter().any(|b| b.of(index).len() > 0);
-            if !surfaces.iter().any(|(bins, _)| has(bins)) {
-                continue;
-            }
-            let area = TileArea { left: column * TILE, width: TILE.min(w - column * TILE), height };
-            tile.move_to(area.left, out.top, area.width, area.height);
-            let (core, own) = &surfaces[0];
-            draw(tile, core, index);
-            let mut light = Vec::new();
-            for (bins, layer) in surfaces[1..].iter().rev().filter(|(bins, _)| has(bins)) {
-                if over.is_empty() {
-                    over.push(Tile::new());
-                }
-                light.resize(TILE * TILE, [1.0; SAMPLES]);
-                over[0].behind(tile);
-                draw(&mut over[0], bins, index);
-                painter.paint(&over[0], layer, &mut light, area, out, batch, queue);
-            }
-            painter.paint(tile, own, &mut light, area, out, batch, queue);
+    surfaces
+}
+
+/// Memory of a thread, reused from band to band.
+struct Scratch {
+    tile: Box<Tile>,
+    /// The tile of the layers, once there are any.
+    over: Vec<Box<Tile>>,
+    batch: Box<SampleBatch>,
+    queue: RayHits,
+}
+
+impl Scratch {
+    fn new() -> Scratch {
+        Scratch {
+            tile: Tile::new(),
+            over: Vec::new(),
+            batch: Box::<SampleBatch>::new(Zeroable::zeroed()),
+            queue: RayHits::default(),
         }
-    });
+    }
+}
+
+/// Draws the tiles of a band of a picture of this width: the layers from the outermost, then the mesh.
+fn draw_band<C: Fn(&RayHits) -> Vec<[f32; 3]>>(
+    painter: &Painter<'_, C>,
+    surfaces: &[BinnedSurface],
+    width: usize,
+    out: &mut PictureRows,
+    scratch: &mut Scratch,
+) {
+    let Scratch { tile, over, batch, queue } = scratch;
+    let (across, height) = (width.div_ceil(TILE), out.depth.len() / width);
+    for column in 0..across {
+        let index = out.top / TILE * across + column;
+        let has = |bins: &[Bins]| bins.iter().any(|b| b.of(index).len() > 0);
+        if !surfaces.iter().any(|(bins, _)| has(bins)) {
+            continue;
+        }
+        let area = TileArea { left: column * TILE, width: TILE.min(width - column * TILE), height };
+        tile.move_to(area.left, out.top, area.width, area.height);
+        let (core, own) = &surfaces[0];
+        draw(tile, core, index);
+        let mut light = Vec::new();
+        for (bins, layer) in surfaces[1..].iter().rev().filter(|(bins, _)| has(bins)) {
+            if over.is_empty() {
+                over.push(Tile::new());
+            }
+            light.resize(TILE * TILE, [1.0; SAMPLES]);
+            over[0].behind(tile);
+            draw(&mut over[0], bins, index);
+            painter.paint(&over[0], layer, &mut light, area, out, batch, queue);
+        }
+        painter.paint(tile, own, &mut light, area, out, batch, queue);
+    }
 }
 
 crate::dispatch! {

@@ -135,6 +135,9 @@ fn a_turntable_turns_and_a_sheet_has_eight_pictures() {
     let o = tiface(dir.path(), &["preview", "b.ply", "--sheet", "--size", "40", "--out", "new/"]);
     assert_eq!(code(&o), 0, "{}", err(&o));
     assert_eq!(picture(&dir.path().join("new/b_sheet.png")).dimensions(), (160, 80));
+    // the pictures have no labels: the answer names them
+    let rows = "row 1     front, left, right, back\nrow 2     top, wireframe, normals, shape\n";
+    assert!(out(&o).ends_with(rows), "{}", out(&o));
 }
 
 #[test]

@@ -5,7 +5,7 @@
 RUN/estimate.json holds the estimates, RUN/*/done.json the memory of the process while it made each stage, and the files
 of a stage are what it took of the disk. A whole run is told right if memory and disk told are 1 to 1.3 times what was
 used; run it in one process (`tiface run CAPTURE --run NEW`). To fit the constants of `mib` and `kept` in
-src/pipeline/plan.rs: raise what makes a stage fall below 1, lower what makes the stage of the maximum exceed 1.3.
+src/pipeline/cost.rs: raise what makes a stage fall below 1, lower what makes the stage of the maximum exceed 1.3.
 """
 
 import json

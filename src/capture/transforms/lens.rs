@@ -123,6 +123,16 @@ pub(super) fn canonical(
     beyond: Option<&Object>,
     notes: &mut LensNotes,
 ) -> Result<Object, String> {
+    let mut lens = CanonicalLens { object, beyond, out: given(object, notes), notes };
+    lens.add_aliases()?;
+    lens.add_angles()?;
+    lens.add_matrices()?;
+    lens.add_distortion()?;
+    Ok(lens.out)
+}
+
+/// Returns the keys of an object that are spelled as they are read, if their values can be used.
+fn given(object: &Object, notes: &mut LensNotes) -> Object {
     let is_given = |key: &str, value: &Value| match LENIENT_KEYS.iter().find(|(name, _)| key == *name) {
         Some((_, is_usable)) => is_usable(value),
         None => !value.is_null(),
@@ -139,69 +149,113 @@ pub(super) fn canonical(
         *value = is_on.into();
         notes.taken.insert(("is_fisheye", if is_on { "true" } else { "false" }));
     }
-    let is_of_file = |key: &str| beyond.is_some_and(|top| key != "file_path" && top.contains_key(key));
-    let is_known = |out: &Object, key: &str| out.contains_key(key) || is_of_file(key);
-    let other = |key: &str| object.get(key).filter(|value| !value.is_null());
-    for (alias, key) in ALIASES {
-        // the top of a file has no photograph
-        let Some(value) = other(alias).filter(|_| key != "file_path" || beyond.is_some()) else { continue };
-        let fits = match key {
-            "file_path" => value.is_string(),
-            "w" | "h" => value.is_u64() && object.get(&partner(alias)).is_some_and(Value::is_u64),
-            _ => value.is_number(),
-        };
-        if fits && !is_known(&out, key) {
-            out.insert(key.into(), value.clone());
-            notes.taken.insert((alias, key));
-        } else if fits {
-            Known { own: &out, top: beyond }.check_alias(alias, key, value, &mut notes.doubts)?;
-            notes.skipped.insert((format!("`{key}` is there"), alias));
-        } else {
-            notes.skipped.insert((UNCLEAR.into(), alias));
-        }
+    out
+}
+
+/// An object that is being read.
+struct CanonicalLens<'a> {
+    object: &'a Object,
+    /// The top of the file; `None` for the top itself.
+    beyond: Option<&'a Object>,
+    /// What was read, with one spelling of each key.
+    out: Object,
+    notes: &'a mut LensNotes,
+}
+
+impl<'a> CanonicalLens<'a> {
+    fn is_known(&self, key: &str) -> bool {
+        let is_of_file = |top: &Object| key != "file_path" && top.contains_key(key);
+        self.out.contains_key(key) || self.beyond.is_some_and(is_of_file)
     }
-    let has_focal = |out: &Object| FOCAL_KEYS.iter().any(|key| is_known(out, key));
-    for (key, angle, focal) in [("x_fov", "camera_angle_x", "fl_x"), ("y_fov", "camera_angle_y", "fl_y")] {
-        let Some(value) = other(key) else { continue };
-        if let Some(known) = [focal, angle].into_iter().find(|key| is_known(&out, key)) {
-            notes.skipped.insert((format!("`{known}` is there"), key));
-            continue;
-        }
-        out.insert(angle.into(), degrees(key, value)?.into());
-        notes.taken.insert((key, "an angle in degrees"));
+
+    /// Returns the value of another spelling.
+    fn other(&self, key: &str) -> Option<&'a Value> {
+        self.object.get(key).filter(|value| !value.is_null())
     }
-    for key in MATRICES {
-        let Some(value) = other(key) else { continue };
-        let found = matrix(key, value)?;
-        if has_focal(&out) {
-            let known = Known { own: &out, top: beyond };
-            match (found, numbers(value)) {
-                (Some(found), _) => known.check_matrix(key, found, &mut notes.doubts)?,
-                (None, Some(four)) => known.check_list(key, four)?,
-                (None, None) => {}
+
+    fn skip(&mut self, why: impl Into<String>, key: &'static str) {
+        self.notes.skipped.insert((why.into(), key));
+    }
+
+    /// Reads other spellings of keys.
+    fn add_aliases(&mut self) -> Result<(), String> {
+        for (alias, key) in ALIASES {
+            // the top of a file has no photograph
+            let value = self.other(alias).filter(|_| key != "file_path" || self.beyond.is_some());
+            let Some(value) = value else { continue };
+            let fits = match key {
+                "file_path" => value.is_string(),
+                "w" | "h" => value.is_u64() && self.object.get(&partner(alias)).is_some_and(Value::is_u64),
+                _ => value.is_number(),
+            };
+            if fits && !self.is_known(key) {
+                self.out.insert(key.into(), value.clone());
+                self.notes.taken.insert((alias, key));
+            } else if fits {
+                let known = Known { own: &self.out, top: self.beyond };
+                known.check_alias(alias, key, value, &mut self.notes.doubts)?;
+                self.skip(format!("`{key}` is there"), alias);
+            } else {
+                self.skip(UNCLEAR, alias);
             }
-            notes.skipped.insert(("a focal length or an angle is there".into(), key));
-            continue;
         }
-        let Some(found) = found else {
-            notes.skipped.insert((UNCLEAR.into(), key));
-            continue;
-        };
-        for (key, value) in PINHOLE.into_iter().zip(found) {
-            out.entry(key).or_insert_with(|| value.into());
-        }
-        notes.taken.insert((key, "intrinsics in pixels"));
+        Ok(())
     }
-    if let Some(value) = out.get("distortion_params") {
-        let of = |key: &str| out.get(key).or_else(|| beyond?.get(key));
+
+    /// Reads angles in degrees.
+    fn add_angles(&mut self) -> Result<(), String> {
+        for (key, angle, focal) in [("x_fov", "camera_angle_x", "fl_x"), ("y_fov", "camera_angle_y", "fl_y")]
+        {
+            let Some(value) = self.other(key) else { continue };
+            if let Some(known) = [focal, angle].into_iter().find(|key| self.is_known(key)) {
+                self.skip(format!("`{known}` is there"), key);
+                continue;
+            }
+            self.out.insert(angle.into(), degrees(key, value)?.into());
+            self.notes.taken.insert((key, "an angle in degrees"));
+        }
+        Ok(())
+    }
+
+    /// Reads matrices of intrinsics, or checks them where a focal length is known.
+    fn add_matrices(&mut self) -> Result<(), String> {
+        for key in MATRICES {
+            let Some(value) = self.other(key) else { continue };
+            let found = matrix(key, value)?;
+            if FOCAL_KEYS.iter().any(|key| self.is_known(key)) {
+                let known = Known { own: &self.out, top: self.beyond };
+                match (found, numbers(value)) {
+                    (Some(found), _) => known.check_matrix(key, found, &mut self.notes.doubts)?,
+                    (None, Some(four)) => known.check_list(key, four)?,
+                    (None, None) => {}
+                }
+                self.skip("a focal length or an angle is there", key);
+                continue;
+            }
+            let Some(found) = found else {
+                self.skip(UNCLEAR, key);
+                continue;
+            };
+            for (key, value) in PINHOLE.into_iter().zip(found) {
+                self.out.entry(key).or_insert_with(|| value.into());
+            }
+            self.notes.taken.insert((key, "intrinsics in pixels"));
+        }
+        Ok(())
+    }
+
+    /// Reads the list of distortion parameters into one key each.
+    fn add_distortion(&mut self) -> Result<(), String> {
+        let Some(value) = self.out.get("distortion_params") else { return Ok(()) };
+        let of = |key: &str| self.out.get(key).or_else(|| self.beyond?.get(key));
         let model = of("camera_model").and_then(Value::as_str).unwrap_or_default().to_ascii_uppercase();
         let is_fisheye = of("is_fisheye") == Some(&Value::Bool(true)) || model.contains("FISHEYE");
         for (key, value) in distortion_params(value, is_fisheye)? {
-            out.insert(key.into(), value.into());
+            self.out.insert(key.into(), value.into());
         }
-        notes.taken.insert(("distortion_params", "k1, k2, k3, k4, p1, p2"));
+        self.notes.taken.insert(("distortion_params", "k1, k2, k3, k4, p1, p2"));
+        Ok(())
     }
-    Ok(out)
 }
 
 /// Returns the other side's spelling of a width or height: a height alone may be one of anything.

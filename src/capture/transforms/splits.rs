@@ -37,7 +37,21 @@ pub(super) fn assign(
     settled: &[bool],
     listing: &mut Listing,
 ) -> Result<Vec<Listed>, Error> {
-    let mut lists: Vec<(&str, Split, Vec<String>)> = Vec::new();
+    let lists = lists(file, top)?;
+    if lists.is_empty() {
+        return Ok(vec![Listed::In(None); names.len()]);
+    }
+    let found = found_in(file, &lists, names, listing)?;
+    let names: Vec<Option<&str>> = names.iter().zip(settled).map(|(name, is)| name.filter(|_| !is)).collect();
+    Ok(rest(file, &lists, &names, &found, listing))
+}
+
+/// A list of a split: its key and its entries.
+type SplitList = (&'static str, Split, Vec<String>);
+
+/// Reads the lists at the top of a file.
+fn lists(file: &str, top: &Object) -> Result<Vec<SplitList>, Error> {
+    let mut lists = Vec::new();
     for (key, split) in LISTS {
         let Some(value) = top.get(key).filter(|value| !value.is_null()) else { continue };
         let entries = io::typed(value).map_err(|[place, found, expected]| {
@@ -47,13 +61,21 @@ pub(super) fn assign(
         })?;
         lists.push((key, split, entries));
     }
+    Ok(lists)
+}
+
+/// Returns the key and the split of the first list that names each frame, with what is to be said of
+/// frames in two lists and of entries that name none.
+fn found_in(
+    file: &str,
+    lists: &[SplitList],
+    names: &[Option<&str>],
+    listing: &mut Listing,
+) -> Result<Vec<Option<(&'static str, Split)>>, Error> {
     let mut found: Vec<Option<(&str, Split)>> = vec![None; names.len()];
-    if lists.is_empty() {
-        return Ok(vec![Listed::In(None); names.len()]);
-    }
     let index = Index::new(names);
     let (mut respelled, mut twice) = (None, Vec::new());
-    for (key, split, entries) in &lists {
+    for (key, split, entries) in lists {
         let mut without = Vec::new();
         for entry in entries {
             let (frames, is_same) = index.find(entry);
@@ -95,24 +117,19 @@ pub(super) fn assign(
         ));
     }
     if let Some((_, first, second)) = twice.first() {
-        let names = few(twice.iter().map(|(name, ..)| name));
-        listing.warnings.push(format!(
-            "`{file}`: {} in both `{first}` and `{second}`, and learned from: {names}",
-            if twice.len() == 1 {
-                "a photograph is".into()
-            } else {
-                format!("{} photographs are", twice.len())
-            }
-        ));
+        let (names, count) = (few(twice.iter().map(|(name, ..)| name)), twice.len());
+        let are = if count == 1 { "a photograph is".into() } else { format!("{count} photographs are") };
+        listing
+            .warnings
+            .push(format!("`{file}`: {are} in both `{first}` and `{second}`, and learned from: {names}"));
     }
-    let names: Vec<Option<&str>> = names.iter().zip(settled).map(|(name, is)| name.filter(|_| !is)).collect();
-    Ok(rest(file, &lists, &names, &found, listing))
+    Ok(found)
 }
 
 /// Returns the splits, with what becomes of frames with a name that are in no list.
 fn rest(
     file: &str,
-    lists: &[(&str, Split, Vec<String>)],
+    lists: &[SplitList],
     names: &[Option<&str>],
     found: &[Option<(&str, Split)>],
     listing: &mut Listing,

@@ -4,11 +4,10 @@
 //! layers; a texel the texture, with colors averaged in linear light, lobes in their own values and normals as vectors.
 
 use super::cover::Bands;
-use super::fill::fill;
 use super::seams::Seams;
-use super::{complete, on_triangles};
+use super::{Texels, on_triangles};
 use crate::geom::{Atlas, Bvh, Hit, Mesh, ShellLayer, Shells, bilinear_taps};
-use crate::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
+use crate::image::{Image, Photo, linear_from_srgb};
 use crate::mesh::files::{HeadMesh, HeadTexture, tangents};
 use crate::{Monitor, Result};
 use glam::{Vec2, Vec3, Vec4};
@@ -74,7 +73,6 @@ impl<'a> Original<'a> {
         gutter_px: u32,
         monitor: &dyn Monitor,
     ) -> Result<CarriedTexture> {
-        let (width, height) = (atlas.width, atlas.height);
         let lobes = texture.lobes.as_ref().map_or(&[][..], |lobes| &lobes.pictures);
         let steps: Vec<f32> =
             texture.lobes.iter().flat_map(|l| &l.scale).map(|scale| scale / 127.0).collect();
@@ -83,9 +81,7 @@ impl<'a> Original<'a> {
             tangents(&self.head.mesh, &texture.atlas).map(|tangents| NormalMap { normal, tangents })
         });
         let bumps = bumps.transpose()?;
-        let mut pictures = vec![Image::new(width, height, 3); 1 + lobes.len()];
-        let mut normals = bumps.is_some().then(|| Image::new(width, height, 3));
-        let mut covered = vec![false; width as usize * height as usize];
+        let mut texels = Texels::new(atlas, lobes.len(), bumps.is_some());
         let bands = Bands::new(atlas, side);
         for band in 0..bands.len() {
             monitor.check_stop()?;
@@ -94,7 +90,7 @@ impl<'a> Original<'a> {
             let mut i = 0;
             for texel in samples.chunk_by(|a, b| a.texel == b.texel) {
                 let at = 3 * texel[0].texel as usize;
-                covered[at / 3] = true;
+                texels.covered[at / 3] = true;
                 let own = &hits[i..i + texel.len()];
                 i += texel.len();
                 let mean = |value: &dyn Fn(&Hit) -> Vec3| {
@@ -107,12 +103,12 @@ impl<'a> Original<'a> {
                     bilinear(photo, uv, value)
                 };
                 let color = mean(&|hit| look_up(&texture.color, hit, &|byte| linear[byte as usize]));
-                pictures[0].data[at..at + 3].copy_from_slice(&color);
+                texels.color.data[at..at + 3].copy_from_slice(&color);
                 for (k, lobe) in lobes.iter().enumerate() {
                     let value = mean(&|hit| look_up(lobe, hit, &|byte| (f32::from(byte) - 128.0) * steps[k]));
-                    pictures[k + 1].data[at..at + 3].copy_from_slice(&value);
+                    texels.lobes[k].data[at..at + 3].copy_from_slice(&value);
                 }
-                if let (Some(bumps), Some(normals)) = (&bumps, &mut normals) {
+                if let (Some(bumps), Some(normals)) = (&bumps, &mut texels.normal) {
                     let bump =
                         |hit: &Hit| look_up(bumps.normal, hit, &|byte| (f32::from(byte) - 128.0) / 127.5);
                     let n = Vec3::from(mean(&|hit| bumps.bent(&self.head.mesh, hit, bump(hit))));
@@ -122,15 +118,9 @@ impl<'a> Original<'a> {
             }
             monitor.step(band as u64 + 1, bands.len() as u64, &[]);
         }
-        let seams = Seams::new(mesh, atlas);
-        let mut color = pictures.remove(0);
-        fill(&mut color, &covered, gutter_px);
-        seams.even(&mut color, srgb_from_linear, linear_from_srgb);
-        pictures.iter_mut().for_each(|lobe| complete(lobe, &covered, gutter_px, &seams));
-        if let Some(normals) = &mut normals {
-            fill(normals, &covered, gutter_px);
-        }
-        Ok(CarriedTexture { color, lobes: pictures, normal: normals })
+        texels.fill(&Seams::new(mesh, atlas), gutter_px);
+        let Texels { color, lobes, normal, .. } = texels;
+        Ok(CarriedTexture { color, lobes, normal })
     }
 
     /// Returns the nearest points of the original. `[n]` → `[n]`.
@@ -182,9 +172,11 @@ fn bilinear(photo: &Photo, uv: Vec2, value: &dyn Fn(u8) -> f32) -> Vec3 {
 
 #[cfg(test)]
 pub(super) mod tests {
+    use super::super::fill::fill;
     use super::*;
     use crate::Quiet;
     use crate::geom::Similarity;
+    use crate::image::srgb_from_linear;
     use crate::mesh::files::Lobes;
     use crate::mesh::{AtlasConfig, SimplifyConfig, Volume, atlas, marching, simplify};
     use glam::Mat3;

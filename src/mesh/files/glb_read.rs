@@ -89,6 +89,18 @@ fn chunks<'a>(bytes: &'a [u8], source: Source) -> Result<Glb<'a>> {
     Ok(glb)
 }
 
+/// Returns a number of an accessor, and the one that stands for 1 if it is normalized.
+fn number(component: C, b: &[u8]) -> (f64, f64) {
+    match component {
+        C::U8 => (f64::from(b[0]), 255.0),
+        C::I8 => (f64::from(b[0] as i8), 127.0),
+        C::I16 => (f64::from(i16::from_le_bytes([b[0], b[1]])), 32767.0),
+        C::U16 => (f64::from(u16::from_le_bytes([b[0], b[1]])), 65535.0),
+        C::U32 => (f64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])), 1.0),
+        C::F32 => (f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]])), 1.0),
+    }
+}
+
 /// The reachable nodes that are still to be read, with their parents' transforms. Each occurs once.
 struct NodeStack<'a> {
     reached: Vec<bool>,
@@ -101,6 +113,28 @@ struct NodeToRead<'a> {
     parent: DMat4,
     /// Whether it or a node above it is hidden.
     is_hidden: bool,
+}
+
+/// A primitive that is being added.
+struct GlbPart<'a> {
+    /// Its place in the document, for messages.
+    at: &'a str,
+    primitive: &'a GlbPrimitive,
+    /// Index of its first vertex in the mesh.
+    first: usize,
+    /// Its node's transform without the translation.
+    linear: DMat3,
+}
+
+impl GlbPart<'_> {
+    /// Returns the accessor of an attribute.
+    fn accessor(&self, semantic: Semantic) -> Option<u32> {
+        self.primitive.attributes.get(&Valid(semantic)).copied()
+    }
+
+    fn is_mirrored(&self) -> bool {
+        self.linear.determinant() < 0.0
+    }
 }
 
 /// A document and the mesh that is read from it. Normals, colors and texture coordinates are kept only if every part has
@@ -255,11 +289,46 @@ impl<'a> GlbReader<'a> {
         if material.is_some_and(|m| m.is_soft_layer()) {
             return Ok(());
         }
-        let of = |semantic: Semantic| primitive.attributes.get(&Valid(semantic)).copied();
-        let position = of(Semantic::Positions).ok_or_else(|| source.broken(at, "there is no `POSITION`"))?;
+        let part = GlbPart { at, primitive, first: self.out.places.len(), linear: DMat3::from_mat4(matrix) };
+        let position = part.accessor(Semantic::Positions);
+        let position = position.ok_or_else(|| source.broken(at, "there is no `POSITION`"))?;
         let (positions, _) = self.numbers(position, &[Type::Vec3], self.short)?;
         let count = positions.len() / 3;
-        let indices: Vec<u32> = match primitive.indices {
+        let indices = self.indices(&part, count)?;
+        source.allow(part.first + count, self.out.mesh.triangles.len() + indices.len() / 3)?;
+        for p in positions.as_chunks::<3>().0 {
+            let moved = matrix.transform_point3(DVec3::from(*p));
+            if !moved.as_vec3().is_finite() {
+                return Err(source.broken(at, "a vertex is not finite once its node has moved it"));
+            }
+            self.out.places.push(moved);
+        }
+        self.add_normals(&part)?;
+        self.add_colors(&part)?;
+        let color = material.map(|m| m.color()).unwrap_or_default();
+        color.note.into_iter().for_each(|note| self.out.note(note));
+        if let Some(factors) = color.tint.filter(|_| color.texture.is_none()) {
+            self.tinted = true;
+            let colors = &mut self.out.mesh.colors[part.first..];
+            for (c, f) in colors.iter_mut().flat_map(|c| c.iter_mut().zip(factors)) {
+                *c = srgb_from_linear(linear_from_srgb(*c) * f);
+            }
+        }
+        if source.options.texture {
+            self.add_texture(&part, color.tint)?;
+        }
+        let mirrored = part.is_mirrored();
+        for t in indices.as_chunks::<3>().0 {
+            let [a, b, c] = t.map(|i| part.first as u32 + i);
+            self.out.mesh.triangles.push(if mirrored { [a, c, b] } else { [a, b, c] });
+        }
+        Ok(())
+    }
+
+    /// Returns the indices of a part of `count` vertices, three for each triangle.
+    fn indices(&self, part: &GlbPart, count: usize) -> Result<Vec<u32>> {
+        let (source, at) = (self.source, part.at);
+        let indices: Vec<u32> = match part.primitive.indices {
             Some(i) => {
                 let (numbers, _) = self.numbers(i, &[Type::Scalar], &[C::U8, C::U16, C::U32])?;
                 numbers.into_iter().map(|v| v as u32).collect()
@@ -272,93 +341,89 @@ impl<'a> GlbReader<'a> {
         if let Some(i) = indices.iter().find(|&&i| i as usize >= count) {
             return Err(source.broken(at, format!("index {i}, but there are {count} vertices")));
         }
-        let first = self.out.places.len();
-        source.allow(first + count, self.out.mesh.triangles.len() + indices.len() / 3)?;
-        let linear = DMat3::from_mat4(matrix);
-        let mirrored = linear.determinant() < 0.0;
-        for p in positions.as_chunks::<3>().0 {
-            let moved = matrix.transform_point3(DVec3::from(*p));
-            if !moved.as_vec3().is_finite() {
-                return Err(source.broken(at, "a vertex is not finite once its node has moved it"));
-            }
-            self.out.places.push(moved);
+        Ok(indices)
+    }
+
+    /// Returns one value a vertex of an attribute, flat, and its number of components; `None` if the
+    /// part lacks it. The positions of the part have been added.
+    fn attribute(
+        &self,
+        part: &GlbPart,
+        semantic: Semantic,
+        kinds: &[Type],
+        components: &[C],
+    ) -> Result<Option<(Vec<f64>, usize)>> {
+        let name = semantic.to_string();
+        let Some(index) = part.accessor(semantic) else { return Ok(None) };
+        let (numbers, width) = self.numbers(index, kinds, components)?;
+        let (found, count) = (numbers.len() / width, self.out.places.len() - part.first);
+        if found != count {
+            let what = format!("{found} of `{name}` for {count} of `POSITION`");
+            return Err(self.source.broken(part.at, what));
         }
-        // One value a vertex of an attribute that a part may lack.
-        let attribute = |reader: &GlbReader, semantic: Semantic, kinds: &[Type], components: &[C]| {
-            let name = semantic.to_string();
-            let Some(index) = of(semantic) else { return Ok(None) };
-            let (numbers, width) = reader.numbers(index, kinds, components)?;
-            let found = numbers.len() / width;
-            if found != count {
-                return Err(source.broken(at, format!("{found} of `{name}` for {count} of `POSITION`")));
-            }
-            Ok(Some((numbers, width)))
+        Ok(Some((numbers, width)))
+    }
+
+    fn add_normals(&mut self, part: &GlbPart) -> Result<()> {
+        let Some((normals, _)) = self.attribute(part, Semantic::Normals, &[Type::Vec3], self.short)? else {
+            self.bare_normals = true;
+            return Ok(());
         };
-        match attribute(self, Semantic::Normals, &[Type::Vec3], self.short)? {
-            None => self.bare_normals = true,
-            Some((normals, _)) => {
-                // the inverse transpose, up to a factor that normalizing removes, also for singular matrices
-                let cofactor = DMat3::from_cols(
-                    linear.y_axis.cross(linear.z_axis),
-                    linear.z_axis.cross(linear.x_axis),
-                    linear.x_axis.cross(linear.y_axis),
-                ) * if mirrored { -1.0 } else { 1.0 };
-                let moved = |n: &[f64; 3]| (cofactor * DVec3::from(*n)).normalize_or_zero().as_vec3();
-                self.out.mesh.normals.extend(normals.as_chunks::<3>().0.iter().map(moved));
+        // the inverse transpose, up to a factor that normalizing removes, also for singular matrices
+        let linear = part.linear;
+        let cofactor = DMat3::from_cols(
+            linear.y_axis.cross(linear.z_axis),
+            linear.z_axis.cross(linear.x_axis),
+            linear.x_axis.cross(linear.y_axis),
+        ) * if part.is_mirrored() { -1.0 } else { 1.0 };
+        let moved = |n: &[f64; 3]| (cofactor * DVec3::from(*n)).normalize_or_zero().as_vec3();
+        self.out.mesh.normals.extend(normals.as_chunks::<3>().0.iter().map(moved));
+        Ok(())
+    }
+
+    /// Adds the colors at the vertices; white, where a part has none.
+    fn add_colors(&mut self, part: &GlbPart) -> Result<()> {
+        let (kinds, components) = ([Type::Vec3, Type::Vec4], [C::F32, C::U8, C::U16]);
+        let Some((colors, width)) = self.attribute(part, Semantic::Colors(0), &kinds, &components)? else {
+            self.bare_colors = true;
+            if part.primitive.attributes.keys().any(|key| matches!(key, Valid(Semantic::Colors(_)))) {
+                let what = "vertex colors are not shown: they are not in `COLOR_0`, but in another set";
+                self.out.note(what);
             }
+            self.out.mesh.colors.resize(self.out.places.len(), [1.0; 3]);
+            return Ok(());
+        };
+        let linear = |c: &[f64]| [c[0], c[1], c[2]].map(|v| v as f32);
+        let mut linear: Vec<[f32; 3]> = colors.chunks_exact(width).map(linear).collect();
+        bring_into_range(&mut linear, "`COLOR_0`").into_iter().for_each(|note| self.out.note(note));
+        if width == 4 && colors.chunks_exact(4).any(|c| c[3] < 1.0) {
+            self.out.note("`COLOR_0` has an alpha below 1; it is shown opaque");
         }
-        match attribute(self, Semantic::Colors(0), &[Type::Vec3, Type::Vec4], &[C::F32, C::U8, C::U16])? {
-            None => {
-                self.bare_colors = true;
-                if primitive.attributes.keys().any(|key| matches!(key, Valid(Semantic::Colors(_)))) {
-                    let what = "vertex colors are not shown: they are not in `COLOR_0`, but in another set";
-                    self.out.note(what);
-                }
-                self.out.mesh.colors.resize(first + count, [1.0; 3]);
-            }
-            Some((colors, width)) => {
-                let linear = |c: &[f64]| [c[0], c[1], c[2]].map(|v| v as f32);
-                let mut linear: Vec<[f32; 3]> = colors.chunks_exact(width).map(linear).collect();
-                bring_into_range(&mut linear, "`COLOR_0`").into_iter().for_each(|note| self.out.note(note));
-                if width == 4 && colors.chunks_exact(4).any(|c| c[3] < 1.0) {
-                    self.out.note("`COLOR_0` has an alpha below 1; it is shown opaque");
-                }
-                self.out.mesh.colors.extend(linear.into_iter().map(|c| c.map(srgb_from_linear)));
-            }
+        self.out.mesh.colors.extend(linear.into_iter().map(|c| c.map(srgb_from_linear)));
+        Ok(())
+    }
+
+    /// Adds the texture coordinates, and the texture and its factor to those of the other parts.
+    fn add_texture(&mut self, part: &GlbPart, tint: Option<[f32; 3]>) -> Result<()> {
+        let used = self.texture_of(part.primitive.material)?;
+        self.textures.insert(used.map(|i| i.index));
+        if used.is_some() {
+            self.tints.push(tint);
         }
-        let color = material.map(|m| m.color()).unwrap_or_default();
-        color.note.into_iter().for_each(|note| self.out.note(note));
-        if let Some(factors) = color.tint.filter(|_| color.texture.is_none()) {
-            self.tinted = true;
-            for (c, f) in self.out.mesh.colors[first..].iter_mut().flat_map(|c| c.iter_mut().zip(factors)) {
-                *c = srgb_from_linear(linear_from_srgb(*c) * f);
-            }
-        }
-        if source.options.texture {
-            let used = self.texture_of(primitive.material)?;
-            self.textures.insert(used.map(|i| i.index));
-            if used.is_some() {
-                self.tints.push(color.tint);
-            }
-            let set = used.map_or(0, GlbTextureUse::set);
-            match (attribute(self, Semantic::TexCoords(set), &[Type::Vec2], &SHORTENED)?, used) {
-                (Some((uvs, _)), _) => {
-                    let placed = |uv: &[f64; 2]| used.map_or(*uv, |used| used.placed(*uv)).map(|v| v as f32);
-                    let uvs: Vec<Vec2> = uvs.as_chunks::<2>().0.iter().map(|uv| placed(uv).into()).collect();
-                    if uvs.iter().any(|uv| !uv.is_finite()) {
-                        return Err(source.broken(at, "a texture coordinate is not finite"));
-                    }
-                    self.out.atlas.iter_mut().for_each(|atlas| atlas.uvs.extend(&uvs));
+        let set = used.map_or(0, GlbTextureUse::set);
+        match (self.attribute(part, Semantic::TexCoords(set), &[Type::Vec2], &SHORTENED)?, used) {
+            (Some((uvs, _)), _) => {
+                let placed = |uv: &[f64; 2]| used.map_or(*uv, |used| used.placed(*uv)).map(|v| v as f32);
+                let uvs: Vec<Vec2> = uvs.as_chunks::<2>().0.iter().map(|uv| placed(uv).into()).collect();
+                if uvs.iter().any(|uv| !uv.is_finite()) {
+                    return Err(self.source.broken(part.at, "a texture coordinate is not finite"));
                 }
-                (None, Some(_)) => {
-                    return Err(source.broken(at, format!("there is no `TEXCOORD_{set}`")));
-                }
-                (None, None) => self.out.atlas = None,
+                self.out.atlas.iter_mut().for_each(|atlas| atlas.uvs.extend(&uvs));
             }
-        }
-        for t in indices.as_chunks::<3>().0 {
-            let [a, b, c] = t.map(|i| first as u32 + i);
-            self.out.mesh.triangles.push(if mirrored { [a, c, b] } else { [a, b, c] });
+            (None, Some(_)) => {
+                return Err(self.source.broken(part.at, format!("there is no `TEXCOORD_{set}`")));
+            }
+            (None, None) => self.out.atlas = None,
         }
         Ok(())
     }
@@ -413,14 +478,7 @@ impl<'a> GlbReader<'a> {
         for i in 0..count as usize {
             let start = offset as usize + i * stride;
             for b in bytes[start..start + element].chunks_exact(component.size()) {
-                let (value, top) = match component {
-                    C::U8 => (f64::from(b[0]), 255.0),
-                    C::I8 => (f64::from(b[0] as i8), 127.0),
-                    C::I16 => (f64::from(i16::from_le_bytes([b[0], b[1]])), 32767.0),
-                    C::U16 => (f64::from(u16::from_le_bytes([b[0], b[1]])), 65535.0),
-                    C::U32 => (f64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])), 1.0),
-                    C::F32 => (f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]])), 1.0),
-                };
+                let (value, top) = number(component, b);
                 if !value.is_finite() {
                     return Err(
                         source.broken(at, format!("element {i} is {value}, expected a finite number"))

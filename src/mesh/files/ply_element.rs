@@ -108,6 +108,12 @@ impl Element {
         spellings.into_iter().find_map(|names| self.slots(names))
     }
 
+    /// Returns the color in these properties of a row, coded; `None` if it is not finite.
+    pub fn coded_color(&self, slots: [usize; 3], row: &[f64]) -> Option<[f32; 3]> {
+        let coded = slots.map(|k| self.properties[k].coded(row[k]));
+        coded.iter().all(|c| c.is_finite()).then_some(coded)
+    }
+
     /// Returns the property that holds whole colors, as PCL packs them, if there are no others.
     pub fn packed_color(&self) -> Option<usize> {
         let found = ["rgb", "rgba"].into_iter().find_map(|name| self.slots([name]));

@@ -23,6 +23,17 @@ enum Order {
     Big,
 }
 
+impl Order {
+    fn named(word: &str) -> Option<Order> {
+        match word {
+            "ascii" => Some(Order::Text),
+            "binary_little_endian" => Some(Order::Little),
+            "binary_big_endian" => Some(Order::Big),
+            _ => None,
+        }
+    }
+}
+
 pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
     let Header { order, elements, start, pictures } = header(bytes, source)?;
     let mut body = Body { bytes, at: start, order, source };
@@ -124,31 +135,15 @@ fn header(bytes: &[u8], source: Source) -> Result<Header> {
             }
             ["ply"] | ["comment" | "obj_info", ..] | [] => {}
             ["format", kind, _] => {
-                order = match kind {
-                    "ascii" => Some(Order::Text),
-                    "binary_little_endian" => Some(Order::Little),
-                    "binary_big_endian" => Some(Order::Big),
-                    _ => return Err(broken(format!("format `{kind}` is unknown"))),
-                }
+                let named = Order::named(kind);
+                order = Some(named.ok_or_else(|| broken(format!("format `{kind}` is unknown")))?);
             }
             ["element", name, count] => {
                 let count = count.parse().map_err(|_| broken(format!("`{count}` is not a count")))?;
                 elements.push(Element { name: name.into(), count, properties: Vec::new() });
             }
             ["property", ref kind @ .., name] => {
-                let scalar =
-                    |k: &str| Scalar::named(k).ok_or_else(|| broken(format!("type `{k}` is unknown")));
-                let (item, length) = match *kind {
-                    ["list", length, item] => {
-                        let length = scalar(length)?;
-                        if matches!(length, Scalar::F32 | Scalar::F64) {
-                            return Err(broken("a list length that is not an integer".into()));
-                        }
-                        (scalar(item)?, Some(length))
-                    }
-                    [item] => (scalar(item)?, None),
-                    _ => return Err(broken(format!("`{line}` is no property"))),
-                };
+                let (item, length) = property_type(kind, &line).map_err(broken)?;
                 let element =
                     elements.last_mut().ok_or_else(|| broken("a property before any element".into()))?;
                 element.properties.push(Property { name: name.into(), item, length });
@@ -163,6 +158,22 @@ fn header(bytes: &[u8], source: Source) -> Result<Header> {
         }
     }
     unreachable!("the loop over line numbers only returns")
+}
+
+/// Returns the type of a property's items, and that of the length of a list.
+fn property_type(kind: &[&str], line: &str) -> Result<(Scalar, Option<Scalar>), String> {
+    let scalar = |k: &str| Scalar::named(k).ok_or_else(|| format!("type `{k}` is unknown"));
+    match *kind {
+        ["list", length, item] => {
+            let length = scalar(length)?;
+            if matches!(length, Scalar::F32 | Scalar::F64) {
+                return Err("a list length that is not an integer".into());
+            }
+            Ok((scalar(item)?, Some(length)))
+        }
+        [item] => Ok((scalar(item)?, None)),
+        _ => Err(format!("`{line}` is no property")),
+    }
 }
 
 /// Returns the beginning of a text, for messages.
@@ -299,11 +310,9 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
             out.mesh.normals.push(direction.normalize_or_zero());
         }
         if let Some(color) = color {
-            let coded = color.map(|k| element.properties[k].coded(row[k]));
-            if coded.iter().any(|c| !c.is_finite()) {
-                return Err(source.broken(format!("vertex {i}"), "its color is not a number"));
-            }
-            out.mesh.colors.push(coded);
+            let coded = element.coded_color(color, &row);
+            let what = "its color is not a number";
+            out.mesh.colors.push(coded.ok_or_else(|| source.broken(format!("vertex {i}"), what))?);
         }
         out.mesh.colors.extend(packed.and_then(|k| element.properties[k].unpacked(row[k])));
         if let Some([k]) = alpha {
@@ -378,8 +387,34 @@ impl Faces {
     }
 }
 
-/// Adds the triangles of polygons, which are fanned, or of strips, where each corner forms a triangle with the two
-/// before it, with alternating winding, and −1 starts a new strip.
+/// A polygon, which is fanned, or a strip, where each corner forms a triangle with the two before it,
+/// with alternating winding.
+struct Polygon {
+    strips: bool,
+    /// Number of corners so far.
+    corners: usize,
+    /// The two corners that the next one forms a triangle with.
+    pair: [u32; 2],
+}
+
+impl Polygon {
+    /// Adds a corner, and returns the triangle that it completes.
+    fn triangle_with(&mut self, c: u32) -> Option<[u32; 3]> {
+        let (strips, [a, b]) = (self.strips, self.pair);
+        self.corners += 1;
+        self.pair = match self.corners {
+            1 => [c, c],
+            2 => [a, c],
+            _ => [if strips { b } else { a }, c],
+        };
+        // repeated corners of a strip only continue it
+        let is_new = self.corners > 2 && !(strips && (a == b || b == c || c == a));
+        let is_turned = strips && self.corners.is_multiple_of(2);
+        is_new.then_some(if is_turned { [b, a, c] } else { [a, b, c] })
+    }
+}
+
+/// Adds the triangles of polygons, or of strips, where −1 starts a new strip.
 fn triangles(body: &mut Body, element: &Element, out: &mut Faces) -> Result<()> {
     let (source, strips) = (body.source, element.name.eq_ignore_ascii_case("tristrips"));
     let list_of = |names: &[&str]| {
@@ -397,11 +432,10 @@ fn triangles(body: &mut Body, element: &Element, out: &mut Faces) -> Result<()> 
     let (mut row, mut coords) = (vec![0.0; element.properties.len()], Vec::new());
     for i in 0..element.count {
         let first = out.triangles.len();
-        // number of corners so far, and the two corners that the next one forms a triangle with
-        let (mut corners, mut pair) = (0, [0, 0]);
+        let mut polygon = Polygon { strips, corners: 0, pair: [0, 0] };
         let mut corner = |v: f64| {
             if strips && v == -1.0 {
-                corners = 0;
+                polygon.corners = 0;
                 return Ok(());
             }
             if v.fract() != 0.0 || !(0.0..4294967295.0).contains(&v) {
@@ -409,18 +443,10 @@ fn triangles(body: &mut Body, element: &Element, out: &mut Faces) -> Result<()> 
                 let what = format!("index {v}, expected a whole number from {least}");
                 return Err(source.broken(format!("{name} {i}"), what));
             }
-            let ([a, b], c) = (pair, v as u32);
-            corners += 1;
-            // repeated corners of a strip only continue it
-            if corners > 2 && !(strips && (a == b || b == c || c == a)) {
+            if let Some(triangle) = polygon.triangle_with(v as u32) {
                 source.allow(0, out.triangles.len() + 1)?;
-                out.triangles.push(if strips && corners % 2 == 0 { [b, a, c] } else { [a, b, c] });
+                out.triangles.push(triangle);
             }
-            pair = match corners {
-                1 => [c, c],
-                2 => [a, c],
-                _ => [if strips { b } else { a }, c],
-            };
             Ok(())
         };
         coords.clear();
@@ -437,17 +463,16 @@ fn triangles(body: &mut Body, element: &Element, out: &mut Faces) -> Result<()> 
             })?;
         }
         if let Some(color) = color {
-            let coded = color.map(|k| element.properties[k].coded(row[k]));
-            if coded.iter().any(|c| !c.is_finite()) {
-                return Err(source.broken(format!("face {i}"), "its color is not a number"));
-            }
+            let coded = element.coded_color(color, &row);
+            let what = "its color is not a number";
+            let coded = coded.ok_or_else(|| source.broken(format!("face {i}"), what))?;
             out.colors.resize(out.triangles.len(), coded);
         }
         if let Some([k]) = page {
             out.has_pages |= *out.page.get_or_insert(row[k]) != row[k];
         }
         if coordinates.is_some() && out.triangles.len() > first {
-            out.add_wedges(&format_args!("face {i}"), &coords, corners, source)?;
+            out.add_wedges(&format_args!("face {i}"), &coords, polygon.corners, source)?;
         }
     }
     Ok(())
