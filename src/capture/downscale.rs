@@ -6,7 +6,6 @@
 
 use crate::geom::Camera;
 use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
-use rayon::prelude::*;
 
 /// Returns the camera of a picture averaged down by `d`.
 pub(super) fn downscaled(camera: &Camera, d: u32) -> Camera {
