@@ -162,8 +162,10 @@ fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> E
 pub(super) fn explain(root: &Path) -> Error {
     let found = FolderEntries::of(root);
     if is_run(root)
-        && let Some(path) = Config::of_run(root).map(|run| run.capture.path).filter(|path| !path.is_empty())
+        && let Some(path) =
+            Config::of_run(root).map(|run| run.capture.path).filter(|path| !path.as_os_str().is_empty())
     {
+        let path = path.display();
         let hint = format!("inspect its capture, `{path}`; `tiface status` shows the state of the run");
         return not_a_capture(root, "it is the folder of a run", hint);
     }

@@ -7,7 +7,7 @@ use super::run::in_words;
 use super::screen::print;
 use crate::capture::is_run;
 use crate::capture::synthetic::SyntheticOptions;
-use crate::config::Config;
+use crate::config::{Config, key};
 use crate::io::{self, Limits};
 use crate::pipeline::Session;
 use crate::pipeline::experiment::{
@@ -91,8 +91,8 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
         None => Vec::new(),
     };
     let mut set = common.set.clone();
-    set.extend(common.device_word().iter().map(|d| format!("device={d}")));
-    set.extend(common.seed.iter().map(|s| format!("seed={s}")));
+    set.extend(common.device_word().iter().map(|d| format!("{}={d}", key!(device))));
+    set.extend(common.seed.iter().map(|s| format!("{}={s}", key!(seed))));
     let mut captures: Vec<String> = Vec::new();
     let mut tasks = Vec::new();
     for path in &options.captures {
@@ -104,15 +104,8 @@ pub(super) fn run(invocation: &Invocation, options: &ExperimentOptions) -> Resul
                 "rename one of the folders",
             ));
         }
-        let text = real.to_str().ok_or_else(|| {
-            Error::cannot(
-                format!("the path of the capture is not UTF-8: `{}`", real.display()),
-                "rename the folder",
-            )
-        })?;
         for run in runs(&words) {
-            let mut config = config(run, options.scale, &set)?;
-            config.capture.path = text.into();
+            let mut config = config(run, options.scale, &set)?.with_capture(real.clone())?;
             without_masks(run, &mut config);
             tasks.push(Task { name: format!("{name}/{run}"), run, config });
         }

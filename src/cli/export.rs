@@ -1,22 +1,18 @@
 //! `tiface export`: writes the finished mesh of a run again.
 
 use super::Invocation;
-use super::options::{KeyOption, RunTarget};
+use super::flags::KeyFlags;
+use super::options::RunTarget;
 use super::out::{Out, require_outside, write_head};
 use super::screen::print;
-use crate::config::{Config, MeshFormat, Stage};
+use crate::config::{Config, MeshFormat, Stage, key};
 use crate::pipeline::KeptHead;
 use crate::{Error, Quiet, Result, io};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Writes the mesh of a run with the settings `keys`; `lists_formats` if they name formats.
-pub(super) fn run(
-    invocation: &Invocation,
-    path: Option<&Path>,
-    lists_formats: bool,
-    keys: &[KeyOption],
-) -> Result<()> {
+/// Writes the mesh of a run with the settings of these options.
+pub(super) fn run(invocation: &Invocation, path: Option<&Path>, flags: &KeyFlags) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
     let out = Out::find(common.out.as_deref(), "export")?;
     let target = RunTarget::find(common, path)?;
@@ -27,7 +23,8 @@ pub(super) fn run(
     if target.guessed {
         screen.note("run", &format!("using `{}`", target.run.display()));
     }
-    let asked = common.resolve(Some(saved), None, keys)?;
+    let asked = common.resolve(Some(saved), None, &flags.options()?)?;
+    let lists_formats = flags.typed(key!(mesh.format)).is_some();
     let files = destinations(out.as_ref(), &target.run, lists_formats, &asked)?;
     // a file of the run may be put back, but not replaced by another
     let (own, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| is_own(file, &target.run));

@@ -1,6 +1,6 @@
 //! Which value wins, and what is said of a wrong one.
 
-use super::{Config, MeshFormat, Preset, Sources};
+use super::{Config, Fallback, MeshFormat, Preset, Sources};
 use crate::Result;
 
 fn from(file: &str, set: &[&str]) -> Result<Config> {
@@ -42,7 +42,8 @@ fn later_wins_default_preset_file_set() {
 #[test]
 fn a_fallback_holds_until_a_source_names_a_preset() {
     let with = |file: &str, set: &[&str]| {
-        let fallback = Some((Preset::Draft, "mesh.resolution = 99\niface.steps = 7".to_string()));
+        let change = |c: &mut Config| (c.mesh.resolution, c.iface.steps) = (99, 7);
+        let fallback: Option<Fallback> = Some((Preset::Draft, change));
         let set = set.iter().map(|s| s.to_string()).collect();
         let files = vec![("f".into(), file.into())];
         let c = Config::resolve(&Sources { fallback, files, set, ..Sources::default() }).unwrap();

@@ -140,7 +140,7 @@ pub fn judge(
     if held_out.is_empty() {
         return Err(Error::cannot(
             "the capture holds out no photograph to judge by",
-            "hold some out: `--set capture.test=...` (see `tiface config --explain capture`)",
+            "say in the capture which ones to hold out, as `test_filenames` of a transforms.json does",
         ));
     }
     let mut warnings = Vec::new();

@@ -13,7 +13,7 @@ use super::surface::Fields;
 use super::{learn, pictures};
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, MaskMeaning, View, ViewMask};
-use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, called};
+use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, called, key};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::image::{Gray, Image, Photo};
 use crate::io::{self, Limits};
@@ -77,12 +77,12 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
         Err(Error::usage(format!("`{key}` {problem}"), hint))
     };
     if c.members.is_empty() {
-        return wrong("ensemble.members", "is empty: there is nothing to blend".into(), "name members");
+        return wrong(key!(ensemble.members), "is empty: there is nothing to blend".into(), "name members");
     }
     for (i, member) in c.members.iter().enumerate() {
         let name = member.folder();
         if c.members[..i].contains(member) {
-            return wrong("ensemble.members", format!("names {name} twice"), "name every member once");
+            return wrong(key!(ensemble.members), format!("names {name} twice"), "name every member once");
         }
         if !config.render.method.contains(member) {
             let problem = format!("names {name}, which render.method does not make");
@@ -91,7 +91,7 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
                      ensemble.members and ensemble.weights; `--set ensemble.members=` blends nothing",
                 shown_with_members(config)
             );
-            return wrong("ensemble.members", problem, &hint);
+            return wrong(key!(ensemble.members), problem, &hint);
         }
     }
     let (found, members) = (c.weights.len(), c.members.len());
@@ -99,7 +99,7 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
     if found == 0 && config.capture.tiles <= 0.0 {
         let problem = "is empty, but there is nothing to fit them on: capture.tiles is 0".into();
         return wrong(
-            "ensemble.weights",
+            key!(ensemble.weights),
             problem,
             "give one for each of ensemble.members, or set capture.tiles=0.04",
         );
@@ -107,14 +107,14 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
     if found != members && found > 0 {
         let problem = format!("has {found} weights for {members} members");
         let hint = "give one for each of ensemble.members, in that order, or none to have them fitted";
-        return wrong("ensemble.weights", problem, hint);
+        return wrong(key!(ensemble.weights), problem, hint);
     }
     if found > 0 && (sum - 1.0).abs() > 1e-3 {
-        return wrong("ensemble.weights", format!("sum to {sum}, expected 1"), &shares_hint(&shares(c)));
+        return wrong(key!(ensemble.weights), format!("sum to {sum}, expected 1"), &shares_hint(&shares(c)));
     }
     if !config.render.float {
         let problem = "is false, but members are blended in float".into();
-        return wrong("render.float", problem, "set it to true, or blend nothing: ensemble.members=");
+        return wrong(key!(render.float), problem, "set it to true, or blend nothing: ensemble.members=");
     }
     Ok(())
 }

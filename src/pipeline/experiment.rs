@@ -14,7 +14,6 @@ use crate::report::experiment::{ExperimentRow, Measured, Ordering};
 use crate::run::{Cost, read_record, read_status};
 use crate::{Error, Result};
 use serde_json::Value;
-use std::path::Path;
 
 /// The tables, by their name and heading.
 pub const TABLES: [(&str, &str); 4] = [
@@ -178,7 +177,7 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
 pub fn without_masks(run: &str, config: &mut Config) {
     let options = capture_options(config);
     let bare = || {
-        let capture = capture::open(Path::new(&config.capture.path), &options)?;
+        let capture = capture::open(&config.capture.path, &options)?;
         capture::require_masks(&capture, &options)
     };
     if run == "baseline-one" && bare().is_err() {
@@ -329,12 +328,13 @@ mod tests {
     use crate::run::Run;
     use glam::Vec3;
     use serde_json::json;
+    use std::path::{Path, PathBuf};
 
     /// Writes a tiny capture into a folder and returns its path.
-    fn head(dir: &Path) -> String {
+    fn head(dir: &Path) -> PathBuf {
         let root = dir.join("head");
         demo_head(&root, (32, 40), (8, 2));
-        root.to_str().unwrap().into()
+        root
     }
 
     fn row_of(table: &str, row: &str) -> ExperimentRow {
@@ -407,9 +407,9 @@ mod tests {
             Session::open(&c, &run).map(|_| c.mask.source)
         };
         assert!(opens("baseline-one").is_ok_and(|source| source == MaskSource::Auto));
-        std::fs::remove_dir_all(Path::new(&path).join("masks")).unwrap();
+        std::fs::remove_dir_all(path.join("masks")).unwrap();
         for file in ["transforms.json", "transforms_train.json", "transforms_test.json"] {
-            let file = Path::new(&path).join(file);
+            let file = path.join(file);
             let text = std::fs::read_to_string(&file).unwrap();
             std::fs::write(&file, text.replace("mask_path", "no_path")).unwrap();
         }

@@ -102,7 +102,7 @@ fn page(session: &Session) -> Result<String> {
         warnings: report::warnings(session.run.dir(), records.iter().map(|(stage, record)| (*stage, record))),
         repeat: format!(
             "tiface run {} --config config.toml --run again",
-            quoted(&session.config.capture.path)
+            quoted(&session.config.capture.path.to_string_lossy())
         ),
         summaries: records.iter().filter_map(summary).collect(),
         settings: session.config.to_toml(),

@@ -15,7 +15,6 @@ use crate::{Error, Result};
 use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::ErrorKind::NotFound;
-use std::path::Path;
 use std::sync::OnceLock;
 
 /// A capture, its configuration and its run folder.
@@ -220,7 +219,7 @@ pub fn check_feasible(config: &Config) -> Result<()> {
 
 /// Returns whether the capture is the synthetic head of a demo, whose surface is known.
 pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
-    io::real_path(&run.path(DEMO_CAPTURE)).is_ok_and(|made| made == Path::new(&config.capture.path))
+    io::real_path(&run.path(DEMO_CAPTURE)).is_ok_and(|made| made == config.capture.path)
 }
 
 /// Refuses a device that this build or this machine does not have, or that another process uses. Finished stages need

@@ -693,27 +693,6 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
 }
 
 #[test]
-fn views_from_before_files_of_the_mesh_were_told_apart_are_still_done() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    capture(&root);
-    let mut config = draft(&root);
-    (config.mesh.material, config.mesh.format) = (Material::Lit, vec![MeshFormat::Ply]);
-    let run = quiet(dir.path());
-    let session = Session::open(&config, &run).unwrap();
-    for stage in session.order(Stage::Metrics) {
-        let mut plan = session.plan(stage);
-        if stage == Stage::Render {
-            let whole = session.plan(Stage::Mesh).fingerprint.digest();
-            assert_ne!(plan.fingerprint.inputs.insert("mesh".into(), whole.clone()), Some(whole));
-        }
-        session.run.stage(plan, |_| Ok(json!(null))).unwrap();
-    }
-    assert_eq!(done(&session), "mask tface iface mesh render ensemble metrics");
-    session.remember(Stage::Metrics).unwrap();
-}
-
-#[test]
 fn the_frame_of_a_file_shapes_nothing_that_views_show() {
     let dir = tempfile::tempdir().unwrap();
     let root = dir.path().join("head");

@@ -49,7 +49,7 @@ pub(super) fn demo_head(root: &Path, (width, height): (u32, u32), (train, test):
 /// longer than all else of the stage `mask`, and has tests of its own.
 pub(super) fn draft(root: &Path) -> Config {
     let mut config = Config::preset(Preset::Draft);
-    config.capture.path = root.to_str().unwrap().into();
+    config.capture.path = root.into();
     (config.capture.cameras, config.capture.exposure) = (CameraPoses::Given, Exposures::Given);
     config
 }

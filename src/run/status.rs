@@ -2,7 +2,7 @@
 //! [`RunStatus`]: the state of a whole run, from the files of its stages.
 
 use super::{Fingerprint, LOCK};
-use crate::config::{Config, Stage};
+use crate::config::{Config, Stage, key};
 use crate::io::{self, Limits, ReadError};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -195,7 +195,7 @@ impl Record {
         match (exported, self.stage.split_once('/')) {
             (Some(name), None) => format!("tiface export {run} --out {}", folder.join(name).display()),
             (_, Some((owner, _))) => {
-                let cameras = self.fingerprint.settings.get("render.cameras");
+                let cameras = self.fingerprint.settings.get(key!(render.cameras));
                 let cameras = cameras.map_or("FILE", |word| word.trim_matches('"'));
                 format!("tiface {owner} {run} --cameras {cameras} --fresh {owner}")
             }
