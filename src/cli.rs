@@ -564,7 +564,7 @@ impl Command {
         let (product, require) = match self {
             Command::Run { require, .. } => ("run", &require[..]),
             Command::Metrics { require, .. } => ("metrics", &require[..]),
-            _ => (until.word(), &[][..]),
+            _ => (until.as_str(), &[][..]),
         };
         let target = RunTarget::find(common, input.path.as_deref())?;
         Ok(StageCommand { product, until, target, require, keys, fallback: None })

@@ -4,9 +4,10 @@
 //! the wrong type or out of range is an error that names the line, the key and a suggested fix. The
 //! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
 //!
-//! Each stage owns its table, declared by `table!`: a key, its documentation, range and the values of the presets
-//! stand once, on its field. Everything here works on what serde says about them. What no user has a reason to
-//! change is no key but a constant of the preset, in the same place.
+//! Each stage owns its table, declared by `table!`: a key, its documentation, range, the products that it affects, its
+//! command-line option and the values of the presets stand once, on its field. Everything here works on what serde says
+//! about them; what makes a stage again is a filter over the rows ([`Config::settings_of`]), and code that names a key writes
+//! `key!(mesh.lobes)`. What no user has a reason to change is no key but a constant of the preset, in the same place.
 
 mod affects;
 pub mod iface;
@@ -123,7 +124,7 @@ impl Preset {
     pub const ALL: [Preset; 4] = [Preset::Quick, Preset::Draft, Preset::Standard, Preset::Paper];
 
     /// Its word in the configuration.
-    pub fn name(self) -> &'static str {
+    pub fn as_str(self) -> &'static str {
         match self {
             Preset::Quick => "quick",
             Preset::Draft => "draft",
@@ -137,7 +138,7 @@ impl FromStr for Preset {
     type Err = Error;
 
     fn from_str(word: &str) -> Result<Preset> {
-        let found = Preset::ALL.into_iter().find(|preset| preset.name() == word);
+        let found = Preset::ALL.into_iter().find(|preset| preset.as_str() == word);
         found.ok_or_else(|| {
             Error::usage(format!("there is no preset `{word}`"), "use quick, draft, standard or paper")
         })
@@ -425,7 +426,7 @@ pub struct Explained {
 /// Returns a key, or all keys of a table; an unknown name is an error that knows the nearest one.
 pub fn explained(name: &str) -> Result<Vec<Explained>> {
     let wanted = all_keys().filter(|(full, _)| full == name || full.starts_with(&format!("{name}.")));
-    let tables = Preset::ALL.map(|preset| (preset.name(), Config::preset(preset).to_table()));
+    let tables = Preset::ALL.map(|preset| (preset.as_str(), Config::preset(preset).to_table()));
     let one = |(full, key): (String, &Key)| {
         let value = |(preset, table): &(&'static str, Table)| Some((*preset, lookup(table, &full)?.clone()));
         let values = tables.iter().filter_map(value).collect();
@@ -448,7 +449,7 @@ pub fn explain(name: &str) -> Result<String> {
             let _ = writeln!(out, "  allowed: {allowed}");
         }
         let [quick, draft, standard, paper] =
-            Preset::ALL.map(|preset| values.get(preset.name()).map(show).unwrap_or_default());
+            Preset::ALL.map(|preset| values.get(preset.as_str()).map(show).unwrap_or_default());
         if key == key!(preset) || (quick == draft && draft == standard && standard == paper) {
             let _ = writeln!(out, "  default: {standard}");
         } else {

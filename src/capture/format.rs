@@ -143,7 +143,7 @@ const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
 /// is a capture's, be it one that cannot be read (photographs without cameras, a project of another program).
 pub fn is_run(folder: &Path) -> bool {
     let has_record = |stage: &Stage| {
-        ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.word()).join(f)))
+        ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.as_str()).join(f)))
     };
     let is_begun = || Stage::ALL.iter().any(has_record);
     let is_capture = || {

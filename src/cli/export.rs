@@ -66,7 +66,7 @@ fn is_own((file, format): &(PathBuf, MeshFormat), run: &Path) -> bool {
     let folder = file.parent().and_then(|folder| io::real_path(folder).ok());
     let is_there =
         folder.is_some_and(|folder| io::real_path(&run.join(Stage::Mesh)).is_ok_and(|own| own == folder));
-    is_there && file.file_name().is_some_and(|name| name == format!("head.{}", format.ending()).as_str())
+    is_there && file.file_name().is_some_and(|name| name == format!("head.{}", format.as_str()).as_str())
 }
 
 /// Returns the files to write with their formats: `--out`, files in its folder, or else files in the working directory with
@@ -79,13 +79,13 @@ fn destinations(
 ) -> Result<Vec<(PathBuf, MeshFormat)>> {
     let formats = &asked.mesh.format;
     let named = |folder: &Path, stem: &str| {
-        let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.ending())), *format);
+        let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.as_str())), *format);
         formats.iter().map(file).collect()
     };
     match out {
         Some(Out::File(file, ending)) => {
             let format =
-                MeshFormat::of_ending(ending).filter(|format| !lists_formats || formats == &[*format]);
+                ending.parse().ok().filter(|format: &MeshFormat| !lists_formats || formats == &[*format]);
             let format = format.ok_or_else(|| {
                 let what =
                     format!("`--out {}` is one .{ending}, and `--format` lists others", file.display());

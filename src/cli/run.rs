@@ -5,7 +5,7 @@ use super::Invocation;
 use super::options::{Common, KeyOption, RunTarget};
 use super::out::Out;
 use super::screen::{figure, one_line, print};
-use crate::config::{Fallback, NAMES, RenderConfig, called};
+use crate::config::{Fallback, NAMES, RenderConfig, called, key};
 use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::{blend_verdict, duration, height, judged_by};
 use crate::run::{Cost, Done, Phase, Run, RunStatus, read_record};
@@ -113,7 +113,8 @@ fn saved_config(run: &Run) -> Option<String> {
 
 /// Returns settings without the device: stages of one run may be computed on several devices.
 fn without_device(settings: &str) -> String {
-    settings.lines().filter(|line| !line.starts_with("device = ")).map(|line| format!("{line}\n")).collect()
+    let device = format!("{} = ", key!(device));
+    settings.lines().filter(|line| !line.starts_with(&device)).map(|line| format!("{line}\n")).collect()
 }
 
 /// Returns the plan up to `until`: a row for each stage with its estimated cost, and the total.
@@ -242,7 +243,7 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
         let faults = record.map_or(Vec::new(), |record| record.faults(&run.path(Stage::Mesh)));
         faults.iter().for_each(|fault| row("", &one_line(&fault.to_string())));
     }
-    for (stage, folder) in [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.word())] {
+    for (stage, folder) in [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.as_str())] {
         if of(stage).is_some() {
             row("pictures", &run.path(folder).display());
         }

@@ -2,7 +2,9 @@
 
 use super::key;
 use super::table::table;
+use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use std::str::FromStr;
 
 /// A mesh file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -17,18 +19,24 @@ pub enum MeshFormat {
 }
 
 impl MeshFormat {
-    /// Returns the ending of its files.
-    pub fn ending(self) -> &'static str {
+    /// Its word, which is the ending of its files.
+    pub fn as_str(self) -> &'static str {
         match self {
             MeshFormat::Glb => "glb",
             MeshFormat::Obj => "obj",
             MeshFormat::Ply => "ply",
         }
     }
+}
 
-    /// Returns the format of a file ending.
-    pub fn of_ending(ending: &str) -> Option<MeshFormat> {
-        [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply].into_iter().find(|f| f.ending() == ending)
+impl FromStr for MeshFormat {
+    type Err = Error;
+
+    fn from_str(word: &str) -> Result<MeshFormat> {
+        let all = [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply];
+        all.into_iter()
+            .find(|format| format.as_str() == word)
+            .ok_or_else(|| Error::usage(format!("there is no mesh format `{word}`"), "use glb, obj or ply"))
     }
 }
 

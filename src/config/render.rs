@@ -46,8 +46,8 @@ pub fn called(word: &str) -> String {
 }
 
 impl Method {
-    /// Returns the folder of its pictures below `render/`, and its word in the configuration.
-    pub fn folder(self) -> &'static str {
+    /// Its word in the configuration, and the folder of its pictures below `render/`.
+    pub fn as_str(self) -> &'static str {
         NAMES[self as usize].0
     }
 
@@ -196,7 +196,7 @@ mod tests {
         let methods = [Baseline, Tface, Volume, Raycast, Textured, Raster];
         for (method, (word, _)) in methods.into_iter().zip(NAMES) {
             // the word of the folder is the word of the configuration
-            assert_eq!((serde_json::json!(method), method.folder()), (serde_json::json!(word), word));
+            assert_eq!((serde_json::json!(method), method.as_str()), (serde_json::json!(word), word));
         }
         assert_eq!(called("volume"), "I-Face (volume)");
         assert_eq!((called("baseline"), called("truth")), ("baseline".into(), "truth".into()));

@@ -93,7 +93,7 @@ pub fn compare_runs(runs: [&Session; 2], names: [&str; 2], folder: &Path) -> Res
 fn facts(run: &Session, name: &str) -> String {
     let times = Stage::ALL.iter().filter_map(|&stage| read_record(&run.run.path(stage)).ok()?);
     let seconds = times.map(|record| record.elapsed_s).sum();
-    format!("{name}: preset {}, seed {}, {}", run.config.preset.name(), run.config.seed, duration(seconds))
+    format!("{name}: preset {}, seed {}, {}", run.config.preset.as_str(), run.config.seed, duration(seconds))
 }
 
 /// Returns the distances between the extracted surfaces in dataset units, both ways; `None` if a run has no mesh.

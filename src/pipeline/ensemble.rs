@@ -80,7 +80,7 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
         return wrong(key!(ensemble.members), "is empty: there is nothing to blend".into(), "name members");
     }
     for (i, member) in c.members.iter().enumerate() {
-        let name = member.folder();
+        let name = member.as_str();
         if c.members[..i].contains(member) {
             return wrong(key!(ensemble.members), format!("names {name} twice"), "name every member once");
         }
@@ -121,7 +121,7 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
 
 /// Returns the names of methods.
 fn words(methods: &[Method]) -> Vec<&'static str> {
-    methods.iter().map(|m| m.folder()).collect()
+    methods.iter().map(|m| m.as_str()).collect()
 }
 
 /// Returns the shown and the blended methods in the syntax of `--with`.
@@ -142,7 +142,7 @@ fn shares(c: &EnsembleConfig) -> Vec<f32> {
 /// Reads the views of all members from one camera, in float.
 fn member_views(config: &Config, run: &Run, name: &str) -> Result<Vec<Image>> {
     let view = |member: &Method| {
-        let word = member.folder();
+        let word = member.as_str();
         let below = format!("render/{word}/{}", pictures::FLOAT);
         let file = pictures::float_path(&run.path(&below), name);
         if io::is_file(&file) {
@@ -167,7 +167,7 @@ fn member_views(config: &Config, run: &Run, name: &str) -> Result<Vec<Image>> {
 fn members<'i>(capture: &Capture, config: &Config, views: &'i [Image]) -> Result<Members<'i>> {
     let c = &config.ensemble;
     let member = |(m, image): (&Method, &'i Image)| Member {
-        name: m.folder(),
+        name: m.as_str(),
         image,
         masked: trained_with_masks(capture, config, *m),
     };

@@ -299,7 +299,7 @@ fn figures(session: &Session, row: &ExperimentRow, value: &Value) -> Measured {
     out.seconds = match row.pictures {
         "ensemble" => {
             let blend = summary(Stage::Ensemble)["seconds_per_view"].as_f64();
-            let members = session.config.ensemble.members.iter().map(|member| seconds(member.folder()));
+            let members = session.config.ensemble.members.iter().map(|member| seconds(member.as_str()));
             members.chain([blend]).sum()
         }
         method => seconds(method),
@@ -345,7 +345,7 @@ mod tests {
     fn every_row_has_a_run_whose_pictures_it_names() {
         for row in ROWS {
             let c = config(row.run, 1.0, &[]).unwrap();
-            let made = c.render.method.iter().any(|m| m.folder() == row.pictures);
+            let made = c.render.method.iter().any(|m| m.as_str() == row.pictures);
             let blended = row.pictures == "ensemble" && !c.ensemble.members.is_empty();
             assert!(made || blended, "{row:?}");
             assert_eq!(c.metrics.truth, TruthPhoto::Photo);

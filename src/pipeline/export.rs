@@ -133,7 +133,7 @@ impl KeptHead {
         match written.iter().all(is_own) {
             true => Ok(()),
             false => Err(Error::usage(
-                format!("these settings write another `head.{}` than the run's", format.ending()),
+                format!("these settings write another `head.{}` than the run's", format.as_str()),
                 "choose a place beside the run with `--out`, or leave the settings out",
             )),
         }
@@ -286,7 +286,7 @@ fn not_shown(
     formats: &[MeshFormat],
 ) -> Result<Option<String>> {
     let endings = |list: &mut dyn Iterator<Item = &MeshFormat>| {
-        list.map(|format| format!(".{}", format.ending())).collect::<Vec<_>>().join(", ")
+        list.map(|format| format!(".{}", format.as_str())).collect::<Vec<_>>().join(", ")
     };
     let without = endings(&mut formats.iter().filter(|f| !shown_by.contains(f)));
     if without.is_empty() {

@@ -160,12 +160,12 @@ impl Session<'_> {
         let made: Vec<Stage> = stage
             .followers(self.config)
             .into_iter()
-            .filter(|s| *s == stage || names.iter().any(|name| name == s.word()))
+            .filter(|s| *s == stage || names.iter().any(|name| name == s.as_str()))
             .collect();
         self.require_inputs(&made)?;
         self.require_masks(&made)?;
         // do not clear a finished blend whose views could not be made again
-        let blended = names.iter().any(|n| n == Stage::Ensemble.word())
+        let blended = names.iter().any(|n| n == Stage::Ensemble.as_str())
             && !self.config.ensemble.members.is_empty()
             && read_record(&self.run.path(Stage::Ensemble)).ok().flatten().is_some();
         if blended {
@@ -187,7 +187,7 @@ impl Session<'_> {
         let plans = self.order(until).into_iter().map(|stage| self.compared_plan(stage));
         let mut kept = plans.filter(|plan| !cleared.iter().any(|name| name == plan.name));
         kept.try_for_each(|plan| {
-            self.run.agrees(&plan).map_err(|e| match plan.name == Stage::Mesh.word() && self.differs_in_files() {
+            self.run.agrees(&plan).map_err(|e| match plan.name == Stage::Mesh.as_str() && self.differs_in_files() {
                 true => {
                     let run = self.run.dir().display();
                     let hint = format!(
@@ -238,7 +238,7 @@ impl Session<'_> {
     /// Returns the plan of a stage; if the stage makes views, they are those of the evaluation.
     fn stage_plan(&self, stage: Stage) -> Plan<'_> {
         Plan {
-            name: stage.word(),
+            name: stage.as_str(),
             fingerprint: self.fingerprint(Product::of(stage)),
             device: &self.config.device,
             needs_bytes: (16 << 20) + self.needs_bytes(stage),
@@ -251,7 +251,7 @@ impl Session<'_> {
         let (stage, config) = (product.stage(), self.config);
         let mut fingerprint = Fingerprint::new(FORMAT, config.settings_of(product));
         for needed in stage.needs(config) {
-            fingerprint = fingerprint.input(needed.word(), self.input(needed, &config.render.method));
+            fingerprint = fingerprint.input(needed.as_str(), self.input(needed, &config.render.method));
         }
         for (name, digest) in self.inputs.read_by(stage) {
             fingerprint = fingerprint.input(name, digest);
@@ -303,7 +303,7 @@ impl Session<'_> {
             fingerprint = fingerprint.input("cameras", digest);
         }
         for stage in render.shows() {
-            fingerprint = fingerprint.input(stage.word(), self.input(stage, &render.method));
+            fingerprint = fingerprint.input(stage.as_str(), self.input(stage, &render.method));
         }
         let pixels = |c: &crate::geom::Camera| c.width as u64 * c.height as u64;
         let all = match cameras {
@@ -421,7 +421,7 @@ impl Session<'_> {
             return Ok(());
         }
         let stages = self.order(Stage::Metrics).into_iter();
-        let estimate: Estimate = stages.map(|stage| (stage.word().to_owned(), self.cost(stage))).collect();
+        let estimate: Estimate = stages.map(|stage| (stage.as_str().to_owned(), self.cost(stage))).collect();
         let text = serde_json::to_string_pretty(&estimate).unwrap_or_default();
         self.write(ESTIMATE, format!("{text}\n").as_bytes(), idle)
     }

@@ -83,7 +83,7 @@ impl<'a> Session<'a> {
         let mut evaluated = Capture { views, ..capture.clone() };
         if let Err(e) = evaluated.settle_masks(&self.config.mask.head, &Limits::default()) {
             let text = format!("the capture's own masks are not used for the figures: {e}; {}", e.hint());
-            self.run.warn(Stage::Metrics.word(), &text);
+            self.run.warn(Stage::Metrics.as_str(), &text);
             return Ok(capture);
         }
         let has_own = capture.views.iter_mut().zip(&own.masks).filter(|(_, own)| **own != ViewMask::None);
@@ -189,7 +189,7 @@ impl<'a> Session<'a> {
         stages.iter().try_for_each(|&stage| match stage {
             Stage::Iface => crate::iface::require_fit(&self.config.iface, &device),
             Stage::Baseline | Stage::Tface => {
-                crate::tface::require_fit(stage.word(), &self.config.radiance(stage), bounds, &device)
+                crate::tface::require_fit(stage.as_str(), &self.config.radiance(stage), bounds, &device)
             }
             _ => Ok(()),
         })

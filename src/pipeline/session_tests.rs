@@ -574,7 +574,7 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
     let changed = |change: &dyn Fn(&mut Config)| -> String {
         let now = digests(change);
         let names = Stage::ALL.iter().zip(base.iter().zip(&now)).filter(|(_, (a, b))| a != b);
-        names.map(|(s, _)| s.word()).collect::<Vec<_>>().join(" ")
+        names.map(|(s, _)| s.as_str()).collect::<Vec<_>>().join(" ")
     };
     let all = words(&Stage::ALL);
     assert_eq!(changed(&|c| c.mesh.resolution = 100), "mesh render ensemble metrics");

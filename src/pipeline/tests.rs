@@ -36,7 +36,7 @@ pub(super) fn quiet(dir: &Path) -> Run {
 
 /// The words of stages, with spaces.
 pub(super) fn words(stages: &[Stage]) -> String {
-    stages.iter().map(|s| s.word()).collect::<Vec<_>>().join(" ")
+    stages.iter().map(|s| s.as_str()).collect::<Vec<_>>().join(" ")
 }
 
 /// Writes the demo head, photographed at a size by so many training and held-out views, into a folder. A size of its own costs

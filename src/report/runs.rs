@@ -78,7 +78,7 @@ impl RunRow {
             done: standing.phase == Phase::Done,
             failed: matches!(standing.phase, Phase::Failed | Phase::Damaged),
             picture: picture(run).unwrap_or_default(),
-            preset: Config::of_run(run).map_or(String::new(), |config| config.preset.name().into()),
+            preset: Config::of_run(run).map_or(String::new(), |config| config.preset.as_str().into()),
             seconds: standing.elapsed_s,
             cpu_s: records.iter().map(|(_, r)| r.cpu_s).sum::<Option<f64>>().filter(|s| *s > 0.0),
             peak_bytes: records.iter().filter_map(|(_, r)| r.peak_bytes).max(),
