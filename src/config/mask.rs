@@ -228,7 +228,7 @@ table! {
         meaning: MaskMeaning [Masks] => MaskMeaning::Empty;
         /// Pixels of the capture's mask files that are the head: white (gray is opacity; a single other color on black is
         /// taken for white), not-black, or values and colors, as 1,2,17 (labels) or #5000ff,#ff0000.
-        head: MaskHead [Masks if read] => MaskHead::White;
+        head: MaskHead [Masks if read, Metrics if made] => MaskHead::White;
         /// File of clicks to make masks from: a prompts.json, as `tiface mask --page` saves it.
         #[flag("prompts", File, ["run", "mask"], "Make masks from the clicks in a prompts.json")]
         prompts: String [nothing] => String::new();

@@ -105,7 +105,7 @@ fn set_needs_neither_quotes_nor_brackets() {
     let c = from("", &["mesh.format=glb,obj", "iface.steps=2e4", "capture.unit_m=1", "capture.path=a b"])
         .unwrap();
     assert_eq!(c.mesh.format, [MeshFormat::Glb, MeshFormat::Obj]);
-    assert_eq!((c.iface.steps, c.capture.unit_m, c.capture.path.as_str()), (20_000, 1.0, "a b"));
+    assert_eq!((c.iface.steps, c.capture.unit_m, c.capture.path.to_str()), (20_000, 1.0, Some("a b")));
     let c = from("", &["mesh.format=[\"ply\"]", "mask.source=\"none\""]).unwrap();
     assert_eq!(c.mesh.format, [MeshFormat::Ply]);
 }

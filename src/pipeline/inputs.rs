@@ -6,7 +6,7 @@ use super::clicks::MaskPrompts;
 use super::readings::{Settled, settle};
 use super::{mask, scene_file};
 use crate::capture::{self, Capture, CaptureOptions, Reading, View, ViewMask};
-use crate::config::{Config, MaskHead, MaskSource, Stage};
+use crate::config::{Config, MaskSource, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
 use crate::{Error, Result};
@@ -146,10 +146,7 @@ fn own_masks(capture: &Capture, options: &CaptureOptions) -> Result<OwnMasks> {
         // the photograph is already part of the capture's digest
         other => Ok(format!("{other:?}")),
     });
-    let mut digests = digests.collect::<Result<Vec<String>>>()?;
-    if options.head != MaskHead::White {
-        digests.push(options.head.into()); // which of their pixels are the head
-    }
+    let digests = digests.collect::<Result<Vec<String>>>()?;
     Ok(OwnMasks { masks, turns, digest: Fingerprint::of_bytes(digests.join(" ").as_bytes()) })
 }
 
