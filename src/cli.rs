@@ -13,6 +13,7 @@ mod complete;
 mod demo;
 mod experiment;
 mod export;
+mod flags;
 mod options;
 mod out;
 mod preview;
@@ -22,6 +23,7 @@ mod screen;
 mod signals;
 mod status;
 
+use crate::config::key;
 use crate::pipeline::Stage;
 use crate::run::Stop;
 use crate::{Error, Result};
@@ -31,7 +33,8 @@ use clap::parser::ValueSource;
 use clap::{ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use clap_complete::{ArgValueCompleter, Shell};
 use experiment::ExperimentOptions;
-use options::{Common, KeyOption, RunTarget};
+use flags::KeyFlags;
+use options::{Common, RunTarget};
 use out::Out;
 use preview::PreviewOptions;
 use run::StageCommand;
@@ -68,6 +71,10 @@ struct Cli {
     common: Common,
 }
 
+/// Options for making masks, of which the page that asks for clicks has no use.
+const NOT_WITH_PAGE: [&str; 5] =
+    [key!(mask.point), key!(mask.sam), key!(mask.sam_decoder), key!(mask.vitmatte), key!(mask.alpha_net)];
+
 /// Capture or run of a stage command.
 #[derive(Args, Debug)]
 struct CaptureOrRun {
@@ -75,102 +82,6 @@ struct CaptureOrRun {
     /// runs/]
     #[arg(value_name = "CAPTURE|RUN")]
     path: Option<PathBuf>,
-}
-
-/// Options for masks from clicks.
-#[derive(Args, Debug, Default)]
-struct ClickOptions {
-    /// Make masks from the clicks in a prompts.json
-    #[arg(long, alias = "points", value_name = "FILE")]
-    prompts: Option<PathBuf>,
-    /// Click on one photograph: 1 for the head, 0 for background; repeatable
-    #[arg(long, value_name = "X,Y,LABEL", conflicts_with = "prompts", allow_hyphen_values = true)]
-    point: Vec<String>,
-    /// View of --point [default: the first training view]
-    #[arg(long, value_name = "NAME", requires = "point")]
-    view: Option<String>,
-    /// Image encoder of SAM, an ONNX file; needs --sam-decoder
-    #[arg(long, value_name = "FILE")]
-    sam: Option<PathBuf>,
-    /// Prompt encoder and mask decoder of SAM, an ONNX file
-    #[arg(long, value_name = "FILE")]
-    sam_decoder: Option<PathBuf>,
-    /// ViTMatte, an ONNX file
-    #[arg(long, value_name = "FILE")]
-    vitmatte: Option<PathBuf>,
-    /// Make masks without clicks, by a network that predicts alpha (U²-Net, ISNet, MODNet, BiRefNet), an ONNX file
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["prompts", "point"])]
-    alpha_net: Option<PathBuf>,
-}
-
-impl ClickOptions {
-    /// Returns the options as keys of the configuration; files by their absolute path, so that the run finds them from any
-    /// working directory.
-    fn keys(&self) -> Result<Vec<KeyOption>> {
-        let file = |option: &str, key: &str, file: &Option<PathBuf>| -> Result<Option<KeyOption>> {
-            let Some(file) = file else { return Ok(None) };
-            let path = crate::io::real_path(file)?;
-            let text = path.to_str().ok_or_else(|| {
-                Error::cannot(format!("the path `{}` is not UTF-8", path.display()), "rename the file")
-            })?;
-            Ok(Some((format!("{option} {}", file.display()), key.into(), text.into())))
-        };
-        let files = [
-            file("--prompts", "mask.prompts", &self.prompts)?,
-            file("--sam", "mask.sam", &self.sam)?,
-            file("--sam-decoder", "mask.sam_decoder", &self.sam_decoder)?,
-            file("--vitmatte", "mask.vitmatte", &self.vitmatte)?,
-            file("--alpha-net", "mask.alpha_net", &self.alpha_net)?,
-        ];
-        let mut keys: Vec<KeyOption> = files.into_iter().flatten().collect();
-        if !self.point.is_empty() {
-            let list = serde_json::json!(self.point).to_string();
-            keys.push((format!("--point {}", self.point.join(" --point ")), "mask.point".into(), list));
-        }
-        keys.extend(key_options([("--view", "mask.view", self.view.as_deref())]));
-        Ok(keys)
-    }
-}
-
-/// How the files of a mesh are written.
-#[derive(Args, Debug, Default)]
-struct FileOptions {
-    /// Formats to write: glb, obj, ply
-    #[arg(long, value_name = "LIST")]
-    format: Option<String>,
-    /// Coordinate frame: dataset, or head (+Y up, face towards +Z)
-    #[arg(long, value_name = "FRAME")]
-    frame: Option<String>,
-    /// Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it
-    #[arg(long, value_name = "METERS")]
-    height: Option<String>,
-    /// Number of triangles after simplification; 0 keeps all
-    #[arg(long, value_name = "N")]
-    triangles: Option<String>,
-    /// Side of the texture, texels; 0 stores colors at the vertices
-    #[arg(long, value_name = "PX")]
-    texture: Option<String>,
-    /// Hair and other soft outlines: shells (translucent layers, where they help) or none
-    #[arg(long, value_name = "KIND")]
-    hair: Option<String>,
-    /// Material in other programs: unlit (colors as photographed) or lit (shaded by lamps)
-    #[arg(long, value_name = "KIND")]
-    material: Option<String>,
-}
-
-impl FileOptions {
-    /// Returns the options as keys of the configuration.
-    fn keys(&self) -> Vec<KeyOption> {
-        key_options([
-            ("--format", "mesh.format", self.format.as_deref()),
-            ("--frame", "mesh.frame", self.frame.as_deref()),
-            ("--height", "mesh.height_m", self.height.as_deref()),
-            ("--triangles", "mesh.triangles", self.triangles.as_deref()),
-            ("--texture", "mesh.texture_px", self.texture.as_deref()),
-            ("--hair", "mesh.hair", self.hair.as_deref()),
-            ("--material", "mesh.material", self.material.as_deref()),
-        ])
-    }
 }
 
 #[derive(Subcommand, Debug)]
@@ -186,7 +97,7 @@ enum Command {
         #[command(flatten)]
         input: CaptureOrRun,
         #[command(flatten)]
-        clicks: ClickOptions,
+        flags: KeyFlags,
         /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
@@ -259,9 +170,9 @@ background twice. The masks of the other views follow from the cameras.")]
         #[command(flatten)]
         input: CaptureOrRun,
         #[command(flatten)]
-        clicks: ClickOptions,
+        flags: KeyFlags,
         /// Write a page to click on instead, to --out or <capture>_clicks.html
-        #[arg(long, conflicts_with_all = ["point", "sam", "sam_decoder", "vitmatte", "alpha_net"])]
+        #[arg(long, conflicts_with_all = NOT_WITH_PAGE)]
         page: bool,
     },
     /// Stage: train T-Face, a radiance field of the masked photographs
@@ -296,16 +207,7 @@ background twice. The masks of the other views follow from the cameras.")]
         #[command(flatten)]
         input: CaptureOrRun,
         #[command(flatten)]
-        files: FileOptions,
-        /// Degree of the view-dependent spherical harmonics in the GLB: 0, 1 or 2
-        #[arg(long, value_name = "DEGREE")]
-        lobes: Option<String>,
-        /// Store the detail that simplification removes in a normal map; makes the material lit
-        #[arg(long)]
-        normal_map: bool,
-        /// Leave the mesh open where the frames cut the body
-        #[arg(long)]
-        no_cap: bool,
+        flags: KeyFlags,
     },
     /// Stage: render views of the fields and of the mesh
     #[command(after_long_help = "Examples:
@@ -319,20 +221,8 @@ held-out views, their blend and the metrics do not change; --fresh render then r
     Render {
         #[command(flatten)]
         input: CaptureOrRun,
-        /// Cameras: test (the held-out views), train, orbit or a file (a nerfstudio camera path or a
-        /// transforms.json)
-        #[arg(long, value_name = "WHICH")]
-        cameras: Option<String>,
-        /// Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
-        /// (head.glb, as a viewer shows it) and raster (the same, rasterized)
-        #[arg(long = "with", value_name = "LIST")]
-        method: Option<String>,
-        /// Picture format: png or exr
-        #[arg(long)]
-        format: Option<String>,
-        /// Background: black, white or none
-        #[arg(long)]
-        background: Option<String>,
+        #[command(flatten)]
+        flags: KeyFlags,
     },
     /// Stage: blend the views of several methods
     #[command(after_long_help = "Examples:
@@ -345,13 +235,8 @@ all trainings (capture.tiles).")]
     Ensemble {
         #[command(flatten)]
         input: CaptureOrRun,
-        /// Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured
-        /// and raster (head.glb)
-        #[arg(long, value_name = "LIST")]
-        members: Option<String>,
-        /// Weights of the methods, in that order, with sum 1 [default: fitted]
-        #[arg(long, value_name = "LIST")]
-        weights: Option<String>,
+        #[command(flatten)]
+        flags: KeyFlags,
     },
     /// Stage: compare views and blends with held-out photographs
     #[command(after_long_help = "Examples:
@@ -388,7 +273,7 @@ valid. Settings that are not given are the run's. More triangles or a larger tex
         #[arg(value_name = "RUN")]
         path: Option<PathBuf>,
         #[command(flatten)]
-        files: FileOptions,
+        flags: KeyFlags,
     },
     /// Render pictures of a run's mesh, or of any .glb, .gltf, .obj, .ply or .stl
     #[command(after_long_help = "Examples:
@@ -553,8 +438,8 @@ pub fn main(collect: fn()) -> ExitCode {
     let begun = refuse_ignored(&found).and_then(|()| signals::listen(&invocation));
     let ended = begun.and_then(|()| match &command {
         Command::Demo { size, views, border } => demo::run(&invocation, size.as_deref(), *views, *border),
-        Command::Mask { input, clicks, page: true } => {
-            capture::page(&invocation, input.path.as_deref(), clicks.prompts.as_deref())
+        Command::Mask { input, flags, page: true } => {
+            capture::page(&invocation, input.path.as_deref(), flags.typed(key!(mask.prompts)))
         }
         Command::Metrics { input, views, mesh, .. } if !(views.is_empty() && mesh.is_empty()) => {
             capture::judge(&invocation, input.path.as_deref(), views, mesh)
@@ -566,9 +451,7 @@ pub fn main(collect: fn()) -> ExitCode {
         Command::Convert { capture, to } => capture::convert(&invocation, capture, to),
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
-        Command::Export { path, files } => {
-            export::run(&invocation, path.as_deref(), files.format.is_some(), &files.keys())
-        }
+        Command::Export { path, flags } => export::run(&invocation, path.as_deref(), flags),
         Command::Preview(options) => preview::run(&invocation, options),
         Command::Bench(options) => bench::run(&invocation, options),
         Command::Experiment(options) => experiment::run(&invocation, options),
@@ -665,57 +548,27 @@ fn suggest(error: Error) -> Error {
 impl Command {
     /// Returns the stages that a command runs, and its settings.
     fn on_stages(&self, common: &Common) -> Result<StageCommand<'_>> {
-        let on = |flag: bool, value: &'static str| flag.then_some(value);
-        let (input, until, keys) = match self {
-            Command::Run { input, clicks, .. } => (input, Stage::Metrics, clicks.keys()?),
-            Command::Mask { input, clicks, .. } => (input, Stage::Mask, clicks.keys()?),
-            Command::Baseline(input) => (input, Stage::Baseline, Vec::new()),
-            Command::Tface(input) => (input, Stage::Tface, Vec::new()),
-            Command::Iface(input) => (input, Stage::Iface, Vec::new()),
-            Command::Mesh { input, files, lobes, normal_map, no_cap } => {
-                let mut keys = files.keys();
-                keys.extend(key_options([
-                    ("--lobes", "mesh.lobes", lobes.as_deref()),
-                    ("--normal-map", "mesh.normal_map", on(*normal_map, "true")),
-                    ("--no-cap", "mesh.cap", on(*no_cap, "false")),
-                ]));
-                (input, Stage::Mesh, keys)
-            }
-            Command::Render { input, cameras, method, format, background } => {
-                let keys = key_options([
-                    ("--cameras", "render.cameras", cameras.as_deref()),
-                    ("--with", "render.method", method.as_deref()),
-                    ("--format", "render.format", format.as_deref()),
-                    ("--background", "render.background", background.as_deref()),
-                ]);
-                (input, Stage::Render, keys)
-            }
-            Command::Ensemble { input, members, weights } => {
-                let keys = key_options([
-                    ("--members", "ensemble.members", members.as_deref()),
-                    ("--weights", "ensemble.weights", weights.as_deref()),
-                ]);
-                (input, Stage::Ensemble, keys)
-            }
-            Command::Metrics { input, .. } => (input, Stage::Metrics, Vec::new()),
+        let (input, until, flags) = match self {
+            Command::Run { input, flags, .. } => (input, Stage::Metrics, Some(flags)),
+            Command::Mask { input, flags, .. } => (input, Stage::Mask, Some(flags)),
+            Command::Baseline(input) => (input, Stage::Baseline, None),
+            Command::Tface(input) => (input, Stage::Tface, None),
+            Command::Iface(input) => (input, Stage::Iface, None),
+            Command::Mesh { input, flags } => (input, Stage::Mesh, Some(flags)),
+            Command::Render { input, flags } => (input, Stage::Render, Some(flags)),
+            Command::Ensemble { input, flags } => (input, Stage::Ensemble, Some(flags)),
+            Command::Metrics { input, .. } => (input, Stage::Metrics, None),
             other => unreachable!("{other:?} runs no stage"),
         };
+        let keys = flags.map(KeyFlags::options).transpose()?.unwrap_or_default();
         let (product, require) = match self {
             Command::Run { require, .. } => ("run", &require[..]),
             Command::Metrics { require, .. } => ("metrics", &require[..]),
-            _ => (until.word(), &[][..]),
+            _ => (until.as_str(), &[][..]),
         };
         let target = RunTarget::find(common, input.path.as_deref())?;
         Ok(StageCommand { product, until, target, require, keys, fallback: None })
     }
-}
-
-/// Returns the given options of a command, each as the configuration key that it sets.
-fn key_options<const N: usize>(options: [(&str, &str, Option<&str>); N]) -> Vec<KeyOption> {
-    let given = options.into_iter().filter_map(|(option, key, value)| {
-        value.map(|v| (format!("{option} {v}"), key.to_string(), v.to_string()))
-    });
-    given.collect()
 }
 
 /// A running command.

@@ -4,10 +4,12 @@
 //! the wrong type or out of range is an error that names the line, the key and a suggested fix. The
 //! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
 //!
-//! Each stage owns its table, declared by `table!`: a key, its documentation, range and the values of the presets
-//! stand once, on its field. Everything here works on what serde says about them. A
-//! value that no user has a reason to change is a constant of the preset instead of a key, in the same place.
+//! Each stage owns its table, declared by `table!`: a key, its documentation, range, the products that it affects, its
+//! command-line option and the values of the presets stand once, on its field. Everything here works on what serde says
+//! about them; what makes a stage again is a filter over the rows ([`Config::settings_of`]), and code that names a key writes
+//! `key!(mesh.lobes)`. A value that no user has a reason to change is a constant of the preset instead of a key, in the same place.
 
+mod affects;
 pub mod iface;
 mod mask;
 mod mesh;
@@ -17,6 +19,7 @@ mod stage;
 mod table;
 mod vm;
 
+pub use affects::{Effect, Product};
 pub use iface::IfaceConfig;
 pub use mask::{
     CameraPoses, CaptureConfig, CutMethod, Exposures, HeadValue, MaskConfig, MaskHead, MaskMeaning,
@@ -27,16 +30,17 @@ pub use render::{
     EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
     display_name,
 };
-pub use source::{Sources, known_words};
+pub use source::{Fallback, Sources, known_words};
 pub use stage::Stage;
 pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
 use crate::io::{self, Limits};
 use crate::{Error, Result};
+use affects::affects;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use toml::{Table, Value};
 
@@ -51,17 +55,42 @@ pub struct Key {
     pub min: f64,
     /// Maximum; `f64::INFINITY` if unbounded or not numeric.
     pub max: f64,
+    /// What its value changes; empty: no result.
+    pub affects: &'static [Effect],
+    /// The option of commands that sets it.
+    pub flag: Option<Flag>,
+}
+
+/// An option of commands that sets a key.
+#[derive(Clone, Copy, Debug)]
+pub struct Flag {
+    /// Its name, without `--`.
+    pub long: &'static str,
+    /// The values that it takes.
+    pub takes: Takes,
+    /// The commands that have it.
+    pub commands: &'static [&'static str],
+    /// What it does; empty: the documentation of the key.
+    pub help: &'static str,
+}
+
+/// The values of a [`Flag`], with their name in help.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Takes {
+    /// One value.
+    Text(&'static str),
+    /// A file, which is stored by its absolute path.
+    File,
+    /// The option is repeatable: a list.
+    Each(&'static str),
+    /// None: the option stands for this value.
+    Switch(&'static str),
 }
 
 impl Key {
-    /// Returns a number between `min` and `max`, both allowed.
-    pub const fn number(name: &'static str, doc: &'static str, min: f64, max: f64) -> Key {
-        Key { name, doc, min, max }
-    }
-
-    /// Returns a word, text, switch or list.
-    pub const fn word(name: &'static str, doc: &'static str) -> Key {
-        Key { name, doc, min: f64::NEG_INFINITY, max: f64::INFINITY }
+    /// Returns whether the value of this key affects a product directly, with these settings.
+    pub fn affects(&self, product: Product, config: &Config) -> bool {
+        self.affects.iter().any(|effect| effect.reaches(product, config))
     }
 
     /// `1 to 64`, `at least 1`; empty where every value is allowed.
@@ -95,7 +124,7 @@ impl Preset {
     pub const ALL: [Preset; 4] = [Preset::Quick, Preset::Draft, Preset::Standard, Preset::Paper];
 
     /// Its word in the configuration.
-    pub fn name(self) -> &'static str {
+    pub fn as_str(self) -> &'static str {
         match self {
             Preset::Quick => "quick",
             Preset::Draft => "draft",
@@ -109,7 +138,7 @@ impl FromStr for Preset {
     type Err = Error;
 
     fn from_str(word: &str) -> Result<Preset> {
-        let found = Preset::ALL.into_iter().find(|preset| preset.name() == word);
+        let found = Preset::ALL.into_iter().find(|preset| preset.as_str() == word);
         found.ok_or_else(|| {
             Error::usage(format!("there is no preset `{word}`"), "use quick, draft, standard or paper")
         })
@@ -147,22 +176,32 @@ pub struct Config {
 }
 
 const ROOT_KEYS: &[Key] = &[
-    Key::word(
-        "preset",
-        "Preset that all other keys default to: quick (a look in minutes), draft (a first result), standard, paper (the \
-         published recipe).",
-    ),
-    Key::number(
-        "seed",
-        "Random seed; the same seed on the same device gives the same result.",
-        0.0,
-        i64::MAX as f64,
-    ),
-    Key::word(
-        "device",
-        "Device that fields are trained on: auto, cpu, wgpu, vulkan, metal or dx12, :N for an adapter by number; \
-         +deterministic accumulates in fixed point, +8GiB limits the memory.",
-    ),
+    Key {
+        name: "preset",
+        doc: "Preset that all other keys default to: quick (a look in minutes), draft (a first result), standard, paper \
+              (the published recipe).",
+        min: f64::NEG_INFINITY,
+        max: f64::INFINITY,
+        affects: affects!(Baseline, Tface, Iface),
+        flag: None,
+    },
+    Key {
+        name: "seed",
+        doc: "Random seed; the same seed on the same device gives the same result.",
+        min: 0.0,
+        max: i64::MAX as f64,
+        affects: affects!(Baseline, Tface, Iface),
+        flag: None,
+    },
+    Key {
+        name: "device",
+        doc: "Device that fields are trained on: auto, cpu, wgpu, vulkan, metal or dx12, :N for an adapter by number; \
+              +deterministic accumulates in fixed point, +8GiB limits the memory.",
+        min: f64::NEG_INFINITY,
+        max: f64::INFINITY,
+        affects: affects!(nothing),
+        flag: None,
+    },
 ];
 
 /// Every table with its keys, in pipeline order; the first has no name.
@@ -184,8 +223,47 @@ pub fn keys() -> impl Iterator<Item = (String, &'static str)> {
     all_keys().map(|(name, key)| (name, key.doc))
 }
 
+/// Returns whether a table has a key; the first table has no name.
+pub(crate) const fn is_key(table: &str, name: &str) -> bool {
+    let mut t = 0;
+    while t < TABLES.len() {
+        let (known, keys) = TABLES[t];
+        let mut k = 0;
+        while same(known, table) && k < keys.len() {
+            if same(keys[k].name, name) {
+                return true;
+            }
+            k += 1;
+        }
+        t += 1;
+    }
+    false
+}
+
+const fn same(a: &str, b: &str) -> bool {
+    let (a, b) = (a.as_bytes(), b.as_bytes());
+    let mut i = 0;
+    while i < a.len() && i < b.len() && a[i] == b[i] {
+        i += 1;
+    }
+    i == a.len() && i == b.len()
+}
+
+/// Returns the full name of a key, as in `key!(mesh.lobes)` or `key!(seed)`. A key that no table has does not compile.
+macro_rules! key {
+    ($table:ident . $name:ident) => {{
+        const _: () = assert!($crate::config::is_key(stringify!($table), stringify!($name)));
+        concat!(stringify!($table), ".", stringify!($name))
+    }};
+    ($name:ident) => {{
+        const _: () = assert!($crate::config::is_key("", stringify!($name)));
+        stringify!($name)
+    }};
+}
+pub(crate) use key;
+
 /// Returns every key with its full, dotted name.
-fn all_keys() -> impl Iterator<Item = (String, &'static Key)> {
+pub(crate) fn all_keys() -> impl Iterator<Item = (String, &'static Key)> {
     TABLES.iter().flat_map(|(table, keys)| keys.iter().map(|k| (dotted(table, k.name), k)))
 }
 
@@ -231,6 +309,20 @@ impl Config {
     /// Settings of the radiance field that the stage `baseline` or `tface` learns.
     pub fn radiance(&self, stage: Stage) -> VmConfig {
         if stage == Stage::Baseline { self.baseline.field(&self.tface) } else { self.tface.clone() }
+    }
+
+    /// Returns the configuration for the capture in a folder.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the path is not UTF-8, which a configuration file has to be.
+    pub fn with_capture(mut self, folder: PathBuf) -> Result<Config> {
+        if folder.to_str().is_none() {
+            let problem = format!("the path of the capture is not UTF-8: `{}`", folder.display());
+            return Err(Error::cannot(problem, "rename the folder"));
+        }
+        self.capture.path = folder;
+        Ok(self)
     }
 
     /// With the constants of its preset, which are not read from text.
@@ -279,12 +371,16 @@ impl Config {
         out
     }
 
-    /// Returns the values of one table (`iface`), by full name (`iface.steps`), as they are written in TOML:
-    /// what a stage's fingerprint is made of.
-    pub fn values(&self, table: &str) -> BTreeMap<String, String> {
-        let root = self.to_table();
+    /// Returns the keys that affect a product directly, by full name (`iface.steps`), with their values as they are written
+    /// in TOML: the settings in its fingerprint.
+    pub fn settings_of(&self, product: Product) -> BTreeMap<String, String> {
+        let root = match product {
+            // what the baseline takes from T-Face's table, with its differences from that
+            Product::Baseline => Config { tface: self.radiance(Stage::Baseline), ..self.clone() }.to_table(),
+            _ => self.to_table(),
+        };
         all_keys()
-            .filter(|(name, _)| name.split('.').next() == Some(table) && name.contains('.'))
+            .filter(|(_, key)| key.affects(product, self))
             .filter_map(|(name, _)| lookup(&root, &name).map(|v| (name, show(v))))
             .collect()
     }
@@ -330,7 +426,7 @@ pub struct Explained {
 /// Returns a key, or all keys of a table; an unknown name is an error that knows the nearest one.
 pub fn explained(name: &str) -> Result<Vec<Explained>> {
     let wanted = all_keys().filter(|(full, _)| full == name || full.starts_with(&format!("{name}.")));
-    let tables = Preset::ALL.map(|preset| (preset.name(), Config::preset(preset).to_table()));
+    let tables = Preset::ALL.map(|preset| (preset.as_str(), Config::preset(preset).to_table()));
     let one = |(full, key): (String, &Key)| {
         let value = |(preset, table): &(&'static str, Table)| Some((*preset, lookup(table, &full)?.clone()));
         let values = tables.iter().filter_map(value).collect();
@@ -353,8 +449,8 @@ pub fn explain(name: &str) -> Result<String> {
             let _ = writeln!(out, "  allowed: {allowed}");
         }
         let [quick, draft, standard, paper] =
-            Preset::ALL.map(|preset| values.get(preset.name()).map(show).unwrap_or_default());
-        if key == "preset" || (quick == draft && draft == standard && standard == paper) {
+            Preset::ALL.map(|preset| values.get(preset.as_str()).map(show).unwrap_or_default());
+        if key == key!(preset) || (quick == draft && draft == standard && standard == paper) {
             let _ = writeln!(out, "  default: {standard}");
         } else {
             let _ =

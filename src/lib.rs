@@ -12,7 +12,7 @@
 //! write_capture(folder.path(), &options)?;
 //!
 //! let mut config = Config::preset(Preset::Draft);
-//! config.capture.path = folder.path().display().to_string();
+//! config.capture.path = folder.path().into();
 //! (config.iface.steps, config.iface.rays, config.iface.samples) = (30, 128, 2048);
 //! (config.iface.levels, config.iface.log2_table) = (8, 12);
 //! (config.mesh.resolution, config.mesh.triangles, config.mesh.texture_px) = (48, 2000, 128);

@@ -159,6 +159,8 @@ mod exposure_tests;
 #[cfg(test)]
 mod path_tests;
 #[cfg(test)]
+mod plan_tests;
+#[cfg(test)]
 mod session_tests;
 #[cfg(test)]
 mod tests;

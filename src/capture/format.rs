@@ -143,7 +143,7 @@ const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
 /// is a capture's, even an unreadable one (photographs without cameras, a project of another program).
 pub fn is_run(folder: &Path) -> bool {
     let has_record = |stage: &Stage| {
-        ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.word()).join(f)))
+        ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.as_str()).join(f)))
     };
     let is_begun = || Stage::ALL.iter().any(has_record);
     let is_capture = || {
@@ -162,8 +162,10 @@ fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> E
 pub(super) fn explain(root: &Path) -> Error {
     let found = FolderEntries::of(root);
     if is_run(root)
-        && let Some(path) = Config::of_run(root).map(|run| run.capture.path).filter(|path| !path.is_empty())
+        && let Some(path) =
+            Config::of_run(root).map(|run| run.capture.path).filter(|path| !path.as_os_str().is_empty())
     {
+        let path = path.display();
         let hint = format!("inspect its capture, `{path}`; `tiface status` shows the state of the run");
         return not_a_capture(root, "it is the folder of a run", hint);
     }

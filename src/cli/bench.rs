@@ -1,10 +1,10 @@
 //! `tiface bench`: speed against error of settings, measured on this machine.
 
 use super::Invocation;
-use super::options::{Common, RunTarget};
+use super::options::RunTarget;
 use super::out::Out;
 use super::screen::print;
-use crate::config::{Config, Preset};
+use crate::config::{Config, Fallback, Preset};
 use crate::io::{self, Limits};
 use crate::pipeline::{Bench, SWEEPS, Session, check_feasible, require_device};
 use crate::report::bench::BenchResult;
@@ -30,7 +30,7 @@ pub(super) struct BenchOptions {
 }
 
 /// Half the steps of the preset `draft`, so that all sweeps end within minutes.
-const BENCH_SETTINGS: &str = "iface.steps = 1500\n";
+const START: Fallback = (Preset::Draft, |config| config.iface.steps = 1500);
 
 /// Files in the folder of a bench.
 const RESULTS: &str = "bench.json";
@@ -51,7 +51,7 @@ pub(super) fn run(invocation: &Invocation, options: &BenchOptions) -> Result<()>
     let Invocation { common, screen, .. } = invocation;
     let out = Out::find(common.out.as_deref(), "bench")?;
     let target = RunTarget::find(common, Some(&options.path))?;
-    let config = configure(common, &target)?;
+    let config = target.configure(common, Some(START), &[])?;
     check_feasible(&config)?;
     require_device(&config)?;
     let name = target.run.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
@@ -128,16 +128,4 @@ fn measure(
         io::write_atomic(&folder.join(RESULTS), result.json().as_bytes())?;
     }
     Ok(())
-}
-
-/// Returns a run's own configuration, or that of a bench on a capture.
-fn configure(common: &Common, target: &RunTarget) -> Result<Config> {
-    let mut config = common.resolve(target.saved.as_deref(), Some((Preset::Draft, BENCH_SETTINGS)), &[])?;
-    if let Some(capture) = &target.capture {
-        config.capture.path = capture.to_str().map(String::from).ok_or_else(|| {
-            let shown = capture.display();
-            Error::cannot(format!("the path of the capture is not UTF-8: `{shown}`"), "rename the folder")
-        })?;
-    }
-    Ok(config)
 }

@@ -56,10 +56,8 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
 fn capture_of(common: &Common, path: &Path) -> Result<(Config, PathBuf)> {
     let saved = capture::is_run(path).then(|| path.join("config.toml"));
     let config = common.resolve(saved.as_deref(), None, &[])?;
-    let root = match config.capture.path.as_str() {
-        known if saved.is_some() && !known.is_empty() => known.into(),
-        _ => path.into(),
-    };
+    let known = &config.capture.path;
+    let root = if saved.is_some() && !known.as_os_str().is_empty() { known.clone() } else { path.into() };
     Ok((config, root))
 }
 

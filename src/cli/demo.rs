@@ -5,7 +5,7 @@ use super::options::RunTarget;
 use super::out::Out;
 use super::run::{StageCommand, run as run_stages};
 use crate::capture::synthetic::{MadeCapture, SyntheticOptions, check, write_borders, write_capture};
-use crate::config::Preset;
+use crate::config::{Fallback, Preset};
 use crate::io;
 use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
 use crate::report::duration;
@@ -14,12 +14,10 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// Settings of the demo: few steps, because its pictures are small.
-pub(super) const DEMO_SETTINGS: &str = "\
-tface.steps = 800
-tface.rays = 2048
-baseline.steps = 600
-baseline.rays = 2048
-";
+pub(super) const DEMO: Fallback = (Preset::Draft, |config| {
+    (config.tface.steps, config.tface.rays) = (800, 2048);
+    (config.baseline.steps, config.baseline.rays) = (600, 2048);
+});
 
 pub(super) fn run(
     invocation: &Invocation,
@@ -41,7 +39,7 @@ pub(super) fn run(
     }
     // repeated, the demo continues with its saved settings
     let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
-    let fallback = Some((Preset::Draft, DEMO_SETTINGS));
+    let fallback = Some(DEMO);
     // command-line errors are reported before any photograph is rendered
     Out::find(common.out.as_deref(), "run")?;
     let config = common.resolve(saved.as_deref(), fallback, &[])?;

@@ -8,7 +8,7 @@ use super::run::in_words;
 use super::screen::{Screen, print};
 use crate::capture::is_run;
 use crate::capture::synthetic::SyntheticOptions;
-use crate::config::Config;
+use crate::config::{Config, key};
 use crate::io::{self, Limits};
 use crate::pipeline::Session;
 use crate::pipeline::experiment::{
@@ -155,18 +155,11 @@ impl Plan {
                 "rename one of the folders",
             ));
         }
-        let text = real.to_str().ok_or_else(|| {
-            Error::cannot(
-                format!("the path of the capture is not UTF-8: `{}`", real.display()),
-                "rename the folder",
-            )
-        })?;
         let mut set = common.set.clone();
-        set.extend(common.device_word().iter().map(|d| format!("device={d}")));
-        set.extend(common.seed.iter().map(|s| format!("seed={s}")));
+        set.extend(common.device_word().iter().map(|d| format!("{}={d}", key!(device))));
+        set.extend(common.seed.iter().map(|s| format!("{}={s}", key!(seed))));
         for run in runs(&self.table_names()) {
-            let mut config = config(run, options.scale, &set)?;
-            config.capture.path = text.into();
+            let mut config = config(run, options.scale, &set)?.with_capture(real.clone())?;
             without_masks(run, &mut config);
             let name = format!("{capture}/{run}");
             let is_named = options.only.is_empty() || options.only.contains(&name);

@@ -1,22 +1,18 @@
 //! `tiface export`: writes the finished mesh of a run again.
 
 use super::Invocation;
-use super::options::{KeyOption, RunTarget};
+use super::flags::KeyFlags;
+use super::options::RunTarget;
 use super::out::{Out, require_outside, write_head};
 use super::screen::print;
-use crate::config::{Config, MeshFormat, Stage};
+use crate::config::{Config, MeshFormat, Stage, key};
 use crate::pipeline::KeptHead;
 use crate::{Error, Quiet, Result, io};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Writes the mesh of a run with the settings `keys`; `lists_formats` if they name formats.
-pub(super) fn run(
-    invocation: &Invocation,
-    path: Option<&Path>,
-    lists_formats: bool,
-    keys: &[KeyOption],
-) -> Result<()> {
+/// Writes the mesh of a run with the settings of these options.
+pub(super) fn run(invocation: &Invocation, path: Option<&Path>, flags: &KeyFlags) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
     let out = Out::find(common.out.as_deref(), "export")?;
     let target = RunTarget::find(common, path)?;
@@ -27,7 +23,8 @@ pub(super) fn run(
     if target.guessed {
         screen.note("run", &format!("using `{}`", target.run.display()));
     }
-    let asked = common.resolve(Some(saved), None, keys)?;
+    let asked = common.resolve(Some(saved), None, &flags.options()?)?;
+    let lists_formats = flags.typed(key!(mesh.format)).is_some();
     let files = destinations(out.as_ref(), &target.run, lists_formats, &asked)?;
     // a file of the run may be put back, but not replaced by another
     let (own, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| is_own(file, &target.run));
@@ -69,7 +66,7 @@ fn is_own((file, format): &(PathBuf, MeshFormat), run: &Path) -> bool {
     let folder = file.parent().and_then(|folder| io::real_path(folder).ok());
     let is_there =
         folder.is_some_and(|folder| io::real_path(&run.join(Stage::Mesh)).is_ok_and(|own| own == folder));
-    is_there && file.file_name().is_some_and(|name| name == format!("head.{}", format.ending()).as_str())
+    is_there && file.file_name().is_some_and(|name| name == format!("head.{}", format.as_str()).as_str())
 }
 
 /// Returns the files to write with their formats: `--out`, files in its folder, or else files in the working directory with
@@ -82,13 +79,13 @@ fn destinations(
 ) -> Result<Vec<(PathBuf, MeshFormat)>> {
     let formats = &asked.mesh.format;
     let named = |folder: &Path, stem: &str| {
-        let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.ending())), *format);
+        let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.as_str())), *format);
         formats.iter().map(file).collect()
     };
     match out {
         Some(Out::File(file, ending)) => {
             let format =
-                MeshFormat::of_ending(ending).filter(|format| !lists_formats || formats == &[*format]);
+                ending.parse().ok().filter(|format: &MeshFormat| !lists_formats || formats == &[*format]);
             let format = format.ok_or_else(|| {
                 let what =
                     format!("`--out {}` is one .{ending}, and `--format` lists others", file.display());

@@ -2,7 +2,7 @@
 
 use super::complete::complete_setting;
 use crate::capture::is_run;
-use crate::config::{Config, Preset, Sources, Stage};
+use crate::config::{Config, Fallback, Preset, Sources, Stage, key};
 use crate::io::{self, Limits};
 use crate::{Error, Result};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -29,7 +29,7 @@ pub(super) struct Common {
     pub config: Vec<PathBuf>,
     /// Configuration preset
     #[arg(long, global = true)]
-    #[arg(value_parser = PossibleValuesParser::new(Preset::ALL.map(Preset::name)).try_map(|word| word.parse::<Preset>()))]
+    #[arg(value_parser = PossibleValuesParser::new(Preset::ALL.map(Preset::as_str)).try_map(|word| word.parse::<Preset>()))]
     pub preset: Option<Preset>,
     /// Set a configuration key; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE", add = ArgValueCompleter::new(complete_setting))]
@@ -48,7 +48,7 @@ pub(super) struct Common {
     pub seed: Option<u64>,
     /// Recompute a stage and all stages that depend on it
     #[arg(long, global = true, value_name = "STAGE")]
-    #[arg(value_parser = PossibleValuesParser::new(Stage::ALL.map(Stage::word)).try_map(|word| word.parse::<Stage>()))]
+    #[arg(value_parser = PossibleValuesParser::new(Stage::ALL.map(Stage::as_str)).try_map(|word| word.parse::<Stage>()))]
     pub fresh: Option<Stage>,
     /// Print the plan without running it
     #[arg(long, global = true)]
@@ -101,28 +101,23 @@ impl Common {
     /// Returns the configuration from, in rising priority: the user's file, `TIFACE_PRESET`, the run's (`saved`),
     /// `--config`, `--set`, options.
     ///
-    /// `fallback` is the preset if no source names one, and settings on top of it, as TOML.
+    /// `fallback` is the start if no source names a preset.
     pub fn resolve(
         &self,
         saved: Option<&Path>,
-        fallback: Option<(Preset, &str)>,
+        fallback: Option<Fallback>,
         options: &[KeyOption],
     ) -> Result<Config> {
-        let mut sources = Sources {
-            preset: self.preset,
-            fallback: fallback.map(|(preset, text)| (preset, text.into())),
-            set: self.set.clone(),
-            ..Sources::default()
-        };
+        let mut sources =
+            Sources { preset: self.preset, fallback, set: self.set.clone(), ..Sources::default() };
         let own = own_file().filter(|f| io::is_file(f));
         let has_own = usize::from(own.is_some());
         let mut files = Vec::from_iter(own);
+        let mut photographed = PathBuf::new();
         match saved {
             Some(saved) if self.preset.is_some() => {
                 // another preset starts over on the same photographs: the saved values would override all of it
-                let path = Common::default().resolve(Some(saved), None, &[])?.capture.path;
-                let text = format!("capture.path = {}", toml::Value::from(path));
-                sources.files.push((saved.display().to_string(), text));
+                photographed = Common::default().resolve(Some(saved), None, &[])?.capture.path;
             }
             saved => files.extend(saved.map(Path::to_path_buf)),
         }
@@ -139,13 +134,18 @@ impl Common {
             sources.files.insert(has_own, ("TIFACE_PRESET".into(), format!("preset = {word:?}")));
         }
         if let Some(word) = self.device_word() {
-            sources.options.push((format!("--device {word}"), "device".into(), word));
+            sources.options.push((format!("--device {word}"), key!(device).into(), word));
         }
         if let Some(seed) = self.seed {
-            sources.options.push((format!("--seed {seed}"), "seed".into(), seed.to_string()));
+            sources.options.push((format!("--seed {seed}"), key!(seed).into(), seed.to_string()));
         }
         sources.options.extend_from_slice(options);
-        Config::resolve(&sources)
+        let config = Config::resolve(&sources)?;
+        if config.capture.path.as_os_str().is_empty() {
+            config.with_capture(photographed)
+        } else {
+            Ok(config)
+        }
     }
 
     /// Returns the device option with its modifiers, or `None` if no option of the device is given.
@@ -216,6 +216,30 @@ impl RunTarget {
         }
     }
 
+    /// Returns the configuration for this target: the capture's path absolute, so that the run finds it from any working
+    /// directory.
+    ///
+    /// # Errors
+    ///
+    /// Fails if no source names a capture, or if its path is not UTF-8.
+    pub fn configure(
+        &self,
+        common: &Common,
+        fallback: Option<Fallback>,
+        options: &[KeyOption],
+    ) -> Result<Config> {
+        let config = common.resolve(self.saved.as_deref(), fallback, options)?;
+        let folder = match &self.capture {
+            Some(capture) => capture.clone(),
+            None if config.capture.path.as_os_str().is_empty() => {
+                return Err(Error::usage("no capture is named", "name one: `tiface run CAPTURE`"));
+            }
+            // one that was moved is as it is recorded
+            None => io::real_path(&config.capture.path).unwrap_or_else(|_| config.capture.path.clone()),
+        };
+        config.with_capture(folder)
+    }
+
     fn run(run: PathBuf, guessed: bool) -> RunTarget {
         RunTarget { saved: Some(run.join("config.toml")), run, capture: None, guessed }
     }
@@ -257,7 +281,7 @@ mod tests {
         assert_eq!(found.capture.path, config.capture.path);
         // they may have been moved
         common.set = vec!["capture.path=/elsewhere".into()];
-        assert_eq!(common.resolve(Some(&saved), None, &[]).unwrap().capture.path, "/elsewhere");
+        assert_eq!(common.resolve(Some(&saved), None, &[]).unwrap().capture.path, Path::new("/elsewhere"));
     }
 
     #[test]

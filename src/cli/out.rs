@@ -72,7 +72,7 @@ impl Out {
 
     /// Refuses a folder inside the run, and a mesh file if none of these stages makes a mesh.
     pub fn check(&self, run: &Path, stages: &[Stage]) -> Result<()> {
-        let mesh = matches!(self, Out::File(_, ending) if MeshFormat::of_ending(ending).is_some());
+        let mesh = matches!(self, Out::File(_, ending) if ending.parse::<MeshFormat>().is_ok());
         if mesh && !stages.contains(&Stage::Mesh) {
             return Err(Error::usage(
                 "these settings make no mesh that `--out` could write",
@@ -102,7 +102,7 @@ impl Out {
     pub fn write(&self, product: &str, session: &Session, run: &Run) -> Result<Vec<PathBuf>> {
         self.prepare()?;
         match self {
-            Out::File(file, ending) if let Some(format) = MeshFormat::of_ending(ending) => {
+            Out::File(file, ending) if let Ok(format) = ending.parse() => {
                 let head = KeptHead::read(run.dir(), session.config())?;
                 write_head(file, &head, format, &mut |warning| run.warn("mesh", warning))
             }

@@ -56,7 +56,7 @@ fn are_comparable(a: &Path, b: &Path) -> bool {
     let capture = |run: &Path| {
         let is_judged = read_record(&run.join(Stage::Metrics)).is_ok_and(|record| record.is_some());
         let path = Config::of_run(run).filter(|_| is_judged)?.capture.path;
-        Some(io::real_path(Path::new(&path)).unwrap_or(path.into()))
+        Some(io::real_path(&path).unwrap_or(path))
     };
     capture(a).is_some_and(|a| Some(a) == capture(b))
 }

@@ -5,13 +5,13 @@ use super::Invocation;
 use super::options::{Common, KeyOption, RunTarget};
 use super::out::Out;
 use super::screen::{figure, one_line, print};
-use crate::config::{Config, NAMES, Preset, RenderConfig, display_name};
+use crate::config::{Fallback, NAMES, RenderConfig, display_name, key};
 use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::{blend_verdict, duration, height, judged_by};
 use crate::run::{Cost, Done, Phase, Run, RunStatus, read_record};
 use crate::{Error, ErrorKind, Result, io};
 use serde_json::{Map, Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// A command that runs stages.
 pub(super) struct StageCommand<'a> {
@@ -25,19 +25,19 @@ pub(super) struct StageCommand<'a> {
     pub require: &'a [String],
     /// Options of this command that set keys of the configuration.
     pub keys: Vec<KeyOption>,
-    /// The preset if no other is named, and settings on top of it, as TOML.
-    pub fallback: Option<(Preset, &'static str)>,
+    /// The start if no other source names a preset.
+    pub fallback: Option<Fallback>,
 }
 
 /// Completes the stages that a command needs, and writes its product to `--out`.
 pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()> {
     let Invocation { common, screen, stop } = invocation;
-    let StageCommand { product, until, target, require, .. } = command;
+    let StageCommand { product, until, target, require, keys, fallback } = command;
     let out = Out::find(common.out.as_deref(), product)?;
     if target.guessed {
         screen.note("run", &format!("using `{}`", target.run.display()));
     }
-    let mut config = configure(common, command)?;
+    let mut config = target.configure(common, *fallback, keys)?;
     // these options set how the views of a path are rendered; the evaluation's views keep their settings
     let path = (*until == Stage::Render && config.render.cameras != "test").then(|| config.render.clone());
     if path.is_some() {
@@ -113,7 +113,8 @@ fn saved_config(run: &Run) -> Option<String> {
 
 /// Returns settings without the device: stages of one run may be computed on several devices.
 fn without_device(settings: &str) -> String {
-    settings.lines().filter(|line| !line.starts_with("device = ")).map(|line| format!("{line}\n")).collect()
+    let device = format!("{} = ", key!(device));
+    settings.lines().filter(|line| !line.starts_with(&device)).map(|line| format!("{line}\n")).collect()
 }
 
 /// Returns the plan up to `until`: a row for each stage with its estimated cost, and the total.
@@ -165,29 +166,6 @@ pub(super) fn in_words(cost: Cost) -> String {
     let (memory, disk) = (gib(cost.memory_bytes), gib(cost.disk_bytes));
     let time = duration(cost.seconds());
     format!("about {time} on the CPU, {memory:.1} GiB of memory, {disk:.1} GiB of disk")
-}
-
-/// Returns the effective configuration of a target and the options, with the capture's absolute path.
-fn configure(common: &Common, command: &StageCommand) -> Result<Config> {
-    let StageCommand { target, fallback, keys, .. } = command;
-    let mut keys = keys.clone();
-    if let Some(capture) = &target.capture {
-        let path = capture.to_str().ok_or_else(|| {
-            let shown = capture.display();
-            Error::cannot(format!("the path of the capture is not UTF-8: `{shown}`"), "rename the folder")
-        })?;
-        keys.push((format!("CAPTURE {path}"), "capture.path".into(), path.into()));
-    }
-    let mut config = common.resolve(target.saved.as_deref(), *fallback, &keys)?;
-    // an absolute path, so that the run finds its capture from any working directory
-    if let Some(path) = io::real_path(Path::new(&config.capture.path)).ok().as_deref().and_then(Path::to_str)
-    {
-        config.capture.path = path.into();
-    }
-    if config.capture.path.is_empty() {
-        return Err(Error::usage("no capture is named", "name one: `tiface run CAPTURE`"));
-    }
-    Ok(config)
 }
 
 /// Returns how the evaluation's views are rendered: by the run's saved settings, else by the defaults and `--set`, but
@@ -267,7 +245,7 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
         let faults = record.map_or(Vec::new(), |record| record.faults(&run.path(Stage::Mesh)));
         faults.iter().for_each(|fault| row("", &one_line(&fault.to_string())));
     }
-    for (stage, folder) in [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.word())] {
+    for (stage, folder) in [(Stage::Render, views), (Stage::Ensemble, Stage::Ensemble.as_str())] {
         if summary(stage).is_some() {
             row("pictures", &run.path(folder).display());
         }

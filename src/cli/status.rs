@@ -299,7 +299,7 @@ fn objects(runs: &[(&Path, Result<RunStatus>)], failed: bool) -> String {
             Err(e) => json!({"run": run, "state": Phase::Unreadable, "error": e.to_string()}),
             Ok(s) => {
                 let stages: Vec<Value> = s.stages.iter().map(stage_object).collect();
-                json!({"run": run, "state": s.phase, "stage": s.at.map(|s| s.word()), "error": s.error,
+                json!({"run": run, "state": s.phase, "stage": s.at.map(|s| s.as_str()), "error": s.error,
                     "elapsed_s": s.elapsed_s, "left_s": s.left_s, "stages": stages})
             }
         };
@@ -309,7 +309,8 @@ fn objects(runs: &[(&Path, Result<RunStatus>)], failed: bool) -> String {
 }
 
 fn stage_object(s: &crate::run::StageStatus) -> Value {
-    let mut value = json!({"stage": s.stage.word(), "state": s.phase, "left_s": s.left_s, "error": s.error});
+    let mut value =
+        json!({"stage": s.stage.as_str(), "state": s.phase, "left_s": s.left_s, "error": s.error});
     if let Some(status) = &s.status {
         value["step"] = json!(status.step);
         value["steps"] = json!(status.steps);
@@ -338,7 +339,7 @@ fn stages(run: &Path, status: &RunStatus) -> String {
         let _ = writeln!(text, "{:<24} {stage:<8} {}", one_line(&run.display().to_string()), one_line(words));
     };
     for s in &status.stages {
-        row(s.stage.word(), &of_stage(s));
+        row(s.stage.as_str(), &of_stage(s));
     }
     for path in io::list_folders(&run.join("render/paths")).unwrap_or_default() {
         let name = format!("render/paths/{}", path.file_name().unwrap_or_default().to_string_lossy());

@@ -63,43 +63,43 @@ table! {
     pub struct IfaceConfig;
     keys {
         /// Kind of field: sdf (signed distance, as in NeuS) or density (Instant-NeRF, in preset paper).
-        field: FieldKind => FieldKind::Sdf;
+        field: FieldKind [Iface] => FieldKind::Sdf;
         /// Optimizer steps.
-        steps: u64, 1.0..=1e7 => 3000, 8000, 20_000, 1200;
+        steps: u64, 1.0..=1e7 [Iface] => 3000, 8000, 20_000, 1200;
         /// Rays per step at the start.
-        rays: usize, 1.0..=1_048_576.0 => 1024, 1024, 256;
+        rays: usize, 1.0..=1_048_576.0 [Iface] => 1024, 1024, 256;
         /// Largest number of rays per step; the number adapts to `samples`.
-        max_rays: usize, 1.0..=1_048_576.0 => 8192;
+        max_rays: usize, 1.0..=1_048_576.0 [Iface] => 8192;
         /// Target number of samples per step, over all rays.
-        samples: usize, 64.0..=1e8 => 24_576, 24_576, 262_144;
+        samples: usize, 64.0..=1e8 [Iface] => 24_576, 24_576, 262_144;
         /// Levels of the hash grid.
-        levels: usize, 1.0..=32.0 => 14, 14, 16;
+        levels: usize, 1.0..=32.0 [Iface] => 14, 14, 16;
         /// Cells per axis of the coarsest level.
-        base_resolution: u32, 2.0..=1024.0 => 16, 16, 32;
+        base_resolution: u32, 2.0..=1024.0 [Iface] => 16, 16, 32;
         /// Ratio of the resolutions of consecutive levels.
-        growth: f64, 1.0..=4.0 => 1.4, 1.4, 1.319_507_910_772_894_2;
+        growth: f64, 1.0..=4.0 [Iface] => 1.4, 1.4, 1.319_507_910_772_894_2;
         /// Binary logarithm of a level's largest table.
-        log2_table: u32, 4.0..=24.0 => 18, 19, 19;
+        log2_table: u32, 4.0..=24.0 [Iface] => 18, 19, 19;
         /// Largest ratio of the local to the smallest width of the surface, for hair (spatially varying sharpness, after
         /// Adaptive Shells, Wang et al. 2023); 1: one sharpness everywhere (published).
-        soften: f64, 1.0..=1e3 => 8.0, 8.0, 1.0;
+        soften: f64, 1.0..=1e3 [Iface] => 8.0, 8.0, 1.0;
         /// Learning rate of the hash table at its peak.
-        lr_table: f64, 0.0..=1.0 => 1e-2;
+        lr_table: f64, 0.0..=1.0 [Iface] => 1e-2;
         /// Learning rate of the networks at its peak.
-        lr_network: f64, 0.0..=1.0 => 5e-3, 5e-3, 1e-2;
+        lr_network: f64, 0.0..=1.0 [Iface] => 5e-3, 5e-3, 1e-2;
         /// Weight of the mask's binary cross entropy.
-        mask: f64, 0.0..=1e6 => 0.1;
+        mask: f64, 0.0..=1e6 [Iface] => 0.1;
         /// Weight of the eikonal loss, mean (‖∇sdf‖ − 1)².
-        eikonal: f64, 0.0..=1e6 => 0.1;
+        eikonal: f64, 0.0..=1e6 [Iface] => 0.1;
         /// Weight of the sparsity term, the mean of exp(-scale * |sdf|).
-        sparsity: f64, 0.0..=1e6 => 0.0, 0.0, 0.5;
+        sparsity: f64, 0.0..=1e6 [Iface] => 0.0, 0.0, 0.5;
         /// Weight of the distance to multi-view stereo points, which are found on the surface after 0.6 of the steps; 0:
         /// none (published).
-        stereo: f64, 0.0..=1e6 => 0.02, 0.02, 0.0;
+        stereo: f64, 0.0..=1e6 [Iface] => 0.02, 0.02, 0.0;
         /// Cells per axis of the occupancy grid.
-        occupancy_resolution: usize, 8.0..=1024.0 => 160, 160, 128;
+        occupancy_resolution: usize, 8.0..=1024.0 [Iface] => 160, 160, 128;
         /// Seconds between checkpoints.
-        checkpoint_s: f64, 0.05..=86_400.0 => 60.0;
+        checkpoint_s: f64, 0.05..=86_400.0 [nothing] => 60.0;
     }
     constants {
         /// Levels that are active at the first step.

@@ -1,33 +1,40 @@
 //! `[capture]`: how a capture is read; `[mask]`: where head masks come from.
 
 use super::table::table;
+use super::{Config, key};
 use serde::{Deserialize, Serialize};
 use std::fmt;
+use std::path::PathBuf;
 
 table! {
     /// How a capture is read.
     pub struct CaptureConfig;
     keys {
         /// Folder of the capture; stored in the run.
-        path: String => String::new();
+        path: PathBuf [nothing] => PathBuf::new();
         /// Integer factor by which photographs are reduced, by averaging.
-        downscale: u32, 1.0..=64.0 => 1;
+        downscale: u32, 1.0..=64.0 [Masks] => 1;
         /// Poses of the training views: auto (measured on the photographs, and refined where they do not fit), refine
         /// (always) or given.
-        cameras: CameraPoses => CameraPoses::Auto, CameraPoses::Auto, CameraPoses::Given;
+        cameras: CameraPoses [Masks] => CameraPoses::Auto, CameraPoses::Auto, CameraPoses::Given;
         /// Exposure and white balance of the photographs: auto (measured, and divided out of the training photographs where
         /// they differ) or given (photographs are used as they are).
-        exposure: Exposures => Exposures::Auto, Exposures::Auto, Exposures::Given;
+        exposure: Exposures [Masks] => Exposures::Auto, Exposures::Auto, Exposures::Given;
         /// Bounding box of the fields: head (found from cameras and masks), ilsh (published: ±0.45, ±0.501, ±0.3 dataset
         /// units for radiance, ±0.3 for I-Face; falls back to head if the head is elsewhere) or six numbers in dataset
         /// units, lowest corner first.
-        r#box: String => "head".into(), "head".into(), "ilsh".into();
+        r#box: String [Masks] => "head".into(), "head".into(), "ilsh".into();
         /// Length of one dataset unit, meters.
-        unit_m: f64, 1e-6..=1e6 => 1.0;
+        unit_m: f64, 1e-6..=1e6 [Masks, Files] => 1.0;
         /// Folder of masks inside the capture, named like the photographs; empty: search for one.
-        mask_dir: String => String::new();
+        mask_dir: String [Masks] => String::new();
         /// Share of the training pixels that is held out, in small squares, to fit the weights of the blend; 0: none.
-        tiles: f64, 0.0..=0.25 => 0.04, 0.04, 0.0;
+        tiles: f64, 0.0..=0.25 [
+            Baseline if |c| c.baseline.import.is_empty(),
+            Tface if |c| c.tface.import.is_empty(),
+            Iface,
+            Blend if |c| c.ensemble.weights.is_empty()
+        ] => 0.04, 0.04, 0.0;
     }
 }
 
@@ -199,54 +206,74 @@ pub enum VitmatteColors {
     Half,
 }
 
+/// Returns whether the run makes masks.
+fn made(config: &Config) -> bool {
+    config.mask.makes_masks()
+}
+
+/// Returns whether masks are those of the capture.
+fn read(config: &Config) -> bool {
+    !config.mask.makes_masks()
+}
+
 table! {
     /// Where masks come from, what they mean, and how they are made from clicks.
     pub struct MaskConfig;
     keys {
         /// Where masks come from: auto (clicks or an alpha network if given, else those of the capture), alpha, folder
         /// (capture.mask_dir), clicks, network or none (no masks: everything the cameras see is reconstructed).
-        source: MaskSource => MaskSource::Auto;
+        source: MaskSource [Masks] => MaskSource::Auto;
         /// Train even with masks that look wrong: inverted ones, and those that contradict the others.
-        trust: bool => false;
+        trust: bool [nothing] => false;
         /// Meaning of pixels outside a mask: empty (no head) or ignore (unknown).
-        meaning: MaskMeaning => MaskMeaning::Empty;
+        meaning: MaskMeaning [Masks] => MaskMeaning::Empty;
         /// Pixels of the capture's mask files that are the head: white (gray is opacity; a single other color on black is
         /// taken for white), not-black, or values and colors, as 1,2,17 (labels) or #5000ff,#ff0000.
-        head: MaskHead => MaskHead::White;
+        head: MaskHead [Masks if read, Metrics if made] => MaskHead::White;
         /// File of clicks to make masks from: a prompts.json, as `tiface mask --page` saves it.
-        prompts: String => String::new();
+        #[flag("prompts", File, ["run", "mask"], "Make masks from the clicks in a prompts.json")]
+        prompts: String [nothing] => String::new();
         /// List of clicks x,y,label on one photograph (label 1: head, 0: background), for a quick try.
-        point: Vec<String> => Vec::new();
+        #[flag("point", Each("X,Y,LABEL"), ["run", "mask"],
+            "Click on one photograph: 1 for the head, 0 for background; repeatable")]
+        point: Vec<String> [nothing] => Vec::new();
         /// View of `mask.point`; empty: the first training view.
-        view: String => String::new();
+        #[flag("view", Text("NAME"), ["run", "mask"], "View of --point [default: the first training view]")]
+        view: String [nothing] => String::new();
         /// Method for a hard mask: auto (sam if its files are given), grabcut (built in) or sam.
-        cut: CutMethod => CutMethod::Auto;
+        cut: CutMethod [Masks if made] => CutMethod::Auto;
         /// Method for the alpha: auto (vitmatte if its file is given), closed (closed form, built in) or vitmatte.
-        matting: MattingMethod => MattingMethod::Auto;
+        matting: MattingMethod [Masks if made] => MattingMethod::Auto;
         /// Image encoder of SAM, an ONNX file (needs a build with the feature `matting`).
-        sam: String => String::new();
+        #[flag("sam", File, ["run", "mask"], "Image encoder of SAM, an ONNX file; needs --sam-decoder")]
+        sam: String [nothing] => String::new();
         /// Prompt encoder and mask decoder of SAM, an ONNX file.
-        sam_decoder: String => String::new();
+        #[flag("sam-decoder", File, ["run", "mask"])]
+        sam_decoder: String [nothing] => String::new();
         /// ViTMatte, an ONNX file (needs a build with the feature `matting`).
-        vitmatte: String => String::new();
+        #[flag("vitmatte", File, ["run", "mask"], "ViTMatte, an ONNX file")]
+        vitmatte: String [nothing] => String::new();
         /// Network that predicts alpha without clicks (U²-Net, ISNet, MODNet, BiRefNet), an ONNX file (needs a build
         /// with the feature `matting`).
-        alpha_net: String => String::new();
+        #[flag("alpha-net", File, ["run", "mask"],
+            "Make masks without clicks, by a network that predicts alpha (U²-Net, ISNet, MODNet, BiRefNet), an \
+             ONNX file")]
+        alpha_net: String [nothing] => String::new();
         /// Size and normalization of its input: auto (from the file beside it, else by its name), SIDE,MEAN,SCALE as
         /// 1024,0.5,1, or SIDE,imagenet.
-        alpha_input: String => "auto".into();
+        alpha_input: String [Masks if |c| c.mask.with_alpha_net()] => "auto".into();
         /// Normalization of the input of ViTMatte: auto (from the file beside it, else imagenet), imagenet or half.
-        vitmatte_colors: VitmatteColors => VitmatteColors::Auto;
+        vitmatte_colors: VitmatteColors [Masks if made] => VitmatteColors::Auto;
         /// Largest memory for running networks, GiB.
-        memory_gib: f64, 0.25..=1024.0 => 12.0;
+        memory_gib: f64, 0.25..=1024.0 [nothing] => 12.0;
         /// Longest side of the input of SAM and matting, pixels.
-        side_px: u32, 64.0..=8192.0 => 1024;
+        side_px: u32, 64.0..=8192.0 [Masks if made] => 1024;
         /// Half width of the unknown band around the outline, as a share of the height.
-        band: f32, 0.0..=0.5 => 0.023;
+        band: f32, 0.0..=0.5 [Masks if made] => 0.023;
         /// Side of the square structuring element that makes the band, pixels (published: 10); 0: use `band`.
-        kernel: u32, 0.0..=1000.0 => 0, 0, 10;
+        kernel: u32, 0.0..=1000.0 [Masks if made] => 0, 0, 10;
         /// Number of erosions and dilations with that square (published: 5).
-        iterations: u32, 0.0..=1000.0 => 5;
+        iterations: u32, 0.0..=1000.0 [Masks if made] => 5;
     }
 }
 
@@ -300,53 +327,53 @@ impl MaskConfig {
         let given = !self.prompts.is_empty() || !self.point.is_empty();
         let problem = |key, problem: &str, hint| Some((key, problem.to_owned(), hint));
         if !self.prompts.is_empty() && !self.point.is_empty() {
-            return problem("mask.point", "is given beside `mask.prompts`", "give one of them");
+            return problem(key!(mask.point), "is given beside `mask.prompts`", "give one of them");
         }
         match self.source {
             MaskSource::Clicks if !given => {
                 return problem(
-                    "mask.source",
+                    key!(mask.source),
                     "is clicks, but there are none",
                     "name a file: `--prompts prompts.json`",
                 );
             }
             MaskSource::Network if self.alpha_net.is_empty() => {
                 let hint = "name its file: `--alpha-net FILE.onnx`";
-                return problem("mask.source", "is network, but there is none", hint);
+                return problem(key!(mask.source), "is network, but there is none", hint);
             }
             MaskSource::Alpha | MaskSource::Folder | MaskSource::None if given => {
                 let hint = "leave out the clicks, or set `mask.source` to clicks";
-                return problem("mask.source", "does not make masks, but clicks are given", hint);
+                return problem(key!(mask.source), "does not make masks, but clicks are given", hint);
             }
             _ => {}
         }
         if given && !self.alpha_net.is_empty() {
             let hint = "leave one of them out: an alpha network needs no clicks";
-            return problem("mask.alpha_net", "is named beside clicks", hint);
+            return problem(key!(mask.alpha_net), "is named beside clicks", hint);
         }
         let networks = [&self.sam, &self.sam_decoder, &self.vitmatte, &self.alpha_net];
         if !self.makes_masks() && networks.iter().any(|file| !file.is_empty()) {
             let hint = "give clicks: `--prompts prompts.json`, or `--alpha-net FILE.onnx`";
             return problem(
-                "mask.sam",
+                key!(mask.sam),
                 "or `mask.vitmatte` names a network, but there are no clicks to start from",
                 hint,
             );
         }
         if self.makes_masks() && self.meaning == MaskMeaning::Ignore {
             let hint = "set `mask.meaning` to empty: masks that are made say what is head";
-            return problem("mask.meaning", "is ignore, but masks are made", hint);
+            return problem(key!(mask.meaning), "is ignore, but masks are made", hint);
         }
         if self.with_sam() && (self.sam.is_empty() || self.sam_decoder.is_empty()) {
             let hint = "name both files: `--sam encoder.onnx --sam-decoder decoder.onnx`";
-            return problem("mask.cut", "needs both `mask.sam` and `mask.sam_decoder`", hint);
+            return problem(key!(mask.cut), "needs both `mask.sam` and `mask.sam_decoder`", hint);
         }
         if !self.sam_decoder.is_empty() && self.sam.is_empty() {
-            return problem("mask.sam_decoder", "is named without `mask.sam`", "name SAM's encoder too");
+            return problem(key!(mask.sam_decoder), "is named without `mask.sam`", "name SAM's encoder too");
         }
         if self.matting == MattingMethod::Vitmatte && self.vitmatte.is_empty() {
             return problem(
-                "mask.matting",
+                key!(mask.matting),
                 "is vitmatte, but no file is named",
                 "name it: `--vitmatte model.onnx`",
             );

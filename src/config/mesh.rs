@@ -1,7 +1,10 @@
 //! `[mesh]`: the extracted surface.
 
+use super::key;
 use super::table::table;
+use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use std::str::FromStr;
 
 /// A mesh file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -16,18 +19,24 @@ pub enum MeshFormat {
 }
 
 impl MeshFormat {
-    /// Returns the ending of its files.
-    pub fn ending(self) -> &'static str {
+    /// Its word, which is the ending of its files.
+    pub fn as_str(self) -> &'static str {
         match self {
             MeshFormat::Glb => "glb",
             MeshFormat::Obj => "obj",
             MeshFormat::Ply => "ply",
         }
     }
+}
 
-    /// Returns the format of a file ending.
-    pub fn of_ending(ending: &str) -> Option<MeshFormat> {
-        [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply].into_iter().find(|f| f.ending() == ending)
+impl FromStr for MeshFormat {
+    type Err = Error;
+
+    fn from_str(word: &str) -> Result<MeshFormat> {
+        let all = [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply];
+        all.into_iter()
+            .find(|format| format.as_str() == word)
+            .ok_or_else(|| Error::usage(format!("there is no mesh format `{word}`"), "use glb, obj or ply"))
     }
 }
 
@@ -96,41 +105,59 @@ table! {
     pub struct MeshConfig;
     keys {
         /// Grid samples along the longest side of the box.
-        resolution: u32, 16.0..=4096.0 => 256, 512, 512;
+        resolution: u32, 16.0..=4096.0 [Surface] => 256, 512, 512;
         /// Topological handles, such as loops of hair: keep, or simple (cut or filled, up to a loop of 0.15 of the
         /// surface's longest side, about 45 mm on a head).
-        genus: Genus => Genus::Simple, Genus::Simple, Genus::Keep;
+        genus: Genus [Surface] => Genus::Simple, Genus::Simple, Genus::Keep;
         /// Close the surface where the frames cut the body: true or false.
-        cap: bool => true, true, false;
+        #[flag("no-cap", Switch("false"), ["mesh"], "Leave the mesh open where the frames cut the body")]
+        cap: bool [Surface] => true, true, false;
         /// Number of triangles after simplification; 0 keeps all.
-        triangles: u32, 0.0..=1e8 => 50_000, 50_000, 0;
+        #[flag("triangles", Text("N"), ["mesh", "export"])]
+        triangles: u32, 0.0..=1e8 [Head] => 50_000, 50_000, 0;
         /// Largest distance of the simplified mesh from the field's surface, cells; 0: no limit.
-        max_error: f32, 0.0..=100.0 => 0.0;
+        max_error: f32, 0.0..=100.0 [Head] => 0.0;
         /// Source of the colors: photographs (fitted to them) or network (published).
-        color: ColorSource => ColorSource::Photographs, ColorSource::Photographs, ColorSource::Network;
+        color: ColorSource [Surface]
+            => ColorSource::Photographs, ColorSource::Photographs, ColorSource::Network;
         /// Side of the texture, texels; 0: colors at the vertices.
-        texture_px: u32, 0.0..=16384.0 => 1024, 2048, 0;
+        #[flag("texture", Text("PX"), ["mesh", "export"],
+            "Side of the texture, texels; 0 stores colors at the vertices")]
+        texture_px: u32, 0.0..=16384.0 [Head] => 1024, 2048, 0;
         /// Degree of the view-dependent spherical harmonics in the GLB: 0 (none), 1 or 2; limits all views of the mesh.
-        lobes: u32, 0.0..=2.0 => 0;
+        #[flag("lobes", Text("DEGREE"), ["mesh"],
+            "Degree of the view-dependent spherical harmonics in the GLB: 0, 1 or 2")]
+        lobes: u32, 0.0..=2.0 [Head] => 0;
         /// Hair and other soft outlines: shells (translucent layers in the GLB, where they help) or none. raycast
         /// renders them with `mesh.color=photographs`.
-        hair: Hair => Hair::Shells, Hair::Shells, Hair::None;
+        #[flag("hair", Text("KIND"), ["mesh", "export"],
+            "Hair and other soft outlines: shells (translucent layers, where they help) or none")]
+        hair: Hair [Head] => Hair::Shells, Hair::Shells, Hair::None;
         /// Write a tangent-space map of the field's normals to the GLB: true or false.
-        normal_map: bool => false;
+        #[flag("normal-map", Switch("true"), ["mesh"],
+            "Store the detail that simplification removes in a normal map; makes the material lit")]
+        normal_map: bool [Head] => false;
         /// Material of the GLB: unlit (colors as photographed, light included) or lit (shaded by lamps, as a normal map
         /// needs).
-        material: Material => Material::Unlit;
+        #[flag("material", Text("KIND"), ["mesh", "export"],
+            "Material in other programs: unlit (colors as photographed) or lit (shaded by lamps)")]
+        material: Material [Files] => Material::Unlit;
         /// Format of the texture: png or jpeg.
-        texture_format: TextureFormat => TextureFormat::Png;
+        texture_format: TextureFormat [Files] => TextureFormat::Png;
         /// Write the baked color to head.exr too, scene-linear: true or false.
-        exr: bool => false;
+        exr: bool [Files] => false;
         /// Formats to write, a list of glb, obj, ply.
-        format: Vec<MeshFormat> => vec![MeshFormat::Glb];
+        #[flag("format", Text("LIST"), ["mesh", "export"], "Formats to write: glb, obj, ply")]
+        format: Vec<MeshFormat> [Files] => vec![MeshFormat::Glb];
         /// Coordinate frame of the files: dataset, or head (+Y up, face towards +Z, centered).
-        frame: MeshFrame => MeshFrame::Dataset;
+        #[flag("frame", Text("FRAME"), ["mesh", "export"],
+            "Coordinate frame: dataset, or head (+Y up, face towards +Z)")]
+        frame: MeshFrame [Files, Head if |c| c.mesh.lobes > 0] => MeshFrame::Dataset;
         /// Height of the head mesh in GLB and OBJ files, meters, from the crown to the end of what is shown of the body; 0:
         /// as `capture.unit_m` says.
-        height_m: f64, 0.0..=10.0 => 0.0;
+        #[flag("height", Text("METRES"), ["mesh", "export"],
+            "Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it")]
+        height_m: f64, 0.0..=10.0 [Files] => 0.0;
     }
     constants {
         /// Evaluate the whole grid, and keep every surface found (published).
@@ -163,9 +190,9 @@ impl MeshConfig {
         let px = self.texture_px;
         if px == 0 {
             let asked = [
-                (self.lobes > 0, "mesh.lobes"),
-                (self.normal_map, "mesh.normal_map"),
-                (self.exr, "mesh.exr"),
+                (self.lobes > 0, key!(mesh.lobes)),
+                (self.normal_map, key!(mesh.normal_map)),
+                (self.exr, key!(mesh.exr)),
             ];
             return asked.iter().find(|(on, _)| *on).map(|(_, key)| {
                 let problem = "asks for a picture, but `mesh.texture_px` is 0".to_owned();
@@ -175,7 +202,7 @@ impl MeshConfig {
         if px < 64 || self.gutter_px > px / 8 {
             let problem = format!("is {px}: no room for a gutter of {} texels", self.gutter_px);
             let hint = "it must be 0, or at least 64";
-            return Some(("mesh.texture_px", problem, hint));
+            return Some((key!(mesh.texture_px), problem, hint));
         }
         // held as floats while they are baked
         let pictures = self.pictures();
@@ -184,7 +211,7 @@ impl MeshConfig {
         let gib = (self.texels() * (21 * pictures + fit)) >> 30;
         (gib > 16).then(|| {
             let problem = format!("is {px}: {pictures} pictures of that size take {gib} GiB to make");
-            ("mesh.texture_px", problem, "lower it, or `mesh.lobes`, or set `mesh.color=network`")
+            (key!(mesh.texture_px), problem, "lower it, or `mesh.lobes`, or set `mesh.color=network`")
         })
     }
 }

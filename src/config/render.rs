@@ -46,8 +46,8 @@ pub fn display_name(word: &str) -> String {
 }
 
 impl Method {
-    /// Returns the folder of its pictures below `render/`, and its word in the configuration.
-    pub fn folder(self) -> &'static str {
+    /// Its word in the configuration, and the folder of its pictures below `render/`.
+    pub fn as_str(self) -> &'static str {
         NAMES[self as usize].0
     }
 
@@ -90,30 +90,43 @@ table! {
     keys {
         /// Cameras of `tiface render`: test (held-out views), train, orbit or a file (transforms.json or a nerfstudio
         /// camera path). Blend and metrics always use test.
-        cameras: String => "test".into();
+        #[flag("cameras", Text("WHICH"), ["render"],
+            "Cameras: test (the held-out views), train, orbit or a file (a nerfstudio camera path or a \
+             transforms.json)")]
+        cameras: String [Path if |c| !c.render.cameras_are_a_file()] => "test".into();
         /// Methods, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with view-dependent color),
         /// textured (head.glb, as a viewer shows it) and raster (the same, rasterized, without soft layers).
-        method: Vec<Method>
+        #[flag("with", Text("LIST"), ["render"],
+            "Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured \
+             (head.glb, as a viewer shows it) and raster (the same, rasterized)")]
+        method: Vec<Method> [Views]
             => vec![Method::Tface, Method::Raycast],
             vec![Method::Tface, Method::Raycast],
             vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
         /// Number of views of an orbit around the head.
-        orbit_views: u32, 1.0..=10_000.0 => 36;
+        orbit_views: u32, 1.0..=10_000.0 [Path if |c| c.render.cameras == "orbit"] => 36;
         /// Rays along each side of a pixel of the mesh; twice as many at its edges.
-        samples: u32, 1.0..=8.0 => 2;
+        samples: u32, 1.0..=8.0 [Views] => 2;
         /// Add to views of raycast what the mesh misses of the nearest training photographs, which must be there: true or
         /// false. No exported file has it.
-        residuals: bool => true, true, false;
+        residuals: bool [Views if |c| c.render.method.contains(&Method::Raycast)] => true, true, false;
         /// Picture format: png (8-bit sRGB) or exr (float, with depth and normals).
-        format: PictureFormat => PictureFormat::Png;
+        #[flag("format", Text("FORMAT"), ["render"], "Picture format: png or exr")]
+        format: PictureFormat [Views] => PictureFormat::Png;
         /// Background: black, white or none (alpha channel).
-        background: ViewBackground => ViewBackground::None;
+        #[flag("background", Text("BACKGROUND"), ["render"], "Background: black, white or none")]
+        background: ViewBackground [Views] => ViewBackground::None;
         /// Store every view in float too, in METHOD/float, for the blend: true or false.
-        float: bool => true;
+        float: bool [HeldOut] => true;
     }
 }
 
 impl RenderConfig {
+    /// Returns whether the cameras come from a file.
+    pub fn cameras_are_a_file(&self) -> bool {
+        !["test", "train", "orbit"].contains(&self.cameras.as_str())
+    }
+
     /// Returns whether views of these methods show residuals.
     pub fn shows_residuals(&self, methods: &[Method]) -> bool {
         self.residuals && methods.contains(&Method::Raycast)
@@ -132,14 +145,19 @@ table! {
     keys {
         /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb);
         /// empty: no blend.
-        members: Vec<Method>
+        #[flag("members", Text("LIST"), ["ensemble"],
+            "Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), \
+             textured and raster (head.glb)")]
+        members: Vec<Method> [Blend]
             => vec![Method::Tface, Method::Raycast],
             vec![Method::Tface, Method::Raycast],
             vec![Method::Baseline, Method::Tface, Method::Volume];
         /// Weights of the members, in their order, with sum 1; empty: fit them on capture.tiles.
-        weights: Vec<f64>, 0.0..=1.0 => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
+        #[flag("weights", Text("LIST"), ["ensemble"],
+            "Weights of the methods, in that order, with sum 1 [default: fitted]")]
+        weights: Vec<f64>, 0.0..=1.0 [Blend] => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
         /// Cut members that were trained without masks to the head: true or false.
-        cut: bool => true, true, false;
+        cut: bool [Blend] => true, true, false;
     }
 }
 
@@ -159,11 +177,11 @@ table! {
     keys {
         /// Reference of the views: photo (as taken; whole-frame figures include the background) or masked (cut out by its
         /// mask, over render.background).
-        truth: TruthPhoto => TruthPhoto::Masked, TruthPhoto::Masked, TruthPhoto::Photo;
+        truth: TruthPhoto [Metrics] => TruthPhoto::Masked, TruthPhoto::Masked, TruthPhoto::Photo;
         /// LPIPS network, an ONNX file that takes two pictures (needs a build with the feature `matting`); empty: no LPIPS.
-        lpips: String => String::new();
+        lpips: String [nothing] => String::new();
         /// Number of points sampled on a surface to compare it with a known one.
-        surface_points: u32, 100.0..=10_000_000.0 => 20_000, 100_000, 100_000;
+        surface_points: u32, 100.0..=10_000_000.0 [Metrics] => 20_000, 100_000, 100_000;
     }
 }
 
@@ -178,7 +196,7 @@ mod tests {
         let methods = [Baseline, Tface, Volume, Raycast, Textured, Raster];
         for (method, (word, _)) in methods.into_iter().zip(NAMES) {
             // the word of the folder is the word of the configuration
-            assert_eq!((serde_json::json!(method), method.folder()), (serde_json::json!(word), word));
+            assert_eq!((serde_json::json!(method), method.as_str()), (serde_json::json!(word), word));
         }
         assert_eq!(display_name("volume"), "I-Face (volume)");
         assert_eq!((display_name("baseline"), display_name("truth")), ("baseline".into(), "truth".into()));

@@ -1,18 +1,21 @@
 //! Resolves files and `--set` to a [`Config`]: precedence and validation of values.
 
-use super::{Config, DeviceChoice, Key, Preset, all_keys, lookup, show};
+use super::{Config, DeviceChoice, Key, Preset, all_keys, key, lookup, show};
 use crate::{Error, Result};
 use serde::Deserialize;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
+
+/// A preset, and changes on top of it.
+pub type Fallback = (Preset, fn(&mut Config));
 
 /// Sources of values, weakest first.
 #[derive(Clone, Debug, Default)]
 pub struct Sources {
     /// `--preset`; beats the `preset` of any file.
     pub preset: Option<Preset>,
-    /// The preset if no other source names one, and settings on top of it, as TOML.
-    pub fallback: Option<(Preset, String)>,
+    /// The start if no other source names a preset.
+    pub fallback: Option<Fallback>,
     /// Configuration files: name for messages, text.
     pub files: Vec<(String, String)>,
     /// `--set`: each `key=value`.
@@ -48,22 +51,20 @@ pub(super) fn resolve(sources: &Sources) -> Result<Config> {
     }
 
     // the preset comes first, on whatever line it is; `assign` checks its value below
-    let named = given.iter().rfind(|(key, ..)| key == "preset").and_then(|(_, value, _)| {
+    let named = given.iter().rfind(|(key, ..)| key == key!(preset)).and_then(|(_, value, _)| {
         let word = match value {
             RawValue::Toml(value) => value.as_str()?,
             RawValue::Text(text) => text.trim_matches('"'),
         };
         word.parse().ok()
     });
-    let mut preset = sources.preset.or(named);
-    if let (None, Some((fallback, text))) = (preset, &sources.fallback) {
-        preset = Some(*fallback);
-        let mut weakest = Vec::new();
-        read_file("built in", text, &mut weakest)?;
-        given.splice(0..0, weakest);
-    }
-    let preset = preset.unwrap_or_default();
+    let named = sources.preset.or(named);
+    let (preset, change) = match sources.fallback {
+        Some((preset, change)) if named.is_none() => (preset, Some(change)),
+        _ => (named.unwrap_or_default(), None),
+    };
     let mut config = Config::preset(preset);
+    change.iter().for_each(|change| change(&mut config));
     for (key, value, place) in given {
         config = assign(&config, &key, value).map_err(|e| e.within(place))?;
     }
@@ -140,7 +141,7 @@ fn assign(config: &Config, key: &str, given: RawValue) -> Result<Config> {
             let problem = format!(": `{word}`: `~` is a word of the shell; write the whole path");
             return Err(wrong(key, &problem));
         }
-        Some(word) if key == "device" && DeviceChoice::parse(word).is_none() => {
+        Some(word) if key == key!(device) && DeviceChoice::parse(word).is_none() => {
             let problem = format!(
                 ": unknown device `{word}`, expected auto, cpu, wgpu, vulkan, metal or dx12, with :N a numbered one"
             );

@@ -1,6 +1,6 @@
 //! Which value wins, and what is said of a wrong one.
 
-use super::{Config, MeshFormat, Preset, Sources};
+use super::{Config, Fallback, MeshFormat, Preset, Sources};
 use crate::Result;
 
 fn from(file: &str, set: &[&str]) -> Result<Config> {
@@ -43,7 +43,8 @@ fn later_wins_default_preset_file_set() {
 #[test]
 fn a_fallback_holds_until_a_source_names_a_preset() {
     let with = |file: &str, set: &[&str]| {
-        let fallback = Some((Preset::Draft, "mesh.resolution = 99\niface.steps = 7".to_string()));
+        let change = |c: &mut Config| (c.mesh.resolution, c.iface.steps) = (99, 7);
+        let fallback: Option<Fallback> = Some((Preset::Draft, change));
         let set = set.iter().map(|s| s.to_string()).collect();
         let files = vec![("f".into(), file.into())];
         let c = Config::resolve(&Sources { fallback, files, set, ..Sources::default() }).unwrap();
@@ -105,7 +106,7 @@ fn set_needs_neither_quotes_nor_brackets() {
     let c = from("", &["mesh.format=glb,obj", "iface.steps=2e4", "capture.unit_m=1", "capture.path=a b"])
         .unwrap();
     assert_eq!(c.mesh.format, [MeshFormat::Glb, MeshFormat::Obj]);
-    assert_eq!((c.iface.steps, c.capture.unit_m, c.capture.path.as_str()), (20_000, 1.0, "a b"));
+    assert_eq!((c.iface.steps, c.capture.unit_m, c.capture.path.to_str()), (20_000, 1.0, Some("a b")));
     let c = from("", &["mesh.format=[\"ply\"]", "mask.source=\"none\""]).unwrap();
     assert_eq!(c.mesh.format, [MeshFormat::Ply]);
 }

@@ -34,7 +34,7 @@ impl Stage {
     pub const ALL: [Stage; 8] = [Mask, Baseline, Tface, Iface, Mesh, Render, Ensemble, Metrics];
 
     /// Its word.
-    pub fn word(self) -> &'static str {
+    pub fn as_str(self) -> &'static str {
         ["mask", "baseline", "tface", "iface", "mesh", "render", "ensemble", "metrics"][self as usize]
     }
 
@@ -80,7 +80,7 @@ impl Stage {
 
 impl Display for Stage {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str(self.word())
+        f.write_str(self.as_str())
     }
 }
 
@@ -88,8 +88,8 @@ impl FromStr for Stage {
     type Err = Error;
 
     fn from_str(word: &str) -> Result<Stage> {
-        Stage::ALL.into_iter().find(|s| s.word() == word).ok_or_else(|| {
-            let known = Stage::ALL.map(Stage::word).join(", ");
+        Stage::ALL.into_iter().find(|s| s.as_str() == word).ok_or_else(|| {
+            let known = Stage::ALL.map(Stage::as_str).join(", ");
             Error::usage(format!("there is no stage `{word}`"), format!("stages are {known}"))
         })
     }
@@ -98,6 +98,6 @@ impl FromStr for Stage {
 /// Its folder in a run.
 impl AsRef<Path> for Stage {
     fn as_ref(&self) -> &Path {
-        Path::new(self.word())
+        Path::new(self.as_str())
     }
 }

@@ -1,4 +1,5 @@
-//! One place for a setting: its field is its key, its comment the documentation that users read.
+//! One place for a setting: its field is its key, its comment the documentation that users read; its row says what it
+//! affects, and which option of a command sets it.
 
 /// Declares the settings of a stage.
 ///
@@ -7,12 +8,15 @@
 ///     /// What the table is about.
 ///     pub struct NameConfig;
 ///     keys {
-///         /// What it means, with its unit.
-///         steps: u64, 1.0..=1e7 => 3000, 8000, 20_000;   // draft, standard, paper
+///         /// What it means, with its unit. In brackets, the products that it affects.
+///         steps: u64, 1.0..=1e7 [Iface] => 3000, 8000, 20_000;   // draft, standard, paper
 ///         /// One more value is that of the preset quick, which otherwise is draft's.
-///         rays: usize, 1.0..=1e6 => 1024, 1024, 256, 512;
+///         rays: usize, 1.0..=1e6 [Iface] => 1024, 1024, 256, 512;
 ///         /// A word, text, switch or list has no range; one value may serve every preset.
-///         masks: MaskUse => MaskUse::Soft;
+///         masks: MaskUse [Iface if has_masks, Surface] => MaskUse::Soft;
+///         /// How often it is saved, which is the same result.
+///         #[flag("every", Text("SECONDS"), ["iface"], "Seconds between checkpoints")]
+///         checkpoint_s: f64, 0.05..=86_400.0 [nothing] => 60.0;
 ///     }
 ///     constants {
 ///         /// Part of a preset that users have no reason to change: no key, not written to `config.toml`.
@@ -22,13 +26,14 @@
 /// ```
 ///
 /// Makes the struct, its list of [`Key`](super::Key)s as `KEYS`, `preset(Preset)`, and `keep_constants(Preset)`, which
-/// gives the constants their values again after the keys were read from text.
+/// gives the constants their values again after the keys were read from text. A row without its effects does not compile.
 macro_rules! table {
     (
         $(#[$about:meta])*
         pub struct $name:ident;
         keys {
-            $($(#[doc = $doc:literal])+ $key:ident: $ty:ty $(, $min:literal ..= $max:literal)?
+            $($(#[doc = $doc:literal])+ $(#[flag($($flag:tt)+)])?
+                $key:ident: $ty:ty $(, $min:literal ..= $max:literal)? [$($affects:tt)+]
                 => $draft:expr $(, $standard:expr, $paper:expr $(, $quick:expr)?)?;)+
         }
         $(constants {
@@ -51,6 +56,8 @@ macro_rules! table {
                     doc: concat!($($doc),+).trim_ascii_start(),
                     min: $crate::config::table::bound!(f64::NEG_INFINITY $(, $min)?),
                     max: $crate::config::table::bound!(f64::INFINITY $(, $max)?),
+                    affects: $crate::config::affects::affects!($($affects)+),
+                    flag: $crate::config::table::flag!($($($flag)+)?),
                 },)+
             ];
 
@@ -103,6 +110,21 @@ macro_rules! bound {
     };
 }
 
+/// The option of a row: its name, its value, the commands that have it, and its help if that is not the key's documentation.
+macro_rules! flag {
+    () => {
+        None
+    };
+    ($long:literal, $takes:ident $(($value:literal))?, [$($command:literal),+] $(, $help:literal)?) => {
+        Some($crate::config::Flag {
+            long: $long,
+            takes: $crate::config::Takes::$takes $(($value))?,
+            commands: &[$($command),+],
+            help: concat!($($help)?),
+        })
+    };
+}
+
 /// The value of a preset: one for all, or draft, standard, paper, and quick where it is not draft's.
 macro_rules! of_preset {
     ($preset:ident, $all:expr) => {
@@ -121,4 +143,4 @@ macro_rules! of_preset {
     };
 }
 
-pub(super) use {bound, of_preset, table};
+pub(super) use {bound, flag, of_preset, table};

@@ -73,45 +73,48 @@ table! {
     keys {
         /// A published checkpoint to use instead of training, converted by tools/reference/th_to_safetensors.py; empty:
         /// train.
-        import: String => String::new();
+        import: String [nothing] => String::new();
         /// Length of a dataset unit in the imported checkpoint's world (published: 1 / 0.3).
-        import_scale: f64, 1e-6..=1e6 => 1.0 / 0.3;
+        import_scale: f64, 1e-6..=1e6 [Tface, Baseline] => 1.0 / 0.3;
         /// Number of fields, trained one after the other with different seeds; views are their mean. Always one with
         /// `import`. Two fields are better than one with twice the rays, which takes the same time.
-        fields: usize, 1.0..=16.0 => 1, 2, 1;
+        fields: usize, 1.0..=16.0 [Tface] => 1, 2, 1;
         /// Optimizer steps of each field. Few steps of many rays are better than many steps of few.
-        steps: u64, 1.0..=1e7 => 1500, 2000, 50_000, 450;
+        steps: u64, 1.0..=1e7 [Tface] => 1500, 2000, 50_000, 450;
         /// Rays per step.
-        rays: usize, 1.0..=1_048_576.0 => 8192, 8192, 4096;
+        rays: usize, 1.0..=1_048_576.0 [Tface] => 8192, 8192, 4096;
         /// How masks are applied to the photographs: none, binary (alpha > 0 is head), hard (alpha ≥ 0.5 is head) or soft.
-        masks: MaskUse => MaskUse::Soft, MaskUse::Soft, MaskUse::Binary;
+        masks: MaskUse [Tface] => MaskUse::Soft, MaskUse::Soft, MaskUse::Binary;
         /// Mask loss: none, l2 (opacity² of background rays) or ce (cross entropy).
-        mask_loss: MaskLoss => MaskLoss::L2;
+        mask_loss: MaskLoss [Tface] => MaskLoss::L2;
         /// Weight of the mask loss.
-        mask_weight: f64, 0.0..=1e6 => 0.01;
+        mask_weight: f64, 0.0..=1e6 [Tface] => 0.01;
         /// Background while training: random, black, or reference (published: white in half of the batches, against a
         /// black target).
-        background: VmBackground => VmBackground::Random, VmBackground::Random, VmBackground::Reference;
+        background: VmBackground [Tface, Baseline]
+            => VmBackground::Random, VmBackground::Random, VmBackground::Reference;
         /// Number of voxels at the start.
-        voxels_start: u64, 8.0..=1e12 => 96 * 96 * 96, 128 * 128 * 128, 2_097_156;
+        voxels_start: u64, 8.0..=1e12 [Tface, Baseline] => 96 * 96 * 96, 128 * 128 * 128, 2_097_156;
         /// Number of voxels after the last upsampling.
-        voxels_final: u64, 8.0..=1e12 => 192 * 192 * 192, 256 * 256 * 256, 27_000_000;
+        voxels_final: u64, 8.0..=1e12 [Tface, Baseline] => 192 * 192 * 192, 256 * 256 * 256, 27_000_000;
         /// Shares of the steps after which the grids are upsampled, an increasing list.
-        upsample_at: Vec<f64>, 0.0..=1.0
+        upsample_at: Vec<f64>, 0.0..=1.0 [Tface, Baseline]
             => vec![0.1, 0.2, 0.33], vec![0.1, 0.2, 0.325, 0.5], vec![0.04, 0.06, 0.08, 0.11, 0.14];
         /// Shares of the steps after which the alpha mask is rebuilt, an increasing list.
-        mask_at: Vec<f64>, 0.0..=1.0 => vec![0.1, 0.33], vec![0.1, 0.325], vec![0.04, 0.08];
+        mask_at: Vec<f64>, 0.0..=1.0 [Tface, Baseline] => vec![0.1, 0.33], vec![0.1, 0.325], vec![0.04, 0.08];
         /// Channels of the density's planes xy, xz, yz. The published ranks favor one axis of one light stage; a
         /// head may face any way.
-        density_rank: Vec<usize>, 0.0..=1024.0 => vec![8, 8, 8], vec![8, 8, 8], vec![16, 4, 4];
+        density_rank: Vec<usize>, 0.0..=1024.0 [Tface, Baseline]
+            => vec![8, 8, 8], vec![8, 8, 8], vec![16, 4, 4];
         /// Channels of the appearance's planes xy, xz, yz.
-        color_rank: Vec<usize>, 0.0..=1024.0 => vec![24, 24, 24], vec![24, 24, 24], vec![48, 12, 12];
+        color_rank: Vec<usize>, 0.0..=1024.0 [Tface, Baseline]
+            => vec![24, 24, 24], vec![24, 24, 24], vec![48, 12, 12];
         /// Weight of the density planes' total variation, times 0.01.
-        tv_density: f64, 0.0..=1e6 => 1.0;
+        tv_density: f64, 0.0..=1e6 [Tface, Baseline] => 1.0;
         /// Weight of the appearance planes' total variation, times 0.01.
-        tv_color: f64, 0.0..=1e6 => 1.0;
+        tv_color: f64, 0.0..=1e6 [Tface, Baseline] => 1.0;
         /// Seconds between checkpoints.
-        checkpoint_s: f64, 0.05..=86_400.0 => 120.0;
+        checkpoint_s: f64, 0.05..=86_400.0 [nothing] => 120.0;
     }
     constants {
         /// What a pixel with a soft mask should look like. As published: the views are compared with photographs
@@ -246,11 +249,11 @@ table! {
     keys {
         /// A published checkpoint to use instead of training, converted by tools/reference/th_to_safetensors.py; empty:
         /// train.
-        import: String => String::new();
+        import: String [nothing] => String::new();
         /// Optimizer steps.
-        steps: u64, 1.0..=1e7 => 1500, 2000, 50_000;
+        steps: u64, 1.0..=1e7 [Baseline] => 1500, 2000, 50_000;
         /// Rays per step: fewer than T-Face has, for whole frames cost several times a head.
-        rays: usize, 1.0..=1_048_576.0 => 4096, 8192, 4096;
+        rays: usize, 1.0..=1_048_576.0 [Baseline] => 4096, 8192, 4096;
     }
 }
 

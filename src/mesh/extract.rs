@@ -86,7 +86,6 @@ pub struct MeshReport {
     /// Number of vertices that a step moved less than the Newton step, because a face would have folded.
     pub held_back: usize,
     /// Handles that were cut, filled or left.
-    #[serde(default)]
     pub handles: HandleReport,
     /// The finished mesh: closed, manifold, pieces, Euler number.
     pub topology: Topology,

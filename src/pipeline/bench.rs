@@ -186,7 +186,7 @@ impl Evaluator {
         for (view, loaded, expected) in &self.views {
             let camera = view.camera.transformed(&scene.scene_from_world);
             let mut rendered = renderer.view(method, &camera)?.ok_or_else(|| {
-                Error::cannot(format!("no view can be rendered for `{}`", method.folder()), "")
+                Error::cannot(format!("no view can be rendered for `{}`", method.as_str()), "")
             })?;
             if let Some(background) = pictures::background_color(self.background) {
                 pictures::over(&mut rendered, background);
@@ -247,7 +247,7 @@ fn train_until(session: &Session, stage: Stage, step: u64) -> Result<()> {
     let folder = session.run.path(stage);
     io::create_folder(&folder)?;
     let training = TrainingSession {
-        stage: stage.word(),
+        stage: stage.as_str(),
         seed: learn::seed(stage, session.config),
         device: &session.config.device,
         dir: &folder,

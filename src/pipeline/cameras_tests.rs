@@ -216,7 +216,7 @@ fn refinement_that_cannot_be_done_is_told_with_its_reason() {
         let folder = tempfile::tempdir().unwrap();
         let run = quiet(folder.path());
         let mut config = Config::preset(Preset::Draft);
-        config.capture.path = dir.path().display().to_string();
+        config.capture.path = dir.path().into();
         config.capture.cameras = poses;
         config.mask.source = MaskSource::None;
         complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
@@ -247,7 +247,7 @@ fn the_stage_mask_keeps_refined_poses_for_later_stages_unless_given_ones_are_ask
         let folder = tempfile::tempdir().unwrap();
         let run = quiet(folder.path());
         let mut config = Config::preset(Preset::Draft);
-        config.capture.path = dir.path().display().to_string();
+        config.capture.path = dir.path().into();
         config.capture.cameras = poses;
         let session = Session::open(&config, &run).unwrap();
         complete(&session, Stage::Mask, &NoFields).unwrap();

@@ -7,7 +7,7 @@
 //! ```
 
 use crate::capture::{Capture, Split};
-use crate::config::MaskConfig;
+use crate::config::{MaskConfig, key};
 use crate::image::{Gray, Photo, reduce_photo, working_size};
 use crate::io::{self, Limits};
 use crate::mask::grabcut::grabcut;
@@ -64,7 +64,7 @@ impl MaskPrompts {
                 )
             })?;
             let frame = PhotoPrompts { file_path: prompts::file_path(capture, view), points };
-            Prompts { frames: vec![frame] }.clicks("mask.point", capture)?
+            Prompts { frames: vec![frame] }.clicks(key!(mask.point), capture)?
         } else {
             let named = Path::new(&config.prompts);
             let path = if !io::is_file(named) && io::is_file(kept) { kept } else { named };

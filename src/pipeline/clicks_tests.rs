@@ -206,7 +206,7 @@ fn networks_cut_and_soften_and_are_recorded() {
 fn a_network_masks_all_views_without_a_click() {
     let dir = tempfile::tempdir().unwrap();
     let (mut config, truth) = clicked(dir.path(), SHARP);
-    let capture = capture::open(Path::new(&config.capture.path), &CaptureOptions::default()).unwrap();
+    let capture = capture::open(&config.capture.path, &CaptureOptions::default()).unwrap();
     for (view, mask) in capture.views.iter().zip(&truth) {
         let color = |(i, &m): (usize, &u8)| [if m >= 128 { 180 } else { 20 } + (i * 7919 % 13) as u8; 3];
         let rgb: Vec<[u8; 3]> = mask.values.iter().enumerate().map(color).collect();
@@ -301,7 +301,7 @@ fn three_clicked_photographs_mask_all_at_full_size_and_matting_takes_four_tenths
 fn held_out_photographs_shape_only_their_own_masks() {
     let dir = tempfile::tempdir().unwrap();
     let (config, _) = clicked(dir.path(), SMALL);
-    let capture = capture::open(Path::new(&config.capture.path), &CaptureOptions::default()).unwrap();
+    let capture = capture::open(&config.capture.path, &CaptureOptions::default()).unwrap();
     let held_out = capture.views.iter().find(|v| v.split == Split::Test).unwrap();
     // clicks on a test view as well: deep in its own true mask
     let mask = held_out.load_mask(&Limits::default()).unwrap().unwrap();

@@ -93,7 +93,7 @@ pub fn compare_runs(runs: [&Session; 2], names: [&str; 2], folder: &Path) -> Res
 fn facts(run: &Session, name: &str) -> String {
     let times = Stage::ALL.iter().filter_map(|&stage| read_record(&run.run.path(stage)).ok()?);
     let seconds = times.map(|record| record.elapsed_s).sum();
-    format!("{name}: preset {}, seed {}, {}", run.config.preset.name(), run.config.seed, duration(seconds))
+    format!("{name}: preset {}, seed {}, {}", run.config.preset.as_str(), run.config.seed, duration(seconds))
 }
 
 /// Returns the distances between the extracted surfaces in dataset units, both ways; `None` if a run has no mesh.
@@ -140,7 +140,7 @@ pub fn judge(
     if held_out.is_empty() {
         return Err(Error::cannot(
             "the capture holds out no photograph to judge by",
-            "hold some out: `--set capture.test=...` (see `tiface config --explain capture`)",
+            "say in the capture which ones to hold out, as `test_filenames` of a transforms.json does",
         ));
     }
     let Entries { names, sets, mut shapes, warnings } =

@@ -95,7 +95,7 @@ impl Session<'_> {
             return Ok(());
         }
         let stages = self.order(Stage::Metrics).into_iter();
-        let estimate: Estimate = stages.map(|stage| (stage.word().to_owned(), self.cost(stage))).collect();
+        let estimate: Estimate = stages.map(|stage| (stage.as_str().to_owned(), self.cost(stage))).collect();
         let text = serde_json::to_string_pretty(&estimate).unwrap_or_default();
         self.write(ESTIMATE, format!("{text}\n").as_bytes(), idle)
     }

@@ -13,7 +13,7 @@ use super::surface::Fields;
 use super::{learn, pictures};
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, MaskMeaning, View, ViewMask};
-use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, display_name};
+use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, display_name, key};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::image::{Gray, INSIDE, Image, Photo};
 use crate::io::{self, Limits};
@@ -74,12 +74,12 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
         Err(Error::usage(format!("`{key}` {problem}"), hint))
     };
     if c.members.is_empty() {
-        return wrong("ensemble.members", "is empty: there is nothing to blend".into(), "name members");
+        return wrong(key!(ensemble.members), "is empty: there is nothing to blend".into(), "name members");
     }
     for (i, member) in c.members.iter().enumerate() {
-        let name = member.folder();
+        let name = member.as_str();
         if c.members[..i].contains(member) {
-            return wrong("ensemble.members", format!("names {name} twice"), "name every member once");
+            return wrong(key!(ensemble.members), format!("names {name} twice"), "name every member once");
         }
         if !config.render.method.contains(member) {
             let problem = format!("names {name}, which render.method does not make");
@@ -88,7 +88,7 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
                      ensemble.members and ensemble.weights; `--set ensemble.members=` blends nothing",
                 shown_with_members(config)
             );
-            return wrong("ensemble.members", problem, &hint);
+            return wrong(key!(ensemble.members), problem, &hint);
         }
     }
     let (found, members) = (c.weights.len(), c.members.len());
@@ -96,7 +96,7 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
     if found == 0 && config.capture.tiles <= 0.0 {
         let problem = "is empty, but there is nothing to fit them on: capture.tiles is 0".into();
         return wrong(
-            "ensemble.weights",
+            key!(ensemble.weights),
             problem,
             "give one for each of ensemble.members, or set capture.tiles=0.04",
         );
@@ -104,21 +104,21 @@ pub(super) fn can_blend(config: &Config) -> Result<()> {
     if found != members && found > 0 {
         let problem = format!("has {found} weights for {members} members");
         let hint = "give one for each of ensemble.members, in that order, or none to have them fitted";
-        return wrong("ensemble.weights", problem, hint);
+        return wrong(key!(ensemble.weights), problem, hint);
     }
     if found > 0 && (sum - 1.0).abs() > 1e-3 {
-        return wrong("ensemble.weights", format!("sum to {sum}, expected 1"), &shares_hint(&shares(c)));
+        return wrong(key!(ensemble.weights), format!("sum to {sum}, expected 1"), &shares_hint(&shares(c)));
     }
     if !config.render.float {
         let problem = "is false, but members are blended in float".into();
-        return wrong("render.float", problem, "set it to true, or blend nothing: ensemble.members=");
+        return wrong(key!(render.float), problem, "set it to true, or blend nothing: ensemble.members=");
     }
     Ok(())
 }
 
 /// Returns the names of methods.
 fn method_names(methods: &[Method]) -> Vec<&'static str> {
-    methods.iter().map(|m| m.folder()).collect()
+    methods.iter().map(|m| m.as_str()).collect()
 }
 
 /// Returns the shown and the blended methods in the syntax of `--with`.
@@ -139,7 +139,7 @@ fn shares(c: &EnsembleConfig) -> Vec<f32> {
 /// Reads the views of all members from one camera, in float.
 fn member_views(config: &Config, run: &Run, name: &str) -> Result<Vec<Image>> {
     let view = |member: &Method| {
-        let word = member.folder();
+        let word = member.as_str();
         let below = format!("render/{word}/{}", pictures::FLOAT);
         let file = pictures::float_path(&run.path(&below), name);
         if io::is_file(&file) {
@@ -164,7 +164,7 @@ fn member_views(config: &Config, run: &Run, name: &str) -> Result<Vec<Image>> {
 fn members<'i>(capture: &Capture, config: &Config, views: &'i [Image]) -> Result<Members<'i>> {
     let c = &config.ensemble;
     let member = |(m, image): (&Method, &'i Image)| Member {
-        name: m.folder(),
+        name: m.as_str(),
         image,
         masked: trained_with_masks(capture, config, *m),
     };

@@ -14,7 +14,6 @@ use crate::report::experiment::{ExperimentRow, Measured, Ordering};
 use crate::run::{Cost, read_record, read_status};
 use crate::{Error, Result};
 use serde_json::Value;
-use std::path::Path;
 
 /// The tables, by their name and heading.
 pub const TABLES: [(&str, &str); 4] = [
@@ -183,7 +182,7 @@ fn full_scale(run: &str) -> Result<Config> {
 pub fn without_masks(run: &str, config: &mut Config) {
     let options = capture_options(config);
     let bare = || {
-        let capture = capture::open(Path::new(&config.capture.path), &options)?;
+        let capture = capture::open(&config.capture.path, &options)?;
         capture::require_masks(&capture, &options)
     };
     if run == "baseline-one" && bare().is_err() {
@@ -305,7 +304,7 @@ fn figures(session: &Session, row: &ExperimentRow, value: &Value) -> Measured {
     out.seconds = match row.pictures {
         "ensemble" => {
             let blend = summary(Stage::Ensemble)["seconds_per_view"].as_f64();
-            let members = session.config.ensemble.members.iter().map(|member| seconds(member.folder()));
+            let members = session.config.ensemble.members.iter().map(|member| seconds(member.as_str()));
             members.chain([blend]).sum()
         }
         method => seconds(method),
@@ -334,12 +333,13 @@ mod tests {
     use crate::run::Run;
     use glam::Vec3;
     use serde_json::json;
+    use std::path::{Path, PathBuf};
 
     /// Writes a tiny capture into a folder and returns its path.
-    fn head(dir: &Path) -> String {
+    fn head(dir: &Path) -> PathBuf {
         let root = dir.join("head");
         demo_head(&root, (32, 40), (8, 2));
-        root.to_str().unwrap().into()
+        root
     }
 
     fn row_of(table: &str, row: &str) -> ExperimentRow {
@@ -350,7 +350,7 @@ mod tests {
     fn every_row_has_a_run_whose_pictures_it_names() {
         for row in ROWS {
             let c = config(row.run, 1.0, &[]).unwrap();
-            let made = c.render.method.iter().any(|m| m.folder() == row.pictures);
+            let made = c.render.method.iter().any(|m| m.as_str() == row.pictures);
             let blended = row.pictures == "ensemble" && !c.ensemble.members.is_empty();
             assert!(made || blended, "{row:?}");
             assert_eq!(c.metrics.truth, TruthPhoto::Photo);
@@ -412,9 +412,9 @@ mod tests {
             Session::open(&c, &run).map(|_| c.mask.source)
         };
         assert!(opens("baseline-one").is_ok_and(|source| source == MaskSource::Auto));
-        std::fs::remove_dir_all(Path::new(&path).join("masks")).unwrap();
+        std::fs::remove_dir_all(path.join("masks")).unwrap();
         for file in ["transforms.json", "transforms_train.json", "transforms_test.json"] {
-            let file = Path::new(&path).join(file);
+            let file = path.join(file);
             let text = std::fs::read_to_string(&file).unwrap();
             std::fs::write(&file, text.replace("mask_path", "no_path")).unwrap();
         }

@@ -10,7 +10,7 @@ use super::mesh::{finished_mesh, read_finished};
 use super::scene_file::read_capture;
 use super::session::{check_feasible, unusable};
 use crate::capture::Capture;
-use crate::config::{Config, Hair, Material, MeshFormat, Stage};
+use crate::config::{Config, Hair, Material, MeshFormat, Stage, key};
 use crate::mesh::bake::{Original, tangent_space};
 use crate::mesh::files::{ExportedFiles, HeadMesh, HeadTexture, tangents};
 use crate::mesh::{SimplifyConfig, atlas, simplify};
@@ -20,17 +20,17 @@ use std::path::{Path, PathBuf};
 
 /// Keys that affect how the files of a mesh are written, each with what it is and the formats that show it.
 const FILE_KEYS: [(&str, &str, &[MeshFormat]); 6] = [
-    ("mesh.format", "format", &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply]),
-    ("mesh.material", "material", &[MeshFormat::Glb]),
-    ("mesh.frame", "frame but the dataset's", &[MeshFormat::Glb, MeshFormat::Obj]),
-    ("mesh.height_m", "height in meters", &[MeshFormat::Glb, MeshFormat::Obj]),
-    ("capture.unit_m", "length in meters", &[MeshFormat::Glb, MeshFormat::Obj]),
-    ("mesh.texture_format", "picture", &[MeshFormat::Glb, MeshFormat::Obj]),
+    (key!(mesh.format), "format", &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply]),
+    (key!(mesh.material), "material", &[MeshFormat::Glb]),
+    (key!(mesh.frame), "frame but the dataset's", &[MeshFormat::Glb, MeshFormat::Obj]),
+    (key!(mesh.height_m), "height in meters", &[MeshFormat::Glb, MeshFormat::Obj]),
+    (key!(capture.unit_m), "length in meters", &[MeshFormat::Glb, MeshFormat::Obj]),
+    (key!(mesh.texture_format), "picture", &[MeshFormat::Glb, MeshFormat::Obj]),
 ];
 
 /// Keys that affect how much of the kept head the files show.
 const PART_KEYS: [&str; 5] =
-    ["mesh.triangles", "mesh.texture_px", "mesh.hair", "mesh.lobes", "mesh.normal_map"];
+    [key!(mesh.triangles), key!(mesh.texture_px), key!(mesh.hair), key!(mesh.lobes), key!(mesh.normal_map)];
 
 /// Returns whether a key affects only how the files of a mesh are written.
 pub(super) fn is_file_key(key: &str) -> bool {
@@ -68,7 +68,7 @@ impl KeptHead {
             let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
             Ok((HeadMesh::load(&folder.join("parts"))?, warnings))
         })?;
-        let mut capture = read_capture(&run.join("cameras.json"), Path::new(&made.capture.path))
+        let mut capture = read_capture(&run.join("cameras.json"), &made.capture.path)
             .map_err(|e| Error::cannot(&e, format!("`tiface mask {}` writes it again", run.display())))?;
         let check = CameraCheck::read(&run.join(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
         check.iter().for_each(|check| check.apply(&mut capture));
@@ -92,7 +92,7 @@ impl KeptHead {
         for [key, value, _] in asked.differences(&self.made) {
             if let Some((_, what, shown_by)) = FILE_KEYS.iter().find(|(name, ..)| *name == key) {
                 self.warnings.extend(not_shown(&key, what, shown_by, formats)?);
-            } else if !PART_KEYS.contains(&key.as_str()) && key != "device" {
+            } else if !PART_KEYS.contains(&key.as_str()) && key != key!(device) {
                 let what =
                     format!("`{key}` affects what is made, and `export` only writes what has been made");
                 return Err(Error::usage(what, self.anew(&key, &value)));
@@ -104,8 +104,10 @@ impl KeptHead {
         self.turn_lobes()?;
         let has_normals = self.head.texture.as_ref().is_some_and(|t| t.normal.is_some());
         if asked.mesh.material == Material::Unlit && self.made.mesh.material == Material::Lit && has_normals {
-            let what = "the material stays lit, for a normal map needs light; `--set mesh.normal_map=false` leaves it out";
-            self.warnings.push(what.into());
+            let left_out = key!(mesh.normal_map);
+            self.warnings.push(format!(
+                "the material stays lit, for a normal map needs light; `--set {left_out}=false` leaves it out"
+            ));
         }
         Ok(self)
     }
@@ -131,7 +133,7 @@ impl KeptHead {
         match written.iter().all(is_own) {
             true => Ok(()),
             false => Err(Error::usage(
-                format!("these settings write another `head.{}` than the run's", format.ending()),
+                format!("these settings write another `head.{}` than the run's", format.as_str()),
                 "choose a place beside the run with `--out`, or leave the settings out",
             )),
         }
@@ -166,15 +168,15 @@ impl KeptHead {
         let (was, is) = (&self.made.mesh, &asked.mesh);
         if is.hair != was.hair {
             if is.hair == Hair::Shells {
-                return Err(self.more("mesh.hair", "shells", "no soft layers"));
+                return Err(self.more(key!(mesh.hair), "shells", "no soft layers"));
             }
             self.head.shells = None;
         }
         if is.normal_map && !was.normal_map {
-            return Err(self.more("mesh.normal_map", true, "no normal map"));
+            return Err(self.more(key!(mesh.normal_map), true, "no normal map"));
         }
         if is.lobes != was.lobes && is.lobes != 0 {
-            return Err(self.more("mesh.lobes", is.lobes, &format!("lobes of degree {}", was.lobes)));
+            return Err(self.more(key!(mesh.lobes), is.lobes, &format!("lobes of degree {}", was.lobes)));
         }
         if let Some(texture) = &mut self.head.texture {
             texture.normal = texture.normal.take().filter(|_| is.normal_map);
@@ -194,19 +196,23 @@ impl KeptHead {
                 0 => "no texture".into(),
                 kept => format!("a texture of {kept}"),
             };
-            return Err(self.more("mesh.texture_px", px, &kept));
+            return Err(self.more(key!(mesh.texture_px), px, &kept));
         }
         if px == 0 && kept_px > 0 && self.head.mesh.colors.is_empty() {
-            return Err(self.more("mesh.texture_px", px, "no colors at the vertices"));
+            return Err(self.more(key!(mesh.texture_px), px, "no colors at the vertices"));
         }
         if px > 0 && px < kept_px {
             let shown_by = &[MeshFormat::Glb, MeshFormat::Obj];
-            self.warnings.extend(not_shown("mesh.texture_px", "texture", shown_by, formats)?);
+            self.warnings.extend(not_shown(key!(mesh.texture_px), "texture", shown_by, formats)?);
         }
         let count = is.triangles as usize;
         let more = was.triangles != 0 && is.triangles > was.triangles && count > kept;
         if is.triangles != was.triangles && (count == 0 || more) {
-            return Err(self.more("mesh.triangles", is.triangles, &format!("a mesh of {kept} triangles")));
+            return Err(self.more(
+                key!(mesh.triangles),
+                is.triangles,
+                &format!("a mesh of {kept} triangles"),
+            ));
         }
         if is.triangles != was.triangles && count < kept {
             return self.simplify(count, px, monitor);
@@ -217,7 +223,8 @@ impl KeptHead {
                 let least = kept_px.div_ceil(was.gutter_px);
                 return Err(Error::usage(
                     format!(
-                        "`mesh.texture_px` is {px}: charts of the kept texture of {kept_px} would run into each other"
+                        "`{}` is {px}: charts of the kept texture of {kept_px} would run into each other",
+                        key!(mesh.texture_px)
                     ),
                     format!("use {least} or more"),
                 ));
@@ -279,7 +286,7 @@ fn not_shown(
     formats: &[MeshFormat],
 ) -> Result<Option<String>> {
     let endings = |list: &mut dyn Iterator<Item = &MeshFormat>| {
-        list.map(|format| format!(".{}", format.ending())).collect::<Vec<_>>().join(", ")
+        list.map(|format| format!(".{}", format.as_str())).collect::<Vec<_>>().join(", ")
     };
     let without = endings(&mut formats.iter().filter(|f| !shown_by.contains(f)));
     if without.is_empty() {

@@ -147,7 +147,7 @@ fn later_stages_read_photographs_with_the_mean_exposure_unless_given_ones_are_as
         let folder = tempfile::tempdir().unwrap();
         let run = quiet(folder.path());
         let mut config = Config::preset(Preset::Draft);
-        config.capture.path = dir.path().display().to_string();
+        config.capture.path = dir.path().into();
         (config.capture.cameras, config.capture.exposure) = (CameraPoses::Given, exposure);
         let session = Session::open(&config, &run).unwrap();
         complete(&session, Stage::Mask, &NoFields).unwrap();

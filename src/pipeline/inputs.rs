@@ -6,7 +6,7 @@ use super::clicks::MaskPrompts;
 use super::readings::{Settled, decide_reading};
 use super::{mask, scene_file};
 use crate::capture::{self, Capture, CaptureOptions, Reading, View, ViewMask};
-use crate::config::{Config, MaskHead, MaskSource, Stage};
+use crate::config::{Config, MaskSource, Stage};
 use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
 use crate::{Error, Result};
@@ -63,7 +63,7 @@ impl Inputs {
     /// Opens the capture and reads every file that the stages will read, to compute its digest.
     pub fn read(config: &Config, run: &Run) -> Result<(Capture, Inputs)> {
         let mut options = capture_options(config);
-        let opened = capture::open(Path::new(&config.capture.path), &options);
+        let opened = capture::open(&config.capture.path, &options);
         let (capture, mut inputs) = match opened.and_then(|capture| decide_reading(capture, &options)) {
             Err(e) => restore_from_run(config, run, e)?,
             Ok(Settled { mut capture, reading, reason, .. }) => {
@@ -83,6 +83,25 @@ impl Inputs {
         inputs.imports = imports(config, run)?;
         inputs.lpips = lpips(config, run)?;
         Ok((capture, inputs))
+    }
+
+    /// Returns the names and digests of what a stage reads from outside the run.
+    pub fn read_by(&self, stage: Stage) -> Vec<(&'static str, String)> {
+        match stage {
+            Stage::Mask => {
+                let clicks = self.clicks.iter().flat_map(|clicks| clicks.inputs.iter().cloned());
+                std::iter::once(("capture", self.digest.clone())).chain(clicks).collect()
+            }
+            Stage::Baseline | Stage::Tface => {
+                let imported = self.imports.iter().filter(|import| import.stage == stage);
+                imported.map(|import| ("import", import.digest.clone())).collect()
+            }
+            Stage::Metrics => {
+                let own = self.own_masks.iter().map(|own| ("own masks", own.digest.clone()));
+                own.chain(self.lpips.iter().map(|digest| ("lpips", digest.clone()))).collect()
+            }
+            Stage::Iface | Stage::Mesh | Stage::Render | Stage::Ensemble => Vec::new(),
+        }
     }
 
     /// Writes the digests of the capture's files that the stage `mask` reads, so that a later change can be named.
@@ -127,10 +146,7 @@ fn own_masks(capture: &Capture, options: &CaptureOptions) -> Result<OwnMasks> {
         // the photograph is already part of the capture's digest
         other => Ok(format!("{other:?}")),
     });
-    let mut digests = digests.collect::<Result<Vec<String>>>()?;
-    if options.head != MaskHead::White {
-        digests.push(options.head.into()); // which of their pixels are the head
-    }
+    let digests = digests.collect::<Result<Vec<String>>>()?;
     Ok(OwnMasks { masks, turns, digest: Fingerprint::of_bytes(digests.join(" ").as_bytes()) })
 }
 
@@ -245,7 +261,7 @@ fn is_missing(e: &io::ReadError) -> bool {
 /// `error` itself if the capture exists (the error then says what is wrong with it) or if the run does not exist yet;
 /// otherwise that the run has not recorded its capture yet.
 fn restore_from_run(config: &Config, run: &Run, error: Error) -> Result<(Capture, Inputs)> {
-    let root = Path::new(&config.capture.path);
+    let root = &config.capture.path;
     if capture::has_cameras(root) || !io::is_file(&run.path("config.toml")) {
         return Err(error);
     }

@@ -35,7 +35,7 @@ pub(super) fn learn(
     dir: &StageDir,
 ) -> Result<Value> {
     let session = TrainingSession {
-        stage: stage.word(),
+        stage: stage.as_str(),
         seed: seed(stage, config),
         device: &config.device,
         dir: dir.folder(),
@@ -137,7 +137,7 @@ impl Fields for TrainedFields<'_> {
         let Session { run, config, .. } = self.session;
         let load = || {
             let count = config.radiance(stage).learned();
-            let field = FieldMean::load(stage.word(), &run.path(stage), count)?;
+            let field = FieldMean::load(stage.as_str(), &run.path(stage), count)?;
             let field = field.on(compute_device(&config.device, &VM_TEST)?);
             Ok(field)
         };
@@ -157,7 +157,7 @@ pub(super) type FieldLook = Box<dyn Fn(&Camera) -> RenderedView>;
 /// Returns a renderer for the newest checkpoint of a stage's field in a run, finished or not. If several fields are
 /// trained one after the other, the first one is used.
 pub(super) fn load_field(run: &Path, config: &Config, scene: &Scene, stage: Stage) -> Result<FieldLook> {
-    let (folder, world_from_scene) = (run.join(stage.word()), scene.scene_from_world.inverse());
+    let (folder, world_from_scene) = (run.join(stage.as_str()), scene.scene_from_world.inverse());
     if stage == Stage::Iface && config.iface.field == FieldKind::Density {
         let field = DensityField::load(&folder, &config.iface)?;
         return Ok(Box::new(move |camera| {
@@ -170,7 +170,7 @@ pub(super) fn load_field(run: &Path, config: &Config, scene: &Scene, stage: Stag
             march(camera, &world_from_scene, false, |rays| field.render(rays))
         }));
     }
-    let field = FieldMean::load(stage.word(), &folder, 1)?;
+    let field = FieldMean::load(stage.as_str(), &folder, 1)?;
     Ok(Box::new(move |camera| {
         march(camera, &world_from_scene, false, |rays| field.render(rays, camera.forward()))
     }))

@@ -57,7 +57,7 @@ struct ViewFigures {
 /// Returns all sets that are evaluated, in pipeline order.
 pub(super) fn picture_sets(config: &Config, run: &Run) -> Vec<PictureSet> {
     let set = |name: &str, folder: &str| PictureSet { name: name.into(), folder: run.path(folder) };
-    let methods = config.render.method.iter().map(|m| m.folder());
+    let methods = config.render.method.iter().map(|m| m.as_str());
     let mut sets: Vec<PictureSet> = methods.map(|m| set(m, &format!("render/{m}"))).collect();
     if !config.ensemble.members.is_empty() {
         sets.push(set("ensemble", "ensemble"));
@@ -126,7 +126,7 @@ fn blend_gain(sets: &Map<String, Value>, members: &[Method]) -> Option<Value> {
         let mean = sets.get(set)?.pointer("/head/mean")?;
         mean["psnr_masked"].as_f64().or(mean["psnr"].as_f64())
     };
-    let each = members.iter().filter_map(|member| Some((member.folder(), psnr(member.folder())?)));
+    let each = members.iter().filter_map(|member| Some((member.as_str(), psnr(member.as_str())?)));
     let (best, alone) = each.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|_| members.len() > 1)?;
     Some(json!({"best_member": best, "gain_db": psnr("ensemble")? - alone}))
 }

@@ -55,7 +55,7 @@ pub fn curves(runs: &[(&Session, &str)]) -> Result<Vec<Chart>> {
     for (stage, figures) in LEARNED {
         for (session, name) in runs {
             let log = text(&session.run.path(stage).join("log.jsonl"))?;
-            for mut chart in report::charts(stage.word(), &log, figures) {
+            for mut chart in report::charts(stage.as_str(), &log, figures) {
                 for curve in &mut chart.curves {
                     curve.name = format!("{name} {}", curve.name).trim().to_string();
                 }
@@ -102,7 +102,7 @@ fn page(session: &Session) -> Result<String> {
         warnings: report::warnings(session.run.dir(), records.iter().map(|(stage, record)| (*stage, record))),
         repeat: format!(
             "tiface run {} --config config.toml --run again",
-            quoted(&session.config.capture.path)
+            quoted(&session.config.capture.path.to_string_lossy())
         ),
         summaries: records.iter().filter_map(summary).collect(),
         settings: session.config.to_toml(),
@@ -123,7 +123,7 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
     let [train, test] = [Train, Test].map(|split| session.capture.split(split).count());
     let mut facts = vec![
         format!("{} to learn from, {test} held out", counted(train, "photograph")),
-        format!("preset {}", session.config.preset.name()),
+        format!("preset {}", session.config.preset.as_str()),
         format!("seed {}", session.config.seed),
     ];
     let of = |stage: Stage| records.iter().find(|(s, _)| *s == stage).map(|(_, record)| &record.summary);
@@ -222,11 +222,11 @@ pub(super) fn methods(session: &Session) -> Vec<(String, Vec<Option<f64>>)> {
 /// Returns the stages that must have run before a picture of this method can be made, in order.
 fn stages_of(session: &Session, word: &str) -> Vec<Stage> {
     let members = &session.config.ensemble.members;
-    match session.config.render.method.iter().find(|m| m.folder() == word) {
+    match session.config.render.method.iter().find(|m| m.as_str() == word) {
         Some(method) if method.stage() == Stage::Mesh => vec![Stage::Iface, Stage::Mesh],
         Some(method) => vec![method.stage()],
         None => {
-            let needed: Vec<Stage> = members.iter().flat_map(|m| stages_of(session, m.folder())).collect();
+            let needed: Vec<Stage> = members.iter().flat_map(|m| stages_of(session, m.as_str())).collect();
             let is_needed = |stage: &Stage| needed.contains(stage) || *stage == Stage::Ensemble;
             Stage::ALL.into_iter().filter(is_needed).collect()
         }
@@ -235,9 +235,9 @@ fn stages_of(session: &Session, word: &str) -> Vec<Stage> {
 
 /// Returns the files that hold the data a method shows.
 fn files_of(session: &Session, word: &str) -> Vec<std::path::PathBuf> {
-    let Some(method) = session.config.render.method.iter().find(|m| m.folder() == word) else {
+    let Some(method) = session.config.render.method.iter().find(|m| m.as_str() == word) else {
         let members = session.config.ensemble.members.iter();
-        let mut all: Vec<_> = members.flat_map(|m| files_of(session, m.folder())).collect();
+        let mut all: Vec<_> = members.flat_map(|m| files_of(session, m.as_str())).collect();
         all.sort();
         all.dedup();
         return all;

@@ -307,7 +307,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
 
     // and the suggested fix is one
     let mut moved = config.clone();
-    moved.capture.path = dir.path().join("moved").to_str().unwrap().into();
+    moved.capture.path = dir.path().join("moved");
     assert_eq!(evaluate(&Session::open(&moved, &run).unwrap()), [false, true, true, true]);
     // where there is no run, it is the capture that is wrong
     let e = Session::open(&config, &quiet(&dir.path().join("new"))).err().unwrap();

@@ -8,47 +8,13 @@ use super::path::{CameraPath, PATHS};
 use super::render::shows_head;
 use super::session::Session;
 use crate::capture::View;
-use crate::config::iface::FieldKind;
-use crate::config::{CameraPoses, Config, Exposures, MaskHead, Material, Method, Stage, VmConfig};
+use crate::config::{Config, Method, Product, Stage, VmConfig, key};
 use crate::run::{Fingerprint, Plan, read_record, read_status};
 use crate::{Error, Result, io};
 use std::path::Path;
 
-/// Version of the stages' files; raised when their meaning changes.
-const FORMAT: u32 = 2;
-
-/// Keys of `[mask]` that do not affect the masks that are made: paths, whose contents are inputs of the stage
-/// instead, and checks of other masks.
-const UNTRACKED_MASK_KEYS: [&str; 10] = [
-    "mask.trust",
-    "mask.head",
-    "mask.prompts",
-    "mask.point",
-    "mask.view",
-    "mask.sam",
-    "mask.sam_decoder",
-    "mask.vitmatte",
-    "mask.alpha_net",
-    "mask.memory_gib",
-];
-
-/// Keys of `[mask]` that affect masks read from the capture.
-const CAPTURE_MASK_KEYS: [&str; 3] = ["mask.source", "mask.meaning", "mask.head"];
-
-/// Keys of `[mesh]` that affect files for other programs, but no rendered view.
-const FILE_KEYS: [&str; 5] =
-    ["mesh.format", "mesh.material", "mesh.texture_format", "mesh.exr", "mesh.height_m"];
-
-/// Keys of `[mesh]` that affect the head mesh, but not the surface it is made from.
-const HEAD_KEYS: [&str; 7] = [
-    "mesh.frame",
-    "mesh.triangles",
-    "mesh.max_error",
-    "mesh.texture_px",
-    "mesh.lobes",
-    "mesh.hair",
-    "mesh.normal_map",
-];
+/// Version of the stages' files and of what is recorded of their settings; raised when their meaning changes.
+const FORMAT: u32 = 3;
 
 impl Session<'_> {
     /// Returns `until` and the stages it needs, in pipeline order. Views along a camera path need only the stages
@@ -130,7 +96,7 @@ impl Session<'_> {
             let followers = stage.followers(self.config).into_iter();
             names = followers.filter(|s| !stays(s)).map(|s| s.to_string()).collect();
             // views of a path show only the head mesh or the extracted surface
-            let kept = [true, false].map(|head| self.mesh_input(head));
+            let kept = [Product::Head, Product::Surface].map(|part| self.fingerprint(part).digest());
             let removed = names.clone();
             let is_old = |input: &String, digest: &String| {
                 removed.contains(input) && (repeated || !kept.contains(digest))
@@ -189,12 +155,12 @@ impl Session<'_> {
         let made: Vec<Stage> = stage
             .followers(self.config)
             .into_iter()
-            .filter(|s| *s == stage || names.iter().any(|name| name == s.word()))
+            .filter(|s| *s == stage || names.iter().any(|name| name == s.as_str()))
             .collect();
         self.require_inputs(&made)?;
         self.require_masks(&made)?;
         // do not clear a finished blend whose views could not be made again
-        let blended = names.iter().any(|n| n == Stage::Ensemble.word())
+        let blended = names.iter().any(|n| n == Stage::Ensemble.as_str())
             && !self.config.ensemble.members.is_empty()
             && read_record(&self.run.path(Stage::Ensemble)).ok().flatten().is_some();
         if blended {
@@ -216,7 +182,7 @@ impl Session<'_> {
         let plans = self.order(until).into_iter().map(|stage| self.compared_plan(stage));
         let mut kept = plans.filter(|plan| !cleared.iter().any(|name| name == plan.name));
         kept.try_for_each(|plan| {
-            self.run.agrees(&plan).map_err(|e| match plan.name == Stage::Mesh.word() && self.differs_in_files() {
+            self.run.agrees(&plan).map_err(|e| match plan.name == Stage::Mesh.as_str() && self.differs_in_files() {
                 true => {
                     let run = self.run.dir().display();
                     let hint = format!(
@@ -233,14 +199,13 @@ impl Session<'_> {
     /// Checks, before any work, that the settings that `until` depends on are consistent.
     fn can_make(&self, until: Stage) -> Result<()> {
         let order = self.order(until);
+        const CAMERAS: &str = key!(render.cameras);
         let cameras = &self.config.render.cameras;
         if order.contains(&Stage::Render) && cameras != "test" {
             return Err(Error::usage(
+                format!("`{CAMERAS}` is {cameras}, but it is the held-out views that are blended and judged"),
                 format!(
-                    "`render.cameras` is {cameras}, but it is the held-out views that are blended and judged"
-                ),
-                format!(
-                    "set it back with `--set render.cameras=test`; `tiface render RUN --cameras {cameras}` makes the \
+                    "set it back with `--set {CAMERAS}=test`; `tiface render RUN --cameras {cameras}` makes the \
                      others, in a folder of their own"
                 ),
             ));
@@ -267,170 +232,73 @@ impl Session<'_> {
 
     /// Returns the plan of a stage; if the stage makes views, they are those of the evaluation.
     fn stage_plan(&self, stage: Stage) -> Plan<'_> {
-        let config = self.config;
-        let name = stage.word();
-        let mut settings = config.values(name);
-        let mut needs_bytes = 16 << 20;
-        let needs = stage.needs(config).into_iter();
-        let methods = &config.render.method;
-        let mut inputs: Vec<_> = needs.map(|s| (s.word(), self.input(s, name, methods))).collect();
-        if stage.learns() {
-            settings.insert("capture.tiles".into(), config.capture.tiles.to_string());
-            settings.insert("seed".into(), config.seed.to_string());
-            settings.insert("preset".into(), config.preset.name().into());
+        Plan {
+            name: stage.as_str(),
+            fingerprint: self.fingerprint(Product::of(stage)),
+            device: &self.config.device,
+            needs_bytes: (16 << 20) + self.needs_bytes(stage),
+            saves: stage.learns(),
         }
-        match stage {
-            Stage::Mask => {
-                settings.extend(config.values("capture"));
-                settings.remove("capture.path"); // its content counts, not its path
-                settings.remove("capture.tiles"); // masks are of whole photographs
-                if config.capture.cameras == CameraPoses::Given {
-                    settings.remove("capture.cameras"); // as in runs from before poses were measured
-                }
-                if config.capture.exposure == Exposures::Given {
-                    settings.remove("capture.exposure"); // as in runs from before exposures were measured
-                }
-                if config.capture.r#box == "head" {
-                    settings.remove("capture.box"); // as in runs from before there was another
-                }
-                if config.mask.head == MaskHead::White {
-                    settings.remove("mask.head"); // as in runs from before there was another
-                }
-                inputs.push(("capture", self.inputs.digest.clone()));
-                match &self.inputs.clicks {
-                    // the paths of clicks and networks do not matter either, nor does the memory limit
-                    Some(clicks) => {
-                        settings.retain(|key, _| !UNTRACKED_MASK_KEYS.contains(&key.as_str()));
-                        if !config.mask.with_alpha_net() {
-                            settings.remove("mask.alpha_input"); // as in runs from before there was any
-                        }
-                        inputs.extend(clicks.inputs.iter().cloned());
-                    }
-                    // settings for making masks do not affect masks read from the capture
-                    None => settings.retain(|key, _| {
-                        !key.starts_with("mask.") || CAPTURE_MASK_KEYS.contains(&key.as_str())
-                    }),
-                }
-            }
-            Stage::Iface => {
-                settings.remove("iface.checkpoint_s"); // how often is no matter of what
-                if config.iface.field == FieldKind::Sdf {
-                    settings.remove("iface.field"); // as in runs from before there was another
-                }
-                // weights and two moments, for two checkpoints and one being written
-                needs_bytes += (config.iface.levels as u64) << config.iface.log2_table.min(40) << 3 << 3;
-            }
-            Stage::Baseline | Stage::Tface => {
-                // the baseline's own table holds only its differences from T-Face's
-                let learned = Config { tface: config.radiance(stage), ..config.clone() };
-                for (key, value) in learned.values("tface") {
-                    let own = key.replacen("tface", name, 1);
-                    settings.insert(if settings.contains_key(&own) { own } else { key }, value);
-                }
-                settings.remove("tface.checkpoint_s");
-                if stage == Stage::Baseline {
-                    settings.remove("tface.mask_weight"); // of a loss that it has not
-                }
-                if let Some(import) = self.inputs.imports.iter().find(|import| import.stage == stage) {
-                    settings.retain(|key, _| !key.ends_with(".import") && key != "capture.tiles");
-                    inputs.push(("import", import.digest.clone()));
-                }
-                needs_bytes += vm_bytes(&learned.tface);
-            }
-            Stage::Mesh => {
-                settings.insert("capture.unit_m".into(), config.capture.unit_m.to_string());
-                if config.mesh.material == Material::Unlit {
-                    settings.remove("mesh.material"); // as in runs from before there was another
-                }
-                if config.mesh.height_m == 0.0 {
-                    settings.remove("mesh.height_m"); // as in runs from before files could be scaled
-                }
-                if !config.mesh.dense {
-                    settings.remove("mesh.dense"); // as in runs from before there was another
-                }
-                settings.insert("format of mesh/parts".into(), crate::mesh::files::FORMAT.into());
-                // a few triangles per cell of a closed surface, three formats and the parts
-                let c = &config.mesh;
-                needs_bytes += (c.resolution as u64).pow(2) * 12 * 130;
-                // pictures as parts and inside the files, and the float one
-                needs_bytes += c.texels() * (6 * c.pictures() + 3 + if c.exr { 12 } else { 0 });
-            }
-            Stage::Render => {
-                // settings that only camera paths use do not affect held-out views
-                settings.remove("render.cameras");
-                settings.remove("render.orbit_views");
-                let render = &config.render;
-                if !render.shows_residuals(&render.method) {
-                    settings.remove("render.residuals"); // as in runs from before
-                }
-                let each = if config.render.float { 12 + 10 } else { 12 };
-                needs_bytes += self.pixels() * each * config.render.method.len().max(1) as u64 / 2;
-            }
-            Stage::Ensemble => needs_bytes += self.pixels() * 4,
-            Stage::Metrics => {
-                inputs.extend(self.inputs.own_masks.as_ref().map(|own| ("own masks", own.digest.clone())));
-                settings.remove("metrics.lpips"); // the file's content counts, not its path
-                inputs.extend(self.inputs.lpips.clone().map(|digest| ("lpips", digest)));
-            }
+    }
+
+    /// Returns everything that affects a product: the settings that say so, and what its stage reads.
+    fn fingerprint(&self, product: Product) -> Fingerprint {
+        let (stage, config) = (product.stage(), self.config);
+        let mut fingerprint = Fingerprint::new(FORMAT, config.settings_of(product));
+        for needed in stage.needs(config) {
+            fingerprint = fingerprint.input(needed.as_str(), self.input(needed, &config.render.method));
         }
-        let mut fingerprint = Fingerprint::new(FORMAT, settings);
-        for (name, digest) in inputs {
+        for (name, digest) in self.inputs.read_by(stage) {
             fingerprint = fingerprint.input(name, digest);
         }
-        Plan { name, fingerprint, device: &config.device, needs_bytes, saves: stage.learns() }
-    }
-
-    /// Returns the digest of a stage as an input of the folder `reader`; for the mesh, the digest of the parts that
-    /// views by these methods show.
-    fn input(&self, stage: Stage, reader: &str, methods: &[Method]) -> String {
-        let whole = self.stage_plan(stage).fingerprint.digest();
-        // older runs made no difference and used the digest of the whole mesh
-        let old = || {
-            let folder = self.run.path(reader);
-            let record = read_record(&folder).ok().flatten().map(|r| r.fingerprint);
-            let begun = || read_status(&folder).ok().flatten().map(|s| s.fingerprint);
-            record.or_else(begun)?.inputs.remove(stage.word())
-        };
-        match stage {
-            Stage::Mesh if old().as_ref() != Some(&whole) => {
-                self.mesh_input(shows_head(self.config, methods))
-            }
-            _ => whole,
+        if stage == Stage::Mesh {
+            fingerprint = fingerprint.setting("format of mesh/parts", crate::mesh::files::FORMAT);
         }
+        fingerprint
     }
 
-    /// Returns the digest of the head mesh or of the extracted surface, without the settings that do not affect it.
-    fn mesh_input(&self, head: bool) -> String {
-        let mut fingerprint = self.stage_plan(Stage::Mesh).fingerprint;
-        // lobes are in the coordinates of the file
-        let frame = self.config.mesh.lobes == 0;
-        fingerprint.settings.retain(|key, _| {
-            let shapes = !FILE_KEYS.contains(&key.as_str()) && (head || !HEAD_KEYS.contains(&key.as_str()));
-            shapes && !(frame && key == "mesh.frame")
-        });
-        fingerprint.digest()
+    /// Returns the digest of a stage as an input; for the mesh, the digest of the part that views by these methods show.
+    fn input(&self, stage: Stage, methods: &[Method]) -> String {
+        let product = match stage {
+            Stage::Mesh if shows_head(self.config, methods) => Product::Head,
+            Stage::Mesh => Product::Surface,
+            stage => Product::of(stage),
+        };
+        self.fingerprint(product).digest()
+    }
+
+    /// Returns about how many bytes a stage takes on the disk while it works, beside small files.
+    fn needs_bytes(&self, stage: Stage) -> u64 {
+        let Config { iface, mesh, render, .. } = self.config;
+        match stage {
+            Stage::Mask | Stage::Metrics => 0,
+            // weights and two moments, for two checkpoints and one being written
+            Stage::Iface => (iface.levels as u64) << iface.log2_table.min(40) << 3 << 3,
+            Stage::Baseline | Stage::Tface => vm_bytes(&self.config.radiance(stage)),
+            Stage::Mesh => {
+                // a few triangles per cell of a closed surface, three formats and the parts
+                let surface = (mesh.resolution as u64).pow(2) * 12 * 130;
+                // pictures as parts and inside the files, and the float one
+                surface + mesh.texels() * (6 * mesh.pictures() + 3 + if mesh.exr { 12 } else { 0 })
+            }
+            Stage::Render => {
+                let each = if render.float { 12 + 10 } else { 12 };
+                self.pixels() * each * render.method.len().max(1) as u64 / 2
+            }
+            Stage::Ensemble => self.pixels() * 4,
+        }
     }
 
     /// Returns the inputs of the views along a path.
     fn path_plan<'p>(&'p self, path: &'p CameraPath) -> Plan<'p> {
         let CameraPath { folder, render, cameras, digest } = path;
-        let mut settings = Config { render: render.clone(), ..self.config.clone() }.values("render");
-        settings.remove("render.float");
-        if !render.shows_residuals(&render.method) {
-            settings.remove("render.residuals"); // as in runs from before
-        }
-        if cameras.is_some() {
-            settings.remove("render.orbit_views");
-        }
-        if digest.is_some() {
-            settings.remove("render.cameras"); // the file's content counts, not its path
-        }
-        let mut fingerprint = Fingerprint::new(FORMAT, settings);
+        let config = Config { render: render.clone(), ..self.config.clone() };
+        let mut fingerprint = Fingerprint::new(FORMAT, config.settings_of(Product::Path));
         if let Some(digest) = digest {
             fingerprint = fingerprint.input("cameras", digest);
         }
         for stage in render.shows() {
-            fingerprint = fingerprint.input(stage.word(), self.input(stage, folder, &render.method));
+            fingerprint = fingerprint.input(stage.as_str(), self.input(stage, &render.method));
         }
         let pixels = |c: &crate::geom::Camera| c.width as u64 * c.height as u64;
         let all = match cameras {

@@ -49,7 +49,7 @@ pub(super) fn render(
     let mut seconds = Map::new();
     for &method in &c.method {
         let (mut spent, mut made) = (Duration::ZERO, 0);
-        let whole = dir.folder().join(method.folder());
+        let whole = dir.folder().join(method.as_str());
         let own = own_poses(method).iter().map(|camera| (camera, whole.join(pictures::OWN_POSE), None));
         let float = c.float.then(|| whole.join(pictures::FLOAT));
         let given = cameras.iter().map(|camera| (camera, whole.clone(), float.clone()));
@@ -77,9 +77,9 @@ pub(super) fn render(
             dir.step(done, total)?;
         }
         let per_view = spent.as_secs_f64() / made.max(1) as f64;
-        seconds.insert(method.folder().to_owned(), json!(per_view));
+        seconds.insert(method.as_str().to_owned(), json!(per_view));
     }
-    let methods: Vec<_> = c.method.iter().map(|m| m.folder()).collect();
+    let methods: Vec<_> = c.method.iter().map(|m| m.as_str()).collect();
     Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
 }
 

@@ -15,7 +15,6 @@ use crate::{Error, Result};
 use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::ErrorKind::NotFound;
-use std::path::Path;
 use std::sync::OnceLock;
 
 /// A capture, its configuration and its run folder.
@@ -85,7 +84,7 @@ impl<'a> Session<'a> {
         let mut evaluated = Capture { views, ..capture.clone() };
         if let Err(e) = evaluated.settle_masks(&self.config.mask.head, &Limits::default()) {
             let text = format!("the capture's own masks are not used for the figures: {e}; {}", e.hint());
-            self.run.warn(Stage::Metrics.word(), &text);
+            self.run.warn(Stage::Metrics.as_str(), &text);
             return Ok(capture);
         }
         let has_own = capture.views.iter_mut().zip(&own.masks).filter(|(_, own)| **own != ViewMask::None);
@@ -191,7 +190,7 @@ impl<'a> Session<'a> {
         stages.iter().try_for_each(|&stage| match stage {
             Stage::Iface => crate::iface::require_fit(&self.config.iface, &device),
             Stage::Baseline | Stage::Tface => {
-                crate::tface::require_fit(stage.word(), &self.config.radiance(stage), bounds, &device)
+                crate::tface::require_fit(stage.as_str(), &self.config.radiance(stage), bounds, &device)
             }
             _ => Ok(()),
         })
@@ -221,7 +220,7 @@ pub fn check_feasible(config: &Config) -> Result<()> {
 
 /// Returns whether the capture is the synthetic head of a demo, whose surface is known.
 pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
-    io::real_path(&run.path(DEMO_CAPTURE)).is_ok_and(|made| made == Path::new(&config.capture.path))
+    io::real_path(&run.path(DEMO_CAPTURE)).is_ok_and(|made| made == config.capture.path)
 }
 
 /// Refuses a device that this build or this machine does not have, or that another process uses. Finished stages need

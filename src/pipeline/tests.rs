@@ -36,7 +36,7 @@ pub(super) fn quiet(dir: &Path) -> Run {
 
 /// The words of stages, with spaces.
 pub(super) fn words(stages: &[Stage]) -> String {
-    stages.iter().map(|s| s.word()).collect::<Vec<_>>().join(" ")
+    stages.iter().map(|s| s.as_str()).collect::<Vec<_>>().join(" ")
 }
 
 /// Writes the demo head, photographed at a size by this many training and held-out views, into a folder. A size of its own costs
@@ -49,7 +49,7 @@ pub(super) fn demo_head(root: &Path, (width, height): (u32, u32), (train, test):
 /// longer than all else of the stage `mask`, and has tests of its own.
 pub(super) fn draft(root: &Path) -> Config {
     let mut config = Config::preset(Preset::Draft);
-    config.capture.path = root.to_str().unwrap().into();
+    config.capture.path = root.into();
     (config.capture.cameras, config.capture.exposure) = (CameraPoses::Given, Exposures::Given);
     config
 }

@@ -162,11 +162,9 @@ pub struct BenchResult {
     pub threads: usize,
     /// The capture's name.
     pub capture: String,
-    /// The settings, as TOML; those of older results are not known.
-    #[serde(default)]
+    /// The settings, as TOML.
     pub settings: String,
     /// Words of the sweeps that were asked for.
-    #[serde(default)]
     pub asked: Vec<String>,
     /// The sweeps, in order.
     pub sweeps: Vec<Sweep>,

@@ -40,7 +40,7 @@ pub fn live_html(
     let mut drawn = Vec::new();
     for (stage, names) in LEARNED {
         let log = io::read_bytes(&run.join(stage).join("log.jsonl"), &Limits::default()).unwrap_or_default();
-        let found = charts(stage.word(), &String::from_utf8_lossy(&log), names);
+        let found = charts(stage.as_str(), &String::from_utf8_lossy(&log), names);
         drawn.extend(found.iter().map(super::Chart::html));
     }
     let time = |name: &String| io::modified(&run.join(name)).unwrap_or(SystemTime::UNIX_EPOCH);
@@ -87,7 +87,7 @@ fn row(run: &Path, stage: Stage) -> Option<StageRow> {
         let faults = record.faults(&folder);
         let gone = faults.iter().map(|fault| format!("; {fault}")).collect::<String>();
         let words = format!("done in {}{gone}", duration(record.elapsed_s));
-        return Some(StageRow { name: stage.word(), words, share: 100 });
+        return Some(StageRow { name: stage.as_str(), words, share: 100 });
     }
     let s = read_status(&folder).ok()??;
     let mut words = match s.state {
@@ -98,7 +98,7 @@ fn row(run: &Path, stage: Stage) -> Option<StageRow> {
     if let (State::Running, Some(eta)) = (s.state, s.eta_s) {
         words += &format!(", {} left", duration(eta));
     }
-    Some(StageRow { name: stage.word(), words, share: 100 * s.step.min(s.steps) / s.steps.max(1) })
+    Some(StageRow { name: stage.as_str(), words, share: 100 * s.step.min(s.steps) / s.steps.max(1) })
 }
 
 #[cfg(test)]

@@ -79,7 +79,7 @@ impl RunRow {
             done: status.phase == Phase::Done,
             failed: matches!(status.phase, Phase::Failed | Phase::Damaged),
             picture: picture(run).unwrap_or_default(),
-            preset: Config::of_run(run).map_or(String::new(), |config| config.preset.name().into()),
+            preset: Config::of_run(run).map_or(String::new(), |config| config.preset.as_str().into()),
             seconds: status.elapsed_s,
             cpu_s: records.iter().map(|(_, r)| r.cpu_s).sum::<Option<f64>>().filter(|s| *s > 0.0),
             peak_bytes: records.iter().filter_map(|(_, r)| r.peak_bytes).max(),

@@ -71,11 +71,12 @@ impl Fingerprint {
         Ok(hex(&digest.finalize()))
     }
 
-    /// Returns the differences from an `older` fingerprint, one line each.
+    /// Returns the differences from an `older` fingerprint, one line each; of another format, that alone.
     pub fn differences(&self, older: &Fingerprint) -> Vec<String> {
         let mut lines = Vec::new();
         if self.format != older.format {
-            lines.push(format!("format version: was {}, is {}", older.format, self.format));
+            // settings and inputs of another format mean something else
+            return vec![format!("format version: was {}, is {}", older.format, self.format)];
         }
         let names: BTreeSet<_> = self.settings.keys().chain(older.settings.keys()).collect();
         for name in names {
@@ -122,6 +123,10 @@ mod tests {
         assert_eq!(
             other.differences(&old),
             ["mask: was an input, is none now", "tface: is an input, was none before"]
+        );
+        assert_eq!(
+            Fingerprint { format: 3, ..new.clone() }.differences(&old),
+            ["format version: was 0, is 3"]
         );
         assert_ne!(new.digest(), old.digest());
         assert_eq!(old.digest(), old.clone().digest());

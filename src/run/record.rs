@@ -1,6 +1,7 @@
 //! `done.json`: the record of a complete stage, and comparison of its files with it.
 
 use super::Fingerprint;
+use crate::config::key;
 use crate::io::{self, Limits, ReadError};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -140,7 +141,7 @@ impl Record {
         match (exported, self.stage.split_once('/')) {
             (Some(name), None) => format!("tiface export {run} --out {}", folder.join(name).display()),
             (_, Some((owner, _))) => {
-                let cameras = self.fingerprint.settings.get("render.cameras");
+                let cameras = self.fingerprint.settings.get(key!(render.cameras));
                 let cameras = cameras.map_or("FILE", |word| word.trim_matches('"'));
                 format!("tiface {owner} {run} --cameras {cameras} --fresh {owner}")
             }

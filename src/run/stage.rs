@@ -284,6 +284,18 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
         return Ok(());
     }
     let (stage, state) = (plan.name, if done { "done" } else { "begun" });
+    let (was, is) = (found.format, plan.fingerprint.format);
+    if was != is {
+        let what = format!(
+            "stage `{stage}` was {state} by another version of tiface: its format is {was}, not {is}"
+        );
+        let first = stage.split('/').next().unwrap_or_default();
+        let hint = format!(
+            "choose another folder with `--run DIR`, continue with that version, or recompute this stage and what \
+             follows with `--fresh {first}`"
+        );
+        return Err(Error::cannot(what, hint));
+    }
     if let [difference] = &differences[..]
         && difference.starts_with("capture: ")
     {
@@ -355,6 +367,23 @@ mod tests {
 
     fn never(_: &StageDir) -> Result<Value> {
         panic!("the stage should have been skipped")
+    }
+
+    #[test]
+    fn a_stage_of_another_format_is_refused_with_what_to_do() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = open(dir.path());
+        run.stage(plan(5), work).unwrap();
+        let mut other = plan(6);
+        other.fingerprint.format = 3;
+        let told = "stage `iface` was done by another version of tiface: its format is 0, not 3";
+        for error in [run.agrees(&other).unwrap_err(), run.stage(other.clone(), never).unwrap_err()] {
+            assert_eq!((error.to_string().as_str(), error.kind()), (told, ErrorKind::Cannot));
+            assert!(
+                error.hint().contains("`--run DIR`") && error.hint().ends_with("`--fresh iface`"),
+                "{error:?}"
+            );
+        }
     }
 
     #[test]

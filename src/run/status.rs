@@ -151,10 +151,10 @@ impl RunStatus {
     /// Reads the state of the run in a folder; missing and damaged files are part of the state.
     pub fn read(run: &Path) -> RunStatus {
         let estimate = read_estimate(run).unwrap_or_default();
-        let is_part = |stage: &Stage| estimate.as_ref().is_none_or(|e| e.contains_key(stage.word()));
+        let is_part = |stage: &Stage| estimate.as_ref().is_none_or(|e| e.contains_key(stage.as_str()));
         let mut stages: Vec<StageStatus> =
             Stage::ALL.into_iter().filter(is_part).map(|s| StageStatus::read(&run.join(s), s)).collect();
-        let cost = |s: &StageStatus| estimate.as_ref()?.get(s.stage.word()).map(|c| c.seconds());
+        let cost = |s: &StageStatus| estimate.as_ref()?.get(s.stage.as_str()).map(|c| c.seconds());
         // the machine that works on it may be faster or slower, and do other things besides; what networks do for masks
         // says nothing about that
         let done = stages.iter().filter(|s| s.stage != Stage::Mask);

@@ -21,7 +21,7 @@ fn two_processes_at_once_make_every_stage_once() {
     let dir = tempfile::tempdir().unwrap();
     capture(dir.path());
     for stage in tiface::pipeline::Stage::ALL {
-        let stage = stage.word();
+        let stage = stage.as_str();
         worked(&tiface(dir.path(), &[stage, "head", "--run", "calm"]).output().unwrap());
         let start = || {
             let mut command = tiface(dir.path(), &[stage, "head", "--run", "raced"]);

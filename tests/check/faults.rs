@@ -133,7 +133,7 @@ fn faults_lose_nothing(most: usize, least: usize) {
     let mut tried = 0;
     for stage in Stage::ALL {
         let capture = capture.to_str().unwrap();
-        let (after, count) = bench.try_faults(&place, &[stage.word(), capture, "--run", "HERE/run"], tried);
+        let (after, count) = bench.try_faults(&place, &[stage.as_str(), capture, "--run", "HERE/run"], tried);
         (place, tried) = (after, tried + count);
     }
     let words: [&[&str]; 6] = [

@@ -283,3 +283,63 @@ fn only_the_items_under_the_attribute_are_tests() {
     let kept: Vec<&str> = without_tests(text).into_iter().map(|(_, line)| line.trim()).collect();
     assert_eq!(kept, ["use a;", "use b;", "use e;", "impl F {", "", "fn l() {}", "}"]);
 }
+
+/// The texts between quotes of consecutive lines; one that a backslash continues stands in several pieces.
+fn texts(lines: &[(usize, String)]) -> Vec<(usize, String)> {
+    let (mut found, mut is_open) = (Vec::new(), false);
+    for (number, line) in lines {
+        let line = line.replace("'\"'", "' '");
+        let mut text = String::new();
+        let mut chars = line.chars();
+        while let Some(c) = chars.next() {
+            match c {
+                '\\' => drop(chars.next()),
+                '"' => {
+                    found.extend(is_open.then(|| (*number, std::mem::take(&mut text))));
+                    is_open = !is_open;
+                }
+                c if is_open => text.push(c),
+                _ => {}
+            }
+        }
+        found.extend(is_open.then_some((*number, text)));
+        is_open &= line.ends_with('\\');
+    }
+    found
+}
+
+/// What looks like a key and is none: a file, and tensors of a checkpoint.
+const NO_KEYS: [&str; 4] = ["metrics.json", "mask.bounds", "mask.size", "mask.bits"];
+
+#[test]
+fn every_key_in_a_message_exists_and_code_names_keys_by_the_macro() {
+    let known: BTreeSet<String> = tiface::config::keys().map(|(name, _)| name).collect();
+    let tables: BTreeSet<&str> = known.iter().filter_map(|key| Some(key.split_once('.')?.0)).collect();
+    let is_word = |c: char| c.is_ascii_alphanumeric() || c == '_';
+    let mut wrong = Vec::new();
+    for source in sources() {
+        let at = source.path.display();
+        for (number, text) in texts(&source.lines) {
+            // meshes are a layer that knows no configuration
+            if known.contains(&text) && text.contains('.') && source.module != "mesh" {
+                wrong.push(format!("src/{at}:{number}: write key!({text})"));
+            }
+            for word in text.split(|c: char| !(is_word(c) || c == '.' || c == '/')) {
+                let word = word.trim_end_matches('.');
+                let is_key = word.split_once('.').is_some_and(|(table, _)| tables.contains(table));
+                if is_key && !known.contains(word) && !NO_KEYS.contains(&word) {
+                    wrong.push(format!("src/{at}:{number}: there is no key `{word}`"));
+                }
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "\n{}", wrong.join("\n"));
+}
+
+#[test]
+fn texts_are_what_stands_between_quotes() {
+    let lines = ["f(\"a \\\" b\", '\"', \"c\");", "g(\"d \\", "   e\");", "h(\"i"];
+    let lines: Vec<(usize, String)> = lines.iter().map(|l| l.to_string()).enumerate().collect();
+    let found: Vec<String> = texts(&lines).into_iter().map(|(_, text)| text.trim().into()).collect();
+    assert_eq!(found, ["a  b", "c", "d", "e", "i"]);
+}

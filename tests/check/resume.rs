@@ -159,7 +159,7 @@ fn killed_once_in_every_stage_the_run_ends_with_the_same_bytes() {
     for stage in Stage::ALL {
         let mut child = runs.start("hunted");
         wait_for_stage(&runs.path("hunted"), stage, &mut child);
-        kills += u32::from(killed(child, stage.word()));
+        kills += u32::from(killed(child, stage.as_str()));
     }
     // and twice where a training has left something to go on from
     for _ in 0..2 {

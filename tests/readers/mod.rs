@@ -244,7 +244,7 @@ fn cameras(dir: &Path, bytes: &[u8]) -> String {
     put(&run.path("mask"), "done.json", parts.next().unwrap_or_default());
     put(run.dir(), "config.toml", b"");
     let mut config = Config::preset(Preset::Draft);
-    config.capture.path = dir.join("gone").display().to_string();
+    config.capture.path = dir.join("gone");
     config.device = "cpu".into();
     outcome(Session::open(&config, &run))
 }

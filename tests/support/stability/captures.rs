@@ -123,7 +123,7 @@ fn captures() -> Vec<Hard> {
 /// Settings of a training of a second or two.
 fn config(folder: &Path) -> Config {
     let mut config = Config::preset(Preset::Draft);
-    config.capture.path = folder.display().to_string();
+    config.capture.path = folder.into();
     let f = &mut config.iface;
     (f.steps, f.rays, f.max_rays, f.samples, f.start, f.stereo) = (100, 256, 512, 4096, Start::Sphere, 0.0);
     (f.levels, f.log2_table, f.occupancy_resolution) = (6, 12, 32);
