@@ -381,6 +381,10 @@ fn vitmatte_is_shown_the_colors_of_each_convention() {
         let pixels = network.pixels(&photo, &trimap, padded);
         let expected = array(&folder.join(format!("pixel_values{kind}.npy")));
         close("pixel_values", numbers(&pixels), numbers(&expected), 1e-6);
+        // the network is run once for each convention: it is shown the same numbers from the other file
+        if path == &alone && set == VitmatteColors::Half || set == VitmatteColors::Imagenet {
+            continue;
+        }
         let alpha = network.alpha(&photo, &trimap).unwrap();
         let whole = array(&folder.join(format!("alphas{kind}.npy")));
         let cut: Vec<f32> =
