@@ -44,12 +44,15 @@ pub(super) fn vote<T: Copy + Default + Send>(
     vote: impl Fn(&mut [T], usize, usize) + Sync,
 ) -> Vec<T> {
     let n = cube.n;
+    let [xs, ys, zs] = cube.centers();
     let slab = |x: usize| {
         let mut slab = vec![T::default(); n * n * values];
         for (k, frame) in frames.iter().enumerate() {
-            for (i, cell) in slab.chunks_exact_mut(values).enumerate() {
-                if let Some(pixel) = frame.pixel(cube.cell_center(x, i / n, i % n)) {
-                    vote(cell, k, pixel);
+            for (row, y) in slab.chunks_exact_mut(n * values).zip(&ys) {
+                for (cell, z) in row.chunks_exact_mut(values).zip(&zs) {
+                    if let Some(pixel) = frame.pixel(DVec3::new(xs[x], *y, *z)) {
+                        vote(cell, k, pixel);
+                    }
                 }
             }
         }

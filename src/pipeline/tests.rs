@@ -54,6 +54,21 @@ pub(super) fn draft(root: &Path) -> Config {
     config
 }
 
+/// A folder with the demo head, photographed at a size by so many training and held-out views, the configuration of a draft
+/// of it, and a run of that folder which reports nothing.
+pub(super) fn head_run(size: (u32, u32), views: (usize, usize)) -> (TempDir, Config, Run) {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    demo_head(&root, size, views);
+    let (config, run) = (draft(&root), quiet(dir.path()));
+    (dir, config, run)
+}
+
+/// The least of these that most questions can be asked about: eight training and two held-out views.
+pub(super) fn tiny_run() -> (TempDir, Config, Run) {
+    head_run((32, 40), (8, 2))
+}
+
 /// The demo head on which cameras are measured: 14 training views, and a held-out one, the last.
 pub(super) fn measured_head() -> (TempDir, Capture) {
     head_of((144, 180), 1)
