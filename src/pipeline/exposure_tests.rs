@@ -2,7 +2,7 @@
 
 use super::exposure::{EXPOSURE, ExposureCheck};
 use super::rig_photos::RigPhotos;
-use super::tests::{NoFields, evened_head, exposed_head, measured_head, quiet, scene_of};
+use super::tests::{NoFields, exposed_head, measured_head, quiet, scene_of};
 use super::{Session, Stage, complete};
 use crate::capture::{self, Capture, CaptureOptions, View};
 use crate::config::{CameraPoses, Config, Exposures, Preset};
@@ -68,7 +68,7 @@ fn known_gains_are_found() {
 
 #[test]
 fn one_dark_photograph_is_left_out_and_named_and_the_others_are_compared() {
-    let (_dir, mut exposed) = exposed_head();
+    let (_dir, mut exposed) = measured_head();
     assert!(measure(&exposed).not_measured().is_none());
     // 1/64 of the light leaves even white darker than what is compared
     let mut gains = gains();
@@ -137,7 +137,7 @@ fn one_photograph_that_is_brighter_is_named() {
 
 #[test]
 fn later_stages_read_photographs_with_the_mean_exposure_unless_given_ones_are_asked_for() {
-    let (dir, mut exposed) = evened_head();
+    let (dir, mut exposed) = exposed_head();
     expose(&mut exposed, &gains());
     let photos = |capture: &Capture| -> Vec<_> {
         capture.views.iter().map(|v| v.load_photo(&Limits::default()).unwrap()).collect()

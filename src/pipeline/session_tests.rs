@@ -488,7 +488,7 @@ fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
     }
     // which it is
     session.fresh(Stage::Mask, Stage::Mask).unwrap();
-    complete(&session, Stage::Mask, &NoFields).unwrap();
+    masked(&session);
 }
 
 #[test]

@@ -74,13 +74,8 @@ pub(super) fn measured_head() -> (TempDir, Capture) {
     head_of((144, 180), 1)
 }
 
-/// The same on which exposures are measured within some per cent, which takes more pixels.
+/// The same from other places, of which exposures are measured well although the photographs are small.
 pub(super) fn exposed_head() -> (TempDir, Capture) {
-    head_of((240, 300), 1)
-}
-
-/// The same for what is done with measured exposures: small, from places of which it is measured well all the same.
-pub(super) fn evened_head() -> (TempDir, Capture) {
     head_of((144, 180), 3)
 }
 
