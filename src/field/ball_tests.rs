@@ -111,7 +111,7 @@ pub fn bytes(dir: &Path) -> Vec<u8> {
 }
 
 /// Returns the checkpoint that a training begins with.
-pub fn beginning(run: Run) -> Files {
+pub(crate) fn beginning(run: Run) -> Files {
     /// Keeps the files that lie in a folder after the first step, and stops.
     struct First<'a>(&'a Path, OnceLock<Files>);
     impl Monitor for First<'_> {
@@ -135,7 +135,7 @@ pub fn resumes(run: Run, stops: usize) -> tempfile::TempDir {
 }
 
 /// Asserts what [`resumes`] does of a training that is stopped and begins with these files.
-pub fn resumes_from(begun: &Files, run: Run, stops: usize) -> tempfile::TempDir {
+pub(crate) fn resumes_from(begun: &Files, run: Run, stops: usize) -> tempfile::TempDir {
     let (undisturbed, stopped) = (temporary(), temporary());
     run(undisturbed.path(), &Quiet).unwrap();
     begun.write(stopped.path());
