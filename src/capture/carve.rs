@@ -258,37 +258,27 @@ pub(crate) fn pieces<I: Iterator<Item = usize>>(marked: &[bool], around: impl Fn
         stack.push(start);
         while let Some(i) = stack.pop() {
             size[id as usize] += 1;
-            for j in around(i) {
+            // from inside, nested iterators are plain loops
+            around(i).for_each(|j| {
                 if marked[j] && label[j] == 0 {
                     label[j] = id;
                     stack.push(j);
                 }
-            }
+            });
         }
     }
     Pieces { label, size }
 }
 
 /// Neighbors of a cell over faces, or over corners too.
-#[inline]
 pub(crate) fn around([x, y, z]: [usize; 3], n: usize, corners: bool) -> impl Iterator<Item = usize> {
-    /// Places in a cube of three cells a side, whose middle one is the cell.
-    const PLACES: [[usize; 3]; 27] = {
-        let (mut places, mut k) = ([[0; 3]; 27], 0);
-        while k < 27 {
-            places[k] = [k / 9, k / 3 % 3, k % 3];
-            k += 1;
-        }
-        places
-    };
-    PLACES.iter().filter_map(move |&[i, j, k]| {
-        let steps = i.abs_diff(1) + j.abs_diff(1) + k.abs_diff(1);
-        // one more than the neighbor's place along each axis
-        let (u, v, w) = (x + i, y + j, z + k);
-        let inside = (1..=n).contains(&u) && (1..=n).contains(&v) && (1..=n).contains(&w);
-        let wanted = steps == 1 || (corners && steps > 1);
-        (wanted && inside).then(|| ((u - 1) * n + v - 1) * n + w - 1)
-    })
+    let span = move |v: usize| v.saturating_sub(1)..(v + 2).min(n);
+    span(x).flat_map(move |u| span(y).flat_map(move |v| span(z).map(move |w| (u, v, w)))).filter_map(
+        move |(u, v, w)| {
+            let steps = u.abs_diff(x) + v.abs_diff(y) + w.abs_diff(z);
+            (steps == 1 || (corners && steps > 1)).then_some((u * n + v) * n + w)
+        },
+    )
 }
 
 /// Removes every 26-connected piece smaller than `share` of the largest one; returns how many cells it removed.

@@ -171,12 +171,12 @@ pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
         layer += 1;
         let mut next = Vec::new();
         for &i in &front {
-            for j in around(at(i), n, layer % 2 == 0) {
+            around(at(i), n, layer % 2 == 0).for_each(|j| {
                 if cells[j] && depth[j] == 0 {
                     depth[j] = layer;
                     next.push(j);
                 }
-            }
+            });
         }
         front = next;
     }
