@@ -153,6 +153,12 @@ impl Cube {
         self.center + DVec3::new(at(x), at(y), at(z))
     }
 
+    /// Returns where the centers of cells lie along each axis.
+    pub fn centers(&self) -> [Vec<f64>; 3] {
+        let at = |i: usize| (i as f64 + 0.5) * self.cell() - self.half;
+        self.center.to_array().map(|center| (0..self.n).map(|i| center + at(i)).collect())
+    }
+
     /// Returns half the diagonal of a cell.
     pub fn radius(&self) -> f64 {
         0.5 * self.cell() * 3f64.sqrt()
@@ -177,6 +183,7 @@ impl Carved {
 /// Asks every silhouette about every cell.
 pub(super) fn carve(cube: &Cube, silhouettes: &[SilhouetteTable]) -> Carved {
     let (n, radius) = (cube.n, cube.radius());
+    let centers = cube.centers();
     let slabs: Vec<(Vec<u16>, Vec<u64>)> = (0..n)
         .into_par_iter()
         .map(|x| {
@@ -184,7 +191,7 @@ pub(super) fn carve(cube: &Cube, silhouettes: &[SilhouetteTable]) -> Carved {
             let mut alone = vec![0u64; silhouettes.len()];
             for y in 0..n {
                 for z in 0..n {
-                    let center = cube.cell_center(x, y, z);
+                    let center = DVec3::new(centers[0][x], centers[1][y], centers[2][z]);
                     let (mut seen, mut removed, mut by) = (0u16, 0, 0);
                     for (i, s) in silhouettes.iter().enumerate() {
                         match s.footprint(center, radius) {
@@ -238,12 +245,13 @@ pub(crate) fn pieces<I: Iterator<Item = usize>>(marked: &[bool], around: impl Fn
         stack.push(start);
         while let Some(i) = stack.pop() {
             size[id as usize] += 1;
-            for j in around(i) {
+            // from inside, nested iterators are plain loops
+            around(i).for_each(|j| {
                 if marked[j] && label[j] == 0 {
                     label[j] = id;
                     stack.push(j);
                 }
-            }
+            });
         }
     }
     Pieces { label, size }

@@ -256,6 +256,7 @@ pub(crate) mod shared {
     use std::sync::{Arc, Mutex, OnceLock};
 
     /// The files of a folder with their bytes, in memory: nothing is left in the folder for temporary files.
+    #[derive(Default)]
     pub(crate) struct Files(Vec<(PathBuf, Vec<u8>)>);
 
     impl Files {

@@ -1,6 +1,7 @@
 //! Helpers that the tests of the learned fields share, besides the ball.
 
 use super::view;
+use crate::capture::synthetic::shared::Files;
 use crate::field::checkpoint::newest;
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
@@ -13,6 +14,7 @@ use crate::{Monitor, Quiet, Result};
 use glam::Vec2;
 use glam::Vec3;
 use std::path::Path;
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Returns photographs of a ball textured with waves of a few pixels: nine from the front and three from the back.
@@ -108,11 +110,35 @@ pub fn bytes(dir: &Path) -> Vec<u8> {
     std::fs::read(newest(dir)).unwrap()
 }
 
+/// Returns the checkpoint that a training begins with.
+pub(crate) fn beginning(run: Run) -> Files {
+    /// Keeps the files that lie in a folder after the first step, and stops.
+    struct First<'a>(&'a Path, OnceLock<Files>);
+    impl Monitor for First<'_> {
+        fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {
+            self.1.get_or_init(|| Files::read(self.0));
+        }
+        fn stop(&self) -> bool {
+            self.1.get().is_some()
+        }
+    }
+    let dir = temporary();
+    let first = First(dir.path(), OnceLock::new());
+    assert!(run(dir.path(), &first).unwrap_err().kind().is_stop());
+    first.1.into_inner().unwrap()
+}
+
 /// Asserts that a training stopped `stops` times after 11 steps, whose newest checkpoint is then truncated as by a crash,
 /// ends with the same bytes as an uninterrupted training. Returns the folder of the latter.
 pub fn resumes(run: Run, stops: usize) -> tempfile::TempDir {
+    resumes_from(&Files::default(), run, stops)
+}
+
+/// Asserts what [`resumes`] does of a training that is stopped and begins with these files.
+pub(crate) fn resumes_from(begun: &Files, run: Run, stops: usize) -> tempfile::TempDir {
     let (undisturbed, stopped) = (temporary(), temporary());
     run(undisturbed.path(), &Quiet).unwrap();
+    begun.write(stopped.path());
     for _ in 0..stops {
         assert!(run(stopped.path(), &StopAfter::new(11)).unwrap_err().kind().is_stop());
     }

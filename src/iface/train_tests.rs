@@ -2,15 +2,18 @@
 
 use super::super::stereo::SurfacePoint;
 use super::*;
+use crate::capture::synthetic::shared::Files;
 use crate::config::Preset;
 use crate::field::ball::{
-    BALL, hull, negative, refuses, resumes, says, session, tampered, temporary, textured_views, views,
+    BALL, beginning, hull, negative, refuses, resumes, resumes_from, says, session, tampered, temporary,
+    textured_views, views,
 };
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::geom::SdfField;
 use crate::{Monitor, Quiet};
 use glam::{Vec2, Vec3};
 use std::path::Path;
+use std::sync::OnceLock;
 
 fn config() -> IfaceConfig {
     IfaceConfig {
@@ -33,10 +36,25 @@ fn small() -> IfaceConfig {
     IfaceConfig { rays: 64, max_rays: 128, samples: 1024, start: Start::Sphere, ..config() }
 }
 
+/// The checkpoint that trainings of [`config`] begin with after the fit to the hull, which takes seconds; whatever is
+/// photographed. Made once a test program.
+fn fitted() -> &'static Files {
+    static FITTED: OnceLock<Files> = OnceLock::new();
+    FITTED.get_or_init(|| {
+        let (views, hull) = (views(), hull());
+        let run = |dir: &Path, monitor: &dyn Monitor| {
+            train(&views, Some(&hull), &config(), &session("iface", dir, "ball", monitor))
+                .map(|(_, r)| r.warnings)
+        };
+        beginning(&run)
+    })
+}
+
 /// Longer than a second: the fit to the hull makes 250 steps, and a surface within a pixel takes as many.
 #[test]
 fn a_ball_is_learned_from_eight_views() {
     let dir = temporary();
+    fitted().write(dir.path());
     let (views, hull) = (views(), hull());
     let (face, report) =
         train(&views, Some(&hull), &config(), &session("iface", dir.path(), "ball", &Quiet)).unwrap();
@@ -72,10 +90,10 @@ fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
     let (views, hull) = (textured_views(), hull());
     let config = IfaceConfig { steps: 70, anneal_end: 0.7, warmup: 0.3, ..config() };
     let run = |dir: &Path, monitor: &dyn Monitor| {
-        train(&views, Some(&hull), &config, &session("iface", dir, "waves", monitor)).map(|(_, r)| r.warnings)
+        train(&views, Some(&hull), &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
-    // stopped before step 42, at which points are found, and after it
-    let dir = resumes(&run, 5);
+    // stopped before step 42, at which points are found, and after it; the undisturbed training makes its own fit to the hull
+    let dir = resumes_from(fitted(), &run, 5);
     let state = |config: &IfaceConfig, dir: &Path| {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT).unwrap();
         SdfState::restore(parts(config), config, Some(&hull), &mut file).unwrap()

@@ -44,12 +44,15 @@ pub(super) fn vote<T: Copy + Default + Send>(
     vote: impl Fn(&mut [T], usize, usize) + Sync,
 ) -> Vec<T> {
     let n = cube.n;
+    let [xs, ys, zs] = cube.centers();
     let slab = |x: usize| {
         let mut slab = vec![T::default(); n * n * values];
         for (k, frame) in frames.iter().enumerate() {
-            for (i, cell) in slab.chunks_exact_mut(values).enumerate() {
-                if let Some(pixel) = frame.pixel(cube.cell_center(x, i / n, i % n)) {
-                    vote(cell, k, pixel);
+            for (row, y) in slab.chunks_exact_mut(n * values).zip(&ys) {
+                for (cell, z) in row.chunks_exact_mut(values).zip(&zs) {
+                    if let Some(pixel) = frame.pixel(DVec3::new(xs[x], *y, *z)) {
+                        vote(cell, k, pixel);
+                    }
                 }
             }
         }
@@ -103,11 +106,10 @@ pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
     Ok(Cube { center, half, n })
 }
 
-/// Returns the pixels that a set of cells covers in a view.
-pub(super) fn silhouette(cube: &Cube, cells: &[bool], camera: &Camera) -> Vec<bool> {
-    let (w, h, n) = (camera.width as usize, camera.height as usize, cube.n);
-    let projector = Projector::new(camera);
-    let mut covered = vec![false; w * h];
+/// Returns the centers of the cells of a set that lie at its surface.
+pub(super) fn surface(cube: &Cube, cells: &[bool]) -> Vec<DVec3> {
+    let n = cube.n;
+    let mut centers = Vec::new();
     for i in (0..cells.len()).filter(|&i| cells[i]) {
         let (x, y, z) = (i / (n * n), i / n % n, i % n);
         let edge = |v: usize| v == 0 || v + 1 == n;
@@ -120,10 +122,21 @@ pub(super) fn silhouette(cube: &Cube, cells: &[bool], camera: &Camera) -> Vec<bo
                 && cells[i + n]
                 && cells[i - 1]
                 && cells[i + 1]);
-        if !surface {
-            continue; // what surrounds it covers it
+        if surface {
+            centers.push(cube.cell_center(x, y, z));
         }
-        let Some((u, v, depth)) = projector.project(cube.cell_center(x, y, z)) else { continue };
+    }
+    centers
+}
+
+/// Returns the pixels that a set of cells covers in a view. `surface` are the centers of those at
+/// its surface: they cover what they surround.
+pub(super) fn silhouette(cube: &Cube, surface: &[DVec3], camera: &Camera) -> Vec<bool> {
+    let (w, h) = (camera.width as usize, camera.height as usize);
+    let projector = Projector::new(camera);
+    let mut covered = vec![false; w * h];
+    for &center in surface {
+        let Some((u, v, depth)) = projector.project(center) else { continue };
         let (rx, ry) = (0.5 * camera.fx * cube.cell() / depth, 0.5 * camera.fy * cube.cell() / depth);
         let range = |c: f64, r: f64, size: usize| {
             let first = (c - r).floor().clamp(0.0, size as f64) as usize;
@@ -155,12 +168,12 @@ pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
         layer += 1;
         let mut next = Vec::new();
         for &i in &front {
-            for j in around(at(i), n, layer % 2 == 0) {
+            around(at(i), n, layer % 2 == 0).for_each(|j| {
                 if cells[j] && depth[j] == 0 {
                     depth[j] = layer;
                     next.push(j);
                 }
-            }
+            });
         }
         front = next;
     }
@@ -209,7 +222,7 @@ mod tests {
         // a box of 2 units has 24 cells of 1/12 along each side; perspective moves its walls by a cell or two
         let count = box_cells.iter().filter(|c| **c).count() as f64;
         assert!((count.cbrt() - 24.0).abs() < 2.0, "{count}");
-        let drawn = silhouette(&cube, &box_cells, &cameras[0]);
+        let drawn = silhouette(&cube, &surface(&cube, &box_cells), &cameras[0]);
         let wrong = (drawn.iter().zip(&square(20).values)).filter(|(d, s)| **d != (**s == 255)).count();
         assert!(wrong < 2 * 4 * 40, "{wrong}"); // two pixels along the outline
         // one forgiven vote lets all cells in that one view keeps: two beams

@@ -23,6 +23,7 @@ use crate::capture::findings;
 use crate::geom::Camera;
 use crate::image::{Gray, Photo, grow, reduce_to_rows, shrink, size_at_rows};
 use crate::{Error, Result};
+use glam::DVec3;
 use rayon::prelude::*;
 
 /// Cells along each side of the carved cube.
@@ -231,6 +232,7 @@ impl<'a> Propagation<'a> {
         let mut ambiguous = vec![0.0; self.views.len()];
         for round in 0..ROUNDS {
             let (hull, core) = self.carve(&masks);
+            let [hull, core] = [hull, core].map(|cells| hull::surface(&self.cube, &cells));
             let done: Vec<(Gray, f64)> = (0..self.views.len())
                 .into_par_iter()
                 .map(|i| {
@@ -284,8 +286,15 @@ impl<'a> Propagation<'a> {
         (hull, core)
     }
 
-    /// Cuts one view within the constraints of the hull.
-    fn cut_one(&self, i: usize, models: &Models, hull: &[bool], core: &[bool], round: usize) -> (Gray, f64) {
+    /// Cuts one view within the constraints of the hull and its core, whose surfaces are given.
+    fn cut_one(
+        &self,
+        i: usize,
+        models: &Models,
+        hull: &[DVec3],
+        core: &[DVec3],
+        round: usize,
+    ) -> (Gray, f64) {
         let (mut grabcut, _) = self.grabcut(i, round == 0 && !self.is_proposed());
         let (w, h) = (grabcut.width, grabcut.height);
         let camera = self.views[i].camera.resized(w as u32, h as u32);

@@ -3,6 +3,7 @@
 use super::clicks::propagated_clicks;
 use super::tests::{NoFields, demo_head, draft, masked};
 use super::*;
+use crate::ErrorKind;
 use crate::capture::{self, CaptureOptions, Split};
 use crate::config::{Config, MaskSource, Preset};
 use crate::image::Gray;
@@ -335,11 +336,14 @@ fn held_out_photographs_shape_only_their_own_masks() {
 
 #[test]
 fn paper_masks_without_networks_are_a_warning() {
-    struct Warnings(std::sync::Mutex<Vec<String>>);
+    /// Keeps warnings, and stops a stage that has begun: before its first photograph, about which nothing is asked.
+    struct Warnings(Stop, std::sync::Mutex<Vec<String>>);
     impl Observer for Warnings {
         fn event(&self, event: &Event) {
-            if let Event::Warning { text, .. } = event {
-                self.0.lock().unwrap().push(text.to_string());
+            match event {
+                Event::Started { .. } => self.0.request(ErrorKind::Interrupted),
+                Event::Warning { text, .. } => self.1.lock().unwrap().push(text.to_string()),
+                _ => {}
             }
         }
     }
@@ -348,10 +352,11 @@ fn paper_masks_without_networks_are_a_warning() {
     let mut paper = Config::preset(Preset::Paper);
     (paper.capture.path, paper.mask.prompts) = (draft.capture.path.clone(), draft.mask.prompts.clone());
     let warned = |config: &Config, name: &str| {
-        let seen = std::sync::Arc::new(Warnings(Default::default()));
-        let run = Run::open(&dir.path().join(name), Stop::new(), seen.clone());
-        complete(&Session::open(config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
-        seen.0.lock().unwrap().iter().filter(|t| t.contains("the published masks are SAM's")).count()
+        let seen = std::sync::Arc::new(Warnings(Stop::new(), Default::default()));
+        let run = Run::open(&dir.path().join(name), seen.0.clone(), seen.clone());
+        let stopped = complete(&Session::open(config, &run).unwrap(), Stage::Mask, &NoFields).unwrap_err();
+        assert_eq!(stopped.kind(), ErrorKind::Interrupted, "{stopped}");
+        seen.1.lock().unwrap().iter().filter(|t| t.contains("the published masks are SAM's")).count()
     };
     assert_eq!((warned(&draft, "draft"), warned(&paper, "paper")), (0, 1));
 }

@@ -1,6 +1,6 @@
 //! The stage `ensemble` on pictures made by hand.
 
-use super::tests::{NoFields, demo_head, draft, masked, quiet, words};
+use super::tests::{NoFields, masked, tiny_run, words};
 use super::*;
 use crate::capture::{Split, View};
 use crate::config::{Config, Method, Preset, ViewBackground};
@@ -12,14 +12,10 @@ use crate::run::Run;
 use crate::{ErrorKind, Result};
 use glam::Vec3;
 use serde_json::json;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
+/// Size of the photographs of [`tiny_run`].
 const SIZE: (u32, u32) = (32, 40);
-
-fn config(root: &Path) -> Config {
-    demo_head(root, SIZE, (8, 2));
-    draft(root)
-}
 
 fn flat(color: [f32; 4]) -> Image {
     let mut image = Image::new(SIZE.0, SIZE.1, 4);
@@ -44,11 +40,9 @@ fn pixel(run: &Run, file: &str, at: usize) -> [u8; 3] {
 
 #[test]
 fn float_members_are_blended_and_rounded_once_and_a_missing_one_is_named() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut config = config(&dir.path().join("head"));
+    let (_dir, mut config, run) = tiny_run();
     let paper = Config::preset(Preset::Paper);
     (config.ensemble, config.render.method) = (paper.ensemble, paper.render.method);
-    let run = quiet(dir.path());
     let session = Session::open(&config, &run).unwrap();
     masked(&session);
     let names: Vec<String> = session.capture().split(Split::Test).map(|v| v.name.clone()).collect();
@@ -136,12 +130,10 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
     for (tface, baseline, expected) in
         [(0.02, 0.1, 1.0), (0.1, 0.02, 0.0), (0.05, -0.05, 0.5), (0.02, -0.06, 0.75)]
     {
-        let dir = tempfile::tempdir().unwrap();
-        let mut config = config(&dir.path().join("head"));
+        let (_dir, mut config, run) = tiny_run();
         config.render.method = vec![Method::Tface, Method::Baseline];
         config.ensemble.members = vec![Method::Tface, Method::Baseline];
         config.metrics.surface_points = 100;
-        let run = quiet(dir.path());
         let session = Session::open(&config, &run).unwrap();
         masked(&session);
         // what is rendered of test views says the opposite: had they a say, the worse member would win
@@ -173,9 +165,7 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
 
 #[test]
 fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, mut config, run) = tiny_run();
     let blind = |config: &Config| -> Vec<usize> {
         let session = Session::open(config, &run).unwrap();
         if !run.path("mask/scene.json").exists() {
@@ -200,9 +190,7 @@ fn no_field_learns_from_the_pixels_that_weights_are_fitted_on() {
 
 #[test]
 fn what_cannot_be_blended_is_said_before_anything_is_learned() {
-    let dir = tempfile::tempdir().unwrap();
-    let base = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, base, run) = tiny_run();
     let error = |change: &dyn Fn(&mut Config)| {
         let mut config = base.clone();
         change(&mut config);

@@ -1,12 +1,14 @@
 //! Views of camera paths, beside a finished evaluation.
 
-use super::tests::{NoFields, demo_head, draft, masked, quiet, words};
+use super::tests::{NoFields, head_run, masked, quiet, words};
 use super::*;
 use crate::config::{Config, Method, RenderConfig, ViewBackground};
 use crate::io;
+use crate::run::Run;
 use crate::{ErrorKind, Result};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
+use tempfile::TempDir;
 
 /// Radiance fields that are one color; others may not be asked for.
 struct Fog;
@@ -27,13 +29,13 @@ impl Fields for Fog {
     }
 }
 
-fn config(root: &Path) -> Config {
-    demo_head(root, (16, 20), (4, 2));
-    let mut config = draft(root);
+/// The least capture, whose views are those of two radiance fields and their blend.
+fn head() -> (TempDir, Config, Run) {
+    let (dir, mut config, run) = head_run((16, 20), (4, 2));
     config.render.method = vec![Method::Baseline, Method::Tface];
     config.ensemble.members = vec![Method::Baseline, Method::Tface];
     config.ensemble.weights = vec![0.25, 0.75];
-    config
+    (dir, config, run)
 }
 
 /// As `--cameras CAMERAS --with tface --background white` asks for it.
@@ -89,9 +91,7 @@ fn files(run: &Path) -> Vec<(PathBuf, Vec<u8>)> {
 
 #[test]
 fn camera_paths_never_touch_the_evaluations_views() {
-    let dir = tempfile::tempdir().unwrap();
-    let config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (dir, config, run) = head();
     let open = || Session::open(&config, &run).unwrap();
     assert_eq!(evaluate(&open()), [false; 4]);
     let before = files(run.dir());
@@ -129,9 +129,7 @@ fn camera_paths_never_touch_the_evaluations_views() {
 
 #[test]
 fn views_of_a_path_are_made_again_alone_and_never_in_silence() {
-    let dir = tempfile::tempdir().unwrap();
-    let config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, config, run) = head();
     let session = || Session::open(&config, &run).unwrap();
     finished(&session());
     let orbit = turn(&config, "orbit");
@@ -162,9 +160,7 @@ fn views_of_a_path_are_made_again_alone_and_never_in_silence() {
 
 #[test]
 fn views_of_a_path_whose_records_cannot_be_read_are_made_again_with_any_field() {
-    let dir = tempfile::tempdir().unwrap();
-    let config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, config, run) = head();
     finished(&Session::open(&config, &run).unwrap());
     let session = Session::open(&config, &run).unwrap().with_camera_path(turn(&config, "orbit")).unwrap();
     complete(&session, Stage::Render, &Fog).unwrap();
@@ -180,9 +176,7 @@ fn views_of_a_path_whose_records_cannot_be_read_are_made_again_with_any_field() 
 
 #[test]
 fn a_file_of_cameras_is_read_before_anything_is_learned() {
-    let dir = tempfile::tempdir().unwrap();
-    let config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (dir, config, run) = head();
     let path = dir.path().join("path.json");
     let along = |text: &str| {
         std::fs::write(&path, text).unwrap();
@@ -203,9 +197,7 @@ fn a_file_of_cameras_is_read_before_anything_is_learned() {
 
 #[test]
 fn a_method_that_is_not_asked_for_is_not_called_changed() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, mut config, run) = head();
     finished(&Session::open(&config, &run).unwrap());
     config.render.method = vec![Method::Tface];
     let e = Session::open(&config, &run).unwrap().remember(Stage::Render).unwrap_err().to_string();
@@ -215,9 +207,7 @@ fn a_method_that_is_not_asked_for_is_not_called_changed() {
 
 #[test]
 fn an_evaluation_of_other_cameras_than_the_held_out_ones_is_refused_with_the_way_out() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, mut config, run) = head();
     config.render.cameras = "orbit".into();
     let session = Session::open(&config, &run).unwrap();
     let e = session.remember(Stage::Metrics).unwrap_err();
@@ -232,11 +222,9 @@ fn an_evaluation_of_other_cameras_than_the_held_out_ones_is_refused_with_the_way
 
 #[test]
 fn nothing_to_judge_is_an_error_and_no_empty_file() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut config = config(&dir.path().join("head"));
+    let (_dir, mut config, run) = head();
     config.render.method.clear();
     config.ensemble.members.clear();
-    let run = quiet(dir.path());
     let session = Session::open(&config, &run).unwrap();
     masked(&session);
     complete(&session, Stage::Render, &Fog).unwrap();
@@ -246,9 +234,7 @@ fn nothing_to_judge_is_an_error_and_no_empty_file() {
 
 #[test]
 fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
-    let dir = tempfile::tempdir().unwrap();
-    let config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, config, run) = head();
     let session = Session::open(&config, &run).unwrap();
     finished(&session);
     let page = || std::fs::read_to_string(run.path("report.html")).unwrap();
@@ -271,10 +257,8 @@ fn a_stage_command_does_not_shrink_the_report_of_a_finished_run() {
 
 #[test]
 fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_name_it() {
-    let dir = tempfile::tempdir().unwrap();
+    let (dir, config, run) = head();
     let root = dir.path().join("head");
-    let config = config(&root);
-    let run = quiet(dir.path());
     let first = Session::open(&config, &run).unwrap();
     finished(&first);
     let (before, export) = (files(run.dir()), Export::new(first.capture(), &config));
@@ -316,9 +300,7 @@ fn a_finished_run_needs_its_capture_no_more_and_an_unfinished_one_says_how_to_na
 
 #[test]
 fn a_finished_run_that_cannot_be_written_is_still_done() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, mut config, run) = head();
     finished(&Session::open(&config, &run).unwrap());
     // a folder in the place of a file cannot be written by anybody
     for file in ["config.toml", "cameras.json", "report.html"] {
@@ -337,9 +319,7 @@ fn a_finished_run_that_cannot_be_written_is_still_done() {
 
 #[test]
 fn a_command_that_is_refused_clears_nothing_with_fresh() {
-    let dir = tempfile::tempdir().unwrap();
-    let config = config(&dir.path().join("head"));
-    let run = quiet(dir.path());
+    let (_dir, config, run) = head();
     finished(&Session::open(&config, &run).unwrap());
     let before = files(run.dir());
     let refused = |change: &dyn Fn(&mut Config)| {

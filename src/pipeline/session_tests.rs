@@ -1,6 +1,6 @@
 //! The pipeline on the demo head.
 
-use super::tests::{NoFields, demo_head, draft, masked, quiet, words};
+use super::tests::{NoFields, demo_head, draft, head_run, masked, quiet, tiny_run, words};
 use super::*;
 use crate::capture::Split;
 use crate::capture::synthetic::SyntheticHead;
@@ -15,7 +15,7 @@ use crate::run::{Run, Stop, read_record};
 use crate::{ErrorKind, Result};
 use glam::Vec3;
 use serde_json::json;
-use std::path::Path;
+use tempfile::TempDir;
 
 /// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little brighter seen
 /// from one side.
@@ -68,22 +68,17 @@ impl Fields for Formula {
     }
 }
 
-/// Writes the least capture of eight training and two held-out views.
-fn capture(root: &Path) {
-    demo_head(root, (32, 40), (8, 2));
-}
+/// Photographs whose silhouettes are sharp enough to hold a mesh against them.
+const SHARP: ((u32, u32), (usize, usize)) = ((96, 120), (12, 2));
 
-/// Writes a capture whose silhouettes are sharp enough to hold a mesh against them.
-fn sharp_capture(root: &Path) {
-    demo_head(root, (96, 120), (12, 2));
+fn sharp_run() -> (TempDir, Config, Run) {
+    head_run(SHARP.0, SHARP.1)
 }
 
 #[test]
 fn views_held_out_for_validation_cost_what_test_views_cost() {
-    let dir = tempfile::tempdir().unwrap();
+    let (dir, config, run) = tiny_run();
     let root = dir.path().join("head");
-    capture(&root);
-    let (config, run) = (draft(&root), quiet(dir.path()));
     let costs = || {
         let session = Session::open(&config, &run).unwrap();
         [Stage::Render, Stage::Ensemble, Stage::Metrics].map(|stage| session.cost(stage).cpu_s)
@@ -98,12 +93,8 @@ fn views_held_out_for_validation_cost_what_test_views_cost() {
 
 #[test]
 fn a_large_texture_is_told_the_memory_that_it_takes_and_no_three_times_of_it() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    capture(&root);
-    let run = quiet(dir.path());
-    let mib = |texture_px: u32| {
-        let mut config = draft(&root);
+    let (_dir, mut config, run) = tiny_run();
+    let mut mib = |texture_px: u32| {
         config.mesh.texture_px = texture_px;
         let bytes = Session::open(&config, &run).unwrap().cost(Stage::Mesh).memory_bytes;
         bytes as f64 / f64::from(1 << 20)
@@ -115,10 +106,7 @@ fn a_large_texture_is_told_the_memory_that_it_takes_and_no_three_times_of_it() {
 
 #[test]
 fn the_disk_told_is_what_a_field_leaves_not_what_its_checkpoints_take_meanwhile() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    capture(&root);
-    let (config, run) = (draft(&root), quiet(dir.path()));
+    let (_dir, config, run) = tiny_run();
     let session = Session::open(&config, &run).unwrap();
     // 96 channels of 192 x 193 floats, and a megabyte of logs
     let left = 4.0 * 96.0 * 192.0 * 193.0 + 1e6;
@@ -130,10 +118,7 @@ fn the_disk_told_is_what_a_field_leaves_not_what_its_checkpoints_take_meanwhile(
 #[test]
 fn a_stage_gives_the_scratch_memory_of_its_kernels_back() {
     use crate::kernel::cpu::pool::{Buffer, keeps};
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    capture(&root);
-    let (config, run) = (draft(&root), quiet(dir.path()));
+    let (_dir, config, run) = tiny_run();
     let session = Session::open(&config, &run).unwrap();
     // rounded up to 5 eighths of 2^20; nobody else has one of this size
     drop(Buffer::scratch(640_001));
@@ -146,7 +131,7 @@ fn a_stage_gives_the_scratch_memory_of_its_kernels_back() {
 fn the_stages_after_learning_keep_the_exact_head_exact() {
     let dir = tempfile::tempdir().unwrap();
     let root = dir.path().join("run/capture");
-    sharp_capture(&root);
+    demo_head(&root, SHARP.0, SHARP.1);
     let mut config = draft(&root);
     config.mesh.resolution = 128;
     config.mesh.triangles = 8000;
@@ -217,10 +202,7 @@ fn the_stages_after_learning_keep_the_exact_head_exact() {
 /// Makes heads with colors from a source, lobes and a frame each. By the photographs, a head must look as rays show it and like
 /// the photograph; for every other one the difference between what rays and what a viewer shows is returned.
 fn textured_heads((resolution, texture_px): (u32, u32), heads: &[(ColorSource, u32, MeshFrame)]) -> Vec<f64> {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    sharp_capture(&root);
-    let mut config = draft(&root);
+    let (dir, mut config, _) = sharp_run();
     config.mesh.resolution = resolution;
     config.mesh.triangles = 8000;
     config.mesh.texture_px = texture_px;
@@ -304,10 +286,7 @@ fn the_textured_head_looks_the_same_in_whatever_frame_it_is_exported() {
 
 #[test]
 fn a_surface_may_stay_open_and_without_a_texture() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    sharp_capture(&root);
-    let mut config = draft(&root);
+    let (_dir, mut config, run) = sharp_run();
     config.mesh.resolution = 64;
     config.mesh.triangles = 3000;
     config.mesh.texture_px = 0;
@@ -316,7 +295,6 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     (config.mesh.color, config.mesh.hair) = (ColorSource::Network, Hair::None);
     config.render.method = vec![Method::Textured];
     config.ensemble.members = Vec::new();
-    let run = quiet(dir.path());
     let session = Session::open(&config, &run).unwrap();
     session.remember(Stage::Render).unwrap();
     masked(&session);
@@ -382,12 +360,9 @@ impl Fields for Drilled {
 
 #[test]
 fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    sharp_capture(&root);
+    let (dir, mut config, _) = sharp_run();
     let (mut digests, mut counts) = (Vec::new(), Vec::new());
     for genus in [Genus::Simple, Genus::Keep] {
-        let mut config = draft(&root);
         config.mesh.resolution = 64;
         config.mesh.triangles = 3000;
         config.mesh.texture_px = 0;
@@ -445,12 +420,9 @@ impl Fields for Fog {
 
 #[test]
 fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
-    let dir = tempfile::tempdir().unwrap();
-    demo_head(dir.path(), (32, 40), (4, 3));
-    let mut config = draft(dir.path());
+    let (dir, mut config, run) = head_run((32, 40), (4, 3));
     config.render.method = vec![Method::Tface];
     config.render.background = ViewBackground::White;
-    let run = quiet(dir.path());
     masked(&Session::open(&config, &run).unwrap());
     let interrupted = Fog(0.into(), Some(run.stop().clone()));
     let e = complete(&Session::open(&config, &run).unwrap(), Stage::Render, &interrupted).unwrap_err();
@@ -472,9 +444,8 @@ fn rendering_goes_on_after_a_stop_with_the_view_it_was_stopped_in() {
 
 #[test]
 fn a_run_without_masks_stops_before_anything_is_written_unless_masks_are_declined() {
-    let dir = tempfile::tempdir().unwrap();
+    let (dir, mut config, run) = tiny_run();
     let root = dir.path().join("head");
-    capture(&root);
     std::fs::remove_dir_all(root.join("masks")).unwrap();
     for name in io::list_files(&root).unwrap().iter().filter(|n| n.ends_with(".json")) {
         let mut value = io::read_json(&root.join(name), &Limits::default()).unwrap();
@@ -483,8 +454,6 @@ fn a_run_without_masks_stops_before_anything_is_written_unless_masks_are_decline
         }
         std::fs::write(root.join(name), value.to_string()).unwrap();
     }
-    let run = quiet(dir.path());
-    let mut config = draft(&root);
     let e = Session::open(&config, &run).err().unwrap();
     assert!(e.to_string().contains("head mask") && e.kind() == ErrorKind::Cannot, "{e}");
     assert!(e.hint().contains("--page") && e.hint().contains("--set mask.source=none"), "{}", e.hint());
@@ -497,12 +466,8 @@ fn a_run_without_masks_stops_before_anything_is_written_unless_masks_are_decline
 
 #[test]
 fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    capture(&root);
-    let mut config = draft(&root);
+    let (_dir, mut config, run) = tiny_run();
     config.render.method = vec![Method::Tface];
-    let run = quiet(dir.path());
     let session = Session::open(&config, &run).unwrap();
     masked(&session);
     let path = run.path("mask/scene.json");
@@ -523,16 +488,14 @@ fn a_scene_that_was_changed_by_hand_stops_every_stage_and_names_the_way_out() {
     }
     // which it is
     session.fresh(Stage::Mask, Stage::Mask).unwrap();
-    complete(&session, Stage::Mask, &NoFields).unwrap();
+    masked(&session);
 }
 
 #[test]
 fn a_command_runs_what_its_stage_needs_and_nothing_else() {
-    let dir = tempfile::tempdir().unwrap();
-    capture(dir.path());
-    let run = quiet(dir.path());
+    let (_dir, base, run) = tiny_run();
     let order = |until: Stage, methods: &[Method]| {
-        let mut config = draft(dir.path());
+        let mut config = base.clone();
         if !methods.is_empty() {
             config.render.method = methods.to_vec();
         }
@@ -552,20 +515,17 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
     let shown = [Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
     assert_eq!(order(Stage::Metrics, &shown), words(&Stage::ALL));
     // and only those that build on it are out of date with it
-    let config = draft(dir.path());
-    assert_eq!(words(&Stage::Tface.followers(&config)), "tface render ensemble metrics");
-    assert_eq!(words(&Stage::Iface.followers(&config)), "iface mesh render ensemble metrics");
-    assert_eq!(words(&Stage::Mask.followers(&config)), words(&Stage::ALL));
+    assert_eq!(words(&Stage::Tface.followers(&base)), "tface render ensemble metrics");
+    assert_eq!(words(&Stage::Iface.followers(&base)), "iface mesh render ensemble metrics");
+    assert_eq!(words(&Stage::Mask.followers(&base)), words(&Stage::ALL));
 }
 
 #[test]
 fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
-    let dir = tempfile::tempdir().unwrap();
-    capture(dir.path());
+    let (dir, draft, run) = tiny_run();
     std::fs::write(dir.path().join("a.safetensors"), b"weights").unwrap();
-    let run = quiet(dir.path());
     let digests = |change: &dyn Fn(&mut Config)| -> Vec<String> {
-        let mut config = draft(dir.path());
+        let mut config = draft.clone();
         change(&mut config);
         let session = Session::open(&config, &run).unwrap();
         Stage::ALL.iter().map(|s| session.plan(*s).fingerprint.digest()).collect()
@@ -602,11 +562,9 @@ fn a_changed_setting_changes_its_stage_and_those_after_it_only() {
 
 #[test]
 fn what_is_not_rendered_does_not_shape_the_views() {
-    let dir = tempfile::tempdir().unwrap();
-    capture(dir.path());
-    let run = quiet(dir.path());
+    let (_dir, draft, run) = tiny_run();
     let render = |change: &dyn Fn(&mut Config)| {
-        let mut config = draft(dir.path());
+        let mut config = draft.clone();
         config.render.method = vec![Method::Tface];
         change(&mut config);
         Session::open(&config, &run).unwrap().plan(Stage::Render).fingerprint
@@ -632,11 +590,7 @@ fn done(session: &Session) -> String {
 
 #[test]
 fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    capture(&root);
-    let mut config = draft(&root);
-    let run = quiet(dir.path());
+    let (dir, mut config, run) = tiny_run();
     finish(&Session::open(&config, &run).unwrap());
     let all = "mask tface iface mesh render ensemble metrics";
     for change in [
@@ -694,11 +648,8 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
 
 #[test]
 fn the_frame_of_a_file_shapes_nothing_that_views_show() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    capture(&root);
+    let (dir, mut config, _) = tiny_run();
     let parts = [MeshFrame::Dataset, MeshFrame::Head].map(|frame| {
-        let mut config = draft(&root);
         config.mesh.resolution = 48;
         config.mesh.triangles = 1000;
         config.mesh.texture_px = 128;
@@ -717,11 +668,7 @@ fn the_frame_of_a_file_shapes_nothing_that_views_show() {
 
 #[test]
 fn a_stage_that_the_disk_has_no_room_for_is_refused_before_the_old_one_is_cleared() {
-    let dir = tempfile::tempdir().unwrap();
-    let root = dir.path().join("head");
-    capture(&root);
-    let mut config = draft(&root);
-    let run = quiet(dir.path());
+    let (dir, mut config, run) = tiny_run();
     finish(&Session::open(&config, &run).unwrap());
     if io::free_bytes(dir.path()).is_none() {
         eprintln!("skipped: this system does not tell how much room is left");
@@ -741,10 +688,8 @@ fn a_stage_that_the_disk_has_no_room_for_is_refused_before_the_old_one_is_cleare
 
 #[test]
 fn later_stages_read_masks_in_a_color_as_the_stage_mask_found_them() {
-    let dir = tempfile::tempdir().unwrap();
+    let (dir, config, run) = tiny_run();
     let root = dir.path().join("head");
-    demo_head(&root, (32, 40), (8, 2));
-    let config = draft(&root);
     let load = |views: &[crate::capture::View]| -> Vec<Vec<u8>> {
         views.iter().map(|view| view.load_mask(&Limits::default()).unwrap().unwrap().values).collect()
     };
@@ -755,7 +700,6 @@ fn later_stages_read_masks_in_a_color_as_the_stage_mask_found_them() {
         let blue: Vec<[u8; 3]> = mask.iter().map(|&m| [0, 0, m]).collect();
         io::write_png_rgb(file, view.camera.width, view.camera.height, &blue).unwrap();
     }
-    let run = quiet(dir.path());
     complete(&Session::open(&config, &run).unwrap(), Stage::Mask, &NoFields).unwrap();
     // another process goes on
     let session = Session::open(&config, &run).unwrap();

@@ -54,19 +54,34 @@ pub(super) fn draft(root: &Path) -> Config {
     config
 }
 
+/// A folder with the demo head, photographed at a size by so many training and held-out views, the configuration of a draft
+/// of it, and a run of that folder which reports nothing.
+pub(super) fn head_run(size: (u32, u32), views: (usize, usize)) -> (TempDir, Config, Run) {
+    let dir = tempfile::tempdir().unwrap();
+    let root = dir.path().join("head");
+    demo_head(&root, size, views);
+    let (config, run) = (draft(&root), quiet(dir.path()));
+    (dir, config, run)
+}
+
+/// The least of these that most questions can be asked about: eight training and two held-out views.
+pub(super) fn tiny_run() -> (TempDir, Config, Run) {
+    head_run((32, 40), (8, 2))
+}
+
 /// The demo head on which cameras are measured: 14 training views, and a held-out one, the last.
 pub(super) fn measured_head() -> (TempDir, Capture) {
-    head_of((144, 180))
+    head_of((144, 180), 1)
 }
 
-/// The same on which exposures are measured, which takes more pixels.
+/// The same from other places, of which exposures are measured well although the photographs are small.
 pub(super) fn exposed_head() -> (TempDir, Capture) {
-    head_of((240, 300))
+    head_of((144, 180), 3)
 }
 
-fn head_of(size: (u32, u32)) -> (TempDir, Capture) {
+fn head_of((width, height): (u32, u32), seed: u64) -> (TempDir, Capture) {
     let dir = tempfile::tempdir().unwrap();
-    demo_head(dir.path(), size, (14, 1));
+    write_capture(dir.path(), &SyntheticOptions { width, height, train: 14, test: 1, seed });
     let capture = capture::open(dir.path(), &CaptureOptions::default()).unwrap();
     (dir, capture)
 }

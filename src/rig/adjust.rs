@@ -63,15 +63,15 @@ impl Linear {
         let p = camera.local(point);
         let (DVec2 { x, y }, depth) = Camera::ideal(p)?;
         let [[ux, uy], [vx, vy]] = camera.distortion.slopes(x, y);
-        // of (x, y) by the three coordinates of p
-        let ideal =
-            [DVec2::new(1.0 / depth, 0.0), DVec2::new(0.0, -1.0 / depth), DVec2::new(x / depth, y / depth)];
+        // of (x, y) by the three coordinates of p; written out, for `map` of an array is a call for each element
         let focal = DVec2::new(camera.fx, camera.fy);
-        let by_p = ideal.map(|d| focal * DVec2::new(ux * d.x + uy * d.y, vx * d.x + vy * d.y));
+        let picture = |x: f64, y: f64| focal * DVec2::new(ux * x + uy * y, vx * x + vy * y);
+        let by_p = [picture(1.0 / depth, 0.0), picture(0.0, -1.0 / depth), picture(x / depth, y / depth)];
         let along = |d: DVec3| d.x * by_p[0] + d.y * by_p[1] + d.z * by_p[2];
-        let axes = DVec3::AXES;
-        let point = axes.map(|e| along(camera.rotation.transpose() * e));
-        let [a, b, c] = axes.map(|e| along(p.cross(e)));
+        let moved = |e: DVec3| along(camera.rotation.transpose() * e);
+        let point = [moved(DVec3::X), moved(DVec3::Y), moved(DVec3::Z)];
+        let turned = |e: DVec3| along(p.cross(e));
+        let [a, b, c] = [turned(DVec3::X), turned(DVec3::Y), turned(DVec3::Z)];
         let camera_slopes = [a, b, c, -point[0], -point[1], -point[2]];
         let residual = camera.pixel(DVec2::new(x, y)) - pixel;
         Some(Linear { residual, camera: camera_slopes, point })
@@ -111,11 +111,13 @@ impl Problem<'_> {
         for s in &track.sightings {
             let Some(l) = Linear::new(&cameras[s.view], track.position, s.pixel) else { continue };
             let w = self.weight(l.residual);
-            let column = |k: usize| DVec3::from(l.point.map(|d| w * d.dot(l.point[k])));
-            normal += DMat3::from_cols(column(0), column(1), column(2));
-            gradient += DVec3::from(l.point.map(|d| w * d.dot(l.residual)));
+            let [x, y, z] = l.point;
+            let weighted = |by: DVec2| DVec3::new(w * x.dot(by), w * y.dot(by), w * z.dot(by));
+            normal += DMat3::from_cols(weighted(x), weighted(y), weighted(z));
+            gradient += weighted(l.residual);
             if let Some(place) = self.places[s.view] {
-                let mixed = l.camera.map(|c| DVec3::from(l.point.map(|d| w * c.dot(d))));
+                let [a, b, c, d, e, f] = l.camera;
+                let mixed = [weighted(a), weighted(b), weighted(c), weighted(d), weighted(e), weighted(f)];
                 free.push((place, w, l, mixed));
             }
         }
@@ -142,7 +144,8 @@ impl Problem<'_> {
         let n = vector.len();
         let e = self.eliminate(cameras, track);
         for (place, w, l, mixed) in &e.free {
-            let reduced = mixed.map(|m| e.inverse * m);
+            let mut reduced = *mixed;
+            reduced.iter_mut().for_each(|m| *m = e.inverse * *m);
             for i in 0..6 {
                 let row = &mut matrix[(place + i) * n..][..n];
                 for k in 0..=i {

@@ -331,7 +331,8 @@ fn align(placed: &mut Vec<Placed>, level: usize, patch: &mut Patch) -> Vec<f32> 
         while i < placed.len() && placed.len() >= MIN_VIEWS {
             (0..PATCH).for_each(|k| sum[k] -= values[i][k]);
             let length = dot(&sum, &sum).sqrt().max(f32::MIN_POSITIVE);
-            let target = sum.map(|s| s / length);
+            let mut target = sum;
+            target.iter_mut().for_each(|t| *t /= length);
             let moved = if placed[i].sample(level, patch) { step_to(patch, &target) } else { None };
             let Some(moved) = moved else {
                 placed.remove(i);

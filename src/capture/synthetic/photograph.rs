@@ -248,10 +248,13 @@ impl DistanceGrid {
         let g = ((p - self.bounds.min) / CELL).clamp(Vec3::ZERO, self.size.as_vec3() - 1.001);
         let i = g.as_uvec3();
         let f = g - i.as_vec3();
-        trilinear(f, |corner| {
-            let [x, y, z] = corner.map(|c| c as u32);
-            self.values[(((i.z + z) * self.size.y + i.y + y) * self.size.x + i.x + x) as usize]
-        })
+        let (row, layer) = (self.size.x as usize, (self.size.x * self.size.y) as usize);
+        let first = i.z as usize * layer + i.y as usize * row + i.x as usize;
+        let face = |k: usize| {
+            let (near, far) = (&self.values[k..][..2], &self.values[k + row..][..2]);
+            [near[0], near[1], far[0], far[1]]
+        };
+        trilinear(f, face(first), face(first + layer))
     }
 
     /// Returns a step that cannot cross the surface: the slope is at most 1, so the trilinear value errs by

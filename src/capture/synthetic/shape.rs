@@ -353,6 +353,7 @@ pub(super) fn unit(seed: u64, a: u32, b: u32) -> f32 {
     (mix(key.wrapping_add(0x9E37_79B9_7F4A_7C15)) >> 40) as f32 / (1u64 << 24) as f32
 }
 
+#[inline(always)]
 fn lattice(x: i32, y: i32, z: i32) -> f32 {
     let mut h = (x as u32).wrapping_mul(0x8DA6_B343)
         ^ (y as u32).wrapping_mul(0xD816_3841)
@@ -369,15 +370,17 @@ pub(super) fn noise(p: Vec3) -> f32 {
     let f = p - floor;
     let t = f * f * (3.0 - 2.0 * f);
     let i: IVec3 = floor.as_ivec3();
-    trilinear(t, |[x, y, z]| lattice(i.x + x, i.y + y, i.z + z))
+    let at = |x, y, z| lattice(i.x + x, i.y + y, i.z + z);
+    let low = [at(0, 0, 0), at(1, 0, 0), at(0, 1, 0), at(1, 1, 0)];
+    trilinear(t, low, [at(0, 0, 1), at(1, 0, 1), at(0, 1, 1), at(1, 1, 1)])
 }
 
-/// Between the corners (0 or 1 along each axis) of a cell, at `t` inside it.
-pub(super) fn trilinear(t: Vec3, corner: impl Fn([i32; 3]) -> f32) -> f32 {
+/// Returns the value at `t` inside a cell, between those of its lower and its upper corners, along x first.
+#[inline(always)]
+pub(super) fn trilinear(t: Vec3, low: [f32; 4], high: [f32; 4]) -> f32 {
     let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
-    let edge = |y, z| mix(corner([0, y, z]), corner([1, y, z]), t.x);
-    let face = |z| mix(edge(0, z), edge(1, z), t.y);
-    mix(face(0), face(1), t.z)
+    let face = |[a, b, c, d]: [f32; 4]| mix(mix(a, b, t.x), mix(c, d, t.x), t.y);
+    mix(face(low), face(high), t.z)
 }
 
 /// Three octaves of [`noise`], 0..=1.

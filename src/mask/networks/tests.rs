@@ -367,11 +367,12 @@ fn vitmatte_is_shown_the_colors_of_each_convention() {
     let alone = dir.path().join("model.onnx");
     fs::copy(folder.join("model.onnx"), &alone).unwrap();
     let beside = folder.join("model.onnx");
-    for (path, set, kind) in [
-        (&beside, VitmatteColors::Auto, ""),
-        (&alone, VitmatteColors::Auto, "_imagenet"),
-        (&beside, VitmatteColors::Imagenet, "_imagenet"),
-        (&alone, VitmatteColors::Half, ""),
+    // shown the same numbers from another file, the network is not run again
+    for (path, set, kind, runs) in [
+        (&beside, VitmatteColors::Auto, "", true),
+        (&alone, VitmatteColors::Auto, "_imagenet", true),
+        (&beside, VitmatteColors::Imagenet, "_imagenet", false),
+        (&alone, VitmatteColors::Half, "", false),
     ] {
         let network = VitMatte::open(path, ARRAY_BYTES, set).unwrap();
         let recorded = &network.session.file.contract;
@@ -381,6 +382,9 @@ fn vitmatte_is_shown_the_colors_of_each_convention() {
         let pixels = network.pixels(&photo, &trimap, padded);
         let expected = array(&folder.join(format!("pixel_values{kind}.npy")));
         close("pixel_values", numbers(&pixels), numbers(&expected), 1e-6);
+        if !runs {
+            continue;
+        }
         let alpha = network.alpha(&photo, &trimap).unwrap();
         let whole = array(&folder.join(format!("alphas{kind}.npy")));
         let cut: Vec<f32> =

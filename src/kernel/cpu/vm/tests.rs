@@ -166,7 +166,7 @@ fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
     let mut x: Vec<f64> = reference::wide(&[density, color, network].concat());
     let largest = analytic.iter().fold(0f32, |m, g| m.max(g.abs())) as f64;
     let mut errors = Vec::new();
-    for k in 0..300u64 {
+    for k in 0..150u64 {
         let i = rng::below(seed, 6, k, x.len() as u64) as usize;
         let (old, h) = (x[i], 1e-6);
         x[i] = old + h;
