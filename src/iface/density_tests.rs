@@ -41,17 +41,17 @@ fn a_step_is_the_one_of_its_formulas() {
         ..config()
     };
     let views = views();
-    let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
-    agrees_on(CpuDensity::new(&config, &pixels), &config, &pixels, [1e-5, 1e-3]);
+    let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+    agrees_on(CpuDensity::new(&config, &sampler), &config, &sampler, [1e-5, 1e-3]);
     #[cfg(feature = "wgpu")]
     for device in crate::kernel::gpu::tests::devices() {
-        agrees_on(GpuDensity::new(&config, &pixels, device).unwrap(), &config, &pixels, [1e-4, 1e-2]);
+        agrees_on(GpuDensity::new(&config, &sampler, device).unwrap(), &config, &sampler, [1e-4, 1e-2]);
     }
 }
 
 /// The third step against the formulas in f64, parameter by parameter: terms and the median of the updates within the
 /// first tolerance, every update within the second.
-fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, pixels: &Pixels, [close, near]: [f64; 2]) {
+fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, [close, near]: [f64; 2]) {
     let dir = temporary();
     let session = session("iface", dir.path(), "step", &Quiet);
     let mut state = DensityState::start(initial(config, session.seed), config, None);
@@ -70,7 +70,7 @@ fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, pixels: &Pixels, [clos
     let before = state.groups.clone().map(|group| group.state);
     let shape = shape(config);
     let weights = DensityWeights::new(&shape, &before[1][0]);
-    let batch = pixels.draw(3, 2, state.rays, false, 0.0);
+    let batch = sampler.draw(3, 2, state.rays, false, 0.0);
     let table = bytemuck::cast_slice(&before[0][0]);
     let samples = march(config, &state.occupancy, (&shape, table, &weights), &batch.rays);
     let n = samples.t.len();
@@ -265,12 +265,12 @@ mod on_gpus {
     fn a_step_waits_for_nothing_and_whole_numbers_give_the_same_bytes() {
         let views = textured_views();
         let config = config();
-        let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+        let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
         let dir = temporary();
         let session = session("iface", dir.path(), "ball", &Quiet);
         // launches and readbacks of each step, and the table after them
         let trained = |device: Device, steps: &[u64]| {
-            let ops = GpuDensity::new(&config, &pixels, device).unwrap();
+            let ops = GpuDensity::new(&config, &sampler, device).unwrap();
             let mut model = DensityModel::new(ops, &config, &session);
             model.restore(None).ok().unwrap();
             let mut step = |&step: &u64| {
@@ -304,8 +304,8 @@ mod on_gpus {
         let Some(device) = device() else { return };
         let views = textured_views();
         let config = IfaceConfig { samples: 1 << 18, ..config() };
-        let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
-        let e = GpuDensity::fits(&config, &pixels, &device.with_memory(600 << 20)).err().unwrap();
+        let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+        let e = GpuDensity::fits(&config, &sampler, &device.with_memory(600 << 20)).err().unwrap();
         assert!(e.to_string().contains("has memory for") && e.hint().contains("iface.samples to"), "{e:?}");
     }
 }

@@ -3,7 +3,7 @@
 use super::super::cpu::CpuSdf;
 use super::super::model::parts;
 use super::super::state::{FORMAT, SdfState};
-use super::super::train::{SdfModel, pixels};
+use super::super::train::{SdfModel, sampler};
 use super::*;
 use crate::config::Preset;
 use crate::config::iface::Start;
@@ -74,12 +74,12 @@ fn on<'a>(device: &'a str, dir: &'a Path, monitor: &'a dyn Monitor) -> TrainingS
 /// A training before its first step.
 fn begun<'a, O: SdfOps>(
     ops: O,
-    pixels: &'a Pixels<'a>,
+    sampler: &'a RaySampler<'a>,
     hull: Option<&'a Bitmask>,
     config: &'a IfaceConfig,
     session: &TrainingSession<'a>,
 ) -> SdfModel<'a, O> {
-    let mut model = SdfModel::new(ops, pixels, hull, config, session);
+    let mut model = SdfModel::new(ops, sampler, hull, config, session);
     model.restore(None).ok().unwrap();
     model
 }
@@ -202,9 +202,9 @@ fn a_step_waits_for_nothing() {
     let config = IfaceConfig { stereo: 0.0, occupancy_every: 1.0, all_levels: 0.0, ..config() };
     let (hull, dir) = (hull(), temporary());
     let session = on("wgpu:0", dir.path(), &Quiet);
-    let pixels = pixels(&views, Some(&hull), &config).unwrap();
-    let ops = GpuSdf::new(&config, &pixels, device().unwrap()).unwrap();
-    let mut model = begun(ops, &pixels, Some(&hull), &config, &session);
+    let sampler = sampler(&views, Some(&hull), &config).unwrap();
+    let ops = GpuSdf::new(&config, &sampler, device().unwrap()).unwrap();
+    let mut model = begun(ops, &sampler, Some(&hull), &config, &session);
     let step = |model: &mut SdfModel<GpuSdf>, step: u64| {
         let progress = TrainingProgress { step, ..TrainingProgress::default() };
         let read = (step + 1).is_multiple_of(Device::READ_EVERY);
@@ -236,10 +236,10 @@ fn cells_are_those_that_the_cpu_keeps() {
     let config = IfaceConfig { occupancy_resolution: 40, soften: 8.0, band: 0.3, ..config() };
     let (hull, dir) = (hull(), temporary());
     let session = on("wgpu:0", dir.path(), &Quiet);
-    let pixels = pixels(&views, Some(&hull), &config).unwrap();
-    let gpu = GpuSdf::new(&config, &pixels, device).unwrap();
-    let mut on_gpu = begun(gpu, &pixels, Some(&hull), &config, &session);
-    let mut on_cpu = begun(CpuSdf::new(&config, &pixels), &pixels, Some(&hull), &config, &session);
+    let sampler = sampler(&views, Some(&hull), &config).unwrap();
+    let gpu = GpuSdf::new(&config, &sampler, device).unwrap();
+    let mut on_gpu = begun(gpu, &sampler, Some(&hull), &config, &session);
+    let mut on_cpu = begun(CpuSdf::new(&config, &sampler), &sampler, Some(&hull), &config, &session);
     let at = StepAt { seed: 3, step: 7 };
     let want = updated(&mut on_cpu, at);
     let before = on_gpu.ops.device.counts().1;
@@ -270,10 +270,10 @@ fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
     };
     let dir = temporary();
     let session = on("wgpu:0", dir.path(), &Quiet);
-    let pixels = pixels(&views, None, &config).unwrap();
-    let gpu = GpuSdf::new(&config, &pixels, device).unwrap();
-    let mut on_gpu = begun(gpu, &pixels, None, &config, &session);
-    let mut on_cpu = begun(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);
+    let sampler = sampler(&views, None, &config).unwrap();
+    let gpu = GpuSdf::new(&config, &sampler, device).unwrap();
+    let mut on_gpu = begun(gpu, &sampler, None, &config, &session);
+    let mut on_cpu = begun(CpuSdf::new(&config, &sampler), &sampler, None, &config, &session);
     let total = SIDE.pow(3);
     assert!(on_gpu.ops.samples.t.words() < total / 2);
     // all cells; a quarter anywhere with some of all, of many and of few that are kept; of those that the device kept itself
@@ -349,9 +349,9 @@ fn the_paper_goes_on_where_the_cpu_stopped_and_waits_for_nothing_either() {
     let start = psnr(&views[4], |rays| face.render(rays));
     assert!(db > start + 0.5 && share < 0.9, "{start} {db} {share}");
     // with three looks at cells that are drawn: one readback
-    let pixels = pixels(&views, None, &config).unwrap();
-    let ops = GpuSdf::new(&config, &pixels, device).unwrap();
-    let mut model = begun(ops, &pixels, None, &config, &session);
+    let sampler = sampler(&views, None, &config).unwrap();
+    let ops = GpuSdf::new(&config, &sampler, device).unwrap();
+    let mut model = begun(ops, &sampler, None, &config, &session);
     let before = model.ops.device.counts().1;
     for step in [256, 257, 272, 288, 299] {
         let progress = TrainingProgress { step, ..TrainingProgress::default() };
@@ -387,11 +387,11 @@ fn all_ways_to_add_learn_alike_and_whole_numbers_the_same_bytes() {
     let config = IfaceConfig { stereo: 0.0, ..config() };
     let (hull, dir) = (hull(), temporary());
     let session = on("wgpu:0", dir.path(), &Quiet);
-    let pixels = pixels(&views, Some(&hull), &config).unwrap();
+    let sampler = sampler(&views, Some(&hull), &config).unwrap();
     // losses of the third step, and the table after it
     let trained = |device: Device| {
-        let ops = GpuSdf::new(&config, &pixels, device).unwrap();
-        let mut model = begun(ops, &pixels, Some(&hull), &config, &session);
+        let ops = GpuSdf::new(&config, &sampler, device).unwrap();
+        let mut model = begun(ops, &sampler, Some(&hull), &config, &session);
         let step = |step: u64| {
             let progress = TrainingProgress { step, ..TrainingProgress::default() };
             training::step(&mut model, session.seed, &progress, true).ok().flatten().unwrap().figures
@@ -415,8 +415,8 @@ fn a_device_with_too_little_room_is_refused_before_the_first_step() {
     let views = textured_views();
     let hull = hull();
     let room = |config: &IfaceConfig, device: &Device| {
-        let pixels = pixels(&views, Some(&hull), config).unwrap();
-        max_samples(config, &shape(config), &pixels, device)
+        let sampler = sampler(&views, Some(&hull), config).unwrap();
+        max_samples(config, &shape(config), &sampler, device)
     };
     let config = IfaceConfig { stereo: 0.0, levels: 6, occupancy_resolution: 32, ..config() };
     let e = room(&IfaceConfig { samples: 100_000_000, ..config.clone() }, &device).err().unwrap();
@@ -455,10 +455,10 @@ fn exchange_costs_at_most_half_more_than_native_sums() {
     let (hull, dir) = (hull(), temporary());
     let session = on("wgpu:0", dir.path(), &Quiet);
     let ways = [native, device().unwrap().with_atomics(Atomics::Exchange)];
-    let pixels = pixels(&views, Some(&hull), &config).unwrap();
+    let sampler = sampler(&views, Some(&hull), &config).unwrap();
     let mut both = ways.map(|device| {
-        let ops = GpuSdf::new(&config, &pixels, device).unwrap();
-        begun(ops, &pixels, Some(&hull), &config, &session)
+        let ops = GpuSdf::new(&config, &sampler, device).unwrap();
+        begun(ops, &sampler, Some(&hull), &config, &session)
     });
     let mut best = [f64::INFINITY; 2];
     let mut step = 1;
@@ -500,13 +500,13 @@ fn memory_of_a_training() {
     let config = IfaceConfig { samples: 1 << 16, ..config() };
     let (hull, dir) = (hull(), temporary());
     let session = on("wgpu:0", dir.path(), &Quiet);
-    let pixels = pixels(&views, Some(&hull), &config).unwrap();
+    let sampler = sampler(&views, Some(&hull), &config).unwrap();
     let given = device().unwrap().with_memory(700 << 20);
     let most = given.available_memory();
     let before = given.reserved_memory();
-    let ops = GpuSdf::new(&config, &pixels, given).unwrap();
-    let model = begun(ops, &pixels, Some(&hull), &config, &session);
-    assert!(!model.ops.is_broken().unwrap());
+    let ops = GpuSdf::new(&config, &sampler, given).unwrap();
+    let model = begun(ops, &sampler, Some(&hull), &config, &session);
+    assert!(!model.ops.is_non_finite().unwrap());
     let taken = model.ops.device.reserved_memory() - before;
     println!("{taken} bytes of {most} are taken");
     assert!(taken as f64 <= 1.05 * most as f64 && taken as f64 > 0.8 * most as f64, "{taken} of {most}");

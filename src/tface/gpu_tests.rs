@@ -35,8 +35,8 @@ fn config() -> VmConfig {
     }
 }
 
-fn pixels<'a>(views: &'a [TrainView], config: &VmConfig) -> Pixels<'a> {
-    Pixels::new(views, 0.25, 1.0, config.foreground, config.whole_frame)
+fn sampler<'a>(views: &'a [TrainView], config: &VmConfig) -> RaySampler<'a> {
+    RaySampler::new(views, 0.25, 1.0, config.foreground, config.whole_frame)
 }
 
 fn start(config: &VmConfig) -> VmState {
@@ -51,9 +51,9 @@ fn begun<'a, O: VmOps>(ops: O, config: &'a VmConfig, session: &TrainingSession<'
 }
 
 /// Operations on a device whose memory holds the photographs, if the device can draw from them.
-fn on_gpu<'a>(config: &'a VmConfig, pixels: &'a Pixels<'a>, device: Device) -> GpuVm<'a> {
-    let resident = GpuVm::fits("tface", config, pixels, BOUNDS, &device).unwrap();
-    GpuVm::new(config, pixels, device, resident)
+fn on_gpu<'a>(config: &'a VmConfig, sampler: &'a RaySampler<'a>, device: Device) -> GpuVm<'a> {
+    let resident = GpuVm::fits("tface", config, sampler, BOUNDS, &device).unwrap();
+    GpuVm::new(config, sampler, device, resident)
 }
 
 /// Compares the color loss of steps that go on from the start on the CPU and on the device, which is read after every
@@ -63,10 +63,10 @@ fn losses_follow_those_of_the_cpu(config: &VmConfig, steps: u64, every: u64) {
     let (dir, views) = (temporary(), ball::views());
     // after a grid has grown, Adam's first steps go by the sign of what is zero but for rounding: that is another story
     let config = &VmConfig { steps: 200, upsample_at: vec![], mask_at: vec![], ..config.clone() };
-    let pixels = pixels(&views, config);
+    let sampler = sampler(&views, config);
     let session = session("tface", dir.path(), "ball", &Quiet);
-    let mut on_cpu = begun(CpuVm::new(config, &pixels), config, &session);
-    let mut on_gpu = begun(on_gpu(config, &pixels, device), config, &session);
+    let mut on_cpu = begun(CpuVm::new(config, &sampler), config, &session);
+    let mut on_gpu = begun(on_gpu(config, &sampler, device), config, &session);
     let mut want = 0f64;
     for step in 0..steps {
         let progress = TrainingProgress { step, ..TrainingProgress::default() };
@@ -123,7 +123,7 @@ fn trainings_follow_the_cpu(config: &VmConfig, first: u64, on_device: u64) {
         return;
     }
     let views = ball::views();
-    let pixels = pixels(&views, config);
+    let sampler = sampler(&views, config);
     // grids grow at steps between two reads
     let upsampled = (0..config.steps).filter(|&step| config.due(&config.upsample_at, step).is_some());
     assert!(
@@ -132,7 +132,7 @@ fn trainings_follow_the_cpu(config: &VmConfig, first: u64, on_device: u64) {
     );
     let run = |dir: &Path, device: &str, monitor: &dyn Monitor| {
         let session = TrainingSession { device, ..session("tface", dir, "ball", monitor) };
-        let report = train_one(&pixels, BOUNDS, Some(&hull()), config, &session)?;
+        let report = train_one(&sampler, BOUNDS, Some(&hull()), config, &session)?;
         if device != "cpu" {
             a_device_sees_the_same(&views[0], dir);
         }
@@ -197,15 +197,15 @@ fn memory_of_a_training() {
         hidden: 32,
         ..config()
     };
-    let pixels = pixels(&views, &config);
+    let sampler = sampler(&views, &config);
     // The memory is for all points of the lattices, of which few lie in these cells.
     let start = VmState::new(&config, 3, BOUNDS, Some(&ball::cells_within(0.15)));
     let with = |mib: u64| device().unwrap().with_memory((512 + mib) << 20);
-    let fits = |mib: &u64| GpuVm::fits("tface", &config, &pixels, BOUNDS, &with(*mib)).is_ok_and(|r| r);
+    let fits = |mib: &u64| GpuVm::fits("tface", &config, &sampler, BOUNDS, &with(*mib)).is_ok_and(|r| r);
     let planned = (8..4096).step_by(4).find(fits).unwrap();
     let session = session("tface", dir.path(), "ball", &Quiet);
     let before = with(planned).reserved_memory();
-    let mut model = VmModel::new(on_gpu(&config, &pixels, with(planned)), start, &config, &session);
+    let mut model = VmModel::new(on_gpu(&config, &sampler, with(planned)), start, &config, &session);
     model.load();
     for step in 0..2 {
         let progress = TrainingProgress { step, ..TrainingProgress::default() };
@@ -226,10 +226,10 @@ fn rays_that_the_host_draws_in_order_give_the_losses_of_the_cpu() {
         background: VmBackground::Reference,
         ..config()
     };
-    let pixels = Pixels::permuted(&views, config.foreground, BOUNDS, true);
+    let sampler = RaySampler::permuted(&views, config.foreground, BOUNDS, true);
     let session = session("tface", dir.path(), "ball", &Quiet);
-    let mut on_cpu = begun(CpuVm::new(&config, &pixels), &config, &session);
-    let mut on_gpu = begun(on_gpu(&config, &pixels, device), &config, &session);
+    let mut on_cpu = begun(CpuVm::new(&config, &sampler), &config, &session);
+    let mut on_gpu = begun(on_gpu(&config, &sampler, device), &config, &session);
     for step in 0..6 {
         let progress = TrainingProgress { step, ..TrainingProgress::default() };
         let want = training::step(&mut on_cpu, session.seed, &progress, true).ok().flatten().unwrap().figures;
@@ -258,10 +258,10 @@ fn a_device_that_is_lost_leaves_the_last_checkpoint_and_the_training_goes_on() {
     let again = vec![0.2, 0.923];
     let config = VmConfig { steps: 52, upsample_at: again.clone(), mask_at: again, ..config() };
     let views = ball::views();
-    let pixels = pixels(&views, &config);
+    let sampler = sampler(&views, &config);
     let run = |dir: &Path, device: &str, monitor: &dyn Monitor| {
         let session = TrainingSession { device, ..session("tface", dir, "ball", monitor) };
-        train_one(&pixels, BOUNDS, Some(&hull()), &config, &session)
+        train_one(&sampler, BOUNDS, Some(&hull()), &config, &session)
     };
     let begun = temporary();
     assert!(run(begun.path(), "cpu", &StopAfter::new(47)).err().unwrap().kind().is_stop());
@@ -275,9 +275,9 @@ fn a_device_with_too_little_memory_is_refused_before_the_first_step_and_told_wha
     let Some(device) = device() else { return };
     let views = ball::views();
     let refused = |config: &VmConfig, mib: u64| {
-        let pixels = pixels(&views, config);
+        let sampler = sampler(&views, config);
         let device = self::device().unwrap().with_memory(mib << 20);
-        GpuVm::fits("tface", config, &pixels, BOUNDS, &device)
+        GpuVm::fits("tface", config, &sampler, BOUNDS, &device)
     };
     assert!(refused(&config(), 1024).unwrap(), "photographs lie there");
     let e = refused(&config(), 512).err().unwrap();

@@ -390,7 +390,7 @@ fn keep(wanted: &[u32], alive: &mut [u32]) {
 }
 
 /// Rays of a step, and the colors of their pixels.
-pub struct Batch {
+pub struct DeviceBatch {
     /// Planes `[3, rays]`, where they start, in the field's coordinates.
     pub origin: Buffer,
     /// Planes `[3, rays]`, unit directions.
@@ -407,10 +407,10 @@ pub struct Batch {
     pub alive: Buffer,
 }
 
-impl Batch {
+impl DeviceBatch {
     /// Allocates a batch with a capacity of `rays`, all inactive.
-    pub fn new(device: &Device, rays: usize) -> Batch {
-        Batch {
+    pub fn new(device: &Device, rays: usize) -> DeviceBatch {
+        DeviceBatch {
             origin: device.zeros::<f32>(3 * rays),
             direction: device.zeros::<f32>(3 * rays),
             jitter: device.zeros::<f32>(rays),
@@ -422,7 +422,7 @@ impl Batch {
     }
 
     /// Uploads rays into a batch of the given capacity, with black colors.
-    pub fn of_rays(device: &Device, rays: &[MarchRay], capacity: usize) -> Batch {
+    pub fn of_rays(device: &Device, rays: &[MarchRay], capacity: usize) -> DeviceBatch {
         assert!(rays.len() <= capacity);
         let mut planes = [vec![0f32; 3 * capacity], vec![0f32; 3 * capacity]];
         let (mut jitter, mut alive) = (vec![0f32; capacity], vec![0u32; capacity]);
@@ -433,12 +433,12 @@ impl Batch {
             }
             (jitter[r], alive[r]) = (ray.jitter, 1);
         }
-        Batch {
+        DeviceBatch {
             origin: device.upload(&planes[0]),
             direction: device.upload(&planes[1]),
             jitter: device.upload(&jitter),
             alive: device.upload(&alive),
-            ..Batch::new(device, capacity)
+            ..DeviceBatch::new(device, capacity)
         }
     }
 
@@ -555,7 +555,7 @@ impl Photographs {
         device: &Device,
         (seed, step): (u64, u64),
         wanted: &Buffer,
-        into: &Batch,
+        into: &DeviceBatch,
         detail: f32,
     ) {
         let [view, pixel, shift, background] =

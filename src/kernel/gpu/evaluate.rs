@@ -1,9 +1,9 @@
 //! Evaluation of a trained signed-distance field on a device, in batches that fill the device.
 
 use super::device::{Buffer, Device};
-use super::draw::Batch;
+use super::draw::DeviceBatch;
 use super::march::Samples;
-use super::neus::{Neus, Rays};
+use super::neus::Neus;
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
 use crate::Result;
@@ -129,17 +129,12 @@ impl Evaluator {
         let mut out = Vec::with_capacity(rays.len());
         while out.len() < rays.len() {
             let own = &rays[out.len()..(out.len() + RAYS).min(rays.len())];
-            let batch = Batch::of_rays(device, own, RAYS);
+            let batch = DeviceBatch::of_rays(device, own, RAYS);
             samples.march(device, &self.occupancy, &batch, &step, usize::MAX, 0);
             let (x, view_dir, count) = (&samples.x, &samples.direction, &samples.count);
             let field = self.sdf.forward(device, &self.table, &self.flat, x, view_dir, count);
-            let bundle = Rays {
-                offsets: &samples.offsets,
-                direction: &batch.direction,
-                t: &samples.t,
-                dt: &samples.dt,
-            };
-            let seen: Vec<f32> = device.fetch(neus.forward(device, bundle, field, &self.inv_s, 1.0))?;
+            let composited = neus.forward(device, &batch, samples, field, &self.inv_s, 1.0);
+            let seen: Vec<f32> = device.fetch(composited)?;
             let alive: Vec<u32> = device.fetch(&batch.alive)?;
             // Rays that exceeded the sample capacity are marched again with the next batch.
             let done = alive[..own.len()].iter().position(|&a| a == 0).unwrap_or(own.len());
@@ -211,13 +206,13 @@ mod tests {
         let field = sdf::forward(&shape, &table, &weights, &x, &d);
         let along: Vec<[f32; 3]> = few.iter().map(|r| r.direction).collect();
         let dt = vec![step; x.len()];
-        let bundle = crate::kernel::cpu::neus::Rays {
+        let segments = crate::kernel::cpu::neus::Segments {
             offsets: &samples.offsets,
             direction: &along,
             t: &samples.t,
             dt: &dt,
         };
-        let want = crate::kernel::cpu::neus::forward(bundle, field.output(), 20.0, 1.0);
+        let want = crate::kernel::cpu::neus::forward(segments, field.output(), 20.0, 1.0);
         let got: Vec<[f32; RAY_WIDTH]> = some.iter().map(|&r| got[r]).collect();
         agree("renders", got.as_flattened(), &want, 1e-4);
         assert!(flatten(x).len() > 20_000);

@@ -1,7 +1,7 @@
 //! The training loss of the signed-distance field and its gradients: see [`crate::kernel::cpu::losses`].
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::Batch;
+use super::draw::DeviceBatch;
 use super::sum::group_sum;
 use crate::kernel::cpu::losses::{LossWeights, RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::neus::RAY_WIDTH;
@@ -211,9 +211,15 @@ impl Losses {
 
     /// Computes the losses of rays, and returns the gradients with respect to the output of
     /// [`Neus::forward`](super::Neus::forward), planes `[9, rays]`. offsets: `[rays + 1]`.
-    pub fn of_rays(&self, device: &Device, composed: &Buffer, batch: &Batch, offsets: &Buffer) -> &Buffer {
+    pub fn of_rays(
+        &self,
+        device: &Device,
+        composed: &Buffer,
+        batch: &DeviceBatch,
+        offsets: &Buffer,
+    ) -> &Buffer {
         let w = &self.weights;
-        let Batch { color, alpha, background, alive, .. } = batch;
+        let DeviceBatch { color, alpha, background, alive, .. } = batch;
         let tally = &self.tally;
         let one = CubeCount::new_single();
         launch!(device, tally::launch, one, UNITS; offsets, alpha, alive, tally; true);
@@ -257,7 +263,8 @@ impl Losses {
 #[cfg(test)]
 mod tests {
     use super::super::device::tests::{agree, device, planes};
-    use super::super::neus::{Neus, Rays};
+    use super::super::march::Samples;
+    use super::super::neus::Neus;
     use super::*;
     use crate::kernel::cpu::rng;
 
@@ -367,22 +374,26 @@ mod tests {
         case.alpha.push(1.0);
         let inv_s = 30f32;
         let up = |v: &[f32]| device.upload(v);
-        let (offsets, direction) = (device.upload(&case.offsets), up(&planes(&case.direction, 6)));
-        let (t, dt) = (up(&[1.0; 24]), up(&[STEP as f32; 24]));
-        let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let samples = Samples {
+            offsets: device.upload(&case.offsets),
+            t: up(&[1.0; 24]),
+            dt: up(&[STEP as f32; 24]),
+            ..Samples::new(&device, 6, 24)
+        };
         let (field, sharp) = (up(&planes(&case.field, 24)), up(&[inv_s]));
-        let batch = Batch {
+        let batch = DeviceBatch {
+            direction: up(&planes(&case.direction, 6)),
             color: up(&planes(&case.color, 6)),
             background: up(&planes(&case.background, 6)),
             alpha: up(&case.alpha),
             alive: device.upload(&[1u32, 1, 1, 1, 1, 0]),
-            ..Batch::new(&device, 6)
+            ..DeviceBatch::new(&device, 6)
         };
         let (neus, losses) = (Neus::new(&device, 6, 24), Losses::new(&device, WEIGHTS, 6, 24));
         let (count, g_s) = (device.upload(&[24u32]), device.zeros::<f32>(1));
-        let composed = neus.forward(&device, rays, &field, &sharp, ANNEAL as f32);
-        let g_out = losses.of_rays(&device, composed, &batch, &offsets);
-        let g_field = neus.backward(&device, rays, &field, &sharp, ANNEAL as f32, g_out, &g_s);
+        let composed = neus.forward(&device, &batch, &samples, &field, &sharp, ANNEAL as f32);
+        let g_out = losses.of_rays(&device, composed, &batch, &samples.offsets);
+        let g_field = neus.backward(&device, &batch, &samples, &field, &sharp, ANNEAL as f32, g_out, &g_s);
         losses.of_samples(&device, &field, &count, g_field);
         (0..2).for_each(|_| losses.add(&device, &count, &up(&[0.25, 0.5])));
         let sums = losses.sums();

@@ -3,7 +3,7 @@
 //! samples.
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::Batch;
+use super::draw::DeviceBatch;
 use super::occupancy::Occupancy;
 use burn::cubecl::{self, prelude::*};
 
@@ -243,7 +243,7 @@ impl Samples {
         &self,
         device: &Device,
         occupancy: &Occupancy,
-        rays: &Batch,
+        rays: &DeviceBatch,
         step_length: &Buffer,
         limit: usize,
         reserved: usize,
@@ -310,7 +310,7 @@ mod tests {
     ) -> (Samples, Vec<u32>) {
         // the buffers have capacity for more rays and samples than are used
         let samples = Samples::new(device, rays.len() + 5, capacity + 3);
-        let batch = Batch::of_rays(device, rays, rays.len() + 5);
+        let batch = DeviceBatch::of_rays(device, rays, rays.len() + 5);
         samples.march(device, occupancy, &batch, &device.upload(&[STEP]), limit, 3);
         (samples, device.read(&batch.alive))
     }

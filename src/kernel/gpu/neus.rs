@@ -1,6 +1,8 @@
 //! NeuS compositing of ragged rays, one thread per ray: see [`crate::kernel::cpu::neus`].
 
 use super::device::{Buffer, Device, Words, groups, launch};
+use super::draw::DeviceBatch;
+use super::march::Samples;
 use super::sum::group_sum;
 use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
 use crate::kernel::cpu::sdf::WIDTH;
@@ -243,19 +245,6 @@ fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
     }
 }
 
-/// The ragged samples of a batch of rays on a device, sorted by ray and then by `t`.
-#[derive(Clone, Copy)]
-pub struct Rays<'a> {
-    /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
-    pub offsets: &'a Buffer,
-    /// Planes `[3, rays]`, unit directions.
-    pub direction: &'a Buffer,
-    /// `[capacity]` midpoints.
-    pub t: &'a Buffer,
-    /// `[capacity]` lengths.
-    pub dt: &'a Buffer,
-}
-
 /// Buffers of compositing and its gradients.
 pub struct Neus {
     out: Buffer,
@@ -302,17 +291,20 @@ impl Neus {
         &self.g_field
     }
 
-    /// Composites the field's output, planes `[8, capacity]`, and returns planes `[9, rays]`; inv_s: `[1]`.
+    /// Composites the field's output at the samples of rays, planes `[8, capacity]`, and returns planes
+    /// `[9, rays]`; inv_s: `[1]`.
     pub fn forward(
         &self,
         device: &Device,
-        rays: Rays,
+        rays: &DeviceBatch,
+        samples: &Samples,
         field: &Buffer,
         inv_s: &Buffer,
         anneal: f32,
     ) -> &Buffer {
         launch!(device, forward::launch, groups(self.g_ln.words().div_ceil(UNITS as usize)), UNITS;
-            rays.offsets, rays.direction, rays.t, rays.dt, field, inv_s, self.out, self.light; anneal
+            samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.out, self.light;
+            anneal
         );
         &self.out
     }
@@ -322,7 +314,8 @@ impl Neus {
     pub fn backward(
         &self,
         device: &Device,
-        rays: Rays,
+        rays: &DeviceBatch,
+        samples: &Samples,
         field: &Buffer,
         inv_s: &Buffer,
         anneal: f32,
@@ -330,8 +323,8 @@ impl Neus {
         g_inv_s: &Buffer,
     ) -> &Buffer {
         launch!(device, backward::launch, groups(self.g_ln.words().div_ceil(UNITS as usize)), UNITS;
-            rays.offsets, rays.direction, rays.t, rays.dt, field, inv_s, self.light, g_out, self.g_field,
-            self.g_ln;
+            samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.light, g_out,
+            self.g_field, self.g_ln;
             anneal
         );
         let one = CubeCount::new_single();
@@ -352,24 +345,30 @@ mod tests {
     /// Runs forward and backward pass, and returns the results of the device and of the CPU.
     fn device_and_cpu(
         device: &Device,
-        rays: neus::Rays,
+        segments: neus::Segments,
         field: &[[f32; WIDTH]],
         inv_s: f32,
         anneal: f32,
         g: &[[f32; RAY_WIDTH]],
     ) -> [Results; 2] {
-        let (n, count) = (field.len(), rays.direction.len());
+        let (n, count) = (field.len(), segments.direction.len());
         let device_neus = Neus::new(device, count, n);
-        let (offsets, direction) =
-            (device.upload(rays.offsets), device.upload(&planes(rays.direction, count)));
-        let (t, dt) = (device.upload(rays.t), device.upload(rays.dt));
-        let device_rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let direction = device.upload(&planes(segments.direction, count));
+        let rays = DeviceBatch { direction, ..DeviceBatch::new(device, count) };
+        let samples = Samples {
+            offsets: device.upload(segments.offsets),
+            t: device.upload(segments.t),
+            dt: device.upload(segments.dt),
+            ..Samples::new(device, count, n)
+        };
         let (device_field, device_inv_s) = (device.upload(&planes(field, n)), device.upload(&[inv_s]));
-        let out = device.read(device_neus.forward(device, device_rays, &device_field, &device_inv_s, anneal));
+        let composited = device_neus.forward(device, &rays, &samples, &device_field, &device_inv_s, anneal);
+        let out = device.read(composited);
         let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros::<f32>(1));
         let g_field = device.read(device_neus.backward(
             device,
-            device_rays,
+            &rays,
+            &samples,
             &device_field,
             &device_inv_s,
             anneal,
@@ -377,8 +376,8 @@ mod tests {
             &g_s,
         ));
         let flat = field.as_flattened();
-        let want = neus::forward(rays, flat, inv_s, anneal);
-        let (want_field, want_s) = neus::backward(rays, flat, inv_s, anneal, g.as_flattened());
+        let want = neus::forward(segments, flat, inv_s, anneal);
+        let (want_field, want_s) = neus::backward(segments, flat, inv_s, anneal, g.as_flattened());
         let [want, want_field] =
             [planes::<RAY_WIDTH>(want.as_chunks().0, count), planes::<WIDTH>(want_field.as_chunks().0, n)];
         [(out, g_field, device.read::<f32>(&g_s)[0]), (want, want_field, want_s)]
@@ -415,11 +414,11 @@ mod tests {
             }
         }
         let dt = vec![0.01f32; n];
-        let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments = neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let g: Vec<[f32; RAY_WIDTH]> =
             (0..200).map(|r| std::array::from_fn(|k| normal(5, RAY_WIDTH * r + k))).collect();
         for (inv_s, anneal) in [(20.0, 0.0), (60.0, 0.4), (200.0, 1.0)] {
-            let [got, want] = device_and_cpu(&device, rays, &field, inv_s, anneal, &g);
+            let [got, want] = device_and_cpu(&device, segments, &field, inv_s, anneal, &g);
             agree("rays", &got.0, &want.0, 1e-4);
             for k in 0..8 {
                 // the gradient by the sdf is a difference of nearly equal numbers, which is no more accurate on the CPU
@@ -446,10 +445,10 @@ mod tests {
         let offsets: Vec<i32> = (0..=count as i32).map(|r| 4 * r).collect();
         let direction = vec![[0.6, 0.0, -0.8]; count];
         let (t, dt) = ([1.0, 1.1, 1.2, 1.3].repeat(count), [1e-9, 0.05, 3.0, 1e3].repeat(count));
-        let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments = neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let g = vec![[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]; count];
         for inv_s in [0.0, 1e-6, 1.0, 1e6, 1e9] {
-            let [(out, g_field, g_s), _] = device_and_cpu(&device, rays, &field, inv_s, 1.0, &g);
+            let [(out, g_field, g_s), _] = device_and_cpu(&device, segments, &field, inv_s, 1.0, &g);
             // sample i of all planes
             let of = |values: &[f32], n: usize, i: usize| -> Vec<f32> {
                 values.iter().skip(i).step_by(n).copied().collect()

@@ -167,7 +167,7 @@ impl Occupancy {
 }
 
 /// Update rule of a band around the zero level set: see [`crate::kernel::cpu::occupancy::update_band`].
-pub struct Band {
+pub struct BandUpdate {
     cells: Buffer,
     allowed: Buffer,
     value: Buffer,
@@ -176,12 +176,12 @@ pub struct Band {
     rule: BandRule,
 }
 
-impl Band {
+impl BandUpdate {
     /// Creates the rule; cells outside `allowed` are never occupied.
-    pub fn new(device: &Device, allowed: &Bitmask, rule: BandRule) -> Band {
+    pub fn new(device: &Device, allowed: &Bitmask, rule: BandRule) -> BandUpdate {
         let total = allowed.resolution.pow(3);
         let cells: Vec<u32> = (0..total).filter(|&i| allowed.get(i)).map(|i| i as u32).collect();
-        Band {
+        BandUpdate {
             cells: device.upload(&cells),
             allowed: device.upload(&words(&allowed.bits)),
             // cells that are not evaluated stay 0, which has no sign

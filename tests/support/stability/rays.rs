@@ -5,7 +5,7 @@ use super::case::{Cases, StabilityCase, worst};
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use tiface::geom::{Bvh, Camera, Distortion, Mesh, Ray};
 use tiface::kernel::cpu::march::{Bitmask, MarchRay, march};
-use tiface::kernel::cpu::neus::{self, Rays};
+use tiface::kernel::cpu::neus::{self, Segments};
 use tiface::kernel::cpu::vm::mask::{Lattice, Walk};
 use tiface::kernel::cpu::{hash, rng};
 use tiface::mesh::{Volume, marching};
@@ -222,8 +222,9 @@ fn spheres(cases: &mut Cases) {
                 })
                 .collect();
             let dt = vec![step; samples.t.len()];
-            let rays = Rays { offsets: &samples.offsets, direction: &[r.direction], t: &samples.t, dt: &dt };
-            let out = neus::forward(rays, &field, inv_s, 1.0);
+            let segments =
+                Segments { offsets: &samples.offsets, direction: &[r.direction], t: &samples.t, dt: &dt };
+            let out = neus::forward(segments, &field, inv_s, 1.0);
             (out[3] as f64, (out[4] / out[3]) as f64)
         };
         let inside = (0..100).map(|i| 0.495 * (i as f64 / 99.0).sqrt());

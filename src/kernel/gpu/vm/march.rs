@@ -2,7 +2,7 @@
 //! [`crate::kernel::cpu::vm::mask::Walk`].
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::draw::Batch;
+use super::super::draw::DeviceBatch;
 use super::super::march::{FAR, Span, bit, narrowed, prefix_sum};
 use super::super::occupancy::words;
 use crate::kernel::cpu::march::BLOCK;
@@ -243,7 +243,7 @@ impl VmSamples {
     }
 
     /// Marches a batch of rays. Rays whose samples exceed the capacity are marked as not alive.
-    pub fn march(&self, device: &Device, lattice: &DeviceLattice, rays: &Batch) {
+    pub fn march(&self, device: &Device, lattice: &DeviceLattice, rays: &DeviceBatch) {
         assert_eq!(rays.rays(), self.counts.words());
         let [bits, blocks] = match &lattice.mask {
             Some(masks) => masks.each_ref(),

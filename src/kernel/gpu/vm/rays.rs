@@ -171,7 +171,7 @@ fn backward(
 }
 
 /// Values of samples along the rays of a batch, and the composited rays.
-pub struct Along {
+pub struct CompositedRays {
     /// `[capacity]`: features of samples.
     pub feature: Buffer,
     /// `[capacity]`: gradients with respect to features.
@@ -199,7 +199,7 @@ pub struct Along {
     softplus: bool,
 }
 
-impl Along {
+impl CompositedRays {
     /// Memory per sample of a field that is trained, in words.
     pub const WORDS: usize = 12;
     /// Memory per ray, in words: composited values, their gradients and loss terms, offsets, counts, and the ray itself.
@@ -207,11 +207,17 @@ impl Along {
 
     /// Allocates buffers for `rays` rays and up to `capacity` samples of a field; buffers for gradients only if `learns` is
     /// set.
-    pub fn new(device: &Device, field: &VmField, rays: usize, capacity: usize, learns: bool) -> Along {
+    pub fn new(
+        device: &Device,
+        field: &VmField,
+        rays: usize,
+        capacity: usize,
+        learns: bool,
+    ) -> CompositedRays {
         let s = &field.shading;
         let samples = |planes: usize| device.scratch::<f32>(planes * capacity);
         let gradients = |planes: usize| device.scratch::<f32>(if learns { planes * capacity } else { 1 });
-        Along {
+        CompositedRays {
             feature: samples(1),
             g_feature: gradients(1),
             count: device.zeros::<u32>(2),
