@@ -10,6 +10,8 @@ pub mod checkpoint;
 pub mod devices;
 #[cfg(feature = "wgpu")]
 pub mod drawing;
+#[cfg(all(test, feature = "wgpu"))]
+pub(crate) mod gpu_tests;
 pub mod ops;
 pub mod parameters;
 pub mod pixels;
