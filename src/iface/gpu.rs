@@ -131,7 +131,7 @@ impl<'a> GpuSdf<'a> {
         directions: &[[f32; 3]],
         normals: &[[f32; 3]],
     ) -> Result<Vec<f32>> {
-        let (device, capacity) = (&self.device, self.samples.t.words());
+        let (device, capacity) = (&self.device, self.samples.t.word_count());
         let [x, direction, normal] = [points, directions, normals]
             .map(|rows| device.upload(&gpu::planes(&rows[..points.len()], capacity)));
         let count = device.upload(&[points.len() as u32]);
@@ -248,7 +248,7 @@ impl Ops for GpuSdf<'_> {
 impl SdfOps for GpuSdf<'_> {
     fn load(&mut self, occupancy: &Occupancy, rays: usize, points: &[SurfacePoint]) {
         let (device, config) = (&self.device, self.config);
-        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.words());
+        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.word_count());
         let budget = schedule::ray_budget(config);
         self.schedule = Schedule::new(device, schedule::step_length(config), budget, rays);
         self.non_finite = device.zeros::<u32>(1);

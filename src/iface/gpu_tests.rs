@@ -270,7 +270,7 @@ fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
     let mut on_gpu = begun(gpu, &sampler, None, &config, &session);
     let mut on_cpu = begun(CpuSdf::new(&config, &sampler), &sampler, None, &config, &session);
     let total = SIDE.pow(3);
-    assert!(on_gpu.ops.samples.t.words() < total / 2);
+    assert!(on_gpu.ops.samples.t.word_count() < total / 2);
     // all cells; a quarter anywhere with some of all, of many and of few that are kept; of those that the device kept itself
     for (step, kept) in
         [(16, None), (272, Some(total)), (288, Some(total / 2)), (304, Some(500)), (320, None)]

@@ -9,6 +9,7 @@
 
 mod adam;
 mod color;
+mod composite;
 mod density;
 mod device;
 mod draw;
@@ -24,6 +25,7 @@ mod schedule;
 mod sdf;
 mod sum;
 mod tile;
+mod vec3;
 mod vm;
 mod weight_norm;
 

@@ -116,7 +116,7 @@ impl Ops for GpuDensity<'_> {
 impl DensityOps for GpuDensity<'_> {
     fn load(&mut self, occupancy: &Occupancy, rays: usize) {
         let (device, config) = (&self.device, self.config);
-        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.words());
+        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.word_count());
         let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         self.schedule = Schedule::new(device, length, budget, rays);
         self.non_finite = device.zeros::<u32>(1);

@@ -48,9 +48,9 @@ pub struct Gate<'a> {
 
 /// Takes one AdamW step in place; the gradient is left zero. All four buffers are `[n]`.
 pub fn adam(device: &Device, [p, m, v]: [&Buffer; 3], g: &Buffer, step: &AdamStep, gate: Gate) {
-    assert!([m, v, g].iter().all(|b| b.words() == p.words()));
+    assert!([m, v, g].iter().all(|b| b.word_count() == p.word_count()));
     let correction = |beta: f32| (1.0 / (1.0 - (beta as f64).powf(step.step as f64))) as f32;
-    launch!(device, adam_kernel::launch, groups(p.words().div_ceil(UNITS as usize)), UNITS;
+    launch!(device, adam_kernel::launch, groups(p.word_count().div_ceil(UNITS as usize)), UNITS;
         p, m, v, g, gate.count, gate.non_finite;
         step.lr, step.beta1, step.beta2, step.epsilon, 1.0 - step.lr * step.weight_decay,
         correction(step.beta1), correction(step.beta2), step.skip_zero

@@ -411,7 +411,7 @@ impl Density {
 
     /// Converts new network weights to the layout of the kernels.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
-        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, prepare::launch, groups(self.weights.word_count().div_ceil(UNITS as usize)), UNITS;
             flat, self.prepared_map, self.weights
         );
     }
@@ -431,7 +431,9 @@ impl Density {
         direction: Option<&Buffer>,
         count: &Buffer,
     ) -> &Buffer {
-        assert!(x.words() == 3 * self.capacity && direction.is_none_or(|d| d.words() == x.words()));
+        assert!(
+            x.word_count() == 3 * self.capacity && direction.is_none_or(|d| d.word_count() == x.word_count())
+        );
         self.grid.gather(device, table, x, count, &self.value, None);
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
@@ -448,7 +450,7 @@ impl Density {
     /// evaluation, and copies the remaining samples to `kept`.
     pub fn cut(&self, device: &Device, samples: &Samples, kept: &Samples) {
         let pass = |writes: bool| {
-            launch!(device, cut::launch, groups(kept.counts.words().div_ceil(UNITS as usize)), UNITS;
+            launch!(device, cut::launch, groups(kept.counts.word_count().div_ceil(UNITS as usize)), UNITS;
                 self.out, samples.offsets, kept.offsets, kept.counts, samples.t, samples.x, samples.direction,
                 kept.t, kept.x, kept.direction;
                 self.dt, writes
@@ -500,7 +502,7 @@ impl Density {
         }
         let size = self.plan.color.gradients[1] * CHANNELS;
         sum_groups(device, partial, Some(&self.summed_map), count, g_flat, (size, TILE, summing));
-        launch!(device, check::launch, groups(g_flat.words().div_ceil(UNITS as usize)), UNITS; g_flat, non_finite);
+        launch!(device, check::launch, groups(g_flat.word_count().div_ceil(UNITS as usize)), UNITS; g_flat, non_finite);
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
     }
 

@@ -124,7 +124,7 @@ impl Schedule {
         count: &Buffer,
         non_finite: &Buffer,
     ) -> Result<Figures> {
-        assert_eq!(losses.words(), SUMS);
+        assert_eq!(losses.word_count(), SUMS);
         launch!(device, collect::launch, CubeCount::new_single(), 16;
             losses, variance, count, self.rays, self.empty_steps, non_finite, self.figures
         );

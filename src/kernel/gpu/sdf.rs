@@ -247,12 +247,12 @@ impl Sdf {
         normals: Option<&Buffer>,
         count: &Buffer,
     ) -> &Buffer {
-        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, prepare::launch, groups(self.weights.word_count().div_ceil(UNITS as usize)), UNITS;
             flat, self.prepared_map, self.weights
         );
         self.grid.gather(device, table, x, count, &self.value, Some(&self.jacobian));
-        assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
-        assert!(normals.is_none_or(|n| n.words() == x.words()));
+        assert!(x.word_count() == 3 * self.capacity && direction.word_count() == x.word_count());
+        assert!(normals.is_none_or(|n| n.word_count() == x.word_count()));
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
             launch!(device, forward::launch_unchecked, groups(self.capacity / TILE), UNITS;
@@ -281,8 +281,8 @@ impl Sdf {
         g_table: &Buffer,
         g_flat: &Buffer,
     ) {
-        assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
-        assert!(g_out.words() == WIDTH * self.capacity);
+        assert!(x.word_count() == 3 * self.capacity && direction.word_count() == x.word_count());
+        assert!(g_out.word_count() == WIDTH * self.capacity);
         let summing_groups = groups(self.summing);
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {

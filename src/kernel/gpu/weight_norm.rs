@@ -153,7 +153,7 @@ impl WeightNorm {
         flat: &Buffer,
         inv_s: &Buffer,
     ) {
-        assert_eq!(raw.words(), self.parameters);
+        assert_eq!(raw.word_count(), self.parameters);
         launch!(device, forward::launch, groups(self.count.div_ceil(UNITS as usize)), UNITS;
             raw, self.pieces, variance, flat, inv_s; range[0], range[1]
         );

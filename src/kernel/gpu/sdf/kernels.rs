@@ -92,7 +92,7 @@ pub(in super::super) fn sum_groups(
     // not known to the compiler, which would compile both kernels again for every capacity
     let (size, tile, summing) = (size as u32, tile as u32, summing as u32);
     launch!(device, sum_slices::launch, slices, UNITS; partial, count; size, tile, summing);
-    launch!(device, reduce::launch, groups(over(flat.words())), UNITS;
+    launch!(device, reduce::launch, groups(over(flat.word_count())), UNITS;
         partial, map.unwrap_or(count), count, flat; size, tile, summing, map.is_some()
     );
 }

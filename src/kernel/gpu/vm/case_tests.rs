@@ -132,7 +132,7 @@ impl DeviceCase {
 
     /// Of density, appearance and decoder, after a render.
     pub fn gradients(&self, device: &Device) -> Result<[Vec<f32>; 3]> {
-        let [d, c, n] = self.values.each_ref().map(|v| device.zeros::<f32>(v.words()));
+        let [d, c, n] = self.values.each_ref().map(|v| device.zeros::<f32>(v.word_count()));
         let gradients = VmValues { density: &d, color: &c, network: &n };
         let non_finite = device.zeros::<u32>(1);
         self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients, &non_finite);

@@ -178,8 +178,8 @@ impl DeviceDecoder {
 
     /// Converts the flat weights, as on the CPU, to the layout of the kernels.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
-        assert_eq!(flat.words(), self.plan.parts()[7]);
-        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+        assert_eq!(flat.word_count(), self.plan.parts()[7]);
+        launch!(device, prepare::launch, groups(self.weights.word_count().div_ceil(UNITS as usize)), UNITS;
             flat, self.real, self.weights; self.plan
         );
     }
@@ -194,12 +194,12 @@ impl DeviceDecoder {
         samples: &VmSamples,
         composited: &CompositedRays,
     ) {
-        assert!(composited.index.words() == self.capacity && values.words() == grid.len());
+        assert!(composited.index.word_count() == self.capacity && values.word_count() == grid.len());
         let tiles = self.capacity.div_ceil(4 * self.plan.lanes);
         // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
         unsafe {
             launch!(device, forward::launch_unchecked, groups(tiles.min(DECODING)), UNITS;
-                self.weights, values, grid.words(), samples.place, samples.ray, rays.direction, composited.index,
+                self.weights, values, grid.sizes(), samples.place, samples.ray, rays.direction, composited.index,
                 composited.count, composited.rgb;
                 self.plan
             );
@@ -221,12 +221,12 @@ impl DeviceDecoder {
         g_flat: &Buffer,
         non_finite: &Buffer,
     ) {
-        assert!(composited.index.words() == self.capacity && values.words() == grid.len());
+        assert!(composited.index.word_count() == self.capacity && values.word_count() == grid.len());
         for from in (0..self.capacity).step_by(self.chunk) {
             // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
             unsafe {
                 launch!(device, backward::launch_unchecked, groups(self.summing()), UNITS;
-                    self.weights, values, grid.words(), samples.place, samples.ray, rays.direction,
+                    self.weights, values, grid.sizes(), samples.place, samples.ray, rays.direction,
                     composited.index, composited.count, composited.g_pre, self.g_products, self.partial;
                     from as u32, self.chunk as u32, self.plan
                 );
@@ -235,9 +235,9 @@ impl DeviceDecoder {
             let (place, count) = (&samples.place, &composited.count);
             grid.scatter(device, g_values, values, place, part, count, &self.g_products);
         }
-        let sizes = (self.summed.words(), 4 * self.plan.lanes, self.summing());
+        let sizes = (self.summed.word_count(), 4 * self.plan.lanes, self.summing());
         sum_groups(device, &self.partial, None, &composited.count, &self.summed, sizes);
-        launch!(device, chain::launch, groups(flat.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, chain::launch, groups(flat.word_count().div_ceil(UNITS as usize)), UNITS;
             flat, self.real, self.padded, self.summed, g_flat, non_finite; self.plan
         );
     }

@@ -2,7 +2,7 @@
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::draw::DeviceBatch;
-use super::super::losses::{BACKGROUND, TALLY, tally};
+use super::super::losses::{BACKGROUND, TALLY, cross_entropy, tally};
 use super::super::sum::group_sum;
 use super::Vm;
 use crate::Result;
@@ -12,7 +12,8 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Number of words of the results of steps: loss terms, lattice points, evaluated samples, decoded samples, rays, non_finite.
+/// Number of words of the results of steps: loss terms, lattice points, evaluated samples, decoded samples, rays, whether a
+/// gradient was not finite.
 const TOTALS: usize = TERMS + 5;
 
 /// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
@@ -61,11 +62,9 @@ fn of_rays(
             g_opacity += 2.0f32 * weight * opacity * background_share;
         }
         if ce {
-            let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
-            let m = select(a == 0.0f32, 0.0f32, 1.0f32);
-            mask = -(m * p.ln() + (1.0f32 - m) * (1.0f32 - p).ln()) * ray_share;
-            let by_p = ((1.0f32 - m) / (1.0f32 - p) - m / p) * ray_share * weight;
-            g_opacity += select(p == opacity, by_p, 0.0f32);
+            let entropy = cross_entropy(opacity, select(a == 0.0f32, 0.0f32, 1.0f32), ray_share, weight);
+            mask = entropy.value;
+            g_opacity += entropy.slope;
         }
         g_out[3 * rays + r] = g_opacity;
         g_out[4 * rays + r] = 0.0f32;
@@ -151,7 +150,7 @@ impl VmLosses {
         let DeviceBatch { color, alpha, background, alive, .. } = batch;
         let one = CubeCount::new_single();
         launch!(device, tally::launch, one, UNITS; alive, alpha, alive, self.tally; false);
-        launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, of_rays::launch, groups(alpha.word_count().div_ceil(UNITS as usize)), UNITS;
             composed, color, alpha, background, alive, self.tally, self.g_out, self.terms;
             mode.lift, f32::from(mode.target), weight, l2, ce
         );

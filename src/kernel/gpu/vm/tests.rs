@@ -36,7 +36,7 @@ fn lattice_points_are_those_of_the_cpu_with_and_without_a_mask() {
         }
         offsets.extend([t.len() as u32; 3]);
         points.extend([0; 3]);
-        println!("{} samples, {} at most", t.len(), on_gpu.vm.samples.t.words());
+        println!("{} samples, {} at most", t.len(), on_gpu.vm.samples.t.word_count());
         assert_eq!(device.read::<u32>(&on_gpu.vm.samples.count), [t.len() as u32; 2]);
         assert_eq!(device.read::<u32>(&on_gpu.vm.samples.offsets), offsets);
         assert_eq!(device.read::<u32>(&on_gpu.vm.samples.points), points);

@@ -217,6 +217,33 @@ fn second_layer(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan:
     ))
 }
 
+/// Computes both hidden layers of a tile of samples: the first one in tile `b`, the second one in `a`.
+#[cube]
+fn hidden_layers(
+    a: &mut [F4],
+    b: &mut [F4],
+    w: &[F4],
+    values: &[F4],
+    words: &[u32],
+    place: &[f32],
+    ray: &[u32],
+    direction: &[f32],
+    index: &[u32],
+    tile: usize,
+    samples: usize,
+    row: usize,
+    column: usize,
+    #[comptime] plan: DecoderPlan,
+) {
+    let lanes = comptime!(plan.lanes);
+    let h1 = first_layer(a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan);
+    store_block(b, &h1, row, column, lanes);
+    sync_cube();
+    let h2 = second_layer(&*b, w, row, column, plan);
+    store_block(a, &h2, row, column, lanes);
+    sync_cube();
+}
+
 /// Writes colors, planes `[3, capacity]`.
 #[cube(launch_unchecked)]
 pub(super) fn forward(
@@ -239,14 +266,9 @@ pub(super) fn forward(
     let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let samples = tile::uniform_count(count, &mut a);
     for tile in range_stepped(CUBE_POS, samples.div_ceil(comptime!(4 * lanes)), CUBE_COUNT) {
-        let h1 = first_layer(
-            &mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
+        hidden_layers(
+            &mut a, &mut b, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
         );
-        store_block(&mut b, &h1, row, column, lanes);
-        sync_cube();
-        let h2 = second_layer(&b, w, row, column, plan);
-        store_block(&mut a, &h2, row, column, lanes);
-        sync_cube();
         let v = output_layer(&a, w, comptime!(rows[4]), row, column, 3usize, lanes);
         if column < 3 {
             let bias = w[comptime!(rows[5] * columns)];
@@ -318,14 +340,9 @@ pub(super) fn backward(
     let mut b3 = 0.0f32;
     for tile in range_stepped(start + CUBE_POS, end, CUBE_COUNT) {
         let here = tile * lanes + row;
-        let h1 = first_layer(
-            &mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
+        hidden_layers(
+            &mut a, &mut b, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
         );
-        store_block(&mut b, &h1, row, column, lanes);
-        sync_cube();
-        let h2 = second_layer(&b, w, row, column, plan);
-        store_block(&mut a, &h2, row, column, lanes);
-        sync_cube();
         if c < hidden {
             let mut of_w3 = F4::new(0.0f32);
             #[unroll]
