@@ -18,8 +18,9 @@ use tiface::kernel::cpu::adam::{AdamStep, adam};
 use tiface::kernel::cpu::hash;
 use tiface::kernel::cpu::losses::{self, LossWeights, Targets};
 use tiface::kernel::cpu::mlp::Weights;
-use tiface::kernel::cpu::neus::{self, Rays};
+use tiface::kernel::cpu::neus::{self, Segments};
 use tiface::kernel::cpu::sdf::{self, FieldShape};
+use tiface::math::rng;
 use tiface::math::rng;
 
 #[global_allocator]
@@ -98,14 +99,14 @@ fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 5]) {
     let [p, m, v, g] = state;
     let a = sdf::forward(&i.shape, bytemuck::cast_slice(p), &w, &i.x, &i.d);
     lap(0);
-    let rays = Rays { offsets: &i.offsets, direction: &i.directions, t: &i.t, dt: &i.dt };
-    let out = neus::forward(rays, a.output(), 20.0, 0.5);
+    let segments = Segments { offsets: &i.offsets, direction: &i.directions, t: &i.t, dt: &i.dt };
+    let out = neus::forward(segments, a.output(), 20.0, 0.5);
     lap(1);
     let targets =
         Targets { offsets: &i.offsets, color: &i.directions, alpha: &i.alpha, background: &i.directions };
     let (_, g_out) = losses::of_rays(&out, targets, &WEIGHTS);
     lap(2);
-    let (mut g_field, _) = neus::backward(rays, a.output(), 20.0, 0.5, &g_out);
+    let (mut g_field, _) = neus::backward(segments, a.output(), 20.0, 0.5, &g_out);
     lap(1);
     losses::of_samples(a.output(), &WEIGHTS, &mut g_field);
     lap(2);

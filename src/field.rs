@@ -13,6 +13,8 @@ pub mod devices;
 #[cfg(feature = "wgpu")]
 pub mod drawing;
 mod gpu_field;
+#[cfg(all(test, feature = "wgpu"))]
+pub(crate) mod gpu_tests;
 pub mod ops;
 pub mod parameters;
 pub mod pixels;

@@ -56,7 +56,8 @@ pub fn require_fit(config: &IfaceConfig, device: &ComputeDevice) -> Result<()> {
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(found) => {
             use crate::config::iface::{FieldKind, Foreground};
-            let none = crate::field::pixels::Pixels::new(&[], f32::INFINITY, 1.0, Foreground::Photo, false);
+            let none =
+                crate::field::pixels::RaySampler::new(&[], f32::INFINITY, 1.0, Foreground::Photo, false);
             match config.field {
                 FieldKind::Sdf => gpu::GpuSdf::fits(config, &none, &found.device),
                 FieldKind::Density => density::GpuDensity::fits(config, &none, &found.device),

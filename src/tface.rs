@@ -42,11 +42,11 @@ pub fn require_fit(
         ComputeDevice::Gpu(_) if !config.import.is_empty() => Ok(()),
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(found) => {
-            use crate::field::pixels::Pixels;
+            use crate::field::pixels::RaySampler;
             use gpu::GpuVm;
             train::check(stage, config)?;
             let (none, device) =
-                (Pixels::new(&[], f32::INFINITY, 1.0, config.foreground, false), &found.device);
+                (RaySampler::new(&[], f32::INFINITY, 1.0, config.foreground, false), &found.device);
             let fits = match bounds.map(|bounds| [bounds.min.to_array(), bounds.max.to_array()]) {
                 Some(bounds) => GpuVm::fits(stage, config, &none, bounds, device),
                 None => GpuVm::fits_some_box(stage, config, &none, device),

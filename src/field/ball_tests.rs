@@ -5,13 +5,9 @@ use crate::capture::synthetic::shared::Files;
 use crate::field::checkpoint::newest;
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
-#[cfg(feature = "wgpu")]
-use crate::geom::{Ray, RayResult};
 use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
 use crate::math::rng;
 use crate::{Monitor, Quiet, Result};
-#[cfg(feature = "wgpu")]
-use glam::Vec2;
 use glam::Vec3;
 use std::path::Path;
 use std::sync::OnceLock;
@@ -173,63 +169,4 @@ pub fn refuses(run: Run, stop_after: u64, stage: &str, rows: &[(&str, &dyn Fn(&m
             assert_eq!(e.hint(), format!("start the stage again with `--fresh {stage}`"));
         }
     }
-}
-
-/// Error of the colors that a field shows of every third pixel of a view over black, dB.
-#[cfg(feature = "wgpu")]
-pub fn psnr(view: &TrainView, render: impl FnOnce(&[Ray]) -> Vec<RayResult>) -> f64 {
-    let width = view.camera.width as usize;
-    let pixels: Vec<usize> = (0..view.photo.rgb.len()).step_by(3).collect();
-    let center = |p: usize| Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
-    let rays: Vec<Ray> = pixels.iter().map(|&p| view.camera.ray(center(p)).unwrap()).collect();
-    let alpha = &view.mask.as_ref().unwrap().values;
-    let error = |(&p, seen): (&usize, RayResult)| -> f64 {
-        let want = view.photo.rgb[p].map(|c| f64::from(alpha[p]) / 255.0 * f64::from(c) / 255.0);
-        (0..3).map(|c| (f64::from(seen.color[c]) - want[c]).powi(2)).sum()
-    };
-    let all: f64 = pixels.iter().zip(render(&rays)).map(error).sum();
-    -10.0 * (all / (3 * pixels.len()) as f64).log10()
-}
-
-/// A function that trains in a folder on a device.
-#[cfg(feature = "wgpu")]
-pub type RunOn<'a, T> = &'a dyn Fn(&Path, &str, &dyn Monitor) -> Result<T>;
-
-/// Trains for this many steps on the CPU, and from there in two ways: on the CPU to the end; and in parts, each on a device
-/// for this many steps, before the CPU goes on to the end.
-#[cfg(feature = "wgpu")]
-pub fn alone_and_in_turn<T>(run: RunOn<T>, first: u64, parts: &[(&str, u64)]) -> [T; 2] {
-    let stops = |dir: &Path, device: &str, steps: u64| {
-        let stopped = run(dir, device, &StopAfter::new(steps)).err().unwrap();
-        assert!(stopped.to_string().contains("saved at step"), "{stopped}");
-    };
-    let alone = temporary();
-    stops(alone.path(), "cpu", first);
-    let moved = copied(alone.path());
-    parts.iter().for_each(|&(device, steps)| stops(moved.path(), device, steps));
-    [alone, moved].map(|dir| run(dir.path(), "cpu", &Quiet).unwrap())
-}
-
-/// Asserts that a training is not harmed when its device fails after any of these numbers of readbacks: the checkpoint
-/// that lies in `begun` stays as it is, and the training goes on from there to the bytes of one whose device was not
-/// lost.
-#[cfg(feature = "wgpu")]
-pub fn outlives_lost_devices<T>(run: RunOn<T>, begun: &Path, answers: &[usize]) {
-    use crate::kernel::gpu::tests::lose_after;
-    // sums in fixed point, which come to the same bytes twice
-    let run = |dir: &Path| run(dir, "wgpu:0+deterministic", &Quiet);
-    let undisturbed = copied(begun);
-    run(undisturbed.path()).unwrap();
-    let before = bytes(begun);
-    for &answers in answers {
-        lose_after(answers);
-        let lost = run(begun);
-        lose_after(usize::MAX);
-        let e = lost.err().unwrap_or_else(|| panic!("a training reads no more than {answers} times"));
-        assert!(e.to_string().contains("failed: device lost") && e.hint().contains("repeat"), "{e}");
-        assert_eq!(e.kind() as i32, 75);
-        assert!(bytes(begun) == before, "the last checkpoint is touched after {answers}");
-    }
-    run(begun).unwrap();
-    assert!(bytes(begun) == bytes(undisturbed.path()));
 }

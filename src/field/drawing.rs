@@ -6,35 +6,40 @@
 //!
 //! [`MemoryNeed`] plans a training's memory on a device.
 
-use super::pixels::{Pixels, SampledRay, ray_backgrounds};
+use super::pixels::{RaySampler, ray_backgrounds};
 use super::training::StepAt;
-use crate::kernel::gpu::{BUFFERS, Batch, Buffer, Device, Photographs, SamplingOptions};
+use crate::kernel::gpu::{BUFFERS, Buffer, Device, DeviceBatch, Photographs, SamplingOptions, planes};
 use crate::{Error, Result};
 
 /// Source of the rays of a training on a device.
-pub struct DeviceRays {
-    /// Photographs in device memory; `None` if the CPU samples the rays.
+pub struct DeviceSampler {
+    /// Photographs in device memory; `None` if the processor samples the rays.
     resident: Option<Photographs>,
     drawing: SamplingOptions,
 }
 
 /// Returns the bytes that the photographs take on a device, or `None` if they do not fit in `available` bytes.
-pub fn resident(pixels: &Pixels, device: &Device, available: u64) -> Option<u64> {
-    let buffers = pixels.buffers_on_device(device.limits().largest_buffer);
+pub fn resident(sampler: &RaySampler, device: &Device, available: u64) -> Option<u64> {
+    let buffers = sampler.buffers_on_device(device.limits().largest_buffer);
     // A pixel takes four bytes for its color, one bit for whether it is drawable, and its share of the bits' counts.
     let bytes = buffers.iter().sum::<u64>() * 17 / 4;
     let fits = buffers.len() <= BUFFERS && bytes <= available;
-    (fits && pixels.count() <= u32::MAX as u64).then_some(bytes)
+    (fits && sampler.count() <= u32::MAX as u64).then_some(bytes)
 }
 
-impl DeviceRays {
+impl DeviceSampler {
     /// Creates the source, and copies the photographs to the device if they are to be `resident`.
-    pub fn new(pixels: &Pixels, device: &Device, drawing: SamplingOptions, resident: bool) -> DeviceRays {
+    pub fn new(
+        sampler: &RaySampler,
+        device: &Device,
+        drawing: SamplingOptions,
+        resident: bool,
+    ) -> DeviceSampler {
         let largest = device.limits().largest_buffer;
-        DeviceRays { resident: resident.then(|| pixels.on_device(device, drawing, largest)), drawing }
+        DeviceSampler { resident: resident.then(|| sampler.on_device(device, drawing, largest)), drawing }
     }
 
-    /// Draws the rays of a step into `batch`. They depend on seed and step alone; see [`Pixels::draw`].
+    /// Draws the rays of a step into `batch`. They depend on seed and step alone; see [`RaySampler::draw`].
     ///
     /// # Shapes
     ///
@@ -42,33 +47,40 @@ impl DeviceRays {
     pub fn draw(
         &self,
         device: &Device,
-        pixels: &Pixels,
+        sampler: &RaySampler,
         (seed, step): (u64, u64),
         wanted: &Buffer,
-        batch: &mut Batch,
+        batch: &mut DeviceBatch,
         detail: f32,
     ) {
         if let Some(photographs) = &self.resident {
             return photographs.draw(device, (seed, step), wanted, batch, detail);
         }
         let rays = batch.rays();
-        let drawn = pixels.draw_each(seed, step, rays, self.drawing.jitter, detail);
+        let drawn = sampler.draw(seed, step, rays, self.drawing.jitter, detail);
         let stream = self.drawing.background.then_some(self.drawing.background_stream);
         let background = ray_backgrounds(StepAt { seed, step }, stream, rays);
-        let planes = |of: &dyn Fn(usize) -> [f32; 3]| -> Buffer {
-            device.upload(&(0..3 * rays).map(|i| of(i % rays)[i / rays]).collect::<Vec<f32>>())
+        // the values of drawn rays at their numbers, and zeros where a pixel has no ray
+        let triples = |of: &dyn Fn(usize) -> [f32; 3]| -> Buffer {
+            let mut rows = vec![[0.0; 3]; rays];
+            drawn.number.iter().enumerate().for_each(|(k, &r)| rows[r as usize] = of(k));
+            device.upload(&planes(&rows, rays))
         };
-        let floats = |of: fn(SampledRay) -> f32| -> Buffer {
-            device.upload(&drawn.iter().map(|ray| ray.map_or(0.0, of)).collect::<Vec<f32>>())
+        let floats = |of: &dyn Fn(usize) -> f32| -> Buffer {
+            let mut values = vec![0.0; rays];
+            drawn.number.iter().enumerate().for_each(|(k, &r)| values[r as usize] = of(k));
+            device.upload(&values)
         };
-        *batch = Batch {
-            origin: planes(&|r| drawn[r].map_or([0.0; 3], |(ray, ..)| ray.origin)),
-            direction: planes(&|r| drawn[r].map_or([0.0; 3], |(ray, ..)| ray.direction)),
-            jitter: floats(|(ray, ..)| ray.jitter),
-            color: planes(&|r| drawn[r].map_or([0.0; 3], |(_, color, _)| color)),
-            alpha: floats(|(.., alpha)| alpha),
-            background: planes(&|r| background[r]),
-            alive: device.upload(&drawn.iter().map(|ray| u32::from(ray.is_some())).collect::<Vec<u32>>()),
+        let mut alive = vec![0u32; rays];
+        drawn.number.iter().for_each(|&r| alive[r as usize] = 1);
+        *batch = DeviceBatch {
+            origin: triples(&|k| drawn.rays[k].origin),
+            direction: triples(&|k| drawn.rays[k].direction),
+            jitter: floats(&|k| drawn.rays[k].jitter),
+            color: triples(&|k| drawn.color[k]),
+            alpha: floats(&|k| drawn.alpha[k]),
+            background: device.upload(&planes(&background, rays)),
+            alive: device.upload(&alive),
         };
         batch.keep(device, wanted);
     }
@@ -97,14 +109,14 @@ impl MemoryNeed {
     /// If fewer than the minimum fit; `remedy` receives how many fit and returns the setting to lower.
     pub fn plan(
         &self,
-        pixels: &Pixels,
+        sampler: &RaySampler,
         device: &Device,
         remedy: impl FnOnce(u64) -> String,
     ) -> Result<(usize, bool)> {
         let [bytes, widest] = self.each;
         let (fixed, what) = self.fixed;
         let left = device.available_memory().saturating_sub(fixed);
-        let resident = resident(pixels, device, left.saturating_sub(self.wanted.saturating_mul(bytes)));
+        let resident = resident(sampler, device, left.saturating_sub(self.wanted.saturating_mul(bytes)));
         let by_buffer = device.limits().largest_buffer / widest;
         let fits = self.wanted.min(by_buffer).min((left - resident.unwrap_or(0)) / bytes);
         if fits < self.minimum {
@@ -134,20 +146,20 @@ mod tests {
     fn photographs_that_stay_in_host_memory_give_the_same_rays() {
         let Some(device) = device() else { return };
         let views = ball::textured_views();
-        let pixels = Pixels::new(&views, 0.25, 1.0, Foreground::Estimated, false).with_large(1.0);
+        let sampler = RaySampler::new(&views, 0.25, 1.0, Foreground::Estimated, false).with_large(1.0);
         let drawing = SamplingOptions { jitter: true, background: true, background_stream: 8 };
-        assert!(resident(&pixels, &device, 0).is_none() && resident(&pixels, &device, 1 << 30).is_some());
+        assert!(resident(&sampler, &device, 0).is_none() && resident(&sampler, &device, 1 << 30).is_some());
         let wanted = device.upload(&[900u32]);
         for detail in [0.0, 0.2] {
             let [resident, sent] = [true, false].map(|on_device| {
-                let mut batch = Batch::new(&device, 1000);
-                let rays = DeviceRays::new(&pixels, &device, drawing, on_device);
-                rays.draw(&device, &pixels, (5, 7), &wanted, &mut batch, detail);
+                let mut batch = DeviceBatch::new(&device, 1000);
+                let rays = DeviceSampler::new(&sampler, &device, drawing, on_device);
+                rays.draw(&device, &sampler, (5, 7), &wanted, &mut batch, detail);
                 batch
             });
             assert_eq!(device.read::<u32>(&resident.alive), device.read::<u32>(&sent.alive));
             let planes =
-                |b: &Batch| [&b.origin, &b.direction, &b.color, &b.background].map(|p| device.read(p));
+                |b: &DeviceBatch| [&b.origin, &b.direction, &b.color, &b.background].map(|p| device.read(p));
             for (got, want) in planes(&sent).iter().zip(&planes(&resident)) {
                 let alive = |all: &Vec<f32>| -> Vec<f32> { (0..900).map(|r| all[r]).collect() };
                 agree("rays drawn by the host", &alive(got), &alive(want), 1e-5);
@@ -187,11 +199,11 @@ mod tests {
         let again =
             |_| TrainView { camera: one.camera.clone(), photo: one.photo.clone(), mask: None, valid: None };
         let views: Vec<TrainView> = (0..count).map(again).collect();
-        let pixels = Pixels::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
+        let sampler = RaySampler::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
         let drawing = SamplingOptions { jitter: true, background: true, background_stream: 8 };
-        let bytes = resident(&pixels, &device, u64::MAX).unwrap();
+        let bytes = resident(&sampler, &device, u64::MAX).unwrap();
         let before = resident_memory(false);
-        let _rays = DeviceRays::new(&pixels, &device, drawing, true);
+        let _rays = DeviceSampler::new(&sampler, &device, drawing, true);
         device.read::<f32>(&device.zeros::<f32>(1));
         let more = 1024 * (resident_memory(true) - before);
         let share = more as f64 / bytes as f64;

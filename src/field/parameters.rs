@@ -11,14 +11,14 @@ use crate::kernel::cpu::adam::AdamStep;
 
 /// A named array of a group.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Part {
+pub struct ParameterPart {
     /// Name in checkpoints.
     pub name: &'static str,
     /// Shape in checkpoints.
     pub shape: Vec<usize>,
 }
 
-impl Part {
+impl ParameterPart {
     /// Returns the number of values.
     pub fn count(&self) -> usize {
         self.shape.iter().product()
@@ -29,7 +29,7 @@ impl Part {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HostGroup {
     /// Parts, concatenated in this order.
-    pub parts: Vec<Part>,
+    pub parts: Vec<ParameterPart>,
     /// Values, running mean of the gradient, and running mean of its square.
     pub state: [Vec<f32>; 3],
 }
@@ -39,15 +39,15 @@ const PREFIXES: [&str; 3] = ["model", "first", "second"];
 
 impl HostGroup {
     /// Creates a group from parts and values, with zero moments.
-    pub fn new(parts: Vec<Part>, values: Vec<f32>) -> HostGroup {
-        assert_eq!(values.len(), parts.iter().map(Part::count).sum::<usize>());
+    pub fn new(parts: Vec<ParameterPart>, values: Vec<f32>) -> HostGroup {
+        assert_eq!(values.len(), parts.iter().map(ParameterPart::count).sum::<usize>());
         let zeros = vec![0.0; values.len()];
         HostGroup { parts, state: [values, zeros.clone(), zeros] }
     }
 
     /// Creates a group with a single part, a flat array.
     pub fn flat(name: &'static str, values: Vec<f32>) -> HostGroup {
-        HostGroup::new(vec![Part { name, shape: vec![values.len()] }], values)
+        HostGroup::new(vec![ParameterPart { name, shape: vec![values.len()] }], values)
     }
 
     /// Returns the values.
@@ -79,7 +79,11 @@ impl HostGroup {
 
     /// Reads parts of exactly these shapes from a checkpoint. Without `with_moments` the moments are zero. Memory is
     /// allocated only for tensors that the file really holds, independent of the claimed shapes.
-    pub fn restore(parts: Vec<Part>, from: &mut Checkpoint, with_moments: bool) -> Result<HostGroup> {
+    pub fn restore(
+        parts: Vec<ParameterPart>,
+        from: &mut Checkpoint,
+        with_moments: bool,
+    ) -> Result<HostGroup> {
         let mut state = [Vec::new(), Vec::new(), Vec::new()];
         for part in &parts {
             let name = |kind: &str| format!("{kind}.{}", part.name);
@@ -99,7 +103,7 @@ impl HostGroup {
 
 /// A group on the device that trains it.
 pub struct ParameterGroup<D: ArrayDevice> {
-    parts: Vec<Part>,
+    parts: Vec<ParameterPart>,
     /// Values, running mean of the gradient, and running mean of its square.
     state: [D::Array; 3],
     /// Gradient; zero before the backward pass of a step, which adds to it or overwrites it.

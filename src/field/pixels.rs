@@ -34,23 +34,33 @@ pub struct TrainView {
 
 /// Rays drawn for one step, with the colors and alphas of their pixels.
 #[derive(Default)]
-pub struct Batch {
+pub struct HostBatch {
     /// Rays in field coordinates.
     pub rays: Vec<MarchRay>,
     /// `[rays, 3]` head over black, sRGB-coded 0..=1: premultiplied by `alpha`.
     pub color: Vec<[f32; 3]>,
     /// `[rays]` soft alpha; 1 where the view has no mask.
     pub alpha: Vec<f32>,
+    /// `[rays]` number of each ray among those drawn, in increasing order. The numbers of pixels
+    /// without a ray are missing.
+    pub number: Vec<u32>,
 }
 
-/// A ray, the color over black that its pixel shows, and the pixel's alpha.
-pub type SampledRay = (MarchRay, [f32; 3], f32);
+impl HostBatch {
+    /// Drops all rays after the first `count`.
+    pub fn truncate(&mut self, count: usize) {
+        self.rays.truncate(count);
+        self.color.truncate(count);
+        self.alpha.truncate(count);
+        self.number.truncate(count);
+    }
+}
 
 /// Inclusive box of drawable pixels and one bit per pixel.
 type Drawable = (u32, u32, u32, u32, Vec<u64>);
 
 /// The drawable pixels of all views.
-pub struct Pixels<'a> {
+pub struct RaySampler<'a> {
     views: &'a [TrainView],
     /// Per view: target colors over black of the soft pixels; `None` if the target is alpha times the photograph.
     soft: Vec<Option<SoftPixels>>,
@@ -76,7 +86,7 @@ struct Order {
     depth_directions: bool,
 }
 
-impl<'a> Pixels<'a> {
+impl<'a> RaySampler<'a> {
     /// Collects the drawable pixels of the views. `reach` is how far outside the mask, in scene units, a ray may still
     /// meet an occupied cell.
     ///
@@ -91,7 +101,7 @@ impl<'a> Pixels<'a> {
         radius: f32,
         foreground: Foreground,
         reference_sampling: bool,
-    ) -> Pixels<'a> {
+    ) -> RaySampler<'a> {
         let usable = |v: &TrainView| v.mask.as_ref().is_some_and(|m| m.values.iter().any(|&a| a < 255));
         let has_masks = views.iter().any(usable);
         let reach = if reference_sampling { f32::INFINITY } else { reach };
@@ -109,7 +119,7 @@ impl<'a> Pixels<'a> {
             .collect();
         let cumulative = cumulative(&drawable);
         let order = None;
-        Pixels { views, soft, pixel, drawable, cumulative, radius, has_masks, reference_sampling, order }
+        RaySampler { views, soft, pixel, drawable, cumulative, radius, has_masks, reference_sampling, order }
     }
 
     /// Collects pixels as TensoRF's code draws them: all valid ones whose ray meets the box `bounds` at any distance, in a
@@ -123,9 +133,9 @@ impl<'a> Pixels<'a> {
         foreground: Foreground,
         bounds: [[f32; 3]; 2],
         depth_directions: bool,
-    ) -> Pixels<'a> {
-        let mut pixels = Pixels::new(views, f32::INFINITY, 1.0, foreground, false);
-        pixels.drawable.par_iter_mut().zip(views).for_each(|((.., bits), view)| {
+    ) -> RaySampler<'a> {
+        let mut sampler = RaySampler::new(views, f32::INFINITY, 1.0, foreground, false);
+        sampler.drawable.par_iter_mut().zip(views).for_each(|((.., bits), view)| {
             let width = view.photo.width as usize;
             for (i, word) in bits.iter_mut().enumerate() {
                 let valid = *word;
@@ -141,7 +151,7 @@ impl<'a> Pixels<'a> {
                 }
             }
         });
-        pixels.cumulative = cumulative(&pixels.drawable);
+        sampler.cumulative = cumulative(&sampler.drawable);
         let before = |(.., bits): &Drawable| {
             let mut sum = 0;
             let count = |word: &u64| {
@@ -150,8 +160,9 @@ impl<'a> Pixels<'a> {
             };
             bits.iter().map(count).collect()
         };
-        pixels.order = Some(Order { before: pixels.drawable.iter().map(before).collect(), depth_directions });
-        pixels
+        sampler.order =
+            Some(Order { before: sampler.drawable.iter().map(before).collect(), depth_directions });
+        sampler
     }
 
     /// Treats photographs as large whose pixels, at the scene's center, are finer than `finest`, the field's final
@@ -177,26 +188,21 @@ impl<'a> Pixels<'a> {
 
     /// Draws `count` random rays of a step, which depend on seed and step alone. A ray of a large photograph stands for a
     /// square of pixels, the widest of [`SIDES`] that is at most `detail` wide, in scene units.
-    pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool, detail: f32) -> Batch {
-        let drawn = self.draw_each(seed, step, count, jitter, detail).into_iter().flatten();
-        let (rays, color, alpha) = drawn.collect();
-        Batch { rays, color, alpha }
-    }
-
-    /// Draws as [`draw`](Pixels::draw), but keeps each ray at its index, with `None` if its pixel has no ray.
-    pub fn draw_each(
-        &self,
-        seed: u64,
-        step: u64,
-        count: usize,
-        jitter: bool,
-        detail: f32,
-    ) -> Vec<Option<SampledRay>> {
+    pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool, detail: f32) -> HostBatch {
         let draw = |i: usize| match &self.order {
             Some(order) => self.draw_next(order, (seed, step), (i as u64, count as u64), jitter),
             None => self.draw_one((seed, step), i as u64, jitter, detail),
         };
-        (0..count).into_par_iter().with_min_len(256).map(draw).collect()
+        let drawn: Vec<_> = (0..count).into_par_iter().with_min_len(256).map(draw).collect();
+        let mut batch = HostBatch::default();
+        for (i, drawn) in drawn.into_iter().enumerate() {
+            let Some((ray, color, alpha)) = drawn else { continue };
+            batch.rays.push(ray);
+            batch.color.push(color);
+            batch.alpha.push(alpha);
+            batch.number.push(i as u32);
+        }
+        batch
     }
 
     /// Copies the photographs to a device, in buffers of at most `largest` bytes. The device draws the same rays from
@@ -264,14 +270,15 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// Draws ray `i` of a batch of `count` in the order without repetition.
+    /// Draws ray `i` of a batch of `count` in the order without repetition: the ray, its pixel's color
+    /// over black, and the pixel's alpha.
     fn draw_next(
         &self,
         order: &Order,
         (seed, step): (u64, u64),
         (i, count): (u64, u64),
         jitter: bool,
-    ) -> Option<SampledRay> {
+    ) -> Option<(MarchRay, [f32; 3], f32)> {
         let which = rng::Permutation::of_step((seed, step), count, self.count()).get(i)?;
         let v = self.cumulative.partition_point(|&c| c <= which);
         let rank = (which - if v > 0 { self.cumulative[v - 1] } else { 0 }) as u32;
@@ -329,7 +336,15 @@ impl<'a> Pixels<'a> {
         (Vec2::from(middle), color.map(|sum| mean(sum, 255 * 255)), mean(alpha, 255))
     }
 
-    fn draw_one(&self, (seed, step): (u64, u64), i: u64, jitter: bool, detail: f32) -> Option<SampledRay> {
+    /// Draws ray `i` of a batch independently of the others, and returns what
+    /// [`draw_next`](RaySampler::draw_next) does.
+    fn draw_one(
+        &self,
+        (seed, step): (u64, u64),
+        i: u64,
+        jitter: bool,
+        detail: f32,
+    ) -> Option<(MarchRay, [f32; 3], f32)> {
         let stream = step << 4;
         let v = if self.reference_sampling {
             rng::below(seed, stream, i, self.views.len() as u64) as usize

@@ -19,9 +19,9 @@ fn view() -> TrainView {
 fn only_pixels_near_the_mask_are_drawn_and_carry_their_own_color() {
     // margin = ceil(0.1 · 20 / 3) + 1 = 2: a square of 5 × 5 around (8, 5)
     let views = [view()];
-    let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
-    assert_eq!(pixels.count(), 25);
-    let batch = pixels.draw(1, 2, 400, true, 0.0);
+    let sampler = RaySampler::new(&views, 0.1, 1.0, Foreground::Photo, false);
+    assert_eq!(sampler.count(), 25);
+    let batch = sampler.draw(1, 2, 400, true, 0.0);
     assert_eq!(batch.rays.len(), 400);
     let mut head = 0;
     for (ray, (color, alpha)) in batch.rays.iter().zip(batch.color.iter().zip(&batch.alpha)) {
@@ -44,7 +44,7 @@ fn only_pixels_near_the_mask_are_drawn_and_carry_their_own_color() {
 fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_coarse() {
     // a pixel is 4 / 20 = 0.2 wide at the middle: less than 0.3, so two of them for a detail of 0.5, not four
     let views = [view()];
-    let large = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false).with_large(0.3);
+    let large = RaySampler::new(&views, 0.1, 1.0, Foreground::Photo, false).with_large(0.3);
     let batch = large.draw(1, 2, 400, true, 0.5);
     assert_eq!(batch.rays.len(), 400);
     let mut head = 0;
@@ -68,9 +68,9 @@ fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_
     // four of 25 pixels lie in that square
     assert!((40..90).contains(&head), "{head} of 400 should be about 64");
     // At detail 0, and for pixels that are not that fine, every ray is a single pixel.
-    let small = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false).with_large(0.1);
-    for (pixels, detail) in [(&large, 0.0), (&small, 0.5)] {
-        assert_eq!(pixels.draw(1, 2, 400, true, detail).rays, large.draw(1, 2, 400, true, 0.3).rays);
+    let small = RaySampler::new(&views, 0.1, 1.0, Foreground::Photo, false).with_large(0.1);
+    for (sampler, detail) in [(&large, 0.0), (&small, 0.5)] {
+        assert_eq!(sampler.draw(1, 2, 400, true, detail).rays, large.draw(1, 2, 400, true, 0.3).rays);
     }
     assert_eq!([0.1f32, 0.2, 0.4, 0.9, 9.0].map(|detail| side(0.1, detail)), [1, 2, 4, 8, 8]);
 }
@@ -80,11 +80,11 @@ fn a_view_without_a_mask_teaches_nothing_beside_views_with_one() {
     let mut white = view();
     white.mask.as_mut().unwrap().values.fill(255);
     let views = [view(), TrainView { mask: None, ..view() }, white];
-    let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, false);
-    assert_eq!(pixels.count(), 25);
+    let sampler = RaySampler::new(&views, 0.1, 1.0, Foreground::Photo, false);
+    assert_eq!(sampler.count(), 25);
     // As the only view it is drawn from everywhere.
     let alone = [TrainView { mask: None, ..view() }];
-    assert_eq!(Pixels::new(&alone, 0.1, 1.0, Foreground::Photo, false).count(), 200);
+    assert_eq!(RaySampler::new(&alone, 0.1, 1.0, Foreground::Photo, false).count(), 200);
 }
 
 #[test]
@@ -97,12 +97,12 @@ fn an_epoch_has_every_valid_pixel_that_meets_the_box_once_with_directions_of_dep
     // pixels are 1/20 apart at depth 1. The near face at z = 1 is 3 away: |x − 10| < 1.5 · 20 / 3 = 10 has all
     // columns, |y − 5| < 0.4 · 20 / 3 = 2.67 the six rows with centers 0.5, 1.5 and 2.5 off the middle
     let bounds = [[-1.5, -0.4, -1.0], [1.5, 0.4, 1.0]];
-    let pixels = Pixels::permuted(&views, Foreground::Photo, bounds, true);
-    assert_eq!(pixels.count(), 2 * 20 * 6 - 1);
+    let sampler = RaySampler::permuted(&views, Foreground::Photo, bounds, true);
+    assert_eq!(sampler.count(), 2 * 20 * 6 - 1);
     // 239 pixels in batches of 50: four a round, and a tail that is left out
     let mut seen = Vec::new();
     for step in 0..4 {
-        let batch = pixels.draw(1, step, 50, false, 0.0);
+        let batch = sampler.draw(1, step, 50, false, 0.0);
         assert_eq!(batch.rays.len(), 50);
         for (ray, color) in batch.rays.iter().zip(&batch.color) {
             assert!((ray.direction[2] + 1.0).abs() < 1e-6, "{ray:?}");
@@ -116,19 +116,19 @@ fn an_epoch_has_every_valid_pixel_that_meets_the_box_once_with_directions_of_dep
     // pixel (8, 5), number 108, is head
     let head = seen.iter().filter(|(p, _)| *p == 108);
     assert!(head.clone().count() > 0 && head.clone().all(|(_, c)| (c[0] * 255.0 - 108.0).abs() < 1e-3));
-    let first = pixels.draw(1, 0, 50, false, 0.0).rays;
+    let first = sampler.draw(1, 0, 50, false, 0.0).rays;
     assert!(
-        first == pixels.draw(1, 0, 50, false, 0.0).rays && first != pixels.draw(1, 4, 50, false, 0.0).rays
+        first == sampler.draw(1, 0, 50, false, 0.0).rays && first != sampler.draw(1, 4, 50, false, 0.0).rays
     );
     // A batch larger than the number of pixels draws each of them once.
-    assert_eq!(pixels.draw(1, 9, 1000, false, 0.0).rays.len(), 239);
+    assert_eq!(sampler.draw(1, 9, 1000, false, 0.0).rays.len(), 239);
 }
 
 #[test]
 fn published_sampling_draws_the_whole_frame_of_every_view_as_often() {
     let views = [view(), view()];
-    let pixels = Pixels::new(&views, 0.1, 1.0, Foreground::Photo, true);
-    let batch = pixels.draw(1, 2, 2000, false, 0.0);
+    let sampler = RaySampler::new(&views, 0.1, 1.0, Foreground::Photo, true);
+    let batch = sampler.draw(1, 2, 2000, false, 0.0);
     assert_eq!(batch.rays.len(), 2000);
     let left = batch.rays.iter().filter(|r| r.direction[0] < 0.0).count();
     assert!((900..1100).contains(&left), "{left}");
@@ -159,10 +159,11 @@ fn a_device_draws_the_same_rays() {
     let empty = TrainView { mask: None, ..view() };
     let views = [view(), bent(perspective), empty, bent(fisheye), bent(fov)];
     // the last but one with squares of two pixels for a ray, a twentieth of the distance 4 wide each
-    let new = |foreground, published| Pixels::new(&views, 0.1, 0.3, foreground, published).with_large(0.3);
+    let new =
+        |foreground, published| RaySampler::new(&views, 0.1, 0.3, foreground, published).with_large(0.3);
     let all = [[-1.0f32; 3], [1.0; 3]];
-    let permuted = |depth| Pixels::permuted(&views, Foreground::Photo, all, depth);
-    for (pixels, published, detail, largest) in [
+    let permuted = |depth| RaySampler::permuted(&views, Foreground::Photo, all, depth);
+    for (sampler, published, detail, largest) in [
         (new(Foreground::Estimated, false), false, 0.0, u64::MAX),
         (new(Foreground::Photo, true), true, 0.0, u64::MAX),
         (new(Foreground::Estimated, false), false, 0.5, u64::MAX),
@@ -172,19 +173,19 @@ fn a_device_draws_the_same_rays() {
         (permuted(true), false, 0.0, u64::MAX),
     ] {
         let drawing = gpu::SamplingOptions { jitter: !published, background: true, background_stream: 3 };
-        let photographs = pixels.on_device(&device, drawing, largest);
+        let photographs = sampler.on_device(&device, drawing, largest);
         let (seed, step) = (77, 1 << 33);
         // A batch larger than the number of pixels draws each of them once.
         let wanted = 2000;
-        let batch = gpu::Batch::new(&device, if pixels.order.is_some() { wanted } else { 2050 });
+        let batch = gpu::DeviceBatch::new(&device, if sampler.order.is_some() { wanted } else { 2050 });
         let rays = batch.rays();
         photographs.draw(&device, (seed, step), &device.upload(&[wanted as u32]), &batch, detail);
-        let want = pixels.draw(seed, step, wanted, !published, detail);
+        let want = sampler.draw(seed, step, wanted, !published, detail);
         let alive = device.read::<u32>(&batch.alive);
         assert!(alive[wanted..].iter().all(|&a| a == 0));
         let kept: Vec<usize> = (0..rays).filter(|&r| alive[r] == 1).collect();
         // In the published code, pixels that are not valid leave a gap.
-        let gaps = published || pixels.order.is_some();
+        let gaps = published || sampler.order.is_some();
         assert_eq!((kept.len(), kept.len() < wanted), (want.rays.len(), gaps));
         let take = |buffer: &gpu::Buffer, planes: usize| -> Vec<f32> {
             let all = device.read::<f32>(buffer);

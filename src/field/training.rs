@@ -54,15 +54,15 @@ impl StepReport {
     ///
     /// # Errors
     ///
-    /// Fails if a term is not finite, or if a gradient is not, which `broken` says.
+    /// Fails if a term is not finite, or if a gradient is not, which `non_finite` says.
     pub fn checked<const N: usize>(
         terms: [(&'static str, f32); N],
-        broken: bool,
+        non_finite: bool,
         square_error: Option<f32>,
         others: impl IntoIterator<Item = (&'static str, f64)>,
     ) -> Result<StepReport, StepError> {
         StepError::check(terms)?;
-        if broken {
+        if non_finite {
             return Err(StepError::gradient());
         }
         let terms = terms.map(|(name, value)| (name, f64::from(value)));

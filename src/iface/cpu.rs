@@ -11,13 +11,12 @@ use super::stereo::SurfacePoint;
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
-use crate::field::pixels::ray_backgrounds;
-use crate::field::pixels::{Batch, Pixels};
+use crate::field::pixels::{HostBatch, RaySampler, ray_backgrounds};
 use crate::field::training::StepAt;
 use crate::kernel::cpu::losses::{self, RAY_TERMS, STEREO_STREAM, TERMS, Targets};
 use crate::kernel::cpu::march::Samples;
 use crate::kernel::cpu::mlp::Weights;
-use crate::kernel::cpu::neus::{self, Rays};
+use crate::kernel::cpu::neus::{self, Segments};
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::sdf::{self, Activations, FieldShape, WIDTH};
 use crate::kernel::cpu::weight_norm;
@@ -26,13 +25,13 @@ use crate::math::rng;
 /// The operations of [`SdfOps`] on the CPU.
 pub struct CpuSdf<'a> {
     config: &'a IfaceConfig,
-    pixels: &'a Pixels<'a>,
+    sampler: &'a RaySampler<'a>,
     shape: FieldShape,
     occupancy: Occupancy,
     all_points: Vec<SurfacePoint>,
     rays: usize,
     /// Number of consecutive steps without a sample.
-    blind: u64,
+    empty_steps: u64,
     /// Samples of the last step before truncation to the budget; `None` before the first step.
     samples_wanted: Option<usize>,
     weights: Option<Weights>,
@@ -44,7 +43,7 @@ pub struct CpuSdf<'a> {
 #[derive(Default)]
 struct CpuStep {
     dt: f32,
-    batch: Batch,
+    batch: HostBatch,
     background: Vec<[f32; 3]>,
     samples: Samples,
     direction: Vec<[f32; 3]>,
@@ -56,13 +55,13 @@ struct CpuStep {
     /// `[samples + points, 8]`.
     g_field: Vec<f32>,
     g_inv_s: f32,
-    broken: bool,
+    non_finite: bool,
 }
 
 impl CpuStep {
-    fn rays(&self) -> Rays<'_> {
+    fn segments(&self) -> Segments<'_> {
         let Samples { offsets, t } = &self.samples;
-        Rays { offsets, direction: &self.direction, t, dt: &self.dts }
+        Segments { offsets, direction: &self.direction, t, dt: &self.dts }
     }
 
     fn is_empty(&self) -> bool {
@@ -71,29 +70,27 @@ impl CpuStep {
 }
 
 /// Drops the last rays of a batch until at most `max_samples` are left (one ray always stays).
-fn truncate(batch: &mut Batch, samples: &mut Samples, max_samples: usize) {
+fn truncate(batch: &mut HostBatch, samples: &mut Samples, max_samples: usize) {
     if samples.t.len() <= max_samples {
         return;
     }
     let kept = samples.offsets.iter().rposition(|&o| o as usize <= max_samples).unwrap_or(0).max(1);
     samples.offsets.truncate(kept + 1);
     samples.t.truncate(samples.offsets[kept] as usize);
-    batch.rays.truncate(kept);
-    batch.color.truncate(kept);
-    batch.alpha.truncate(kept);
+    batch.truncate(kept);
 }
 
 impl<'a> CpuSdf<'a> {
     /// Creates the operations of a training with these settings and photographs.
-    pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>) -> CpuSdf<'a> {
+    pub fn new(config: &'a IfaceConfig, sampler: &'a RaySampler<'a>) -> CpuSdf<'a> {
         CpuSdf {
             config,
-            pixels,
+            sampler,
             shape: shape(config),
             occupancy: Occupancy::new(config, None),
             all_points: Vec::new(),
             rays: config.rays,
-            blind: 0,
+            empty_steps: 0,
             samples_wanted: None,
             weights: None,
             inv_s: 0.0,
@@ -118,14 +115,14 @@ impl Ops for CpuSdf<'_> {
     }
 
     fn gate(&self) -> bool {
-        !self.step.is_empty() && !self.step.broken
+        !self.step.is_empty() && !self.step.non_finite
     }
 }
 
 impl SdfOps for CpuSdf<'_> {
     fn load(&mut self, occupancy: &Occupancy, rays: usize, points: &[SurfacePoint]) {
         self.occupancy = occupancy.clone();
-        (self.rays, self.samples_wanted, self.blind) = (rays, None, 0);
+        (self.rays, self.samples_wanted, self.empty_steps) = (rays, None, 0);
         self.step = CpuStep::default();
         self.set_points(points);
     }
@@ -139,8 +136,8 @@ impl SdfOps for CpuSdf<'_> {
         Ok(self.next_rays())
     }
 
-    fn is_broken(&self) -> Result<bool> {
-        Ok(self.step.broken)
+    fn is_non_finite(&self) -> Result<bool> {
+        Ok(self.step.non_finite)
     }
 
     fn weights(&mut self, groups: &mut SdfGroups<Self>) {
@@ -167,7 +164,7 @@ impl SdfOps for CpuSdf<'_> {
     }
 
     fn draw(&mut self, at: StepAt, detail: f32) {
-        self.step.batch = self.pixels.draw(at.seed, at.step, self.rays, self.config.jitter, detail);
+        self.step.batch = self.sampler.draw(at.seed, at.step, self.rays, self.config.jitter, detail);
         let stream = random_background(self.config).then_some(BACKGROUND_STREAM);
         self.step.background = ray_backgrounds(at, stream, self.step.batch.rays.len());
     }
@@ -181,7 +178,7 @@ impl SdfOps for CpuSdf<'_> {
         step.direction = step.batch.rays.iter().map(|r| r.direction).collect();
         step.dts = vec![step.dt; step.samples.t.len()];
         self.samples_wanted = Some(wanted);
-        self.blind = if wanted == 0 { self.blind + 1 } else { 0 };
+        self.empty_steps = if wanted == 0 { self.empty_steps + 1 } else { 0 };
     }
 
     fn append_points(&mut self, at: StepAt) {
@@ -209,19 +206,19 @@ impl SdfOps for CpuSdf<'_> {
     fn neus(&mut self, anneal: f32) {
         let step = &mut self.step;
         let field = step.activations.as_ref().map_or(&[][..], |a| a.output());
-        step.composed = neus::forward(step.rays(), field, self.inv_s, anneal);
+        step.composed = neus::forward(step.segments(), field, self.inv_s, anneal);
     }
 
     fn losses(&mut self, anneal: f32) {
         let step = &mut self.step;
-        let w = loss_weights(self.config, self.pixels.has_masks);
-        let Batch { color, alpha, .. } = &step.batch;
+        let w = loss_weights(self.config, self.sampler.has_masks);
+        let HostBatch { color, alpha, .. } = &step.batch;
         let targets = Targets { offsets: &step.samples.offsets, color, alpha, background: &step.background };
         let (of_rays, g_composed) = losses::of_rays(&step.composed, targets, &w);
         let field = step.activations.as_ref().map_or(&[][..], |a| a.output());
         let n = step.samples.t.len();
         let (mut g_field, g_inv_s) =
-            neus::backward(step.rays(), &field[..n * WIDTH], self.inv_s, anneal, &g_composed);
+            neus::backward(step.segments(), &field[..n * WIDTH], self.inv_s, anneal, &g_composed);
         let of_samples = losses::of_samples(&field[..n * WIDTH], &w, &mut g_field);
         g_field.resize(field.len(), 0.0);
         let points: Vec<[f32; 2]> = step.points.iter().map(|p| [p.footprint, p.weight]).collect();
@@ -247,7 +244,7 @@ impl SdfOps for CpuSdf<'_> {
         // A non-finite gradient of the table passes through the layers above it, so checking those suffices. The loss
         // terms are checked too, so that no step follows a loss that is not finite.
         let all = g_network.iter().chain(&self.step.terms).chain([&g_variance]);
-        self.step.broken |= !all.into_iter().all(|g| g.is_finite());
+        self.step.non_finite |= !all.into_iter().all(|g| g.is_finite());
     }
 
     fn figures(&mut self, [.., variance]: &SdfGroups<Self>) -> Result<Figures> {
@@ -257,8 +254,8 @@ impl SdfOps for CpuSdf<'_> {
             variance: slice(variance.value())[0],
             samples: self.samples_wanted.unwrap_or(0),
             rays: self.next_rays(),
-            blind: self.blind,
-            broken: self.step.broken,
+            empty_steps: self.empty_steps,
+            non_finite: self.step.non_finite,
         })
     }
 }

@@ -18,8 +18,8 @@ use super::train::IfaceReport;
 use crate::config::iface::{Foreground, IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::{ArrayDevice, Ops};
-use crate::field::parameters::{HostGroup, ParameterGroup, Part};
-use crate::field::pixels::{Pixels, TrainView};
+use crate::field::parameters::{HostGroup, ParameterGroup, ParameterPart};
+use crate::field::pixels::{RaySampler, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self as fields, ComputeDevice};
 #[cfg(feature = "wgpu")]
@@ -70,10 +70,10 @@ fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 2] {
 }
 
 /// Returns the parts of both groups, as checkpoints store them.
-fn parts(config: &IfaceConfig) -> [Vec<Part>; 2] {
+fn parts(config: &IfaceConfig) -> [Vec<ParameterPart>; 2] {
     let shape = shape(config);
     let lengths = [2 * hash::entries(&shape.levels), shape.len()];
-    std::array::from_fn(|k| vec![Part { name: NAMES[k], shape: vec![lengths[k]] }])
+    std::array::from_fn(|k| vec![ParameterPart { name: NAMES[k], shape: vec![lengths[k]] }])
 }
 
 /// A density in training on a device.
@@ -94,8 +94,8 @@ pub fn train_density(
 ) -> Result<(DensityField, IfaceReport)> {
     check(config)?;
     let began = Instant::now();
-    let pixels = Pixels::new(views, f32::INFINITY, config.radius, Foreground::Photo, true);
-    if pixels.count() == 0 {
+    let sampler = RaySampler::new(views, f32::INFINITY, config.radius, Foreground::Photo, true);
+    if sampler.count() == 0 {
         return Err(training::no_pixels());
     }
     let device =
@@ -103,14 +103,14 @@ pub fn train_density(
             |device| match device {
                 ComputeDevice::Cpu(_) => Ok(()),
                 #[cfg(feature = "wgpu")]
-                ComputeDevice::Gpu(gpu) => GpuDensity::fits(config, &pixels, &gpu.device),
+                ComputeDevice::Gpu(gpu) => GpuDensity::fits(config, &sampler, &gpu.device),
             },
         )?;
     let (description, refused) = (device.description(), device.warning());
     let (state, progress, warnings) = match device {
-        ComputeDevice::Cpu(_) => train_on(CpuDensity::new(config, &pixels), config, session)?,
+        ComputeDevice::Cpu(_) => train_on(CpuDensity::new(config, &sampler), config, session)?,
         #[cfg(feature = "wgpu")]
-        ComputeDevice::Gpu(gpu) => train_on(GpuDensity::new(config, &pixels, gpu.device)?, config, session)?,
+        ComputeDevice::Gpu(gpu) => train_on(GpuDensity::new(config, &sampler, gpu.device)?, config, session)?,
     };
     let report = IfaceReport {
         steps: config.steps,
@@ -215,15 +215,15 @@ impl<O: DensityOps> Model for DensityModel<'_, O> {
     }
 
     fn report(&mut self, _: u64) -> Result<StepReport, StepError> {
-        let Figures { losses, mean_square, samples, rays, broken, .. } = self.ops.figures()?;
+        let Figures { losses, mean_square, samples, rays, non_finite, .. } = self.ops.figures()?;
         let [square, smooth, distortion, ..] = if samples > 0 { losses } else { [0.0; TERMS] };
         let terms = [("rgb", square), ("smooth", smooth), ("distortion", distortion)];
         let counts = [("rays", rays as f64), ("samples", samples as f64)];
-        StepReport::checked(terms, broken, mean_square, counts)
+        StepReport::checked(terms, non_finite, mean_square, counts)
     }
 
     fn save(&self, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {
-        if self.ops.is_broken()? {
+        if self.ops.is_non_finite()? {
             return Err(StepError::gradient());
         }
         self.state()?.save(into);
@@ -253,7 +253,7 @@ pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<C
     use crate::field::self_test::{CELLS_AT, SEED, compare, compare_cells, run_step, session};
     const FIELD: &str = "density";
     let (views, session) = (fields::ball::views(), session("iface"));
-    let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+    let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
     // Larger values imitate a partly trained field: it is visible, and varies in space.
     let start = || {
         let mut state = DensityState::start(initial(config, SEED), config, None);
@@ -267,9 +267,9 @@ pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<C
         model.ops.update_occupancy(&model.groups, StepAt { seed: SEED, step: CELLS_AT });
         Ok(model.state()?.occupancy)
     }
-    let mut on_cpu = DensityModel::new(CpuDensity::new(config, &pixels), config, &session);
+    let mut on_cpu = DensityModel::new(CpuDensity::new(config, &sampler), config, &session);
     let device = crate::kernel::gpu::Device::open(adapter)?;
-    let mut on_gpu = DensityModel::new(GpuDensity::new(config, &pixels, device)?, config, &session);
+    let mut on_gpu = DensityModel::new(GpuDensity::new(config, &sampler, device)?, config, &session);
     let [want, got] = [cells(&mut on_cpu, start())?, cells(&mut on_gpu, start())?];
     let mut checks = vec![compare_cells(FIELD, &got.occupied.bits, &want.occupied.bits)];
     on_cpu.load(DensityState { occupancy: want.clone(), ..start() });
@@ -294,7 +294,7 @@ pub trait DensityOps: Ops {
     fn read(&self, occupancy: &mut Occupancy) -> Result<usize>;
 
     /// Waits for the device and returns whether any gradient was not finite since the state was loaded.
-    fn is_broken(&self) -> Result<bool>;
+    fn is_non_finite(&self) -> Result<bool>;
 
     /// Evaluates the field to update the cells that are marched through.
     fn update_occupancy(&mut self, groups: &DensityGroups<Self>, at: StepAt);

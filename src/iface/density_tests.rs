@@ -41,17 +41,17 @@ fn a_step_is_the_one_of_its_formulas() {
         ..config()
     };
     let views = views();
-    let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
-    agrees_on(CpuDensity::new(&config, &pixels), &config, &pixels, [1e-5, 1e-3]);
+    let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+    agrees_on(CpuDensity::new(&config, &sampler), &config, &sampler, [1e-5, 1e-3]);
     #[cfg(feature = "wgpu")]
     for device in crate::kernel::gpu::tests::devices() {
-        agrees_on(GpuDensity::new(&config, &pixels, device).unwrap(), &config, &pixels, [1e-4, 1e-2]);
+        agrees_on(GpuDensity::new(&config, &sampler, device).unwrap(), &config, &sampler, [1e-4, 1e-2]);
     }
 }
 
 /// The third step against the formulas in f64, parameter by parameter: terms and the median of the updates within the
 /// first tolerance, every update within the second.
-fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, pixels: &Pixels, [close, near]: [f64; 2]) {
+fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, [close, near]: [f64; 2]) {
     let dir = temporary();
     let session = session("iface", dir.path(), "step", &Quiet);
     let mut state = DensityState::start(initial(config, session.seed), config, None);
@@ -70,7 +70,7 @@ fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, pixels: &Pixels, [clos
     let before = state.groups.clone().map(|group| group.state);
     let shape = shape(config);
     let weights = DensityWeights::new(&shape, &before[1][0]);
-    let batch = pixels.draw(3, 2, state.rays, false, 0.0);
+    let batch = sampler.draw(3, 2, state.rays, false, 0.0);
     let table = bytemuck::cast_slice(&before[0][0]);
     let samples = march(config, &state.occupancy, (&shape, table, &weights), &batch.rays);
     let n = samples.t.len();
@@ -184,10 +184,13 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 #[cfg(feature = "wgpu")]
 mod on_gpus {
     use super::*;
-    use crate::field::ball::{alone_and_in_turn, psnr, textured_views};
+    use crate::field::ball::textured_views;
+    use crate::field::gpu_tests::{
+        Outcome, RunOn, alike, alone_and_in_turn, counted_step, cpu_and_both, fixed_sums_repeat, psnr,
+    };
     use crate::field::ops::Ops;
-    use crate::kernel::gpu::tests::{device, devices};
-    use crate::kernel::gpu::{Atomics, Device};
+    use crate::kernel::gpu::Device;
+    use crate::kernel::gpu::tests::device;
 
     /// As small as a driver in software needs it, for which a step takes as long as it has samples.
     fn config() -> IfaceConfig {
@@ -207,21 +210,19 @@ mod on_gpus {
         IfaceConfig { steps: 300, rays: 100, max_rays: 200, samples: 1 << 11, samples_per_ray: 64, ..config }
     }
 
-    /// Error of a view, dB, and share of the cells that is marched.
-    fn learned(config: &IfaceConfig, dir: &Path, device: &str, monitor: &dyn Monitor) -> Result<(f64, f64)> {
+    /// A training, and what it comes to.
+    fn learned(config: &IfaceConfig, dir: &Path, device: &str, monitor: &dyn Monitor) -> Result<Outcome> {
         let views = textured_views();
         let session = TrainingSession { device, ..session("iface", dir, "ball", monitor) };
         let (field, report) = train_density(&views, config, &session)?;
-        Ok((psnr(&views[4], |rays| field.render(rays)), report.occupied))
+        Ok(Outcome { db: psnr(&views[4], |rays| field.render(rays)), share: report.occupied })
     }
 
-    /// Compares a training on the device with that on the CPU, which it returns.
-    fn follows_the_cpu(config: &IfaceConfig) -> (f64, f64) {
-        let train = |device: &str| learned(config, temporary().path(), device, &Quiet).unwrap();
-        let [cpu, gpu] = ["cpu", "wgpu:0"].map(train);
-        println!("dB and share of the cells: {cpu:.3?} on the CPU, {gpu:.3?} on the device");
-        assert!((cpu.0 - gpu.0).abs() < 0.3 && (cpu.1 - gpu.1).abs() < 0.03, "{cpu:?} {gpu:?}");
-        cpu
+    /// Returns what a training on the CPU comes to, and so does one on the device with some steps on
+    /// the CPU in between.
+    fn follows_the_cpu(config: &IfaceConfig, in_turn: [u64; 2]) -> Outcome {
+        let run: RunOn<Outcome> = &|dir, device, monitor| learned(config, dir, device, monitor);
+        alike(&cpu_and_both(run, in_turn), [0.3, 0.03])
     }
 
     #[test]
@@ -229,57 +230,49 @@ mod on_gpus {
         if device().is_none() {
             return;
         }
-        let (db, _) = follows_the_cpu(&config());
+        let end = follows_the_cpu(&config(), [36, 2]);
         let one = IfaceConfig { steps: 1, ..config() };
-        let (start, _) = learned(&one, temporary().path(), "cpu", &Quiet).unwrap();
-        assert!(db > start + 1.0, "{start} {db}");
+        let start = learned(&one, temporary().path(), "cpu", &Quiet).unwrap();
+        assert!(end.db > start.db + 1.0, "{start:?} {end:?}");
     }
 
     #[test]
     #[ignore = "long: run by `tools/test.sh all`; over three hundred steps rounding adds up, and the cells are drawn"]
     fn a_gpu_learns_in_many_steps_what_the_cpu_does() {
         if device().is_some() {
-            let (db, share) = follows_the_cpu(&long());
-            assert!(db > 15.0 && share < 0.9, "{db} {share}");
+            let end = follows_the_cpu(&long(), [290, 2]);
+            assert!(end.db > 15.0 && end.share < 0.9, "{end:?}");
         }
-    }
-
-    /// Goes on past step 256, from which cells are drawn, on the device for some steps.
-    fn goes_on(config: &IfaceConfig, on_device: u64) {
-        if device().is_none() {
-            return;
-        }
-        let run = |dir: &Path, device: &str, monitor: &dyn Monitor| learned(config, dir, device, monitor);
-        let [cpu, both] = alone_and_in_turn(&run, 254, &[("wgpu:0", on_device)]);
-        println!("dB and share of the cells: {cpu:.3?} on the CPU, {both:.3?} on both in turn");
-        assert!(cpu.0 > 15.0 && cpu.1 < 0.9, "{cpu:?}");
-        assert!((cpu.0 - both.0).abs() < 0.3 && (cpu.1 - both.1).abs() < 0.03, "{both:?}");
     }
 
     #[test]
-    fn both_go_on_where_the_other_stopped() {
-        goes_on(&IfaceConfig { steps: 264, ..config() }, 5);
+    fn a_gpu_goes_on_where_the_cpu_stopped() {
+        if device().is_none() {
+            return;
+        }
+        // past step 256, from which cells are drawn
+        let config = IfaceConfig { steps: 264, ..config() };
+        let run: RunOn<Outcome> = &|dir, device, monitor| learned(&config, dir, device, monitor);
+        let end = alike(&alone_and_in_turn(run, 254, &[("wgpu:0", 5)]), [0.3, 0.03]);
+        assert!(end.db > 15.0 && end.share < 0.9, "{end:?}");
     }
 
     #[test]
     fn a_step_waits_for_nothing_and_whole_numbers_give_the_same_bytes() {
         let views = textured_views();
         let config = config();
-        let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+        let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
         let dir = temporary();
         let session = session("iface", dir.path(), "ball", &Quiet);
         // launches and readbacks of each step, and the table after them
         let trained = |device: Device, steps: &[u64]| {
-            let ops = GpuDensity::new(&config, &pixels, device).unwrap();
+            let ops = GpuDensity::new(&config, &sampler, device).unwrap();
             let mut model = DensityModel::new(ops, &config, &session);
             model.restore(None).ok().unwrap();
             let mut step = |&step: &u64| {
-                let before = model.ops.device().counts();
-                let progress = TrainingProgress { step, ..TrainingProgress::default() };
                 let read = (step + 1).is_multiple_of(Device::READ_EVERY);
-                training::step(&mut model, session.seed, &progress, read).ok().unwrap();
-                let after = model.ops.device().counts();
-                (after.0 - before.0, after.1 - before.1)
+                let counted = counted_step(&mut model, |m| m.ops.device(), session.seed, step, read);
+                (counted.launches, counted.readbacks)
             };
             let counts: Vec<(usize, usize)> = steps.iter().map(&mut step).collect();
             let table = model.state().unwrap().groups[0].values().to_vec();
@@ -294,9 +287,7 @@ mod on_gpus {
         assert_eq!([plain.1, look.1, read.1], [0, 0, 1]);
         // of fifty steps, three look
         assert!(46 * plain.0 + 3 * look.0 + read.0 <= 40 * 50, "{counts:?}");
-        let fixed = || devices().pop().filter(|device| device.atomics() == Atomics::Fixed).unwrap();
-        let steps = [255, 256, 257];
-        assert!(trained(fixed(), &steps) == trained(fixed(), &steps), "the same steps give the same bytes");
+        fixed_sums_repeat(|device| trained(device, &[255, 256, 257]));
     }
 
     #[test]
@@ -304,8 +295,8 @@ mod on_gpus {
         let Some(device) = device() else { return };
         let views = textured_views();
         let config = IfaceConfig { samples: 1 << 18, ..config() };
-        let pixels = Pixels::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
-        let e = GpuDensity::fits(&config, &pixels, &device.with_memory(600 << 20)).err().unwrap();
+        let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
+        let e = GpuDensity::fits(&config, &sampler, &device.with_memory(600 << 20)).err().unwrap();
         assert!(e.to_string().contains("has memory for") && e.hint().contains("iface.samples to"), "{e:?}");
     }
 }

@@ -11,10 +11,10 @@ use super::ops::{
 use super::schedule;
 use super::stereo::SurfacePoint;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
-use crate::field::drawing::DeviceRays;
+use crate::field::drawing::DeviceSampler;
 use crate::field::drawing::MemoryNeed;
 use crate::field::ops::Ops;
-use crate::field::pixels::Pixels;
+use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;
 use crate::kernel::cpu::hash;
 use crate::kernel::cpu::march::MarchRay;
@@ -24,25 +24,25 @@ use crate::kernel::cpu::occupancy::OPAQUE;
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::cpu::sdf::FieldShape;
 use crate::kernel::gpu::{
-    self, Band, Batch, Buffer, Device, Gate, Losses, Nerfacc, Neus, Rays, Samples, SamplingOptions, Schedule,
-    Sdf, SurfacePoints, WeightNorm, Words,
+    self, BandUpdate, Buffer, Device, DeviceBatch, Gate, Losses, Nerfacc, Neus, Samples, SamplingOptions,
+    Schedule, Sdf, SurfacePoints, WeightNorm, Words,
 };
 use crate::{Error, Result};
 use std::ops::Range;
 
 /// Rule that updates the cells to march through.
 enum CellRule {
-    Band(Box<Band>),
+    Band(Box<BandUpdate>),
     Nerfacc(Box<Nerfacc>),
 }
 
 /// The operations of [`SdfOps`] on a GPU, with their device memory.
 pub struct GpuSdf<'a> {
     config: &'a IfaceConfig,
-    pixels: &'a Pixels<'a>,
+    sampler: &'a RaySampler<'a>,
     pub(super) device: Device,
-    photographs: DeviceRays,
-    batch: Batch,
+    photographs: DeviceSampler,
+    batch: DeviceBatch,
     samples: Samples,
     points: SurfacePoints,
     /// `[1]`: samples and points of the step.
@@ -56,7 +56,7 @@ pub struct GpuSdf<'a> {
     inv_s: Buffer,
     g_inv_s: Buffer,
     /// `[1]`: not 0 once a gradient was not finite.
-    broken: Buffer,
+    non_finite: Buffer,
     schedule: Schedule,
     occupancy: gpu::Occupancy,
     cells: CellRule,
@@ -66,13 +66,13 @@ pub struct GpuSdf<'a> {
 
 impl<'a> GpuSdf<'a> {
     /// Checks that a device supports the field and has enough memory for the training.
-    pub fn fits(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<()> {
+    pub fn fits(config: &IfaceConfig, sampler: &RaySampler, device: &Device) -> Result<()> {
         let shape = shape(config);
         if !Sdf::supports(&shape) {
             let problem = format!("a tile on a GPU cannot hold {} levels", config.levels);
             return Err(Error::usage(problem, "lower iface.levels, or train with `--device cpu`"));
         }
-        max_samples(config, &shape, pixels, device).map(drop)
+        max_samples(config, &shape, sampler, device).map(drop)
     }
 
     /// Creates the operations of a training that [`fits`](GpuSdf::fits) a device.
@@ -80,11 +80,11 @@ impl<'a> GpuSdf<'a> {
     /// # Errors
     ///
     /// If the device has too little memory.
-    pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>, device: Device) -> Result<GpuSdf<'a>> {
+    pub fn new(config: &'a IfaceConfig, sampler: &'a RaySampler<'a>, device: Device) -> Result<GpuSdf<'a>> {
         let shape = shape(config);
         let rays = config.rays.max(config.max_rays);
-        let (capacity, resident) = max_samples(config, &shape, pixels, &device)?;
-        let weights = loss_weights(config, pixels.has_masks);
+        let (capacity, resident) = max_samples(config, &shape, sampler, &device)?;
+        let weights = loss_weights(config, sampler.has_masks);
         let drawing = SamplingOptions {
             jitter: config.jitter,
             background: random_background(config),
@@ -95,9 +95,9 @@ impl<'a> GpuSdf<'a> {
         let (occupancy, cells) = cells(&device, config, &start, capacity);
         Ok(GpuSdf {
             config,
-            pixels,
-            photographs: DeviceRays::new(pixels, &device, drawing, resident),
-            batch: Batch::new(&device, rays),
+            sampler,
+            photographs: DeviceSampler::new(sampler, &device, drawing, resident),
+            batch: DeviceBatch::new(&device, rays),
             samples: Samples::new(&device, rays, capacity),
             points: SurfacePoints::new(&device, stereo_points(config), &weights),
             total_count: device.zeros::<u32>(1),
@@ -109,7 +109,7 @@ impl<'a> GpuSdf<'a> {
             g_flat: device.zeros::<f32>(flat),
             inv_s: device.zeros::<f32>(1),
             g_inv_s: device.zeros::<f32>(1),
-            broken: device.zeros::<u32>(1),
+            non_finite: device.zeros::<u32>(1),
             schedule: Schedule::new(
                 &device,
                 schedule::step_length(config),
@@ -131,7 +131,7 @@ impl<'a> GpuSdf<'a> {
         directions: &[[f32; 3]],
         normals: &[[f32; 3]],
     ) -> Result<Vec<f32>> {
-        let (device, capacity) = (&self.device, self.samples.t.words());
+        let (device, capacity) = (&self.device, self.samples.t.word_count());
         let [x, direction, normal] = [points, directions, normals]
             .map(|rows| device.upload(&gpu::planes(&rows[..points.len()], capacity)));
         let count = device.upload(&[points.len() as u32]);
@@ -139,11 +139,6 @@ impl<'a> GpuSdf<'a> {
         let out: Vec<f32> =
             device.fetch(self.sdf.shade(device, field, &x, &direction, Some(&normal), &count))?;
         Ok((4..7).flat_map(|k| &out[k * capacity..][..points.len()]).copied().collect())
-    }
-
-    fn rays(&self) -> Rays<'_> {
-        let Samples { offsets, t, dt, .. } = &self.samples;
-        Rays { offsets, direction: &self.batch.direction, t, dt }
     }
 }
 
@@ -157,7 +152,7 @@ fn stereo_points(config: &IfaceConfig) -> usize {
 pub(super) fn max_samples(
     config: &IfaceConfig,
     shape: &FieldShape,
-    pixels: &Pixels,
+    sampler: &RaySampler,
     device: &Device,
 ) -> Result<(usize, bool)> {
     /// Words per sample outside the field: positions, directions, steps, compositing, losses, and the index of the cell
@@ -166,7 +161,7 @@ pub(super) fn max_samples(
     let [words, widest] = Sdf::words_per_sample(shape);
     let points = stereo_points(config);
     let sums = Sdf::words_of_sums(shape, wanted_samples(config, points));
-    samples_that_fit(config, [words + EXTRA_WORDS, widest], sums, points, pixels, device)
+    samples_that_fit(config, [words + EXTRA_WORDS, widest], sums, points, sampler, device)
 }
 
 /// Returns the sample capacity of a step that the CPU has, with `points` besides its samples.
@@ -181,7 +176,7 @@ pub(super) fn samples_that_fit(
     [words, widest]: [usize; 2],
     sums: usize,
     points: usize,
-    pixels: &Pixels,
+    sampler: &RaySampler,
     device: &Device,
 ) -> Result<(usize, bool)> {
     let bytes = 4 * words as u64;
@@ -201,7 +196,7 @@ pub(super) fn samples_that_fit(
         wanted,
         minimum,
     };
-    let (capacity, resident) = need.plan(pixels, device, |fits| {
+    let (capacity, resident) = need.plan(sampler, device, |fits| {
         let by_buffer = device.limits().largest_buffer / (4 * widest as u64);
         let left = device.available_memory().checked_sub(minimum * bytes).filter(|_| by_buffer >= minimum);
         let smaller = left.and_then(|left| (4..config.log2_table).rev().find(|&log2| fixed(log2) <= left));
@@ -227,7 +222,9 @@ fn cells(
     let solid = (config.occupancy == OccupancyRule::Band).then_some(&start.solid);
     let cells = gpu::Occupancy::new(device, &start.occupied, solid, config.radius);
     let rule = match config.occupancy {
-        OccupancyRule::Band => CellRule::Band(Box::new(Band::new(device, start.allowed(), band(config)))),
+        OccupancyRule::Band => {
+            CellRule::Band(Box::new(BandUpdate::new(device, start.allowed(), band(config))))
+        }
         OccupancyRule::Nerfacc => {
             let rule = Nerfacc::new(device, &cells, &start.history, OPAQUE, capacity);
             CellRule::Nerfacc(Box::new(rule))
@@ -244,17 +241,17 @@ impl Ops for GpuSdf<'_> {
     }
 
     fn gate(&self) -> Gate<'_> {
-        Gate { count: &self.samples.count, broken: &self.broken }
+        Gate { count: &self.samples.count, non_finite: &self.non_finite }
     }
 }
 
 impl SdfOps for GpuSdf<'_> {
     fn load(&mut self, occupancy: &Occupancy, rays: usize, points: &[SurfacePoint]) {
         let (device, config) = (&self.device, self.config);
-        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.words());
+        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.word_count());
         let budget = schedule::ray_budget(config);
         self.schedule = Schedule::new(device, schedule::step_length(config), budget, rays);
-        self.broken = device.zeros::<u32>(1);
+        self.non_finite = device.zeros::<u32>(1);
         self.losses.reset_sums(device);
         self.stepped = false;
         self.set_points(points);
@@ -272,8 +269,8 @@ impl SdfOps for GpuSdf<'_> {
         self.schedule.next_rays(&self.device, self.stepped.then_some(&self.samples.count))
     }
 
-    fn is_broken(&self) -> Result<bool> {
-        Ok(self.device.fetch::<u32>(&self.broken)?[0] != 0)
+    fn is_non_finite(&self) -> Result<bool> {
+        Ok(self.device.fetch::<u32>(&self.non_finite)?[0] != 0)
     }
 
     fn weights(&mut self, [_, network, variance]: &mut SdfGroups<Self>) {
@@ -307,7 +304,7 @@ impl SdfOps for GpuSdf<'_> {
 
     fn draw(&mut self, at: StepAt, detail: f32) {
         let (device, at) = (&self.device, (at.seed, at.step));
-        self.photographs.draw(device, self.pixels, at, &self.schedule.rays, &mut self.batch, detail);
+        self.photographs.draw(device, self.sampler, at, &self.schedule.rays, &mut self.batch, detail);
     }
 
     fn march(&mut self) {
@@ -327,14 +324,16 @@ impl SdfOps for GpuSdf<'_> {
     }
 
     fn neus(&mut self, anneal: f32) {
-        self.neus.forward(&self.device, self.rays(), self.sdf.output(), &self.inv_s, anneal);
+        let (batch, samples) = (&self.batch, &self.samples);
+        self.neus.forward(&self.device, batch, samples, self.sdf.output(), &self.inv_s, anneal);
     }
 
     fn losses(&mut self, anneal: f32) {
         let (device, field, count) = (&self.device, self.sdf.output(), &self.samples.count);
-        let g_out = self.losses.of_rays(device, self.neus.output(), &self.batch, &self.samples.offsets);
+        let (batch, samples) = (&self.batch, &self.samples);
+        let g_out = self.losses.of_rays(device, self.neus.output(), batch, &samples.offsets);
         let (inv_s, g_inv_s) = (&self.inv_s, &self.g_inv_s);
-        let g_field = self.neus.backward(device, self.rays(), field, inv_s, anneal, g_out, g_inv_s);
+        let g_field = self.neus.backward(device, batch, samples, field, inv_s, anneal, g_out, g_inv_s);
         self.losses.of_samples(device, field, count, g_field);
         self.points.losses(device, field, count, g_field);
         self.losses.add(device, count, self.points.terms());
@@ -347,13 +346,13 @@ impl SdfOps for GpuSdf<'_> {
         self.sdf.backward(device, x, direction, count, g_field, &table.gradient, &self.g_flat);
         let from = [&self.g_flat, &self.g_inv_s];
         let into = [&network.gradient, &variance.gradient];
-        self.norm.backward(device, network.value(), &self.inv_s, from, into, &self.broken);
+        self.norm.backward(device, network.value(), &self.inv_s, from, into, &self.non_finite);
     }
 
     fn figures(&mut self, [.., variance]: &SdfGroups<Self>) -> Result<Figures> {
         let (device, count) = (&self.device, &self.samples.count);
         let sums = self.losses.sums();
-        let figures = self.schedule.figures(device, sums, variance.value(), count, &self.broken);
+        let figures = self.schedule.figures(device, sums, variance.value(), count, &self.non_finite);
         self.losses.reset_sums(device);
         figures
     }

@@ -9,7 +9,7 @@ use super::schedule;
 use super::state::SdfState;
 use crate::Error;
 use crate::config::iface::IfaceConfig;
-use crate::field::parameters::Part;
+use crate::field::parameters::ParameterPart;
 use crate::field::training::{StepError, TrainingSession};
 use crate::geom::BitGrid;
 use crate::kernel::cpu::adam::adam;
@@ -109,7 +109,7 @@ pub fn fit_hull(
     let shape = FieldShape { active: schedule::active_levels(config, 0), ..shape(config) };
     let layout = shape.layout();
     // The color network's parameters follow the geometry's in the group, and are not fitted.
-    let colors = |part: &&Part| part.name.starts_with('c');
+    let colors = |part: &&ParameterPart| part.name.starts_with('c');
     let [table, network, _] = &state.groups;
     let colored: usize = network.parts.iter().filter(colors).map(|part| part.count()).sum();
     let geometry = network.values().len() - colored;

@@ -12,7 +12,7 @@ use crate::geom::{BitGrid, Ray, RayResult, SdfField};
 use crate::io::Lock;
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::mlp::Weights;
-use crate::kernel::cpu::neus::{self, Rays};
+use crate::kernel::cpu::neus::{self, Segments};
 use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
 use glam::Vec3;
 use std::ops::Range;
@@ -234,7 +234,7 @@ impl IFace {
             }
             let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
             let direction: Vec<[f32; 3]> = open.iter().map(|&(r, _)| rays[r].direction).collect();
-            let pieces = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &vec![dt; t.len()] };
+            let pieces = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &vec![dt; t.len()] };
             let composited = neus::forward(pieces, field.output(), self.inv_s, 1.0);
             let mut pieces = composited.as_chunks::<{ neus::RAY_WIDTH }>().0.iter();
             open.retain_mut(|(r, k)| {

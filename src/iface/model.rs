@@ -12,7 +12,7 @@
 //! Columns of `v1` are the position, then the features.
 
 use crate::config::iface::IfaceConfig;
-use crate::field::parameters::{HostGroup, Part};
+use crate::field::parameters::{HostGroup, ParameterPart};
 use crate::kernel::cpu::hash;
 use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS};
 use crate::kernel::cpu::sdf::FieldShape;
@@ -80,11 +80,11 @@ pub fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 3] {
 }
 
 /// Returns names and shapes of the parameters in each of the three groups.
-pub fn parts(config: &IfaceConfig) -> [Vec<Part>; 3] {
+pub fn parts(config: &IfaceConfig) -> [Vec<ParameterPart>; 3] {
     let shape = shape(config);
     let layout = shape.layout();
     let (inputs, colored) = (layout.inputs, layout.color_inputs());
-    let part = |name, shape: &[usize]| Part { name, shape: shape.to_vec() };
+    let part = |name, shape: &[usize]| ParameterPart { name, shape: shape.to_vec() };
     [
         vec![part("table", &[hash::entries(&shape.levels), 2])],
         vec![

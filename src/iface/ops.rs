@@ -64,7 +64,7 @@ pub trait SdfOps: Ops {
     fn read(&self, occupancy: &mut Occupancy) -> Result<usize>;
 
     /// Waits for the device and returns whether any gradient was not finite since the state was loaded.
-    fn is_broken(&self) -> Result<bool>;
+    fn is_non_finite(&self) -> Result<bool>;
 
     /// Computes network weights and sharpness from parameters; keeps the variance within [`VARIANCE`].
     fn weights(&mut self, groups: &mut SdfGroups<Self>);

@@ -9,7 +9,7 @@ use super::ops::SdfOps;
 use super::schedule;
 use super::state::SdfState;
 use super::stereo::SurfacePoint;
-use super::train::{SdfModel, pixels};
+use super::train::{SdfModel, sampler};
 use crate::Result;
 use crate::config::Preset;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
@@ -94,7 +94,7 @@ fn compare_sdf(adapter: &Adapter, config: IfaceConfig) -> Result<Vec<Check>> {
     const FIELD: &str = "signed distance";
     let full = IfaceConfig { sparsity: 0.1, stereo: 0.1, ..config };
     let (views, session) = (ball::views(), session("iface"));
-    let pixels = pixels(&views, None, &full)?;
+    let sampler = sampler(&views, None, &full)?;
     let mut checks = Vec::new();
     for (way, (device, part)) in [FIELD, "signed distance in fixed point"].into_iter().zip(devices(adapter)?)
     {
@@ -103,10 +103,10 @@ fn compare_sdf(adapter: &Adapter, config: IfaceConfig) -> Result<Vec<Check>> {
         let occupancy = if part == 1 { full.occupancy } else { OccupancyRule::Nerfacc };
         let samples = full.samples / part;
         let config = IfaceConfig { occupancy, rays, max_rays: rays, samples, ..full.clone() };
-        let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &pixels), &pixels, None, &config, &session);
+        let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &sampler), &sampler, None, &config, &session);
         let mut on_gpu =
-            SdfModel::new(GpuSdf::new(&config, &pixels, device)?, &pixels, None, &config, &session);
-        // Both keep the same cells up to rounding. The compared steps use the CPU's.
+            SdfModel::new(GpuSdf::new(&config, &sampler, device)?, &sampler, None, &config, &session);
+        // Both keep the same cells up to rounding. The compared steps use the processor's.
         let [want, got] = [cells(&mut on_cpu)?, cells(&mut on_gpu)?];
         checks.push(compare_cells(way, &got.occupied.bits, &want.occupied.bits));
         if part == 1 {

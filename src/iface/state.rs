@@ -5,7 +5,7 @@ use super::stereo::SurfacePoint;
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::Checkpoint;
-use crate::field::parameters::{HostGroup, Part};
+use crate::field::parameters::{HostGroup, ParameterPart};
 use crate::geom::BitGrid;
 use crate::kernel::cpu::mlp::Weights;
 use crate::kernel::cpu::sdf::FieldShape;
@@ -49,7 +49,7 @@ impl<const GROUPS: usize> FieldState<GROUPS> {
 
     /// Reads the state from a checkpoint; names, shapes and types must be exactly those of the parts.
     pub fn restore(
-        parts: [Vec<Part>; GROUPS],
+        parts: [Vec<ParameterPart>; GROUPS],
         config: &IfaceConfig,
         hull: Option<&BitGrid>,
         from: &mut Checkpoint,

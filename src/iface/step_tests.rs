@@ -10,7 +10,7 @@ use crate::config::iface::Background;
 use crate::field::ball::{session, temporary, views};
 use crate::kernel::cpu::losses::STEREO_STREAM;
 use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::neus::Rays;
+use crate::kernel::cpu::neus::Segments;
 use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
 use crate::kernel::cpu::reference::{Real, neus, sdf, wide};
 use crate::math::rng;
@@ -56,11 +56,11 @@ fn ours() -> IfaceConfig {
 fn model<'a, O: SdfOps>(
     ops: O,
     config: &'a IfaceConfig,
-    pixels: &'a Pixels<'a>,
+    sampler: &'a RaySampler<'a>,
     dir: &'a std::path::Path,
 ) -> SdfModel<'a, O> {
     let session = session("iface", dir, "step", &Quiet);
-    let mut model = SdfModel::new(ops, pixels, None, config, &session);
+    let mut model = SdfModel::new(ops, sampler, None, config, &session);
     let mut state = SdfState::start(initial(config, session.seed), config, None);
     let point = |i: u64| SurfacePoint {
         position: std::array::from_fn(|a| 0.2 * rng::uniform(9, a as u64, i) - 0.1),
@@ -110,7 +110,7 @@ fn samples(config: &IfaceConfig, state: &SdfState, ray: &MarchRay, dt: f64) -> V
 
 /// Named losses of a step by the formulas, their weighted sum last. `x` are all parameters, one after the other.
 fn formulas(
-    (config, pixels, state): (&IfaceConfig, &Pixels, &SdfState),
+    (config, sampler, state): (&IfaceConfig, &RaySampler, &SdfState),
     x: &[Var],
     (seed, step): (u64, u64),
     lengths: &[usize],
@@ -139,7 +139,7 @@ fn formulas(
     let table: Vec<[Var; 2]> = table.as_chunks::<2>().0.to_vec();
     let inv_s = (variance[0] * of(10.0)).exp();
 
-    let batch = pixels.draw(seed, step, state.rays, config.jitter, 0.0);
+    let batch = sampler.draw(seed, step, state.rays, config.jitter, 0.0);
     // the f32 of 1.732 · 2 r / n
     let dt = f64::from(1.732 * 2.0 * config.radius / config.samples_per_ray as f32);
     let (mut offsets, mut t) = (vec![0i32], Vec::new());
@@ -158,9 +158,9 @@ fn formulas(
     let n = t.len();
     assert!(n > 150, "{n} samples");
     let steps = vec![dt as f32; n];
-    let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &steps };
+    let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &steps };
     let anneal = step as f64 / (config.anneal_end * config.steps as f64).round();
-    let seen = neus::composite(rays, &outputs, inv_s, anneal);
+    let seen = neus::composite(segments, &outputs, inv_s, anneal);
     // Σ w ‖c − head‖²: the same compositing of what each sample is off
     let owner: Vec<usize> =
         (0..batch.rays.len()).flat_map(|r| vec![r; (offsets[r + 1] - offsets[r]) as usize]).collect();
@@ -171,7 +171,7 @@ fn formulas(
             out[4 + c] = e * e;
         }
     }
-    let single = neus::composite(rays, &off, inv_s, anneal);
+    let single = neus::composite(segments, &off, inv_s, anneal);
 
     let (mut squares, mut of_samples, mut cross) = (of(0.0), of(0.0), of(0.0));
     let (mut met, mut full) = (0.0, 0.0);
@@ -225,19 +225,19 @@ fn formulas(
 /// Checks a step on every device that is here.
 fn agrees(config: &IfaceConfig) {
     let views = views();
-    let pixels = Pixels::new(&views, f32::INFINITY, config.radius, config.foreground, true);
-    agrees_on(CpuSdf::new(config, &pixels), config, &pixels, [1e-5, 1e-3]);
+    let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, config.foreground, true);
+    agrees_on(CpuSdf::new(config, &sampler), config, &sampler, [1e-5, 1e-3]);
     #[cfg(feature = "wgpu")]
     if let Some(device) = crate::kernel::gpu::tests::device() {
-        agrees_on(GpuSdf::new(config, &pixels, device).unwrap(), config, &pixels, [1e-4, 1e-2]);
+        agrees_on(GpuSdf::new(config, &sampler, device).unwrap(), config, &sampler, [1e-4, 1e-2]);
     }
 }
 
 /// The third step of a training, so that the moments are some; terms and the median of the updates within the first
 /// tolerance, every update within the second.
-fn agrees_on<O: SdfOps>(ops: O, config: &IfaceConfig, pixels: &Pixels, [close, near]: [f64; 2]) {
+fn agrees_on<O: SdfOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, [close, near]: [f64; 2]) {
     let dir = temporary();
-    let mut model = model(ops, config, pixels, dir.path());
+    let mut model = model(ops, config, sampler, dir.path());
     let seed = model.session.seed;
     let progress = |step: u64| TrainingProgress { step, ..TrainingProgress::default() };
     for step in 0..2 {
@@ -254,7 +254,7 @@ fn agrees_on<O: SdfOps>(ops: O, config: &IfaceConfig, pixels: &Pixels, [close, n
     let x: Vec<f64> = before.iter().flat_map(|(_, [v, ..])| wide(v)).collect();
     let mut terms = Vec::new();
     let (_, slopes) = gradient(&x, |x| {
-        terms = formulas((config, pixels, &state), x, (seed, 2), &lengths);
+        terms = formulas((config, sampler, &state), x, (seed, 2), &lengths);
         terms[5]
     });
     let Ok(Some(report)) = training::step(&mut model, seed, &progress(2), true) else {

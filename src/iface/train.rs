@@ -15,7 +15,7 @@ use crate::config::iface::{IfaceConfig, OccupancyRule, Start};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::ArrayDevice;
 use crate::field::parameters::ParameterGroup;
-use crate::field::pixels::{LARGE, Pixels, TrainView};
+use crate::field::pixels::{LARGE, RaySampler, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self, ComputeDevice};
 use crate::geom::BitGrid;
@@ -54,7 +54,7 @@ pub(super) struct SdfModel<'a, O: SdfOps> {
     pub config: &'a IfaceConfig,
     session: TrainingSession<'a>,
     hull: Option<&'a BitGrid>,
-    pub pixels: &'a Pixels<'a>,
+    pub sampler: &'a RaySampler<'a>,
     pub ops: O,
     pub groups: SdfGroups<O>,
     /// Cells at the time of loading; those on the device are newer.
@@ -64,25 +64,25 @@ pub(super) struct SdfModel<'a, O: SdfOps> {
 }
 
 /// Collects the pixels that training rays are drawn from.
-pub(super) fn pixels<'a>(
+pub(super) fn sampler<'a>(
     views: &'a [TrainView],
     hull: Option<&BitGrid>,
     config: &IfaceConfig,
-) -> Result<Pixels<'a>> {
+) -> Result<RaySampler<'a>> {
     // Without a hull every ray may meet a sample; with one, occupied cells reach about four cells beyond the outline.
     let reach = match hull {
         Some(_) => 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32,
         None => f32::INFINITY,
     };
     let published = config.occupancy == OccupancyRule::Nerfacc;
-    let mut pixels = Pixels::new(views, reach, config.radius, config.foreground, published);
+    let mut sampler = RaySampler::new(views, reach, config.radius, config.foreground, published);
     if !published {
-        pixels = pixels.with_large(LARGE.min(schedule::cell(config, config.levels)));
+        sampler = sampler.with_large(LARGE.min(schedule::cell(config, config.levels)));
     }
-    if pixels.count() == 0 {
+    if sampler.count() == 0 {
         return Err(training::no_pixels());
     }
-    Ok(pixels)
+    Ok(sampler)
 }
 
 /// Trains until `config.steps`, saving checkpoints and continuing from the one that lies in the session's folder.
@@ -95,19 +95,19 @@ pub fn train(
     session: &TrainingSession,
 ) -> Result<(IFace, IfaceReport)> {
     let began = Instant::now();
-    let pixels = pixels(views, hull, config)?;
+    let sampler = sampler(views, hull, config)?;
     let device =
         field::compute_device(session.device, &super::SDF_TEST)?.fallback_to_cpu(|device| match device {
             ComputeDevice::Cpu(_) => Ok(()),
             #[cfg(feature = "wgpu")]
-            ComputeDevice::Gpu(gpu) => GpuSdf::fits(config, &pixels, &gpu.device),
+            ComputeDevice::Gpu(gpu) => GpuSdf::fits(config, &sampler, &gpu.device),
         })?;
     let (description, refused) = (device.description(), device.warning());
     let (state, progress, warnings) = match device {
-        ComputeDevice::Cpu(_) => train_on(CpuSdf::new(config, &pixels), &pixels, hull, config, session)?,
+        ComputeDevice::Cpu(_) => train_on(CpuSdf::new(config, &sampler), &sampler, hull, config, session)?,
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(gpu) => {
-            train_on(GpuSdf::new(config, &pixels, gpu.device)?, &pixels, hull, config, session)?
+            train_on(GpuSdf::new(config, &sampler, gpu.device)?, &sampler, hull, config, session)?
         }
     };
     let report = IfaceReport {
@@ -124,12 +124,12 @@ pub fn train(
 
 fn train_on<O: SdfOps>(
     ops: O,
-    pixels: &Pixels,
+    sampler: &RaySampler,
     hull: Option<&BitGrid>,
     config: &IfaceConfig,
     session: &TrainingSession,
 ) -> Result<(SdfState, TrainingProgress, Vec<String>)> {
-    let mut model = SdfModel::new(ops, pixels, hull, config, session);
+    let mut model = SdfModel::new(ops, sampler, hull, config, session);
     let (progress, warnings) = training::train(&mut model, session, config.steps, config.checkpoint_s)?;
     Ok((model.state()?, progress, warnings))
 }
@@ -138,7 +138,7 @@ impl<'a, O: SdfOps> SdfModel<'a, O> {
     /// Creates the model in its initial state, without looking for a checkpoint.
     pub fn new(
         ops: O,
-        pixels: &'a Pixels<'a>,
+        sampler: &'a RaySampler<'a>,
         hull: Option<&'a BitGrid>,
         config: &'a IfaceConfig,
         session: &TrainingSession<'a>,
@@ -146,7 +146,7 @@ impl<'a, O: SdfOps> SdfModel<'a, O> {
         let SdfState { groups, occupancy, stereo, .. } =
             SdfState::start(initial(config, session.seed), config, hull);
         let groups = groups.map(|group| ParameterGroup::upload(ops.device(), group));
-        SdfModel { config, session: *session, hull, pixels, ops, groups, occupancy, stereo }
+        SdfModel { config, session: *session, hull, sampler, ops, groups, occupancy, stereo }
     }
 
     /// Waits for the device and returns the current state.
@@ -174,7 +174,7 @@ impl<'a, O: SdfOps> SdfModel<'a, O> {
         shape.active = levels;
         let (_, weights) = state.weights(&shape);
         let field = HostField { shape: &shape, table: state.table(), weights: &weights };
-        self.stereo = stereo::points(self.pixels.views(), self.config, &field, &state.occupancy);
+        self.stereo = stereo::points(self.sampler.views(), self.config, &field, &state.occupancy);
         self.ops.set_points(&self.stereo);
         Ok(())
     }
@@ -223,10 +223,10 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
     }
 
     fn report(&mut self, step: u64) -> Result<StepReport, StepError> {
-        let Figures { losses, mean_square, variance, samples, rays, blind, broken } =
+        let Figures { losses, mean_square, variance, samples, rays, empty_steps, non_finite } =
             self.ops.figures(&self.groups)?;
         let [rgb, _, mask, eikonal, sparsity, stereo] = losses;
-        if blind >= LOST_AFTER {
+        if empty_steps >= LOST_AFTER {
             return Err(StepError::Failed(Error::cannot(
                 format!("the surface is lost at step {step}: no ray of {LOST_AFTER} steps met a sample"),
                 "look at the masks and poses with `tiface inspect`; lower iface.lr_network",
@@ -235,7 +235,7 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
         // Terms without weight are shown as 0.
         let config = self.config;
         let weighted = |weight: f64, value: f32| if weight > 0.0 { value } else { 0.0 };
-        let masked = if self.pixels.has_masks { config.mask } else { 0.0 };
+        let masked = if self.sampler.has_masks { config.mask } else { 0.0 };
         let terms = [
             rgb,
             weighted(masked, mask),
@@ -249,11 +249,11 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
             ("rays", rays as f64),
             ("samples", samples as f64),
         ];
-        StepReport::checked(terms, broken, mean_square, others)
+        StepReport::checked(terms, non_finite, mean_square, others)
     }
 
     fn save(&self, into: &mut Checkpoint, _: bool) -> Result<(), StepError> {
-        if self.ops.is_broken()? {
+        if self.ops.is_non_finite()? {
             return Err(StepError::gradient());
         }
         self.state()?.save(into);

@@ -9,6 +9,7 @@
 
 mod adam;
 mod color;
+mod composite;
 mod density;
 mod device;
 mod draw;
@@ -24,19 +25,20 @@ mod schedule;
 mod sdf;
 mod sum;
 mod tile;
+mod vec3;
 mod vm;
 mod weight_norm;
 
 pub use adam::{Gate, adam};
 pub use density::Density;
 pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits, Words};
-pub use draw::{BUFFERS, Batch, DrawnView, Photographs, PixelOrder, SamplingOptions};
+pub use draw::{BUFFERS, DeviceBatch, DrawnView, Photographs, PixelOrder, SamplingOptions};
 pub use evaluate::{Evaluator, planes};
 pub use hash::Grid;
 pub use losses::Losses;
 pub use march::Samples;
-pub use neus::{Neus, Rays};
-pub use occupancy::{Band, Nerfacc, Occupancy};
+pub use neus::Neus;
+pub use occupancy::{BandUpdate, Nerfacc, Occupancy};
 pub use points::SurfacePoints;
 pub use schedule::Schedule;
 pub use sdf::Sdf;

@@ -5,8 +5,7 @@ use crate::Result;
 use crate::config::VmConfig;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
 use crate::field::parameters::{HostGroup, ParameterGroup};
-use crate::field::pixels::ray_backgrounds;
-use crate::field::pixels::{Batch, Pixels};
+use crate::field::pixels::{HostBatch, RaySampler, ray_backgrounds};
 use crate::field::training::StepAt;
 use crate::kernel::cpu::vm::losses::{self, BackgroundMode, Targets, VmFigures};
 use crate::kernel::cpu::vm::{self, DecoderWeights, Rendered, VmField};
@@ -15,9 +14,9 @@ use std::sync::Arc;
 /// The operations of [`VmOps`] on the CPU.
 pub struct CpuVm<'a> {
     config: &'a VmConfig,
-    pixels: &'a Pixels<'a>,
+    sampler: &'a RaySampler<'a>,
     field: Option<Arc<VmField>>,
-    batch: Batch,
+    batch: HostBatch,
     background: Vec<[f32; 3]>,
     rendered: Option<(DecoderWeights, Rendered)>,
     g_composed: Vec<f32>,
@@ -26,12 +25,12 @@ pub struct CpuVm<'a> {
 
 impl<'a> CpuVm<'a> {
     /// Creates the operations of a training with these settings and photographs.
-    pub fn new(config: &'a VmConfig, pixels: &'a Pixels<'a>) -> CpuVm<'a> {
+    pub fn new(config: &'a VmConfig, sampler: &'a RaySampler<'a>) -> CpuVm<'a> {
         CpuVm {
             config,
-            pixels,
+            sampler,
             field: None,
-            batch: Batch::default(),
+            batch: HostBatch::default(),
             background: Vec::new(),
             rendered: None,
             g_composed: Vec::new(),
@@ -52,14 +51,14 @@ impl Ops for CpuVm<'_> {
     }
 
     fn gate(&self) -> bool {
-        !self.batch.rays.is_empty() && !self.figures.broken
+        !self.batch.rays.is_empty() && !self.figures.non_finite
     }
 }
 
 impl VmOps for CpuVm<'_> {
     fn load(&mut self, field: &Arc<VmField>, groups: [HostGroup; 3]) -> VmGroups<Self> {
         self.field = Some(field.clone());
-        self.figures.broken = false;
+        self.figures.non_finite = false;
         groups.map(|group| ParameterGroup::upload(&Cpu, group))
     }
 
@@ -72,12 +71,12 @@ impl VmOps for CpuVm<'_> {
         Ok([density?, color?, network?])
     }
 
-    fn is_broken(&self) -> Result<bool> {
-        Ok(self.figures.broken)
+    fn is_non_finite(&self) -> Result<bool> {
+        Ok(self.figures.non_finite)
     }
 
     fn draw(&mut self, at: StepAt, rays: usize, detail: f32) {
-        self.batch = self.pixels.draw(at.seed, at.step, rays, true, detail);
+        self.batch = self.sampler.draw(at.seed, at.step, rays, true, detail);
         let stream = random_background(self.config).then_some(BACKGROUND_STREAM);
         self.background = ray_backgrounds(at, stream, self.batch.rays.len());
         let lattice = &self.field().lattice;
@@ -98,9 +97,10 @@ impl VmOps for CpuVm<'_> {
 
     fn losses(&mut self, mode: BackgroundMode) {
         let composed = self.rendered.as_ref().map_or(&[][..], |(_, rendered)| &rendered.out);
-        let Batch { color, alpha, .. } = &self.batch;
+        let HostBatch { color, alpha, .. } = &self.batch;
         let targets = Targets { color, alpha, background: &self.background };
-        let (terms, gradient) = losses::of_rays(composed, targets, mode, mask_term(self.config, self.pixels));
+        let (terms, gradient) =
+            losses::of_rays(composed, targets, mode, mask_term(self.config, self.sampler));
         self.g_composed = gradient;
         self.figures.terms.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
     }
@@ -117,7 +117,7 @@ impl VmOps for CpuVm<'_> {
             slice_mut(g_density),
             slice_mut(&mut color.gradient),
         );
-        self.figures.broken |= !flat.iter().chain(&self.figures.terms).all(|g| g.is_finite());
+        self.figures.non_finite |= !flat.iter().chain(&self.figures.terms).all(|g| g.is_finite());
         slice_mut(&mut network.gradient).copy_from_slice(&flat);
     }
 
@@ -135,7 +135,7 @@ impl VmOps for CpuVm<'_> {
     }
 
     fn reset_totals(&mut self) {
-        self.figures = VmFigures { broken: self.figures.broken, ..VmFigures::default() };
+        self.figures = VmFigures { non_finite: self.figures.non_finite, ..VmFigures::default() };
     }
 
     fn figures(&self) -> Result<VmFigures> {

@@ -6,16 +6,16 @@ use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_backgroun
 use super::record::decoder;
 use super::state::first_and_last;
 use crate::config::VmConfig;
-use crate::field::drawing::DeviceRays;
+use crate::field::drawing::DeviceSampler;
 use crate::field::drawing::MemoryNeed;
 use crate::field::ops::{ArrayDevice, Ops};
 use crate::field::parameters::{HostGroup, ParameterGroup};
-use crate::field::pixels::Pixels;
+use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;
 use crate::kernel::cpu::vm::VmField;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, VmFigures};
 use crate::kernel::gpu::{
-    self, Batch, Buffer, Device, DeviceDecoder, Gate, SamplingOptions, Vm, VmLosses, VmValues,
+    self, Buffer, Device, DeviceBatch, DeviceDecoder, Gate, SamplingOptions, Vm, VmLosses, VmValues,
 };
 use crate::{Error, Result};
 use std::sync::Arc;
@@ -36,18 +36,18 @@ fn with_fewest_voxels(config: &VmConfig) -> VmConfig {
 
 /// The operations of [`VmOps`] on a GPU, with their device memory.
 pub struct GpuVm<'a> {
-    pixels: &'a Pixels<'a>,
+    sampler: &'a RaySampler<'a>,
     pub(super) device: Device,
-    photographs: DeviceRays,
+    photographs: DeviceSampler,
     /// Number of rays of a step, and the same on the device, `[1]`.
     rays: usize,
     ray_count: Buffer,
-    batch: Batch,
+    batch: DeviceBatch,
     losses: VmLosses,
     /// Kernels and buffers of the field; `None` while no field is loaded.
     vm: Option<Vm>,
     /// `[1]`: not 0 once a gradient was not finite.
-    broken: Buffer,
+    non_finite: Buffer,
 }
 
 impl<'a> GpuVm<'a> {
@@ -56,23 +56,28 @@ impl<'a> GpuVm<'a> {
     pub fn fits(
         stage: &str,
         config: &VmConfig,
-        pixels: &Pixels,
+        sampler: &RaySampler,
         bounds: [[f32; 3]; 2],
         device: &Device,
     ) -> Result<bool> {
-        Self::fits_fields(stage, config, pixels, &first_and_last(config, bounds), device)
+        Self::fits_fields(stage, config, sampler, &first_and_last(config, bounds), device)
     }
 
     /// The same before a box is known: refuses what fits in none.
-    pub fn fits_some_box(stage: &str, config: &VmConfig, pixels: &Pixels, device: &Device) -> Result<bool> {
+    pub fn fits_some_box(
+        stage: &str,
+        config: &VmConfig,
+        sampler: &RaySampler,
+        device: &Device,
+    ) -> Result<bool> {
         let fields = first_and_last(&with_fewest_voxels(config), [[-1.0; 3], [1.0; 3]]);
-        Self::fits_fields(stage, config, pixels, &fields, device)
+        Self::fits_fields(stage, config, sampler, &fields, device)
     }
 
     fn fits_fields(
         stage: &str,
         config: &VmConfig,
-        pixels: &Pixels,
+        sampler: &RaySampler,
         fields: &[VmField; 2],
         device: &Device,
     ) -> Result<bool> {
@@ -97,7 +102,7 @@ impl<'a> GpuVm<'a> {
             minimum: rays,
         };
         // the grids of both stages are those of `tface`
-        let plan = need.plan(pixels, device, |fits| match fits {
+        let plan = need.plan(sampler, device, |fits| match fits {
             0..64 => format!("tface.voxels_final ({})", config.voxels_final),
             _ => format!("{stage}.rays to {fits}"),
         });
@@ -106,21 +111,26 @@ impl<'a> GpuVm<'a> {
 
     /// Creates the operations of a training that [`fits`](GpuVm::fits) a device. `resident` copies the photographs to the
     /// device.
-    pub fn new(config: &'a VmConfig, pixels: &'a Pixels<'a>, device: Device, resident: bool) -> GpuVm<'a> {
+    pub fn new(
+        config: &'a VmConfig,
+        sampler: &'a RaySampler<'a>,
+        device: Device,
+        resident: bool,
+    ) -> GpuVm<'a> {
         let drawing = SamplingOptions {
             jitter: true,
             background: random_background(config),
             background_stream: BACKGROUND_STREAM,
         };
         GpuVm {
-            pixels,
-            photographs: DeviceRays::new(pixels, &device, drawing, resident),
+            sampler,
+            photographs: DeviceSampler::new(sampler, &device, drawing, resident),
             rays: config.rays,
             ray_count: device.upload(&[config.rays as u32]),
-            batch: Batch::new(&device, config.rays),
-            losses: VmLosses::new(&device, config.rays, mask_term(config, pixels)),
+            batch: DeviceBatch::new(&device, config.rays),
+            losses: VmLosses::new(&device, config.rays, mask_term(config, sampler)),
             vm: None,
-            broken: device.zeros::<u32>(1),
+            non_finite: device.zeros::<u32>(1),
             device,
         }
     }
@@ -147,14 +157,14 @@ impl Ops for GpuVm<'_> {
     }
 
     fn gate(&self) -> Gate<'_> {
-        Gate { count: self.losses.rays(), broken: &self.broken }
+        Gate { count: self.losses.rays(), non_finite: &self.non_finite }
     }
 }
 
 impl VmOps for GpuVm<'_> {
     fn load(&mut self, field: &Arc<VmField>, groups: [HostGroup; 3]) -> VmGroups<Self> {
         self.vm = Some(Vm::new(&self.device, field, self.batch.rays(), true));
-        self.broken = self.device.zeros::<u32>(1);
+        self.non_finite = self.device.zeros::<u32>(1);
         let [density, color, network] = groups;
         let pad = |mut group: HostGroup, grid: &gpu::DeviceGrid| {
             group.state = group.state.map(|values| grid.pad(values));
@@ -181,8 +191,8 @@ impl VmOps for GpuVm<'_> {
         Ok([cut(density?, &vm.density), cut(color?, &vm.color), network?])
     }
 
-    fn is_broken(&self) -> Result<bool> {
-        Ok(self.device.fetch::<u32>(&self.broken)?[0] != 0)
+    fn is_non_finite(&self) -> Result<bool> {
+        Ok(self.device.fetch::<u32>(&self.non_finite)?[0] != 0)
     }
 
     fn draw(&mut self, at: StepAt, rays: usize, detail: f32) {
@@ -190,7 +200,7 @@ impl VmOps for GpuVm<'_> {
             (self.rays, self.ray_count) = (rays, self.device.upload(&[rays as u32]));
         }
         let (device, at) = (&self.device, (at.seed, at.step));
-        self.photographs.draw(device, self.pixels, at, &self.ray_count, &mut self.batch, detail);
+        self.photographs.draw(device, self.sampler, at, &self.ray_count, &mut self.batch, detail);
     }
 
     fn vm_render(&mut self, groups: &VmGroups<Self>) {
@@ -205,8 +215,8 @@ impl VmOps for GpuVm<'_> {
         let (device, vm) = (&self.device, self.vm());
         let values = arrays(groups, |group| group.value());
         let gradients = arrays(groups, |group| &group.gradient);
-        vm.backward(device, values, &self.batch, self.losses.gradient(), gradients, &self.broken);
-        self.losses.add(device, vm, &self.broken);
+        vm.backward(device, values, &self.batch, self.losses.gradient(), gradients, &self.non_finite);
+        self.losses.add(device, vm, &self.non_finite);
     }
 
     fn penalize(&mut self, groups: &mut VmGroups<Self>, weights: [f32; 2]) {

@@ -18,7 +18,7 @@ use super::TFace;
 use super::train::{self, TfaceReport, train_one};
 use crate::config::{MaskUse, VmConfig, VmStart};
 use crate::field::ComputeDevice;
-use crate::field::pixels::{LARGE, Pixels, TrainView};
+use crate::field::pixels::{LARGE, RaySampler, TrainView};
 use crate::field::training::{self, TrainingSession};
 use crate::geom::{Aabb, BitGrid, Ray, RayResult};
 use crate::io::Lock;
@@ -109,16 +109,16 @@ pub fn train(
     let reach = hull.map_or(f32::INFINITY, |h| 4.0 * 2.0 / h.resolution.min(128) as f32);
     let bounds = [bounds.min.to_array(), bounds.max.to_array()];
     let config = &config.placed(bounds);
-    let pixels = match config.whole_frame {
-        true => Pixels::permuted(&views, config.foreground, bounds, config.depth_directions),
+    let sampler = match config.whole_frame {
+        true => RaySampler::permuted(&views, config.foreground, bounds, config.depth_directions),
         false => {
             let volume: f32 = (0..3).map(|a| bounds[1][a] - bounds[0][a]).product();
             let cell = (volume as f64 / config.voxels_final as f64).cbrt() as f32;
-            Pixels::new(&views, reach, 1.0, config.foreground, false)
+            RaySampler::new(&views, reach, 1.0, config.foreground, false)
                 .with_large(LARGE.min(train::DETAIL * cell))
         }
     };
-    if pixels.count() == 0 {
+    if sampler.count() == 0 {
         return Err(training::no_pixels());
     }
     let fields = config.learned();
@@ -132,17 +132,17 @@ pub fn train(
         let identity =
             if i == 0 { session.identity.into() } else { format!("{} {}", session.identity, i + 1) };
         io::create_folder(&folder)?;
-        let part = Part { monitor: session.monitor, field: i + 1, fields, before };
+        let monitor = FieldMonitor { monitor: session.monitor, field: i + 1, fields, before };
         let own = TrainingSession {
             // The offset keeps derived seeds away from the small numbers that users choose.
             seed: session.seed ^ (i as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15),
             dir: &folder,
             identity: &identity,
-            monitor: &part,
+            monitor: &monitor,
             ..*session
         };
         let several = (fields > 1).then(|| format!("field {} of {fields}", i + 1));
-        let trained = train_one(&pixels, bounds, hull, config, &own);
+        let trained = train_one(&sampler, bounds, hull, config, &own);
         let mut report = trained.map_err(|e| match &several {
             Some(which) if !e.kind().is_stop() => e.within(which),
             _ => e,
@@ -158,8 +158,8 @@ pub fn train(
     Ok(whole.expect("at least one field is learned"))
 }
 
-/// One field's share of the stage's steps.
-struct Part<'a> {
+/// Reports the steps of one field as a share of the stage's steps.
+struct FieldMonitor<'a> {
     monitor: &'a dyn Monitor,
     /// Number of the field, from 1.
     field: usize,
@@ -168,7 +168,7 @@ struct Part<'a> {
     before: u64,
 }
 
-impl Monitor for Part<'_> {
+impl Monitor for FieldMonitor<'_> {
     fn step(&self, step: u64, steps: u64, values: &[(&str, f64)]) {
         let field = (self.fields > 1).then_some(("field", self.field as f64));
         let values: Vec<_> = values.iter().copied().chain(field).collect();

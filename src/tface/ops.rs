@@ -4,7 +4,7 @@ use crate::Result;
 use crate::config::{MaskLoss, VmBackground, VmConfig};
 use crate::field::ops::Ops;
 use crate::field::parameters::{HostGroup, ParameterGroup};
-use crate::field::pixels::Pixels;
+use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;
 use crate::kernel::cpu::vm::VmField;
 use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm, VmFigures};
@@ -15,10 +15,10 @@ use std::sync::Arc;
 pub const BACKGROUND_STREAM: u64 = 8;
 
 /// Returns the loss term that compares opacity with the mask.
-pub fn mask_term(config: &VmConfig, pixels: &Pixels) -> MaskTerm {
+pub fn mask_term(config: &VmConfig, sampler: &RaySampler) -> MaskTerm {
     let weight = config.mask_weight as f32;
     match config.mask_loss {
-        _ if !pixels.has_masks => MaskTerm::None,
+        _ if !sampler.has_masks => MaskTerm::None,
         MaskLoss::None => MaskTerm::None,
         MaskLoss::L2 => MaskTerm::L2(weight),
         MaskLoss::Ce => MaskTerm::Ce(weight),
@@ -54,7 +54,7 @@ pub trait VmOps: Ops {
     fn read(&self, groups: &VmGroups<Self>) -> Result<[HostGroup; 3]>;
 
     /// Waits for the device and returns whether any gradient was not finite since the state was loaded.
-    fn is_broken(&self) -> Result<bool>;
+    fn is_non_finite(&self) -> Result<bool>;
 
     /// Draws `rays` rays. A ray of a large photograph stands for a square of pixels at most `detail` wide.
     fn draw(&mut self, at: StepAt, rays: usize, detail: f32);

@@ -10,7 +10,7 @@ use crate::config::{Preset, VmConfig};
 use crate::field::Check;
 use crate::field::ball;
 use crate::field::parameters::HostGroup;
-use crate::field::pixels::Pixels;
+use crate::field::pixels::RaySampler;
 use crate::field::self_test::{SEED, TestedModel, compare, devices, run_step, session};
 use crate::kernel::gpu::Adapter;
 
@@ -41,17 +41,17 @@ fn compare_vm(adapter: &Adapter, rays: usize) -> Result<Vec<Check>> {
     let (views, hull, session) = (ball::views(), ball::hull(), session("tface"));
     // The first step has rays that the host drew; the smaller one draws on the device, in the
     // published order.
-    let of_host = Pixels::new(&views, 0.25, 1.0, full.foreground, full.whole_frame);
-    let published = Pixels::permuted(&views, full.foreground, BOUNDS, full.depth_directions);
+    let of_host = RaySampler::new(&views, 0.25, 1.0, full.foreground, full.whole_frame);
+    let published = RaySampler::permuted(&views, full.foreground, BOUNDS, full.depth_directions);
     let state = VmState::new(&full, SEED, BOUNDS, Some(&hull));
     let mut checks = Vec::new();
     for (way, (device, part)) in [FIELD, "vector-matrix in fixed point"].into_iter().zip(devices(adapter)?) {
         let config = VmConfig { rays: full.rays / part, ..full.clone() };
-        let pixels = if part == 1 { &of_host } else { &published };
-        let mut on_cpu = VmModel::new(CpuVm::new(&config, pixels), state.clone(), &config, &session);
+        let sampler = if part == 1 { &of_host } else { &published };
+        let mut on_cpu = VmModel::new(CpuVm::new(&config, sampler), state.clone(), &config, &session);
         on_cpu.load();
-        let resident = GpuVm::fits("tface", &config, pixels, BOUNDS, &device)? && part > 1;
-        let ops = GpuVm::new(&config, pixels, device, resident);
+        let resident = GpuVm::fits("tface", &config, sampler, BOUNDS, &device)? && part > 1;
+        let ops = GpuVm::new(&config, sampler, device, resident);
         let mut on_gpu = VmModel::new(ops, state.clone(), &config, &session);
         on_gpu.load();
         checks.extend(compare(way, &run_step(&mut on_gpu)?, &run_step(&mut on_cpu)?));

@@ -4,7 +4,7 @@ use super::record::{FieldRecord, NAMES, decoder, geometry, grids};
 use crate::Result;
 use crate::config::VmConfig;
 use crate::field::checkpoint::Checkpoint;
-use crate::field::parameters::{HostGroup, Part};
+use crate::field::parameters::{HostGroup, ParameterPart};
 use crate::geom::BitGrid;
 use crate::kernel::cpu::vm::mask::BoxMask;
 use crate::kernel::cpu::vm::{VmField, size_for};
@@ -134,7 +134,7 @@ impl VmState {
         let (density, color) = grids(config, self.size);
         let lengths = [density.len(), color.len(), decoder(config).len()];
         for ((group, name), len) in self.groups.iter_mut().zip(NAMES).zip(lengths) {
-            *group = HostGroup::restore(vec![Part { name, shape: vec![len] }], from, !finished)?;
+            *group = HostGroup::restore(vec![ParameterPart { name, shape: vec![len] }], from, !finished)?;
         }
         Ok(())
     }

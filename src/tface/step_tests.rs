@@ -33,10 +33,10 @@ fn paper() -> VmConfig {
     .placed(BOX)
 }
 
-fn model<'a>(config: &'a VmConfig, pixels: &'a Pixels<'a>, dir: &'a Path) -> VmModel<'a, CpuVm<'a>> {
+fn model<'a>(config: &'a VmConfig, sampler: &'a RaySampler<'a>, dir: &'a Path) -> VmModel<'a, CpuVm<'a>> {
     let session = session("tface", dir, "step", &Quiet);
     let state = VmState::new(config, session.seed, BOX, None);
-    let mut model = VmModel::new(CpuVm::new(config, pixels), state, config, &session);
+    let mut model = VmModel::new(CpuVm::new(config, sampler), state, config, &session);
     model.load();
     model
 }
@@ -65,11 +65,11 @@ fn total_variation(grid: &Grid, x: &[Var]) -> Var {
 }
 
 /// Color loss, mask loss and all together, by the formulas.
-fn formulas((config, pixels, state): (&VmConfig, &Pixels, &VmState), x: &[Var], step: u64) -> [Var; 3] {
+fn formulas((config, sampler, state): (&VmConfig, &RaySampler, &VmState), x: &[Var], step: u64) -> [Var; 3] {
     let of = Var::of;
     let seed = 3; // of the session
     let field = state.field(config, true);
-    let batch = pixels.draw(seed, step, config.rays, true, 0.0);
+    let batch = sampler.draw(seed, step, config.rays, true, 0.0);
     let out = vm::render(&field, x, &batch.rays);
     let n = batch.rays.len();
     let white = config.background == VmBackground::Reference && rng::uniform(seed, step << 4 | 9, 0) < 0.5;
@@ -95,7 +95,7 @@ fn formulas((config, pixels, state): (&VmConfig, &Pixels, &VmState), x: &[Var], 
     }
     let rgb = squares / of(3.0 * n as f64);
     let mask = match config.mask_loss {
-        _ if !pixels.has_masks => of(0.0),
+        _ if !sampler.has_masks => of(0.0),
         MaskLoss::None => of(0.0),
         MaskLoss::L2 => outside / of(count),
         MaskLoss::Ce => cross / of(n as f64),
@@ -114,8 +114,8 @@ fn formulas((config, pixels, state): (&VmConfig, &Pixels, &VmState), x: &[Var], 
 fn agrees(config: &VmConfig) {
     let dir = temporary();
     let views = masked_as_configured(views(), config.masks);
-    let pixels = Pixels::permuted(&views, config.foreground, BOX, config.depth_directions);
-    let mut model = model(config, &pixels, dir.path());
+    let sampler = RaySampler::permuted(&views, config.foreground, BOX, config.depth_directions);
+    let mut model = model(config, &sampler, dir.path());
     let seed = model.session.seed;
     let progress = |step: u64| TrainingProgress { step, ..TrainingProgress::default() };
     for step in 0..2 {
@@ -126,7 +126,7 @@ fn agrees(config: &VmConfig) {
     let x: Vec<f64> = before.iter().flat_map(|[v, ..]| wide(v)).collect();
     let mut terms = [0.0; 2];
     let (_, slopes) = gradient(&x, |x| {
-        let [rgb, mask, total] = formulas((config, &pixels, &model.state), x, 2);
+        let [rgb, mask, total] = formulas((config, &sampler, &model.state), x, 2);
         terms = [rgb.value(), mask.value()];
         total
     });
@@ -192,14 +192,14 @@ fn losses_of(config: &VmConfig, step: u64) -> (f32, f32) {
         0.0, 0.0, 0.0, 0.2, 0.0,
     ];
     let views = views();
-    let pixels = Pixels::permuted(&views, config.foreground, BOX, false);
+    let sampler = RaySampler::permuted(&views, config.foreground, BOX, false);
     let random = config.background == VmBackground::Random;
     let behind = |r: u64| std::array::from_fn(|c| rng::uniform(3, step << 4 | 8, 3 * r + c as u64));
     let background = [0, 1, 2].map(|r| if random { behind(r) } else { [0.0; 3] });
     let color = [[0.4, 0.2, 0.3], [0.0; 3], [0.0; 3]];
     let targets = Targets { color: &color, alpha: &[1.0, 0.0, 0.0], background: &background };
     let mode = background_mode(config, StepAt { seed: 3, step });
-    let ([rgb, mask, outside], _) = of_rays(&composed, targets, mode, mask_term(config, &pixels));
+    let ([rgb, mask, outside], _) = of_rays(&composed, targets, mode, mask_term(config, &sampler));
     // (0.36 + 0.04) / 2, whatever the loss
     assert!((outside - 0.2).abs() < 1e-6);
     (rgb, mask)
@@ -255,10 +255,10 @@ fn the_alpha_mask_looks_at_steps_of_the_published_world() {
     // box of half 0.8 for 1.67: 1 − exp(−σ step / unit) ≥ 1e-4. Density of one value everywhere: 0.1 · 0.1 · 6 channels
     let config = VmConfig { mask_at: vec![0.0], ..paper() };
     let (dir, views) = (temporary(), views());
-    let pixels = Pixels::permuted(&views, config.foreground, BOX, true);
+    let sampler = RaySampler::permuted(&views, config.foreground, BOX, true);
     let unit = 0.8 / 1.67;
     assert!((config.alpha_unit - unit).abs() < 1e-6 && (config.distance_scale - 25.0 / unit).abs() < 1e-4);
-    let mut state = model(&config, &pixels, dir.path()).state;
+    let mut state = model(&config, &sampler, dir.path()).state;
     let field = state.field(&config, false);
     let step = f64::from(field.lattice.step) / unit;
     // Σ of plane · line over 6 channels at the threshold

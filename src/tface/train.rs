@@ -10,7 +10,7 @@ use super::state::VmState;
 use crate::config::{MaskUse, VmConfig};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::ArrayDevice;
-use crate::field::pixels::{Pixels, TrainView};
+use crate::field::pixels::{RaySampler, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self, ComputeDevice};
 use crate::geom::BitGrid;
@@ -97,7 +97,7 @@ pub(super) struct VmModel<'a, O: VmOps> {
 /// Trains one field in `bounds` until `config.steps`, saving checkpoints into the session's folder and continuing
 /// from the last one; a finished training is left as it is.
 pub(super) fn train_one(
-    pixels: &Pixels,
+    sampler: &RaySampler,
     bounds: [[f32; 3]; 2],
     hull: Option<&BitGrid>,
     config: &VmConfig,
@@ -110,16 +110,16 @@ pub(super) fn train_one(
             ComputeDevice::Cpu(_) => Ok(()),
             #[cfg(feature = "wgpu")]
             ComputeDevice::Gpu(gpu) => {
-                GpuVm::fits(session.stage, config, pixels, bounds, &gpu.device).map(drop)
+                GpuVm::fits(session.stage, config, sampler, bounds, &gpu.device).map(drop)
             }
         })?;
     let (description, refused) = (device.description(), device.warning());
     let (state, progress, counts, warnings) = match device {
-        ComputeDevice::Cpu(_) => train_on(CpuVm::new(config, pixels), state, config, session)?,
+        ComputeDevice::Cpu(_) => train_on(CpuVm::new(config, sampler), state, config, session)?,
         #[cfg(feature = "wgpu")]
         ComputeDevice::Gpu(gpu) => {
-            let resident = GpuVm::fits(session.stage, config, pixels, bounds, &gpu.device)?;
-            train_on(GpuVm::new(config, pixels, gpu.device, resident), state, config, session)?
+            let resident = GpuVm::fits(session.stage, config, sampler, bounds, &gpu.device)?;
+            train_on(GpuVm::new(config, sampler, gpu.device, resident), state, config, session)?
         }
     };
     Ok(TfaceReport {
@@ -231,7 +231,7 @@ impl<'a, O: VmOps> VmModel<'a, O> {
 
     /// Waits for the device and returns the current state.
     fn state(&self) -> Result<VmState, StepError> {
-        if self.ops.is_broken()? {
+        if self.ops.is_non_finite()? {
             return Err(StepError::gradient());
         }
         let groups = self.ops.read(self.groups())?;
@@ -297,7 +297,7 @@ impl<O: VmOps> Model for VmModel<'_, O> {
         self.counts.count(&found);
         let [rgb, mask, outside] = found.terms.map(|t| f64::from(t) / steps);
         StepError::check([("rgb", rgb as f32), ("mask", mask as f32)])?;
-        if found.broken {
+        if found.non_finite {
             return Err(StepError::gradient());
         }
         let samples = found.density as f64 / steps;

@@ -5,7 +5,7 @@ use super::{DensityGroups, DensityOps, OCCUPIED};
 use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
-use crate::field::pixels::{Batch, Pixels};
+use crate::field::pixels::{HostBatch, RaySampler};
 use crate::field::training::StepAt;
 use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule;
@@ -30,39 +30,39 @@ pub fn march(
 /// The operations of [`DensityOps`] on the CPU.
 pub struct CpuDensity<'a> {
     config: &'a IfaceConfig,
-    pixels: &'a Pixels<'a>,
+    sampler: &'a RaySampler<'a>,
     shape: DensityShape,
     occupancy: Occupancy,
     rays: usize,
     /// Samples of the last step; `None` before the first step.
     last_samples: Option<usize>,
-    batch: Batch,
+    batch: HostBatch,
     samples: Samples,
     weights: Option<DensityWeights>,
     found: Option<DensitySamples>,
     terms: [f32; 3],
     /// Gradients with respect to densities and colors of the samples.
     gradients: (Vec<f32>, Vec<[f32; 3]>),
-    broken: bool,
+    non_finite: bool,
 }
 
 impl<'a> CpuDensity<'a> {
     /// Creates the operations of a training with these settings and photographs.
-    pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>) -> CpuDensity<'a> {
+    pub fn new(config: &'a IfaceConfig, sampler: &'a RaySampler<'a>) -> CpuDensity<'a> {
         CpuDensity {
             config,
-            pixels,
+            sampler,
             shape: shape(config),
             occupancy: Occupancy::new(config, None),
             rays: config.rays,
             last_samples: None,
-            batch: Batch::default(),
+            batch: HostBatch::default(),
             samples: Samples::default(),
             weights: None,
             found: None,
             terms: [0.0; 3],
             gradients: Default::default(),
-            broken: false,
+            non_finite: false,
         }
     }
 
@@ -84,14 +84,14 @@ impl Ops for CpuDensity<'_> {
     }
 
     fn gate(&self) -> bool {
-        !self.samples.t.is_empty() && !self.broken
+        !self.samples.t.is_empty() && !self.non_finite
     }
 }
 
 impl DensityOps for CpuDensity<'_> {
     fn load(&mut self, occupancy: &Occupancy, rays: usize) {
         self.occupancy = occupancy.clone();
-        (self.rays, self.last_samples, self.broken) = (rays, None, false);
+        (self.rays, self.last_samples, self.non_finite) = (rays, None, false);
     }
 
     fn read(&self, occupancy: &mut Occupancy) -> Result<usize> {
@@ -99,8 +99,8 @@ impl DensityOps for CpuDensity<'_> {
         Ok(self.next_rays())
     }
 
-    fn is_broken(&self) -> Result<bool> {
-        Ok(self.broken)
+    fn is_non_finite(&self) -> Result<bool> {
+        Ok(self.non_finite)
     }
 
     fn update_occupancy(&mut self, groups: &DensityGroups<Self>, at: StepAt) {
@@ -115,7 +115,7 @@ impl DensityOps for CpuDensity<'_> {
 
     fn draw(&mut self, at: StepAt) {
         self.rays = self.next_rays();
-        self.batch = self.pixels.draw(at.seed, at.step, self.rays, self.config.jitter, 0.0);
+        self.batch = self.sampler.draw(at.seed, at.step, self.rays, self.config.jitter, 0.0);
     }
 
     fn march(&mut self, groups: &DensityGroups<Self>) {
@@ -145,7 +145,7 @@ impl DensityOps for CpuDensity<'_> {
         let g_table = bytemuck::cast_slice_mut(slice_mut(&mut table.gradient));
         let by = (&self.gradients.0[..], &self.gradients.1[..]);
         let g_network = density::backward(&self.shape, &weights, &found, by, g_table);
-        self.broken |= !g_network.iter().chain(&self.terms).all(|g| g.is_finite());
+        self.non_finite |= !g_network.iter().chain(&self.terms).all(|g| g.is_finite());
         slice_mut(&mut network.gradient).copy_from_slice(&g_network);
     }
 
@@ -154,6 +154,14 @@ impl DensityOps for CpuDensity<'_> {
         losses[..3].copy_from_slice(&self.terms);
         let (samples, rays) = (self.samples.t.len(), self.next_rays());
         let mean_square = (samples > 0).then_some(losses[0]);
-        Ok(Figures { losses, mean_square, variance: 0.0, samples, rays, blind: 0, broken: self.broken })
+        Ok(Figures {
+            losses,
+            mean_square,
+            variance: 0.0,
+            samples,
+            rays,
+            empty_steps: 0,
+            non_finite: self.non_finite,
+        })
     }
 }

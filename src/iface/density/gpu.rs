@@ -3,26 +3,26 @@
 use super::shape;
 use super::{DensityGroups, DensityOps, OCCUPIED};
 use crate::config::iface::IfaceConfig;
-use crate::field::drawing::DeviceRays;
+use crate::field::drawing::DeviceSampler;
 use crate::field::ops::Ops;
-use crate::field::pixels::Pixels;
+use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;
 use crate::iface::gpu::{samples_that_fit, wanted_samples};
 use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule;
 use crate::kernel::cpu::schedule::Figures;
 use crate::kernel::gpu::{
-    self, Batch, Buffer, Density, Device, Gate, Nerfacc, Samples, SamplingOptions, Schedule, Words,
+    self, Buffer, Density, Device, DeviceBatch, Gate, Nerfacc, Samples, SamplingOptions, Schedule, Words,
 };
 use crate::{Error, Result};
 
 /// The operations of [`DensityOps`] on a GPU, with their device memory.
 pub struct GpuDensity<'a> {
     config: &'a IfaceConfig,
-    pixels: &'a Pixels<'a>,
+    sampler: &'a RaySampler<'a>,
     device: Device,
-    photographs: DeviceRays,
-    batch: Batch,
+    photographs: DeviceSampler,
+    batch: DeviceBatch,
     /// Samples in all occupied cells; `samples` has those up to where the transmittance has vanished.
     marched: Samples,
     samples: Samples,
@@ -30,7 +30,7 @@ pub struct GpuDensity<'a> {
     /// `[1]`: a density has no sharpness.
     no_sharpness: Buffer,
     /// `[1]`: not 0 once a gradient was not finite.
-    broken: Buffer,
+    non_finite: Buffer,
     schedule: Schedule,
     occupancy: gpu::Occupancy,
     cells: Nerfacc,
@@ -40,12 +40,12 @@ pub struct GpuDensity<'a> {
 
 impl<'a> GpuDensity<'a> {
     /// Checks that a device supports the field and has enough memory for the training.
-    pub fn fits(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<()> {
+    pub fn fits(config: &IfaceConfig, sampler: &RaySampler, device: &Device) -> Result<()> {
         if !Density::supports(&shape(config)) {
             let problem = format!("a tile on a GPU cannot hold {} levels", config.levels);
             return Err(Error::usage(problem, "lower iface.levels, or train with `--device cpu`"));
         }
-        max_samples(config, pixels, device).map(drop)
+        max_samples(config, sampler, device).map(drop)
     }
 
     /// Creates the operations of a training that [`fits`](GpuDensity::fits) a device.
@@ -53,22 +53,26 @@ impl<'a> GpuDensity<'a> {
     /// # Errors
     ///
     /// If the device has too little memory.
-    pub fn new(config: &'a IfaceConfig, pixels: &'a Pixels<'a>, device: Device) -> Result<GpuDensity<'a>> {
+    pub fn new(
+        config: &'a IfaceConfig,
+        sampler: &'a RaySampler<'a>,
+        device: Device,
+    ) -> Result<GpuDensity<'a>> {
         let rays = config.rays.max(config.max_rays);
-        let (capacity, resident) = max_samples(config, pixels, &device)?;
+        let (capacity, resident) = max_samples(config, sampler, &device)?;
         let drawing = SamplingOptions { jitter: config.jitter, background: false, background_stream: 0 };
         let (occupancy, cells) = cells(&device, config, &Occupancy::new(config, None), capacity);
         let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         Ok(GpuDensity {
             config,
-            pixels,
-            photographs: DeviceRays::new(pixels, &device, drawing, resident),
-            batch: Batch::new(&device, rays),
+            sampler,
+            photographs: DeviceSampler::new(sampler, &device, drawing, resident),
+            batch: DeviceBatch::new(&device, rays),
             marched: Samples::new(&device, rays, capacity),
             samples: Samples::new(&device, rays, capacity),
             density: Density::new(&device, &shape(config), length.at(0.0), rays, capacity),
             no_sharpness: device.zeros::<f32>(1),
-            broken: device.zeros::<u32>(1),
+            non_finite: device.zeros::<u32>(1),
             schedule: Schedule::new(&device, length, budget, config.rays),
             occupancy,
             cells,
@@ -79,10 +83,10 @@ impl<'a> GpuDensity<'a> {
 }
 
 /// Returns the sample capacity of a step, and whether the photographs fit on the device as well.
-fn max_samples(config: &IfaceConfig, pixels: &Pixels, device: &Device) -> Result<(usize, bool)> {
+fn max_samples(config: &IfaceConfig, sampler: &RaySampler, device: &Device) -> Result<(usize, bool)> {
     let shape = shape(config);
     let sums = Density::words_of_sums(&shape, wanted_samples(config, 0));
-    samples_that_fit(config, Density::words_per_sample(&shape), sums, 0, pixels, device)
+    samples_that_fit(config, Density::words_per_sample(&shape), sums, 0, sampler, device)
 }
 
 /// Creates the cells to march through, and the rule that updates them.
@@ -105,17 +109,17 @@ impl Ops for GpuDensity<'_> {
     }
 
     fn gate(&self) -> Gate<'_> {
-        Gate { count: &self.samples.count, broken: &self.broken }
+        Gate { count: &self.samples.count, non_finite: &self.non_finite }
     }
 }
 
 impl DensityOps for GpuDensity<'_> {
     fn load(&mut self, occupancy: &Occupancy, rays: usize) {
         let (device, config) = (&self.device, self.config);
-        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.words());
+        (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.word_count());
         let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         self.schedule = Schedule::new(device, length, budget, rays);
-        self.broken = device.zeros::<u32>(1);
+        self.non_finite = device.zeros::<u32>(1);
         self.density.reset_sums(device);
         self.stepped = false;
     }
@@ -126,8 +130,8 @@ impl DensityOps for GpuDensity<'_> {
         self.schedule.next_rays(&self.device, self.stepped.then_some(&self.samples.count))
     }
 
-    fn is_broken(&self) -> Result<bool> {
-        Ok(self.device.fetch::<u32>(&self.broken)?[0] != 0)
+    fn is_non_finite(&self) -> Result<bool> {
+        Ok(self.device.fetch::<u32>(&self.non_finite)?[0] != 0)
     }
 
     fn update_occupancy(&mut self, [table, network]: &DensityGroups<Self>, at: StepAt) {
@@ -144,7 +148,7 @@ impl DensityOps for GpuDensity<'_> {
         let (device, at) = (&self.device, (at.seed, at.step));
         self.schedule.advance(device, &self.no_sharpness, &self.samples.count, !self.stepped);
         self.stepped = true;
-        self.photographs.draw(device, self.pixels, at, &self.schedule.rays, &mut self.batch, 0.0);
+        self.photographs.draw(device, self.sampler, at, &self.schedule.rays, &mut self.batch, 0.0);
     }
 
     fn march(&mut self, [table, network]: &DensityGroups<Self>) {
@@ -166,13 +170,13 @@ impl DensityOps for GpuDensity<'_> {
 
     fn backward(&mut self, [table, network]: &mut DensityGroups<Self>) {
         let into = [&table.gradient, &network.gradient];
-        self.density.backward(&self.device, &self.samples, into, &self.broken);
+        self.density.backward(&self.device, &self.samples, into, &self.non_finite);
     }
 
     fn figures(&mut self) -> Result<Figures> {
         let (device, count) = (&self.device, &self.samples.count);
         let sums = self.density.sums();
-        let figures = self.schedule.figures(device, sums, &self.no_sharpness, count, &self.broken);
+        let figures = self.schedule.figures(device, sums, &self.no_sharpness, count, &self.non_finite);
         self.density.reset_sums(device);
         figures
     }

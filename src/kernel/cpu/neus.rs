@@ -17,9 +17,9 @@ use rayon::prelude::*;
 /// Number of values per ray: rgb (3), opacity, depth (Σ w t), normal (3, Σ w n̂), squared color (Σ w ‖rgb‖²).
 pub const RAY_WIDTH: usize = 9;
 
-/// The ragged samples of a batch of rays, sorted by ray and then by `t`.
+/// The segments of rays that samples stand for, sorted by ray and then by `t`.
 #[derive(Clone, Copy)]
-pub struct Rays<'a> {
+pub struct Segments<'a> {
     /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
     pub offsets: &'a [i32],
     /// `[rays, 3]` unit directions.
@@ -99,19 +99,25 @@ fn local_sharpness(inv_s: f32, field: &[f32]) -> f32 {
 ///
 /// - field: `[samples, 8]`, the output of the field
 /// - output: `[rays, 9]` = rgb, opacity, Σ w t, Σ w n̂, Σ w ‖rgb‖²
-pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
+pub fn forward(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
     let inv_s = inv_s.clamp(1e-6, 1e6);
-    let count = rays.offsets.len() - 1;
+    let count = segments.offsets.len() - 1;
     let mut out = vec![0f32; count * RAY_WIDTH];
     out.par_chunks_mut(RAY_WIDTH).with_min_len(64).enumerate().for_each(|(r, out)| {
         let mut transmittance = 1f32;
-        for s in rays.offsets[r] as usize..rays.offsets[r + 1] as usize {
+        for s in segments.offsets[r] as usize..segments.offsets[r + 1] as usize {
             let f = &field[s * WIDTH..][..WIDTH];
             let (n, _) = normal_of(f);
-            let a = alpha_of(f[0], dot(rays.direction[r], n), rays.dt[s], local_sharpness(inv_s, f), anneal)
-                .alpha;
+            let a = alpha_of(
+                f[0],
+                dot(segments.direction[r], n),
+                segments.dt[s],
+                local_sharpness(inv_s, f),
+                anneal,
+            )
+            .alpha;
             let w = transmittance * a;
-            out.iter_mut().zip(values_of(f, n, rays.t[s])).for_each(|(out, value)| *out += w * value);
+            out.iter_mut().zip(values_of(f, n, segments.t[s])).for_each(|(out, value)| *out += w * value);
             transmittance *= 1.0 - a;
         }
     });
@@ -123,14 +129,20 @@ pub fn forward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
 /// # Shapes
 ///
 /// - g_out: `[rays, 9]`, the gradient of the loss with respect to the output of [`forward`]
-pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32]) -> (Vec<f32>, f32) {
+pub fn backward(
+    segments: Segments,
+    field: &[f32],
+    inv_s: f32,
+    anneal: f32,
+    g_out: &[f32],
+) -> (Vec<f32>, f32) {
     let clamped = inv_s.clamp(1e-6, 1e6);
-    let count = rays.offsets.len() - 1;
+    let count = segments.offsets.len() - 1;
     let mut g_field = vec![0f32; field.len()];
     // each ray owns a contiguous piece of the samples
     let mut rest = &mut g_field[..];
     let split_ray = |r: usize| {
-        let n = (rays.offsets[r + 1] - rays.offsets[r]) as usize;
+        let n = (segments.offsets[r + 1] - segments.offsets[r]) as usize;
         rest.split_off_mut(..n * WIDTH).expect("a row for each sample")
     };
     let tasks: Vec<&mut [f32]> = (0..count).map(split_ray).collect();
@@ -139,7 +151,7 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
         .enumerate()
         .with_min_len(64)
         .map(|(r, g_samples)| {
-            let first = rays.offsets[r] as usize;
+            let first = segments.offsets[r] as usize;
             let n = g_samples.len() / WIDTH;
             let g = &g_out[r * RAY_WIDTH..][..RAY_WIDTH];
             // recompute the forward pass: alphas, transmittances and the loss gradient g_w by each weight
@@ -148,11 +160,11 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
             for s in first..first + n {
                 let f = &field[s * WIDTH..][..WIDTH];
                 let (normal, length) = normal_of(f);
-                let cos = dot(rays.direction[r], normal);
+                let cos = dot(segments.direction[r], normal);
                 let sharp = local_sharpness(clamped, f);
-                let a = alpha_of(f[0], cos, rays.dt[s], sharp, anneal);
+                let a = alpha_of(f[0], cos, segments.dt[s], sharp, anneal);
                 let g_w: f32 =
-                    g.iter().zip(values_of(f, normal, rays.t[s])).map(|(g, value)| g * value).sum();
+                    g.iter().zip(values_of(f, normal, segments.t[s])).map(|(g, value)| g * value).sum();
                 let next = transmittance * (1.0 - a.alpha);
                 samples.push((a, normal, length, transmittance, g_w, sharp));
                 transmittance = next;
@@ -178,16 +190,16 @@ pub fn backward(rays: Rays, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32
                     let g_p = g_alpha * q / (d * d) * p * (1.0 - p);
                     let g_q = -g_alpha / d * q * (1.0 - q);
                     out[0] = (g_p + g_q) * sharp;
-                    let half = 0.5 * a.ic * rays.dt[s];
+                    let half = 0.5 * a.ic * segments.dt[s];
                     let sdf = field[s * WIDTH];
                     // the gradient by ln s is that by the sample's offset and, divided by inv_s, that by inv_s
                     let g_ln = (g_p * (sdf - half) + g_q * (sdf + half)) * sharp;
                     out[7] = g_ln;
                     g_s += g_ln as f64;
-                    let g_ic = (g_q - g_p) * sharp * 0.5 * rays.dt[s];
+                    let g_ic = (g_q - g_p) * sharp * 0.5 * segments.dt[s];
                     let g_cos = g_ic * a.ic_by_cos;
                     for c in 0..3 {
-                        g_normal[c] += g_cos * rays.direction[r][c];
+                        g_normal[c] += g_cos * segments.direction[r][c];
                     }
                 }
                 let radial = dot(*normal, g_normal);
@@ -234,19 +246,19 @@ mod tests {
     fn extreme_fields_have_finite_opacities_and_bounded_gradients() {
         let offsets = [0, 4];
         let (direction, t, dt) = ([[0.6, 0.0, -0.8]], [1.0, 1.1, 1.2, 1.3], [1e-9, 0.05, 3.0, 1e3]);
-        let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let g = [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0];
         for inv_s in [0.0, 1e-9, 1e-6, 1.0, 1e6, 1e9, f32::INFINITY] {
             for sdf in [0.0, 1e-30, -1e-6, 1.0, -1e3, 1e20] {
                 for slope in [0.0, 1e-30, 1e-12, 2e-6, 1.0, 1e6] {
                     let sample = |k: usize| [sdf, slope, -0.5 * slope, 0.0, 0.5, 0.5, 0.5, -(k as f32)];
                     let field: Vec<f32> = (0..4).flat_map(sample).collect();
-                    let composited = forward(rays, &field, inv_s, 1.0);
+                    let composited = forward(segments, &field, inv_s, 1.0);
                     assert!(
                         composited.iter().all(|v| v.is_finite() && v.abs() < 2.0),
                         "{inv_s} {sdf} {slope} {composited:?}"
                     );
-                    let (g_field, g_s) = backward(rays, &field, inv_s, 1.0, &g);
+                    let (g_field, g_s) = backward(segments, &field, inv_s, 1.0, &g);
                     let gradients = || g_field.iter().chain([&g_s]);
                     assert!(gradients().all(|v| v.is_finite()), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
                     // 3 · 1e6, the unit normal's 1 / MIN_GRADIENT_NORM, and 1e3 · 1e6 by the length of an interval
@@ -260,8 +272,8 @@ mod tests {
     }
 
     /// Returns Σ g · out, by the formulas in f64.
-    fn loss(rays: Rays, field: &[f64], inv_s: f64, anneal: f64, g: &[f32]) -> f64 {
-        let out = reference::neus::composite(rays, field, inv_s, anneal);
+    fn loss(segments: Segments, field: &[f64], inv_s: f64, anneal: f64, g: &[f32]) -> f64 {
+        let out = reference::neus::composite(segments, field, inv_s, anneal);
         out.iter().zip(g).map(|(o, g)| o * *g as f64).sum()
     }
 
@@ -271,7 +283,7 @@ mod tests {
         let direction = [[0.6, 0.0, -0.8], [0.0, 0.0, 1.0], [0.36, -0.48, 0.8]];
         let t: Vec<f32> = (0..12).map(|i| 1.0 + 0.05 * i as f32).collect();
         let dt = vec![0.05f32; 12];
-        let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let field: Vec<f32> = (0..96)
             .map(|i| match i % 8 {
                 0 => 0.12 - 0.03 * (i / 8 % 6) as f32,
@@ -282,9 +294,9 @@ mod tests {
             .collect();
         let g: Vec<f32> = (0..27).map(|i| (i as f32 * 0.9).sin()).collect();
         let (inv_s, anneal) = (30f32, 0.4f32);
-        let (g_field, g_s) = backward(rays, &field, inv_s, anneal, &g);
+        let (g_field, g_s) = backward(segments, &field, inv_s, anneal, &g);
         let wide = reference::wide(&field);
-        let at = |f: &[f64], s: f64| loss(rays, f, s, anneal as f64, &g);
+        let at = |f: &[f64], s: f64| loss(segments, f, s, anneal as f64, &g);
         let scale = g_field.iter().fold(0f32, |a, &b| a.max(b.abs())) as f64;
         for i in 0..96 {
             let mut f = wide.clone();
@@ -297,6 +309,6 @@ mod tests {
         }
         let slope = (at(&wide, inv_s as f64 + 1e-4) - at(&wide, inv_s as f64 - 1e-4)) / 2e-4;
         assert!((slope - g_s as f64).abs() < 1e-3 * slope.abs(), "inv_s {slope} {g_s}");
-        assert_eq!(&forward(rays, &field, inv_s, anneal)[9..18], &[0.0; 9]);
+        assert_eq!(&forward(segments, &field, inv_s, anneal)[9..18], &[0.0; 9]);
     }
 }

@@ -66,9 +66,9 @@ pub struct Figures {
     /// Number of rays of the next step.
     pub rays: usize,
     /// Number of consecutive steps without a sample, up to and including this one.
-    pub blind: u64,
+    pub empty_steps: u64,
     /// Whether a gradient was not finite, in this step or an earlier one.
-    pub broken: bool,
+    pub non_finite: bool,
 }
 
 #[cfg(test)]

@@ -13,7 +13,7 @@ fn adam_kernel(
     v: &mut [f32],
     g: &mut [f32],
     count: &[u32],
-    broken: &[u32],
+    non_finite: &[u32],
     lr: f32,
     beta1: f32,
     beta2: f32,
@@ -24,7 +24,7 @@ fn adam_kernel(
     #[comptime] skip_zero: bool,
 ) {
     let i = ABSOLUTE_POS;
-    if i < p.len() && count[0] > 0 && broken[0] == 0 {
+    if i < p.len() && count[0] > 0 && non_finite[0] == 0 {
         let gradient = g[i];
         if !skip_zero || gradient != 0.0f32 {
             let m1 = fma(beta1, m[i], (1.0f32 - beta1) * gradient);
@@ -43,15 +43,15 @@ pub struct Gate<'a> {
     /// `[1]` or more: number of samples of the step in the first word. Nothing is updated if it is 0.
     pub count: &'a Buffer,
     /// `[1]`: not 0 once a gradient was not finite. Nothing is updated from then on.
-    pub broken: &'a Buffer,
+    pub non_finite: &'a Buffer,
 }
 
 /// Takes one AdamW step in place; the gradient is left zero. All four buffers are `[n]`.
 pub fn adam(device: &Device, [p, m, v]: [&Buffer; 3], g: &Buffer, step: &AdamStep, gate: Gate) {
-    assert!([m, v, g].iter().all(|b| b.words() == p.words()));
+    assert!([m, v, g].iter().all(|b| b.word_count() == p.word_count()));
     let correction = |beta: f32| (1.0 / (1.0 - (beta as f64).powf(step.step as f64))) as f32;
-    launch!(device, adam_kernel::launch, groups(p.words().div_ceil(UNITS as usize)), UNITS;
-        p, m, v, g, gate.count, gate.broken;
+    launch!(device, adam_kernel::launch, groups(p.word_count().div_ceil(UNITS as usize)), UNITS;
+        p, m, v, g, gate.count, gate.non_finite;
         step.lr, step.beta1, step.beta2, step.epsilon, 1.0 - step.lr * step.weight_decay,
         correction(step.beta1), correction(step.beta2), step.skip_zero
     );
@@ -88,10 +88,11 @@ mod tests {
                 let mut g: Vec<f32> = (0..n).map(|i| if (i + k) % 3 == 0 { 0.0 } else { size(i) }).collect();
                 let device_g = device.upload(&g);
                 let [device_p, device_m, device_v] = &device_state;
-                for (count, broken) in [(0, 0), (7, 1), (7, 0)] {
+                for (count, non_finite) in [(0, 0), (7, 1), (7, 0)] {
                     // nothing is updated without samples, or after a gradient that was not finite
-                    let (count, broken) = (device.upload::<u32>(&[count]), device.upload::<u32>(&[broken]));
-                    let gate = Gate { count: &count, broken: &broken };
+                    let (count, non_finite) =
+                        (device.upload::<u32>(&[count]), device.upload::<u32>(&[non_finite]));
+                    let gate = Gate { count: &count, non_finite: &non_finite };
                     super::adam(&device, [device_p, device_m, device_v], &device_g, &step, gate);
                 }
                 adam::adam(&mut p, &mut m, &mut v, &mut g, &step);

@@ -3,7 +3,7 @@
 
 use super::color::{ColorPlan, color_backward, color_forward, color_inputs, unit};
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::Batch;
+use super::draw::DeviceBatch;
 use super::hash::Grid;
 use super::losses::{HIT, LAST, TALLY, sum, tally};
 use super::march::{Samples, prefix_sum};
@@ -30,14 +30,14 @@ const WIDTH: usize = 4;
 /// Offsets of the matrices in rows of 64 floats. Weights are stored in the orders in which they are read, gradients
 /// row-major like on the CPU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-struct Plan {
+struct DensityPlan {
     /// Number of hash features: two per level.
     features: usize,
     color: ColorPlan,
 }
 
-impl Plan {
-    fn new(shape: &DensityShape) -> Plan {
+impl DensityPlan {
+    fn new(shape: &DensityShape) -> DensityPlan {
         let features = 2 * shape.levels.len();
         let color = ColorPlan {
             outputs: FEATURES,
@@ -48,7 +48,7 @@ impl Plan {
             gradients: [HIDDEN + FEATURES, 3 * HIDDEN + FEATURES + 3],
             colors: 1,
         };
-        Plan { features, color }
+        DensityPlan { features, color }
     }
 
     /// Returns the first rows of W1ᵀ, W1, W2.
@@ -83,7 +83,7 @@ fn forward(
     c1: &mut [F4],
     c2: &mut [F4],
     out: &mut [F4],
-    #[comptime] plan: Plan,
+    #[comptime] plan: DensityPlan,
     #[comptime] colors: bool,
 ) {
     let rows = comptime!(plan.rows());
@@ -142,7 +142,7 @@ fn geometry_backward(
     g_o: &[F4],
     g_value: &mut [F4],
     partial: &mut [f32],
-    #[comptime] plan: Plan,
+    #[comptime] plan: DensityPlan,
 ) {
     let rows = comptime!(plan.rows());
     let inputs = comptime!(plan.features);
@@ -189,12 +189,12 @@ fn geometry_backward(
     }
 }
 
-/// Sets `broken` if a value of the gradient is not finite.
+/// Sets `non_finite` if a value of the gradient is not finite.
 #[cube(launch)]
-fn check(gradient: &[f32], broken: &mut [u32]) {
+fn check(gradient: &[f32], non_finite: &mut [u32]) {
     let i = ABSOLUTE_POS;
     if i < gradient.len() && !finite(gradient[i]) {
-        broken[0] = 1;
+        non_finite[0] = 1;
     }
 }
 
@@ -332,7 +332,7 @@ fn smooth(e: f32) -> f32 {
 
 /// A density field on a device, with the buffers of a training step for up to `rays` rays and `capacity` samples.
 pub struct Density {
-    plan: Plan,
+    plan: DensityPlan,
     grid: Grid,
     dt: f32,
     capacity: usize,
@@ -362,7 +362,7 @@ impl Density {
     /// Creates a field that is marched in steps of `dt`; `capacity` must be a multiple of [`TILE`].
     pub fn new(device: &Device, shape: &DensityShape, dt: f32, rays: usize, capacity: usize) -> Density {
         assert!(capacity.is_multiple_of(TILE) && capacity > 0 && Density::supports(shape));
-        let plan = Plan::new(shape);
+        let plan = DensityPlan::new(shape);
         let (prepared, summed) = plan.maps(shape);
         let planes = |count: usize| device.scratch::<f32>(count * capacity);
         Density {
@@ -406,12 +406,12 @@ impl Density {
 
     /// Returns the memory of the groups' partial gradient sums in words, for up to `capacity` samples.
     pub fn words_of_sums(shape: &DensityShape, capacity: usize) -> usize {
-        summing(capacity) * Plan::new(shape).color.gradients[1] * CHANNELS
+        summing(capacity) * DensityPlan::new(shape).color.gradients[1] * CHANNELS
     }
 
     /// Converts new network weights to the layout of the kernels.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
-        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, prepare::launch, groups(self.weights.word_count().div_ceil(UNITS as usize)), UNITS;
             flat, self.prepared_map, self.weights
         );
     }
@@ -431,7 +431,9 @@ impl Density {
         direction: Option<&Buffer>,
         count: &Buffer,
     ) -> &Buffer {
-        assert!(x.words() == 3 * self.capacity && direction.is_none_or(|d| d.words() == x.words()));
+        assert!(
+            x.word_count() == 3 * self.capacity && direction.is_none_or(|d| d.word_count() == x.word_count())
+        );
         self.grid.gather(device, table, x, count, &self.value, None);
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
@@ -448,7 +450,7 @@ impl Density {
     /// evaluation, and copies the remaining samples to `kept`.
     pub fn cut(&self, device: &Device, samples: &Samples, kept: &Samples) {
         let pass = |writes: bool| {
-            launch!(device, cut::launch, groups(kept.counts.words().div_ceil(UNITS as usize)), UNITS;
+            launch!(device, cut::launch, groups(kept.counts.word_count().div_ceil(UNITS as usize)), UNITS;
                 self.out, samples.offsets, kept.offsets, kept.counts, samples.t, samples.x, samples.direction,
                 kept.t, kept.x, kept.direction;
                 self.dt, writes
@@ -461,7 +463,7 @@ impl Density {
 
     /// Composites the samples of the last evaluation, and keeps the gradients of their losses for
     /// [`backward`](Density::backward).
-    pub fn losses(&self, device: &Device, samples: &Samples, batch: &Batch) {
+    pub fn losses(&self, device: &Device, samples: &Samples, batch: &DeviceBatch) {
         let offsets = &samples.offsets;
         let one = CubeCount::new_single();
         launch!(device, tally::launch, one, UNITS; offsets, batch.alpha, batch.alive, self.tally; true);
@@ -476,13 +478,13 @@ impl Density {
     }
 
     /// Adds the gradient with respect to the table, which must be zero before, writes that with respect to the weights, and
-    /// sets `broken` if the latter is not finite.
+    /// sets `non_finite` if the latter is not finite.
     pub fn backward(
         &self,
         device: &Device,
         samples: &Samples,
         [g_table, g_flat]: [&Buffer; 2],
-        broken: &Buffer,
+        non_finite: &Buffer,
     ) {
         let count = &samples.count;
         let (weights, partial, direction) = (&self.weights, &self.partial, &samples.direction);
@@ -500,7 +502,7 @@ impl Density {
         }
         let size = self.plan.color.gradients[1] * CHANNELS;
         sum_groups(device, partial, Some(&self.summed_map), count, g_flat, (size, TILE, summing));
-        launch!(device, check::launch, groups(g_flat.words().div_ceil(UNITS as usize)), UNITS; g_flat, broken);
+        launch!(device, check::launch, groups(g_flat.word_count().div_ceil(UNITS as usize)), UNITS; g_flat, non_finite);
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
     }
 

@@ -80,20 +80,27 @@ pub type Buffer = FloatTensor<Cube>;
 /// A tensor as kernels see it.
 pub trait Words {
     /// Returns the number of 32-bit words.
-    fn words(&self) -> usize;
+    fn word_count(&self) -> usize;
 
     /// Returns the buffer as a kernel argument.
     fn arg(&self) -> BufferArg;
+
+    /// Returns the handles of the buffer's memory.
+    fn handles(&self) -> [&Handle; 1];
 }
 
 impl Words for Buffer {
-    fn words(&self) -> usize {
+    fn word_count(&self) -> usize {
         self.meta.num_elements()
     }
 
     fn arg(&self) -> BufferArg {
         // SAFETY: the handle was allocated with this length.
-        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.words()) }
+        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.word_count()) }
+    }
+
+    fn handles(&self) -> [&Handle; 1] {
+        [&self.handle]
     }
 }
 
@@ -375,7 +382,7 @@ impl Device {
 
     /// Copies values into a buffer, from its word `first` on. They are sent at once: the driver keeps a copy until then.
     pub(super) fn write<T: Element>(&self, into: &Buffer, first: usize, values: Vec<T>) {
-        let behind = into.words() - first - values.len();
+        let behind = into.word_count() - first - values.len();
         let handle = into.handle.clone().offset_start(4 * first as u64).offset_end(4 * behind as u64);
         self.client.write(&handle, Bytes::from_elems(values));
         // A failure here also fails the next read.
@@ -416,12 +423,12 @@ impl Device {
             Ok(read) => read.map_err(|e| self.failed(format!("{e:?}")))?,
             Err(panic) => panic::resume_unwind(panic),
         };
-        Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.words() * 4]))
+        Ok(bytemuck::pod_collect_to_vec(&bytes[..buffer.word_count() * 4]))
     }
 
     /// Reads a part of a buffer's floats as [`Device::fetch`] does.
     pub(super) fn fetch_part(&self, buffer: &Buffer, part: Range<usize>) -> Result<Vec<f32>> {
-        let behind = buffer.words() - part.end;
+        let behind = buffer.word_count() - part.end;
         let handle = buffer.handle.clone().offset_start(4 * part.start as u64).offset_end(4 * behind as u64);
         self.fetch(&self.tensor(handle, part.len(), buffer.dtype))
     }
@@ -460,10 +467,10 @@ impl Device {
     }
 
     /// Notes where a kernel's first launch was refused: the error of a later read does not always name the kernel.
-    pub(super) fn launched<'h>(&self, kernel: &'static str, buffers: impl IntoIterator<Item = &'h Handle>) {
+    pub(super) fn launched<'h>(&self, kernel: &'static str, buffers: impl FnOnce() -> Vec<&'h Handle>) {
         let mut kernels = self.kernels.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
         if kernels.insert(kernel)
-            && let Err(e) = self.client.check(buffers)
+            && let Err(e) = self.client.check(buffers())
         {
             note(format!(
                 "the launch of `{}` was refused: {e:?}",
@@ -486,7 +493,8 @@ fn on_one_line(text: impl Display, limit: usize) -> String {
 }
 
 /// Launches a kernel and counts it: `launch!(device, kernel::launch, groups, threads; buffers; scalars)`, with the threads
-/// of one group. Unsafe with `kernel::launch_unchecked`.
+/// of one group. Unsafe with `kernel::launch_unchecked`. Something else than a buffer takes its place
+/// if it has the methods `arg` and `handles` of [`Words`]: several buffers that kernels take as a struct.
 macro_rules! launch {
     ($device:expr, $launch:expr, $groups:expr, $threads:expr; $($buffer:expr),+ $(; $($scalar:expr),+)?) => {{
         let device = &$device;
@@ -497,7 +505,9 @@ macro_rules! launch {
             $($buffer.arg(),)+
             $($($scalar,)+)?
         );
-        device.launched(concat!(module_path!(), "::", stringify!($launch)), [$(&$buffer.handle),+]);
+        device.launched(concat!(module_path!(), "::", stringify!($launch)), || {
+            [$(&$buffer.handles()[..]),+].concat()
+        });
     }};
 }
 pub(super) use launch;
@@ -714,7 +724,7 @@ pub(crate) mod tests {
         let sizes = std::iter::once(30).chain([7; 20]).chain([1; 8]);
         let all: Vec<Buffer> = sizes.map(|mib| device.zeros::<f32>(mib * MIB)).collect();
         device.read::<f32>(&all[all.len() - 1]);
-        let requested: usize = all.iter().map(|buffer| 4 * buffer.words()).sum();
+        let requested: usize = all.iter().map(|buffer| 4 * buffer.word_count()).sum();
         let taken = device.reserved_memory() - before;
         println!("{requested} bytes of buffers take {taken}");
         assert!(taken as f64 <= 1.05 * requested as f64, "{taken} of {requested}");

@@ -4,9 +4,11 @@
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::rng::{Wide, below, permuted, ranked, stream, uniform, upper_bound, word};
+use super::vec3::Vec3;
 use crate::geom::{Camera, Projection};
 use crate::kernel::cpu::march::MarchRay;
 use crate::math::rng;
+use burn::cubecl::server::Handle;
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
@@ -77,6 +79,50 @@ impl DrawnView {
 #[cube]
 fn number(views: &[u32], view: usize, i: usize) -> f32 {
     f32::reinterpret(views[view + i])
+}
+
+/// Three floats of a view.
+#[cube]
+fn vector(views: &[u32], view: usize, i: usize) -> Vec3 {
+    Vec3::new(number(views, view, i), number(views, view, i + 1), number(views, view, i + 2))
+}
+
+/// The photographs as kernels see them; [`Photographs`] documents the arrays.
+#[derive(CubeType, CubeLaunch)]
+struct PhotographArrays {
+    views: Box<[u32]>,
+    pixels0: Box<[u32]>,
+    pixels1: Box<[u32]>,
+    pixels2: Box<[u32]>,
+    pixels3: Box<[u32]>,
+    drawable: Box<[u32]>,
+    before: Box<[u32]>,
+}
+
+/// The rays that a kernel writes; [`DeviceBatch`] documents the arrays.
+#[derive(CubeType, CubeLaunch)]
+struct RayArrays {
+    origin: Box<[f32]>,
+    direction: Box<[f32]>,
+    jitter: Box<[f32]>,
+    color: Box<[f32]>,
+    alpha: Box<[f32]>,
+    background: Box<[f32]>,
+    alive: Box<[u32]>,
+}
+
+/// The random numbers of a step: keys of streams, and the permutation of all drawable pixels.
+#[derive(CubeType, CubeLaunch)]
+struct StepDraws {
+    view: Wide,
+    pixel: Wide,
+    jitter: Wide,
+    background: Wide,
+    permutation: Wide,
+    /// Half the number of bits of a permuted index.
+    half_bits: u32,
+    /// Place of the step's first ray in the order of the permutation.
+    first: u32,
 }
 
 /// A point of the picture's plane.
@@ -185,24 +231,31 @@ struct Square {
 
 /// Returns whether pixel `at` of a view's box is drawable.
 #[cube]
-fn is_drawable(views: &[u32], drawable: &[u32], view: usize, at: u32) -> bool {
-    (drawable[(views[view + FIRST_WORD] + (at >> 5)) as usize] >> (at & 31)) & 1 == 1
+fn is_drawable(photographs: &PhotographArrays, view: usize, at: u32) -> bool {
+    let word = photographs.views[view + FIRST_WORD] + (at >> 5);
+    (photographs.drawable[word as usize] >> (at & 31)) & 1 == 1
+}
+
+/// Returns pixel `at` of a view's box.
+#[cube]
+fn pixel_at(photographs: &PhotographArrays, view: usize, at: u32) -> u32 {
+    let at = (photographs.views[view + FIRST_PIXEL] + at) as usize;
+    let buffer = photographs.views[view + BUFFER];
+    if buffer == 0 {
+        photographs.pixels0[at]
+    } else if buffer == 1 {
+        photographs.pixels1[at]
+    } else if buffer == 2 {
+        photographs.pixels2[at]
+    } else {
+        photographs.pixels3[at]
+    }
 }
 
 /// Sums the square around a pixel of a view's box, at most `detail` wide; column and row are relative to the box.
 #[cube]
-fn square(
-    views: &[u32],
-    pixels0: &[u32],
-    pixels1: &[u32],
-    pixels2: &[u32],
-    pixels3: &[u32],
-    drawable: &[u32],
-    view: usize,
-    column: u32,
-    row: u32,
-    detail: f32,
-) -> Square {
+fn square(photographs: &PhotographArrays, view: usize, column: u32, row: u32, detail: f32) -> Square {
+    let views = &photographs.views;
     let (x0, y0, width, height) = (views[view + 1], views[view + 2], views[view + 3], views[view + 4]);
     let mut side = 1u32;
     for _ in 0..3u32 {
@@ -215,18 +268,8 @@ fn square(
     for y in max(top, y0)..min(top + side, y0 + height) {
         for x in max(left, x0)..min(left + side, x0 + width) {
             let at = (y - y0) * width + x - x0;
-            if is_drawable(views, drawable, view, at) {
-                let at = (views[view + FIRST_PIXEL] + at) as usize;
-                let buffer = views[view + BUFFER];
-                let pixel = if buffer == 0 {
-                    pixels0[at]
-                } else if buffer == 1 {
-                    pixels1[at]
-                } else if buffer == 2 {
-                    pixels2[at]
-                } else {
-                    pixels3[at]
-                };
+            if is_drawable(photographs, view, at) {
+                let pixel = pixel_at(photographs, view, at);
                 let alpha = pixel >> 24;
                 let share = select(views[view + OVER_BLACK] == 1, 255u32, alpha);
                 sums.x += x;
@@ -244,51 +287,34 @@ fn square(
 
 #[cube(launch)]
 fn draw_rays(
-    views: &[u32],
-    pixels0: &[u32],
-    pixels1: &[u32],
-    pixels2: &[u32],
-    pixels3: &[u32],
-    drawable: &[u32],
-    before: &[u32],
+    photographs: &PhotographArrays,
     wanted: &[u32],
-    origin: &mut [f32],
-    direction: &mut [f32],
-    jitter: &mut [f32],
-    color: &mut [f32],
-    alpha: &mut [f32],
-    background: &mut [f32],
-    alive: &mut [u32],
-    of_view: Wide,
-    of_pixel: Wide,
-    of_jitter: Wide,
-    of_background: Wide,
-    key: Wide,
-    half_bits: u32,
-    position: u32,
+    mut rays: RayArrays,
+    draws: &StepDraws,
     detail: f32,
     #[comptime] order: PixelOrder,
     #[comptime] shifted: bool,
     #[comptime] random: bool,
 ) {
-    let rays = jitter.len();
+    let count = rays.jitter.len();
     let r = ABSOLUTE_POS;
-    if r < rays {
+    if r < count {
+        let views = &photographs.views;
         let i = u32::cast_from(r);
         let all = views.len() / VIEW;
-        let count = views[(all - 1) * VIEW];
+        let pixels = views[(all - 1) * VIEW];
         // Index of the pixel among all drawable ones, unless views are drawn first.
         let mut which = 0u32;
         let mut wanted = i < wanted[0];
         let view = if comptime!(order == PixelOrder::EachView) {
-            below(&of_view, i, u32::cast_from(all)) as usize
+            below(&draws.view, i, u32::cast_from(all)) as usize
         } else {
             if comptime!(order.is_permuted()) {
                 // A batch may be larger than the number of drawable pixels.
-                wanted = wanted && position + i < count;
-                which = permuted(&key, half_bits, (position + i) % count, count);
+                wanted = wanted && draws.first + i < pixels;
+                which = permuted(&draws.permutation, draws.half_bits, (draws.first + i) % pixels, pixels);
             } else {
-                which = below(&of_view, i, count);
+                which = below(&draws.view, i, pixels);
             }
             // the first view whose running count exceeds the pixel's index
             upper_bound(views, 0usize, all, which, VIEW)
@@ -313,26 +339,16 @@ fn draw_rays(
                     rank = which - views[view - VIEW];
                 }
                 let words = (width * height).div_ceil(32u32) as usize;
-                ranked(before, drawable, views[view + FIRST_WORD] as usize, words, rank)
+                let first = views[view + FIRST_WORD] as usize;
+                ranked(&photographs.before, &photographs.drawable, first, words, rank)
             } else {
                 let k = (i << 9) | (attempt << 1);
-                let column = below(&of_pixel, k, width);
-                below(&of_pixel, k | 1, height) * width + column
+                let column = below(&draws.pixel, k, width);
+                below(&draws.pixel, k | 1, height) * width + column
             };
             attempt += 1;
-            if is_drawable(views, drawable, view, at) {
-                sums = square(
-                    views,
-                    pixels0,
-                    pixels1,
-                    pixels2,
-                    pixels3,
-                    drawable,
-                    view,
-                    at % width,
-                    at / width,
-                    detail,
-                );
+            if is_drawable(photographs, view, at) {
+                sums = square(photographs, view, at % width, at / width, detail);
                 let whole = f32::cast_from(sums.count);
                 let (u, v) = (f32::cast_from(sums.x) / whole, f32::cast_from(sums.y) / whole);
                 let xd = (u + 0.5f32 - number(views, view, CAMERA + 2)) / number(views, view, CAMERA);
@@ -347,36 +363,32 @@ fn draw_rays(
         }
         let kept = select(found, 1u32, 0u32);
         let full = f32::cast_from(255 * sums.count);
-        alive[r] = kept;
-        alpha[r] = f32::cast_from(kept * sums.alpha) / full;
-        color[r] = f32::cast_from(kept * sums.red) / (255.0f32 * full);
-        color[rays + r] = f32::cast_from(kept * sums.green) / (255.0f32 * full);
-        color[2 * rays + r] = f32::cast_from(kept * sums.blue) / (255.0f32 * full);
+        rays.alive[r] = kept;
+        rays.alpha[r] = f32::cast_from(kept * sums.alpha) / full;
+        let (red, green, blue) = (kept * sums.red, kept * sums.green, kept * sums.blue);
+        let color = Vec3::new(f32::cast_from(red), f32::cast_from(green), f32::cast_from(blue));
+        (color / (255.0f32 * full)).write(&mut rays.color, count, r);
         // cameras look along −Z
         let mut over = 1.0f32;
         if comptime!(order != PixelOrder::Permuted { depth_directions: true }) {
             over = 1.0f32 / (x * x + y * y + 1.0f32).sqrt();
         }
-        #[unroll]
-        for axis in 0..3usize {
-            let (right, up) =
-                (number(views, view, ROTATION + axis), number(views, view, ROTATION + 3 + axis));
-            let back = number(views, view, ROTATION + 6 + axis);
-            direction[axis * rays + r] = (right * x + up * y - back) * over;
-            origin[axis * rays + r] = number(views, view, POSITION + axis);
-        }
+        let (right, up) = (vector(views, view, ROTATION), vector(views, view, ROTATION + 3));
+        let back = vector(views, view, ROTATION + 6);
+        ((right * x + up * y - back) * over).write(&mut rays.direction, count, r);
+        vector(views, view, POSITION).write(&mut rays.origin, count, r);
         let mut shift = 0.0f32;
         if shifted {
-            shift = uniform(&of_jitter, i);
+            shift = uniform(&draws.jitter, i);
         }
-        jitter[r] = shift;
+        rays.jitter[r] = shift;
         #[unroll]
         for c in 0..3u32 {
             let mut channel = 0.0f32;
             if random {
-                channel = uniform(&of_background, 3 * i + c);
+                channel = uniform(&draws.background, 3 * i + c);
             }
-            background[c as usize * rays + r] = channel;
+            rays.background[c as usize * count + r] = channel;
         }
     }
 }
@@ -390,7 +402,7 @@ fn keep(wanted: &[u32], alive: &mut [u32]) {
 }
 
 /// Rays of a step, and the colors of their pixels.
-pub struct Batch {
+pub struct DeviceBatch {
     /// Planes `[3, rays]`, where they start, in the field's coordinates.
     pub origin: Buffer,
     /// Planes `[3, rays]`, unit directions.
@@ -407,10 +419,10 @@ pub struct Batch {
     pub alive: Buffer,
 }
 
-impl Batch {
+impl DeviceBatch {
     /// Allocates a batch with a capacity of `rays`, all inactive.
-    pub fn new(device: &Device, rays: usize) -> Batch {
-        Batch {
+    pub fn new(device: &Device, rays: usize) -> DeviceBatch {
+        DeviceBatch {
             origin: device.zeros::<f32>(3 * rays),
             direction: device.zeros::<f32>(3 * rays),
             jitter: device.zeros::<f32>(rays),
@@ -422,7 +434,7 @@ impl Batch {
     }
 
     /// Uploads rays into a batch of the given capacity, with black colors.
-    pub fn of_rays(device: &Device, rays: &[MarchRay], capacity: usize) -> Batch {
+    pub fn of_rays(device: &Device, rays: &[MarchRay], capacity: usize) -> DeviceBatch {
         assert!(rays.len() <= capacity);
         let mut planes = [vec![0f32; 3 * capacity], vec![0f32; 3 * capacity]];
         let (mut jitter, mut alive) = (vec![0f32; capacity], vec![0u32; capacity]);
@@ -433,18 +445,34 @@ impl Batch {
             }
             (jitter[r], alive[r]) = (ray.jitter, 1);
         }
-        Batch {
+        DeviceBatch {
             origin: device.upload(&planes[0]),
             direction: device.upload(&planes[1]),
             jitter: device.upload(&jitter),
             alive: device.upload(&alive),
-            ..Batch::new(device, capacity)
+            ..DeviceBatch::new(device, capacity)
         }
     }
 
     /// Returns the capacity in rays.
     pub fn rays(&self) -> usize {
-        self.jitter.words()
+        self.jitter.word_count()
+    }
+
+    fn arrays(&self) -> [&Buffer; 7] {
+        let DeviceBatch { origin, direction, jitter, color, alpha, background, alive } = self;
+        [origin, direction, jitter, color, alpha, background, alive]
+    }
+
+    /// Returns the buffers as a kernel argument.
+    fn arg(&self) -> RayArraysLaunch {
+        let [origin, direction, jitter, color, alpha, background, alive] = self.arrays().map(Words::arg);
+        RayArraysLaunch::new(origin, direction, jitter, color, alpha, background, alive)
+    }
+
+    /// Returns the handles of the buffers' memory.
+    fn handles(&self) -> [&Handle; 7] {
+        self.arrays().map(|buffer| &buffer.handle)
     }
 
     /// Deactivates all rays after the first `wanted`, `[1]`.
@@ -500,8 +528,8 @@ pub struct Photographs {
 }
 
 impl Photographs {
-    /// Copies photographs to the device, one after the other, into buffers of so many pixels, each photograph into the first
-    /// that it fits into; the field's coordinates are the scene's times `radius`.
+    /// Copies photographs to the device, one after the other, into buffers of the given sizes in pixels,
+    /// first fit; the field's coordinates are the scene's times `radius`.
     ///
     /// # Panics
     ///
@@ -544,6 +572,22 @@ impl Photographs {
         Photographs { views, pixels, drawable, before, count: cumulative, order, drawing }
     }
 
+    fn arrays(&self) -> [&Buffer; 7] {
+        let Photographs { views, pixels: [a, b, c, d], drawable, before, .. } = self;
+        [views, a, b, c, d, drawable, before]
+    }
+
+    /// Returns the buffers as a kernel argument.
+    fn arg(&self) -> PhotographArraysLaunch {
+        let [views, a, b, c, d, drawable, before] = self.arrays().map(Words::arg);
+        PhotographArraysLaunch::new(views, a, b, c, d, drawable, before)
+    }
+
+    /// Returns the handles of the buffers' memory.
+    fn handles(&self) -> [&Handle; 7] {
+        self.arrays().map(|buffer| &buffer.handle)
+    }
+
     /// Draws the rays of a step, which depend on seed and step alone. A ray of a large photograph stands for a square of
     /// pixels at most `detail` wide.
     ///
@@ -555,19 +599,18 @@ impl Photographs {
         device: &Device,
         (seed, step): (u64, u64),
         wanted: &Buffer,
-        into: &Batch,
+        into: &DeviceBatch,
         detail: f32,
     ) {
         let [view, pixel, shift, background] =
             [0, 1, 2, self.drawing.background_stream].map(|k| stream(seed, step << 4 | k));
         assert!(into.rays() < 1 << 22, "the number of a try has 32 bits");
         let permutation = rng::Permutation::of_step((seed, step), into.rays() as u64, self.count as u64);
-        let [pixels0, pixels1, pixels2, pixels3] = &self.pixels;
+        let (key, first) = (word(permutation.key), permutation.first as u32);
+        let draws = StepDrawsLaunch::new(view, pixel, shift, background, key, permutation.half_bits, first);
         launch!(device, draw_rays::launch, groups(into.rays().div_ceil(UNITS as usize)), UNITS;
-            self.views, pixels0, pixels1, pixels2, pixels3, self.drawable, self.before, wanted, into.origin,
-            into.direction, into.jitter, into.color, into.alpha, into.background, into.alive;
-            view, pixel, shift, background, word(permutation.key), permutation.half_bits,
-            permutation.first as u32, detail, self.order, self.drawing.jitter, self.drawing.background
+            self, wanted, into;
+            draws, detail, self.order, self.drawing.jitter, self.drawing.background
         );
     }
 }

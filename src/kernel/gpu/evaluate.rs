@@ -1,9 +1,9 @@
 //! Evaluation of a trained signed-distance field on a device, in batches that fill the device.
 
 use super::device::{Buffer, Device};
-use super::draw::Batch;
+use super::draw::DeviceBatch;
 use super::march::Samples;
-use super::neus::{Neus, Rays};
+use super::neus::Neus;
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
 use crate::Result;
@@ -13,14 +13,15 @@ use crate::kernel::cpu::neus::RAY_WIDTH;
 use crate::kernel::cpu::sdf::FieldShape;
 use std::ops::Range;
 
-/// Number of samples evaluated together, which takes about two hundred megabytes of memory.
-const CAPACITY: usize = 1 << 17;
+/// Number of samples evaluated together, which takes about two hundred megabytes of memory; fewer in
+/// tests, which drivers in software run.
+const CAPACITY: usize = if cfg!(test) { 1 << 15 } else { 1 << 17 };
 
 /// Smaller capacities for fewer points, because planes are copied whole.
 const FEWER: [usize; 2] = [1 << 10, 1 << 14];
 
 /// Number of rays marched together.
-const RAYS: usize = 1 << 14;
+const RAYS: usize = CAPACITY / 8;
 
 /// Transposes rows `[n, W]` to planes `[W, capacity]`.
 pub fn planes<const W: usize>(rows: &[[f32; W]], capacity: usize) -> Vec<f32> {
@@ -130,17 +131,12 @@ impl Evaluator {
         let mut out = Vec::with_capacity(rays.len());
         while out.len() < rays.len() {
             let own = &rays[out.len()..(out.len() + RAYS).min(rays.len())];
-            let batch = Batch::of_rays(device, own, RAYS);
+            let batch = DeviceBatch::of_rays(device, own, RAYS);
             samples.march(device, &self.occupancy, &batch, &step, usize::MAX, 0);
             let (x, view_dir, count) = (&samples.x, &samples.direction, &samples.count);
             let field = self.sdf.forward(device, &self.table, &self.flat, x, view_dir, count);
-            let bundle = Rays {
-                offsets: &samples.offsets,
-                direction: &batch.direction,
-                t: &samples.t,
-                dt: &samples.dt,
-            };
-            let seen: Vec<f32> = device.fetch(neus.forward(device, bundle, field, &self.inv_s, 1.0))?;
+            let composited = neus.forward(device, &batch, samples, field, &self.inv_s, 1.0);
+            let seen: Vec<f32> = device.fetch(composited)?;
             let alive: Vec<u32> = device.fetch(&batch.alive)?;
             // Rays that exceeded the sample capacity are marched again with the next batch.
             let done = alive[..own.len()].iter().position(|&a| a == 0).unwrap_or(own.len());
@@ -193,9 +189,9 @@ mod tests {
         let want = sdf::colors(&shape, &table, &weights, &x, &normal, None, &direction);
         agree("colors", &got.concat(), &planes(&want, x.len()), 1e-4);
 
-        // More rays and more samples than the buffers hold: 17,000 of about 15.
+        // More rays and more samples than the buffers hold: 4,300 of about 15.
         let step = 0.16;
-        let rays: Vec<MarchRay> = (0..17_000)
+        let rays: Vec<MarchRay> = (0..4_300)
             .map(|i| {
                 let d = direction[i % 700];
                 let origin = std::array::from_fn(|a| -3.0 * d[a] + rng::normal(1, 2, (3 * i + a) as u64));
@@ -206,20 +202,20 @@ mod tests {
         assert!(rays.len() > RAYS && marched(&rays[..RAYS]).t.len() > CAPACITY);
         let got = evaluator.render(&rays, step).unwrap();
         assert_eq!(got.len(), rays.len());
-        let some: Vec<usize> = (0..rays.len()).step_by(29).collect();
+        let some: Vec<usize> = (0..rays.len()).step_by(7).collect();
         let few: Vec<MarchRay> = some.iter().map(|&r| rays[r]).collect();
         let samples = marched(&few);
         let (x, d) = samples.points(&few);
         let field = sdf::forward(&shape, &table, &weights, &x, &d);
         let along: Vec<[f32; 3]> = few.iter().map(|r| r.direction).collect();
         let dt = vec![step; x.len()];
-        let bundle = crate::kernel::cpu::neus::Rays {
+        let segments = crate::kernel::cpu::neus::Segments {
             offsets: &samples.offsets,
             direction: &along,
             t: &samples.t,
             dt: &dt,
         };
-        let want = crate::kernel::cpu::neus::forward(bundle, field.output(), 20.0, 1.0);
+        let want = crate::kernel::cpu::neus::forward(segments, field.output(), 20.0, 1.0);
         let got: Vec<[f32; RAY_WIDTH]> = some.iter().map(|&r| got[r]).collect();
         agree("renders", got.as_flattened(), &want, 1e-4);
         assert!(flatten(x).len() > 20_000);

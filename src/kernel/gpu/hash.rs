@@ -3,6 +3,7 @@
 
 use super::device::{Atomics, Buffer, Device, MAX_GROUPS, Words, launch};
 use super::sum::{Exchange, FIXED_POINT_RANGE, Fixed, Native, Sum, group_sum};
+use super::vec3::Vec3;
 use crate::kernel::cpu::hash::Level;
 use crate::kernel::cpu::mlp::TILE;
 use burn::cubecl::{self, prelude::*};
@@ -31,9 +32,7 @@ struct Cell {
     low_x: u32,
     low_y: u32,
     low_z: u32,
-    fx: f32,
-    fy: f32,
-    fz: f32,
+    inside: Vec3,
 }
 
 /// Returns the cell of sample `s`.
@@ -48,9 +47,7 @@ fn cell(levels: &[u32], level: usize, x: &[f32], s: usize, capacity: usize, worl
         low_x: u32::cast_from(i32::cast_from(lx)),
         low_y: u32::cast_from(i32::cast_from(ly)),
         low_z: u32::cast_from(i32::cast_from(lz)),
-        fx: px - lx,
-        fy: py - ly,
-        fz: pz - lz,
+        inside: Vec3::new(px - lx, py - ly, pz - lz),
     }
 }
 
@@ -112,7 +109,8 @@ fn gather(
             for k in 0..8u32 {
                 let (ux, uy, uz) = comptime!((k & 1 == 1, k & 2 == 2, k & 4 == 4));
                 let e = table[entry(levels, level, &cell, k)];
-                let (wx, wy, wz) = (along(cell.fx, ux), along(cell.fy, uy), along(cell.fz, uz));
+                let f = cell.inside;
+                let (wx, wy, wz) = (along(f.x, ux), along(f.y, uy), along(f.z, uz));
                 v += e * Vector::new(wx * wy * wz);
                 if slopes {
                     jx += e * Vector::new(signed(wy * wz * slope, ux));
@@ -159,23 +157,20 @@ fn scatter<S: Sum>(
         let (g0, g1) = (g_value[plane], g_value[plane + capacity]);
         let mut q0 = 0.0f32;
         let mut q1 = 0.0f32;
-        let mut nx = 0.0f32;
-        let mut ny = 0.0f32;
-        let mut nz = 0.0f32;
+        let mut n = Vec3::zero();
         if slopes {
             let slope = f32::reinterpret(levels[level * LEVEL]) * world;
-            nx = g_normal[s] * slope;
-            ny = g_normal[capacity + s] * slope;
-            nz = g_normal[2 * capacity + s] * slope;
+            n = Vec3::read(g_normal, capacity, s) * slope;
             q0 = q[plane];
             q1 = q[plane + capacity];
         }
         #[unroll]
         for k in 0..8u32 {
             let (ux, uy, uz) = comptime!((k & 1 == 1, k & 2 == 2, k & 4 == 4));
-            let (wx, wy, wz) = (along(cell.fx, ux), along(cell.fy, uy), along(cell.fz, uz));
+            let f = cell.inside;
+            let (wx, wy, wz) = (along(f.x, ux), along(f.y, uy), along(f.z, uz));
             let w = wx * wy * wz;
-            let d = signed(nx * (wy * wz), ux) + signed(ny * (wx * wz), uy) + signed(nz * (wx * wy), uz);
+            let d = signed(n.x * (wy * wz), ux) + signed(n.y * (wx * wz), uy) + signed(n.z * (wx * wy), uz);
             let e = 2 * entry(levels, level, &cell, k);
             S::add(&gradient[e], g0 * w + q0 * d, unit);
             S::add(&gradient[e + 1], g1 * w + q1 * d, unit);
@@ -293,7 +288,7 @@ impl Grid {
         value: &Buffer,
         jacobian: Option<&Buffer>,
     ) {
-        let capacity = x.words() / 3;
+        let capacity = x.word_count() / 3;
         let groups = stepping_groups(capacity, self.count);
         launch!(device, gather::launch, groups, GROUP;
             table, self.levels, x, count, value, jacobian.unwrap_or(value);
@@ -318,7 +313,7 @@ impl Grid {
         slopes: Option<[&Buffer; 2]>,
     ) {
         let [q, g_normal] = slopes.unwrap_or([g_value, x]);
-        let capacity = x.words() / 3;
+        let capacity = x.word_count() / 3;
         let fixed = device.atomics() == Atomics::Fixed;
         if fixed {
             let groups = CubeCount::Static(BOUNDING as u32, self.active as u32, 1);

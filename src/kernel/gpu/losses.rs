@@ -1,8 +1,9 @@
 //! The training loss of the signed-distance field and its gradients: see [`crate::kernel::cpu::losses`].
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::Batch;
+use super::draw::DeviceBatch;
 use super::sum::group_sum;
+use super::vec3::Vec3;
 use crate::kernel::cpu::losses::{LossWeights, RAY_TERMS, SAMPLE_TERMS, TERMS};
 use crate::kernel::cpu::neus::RAY_WIDTH;
 use burn::cubecl::{self, prelude::*};
@@ -62,6 +63,22 @@ pub(super) fn tally(
     }
 }
 
+/// A loss term of a ray, and the derivative of the weighted term with respect to the opacity.
+#[derive(CubeType, Clone, Copy)]
+pub(super) struct OpacityTerm {
+    pub value: f32,
+    pub slope: f32,
+}
+
+/// Returns the binary cross entropy of an opacity with its target, times the ray's share in the mean.
+#[cube]
+pub(super) fn cross_entropy(opacity: f32, target: f32, share: f32, weight: f32) -> OpacityTerm {
+    let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
+    let value = -(target * p.ln() + (1.0f32 - target) * (1.0f32 - p).ln()) * share;
+    let by_p = ((1.0f32 - target) / (1.0f32 - p) - target / p) * share * weight;
+    OpacityTerm { value, slope: select(p == opacity, by_p, 0.0f32) }
+}
+
 /// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
 /// `[9, rays]`.
 #[cube(launch)]
@@ -100,18 +117,16 @@ fn of_rays(
             g_out[c * rays + r] = g - 2.0f32 * h * rgb_sample * head;
             g_opacity += h * h * rgb_sample * head - b * g;
         }
-        let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
         let ray_share = is_alive / max(f32::cast_from(tally[0]), 1.0f32);
-        let cross = -(a * p.ln() + (1.0f32 - a) * (1.0f32 - p).ln()) * ray_share;
-        let by_p = ((1.0f32 - a) / (1.0f32 - p) - a / p) * ray_share * mask;
-        g_out[3 * rays + r] = g_opacity + select(p == opacity, by_p, 0.0f32);
+        let entropy = cross_entropy(opacity, a, ray_share, mask);
+        g_out[3 * rays + r] = g_opacity + entropy.slope;
         for k in 4..8usize {
             g_out[k * rays + r] = 0.0f32;
         }
         g_out[8 * rays + r] = rgb_sample * head;
         terms[r] = square * share;
         terms[rays + r] = sample_error * head;
-        terms[2 * rays + r] = cross;
+        terms[2 * rays + r] = entropy.value;
     }
 }
 
@@ -131,13 +146,13 @@ fn of_samples(
     if s < count[0] as usize {
         let share = 1.0f32 / f32::cast_from(count[0]);
         let f = field[s];
-        let (x, y, z) = (field[plane + s], field[2 * plane + s], field[3 * plane + s]);
-        let length = (x * x + y * y + z * z + 1e-12f32).sqrt();
+        let gradient = Vec3::read(field, plane, plane + s);
+        let length = (gradient.dot(gradient) + 1e-12f32).sqrt();
         let excess = length - 1.0f32;
         let g = 2.0f32 * excess / length * share * eikonal;
-        g_field[plane + s] += g * x;
-        g_field[2 * plane + s] += g * y;
-        g_field[3 * plane + s] += g * z;
+        g_field[plane + s] += g * gradient.x;
+        g_field[2 * plane + s] += g * gradient.y;
+        g_field[3 * plane + s] += g * gradient.z;
         let closeness = (-scale * f.abs()).exp() * share;
         let sign = select(f > 0.0f32, 1.0f32, select(f < 0.0f32, -1.0f32, 0.0f32));
         g_field[s] -= scale * sign * closeness * sparsity;
@@ -211,13 +226,19 @@ impl Losses {
 
     /// Computes the losses of rays, and returns the gradients with respect to the output of
     /// [`Neus::forward`](super::Neus::forward), planes `[9, rays]`. offsets: `[rays + 1]`.
-    pub fn of_rays(&self, device: &Device, composed: &Buffer, batch: &Batch, offsets: &Buffer) -> &Buffer {
+    pub fn of_rays(
+        &self,
+        device: &Device,
+        composed: &Buffer,
+        batch: &DeviceBatch,
+        offsets: &Buffer,
+    ) -> &Buffer {
         let w = &self.weights;
-        let Batch { color, alpha, background, alive, .. } = batch;
+        let DeviceBatch { color, alpha, background, alive, .. } = batch;
         let tally = &self.tally;
         let one = CubeCount::new_single();
         launch!(device, tally::launch, one, UNITS; offsets, alpha, alive, tally; true);
-        launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, of_rays::launch, groups(alpha.word_count().div_ceil(UNITS as usize)), UNITS;
             composed, color, alpha, background, alive, offsets, tally, self.g_out, self.ray_terms;
             w.rgb_mse, w.rgb_sample, w.mask
         );
@@ -228,7 +249,7 @@ impl Losses {
     /// `[8, capacity]`.
     pub fn of_samples(&self, device: &Device, field: &Buffer, count: &Buffer, g_field: &Buffer) {
         let w = &self.weights;
-        let capacity = self.sample_terms.words() / SAMPLE_TERMS;
+        let capacity = self.sample_terms.word_count() / SAMPLE_TERMS;
         launch!(device, of_samples::launch, groups(capacity.div_ceil(UNITS as usize)), UNITS;
             field, count, g_field, self.sample_terms; w.eikonal, w.sparsity, w.sparsity_scale
         );
@@ -257,7 +278,8 @@ impl Losses {
 #[cfg(test)]
 mod tests {
     use super::super::device::tests::{agree, device, planes};
-    use super::super::neus::{Neus, Rays};
+    use super::super::march::Samples;
+    use super::super::neus::Neus;
     use super::*;
     use crate::math::rng;
 
@@ -367,22 +389,26 @@ mod tests {
         case.alpha.push(1.0);
         let inv_s = 30f32;
         let up = |v: &[f32]| device.upload(v);
-        let (offsets, direction) = (device.upload(&case.offsets), up(&planes(&case.direction, 6)));
-        let (t, dt) = (up(&[1.0; 24]), up(&[STEP as f32; 24]));
-        let rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let samples = Samples {
+            offsets: device.upload(&case.offsets),
+            t: up(&[1.0; 24]),
+            dt: up(&[STEP as f32; 24]),
+            ..Samples::new(&device, 6, 24)
+        };
         let (field, sharp) = (up(&planes(&case.field, 24)), up(&[inv_s]));
-        let batch = Batch {
+        let batch = DeviceBatch {
+            direction: up(&planes(&case.direction, 6)),
             color: up(&planes(&case.color, 6)),
             background: up(&planes(&case.background, 6)),
             alpha: up(&case.alpha),
             alive: device.upload(&[1u32, 1, 1, 1, 1, 0]),
-            ..Batch::new(&device, 6)
+            ..DeviceBatch::new(&device, 6)
         };
         let (neus, losses) = (Neus::new(&device, 6, 24), Losses::new(&device, WEIGHTS, 6, 24));
         let (count, g_s) = (device.upload(&[24u32]), device.zeros::<f32>(1));
-        let composed = neus.forward(&device, rays, &field, &sharp, ANNEAL as f32);
-        let g_out = losses.of_rays(&device, composed, &batch, &offsets);
-        let g_field = neus.backward(&device, rays, &field, &sharp, ANNEAL as f32, g_out, &g_s);
+        let composed = neus.forward(&device, &batch, &samples, &field, &sharp, ANNEAL as f32);
+        let g_out = losses.of_rays(&device, composed, &batch, &samples.offsets);
+        let g_field = neus.backward(&device, &batch, &samples, &field, &sharp, ANNEAL as f32, g_out, &g_s);
         losses.of_samples(&device, &field, &count, g_field);
         (0..2).for_each(|_| losses.add(&device, &count, &up(&[0.25, 0.5])));
         let sums = losses.sums();

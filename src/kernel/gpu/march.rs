@@ -3,8 +3,9 @@
 //! samples.
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::Batch;
+use super::draw::DeviceBatch;
 use super::occupancy::Occupancy;
+use super::vec3::Vec3;
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
@@ -54,6 +55,17 @@ fn border(g: f32, cell: i32, d: f32) -> f32 {
     select(d == 0.0f32, FAR, (wall - g) * (1.0f32 / d))
 }
 
+/// Returns the number of samples of a ray that are written. A ray whose samples exceed the capacity is
+/// marked as not alive.
+#[cube]
+pub(super) fn room(offsets: &[u32], counts: &[u32], alive: &mut [u32], r: usize) -> u32 {
+    let room = offsets[r + 1] - offsets[r];
+    if room < counts[r] {
+        alive[r] = 0;
+    }
+    room
+}
+
 /// Counts the samples of rays or, if `writes` is set, writes them at the given offsets.
 #[cube(launch)]
 fn pass(
@@ -80,11 +92,11 @@ fn pass(
     let plane = t.len();
     let r = ABSOLUTE_POS;
     if r < rays {
-        let (ox, oy, oz) = (origin[r], origin[rays + r], origin[2 * rays + r]);
-        let (dx, dy, dz) = (direction[r], direction[rays + r], direction[2 * rays + r]);
-        let span = clipped(Span { enter: 0.0f32, leave: FAR }, ox, dx, radius);
-        let span = clipped(span, oy, dy, radius);
-        let span = clipped(span, oz, dz, radius);
+        let o = Vec3::read(origin, rays, r);
+        let d = Vec3::read(direction, rays, r);
+        let span = clipped(Span { enter: 0.0f32, leave: FAR }, o.x, d.x, radius);
+        let span = clipped(span, o.y, d.y, radius);
+        let span = clipped(span, o.z, d.z, radius);
         let top = i32::cast_from(resolution) - 1;
         let scale = 0.5f32 * f32::cast_from(resolution) / radius;
         let step = step_length[0];
@@ -93,10 +105,7 @@ fn pass(
         let mut max_count = limit;
         if writes {
             first = offsets[r] as usize;
-            max_count = offsets[r + 1] - offsets[r];
-            if max_count < counts[r] {
-                alive[r] = 0;
-            }
+            max_count = room(offsets, &*counts, alive, r);
         }
         let mut found = 0u32;
         let mut k = 0u32;
@@ -107,9 +116,9 @@ fn pass(
             if at >= span.leave {
                 marching = false;
             } else {
-                let (px, py, pz) = (ox + at * dx, oy + at * dy, oz + at * dz);
-                let (gx, gy, gz) = ((px + radius) * scale, (py + radius) * scale, (pz + radius) * scale);
-                let (cx, cy, cz) = (cell(gx, top), cell(gy, top), cell(gz, top));
+                let p = o + d * at;
+                let g = (p + Vec3::new(radius, radius, radius)) * scale;
+                let (cx, cy, cz) = (cell(g.x, top), cell(g.y, top), cell(g.z, top));
                 let i =
                     (u32::cast_from(cx) * resolution + u32::cast_from(cy)) * resolution + u32::cast_from(cz);
                 if bit(mask, i) {
@@ -117,18 +126,14 @@ fn pass(
                         let s = first + found as usize;
                         t[s] = at;
                         dt[s] = step;
-                        x[s] = px;
-                        x[plane + s] = py;
-                        x[2 * plane + s] = pz;
-                        view_dir[s] = dx;
-                        view_dir[plane + s] = dy;
-                        view_dir[2 * plane + s] = dz;
+                        p.write(x, plane, s);
+                        d.write(view_dir, plane, s);
                     }
                     found += 1;
                     k += 1;
                     marching = found < max_count;
                 } else {
-                    let far = min(border(gx, cx, dx), min(border(gy, cy, dy), border(gz, cz, dz)));
+                    let far = min(border(g.x, cx, d.x), min(border(g.y, cy, d.y), border(g.z, cz, d.z)));
                     let skip = max((max(far, 0.0f32) / (scale * step)).ceil(), 1.0f32);
                     k += u32::cast_from(min(skip, 1e9f32));
                     if has_solid && bit(solid, i) {
@@ -200,8 +205,23 @@ pub(super) fn prefix_sum(
     total: &Buffer,
     capacity: usize,
 ) {
-    assert_eq!(offsets.words(), counts.words() + 1);
+    assert_eq!(offsets.word_count(), counts.word_count() + 1);
     launch!(device, scan::launch, CubeCount::new_single(), UNITS; counts, offsets, total; capacity as u32);
+}
+
+/// Marches rays without a readback: counts their samples with `pass(false)`, sums the counts as
+/// [`prefix_sum`] does, and writes the samples with `pass(true)`.
+pub(super) fn count_and_write(
+    device: &Device,
+    counts: &Buffer,
+    offsets: &Buffer,
+    total: &Buffer,
+    capacity: usize,
+    pass: impl Fn(bool),
+) {
+    pass(false);
+    prefix_sum(device, counts, offsets, total, capacity);
+    pass(true);
 }
 
 /// The samples of a batch of rays on a device.
@@ -243,12 +263,12 @@ impl Samples {
         &self,
         device: &Device,
         occupancy: &Occupancy,
-        rays: &Batch,
+        rays: &DeviceBatch,
         step_length: &Buffer,
         limit: usize,
         reserved: usize,
     ) {
-        assert!(rays.rays() == self.counts.words() && reserved < self.t.words());
+        assert!(rays.rays() == self.counts.word_count() && reserved < self.t.word_count());
         let run_pass = |writes: bool| {
             launch!(device, pass::launch, groups(rays.rays().div_ceil(UNITS as usize)), UNITS;
                 occupancy.mask, occupancy.solid.as_ref().unwrap_or(&occupancy.mask), rays.origin,
@@ -258,9 +278,8 @@ impl Samples {
                 occupancy.solid.is_some()
             );
         };
-        run_pass(false);
-        prefix_sum(device, &self.counts, &self.offsets, &self.count, self.t.words() - reserved);
-        run_pass(true);
+        let capacity = self.t.word_count() - reserved;
+        count_and_write(device, &self.counts, &self.offsets, &self.count, capacity, run_pass);
     }
 }
 
@@ -311,7 +330,7 @@ mod tests {
     ) -> (Samples, Vec<u32>) {
         // the buffers have capacity for more rays and samples than are used
         let samples = Samples::new(device, rays.len() + 5, capacity + 3);
-        let batch = Batch::of_rays(device, rays, rays.len() + 5);
+        let batch = DeviceBatch::of_rays(device, rays, rays.len() + 5);
         samples.march(device, occupancy, &batch, &device.upload(&[STEP]), limit, 3);
         (samples, device.read(&batch.alive))
     }

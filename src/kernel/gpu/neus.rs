@@ -1,7 +1,11 @@
 //! NeuS compositing of ragged rays, one thread per ray: see [`crate::kernel::cpu::neus`].
 
+use super::composite::Composited;
 use super::device::{Buffer, Device, Words, groups, launch};
+use super::draw::DeviceBatch;
+use super::march::Samples;
 use super::sum::group_sum;
+use super::vec3::Vec3;
 use crate::kernel::cpu::neus::MIN_GRADIENT_NORM;
 use crate::kernel::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
@@ -23,9 +27,7 @@ struct Sample {
     half: f32,
     ic_by_cos: f32,
     sharp: f32,
-    nx: f32,
-    ny: f32,
-    nz: f32,
+    normal: Vec3,
     length: f32,
 }
 
@@ -53,23 +55,21 @@ fn opacities(field: &[f32], inv_s: &[f32], count: &[u32], out: &mut [f32], step:
     }
 }
 
-/// Evaluates sample `s` of a ray in direction `(dx, dy, dz)`.
+/// Evaluates sample `s` of a ray in a direction.
 #[cube]
 fn sample(
     field: &[f32],
     plane: usize,
     s: usize,
     dt: f32,
-    dx: f32,
-    dy: f32,
-    dz: f32,
+    direction: Vec3,
     inv_s: f32,
     anneal: f32,
 ) -> Sample {
-    let (x, y, z) = (field[plane + s], field[2 * plane + s], field[3 * plane + s]);
-    let length = max((x * x + y * y + z * z).sqrt(), 1e-12f32);
-    let (nx, ny, nz) = (x / length, y / length, z / length);
-    let cos = dx * nx + dy * ny + dz * nz;
+    let gradient = Vec3::read(field, plane, plane + s);
+    let length = max(gradient.length(), 1e-12f32);
+    let normal = gradient / length;
+    let cos = direction.dot(normal);
     let (soft, hard) = (0.5f32 - 0.5f32 * cos, -cos);
     let ic = -(max(soft, 0.0f32) * (1.0f32 - anneal) + max(hard, 0.0f32) * anneal);
     let by_soft = select(soft > 0.0f32, 0.5f32 * (1.0f32 - anneal), 0.0f32);
@@ -88,9 +88,7 @@ fn sample(
         half,
         ic_by_cos: by_soft + by_hard,
         sharp,
-        nx,
-        ny,
-        nz,
+        normal,
         length,
     }
 }
@@ -113,41 +111,24 @@ fn forward(
     let r = ABSOLUTE_POS;
     if r < rays {
         let inv_s = clamp(inv_s[0], 1e-6f32, 1e6f32);
-        let (dx, dy, dz) = (direction[r], direction[rays + r], direction[2 * rays + r]);
+        let d = Vec3::read(direction, rays, r);
         let mut transmittance = 1.0f32;
-        let mut red = 0.0f32;
-        let mut green = 0.0f32;
-        let mut blue = 0.0f32;
-        let mut opacity = 0.0f32;
-        let mut depth = 0.0f32;
-        let mut nx = 0.0f32;
-        let mut ny = 0.0f32;
-        let mut nz = 0.0f32;
+        let mut sums = Composited::empty();
+        let mut normal = Vec3::zero();
         let mut squares = 0.0f32;
         for s in (offsets[r] as usize)..(offsets[r + 1] as usize) {
-            let a = sample(field, plane, s, dt[s], dx, dy, dz, inv_s, anneal);
+            let a = sample(field, plane, s, dt[s], d, inv_s, anneal);
             let w = transmittance * a.alpha;
-            let (c0, c1, c2) = (field[4 * plane + s], field[5 * plane + s], field[6 * plane + s]);
-            red += w * c0;
-            green += w * c1;
-            blue += w * c2;
-            squares += w * (c0 * c0 + c1 * c1 + c2 * c2);
-            opacity += w;
-            depth += w * t[s];
-            nx += w * a.nx;
-            ny += w * a.ny;
-            nz += w * a.nz;
+            let color = Vec3::read(field, plane, 4 * plane + s);
+            sums.rgb.add_weighted(w, color);
+            squares += w * color.dot(color);
+            sums.add(w, t[s]);
+            normal.add_weighted(w, a.normal);
             light[s] = transmittance;
             transmittance *= 1.0f32 - a.alpha;
         }
-        out[r] = red;
-        out[rays + r] = green;
-        out[2 * rays + r] = blue;
-        out[3 * rays + r] = opacity;
-        out[4 * rays + r] = depth;
-        out[5 * rays + r] = nx;
-        out[6 * rays + r] = ny;
-        out[7 * rays + r] = nz;
+        sums.write(out, rays, r);
+        normal.write(out, rays, 5 * rays + r);
         out[8 * rays + r] = squares;
     }
 }
@@ -173,31 +154,29 @@ fn backward(
     let r = ABSOLUTE_POS;
     if r < rays {
         let inv_s = clamp(inv_s[0], 1e-6f32, 1e6f32);
-        let (dx, dy, dz) = (direction[r], direction[rays + r], direction[2 * rays + r]);
-        let (g0, g1, g2, g3) = (g_out[r], g_out[rays + r], g_out[2 * rays + r], g_out[3 * rays + r]);
-        let (g4, g5) = (g_out[4 * rays + r], g_out[5 * rays + r]);
-        let (g6, g7, g8) = (g_out[6 * rays + r], g_out[7 * rays + r], g_out[8 * rays + r]);
+        let d = Vec3::read(direction, rays, r);
+        let g_rgb = Vec3::read(g_out, rays, r);
+        let (g_opacity, g_depth) = (g_out[3 * rays + r], g_out[4 * rays + r]);
+        let g_normal = Vec3::read(g_out, rays, 5 * rays + r);
+        let g_squares = g_out[8 * rays + r];
         let (begin, end) = (offsets[r] as usize, offsets[r + 1] as usize);
         let mut farther = 0.0f32; // Σ_{j>k} w_j g_w_j
         let mut sum = 0.0f32;
         for k in 0..end - begin {
             let s = end - 1 - k;
-            let a = sample(field, plane, s, dt[s], dx, dy, dz, inv_s, anneal);
-            let (c0, c1, c2) = (field[4 * plane + s], field[5 * plane + s], field[6 * plane + s]);
-            let g_w = g0 * c0
-                + g1 * c1
-                + g2 * c2
-                + g8 * (c0 * c0 + c1 * c1 + c2 * c2)
-                + g3
-                + g4 * t[s]
-                + g5 * a.nx
-                + g6 * a.ny
-                + g7 * a.nz;
+            let a = sample(field, plane, s, dt[s], d, inv_s, anneal);
+            let color = Vec3::read(field, plane, 4 * plane + s);
+            // from left to right, without brackets around the dot product of the normals
+            let g_w = g_rgb.dot(color)
+                + g_squares * color.dot(color)
+                + g_opacity
+                + g_depth * t[s]
+                + g_normal.x * a.normal.x
+                + g_normal.y * a.normal.y
+                + g_normal.z * a.normal.z;
             let transmittance = light[s];
             let w = transmittance * a.alpha;
-            g_field[4 * plane + s] = w * (g0 + 2.0f32 * g8 * c0);
-            g_field[5 * plane + s] = w * (g1 + 2.0f32 * g8 * c1);
-            g_field[6 * plane + s] = w * (g2 + 2.0f32 * g8 * c2);
+            ((g_rgb + color * (2.0f32 * g_squares)) * w).write(g_field, plane, 4 * plane + s);
             let g_alpha = transmittance * g_w - farther / max(1.0f32 - a.alpha, 1e-10f32);
             farther += w * g_w;
             // the gradient by the unit normal has two parts: as composited, and through the cosine
@@ -216,12 +195,10 @@ fn backward(
             g_field[s] = g_sdf;
             g_field[7 * plane + s] = ln;
             sum += ln;
-            let (nx, ny, nz) = (w * g5 + g_cos * dx, w * g6 + g_cos * dy, w * g7 + g_cos * dz);
-            let radial = a.nx * nx + a.ny * ny + a.nz * nz;
+            let by_normal = g_normal * w + d * g_cos;
+            let radial = a.normal.dot(by_normal);
             let share = select(a.length > MIN_GRADIENT_NORM, 1.0f32 / a.length, 0.0f32);
-            g_field[plane + s] = (nx - a.nx * radial) * share;
-            g_field[2 * plane + s] = (ny - a.ny * radial) * share;
-            g_field[3 * plane + s] = (nz - a.nz * radial) * share;
+            ((by_normal - a.normal * radial) * share).write(g_field, plane, plane + s);
         }
         g_ln[r] = sum;
     }
@@ -241,19 +218,6 @@ fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
         let s = inv_s[0];
         g_inv_s[0] = select(clamp(s, 1e-6f32, 1e6f32) == s, total / s, 0.0f32);
     }
-}
-
-/// The ragged samples of a batch of rays on a device, sorted by ray and then by `t`.
-#[derive(Clone, Copy)]
-pub struct Rays<'a> {
-    /// `[rays + 1]`: ray `r` owns samples `offsets[r]..offsets[r + 1]`.
-    pub offsets: &'a Buffer,
-    /// Planes `[3, rays]`, unit directions.
-    pub direction: &'a Buffer,
-    /// `[capacity]` midpoints.
-    pub t: &'a Buffer,
-    /// `[capacity]` lengths.
-    pub dt: &'a Buffer,
 }
 
 /// Buffers of compositing and its gradients.
@@ -291,7 +255,7 @@ impl Neus {
         step: f32,
     ) -> &Buffer {
         let out = &self.light;
-        launch!(device, opacities::launch, groups(out.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, opacities::launch, groups(out.word_count().div_ceil(UNITS as usize)), UNITS;
             field, inv_s, count, out; step
         );
         out
@@ -302,17 +266,20 @@ impl Neus {
         &self.g_field
     }
 
-    /// Composites the field's output, planes `[8, capacity]`, and returns planes `[9, rays]`; inv_s: `[1]`.
+    /// Composites the field's output at the samples of rays, planes `[8, capacity]`, and returns planes
+    /// `[9, rays]`; inv_s: `[1]`.
     pub fn forward(
         &self,
         device: &Device,
-        rays: Rays,
+        rays: &DeviceBatch,
+        samples: &Samples,
         field: &Buffer,
         inv_s: &Buffer,
         anneal: f32,
     ) -> &Buffer {
-        launch!(device, forward::launch, groups(self.g_ln.words().div_ceil(UNITS as usize)), UNITS;
-            rays.offsets, rays.direction, rays.t, rays.dt, field, inv_s, self.out, self.light; anneal
+        launch!(device, forward::launch, groups(self.g_ln.word_count().div_ceil(UNITS as usize)), UNITS;
+            samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.out, self.light;
+            anneal
         );
         &self.out
     }
@@ -322,16 +289,17 @@ impl Neus {
     pub fn backward(
         &self,
         device: &Device,
-        rays: Rays,
+        rays: &DeviceBatch,
+        samples: &Samples,
         field: &Buffer,
         inv_s: &Buffer,
         anneal: f32,
         g_out: &Buffer,
         g_inv_s: &Buffer,
     ) -> &Buffer {
-        launch!(device, backward::launch, groups(self.g_ln.words().div_ceil(UNITS as usize)), UNITS;
-            rays.offsets, rays.direction, rays.t, rays.dt, field, inv_s, self.light, g_out, self.g_field,
-            self.g_ln;
+        launch!(device, backward::launch, groups(self.g_ln.word_count().div_ceil(UNITS as usize)), UNITS;
+            samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.light, g_out,
+            self.g_field, self.g_ln;
             anneal
         );
         let one = CubeCount::new_single();
@@ -353,24 +321,30 @@ mod tests {
     /// Runs forward and backward pass, and returns the results of the device and of the CPU.
     fn device_and_cpu(
         device: &Device,
-        rays: neus::Rays,
+        segments: neus::Segments,
         field: &[[f32; WIDTH]],
         inv_s: f32,
         anneal: f32,
         g: &[[f32; RAY_WIDTH]],
     ) -> [Results; 2] {
-        let (n, count) = (field.len(), rays.direction.len());
+        let (n, count) = (field.len(), segments.direction.len());
         let device_neus = Neus::new(device, count, n);
-        let (offsets, direction) =
-            (device.upload(rays.offsets), device.upload(&planes(rays.direction, count)));
-        let (t, dt) = (device.upload(rays.t), device.upload(rays.dt));
-        let device_rays = Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let direction = device.upload(&planes(segments.direction, count));
+        let rays = DeviceBatch { direction, ..DeviceBatch::new(device, count) };
+        let samples = Samples {
+            offsets: device.upload(segments.offsets),
+            t: device.upload(segments.t),
+            dt: device.upload(segments.dt),
+            ..Samples::new(device, count, n)
+        };
         let (device_field, device_inv_s) = (device.upload(&planes(field, n)), device.upload(&[inv_s]));
-        let out = device.read(device_neus.forward(device, device_rays, &device_field, &device_inv_s, anneal));
+        let composited = device_neus.forward(device, &rays, &samples, &device_field, &device_inv_s, anneal);
+        let out = device.read(composited);
         let (g_out, g_s) = (device.upload(&planes(g, count)), device.zeros::<f32>(1));
         let g_field = device.read(device_neus.backward(
             device,
-            device_rays,
+            &rays,
+            &samples,
             &device_field,
             &device_inv_s,
             anneal,
@@ -378,8 +352,8 @@ mod tests {
             &g_s,
         ));
         let flat = field.as_flattened();
-        let want = neus::forward(rays, flat, inv_s, anneal);
-        let (want_field, want_s) = neus::backward(rays, flat, inv_s, anneal, g.as_flattened());
+        let want = neus::forward(segments, flat, inv_s, anneal);
+        let (want_field, want_s) = neus::backward(segments, flat, inv_s, anneal, g.as_flattened());
         let [want, want_field] =
             [planes::<RAY_WIDTH>(want.as_chunks().0, count), planes::<WIDTH>(want_field.as_chunks().0, n)];
         [(out, g_field, device.read::<f32>(&g_s)[0]), (want, want_field, want_s)]
@@ -416,11 +390,11 @@ mod tests {
             }
         }
         let dt = vec![0.01f32; n];
-        let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments = neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let g: Vec<[f32; RAY_WIDTH]> =
             (0..200).map(|r| std::array::from_fn(|k| normal(5, RAY_WIDTH * r + k))).collect();
         for (inv_s, anneal) in [(20.0, 0.0), (60.0, 0.4), (200.0, 1.0)] {
-            let [got, want] = device_and_cpu(&device, rays, &field, inv_s, anneal, &g);
+            let [got, want] = device_and_cpu(&device, segments, &field, inv_s, anneal, &g);
             agree("rays", &got.0, &want.0, 1e-4);
             for k in 0..8 {
                 // the gradient by the sdf is a difference of nearly equal numbers, which is no more accurate on the CPU
@@ -447,10 +421,10 @@ mod tests {
         let offsets: Vec<i32> = (0..=count as i32).map(|r| 4 * r).collect();
         let direction = vec![[0.6, 0.0, -0.8]; count];
         let (t, dt) = ([1.0, 1.1, 1.2, 1.3].repeat(count), [1e-9, 0.05, 3.0, 1e3].repeat(count));
-        let rays = neus::Rays { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments = neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
         let g = vec![[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]; count];
         for inv_s in [0.0, 1e-6, 1.0, 1e6, 1e9] {
-            let [(out, g_field, g_s), _] = device_and_cpu(&device, rays, &field, inv_s, 1.0, &g);
+            let [(out, g_field, g_s), _] = device_and_cpu(&device, segments, &field, inv_s, 1.0, &g);
             // sample i of all planes
             let of = |values: &[f32], n: usize, i: usize| -> Vec<f32> {
                 values.iter().skip(i).step_by(n).copied().collect()

@@ -2,6 +2,7 @@
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::sdf::Sdf;
+use super::vec3::Vec3;
 use crate::Result;
 use crate::geom::BitGrid;
 use crate::kernel::cpu::occupancy::BandRule;
@@ -34,9 +35,9 @@ fn centers(
     if s < batch as usize {
         let i = cells[first as usize + s];
         let cell = 2.0f32 * radius / f32::cast_from(resolution);
-        x[s] = center(i / (resolution * resolution), cell, radius);
-        x[plane + s] = center(i / resolution % resolution, cell, radius);
-        x[2 * plane + s] = center(i % resolution, cell, radius);
+        let at_x = center(i / (resolution * resolution), cell, radius);
+        let at_y = center(i / resolution % resolution, cell, radius);
+        Vec3::new(at_x, at_y, center(i % resolution, cell, radius)).write(x, plane, s);
     }
     if s == 0 {
         count[0] = batch;
@@ -141,7 +142,7 @@ pub struct Occupancy {
 }
 
 /// Converts 64-bit words to the 32-bit words of a device.
-pub(super) fn words(bits: &[u64]) -> Vec<u32> {
+pub(super) fn u32_words(bits: &[u64]) -> Vec<u32> {
     bits.iter().flat_map(|&w| [w as u32, (w >> 32) as u32]).collect()
 }
 
@@ -149,7 +150,7 @@ impl Occupancy {
     /// Uploads masks.
     pub fn new(device: &Device, mask: &BitGrid, solid: Option<&BitGrid>, radius: f32) -> Occupancy {
         assert!(solid.is_none_or(|s| s.resolution == mask.resolution));
-        let upload = |mask: &BitGrid| device.upload(&words(&mask.bits));
+        let upload = |mask: &BitGrid| device.upload(&u32_words(&mask.bits));
         Occupancy { mask: upload(mask), solid: solid.map(upload), resolution: mask.resolution, radius }
     }
 
@@ -167,7 +168,7 @@ impl Occupancy {
 }
 
 /// Update rule of a band around the zero level set: see [`crate::kernel::cpu::occupancy::update_band`].
-pub struct Band {
+pub struct BandUpdate {
     cells: Buffer,
     allowed: Buffer,
     value: Buffer,
@@ -176,14 +177,14 @@ pub struct Band {
     rule: BandRule,
 }
 
-impl Band {
+impl BandUpdate {
     /// Creates the rule; cells outside `allowed` are never occupied.
-    pub fn new(device: &Device, allowed: &BitGrid, rule: BandRule) -> Band {
+    pub fn new(device: &Device, allowed: &BitGrid, rule: BandRule) -> BandUpdate {
         let total = allowed.resolution.pow(3);
         let cells: Vec<u32> = (0..total).filter(|&i| allowed.get(i)).map(|i| i as u32).collect();
-        Band {
+        BandUpdate {
             cells: device.upload(&cells),
-            allowed: device.upload(&words(&allowed.bits)),
+            allowed: device.upload(&u32_words(&allowed.bits)),
             // cells that are not evaluated stay 0, which has no sign
             value: device.zeros::<f32>(total),
             reach: device.zeros::<f32>(total),
@@ -204,10 +205,10 @@ impl Band {
     ) {
         let (resolution, radius) = (occupancy.resolution as u32, occupancy.radius);
         let half = 0.5 * 3f32.sqrt() * 2.0 * radius / resolution as f32;
-        let capacity = x.words() / 3;
+        let capacity = x.word_count() / 3;
         let solid = occupancy.solid.as_ref().expect("the rule of a band needs a solid mask");
-        for first in (0..self.cells.words()).step_by(capacity) {
-            let batch = capacity.min(self.cells.words() - first);
+        for first in (0..self.cells.word_count()).step_by(capacity) {
+            let batch = capacity.min(self.cells.word_count() - first);
             let group_count = groups(batch.div_ceil(UNITS as usize));
             launch!(device, centers::launch, group_count.clone(), UNITS;
                 self.cells, x, self.count; first as u32, batch as u32, resolution, radius
@@ -218,7 +219,7 @@ impl Band {
                 first as u32, batch as u32, self.rule.width, self.rule.soften, half
             );
         }
-        launch!(device, decide::launch, groups(occupancy.mask.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, decide::launch, groups(occupancy.mask.word_count().div_ceil(UNITS as usize)), UNITS;
             self.allowed, self.value, self.reach, inv_s, occupancy.mask, solid; resolution, self.rule.width, half
         );
     }

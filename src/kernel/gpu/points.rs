@@ -7,6 +7,7 @@
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::march::Samples;
 use super::rng::{Wide, below, stream};
+use super::vec3::Vec3;
 use crate::kernel::cpu::losses::{LossWeights, STEREO_STREAM};
 use crate::kernel::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
@@ -38,14 +39,9 @@ fn append(
         let which = below(&stream, u32::cast_from(i), available);
         drawn[i] = which;
         let s = first as usize + i;
-        #[unroll]
-        for axis in 0..3usize {
-            x[axis * plane + s] = rows[which as usize * ROW + axis];
-        }
+        Vec3::read(rows, 1usize, which as usize * ROW).write(x, plane, s);
         // any direction will do, because the color of points is not used
-        view_dir[s] = 0.0f32;
-        view_dir[plane + s] = 0.0f32;
-        view_dir[2 * plane + s] = 1.0f32;
+        Vec3::new(0.0f32, 0.0f32, 1.0f32).write(view_dir, plane, s);
     }
     if i == 0 {
         total[0] = first + points;
@@ -123,7 +119,7 @@ impl SurfacePoints {
 
     /// Returns the number of points that a step draws.
     pub fn max_per_step(&self) -> usize {
-        self.terms.words()
+        self.terms.word_count()
     }
 
     /// Draws points by seed and step, writes them after the step's samples, and returns the number of samples and points,

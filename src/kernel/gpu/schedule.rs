@@ -14,7 +14,7 @@ fn advance(
     count: &[u32],
     rays: &mut [u32],
     step_length: &mut [f32],
-    blind: &mut [u32],
+    empty_steps: &mut [u32],
     units: f32,
     shortest: f32,
     longest: f32,
@@ -29,9 +29,9 @@ fn advance(
         let wanted = count[1];
         if first == 0 {
             if wanted == 0 {
-                blind[0] += 1;
+                empty_steps[0] += 1;
             } else {
-                blind[0] = 0;
+                empty_steps[0] = 0;
                 let fitting =
                     u32::cast_from((f32::cast_from(rays[0]) * (budget / f32::cast_from(wanted))).floor());
                 rays[0] = clamp((9 * rays[0] + min(fitting, max_rays * 10)) / 10, min_rays, max_rays);
@@ -47,8 +47,8 @@ fn collect(
     variance: &[f32],
     count: &[u32],
     rays: &[u32],
-    blind: &[u32],
-    broken: &[u32],
+    empty_steps: &[u32],
+    non_finite: &[u32],
     out: &mut [u32],
 ) {
     let i = ABSOLUTE_POS;
@@ -59,8 +59,8 @@ fn collect(
         out[losses.len()] = u32::reinterpret(variance[0]);
         out[losses.len() + 1] = count[1];
         out[losses.len() + 2] = rays[0];
-        out[losses.len() + 3] = blind[0];
-        out[losses.len() + 4] = broken[0];
+        out[losses.len() + 3] = empty_steps[0];
+        out[losses.len() + 4] = non_finite[0];
     }
 }
 
@@ -76,7 +76,7 @@ pub struct Schedule {
     /// `[1]`: length of a march step in the current step, in field units.
     pub step_length: Buffer,
     /// `[1]`: number of consecutive steps without a sample, before the current one.
-    blind: Buffer,
+    empty_steps: Buffer,
     figures: Buffer,
 }
 
@@ -88,7 +88,7 @@ impl Schedule {
             budget,
             rays: device.upload(&[rays as u32]),
             step_length: device.zeros::<f32>(1),
-            blind: device.zeros::<u32>(1),
+            empty_steps: device.zeros::<u32>(1),
             figures: device.zeros::<u32>(SUMS + 5),
         }
     }
@@ -102,7 +102,7 @@ impl Schedule {
             StepLength::OfSharpness { units, min, max } => [units, min, max],
         };
         launch!(device, advance::launch, CubeCount::new_single(), 1;
-            inv_s, count, self.rays, self.step_length, self.blind;
+            inv_s, count, self.rays, self.step_length, self.empty_steps;
             units, shortest, longest, samples as f32, min.min(max) as u32, max as u32, u32::from(first)
         );
     }
@@ -122,11 +122,11 @@ impl Schedule {
         losses: &Buffer,
         variance: &Buffer,
         count: &Buffer,
-        broken: &Buffer,
+        non_finite: &Buffer,
     ) -> Result<Figures> {
-        assert_eq!(losses.words(), SUMS);
+        assert_eq!(losses.word_count(), SUMS);
         launch!(device, collect::launch, CubeCount::new_single(), 16;
-            losses, variance, count, self.rays, self.blind, broken, self.figures
+            losses, variance, count, self.rays, self.empty_steps, non_finite, self.figures
         );
         let words = device.fetch::<u32>(&self.figures)?;
         let (samples, rays) = (words[SUMS + 1] as usize, words[SUMS + 2] as usize);
@@ -138,8 +138,8 @@ impl Schedule {
             samples,
             rays: self.budget.next(rays, samples),
             // the device counts the last step only when the next one begins
-            blind: if samples == 0 { u64::from(words[SUMS + 3]) + 1 } else { 0 },
-            broken: words[SUMS + 4] != 0,
+            empty_steps: if samples == 0 { u64::from(words[SUMS + 3]) + 1 } else { 0 },
+            non_finite: words[SUMS + 4] != 0,
         })
     }
 }
@@ -170,12 +170,19 @@ mod tests {
         (0..3).for_each(|_| schedule.advance(&device, &device.upload(&[1e-3f32]), &none, false));
         let losses: [f32; TERMS] = std::array::from_fn(|i| i as f32);
         let device_losses = device.upload(&[&losses[..], &[0.5, 2.0]].concat());
-        let figures = |count: &Buffer, broken: u32| {
-            schedule.figures(&device, &device_losses, &inv_s, count, &device.upload(&[broken])).unwrap()
+        let figures = |count: &Buffer, non_finite: u32| {
+            schedule.figures(&device, &device_losses, &inv_s, count, &device.upload(&[non_finite])).unwrap()
         };
-        let (samples, rays, blind) = (0, rays as usize, 4);
-        let want =
-            Figures { losses, mean_square: Some(0.25), variance: 100.0, samples, rays, blind, broken: true };
+        let (samples, rays, empty_steps) = (0, rays as usize, 4);
+        let want = Figures {
+            losses,
+            mean_square: Some(0.25),
+            variance: 100.0,
+            samples,
+            rays,
+            empty_steps,
+            non_finite: true,
+        };
         assert_eq!(figures(&none, 1), want);
         assert_eq!(device.read::<f32>(&schedule.step_length), [0.05]);
         // few and many samples stay within the bounds
@@ -183,6 +190,6 @@ mod tests {
             schedule.advance(&device, &inv_s, &device.upload(&[0, wanted]), false);
             assert_eq!(device.read::<u32>(&schedule.rays), [want]);
         }
-        assert_eq!(figures(&none, 0).blind, 1);
+        assert_eq!(figures(&none, 0).empty_steps, 1);
     }
 }

@@ -31,7 +31,7 @@ pub(super) fn summing(capacity: usize) -> usize {
 /// Offsets of the matrices of a field, in rows of 64 floats. Weights are stored in the orders in which they are read,
 /// gradients row-major like on the CPU. Geometry columns are `[hash, x]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-struct Plan {
+struct SdfPlan {
     /// Number of hash features: two per level.
     features: usize,
     /// Number of inputs of the geometry network, padded.
@@ -40,14 +40,14 @@ struct Plan {
     color: ColorPlan,
 }
 
-impl Plan {
+impl SdfPlan {
     /// Returns whether a tile can hold the inputs of each network.
     fn fits(layout: Layout) -> bool {
         layout.padded() + OUTPUTS <= CHANNELS && layout.color_padded() <= CHANNELS
     }
 
-    fn new(layout: Layout) -> Plan {
-        assert!(Plan::fits(layout), "the field has more levels than a tile can hold");
+    fn new(layout: Layout) -> SdfPlan {
+        assert!(SdfPlan::fits(layout), "the field has more levels than a tile can hold");
         let (features, padded) = (layout.inputs - 3, layout.padded());
         let color = ColorPlan {
             outputs: OUTPUTS,
@@ -58,7 +58,7 @@ impl Plan {
             gradients: [0; 2],
             colors: 4,
         };
-        let mut plan = Plan { features, padded, color };
+        let mut plan = SdfPlan { features, padded, color };
         plan.color.weights = plan.rows()[5];
         plan.color.gradients[0] = plan.gradients()[4];
         plan.color.gradients[1] = plan.color.gradient_rows()[3];
@@ -132,7 +132,7 @@ pub(super) fn maps(
 
 /// A signed-distance field on a device, with the activations and gradients of up to `capacity` samples.
 pub struct Sdf {
-    plan: Plan,
+    plan: SdfPlan,
     grid: Grid,
     inv_radius: f32,
     soften: f32,
@@ -159,7 +159,7 @@ pub struct Sdf {
 impl Sdf {
     /// Returns whether a device can compute a field of this shape; about twenty levels are too many.
     pub fn supports(shape: &FieldShape) -> bool {
-        Plan::fits(shape.layout())
+        SdfPlan::fits(shape.layout())
     }
 
     /// Allocates buffers for up to `capacity` samples, a multiple of [`TILE`], of a shape that it
@@ -167,7 +167,7 @@ impl Sdf {
     pub fn new(device: &Device, shape: &FieldShape, capacity: usize) -> Sdf {
         assert!(capacity.is_multiple_of(TILE) && capacity > 0);
         let layout = shape.layout();
-        let plan = Plan::new(layout);
+        let plan = SdfPlan::new(layout);
         let (prepared, summed) = plan.maps(layout);
         let planes = |count: usize| device.scratch::<f32>(count * capacity);
         Sdf {
@@ -203,7 +203,7 @@ impl Sdf {
 
     /// Returns the memory of the groups' partial gradient sums in words, for up to `capacity` samples.
     pub fn words_of_sums(shape: &FieldShape, capacity: usize) -> usize {
-        summing(capacity) * Plan::new(shape.layout()).color.gradients[1] * CHANNELS
+        summing(capacity) * SdfPlan::new(shape.layout()).color.gradients[1] * CHANNELS
     }
 
     /// Returns the output of the last forward pass, planes `[8, capacity]`.
@@ -247,12 +247,12 @@ impl Sdf {
         normals: Option<&Buffer>,
         count: &Buffer,
     ) -> &Buffer {
-        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, prepare::launch, groups(self.weights.word_count().div_ceil(UNITS as usize)), UNITS;
             flat, self.prepared_map, self.weights
         );
         self.grid.gather(device, table, x, count, &self.value, Some(&self.jacobian));
-        assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
-        assert!(normals.is_none_or(|n| n.words() == x.words()));
+        assert!(x.word_count() == 3 * self.capacity && direction.word_count() == x.word_count());
+        assert!(normals.is_none_or(|n| n.word_count() == x.word_count()));
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {
             launch!(device, forward::launch_unchecked, groups(self.capacity / TILE), UNITS;
@@ -281,8 +281,8 @@ impl Sdf {
         g_table: &Buffer,
         g_flat: &Buffer,
     ) {
-        assert!(x.words() == 3 * self.capacity && direction.words() == x.words());
-        assert!(g_out.words() == WIDTH * self.capacity);
+        assert!(x.word_count() == 3 * self.capacity && direction.word_count() == x.word_count());
+        assert!(g_out.word_count() == WIDTH * self.capacity);
         let summing_groups = groups(self.summing);
         // SAFETY: all planes have `capacity` samples, and no tile reaches beyond it.
         unsafe {

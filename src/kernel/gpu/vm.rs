@@ -15,12 +15,12 @@ pub use grid::DeviceGrid;
 pub use losses::VmLosses;
 
 use super::device::{Atomics, Buffer, Device};
-use super::draw::Batch;
+use super::draw::DeviceBatch;
 use crate::Result;
 use crate::kernel::cpu::march::MarchRay;
 use crate::kernel::cpu::vm::{Grid, RAY_WIDTH, VmField};
 use march::{DeviceLattice, VmSamples};
-use rays::Along;
+use rays::CompositedRays;
 use std::sync::Arc;
 
 /// Number of samples of a tile; capacities are multiples of it.
@@ -38,7 +38,7 @@ pub struct Vm {
     lattice: DeviceLattice,
     decoder: DeviceDecoder,
     samples: VmSamples,
-    along: Along,
+    composited: CompositedRays,
 }
 
 /// The weights of a field on a device: planes and lines as [`DeviceGrid::upload`] lays them, the decoder's as the CPU's.
@@ -67,8 +67,8 @@ impl Vm {
         let grids = copies * (floats(field.density) + floats(field.color));
         let (max_samples, quads) = (DeviceLattice::max_samples(field), DeviceGrid::quads_of(field.color));
         let gradients = DeviceDecoder::words_of_gradients(&field.decoder, quads, rays * max_samples);
-        let samples = max_samples * (VmSamples::WORDS + Along::WORDS);
-        [4 * (grids + gradients) as u64, 4 * (samples + Along::OF_RAY) as u64]
+        let samples = max_samples * (VmSamples::WORDS + CompositedRays::WORDS);
+        [4 * (grids + gradients) as u64, 4 * (samples + CompositedRays::OF_RAY) as u64]
     }
 
     /// Bytes of the largest buffer for each ray of a batch.
@@ -94,43 +94,43 @@ impl Vm {
             color,
             lattice,
             samples: VmSamples::new(device, rays, capacity),
-            along: Along::new(device, field, rays, capacity, learns),
+            composited: CompositedRays::new(device, field, rays, capacity, learns),
         }
     }
 
     /// Renders all rays whose samples fit into the buffers: planes `[5, rays]`, see [`crate::kernel::cpu::vm::RAY_WIDTH`].
-    pub fn render(&self, device: &Device, values: VmValues, rays: &Batch) -> &Buffer {
-        let (samples, along) = (&self.samples, &self.along);
+    pub fn render(&self, device: &Device, values: VmValues, rays: &DeviceBatch) -> &Buffer {
+        let (samples, composited) = (&self.samples, &self.composited);
         self.decoder.prepare(device, values.network);
         samples.march(device, &self.lattice, rays);
-        self.density.gather(device, values.density, &samples.place, &samples.count, &along.feature);
-        along.compute_weights(device, samples);
-        self.decoder.forward(device, &self.color, values.color, rays, samples, along);
-        along.composite(device, samples);
-        &along.out
+        self.density.gather(device, values.density, &samples.place, &samples.count, &composited.feature);
+        composited.compute_weights(device, samples);
+        self.decoder.forward(device, &self.color, values.color, rays, samples, composited);
+        composited.composite(device, samples);
+        &composited.out
     }
 
     /// Returns the composited values of the last render, planes `[5, rays]`.
     pub fn output(&self) -> &Buffer {
-        &self.along.out
+        &self.composited.out
     }
 
     /// Adds the gradients of planes and lines to those of `gradients`, and writes those of the decoder's weights: of the
     /// rays of the last render, by what was composited, planes `[5, rays]`. Where one of the latter is not finite,
-    /// `broken`, `[1]`, becomes 1.
+    /// `non_finite`, `[1]`, becomes 1.
     pub fn backward(
         &self,
         device: &Device,
         values: VmValues,
-        rays: &Batch,
+        rays: &DeviceBatch,
         g_out: &Buffer,
         gradients: VmValues,
-        broken: &Buffer,
+        non_finite: &Buffer,
     ) {
-        let (samples, along) = (&self.samples, &self.along);
-        along.backward(device, samples, g_out);
+        let (samples, composited) = (&self.samples, &self.composited);
+        composited.backward(device, samples, g_out);
         let (place, count) = (&samples.place, &samples.count);
-        let g = &along.g_feature;
+        let g = &composited.g_feature;
         self.density.scatter(device, gradients.density, values.density, place, None, count, g);
         self.decoder.backward(
             device,
@@ -138,22 +138,22 @@ impl Vm {
             values.color,
             rays,
             samples,
-            along,
+            composited,
             values.network,
             gradients.color,
             gradients.network,
-            broken,
+            non_finite,
         );
     }
 
     /// Returns the number of samples that were looked up and that would have been with larger buffers, the same of decoded ones, `[2]` each; and the lattice points of each ray, `[rays]`.
     pub fn counts(&self) -> [&Buffer; 3] {
-        [&self.samples.count, &self.along.count, &self.samples.points]
+        [&self.samples.count, &self.composited.count, &self.samples.points]
     }
 }
 
-/// Maximum number of rays of a pass.
-const PASS: usize = 1 << 15;
+/// Maximum number of rays of a pass; fewer in tests, which drivers in software run.
+const PASS: usize = if cfg!(test) { 1 << 11 } else { 1 << 15 };
 
 /// A trained field on a device.
 pub struct VmRenderer {
@@ -181,7 +181,7 @@ impl VmRenderer {
         let mut seen = Vec::with_capacity(rays.len());
         while seen.len() < rays.len() {
             let own = &rays[seen.len()..rays.len().min(seen.len() + self.pass)];
-            let out = self.vm.render(device, values, &Batch::of_rays(device, own, PASS));
+            let out = self.vm.render(device, values, &DeviceBatch::of_rays(device, own, PASS));
             let out = device.fetch::<f32>(out)?;
             let [count, ..] = self.vm.counts();
             let found = device.fetch::<u32>(count)?;

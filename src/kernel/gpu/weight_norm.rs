@@ -82,7 +82,7 @@ fn backward(
     g_inv_s: &[f32],
     g_raw: &mut [f32],
     g_variance: &mut [f32],
-    broken: &mut [u32],
+    non_finite: &mut [u32],
 ) {
     let i = ABSOLUTE_POS;
     if i < pieces.len() / PIECE {
@@ -99,7 +99,7 @@ fn backward(
             radial /= length;
             g_raw[at as usize] = radial;
             if !finite(radial) {
-                broken[0] = 1;
+                non_finite[0] = 1;
             }
         }
         for k in 0..count {
@@ -107,7 +107,7 @@ fn backward(
             g_raw[from + k] = gradient;
             // all threads that write, write the same value
             if !finite(gradient) {
-                broken[0] = 1;
+                non_finite[0] = 1;
             }
         }
     }
@@ -115,7 +115,7 @@ fn backward(
         let gradient = 10.0f32 * inv_s[0] * g_inv_s[0];
         g_variance[0] = gradient;
         if !finite(gradient) {
-            broken[0] = 1;
+            non_finite[0] = 1;
         }
     }
 }
@@ -153,14 +153,14 @@ impl WeightNorm {
         flat: &Buffer,
         inv_s: &Buffer,
     ) {
-        assert_eq!(raw.words(), self.parameters);
+        assert_eq!(raw.word_count(), self.parameters);
         launch!(device, forward::launch, groups(self.count.div_ceil(UNITS as usize)), UNITS;
             raw, self.pieces, variance, flat, inv_s; range[0], range[1]
         );
     }
 
     /// Writes the gradients with respect to parameters and variance, given those with respect to weights and sharpness.
-    /// Sets `broken`, `[1]`, to 1 if one of them is not finite. The table needs no check of its own: a value that is not
+    /// Sets `non_finite`, `[1]`, to 1 if one of them is not finite. The table needs no check of its own: a value that is not
     /// finite reaches it through the layers checked here.
     pub fn backward(
         &self,
@@ -169,10 +169,10 @@ impl WeightNorm {
         inv_s: &Buffer,
         [g_flat, g_inv_s]: [&Buffer; 2],
         [g_raw, g_variance]: [&Buffer; 2],
-        broken: &Buffer,
+        non_finite: &Buffer,
     ) {
         launch!(device, backward::launch, groups(self.count.div_ceil(UNITS as usize)), UNITS;
-            raw, self.pieces, inv_s, g_flat, g_inv_s, g_raw, g_variance, broken
+            raw, self.pieces, inv_s, g_flat, g_inv_s, g_raw, g_variance, non_finite
         );
     }
 }
@@ -229,10 +229,10 @@ mod tests {
         assert_eq!(device.read::<f32>(&variance), [0.25]);
         agree("sharpness", &device.read::<f32>(&inv_s), &[2.5f32.exp()], 1e-5);
         let (g_raw, g_variance) = (device.scratch::<f32>(raw.len()), device.scratch::<f32>(1));
-        let broken = device.zeros::<u32>(1);
+        let non_finite = device.zeros::<u32>(1);
         let outputs = [&g_raw, &g_variance];
-        norm.backward(&device, &device_raw, &inv_s, [&g_flat, &g_inv_s], outputs, &broken);
-        assert_eq!(device.read::<u32>(&broken), [0]);
+        norm.backward(&device, &device_raw, &inv_s, [&g_flat, &g_inv_s], outputs, &non_finite);
+        assert_eq!(device.read::<u32>(&non_finite), [0]);
         agree("gradient by the variance", &device.read::<f32>(&g_variance), &[7.0 * 2.5f32.exp()], 1e-5);
         let loss =
             |raw: &[f64]| -> f64 { weights(layout, raw).iter().zip(&g).map(|(w, &g)| w * g as f64).sum() };
@@ -253,9 +253,9 @@ mod tests {
         for (value, at) in [(f32::NAN, 0), (f32::INFINITY, layout.len() - 1)] {
             let mut g = g.clone();
             g[at] = value;
-            let broken = device.zeros::<u32>(1);
-            norm.backward(&device, &device_raw, &inv_s, [&device.upload(&g), &g_inv_s], outputs, &broken);
-            assert_eq!(device.read::<u32>(&broken), [1]);
+            let non_finite = device.zeros::<u32>(1);
+            norm.backward(&device, &device_raw, &inv_s, [&device.upload(&g), &g_inv_s], outputs, &non_finite);
+            assert_eq!(device.read::<u32>(&non_finite), [1]);
         }
     }
 }

@@ -6,7 +6,7 @@ use glam::{DMat3, DVec3, Vec2, Vec3};
 use tiface::geom::{BitGrid, Bvh, Camera, Distortion, Mesh, Ray};
 use tiface::kernel::cpu::hash;
 use tiface::kernel::cpu::march::{MarchRay, march};
-use tiface::kernel::cpu::neus::{self, Rays};
+use tiface::kernel::cpu::neus::{self, Segments};
 use tiface::kernel::cpu::vm::mask::{Lattice, Walk};
 use tiface::math::rng;
 use tiface::mesh::{Volume, marching};
@@ -223,8 +223,9 @@ fn spheres(cases: &mut Cases) {
                 })
                 .collect();
             let dt = vec![step; samples.t.len()];
-            let rays = Rays { offsets: &samples.offsets, direction: &[r.direction], t: &samples.t, dt: &dt };
-            let out = neus::forward(rays, &field, inv_s, 1.0);
+            let segments =
+                Segments { offsets: &samples.offsets, direction: &[r.direction], t: &samples.t, dt: &dt };
+            let out = neus::forward(segments, &field, inv_s, 1.0);
             (out[3] as f64, (out[4] / out[3]) as f64)
         };
         let inside = (0..100).map(|i| 0.495 * (i as f64 / 99.0).sqrt());

@@ -3,7 +3,7 @@
 use super::case::{Cases, StabilityCase, relative, worst};
 use super::reference::{neus::composite, wide};
 use std::array::from_fn;
-use tiface::kernel::cpu::neus::{self, Rays};
+use tiface::kernel::cpu::neus::{self, Segments};
 use tiface::kernel::cpu::sdf::WIDTH;
 use tiface::math::rng;
 
@@ -45,8 +45,8 @@ impl Bundle {
         }
     }
 
-    fn rays(&self) -> Rays<'_> {
-        Rays { offsets: &self.offsets, direction: &self.direction, t: &self.t, dt: &self.dt }
+    fn rays(&self) -> Segments<'_> {
+        Segments { offsets: &self.offsets, direction: &self.direction, t: &self.t, dt: &self.dt }
     }
 
     /// Distances that cross zero somewhere on each ray, on a scale that the sharpness can tell; drawn gradients and

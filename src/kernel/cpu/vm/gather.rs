@@ -172,7 +172,7 @@ pub(super) struct FactorGradients<'a> {
 }
 
 /// The part of a plane or line that one task owns in the scatter.
-struct Band<'a> {
+struct ScatterBand<'a> {
     term: usize,
     line: bool,
     /// First row of the plane; 0 for a line.
@@ -209,7 +209,7 @@ fn add_pair<const F: bool>(into: &mut [f32], g: &[f32], a: f32, b: f32, n: usize
 }
 
 #[inline(always)]
-fn band_body<const F: bool>(band: &mut Band, gradients: &FactorGradients) {
+fn band_body<const F: bool>(band: &mut ScatterBand, gradients: &FactorGradients) {
     let n = band.channels;
     if band.line {
         let axis = LINE_AXIS[band.term];
@@ -243,7 +243,7 @@ fn band_body<const F: bool>(band: &mut Band, gradients: &FactorGradients) {
     }
 }
 
-dispatch! { fn scatter_band / band_body(band: &mut Band, gradients: &FactorGradients) }
+dispatch! { fn scatter_band / band_body(band: &mut ScatterBand, gradients: &FactorGradients) }
 
 /// Number of bands of a plane. It is fixed, so that the order of sums does not depend on the number of threads.
 const BANDS: usize = 6;
@@ -259,7 +259,7 @@ pub(super) fn scatter(grid: &Grid, gradients: &FactorGradients, gradient: &mut [
         let first = grid.rank[..term].iter().sum();
         let rows = if line { 1 } else { height.div_ceil(BANDS) };
         for (i, values) in factor_gradient.chunks_mut((rows * width * channels).max(1)).enumerate() {
-            bands.push(Band {
+            bands.push(ScatterBand {
                 term,
                 line,
                 row: i * rows,

@@ -116,7 +116,7 @@ pub struct VmFigures {
     /// Number of rays.
     pub rays: u64,
     /// Whether a gradient of the decoder was not finite.
-    pub broken: bool,
+    pub non_finite: bool,
 }
 
 impl VmFigures {

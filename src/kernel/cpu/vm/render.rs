@@ -90,7 +90,7 @@ impl VmField {
 
 /// A sample that contributes to its ray or its gradient.
 #[derive(Clone, Copy, Debug)]
-struct Kept {
+struct KeptSample {
     t: f32,
     feature: f32,
     alpha: f32,
@@ -106,7 +106,7 @@ pub struct Rendered {
     pub density_samples: u64,
     /// Number of samples whose color was decoded.
     pub color_samples: u64,
-    kept: Vec<Kept>,
+    kept: Vec<KeptSample>,
     cells: Vec<Cell>,
     /// `[rays + 1]` into `kept`.
     offsets: Vec<u32>,
@@ -120,7 +120,7 @@ const RAYS: usize = 32;
 
 struct MarchTask<'a> {
     rays: &'a [MarchRay],
-    kept: Vec<Kept>,
+    kept: Vec<KeptSample>,
     cells: Vec<Cell>,
     counts: Vec<u32>,
     looked_up: u64,
@@ -143,7 +143,7 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
                 continue; // the sample has neither weight nor gradient
             }
             let alpha = 1.0 - exp::<F>(-s.density::<F>(feature) * length);
-            task.kept.push(Kept { t, feature, alpha, transmittance });
+            task.kept.push(KeptSample { t, feature, alpha, transmittance });
             task.cells.push(cell);
             transmittance *= 1.0 - alpha + 1e-10;
             if transmittance <= s.stop {

@@ -211,7 +211,7 @@ impl Nerfacc {
         threshold: f32,
         capacity: usize,
     ) -> Nerfacc {
-        let (cells, words) = (history.len(), occupancy.mask.words());
+        let (cells, words) = (history.len(), occupancy.mask.word_count());
         assert_eq!(cells, occupancy.resolution.pow(3));
         Nerfacc {
             history: device.upload(history),
@@ -242,7 +242,7 @@ impl Nerfacc {
         x: &Buffer,
         mut opacity: impl FnMut(&Buffer) -> (&'a Buffer, f32),
     ) {
-        let cells = self.history.words();
+        let cells = self.history.word_count();
         let warmup = n < WARMUP_STEPS;
         let [any_stream, occupied_stream, jitter_stream] = STREAMS;
         let groups_for = |count: usize| groups(count.div_ceil(UNITS as usize));
@@ -250,14 +250,14 @@ impl Nerfacc {
         let draw_count = if warmup { cells } else { cells / 4 * 2 };
         if !warmup {
             let mask = &occupancy.mask;
-            launch!(device, tally::launch, groups_for(mask.words()), UNITS; mask, self.counts);
+            launch!(device, tally::launch, groups_for(mask.word_count()), UNITS; mask, self.counts);
             prefix_sum(device, &self.counts, &self.before, &self.kept, cells);
             launch!(device, find_last_draws::launch, groups_for(draw_count), UNITS;
                 mask, self.before, self.last; cells as u32, draws(any_stream), draws(occupied_stream)
             );
         }
-        let capacity = self.drawn.words();
-        assert!(capacity <= x.words() / 3);
+        let capacity = self.drawn.word_count();
+        assert!(capacity <= x.word_count() / 3);
         for first in (0..draw_count).step_by(capacity) {
             let batch = capacity.min(draw_count - first);
             launch!(device, sample_points::launch, groups_for(batch), UNITS;
@@ -271,11 +271,11 @@ impl Nerfacc {
             );
         }
         let sums = &self.sums;
-        launch!(device, partial_sums::launch, groups(sums.words()), UNITS; self.history, sums);
+        launch!(device, partial_sums::launch, groups(sums.word_count()), UNITS; self.history, sums);
         launch!(device, update_threshold::launch, CubeCount::new_single(), 1;
             sums, self.device_threshold; cells as u32, self.threshold
         );
-        launch!(device, update_mask::launch, groups_for(occupancy.mask.words()), UNITS;
+        launch!(device, update_mask::launch, groups_for(occupancy.mask.word_count()), UNITS;
             self.history, self.device_threshold, self.last, occupancy.mask
         );
     }

@@ -7,7 +7,7 @@ use super::super::tile::{
     self, Block, CHANNELS, LANES, Lane, UNITS, at, channel_sums, load_planes, outer_block, outer_row,
     output_layer, product, sigmoid, store_block, store_outer, store_planes, store_row,
 };
-use super::Plan;
+use super::SdfPlan;
 use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS, SOFTNESS, TILE};
 use burn::cubecl::{self, prelude::*};
 
@@ -92,7 +92,7 @@ pub(in super::super) fn sum_groups(
     // not known to the compiler, which would compile both kernels again for every capacity
     let (size, tile, summing) = (size as u32, tile as u32, summing as u32);
     launch!(device, sum_slices::launch, slices, UNITS; partial, count; size, tile, summing);
-    launch!(device, reduce::launch, groups(over(flat.words())), UNITS;
+    launch!(device, reduce::launch, groups(over(flat.word_count())), UNITS;
         partial, map.unwrap_or(count), count, flat; size, tile, summing, map.is_some()
     );
 }
@@ -138,7 +138,7 @@ pub(super) fn forward(
     out: &mut [F4],
     inv_radius: f32,
     soften: f32,
-    #[comptime] plan: Plan,
+    #[comptime] plan: SdfPlan,
     #[comptime] given: bool,
 ) {
     let rows = comptime!(plan.rows());
@@ -233,7 +233,7 @@ pub(super) fn geometry_backward(
     g_value: &mut [F4],
     partial: &mut [f32],
     inv_radius: f32,
-    #[comptime] plan: Plan,
+    #[comptime] plan: SdfPlan,
 ) {
     let rows = comptime!(plan.rows());
     let gradient_rows = comptime!(plan.gradients());

@@ -1,7 +1,7 @@
 //! A vector-matrix field and rays to test kernels on.
 
 use super::super::device::{Buffer, Device, Words};
-use super::super::draw::Batch;
+use super::super::draw::DeviceBatch;
 use super::super::evaluate::planes;
 use super::{Vm, VmValues};
 use crate::Result;
@@ -102,7 +102,7 @@ pub(super) fn capacity(case: &Case) -> usize {
 pub(super) struct DeviceCase {
     pub vm: Vm,
     values: [Buffer; 3],
-    pub rays: Batch,
+    pub rays: DeviceBatch,
     g_out: Buffer,
 }
 
@@ -116,7 +116,7 @@ impl DeviceCase {
                 vm.color.upload(device, &case.color),
                 device.upload(&case.network),
             ],
-            rays: Batch::of_rays(device, &case.rays, n),
+            rays: DeviceBatch::of_rays(device, &case.rays, n),
             g_out: device.upload(&planes::<RAY_WIDTH>(case.g.as_chunks().0, n)),
             vm,
         }
@@ -132,11 +132,11 @@ impl DeviceCase {
 
     /// Of density, appearance and decoder, after a render.
     pub fn gradients(&self, device: &Device) -> Result<[Vec<f32>; 3]> {
-        let [d, c, n] = self.values.each_ref().map(|v| device.zeros::<f32>(v.words()));
+        let [d, c, n] = self.values.each_ref().map(|v| device.zeros::<f32>(v.word_count()));
         let gradients = VmValues { density: &d, color: &c, network: &n };
-        let broken = device.zeros::<u32>(1);
-        self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients, &broken);
-        assert_eq!(device.fetch::<u32>(&broken)?, [0]);
+        let non_finite = device.zeros::<u32>(1);
+        self.vm.backward(device, self.values(), &self.rays, &self.g_out, gradients, &non_finite);
+        assert_eq!(device.fetch::<u32>(&non_finite)?, [0]);
         let (density, color) = (&self.vm.density, &self.vm.color);
         Ok([density.cut(device.fetch(&d)?), color.cut(device.fetch(&c)?), device.fetch(&n)?])
     }

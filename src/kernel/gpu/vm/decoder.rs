@@ -15,12 +15,12 @@
 mod kernels;
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::draw::Batch;
+use super::super::draw::DeviceBatch;
 use super::super::sdf::kernels::sum_groups;
 use super::super::tile::{self, UNITS};
 use super::grid::{DeviceGrid, NONE};
 use super::march::VmSamples;
-use super::rays::Along;
+use super::rays::CompositedRays;
 use crate::kernel::cpu::vm::DecoderShape;
 use kernels::{backward, chain, forward, prepare};
 
@@ -33,7 +33,7 @@ const DECODING: usize = 4096;
 
 /// Sizes and offsets of the matrices of a decoder, in rows with as many floats as a tile has channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-struct Plan {
+struct DecoderPlan {
     /// Number of vectors of four channels of each term.
     quads: [usize; 3],
     /// Number of channels on the CPU, without padding.
@@ -43,11 +43,11 @@ struct Plan {
     lanes: usize,
 }
 
-impl Plan {
-    fn new(shape: &DecoderShape, quads: [usize; 3]) -> Plan {
+impl DecoderPlan {
+    fn new(shape: &DecoderShape, quads: [usize; 3]) -> DecoderPlan {
         let lanes = if shape.hidden > tile::channels(16) { 8 } else { 16 };
         let (channels, features, hidden) = (shape.channels, shape.features, shape.hidden);
-        Plan { quads, channels, features, hidden, lanes }
+        DecoderPlan { quads, channels, features, hidden, lanes }
     }
 
     /// Returns the number of vectors of products.
@@ -107,7 +107,7 @@ impl Plan {
 
 /// A decoder on a device.
 pub struct DeviceDecoder {
-    plan: Plan,
+    plan: DecoderPlan,
     /// Channel on the CPU of each channel on the device.
     real: Buffer,
     /// Channel on the device of each channel on the CPU.
@@ -137,7 +137,7 @@ impl DeviceDecoder {
 
     /// Returns the memory of the gradients of products and weights in words, for up to `capacity` samples.
     pub fn words_of_gradients(shape: &DecoderShape, quads: [usize; 3], capacity: usize) -> usize {
-        let plan = Plan::new(shape, quads);
+        let plan = DecoderPlan::new(shape, quads);
         let chunk = capacity.min(Self::CHUNK);
         chunk * 4 * plan.products() + (plan.groups(chunk) + 1) * plan.gradients()[6] * plan.width()
     }
@@ -152,7 +152,7 @@ impl DeviceDecoder {
         learns: bool,
     ) -> DeviceDecoder {
         assert_eq!(DeviceDecoder::supports(shape), Ok(()));
-        let plan = Plan::new(shape, grid.quads());
+        let plan = DecoderPlan::new(shape, grid.quads());
         let real = grid.channels();
         let mut padded = vec![0u32; shape.channels];
         for (c, &cpu_channel) in real.iter().enumerate().filter(|(_, real)| **real != NONE) {
@@ -179,8 +179,8 @@ impl DeviceDecoder {
 
     /// Converts the flat weights, as on the CPU, to the layout of the kernels.
     pub fn prepare(&self, device: &Device, flat: &Buffer) {
-        assert_eq!(flat.words(), self.plan.parts()[7]);
-        launch!(device, prepare::launch, groups(self.weights.words().div_ceil(UNITS as usize)), UNITS;
+        assert_eq!(flat.word_count(), self.plan.parts()[7]);
+        launch!(device, prepare::launch, groups(self.weights.word_count().div_ceil(UNITS as usize)), UNITS;
             flat, self.real, self.weights; self.plan
         );
     }
@@ -191,55 +191,55 @@ impl DeviceDecoder {
         device: &Device,
         grid: &DeviceGrid,
         values: &Buffer,
-        rays: &Batch,
+        rays: &DeviceBatch,
         samples: &VmSamples,
-        along: &Along,
+        composited: &CompositedRays,
     ) {
-        assert!(along.index.words() == self.capacity && values.words() == grid.len());
+        assert!(composited.index.word_count() == self.capacity && values.word_count() == grid.len());
         let tiles = self.capacity.div_ceil(4 * self.plan.lanes);
         // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
         unsafe {
             launch!(device, forward::launch_unchecked, groups(tiles.min(DECODING)), UNITS;
-                self.weights, values, grid.words(), samples.place, samples.ray, rays.direction, along.index,
-                along.count, along.rgb;
+                self.weights, values, grid.sizes(), samples.place, samples.ray, rays.direction, composited.index,
+                composited.count, composited.rgb;
                 self.plan
             );
         }
     }
 
-    /// Adds the gradient with respect to planes and lines, and writes that with respect to the flat weights. Sets `broken`,
+    /// Adds the gradient with respect to planes and lines, and writes that with respect to the flat weights. Sets `non_finite`,
     /// `[1]`, to 1 if a value of the latter is not finite.
     pub fn backward(
         &self,
         device: &Device,
         grid: &DeviceGrid,
         values: &Buffer,
-        rays: &Batch,
+        rays: &DeviceBatch,
         samples: &VmSamples,
-        along: &Along,
+        composited: &CompositedRays,
         flat: &Buffer,
         g_values: &Buffer,
         g_flat: &Buffer,
-        broken: &Buffer,
+        non_finite: &Buffer,
     ) {
-        assert!(along.index.words() == self.capacity && values.words() == grid.len());
+        assert!(composited.index.word_count() == self.capacity && values.word_count() == grid.len());
         for from in (0..self.capacity).step_by(self.chunk) {
             // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
             unsafe {
                 launch!(device, backward::launch_unchecked, groups(self.summing()), UNITS;
-                    self.weights, values, grid.words(), samples.place, samples.ray, rays.direction,
-                    along.index, along.count, along.g_pre, self.g_products, self.partial;
+                    self.weights, values, grid.sizes(), samples.place, samples.ray, rays.direction,
+                    composited.index, composited.count, composited.g_pre, self.g_products, self.partial;
                     from as u32, self.chunk as u32, self.plan
                 );
             }
-            let part = Some((&along.index, from, self.chunk));
-            let (place, count) = (&samples.place, &along.count);
+            let part = Some((&composited.index, from, self.chunk));
+            let (place, count) = (&samples.place, &composited.count);
             grid.scatter(device, g_values, values, place, part, count, &self.g_products);
         }
-        let sizes = (self.summed.words(), 4 * self.plan.lanes, self.summing());
-        sum_groups(device, &self.partial, None, &along.count, &self.summed, sizes);
-        launch!(device, chain::launch, groups(flat.words().div_ceil(UNITS as usize)), UNITS;
-            flat, self.real, self.padded, self.summed, g_flat, broken; self.plan
+        let sizes = (self.summed.word_count(), 4 * self.plan.lanes, self.summing());
+        sum_groups(device, &self.partial, None, &composited.count, &self.summed, sizes);
+        launch!(device, chain::launch, groups(flat.word_count().div_ceil(UNITS as usize)), UNITS;
+            flat, self.real, self.padded, self.summed, g_flat, non_finite; self.plan
         );
     }
 

@@ -364,7 +364,7 @@ impl DeviceGrid {
     }
 
     /// Returns the sizes and offsets that kernels need for interpolation.
-    pub(super) fn words(&self) -> &Buffer {
+    pub(super) fn sizes(&self) -> &Buffer {
         &self.words
     }
 
@@ -421,8 +421,8 @@ impl DeviceGrid {
     /// Writes the features of samples, `[capacity]`: the sum over terms and channels. place: planes `[3, capacity]`, in
     /// units of vertices.
     pub fn gather(&self, device: &Device, values: &Buffer, place: &Buffer, count: &Buffer, feature: &Buffer) {
-        assert!(values.words() == self.len() && place.words() == 3 * feature.words());
-        launch!(device, gather::launch, groups(feature.words().div_ceil(UNITS as usize).min(GROUPS)), UNITS;
+        assert!(values.word_count() == self.len() && place.word_count() == 3 * feature.word_count());
+        launch!(device, gather::launch, groups(feature.word_count().div_ceil(UNITS as usize).min(GROUPS)), UNITS;
             values, self.words, place, count, feature; self.quads()
         );
     }
@@ -440,9 +440,9 @@ impl DeviceGrid {
         count: &Buffer,
         g: &Buffer,
     ) {
-        assert!(gradient.words() == self.len() && values.words() == self.len());
+        assert!(gradient.word_count() == self.len() && values.word_count() == self.len());
         let channels = self.padded.channels();
-        let (list, from, limit) = index.unwrap_or((count, 0, g.words()));
+        let (list, from, limit) = index.unwrap_or((count, 0, g.word_count()));
         if self.fixed_sums.is_some() {
             launch!(device, bound::launch, groups(BOUNDING), UNITS;
                 values, self.words, count, g, self.partial;

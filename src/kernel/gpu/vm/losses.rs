@@ -1,8 +1,8 @@
 //! The training loss of TensoRF's field and its gradients: see [`crate::kernel::cpu::vm::losses`].
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::draw::Batch;
-use super::super::losses::{BACKGROUND, TALLY, tally};
+use super::super::draw::DeviceBatch;
+use super::super::losses::{BACKGROUND, TALLY, cross_entropy, tally};
 use super::super::sum::group_sum;
 use super::Vm;
 use crate::Result;
@@ -12,7 +12,8 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Number of words of the results of steps: loss terms, lattice points, evaluated samples, decoded samples, rays, broken.
+/// Number of words of the results of steps: loss terms, lattice points, evaluated samples, decoded samples, rays, whether a
+/// gradient was not finite.
 const TOTALS: usize = TERMS + 5;
 
 /// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
@@ -61,11 +62,9 @@ fn of_rays(
             g_opacity += 2.0f32 * weight * opacity * background_share;
         }
         if ce {
-            let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
-            let m = select(a == 0.0f32, 0.0f32, 1.0f32);
-            mask = -(m * p.ln() + (1.0f32 - m) * (1.0f32 - p).ln()) * ray_share;
-            let by_p = ((1.0f32 - m) / (1.0f32 - p) - m / p) * ray_share * weight;
-            g_opacity += select(p == opacity, by_p, 0.0f32);
+            let entropy = cross_entropy(opacity, select(a == 0.0f32, 0.0f32, 1.0f32), ray_share, weight);
+            mask = entropy.value;
+            g_opacity += entropy.slope;
         }
         g_out[3 * rays + r] = g_opacity;
         g_out[4 * rays + r] = 0.0f32;
@@ -83,7 +82,7 @@ fn add(
     looked_up: &[u32],
     decoded: &[u32],
     tally: &[u32],
-    broken: &[u32],
+    non_finite: &[u32],
     totals: &mut [u32],
 ) {
     let unit = UNIT_POS as usize;
@@ -108,7 +107,7 @@ fn add(
             totals[comptime!(TERMS + 1)] += looked_up[0];
             totals[comptime!(TERMS + 2)] += decoded[0];
             totals[comptime!(TERMS + 3)] += tally[0];
-            totals[comptime!(TERMS + 4)] = broken[0];
+            totals[comptime!(TERMS + 4)] = non_finite[0];
         }
     }
 }
@@ -140,7 +139,7 @@ impl VmLosses {
         &self,
         device: &Device,
         composed: &Buffer,
-        batch: &Batch,
+        batch: &DeviceBatch,
         mode: BackgroundMode,
     ) -> &Buffer {
         let (weight, l2, ce) = match self.term {
@@ -148,10 +147,10 @@ impl VmLosses {
             MaskTerm::L2(weight) => (weight, true, false),
             MaskTerm::Ce(weight) => (weight, false, true),
         };
-        let Batch { color, alpha, background, alive, .. } = batch;
+        let DeviceBatch { color, alpha, background, alive, .. } = batch;
         let one = CubeCount::new_single();
         launch!(device, tally::launch, one, UNITS; alive, alpha, alive, self.tally; false);
-        launch!(device, of_rays::launch, groups(alpha.words().div_ceil(UNITS as usize)), UNITS;
+        launch!(device, of_rays::launch, groups(alpha.word_count().div_ceil(UNITS as usize)), UNITS;
             composed, color, alpha, background, alive, self.tally, self.g_out, self.terms;
             mode.lift, f32::from(mode.target), weight, l2, ce
         );
@@ -169,10 +168,10 @@ impl VmLosses {
     }
 
     /// Adds the results of the last step to the totals that [`fetch`](VmLosses::fetch) returns.
-    pub fn add(&self, device: &Device, vm: &Vm, broken: &Buffer) {
+    pub fn add(&self, device: &Device, vm: &Vm, non_finite: &Buffer) {
         let [looked_up, decoded, points] = vm.counts();
         launch!(device, add::launch, CubeCount::new_1d(TERMS as u32 + 1), UNITS;
-            self.terms, points, looked_up, decoded, self.tally, broken, self.totals
+            self.terms, points, looked_up, decoded, self.tally, non_finite, self.totals
         );
     }
 
@@ -186,6 +185,6 @@ impl VmLosses {
         let t = device.fetch::<u32>(&self.totals)?;
         let [lattice, density, color, rays] = [3, 4, 5, 6].map(|i| t[i] as u64);
         let terms = [t[0], t[1], t[2]].map(f32::from_bits);
-        Ok(VmFigures { terms, lattice, density, color, rays, broken: t[7] != 0 })
+        Ok(VmFigures { terms, lattice, density, color, rays, non_finite: t[7] != 0 })
     }
 }

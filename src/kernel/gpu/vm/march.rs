@@ -2,9 +2,10 @@
 //! [`crate::kernel::cpu::vm::mask::Walk`].
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::draw::Batch;
-use super::super::march::{FAR, Span, bit, narrowed, prefix_sum};
-use super::super::occupancy::words;
+use super::super::draw::DeviceBatch;
+use super::super::march::{FAR, Span, bit, count_and_write, narrowed, room};
+use super::super::occupancy::u32_words;
+use super::super::vec3::Vec3;
 use crate::kernel::cpu::march::BLOCK;
 use crate::kernel::cpu::vm::VmField;
 use burn::cubecl::{self, prelude::*};
@@ -35,6 +36,14 @@ fn outside(v: f32, low: f32, high: f32, slack: f32) -> bool {
     !(v >= low - slack && v <= high + slack)
 }
 
+/// Returns whether a point lies outside a box by more than `slack` along any axis.
+#[cube]
+fn outside_box(p: Vec3, low: Vec3, high: Vec3, slack: Vec3) -> bool {
+    outside(p.x, low.x, high.x, slack.x)
+        || outside(p.y, low.y, high.y, slack.y)
+        || outside(p.z, low.z, high.z, slack.z)
+}
+
 /// Returns the cell of a coordinate in units of cells, clamped to the mask.
 #[cube]
 fn cell(g: f32, cells: u32) -> u32 {
@@ -52,7 +61,7 @@ fn border(g: f32, cell: u32, cells: u32, d: f32, scale: f32, empty: bool) -> f32
 
 /// Returns a coordinate in units of vertices of the grid, clamped to the outer ones.
 #[cube]
-fn place_of(p: f32, low: f32, high: f32, vertices: u32) -> f32 {
+fn grid_coordinate(p: f32, low: f32, high: f32, vertices: u32) -> f32 {
     let last = f32::cast_from(vertices - 1);
     clamp((p - low) / (high - low) * last, 0.0f32, last)
 }
@@ -81,28 +90,24 @@ fn pass(
     let plane = t.len();
     let r = ABSOLUTE_POS;
     if r < rays {
-        let (ox, oy, oz) = (origin[r], origin[rays + r], origin[2 * rays + r]);
-        let (dx, dy, dz) = (direction[r], direction[rays + r], direction[2 * rays + r]);
-        let (lx, ly, lz) = (lattice[0], lattice[1], lattice[2]);
-        let (hx, hy, hz) = (lattice[3], lattice[4], lattice[5]);
+        let o = Vec3::read(origin, rays, r);
+        let d = Vec3::read(direction, rays, r);
+        let low = Vec3::read(lattice, 1usize, 0usize);
+        let high = Vec3::read(lattice, 1usize, 3usize);
         let step = lattice[STEP];
-        let span = crossed(Span { enter: -FAR, leave: FAR }, ox, dx, lx, hx);
-        let span = crossed(span, oy, dy, ly, hy);
-        let span = crossed(span, oz, dz, lz, hz);
+        let span = crossed(Span { enter: -FAR, leave: FAR }, o.x, d.x, low.x, high.x);
+        let span = crossed(span, o.y, d.y, low.y, high.y);
+        let span = crossed(span, o.z, d.z, low.z, high.z);
         let entry = clamp(span.enter, lattice[STEP + 1], lattice[STEP + 2]);
         let start = entry + jitter[r] * step;
         let meets = span.enter <= span.leave && alive[r] == 1;
         let end = select(meets, sizes[0] - 1, 0u32);
-        let (sx, sy, sz) = (1e-6f32 * (hx - lx), 1e-6f32 * (hy - ly), 1e-6f32 * (hz - lz));
+        let slack = (high - low) * 1e-6f32;
         let mut first = 0usize;
         let mut max_count = end;
         if writes {
             first = offsets[r] as usize;
-            max_count = offsets[r + 1] - offsets[r];
-            // a ray whose samples exceed the capacity is not alive
-            if max_count < counts[r] {
-                alive[r] = 0;
-            }
+            max_count = room(offsets, &*counts, alive, r);
         } else {
             let inside = max((span.leave - entry) / step, 0.0f32);
             points[r] = select(meets, min(u32::cast_from(min(inside, 1e9f32)) + 1, sizes[0]), 0u32);
@@ -113,23 +118,21 @@ fn pass(
         while marching {
             // t is computed for each k, never accumulated
             let at = start + step * f32::cast_from(k);
-            let (px, py, pz) = (ox + at * dx, oy + at * dy, oz + at * dz);
+            let p = o + d * at;
             // the border itself belongs to the box, and rounding may put a sample just outside
-            let outside_box = outside(px, lx, hx, sx) || outside(py, ly, hy, sy) || outside(pz, lz, hz, sz);
-            let mut kept = !outside_box;
+            let inside_box = !outside_box(p, low, high, slack);
+            let mut kept = inside_box;
             let mut skip = 1u32;
             if masked {
                 let (nx, ny, nz) = (sizes[CELLS], sizes[CELLS + 1], sizes[CELLS + 2]);
-                let (ux, uy, uz) = (lattice[SCALE], lattice[SCALE + 1], lattice[SCALE + 2]);
-                let gx = (px - lattice[MASK]) * ux;
-                let gy = (py - lattice[MASK + 1]) * uy;
-                let gz = (pz - lattice[MASK + 2]) * uz;
-                let outside_mask = outside(gx, 0.0f32, f32::cast_from(nx), 1e-3f32)
-                    || outside(gy, 0.0f32, f32::cast_from(ny), 1e-3f32)
-                    || outside(gz, 0.0f32, f32::cast_from(nz), 1e-3f32);
-                kept = !outside_box && !outside_mask;
+                let u = Vec3::read(lattice, 1usize, SCALE);
+                let from = p - Vec3::read(lattice, 1usize, MASK);
+                let g = Vec3::new(from.x * u.x, from.y * u.y, from.z * u.z);
+                let cells = Vec3::new(f32::cast_from(nx), f32::cast_from(ny), f32::cast_from(nz));
+                let slack = Vec3::new(1e-3f32, 1e-3f32, 1e-3f32);
+                kept = inside_box && !outside_box(g, Vec3::zero(), cells, slack);
                 if kept {
-                    let (cx, cy, cz) = (cell(gx, nx), cell(gy, ny), cell(gz, nz));
+                    let (cx, cy, cz) = (cell(g.x, nx), cell(g.y, ny), cell(g.z, nz));
                     if !bit(bits, (cx * ny + cy) * nz + cz) {
                         kept = false;
                         // skip to the border of the empty cell, or of its block if that is empty too, by a whole
@@ -138,8 +141,8 @@ fn pass(
                         let b = (cx / size * sizes[BLOCKS + 1] + cy / size) * sizes[BLOCKS + 2] + cz / size;
                         let empty = !bit(blocks, b);
                         let far = min(
-                            border(gx, cx, nx, dx, ux, empty),
-                            min(border(gy, cy, ny, dy, uy, empty), border(gz, cz, nz, dz, uz, empty)),
+                            border(g.x, cx, nx, d.x, u.x, empty),
+                            min(border(g.y, cy, ny, d.y, u.y, empty), border(g.z, cz, nz, d.z, u.z, empty)),
                         );
                         // slightly less than that, so that rounding cannot skip a sample in the next cell
                         let whole = (max(far, 0.0f32) / step - 1e-3f32).ceil();
@@ -155,9 +158,11 @@ fn pass(
                         let s = first + found as usize;
                         t[s] = at;
                         ray[s] = r as u32;
-                        place[s] = place_of(px, lx, hx, sizes[VERTICES]);
-                        place[plane + s] = place_of(py, ly, hy, sizes[VERTICES + 1]);
-                        place[2 * plane + s] = place_of(pz, lz, hz, sizes[VERTICES + 2]);
+                        let (nx, ny, nz) = (sizes[VERTICES], sizes[VERTICES + 1], sizes[VERTICES + 2]);
+                        let x = grid_coordinate(p.x, low.x, high.x, nx);
+                        let y = grid_coordinate(p.y, low.y, high.y, ny);
+                        let z = grid_coordinate(p.z, low.z, high.z, nz);
+                        Vec3::new(x, y, z).write(place, plane, s);
                     }
                     found += 1;
                 }
@@ -194,7 +199,7 @@ impl DeviceLattice {
             numbers.extend((0..3).map(|a| cells[a] as f32 / (high[a] - low[a])));
             sizes.extend(cells.map(|n| n as u32));
             sizes.extend(cells.map(|n| n.div_ceil(BLOCK) as u32));
-            [mask.bits(), mask.blocks()].map(|bits| device.upload(&words(bits)))
+            [mask.bits(), mask.blocks()].map(|bits| device.upload(&u32_words(bits)))
         });
         let max_samples = DeviceLattice::max_samples(field);
         DeviceLattice { lattice: device.upload(&numbers), sizes: device.upload(&sizes), mask, max_samples }
@@ -243,21 +248,19 @@ impl VmSamples {
     }
 
     /// Marches a batch of rays. Rays whose samples exceed the capacity are marked as not alive.
-    pub fn march(&self, device: &Device, lattice: &DeviceLattice, rays: &Batch) {
-        assert_eq!(rays.rays(), self.counts.words());
+    pub fn march(&self, device: &Device, lattice: &DeviceLattice, rays: &DeviceBatch) {
+        assert_eq!(rays.rays(), self.counts.word_count());
         let [bits, blocks] = match &lattice.mask {
             Some(masks) => masks.each_ref(),
             None => [&lattice.sizes; 2],
         };
         let run_pass = |writes: bool| {
-            launch!(device, pass::launch, groups(rays.jitter.words().div_ceil(UNITS as usize)), UNITS;
+            launch!(device, pass::launch, groups(rays.jitter.word_count().div_ceil(UNITS as usize)), UNITS;
                 lattice.lattice, lattice.sizes, bits, blocks, rays.origin, rays.direction, rays.jitter,
                 rays.alive, self.offsets, self.counts, self.points, self.t, self.ray, self.place;
                 lattice.mask.is_some(), writes
             );
         };
-        run_pass(false);
-        prefix_sum(device, &self.counts, &self.offsets, &self.count, self.t.words());
-        run_pass(true);
+        count_and_write(device, &self.counts, &self.offsets, &self.count, self.t.word_count(), run_pass);
     }
 }

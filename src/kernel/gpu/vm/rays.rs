@@ -1,9 +1,11 @@
 //! Conversion of features to weights, and compositing, with one thread per ray: see `render` of
 //! [`crate::kernel::cpu::vm`], whose module has the formulas.
 
+use super::super::composite::Composited;
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
 use super::super::neus::sigmoid;
+use super::super::vec3::Vec3;
 use super::march::VmSamples;
 use crate::kernel::cpu::vm::{RAY_WIDTH, VmField};
 use burn::cubecl::{self, prelude::*};
@@ -89,27 +91,16 @@ fn composite(
     if r < rays {
         let plane = rgb.len() / 3;
         let mut next = firsts[r] as usize;
-        let mut red = 0.0f32;
-        let mut green = 0.0f32;
-        let mut blue = 0.0f32;
-        let mut opacity = 0.0f32;
-        let mut depth = 0.0f32;
+        let mut sums = Composited::empty();
         for s in (offsets[r] as usize)..(ends[r] as usize) {
             let w = weight[s];
             if w > threshold {
-                red += w * rgb[next];
-                green += w * rgb[plane + next];
-                blue += w * rgb[2 * plane + next];
+                sums.rgb.add_weighted(w, Vec3::read(rgb, plane, next));
                 next += 1;
             }
-            opacity += w;
-            depth += w * t[s];
+            sums.add(w, t[s]);
         }
-        out[r] = red;
-        out[rays + r] = green;
-        out[2 * rays + r] = blue;
-        out[3 * rays + r] = opacity;
-        out[4 * rays + r] = depth;
+        sums.write(out, rays, r);
     }
 }
 
@@ -137,8 +128,8 @@ fn backward(
     let rays = ends.len();
     if r < rays {
         let plane = rgb.len() / 3;
-        let (g0, g1, g2) = (g_out[r], g_out[rays + r], g_out[2 * rays + r]);
-        let (g3, g4) = (g_out[3 * rays + r], g_out[4 * rays + r]);
+        let g_color = Vec3::read(g_out, rays, r);
+        let (g_opacity, g_depth) = (g_out[3 * rays + r], g_out[4 * rays + r]);
         let (begin, end) = (offsets[r] as usize, ends[r] as usize);
         for s in end..(offsets[r + 1] as usize) {
             g_feature[s] = 0.0f32;
@@ -148,14 +139,17 @@ fn backward(
         for k in 0..end - begin {
             let s = end - 1 - k;
             let w = weight[s];
-            let mut g_w = g3 + g4 * t[s];
+            let mut g_w = g_opacity + g_depth * t[s];
             if w > threshold {
                 next -= 1;
-                let (c0, c1, c2) = (rgb[next], rgb[plane + next], rgb[2 * plane + next]);
-                g_w += g0 * c0 + g1 * c1 + g2 * c2;
-                g_pre[next] = w * g0 * c0 * (1.0f32 - c0);
-                g_pre[plane + next] = w * g1 * c1 * (1.0f32 - c1);
-                g_pre[2 * plane + next] = w * g2 * c2 * (1.0f32 - c2);
+                let c = Vec3::read(rgb, plane, next);
+                g_w += g_color.dot(c);
+                // the derivative of a sigmoid with value c is c (1 − c)
+                let g = g_color * w;
+                let x = g.x * c.x * (1.0f32 - c.x);
+                let y = g.y * c.y * (1.0f32 - c.y);
+                let z = g.z * c.z * (1.0f32 - c.z);
+                Vec3::new(x, y, z).write(g_pre, plane, next);
             }
             let open = 1.0f32 - alpha[s];
             let g_alpha = light[s] * g_w - farther / (open + 1e-10f32);
@@ -171,7 +165,7 @@ fn backward(
 }
 
 /// Values of samples along the rays of a batch, and the composited rays.
-pub struct Along {
+pub struct CompositedRays {
     /// `[capacity]`: features of samples.
     pub feature: Buffer,
     /// `[capacity]`: gradients with respect to features.
@@ -199,7 +193,7 @@ pub struct Along {
     softplus: bool,
 }
 
-impl Along {
+impl CompositedRays {
     /// Memory per sample of a field that is trained, in words.
     pub const WORDS: usize = 12;
     /// Memory per ray, in words: composited values, their gradients and loss terms, offsets, counts, and the ray itself.
@@ -207,11 +201,17 @@ impl Along {
 
     /// Allocates buffers for `rays` rays and up to `capacity` samples of a field; buffers for gradients only if `learns` is
     /// set.
-    pub fn new(device: &Device, field: &VmField, rays: usize, capacity: usize, learns: bool) -> Along {
+    pub fn new(
+        device: &Device,
+        field: &VmField,
+        rays: usize,
+        capacity: usize,
+        learns: bool,
+    ) -> CompositedRays {
         let s = &field.shading;
         let samples = |planes: usize| device.scratch::<f32>(planes * capacity);
         let gradients = |planes: usize| device.scratch::<f32>(if learns { planes * capacity } else { 1 });
-        Along {
+        CompositedRays {
             feature: samples(1),
             g_feature: gradients(1),
             count: device.zeros::<u32>(2),
@@ -234,7 +234,7 @@ impl Along {
     }
 
     fn groups(&self) -> CubeCount {
-        groups(self.ends.words().div_ceil(UNITS as usize))
+        groups(self.ends.word_count().div_ceil(UNITS as usize))
     }
 
     /// Computes the weights of samples from their features, and lists the samples that need a color.
@@ -243,7 +243,7 @@ impl Along {
             samples.offsets, self.feature, self.alpha, self.light, self.weight, self.ends, self.counts;
             self.shift, self.length, self.threshold, self.stop, self.softplus
         );
-        prefix_sum(device, &self.counts, &self.firsts, &self.count, self.index.words());
+        prefix_sum(device, &self.counts, &self.firsts, &self.count, self.index.word_count());
         launch!(device, list::launch, self.groups(), UNITS;
             samples.offsets, self.ends, self.weight, self.firsts, self.index; self.threshold
         );
@@ -259,7 +259,10 @@ impl Along {
 
     /// Computes the gradients of samples from those with respect to the composited rays, planes `[5, rays]`.
     pub fn backward(&self, device: &Device, samples: &VmSamples, g_out: &Buffer) {
-        assert!(g_out.words() == self.out.words() && self.g_feature.words() == self.feature.words());
+        assert!(
+            g_out.word_count() == self.out.word_count()
+                && self.g_feature.word_count() == self.feature.word_count()
+        );
         launch!(device, backward::launch, self.groups(), UNITS;
             samples.offsets, self.ends, self.firsts, samples.t, self.feature, self.alpha, self.light,
             self.weight, self.rgb, g_out, self.g_feature, self.g_pre;

@@ -37,7 +37,7 @@ fn lattice_points_are_those_of_the_cpu_with_and_without_a_mask() {
         }
         offsets.extend([t.len() as u32; 3]);
         points.extend([0; 3]);
-        println!("{} samples, {} at most", t.len(), on_gpu.vm.samples.t.words());
+        println!("{} samples, {} at most", t.len(), on_gpu.vm.samples.t.word_count());
         assert_eq!(device.read::<u32>(&on_gpu.vm.samples.count), [t.len() as u32; 2]);
         assert_eq!(device.read::<u32>(&on_gpu.vm.samples.offsets), offsets);
         assert_eq!(device.read::<u32>(&on_gpu.vm.samples.points), points);
@@ -207,12 +207,12 @@ fn losses_and_gradients_agree_with_f64_finite_differences() {
         Shown { color: drawn(1, 3 * N, 0.0, 1.0), alpha, background: drawn(2, 3 * N, 0.0, 1.0), alive };
     // some colors and opacities leave their range
     let composed = [drawn(3, 3 * N, -0.3, 1.1), drawn(4, N, 0.0, 1.0), drawn(5, N, 0.0, 3.0)].concat();
-    let batch = Batch {
+    let batch = DeviceBatch {
         color: device.upload(&shown.color),
         alpha: device.upload(&shown.alpha),
         background: device.upload(&shown.background),
         alive: device.upload(&shown.alive),
-        ..Batch::new(&device, N)
+        ..DeviceBatch::new(&device, N)
     };
     let vm = Vm::new(&device, &case(NARROW, 1).field, N, false);
     for (term, lift, target) in
@@ -228,7 +228,7 @@ fn losses_and_gradients_agree_with_f64_finite_differences() {
         on.add(&device, &vm, &device.upload(&[1u32]));
         let figures = on.fetch(&device).unwrap();
         agree("losses", &figures.terms, &want.map(|t| 2.0 * t as f32), 1e-5);
-        assert_eq!((figures.rays, figures.broken), (2 * 34, true));
+        assert_eq!((figures.rays, figures.non_finite), (2 * 34, true));
         on.reset_totals(&device);
         assert_eq!(on.fetch(&device).unwrap().terms, [0.0; 3]);
         let total = |x: &[f64]| {

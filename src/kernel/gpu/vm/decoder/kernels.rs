@@ -7,14 +7,14 @@ use super::super::super::tile::{
 };
 use super::super::super::weight_norm::finite;
 use super::super::grid::{NONE, looked_up, term};
-use super::Plan;
+use super::DecoderPlan;
 use burn::cubecl::{self, prelude::*};
 
 type F4 = Vector<f32, Const<4>>;
 
 /// Returns `[M, W1_direction]` for hidden channel `h` and input `c`.
 #[cube]
-fn merged(flat: &[f32], real: &[u32], h: usize, c: usize, #[comptime] plan: Plan) -> f32 {
+fn merged(flat: &[f32], real: &[u32], h: usize, c: usize, #[comptime] plan: DecoderPlan) -> f32 {
     let parts = comptime!(plan.parts());
     let (products, features) = comptime!((4 * plan.products(), plan.features));
     let row = comptime!(parts[1]) + h * comptime!(features + 3);
@@ -53,7 +53,7 @@ fn zero_padded(
 
 /// Copies the weights to the orders in which they are read.
 #[cube(launch)]
-pub(super) fn prepare(flat: &[f32], real: &[u32], out: &mut [f32], #[comptime] plan: Plan) {
+pub(super) fn prepare(flat: &[f32], real: &[u32], out: &mut [f32], #[comptime] plan: DecoderPlan) {
     let i = ABSOLUTE_POS;
     if i < out.len() {
         let rows = comptime!(plan.rows());
@@ -94,7 +94,7 @@ fn input(
     k: usize,
     samples: usize,
     quad: usize,
-    #[comptime] plan: Plan,
+    #[comptime] plan: DecoderPlan,
 ) -> F4 {
     let mut v = F4::new(0.0f32);
     if k < samples {
@@ -121,7 +121,7 @@ fn input(
 
 /// Returns the number of inputs in piece `p`, which fills a tile or is the last one.
 #[cube]
-fn piece_inputs(p: usize, #[comptime] plan: Plan) -> usize {
+fn piece_inputs(p: usize, #[comptime] plan: DecoderPlan) -> usize {
     min(comptime!(plan.inputs()) - p * comptime!(plan.width()), comptime!(plan.width()))
 }
 
@@ -140,7 +140,7 @@ fn inputs(
     row: usize,
     column: usize,
     piece: usize,
-    #[comptime] plan: Plan,
+    #[comptime] plan: DecoderPlan,
 ) {
     let lanes = comptime!(plan.lanes);
     let quad = piece * comptime!(tile::columns(lanes)) + column;
@@ -177,7 +177,7 @@ fn first_layer(
     samples: usize,
     row: usize,
     column: usize,
-    #[comptime] plan: Plan,
+    #[comptime] plan: DecoderPlan,
 ) -> Block {
     let lanes = comptime!(plan.lanes);
     let rows = comptime!(plan.rows());
@@ -204,7 +204,7 @@ fn first_layer(
 
 /// Returns a thread's block of the second hidden layer, computed from the first one in tile `b`.
 #[cube]
-fn second_layer(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan: Plan) -> Block {
+fn second_layer(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan: DecoderPlan) -> Block {
     let lanes = comptime!(plan.lanes);
     let rows = comptime!(plan.rows());
     let bias = w[comptime!(rows[3] * tile::columns(lanes)) + column];
@@ -215,6 +215,33 @@ fn second_layer(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan:
         z.channel(2usize) + broadcast(bias, 2usize),
         z.channel(3usize) + broadcast(bias, 3usize),
     ))
+}
+
+/// Computes both hidden layers of a tile of samples: the first one in tile `b`, the second one in `a`.
+#[cube]
+fn hidden_layers(
+    a: &mut [F4],
+    b: &mut [F4],
+    w: &[F4],
+    values: &[F4],
+    words: &[u32],
+    place: &[f32],
+    ray: &[u32],
+    direction: &[f32],
+    index: &[u32],
+    tile: usize,
+    samples: usize,
+    row: usize,
+    column: usize,
+    #[comptime] plan: DecoderPlan,
+) {
+    let lanes = comptime!(plan.lanes);
+    let h1 = first_layer(a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan);
+    store_block(b, &h1, row, column, lanes);
+    sync_cube();
+    let h2 = second_layer(&*b, w, row, column, plan);
+    store_block(a, &h2, row, column, lanes);
+    sync_cube();
 }
 
 /// Writes colors, planes `[3, capacity]`.
@@ -229,7 +256,7 @@ pub(super) fn forward(
     index: &[u32],
     count: &[u32],
     rgb: &mut [F4],
-    #[comptime] plan: Plan,
+    #[comptime] plan: DecoderPlan,
 ) {
     let (lanes, width) = comptime!((plan.lanes, plan.width()));
     let rows = comptime!(plan.rows());
@@ -239,14 +266,9 @@ pub(super) fn forward(
     let mut b = Shared::<[F4]>::new_slice(comptime!(width * lanes));
     let samples = tile::uniform_count(count, &mut a);
     for tile in range_stepped(CUBE_POS, samples.div_ceil(comptime!(4 * lanes)), CUBE_COUNT) {
-        let h1 = first_layer(
-            &mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
+        hidden_layers(
+            &mut a, &mut b, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
         );
-        store_block(&mut b, &h1, row, column, lanes);
-        sync_cube();
-        let h2 = second_layer(&b, w, row, column, plan);
-        store_block(&mut a, &h2, row, column, lanes);
-        sync_cube();
         let v = output_layer(&a, w, comptime!(rows[4]), row, column, 3usize, lanes);
         if column < 3 {
             let bias = w[comptime!(rows[5] * columns)];
@@ -295,7 +317,7 @@ pub(super) fn backward(
     partial: &mut [f32],
     from: u32,
     limit: u32,
-    #[comptime] plan: Plan,
+    #[comptime] plan: DecoderPlan,
 ) {
     let (lanes, width, hidden) = comptime!((plan.lanes, plan.width(), plan.hidden));
     let (rows, gradient_rows) = comptime!((plan.rows(), plan.gradients()));
@@ -318,14 +340,9 @@ pub(super) fn backward(
     let mut b3 = 0.0f32;
     for tile in range_stepped(start + CUBE_POS, end, CUBE_COUNT) {
         let here = tile * lanes + row;
-        let h1 = first_layer(
-            &mut a, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
+        hidden_layers(
+            &mut a, &mut b, w, values, words, place, ray, direction, index, tile, samples, row, column, plan,
         );
-        store_block(&mut b, &h1, row, column, lanes);
-        sync_cube();
-        let h2 = second_layer(&b, w, row, column, plan);
-        store_block(&mut a, &h2, row, column, lanes);
-        sync_cube();
         if c < hidden {
             let mut of_w3 = F4::new(0.0f32);
             #[unroll]
@@ -432,8 +449,8 @@ pub(super) fn chain(
     padded: &[u32],
     summed: &[f32],
     g_flat: &mut [f32],
-    broken: &mut [u32],
-    #[comptime] plan: Plan,
+    non_finite: &mut [u32],
+    #[comptime] plan: DecoderPlan,
 ) {
     let i = ABSOLUTE_POS;
     if i < g_flat.len() {
@@ -474,7 +491,7 @@ pub(super) fn chain(
         g_flat[i] = g;
         // all threads that write, write the same value
         if !finite(g) {
-            broken[0] = 1;
+            non_finite[0] = 1;
         }
     }
 }
