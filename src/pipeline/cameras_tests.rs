@@ -2,7 +2,7 @@
 
 use super::cameras::{CameraCheck, POSES, check_by};
 use super::rig_photos::RigPhotos;
-use super::tests::{NoFields, measured_head, quiet, scene_of};
+use super::tests::{NoFields, draft, measured_head, quiet, scene_of};
 use super::{Session, Stage, capture_options, complete, inspect_capture};
 use crate::capture::path::NamedCamera;
 use crate::capture::scene::{self, SceneOptions};
@@ -246,8 +246,7 @@ fn the_stage_mask_keeps_refined_poses_for_later_stages_unless_given_ones_are_ask
     for (poses, refined) in [(CameraPoses::Given, false), (CameraPoses::Auto, true)] {
         let folder = tempfile::tempdir().unwrap();
         let run = quiet(folder.path());
-        let mut config = Config::preset(Preset::Draft);
-        config.capture.path = dir.path().into();
+        let mut config = draft(dir.path());
         config.capture.cameras = poses;
         let session = Session::open(&config, &run).unwrap();
         complete(&session, Stage::Mask, &NoFields).unwrap();

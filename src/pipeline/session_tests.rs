@@ -145,7 +145,7 @@ fn the_stages_after_learning_keep_the_exact_head_exact() {
     let run = quiet(dir.path());
     let session = Session::open(&config, &run).unwrap();
     session.remember(Stage::Metrics).unwrap();
-    assert_eq!(complete(&session, Stage::Mask, &NoFields).unwrap().summary["masks"], 14);
+    assert_eq!(masked(&session).summary["masks"], 14);
     let scene = session.scene().unwrap();
     let exact = Formula(Exact { world_from_scene: scene.scene_from_world.inverse() });
     let mesh = complete(&session, Stage::Mesh, &exact).unwrap();
