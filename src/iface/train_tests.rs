@@ -36,8 +36,8 @@ fn small() -> IfaceConfig {
     IfaceConfig { rays: 64, max_rays: 128, samples: 1024, start: Start::Sphere, ..config() }
 }
 
-/// The checkpoint that trainings of [`config`] begin with, whatever is photographed: that of the fit
-/// to the hull, which takes seconds. Made once a test program.
+/// The checkpoint that trainings of [`config`] begin with, whatever is photographed: that of the
+/// fit to the hull, which takes seconds. Made once a test program.
 fn fitted() -> &'static Files {
     static FITTED: OnceLock<Files> = OnceLock::new();
     FITTED.get_or_init(|| {
