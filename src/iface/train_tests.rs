@@ -36,8 +36,8 @@ fn small() -> IfaceConfig {
     IfaceConfig { rays: 64, max_rays: 128, samples: 1024, start: Start::Sphere, ..config() }
 }
 
-/// The checkpoint that trainings of [`config`] begin with after the fit to the hull, which takes seconds; whatever is
-/// photographed. Made once a test program.
+/// The checkpoint that trainings of [`config`] begin with, whatever is photographed: that of the
+/// fit to the hull, which takes seconds. Made once a test program.
 fn fitted() -> &'static Files {
     static FITTED: OnceLock<Files> = OnceLock::new();
     FITTED.get_or_init(|| {
@@ -92,7 +92,8 @@ fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train(&views, Some(&hull), &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
-    // stopped before step 42, at which points are found, and after it; the undisturbed training makes its own fit to the hull
+    // stopped before step 42, at which points are found, and after it; the undisturbed training
+    // makes its own fit to the hull
     let dir = resumes_from(fitted(), &run, 5);
     let state = |config: &IfaceConfig, dir: &Path| {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT).unwrap();

@@ -336,7 +336,7 @@ fn held_out_photographs_shape_only_their_own_masks() {
 
 #[test]
 fn paper_masks_without_networks_are_a_warning() {
-    /// Keeps warnings, and stops a stage that has begun: before its first photograph, about which nothing is asked.
+    /// Keeps warnings, and stops a stage that has begun before it reads a photograph.
     struct Warnings(Stop, std::sync::Mutex<Vec<String>>);
     impl Observer for Warnings {
         fn event(&self, event: &Event) {

@@ -54,8 +54,8 @@ pub(super) fn draft(root: &Path) -> Config {
     config
 }
 
-/// A folder with the demo head, photographed at a size by so many training and held-out views, the configuration of a draft
-/// of it, and a run of that folder which reports nothing.
+/// A folder with the demo head, photographed at a size by so many training and held-out views; the
+/// configuration of a draft of it, and a run that reports nothing.
 pub(super) fn head_run(size: (u32, u32), views: (usize, usize)) -> (TempDir, Config, Run) {
     let dir = tempfile::tempdir().unwrap();
     let root = dir.path().join("head");
@@ -64,7 +64,7 @@ pub(super) fn head_run(size: (u32, u32), views: (usize, usize)) -> (TempDir, Con
     (dir, config, run)
 }
 
-/// The least of these that most questions can be asked about: eight training and two held-out views.
+/// The least of these that most questions can be asked about.
 pub(super) fn tiny_run() -> (TempDir, Config, Run) {
     head_run((32, 40), (8, 2))
 }
@@ -74,7 +74,7 @@ pub(super) fn measured_head() -> (TempDir, Capture) {
     head_of((144, 180), 1)
 }
 
-/// The same from other places, of which exposures are measured well although the photographs are small.
+/// The same from other places, of which exposures are measured well although photographs are small.
 pub(super) fn exposed_head() -> (TempDir, Capture) {
     head_of((144, 180), 3)
 }

@@ -63,7 +63,7 @@ impl Linear {
         let p = camera.local(point);
         let (DVec2 { x, y }, depth) = Camera::ideal(p)?;
         let [[ux, uy], [vx, vy]] = camera.distortion.slopes(x, y);
-        // of (x, y) by the three coordinates of p; written out, for `map` of an array is a call for each element
+        // of (x, y) by the three coordinates of p; `map` of an array would be a call an element
         let focal = DVec2::new(camera.fx, camera.fy);
         let picture = |x: f64, y: f64| focal * DVec2::new(ux * x + uy * y, vx * x + vy * y);
         let by_p = [picture(1.0 / depth, 0.0), picture(0.0, -1.0 / depth), picture(x / depth, y / depth)];

@@ -375,7 +375,8 @@ pub(super) fn noise(p: Vec3) -> f32 {
     trilinear(t, low, [at(0, 0, 1), at(1, 0, 1), at(0, 1, 1), at(1, 1, 1)])
 }
 
-/// Returns the value at `t` inside a cell, between those of its lower and its upper corners, along x first.
+/// Returns the value at `t` inside a cell, between those of its lower and its upper corners, along
+/// x first.
 #[inline(always)]
 pub(super) fn trilinear(t: Vec3, low: [f32; 4], high: [f32; 4]) -> f32 {
     let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
