@@ -502,7 +502,9 @@ impl Density {
         }
         let size = self.plan.color.gradients[1] * CHANNELS;
         sum_groups(device, partial, Some(&self.summed_map), count, g_flat, (size, TILE, summing));
-        launch!(device, check::launch, groups(g_flat.word_count().div_ceil(UNITS as usize)), UNITS; g_flat, non_finite);
+        launch!(device, check::launch, groups(g_flat.word_count().div_ceil(UNITS as usize)), UNITS;
+            g_flat, non_finite
+        );
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
     }
 

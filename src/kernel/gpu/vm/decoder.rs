@@ -200,8 +200,8 @@ impl DeviceDecoder {
         // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
         unsafe {
             launch!(device, forward::launch_unchecked, groups(tiles.min(DECODING)), UNITS;
-                self.weights, values, grid.sizes(), samples.place, samples.ray, rays.direction, composited.index,
-                composited.count, composited.rgb;
+                self.weights, values, grid.sizes(), samples.place, samples.ray, rays.direction,
+                composited.index, composited.count, composited.rgb;
                 self.plan
             );
         }

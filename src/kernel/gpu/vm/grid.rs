@@ -422,7 +422,8 @@ impl DeviceGrid {
     /// units of vertices.
     pub fn gather(&self, device: &Device, values: &Buffer, place: &Buffer, count: &Buffer, feature: &Buffer) {
         assert!(values.word_count() == self.len() && place.word_count() == 3 * feature.word_count());
-        launch!(device, gather::launch, groups(feature.word_count().div_ceil(UNITS as usize).min(GROUPS)), UNITS;
+        let groups = groups(feature.word_count().div_ceil(UNITS as usize).min(GROUPS));
+        launch!(device, gather::launch, groups, UNITS;
             values, self.words, place, count, feature; self.quads()
         );
     }

@@ -12,8 +12,8 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Number of words of the results of steps: loss terms, lattice points, evaluated samples, decoded samples, rays, whether a
-/// gradient was not finite.
+/// Number of words of the results of steps: loss terms, lattice points, evaluated samples, decoded
+/// samples, rays, whether a gradient was not finite.
 const TOTALS: usize = TERMS + 5;
 
 /// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
