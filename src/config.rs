@@ -4,10 +4,11 @@
 //! the wrong type or out of range is an error that names the line, the key and a suggested fix. The
 //! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
 //!
-//! Each stage owns its table, declared by `table!`: a key, its documentation, range, the products that it affects, its
-//! command-line option and the values of the presets stand once, on its field. Everything here works on what serde says
-//! about them; what makes a stage again is a filter over the rows ([`Config::settings_of`]), and code that names a key writes
-//! `key!(mesh.lobes)`. What no user has a reason to change is no key but a constant of the preset, in the same place.
+//! Each stage owns its table, declared by `table!`: a key, its documentation, range, the products
+//! that it affects, its command-line option and the values of the presets stand once, on its field.
+//! Everything here works on what serde says about them; what makes a stage again is a filter over
+//! the rows ([`Config::settings_of`]), and code that names a key writes `key!(mesh.lobes)`. What no
+//! user has a reason to change is no key but a constant of the preset, in the same place.
 
 mod affects;
 pub mod iface;
@@ -249,7 +250,8 @@ const fn same(a: &str, b: &str) -> bool {
     i == a.len() && i == b.len()
 }
 
-/// Returns the full name of a key, as in `key!(mesh.lobes)` or `key!(seed)`. A key that no table has does not compile.
+/// Returns the full name of a key, as in `key!(mesh.lobes)` or `key!(seed)`. A key that no table
+/// has does not compile.
 macro_rules! key {
     ($table:ident . $name:ident) => {{
         const _: () = assert!($crate::config::is_key(stringify!($table), stringify!($name)));
@@ -371,8 +373,8 @@ impl Config {
         out
     }
 
-    /// Returns the keys that affect a product directly, by full name (`iface.steps`), with their values as they are written
-    /// in TOML: the settings in its fingerprint.
+    /// Returns the keys that affect a product directly, by full name (`iface.steps`), with their
+    /// values as they are written in TOML: the settings in its fingerprint.
     pub fn settings_of(&self, product: Product) -> BTreeMap<String, String> {
         let root = match product {
             // what the baseline takes from T-Face's table, with its differences from that
