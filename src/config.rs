@@ -249,7 +249,8 @@ const fn same(a: &str, b: &str) -> bool {
     i == a.len() && i == b.len()
 }
 
-/// Returns the full name of a key, as in `key!(mesh.lobes)` or `key!(seed)`. A key that no table has does not compile.
+/// Returns the full name of a key, as in `key!(mesh.lobes)` or `key!(seed)`. A key that no table
+/// has does not compile.
 macro_rules! key {
     ($table:ident . $name:ident) => {{
         const _: () = assert!($crate::config::is_key(stringify!($table), stringify!($name)));
@@ -371,8 +372,8 @@ impl Config {
         out
     }
 
-    /// Returns the keys that affect a product directly, by full name (`iface.steps`), with their values as they are written
-    /// in TOML: the settings in its fingerprint.
+    /// Returns the keys that affect a product directly, by full name (`iface.steps`), with their
+    /// values as they are written in TOML: the settings in its fingerprint.
     pub fn settings_of(&self, product: Product) -> BTreeMap<String, String> {
         let root = match product {
             // what the baseline takes from T-Face's table, with its differences from that

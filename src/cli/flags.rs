@@ -22,8 +22,8 @@ struct GivenFlag {
 }
 
 impl KeyFlags {
-    /// Returns the options as keys of the configuration; files by their absolute path, so that the run finds them from
-    /// any working directory.
+    /// Returns the options as keys of the configuration; files by their absolute path, so that the
+    /// run finds them from any working directory.
     pub fn options(&self) -> Result<Vec<KeyOption>> {
         self.0.iter().map(GivenFlag::option).collect()
     }

@@ -216,8 +216,8 @@ impl RunTarget {
         }
     }
 
-    /// Returns the configuration for this target: the capture's path absolute, so that the run finds it from any working
-    /// directory.
+    /// Returns the configuration for this target: the capture's path absolute, so that the run
+    /// finds it from any working directory.
     ///
     /// # Errors
     ///

@@ -256,8 +256,8 @@ table! {
         /// Network that predicts alpha without clicks (U²-Net, ISNet, MODNet, BiRefNet), an ONNX file (needs a build
         /// with the feature `matting`).
         #[flag("alpha-net", File, ["run", "mask"],
-            "Make masks without clicks, by a network that predicts alpha (U²-Net, ISNet, MODNet, BiRefNet), an \
-             ONNX file")]
+            "Make masks without clicks, by a network that predicts alpha (U²-Net, ISNet, MODNet, BiRefNet), \
+             an ONNX file")]
         alpha_net: String [nothing] => String::new();
         /// Size and normalization of its input: auto (from the file beside it, else by its name), SIDE,MEAN,SCALE as
         /// 1024,0.5,1, or SIDE,imagenet.

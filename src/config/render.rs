@@ -97,8 +97,8 @@ table! {
         /// Methods, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with view-dependent color),
         /// textured (head.glb, as a viewer shows it) and raster (the same, rasterized, without soft layers).
         #[flag("with", Text("LIST"), ["render"],
-            "Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), textured \
-             (head.glb, as a viewer shows it) and raster (the same, rasterized)")]
+            "Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), \
+             textured (head.glb, as a viewer shows it) and raster (the same, rasterized)")]
         method: Vec<Method> [Views]
             => vec![Method::Tface, Method::Raycast],
             vec![Method::Tface, Method::Raycast],
@@ -146,8 +146,8 @@ table! {
         /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb);
         /// empty: no blend.
         #[flag("members", Text("LIST"), ["ensemble"],
-            "Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), \
-             textured and raster (head.glb)")]
+            "Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's \
+             mesh), textured and raster (head.glb)")]
         members: Vec<Method> [Blend]
             => vec![Method::Tface, Method::Raycast],
             vec![Method::Tface, Method::Raycast],

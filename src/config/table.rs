@@ -1,5 +1,5 @@
-//! One place for a setting: its field is its key, its comment the documentation that users read; its row says what it
-//! affects, and which option of a command sets it.
+//! One place for a setting: its field is its key, its comment the documentation that users read;
+//! its row says what it affects, and which option of a command sets it.
 
 /// Declares the settings of a stage.
 ///
@@ -25,8 +25,9 @@
 /// }
 /// ```
 ///
-/// Makes the struct, its list of [`Key`](super::Key)s as `KEYS`, `preset(Preset)`, and `keep_constants(Preset)`, which
-/// gives the constants their values again after the keys were read from text. A row without its effects does not compile.
+/// Makes the struct, its list of [`Key`](super::Key)s as `KEYS`, `preset(Preset)`, and
+/// `keep_constants(Preset)`, which gives the constants their values again after the keys were read
+/// from text. A row without its effects does not compile.
 macro_rules! table {
     (
         $(#[$about:meta])*
@@ -110,7 +111,8 @@ macro_rules! bound {
     };
 }
 
-/// The option of a row: its name, its value, the commands that have it, and its help if that is not the key's documentation.
+/// The option of a row: its name, its value, the commands that have it, and its help if that is not
+/// the key's documentation.
 macro_rules! flag {
     () => {
         None

@@ -13,7 +13,8 @@ use crate::run::{Fingerprint, Plan, read_record, read_status};
 use crate::{Error, Result, io};
 use std::path::Path;
 
-/// Version of the stages' files and of what is recorded of their settings; raised when their meaning changes.
+/// Version of the stages' files and of what is recorded of their settings; raised when their
+/// meaning changes.
 const FORMAT: u32 = 3;
 
 impl Session<'_> {
@@ -205,8 +206,8 @@ impl Session<'_> {
             return Err(Error::usage(
                 format!("`{CAMERAS}` is {cameras}, but it is the held-out views that are blended and judged"),
                 format!(
-                    "set it back with `--set {CAMERAS}=test`; `tiface render RUN --cameras {cameras}` makes the \
-                     others, in a folder of their own"
+                    "set it back with `--set {CAMERAS}=test`; `tiface render RUN --cameras {cameras}` makes \
+                     the others, in a folder of their own"
                 ),
             ));
         }
@@ -241,7 +242,8 @@ impl Session<'_> {
         }
     }
 
-    /// Returns everything that affects a product: the settings that say so, and what its stage reads.
+    /// Returns everything that affects a product: the settings that say so, and what its stage
+    /// reads.
     fn fingerprint(&self, product: Product) -> Fingerprint {
         let (stage, config) = (product.stage(), self.config);
         let mut fingerprint = Fingerprint::new(FORMAT, config.settings_of(product));
@@ -257,7 +259,8 @@ impl Session<'_> {
         fingerprint
     }
 
-    /// Returns the digest of a stage as an input; for the mesh, the digest of the part that views by these methods show.
+    /// Returns the digest of a stage as an input; for the mesh, the digest of the part that views
+    /// by these methods show.
     fn input(&self, stage: Stage, methods: &[Method]) -> String {
         let product = match stage {
             Stage::Mesh if shows_head(self.config, methods) => Product::Head,

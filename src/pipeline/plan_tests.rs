@@ -1,4 +1,5 @@
-//! Which stages a changed setting makes again: what the rows of the tables say, and what the plans do.
+//! Which stages a changed setting makes again: what the rows of the tables say, and what the plans
+//! do.
 
 use super::inputs::capture_options;
 use super::render::shows_head;
@@ -10,7 +11,8 @@ use crate::mask::prompts::{PhotoPrompts, Prompts, file_path, parse_point};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Another value of a key, as `--set` takes it; of a file the same content elsewhere. `None` if the key names no file.
+/// Another value of a key, as `--set` takes it; of a file the same content elsewhere. `None` if the
+/// key names no file.
 fn another(key: &str, config: &Config, dir: &Path) -> Option<String> {
     let listed = [
         (key!(device), "cpu"),
@@ -54,7 +56,8 @@ fn another(key: &str, config: &Config, dir: &Path) -> Option<String> {
     }
 }
 
-/// Returns whether a row says that a product changes with its key, or with what the product is made of.
+/// Returns whether a row says that a product changes with its key, or with what the product is made
+/// of.
 fn is_said(row: &Key, product: Product, config: &Config) -> bool {
     let read = |stage: Stage| match stage {
         Stage::Mesh if shows_head(config, &config.render.method) => Product::Head,
@@ -65,7 +68,8 @@ fn is_said(row: &Key, product: Product, config: &Config) -> bool {
     row.affects(product, config) || needs.any(|stage| is_said(row, read(stage), config))
 }
 
-/// Settings, each with the keys that are changed there; at the first, all of which it has another value.
+/// Settings, each with the keys that are changed there; at the first, all of which it has another
+/// value.
 fn cases(dir: &Path) -> Vec<(Config, Vec<&'static str>)> {
     let root = dir.join("head");
     demo_head(&root, (32, 40), (8, 2));

@@ -71,7 +71,8 @@ impl Fingerprint {
         Ok(hex(&digest.finalize()))
     }
 
-    /// Returns the differences from an `older` fingerprint, one line each; of another format, that alone.
+    /// Returns the differences from an `older` fingerprint, one line each; of another format, that
+    /// alone.
     pub fn differences(&self, older: &Fingerprint) -> Vec<String> {
         let mut lines = Vec::new();
         if self.format != older.format {

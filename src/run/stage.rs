@@ -291,8 +291,8 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
         );
         let first = stage.split('/').next().unwrap_or_default();
         let hint = format!(
-            "choose another folder with `--run DIR`, continue with that version, or recompute this stage and what \
-             follows with `--fresh {first}`"
+            "choose another folder with `--run DIR`, continue with that version, or recompute this stage and \
+             what follows with `--fresh {first}`"
         );
         return Err(Error::cannot(what, hint));
     }

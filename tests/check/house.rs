@@ -284,7 +284,8 @@ fn only_the_items_under_the_attribute_are_tests() {
     assert_eq!(kept, ["use a;", "use b;", "use e;", "impl F {", "", "fn l() {}", "}"]);
 }
 
-/// The texts between quotes of consecutive lines; one that a backslash continues stands in several pieces.
+/// The texts between quotes of consecutive lines; one that a backslash continues stands in several
+/// pieces.
 fn texts(lines: &[(usize, String)]) -> Vec<(usize, String)> {
     let (mut found, mut is_open) = (Vec::new(), false);
     for (number, line) in lines {
