@@ -228,10 +228,8 @@ fn killed_again_and_again_the_run_ends_with_the_same_bytes() {
 fn a_signal_saves_and_names_itself_in_the_exit_code_and_two_processes_do_not_share_a_stage() {
     let runs = Runs::of(&SMALL);
     let run = runs.path("run");
-    // enough steps that the process is halted before the last one; without masks, no fit to a hull
-    // comes before the first
-    let long = "mask.source=none iface.steps=800 iface.samples=512 iface.rays=32 iface.max_rays=64";
-    let long: Vec<&str> = long.split(' ').collect();
+    // enough steps that the process is halted before the last one
+    let long = ["iface.steps=800", "iface.samples=512", "iface.rays=32", "iface.max_rays=64"];
     for (signal, expected) in [("TERM", 143), ("INT", 130)] {
         let mut child = runs.begin("iface", "run", &long);
         wait_for_stage(&run, Stage::Iface, &mut child);
@@ -271,8 +269,7 @@ fn wait_for_training(run: &Path, child: &Child) {
 fn a_signal_sent_twice_at_once_saves_what_was_learned() {
     let runs = Runs::of(&SMALL);
     let run = runs.path("run");
-    let endless = ["mask.source=none", "iface.steps=100000", "iface.checkpoint_s=3600"];
-    let child = runs.begin("iface", "run", &endless);
+    let child = runs.begin("iface", "run", &["iface.steps=100000", "iface.checkpoint_s=3600"]);
     wait_for_training(&run, &child);
     // as GNU `timeout` does: to the process, and to its group
     let twice = format!("kill -TERM {0}; kill -TERM {0}", child.id());
