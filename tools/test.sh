@@ -16,8 +16,9 @@
 # `all` adds loops and breadth. Each claim has its test in the check, or is about a program of somebody else:
 #
 # long         tests marked `#[ignore = "long: …"]`: GPU trainings at full length and of every preset, kills by the dozen,
-#              every write that fails, sweeps of cases, inputs of `../shared`, gradients of the device against f64. The check
-#              makes the same claims on fewer steps, kills and cases, and compares the device with the CPU.
+#              every write that fails, every change of every byte of a model, masks of all views of two captures, sweeps of
+#              cases, inputs of `../shared`, gradients of the device against f64. The check makes the same claims on fewer
+#              steps, kills, bytes, views and cases, and compares the device with the CPU.
 # fuzz         a minute for every reader instead of three seconds
 # gpu          `tools/gpu/first_look.sh`, eleven trainings on a driver in software, six minutes. The check trains each field
 #              on that driver once, beside the CPU.

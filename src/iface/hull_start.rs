@@ -91,6 +91,34 @@ impl HullDistance {
     }
 }
 
+/// Returns `count` points for a step of the fit and the distances there, both times the field's
+/// `radius`. Every second point lies anywhere in the box, the others near the hull's boundary.
+fn fit_points(
+    distance: &HullDistance,
+    seed: u64,
+    step: u64,
+    count: usize,
+    radius: f32,
+) -> (Vec<[f32; 3]>, Vec<f32>) {
+    let candidate = |k: usize| {
+        let u = |a: u64| 2.0 * rng::uniform(seed, 201 + (step << 10), 4 * k as u64 + a) - 1.0;
+        let p = [u(0), u(1), u(2)];
+        let f = distance.at(p);
+        (k % 2 == 0 || f.abs() <= 0.1).then(|| (p.map(|c| c * radius), f * radius))
+    };
+    let (mut x, mut target) = (Vec::with_capacity(count), Vec::with_capacity(count));
+    let mut drawn = 0;
+    while target.len() < count {
+        let found: Vec<_> = (drawn..drawn + count).into_par_iter().with_min_len(512).map(candidate).collect();
+        drawn += count;
+        for (p, f) in found.into_iter().flatten().take(count - target.len()) {
+            x.push(p);
+            target.push(f);
+        }
+    }
+    (x, target)
+}
+
 /// Fits the geometry of the field to the hull's distance, on the CPU. Half of the points lie in a band around the
 /// hull's boundary.
 pub fn fit_hull(
@@ -116,21 +144,7 @@ pub fn fit_hull(
     let mut g_table = vec![0f32; table.values().len()];
     let mut g_network = vec![0f32; network.values().len()];
     for step in 0..STEPS {
-        let mut x = Vec::with_capacity(POINTS);
-        let mut target = Vec::with_capacity(POINTS);
-        let mut k = 0;
-        while target.len() < POINTS {
-            let u = |a: u64| 2.0 * rng::uniform(session.seed, 201 + (step << 10), 4 * k + a) - 1.0;
-            let p = [u(0), u(1), u(2)];
-            k += 1;
-            let f = distance.at(p);
-            // every second point anywhere, the others near the boundary
-            if k % 2 == 0 && f.abs() > 0.1 {
-                continue;
-            }
-            x.push(p.map(|c| c * config.radius));
-            target.push(f * config.radius);
-        }
+        let (x, target) = fit_points(&distance, session.seed, step, POINTS, config.radius);
         let (_, weights) = state.weights(&shape);
         let field = sdf::forward(&shape, state.table(), &weights, &x, &[[0.0, 0.0, 1.0]; POINTS]);
         let mut g_field = vec![0f32; field.output().len()];

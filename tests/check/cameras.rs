@@ -1,5 +1,6 @@
 //! Cameras of NeuS, Metashape and RealityCapture: where a known point lands, and every hostile file refused by name.
 
+use crate::capture_folder::{open, put, refused};
 use glam::{DMat3, DVec3, Vec3};
 use std::fs;
 use std::io::Write;
@@ -16,24 +17,6 @@ fn photographs(dir: &Path, folder: &str, count: usize) {
     for i in 0..count {
         let rgb = vec![[i as u8; 3]; (SIZE.0 * SIZE.1) as usize];
         io::write_png_rgb(&dir.join(format!("{folder}/{i:02}.png")), SIZE.0, SIZE.1, &rgb).unwrap();
-    }
-}
-
-fn put(dir: &TempDir, name: &str, bytes: impl AsRef<[u8]>) {
-    let path = dir.path().join(name);
-    fs::create_dir_all(path.parent().unwrap()).unwrap();
-    fs::write(path, bytes).unwrap();
-}
-
-fn open(dir: &TempDir) -> tiface::Result<Capture> {
-    capture::open(dir.path(), &CaptureOptions::default())
-}
-
-fn refused(dir: &TempDir, words: &[&str]) {
-    let e = open(dir).unwrap_err();
-    assert!(!e.hint().is_empty(), "{e}");
-    for word in words {
-        assert!(e.to_string().contains(word), "`{word}` is missing in: {e}");
     }
 }
 

@@ -1,18 +1,17 @@
 //! `tiface export` as a user runs it: the finished mesh of a run in other files, and a run that stays as it is.
 
 use crate::command::{said, tiface};
-use crate::kept::{copy_run, once, photographed};
+use crate::kept::{copy_run, once};
+use crate::tiny::{FIELD, capture};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use tiface::capture::synthetic::SyntheticOptions;
 use tiface::geom::topology;
 use tiface::io::{Limits, parse_picture_info, read_tensors};
 use tiface::mesh::files::{HeadMesh, PictureSource, ReadMesh, ReadOptions, read_with, weld};
 
-/// A head that is learned in a few steps, and views of it that need no radiance field.
-const SETTINGS: &str = "device=cpu iface.steps=4 iface.rays=64 iface.max_rays=128 iface.samples=1024 iface.levels=4 \
-    iface.log2_table=10 iface.occupancy_resolution=16 iface.stereo=0 mesh.resolution=32 mesh.triangles=600 \
-    mesh.texture_px=128 mesh.format=glb,obj,ply render.samples=1 mesh.hair=none render.method=textured ensemble.members=";
+/// A mesh in all formats, and views of it that need no radiance field.
+const SETTINGS: &str = "mesh.triangles=600 mesh.texture_px=128 mesh.format=glb,obj,ply render.method=textured \
+    ensemble.members=";
 
 fn worked(folder: &Path, words: &[&str]) -> String {
     let output = tiface(folder, words);
@@ -23,10 +22,10 @@ fn worked(folder: &Path, words: &[&str]) -> String {
 /// Makes all stages of a run, up to its metrics. The head is learned once; its mesh is made again with these settings.
 fn finished(folder: &Path, more: &[&str]) -> PathBuf {
     let kept = once("to export", |folder| {
-        let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
-        photographed(&folder.join("head"), &options);
+        capture(folder);
         let mut words = vec!["run", "head", "--run", "run", "--preset", "draft"];
-        SETTINGS.split_whitespace().for_each(|set| words.extend(["--set", set]));
+        let settings = FIELD.split_whitespace().chain(SETTINGS.split_whitespace());
+        settings.for_each(|set| words.extend(["--set", set]));
         worked(folder, &words);
     });
     let run = copy_run(&kept, folder, "runs/head");

@@ -1,9 +1,9 @@
 //! A finished run in its user's hands: turntables, single stages, a capture that has moved.
 
 use crate::command::{said, tiface, worked};
-use crate::kept::{copy, copy_run, once, photographed};
+use crate::kept::{copy, copy_run, once};
+use crate::tiny::capture;
 use std::path::{Path, PathBuf};
-use tiface::capture::synthetic::SyntheticOptions;
 
 /// A checkpoint of T-Face that was learned elsewhere.
 fn checkpoint() -> PathBuf {
@@ -13,8 +13,7 @@ fn checkpoint() -> PathBuf {
 /// A run with an imported T-Face: nothing has to be learned.
 fn finished(folder: &Path) {
     let kept = once("imported", |folder| {
-        let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
-        photographed(&folder.join("head"), &options);
+        capture(folder);
         let import = format!("tface.import={}", checkpoint().display());
         let mut words = vec!["run", "head", "--run", "run", "--preset", "draft"];
         let settings = [
@@ -108,8 +107,7 @@ fn a_finished_run_outlives_its_capture_and_single_stages() {
 #[test]
 fn a_finished_run_needs_its_imported_checkpoint_no_more() {
     let dir = tempfile::tempdir().unwrap();
-    let options = SyntheticOptions { width: 24, height: 30, train: 4, test: 2, seed: 1 };
-    photographed(&dir.path().join("head"), &options);
+    capture(dir.path());
     let import = dir.path().join("official.safetensors");
     std::fs::copy(checkpoint(), &import).unwrap();
     let import = format!("tface.import={}", import.display());

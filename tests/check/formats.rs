@@ -1,22 +1,16 @@
 //! Camera files that are nearly right, models in other places, and the known cameras of other
 //! programs: read, or named with a way that works.
 
+use crate::capture_folder::{open, put};
 use crate::command::{code, err, out, tiface};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use std::fs;
-use std::path::Path;
 use tempfile::TempDir;
-use tiface::capture::{self, Capture, CaptureOptions, Split};
+use tiface::capture::{Capture, Split};
 use tiface::io;
 
 const SIZE: (u32, u32) = (24, 32);
 const VIEWS: usize = 5;
-
-fn put(dir: &TempDir, name: &str, bytes: impl AsRef<[u8]>) {
-    let path = dir.path().join(name);
-    fs::create_dir_all(path.parent().unwrap()).unwrap();
-    fs::write(path, bytes).unwrap();
-}
 
 fn photograph(dir: &TempDir, name: &str, size: (u32, u32)) {
     let path = dir.path().join(name);
@@ -30,10 +24,6 @@ fn photographs(folder: &str) -> TempDir {
     let dir = tempfile::tempdir().unwrap();
     (0..VIEWS).for_each(|i| photograph(&dir, &format!("{folder}/{i:02}.png"), SIZE));
     dir
-}
-
-fn open(folder: &Path) -> tiface::Result<Capture> {
-    capture::open(folder, &CaptureOptions::default())
 }
 
 /// What opening a folder says: the message and the suggested fix, with `ROOT` for the folder of the test.

@@ -1,6 +1,7 @@
 //! Crafted and unlucky files: each ends in the named error that says which file and where, never in a panic,
 //! a hang or a large allocation. One test per row of the specification's table of hostile input.
 
+use crate::capture_folder::open;
 use crate::kept::copy;
 use std::fs;
 use std::io::Cursor;
@@ -606,14 +607,6 @@ fn sound(frames: &[String]) -> String {
         r#"{{"camera_angle_x": 0.8, "w": 8, "h": 6, "unknown": {{"x": []}}, "frames": [{}]}}"#,
         frames.join(",")
     )
-}
-
-fn open(dir: &TempDir) -> tiface::Result<capture::Capture> {
-    let result = capture::open(dir.path(), &CaptureOptions::default());
-    if let Err(e) = &result {
-        assert!(!e.hint().is_empty(), "{e}");
-    }
-    result
 }
 
 #[test]

@@ -3,6 +3,7 @@
 //! What takes minutes is ignored with a reason that begins with `long:`, and run by `tools/test.sh all`.
 
 // what the tests share
+mod capture_folder;
 #[path = "../support/clicked.rs"]
 mod clicked;
 mod command;

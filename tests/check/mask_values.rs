@@ -4,6 +4,7 @@ use crate::command::{code, err, out, tiface, worked};
 use crate::kept::photographed;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use tempfile::TempDir;
 use tiface::capture::inspect::{Inspection, inspect};
 use tiface::capture::synthetic::SyntheticOptions;
@@ -77,14 +78,15 @@ fn coverage(found: &Inspection) -> f64 {
     found.coverage.unwrap().median
 }
 
-/// The same masks in white, inspected.
-fn plain() -> Inspection {
-    found(&drawn(|_, _| {}), "white")
+/// The same masks in white, inspected once.
+fn plain() -> &'static Inspection {
+    static PLAIN: OnceLock<Inspection> = OnceLock::new();
+    PLAIN.get_or_init(|| found(&drawn(|_, _| {}), "white"))
 }
 
 /// Their coverage.
 fn white() -> f64 {
-    coverage(&plain())
+    coverage(plain())
 }
 
 /// The only problem, and its hint.
@@ -101,7 +103,7 @@ fn masks_in_one_color_or_gray_make_no_transparent_head() {
             write_png_rgb(file, mask.width, mask.height, &in_color(mask, color)).unwrap();
         });
         let found = found(&dir, "white");
-        assert!((coverage(&found) - coverage(&plain)).abs() < 0.01, "{color:?}: {found}");
+        assert!((coverage(&found) - coverage(plain)).abs() < 0.01, "{color:?}: {found}");
         let [r, g, b] = color;
         let shown = if r == g { format!("gray {r}") } else { format!("({r}, {g}, {b})") };
         let said = |text: &String| text.contains(&shown) && text.contains("taken for white");

@@ -1,12 +1,13 @@
 //! COLMAP's models and Metashape's cameras as people have them: left-out lines, rigs, several chunks; and COLMAP's commands
 //! in the words of its versions.
 
+use crate::capture_folder::{open, put, refused};
 #[cfg(unix)]
 use crate::photographs::{cameras, found_by_script, script};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use std::fs;
 use tempfile::TempDir;
-use tiface::capture::{self, Capture, CaptureOptions, View};
+use tiface::capture::{Capture, View};
 use tiface::geom::Projection;
 use tiface::io;
 
@@ -22,24 +23,6 @@ fn photographs(names: &[String]) -> TempDir {
         io::write_png_rgb(&path, SIZE.0, SIZE.1, &rgb).unwrap();
     }
     dir
-}
-
-fn put(dir: &TempDir, name: &str, bytes: impl AsRef<[u8]>) {
-    let path = dir.path().join(name);
-    fs::create_dir_all(path.parent().unwrap()).unwrap();
-    fs::write(path, bytes).unwrap();
-}
-
-fn open(dir: &TempDir) -> tiface::Result<Capture> {
-    capture::open(dir.path(), &CaptureOptions::default())
-}
-
-fn refused(dir: &TempDir, words: &[&str]) {
-    let e = open(dir).unwrap_err();
-    assert!(!e.hint().is_empty(), "{e}");
-    for word in words {
-        assert!(e.to_string().contains(word), "`{word}` is missing in: {e}");
-    }
 }
 
 fn says(texts: &[String], words: &[&str]) {

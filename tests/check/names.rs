@@ -1,6 +1,7 @@
 //! Photographs and masks under names that are nearly those of the camera files: read where only one
 //! fits, else named.
 
+use crate::capture_folder::open;
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -67,10 +68,6 @@ fn capture_of(name: &str, photo: &str, mask_name: &str) -> TempDir {
         }
     }
     dir
-}
-
-fn open(dir: &TempDir) -> tiface::Result<Capture> {
-    capture::open(dir.path(), &CaptureOptions::default())
 }
 
 fn inspected(dir: &TempDir) -> Inspection {

@@ -5,7 +5,7 @@ use crate::kept::photographed;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use proptest::collection::{btree_map, vec};
 use proptest::prelude::*;
-use proptest::test_runner::RngSeed;
+use proptest::test_runner::{RngSeed, TestRunner};
 use std::path::Path;
 use tiface::capture::convert::{CameraFormat, convert};
 use tiface::capture::synthetic::SyntheticOptions;
@@ -110,22 +110,34 @@ fn assert_same(found: &Capture, expected: &Capture) {
     }
 }
 
-proptest! {
-    #![proptest_config(config(24))]
-
-    #[test]
-    fn cameras_survive_transforms_and_colmap(views in views()) {
-        let dir = tempfile::tempdir().unwrap();
-        let small = SyntheticOptions { width: 16, height: 16, train: 6, test: 3, seed: 1 };
-        photographed(&dir.path().join("head"), &small);
-        let head = capture::open(&dir.path().join("head"), &CaptureOptions::default()).unwrap();
+/// Writes and reads this many captures of nine random cameras, in both formats.
+fn cameras_survive(cases: u32) {
+    let dir = tempfile::tempdir().unwrap();
+    let small = SyntheticOptions { width: 16, height: 16, train: 6, test: 3, seed: 1 };
+    photographed(&dir.path().join("head"), &small);
+    let head = capture::open(&dir.path().join("head"), &CaptureOptions::default()).unwrap();
+    let survives = |views: Views| {
+        let written = tempfile::tempdir().unwrap();
         for format in [CameraFormat::Transforms, CameraFormat::Colmap] {
             let from = with_cameras(&head, &views);
-            let folder = dir.path().join(format!("{format:?}"));
+            let folder = written.path().join(format!("{format:?}"));
             convert(&from, format, &folder).unwrap();
             assert_same(&capture::open(&folder, &CaptureOptions::default()).unwrap(), &from);
         }
-    }
+        Ok(())
+    };
+    TestRunner::new(config(cases)).run(&views(), survives).unwrap();
+}
+
+#[test]
+fn cameras_survive_transforms_and_colmap() {
+    cameras_survive(8);
+}
+
+#[test]
+#[ignore = "long: run by `tools/test.sh all`; writes two thousand photographs to the disk"]
+fn cameras_of_a_hundred_captures_survive_transforms_and_colmap() {
+    cameras_survive(100);
 }
 
 proptest! {

@@ -9,7 +9,7 @@ use std::io::Write;
 use std::path::Path;
 use tempfile::TempDir;
 use tiface::capture::synthetic::{self, SyntheticOptions};
-use tiface::capture::{Capture, CaptureOptions, MaskSource, ViewMask};
+use tiface::capture::{self, Capture, CaptureOptions, MaskSource, ViewMask};
 use tiface::config::CameraPoses;
 use tiface::geom::Camera;
 use tiface::image::Photo;
@@ -304,7 +304,7 @@ fn photographs_are_turned_by_half_as_exif_asks_where_their_cameras_expect_that()
     let limits = Limits::default();
     let plain = tempfile::tempdir().unwrap();
     photographed(plain.path(), &HEAD);
-    let upright = &opened(plain.path()).views[4];
+    let upright = &capture::open(plain.path(), &CaptureOptions::default()).unwrap().views[4];
     for masks in [false, true] {
         let dir = half_turned([true, masks]);
         let capture = opened(dir.path());

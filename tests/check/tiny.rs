@@ -7,11 +7,13 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use tiface::capture::synthetic::SyntheticOptions;
 
-const SETTINGS: &str = "device=cpu mask.source=none iface.steps=4 iface.rays=64 iface.max_rays=128 \
-    iface.samples=1024 iface.levels=4 iface.log2_table=10 iface.occupancy_resolution=16 iface.stereo=0 \
-    tface.steps=4 tface.fields=2 tface.rays=64 tface.voxels_start=512 tface.voxels_final=1728 \
-    baseline.steps=2 baseline.rays=64 mesh.resolution=32 \
-    mesh.triangles=300 mesh.texture_px=64 mesh.format=glb,obj mesh.hair=none render.samples=1 \
+/// A distance field that is learned in a few steps, and a coarse mesh of it.
+pub const FIELD: &str = "device=cpu iface.steps=4 iface.rays=64 iface.max_rays=128 iface.samples=1024 iface.levels=4 \
+    iface.log2_table=10 iface.occupancy_resolution=16 iface.stereo=0 mesh.resolution=32 mesh.hair=none render.samples=1";
+
+/// All other stages of the smallest run.
+const OTHERS: &str = "mask.source=none tface.steps=4 tface.fields=2 tface.rays=64 tface.voxels_start=512 \
+    tface.voxels_final=1728 baseline.steps=2 baseline.rays=64 mesh.triangles=300 mesh.texture_px=64 mesh.format=glb,obj \
     render.method=baseline,tface,volume,textured ensemble.members=tface,volume ensemble.weights=0.8,0.2";
 
 pub type Files = BTreeMap<PathBuf, Vec<u8>>;
@@ -28,7 +30,7 @@ pub fn tiface(folder: &Path, words: &[&str]) -> Command {
     let mut command = command(folder, words);
     if !["report", "convert", "preview", "export", "status"].contains(&words[0]) {
         command.args(["--preset", "draft"]);
-        for setting in SETTINGS.split_whitespace() {
+        for setting in FIELD.split_whitespace().chain(OTHERS.split_whitespace()) {
             command.args(["--set", setting]);
         }
     }

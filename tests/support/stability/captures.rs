@@ -176,15 +176,17 @@ fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> 
 
 /// Trainings that start as sharp, and as soft, as a surface may be, and change that as fast as can be.
 fn variances(cases: &mut Cases, scratch: &Path) -> Result<()> {
+    let folder = scratch.join("0");
+    // the run of the plain capture, whose masks need no second check
+    let run = Run::quiet(&folder.join("run"));
     for (name, start) in [("sharpest", 1.38), ("softest", -1.38)] {
-        let folder = scratch.join("0");
         let mut config = config(&folder);
         (config.iface.variance, config.iface.lr_variance) = (start, 1.0);
         // at such a rate it swings from one end to the other: it is stuck only if it is never seen elsewhere
         let (mut outside, mut stays) = (0f64, 1f64);
         for steps in (1..=8).rev().map(|k| 5 * k) {
             config.iface.steps = steps;
-            let run = Run::quiet(&scratch.join(format!("{name}_{steps}")));
+            run.fresh(&[Stage::Iface.to_string()])?;
             let session = Session::open(&config, &run)?;
             let done = reconstruct(&session, Stage::Iface).ok();
             let inv_s = done.and_then(|done| done.last()?.1.summary["inv_s"].as_f64());
