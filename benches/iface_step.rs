@@ -21,7 +21,6 @@ use tiface::kernel::cpu::mlp::Weights;
 use tiface::kernel::cpu::neus::{self, Segments};
 use tiface::kernel::cpu::sdf::{self, FieldShape};
 use tiface::math::rng;
-use tiface::math::rng;
 
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;

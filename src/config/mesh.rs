@@ -155,7 +155,7 @@ table! {
         frame: MeshFrame [Files, Head if |c| c.mesh.lobes > 0] => MeshFrame::Dataset;
         /// Height of the head mesh in GLB and OBJ files, meters, from the crown to the end of what is shown of the body; 0:
         /// as `capture.unit_m` says.
-        #[flag("height", Text("METRES"), ["mesh", "export"],
+        #[flag("height", Text("METERS"), ["mesh", "export"],
             "Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it")]
         height_m: f64, 0.0..=10.0 [Files] => 0.0;
     }

@@ -1,4 +1,4 @@
-//! The quadratic of least value on the simplex.
+//! Small dense least squares: the quadratic of least value on the simplex.
 
 use super::MAX_MEMBERS;
 use crate::math::cholesky::{factor, substitute};

@@ -13,7 +13,7 @@ use crate::{Error, Result};
 
 /// Source of the rays of a training on a device.
 pub struct DeviceSampler {
-    /// Photographs in device memory; `None` if the processor samples the rays.
+    /// Photographs in device memory; `None` if the CPU samples the rays.
     resident: Option<Photographs>,
     drawing: SamplingOptions,
 }

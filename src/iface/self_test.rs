@@ -106,7 +106,7 @@ fn compare_sdf(adapter: &Adapter, config: IfaceConfig) -> Result<Vec<Check>> {
         let mut on_cpu = SdfModel::new(CpuSdf::new(&config, &sampler), &sampler, None, &config, &session);
         let mut on_gpu =
             SdfModel::new(GpuSdf::new(&config, &sampler, device)?, &sampler, None, &config, &session);
-        // Both keep the same cells up to rounding. The compared steps use the processor's.
+        // Both keep the same cells up to rounding. The compared steps use the CPU's.
         let [want, got] = [cells(&mut on_cpu)?, cells(&mut on_gpu)?];
         checks.push(compare_cells(way, &got.occupied.bits, &want.occupied.bits));
         if part == 1 {

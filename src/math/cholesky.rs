@@ -1,5 +1,5 @@
 //! Small dense symmetric systems by Cholesky's factorization. Plain loops give the same bits on
-//! every processor, which libraries that choose instructions at run time do not.
+//! every CPU, which libraries that choose instructions at run time do not.
 
 /// Factors a symmetric matrix as `L Lᵀ` in place. Only its lower half is read and written. Returns
 /// whether it is positive definite; if not, the matrix is left half factored.

@@ -161,7 +161,7 @@ fn review(
     Ok(views.into_iter().filter(|v| !v.suspicions.is_empty()).map(|v| v.name).collect())
 }
 
-/// What was measured of cameras and exposures.
+/// Results of the checks of cameras and exposures.
 #[derive(Default)]
 struct RigCheck {
     cameras: Option<CameraCheck>,

@@ -29,7 +29,7 @@ pub trait Surface: SdfField {
 #[derive(Clone, Copy)]
 pub(super) struct ClosedSurface<'a> {
     pub field: &'a dyn Surface,
-    /// What lies outside of it is outside of the surface.
+    /// Visual hull of the masks; points outside it are outside the surface.
     pub hull: Option<&'a BitGrid>,
     /// The cap where the frames cut the body.
     pub cap: Option<&'a Cap>,

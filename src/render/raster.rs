@@ -276,14 +276,14 @@ fn draw_band<C: Fn(&RayHits) -> Vec<[f32; 3]>>(
         let (core, own) = &surfaces[0];
         draw(tile, core, index);
         let mut light = Vec::new();
-        for (bins, layer) in surfaces[1..].iter().rev().filter(|(bins, _)| has(bins)) {
+        for (bins, surface) in surfaces[1..].iter().rev().filter(|(bins, _)| has(bins)) {
             if over.is_empty() {
                 over.push(Tile::new());
             }
             light.resize(TILE * TILE, [1.0; SAMPLES]);
             over[0].behind(tile);
             draw(&mut over[0], bins, index);
-            painter.paint(&over[0], layer, &mut light, area, out, batch, queue);
+            painter.paint(&over[0], surface, &mut light, area, out, batch, queue);
         }
         painter.paint(tile, own, &mut light, area, out, batch, queue);
     }

@@ -334,7 +334,7 @@ fn stretches(report: &mut UvReport, triangles: &[([DVec3; 3], [DVec2; 3])]) {
     (report.angle_stretch_median, report.angle_stretch_p99) = quantiles(&mut angles);
 }
 
-/// Returns the median and 99th percentile.
+/// Returns the median and 99th percentile of some values, of which there is one at least.
 fn quantiles(values: &mut [f64]) -> (f64, f64) {
     let [median, high] = [0.5, 0.99].map(|share| quantile(values, share, f64::total_cmp).unwrap_or(f64::NAN));
     (median, high)
