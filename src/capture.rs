@@ -59,9 +59,6 @@ pub(crate) use order::by_number;
 pub use scene::well_seen;
 pub use view::{Capture, CaptureOptions, LoadedView, Reading, Split, View, ViewMask};
 
-use crate::error::counted;
-use crate::io::{self, Limits, PictureInfo};
-use crate::{Error, Result};
 use downscale::downscaled;
 use folder::{CaptureFolder, in_frame, no_views};
 use format::CameraFiles;
@@ -71,6 +68,9 @@ use masks::few;
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use tiface_base::error::counted;
+use tiface_base::io::{self, Limits, PictureInfo};
+use tiface_base::{Error, Result};
 use view::{undone, wrong_size};
 
 /// Opens a capture, or returns the first thing that is wrong with it; [`inspect::inspect`] returns all.

@@ -2,7 +2,7 @@
 //! prints.
 //!
 //! Data goes to stdout, everything else to stderr; the exit code distinguishes errors worth a retry
-//! ([`crate::ErrorKind`]).
+//! ([`tiface_base::ErrorKind`]).
 
 mod about;
 mod bench;
@@ -26,7 +26,6 @@ mod status;
 use crate::config::key;
 use crate::pipeline::Stage;
 use crate::run::Stop;
-use crate::{Error, Result};
 use bench::BenchOptions;
 use cameras::CamerasOptions;
 use clap::parser::ValueSource;
@@ -44,6 +43,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
+use tiface_base::{Error, Result};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -411,13 +411,13 @@ pub fn out_of_memory(bytes: usize) -> ! {
          hint: free memory, raise `capture.downscale`, or lower `mesh.resolution` or the `rays` of a field; what is \
          complete is kept: repeat the command to continue"
     );
-    signal_hook::low_level::exit(crate::ErrorKind::NotNow.code().into())
+    signal_hook::low_level::exit(tiface_base::ErrorKind::NotNow.code().into())
 }
 
 /// Parses the command line, runs the command and returns the exit code. `collect` gives the allocator's free memory back to
 /// the system.
 pub fn main(collect: fn()) -> ExitCode {
-    crate::io::set_memory_collector(collect);
+    tiface_base::io::set_memory_collector(collect);
     complete::answer(Cli::command);
     let parsed =
         Cli::command().try_get_matches().and_then(|found| Ok((Cli::from_arg_matches(&found)?, found)));
@@ -491,7 +491,7 @@ fn hint_for(error: &clap::Error) -> Option<&'static str> {
     let Some(ContextValue::String(word)) = error.get(ContextKind::InvalidArg) else { return None };
     match error.kind() {
         ErrorKind::UnknownArgument if word == "--watch" => Some(WATCH),
-        ErrorKind::UnknownArgument if !word.starts_with('-') && crate::io::exists(Path::new(word)) => {
+        ErrorKind::UnknownArgument if !word.starts_with('-') && tiface_base::io::exists(Path::new(word)) => {
             Some(ONE_HEAD)
         }
         _ => None,
@@ -533,10 +533,10 @@ fn refuse_ignored(found: &ArgMatches) -> Result<()> {
 fn suggest(error: Error) -> Error {
     let text = error.to_string();
     let is_missing =
-        |word: &String| text.starts_with(&format!("`{word}`")) && !crate::io::exists(Path::new(word));
+        |word: &String| text.starts_with(&format!("`{word}`")) && !tiface_base::io::exists(Path::new(word));
     let mut words = std::env::args_os().skip(1).filter_map(|word| word.into_string().ok());
     let missing = words.find(is_missing);
-    match missing.and_then(|word| crate::io::similar(Path::new(&word))) {
+    match missing.and_then(|word| tiface_base::io::similar(Path::new(&word))) {
         Some(found) if !error.hint().contains("did you mean") => {
             let hint = format!("did you mean `{}`? {}", found.display(), error.hint());
             error.with_hint(hint)

@@ -34,14 +34,14 @@ pub use source::{Fallback, Sources, known_words};
 pub use stage::Stage;
 pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
-use crate::io::{self, Limits};
-use crate::{Error, Result};
 use affects::affects;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 use toml::{Table, Value};
 
 /// A key of the configuration: what it means and what a number may be.

@@ -17,10 +17,10 @@ mod tiles;
 pub use fit::{Fit, fit_weights};
 pub use tiles::{Tile, tiles};
 
-use crate::image::{Gray, Image, Photo};
-use crate::{Error, Result};
 use rayon::prelude::*;
 use std::ops::Range;
+use tiface_base::image::{Gray, Image, Photo};
+use tiface_base::{Error, Result};
 
 /// Maximum number of members in a fit.
 pub const MAX_MEMBERS: usize = 8;

@@ -28,9 +28,9 @@ pub use density::{DensityField, train_density};
 pub use infer::IFace;
 pub use train::{IfaceReport, train};
 
-use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::{ComputeDevice, SelfTest};
+use tiface_base::Result;
 
 /// Whether a GPU learns a signed distance as the CPU does.
 pub const SDF_TEST: SelfTest = SelfTest {

@@ -33,27 +33,18 @@
 //! casting and rasterization) → **ensemble** (they become one) → **metrics**. [`pipeline`] runs them; every stage
 //! leaves a folder of plain files in the [`run`], and is skipped when it is done.
 //!
-//! Modules are declared in pipeline order, after the modules that they share. The parts can be used alone:
-//! [`mesh`] meshes any signed distance and needs no field, [`capture`] reads seven kinds of camera files and names
-//! the others, [`io`] opens every file within limits. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file and
-//! place, and a suggested fix.
+//! Modules are declared in pipeline order, after the modules that they share. The packages below this
+//! one can be used alone: `tiface-surface` ([`mesh`], [`render`]) meshes any signed distance and needs no
+//! field, `tiface-kernels` ([`kernel`]) computes the fields, `tiface-base` has what all know, with [`io`],
+//! which opens every file within limits. [`capture`] reads seven kinds of camera files and names the
+//! others. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file
+//! and place, and a suggested fix.
 //!
 //! [ARCHITECTURE.md](../../../ARCHITECTURE.md) shows components, data flow, coordinate frames and tensor layouts on one page.
 
-// The reference arithmetic of tests names the crate as its other users do.
-#[cfg(test)]
-extern crate self as tiface;
-
-pub mod error;
-pub mod geom;
-pub mod image;
-pub mod io;
-pub mod kernel;
-pub mod math;
-pub mod monitor;
-
-pub use error::{Error, ErrorKind, Result};
-pub use monitor::{Monitor, Quiet};
+pub use tiface_base::{Error, ErrorKind, Monitor, Quiet, Result, error, geom, image, io, math, monitor};
+pub use tiface_kernels as kernel;
+pub use tiface_surface::{self as mesh, render};
 
 pub mod config;
 pub mod run;
@@ -71,9 +62,6 @@ pub mod rig;
 pub mod tface;
 
 pub mod iface;
-pub mod mesh;
-
-pub mod render;
 
 pub mod ensemble;
 pub mod metrics;
@@ -81,3 +69,7 @@ pub mod metrics;
 pub mod pipeline;
 
 pub mod cli;
+
+#[cfg(test)]
+#[path = "../tests/support/reference/mod.rs"]
+pub(crate) mod reference;

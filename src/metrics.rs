@@ -28,11 +28,11 @@ pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr_ssim::{psnr, ssim_reflect_map, ssim_valid};
 
-use crate::image::{Gray, INSIDE, Image, Photo, quantize};
 #[cfg(not(feature = "matting"))]
 use crate::onnx as lpips;
-use crate::{Error, Result};
 use serde::Serialize;
+use tiface_base::image::{Gray, INSIDE, Image, Photo, quantize};
+use tiface_base::{Error, Result};
 
 /// Metrics of one view.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -20,11 +20,11 @@ pub use self::network::NetworkFile;
 pub(crate) use self::network::{Contract, NetworkArray, Role, file_error};
 
 use self::network::{I64, NetworkInputs, Port, guarded, in_words, one_line};
-use crate::io::{self, Limits};
-use crate::{Error, Result};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 use tract_onnx::pb;
 use tract_onnx::prelude::*;
 use tract_onnx::tract_hir::infer::Factoid;

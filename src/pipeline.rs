@@ -48,7 +48,6 @@ mod session;
 mod surface;
 
 pub use crate::config::Stage;
-pub use crate::geom::RayResult;
 pub use bench::{Bench, SWEEPS};
 pub use compare::{Judged, compare_runs, judge};
 pub use export::KeptHead;
@@ -61,10 +60,12 @@ pub use preview::{Preview, PreviewPicture, PreviewRenderer, field_view};
 pub use readings::open_capture;
 pub use session::{DEMO_CAPTURE, Session, check_feasible, require_device};
 pub use surface::{Fields, Radiance, Surface};
+pub use tiface_base::geom::RayResult;
 
 use crate::run::{Done, StageDir};
-use crate::{Result, io, kernel};
 use render::{Meshes, Renderer};
+use tiface_base::{Result, io};
+use tiface_kernels as kernel;
 
 /// Completes `until` and every stage that it needs, and writes the report.
 pub fn reconstruct(session: &Session, until: Stage) -> Result<Vec<(Stage, Done)>> {

@@ -15,16 +15,16 @@ pub use live::live_html;
 pub use runs::{RunRow, runs_csv, runs_html};
 
 use crate::config::{Stage, display_name};
-use crate::image::{Photo, over_black, quantize, reduce_photo, srgb_from_linear, working_size};
-use crate::io::{self, Limits};
 use crate::run::Record;
-use crate::{Error, ErrorKind, Result};
 use base64::prelude::{BASE64_STANDARD, Engine};
 use minijinja::{Environment, context};
 use serde::Serialize;
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
+use tiface_base::image::{Photo, over_black, quantize, reduce_photo, srgb_from_linear, working_size};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, ErrorKind, Result};
 
 /// Style that all pages share.
 const STYLE: &str = include_str!("report/style.css");

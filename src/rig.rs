@@ -21,9 +21,9 @@ mod tracks;
 pub use gate::{CameraFit, CameraState, LEAST_SIGHTINGS, PoseDecision};
 pub use tracks::RigView;
 
-use crate::geom::{Camera, Mesh};
 use adjust::{Track, adjust, gauge, median, project, resected};
 use glam::DVec3;
+use tiface_base::geom::{Camera, Mesh};
 
 /// Points to spread over the surface. A third of them is found on skin with stubble and pores.
 pub const POINTS: usize = 8000;

@@ -17,7 +17,7 @@
 //! device and for one seed). `status.json`, `log.jsonl` and `done.json` contain times and rates, and
 //! so differ from run to run.
 
-use crate::{Error, ErrorKind, Quiet, Result};
+use tiface_base::{Error, ErrorKind, Quiet, Result};
 mod estimate;
 mod failure;
 mod fingerprint;
@@ -36,10 +36,10 @@ pub use stage::{Done, Plan, StageDir};
 pub use status::{Phase, RunStatus, StageStatus, State, Status, read_status};
 pub use verify::{Verification, VerifiedFile, verify};
 
-use crate::io::{self, Lock, LockError};
 use record::TIMED;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use tiface_base::io::{self, Lock, LockError};
 
 impl Observer for Quiet {
     fn event(&self, _: &Event) {}

@@ -21,10 +21,10 @@ pub use infer::{TFace, import};
 pub use mean::{FieldMean, train};
 pub use train::TfaceReport;
 
-use crate::Result;
 use crate::config::VmConfig;
 use crate::field::ComputeDevice;
-use crate::geom::Aabb;
+use tiface_base::Result;
+use tiface_base::geom::Aabb;
 
 /// Refuses a GPU that cannot hold the training of a field, before its photographs are known: they need no memory there.
 /// Without `bounds`, the box that the masks give, refuses what fits in no box. An imported field is not trained.

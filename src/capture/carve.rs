@@ -7,10 +7,10 @@
 //! leave through one border and come back beside another, as shoulders do not.) Footprints are generous rectangles counted with a
 //! summed-area table, so a hair thinner than a cell is never lost.
 
-use crate::geom::Camera;
-use crate::image::Gray;
 use glam::{DMat3, DVec3, Vec2};
 use rayon::prelude::*;
+use tiface_base::geom::Camera;
+use tiface_base::image::Gray;
 
 /// A camera prepared for many projections.
 pub(crate) struct Projector {

@@ -18,11 +18,11 @@ use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join};
 use super::frame::{CameraFrame, LensModel, Listing};
 use super::masks::few;
 use super::view::Split;
-use crate::io::{self, ReadError};
-use crate::{Error, Result, geom};
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
+use tiface_base::io::{self, ReadError};
+use tiface_base::{Error, Result, geom};
 
 impl ModelFiles {
     fn read(&self, folder: &CaptureFolder) -> Result<Model> {

@@ -10,15 +10,15 @@ use super::folder::is_hidden;
 use super::frame::LensModel;
 use super::view::{Capture, Split, View, ViewMask};
 use super::{every_eighth, up};
-use crate::geom::Camera;
-use crate::image::Photo;
-use crate::io::{self, Limits};
-use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use tiface_base::geom::Camera;
+use tiface_base::image::Photo;
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// A format that cameras can be written in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -4,8 +4,8 @@
 //! so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as a sensor
 //! with larger pixels would, weighted by alpha where there is one.
 
-use crate::geom::Camera;
-use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
+use tiface_base::geom::Camera;
+use tiface_base::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 
 /// Returns the camera of a picture averaged down by `d`.
 pub(super) fn downscaled(camera: &Camera, d: u32) -> Camera {

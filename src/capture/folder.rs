@@ -7,13 +7,13 @@ pub(super) use super::near::names::{PHOTOGRAPHS, has_ending, is_common_name};
 use super::near::{Kind, Search};
 use super::table;
 use super::view::{CaptureOptions, Reading};
-use crate::io::{self, ReadError};
-use crate::{Error, Result};
 use glam::DMat3;
 use roxmltree::{Document, ParsingOptions};
 use std::collections::HashSet;
 use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
+use tiface_base::io::{self, ReadError};
+use tiface_base::{Error, Result};
 
 /// Endings that may be missing from a photograph's name: of supported files, and of files that are found only to be refused
 /// by name.

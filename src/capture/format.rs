@@ -6,12 +6,12 @@ use super::colmap::{ModelFiles, mixed_model, model_elsewhere};
 use super::folder::{FolderEntries, PHOTOGRAPHS, has_ending, is_common_name};
 use super::pose_folder::PoseFolder;
 use super::{neus, programs, realitycapture};
-use crate::Error;
 use crate::config::{Config, Stage};
-use crate::io;
 use std::cell::OnceCell;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
+use tiface_base::Error;
+use tiface_base::io;
 
 /// The files that describe the cameras.
 pub(super) enum CameraFiles {

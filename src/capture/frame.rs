@@ -2,11 +2,11 @@
 //! nerfstudio and instant-ngp also use.
 
 use super::view::Split;
-use crate::Error;
-use crate::geom::{Aabb, Camera, Distortion, Projection};
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 use std::path::PathBuf;
+use tiface_base::Error;
+use tiface_base::geom::{Aabb, Camera, Distortion, Projection};
 
 /// Everything that a reader of camera files found.
 #[derive(Debug)]

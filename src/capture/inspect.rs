@@ -7,17 +7,17 @@ use super::masks::{self, few};
 use super::photo_checks::{self, PhotoCheck};
 use super::scene::{self, Scene, SceneOptions};
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
-use crate::Error;
 use crate::config::MaskMeaning;
-use crate::geom::Aabb;
-use crate::image::Gray;
-use crate::math::rank::median;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
 use std::path::{Path, PathBuf};
+use tiface_base::Error;
+use tiface_base::geom::Aabb;
+use tiface_base::image::Gray;
+use tiface_base::math::rank::median;
 
 /// A problem and its suggested fix.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]

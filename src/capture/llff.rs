@@ -11,9 +11,9 @@ use super::missing;
 use super::near::names::IMAGE_FOLDERS;
 use super::order;
 use super::view::Split;
-use crate::io::{self, NpyValues};
-use crate::{Error, Result};
 use glam::{DMat3, DVec3};
+use tiface_base::io::{self, NpyValues};
+use tiface_base::{Error, Result};
 
 /// Relative to the spread of the cameras.
 const POSITION_TOLERANCE: f64 = 1e-3;

@@ -7,10 +7,10 @@ use super::near::names::{
 };
 use super::near::pairs::{Pairs, pair, pair_below};
 use super::view::View;
-use crate::error::counted;
-use crate::io;
 use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
+use tiface_base::error::counted;
+use tiface_base::io;
 
 /// Folders in the order in which they are taken; others follow by name.
 const STANDING: [&str; 3] = ["vit_mask", "masks", "mask"];

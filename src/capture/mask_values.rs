@@ -6,14 +6,14 @@
 //! head by themselves: [`MaskSurvey::reading`] refuses them.
 
 use crate::config::{HeadValue, MaskHead};
-use crate::error::counted;
-use crate::image::{Gray, OPAQUE_ALPHA};
-use crate::io::MaskPicture;
-use crate::{Error, Result};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use tiface_base::error::counted;
+use tiface_base::image::{Gray, OPAQUE_ALPHA};
+use tiface_base::io::MaskPicture;
+use tiface_base::{Error, Result};
 
 /// Maximum of a channel that counts as black in pictures with noise.
 pub(super) const MAX_BLACK: u8 = 16;

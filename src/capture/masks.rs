@@ -6,12 +6,12 @@ use super::mask_names;
 use super::mask_values::MAX_BLACK;
 use super::view::{Capture, CaptureOptions, Split, View, ViewMask};
 use crate::config::{MaskMeaning, MaskSource};
-use crate::error::counted;
-use crate::image::{Gray, OPAQUE_ALPHA, Photo};
-use crate::io::{self, Limits, PictureInfo};
-use crate::{Error, Result};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
+use tiface_base::error::counted;
+use tiface_base::image::{Gray, OPAQUE_ALPHA, Photo};
+use tiface_base::io::{self, Limits, PictureInfo};
+use tiface_base::{Error, Result};
 
 /// Returns names for a message: at most six, then the number of others.
 pub(super) fn few(names: impl IntoIterator<Item = impl AsRef<str>>) -> String {

@@ -11,14 +11,14 @@
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join, parse_xml, shortened};
 use super::frame::{self, CameraFrame, Listing};
 use super::masks::few;
-use crate::Result;
-use crate::error::counted;
-use crate::io::{self, ReadError};
 use glam::{DMat3, DVec3};
 use roxmltree::{Document, Node};
 use sensor::Sensor;
 use std::collections::{HashMap, HashSet};
 use std::str::FromStr;
+use tiface_base::Result;
+use tiface_base::error::counted;
+use tiface_base::io::{self, ReadError};
 
 mod sensor;
 

@@ -5,10 +5,10 @@ use super::folder::{CaptureFolder, in_frame};
 use super::frame::{CameraFrame, Listing};
 use super::near::names::{fold, is_aside, is_common_name, is_number, reduced};
 use super::near::{Answer, Kind, NearMatch};
-use crate::error::counted;
-use crate::io;
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
+use tiface_base::error::counted;
+use tiface_base::io;
 
 /// Number of examples in a sentence.
 const EXAMPLES: usize = 2;

@@ -10,7 +10,6 @@
 pub(super) mod names;
 pub(super) mod pairs;
 
-use crate::io;
 use names::{PHOTOGRAPHS, READABLE_FORMATS};
 use names::{
     bare, fold, has_ending, is_aside, is_common_name, is_mask_folder, is_same_format, reduced, without_ending,
@@ -18,6 +17,7 @@ use names::{
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+use tiface_base::io;
 
 /// Maximum number of entries that are looked at; where a capture has more, none is near.
 const MAX_ENTRIES: usize = 100_000;

@@ -13,12 +13,12 @@ use super::near::names::{IMAGE_FOLDERS, without_ending};
 use super::near::pairs::pair;
 use super::order;
 use super::view::Reading;
-use crate::Result;
-use crate::geom::Aabb;
-use crate::io::{self, Npy, NpyValues};
 use glam::{DMat3, DVec3};
 use std::collections::BTreeMap;
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::geom::Aabb;
+use tiface_base::io::{self, Npy, NpyValues};
 
 /// Files of this format, in this order.
 pub(super) const FILES: [&str; 2] = ["cameras_sphere.npz", "cameras.npz"];

@@ -6,11 +6,11 @@
 //! with `--orientation-method none --center-method none --auto-scale-poses False`.
 
 use super::transforms::camera_like;
-use crate::geom::{Aabb, Camera, Distortion};
-use crate::{Error, Result};
 use glam::{BVec3, DMat3, DVec3, Vec3};
 use serde::Deserialize;
 use serde_json::{Map, Value};
+use tiface_base::geom::{Aabb, Camera, Distortion};
+use tiface_base::{Error, Result};
 
 /// Maximum number of cameras in one file.
 const MAX_CAMERAS: usize = 100_000;
@@ -267,7 +267,7 @@ fn pose(rows: &[Vec<f64>]) -> Result<(DMat3, DVec3), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Projection;
+    use tiface_base::geom::Projection;
 
     fn like() -> Camera {
         Camera {

@@ -1,7 +1,7 @@
 //! Checks of the photographs themselves: blur, overexposure, and pictures that occur twice.
 
 use super::masks::few;
-use crate::image::{Gray, Photo, eroded, reduce_photo, resize_gray, working_size};
+use tiface_base::image::{Gray, Photo, eroded, reduce_photo, resize_gray, working_size};
 
 /// Longest side at which sharpness is compared, pixels.
 const COMPARED_PX: u32 = 1024;
@@ -124,7 +124,7 @@ pub(super) fn findings(photos: &[(&str, PhotoCheck)]) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::rng::uniform;
+    use tiface_base::math::rng::uniform;
 
     /// A pattern of 96 × 96 pixels with detail at every scale, or a mean of its neighborhoods.
     fn photo(seed: u64, blur: usize) -> Photo {

@@ -16,12 +16,12 @@ use super::frame::{self, CameraFrame, Intrinsics, Listing};
 use super::masks::few;
 use super::table;
 use super::view::Split;
-use crate::Result;
-use crate::geom::Aabb;
-use crate::io;
 use glam::{DMat3, DVec3, Vec3};
 use std::collections::HashSet;
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::geom::Aabb;
+use tiface_base::io;
 
 /// Where the poses are, in this order.
 const POSES: [&str; 2] = ["pose", "poses"];

@@ -1,7 +1,7 @@
 //! What other programs leave in a folder: how it is recognized, and the way from there to a capture.
 
 use super::folder::{FolderEntries, has_ending, join};
-use crate::io;
+use tiface_base::io;
 
 /// Signs that a folder is a program's.
 enum Sign {

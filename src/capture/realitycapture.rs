@@ -12,12 +12,12 @@ use super::folder::{
 };
 use super::frame::{self, CameraFrame, Intrinsics, Listing};
 use super::table::{self, Heading};
-use crate::geom::Distortion;
-use crate::io;
-use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use roxmltree::Node;
 use std::path::{Path, PathBuf};
+use tiface_base::geom::Distortion;
+use tiface_base::io;
+use tiface_base::{Error, Result};
 
 /// How a CSV file begins.
 pub(super) const HEADER: &str = "#name,x,y,alt";

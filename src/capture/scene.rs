@@ -22,14 +22,14 @@ pub use well_seen::well_seen;
 
 use super::carve::{self, Cube, Projector, SilhouetteTable};
 use super::masks::few;
-use crate::error::counted;
-use crate::geom::{Aabb, BitGrid, Camera, Similarity};
-use crate::image::Gray;
-use crate::math::rank::median;
-use crate::{Error, Result};
 use frusta::from_frusta;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use serde::{Deserialize, Serialize};
+use tiface_base::error::counted;
+use tiface_base::geom::{Aabb, BitGrid, Camera, Similarity};
+use tiface_base::image::Gray;
+use tiface_base::math::rank::median;
+use tiface_base::{Error, Result};
 
 /// The head's box and how it sits in the world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -20,11 +20,7 @@ use super::masks::few;
 use super::view::{Capture, CaptureOptions, ViewMask};
 use super::{MaskSource, build, convert};
 use crate::config::MaskHead;
-use crate::error::counted;
-use crate::image::Photo;
-use crate::io::{self, Limits, Lock, Program, ProgramFailure, VideoFrames};
 use crate::run::Fingerprint;
-use crate::{Error, Result};
 use commands::{Programs, Spelling};
 use glam::{DMat3, DVec3};
 use output::{LOG, NAMES, Output, PHOTOGRAPHS, Request};
@@ -33,6 +29,10 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashSet;
 use std::ffi::OsString;
 use std::path::{Component, Path, PathBuf};
+use tiface_base::error::counted;
+use tiface_base::image::Photo;
+use tiface_base::io::{self, Limits, Lock, Program, ProgramFailure, VideoFrames};
+use tiface_base::{Error, Result};
 
 mod commands;
 mod output;
@@ -159,7 +159,7 @@ impl<'a> Search<'a> {
     ///
     /// Fails without COLMAP, if the folder has cameras or a picture cannot be read, if something
     /// would be overwritten, if the disk has too little room, and with
-    /// [`ErrorKind::NotNow`](crate::ErrorKind::NotNow) if another search works in the output
+    /// [`ErrorKind::NotNow`](tiface_base::ErrorKind::NotNow) if another search works in the output
     /// folder.
     pub fn of_photographs(root: &Path, options: &CaptureOptions, sfm: &'a SfmOptions) -> Result<Search<'a>> {
         let options = CaptureOptions { downscale: 1, ..options.clone() };

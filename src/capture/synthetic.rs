@@ -11,14 +11,14 @@ mod shape;
 
 pub use shape::SyntheticHead;
 
-use crate::geom::{Camera, Distortion, Similarity};
-use crate::io::{self, Limits};
-use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use photograph::Studio;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
+use tiface_base::geom::{Camera, Distortion, Similarity};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// What [`write_capture`] makes.
 #[derive(Clone, Debug, PartialEq)]

@@ -18,8 +18,6 @@ use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, CameraFrame, Listing};
 use super::masks::few;
 use super::view::Split;
-use crate::io;
-use crate::{Error, Result};
 use glam::DVec3;
 use keys::KeyLog;
 use lens::{FrameKeys, LensNotes};
@@ -27,6 +25,8 @@ use moments::Moments;
 use serde_json::{Map, Value};
 use splits::Listed;
 use std::path::PathBuf;
+use tiface_base::io;
+use tiface_base::{Error, Result};
 
 type Object = Map<String, Value>;
 

@@ -4,14 +4,14 @@
 use super::downscale::{Average, average_gray, average_photo};
 use super::mask_values::{MaskReading, MaskSurvey, MaskValues};
 use crate::config::{CameraPoses, Exposures, MaskHead, MaskMeaning, MaskSource};
-use crate::geom::{Aabb, Camera};
-use crate::image::{Exposure, Gray, Photo};
-use crate::io::{self, Limits, NpyValues};
-use crate::{Error, Result};
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+use tiface_base::geom::{Aabb, Camera};
+use tiface_base::image::{Exposure, Gray, Photo};
+use tiface_base::io::{self, Limits, NpyValues};
+use tiface_base::{Error, Result};
 
 /// Use of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]

@@ -5,11 +5,11 @@ use super::options::{Common, RunTarget};
 use super::screen::print;
 use crate::config::{explain, explained};
 use crate::field::{DeviceReport, examine_devices};
-use crate::{Error, ErrorKind, Result, io};
 use serde::Serialize;
 use serde_json::json;
 use std::fmt::{self, Display};
 use std::path::Path;
+use tiface_base::{Error, ErrorKind, Result, io};
 
 pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) -> Result<()> {
     if let Some(key) = key {

@@ -5,18 +5,18 @@ use super::options::RunTarget;
 use super::out::Out;
 use super::screen::print;
 use crate::config::{Config, Fallback, Preset};
-use crate::io::{self, Limits};
 use crate::pipeline::{Bench, SWEEPS, Session, check_feasible, require_device};
 use crate::report::bench::BenchResult;
 use crate::report::duration;
 use crate::run::{Event, Observer, Run};
-use crate::{Error, Result};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// Options of `tiface bench`.
 #[derive(Args, Debug)]

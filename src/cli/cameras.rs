@@ -4,9 +4,9 @@ use super::Invocation;
 use super::screen::print;
 use crate::capture::sfm::{Search, SfmOptions, default_folder};
 use crate::pipeline::capture_options;
-use crate::{Error, Result};
 use clap::Args;
 use std::path::PathBuf;
+use tiface_base::{Error, Result};
 
 /// Options of `cameras`.
 #[derive(Args, Debug)]

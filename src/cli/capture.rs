@@ -5,14 +5,15 @@ use super::Invocation;
 use super::options::Common;
 use super::out::Out;
 use super::screen::{one_line, print};
+use crate::capture;
 use crate::capture::convert::CameraFormat;
 use crate::config::{CameraPoses, Config};
-use crate::error::counted;
-use crate::io::Limits;
 use crate::pipeline::{self, capture_options, click_page, inspect_capture, open_capture};
-use crate::{Error, ErrorKind, Result, capture, io};
 use serde_json::json;
 use std::path::{Path, PathBuf};
+use tiface_base::error::counted;
+use tiface_base::io::Limits;
+use tiface_base::{Error, ErrorKind, Result, io};
 
 pub(super) fn inspect(common: &Common, capture: &Path) -> Result<()> {
     let (config, root) = capture_of(common, capture)?;

@@ -4,21 +4,21 @@ use super::options::Common;
 use super::screen::{one_line, print};
 use crate::capture::{self, CaptureOptions, Split, View};
 use crate::config::Stage;
-use crate::geom::{Bvh, Camera, Mesh};
-use crate::io::{self, Limits};
-use crate::mesh::files::{
-    CheckReport, OpenedMesh, ReadMesh, check_around, open_mesh, open_surface, uv_check, weld,
-};
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
 use crate::pipeline::open_capture;
 use crate::run::{Fault, ProductState, read_record};
-use crate::{Error, ErrorKind, Result};
 use glam::DVec3;
 use serde::Serialize;
 use std::fmt::{self, Display};
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
+use tiface_base::geom::{Bvh, Camera, Mesh};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, ErrorKind, Result};
+use tiface_surface::files::{
+    CheckReport, OpenedMesh, ReadMesh, check_around, open_mesh, open_surface, uv_check, weld,
+};
 
 /// Points sampled on each surface.
 const SURFACE_SAMPLES: usize = 200_000;

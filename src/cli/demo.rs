@@ -6,12 +6,12 @@ use super::out::Out;
 use super::run::{StageCommand, run as run_stages};
 use crate::capture::synthetic::{MadeCapture, SyntheticOptions, check, write_borders, write_capture};
 use crate::config::{Fallback, Preset};
-use crate::io;
 use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
 use crate::report::duration;
-use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use tiface_base::io;
+use tiface_base::{Error, Result};
 
 /// Settings of the demo: few steps, because its pictures are small.
 pub(super) const DEMO: Fallback = (Preset::Draft, |config| {

@@ -9,7 +9,6 @@ use super::screen::{Screen, print};
 use crate::capture::is_run;
 use crate::capture::synthetic::SyntheticOptions;
 use crate::config::{Config, key};
-use crate::io::{self, Limits};
 use crate::pipeline::Session;
 use crate::pipeline::experiment::{
     ORDERINGS, ROWS, TABLES, ahead, config, measured, runs, without_masks, work,
@@ -17,11 +16,12 @@ use crate::pipeline::experiment::{
 use crate::report::duration;
 use crate::report::experiment::{Experiment, ExperimentRow, Measured, Published, read_published};
 use crate::run::{Cost, Run};
-use crate::{Error, Result};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use serde_json::json;
 use std::path::{Path, PathBuf};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// Options of `tiface experiment`.
 #[derive(Args, Debug)]

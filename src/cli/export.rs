@@ -7,9 +7,9 @@ use super::out::{Out, require_outside, write_head};
 use super::screen::print;
 use crate::config::{Config, MeshFormat, Stage, key};
 use crate::pipeline::KeptHead;
-use crate::{Error, Quiet, Result, io};
 use serde_json::json;
 use std::path::{Path, PathBuf};
+use tiface_base::{Error, Quiet, Result, io};
 
 /// Writes the mesh of a run with the settings of these options.
 pub(super) fn run(invocation: &Invocation, path: Option<&Path>, flags: &KeyFlags) -> Result<()> {

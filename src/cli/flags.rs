@@ -2,11 +2,11 @@
 
 use super::options::KeyOption;
 use crate::config::{Flag, Takes, all_keys, key};
-use crate::{Error, Result, io};
 use clap::parser::ValueSource;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, value_parser};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
+use tiface_base::{Error, Result, io};
 
 /// The options of a command that set keys, as they are given.
 #[derive(Debug, Default)]

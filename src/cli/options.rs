@@ -3,12 +3,12 @@
 use super::complete::complete_setting;
 use crate::capture::is_run;
 use crate::config::{Config, Fallback, Preset, Sources, Stage, key};
-use crate::io::{self, Limits};
-use crate::{Error, Result};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ColorChoice};
 use clap_complete::ArgValueCompleter;
 use std::path::{Path, PathBuf};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// An option of one command that sets a key of the configuration: as typed, the key, its value.
 pub(super) type KeyOption = (String, String, String);

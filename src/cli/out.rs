@@ -4,12 +4,12 @@
 //! product under its usual names; everything else is refused.
 
 use crate::config::MeshFormat;
-use crate::io;
-use crate::mesh::files::ExportedFiles;
 use crate::pipeline::{DEMO_CAPTURE, KeptHead, Session, Stage};
 use crate::run::Run;
-use crate::{Error, Result};
 use std::path::{Path, PathBuf};
+use tiface_base::io;
+use tiface_base::{Error, Result};
+use tiface_surface::files::ExportedFiles;
 
 /// A writable destination.
 #[derive(Debug, PartialEq)]

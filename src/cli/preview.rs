@@ -7,13 +7,9 @@ use super::out::Out;
 use super::screen::print;
 use crate::capture::is_run;
 use crate::config::ViewBackground;
-use crate::geom::Camera;
-use crate::io::{self, Animation};
 use crate::pipeline::{Preview, PreviewPicture, Session, Stage, field_view, head_page, viewer_of_file};
-use crate::render::Look;
 use crate::report::live_html;
 use crate::run::Run;
-use crate::{Error, Result};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use glam::Vec3;
@@ -23,6 +19,10 @@ use std::collections::HashMap;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
+use tiface_base::geom::Camera;
+use tiface_base::io::{self, Animation};
+use tiface_base::{Error, Result};
+use tiface_surface::render::Look;
 
 /// Options of `tiface preview`.
 #[derive(Args, Debug)]

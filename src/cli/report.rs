@@ -5,14 +5,14 @@ use super::options::RunTarget;
 use super::out::Out;
 use super::screen::print;
 use crate::config::{Config, Stage};
-use crate::io;
 use crate::pipeline::{Session, compare_runs, curves, renew_report};
 use crate::report::{RunRow, curves_csv, runs_csv, runs_html};
 use crate::run::{Run, read_record};
-use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::json;
 use std::path::{Path, PathBuf};
+use tiface_base::io;
+use tiface_base::{Error, Result};
 
 pub(super) fn run(invocation: &Invocation, runs: &[PathBuf], table: bool) -> Result<()> {
     let common = invocation.common;

@@ -9,9 +9,9 @@ use crate::config::{Fallback, NAMES, RenderConfig, display_name, key};
 use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::{blend_verdict, duration, height, judged_by};
 use crate::run::{Cost, Done, Phase, Run, RunStatus, read_record};
-use crate::{Error, ErrorKind, Result, io};
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
+use tiface_base::{Error, ErrorKind, Result, io};
 
 /// A command that runs stages.
 pub(super) struct StageCommand<'a> {

@@ -6,7 +6,6 @@ use super::options::Common;
 use crate::pipeline::Stage;
 use crate::report::duration;
 use crate::run::{Event, Observer};
-use crate::{Error, Result};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Value, json};
 use std::borrow::Cow;
@@ -14,6 +13,7 @@ use std::fmt::Write as _;
 use std::io::{self, IsTerminal, Write};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+use tiface_base::{Error, Result};
 
 /// Shows events: a progress line on a terminal, else a plain line every 30 s; with `--json` one
 /// object per event on stdout.

@@ -4,12 +4,12 @@
 //! a later one ends the process at once.
 
 use super::Invocation;
-use crate::{Error, ErrorKind, Result};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::{flag, low_level};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
+use tiface_base::{Error, ErrorKind, Result};
 
 /// How often received signals are polled.
 const POLL_INTERVAL: Duration = Duration::from_millis(50);

@@ -3,11 +3,8 @@
 use super::Invocation;
 use super::screen::{figure, one_line, print};
 use crate::config::Stage;
-use crate::error::counted;
-use crate::io;
 use crate::report::duration;
 use crate::run::{Phase, Record, RunStatus, StageStatus, Status, Verification, VerifiedFile};
-use crate::{Error, Result};
 use clap::Args;
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -16,6 +13,9 @@ use std::fmt::Write as _;
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+use tiface_base::error::counted;
+use tiface_base::io;
+use tiface_base::{Error, Result};
 
 /// Options of `tiface status`.
 #[derive(Args, Debug)]

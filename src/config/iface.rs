@@ -171,8 +171,8 @@ table! {
 mod tests {
     use super::*;
     use crate::config::Preset;
-    use crate::kernel::cpu::hash;
-    use crate::kernel::cpu::sdf::FieldShape;
+    use tiface_kernels::cpu::hash;
+    use tiface_kernels::cpu::sdf::FieldShape;
 
     /// What follows from the published settings, as the published code's own printout and arithmetic have it.
     #[test]

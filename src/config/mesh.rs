@@ -2,9 +2,9 @@
 
 use super::key;
 use super::table::table;
-use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
+use tiface_base::{Error, Result};
 
 /// A mesh file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -1,8 +1,8 @@
 //! Resolves files and `--set` to a [`Config`]: precedence and validation of values.
 
 use super::{Config, DeviceChoice, Key, Preset, all_keys, key, lookup, show};
-use crate::{Error, Result};
 use serde::Deserialize;
+use tiface_base::{Error, Result};
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 

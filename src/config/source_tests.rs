@@ -1,7 +1,7 @@
 //! Which value wins, and what is said of a wrong one.
 
 use super::{Config, Fallback, MeshFormat, Preset, Sources};
-use crate::Result;
+use tiface_base::Result;
 
 fn from(file: &str, set: &[&str]) -> Result<Config> {
     let files = vec![("tiface.toml".to_string(), file.to_string())];

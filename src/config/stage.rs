@@ -1,10 +1,10 @@
 //! The stages. The name of a stage is also its table in `config.toml`, its folder in the run and its command.
 
 use super::Config;
-use crate::{Error, Result};
 use std::fmt::{self, Display};
 use std::path::Path;
 use std::str::FromStr;
+use tiface_base::{Error, Result};
 
 /// A stage of the pipeline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]

@@ -284,7 +284,7 @@ impl BaselineConfig {
 mod tests {
     use super::*;
     use crate::config::{Config, Preset};
-    use crate::kernel::cpu::vm::{DecoderShape, Grid, size_for, voxel_schedule};
+    use tiface_kernels::cpu::vm::{DecoderShape, Grid, size_for, voxel_schedule};
 
     /// What follows from the published settings in the published box.
     #[test]

@@ -6,7 +6,7 @@
 
 use super::least_squares::least;
 use super::{BlendTarget, MAX_MEMBERS, Members, in_bands, no_members, normalized};
-use crate::{Error, Result};
+use tiface_base::{Error, Result};
 
 /// Sums over the pixels seen so far: `members²` numbers, so each view may keep its own.
 ///
@@ -151,8 +151,8 @@ pub fn fit_weights(views: &[Fit]) -> Result<Option<Vec<f32>>> {
 mod tests {
     use super::*;
     use crate::ensemble::{Member, PAPER_WEIGHTS, blend};
-    use crate::image::{Gray, Image, Photo, quantize};
-    use crate::math::rng::{normal, uniform};
+    use tiface_base::image::{Gray, Image, Photo, quantize};
+    use tiface_base::math::rng::{normal, uniform};
 
     const SIZE: u32 = 64;
     const PIXELS: usize = (SIZE * SIZE) as usize;

@@ -1,7 +1,7 @@
 //! Small dense least squares: the quadratic of least value on the simplex.
 
 use super::MAX_MEMBERS;
-use crate::math::cholesky::{factor, substitute};
+use tiface_base::math::cholesky::{factor, substitute};
 
 /// `argmin ½ wᵀHw − gᵀw` with `w ≥ 0`, `Σ w = 1`; H `[n · n]` symmetric positive definite, n ≤ 8.
 ///
@@ -66,7 +66,7 @@ fn on_face(h: &[f64], g: &[f64], on: &[usize]) -> Option<[f64; MAX_MEMBERS]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::rng::uniform;
+    use tiface_base::math::rng::uniform;
 
     #[test]
     fn the_nearest_point_of_the_simplex_is_found_inside_on_an_edge_and_in_a_corner() {

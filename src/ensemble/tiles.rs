@@ -3,7 +3,7 @@
 //! Excluding whole views would harm the fields; excluding a few squares of each does not, since other views show the
 //! same skin. The squares are large enough that their content cannot be guessed from the pixels around.
 
-use crate::math::rng;
+use tiface_base::math::rng;
 
 /// The side of a tile is this part of the shorter side of its photograph: a third of an eye.
 const TILES_PER_SIDE: u32 = 16;

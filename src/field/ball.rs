@@ -1,9 +1,9 @@
 //! Photographs of an analytic ball, the training data of self-tests and tests.
 
 use super::pixels::TrainView;
-use crate::geom::{BitGrid, Camera, Distortion};
-use crate::image::{Gray, Photo};
 use glam::{DMat3, DVec3, Vec2, Vec3};
+use tiface_base::geom::{BitGrid, Camera, Distortion};
+use tiface_base::image::{Gray, Photo};
 
 /// Radius of the ball, scene units.
 pub const BALL: f32 = 0.6;

@@ -5,13 +5,13 @@ use crate::capture::synthetic::shared::Files;
 use crate::field::checkpoint::newest;
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
-use crate::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
-use crate::math::rng;
-use crate::{Monitor, Quiet, Result};
 use glam::Vec3;
 use std::path::Path;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
+use tiface_base::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
+use tiface_base::math::rng;
+use tiface_base::{Monitor, Quiet, Result};
 
 /// Returns photographs of a ball textured with waves of a few pixels: nine from the front and three from the back.
 pub fn textured_views() -> Vec<TrainView> {

@@ -5,13 +5,13 @@
 //! and others by field. Two files alternate, so that the newest complete checkpoint is never replaced before its
 //! successor is written, and a checkpoint that fails validation falls back to the previous one.
 
-use crate::io::{
-    Limits, ReadError, TensorValues, Tensors, is_file, read_tensors, remove, rename, write_tensors,
-};
-use crate::{Error, ErrorKind, Result};
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
+use tiface_base::io::{
+    Limits, ReadError, TensorValues, Tensors, is_file, read_tensors, remove, rename, write_tensors,
+};
+use tiface_base::{Error, ErrorKind, Result};
 
 /// The checkpoint of one training, in memory.
 #[derive(Clone, Debug)]

@@ -4,7 +4,7 @@ use super::device_report::{DeviceReport, NO_GPU, SelfTest};
 #[cfg(feature = "wgpu")]
 use super::devices;
 use crate::config::DeviceChoice;
-use crate::{Error, Result};
+use tiface_base::{Error, Result};
 
 /// The device that a field is trained on.
 // A process holds one or two of these, so boxing the larger variant would save nothing.

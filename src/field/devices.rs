@@ -6,12 +6,12 @@
 
 use super::device_report::{Check, DeviceReport, NO_GPU, SelfTest};
 use crate::config::DeviceChoice;
-use crate::io::{self, Limits, Lock, LockError};
-use crate::kernel::gpu::{self, Adapter, Device};
-use crate::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
+use tiface_base::io::{self, Limits, Lock, LockError};
+use tiface_base::{Error, Result};
+use tiface_kernels::gpu::{self, Adapter, Device};
 
 /// A device opened for a training.
 pub struct Gpu {
@@ -297,7 +297,7 @@ mod tests {
         for name in ["wgpu:99", "vulkan:99", "metal:99"] {
             let e = open(&named(name)).err().unwrap();
             assert!(e.to_string().contains(name) && e.hint().contains("tiface doctor"), "{e}");
-            assert_eq!(e.kind(), crate::ErrorKind::Usage);
+            assert_eq!(e.kind(), tiface_base::ErrorKind::Usage);
         }
         let all = Adapter::all();
         if all.iter().all(|a| a.software) {

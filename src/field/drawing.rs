@@ -8,8 +8,8 @@
 
 use super::pixels::{RaySampler, ray_backgrounds};
 use super::training::StepAt;
-use crate::kernel::gpu::{BUFFERS, Buffer, Device, DeviceBatch, Photographs, SamplingOptions, planes};
-use crate::{Error, Result};
+use tiface_base::{Error, Result};
+use tiface_kernels::gpu::{BUFFERS, Buffer, Device, DeviceBatch, Photographs, SamplingOptions, planes};
 
 /// Source of the rays of a training on a device.
 pub struct DeviceSampler {
@@ -140,7 +140,7 @@ mod tests {
     use crate::config::iface::Foreground;
     use crate::field::ball;
     use crate::field::pixels::TrainView;
-    use crate::kernel::gpu::tests::{agree, device};
+    use tiface_kernels::gpu::testing::{agree, device};
 
     #[test]
     fn photographs_that_stay_in_host_memory_give_the_same_rays() {
@@ -184,7 +184,7 @@ mod tests {
     #[cfg(target_os = "linux")]
     fn photographs_are_not_copied_whole_on_their_way() {
         if device().is_some() {
-            crate::kernel::gpu::tests::alone("field::drawing::tests::memory_of_photographs");
+            tiface_kernels::gpu::testing::alone("field::drawing::tests::memory_of_photographs");
         }
     }
 

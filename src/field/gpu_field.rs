@@ -1,7 +1,7 @@
 //! A field on a GPU, with the CPU's field in reserve.
 
-use crate::Result;
 use std::sync::{Mutex, OnceLock};
+use tiface_base::Result;
 
 /// Advice for a GPU that failed.
 const GPU_HINT: &str = "`tiface doctor` tests the GPU, `--device cpu` leaves it out";
@@ -40,7 +40,7 @@ impl<T> GpuField<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Error;
+    use tiface_base::Error;
 
     #[test]
     fn a_gpu_that_failed_is_asked_no_more_and_says_why() {

@@ -4,12 +4,12 @@ use super::ball::{StopAfter, bytes, copied, temporary};
 use super::checkpoint::TrainingProgress;
 use super::pixels::TrainView;
 use super::training::{self, Model, StepReport};
-use crate::geom::{Ray, RayResult};
-use crate::kernel::gpu::tests::{devices, lose_after};
-use crate::kernel::gpu::{Atomics, Device};
-use crate::{Monitor, Quiet, Result};
 use glam::Vec2;
 use std::path::Path;
+use tiface_base::geom::{Ray, RayResult};
+use tiface_base::{Monitor, Quiet, Result};
+use tiface_kernels::gpu::testing::{devices, lose_after};
+use tiface_kernels::gpu::{Atomics, Device};
 
 /// Returns the error of the colors that a field shows of every third pixel of a view over black, dB.
 pub fn psnr(view: &TrainView, render: impl FnOnce(&[Ray]) -> Vec<RayResult>) -> f64 {

@@ -5,15 +5,15 @@
 //! computes on burn's CubeCL tensors; the host queues the launches of many steps and reads results back once in
 //! [`ArrayDevice::READ_EVERY`] steps.
 
-use crate::Result;
-use crate::kernel::cpu::adam::{self, AdamStep};
-#[cfg(feature = "wgpu")]
-use crate::kernel::gpu;
 #[cfg(feature = "wgpu")]
 use burn::backend::Cube;
 use burn::backend::Flex;
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::TensorData;
+use tiface_base::Result;
+use tiface_kernels::cpu::adam::{self, AdamStep};
+#[cfg(feature = "wgpu")]
+use tiface_kernels::gpu;
 
 /// A device that stores arrays of floats and runs the optimizer on them.
 pub trait ArrayDevice {

@@ -6,8 +6,8 @@
 
 use super::checkpoint::Checkpoint;
 use super::ops::ArrayDevice;
-use crate::Result;
-use crate::kernel::cpu::adam::AdamStep;
+use tiface_base::Result;
+use tiface_kernels::cpu::adam::AdamStep;
 
 /// A named array of a group.
 #[derive(Clone, Debug, PartialEq)]

@@ -10,15 +10,15 @@
 use super::soft_pixels::{SoftPixels, soft_pixels};
 use super::training::StepAt;
 use crate::config::iface::Foreground;
-use crate::geom::{Camera, Ray};
-use crate::image::{Gray, Photo, dilated};
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::vm::mask::crossing;
-#[cfg(feature = "wgpu")]
-use crate::kernel::gpu;
-use crate::math::rng;
 use glam::Vec2;
 use rayon::prelude::*;
+use tiface_base::geom::{Camera, Ray};
+use tiface_base::image::{Gray, Photo, dilated};
+use tiface_base::math::rng;
+use tiface_kernels::cpu::march::MarchRay;
+use tiface_kernels::cpu::vm::mask::crossing;
+#[cfg(feature = "wgpu")]
+use tiface_kernels::gpu;
 
 /// One training photograph.
 pub struct TrainView {

@@ -140,8 +140,8 @@ fn published_sampling_draws_the_whole_frame_of_every_view_as_often() {
 #[cfg(feature = "wgpu")]
 #[test]
 fn a_device_draws_the_same_rays() {
-    use crate::geom::{Distortion, Projection};
-    use crate::kernel::gpu::tests::{agree, device, planes};
+    use tiface_base::geom::{Distortion, Projection};
+    use tiface_kernels::gpu::testing::{agree, device, planes};
     let Some(device) = device() else { return };
     let bent = |distortion: Distortion| {
         let mut view = view();

@@ -5,9 +5,9 @@ use super::Check;
 use super::checkpoint::TrainingProgress;
 use super::parameters::HostGroup;
 use super::training::{self, Model, StepError, TrainingSession};
-use crate::kernel::gpu::{Adapter, Atomics, Device};
-use crate::{Quiet, Result};
 use std::path::Path;
+use tiface_base::{Quiet, Result};
+use tiface_kernels::gpu::{Adapter, Atomics, Device};
 
 /// Seed of a test's random numbers.
 pub const SEED: u64 = 3;

@@ -5,7 +5,7 @@
 //! estimates the background `B` from nearby pixels that are fully background, and subtracts it:
 //! `target over black = coded(α F) = coded(photo − (1 − α) B)`, which is the color of a render over black.
 
-use crate::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
+use tiface_base::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 
 /// Half edge of the window that collects background pixels, as a share of the picture's height.
 const WINDOW: f32 = 0.02;

@@ -11,9 +11,9 @@
 //! steps. The trainer sees named figures after a step, and the whole state only when a checkpoint is due.
 
 use super::checkpoint::{self, Checkpoint, TrainingProgress};
-use crate::{Error, Monitor, Result};
 use std::path::Path;
 use std::time::{Duration, Instant};
+use tiface_base::{Error, Monitor, Result};
 
 /// Context of a training, besides its photographs and settings.
 #[derive(Clone, Copy)]

@@ -8,19 +8,19 @@ use super::ops::{
 };
 use super::schedule;
 use super::stereo::SurfacePoint;
-use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
 use crate::field::pixels::{HostBatch, RaySampler, ray_backgrounds};
 use crate::field::training::StepAt;
-use crate::kernel::cpu::losses::{self, RAY_TERMS, STEREO_STREAM, TERMS, Targets};
-use crate::kernel::cpu::march::Samples;
-use crate::kernel::cpu::mlp::Weights;
-use crate::kernel::cpu::neus::{self, Segments};
-use crate::kernel::cpu::schedule::Figures;
-use crate::kernel::cpu::sdf::{self, Activations, FieldShape, WIDTH};
-use crate::kernel::cpu::weight_norm;
-use crate::math::rng;
+use tiface_base::Result;
+use tiface_base::math::rng;
+use tiface_kernels::cpu::losses::{self, RAY_TERMS, STEREO_STREAM, TERMS, Targets};
+use tiface_kernels::cpu::march::Samples;
+use tiface_kernels::cpu::mlp::Weights;
+use tiface_kernels::cpu::neus::{self, Segments};
+use tiface_kernels::cpu::schedule::Figures;
+use tiface_kernels::cpu::sdf::{self, Activations, FieldShape, WIDTH};
+use tiface_kernels::cpu::weight_norm;
 
 /// The operations of [`SdfOps`] on the CPU.
 pub struct CpuSdf<'a> {

@@ -24,19 +24,19 @@ use crate::field::training::{self, Model, StepAt, StepError, StepReport, Trainin
 use crate::field::{self as fields, ComputeDevice};
 #[cfg(feature = "wgpu")]
 use crate::field::{Check, self_test::TestedModel};
-use crate::kernel::cpu::adam::AdamStep;
-use crate::kernel::cpu::density::DensityShape;
-use crate::kernel::cpu::hash;
-use crate::kernel::cpu::losses::TERMS;
-use crate::kernel::cpu::schedule::Figures;
-#[cfg(feature = "wgpu")]
-use crate::kernel::gpu::Adapter;
-use crate::math::rng;
-use crate::{Error, Result};
 use cpu::CpuDensity;
 #[cfg(feature = "wgpu")]
 pub(super) use gpu::GpuDensity;
 use std::time::Instant;
+use tiface_base::math::rng;
+use tiface_base::{Error, Result};
+use tiface_kernels::cpu::adam::AdamStep;
+use tiface_kernels::cpu::density::DensityShape;
+use tiface_kernels::cpu::hash;
+use tiface_kernels::cpu::losses::TERMS;
+use tiface_kernels::cpu::schedule::Figures;
+#[cfg(feature = "wgpu")]
+use tiface_kernels::gpu::Adapter;
 
 /// Version of the checkpoints' layout.
 const FORMAT: &str = "tiface-density-1";
@@ -268,7 +268,7 @@ pub(super) fn self_test(adapter: &Adapter, config: &IfaceConfig) -> Result<Vec<C
         Ok(model.state()?.occupancy)
     }
     let mut on_cpu = DensityModel::new(CpuDensity::new(config, &sampler), config, &session);
-    let device = crate::kernel::gpu::Device::open(adapter)?;
+    let device = tiface_kernels::gpu::Device::open(adapter)?;
     let mut on_gpu = DensityModel::new(GpuDensity::new(config, &sampler, device)?, config, &session);
     let [want, got] = [cells(&mut on_cpu, start())?, cells(&mut on_gpu, start())?];
     let mut checks = vec![compare_cells(FIELD, &got.occupied.bits, &want.occupied.bits)];

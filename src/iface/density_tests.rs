@@ -4,14 +4,14 @@ use super::cpu::march;
 use super::*;
 use crate::config::Preset;
 use crate::field::ball::{BALL, resumes, session, temporary, views};
-use crate::geom::SdfField;
 use crate::iface::schedule::step_length;
-use crate::kernel::cpu::density::DensityWeights;
-use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
-use crate::kernel::cpu::reference::{Real, density as plain, wide};
-use crate::{Monitor, Quiet};
+use crate::reference::tape::{AdamW, Stepped, Var, gradient};
+use crate::reference::{Real, density as plain, wide};
 use glam::{Vec2, Vec3};
 use std::path::Path;
+use tiface_base::geom::SdfField;
+use tiface_base::{Monitor, Quiet};
+use tiface_kernels::cpu::density::DensityWeights;
 
 fn config() -> IfaceConfig {
     IfaceConfig {
@@ -44,7 +44,7 @@ fn a_step_is_the_one_of_its_formulas() {
     let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, Foreground::Photo, true);
     agrees_on(CpuDensity::new(&config, &sampler), &config, &sampler, [1e-5, 1e-3]);
     #[cfg(feature = "wgpu")]
-    for device in crate::kernel::gpu::tests::devices() {
+    for device in tiface_kernels::gpu::testing::devices() {
         agrees_on(GpuDensity::new(&config, &sampler, device).unwrap(), &config, &sampler, [1e-4, 1e-2]);
     }
 }
@@ -189,8 +189,8 @@ mod on_gpus {
         Outcome, RunOn, alike, alone_and_in_turn, counted_step, cpu_and_both, fixed_sums_repeat, psnr,
     };
     use crate::field::ops::Ops;
-    use crate::kernel::gpu::Device;
-    use crate::kernel::gpu::tests::device;
+    use tiface_kernels::gpu::Device;
+    use tiface_kernels::gpu::testing::device;
 
     /// As small as a driver in software needs it, for which a step takes as long as it has samples.
     fn config() -> IfaceConfig {

@@ -16,19 +16,19 @@ use crate::field::drawing::MemoryNeed;
 use crate::field::ops::Ops;
 use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;
-use crate::kernel::cpu::hash;
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::mlp::TILE;
-use crate::kernel::cpu::neus::RAY_WIDTH;
-use crate::kernel::cpu::occupancy::OPAQUE;
-use crate::kernel::cpu::schedule::Figures;
-use crate::kernel::cpu::sdf::FieldShape;
-use crate::kernel::gpu::{
+use std::ops::Range;
+use tiface_base::{Error, Result};
+use tiface_kernels::cpu::hash;
+use tiface_kernels::cpu::march::MarchRay;
+use tiface_kernels::cpu::mlp::TILE;
+use tiface_kernels::cpu::neus::RAY_WIDTH;
+use tiface_kernels::cpu::occupancy::OPAQUE;
+use tiface_kernels::cpu::schedule::Figures;
+use tiface_kernels::cpu::sdf::FieldShape;
+use tiface_kernels::gpu::{
     self, BandUpdate, Buffer, Device, DeviceBatch, Gate, Losses, Nerfacc, Neus, Samples, SamplingOptions,
     Schedule, Sdf, SurfacePoints, WeightNorm, Words,
 };
-use crate::{Error, Result};
-use std::ops::Range;
 
 /// Rule that updates the cells to march through.
 enum CellRule {

@@ -16,12 +16,12 @@ use crate::field::gpu_tests::{
 use crate::field::ops::ArrayDevice;
 use crate::field::pixels::TrainView;
 use crate::field::training::{Model, TrainingSession};
-use crate::geom::BitGrid;
 use crate::iface::{IFace, IfaceReport, train};
-use crate::kernel::gpu::tests::{device, devices};
-use crate::{Monitor, Quiet};
 use std::path::Path;
 use std::sync::Mutex;
+use tiface_base::geom::BitGrid;
+use tiface_base::{Monitor, Quiet};
+use tiface_kernels::gpu::testing::{device, devices};
 
 /// As small as a driver in software needs it, for which a step takes as long as it has samples.
 fn config() -> IfaceConfig {
@@ -424,7 +424,7 @@ fn a_device_with_too_little_room_is_refused_before_the_first_step() {
 #[test]
 #[ignore = "measures times"]
 fn exchange_costs_at_most_half_more_than_native_sums() {
-    use crate::kernel::gpu::Atomics;
+    use tiface_kernels::gpu::Atomics;
     let Some(native) = device().filter(|d| d.atomics() == Atomics::Native) else {
         println!("skipped: no adapter here adds floats by itself");
         return;
@@ -467,7 +467,7 @@ fn exchange_costs_at_most_half_more_than_native_sums() {
 #[test]
 fn a_training_takes_the_memory_that_it_is_given() {
     if device().is_some() {
-        crate::kernel::gpu::tests::alone("iface::gpu::tests::memory_of_a_training");
+        tiface_kernels::gpu::testing::alone("iface::gpu::tests::memory_of_a_training");
     }
 }
 

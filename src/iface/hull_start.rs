@@ -7,18 +7,18 @@
 use super::model::shape;
 use super::schedule;
 use super::state::SdfState;
-use crate::Error;
 use crate::config::iface::IfaceConfig;
 use crate::field::parameters::ParameterPart;
 use crate::field::training::{StepError, TrainingSession};
-use crate::geom::BitGrid;
-use crate::kernel::cpu::adam::adam;
-use crate::kernel::cpu::losses::{self, LossWeights};
-use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
-use crate::kernel::cpu::weight_norm;
-use crate::math::distance::LowerEnvelope;
-use crate::math::rng;
 use rayon::prelude::*;
+use tiface_base::Error;
+use tiface_base::geom::BitGrid;
+use tiface_base::math::distance::LowerEnvelope;
+use tiface_base::math::rng;
+use tiface_kernels::cpu::adam::adam;
+use tiface_kernels::cpu::losses::{self, LossWeights};
+use tiface_kernels::cpu::sdf::{self, FieldShape, WIDTH};
+use tiface_kernels::cpu::weight_norm;
 
 /// Signed distance to a hull's boundary at cell centers, in units of the box's half edge; negative inside.
 pub struct HullDistance {

@@ -4,20 +4,20 @@ use super::model::{parts, shape};
 use super::occupancy::Occupancy;
 use super::schedule::step_length;
 use super::state::{FORMAT, SdfState};
-use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
 use crate::field::{ComputeDevice, GpuField};
-use crate::geom::{BitGrid, Ray, RayResult, SdfField};
-use crate::io::Lock;
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::mlp::Weights;
-use crate::kernel::cpu::neus::{self, Segments};
-use crate::kernel::cpu::sdf::{self, FieldShape, WIDTH};
 use glam::Vec3;
 use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
+use tiface_base::Result;
+use tiface_base::geom::{BitGrid, Ray, RayResult, SdfField};
+use tiface_base::io::Lock;
+use tiface_kernels::cpu::march::MarchRay;
+use tiface_kernels::cpu::mlp::Weights;
+use tiface_kernels::cpu::neus::{self, Segments};
+use tiface_kernels::cpu::sdf::{self, FieldShape, WIDTH};
 
 /// The field on a device. Points, directions and normals are `[n, 3]`, in the network's coordinates.
 pub(super) trait DeviceField: Send {
@@ -94,7 +94,7 @@ impl IFace {
             ComputeDevice::Cpu(_) => self,
             #[cfg(feature = "wgpu")]
             ComputeDevice::Gpu(gpu) => {
-                use crate::kernel::gpu::Evaluator;
+                use tiface_kernels::gpu::Evaluator;
                 if !Evaluator::supports(&self.shape) {
                     return self;
                 }

@@ -13,10 +13,10 @@
 
 use crate::config::iface::IfaceConfig;
 use crate::field::parameters::{HostGroup, ParameterPart};
-use crate::kernel::cpu::hash;
-use crate::kernel::cpu::mlp::{HIDDEN, OUTPUTS};
-use crate::kernel::cpu::sdf::FieldShape;
-use crate::math::rng;
+use tiface_base::math::rng;
+use tiface_kernels::cpu::hash;
+use tiface_kernels::cpu::mlp::{HIDDEN, OUTPUTS};
+use tiface_kernels::cpu::sdf::FieldShape;
 
 /// Returns the shape of the field that a configuration describes.
 pub fn shape(config: &IfaceConfig) -> FieldShape {
@@ -106,8 +106,8 @@ pub fn parts(config: &IfaceConfig) -> [Vec<ParameterPart>; 3] {
 mod tests {
     use super::*;
     use crate::config::Preset;
-    use crate::kernel::cpu::mlp::Weights;
-    use crate::kernel::cpu::{sdf, weight_norm};
+    use tiface_kernels::cpu::mlp::Weights;
+    use tiface_kernels::cpu::{sdf, weight_norm};
 
     #[test]
     fn the_start_is_a_sphere_of_half_the_box_with_unit_gradient() {

@@ -1,13 +1,13 @@
 //! The grid of cells that may contain surface.
 
-use crate::Result;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::Checkpoint;
-use crate::geom::BitGrid;
-use crate::kernel::cpu::march::{self, MarchRay, Samples};
-use crate::kernel::cpu::neus;
-use crate::kernel::cpu::occupancy::{self, BandRule};
 use rayon::prelude::*;
+use tiface_base::Result;
+use tiface_base::geom::BitGrid;
+use tiface_kernels::cpu::march::{self, MarchRay, Samples};
+use tiface_kernels::cpu::neus;
+use tiface_kernels::cpu::occupancy::{self, BandRule};
 
 /// Cells to march through, cells known to be deep inside, and the history of the nerfacc rule.
 #[derive(Clone, Debug, PartialEq)]

@@ -2,13 +2,13 @@
 
 use super::occupancy::Occupancy;
 use super::stereo::SurfacePoint;
-use crate::Result;
 use crate::config::iface::{Background, IfaceConfig};
 use crate::field::ops::Ops;
 use crate::field::parameters::ParameterGroup;
 use crate::field::training::StepAt;
-use crate::kernel::cpu::losses::LossWeights;
-use crate::kernel::cpu::schedule::Figures;
+use tiface_base::Result;
+use tiface_kernels::cpu::losses::LossWeights;
+use tiface_kernels::cpu::schedule::Figures;
 
 /// Distance from a stereo point, in pixels, at which the loss changes from quadratic to linear: about the error of such
 /// points.

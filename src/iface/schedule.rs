@@ -1,8 +1,8 @@
 //! Schedules of a training: learning rate, rays per step, active levels, march step.
 
 use crate::config::iface::{IfaceConfig, OccupancyRule};
-use crate::kernel::cpu::adam::AdamStep;
-use crate::kernel::cpu::schedule::{RayBudget, StepLength};
+use tiface_kernels::cpu::adam::AdamStep;
+use tiface_kernels::cpu::schedule::{RayBudget, StepLength};
 
 /// Returns a share of the steps as a number of steps, at least one.
 fn steps(config: &IfaceConfig, share: f64) -> u64 {

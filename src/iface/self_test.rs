@@ -10,7 +10,6 @@ use super::schedule;
 use super::state::SdfState;
 use super::stereo::SurfacePoint;
 use super::train::{SdfModel, sampler};
-use crate::Result;
 use crate::config::Preset;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::Check;
@@ -20,9 +19,10 @@ use crate::field::self_test::{
     CELLS_AT, SEED, TestedModel, compare, compare_cells, compare_values, devices, run_step, session,
 };
 use crate::field::training::StepAt;
-use crate::kernel::cpu::sdf as on_host;
-use crate::kernel::gpu::{Adapter, planes};
-use crate::math::rng;
+use tiface_base::Result;
+use tiface_base::math::rng;
+use tiface_kernels::cpu::sdf as on_host;
+use tiface_kernels::gpu::{Adapter, planes};
 
 impl<O: SdfOps> TestedModel for SdfModel<'_, O> {
     fn host_groups(&self) -> Result<Vec<HostGroup>> {

@@ -2,14 +2,14 @@
 
 use super::occupancy::Occupancy;
 use super::stereo::SurfacePoint;
-use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::Checkpoint;
 use crate::field::parameters::{HostGroup, ParameterPart};
-use crate::geom::BitGrid;
-use crate::kernel::cpu::mlp::Weights;
-use crate::kernel::cpu::sdf::FieldShape;
-use crate::kernel::cpu::weight_norm;
+use tiface_base::Result;
+use tiface_base::geom::BitGrid;
+use tiface_kernels::cpu::mlp::Weights;
+use tiface_kernels::cpu::sdf::FieldShape;
+use tiface_kernels::cpu::weight_norm;
 
 /// Version of the checkpoints' layout.
 pub const FORMAT: &str = "tiface-iface-1";

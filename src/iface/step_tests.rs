@@ -4,16 +4,16 @@
 use super::super::ops::STEREO_POINTS;
 use super::super::stereo::SurfacePoint;
 use super::*;
-use crate::Quiet;
 use crate::config::Preset;
 use crate::config::iface::Background;
 use crate::field::ball::{session, temporary, views};
-use crate::kernel::cpu::losses::STEREO_STREAM;
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::neus::Segments;
-use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
-use crate::kernel::cpu::reference::{Real, neus, sdf, wide};
-use crate::math::rng;
+use crate::reference::tape::{AdamW, Stepped, Var, gradient};
+use crate::reference::{Real, neus, sdf, wide};
+use tiface_base::Quiet;
+use tiface_base::math::rng;
+use tiface_kernels::cpu::losses::STEREO_STREAM;
+use tiface_kernels::cpu::march::MarchRay;
+use tiface_kernels::cpu::neus::Segments;
 
 /// As published, but for the sizes.
 fn paper() -> IfaceConfig {
@@ -228,7 +228,7 @@ fn agrees(config: &IfaceConfig) {
     let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, config.foreground, true);
     agrees_on(CpuSdf::new(config, &sampler), config, &sampler, [1e-5, 1e-3]);
     #[cfg(feature = "wgpu")]
-    if let Some(device) = crate::kernel::gpu::tests::device() {
+    if let Some(device) = tiface_kernels::gpu::testing::device() {
         agrees_on(GpuSdf::new(config, &sampler, device).unwrap(), config, &sampler, [1e-4, 1e-2]);
     }
 }

@@ -1,21 +1,21 @@
 //! Search for surface points that several photographs agree on, starting from the current field.
 //!
 //! Rays are intersected with the field's zero set. Points spread over it are moved along their normals until all
-//! photographs in which they are visible match ([`crate::kernel::cpu::stereo`]). Hair is excluded, because stereo
+//! photographs in which they are visible match ([`tiface_kernels::cpu::stereo`]). Hair is excluded, because stereo
 //! places its strands some millimeters inside its outline.
 
 use super::occupancy::Occupancy;
 use crate::config::iface::IfaceConfig;
 use crate::field::pixels::TrainView;
-use crate::geom::Camera;
-use crate::image::eroded;
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::mlp::Weights;
-use crate::kernel::cpu::sdf::{self, FieldShape};
-use crate::kernel::cpu::stereo::{self, StereoPoint, StereoView, Surfel};
-use crate::math::rank::median;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
+use tiface_base::geom::Camera;
+use tiface_base::image::eroded;
+use tiface_base::math::rank::median;
+use tiface_kernels::cpu::march::MarchRay;
+use tiface_kernels::cpu::mlp::Weights;
+use tiface_kernels::cpu::sdf::{self, FieldShape};
+use tiface_kernels::cpu::stereo::{self, StereoPoint, StereoView, Surfel};
 
 /// Distance between neighboring rays, pixels.
 const STRIDE: usize = 4;
@@ -244,7 +244,7 @@ pub fn points(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::{Gray, Photo};
+    use tiface_base::image::{Gray, Photo};
 
     #[test]
     fn a_large_photograph_is_averaged_and_a_pixel_is_head_where_all_of_it_is() {

@@ -18,11 +18,11 @@ use crate::field::parameters::ParameterGroup;
 use crate::field::pixels::{LARGE, RaySampler, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self, ComputeDevice};
-use crate::geom::BitGrid;
-use crate::kernel::cpu::schedule::Figures;
-use crate::{Error, Result};
 use serde::Serialize;
 use std::time::Instant;
+use tiface_base::geom::BitGrid;
+use tiface_base::{Error, Result};
+use tiface_kernels::cpu::schedule::Figures;
 
 /// Report of a training.
 #[derive(Clone, Debug, Serialize)]

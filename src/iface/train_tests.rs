@@ -9,11 +9,11 @@ use crate::field::ball::{
     textured_views, views,
 };
 use crate::field::checkpoint::{self, Checkpoint};
-use crate::geom::SdfField;
-use crate::{Monitor, Quiet};
 use glam::{Vec2, Vec3};
 use std::path::Path;
 use std::sync::OnceLock;
+use tiface_base::geom::SdfField;
+use tiface_base::{Monitor, Quiet};
 
 fn config() -> IfaceConfig {
     IfaceConfig {

@@ -1,6 +1,6 @@
 //! Clicks on a photograph, and the conditions that all of them must meet.
 
-use crate::{Error, Result};
+use tiface_base::{Error, Result};
 
 /// One click of a person on a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -14,12 +14,12 @@ pub use proposals::{MaskVerdict, verdicts};
 
 use super::hull::{self, ViewFrame};
 use super::morphology::squared_distance;
-use crate::Result;
 use crate::capture::carve::Cube;
-use crate::geom::Camera;
-use crate::image::{Gray, resize_hard};
 use glam::{DVec3, Vec2};
 use rayon::prelude::*;
+use tiface_base::Result;
+use tiface_base::geom::Camera;
+use tiface_base::image::{Gray, resize_hard};
 
 /// Rows that masks are reduced to.
 const ROWS: u32 = 160;
@@ -380,8 +380,8 @@ fn best_on_ray(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Distortion;
     use glam::DMat3;
+    use tiface_base::geom::Distortion;
 
     /// Eight cameras on a ring, rising a little from one to the next.
     fn ring(count: usize) -> Vec<Camera> {

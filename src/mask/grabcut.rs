@@ -20,8 +20,8 @@ use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
 use super::clicks::{self, Click};
 use super::morphology::{fill_holes, gray, keep_pieces, open, squared_distance};
-use crate::image::{Gray, Photo, grow, reduce_to_rows};
-use crate::{Error, Result};
+use tiface_base::image::{Gray, Photo, grow, reduce_to_rows};
+use tiface_base::{Error, Result};
 
 /// Rows of the working size; larger photographs are averaged down to it.
 pub(super) const ROWS: u32 = 512;
@@ -468,7 +468,7 @@ fn start(seeds: &[Seed], skeleton: &[bool], width: usize, height: usize) -> [Vec
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::rng;
+    use tiface_base::math::rng;
 
     /// Returns a noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges
     /// everything.
@@ -518,7 +518,7 @@ mod tests {
         let (photo, truth) = head(3.0);
         let cut = cut_at(128, "a", &photo, &clicks(3.0)).unwrap();
         assert_eq!((cut.mask.width, cut.mask.height), (96, 128));
-        let large = crate::image::resize_hard(&cut.mask, (photo.width, photo.height));
+        let large = tiface_base::image::resize_hard(&cut.mask, (photo.width, photo.height));
         assert!(overlap(&large, &truth) > 0.97, "{}", overlap(&large, &truth));
     }
 

@@ -4,11 +4,11 @@
 //! all outside its frame. A set of cells is drawn back into any view by its surface.
 
 use crate::capture::carve::{Cube, Projector, around, meeting_point};
-use crate::geom::Camera;
-use crate::image::Gray;
-use crate::{Error, Result};
 use glam::DVec3;
 use rayon::prelude::*;
+use tiface_base::geom::Camera;
+use tiface_base::image::Gray;
+use tiface_base::{Error, Result};
 
 /// The frame of a picture: which of its pixels shows a point.
 pub(super) struct ViewFrame {

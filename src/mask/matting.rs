@@ -21,10 +21,10 @@
 pub mod closed_form;
 
 use self::closed_form::{ClosedFormOptions, closed_form};
-use crate::image::{
+use tiface_base::image::{
     Gray, INSIDE, Photo, dilated, enlarge, grow, reduce_photo, resize_hard, shrink, working_size,
 };
-use crate::{Error, Result};
+use tiface_base::{Error, Result};
 
 /// Alphas below become 0.
 const MIN_ALPHA: f32 = 0.02;
@@ -235,8 +235,8 @@ pub fn dilate(marked: &[bool], width: usize, height: usize, kernel: u32, iterati
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::image::resize_gray;
-    use crate::io::{Limits, read_gray, read_photo};
+    use tiface_base::image::resize_gray;
+    use tiface_base::io::{Limits, read_gray, read_photo};
 
     /// Returns a bright disc on a dark background whose rim is soft over 6 pixels.
     fn disc(width: u32, height: u32) -> (Photo, Vec<f32>) {

@@ -2,9 +2,9 @@
 //! connected pieces: keeping some, filling holes, smoothing with a 3 × 3 square.
 
 use crate::capture::carve::{self, Pieces};
-use crate::image::{Gray, dilated};
-use crate::math::distance::LowerEnvelope;
 use rayon::prelude::*;
+use tiface_base::image::{Gray, dilated};
+use tiface_base::math::distance::LowerEnvelope;
 
 /// Far away: no pixel is marked. Larger than any squared distance in a picture, finite in arithmetic.
 const FAR: f32 = 1e12;

@@ -18,9 +18,9 @@ use self::alpha::{AlphaNet, VitMatte};
 use self::sam::Sam;
 use super::clicks::Click;
 use crate::config::MaskConfig;
-use crate::image::{Gray, Photo};
 use crate::onnx::Contract;
-use crate::{Error, Result};
+use tiface_base::image::{Gray, Photo};
+use tiface_base::{Error, Result};
 
 /// The networks at hand.
 pub struct Networks {

@@ -13,15 +13,15 @@
 use super::matting::{UNKNOWN, unknown_share};
 use super::prompts::{Prompts, file_path};
 use crate::capture::{Capture, View, coverage, findings};
-use crate::image::{Gray, Photo, reduce_photo, resize_gray, resize_hard, working_size};
-use crate::io::{self, Limits};
 use crate::report::{base64, escape};
-use crate::{Error, ErrorKind, Result};
 use minijinja::{Environment, context};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::Path;
+use tiface_base::image::{Gray, Photo, reduce_photo, resize_gray, resize_hard, working_size};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, ErrorKind, Result};
 
 const TEMPLATE: &str = include_str!("annotation.html");
 

@@ -12,13 +12,13 @@
 
 use super::clicks::Click;
 use crate::capture::{Capture, View};
-use crate::io::{self, Limits};
-use crate::{Error, Result};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use serde_json::{Number, Value, json};
 use std::collections::BTreeMap;
 use std::path::{Component, Path};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// Value of `convention` that the writer uses.
 const CONVENTION: &str =

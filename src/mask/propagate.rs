@@ -20,11 +20,11 @@ use super::hull::{self, Voter};
 use super::morphology::gray;
 use crate::capture::carve::{Cube, drop_dust};
 use crate::capture::findings;
-use crate::geom::Camera;
-use crate::image::{Gray, Photo, grow, reduce_to_rows, shrink, size_at_rows};
-use crate::{Error, Result};
 use glam::DVec3;
 use rayon::prelude::*;
+use tiface_base::geom::Camera;
+use tiface_base::image::{Gray, Photo, grow, reduce_to_rows, shrink, size_at_rows};
+use tiface_base::{Error, Result};
 
 /// Cells along each side of the carved cube.
 const CELLS: usize = 112;
@@ -427,9 +427,9 @@ impl Propagation<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Distortion;
-    use crate::math::rng;
     use glam::{DMat3, DVec3, Vec2};
+    use tiface_base::geom::Distortion;
+    use tiface_base::math::rng;
 
     pub(super) fn ring() -> Vec<Camera> {
         (0..6)

@@ -3,12 +3,12 @@
 //! Points are spread evenly by area over one mesh, always at the same positions, and their nearest points on the
 //! other are found. Both directions are needed: missing parts show in one, superfluous parts in the other.
 
-use crate::geom::{Bvh, Camera, Mesh, Ray};
-use crate::math::rank::nearest_rank;
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::ops::RangeInclusive;
+use tiface_base::geom::{Bvh, Camera, Mesh, Ray};
+use tiface_base::math::rank::nearest_rank;
 
 /// Distances from one surface to another, in the units of the meshes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]

@@ -5,11 +5,11 @@
 //! network returns a map, its mean counts. Nothing is downloaded.
 
 use super::{picture, rounded};
-use crate::image::{Image, Photo};
 use crate::onnx::{NetworkArray, NetworkFile, NetworkSession, Role};
-use crate::{Error, Result};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
+use tiface_base::image::{Image, Photo};
+use tiface_base::{Error, Result};
 
 /// A network that measures the perceptual distance of two pictures.
 pub struct Lpips {

@@ -11,13 +11,13 @@
 //! colors in every covered pixel.
 
 use super::{picture, rounded};
-use crate::Result;
 use crate::capture::{LoadedView, View};
-use crate::image::{Gray, INSIDE, Image, Photo, grow};
-use crate::io::Limits;
-use crate::math::rank::median_of_counts;
 use rayon::prelude::*;
 use serde::Serialize;
+use tiface_base::Result;
+use tiface_base::image::{Gray, INSIDE, Image, Photo, grow};
+use tiface_base::io::Limits;
+use tiface_base::math::rank::median_of_counts;
 
 /// Half of the band around the mask's contour, pixels.
 const EDGE_PX: f32 = 3.0;

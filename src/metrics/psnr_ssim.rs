@@ -11,8 +11,8 @@
 //! variances to be possible. instant-nsr-pl's mirrors the border (*reflect*), which gives one value
 //! per pixel: that one can be averaged over a mask.
 
-use crate::image::Image;
 use rayon::prelude::*;
+use tiface_base::image::Image;
 
 /// PSNR in dB of two three-channel pictures of one size, over the pixels where `inside` holds, or
 /// all. `None` without pixels, with different sizes, or without any difference.

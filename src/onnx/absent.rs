@@ -1,10 +1,10 @@
 //! Networks in a build without the feature `matting`: none can be opened, so no type has a value.
 
 use crate::config::MaskConfig;
-use crate::image::{Gray, Image, Photo};
-use crate::{Error, Result};
 use std::convert::Infallible;
 use std::path::Path;
+use tiface_base::image::{Gray, Image, Photo};
+use tiface_base::{Error, Result};
 
 /// The networks that make masks.
 #[derive(Clone, Copy, Debug)]

@@ -2,11 +2,11 @@
 //!
 //! Also the arrays that the engine takes and returns, and how it is called.
 
-use crate::Error;
 use sha2::{Digest, Sha256};
 use std::fmt::{self, Display};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+use tiface_base::Error;
 use tract_onnx::pb;
 
 /// ONNX's number for 32-bit floats.

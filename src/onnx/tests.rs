@@ -3,10 +3,10 @@
 use self::made::{Message, floats, graph, integers, model, node, port, tensor, trimap_times, vitmatte};
 use super::*;
 use crate::config::{MaskConfig, Preset};
-use crate::image::{Gray, Photo};
 use crate::mask::networks::Networks;
 use std::fs;
 use std::path::PathBuf;
+use tiface_base::image::{Gray, Photo};
 
 pub(crate) mod made;
 

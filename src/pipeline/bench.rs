@@ -14,19 +14,19 @@ use crate::capture::scene::Scene;
 use crate::capture::{LoadedView, Split, View};
 use crate::config::{ColorSource, Config, Hair, MeshConfig, Method, Stage, ViewBackground};
 use crate::field::training::TrainingSession;
-use crate::geom::{Camera, Mesh, SdfField};
-use crate::image::Photo;
-use crate::io::{self, Limits};
-use crate::math::rank::median;
-use crate::mesh::files::HeadMesh;
-use crate::mesh::{SimplifyConfig, simplify};
 use crate::metrics::{compare, distance};
 use crate::report::bench::{BenchResult, Measure, Row, Sweep, WorkCost};
 use crate::run::{Run, Stop};
-use crate::{Error, Monitor, Quiet, Result};
 use std::borrow::Cow;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
+use tiface_base::geom::{Camera, Mesh, SdfField};
+use tiface_base::image::Photo;
+use tiface_base::io::{self, Limits};
+use tiface_base::math::rank::median;
+use tiface_base::{Error, Monitor, Quiet, Result};
+use tiface_surface::files::HeadMesh;
+use tiface_surface::{SimplifyConfig, simplify};
 
 /// The available sweeps, in order.
 pub const SWEEPS: [&str; 5] = ["steps", "photographs", "hash", "triangles", "texture"];

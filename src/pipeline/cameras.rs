@@ -8,14 +8,14 @@ use super::rig_photos::RigPhotos;
 use crate::capture::path::NamedCamera;
 use crate::capture::{Capture, Split, View};
 use crate::config::CameraPoses;
-use crate::geom::{Camera, Similarity};
-use crate::image::{Gray, Photo};
-use crate::io::{self, Limits, ReadError};
 use crate::rig::{self, CameraState, LEAST_SIGHTINGS, PoseDecision, RigView};
-use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+use tiface_base::geom::{Camera, Similarity};
+use tiface_base::image::{Gray, Photo};
+use tiface_base::io::{self, Limits, ReadError};
+use tiface_base::{Error, Result};
 
 /// File name of the measurement, in the folder of the stage `mask`.
 pub(super) const POSES: &str = "poses.json";

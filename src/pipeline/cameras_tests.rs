@@ -9,13 +9,13 @@ use crate::capture::scene::{self, SceneOptions};
 use crate::capture::synthetic::SyntheticHead;
 use crate::capture::{self, Capture, Split, View};
 use crate::config::{CameraPoses, Config, MaskSource, Preset};
-use crate::geom::Camera;
-use crate::io::{self, Limits};
 use crate::rig;
 use crate::run::read_record;
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::{Value, json};
 use std::sync::OnceLock;
+use tiface_base::geom::Camera;
+use tiface_base::io::{self, Limits};
 
 /// A quarter of the points is enough for small photographs, and takes a quarter of the time.
 const POINTS: usize = rig::POINTS / 4;

@@ -8,8 +8,6 @@
 
 use crate::capture::{Capture, Split};
 use crate::config::{MaskConfig, key};
-use crate::image::{Gray, Photo, reduce_photo, working_size};
-use crate::io::{self, Limits};
 use crate::mask::grabcut::grabcut;
 use crate::mask::matting::{SoftMask, SoftenOptions, UnknownBand, soften_with};
 use crate::mask::networks::Networks;
@@ -17,11 +15,13 @@ use crate::mask::prompts::{self, PhotoPrompts, Prompts};
 use crate::mask::propagate::{PropagateView, propagate, propagate_proposals, rows_size};
 use crate::mask::{Click, morphology};
 use crate::run::{Fingerprint, StageDir};
-use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::Path;
+use tiface_base::image::{Gray, Photo, reduce_photo, working_size};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// Memory that photographs processed in parallel may take without networks, bytes.
 const MAX_BYTES: u64 = 3 << 29;

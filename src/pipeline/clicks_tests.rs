@@ -3,14 +3,14 @@
 use super::clicks::propagated_clicks;
 use super::tests::{NoFields, demo_head, draft, masked};
 use super::*;
-use crate::ErrorKind;
 use crate::capture::{self, CaptureOptions, Split};
 use crate::config::{Config, MaskSource, Preset};
-use crate::image::Gray;
-use crate::io::{self, Limits};
 use crate::mask::prompts::{PhotoPrompts, Prompts, file_path};
 use crate::run::{Event, Observer, Run, Stop};
 use std::path::{Path, PathBuf};
+use tiface_base::ErrorKind;
+use tiface_base::image::Gray;
+use tiface_base::io::{self, Limits};
 
 /// Photographs that masks are held against the truth on.
 const SHARP: (u32, u32) = (120, 160);

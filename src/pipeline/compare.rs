@@ -8,18 +8,18 @@ use super::render::VisibleHead;
 use super::session::Session;
 use crate::capture::{Capture, Split, View, ViewMask};
 use crate::config::{Config, PictureFormat, Stage};
-use crate::error::counted;
-use crate::geom::Bvh;
-use crate::io;
-use crate::mesh::files::{HeadMesh, OpenedMesh, check, open_mesh, weld};
 use crate::metrics::distance::one_way;
 use crate::pipeline::mesh::{finished_mesh, read_finished, surface_in_world};
-use crate::render::RaycastOptions;
 use crate::report::{self, Chart, MethodTable, Report, duration, leaves, relative};
 use crate::run::read_record;
-use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
+use tiface_base::error::counted;
+use tiface_base::geom::Bvh;
+use tiface_base::io;
+use tiface_base::{Error, Result};
+use tiface_surface::files::{HeadMesh, OpenedMesh, check, open_mesh, weld};
+use tiface_surface::render::RaycastOptions;
 
 /// Points sampled on each of two surfaces.
 const SURFACE_SAMPLES: usize = 100_000;

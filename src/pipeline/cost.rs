@@ -7,12 +7,12 @@
 use super::path::CameraPath;
 use super::render::held_out;
 use super::session::Session;
-use crate::Result;
 use crate::config::{
     ColorSource, Config, IfaceConfig, MaskSource, Method, Preset, Stage, VmBackground, VmConfig,
 };
-use crate::kernel::cpu::hash;
 use crate::run::{Cost, ESTIMATE, Estimate};
+use tiface_base::Result;
+use tiface_kernels::cpu::hash;
 
 const MIB: f64 = (1u64 << 20) as f64;
 

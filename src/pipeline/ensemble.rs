@@ -15,13 +15,13 @@ use crate::capture::scene::Scene;
 use crate::capture::{Capture, MaskMeaning, View, ViewMask};
 use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, display_name, key};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
-use crate::image::{Gray, INSIDE, Image, Photo};
-use crate::io::{self, Limits};
-use crate::render::RenderedView;
 use crate::run::{Run, StageDir};
-use crate::{Error, Result};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
+use tiface_base::image::{Gray, INSIDE, Image, Photo};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
+use tiface_surface::render::RenderedView;
 
 /// Blends one picture per camera of `render`. `fields` are evaluated only if weights are to be fitted.
 pub(super) fn ensemble(

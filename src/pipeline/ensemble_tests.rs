@@ -4,15 +4,15 @@ use super::tests::{NoFields, masked, tiny_run, words};
 use super::*;
 use crate::capture::{Split, View};
 use crate::config::{Config, Method, Preset, ViewBackground};
-use crate::geom::{Camera, Ray};
-use crate::image::{Image, quantize};
-use crate::io;
-use crate::render::RenderedView;
 use crate::run::Run;
-use crate::{ErrorKind, Result};
 use glam::Vec3;
 use serde_json::json;
 use std::path::PathBuf;
+use tiface_base::geom::{Camera, Ray};
+use tiface_base::image::{Image, quantize};
+use tiface_base::io;
+use tiface_base::{ErrorKind, Result};
+use tiface_surface::render::RenderedView;
 
 /// Size of the photographs of [`tiny_run`].
 const SIZE: (u32, u32) = (32, 40);

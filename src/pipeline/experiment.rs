@@ -9,11 +9,11 @@ use crate::config::iface::FieldKind;
 use crate::config::{
     Config, MaskLoss, MaskSource, MaskUse, Method, Preset, Sources, TruthPhoto, VmBackground, VmConfig,
 };
-use crate::io::{self, Limits};
 use crate::report::experiment::{ExperimentRow, Measured, Ordering};
 use crate::run::{Cost, read_record, read_status};
-use crate::{Error, Result};
 use serde_json::Value;
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// The tables, by their name and heading.
 pub const TABLES: [(&str, &str); 4] = [
@@ -327,13 +327,13 @@ pub fn ahead(session: &Session, run: &str) -> Result<Option<Cost>> {
 mod tests {
     use super::super::tests::demo_head;
     use super::*;
-    use crate::Quiet;
-    use crate::geom::Aabb;
-    use crate::mesh::extract_dense;
     use crate::run::Run;
     use glam::Vec3;
     use serde_json::json;
     use std::path::{Path, PathBuf};
+    use tiface_base::Quiet;
+    use tiface_base::geom::Aabb;
+    use tiface_surface::extract_dense;
 
     /// Writes a tiny capture into a folder and returns its path.
     fn head(dir: &Path) -> PathBuf {

@@ -5,18 +5,18 @@
 //! everything that it shows from the nearest points of the kept one ([`Original`]).
 
 use super::cameras::CameraCheck;
-use super::finish::{Export, center, coded, lobes};
+use super::finish::{Export, center, lobes};
 use super::mesh::{finished_mesh, read_finished};
 use super::scene_file::read_capture;
 use super::session::{check_feasible, unusable};
 use crate::capture::Capture;
 use crate::config::{Config, Hair, Material, MeshFormat, Stage, key};
-use crate::mesh::bake::{Original, tangent_space};
-use crate::mesh::files::{ExportedFiles, HeadMesh, HeadTexture, tangents};
-use crate::mesh::{SimplifyConfig, atlas, simplify};
 use crate::run::Fingerprint;
-use crate::{Error, Monitor, Result};
 use std::path::{Path, PathBuf};
+use tiface_base::{Error, Monitor, Result};
+use tiface_surface::bake::{Original, tangent_space};
+use tiface_surface::files::{ExportedFiles, HeadMesh, HeadTexture, tangents};
+use tiface_surface::{SimplifyConfig, atlas, simplify};
 
 /// Keys that affect how the files of a mesh are written, each with what it is and the formats that show it.
 const FILE_KEYS: [(&str, &str, &[MeshFormat]); 6] = [
@@ -269,7 +269,7 @@ impl KeptHead {
             };
             let normal = carried.normal.as_ref().map(bend).transpose()?;
             let lobes = texture.lobes.as_ref().and_then(|l| lobes(&carried.lobes, l.asset_from_world));
-            Ok(HeadTexture { color: coded(&carried.color), normal, lobes, atlas: layout })
+            Ok(HeadTexture { color: carried.color.encoded(), normal, lobes, atlas: layout })
         };
         let texture = texture.as_ref().filter(|_| px > 0).map(carry).transpose()?;
         // no file holds the harmonics of vertices
@@ -304,12 +304,13 @@ fn not_shown(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Quiet;
     use crate::config::{MeshFrame, Preset};
-    use crate::geom::sphharm::combine;
-    use crate::mesh::bake::test_ball;
-    use crate::mesh::files::{read, test_head, weld};
     use glam::{Vec3, vec3};
+    use tiface_base::Quiet;
+    use tiface_base::geom::sphharm::combine;
+    use tiface_surface::bake::testing::ball;
+    use tiface_surface::files::testing::tetrahedron;
+    use tiface_surface::files::{read, weld};
 
     /// A head as a run would keep it that was made with these settings.
     fn kept(head: HeadMesh, change: impl Fn(&mut Config)) -> KeptHead {
@@ -340,12 +341,13 @@ mod tests {
 
     #[test]
     fn lobes_add_the_same_color_in_another_frame() {
-        let head = kept(test_head(), |c| (c.mesh.lobes, c.mesh.normal_map) = (1, true));
+        let head = kept(tetrahedron(), |c| (c.mesh.lobes, c.mesh.normal_map) = (1, true));
         let seen = |head: &HeadMesh, d: Vec3| {
             let lobes = head.texture.as_ref().unwrap().lobes.as_ref().unwrap();
             let texel = lobes.pictures.iter().zip(&lobes.scale);
-            let value =
-                |(p, s): (&crate::image::Photo, &f32)| p.rgb[9].map(|b| (f32::from(b) - 128.0) / 127.0 * s);
+            let value = |(p, s): (&tiface_base::image::Photo, &f32)| {
+                p.rgb[9].map(|b| (f32::from(b) - 128.0) / 127.0 * s)
+            };
             Vec3::from(combine(
                 &texel.map(value).collect::<Vec<_>>(),
                 (lobes.asset_from_world * d).to_array(),
@@ -367,7 +369,7 @@ mod tests {
 
     #[test]
     fn fewer_triangles_keep_layers_and_view_dependent_color() {
-        let head = kept(test_ball(), |c| (c.mesh.texture_px, c.mesh.lobes) = (512, 1));
+        let head = kept(ball(), |c| (c.mesh.texture_px, c.mesh.lobes) = (512, 1));
         let before = head.head.clone();
         let asked = asked(&head, |c| (c.mesh.triangles, c.mesh.texture_px) = (800, 256));
         let after = head.changed(&asked, &[MeshFormat::Glb], &Quiet).unwrap();
@@ -399,7 +401,7 @@ mod tests {
 
     #[test]
     fn a_smaller_texture_that_would_mix_charts_is_refused() {
-        let head = || kept(test_ball(), |c| c.mesh.texture_px = 512);
+        let head = || kept(ball(), |c| c.mesh.texture_px = 512);
         let change = |px: u32| {
             let head = head();
             let asked = asked(&head, |c| c.mesh.texture_px = px);
@@ -423,12 +425,12 @@ mod tests {
 
     #[test]
     fn the_normal_map_keeps_the_material_lit_and_says_so() {
-        let head = kept(test_head(), |c| (c.mesh.material, c.mesh.normal_map) = (Material::Lit, true));
+        let head = kept(tetrahedron(), |c| (c.mesh.material, c.mesh.normal_map) = (Material::Lit, true));
         let unlit = asked(&head, |c| c.mesh.material = Material::Unlit);
         let without = asked(&head, |c| (c.mesh.material, c.mesh.normal_map) = (Material::Unlit, false));
         let lit = head.changed(&unlit, &[MeshFormat::Glb], &Quiet).unwrap();
         assert!(lit.warnings[0].contains("`--set mesh.normal_map=false`"), "{:?}", lit.warnings);
-        let head = kept(test_head(), |c| (c.mesh.material, c.mesh.normal_map) = (Material::Lit, true));
+        let head = kept(tetrahedron(), |c| (c.mesh.material, c.mesh.normal_map) = (Material::Lit, true));
         let unlit = head.changed(&without, &[MeshFormat::Glb], &Quiet).unwrap();
         assert!(unlit.warnings.is_empty() && unlit.head.texture.as_ref().unwrap().normal.is_none());
         let glb = unlit.files(MeshFormat::Glb, "head").unwrap().files.remove(0).1;

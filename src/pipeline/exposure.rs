@@ -5,15 +5,15 @@
 //! used by the metrics alone.
 
 use super::rig_photos::RigPhotos;
-use crate::Result;
 use crate::capture::{Capture, Split, View};
-use crate::error::counted;
-use crate::image::Exposure;
-use crate::io::{self, Limits, ReadError};
 use crate::rig::exposure::{self, ExposureView, Incomparable, MIN_TRAINING_VIEWS};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::error::counted;
+use tiface_base::image::Exposure;
+use tiface_base::io::{self, Limits, ReadError};
 
 /// File name of the measurement, in the folder of the stage `mask`.
 pub(super) const EXPOSURE: &str = "exposure.json";

@@ -6,10 +6,10 @@ use super::tests::{NoFields, exposed_head, measured_head, quiet, scene_of};
 use super::{Session, Stage, complete};
 use crate::capture::{self, Capture, CaptureOptions, View};
 use crate::config::{CameraPoses, Config, Exposures, Preset};
-use crate::image::{Exposure, Photo};
-use crate::io::{self, Limits};
 use serde_json::{Value, json};
 use std::sync::OnceLock;
+use tiface_base::image::{Exposure, Photo};
+use tiface_base::io::{self, Limits};
 
 fn measure(capture: &Capture) -> ExposureCheck {
     tried(capture).unwrap()

@@ -5,18 +5,18 @@
 use crate::capture::Capture;
 use crate::capture::scene::Scene;
 use crate::config::{ColorSource, Config, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
-use crate::geom::{Atlas, Camera, Harmonics, Mesh, SdfField, Shells, Similarity};
-use crate::image::{Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
-use crate::mesh::bake::{BakeConfig, Baked, Seams, bake, bake_harmonics, complete, tangent_space};
-use crate::mesh::files::{
-    ExportOptions, ExportedFiles, HeadMesh, HeadTexture, Lobes, tangents, to_glb, to_obj, to_ply,
-};
-use crate::mesh::{
-    Appearance, AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
-};
-use crate::{Monitor, Result};
 use glam::{DMat3, DVec3, Mat3, Vec3};
 use serde_json::{Map, Value, json};
+use tiface_base::geom::{Atlas, Camera, Harmonics, Mesh, SdfField, Shells, Similarity};
+use tiface_base::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
+use tiface_base::{Monitor, Result};
+use tiface_surface::bake::{BakeConfig, Baked, Seams, bake, bake_harmonics, complete, tangent_space};
+use tiface_surface::files::{
+    ExportOptions, ExportedFiles, HeadMesh, HeadTexture, Lobes, tangents, to_glb, to_obj, to_ply,
+};
+use tiface_surface::{
+    Appearance, AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
+};
 
 /// How far the true surface may lie from a triangle, in cells: the chords of large triangles and half a cell.
 pub(super) const REACH: f32 = 2.5;
@@ -217,7 +217,7 @@ impl Finish<'_> {
         log: &mut StepLog,
     ) -> HeadTexture {
         let c = self.config;
-        let color = coded(&baked.color);
+        let color = baked.color.encoded();
         log.report.insert("seam_step_255".into(), json!(Seams::new(mesh, &layout).step(&color)));
         let mut normal = None;
         if let Some(normals) = &baked.normal {
@@ -237,13 +237,6 @@ impl Finish<'_> {
         let lobes = lobes(&baked.lobes, file_from_world);
         HeadTexture { atlas: layout, color, normal, lobes }
     }
-}
-
-/// Returns linear color as an 8-bit picture, rounded to nearest.
-pub(super) fn coded(image: &Image) -> Photo {
-    let texel = |c: &[f32; 3]| c.map(|v| quantize(srgb_from_linear(v)));
-    let rgb = image.data.as_chunks::<3>().0.iter().map(texel).collect();
-    Photo { width: image.width, height: image.height, rgb, alpha: None }
 }
 
 /// Returns the lobes as pictures. Each is scaled by the value that all but a thousandth of its texels stay below, so
@@ -462,8 +455,8 @@ pub(super) fn center(mesh: &Mesh, world_from_mesh: &Similarity) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::files::test_head;
     use std::f32::consts::PI;
+    use tiface_surface::files::testing::tetrahedron;
 
     #[test]
     fn a_mesh_that_widens_below_the_head_is_called_head_and_shoulders() {
@@ -596,7 +589,7 @@ mod tests {
     fn a_head_at_the_end_of_the_world_keeps_its_shape_in_every_file() {
         let mesh = ball();
         assert!(mesh.is_closed());
-        let mut far = test_head();
+        let mut far = tetrahedron();
         far.texture.as_mut().unwrap().atlas.triangles = vec![[0, 1, 2]; mesh.triangles.len()];
         (far.mesh, far.harmonics, far.shells) = (mesh.clone(), None, None);
         // as it is when it has been kept for a while
@@ -714,7 +707,7 @@ mod tests {
             cameras: vec![DVec3::new(0.0, -3.0, 0.0)],
         };
         let names = |format| {
-            let files = export.files(&test_head(), format, "head").unwrap().files;
+            let files = export.files(&tetrahedron(), format, "head").unwrap().files;
             files.into_iter().map(|(name, _)| name).collect::<Vec<_>>()
         };
         assert_eq!(names(MeshFormat::Glb), ["head.glb"]);

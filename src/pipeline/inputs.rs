@@ -7,13 +7,13 @@ use super::readings::{Settled, decide_reading};
 use super::{mask, scene_file};
 use crate::capture::{self, Capture, CaptureOptions, Reading, View, ViewMask};
 use crate::config::{Config, MaskSource, Stage};
-use crate::io::{self, Limits};
 use crate::run::{Fingerprint, Run, read_record};
-use crate::{Error, Result};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind::NotFound;
 use std::path::Path;
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// Digests of what the stages read from outside the run.
 #[derive(Default)]

@@ -13,18 +13,18 @@ use crate::ensemble::{self, Tile};
 use crate::field::compute_device;
 use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
-use crate::geom::Camera;
 use crate::iface::{self, DensityField, IFace, SDF_TEST};
-use crate::image::Gray;
-use crate::io::Limits;
-use crate::render::RenderedView;
 use crate::run::StageDir;
 use crate::tface::{self, FieldMean, VM_TEST};
-use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::cell::OnceCell;
 use std::path::Path;
+use tiface_base::geom::Camera;
+use tiface_base::image::Gray;
+use tiface_base::io::Limits;
+use tiface_base::{Error, Result};
+use tiface_surface::render::RenderedView;
 
 /// Trains or imports the field of a stage; training resumes from the last checkpoint.
 pub(super) fn learn(

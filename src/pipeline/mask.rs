@@ -10,18 +10,18 @@ use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
 use crate::capture::scene::{self, Scene, SceneBox, SceneOptions, in_box};
 use crate::capture::{self, Capture, CaptureOptions, MASK_HINT, MaskReading, MaskSurvey, Split, View};
 use crate::config::{CameraPoses, Config, Exposures, MaskConfig, MaskMeaning, Preset};
-use crate::image::{Gray, Photo, resize_gray, working_size};
-use crate::io::{self, Limits, ReadError};
 use crate::mask::consistency::{ConsistencyView, check_consistency};
 use crate::mask::matting::unknown_share;
 use crate::mask::pages::{SheetView, page_of, sheet};
 use crate::mask::prompts::read_prompts;
 use crate::run::StageDir;
-use crate::{Error, Result};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
+use tiface_base::image::{Gray, Photo, resize_gray, working_size};
+use tiface_base::io::{self, Limits, ReadError};
+use tiface_base::{Error, Result};
 
 /// File name of the contact sheet, in the stage's folder.
 pub(super) const SHEET: &str = "sheet.html";

@@ -14,17 +14,17 @@ use super::surface::{ClosedSurface, Surface};
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, LoadedView, Split};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, Stage};
-use crate::geom::{Aabb, Camera, Mesh, Similarity};
-use crate::image::Image;
-use crate::io::{self, Limits};
-use crate::mesh::bake::seen_colors;
-use crate::mesh::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
-use crate::mesh::{self, Cap, HandleReport, MAX_HANDLE, MeshReport, Patches, Photograph};
 use crate::run::{Phase, Record, Run, StageDir, StageStatus, Status};
-use crate::{Error, ErrorKind, Monitor, Result};
 use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 use std::path::Path;
+use tiface_base::geom::{Aabb, Camera, Mesh, Similarity};
+use tiface_base::image::Image;
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, ErrorKind, Monitor, Result};
+use tiface_surface::bake::seen_colors;
+use tiface_surface::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
+use tiface_surface::{self, Cap, HandleReport, MAX_HANDLE, MeshReport, Patches, Photograph};
 
 /// Runs the stage `mesh`: writes the whole surface as `surface.ply` in the dataset's world, and the head mesh in the
 /// configured formats.
@@ -193,17 +193,17 @@ pub(super) fn extract(
     monitor: &dyn Monitor,
 ) -> Result<Extraction> {
     let (mesh, report) = if c.dense {
-        mesh::extract_dense(field, Aabb::SCENE, c.resolution as usize, monitor)?
+        tiface_surface::extract_dense(field, Aabb::SCENE, c.resolution as usize, monitor)?
     } else {
-        let options = mesh::ExtractOptions {
+        let options = tiface_surface::ExtractOptions {
             resolution: c.resolution as usize,
             longest_handle: if c.genus == Genus::Simple { MAX_HANDLE } else { 0.0 },
-            ..mesh::ExtractOptions::default()
+            ..tiface_surface::ExtractOptions::default()
         };
         let field = ClosedSurface { field, hull: scene.hull.as_ref(), cap: None, patches: None };
         // below the frames' border the surface is a guess: close the mesh where enough cameras see it
         let kept = capture::well_seen(scene, cameras, up, c.seen_by);
-        mesh::extract(&field, kept, &options, monitor)?
+        tiface_surface::extract(&field, kept, &options, monitor)?
     };
     let patches = Patches::of(&mesh, &report.handles);
     let cap = (!c.dense).then(|| Cap::of(&mesh, report.bounds(), report.cell_size));

@@ -7,16 +7,16 @@ use super::pictures;
 use crate::capture::synthetic::SyntheticHead;
 use crate::capture::{Capture, LoadedView, View};
 use crate::config::{Config, Method, TruthPhoto, ViewBackground};
-use crate::geom::{Bvh, Mesh};
-use crate::image::{Gray, Image, Photo};
-use crate::io::{self, Limits};
 use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
 use crate::run::{Run, StageDir};
-use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
+use tiface_base::geom::{Bvh, Mesh};
+use tiface_base::image::{Gray, Image, Photo};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// Largest mask value that counts as empty.
 const MAX_EMPTY: u8 = 0;

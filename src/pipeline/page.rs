@@ -9,14 +9,14 @@ pub(super) mod views;
 pub use views::{head_page, viewer_of_file};
 
 use super::session::Session;
-use crate::Result;
 use crate::config::{NAMES, Stage, display_name};
-use crate::error::counted;
-use crate::io::{self, Limits};
 use crate::report::{self, Chart, LEARNED, MethodTable, Report, Viewer, duration};
 use crate::run::{Record, read_record};
 use serde_json::Value;
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::error::counted;
+use tiface_base::io::{self, Limits};
 
 /// Maximum size of a page without its fixed parts, bytes.
 pub(super) const MAX_BYTES: usize = 7_600_000;

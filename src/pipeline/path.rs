@@ -12,11 +12,11 @@
 use crate::capture::path::{NamedCamera, from_json};
 use crate::capture::{Capture, Split, View};
 use crate::config::RenderConfig;
-use crate::geom::Camera;
-use crate::io::{self, Limits};
 use crate::run::Fingerprint;
-use crate::{Error, Result};
 use std::path::Path;
+use tiface_base::geom::Camera;
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// Folder of the paths, relative to the run: one folder for each path.
 pub(super) const PATHS: &str = "render/paths";

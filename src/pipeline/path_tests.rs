@@ -3,18 +3,18 @@
 use super::tests::{NoFields, head_run, masked, quiet, words};
 use super::*;
 use crate::config::{Config, Method, RenderConfig, ViewBackground};
-use crate::io;
 use crate::run::Run;
-use crate::{ErrorKind, Result};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
+use tiface_base::io;
+use tiface_base::{ErrorKind, Result};
 
 /// Radiance fields that are one color; others may not be asked for.
 struct Fog;
 
 impl Radiance for Fog {
-    fn render_rays(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
+    fn render_rays(&self, rays: &[tiface_base::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
         vec![RayResult { color: [0.25; 3], opacity: 0.5, depth: 2.0, ..RayResult::default() }; rays.len()]
     }
 }
@@ -182,7 +182,7 @@ fn a_file_of_cameras_is_read_before_anything_is_learned() {
         std::fs::write(&path, text).unwrap();
         let session = Session::open(&config, &run).unwrap();
         let session = session.with_camera_path(turn(&config, path.to_str().unwrap()))?;
-        Ok::<_, crate::Error>(session.views().to_owned())
+        Ok::<_, tiface_base::Error>(session.views().to_owned())
     };
     let e = along("{}").unwrap_err();
     assert!(e.to_string().contains("camera_path") && e.kind().code() == 1, "{e}");

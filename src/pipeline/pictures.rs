@@ -1,11 +1,11 @@
 //! Writing and reading rendered views.
 
-use crate::Result;
 use crate::config::{PictureFormat, ViewBackground};
-use crate::image::{Gray, Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
-use crate::io::{self, Limits, ReadError, WriteError};
-use crate::render::RenderedView;
 use std::path::{Path, PathBuf};
+use tiface_base::Result;
+use tiface_base::image::{Gray, Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
+use tiface_base::io::{self, Limits, ReadError, WriteError};
+use tiface_surface::render::RenderedView;
 
 /// Returns the color behind the head, sRGB-coded; `None` leaves alpha.
 pub(super) fn background_color(background: ViewBackground) -> Option<[f32; 3]> {

@@ -10,8 +10,8 @@ use super::session::Session;
 use crate::capture::View;
 use crate::config::{Config, Method, Product, Stage, VmConfig, key};
 use crate::run::{Fingerprint, Plan, read_record, read_status};
-use crate::{Error, Result, io};
 use std::path::Path;
+use tiface_base::{Error, Result, io};
 
 /// Version of the stages' files and of what is recorded of their settings; raised when their
 /// meaning changes.
@@ -254,7 +254,7 @@ impl Session<'_> {
             fingerprint = fingerprint.input(name, digest);
         }
         if stage == Stage::Mesh {
-            fingerprint = fingerprint.setting("format of mesh/parts", crate::mesh::files::FORMAT);
+            fingerprint = fingerprint.setting("format of mesh/parts", tiface_surface::files::FORMAT);
         }
         fingerprint
     }
@@ -303,7 +303,7 @@ impl Session<'_> {
         for stage in render.shows() {
             fingerprint = fingerprint.input(stage.as_str(), self.input(stage, &render.method));
         }
-        let pixels = |c: &crate::geom::Camera| c.width as u64 * c.height as u64;
+        let pixels = |c: &tiface_base::geom::Camera| c.width as u64 * c.height as u64;
         let all = match cameras {
             Some(cameras) => cameras.iter().map(|c| pixels(&c.camera)).sum(),
             None => self.capture.views.first().map_or(0, |v| pixels(&v.camera)) * render.orbit_views as u64,

@@ -13,18 +13,18 @@ use super::scene_file::{read_capture, read_scene};
 use crate::capture::path::{NamedCamera, orbit};
 use crate::capture::{Split, View};
 use crate::config::{Config, Stage, ViewBackground};
-use crate::geom::{Atlas, Camera, Distortion, Similarity};
-use crate::image::{Image, Photo, quantize, reduce_photo, working_size};
-use crate::io::{self, Limits};
-use crate::mesh::files::{HeadMesh, OpenedMesh, open_mesh};
-use crate::render::{
-    LobePictures, Look, MeshTexture, RasterLayers, RasterOptions, RasterView, Surface, raster_into,
-};
-use crate::{Error, Result};
 use glam::{DMat3, DVec3, Vec3};
 use rayon::prelude::*;
 use std::ops::Range;
 use std::path::Path;
+use tiface_base::geom::{Atlas, Camera, Distortion, Similarity};
+use tiface_base::image::{Image, Photo, quantize, reduce_photo, working_size};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
+use tiface_surface::files::{HeadMesh, OpenedMesh, open_mesh};
+use tiface_surface::render::{
+    LobePictures, Look, MeshTexture, RasterLayers, RasterOptions, RasterView, Surface, raster_into,
+};
 
 /// The lens of a preview: distance over visible width. A long one, as for portraits.
 const FOCAL: f64 = 2.5;

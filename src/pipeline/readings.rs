@@ -11,14 +11,14 @@ use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
 use crate::capture::scene::{self, SceneOptions};
 use crate::capture::{self, Capture, CaptureOptions, Reading, Split, View, ViewMask, by_number};
 use crate::config::{CameraPoses, MaskMeaning, MaskSource};
-use crate::geom::Camera;
-use crate::image::{Gray, resize_gray, working_size};
-use crate::io::Limits;
 use crate::mask::consistency::{ConsistencyView, check_consistency};
 use crate::rig::{self, PoseDecision};
-use crate::{Error, Result};
 use rayon::prelude::*;
 use std::path::Path;
+use tiface_base::geom::Camera;
+use tiface_base::image::{Gray, resize_gray, working_size};
+use tiface_base::io::Limits;
+use tiface_base::{Error, Result};
 
 /// Longest side of the photographs that are compared, pixels.
 const SIDE_PX: u32 = 256;

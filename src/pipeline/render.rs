@@ -19,17 +19,17 @@ use crate::capture::path::{NamedCamera, orbit};
 use crate::capture::scene::{self, Scene};
 use crate::capture::{Capture, Split};
 use crate::config::{ColorSource, Config, Method, RenderConfig};
-use crate::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
-use crate::io;
-use crate::mesh::files::{ExtractedSurface, HeadMesh};
-use crate::render::{
+use crate::run::{Run, StageDir};
+use serde_json::{Map, Value, json};
+use std::time::{Duration, Instant};
+use tiface_base::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
+use tiface_base::io;
+use tiface_base::{Error, Monitor, Result};
+use tiface_surface::files::{ExtractedSurface, HeadMesh};
+use tiface_surface::render::{
     LobePictures, MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView,
     ResidualSource, ResidualView, Residuals, Surface, raster, raycast,
 };
-use crate::run::{Run, StageDir};
-use crate::{Error, Monitor, Result};
-use serde_json::{Map, Value, json};
-use std::time::{Duration, Instant};
 
 /// Renders one folder per method and one picture per camera, and the `fitted` cameras by the methods that compare poses;
 /// `unit_m` is the number of meters in a dataset unit.
@@ -345,11 +345,11 @@ impl<'a> Renderer<'a> {
 mod tests {
     use super::super::surface::{Radiance, Surface};
     use super::*;
-    use crate::Quiet;
     use crate::config::Stage;
-    use crate::geom::{Aabb, Mesh, SdfField};
-    use crate::mesh::{Cap, RimVertex};
     use glam::Vec3;
+    use tiface_base::Quiet;
+    use tiface_base::geom::{Aabb, Mesh, SdfField};
+    use tiface_surface::{Cap, RimVertex};
 
     /// A field that is red everywhere.
     struct Red;

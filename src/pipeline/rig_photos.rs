@@ -1,16 +1,16 @@
 //! What cameras and exposures are measured on: photographs at a moderate size, their masks, and the surface of the hull.
 
-use crate::Result;
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, Split, View};
-use crate::error::counted;
-use crate::geom::{BitGrid, Camera, Mesh, Similarity};
-use crate::image::{Gray, Photo, reduce_photo, resize_gray, working_size};
-use crate::io::Limits;
-use crate::mesh::{Volume, marching};
 use crate::rig::{self, Rig, RigView};
 use glam::Vec3;
 use rayon::prelude::*;
+use tiface_base::Result;
+use tiface_base::error::counted;
+use tiface_base::geom::{BitGrid, Camera, Mesh, Similarity};
+use tiface_base::image::{Gray, Photo, reduce_photo, resize_gray, working_size};
+use tiface_base::io::Limits;
+use tiface_surface::{Volume, marching};
 
 /// Longest side of the photographs, pixels.
 const SEARCHED_PX: u32 = 1024;

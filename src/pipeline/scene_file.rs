@@ -2,15 +2,15 @@
 
 use super::cameras::CameraCheck;
 use super::exposure::ExposureCheck;
-use crate::Result;
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, View};
-use crate::geom::{Aabb, BitGrid};
-use crate::io::{self, Limits, ReadError, WriteError};
 use glam::Vec3;
 use serde::Deserialize;
 use serde_json::json;
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::geom::{Aabb, BitGrid};
+use tiface_base::io::{self, Limits, ReadError, WriteError};
 
 /// Maximum number of cells along an axis of a hull; the stage makes 128.
 const MAX_CELLS: usize = 1024;
@@ -118,9 +118,9 @@ pub(super) fn read_capture(path: &Path, root: &Path) -> Result<Capture, ReadErro
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Similarity;
     use glam::{DMat3, DVec3, Vec3};
     use serde_json::Value;
+    use tiface_base::geom::Similarity;
 
     fn scene() -> Scene {
         let mut bits = vec![0; 8];
@@ -194,7 +194,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("cameras.json");
         let named = |name: &str| {
-            let camera = crate::geom::Camera::above(4, 4, 4.0, 3.0);
+            let camera = tiface_base::geom::Camera::above(4, 4, 4.0, 3.0);
             let view = View {
                 name: name.into(),
                 split: crate::capture::Split::Test,

@@ -8,14 +8,14 @@ use super::{mask, scene_file};
 use crate::capture::scene::{Scene, SceneBox};
 use crate::capture::{Capture, MaskReading, Split, View, ViewMask};
 use crate::config::{Config, RenderConfig, Stage};
-use crate::io::{self, Limits};
 use crate::metrics::Lpips;
 use crate::run::Run;
-use crate::{Error, Result};
 use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::ErrorKind::NotFound;
 use std::sync::OnceLock;
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Result};
 
 /// A capture, its configuration and its run folder.
 pub struct Session<'a> {

@@ -8,14 +8,14 @@ use crate::config::{
     ColorSource, Config, Genus, Hair, MaskSource, Material, MeshConfig, MeshFormat, MeshFrame, Method,
     TextureFormat, ViewBackground,
 };
-use crate::geom::{SdfField, Similarity};
-use crate::io::{self, Limits};
 use crate::metrics::compare;
 use crate::run::{Run, Stop, read_record};
-use crate::{ErrorKind, Result};
 use glam::Vec3;
 use serde_json::json;
 use tempfile::TempDir;
+use tiface_base::geom::{SdfField, Similarity};
+use tiface_base::io::{self, Limits};
+use tiface_base::{ErrorKind, Result};
 
 /// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little brighter seen
 /// from one side.
@@ -117,7 +117,7 @@ fn the_disk_told_is_what_a_field_leaves_not_what_its_checkpoints_take_meanwhile(
 
 #[test]
 fn a_stage_gives_the_scratch_memory_of_its_kernels_back() {
-    use crate::kernel::cpu::pool::{Buffer, keeps};
+    use tiface_kernels::cpu::pool::{Buffer, keeps};
     let (_dir, config, run) = tiny_run();
     let session = Session::open(&config, &run).unwrap();
     // rounded up to 5 eighths of 2^20; nobody else has one of this size
@@ -380,7 +380,7 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
         let left = handles["left"].as_u64().unwrap() as usize;
         let lengths = |key: &str| handles[key].as_array().unwrap().len();
         counts.push((lengths("cut_mm") + lengths("filled_mm"), left));
-        let topology = crate::geom::topology(&product.positions, &product.triangles);
+        let topology = tiface_base::geom::topology(&product.positions, &product.triangles);
         assert_eq!(topology.genus, Some(left as i64));
         if genus == Genus::Simple {
             let around = handles["filled_mm"][0].as_f64().unwrap();
@@ -398,7 +398,7 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
 struct Fog(std::sync::atomic::AtomicUsize, Option<Stop>);
 
 impl Radiance for Fog {
-    fn render_rays(&self, rays: &[crate::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
+    fn render_rays(&self, rays: &[tiface_base::geom::Ray], _: glam::Vec3) -> Vec<RayResult> {
         let views = self.0.fetch_add(1, std::sync::atomic::Ordering::SeqCst) + 1;
         if let Some(stop) = self.1.as_ref().filter(|_| views == 2) {
             stop.request(ErrorKind::Interrupted);

@@ -3,13 +3,13 @@
 //! Views are made by marching rays through a field, a band of rows at a time: for a photograph of twelve megapixels,
 //! memory holds the picture, but not a ray and its result for every pixel.
 
-use crate::Result;
 use crate::config::Stage;
-use crate::geom::{BitGrid, Camera, Ray, RayResult, SdfField, Similarity};
-use crate::mesh::{Cap, Patches};
-use crate::render::RenderedView;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
+use tiface_base::Result;
+use tiface_base::geom::{BitGrid, Camera, Ray, RayResult, SdfField, Similarity};
+use tiface_surface::render::RenderedView;
+use tiface_surface::{Cap, Patches};
 
 /// A signed distance that may also be rendered by marching rays through it.
 pub trait Surface: SdfField {

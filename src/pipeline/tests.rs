@@ -1,20 +1,20 @@
 //! What the tests of the pipeline share.
 
 use super::{Fields, Radiance, Session, Stage, Surface, complete};
-use crate::Result;
 use crate::capture::scene::{self, Scene, SceneOptions};
 use crate::capture::synthetic::SyntheticOptions;
 use crate::capture::synthetic::shared::{Files, write_capture};
 use crate::capture::{self, Capture, CaptureOptions, Split};
 use crate::config::{CameraPoses, Config, Exposures, Preset};
-use crate::geom::Camera;
-use crate::image::Gray;
-use crate::io::Limits;
 use crate::run::{Done, Run};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, OnceLock};
 use tempfile::TempDir;
+use tiface_base::Result;
+use tiface_base::geom::Camera;
+use tiface_base::image::Gray;
+use tiface_base::io::Limits;
 
 /// Fields that no stage may load.
 pub(super) struct NoFields;

@@ -1,11 +1,11 @@
 //! The results of `tiface bench`: speed against error, as tables, as a page and as `bench.json`.
 
 use super::{Chart, Curve, STYLE, duration, fill};
-use crate::Result;
 use minijinja::context;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::fmt::Write;
+use tiface_base::Result;
 
 /// Cost of some work.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]

@@ -1,9 +1,9 @@
 //! The paper's tables beside our figures: Markdown and JSON.
 
-use crate::math::rng;
-use crate::{Error, Result};
 use serde::Serialize;
 use std::fmt::Write;
+use tiface_base::math::rng;
+use tiface_base::{Error, Result};
 
 /// Measures of a row, in the order of the columns: word, heading, and digits.
 pub const MEASURES: [(&str, &str, usize); 7] = [

@@ -1,14 +1,14 @@
 //! A run while it works: its stages, curves and newest views, as a file beside them that loads itself again and again.
 
 use super::{LEARNED, STYLE, charts, duration, fill, link, picture_url, views};
-use crate::Result;
 use crate::config::{NAMES, Stage};
-use crate::io::{self, Limits};
 use crate::run::{State, read_record, read_status};
 use minijinja::context;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
+use tiface_base::Result;
+use tiface_base::io::{self, Limits};
 
 /// Views on the page.
 const MAX_VIEWS: usize = 12;

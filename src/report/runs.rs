@@ -1,17 +1,17 @@
 //! One page of many runs, one row each, that is searched, filtered and sorted by any column.
 
 use super::{STYLE, csv_text, fill, glb_megabytes, picture_url, relative, small_view, views, warnings};
-use crate::Result;
 use crate::config::{Config, NAMES, Stage, display_name};
-use crate::error::counted;
-use crate::geom::Camera;
-use crate::io::{self, Limits};
-use crate::math::rank::mean_of_middle;
 use crate::run::{Phase, Record, RunStatus};
 use glam::Vec3;
 use minijinja::context;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::error::counted;
+use tiface_base::geom::Camera;
+use tiface_base::io::{self, Limits};
+use tiface_base::math::rank::mean_of_middle;
 
 /// Longest side of a picture: about 4 kB each, so that two hundred are light.
 const PICTURE_PX: u32 = 120;

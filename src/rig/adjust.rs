@@ -6,10 +6,10 @@
 //! unknowns for each camera (the Schur complement: Triggs, McLauchlan, Hartley, Fitzgibbon 2000, "Bundle Adjustment — A
 //! Modern Synthesis"). A camera moves by `R ← R exp(ω)`, `C ← C + t`. The matrix is small and dense.
 
-use crate::geom::{Camera, Similarity};
-use crate::math::{cholesky::solve, rank};
 use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
 use rayon::prelude::*;
+use tiface_base::geom::{Camera, Similarity};
+use tiface_base::math::{cholesky::solve, rank};
 
 /// Standard deviation of a camera's rotation before any measurement, radians: 0.3°.
 const PRIOR_TURN: f64 = 0.3 * std::f64::consts::PI / 180.0;
@@ -384,7 +384,7 @@ pub fn median(values: &mut [f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::{Distortion, Projection};
+    use tiface_base::geom::{Distortion, Projection};
 
     fn aimed(azimuth: f64, lens: Distortion) -> Camera {
         let turn = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-0.3 * azimuth);

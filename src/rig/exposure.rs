@@ -13,12 +13,12 @@
 
 use super::adjust::median;
 use super::tracks::{HEAD, MIN_VIEWS, Seed, blurred, is_set, seeds};
-use crate::geom::{Camera, Mesh};
-use crate::image::{Exposure, Gray, Photo, eroded, linear_from_srgb};
-use crate::math::cholesky::solve;
 use glam::DVec3;
 use rayon::prelude::*;
 use std::ops::Range;
+use tiface_base::geom::{Camera, Mesh};
+use tiface_base::image::{Exposure, Gray, Photo, eroded, linear_from_srgb};
+use tiface_base::math::cholesky::solve;
 
 /// Points spread over the surface.
 const POINTS: usize = 6000;

@@ -2,8 +2,8 @@
 
 use super::adjust::{Track, adjust, median};
 use super::{LEAST_SCALE, Rig, distance_px, residuals, sampled, sightings};
-use crate::geom::Camera;
 use serde::{Deserialize, Serialize};
+use tiface_base::geom::Camera;
 
 /// Sightings that a camera needs to be judged at all.
 pub const LEAST_SIGHTINGS: usize = 30;

@@ -8,10 +8,10 @@
 //! the adjustment, where points are free.
 
 use super::adjust::{Sighting, Track, project};
-use crate::geom::{Bvh, Camera, Mesh, Ray};
-use crate::image::{Gray, Photo, eroded};
 use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
+use tiface_base::geom::{Bvh, Camera, Mesh, Ray};
+use tiface_base::image::{Gray, Photo, eroded};
 
 /// Samples from a patch's center to its edge.
 const HALF: i32 = 6;

@@ -1,11 +1,11 @@
 //! `estimate.json`: estimated cost of the stages of a run.
 
 use super::record::read_if_present;
-use crate::io::ReadError;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ops::Add;
 use std::path::Path;
+use tiface_base::io::ReadError;
 
 /// File name of the estimate in a run.
 pub const ESTIMATE: &str = "estimate.json";

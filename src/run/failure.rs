@@ -1,8 +1,8 @@
 //! `failed.json`: the error of a command that ended before its first stage.
 
-use crate::io::{self, Limits};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+use tiface_base::io::{self, Limits};
 
 /// `failed.json`: the error of a command that ended before its first stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

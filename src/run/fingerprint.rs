@@ -1,10 +1,10 @@
 //! Fingerprint of a stage's result: settings, inputs, format version; and the difference of two.
 
-use crate::io::{self, ReadError};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+use tiface_base::io::{self, ReadError};
 
 /// Everything that affects the result of a stage. Stored in full, not only as a hash, so that a difference can be
 /// reported key by key.

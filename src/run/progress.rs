@@ -5,15 +5,15 @@
 
 use super::status::now;
 use super::{State, Status};
-use crate::error::COMPLETE_IS_KEPT;
-use crate::io;
-use crate::{Error, ErrorKind, Monitor, Result};
 use serde::{Serialize, Serializer};
 use serde_json::{Map, Value};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
+use tiface_base::error::COMPLETE_IS_KEPT;
+use tiface_base::io;
+use tiface_base::{Error, ErrorKind, Monitor, Result};
 
 /// Receives the events of a run.
 #[derive(Clone, Copy, Debug, Serialize)]

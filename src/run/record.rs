@@ -2,13 +2,13 @@
 
 use super::Fingerprint;
 use crate::config::key;
-use crate::io::{self, Limits, ReadError};
-use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fmt::{self, Display};
 use std::path::Path;
+use tiface_base::io::{self, Limits, ReadError};
+use tiface_base::{Error, Result};
 
 /// `done.json`: the stage is complete.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -5,12 +5,12 @@ use super::record::TIMED;
 use super::status::{host, now};
 use super::{Event, Fingerprint, Record, Run, State, Status};
 use super::{has_record, read_record, read_status};
-use crate::io;
-use crate::{Error, Monitor, Result};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
+use tiface_base::io;
+use tiface_base::{Error, Monitor, Result};
 
 /// Plan of a stage.
 #[derive(Clone, Debug)]
@@ -340,11 +340,11 @@ fn sweep(folder: &Path) -> Result<usize> {
 mod tests {
     use super::*;
     use crate::run::{Observer, Stop};
-    use crate::{ErrorKind, Quiet};
     use serde_json::json;
     use std::fs;
     use std::sync::Mutex;
     use std::time::Duration;
+    use tiface_base::{ErrorKind, Quiet};
 
     fn plan(steps: u32) -> Plan<'static> {
         let fingerprint = Fingerprint::default().setting("iface.steps", steps);

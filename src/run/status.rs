@@ -5,10 +5,10 @@ use super::failure::read_failure;
 use super::record::{Fault, Record, not_negative, read_if_present, read_record};
 use super::{Fingerprint, LOCK};
 use crate::config::{Config, Stage};
-use crate::io::{self, Limits, ReadError};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
+use tiface_base::io::{self, Limits, ReadError};
 
 /// The state of a stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -258,8 +258,8 @@ fn is_alive(status: &Status, folder: &Path) -> bool {
 mod tests {
     use super::*;
     use crate::run::{ESTIMATE, FAILED, Failure, Plan, ProductState, Run, StageDir};
-    use crate::{Error, Result};
     use serde_json::{Value, json};
+    use tiface_base::{Error, Result};
 
     fn plan(stage: &str) -> Plan<'_> {
         Plan {

@@ -2,10 +2,10 @@
 
 use super::Fingerprint;
 use super::record::{Fault, ProductState, Record, read_record};
-use crate::io;
-use crate::{Error, Result};
 use serde::Serialize;
 use std::path::Path;
+use tiface_base::io;
+use tiface_base::{Error, Result};
 
 /// What [`verify`] found in a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]

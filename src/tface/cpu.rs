@@ -1,15 +1,15 @@
 //! A training step of the vector-matrix field on the CPU.
 
 use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
-use crate::Result;
 use crate::config::VmConfig;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
 use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::{HostBatch, RaySampler, ray_backgrounds};
 use crate::field::training::StepAt;
-use crate::kernel::cpu::vm::losses::{self, BackgroundMode, Targets, VmFigures};
-use crate::kernel::cpu::vm::{self, DecoderWeights, Rendered, VmField};
 use std::sync::Arc;
+use tiface_base::Result;
+use tiface_kernels::cpu::vm::losses::{self, BackgroundMode, Targets, VmFigures};
+use tiface_kernels::cpu::vm::{self, DecoderWeights, Rendered, VmField};
 
 /// The operations of [`VmOps`] on the CPU.
 pub struct CpuVm<'a> {

@@ -12,13 +12,13 @@ use crate::field::ops::{ArrayDevice, Ops};
 use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;
-use crate::kernel::cpu::vm::VmField;
-use crate::kernel::cpu::vm::losses::{BackgroundMode, VmFigures};
-use crate::kernel::gpu::{
+use std::sync::Arc;
+use tiface_base::{Error, Result};
+use tiface_kernels::cpu::vm::VmField;
+use tiface_kernels::cpu::vm::losses::{BackgroundMode, VmFigures};
+use tiface_kernels::gpu::{
     self, Buffer, Device, DeviceBatch, DeviceDecoder, Gate, SamplingOptions, Vm, VmLosses, VmValues,
 };
-use crate::{Error, Result};
-use std::sync::Arc;
 
 /// Returns the settings with so few voxels that a cube of them takes no more memory than a box of any shape does with
 /// those of `config`. A cube has the shortest diagonal, and the smallest planes if all have as many channels; else a box

@@ -13,10 +13,10 @@ use crate::field::gpu_tests::{
 use crate::field::ops::ArrayDevice;
 use crate::field::pixels::TrainView;
 use crate::field::training::{self, Model, StepReport, TrainingSession};
-use crate::kernel::gpu::tests::device;
 use crate::tface::{FieldMean, TFace};
-use crate::{Monitor, Quiet};
 use std::path::Path;
+use tiface_base::{Monitor, Quiet};
+use tiface_kernels::gpu::testing::device;
 
 const BOUNDS: [[f32; 3]; 2] = [[-0.8; 3], [0.8; 3]];
 
@@ -180,7 +180,7 @@ fn a_device_trains_as_the_cpu_does_for_many_steps() {
 #[test]
 fn a_training_reserves_the_memory_that_was_planned() {
     if device().is_some() {
-        crate::kernel::gpu::tests::alone("tface::gpu::tests::memory_of_a_training");
+        tiface_kernels::gpu::testing::alone("tface::gpu::tests::memory_of_a_training");
     }
 }
 

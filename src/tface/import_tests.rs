@@ -1,14 +1,14 @@
 //! A converted checkpoint rendered by our kernels, compared with the published arithmetic.
 
 use super::*;
-use crate::Quiet;
 use crate::field::ball::session;
-use crate::geom::Ray;
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::vm::{DecoderWeights, RAY_WIDTH, render};
 use glam::{DVec3, Vec3};
 use serde_json::Value;
 use std::path::PathBuf;
+use tiface_base::Quiet;
+use tiface_base::geom::Ray;
+use tiface_kernels::cpu::march::MarchRay;
+use tiface_kernels::cpu::vm::{DecoderWeights, RAY_WIDTH, render};
 
 fn reference(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/reference").join(name)

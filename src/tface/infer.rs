@@ -5,15 +5,15 @@
 //! published loader.
 
 use super::record::{FORMAT, FieldRecord, NAMES, Placement, geometry};
-use crate::Result;
 use crate::field::GpuField;
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::field::training::TrainingSession;
-use crate::geom::{Ray, RayResult, Similarity};
-use crate::kernel::cpu::march::MarchRay;
-use crate::kernel::cpu::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
 use glam::{DMat3, Vec3};
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::geom::{Ray, RayResult, Similarity};
+use tiface_kernels::cpu::march::MarchRay;
+use tiface_kernels::cpu::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
 
 /// Renders rays in the field's coordinates on a device. `[n]` rays → `[n]`.
 type Renderer = dyn FnMut(&[MarchRay]) -> Result<Vec<[f32; RAY_WIDTH]>> + Send;
@@ -58,8 +58,8 @@ impl TFace {
 
     /// Renders on `device` from now on, if it supports the field's decoder.
     #[cfg(feature = "wgpu")]
-    pub(super) fn on(&mut self, device: std::sync::Arc<crate::kernel::gpu::Device>) {
-        use crate::kernel::gpu::{DeviceDecoder, VmRenderer};
+    pub(super) fn on(&mut self, device: std::sync::Arc<tiface_kernels::gpu::Device>) {
+        use tiface_kernels::gpu::{DeviceDecoder, VmRenderer};
         if DeviceDecoder::supports(&self.field.decoder).is_ok() {
             let values = self.values.each_ref().map(|v| v.as_slice());
             let mut renderer = VmRenderer::new(device, &self.field, values);

@@ -20,12 +20,12 @@ use crate::config::{MaskUse, VmConfig, VmStart};
 use crate::field::ComputeDevice;
 use crate::field::pixels::{LARGE, RaySampler, TrainView};
 use crate::field::training::{self, TrainingSession};
-use crate::geom::{Aabb, BitGrid, Ray, RayResult};
-use crate::io::Lock;
-use crate::{Monitor, Result, io};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use tiface_base::geom::{Aabb, BitGrid, Ray, RayResult};
+use tiface_base::io::Lock;
+use tiface_base::{Monitor, Result, io};
 
 /// The trained fields of a stage. Positions and distances are in scene units.
 pub struct FieldMean {
@@ -183,10 +183,10 @@ impl Monitor for FieldMonitor<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Quiet;
     use crate::config::Preset;
     use crate::field::ball::{StopAfter, hull, session, temporary, views};
     use std::sync::Mutex;
+    use tiface_base::Quiet;
 
     const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };
 

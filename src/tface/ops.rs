@@ -1,15 +1,15 @@
 //! The operations of a training step of the vector-matrix field, in the order of the step.
 
-use crate::Result;
 use crate::config::{MaskLoss, VmBackground, VmConfig};
 use crate::field::ops::Ops;
 use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;
-use crate::kernel::cpu::vm::VmField;
-use crate::kernel::cpu::vm::losses::{BackgroundMode, MaskTerm, VmFigures};
-use crate::math::rng;
 use std::sync::Arc;
+use tiface_base::Result;
+use tiface_base::math::rng;
+use tiface_kernels::cpu::vm::VmField;
+use tiface_kernels::cpu::vm::losses::{BackgroundMode, MaskTerm, VmFigures};
 
 /// Random stream of a step's background colors.
 pub const BACKGROUND_STREAM: u64 = 8;

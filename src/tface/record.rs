@@ -1,11 +1,11 @@
 //! The metadata of a field in a checkpoint: its shape and settings, and the geometry of its grid.
 
-use crate::Result;
 use crate::config::{DensityActivation, VmConfig};
 use crate::field::checkpoint::Checkpoint;
-use crate::kernel::cpu::vm::mask::{BoxMask, Lattice};
-use crate::kernel::cpu::vm::{DecoderShape, Grid, Shading, VmField, samples_across, step_size};
 use serde::{Deserialize, Serialize};
+use tiface_base::Result;
+use tiface_kernels::cpu::vm::mask::{BoxMask, Lattice};
+use tiface_kernels::cpu::vm::{DecoderShape, Grid, Shading, VmField, samples_across, step_size};
 
 /// Version of the checkpoints' layout.
 pub const FORMAT: &str = "tiface-vm-1";

@@ -4,10 +4,10 @@ use super::record::{NAMES, grids};
 use super::state::VmState;
 use crate::config::VmConfig;
 use crate::field::parameters::HostGroup;
-use crate::geom::dilated_cells;
-use crate::kernel::cpu::vm::mask::BoxMask;
-use crate::kernel::cpu::vm::{cropped, density_at, resized, size_for, voxel_schedule};
 use rayon::prelude::*;
+use tiface_base::geom::dilated_cells;
+use tiface_kernels::cpu::vm::mask::BoxMask;
+use tiface_kernels::cpu::vm::{cropped, density_at, resized, size_for, voxel_schedule};
 
 /// Most vertices of an alpha mask; a finer grid keeps the mask's size (published).
 const MASK_VERTICES: usize = 256 * 256 * 256;

@@ -5,14 +5,14 @@ use super::gpu::GpuVm;
 use super::ops::VmOps;
 use super::state::VmState;
 use super::train::VmModel;
-use crate::Result;
 use crate::config::{Preset, VmConfig};
 use crate::field::Check;
 use crate::field::ball;
 use crate::field::parameters::HostGroup;
 use crate::field::pixels::RaySampler;
 use crate::field::self_test::{SEED, TestedModel, compare, devices, run_step, session};
-use crate::kernel::gpu::Adapter;
+use tiface_base::Result;
+use tiface_kernels::gpu::Adapter;
 
 // no plane of symmetry between the cameras lies on the border of a cell, where rounding decides
 const BOUNDS: [[f32; 3]; 2] = [[-0.813, -0.797, -0.829], [0.787, 0.819, 0.803]];

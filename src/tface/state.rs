@@ -1,15 +1,15 @@
 //! The state of a T-Face training between steps: parameters, and the geometry of the grid.
 
 use super::record::{FieldRecord, NAMES, decoder, geometry, grids};
-use crate::Result;
 use crate::config::VmConfig;
 use crate::field::checkpoint::Checkpoint;
 use crate::field::parameters::{HostGroup, ParameterPart};
-use crate::geom::BitGrid;
-use crate::kernel::cpu::vm::mask::BoxMask;
-use crate::kernel::cpu::vm::{VmField, size_for};
-use crate::math::rng;
 use std::sync::Arc;
+use tiface_base::Result;
+use tiface_base::geom::BitGrid;
+use tiface_base::math::rng;
+use tiface_kernels::cpu::vm::mask::BoxMask;
+use tiface_kernels::cpu::vm::{VmField, size_for};
 
 /// State of a training between two steps.
 #[derive(Clone)]

@@ -3,16 +3,16 @@
 
 use super::super::ops::mask_term;
 use super::*;
-use crate::Quiet;
 use crate::config::{DensityActivation, MaskLoss, Preset, VmBackground};
 use crate::field::ball::{session, temporary, views};
 use crate::field::parameters::HostGroup;
-use crate::kernel::cpu::reference::tape::{AdamW, Stepped, Var, gradient};
-use crate::kernel::cpu::reference::{Real, vm, wide};
-use crate::kernel::cpu::vm::Grid;
-use crate::kernel::cpu::vm::losses::{Targets, of_rays};
-use crate::math::rng;
+use crate::reference::tape::{AdamW, Stepped, Var, gradient};
+use crate::reference::{Real, vm, wide};
 use std::path::Path;
+use tiface_base::Quiet;
+use tiface_base::math::rng;
+use tiface_kernels::cpu::vm::Grid;
+use tiface_kernels::cpu::vm::losses::{Targets, of_rays};
 
 const BOX: [[f32; 3]; 2] = [[-0.8, -0.7, -0.75], [0.8, 0.7, 0.75]];
 

@@ -13,12 +13,12 @@ use crate::field::ops::ArrayDevice;
 use crate::field::pixels::{RaySampler, TrainView};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self, ComputeDevice};
-use crate::geom::BitGrid;
-use crate::kernel::cpu::adam::AdamStep;
-use crate::kernel::cpu::vm::losses::VmFigures;
-use crate::{Error, Result};
 use serde::Serialize;
 use std::time::Instant;
+use tiface_base::geom::BitGrid;
+use tiface_base::{Error, Result};
+use tiface_kernels::cpu::adam::AdamStep;
+use tiface_kernels::cpu::vm::losses::VmFigures;
 
 /// Report of a training.
 #[derive(Clone, Debug, Serialize)]

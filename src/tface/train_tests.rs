@@ -7,12 +7,12 @@ use crate::field::ball::{
     words,
 };
 use crate::field::checkpoint;
-use crate::geom::Aabb;
-use crate::kernel::cpu::vm::size_for;
 use crate::tface::{TFace, train};
-use crate::{Monitor, Quiet};
 use glam::{Vec2, Vec3};
 use std::path::Path;
+use tiface_base::geom::Aabb;
+use tiface_base::{Monitor, Quiet};
+use tiface_kernels::cpu::vm::size_for;
 
 const BOX: Aabb = Aabb { min: Vec3::splat(-0.8), max: Vec3::splat(0.8) };
 

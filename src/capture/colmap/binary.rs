@@ -3,11 +3,11 @@
 
 use super::super::frame::LensModel;
 use super::{Camera, Image, Model, Rigid};
-use crate::Result;
-use crate::io::{Limits, ReadError};
 use glam::DVec3;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use tiface_base::Result;
+use tiface_base::io::{Limits, ReadError};
 
 /// A file with its bytes.
 type Source = (PathBuf, Vec<u8>);

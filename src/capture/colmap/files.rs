@@ -5,8 +5,8 @@
 //! has written the files with capitals.
 
 use super::super::folder::{CaptureFolder, join};
-use crate::io;
 use std::path::Path;
+use tiface_base::io;
 
 /// The files that are read.
 const KINDS: [&str; 4] = ["cameras", "images", "points3D", "test"];

@@ -7,13 +7,13 @@
 use super::super::folder::{in_file, shortened};
 use super::super::frame::LensModel;
 use super::{Camera, Image, Model, Rigid};
-use crate::io::Limits;
-use crate::{Error, Result};
 use glam::DVec3;
 use std::cell::Cell;
 use std::collections::HashMap;
 use std::path::Path;
 use std::str::{FromStr, SplitWhitespace};
+use tiface_base::io::Limits;
+use tiface_base::{Error, Result};
 
 /// Greatest difference from 1 of the length of a quaternion that tells an image's line from points.
 const UNIT: f64 = 1e-2;

@@ -3,9 +3,9 @@
 use super::super::folder::shortened;
 use super::super::frame::{self, Intrinsics};
 use super::{Pose, child, is_off, numbers};
-use crate::geom::{Distortion, Projection};
 use glam::{DMat3, DVec3};
 use roxmltree::Node;
+use tiface_base::geom::{Distortion, Projection};
 
 /// Skew moves no pixel farther.
 const SKEW_PX: f64 = 0.1;

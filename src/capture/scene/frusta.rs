@@ -3,12 +3,12 @@
 //! dataset's points within it, or the dataset's own box.
 
 use super::{Scene, aim, head_outside, scene_from, world_box};
-use crate::Result;
 use crate::capture::carve::{self, Cube, Projector};
 use crate::capture::view::View;
-use crate::geom::{Aabb, Camera};
-use crate::math::rank::median;
 use glam::{DVec3, Vec3};
+use tiface_base::Result;
+use tiface_base::geom::{Aabb, Camera};
+use tiface_base::math::rank::median;
 
 /// Minimum number of points for a box around them.
 const MIN_POINTS: usize = 100;

@@ -6,9 +6,9 @@
 //! I-Face in [-1, 1]³, as every scene has, and T-Face in its published numbers.
 
 use super::{Scene, world_box};
-use crate::geom::{Aabb, Similarity};
-use crate::{Error, Result};
 use glam::{DVec3, Vec3};
+use tiface_base::geom::{Aabb, Similarity};
+use tiface_base::{Error, Result};
 
 /// Half of the sides of T-Face's published box, in units of 0.3 of the dataset's.
 const ILSH_HALF: Vec3 = Vec3::new(1.5, 1.67, 1.0);
@@ -99,7 +99,7 @@ pub fn in_box(
 mod tests {
     use super::*;
     use crate::config::{Preset, VmConfig};
-    use crate::kernel::cpu::vm::{samples_across, size_for, step_size};
+    use tiface_kernels::cpu::vm::{samples_across, size_for, step_size};
 
     fn found(center: f32, half: f32) -> impl FnOnce() -> Result<(Scene, Vec<String>)> {
         let scale = 1.0 / f64::from(half);

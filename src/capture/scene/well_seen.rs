@@ -6,9 +6,9 @@
 
 use super::Scene;
 use crate::capture::carve::Projector;
-use crate::geom::{Aabb, Camera};
-use crate::math::rank::median;
 use glam::{DVec3, Vec3};
+use tiface_base::geom::{Aabb, Camera};
+use tiface_base::math::rank::median;
 
 /// Returns the part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
 /// median, inside the frames of a `share` of the cameras, 0..=1 (three at least). `cameras` are in the world;
@@ -61,8 +61,8 @@ pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3, share: f64) -> Aab
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::{BitGrid, Distortion, Similarity};
     use glam::DMat3;
+    use tiface_base::geom::{BitGrid, Distortion, Similarity};
 
     /// Eight cameras around the y axis at distance 4, looking at the middle from `height` above.
     fn cameras(height: f64) -> Vec<Camera> {

@@ -11,10 +11,10 @@
 
 use super::output::{NAMES, OPTIONS};
 use super::{Attempt, MAX_EXHAUSTIVE, SfmOptions, Work};
-use crate::io;
-use crate::{Error, Result};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
+use tiface_base::io;
+use tiface_base::{Error, Result};
 
 const INSTALL_COLMAP: &str = "install COLMAP: `apt-get install colmap` on Debian and Ubuntu, `brew install colmap` on macOS; on \
                               Windows, unpack the release from https://github.com/colmap/colmap/releases and add its folder \

@@ -14,11 +14,11 @@
 
 use super::super::folder::is_hidden;
 use super::{SfmOptions, Solution};
-use crate::io::{self, Limits, Lock, LockError};
 use crate::run::Fingerprint;
-use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::path::{Component, Path, PathBuf};
+use tiface_base::io::{self, Limits, Lock, LockError};
+use tiface_base::{Error, Result};
 
 /// File of the programs' messages.
 pub(super) const LOG: &str = "tiface_cameras.log";
@@ -94,7 +94,7 @@ impl<'a> Output<'a> {
     /// # Errors
     ///
     /// Fails if the folder has something else, and with
-    /// [`ErrorKind::NotNow`](crate::ErrorKind::NotNow) if a search works in it, unless this process
+    /// [`ErrorKind::NotNow`](tiface_base::ErrorKind::NotNow) if a search works in it, unless this process
     /// holds its lock.
     pub fn result_of(&self, request: &Request, lock: Option<&Lock>) -> Result<Option<Solution>> {
         let exists = |what: String, hint: &str| {

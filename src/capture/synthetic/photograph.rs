@@ -13,11 +13,11 @@ use super::shape::{
     EYE, EYE_RADIUS, HeadMaterial, OFFSET, SyntheticHead, cloud, combed, lower_lip, noise, parts, smooth,
     trilinear, unit, upper_lip,
 };
-use crate::geom::{Aabb, Camera};
-use crate::image::{Gray, Photo, quantize, srgb_from_linear};
 use glam::{UVec3, Vec2, Vec3};
 use rayon::prelude::*;
 use std::sync::OnceLock;
+use tiface_base::geom::{Aabb, Camera};
+use tiface_base::image::{Gray, Photo, quantize, srgb_from_linear};
 
 /// One picture with its masks.
 pub(super) struct SyntheticPhoto {

@@ -7,9 +7,9 @@
 //! Displacements, and everything else that is drawn, come from smooth value noise and hashed random numbers: the same bits
 //! on every machine.
 
-use crate::geom::Aabb;
-use crate::math::rng::mix;
 use glam::{IVec3, Vec2, Vec3};
+use tiface_base::geom::Aabb;
+use tiface_base::math::rng::mix;
 
 /// The demo head. It has one shape; a capture's seed moves cameras and grain, never the surface.
 #[derive(Clone, Copy, Debug, Default)]

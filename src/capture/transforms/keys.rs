@@ -462,7 +462,7 @@ mod tests {
         log.report("t.json", BTreeSet::new(), false, &mut listing);
         assert!(matches!(&listing.reasons[..], [r] if r.contains("`aabb_scale`")), "{:?}", listing.reasons);
         assert!(matches!(&listing.warnings[..], [w] if w.contains("`lens_id`")), "{:?}", listing.warnings);
-        let problems: Vec<String> = listing.problems.iter().map(crate::Error::to_string).collect();
+        let problems: Vec<String> = listing.problems.iter().map(tiface_base::Error::to_string).collect();
         assert_eq!(
             problems,
             [

@@ -4,12 +4,12 @@
 use super::agreement::{FOCAL_KEYS, Known, PINHOLE, numbers};
 use super::{Fault, Object};
 use crate::capture::frame::{self, Intrinsics, LensModel};
-use crate::geom::{Camera, Distortion};
-use crate::io;
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::BTreeSet;
+use tiface_base::geom::{Camera, Distortion};
+use tiface_base::io;
 
 /// The other keys that may stand at the top for all frames.
 pub(super) const SHARED_KEYS: &str =
@@ -615,7 +615,7 @@ mod tests {
             assert_eq!(of(small), of(large));
         }
         let fisheye = intrinsics_of(r#"{"camera_model": "fisheye", "k4": 0.1}"#, "{}").unwrap();
-        assert_eq!(fisheye.distortion.projection, crate::geom::Projection::Fisheye);
+        assert_eq!(fisheye.distortion.projection, tiface_base::geom::Projection::Fisheye);
         assert!(
             intrinsics_of(r#"{"camera_model": "pinhole", "k1": 0.1}"#, "{}").unwrap().distortion.is_none()
         );
@@ -686,7 +686,11 @@ mod tests {
     fn a_fisheye_lens_may_be_told_by_a_number() {
         for (value, is_one) in [("1", true), ("0", false), ("true", true), ("2", false)] {
             let (found, notes) = read(&format!(r#"{{"is_fisheye": {value}, "fl_x": 9}}"#), "{}").unwrap();
-            assert_eq!(found.distortion.projection == crate::geom::Projection::Fisheye, is_one, "{value}");
+            assert_eq!(
+                found.distortion.projection == tiface_base::geom::Projection::Fisheye,
+                is_one,
+                "{value}"
+            );
             assert_eq!(notes.misread.is_empty(), value != "2");
         }
     }

@@ -7,7 +7,6 @@
 //! warning.
 
 use super::Object;
-use crate::Error;
 use crate::capture::folder::shortened;
 use crate::capture::frame::Listing;
 use crate::capture::masks::few;
@@ -15,6 +14,7 @@ use glam::{DMat3, DVec3};
 use serde_json::Value;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
+use tiface_base::Error;
 
 /// Keys that tell one moment from another, the best first, and whether each is worth a word where cameras
 /// move: all photographs have times.

@@ -2,8 +2,8 @@
 //! its place.
 
 use super::{Fault, Object};
-use crate::io;
 use serde_json::Value;
+use tiface_base::io;
 
 /// How a pose has to be written.
 const WRITTEN: &str = "camera to world, row by row, its last column the position; the camera has +X right, \

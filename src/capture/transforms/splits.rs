@@ -5,13 +5,13 @@
 //! another ending or none, or with fewer or more folders in front, where only one photograph fits.
 
 use super::Object;
-use crate::Error;
 use crate::capture::folder::{PHOTOGRAPHS, has_ending, in_file, shortened};
 use crate::capture::frame::Listing;
 use crate::capture::masks::few;
 use crate::capture::view::Split;
-use crate::io;
 use std::collections::HashMap;
+use tiface_base::Error;
+use tiface_base::io;
 
 const LISTS: [(&str, Split); 3] =
     [("train_filenames", Split::Train), ("val_filenames", Split::Val), ("test_filenames", Split::Test)];

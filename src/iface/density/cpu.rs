@@ -2,17 +2,17 @@
 
 use super::shape;
 use super::{DensityGroups, DensityOps, OCCUPIED};
-use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::ops::{Cpu, Ops, slice, slice_mut};
 use crate::field::pixels::{HostBatch, RaySampler};
 use crate::field::training::StepAt;
 use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule;
-use crate::kernel::cpu::density::{self, DensitySamples, DensityShape, DensityWeights};
-use crate::kernel::cpu::losses::TERMS;
-use crate::kernel::cpu::march::{MarchRay, Samples};
-use crate::kernel::cpu::schedule::Figures;
+use tiface_base::Result;
+use tiface_kernels::cpu::density::{self, DensitySamples, DensityShape, DensityWeights};
+use tiface_kernels::cpu::losses::TERMS;
+use tiface_kernels::cpu::march::{MarchRay, Samples};
+use tiface_kernels::cpu::schedule::Figures;
 
 /// Returns the samples along rays in occupied cells, up to where the transmittance has vanished.
 pub fn march(

@@ -2,16 +2,16 @@
 
 use super::cpu::march;
 use super::{DensityState, FORMAT, parts, shape};
-use crate::Result;
 use crate::config::iface::IfaceConfig;
 use crate::field::checkpoint::{self, Checkpoint, TrainingProgress};
-use crate::geom::{Ray, RayResult, SdfField};
 use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule::step_length;
-use crate::kernel::cpu::density::{self, DensityShape, DensityWeights};
-use crate::kernel::cpu::march::MarchRay;
 use glam::Vec3;
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::geom::{Ray, RayResult, SdfField};
+use tiface_kernels::cpu::density::{self, DensityShape, DensityWeights};
+use tiface_kernels::cpu::march::MarchRay;
 
 /// Density of the level set that is taken as the surface.
 const LEVEL: f32 = 5.0;

@@ -10,11 +10,11 @@ use crate::field::training::StepAt;
 use crate::iface::gpu::{samples_that_fit, wanted_samples};
 use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule;
-use crate::kernel::cpu::schedule::Figures;
-use crate::kernel::gpu::{
+use tiface_base::{Error, Result};
+use tiface_kernels::cpu::schedule::Figures;
+use tiface_kernels::gpu::{
     self, Buffer, Density, Device, DeviceBatch, Gate, Nerfacc, Samples, SamplingOptions, Schedule, Words,
 };
-use crate::{Error, Result};
 
 /// The operations of [`DensityOps`] on a GPU, with their device memory.
 pub struct GpuDensity<'a> {

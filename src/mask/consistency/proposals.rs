@@ -14,9 +14,9 @@
 //! claim relative to one that is ruled out.)
 
 use super::{ConsistencyView, Opposition, SilhouetteConstraints, Votes, cells_on_ray, claims_of};
-use crate::Result;
-use crate::image::INSIDE;
 use rayon::prelude::*;
+use tiface_base::Result;
+use tiface_base::image::INSIDE;
 
 /// Rows and cells of [`verdicts`], which compares masks that a network proposes.
 const PROPOSAL_ROWS: u32 = 96;
@@ -125,9 +125,9 @@ fn blame(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Ve
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::{Camera, Distortion};
-    use crate::image::Gray;
     use glam::{DMat3, DVec3, Vec2};
+    use tiface_base::geom::{Camera, Distortion};
+    use tiface_base::image::Gray;
 
     /// Twelve cameras on a ring, looking a little down.
     fn ring() -> Vec<Camera> {

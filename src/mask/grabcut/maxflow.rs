@@ -323,7 +323,7 @@ impl PixelGraph {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::math::rng;
+    use tiface_base::math::rng;
 
     struct Random(u64, u64);
 

@@ -5,8 +5,8 @@
 //! covariance are measured again. A covariance always gains the minimum that 8-bit rounding and sensor noise leave,
 //! so that one flat color is no singular Gaussian.
 
-use crate::geom::cofactors;
-use crate::math::rng;
+use tiface_base::geom::cofactors;
+use tiface_base::math::rng;
 
 /// A color in coded 0..=255.
 pub type Rgb = [u8; 3];

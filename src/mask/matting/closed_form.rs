@@ -24,10 +24,10 @@
 //! faster, and for 750 × 1024 unknown pixels it takes 1.9 GB where this takes 0.25.
 
 use super::{HEAD, UNKNOWN};
-use crate::geom::cofactors;
-use crate::image::{Gray, Photo};
-use crate::math::cg::{self, dot};
-use crate::{Error, Result};
+use tiface_base::geom::cofactors;
+use tiface_base::image::{Gray, Photo};
+use tiface_base::math::cg::{self, dot};
+use tiface_base::{Error, Result};
 
 /// Options of the solver.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -366,7 +366,7 @@ fn conjugate_gradients(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::io::{Limits, NpyValues, read_gray, read_npy, read_photo};
+    use tiface_base::io::{Limits, NpyValues, read_gray, read_npy, read_photo};
 
     /// Photograph with two colors that meet softly, and noise; trimap unknown in the middle.
     fn small(width: usize, height: usize) -> (Photo, Gray) {

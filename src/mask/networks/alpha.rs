@@ -19,10 +19,10 @@
 use super::processor::{self, IMAGENET, Normal};
 use super::sam::resized;
 use crate::config::VitmatteColors;
-use crate::image::{Gray, Photo, bilinear, quantize};
 use crate::onnx::{NetworkArray, NetworkSession, Role, file_error};
-use crate::{Error, Result};
 use std::path::Path;
+use tiface_base::image::{Gray, Photo, bilinear, quantize};
+use tiface_base::{Error, Result};
 
 const ISNET: Normal = Normal { mean: [0.5; 3], std: [1.0; 3] };
 const MODNET: Normal = Normal { mean: [0.5; 3], std: [0.5; 3] };
@@ -201,10 +201,10 @@ impl VitMatte {
 #[cfg(test)]
 mod tests {
     use crate::config::MaskConfig;
-    use crate::image::Photo;
     use crate::mask::networks::Networks;
     use crate::onnx::tests::{config, made};
     use std::fs;
+    use tiface_base::image::Photo;
 
     #[test]
     fn an_alpha_network_sees_a_square_and_its_logits_become_an_alpha() {

@@ -3,12 +3,12 @@
 //! It is searched in the folder of the network's file, and in the parent of a folder called `onnx`, as in public
 //! collections. A file of another network's processor is ignored.
 
-use crate::Result;
-use crate::io::{self, Limits};
 use crate::onnx::file_error;
 use serde::Deserialize;
 use serde_json::Value;
 use std::path::Path;
+use tiface_base::Result;
+use tiface_base::io::{self, Limits};
 
 /// Mean and standard deviation of ImageNet's colors in 0..1: what SAM and ViTMatte were trained with.
 pub(super) const IMAGENET: Normal = Normal { mean: [0.485, 0.456, 0.406], std: [0.229, 0.224, 0.225] };

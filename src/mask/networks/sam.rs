@@ -10,13 +10,13 @@
 //! end when no box is given. S and the embedding's width are read from the files.
 
 use super::processor::{self, IMAGENET, Normal};
-use crate::image::{Gray, Photo, bilinear};
 use crate::mask::clicks::{self, Click};
 use crate::onnx::{Contract, NetworkArray, NetworkSession, Role, file_error};
-use crate::{Error, Result};
 use image::RgbImage;
 use image::imageops::{self, FilterType};
 use std::path::Path;
+use tiface_base::image::{Gray, Photo, bilinear};
+use tiface_base::{Error, Result};
 
 /// Pixels of the photograph under one cell of the embedding.
 const CELL: usize = 16;

@@ -7,16 +7,16 @@ use super::Networks;
 use super::alpha::VitMatte;
 use super::processor::IMAGENET;
 use super::sam::{Sam, enlarged, normalized, resized};
-use crate::Result;
 use crate::config::{MaskConfig, VitmatteColors};
-use crate::image::{Gray, Photo};
-use crate::io::{Limits, NpyValues, read_gray, read_json, read_npy, read_photo};
 use crate::mask::Click;
 use crate::onnx::tests::{config, made, shared};
 use crate::onnx::{NetworkArray, NetworkSession, Role};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
+use tiface_base::Result;
+use tiface_base::image::{Gray, Photo};
+use tiface_base::io::{Limits, NpyValues, read_gray, read_json, read_npy, read_photo};
 
 fn array(path: &Path) -> NetworkArray {
     let npy = read_npy(path, &Limits::default()).unwrap();

@@ -4,11 +4,6 @@
 
 use crate::capture::{Split, View};
 use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, ViewBackground, display_name};
-use crate::geom::{Camera, Similarity};
-use crate::image::{Photo, quantize, reduce_photo, working_size};
-use crate::io::{self, Limits};
-use crate::mesh::files::{ExportOptions, HeadMesh, HeadTexture, OpenedMesh, open_mesh, to_glb, weld};
-use crate::mesh::{SimplifyConfig, simplify};
 use crate::pipeline::finish::{Export, center};
 use crate::pipeline::mesh::{head_mesh, read_finished};
 use crate::pipeline::metrics::{Comparable, PictureSet, comparable, picture_sets};
@@ -18,11 +13,16 @@ use crate::report::{
     HEAT, MAX_ERROR, ViewPicture, ViewRow, Viewer, ViewerCamera, picture_url, relative, viewer_html,
 };
 use crate::run::{Record, read_record};
-use crate::{Error, Quiet, Result};
 use glam::{DVec2, Vec3};
 use rayon::prelude::*;
 use serde_json::Value;
 use std::path::Path;
+use tiface_base::geom::{Camera, Similarity};
+use tiface_base::image::{Photo, quantize, reduce_photo, working_size};
+use tiface_base::io::{self, Limits};
+use tiface_base::{Error, Quiet, Result};
+use tiface_surface::files::{ExportOptions, HeadMesh, HeadTexture, OpenedMesh, open_mesh, to_glb, weld};
+use tiface_surface::{SimplifyConfig, simplify};
 
 /// Longest side of a picture on the page: of few views, and of many.
 const SIDE_PX: (u32, u32) = (480, 320);
@@ -367,8 +367,8 @@ fn texel(photo: &Photo, [u, v]: [f32; 2]) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geom::Distortion;
     use glam::{DMat3, DVec3, Vec3};
+    use tiface_base::geom::Distortion;
 
     #[test]
     fn errors_are_colored_from_dark_to_bright() {

@@ -1,9 +1,9 @@
-//! Instant-NeRF's field: see [`tiface::kernel::cpu::density`].
+//! Instant-NeRF's field: see [`tiface_kernels::cpu::density`].
 
 use super::sdf::features;
 use super::{Real, harmonics, sigmoid};
-use tiface::kernel::cpu::density::DensityShape;
-use tiface::kernel::cpu::sdf::FieldShape;
+use tiface_kernels::cpu::density::DensityShape;
+use tiface_kernels::cpu::sdf::FieldShape;
 
 /// Density and color at a point seen along `d`; `flat` are the networks' weights.
 pub(crate) fn field<R: Real>(

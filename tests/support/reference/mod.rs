@@ -84,7 +84,7 @@ impl Real for f64 {
     }
 }
 
-/// The sixteen functions of [`sh16`](tiface::geom::sphharm::sh16), their factors from the definition.
+/// The sixteen functions of [`sh16`](tiface_base::geom::sphharm::sh16), their factors from the definition.
 pub(crate) fn harmonics([x, y, z]: [f64; 3]) -> [f64; 16] {
     let root = |n: f64, d: f64| (n / (d * std::f64::consts::PI)).sqrt();
     let (r2, s2) = (x * x - y * y, 5.0 * z * z);

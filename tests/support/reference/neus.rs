@@ -1,9 +1,9 @@
-//! NeuS compositing: see [`tiface::kernel::cpu::neus`].
+//! NeuS compositing: see [`tiface_kernels::cpu::neus`].
 
 use super::{Real, sigmoid};
 use std::array::from_fn;
-use tiface::kernel::cpu::neus::{RAY_WIDTH, Segments};
-use tiface::kernel::cpu::sdf::WIDTH;
+use tiface_kernels::cpu::neus::{RAY_WIDTH, Segments};
+use tiface_kernels::cpu::sdf::WIDTH;
 
 /// `[rays, 9]` of a field `[samples, 8]`, of any sharpness.
 pub(crate) fn composite<R: Real>(segments: Segments, field: &[R], inv_s: R, anneal: f64) -> Vec<R> {

@@ -1,9 +1,9 @@
-//! The signed-distance field: see [`tiface::kernel::cpu::sdf`].
+//! The signed-distance field: see [`tiface_kernels::cpu::sdf`].
 
 use super::{Real, harmonics, sigmoid};
 use std::array::from_fn;
-use tiface::kernel::cpu::hash;
-use tiface::kernel::cpu::sdf::FieldShape;
+use tiface_kernels::cpu::hash;
+use tiface_kernels::cpu::sdf::FieldShape;
 
 /// What the geometry network reads at a point, `[3 + 2 levels]`, position first, and the derivatives of that by the
 /// point. The cells are those of the f32 kernel: at their borders derivatives jump.

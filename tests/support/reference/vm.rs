@@ -1,10 +1,10 @@
-//! TensoRF's field and its rays: see [`tiface::kernel::cpu::vm`].
+//! TensoRF's field and its rays: see [`tiface_kernels::cpu::vm`].
 
 use super::{Real, sigmoid};
 use std::array::from_fn;
-use tiface::kernel::cpu::march::MarchRay;
-use tiface::kernel::cpu::vm::mask::Walk;
-use tiface::kernel::cpu::vm::{Grid, LINE_AXIS, PLANE_AXES, RAY_WIDTH, VmField};
+use tiface_kernels::cpu::march::MarchRay;
+use tiface_kernels::cpu::vm::mask::Walk;
+use tiface_kernels::cpu::vm::{Grid, LINE_AXIS, PLANE_AXES, RAY_WIDTH, VmField};
 
 /// Plane times line of every channel at a point.
 pub(crate) fn products<R: Real>(f: &VmField, grid: &Grid, values: &[R], p: [f64; 3]) -> Vec<R> {

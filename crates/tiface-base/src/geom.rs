@@ -1,0 +1,70 @@
+//! The vocabulary: plain f32 geometry on glam; no files, no tensors.
+
+mod bit_grid;
+mod boxes;
+mod bvh;
+mod camera;
+mod field;
+mod mesh;
+mod overlap;
+mod pieces;
+mod ray;
+mod shells;
+mod similarity;
+pub mod sphharm;
+mod topology;
+
+pub use bit_grid::{BitGrid, dilated_cells};
+pub use boxes::{Boxes, DBox, DEFAULT_EFFORT, Effort, share_out};
+pub use bvh::{Bvh, Closest};
+pub use camera::{Camera, Distortion, Projection};
+pub use field::SdfField;
+pub use mesh::{Atlas, Mesh};
+pub use mesh::{area_vector, bilinear_taps, shape};
+pub use overlap::{OutlineSide, THOROUGH_EFFORT, intersect, nearest_charts, overlaps, shared_area, turn};
+pub use pieces::{WrongPiece, wrong_pieces};
+pub use ray::{Aabb, Hit, Ray, RayResult};
+pub use shells::{ShellCaster, ShellLayer, Shells};
+pub use similarity::Similarity;
+pub use sphharm::Harmonics;
+pub use topology::{Sets, side_ends, sorted_sides};
+pub use topology::{Topology, topology};
+
+/// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of entries
+/// `xx xy xz yy yz zz`: their quotient is the inverse.
+#[inline]
+pub fn cofactors([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> ([f64; 6], f64) {
+    let c = [
+        yy * zz - yz * yz,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz * xz,
+        xy * xz - xx * yz,
+        xx * yy - xy * xy,
+    ];
+    (c, xx * c[0] + xy * c[1] + xz * c[2])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_matrix_times_its_cofactors_is_its_determinant() {
+        let (m, [xx, xy, xz, yy, yz, zz]) = {
+            let m = [4.0, 1.0, -2.0, 3.0, 0.5, 5.0];
+            (m, m)
+        };
+        let (c, determinant) = cofactors(m);
+        // 4 · (15 − 0.25) − 1 · (5 + 1) − 2 · (0.5 + 6)
+        assert_eq!(determinant, 40.0);
+        let rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+        let columns = [[c[0], c[1], c[2]], [c[1], c[3], c[4]], [c[2], c[4], c[5]]];
+        for (i, row) in rows.iter().enumerate() {
+            for (j, column) in columns.iter().enumerate() {
+                let sum: f64 = row.iter().zip(column).map(|(a, b)| a * b).sum();
+                assert_eq!(sum, if i == j { determinant } else { 0.0 });
+            }
+        }
+    }
+}

@@ -1,0 +1,208 @@
+//! Arithmetic of bodies that are compiled per CPU level: matrix blocks and a few transcendental
+//! functions.
+//!
+//! Fixed-width arrays are left to the autovectorizer. Each hot body is `#[inline(always)]` and
+//! generic over `F` ("has fused multiply-add"), instantiated inside a `#[target_feature]` wrapper
+//! that [`tiface_base::dispatch!`] chooses at run time. `f32::mul_add` without hardware FMA is a library
+//! call, hence [`fma`].
+//!
+//! [`Matrix`] holds the weights of small networks, zero-padded to the size of the matrix blocks, with their transpose.
+
+/// `a · b + c`, fused where the hardware can.
+#[inline(always)]
+pub fn fma<const F: bool>(a: f32, b: f32, c: f32) -> f32 {
+    if F { a.mul_add(b, c) } else { a * b + c }
+}
+
+/// Rows of the accumulator block. With eight rows the accumulators no longer stay in registers and
+/// the block is forty times slower.
+pub const ROWS: usize = 4;
+
+/// One block `C[ROWS, NR] (+)= Σ_p A[ROWS, p] · B[p, NR]`; `A` is strided, rows of `B` and `C` contiguous.
+#[inline(always)]
+fn block<const F: bool, const NR: usize>(
+    k: usize,
+    a: &[f32],
+    row_stride: usize,
+    column_stride: usize,
+    b: &[f32],
+    ldb: usize,
+    c: &mut [f32],
+    ldc: usize,
+    add: bool,
+) {
+    assert!(a.len() > (ROWS - 1) * row_stride + (k - 1) * column_stride);
+    assert!(b.len() >= (k - 1) * ldb + NR);
+    assert!(c.len() >= (ROWS - 1) * ldc + NR);
+    let mut acc = [[0f32; NR]; ROWS];
+    for p in 0..k {
+        // SAFETY: the three extents were asserted above and p < k.
+        let row: &[f32; NR] = unsafe { &*(b.as_ptr().add(p * ldb) as *const [f32; NR]) };
+        for i in 0..ROWS {
+            // SAFETY: as above, i < ROWS.
+            let v = unsafe { *a.get_unchecked(i * row_stride + p * column_stride) };
+            for l in 0..NR {
+                acc[i][l] = fma::<F>(v, row[l], acc[i][l]);
+            }
+        }
+    }
+    for i in 0..ROWS {
+        let out = &mut c[i * ldc..][..NR];
+        for l in 0..NR {
+            out[l] = if add { out[l] + acc[i][l] } else { acc[i][l] };
+        }
+    }
+}
+
+/// `C[m, n] (+)= A[m, k] · B[k, n]`: `m` a multiple of 4, `n` a multiple of 8.
+///
+/// `A[i, p] = a[i · row_stride + p · column_stride]`, so a transpose costs nothing.
+#[inline(always)]
+pub fn gemm<const F: bool>(
+    (m, n, k): (usize, usize, usize),
+    a: &[f32],
+    (row_stride, column_stride): (usize, usize),
+    b: &[f32],
+    ldb: usize,
+    c: &mut [f32],
+    ldc: usize,
+    add: bool,
+) {
+    debug_assert!(m % ROWS == 0 && n % 8 == 0);
+    for i in (0..m).step_by(ROWS) {
+        let a = &a[i * row_stride..];
+        let mut j = 0;
+        while j + 16 <= n {
+            block::<F, 16>(k, a, row_stride, column_stride, &b[j..], ldb, &mut c[i * ldc + j..], ldc, add);
+            j += 16;
+        }
+        if j < n {
+            block::<F, 8>(k, a, row_stride, column_stride, &b[j..], ldb, &mut c[i * ldc + j..], ldc, add);
+        }
+    }
+}
+
+/// eˣ, relative error below 2e-7 on [-87, 88]; clamped outside. Branch-free, so loops vectorize.
+#[inline(always)]
+pub fn exp<const F: bool>(x: f32) -> f32 {
+    let x = x.clamp(-87.0, 88.0);
+    // x = n ln 2 + r, |r| ≤ ln 2 / 2; ln 2 in two parts (Cody, Waite) keeps r exact.
+    let rounded = fma::<F>(x, std::f32::consts::LOG2_E, 12_582_912.0);
+    let n = rounded - 12_582_912.0;
+    let r = fma::<F>(n, -0.693_145_75, x);
+    let r = fma::<F>(n, -1.428_606_8e-6, r);
+    let p = fma::<F>(r, 1.0 / 720.0, 1.0 / 120.0);
+    let p = fma::<F>(r, p, 1.0 / 24.0);
+    let p = fma::<F>(r, p, 1.0 / 6.0);
+    let p = fma::<F>(r, p, 0.5);
+    let p = fma::<F>(r * r, p, r + 1.0);
+    // The lowest bits of `rounded` are n in [-126, 127], which becomes the exponent. A cast of n to an integer would
+    // saturate, which keeps loops from being vectorized.
+    p * f32::from_bits((rounded.to_bits() << 23).wrapping_add(127 << 23))
+}
+
+/// ln(1 + e) for e in [0, 1], error below 2e-7 relative: 2 artanh(e / (2 + e)).
+#[inline(always)]
+pub fn ln_1p<const F: bool>(e: f32) -> f32 {
+    let t = e / (2.0 + e);
+    let s = t * t;
+    let p = fma::<F>(s, 1.0 / 13.0, 1.0 / 11.0);
+    let p = fma::<F>(s, p, 1.0 / 9.0);
+    let p = fma::<F>(s, p, 1.0 / 7.0);
+    let p = fma::<F>(s, p, 1.0 / 5.0);
+    let p = fma::<F>(s, p, 1.0 / 3.0);
+    let p = fma::<F>(s, p, 1.0);
+    2.0 * t * p
+}
+
+/// Returns `g` if `h` is positive, else 0: the gradient of a relu whose output is `h`. A branch would become a masked store,
+/// which takes tens of cycles on some CPUs.
+#[inline(always)]
+pub fn relu_gradient(g: f32, h: f32) -> f32 {
+    f32::from_bits(g.to_bits() & u32::from(h > 0.0).wrapping_neg())
+}
+
+/// 1 / (1 + e⁻ˣ).
+#[inline(always)]
+pub fn sigmoid<const F: bool>(x: f32) -> f32 {
+    1.0 / (1.0 + exp::<F>(-x))
+}
+
+/// A zero-padded matrix and its transpose.
+#[derive(Debug)]
+pub struct Matrix {
+    /// `[rows, columns]` of the padded sizes.
+    pub m: Vec<f32>,
+    /// `[columns, rows]` of the padded sizes.
+    pub t: Vec<f32>,
+}
+
+impl Matrix {
+    /// Creates a matrix from row-major `values` of shape `[rows, columns]`, zero-padded to the shape `padded`.
+    pub fn new(values: &[f32], (rows, columns): (usize, usize), padded: (usize, usize)) -> Matrix {
+        let mut m = vec![0.0; padded.0 * padded.1];
+        let mut t = m.clone();
+        for r in 0..rows {
+            for c in 0..columns {
+                m[r * padded.1 + c] = values[r * columns + c];
+                t[c * padded.0 + r] = values[r * columns + c];
+            }
+        }
+        Matrix { m, t }
+    }
+}
+
+/// Splits the flat vector of a network's weights into row-major matrices of the given shapes.
+pub fn split<const N: usize>(mut flat: &[f32], shapes: [(usize, usize); N]) -> [&[f32]; N] {
+    shapes.map(|(rows, columns)| {
+        flat.split_off(..rows * columns).expect("the vector has the weights of all matrices")
+    })
+}
+
+/// Adds matrices to those of a flat vector. Each part is a matrix with the distance of its rows, in floats.
+pub fn add_to(mut flat: &mut [f32], shapes: &[(usize, usize)], parts: &[(&[f32], usize)]) {
+    for (&(rows, columns), &(part, stride)) in shapes.iter().zip(parts) {
+        let matrix = flat.split_off_mut(..rows * columns).expect("a gradient for each weight");
+        for (row, g) in matrix.chunks_exact_mut(columns).zip(part.chunks(stride)) {
+            row.iter_mut().zip(g).for_each(|(a, b)| *a += b);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exp_and_its_kin_agree_with_f64() {
+        for i in -8000..=8000 {
+            let x = i as f32 * 0.01;
+            let want = (x as f64).exp();
+            assert!(((exp::<false>(x) as f64 - want) / want).abs() < 3e-7, "exp {x}");
+            assert!(((exp::<true>(x) as f64 - want) / want).abs() < 3e-7, "exp {x}");
+        }
+        for i in 0..=1000 {
+            let e = i as f32 / 1000.0;
+            assert!((ln_1p::<true>(e) as f64 - (e as f64).ln_1p()).abs() < 2e-7, "ln_1p {e}");
+        }
+    }
+
+    #[test]
+    fn gemm_agrees_with_three_loops_for_both_orders() {
+        let (m, n, k) = (8, 24, 5);
+        let a: Vec<f32> = (0..m * k).map(|i| (i as f32 * 0.37).sin()).collect();
+        let b: Vec<f32> = (0..k * n).map(|i| (i as f32 * 0.61).cos()).collect();
+        let mut c = vec![0.5; m * n];
+        gemm::<false>((m, n, k), &a, (k, 1), &b, n, &mut c, n, true);
+        let mut t = vec![0.0; m * n];
+        let at: Vec<f32> = (0..m * k).map(|i| a[(i % m) * k + i / m]).collect(); // [k, m]
+        gemm::<true>((m, n, k), &at, (1, m), &b, n, &mut t, n, false);
+        for i in 0..m {
+            for j in 0..n {
+                let want: f32 = (0..k).map(|p| a[i * k + p] * b[p * n + j]).sum();
+                assert!((c[i * n + j] - want - 0.5).abs() < 1e-5);
+                assert!((t[i * n + j] - want).abs() < 1e-5);
+            }
+        }
+    }
+}

@@ -1,0 +1,281 @@
+//! The occupied cells of a box, and marching through them on a fixed lattice of steps.
+//!
+//! TensoRF's alpha mask (Chen et al. 2022, §4.3; `alphaMask` of the published code) marks vertices and is
+//! looked up trilinearly: a point is kept if any vertex around it is marked. A cell is therefore either kept
+//! as a whole or empty, so cells are stored here, and a ray skips empty ones *before* the field is evaluated. Sample
+//! positions `t = entry + step · (k + jitter)` do not depend on the mask.
+
+use crate::cpu::march::{BLOCK, MarchRay};
+
+/// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`. A second bitmask holds
+/// the blocks with an occupied cell, so that rays can skip empty blocks.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BoxMask {
+    min: [f32; 3],
+    max: [f32; 3],
+    size: [usize; 3],
+    bits: Vec<u64>,
+    /// One bit per block of `BLOCK`³ cells, set if the block contains an occupied cell.
+    blocks: Vec<u64>,
+}
+
+fn bit(bits: &[u64], i: usize) -> bool {
+    bits[i >> 6] >> (i & 63) & 1 == 1
+}
+
+/// Iterates over the cells of a box in the order of their bits.
+fn cells([nx, ny, nz]: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
+    (0..nx).flat_map(move |x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])))
+}
+
+impl BoxMask {
+    /// Creates a mask by evaluating `occupied` for every cell.
+    pub fn new(
+        min: [f32; 3],
+        max: [f32; 3],
+        size: [usize; 3],
+        occupied: impl Fn([usize; 3]) -> bool,
+    ) -> BoxMask {
+        let mut bits = vec![0u64; size.iter().product::<usize>().div_ceil(64)];
+        for i in cells(size).enumerate().filter(|(_, c)| occupied(*c)).map(|(i, _)| i) {
+            bits[i >> 6] |= 1 << (i & 63);
+        }
+        BoxMask::from_bits(min, max, size, bits).expect("a bit for each cell")
+    }
+
+    /// Creates a mask from its bits, as [`BoxMask::bits`] returns them; `None` if their number does not fit the cells.
+    pub fn from_bits(min: [f32; 3], max: [f32; 3], size: [usize; 3], bits: Vec<u64>) -> Option<BoxMask> {
+        let count = size.iter().try_fold(1usize, |n, &s| n.checked_mul(s))?;
+        if bits.len() != count.div_ceil(64) {
+            return None;
+        }
+        let b = size.map(|n| n.div_ceil(BLOCK));
+        let mut blocks = vec![0; (b[0] * b[1] * b[2]).div_ceil(64)];
+        for [x, y, z] in cells(size).enumerate().filter(|(i, _)| bit(&bits, *i)).map(|(_, c)| c) {
+            let i = ((x / BLOCK) * b[1] + y / BLOCK) * b[2] + z / BLOCK;
+            blocks[i >> 6] |= 1 << (i & 63);
+        }
+        Some(BoxMask { min, max, size, bits, blocks })
+    }
+
+    /// Creates a mask from marked vertices: a cell is occupied if one of its eight corners is marked. Vertex `(x, y, z)`
+    /// has index `(x · ny + y) · nz + z`; each axis has at least 2, and the outer ones lie on the border of
+    /// `min..max`.
+    ///
+    /// The cells extend beyond the vertices by one on every side. The published lookup pads with zeros, so a vertex on the
+    /// border still contributes to points that lie less than a cell outside.
+    pub fn from_vertices(min: [f32; 3], max: [f32; 3], size: [usize; 3], vertices: &[bool]) -> BoxMask {
+        assert_eq!(vertices.len(), size.iter().product::<usize>());
+        let unit: [f32; 3] = std::array::from_fn(|a| (max[a] - min[a]) / (size[a] - 1) as f32);
+        let grown = |corner: [f32; 3], sign: f32| std::array::from_fn(|a| corner[a] + sign * unit[a]);
+        BoxMask::new(grown(min, -1.0), grown(max, 1.0), size.map(|n| n + 1), |[x, y, z]| {
+            (0..8).any(|k| {
+                // cell 0 lies before vertex 0, which is its upper corner
+                let v = [x + (k & 1), y + (k >> 1 & 1), z + (k >> 2)];
+                (0..3).all(|a| v[a] > 0 && v[a] <= size[a])
+                    && vertices[((v[0] - 1) * size[1] + v[1] - 1) * size[2] + v[2] - 1]
+            })
+        })
+    }
+
+    fn cell(&self, c: [usize; 3]) -> usize {
+        (c[0] * self.size[1] + c[1]) * self.size[2] + c[2]
+    }
+
+    /// Returns the lower and upper corner of the mask's box.
+    pub fn bounds(&self) -> ([f32; 3], [f32; 3]) {
+        (self.min, self.max)
+    }
+
+    /// Returns the number of cells along each axis.
+    pub fn size(&self) -> [usize; 3] {
+        self.size
+    }
+
+    /// Returns the cells' bits.
+    pub fn bits(&self) -> &[u64] {
+        &self.bits
+    }
+
+    /// Returns one bit per block of 8³ cells, set if the block contains an occupied cell, in the order of cells.
+    #[cfg(feature = "wgpu")]
+    pub fn blocks(&self) -> &[u64] {
+        &self.blocks
+    }
+
+    /// Returns the fraction of cells that are occupied, 0..=1.
+    pub fn share(&self) -> f64 {
+        let cells: usize = self.size.iter().product();
+        let set: u64 = self.bits.iter().map(|b| b.count_ones() as u64).sum();
+        set as f64 / cells.max(1) as f64
+    }
+
+    /// Returns whether a point lies in an occupied cell; false outside the box.
+    pub fn contains(&self, p: [f32; 3]) -> bool {
+        let mut c = [0; 3];
+        for a in 0..3 {
+            // this form of the comparison also rejects NaN
+            if !(p[a] >= self.min[a] && p[a] <= self.max[a]) {
+                return false;
+            }
+            let g = (p[a] - self.min[a]) / (self.max[a] - self.min[a]) * self.size[a] as f32;
+            c[a] = (g as usize).min(self.size[a] - 1);
+        }
+        bit(&self.bits, self.cell(c))
+    }
+}
+
+/// The lattice of samples on a ray through a box.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lattice {
+    /// Lower corner of the field's box.
+    pub min: [f32; 3],
+    /// Upper corner.
+    pub max: [f32; 3],
+    /// Distance between samples, in units of `t`.
+    pub step: f32,
+    /// Number of samples of a ray; the last one has length 0 and therefore no weight.
+    pub samples: usize,
+    /// Minimum of `t` at the first sample.
+    pub near: f32,
+    /// Maximum of `t` at the first sample.
+    pub far: f32,
+}
+
+impl Lattice {
+    /// Returns the number of lattice points of a ray inside the box, which a renderer without a mask evaluates.
+    pub fn points(&self, ray: &MarchRay) -> u64 {
+        match self.crossing(ray) {
+            Some((enter, leave)) => {
+                let inside = (leave - enter.clamp(self.near, self.far)) / self.step;
+                (inside.max(0.0) as u64 + 1).min(self.samples as u64)
+            }
+            None => 0,
+        }
+    }
+
+    /// Returns `t` where a ray enters and leaves the box; `None` if it misses.
+    #[inline(always)]
+    fn crossing(&self, ray: &MarchRay) -> Option<(f32, f32)> {
+        let (enter, leave) = crossing([self.min, self.max], ray.origin, ray.direction);
+        // also refuses NaN
+        (enter <= leave).then_some((enter, leave))
+    }
+}
+
+/// Returns `t` where a line enters and leaves a box; the first is greater than the second if the line misses. Zero
+/// components of the direction are replaced by 1e-6, as in the published code.
+#[inline(always)]
+pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3]) -> (f32, f32) {
+    let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
+    for a in 0..3 {
+        let d = if direction[a] == 0.0 { 1e-6 } else { direction[a] };
+        let (p, q) = ((low[a] - origin[a]) / d, (high[a] - origin[a]) / d);
+        enter = enter.max(p.min(q));
+        leave = leave.min(p.max(q));
+    }
+    (enter, leave)
+}
+
+/// Walks over the lattice points of a ray inside the box and inside a mask.
+///
+/// This is a state rather than a closure, because a closure would be compiled without the vector instructions of the
+/// kernel that calls it.
+pub struct Walk<'a> {
+    lattice: &'a Lattice,
+    mask: Option<&'a BoxMask>,
+    ray: MarchRay,
+    start: f32,
+    leave: f32,
+    /// Index of the next lattice point.
+    k: i64,
+    end: i64,
+    /// Mask cells per unit of length.
+    scale: [f32; 3],
+    /// Inverse of the number of mask cells that the ray crosses per unit of `t`.
+    inverse: [f32; 3],
+    blocks: [usize; 3],
+}
+
+impl<'a> Walk<'a> {
+    /// Creates a walk that starts before the first lattice point; it has no points if the ray misses the box.
+    #[inline(always)]
+    pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &MarchRay) -> Walk<'a> {
+        let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
+        let (enter, leave) = crossing.unwrap_or((0.0, 0.0));
+        let start = enter.clamp(lattice.near, lattice.far) + ray.jitter * lattice.step;
+        let any = crossing.is_some() && start.is_finite();
+        let mut scale = [0f32; 3];
+        let mut inverse = [0f32; 3];
+        let mut blocks = [0; 3];
+        if let Some(m) = mask {
+            for a in 0..3 {
+                scale[a] = m.size[a] as f32 / (m.max[a] - m.min[a]);
+                inverse[a] = 1.0 / (ray.direction[a] * scale[a]);
+                blocks[a] = m.size[a].div_ceil(BLOCK);
+            }
+        }
+        let end = if any { lattice.samples.saturating_sub(1) as i64 } else { 0 };
+        Walk { lattice, mask, ray: *ray, start, leave, k: 0, end, scale, inverse, blocks }
+    }
+
+    /// Returns `t` of the next lattice point.
+    #[inline(always)]
+    pub fn advance(&mut self) -> Option<f32> {
+        let l = self.lattice;
+        while self.k < self.end {
+            let t = self.start + l.step * self.k as f32;
+            // the border itself belongs to the box, and rounding may put a sample just outside
+            if t > self.leave + l.step {
+                return None;
+            }
+            let mut p = [0f32; 3];
+            let mut outside = false;
+            for a in 0..3 {
+                p[a] = self.ray.origin[a] + t * self.ray.direction[a];
+                let slack = 1e-6 * (l.max[a] - l.min[a]);
+                // written so that NaN is outside, too
+                outside |= !(p[a] >= l.min[a] - slack && p[a] <= l.max[a] + slack);
+            }
+            let Some(mask) = self.mask else {
+                self.k += 1;
+                if outside {
+                    continue;
+                }
+                return Some(t);
+            };
+            let mut g = [0f32; 3];
+            let mut c = [0usize; 3];
+            for a in 0..3 {
+                g[a] = (p[a] - mask.min[a]) * self.scale[a];
+                let top = mask.size[a] as f32;
+                outside |= !(g[a] >= -1e-3 && g[a] <= top + 1e-3);
+                c[a] = (g[a].max(0.0) as usize).min(mask.size[a] - 1);
+            }
+            if outside {
+                self.k += 1;
+                continue;
+            }
+            if bit(&mask.bits, (c[0] * mask.size[1] + c[1]) * mask.size[2] + c[2]) {
+                self.k += 1;
+                return Some(t);
+            }
+            // skip to the border of the empty cell, or of its block if that is empty too, by a whole number of steps
+            let block = [c[0] / BLOCK, c[1] / BLOCK, c[2] / BLOCK];
+            let at = (block[0] * self.blocks[1] + block[1]) * self.blocks[2] + block[2];
+            let empty = !bit(&mask.blocks, at);
+            let mut border = f32::INFINITY;
+            for a in 0..3 {
+                let ahead = usize::from(self.ray.direction[a] > 0.0);
+                if self.ray.direction[a] != 0.0 {
+                    let wall =
+                        if empty { ((block[a] + ahead) * BLOCK).min(mask.size[a]) } else { c[a] + ahead };
+                    border = border.min((wall as f32 - g[a]) * self.inverse[a]);
+                }
+            }
+            // slightly less than that, so that rounding cannot skip a sample in the next cell
+            self.k += ((border.max(0.0) / l.step - 1e-3).ceil() as i64).max(1);
+        }
+        None
+    }
+}

@@ -1,0 +1,616 @@
+//! Sampling of random rays from photographs in device memory: 8 bits a channel, cropped to the box of drawable pixels.
+//!
+//! The pixel of a ray depends on seed, step and the ray's index alone, as on the CPU.
+
+use super::device::{Buffer, Device, Words, groups, launch};
+use super::rng::{Wide, below, permuted, ranked, stream, uniform, upper_bound, word};
+use super::vec3::Vec3;
+use crate::cpu::march::MarchRay;
+use burn::cubecl::server::Handle;
+use burn::cubecl::{self, prelude::*};
+use tiface_base::geom::{Camera, Projection};
+use tiface_base::math::rng;
+
+const UNITS: u32 = 256;
+
+/// Words that describe a photograph: pixels drawable up to and with it, box, its first pixel and the buffer that holds
+/// it, its first word of drawable bits, whether color is over black already, focal lengths, principal point, lens,
+/// rotation by columns, position, width of a pixel.
+const VIEW: usize = 39;
+const FIRST_PIXEL: usize = 5;
+const BUFFER: usize = 6;
+const FIRST_WORD: usize = 7;
+const OVER_BLACK: usize = 8;
+/// First word of the camera.
+const CAMERA: usize = 9;
+const LENS: usize = CAMERA + 4;
+const ROTATION: usize = LENS + 13;
+const POSITION: usize = ROTATION + 9;
+const PIXEL: usize = POSITION + 3;
+
+/// Attempts to draw a drawable pixel from the box before a ray is given up.
+const TRIES: u32 = 256;
+
+/// Buffers of pixels: no adapter binds more than 2³¹ bytes at once, however much memory it has.
+pub const BUFFERS: usize = 4;
+
+/// A packed photograph to draw from.
+pub struct DrawnView {
+    /// Camera in scene coordinates.
+    pub camera: Camera,
+    /// First column and row of the box of drawable pixels, its width and height; a width of 0 means none.
+    pub part: [u32; 4],
+    /// The box's pixels, row by row: red, green, blue and alpha, from the lowest byte on.
+    pub pixels: Vec<u32>,
+    /// Whether the colors are the head's over black already; otherwise they are the photograph's, to be multiplied by
+    /// alpha.
+    pub over_black: bool,
+    /// One bit per pixel of the box, from the lowest of each word: whether the pixel is drawable.
+    pub drawable: Vec<u32>,
+    /// The width of a pixel at the scene's middle, scene units, where rays may stand for squares of pixels; else infinite.
+    pub pixel: f32,
+}
+
+impl DrawnView {
+    fn words(&self, cumulative: u32, [pixel, buffer, word]: [usize; 3], radius: f32) -> [u32; VIEW] {
+        let (c, d) = (&self.camera, &self.camera.distortion);
+        let projection = match d.projection {
+            Projection::Perspective => 0u32,
+            Projection::Fisheye => 1,
+            Projection::Fov => 2,
+        };
+        let camera = [c.fx, c.fy, c.cx, c.cy].map(|v| v as f32);
+        let bends = [d.k1, d.k2, d.k3, d.k4, d.k5, d.k6, d.p1, d.p2, d.sx1, d.sy1, d.omega];
+        let mut words = vec![cumulative];
+        words.extend(self.part);
+        words.extend([pixel, buffer, word].map(|at| u32::try_from(at).expect("fewer than 2³² pixels")));
+        words.push(u32::from(self.over_black));
+        words.extend(camera.map(f32::to_bits));
+        words.extend([projection, u32::from(d.is_none())]);
+        words.extend(bends.map(|v| (v as f32).to_bits()));
+        words.extend(c.rotation.to_cols_array().map(|v| (v as f32).to_bits()));
+        words.extend((c.position.as_vec3() * radius).to_array().map(f32::to_bits));
+        words.push(self.pixel.to_bits());
+        words.try_into().expect("as many words as a view has")
+    }
+}
+
+/// A float of a view.
+#[cube]
+fn number(views: &[u32], view: usize, i: usize) -> f32 {
+    f32::reinterpret(views[view + i])
+}
+
+/// Three floats of a view.
+#[cube]
+fn vector(views: &[u32], view: usize, i: usize) -> Vec3 {
+    Vec3::new(number(views, view, i), number(views, view, i + 1), number(views, view, i + 2))
+}
+
+/// The photographs as kernels see them; [`Photographs`] documents the arrays.
+#[derive(CubeType, CubeLaunch)]
+struct PhotographArrays {
+    views: Box<[u32]>,
+    pixels0: Box<[u32]>,
+    pixels1: Box<[u32]>,
+    pixels2: Box<[u32]>,
+    pixels3: Box<[u32]>,
+    drawable: Box<[u32]>,
+    before: Box<[u32]>,
+}
+
+/// The rays that a kernel writes; [`DeviceBatch`] documents the arrays.
+#[derive(CubeType, CubeLaunch)]
+struct RayArrays {
+    origin: Box<[f32]>,
+    direction: Box<[f32]>,
+    jitter: Box<[f32]>,
+    color: Box<[f32]>,
+    alpha: Box<[f32]>,
+    background: Box<[f32]>,
+    alive: Box<[u32]>,
+}
+
+/// The random numbers of a step: keys of streams, and the permutation of all drawable pixels.
+#[derive(CubeType, CubeLaunch)]
+struct StepDraws {
+    view: Wide,
+    pixel: Wide,
+    jitter: Wide,
+    background: Wide,
+    permutation: Wide,
+    /// Half the number of bits of a permuted index.
+    half_bits: u32,
+    /// Place of the step's first ray in the order of the permutation.
+    first: u32,
+}
+
+/// A point of the picture's plane.
+#[derive(CubeType, Clone, Copy)]
+struct Point {
+    x: f32,
+    y: f32,
+    found: bool,
+}
+
+/// A point distorted by a lens, and the Jacobian of the distortion.
+#[derive(CubeType, Clone, Copy)]
+struct DistortJacobian {
+    x: f32,
+    y: f32,
+    xx: f32,
+    xy: f32,
+    yx: f32,
+    yy: f32,
+}
+
+#[cube]
+fn distort(views: &[u32], lens: usize, x: f32, y: f32) -> DistortJacobian {
+    let (k1, k2, k3) = (number(views, lens, 2), number(views, lens, 3), number(views, lens, 4));
+    let (k4, k5, k6) = (number(views, lens, 5), number(views, lens, 6), number(views, lens, 7));
+    let (p1, p2) = (number(views, lens, 8), number(views, lens, 9));
+    let (sx, sy) = (number(views, lens, 10), number(views, lens, 11));
+    let r2 = x * x + y * y;
+    let mut radial = 1.0f32 + r2 * (k1 + r2 * (k2 + r2 * k3));
+    let mut slope = k1 + r2 * (2.0f32 * k2 + 3.0f32 * r2 * k3);
+    if views[lens] == 1 {
+        radial += r2 * r2 * r2 * r2 * k4;
+        slope += 4.0f32 * r2 * r2 * r2 * k4;
+    } else {
+        let under = 1.0f32 + r2 * (k4 + r2 * (k5 + r2 * k6));
+        radial /= under;
+        slope = (slope - radial * (k4 + r2 * (2.0f32 * k5 + 3.0f32 * r2 * k6))) / under;
+    }
+    slope *= 2.0f32;
+    let cross = x * y * slope + 2.0f32 * p1 * x + 2.0f32 * p2 * y;
+    DistortJacobian {
+        x: x * radial + 2.0f32 * p1 * x * y + p2 * (r2 + 2.0f32 * x * x) + sx * r2,
+        y: y * radial + p1 * (r2 + 2.0f32 * y * y) + 2.0f32 * p2 * x * y + sy * r2,
+        xx: radial + x * x * slope + 2.0f32 * p1 * y + 6.0f32 * p2 * x + 2.0f32 * sx * x,
+        xy: cross + 2.0f32 * sx * y,
+        yx: cross + 2.0f32 * sy * x,
+        yy: radial + y * y * slope + 6.0f32 * p1 * y + 2.0f32 * p2 * x + 2.0f32 * sy * y,
+    }
+}
+
+/// Inverts the distortion of a lens; see [`tiface_base::geom::Distortion::undistort`].
+#[cube]
+fn undistort(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
+    let mut x = xd;
+    let mut y = yd;
+    let mut found = true;
+    if views[lens + 1] == 0 {
+        for _ in 0..10u32 {
+            let at = distort(views, lens, x, y);
+            let (ex, ey) = (at.x - xd, at.y - yd);
+            let det = at.xx * at.yy - at.xy * at.yx;
+            found = found && det > 1e-6f32;
+            let over = 1.0f32 / max(det, 1e-6f32);
+            x -= (at.yy * ex - at.xy * ey) * over;
+            y -= (at.xx * ey - at.yx * ex) * over;
+        }
+        let at = distort(views, lens, x, y);
+        found = found && (at.x - xd).abs() + (at.y - yd).abs() < 1e-5f32;
+        // tan θ / r of the projection
+        let r = (x * x + y * y).sqrt();
+        let widest = 1.569_796_3f32;
+        let mut scale = 1.0f32;
+        if views[lens] == 1 {
+            found = found && r < widest;
+            if r > 1e-4f32 {
+                scale = min(r, widest).tan() / r;
+            }
+        }
+        let omega = number(views, lens, 12);
+        if views[lens] == 2 && omega.abs() > 1e-6f32 {
+            let spread = 2.0f32 * (0.5f32 * omega).tan().abs();
+            let angle = r * omega.abs();
+            found = found && angle < widest;
+            scale = omega.abs() / spread;
+            if angle > 1e-4f32 {
+                scale = min(angle, widest).tan() / (spread * r);
+            }
+        }
+        x *= scale;
+        y *= scale;
+    }
+    Point { x, y, found }
+}
+
+/// Sums over the drawable pixels of a square.
+#[derive(CubeType, cubecl::CubeTypeMut, Clone, Copy)]
+struct Square {
+    x: u32,
+    y: u32,
+    red: u32,
+    green: u32,
+    blue: u32,
+    alpha: u32,
+    count: u32,
+}
+
+/// Returns whether pixel `at` of a view's box is drawable.
+#[cube]
+fn is_drawable(photographs: &PhotographArrays, view: usize, at: u32) -> bool {
+    let word = photographs.views[view + FIRST_WORD] + (at >> 5);
+    (photographs.drawable[word as usize] >> (at & 31)) & 1 == 1
+}
+
+/// Returns pixel `at` of a view's box.
+#[cube]
+fn pixel_at(photographs: &PhotographArrays, view: usize, at: u32) -> u32 {
+    let at = (photographs.views[view + FIRST_PIXEL] + at) as usize;
+    let buffer = photographs.views[view + BUFFER];
+    if buffer == 0 {
+        photographs.pixels0[at]
+    } else if buffer == 1 {
+        photographs.pixels1[at]
+    } else if buffer == 2 {
+        photographs.pixels2[at]
+    } else {
+        photographs.pixels3[at]
+    }
+}
+
+/// Sums the square around a pixel of a view's box, at most `detail` wide; column and row are relative to the box.
+#[cube]
+fn square(photographs: &PhotographArrays, view: usize, column: u32, row: u32, detail: f32) -> Square {
+    let views = &photographs.views;
+    let (x0, y0, width, height) = (views[view + 1], views[view + 2], views[view + 3], views[view + 4]);
+    let mut side = 1u32;
+    for _ in 0..3u32 {
+        let wider = f32::cast_from(2 * side) * number(views, view, PIXEL) <= detail;
+        side = select(wider, 2 * side, side);
+    }
+    // squares begin at multiples of their width in the whole photograph
+    let (left, top) = ((x0 + column) / side * side, (y0 + row) / side * side);
+    let mut sums = Square { x: 0u32, y: 0u32, red: 0u32, green: 0u32, blue: 0u32, alpha: 0u32, count: 0u32 };
+    for y in max(top, y0)..min(top + side, y0 + height) {
+        for x in max(left, x0)..min(left + side, x0 + width) {
+            let at = (y - y0) * width + x - x0;
+            if is_drawable(photographs, view, at) {
+                let pixel = pixel_at(photographs, view, at);
+                let alpha = pixel >> 24;
+                let share = select(views[view + OVER_BLACK] == 1, 255u32, alpha);
+                sums.x += x;
+                sums.y += y;
+                sums.red += share * (pixel & 255);
+                sums.green += share * ((pixel >> 8) & 255);
+                sums.blue += share * ((pixel >> 16) & 255);
+                sums.alpha += alpha;
+                sums.count += 1;
+            }
+        }
+    }
+    sums
+}
+
+#[cube(launch)]
+fn draw_rays(
+    photographs: &PhotographArrays,
+    wanted: &[u32],
+    mut rays: RayArrays,
+    draws: &StepDraws,
+    detail: f32,
+    #[comptime] order: PixelOrder,
+    #[comptime] shifted: bool,
+    #[comptime] random: bool,
+) {
+    let count = rays.jitter.len();
+    let r = ABSOLUTE_POS;
+    if r < count {
+        let views = &photographs.views;
+        let i = u32::cast_from(r);
+        let all = views.len() / VIEW;
+        let pixels = views[(all - 1) * VIEW];
+        // Index of the pixel among all drawable ones, unless views are drawn first.
+        let mut which = 0u32;
+        let mut wanted = i < wanted[0];
+        let view = if comptime!(order == PixelOrder::EachView) {
+            below(&draws.view, i, u32::cast_from(all)) as usize
+        } else {
+            if comptime!(order.is_permuted()) {
+                // A batch may be larger than the number of drawable pixels.
+                wanted = wanted && draws.first + i < pixels;
+                which = permuted(&draws.permutation, draws.half_bits, (draws.first + i) % pixels, pixels);
+            } else {
+                which = below(&draws.view, i, pixels);
+            }
+            // the first view whose running count exceeds the pixel's index
+            upper_bound(views, 0usize, all, which, VIEW)
+        };
+        let view = view * VIEW;
+        let (width, height) = (views[view + 3], views[view + 4]);
+        let mut found = false;
+        // rejection inside the box: a head fills most of it
+        let mut attempt = 0u32;
+        let mut last = 0u32;
+        if wanted && width > 0 {
+            last = comptime!(if order == PixelOrder::Random { TRIES } else { 1u32 }).runtime();
+        }
+        let mut x = 0.0f32;
+        let mut y = 0.0f32;
+        let mut sums =
+            Square { x: 0u32, y: 0u32, red: 0u32, green: 0u32, blue: 0u32, alpha: 0u32, count: 1u32 };
+        while attempt < last {
+            let at = if comptime!(order.is_permuted()) {
+                let mut rank = which;
+                if view > 0 {
+                    rank = which - views[view - VIEW];
+                }
+                let words = (width * height).div_ceil(32u32) as usize;
+                let first = views[view + FIRST_WORD] as usize;
+                ranked(&photographs.before, &photographs.drawable, first, words, rank)
+            } else {
+                let k = (i << 9) | (attempt << 1);
+                let column = below(&draws.pixel, k, width);
+                below(&draws.pixel, k | 1, height) * width + column
+            };
+            attempt += 1;
+            if is_drawable(photographs, view, at) {
+                sums = square(photographs, view, at % width, at / width, detail);
+                let whole = f32::cast_from(sums.count);
+                let (u, v) = (f32::cast_from(sums.x) / whole, f32::cast_from(sums.y) / whole);
+                let xd = (u + 0.5f32 - number(views, view, CAMERA + 2)) / number(views, view, CAMERA);
+                let yd = (v + 0.5f32 - number(views, view, CAMERA + 3)) / number(views, view, CAMERA + 1);
+                // pictures have y down
+                let d = undistort(views, view + LENS, xd, yd);
+                x = d.x;
+                y = -d.y;
+                found = d.found;
+                last = select(found, 0u32, last);
+            }
+        }
+        let kept = select(found, 1u32, 0u32);
+        let full = f32::cast_from(255 * sums.count);
+        rays.alive[r] = kept;
+        rays.alpha[r] = f32::cast_from(kept * sums.alpha) / full;
+        let (red, green, blue) = (kept * sums.red, kept * sums.green, kept * sums.blue);
+        let color = Vec3::new(f32::cast_from(red), f32::cast_from(green), f32::cast_from(blue));
+        (color / (255.0f32 * full)).write(&mut rays.color, count, r);
+        // cameras look along −Z
+        let mut over = 1.0f32;
+        if comptime!(order != PixelOrder::Permuted { depth_directions: true }) {
+            over = 1.0f32 / (x * x + y * y + 1.0f32).sqrt();
+        }
+        let (right, up) = (vector(views, view, ROTATION), vector(views, view, ROTATION + 3));
+        let back = vector(views, view, ROTATION + 6);
+        ((right * x + up * y - back) * over).write(&mut rays.direction, count, r);
+        vector(views, view, POSITION).write(&mut rays.origin, count, r);
+        let mut shift = 0.0f32;
+        if shifted {
+            shift = uniform(&draws.jitter, i);
+        }
+        rays.jitter[r] = shift;
+        #[unroll]
+        for c in 0..3u32 {
+            let mut channel = 0.0f32;
+            if random {
+                channel = uniform(&draws.background, 3 * i + c);
+            }
+            rays.background[c as usize * count + r] = channel;
+        }
+    }
+}
+
+#[cube(launch)]
+fn keep(wanted: &[u32], alive: &mut [u32]) {
+    let r = ABSOLUTE_POS;
+    if r < alive.len() && r >= wanted[0] as usize {
+        alive[r] = 0;
+    }
+}
+
+/// Rays of a step, and the colors of their pixels.
+pub struct DeviceBatch {
+    /// Planes `[3, rays]`, where they start, in the field's coordinates.
+    pub origin: Buffer,
+    /// Planes `[3, rays]`, unit directions.
+    pub direction: Buffer,
+    /// `[rays]`: the part of a step that samples are shifted by.
+    pub jitter: Buffer,
+    /// Planes `[3, rays]`: the head over black, sRGB-coded, 0 to 1.
+    pub color: Buffer,
+    /// `[rays]`: soft alpha, 1 without a mask.
+    pub alpha: Buffer,
+    /// Planes `[3, rays]`: background color of render and target.
+    pub background: Buffer,
+    /// `[rays]`: 1 for rays in use; the others have no samples and no part in any mean.
+    pub alive: Buffer,
+}
+
+impl DeviceBatch {
+    /// Allocates a batch with a capacity of `rays`, all inactive.
+    pub fn new(device: &Device, rays: usize) -> DeviceBatch {
+        DeviceBatch {
+            origin: device.zeros::<f32>(3 * rays),
+            direction: device.zeros::<f32>(3 * rays),
+            jitter: device.zeros::<f32>(rays),
+            color: device.zeros::<f32>(3 * rays),
+            alpha: device.zeros::<f32>(rays),
+            background: device.zeros::<f32>(3 * rays),
+            alive: device.zeros::<u32>(rays),
+        }
+    }
+
+    /// Uploads rays into a batch of the given capacity, with black colors.
+    pub fn of_rays(device: &Device, rays: &[MarchRay], capacity: usize) -> DeviceBatch {
+        assert!(rays.len() <= capacity);
+        let mut planes = [vec![0f32; 3 * capacity], vec![0f32; 3 * capacity]];
+        let (mut jitter, mut alive) = (vec![0f32; capacity], vec![0u32; capacity]);
+        for (r, ray) in rays.iter().enumerate() {
+            for a in 0..3 {
+                planes[0][a * capacity + r] = ray.origin[a];
+                planes[1][a * capacity + r] = ray.direction[a];
+            }
+            (jitter[r], alive[r]) = (ray.jitter, 1);
+        }
+        DeviceBatch {
+            origin: device.upload(&planes[0]),
+            direction: device.upload(&planes[1]),
+            jitter: device.upload(&jitter),
+            alive: device.upload(&alive),
+            ..DeviceBatch::new(device, capacity)
+        }
+    }
+
+    /// Returns the capacity in rays.
+    pub fn rays(&self) -> usize {
+        self.jitter.word_count()
+    }
+
+    fn arrays(&self) -> [&Buffer; 7] {
+        let DeviceBatch { origin, direction, jitter, color, alpha, background, alive } = self;
+        [origin, direction, jitter, color, alpha, background, alive]
+    }
+
+    /// Returns the buffers as a kernel argument.
+    fn arg(&self) -> RayArraysLaunch {
+        let [origin, direction, jitter, color, alpha, background, alive] = self.arrays().map(Words::arg);
+        RayArraysLaunch::new(origin, direction, jitter, color, alpha, background, alive)
+    }
+
+    /// Returns the handles of the buffers' memory.
+    fn handles(&self) -> [&Handle; 7] {
+        self.arrays().map(|buffer| &buffer.handle)
+    }
+
+    /// Deactivates all rays after the first `wanted`, `[1]`.
+    pub fn keep(&self, device: &Device, wanted: &Buffer) {
+        let count = groups(self.rays().div_ceil(UNITS as usize));
+        launch!(device, keep::launch, count, UNITS; wanted, self.alive);
+    }
+}
+
+/// Order in which pixels are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum PixelOrder {
+    /// Any drawable pixel, each as likely.
+    Random,
+    /// Every photograph as often, any pixel of its box once: without a ray where that is not drawable.
+    EachView,
+    /// Every drawable pixel once, then again in another order.
+    Permuted {
+        /// Directions have depth 1 in front of the camera, not length 1.
+        depth_directions: bool,
+    },
+}
+
+impl PixelOrder {
+    /// Returns whether every pixel is drawn once before any is drawn again.
+    pub fn is_permuted(self) -> bool {
+        matches!(self, PixelOrder::Permuted { .. })
+    }
+}
+
+/// Options for drawing rays.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SamplingOptions {
+    /// Whether each ray's first sample is shifted by a random part of a step.
+    pub jitter: bool,
+    /// Whether each ray has a random background color, rather than black.
+    pub background: bool,
+    /// Random stream of the background colors.
+    pub background_stream: u64,
+}
+
+/// Photographs on a device.
+pub struct Photographs {
+    views: Buffer,
+    pixels: [Buffer; BUFFERS],
+    drawable: Buffer,
+    /// Drawable pixels of the view before each word of `drawable`; of one word where pixels are not permuted.
+    before: Buffer,
+    /// Drawable pixels of all views.
+    count: u32,
+    order: PixelOrder,
+    drawing: SamplingOptions,
+}
+
+impl Photographs {
+    /// Copies photographs to the device, one after the other, into buffers of the given sizes in pixels,
+    /// first fit; the field's coordinates are the scene's times `radius`.
+    ///
+    /// # Panics
+    ///
+    /// Panics if no pixel is drawable, if 2³² pixels are, or with more than [`BUFFERS`] buffers.
+    pub fn new(
+        device: &Device,
+        seen: impl Iterator<Item = DrawnView>,
+        buffers: &[u64],
+        radius: f32,
+        order: PixelOrder,
+        drawing: SamplingOptions,
+    ) -> Photographs {
+        assert!(buffers.len() <= BUFFERS, "{} buffers of pixels", buffers.len());
+        let pixels: [Buffer; BUFFERS] =
+            std::array::from_fn(|b| device.scratch::<u32>(buffers.get(b).map_or(1, |&n| n as usize)));
+        let (mut views, mut drawable, mut before) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut cumulative, mut buffer, mut first) = (0u32, 0, 0);
+        for view in seen {
+            let area = (view.part[2] * view.part[3]) as usize;
+            assert!(view.pixels.len() == area && view.drawable.len() == area.div_ceil(32));
+            if (first + area) as u64 > buffers[buffer] {
+                (buffer, first) = (buffer + 1, 0);
+            }
+            let mut own = 0;
+            for word in &view.drawable {
+                before.push(own);
+                own += word.count_ones();
+            }
+            cumulative = cumulative.checked_add(own).expect("fewer than 2³² pixels");
+            views.extend(view.words(cumulative, [first, buffer, drawable.len()], radius));
+            drawable.extend(view.drawable);
+            if area > 0 {
+                device.write(&pixels[buffer], first, view.pixels);
+            }
+            first += area;
+        }
+        assert!(cumulative > 0, "no pixel is drawable");
+        before.truncate(if order.is_permuted() { usize::MAX } else { 1 });
+        let [views, drawable, before] = [views, drawable, before].map(|words| device.upload_vec(words));
+        Photographs { views, pixels, drawable, before, count: cumulative, order, drawing }
+    }
+
+    fn arrays(&self) -> [&Buffer; 7] {
+        let Photographs { views, pixels: [a, b, c, d], drawable, before, .. } = self;
+        [views, a, b, c, d, drawable, before]
+    }
+
+    /// Returns the buffers as a kernel argument.
+    fn arg(&self) -> PhotographArraysLaunch {
+        let [views, a, b, c, d, drawable, before] = self.arrays().map(Words::arg);
+        PhotographArraysLaunch::new(views, a, b, c, d, drawable, before)
+    }
+
+    /// Returns the handles of the buffers' memory.
+    fn handles(&self) -> [&Handle; 7] {
+        self.arrays().map(|buffer| &buffer.handle)
+    }
+
+    /// Draws the rays of a step, which depend on seed and step alone. A ray of a large photograph stands for a square of
+    /// pixels at most `detail` wide.
+    ///
+    /// # Shapes
+    ///
+    /// - wanted: `[1]`, number of rays to draw; the remaining rays of `into` are marked inactive
+    pub fn draw(
+        &self,
+        device: &Device,
+        (seed, step): (u64, u64),
+        wanted: &Buffer,
+        into: &DeviceBatch,
+        detail: f32,
+    ) {
+        let [view, pixel, shift, background] =
+            [0, 1, 2, self.drawing.background_stream].map(|k| stream(seed, step << 4 | k));
+        assert!(into.rays() < 1 << 22, "the number of a try has 32 bits");
+        let permutation = rng::Permutation::of_step((seed, step), into.rays() as u64, self.count as u64);
+        let (key, first) = (word(permutation.key), permutation.first as u32);
+        let draws = StepDrawsLaunch::new(view, pixel, shift, background, key, permutation.half_bits, first);
+        launch!(device, draw_rays::launch, groups(into.rays().div_ceil(UNITS as usize)), UNITS;
+            self, wanted, into;
+            draws, detail, self.order, self.drawing.jitter, self.drawing.background
+        );
+    }
+}

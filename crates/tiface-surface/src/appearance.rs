@@ -1,0 +1,289 @@
+//! Colors of a mesh, fitted to the photographs by linear least squares.
+//!
+//! A pixel `p` of a photograph is the mean of what its rays meet, and so linear in colors that live at nodes of the
+//! surface: texels of an atlas, or vertices.
+//!
+//! ```text
+//! min_c  Σ_p D_p ‖ g y_p − b_p − Σ_k Y_k(d_p) Σ_t W_pt c_tk ‖²
+//!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖²
+//! ```
+//!
+//! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before the fit, `W` the
+//! shares of the nodes under the pixel's rays (visibility and footprint in one), `Y_k` real spherical harmonics of the
+//! direction to the viewer and `∇` the difference between neighboring nodes. `D` is the root of the cosine between view
+//! and surface where the head alone fills the pixel, by the mask and by all rays, and else 0: what is behind the head
+//! never bleeds in. All values are sRGB-coded, as the metrics are.
+//!
+//! It is solved twice. The diffuse color (one function) has the finest nodes available, and is what every viewer
+//! shows. What depends on the view is smooth over the surface, so that the vertices carry it, as a difference to the
+//! diffuse color. What no photograph shows follows its neighbors some nodes far, and keeps its color beyond.
+
+mod nodes;
+mod rows;
+mod solve;
+
+pub(super) use nodes::Nodes;
+pub use rows::Photograph;
+
+use glam::Mat3;
+use rayon::prelude::*;
+use rows::{Row, Rows};
+use serde::Serialize;
+use solve::{Smoothness, System};
+use std::time::Instant;
+use tiface_base::geom::sphharm::{Y0, functions};
+use tiface_base::geom::{Atlas, Bvh, Harmonics, Mesh};
+use tiface_base::image::Image;
+use tiface_base::{Monitor, Result};
+
+/// Approximate maximum number of pixels that colors are fitted to: more hardly change the colors.
+const MAX_PIXELS: usize = 1_000_000;
+
+/// Every n-th photograph is left out of the first fits, to validate them.
+const VALIDATION_STRIDE: u32 = 6;
+
+/// Gains stay within this factor of their mean: more is no exposure.
+const MAX_GAIN: f32 = 1.25;
+
+/// Smoothness of the diffuse color over texels.
+const TEXELS: Smoothness = Smoothness { constant: 0.25, others: 0.0, ridge: 0.0 };
+
+/// Candidates for the smoothness of view-dependent color, over vertices: skin prefers the first, hair the second.
+const VERTICES: [Smoothness; 2] = [
+    Smoothness { constant: 0.02, others: 0.05, ridge: 8e-6 },
+    Smoothness { constant: 0.25, others: 0.75, ridge: 1e-4 },
+];
+
+/// Fitted colors.
+pub struct Appearance {
+    /// Diffuse color of the texels, sRGB-coded, and which of them were fitted; empty where colors are those of
+    /// vertices.
+    pub texels: (Vec<[f32; 3]>, Vec<bool>),
+    /// Diffuse color of the vertices, sRGB-coded.
+    pub vertices: Vec<[f32; 3]>,
+    /// View-dependent color, if it improves photographs that were left out.
+    pub harmonics: Option<Harmonics>,
+    /// A report of the fit.
+    pub report: AppearanceReport,
+}
+
+/// A report of a fit.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct AppearanceReport {
+    /// Pixels of photographs that were fitted to.
+    pub pixels: usize,
+    /// Share of the nodes that some of them show, 0..=1.
+    pub seen: f64,
+    /// Degree of view-dependent color.
+    pub degree: u32,
+    /// Weight of its smoothness, if its degree is above 0.
+    pub smoothness: f32,
+    /// PSNR of photographs left out, dB: diffuse, then per candidate (degree, smoothness, PSNR).
+    pub left_out: Vec<(u32, f32, f64)>,
+    /// PSNR of the fitted pixels, dB: before, diffuse, with view-dependent color.
+    pub psnr: [f64; 3],
+    /// Smallest and largest gain of a photograph.
+    pub gains: [f32; 2],
+    /// Duration of the fit.
+    pub seconds: f64,
+}
+
+/// The nodes of the colors, with their values before the fit, sRGB-coded.
+pub enum Colors<'a> {
+    /// Texels of an atlas: a picture of its size, 3 channels.
+    Texels(&'a Atlas, &'a Image),
+    /// The vertices' own colors.
+    Vertices,
+}
+
+/// Fits colors to photographs, whose masks have their sizes; vertices have colors. What depends on the view has degree
+/// `max_degree` at most, and 2; the degree and its smoothness are those that show photographs best that were left out of a first fit.
+///
+/// Returns `None` where no photograph shows the head.
+///
+/// # Errors
+///
+/// A request to stop.
+pub fn fit(
+    mesh: &Mesh,
+    colors: Colors,
+    photographs: &[Photograph],
+    max_degree: u32,
+    turned: Mat3,
+    monitor: &dyn Monitor,
+) -> Result<Option<Appearance>> {
+    let (begin, max_degree) = (Instant::now(), max_degree.min(2));
+    let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
+    let stride = (head as f64 / MAX_PIXELS as f64).sqrt().ceil().max(1.0) as u32;
+    let rows = Rows::new(mesh, &Bvh::new(mesh), photographs, stride, turned);
+    if rows.is_empty() {
+        return Ok(None);
+    }
+    let vertices = Nodes::vertices(mesh);
+    let (fine, before) = match colors {
+        Colors::Vertices => (Nodes::vertices(mesh), mesh.colors.clone()),
+        Colors::Texels(atlas, image) => {
+            let nodes = Nodes::texels(atlas);
+            let before = nodes.texels_of(image);
+            (nodes, before)
+        }
+    };
+    let smooth = match colors {
+        Colors::Texels(..) => TEXELS,
+        Colors::Vertices => VERTICES[0],
+    };
+    monitor.check_stop()?;
+    let fine_start = (&fine, &before[..], &smooth);
+    let choice = choose(&rows.quarter(), &vertices, fine_start, photographs.len(), max_degree, monitor)?;
+    let Choice { degree, smoothness, gains, left_out } = choice;
+    monitor.check_stop()?;
+
+    let all = |_: u32| true;
+    let (in_fine, in_vertices) = (rows.matrix(&fine), rows.matrix(&vertices));
+    let system = System { rows: &rows, matrix: &in_fine, nodes: &fine };
+    let target = system.missing(&photo(&rows, &gains), &before, 1);
+    let change = system.solve(&target, 1, &smooth, &all);
+    let rest = system.missing(&target, &change, 1);
+    monitor.check_stop()?;
+    let system = System { rows: &rows, matrix: &in_vertices, nodes: &vertices };
+    let mut report =
+        AppearanceReport { psnr: [&target, &rest, &rest].map(|e| psnr(e)), ..Default::default() };
+    let harmonics = (degree > 0).then(|| {
+        let functions = functions(degree);
+        let mut coefficients = system.solve(&rest, functions, &smoothness, &all);
+        report.psnr[2] = psnr(&system.missing(&rest, &coefficients, functions));
+        // the first function of the fit was 1
+        coefficients.iter_mut().step_by(functions).for_each(|c| *c = c.map(|v| v / Y0));
+        Harmonics { functions, coefficients, turned }
+    });
+
+    let seen = in_fine.seen();
+    let color = |(b, c): (&[f32; 3], &[f32; 3])| std::array::from_fn(|k| (b[k] + c[k]).clamp(0.0, 1.0));
+    let own: Vec<[f32; 3]> = before.iter().zip(&change).map(color).collect();
+    let (texels, vertices) = match colors {
+        Colors::Vertices => (Default::default(), own),
+        Colors::Texels(_, image) => (fine.onto(&own, image), fine.at_corners(mesh, &own)),
+    };
+    let shown = |v: &usize| rows.binary_search_by_key(&(*v as u32), |row| row.view).is_ok();
+    let of_all = (0..gains.len()).filter(shown).flat_map(|v| gains[v]);
+    report = AppearanceReport {
+        pixels: rows.len(),
+        seen,
+        degree,
+        smoothness: smoothness.others,
+        left_out,
+        gains: [of_all.clone().fold(f32::MAX, f32::min), of_all.fold(0.0, f32::max)],
+        seconds: begin.elapsed().as_secs_f64(),
+        ..report
+    };
+    Ok(Some(Appearance { texels, vertices, harmonics, report }))
+}
+
+/// Degree and smoothness, chosen by the photographs that were left out.
+struct Choice {
+    degree: u32,
+    smoothness: Smoothness,
+    /// `[photographs]`, per channel; their mean is 1.
+    gains: Vec<[f32; 3]>,
+    left_out: Vec<(u32, f32, f64)>,
+}
+
+fn choose(
+    rows: &Rows,
+    vertices: &Nodes,
+    (fine, before, smooth): (&Nodes, &[[f32; 3]], &Smoothness),
+    photographs: usize,
+    max_degree: u32,
+    monitor: &dyn Monitor,
+) -> Result<Choice> {
+    let all = |_: u32| true;
+    let held = |v: u32| v % VALIDATION_STRIDE == VALIDATION_STRIDE / 2;
+    let ones = vec![[1f32; 3]; photographs];
+    let (in_fine, in_vertices) = (rows.matrix(fine), rows.matrix(vertices));
+    let (of_fine, of_vertices) = (
+        System { rows, matrix: &in_fine, nodes: fine },
+        System { rows, matrix: &in_vertices, nodes: vertices },
+    );
+    let start = of_fine.missing(&photo(rows, &ones), before, 1);
+    // even a coarse fit to all photographs gives their brightness; twice, since the fit follows them
+    let (count, mut gains) = (functions(max_degree.min(1)), ones.clone());
+    for _ in 0..2 {
+        let target = of_fine.missing(&photo(rows, &gains), before, 1);
+        monitor.check_stop()?;
+        let x = of_vertices.solve(&target, count, &VERTICES[0], &all);
+        gains = gains_of(rows, &of_vertices.missing(&start, &x, count), photographs);
+    }
+    let target = of_fine.missing(&photo(rows, &gains), before, 1);
+    let change = of_fine.solve(&target, 1, smooth, &|v| !held(v));
+    let rest = of_fine.missing(&target, &change, 1);
+    let judge = |error: &[[f32; 3]]| -> f64 {
+        let of: Vec<[f32; 3]> =
+            rows.iter().zip(error).filter(|(row, _)| held(row.view)).map(|(_, e)| *e).collect();
+        psnr(&of)
+    };
+    let mut candidates: Vec<(u32, Smoothness, f64)> = Vec::new();
+    candidates.push((0, VERTICES[1], judge(&rest)));
+    for (degree, smoothness) in (1..=max_degree).flat_map(|d| VERTICES.map(|s| (d, s))) {
+        monitor.check_stop()?;
+        let x = of_vertices.solve(&rest, functions(degree), &smoothness, &|v| !held(v));
+        let error = of_vertices.missing(&rest, &x, functions(degree));
+        candidates.push((degree, smoothness, judge(&error)));
+    }
+    let left_out = candidates.iter().map(|(d, s, db)| (*d, s.others, *db)).collect();
+    // without data to decide on, the more careful one
+    let enough = (0..photographs as u32).any(held);
+    let best = match enough {
+        true => candidates.iter().fold(&candidates[0], |best, c| if c.2 > best.2 { c } else { best }),
+        false => &candidates[0],
+    };
+    Ok(Choice { degree: best.0, smoothness: best.1, gains, left_out })
+}
+
+/// Returns the photographs' pixels with gains, `[rows]`.
+fn photo(rows: &Rows, gains: &[[f32; 3]]) -> Vec<[f32; 3]> {
+    let with = |row: &Row| std::array::from_fn(|k| row.photo[k] * gains[row.view as usize][k]);
+    rows.iter().map(with).collect()
+}
+
+/// Returns the gain of each photograph that brings it closest to the fitted image, which is the photograph less
+/// `error` `[rows]`; relative to their mean.
+fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]> {
+    let mut sums = vec![[[0f64; 2]; 3]; photographs];
+    for (row, error) in rows.iter().zip(error) {
+        for k in 0..3 {
+            let (y, e) = (f64::from(row.photo[k]), f64::from(error[k]));
+            let sum = &mut sums[row.view as usize][k];
+            *sum = [sum[0] + (y - e) * y, sum[1] + y * y];
+        }
+    }
+    let raw = |s: &[f64; 2]| if s[1] > 0.0 { s[0] / s[1] } else { 1.0 };
+    let mean: [f64; 3] = std::array::from_fn(|k| {
+        let seen = sums.iter().filter(|s| s[k][1] > 0.0);
+        let (total, n) = seen.fold((0.0, 0), |(t, n), s| (t + raw(&s[k]).max(1e-3).ln(), n + 1));
+        (total / f64::from(n.max(1))).exp()
+    });
+    let gain = |s: &[[f64; 2]; 3]| {
+        std::array::from_fn(|k| ((raw(&s[k]) / mean[k]) as f32).clamp(1.0 / MAX_GAIN, MAX_GAIN))
+    };
+    sums.iter().map(gain).collect()
+}
+
+/// Returns the PSNR of errors, dB; an exact fit counts as 100.
+fn psnr(errors: &[[f32; 3]]) -> f64 {
+    let sum: f64 = errors.iter().flatten().map(|e| f64::from(*e).powi(2)).sum();
+    (-10.0 * (sum / (3 * errors.len()).max(1) as f64).log10()).min(100.0)
+}
+
+impl System<'_> {
+    /// Returns the residual of `target` `[rows]` after subtracting the rows of `x` `[nodes, count]`.
+    fn missing(&self, target: &[[f32; 3]], x: &[[f32; 3]], count: usize) -> Vec<[f32; 3]> {
+        let left = |(p, t): (usize, &[f32; 3])| {
+            let shown = self.shown(p, x, count);
+            std::array::from_fn(|k| t[k] - shown[k])
+        };
+        target.par_iter().enumerate().with_min_len(4096).map(left).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,202 @@
+//! Pixels of photographs as rows of a linear system.
+
+use super::nodes::{Nodes, grouped};
+use glam::{Mat3, Vec2, Vec3};
+use rayon::prelude::*;
+use std::ops::Deref;
+use tiface_base::geom::{Bvh, Camera, Hit, Mesh, area_vector};
+use tiface_base::image::{Gray, OPAQUE_ALPHA, Photo, eroded};
+
+/// Rays along each side of a pixel.
+const SIDE: u32 = 2;
+
+/// Rays of a pixel.
+const RAYS: usize = (SIDE * SIDE) as usize;
+
+/// A photograph that colors are fitted to.
+#[derive(Clone, Copy)]
+pub struct Photograph<'a> {
+    /// Its camera, in the mesh's coordinates.
+    pub camera: &'a Camera,
+    /// Its pixels, sRGB-coded.
+    pub photo: &'a Photo,
+    /// Soft alpha of the head, same size; `None`: all is head.
+    pub mask: Option<&'a Gray>,
+    /// Usable pixels (non-zero), same size; `None`: all are.
+    pub valid: Option<&'a Gray>,
+}
+
+impl Photograph<'_> {
+    /// Returns whether a pixel shows the head alone. Soft pixels also show the background, and would paint
+    /// the outline with it.
+    fn is_head(&self, at: usize) -> bool {
+        self.mask.is_none_or(|m| m.values[at] >= OPAQUE_ALPHA) && self.valid.is_none_or(|v| v.values[at] > 0)
+    }
+
+    /// Returns the usable pixels within `margin` pixels of the mask's outline.
+    pub fn outline(&self, margin: usize) -> Vec<usize> {
+        let Some(mask) = self.mask else { return Vec::new() };
+        let (w, h) = (mask.width as usize, mask.height as usize);
+        // a mask continues beyond its border with the value at the border
+        let (wide, high) = (w + 2 * margin, h + 2 * margin);
+        let inner = |at: usize, n: usize| at.clamp(margin, margin + n - 1) - margin;
+        let side = |head: bool| {
+            let of = |i: usize| (mask.values[inner(i / wide, h) * w + inner(i % wide, w)] >= 128) == head;
+            let set = eroded((0..wide * high).map(of).collect(), wide, high, margin);
+            (0..w * h).map(|i| set[(i / w + margin) * wide + i % w + margin]).collect::<Vec<bool>>()
+        };
+        let (inside, outside) = (side(true), side(false));
+        let usable = |at: &usize| self.valid.is_none_or(|v| v.values[*at] > 0);
+        (0..w * h).filter(|&at| !inside[at] && !outside[at]).filter(usable).collect()
+    }
+
+    /// Returns how many pixels show the head alone.
+    pub fn head_pixels(&self) -> usize {
+        (0..self.photo.rgb.len()).into_par_iter().filter(|&at| self.is_head(at)).count()
+    }
+}
+
+/// A pixel that the head fills, by the mask and by all of its rays.
+#[derive(Clone)]
+pub struct Row {
+    /// Color of the photograph, sRGB-coded.
+    pub photo: [f32; 3],
+    /// Unit direction to the viewer, turned to the coordinates of the harmonics.
+    pub direction: Vec3,
+    /// Weight of the row, 0..=1: the root of the cosine between view and surface.
+    pub weight: f32,
+    /// Its photograph.
+    pub view: u32,
+    hits: [Hit; RAYS],
+}
+
+/// The pixels that colors are fitted to.
+pub struct Rows(Vec<Row>);
+
+impl Deref for Rows {
+    type Target = [Row];
+
+    fn deref(&self) -> &[Row] {
+        &self.0
+    }
+}
+
+impl Rows {
+    /// Looks at every `stride`-th pixel each way of the photographs; `turned` leads from the mesh's coordinates to
+    /// those of the harmonics.
+    pub fn new(mesh: &Mesh, bvh: &Bvh, photographs: &[Photograph], stride: u32, turned: Mat3) -> Rows {
+        let lines: Vec<(u32, u32)> = (0..photographs.len() as u32)
+            .flat_map(|v| {
+                let height = photographs[v as usize].photo.height;
+                (0..height).filter(move |y| y % stride == v % stride).map(move |y| (v, y))
+            })
+            .collect();
+        let line = |&(view, y): &(u32, u32)| {
+            let photograph = &photographs[view as usize];
+            let xs = (y / stride % stride..photograph.photo.width).step_by(stride as usize);
+            xs.filter_map(move |x| Row::new(mesh, bvh, (view, photograph), [x, y], turned))
+        };
+        Rows(lines.par_iter().flat_map_iter(line).collect())
+    }
+
+    /// Returns every fourth row, for a first, cheap fit.
+    pub fn quarter(&self) -> Rows {
+        Rows(self.0.iter().step_by(4).cloned().collect())
+    }
+
+    /// Returns the nodes under all rows, and their weights.
+    pub fn matrix(&self, nodes: &Nodes) -> Matrix {
+        let parts: Vec<(Vec<u32>, Vec<(u32, f32)>)> = self
+            .par_chunks(1 << 14)
+            .map(|rows| {
+                let (mut counts, mut entries) = (Vec::with_capacity(rows.len()), Vec::new());
+                let mut row: Vec<(u32, f32)> = Vec::new();
+                for Row { hits, .. } in rows {
+                    row.clear();
+                    for hit in hits {
+                        nodes.under(hit, |node, w| match row.iter_mut().find(|e| e.0 == node) {
+                            Some(e) => e.1 += w / RAYS as f32,
+                            None => row.push((node, w / RAYS as f32)),
+                        });
+                    }
+                    counts.push(row.len() as u32);
+                    entries.extend_from_slice(&row);
+                }
+                (counts, entries)
+            })
+            .collect();
+        let mut start = vec![0u32];
+        let mut entries: Vec<(u32, f32)> = Vec::with_capacity(parts.iter().map(|p| p.1.len()).sum());
+        for (counts, part) in parts {
+            for n in counts {
+                start.push(start[start.len() - 1] + n);
+            }
+            entries.extend(part);
+        }
+        let row = |p: usize| start[p] as usize..start[p + 1] as usize;
+        let by_node =
+            (0..self.len()).flat_map(|p| entries[row(p)].iter().map(move |e| (e.0, (p as u32, e.1))));
+        let (column_start, column_entries) = grouped(nodes.len(), by_node, (0, 0.0));
+        Matrix { start, entries, column_start, column_entries }
+    }
+}
+
+impl Row {
+    /// Returns a pixel of a photograph, if the head fills it.
+    fn new(
+        mesh: &Mesh,
+        bvh: &Bvh,
+        (view, photograph): (u32, &Photograph),
+        [x, y]: [u32; 2],
+        turned: Mat3,
+    ) -> Option<Row> {
+        let Photograph { camera, photo, .. } = photograph;
+        let at = y as usize * photo.width as usize + x as usize;
+        if !photograph.is_head(at) {
+            return None;
+        }
+        let mut cosine = 0.0;
+        let mut hits = [Hit { t: 0.0, triangle: 0, u: 0.0, v: 0.0 }; RAYS];
+        for (slot, k) in hits.iter_mut().zip(0..) {
+            let sub = |k: u32| (k as f32 + 0.5) / SIDE as f32;
+            let ray = camera.ray(Vec2::new(x as f32 + sub(k % SIDE), y as f32 + sub(k / SIDE)))?;
+            *slot = bvh.closest_hit(&ray)?;
+            let normal = area_vector(mesh.corners(slot.triangle)).normalize_or_zero();
+            cosine -= normal.dot(ray.direction) / RAYS as f32;
+        }
+        let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
+        Some(Row {
+            photo: photo.rgb[at].map(|b| f32::from(b) / 255.0),
+            direction: turned * -ray.direction,
+            weight: cosine.clamp(0.0, 1.0).sqrt(),
+            view,
+            hits,
+        })
+    }
+}
+
+/// Which nodes a row shows and which rows show a node, with the node's share of the row.
+pub struct Matrix {
+    start: Vec<u32>,
+    entries: Vec<(u32, f32)>,
+    column_start: Vec<u32>,
+    column_entries: Vec<(u32, f32)>,
+}
+
+impl Matrix {
+    /// Returns the nodes of a row; their shares sum to 1.
+    pub fn row(&self, row: usize) -> &[(u32, f32)] {
+        &self.entries[self.start[row] as usize..self.start[row + 1] as usize]
+    }
+
+    /// Returns the rows of a node.
+    pub fn column(&self, node: usize) -> &[(u32, f32)] {
+        &self.column_entries[self.column_start[node] as usize..self.column_start[node + 1] as usize]
+    }
+
+    /// Returns the share of the nodes that some row shows.
+    pub fn seen(&self) -> f64 {
+        let nodes = self.column_start.len() - 1;
+        (0..nodes).filter(|&n| !self.column(n).is_empty()).count() as f64 / nodes.max(1) as f64
+    }
+}

@@ -1,0 +1,158 @@
+//! The texture of a mesh: its texture coordinates and pictures.
+
+use glam::Mat3;
+use tiface_base::geom::sphharm::rotated;
+use tiface_base::geom::{Atlas, Mesh};
+use tiface_base::image::{Image, Photo, reduce_photo, reduce_to_rows, working_size};
+use tiface_base::{Error, Result};
+
+/// The texture of a mesh: its texture coordinates and pictures.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HeadTexture {
+    /// The texture coordinates.
+    pub atlas: Atlas,
+    /// Base color, sRGB-coded; its alpha is not written.
+    pub color: Photo,
+    /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents of
+    /// [`tangents()`](super::tangents()). GLB only.
+    pub normal: Option<Photo>,
+    /// View-dependent color. GLB only.
+    pub lobes: Option<Lobes>,
+}
+
+/// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lobes {
+    /// One picture per spherical-harmonic function; a byte `b` stands for `(b − 128) / 127 · scale`.
+    pub pictures: Vec<Photo>,
+    /// Scale of each, sRGB-coded.
+    pub scale: Vec<f32>,
+    /// Rotates directions of the dataset's world to those of the exported files.
+    pub asset_from_world: Mat3,
+}
+
+impl Lobes {
+    /// Returns the same lobes in the coordinates of other files, as sRGB-coded differences: one picture a function.
+    pub fn turned(&self, asset_from_world: Mat3) -> Vec<Image> {
+        let matrix = rotated(self.pictures.len(), self.asset_from_world * asset_from_world.transpose());
+        let turned = |j: usize| {
+            let Photo { width, height, .. } = self.pictures[j];
+            let mut image = Image::new(width, height, 3);
+            for (k, picture) in self.pictures.iter().enumerate() {
+                let step = matrix[k][j] * self.scale[k] / 127.0;
+                let bytes = picture.rgb.as_flattened();
+                image.data.iter_mut().zip(bytes).for_each(|(sum, &b)| *sum += step * (f32::from(b) - 128.0));
+            }
+            image
+        };
+        (0..self.pictures.len()).map(turned).collect()
+    }
+}
+
+impl HeadTexture {
+    /// Returns a texture of a base color alone.
+    pub fn new(atlas: Atlas, color: Photo) -> HeadTexture {
+        HeadTexture { atlas, color, normal: None, lobes: None }
+    }
+
+    /// Returns the texture with pictures whose longest side is at most `px`, those of lobes at most `lobe_px`: averaged,
+    /// colors in linear light.
+    pub fn reduced(self, px: u32, lobe_px: u32) -> HeadTexture {
+        let smaller = |photo: &Photo, px| reduce_photo(photo, working_size(photo.width, photo.height, px));
+        let color = reduce_to_rows(&self.color, working_size(self.color.width, self.color.height, px).1);
+        let normal = self.normal.map(|normal| smaller(&normal, px));
+        let lobes = self.lobes.map(|lobes| Lobes {
+            pictures: lobes.pictures.iter().map(|picture| smaller(picture, lobe_px)).collect(),
+            ..lobes
+        });
+        let atlas = Atlas { width: color.width, height: color.height, ..self.atlas };
+        HeadTexture { atlas, color, normal, lobes }
+    }
+
+    /// Returns the pictures of the lobes, if the texture has any.
+    pub(super) fn lobe_pictures(&self) -> &[Photo] {
+        self.lobes.as_ref().map_or(&[], |l| &l.pictures)
+    }
+
+    /// Checks that every picture is complete and has the atlas's aspect ratio; its scale is free.
+    pub(super) fn check_pictures(&self) -> Result<()> {
+        self.check("base color", &self.color)?;
+        self.normal.as_ref().map_or(Ok(()), |normal| self.check("normal map", normal))?;
+        let mut lobes = self.lobe_pictures().iter().enumerate();
+        lobes.try_for_each(|(k, picture)| self.check(&format!("texture `lobe {k}`"), picture))
+    }
+
+    fn check(&self, what: &str, picture: &Photo) -> Result<()> {
+        let (w, h) = (u64::from(picture.width), u64::from(picture.height));
+        if w * h == 0 || w * h != picture.rgb.len() as u64 {
+            let found = format!("{} pixels for {w} × {h}", picture.rgb.len());
+            return Err(wrong_picture(what, found, "one for each, and at least one"));
+        }
+        if w * u64::from(self.atlas.height) != h * u64::from(self.atlas.width) {
+            let expected = format!("the shape of its atlas, {} × {}", self.atlas.width, self.atlas.height);
+            return Err(wrong_picture(what, format!("{w} × {h} pixels"), &expected));
+        }
+        Ok(())
+    }
+}
+
+/// Checks that the atlas belongs to this mesh and lies within its texture.
+pub(super) fn check_atlas(mesh: &Mesh, atlas: &Atlas) -> Result<()> {
+    let wrong = |what: String| {
+        Err(Error::cannot(what, "the atlas is damaged or belongs to another mesh; unwrap it again"))
+    };
+    let (found, expected) = (atlas.triangles.len(), mesh.triangles.len());
+    if found != expected {
+        return wrong(format!("the atlas has {found} triangles, the mesh {expected}"));
+    }
+    let uvs = atlas.uvs.len();
+    for (triangle, t) in atlas.triangles.iter().enumerate() {
+        if let Some(index) = t.iter().find(|&&i| i as usize >= uvs) {
+            return wrong(format!(
+                "triangle {triangle} uses texture coordinate {index}, but there are only {uvs}"
+            ));
+        }
+    }
+    let outside = |v: &f32| !(0.0..=1.0).contains(v);
+    match atlas.uvs.iter().position(|uv| uv.to_array().iter().any(outside)) {
+        Some(index) => wrong(format!(
+            "texture coordinate {index} is {}, expected 0 to 1 in both directions",
+            atlas.uvs[index]
+        )),
+        None => Ok(()),
+    }
+}
+
+/// Returns an error if a picture does not fit its own size or the atlas.
+fn wrong_picture(what: &str, found: String, expected: &str) -> Error {
+    let hint = "bake it again, for this atlas";
+    Error::cannot(format!("the {what} is {found}, expected {expected}"), hint)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_smaller_texture_averages_light_and_other_values_as_they_are() {
+        // columns of black and white, and of lobes and normals of the same bytes
+        let photo = Photo {
+            width: 4,
+            height: 2,
+            rgb: (0..8).map(|i| [if i % 2 == 0 { 0 } else { 255 }; 3]).collect(),
+            alpha: None,
+        };
+        let lobes =
+            Lobes { pictures: vec![photo.clone()], scale: vec![0.5], asset_from_world: Mat3::IDENTITY };
+        let atlas = Atlas { width: 4, height: 2, ..Atlas::default() };
+        let texture =
+            HeadTexture { atlas, color: photo.clone(), normal: Some(photo.clone()), lobes: Some(lobes) };
+        let small = texture.clone().reduced(2, 2);
+        // half of the light is 188 in sRGB
+        assert_eq!((small.color.width, small.color.height, &small.color.rgb[..]), (2, 1, &[[188; 3]; 2][..]));
+        assert_eq!((small.atlas.width, small.atlas.height), (2, 1));
+        assert_eq!(small.normal.unwrap().rgb, [[128; 3]; 2]);
+        assert_eq!(small.lobes.unwrap().pictures[0].rgb, [[128; 3]; 2]);
+        assert_eq!(texture.clone().reduced(4, 9), texture);
+    }
+}
