@@ -9,6 +9,7 @@ WORKDIR /build
 COPY Cargo.toml Cargo.lock rust-toolchain* ./
 COPY benches benches
 COPY examples examples
+COPY crates crates
 COPY src src
 COPY docs docs
 COPY README.md LICENSE-* ./

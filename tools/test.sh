@@ -179,7 +179,7 @@ install_ends() {
 ## One build serves all parts: with the networks and with the kernels of GPUs.
 
 build() {
-  cargo test --release --features matting,wgpu --no-run 2>&1 | tee "$scratch/build.log"
+  cargo test --release --workspace --features matting,wgpu --no-run 2>&1 | tee "$scratch/build.log"
   return "${PIPESTATUS[0]}"
 }
 
@@ -191,8 +191,9 @@ need_build() {
   install_ends
 }
 
-# executable WHAT: the path of a program of tests, as the build named it
-executable() { sed -n "s|.*Executable.*$1.* (\(.*\))$|\1|p" "$scratch/build.log" | tail -n 1; }
+# executables WHAT: the paths of programs of tests, as the build named them
+executables() { sed -n "s|.*Executable.*$1.* (\(.*\))$|\1|p" "$scratch/build.log"; }
+executable() { executables "$1" | tail -n 1; }
 
 # tests LOG PROGRAM OPTIONS...: runs a program of tests. Each test is shown as it ends, and what failing ones said; the
 # summary repeats what was skipped, so that a skipped test is not taken for a passed one. Times are an unstable option of
@@ -213,7 +214,6 @@ tests() {
   return $ended
 }
 
-unit_tests=src/lib.rs
 check_tests=tests/check/main.rs
 fuzz_tests=tests/fuzz.rs
 
@@ -221,21 +221,30 @@ lint() {
   step "format" cargo fmt --all -- --check
   step "comments of at most 100 columns" "${PYTHON:-python3}" tools/reference/wrap_comments.py --check
   # once with all features, and once without any; then built once
-  step "lints" cargo clippy --release --all-targets --features matting,wgpu -- -D warnings
-  step "no features" cargo clippy --release --lib --bins -- -D warnings
-  step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --features matting,wgpu --no-deps
+  step "lints" cargo clippy --release --workspace --all-targets --features matting,wgpu -- -D warnings
+  step "no features" cargo clippy --release --workspace --lib --bins -- -D warnings
+  step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --workspace --features matting,wgpu --no-deps
   step "figures of the documents" "${PYTHON:-python3}" tools/reference/figures.py check
+}
+
+# unit_tests OPTIONS...: the unit tests of all packages, one after the other
+unit_tests() {
+  local program ended=0
+  for program in $(executables src/lib.rs); do
+    tests "$(basename "$program")" "$program" "$@" || ended=1
+  done
+  return $ended
 }
 
 # Kernels are compiled for a driver in software on one CPU, which leaves the other to the integration tests.
 unit_begins() {
   need_build
-  begin unit tests unit "$(executable $unit_tests)" "${names[@]}"
+  begin unit unit_tests "${names[@]}"
 }
 unit_ends() {
   step "unit tests" end unit
   [ ${#names[@]} -gt 0 ] ||
-    step "examples in the documentation" cargo test --release --features matting,wgpu --doc
+    step "examples in the documentation" cargo test --release --workspace --features matting,wgpu --doc
 }
 
 integration() {
@@ -336,8 +345,8 @@ demo() {
 
 long() {
   need_build
-  step "long unit tests" long_tests unit "$(executable $unit_tests)" src
-  step "long integration tests" long_tests check "$(executable $check_tests)" tests/check
+  step "long unit tests" long_tests "src crates" unit_tests
+  step "long integration tests" long_tests tests/check tests long_check "$(executable $check_tests)"
   if [ -f ../shared/tools/cases.py ]; then
     step "inputs of many shapes are read or named" "${PYTHON:-python3}" ../shared/tools/cases.py "$target/release/tiface" \
       ../shared/data/cases
@@ -347,12 +356,15 @@ long() {
 }
 
 # Tests that are ignored because they are long; others are ignored because they measure, or are run by a test.
+# long_tests FOLDERS COMMAND...: runs a command of tests with the names of those that stand in the folders
 long_tests() {
-  local log=long_$1 program=$2 marked
-  marked=$(grep -rh -A 4 '#\[ignore = "long: ' "$3" | sed -n 's/^ *fn \([a-z0-9_]*\)().*/\1/p')
+  local folders=$1 marked
+  shift
+  # shellcheck disable=SC2086
+  marked=$(grep -rh -A 4 '#\[ignore = "long: ' $folders | sed -n 's/^ *fn \([a-z0-9_]*\)().*/\1/p')
   [ -n "$marked" ] || { echo "no test is marked as long"; return 1; }
   # shellcheck disable=SC2086
-  TIFACE_KILLS=40 tests "$log" "$program" --ignored $marked
+  TIFACE_KILLS=40 "$@" --ignored $marked
 }
 
 gpu() {

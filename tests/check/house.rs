@@ -1,25 +1,31 @@
-//! The house rules that can be read from the source: who may know whom, in no circle, who opens files, who prints.
+//! The house rules that the compiler does not see: who may know whom within the package `tiface`, in no circle within any
+//! package, who opens files, who prints.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Layers from the ground up; a module may know those below its own layer.
+/// Layers of the package `tiface`, from the ground up; a module may know those below its own layer.
 const LAYERS: &[(&str, &[&str])] = &[
-    ("ground", &["error", "monitor", "geom", "image", "io", "math"]),
-    ("parts", &["mesh", "render", "kernel"]),
     ("shared", &["config", "capture", "field", "onnx", "run", "report"]),
     ("stages", &["mask", "rig", "tface", "iface", "ensemble", "metrics"]),
     ("pipeline", &["pipeline"]),
     ("cli", &["cli"]),
 ];
 
-/// Modules of these layers may know each other; parts that can be used alone, and stages, never.
-const SOCIABLE: &[&str] = &["ground", "shared", "pipeline", "cli"];
+/// Modules of these layers may know each other; stages never.
+const SOCIABLE: &[&str] = &["shared", "pipeline", "cli"];
+
+/// The package of the pipeline and of the program, at the root of the workspace.
+const ROOT: &str = "tiface";
 
 struct Source {
+    package: String,
     module: String,
+    /// Path from the package's `src`.
     path: PathBuf,
+    /// Path from the root of the workspace.
+    place: String,
     /// Lines of code with their numbers: no comments, nothing of the tests.
     lines: Vec<(usize, String)>,
 }
@@ -29,11 +35,21 @@ fn layer(module: &str) -> Option<usize> {
 }
 
 fn sources() -> Vec<Source> {
-    let src = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
-    let mut files = Vec::new();
-    collect(&src, &mut files);
-    files.sort();
-    files.iter().filter_map(|path| read(&src, path)).collect()
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut packages = vec![(ROOT.to_string(), root.join("src"))];
+    for entry in fs::read_dir(root.join("crates")).unwrap() {
+        let entry = entry.unwrap();
+        packages.push((entry.file_name().to_str().unwrap().into(), entry.path().join("src")));
+    }
+    let mut all = Vec::new();
+    for (package, src) in packages {
+        let mut files = Vec::new();
+        collect(&src, &mut files);
+        files.sort();
+        let place = |path: &Path| path.strip_prefix(root).unwrap().display().to_string();
+        all.extend(files.iter().filter_map(|path| read(&package, &src, path, place(path))));
+    }
+    all
 }
 
 fn collect(folder: &Path, files: &mut Vec<PathBuf>) {
@@ -47,12 +63,15 @@ fn collect(folder: &Path, files: &mut Vec<PathBuf>) {
     }
 }
 
-fn read(src: &Path, path: &Path) -> Option<Source> {
+fn read(package: &str, src: &Path, path: &Path, place: String) -> Option<Source> {
     let below = path.strip_prefix(src).unwrap();
     let module = below.iter().next().unwrap().to_str().unwrap().trim_end_matches(".rs").to_string();
     let name = path.file_stem().unwrap().to_str().unwrap();
-    // the crate's own two roots know everything; whole files of tests may too
-    if module == "lib" || module == "main" || name == "tests" || name.ends_with("_tests") {
+    // the two roots of the program know everything; whole files of tests may too
+    if (package == ROOT && ["lib", "main"].contains(&module.as_str()))
+        || name == "tests"
+        || name.ends_with("_tests")
+    {
         return None;
     }
     let text = fs::read_to_string(path).unwrap();
@@ -61,7 +80,7 @@ fn read(src: &Path, path: &Path) -> Option<Source> {
         .filter(|(_, line)| !line.trim_start().starts_with("//"))
         .map(|(i, line)| (i + 1, line.split(" // ").next().unwrap_or_default().to_string()))
         .collect();
-    Some(Source { module, path: below.to_path_buf(), lines })
+    Some(Source { package: package.into(), module, path: below.to_path_buf(), place, lines })
 }
 
 /// The numbered lines of a formatted file without the items under `#[cfg(test)]`, wherever they stand.
@@ -130,9 +149,9 @@ fn named(line: &str) -> Vec<String> {
 #[test]
 fn arrows_point_down_only() {
     let mut wrong = Vec::new();
-    for source in sources() {
+    for source in sources().into_iter().filter(|source| source.package == ROOT) {
         let Some(own) = layer(&source.module) else {
-            wrong.push(format!("src/{}: the module `{}` has no layer", source.path.display(), source.module));
+            wrong.push(format!("{}: the module `{}` has no layer", source.place, source.module));
             continue;
         };
         for (number, line) in &source.lines {
@@ -141,8 +160,8 @@ fn arrows_point_down_only() {
                 let sociable = other == source.module || SOCIABLE.contains(&LAYERS[own].0);
                 if theirs > own || (theirs == own && !sociable) {
                     let (a, b) = (LAYERS[own].0, LAYERS[theirs].0);
-                    let at = source.path.display();
-                    wrong.push(format!("src/{at}:{number}: `{}` ({a}) knows `{other}` ({b})", source.module));
+                    let at = &source.place;
+                    wrong.push(format!("{at}:{number}: `{}` ({a}) knows `{other}` ({b})", source.module));
                 }
             }
         }
@@ -150,7 +169,8 @@ fn arrows_point_down_only() {
     assert!(wrong.is_empty(), "\n{}", wrong.join("\n"));
 }
 
-/// A module of the crate: what it names of others, and what it hands on (`pub use`), as paths from the root.
+/// A module of a package: what it names of others there, and what it hands on (`pub use`), as paths that begin with the
+/// package.
 struct Module {
     names: Vec<Vec<String>>,
     hands_on: Vec<Vec<String>>,
@@ -159,8 +179,10 @@ struct Module {
 fn modules() -> BTreeMap<Vec<String>, Module> {
     let place = |source: &Source| -> Vec<String> {
         let parts = source.path.with_extension("");
-        let parts: Vec<String> = parts.iter().map(|p| p.to_str().unwrap().into()).collect();
-        if parts.last().is_some_and(|p| p == "mod") { parts[..parts.len() - 1].to_vec() } else { parts }
+        let parts = parts.iter().map(|p| p.to_str().unwrap().to_string());
+        // the root of a package has its name alone
+        let parts = parts.filter(|part| part != "mod" && part != "lib");
+        [source.package.clone()].into_iter().chain(parts).collect()
     };
     let sources = sources();
     let all: Vec<Vec<String>> = sources.iter().map(place).collect();
@@ -171,7 +193,7 @@ fn modules() -> BTreeMap<Vec<String>, Module> {
         let absolute = |path: Vec<String>| -> Option<Vec<String>> {
             let ups = path.iter().take_while(|part| *part == "super").count();
             let from = if ["crate", "self"].contains(&path[0].as_str()) { 1 } else { ups };
-            let up = if path[0] == "crate" { module.len() } else { ups };
+            let up = if path[0] == "crate" { module.len() - 1 } else { ups };
             Some([&module[..module.len().checked_sub(up)?], &path[from..]].concat())
         };
         let [mut names, mut hands_on] = [String::new(), String::new()];
@@ -221,16 +243,16 @@ fn no_files_know_each_other_in_a_circle() {
     assert!(rows.is_empty(), "\n{}", rows.join("\n"));
 }
 
-fn nobody_else(module: &str, words: &[&str]) {
+fn nobody_else(package: &str, module: &str, words: &[&str]) {
     let mut wrong = Vec::new();
-    for source in sources().iter().filter(|s| s.module != module) {
+    for source in sources().iter().filter(|s| s.package != package || s.module != module) {
         for (number, line) in &source.lines {
             for word in words.iter().filter(|w| stands_in(line, w)) {
-                wrong.push(format!("src/{}:{number}: `{word}`", source.path.display()));
+                wrong.push(format!("{}:{number}: `{word}`", source.place));
             }
         }
     }
-    assert!(wrong.is_empty(), "only `{module}` does this:\n{}", wrong.join("\n"));
+    assert!(wrong.is_empty(), "only `{module}` of {package} does this:\n{}", wrong.join("\n"));
 }
 
 /// Does a word stand in a line, not as the end of a longer one (`NetworkFile::` is not `File::`)?
@@ -245,12 +267,12 @@ fn stands_at(line: &str, at: usize) -> bool {
 
 #[test]
 fn only_io_opens_files() {
-    nobody_else("io", &["std::fs", "fs::", "File::", "OpenOptions"]);
+    nobody_else("tiface-base", "io", &["std::fs", "fs::", "File::", "OpenOptions"]);
 }
 
 #[test]
 fn only_cli_prints_and_exits() {
-    nobody_else("cli", &["println!", "eprintln!", "print!(", "eprint!(", "dbg!", "process::exit"]);
+    nobody_else(ROOT, "cli", &["println!", "eprintln!", "print!(", "eprint!(", "dbg!", "process::exit"]);
 }
 
 #[test]
@@ -319,17 +341,17 @@ fn every_key_in_a_message_exists_and_code_names_keys_by_the_macro() {
     let is_word = |c: char| c.is_ascii_alphanumeric() || c == '_';
     let mut wrong = Vec::new();
     for source in sources() {
-        let at = source.path.display();
+        let at = &source.place;
         for (number, text) in texts(&source.lines) {
-            // meshes are a layer that knows no configuration
-            if known.contains(&text) && text.contains('.') && source.module != "mesh" {
-                wrong.push(format!("src/{at}:{number}: write key!({text})"));
+            // other packages know no configuration
+            if known.contains(&text) && text.contains('.') && source.package == ROOT {
+                wrong.push(format!("{at}:{number}: write key!({text})"));
             }
             for word in text.split(|c: char| !(is_word(c) || c == '.' || c == '/')) {
                 let word = word.trim_end_matches('.');
                 let is_key = word.split_once('.').is_some_and(|(table, _)| tables.contains(table));
                 if is_key && !known.contains(word) && !NO_KEYS.contains(&word) {
-                    wrong.push(format!("src/{at}:{number}: there is no key `{word}`"));
+                    wrong.push(format!("{at}:{number}: there is no key `{word}`"));
                 }
             }
         }
