@@ -5,11 +5,13 @@
 //! RAYON_NUM_THREADS=1 cargo bench --bench iface_step
 //! ```
 //!
-//! The published networks: no color skip, one sharpness (a whole draft takes a seventh more CPU time with both).
+//! The published networks: no color skip, one sharpness (a whole draft takes a seventh more CPU
+//! time with both).
 //!
-//! 32 768 samples (256 rays of 128), 16 levels of 2 features, tables of 2¹⁹ entries, base 16, growth
-//! 1.447; color, mask and eikonal losses, backward to table and network weights, AdamW of the table. CPU time (user + system of
-//! the process) is what is compared: it does not depend on what else the machine does.
+//! 32 768 samples (256 rays of 128), 16 levels of 2 features, tables of 2¹⁹ entries, base 16,
+//! growth 1.447; color, mask and eikonal losses, backward to table and network weights, AdamW of
+//! the table. CPU time (user + system of the process) is what is compared: it does not depend on
+//! what else the machine does.
 
 mod process;
 

@@ -5,8 +5,9 @@
 //! cargo bench --bench marching -- 256                one size
 //! cargo bench --bench marching -- --write head 256 volume.f32
 //! ```
-//! `--write` leaves a raw little-endian f32 volume (x fastest) for `tools/reference/flying_edges.py`,
-//! and `--read 256 volume.f32` times one, a line a run, so that a script can interleave the two.
+//! `--write` leaves a raw little-endian f32 volume (x fastest) for
+//! `tools/reference/flying_edges.py`, and `--read 256 volume.f32` times one, a line a run, so that
+//! a script can interleave the two.
 
 #[path = "../tests/support/fields.rs"]
 mod fields;

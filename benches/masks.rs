@@ -1,4 +1,5 @@
-//! Masks from three clicked views of the shared captures: overlap with the true masks, and CPU seconds.
+//! Masks from three clicked views of the shared captures: overlap with the true masks, and CPU
+//! seconds.
 //!
 //! ```text
 //! cargo bench --bench masks                  both captures

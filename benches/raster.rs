@@ -1,11 +1,12 @@
-//! CPU milliseconds a picture, and how far it agrees with the ray caster: a head-like mesh of 200,000 triangles with a
-//! texture of 2048², 1024 × 1024 pixels.
+//! CPU milliseconds a picture, and how far it agrees with the ray caster: a head-like mesh of
+//! 200,000 triangles with a texture of 2048², 1024 × 1024 pixels.
 //!
 //! ```text
 //! cargo bench --bench raster
 //! ```
 //!
-//! CPU time (user + system of the process) does not depend on what else the machine does, nor on the number of threads.
+//! CPU time (user + system of the process) does not depend on what else the machine does, nor on
+//! the number of threads.
 
 mod head;
 mod process;

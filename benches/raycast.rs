@@ -1,9 +1,9 @@
 //! Rays per second on one thread, over a head-like mesh of 200 000 triangles.
 //!
-//! `cargo bench --bench raycast` prints Mrays/s for primary rays (two views of
-//! 724 × 724) and for scattered rays. With `-- --dump DIR` it also writes the mesh and the very same
-//! rays there, so that `tools/reference/embree.py DIR` can time Embree on them. A mesh of one's own
-//! comes after `--mesh`, as .ply, .obj or .glb.
+//! `cargo bench --bench raycast` prints Mrays/s for primary rays (two views of 724 × 724) and for
+//! scattered rays. With `-- --dump DIR` it also writes the mesh and the very same rays there, so
+//! that `tools/reference/embree.py DIR` can time Embree on them. A mesh of one's own comes after
+//! `--mesh`, as .ply, .obj or .glb.
 
 mod head;
 

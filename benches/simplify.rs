@@ -1,4 +1,5 @@
-//! CPU milliseconds and accuracy of simplification: the head of `tests/support/fields.rs`, one thread.
+//! CPU milliseconds and accuracy of simplification: the head of `tests/support/fields.rs`, one
+//! thread.
 //!
 //! ```text
 //! cargo bench --bench simplify                           202 k to 40 k triangles, 506 k to 100 k
@@ -6,8 +7,8 @@
 //! cargo bench --bench simplify -- --write 245 head       the input as head.vertices, head.triangles
 //! cargo bench --bench simplify -- --read a.vertices a.triangles   the accuracy of another tool's result
 //! ```
-//! Errors are distances of points of the triangles to the true surface, weighted by area, in 512ths of
-//! the cube's edge. Raw files are little-endian f32 and u32.
+//! Errors are distances of points of the triangles to the true surface, weighted by area, in 512ths
+//! of the cube's edge. Raw files are little-endian f32 and u32.
 
 #[path = "../tests/support/fields.rs"]
 mod fields;
@@ -60,7 +61,8 @@ fn field(points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
     out
 }
 
-/// Mean and worst distance to the head's surface, in 512ths of the cube, found by four Newton steps.
+/// Mean and worst distance to the head's surface, in 512ths of the cube, found by four Newton
+/// steps.
 fn error(mesh: &Mesh) -> (f64, f64) {
     const WHERE: [[f32; 3]; 7] = [
         [1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0],

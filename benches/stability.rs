@@ -1,4 +1,5 @@
-//! The largest error of some two hundred hard cases, and its bound; a line that begins with `!` is beyond it.
+//! The largest error of some two hundred hard cases, and its bound; a line that begins with `!` is
+//! beyond it.
 //!
 //!     cargo bench --bench stability
 

@@ -5,12 +5,12 @@
 //! RAYON_NUM_THREADS=1 cargo bench --bench vm_step
 //! ```
 //!
-//! The published settings for heads: density 16, 4, 4, appearance 48, 12, 12 channels, basis 72 → 27, decoder
-//! 30 → 128 → 128 → 3, 4096 rays, step ratio 0.5; color and mask loss, total variation of both grids,
-//! backward to every parameter, Adam.
+//! The published settings for heads: density 16, 4, 4, appearance 48, 12, 12 channels, basis 72 →
+//! 27, decoder 30 → 128 → 128 → 3, 4096 rays, step ratio 0.5; color and mask loss, total variation
+//! of both grids, backward to every parameter, Adam.
 //!
-//! CPU time (user + system of the process) is what is compared: it does not depend on what else the machine
-//! does.
+//! CPU time (user + system of the process) is what is compared: it does not depend on what else the
+//! machine does.
 
 mod process;
 
@@ -65,7 +65,8 @@ impl Training {
         }
     }
 
-    /// One step; adds the seconds of forward, losses, backward, penalty, Adam. Densities looked up, colors decoded.
+    /// One step; adds the seconds of forward, losses, backward, penalty, Adam. Densities looked up,
+    /// colors decoded.
     fn step(&mut self, s: &Scene, parts: &mut [f64; 5]) -> [u64; 2] {
         let mut clock = cpu_s();
         let mut lap = |k: usize| {

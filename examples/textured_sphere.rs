@@ -1,9 +1,10 @@
-//! Writes a textured ball, 20 cm across, as a GLB, an OBJ and a PLY, and as GLBs with everything else.
+//! Writes a textured ball, 20 cm across, as a GLB, an OBJ and a PLY, and as GLBs with everything
+//! else.
 //!
 //! `cargo run --example textured_sphere -- FOLDER`
 //!
-//! A map of the world: u runs around, v from pole to pole, so one meridian is a seam. `tools/readers`
-//! opens all of them with other people's programs.
+//! A map of the world: u runs around, v from pole to pole, so one meridian is a seam.
+//! `tools/readers` opens all of them with other people's programs.
 
 use glam::{Mat3, Vec2, Vec3};
 use std::f32::consts::{PI, TAU};
@@ -46,8 +47,8 @@ fn picture(texel: impl Fn(u32, u32) -> [u8; 3]) -> Photo {
     }
 }
 
-/// A sphere whose upper half is longer, so that a wrong turn shows in its box. Folded triangles at the
-/// poles are left to the export, which drops them.
+/// A sphere whose upper half is longer, so that a wrong turn shows in its box. Folded triangles at
+/// the poles are left to the export, which drops them.
 fn globe(rings: u32, radius: f32, center: Vec3) -> (Mesh, Atlas) {
     let (n, mut mesh) = (2 * rings, Mesh::default());
     let mut atlas = Atlas { width: 256, height: 128, ..Atlas::default() };

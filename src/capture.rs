@@ -2,7 +2,8 @@
 //!
 //! [`open`] recognizes the format, checks every name, size and pose before anything is trained, and
 //! leaves the world as the dataset has it. [`View::load`] brings one photograph with its masks into
-//! memory; [`scene`] says where the head is; [`inspect`] reports everything that can be found wrong.
+//! memory; [`scene`] says where the head is; [`inspect`] reports everything that can be found
+//! wrong.
 //!
 //! ```
 //! use tiface::capture::{self, CaptureOptions, Split, synthetic};
@@ -73,7 +74,8 @@ use tiface_base::io::{self, Limits, PictureInfo};
 use tiface_base::{Error, Result};
 use view::{undone, wrong_size};
 
-/// Opens a capture, or returns the first thing that is wrong with it; [`inspect::inspect`] returns all.
+/// Opens a capture, or returns the first thing that is wrong with it; [`inspect::inspect`] returns
+/// all.
 pub fn open(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     let (capture, listing) = gather(root, options);
     match (listing.problems.into_iter().next(), capture) {
@@ -83,12 +85,14 @@ pub fn open(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     }
 }
 
-/// Returns whether a folder has camera files of a format that is read, whatever may be wrong with them.
+/// Returns whether a folder has camera files of a format that is read, whatever may be wrong with
+/// them.
 pub fn has_cameras(root: &Path) -> bool {
     io::is_folder(root) && CameraFiles::find(root).is_some()
 }
 
-/// Returns the usable part of a capture, and everything that was found: problems, warnings, reasons.
+/// Returns the usable part of a capture, and everything that was found: problems, warnings,
+/// reasons.
 fn gather(root: &Path, options: &CaptureOptions) -> (Option<Capture>, Listing) {
     // messages join names to it: no `/` at its end
     let root = &root.components().collect::<PathBuf>();
@@ -192,7 +196,8 @@ fn build(folder: &CaptureFolder, format: &str, listing: &mut Listing) -> Option<
     })
 }
 
-/// Returns the frames whose photograph is there, `None` if there are none; the listing tells of the others.
+/// Returns the frames whose photograph is there, `None` if there are none; the listing tells of the
+/// others.
 fn frames_with_photographs(folder: &CaptureFolder, listing: &mut Listing) -> Option<Vec<CameraFrame>> {
     let total = listing.frames.len();
     let near = missing::confirm_near(folder, listing);
@@ -285,8 +290,9 @@ fn warn_of_turns(kept: &[String], open: &[String], listing: &mut Listing) {
     }
 }
 
-/// Returns the ways in which a capture can be read, that of its files' order and without turns first; none where only that
-/// one is possible. `has_masks` says whether there are files of masks that may be turned.
+/// Returns the ways in which a capture can be read, that of its files' order and without turns
+/// first; none where only that one is possible. `has_masks` says whether there are files of masks
+/// that may be turned.
 fn readings(listing: &Listing, turn_is_open: bool, has_masks: bool) -> Vec<Reading> {
     let choices = |is_open: bool| if is_open { &[false, true][..] } else { &[false][..] };
     let mut all = Vec::new();
@@ -325,7 +331,8 @@ fn check_names(frames: &[CameraFrame], names: &[String], listing: &mut Listing) 
     }
 }
 
-/// Returns whether the size of a photograph does not say whether its cameras expect the turn that EXIF asks for.
+/// Returns whether the size of a photograph does not say whether its cameras expect the turn that
+/// EXIF asks for.
 fn is_turn_open(frame: &CameraFrame, info: &PictureInfo) -> bool {
     info.is_turn_open() || (info.exif > 4 && frame.intrinsics.size.is_none())
 }
@@ -379,7 +386,8 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
     })
 }
 
-/// Says which masks lie on their side against a photograph that EXIF turns: they are turned when they are read.
+/// Says which masks lie on their side against a photograph that EXIF turns: they are turned when
+/// they are read.
 fn name_turned_masks(views: &[View], limits: &Limits, listing: &mut Listing) {
     let is_turned = |view: &&View| match &view.mask {
         ViewMask::File(path) if view.side_turn.is_some() => {
@@ -417,8 +425,8 @@ fn name_splits(views: &mut [View], kept: &[(CameraFrame, PictureInfo)], listing:
     listing.reasons.push("no splits are named: every 8th view in name order is held out for testing".into());
 }
 
-/// Returns the splits of a capture that names none: every 8th view in name order, starting with the first, is held out,
-/// but none of fewer than four.
+/// Returns the splits of a capture that names none: every 8th view in name order, starting with the
+/// first, is held out, but none of fewer than four.
 fn every_eighth<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Split> {
     let mut order: Vec<(&str, usize)> = names.zip(0..).collect();
     order.sort_unstable();
@@ -429,7 +437,8 @@ fn every_eighth<'n>(names: impl Iterator<Item = &'n str>) -> Vec<Split> {
     splits
 }
 
-/// Up in the world, as the dataset says, else as the cameras stand; and a warning if the cameras are rolled.
+/// Up in the world, as the dataset says, else as the cameras stand; and a warning if the cameras
+/// are rolled.
 fn up(views: &[View], named: Option<DVec3>) -> (Vec3, Option<String>) {
     if let Some(up) = named {
         return (up.normalize().as_vec3(), None);

@@ -1,5 +1,5 @@
-//! The command line: a file per command, with its name; small commands share `about`, `capture` and `status`. The only module that
-//! prints.
+//! The command line: a file per command, with its name; small commands share `about`, `capture` and
+//! `status`. The only module that prints.
 //!
 //! Data goes to stdout, everything else to stderr; the exit code distinguishes errors worth a retry
 //! ([`tiface_base::ErrorKind`]).
@@ -61,7 +61,8 @@ Exit codes:
   101       a bug
   130, 143  stopped: repeat to continue";
 
-/// Reconstruct a human head from photographs by calibrated cameras: a watertight mesh and novel views.
+/// Reconstruct a human head from photographs by calibrated cameras: a watertight mesh and novel
+/// views.
 #[derive(Parser, Debug)]
 #[command(name = "tiface", version, max_term_width = 100, after_long_help = EXAMPLES)]
 struct Cli {
@@ -78,8 +79,8 @@ const NOT_WITH_PAGE: [&str; 5] =
 /// Capture or run of a stage command.
 #[derive(Args, Debug)]
 struct CaptureOrRun {
-    /// Capture (a folder of photographs with cameras) or run [default: the run in this folder, else the newest under
-    /// runs/]
+    /// Capture (a folder of photographs with cameras) or run [default: the run in this folder, else
+    /// the newest under runs/]
     #[arg(value_name = "CAPTURE|RUN")]
     path: Option<PathBuf>,
 }
@@ -252,7 +253,8 @@ pictures of meshes are written to CAPTURE_judged/ or to --out; no run is started
         /// Judge the pictures that another program made of the capture's held-out views; repeatable
         #[arg(long, value_name = "FOLDER", conflicts_with = "require")]
         views: Vec<PathBuf>,
-        /// Judge a .glb, .gltf, .obj, .ply or .stl mesh by pictures from the held-out cameras; repeatable
+        /// Judge a .glb, .gltf, .obj, .ply or .stl mesh by pictures from the held-out cameras;
+        /// repeatable
         #[arg(long, value_name = "FILE", conflicts_with = "require")]
         mesh: Vec<PathBuf>,
         /// Exit with 3 if not met: watertight, psnr=DB (masked PSNR of the best method); repeatable
@@ -312,18 +314,20 @@ experiment.json.")]
   tiface check head.ply --json
   tiface check runs/lps/mesh/surface.ply --against captures/lps/gt.ply --seen-by captures/lps")]
     Check {
-        /// .glb, .gltf, .obj, .ply or .stl file, or a run: its exported mesh, or with --against its extracted surface
+        /// .glb, .gltf, .obj, .ply or .stl file, or a run: its exported mesh, or with --against its
+        /// extracted surface
         #[arg(value_name = "MESH|RUN")]
         mesh: PathBuf,
-        /// Exit with 3 if not met: watertight, manifold, one-piece, no-self-intersections, sound-uv;
-        /// repeatable
+        /// Exit with 3 if not met: watertight, manifold, one-piece, no-self-intersections,
+        /// sound-uv; repeatable
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
-        /// Measure the distance to this surface, in the same coordinates (use a PLY: a GLB is rotated to +Y up)
+        /// Measure the distance to this surface, in the same coordinates (use a PLY: a GLB is
+        /// rotated to +Y up)
         #[arg(long, value_name = "MESH")]
         against: Option<PathBuf>,
-        /// Measure it also where three or more training cameras of this capture see the surface, by the number of
-        /// cameras, and back from skin and hair
+        /// Measure it also where three or more training cameras of this capture see the surface, by
+        /// the number of cameras, and back from skin and hair
         #[arg(long, value_name = "CAPTURE", requires = "against")]
         seen_by: Option<PathBuf>,
     },
@@ -402,7 +406,8 @@ It exits with 1 if a device fails its self-test against the CPU. A build without
     },
 }
 
-/// Ends the process after a failed allocation of `bytes`. Does not allocate; loses no more than a kill would.
+/// Ends the process after a failed allocation of `bytes`. Does not allocate; loses no more than a
+/// kill would.
 #[cold]
 pub fn out_of_memory(bytes: usize) -> ! {
     let _ = writeln!(
@@ -414,8 +419,8 @@ pub fn out_of_memory(bytes: usize) -> ! {
     signal_hook::low_level::exit(tiface_base::ErrorKind::NotNow.code().into())
 }
 
-/// Parses the command line, runs the command and returns the exit code. `collect` gives the allocator's free memory back to
-/// the system.
+/// Parses the command line, runs the command and returns the exit code. `collect` gives the
+/// allocator's free memory back to the system.
 pub fn main(collect: fn()) -> ExitCode {
     tiface_base::io::set_memory_collector(collect);
     complete::answer(Cli::command);
@@ -484,8 +489,8 @@ const ONE_HEAD: &str = "hint: this command takes one path; repeat it for each, a
 const WATCH: &str = "hint: beside the working command, `tiface status --watch` shows its progress in a terminal, and \
     `tiface preview RUN --watch` as a page";
 
-/// Returns the hint for a command line that clap refuses: one with another path than the one that its command takes, or
-/// with `--watch` of another command.
+/// Returns the hint for a command line that clap refuses: one with another path than the one that
+/// its command takes, or with `--watch` of another command.
 fn hint_for(error: &clap::Error) -> Option<&'static str> {
     use clap::error::{ContextKind, ContextValue, ErrorKind};
     let Some(ContextValue::String(word)) = error.get(ContextKind::InvalidArg) else { return None };
@@ -529,7 +534,8 @@ fn refuse_ignored(found: &ArgMatches) -> Result<()> {
     }
 }
 
-/// Adds to an error about a path of the command line that does not exist the one that was probably meant.
+/// Adds to an error about a path of the command line that does not exist the one that was probably
+/// meant.
 fn suggest(error: Error) -> Error {
     let text = error.to_string();
     let is_missing =

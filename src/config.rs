@@ -4,10 +4,12 @@
 //! the wrong type or out of range is an error that names the line, the key and a suggested fix. The
 //! complete result ([`Config::to_toml`]) passed back as a file gives the same configuration.
 //!
-//! Each stage owns its table, declared by `table!`: a key, its documentation, range, the products that it affects, its
-//! command-line option and the values of the presets stand once, on its field. Everything here works on what serde says
-//! about them; what makes a stage again is a filter over the rows ([`Config::settings_of`]), and code that names a key writes
-//! `key!(mesh.lobes)`. A value that no user has a reason to change is a constant of the preset instead of a key, in the same place.
+//! Each stage owns its table, declared by `table!`: a key, its documentation, range, the products
+//! that it affects, its command-line option and the values of the presets stand once, on its field.
+//! Everything here works on what serde says about them; what makes a stage again is a filter over
+//! the rows ([`Config::settings_of`]), and code that names a key writes `key!(mesh.lobes)`. A value
+//! that no user has a reason to change is a constant of the preset instead of a key, in the same
+//! place.
 
 mod affects;
 pub mod iface;
@@ -291,8 +293,8 @@ impl Config {
         }
     }
 
-    /// Returns the configuration that the run in `folder` was last worked on with; none where it has no `config.toml`, or
-    /// one that is not understood any more.
+    /// Returns the configuration that the run in `folder` was last worked on with; none where it
+    /// has no `config.toml`, or one that is not understood any more.
     pub fn of_run(folder: &Path) -> Option<Config> {
         Config::read(&folder.join("config.toml")).ok()
     }
@@ -386,13 +388,14 @@ impl Config {
             .collect()
     }
 
-    /// Returns the keys whose values are not those of the preset: full name, value, the preset's value, as in TOML.
+    /// Returns the keys whose values are not those of the preset: full name, value, the preset's
+    /// value, as in TOML.
     pub fn changes(&self) -> Vec<[String; 3]> {
         self.differences(&Config::preset(self.preset))
     }
 
-    /// Returns the keys whose values differ from those of another configuration: full name, value, the other's value, as in
-    /// TOML.
+    /// Returns the keys whose values differ from those of another configuration: full name, value,
+    /// the other's value, as in TOML.
     pub fn differences(&self, other: &Config) -> Vec<[String; 3]> {
         let (own, other) = (self.to_table(), other.to_table());
         let change = |(name, _): (String, &Key)| {
@@ -405,7 +408,8 @@ impl Config {
     fn to_table(&self) -> Table {
         match Value::try_from(self) {
             Ok(Value::Table(table)) => table,
-            // a struct of numbers, words and lists always is a table; a test serializes every preset
+            // a struct of numbers, words and lists always is a table; a test serializes every
+            // preset
             _ => Table::new(),
         }
     }
@@ -437,8 +441,8 @@ pub fn explained(name: &str) -> Result<Vec<Explained>> {
     if found.is_empty() { Err(source::unknown(name).within("`--explain`")) } else { Ok(found) }
 }
 
-/// Returns what a key or a whole table means, its range and its value in every preset; an unknown name is an
-/// error that knows the nearest one.
+/// Returns what a key or a whole table means, its range and its value in every preset; an unknown
+/// name is an error that knows the nearest one.
 pub fn explain(name: &str) -> Result<String> {
     let mut out = String::new();
     for (i, Explained { key, meaning, allowed, values }) in explained(name)?.into_iter().enumerate() {
@@ -470,8 +474,8 @@ fn lookup<'a>(root: &'a Table, dotted: &str) -> Option<&'a Value> {
     Some(value)
 }
 
-/// Returns a value as it is written in TOML. A number that came from an f32 is written with an f32's digits
-/// (0.1, not 0.10000000149011612): read back, it is the same f32.
+/// Returns a value as it is written in TOML. A number that came from an f32 is written with an
+/// f32's digits (0.1, not 0.10000000149011612): read back, it is the same f32.
 fn show(value: &Value) -> String {
     match value {
         Value::Float(f) if f.is_finite() && (*f as f32) as f64 == *f => {
@@ -491,7 +495,8 @@ pub struct DeviceChoice {
     pub name: String,
     /// Which of its adapters, from 0.
     pub number: Option<usize>,
-    /// Whether GPU sums are accumulated in fixed point, bitwise reproducible; on the CPU they always are.
+    /// Whether GPU sums are accumulated in fixed point, bitwise reproducible; on the CPU they
+    /// always are.
     pub deterministic: bool,
     /// Memory that a training may use, GiB; `None`: all of it.
     pub memory_gib: Option<f64>,

@@ -1,10 +1,10 @@
 //! Stage: blends several views of one camera into one.
 //!
-//! `I(p) = Σ_k w_k · clamp(I_k(p), 0, 1)`, the paper's §5 with `w` = 0.1 baseline, 0.6 T-Face,
-//! 0.3 I-Face. Which member is the better one differs from capture to capture, and fixed weights that suit
-//! one make the blend of another worse than its best member. So weights are fitted ([`fit_weights`]): those of
-//! least squared error, `w ≥ 0`, `Σ w = 1`, on squares of the training photographs that nothing learned
-//! from ([`tiles()`]), never on test views.
+//! `I(p) = Σ_k w_k · clamp(I_k(p), 0, 1)`, the paper's §5 with `w` = 0.1 baseline, 0.6 T-Face, 0.3
+//! I-Face. Which member is the better one differs from capture to capture, and fixed weights that
+//! suit one make the blend of another worse than its best member. So weights are fitted
+//! ([`fit_weights`]): those of least squared error, `w ≥ 0`, `Σ w = 1`, on squares of the training
+//! photographs that nothing learned from ([`tiles()`]), never on test views.
 //!
 //! A fit gathers sums view by view, so a capture never has to be in memory. Everything is
 //! sRGB-coded color over black (premultiplied), and nothing is rounded to 8 bits here. Sums are
@@ -28,15 +28,16 @@ pub const MAX_MEMBERS: usize = 8;
 /// The paper's §5: baseline, T-Face, I-Face.
 pub const PAPER_WEIGHTS: [f32; 3] = [0.1, 0.6, 0.3];
 
-/// Blends the members with one weight each, in float; the result is rounded once, when it is written.
+/// Blends the members with one weight each, in float; the result is rounded once, when it is
+/// written.
 ///
 /// Weights are shares: finite, from 0 up, with sum 1. A sum beside 1 by at most 0.001 is taken as
-/// rounding and divided out; beyond that it is an error, since the blend would be darker or brighter
-/// than its members.
+/// rounding and divided out; beyond that it is an error, since the blend would be darker or
+/// brighter than its members.
 ///
 /// # Errors
-/// Fails if the number of weights differs from that of the members, if a weight is negative or not finite, or if
-/// their sum is not 1.
+/// Fails if the number of weights differs from that of the members, if a weight is negative or not
+/// finite, or if their sum is not 1.
 ///
 /// # Examples
 ///
@@ -92,8 +93,8 @@ pub struct Member<'a> {
 pub struct BlendTarget<'a> {
     /// The photograph over black: its colors multiplied by the mask.
     pub photo: &'a Photo,
-    /// Weight of each pixel, 255 = once, 0 = not at all: the mask, or the mask from half on, and 0 where the
-    /// photograph is not valid.
+    /// Weight of each pixel, 255 = once, 0 = not at all: the mask, or the mask from half on, and 0
+    /// where the photograph is not valid.
     pub weight: &'a Gray,
 }
 
@@ -108,8 +109,8 @@ pub struct Members<'a> {
 impl<'a> Members<'a> {
     /// Checks the renders. Their order is that of the weights.
     ///
-    /// A pixel that is not finite is an error, here and so in every fit: it comes from a member that
-    /// has diverged, of which no other pixel should be trusted.
+    /// A pixel that is not finite is an error, here and so in every fit: it comes from a member
+    /// that has diverged, of which no other pixel should be trusted.
     pub fn new(list: &[Member<'a>]) -> Result<Members<'a>> {
         let first = list.first().ok_or_else(no_members)?;
         let expected = (first.image.width, first.image.height);
@@ -129,9 +130,10 @@ impl<'a> Members<'a> {
 
     /// Cuts the members that were trained without masks to the head.
     ///
-    /// They fill the frame, and a blend would show a ghost of the background at their weight. Color and alpha are
-    /// multiplied by the mean opacity of the masked members, averaged with their `weights` (equally if those are all
-    /// 0); where the head is opaque nothing changes. Without masked members nothing is cut.
+    /// They fill the frame, and a blend would show a ghost of the background at their weight. Color
+    /// and alpha are multiplied by the mean opacity of the masked members, averaged with their
+    /// `weights` (equally if those are all 0); where the head is opaque nothing changes. Without
+    /// masked members nothing is cut.
     pub fn cut(mut self, weights: &[f32]) -> Result<Members<'a>> {
         let weights = normalized(weights, self.list.len())?;
         let shares = |of: &dyn Fn(usize) -> f32| -> Option<Vec<f32>> {
@@ -179,7 +181,8 @@ impl<'a> Members<'a> {
         same_size("the weight map", (weight.width, weight.height), self.size())
     }
 
-    /// Calls `with(i, weight, member − photo)` for the pixels that count. The errors are `[members]`, RGB.
+    /// Calls `with(i, weight, member − photo)` for the pixels that count. The errors are
+    /// `[members]`, RGB.
     fn errors(
         &self,
         target: &BlendTarget,

@@ -1,7 +1,8 @@
-//! Code that all learned fields share: the trainer, its device operations, parameters, photographs and checkpoints.
+//! Code that all learned fields share: the trainer, its device operations, parameters, photographs
+//! and checkpoints.
 //!
-//! A model ([`training::Model`]) defines what differs between fields. Its training step is written once, over
-//! operations ([`ops::Ops`]) that each device implements with its own kernels.
+//! A model ([`training::Model`]) defines what differs between fields. Its training step is written
+//! once, over operations ([`ops::Ops`]) that each device implements with its own kernels.
 
 #[cfg(any(test, feature = "wgpu"))]
 pub(crate) mod ball;

@@ -4,9 +4,9 @@
 //! (Wang et al. 2021) renders it; color, mask, eikonal and sparsity losses train it (I-Face of
 //! TI-Face, ICCV 2023 View Synthesis Challenge for Human Heads). The `paper` preset follows the
 //! published system; the others start from the masks' visual hull, sample only a band around the
-//! surface, let the surface be softer in hair than on skin (Wang et al. 2023, "Adaptive Shells"), show the color
-//! network the hash features themselves, and hold the surface to points that stereo finds on it half-way (Fu et al.
-//! 2022, "Geo-NeuS", use points of a reconstruction as zero set).
+//! surface, let the surface be softer in hair than on skin (Wang et al. 2023, "Adaptive Shells"),
+//! show the color network the hash features themselves, and hold the surface to points that stereo
+//! finds on it half-way (Fu et al. 2022, "Geo-NeuS", use points of a reconstruction as zero set).
 
 mod cpu;
 mod density;

@@ -1,4 +1,5 @@
-//! Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel views.
+//! Photographs of a human head, taken by calibrated cameras, become a watertight mesh and novel
+//! views.
 //!
 //! ```
 //! use tiface::capture::synthetic::{SyntheticOptions, write_capture};
@@ -27,20 +28,22 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! The pipeline, one word per stage: **capture** (what was photographed, from where) → **mask** (which
-//! pixels are the head) → **baseline**, **tface** (radiance fields without and with masks), **iface** (a
-//! learned signed distance) → **mesh** (its zero level set, closed) → **render** (views by volume rendering, ray
-//! casting and rasterization) → **ensemble** (they become one) → **metrics**. [`pipeline`] runs them; every stage
-//! leaves a folder of plain files in the [`run`], and is skipped when it is done.
+//! The pipeline, one word per stage: **capture** (what was photographed, from where) → **mask**
+//! (which pixels are the head) → **baseline**, **tface** (radiance fields without and with masks),
+//! **iface** (a learned signed distance) → **mesh** (its zero level set, closed) → **render**
+//! (views by volume rendering, ray casting and rasterization) → **ensemble** (they become one) →
+//! **metrics**. [`pipeline`] runs them; every stage leaves a folder of plain files in the [`run`],
+//! and is skipped when it is done.
 //!
-//! Modules are declared in pipeline order, after the modules that they share. The packages below this
-//! one can be used alone: `tiface-surface` ([`mesh`], [`render`]) meshes any signed distance and needs no
-//! field, `tiface-kernels` ([`kernel`]) computes the fields, `tiface-base` has what all know, with [`io`],
-//! which opens every file within limits. [`capture`] reads seven kinds of camera files and names the
-//! others. Whatever fails returns [`Error`]: a kind that a caller can act on, a message that names file
-//! and place, and a suggested fix.
+//! Modules are declared in pipeline order, after the modules that they share. The packages below
+//! this one can be used alone: `tiface-surface` ([`mesh`], [`render`]) meshes any signed distance
+//! and needs no field, `tiface-kernels` ([`kernel`]) computes the fields, `tiface-base` has what
+//! all know, with [`io`], which opens every file within limits. [`capture`] reads seven kinds of
+//! camera files and names the others. Whatever fails returns [`Error`]: a kind that a caller can
+//! act on, a message that names file and place, and a suggested fix.
 //!
-//! [ARCHITECTURE.md](../../../ARCHITECTURE.md) shows components, data flow, coordinate frames and tensor layouts on one page.
+//! [ARCHITECTURE.md](../../../ARCHITECTURE.md) shows components, data flow, coordinate frames and
+//! tensor layouts on one page.
 
 pub use tiface_base::{Error, ErrorKind, Monitor, Quiet, Result, error, geom, image, io, math, monitor};
 pub use tiface_kernels as kernel;

@@ -3,8 +3,8 @@
 use mimalloc::MiMalloc;
 use std::alloc::{GlobalAlloc, Layout};
 
-/// Training allocates and frees the same large blocks every step; mimalloc returns them to the system late. If memory
-/// runs out, the process ends with an error message instead of an abort.
+/// Training allocates and frees the same large blocks every step; mimalloc returns them to the
+/// system late. If memory runs out, the process ends with an error message instead of an abort.
 struct Allocator;
 
 #[global_allocator]
@@ -56,7 +56,8 @@ fn check_alloc(place: *mut u8, bytes: usize) -> *mut u8 {
 }
 
 fn main() -> std::process::ExitCode {
-    // On machines without a desktop, a library of the graphics drivers prints a warning per adapter on stderr.
+    // On machines without a desktop, a library of the graphics drivers prints a warning per adapter
+    // on stderr.
     #[cfg(all(feature = "wgpu", unix))]
     if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
         // SAFETY: no other thread runs yet.

@@ -7,7 +7,8 @@
 //! photograph + clicks → hard mask → trimap → soft alpha
 //! ```
 //!
-//! Masks, trimaps and alphas are [`Gray`](tiface_base::image::Gray): 0 outside, 255 head, 128 unknown in a trimap.
+//! Masks, trimaps and alphas are [`Gray`](tiface_base::image::Gray): 0 outside, 255 head, 128
+//! unknown in a trimap.
 
 mod clicks;
 mod hull;

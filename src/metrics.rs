@@ -1,9 +1,9 @@
 //! Stage: compares views with photographs, and a mesh with a reference.
 //!
-//! Views are compared as they would be after a trip through an 8-bit file: every value is rounded to
-//! 1/255 first. Figures are in f64, averaged per image, then over images. A figure that has no value
-//! (no pixels in the mask, an image smaller than the window, no difference at all) is `None`, `null`
-//! in the JSON, and does not take part in the mean.
+//! Views are compared as they would be after a trip through an 8-bit file: every value is rounded
+//! to 1/255 first. Figures are in f64, averaged per image, then over images. A figure that has no
+//! value (no pixels in the mask, an image smaller than the window, no difference at all) is `None`,
+//! `null` in the JSON, and does not take part in the mean.
 //!
 //! ```
 //! use tiface::image::Image;
@@ -100,8 +100,8 @@ fn mean<V>(views: &[V], of: fn(&V) -> Option<f64>) -> Option<f64> {
 
 /// Compares a render with the photograph of the same view.
 ///
-/// A render with alpha is taken as it is over black. `mask` says where the head is, `valid` where the
-/// photograph can be used; both count from half. Without a mask the masked figures are `None`.
+/// A render with alpha is taken as it is over black. `mask` says where the head is, `valid` where
+/// the photograph can be used; both count from half. Without a mask the masked figures are `None`.
 pub fn compare(
     name: &str,
     render: &Image,

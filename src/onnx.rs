@@ -1,18 +1,20 @@
 //! ONNX networks in a session: a file is read once, recognized, and run by tract.
 //!
-//! The same bytes are hashed and given to the engine, and a file that refers to another one is refused, so the record
-//! describes exactly what ran. Nothing is downloaded.
+//! The same bytes are hashed and given to the engine, and a file that refers to another one is
+//! refused, so the record describes exactly what ran. Nothing is downloaded.
 //!
-//! The engine is a large program that reads untrusted files. Every call into it runs under `catch_unwind`: a panic inside
-//! becomes an error that names the file. (The process's panic hook still prints its line.) Arrays beyond a limit are
-//! refused before they are allocated.
+//! The engine is a large program that reads untrusted files. Every call into it runs under
+//! `catch_unwind`: a panic inside becomes an error that names the file. (The process's panic hook
+//! still prints its line.) Arrays beyond a limit are refused before they are allocated.
 //!
-//! tract wants every shape fixed. The file is parsed once; for each set of input shapes a plan is made from it (0.2 to 1 s for
-//! public networks) and kept, since the photographs of a capture share their size. A run uses one thread.
+//! tract wants every shape fixed. The file is parsed once; for each set of input shapes a plan is
+//! made from it (0.2 to 1 s for public networks) and kept, since the photographs of a capture share
+//! their size. A run uses one thread.
 //!
-//! ONNX Runtime, loaded from a library of the user's, was tried as a second engine: ViTMatte-S on a photograph of 384 × 512
-//! pixels takes 2.4 CPU s with tract and 1.3 with ONNX Runtime. It also runs float16 and int8 files and more of what recent
-//! exporters write; but it needs a library to be installed, cannot be kept from large arrays, and a crash ends the process.
+//! ONNX Runtime, loaded from a library of the user's, was tried as a second engine: ViTMatte-S on a
+//! photograph of 384 × 512 pixels takes 2.4 CPU s with tract and 1.3 with ONNX Runtime. It also
+//! runs float16 and int8 files and more of what recent exporters write; but it needs a library to
+//! be installed, cannot be kept from large arrays, and a crash ends the process.
 
 mod network;
 
@@ -46,8 +48,8 @@ pub(crate) struct NetworkSession {
 }
 
 impl NetworkSession {
-    /// Reads, recognizes and loads a file, which must be of a form of this role. `array_bytes` is the size of the largest
-    /// single array that may be planned.
+    /// Reads, recognizes and loads a file, which must be of a form of this role. `array_bytes` is
+    /// the size of the largest single array that may be planned.
     pub(crate) fn open(role: Role, path: &Path, array_bytes: u64) -> Result<NetworkSession> {
         let bytes = io::read_bytes(path, &Limits { file_bytes: MAX_FILE_BYTES, ..Limits::default() })?;
         if names_another_file(&bytes) {
@@ -149,9 +151,10 @@ impl NetworkSession {
     }
 }
 
-/// Returns whether an engine could open another file for this one's sake. Weights elsewhere are named by an entry with the key
-/// `location`, and pieces compiled for a device by the operator `EPContext`. Whatever the message around them, in
-/// functions or training graphs too, the key's eight letters stand behind their length: 8, or 8 spelled longer.
+/// Returns whether an engine could open another file for this one's sake. Weights elsewhere are
+/// named by an entry with the key `location`, and pieces compiled for a device by the operator
+/// `EPContext`. Whatever the message around them, in functions or training graphs too, the key's
+/// eight letters stand behind their length: 8, or 8 spelled longer.
 fn names_another_file(bytes: &[u8]) -> bool {
     let at = |i: usize| bytes[..i].last().is_some_and(|&length| length == 8 || length == 0);
     bytes.windows(8).enumerate().any(|(i, w)| w == b"location" && at(i))
@@ -180,8 +183,9 @@ struct TractModel {
 }
 
 impl TractModel {
-    /// Takes the graph of a file; shapes that it states for inner arrays are not trusted, exporters write wrong
-    /// ones. `outputs`: those that will be asked for. `array_bytes`: bytes of the largest array that may be planned.
+    /// Takes the graph of a file; shapes that it states for inner arrays are not trusted, exporters
+    /// write wrong ones. `outputs`: those that will be asked for. `array_bytes`: bytes of the
+    /// largest array that may be planned.
     fn load(proto: &pb::ModelProto, outputs: &[String], array_bytes: u64) -> Result<TractModel, String> {
         let read = || -> TractResult<InferenceModel> {
             let onnx = tract_onnx::onnx().with_ignore_output_shapes(true).with_ignore_value_info(true);
@@ -232,8 +236,8 @@ impl TractModel {
         Ok(())
     }
 
-    /// Returns what is known of a node's outputs once what is known of its inputs is taken in. Inferring also computes
-    /// what is constant, so the extents alone are asked for first.
+    /// Returns what is known of a node's outputs once what is known of its inputs is taken in.
+    /// Inferring also computes what is constant, so the extents alone are asked for first.
     fn inferred(&self, model: &InferenceModel, id: usize) -> TractResult<Vec<InferenceFact>> {
         let node = model.node(id);
         let mut op = node.op.clone();
@@ -274,8 +278,8 @@ impl TractModel {
     }
 }
 
-/// Returns where and why, in a sentence: the first of what the engine says, and the beginning of the innermost; the
-/// pages of shape algebra between them go to the log.
+/// Returns where and why, in a sentence: the first of what the engine says, and the beginning of
+/// the innermost; the pages of shape algebra between them go to the log.
 fn sentence(error: &TractError) -> String {
     tracing::debug!(target: "tract", "{error:#}");
     let (first, root) = (error.to_string(), error.root_cause().to_string());

@@ -14,11 +14,12 @@
 //! Views from other cameras, a turntable for example, are a separate output of the pipeline
 //! ([`Session::with_camera_path`]).
 //!
-//! Each stage names the stages that it reads from ([`Stage::needs`]); a command runs what its stage needs and nothing
-//! else. A stage is determined by its settings and by those of the stages it needs, which are known before it runs.
-//! So all fingerprints can be computed at once ([`Session::plan`]), a dry run lists what would be done, and a finished
-//! stage is skipped without loading anything. The device is not part of the fingerprint, because it decides how fast
-//! a field is trained, not what the field is.
+//! Each stage names the stages that it reads from ([`Stage::needs`]); a command runs what its stage
+//! needs and nothing else. A stage is determined by its settings and by those of the stages it
+//! needs, which are known before it runs. So all fingerprints can be computed at once
+//! ([`Session::plan`]), a dry run lists what would be done, and a finished stage is skipped without
+//! loading anything. The device is not part of the fingerprint, because it decides how fast a field
+//! is trained, not what the field is.
 
 mod bench;
 mod cameras;
@@ -79,8 +80,8 @@ pub fn reconstruct(session: &Session, until: Stage) -> Result<Vec<(Stage, Done)>
     Ok(done)
 }
 
-/// Completes a stage from the outputs of the stages before it, or skips it if it is done. `fields` are the trained
-/// fields; only a stage that has work to do loads them.
+/// Completes a stage from the outputs of the stages before it, or skips it if it is done. `fields`
+/// are the trained fields; only a stage that has work to do loads them.
 pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<Done> {
     let Session { capture, config, run, .. } = session;
     if stage == Stage::Ensemble {
@@ -143,7 +144,8 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
     Ok(done)
 }
 
-/// Frees what a stage kept for its next step, so that the next stage begins with the memory that it needs itself.
+/// Frees what a stage kept for its next step, so that the next stage begins with the memory that it
+/// needs itself.
 fn give_memory_back() {
     kernel::cpu::pool::clear();
     io::give_memory_back();

@@ -1,8 +1,8 @@
 //! Self-contained HTML pages, one file each: `report.html` of a run, a page of many runs, the head
 //! to turn, a run while it works. Their markup is in `report/*.html`.
 //!
-//! Everything that comes from outside is escaped by the templates; only what this module made itself (drawings,
-//! pictures, JSON) goes in as it is.
+//! Everything that comes from outside is escaped by the templates; only what this module made
+//! itself (drawings, pictures, JSON) goes in as it is.
 
 pub mod bench;
 mod chart;
@@ -43,8 +43,8 @@ pub const MAX_ERROR: f32 = 0.2;
 pub const HEAT: [[u8; 3]; 6] =
     [[0, 0, 4], [66, 10, 104], [147, 38, 103], [221, 81, 58], [252, 165, 10], [252, 255, 164]];
 
-/// Returns the files of a run's views of one kind, a word of [`NAMES`](crate::config::NAMES), relative to the run and in
-/// name order; not the depth and the float views beside them.
+/// Returns the files of a run's views of one kind, a word of [`NAMES`](crate::config::NAMES),
+/// relative to the run and in name order; not the depth and the float views beside them.
 fn views(run: &Path, word: &str) -> Vec<String> {
     let folder = if word == "ensemble" { word.to_owned() } else { format!("render/{word}") };
     let root = run.join(&folder);
@@ -60,7 +60,8 @@ fn csv_text(text: &str) -> String {
     format!("\"{}\"", text.replace('"', "\"\""))
 }
 
-/// Returns a view over black as a JPEG file of at most `side` pixels; `None` where it cannot be read.
+/// Returns a view over black as a JPEG file of at most `side` pixels; `None` where it cannot be
+/// read.
 fn small_view(file: &Path, side: u32, quality: u8) -> Option<Vec<u8>> {
     let limits = Limits::default();
     let photo = if file.extension().is_some_and(|ending| ending == "exr") {
@@ -89,7 +90,8 @@ pub struct Report {
     pub viewer: Option<Viewer>,
     /// Quality and cost of each rendering method.
     pub table: MethodTable,
-    /// Errors of each kind of picture by part of the head: the heading, then a row each; may be empty.
+    /// Errors of each kind of picture by part of the head: the heading, then a row each; may be
+    /// empty.
     pub quality: Vec<Vec<String>>,
     /// Photographs with what was rendered for them.
     pub views: Vec<ViewRow>,
@@ -101,7 +103,8 @@ pub struct Report {
     pub charts: Vec<String>,
     /// Durations: stage, words, share of the longest in percent.
     pub times: Vec<(String, String, f64)>,
-    /// Settings that are not the preset's: key, value, the preset's; of two runs, those that differ.
+    /// Settings that are not the preset's: key, value, the preset's; of two runs, those that
+    /// differ.
     pub changes: Vec<[String; 3]>,
     /// Names of the two runs that the page compares; else empty.
     pub compared: Vec<String>,
@@ -125,7 +128,8 @@ pub struct MethodTable {
 }
 
 impl MethodTable {
-    /// Of columns (heading, digits, and whether more is better, less is, or neither) and rows of figures.
+    /// Of columns (heading, digits, and whether more is better, less is, or neither) and rows of
+    /// figures.
     pub fn new(
         columns: &[(&str, usize, Option<bool>)],
         rows: Vec<(String, Vec<Option<f64>>)>,
@@ -295,7 +299,8 @@ pub fn picture_url(file: &[u8]) -> String {
     format!("data:image/{kind};base64,{}", base64(file))
 }
 
-/// Returns a path as an address relative to the page: reserved characters are percent-encoded (RFC 3986).
+/// Returns a path as an address relative to the page: reserved characters are percent-encoded (RFC
+/// 3986).
 pub fn link(path: &str) -> String {
     let byte = |b: u8| match b {
         b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' | b'/' => (b as char).to_string(),
@@ -304,7 +309,8 @@ pub fn link(path: &str) -> String {
     path.bytes().map(byte).collect()
 }
 
-/// Returns the address of a file, relative to the folder of a page; of the file itself if one of them does not exist.
+/// Returns the address of a file, relative to the folder of a page; of the file itself if one of
+/// them does not exist.
 pub fn relative(file: &Path, folder: &Path) -> String {
     let (Ok(file), Ok(folder)) = (io::real_path(file), io::real_path(folder)) else {
         return link(&file.to_string_lossy());
@@ -333,8 +339,8 @@ pub fn leaves(value: &Value) -> Vec<(String, String)> {
     map.iter().flat_map(inner).collect()
 }
 
-/// Returns what the figures of `metrics.json` were taken against, from its `truth`: a few words, or nothing where it
-/// says nothing.
+/// Returns what the figures of `metrics.json` were taken against, from its `truth`: a few words, or
+/// nothing where it says nothing.
 pub fn judged_by(truth: &Value) -> Option<String> {
     let photographs = match truth["photographs"].as_str()? {
         "photo" => "against photographs as they were taken",
@@ -348,8 +354,8 @@ pub fn judged_by(truth: &Value) -> Option<String> {
     Some(format!("judged {photographs}, {masks}"))
 }
 
-/// Returns the statement that a blend is no better than the best of its members, from the `blend` of `metrics.json`;
-/// `None` if the blend is better.
+/// Returns the statement that a blend is no better than the best of its members, from the `blend`
+/// of `metrics.json`; `None` if the blend is better.
 pub fn blend_verdict(blend: &Value) -> Option<String> {
     let gain = blend["gain_db"].as_f64().filter(|gain| *gain <= 0.0)?;
     let member = display_name(blend["best_member"].as_str()?);
@@ -359,7 +365,8 @@ pub fn blend_verdict(blend: &Value) -> Option<String> {
     ))
 }
 
-/// Returns the height of what a run shows, from the figures of its stages: the mesh's own, else that of the masks' hull.
+/// Returns the height of what a run shows, from the figures of its stages: the mesh's own, else
+/// that of the masks' hull.
 pub fn height(mask: Option<&Value>, mesh: Option<&Value>) -> Option<String> {
     let of = |figures: &Value| Some((figures["height_units"].as_f64()?, figures["height_m"].as_f64()?));
     let told = |what: &str, (units, meters): (f64, f64)| {
@@ -374,8 +381,9 @@ pub fn glb_megabytes(run: &Path) -> Option<f64> {
     io::file_size(&run.join("mesh/head.glb")).map(|bytes| bytes as f64 / 1e6)
 }
 
-/// Returns the warnings of a run by its records: what its stages warned of, what is wrong with their results, and which
-/// files are no longer as a stage left them, each with what to do. The reports of one run and of many have the same.
+/// Returns the warnings of a run by its records: what its stages warned of, what is wrong with
+/// their results, and which files are no longer as a stage left them, each with what to do. The
+/// reports of one run and of many have the same.
 pub fn warnings<'r>(run: &Path, records: impl IntoIterator<Item = (Stage, &'r Record)>) -> Vec<String> {
     let mut all = Vec::new();
     for (stage, record) in records {

@@ -1,17 +1,19 @@
 //! How well calibrated cameras fit each other, and poses that fit better.
 //!
-//! The visual hull of the masks is a rough surface. Patches of it are found again in the photographs (`tracks`), and poses
-//! and points that explain where they were found follow from a robust bundle adjustment (`adjust`). Points are free: a
-//! surface contains the errors of the poses that it was made with, so aligning photographs to it would keep half of them.
-//! The points that result are the next surface; after four rounds they lie within a fraction of a pixel, whatever the hull
-//! was like.
+//! The visual hull of the masks is a rough surface. Patches of it are found again in the
+//! photographs (`tracks`), and poses and points that explain where they were found follow from a
+//! robust bundle adjustment (`adjust`). Points are free: a surface contains the errors of the poses
+//! that it was made with, so aligning photographs to it would keep half of them. The points that
+//! result are the next surface; after four rounds they lie within a fraction of a pixel, whatever
+//! the hull was like.
 //!
-//! Exact cameras gain an error this way, since shading that moves with the view moves patches a little. `gate` therefore
-//! decides from the residuals which cameras are refined: none, those that stand out, or all. Held-out cameras take no part;
-//! each can then be fitted alone to the points, which stay.
+//! Exact cameras gain an error this way, since shading that moves with the view moves patches a
+//! little. `gate` therefore decides from the residuals which cameras are refined: none, those that
+//! stand out, or all. Held-out cameras take no part; each can then be fitted alone to the points,
+//! which stay.
 //!
-//! Everything is in scene coordinates and in pixels of the pictures searched, and a function of its arguments alone,
-//! whatever the threads.
+//! Everything is in scene coordinates and in pixels of the pictures searched, and a function of its
+//! arguments alone, whatever the threads.
 
 mod adjust;
 pub mod exposure;
@@ -43,8 +45,8 @@ const FIRST_SCALE: f64 = 1.0;
 /// Least residual of half weight, pixels.
 const LEAST_SCALE: f64 = 0.1;
 
-/// Largest residual of a camera fitted alone, pixels. Points that stay have errors of their own, of up to 1.2; those found by
-/// chance lie anywhere within the reach of the search, some ten pixels.
+/// Largest residual of a camera fitted alone, pixels. Points that stay have errors of their own, of
+/// up to 1.2; those found by chance lie anywhere within the reach of the search, some ten pixels.
 const MOST_ALONE_PX: f64 = 2.0;
 
 /// Result of the adjustment of a rig.
@@ -54,7 +56,8 @@ pub struct Rig {
     pub verdict: PoseDecision,
     /// Every camera, in the order given.
     pub cameras: Vec<CameraFit>,
-    /// Median distance of a sighting from its point's projection with the poses given and free points, pixels.
+    /// Median distance of a sighting from its point's projection with the poses given and free
+    /// points, pixels.
     pub given_px: f64,
     /// The same after the adjustment of all cameras.
     pub adjusted_px: f64,
@@ -62,7 +65,8 @@ pub struct Rig {
     tracks: Vec<Track>,
 }
 
-/// A camera that took no part in the measurement of its rig, fitted alone to the points that the rig found.
+/// A camera that took no part in the measurement of its rig, fitted alone to the points that the
+/// rig found.
 #[derive(Clone, Debug)]
 pub struct HeldOutFit {
     /// How many of the points were found in its photograph.
@@ -71,14 +75,16 @@ pub struct HeldOutFit {
     pub given_px: f64,
     /// The same with the pose fitted.
     pub fitted_px: f64,
-    /// How far the head moves in its picture from the pose given to the fitted one, pixels (root mean square).
+    /// How far the head moves in its picture from the pose given to the fitted one, pixels (root
+    /// mean square).
     pub moved_px: f64,
     /// The camera with the pose fitted; `None` where too few points were found, or fit no pose.
     pub camera: Option<Camera>,
 }
 
 impl Rig {
-    /// Fits a camera that took no part to the points, which stay. `views` are the photographs that were measured.
+    /// Fits a camera that took no part to the points, which stay. `views` are the photographs that
+    /// were measured.
     pub fn fit_held_out(&self, views: &[RigView], photo: &RigView, given: &Camera) -> HeldOutFit {
         let cameras: Vec<Camera> = self.cameras.iter().map(|fit| fit.camera.clone()).collect();
         let found = tracks::find_in((photo, given), views, &cameras, &self.tracks);
@@ -101,9 +107,9 @@ impl Rig {
     }
 }
 
-/// Measures how well cameras fit each other by this many points ([`POINTS`]). `surface` is any rough surface of the head with
-/// normals; `views` and `given` are photographs and cameras of the same order. `all` asks for all cameras to be refined,
-/// whatever the gain.
+/// Measures how well cameras fit each other by this many points ([`POINTS`]). `surface` is any
+/// rough surface of the head with normals; `views` and `given` are photographs and cameras of the
+/// same order. `all` asks for all cameras to be refined, whatever the gain.
 pub fn measure(views: &[RigView], given: &[Camera], surface: &Mesh, points: usize, all: bool) -> Rig {
     let mut cameras = given.to_vec();
     let mut seeds = tracks::seeds(surface, given, |v, pixel| views[v].is_usable(pixel), points);
@@ -120,8 +126,8 @@ pub fn measure(views: &[RigView], given: &[Camera], surface: &Mesh, points: usiz
     gate::decide(given, cameras, tracks, &expected, all)
 }
 
-/// Returns the cameras that fit the tracks best, in the world of the given ones, and moves the tracks' points there. A camera
-/// with too few sightings stays as it was given.
+/// Returns the cameras that fit the tracks best, in the world of the given ones, and moves the
+/// tracks' points there. A camera with too few sightings stays as it was given.
 fn refined(given: &[Camera], start: Vec<Camera>, tracks: &mut [Track]) -> Vec<Camera> {
     let mut cameras = start;
     let free: Vec<bool> = sightings(tracks, given.len()).iter().map(|&n| n >= LEAST_SIGHTINGS).collect();
@@ -154,7 +160,8 @@ fn sightings(tracks: &[Track], cameras: usize) -> Vec<usize> {
     counts
 }
 
-/// Returns for each camera the distances of its sightings from where their points are projected, pixels.
+/// Returns for each camera the distances of its sightings from where their points are projected,
+/// pixels.
 fn residuals(cameras: &[Camera], tracks: &[Track]) -> Vec<Vec<f64>> {
     let mut all = vec![Vec::new(); cameras.len()];
     for track in tracks {

@@ -11,11 +11,12 @@
 //! ```
 //!
 //! A stage whose `done.json` has the same fingerprint is skipped without touching a file; one with
-//! another fingerprint is an error that prints the difference: nothing is retrained or reused silently.
+//! another fingerprint is an error that prints the difference: nothing is retrained or reused
+//! silently.
 //!
 //! Repeating a command after an interruption gives the same bytes in the stage's own files (on one
-//! device and for one seed). `status.json`, `log.jsonl` and `done.json` contain times and rates, and
-//! so differ from run to run.
+//! device and for one seed). `status.json`, `log.jsonl` and `done.json` contain times and rates,
+//! and so differ from run to run.
 
 use tiface_base::{Error, ErrorKind, Quiet, Result};
 mod estimate;
@@ -67,16 +68,16 @@ fn has_record(folder: &Path) -> bool {
         || matches!(read_status(folder), Ok(Some(_)))
 }
 
-/// Returns whether this is an empty lock, or a record that a crash left empty, whoever made it: alone
-/// in a folder it is nothing that could be lost.
+/// Returns whether this is an empty lock, or a record that a crash left empty, whoever made it:
+/// alone in a folder it is nothing that could be lost.
 fn is_bare(path: &Path) -> bool {
     let is_bare_lock = path.ends_with(LOCK) && io::begins(path, LOCK_MARK) == Some(false);
     is_bare_lock || TIMED.iter().any(|name| path.ends_with(name)) && io::file_size(path) == Some(0)
 }
 
 impl Run {
-    /// Opens the run in `dir`; the folder is created with the first file. Events go to `observer`; `stop` stops every
-    /// stage.
+    /// Opens the run in `dir`; the folder is created with the first file. Events go to `observer`;
+    /// `stop` stops every stage.
     pub fn open(dir: &Path, stop: Stop, observer: Arc<dyn Observer>) -> Run {
         Run { dir: dir.into(), stop, observer }
     }
@@ -96,15 +97,16 @@ impl Run {
         self.dir.join(name)
     }
 
-    /// Writes a file of the run itself (`config.toml`, `cameras.json`, `report.html`); a file with the same bytes is not
-    /// rewritten, so that its modification time stays meaningful.
+    /// Writes a file of the run itself (`config.toml`, `cameras.json`, `report.html`); a file with
+    /// the same bytes is not rewritten, so that its modification time stays meaningful.
     pub fn write(&self, name: &str, bytes: &[u8]) -> Result<()> {
         let path = self.path(name);
         if io::is_file(&path) && io::read_bytes(&path, &io::Limits::default()).is_ok_and(|old| old == bytes) {
             return Ok(());
         }
         io::create_folder(&self.dir)?;
-        // one process at a time: other temporary files of this name were left by a process that has ended
+        // one process at a time: other temporary files of this name were left by a process that has
+        // ended
         let lock = Lock::wait(&self.path(LOCK));
         if lock.is_ok() {
             let _ = io::remove_leftovers(&self.dir, |of, _| of == name); // the next one tries again
@@ -112,8 +114,8 @@ impl Run {
         Ok(io::write_atomic(&path, bytes)?)
     }
 
-    /// Removes the results of stages, so that they are computed again; `names` in pipeline order. All their locks are
-    /// held meanwhile. Subfolders with a lock or a record of their own stay.
+    /// Removes the results of stages, so that they are computed again; `names` in pipeline order.
+    /// All their locks are held meanwhile. Subfolders with a lock or a record of their own stay.
     ///
     /// # Errors
     ///
@@ -175,8 +177,8 @@ impl Run {
         &self.stop
     }
 
-    /// Records the error of a command that ended before its first stage; a failure to write it is ignored. Nothing is
-    /// written into a folder that contains files but no run.
+    /// Records the error of a command that ended before its first stage; a failure to write it is
+    /// ignored. Nothing is written into a folder that contains files but no run.
     pub fn failed(&self, error: &Error) {
         let is_run = ["config.toml", FAILED].iter().any(|name| io::is_file(&self.path(name)));
         if !is_run && !matches!(io::any_file(&self.dir, &|_| false), Ok(None)) {

@@ -1,8 +1,8 @@
 //! Stages `baseline` and `tface`: TensoRF's vector-matrix radiance field learned from photographs.
 //!
-//! Chen et al. 2022 (TensoRF) with the mask loss of T-Face (TI-Face, ICCV 2023 View Synthesis Challenge for
-//! Human Heads): the opacity that background rays collect is pushed to zero. The baseline is the same code
-//! on photographs as they are; only its box still comes from the masks.
+//! Chen et al. 2022 (TensoRF) with the mask loss of T-Face (TI-Face, ICCV 2023 View Synthesis
+//! Challenge for Human Heads): the opacity that background rays collect is pushed to zero. The
+//! baseline is the same code on photographs as they are; only its box still comes from the masks.
 
 mod cpu;
 #[cfg(feature = "wgpu")]
@@ -26,8 +26,9 @@ use crate::field::ComputeDevice;
 use tiface_base::Result;
 use tiface_base::geom::Aabb;
 
-/// Refuses a GPU that cannot hold the training of a field, before its photographs are known: they need no memory there.
-/// Without `bounds`, the box that the masks give, refuses what fits in no box. An imported field is not trained.
+/// Refuses a GPU that cannot hold the training of a field, before its photographs are known: they
+/// need no memory there. Without `bounds`, the box that the masks give, refuses what fits in no
+/// box. An imported field is not trained.
 pub fn require_fit(
     stage: &str,
     config: &VmConfig,

@@ -1,10 +1,11 @@
-//! Every reader of foreign bytes against inputs made of its seeds: none panics, works for more than a second or
-//! allocates beyond its limits.
+//! Every reader of foreign bytes against inputs made of its seeds: none panics, works for more than
+//! a second or allocates beyond its limits.
 //!
-//! An input that is answered in words that no other was answered in, numbers and quotations left out, becomes a seed of further ones:
-//! what the readers say stands in for what of their code was reached. `TIFACE_FUZZ_S=3600` gives each reader an hour,
-//! `TIFACE_FUZZ_SEED` another beginning, `TIFACE_FUZZ_READER=mesh` one reader all the time. A finding is kept beside the
-//! seeds, where it is tried first from then on.
+//! An input that is answered in words that no other was answered in, numbers and quotations left
+//! out, becomes a seed of further ones: what the readers say stands in for what of their code was
+//! reached. `TIFACE_FUZZ_S=3600` gives each reader an hour, `TIFACE_FUZZ_SEED` another beginning,
+//! `TIFACE_FUZZ_READER=mesh` one reader all the time. A finding is kept beside the seeds, where it
+//! is tried first from then on.
 
 mod readers;
 
@@ -18,7 +19,8 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
-/// What a reader may hold beyond what was held before it, bytes: its limits and as much again to work with, many times.
+/// What a reader may hold beyond what was held before it, bytes: its limits and as much again to
+/// work with, many times.
 const MAX_BYTES: usize = 160 << 20;
 /// Work for one input, seconds.
 const MOST_SECONDS: f64 = 1.0;

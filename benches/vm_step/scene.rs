@@ -28,7 +28,8 @@ pub struct Scene {
 
 /// An ellipsoid of density `peak · max(0, 1 − r²)` with noise, on a grid of `size` vertices.
 ///
-/// `1 − r²` needs two channels of the first term; the other channels keep the published start, 0.1 N(0, 1).
+/// `1 − r²` needs two channels of the first term; the other channels keep the published start, 0.1
+/// N(0, 1).
 pub fn scene(size: [usize; 3], peak: f32, rays: usize) -> Scene {
     let density = Grid { size, rank: [16, 4, 4] };
     let color = Grid { size, rank: [48, 12, 12] };
@@ -82,8 +83,8 @@ pub fn scene(size: [usize; 3], peak: f32, rays: usize) -> Scene {
     s
 }
 
-/// The published mask: vertices of alpha ≥ 1e-4 (without the distance scale), those beside them, and the
-/// cells around all of these.
+/// The published mask: vertices of alpha ≥ 1e-4 (without the distance scale), those beside them,
+/// and the cells around all of these.
 fn alpha_mask(s: &Scene) -> BoxMask {
     let (l, n) = (&s.field.lattice, MASK_SIZE);
     let at = |a: usize, i: usize| l.min[a] + (l.max[a] - l.min[a]) * i as f32 / (n[a] - 1) as f32;

@@ -1,11 +1,12 @@
 //! Space carving: what every silhouette allows, cell by cell (Laurentini's visual hull).
 //!
-//! A view *keeps* a cell if any masked pixel is in the cell's footprint, and *removes* it if none is although
-//! the whole footprint lies inside the frame. An empty footprint that leaves the frame decides nothing if it
-//! leaves through a border that the mask touches, since the subject may go on outside; through any other border
-//! it leaves the subject too, and the cell is removed. (That takes the subject for one piece that does not
-//! leave through one border and come back beside another, as shoulders do not.) Footprints are generous rectangles counted with a
-//! summed-area table, so a hair thinner than a cell is never lost.
+//! A view *keeps* a cell if any masked pixel is in the cell's footprint, and *removes* it if none
+//! is although the whole footprint lies inside the frame. An empty footprint that leaves the frame
+//! decides nothing if it leaves through a border that the mask touches, since the subject may go on
+//! outside; through any other border it leaves the subject too, and the cell is removed. (That
+//! takes the subject for one piece that does not leave through one border and come back beside
+//! another, as shoulders do not.) Footprints are generous rectangles counted with a summed-area
+//! table, so a hair thinner than a cell is never lost.
 
 use glam::{DMat3, DVec3, Vec2};
 use rayon::prelude::*;
@@ -78,8 +79,8 @@ enum FootprintState {
 }
 
 impl SilhouetteTable {
-    /// Pixels over `threshold` count as masked. A mask of another size than the camera's is taken for the
-    /// same picture at that size.
+    /// Pixels over `threshold` count as masked. A mask of another size than the camera's is taken
+    /// for the same picture at that size.
     pub fn new(view: usize, camera: &Camera, mask: &Gray, threshold: u8) -> SilhouetteTable {
         let (width, height) = (mask.width as usize, mask.height as usize);
         let row = width + 1;
@@ -169,7 +170,8 @@ impl Cube {
 pub(super) struct Carved {
     /// How many masks each cell touches; 0 where some view removes it. `[n, n, n]`, x outermost.
     pub support: Vec<u16>,
-    /// Per silhouette: cells that it alone removes, while at least half of all, and three, keep them.
+    /// Per silhouette: cells that it alone removes, while at least half of all, and three, keep
+    /// them.
     pub alone: Vec<u64>,
 }
 
@@ -224,7 +226,8 @@ pub(super) fn carve(cube: &Cube, silhouettes: &[SilhouetteTable]) -> Carved {
 
 /// Connected pieces of a set of cells or pixels.
 pub(crate) struct Pieces {
-    /// The piece of each element, numbered from 1 in the order of their first elements; 0 outside the set.
+    /// The piece of each element, numbered from 1 in the order of their first elements; 0 outside
+    /// the set.
     pub label: Vec<u32>,
     /// How many elements each piece has; 0 for number 0.
     pub size: Vec<usize>,
@@ -268,7 +271,8 @@ pub(crate) fn around([x, y, z]: [usize; 3], n: usize, corners: bool) -> impl Ite
     )
 }
 
-/// Removes every 26-connected piece smaller than `share` of the largest one; returns how many cells it removed.
+/// Removes every 26-connected piece smaller than `share` of the largest one; returns how many cells
+/// it removed.
 pub(crate) fn drop_dust(kept: &mut [bool], n: usize, share: f64) -> usize {
     let Pieces { label, size } = pieces(kept, |i| around([i / (n * n), i / n % n, i % n], n, true));
     let least = share * size.iter().copied().max().unwrap_or(0) as f64;
@@ -293,8 +297,8 @@ pub(super) fn extent(kept: &[bool], n: usize) -> Option<[(usize, usize); 3]> {
     (found[0].0 != usize::MAX).then_some(found)
 }
 
-/// Returns the point nearest to all rays, least squares: `Σ (I − ddᵀ)(p − o) = 0`. `None` when they are parallel
-/// within about half a degree.
+/// Returns the point nearest to all rays, least squares: `Σ (I − ddᵀ)(p − o) = 0`. `None` when they
+/// are parallel within about half a degree.
 pub(crate) fn meeting_point(rays: &[(DVec3, DVec3)]) -> Option<DVec3> {
     // sums relative to one origin: far-away worlds would lose digits
     let base = rays.first()?.0;
@@ -314,7 +318,8 @@ pub(crate) fn meeting_point(rays: &[(DVec3, DVec3)]) -> Option<DVec3> {
     Some(base + a.inverse() * b)
 }
 
-/// Returns the direction through the middle of a mask's weight, or along the viewing axis without one.
+/// Returns the direction through the middle of a mask's weight, or along the viewing axis without
+/// one.
 pub(super) fn ray_to(camera: &Camera, mask: Option<&Gray>) -> (DVec3, DVec3) {
     let axis = -camera.rotation.z_axis;
     let Some(mask) = mask else { return (camera.position, axis) };

@@ -1,12 +1,13 @@
 //! COLMAP's sparse models, in the places of [`files`].
 //!
-//! A pose takes the world to a camera whose axes point right, down and ahead, as a quaternion (w, x, y, z) and a
-//! translation; a pixel's center is at +0.5. The binary files are preferred to the text. Poses are
-//! complete in the images file, of rigs as well: `rigs` and `frames` beside it (COLMAP 3.12 to 4.2) are not read.
-//! Points are optional, and say where the head is if no masks do.
+//! A pose takes the world to a camera whose axes point right, down and ahead, as a quaternion (w,
+//! x, y, z) and a translation; a pixel's center is at +0.5. The binary files are preferred to the
+//! text. Poses are complete in the images file, of rigs as well: `rigs` and `frames` beside it
+//! (COLMAP 3.12 to 4.2) are not read. Points are optional, and say where the head is if no masks
+//! do.
 //!
-//! A model is written back as binary files: one camera for each lens that differs, no points. [`SparseModel`] sums up what
-//! COLMAP itself has just written.
+//! A model is written back as binary files: one camera for each lens that differs, no points.
+//! [`SparseModel`] sums up what COLMAP itself has just written.
 
 mod binary;
 mod files;
@@ -147,7 +148,8 @@ fn names_in(text: &str) -> impl Iterator<Item = &str> {
     text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'))
 }
 
-/// Returns whether a photograph's name can be read back from a model, and from `test.txt` if it is held out.
+/// Returns whether a photograph's name can be read back from a model, and from `test.txt` if it is
+/// held out.
 pub(super) fn can_name(name: &str, in_test: bool) -> bool {
     let is_relative = join("images", name).len() > name.len();
     is_relative && (!in_test || !name.contains(char::is_control) && names_in(name).eq([name]))
@@ -289,8 +291,8 @@ impl SparseModel {
         })
     }
 
-    /// Returns the camera that all photographs share, if they do: its longest side and its focal length, x and y of its
-    /// principal point relative to the center, in pixels.
+    /// Returns the camera that all photographs share, if they do: its longest side and its focal
+    /// length, x and y of its principal point relative to the center, in pixels.
     pub fn shared_lens(&self) -> Option<(f64, [f64; 3])> {
         let mut cameras = self.cameras.values();
         let (camera, None) = (cameras.next()?, cameras.next()) else { return None };
@@ -301,7 +303,8 @@ impl SparseModel {
         Some((w.max(h), [f?, cx? - 0.5 * w, cy? - 0.5 * h]))
     }
 
-    /// Returns the cameras file with the lens as OPENCV's model, which has two focal lengths and tangential distortion.
+    /// Returns the cameras file with the lens as OPENCV's model, which has two focal lengths and
+    /// tangential distortion.
     pub fn as_opencv(&self) -> Option<Vec<u8>> {
         let model = LensModel::named("OPENCV").ok()?;
         let widened = |(&id, camera): (&u32, &Camera)| -> Option<(u32, Camera)> {

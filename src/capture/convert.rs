@@ -1,9 +1,11 @@
-//! Writes a copy of a capture with its cameras in another format. Nothing is resampled, and no existing file is changed.
+//! Writes a copy of a capture with its cameras in another format. Nothing is resampled, and no
+//! existing file is changed.
 //!
-//! Photographs are copied to `images/`, head masks to `masks/`, valid pixels to `valid/` and regions to `face_masks/`; the
-//! camera files are written last, so that a folder with camera files is complete. One that a killed process left without
-//! them is completed. Data that the format cannot represent is an error if pictures would no longer match their cameras, and a
-//! warning otherwise.
+//! Photographs are copied to `images/`, head masks to `masks/`, valid pixels to `valid/` and
+//! regions to `face_masks/`; the camera files are written last, so that a folder with camera files
+//! is complete. One that a killed process left without them is completed. Data that the format
+//! cannot represent is an error if pictures would no longer match their cameras, and a warning
+//! otherwise.
 
 use super::colmap;
 use super::folder::is_hidden;
@@ -112,7 +114,8 @@ impl Content<'_> {
 /// Files to write, by their paths.
 type Contents<'v> = Vec<(PathBuf, Content<'v>)>;
 
-/// Returns whether a folder contains nothing but files of an unfinished conversion: `contents` but for the last one.
+/// Returns whether a folder contains nothing but files of an unfinished conversion: `contents` but
+/// for the last one.
 fn is_unfinished(folder: &Path, contents: &Contents) -> Result<bool> {
     let Some((_, written)) = contents.split_last() else { return Ok(false) };
     let targets: BTreeSet<&Path> = written.iter().map(|(target, _)| target.as_path()).collect();
@@ -131,12 +134,13 @@ fn is_unfinished(folder: &Path, contents: &Contents) -> Result<bool> {
     Ok(true)
 }
 
-/// Writes `capture` into `folder`, which must be new, empty, or left by a killed process that wrote the same. Photographs
-/// and masks are copied.
+/// Writes `capture` into `folder`, which must be new, empty, or left by a killed process that wrote
+/// the same. Photographs and masks are copied.
 ///
 /// # Errors
 ///
-/// Fails if the capture was opened at reduced size, the folder is not empty, or the format has no such lens model.
+/// Fails if the capture was opened at reduced size, the folder is not empty, or the format has no
+/// such lens model.
 pub fn convert(capture: &Capture, to: CameraFormat, folder: &Path) -> Result<Conversion> {
     if let Some(view) = capture.views.iter().find(|v| v.photo_size != (v.camera.width, v.camera.height)) {
         let message = format!("the photograph of `{}` would be converted at reduced size", view.name);
@@ -221,7 +225,8 @@ fn files_of_views(capture: &Capture, to: CameraFormat) -> Result<Vec<ViewFiles<'
     Ok(files_of_views)
 }
 
-/// Returns photographs, masks and regions as they are copied to a folder, and the number of head masks.
+/// Returns photographs, masks and regions as they are copied to a folder, and the number of head
+/// masks.
 fn pictures<'v>(
     capture: &Capture,
     files_of_views: &[ViewFiles<'v>],

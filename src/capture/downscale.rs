@@ -1,8 +1,8 @@
 //! Cameras and pictures at a whole fraction of their size.
 //!
-//! Downscaling by `d` averages `d × d` blocks and drops the last columns and rows that fill no block,
-//! so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as a sensor
-//! with larger pixels would, weighted by alpha where there is one.
+//! Downscaling by `d` averages `d × d` blocks and drops the last columns and rows that fill no
+//! block, so that every intrinsic is divided by exactly `d`. Color is averaged in linear light, as
+//! a sensor with larger pixels would, weighted by alpha where there is one.
 
 use tiface_base::geom::Camera;
 use tiface_base::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};

@@ -1,5 +1,5 @@
-//! A capture's folder: its entries, the paths that names in camera files refer to, and errors shared by the camera formats.
-//! No file outside the capture is opened.
+//! A capture's folder: its entries, the paths that names in camera files refer to, and errors
+//! shared by the camera formats. No file outside the capture is opened.
 
 use super::frame::CameraFrame;
 use super::near::names::{IMAGE_FOLDERS, READABLE_FORMATS, bare, fold, without_ending};
@@ -15,8 +15,8 @@ use std::path::{Component, Path, PathBuf};
 use tiface_base::io::{self, ReadError};
 use tiface_base::{Error, Result};
 
-/// Endings that may be missing from a photograph's name: of supported files, and of files that are found only to be refused
-/// by name.
+/// Endings that may be missing from a photograph's name: of supported files, and of files that are
+/// found only to be refused by name.
 const ENDINGS: [&[&str]; 2] = [
     &["", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG"],
     &[".tif", ".tiff", ".webp", ".heic", ".TIF", ".TIFF"],
@@ -57,8 +57,8 @@ impl CaptureFolder<'_> {
         path.strip_prefix(self.root).unwrap_or(path).to_string_lossy().into_owned()
     }
 
-    /// Returns the path below the capture that `name` refers to. `\` counts as a separator, since tools on Windows
-    /// write it; an absolute name is accepted if it points into the capture.
+    /// Returns the path below the capture that `name` refers to. `\` counts as a separator, since
+    /// tools on Windows write it; an absolute name is accepted if it points into the capture.
     pub fn relative(&self, file: &str, name: &str) -> Result<PathBuf> {
         let outside = || outside(file, name);
         if name.is_empty() || name.contains('\0') {
@@ -86,14 +86,15 @@ impl CaptureFolder<'_> {
         Ok(relative)
     }
 
-    /// Returns the regular file at a relative path, if it exists. Links are followed: data sets are kept as links into a store,
-    /// and the paths that [`CaptureFolder::relative`] returns cannot climb out of the capture.
+    /// Returns the regular file at a relative path, if it exists. Links are followed: data sets are
+    /// kept as links into a store, and the paths that [`CaptureFolder::relative`] returns cannot
+    /// climb out of the capture.
     pub fn file(&self, relative: &Path) -> Option<PathBuf> {
         Some(self.root.join(relative)).filter(|path| io::is_file(path))
     }
 
-    /// Returns the folder that photographs' names are relative to, if the format does not define it: the one that contains
-    /// most of the first names.
+    /// Returns the folder that photographs' names are relative to, if the format does not define
+    /// it: the one that contains most of the first names.
     pub fn image_folder<'n>(&self, names: impl Iterator<Item = &'n str>) -> &'static str {
         let names: Vec<&str> = names.take(64).collect();
         let is_in = |base: &str, name: &str| {
@@ -104,7 +105,8 @@ impl CaptureFolder<'_> {
         counted.fold(("images", 0), |best, next| if next.1 > best.1 { next } else { best }).0
     }
 
-    /// Returns the mask of a photograph: by COLMAP's own convention (`masks/NAME.jpg.png`), or by its name without ending.
+    /// Returns the mask of a photograph: by COLMAP's own convention (`masks/NAME.jpg.png`), or by
+    /// its name without ending.
     pub fn mask_of(&self, file: &str, name: &str) -> Result<Option<PathBuf>> {
         let stem =
             if has_ending(name, &PHOTOGRAPHS) { Path::new(name).with_extension("") } else { name.into() };
@@ -176,9 +178,9 @@ impl CaptureFolder<'_> {
         listed(name)
     }
 
-    /// Returns the photograph that `name` refers to, with its path below the capture: the exact name, else with a
-    /// usual ending, else in the folder of pictures already reduced by `options.downscale`
-    /// (`images_4/`, `images_4x/`).
+    /// Returns the photograph that `name` refers to, with its path below the capture: the exact
+    /// name, else with a usual ending, else in the folder of pictures already reduced by
+    /// `options.downscale` (`images_4/`, `images_4x/`).
     pub fn exact_photo(&self, file: &str, name: &str) -> Result<(PathBuf, Option<PathBuf>)> {
         let downscale = self.options.downscale;
         let wanted = self.relative(file, name)?;
@@ -203,7 +205,8 @@ impl CaptureFolder<'_> {
     }
 }
 
-/// Returns the common folder of all photographs, and each one's path below it without ending, separated by `/`.
+/// Returns the common folder of all photographs, and each one's path below it without ending,
+/// separated by `/`.
 pub(super) fn view_names(frames: &[CameraFrame]) -> (PathBuf, Vec<String>) {
     let mut folder: Option<PathBuf> = None;
     for frame in frames {
@@ -321,7 +324,8 @@ pub(super) fn is_nameable(name: &str) -> bool {
     !name.contains('\\')
 }
 
-/// Parses an XML file with at most `nodes` nodes. A DTD is refused, because its entities could grow without bound.
+/// Parses an XML file with at most `nodes` nodes. A DTD is refused, because its entities could grow
+/// without bound.
 pub(super) fn parse_xml<'t>(
     path: &Path,
     format: &'static str,

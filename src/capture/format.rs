@@ -1,6 +1,8 @@
-//! Recognizes the camera files of a folder. If it has several kinds, the first of [`CameraFiles`] is read.
+//! Recognizes the camera files of a folder. If it has several kinds, the first of [`CameraFiles`]
+//! is read.
 //!
-//! A folder of another program is recognized by its files, and the error explains how to convert it.
+//! A folder of another program is recognized by its files, and the error explains how to convert
+//! it.
 
 use super::colmap::{ModelFiles, mixed_model, model_elsewhere};
 use super::folder::{FolderEntries, PHOTOGRAPHS, has_ending, is_common_name};
@@ -111,8 +113,8 @@ impl CameraFiles {
     }
 }
 
-/// Returns the split files, if there are some to learn from, else `transforms.json`, as they are spelled.
-/// Other capitals count only where none of both is spelled as usual.
+/// Returns the split files, if there are some to learn from, else `transforms.json`, as they are
+/// spelled. Other capitals count only where none of both is spelled as usual.
 fn transforms(root: &Path) -> Vec<String> {
     let [train, plain] = ["transforms_train.json", "transforms.json"];
     let files = OnceCell::new();
@@ -139,8 +141,9 @@ const MESHES: [&str; 11] = ["glb", "gltf", "obj", "ply", "stl", "fbx", "usdz", "
 
 const VIDEOS: [&str; 6] = ["mp4", "mov", "m4v", "avi", "mkv", "webm"];
 
-/// Returns whether a folder is a run: it has a run's configuration, and either a stage was begun in it or nothing else in it
-/// is a capture's, even an unreadable one (photographs without cameras, a project of another program).
+/// Returns whether a folder is a run: it has a run's configuration, and either a stage was begun in
+/// it or nothing else in it is a capture's, even an unreadable one (photographs without cameras, a
+/// project of another program).
 pub fn is_run(folder: &Path) -> bool {
     let has_record = |stage: &Stage| {
         ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.as_str()).join(f)))
@@ -292,8 +295,8 @@ fn has_pictures(root: &Path) -> bool {
     io::any_file(root, &is_other).is_ok_and(|found| found.is_some())
 }
 
-/// Returns the error for a folder inside a capture: that of its photographs, or, up to three levels deep, that of its
-/// model or poses.
+/// Returns the error for a folder inside a capture: that of its photographs, or, up to three levels
+/// deep, that of its model or poses.
 fn above(root: &Path) -> Option<Error> {
     let real = io::real_path(root).ok()?;
     let is_photographs = real.file_name().and_then(|n| n.to_str()).is_some_and(is_common_name)

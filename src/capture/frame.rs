@@ -1,5 +1,5 @@
-//! The content of camera files, before any photograph is read: frames, pose matrices, and lens models by COLMAP's names, which
-//! nerfstudio and instant-ngp also use.
+//! The content of camera files, before any photograph is read: frames, pose matrices, and lens
+//! models by COLMAP's names, which nerfstudio and instant-ngp also use.
 
 use super::view::Split;
 use glam::{DMat3, DVec3};
@@ -91,8 +91,9 @@ pub(super) struct CameraFrame {
 }
 
 impl CameraFrame {
-    /// Returns a frame of `file`, without split, mask and region. `name` is the photograph's name as written in it, `photo`
-    /// the result of [`CaptureFolder::photo`](super::folder::CaptureFolder::photo).
+    /// Returns a frame of `file`, without split, mask and region. `name` is the photograph's name
+    /// as written in it, `photo` the result of
+    /// [`CaptureFolder::photo`](super::folder::CaptureFolder::photo).
     pub fn new(
         file: &str,
         name: &str,
@@ -155,8 +156,8 @@ impl Intrinsics {
         Ok(Camera { width, height, fx, fy, cx, cy, distortion, rotation, position })
     }
 
-    /// Refuses a focal length and a principal point that cannot be pixels of a picture of this size:
-    /// a lens of more than 157°, and a principal point in the corner or on the edge.
+    /// Refuses a focal length and a principal point that cannot be pixels of a picture of this
+    /// size: a lens of more than 157°, and a principal point in the corner or on the edge.
     fn check_pixels(&self, side: [f64; 2]) -> Result<(), String> {
         let longest = side[0].max(side[1]);
         for (k, name) in ["fl_x", "fl_y"].into_iter().enumerate() {
@@ -200,8 +201,8 @@ impl Intrinsics {
 /// Maximum difference of `RᵀR` from the identity.
 const TOLERANCE: f64 = 1e-3;
 
-/// Returns rotation and position of the upper three rows of a camera-to-world matrix, the rotation exactly orthonormal.
-/// The error says whether the matrix mirrors, scales or shears.
+/// Returns rotation and position of the upper three rows of a camera-to-world matrix, the rotation
+/// exactly orthonormal. The error says whether the matrix mirrors, scales or shears.
 pub(super) fn pose(rows: &[[f64; 4]; 3]) -> Result<(DMat3, DVec3), String> {
     if rows.iter().flatten().any(|v| !v.is_finite()) {
         return Err("its pose holds a number that is not finite".into());

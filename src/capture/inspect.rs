@@ -60,8 +60,8 @@ pub fn grouped(all: &[Error]) -> Vec<Problem> {
     problems
 }
 
-/// Returns a message without its digits and what it quotes as the name of a frame, a view or a file that is no camera
-/// file.
+/// Returns a message without its digits and what it quotes as the name of a frame, a view or a file
+/// that is no camera file.
 fn without_names(message: &str) -> String {
     let mut before = "";
     let mut rest = String::new();
@@ -139,7 +139,8 @@ pub struct Inspection {
     pub scene: Option<Aabb>,
     /// The same in words.
     pub scene_text: Option<String>,
-    /// How well the cameras fit each other, measured on the photographs, and what a run does about it.
+    /// How well the cameras fit each other, measured on the photographs, and what a run does about
+    /// it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fit: Option<String>,
     /// How exposure and white balance differ, and what a run does about it.
@@ -174,7 +175,8 @@ impl Inspection {
     }
 }
 
-/// Reads everything in a capture, every photograph to its last pixel, and reports; never fails itself.
+/// Reads everything in a capture, every photograph to its last pixel, and reports; never fails
+/// itself.
 pub fn inspect(root: &Path, options: &CaptureOptions) -> Inspection {
     let (capture, listing) = gather(root, options);
     let mut out = Inspection {
@@ -268,7 +270,8 @@ fn load_all(capture: &Capture, options: &CaptureOptions) -> (Vec<Result<ViewPixe
     (all, survey)
 }
 
-/// Loads every view as its mask is to be read; returns the masks at a size that is enough to place the head.
+/// Loads every view as its mask is to be read; returns the masks at a size that is enough to place
+/// the head.
 fn pixels(capture: &mut Capture, options: &CaptureOptions, out: &mut Inspection) -> Vec<Option<Gray>> {
     let (mut loaded, survey) = load_all(capture, options);
     match survey.reading(&options.head, &capture.root) {

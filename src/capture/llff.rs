@@ -1,9 +1,9 @@
 //! LLFF poses, `poses_bounds*.npy`: alone, or to check the JSON beside them.
 //!
-//! A row is a 3×5 matrix in row-major order, columns down, right, backwards, position and
-//! (height, width, focal), then near and far, which are not needed. OpenGL axes are
-//! (column 1, −column 0, column 2). The published loader divides positions by 0.3; here the world stays
-//! as the dataset has it.
+//! A row is a 3×5 matrix in row-major order, columns down, right, backwards, position and (height,
+//! width, focal), then near and far, which are not needed. OpenGL axes are (column 1, −column 0,
+//! column 2). The published loader divides positions by 0.3; here the world stays as the dataset
+//! has it.
 
 use super::folder::{CaptureFolder, in_file, in_frame};
 use super::frame::{self, Agreement, CameraFrame, Intrinsics, Listing};
@@ -66,8 +66,8 @@ fn split_of(file: &str) -> Option<Split> {
     }
 }
 
-/// Compares each LLFF file with the frames of its split. Rows carry no names, so they are paired with the
-/// frames in the JSON's order, in name order or by number, whichever fits best.
+/// Compares each LLFF file with the frames of its split. Rows carry no names, so they are paired
+/// with the frames in the JSON's order, in name order or by number, whichever fits best.
 pub(super) fn check(folder: &CaptureFolder, files: &[&str], listing: &mut Listing) {
     for &file in files {
         let split = split_of(file);
@@ -225,8 +225,8 @@ pub(super) fn list(folder: &CaptureFolder, files: &[&str], listing: &mut Listing
     Ok(())
 }
 
-/// Returns the photographs in `images` + `suffix`, or in that folder of pictures already reduced, in the order that is read;
-/// `None` without such a folder.
+/// Returns the photographs in `images` + `suffix`, or in that folder of pictures already reduced,
+/// in the order that is read; `None` without such a folder.
 fn photographs(folder: &CaptureFolder, suffix: &str, listing: &mut Listing) -> Result<Option<Vec<String>>> {
     let downscale = folder.options.downscale;
     let mut names = vec![format!("images{suffix}")];

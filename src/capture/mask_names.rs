@@ -216,8 +216,8 @@ pub(super) fn stray(folder: &CaptureFolder, groups: &[Group], views: &[View]) ->
     other_folder(folder, views).or_else(|| beside_photographs(folder, views))
 }
 
-/// Returns what is said of a folder that is not called like masks of heads and has a picture of each
-/// view.
+/// Returns what is said of a folder that is not called like masks of heads and has a picture of
+/// each view.
 fn other_folder(folder: &CaptureFolder, views: &[View]) -> Option<String> {
     let is_other = |name: &str| {
         name.split('/')

@@ -1,9 +1,10 @@
 //! What the values of mask files mean: white, another color in its place, or what `mask.head` says.
 //!
-//! A single file does not show it: where a view has one label, its mask looks like one drawn in gray. So the values of all
-//! files are counted, and one reading holds for the whole capture. Masks with white are opacity. Masks in one
-//! other color `C` on black are opacity too, `α = p · C / C · C`. Labels, several colors and photographs say nothing of a
-//! head by themselves: [`MaskSurvey::reading`] refuses them.
+//! A single file does not show it: where a view has one label, its mask looks like one drawn in
+//! gray. So the values of all files are counted, and one reading holds for the whole capture. Masks
+//! with white are opacity. Masks in one other color `C` on black are opacity too,
+//! `α = p · C / C · C`. Labels, several colors and photographs say nothing of a head by themselves:
+//! [`MaskSurvey::reading`] refuses them.
 
 use crate::config::{HeadValue, MaskHead};
 use glam::Vec3;
@@ -18,7 +19,8 @@ use tiface_base::{Error, Result};
 /// Maximum of a channel that counts as black in pictures with noise.
 pub(super) const MAX_BLACK: u8 = 16;
 
-/// Maximum of what can only be labels, where nothing is brighter: they are exact, and 1 is not black.
+/// Maximum of what can only be labels, where nothing is brighter: they are exact, and 1 is not
+/// black.
 const MAX_LABEL: u8 = 40;
 
 /// From this value on, a gray may be white that a program changed a little.
@@ -95,7 +97,8 @@ impl MaskReading {
     }
 }
 
-/// Returns the color that a value stands for in a file with this palette, and how far off it may be.
+/// Returns the color that a value stands for in a file with this palette, and how far off it may
+/// be.
 fn color_of(value: HeadValue, palette: &[[u8; 3]]) -> Option<([u8; 3], u8)> {
     match value {
         HeadValue::Color(color) => Some((color, NOISE[1])),
@@ -399,7 +402,8 @@ fn has_white(tallies: &[Tally]) -> bool {
     white > 0 && 1000 * white >= visible
 }
 
-/// Returns the gray that one file is drawn in instead of white, if it covers a hundredth of the picture.
+/// Returns the gray that one file is drawn in instead of white, if it covers a hundredth of the
+/// picture.
 fn gray_of(tallies: &[Tally]) -> Option<u8> {
     let color = drawn_in(tallies, MAX_BLACK).filter(|color| chroma(*color) <= MAX_CHROMA)?;
     let pixels = |is: &dyn Fn(u8) -> bool| {
@@ -428,8 +432,8 @@ fn levels(tallies: &[Tally]) -> Vec<Tally> {
     large.copied().collect()
 }
 
-/// Returns whether grays between black and white are labels of an area. Unknown pixels of a trimap are a band around
-/// all white, which then does not touch black.
+/// Returns whether grays between black and white are labels of an area. Unknown pixels of a trimap
+/// are a band around all white, which then does not touch black.
 fn is_area(grays: &[Tally], seen: &[Tally]) -> bool {
     let white = seen.iter().filter(|t| brightest(t.color) >= ALMOST_WHITE);
     let [gray_edges, white_edges] =
@@ -440,7 +444,8 @@ fn is_area(grays: &[Tally], seen: &[Tally]) -> bool {
     least * even(grays) > even(seen)
 }
 
-/// Returns the one gray or color that these are drawn in on black, soft edges and the noise of JPEG allowed.
+/// Returns the one gray or color that these are drawn in on black, soft edges and the noise of JPEG
+/// allowed.
 fn drawn_in(tallies: &[Tally], black: u8) -> Option<[u8; 3]> {
     let seen: Vec<&Tally> = tallies.iter().filter(|t| brightest(t.color) > black).collect();
     let most = seen.iter().max_by_key(|t| (t.pixels, std::cmp::Reverse(t.color)))?;

@@ -291,9 +291,9 @@ fn complete(folder: &CaptureFolder, views: &[View], source: &mut Source, listing
     }
 }
 
-/// Checks that the head masks exist that `options` require. Without masks, everything in view would be reconstructed as part
-/// of the head, which [`MaskSource::None`] must allow explicitly. Held-out views need no mask; at least half of the others
-/// must have one.
+/// Checks that the head masks exist that `options` require. Without masks, everything in view would
+/// be reconstructed as part of the head, which [`MaskSource::None`] must allow explicitly. Held-out
+/// views need no mask; at least half of the others must have one.
 pub fn require_masks(capture: &Capture, options: &CaptureOptions) -> Result<()> {
     if matches!(options.masks, MaskSource::None | MaskSource::Clicks) {
         return Ok(());
@@ -338,8 +338,8 @@ fn full_name(view: &View) -> String {
     format!("{}.{ending}", view.name)
 }
 
-/// Returns whether the alpha channels are opaque, by three photographs: an exporter that adds an opaque channel adds it to
-/// all.
+/// Returns whether the alpha channels are opaque, by three photographs: an exporter that adds an
+/// opaque channel adds it to all.
 fn all_opaque(
     views: &[View],
     kept: &[(CameraFrame, PictureInfo)],
@@ -369,7 +369,8 @@ pub const MASK_HINT: &str = "correct masks, photograph or camera, or remove the 
 /// The finding for an inverted mask.
 const INVERTED: &str = "looks inverted: white must keep the head";
 
-/// Refuses a view whose mask cannot be right by itself: it is inverted, or the photograph is black inside it.
+/// Refuses a view whose mask cannot be right by itself: it is inverted, or the photograph is black
+/// inside it.
 pub fn refuse(view: &str, photo: &Photo, mask: &Gray) -> Result<()> {
     let head = || photo.rgb.iter().zip(&mask.values).filter(|(_, m)| **m > 127).map(|(rgb, _)| rgb);
     let (all, lit) = (head().count(), head().filter(|rgb| rgb.iter().any(|&v| v > MAX_BLACK)).count());
@@ -383,8 +384,9 @@ pub fn refuse(view: &str, photo: &Photo, mask: &Gray) -> Result<()> {
     Err(Error::cannot(problem, MASK_HINT))
 }
 
-/// Returns why a mask is suspicious as the mask of a head: empty, all white, probably inverted, touching three borders or
-/// more. These are warnings for a user to check; [`refuse`] has the errors.
+/// Returns why a mask is suspicious as the mask of a head: empty, all white, probably inverted,
+/// touching three borders or more. These are warnings for a user to check; [`refuse`] has the
+/// errors.
 pub fn findings(mask: &Gray) -> Vec<&'static str> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let brightest = mask.values.iter().copied().max().unwrap_or(0);

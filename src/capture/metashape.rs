@@ -1,12 +1,14 @@
-//! Agisoft Metashape's exported cameras: an XML file with sensors, cameras and how the chunk sits in the world.
+//! Agisoft Metashape's exported cameras: an XML file with sensors, cameras and how the chunk sits
+//! in the world.
 //!
 //! Camera axes point right, down and ahead; principal points are offsets from the middle of the
-//! picture. Metashape's P1 and P2 are OpenCV's p2 and p1, B1 is added to the horizontal focal length,
-//! and K4 multiplies r⁸ (Metashape manual, appendix D). Of a perspective lens that coefficient is
-//! refused, as are P3 and P4, and skew that could be seen.
+//! picture. Metashape's P1 and P2 are OpenCV's p2 and p1, B1 is added to the horizontal focal
+//! length, and K4 multiplies r⁸ (Metashape manual, appendix D). Of a perspective lens that
+//! coefficient is refused, as are P3 and P4, and skew that could be seen.
 //!
 //! The slaves of a rig have a master instead of a `transform`; their sensors have a rotation and a
-//! location in it, in the unit of the chunk: `chunk_from_slave = chunk_from_master · master_from_slave`.
+//! location in it, in the unit of the chunk:
+//! `chunk_from_slave = chunk_from_master · master_from_slave`.
 
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join, parse_xml, shortened};
 use super::frame::{self, CameraFrame, Listing};
@@ -136,8 +138,8 @@ fn choose_chunk<'a, 'i>(
     Ok(*chunk)
 }
 
-/// Returns the cameras of one component, where several were aligned apart and have no place in a common
-/// world: of the active one, else of the largest.
+/// Returns the cameras of one component, where several were aligned apart and have no place in a
+/// common world: of the active one, else of the largest.
 fn of_one_world<'a, 'i>(
     placed: Vec<Placed<'a, 'i>>,
     chunk: Node<'a, 'i>,
@@ -179,7 +181,8 @@ fn is_off(node: Node) -> bool {
     matches!(node.attribute("enabled"), Some("0" | "false"))
 }
 
-/// Returns the photographs' names: labels, which have no folders. Of equal ones, the group is the folder.
+/// Returns the photographs' names: labels, which have no folders. Of equal ones, the group is the
+/// folder.
 fn labels(placed: &[Placed]) -> Vec<String> {
     let (mut seen, mut twice) = (HashSet::new(), HashSet::new());
     for placed in placed {

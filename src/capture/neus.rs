@@ -1,9 +1,10 @@
 //! NeuS, IDR and DTU: `cameras_sphere.npz` or `cameras.npz`.
 //!
-//! `world_mat_I` is the projection K [R | t] of photograph I in name order, for an OpenCV camera; `scale_mat_I` takes
-//! the unit sphere around the object into the same world, which stays as it is here: meshes come out where the
-//! dataset's own do. NeuS sends its rays through whole numbers as the centers of pixels, so principal points move
-//! by half a pixel (NeuS, `models/dataset.py`, `gen_rays_at`).
+//! `world_mat_I` is the projection K [R | t] of photograph I in name order, for an OpenCV camera;
+//! `scale_mat_I` takes the unit sphere around the object into the same world, which stays as it is
+//! here: meshes come out where the dataset's own do. NeuS sends its rays through whole numbers as
+//! the centers of pixels, so principal points move by half a pixel (NeuS, `models/dataset.py`,
+//! `gen_rays_at`).
 
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame};
 use super::frame::{CameraFrame, Intrinsics, Listing};
@@ -79,9 +80,9 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
 /// Masks by the paths of their photographs.
 type Masks<'m> = BTreeMap<&'m str, &'m str>;
 
-/// Returns the mask of each photograph: by name if each has one of its name; else in order, as NeuS pairs them, if they are
-/// as many; else again by name if most have one. Where the orders by name and by number pair them otherwise, both pairings
-/// are returned, that by name first.
+/// Returns the mask of each photograph: by name if each has one of its name; else in order, as NeuS
+/// pairs them, if they are as many; else again by name if most have one. Where the orders by name
+/// and by number pair them otherwise, both pairings are returned, that by name first.
 fn paired_masks<'m>(
     plain: &'m [String],
     numbered: &'m [String],
@@ -128,8 +129,8 @@ fn paired_masks<'m>(
     vec![plain.iter().zip(&pairs.files).filter_map(of_name).collect()]
 }
 
-/// Returns the pairs of as many photographs and masks whose names differ: by number where all have the same numbers, else by
-/// their places in order.
+/// Returns the pairs of as many photographs and masks whose names differ: by number where all have
+/// the same numbers, else by their places in order.
 fn paired_in_order<'m>(plain: &'m [String], numbered: &'m [String], masks: &'m [String]) -> Vec<Masks<'m>> {
     let in_order: Masks = plain.iter().map(String::as_str).zip(masks.iter().map(String::as_str)).collect();
     if !order::is_open(plain) && !order::is_open(masks) {
@@ -165,7 +166,8 @@ fn matrix(arrays: &BTreeMap<String, Npy>, name: &str) -> Result<[f64; 12], Strin
     }
 }
 
-/// K, rotation and position of a projection: a QR decomposition from the last row up (Hartley and Zisserman, §6.2.4).
+/// K, rotation and position of a projection: a QR decomposition from the last row up (Hartley and
+/// Zisserman, §6.2.4).
 fn decompose(p: &[f64; 12]) -> Result<(Intrinsics, DMat3, DVec3), String> {
     let row = |k: usize| DVec3::new(p[4 * k], p[4 * k + 1], p[4 * k + 2]);
     let (m, last) = (DMat3::from_cols(row(0), row(1), row(2)).transpose(), DVec3::new(p[3], p[7], p[11]));

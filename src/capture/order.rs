@@ -1,4 +1,5 @@
-//! The order of pictures that a camera file does not name: by the bytes of their names, or by number.
+//! The order of pictures that a camera file does not name: by the bytes of their names, or by
+//! number.
 
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
@@ -30,15 +31,17 @@ pub(super) fn compare(a: &str, b: &str) -> Ordering {
     }
 }
 
-/// Returns names in their order by number, `view2` before `view10`, which are the other way round by their bytes.
+/// Returns names in their order by number, `view2` before `view10`, which are the other way round
+/// by their bytes.
 pub fn by_number(names: &[String]) -> Vec<String> {
     let mut sorted = names.to_vec();
     sorted.sort_by(|a, b| compare(a, b));
     sorted
 }
 
-/// Returns whether files in the order of their names have another one by number, which takes names that differ in their numbers
-/// alone: those of a quarter of the files at least, such as one of four rings. Random names have no order by number.
+/// Returns whether files in the order of their names have another one by number, which takes names
+/// that differ in their numbers alone: those of a quarter of the files at least, such as one of
+/// four rings. Random names have no order by number.
 pub(super) fn is_open(sorted: &[String]) -> bool {
     let mut alike: BTreeMap<String, Vec<&str>> = BTreeMap::new();
     for name in sorted {

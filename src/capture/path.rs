@@ -1,9 +1,9 @@
 //! Cameras of novel views: an orbit around the head, or a file.
 //!
 //! Two kinds of JSON are read: nerfstudio's camera path (`camera_path`, made in its viewer) and
-//! `transforms.json` (`frames`). Both give camera-to-world matrices with OpenGL axes, as ours are, and
-//! must be in the dataset's own world. A path from nerfstudio's viewer is only if its training ran
-//! with `--orientation-method none --center-method none --auto-scale-poses False`.
+//! `transforms.json` (`frames`). Both give camera-to-world matrices with OpenGL axes, as ours are,
+//! and must be in the dataset's own world. A path from nerfstudio's viewer is only if its training
+//! ran with `--orientation-method none --center-method none --auto-scale-poses False`.
 
 use super::transforms::camera_like;
 use glam::{BVec3, DMat3, DVec3, Vec3};
@@ -48,16 +48,17 @@ fn check_count(found: usize) -> Result<()> {
 /// Maximum part of a picture that the head fills in `orbit`, so that it does not touch the border.
 const FILLED: f64 = 0.95;
 
-/// Returns `count` cameras on a circle around the middle of `bounds`, evenly spaced, all looking at it.
+/// Returns `count` cameras on a circle around the middle of `bounds`, evenly spaced, all looking at
+/// it.
 ///
-/// The circle lies across `up` at the mean height and mean distance of the capture's cameras, or so much
-/// farther away, in the same direction, that every picture shows all of `bounds`. It begins where the mean
-/// direction of the cameras is. Lens and picture size are those of the first camera, without
-/// distortion and with the middle of the picture as principal point.
+/// The circle lies across `up` at the mean height and mean distance of the capture's cameras, or so
+/// much farther away, in the same direction, that every picture shows all of `bounds`. It begins
+/// where the mean direction of the cameras is. Lens and picture size are those of the first camera,
+/// without distortion and with the middle of the picture as principal point.
 ///
 /// # Errors
-/// Fails if `cameras` is empty, `up` has no direction, `count` is 0 or beyond 100,000, or the cameras lie on the axis
-/// of the circle.
+/// Fails if `cameras` is empty, `up` has no direction, `count` is 0 or beyond 100,000, or the
+/// cameras lie on the axis of the circle.
 ///
 /// # Examples
 ///
@@ -102,7 +103,8 @@ pub fn orbit(cameras: &[Camera], bounds: Aabb, up: Vec3, count: usize) -> Result
         DMat3::from_cols(right, back.cross(right), back)
     };
     let rotations: Vec<DMat3> = (0..count).map(turned).collect();
-    // a corner at (x, y, z) from the middle, as the camera sees it, is f·x / (distance − z) from the picture's middle
+    // a corner at (x, y, z) from the middle, as the camera sees it, is f·x / (distance − z) from
+    // the picture's middle
     let reach = |focal: f64, side: u32| focal / (FILLED * side as f64 / 2.0);
     let (reach_x, reach_y) = (reach(like.fx, like.width), reach(like.fy, like.height));
     let mut distance = height.hypot(radius);
@@ -153,8 +155,8 @@ struct TransformsFrame {
     numbers: Map<String, Value>,
 }
 
-/// Reads cameras from the text of a nerfstudio camera path or a `transforms.json`. Lens parameters that the file
-/// lacks are taken from `like`.
+/// Reads cameras from the text of a nerfstudio camera path or a `transforms.json`. Lens parameters
+/// that the file lacks are taken from `like`.
 ///
 /// # Errors
 /// Fails if the text is neither, holds no cameras or too many, or if one of them is invalid.
@@ -243,8 +245,8 @@ fn side(object: &Map<String, Value>, name: &str, other: u32) -> Result<u32, Stri
     }
 }
 
-/// Returns rotation and position of a camera-to-world matrix of 3 or 4 rows. A uniform scale, which viewers leave in,
-/// is divided out.
+/// Returns rotation and position of a camera-to-world matrix of 3 or 4 rows. A uniform scale, which
+/// viewers leave in, is divided out.
 fn pose(rows: &[Vec<f64>]) -> Result<(DMat3, DVec3), String> {
     if !(3..=4).contains(&rows.len()) || rows.iter().any(|r| r.len() != 4) {
         return Err("its matrix is not 4 × 4".into());
@@ -310,7 +312,8 @@ mod tests {
 
     #[test]
     fn an_orbit_never_cuts_the_bottom_of_a_bust() {
-        // 5 away, cameras for a face: the bust is 4 high, and wide across where it is seen from the side
+        // 5 away, cameras for a face: the bust is 4 high, and wide across where it is seen from the
+        // side
         let bounds = Aabb { min: Vec3::new(-1.5, -2.0, -1.0), max: Vec3::new(1.5, 2.0, 1.0) };
         for (width, height) in [(400, 200), (200, 400), (300, 300)] {
             let camera = Camera { width, height, ..like() };

@@ -15,8 +15,8 @@ const MARGIN: usize = 3;
 /// Minimum number of pixels to compare.
 const MIN_PIXELS: usize = 1000;
 
-/// A photograph is blurred below this share of the median photograph's sharpness. Sharp captures have 0.82 at least; a blur of
-/// one pixel's deviation leaves 0.55 to 0.70.
+/// A photograph is blurred below this share of the median photograph's sharpness. Sharp captures
+/// have 0.82 at least; a blur of one pixel's deviation leaves 0.55 to 0.70.
 const BLURRED: f64 = 0.78;
 
 /// A head is overexposed from this share of saturated pixels on.

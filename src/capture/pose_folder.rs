@@ -1,6 +1,6 @@
-//! Folders of poses: `pose/NAME.txt` (or `poses/`) has the camera-to-world matrix of an OpenCV camera for
-//! each photograph, one more file the intrinsics. NSVF and SRN call it `intrinsics.txt`, beside `rgb/`;
-//! ScanNet's exports `intrinsic/intrinsic_color.txt`, beside `color/`.
+//! Folders of poses: `pose/NAME.txt` (or `poses/`) has the camera-to-world matrix of an OpenCV
+//! camera for each photograph, one more file the intrinsics. NSVF and SRN call it `intrinsics.txt`,
+//! beside `rgb/`; ScanNet's exports `intrinsic/intrinsic_color.txt`, beside `color/`.
 //!
 //! Intrinsics are a matrix, or begin with a line `f cx cy 0` (SRN, `util.parse_intrinsics`), which
 //! a line `height width` may follow. Rays go through whole numbers as the centers of pixels (NSVF,
@@ -170,7 +170,8 @@ fn numbers(folder: &CaptureFolder, file: &str) -> Result<Vec<Vec<f64>>> {
     Ok(lines.into_iter().filter(|line| !line.is_empty()).collect())
 }
 
-/// Returns rotation and position of an OpenCV camera in the world; `None` where the pose is not finite.
+/// Returns rotation and position of an OpenCV camera in the world; `None` where the pose is not
+/// finite.
 fn read_pose(folder: &CaptureFolder, file: &str) -> Result<Option<(DMat3, DVec3)>> {
     let values = numbers(folder, file)?.concat();
     let wrong = |text: String| in_frame(file, &stem(file), text);

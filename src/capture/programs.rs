@@ -1,4 +1,5 @@
-//! What other programs leave in a folder: how it is recognized, and the way from there to a capture.
+//! What other programs leave in a folder: how it is recognized, and the way from there to a
+//! capture.
 
 use super::folder::{FolderEntries, has_ending, join};
 use tiface_base::io;

@@ -1,9 +1,10 @@
 //! RealityCapture (RealityScan): a CSV file of all cameras, or one XMP file beside each photograph.
 //!
-//! Focal lengths are those of a picture 36 wide, principal points offsets from the middle; both are measured by the
-//! picture's longer side. CSV (`Internal/External camera parameters`): heading, pitch and roll in degrees, Z up; XMP: the
-//! rotation of an OpenCV camera by rows, and its position. Brown's model with k1, k2, k3 and, in that order, t1 and
-//! t2 as OpenCV's p1 and p2; k4 and the division model are refused. (Capturing Reality, "XMP camera math"; nerfstudio,
+//! Focal lengths are those of a picture 36 wide, principal points offsets from the middle; both are
+//! measured by the picture's longer side. CSV (`Internal/External camera parameters`): heading,
+//! pitch and roll in degrees, Z up; XMP: the rotation of an OpenCV camera by rows, and its
+//! position. Brown's model with k1, k2, k3 and, in that order, t1 and t2 as OpenCV's p1 and p2; k4
+//! and the division model are refused. (Capturing Reality, "XMP camera math"; nerfstudio,
 //! `realitycapture_utils.py`.)
 
 use super::folder::{
@@ -119,7 +120,8 @@ fn entry(heading: &Heading, values: &[String]) -> Result<Entry, String> {
     })
 }
 
-/// Returns the folder below the capture whose photographs have XMP files of RealityCapture beside them.
+/// Returns the folder below the capture whose photographs have XMP files of RealityCapture beside
+/// them.
 pub(super) fn xmp_folder(root: &Path) -> Option<PathBuf> {
     let inside = FolderEntries::of(root).photographs().into_iter();
     let mut folders = [root.to_path_buf()].into_iter().chain(inside);

@@ -1,16 +1,18 @@
 //! Locates the head: a box from cameras and masks, and with masks its visual hull.
 //!
-//! With masks: the rays through the masks' centroids meet near the head. A cube around that point, wide
-//! enough for every frame, is carved by the silhouettes at a coarse resolution, shrunk to the remaining cells, and
-//! carved again until it no longer shrinks. Space outside a frame, beyond a border that the mask touches, is undecided
-//! for that view. So two rules define the end of a body that the frames cut:
+//! With masks: the rays through the masks' centroids meet near the head. A cube around that point,
+//! wide enough for every frame, is carved by the silhouettes at a coarse resolution, shrunk to the
+//! remaining cells, and carved again until it no longer shrinks. Space outside a frame, beyond a
+//! border that the mask touches, is undecided for that view. So two rules define the end of a body
+//! that the frames cut:
 //!
-//! - the *box* is drawn around the cells that touch the masks of a third of the views (three at least):
-//!   farther out, too few cameras see the body to reconstruct it;
-//! - the *hull* is everything inside that box that touches three masks: the space in which the head may still be.
+//! - the *box* is drawn around the cells that touch the masks of a third of the views (three at
+//!   least): farther out, too few cameras see the body to reconstruct it;
+//! - the *hull* is everything inside that box that touches three masks: the space in which the head
+//!   may still be.
 //!
-//! Without masks, the frames of the cameras and the dataset's points or box decide (`frusta`); a given box, and the
-//! published one, override both ([`SceneBox`]).
+//! Without masks, the frames of the cameras and the dataset's points or box decide (`frusta`); a
+//! given box, and the published one, override both ([`SceneBox`]).
 
 mod frusta;
 mod scene_box;
@@ -34,8 +36,8 @@ use tiface_base::{Error, Result};
 /// The head's box and how it sits in the world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scene {
-    /// The box's longest side fills [-1, 1], to within a tenth. Up is an axis of the scene where masks locate the head;
-    /// elsewhere the scene has the axes of the world.
+    /// The box's longest side fills [-1, 1], to within a tenth. Up is an axis of the scene where
+    /// masks locate the head; elsewhere the scene has the axes of the world.
     pub scene_from_world: Similarity,
     /// The tight box in scene coordinates, within [-1, 1]³.
     pub aabb: Aabb,
@@ -62,7 +64,8 @@ pub struct SceneOptions {
     pub names: Vec<String>,
     /// The dataset's own box of the head; used with fewer than two masks.
     pub focus: Option<Aabb>,
-    /// Up in the world, a unit vector: the scene is turned to have it as the nearest axis, so that the box ends level.
+    /// Up in the world, a unit vector: the scene is turned to have it as the nearest axis, so that
+    /// the box ends level.
     pub up: Option<Vec3>,
 }
 
@@ -74,8 +77,8 @@ impl Default for SceneOptions {
 
 /// Returns the scene: the box, and with masks the hull; warnings name suspicious views.
 ///
-/// `masks[i]` belongs to `cameras[i]`; a view without one does not carve. Masks may have another size than
-/// their camera. Empty and all-white masks are left out with a warning.
+/// `masks[i]` belongs to `cameras[i]`; a view without one does not carve. Masks may have another
+/// size than their camera. Empty and all-white masks are left out with a warning.
 ///
 /// ```
 /// use tiface::capture::scene::{self, SceneOptions};
@@ -360,7 +363,8 @@ fn head_outside(seen: usize, cameras: usize) -> Error {
     )
 }
 
-/// Returns half the side of a cube around `center` that covers every frame, and does not reach the cameras.
+/// Returns half the side of a cube around `center` that covers every frame, and does not reach the
+/// cameras.
 fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
     let wide = cameras.iter().map(|c| {
         let (x, y) = (0.5 * c.width as f64 / c.fx, 0.5 * c.height as f64 / c.fy);
@@ -373,8 +377,8 @@ fn first_half(cameras: &[&Camera], center: DVec3) -> f64 {
 /// Plausible heights of a head, meters: with or without neck and shoulders, of a child or an adult.
 const HEIGHTS_M: std::ops::RangeInclusive<f64> = 0.15..=0.6;
 
-/// Returns the height of the hull along `up`, in dataset units; `None` without a hull, because the end of the head is then
-/// unknown.
+/// Returns the height of the hull along `up`, in dataset units; `None` without a hull, because the
+/// end of the head is then unknown.
 pub fn height(scene: &Scene, up: Vec3) -> Option<f64> {
     let hull = scene.hull.as_ref()?;
     let r = hull.resolution;
@@ -386,7 +390,8 @@ pub fn height(scene: &Scene, up: Vec3) -> Option<f64> {
     (low <= high).then(|| f64::from(high - low + 1.0) * cell)
 }
 
-/// Returns a warning if the height is implausible for a head, probably because `capture.unit_m` is wrong.
+/// Returns a warning if the height is implausible for a head, probably because `capture.unit_m` is
+/// wrong.
 pub fn doubtful_height(height: f64, unit_m: f64) -> Option<String> {
     let height_m = height * unit_m;
     (!HEIGHTS_M.contains(&height_m)).then(|| {
@@ -410,7 +415,8 @@ pub fn world_box(scene: &Scene) -> Aabb {
     corners.fold(none, |b, p| Aabb { min: b.min.min(p), max: b.max.max(p) })
 }
 
-/// Returns a line that describes a scene: its box in world units and the share of it that the hull fills.
+/// Returns a line that describes a scene: its box in world units and the share of it that the hull
+/// fills.
 pub fn describe(scene: &Scene) -> String {
     let b = world_box(scene);
     let size = b.size();

@@ -1,5 +1,5 @@
-//! Cameras of photographs that have none: structure from motion by COLMAP (Schönberger, Frahm 2016), a program that is
-//! installed beside this one.
+//! Cameras of photographs that have none: structure from motion by COLMAP (Schönberger, Frahm
+//! 2016), a program that is installed beside this one.
 //!
 //! Photographs, or the sharpest frames of a video, are copied to `OUT/images/`, with masks to
 //! `OUT/masks/`; COLMAP works in `OUT/colmap/`, where its log stays. The model is opened as a
@@ -9,8 +9,9 @@
 //! registered, a second attempt accepts weak features as well, which smooth skin has more of, and a
 //! third one searches the whole photographs.
 //!
-//! The mapper fits one coefficient of distortion, because few views cannot tell more. A lens that all photographs share is
-//! then refined as OPENCV's model with its principal point where that is observable: a wide lens and many points.
+//! The mapper fits one coefficient of distortion, because few views cannot tell more. A lens that
+//! all photographs share is then refined as OPENCV's model with its principal point where that is
+//! observable: a wide lens and many points.
 
 use super::colmap::{self, ModelFiles, SparseModel};
 use super::folder::{CaptureFolder, FolderEntries, is_common_name, is_nameable, photographs, unnameable};
@@ -46,15 +47,18 @@ const ENOUGH: f64 = 0.8;
 /// Reprojection errors above this are warned of. Those of sharp photographs are below one pixel.
 const MAX_ERROR_PX: f64 = 2.0;
 
-/// Most pictures of which each is matched with every other; frames of a longer video with those near in time.
+/// Most pictures of which each is matched with every other; frames of a longer video with those
+/// near in time.
 const MAX_EXHAUSTIVE: usize = 200;
 
-/// A principal point is refined with this many registered photographs, of this many points each, and a focal length of at
-/// most this many long sides. On a head of 24 photographs at 2.6 long sides and 180 points it moved by a quarter of the
-/// width; on one of 50 at 0.7 and 690 it came within half a pixel of its calibration.
+/// A principal point is refined with this many registered photographs, of this many points each,
+/// and a focal length of at most this many long sides. On a head of 24 photographs at 2.6 long
+/// sides and 180 points it moved by a quarter of the width; on one of 50 at 0.7 and 690 it came
+/// within half a pixel of its calibration.
 const OBSERVABLE: (usize, usize, f64) = (20, 300, 1.5);
 
-/// How far refinement may move focal length and principal point to be believed, as a share of the longest side.
+/// How far refinement may move focal length and principal point to be believed, as a share of the
+/// longest side.
 const MAX_MOVE: f64 = 0.05;
 
 /// Bytes of COLMAP's database for a picture: 8192 features of 128 bytes, and six numbers for where
@@ -102,7 +106,8 @@ pub struct Solution {
     pub registered: usize,
     /// Photographs without a camera.
     pub left_out: Vec<String>,
-    /// Mean reprojection error, pixels, of the mapper's model: before the principal point is refined.
+    /// Mean reprojection error, pixels, of the mapper's model: before the principal point is
+    /// refined.
     pub error_px: f64,
     /// Whether features were searched inside head masks only.
     pub masked: bool,
@@ -226,8 +231,8 @@ impl<'a> Search<'a> {
         matches!(self.work, Planned::Nothing(_))
     }
 
-    /// Finds the cameras, and leaves a capture; if the search [is done](Self::is_done), returns what
-    /// was found before.
+    /// Finds the cameras, and leaves a capture; if the search [is done](Self::is_done), returns
+    /// what was found before.
     ///
     /// # Errors
     ///
@@ -288,7 +293,8 @@ fn copy_photographs(
     output.list(&files)?;
     convert::copy_for_colmap(capture, &sfm.out)?;
     let limits = &sfm.limits;
-    // COLMAP ignores what is black: half transparent hair is the head's outline, which shows the background as well
+    // COLMAP ignores what is black: half transparent hair is the head's outline, which shows the
+    // background as well
     capture.views.par_iter().zip(names).try_for_each(|(view, name)| -> Result<()> {
         let Some(mut mask) = view.load_mask(limits)? else { return Ok(()) };
         mask.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
@@ -328,7 +334,8 @@ fn copy_frames(
     Ok(names)
 }
 
-/// Hands on the sharpest of each `every` frames, with its number, and that of those left over at the end.
+/// Hands on the sharpest of each `every` frames, with its number, and that of those left over at
+/// the end.
 fn sharpest(
     frames: impl Iterator<Item = Result<Photo>>,
     every: usize,
@@ -359,7 +366,8 @@ fn sharpness(photo: &Photo) -> f64 {
     along.chain(down).sum::<i64>() as f64 / photo.rgb.len().max(1) as f64
 }
 
-/// Opens a folder of photographs as a capture whose cameras say nothing, for its photographs and masks.
+/// Opens a folder of photographs as a capture whose cameras say nothing, for its photographs and
+/// masks.
 fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     let shown = root.display();
     if io::is_file(root) {
@@ -634,7 +642,8 @@ impl Work<'_> {
         Err(Error::cannot(what, "repeat the command: COLMAP does not find the same twice"))
     }
 
-    /// Returns the folder of the model with the lens refined; `None` where its principal point is not observable.
+    /// Returns the folder of the model with the lens refined; `None` where its principal point is
+    /// not observable.
     fn refined(&self, model: &Model) -> Result<Option<PathBuf>> {
         let SparseModel { names, sightings, .. } = &model.found;
         let Some((side, before)) = model.found.shared_lens().filter(|_| self.shared) else { return Ok(None) };

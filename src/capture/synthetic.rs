@@ -1,8 +1,9 @@
-//! The demo capture: an analytic head photographed among the lamps of a small light stage, with exact truth.
+//! The demo capture: an analytic head photographed among the lamps of a small light stage, with
+//! exact truth.
 //!
 //! Written in the layout of a real capture (`images/`, `masks/`, `transforms.json`), so that the
-//! whole pipeline runs on it unchanged; and its surface is a formula ([`SyntheticHead`]), so that what
-//! comes out can be measured against the truth instead of against another reconstruction.
+//! whole pipeline runs on it unchanged; and its surface is a formula ([`SyntheticHead`]), so that
+//! what comes out can be measured against the truth instead of against another reconstruction.
 //!
 //! Same options, same bytes.
 
@@ -113,16 +114,16 @@ pub fn check(options: &SyntheticOptions) -> Result<()> {
 }
 
 /// Photographs the head and writes the capture folder `dir`: `images/`, `masks/` (soft),
-/// `face_masks/` (binary), `transforms.json` with every view and its split, `transforms_train.json`,
-/// `transforms_test.json` and `README.md`. `transforms.json` comes last: a capture that has one is
-/// complete.
+/// `face_masks/` (binary), `transforms.json` with every view and its split,
+/// `transforms_train.json`, `transforms_test.json` and `README.md`. `transforms.json` comes last: a
+/// capture that has one is complete.
 pub fn write_capture(dir: &Path, options: &SyntheticOptions) -> Result<()> {
     check(options)?;
     write_photographs(dir, &cameras(options), &Similarity::IDENTITY, options.seed, &readme(options))
 }
 
-/// Photographs the head with these cameras (all of the intrinsics of the first) and writes the capture folder `dir`,
-/// as [`write_capture`] does, in another world than the head's.
+/// Photographs the head with these cameras (all of the intrinsics of the first) and writes the
+/// capture folder `dir`, as [`write_capture`] does, in another world than the head's.
 pub fn write_photographs(
     dir: &Path,
     cameras: &[(Camera, bool)],
@@ -154,8 +155,9 @@ pub fn write_photographs(
     Ok(())
 }
 
-/// Writes `valid/NAME.npy` for every view of a capture: a border of this width is not usable, as in the ILSH
-/// dataset, whose photographs are undistorted. To be written before the capture, whose cameras say that it is complete.
+/// Writes `valid/NAME.npy` for every view of a capture: a border of this width is not usable, as in
+/// the ILSH dataset, whose photographs are undistorted. To be written before the capture, whose
+/// cameras say that it is complete.
 pub fn write_borders(dir: &Path, options: &SyntheticOptions, border: u32) -> Result<()> {
     let bytes = border_bytes(options.width, options.height, border);
     io::create_folder(&dir.join("valid"))?;
@@ -255,7 +257,8 @@ pub(crate) mod shared {
     use std::path::{Path, PathBuf};
     use std::sync::{Arc, Mutex, OnceLock};
 
-    /// The files of a folder with their bytes, in memory: nothing is left in the folder for temporary files.
+    /// The files of a folder with their bytes, in memory: nothing is left in the folder for
+    /// temporary files.
     #[derive(Default)]
     pub(crate) struct Files(Vec<(PathBuf, Vec<u8>)>);
 
@@ -287,8 +290,8 @@ pub(crate) mod shared {
         }
     }
 
-    /// Does what [`super::write_capture`] does. Photographs of the same options are taken once a test program; every test gets
-    /// files of its own.
+    /// Does what [`super::write_capture`] does. Photographs of the same options are taken once a
+    /// test program; every test gets files of its own.
     pub(crate) fn write_capture(dir: &Path, options: &SyntheticOptions) {
         type Taken = Arc<OnceLock<Files>>;
         static CAPTURES: Mutex<Vec<(SyntheticOptions, Taken)>> = Mutex::new(Vec::new());

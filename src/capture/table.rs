@@ -1,8 +1,8 @@
 //! Tables of text as other programs export them: their encoding, what separates their columns, and
 //! decimal commas.
 
-/// Returns the text of a file: UTF-8 or UTF-16, with a byte order mark or without, else Latin-1. Lines end as
-/// [`str::lines`] has it, those of old Macs, too.
+/// Returns the text of a file: UTF-8 or UTF-16, with a byte order mark or without, else Latin-1.
+/// Lines end as [`str::lines`] has it, those of old Macs, too.
 pub(super) fn decoded(bytes: &[u8]) -> String {
     let text = match utf16(bytes) {
         Some((units, unit)) => from_utf16(units, unit),
@@ -11,7 +11,8 @@ pub(super) fn decoded(bytes: &[u8]) -> String {
     if text.contains('\n') { text } else { text.replace('\r', "\n") }
 }
 
-/// Returns the bytes of UTF-16 without their mark, and how two of them make a unit; `None` for other text.
+/// Returns the bytes of UTF-16 without their mark, and how two of them make a unit; `None` for
+/// other text.
 pub(super) fn utf16(bytes: &[u8]) -> Option<(&[u8], fn([u8; 2]) -> u16)> {
     match bytes {
         [0xFF, 0xFE, rest @ ..] => Some((rest, u16::from_le_bytes)),
@@ -48,7 +49,8 @@ pub(super) struct Heading {
 }
 
 impl Heading {
-    /// Returns the heading whose first columns are called so. Comments and Excel's `sep=` may come before it.
+    /// Returns the heading whose first columns are called so. Comments and Excel's `sep=` may come
+    /// before it.
     pub fn find(text: &str, first: &[&str]) -> Option<Heading> {
         for (i, line) in text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()).take(16) {
             let separator = [';', '\t', ','].into_iter().find(|s| line.contains(*s)).unwrap_or(' ');

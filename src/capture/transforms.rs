@@ -1,9 +1,10 @@
-//! `transforms.json` and its split forms: the dialects of NeRF-Blender, instant-ngp, nerfstudio and their
-//! descendants.
+//! `transforms.json` and its split forms: the dialects of NeRF-Blender, instant-ngp, nerfstudio and
+//! their descendants.
 //!
-//! Poses are camera-to-world with OpenGL axes in all of them. Intrinsics may stand at the top or in each
-//! frame; a frame's own win. Every key is read, known to change nothing, or named ([`keys`]); `null` counts
-//! as absent. Keys of the wrong type are errors, but for some that count as absent as well, as `up` does.
+//! Poses are camera-to-world with OpenGL axes in all of them. Intrinsics may stand at the top or in
+//! each frame; a frame's own win. Every key is read, known to change nothing, or named ([`keys`]);
+//! `null` counts as absent. Keys of the wrong type are errors, but for some that count as absent as
+//! well, as `up` does.
 
 mod agreement;
 mod keys;
@@ -160,8 +161,8 @@ impl<'v> Entry<'v> {
     }
 }
 
-/// Returns the top of a file and its frames, which may be an object of named ones, or stand alone or with
-/// the whole file in a list.
+/// Returns the top of a file and its frames, which may be an object of named ones, or stand alone
+/// or with the whole file in a list.
 fn parts<'v>(
     folder: &CaptureFolder,
     file: &str,

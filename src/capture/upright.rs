@@ -1,10 +1,11 @@
 //! Where up is, by how cameras are held.
 //!
-//! Of a camera that is held level, the right axis is horizontal, however much it looks down; of one that is held on its
-//! side, the up axis is. Up `n` is therefore where each camera's image of it, `(n · right, n · up)`, lies near a
-//! multiple of 90°, and is long: a camera that looks along `n` shows nothing of it. Candidates are the normals of any two
-//! image axes of two cameras, and those axes themselves; the best one says how each camera is rolled, and cameras
-//! that are rolled back give the direction.
+//! Of a camera that is held level, the right axis is horizontal, however much it looks down; of one
+//! that is held on its side, the up axis is. Up `n` is therefore where each camera's image of it,
+//! `(n · right, n · up)`, lies near a multiple of 90°, and is long: a camera that looks along `n`
+//! shows nothing of it. Candidates are the normals of any two image axes of two cameras, and those
+//! axes themselves; the best one says how each camera is rolled, and cameras that are rolled back
+//! give the direction.
 
 use glam::{DMat3, DVec3};
 
@@ -86,7 +87,8 @@ fn spread(cameras: &[DMat3], count: usize) -> Vec<DMat3> {
     cameras.iter().step_by(cameras.len().div_ceil(count).max(1)).copied().collect()
 }
 
-/// Returns directions that are level up, an image axis, or perpendicular to two of them, each with its opposite.
+/// Returns directions that are level up, an image axis, or perpendicular to two of them, each with
+/// its opposite.
 fn candidates(cameras: &[DMat3], level: DVec3) -> Vec<DVec3> {
     let axes: Vec<DVec3> = cameras.iter().flat_map(|c| [c.x_axis, c.y_axis]).collect();
     let pairs = axes.iter().enumerate().flat_map(|(i, a)| axes[..i].iter().map(|b| a.cross(*b)));
@@ -104,8 +106,8 @@ fn score(cameras: &[DMat3], up: DVec3) -> f64 {
     cameras.iter().map(of).sum()
 }
 
-/// Returns a direction or its opposite: where most cameras are upright. Where none is upright or upside down, up is
-/// left in most pictures, as in those of a phone that are stored on their side.
+/// Returns a direction or its opposite: where most cameras are upright. Where none is upright or
+/// upside down, up is left in most pictures, as in those of a phone that are stored on their side.
 fn signed(cameras: &[DMat3], up: DVec3) -> DVec3 {
     let mut count = [0usize; 4];
     cameras.iter().for_each(|camera| count[Roll::of(camera, up).quarters] += 1);
@@ -113,15 +115,17 @@ fn signed(cameras: &[DMat3], up: DVec3) -> DVec3 {
     if (upright, left) < (down, right) { -up } else { up }
 }
 
-/// Returns a camera that is turned in its picture by so many quarters, so that what lay there is up.
+/// Returns a camera that is turned in its picture by so many quarters, so that what lay there is
+/// up.
 fn rolled_back(camera: &DMat3, quarters: usize) -> DMat3 {
     let (x, y) = (camera.x_axis, camera.y_axis);
     let (x, y) = [(x, y), (-y, x), (-x, -y), (y, -x)][quarters];
     DMat3::from_cols(x, y, camera.z_axis)
 }
 
-/// Returns the direction perpendicular to the right axes of cameras: those of a level camera are horizontal, however much it
-/// looks down. Where all look the same way, it is the mean of their ups, which is tilted by how much they look down.
+/// Returns the direction perpendicular to the right axes of cameras: those of a level camera are
+/// horizontal, however much it looks down. Where all look the same way, it is the mean of their
+/// ups, which is tilted by how much they look down.
 fn level_up(cameras: impl Iterator<Item = DMat3> + Clone) -> DVec3 {
     /// Weight of the mean.
     const MEAN: f64 = 0.01;
@@ -140,7 +144,8 @@ mod tests {
     use super::*;
     use std::f64::consts::{FRAC_PI_2, PI};
 
-    /// A camera at an azimuth that looks down by a pitch and is rolled by quarters, degrees but for the quarters.
+    /// A camera at an azimuth that looks down by a pitch and is rolled by quarters, degrees but for
+    /// the quarters.
     fn camera(azimuth: f64, pitch: f64, quarters: f64) -> DMat3 {
         let turn = DMat3::from_rotation_y(azimuth.to_radians());
         turn * DMat3::from_rotation_x(-pitch.to_radians()) * DMat3::from_rotation_z(quarters * FRAC_PI_2)
@@ -200,7 +205,8 @@ mod tests {
             let cameras = (0..16).map(|i| camera(22.5 * f64::from(i), 10.0, quarters));
             off(&cameras.collect::<Vec<_>>())
         };
-        // three quarters from up towards the right is left; one is right, where up is taken for down
+        // three quarters from up towards the right is left; one is right, where up is taken for
+        // down
         let ([left, right], all) = ([ring(3.0), ring(1.0)], 16);
         assert!(left.0 < 1.0 && left.1 == all, "{left:?}");
         assert!(right.0 > 179.0 && right.1 == all, "{right:?}");

@@ -46,7 +46,8 @@ impl From<Option<PathBuf>> for ViewMask {
 /// How what the files of a capture leave open is read.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Reading {
-    /// Photographs that the camera file does not name follow by number (2 before 10), not by the bytes of their names.
+    /// Photographs that the camera file does not name follow by number (2 before 10), not by the
+    /// bytes of their names.
     pub by_number: bool,
     /// So do masks that are paired with photographs by their order.
     pub masks_by_number: bool,
@@ -61,7 +62,8 @@ pub struct Reading {
 pub struct CaptureOptions {
     /// Whole factor by which photographs are averaged down, at least 1.
     pub downscale: u32,
-    /// Which masks to use: those of the capture, unless another source is set; none with [`MaskSource::Clicks`].
+    /// Which masks to use: those of the capture, unless another source is set; none with
+    /// [`MaskSource::Clicks`].
     pub masks: MaskSource,
     /// The only folder of masks, relative to the capture; empty to look beside the photographs.
     pub mask_dir: String,
@@ -114,21 +116,23 @@ pub struct Capture {
     pub reasons: Vec<String>,
     /// Every view with a photograph, in the dataset's order, splits one after the other.
     pub views: Vec<View>,
-    /// Unit vector up in the world: given by the dataset (`up`), else the mean of
-    /// the cameras' up vectors; the mean is snapped to a world axis within 20°, because datasets are
-    /// nearly always aligned and an export is then turned by exactly 90°.
+    /// Unit vector up in the world: given by the dataset (`up`), else the mean of the cameras' up
+    /// vectors; the mean is snapped to a world axis within 20°, because datasets are nearly always
+    /// aligned and an export is then turned by exactly 90°.
     pub up: Vec3,
     /// Where the dataset says the head is, in the world; of use where no masks say it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub focus: Option<Aabb>,
     /// Meters per dataset unit.
     pub unit_m: f64,
-    /// Where no mask is found: pictures that may be masks, and why they are not used, in a sentence.
+    /// Where no mask is found: pictures that may be masks, and why they are not used, in a
+    /// sentence.
     #[serde(skip)]
     pub stray_masks: Option<String>,
     /// Warnings, none of which stops the work.
     pub warnings: Vec<String>,
-    /// All ways in which it can be read where its files leave something open, this one first; else none.
+    /// All ways in which it can be read where its files leave something open, this one first; else
+    /// none.
     #[serde(skip)]
     pub readings: Vec<Reading>,
 }
@@ -157,18 +161,20 @@ pub struct View {
     pub region: Option<PathBuf>,
     /// Factor from the declared size to the camera's.
     pub downscale: u32,
-    /// Size of the stored photograph after any EXIF turn: `declared`, or the camera's if it is already
-    /// reduced.
+    /// Size of the stored photograph after any EXIF turn: `declared`, or the camera's if it is
+    /// already reduced.
     pub photo_size: (u32, u32),
-    /// EXIF orientation, 5 to 8, that takes a mask which lies on its side to the photograph as it is read: the turn of
-    /// the photograph's EXIF for a mask of the stored pixels, else its inverse.
+    /// EXIF orientation, 5 to 8, that takes a mask which lies on its side to the photograph as it
+    /// is read: the turn of the photograph's EXIF for a mask of the stored pixels, else its
+    /// inverse.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub side_turn: Option<u8>,
     /// Size the cameras were calibrated for, before downscaling.
     pub declared: (u32, u32),
     /// The file that declares it.
     pub declared_by: String,
-    /// The EXIF orientation by which the stored photograph is turned although its size does not ask for it.
+    /// The EXIF orientation by which the stored photograph is turned although its size does not ask
+    /// for it.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub turn: Option<u8>,
     /// Orientation of the pictures of its mask, its usable pixels and its region.
@@ -190,7 +196,8 @@ impl Capture {
         self.views.iter_mut().for_each(|view| view.mask_reading = reading.clone());
     }
 
-    /// Reads every mask file once and decides how all are read, for what uses a capture without the stage `mask`.
+    /// Reads every mask file once and decides how all are read, for what uses a capture without the
+    /// stage `mask`.
     ///
     /// # Errors
     ///
@@ -317,7 +324,8 @@ impl View {
         self.head_mask(alpha.as_deref(), limits, values)
     }
 
-    /// Adds the values of this view's mask file, and the mask that was read of it, to those of other views.
+    /// Adds the values of this view's mask file, and the mask that was read of it, to those of
+    /// other views.
     pub(crate) fn survey(&self, values: Option<MaskValues>, mask: Option<&Gray>, all: &mut MaskSurvey) {
         if let (ViewMask::File(path), Some(values)) = (&self.mask, values) {
             all.add(path, values, mask);
@@ -368,8 +376,8 @@ impl View {
         Ok(Gray { width: width as u32, height: height as u32, values })
     }
 
-    /// Returns whether a picture of this size beside the photograph, such as a mask, has to be turned as
-    /// [`View::side_turn`] says.
+    /// Returns whether a picture of this size beside the photograph, such as a mask, has to be
+    /// turned as [`View::side_turn`] says.
     pub(super) fn turns(&self, (width, height): (u32, u32)) -> bool {
         let fits = |size| size == self.declared || size == (self.camera.width, self.camera.height);
         self.side_turn.is_some() && !fits((width, height)) && fits((height, width))
@@ -422,7 +430,8 @@ pub(super) fn undone(exif: u8) -> u8 {
     }
 }
 
-/// Returns the error for a picture whose size differs from the one that `file` declares; the hint is their ratio.
+/// Returns the error for a picture whose size differs from the one that `file` declares; the hint
+/// is their ratio.
 pub(super) fn wrong_size(
     picture: &str,
     found: (u32, u32),

@@ -1,5 +1,5 @@
-//! `tiface config`: the effective configuration, or the documentation of a key. `tiface doctor`: devices and features of this
-//! machine and build, for the choice of a device and for bug reports.
+//! `tiface config`: the effective configuration, or the documentation of a key. `tiface doctor`:
+//! devices and features of this machine and build, for the choice of a device and for bug reports.
 
 use super::options::{Common, RunTarget};
 use super::screen::print;

@@ -21,10 +21,12 @@ pub(super) struct CamerasOptions {
     #[arg(long, value_name = "N", default_value_t = 10, requires = "video")]
     #[arg(value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Calibrate a lens for each photograph, as for a rig [default: one, where sizes and EXIF focal lengths agree]
+    /// Calibrate a lens for each photograph, as for a rig [default: one, where sizes and EXIF focal
+    /// lengths agree]
     #[arg(long)]
     lens_each: bool,
-    /// Map with GLOMAP instead of COLMAP's mapper: COLMAP 4 has it, an older one needs GLOMAP beside it
+    /// Map with GLOMAP instead of COLMAP's mapper: COLMAP 4 has it, an older one needs GLOMAP
+    /// beside it
     #[arg(long)]
     glomap: bool,
 }

@@ -1,5 +1,5 @@
-//! Commands on a capture: `tiface inspect` checks it, `tiface convert` rewrites its cameras in another format,
-//! `tiface mask --page` writes a page to click on in a browser.
+//! Commands on a capture: `tiface inspect` checks it, `tiface convert` rewrites its cameras in
+//! another format, `tiface mask --page` writes a page to click on in a browser.
 
 use super::Invocation;
 use super::options::Common;
@@ -53,7 +53,8 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
     print(&format!("{shown}\n"))
 }
 
-/// Returns the settings for a capture and its folder; a run's configuration has its capture and the size of its photographs.
+/// Returns the settings for a capture and its folder; a run's configuration has its capture and the
+/// size of its photographs.
 fn capture_of(common: &Common, path: &Path) -> Result<(Config, PathBuf)> {
     let saved = capture::is_run(path).then(|| path.join("config.toml"));
     let config = common.resolve(saved.as_deref(), None, &[])?;
@@ -113,7 +114,8 @@ pub(super) fn judge(
     print(&format!("{text}report    {}\n", page.display()))
 }
 
-/// Writes the page for a capture, with existing clicks from `prompts` or the capture's own `prompts.json`.
+/// Writes the page for a capture, with existing clicks from `prompts` or the capture's own
+/// `prompts.json`.
 pub(super) fn page(invocation: &Invocation, path: Option<&Path>, prompts: Option<&Path>) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
     let destination = Out::find(common.out.as_deref(), "page")?;

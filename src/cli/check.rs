@@ -36,8 +36,9 @@ struct Against {
     by_views: Vec<ByViews>,
     /// From the other surface to the mesh: what the mesh misses.
     back: Millimeters,
-    /// ... and back from its skin and its hair where three or more training cameras look, with the signed median
-    /// (negative where the mesh is inside); only for photographs that separate the two.
+    /// ... and back from its skin and its hair where three or more training cameras look, with the
+    /// signed median (negative where the mesh is inside); only for photographs that separate the
+    /// two.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     parts: Vec<PartDistance>,
 }
@@ -115,8 +116,9 @@ struct CheckJson<'a> {
     against: Option<&'a Against>,
 }
 
-/// Returns the file itself, or the mesh of a run: the extracted surface, which lies in the dataset's world, if it is
-/// compared with another, and else the exported head; and the error if it is not the one that the run recorded.
+/// Returns the file itself, or the mesh of a run: the extracted surface, which lies in the
+/// dataset's world, if it is compared with another, and else the exported head; and the error if it
+/// is not the one that the run recorded.
 fn mesh_of(path: &Path, is_compared: bool) -> Result<(PathBuf, Option<Error>)> {
     if !capture::is_run(path) && io::is_folder(path) {
         let text = format!("`{}` is a folder, but not that of a run", path.display());
@@ -243,7 +245,8 @@ fn compare(mesh: &Mesh, origin: DVec3, other: &Path, seen_by: Option<&Path>, uni
     Ok(Against { whole: mm(whole), seen, by_views, back: mm(back), parts })
 }
 
-/// Returns skin (0) and hair (1) of each photograph's pixels, row by row. Empty if the capture does not separate them.
+/// Returns skin (0) and hair (1) of each photograph's pixels, row by row. Empty if the capture does
+/// not separate them.
 fn skin_and_hair(views: &[&View]) -> Result<Vec<Vec<Option<usize>>>> {
     // only photographs with region masks are read
     let able = views.iter().any(|v| v.region.is_some());

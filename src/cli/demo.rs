@@ -58,7 +58,8 @@ pub(super) fn run(
     run_stages(invocation, &StageCommand { product, until, target, require: &[], keys: Vec::new(), fallback })
 }
 
-/// Refuses options that the finished photographs were not made with; `given` says whether size and number are.
+/// Refuses options that the finished photographs were not made with; `given` says whether size and
+/// number are.
 fn agree(
     made: &MadeCapture,
     capture: &Path,

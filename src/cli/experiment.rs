@@ -209,8 +209,8 @@ fn print_costs(plan: &Plan, runs: &[Run], json: bool) -> Result<()> {
     Ok(())
 }
 
-/// Completes the chosen runs. Returns the sessions of all tasks, `None` for one that was not opened,
-/// and the first error.
+/// Completes the chosen runs. Returns the sessions of all tasks, `None` for one that was not
+/// opened, and the first error.
 fn make<'r>(
     plan: &'r Plan,
     runs: &'r [Run],
@@ -270,7 +270,8 @@ fn tell(folder: &Path, experiment: &Experiment, common: &Common) -> Result<()> {
     Ok(())
 }
 
-/// Returns the folder of a capture; `demo`, if no capture has this name, is the demo head, rendered into the experiment.
+/// Returns the folder of a capture; `demo`, if no capture has this name, is the demo head, rendered
+/// into the experiment.
 fn demo(path: &Path, folder: &Path, invocation: &Invocation) -> Result<PathBuf> {
     let is_capture = io::is_folder(path) && !is_run(path);
     if path != Path::new("demo") || is_capture {

@@ -69,8 +69,8 @@ fn is_own((file, format): &(PathBuf, MeshFormat), run: &Path) -> bool {
     is_there && file.file_name().is_some_and(|name| name == format!("head.{}", format.as_str()).as_str())
 }
 
-/// Returns the files to write with their formats: `--out`, files in its folder, or else files in the working directory with
-/// the run's name.
+/// Returns the files to write with their formats: `--out`, files in its folder, or else files in
+/// the working directory with the run's name.
 fn destinations(
     out: Option<&Out>,
     run: &Path,

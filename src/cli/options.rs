@@ -1,4 +1,5 @@
-//! Options that all commands share, the configuration that they result in, and the capture and run of a command.
+//! Options that all commands share, the configuration that they result in, and the capture and run
+//! of a command.
 
 use super::complete::complete_setting;
 use crate::capture::is_run;
@@ -21,7 +22,8 @@ pub(super) struct Common {
     pub run: Option<PathBuf>,
     /// Also write the result to PATH, a file or a folder
     ///
-    /// A file has the ending of its format: .glb, .obj or .ply, .json for metrics. A folder exists or ends with /.
+    /// A file has the ending of its format: .glb, .obj or .ply, .json for metrics. A folder exists
+    /// or ends with /.
     #[arg(short, long, global = true, value_name = "PATH")]
     pub out: Option<PathBuf>,
     /// Read a configuration file; repeatable, later files win
@@ -34,10 +36,12 @@ pub(super) struct Common {
     /// Set a configuration key; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE", add = ArgValueCompleter::new(complete_setting))]
     pub set: Vec<String>,
-    /// Device to train and render on: auto, cpu, wgpu, vulkan, metal or dx12; :N selects an adapter by number
+    /// Device to train and render on: auto, cpu, wgpu, vulkan, metal or dx12; :N selects an adapter
+    /// by number
     #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
     pub device: Option<String>,
-    /// Make training on a GPU bitwise reproducible, by fixed-point accumulation; on the CPU it always is
+    /// Make training on a GPU bitwise reproducible, by fixed-point accumulation; on the CPU it
+    /// always is
     #[arg(long, global = true, hide_short_help = true)]
     pub deterministic: bool,
     /// GPU memory that a training may take, GiB [default: what the driver states]
@@ -98,8 +102,8 @@ impl Common {
         }
     }
 
-    /// Returns the configuration from, in rising priority: the user's file, `TIFACE_PRESET`, the run's (`saved`),
-    /// `--config`, `--set`, options.
+    /// Returns the configuration from, in rising priority: the user's file, `TIFACE_PRESET`, the
+    /// run's (`saved`), `--config`, `--set`, options.
     ///
     /// `fallback` is the start if no source names a preset.
     pub fn resolve(
@@ -116,7 +120,8 @@ impl Common {
         let mut photographed = PathBuf::new();
         match saved {
             Some(saved) if self.preset.is_some() => {
-                // another preset starts over on the same photographs: the saved values would override all of it
+                // another preset starts over on the same photographs: the saved values would
+                // override all of it
                 photographed = Common::default().resolve(Some(saved), None, &[])?.capture.path;
             }
             saved => files.extend(saved.map(Path::to_path_buf)),

@@ -1,7 +1,8 @@
-//! `--out`: another place to write the product of a command to. One rule for all commands, checked before any work begins.
+//! `--out`: another place to write the product of a command to. One rule for all commands, checked
+//! before any work begins.
 //!
-//! A path with an ending of the product's formats is a file; an existing folder, or a path that ends in `/`, receives the
-//! product under its usual names; everything else is refused.
+//! A path with an ending of the product's formats is a file; an existing folder, or a path that
+//! ends in `/`, receives the product under its usual names; everything else is refused.
 
 use crate::config::MeshFormat;
 use crate::pipeline::{DEMO_CAPTURE, KeptHead, Session, Stage};
@@ -34,7 +35,8 @@ fn endings(product: &str) -> &'static [&'static str] {
 }
 
 impl Out {
-    /// Returns the destination that `out` means for the product of a command, named like the command. Nothing is written.
+    /// Returns the destination that `out` means for the product of a command, named like the
+    /// command. Nothing is written.
     pub fn find(out: Option<&Path>, product: &str) -> Result<Option<Out>> {
         let Some(out) = out else { return Ok(None) };
         let shown = out.display();
@@ -86,8 +88,8 @@ impl Out {
         }
     }
 
-    /// Creates the destination folder, and removes temporary files of killed commands from it: all of them in a folder that
-    /// was named, else those that begin with the file's name.
+    /// Creates the destination folder, and removes temporary files of killed commands from it: all
+    /// of them in a folder that was named, else those that begin with the file's name.
     pub fn prepare(&self) -> Result<()> {
         match self {
             Out::File(file, _) => {
@@ -150,7 +152,8 @@ pub(super) fn require_outside(path: &Path, run: &Path) -> Result<()> {
     }
 }
 
-/// Writes a head to a file, and the files that it refers to beside it; returns their paths. Warnings go to `warn`.
+/// Writes a head to a file, and the files that it refers to beside it; returns their paths.
+/// Warnings go to `warn`.
 pub(super) fn write_head(
     file: &Path,
     head: &KeptHead,
@@ -183,8 +186,8 @@ fn copy_file(from: &Path, to: &Path) -> Result<()> {
     Ok(io::write_atomic(to, &io::read_maybe_empty(from, &io::Limits::default())?)?)
 }
 
-/// Copies all files but the records of the stages, and all folders except those in `left`; in subfolders only the float
-/// views are left out.
+/// Copies all files but the records of the stages, and all folders except those in `left`; in
+/// subfolders only the float views are left out.
 fn copy_folder(from: &Path, to: &Path, left: &[&str]) -> Result<()> {
     prepare(to, "")?;
     for name in io::list_files(from)? {

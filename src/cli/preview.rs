@@ -1,5 +1,5 @@
-//! `tiface preview`: pictures of a mesh, one by one or on a sheet whose rows are named in the answer;
-//! `--page`: a viewer for the browser; `--watch`: a live page of a running run.
+//! `tiface preview`: pictures of a mesh, one by one or on a sheet whose rows are named in the
+//! answer; `--page`: a viewer for the browser; `--watch`: a live page of a running run.
 
 use super::Invocation;
 use super::options::RunTarget;
@@ -27,11 +27,12 @@ use tiface_surface::render::Look;
 /// Options of `tiface preview`.
 #[derive(Args, Debug)]
 pub(super) struct PreviewOptions {
-    /// Run, or .glb, .gltf, .obj, .ply or .stl file [default: the run in this folder, else the newest under runs/]
+    /// Run, or .glb, .gltf, .obj, .ply or .stl file [default: the run in this folder, else the
+    /// newest under runs/]
     #[arg(value_name = "RUN|FILE")]
     path: Option<PathBuf>,
-    /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (checkerboard) or wire [default:
-    /// unlit if the mesh has colors, else studio]
+    /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (checkerboard)
+    /// or wire [default: unlit if the mesh has colors, else studio]
     #[arg(long, value_name = "LOOK")]
     #[arg(value_parser = PossibleValuesParser::new(Look::ALL.map(Look::word)).map(|word| look(&word)))]
     light: Option<Look>,
@@ -42,15 +43,16 @@ pub(super) struct PreviewOptions {
     #[arg(long, value_name = "N", default_value_t = 36, value_parser = clap::value_parser!(u32).range(2..=3600))]
     #[arg(requires = "turntable")]
     frames: u32,
-    /// Render front, sides, back, top, wireframe, normals and texture coordinates on one sheet; for a run also a held-out
-    /// photograph and the error against it
+    /// Render front, sides, back, top, wireframe, normals and texture coordinates on one sheet; for
+    /// a run also a held-out photograph and the error against it
     #[arg(long, conflicts_with = "cameras")]
     sheet: bool,
-    /// Render from the cameras of a file (a nerfstudio camera path or a transforms.json), or from those of a run's
-    /// photographs: train or test
+    /// Render from the cameras of a file (a nerfstudio camera path or a transforms.json), or from
+    /// those of a run's photographs: train or test
     #[arg(long, value_name = "WHICH")]
     cameras: Option<String>,
-    /// Side of each picture, pixels [default: 1024; turntable and sheet: 512; --cameras: their own size]
+    /// Side of each picture, pixels [default: 1024; turntable and sheet: 512; --cameras: their own
+    /// size]
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     size: Option<u32>,
     /// Background: black, white or none
@@ -100,7 +102,8 @@ const TURNTABLE_ELEVATION: f64 = 0.1;
 /// Frame rate of animations.
 const FRAMES_PER_SECOND: u16 = 12;
 
-/// Pictures of the sheet: name, azimuth from the front, elevation, shading; `None` is the default shading.
+/// Pictures of the sheet: name, azimuth from the front, elevation, shading; `None` is the default
+/// shading.
 const SHEET_VIEWS: [(&str, f64, f64, Option<Look>); 8] = [
     ("front", 0.0, 0.0, None),
     ("left", FRAC_PI_2, 0.0, None),
@@ -400,7 +403,8 @@ fn no_up(up: Option<Vec3>) -> Result<()> {
 /// The live page in the run's folder.
 const WATCH_FILE: &str = "watch.html";
 
-/// Interval between checks for a stop request: the signal handler ends an idle command after half a second.
+/// Interval between checks for a stop request: the signal handler ends an idle command after half a
+/// second.
 const STOP_CHECK: Duration = Duration::from_millis(50);
 
 /// Interval between updates of the live page.
@@ -419,7 +423,8 @@ fn watch(invocation: &Invocation, path: Option<&Path>) -> Result<()> {
     let mut made: HashMap<Stage, (SystemTime, Option<Vec<u8>>)> = HashMap::new();
     let mut write = |renewed: bool| {
         let mut view = |stage: Stage, saved: SystemTime| -> Option<Vec<u8>> {
-            // the last page has to be written before the handler of signals ends the process: it shows what there is
+            // the last page has to be written before the handler of signals ends the process: it
+            // shows what there is
             let known = |(time, _): &&(SystemTime, _)| !renewed || *time == saved;
             if let Some((_, picture)) = made.get(&stage).filter(known) {
                 return picture.clone();

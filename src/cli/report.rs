@@ -24,7 +24,8 @@ pub(super) fn run(invocation: &Invocation, runs: &[PathBuf], table: bool) -> Res
     }
 }
 
-/// Writes the page of one run and its curves as CSV into the run, and a copy of the page to `--out`.
+/// Writes the page of one run and its curves as CSV into the run, and a copy of the page to
+/// `--out`.
 fn renew(invocation: &Invocation, path: &Path, out: Option<&Out>) -> Result<()> {
     let common = invocation.common;
     let target = RunTarget::find(common, Some(path))?;

@@ -1,5 +1,5 @@
-//! `tiface run` and the commands of single stages: the pipeline up to a stage, requirements on its result (`--require`), and
-//! the printed summary of files and quality.
+//! `tiface run` and the commands of single stages: the pipeline up to a stage, requirements on its
+//! result (`--require`), and the printed summary of files and quality.
 
 use super::Invocation;
 use super::options::{Common, KeyOption, RunTarget};
@@ -38,7 +38,8 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
         screen.note("run", &format!("using `{}`", target.run.display()));
     }
     let mut config = target.configure(common, *fallback, keys)?;
-    // these options set how the views of a path are rendered; the evaluation's views keep their settings
+    // these options set how the views of a path are rendered; the evaluation's views keep their
+    // settings
     let path = (*until == Stage::Render && config.render.cameras != "test").then(|| config.render.clone());
     if path.is_some() {
         config.render = evaluation(common, target)?;
@@ -63,8 +64,9 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
         Ok(session)
     };
     let session = open().inspect_err(|e| {
-        // failures of a batch are found in the run folders, not in logs; a finished run keeps its state, other settings
-        // are no failure of a run that has begun, and a wrong command creates no folder
+        // failures of a batch are found in the run folders, not in logs; a finished run keeps its
+        // state, other settings are no failure of a run that has begun, and a wrong command creates
+        // no folder
         let is_named = io::is_folder(run.dir()) || common.run.is_some() && e.kind() == ErrorKind::Cannot;
         let is_recorded = match (e.kind(), saved_config(&run)) {
             (ErrorKind::Cannot | ErrorKind::Usage, None) => true,
@@ -168,8 +170,8 @@ pub(super) fn in_words(cost: Cost) -> String {
     format!("about {time} on the CPU, {memory:.1} GiB of memory, {disk:.1} GiB of disk")
 }
 
-/// Returns how the evaluation's views are rendered: by the run's saved settings, else by the defaults and `--set`, but
-/// not by the options of this command.
+/// Returns how the evaluation's views are rendered: by the run's saved settings, else by the
+/// defaults and `--set`, but not by the options of this command.
 fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
     let kept = Some(target.run.join("config.toml")).filter(|file| io::is_file(file));
     let config = match kept {
@@ -224,8 +226,8 @@ impl Requirement {
     }
 }
 
-/// Returns a summary of the result: its files, its quality and what was `written` to `--out`. `views` is the folder of the
-/// views, relative to the run.
+/// Returns a summary of the result: its files, its quality and what was `written` to `--out`.
+/// `views` is the folder of the views, relative to the run.
 fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) -> String {
     let summary = |stage| done.iter().find(|(s, _)| *s == stage).map(|(_, d)| &d.summary);
     let mut text = String::new();
@@ -260,7 +262,8 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     text
 }
 
-/// Returns how many handles were cut, filled and left, after a comma; empty if the surface had none.
+/// Returns how many handles were cut, filled and left, after a comma; empty if the surface had
+/// none.
 fn handles(figures: &Value) -> String {
     let count = |key: &str| figures[key].as_array().map_or(0, Vec::len) as u64;
     let all = [

@@ -53,7 +53,8 @@ impl Screen {
         self.moving.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Sets the stages ahead with the estimated seconds of each, for the time left of the whole command.
+    /// Sets the stages ahead with the estimated seconds of each, for the time left of the whole
+    /// command.
     pub fn expect(&self, ahead: Vec<(String, f64)>) {
         self.moving().ahead = ahead;
     }
@@ -92,7 +93,8 @@ impl Screen {
         }
     }
 
-    /// Prints a label and a text, which may quote files, above the progress line. A closed stderr is ignored.
+    /// Prints a label and a text, which may quote files, above the progress line. A closed stderr
+    /// is ignored.
     fn line(&self, head: &str, text: &str) {
         let text = indented(text);
         let bar = self.moving().bar.clone();
@@ -129,8 +131,9 @@ impl Screen {
         }
     }
 
-    /// Returns the number of stages after this one, and the seconds left of the command, given `eta_s` left of the
-    /// `all_s` of this one: estimates of the others are scaled by this stage's ratio of time to estimate.
+    /// Returns the number of stages after this one, and the seconds left of the command, given
+    /// `eta_s` left of the `all_s` of this one: estimates of the others are scaled by this stage's
+    /// ratio of time to estimate.
     fn after(&self, stage: &str, eta_s: Option<f64>, all_s: Option<f64>) -> (usize, Option<f64>) {
         let moving = self.moving();
         let Some(at) = moving.ahead.iter().position(|(s, _)| s == stage) else { return (0, eta_s) };
@@ -257,8 +260,8 @@ pub(super) fn print(text: &str) -> Result<()> {
     }
 }
 
-/// Returns text with control and bidirectional characters escaped as in JSON, so that JSON is unchanged. Line breaks and
-/// tabs stay.
+/// Returns text with control and bidirectional characters escaped as in JSON, so that JSON is
+/// unchanged. Line breaks and tabs stay.
 fn plain(text: &str) -> Cow<'_, str> {
     escaped(text, |c| acts(c) && c != '\n' && c != '\t')
 }
@@ -268,7 +271,8 @@ pub(super) fn one_line(text: &str) -> Cow<'_, str> {
     escaped(text, acts)
 }
 
-/// Returns the same with lines after the first indented, so that none can pass for a line of this program.
+/// Returns the same with lines after the first indented, so that none can pass for a line of this
+/// program.
 fn indented(text: &str) -> String {
     let mut lines = String::with_capacity(text.len());
     for (i, line) in plain(text).split('\n').enumerate() {

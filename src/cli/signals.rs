@@ -1,7 +1,8 @@
-//! Ctrl-C and SIGTERM: a command ends within a second, a training stage as soon as it has saved a checkpoint.
+//! Ctrl-C and SIGTERM: a command ends within a second, a training stage as soon as it has saved a
+//! checkpoint.
 //!
-//! The first signal requests a stop. A signal within a second of it repeats the same request, as GNU `timeout` sends it;
-//! a later one ends the process at once.
+//! The first signal requests a stop. A signal within a second of it repeats the same request, as
+//! GNU `timeout` sends it; a later one ends the process at once.
 
 use super::Invocation;
 use signal_hook::consts::{SIGINT, SIGTERM};

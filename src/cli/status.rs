@@ -63,7 +63,8 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
     }
 }
 
-/// The states that need a user's attention, the worst first: of one run and of several, and what to do about it.
+/// The states that need a user's attention, the worst first: of one run and of several, and what to
+/// do about it.
 const WRONG: [(Phase, [&str; 2], &str); 4] = [
     (
         Phase::Failed,
@@ -87,8 +88,8 @@ const WRONG: [(Phase, [&str; 2], &str); 4] = [
     ),
 ];
 
-/// Fails with what is wrong with runs of these states. The worst decides about the exit code: 1 if runs could only not be
-/// read, else 3.
+/// Fails with what is wrong with runs of these states. The worst decides about the exit code: 1 if
+/// runs could only not be read, else 3.
 fn worst(states: &[Phase]) -> Result<()> {
     let count = |wrong: Phase| states.iter().filter(|state| **state == wrong).count();
     let found: Vec<_> = WRONG.iter().map(|row| (count(row.0), row)).filter(|(n, _)| *n > 0).collect();

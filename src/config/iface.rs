@@ -59,10 +59,12 @@ pub enum Start {
 }
 
 table! {
-    /// Settings of the stage `iface`. Lengths are in field units: the scene's box is `[-radius, radius]³`.
+    /// Settings of the stage `iface`. Lengths are in field units: the scene's box is
+    /// `[-radius, radius]³`.
     pub struct IfaceConfig;
     keys {
-        /// Kind of field: sdf (signed distance, as in NeuS) or density (Instant-NeRF, in preset paper).
+        /// Kind of field: sdf (signed distance, as in NeuS) or density (Instant-NeRF, in preset
+        /// paper).
         field: FieldKind [Iface] => FieldKind::Sdf;
         /// Optimizer steps.
         steps: u64, 1.0..=1e7 [Iface] => 3000, 8000, 20_000, 1200;
@@ -80,8 +82,9 @@ table! {
         growth: f64, 1.0..=4.0 [Iface] => 1.4, 1.4, 1.319_507_910_772_894_2;
         /// Binary logarithm of a level's largest table.
         log2_table: u32, 4.0..=24.0 [Iface] => 18, 19, 19;
-        /// Largest ratio of the local to the smallest width of the surface, for hair (spatially varying sharpness, after
-        /// Adaptive Shells, Wang et al. 2023); 1: one sharpness everywhere (published).
+        /// Largest ratio of the local to the smallest width of the surface, for hair (spatially
+        /// varying sharpness, after Adaptive Shells, Wang et al. 2023); 1: one sharpness everywhere
+        /// (published).
         soften: f64, 1.0..=1e3 [Iface] => 8.0, 8.0, 1.0;
         /// Learning rate of the hash table at its peak.
         lr_table: f64, 0.0..=1.0 [Iface] => 1e-2;
@@ -93,8 +96,8 @@ table! {
         eikonal: f64, 0.0..=1e6 [Iface] => 0.1;
         /// Weight of the sparsity term, the mean of exp(-scale * |sdf|).
         sparsity: f64, 0.0..=1e6 [Iface] => 0.0, 0.0, 0.5;
-        /// Weight of the distance to multi-view stereo points, which are found on the surface after 0.6 of the steps; 0:
-        /// none (published).
+        /// Weight of the distance to multi-view stereo points, which are found on the surface after
+        /// 0.6 of the steps; 0: none (published).
         stereo: f64, 0.0..=1e6 [Iface] => 0.02, 0.02, 0.0;
         /// Cells per axis of the occupancy grid.
         occupancy_resolution: usize, 8.0..=1024.0 [Iface] => 160, 160, 128;
@@ -104,7 +107,8 @@ table! {
     constants {
         /// Levels that are active at the first step.
         start_levels: usize => 6, 6, 16;
-        /// Share of the steps after which all levels are active; they are activated at equal intervals.
+        /// Share of the steps after which all levels are active; they are activated at equal
+        /// intervals.
         all_levels: f64 => 0.25, 0.25, 0.0;
         /// Whether the color network also reads the hash features.
         color_skip: bool => true, true, false;
@@ -112,8 +116,8 @@ table! {
         radius: f32 => 1.0, 1.0, 0.3;
         /// Initial surface.
         start: Start => Start::Hull, Start::Hull, Start::Sphere;
-        /// Learning rate of the variance at its peak. Four times the published one: with local softness, skin may become
-        /// as sharp as it is.
+        /// Learning rate of the variance at its peak. Four times the published one: with local
+        /// softness, skin may become as sharp as it is.
         lr_variance: f64 => 4e-3, 4e-3, 1e-3;
         /// Share of the steps over which the rates warm up linearly, from 1 % of the peak.
         warmup: f64 => 0.025;
@@ -127,8 +131,9 @@ table! {
         touched_rows: bool => true, true, false;
         /// Weight of the squared color error.
         rgb_mse: f64 => 10.0;
-        /// Weight of the squared color error of single samples, Σ w ‖c − target‖² on rays that are all head. The
-        /// blend alone leaves each sample's color free, and a mesh shows a single one.
+        /// Weight of the squared color error of single samples, Σ w ‖c − target‖² on rays that are
+        /// all head. The blend alone leaves each sample's color free, and a mesh shows a single
+        /// one.
         rgb_sample: f64 => 3.0, 3.0, 0.0;
         /// Scale of the sparsity term, mean exp(−scale · |sdf|).
         sparsity_scale: f64 => 50.0, 50.0, 1.0;
@@ -142,7 +147,8 @@ table! {
         occupancy_every: f64 => 0.08;
         /// Half width of the band in units of 1 / local sharpness.
         band: f32 => 4.0, 4.0, 6.0;
-        /// Share of the steps after which stereo points are searched for: the surface is accurate to a pixel or two by then.
+        /// Share of the steps after which stereo points are searched for: the surface is accurate
+        /// to a pixel or two by then.
         stereo_at: f64 => 0.6;
         /// March step in units of 1 / inv_s, the sharpest (`band` rule).
         march: f32 => 1.0;
@@ -156,11 +162,11 @@ table! {
         jitter: bool => true, true, false;
         /// Background while training.
         background: Background => Background::Random, Background::Random, Background::Black;
-        /// Start with a gradient of length one. The published start is a unit sphere of the networks' own
-        /// coordinates, and so has gradients of 1 / radius.
+        /// Start with a gradient of length one. The published start is a unit sphere of the
+        /// networks' own coordinates, and so has gradients of 1 / radius.
         unit_start: bool => true, true, false;
-        /// Start the features that go to the color network apart from each other. The published start gives
-        /// all thirteen the sdf's own weights, and color is learned late.
+        /// Start the features that go to the color network apart from each other. The published
+        /// start gives all thirteen the sdf's own weights, and color is learned late.
         spread_features: bool => true, true, false;
         /// Target color of a pixel with a soft mask.
         foreground: Foreground => Foreground::Estimated, Foreground::Estimated, Foreground::Photo;
@@ -174,17 +180,19 @@ mod tests {
     use tiface_kernels::cpu::hash;
     use tiface_kernels::cpu::sdf::FieldShape;
 
-    /// What follows from the published settings, as the published code's own printout and arithmetic have it.
+    /// What follows from the published settings, as the published code's own printout and
+    /// arithmetic have it.
     #[test]
     fn the_paper_preset_makes_the_published_grid_network_and_lattice() {
         let p = IfaceConfig::preset(Preset::Paper);
         let levels = hash::levels(p.levels, p.base_resolution, p.growth, p.log2_table);
-        // 6,984,576 entries of two features; the first four levels are whole, all others 2^19 entries
+        // 6,984,576 entries of two features; the first four levels are whole, all others 2^19
+        // entries
         assert_eq!(hash::entries(&levels), 6_984_576);
         let side = |l: usize| levels[l].scale.ceil() as u32 + 1;
         assert_eq!([0, 1, 2, 3, 4, 8, 15].map(side), [32, 43, 56, 74, 98, 295, 2049]);
-        // 3 + 32 inputs; geometry 35·64 + 64 + 64·13 + 13, color (64·32 + 64·64 + 3·64) of the published 7168, whose
-        // last layer is padded to 16
+        // 3 + 32 inputs; geometry 35·64 + 64 + 64·13 + 13, color (64·32 + 64·64 + 3·64) of the
+        // published 7168, whose last layer is padded to 16
         let shape =
             FieldShape { levels, radius: p.radius, active: 16, color_skip: p.color_skip, soften: 0.0 };
         assert_eq!(shape.layout().len(), 2240 + 64 + 832 + 13 + 7168 - 13 * 64);

@@ -14,21 +14,22 @@ table! {
         path: PathBuf [nothing] => PathBuf::new();
         /// Integer factor by which photographs are reduced, by averaging.
         downscale: u32, 1.0..=64.0 [Masks] => 1;
-        /// Poses of the training views: auto (measured on the photographs, and refined where they do not fit), refine
-        /// (always) or given.
+        /// Poses of the training views: auto (measured on the photographs, and refined where they
+        /// do not fit), refine (always) or given.
         cameras: CameraPoses [Masks] => CameraPoses::Auto, CameraPoses::Auto, CameraPoses::Given;
-        /// Exposure and white balance of the photographs: auto (measured, and divided out of the training photographs where
-        /// they differ) or given (photographs are used as they are).
+        /// Exposure and white balance of the photographs: auto (measured, and divided out of the
+        /// training photographs where they differ) or given (photographs are used as they are).
         exposure: Exposures [Masks] => Exposures::Auto, Exposures::Auto, Exposures::Given;
-        /// Bounding box of the fields: head (found from cameras and masks), ilsh (published: ±0.45, ±0.501, ±0.3 dataset
-        /// units for radiance, ±0.3 for I-Face; falls back to head if the head is elsewhere) or six numbers in dataset
-        /// units, lowest corner first.
+        /// Bounding box of the fields: head (found from cameras and masks), ilsh (published: ±0.45,
+        /// ±0.501, ±0.3 dataset units for radiance, ±0.3 for I-Face; falls back to head if the head
+        /// is elsewhere) or six numbers in dataset units, lowest corner first.
         r#box: String [Masks] => "head".into(), "head".into(), "ilsh".into();
         /// Length of one dataset unit, meters.
         unit_m: f64, 1e-6..=1e6 [Masks, Files] => 1.0;
         /// Folder of masks inside the capture, named like the photographs; empty: search for one.
         mask_dir: String [Masks] => String::new();
-        /// Share of the training pixels that is held out, in small squares, to fit the weights of the blend; 0: none.
+        /// Share of the training pixels that is held out, in small squares, to fit the weights of
+        /// the blend; 0: none.
         tiles: f64, 0.0..=0.25 [
             Baseline if |c| c.baseline.import.is_empty(),
             Tface if |c| c.tface.import.is_empty(),
@@ -64,8 +65,8 @@ pub enum Exposures {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MaskSource {
-    /// Clicks or an alpha network, if given; else whatever the capture has: named in its frames, beside the
-    /// photographs, or their alpha.
+    /// Clicks or an alpha network, if given; else whatever the capture has: named in its frames,
+    /// beside the photographs, or their alpha.
     Auto,
     /// The photographs' own alpha.
     Alpha,
@@ -220,20 +221,24 @@ table! {
     /// Where masks come from, what they mean, and how they are made from clicks.
     pub struct MaskConfig;
     keys {
-        /// Where masks come from: auto (clicks or an alpha network if given, else those of the capture), alpha, folder
-        /// (capture.mask_dir), clicks, network or none (no masks: everything the cameras see is reconstructed).
+        /// Where masks come from: auto (clicks or an alpha network if given, else those of the
+        /// capture), alpha, folder (capture.mask_dir), clicks, network or none (no masks:
+        /// everything the cameras see is reconstructed).
         source: MaskSource [Masks] => MaskSource::Auto;
-        /// Train even with masks that look wrong: inverted ones, and those that contradict the others.
+        /// Train even with masks that look wrong: inverted ones, and those that contradict the
+        /// others.
         trust: bool [nothing] => false;
         /// Meaning of pixels outside a mask: empty (no head) or ignore (unknown).
         meaning: MaskMeaning [Masks] => MaskMeaning::Empty;
-        /// Pixels of the capture's mask files that are the head: white (gray is opacity; a single other color on black is
-        /// taken for white), not-black, or values and colors, as 1,2,17 (labels) or #5000ff,#ff0000.
+        /// Pixels of the capture's mask files that are the head: white (gray is opacity; a single
+        /// other color on black is taken for white), not-black, or values and colors, as 1,2,17
+        /// (labels) or #5000ff,#ff0000.
         head: MaskHead [Masks if read, Metrics if made] => MaskHead::White;
         /// File of clicks to make masks from: a prompts.json, as `tiface mask --page` saves it.
         #[flag("prompts", File, ["run", "mask"], "Make masks from the clicks in a prompts.json")]
         prompts: String [nothing] => String::new();
-        /// List of clicks x,y,label on one photograph (label 1: head, 0: background), for a quick try.
+        /// List of clicks x,y,label on one photograph (label 1: head, 0: background), for a quick
+        /// try.
         #[flag("point", Each("X,Y,LABEL"), ["run", "mask"],
             "Click on one photograph: 1 for the head, 0 for background; repeatable")]
         point: Vec<String> [nothing] => Vec::new();
@@ -242,7 +247,8 @@ table! {
         view: String [nothing] => String::new();
         /// Method for a hard mask: auto (sam if its files are given), grabcut (built in) or sam.
         cut: CutMethod [Masks if made] => CutMethod::Auto;
-        /// Method for the alpha: auto (vitmatte if its file is given), closed (closed form, built in) or vitmatte.
+        /// Method for the alpha: auto (vitmatte if its file is given), closed (closed form, built
+        /// in) or vitmatte.
         matting: MattingMethod [Masks if made] => MattingMethod::Auto;
         /// Image encoder of SAM, an ONNX file (needs a build with the feature `matting`).
         #[flag("sam", File, ["run", "mask"], "Image encoder of SAM, an ONNX file; needs --sam-decoder")]
@@ -253,16 +259,17 @@ table! {
         /// ViTMatte, an ONNX file (needs a build with the feature `matting`).
         #[flag("vitmatte", File, ["run", "mask"], "ViTMatte, an ONNX file")]
         vitmatte: String [nothing] => String::new();
-        /// Network that predicts alpha without clicks (U²-Net, ISNet, MODNet, BiRefNet), an ONNX file (needs a build
-        /// with the feature `matting`).
+        /// Network that predicts alpha without clicks (U²-Net, ISNet, MODNet, BiRefNet), an ONNX
+        /// file (needs a build with the feature `matting`).
         #[flag("alpha-net", File, ["run", "mask"],
             "Make masks without clicks, by a network that predicts alpha (U²-Net, ISNet, MODNet, BiRefNet), \
              an ONNX file")]
         alpha_net: String [nothing] => String::new();
-        /// Size and normalization of its input: auto (from the file beside it, else by its name), SIDE,MEAN,SCALE as
-        /// 1024,0.5,1, or SIDE,imagenet.
+        /// Size and normalization of its input: auto (from the file beside it, else by its name),
+        /// SIDE,MEAN,SCALE as 1024,0.5,1, or SIDE,imagenet.
         alpha_input: String [Masks if |c| c.mask.with_alpha_net()] => "auto".into();
-        /// Normalization of the input of ViTMatte: auto (from the file beside it, else imagenet), imagenet or half.
+        /// Normalization of the input of ViTMatte: auto (from the file beside it, else imagenet),
+        /// imagenet or half.
         vitmatte_colors: VitmatteColors [Masks if made] => VitmatteColors::Auto;
         /// Largest memory for running networks, GiB.
         memory_gib: f64, 0.25..=1024.0 [nothing] => 12.0;
@@ -270,7 +277,8 @@ table! {
         side_px: u32, 64.0..=8192.0 [Masks if made] => 1024;
         /// Half width of the unknown band around the outline, as a share of the height.
         band: f32, 0.0..=0.5 [Masks if made] => 0.023;
-        /// Side of the square structuring element that makes the band, pixels (published: 10); 0: use `band`.
+        /// Side of the square structuring element that makes the band, pixels (published: 10); 0:
+        /// use `band`.
         kernel: u32, 0.0..=1000.0 [Masks if made] => 0, 0, 10;
         /// Number of erosions and dilations with that square (published: 5).
         iterations: u32, 0.0..=1000.0 [Masks if made] => 5;

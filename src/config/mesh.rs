@@ -106,8 +106,8 @@ table! {
     keys {
         /// Grid samples along the longest side of the box.
         resolution: u32, 16.0..=4096.0 [Surface] => 256, 512, 512;
-        /// Topological handles, such as loops of hair: keep, or simple (cut or filled, up to a loop of 0.15 of the
-        /// surface's longest side, about 45 mm on a head).
+        /// Topological handles, such as loops of hair: keep, or simple (cut or filled, up to a loop
+        /// of 0.15 of the surface's longest side, about 45 mm on a head).
         genus: Genus [Surface] => Genus::Simple, Genus::Simple, Genus::Keep;
         /// Close the surface where the frames cut the body: true or false.
         #[flag("no-cap", Switch("false"), ["mesh"], "Leave the mesh open where the frames cut the body")]
@@ -124,12 +124,13 @@ table! {
         #[flag("texture", Text("PX"), ["mesh", "export"],
             "Side of the texture, texels; 0 stores colors at the vertices")]
         texture_px: u32, 0.0..=16384.0 [Head] => 1024, 2048, 0;
-        /// Degree of the view-dependent spherical harmonics in the GLB: 0 (none), 1 or 2; limits all views of the mesh.
+        /// Degree of the view-dependent spherical harmonics in the GLB: 0 (none), 1 or 2; limits
+        /// all views of the mesh.
         #[flag("lobes", Text("DEGREE"), ["mesh"],
             "Degree of the view-dependent spherical harmonics in the GLB: 0, 1 or 2")]
         lobes: u32, 0.0..=2.0 [Head] => 0;
-        /// Hair and other soft outlines: shells (translucent layers in the GLB, where they help) or none. raycast
-        /// renders them with `mesh.color=photographs`.
+        /// Hair and other soft outlines: shells (translucent layers in the GLB, where they help) or
+        /// none. raycast renders them with `mesh.color=photographs`.
         #[flag("hair", Text("KIND"), ["mesh", "export"],
             "Hair and other soft outlines: shells (translucent layers, where they help) or none")]
         hair: Hair [Head] => Hair::Shells, Hair::Shells, Hair::None;
@@ -137,8 +138,8 @@ table! {
         #[flag("normal-map", Switch("true"), ["mesh"],
             "Store the detail that simplification removes in a normal map; makes the material lit")]
         normal_map: bool [Head] => false;
-        /// Material of the GLB: unlit (colors as photographed, light included) or lit (shaded by lamps, as a normal map
-        /// needs).
+        /// Material of the GLB: unlit (colors as photographed, light included) or lit (shaded by
+        /// lamps, as a normal map needs).
         #[flag("material", Text("KIND"), ["mesh", "export"],
             "Material in other programs: unlit (colors as photographed) or lit (shaded by lamps)")]
         material: Material [Files] => Material::Unlit;
@@ -153,8 +154,8 @@ table! {
         #[flag("frame", Text("FRAME"), ["mesh", "export"],
             "Coordinate frame: dataset, or head (+Y up, face towards +Z)")]
         frame: MeshFrame [Files, Head if |c| c.mesh.lobes > 0] => MeshFrame::Dataset;
-        /// Height of the head mesh in GLB and OBJ files, meters, from the crown to the end of what is shown of the body; 0:
-        /// as `capture.unit_m` says.
+        /// Height of the head mesh in GLB and OBJ files, meters, from the crown to the end of what
+        /// is shown of the body; 0: as `capture.unit_m` says.
         #[flag("height", Text("METERS"), ["mesh", "export"],
             "Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it")]
         height_m: f64, 0.0..=10.0 [Files] => 0.0;
@@ -162,9 +163,10 @@ table! {
     constants {
         /// Evaluate the whole grid, and keep every surface found (published).
         dense: bool => false, false, true;
-        /// Share of the cameras that must have the median cell of a slab in their frames, or the body is cut off
-        /// above it. On `lps` a sixth keeps 8 cm more than a third does and the lower half of that is off by 1 to 4 cm;
-        /// a quarter keeps 3.4 cm whose median error is 1 to 2 mm, and covers as much of the training views.
+        /// Share of the cameras that must have the median cell of a slab in their frames, or the
+        /// body is cut off above it. On `lps` a sixth keeps 8 cm more than a third does and the
+        /// lower half of that is off by 1 to 4 cm; a quarter keeps 3.4 cm whose median error is 1
+        /// to 2 mm, and covers as much of the training views.
         seen_by: f64 => 0.25, 0.25, 1.0 / 3.0;
         /// Samples along each side of a texel, where colors are the network's.
         texture_samples: u32 => 2;

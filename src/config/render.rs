@@ -1,5 +1,5 @@
-//! `[render]`: the views made of the result; `[ensemble]`: how several views of one camera become one; `[metrics]`: how
-//! the result is judged.
+//! `[render]`: the views made of the result; `[ensemble]`: how several views of one camera become
+//! one; `[metrics]`: how the result is judged.
 
 use super::stage::Stage;
 use super::table::table;
@@ -16,8 +16,9 @@ pub enum Method {
     /// I-Face's field, marched and composited.
     #[serde(alias = "iface")]
     Volume,
-    /// Rays cast at I-Face's mesh with all that is known of its color: the head mesh with colors fitted to the
-    /// photographs, or the whole extraction with those of the network, by `mesh.color`.
+    /// Rays cast at I-Face's mesh with all that is known of its color: the head mesh with colors
+    /// fitted to the photographs, or the whole extraction with those of the network, by
+    /// `mesh.color`.
     Raycast,
     /// Rays cast at the product, color from its texture: what a viewer of `head.glb` sees.
     Textured,
@@ -37,7 +38,8 @@ pub const NAMES: [(&str, &str); 7] = [
     ("ensemble", "blend"),
 ];
 
-/// Returns the display name of a method: `I-Face (volume)`; the word itself if it is the same, or of no method.
+/// Returns the display name of a method: `I-Face (volume)`; the word itself if it is the same, or
+/// of no method.
 pub fn display_name(word: &str) -> String {
     match NAMES.iter().find(|(w, title)| *w == word && title != w) {
         Some((_, title)) => format!("{title} ({word})"),
@@ -88,14 +90,15 @@ table! {
     /// Cameras, methods and format of the rendered views.
     pub struct RenderConfig;
     keys {
-        /// Cameras of `tiface render`: test (held-out views), train, orbit or a file (transforms.json or a nerfstudio
-        /// camera path). Blend and metrics always use test.
+        /// Cameras of `tiface render`: test (held-out views), train, orbit or a file
+        /// (transforms.json or a nerfstudio camera path). Blend and metrics always use test.
         #[flag("cameras", Text("WHICH"), ["render"],
             "Cameras: test (the held-out views), train, orbit or a file (a nerfstudio camera path or a \
              transforms.json)")]
         cameras: String [Path if |c| !c.render.cameras_are_a_file()] => "test".into();
-        /// Methods, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with view-dependent color),
-        /// textured (head.glb, as a viewer shows it) and raster (the same, rasterized, without soft layers).
+        /// Methods, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with
+        /// view-dependent color), textured (head.glb, as a viewer shows it) and raster (the same,
+        /// rasterized, without soft layers).
         #[flag("with", Text("LIST"), ["render"],
             "Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), \
              textured (head.glb, as a viewer shows it) and raster (the same, rasterized)")]
@@ -107,8 +110,8 @@ table! {
         orbit_views: u32, 1.0..=10_000.0 [Path if |c| c.render.cameras == "orbit"] => 36;
         /// Rays along each side of a pixel of the mesh; twice as many at its edges.
         samples: u32, 1.0..=8.0 [Views] => 2;
-        /// Add to views of raycast what the mesh misses of the nearest training photographs, which must be there: true or
-        /// false. No exported file has it.
+        /// Add to views of raycast what the mesh misses of the nearest training photographs, which
+        /// must be there: true or false. No exported file has it.
         residuals: bool [Views if |c| c.render.method.contains(&Method::Raycast)] => true, true, false;
         /// Picture format: png (8-bit sRGB) or exr (float, with depth and normals).
         #[flag("format", Text("FORMAT"), ["render"], "Picture format: png or exr")]
@@ -143,8 +146,8 @@ table! {
     /// Members and weights of the blend.
     pub struct EnsembleConfig;
     keys {
-        /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh) and textured (head.glb);
-        /// empty: no blend.
+        /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh)
+        /// and textured (head.glb); empty: no blend.
         #[flag("members", Text("LIST"), ["ensemble"],
             "Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's \
              mesh), textured and raster (head.glb)")]
@@ -175,10 +178,11 @@ table! {
     /// Comparison of views with photographs, and of the surface with a known one.
     pub struct MetricsConfig;
     keys {
-        /// Reference of the views: photo (as taken; whole-frame figures include the background) or masked (cut out by its
-        /// mask, over render.background).
+        /// Reference of the views: photo (as taken; whole-frame figures include the background) or
+        /// masked (cut out by its mask, over render.background).
         truth: TruthPhoto [Metrics] => TruthPhoto::Masked, TruthPhoto::Masked, TruthPhoto::Photo;
-        /// LPIPS network, an ONNX file that takes two pictures (needs a build with the feature `matting`); empty: no LPIPS.
+        /// LPIPS network, an ONNX file that takes two pictures (needs a build with the feature
+        /// `matting`); empty: no LPIPS.
         lpips: String [nothing] => String::new();
         /// Number of points sampled on a surface to compare it with a known one.
         surface_points: u32, 100.0..=10_000_000.0 [Metrics] => 20_000, 100_000, 100_000;

@@ -106,7 +106,8 @@ fn read_file(name: &str, text: &str, given: &mut Vec<Assignment>) -> Result<()> 
     Ok(())
 }
 
-/// Leaves of a table with the offset of their key; a table that is itself a leaf's name stays whole.
+/// Leaves of a table with the offset of their key; a table that is itself a leaf's name stays
+/// whole.
 fn walk(table: &DeTable, prefix: &str, found: &mut Vec<(usize, String)>) {
     for (key, value) in table {
         let full = super::dotted(prefix, key.get_ref());
@@ -242,7 +243,8 @@ fn put(root: &mut Table, dotted: &str, value: Value) {
     }
 }
 
-/// Returns the known key most like `key`, by its full name or by its last word, if any is like it at all.
+/// Returns the known key most like `key`, by its full name or by its last word, if any is like it
+/// at all.
 fn nearest(key: &str) -> Option<String> {
     let last = |name: &str| name.rsplit('.').next().unwrap_or_default().to_string();
     all_keys()

@@ -1,4 +1,5 @@
-//! The stages. The name of a stage is also its table in `config.toml`, its folder in the run and its command.
+//! The stages. The name of a stage is also its table in `config.toml`, its folder in the run and
+//! its command.
 
 use super::Config;
 use std::fmt::{self, Display};
@@ -72,7 +73,8 @@ impl Stage {
         Stage::ALL.into_iter().filter(|stage| wanted.contains(stage)).collect()
     }
 
-    /// Returns the stage and all that build on it, in order: what is out of date when it is made again.
+    /// Returns the stage and all that build on it, in order: what is out of date when it is made
+    /// again.
     pub fn followers(self, config: &Config) -> Vec<Stage> {
         Stage::ALL.into_iter().filter(|s| Stage::with_needs(vec![*s], config).contains(&self)).collect()
     }

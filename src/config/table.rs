@@ -90,7 +90,8 @@ macro_rules! table {
     };
 }
 
-/// Returns the name of a field as it is written in TOML: without the mark of a word that is Rust's own.
+/// Returns the name of a field as it is written in TOML: without the mark of a word that is Rust's
+/// own.
 pub(super) const fn plain(field: &'static str) -> &'static str {
     match field.as_bytes() {
         [b'r', b'#', name @ ..] => match std::str::from_utf8(name) {
@@ -127,7 +128,8 @@ macro_rules! flag {
     };
 }
 
-/// The value of a preset: one for all, or draft, standard, paper, and quick where it is not draft's.
+/// The value of a preset: one for all, or draft, standard, paper, and quick where it is not
+/// draft's.
 macro_rules! of_preset {
     ($preset:ident, $all:expr) => {
         $all

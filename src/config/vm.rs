@@ -1,6 +1,6 @@
-//! `[baseline]` and `[tface]`: TensoRF's vector-matrix radiance field and its training. Both stages are the
-//! same code; they differ in what masks do, and T-Face may be the mean of several fields. `[baseline]` has only what
-//! differs from `[tface]`.
+//! `[baseline]` and `[tface]`: TensoRF's vector-matrix radiance field and its training. Both stages
+//! are the same code; they differ in what masks do, and T-Face may be the mean of several fields.
+//! `[baseline]` has only what differs from `[tface]`.
 
 use super::iface::Foreground;
 use super::table::table;
@@ -28,8 +28,8 @@ pub enum MaskLoss {
     None,
     /// Mean of opacity² over rays that are all background (T-Face).
     L2,
-    /// Binary cross entropy of opacity and mask over all rays, where every pixel that is a little head is head (the
-    /// paper's ablation).
+    /// Binary cross entropy of opacity and mask over all rays, where every pixel that is a little
+    /// head is head (the paper's ablation).
     Ce,
 }
 
@@ -37,7 +37,8 @@ pub enum MaskLoss {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VmBackground {
-    /// The published training: half of the batches are rendered over white against a target over black.
+    /// The published training: half of the batches are rendered over white against a target over
+    /// black.
     Reference,
     /// Black for both.
     Black,
@@ -68,29 +69,32 @@ pub enum DensityActivation {
 }
 
 table! {
-    /// Settings of a vector-matrix field. Lengths are in scene units: the head's box is within [-1, 1]³.
+    /// Settings of a vector-matrix field. Lengths are in scene units: the head's box is within [-1,
+    /// 1]³.
     pub struct VmConfig;
     keys {
-        /// A published checkpoint to use instead of training, converted by tools/reference/th_to_safetensors.py; empty:
-        /// train.
+        /// A published checkpoint to use instead of training, converted by
+        /// tools/reference/th_to_safetensors.py; empty: train.
         import: String [nothing] => String::new();
         /// Length of a dataset unit in the imported checkpoint's world (published: 1 / 0.3).
         import_scale: f64, 1e-6..=1e6 [Tface, Baseline] => 1.0 / 0.3;
-        /// Number of fields, trained one after the other with different seeds; views are their mean. Always one with
-        /// `import`. Two fields are better than one with twice the rays, which takes the same time.
+        /// Number of fields, trained one after the other with different seeds; views are their
+        /// mean. Always one with `import`. Two fields are better than one with twice the rays,
+        /// which takes the same time.
         fields: usize, 1.0..=16.0 [Tface] => 1, 2, 1;
         /// Optimizer steps of each field. Few steps of many rays are better than many steps of few.
         steps: u64, 1.0..=1e7 [Tface] => 1500, 2000, 50_000, 450;
         /// Rays per step.
         rays: usize, 1.0..=1_048_576.0 [Tface] => 8192, 8192, 4096;
-        /// How masks are applied to the photographs: none, binary (alpha > 0 is head), hard (alpha ≥ 0.5 is head) or soft.
+        /// How masks are applied to the photographs: none, binary (alpha > 0 is head), hard (alpha
+        /// ≥ 0.5 is head) or soft.
         masks: MaskUse [Tface] => MaskUse::Soft, MaskUse::Soft, MaskUse::Binary;
         /// Mask loss: none, l2 (opacity² of background rays) or ce (cross entropy).
         mask_loss: MaskLoss [Tface] => MaskLoss::L2;
         /// Weight of the mask loss.
         mask_weight: f64, 0.0..=1e6 [Tface] => 0.01;
-        /// Background while training: random, black, or reference (published: white in half of the batches, against a
-        /// black target).
+        /// Background while training: random, black, or reference (published: white in half of the
+        /// batches, against a black target).
         background: VmBackground [Tface, Baseline]
             => VmBackground::Random, VmBackground::Random, VmBackground::Reference;
         /// Number of voxels at the start.
@@ -102,8 +106,8 @@ table! {
             => vec![0.1, 0.2, 0.33], vec![0.1, 0.2, 0.325, 0.5], vec![0.04, 0.06, 0.08, 0.11, 0.14];
         /// Shares of the steps after which the alpha mask is rebuilt, an increasing list.
         mask_at: Vec<f64>, 0.0..=1.0 [Tface, Baseline] => vec![0.1, 0.33], vec![0.1, 0.325], vec![0.04, 0.08];
-        /// Channels of the density's planes xy, xz, yz. The published ranks favor one axis of one light stage; a
-        /// head may face any way.
+        /// Channels of the density's planes xy, xz, yz. The published ranks favor one axis of one
+        /// light stage; a head may face any way.
         density_rank: Vec<usize>, 0.0..=1024.0 [Tface, Baseline]
             => vec![8, 8, 8], vec![8, 8, 8], vec![16, 4, 4];
         /// Channels of the appearance's planes xy, xz, yz.
@@ -117,21 +121,24 @@ table! {
         checkpoint_s: f64, 0.05..=86_400.0 [nothing] => 120.0;
     }
     constants {
-        /// What a pixel with a soft mask should look like. As published: the views are compared with photographs
-        /// times mask, and what the background sheds on soft hair belongs to those (I-Face, whose mesh leaves the
-        /// background, learns without it).
+        /// What a pixel with a soft mask should look like. As published: the views are compared
+        /// with photographs times mask, and what the background sheds on soft hair belongs to those
+        /// (I-Face, whose mesh leaves the background, learns without it).
         foreground: Foreground => Foreground::Photo;
         /// Cells at the start.
         start: VmStart => VmStart::Hull, VmStart::Hull, VmStart::Box;
-        /// Draw as published: every valid pixel of the frames whose ray meets the box, in a random order without
-        /// repetition; else those near the masks, with repetition.
+        /// Draw as published: every valid pixel of the frames whose ray meets the box, in a random
+        /// order without repetition; else those near the masks, with repetition.
         whole_frame: bool => false, false, true;
-        /// Directions have depth 1, not length 1, so that steps are longer off the axis (published).
+        /// Directions have depth 1, not length 1, so that steps are longer off the axis
+        /// (published).
         depth_directions: bool => false, false, true;
-        /// Half of the box's longest side in units of `distance_scale`, of the step that `mask_threshold` looks at and of
-        /// `near` and `far`; none: all of them are scene units. Published is a fixed box, 3.34 units long.
+        /// Half of the box's longest side in units of `distance_scale`, of the step that
+        /// `mask_threshold` looks at and of `near` and `far`; none: all of them are scene units.
+        /// Published is a fixed box, 3.34 units long.
         box_half: Option<f64> => None, None, Some(1.67);
-        /// Scene units in the unit that the alpha mask's step is counted in: see [`VmConfig::placed`].
+        /// Scene units in the unit that the alpha mask's step is counted in: see
+        /// [`VmConfig::placed`].
         alpha_unit: f64 => 1.0;
         /// Rays enter the box between this depth and `far`: of the published box, and of no other.
         near: f64 => 0.0, 0.0, 3.5;
@@ -151,12 +158,15 @@ table! {
         activation: DensityActivation => DensityActivation::Relu;
         /// Added to the feature before softplus.
         density_shift: f64 => -10.0;
-        /// Smallest share of the rays in steps up to the last upsampling: see [`VmConfig::rays_at`].
+        /// Smallest share of the rays in steps up to the last upsampling: see
+        /// [`VmConfig::rays_at`].
         early_rays: f64 => 0.5, 0.5, 1.0;
-        /// Optical lengths are lengths times density times this, in scene units or those of `box_half`. Denser matter sets
-        /// a thinner surface, and fewer samples of a ray need a color, but from 200 on hair hardens.
+        /// Optical lengths are lengths times density times this, in scene units or those of
+        /// `box_half`. Denser matter sets a thinner surface, and fewer samples of a ray need a
+        /// color, but from 200 on hair hardens.
         distance_scale: f64 => 100.0, 100.0, 25.0;
-        /// March step as a share of the distance of vertices. Half as many samples as published, at the same quality.
+        /// March step as a share of the distance of vertices. Half as many samples as published, at
+        /// the same quality.
         step_ratio: f64 => 1.0, 1.0, 0.5;
         /// Color is evaluated only of samples with more weight.
         weight_threshold: f64 => 1e-3, 1e-3, 1e-4;
@@ -166,15 +176,17 @@ table! {
         lr_grid: f64 => 0.02;
         /// Learning rate of the basis matrix and the decoder.
         lr_network: f64 => 0.001;
-        /// Learning rate after `steps` steps without a reset, as a share of the first; exponential in between. Every
-        /// upsampling starts the rates again. Rates that end low take the noise of single batches out of the result.
+        /// Learning rate after `steps` steps without a reset, as a share of the first; exponential
+        /// in between. Every upsampling starts the rates again. Rates that end low take the noise
+        /// of single batches out of the result.
         lr_final: f64 => 0.01, 0.003, 0.1;
     }
 }
 
-/// Rays up to the last upsampling that a field needs, however few its steps are: as many as preset draft has with half of
-/// its rays there. Trainings of an earlier version with all of them were equal on a head with hair and 0.1 dB better on a bust.
-/// Half of the rays of the demo's 800 steps of 2048 cost 0.2 dB in the same comparison, those of a hundred steps 1.2 dB.
+/// Rays up to the last upsampling that a field needs, however few its steps are: as many as preset
+/// draft has with half of its rays there. Trainings of an earlier version with all of them were
+/// equal on a head with hair and 0.1 dB better on a bust. Half of the rays of the demo's 800 steps
+/// of 2048 cost 0.2 dB in the same comparison, those of a hundred steps 1.2 dB.
 const EARLY_RAYS: f64 = 2e6;
 
 impl VmConfig {
@@ -184,8 +196,8 @@ impl VmConfig {
         self.box_half.map_or(1.0, |of| half / of)
     }
 
-    /// Returns the settings of a field that starts in a box, all lengths in scene units; done once, before the box
-    /// shrinks.
+    /// Returns the settings of a field that starts in a box, all lengths in scene units; done once,
+    /// before the box shrinks.
     ///
     /// ```
     /// # use tiface::config::{Preset, VmConfig};
@@ -207,21 +219,22 @@ impl VmConfig {
         }
     }
 
-    /// Returns which entry of a list of shares of the steps is due after `step`; the last one, if a training is so short
-    /// that several are.
+    /// Returns which entry of a list of shares of the steps is due after `step`; the last one, if a
+    /// training is so short that several are.
     pub fn due(&self, shares: &[f64], step: u64) -> Option<usize> {
         shares.iter().rposition(|share| (share * self.steps as f64).round() as u64 == step)
     }
 
-    /// Returns the number of steps up to the last upsampling. The published order of pixels counts rays of steps that all
-    /// have the same, so it has none.
+    /// Returns the number of steps up to the last upsampling. The published order of pixels counts
+    /// rays of steps that all have the same, so it has none.
     fn early_steps(&self) -> f64 {
         let share = self.upsample_at.last().copied().filter(|_| !self.whole_frame);
         share.unwrap_or(0.0).min(1.0) * self.steps as f64
     }
 
-    /// Returns the number of rays of a step. The steps up to the last upsampling, on coarse grids, have fewer, down to
-    /// `early_rays` of them, as long as they are two million together: a short training needs all of its rays.
+    /// Returns the number of rays of a step. The steps up to the last upsampling, on coarse grids,
+    /// have fewer, down to `early_rays` of them, as long as they are two million together: a short
+    /// training needs all of its rays.
     pub fn rays_at(&self, step: u64) -> usize {
         let early_steps = self.early_steps();
         if early_steps == 0.0 || step as f64 > early_steps {
@@ -237,7 +250,8 @@ impl VmConfig {
         early_steps * self.rays_at(0) as f64 + (self.steps as f64 - early_steps) * self.rays as f64
     }
 
-    /// Returns how many fields there are in the end: at least one, and no more where it comes from a file.
+    /// Returns how many fields there are in the end: at least one, and no more where it comes from
+    /// a file.
     pub fn learned(&self) -> usize {
         if self.import.is_empty() { self.fields.max(1) } else { 1 }
     }
@@ -247,8 +261,8 @@ table! {
     /// Settings of the stage `baseline`: T-Face's but for these, one field, and no masks.
     pub struct BaselineConfig;
     keys {
-        /// A published checkpoint to use instead of training, converted by tools/reference/th_to_safetensors.py; empty:
-        /// train.
+        /// A published checkpoint to use instead of training, converted by
+        /// tools/reference/th_to_safetensors.py; empty: train.
         import: String [nothing] => String::new();
         /// Optimizer steps.
         steps: u64, 1.0..=1e7 [Baseline] => 1500, 2000, 50_000;
@@ -260,9 +274,9 @@ table! {
 impl BaselineConfig {
     /// `tface` without masks, of one field.
     ///
-    /// Over black, where T-Face is over random colors: without a mask a target has no hole, and any color behind the
-    /// head but the photographs' own asks for matter in front of it (19.8 instead of 23.6 dB inside the mask in a
-    /// light stage all around the head).
+    /// Over black, where T-Face is over random colors: without a mask a target has no hole, and any
+    /// color behind the head but the photographs' own asks for matter in front of it (19.8 instead
+    /// of 23.6 dB inside the mask in a light stage all around the head).
     pub fn field(&self, tface: &VmConfig) -> VmConfig {
         VmConfig {
             import: self.import.clone(),
@@ -300,7 +314,8 @@ mod tests {
         let samples =
             |n: [usize; 3]| (n.iter().map(|n| (n * n) as f64).sum::<f64>().sqrt() / p.step_ratio) as usize;
         assert_eq!((samples(sizes[0]), samples(sizes[5])), (462, 1083));
-        // planes of 141 × 157, 141 × 94, 157 × 94 vertices with 16, 4, 4 channels, lines of 94, 157, 141
+        // planes of 141 × 157, 141 × 94, 157 × 94 vertices with 16, 4, 4 channels, lines of 94,
+        // 157, 141
         let triple = |list: &[usize]| [list[0], list[1], list[2]];
         let density = Grid { size: sizes[0], rank: triple(&p.density_rank) };
         let planes = 22_137 * 16 + 13_254 * 4 + 14_758 * 4;
@@ -335,8 +350,8 @@ mod tests {
     fn short_trainings_have_all_rays_from_the_first_step() {
         let draft = VmConfig::preset(Preset::Draft);
         let early = |steps: u64| VmConfig { steps, ..draft.clone() }.rays_at(0);
-        // 0.33 of 1500 steps are 495: half of their rays are 2.03 million; of 600 steps 198, all of their rays 1.6 million;
-        // of 900 steps 297, where 2 / 2.43 of the rays are left
+        // 0.33 of 1500 steps are 495: half of their rays are 2.03 million; of 600 steps 198, all of
+        // their rays 1.6 million; of 900 steps 297, where 2 / 2.43 of the rays are left
         assert_eq!((early(1500), early(600), early(900)), (4096, 8192, 6734));
         assert_eq!((draft.rays_at(495), draft.rays_at(496)), (4096, 8192));
     }

@@ -1,7 +1,7 @@
 //! The weights of least squared error, from the products of the members' errors.
 //!
-//! With `Σ_k w_k = 1` the blend's error is the blend of the errors, `e = Σ_k w_k e_k`, so all that a
-//! fit needs from the pixels is the matrix `D_kl = Σ ρ · e_k · e_l` over head pixels (counted ρ
+//! With `Σ_k w_k = 1` the blend's error is the blend of the errors, `e = Σ_k w_k e_k`, so all that
+//! a fit needs from the pixels is the matrix `D_kl = Σ ρ · e_k · e_l` over head pixels (counted ρ
 //! each) and channels: the squared error is `wᵀDw`, and no large numbers cancel in it.
 
 use super::least_squares::least;
@@ -10,8 +10,8 @@ use tiface_base::{Error, Result};
 
 /// Sums over the pixels seen so far: `members²` numbers, so each view may keep its own.
 ///
-/// The pixels must have been excluded from training, because a member looks better than it is on its training pixels.
-/// They must never come from test views.
+/// The pixels must have been excluded from training, because a member looks better than it is on
+/// its training pixels. They must never come from test views.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fit {
     members: usize,
@@ -63,8 +63,8 @@ impl Fit {
         self.pixels
     }
 
-    /// Returns the weights `argmin wᵀDw`, `w ≥ 0`, `Σ w = 1`; `None` if no pixel counts. Identical members get equal
-    /// weights.
+    /// Returns the weights `argmin wᵀDw`, `w ≥ 0`, `Σ w = 1`; `None` if no pixel counts. Identical
+    /// members get equal weights.
     pub fn solve(&self) -> Option<Vec<f32>> {
         if self.pixels <= 0.0 {
             return None;
@@ -79,10 +79,11 @@ impl Fit {
         Some(weights[..m].iter().map(|w| *w as f32).collect())
     }
 
-    /// Returns the PSNR of the blend with these weights over the counted pixels of all views together, dB.
+    /// Returns the PSNR of the blend with these weights over the counted pixels of all views
+    /// together, dB.
     ///
-    /// Before 8-bit rounding, and one mean over all pixels, where `metrics` takes one for each view.
-    /// `None` without pixels or without any error.
+    /// Before 8-bit rounding, and one mean over all pixels, where `metrics` takes one for each
+    /// view. `None` without pixels or without any error.
     pub fn psnr(&self, weights: &[f32]) -> Result<Option<f64>> {
         let weights = normalized(weights, self.members)?;
         // finite unless there are no pixels or no error
@@ -119,9 +120,9 @@ impl Fit {
     }
 }
 
-/// Returns the weights of least squared error over several views. A single member gets the whole weight if it alone
-/// is no worse under cross-validation, in which each view is evaluated with weights fitted to the others. `None` if
-/// no pixel counts.
+/// Returns the weights of least squared error over several views. A single member gets the whole
+/// weight if it alone is no worse under cross-validation, in which each view is evaluated with
+/// weights fitted to the others. `None` if no pixel counts.
 pub fn fit_weights(views: &[Fit]) -> Result<Option<Vec<f32>>> {
     let Some(first) = views.first() else { return Ok(None) };
     let merged = |left_out: Option<usize>| -> Result<Fit> {
@@ -299,9 +300,10 @@ mod tests {
 
     #[test]
     fn where_no_weights_hold_on_other_views_the_best_member_stands_alone() {
-        // errors of the members: 0.1 and -0.3 in one view, -0.1 and 0.02 in the other. Over both, (0.7, 0.3) is best;
-        // but the first alone asks for (0.75, 0.25) and the second for (0.17, 0.83), which leave 0.0049 of the second
-        // and 0.0544 of the first, and the first member alone 0.01 of each
+        // errors of the members: 0.1 and -0.3 in one view, -0.1 and 0.02 in the other. Over both,
+        // (0.7, 0.3) is best; but the first alone asks for (0.75, 0.25) and the second for (0.17,
+        // 0.83), which leave 0.0049 of the second and 0.0544 of the first, and the first member
+        // alone 0.01 of each
         let of =
             |errors: [f32; 2]| fit(&errors.map(|e| view(|_, _| 0.4 + e)), &photo(|_, _| 0.4), &everywhere());
         let views = [of([0.1, -0.3]), of([-0.1, 0.02])];

@@ -6,8 +6,8 @@ use tiface_base::math::cholesky::{factor, substitute};
 /// `argmin ½ wᵀHw − gᵀw` with `w ≥ 0`, `Σ w = 1`; H `[n · n]` symmetric positive definite, n ≤ 8.
 ///
 /// The least value lies inside the face of some members that are above 0. There are at most 255
-/// faces; on each one the minimum without bounds is `H w = g + ν`, ν such that the sum is 1, and the
-/// best of those that have no weight below 0 is the answer. Exact, no iteration.
+/// faces; on each one the minimum without bounds is `H w = g + ν`, ν such that the sum is 1, and
+/// the best of those that have no weight below 0 is the answer. Exact, no iteration.
 pub(super) fn least(h: &[f64], g: &[f64]) -> [f64; MAX_MEMBERS] {
     let n = g.len();
     let mut best = [0.0; MAX_MEMBERS];
@@ -34,8 +34,8 @@ pub(super) fn least(h: &[f64], g: &[f64]) -> [f64; MAX_MEMBERS] {
     best
 }
 
-/// Returns the minimum on one face, if it has no weight below 0. Corners need no equations, so a solution always
-/// exists.
+/// Returns the minimum on one face, if it has no weight below 0. Corners need no equations, so a
+/// solution always exists.
 fn on_face(h: &[f64], g: &[f64], on: &[usize]) -> Option<[f64; MAX_MEMBERS]> {
     let (n, m) = (g.len(), on.len());
     let mut x = [0.0; MAX_MEMBERS];

@@ -1,7 +1,9 @@
-//! Tiles: squares of the training photographs that are excluded from training; the weights are fitted on them.
+//! Tiles: squares of the training photographs that are excluded from training; the weights are
+//! fitted on them.
 //!
-//! Excluding whole views would harm the fields; excluding a few squares of each does not, since other views show the
-//! same skin. The squares are large enough that their content cannot be guessed from the pixels around.
+//! Excluding whole views would harm the fields; excluding a few squares of each does not, since
+//! other views show the same skin. The squares are large enough that their content cannot be
+//! guessed from the pixels around.
 
 use tiface_base::math::rng;
 
@@ -30,8 +32,9 @@ impl Tile {
     }
 }
 
-/// Returns the tiles of photograph number `view`: about `share` of its pixels, at least one tile, each at a random
-/// position in its own cell of a grid; none if `share` is 0. The same arguments give the same tiles.
+/// Returns the tiles of photograph number `view`: about `share` of its pixels, at least one tile,
+/// each at a random position in its own cell of a grid; none if `share` is 0. The same arguments
+/// give the same tiles.
 pub fn tiles(width: u32, height: u32, share: f64, seed: u64, view: u64) -> Vec<Tile> {
     let shorter = width.min(height);
     let side = (shorter / TILES_PER_SIDE).max(MIN_TILE_PX).min(shorter);

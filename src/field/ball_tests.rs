@@ -13,7 +13,8 @@ use tiface_base::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors
 use tiface_base::math::rng;
 use tiface_base::{Monitor, Quiet, Result};
 
-/// Returns photographs of a ball textured with waves of a few pixels: nine from the front and three from the back.
+/// Returns photographs of a ball textured with waves of a few pixels: nine from the front and three
+/// from the back.
 pub fn textured_views() -> Vec<TrainView> {
     let waves = |p: Vec3| {
         let wave = |i: u64| {
@@ -124,8 +125,9 @@ pub(crate) fn beginning(run: Run) -> Files {
     first.1.into_inner().unwrap()
 }
 
-/// Asserts that a training stopped `stops` times after 11 steps, whose newest checkpoint is then truncated as by a crash,
-/// ends with the same bytes as an uninterrupted training. Returns the folder of the latter.
+/// Asserts that a training stopped `stops` times after 11 steps, whose newest checkpoint is then
+/// truncated as by a crash, ends with the same bytes as an uninterrupted training. Returns the
+/// folder of the latter.
 pub fn resumes(run: Run, stops: usize) -> tempfile::TempDir {
     resumes_from(&Files::default(), run, stops)
 }
@@ -146,8 +148,9 @@ pub(crate) fn resumes_from(begun: &Files, run: Run, stops: usize) -> tempfile::T
     undisturbed
 }
 
-/// Asserts that each changed checkpoint of a training that was stopped twice is reported with its defect and that the
-/// previous checkpoint is used; without a previous one, the error must say how to restart the stage.
+/// Asserts that each changed checkpoint of a training that was stopped twice is reported with its
+/// defect and that the previous checkpoint is used; without a previous one, the error must say how
+/// to restart the stage.
 pub fn refuses(run: Run, stop_after: u64, stage: &str, rows: &[(&str, &dyn Fn(&mut Tensors))]) {
     let (begun, undisturbed) = (temporary(), temporary());
     for _ in 0..2 {

@@ -1,9 +1,10 @@
 //! Checkpoints: everything needed to resume the training of a field, in one safetensors file.
 //!
-//! A file holds named tensors (`model.` for values, `first.` and `second.` for the optimizer's moments, and others by
-//! field) and a header of strings: `format`, `identity` (settings, inputs and seed of the training), `finished`, `step`
-//! and others by field. Two files alternate, so that the newest complete checkpoint is never replaced before its
-//! successor is written, and a checkpoint that fails validation falls back to the previous one.
+//! A file holds named tensors (`model.` for values, `first.` and `second.` for the optimizer's
+//! moments, and others by field) and a header of strings: `format`, `identity` (settings, inputs
+//! and seed of the training), `finished`, `step` and others by field. Two files alternate, so that
+//! the newest complete checkpoint is never replaced before its successor is written, and a
+//! checkpoint that fails validation falls back to the previous one.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -47,8 +48,8 @@ fn unreadable(e: ReadError, stage: &str) -> Error {
 }
 
 impl Checkpoint {
-    /// Returns a checkpoint without tensors. `stage` is the settings table that messages name; `identity` identifies
-    /// settings, inputs and seed of the training.
+    /// Returns a checkpoint without tensors. `stage` is the settings table that messages name;
+    /// `identity` identifies settings, inputs and seed of the training.
     pub fn new(stage: &'static str, format: &str, identity: &str) -> Checkpoint {
         let mut empty =
             Checkpoint { path: PathBuf::new(), stage, tensors: BTreeMap::new(), header: BTreeMap::new() };
@@ -96,7 +97,8 @@ impl Checkpoint {
         self.put(name, &[values.len()], TensorValues::U64(values));
     }
 
-    /// Writes the checkpoint as the newest of a stage folder; the newest so far becomes the previous one.
+    /// Writes the checkpoint as the newest of a stage folder; the newest so far becomes the
+    /// previous one.
     pub fn save(self, dir: &Path) -> Result<()> {
         let path = newest(dir);
         let next = dir.join("checkpoint.next.safetensors");
@@ -119,7 +121,8 @@ impl Checkpoint {
         text.ok_or_else(|| self.mismatch(format!("its metadata has no `{key}`")))
     }
 
-    /// Returns an integer from the header; a value outside `range` is an error, because no training writes one.
+    /// Returns an integer from the header; a value outside `range` is an error, because no training
+    /// writes one.
     pub fn number(&self, key: &str, range: RangeInclusive<u64>) -> Result<u64> {
         let found = self.header.get(key);
         found.and_then(|text| text.parse().ok()).filter(|n| range.contains(n)).ok_or_else(|| {
@@ -155,7 +158,8 @@ impl Checkpoint {
         }
     }
 
-    /// Removes and returns a tensor of non-negative floats, such as mean squares, whose roots will be taken.
+    /// Removes and returns a tensor of non-negative floats, such as mean squares, whose roots will
+    /// be taken.
     pub fn squares(&mut self, name: &str, shape: &[usize]) -> Result<Vec<f32>> {
         let values = self.floats(name, shape)?;
         match values.iter().position(|v| *v < 0.0) {
@@ -201,7 +205,8 @@ impl TrainingProgress {
         into.set("finished", u64::from(finished));
     }
 
-    /// Reads the progress from a checkpoint of a training of `steps` steps, and whether the training had finished.
+    /// Reads the progress from a checkpoint of a training of `steps` steps, and whether the
+    /// training had finished.
     pub fn restore(from: &Checkpoint, steps: u64) -> Result<(TrainingProgress, bool)> {
         // Early versions of the format have no `finished` entry.
         let finished = from.number_or("finished", 0, 0..=1)? == 1;
@@ -217,8 +222,9 @@ impl TrainingProgress {
     }
 }
 
-/// Restores the newest checkpoint of a stage folder that `read` accepts, and returns it with warnings about a newer one
-/// that it refused. Returns `None` if the folder has no checkpoint. A checkpoint of another identity is refused.
+/// Restores the newest checkpoint of a stage folder that `read` accepts, and returns it with
+/// warnings about a newer one that it refused. Returns `None` if the folder has no checkpoint. A
+/// checkpoint of another identity is refused.
 pub fn restore<T>(
     dir: &Path,
     stage: &'static str,
@@ -233,7 +239,8 @@ pub fn restore<T>(
             continue;
         }
         let content = match read_tensors(&path, &Limits::default()) {
-            // A read failure of the disk does not mean a damaged file, so no checkpoint may be discarded for it.
+            // A read failure of the disk does not mean a damaged file, so no checkpoint may be
+            // discarded for it.
             Err(e @ (ReadError::Io { .. } | ReadError::TooLarge { .. })) => return Err(unreadable(e, stage)),
             content => content.map_err(|e| unreadable(e, stage)),
         };

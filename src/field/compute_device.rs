@@ -55,8 +55,9 @@ impl ComputeDevice {
     }
 }
 
-/// Returns the report on every GPU of this machine, software renderers included, and the device that `--device auto`
-/// selects for all fields. The self-tests run again, regardless of earlier verdicts.
+/// Returns the report on every GPU of this machine, software renderers included, and the device
+/// that `--device auto` selects for all fields. The self-tests run again, regardless of earlier
+/// verdicts.
 pub fn examine_devices(tests: &[SelfTest]) -> Result<(Vec<DeviceReport>, ComputeDevice)> {
     #[cfg(feature = "wgpu")]
     let found = devices::examine_adapters(tests);
@@ -76,8 +77,8 @@ fn select(choice: &DeviceChoice, tests: &[SelfTest]) -> ComputeDevice {
     }
 }
 
-/// Opens the device named `name`; see [`DeviceChoice`] for the syntax. `auto` selects a GPU only if it passes `test`, the
-/// self-test of the field to be computed.
+/// Opens the device named `name`; see [`DeviceChoice`] for the syntax. `auto` selects a GPU only if
+/// it passes `test`, the self-test of the field to be computed.
 ///
 /// # Errors
 ///

@@ -1,4 +1,5 @@
-//! The report of `tiface doctor` on a device: its properties, and a training step compared with the CPU's.
+//! The report of `tiface doctor` on a device: its properties, and a training step compared with the
+//! CPU's.
 
 use serde::Serialize;
 use tiface_base::Result;

@@ -1,8 +1,9 @@
 //! The GPUs of this machine: enumeration, selection and self-tests.
 //!
-//! One training uses a device at a time, which a lock file in the temporary folder enforces. Before `auto` selects a
-//! device, it compares a training step on the device with the CPU's. The verdict is stored in the user's cache, so
-//! the test runs once for each adapter, driver, program and field.
+//! One training uses a device at a time, which a lock file in the temporary folder enforces. Before
+//! `auto` selects a device, it compares a training step on the device with the CPU's. The verdict
+//! is stored in the user's cache, so the test runs once for each adapter, driver, program and
+//! field.
 
 use super::device_report::{Check, DeviceReport, NO_GPU, SelfTest};
 use crate::config::DeviceChoice;
@@ -19,14 +20,15 @@ pub struct Gpu {
     pub device: Device,
     /// The reason for choosing the device.
     pub why: String,
-    /// Lock that keeps other processes' `auto` from selecting the device; `None` if another process held it already.
+    /// Lock that keeps other processes' `auto` from selecting the device; `None` if another process
+    /// held it already.
     pub lock: Option<Arc<Lock>>,
     /// Whether `auto` selected the device, rather than the user naming it.
     pub auto_selected: bool,
 }
 
-/// Opens the named GPU: an API (`wgpu` stands for any) and an index among its adapters. Without an index, opens the
-/// first free adapter that is not a software renderer.
+/// Opens the named GPU: an API (`wgpu` stands for any) and an index among its adapters. Without an
+/// index, opens the first free adapter that is not a software renderer.
 ///
 /// # Errors
 ///
@@ -109,8 +111,8 @@ fn no_such_adapter(name: &str, api: &str, adapters: &[&Adapter]) -> Error {
     )
 }
 
-/// Opens the first GPU that is not a software renderer, is not in use and passes the tests. Otherwise returns why each
-/// adapter was rejected.
+/// Opens the first GPU that is not a software renderer, is not in use and passes the tests.
+/// Otherwise returns why each adapter was rejected.
 pub fn best(choice: &DeviceChoice, tests: &[SelfTest]) -> std::result::Result<Gpu, String> {
     best_of(Adapter::all().iter().filter(|a| !a.software), choice, tests, &lock_folder())
 }
@@ -147,8 +149,8 @@ fn best_of<'a>(
     Err(if rejected.is_empty() { NO_GPU.into() } else { rejected.join(", ") })
 }
 
-/// Acquires the lock of a device, or shares it if this process holds it already: all fields of a process use the same
-/// device.
+/// Acquires the lock of a device, or shares it if this process holds it already: all fields of a
+/// process use the same device.
 fn acquire_lock(file: PathBuf) -> std::result::Result<Arc<Lock>, LockError> {
     static HELD: Mutex<BTreeMap<PathBuf, Weak<Lock>>> = Mutex::new(BTreeMap::new());
     let mut held_locks = HELD.lock().unwrap_or_else(PoisonError::into_inner);
@@ -179,8 +181,8 @@ fn verdict_file() -> Option<PathBuf> {
     Some(base.join("tiface/devices.json"))
 }
 
-/// Returns the cache key of a verdict. It names adapter, driver, API, program and field, so that a change of any of them
-/// runs the test again.
+/// Returns the cache key of a verdict. It names adapter, driver, API, program and field, so that a
+/// change of any of them runs the test again.
 fn verdict_key(device: &Device, adapter: &Adapter, test: &SelfTest) -> String {
     let built = std::env::current_exe().ok().and_then(|exe| io::modified(&exe));
     let release = env!("CARGO_PKG_VERSION");

@@ -1,8 +1,8 @@
 //! Sampling of training rays for a device, from photographs in device or host memory.
 //!
-//! Photographs that fit are copied to the device, and kernels sample them. Otherwise the CPU samples the same rays
-//! from host memory while the device computes the previous step, and uploads rays and colors: about half a megabyte per
-//! step.
+//! Photographs that fit are copied to the device, and kernels sample them. Otherwise the CPU
+//! samples the same rays from host memory while the device computes the previous step, and uploads
+//! rays and colors: about half a megabyte per step.
 //!
 //! [`MemoryNeed`] plans a training's memory on a device.
 
@@ -18,10 +18,12 @@ pub struct DeviceSampler {
     drawing: SamplingOptions,
 }
 
-/// Returns the bytes that the photographs take on a device, or `None` if they do not fit in `available` bytes.
+/// Returns the bytes that the photographs take on a device, or `None` if they do not fit in
+/// `available` bytes.
 pub fn resident(sampler: &RaySampler, device: &Device, available: u64) -> Option<u64> {
     let buffers = sampler.buffers_on_device(device.limits().largest_buffer);
-    // A pixel takes four bytes for its color, one bit for whether it is drawable, and its share of the bits' counts.
+    // A pixel takes four bytes for its color, one bit for whether it is drawable, and its share of
+    // the bits' counts.
     let bytes = buffers.iter().sum::<u64>() * 17 / 4;
     let fits = buffers.len() <= BUFFERS && bytes <= available;
     (fits && sampler.count() <= u32::MAX as u64).then_some(bytes)
@@ -39,7 +41,8 @@ impl DeviceSampler {
         DeviceSampler { resident: resident.then(|| sampler.on_device(device, drawing, largest)), drawing }
     }
 
-    /// Draws the rays of a step into `batch`. They depend on seed and step alone; see [`RaySampler::draw`].
+    /// Draws the rays of a step into `batch`. They depend on seed and step alone; see
+    /// [`RaySampler::draw`].
     ///
     /// # Shapes
     ///
@@ -101,12 +104,13 @@ pub struct MemoryNeed {
 }
 
 impl MemoryNeed {
-    /// Returns how many samples or rays fit on the device, up to the wanted number, and whether the photographs fit as
-    /// well.
+    /// Returns how many samples or rays fit on the device, up to the wanted number, and whether the
+    /// photographs fit as well.
     ///
     /// # Errors
     ///
-    /// If fewer than the minimum fit; `remedy` receives how many fit and returns the setting to lower.
+    /// If fewer than the minimum fit; `remedy` receives how many fit and returns the setting to
+    /// lower.
     pub fn plan(
         &self,
         sampler: &RaySampler,
@@ -170,7 +174,8 @@ mod tests {
         }
     }
 
-    /// Returns the resident memory of this process in kilobytes: the current amount, or the peak since the last call.
+    /// Returns the resident memory of this process in kilobytes: the current amount, or the peak
+    /// since the last call.
     fn resident_memory(peak: bool) -> u64 {
         let status = std::fs::read_to_string("/proc/self/status").unwrap();
         let name = if peak { "VmHWM:" } else { "VmRSS:" };

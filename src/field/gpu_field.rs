@@ -23,8 +23,8 @@ impl<T> GpuField<T> {
         self.failure.get().map(String::as_str)
     }
 
-    /// Evaluates the field on the GPU. Returns `None` without a field or if the GPU failed, so that the caller
-    /// evaluates it on the CPU.
+    /// Evaluates the field on the GPU. Returns `None` without a field or if the GPU failed, so that
+    /// the caller evaluates it on the CPU.
     pub fn ask<A>(&self, evaluate: impl FnOnce(&mut T) -> Result<A>) -> Option<A> {
         let mut field = self.field.lock().ok()?;
         let result = evaluate(field.as_mut()?);

@@ -11,7 +11,8 @@ use tiface_base::{Monitor, Quiet, Result};
 use tiface_kernels::gpu::testing::{devices, lose_after};
 use tiface_kernels::gpu::{Atomics, Device};
 
-/// Returns the error of the colors that a field shows of every third pixel of a view over black, dB.
+/// Returns the error of the colors that a field shows of every third pixel of a view over black,
+/// dB.
 pub fn psnr(view: &TrainView, render: impl FnOnce(&[Ray]) -> Vec<RayResult>) -> f64 {
     let width = view.camera.width as usize;
     let pixels: Vec<usize> = (0..view.photo.rgb.len()).step_by(3).collect();
@@ -66,8 +67,8 @@ pub fn alone_and_in_turn<T>(run: RunOn<T>, first: u64, parts: &[(&str, u64)]) ->
     [alone, moved].map(|dir| run(dir.path(), "cpu", &Quiet).unwrap())
 }
 
-/// Trains in two ways: on the CPU; and on the device for so many steps, on the CPU for so many, and on
-/// the device to the end.
+/// Trains in two ways: on the CPU; and on the device for so many steps, on the CPU for so many, and
+/// on the device to the end.
 pub fn cpu_and_both<T>(run: RunOn<T>, [on_device, on_cpu]: [u64; 2]) -> [T; 2] {
     let alone = run(temporary().path(), "cpu", &Quiet).unwrap();
     let both = temporary();
@@ -77,8 +78,8 @@ pub fn cpu_and_both<T>(run: RunOn<T>, [on_device, on_cpu]: [u64; 2]) -> [T; 2] {
 }
 
 /// Asserts that a training is not harmed when its device fails after any of these numbers of
-/// readbacks: the checkpoint that lies in `begun` stays as it is, and the training goes on from there
-/// to the bytes of one whose device was not lost.
+/// readbacks: the checkpoint that lies in `begun` stays as it is, and the training goes on from
+/// there to the bytes of one whose device was not lost.
 pub fn outlives_lost_devices<T>(run: RunOn<T>, begun: &Path, answers: &[usize]) {
     // sums in fixed point, which come to the same bytes twice
     let run = |dir: &Path| run(dir, "wgpu:0+deterministic", &Quiet);
@@ -120,7 +121,8 @@ pub fn counted_step<M: Model>(
     CountedStep { report, launches: after.0 - before.0, readbacks: after.1 - before.1 }
 }
 
-/// Asserts that steps whose sums are in fixed point give the same values twice; skipped without a GPU.
+/// Asserts that steps whose sums are in fixed point give the same values twice; skipped without a
+/// GPU.
 pub fn fixed_sums_repeat<T: PartialEq>(trained: impl Fn(Device) -> T) {
     let fixed = || devices().pop().inspect(|device| assert_eq!(device.atomics(), Atomics::Fixed));
     let (Some(a), Some(b)) = (fixed(), fixed()) else { return };

@@ -1,9 +1,9 @@
 //! Operations that every field needs from the device it trains on.
 //!
-//! A model's training step is written once, over traits of operations ([`Ops`] and one for each model); each device
-//! implements them with its own kernels. The CPU computes on burn's Flex tensors and completes each step. A GPU
-//! computes on burn's CubeCL tensors; the host queues the launches of many steps and reads results back once in
-//! [`ArrayDevice::READ_EVERY`] steps.
+//! A model's training step is written once, over traits of operations ([`Ops`] and one for each
+//! model); each device implements them with its own kernels. The CPU computes on burn's Flex
+//! tensors and completes each step. A GPU computes on burn's CubeCL tensors; the host queues the
+//! launches of many steps and reads results back once in [`ArrayDevice::READ_EVERY`] steps.
 
 #[cfg(feature = "wgpu")]
 use burn::backend::Cube;
@@ -20,12 +20,14 @@ pub trait ArrayDevice {
     /// A flat array of floats.
     type Array;
 
-    /// Condition for an optimizer step: closed if the training step had no sample, or once a gradient was not finite.
+    /// Condition for an optimizer step: closed if the training step had no sample, or once a
+    /// gradient was not finite.
     type Gate<'a>
     where
         Self: 'a;
 
-    /// Steps between two readbacks of losses and flags, which is also the delay in detecting an error.
+    /// Steps between two readbacks of losses and flags, which is also the delay in detecting an
+    /// error.
     const READ_EVERY: u64;
 
     /// Copies values to the device.
@@ -38,7 +40,8 @@ pub trait ArrayDevice {
     /// If the device does not respond.
     fn download(&self, array: &Self::Array) -> Result<Vec<f32>>;
 
-    /// Makes an AdamW step of values, first and second moments in place and zeroes the gradient, if the gate is open.
+    /// Makes an AdamW step of values, first and second moments in place and zeroes the gradient, if
+    /// the gate is open.
     fn adam(
         &self,
         state: [&mut Self::Array; 3],

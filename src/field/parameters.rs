@@ -1,8 +1,9 @@
-//! Trained arrays with their AdamW moments: on the host, as checkpoints hold them, and on the device that trains.
+//! Trained arrays with their AdamW moments: on the host, as checkpoints hold them, and on the
+//! device that trains.
 //!
-//! A group is one flat array of parameters with a common learning rate and weight decay; in checkpoints each of its parts
-//! has its own name. The hash table updates touched rows only. Checkpoints store the moments beside the weights, so that
-//! a resumed run gives the same bytes.
+//! A group is one flat array of parameters with a common learning rate and weight decay; in
+//! checkpoints each of its parts has its own name. The hash table updates touched rows only.
+//! Checkpoints store the moments beside the weights, so that a resumed run gives the same bytes.
 
 use super::checkpoint::Checkpoint;
 use super::ops::ArrayDevice;
@@ -77,8 +78,9 @@ impl HostGroup {
         }
     }
 
-    /// Reads parts of exactly these shapes from a checkpoint. Without `with_moments` the moments are zero. Memory is
-    /// allocated only for tensors that the file really holds, independent of the claimed shapes.
+    /// Reads parts of exactly these shapes from a checkpoint. Without `with_moments` the moments
+    /// are zero. Memory is allocated only for tensors that the file really holds, independent of
+    /// the claimed shapes.
     pub fn restore(
         parts: Vec<ParameterPart>,
         from: &mut Checkpoint,

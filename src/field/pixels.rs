@@ -1,11 +1,13 @@
-//! Sampling of training rays: random pixels of the photographs that carry information about the head.
+//! Sampling of training rays: random pixels of the photographs that carry information about the
+//! head.
 //!
-//! The ray of a pixel farther from the mask than the visual hull's cells reach meets no sample and contributes nothing,
-//! so only the mask and a margin around it are drawn. Photographs stay 8 bit.
+//! The ray of a pixel farther from the mask than the visual hull's cells reach meets no sample and
+//! contributes nothing, so only the mask and a margin around it are drawn. Photographs stay 8 bit.
 //!
-//! A photograph counts as large if its pixels are finer than the field's final resolution. While the field is still
-//! coarser, a ray of a large photograph stands for a square of pixels: it passes through their middle and has their mean
-//! color, as if drawn from a level of an image pyramid. Single pixels would alias and act as noise.
+//! A photograph counts as large if its pixels are finer than the field's final resolution. While
+//! the field is still coarser, a ray of a large photograph stands for a square of pixels: it passes
+//! through their middle and has their mean color, as if drawn from a level of an image pyramid.
+//! Single pixels would alias and act as noise.
 
 use super::soft_pixels::{SoftPixels, soft_pixels};
 use super::training::StepAt;
@@ -62,9 +64,11 @@ type Drawable = (u32, u32, u32, u32, Vec<u64>);
 /// The drawable pixels of all views.
 pub struct RaySampler<'a> {
     views: &'a [TrainView],
-    /// Per view: target colors over black of the soft pixels; `None` if the target is alpha times the photograph.
+    /// Per view: target colors over black of the soft pixels; `None` if the target is alpha times
+    /// the photograph.
     soft: Vec<Option<SoftPixels>>,
-    /// Per view: width of a pixel at the scene's center, scene units; infinite if the photograph is not large.
+    /// Per view: width of a pixel at the scene's center, scene units; infinite if the photograph is
+    /// not large.
     pixel: Vec<f32>,
     /// Per view.
     drawable: Vec<Drawable>,
@@ -87,14 +91,15 @@ struct Order {
 }
 
 impl<'a> RaySampler<'a> {
-    /// Collects the drawable pixels of the views. `reach` is how far outside the mask, in scene units, a ray may still
-    /// meet an occupied cell.
+    /// Collects the drawable pixels of the views. `reach` is how far outside the mask, in scene
+    /// units, a ray may still meet an occupied cell.
     ///
-    /// `foreground` selects the target color of soft pixels. If some views have masks, views without one (or with one
-    /// that is white all over) are not drawn from: they would label the whole frame as head.
+    /// `foreground` selects the target color of soft pixels. If some views have masks, views
+    /// without one (or with one that is white all over) are not drawn from: they would label the
+    /// whole frame as head.
     ///
-    /// `reference_sampling` draws as the published code does: a uniformly random view, then a uniformly random pixel of
-    /// its frame.
+    /// `reference_sampling` draws as the published code does: a uniformly random view, then a
+    /// uniformly random pixel of its frame.
     pub fn new(
         views: &'a [TrainView],
         reach: f32,
@@ -122,12 +127,13 @@ impl<'a> RaySampler<'a> {
         RaySampler { views, soft, pixel, drawable, cumulative, radius, has_masks, reference_sampling, order }
     }
 
-    /// Collects pixels as TensoRF's code draws them: all valid ones whose ray meets the box `bounds` at any distance, in a
-    /// random order without repetition, which restarts when less than a batch is left. With `depth_directions`, ray
-    /// directions have depth 1 along the optical axis, as in its loader of forward-facing captures.
+    /// Collects pixels as TensoRF's code draws them: all valid ones whose ray meets the box
+    /// `bounds` at any distance, in a random order without repetition, which restarts when less
+    /// than a batch is left. With `depth_directions`, ray directions have depth 1 along the optical
+    /// axis, as in its loader of forward-facing captures.
     ///
-    /// The permutation is computed, not stored: for twenty-four photographs of twelve megapixels its table would take two
-    /// gigabytes.
+    /// The permutation is computed, not stored: for twenty-four photographs of twelve megapixels
+    /// its table would take two gigabytes.
     pub fn permuted(
         views: &'a [TrainView],
         foreground: Foreground,
@@ -165,8 +171,8 @@ impl<'a> RaySampler<'a> {
         sampler
     }
 
-    /// Treats photographs as large whose pixels, at the scene's center, are finer than `finest`, the field's final
-    /// resolution in scene units.
+    /// Treats photographs as large whose pixels, at the scene's center, are finer than `finest`,
+    /// the field's final resolution in scene units.
     pub fn with_large(mut self, finest: f32) -> Self {
         for (width, view) in self.pixel.iter_mut().zip(self.views) {
             let camera = &view.camera;
@@ -186,8 +192,9 @@ impl<'a> RaySampler<'a> {
         self.cumulative.last().copied().unwrap_or(0)
     }
 
-    /// Draws `count` random rays of a step, which depend on seed and step alone. A ray of a large photograph stands for a
-    /// square of pixels, the widest of [`SIDES`] that is at most `detail` wide, in scene units.
+    /// Draws `count` random rays of a step, which depend on seed and step alone. A ray of a large
+    /// photograph stands for a square of pixels, the widest of [`SIDES`] that is at most `detail`
+    /// wide, in scene units.
     pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool, detail: f32) -> HostBatch {
         let draw = |i: usize| match &self.order {
             Some(order) => self.draw_next(order, (seed, step), (i as u64, count as u64), jitter),
@@ -205,8 +212,8 @@ impl<'a> RaySampler<'a> {
         batch
     }
 
-    /// Copies the photographs to a device, in buffers of at most `largest` bytes. The device draws the same rays from
-    /// them.
+    /// Copies the photographs to a device, in buffers of at most `largest` bytes. The device draws
+    /// the same rays from them.
     #[cfg(feature = "wgpu")]
     pub fn on_device(
         &self,
@@ -219,8 +226,8 @@ impl<'a> RaySampler<'a> {
             None if self.reference_sampling => gpu::PixelOrder::EachView,
             None => gpu::PixelOrder::Random,
         };
-        // Packing one photograph per thread at a time bounds the extra memory: packed photographs are as large as the
-        // originals.
+        // Packing one photograph per thread at a time bounds the extra memory: packed photographs
+        // are as large as the originals.
         let (count, threads) = (self.views.len(), rayon::current_num_threads());
         let pack = |first: usize| -> Vec<gpu::DrawnView> {
             (first..count.min(first + threads)).into_par_iter().map(|v| self.packed_view(v)).collect()
@@ -229,7 +236,8 @@ impl<'a> RaySampler<'a> {
         gpu::Photographs::new(device, views, &self.buffers_on_device(largest), self.radius, order, drawing)
     }
 
-    /// Returns how many pixels each buffer of the photographs holds on a device whose buffers have at most `largest` bytes.
+    /// Returns how many pixels each buffer of the photographs holds on a device whose buffers have
+    /// at most `largest` bytes.
     #[cfg(feature = "wgpu")]
     pub fn buffers_on_device(&self, largest: u64) -> Vec<u64> {
         let mut buffers = vec![0];
@@ -270,8 +278,8 @@ impl<'a> RaySampler<'a> {
         }
     }
 
-    /// Draws ray `i` of a batch of `count` in the order without repetition: the ray, its pixel's color
-    /// over black, and the pixel's alpha.
+    /// Draws ray `i` of a batch of `count` in the order without repetition: the ray, its pixel's
+    /// color over black, and the pixel's alpha.
     fn draw_next(
         &self,
         order: &Order,
@@ -295,7 +303,8 @@ impl<'a> RaySampler<'a> {
         Some((MarchRay { origin, direction, jitter }, color, alpha))
     }
 
-    /// Returns color and alpha of pixel `p` of view `v`. The color is already over black if the view has soft pixels.
+    /// Returns color and alpha of pixel `p` of view `v`. The color is already over black if the
+    /// view has soft pixels.
     fn pixel(&self, v: usize, p: usize) -> ([u8; 3], u8) {
         let view = &self.views[v];
         let alpha = view.mask.as_ref().map_or(255, |m| m.values[p]);
@@ -313,7 +322,8 @@ impl<'a> RaySampler<'a> {
         (color.map(|c| share * c as f32 / 255.0), alpha)
     }
 
-    /// Returns the middle of the drawable pixels of the square with its corner at `at`, and their mean color and alpha.
+    /// Returns the middle of the drawable pixels of the square with its corner at `at`, and their
+    /// mean color and alpha.
     fn square(&self, v: usize, at: [u32; 2], side: u32) -> (Vec2, [f32; 3], f32) {
         let (.., bits) = &self.drawable[v];
         let photo = &self.views[v].photo;
@@ -358,8 +368,8 @@ impl<'a> RaySampler<'a> {
         }
         let view = &self.views[v];
         let width = view.photo.width;
-        // Rejection sampling in the box of drawable pixels is cheap, because a head fills most of its box.
-        // (The published code drops a pixel that is not valid, and the batch shrinks.)
+        // Rejection sampling in the box of drawable pixels is cheap, because a head fills most of
+        // its box. (The published code drops a pixel that is not valid, and the batch shrinks.)
         for attempt in 0..if self.reference_sampling { 1 } else { 256 } {
             let k = i << 9 | attempt << 1;
             let x = x0 + rng::below(seed, stream + 1, k, (x1 - x0 + 1) as u64) as u32;
@@ -383,14 +393,15 @@ impl<'a> RaySampler<'a> {
     }
 }
 
-/// Widest pixel of a large photograph, scene units: a thousandth of the scene's width. Coarser photographs are sampled
-/// pixel by pixel from the first step, however coarse the field is.
+/// Widest pixel of a large photograph, scene units: a thousandth of the scene's width. Coarser
+/// photographs are sampled pixel by pixel from the first step, however coarse the field is.
 pub const LARGE: f32 = 2.0 / 1000.0;
 
 /// Possible widths of a square, in pixels.
 pub const SIDES: [u32; 4] = [1, 2, 4, 8];
 
-/// Returns the side in pixels of the widest square that is at most `detail` wide, for pixels of width `pixel`; at least 1.
+/// Returns the side in pixels of the widest square that is at most `detail` wide, for pixels of
+/// width `pixel`; at least 1.
 fn side(pixel: f32, detail: f32) -> u32 {
     SIDES.into_iter().rfind(|&side| side as f32 * pixel <= detail).unwrap_or(1)
 }
@@ -416,15 +427,16 @@ fn center(p: usize, width: usize) -> Vec2 {
     Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5)
 }
 
-/// Returns box and bits of the pixels to draw from in one view: those within `reach` scene units of the mask, or all
-/// without a mask; none if `reach` is `None`.
+/// Returns box and bits of the pixels to draw from in one view: those within `reach` scene units of
+/// the mask, or all without a mask; none if `reach` is `None`.
 fn drawable(view: &TrainView, reach: Option<f32>) -> Drawable {
     let (w, h) = (view.photo.width as usize, view.photo.height as usize);
     let mut in_reach = vec![reach.is_some(); w * h];
     if let (Some(mask), Some(reach)) = (&view.mask, reach)
         && reach.is_finite()
     {
-        // The reach in pixels is largest at the nearest part of the box, at most one unit closer than its center.
+        // The reach in pixels is largest at the nearest part of the box, at most one unit closer
+        // than its center.
         let distance = (view.camera.position.length() - 1.0).max(0.2);
         let margin = (reach as f64 * view.camera.fx.max(view.camera.fy) / distance).ceil() as usize + 1;
         in_reach = dilated(mask.values.iter().map(|&v| v > 0).collect(), w, h, margin, margin);
@@ -442,8 +454,8 @@ fn drawable(view: &TrainView, reach: Option<f32>) -> Drawable {
     (x0, y0, x1, y1, bits)
 }
 
-/// Returns the background color of each ray, used for both target and render: random colors from the given random
-/// stream, or black without one.
+/// Returns the background color of each ray, used for both target and render: random colors from
+/// the given random stream, or black without one.
 pub fn ray_backgrounds(at: StepAt, stream: Option<u64>, rays: usize) -> Vec<[f32; 3]> {
     let Some(stream) = stream else { return vec![[0.0; 3]; rays] };
     let channel = |i: u64| rng::uniform(at.seed, at.step << 4 | stream, i);

@@ -42,7 +42,8 @@ fn only_pixels_near_the_mask_are_drawn_and_carry_their_own_color() {
 
 #[test]
 fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_coarse() {
-    // a pixel is 4 / 20 = 0.2 wide at the middle: less than 0.3, so two of them for a detail of 0.5, not four
+    // a pixel is 4 / 20 = 0.2 wide at the middle: less than 0.3, so two of them for a detail of
+    // 0.5, not four
     let views = [view()];
     let large = RaySampler::new(&views, 0.1, 1.0, Foreground::Photo, false).with_large(0.3);
     let batch = large.draw(1, 2, 400, true, 0.5);
@@ -51,8 +52,8 @@ fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_
     for (ray, (color, alpha)) in batch.rays.iter().zip(batch.color.iter().zip(&batch.alpha)) {
         let d = ray.direction;
         let (x, y) = (d[0] / -d[2] * 20.0 + 10.0, d[1] / d[2] * 20.0 + 5.0);
-        // Columns 6 to 10 and rows 3 to 7 are drawable. Squares begin at even ones, and their rays pass through the
-        // middle of their drawable pixels.
+        // Columns 6 to 10 and rows 3 to 7 are drawable. Squares begin at even ones, and their rays
+        // pass through the middle of their drawable pixels.
         let near = |v: f32, middles: &[f32]| middles.iter().any(|m| (v - m).abs() < 1e-3);
         assert!(near(x, &[7.0, 9.0, 10.5]) && near(y, &[3.5, 5.0, 7.0]), "{x} {y}");
         if *alpha > 0.0 {
@@ -94,8 +95,9 @@ fn an_epoch_has_every_valid_pixel_that_meets_the_box_once_with_directions_of_dep
     valid[7 * 20 + 9] = 0;
     one.valid = Some(Gray { width: 20, height: 10, values: valid });
     let views = [one, view()];
-    // pixels are 1/20 apart at depth 1. The near face at z = 1 is 3 away: |x − 10| < 1.5 · 20 / 3 = 10 has all
-    // columns, |y − 5| < 0.4 · 20 / 3 = 2.67 the six rows with centers 0.5, 1.5 and 2.5 off the middle
+    // pixels are 1/20 apart at depth 1. The near face at z = 1 is 3 away: |x − 10| < 1.5 · 20 / 3 =
+    // 10 has all columns, |y − 5| < 0.4 · 20 / 3 = 2.67 the six rows with centers 0.5, 1.5 and 2.5
+    // off the middle
     let bounds = [[-1.5, -0.4, -1.0], [1.5, 0.4, 1.0]];
     let sampler = RaySampler::permuted(&views, Foreground::Photo, bounds, true);
     assert_eq!(sampler.count(), 2 * 20 * 6 - 1);
@@ -158,7 +160,8 @@ fn a_device_draws_the_same_rays() {
     let fov = Distortion { omega: 0.9, projection: Projection::Fov, ..Distortion::default() };
     let empty = TrainView { mask: None, ..view() };
     let views = [view(), bent(perspective), empty, bent(fisheye), bent(fov)];
-    // the last but one with squares of two pixels for a ray, a twentieth of the distance 4 wide each
+    // the last but one with squares of two pixels for a ray, a twentieth of the distance 4 wide
+    // each
     let new =
         |foreground, published| RaySampler::new(&views, 0.1, 0.3, foreground, published).with_large(0.3);
     let all = [[-1.0f32; 3], [1.0; 3]];

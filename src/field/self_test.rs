@@ -1,5 +1,5 @@
-//! Self-tests of GPUs: one training step of a field on the GPU and on the CPU, compared before `auto` trusts an
-//! adapter and its driver.
+//! Self-tests of GPUs: one training step of a field on the GPU and on the CPU, compared before
+//! `auto` trusts an adapter and its driver.
 
 use super::Check;
 use super::checkpoint::TrainingProgress;
@@ -12,14 +12,16 @@ use tiface_kernels::gpu::{Adapter, Atomics, Device};
 /// Seed of a test's random numbers.
 pub const SEED: u64 = 3;
 
-/// The compared step. Cells are updated before it, at [`CELLS_AT`], and the learning rates have warmed up.
+/// The compared step. Cells are updated before it, at [`CELLS_AT`], and the learning rates have
+/// warmed up.
 pub const STEP: u64 = 321;
 
-/// The step at which cells are updated. It is late enough that nerfacc's rule draws random cells instead of visiting all.
+/// The step at which cells are updated. It is late enough that nerfacc's rule draws random cells
+/// instead of visiting all.
 pub const CELLS_AT: u64 = STEP - 1;
 
-/// Largest relative error of losses and gradients. A wrong computation is off by more than a percent; another order of
-/// summation, or a sample more or less at the border of a cell, is not.
+/// Largest relative error of losses and gradients. A wrong computation is off by more than a
+/// percent; another order of summation, or a sample more or less at the border of a cell, is not.
 const ALLOWED: f32 = 2e-3;
 
 /// Returns a session for a training without checkpoints.
@@ -27,9 +29,9 @@ pub fn session(stage: &'static str) -> TrainingSession<'static> {
     TrainingSession { stage, seed: SEED, device: "", dir: Path::new(""), identity: "", monitor: &Quiet }
 }
 
-/// Opens an adapter once for each kind of atomics that trainings use on it. The second step is smaller by the returned
-/// divisor: the kernels that add differ, which are a small part of a step, and variants that the
-/// first step does not launch.
+/// Opens an adapter once for each kind of atomics that trainings use on it. The second step is
+/// smaller by the returned divisor: the kernels that add differ, which are a small part of a step,
+/// and variants that the first step does not launch.
 pub fn devices(adapter: &Adapter) -> Result<[(Device, usize); 2]> {
     Ok([(Device::open(adapter)?, 1), (Device::open(adapter)?.with_atomics(Atomics::Fixed), 8)])
 }
@@ -45,7 +47,8 @@ pub struct StepResult {
     /// Losses, and counts of rays and samples; empty if the step failed.
     figures: Vec<(&'static str, f64)>,
     before: Vec<HostGroup>,
-    /// Groups after the step. The first moments started at zero, so they are proportional to the gradients.
+    /// Groups after the step. The first moments started at zero, so they are proportional to the
+    /// gradients.
     after: Vec<HostGroup>,
 }
 
@@ -68,8 +71,8 @@ fn error(pairs: impl Iterator<Item = (f64, f64)>) -> f32 {
     if errors == 0.0 { 0.0 } else { (errors / all) as f32 }
 }
 
-/// Compares the result of a step on a GPU with the CPU's: each loss, the gradient of each parameter, and the
-/// optimizer's updates.
+/// Compares the result of a step on a GPU with the CPU's: each loss, the gradient of each
+/// parameter, and the optimizer's updates.
 pub fn compare(field: &str, got: &StepResult, want: &StepResult) -> Vec<Check> {
     let mut checks = Vec::new();
     for &(name, want) in &want.figures {
@@ -87,8 +90,8 @@ pub fn compare(field: &str, got: &StepResult, want: &StepResult) -> Vec<Check> {
             let pairs = span.map(|i| (slopes[i].into(), wanted[i].into()));
             checks.push(Check::new(format!("{field}: gradient of {}", part.name), error(pairs), ALLOWED));
         }
-        // Adam's first step has the gradient's sign alone, so the updates are weighted by the gradient: the sign of a
-        // gradient near zero means nothing.
+        // Adam's first step has the gradient's sign alone, so the updates are weighted by the
+        // gradient: the sign of a gradient near zero means nothing.
         let moved = |of: &StepResult, i: usize| {
             let [before, after] = [&of.before, &of.after].map(|groups| f64::from(groups[g].state[0][i]));
             (after - before) * f64::from(wanted[i])

@@ -1,16 +1,19 @@
 //! Colors of soft pixels without the light of the background.
 //!
-//! Where the mask is soft, a photograph mixes head and background: `photo = α F + (1 − α) B` in linear light. The
-//! published target `α · photo` darkens the head twice at soft pixels and keeps part of the background's light. This module
-//! estimates the background `B` from nearby pixels that are fully background, and subtracts it:
-//! `target over black = coded(α F) = coded(photo − (1 − α) B)`, which is the color of a render over black.
+//! Where the mask is soft, a photograph mixes head and background: `photo = α F + (1 − α) B` in
+//! linear light. The published target `α · photo` darkens the head twice at soft pixels and keeps
+//! part of the background's light. This module estimates the background `B` from nearby pixels that
+//! are fully background, and subtracts it:
+//! `target over black = coded(α F) = coded(photo − (1 − α) B)`, which is the color of a render over
+//! black.
 
 use tiface_base::image::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 
 /// Half edge of the window that collects background pixels, as a share of the picture's height.
 const WINDOW: f32 = 0.02;
 
-/// Colors over black of a photograph's soft pixels. All other pixels keep the photograph's color or are black.
+/// Colors over black of a photograph's soft pixels. All other pixels keep the photograph's color or
+/// are black.
 pub struct SoftPixels {
     /// Indices of the soft pixels, in ascending order.
     at: Vec<u32>,
@@ -18,7 +21,8 @@ pub struct SoftPixels {
 }
 
 impl SoftPixels {
-    /// Returns the color of pixel `p` over black: the photograph's where the mask is 255, black where it is 0.
+    /// Returns the color of pixel `p` over black: the photograph's where the mask is 255, black
+    /// where it is 0.
     pub fn over_black(&self, photo: &Photo, mask: &Gray, p: usize) -> [u8; 3] {
         match mask.values[p] {
             0 => [0; 3],

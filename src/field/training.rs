@@ -7,8 +7,9 @@
 //!                                → finish
 //! ```
 //!
-//! A model defines what differs between fields, and keeps its rays, samples, parameters and moments on its device between
-//! steps. The trainer sees named figures after a step, and the whole state only when a checkpoint is due.
+//! A model defines what differs between fields, and keeps its rays, samples, parameters and moments
+//! on its device between steps. The trainer sees named figures after a step, and the whole state
+//! only when a checkpoint is due.
 
 use super::checkpoint::{self, Checkpoint, TrainingProgress};
 use std::path::Path;
@@ -43,7 +44,8 @@ pub struct StepAt {
 
 /// Figures of a step, on the host.
 pub struct StepReport {
-    /// Mean squared error of the colors of all steps since the last report; `None` if no ray met a sample.
+    /// Mean squared error of the colors of all steps since the last report; `None` if no ray met a
+    /// sample.
     pub square_error: Option<f32>,
     /// Named figures, for display.
     pub figures: Vec<(&'static str, f64)>,
@@ -84,7 +86,8 @@ pub enum StepError {
 }
 
 impl StepError {
-    /// Returns the error for a gradient that is not finite, which can happen even if the loss is finite.
+    /// Returns the error for a gradient that is not finite, which can happen even if the loss is
+    /// finite.
     pub fn gradient() -> StepError {
         StepError::NotFinite { term: "gradient of the", value: f32::NAN }
     }
@@ -127,7 +130,8 @@ pub trait Model {
     /// Makes the optimizer's step of every parameter group.
     fn optimize(&mut self, step: u64);
 
-    /// Waits for the device and returns the figures of `step`, the last one, or their means since the last report.
+    /// Waits for the device and returns the figures of `step`, the last one, or their means since
+    /// the last report.
     fn report(&mut self, step: u64) -> Result<StepReport, StepError>;
 
     /// Does the work due after a step, such as refining grids.
@@ -135,10 +139,12 @@ pub trait Model {
         Ok(())
     }
 
-    /// Writes everything needed to resume into a checkpoint. A finished checkpoint needs only the result.
+    /// Writes everything needed to resume into a checkpoint. A finished checkpoint needs only the
+    /// result.
     fn save(&self, into: &mut Checkpoint, finished: bool) -> Result<(), StepError>;
 
-    /// Restores the state from a checkpoint, given its progress and whether it is finished, or sets the initial state.
+    /// Restores the state from a checkpoint, given its progress and whether it is finished, or sets
+    /// the initial state.
     fn restore(&mut self, from: Option<(&mut Checkpoint, &TrainingProgress, bool)>) -> Result<(), StepError>;
 }
 
@@ -158,8 +164,8 @@ pub fn step<M: Model>(
     Ok(report)
 }
 
-/// Trains until `steps`, saving a checkpoint every `checkpoint_s` seconds. A finished training is left unchanged.
-/// Returns the progress and warnings.
+/// Trains until `steps`, saving a checkpoint every `checkpoint_s` seconds. A finished training is
+/// left unchanged. Returns the progress and warnings.
 pub fn train<M: Model>(
     model: &mut M,
     session: &TrainingSession,
@@ -225,13 +231,14 @@ impl<'a, M: Model> Training<'a, M> {
     fn save(&self, finished: bool) -> Result<(), StepError> {
         let mut into = Checkpoint::new(self.session.stage, M::FORMAT, self.session.identity);
         self.progress.save(&mut into, finished);
-        // A model with non-finite values returns an error here, so that it does not replace a good checkpoint.
+        // A model with non-finite values returns an error here, so that it does not replace a good
+        // checkpoint.
         self.model.save(&mut into, finished)?;
         Ok(into.save(self.session.dir)?)
     }
 
-    /// Restores the model from the newest checkpoint, and returns its progress with warnings; `None`
-    /// without a checkpoint.
+    /// Restores the model from the newest checkpoint, and returns its progress with warnings;
+    /// `None` without a checkpoint.
     fn restore(&mut self) -> Result<Option<(TrainingProgress, Vec<String>)>> {
         let &TrainingSession { stage, identity, dir, .. } = self.session;
         checkpoint::restore(dir, stage, M::FORMAT, identity, |file| {
@@ -280,8 +287,8 @@ impl<'a, M: Model> Training<'a, M> {
     }
 }
 
-/// Returns the running mean over all steps, each weighted 2 % less than the next, from the mean of the first `old` steps
-/// and the mean of the `new` steps after them.
+/// Returns the running mean over all steps, each weighted 2 % less than the next, from the mean of
+/// the first `old` steps and the mean of the `new` steps after them.
 fn running_mean(mean: f64, old: u64, of_new: f64, new: u64) -> f64 {
     let weight = |steps: u64| 1.0 - 0.98f64.powf(steps as f64);
     let keep = (1.0 - weight(new)) * weight(old) / weight(old + new);

@@ -241,8 +241,9 @@ impl SdfOps for CpuSdf<'_> {
         weight_norm::backward(self.shape.layout(), slice(parameters), &g_flat, g_network);
         let g_variance = 10.0 * self.inv_s * self.step.g_inv_s;
         slice_mut(&mut variance.gradient)[0] = g_variance;
-        // A non-finite gradient of the table passes through the layers above it, so checking those suffices. The loss
-        // terms are checked too, so that no step follows a loss that is not finite.
+        // A non-finite gradient of the table passes through the layers above it, so checking those
+        // suffices. The loss terms are checked too, so that no step follows a loss that is not
+        // finite.
         let all = g_network.iter().chain(&self.step.terms).chain([&g_variance]);
         self.step.non_finite |= !all.into_iter().all(|g| g.is_finite());
     }

@@ -1,8 +1,9 @@
 //! Instant-NeRF, the paper's baseline for I-Face: a density field in place of the signed distance.
 //!
-//! It follows instant-nsr-pl's `nerf-blender` configuration, adapted to these captures: a hash grid of base 16, smooth-L1
-//! on the colors of rays with samples, the distortion loss, no mask loss, and masked photographs over black. AdamW starts
-//! at a rate of 0.01, which each of three milestones reduces to a third. The mesh is the level set of density 5.
+//! It follows instant-nsr-pl's `nerf-blender` configuration, adapted to these captures: a hash grid
+//! of base 16, smooth-L1 on the colors of rays with samples, the distortion loss, no mask loss, and
+//! masked photographs over black. AdamW starts at a rate of 0.01, which each of three milestones
+//! reduces to a third. The mesh is the level set of density 5.
 
 mod cpu;
 mod field;
@@ -41,7 +42,8 @@ use tiface_kernels::gpu::Adapter;
 /// Version of the checkpoints' layout.
 const FORMAT: &str = "tiface-density-1";
 
-/// Milestones of the learning rate, as shares of the steps (10, 15 and 18 of 20 thousand), and its factor at each.
+/// Milestones of the learning rate, as shares of the steps (10, 15 and 18 of 20 thousand), and its
+/// factor at each.
 const MILESTONES: ([f64; 3], f64) = ([0.5, 0.75, 0.9], 0.33);
 
 /// State of a training between two steps, with the groups hash table and networks.
@@ -54,8 +56,8 @@ fn shape(config: &IfaceConfig) -> DensityShape {
     DensityShape { levels, radius: config.radius }
 }
 
-/// Returns the initial parameters as in tiny-cuda-nn: U(±1e-4) for the table, Xavier's bounds for the networks, with the
-/// last layer padded to 16 outputs.
+/// Returns the initial parameters as in tiny-cuda-nn: U(±1e-4) for the table, Xavier's bounds for
+/// the networks, with the last layer padded to 16 outputs.
 fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 2] {
     let shape = shape(config);
     let entries = hash::entries(&shape.levels) as u64;
@@ -85,8 +87,8 @@ struct DensityModel<'a, O: DensityOps> {
     occupancy: Occupancy,
 }
 
-/// Trains until `config.steps`, saving checkpoints and continuing from the one that lies in the session's folder.
-/// `views` have their cameras in scene coordinates.
+/// Trains until `config.steps`, saving checkpoints and continuing from the one that lies in the
+/// session's folder. `views` have their cameras in scene coordinates.
 pub fn train_density(
     views: &[TrainView],
     config: &IfaceConfig,
@@ -284,16 +286,19 @@ pub const OCCUPIED: f32 = 0.01;
 /// Hash table and networks.
 pub type DensityGroups<O> = [ParameterGroup<<O as Ops>::Device>; 2];
 
-/// The operations of a training step on one device. Intermediate results of a step stay on the device, in the value that
-/// implements this trait.
+/// The operations of a training step on one device. Intermediate results of a step stay on the
+/// device, in the value that implements this trait.
 pub trait DensityOps: Ops {
-    /// Starts or resumes a training with the given cells to march through and number of rays of the next step.
+    /// Starts or resumes a training with the given cells to march through and number of rays of the
+    /// next step.
     fn load(&mut self, occupancy: &Occupancy, rays: usize);
 
-    /// Waits for the device, reads the cells to march through, and returns the number of rays of the next step.
+    /// Waits for the device, reads the cells to march through, and returns the number of rays of
+    /// the next step.
     fn read(&self, occupancy: &mut Occupancy) -> Result<usize>;
 
-    /// Waits for the device and returns whether any gradient was not finite since the state was loaded.
+    /// Waits for the device and returns whether any gradient was not finite since the state was
+    /// loaded.
     fn is_non_finite(&self) -> Result<bool>;
 
     /// Evaluates the field to update the cells that are marched through.
@@ -308,14 +313,16 @@ pub trait DensityOps: Ops {
     /// Evaluates the field at the samples.
     fn density_field(&mut self, groups: &DensityGroups<Self>);
 
-    /// Composites the samples of each ray, and computes losses and their gradients with respect to the field's output.
+    /// Composites the samples of each ray, and computes losses and their gradients with respect to
+    /// the field's output.
     fn losses(&mut self);
 
-    /// Computes the gradients of the parameters, and closes the [gate](Ops::gate) if one is not finite.
+    /// Computes the gradients of the parameters, and closes the [gate](Ops::gate) if one is not
+    /// finite.
     fn backward(&mut self, groups: &mut DensityGroups<Self>);
 
-    /// Waits for the device and returns the figures of the last step, whose first losses are squared error, smooth-L1
-    /// and distortion.
+    /// Waits for the device and returns the figures of the last step, whose first losses are
+    /// squared error, smooth-L1 and distortion.
     fn figures(&mut self) -> Result<Figures>;
 }
 

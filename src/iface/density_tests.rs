@@ -49,8 +49,8 @@ fn a_step_is_the_one_of_its_formulas() {
     }
 }
 
-/// The third step against the formulas in f64, parameter by parameter: terms and the median of the updates within the
-/// first tolerance, every update within the second.
+/// The third step against the formulas in f64, parameter by parameter: terms and the median of the
+/// updates within the first tolerance, every update within the second.
 fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, [close, near]: [f64; 2]) {
     let dir = temporary();
     let session = session("iface", dir.path(), "step", &Quiet);
@@ -218,8 +218,8 @@ mod on_gpus {
         Ok(Outcome { db: psnr(&views[4], |rays| field.render(rays)), share: report.occupied })
     }
 
-    /// Returns what a training on the CPU comes to, and so does one on the device with some steps on
-    /// the CPU in between.
+    /// Returns what a training on the CPU comes to, and so does one on the device with some steps
+    /// on the CPU in between.
     fn follows_the_cpu(config: &IfaceConfig, in_turn: [u64; 2]) -> Outcome {
         let run: RunOn<Outcome> = &|dir, device, monitor| learned(config, dir, device, monitor);
         alike(&cpu_and_both(run, in_turn), [0.3, 0.03])

@@ -1,5 +1,5 @@
-//! A training step of the signed-distance field on a GPU. Sampling, marching, evaluation, losses and optimizer all run
-//! on the device, so the host never waits within a step.
+//! A training step of the signed-distance field on a GPU. Sampling, marching, evaluation, losses
+//! and optimizer all run on the device, so the host never waits within a step.
 
 use super::infer::DeviceField;
 use super::model::shape;
@@ -147,16 +147,16 @@ fn stereo_points(config: &IfaceConfig) -> usize {
     if config.stereo > 0.0 { STEREO_POINTS as usize } else { 1 }
 }
 
-/// Returns the sample capacity of a step, which equals the CPU's if the device's memory and buffers are large
-/// enough, and whether the photographs fit on the device as well.
+/// Returns the sample capacity of a step, which equals the CPU's if the device's memory and buffers
+/// are large enough, and whether the photographs fit on the device as well.
 pub(super) fn max_samples(
     config: &IfaceConfig,
     shape: &FieldShape,
     sampler: &RaySampler,
     device: &Device,
 ) -> Result<(usize, bool)> {
-    /// Words per sample outside the field: positions, directions, steps, compositing, losses, and the index of the cell
-    /// that takes the sample's place during an occupancy update.
+    /// Words per sample outside the field: positions, directions, steps, compositing, losses, and
+    /// the index of the cell that takes the sample's place during an occupancy update.
     const EXTRA_WORDS: usize = 3 + 3 + 2 + 9 + 2 + 1;
     let [words, widest] = Sdf::words_per_sample(shape);
     let points = stereo_points(config);
@@ -169,8 +169,9 @@ pub(super) fn wanted_samples(config: &IfaceConfig, points: usize) -> usize {
     MAX_BUDGETS * config.samples + points
 }
 
-/// Computes [`max_samples`] for any field on a hash grid, from its words per sample in all buffers and in the largest
-/// one, its words for sums, and the number of points it evaluates besides the samples of a step.
+/// Computes [`max_samples`] for any field on a hash grid, from its words per sample in all buffers
+/// and in the largest one, its words for sums, and the number of points it evaluates besides the
+/// samples of a step.
 pub(super) fn samples_that_fit(
     config: &IfaceConfig,
     [words, widest]: [usize; 2],
@@ -180,8 +181,8 @@ pub(super) fn samples_that_fit(
     device: &Device,
 ) -> Result<(usize, bool)> {
     let bytes = 4 * words as u64;
-    // The tables hold values, two moments and the gradient. A cell has its index, two words of its rule (distance and
-    // reach, or history and last draw), and bits.
+    // The tables hold values, two moments and the gradient. A cell has its index, two words of its
+    // rule (distance and reach, or history and last draw), and bits.
     let cells = config.occupancy_resolution.pow(3) as u64;
     let fixed = |log2_table: u32| {
         let levels = hash::levels(config.levels, config.base_resolution, config.growth, log2_table);

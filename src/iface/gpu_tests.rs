@@ -127,7 +127,8 @@ fn losses_and_views_follow_the_cpu(config: &IfaceConfig, in_turn: [u64; 2], near
     let [(cpu, _), (both, points)] = cpu_and_both(&run, in_turn);
     alike(&[cpu, both], [near, 0.03]);
     assert!(points > 0, "the device looks for points, and goes on with those of a checkpoint");
-    // what is minimized; single terms of single batches drift apart sooner, as they do between any two orders of sums
+    // what is minimized; single terms of single batches drift apart sooner, as they do between any
+    // two orders of sums
     let total = |figures: &Figures| -> f64 {
         let weights = [
             ("rgb", config.rgb_mse),
@@ -153,7 +154,8 @@ fn losses_and_views_follow_the_cpu(config: &IfaceConfig, in_turn: [u64; 2], near
 
 #[test]
 fn losses_and_views_are_those_of_the_cpu_on_the_device_and_in_turn() {
-    // points, whose number does not shrink with the settings, are looked for at step 47, on the device
+    // points, whose number does not shrink with the settings, are looked for at step 47, on the
+    // device
     let config = IfaceConfig { stereo_at: 0.85, ..config() };
     assert_eq!(schedule::stereo_step(&config), Some(47));
     losses_and_views_follow_the_cpu(&config, [51, 2], 0.1);
@@ -187,9 +189,10 @@ fn a_device_that_is_lost_leaves_the_last_checkpoint_and_the_training_goes_on() {
         |dir: &Path, device: &str, monitor: &dyn Monitor| learned(views, &config, &on(device, dir, monitor));
     let begun = temporary();
     assert!(run(begun.path(), "cpu", &StopAfter::new(49)).err().unwrap().kind().is_stop());
-    // One readback has the losses of step 49. The search for points before step 51 reads the state: nine arrays of
-    // parameters, two of cells, the number of rays and that of samples. One more has the losses of step 52, the last one,
-    // and the checkpoint of the end begins with whether a gradient was not finite: 1 + 13 + 1 + 1.
+    // One readback has the losses of step 49. The search for points before step 51 reads the state:
+    // nine arrays of parameters, two of cells, the number of rays and that of samples. One more has
+    // the losses of step 52, the last one, and the checkpoint of the end begins with whether a
+    // gradient was not finite: 1 + 13 + 1 + 1.
     outlives_lost_devices(&run, begun.path(), &[0, 3, 16]);
 }
 
@@ -253,8 +256,8 @@ fn cells_are_those_that_the_cpu_keeps() {
 fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
     let Some(device) = device() else { return };
     let views = textured_views();
-    // A step's capacity is below the number of cells: the cells are evaluated in pieces; the last word of the
-    // mask is partial.
+    // A step's capacity is below the number of cells: the cells are evaluated in pieces; the last
+    // word of the mask is partial.
     const SIDE: usize = 21;
     let config = IfaceConfig {
         occupancy: OccupancyRule::Nerfacc,
@@ -271,7 +274,8 @@ fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
     let mut on_cpu = begun(CpuSdf::new(&config, &sampler), &sampler, None, &config, &session);
     let total = SIDE.pow(3);
     assert!(on_gpu.ops.samples.t.word_count() < total / 2);
-    // all cells; a quarter anywhere with some of all, of many and of few that are kept; of those that the device kept itself
+    // all cells; a quarter anywhere with some of all, of many and of few that are kept; of those
+    // that the device kept itself
     for (step, kept) in
         [(16, None), (272, Some(total)), (288, Some(total / 2)), (304, Some(500)), (320, None)]
     {
@@ -401,7 +405,8 @@ fn a_device_with_too_little_room_is_refused_before_the_first_step() {
     let config = IfaceConfig { stereo: 0.0, levels: 6, occupancy_resolution: 32, ..config() };
     let e = room(&IfaceConfig { samples: 100_000_000, ..config.clone() }, &device).err().unwrap();
     assert!(e.to_string().contains("has memory for") && e.hint().contains("iface.samples to"), "{e}");
-    // what fits beside 512 MiB that are not to be had: nothing at all, or samples, or samples and photographs
+    // what fits beside 512 MiB that are not to be had: nothing at all, or samples, or samples and
+    // photographs
     let of = |mib: u64| self::device().unwrap().with_memory(mib << 20);
     let some = IfaceConfig { samples: 4096, ..config.clone() };
     let e = room(&some, &of(512)).err().unwrap();

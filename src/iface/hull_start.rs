@@ -1,8 +1,8 @@
 //! Initialization of the signed distance from the visual hull.
 //!
-//! The hull is known before training and lies within millimeters of most of the head. Fitting the field
-//! to its distance for a few hundred cheap steps replaces the thousands that carve a sphere, and gives
-//! the occupancy grid a band from the first training step.
+//! The hull is known before training and lies within millimeters of most of the head. Fitting the
+//! field to its distance for a few hundred cheap steps replaces the thousands that carve a sphere,
+//! and gives the occupancy grid a band from the first training step.
 
 use super::model::shape;
 use super::schedule;
@@ -20,13 +20,15 @@ use tiface_kernels::cpu::losses::{self, LossWeights};
 use tiface_kernels::cpu::sdf::{self, FieldShape, WIDTH};
 use tiface_kernels::cpu::weight_norm;
 
-/// Signed distance to a hull's boundary at cell centers, in units of the box's half edge; negative inside.
+/// Signed distance to a hull's boundary at cell centers, in units of the box's half edge; negative
+/// inside.
 pub struct HullDistance {
     resolution: usize,
     values: Vec<f32>,
 }
 
-/// Returns the distance in cells from each cell's center to the nearest center of a cell in `seeds`.
+/// Returns the distance in cells from each cell's center to the nearest center of a cell in
+/// `seeds`.
 fn distance(resolution: usize, seeds: impl Fn(usize) -> bool + Sync) -> Vec<f32> {
     let r = resolution;
     /// Larger than any squared distance on the grid, small enough to stay exact in f32.
@@ -119,8 +121,8 @@ fn fit_points(
     (x, target)
 }
 
-/// Fits the geometry of the field to the hull's distance, on the CPU. Half of the points lie in a band around the
-/// hull's boundary.
+/// Fits the geometry of the field to the hull's distance, on the CPU. Half of the points lie in a
+/// band around the hull's boundary.
 pub fn fit_hull(
     state: &mut SdfState,
     hull: &BitGrid,

@@ -19,7 +19,8 @@ use tiface_kernels::cpu::mlp::Weights;
 use tiface_kernels::cpu::neus::{self, Segments};
 use tiface_kernels::cpu::sdf::{self, FieldShape, WIDTH};
 
-/// The field on a device. Points, directions and normals are `[n, 3]`, in the network's coordinates.
+/// The field on a device. Points, directions and normals are `[n, 3]`, in the network's
+/// coordinates.
 pub(super) trait DeviceField: Send {
     /// Returns `channels` of the field's output, `[channels, n]`.
     fn evaluate(
@@ -34,7 +35,8 @@ pub(super) trait DeviceField: Send {
     fn render(&mut self, rays: &[MarchRay], dt: f32) -> Result<Vec<[f32; neus::RAY_WIDTH]>>;
 }
 
-/// The trained field on the host. All positions and distances are in scene units, the box is [-1, 1]³.
+/// The trained field on the host. All positions and distances are in scene units, the box is [-1,
+/// 1]³.
 pub struct IFace {
     config: IfaceConfig,
     shape: FieldShape,
@@ -80,7 +82,8 @@ impl IFace {
         face
     }
 
-    /// Loads the field from the checkpoint in a stage folder. `config` and `hull` must be the training's.
+    /// Loads the field from the checkpoint in a stage folder. `config` and `hull` must be the
+    /// training's.
     pub fn load(dir: &Path, config: &IfaceConfig, hull: Option<&BitGrid>) -> Result<IFace> {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT)?;
         TrainingProgress::restore(&file, config.steps)?;
@@ -209,8 +212,8 @@ impl IFace {
         self.composite(&marched, dt).iter().map(|o| self.result(o)).collect()
     }
 
-    /// Composites the samples of rays. Each round evaluates the next few samples of the rays that are not opaque yet; a
-    /// sample takes about two kilobytes.
+    /// Composites the samples of rays. Each round evaluates the next few samples of the rays that
+    /// are not opaque yet; a sample takes about two kilobytes.
     fn composite(&self, rays: &[MarchRay], dt: f32) -> Vec<[f32; neus::RAY_WIDTH]> {
         /// Samples of a ray that are evaluated together.
         const AHEAD: usize = 8;

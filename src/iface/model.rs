@@ -1,5 +1,5 @@
-//! The trainable parameters: hash table, geometry network with weight norm, color network without biases, variance, in
-//! three groups.
+//! The trainable parameters: hash table, geometry network with weight norm, color network without
+//! biases, variance, in three groups.
 //!
 //! | | shape | |
 //! |---|---|---|
@@ -32,8 +32,8 @@ pub fn shape(config: &IfaceConfig) -> FieldShape {
 /// Returns the parameters before the first step.
 ///
 /// Sphere initialization of NeuS' geometry network: `sdf ≈ ‖x / radius‖ − ½` times `radius` for the
-/// band presets, so that the initial gradient has length one; the published code leaves the factor out
-/// and starts with gradients of 1 / radius.
+/// band presets, so that the initial gradient has length one; the published code leaves the factor
+/// out and starts with gradients of 1 / radius.
 pub fn initial(config: &IfaceConfig, seed: u64) -> [HostGroup; 3] {
     let shape = shape(config);
     let layout = shape.layout();

@@ -45,8 +45,9 @@ fn resampled(hull: &BitGrid, resolution: usize) -> BitGrid {
 }
 
 impl Occupancy {
-    /// Marks all cells of the hull as occupied, or all cells without a hull. The `band` rule adds one layer of cells:
-    /// rays would otherwise enter a surface learned slightly outside the hull from its inside, which renders as a hole.
+    /// Marks all cells of the hull as occupied, or all cells without a hull. The `band` rule adds
+    /// one layer of cells: rays would otherwise enter a surface learned slightly outside the hull
+    /// from its inside, which renders as a hole.
     pub fn new(config: &IfaceConfig, hull: Option<&BitGrid>) -> Occupancy {
         let r = config.occupancy_resolution;
         // The published system does not use a hull.
@@ -100,8 +101,8 @@ impl Occupancy {
         &self.allowed
     }
 
-    /// Updates the cells from the field, which returns distances at points in field coordinates, and the logarithm of the
-    /// local sharpness relative to `inv_s`; `step` is the march step.
+    /// Updates the cells from the field, which returns distances at points in field coordinates,
+    /// and the logarithm of the local sharpness relative to `inv_s`; `step` is the march step.
     pub fn update(
         &mut self,
         config: &IfaceConfig,
@@ -125,7 +126,8 @@ impl Occupancy {
         }
     }
 
-    /// Updates the cells by nerfacc's rule: cells above `threshold`, or above the mean if that is less, are occupied.
+    /// Updates the cells by nerfacc's rule: cells above `threshold`, or above the mean if that is
+    /// less, are occupied.
     pub fn update_nerfacc(
         &mut self,
         at: (u64, u64),
@@ -194,8 +196,8 @@ mod tests {
         assert_eq!(Occupancy::new(&config, Some(&hull)).occupied.count(), 16 * 16 * 16);
     }
 
-    /// nerfacc 0.3.3 with I-Face's opacity: inv_s = e³, step 0.00101484375, of which 0.05 from the surface has 0.00546357
-    /// and 0.2 has 0.000370632.
+    /// nerfacc 0.3.3 with I-Face's opacity: inv_s = e³, step 0.00101484375, of which 0.05 from the
+    /// surface has 0.00546357 and 0.2 has 0.000370632.
     #[test]
     fn the_published_rule_decays_what_it_visits_and_keeps_what_is_above_the_mean_or_a_thousandth() {
         let config = IfaceConfig { occupancy_resolution: 8, ..IfaceConfig::preset(Preset::Paper) };
@@ -211,8 +213,8 @@ mod tests {
             o.update(&config, (1, 16 * k), inv_s, step, all(0.2));
             assert!(o.history.iter().all(|&h| near(h, 0.005_463_57 * 0.95f64.powi(k as i32))), "{k}");
         }
-        // from then on a quarter anywhere and as many of the occupied, both with repetition: of 512 cells some
-        // 512 (1 − (1 − 1/512)²⁵⁶) = 201 fall once
+        // from then on a quarter anywhere and as many of the occupied, both with repetition: of 512
+        // cells some 512 (1 − (1 − 1/512)²⁵⁶) = 201 fall once
         let before = o.history[0];
         o.update(&config, (1, 256), inv_s, step, all(0.2));
         let fallen = o.history.iter().filter(|&&h| near(h, 0.95 * f64::from(before))).count();
@@ -228,7 +230,8 @@ mod tests {
 
     #[test]
     fn a_steep_wall_is_kept_although_its_values_are_large() {
-        // slope 40: every center is far from zero in value, the wall at x = 0.01 is crossed all the same
+        // slope 40: every center is far from zero in value, the wall at x = 0.01 is crossed all the
+        // same
         let config = IfaceConfig { occupancy_resolution: 16, ..IfaceConfig::preset(Preset::Draft) };
         let mut o = Occupancy::new(&config, None);
         o.update(&config, (1, 0), 600.0, 0.0, even(|p| 40.0 * (p[0] - 0.01)));

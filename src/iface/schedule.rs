@@ -9,8 +9,8 @@ fn steps(config: &IfaceConfig, share: f64) -> u64 {
     ((config.steps as f64 * share).round() as u64).max(1)
 }
 
-/// Learning-rate factor at optimizer step `n`: linear from 1 % over `warmup`, then exponential down to
-/// `lr_final` at `steps`.
+/// Learning-rate factor at optimizer step `n`: linear from 1 % over `warmup`, then exponential down
+/// to `lr_final` at `steps`.
 pub fn learning_rate(config: &IfaceConfig, n: u64) -> f64 {
     let (n, warmup, steps) = (n as f64, steps(config, config.warmup) as f64, config.steps as f64);
     if n < warmup {
@@ -20,8 +20,8 @@ pub fn learning_rate(config: &IfaceConfig, n: u64) -> f64 {
     }
 }
 
-/// Returns the AdamW parameters of the three groups at step number `step`, counted from 1, with learning rates at
-/// `factor` of their peak.
+/// Returns the AdamW parameters of the three groups at step number `step`, counted from 1, with
+/// learning rates at `factor` of their peak.
 pub fn adam_steps(config: &IfaceConfig, factor: f64, step: u64) -> [AdamStep; 3] {
     let rate = |lr: f64, decay: f64| AdamStep {
         weight_decay: decay as f32,
@@ -51,8 +51,8 @@ pub fn cell(config: &IfaceConfig, levels: usize) -> f32 {
     (2.0 / (config.base_resolution as f64 * config.growth.powi(levels as i32 - 1))) as f32
 }
 
-/// Returns the width that a ray of a large photograph stands for at a step, scene units: the cell width of the finest
-/// active level, or a single pixel (0) in the second half of the training.
+/// Returns the width that a ray of a large photograph stands for at a step, scene units: the cell
+/// width of the finest active level, or a single pixel (0) in the second half of the training.
 pub fn detail(config: &IfaceConfig, step: u64) -> f32 {
     if 2 * step < config.steps { cell(config, active_levels(config, step)) } else { 0.0 }
 }
@@ -80,8 +80,8 @@ pub fn step_length(config: &IfaceConfig) -> StepLength {
     }
 }
 
-/// Returns whether the occupancy is updated before this step. A new level, and the end of the hull's fit, move the
-/// surface, so the update of the `band` rule follows at once.
+/// Returns whether the occupancy is updated before this step. A new level, and the end of the
+/// hull's fit, move the surface, so the update of the `band` rule follows at once.
 pub fn updates_occupancy(config: &IfaceConfig, step: u64) -> bool {
     /// As published.
     const NERFACC_EVERY: u64 = 16;
@@ -137,8 +137,9 @@ mod tests {
     #[test]
     fn rays_stand_for_less_as_levels_come_and_for_a_pixel_in_the_second_half() {
         let config = IfaceConfig { steps: 3200, ..IfaceConfig::preset(Preset::Draft) };
-        // all fourteen levels after a quarter of the steps, eight of them in intervals of a hundred;
-        // cells of the level with 16 · 1.4⁵ = 86.05 of them on a side of 2, then 120.5; the finest has 1269.7
+        // all fourteen levels after a quarter of the steps, eight of them in intervals of a
+        // hundred; cells of the level with 16 · 1.4⁵ = 86.05 of them on a side of 2, then 120.5;
+        // the finest has 1269.7
         for (step, want) in
             [(0, 0.023_242), (99, 0.023_242), (100, 0.016_602), (1599, 0.001_575_2), (1600, 0.0)]
         {

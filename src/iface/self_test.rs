@@ -1,4 +1,5 @@
-//! Self-tests that compare a training step of a signed distance, and of a density, on a GPU with the CPU's.
+//! Self-tests that compare a training step of a signed distance, and of a density, on a GPU with
+//! the CPU's.
 
 use super::cpu::CpuSdf;
 use super::density;
@@ -129,7 +130,8 @@ pub(super) fn density(adapter: &Adapter) -> Result<Vec<Check>> {
 mod tests {
     use super::*;
 
-    /// A device passes the tests with this many times fewer samples, of fields with this many levels.
+    /// A device passes the tests with this many times fewer samples, of fields with this many
+    /// levels.
     fn passes(fewer: usize, [of_sdf, of_density]: [usize; 2]) {
         let Some(adapter) = Adapter::all().first() else { return };
         let of = |preset: Preset, levels: usize| {

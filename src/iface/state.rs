@@ -47,7 +47,8 @@ impl<const GROUPS: usize> FieldState<GROUPS> {
         into.set("rays", self.rays);
     }
 
-    /// Reads the state from a checkpoint; names, shapes and types must be exactly those of the parts.
+    /// Reads the state from a checkpoint; names, shapes and types must be exactly those of the
+    /// parts.
     pub fn restore(
         parts: [Vec<ParameterPart>; GROUPS],
         config: &IfaceConfig,
@@ -75,8 +76,8 @@ impl SdfState {
         bytemuck::cast_slice(self.groups[0].values())
     }
 
-    /// Returns the flat network weights of the field with weight norm applied, and the same weights prepared for the
-    /// CPU kernels.
+    /// Returns the flat network weights of the field with weight norm applied, and the same weights
+    /// prepared for the CPU kernels.
     pub fn weights(&self, shape: &FieldShape) -> (Vec<f32>, Weights) {
         let flat = weight_norm::forward(shape.layout(), self.groups[1].values());
         let weights = Weights::new(shape.layout(), &flat);

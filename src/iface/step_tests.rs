@@ -1,5 +1,5 @@
-//! A whole optimizer step against the same arithmetic in f64: sampling, field, compositing, every loss term, weight norm
-//! and the groups of AdamW, parameter by parameter.
+//! A whole optimizer step against the same arithmetic in f64: sampling, field, compositing, every
+//! loss term, weight norm and the groups of AdamW, parameter by parameter.
 
 use super::super::ops::STEREO_POINTS;
 use super::super::stereo::SurfacePoint;
@@ -32,7 +32,8 @@ fn paper() -> IfaceConfig {
     }
 }
 
-/// All that is not published: softness, random backgrounds, colors of single samples, points of stereo.
+/// All that is not published: softness, random backgrounds, colors of single samples, points of
+/// stereo.
 fn ours() -> IfaceConfig {
     let draft = IfaceConfig::preset(Preset::Draft);
     IfaceConfig {
@@ -108,7 +109,8 @@ fn samples(config: &IfaceConfig, state: &SdfState, ray: &MarchRay, dt: f64) -> V
     (0..).map(place).take_while(|&t| t < leave).filter(|&t| marked(t)).collect()
 }
 
-/// Named losses of a step by the formulas, their weighted sum last. `x` are all parameters, one after the other.
+/// Named losses of a step by the formulas, their weighted sum last. `x` are all parameters, one
+/// after the other.
 fn formulas(
     (config, sampler, state): (&IfaceConfig, &RaySampler, &SdfState),
     x: &[Var],
@@ -233,8 +235,8 @@ fn agrees(config: &IfaceConfig) {
     }
 }
 
-/// The third step of a training, so that the moments are some; terms and the median of the updates within the first
-/// tolerance, every update within the second.
+/// The third step of a training, so that the moments are some; terms and the median of the updates
+/// within the first tolerance, every update within the second.
 fn agrees_on<O: SdfOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, [close, near]: [f64; 2]) {
     let dir = temporary();
     let mut model = model(ops, config, sampler, dir.path());

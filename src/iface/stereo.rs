@@ -1,8 +1,8 @@
 //! Search for surface points that several photographs agree on, starting from the current field.
 //!
-//! Rays are intersected with the field's zero set. Points spread over it are moved along their normals until all
-//! photographs in which they are visible match ([`tiface_kernels::cpu::stereo`]). Hair is excluded, because stereo
-//! places its strands some millimeters inside its outline.
+//! Rays are intersected with the field's zero set. Points spread over it are moved along their
+//! normals until all photographs in which they are visible match ([`tiface_kernels::cpu::stereo`]).
+//! Hair is excluded, because stereo places its strands some millimeters inside its outline.
 
 use super::occupancy::Occupancy;
 use crate::config::iface::IfaceConfig;
@@ -20,10 +20,12 @@ use tiface_kernels::cpu::stereo::{self, StereoPoint, StereoView, Surfel};
 /// Distance between neighboring rays, pixels.
 const STRIDE: usize = 4;
 
-/// Softest surface that is searched: logarithm of the sharpness relative to the sharpest, here a half.
+/// Softest surface that is searched: logarithm of the sharpness relative to the sharpest, here a
+/// half.
 const SOFTEST: f32 = -std::f32::consts::LN_2;
 
-/// A point that the surface should pass through, in field coordinates; in checkpoints and on GPUs a row of its numbers.
+/// A point that the surface should pass through, in field coordinates; in checkpoints and on GPUs a
+/// row of its numbers.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct SurfacePoint {
@@ -51,7 +53,8 @@ impl HostField<'_> {
         sdf::values(self.shape, self.table, self.weights, x)
     }
 
-    /// Moves points in field coordinates onto the nearby zero set, and returns them with their unit normals.
+    /// Moves points in field coordinates onto the nearby zero set, and returns them with their unit
+    /// normals.
     fn project(&self, mut x: Vec<[f32; 3]>) -> Vec<(Vec3, Option<Vec3>)> {
         /// Gradients have lengths of about one, and points start within a pixel or two.
         const ROUNDS: usize = 2;
@@ -107,8 +110,8 @@ fn surface(
     (stereo_views, surfels.collect())
 }
 
-/// Returns a view for stereo with its depths, and the first crossings of its rays with the zero set, in field
-/// coordinates.
+/// Returns a view for stereo with its depths, and the first crossings of its rays with the zero
+/// set, in field coordinates.
 fn first_crossings(
     view: &TrainView,
     config: &IfaceConfig,
@@ -140,7 +143,8 @@ fn first_crossings(
     let rays: Vec<MarchRay> = pixels.iter().map(|p| p.1).collect();
     let samples = occupancy.march(config, config.min_step, &rays);
     let at = |r: usize, t: f32| std::array::from_fn(|a| rays[r].origin[a] + t * rays[r].direction[a]);
-    // A crossing is the first step from outside to inside. Each round evaluates the next few samples of every open ray.
+    // A crossing is the first step from outside to inside. Each round evaluates the next few
+    // samples of every open ray.
     let mut crossing = vec![None; rays.len()];
     let mut open_rays: Vec<(usize, usize, f32)> =
         (0..rays.len()).map(|r| (r, samples.offsets[r] as usize, f32::NAN)).collect();
@@ -193,8 +197,8 @@ struct Reduced {
 
 impl Reduced {
     fn new(view: &TrainView) -> Reduced {
-        /// Longest side in pixels, up to twice: a surface that is half trained is right to a few of these, and a
-        /// tenth of one suffices.
+        /// Longest side in pixels, up to twice: a surface that is half trained is right to a few of
+        /// these, and a tenth of one suffices.
         const SIDE: u32 = 512;
         let (w, h) = (view.camera.width, view.camera.height);
         let factor = (w.max(h) / SIDE).clamp(1, w.min(h).max(1));

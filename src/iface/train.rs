@@ -69,7 +69,8 @@ pub(super) fn sampler<'a>(
     hull: Option<&BitGrid>,
     config: &IfaceConfig,
 ) -> Result<RaySampler<'a>> {
-    // Without a hull every ray may meet a sample; with one, occupied cells reach about four cells beyond the outline.
+    // Without a hull every ray may meet a sample; with one, occupied cells reach about four cells
+    // beyond the outline.
     let reach = match hull {
         Some(_) => 4.0 * 2.0 / config.occupancy_resolution.min(128) as f32,
         None => f32::INFINITY,
@@ -85,9 +86,11 @@ pub(super) fn sampler<'a>(
     Ok(sampler)
 }
 
-/// Trains until `config.steps`, saving checkpoints and continuing from the one that lies in the session's folder.
+/// Trains until `config.steps`, saving checkpoints and continuing from the one that lies in the
+/// session's folder.
 ///
-/// `views` have their cameras in scene coordinates; `hull` is the masks' visual hull over the scene's box.
+/// `views` have their cameras in scene coordinates; `hull` is the masks' visual hull over the
+/// scene's box.
 pub fn train(
     views: &[TrainView],
     hull: Option<&BitGrid>,

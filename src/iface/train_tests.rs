@@ -50,7 +50,8 @@ fn fitted() -> &'static Files {
     })
 }
 
-/// Longer than a second: the fit to the hull makes 250 steps, and a surface within a pixel takes as many.
+/// Longer than a second: the fit to the hull makes 250 steps, and a surface within a pixel takes as
+/// many.
 #[test]
 fn a_ball_is_learned_from_eight_views() {
     let dir = temporary();
@@ -84,7 +85,8 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
     resumes(&run, 3);
 }
 
-/// Longer than a second: points are found on a surface that is right to a few pixels, which begins with the hull.
+/// Longer than a second: points are found on a surface that is right to a few pixels, which begins
+/// with the hull.
 #[test]
 fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
     let (views, hull) = (textured_views(), hull());
@@ -99,7 +101,8 @@ fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT).unwrap();
         SdfState::restore(parts(config), config, Some(&hull), &mut file).unwrap()
     };
-    // a pixel is 2.4 / 120 = 0.02, and a flat patch of 9 on a ball of 25 lies some 0.2 of one inside
+    // a pixel is 2.4 / 120 = 0.02, and a flat patch of 9 on a ball of 25 lies some 0.2 of one
+    // inside
     let off = |p: &SurfacePoint| (Vec3::from(p.position).length() - BALL).abs();
     let mut off: Vec<f32> = state(&config, dir.path()).stereo.iter().map(off).collect();
     off.sort_by(f32::total_cmp);

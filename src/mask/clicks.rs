@@ -5,7 +5,8 @@ use tiface_base::{Error, Result};
 /// One click of a person on a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Click {
-    /// Column, as a pixel index: 0 is the center of the leftmost pixels (`prompts.json`'s convention).
+    /// Column, as a pixel index: 0 is the center of the leftmost pixels (`prompts.json`'s
+    /// convention).
     pub x: f32,
     /// Row, as a pixel index: 0 is the center of the top pixels.
     pub y: f32,
@@ -14,22 +15,24 @@ pub struct Click {
 }
 
 impl Click {
-    /// Returns whether the click is on a photograph of this size. Index 0 is a pixel's center, so a picture reaches from −½ to just before
-    /// `side` − ½, which rounds to the pixel behind the last.
+    /// Returns whether the click is on a photograph of this size. Index 0 is a pixel's center, so a
+    /// picture reaches from −½ to just before `side` − ½, which rounds to the pixel behind the
+    /// last.
     pub fn is_inside(&self, (width, height): (u32, u32)) -> bool {
         let inside = |v: f32, side: u32| v >= -0.5 && v < side as f32 - 0.5;
         inside(self.x, width) && inside(self.y, height)
     }
 
-    /// Returns the same point of the photograph on a picture of it at another size; sizes are width and height.
+    /// Returns the same point of the photograph on a picture of it at another size; sizes are width
+    /// and height.
     pub fn moved(&self, from: (u32, u32), to: (u32, u32)) -> Click {
         let moved = |v: f32, from: u32, to: u32| ((v as f64 + 0.5) * to as f64 / from as f64 - 0.5) as f32;
         Click { x: moved(self.x, from.0, to.0), y: moved(self.y, from.1, to.1), head: self.head }
     }
 }
 
-/// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed; `subject` is
-/// what messages call it.
+/// Checks the clicks on a photograph of `width` × `height` pixels, before anything is computed;
+/// `subject` is what messages call it.
 ///
 /// # Errors
 /// As [`check_places`], or when two clicks call the same pixel head and background.
@@ -97,7 +100,8 @@ mod tests {
 
     #[test]
     fn clicks_keep_their_place() {
-        // the first of four pixels has its center at 1/8 of the width, which is a quarter into the first of two
+        // the first of four pixels has its center at 1/8 of the width, which is a quarter into the
+        // first of two
         let moved = Click { x: 0.0, y: 3.0, head: true }.moved((4, 4), (2, 2));
         assert_eq!((moved.x, moved.y), (-0.25, 1.25));
     }

@@ -1,10 +1,12 @@
-//! Silhouette consistency: whether the masks of all views fit one body (Laurentini 1994; Boyer 2006).
+//! Silhouette consistency: whether the masks of all views fit one body (Laurentini 1994; Boyer
+//! 2006).
 //!
-//! With correct masks, every ray through a masked pixel meets the visual hull: somewhere along it lies a point
-//! that no other mask rules out. Where none does, masks contradict each other: either this view shows too much, or
-//! each view that rules out the best point of the ray shows too little. One such pixel cannot tell which; all of
-//! them together can. The view whose removal settles most of the conflict is named first, and the comparison is repeated
-//! without it, until the rest is no more than discretization.
+//! With correct masks, every ray through a masked pixel meets the visual hull: somewhere along it
+//! lies a point that no other mask rules out. Where none does, masks contradict each other: either
+//! this view shows too much, or each view that rules out the best point of the ray shows too
+//! little. One such pixel cannot tell which; all of them together can. The view whose removal
+//! settles most of the conflict is named first, and the comparison is repeated without it, until
+//! the rest is no more than discretization.
 //!
 //! Nothing but masks and cameras is needed, so the masks of a capture are checked in the same way.
 
@@ -27,7 +29,8 @@ const ROWS: u32 = 160;
 const CELLS: usize = 128;
 /// Half side of the cube, in half heights of the frames at the point where the viewing axes meet.
 const CUBE: f64 = 1.6;
-/// Margin around a mask, in reduced pixels beyond the footprint of a cell, within which no cell is ruled out.
+/// Margin around a mask, in reduced pixels beyond the footprint of a cell, within which no cell is
+/// ruled out.
 const SLACK_PX: f32 = 1.0;
 /// Conflicts of a view, in whole masks, below which it is never named …
 const THRESHOLD: f64 = 0.005;
@@ -179,7 +182,8 @@ impl SilhouetteConstraints {
     }
 }
 
-/// Which views vote against and for every cell: bits of views, `words` of them against and as many for.
+/// Which views vote against and for every cell: bits of views, `words` of them against and as many
+/// for.
 struct Votes {
     cube: Cube,
     words: usize,
@@ -197,7 +201,8 @@ impl Votes {
         Votes { cube, words, bits }
     }
 
-    /// Returns the costs of cells: how many active views rule each out, and how many have it on the head.
+    /// Returns the costs of cells: how many active views rule each out, and how many have it on the
+    /// head.
     fn costs(&self, active: &[bool]) -> Vec<(u16, u16)> {
         let mut mask = vec![0u64; self.words];
         for i in (0..active.len()).filter(|&i| active[i]) {
@@ -241,7 +246,8 @@ impl Conflicts {
         let mut conflict = Conflicts { too_much: zero(), taken: zero(), credit: zero(), others };
         for (j, open) in found.into_iter().enumerate() {
             let Some(Opposition { asked, open, opposing }) = open else { continue };
-            // if hardly any ray enters another view's frustum, the camera is turned away from the head that its mask shows
+            // if hardly any ray enters another view's frustum, the camera is turned away from the
+            // head that its mask shows
             let is_turned = 10 * asked < claims[j].inner.len();
             let own = if is_turned { 1.0 } else { open };
             conflict.too_much[j] = own;
@@ -254,8 +260,9 @@ impl Conflicts {
         conflict
     }
 
-    /// Returns whether a view's part in the conflict is large, or at least unlike that of the others. Of `left` views a single
-    /// wrong one has half of all credit, so few views can stand out less.
+    /// Returns whether a view's part in the conflict is large, or at least unlike that of the
+    /// others. Of `left` views a single wrong one has half of all credit, so few views can stand
+    /// out less.
     fn names(&self, i: usize, left: usize) -> bool {
         let mean = self.credit.iter().sum::<f64>() / left as f64;
         let times = if left == 2 { 0.0 } else { (left as f64 / 6.0).clamp(1.2, OUTLIER_RATIO) };
@@ -275,13 +282,14 @@ struct Opposition {
     asked: usize,
     /// Share of them that no cell explains.
     open: f64,
-    /// Per view: the share of the claims that it rules out, divided among all views that do; and the same undivided.
+    /// Per view: the share of the claims that it rules out, divided among all views that do; and
+    /// the same undivided.
     opposing: Vec<[f64; 2]>,
 }
 
 impl Opposition {
-    /// `best` returns the best cell on a pixel's ray: whether it lacks support (then it explains nothing, but no view is
-    /// to blame), how many active views rule it out, and its index.
+    /// `best` returns the best cell on a pixel's ray: whether it lacks support (then it explains
+    /// nothing, but no view is to blame), how many active views rule it out, and its index.
     fn of(
         votes: &Votes,
         claims: &SilhouetteConstraints,
@@ -351,8 +359,9 @@ fn cells_on_ray<'a>(
     })
 }
 
-/// Returns the cell on a pixel's ray that fewest views rule out, among those that another view has on the head, if any;
-/// of equals the one that most views have on the head. `None` when no other view looks at the ray within the cube.
+/// Returns the cell on a pixel's ray that fewest views rule out, among those that another view has
+/// on the head, if any; of equals the one that most views have on the head. `None` when no other
+/// view looks at the ray within the cube.
 fn best_on_ray(
     cube: &Cube,
     claims: &SilhouetteConstraints,

@@ -1,17 +1,19 @@
 //! Clicks → hard mask: GrabCut (Rother, Kolmogorov, Blake 2004) from a Voronoi start.
 //!
-//! Head and background are mixtures of colors, learned from the labels that the last round gave; a round's labels are
-//! the smallest cut of
+//! Head and background are mixtures of colors, learned from the labels that the last round gave; a
+//! round's labels are the smallest cut of
 //!
 //! ```text
 //! E = Σ_p −ln p(c_p | label) + γ Σ_pq exp(−β ‖c_p − c_q‖²) / |p − q| · [labels differ],  β = 1 / (2 ⟨‖Δ‖²⟩)
 //! ```
 //!
-//! over 8 neighbors. At the end only pieces with a click stay, small holes are filled and threads are opened.
+//! over 8 neighbors. At the end only pieces with a click stay, small holes are filled and threads
+//! are opened.
 //!
-//! Definite head are discs around the head's clicks; definite background are discs around the others and margins along the top
-//! and the upper part of both sides. Everything else starts as head when it is nearer to the head's clicks, joined
-//! by a line, than to definite background: this Voronoi start follows the size of the head, which no fixed radius does.
+//! Definite head are discs around the head's clicks; definite background are discs around the
+//! others and margins along the top and the upper part of both sides. Everything else starts as
+//! head when it is nearer to the head's clicks, joined by a line, than to definite background: this
+//! Voronoi start follows the size of the head, which no fixed radius does.
 
 pub mod maxflow;
 pub mod mixture;
@@ -35,7 +37,8 @@ const SEED_WEIGHT: f64 = 9.0;
 pub(super) const ROUNDS: usize = 8;
 /// Holes up to this share of the picture are filled.
 const MAX_HOLE_SHARE: f64 = 0.01;
-/// Distance from the outline, as a share of the height, within which undecided colors count as ambiguous.
+/// Distance from the outline, as a share of the height, within which undecided colors count as
+/// ambiguous.
 const OUTLINE_BAND: f32 = 0.023;
 /// Seed of the k-means start.
 const SEED: u64 = 42;
@@ -47,16 +50,19 @@ const CAPACITY_SCALE: f64 = 1000.0;
 pub struct HardMask {
     /// 255 head, 0 background.
     pub mask: Gray,
-    /// Share of the picture, 0..=1, that lies near the outline and has a color that fits both sides.
+    /// Share of the picture, 0..=1, that lies near the outline and has a color that fits both
+    /// sides.
     pub ambiguous: f64,
     /// Warnings for the user.
     pub warnings: Vec<String>,
 }
 
-/// Cuts the head out of one photograph. `view` is its name in messages; clicks are pixels of `photo`.
+/// Cuts the head out of one photograph. `view` is its name in messages; clicks are pixels of
+/// `photo`.
 ///
 /// # Errors
-/// When clicks lie outside, contradict each other or name no head, and when nothing of the clicked head is left.
+/// When clicks lie outside, contradict each other or name no head, and when nothing of the clicked
+/// head is left.
 ///
 /// # Examples
 ///
@@ -139,7 +145,8 @@ pub(super) struct Grabcut {
     pub clicks: Vec<Click>,
     /// `[height · width]`.
     pub seeds: Vec<Seed>,
-    /// Costs of different labels of a pixel and its right, lower, lower right and lower left neighbor.
+    /// Costs of different labels of a pixel and its right, lower, lower right and lower left
+    /// neighbor.
     edges: Vec<[i32; 4]>,
 }
 
@@ -147,8 +154,9 @@ pub(super) struct Grabcut {
 const FORWARD: [(usize, isize, isize); 4] = [(0, 1, 0), (2, 0, 1), (4, 1, 1), (6, -1, 1)];
 
 impl Grabcut {
-    /// Draws what clicks make certain on a photograph that is reduced to its working size from `size`, in whose pixels
-    /// the clicks are; also warnings about the clicks. The border margin is a share of the height.
+    /// Draws what clicks make certain on a photograph that is reduced to its working size from
+    /// `size`, in whose pixels the clicks are; also warnings about the clicks. The border margin is
+    /// a share of the height.
     pub fn new(
         view: &str,
         photo: Photo,
@@ -216,7 +224,8 @@ impl Grabcut {
         graph.cut().0
     }
 
-    /// Pieces without a click that are smaller than `min_size` pixels go, small holes are filled, threads are opened.
+    /// Pieces without a click that are smaller than `min_size` pixels go, small holes are filled,
+    /// threads are opened.
     pub fn finish(&self, mut head: Vec<bool>, min_size: f64) -> Vec<bool> {
         let clicked: Vec<bool> = self.seeds.iter().map(|k| *k == Seed::Head).collect();
         keep_pieces(&mut head, &clicked, min_size, self.width, self.height);
@@ -314,16 +323,18 @@ fn edges(photo: &Photo) -> Vec<[i32; 4]> {
 const SEED_RADIUS: f32 = 0.012;
 /// … and at least this many working pixels.
 const MIN_SEED_RADIUS_PX: f32 = 4.0;
-/// Width of the border margins along top and sides that are certainly background, share of the height.
+/// Width of the border margins along top and sides that are certainly background, share of the
+/// height.
 pub(super) const BORDER_MARGIN: f32 = 0.012;
-/// Height of the border margins at the sides, as a share of the picture's height; shoulders may touch the rest.
+/// Height of the border margins at the sides, as a share of the picture's height; shoulders may
+/// touch the rest.
 const BORDER_SIDES: f32 = 0.6;
 /// Radius of the discs around head clicks in the start, share of the height.
 const START_RADIUS: f32 = 0.06;
 /// Width of the line that joins head clicks in the start, share of the height.
 const START_LINE: f32 = 0.02;
-/// The background's first colors come from pixels this many times nearer to definite background than to the head's
-/// clicks; what lies between would teach it the colors of hair.
+/// The background's first colors come from pixels this many times nearer to definite background
+/// than to the head's clicks; what lies between would teach it the colors of hair.
 const START_DISTANCE_RATIO: f32 = 2.0;
 
 /// A definite label of a pixel, or none.
@@ -366,8 +377,8 @@ fn draw(marked: &mut [bool], width: usize, height: usize, a: (f32, f32), b: (f32
     }
 }
 
-/// Returns what is certain from the clicks, with a border margin of this share of the height: `[height · width]`, and
-/// warnings about clicks in each other's way.
+/// Returns what is certain from the clicks, with a border margin of this share of the height:
+/// `[height · width]`, and warnings about clicks in each other's way.
 fn from_clicks(
     view: &str,
     clicks: &[Click],
@@ -434,7 +445,8 @@ fn border(width: usize, height: usize, margin: f32) -> Vec<Seed> {
         .collect()
 }
 
-/// Returns the head's clicks as discs, joined by a line in their order: what the start measures distances from.
+/// Returns the head's clicks as discs, joined by a line in their order: what the start measures
+/// distances from.
 fn skeleton(seeds: &[Seed], clicks: &[Click], width: usize, height: usize) -> Vec<bool> {
     let h = height as f32;
     let mut skeleton: Vec<bool> = seeds.iter().map(|k| *k == Seed::Head).collect();
@@ -448,9 +460,9 @@ fn skeleton(seeds: &[Seed], clicks: &[Click], width: usize, height: usize) -> Ve
     skeleton
 }
 
-/// Returns the Voronoi start, twice `[height · width]`: whether a pixel is nearer to the skeleton than to definite
-/// background, and false where it is so much nearer to definite background that its color is taken for the
-/// background's.
+/// Returns the Voronoi start, twice `[height · width]`: whether a pixel is nearer to the skeleton
+/// than to definite background, and false where it is so much nearer to definite background that
+/// its color is taken for the background's.
 fn start(seeds: &[Seed], skeleton: &[bool], width: usize, height: usize) -> [Vec<bool>; 2] {
     let background: Vec<bool> = seeds.iter().map(|k| *k == Seed::Background).collect();
     let to_head = squared_distance(skeleton, width, height);
@@ -470,8 +482,8 @@ mod tests {
     use super::*;
     use tiface_base::math::rng;
 
-    /// Returns a noisy disc of two skin-like colors on a dark background with bright lamps; `scale` enlarges
-    /// everything.
+    /// Returns a noisy disc of two skin-like colors on a dark background with bright lamps; `scale`
+    /// enlarges everything.
     fn head(scale: f32) -> (Photo, Vec<bool>) {
         let (width, height) = ((96.0 * scale) as u32, (128.0 * scale) as u32);
         let mut truth = Vec::new();
@@ -528,7 +540,8 @@ mod tests {
         let run = || grabcut("a", &photo, &clicks(1.0));
         assert_eq!(run(), run());
         let flat = Photo { rgb: vec![[9, 9, 9]; photo.rgb.len()], ..photo };
-        // head and background have the same color: the mask satisfies the clicks, or the result has a warning
+        // head and background have the same color: the mask satisfies the clicks, or the result has
+        // a warning
         if let Ok(cut) = grabcut("a", &flat, &clicks(1.0)) {
             assert!(cut.ambiguous > 0.0);
         }
@@ -563,7 +576,8 @@ mod tests {
         let discs: Vec<bool> = seeds.iter().map(|k| *k == Seed::Head).collect();
         let [head, not_far] = start(&seeds, &discs, 41, 31);
         assert!(head[15 * 41 + 19] && !head[15 * 41 + 20] && head[0] && !head[40]);
-        // between the discs of 4 pixels 12 are free; twice as far from one as from the other at two thirds
+        // between the discs of 4 pixels 12 are free; twice as far from one as from the other at two
+        // thirds
         assert!(not_far[15 * 41 + 21] && !not_far[15 * 41 + 23]);
     }
 

@@ -1,7 +1,9 @@
-//! Visual hull of the masks of several views: votes for every cell of a cube, and silhouettes of cells.
+//! Visual hull of the masks of several views: votes for every cell of a cube, and silhouettes of
+//! cells.
 //!
-//! A mask votes for a cell when the cell's center falls on the head, against it when it falls beside, and not at
-//! all outside its frame. A set of cells is drawn back into any view by its surface.
+//! A mask votes for a cell when the cell's center falls on the head, against it when it falls
+//! beside, and not at all outside its frame. A set of cells is drawn back into any view by its
+//! surface.
 
 use crate::capture::carve::{Cube, Projector, around, meeting_point};
 use glam::DVec3;
@@ -32,7 +34,8 @@ impl ViewFrame {
     }
 }
 
-/// Lets every frame vote on every cell: `vote(values of the cell, index of the frame, pixel that shows the cell)`.
+/// Lets every frame vote on every cell:
+/// `vote(values of the cell, index of the frame, pixel that shows the cell)`.
 ///
 /// # Shapes
 ///
@@ -80,12 +83,14 @@ pub(super) fn count(cube: &Cube, voters: &[Voter]) -> Vec<[u16; 2]> {
     vote(cube, &frames, 1, |cell: &mut [[u16; 2]], k, pixel| cell[0][voters[k].head[pixel] as usize] += 1)
 }
 
-/// Returns the cells with at most `most_negative` votes against and at least `least_positive` for them.
+/// Returns the cells with at most `most_negative` votes against and at least `least_positive` for
+/// them.
 pub(super) fn cells(votes: &[[u16; 2]], most_negative: usize, least_positive: usize) -> Vec<bool> {
     votes.iter().map(|&[no, yes]| no as usize <= most_negative && yes as usize >= least_positive).collect()
 }
 
-/// Returns the cube around the point where the viewing axes meet, `margin` times as high as the frames at that point.
+/// Returns the cube around the point where the viewing axes meet, `margin` times as high as the
+/// frames at that point.
 pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
     let alike = |how: &str| {
         Error::cannot(
@@ -150,8 +155,8 @@ pub(super) fn silhouette(cube: &Cube, surface: &[DVec3], camera: &Camera) -> Vec
     covered
 }
 
-/// Returns the cells deeper inside than `share` of the deepest one. Depth counts peeled layers, in turn over faces and
-/// over corners, which is near to distance.
+/// Returns the cells deeper inside than `share` of the deepest one. Depth counts peeled layers, in
+/// turn over faces and over corners, which is near to distance.
 pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
     let mut depth = vec![0u16; cells.len()];
     let mut front = Vec::new();
@@ -219,7 +224,8 @@ mod tests {
         let voters: Vec<Voter> = cameras.iter().map(|c| Voter::new(c, &square(20))).collect();
         let votes = count(&cube, &voters);
         let box_cells = cells(&votes, 0, 2);
-        // a box of 2 units has 24 cells of 1/12 along each side; perspective moves its walls by a cell or two
+        // a box of 2 units has 24 cells of 1/12 along each side; perspective moves its walls by a
+        // cell or two
         let count = box_cells.iter().filter(|c| **c).count() as f64;
         assert!((count.cbrt() - 24.0).abs() < 2.0, "{count}");
         let drawn = silhouette(&cube, &surface(&cube, &box_cells), &cameras[0]);

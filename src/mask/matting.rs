@@ -1,12 +1,14 @@
-//! From a hard mask to a soft alpha: smaller, unknown band, opacity of the band, large again, hardened.
+//! From a hard mask to a soft alpha: smaller, unknown band, opacity of the band, large again,
+//! hardened.
 //!
 //! ```text
 //! photograph ─ reduce ─┬────────────── opacity of the band ─ enlarge ─ harden ─ alpha
 //! hard mask ── reduce ─┴─ trimap ─────┘
 //! ```
 //!
-//! The opacity is found at a working size, since the band of a photograph of 3000 × 4096 would hold millions of
-//! pixels and its outline is no sharper than the lens: by closed-form matting, or by a network of the caller's.
+//! The opacity is found at a working size, since the band of a photograph of 3000 × 4096 would hold
+//! millions of pixels and its outline is no sharper than the lens: by closed-form matting, or by a
+//! network of the caller's.
 //!
 //! The trimap has the unknown region around a mask's outline:
 //!
@@ -14,9 +16,9 @@
 //! 255  still head after the mask was shrunk      0  still outside after it was grown      128  between
 //! ```
 //!
-//! Two ways to shrink and grow: squares as the published pipeline does (OpenCV's `erode` and `dilate` with
-//! `k × k` ones, `i` times, anchor `k / 2`, nothing known beyond the picture), which are pixels whatever the
-//! picture's size; and discs whose radius is a share of the height.
+//! Two ways to shrink and grow: squares as the published pipeline does (OpenCV's `erode` and
+//! `dilate` with `k × k` ones, `i` times, anchor `k / 2`, nothing known beyond the picture), which
+//! are pixels whatever the picture's size; and discs whose radius is a share of the height.
 
 pub mod closed_form;
 
@@ -49,11 +51,13 @@ impl Default for SoftenOptions {
 }
 
 impl SoftenOptions {
-    /// Returns the bytes needed at most beside the photograph and the mask themselves, for one photograph of this size:
-    /// the alpha, the working pictures, and the equations if the whole working picture were unknown.
+    /// Returns the bytes needed at most beside the photograph and the mask themselves, for one
+    /// photograph of this size: the alpha, the working pictures, and the equations if the whole
+    /// working picture were unknown.
     pub fn memory_bytes(&self, width: u32, height: u32) -> u64 {
         let pixels = |(w, h): (u32, u32)| w as u64 * h as u64;
-        // per working pixel: photograph 3, mask, trimap 2, alpha and rows 8, distances and marks 12, equations 310
+        // per working pixel: photograph 3, mask, trimap 2, alpha and rows 8, distances and marks
+        // 12, equations 310
         pixels((width, height)) + 335 * pixels(working_size(width, height, self.side))
     }
 }
@@ -69,8 +73,9 @@ pub struct SoftMask {
     pub warnings: Vec<String>,
 }
 
-/// Returns the soft alpha of a photograph from its hard mask (head where it is 128 or more), which may be smaller but
-/// has the photograph's proportions. Where closed-form matting finds no solution the band stays hard, with a warning.
+/// Returns the soft alpha of a photograph from its hard mask (head where it is 128 or more), which
+/// may be smaller but has the photograph's proportions. Where closed-form matting finds no solution
+/// the band stays hard, with a warning.
 ///
 /// # Errors
 /// When the mask has other proportions than the photograph.
@@ -78,8 +83,9 @@ pub fn soften(photo: &Photo, mask: &Gray, options: &SoftenOptions) -> Result<Sof
     soften_with(photo, mask, options, |_, _| Ok(None))
 }
 
-/// [`soften`] with another way to find the opacity: `network` takes the working photograph and its trimap, and returns an
-/// alpha of each pixel or `None` to leave it to closed-form matting. What is definite in the trimap stays.
+/// [`soften`] with another way to find the opacity: `network` takes the working photograph and its
+/// trimap, and returns an alpha of each pixel or `None` to leave it to closed-form matting. What is
+/// definite in the trimap stays.
 pub fn soften_with(
     photo: &Photo,
     mask: &Gray,
@@ -167,7 +173,8 @@ pub const OUTSIDE: u8 = 0;
 pub enum UnknownBand {
     /// `kernel × kernel` ones applied `iterations` times each way.
     Squares {
-        /// Side of the square, pixels; with an even one the band lies half a pixel to the lower right.
+        /// Side of the square, pixels; with an even one the band lies half a pixel to the lower
+        /// right.
         kernel: u32,
         /// Number of applications.
         iterations: u32,
@@ -225,8 +232,8 @@ pub fn erode(marked: &[bool], width: usize, height: usize, kernel: u32, iteratio
 pub fn dilate(marked: &[bool], width: usize, height: usize, kernel: u32, iterations: u32) -> Vec<bool> {
     assert_eq!(marked.len(), width * height);
     let (kernel, iterations) = (kernel.max(1) as usize, iterations as usize);
-    // squares applied in turn are one larger square; OpenCV does not mirror the kernel when it dilates, so both
-    // reach as far before as behind
+    // squares applied in turn are one larger square; OpenCV does not mirror the kernel when it
+    // dilates, so both reach as far before as behind
     let before = (kernel / 2).saturating_mul(iterations);
     let behind = (kernel - 1 - kernel / 2).saturating_mul(iterations);
     dilated(marked.to_vec(), width, height, before, behind)
@@ -285,7 +292,8 @@ mod tests {
         let (before, after) =
             (error(&hard(&truth, 320, 400).values, &truth), error(&full.alpha.values, &truth));
         assert!(after < 0.1 * before, "{after:.2e} of {before:.2e}");
-        // a mask that has the working size already is taken as it is; a smaller one is brought to it
+        // a mask that has the working size already is taken as it is; a smaller one is brought to
+        // it
         let small = soften(&photo, &resize_gray(&hard(&truth, 320, 400), (160, 200)), &options).unwrap();
         assert_eq!(full.alpha, small.alpha);
         let tiny = soften(&photo, &resize_gray(&hard(&truth, 320, 400), (53, 67)), &options).unwrap();
@@ -312,7 +320,8 @@ mod tests {
             let soft = soften(&photo, &gray(vec![value; 64 * 80]), &options).unwrap();
             assert!(soft.alpha.values.iter().all(|&a| a == value) && unknown_share(&soft.trimap) == 0.0);
         }
-        // a line one pixel wide is all band: it stays as it is, where a tie to one side would lose it
+        // a line one pixel wide is all band: it stays as it is, where a tie to one side would lose
+        // it
         let line = gray((0..64 * 80).map(|i| if i % 64 == 30 { 255 } else { 0 }).collect());
         let soft = soften(&photo, &line, &options).unwrap();
         assert!(soft.warnings.iter().any(|w| w.contains("definitely head")), "{:?}", soft.warnings);
@@ -335,8 +344,8 @@ mod tests {
         assert!(bytes < 2 << 30);
     }
 
-    /// Softens masks of a captured head cut as they are at half, too wide and too narrow by 2 pixels, as far as a share of the
-    /// error is given that must at least be gone.
+    /// Softens masks of a captured head cut as they are at half, too wide and too narrow by 2
+    /// pixels, as far as a share of the error is given that must at least be gone.
     fn alphas_are_better(capture: &str, views: &[&str], gains: [Option<f64>; 3]) {
         let shared = std::env::var("TIFACE_SHARED")
             .unwrap_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
@@ -425,7 +434,8 @@ mod tests {
 
     #[test]
     fn an_even_kernel_reaches_farther_right_than_left() {
-        // anchor 2 of 4: a pixel sees two before itself and one behind, so one mark is seen from 4 places
+        // anchor 2 of 4: a pixel sees two before itself and one behind, so one mark is seen from 4
+        // places
         let mut one = [false; 9];
         one[4] = true;
         let grown = dilate(&one, 9, 1, 4, 1);

@@ -1,16 +1,18 @@
-//! Binary pictures: the exact Euclidean distance to the nearest marked pixel (Felzenszwalb & Huttenlocher 2012), and
-//! connected pieces: keeping some, filling holes, smoothing with a 3 × 3 square.
+//! Binary pictures: the exact Euclidean distance to the nearest marked pixel (Felzenszwalb &
+//! Huttenlocher 2012), and connected pieces: keeping some, filling holes, smoothing with a 3 × 3
+//! square.
 
 use crate::capture::carve::{self, Pieces};
 use rayon::prelude::*;
 use tiface_base::image::{Gray, dilated};
 use tiface_base::math::distance::LowerEnvelope;
 
-/// Far away: no pixel is marked. Larger than any squared distance in a picture, finite in arithmetic.
+/// Far away: no pixel is marked. Larger than any squared distance in a picture, finite in
+/// arithmetic.
 const FAR: f32 = 1e12;
 
-/// Returns the squared distance in pixels from every pixel to the nearest one that `marked` names; `f32::INFINITY`
-/// everywhere when none is. `marked`: `[height · width]`.
+/// Returns the squared distance in pixels from every pixel to the nearest one that `marked` names;
+/// `f32::INFINITY` everywhere when none is. `marked`: `[height · width]`.
 pub fn squared_distance(marked: &[bool], width: usize, height: usize) -> Vec<f32> {
     assert_eq!(marked.len(), width * height);
     if !marked.contains(&true) {
@@ -73,7 +75,8 @@ pub(super) fn gray(marked: &[bool], width: usize, height: usize) -> Gray {
     Gray { width: width as u32, height: height as u32, values }
 }
 
-/// Fills enclosed regions that do not touch the border, have at most `largest` pixels and none of `never`.
+/// Fills enclosed regions that do not touch the border, have at most `largest` pixels and none of
+/// `never`.
 pub(super) fn fill_holes(marked: &mut [bool], never: &[bool], width: usize, height: usize, largest: usize) {
     let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
     let found = pieces(&outside, width, height, false);
@@ -88,7 +91,8 @@ pub(super) fn fill_holes(marked: &mut [bool], never: &[bool], width: usize, heig
     marked.iter_mut().zip(&found.label).for_each(|(m, &l)| *m |= l != 0 && fill[l as usize]);
 }
 
-/// Unmarks pixels that no 3 × 3 square of marked pixels covers; pixels outside the picture are ignored.
+/// Unmarks pixels that no 3 × 3 square of marked pixels covers; pixels outside the picture are
+/// ignored.
 pub(super) fn open(marked: &[bool], width: usize, height: usize) -> Vec<bool> {
     let outside: Vec<bool> = marked.iter().map(|m| !m).collect();
     let inner = dilated(outside, width, height, 1, 1).into_iter().map(|m| !m).collect();

@@ -5,8 +5,9 @@
 //! photograph ─────────── propose ── alpha of the network's foreground
 //! ```
 //!
-//! Files are recognized by their inputs and outputs, looked through before an engine sees them, and recorded
-//! with size and SHA-256. Nothing is downloaded, and only the named files and the processor file beside a network are read.
+//! Files are recognized by their inputs and outputs, looked through before an engine sees them, and
+//! recorded with size and SHA-256. Nothing is downloaded, and only the named files and the
+//! processor file beside a network are read.
 
 mod alpha;
 mod processor;
@@ -35,8 +36,9 @@ impl Networks {
     /// Opens every file that the configuration uses; returns `None` where it uses none.
     ///
     /// # Errors
-    /// When a file cannot be read, is no valid ONNX file, is refused for its content, is of no known form or
-    /// of the other network, when encoder and decoder do not fit, or when the engine cannot load it.
+    /// When a file cannot be read, is no valid ONNX file, is refused for its content, is of no
+    /// known form or of the other network, when encoder and decoder do not fit, or when the engine
+    /// cannot load it.
     pub fn open(config: &MaskConfig) -> Result<Option<Networks>> {
         if !config.with_networks() {
             return Ok(None);
@@ -66,8 +68,9 @@ impl Networks {
         &self.files
     }
 
-    /// Runs the networks once, on an empty photograph of this size, so that a file that cannot be run, or returns
-    /// values that are not finite, is refused before the first photograph. Costs as much as one photograph.
+    /// Runs the networks once, on an empty photograph of this size, so that a file that cannot be
+    /// run, or returns values that are not finite, is refused before the first photograph. Costs as
+    /// much as one photograph.
     pub fn prepare(&self, width: u32, height: u32) -> Result<()> {
         self.affordable(width, height)?;
         let pixels = width as usize * height as usize;
@@ -78,29 +81,33 @@ impl Networks {
         Ok(())
     }
 
-    /// Returns the alpha network's alpha of a photograph, at `size`, without clicks; `None` without such a network.
+    /// Returns the alpha network's alpha of a photograph, at `size`, without clicks; `None` without
+    /// such a network.
     ///
     /// # Errors
-    /// For a photograph whose size is not that of its colors; when the network fails or gives what is no picture.
+    /// For a photograph whose size is not that of its colors; when the network fails or gives what
+    /// is no picture.
     pub fn propose(&self, photo: &Photo, size: (u32, u32)) -> Result<Option<Gray>> {
         let Some(alpha_net) = &self.alpha_net else { return Ok(None) };
         check_size(photo)?;
         alpha_net.alpha(photo, size).map(Some)
     }
 
-    /// SAM's hard mask (0 or 255) of what was clicked, and how good SAM thinks it is (estimated IoU); `None` without SAM.
+    /// SAM's hard mask (0 or 255) of what was clicked, and how good SAM thinks it is (estimated
+    /// IoU); `None` without SAM.
     ///
     /// # Errors
-    /// For a photograph whose size is not that of its colors, without a click on the head, with one outside the
-    /// photograph or, for a decoder without labels, on the background; when the network fails or gives what its form does not promise.
+    /// For a photograph whose size is not that of its colors, without a click on the head, with one
+    /// outside the photograph or, for a decoder without labels, on the background; when the network
+    /// fails or gives what its form does not promise.
     pub fn segment(&self, photo: &Photo, clicks: &[Click]) -> Result<Option<(Gray, f32)>> {
         let Some(sam) = &self.sam else { return Ok(None) };
         check_size(photo)?;
         sam.segment(photo, clicks).map(Some)
     }
 
-    /// ViTMatte's alpha in 0..=1 of each pixel, `[height · width]`, where the trimap (0, 128, 255) is a help
-    /// and not a bound: values are as the network gives them. `None` without ViTMatte.
+    /// ViTMatte's alpha in 0..=1 of each pixel, `[height · width]`, where the trimap (0, 128, 255)
+    /// is a help and not a bound: values are as the network gives them. `None` without ViTMatte.
     pub fn alpha(&self, photo: &Photo, trimap: &Gray) -> Result<Option<Vec<f32>>> {
         let Some(vitmatte) = &self.vitmatte else { return Ok(None) };
         check_size(photo)?;
@@ -118,9 +125,10 @@ impl Networks {
 
     /// About how much memory one photograph takes at its worst moment, weights included.
     ///
-    /// Two measured terms: what grows with the pixels, and attention, which grows with their square: `T²` for
-    /// `T` cells of 16 × 16 pixels (SAM ViT-B 2.3 GB at 1024², ViTMatte-S 0.92 GB at 768 × 1024; this says
-    /// 3.4 and 1.2). Networks without attention over the whole picture are overestimated.
+    /// Two measured terms: what grows with the pixels, and attention, which grows with their
+    /// square: `T²` for `T` cells of 16 × 16 pixels (SAM ViT-B 2.3 GB at 1024², ViTMatte-S 0.92 GB
+    /// at 768 × 1024; this says 3.4 and 1.2). Networks without attention over the whole picture are
+    /// overestimated.
     fn bytes_per_photo(&self, width: u32, height: u32) -> u64 {
         let sam = self.sam.as_ref().map_or(0, |sam| {
             let pixels = (sam.side as u64).pow(2);
@@ -144,7 +152,8 @@ impl Networks {
         sam.max(vitmatte).max(alpha)
     }
 
-    /// Returns how many photographs of this size may be run side by side within the memory and `threads`: at least one.
+    /// Returns how many photographs of this size may be run side by side within the memory and
+    /// `threads`: at least one.
     pub fn photos_at_once(&self, width: u32, height: u32, threads: usize) -> usize {
         let fit = self.memory_bytes / self.bytes_per_photo(width, height).max(1);
         usize::try_from(fit).unwrap_or(usize::MAX).min(threads).max(1)

@@ -1,14 +1,15 @@
 //! Pages of masks, one HTML file each: the annotation page to click on, and the contact sheet.
 //!
-//! **Annotation page**: photographs in, `prompts.json` out.
-//! The pages load and send no data: photographs lie inside as JPEG, reduced, while clicks
-//! are counted in pixels of the originals. The page's own text is `annotation.html`; names of files reach it only as
-//! JSON in which no character can end the element that holds it.
+//! **Annotation page**: photographs in, `prompts.json` out. The pages load and send no data:
+//! photographs lie inside as JPEG, reduced, while clicks are counted in pixels of the originals.
+//! The page's own text is `annotation.html`; names of files reach it only as JSON in which no
+//! character can end the element that holds it.
 //!
-//! **Contact sheet**: all masks over their photographs, to see at a glance which went wrong.
-//! The mask's outline is cyan, the unknown band yellow; below each picture stand the view's name, how much the mask
-//! covers and how much is unknown. Suspicious views have a red frame and list the reasons. The sheet is HTML with
-//! the pictures inside: a page of its own, and a part of the report.
+//! **Contact sheet**: all masks over their photographs, to see at a glance which went wrong. The
+//! mask's outline is cyan, the unknown band yellow; below each picture stand the view's name, how
+//! much the mask covers and how much is unknown. Suspicious views have a red frame and list the
+//! reasons. The sheet is HTML with the pictures inside: a page of its own, and a part of the
+//! report.
 
 use super::matting::{UNKNOWN, unknown_share};
 use super::prompts::{Prompts, file_path};
@@ -44,7 +45,8 @@ pub struct PageView {
 }
 
 impl PageView {
-    /// Codes a photograph, reduced to at most `side` pixels; `size` is what clicks on it are counted in.
+    /// Codes a photograph, reduced to at most `side` pixels; `size` is what clicks on it are
+    /// counted in.
     fn new(file_path: String, size: (u32, u32), photo: &Photo, side: u32) -> Result<PageView> {
         let small = reduce_photo(photo, working_size(photo.width, photo.height, side));
         let jpeg = io::jpeg_bytes(&small, QUALITY, Path::new(&file_path))?;
@@ -75,7 +77,8 @@ pub fn page_of(capture: &Capture, prompts: &Prompts, limits: &Limits) -> Result<
     Ok(page(&capture.name, &views, prompts))
 }
 
-/// At most `max_count` of `count` indices in order: those that `wanted` names first, the others evenly.
+/// At most `max_count` of `count` indices in order: those that `wanted` names first, the others
+/// evenly.
 fn evenly(count: usize, max_count: usize, wanted: impl Fn(usize) -> bool) -> Vec<usize> {
     let named: Vec<usize> = (0..count).filter(|&i| wanted(i)).take(max_count).collect();
     let rest: Vec<usize> = (0..count).filter(|i| named.binary_search(i).is_err()).collect();
@@ -100,8 +103,8 @@ pub fn page(title: &str, views: &[PageView], prompts: &Prompts) -> String {
     [&before, data.as_str(), after].concat()
 }
 
-/// JSON that may stand inside a `<script>`: `<`, `>` and `&` occur only within strings, where they can be
-/// written as escapes.
+/// JSON that may stand inside a `<script>`: `<`, `>` and `&` occur only within strings, where they
+/// can be written as escapes.
 fn inside_script(value: &Value) -> String {
     value.to_string().replace('<', "\\u003c").replace('>', "\\u003e").replace('&', "\\u0026")
 }
@@ -129,8 +132,8 @@ pub struct SheetView {
 }
 
 impl SheetView {
-    /// Draws the mask of a view over its photograph and lists what makes the mask suspicious without comparison; the mask and
-    /// the trimap may have other sizes than the photograph.
+    /// Draws the mask of a view over its photograph and lists what makes the mask suspicious
+    /// without comparison; the mask and the trimap may have other sizes than the photograph.
     pub fn new(name: &str, photo: &Photo, alpha: &Gray, trimap: Option<&Gray>) -> Result<SheetView> {
         let picture = io::jpeg_bytes(&overlaid(photo, alpha, trimap, PICTURE_PX), 85, Path::new(name))?;
         let unknown = trimap.map(|t| format!(", unknown {:.1} %", 100.0 * unknown_share(t)));
@@ -165,7 +168,8 @@ fn mixed(a: [u8; 3], b: [u8; 3], share: f32) -> [u8; 3] {
     [0, 1, 2].map(|k| (a[k] as f32 + share * (b[k] as f32 - a[k] as f32) + 0.5) as u8)
 }
 
-/// Draws the rim of the mask in color, and the pixels next to it outside darker, so that it shows on any ground.
+/// Draws the rim of the mask in color, and the pixels next to it outside darker, so that it shows
+/// on any ground.
 fn outline(picture: &mut Photo, mask: &Gray) {
     let (w, h) = (mask.width as i64, mask.height as i64);
     let head = |x: i64, y: i64| {
@@ -183,8 +187,8 @@ fn outline(picture: &mut Photo, mask: &Gray) {
     }
 }
 
-/// Returns the sheet of these views, in their order, as a page of its own. If not all fit, suspicious
-/// ones and evenly spread others are shown, and a last line says so.
+/// Returns the sheet of these views, in their order, as a page of its own. If not all fit,
+/// suspicious ones and evenly spread others are shown, and a last line says so.
 pub fn sheet(views: &[SheetView]) -> Result<String> {
     let shown = evenly(views.len(), MAX_PICTURES, |i| !views[i].suspicions.is_empty());
     let shown: Vec<&SheetView> = shown.into_iter().map(|i| &views[i]).collect();
@@ -195,8 +199,8 @@ pub fn sheet(views: &[SheetView]) -> Result<String> {
     page.map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
-/// Returns what a [`sheet`] shows, without the page around it: for a page with more, in about `max_bytes` bytes. Where not
-/// all views fit, suspicious ones and evenly spread others stay.
+/// Returns what a [`sheet`] shows, without the page around it: for a page with more, in about
+/// `max_bytes` bytes. Where not all views fit, suspicious ones and evenly spread others stay.
 pub fn part(sheet: &str, max_bytes: usize) -> Option<String> {
     let inside = sheet.split_once(SHEET_MARKERS[0])?.1.split_once(SHEET_MARKERS[1])?.0;
     let (head, rest) = inside.split_once("<figure")?;
@@ -318,7 +322,8 @@ mod tests {
                 _ => 255,
             });
             let picture = overlaid(&photo(60, 80), &alpha, Some(&trimap), 320);
-            // columns 20 to 39 but the rim at 30 and the dark one at 29: 100 + 0.4 (255 − 100) = 162
+            // columns 20 to 39 but the rim at 30 and the dark one at 29: 100 + 0.4 (255 − 100) =
+            // 162
             assert_eq!(count(&picture, [162, 140, 60]), 18 * 80, "{scale}");
             let view = SheetView::new("a", &photo(60, 80), &alpha, Some(&trimap)).unwrap();
             assert_eq!(view.shares, "head 50.0 %, unknown 33.3 %");

@@ -6,9 +6,10 @@
 //!     {"x": 181, "y": 288, "label": 1}, {"x": 32, "y": 51, "label": 0}]}]}
 //! ```
 //!
-//! `x` runs right and `y` down, as pixel indices of the photograph at the size its camera was calibrated for,
-//! whatever it is reduced to later; label 1 is the head, 0 is not. The file is untrusted: names are only
-//! compared with those of the capture, never opened, and every number is checked.
+//! `x` runs right and `y` down, as pixel indices of the photograph at the size its camera was
+//! calibrated for, whatever it is reduced to later; label 1 is the head, 0 is not. The file is
+//! untrusted: names are only compared with those of the capture, never opened, and every number is
+//! checked.
 
 use super::clicks::Click;
 use crate::capture::{Capture, View};
@@ -56,7 +57,8 @@ pub struct PhotoPrompts {
 /// Reads a `prompts.json`.
 ///
 /// # Errors
-/// When the file cannot be read or something in it makes no sense; the message names the file and the place in it.
+/// When the file cannot be read or something in it makes no sense; the message names the file and
+/// the place in it.
 pub fn read_prompts(path: &Path, limits: &Limits) -> Result<Prompts> {
     parse(path, &io::read_json(path, &at_most(limits))?, limits)
 }
@@ -209,7 +211,8 @@ fn below(name: &str) -> Result<String, &'static str> {
     if parts.is_empty() { Err("is empty") } else { Ok(parts.join("/")) }
 }
 
-/// Returns the name of a view's photograph in `prompts.json` and camera files: its path below the capture.
+/// Returns the name of a view's photograph in `prompts.json` and camera files: its path below the
+/// capture.
 pub fn file_path(capture: &Capture, view: &View) -> String {
     let path = view.photo.strip_prefix(&capture.root).unwrap_or(&view.photo);
     let parts: Vec<_> = path.components().map(|c| c.as_os_str().to_string_lossy()).collect();
@@ -236,8 +239,9 @@ struct Photographed<'a> {
 }
 
 impl Photographed<'_> {
-    /// Returns whether a file of clicks means this photograph by `name`: with or without ending, with or without the folder common to all
-    /// photographs, and in the folder of pictures already reduced (`images_4/`) as well.
+    /// Returns whether a file of clicks means this photograph by `name`: with or without ending,
+    /// with or without the folder common to all photographs, and in the folder of pictures already
+    /// reduced (`images_4/`) as well.
     fn is_called(&self, name: &str) -> bool {
         let bare = stem(name);
         let same = |path: &str| path == name || stem(path) == name || stem(path) == bare;
@@ -251,12 +255,12 @@ impl Photographed<'_> {
 }
 
 impl Prompts {
-    /// Returns the clicks of each view of a capture, parallel to its `views`, in pixel indices of its camera's picture;
-    /// none where nothing was clicked. `file` is for messages.
+    /// Returns the clicks of each view of a capture, parallel to its `views`, in pixel indices of
+    /// its camera's picture; none where nothing was clicked. `file` is for messages.
     ///
     /// # Errors
-    /// For a photograph that is no view, two names of one view, a point beside the photograph, a view without any click
-    /// on the head.
+    /// For a photograph that is no view, two names of one view, a point beside the photograph, a
+    /// view without any click on the head.
     pub fn clicks(&self, file: &str, capture: &Capture) -> Result<Vec<Vec<Click>>> {
         let of = |view| Photographed {
             path: file_path(capture, view),
@@ -304,7 +308,8 @@ impl Prompts {
                     "add a click on face and hair, or remove the frame",
                 ));
             }
-            // pixel i of the reduced picture averages pixels d i to d i + d − 1; what fills no block is dropped
+            // pixel i of the reduced picture averages pixels d i to d i + d − 1; what fills no
+            // block is dropped
             let d = photo.downscale.max(1) as f32;
             let scaled = |v: f32, side: u32| ((v + 0.5) / d - 0.5).min(side as f32 - 1.0);
             let (rw, rh) = photo.reduced;
@@ -463,8 +468,8 @@ mod tests {
         let photos =
             [photograph("images/b.png", "b", (42, 30), 4), photograph("images/a.png", "a", (42, 30), 4)];
         let clicks = parsed(&one("images/a.png", text)).unwrap().of_photographs("p.json", &photos).unwrap();
-        // (0 + ½) / 4 − ½ = −3/8 and (1.5 + ½) / 4 − ½ = 0; (29 + ½) / 4 − ½ = 6.875 of 7 rows is 6 at most;
-        // column 41 lies in the two that fill no block of four: the last of 10 takes it
+        // (0 + ½) / 4 − ½ = −3/8 and (1.5 + ½) / 4 − ½ = 0; (29 + ½) / 4 − ½ = 6.875 of 7 rows is 6
+        // at most; column 41 lies in the two that fill no block of four: the last of 10 takes it
         assert!(clicks[0].is_empty());
         let found: Vec<_> = clicks[1].iter().map(|c| (c.x, c.y, c.head)).collect();
         assert_eq!(found, [(-0.375, 0.0, true), (9.0, 6.0, false)]);

@@ -1,16 +1,17 @@
 //! A few clicked views → a mask for every view, through the known cameras.
 //!
-//! 1. The clicked views are cut by themselves; from all of them together the colors of head and background are learned
-//!    once, and frozen.
+//! 1. The clicked views are cut by themselves; from all of them together the colors of head and
+//!    background are learned once, and frozen.
 //! 2. The masks so far carve a cube of cells: the visual hull, which the head cannot leave.
-//! 3. In each view what lies outside the hull's silhouette is definite background and what the hull's core covers is definite
-//!    head; between them the frozen colors cut.
+//! 3. In each view what lies outside the hull's silhouette is definite background and what the
+//!    hull's core covers is definite head; between them the frozen colors cut.
 //! 4. All masks carve again, each cell forgiven a few votes against it, and 3 is repeated.
 //!
 //! The hull is an outer bound: it excludes and never includes, but for its core.
 //!
 //! Where a network has proposed a mask for every view ([`propagate_proposals`]), those that agree
-//! ([`verdicts`]) stand for the clicked ones: they teach the colors and carve the hull. What lies well inside a proposal that is not unlike the others is definite head.
+//! ([`verdicts`]) stand for the clicked ones: they teach the colors and carve the hull. What lies
+//! well inside a proposal that is not unlike the others is definite head.
 
 use super::clicks::{self, Click};
 use super::consistency::{ConsistencyView, MaskVerdict, verdicts};
@@ -30,7 +31,8 @@ use tiface_base::{Error, Result};
 const CELLS: usize = 112;
 /// Half side of the cube, in half heights of the frames at the point where the viewing axes meet.
 const CUBE: f64 = 1.15;
-/// Distance from the hull's silhouette at which definite background begins, as a share of the picture's height.
+/// Distance from the hull's silhouette at which definite background begins, as a share of the
+/// picture's height.
 const BACKGROUND_MARGIN: f32 = 0.012;
 /// Cells deeper inside than this share of the deepest one are the core.
 const CORE_DEPTH: f64 = 0.55;
@@ -75,12 +77,12 @@ pub struct HardMasks {
 
 /// Masks every view from the clicks on some. `load` gives the photograph of a view by its index.
 ///
-/// Photographs are loaded a few at a time and kept at the working size only. The result does not depend on the number
-/// of threads.
+/// Photographs are loaded a few at a time and kept at the working size only. The result does not
+/// depend on the number of threads.
 ///
 /// # Errors
-/// When clicks cannot be used, all lie on held-out views or leave nothing of the head; when cameras stand or look
-/// alike; when a photograph cannot be loaded or is not of its camera's size.
+/// When clicks cannot be used, all lie on held-out views or leave nothing of the head; when cameras
+/// stand or look alike; when a photograph cannot be loaded or is not of its camera's size.
 pub fn propagate<F>(views: &[PropagateView], load: F) -> Result<HardMasks>
 where
     F: Fn(usize) -> Result<Photo> + Sync,
@@ -182,8 +184,8 @@ impl<'a> Propagation<'a> {
         Some(models)
     }
 
-    /// Returns the clicks of a view brought to its working size. The border margins are a guess: once a hull says where
-    /// the head is, it may touch any border.
+    /// Returns the clicks of a view brought to its working size. The border margins are a guess:
+    /// once a hull says where the head is, it may touch any border.
     fn grabcut(&self, i: usize, margins: bool) -> (Grabcut, Vec<String>) {
         let (v, photo) = (&self.views[i], &self.photos[i]);
         let margin = if margins { grabcut::BORDER_MARGIN } else { 0.0 };
@@ -342,15 +344,16 @@ impl<'a> Propagation<'a> {
     }
 }
 
-/// Distance from the outline of a proposed mask at which definite head begins, as a share of the picture's height.
+/// Distance from the outline of a proposed mask at which definite head begins, as a share of the
+/// picture's height.
 const HEAD_MARGIN: f32 = 0.012;
 
-/// Masks every view from what a network has proposed for each, at the size [`rows_size`] gives; head from 128. As
-/// [`propagate`], without any click.
+/// Masks every view from what a network has proposed for each, at the size [`rows_size`] gives;
+/// head from 128. As [`propagate`], without any click.
 ///
 /// # Errors
-/// When fewer than two of the views that may vote agree; when cameras stand or look alike; when a photograph cannot be loaded
-/// or is not of its camera's size.
+/// When fewer than two of the views that may vote agree; when cameras stand or look alike; when a
+/// photograph cannot be loaded or is not of its camera's size.
 pub fn propagate_proposals<F>(views: &[PropagateView], proposals: &[Gray], load: F) -> Result<HardMasks>
 where
     F: Fn(usize) -> Result<Photo> + Sync,
@@ -450,7 +453,8 @@ mod tests {
             .collect()
     }
 
-    /// Returns a ball of two colors before a dark background with lamps, and which pixels are the ball.
+    /// Returns a ball of two colors before a dark background with lamps, and which pixels are the
+    /// ball.
     pub(super) fn photo(camera: &Camera, stream: u64) -> (Photo, Vec<bool>) {
         let mut truth = Vec::new();
         let rgb = (0..72 * 96u32)

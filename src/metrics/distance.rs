@@ -1,7 +1,8 @@
 //! Distances between surfaces.
 //!
-//! Points are spread evenly by area over one mesh, always at the same positions, and their nearest points on the
-//! other are found. Both directions are needed: missing parts show in one, superfluous parts in the other.
+//! Points are spread evenly by area over one mesh, always at the same positions, and their nearest
+//! points on the other are found. Both directions are needed: missing parts show in one,
+//! superfluous parts in the other.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -25,7 +26,8 @@ pub struct Distances {
     pub max: f64,
 }
 
-/// Returns the distances from `samples` points on `from` to the surface `to`; `None` if a mesh has no area.
+/// Returns the distances from `samples` points on `from` to the surface `to`; `None` if a mesh has
+/// no area.
 pub fn one_way(from: &Mesh, to: &Bvh, samples: usize) -> Option<Distances> {
     distances(sample(from, samples), to)
 }
@@ -42,8 +44,8 @@ fn distances(points: Vec<Vec3>, to: &Bvh) -> Option<Distances> {
     Some(Distances { samples: distances.len(), mean, median: rank(0.5)?, p90: rank(0.9)?, max: rank(1.0)? })
 }
 
-/// Returns `count` points spread evenly by area: equal steps through the summed areas choose the triangle, the R2
-/// sequence (Roberts 2018) the point in it. Without area, no points.
+/// Returns `count` points spread evenly by area: equal steps through the summed areas choose the
+/// triangle, the R2 sequence (Roberts 2018) the point in it. Without area, no points.
 pub fn sample(mesh: &Mesh, count: usize) -> Vec<Vec3> {
     sample_triangles(mesh, count).into_iter().map(|(p, _)| p).collect()
 }
@@ -75,31 +77,34 @@ pub fn sample_triangles(mesh: &Mesh, count: usize) -> Vec<(Vec3, u32)> {
     (0..count).into_par_iter().map(point).collect()
 }
 
-/// Minimum cosine between a surface's normal and the direction to a camera that counts as seeing it (75°, the limit
-/// of texture baking too): flatter views carry little information.
+/// Minimum cosine between a surface's normal and the direction to a camera that counts as seeing it
+/// (75°, the limit of texture baking too): flatter views carry little information.
 const MIN_COSINE: f32 = 0.26;
 
 /// Visibility of a point, and its label.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SurfaceVisibility {
-    /// Number of cameras that see the point: inside the frame, not steeper than 75°, and unoccluded.
+    /// Number of cameras that see the point: inside the frame, not steeper than 75°, and
+    /// unoccluded.
     pub cameras: u32,
     /// Number of these cameras whose pixel shows the first kind, and the second.
     pub kinds: [u32; 2],
 }
 
 impl SurfaceVisibility {
-    /// Returns whether three or more cameras see the point, and more than half of them label it as this kind.
+    /// Returns whether three or more cameras see the point, and more than half of them label it as
+    /// this kind.
     pub fn is(&self, kind: usize) -> bool {
         self.cameras >= 3 && 2 * self.kinds[kind] > self.cameras
     }
 }
 
-/// Returns the visibility of points of a mesh; `kind` returns the label of a camera (its index) at a pixel (column,
-/// row): 0 or 1, if it has one.
+/// Returns the visibility of points of a mesh; `kind` returns the label of a camera (its index) at
+/// a pixel (column, row): 0 or 1, if it has one.
 ///
-/// Where fewer than three cameras look (a cap below the frames' border, the inside of a nostril, the underside of a
-/// bust) photographs do not determine the surface, and its distance to the truth says nothing about a method.
+/// Where fewer than three cameras look (a cap below the frames' border, the inside of a nostril,
+/// the underside of a bust) photographs do not determine the surface, and its distance to the truth
+/// says nothing about a method.
 pub fn sights(
     mesh: &Mesh,
     bvh: &Bvh,
@@ -140,8 +145,8 @@ fn normal(mesh: &Mesh, triangle: u32) -> Vec3 {
 }
 
 /// Returns the distances from `from` to `to` over the parts that the cameras label as either kind
-/// ([`SurfaceVisibility::is`]), with the median of the signed ones: positive where `to` is outside. `None` for an
-/// empty part.
+/// ([`SurfaceVisibility::is`]), with the median of the signed ones: positive where `to` is outside.
+/// `None` for an empty part.
 pub fn kinds_one_way(
     from: &Mesh,
     to: &Bvh,
@@ -165,8 +170,8 @@ pub fn kinds_one_way(
     })
 }
 
-/// Returns the distances from `from` to `to` over the parts seen by each number of cameras, and each part's share of the
-/// area, in the order of `views`. `None` for an empty part.
+/// Returns the distances from `from` to `to` over the parts seen by each number of cameras, and
+/// each part's share of the area, in the order of `views`. `None` for an empty part.
 pub fn seen_one_way(
     from: &Mesh,
     to: &Bvh,
@@ -264,7 +269,8 @@ mod tests {
         let (d, share) = parts[0].unwrap();
         // area 2 · 2 + 2 = 6 … the lower sheet is 4 × 1, the upper 2 × 1: seen 2 + 2 of 6
         assert!((share - 4.0 / 6.0).abs() < 0.01, "{share}");
-        // the upper sheet lies 1 above, the free half up to 2 beyond the end at x = 2: mean (1 + 1) / 2
+        // the upper sheet lies 1 above, the free half up to 2 beyond the end at x = 2: mean (1 + 1)
+        // / 2
         assert!((d.mean - 1.0).abs() < 0.02 && (d.max - 2.0).abs() < 0.05, "{d:?}");
         // the invisible rest lies on the other surface; no point is counted twice
         let (hidden, rest) = parts[1].unwrap();
@@ -274,8 +280,8 @@ mod tests {
 
     #[test]
     fn a_part_is_what_most_of_three_cameras_take_it_for() {
-        // four cameras above the middle: all call the left half the first kind; of the right half two say the second,
-        // which is no majority, but beyond x = 1.5 three do
+        // four cameras above the middle: all call the left half the first kind; of the right half
+        // two say the second, which is no majority, but beyond x = 1.5 three do
         let camera =
             |x: f64| Camera { position: DVec3::new(x, 0.5, 100.0), ..Camera::above(100, 100, 4000.0, 0.0) };
         let cameras = [0.8, 0.9, 1.1, 1.2].map(camera);

@@ -1,8 +1,8 @@
-//! LPIPS (Zhang et al. 2018), by a network that the user brings as an ONNX file: AlexNet or VGG with the published weights,
-//! exported with two pictures as its inputs.
+//! LPIPS (Zhang et al. 2018), by a network that the user brings as an ONNX file: AlexNet or VGG
+//! with the published weights, exported with two pictures as its inputs.
 //!
-//! Its input is `2 c − 1` of colors in 0..1 (`normalize=True` of the published package), rounded to 8 bits. If a
-//! network returns a map, its mean counts. Nothing is downloaded.
+//! Its input is `2 c − 1` of colors in 0..1 (`normalize=True` of the published package), rounded to
+//! 8 bits. If a network returns a map, its mean counts. Nothing is downloaded.
 
 use super::{picture, rounded};
 use crate::onnx::{NetworkArray, NetworkFile, NetworkSession, Role};
@@ -19,7 +19,8 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// Opens the network's file, whose arrays may take `memory_gib` each; returns `None` for an empty path.
+    /// Opens the network's file, whose arrays may take `memory_gib` each; returns `None` for an
+    /// empty path.
     ///
     /// # Errors
     /// Fails if a file cannot be read, is no valid ONNX file, or does not take two pictures.
@@ -85,8 +86,8 @@ mod tests {
     use super::*;
     use crate::onnx::tests::made::{floats, graph, ints, model, node, port};
 
-    /// LPIPS of one layer in the published form: features `r = relu(W x)`, each pixel's divided by their length,
-    /// their squared differences weighted by `l`, averaged over the picture.
+    /// LPIPS of one layer in the published form: features `r = relu(W x)`, each pixel's divided by
+    /// their length, their squared differences weighted by `l`, averaged over the picture.
     fn network() -> Vec<u8> {
         let weights =
             [floats("w", &[2, 3, 1, 1], &W), floats("l", &[1, 2, 1, 1], &L), floats("ε", &[1], &[1e-10])];

@@ -6,9 +6,9 @@
 //! | edge | within 3 pixels of the mask's 0.5 contour, on either side; the frame's border is none |
 //! | skin, hair | pixels of the region of interest, as [`Tones`] classifies them |
 //!
-//! Pixels are covered if the render's opacity is at least 0.5. Head pixels that are not covered are missing, covered
-//! pixels without head are extra; [`PartMetrics::psnr_cap`] is the masked PSNR of a picture with the photograph's own
-//! colors in every covered pixel.
+//! Pixels are covered if the render's opacity is at least 0.5. Head pixels that are not covered are
+//! missing, covered pixels without head are extra; [`PartMetrics::psnr_cap`] is the masked PSNR of
+//! a picture with the photograph's own colors in every covered pixel.
 
 use super::{picture, rounded};
 use crate::capture::{LoadedView, View};
@@ -91,8 +91,9 @@ impl PartMetrics {
 
 /// Evaluates a render part by part, over the background it was made for.
 ///
-/// `expected` is the photograph over the same background, `behind` that background's color (sRGB-coded),
-/// `opacity` the render's alpha if it is known, `[height · width]`. Sizes agree, as [`super::compare`] makes sure.
+/// `expected` is the photograph over the same background, `behind` that background's color
+/// (sRGB-coded), `opacity` the render's alpha if it is known, `[height · width]`. Sizes agree, as
+/// [`super::compare`] makes sure.
 pub fn parts(
     render: &Image,
     expected: &Photo,
@@ -139,7 +140,8 @@ fn edge(masks: Masks) -> Vec<bool> {
     masks.all(|i, _| to_head[i] && to_rest[i])
 }
 
-/// Around a soft rim this many pixels of opaque head are the hair's, and along a hard rim the skin's.
+/// Around a soft rim this many pixels of opaque head are the hair's, and along a hard rim the
+/// skin's.
 const RIM_BAND_PX: f32 = 6.0;
 
 /// An outline nearer than this to a soft rim does not count as skin's.
@@ -150,12 +152,13 @@ const MIN_SHARE: f64 = 0.05;
 
 /// Classifier of skin and hair by color, learned from the capture itself.
 ///
-/// Where a mask is soft over more than the one pixel of an antialiased outline (a pixel whose eight neighbors are all
-/// soft, too), hair is in front of the background: opaque pixels of the region beside it are samples of hair, those
-/// along the other outlines samples of skin. Every opaque pixel of the region is then assigned to the kind whose
-/// median is nearer, in units of that kind's own median deviation. Brows and lips are classified as hair if they are
-/// as dark. Without soft rims (a shaven head, a bust, hard masks), without hard ones, or with hair of the skin's
-/// color no classification is made.
+/// Where a mask is soft over more than the one pixel of an antialiased outline (a pixel whose eight
+/// neighbors are all soft, too), hair is in front of the background: opaque pixels of the region
+/// beside it are samples of hair, those along the other outlines samples of skin. Every opaque
+/// pixel of the region is then assigned to the kind whose median is nearer, in units of that kind's
+/// own median deviation. Brows and lips are classified as hair if they are as dark. Without soft
+/// rims (a shaven head, a bust, hard masks), without hard ones, or with hair of the skin's color no
+/// classification is made.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tones {
     skin: Tone,
@@ -258,7 +261,8 @@ impl Tones {
     }
 }
 
-/// Returns the pixels where the mask and all eight neighbors (those within the frame) are neither 0 nor 1.
+/// Returns the pixels where the mask and all eight neighbors (those within the frame) are neither 0
+/// nor 1.
 fn soft_rim(mask: &Gray) -> Vec<bool> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let soft = |x: usize, y: usize| !matches!(mask.values[y * w + x], 0 | u8::MAX);
@@ -334,8 +338,8 @@ mod tests {
         assert_eq!((whole.missing, whole.psnr_cap), (Some(0.0), None));
     }
 
-    /// Returns a capture of one photograph, 40 × 20: background above, below it a soft rim of hair on the left half and
-    /// a hard outline of skin on the right; the lowest rows are neck.
+    /// Returns a capture of one photograph, 40 × 20: background above, below it a soft rim of hair
+    /// on the left half and a hard outline of skin on the right; the lowest rows are neck.
     fn head(hair: [u8; 3], skin: [u8; 3]) -> (Photo, Gray, Gray) {
         let (w, h) = (40, 20);
         let mask = |x: usize, y: usize| match (x < w / 2, y) {
@@ -359,8 +363,9 @@ mod tests {
         assert_eq!((tones.hair.median, tones.skin.median), ([60.0, 40.0, 30.0], [200.0, 150.0, 140.0]));
         let (skin, hair) = tones.split(&photo, masks).unwrap();
         let count = |set: &[bool]| set.iter().filter(|s| **s).count();
-        // opaque rows 6 to 15 of 20 columns each; hair has its rim, too: row 4 up to column 18 has soft neighbors
-        // only, and what touches it is in rows 3 to 5 up to there, and column 19 of row 4
+        // opaque rows 6 to 15 of 20 columns each; hair has its rim, too: row 4 up to column 18 has
+        // soft neighbors only, and what touches it is in rows 3 to 5 up to there, and column 19 of
+        // row 4
         assert_eq!((count(&skin), count(&hair)), (200, 200 + 3 * 19 + 1));
         assert!(skin[10 * 40 + 30] && hair[10 * 40 + 10] && hair[4 * 40 + 5] && !skin[17 * 40 + 30]);
         let render = Image::new(40, 20, 4);

@@ -37,8 +37,8 @@ const RADIUS: usize = WINDOW / 2;
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
-/// Returns the mean over the windows that fit; TensoRF's figure. `None` for pictures of different shape or
-/// smaller than the window.
+/// Returns the mean over the windows that fit; TensoRF's figure. `None` for pictures of different
+/// shape or smaller than the window.
 pub fn ssim_valid(a: &Image, b: &Image) -> Option<f64> {
     let maps = maps(a, b, 0, true)?;
     let count: usize = maps.iter().map(Vec::len).sum();

@@ -126,7 +126,8 @@ pub struct Port {
     pub name: String,
     /// ONNX's number for what it holds.
     pub kind: i32,
-    /// Its extents, `None` where any will do; `None` as a whole when not even the number of axes is said.
+    /// Its extents, `None` where any will do; `None` as a whole when not even the number of axes is
+    /// said.
     pub dims: Option<Vec<Option<usize>>>,
 }
 
@@ -215,7 +216,8 @@ fn misfit(inputs: &[Port], wanted: &[(&str, i32, &[usize])]) -> Option<String> {
 /// A file that was loaded, for the record of a run.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 pub struct NetworkFile {
-    /// The name of the setting that named it: "sam", "sam_decoder", "vitmatte", "alpha_net" or "lpips".
+    /// The name of the setting that named it: "sam", "sam_decoder", "vitmatte", "alpha_net" or
+    /// "lpips".
     pub role: &'static str,
     /// The file as named.
     pub path: PathBuf,
@@ -281,8 +283,9 @@ pub(super) type NetworkInputs<'a> = [(&'a Port, &'a NetworkArray)];
 
 /// Runs a piece of an engine; a panic inside becomes its message.
 ///
-/// `AssertUnwindSafe`: what an engine shares between runs is a map of finished plans behind a lock, changed
-/// by one insertion, so a run that panics leaves nothing half made that a later run would see.
+/// `AssertUnwindSafe`: what an engine shares between runs is a map of finished plans behind a lock,
+/// changed by one insertion, so a run that panics leaves nothing half made that a later run would
+/// see.
 pub(super) fn guarded<T>(piece: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
     catch_unwind(AssertUnwindSafe(piece)).unwrap_or_else(|panic| {
         let said = panic.downcast_ref::<String>().map(String::as_str);

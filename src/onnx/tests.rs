@@ -1,4 +1,5 @@
-//! Hostile files, each with the error it must produce; and that the engine really refuses what it refuses.
+//! Hostile files, each with the error it must produce; and that the engine really refuses what it
+//! refuses.
 
 use self::made::{Message, floats, graph, integers, model, node, port, tensor, trimap_times, vitmatte};
 use super::*;
@@ -44,7 +45,8 @@ fn tried(bytes: &[u8]) -> Result<Networks> {
     Ok(networks)
 }
 
-/// What a file that must not be used is refused with: a sentence with its name, and a suggested fix.
+/// What a file that must not be used is refused with: a sentence with its name, and a suggested
+/// fix.
 fn refusal(bytes: &[u8]) -> String {
     match tried(bytes) {
         Ok(_) => panic!("it runs"),
@@ -108,8 +110,8 @@ fn text_and_nothing_are_no_onnx() {
 fn damaged(every: usize) {
     let whole = trimap_times(1.0);
     for end in (1..whole.len()).step_by(every) {
-        // an end between two fields leaves a message that parses and lacks what comes later; the last one is the
-        // opset, without which the rest still stands
+        // an end between two fields leaves a message that parses and lacks what comes later; the
+        // last one is the opset, without which the rest still stands
         if let Err(error) = tried(&whole[..end]) {
             assert!(reason(&error).is_some(), "cut at {end}: {error}");
         }
@@ -289,7 +291,8 @@ fn extents_computed_from_constants_are_followed() {
 
 #[test]
 fn extents_computed_from_the_picture_end_in_an_error_too() {
-    // the picture's own shape times 2³⁰: [2³⁰, 4, 32, 32], 16 TiB, which is found before it is allocated
+    // the picture's own shape times 2³⁰: [2³⁰, 4, 32, 32], 16 TiB, which is found before it is
+    // allocated
     let nodes = [
         node("Shape", &["pixel_values"], &["shape"], &[]),
         node("Mul", &["shape", "factor"], &["size"], &[]),

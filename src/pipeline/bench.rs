@@ -1,8 +1,9 @@
 //! The command `tiface bench`: speed against error of design decisions, measured on a capture.
 //!
-//! Every sweep runs the stages' own code on the same photographs and changes one setting. Errors are measured as
-//! masked PSNR of some held-out views. Some sweeps vary the cost of training (steps, photographs' size, the hash
-//! grid), others the path from a surface to the head mesh (simplification, texture).
+//! Every sweep runs the stages' own code on the same photographs and changes one setting. Errors
+//! are measured as masked PSNR of some held-out views. Some sweeps vary the cost of training
+//! (steps, photographs' size, the hash grid), others the path from a surface to the head mesh
+//! (simplification, texture).
 
 use super::finish::{Export, Finish};
 use super::mesh::{Extraction, extract, photographs};
@@ -44,8 +45,8 @@ pub struct Bench<'l> {
 }
 
 impl<'l> Bench<'l> {
-    /// Returns a bench on a session whose run is deleted. The finished fields of another run of the same capture are
-    /// used where training itself is not measured.
+    /// Returns a bench on a session whose run is deleted. The finished fields of another run of the
+    /// same capture are used where training itself is not measured.
     ///
     /// # Errors
     ///
@@ -57,7 +58,8 @@ impl<'l> Bench<'l> {
         Ok(Bench { session, finished, scene, evaluator, watch })
     }
 
-    /// Returns an empty report of a bench with these settings: program, machine, and the sweeps that it is to have.
+    /// Returns an empty report of a bench with these settings: program, machine, and the sweeps
+    /// that it is to have.
     pub fn begin(config: &Config, sweeps: &[&str]) -> BenchResult {
         BenchResult {
             version: env!("CARGO_PKG_VERSION").into(),
@@ -101,7 +103,8 @@ impl<'l> Bench<'l> {
         }
     }
 
-    /// Returns trained fields: those of a finished run, else those of this one, trained now if necessary.
+    /// Returns trained fields: those of a finished run, else those of this one, trained now if
+    /// necessary.
     fn fields(&self, stages: &[Stage]) -> Result<impl Fields + 'l> {
         let done = |session: &&&'l Session<'l>| stages.iter().all(|s| session.run.is_done(&session.plan(*s)));
         let session: &'l Session<'l> = match self.finished.as_ref().filter(done) {
@@ -134,8 +137,8 @@ impl<'l> Bench<'l> {
     }
 }
 
-/// The metric that views of fields are evaluated by: two trainings with the same settings and different seeds differ
-/// by as much as its noise.
+/// The metric that views of fields are evaluated by: two trainings with the same settings and
+/// different seeds differ by as much as its noise.
 const PSNR: Measure =
     Measure { name: Cow::Borrowed("PSNR, dB"), digits: 2, more_is_better: Some(true), noise: (0.2, 0.0) };
 
@@ -180,7 +183,8 @@ impl Evaluator {
         Ok(Evaluator { views: views.collect::<Result<_>>()?, background })
     }
 
-    /// Returns the mean PSNR of the views by a method, inside the mask (of the frame without one), dB.
+    /// Returns the mean PSNR of the views by a method, inside the mask (of the frame without one),
+    /// dB.
     pub fn psnr(&self, scene: &Scene, renderer: &Renderer, method: Method) -> Result<Option<f64>> {
         let mut found = Vec::new();
         for (view, loaded, expected) in &self.views {
@@ -202,8 +206,9 @@ impl Evaluator {
 /// Shares of the training after which a field is evaluated.
 const EVALUATED_SHARES: [f64; 5] = [0.125, 0.25, 0.5, 0.75, 1.0];
 
-/// Share of a whole training's steps at which trainings of different settings are compared: the setting that leads
-/// after so many steps leads at the end in most cases, and all sweeps should finish in reasonable time.
+/// Share of a whole training's steps at which trainings of different settings are compared: the
+/// setting that leads after so many steps leads at the end in most cases, and all sweeps should
+/// finish in reasonable time.
 const COMPARED_SHARE: f64 = 0.2;
 
 /// Asks a training to stop at a step, or when the user asks.

@@ -1,8 +1,10 @@
-//! How well the cameras of a capture fit each other, in words, and the refined poses that a run keeps.
+//! How well the cameras of a capture fit each other, in words, and the refined poses that a run
+//! keeps.
 //!
-//! The measurement is [`crate::rig`]'s. It takes photographs of the training views and the hull of their masks; held-out
-//! views take no part. The stage `mask` makes it and writes `poses.json`, later stages read refined poses there. Where poses
-//! are refined, each held-out view is then fitted alone: the evaluation shows it from both poses.
+//! The measurement is [`crate::rig`]'s. It takes photographs of the training views and the hull of
+//! their masks; held-out views take no part. The stage `mask` makes it and writes `poses.json`,
+//! later stages read refined poses there. Where poses are refined, each held-out view is then
+//! fitted alone: the evaluation shows it from both poses.
 
 use super::rig_photos::RigPhotos;
 use crate::capture::path::NamedCamera;
@@ -36,7 +38,8 @@ const WORST: usize = 3;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct CameraCheck {
     verdict: PoseDecision,
-    /// Median distance of sightings from their points, pixels, with the poses given and the adjusted ones.
+    /// Median distance of sightings from their points, pixels, with the poses given and the
+    /// adjusted ones.
     given_px: f64,
     adjusted_px: f64,
     cameras: Vec<CheckedCamera>,
@@ -92,8 +95,8 @@ impl From<&Camera> for Pose {
     }
 }
 
-/// Measures how well the cameras of the training views fit each other. If any is refined, the held-out views are then fitted
-/// one by one.
+/// Measures how well the cameras of the training views fit each other. If any is refined, the
+/// held-out views are then fitted one by one.
 pub(super) fn check_cameras(photos: &RigPhotos, poses: CameraPoses) -> CameraCheck {
     check_by(rig::POINTS, photos, poses)
 }
@@ -307,7 +310,8 @@ impl CameraCheck {
         Ok(io::write_atomic(&folder.join(POSES), format!("{text}\n").as_bytes())?)
     }
 
-    /// Reads the file of [`CameraCheck::write`], if there is one; poses that it cannot have written are refused.
+    /// Reads the file of [`CameraCheck::write`], if there is one; poses that it cannot have written
+    /// are refused.
     pub(super) fn read(folder: &Path) -> Result<Option<CameraCheck>, ReadError> {
         let path = folder.join(POSES);
         if !io::is_file(&path) {

@@ -1,4 +1,5 @@
-//! Cameras of the demo head: exact ones, disturbed ones, one that was moved, and photographs that are swapped.
+//! Cameras of the demo head: exact ones, disturbed ones, one that was moved, and photographs that
+//! are swapped.
 
 use super::cameras::{CameraCheck, POSES, check_by};
 use super::rig_photos::RigPhotos;
@@ -35,7 +36,8 @@ fn of_exact(poses: CameraPoses) -> &'static CameraCheck {
     FOUND[usize::from(poses == CameraPoses::Refine)].get_or_init(|| check(&measured_head().1, poses))
 }
 
-/// Turns and moves a camera about this many pixels; neighbors in number move oppositely, so that the world stays.
+/// Turns and moves a camera about this many pixels; neighbors in number move oppositely, so that
+/// the world stays.
 fn disturb(capture: &mut Capture, view: usize, pixels: f64) {
     let camera = &mut capture.views[view].camera;
     let sign = if view.is_multiple_of(2) { 1.0 } else { -1.0 };
@@ -51,7 +53,8 @@ fn error_px(capture: &Capture, exact: &Capture) -> f64 {
     distance_px(&cameras.collect::<Vec<_>>())
 }
 
-/// Returns the root mean square of how far the head in the pictures of each pair of cameras lies apart.
+/// Returns the root mean square of how far the head in the pictures of each pair of cameras lies
+/// apart.
 fn distance_px(pairs: &[[&Camera; 2]]) -> f64 {
     let points = SyntheticHead.surface_points(200, 1);
     let mut squares = Vec::new();
@@ -109,8 +112,8 @@ fn one_camera_that_was_moved_is_named_and_refined_alone() {
 fn a_held_out_view_is_fitted_alone_where_poses_are_refined_and_changes_nothing_else() {
     let (_dir, exact) = measured_head();
     let clean = of_exact(CameraPoses::Refine);
-    // two more held-out views of the same photograph: one whose pose is wrong, and one that shows the back of the head, on
-    // which few of the points lie that others see
+    // two more held-out views of the same photograph: one whose pose is wrong, and one that shows
+    // the back of the head, on which few of the points lie that others see
     let mut more = exact.clone();
     for name in ["wrong", "lost"] {
         more.views.push(View { name: name.into(), ..exact.views[14].clone() });

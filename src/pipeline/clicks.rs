@@ -1,5 +1,5 @@
-//! Masks from clicks: the clicked views are cut, propagated to every other view, and matted. Without clicks, a
-//! network's proposals for each view replace them, as far as the views agree.
+//! Masks from clicks: the clicked views are cut, propagated to every other view, and matted.
+//! Without clicks, a network's proposals for each view replace them, as far as the views agree.
 //!
 //! ```text
 //! clicks → cut (GrabCut, or SAM) ─┬─ propagated through the cameras
@@ -41,7 +41,8 @@ pub(super) struct MaskPrompts {
 const INPUTS: [&str; 5] = ["clicks", "sam", "sam_decoder", "vitmatte", "alpha_net"];
 
 impl MaskPrompts {
-    /// Reads the prompts of a configuration and checks them against the capture; `None` if no masks are made.
+    /// Reads the prompts of a configuration and checks them against the capture; `None` if no masks
+    /// are made.
     ///
     /// `kept` is the run's copy of the clicks, which is used if the original file was removed.
     pub fn open(config: &MaskConfig, capture: &Capture, kept: &Path) -> Result<Option<MaskPrompts>> {
@@ -147,8 +148,8 @@ fn photo(capture: &Capture, view: usize, dir: &StageDir) -> Result<Photo> {
     capture.views[view].load_photo(&Limits::default())
 }
 
-/// Makes masks of all views from clicks on some, passes them to `keep` in order, and returns a record of the networks
-/// that were used.
+/// Makes masks of all views from clicks on some, passes them to `keep` in order, and returns a
+/// record of the networks that were used.
 pub(super) fn make_masks(
     capture: &Capture,
     prompts: &MaskPrompts,
@@ -286,8 +287,8 @@ fn soft_mask(
     Ok(SoftMask { warnings, ..found })
 }
 
-/// Places clicks on a view without any: the deepest points of its propagated mask, each outside the disc of those
-/// before, and the two points farthest from the mask.
+/// Places clicks on a view without any: the deepest points of its propagated mask, each outside the
+/// disc of those before, and the two points farthest from the mask.
 pub(super) fn propagated_clicks(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
     let (w, h) = (mask.width as usize, mask.height as usize);
     let mut out = Vec::new();

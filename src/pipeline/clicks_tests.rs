@@ -18,7 +18,8 @@ const SHARP: (u32, u32) = (120, 160);
 /// Photographs that are only to be masked.
 const SMALL: (u32, u32) = (72, 96);
 
-/// A synthetic capture, clicks on three of its views at the deepest places of the true masks, and those masks.
+/// A synthetic capture, clicks on three of its views at the deepest places of the true masks, and
+/// those masks.
 fn clicked(dir: &Path, size: (u32, u32)) -> (Config, Vec<Gray>) {
     let root = dir.join("head");
     demo_head(&root, size, (8, 2));
@@ -201,7 +202,8 @@ fn networks_cut_and_soften_and_are_recorded() {
     assert_eq!(inputs, ["clicks", "sam", "sam_decoder", "vitmatte"]);
 }
 
-/// Every photograph painted bright where the head is, and a network that takes what is bright for it.
+/// Every photograph painted bright where the head is, and a network that takes what is bright for
+/// it.
 #[cfg(feature = "matting")]
 #[test]
 fn a_network_masks_all_views_without_a_click() {
@@ -238,8 +240,9 @@ fn a_network_masks_all_views_without_a_click() {
     assert!(other.to_string().contains("mask.alpha_input"), "{other}");
 }
 
-/// Masks a capture of a light stage from the clicks that come with it, once for each band around the cut, and holds the masks
-/// against its true ones: so much are their mean and least overlap. Returns the squared errors of the alphas of clicked views.
+/// Masks a capture of a light stage from the clicks that come with it, once for each band around
+/// the cut, and holds the masks against its true ones: so much are their mean and least overlap.
+/// Returns the squared errors of the alphas of clicked views.
 fn masked_light_stage(downscale: u32, bands: &[f32], [mean_least, worst_least]: [f64; 2]) -> Vec<f64> {
     let shared =
         std::env::var("TIFACE_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());

@@ -1,4 +1,5 @@
-//! Comparisons on one page: two runs of a capture, and what other programs made of it, against the same held-out photographs.
+//! Comparisons on one page: two runs of a capture, and what other programs made of it, against the
+//! same held-out photographs.
 
 use super::metrics::{Comparable, Judge, means};
 use super::page::views::{ShownSet, rows, shown_sets};
@@ -27,12 +28,14 @@ const SURFACE_SAMPLES: usize = 100_000;
 /// Folder of the pictures of meshes, beside the page.
 const DRAWN: &str = "pictures";
 
-/// Returns a page, to lie in `folder`, that compares two runs of one capture: their pictures of the same photographs, tables,
-/// curves laid over each other, the distance between their surfaces, and the settings that differ.
+/// Returns a page, to lie in `folder`, that compares two runs of one capture: their pictures of the
+/// same photographs, tables, curves laid over each other, the distance between their surfaces, and
+/// the settings that differ.
 ///
 /// # Errors
 ///
-/// Fails if the photographs have been moved, or if the runs have no pictures of the same photograph over the same background.
+/// Fails if the photographs have been moved, or if the runs have no pictures of the same photograph
+/// over the same background.
 pub fn compare_runs(runs: [&Session; 2], names: [&str; 2], folder: &Path) -> Result<String> {
     runs.iter().try_for_each(|session| session.require_inputs(&[Stage::Metrics]))?;
     let of = |name: &str, what: &str| format!("{name}: {what}");
@@ -96,7 +99,8 @@ fn facts(run: &Session, name: &str) -> String {
     format!("{name}: preset {}, seed {}, {}", run.config.preset.as_str(), run.config.seed, duration(seconds))
 }
 
-/// Returns the distances between the extracted surfaces in dataset units, both ways; `None` if a run has no mesh.
+/// Returns the distances between the extracted surfaces in dataset units, both ways; `None` if a
+/// run has no mesh.
 fn surfaces(runs: [&Session; 2], names: [&str; 2]) -> Result<Option<Value>> {
     if runs.iter().any(|session| finished_mesh(session.run.dir()).is_err()) {
         return Ok(None);
@@ -113,7 +117,8 @@ fn surfaces(runs: [&Session; 2], names: [&str; 2]) -> Result<Option<Value>> {
 pub struct Judged {
     /// `metrics.json`, with an entry for each folder and mesh.
     pub metrics: Value,
-    /// Title, masked PSNR and SSIM (of the whole frame without masks), and the number of views, of each.
+    /// Title, masked PSNR and SSIM (of the whole frame without masks), and the number of views, of
+    /// each.
     pub rows: Vec<(String, Option<f64>, Option<f64>, usize)>,
     /// The page.
     pub page: String,
@@ -121,14 +126,15 @@ pub struct Judged {
     pub warnings: Vec<String>,
 }
 
-/// Compares pictures and meshes of other programs with the held-out photographs of a capture. Each folder of `views` has
-/// pictures named like the photographs (`NAME.png`, `.jpg` or `.exr`); meshes are in the capture's world, and their pictures
-/// are written to folders in `out/pictures`; the page is to lie in `out`.
+/// Compares pictures and meshes of other programs with the held-out photographs of a capture. Each
+/// folder of `views` has pictures named like the photographs (`NAME.png`, `.jpg` or `.exr`); meshes
+/// are in the capture's world, and their pictures are written to folders in `out/pictures`; the
+/// page is to lie in `out`.
 ///
 /// # Errors
 ///
-/// Fails if the capture holds out no photograph, if a folder has a picture of none of them or one of another size, or if a file
-/// cannot be read.
+/// Fails if the capture holds out no photograph, if a folder has a picture of none of them or one
+/// of another size, or if a file cannot be read.
 pub fn judge(
     capture: &Capture,
     config: &Config,
@@ -271,7 +277,8 @@ fn pictures_of<'c>(views: &[&'c View], folder: &Path) -> Result<Vec<Comparable<'
     Ok(found)
 }
 
-/// Writes pictures of a mesh from the cameras of views into a folder, and returns figures of the mesh and its warnings.
+/// Writes pictures of a mesh from the cameras of views into a folder, and returns figures of the
+/// mesh and its warnings.
 fn draw(views: &[&View], config: &Config, mesh: &Path, folder: &Path) -> Result<(Value, Vec<String>)> {
     let opened = open_mesh(mesh)?;
     let mut warnings = opened.warnings();

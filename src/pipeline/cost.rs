@@ -16,7 +16,8 @@ use tiface_kernels::cpu::hash;
 
 const MIB: f64 = (1u64 << 20) as f64;
 
-/// Memory that a stage takes on the CPU, MiB; each is that of the whole process while the stage works.
+/// Memory that a stage takes on the CPU, MiB; each is that of the whole process while the stage
+/// works.
 ///
 /// `tools/reference/estimates.py RUN...` compares what these say with the peaks that runs recorded.
 mod mib {
@@ -26,7 +27,8 @@ mod mib {
     pub const THREAD: f64 = 10.0;
     /// A pixel of a photograph in memory, with mask, validity and what is drawn from it.
     pub const PIXEL: f64 = 25e-6;
-    /// A parameter of a radiance field in training: value, gradient, two moments, and a copy for a checkpoint.
+    /// A parameter of a radiance field in training: value, gradient, two moments, and a copy for a
+    /// checkpoint.
     pub const VM_PARAMETER: f64 = 24e-6;
     /// A ray of a step of a radiance field, with its samples and their activations.
     pub const VM_RAY: f64 = 0.049;
@@ -34,9 +36,11 @@ mod mib {
     pub const TABLE_FLOAT: f64 = 20e-6;
     /// A sample of a step of I-Face.
     pub const SDF_SAMPLE: f64 = 0.0112;
-    /// A cell of the largest slice through the box, per stage `mesh`: the grid near the surface, and the surface.
+    /// A cell of the largest slice through the box, per stage `mesh`: the grid near the surface,
+    /// and the surface.
     pub const CELL: f64 = 6.2e-3;
-    /// A texel while its color is fitted to photographs, while it is the network's, and that of each further picture.
+    /// A texel while its color is fitted to photographs, while it is the network's, and that of
+    /// each further picture.
     pub const FITTED_TEXEL: f64 = 1.4e-4;
     pub const TEXEL: f64 = 4e-5;
     pub const PICTURE_TEXEL: f64 = 2e-5;
@@ -45,7 +49,8 @@ mod mib {
     pub const SHOWN_TEXEL: f64 = 25e-6;
     /// A pixel of a view.
     pub const VIEW_PIXEL: f64 = 1.2e-4;
-    /// The rays of a radiance field and of I-Face that are marched together, and a parameter of a loaded field.
+    /// The rays of a radiance field and of I-Face that are marched together, and a parameter of a
+    /// loaded field.
     pub const RADIANCE: f64 = 180.0;
     pub const VOLUME: f64 = 300.0;
     pub const LOADED: f64 = 8e-6;
@@ -62,7 +67,8 @@ mod kept {
     /// A pixel of a mask, and the outline of a view on the sheet.
     pub const MASK_PIXEL: f64 = 0.12;
     pub const SHEET_VIEW: f64 = 25e3;
-    /// A cell of the largest slice through the box: the extracted surface, in the run and as a file.
+    /// A cell of the largest slice through the box: the extracted surface, in the run and as a
+    /// file.
     pub const CELL: f64 = 300.0;
     /// A triangle of the head mesh in a file.
     pub const TRIANGLE: f64 = 120.0;
@@ -83,13 +89,15 @@ mod kept {
 }
 
 impl Session<'_> {
-    /// Returns the folders of the unfinished stages that `until` needs, with the estimated cost of each on the CPU.
+    /// Returns the folders of the unfinished stages that `until` needs, with the estimated cost of
+    /// each on the CPU.
     pub fn ahead(&self, until: Stage) -> Vec<(String, Cost)> {
         let order = self.order(until).into_iter().map(|stage| (stage, self.plan(stage)));
         order.filter(|(_, p)| !self.run.is_done(p)).map(|(s, p)| (p.name.into(), self.cost(s))).collect()
     }
 
-    /// Writes the estimated cost of the whole pipeline into the run, if the photographs can be counted.
+    /// Writes the estimated cost of the whole pipeline into the run, if the photographs can be
+    /// counted.
     pub(super) fn write_estimate(&self, idle: bool) -> Result<()> {
         if self.inputs.missing_capture.is_some() || self.path.is_some() {
             return Ok(());
@@ -102,8 +110,8 @@ impl Session<'_> {
 
     /// Returns the estimated cost of a stage on the CPU.
     ///
-    /// Memory is that of the whole process, disk what the stage leaves: while a field is trained, its checkpoints take up
-    /// to nine times as much ([`crate::run::Plan::needs_bytes`]).
+    /// Memory is that of the whole process, disk what the stage leaves: while a field is trained,
+    /// its checkpoints take up to nine times as much ([`crate::run::Plan::needs_bytes`]).
     pub fn cost(&self, stage: Stage) -> Cost {
         let work = Workload::new(self);
         let program = mib::PROGRAM + mib::THREAD * rayon::current_num_threads() as f64;
@@ -164,8 +172,8 @@ impl<'a> Workload<'a> {
         let c = self.config.radiance(stage);
         let rays = c.training_rays() * c.learned() as f64;
         let parameters = vm_parameters(&c);
-        // whole frames are mostly outside the hull, where no pixel is skipped; nor is the shell left by
-        // training against two backgrounds
+        // whole frames are mostly outside the hull, where no pixel is skipped; nor is the shell
+        // left by training against two backgrounds
         let outside = match stage {
             Stage::Baseline => 4.0,
             _ if has_shell(&c) => 2.3,
@@ -248,7 +256,8 @@ impl<'a> Workload<'a> {
         let shows_mesh = methods.iter().any(|method| method.stage() == Stage::Mesh);
         let texels = (mesh.texels() * mesh.pictures()) as f64;
         let shown = if shows_mesh { mib::SHOWN_MESH + mib::SHOWN_TEXEL * texels } else { 0.0 };
-        // of each field its parameters and what its rays take while they are marched; the next uses that again
+        // of each field its parameters and what its rays take while they are marched; the next uses
+        // that again
         let field = |method: &Method| match method.stage() {
             Stage::Mesh => (0.0, 0.0),
             Stage::Iface => (hash_floats(iface), mib::VOLUME),

@@ -5,8 +5,8 @@
 //!          weights.json   the weights, and their gain on the pixels they were fitted to
 //! ```
 //!
-//! The weights are fitted on tiles of the training photographs that were excluded from training, unless the settings
-//! give them.
+//! The weights are fitted on tiles of the training photographs that were excluded from training,
+//! unless the settings give them.
 
 use super::render::{Meshes, Renderer, held_out};
 use super::surface::Fields;
@@ -23,7 +23,8 @@ use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
 use tiface_surface::render::RenderedView;
 
-/// Blends one picture per camera of `render`. `fields` are evaluated only if weights are to be fitted.
+/// Blends one picture per camera of `render`. `fields` are evaluated only if weights are to be
+/// fitted.
 pub(super) fn ensemble(
     capture: &Capture,
     config: &Config,
@@ -183,7 +184,8 @@ fn trained_with_masks(capture: &Capture, config: &Config, method: Method) -> boo
     used && capture.views.iter().any(has_mask)
 }
 
-/// Returns weights for the members, and a report of the fit; equal weights if no tile shows the head.
+/// Returns weights for the members, and a report of the fit; equal weights if no tile shows the
+/// head.
 ///
 /// Only the tiles are rendered: a few percent of the pixels of the training views.
 fn fit(

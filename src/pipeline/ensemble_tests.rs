@@ -126,7 +126,8 @@ impl Fields for Two {
 
 #[test]
 fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
-    // errors of one sign cannot be blended away: the better member takes all; of two signs, they cancel
+    // errors of one sign cannot be blended away: the better member takes all; of two signs, they
+    // cancel
     for (tface, baseline, expected) in
         [(0.02, 0.1, 1.0), (0.1, 0.02, 0.0), (0.05, -0.05, 0.5), (0.02, -0.06, 0.75)]
     {
@@ -136,7 +137,8 @@ fn the_blend_is_no_worse_than_its_best_member_whichever_that_is() {
         config.metrics.surface_points = 100;
         let session = Session::open(&config, &run).unwrap();
         masked(&session);
-        // what is rendered of test views says the opposite: had they a say, the worse member would win
+        // what is rendered of test views says the opposite: had they a say, the worse member would
+        // win
         let names: Vec<String> = session.capture().split(Split::Test).map(|v| v.name.clone()).collect();
         for name in &names {
             put(&run, "tface", name, flat([1.0; 4]));

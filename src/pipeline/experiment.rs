@@ -1,5 +1,5 @@
-//! The paper's tables: the runs that they are made of and their results. A row is a preset of settings; its run is
-//! made by the pipeline like any other, and a finished run is not made again.
+//! The paper's tables: the runs that they are made of and their results. A row is a preset of
+//! settings; its run is made by the pipeline like any other, and a finished run is not made again.
 
 use super::inputs::capture_options;
 use super::session::Session;
@@ -65,7 +65,8 @@ const fn more(table: &'static str, better: &'static str, worse: &'static str, by
     Ordering { table, better, worse, by, or_equal: false }
 }
 
-/// The claims of the paper and of our own rows, for example that a blend is better than each of its members.
+/// The claims of the paper and of our own rows, for example that a blend is better than each of its
+/// members.
 pub const ORDERINGS: [Ordering; 15] = [
     more("components", "tface", "baseline", "masked"),
     more("components", "iface", "baseline", "masked"),
@@ -100,11 +101,12 @@ fn has_surface(run: &str) -> bool {
     run.starts_with("iface") || run == "paper"
 }
 
-/// Returns the settings of a run, at a share of the published effort; `set` are `KEY=VALUE` pairs applied on top of
-/// them.
+/// Returns the settings of a run, at a share of the published effort; `set` are `KEY=VALUE` pairs
+/// applied on top of them.
 ///
-/// A scale of 1 is the publication. Below, rays, voxels, samples and steps of I-Face are that share, steps of T-Face and
-/// the baseline its square (each costs more rays and samples, too), and warm-up and annealing follow the steps.
+/// A scale of 1 is the publication. Below, rays, voxels, samples and steps of I-Face are that
+/// share, steps of T-Face and the baseline its square (each costs more rays and samples, too), and
+/// warm-up and annealing follow the steps.
 ///
 /// # Errors
 ///
@@ -114,7 +116,8 @@ pub fn config(run: &str, scale: f64, set: &[String]) -> Result<Config> {
     if scale < 1.0 {
         shrink(&mut c, scale);
     }
-    // parsed from text, as the user's settings are, so that ranges are checked and explicit settings win
+    // parsed from text, as the user's settings are, so that ranges are checked and explicit
+    // settings win
     let sources = Sources {
         preset: Some(c.preset),
         files: vec![(format!("run `{run}`"), c.to_toml())],
@@ -178,7 +181,8 @@ fn full_scale(run: &str) -> Result<Config> {
     Ok(c)
 }
 
-/// Adapts the settings of a run to a capture without masks, if the run needs none; returns them unchanged otherwise.
+/// Adapts the settings of a run to a capture without masks, if the run needs none; returns them
+/// unchanged otherwise.
 pub fn without_masks(run: &str, config: &mut Config) {
     let options = capture_options(config);
     let bare = || {
@@ -223,8 +227,8 @@ fn shrink(c: &mut Config, scale: f64) {
     c.mesh.resolution = share(c.mesh.resolution.into(), scale.sqrt(), 96) as u32;
 }
 
-/// Completes the unfinished stages of a run. I-Face's rows count surfaces, so a missing surface is a result and no
-/// error.
+/// Completes the unfinished stages of a run. I-Face's rows count surfaces, so a missing surface is
+/// a result and no error.
 pub fn work(session: &Session, run: &str) -> Result<()> {
     session.remember(Stage::Metrics)?;
     reconstruct(session, Stage::Metrics)?;
@@ -245,7 +249,8 @@ fn stages(session: &Session, run: &str) -> Vec<Stage> {
     order
 }
 
-/// Returns the errors of a run's failed stages, and the first stage that is not done with the session's settings.
+/// Returns the errors of a run's failed stages, and the first stage that is not done with the
+/// session's settings.
 fn problems(session: &Session, run: &str) -> Vec<String> {
     let failed = |stage: Stage| {
         let status = read_status(&session.run.path(stage)).ok().flatten()?;
@@ -264,8 +269,8 @@ fn problems(session: &Session, run: &str) -> Vec<String> {
     out.iter().map(|text| text.replace(":\n  ", ": ").replace("\n  ", ", ")).collect()
 }
 
-/// Returns the results of a row in its run. Figures count only if the run's stages are done with the session's
-/// configuration; results of other settings in the same folder are ignored.
+/// Returns the results of a row in its run. Figures count only if the run's stages are done with
+/// the session's configuration; results of other settings in the same folder are ignored.
 pub fn measured(session: &Session, row: &ExperimentRow) -> Measured {
     let mut out = Measured::default();
     let mut problems = problems(session, row.run);
@@ -299,7 +304,8 @@ fn figures(session: &Session, row: &ExperimentRow, value: &Value) -> Measured {
         read_record(&session.run.path(stage)).ok().flatten().map_or(Value::Null, |r| r.summary)
     };
     let shown = summary(Stage::Render);
-    // a time of 0 means that an interrupted process had rendered all views, so the time they took is unknown
+    // a time of 0 means that an interrupted process had rendered all views, so the time they took
+    // is unknown
     let seconds = |method: &str| shown["seconds_per_view"][method].as_f64().filter(|s| *s > 0.0);
     out.seconds = match row.pictures {
         "ensemble" => {
@@ -315,7 +321,8 @@ fn figures(session: &Session, row: &ExperimentRow, value: &Value) -> Measured {
     out
 }
 
-/// Returns the estimated cost of the unfinished stages of a run, one after the other; `None` if all are done.
+/// Returns the estimated cost of the unfinished stages of a run, one after the other; `None` if all
+/// are done.
 pub fn ahead(session: &Session, run: &str) -> Result<Option<Cost>> {
     let is_left = |stage: &Stage| !session.run.is_done(&session.plan(*stage));
     let left: Vec<Stage> = stages(session, run).into_iter().filter(is_left).collect();
@@ -433,7 +440,8 @@ mod tests {
         assert!(config("iface-nerf", 1.0, &["device=gpu".into()]).is_err());
     }
 
-    /// Stages that are marked as done without any work, in a folder that is then queried with other settings.
+    /// Stages that are marked as done without any work, in a folder that is then queried with other
+    /// settings.
     #[test]
     fn figures_count_only_where_the_stages_are_done_as_asked_for() {
         let dir = tempfile::tempdir().unwrap();

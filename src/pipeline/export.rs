@@ -1,8 +1,9 @@
 //! The head of a finished run, written again: in another format, material, frame or size.
 //!
-//! Only what the run keeps is read, `mesh/parts` and the cameras; nothing of the run is written. With the run's own
-//! settings the files are those of the stage `mesh`, byte by byte. A mesh of fewer triangles gets an atlas of its own, and
-//! everything that it shows from the nearest points of the kept one ([`Original`]).
+//! Only what the run keeps is read, `mesh/parts` and the cameras; nothing of the run is written.
+//! With the run's own settings the files are those of the stage `mesh`, byte by byte. A mesh of
+//! fewer triangles gets an atlas of its own, and everything that it shows from the nearest points
+//! of the kept one ([`Original`]).
 
 use super::cameras::CameraCheck;
 use super::finish::{Export, center, lobes};
@@ -18,7 +19,8 @@ use tiface_surface::bake::{Original, tangent_space};
 use tiface_surface::files::{ExportedFiles, HeadMesh, HeadTexture, tangents};
 use tiface_surface::{SimplifyConfig, atlas, simplify};
 
-/// Keys that affect how the files of a mesh are written, each with what it is and the formats that show it.
+/// Keys that affect how the files of a mesh are written, each with what it is and the formats that
+/// show it.
 const FILE_KEYS: [(&str, &str, &[MeshFormat]); 6] = [
     (key!(mesh.format), "format", &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply]),
     (key!(mesh.material), "material", &[MeshFormat::Glb]),
@@ -54,7 +56,8 @@ impl KeptHead {
     ///
     /// # Errors
     ///
-    /// Fails if the run has no finished mesh, or if a file is missing, damaged, or not the one that the stage left.
+    /// Fails if the run has no finished mesh, or if a file is missing, damaged, or not the one that
+    /// the stage left.
     pub fn read(run: &Path, made: &Config) -> Result<KeptHead> {
         let (head, warnings) = read_finished(run, |record| {
             let folder = run.join(Stage::Mesh);
@@ -80,8 +83,8 @@ impl KeptHead {
     ///
     /// # Errors
     ///
-    /// Fails if a setting asks for more than the run keeps, or for something that none of the formats shows; the error
-    /// names it.
+    /// Fails if a setting asks for more than the run keeps, or for something that none of the
+    /// formats shows; the error names it.
     pub fn changed(
         mut self,
         asked: &Config,
@@ -121,8 +124,8 @@ impl KeptHead {
         self.export.files(&self.head, format, stem)
     }
 
-    /// Fails unless the files of a format are those that the stage `mesh` left in the run, by their recorded digests; older
-    /// records have sizes alone.
+    /// Fails unless the files of a format are those that the stage `mesh` left in the run, by their
+    /// recorded digests; older records have sizes alone.
     pub fn require_recorded(&self, format: MeshFormat) -> Result<()> {
         let record = finished_mesh(&self.run)?;
         let written = self.files(format, "head")?.files;
@@ -278,7 +281,8 @@ impl KeptHead {
     }
 }
 
-/// Returns a warning for each of the formats that does not show a changed setting. Fails if none shows it.
+/// Returns a warning for each of the formats that does not show a changed setting. Fails if none
+/// shows it.
 fn not_shown(
     key: &str,
     what: &str,

@@ -1,8 +1,9 @@
-//! How exposure and white balance of a capture's photographs differ, in words, and what a run divides out of them.
+//! How exposure and white balance of a capture's photographs differ, in words, and what a run
+//! divides out of them.
 //!
-//! The measurement is [`crate::rig::exposure`]'s. The stage `mask` makes it and writes `exposure.json`; later stages read
-//! training photographs with their exposure divided out. Held-out views are rendered with the mean exposure, and their own is
-//! used by the metrics alone.
+//! The measurement is [`crate::rig::exposure`]'s. The stage `mask` makes it and writes
+//! `exposure.json`; later stages read training photographs with their exposure divided out.
+//! Held-out views are rendered with the mean exposure, and their own is used by the metrics alone.
 
 use super::rig_photos::RigPhotos;
 use crate::capture::{Capture, Split, View};
@@ -46,7 +47,8 @@ fn incomparable(why: Incomparable, train: &[&View]) -> String {
 /// The measurement of a capture's exposures.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct ExposureCheck {
-    /// Whether differences in brightness, and in color, are divided out of the training photographs.
+    /// Whether differences in brightness, and in color, are divided out of the training
+    /// photographs.
     evens_brightness: bool,
     evens_color: bool,
     /// Root mean square of the logarithms of the training views' brightness, and of their colors.
@@ -65,7 +67,8 @@ struct MeasuredView {
     /// Its exposure relative to the mean of the training views; missing where it shows too little.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     measured: Option<Exposure>,
-    /// Exposure that is divided out of a training photograph, or out of a held-out one for figures at its own exposure.
+    /// Exposure that is divided out of a training photograph, or out of a held-out one for figures
+    /// at its own exposure.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     used: Option<Exposure>,
 }
@@ -180,7 +183,8 @@ impl ExposureCheck {
         Ok(io::write_atomic(&folder.join(EXPOSURE), format!("{text}\n").as_bytes())?)
     }
 
-    /// Reads the file of [`ExposureCheck::write`], if there is one; exposures that it cannot have written are refused.
+    /// Reads the file of [`ExposureCheck::write`], if there is one; exposures that it cannot have
+    /// written are refused.
     pub(super) fn read(folder: &Path) -> Result<Option<ExposureCheck>, ReadError> {
         let path = folder.join(EXPOSURE);
         if !io::is_file(&path) {

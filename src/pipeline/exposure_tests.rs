@@ -20,15 +20,16 @@ fn tried(capture: &Capture) -> Result<ExposureCheck, String> {
     ExposureCheck::measure(&photos)
 }
 
-/// Multiplies the light of photographs. A photograph that is read with the inverse exposure is brighter by it.
+/// Multiplies the light of photographs. A photograph that is read with the inverse exposure is
+/// brighter by it.
 pub(super) fn expose(capture: &mut Capture, gains: &[[f32; 3]]) {
     for (view, gain) in capture.views.iter_mut().zip(gains) {
         view.exposure = Some(Exposure { gain: gain.map(|g| 1.0 / g) });
     }
 }
 
-/// Returns gains of a geometric mean of 1 over the training views, which do not follow the viewing direction: neighbors
-/// differ.
+/// Returns gains of a geometric mean of 1 over the training views, which do not follow the viewing
+/// direction: neighbors differ.
 pub(super) fn gains() -> Vec<[f32; 3]> {
     let log = |v: usize, k: usize| {
         let sign = if v.is_multiple_of(2) { 1.0 } else { -1.0 };
@@ -56,13 +57,15 @@ fn known_gains_are_found() {
 
     let found = found_gains();
     assert!(found.evens_out() && found.sentence().contains("white balance differs"), "{}", found.sentence());
-    // the held-out view, the last one, is compared with the training views but does not shape what they share
+    // the held-out view, the last one, is compared with the training views but does not shape what
+    // they share
     let error = |(view, gain): (&View, [f32; 3])| {
         let used = found.used(&view.name).unwrap().gain;
         used.iter().zip(gain).map(|(used, gain)| (used / gain - 1.0).abs()).fold(0.0, f32::max)
     };
     let errors: Vec<f32> = clean.views.iter().zip(gains()).map(error).collect();
-    // what is linear in the viewing direction cannot be told from shading: gains of 10 to 20 % have a little of it
+    // what is linear in the viewing direction cannot be told from shading: gains of 10 to 20 % have
+    // a little of it
     assert!(errors.iter().all(|&e| e < 0.03), "{errors:?}");
 }
 
@@ -83,8 +86,8 @@ fn one_dark_photograph_is_left_out_and_named_and_the_others_are_compared() {
         let used = found.used(&exposed.views[v].name).unwrap().gain;
         used.iter().zip(gains[v]).map(|(used, gain)| (used / gain - 1.0).abs()).fold(0.0, f32::max)
     };
-    // The mean of the others is 1 % off that of all. Around the gap two neighbors have gains of one sign, of which shading,
-    // which is linear in the viewing direction, takes a part.
+    // The mean of the others is 1 % off that of all. Around the gap two neighbors have gains of one
+    // sign, of which shading, which is linear in the viewing direction, takes a part.
     let errors: Vec<(usize, f32)> = (0..15).filter(|&v| v != 5).map(|v| (v, error(v))).collect();
     assert!(errors.iter().all(|&(v, e)| e < if v == 4 || v == 6 { 0.08 } else { 0.04 }), "{errors:?}");
     let dir = tempfile::tempdir().unwrap();
@@ -169,7 +172,8 @@ fn later_stages_read_photographs_with_the_mean_exposure_unless_given_ones_are_as
         pairs.map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>()
     };
     let left: Vec<f64> = (0..14).map(|v| off(&even, v) / off(&given, v)).collect();
-    // photographs are rounded to 8 bits twice, and the brightest pixels of the brighter ones are clipped
+    // photographs are rounded to 8 bits twice, and the brightest pixels of the brighter ones are
+    // clipped
     assert!(left.iter().all(|&share| share < 0.4), "{left:?}");
     // held-out photographs are never changed
     assert!(even[14] == given[14]);

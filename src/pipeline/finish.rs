@@ -1,6 +1,7 @@
 //! From the extracted surface to the head mesh: simplification, atlas and texture baking.
 //!
-//! The files of a head mesh are in the dataset's coordinates or turned so that the face looks at the viewer ([`Export`]).
+//! The files of a head mesh are in the dataset's coordinates or turned so that the face looks at
+//! the viewer ([`Export`]).
 
 use crate::capture::Capture;
 use crate::capture::scene::Scene;
@@ -18,7 +19,8 @@ use tiface_surface::{
     Appearance, AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
 };
 
-/// How far the true surface may lie from a triangle, in cells: the chords of large triangles and half a cell.
+/// How far the true surface may lie from a triangle, in cells: the chords of large triangles and
+/// half a cell.
 pub(super) const REACH: f32 = 2.5;
 
 /// The head mesh, the files kept beside it, and reports.
@@ -36,7 +38,8 @@ pub(super) struct FinishedHead {
 /// Number of cameras that the network's colors are sampled from, where photographs give the rest.
 const FALLBACK_VIEWS: usize = 3;
 
-/// A surface to be finished, and what its colors and its files come from. All is in scene coordinates.
+/// A surface to be finished, and what its colors and its files come from. All is in scene
+/// coordinates.
 pub(super) struct Finish<'a> {
     pub surface: &'a Mesh,
     /// Size of the cells that the surface was extracted with.
@@ -205,8 +208,8 @@ impl Finish<'_> {
         Ok((baked, fitted.harmonics))
     }
 
-    /// Returns the pictures of a texture, coded as in files. Harmonics that were fitted replace baked
-    /// lobes.
+    /// Returns the pictures of a texture, coded as in files. Harmonics that were fitted replace
+    /// baked lobes.
     fn texture(
         &self,
         mesh: &Mesh,
@@ -239,8 +242,8 @@ impl Finish<'_> {
     }
 }
 
-/// Returns the lobes as pictures. Each is scaled by the value that all but a thousandth of its texels stay below, so
-/// that a few outliers do not cost the others their precision.
+/// Returns the lobes as pictures. Each is scaled by the value that all but a thousandth of its
+/// texels stay below, so that a few outliers do not cost the others their precision.
 pub(super) fn lobes(images: &[Image], asset_from_world: Mat3) -> Option<Lobes> {
     if images.is_empty() {
         return None;
@@ -323,8 +326,8 @@ impl Export {
                 Ok(ExportedFiles { files: vec![(format!("{stem}.glb"), bytes)], warnings: Vec::new() })
             }
             MeshFormat::Obj => to_obj(mesh, texture.as_ref(), &options),
-            // always in the dataset's world, with colors at the vertices: one index per vertex, so that the surface
-            // stays closed for every reader
+            // always in the dataset's world, with colors at the vertices: one index per vertex, so
+            // that the surface stays closed for every reader
             MeshFormat::Ply => {
                 to_ply(mesh, None, &ExportOptions { world_from_mesh: *world_from_scene, ..options })
             }
@@ -356,7 +359,8 @@ impl Export {
         f64::from(high - low) * world_from_scene.scale
     }
 
-    /// Returns what a mesh shows: it has shoulders where its lowest quarter is wider than its upper half.
+    /// Returns what a mesh shows: it has shoulders where its lowest quarter is wider than its upper
+    /// half.
     pub(super) fn shows(&self, mesh: &Mesh, world_from_scene: &Similarity) -> &'static str {
         let up = world_from_scene.inverse().direction(self.up.normalize_or(Vec3::Y));
         let (low, high) = extent(mesh.positions.iter().map(|p| p.dot(up)));
@@ -388,7 +392,8 @@ impl Export {
         front(self.up, &self.cameras, center)
     }
 
-    /// Returns the options for the atlas of a head at `center`, in scene coordinates: the face is one upright chart.
+    /// Returns the options for the atlas of a head at `center`, in scene coordinates: the face is
+    /// one upright chart.
     pub(super) fn atlas_config(
         &self,
         center: DVec3,
@@ -438,8 +443,9 @@ impl Frames {
     }
 }
 
-/// Returns the direction in which the face of a head at `center` looks, as a unit vector of the world perpendicular
-/// to `up`: the direction in which most `cameras` stand. `None` if they stand all around.
+/// Returns the direction in which the face of a head at `center` looks, as a unit vector of the
+/// world perpendicular to `up`: the direction in which most `cameras` stand. `None` if they stand
+/// all around.
 pub(super) fn front(up: Vec3, cameras: &[DVec3], center: DVec3) -> Option<Vec3> {
     let up = up.as_dvec3().normalize_or(DVec3::Y);
     let across = |c: &DVec3| (c - center).reject_from_normalized(up).normalize_or_zero();
@@ -584,7 +590,8 @@ mod tests {
         (corners, DVec3::new(k(0), k(1), k(2)))
     }
 
-    /// A head of a quarter of a meter, six thousand kilometers from the origin: where f32 has steps of half a meter.
+    /// A head of a quarter of a meter, six thousand kilometers from the origin: where f32 has steps
+    /// of half a meter.
     #[test]
     fn a_head_at_the_end_of_the_world_keeps_its_shape_in_every_file() {
         let mesh = ball();
@@ -615,7 +622,8 @@ mod tests {
             let glb = export.files(head, MeshFormat::Glb, "head").unwrap();
             assert_eq!(glb.warnings, Vec::<String>::new());
             let (corners, translation) = corners_of(&glb.files[0].1);
-            // a document that is put together by hand for its node keeps what readers of lobes must know
+            // a document that is put together by hand for its node keeps what readers of lobes must
+            // know
             let notes =
                 String::from_utf8_lossy(&glb.files[0].1).contains("\"extras\":{\"tiface\":{\"lobes\":[{");
             assert_eq!(notes, head.texture.is_some());

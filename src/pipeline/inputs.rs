@@ -1,6 +1,8 @@
-//! What the fingerprints of the stages depend on besides the settings: digests of every file that a run reads.
+//! What the fingerprints of the stages depend on besides the settings: digests of every file that a
+//! run reads.
 //!
-//! A finished run no longer needs these files: the digests of those that have been moved are restored from its records.
+//! A finished run no longer needs these files: the digests of those that have been moved are
+//! restored from its records.
 
 use super::clicks::MaskPrompts;
 use super::readings::{Settled, decide_reading};
@@ -20,15 +22,15 @@ use tiface_base::{Error, Result};
 pub(super) struct Inputs {
     /// Digest of everything read from the capture.
     pub digest: String,
-    /// Digest of each file and camera of the capture, keyed by the name shown to users; empty if the capture was
-    /// restored from the run.
+    /// Digest of each file and camera of the capture, keyed by the name shown to users; empty if
+    /// the capture was restored from the run.
     files: BTreeMap<String, String>,
     /// Why the capture cannot be opened, if it was restored from the run.
     pub missing_capture: Option<String>,
     /// The clicks and networks that masks are made from, if masks are not read from the capture.
     pub clicks: Option<MaskPrompts>,
-    /// The capture's own masks, if the run makes others. The metrics use these, because a run must not influence the
-    /// masks that it is evaluated with.
+    /// The capture's own masks, if the run makes others. The metrics use these, because a run must
+    /// not influence the masks that it is evaluated with.
     pub own_masks: Option<OwnMasks>,
     /// Checkpoints that stages import instead of training.
     pub imports: Vec<Import>,
@@ -104,14 +106,15 @@ impl Inputs {
         }
     }
 
-    /// Writes the digests of the capture's files that the stage `mask` reads, so that a later change can be named.
+    /// Writes the digests of the capture's files that the stage `mask` reads, so that a later
+    /// change can be named.
     pub fn write(&self, folder: &Path) -> Result<()> {
         let text = serde_json::to_string_pretty(&self.files).unwrap_or_default();
         Ok(io::write_atomic(&folder.join(INPUTS), format!("{text}\n").as_bytes())?)
     }
 
-    /// Returns the first file or camera of the capture that has changed since the stage `mask` ran, and how many
-    /// others have; `None` if the run has no record of them.
+    /// Returns the first file or camera of the capture that has changed since the stage `mask` ran,
+    /// and how many others have; `None` if the run has no record of them.
     pub fn changed(&self, run: &Run) -> Option<String> {
         let path = run.path(Stage::Mask).join(INPUTS);
         let old: BTreeMap<String, String> = io::read_typed(&path, &Limits::default()).ok()?;
@@ -150,7 +153,8 @@ fn own_masks(capture: &Capture, options: &CaptureOptions) -> Result<OwnMasks> {
     Ok(OwnMasks { masks, turns, digest: Fingerprint::of_bytes(digests.join(" ").as_bytes()) })
 }
 
-/// Returns the digest of the whole capture (cameras, splits and the bytes of every picture), and that of each part.
+/// Returns the digest of the whole capture (cameras, splits and the bytes of every picture), and
+/// that of each part.
 fn capture_digest(capture: &Capture) -> Result<(String, BTreeMap<String, String>)> {
     let views = capture
         .views
@@ -207,8 +211,8 @@ fn file_digest(path: &Path) -> Result<String, io::ReadError> {
     Ok(Fingerprint::of_bytes(&io::read_bytes(path, &Limits::default())?))
 }
 
-/// Returns the checkpoints that the configuration names. A stage that has imported one no longer needs the file: if
-/// it has been moved, the digest is taken from the stage's record.
+/// Returns the checkpoints that the configuration names. A stage that has imported one no longer
+/// needs the file: if it has been moved, the digest is taken from the stage's record.
 fn imports(config: &Config, run: &Run) -> Result<Vec<Import>> {
     let named = [(Stage::Baseline, &config.baseline.import), (Stage::Tface, &config.tface.import)];
     let open = |(stage, file): (Stage, &String)| match file_digest(Path::new(file)) {
@@ -224,7 +228,8 @@ fn imports(config: &Config, run: &Run) -> Result<Vec<Import>> {
     named.into_iter().filter(|(_, file)| !file.is_empty()).map(open).collect()
 }
 
-/// Returns the digest of the network for LPIPS, if one is named; finished metrics no longer need the file.
+/// Returns the digest of the network for LPIPS, if one is named; finished metrics no longer need
+/// the file.
 fn lpips(config: &Config, run: &Run) -> Result<Option<String>> {
     let file = &config.metrics.lpips;
     if file.is_empty() {
@@ -253,13 +258,13 @@ fn is_missing(e: &io::ReadError) -> bool {
     matches!(e, io::ReadError::Io { source, .. } if source.kind() == NotFound)
 }
 
-/// Restores what a run recorded of a capture that has been moved: its cameras, its digest, the clicks' digests, and
-/// why it cannot be opened. A finished run no longer needs its photographs.
+/// Restores what a run recorded of a capture that has been moved: its cameras, its digest, the
+/// clicks' digests, and why it cannot be opened. A finished run no longer needs its photographs.
 ///
 /// # Errors
 ///
-/// `error` itself if the capture exists (the error then says what is wrong with it) or if the run does not exist yet;
-/// otherwise that the run has not recorded its capture yet.
+/// `error` itself if the capture exists (the error then says what is wrong with it) or if the run
+/// does not exist yet; otherwise that the run has not recorded its capture yet.
 fn restore_from_run(config: &Config, run: &Run, error: Error) -> Result<(Capture, Inputs)> {
     let root = &config.capture.path;
     if capture::has_cameras(root) || !io::is_file(&run.path("config.toml")) {

@@ -1,7 +1,8 @@
-//! The trained fields: the stages `baseline`, `tface` and `iface`, and the loading of their results.
+//! The trained fields: the stages `baseline`, `tface` and `iface`, and the loading of their
+//! results.
 //!
-//! The tiles of the training photographs that are excluded from training are chosen here too: the ensemble's weights
-//! are fitted on them.
+//! The tiles of the training photographs that are excluded from training are chosen here too: the
+//! ensemble's weights are fitted on them.
 
 use super::session::Session;
 use super::surface::{Fields, Radiance, Surface, march};
@@ -47,8 +48,8 @@ pub(super) fn learn(
     Ok(report)
 }
 
-/// Returns the random seed of a stage. The published radiance fields use another seed than I-Face's 42; a seed in the
-/// settings changes both.
+/// Returns the random seed of a stage. The published radiance fields use another seed than I-Face's
+/// 42; a seed in the settings changes both.
 pub(super) fn seed(stage: Stage, config: &Config) -> u64 {
     match config.preset {
         Preset::Paper if stage != Stage::Iface => config.seed ^ 42 ^ 20_211_202,
@@ -80,7 +81,8 @@ pub(super) fn train(
         tface::import(Path::new(&c.import), c.import_scale, &scene.scene_from_world, session)?;
         return Ok((json!({"imported": c.import}), Vec::new()));
     }
-    // without masks the training must use neither the head's outline nor the hull carved from it; only the box stays
+    // without masks the training must use neither the head's outline nor the hull carved from it;
+    // only the box stays
     let masked = c.masks != MaskUse::None;
     let views = train_views(capture, scene, config, masked)?;
     let report = tface::train(views, scene.aabb, hull.filter(|_| masked), &c, session)?;
@@ -154,8 +156,8 @@ impl Fields for TrainedFields<'_> {
 /// A function that renders a field as a camera in the scene sees it.
 pub(super) type FieldLook = Box<dyn Fn(&Camera) -> RenderedView>;
 
-/// Returns a renderer for the newest checkpoint of a stage's field in a run, finished or not. If several fields are
-/// trained one after the other, the first one is used.
+/// Returns a renderer for the newest checkpoint of a stage's field in a run, finished or not. If
+/// several fields are trained one after the other, the first one is used.
 pub(super) fn load_field(run: &Path, config: &Config, scene: &Scene, stage: Stage) -> Result<FieldLook> {
     let (folder, world_from_scene) = (run.join(stage.as_str()), scene.scene_from_world.inverse());
     if stage == Stage::Iface && config.iface.field == FieldKind::Density {
@@ -192,7 +194,8 @@ pub(super) fn held_out_tiles<'c>(capture: &'c Capture, config: &Config) -> Vec<(
     capture.split(Split::Train).enumerate().map(tiles).collect()
 }
 
-/// Returns the training photographs, with their cameras in the scene. Pixels of `capture.tiles` count as not valid.
+/// Returns the training photographs, with their cameras in the scene. Pixels of `capture.tiles`
+/// count as not valid.
 pub(super) fn training_views(
     capture: &Capture,
     scene: &Scene,
@@ -202,7 +205,8 @@ pub(super) fn training_views(
     views.par_iter().map(|(view, tiles)| training_view(view, tiles, scene)).collect()
 }
 
-/// Returns a training photograph, with its camera in the scene. Pixels of the tiles count as not valid.
+/// Returns a training photograph, with its camera in the scene. Pixels of the tiles count as not
+/// valid.
 pub(super) fn training_view(view: &View, tiles: &[Tile], scene: &Scene) -> Result<(Camera, LoadedView)> {
     let mut loaded = view.load(&Limits::default())?;
     let (width, height) = (loaded.photo.width, loaded.photo.height);

@@ -26,17 +26,20 @@ use tiface_base::{Error, Result};
 /// File name of the contact sheet, in the stage's folder.
 pub(super) const SHEET: &str = "sheet.html";
 
-/// File name of the clicks, in the stage's folder: the run keeps a copy because it may outlive the original file.
+/// File name of the clicks, in the stage's folder: the run keeps a copy because it may outlive the
+/// original file.
 pub(super) const CLICKS: &str = "prompts.json";
 
-/// File name of how the mask files of the capture are read, in the stage's folder; none where white is the head.
+/// File name of how the mask files of the capture are read, in the stage's folder; none where white
+/// is the head.
 const READING: &str = "reading.json";
 
 /// Longest side of the masks that the head is located with; a hull is coarser still.
 const SCENE_MASK_PX: u32 = 1024;
 
-/// Share of a mask that must contradict the other masks before it counts as wrong. Outlines that are off by six of
-/// 512 pixels contradict nothing; half a mask, the mask of another view or an empty one reach 0.1 to 1.
+/// Share of a mask that must contradict the other masks before it counts as wrong. Outlines that
+/// are off by six of 512 pixels contradict nothing; half a mask, the mask of another view or an
+/// empty one reach 0.1 to 1.
 const MIN_CONFLICT_SHARE: f64 = 0.1;
 
 /// Maximum number of masks compared with each other.
@@ -57,8 +60,8 @@ struct CaptureMasks {
     reading: MaskReading,
 }
 
-/// Reads the masks beside the photographs, or makes them from clicks. Writes the masks as pictures, a contact sheet,
-/// and the box and hull derived from them (`scene.json`).
+/// Reads the masks beside the photographs, or makes them from clicks. Writes the masks as pictures,
+/// a contact sheet, and the box and hull derived from them (`scene.json`).
 pub(super) fn mask(
     capture: &Capture,
     prompts: Option<&MaskPrompts>,
@@ -281,7 +284,8 @@ fn write_reading(folder: &Path, reading: &MaskReading) -> Result<()> {
     Ok(io::write_atomic(&file, format!("{text}\n").as_bytes())?)
 }
 
-/// Lets a capture read its mask files as the stage `mask` found that they are to be read; `folder` is the stage's.
+/// Lets a capture read its mask files as the stage `mask` found that they are to be read; `folder`
+/// is the stage's.
 pub(super) fn apply_reading(folder: &Path, capture: &mut Cow<Capture>) -> Result<(), ReadError> {
     let file = folder.join(READING);
     if io::is_file(&file) {
@@ -291,8 +295,8 @@ pub(super) fn apply_reading(folder: &Path, capture: &mut Cow<Capture>) -> Result
     Ok(())
 }
 
-/// Reads the masks beside the photographs. Their values are known only when all have been read: if these ask for another
-/// reading than that of white masks, they are read once more.
+/// Reads the masks beside the photographs. Their values are known only when all have been read: if
+/// these ask for another reading than that of white masks, they are read once more.
 fn masks_of_capture(capture: &Capture, config: &MaskConfig, dir: &StageDir) -> Result<CaptureMasks> {
     let (mut out, survey) = read_masks(capture, dir)?;
     out.reading = survey.reading(&config.head, &capture.root)?;
@@ -392,11 +396,12 @@ fn locate_head(
     Ok(scene)
 }
 
-/// A view whose mask contradicts the others: its index, the largest contradicting share, and a message.
+/// A view whose mask contradicts the others: its index, the largest contradicting share, and a
+/// message.
 type MaskConflict = (usize, f64, String);
 
-/// Returns the views whose masks contradict the others (none if the cameras cannot decide), and how many masks were
-/// compared.
+/// Returns the views whose masks contradict the others (none if the cameras cannot decide), and how
+/// many masks were compared.
 fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> (Vec<MaskConflict>, usize) {
     // if there are very many views, evenly spread ones: the check keeps bits of every cell for each
     let every = capture.views.len().div_ceil(MAX_COMPARED);
@@ -413,8 +418,8 @@ fn conflicts(capture: &Capture, masks: &[Option<Gray>]) -> (Vec<MaskConflict>, u
     (conflicts.filter(|(_, share, _)| *share >= 0.005).collect(), found.masks)
 }
 
-/// Returns the conflicts as messages: errors for wrong masks and warnings for doubtful ones. When most masks
-/// conflict, the cause is not a single mask, and one message says so.
+/// Returns the conflicts as messages: errors for wrong masks and warnings for doubtful ones. When
+/// most masks conflict, the cause is not a single mask, and one message says so.
 fn classify_conflicts(conflicts: &[MaskConflict], compared: usize) -> (Vec<Error>, Vec<String>) {
     let mut found: Vec<(bool, String)> =
         conflicts.iter().map(|(_, share, text)| (*share >= MIN_CONFLICT_SHARE, text.clone())).collect();

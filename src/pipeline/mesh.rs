@@ -1,5 +1,5 @@
-//! Stage `mesh`: the zero level set of the trained distance field, closed, in the dataset's world; and the head mesh
-//! made from it.
+//! Stage `mesh`: the zero level set of the trained distance field, closed, in the dataset's world;
+//! and the head mesh made from it.
 //!
 //! ```text
 //! mesh/surface.ply   the whole extraction with colors at its vertices, in the dataset's world
@@ -26,8 +26,8 @@ use tiface_surface::bake::seen_colors;
 use tiface_surface::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use tiface_surface::{self, Cap, HandleReport, MAX_HANDLE, MeshReport, Patches, Photograph};
 
-/// Runs the stage `mesh`: writes the whole surface as `surface.ply` in the dataset's world, and the head mesh in the
-/// configured formats.
+/// Runs the stage `mesh`: writes the whole surface as `surface.ply` in the dataset's world, and the
+/// head mesh in the configured formats.
 pub(super) fn mesh(
     capture: &Capture,
     scene: &Scene,
@@ -49,8 +49,8 @@ pub(super) fn mesh(
         ..ExportOptions::default()
     };
     write_files(&to_ply(&extracted.mesh, None, &in_world)?, dir.folder())?;
-    // vertices have the color seen along the normal; textures and rays, and so their cap, have the color that cameras
-    // see
+    // vertices have the color seen along the normal; textures and rays, and so their cap, have the
+    // color that cameras see
     let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
     let views = match c.color {
         ColorSource::Network if c.hair == Hair::None => Vec::new(),
@@ -155,8 +155,8 @@ impl Extraction {
         ClosedSurface { field, hull: None, cap: self.cap.as_ref(), patches: self.patches.as_ref() }
     }
 
-    /// Tells how the surface ends and what is doubtful of it; `mm` is the number of millimeters in a
-    /// scene unit.
+    /// Tells how the surface ends and what is doubtful of it; `mm` is the number of millimeters in
+    /// a scene unit.
     fn announce(&self, capped: bool, mm: f64, dir: &StageDir) {
         self.report.end(capped).iter().for_each(|text| dir.note(text));
         self.report.warnings().iter().for_each(|w| dir.warn(w));
@@ -183,7 +183,8 @@ impl Extraction {
     }
 }
 
-/// Extracts the whole surface with colors at its vertices, closed where the training cameras' frames end.
+/// Extracts the whole surface with colors at its vertices, closed where the training cameras'
+/// frames end.
 pub(super) fn extract(
     scene: &Scene,
     field: &dyn Surface,
@@ -201,7 +202,8 @@ pub(super) fn extract(
             ..tiface_surface::ExtractOptions::default()
         };
         let field = ClosedSurface { field, hull: scene.hull.as_ref(), cap: None, patches: None };
-        // below the frames' border the surface is a guess: close the mesh where enough cameras see it
+        // below the frames' border the surface is a guess: close the mesh where enough cameras see
+        // it
         let kept = capture::well_seen(scene, cameras, up, c.seen_by);
         tiface_surface::extract(&field, kept, &options, monitor)?
     };
@@ -248,8 +250,8 @@ pub(super) fn finished_mesh(run: &Path) -> Result<Record> {
 ///
 /// # Errors
 ///
-/// Returns the same as [`finished_mesh`] and `read`. Files may be missing, or of two makings, if another process
-/// began the stage again meanwhile; the error then says so instead.
+/// Returns the same as [`finished_mesh`] and `read`. Files may be missing, or of two makings, if
+/// another process began the stage again meanwhile; the error then says so instead.
 pub(super) fn read_finished<T>(run: &Path, read: impl FnOnce(&Record) -> Result<T>) -> Result<T> {
     let record = finished_mesh(run)?;
     let found = read(&record);
@@ -271,7 +273,8 @@ pub(super) fn head_mesh(run: &Run) -> Result<HeadMesh> {
     HeadMesh::load(&run.path("mesh/parts"))
 }
 
-/// Returns the extracted surface that the stage wrote, in scene coordinates, as it was before export.
+/// Returns the extracted surface that the stage wrote, in scene coordinates, as it was before
+/// export.
 pub(super) fn extracted_surface(run: &Run) -> Result<ExtractedSurface> {
     ExtractedSurface::load(&run.path("mesh/parts"))
 }

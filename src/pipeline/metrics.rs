@@ -37,7 +37,8 @@ pub(super) struct Comparable<'a> {
     pub file: PathBuf,
     /// The float version of the picture.
     pub float: Option<PathBuf>,
-    /// The picture from the pose fitted to the view alone, if there are such pictures; the same one where it has none.
+    /// The picture from the pose fitted to the view alone, if there are such pictures; the same one
+    /// where it has none.
     pub own_pose: Option<PathBuf>,
 }
 
@@ -46,7 +47,8 @@ struct ViewFigures {
     head: ViewMetrics,
     /// The same where the photograph's own exposure is divided out.
     own_exposure: Option<ViewMetrics>,
-    /// The same from the pose fitted to the view alone, and where the photograph's own exposure is divided out.
+    /// The same from the pose fitted to the view alone, and where the photograph's own exposure is
+    /// divided out.
     own_pose: Option<ViewMetrics>,
     region: Option<ViewMetrics>,
     parts: PartMetrics,
@@ -79,12 +81,14 @@ pub(super) fn comparable<'c>(capture: &'c Capture, config: &Config, set: &Pictur
     capture.views.iter().map(picture).filter(|c| io::is_file(&c.file)).collect()
 }
 
-/// Writes `metrics.json`. Every rendered or blended view is compared with its photograph, inside the mask and inside
-/// the capture's region of interest, and part by part (opaque pixels, outline, skin, hair, coverage); opacity outside
-/// the head is measured. `capture` has the masks that the metrics use, from the source `masks`; `surface` is the demo's
-/// mesh, which is compared with the true surface. Where `exposure` was evened out, views have the mean exposure and
-/// photographs their own, so a second set of figures, `own_exposure`, divides that out of the photographs. Where poses were
-/// refined, `own_pose` compares pictures from the poses that were fitted to each view alone, at its own exposure.
+/// Writes `metrics.json`. Every rendered or blended view is compared with its photograph, inside
+/// the mask and inside the capture's region of interest, and part by part (opaque pixels, outline,
+/// skin, hair, coverage); opacity outside the head is measured. `capture` has the masks that the
+/// metrics use, from the source `masks`; `surface` is the demo's mesh, which is compared with the
+/// true surface. Where `exposure` was evened out, views have the mean exposure and photographs
+/// their own, so a second set of figures, `own_exposure`, divides that out of the photographs.
+/// Where poses were refined, `own_pose` compares pictures from the poses that were fitted to each
+/// view alone, at its own exposure.
 pub(super) fn metrics(
     capture: &Capture,
     config: &Config,
@@ -140,7 +144,8 @@ pub(super) struct Judge<'a> {
 }
 
 impl<'a> Judge<'a> {
-    /// Returns the judge of these pictures, with the networks that `config` names; the photographs tell skin from hair.
+    /// Returns the judge of these pictures, with the networks that `config` names; the photographs
+    /// tell skin from hair.
     pub fn new<'c>(
         config: &'a Config,
         pictures: impl Iterator<Item = &'c Comparable<'c>>,
@@ -233,8 +238,8 @@ fn entry(figures: Vec<ViewFigures>) -> Value {
     Value::Object(entry)
 }
 
-/// Returns the sum of opacity² over the valid pixels where the mask shows no head, and the number of these pixels;
-/// `None` without a mask. This measures floaters in front of the background.
+/// Returns the sum of opacity² over the valid pixels where the mask shows no head, and the number
+/// of these pixels; `None` without a mask. This measures floaters in front of the background.
 fn square_opacity_outside(opacity: &[f32], loaded: &LoadedView) -> Option<(f64, u64)> {
     let mask = loaded.mask.as_ref()?;
     let valid = |i: usize| loaded.valid.as_ref().is_none_or(|v| v.values[i] > 0);

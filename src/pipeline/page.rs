@@ -1,8 +1,8 @@
-//! `report.html`, from the contents of a run: a 3D viewer of the head, views beside their photographs, metrics,
-//! times, settings.
+//! `report.html`, from the contents of a run: a 3D viewer of the head, views beside their
+//! photographs, metrics, times, settings.
 //!
-//! The page stays below eight megabytes, so that it opens at once and can be sent: pictures are small copies that
-//! link to the originals; if there are many views and masks, only some are shown.
+//! The page stays below eight megabytes, so that it opens at once and can be sent: pictures are
+//! small copies that link to the originals; if there are many views and masks, only some are shown.
 
 pub(super) mod views;
 
@@ -23,7 +23,8 @@ pub(super) const MAX_BYTES: usize = 7_600_000;
 /// The part of it that masks may take.
 const MASK_BYTES: usize = 800_000;
 
-/// Writes `report.html` with every finished stage; without the photographs an existing report is kept.
+/// Writes `report.html` with every finished stage; without the photographs an existing report is
+/// kept.
 pub(super) fn write_report(session: &Session, idle: bool) -> Result<()> {
     if session.inputs.missing_capture.is_some() || idle && is_current(session) {
         return Ok(());
@@ -31,7 +32,8 @@ pub(super) fn write_report(session: &Session, idle: bool) -> Result<()> {
     session.write("report.html", page(session)?.as_bytes(), idle)
 }
 
-/// Returns whether the report is newer than every stage and the settings. Writing it again would open all pictures.
+/// Returns whether the report is newer than every stage and the settings. Writing it again would
+/// open all pictures.
 fn is_current(session: &Session) -> bool {
     let time = |name: &str| io::modified(&session.run.path(name));
     let report = time("report.html").filter(|_| io::is_file(&session.run.path("report.html")));
@@ -49,7 +51,8 @@ pub fn renew_report(session: &Session) -> Result<()> {
     session.run.write("report.html", page(session)?.as_bytes())
 }
 
-/// Returns the learning curves of runs, those of one figure in one chart; the name of a run is a part of its curves' names.
+/// Returns the learning curves of runs, those of one figure in one chart; the name of a run is a
+/// part of its curves' names.
 pub fn curves(runs: &[(&Session, &str)]) -> Result<Vec<Chart>> {
     let mut all: Vec<Chart> = Vec::new();
     for (stage, figures) in LEARNED {
@@ -162,7 +165,8 @@ fn quoted(word: &str) -> String {
     }
 }
 
-/// Columns of the table: heading, number of digits, and whether more is better, less is, or neither.
+/// Columns of the table: heading, number of digits, and whether more is better, less is, or
+/// neither.
 pub(super) const COLUMNS: [(&str, usize, Option<bool>); 8] = [
     ("PSNR, head", 2, Some(true)),
     ("SSIM, head", 4, Some(true)),

@@ -6,8 +6,8 @@
 //!              flight-1f0c2a9b/       from a file of cameras: its name, and the beginning of its digest
 //! ```
 //!
-//! No stage reads these views, so making or removing them does not affect the evaluation's views, their blend or the
-//! metrics.
+//! No stage reads these views, so making or removing them does not affect the evaluation's views,
+//! their blend or the metrics.
 
 use crate::capture::path::{NamedCamera, from_json};
 use crate::capture::{Capture, Split, View};
@@ -21,7 +21,8 @@ use tiface_base::{Error, Result};
 /// Folder of the paths, relative to the run: one folder for each path.
 pub(super) const PATHS: &str = "render/paths";
 
-/// Number of characters of a file's name kept before its digest: a file name is limited to 255 bytes.
+/// Number of characters of a file's name kept before its digest: a file name is limited to 255
+/// bytes.
 const MAX_STEM_CHARS: usize = 50;
 
 /// A set of cameras, and the settings of their views.
@@ -37,7 +38,8 @@ pub(super) struct CameraPath {
 }
 
 impl CameraPath {
-    /// Returns the path that `render.cameras` names, reading a file of cameras; `None` for the held-out views.
+    /// Returns the path that `render.cameras` names, reading a file of cameras; `None` for the
+    /// held-out views.
     pub fn new(render: RenderConfig, capture: &Capture) -> Result<Option<CameraPath>> {
         let mut digest = None;
         let (name, cameras) = match render.cameras.as_str() {

@@ -48,8 +48,8 @@ pub(super) fn over(view: &mut RenderedView, background: [f32; 3]) {
 }
 
 /// Writes a view. PNG: 8-bit sRGB with straight alpha, and depth beside it in `depth/`, 16-bit
-/// millimeters, 0 = nothing. EXR: scene-linear, premultiplied, with `Z` and `N.X N.Y N.Z`. Depth and
-/// normals only where the view has them.
+/// millimeters, 0 = nothing. EXR: scene-linear, premultiplied, with `Z` and `N.X N.Y N.Z`. Depth
+/// and normals only where the view has them.
 pub(super) fn write(
     folder: &Path,
     name: &str,
@@ -130,7 +130,8 @@ pub(super) fn straight([r, g, b, a]: [f32; 4]) -> [f32; 4] {
     [r * k, g * k, b * k, a]
 }
 
-/// Reads a view as RGBA, coded color premultiplied over black: scene-linear if its name ends in `.exr`, else coded.
+/// Reads a view as RGBA, coded color premultiplied over black: scene-linear if its name ends in
+/// `.exr`, else coded.
 pub(super) fn read(file: &Path) -> Result<Image, ReadError> {
     let limits = Limits::default();
     if file.extension().is_some_and(|ending| ending == "exr") {
@@ -163,8 +164,8 @@ pub(super) fn read_like(file: &Path, photo: &Photo) -> Result<Image, ReadError> 
     Ok(found)
 }
 
-/// Returns the photograph as the render should look: cut out by its mask and composited over the same background.
-/// Without a mask it is returned unchanged.
+/// Returns the photograph as the render should look: cut out by its mask and composited over the
+/// same background. Without a mask it is returned unchanged.
 pub(super) fn expected(photo: &Photo, mask: Option<&Gray>, background: ViewBackground) -> Photo {
     let Some(mask) = mask else { return photo.clone() };
     let behind = background_color(background).unwrap_or([0.0; 3]);

@@ -18,8 +18,8 @@ use tiface_base::{Error, Result, io};
 const FORMAT: u32 = 3;
 
 impl Session<'_> {
-    /// Returns `until` and the stages it needs, in pipeline order. Views along a camera path need only the stages
-    /// whose results they show, not those that only the evaluation shows.
+    /// Returns `until` and the stages it needs, in pipeline order. Views along a camera path need
+    /// only the stages whose results they show, not those that only the evaluation shows.
     pub fn order(&self, until: Stage) -> Vec<Stage> {
         match &self.path {
             Some(path) if until == Stage::Render => {
@@ -36,9 +36,9 @@ impl Session<'_> {
         self.path.as_ref().map_or("render", |path| &path.folder)
     }
 
-    /// Returns the state of each stage for `until`: its folder, with `None` if the stage was never completed, else
-    /// the differences from the existing result (none if it is up to date). Fails if the settings contradict each
-    /// other. Nothing is written.
+    /// Returns the state of each stage for `until`: its folder, with `None` if the stage was never
+    /// completed, else the differences from the existing result (none if it is up to date). Fails
+    /// if the settings contradict each other. Nothing is written.
     pub fn stage_states(&self, until: Stage) -> Result<Vec<(String, Option<Vec<String>>)>> {
         self.can_make(until)?;
         let (mut found, mut missing) = (Vec::new(), Vec::new());
@@ -67,9 +67,9 @@ impl Session<'_> {
         inspection.problems.first().map_or(Ok(()), |problem| Err(Error::from(problem)))
     }
 
-    /// Writes the complete configuration into the run, so that the run can be repeated. Fails before anything is
-    /// changed if a stage that `until` needs was made or begun with other settings, if the settings contradict each
-    /// other, or if work is left without a capture.
+    /// Writes the complete configuration into the run, so that the run can be repeated. Fails
+    /// before anything is changed if a stage that `until` needs was made or begun with other
+    /// settings, if the settings contradict each other, or if work is left without a capture.
     pub fn remember(&self, until: Stage) -> Result<()> {
         self.agrees(until, &[])?;
         let order = self.order(until).into_iter();
@@ -79,12 +79,13 @@ impl Session<'_> {
         self.write("config.toml", self.config.to_toml().as_bytes(), left.is_empty())
     }
 
-    /// Returns the non-empty folders of the run that become out of date when a stage is made again, in pipeline
-    /// order: its own folder, those of the stages that depend on it, and views along paths that show it. If the views
-    /// of a path are made again, only their own folder is returned.
+    /// Returns the non-empty folders of the run that become out of date when a stage is made again,
+    /// in pipeline order: its own folder, those of the stages that depend on it, and views along
+    /// paths that show it. If the views of a path are made again, only their own folder is
+    /// returned.
     ///
-    /// A finished stage that depends on it is kept if none of its inputs is affected by the changed settings. If no
-    /// setting has changed, the stage and all later ones are made again.
+    /// A finished stage that depends on it is kept if none of its inputs is affected by the changed
+    /// settings. If no setting has changed, the stage and all later ones are made again.
     pub fn out_of_date(&self, stage: Stage) -> Result<Vec<String>> {
         let mut names = vec![self.views().to_string()];
         if stage != Stage::Render || self.path.is_none() {
@@ -118,8 +119,8 @@ impl Session<'_> {
         Ok(holds)
     }
 
-    /// Removes what becomes out of date when a stage is made again on the way to `until`, after logging it. Removes
-    /// nothing if `until` would then be refused.
+    /// Removes what becomes out of date when a stage is made again on the way to `until`, after
+    /// logging it. Removes nothing if `until` would then be refused.
     pub fn fresh(&self, stage: Stage, until: Stage) -> Result<()> {
         let names = self.require(until, Some(stage))?;
         if !names.is_empty() {
@@ -130,14 +131,16 @@ impl Session<'_> {
         self.run.fresh(&names)
     }
 
-    /// Returns the number and size of the files in a folder of the run that a stage made again would remove.
+    /// Returns the number and size of the files in a folder of the run that a stage made again
+    /// would remove.
     pub fn contents(&self, name: &str) -> Result<String> {
         let files = self.run.files(name)?;
         let plural = if files.len() == 1 { "" } else { "s" };
         Ok(format!("{} file{plural}, {:.1} MB", files.len(), files.values().sum::<u64>() as f64 / 1e6))
     }
 
-    /// Returns whether the finished mesh differs from the settings only in how its files are written.
+    /// Returns whether the finished mesh differs from the settings only in how its files are
+    /// written.
     pub fn differs_in_files(&self) -> bool {
         let Ok(Some(record)) = read_record(&self.run.path(Stage::Mesh)) else { return false };
         let differences = self.compared_plan(Stage::Mesh).fingerprint.differences(&record.fingerprint);
@@ -145,7 +148,8 @@ impl Session<'_> {
         !differences.is_empty() && differences.iter().all(is_file)
     }
 
-    /// Returns the folders that are out of date for `until`, if a stage is to be made again. Nothing is written.
+    /// Returns the folders that are out of date for `until`, if a stage is to be made again.
+    /// Nothing is written.
     ///
     /// # Errors
     ///
@@ -177,7 +181,8 @@ impl Session<'_> {
         Ok(names)
     }
 
-    /// Checks that the run's contents agree with the settings of `until`, except for the folders in `cleared`.
+    /// Checks that the run's contents agree with the settings of `until`, except for the folders in
+    /// `cleared`.
     fn agrees(&self, until: Stage, cleared: &[String]) -> Result<()> {
         self.can_make(until)?;
         let plans = self.order(until).into_iter().map(|stage| self.compared_plan(stage));
@@ -319,8 +324,8 @@ impl Session<'_> {
     }
 }
 
-/// Returns whether the views in a path's folder show an outdated stage of this digest. Views with unreadable records
-/// count as such.
+/// Returns whether the views in a path's folder show an outdated stage of this digest. Views with
+/// unreadable records count as such.
 fn may_show(folder: &Path, is_old: &dyn Fn(&String, &String) -> bool) -> bool {
     let any = |f: &Fingerprint| f.inputs.iter().any(|(stage, digest)| is_old(stage, digest));
     match (read_status(folder), read_record(folder)) {
@@ -331,7 +336,8 @@ fn may_show(folder: &Path, is_old: &dyn Fn(&String, &String) -> bool) -> bool {
     }
 }
 
-/// Weights and two moments of the planes, for two checkpoints and one being written; weights of the fields before.
+/// Weights and two moments of the planes, for two checkpoints and one being written; weights of the
+/// fields before.
 fn vm_bytes(c: &VmConfig) -> u64 {
     let channels: usize = c.density_rank.iter().chain(&c.color_rank).sum();
     let side = (c.voxels_final as f64).cbrt();

@@ -1,7 +1,8 @@
 //! Previews of a mesh: of a run's head, or of any mesh file.
 //!
-//! A small view of a field in training is rendered from its newest checkpoint ([`field_view`]). The viewing process
-//! renders it, so the training is not disturbed and its results stay the same, bit by bit.
+//! A small view of a field in training is rendered from its newest checkpoint ([`field_view`]). The
+//! viewing process renders it, so the training is not disturbed and its results stay the same, bit
+//! by bit.
 
 use super::finish::{center as center_of, front as front_of};
 use super::learn::load_field;
@@ -37,7 +38,8 @@ pub struct Preview {
     head: HeadMesh,
     /// The UV coordinates of a mesh without a texture.
     bare_atlas: Option<Atlas>,
-    /// The up and front directions: unit vectors in the mesh's coordinates, perpendicular to each other.
+    /// The up and front directions: unit vectors in the mesh's coordinates, perpendicular to each
+    /// other.
     up: Vec3,
     front: Vec3,
     /// The photographs of a run with their cameras in the world.
@@ -47,7 +49,8 @@ pub struct Preview {
 }
 
 impl Preview {
-    /// Returns the head of a run as the stage `mesh` left it. Its photographs are not opened, and no stage is disturbed.
+    /// Returns the head of a run as the stage `mesh` left it. Its photographs are not opened, and
+    /// no stage is disturbed.
     ///
     /// # Errors
     ///
@@ -69,8 +72,8 @@ impl Preview {
         Ok(Preview { head, bare_atlas: None, up, front, views: capture.views, warnings })
     }
 
-    /// Returns the mesh in a `.glb`, `.gltf`, `.obj`, `.ply` or `.stl` file. `up` is its up direction, +Y for most files; the front is
-    /// then +Z, or −Y if +Z is up, as in Blender.
+    /// Returns the mesh in a `.glb`, `.gltf`, `.obj`, `.ply` or `.stl` file. `up` is its up
+    /// direction, +Y for most files; the front is then +Z, or −Y if +Z is up, as in Blender.
     ///
     /// # Errors
     ///
@@ -95,9 +98,9 @@ impl Preview {
         self.head.texture.is_some() || self.bare_atlas.is_some()
     }
 
-    /// Returns `count` cameras on a circle around the mesh, in its coordinates, far enough away that square pictures
-    /// of `side` pixels show all of it. The first is turned by `turn` radians from the front towards the mesh's left, and
-    /// all of them `tilt` radians above.
+    /// Returns `count` cameras on a circle around the mesh, in its coordinates, far enough away
+    /// that square pictures of `side` pixels show all of it. The first is turned by `turn` radians
+    /// from the front towards the mesh's left, and all of them `tilt` radians above.
     pub fn around(&self, turn: f64, tilt: f64, side: u32, count: usize) -> Result<Vec<NamedCamera>> {
         let (up, front) = (self.up.as_dvec3(), self.front.as_dvec3());
         let level = front * turn.cos() + up.cross(front) * turn.sin();
@@ -123,8 +126,8 @@ impl Preview {
         orbit(&[like], bounds, up.as_vec3(), count)
     }
 
-    /// Returns the cameras that `--cameras` names, in the mesh's coordinates: `train` or `test` of a run, or a file
-    /// (a nerfstudio camera path or a transforms.json, in the world).
+    /// Returns the cameras that `--cameras` names, in the mesh's coordinates: `train` or `test` of
+    /// a run, or a file (a nerfstudio camera path or a transforms.json, in the world).
     pub fn cameras(&self, which: &str, side: u32) -> Result<Vec<NamedCamera>> {
         let scene_from_world = self.head.world_from_scene.inverse();
         let split =
@@ -201,7 +204,8 @@ pub struct PreviewRenderer<'a> {
 }
 
 impl PreviewRenderer<'_> {
-    /// Renders the view of a camera in the mesh's coordinates, reusing the memory of an earlier view.
+    /// Renders the view of a camera in the mesh's coordinates, reusing the memory of an earlier
+    /// view.
     fn view(&self, seen: &mut RasterView, camera: &Camera, look: Look) {
         let Preview { head, bare_atlas, .. } = self.preview;
         let surface = Surface {
@@ -220,9 +224,9 @@ impl PreviewRenderer<'_> {
         raster_into(seen, &head.mesh, layers, camera, &options, |hits| surface.shown(look, hits, camera));
     }
 
-    /// Returns the held-out photograph nearest to the face's front, cut out by its mask, and the mesh's error against
-    /// it in the colors of the error scale, each centered in a square of `side` pixels; `None` if no such photograph
-    /// exists.
+    /// Returns the held-out photograph nearest to the face's front, cut out by its mask, and the
+    /// mesh's error against it in the colors of the error scale, each centered in a square of
+    /// `side` pixels; `None` if no such photograph exists.
     ///
     /// # Errors
     ///
@@ -314,8 +318,8 @@ fn at_hand(head: &mut HeadMesh, path: &Path) -> Result<()> {
 /// Pixels along the longest side.
 const SIDE: u32 = 240;
 
-/// Returns the view of the first held-out camera of the field that a stage of a run has trained so far, over black,
-/// as a JPEG file.
+/// Returns the view of the first held-out camera of the field that a stage of a run has trained so
+/// far, over black, as a JPEG file.
 ///
 /// # Errors
 ///

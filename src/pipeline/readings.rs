@@ -1,10 +1,13 @@
-//! How a capture is read where its files leave open which photograph belongs to which camera, or how photographs lie.
+//! How a capture is read where its files leave open which photograph belongs to which camera, or
+//! how photographs lie.
 //!
-//! Camera files without names pair rows with photographs by order alone, and a half turn that EXIF asks for fits any size. Each
-//! way to read the capture is tried by what is measured of poses anyway ([`crate::rig`]), on small photographs and by few
-//! points: where photographs and cameras belong together, points of the head are found again in many photographs, near to where
-//! its camera expects them. The one that fits clearly better is taken; where none does, turns are left alone with a
-//! warning, and an order is refused, since nothing good is learned from the photographs of other cameras.
+//! Camera files without names pair rows with photographs by order alone, and a half turn that EXIF
+//! asks for fits any size. Each way to read the capture is tried by what is measured of poses
+//! anyway ([`crate::rig`]), on small photographs and by few points: where photographs and cameras
+//! belong together, points of the head are found again in many photographs, near to where its
+//! camera expects them. The one that fits clearly better is taken; where none does, turns are left
+//! alone with a warning, and an order is refused, since nothing good is learned from the
+//! photographs of other cameras.
 
 use super::cameras::grouped;
 use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
@@ -32,15 +35,17 @@ const MAX_VIEWS: usize = 24;
 /// Cells along each axis of the hull.
 const HULL_CELLS: usize = 64;
 
-/// The reading that is taken has at least this many times the weight of all others. Photographs in a wrong order reach a fifth of
-/// that of the right one, and those of neighbors on a ring, whose own turn explains most of it, a third.
+/// The reading that is taken has at least this many times the weight of all others. Photographs in
+/// a wrong order reach a fifth of that of the right one, and those of neighbors on a ring, whose
+/// own turn explains most of it, a third.
 const CLEARLY: f64 = 2.0;
 
-/// Masks that contradict each other less than this, in whole masks, cannot be told to be wrong; right ones do by nothing.
+/// Masks that contradict each other less than this, in whole masks, cannot be told to be wrong;
+/// right ones do by nothing.
 const LEAST_CONFLICT: f64 = 0.01;
 
-/// Where masks alone say which photograph belongs to which camera, those of the other order contradict each other by so much
-/// at least, a third of what is usual …
+/// Where masks alone say which photograph belongs to which camera, those of the other order
+/// contradict each other by so much at least, a third of what is usual …
 const SURE_CONFLICT: f64 = 0.05;
 
 /// … and this many times as much.
@@ -76,7 +81,8 @@ impl Settled {
     }
 }
 
-/// Opens a capture as [`capture::open`] does, and decides by its photographs what its files leave open.
+/// Opens a capture as [`capture::open`] does, and decides by its photographs what its files leave
+/// open.
 pub fn open_capture(root: &Path, options: &CaptureOptions) -> Result<Capture> {
     Ok(decide_reading(capture::open(root, options)?, options)?.capture)
 }
@@ -100,7 +106,8 @@ pub(super) fn decide_reading(capture: Capture, options: &CaptureOptions) -> Resu
     Ok(Settled { capture, reading: Some(reading), reason: Some(reason), doubt: None })
 }
 
-/// Returns a capture as its files order it, with a doubt that says why nothing was decided, or refuses it.
+/// Returns a capture as its files order it, with a doubt that says why nothing was decided, or
+/// refuses it.
 fn left_open(mut capture: Capture, options: &CaptureOptions, why: &str) -> Result<Settled> {
     let photographs = capture.readings.iter().any(|reading| reading.by_number);
     if !photographs && !capture.readings.iter().any(|reading| reading.masks_by_number) {
@@ -133,7 +140,8 @@ fn left_open(mut capture: Capture, options: &CaptureOptions, why: &str) -> Resul
     Err(Error::cannot(problem, hint))
 }
 
-/// Returns whether a capture has no masks that an order could be measured with, and none are wanted.
+/// Returns whether a capture has no masks that an order could be measured with, and none are
+/// wanted.
 fn is_without_masks(capture: &Capture, options: &CaptureOptions) -> bool {
     let with_masks = CaptureOptions { masks: MaskSource::Auto, ..options.clone() };
     let has_masks = |capture: Capture| capture.views.iter().any(|view| view.mask != ViewMask::None);
@@ -157,8 +165,8 @@ struct ReadingFit {
     fits: bool,
 }
 
-/// Decides on the reading of a capture that was opened with these options. Returns it with what was decided and by what, or
-/// the reason for which nothing is.
+/// Decides on the reading of a capture that was opened with these options. Returns it with what was
+/// decided and by what, or the reason for which nothing is.
 fn decide(capture: &Capture, options: &CaptureOptions) -> Result<(Reading, String), String> {
     if options.mask_meaning == MaskMeaning::Ignore {
         return Err(NO_SILHOUETTES.into());
@@ -251,8 +259,9 @@ fn reasons(best: Reading, all: &[(Reading, ReadingFit)], names: &[String]) -> Ve
     order.into_iter().chain(turn).collect()
 }
 
-/// Returns the reading whose masks contradict each other clearly less than by all others, and what is said of it. Where
-/// none does, masks that need not be paired stay as they are stored: `photographs` is the reading without turned masks.
+/// Returns the reading whose masks contradict each other clearly less than by all others, and what
+/// is said of it. Where none does, masks that need not be paired stay as they are stored:
+/// `photographs` is the reading without turned masks.
 fn masks_that_agree(
     photographs: Reading,
     all: &[(Reading, f64)],
@@ -278,8 +287,8 @@ fn masks_that_agree(
     Ok((best, Some(format!("{parts}: so they contradict each other by {least} of a mask, else by {others}"))))
 }
 
-/// Returns the reading whose masks contradict each other the least, if those of all others do at least so much and so many
-/// times as much, and how much both do, in words.
+/// Returns the reading whose masks contradict each other the least, if those of all others do at
+/// least so much and so many times as much, and how much both do, in words.
 fn agreeing(all: &[(Reading, f64)], least: f64, times: f64) -> Option<(Reading, String, String)> {
     let mut sorted = all.to_vec();
     sorted.sort_by(|a, b| a.1.total_cmp(&b.1));
@@ -288,8 +297,9 @@ fn agreeing(all: &[(Reading, f64)], least: f64, times: f64) -> Option<(Reading, 
     (other >= least.max(times * own)).then(|| (best, percent(own), percent(other)))
 }
 
-/// Decides on the order of photographs whose heads are too smooth for points to be found again, if only that is open: masks
-/// move along with their photographs, and those of other cameras contradict each other. Returns what is said of it as well.
+/// Decides on the order of photographs whose heads are too smooth for points to be found again, if
+/// only that is open: masks move along with their photographs, and those of other cameras
+/// contradict each other. Returns what is said of it as well.
 fn by_silhouettes(
     all: &[(Reading, Capture)],
     limits: &Limits,
@@ -338,7 +348,8 @@ fn small_masks(views: &[View], limits: &Limits) -> Result<Vec<Option<Gray>>> {
 }
 
 impl ReadingFit {
-    /// Measures the training views of a capture. Returns the reason instead if that is not possible.
+    /// Measures the training views of a capture. Returns the reason instead if that is not
+    /// possible.
     fn of(mut capture: Capture, limits: &Limits) -> Result<ReadingFit, String> {
         let said = |e: Error| e.to_string();
         capture.views.retain(|view| view.split == Split::Train);

@@ -6,9 +6,9 @@
 //!        tface/float/     the same view for `ensemble`: float, coded, no background
 //! ```
 //!
-//! These are the held-out views. Where poses were refined, T-Face and the ray-cast mesh are also shown from the poses fitted to
-//! each held-out view alone, in `own_pose/` below the method's folder. Views along a camera path are written to a folder of
-//! their own, `render/paths/`.
+//! These are the held-out views. Where poses were refined, T-Face and the ray-cast mesh are also
+//! shown from the poses fitted to each held-out view alone, in `own_pose/` below the method's
+//! folder. Views along a camera path are written to a folder of their own, `render/paths/`.
 
 use super::learn;
 use super::mesh::{extracted_surface, head_mesh};
@@ -31,8 +31,8 @@ use tiface_surface::render::{
     ResidualSource, ResidualView, Residuals, Surface, raster, raycast,
 };
 
-/// Renders one folder per method and one picture per camera, and the `fitted` cameras by the methods that compare poses;
-/// `unit_m` is the number of meters in a dataset unit.
+/// Renders one folder per method and one picture per camera, and the `fitted` cameras by the
+/// methods that compare poses; `unit_m` is the number of meters in a dataset unit.
 pub(super) fn render(
     c: &RenderConfig,
     renderer: &Renderer,
@@ -105,8 +105,8 @@ pub(super) fn cameras(
     }
 }
 
-/// Returns whether some methods show the head mesh. Fitted colors lie on it; the network's colors are evaluated on the
-/// extracted surface.
+/// Returns whether some methods show the head mesh. Fitted colors lie on it; the network's colors
+/// are evaluated on the extracted surface.
 pub(super) fn shows_head(config: &Config, methods: &[Method]) -> bool {
     let fitted = config.mesh.color == ColorSource::Photographs;
     let shows =
@@ -187,8 +187,8 @@ impl<'a> VisibleHead<'a> {
         raycast(&self.bvh, &self.head.mesh, self.shells.as_ref(), camera, options, color)
     }
 
-    /// Renders a view as a viewer shows the head: with its texture or the colors of its vertices, else in gray, lit from
-    /// the camera.
+    /// Renders a view as a viewer shows the head: with its texture or the colors of its vertices,
+    /// else in gray, lit from the camera.
     pub fn as_in_viewer(&self, camera: &Camera, options: &RaycastOptions) -> RenderedView {
         let mesh = &self.head.mesh;
         self.view(camera, options, |hits| match &self.shown {
@@ -231,8 +231,8 @@ pub(super) struct Renderer<'a> {
 }
 
 impl<'a> Renderer<'a> {
-    /// Returns a renderer of these fields and meshes; `samples` is the number of rays along each side of a pixel that
-    /// shows a mesh.
+    /// Returns a renderer of these fields and meshes; `samples` is the number of rays along each
+    /// side of a pixel that shows a mesh.
     pub fn new(
         scene: &Scene,
         fields: &'a dyn Fields,
@@ -251,8 +251,9 @@ impl<'a> Renderer<'a> {
         }
     }
 
-    /// Returns the renderer with the residuals of the training views, which ray casting then adds to other views. With
-    /// `leaves_out_own`, a training view adds nothing to a view from its own position.
+    /// Returns the renderer with the residuals of the training views, which ray casting then adds
+    /// to other views. With `leaves_out_own`, a training view adds nothing to a view from its own
+    /// position.
     pub fn with_residuals(
         mut self,
         capture: &Capture,

@@ -1,4 +1,5 @@
-//! What cameras and exposures are measured on: photographs at a moderate size, their masks, and the surface of the hull.
+//! What cameras and exposures are measured on: photographs at a moderate size, their masks, and the
+//! surface of the hull.
 
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, Split, View};
@@ -52,7 +53,8 @@ impl<'c> RigPhotos<'c> {
         RigPhotos::load_at(SEARCHED_PX, capture, scene, limits)
     }
 
-    /// Does what [`RigPhotos::load`] does, with photographs whose longest side has at most this many pixels.
+    /// Does what [`RigPhotos::load`] does, with photographs whose longest side has at most this
+    /// many pixels.
     pub fn load_at(
         side: u32,
         capture: &'c Capture,
@@ -96,8 +98,9 @@ impl<'c> RigPhotos<'c> {
         Ok(Ok(RigPhotos { views, train, pictures, cameras, surface, scene_from_world }))
     }
 
-    /// Measures how well the cameras of the training views fit each other, by this many points. Returns their
-    /// photographs as they were searched, and what was found. `all` asks for all poses to be refined.
+    /// Measures how well the cameras of the training views fit each other, by this many points.
+    /// Returns their photographs as they were searched, and what was found. `all` asks for all
+    /// poses to be refined.
     pub fn measure(&self, points: usize, all: bool) -> (Vec<RigView>, Rig) {
         let pictures = self.pictures[..self.train].par_iter();
         let views: Vec<RigView> = pictures.map(|(photo, head)| RigView::new(photo, head)).collect();
@@ -117,8 +120,8 @@ fn searched(view: &View, side: u32, limits: &Limits) -> Result<Option<(Photo, Gr
     Ok(Some((reduce_photo(&loaded.photo, size), resize_gray(&mask, size))))
 }
 
-/// Returns the surface of a hull, smoothed and drawn in by about a cell, since a hull holds every cell that any mask may
-/// touch.
+/// Returns the surface of a hull, smoothed and drawn in by about a cell, since a hull holds every
+/// cell that any mask may touch.
 fn hull_surface(hull: &BitGrid) -> Result<Mesh> {
     /// Share of the smoothed cells' value where the surface lies; one half would be the hull's own.
     const LEVEL: f32 = 0.8;

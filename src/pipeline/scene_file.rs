@@ -1,4 +1,5 @@
-//! `mask/scene.json` and `cameras.json`: where the head is, kept for later stages and for other programs.
+//! `mask/scene.json` and `cameras.json`: where the head is, kept for later stages and for other
+//! programs.
 
 use super::cameras::CameraCheck;
 use super::exposure::ExposureCheck;
@@ -51,8 +52,9 @@ pub(super) fn read_scene(path: &Path) -> Result<Scene, ReadError> {
     Ok(scene)
 }
 
-/// Returns the text of `cameras.json`: every view with split, intrinsics and pose, and the transform from the world
-/// to the scene. `check` adds how well the poses fit, and the refined ones, and `exposure` how the exposures differ.
+/// Returns the text of `cameras.json`: every view with split, intrinsics and pose, and the
+/// transform from the world to the scene. `check` adds how well the poses fit, and the refined
+/// ones, and `exposure` how the exposures differ.
 pub(super) fn cameras_json(
     capture: &Capture,
     scene: &Scene,

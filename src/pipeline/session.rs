@@ -20,7 +20,8 @@ use tiface_base::{Error, Result};
 /// A capture, its configuration and its run folder.
 pub struct Session<'a> {
     pub(super) capture: Capture,
-    /// The capture as the stage `mask` read its masks, refined its poses and evened out its exposures, once it is used.
+    /// The capture as the stage `mask` read its masks, refined its poses and evened out its
+    /// exposures, once it is used.
     refined: OnceLock<Capture>,
     pub(super) config: &'a Config,
     pub(super) run: &'a Run,
@@ -36,8 +37,8 @@ pub const DEMO_CAPTURE: &str = "capture";
 impl<'a> Session<'a> {
     /// Opens the capture and reads every byte of it once to compute its digest. Nothing is written.
     ///
-    /// The capture of a finished run may have been moved. Its cameras are then restored from the run, and no stage
-    /// can be worked on ([`Session::remember`]).
+    /// The capture of a finished run may have been moved. Its cameras are then restored from the
+    /// run, and no stage can be worked on ([`Session::remember`]).
     pub fn open(config: &'a Config, run: &'a Run) -> Result<Session<'a>> {
         check_feasible(config)?;
         let (mut capture, inputs) = Inputs::read(config, run)?;
@@ -57,14 +58,16 @@ impl<'a> Session<'a> {
         Ok(Session { capture, refined: OnceLock::new(), config, run, inputs, path: None })
     }
 
-    /// Returns a session whose stage `render` makes the views of `render.cameras` in a folder of their own instead of
-    /// the evaluation's views; a file of cameras is read here. For `test` the session is returned unchanged.
+    /// Returns a session whose stage `render` makes the views of `render.cameras` in a folder of
+    /// their own instead of the evaluation's views; a file of cameras is read here. For `test` the
+    /// session is returned unchanged.
     pub fn with_camera_path(self, render: RenderConfig) -> Result<Session<'a>> {
         let path = CameraPath::new(render, &self.capture)?;
         Ok(Session { path, ..self })
     }
 
-    /// Returns the capture with its mask files read as the stage `mask` found that they are to be read.
+    /// Returns the capture with its mask files read as the stage `mask` found that they are to be
+    /// read.
     pub(super) fn read_capture(&self) -> Result<Cow<'_, Capture>> {
         let mut capture = Cow::Borrowed(&self.capture);
         let applied = mask::apply_reading(&self.run.path(Stage::Mask), &mut capture);
@@ -72,8 +75,8 @@ impl<'a> Session<'a> {
         Ok(capture)
     }
 
-    /// Returns the capture as the metrics use it: each view with the capture's own mask, if it has one. Own masks that do
-    /// not say what is head are left out, with a warning.
+    /// Returns the capture as the metrics use it: each view with the capture's own mask, if it has
+    /// one. Own masks that do not say what is head are left out, with a warning.
     pub(super) fn evaluation_capture(&self) -> Result<Capture> {
         let mut capture = self.read_capture()?.into_owned();
         let Some(own) = &self.inputs.own_masks else { return Ok(capture) };
@@ -92,8 +95,9 @@ impl<'a> Session<'a> {
         Ok(capture)
     }
 
-    /// Returns the source of the masks that the figures of held-out views are restricted to: `capture`, `run` (this
-    /// run made at least one of them, so other runs may evaluate differently) or `none`.
+    /// Returns the source of the masks that the figures of held-out views are restricted to:
+    /// `capture`, `run` (this run made at least one of them, so other runs may evaluate
+    /// differently) or `none`.
     pub(super) fn mask_source(&self, evaluated: &Capture) -> &'static str {
         let masks = self.capture.views.iter().zip(&evaluated.views);
         let all: Vec<_> = masks.map(|(view, evaluated)| (view.split, &view.mask, &evaluated.mask)).collect();
@@ -126,8 +130,8 @@ impl<'a> Session<'a> {
         ExposureCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))
     }
 
-    /// Returns the capture with the poses that the stage `mask` refined and the exposures that it evened out, for the stages
-    /// after it.
+    /// Returns the capture with the poses that the stage `mask` refined and the exposures that it
+    /// evened out, for the stages after it.
     pub(super) fn refined_capture(&self) -> Result<&Capture> {
         if let Some(capture) = self.refined.get() {
             return Ok(capture);
@@ -155,13 +159,14 @@ impl<'a> Session<'a> {
         self.write("cameras.json", &cameras, idle)
     }
 
-    /// Returns how the views of the stage `render` are made: with the settings of the camera path, if the session has
-    /// one.
+    /// Returns how the views of the stage `render` are made: with the settings of the camera path,
+    /// if the session has one.
     pub(super) fn render_config(&self) -> &RenderConfig {
         self.path.as_ref().map_or(&self.config.render, |path| &path.render)
     }
 
-    /// Fails if an input of one of these stages is missing: photographs, checkpoints, networks or the device.
+    /// Fails if an input of one of these stages is missing: photographs, checkpoints, networks or
+    /// the device.
     pub(super) fn require_inputs(&self, stages: &[Stage]) -> Result<()> {
         if let Some(problem) = self.inputs.missing_capture.as_ref().filter(|_| !stages.is_empty()) {
             return Err(missing_capture(problem));
@@ -196,8 +201,8 @@ impl<'a> Session<'a> {
         })
     }
 
-    /// Writes a file of the run itself. A write error is ignored if no work is left, because a finished run may lie
-    /// on a read-only disk.
+    /// Writes a file of the run itself. A write error is ignored if no work is left, because a
+    /// finished run may lie on a read-only disk.
     pub(super) fn write(&self, name: &str, bytes: &[u8], idle: bool) -> Result<()> {
         match self.run.write(name, bytes) {
             Err(e) if idle => {
@@ -223,13 +228,15 @@ pub(super) fn is_demo(config: &Config, run: &Run) -> bool {
     io::real_path(&run.path(DEMO_CAPTURE)).is_ok_and(|made| made == config.capture.path)
 }
 
-/// Refuses a device that this build or this machine does not have, or that another process uses. Finished stages need
-/// no device, so this is checked only if a stage that computes on it has work left.
+/// Refuses a device that this build or this machine does not have, or that another process uses.
+/// Finished stages need no device, so this is checked only if a stage that computes on it has work
+/// left.
 pub fn require_device(config: &Config) -> Result<()> {
     crate::field::require_device(&config.device).map(drop)
 }
 
-/// Returns the error for an unusable file that a stage of this run made: the hint is to make it again.
+/// Returns the error for an unusable file that a stage of this run made: the hint is to make it
+/// again.
 pub(super) fn unusable(e: io::ReadError, stage: impl Display) -> Error {
     match &e {
         io::ReadError::Io { source, .. } if source.kind() != NotFound => e.into(),

@@ -17,8 +17,8 @@ use tiface_base::geom::{SdfField, Similarity};
 use tiface_base::io::{self, Limits};
 use tiface_base::{ErrorKind, Result};
 
-/// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little brighter seen
-/// from one side.
+/// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little
+/// brighter seen from one side.
 struct Exact {
     world_from_scene: Similarity,
 }
@@ -126,7 +126,8 @@ fn a_stage_gives_the_scratch_memory_of_its_kernels_back() {
     assert!(!keeps(5 << 17));
 }
 
-/// The pipeline with the head's formula in place of a trained field: any error is then not one of the training.
+/// The pipeline with the head's formula in place of a trained field: any error is then not one of
+/// the training.
 #[test]
 fn the_stages_after_learning_keep_the_exact_head_exact() {
     let dir = tempfile::tempdir().unwrap();
@@ -199,8 +200,9 @@ fn the_stages_after_learning_keep_the_exact_head_exact() {
     assert!(warnings[0].contains("head.glb` has 4 bytes") && warnings[0].contains("`--fresh mesh`"));
 }
 
-/// Makes heads with colors from a source, lobes and a frame each. By the photographs, a head must look as rays show it and like
-/// the photograph; for every other one the difference between what rays and what a viewer shows is returned.
+/// Makes heads with colors from a source, lobes and a frame each. By the photographs, a head must
+/// look as rays show it and like the photograph; for every other one the difference between what
+/// rays and what a viewer shows is returned.
 fn textured_heads((resolution, texture_px): (u32, u32), heads: &[(ColorSource, u32, MeshFrame)]) -> Vec<f64> {
     let (dir, mut config, _) = sharp_run();
     config.mesh.resolution = resolution;
@@ -257,7 +259,8 @@ fn textured_heads((resolution, texture_px): (u32, u32), heads: &[(ColorSource, u
     errors
 }
 
-/// The product looks like the whole surface, from cameras it was not baked for; what depends on the view is in its lobes.
+/// The product looks like the whole surface, from cameras it was not baked for; what depends on the
+/// view is in its lobes.
 #[test]
 fn the_textured_head_looks_like_the_field_it_was_baked_from() {
     let heads = [

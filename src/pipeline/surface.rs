@@ -1,7 +1,8 @@
-//! The interface of a trained field that later stages use, so that another field can stand in for it.
+//! The interface of a trained field that later stages use, so that another field can stand in for
+//! it.
 //!
-//! Views are made by marching rays through a field, a band of rows at a time: for a photograph of twelve megapixels,
-//! memory holds the picture, but not a ray and its result for every pixel.
+//! Views are made by marching rays through a field, a band of rows at a time: for a photograph of
+//! twelve megapixels, memory holds the picture, but not a ray and its result for every pixel.
 
 use crate::config::Stage;
 use glam::{Vec2, Vec3};
@@ -13,8 +14,8 @@ use tiface_surface::{Cap, Patches};
 
 /// A signed distance that may also be rendered by marching rays through it.
 pub trait Surface: SdfField {
-    /// Returns the view of a camera in scene coordinates by marching rays through the field itself; depth and normals
-    /// are in the world. `None` if the field is only a surface.
+    /// Returns the view of a camera in scene coordinates by marching rays through the field itself;
+    /// depth and normals are in the world. `None` if the field is only a surface.
     fn volume(&self, _camera: &Camera, _world_from_scene: &Similarity) -> Option<RenderedView> {
         None
     }
@@ -42,7 +43,8 @@ impl SdfField for ClosedSurface<'_> {
         self.field.sdf(points)
     }
 
-    /// Returns values and gradients; the closed surface includes the cap over the opening of the field's zero set.
+    /// Returns values and gradients; the closed surface includes the cap over the opening of the
+    /// field's zero set.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
         let (mut values, mut gradients) = self.field.sdf_gradient(points);
         if let Some(cap) = self.cap {
@@ -81,8 +83,8 @@ impl SdfField for ClosedSurface<'_> {
 
 /// A field that is rendered by marching rays through it.
 pub trait Radiance: Sync {
-    /// Returns color and depth along rays in scene coordinates, for a camera that looks along the unit vector
-    /// `forward`; no normals are computed. `[n]` → `[n]`.
+    /// Returns color and depth along rays in scene coordinates, for a camera that looks along the
+    /// unit vector `forward`; no normals are computed. `[n]` → `[n]`.
     fn render_rays(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult>;
 }
 
@@ -127,9 +129,9 @@ const BAND: usize = 1 << 16;
 
 /// Renders a camera in scene coordinates; depth and normals are in the world.
 ///
-/// Depth and normal are kept where the opacity is at least a half. A pixel where the lens model folds over has no ray
-/// and stays empty. `render_rays` maps `[n]` rays to `[n]` colors, some tens of thousands at a time; where it returns
-/// nothing, those pixels stay empty too.
+/// Depth and normal are kept where the opacity is at least a half. A pixel where the lens model
+/// folds over has no ray and stays empty. `render_rays` maps `[n]` rays to `[n]` colors, some tens
+/// of thousands at a time; where it returns nothing, those pixels stay empty too.
 pub(super) fn march(
     camera: &Camera,
     world_from_scene: &Similarity,

@@ -39,14 +39,15 @@ pub(super) fn words(stages: &[Stage]) -> String {
     stages.iter().map(|s| s.as_str()).collect::<Vec<_>>().join(" ")
 }
 
-/// Writes the demo head, photographed at a size by this many training and held-out views, into a folder. A size of its own costs
-/// seconds, one that other tests have nothing.
+/// Writes the demo head, photographed at a size by this many training and held-out views, into a
+/// folder. A size of its own costs seconds, one that other tests have nothing.
 pub(super) fn demo_head(root: &Path, (width, height): (u32, u32), (train, test): (usize, usize)) {
     write_capture(root, &SyntheticOptions { width, height, train, test, seed: 1 });
 }
 
-/// The configuration of a draft of the capture in a folder. Cameras and exposures are used as given: their measurement takes
-/// longer than all else of the stage `mask`, and has tests of its own.
+/// The configuration of a draft of the capture in a folder. Cameras and exposures are used as
+/// given: their measurement takes longer than all else of the stage `mask`, and has tests of its
+/// own.
 pub(super) fn draft(root: &Path) -> Config {
     let mut config = Config::preset(Preset::Draft);
     config.capture.path = root.into();
@@ -86,7 +87,8 @@ fn head_of((width, height): (u32, u32), seed: u64) -> (TempDir, Capture) {
     (dir, capture)
 }
 
-/// The scene of the training views of a capture; that of the same cameras and masks is found once a test program.
+/// The scene of the training views of a capture; that of the same cameras and masks is found once a
+/// test program.
 pub(super) fn scene_of(capture: &Capture) -> Scene {
     type Views = (Vec<Camera>, Vec<Option<Gray>>);
     static FOUND: Mutex<Vec<(Views, Scene)>> = Mutex::new(Vec::new());
@@ -102,8 +104,8 @@ pub(super) fn scene_of(capture: &Capture) -> Scene {
     scene
 }
 
-/// Completes the stage `mask` as [`complete`] does, for tests of what follows. It is made once a test program for each plan; later
-/// its files are copied into the run, where they are found done.
+/// Completes the stage `mask` as [`complete`] does, for tests of what follows. It is made once a
+/// test program for each plan; later its files are copied into the run, where they are found done.
 pub(super) fn masked(session: &Session) -> Done {
     static MADE: Mutex<BTreeMap<String, Arc<OnceLock<Files>>>> = Mutex::new(BTreeMap::new());
     let (folder, plan) = (session.run.path(Stage::Mask), session.plan(Stage::Mask));

@@ -78,8 +78,8 @@ pub struct Sweep {
 }
 
 impl Sweep {
-    /// Returns which rows are better in the first measure, beyond its noise, than all that take less time: the Pareto
-    /// front.
+    /// Returns which rows are better in the first measure, beyond its noise, than all that take
+    /// less time: the Pareto front.
     pub fn front(&self) -> Vec<bool> {
         let mut front = vec![false; self.rows.len()];
         let Some((measure, more)) = self.measures.first().and_then(|m| Some((m, m.more_is_better?))) else {
@@ -171,8 +171,8 @@ pub struct BenchResult {
 }
 
 impl BenchResult {
-    /// Returns whether these are results of the same bench, which may have been stopped: of the same program, machine, settings
-    /// and sweeps.
+    /// Returns whether these are results of the same bench, which may have been stopped: of the
+    /// same program, machine, settings and sweeps.
     pub fn is_part_of(&self, begun: &BenchResult) -> bool {
         let BenchResult { capture, sweeps, .. } = begun.clone();
         BenchResult { capture, sweeps, ..self.clone() } == *begun
@@ -183,7 +183,8 @@ impl BenchResult {
         format!("{:#}\n", serde_json::json!(self))
     }
 
-    /// Returns the tables, for a terminal. A star marks what no other choice beats in time and error together.
+    /// Returns the tables, for a terminal. A star marks what no other choice beats in time and
+    /// error together.
     pub fn text(&self) -> String {
         let mut out = String::new();
         for sweep in &self.sweeps {

@@ -22,9 +22,9 @@ pub struct Chart {
     pub curves: Vec<Curve>,
 }
 
-/// Returns the named figures of a `log.jsonl` over its steps, one chart a figure and one curve for each field that a
-/// stage learns. Lines that are not JSON (cut short by a crash) are passed over; a step logged twice, before and after
-/// an interruption, counts the second time.
+/// Returns the named figures of a `log.jsonl` over its steps, one chart a figure and one curve for
+/// each field that a stage learns. Lines that are not JSON (cut short by a crash) are passed over;
+/// a step logged twice, before and after an interruption, counts the second time.
 pub fn charts(stage: &str, log: &str, names: &[&str]) -> Vec<Chart> {
     let title = |name: &&str| Chart { title: format!("{stage} {name}"), curves: Vec::new() };
     let mut charts: Vec<Chart> = names.iter().map(title).collect();
@@ -141,7 +141,8 @@ impl Chart {
     }
 }
 
-/// Returns two to five round numbers within a range: 1, 2 or 5 times a power of ten apart; whole numbers only if `whole`.
+/// Returns two to five round numbers within a range: 1, 2 or 5 times a power of ten apart; whole
+/// numbers only if `whole`.
 fn ticks(low: f64, high: f64, whole: bool) -> Vec<f64> {
     if high <= low || !(high - low).is_finite() {
         return if low.is_finite() { vec![low] } else { Vec::new() };

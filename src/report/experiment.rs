@@ -68,8 +68,8 @@ pub struct Measured {
     pub outside: Option<f64>,
     /// Pieces of the surface, where one was made.
     pub pieces: Option<u64>,
-    /// Whose masks the figures count inside: `capture`, `run` (made by the run itself, for a photograph at least) or
-    /// `none`.
+    /// Whose masks the figures count inside: `capture`, `run` (made by the run itself, for a
+    /// photograph at least) or `none`.
     pub masks: Option<String>,
     /// Why the figures or the surface are missing.
     pub problem: Option<String>,
@@ -165,8 +165,8 @@ pub struct Interval {
     pub high: f64,
 }
 
-/// Returns the mean over groups of the mean of each, and its interval by resampling within each group (Efron 1979,
-/// percentiles). The draws are those of a fixed seed.
+/// Returns the mean over groups of the mean of each, and its interval by resampling within each
+/// group (Efron 1979, percentiles). The draws are those of a fixed seed.
 pub fn bootstrap(groups: &[Vec<f64>]) -> Option<Interval> {
     let groups: Vec<&Vec<f64>> = groups.iter().filter(|g| !g.is_empty()).collect();
     if groups.is_empty() {
@@ -227,8 +227,8 @@ impl Experiment {
         self.measured[row].iter().zip(&self.measured[from]).map(pair).collect()
     }
 
-    /// Returns whether an ordering holds, and by how much the better row is better: for each capture, and on average
-    /// over those that have both rows.
+    /// Returns whether an ordering holds, and by how much the better row is better: for each
+    /// capture, and on average over those that have both rows.
     pub fn holds(&self, ordering: &Ordering) -> (Vec<OrderingResult>, OrderingResult) {
         let measure = MEASURES.iter().position(|m| m.0 == ordering.by).unwrap_or(0);
         let rows = (self.index(ordering.table, ordering.better), self.index(ordering.table, ordering.worse));
@@ -257,7 +257,8 @@ impl Experiment {
         found.map(|p| p.value)
     }
 
-    /// Returns whether, for at least one capture, a row was evaluated with masks that its own run made.
+    /// Returns whether, for at least one capture, a row was evaluated with masks that its own run
+    /// made.
     fn judged_itself(&self, row: usize) -> bool {
         self.measured[row].iter().any(|m| m.masks.as_deref() == Some("run"))
     }
@@ -490,7 +491,8 @@ mod tests {
         let mut missing = e.clone();
         missing.measured[1][0].figures.clear();
         missing.measured[1][0].views.clear();
-        // on average over the second alone, where the first row is better: 29.99 < 30, though 29.99 > 25.5
+        // on average over the second alone, where the first row is better: 29.99 < 30, though
+        // 29.99 > 25.5
         assert_eq!(words(&missing, 0), (vec![Answer::Unknown, Answer::No], Answer::No));
         missing.measured[0][1].figures.clear();
         assert_eq!(words(&missing, 0), (vec![Answer::Unknown; 2], Answer::Unknown));

@@ -1,4 +1,5 @@
-//! A run while it works: its stages, curves and newest views, as a file beside them that loads itself again and again.
+//! A run while it works: its stages, curves and newest views, as a file beside them that loads
+//! itself again and again.
 
 use super::{LEARNED, STYLE, charts, duration, fill, link, picture_url, views};
 use crate::config::{NAMES, Stage};
@@ -22,9 +23,9 @@ struct StageRow {
     share: u64,
 }
 
-/// Returns the page of a run in its current state, for a file in its folder: pictures are named by their paths. `view` gives the
-/// JPEG file of what a stage that is learning has learned so far, from its checkpoint of that time. The page loads itself
-/// again while `renewed`.
+/// Returns the page of a run in its current state, for a file in its folder: pictures are named by
+/// their paths. `view` gives the JPEG file of what a stage that is learning has learned so far,
+/// from its checkpoint of that time. The page loads itself again while `renewed`.
 ///
 /// # Errors
 ///
@@ -64,7 +65,8 @@ pub fn live_html(
     )
 }
 
-/// Returns the fields that are being learned and have a checkpoint: the stage, and when that was saved.
+/// Returns the fields that are being learned and have a checkpoint: the stage, and when that was
+/// saved.
 fn learning(run: &Path) -> impl Iterator<Item = (Stage, SystemTime)> {
     LEARNED.into_iter().filter_map(move |(stage, _)| {
         let folder = run.join(stage);

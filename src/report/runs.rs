@@ -48,8 +48,8 @@ pub struct RunRow {
     pub triangles: Option<u64>,
     /// Size of `head.glb`.
     pub megabytes: Option<f64>,
-    /// Mean distance of the mesh from the true surface in per cent of the head's height; where that is known, of the demo
-    /// head.
+    /// Mean distance of the mesh from the true surface in per cent of the head's height; where that
+    /// is known, of the demo head.
     pub truth_percent: Option<f64>,
     /// Work of all stages by the clock.
     pub seconds: f64,
@@ -64,8 +64,8 @@ pub struct RunRow {
 }
 
 impl RunRow {
-    /// Reads the state and figures of the run in a folder; its page is linked from one in `beside`. A file that is missing or
-    /// damaged leaves its figures out: one run must not hide the others.
+    /// Reads the state and figures of the run in a folder; its page is linked from one in `beside`.
+    /// A file that is missing or damaged leaves its figures out: one run must not hide the others.
     pub fn read(run: &Path, beside: &Path) -> RunRow {
         let status = RunStatus::read(run);
         let records: Vec<(Stage, &Record)> =
@@ -144,7 +144,8 @@ fn picture(run: &Path) -> Option<String> {
     Some(picture_url(&small_view(&run.join(files.iter().min_by_key(rank)?), PICTURE_PX, 78)?))
 }
 
-/// Returns the names of a run's views, first those that look as all cameras do in the mean; none if they cannot be read.
+/// Returns the names of a run's views, first those that look as all cameras do in the mean; none if
+/// they cannot be read.
 fn frontal_views(run: &Path) -> Vec<String> {
     #[derive(Deserialize)]
     struct Cameras {
@@ -178,11 +179,12 @@ const FIGURES: [(&str, fn(&RunRow) -> Option<f64>); 10] = [
 ];
 const DIGITS: [usize; FIGURES.len()] = [2, 4, 2, 2, 0, 1, 1, 1, 2, 0];
 
-/// Distance from the median, in robust standard deviations, from which a value is an outlier (Iglewicz and Hoaglin 1993).
+/// Distance from the median, in robust standard deviations, from which a value is an outlier
+/// (Iglewicz and Hoaglin 1993).
 const OUTLIER: f64 = 3.5;
 
-/// Returns which of some values are far from the others, by the modified z-score: the distance from the median over
-/// 1.4826 times the median of all distances. None of fewer than five.
+/// Returns which of some values are far from the others, by the modified z-score: the distance from
+/// the median over 1.4826 times the median of all distances. None of fewer than five.
 fn outliers(values: &[Option<f64>]) -> Vec<bool> {
     let median = |mut v: Vec<f64>| mean_of_middle(&mut v).unwrap_or(0.0);
     let known: Vec<f64> = values.iter().flatten().copied().collect();
@@ -191,7 +193,8 @@ fn outliers(values: &[Option<f64>]) -> Vec<bool> {
     }
     let middle = median(known.clone());
     let spread = 1.4826 * median(known.iter().map(|v| (v - middle).abs()).collect());
-    // most may be alike to the last digit: then any difference of more than a thousandth is an outlier
+    // most may be alike to the last digit: then any difference of more than a thousandth is an
+    // outlier
     let spread = spread.max(1e-3 * middle.abs() / OUTLIER);
     values.iter().map(|v| v.is_some_and(|v| (v - middle).abs() > OUTLIER * spread)).collect()
 }

@@ -1,10 +1,12 @@
 //! Robust bundle adjustment: poses and points that explain where patches were found.
 //!
-//! Minimizes the sum of `c² log(1 + ‖r‖² / c²)` (Cauchy) over all sightings, where `r` is the distance in pixels between
-//! the projection of a point and its sighting, plus a weak prior that keeps cameras near their given poses. Iterates
-//! Levenberg–Marquardt with weights `1 / (1 + ‖r‖² / c²)`; points are eliminated, so that the system to solve has six
-//! unknowns for each camera (the Schur complement: Triggs, McLauchlan, Hartley, Fitzgibbon 2000, "Bundle Adjustment — A
-//! Modern Synthesis"). A camera moves by `R ← R exp(ω)`, `C ← C + t`. The matrix is small and dense.
+//! Minimizes the sum of `c² log(1 + ‖r‖² / c²)` (Cauchy) over all sightings, where `r` is the
+//! distance in pixels between the projection of a point and its sighting, plus a weak prior that
+//! keeps cameras near their given poses. Iterates Levenberg–Marquardt with weights
+//! `1 / (1 + ‖r‖² / c²)`; points are eliminated, so that the system to solve has six unknowns for
+//! each camera (the Schur complement: Triggs, McLauchlan, Hartley, Fitzgibbon 2000, "Bundle
+//! Adjustment — A Modern Synthesis"). A camera moves by `R ← R exp(ω)`, `C ← C + t`. The matrix is
+//! small and dense.
 
 use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
 use rayon::prelude::*;
@@ -14,7 +16,8 @@ use tiface_base::math::{cholesky::solve, rank};
 /// Standard deviation of a camera's rotation before any measurement, radians: 0.3°.
 const PRIOR_TURN: f64 = 0.3 * std::f64::consts::PI / 180.0;
 
-/// Standard deviation of a camera's position before any measurement, scene units: 3 mm of a head that is 0.3 m high.
+/// Standard deviation of a camera's position before any measurement, scene units: 3 mm of a head
+/// that is 0.3 m high.
 const PRIOR_SHIFT: f64 = 0.02;
 
 /// Maximum number of Levenberg–Marquardt steps, rejected ones included.
@@ -23,7 +26,8 @@ const STEPS: usize = 25;
 /// The iteration ends once a step lowers the cost by less than this share.
 const CONVERGED: f64 = 1e-4;
 
-/// Pieces that sums over tracks are split into; a constant, so that their order does not depend on the threads.
+/// Pieces that sums over tracks are split into; a constant, so that their order does not depend on
+/// the threads.
 const PIECES: usize = 8;
 
 /// Where a point was found in a photograph.
@@ -51,7 +55,8 @@ pub fn project(camera: &Camera, point: DVec3) -> Option<DVec2> {
     camera.project_f64(point).map(|(pixel, _)| pixel)
 }
 
-/// The residual of a sighting in pixels with its derivatives: columns by ω, t and the point's position.
+/// The residual of a sighting in pixels with its derivatives: columns by ω, t and the point's
+/// position.
 struct Linear {
     residual: DVec2,
     camera: [DVec2; 6],
@@ -84,7 +89,8 @@ struct Eliminated {
     inverse: DMat3,
     /// Gradient by the point.
     gradient: DVec3,
-    /// For each sighting by a free camera: its unknowns' place, and the weighted residual and derivatives.
+    /// For each sighting by a free camera: its unknowns' place, and the weighted residual and
+    /// derivatives.
     free: Vec<(usize, f64, Linear, [DVec3; 6])>,
 }
 
@@ -283,8 +289,9 @@ fn orthonormal(m: DMat3) -> DMat3 {
     DMat3::from_cols(x, z.cross(x), z)
 }
 
-/// Moves the `free` cameras and all points until they fit the sightings. `given` are the poses of the prior, and `scale` is
-/// the residual of half weight in pixels. Without free cameras the points alone are placed.
+/// Moves the `free` cameras and all points until they fit the sightings. `given` are the poses of
+/// the prior, and `scale` is the residual of half weight in pixels. Without free cameras the points
+/// alone are placed.
 pub fn adjust(given: &[Camera], cameras: &mut [Camera], tracks: &mut [Track], free: &[bool], scale: f64) {
     let mut next = 0;
     let place = |free: &bool| {
@@ -295,7 +302,8 @@ pub fn adjust(given: &[Camera], cameras: &mut [Camera], tracks: &mut [Track], fr
     Problem { given, places: &places, fixed_points: false, scale, damping: 1e-4 }.minimize(cameras, tracks);
 }
 
-/// Returns the pose that fits points which stay best, seen by the camera of view 0 alone; the prior is the `given` pose.
+/// Returns the pose that fits points which stay best, seen by the camera of view 0 alone; the prior
+/// is the `given` pose.
 pub fn resected(given: &Camera, start: &Camera, tracks: &[Track], scale: f64) -> Camera {
     let (given, mut camera, mut tracks) = ([given.clone()], [start.clone()], tracks.to_vec());
     Problem { given: &given, places: &[Some(0)], fixed_points: true, scale, damping: 1e-4 }
@@ -304,13 +312,14 @@ pub fn resected(given: &Camera, start: &Camera, tracks: &[Track], scale: f64) ->
     camera
 }
 
-/// Returns the similarity that brings adjusted cameras and points closest to the `given` cameras, in pixels: the
-/// adjustment leaves it open. Every camera counts alike and with all points, whether it sees them or not, because its error
-/// is of the whole camera; one that is much farther off than the others has little weight.
+/// Returns the similarity that brings adjusted cameras and points closest to the `given` cameras,
+/// in pixels: the adjustment leaves it open. Every camera counts alike and with all points, whether
+/// it sees them or not, because its error is of the whole camera; one that is much farther off than
+/// the others has little weight.
 pub fn gauge(given: &[Camera], adjusted: &[Camera], points: &[DVec3]) -> Similarity {
     const ROUNDS: usize = 10;
-    /// Squared errors of half weight, of the median: errors of one kind, however they scatter, count nearly in full, since
-    /// the mean of them all is where the world is.
+    /// Squared errors of half weight, of the median: errors of one kind, however they scatter,
+    /// count nearly in full, since the mean of them all is where the world is.
     const USUAL: f64 = 16.0;
     let middle = points.iter().sum::<DVec3>() / points.len().max(1) as f64;
     let mut total = Similarity::IDENTITY;

@@ -1,15 +1,17 @@
 //! Exposure and white balance of photographs, from points of the head that several of them show.
 //!
-//! In linear light, the logarithm of what view `v` shows of point `p` is `point_p + view_v`. A robust fit (Cauchy weights, points
-//! eliminated) of points on the visual hull in blurred photographs gives both, except for a constant that is taken to be 0 in
-//! the mean of the training views.
+//! In linear light, the logarithm of what view `v` shows of point `p` is `point_p + view_v`. A
+//! robust fit (Cauchy weights, points eliminated) of points on the visual hull in blurred
+//! photographs gives both, except for a constant that is taken to be 0 in the mean of the training
+//! views.
 //!
-//! Skin is not Lambertian: grazing skin and glare make what a view shows brighter by a few per cent, smoothly over the viewing
-//! directions, and the fit cannot tell that from exposure. What is linear in the viewing direction is therefore taken out of
-//! the exposures, which leaves 0.7 to 1.9 % instead of 3 to 4 % on captures of one exposure. Colors have little of it, and keep it.
+//! Skin is not Lambertian: grazing skin and glare make what a view shows brighter by a few per
+//! cent, smoothly over the viewing directions, and the fit cannot tell that from exposure. What is
+//! linear in the viewing direction is therefore taken out of the exposures, which leaves 0.7 to 1.9
+//! % instead of 3 to 4 % on captures of one exposure. Colors have little of it, and keep it.
 //!
-//! Vignetting is not measured: one number for each lens in the same equations came out between −0.24 and +0.11 on captures
-//! without any, since grazing skin lies at the outline.
+//! Vignetting is not measured: one number for each lens in the same equations came out between
+//! −0.24 and +0.11 on captures without any, since grazing skin lies at the outline.
 
 use super::adjust::median;
 use super::tracks::{HEAD, MIN_VIEWS, Seed, blurred, is_set, seeds};
@@ -29,7 +31,8 @@ const BLUR: f32 = 3.0;
 /// Pixels around each that must be usable.
 const MARGIN: usize = 3;
 
-/// Coded values that are neither saturated nor as dark as hair, whose highlights move with the view.
+/// Coded values that are neither saturated nor as dark as hair, whose highlights move with the
+/// view.
 const EXPOSED: Range<u8> = 40..248;
 
 /// Minimum number of training views that can be measured. Four numbers describe what is linear in
@@ -42,10 +45,12 @@ const MIN_POINTS: usize = 50;
 /// Minimum cosine between the normal and the direction to the camera.
 const MIN_COSINE: f32 = 0.35;
 
-/// Root mean square of logarithms from which on exposures or colors differ. Captures of one exposure reach 0.019 and 0.013.
+/// Root mean square of logarithms from which on exposures or colors differ. Captures of one
+/// exposure reach 0.019 and 0.013.
 const MIN_SPREAD: f64 = 0.025;
 
-/// Logarithm of a single view's brightness from which on exposures differ. Captures of one exposure reach 0.044.
+/// Logarithm of a single view's brightness from which on exposures differ. Captures of one exposure
+/// reach 0.044.
 const MIN_ALONE: f64 = 0.08;
 
 /// Rounds of the robust fits.
@@ -123,9 +128,9 @@ struct Sample {
     light: [f64; 3],
 }
 
-/// Measures exposures. The first `train` views are the training views, which alone decide what is common; the others are
-/// compared with it one by one. A training view that shows too little, for it is dark or saturated
-/// or sees the head from where no other does, takes no part.
+/// Measures exposures. The first `train` views are the training views, which alone decide what is
+/// common; the others are compared with it one by one. A training view that shows too little, for
+/// it is dark or saturated or sees the head from where no other does, takes no part.
 pub fn measure(
     views: &[ExposureView],
     cameras: &[Camera],
@@ -261,10 +266,11 @@ fn fit_channel(points: &[Vec<Sample>], k: usize, views: usize, train: usize) -> 
     Some(x)
 }
 
-/// Takes out of the brightness what is linear in the viewing direction, as a robust fit to the training views finds it, and
-/// leaves a mean of 0 over these.
+/// Takes out of the brightness what is linear in the viewing direction, as a robust fit to the
+/// training views finds it, and leaves a mean of 0 over these.
 fn without_direction(logs: &[[f64; 3]], cameras: &[Camera], train: usize) -> Vec<[f64; 3]> {
-    /// Keeps directions that the cameras do not tell apart, such as the height of a turntable's, out of the fit.
+    /// Keeps directions that the cameras do not tell apart, such as the height of a turntable's,
+    /// out of the fit.
     const RIDGE: f64 = 1e-3;
     let row = |c: &Camera| {
         let DVec3 { x, y, z } = c.position.normalize_or_zero();

@@ -14,22 +14,26 @@ const LEAST_EXPECTED: usize = 5 * LEAST_SIGHTINGS;
 /// Points that must be found for anything to be said.
 const LEAST_TRACKS: usize = 100;
 
-/// A camera is not repaired but reported if it has to move farther, pixels: the patches would hardly be found.
+/// A camera is not repaired but reported if it has to move farther, pixels: the patches would
+/// hardly be found.
 const FARTHEST_PX: f64 = 10.0;
 
-/// Patches of a photograph fit somewhere by chance: its camera is lost if its residual stays above this many pixels …
+/// Patches of a photograph fit somewhere by chance: its camera is lost if its residual stays above
+/// this many pixels …
 const LOST_PX: f64 = 1.0;
 
 /// … and above this many times that of all.
 const LOST_SHARE: f64 = 4.0;
 
-/// All cameras are refined if the residual falls below this share of what it is with the poses given.
+/// All cameras are refined if the residual falls below this share of what it is with the poses
+/// given.
 const GAIN: f64 = 0.8;
 
-/// Cameras fit in no pose if the residual of all stays above this many pixels, and less than this share of the points that
-/// other photographs share is found. Nine of ten are found where photographs and cameras belong together, blurred ones (whose
-/// residual is above a pixel) and poses that are 4 px off included; a third to six of ten in a wrong order, and up to eight
-/// where every photograph is a neighbor's.
+/// Cameras fit in no pose if the residual of all stays above this many pixels, and less than this
+/// share of the points that other photographs share is found. Nine of ten are found where
+/// photographs and cameras belong together, blurred ones (whose residual is above a pixel) and
+/// poses that are 4 px off included; a third to six of ten in a wrong order, and up to eight where
+/// every photograph is a neighbor's.
 const APART: [(f64, f64); 2] = [(1.0, 0.8), (0.4, 0.65)];
 
 /// A single camera is refined if it has to move at least so far, pixels …
@@ -62,8 +66,8 @@ pub enum CameraState {
     Stays,
     /// Its pose is refined.
     Refined,
-    /// Its photograph does not show what it should: it has too few sightings, though it sees as much of the head as
-    /// others, or they fit no pose.
+    /// Its photograph does not show what it should: it has too few sightings, though it sees as
+    /// much of the head as others, or they fit no pose.
     Lost,
     /// It is too far off to be refined.
     Far,
@@ -76,20 +80,23 @@ pub struct CameraFit {
     pub state: CameraState,
     /// How many points were found in its photograph.
     pub sightings: usize,
-    /// How many points of the last round, all found in other photographs before, were looked up in it.
+    /// How many points of the last round, all found in other photographs before, were looked up in
+    /// it.
     pub expected: usize,
     /// Median distance of these from the projections of free points with the poses given, pixels.
     pub given_px: f64,
     /// The same after the adjustment of all cameras.
     pub adjusted_px: f64,
-    /// How far the head moves in its picture from the pose given to the adjusted one, pixels (root mean square).
+    /// How far the head moves in its picture from the pose given to the adjusted one, pixels (root
+    /// mean square).
     pub moved_px: f64,
     /// The camera with the pose to use.
     pub camera: Camera,
 }
 
-/// Decides which poses to refine, given the cameras and tracks of an adjustment of all. `expected` is how many points each camera was
-/// expected to see, and `all` asks for all cameras to be refined.
+/// Decides which poses to refine, given the cameras and tracks of an adjustment of all. `expected`
+/// is how many points each camera was expected to see, and `all` asks for all cameras to be
+/// refined.
 pub(super) fn decide(
     given: &[Camera],
     adjusted: Vec<Camera>,
@@ -141,15 +148,16 @@ pub(super) fn decide(
     rig
 }
 
-/// Sets the state of each camera and returns the decision for all. `residual` is that of all after the adjustment, and `gains` says
-/// whether it falls enough.
+/// Sets the state of each camera and returns the decision for all. `residual` is that of all after
+/// the adjustment, and `gains` says whether it falls enough.
 fn judge(cameras: &mut [CameraFit], residual: f64, gains: bool) -> PoseDecision {
     let moves = cameras.iter().filter(|c| c.sightings >= LEAST_SIGHTINGS).map(|c| c.moved_px);
     let usual_move = median(&mut moves.collect::<Vec<f64>>());
     for c in cameras.iter_mut() {
         let stands_out = c.moved_px > LEAST_MOVE_PX.max(STANDS_OUT * usual_move);
         c.state = match () {
-            // where few points are found in other photographs either, such as in hair, few sightings mean nothing
+            // where few points are found in other photographs either, such as in hair, few
+            // sightings mean nothing
             () if c.sightings < LEAST_SIGHTINGS && c.expected < LEAST_EXPECTED => CameraState::Stays,
             () if c.sightings < LEAST_SIGHTINGS => CameraState::Lost,
             () if c.adjusted_px > LOST_PX.max(LOST_SHARE * residual) => CameraState::Lost,
@@ -172,7 +180,8 @@ fn is_apart(cameras: &[CameraFit], residual: f64) -> bool {
     APART.iter().any(|&(most_px, least_share)| residual > most_px && share < least_share)
 }
 
-/// Returns the poses of the cameras to refine where all others keep theirs, and moves the points of the tracks accordingly.
+/// Returns the poses of the cameras to refine where all others keep theirs, and moves the points of
+/// the tracks accordingly.
 fn refine_selected(
     given: &[Camera],
     adjusted: Vec<Camera>,

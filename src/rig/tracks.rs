@@ -1,11 +1,12 @@
 //! Points of a rough surface, found again in the photographs.
 //!
-//! A patch of the tangent plane of a point is looked up in every photograph in which the point is visible. Where poses
-//! and surface are wrong, the patch lies beside its true place there, differently in each photograph. Gauss–Newton moves
-//! it in the picture until its brightness, normalized to mean 0 and length 1, fits that of the mean of the *other*
-//! photographs (Lucas, Kanade 1981, with the inverse of neither picture preferred), first in a blurred picture, then in
-//! the sharp one. Since all photographs move, none is taken for the truth, and what is common to all of them is left to
-//! the adjustment, where points are free.
+//! A patch of the tangent plane of a point is looked up in every photograph in which the point is
+//! visible. Where poses and surface are wrong, the patch lies beside its true place there,
+//! differently in each photograph. Gauss–Newton moves it in the picture until its brightness,
+//! normalized to mean 0 and length 1, fits that of the mean of the *other* photographs (Lucas,
+//! Kanade 1981, with the inverse of neither picture preferred), first in a blurred picture, then in
+//! the sharp one. Since all photographs move, none is taken for the truth, and what is common to
+//! all of them is left to the adjustment, where points are free.
 
 use super::adjust::{Sighting, Track, project};
 use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
@@ -31,7 +32,8 @@ const MIN_COSINE: f32 = 0.35;
 /// Minimum correlation of a patch with the mean of the others.
 const MIN_CORRELATION: f32 = 0.7;
 
-/// Minimum standard deviation of a patch with texture, where white is 1. Rounding to 8 bits has 0.3 / 255.
+/// Minimum standard deviation of a patch with texture, where white is 1. Rounding to 8 bits has 0.3
+/// / 255.
 const MIN_CONTRAST: f32 = 0.8 / 255.0;
 
 /// Mask values from here on are head.
@@ -41,8 +43,8 @@ pub const HEAD: u8 = 250;
 pub struct RigView {
     /// Pixels a row.
     width: usize,
-    /// Brightness, white is 1: slightly blurred, so that interpolation between pixels does not sharpen and soften the
-    /// patch as it moves, and strongly blurred.
+    /// Brightness, white is 1: slightly blurred, so that interpolation between pixels does not
+    /// sharpen and soften the patch as it moves, and strongly blurred.
     pictures: [Vec<f32>; 2],
     /// Per pixel: whether a patch around it shows the head alone.
     usable: Vec<bool>,
@@ -145,8 +147,8 @@ pub fn blurred(picture: &[f32], w: usize, deviation: f32) -> Vec<f32> {
     blurred
 }
 
-/// Spreads `count` points evenly over a surface, and finds out which views see each. `is_usable` says whether a view can be
-/// used at a position of its picture.
+/// Spreads `count` points evenly over a surface, and finds out which views see each. `is_usable`
+/// says whether a view can be used at a position of its picture.
 pub fn seeds(
     surface: &Mesh,
     cameras: &[Camera],
@@ -198,7 +200,8 @@ pub fn seeds(
     places.par_iter().with_min_len(64).filter_map(seed).collect()
 }
 
-/// A patch sampled in a photograph: values of mean 0 and length 1, and their slopes along both axes of the picture.
+/// A patch sampled in a photograph: values of mean 0 and length 1, and their slopes along both axes
+/// of the picture.
 struct Patch {
     value: [f32; PATCH],
     slope: [[f32; PATCH]; 2],
@@ -239,8 +242,8 @@ impl<'a> Placed<'a> {
         Some(Placed { view, picture, center, axes: pixels, shift: Vec2::ZERO })
     }
 
-    /// Samples the patch where it is now. Returns false, and leaves `out` unusable, if it leaves the head or has no
-    /// contrast.
+    /// Samples the patch where it is now. Returns false, and leaves `out` unusable, if it leaves
+    /// the head or has no contrast.
     fn sample(&self, level: usize, out: &mut Patch) -> bool {
         let RigView { width, pictures, usable } = self.picture;
         let (w, picture) = (*width, &pictures[level]);
@@ -291,8 +294,9 @@ fn dot(a: &[f32; PATCH], b: &[f32; PATCH]) -> f32 {
     sums.iter().sum()
 }
 
-/// Returns the step in pixels that fits a patch to a target of mean 0 and length 1: Gauss–Newton on the difference of the
-/// normalized patches. `None` where the patch does not say where it belongs along some direction.
+/// Returns the step in pixels that fits a patch to a target of mean 0 and length 1: Gauss–Newton on
+/// the difference of the normalized patches. `None` where the patch does not say where it belongs
+/// along some direction.
 fn step_to(patch: &Patch, target: &[f32; PATCH]) -> Option<Vec2> {
     /// Smallest share of the larger curvature that the smaller one may have.
     const EDGE: f32 = 0.02;
@@ -312,8 +316,8 @@ fn step_to(patch: &Patch, target: &[f32; PATCH]) -> Option<Vec2> {
         .then(|| -Vec2::new(yy * gx - xy * gy, xx * gy - xy * gx) / determinant)
 }
 
-/// Moves the patches of one point until each fits the mean of the others. Returns how well each fits; those that left the
-/// head are removed.
+/// Moves the patches of one point until each fits the mean of the others. Returns how well each
+/// fits; those that left the head are removed.
 fn align(placed: &mut Vec<Placed>, level: usize, patch: &mut Patch) -> Vec<f32> {
     let Level { spacing, steps, .. } = LEVELS[level];
     let mut values: Vec<[f32; PATCH]> = Vec::with_capacity(placed.len());
@@ -367,8 +371,8 @@ pub fn looked_up(cameras: &[Camera], seeds: &[Seed]) -> Vec<usize> {
     counts
 }
 
-/// Looks up points in the photographs. `levels` counts passes: two begin in the blurred pictures. Returns for each seed the
-/// point with its sightings, if enough views agree.
+/// Looks up points in the photographs. `levels` counts passes: two begin in the blurred pictures.
+/// Returns for each seed the point with its sightings, if enough views agree.
 pub fn find(views: &[RigView], cameras: &[Camera], seeds: &[Seed], levels: usize) -> Vec<Option<Track>> {
     let look_up = |seed: &Seed| {
         let frontal = frontal(cameras, seed);
@@ -395,8 +399,9 @@ pub fn find(views: &[RigView], cameras: &[Camera], seeds: &[Seed], levels: usize
     seeds.par_iter().with_min_len(16).map(look_up).collect()
 }
 
-/// Looks up points in one more photograph, whose patches are moved until they fit the mean of those that the points were
-/// found in; these stay. Returns the points found, each with its sighting in view 0 alone.
+/// Looks up points in one more photograph, whose patches are moved until they fit the mean of those
+/// that the points were found in; these stay. Returns the points found, each with its sighting in
+/// view 0 alone.
 pub fn find_in(
     (photo, camera): (&RigView, &Camera),
     views: &[RigView],
@@ -435,7 +440,8 @@ pub fn find_in(
     tracks.par_iter().with_min_len(16).filter_map(look_up).collect()
 }
 
-/// Returns the seeds moved to the points of their tracks, with normals of the surface through their neighbors.
+/// Returns the seeds moved to the points of their tracks, with normals of the surface through their
+/// neighbors.
 pub fn moved_to(seeds: &[Seed], tracks: &[Track]) -> Vec<Seed> {
     let positions: Vec<DVec3> = tracks.iter().map(|t| t.position).collect();
     let moved = |(seed, track): (&Seed, &Track)| Seed {
@@ -446,7 +452,8 @@ pub fn moved_to(seeds: &[Seed], tracks: &[Track]) -> Vec<Seed> {
     seeds.par_iter().zip(tracks).with_min_len(16).map(moved).collect()
 }
 
-/// Returns the normal of the plane that is closest to the neighbors of a point, or `before` if that is quite another one.
+/// Returns the normal of the plane that is closest to the neighbors of a point, or `before` if that
+/// is quite another one.
 fn normal_among(point: DVec3, positions: &[DVec3], before: Vec3) -> Vec3 {
     const NEIGHBORS: usize = 16;
     /// Least cosine between both.

@@ -28,7 +28,8 @@ impl Cost {
     }
 }
 
-/// Sums costs of stages that run one after the other: times and files add up, memory is the maximum.
+/// Sums costs of stages that run one after the other: times and files add up, memory is the
+/// maximum.
 impl Add for Cost {
     type Output = Cost;
 

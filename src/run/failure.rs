@@ -18,7 +18,8 @@ pub struct Failure {
 /// File name of the failure in a run.
 pub const FAILED: &str = "failed.json";
 
-/// Returns the `failed.json` of a run; `None` if it is absent or unreadable: it is informative only.
+/// Returns the `failed.json` of a run; `None` if it is absent or unreadable: it is informative
+/// only.
 pub fn read_failure(run: &Path) -> Option<Failure> {
     let path = run.join(FAILED);
     io::is_file(&path).then(|| io::read_typed(&path, &Limits::default()).ok()).flatten()

@@ -6,8 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use tiface_base::io::{self, ReadError};
 
-/// Everything that affects the result of a stage. Stored in full, not only as a hash, so that a difference can be
-/// reported key by key.
+/// Everything that affects the result of a stage. Stored in full, not only as a hash, so that a
+/// difference can be reported key by key.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Fingerprint {
     /// Version of the stage's files; raised when their meaning changes.

@@ -1,5 +1,5 @@
-//! Reports a stage's progress to status, log and screen at different rates; and the stop request, which keeps the running
-//! stage.
+//! Reports a stage's progress to status, log and screen at different rates; and the stop request,
+//! which keeps the running stage.
 //!
 //! All intervals use the monotonic clock, so that a change of the system time has no effect.
 
@@ -307,12 +307,12 @@ impl Stop {
         Error::stopped(kept).with_kind(self.requested().unwrap_or(ErrorKind::Interrupted))
     }
 
-    /// Returns the error to end the process with before its stages end. `None` while a stage that saves
-    /// has something to save, and within `patience` of a stage's beginning or end. The status of the stage then says
-    /// that it was stopped.
+    /// Returns the error to end the process with before its stages end. `None` while a stage that
+    /// saves has something to save, and within `patience` of a stage's beginning or end. The status
+    /// of the stage then says that it was stopped.
     ///
-    /// Nothing is lost by it that a stop would have kept: files are written aside and renamed, and only learning can
-    /// go on in the middle of a stage.
+    /// Nothing is lost by it that a stop would have kept: files are written aside and renamed, and
+    /// only learning can go on in the middle of a stage.
     pub fn abandon(&self, patience: Duration) -> Option<Error> {
         let current = self.current();
         if current.since.is_some_and(|t| t.elapsed() < patience) {

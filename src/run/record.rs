@@ -32,7 +32,8 @@ pub struct Record {
     /// Warnings.
     #[serde(default)]
     pub warnings: Vec<String>,
-    /// Size of each file of the stage, bytes, by its path in the stage's folder; empty in older records.
+    /// Size of each file of the stage, bytes, by its path in the stage's folder; empty in older
+    /// records.
     #[serde(default)]
     pub products: BTreeMap<String, u64>,
     /// SHA-256 of the same files, hexadecimal; empty in older records.
@@ -47,8 +48,8 @@ pub struct Record {
 /// Files that record times, and are no products of a stage.
 pub(super) const TIMED: [&str; 3] = ["done.json", "status.json", "log.jsonl"];
 
-/// Files that no stage reads; a run is complete without them. `tiface export` writes the head again from the stage's
-/// folder `parts`.
+/// Files that no stage reads; a run is complete without them. `tiface export` writes the head again
+/// from the stage's folder `parts`.
 const EXPORTS: [&str; 10] = [
     "head.glb",
     "head.obj",
@@ -104,7 +105,8 @@ impl Display for Fault {
 }
 
 impl Record {
-    /// Returns the fault of one of the stage's files, if it is missing from the stage's folder or has another size.
+    /// Returns the fault of one of the stage's files, if it is missing from the stage's folder or
+    /// has another size.
     pub fn fault(&self, folder: &Path, name: &str) -> Option<Fault> {
         let (file, bytes) = (folder.join(name), *self.products.get(name)?);
         let (state, problem) = match io::file_size(&file) {
@@ -149,8 +151,8 @@ impl Record {
         }
     }
 
-    /// Compares the files in the stage's folder with those that the stage left. Returns the exported files that were moved
-    /// away.
+    /// Compares the files in the stage's folder with those that the stage left. Returns the
+    /// exported files that were moved away.
     ///
     /// # Errors
     ///

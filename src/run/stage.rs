@@ -23,7 +23,8 @@ pub struct Plan<'a> {
     pub device: &'a str,
     /// Estimated disk space, bytes.
     pub needs_bytes: u64,
-    /// Whether the stage saves its progress on a stop request. The process does not wait for a stage that does not.
+    /// Whether the stage saves its progress on a stop request. The process does not wait for a
+    /// stage that does not.
     pub saves: bool,
 }
 
@@ -93,7 +94,8 @@ pub struct Done {
 }
 
 impl Run {
-    /// Completes a stage: skips it if it is complete, else calls `work` and records the returned figures.
+    /// Completes a stage: skips it if it is complete, else calls `work` and records the returned
+    /// figures.
     ///
     /// ```
     /// use tiface::run::{Fingerprint, Plan, Run};
@@ -113,8 +115,8 @@ impl Run {
     /// # Ok::<(), Box<dyn std::error::Error>>(())
     /// ```
     ///
-    /// Exit code 75 if another process holds the stage's lock, 1 if it was done or begun with another
-    /// fingerprint or if the disk has too little space. `work` leaves the stage's files in
+    /// Exit code 75 if another process holds the stage's lock, 1 if it was done or begun with
+    /// another fingerprint or if the disk has too little space. `work` leaves the stage's files in
     /// [`StageDir::folder`], complete and durable, before it returns.
     pub fn stage(&self, plan: Plan, work: impl FnOnce(&StageDir) -> Result<Value>) -> Result<Done> {
         let name = plan.name;
@@ -181,8 +183,8 @@ impl Run {
         }
     }
 
-    /// Checks that the content of the stage's folder was made, or begun, with this plan. Fails with the differences if
-    /// not, and if the files were made by no stage; an empty folder is accepted.
+    /// Checks that the content of the stage's folder was made, or begun, with this plan. Fails with
+    /// the differences if not, and if the files were made by no stage; an empty folder is accepted.
     pub fn agrees(&self, plan: &Plan) -> Result<()> {
         // a record that cannot be read counts as none, and is reported when the stage is worked on
         if let Ok(Some(record)) = read_record(&self.path(plan.name)) {
@@ -208,8 +210,8 @@ impl Run {
         ))
     }
 
-    /// Returns the bytes of the files of a stage, by their path in its folder; of what has a record of its own below it
-    /// none.
+    /// Returns the bytes of the files of a stage, by their path in its folder; of what has a record
+    /// of its own below it none.
     pub fn files(&self, stage: &str) -> Result<BTreeMap<String, u64>> {
         Ok(io::file_sizes(&self.path(stage), &has_record)?)
     }
@@ -239,7 +241,8 @@ impl Run {
         Ok(Some(Done { digest, summary, skipped: true }))
     }
 
-    /// Returns the seconds of work of earlier processes in the folder; fails if they had other settings.
+    /// Returns the seconds of work of earlier processes in the folder; fails if they had other
+    /// settings.
     fn begun(&self, plan: &Plan) -> Result<f64> {
         let Ok(Some(status)) = read_status(&self.path(plan.name)) else { return Ok(0.0) };
         same(plan, &status.fingerprint, false)?;
@@ -323,8 +326,8 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
     ))
 }
 
-/// Removes temporary files in a stage's folder and its subfolders, except behind links and in folders that another process
-/// may be writing.
+/// Removes temporary files in a stage's folder and its subfolders, except behind links and in
+/// folders that another process may be writing.
 fn sweep(folder: &Path) -> Result<usize> {
     if io::is_link(folder) {
         return Ok(0);

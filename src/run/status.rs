@@ -1,4 +1,5 @@
-//! `status.json`, the progress of a stage; [`RunStatus`], the state of a whole run from the files of its stages.
+//! `status.json`, the progress of a stage; [`RunStatus`], the state of a whole run from the files
+//! of its stages.
 
 use super::estimate::read_estimate;
 use super::failure::read_failure;
@@ -140,8 +141,8 @@ pub struct RunStatus {
     pub at: Option<Stage>,
     /// The error of a command on it, or of one of its stages.
     pub error: Option<String>,
-    /// Estimated seconds left of all stages (wall clock), at the measured speed of those that are done; `None` without
-    /// an estimate.
+    /// Estimated seconds left of all stages (wall clock), at the measured speed of those that are
+    /// done; `None` without an estimate.
     pub left_s: Option<f64>,
     /// Seconds of work so far.
     pub elapsed_s: f64,
@@ -155,8 +156,8 @@ impl RunStatus {
         let mut stages: Vec<StageStatus> =
             Stage::ALL.into_iter().filter(is_part).map(|s| StageStatus::read(&run.join(s), s)).collect();
         let cost = |s: &StageStatus| estimate.as_ref()?.get(s.stage.as_str()).map(|c| c.seconds());
-        // the machine that works on it may be faster or slower, and do other things besides; what networks do for masks
-        // says nothing about that
+        // the machine that works on it may be faster or slower, and do other things besides; what
+        // networks do for masks says nothing about that
         let done = stages.iter().filter(|s| s.stage != Stage::Mask);
         let done = done.filter_map(|s| Some((s.record.as_ref()?.elapsed_s, cost(s)?)));
         let (took, estimated) = done.fold((0.0, 0.0), |(a, b), (took, cost)| (a + took, b + cost));
@@ -249,7 +250,8 @@ impl StageStatus {
     }
 }
 
-/// Returns whether the process of a status still runs; unknown, so assumed, for one on another machine.
+/// Returns whether the process of a status still runs; unknown, so assumed, for one on another
+/// machine.
 fn is_alive(status: &Status, folder: &Path) -> bool {
     status.host != host() || io::has_open(status.pid, &folder.join(LOCK))
 }

@@ -23,7 +23,8 @@ pub struct VerifiedFile {
     pub file: String,
     /// Its recorded size.
     pub bytes: u64,
-    /// Its recorded SHA-256, hexadecimal; `None` in older records, by which only the size is compared.
+    /// Its recorded SHA-256, hexadecimal; `None` in older records, by which only the size is
+    /// compared.
     pub sha256: Option<String>,
     /// Its state.
     pub state: ProductState,
@@ -43,7 +44,8 @@ impl Verification {
 }
 
 impl Record {
-    /// Returns the fault of one of the stage's files, by its size and then by its SHA-256, as far as they are recorded.
+    /// Returns the fault of one of the stage's files, by its size and then by its SHA-256, as far
+    /// as they are recorded.
     pub fn verify(&self, folder: &Path, name: &str) -> Result<Option<Fault>> {
         if let Some(fault) = self.fault(folder, name) {
             return Ok(Some(fault));
@@ -58,8 +60,8 @@ impl Record {
     }
 }
 
-/// Compares the products in a run's folder with the records of their stages, byte for byte. Products of older records are
-/// compared by size, as far as it is known.
+/// Compares the products in a run's folder with the records of their stages, byte for byte.
+/// Products of older records are compared by size, as far as it is known.
 ///
 /// # Errors
 ///

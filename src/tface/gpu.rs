@@ -1,6 +1,6 @@
-//! A training step of the vector-matrix field on a GPU. Sampling, marching, decoding, losses and optimizer all run on the
-//! device, so the host never waits within a step. Alpha masks and refined grids, a handful per training, are computed on
-//! the host.
+//! A training step of the vector-matrix field on a GPU. Sampling, marching, decoding, losses and
+//! optimizer all run on the device, so the host never waits within a step. Alpha masks and refined
+//! grids, a handful per training, are computed on the host.
 
 use super::ops::{BACKGROUND_STREAM, VmGroups, VmOps, mask_term, random_background};
 use super::record::decoder;
@@ -20,9 +20,10 @@ use tiface_kernels::gpu::{
     self, Buffer, Device, DeviceBatch, DeviceDecoder, Gate, SamplingOptions, Vm, VmLosses, VmValues,
 };
 
-/// Returns the settings with so few voxels that a cube of them takes no more memory than a box of any shape does with
-/// those of `config`. A cube has the shortest diagonal, and the smallest planes if all have as many channels; else a box
-/// may have smaller ones, at least those of the geometric mean of the channels.
+/// Returns the settings with so few voxels that a cube of them takes no more memory than a box of
+/// any shape does with those of `config`. A cube has the shortest diagonal, and the smallest planes
+/// if all have as many channels; else a box may have smaller ones, at least those of the geometric
+/// mean of the channels.
 fn with_fewest_voxels(config: &VmConfig) -> VmConfig {
     let share = |ranks: &[usize]| {
         let ranks = || ranks.iter().map(|rank| rank.next_multiple_of(4) as f64);
@@ -51,8 +52,8 @@ pub struct GpuVm<'a> {
 }
 
 impl<'a> GpuVm<'a> {
-    /// Checks that a device supports the field of a training in a box and has enough memory for its largest grids. Returns
-    /// whether the photographs fit as well.
+    /// Checks that a device supports the field of a training in a box and has enough memory for its
+    /// largest grids. Returns whether the photographs fit as well.
     pub fn fits(
         stage: &str,
         config: &VmConfig,
@@ -109,8 +110,8 @@ impl<'a> GpuVm<'a> {
         plan.map(|(_, resident)| resident)
     }
 
-    /// Creates the operations of a training that [`fits`](GpuVm::fits) a device. `resident` copies the photographs to the
-    /// device.
+    /// Creates the operations of a training that [`fits`](GpuVm::fits) a device. `resident` copies
+    /// the photographs to the device.
     pub fn new(
         config: &'a VmConfig,
         sampler: &'a RaySampler<'a>,

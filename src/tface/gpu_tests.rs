@@ -20,9 +20,9 @@ use tiface_kernels::gpu::testing::device;
 
 const BOUNDS: [[f32; 3]; 2] = [[-0.8; 3], [0.8; 3]];
 
-/// As small as a driver in software needs it, for which a step takes as long as it has samples. Color
-/// ranks and decoder are those of the preset, for which the kernels are compiled anyway; the density's
-/// channels are padded on a device.
+/// As small as a driver in software needs it, for which a step takes as long as it has samples.
+/// Color ranks and decoder are those of the preset, for which the kernels are compiled anyway; the
+/// density's channels are padded on a device.
 fn config() -> VmConfig {
     VmConfig {
         steps: 40,
@@ -66,12 +66,13 @@ fn step_on_cpu(model: &mut VmModel<CpuVm>, step: u64) -> StepReport {
     training::step(model, 3, &progress, true).ok().flatten().unwrap()
 }
 
-/// Compares the color loss of steps that go on from the start on the CPU and on the device, which is read after every
-/// `every`.
+/// Compares the color loss of steps that go on from the start on the CPU and on the device, which
+/// is read after every `every`.
 fn losses_follow_those_of_the_cpu(config: &VmConfig, steps: u64, every: u64) {
     let Some(device) = device() else { return };
     let (dir, views) = (temporary(), ball::views());
-    // after a grid has grown, Adam's first steps go by the sign of what is zero but for rounding: that is another story
+    // after a grid has grown, Adam's first steps go by the sign of what is zero but for rounding:
+    // that is another story
     let config = &VmConfig { steps: 200, upsample_at: vec![], mask_at: vec![], ..config.clone() };
     let sampler = sampler(&views, config);
     let session = session("tface", dir.path(), "ball", &Quiet);
@@ -122,8 +123,8 @@ fn a_device_sees_the_same(view: &TrainView, dir: &Path) {
     });
 }
 
-/// Compares a training on the device, with some steps on the CPU in between, with one on the CPU alone:
-/// what is seen, and the rays of all steps.
+/// Compares a training on the device, with some steps on the CPU in between, with one on the CPU
+/// alone: what is seen, and the rays of all steps.
 fn trainings_follow_the_cpu(config: &VmConfig, in_turn: [u64; 2]) {
     if device().is_none() {
         return;
@@ -261,8 +262,9 @@ fn a_device_that_is_lost_leaves_the_last_checkpoint_and_the_training_goes_on() {
     };
     let begun = temporary();
     assert!(run(begun.path(), "cpu", &StopAfter::new(47)).err().unwrap().kind().is_stop());
-    // To grow the grids, the host reads whether a gradient was not finite, and nine arrays of parameters; then come the
-    // losses of step 49, those of step 51, the last one, and the first of those ten again, to save the end.
+    // To grow the grids, the host reads whether a gradient was not finite, and nine arrays of
+    // parameters; then come the losses of step 49, those of step 51, the last one, and the first of
+    // those ten again, to save the end.
     outlives_lost_devices(&run, begun.path(), &[2, 10, 10 + 1 + 1 + 1]);
 }
 
@@ -289,7 +291,8 @@ fn a_device_with_too_little_memory_is_refused_before_the_first_step_and_told_wha
     let field = start(&config()).field(&config(), true);
     let [fixed, ray] = Vm::bytes(&device, &field, config().rays);
     println!("{} KiB of grids and gradients, {ray} bytes a ray", fixed >> 10);
-    // ‖(16, 16, 16)‖ = 27.7: 27 samples, of which the last is none, of 17 words each, and 34 words of the ray
+    // ‖(16, 16, 16)‖ = 27.7: 27 samples, of which the last is none, of 17 words each, and 34 words
+    // of the ray
     assert_eq!((ray, Vm::widest(&field)), (4 * (26 * 17 + 34), 12 * 26));
 }
 

@@ -59,7 +59,8 @@ fn an_imported_checkpoint_renders_as_the_published_arithmetic_does() {
 fn an_imported_field_renders_in_the_scene_as_in_its_own_world() {
     let scene = Similarity::scale_translate(2.5, DVec3::new(0.3, -0.2, 0.1));
     let face = imported(&scene);
-    // a ray of the published loader, written in the scene: world = field · 0.3, directions of depth 1
+    // a ray of the published loader, written in the scene: world = field · 0.3, directions of depth
+    // 1
     let (origin, direction) = (Vec3::new(0.1, -0.2, 4.5), Vec3::new(0.02, 0.05, -1.0));
     let in_scene = |p: Vec3| scene.point(p * 0.3);
     let ray =

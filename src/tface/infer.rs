@@ -1,8 +1,9 @@
 //! Evaluation of a trained field, and import of published checkpoints in place of training.
 //!
-//! `tools/reference/th_to_safetensors.py` converts published checkpoints. A converted checkpoint has our format ([`FORMAT`]), except that its positions are in scaled dataset coordinates, which
-//! the metadata marks by `frame` = `world`. Its ray directions have depth 1 ([`Placement::depth_directions`]), as in the
-//! published loader.
+//! `tools/reference/th_to_safetensors.py` converts published checkpoints. A converted checkpoint
+//! has our format ([`FORMAT`]), except that its positions are in scaled dataset coordinates, which
+//! the metadata marks by `frame` = `world`. Its ray directions have depth 1
+//! ([`Placement::depth_directions`]), as in the published loader.
 
 use super::record::{FORMAT, FieldRecord, NAMES, Placement, geometry};
 use crate::field::GpuField;
@@ -28,8 +29,8 @@ pub struct TFace {
     on_gpu: GpuField<Box<Renderer>>,
 }
 
-/// Number of rays rendered together. A sample whose color is decoded takes two kilobytes, and a ray has dozens: this keeps
-/// them in the low hundreds of megabytes.
+/// Number of rays rendered together. A sample whose color is decoded takes two kilobytes, and a ray
+/// has dozens: this keeps them in the low hundreds of megabytes.
 const PASS: usize = 1 << 11;
 
 impl TFace {
@@ -73,7 +74,8 @@ impl TFace {
         self.on_gpu.failure()
     }
 
-    /// Renders rays in scene coordinates, with unit directions, of a camera that looks along the unit vector `forward`.
+    /// Renders rays in scene coordinates, with unit directions, of a camera that looks along the
+    /// unit vector `forward`.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         let p = self.placement.unwrap_or(Placement { scale: 1.0, offset: [0.0; 3], depth_directions: false });
         // length of each direction in the field's units of t
@@ -106,8 +108,9 @@ impl TFace {
     }
 }
 
-/// Imports a converted checkpoint as the result of a stage: reads it, places it in the scene and writes it into the
-/// session's folder. `scale` is the length of a dataset unit in the checkpoint's world.
+/// Imports a converted checkpoint as the result of a stage: reads it, places it in the scene and
+/// writes it into the session's folder. `scale` is the length of a dataset unit in the checkpoint's
+/// world.
 pub fn import(
     path: &Path,
     scale: f64,

@@ -1,8 +1,9 @@
 //! The mean of several fields of one head, trained with different random seeds.
 //!
-//! Where the photographs do not determine the field, above all in hair, each training gives a different result; the mean
-//! of a few is closer to the truth than any of them (Lakshminarayanan, Pritzel, Blundell 2017, "Deep ensembles"). Masked
-//! PSNR of eight held-out views, 24 photographs of 384 × 512 pixels:
+//! Where the photographs do not determine the field, above all in hair, each training gives a
+//! different result; the mean of a few is closer to the truth than any of them (Lakshminarayanan,
+//! Pritzel, Blundell 2017, "Deep ensembles"). Masked PSNR of eight held-out views, 24 photographs
+//! of 384 × 512 pixels:
 //!
 //! | | steps × rays, voxels | one field | mean of two |
 //! |---|---|---|---|
@@ -11,8 +12,8 @@
 //! | | 2000 × 16,384, 256³ | 32.49 | |
 //! | a bust | 1500 × 8,192, 192³ (`draft`) | 32.82 | 33.09 |
 //!
-//! Weight decay, smaller initial values, channel dropout, jittered rays within a pixel, a running mean of the weights and
-//! stronger smoothing all failed to improve a single field.
+//! Weight decay, smaller initial values, channel dropout, jittered rays within a pixel, a running
+//! mean of the weights and stronger smoothing all failed to improve a single field.
 
 use super::TFace;
 use super::train::{self, TfaceReport, train_one};
@@ -59,8 +60,9 @@ impl FieldMean {
         self.fields.iter().find_map(TFace::gpu_failure)
     }
 
-    /// Renders rays in scene coordinates, with unit directions, of a camera that looks along the unit vector `forward`.
-    /// Returns the mean color (premultiplied, coded), the mean opacity, and the depth weighted by opacity.
+    /// Renders rays in scene coordinates, with unit directions, of a camera that looks along the
+    /// unit vector `forward`. Returns the mean color (premultiplied, coded), the mean opacity, and
+    /// the depth weighted by opacity.
     pub fn render(&self, rays: &[Ray], forward: Vec3) -> Vec<RayResult> {
         let Some((first, others)) = self.fields.split_first() else { return Vec::new() };
         let mut mean = first.render(rays, forward);
@@ -85,16 +87,17 @@ impl FieldMean {
     }
 }
 
-/// Returns the folder of field `i` of a stage: the stage's folder itself for the first, a subfolder for each other.
+/// Returns the folder of field `i` of a stage: the stage's folder itself for the first, a subfolder
+/// for each other.
 fn folder(dir: &Path, i: usize) -> PathBuf {
     if i == 0 { dir.to_owned() } else { dir.join(format!("field_{}", i + 1)) }
 }
 
-/// Trains `config.fields` fields one after the other, saving checkpoints into the session's folder and continuing
-/// from existing ones.
+/// Trains `config.fields` fields one after the other, saving checkpoints into the session's folder
+/// and continuing from existing ones.
 ///
-/// `views` have their cameras in scene coordinates; `bounds` is the scene's tight box; `hull` the masks' visual hull
-/// over [-1, 1]³.
+/// `views` have their cameras in scene coordinates; `bounds` is the scene's tight box; `hull` the
+/// masks' visual hull over [-1, 1]³.
 pub fn train(
     views: Vec<TrainView>,
     bounds: Aabb,

@@ -25,8 +25,8 @@ pub fn mask_term(config: &VmConfig, sampler: &RaySampler) -> MaskTerm {
     }
 }
 
-/// Returns the background of a step's rays. As published, half of the batches are composited over white while their
-/// targets stay over black.
+/// Returns the background of a step's rays. As published, half of the batches are composited over
+/// white while their targets stay over black.
 pub fn background_mode(config: &VmConfig, at: StepAt) -> BackgroundMode {
     let white =
         config.background == VmBackground::Reference && rng::uniform(at.seed, at.step << 4 | 9, 0) < 0.5;
@@ -41,10 +41,11 @@ pub fn random_background(config: &VmConfig) -> bool {
 /// Planes and lines of the density, those of the appearance, the decoder's weights.
 pub type VmGroups<O> = [ParameterGroup<<O as Ops>::Device>; 3];
 
-/// The operations of a training step on one device. Intermediate results of a step stay on the device, in the value that
-/// implements this trait.
+/// The operations of a training step on one device. Intermediate results of a step stay on the
+/// device, in the value that implements this trait.
 pub trait VmOps: Ops {
-    /// Starts or resumes a training, or continues it with refined grids. Returns the parameters in the device's layout.
+    /// Starts or resumes a training, or continues it with refined grids. Returns the parameters in
+    /// the device's layout.
     fn load(&mut self, field: &Arc<VmField>, groups: [HostGroup; 3]) -> VmGroups<Self>;
 
     /// Frees the memory of a field before another one is loaded.
@@ -53,10 +54,12 @@ pub trait VmOps: Ops {
     /// Waits for the device and copies parameters to the host.
     fn read(&self, groups: &VmGroups<Self>) -> Result<[HostGroup; 3]>;
 
-    /// Waits for the device and returns whether any gradient was not finite since the state was loaded.
+    /// Waits for the device and returns whether any gradient was not finite since the state was
+    /// loaded.
     fn is_non_finite(&self) -> Result<bool>;
 
-    /// Draws `rays` rays. A ray of a large photograph stands for a square of pixels at most `detail` wide.
+    /// Draws `rays` rays. A ray of a large photograph stands for a square of pixels at most
+    /// `detail` wide.
     fn draw(&mut self, at: StepAt, rays: usize, detail: f32);
 
     /// Marches the rays, evaluates and decodes the field at their samples, and composites them.
@@ -65,7 +68,8 @@ pub trait VmOps: Ops {
     /// Computes the losses of the rays and their gradients with respect to the composited values.
     fn losses(&mut self, mode: BackgroundMode);
 
-    /// Computes the gradients of the parameters, and closes the [gate](Ops::gate) if one of the decoder is not finite.
+    /// Computes the gradients of the parameters, and closes the [gate](Ops::gate) if one of the
+    /// decoder is not finite.
     fn backward(&mut self, groups: &mut VmGroups<Self>);
 
     /// Adds the gradients of the regularizers of both grids.

@@ -20,8 +20,8 @@ pub struct Placement {
     pub scale: f32,
     /// The scene's origin in field coordinates.
     pub offset: [f32; 3],
-    /// Ray directions are scaled to depth 1 along the optical axis before the decoder sees them, and steps are
-    /// so much longer off the axis: what the published ILSH loader does.
+    /// Ray directions are scaled to depth 1 along the optical axis before the decoder sees them,
+    /// and steps are so much longer off the axis: what the published ILSH loader does.
     pub depth_directions: bool,
 }
 
@@ -45,7 +45,8 @@ pub fn decoder(config: &VmConfig) -> DecoderShape {
     }
 }
 
-/// Description of a field without its values, sufficient to render it without the settings of its training.
+/// Description of a field without its values, sufficient to render it without the settings of its
+/// training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FieldRecord {
     /// Channels of the density's planes.

@@ -12,10 +12,11 @@ use tiface_kernels::cpu::vm::{cropped, density_at, resized, size_for, voxel_sche
 /// Most vertices of an alpha mask; a finer grid keeps the mask's size (published).
 const MASK_VERTICES: usize = 256 * 256 * 256;
 
-/// Rebuilds the alpha mask after `step` steps and, the first time, shrinks the box to it. False if nothing is left.
+/// Rebuilds the alpha mask after `step` steps and, the first time, shrinks the box to it. False if
+/// nothing is left.
 ///
-/// The published mask leaves the distance scale out of its alpha (`1 − exp(−σ · step)`), which makes it
-/// that much stricter than rendering; kept, and `mask_threshold` is in these terms.
+/// The published mask leaves the distance scale out of its alpha (`1 − exp(−σ · step)`), which
+/// makes it that much stricter than rendering; kept, and `mask_threshold` is in these terms.
 pub fn update_mask(state: &mut VmState, config: &VmConfig, step: u64) -> bool {
     let size = match &state.mask {
         Some(mask) if state.masked && state.size.iter().product::<usize>() >= MASK_VERTICES => {
@@ -74,8 +75,8 @@ fn extent(kept: &[bool], size: [usize; 3]) -> Option<([usize; 3], [usize; 3])> {
     (low[0] != usize::MAX).then_some((low, high))
 }
 
-/// Crops the grids to the vertices `first..=last` of a mask of `size` vertices. The optimizer starts again: its
-/// moments belong to planes of another size.
+/// Crops the grids to the vertices `first..=last` of a mask of `size` vertices. The optimizer
+/// starts again: its moments belong to planes of another size.
 fn shrink(
     state: &mut VmState,
     config: &VmConfig,

@@ -69,7 +69,8 @@ fn extent(bounds: [[f32; 3]; 2]) -> [f32; 3] {
     std::array::from_fn(|a| bounds[1][a] - bounds[0][a])
 }
 
-/// Returns the fields with the first and with the last grids of a training in a box that stays as it is.
+/// Returns the fields with the first and with the last grids of a training in a box that stays as
+/// it is.
 #[cfg(feature = "wgpu")]
 pub fn first_and_last(config: &VmConfig, bounds: [[f32; 3]; 2]) -> [VmField; 2] {
     let last = if config.upsample_at.is_empty() { config.voxels_start } else { config.voxels_final };
@@ -93,14 +94,14 @@ impl VmState {
         VmState { bounds, size, groups, mask, reset: 0, moments_from: 0, masked: false }
     }
 
-    /// Returns whether every weight is finite. A NaN in a relu density has neither weight nor gradient, so no loss would
-    /// show it, and total variation would spread it.
+    /// Returns whether every weight is finite. A NaN in a relu density has neither weight nor
+    /// gradient, so no loss would show it, and total variation would spread it.
     pub fn is_finite(&self) -> bool {
         self.groups.iter().all(|group| group.is_finite())
     }
 
-    /// Returns the field as the kernels see it. In training a ray has `‖size‖ / ratio` samples, else as many as the
-    /// box's diagonal needs; both as published.
+    /// Returns the field as the kernels see it. In training a ray has `‖size‖ / ratio` samples,
+    /// else as many as the box's diagonal needs; both as published.
     pub fn field(&self, config: &VmConfig, training: bool) -> Arc<VmField> {
         let mask = self.mask.clone();
         Arc::new(match training {
@@ -109,8 +110,8 @@ impl VmState {
         })
     }
 
-    /// Writes the state into a checkpoint. A finished checkpoint omits the optimizer's moments, because no training
-    /// resumes from it.
+    /// Writes the state into a checkpoint. A finished checkpoint omits the optimizer's moments,
+    /// because no training resumes from it.
     pub fn save(&self, config: &VmConfig, into: &mut Checkpoint, finished: bool) {
         FieldRecord::of(config).save(self.bounds, self.size, self.mask.as_ref(), into);
         self.groups.iter().for_each(|group| group.save(into, !finished));
@@ -119,7 +120,8 @@ impl VmState {
         into.set("masked", u64::from(self.masked));
     }
 
-    /// Reads the state after `step` from a checkpoint; sizes and types must be exactly the configured model's.
+    /// Reads the state after `step` from a checkpoint; sizes and types must be exactly the
+    /// configured model's.
     pub fn restore(
         &mut self,
         config: &VmConfig,

@@ -1,5 +1,6 @@
-//! A whole optimizer step against the same arithmetic in f64: sampling, field, compositing, every loss term and the groups
-//! of Adam, parameter by parameter, for every row of the paper's table; and the terms on numbers worked by hand.
+//! A whole optimizer step against the same arithmetic in f64: sampling, field, compositing, every
+//! loss term and the groups of Adam, parameter by parameter, for every row of the paper's table;
+//! and the terms on numbers worked by hand.
 
 use super::super::ops::mask_term;
 use super::*;
@@ -184,7 +185,8 @@ fn a_step_with_softplus_and_encodings_is_the_one_of_its_formulas() {
     });
 }
 
-/// Color and mask losses of three rays, half seen on head, background of which 0.6 and 0.2 are collected.
+/// Color and mask losses of three rays, half seen on head, background of which 0.6 and 0.2 are
+/// collected.
 fn losses_of(config: &VmConfig, step: u64) -> (f32, f32) {
     let composed = [
         0.3, 0.2, 0.1, 0.5, 0.0, //
@@ -218,13 +220,15 @@ fn the_terms_are_those_worked_by_hand() {
     let (_, mask) = losses_of(&with(MaskLoss::Ce, VmBackground::Black), 0);
     is(mask, -(0.5f64 * 0.4 * 0.8).ln() / 3.0);
     assert_eq!(losses_of(&with(MaskLoss::None, VmBackground::Black), 0).1, 0.0);
-    // over white against a black target: 0.8, 0.7, 0.6 for 0.4, 0.2, 0.3; 0.5 and 0.8 thrice for nothing
+    // over white against a black target: 0.8, 0.7, 0.6 for 0.4, 0.2, 0.3; 0.5 and 0.8 thrice for
+    // nothing
     let white = (0.16 + 0.25 + 0.09 + 3.0 * 0.25 + 3.0 * 0.64) / 9.0;
     let step_of =
         |is_white: bool| (0..).find(|s| (rng::uniform(3, s << 4 | 9, 0) < 0.5) == is_white).unwrap();
     is(losses_of(&with(MaskLoss::None, VmBackground::Reference), step_of(true)).0, white);
     is(losses_of(&with(MaskLoss::None, VmBackground::Reference), step_of(false)).0, 0.08 / 9.0);
-    // one random color behind both: what is collected beside the head hides it, what is missing lets it through
+    // one random color behind both: what is collected beside the head hides it, what is missing
+    // lets it through
     let step = 5;
     let behind = |i: u64| f64::from(rng::uniform(3, step << 4 | 8, i));
     let (color, open, target) = ([0.3, 0.2, 0.1], [0.5, 0.4, 0.8], [0.4, 0.2, 0.3]);
@@ -252,7 +256,8 @@ fn the_published_background_is_white_in_half_of_the_batches() {
 
 #[test]
 fn the_alpha_mask_looks_at_steps_of_the_published_world() {
-    // box of half 0.8 for 1.67: 1 − exp(−σ step / unit) ≥ 1e-4. Density of one value everywhere: 0.1 · 0.1 · 6 channels
+    // box of half 0.8 for 1.67: 1 − exp(−σ step / unit) ≥ 1e-4. Density of one value everywhere:
+    // 0.1 · 0.1 · 6 channels
     let config = VmConfig { mask_at: vec![0.0], ..paper() };
     let (dir, views) = (temporary(), views());
     let sampler = RaySampler::permuted(&views, config.foreground, BOX, true);

@@ -94,8 +94,8 @@ pub(super) struct VmModel<'a, O: VmOps> {
     pub counts: VmFigures,
 }
 
-/// Trains one field in `bounds` until `config.steps`, saving checkpoints into the session's folder and continuing
-/// from the last one; a finished training is left as it is.
+/// Trains one field in `bounds` until `config.steps`, saving checkpoints into the session's folder
+/// and continuing from the last one; a finished training is left as it is.
 pub(super) fn train_one(
     sampler: &RaySampler,
     bounds: [[f32; 3]; 2],
@@ -179,13 +179,14 @@ fn learning_rate(config: &VmConfig, since: u64) -> f64 {
     config.lr_final.powf(since as f64 / config.steps as f64)
 }
 
-/// Returns the factor of the TV weights at a step: they fade by the published 0.1 over the whole training and,
-/// unlike the learning rate, never start again.
+/// Returns the factor of the TV weights at a step: they fade by the published 0.1 over the whole
+/// training and, unlike the learning rate, never start again.
 fn tv_fade(config: &VmConfig, step: u64) -> f64 {
     0.1f64.powf((step + 1) as f64 / config.steps as f64)
 }
 
-/// Resolvable detail as a share of a cell: interpolation between a cell's corners places outlines anywhere within it.
+/// Resolvable detail as a share of a cell: interpolation between a cell's corners places outlines
+/// anywhere within it.
 pub(super) const DETAIL: f32 = 0.25;
 
 /// Returns the views with their masks removed or binarized as configured.
@@ -242,8 +243,8 @@ impl<'a, O: VmOps> VmModel<'a, O> {
         Ok(state)
     }
 
-    /// Returns the width that a ray of a large photograph stands for at a step, scene units, or a single pixel (0) in the
-    /// second half of the training.
+    /// Returns the width that a ray of a large photograph stands for at a step, scene units, or a
+    /// single pixel (0) in the second half of the training.
     fn detail(&self, step: u64) -> f32 {
         let [low, high] = self.state.bounds;
         let cell =

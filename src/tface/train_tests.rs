@@ -141,7 +141,8 @@ fn a_hostile_description_of_a_field_is_refused_before_it_is_rendered() {
 #[test]
 fn published_rates_are_reproduced() {
     let p = VmConfig::preset(Preset::Paper);
-    // decay per step, then rates used at steps 1999, 2001 (just started again) and 49999 (7001 was the last start)
+    // decay per step, then rates used at steps 1999, 2001 (just started again) and 49999 (7001 was
+    // the last start)
     assert!((learning_rate(&p, 1) - 0.99995395).abs() < 1e-8);
     assert!((0.02 * learning_rate(&p, 1999) - 0.0182411).abs() < 1e-7);
     assert_eq!(0.02 * learning_rate(&p, 0), 0.02);

@@ -1,5 +1,6 @@
-//! What happens around a run: two processes at once, a clock that jumps, a run that may not be written, a capture that
-//! changes, moves or comes along to another machine, few open files, little memory.
+//! What happens around a run: two processes at once, a clock that jumps, a run that may not be
+//! written, a capture that changes, moves or comes along to another machine, few open files, little
+//! memory.
 
 use crate::command::{command, err, worked};
 use crate::kept::copy;

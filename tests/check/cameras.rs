@@ -1,4 +1,5 @@
-//! Cameras of NeuS, Metashape and RealityCapture: where a known point lands, and every hostile file refused by name.
+//! Cameras of NeuS, Metashape and RealityCapture: where a known point lands, and every hostile file
+//! refused by name.
 
 use crate::capture_folder::{open, put, refused};
 use glam::{DMat3, DVec3, Vec3};

@@ -1,6 +1,8 @@
-//! The three shared captures, read as a user would: formats, splits, poses, masks, and the head's box.
+//! The three shared captures, read as a user would: formats, splits, poses, masks, and the head's
+//! box.
 //!
-//! They lie beside the repository, or where `TIFACE_SHARED` says; without them these tests skip, aloud.
+//! They lie beside the repository, or where `TIFACE_SHARED` says; without them these tests skip,
+//! aloud.
 
 use crate::clicked::folder;
 use glam::{Vec2, Vec3};

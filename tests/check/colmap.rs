@@ -1,4 +1,5 @@
-//! COLMAP's models: every lens to the last digits, every format there and back, and every hostile file refused by name.
+//! COLMAP's models: every lens to the last digits, every format there and back, and every hostile
+//! file refused by name.
 
 use crate::capture_folder::{open, put, refused};
 use crate::kept::photographed;
@@ -550,7 +551,8 @@ fn splits_that_only_look_like_every_eighth_survive_every_format() {
         photographed(&folder, &SyntheticOptions { width: 24, height: 30, train, test, seed: 1 });
         capture::open(&folder, &options).unwrap()
     };
-    // `a-1.png` comes before `a.png`, but `a` before `a-1`: readers differ on which of them is the first
+    // `a-1.png` comes before `a.png`, but `a` before `a-1`: readers differ on which of them is the
+    // first
     let head = opened(4, 1);
     let first = renamed(&head, 0, "a.png", &at("names"));
     let mut twins = renamed(&first, 1, "a-1.png", &at("names"));

@@ -1,5 +1,5 @@
-//! A whole run on a device, killed on the way and finished on the CPU; on a software driver where nothing better
-//! is here.
+//! A whole run on a device, killed on the way and finished on the CPU; on a software driver where
+//! nothing better is here.
 
 use crate::command::{code, command, err, worked};
 use crate::kept::photographed;
@@ -9,13 +9,15 @@ use std::time::{Duration, Instant};
 use tiface::capture::synthetic::SyntheticOptions;
 use tiface::kernel::gpu::Adapter;
 
-/// No more than what a driver in software does in seconds; it compiles the kernels for the most part of them.
+/// No more than what a driver in software does in seconds; it compiles the kernels for the most
+/// part of them.
 const SMALL: &str = "iface.steps=20 iface.rays=32 iface.max_rays=64 iface.samples=256 iface.levels=4 iface.log2_table=10 \
     iface.occupancy_resolution=16 iface.stereo=0 iface.checkpoint_s=0.05 tface.steps=8 tface.rays=64 \
     tface.voxels_start=512 tface.voxels_final=512 mesh.resolution=24 mesh.triangles=300 mesh.texture_px=64 \
     mesh.format=glb mesh.hair=none render.samples=1 render.method=tface,volume,raycast";
 
-/// The program whose locks of devices are in its own folder: other tests use the devices of this machine, too.
+/// The program whose locks of devices are in its own folder: other tests use the devices of this
+/// machine, too.
 fn alone(folder: &Path, words: &[&str]) -> Command {
     let mut command = command(folder, words);
     command.env("TMPDIR", folder);

@@ -1,5 +1,5 @@
-//! `transforms.json` as other programs write it: read like the plain file, or refused with a word on what
-//! is there.
+//! `transforms.json` as other programs write it: read like the plain file, or refused with a word
+//! on what is there.
 
 use crate::kept::photographed;
 use serde_json::{Value, json};
@@ -10,7 +10,8 @@ use tiface::capture::inspect::{Inspection, inspect};
 use tiface::capture::synthetic::SyntheticOptions;
 use tiface::capture::{self, Capture, CaptureOptions, Split, ViewMask};
 
-/// Six photographs to learn from and two held out, with one camera file that is written as `edit` leaves it.
+/// Six photographs to learn from and two held out, with one camera file that is written as `edit`
+/// leaves it.
 fn made(edit: impl FnOnce(&mut Value)) -> TempDir {
     let dir = tempfile::tempdir().unwrap();
     photographed(dir.path(), &SyntheticOptions { width: 24, height: 32, train: 6, test: 2, seed: 1 });
@@ -142,7 +143,8 @@ fn a_video_of_a_head_that_holds_still_is_no_moving_head() {
     assert!(open(&dir).warnings.iter().all(|w| !w.contains("moment")));
 }
 
-/// Writes which photographs are for what into lists, as `spell` does, in the place of each frame's own split.
+/// Writes which photographs are for what into lists, as `spell` does, in the place of each frame's
+/// own split.
 fn listed(json: &mut Value, spell: fn(&str) -> String) {
     let mut lists = [vec![], vec![]];
     for frame in frames(json) {

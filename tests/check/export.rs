@@ -1,4 +1,5 @@
-//! `tiface export` as a user runs it: the finished mesh of a run in other files, and a run that stays as it is.
+//! `tiface export` as a user runs it: the finished mesh of a run in other files, and a run that
+//! stays as it is.
 
 use crate::command::{said, tiface};
 use crate::kept::{copy_run, once};
@@ -19,7 +20,8 @@ fn worked(folder: &Path, words: &[&str]) -> String {
     said(&output)
 }
 
-/// Makes all stages of a run, up to its metrics. The head is learned once; its mesh is made again with these settings.
+/// Makes all stages of a run, up to its metrics. The head is learned once; its mesh is made again
+/// with these settings.
 fn finished(folder: &Path, more: &[&str]) -> PathBuf {
     let kept = once("to export", |folder| {
         capture(folder);

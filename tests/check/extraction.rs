@@ -1,5 +1,5 @@
-//! Extraction against hard volumes, an independent count of the trilinear surface's topology, another
-//! marching cubes, and the cost of asking a field.
+//! Extraction against hard volumes, an independent count of the trilinear surface's topology,
+//! another marching cubes, and the cost of asking a field.
 
 use crate::command::said;
 use crate::fields::{self, Noise};
@@ -78,7 +78,8 @@ fn hard_volumes_are_closed_manifold_and_finite() {
 
 #[test]
 fn every_sign_pattern_near_face_and_body_saddles_is_sound() {
-    // All 256 patterns; sizes drawn near values that make face determinants and body saddles vanish.
+    // All 256 patterns; sizes drawn near values that make face determinants and body saddles
+    // vanish.
     (0..256u32).into_par_iter().for_each(|case| {
         let mut noise = Noise(u64::from(case));
         for round in 0..60 {
@@ -106,7 +107,8 @@ fn a_six_cubed_board_of_ties_is_sound() {
         let (dims, v) = padded(6, 1.0, || if noise.bits() & 1 == 0 { 1.0 } else { -1.0 });
         assert_sound("ties", dims, &v, false);
     }
-    // The checkerboard: every face of every cell ambiguous and tied, so every inside node stands alone.
+    // The checkerboard: every face of every cell ambiguous and tied, so every inside node stands
+    // alone.
     let mut i = 0;
     let (dims, v) = padded(6, 1.0, || {
         let (x, y, z) = (i % 6, i / 6 % 6, i / 36);
@@ -220,9 +222,9 @@ proptest! {
 
 /// Pieces and Euler number of the trilinear surface, counted on a finer grid without any triangles.
 ///
-/// The inside samples span a cubical complex. Its Euler number is half that of its surface; the surface
-/// has one piece for each piece of the inside and of the outside (where samples touch diagonally), less
-/// one, by Alexander duality.
+/// The inside samples span a cubical complex. Its Euler number is half that of its surface; the
+/// surface has one piece for each piece of the inside and of the outside (where samples touch
+/// diagonally), less one, by Alexander duality.
 fn sampled_topology(dims: [usize; 3], values: &[f32], fine: usize) -> (usize, i64) {
     let size = dims.map(|d| (d - 1) * fine + 1);
     let at = |x: usize, y: usize, z: usize| f64::from(values[(z * dims[1] + y) * dims[0] + x]);

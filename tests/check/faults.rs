@@ -1,8 +1,8 @@
-//! Whatever goes wrong with whichever write, a run is never worse than before the command, no file is half there, and
-//! the repeated command ends with the bytes of an undisturbed one.
+//! Whatever goes wrong with whichever write, a run is never worse than before the command, no file
+//! is half there, and the repeated command ends with the bytes of an undisturbed one.
 //!
-//! The program is the real one; a library in front of the C library (`fault/fault.c`) lets the n-th change of a file
-//! fail. Of every command some n are tried, spread evenly.
+//! The program is the real one; a library in front of the C library (`fault/fault.c`) lets the n-th
+//! change of a file fail. Of every command some n are tried, spread evenly.
 
 use crate::command::err;
 use crate::kept::copy;
@@ -37,8 +37,8 @@ impl Bench {
         command.env("FAULT_AT", fault.0.to_string()).env("FAULT_KIND", fault.1).output().unwrap()
     }
 
-    /// Tries a command with faults on copies of a folder, after so many faults of other commands; returns the folder after an
-    /// undisturbed one and how many faults were tried.
+    /// Tries a command with faults on copies of a folder, after so many faults of other commands;
+    /// returns the folder after an undisturbed one and how many faults were tried.
     fn try_faults(&self, before: &Path, words: &[&str], earlier: usize) -> (PathBuf, usize) {
         let command = words.join(" ");
         let calm = copy(before, &self.folder.join(format!("after {}", words[0])));
@@ -121,7 +121,8 @@ fn never_worse(old: &Files, new: &Files, found: &Files, killed: bool, what: &str
     }
 }
 
-/// Lets so many writes of every command fail, fewer where there is little to write, but at least so many of all.
+/// Lets so many writes of every command fail, fewer where there is little to write, but at least so
+/// many of all.
 fn faults_lose_nothing(most: usize, least: usize) {
     let dir = tempfile::tempdir().unwrap();
     let folder = dir.path().canonicalize().unwrap();

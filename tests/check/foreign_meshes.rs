@@ -1,4 +1,5 @@
-//! Meshes as other programs write them: `check` and `preview` give one answer, and say why a color is not shown.
+//! Meshes as other programs write them: `check` and `preview` give one answer, and say why a color
+//! is not shown.
 
 use crate::command::{code, err, out, said, tiface, worked};
 use crate::tiny;

@@ -26,7 +26,8 @@ fn photographs(folder: &str) -> TempDir {
     dir
 }
 
-/// What opening a folder says: the message and the suggested fix, with `ROOT` for the folder of the test.
+/// What opening a folder says: the message and the suggested fix, with `ROOT` for the folder of the
+/// test.
 fn refused(dir: &TempDir, inner: &str) -> (String, String) {
     let e = open(&dir.path().join(inner)).unwrap_err();
     let roots = [dir.path().canonicalize().unwrap(), dir.path().to_path_buf()];
@@ -71,7 +72,8 @@ fn sees(c: &Capture, center: [f64; 2]) {
 
 const HEADER: &str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n";
 
-/// Heading, pitch and roll: Rz(−heading) Rx(pitch) Ry(roll) in OpenGL axes; 45 · 32 / 36 = 40 pixels.
+/// Heading, pitch and roll: Rz(−heading) Rx(pitch) Ry(roll) in OpenGL axes; 45 · 32 / 36 = 40
+/// pixels.
 fn table() -> String {
     let row = |i: usize| {
         let (rotation, at) = pose(i);

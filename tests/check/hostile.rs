@@ -1,5 +1,6 @@
-//! Crafted and unlucky files: each ends in the named error that says which file and where, never in a panic,
-//! a hang or a large allocation. One test per row of the specification's table of hostile input.
+//! Crafted and unlucky files: each ends in the named error that says which file and where, never in
+//! a panic, a hang or a large allocation. One test per row of the specification's table of hostile
+//! input.
 
 use crate::capture_folder::open;
 use crate::kept::copy;
@@ -461,7 +462,8 @@ fn deep_and_subsampled_and_huge_exr_pictures_are_refused_by_name() {
     let e = io::read_exr(&path, DEPTH, &limits()).unwrap_err();
     assert!(matches!(e, ReadError::Unsupported { .. }) && e.to_string().contains("deep"), "{e}");
 
-    // channel list entry of `Z`: name, type i32, linear and 3 reserved bytes, then the two samplings
+    // channel list entry of `Z`: name, type i32, linear and 3 reserved bytes, then the two
+    // samplings
     let mut sub = exr(4, 4);
     let list = sub.windows(7).position(|w| w == b"chlist\0").unwrap() + 11;
     assert_eq!(&sub[list..list + 2], b"Z\0");
@@ -613,7 +615,8 @@ fn sound(frames: &[String]) -> String {
 fn a_small_sound_capture_opens_in_every_dialect() {
     let plain = open(&capture_with(sound, 9)).unwrap();
     assert_eq!(plain.split(Split::Test).count(), 2); // views 0 and 8 of nine
-    // with a byte order mark, CRLF, without endings, `./`, backslashes, 3×4 matrices, per-frame lenses
+    // with a byte order mark, CRLF, without endings, `./`, backslashes, 3×4 matrices, per-frame
+    // lenses
     let dialects: [fn(&[String]) -> String; 6] = [
         |f| format!("\u{FEFF}{}", sound(f).replace(", ", ",\r\n")),
         |f| sound(f).replace(".png", ""),
@@ -820,7 +823,8 @@ fn a_size_that_is_not_the_declared_one_says_the_factor() {
     assert_eq!(c.views[0].load(&limits()).unwrap().photo.rgb.len(), 48);
 }
 
-/// A folder with these files, `/` at the end for folders, and what opening it prints: the message and the suggested fix.
+/// A folder with these files, `/` at the end for folders, and what opening it prints: the message
+/// and the suggested fix.
 fn unread(names: &[(&str, &[u8])]) -> (String, String) {
     let dir = tempfile::tempdir().unwrap();
     for (name, bytes) in names {
@@ -911,7 +915,8 @@ fn formats_that_are_not_read_are_named_with_the_way_from_there() {
         assert!(message.contains(what), "{what}: {message}");
         assert!(hint.contains(way), "{what}: {hint}");
     }
-    // other tools' XML and CSV are not theirs, and a list of parameters without photographs is of no format
+    // other tools' XML and CSV are not theirs, and a list of parameters without photographs is of
+    // no format
     let (message, hint) =
         unread(&[("a.xml", b"<svg/>"), ("b.csv", b"a,b\n"), ("params.json", b"{}"), ("notes.txt", b"x")]);
     for format in ["transforms.json", "LLFF", "COLMAP", "NeuS", "H3DS", "Metashape", "RealityCapture"] {
@@ -1095,7 +1100,8 @@ fn a_problem_of_every_frame_is_one_line_with_a_count() {
         "{found}"
     );
 
-    // numbers that differ, and photographs that cannot be read, count together as well; other problems do not
+    // numbers that differ, and photographs that cannot be read, count together as well; other
+    // problems do not
     let dir = capture_with(
         |f| {
             let moved = |(i, f): (usize, &String)| match i {

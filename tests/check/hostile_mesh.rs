@@ -1,5 +1,5 @@
-//! Malformed and malicious mesh files, and the message each must produce. Nothing here may panic, hang or
-//! reserve memory for what a file merely claims.
+//! Malformed and malicious mesh files, and the message each must produce. Nothing here may panic,
+//! hang or reserve memory for what a file merely claims.
 
 use crate::clicked;
 use glam::{DVec3, Vec3};
@@ -237,7 +237,8 @@ fn a_mesh_that_skins_morphs_or_instances_move_is_refused_not_measured_elsewhere(
 
 #[test]
 fn nodes_far_from_the_origin_keep_their_distance() {
-    // f32 has steps of a half at 4 500 000: both nodes would stand at the same place, or half a unit apart
+    // f32 has steps of a half at 4 500 000: both nodes would stand at the same place, or half a
+    // unit apart
     for x in ["translation", "matrix"] {
         let node = |at: f64| {
             let matrix = json!([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, at, 0, 0, 1]);
@@ -397,7 +398,8 @@ fn textured(picture: &[u8], uvs: [[f32; 2]; 4]) -> (Value, Vec<u8>) {
 
 const UVS: [[f32; 2]; 4] = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.5]];
 
-/// The textured tetrahedron as `KHR_mesh_quantization` writes it, 16 bits a number, at (5, 1, 2), a quarter large.
+/// The textured tetrahedron as `KHR_mesh_quantization` writes it, 16 bits a number, at (5, 1, 2), a
+/// quarter large.
 fn quantized() -> Vec<u8> {
     let corners: [[u16; 4]; 4] = [[0; 4], [65535, 0, 0, 0], [0, 65535, 0, 0], [0, 0, 65535, 0]];
     let mut bin: Vec<u8> = corners.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
@@ -739,7 +741,8 @@ fn triangle_strips_of_a_ply_are_cut_into_triangles() {
          element tristrips 1\nproperty list int int vertex_indices\n",
         b"0 0 0  1 0 0  0 1 0  1 1 0  0 2 0\n11 0 1 2 3 -1 2 3 3 4 -1 0\n",
     );
-    // 0 1 2, then 2 1 3 the other way round; then 2 3 3 and 3 3 4, which are none; a lone corner is none either
+    // 0 1 2, then 2 1 3 the other way round; then 2 3 3 and 3 3 4, which are none; a lone corner is
+    // none either
     assert_eq!(read(&bytes, Path::new("a")).unwrap().triangles, [[0, 1, 2], [2, 1, 3]]);
 }
 
@@ -850,7 +853,8 @@ fn a_flipped_byte_anywhere_is_survived_by_reader_and_check() {
     }
 }
 
-/// The whole report of a file, as `tiface check` makes it. Nothing here takes more than a second or two.
+/// The whole report of a file, as `tiface check` makes it. Nothing here takes more than a second or
+/// two.
 fn report(bytes: &[u8]) -> CheckReport {
     let begin = std::time::Instant::now();
     let whole = read_whole(bytes, Path::new("a")).unwrap();
@@ -886,7 +890,8 @@ fn quads_that_each_show_the_whole_texture_are_counted_not_waited_for() {
 fn thousands_of_parallel_slivers_are_counted_not_waited_for() {
     let mut obj = String::new();
     for k in 0..8000 {
-        // along a diagonal, in space and in the texture, so that all boxes meet and no two triangles do
+        // along a diagonal, in space and in the texture, so that all boxes meet and no two
+        // triangles do
         let e = f64::from(k) / 800_000.0;
         let (x, y) = (1.0 + e, 1.0 - e);
         obj += &format!("v {e} {} {e}\nv {x} {y} {x}\nv {} {} {x}\n", -e, x + 1e-7, y - 1e-7);

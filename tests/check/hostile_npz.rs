@@ -1,4 +1,5 @@
-//! Zip archives that lie: each ends in a named error, and no memory is reserved for what they only claim.
+//! Zip archives that lie: each ends in a named error, and no memory is reserved for what they only
+//! claim.
 
 use crate::zips::{self, Entry};
 use tiface::io::{self, Limits, ReadError};

@@ -1,5 +1,5 @@
-//! The house rules that the compiler does not see: who may know whom within the package `tiface`, in no circle within any
-//! package, who opens files, who prints.
+//! The house rules that the compiler does not see: who may know whom within the package `tiface`,
+//! in no circle within any package, who opens files, who prints.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -67,7 +67,7 @@ fn read(package: &str, src: &Path, path: &Path, place: String) -> Option<Source>
     let below = path.strip_prefix(src).unwrap();
     let module = below.iter().next().unwrap().to_str().unwrap().trim_end_matches(".rs").to_string();
     let name = path.file_stem().unwrap().to_str().unwrap();
-    // the two roots of the program know everything; whole files of tests may too
+    // the two roots of the program know everything; whole files of and for tests may too
     if (package == ROOT && ["lib", "main"].contains(&module.as_str()))
         || name == "tests"
         || name.ends_with("_tests")
@@ -83,7 +83,8 @@ fn read(package: &str, src: &Path, path: &Path, place: String) -> Option<Source>
     Some(Source { package: package.into(), module, path: below.to_path_buf(), place, lines })
 }
 
-/// The numbered lines of a formatted file without the items under `#[cfg(test)]`, wherever they stand.
+/// The numbered lines of a formatted file without the items under `#[cfg(test)]`, wherever they
+/// stand.
 fn without_tests(text: &str) -> Vec<(usize, &str)> {
     let indent = |line: &str| line.len() - line.trim_start().len();
     let mut lines = text.lines().enumerate();
@@ -100,7 +101,8 @@ fn without_tests(text: &str) -> Vec<(usize, &str)> {
     kept
 }
 
-/// Paths that begin with one of `roots` in a piece of code: `crate::geom::Ray`, `use super::{tile::Tile, Bins}`.
+/// Paths that begin with one of `roots` in a piece of code: `crate::geom::Ray`,
+/// `use super::{tile::Tile, Bins}`.
 fn paths(code: &str, roots: &[&str]) -> Vec<Vec<String>> {
     let mut found = Vec::new();
     for root in roots {
@@ -169,8 +171,8 @@ fn arrows_point_down_only() {
     assert!(wrong.is_empty(), "\n{}", wrong.join("\n"));
 }
 
-/// A module of a package: what it names of others there, and what it hands on (`pub use`), as paths that begin with the
-/// package.
+/// A module of a package: what it names of others there, and what it hands on (`pub use`), as paths
+/// that begin with the package.
 struct Module {
     names: Vec<Vec<String>>,
     hands_on: Vec<Vec<String>>,

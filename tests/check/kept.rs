@@ -1,11 +1,13 @@
-//! What is made once a test program, and copied from then on: photographs of the synthetic head, and trained heads.
+//! What is made once a test program, and copied from then on: photographs of the synthetic head,
+//! and trained heads.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use tiface::capture::synthetic::{SyntheticOptions, write_capture};
 
-/// Returns the folder of what this program keeps. No test ends the program, so what other programs left goes first.
+/// Returns the folder of what this program keeps. No test ends the program, so what other programs
+/// left goes first.
 fn kept() -> &'static Path {
     static KEPT: OnceLock<PathBuf> = OnceLock::new();
     KEPT.get_or_init(|| {
@@ -27,7 +29,8 @@ fn kept() -> &'static Path {
     })
 }
 
-/// Returns the folder of this name, which the first caller makes while the others wait. It is to be read, not changed.
+/// Returns the folder of this name, which the first caller makes while the others wait. It is to be
+/// read, not changed.
 pub fn once(name: &str, make: impl FnOnce(&Path)) -> PathBuf {
     static MADE: Mutex<BTreeMap<String, Arc<OnceLock<PathBuf>>>> = Mutex::new(BTreeMap::new());
     let made = MADE.lock().unwrap_or_else(PoisonError::into_inner).entry(name.into()).or_default().clone();
@@ -60,15 +63,16 @@ pub fn copy(from: &Path, to: &Path) -> PathBuf {
     to.into()
 }
 
-/// Makes the capture `to` of the synthetic head, which is photographed once for each of these options.
+/// Makes the capture `to` of the synthetic head, which is photographed once for each of these
+/// options.
 pub fn photographed(to: &Path, options: &SyntheticOptions) {
     let SyntheticOptions { width, height, train, test, seed } = *options;
     let name = format!("photographs {width} {height} {train} {test} {seed}");
     copy(&once(&name, |folder| write_capture(folder, options).unwrap()), to);
 }
 
-/// Copies the capture `head` and the run `run` of a kept folder into another, the run under another name. The copy of the
-/// run is one of the copy of the capture.
+/// Copies the capture `head` and the run `run` of a kept folder into another, the run under another
+/// name. The copy of the run is one of the copy of the capture.
 pub fn copy_run(kept: &Path, folder: &Path, name: &str) -> PathBuf {
     let head = copy(&kept.join("head"), &folder.join("head"));
     let run = copy(&kept.join("run"), &folder.join(name));

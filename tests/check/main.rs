@@ -1,6 +1,8 @@
-//! Integration tests: what only the whole program can show, as a user runs it, and readers and files as others write them.
+//! Integration tests: what only the whole program can show, as a user runs it, and readers and
+//! files as others write them.
 //!
-//! What takes minutes is ignored with a reason that begins with `long:`, and run by `tools/test.sh all`.
+//! What takes minutes is ignored with a reason that begins with `long:`, and run by
+//! `tools/test.sh all`.
 
 // what the tests share
 mod capture_folder;

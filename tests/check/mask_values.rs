@@ -1,4 +1,5 @@
-//! Masks that are not white on black: in another color, as labels, as cutouts, or turned against their photographs.
+//! Masks that are not white on black: in another color, as labels, as cutouts, or turned against
+//! their photographs.
 
 use crate::command::{code, err, out, tiface, worked};
 use crate::kept::photographed;
@@ -16,8 +17,8 @@ use tiface::io::{
     write_png_rgba,
 };
 
-/// A capture of eight photographs and a held-out one in `head`, of which `draw` writes each mask again: the file, and the
-/// opacity of the head.
+/// A capture of eight photographs and a held-out one in `head`, of which `draw` writes each mask
+/// again: the file, and the opacity of the head.
 fn drawn(draw: impl Fn(&Path, &Gray)) -> TempDir {
     let dir = tempfile::tempdir().unwrap();
     let options = SyntheticOptions { width: 32, height: 40, train: 8, test: 1, seed: 1 };

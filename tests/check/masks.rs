@@ -1,6 +1,7 @@
 //! Masks from the clicks that come with the shared captures, against their true masks.
 //!
-//! They lie beside the repository, or where `TIFACE_SHARED` says; without them these tests skip, aloud.
+//! They lie beside the repository, or where `TIFACE_SHARED` says; without them these tests skip,
+//! aloud.
 
 use crate::clicked::{self, Clicked, mean_worst, overlap};
 use std::sync::OnceLock;
@@ -100,7 +101,8 @@ fn shifted(mask: &Gray, by: usize) -> Gray {
     Gray { values: (0..mask.values.len()).map(at).collect(), ..mask.clone() }
 }
 
-/// The true masks of a capture, and each of these views wrong in every way, masks of another person among them.
+/// The true masks of a capture, and each of these views wrong in every way, masks of another person
+/// among them.
 fn wrong_masks_are_named(c: &Clicked, other: &Clicked, views: &[usize]) {
     let found = compare(c, &c.truth);
     assert!(found.conflicts.is_empty() && found.left < 1e-4, "{found:?}");

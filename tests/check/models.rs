@@ -1,5 +1,5 @@
-//! COLMAP's models and Metashape's cameras as people have them: left-out lines, rigs, several chunks; and COLMAP's commands
-//! in the words of its versions.
+//! COLMAP's models and Metashape's cameras as people have them: left-out lines, rigs, several
+//! chunks; and COLMAP's commands in the words of its versions.
 
 use crate::capture_folder::{open, put, refused};
 #[cfg(unix)]
@@ -113,7 +113,8 @@ fn empty_lines_that_an_editor_left_out_or_put_in_between_do_not_lose_an_image() 
     let c = open(&six(CAMERA, &six_images(points))).unwrap();
     six_stand(&c);
     says(&c.reasons, &["3 images in lines 3 to 9", "without a second line"]);
-    // nothing is said of a file that is as COLMAP writes it, or has empty lines between all of its lines
+    // nothing is said of a file that is as COLMAP writes it, or has empty lines between all of its
+    // lines
     let whole = six_images(|i| if i.is_multiple_of(2) { "1.5 2.5 -1 3.5 4.5 17\n" } else { "\n" });
     for text in [whole.clone(), whole.replace('\n', "\n\n"), whole.replace('\n', "\r\n# a comment\r\n")] {
         let c = open(&six(CAMERA, &text)).unwrap();
@@ -451,7 +452,8 @@ fn what_a_metashape_lens_has_and_is_not_read_is_named() {
         &["`spherical` is not supported"],
     );
     says_of(&calibration, "", &["it is not calibrated"]);
-    // what says nothing of the lens is passed over; the adjusted calibration counts, wherever it stands
+    // what says nothing of the lens is passed over; the adjusted calibration counts, wherever it
+    // stands
     let more = "<p3>0</p3><covariance><params>f k1</params><coeffs>1 2 3 4</coeffs></covariance></calibration>\
                 <calibration type=\"frame\" class=\"initial\"><f>7</f></calibration>";
     put(&dir, "cameras.xml", whole.replace("</calibration>", more));
@@ -518,8 +520,8 @@ const COLMAP_4: &[(&str, &str)] = &[
     ),
 ];
 
-/// Puts a COLMAP in its place that knows these commands and refuses other options, as the real one does. Its mappers find
-/// the model in `model/`.
+/// Puts a COLMAP in its place that knows these commands and refuses other options, as the real one
+/// does. Its mappers find the model in `model/`.
 #[cfg(unix)]
 fn colmap(dir: &TempDir, commands: &[(&str, &str)]) {
     let known = |(command, options): &(&str, &str)| format!("{command}) known='{options}' ;;\n");

@@ -1,6 +1,6 @@
-//! Photographs without cameras: `tiface cameras` with COLMAP itself on real photographs, and with programs in its place that
-//! fail in every way. Without COLMAP or the shared captures, which lie beside the repository or where `TIFACE_SHARED` says,
-//! the first skips aloud.
+//! Photographs without cameras: `tiface cameras` with COLMAP itself on real photographs, and with
+//! programs in its place that fail in every way. Without COLMAP or the shared captures, which lie
+//! beside the repository or where `TIFACE_SHARED` says, the first skips aloud.
 
 use crate::clicked;
 use crate::command::{code, command, err};
@@ -174,7 +174,8 @@ fn a_colmap_that_fails_is_named_with_its_command_and_log_and_may_be_tried_again(
     assert_eq!(fs::read_dir(at("kept")).unwrap().count(), 2);
 }
 
-/// Returns the number that a script in the place of a program wrote to `started`: of a process. Waits five minutes at most.
+/// Returns the number that a script in the place of a program wrote to `started`: of a process.
+/// Waits five minutes at most.
 #[cfg(unix)]
 fn started(dir: &TempDir) -> Option<u32> {
     (0..6000).find_map(|_| {
@@ -489,7 +490,8 @@ fn the_sharpest_frame_of_each_window_of_a_video_is_kept() {
         return;
     }
     let dir = photographs();
-    // the brightness of a checkerboard rises and falls: frames 3, 11, 19, ... are the sharpest of each eight
+    // the brightness of a checkerboard rises and falls: frames 3, 11, 19, ... are the sharpest of
+    // each eight
     let made = Command::new("ffmpeg")
         .args("-loglevel error -f lavfi -i".split(' '))
         .arg("nullsrc=s=64x48:d=2.4:r=30,geq=lum='128+4*(4-abs(mod(N,8)-3))*(2*mod(floor(X/4)+floor(Y/4),2)-1)':cb=128:cr=128")
@@ -524,8 +526,8 @@ fn root_mean_square(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len() as f64).sqrt()
 }
 
-/// Returns how far cameras are from those that they should be after the best similarity: positions as a share of their extent,
-/// rotations in degrees.
+/// Returns how far cameras are from those that they should be after the best similarity: positions
+/// as a share of their extent, rotations in degrees.
 fn apart(pairs: &[(&Camera, &Camera)]) -> (Vec<f64>, Vec<f64>) {
     let n = pairs.len() as f64;
     // rotation from the rotations, scale and translation from the positions
@@ -553,8 +555,8 @@ fn shared(name: &str) -> Option<PathBuf> {
     clicked::folder(name).filter(|_| installed("colmap"))
 }
 
-/// Finds the cameras of the first photographs of a capture, and returns how far they are from its own, root mean square, and
-/// the capture that was found.
+/// Finds the cameras of the first photographs of a capture, and returns how far they are from its
+/// own, root mean square, and the capture that was found.
 fn found_again(name: &str, photographs: usize, with_masks: bool, dir: &Path) -> Option<(f64, f64, Capture)> {
     let folder = shared(name)?;
     let mut own = capture::open(&folder, &CaptureOptions::default()).unwrap().views;

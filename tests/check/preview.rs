@@ -14,7 +14,8 @@ const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\npr
     property list uchar int vertex_indices\nend_header\n0 0 0 255 0 0\n1 0 0 255 0 0\n0 1 0 255 0 0\n0 0 1 255 0 0\n\
     3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n";
 
-/// Two triangles of one mesh, each of a material with a color: the left one red, the right one green (linear 0.5).
+/// Two triangles of one mesh, each of a material with a color: the left one red, the right one
+/// green (linear 0.5).
 fn two_materials() -> Vec<u8> {
     let corners = [
         [-1.0f32, 0.0, 0.0],
@@ -162,7 +163,8 @@ fn what_a_killed_turntable_left_half_written_is_removed_by_the_next() {
         assert_eq!(code(&o), 0, "{}", err(&o));
     }
     assert!(!frames.join(&left).exists() && !dir.path().join(beside).exists());
-    // what another process writes is its own, and what another command left beside is not this one's
+    // what another process writes is its own, and what another command left beside is not this
+    // one's
     assert!(frames.join(written).exists() && dir.path().join(left).exists());
 }
 

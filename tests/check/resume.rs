@@ -118,7 +118,8 @@ fn wait_for_stage(run: &Path, stage: Stage, child: &mut Child) {
     }
 }
 
-/// SIGKILL: nothing is saved, nothing is cleaned up. Returns whether it came before the end, which must be a good one.
+/// SIGKILL: nothing is saved, nothing is cleaned up. Returns whether it came before the end, which
+/// must be a good one.
 fn killed(mut child: Child, what: &str) -> bool {
     let ended = child.try_wait().unwrap();
     child.kill().unwrap();
@@ -127,7 +128,8 @@ fn killed(mut child: Child, what: &str) -> bool {
     ended.is_none()
 }
 
-/// A run that was completed after all has the bytes of the calm one, and the next command has nothing to do.
+/// A run that was completed after all has the bytes of the calm one, and the next command has
+/// nothing to do.
 fn assert_done(runs: &Runs, calm: &Path, name: &str) {
     let run = runs.path(name);
     assert_same(calm, &run);
@@ -185,9 +187,11 @@ fn killed_after_checkpoint(runs: &Runs, name: &str) -> u32 {
     u32::from(killed(child, "a checkpoint"))
 }
 
-/// Kills a run that takes `whole` until it completes and returns how often; moments follow a fixed sequence from `phase`.
+/// Kills a run that takes `whole` until it completes and returns how often; moments follow a fixed
+/// sequence from `phase`.
 fn hunt(runs: &Runs, name: &str, whole: Duration, phase: u32) -> u32 {
-    // spread over the first sixth of a run, and a little later each time, so that it ends on a busy machine too
+    // spread over the first sixth of a run, and a little later each time, so that it ends on a busy
+    // machine too
     for attempt in 0..300u32 {
         let mut child = runs.start(name);
         let place = (f64::from(phase + attempt) * 0.618_034).fract();

@@ -1,5 +1,6 @@
-//! What is written is read again, whatever it is: every format that has both a writer and a reader here. COLMAP's text and
-//! `.npz` are only read, and the tests of COLMAP and `tests/readers` write those by hand.
+//! What is written is read again, whatever it is: every format that has both a writer and a reader
+//! here. COLMAP's text and `.npz` are only read, and the tests of COLMAP and `tests/readers` write
+//! those by hand.
 
 use crate::kept::photographed;
 use glam::{DMat3, DQuat, DVec3, Vec3};

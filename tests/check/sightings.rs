@@ -1,5 +1,5 @@
-//! Captures whose files leave open which photograph belongs to which camera, or how photographs lie: what photographs show
-//! decides it, and where they cannot, the program says so.
+//! Captures whose files leave open which photograph belongs to which camera, or how photographs
+//! lie: what photographs show decides it, and where they cannot, the program says so.
 
 use crate::command::{code, out, said, tiface, worked};
 use crate::kept::photographed;
@@ -16,7 +16,8 @@ use tiface::image::Photo;
 use tiface::io::{self, Limits};
 use tiface::pipeline::open_capture;
 
-/// The head that is photographed: as few and as small photographs as points of it are found again in.
+/// The head that is photographed: as few and as small photographs as points of it are found again
+/// in.
 const HEAD: SyntheticOptions = SyntheticOptions { width: 144, height: 180, train: 14, test: 1, seed: 1 };
 
 /// How many photographs it has.
@@ -26,8 +27,8 @@ fn cameras() -> Vec<Camera> {
     synthetic::cameras(&HEAD).into_iter().map(|(camera, _)| camera).collect()
 }
 
-/// Copies photographs and masks of the head to two folders of a capture. `names` says how the picture of a camera is called
-/// in each, without ending.
+/// Copies photographs and masks of the head to two folders of a capture. `names` says how the
+/// picture of a camera is called in each, without ending.
 fn pictures(to: &Path, folders: [&str; 2], names: [&dyn Fn(usize) -> String; 2]) {
     let head = tempfile::tempdir().unwrap();
     photographed(&head.path().join("head"), &HEAD);
@@ -78,14 +79,16 @@ fn write_neus(root: &Path, cameras: &[Camera]) {
     fs::write(root.join("cameras_sphere.npz"), zip.finish().unwrap().into_inner()).unwrap();
 }
 
-/// Cameras as they follow each other where photographs without leading zeros are taken in the order of their names.
+/// Cameras as they follow each other where photographs without leading zeros are taken in the order
+/// of their names.
 fn in_name_order(cameras: &[Camera]) -> Vec<Camera> {
     let mut order: Vec<usize> = (0..cameras.len()).collect();
     order.sort_by_key(|i| i.to_string());
     order.into_iter().map(|i| cameras[i].clone()).collect()
 }
 
-/// Returns whether each view, named by the number of its camera behind these letters, has that camera, and a mask of its own.
+/// Returns whether each view, named by the number of its camera behind these letters, has that
+/// camera, and a mask of its own.
 fn has_own_cameras(capture: &Capture, before: &str) -> bool {
     let exact = cameras();
     capture.views.len() == exact.len()
@@ -251,8 +254,8 @@ fn a_run_keeps_the_order_that_was_decided_and_resumes_with_it() {
     assert!(done == fs::read(dir.path().join("run/mask/done.json")).unwrap(), "the stage was made again");
 }
 
-/// A capture whose photographs are JPEGs that ask for a half turn; `turned` says whether photographs, and masks, are stored
-/// turned.
+/// A capture whose photographs are JPEGs that ask for a half turn; `turned` says whether
+/// photographs, and masks, are stored turned.
 fn half_turned(turned: [bool; 2]) -> TempDir {
     let dir = tempfile::tempdir().unwrap();
     photographed(dir.path(), &HEAD);

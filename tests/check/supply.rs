@@ -1,5 +1,5 @@
-//! What the program is made of: every crate from crates.io, under a license that `deny.toml` allows, none that speaks to
-//! a network, and a note on each that the program names itself.
+//! What the program is made of: every crate from crates.io, under a license that `deny.toml`
+//! allows, none that speaks to a network, and a note on each that the program names itself.
 
 use std::path::Path;
 use std::process::Command;
@@ -40,8 +40,8 @@ fn crates() -> Vec<(String, String, String)> {
     crates
 }
 
-/// Is one of the alternatives of an SPDX expression, and in it every part, allowed? Parentheses stand around
-/// alternatives only: `(A OR B) AND C`.
+/// Is one of the alternatives of an SPDX expression, and in it every part, allowed? Parentheses
+/// stand around alternatives only: `(A OR B) AND C`.
 fn allowed(expression: &str, list: &[&str]) -> bool {
     let all = |part: &str| {
         let any = part.trim().trim_matches(['(', ')']);

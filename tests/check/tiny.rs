@@ -37,7 +37,8 @@ pub fn tiface(folder: &Path, words: &[&str]) -> Command {
     command
 }
 
-/// The smallest capture and a finished run of it, `head` and `run` in a folder. They are made once a program, to be read.
+/// The smallest capture and a finished run of it, `head` and `run` in a folder. They are made once
+/// a program, to be read.
 pub fn kept() -> PathBuf {
     once("tiny", |folder| {
         capture(folder);
@@ -45,7 +46,8 @@ pub fn kept() -> PathBuf {
     })
 }
 
-/// Copies the smallest capture to `folder/head` and its finished run to a folder of this name beside it.
+/// Copies the smallest capture to `folder/head` and its finished run to a folder of this name
+/// beside it.
 pub fn finished(folder: &Path, run: &str) -> PathBuf {
     copy_run(&kept(), folder, run)
 }
@@ -95,7 +97,8 @@ pub fn is_timed(file: &Path) -> bool {
 
 /// Files of two folders with the same names and, but for times, the same bytes.
 pub fn same(new: &Files, found: &Files, what: &str) {
-    // a temporary file beside a run may belong to another process; and no work ends because its log cannot be written
+    // a temporary file beside a run may belong to another process; and no work ends because its log
+    // cannot be written
     let counts =
         |f: &&PathBuf| (f.starts_with("run") || !name(f).ends_with(".tmp")) && name(f) != "log.jsonl";
     let names = |files: &Files| files.keys().filter(counts).cloned().collect::<Vec<_>>();

@@ -1,5 +1,6 @@
-//! Short trainings from one end of the pipeline to the other: from photographs without masks to closed meshes at several
-//! resolutions, of one capture in two formats, and of photographs with borders, up to full size.
+//! Short trainings from one end of the pipeline to the other: from photographs without masks to
+//! closed meshes at several resolutions, of one capture in two formats, and of photographs with
+//! borders, up to full size.
 
 use crate::clicked;
 use crate::command::{out, tiface, worked};
@@ -14,7 +15,8 @@ use tiface::mask::Click;
 use tiface::mask::morphology::squared_distance;
 use tiface::mask::prompts::{PhotoPrompts, Prompts};
 
-/// A capture without any mask; beside it, clicks on three of its photographs: three in the head, two far outside.
+/// A capture without any mask; beside it, clicks on three of its photographs: three in the head,
+/// two far outside.
 fn capture(folder: &Path) {
     let root = folder.join("head");
     let options = SyntheticOptions { width: 96, height: 128, train: 10, test: 2, seed: 3 };
@@ -90,7 +92,8 @@ fn meshes_from_clicks_are_closed(resolutions: &[&str]) {
     }
     // it is the resolution that makes them, not one mesh looked at again
     assert!(found.len() > 2 && found.windows(3).all(|w| w[2].2 > w[0].2), "{found:?}");
-    // sheets of a barely trained field lie closer than a cell and then may cross: a few triangles of ten thousand
+    // sheets of a barely trained field lie closer than a cell and then may cross: a few triangles
+    // of ten thousand
     assert!(found.iter().all(|(_, _, triangles, crossing)| crossing * 200 < *triangles), "{found:?}");
     eprintln!("resolution, mesh, triangles, crossing: {found:?}");
 }
@@ -151,7 +154,8 @@ fn some_of_fox(folder: &Path, every: usize) -> Option<()> {
     Some(())
 }
 
-/// Learns both fields from every so-manyth view of the capture `fox`, and from the same written as COLMAP's model.
+/// Learns both fields from every so-manyth view of the capture `fox`, and from the same written as
+/// COLMAP's model.
 fn fox_trains_to_the_same_bytes(every: usize) {
     let dir = tempfile::tempdir().unwrap();
     let Some(()) = some_of_fox(dir.path(), every) else { return };
@@ -164,7 +168,8 @@ fn fox_trains_to_the_same_bytes(every: usize) {
     for stage in ["iface", "tface"] {
         let of = |run: &str| checkpoint(&dir.path().join(run).join(stage).join("checkpoint.safetensors"));
         let ((mut own, own_bytes), (mut read, read_bytes)) = (of("own"), of("read"));
-        // which photographs and cameras it was learned from: files of other names, poses that differ in the last digit
+        // which photographs and cameras it was learned from: files of other names, poses that
+        // differ in the last digit
         for head in [&mut own, &mut read] {
             let identity = head["__metadata__"].as_object_mut().unwrap().remove("identity").unwrap();
             assert_eq!(identity.as_str().map(str::len), Some(64));
@@ -218,7 +223,8 @@ fn enlarged(root: &Path, small: &SyntheticOptions, times: u32, border: u32) {
     }
 }
 
-/// A few steps of both fields and a coarse mesh of photographs of this size; the views that are rendered have it too.
+/// A few steps of both fields and a coarse mesh of photographs of this size; the views that are
+/// rendered have it too.
 fn goes_through_the_pipeline(small: &SyntheticOptions, times: u32, border: u32) {
     let dir = tempfile::tempdir().unwrap();
     enlarged(&dir.path().join("head"), small, times, border);

@@ -41,7 +41,8 @@ impl Entry {
     }
 }
 
-/// An archive of these entries; `offset(i, at)` is where its list says that entry i is, which is at `at`.
+/// An archive of these entries; `offset(i, at)` is where its list says that entry i is, which is at
+/// `at`.
 pub fn archive(entries: &[Entry], offset: impl Fn(usize, u32) -> u32) -> Vec<u8> {
     let mut out = Vec::new();
     let mut list = Vec::new();

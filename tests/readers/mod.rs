@@ -17,8 +17,8 @@ use tiface::report::experiment::{ExperimentRow, read_published};
 use tiface::run::{Run, RunStatus, read_estimate, read_record, read_status};
 use tiface::tface::TFace;
 
-/// A reader gets a folder of its own, prepared by [`prepare`], and the bytes. It must come back, with whatever it
-/// makes of them, in words.
+/// A reader gets a folder of its own, prepared by [`prepare`], and the bytes. It must come back,
+/// with whatever it makes of them, in words.
 pub type Reader = fn(&Path, &[u8]) -> String;
 
 /// By the name of their seeds.
@@ -223,7 +223,8 @@ fn published(_: &Path, bytes: &[u8]) -> String {
     outcome(read_published(&text(bytes), &[row], "published.csv"))
 }
 
-/// Records and statuses of a run, what it may cost, what it ended with, and what a page and a list say of it.
+/// Records and statuses of a run, what it may cost, what it ended with, and what a page and a list
+/// say of it.
 fn run(dir: &Path, bytes: &[u8]) -> String {
     let mask = dir.join("run/mask");
     let mut parts = parts(bytes);

@@ -23,8 +23,8 @@ fn capsule(p: Vec3, a: [f32; 3], b: [f32; 3], r: f32) -> f32 {
     p.distance(a + t * (b - a)) - r
 }
 
-/// A head in [-1, 1]³ looking along +z, +y up: skull, jaw, neck, nose, lips, ears, eye sockets and fine
-/// wrinkles. One closed piece.
+/// A head in [-1, 1]³ looking along +z, +y up: skull, jaw, neck, nose, lips, ears, eye sockets and
+/// fine wrinkles. One closed piece.
 pub fn head(p: Vec3) -> f32 {
     let mirrored = Vec3::new(p.x.abs(), p.y, p.z);
     let mut f = ellipsoid(p, [0.0, 0.22, -0.06], [0.46, 0.52, 0.55]);

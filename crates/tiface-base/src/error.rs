@@ -1,7 +1,8 @@
 //! The error type of the crate: problem, suggested fix, and exit code.
 //!
-//! A caller acts on the kind (retry, correct the command, tell a person); a person reads the message and the
-//! suggested fix. Modules add no enums of their own unless a caller matches on the variants.
+//! A caller acts on the kind (retry, correct the command, tell a person); a person reads the
+//! message and the suggested fix. Modules add no enums of their own unless a caller matches on the
+//! variants.
 
 use std::fmt::{self, Display};
 
@@ -78,7 +79,8 @@ impl Error {
         Error { hint: hint.into(), ..Error::new(ErrorKind::BelowBar, message) }
     }
 
-    /// Returns the error of kind [`ErrorKind::Cannot`] that says that a field has no surface, and how that shows.
+    /// Returns the error of kind [`ErrorKind::Cannot`] that says that a field has no surface, and
+    /// how that shows.
     pub fn no_surface(how: impl Display, hint: impl Into<String>) -> Error {
         Error { no_surface: true, ..Error::cannot(format!("no surface: {how}"), hint) }
     }
@@ -94,7 +96,8 @@ impl Error {
         Error { hint: "repeat the command to continue".into(), ..Error::new(ErrorKind::Interrupted, kept) }
     }
 
-    /// Returns the error that only carries the kind: what is wrong has been printed, and nothing is to be added.
+    /// Returns the error that only carries the kind: what is wrong has been printed, and nothing is
+    /// to be added.
     pub fn already_printed(kind: ErrorKind) -> Error {
         Error::new(kind, "")
     }

@@ -30,8 +30,8 @@ pub use sphharm::Harmonics;
 pub use topology::{Sets, side_ends, sorted_sides};
 pub use topology::{Topology, topology};
 
-/// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of entries
-/// `xx xy xz yy yz zz`: their quotient is the inverse.
+/// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of
+/// entries `xx xy xz yy yz zz`: their quotient is the inverse.
 #[inline]
 pub fn cofactors([xx, xy, xz, yy, yz, zz]: [f64; 6]) -> ([f64; 6], f64) {
     let c = [

@@ -116,7 +116,8 @@ pub fn over_black([r, g, b, a]: [u8; 4]) -> [u8; 3] {
     [r, g, b].map(|v| ((u16::from(v) * u16::from(a) + 127) / 255) as u8)
 }
 
-/// Value of a soft mask from which on a pixel shows the head alone: matting and lossy masks rarely say 255 everywhere.
+/// Value of a soft mask from which on a pixel shows the head alone: matting and lossy masks rarely
+/// say 255 everywhere.
 pub const OPAQUE_ALPHA: u8 = 250;
 
 /// Coded 0..=1 to 8 bit, rounded to nearest (the published code truncates).

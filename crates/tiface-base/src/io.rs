@@ -1,8 +1,9 @@
 //! The only module that opens files: every limit and every hostile input is handled here.
 //!
-//! Readers take a path or bytes together with [`Limits`]. Sizes are multiplied with `checked_mul` and
-//! compared with the bytes that follow before anything is reserved; content, not the ending of the
-//! name, decides the format; only regular files are opened. Writers go through [`write_atomic`].
+//! Readers take a path or bytes together with [`Limits`]. Sizes are multiplied with `checked_mul`
+//! and compared with the bytes that follow before anything is reserved; content, not the ending of
+//! the name, decides the format; only regular files are opened. Writers go through
+//! [`write_atomic`].
 
 mod animation;
 mod exr;

@@ -1,7 +1,8 @@
 //! What every part of `tiface` knows: errors, progress, pictures, geometry, files and arithmetic.
 //!
-//! [`io`] is the only module of all crates that opens files, each within limits. Whatever fails returns [`Error`]: a kind
-//! that a caller can act on, a message that names file and place, and a suggested fix.
+//! [`io`] is the only module of all crates that opens files, each within limits. Whatever fails
+//! returns [`Error`]: a kind that a caller can act on, a message that names file and place, and a
+//! suggested fix.
 
 pub mod error;
 pub mod geom;

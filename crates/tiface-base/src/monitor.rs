@@ -8,7 +8,8 @@ use crate::{Error, Result};
 /// Called from the computing thread between steps, never in the middle of one, so that whatever it
 /// stops is in a state that can be saved.
 pub trait Monitor: Send + Sync {
-    /// `step` of `steps` is done; `values` are named figures of this step (losses, rays, rate, ...).
+    /// `step` of `steps` is done; `values` are named figures of this step (losses, rays, rate,
+    /// ...).
     fn step(&self, step: u64, steps: u64, values: &[(&str, f64)]);
 
     /// Returns whether a stop was requested.

@@ -1,7 +1,9 @@
-//! The kernels on the CPU. They work on slices, with rayon and autovectorized SIMD, and do not depend on tensors.
+//! The kernels on the CPU. They work on slices, with rayon and autovectorized SIMD, and do not
+//! depend on tensors.
 //!
-//! Every kernel is bitwise reproducible for any number of threads: work is split into pieces of fixed size, each piece
-//! owns the memory it writes, and sums over pieces are taken in a fixed order.
+//! Every kernel is bitwise reproducible for any number of threads: work is split into pieces of
+//! fixed size, each piece owns the memory it writes, and sums over pieces are taken in a fixed
+//! order.
 
 pub mod adam;
 pub mod density;

@@ -1,11 +1,14 @@
-//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal and DX12. Each is the twin of a kernel of [`super::cpu`].
+//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal and DX12. Each is the twin of a
+//! kernel of [`super::cpu`].
 //!
-//! Values of samples lie plane by plane, `[channels, capacity]`: neighboring threads read neighboring words, and a
-//! plane is read four samples at a time. `capacity` is a multiple of [`mlp::TILE`](super::cpu::mlp::TILE). The actual number
-//! of samples is a count that an earlier kernel wrote into a buffer, so the host need not read it back. Weights and
-//! tables have the same layout as on the CPU.
+//! Values of samples lie plane by plane, `[channels, capacity]`: neighboring threads read
+//! neighboring words, and a plane is read four samples at a time. `capacity` is a multiple of
+//! [`mlp::TILE`](super::cpu::mlp::TILE). The actual number of samples is a count that an earlier
+//! kernel wrote into a buffer, so the host need not read it back. Weights and tables have the same
+//! layout as on the CPU.
 //!
-//! Many threads that add to one word use atomics, whose kind [`Atomics`] selects. All other sums have a fixed order.
+//! Many threads that add to one word use atomics, whose kind [`Atomics`] selects. All other sums
+//! have a fixed order.
 
 mod adam;
 mod color;

@@ -1,4 +1,5 @@
-//! Says whether the mesh of a GLB, OBJ, PLY or STL file is closed, in one piece and free of self-intersections.
+//! Says whether the mesh of a GLB, OBJ, PLY or STL file is closed, in one piece and free of
+//! self-intersections.
 //!
 //! `cargo run --release -p tiface-surface --example check_file -- FILE`
 

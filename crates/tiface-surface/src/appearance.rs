@@ -1,22 +1,24 @@
 //! Colors of a mesh, fitted to the photographs by linear least squares.
 //!
-//! A pixel `p` of a photograph is the mean of what its rays meet, and so linear in colors that live at nodes of the
-//! surface: texels of an atlas, or vertices.
+//! A pixel `p` of a photograph is the mean of what its rays meet, and so linear in colors that live
+//! at nodes of the surface: texels of an atlas, or vertices.
 //!
 //! ```text
 //! min_c  Σ_p D_p ‖ g y_p − b_p − Σ_k Y_k(d_p) Σ_t W_pt c_tk ‖²
 //!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖²
 //! ```
 //!
-//! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before the fit, `W` the
-//! shares of the nodes under the pixel's rays (visibility and footprint in one), `Y_k` real spherical harmonics of the
-//! direction to the viewer and `∇` the difference between neighboring nodes. `D` is the root of the cosine between view
-//! and surface where the head alone fills the pixel, by the mask and by all rays, and else 0: what is behind the head
-//! never bleeds in. All values are sRGB-coded, as the metrics are.
+//! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before
+//! the fit, `W` the shares of the nodes under the pixel's rays (visibility and footprint in one),
+//! `Y_k` real spherical harmonics of the direction to the viewer and `∇` the difference between
+//! neighboring nodes. `D` is the root of the cosine between view and surface where the head alone
+//! fills the pixel, by the mask and by all rays, and else 0: what is behind the head never bleeds
+//! in. All values are sRGB-coded, as the metrics are.
 //!
-//! It is solved twice. The diffuse color (one function) has the finest nodes available, and is what every viewer
-//! shows. What depends on the view is smooth over the surface, so that the vertices carry it, as a difference to the
-//! diffuse color. What no photograph shows follows its neighbors some nodes far, and keeps its color beyond.
+//! It is solved twice. The diffuse color (one function) has the finest nodes available, and is what
+//! every viewer shows. What depends on the view is smooth over the surface, so that the vertices
+//! carry it, as a difference to the diffuse color. What no photograph shows follows its neighbors
+//! some nodes far, and keeps its color beyond.
 
 mod nodes;
 mod rows;
@@ -48,7 +50,8 @@ const MAX_GAIN: f32 = 1.25;
 /// Smoothness of the diffuse color over texels.
 const TEXELS: Smoothness = Smoothness { constant: 0.25, others: 0.0, ridge: 0.0 };
 
-/// Candidates for the smoothness of view-dependent color, over vertices: skin prefers the first, hair the second.
+/// Candidates for the smoothness of view-dependent color, over vertices: skin prefers the first,
+/// hair the second.
 const VERTICES: [Smoothness; 2] = [
     Smoothness { constant: 0.02, others: 0.05, ridge: 8e-6 },
     Smoothness { constant: 0.25, others: 0.75, ridge: 1e-4 },
@@ -56,8 +59,8 @@ const VERTICES: [Smoothness; 2] = [
 
 /// Fitted colors.
 pub struct Appearance {
-    /// Diffuse color of the texels, sRGB-coded, and which of them were fitted; empty where colors are those of
-    /// vertices.
+    /// Diffuse color of the texels, sRGB-coded, and which of them were fitted; empty where colors
+    /// are those of vertices.
     pub texels: (Vec<[f32; 3]>, Vec<bool>),
     /// Diffuse color of the vertices, sRGB-coded.
     pub vertices: Vec<[f32; 3]>,
@@ -96,8 +99,9 @@ pub enum Colors<'a> {
     Vertices,
 }
 
-/// Fits colors to photographs, whose masks have their sizes; vertices have colors. What depends on the view has degree
-/// `max_degree` at most, and 2; the degree and its smoothness are those that show photographs best that were left out of a first fit.
+/// Fits colors to photographs, whose masks have their sizes; vertices have colors. What depends on
+/// the view has degree `max_degree` at most, and 2; the degree and its smoothness are those that
+/// show photographs best that were left out of a first fit.
 ///
 /// Returns `None` where no photograph shows the head.
 ///
@@ -205,7 +209,8 @@ fn choose(
         System { rows, matrix: &in_vertices, nodes: vertices },
     );
     let start = of_fine.missing(&photo(rows, &ones), before, 1);
-    // even a coarse fit to all photographs gives their brightness; twice, since the fit follows them
+    // even a coarse fit to all photographs gives their brightness; twice, since the fit follows
+    // them
     let (count, mut gains) = (functions(max_degree.min(1)), ones.clone());
     for _ in 0..2 {
         let target = of_fine.missing(&photo(rows, &gains), before, 1);
@@ -245,8 +250,8 @@ fn photo(rows: &Rows, gains: &[[f32; 3]]) -> Vec<[f32; 3]> {
     rows.iter().map(with).collect()
 }
 
-/// Returns the gain of each photograph that brings it closest to the fitted image, which is the photograph less
-/// `error` `[rows]`; relative to their mean.
+/// Returns the gain of each photograph that brings it closest to the fitted image, which is the
+/// photograph less `error` `[rows]`; relative to their mean.
 fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]> {
     let mut sums = vec![[[0f64; 2]; 3]; photographs];
     for (row, error) in rows.iter().zip(error) {
@@ -275,7 +280,8 @@ fn psnr(errors: &[[f32; 3]]) -> f64 {
 }
 
 impl System<'_> {
-    /// Returns the residual of `target` `[rows]` after subtracting the rows of `x` `[nodes, count]`.
+    /// Returns the residual of `target` `[rows]` after subtracting the rows of `x`
+    /// `[nodes, count]`.
     fn missing(&self, target: &[[f32; 3]], x: &[[f32; 3]], count: usize) -> Vec<[f32; 3]> {
         let left = |(p, t): (usize, &[f32; 3])| {
             let shown = self.shown(p, x, count);

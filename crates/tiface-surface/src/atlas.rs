@@ -5,11 +5,12 @@
 //!                                └── fails → one half square a triangle
 //! ```
 //!
-//! Every triangle of the result has area, none is flipped, no two share any, and charts keep their distance: that
-//! is checked exactly before an atlas is returned.
+//! Every triangle of the result has area, none is flipped, no two share any, and charts keep their
+//! distance: that is checked exactly before an atlas is returned.
 //!
-//! Triangles that are flipped, cover others, or are too thin for 32-bit coordinates leave their chart and become
-//! half squares of their own. What is left of a chart is packed again, part by part.
+//! Triangles that are flipped, cover others, or are too thin for 32-bit coordinates leave their
+//! chart and become half squares of their own. What is left of a chart is packed again, part by
+//! part.
 
 mod chart;
 mod divide;
@@ -40,7 +41,8 @@ use tiface_base::{Error, Monitor, Result};
 pub struct AtlasReport {
     /// Why every triangle became a half square of its own; `None` if charts were possible.
     pub fallback: Option<String>,
-    /// Triangles that would have been flipped, overlapping or without area, and got a small chart of their own.
+    /// Triangles that would have been flipped, overlapping or without area, and got a small chart
+    /// of their own.
     pub repaired: usize,
     /// Half the distance that charts keep, in texels: as configured, less only for the fall-back.
     pub gutter_px: f64,
@@ -73,7 +75,8 @@ impl AtlasReport {
     }
 }
 
-/// Lays a mesh into a square texture. Meant for closed meshes of up to some 200,000 triangles; others work too.
+/// Lays a mesh into a square texture. Meant for closed meshes of up to some 200,000 triangles;
+/// others work too.
 ///
 /// ```
 /// use glam::Vec3;
@@ -97,8 +100,8 @@ impl AtlasReport {
 ///
 /// # Errors
 ///
-/// A configuration out of range; a mesh without triangles, with an index out of range or a vertex that is not
-/// finite; a texture too small for its triangles; a stop request.
+/// A configuration out of range; a mesh without triangles, with an index out of range or a vertex
+/// that is not finite; a texture too small for its triangles; a stop request.
 pub fn atlas(mesh: &Mesh, config: &AtlasConfig, monitor: &dyn Monitor) -> Result<(Atlas, AtlasReport)> {
     atlas_by(by_charts, mesh, config, monitor)
 }
@@ -160,14 +163,15 @@ const STEPS: u64 = 4;
 pub struct AtlasConfig {
     /// Texels across and down; 16..=16384.
     pub size_px: u32,
-    /// Charts are at least twice this far from each other and from the border; 0..=256 and at most an eighth of
-    /// the texture.
+    /// Charts are at least twice this far from each other and from the border; 0..=256 and at most
+    /// an eighth of the texture.
     pub gutter_px: u32,
-    /// Direction that the face looks in, in the mesh's coordinates: the surface in front becomes one chart, with seams around it
-    /// and none across. That costs stretch: the nose is laid flat with the cheeks. Flat pieces, the caps of a head, then get
-    /// fewer texels.
+    /// Direction that the face looks in, in the mesh's coordinates: the surface in front becomes
+    /// one chart, with seams around it and none across. That costs stretch: the nose is laid flat
+    /// with the cheeks. Flat pieces, the caps of a head, then get fewer texels.
     pub front: Option<Vec3>,
-    /// Up direction in the mesh's coordinates: the chart in front stands upright in the texture. Only used with `front`.
+    /// Up direction in the mesh's coordinates: the chart in front stands upright in the texture.
+    /// Only used with `front`.
     pub up: Option<Vec3>,
 }
 
@@ -203,11 +207,12 @@ struct AtlasLayout {
     gutter_px: f64,
 }
 
-/// Thinner than this, in texels, and rounding to f32 could turn a triangle: eight times the distance of two
-/// coordinates at 4096.
+/// Thinner than this, in texels, and rounding to f32 could turn a triangle: eight times the
+/// distance of two coordinates at 4096.
 const THIN_PX: f64 = 2e-3;
 
-/// Scale of flat pieces of a head relative to the rest: caps, where the photographs end, which have no detail.
+/// Scale of flat pieces of a head relative to the rest: caps, where the photographs end, which have
+/// no detail.
 const CAP_SCALE: f64 = 0.3;
 
 /// Maximum number of rounds of repairing bad triangles.

@@ -1,13 +1,15 @@
-//! Bakes the field's color into texels, either as the final texture or as the start of the fit to photographs.
+//! Bakes the field's color into texels, either as the final texture or as the start of the fit to
+//! photographs.
 //!
 //! Every texel that a chart covers has several samples (`cover`); each sample moves onto the
-//! field's true surface, is seen by the training cameras that nothing hides from it, and takes the mean of what
-//! they see in linear light (`light`), or those of them that look most directly. What the cameras see
-//! differently can be kept as a few lobes a texel (`light`), and the field's normal as a picture of normals
-//! ([`tangent_space()`]). Gaps are filled; color and lobes are then made to agree along seams by [`Seams`].
+//! field's true surface, is seen by the training cameras that nothing hides from it, and takes the
+//! mean of what they see in linear light (`light`), or those of them that look most directly. What
+//! the cameras see differently can be kept as a few lobes a texel (`light`), and the field's normal
+//! as a picture of normals ([`tangent_space()`]). Gaps are filled; color and lobes are then made to
+//! agree along seams by [`Seams`].
 //!
-//! The picture is baked in bands of rows, so that samples never lie in memory together: twelve bytes a texel for
-//! color, normals and each lobe are what it takes.
+//! The picture is baked in bands of rows, so that samples never lie in memory together: twelve
+//! bytes a texel for color, normals and each lobe are what it takes.
 
 mod carry;
 mod cover;
@@ -42,7 +44,8 @@ pub struct BakeConfig {
     pub side: u32,
     /// Texels that repeat a chart's border around it.
     pub gutter_px: u32,
-    /// Maximum distance of a sample from the true surface: the simplification's error and half a cell.
+    /// Maximum distance of a sample from the true surface: the simplification's error and half a
+    /// cell.
     pub reach: f32,
     /// Maximum number of cameras per sample: the ones that view it most directly.
     pub views: usize,
@@ -86,7 +89,8 @@ pub struct BakeReport {
     pub seconds: f64,
 }
 
-/// Bakes a texture for `mesh` with normals, laid out by `atlas`, from the field it was extracted from.
+/// Bakes a texture for `mesh` with normals, laid out by `atlas`, from the field it was extracted
+/// from.
 ///
 /// ```
 /// use glam::{Mat3, Vec3};
@@ -206,8 +210,8 @@ impl Texels {
         }
     }
 
-    /// Gives texels the mean of their samples, which are sorted by texel. If some samples of a texel
-    /// are visible, the invisible ones are ignored.
+    /// Gives texels the mean of their samples, which are sorted by texel. If some samples of a
+    /// texel are visible, the invisible ones are ignored.
     fn put_means(&mut self, samples: &[Sample], points: &SurfacePoints, shades: &Shades) {
         let count = self.lobes.len();
         let mut i = 0;
@@ -250,14 +254,15 @@ impl Texels {
     }
 }
 
-/// Fills a picture of 3 channels between its charts, of which the `known` texels lie in one, and makes it agree along
-/// seams.
+/// Fills a picture of 3 channels between its charts, of which the `known` texels lie in one, and
+/// makes it agree along seams.
 pub fn complete(image: &mut Image, known: &[bool], gutter_px: u32, seams: &Seams) {
     fill(image, known, gutter_px);
     seams.even(image, |v| v, |v| v);
 }
 
-/// Draws harmonics at the vertices of a mesh into the texels of its atlas: a picture a function, complete.
+/// Draws harmonics at the vertices of a mesh into the texels of its atlas: a picture a function,
+/// complete.
 pub fn bake_harmonics(mesh: &Mesh, atlas: &Atlas, harmonics: &Harmonics, gutter_px: u32) -> Vec<Image> {
     let (width, height, count) = (atlas.width, atlas.height, harmonics.functions);
     let mut pictures = vec![Image::new(width, height, 3); count];

@@ -32,15 +32,17 @@ use tiface_base::{Error, Monitor, Result};
 pub struct ExtractOptions {
     /// Cells along the longest side of the box; 2..=8192.
     pub resolution: usize,
-    /// Cell step of the first evaluation of the field: 2, 4 or 8. Smaller steps find smaller loose pieces.
+    /// Cell step of the first evaluation of the field: 2, 4 or 8. Smaller steps find smaller loose
+    /// pieces.
     pub coarse_step: usize,
-    /// Handles are cut, or their holes filled, where they have a loop no longer than this share of the surface's
-    /// longest side; 0..=1, 0 leaves them all.
+    /// Handles are cut, or their holes filled, where they have a loop no longer than this share of
+    /// the surface's longest side; 0..=1, 0 leaves them all.
     pub longest_handle: f32,
 }
 
-/// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm long, which
-/// is a strand or a hole as thick as a thumb. A share, because not every capture has a known unit.
+/// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm
+/// long, which is a strand or a hole as thick as a thumb. A share, because not every capture has a
+/// known unit.
 pub const MAX_HANDLE: f32 = 0.15;
 
 /// Maximum number of points in one call of a field.
@@ -83,7 +85,8 @@ pub struct MeshReport {
     pub off_surface_before: f64,
     /// Mean |f| / |∇f| after they moved, in cells.
     pub off_surface_after: f64,
-    /// Number of vertices that a step moved less than the Newton step, because a face would have folded.
+    /// Number of vertices that a step moved less than the Newton step, because a face would have
+    /// folded.
     pub held_back: usize,
     /// Handles that were cut, filled or left.
     pub handles: HandleReport,
@@ -110,7 +113,8 @@ impl MeshReport {
         self.seconds = begin.elapsed().as_secs_f64();
     }
 
-    /// Returns where the surface ends with the kept region, as every bust does; `cap` says whether the cap was kept.
+    /// Returns where the surface ends with the kept region, as every bust does; `cap` says whether
+    /// the cap was kept.
     pub fn end(&self, cap: bool) -> Option<String> {
         let state = if cap { "is closed by a cap" } else { "is open" };
         (self.capped > 0).then(|| {
@@ -144,11 +148,12 @@ impl MeshReport {
 
 /// Meshes the zero level set of a field within `bounds`.
 ///
-/// The field gets points of the same space as `bounds`, tens of thousands a call, from one thread. Vertices are colored
-/// as they are seen along their normals.
+/// The field gets points of the same space as `bounds`, tens of thousands a call, from one thread.
+/// Vertices are colored as they are seen along their normals.
 ///
-/// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's zero,
-/// its normals the field's gradient. Handles with a loop no longer than `options.longest_handle` are removed.
+/// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's
+/// zero, its normals the field's gradient. Handles with a loop no longer than
+/// `options.longest_handle` are removed.
 ///
 /// ```
 /// use glam::Vec3;
@@ -165,7 +170,8 @@ impl MeshReport {
 ///
 /// # Errors
 ///
-/// A box or option out of range, a field without a surface, answers of the wrong length, a request to stop.
+/// A box or option out of range, a field without a surface, answers of the wrong length, a request
+/// to stop.
 pub fn extract(
     field: &dyn SdfField,
     bounds: Aabb,
@@ -281,7 +287,8 @@ fn check_surface(found: &Sparse) -> Result<()> {
     Ok(())
 }
 
-/// Returns the mean first-order distance to the surface, in cells, over vertices that are not capped.
+/// Returns the mean first-order distance to the surface, in cells, over vertices that are not
+/// capped.
 fn off_surface(values: &[f32], gradients: &[Vec3], capped: &[bool], cell: f32) -> f64 {
     let distances = (0..values.len())
         .filter(|&i| !capped[i])

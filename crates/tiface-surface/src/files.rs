@@ -1,9 +1,9 @@
 //! Mesh files: GLB, OBJ and PLY, written, read and checked; glTF and STL, read.
 //!
-//! [`to_glb`], [`to_obj`] and [`to_ply`] write; [`open_mesh`] opens all formats from any program, with the pictures
-//! beside them, and [`read()`] the surface in bytes. [`check()`] examines a surface, [`uv_check()`] its texture
-//! coordinates. [`ExtractedSurface`] and [`HeadMesh`] are the meshes
-//! that later stages read.
+//! [`to_glb`], [`to_obj`] and [`to_ply`] write; [`open_mesh`] opens all formats from any program,
+//! with the pictures beside them, and [`read()`] the surface in bytes. [`check()`] examines a
+//! surface, [`uv_check()`] its texture coordinates. [`ExtractedSurface`] and [`HeadMesh`] are the
+//! meshes that later stages read.
 
 mod beside;
 mod check;

@@ -2,10 +2,10 @@
 //!
 //! # Modules
 //!
-//! - `extract`: [`sparse`] evaluates a field only near its surface, [`clean`] keeps the head and drops
-//!   loose pieces; [`extract`] runs both, adds normals and colors, and removes small handles. [`Cap`]
-//!   closes the surface where the frames cut it. [`extract_dense`] evaluates a field at all nodes of
-//!   a grid, which [`marching`] meshes.
+//! - `extract`: [`sparse`] evaluates a field only near its surface, [`clean`] keeps the head and
+//!   drops loose pieces; [`extract`] runs both, adds normals and colors, and removes small handles.
+//!   [`Cap`] closes the surface where the frames cut it. [`extract_dense`] evaluates a field at all
+//!   nodes of a grid, which [`marching`] meshes.
 //! - [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured mesh.
 //! - [`files`] writes, reads and checks GLB, OBJ and PLY, and reads glTF and STL.
 //! - [`render`] shows a mesh from a camera.
@@ -36,7 +36,8 @@ use std::fmt::Display;
 use tiface_base::geom::{Mesh, SdfField};
 use tiface_base::{Error, Monitor, Result};
 
-/// Refuses a setting that is not `ok`. `name` is the configuration's key if it has one, else the parameter or field.
+/// Refuses a setting that is not `ok`. `name` is the configuration's key if it has one, else the
+/// parameter or field.
 fn setting(ok: bool, name: &str, expected: &str, found: impl Display) -> Result<()> {
     if ok { Ok(()) } else { Err(Error::cannot(format!("`{name}` is {found}, expected {expected}"), "")) }
 }

@@ -1,28 +1,30 @@
 //! Movement of vertices towards a surface without spoiling triangles.
 //!
-//! [`Polish`] moves vertices onto the field's zero and apart from each other, without ever spoiling a face.
+//! [`Polish`] moves vertices onto the field's zero and apart from each other, without ever spoiling
+//! a face.
 //!
-//! A Newton step `p −= f g / |g|²` takes out most of the error of linear interpolation; what two steps
-//! leave is the chord error of flat triangles. With the first step each vertex also slides along the
-//! surface towards the middle of its neighbors, which turns the slivers of marching cubes into fair
-//! triangles at no further evaluation.
+//! A Newton step `p −= f g / |g|²` takes out most of the error of linear interpolation; what two
+//! steps leave is the chord error of flat triangles. With the first step each vertex also slides
+//! along the surface towards the middle of its neighbors, which turns the slivers of marching cubes
+//! into fair triangles at no further evaluation.
 
 use glam::Vec3;
 use rayon::prelude::*;
 use tiface_base::geom::{area_vector, shape};
 
-/// Returns the first-order step to a field's zero, `−f g / |g|²`; zero if value or gradient is unusable.
+/// Returns the first-order step to a field's zero, `−f g / |g|²`; zero if value or gradient is
+/// unusable.
 pub(super) fn newton(f: f32, g: Vec3) -> Option<Vec3> {
     let slope = g.length_squared();
     let step = -f / slope * g;
     (slope.is_finite() && slope >= 1e-12 && step.is_finite()).then_some(step)
 }
 
-/// Moves vertices all the way, half of it, a quarter, or not at all where a triangle would be spoiled; returns how
-/// many were held back.
+/// Moves vertices all the way, half of it, a quarter, or not at all where a triangle would be
+/// spoiled; returns how many were held back.
 ///
-/// `at(v, p, share)` is where vertex `v`, now at `p`, is after that share of its way. `spoiled(t, from, to)` is only
-/// evaluated for triangles of which a vertex moved.
+/// `at(v, p, share)` is where vertex `v`, now at `p`, is after that share of its way.
+/// `spoiled(t, from, to)` is only evaluated for triangles of which a vertex moved.
 pub(super) fn move_vertices(
     positions: &mut [Vec3],
     triangles: &[[u32; 3]],
@@ -86,9 +88,9 @@ impl<'a> Polish<'a> {
         Polish { triangles, start: positions.to_vec(), facing, reach, fixed }
     }
 
-    /// Makes one Newton step with values and gradients at `positions`, plus the share `relax` of the way along the
-    /// surface to the mean of the neighbors. Steps that would spoil a face are shortened or undone; returns the
-    /// number of such vertices.
+    /// Makes one Newton step with values and gradients at `positions`, plus the share `relax` of
+    /// the way along the surface to the mean of the neighbors. Steps that would spoil a face are
+    /// shortened or undone; returns the number of such vertices.
     pub(super) fn step(
         &self,
         positions: &mut [Vec3],

@@ -1,17 +1,18 @@
 //! Soft layers around the mesh where the field is softer than a surface: the outline of hair.
 //!
-//! The field's opacity falls from one to none over a few lengths `1 / s` of its local sharpness `s`: a ray that comes
-//! as near as `f` to its level set is stopped to the share `σ(−f · s)` (Wang et al., NeuS, 2021). The mesh stands at
-//! `f = 0` and shows nothing of what is outside. Layers at `f = q / s` do, the opacity of each what rays lose between
-//! the middles to its neighbors:
+//! The field's opacity falls from one to none over a few lengths `1 / s` of its local sharpness
+//! `s`: a ray that comes as near as `f` to its level set is stopped to the share `σ(−f · s)` (Wang
+//! et al., NeuS, 2021). The mesh stands at `f = 0` and shows nothing of what is outside. Layers at
+//! `f = q / s` do, the opacity of each what rays lose between the middles to its neighbors:
 //!
 //! ```text
 //! α_k = 1 − σ(q_low) / σ(q_high)
 //! ```
 //!
-//! One Gauss-Newton step on the logits of the opacities, at the vertices of each layer, then brings the outline closer
-//! to the masks' ([`Photograph::mask`]). Both are evaluated on photographs that were left out, and the layers are dropped
-//! if they gain nothing. The mesh itself stays as it is: inside of it nothing is transparent.
+//! One Gauss-Newton step on the logits of the opacities, at the vertices of each layer, then brings
+//! the outline closer to the masks' ([`Photograph::mask`]). Both are evaluated on photographs that
+//! were left out, and the layers are dropped if they gain nothing. The mesh itself stays as it is:
+//! inside of it nothing is transparent.
 
 use super::appearance::{Nodes, Photograph};
 use glam::Vec2;
@@ -22,11 +23,12 @@ use tiface_base::math::cg::{conjugate_gradients, dot};
 use tiface_base::math::rank::median;
 use tiface_base::{Monitor, Result};
 
-/// Distances of the layers, in lengths `1 / s`. Two would say nearly as much, but show as steps before a bright wall.
+/// Distances of the layers, in lengths `1 / s`. Two would say nearly as much, but show as steps
+/// before a bright wall.
 const LAYERS: [f32; 4] = [0.5, 1.5, 3.0, 5.0];
 
-/// Softness `1 / s` from which on a vertex has layers, in pixels of the nearest camera: antialiasing shows the rest.
-/// From twice this softness on they have their full opacity.
+/// Softness `1 / s` from which on a vertex has layers, in pixels of the nearest camera:
+/// antialiasing shows the rest. From twice this softness on they have their full opacity.
 const MIN_SOFTNESS_PX: f32 = 0.5;
 
 /// Rounds in which the softness of vertices takes the mean with its neighbors.
@@ -50,7 +52,8 @@ const VALIDATION_STRIDE: usize = 6;
 /// Minimum share of the squared error of left-out outlines that layers must remove.
 const MIN_GAIN: f64 = 0.05;
 
-/// Weights of squared logits, and of squared differences along an edge, against the square of one pixel's error.
+/// Weights of squared logits, and of squared differences along an edge, against the square of one
+/// pixel's error.
 const RIDGE: f64 = 0.01;
 const SMOOTH: f64 = 0.05;
 
@@ -64,15 +67,16 @@ pub struct ShellsReport {
     pub triangles: usize,
     /// Median softness of the vertices that have, in pixels.
     pub softness_px: f32,
-    /// Root mean square error of opacity near the outlines of left-out photographs: without layers, with those of the
-    /// field, with fitted ones.
+    /// Root mean square error of opacity near the outlines of left-out photographs: without layers,
+    /// with those of the field, with fitted ones.
     pub left_out: [f64; 3],
     /// Whether the layers are kept.
     pub kept: bool,
 }
 
-/// Returns layers around a mesh whose vertices have normals, of the local `sharpness` of the field at its vertices.
-/// Returns `None` if the masks carry no information, nothing is soft, or left-out photographs do not look better.
+/// Returns layers around a mesh whose vertices have normals, of the local `sharpness` of the field
+/// at its vertices. Returns `None` if the masks carry no information, nothing is soft, or left-out
+/// photographs do not look better.
 ///
 /// # Errors
 ///
@@ -277,7 +281,8 @@ impl Outlines {
         (rows.iter().map(square).sum::<f64>() / rows.len().max(1) as f64).sqrt()
     }
 
-    /// One Gauss-Newton step from the opacities of `shells`, to the rows that `keep` names (by photograph).
+    /// One Gauss-Newton step from the opacities of `shells`, to the rows that `keep` names (by
+    /// photograph).
     fn fit(&self, shells: &Shells, nodes: &Nodes, keep: &dyn Fn(u32) -> bool) -> Shells {
         let vertices = nodes.len();
         let unknowns = vertices * shells.layers.len();
@@ -367,8 +372,9 @@ mod tests {
         (0..12).map(camera).collect()
     }
 
-    /// Returns the mask of a ball whose opacity falls from 1 to 0 as that of a field of this sharpness does, seen by a
-    /// camera: a ray that comes as near as `f` to the surface has σ(−f · sharpness).
+    /// Returns the mask of a ball whose opacity falls from 1 to 0 as that of a field of this
+    /// sharpness does, seen by a camera: a ray that comes as near as `f` to the surface has σ(−f ·
+    /// sharpness).
     fn mask(camera: &Camera, sharpness: f32) -> Gray {
         let value = |i: u32| {
             let ray = camera.ray(Vec2::new((i % SIZE) as f32 + 0.5, (i / SIZE) as f32 + 0.5)).unwrap();
@@ -412,8 +418,8 @@ mod tests {
         let photographs = [Photograph { camera, photo: &photo, mask: Some(&mask), valid: None }];
         let sharpness = vec![20.0; mesh.positions.len()];
         let (shells, _) = from_field(&mesh, &Nodes::vertices(&mesh), &sharpness, &photographs).unwrap();
-        // the first two of layers at ½, 3/2 and 3: 1 − σ(¼) / σ(1) = 1 − 0.56218 / 0.73106, and 1 − σ(1) / σ(9/4) =
-        // 1 − 0.73106 / 0.90465; the last, at 5 after 3: 1 − σ(4)
+        // the first two of layers at ½, 3/2 and 3: 1 − σ(¼) / σ(1) = 1 − 0.56218 / 0.73106, and 1 −
+        // σ(1) / σ(9/4) = 1 − 0.73106 / 0.90465; the last, at 5 after 3: 1 − σ(4)
         let first: Vec<f32> = shells.layers.iter().map(|layer| layer.alphas[0]).collect();
         assert!((first[0] - 0.23101).abs() < 1e-4 && (first[1] - 0.19189).abs() < 1e-4, "{first:?}");
         assert!((first[3] - 0.01799).abs() < 1e-4, "{first:?}");

@@ -1,23 +1,24 @@
-//! Fewer triangles for the same surface: edge collapse by quadrics, checked against the field itself.
+//! Fewer triangles for the same surface: edge collapse by quadrics, checked against the field
+//! itself.
 //!
-//! Garland, Heckbert 1997 with the memoryless quadrics of Lindstrom, Turk 1998; see `quadric`. Every
-//! collapse keeps the link condition, turns no triangle by more than 60° and leaves none thinner than
-//! the thinnest it found, so a closed manifold stays one, of the same genus.
+//! Garland, Heckbert 1997 with the memoryless quadrics of Lindstrom, Turk 1998; see `quadric`.
+//! Every collapse keeps the link condition, turns no triangle by more than 60° and leaves none
+//! thinner than the thinnest it found, so a closed manifold stays one, of the same genus.
 //!
-//! The field is a network: thousands of points a call are cheap, single ones are not. So it is evaluated
-//! between rounds of collapses: at the vertices and in the middles of triangles, in one batch each (`rounds`).
-//! Vertices go to its zero, or where their triangles lie nearest to it; from these positions the next round
-//! measures its planes. With an error to keep, a batch at the middles of triangles and edges tells how
-//! much each place may still give.
+//! The field is a network: thousands of points a call are cheap, single ones are not. So it is
+//! evaluated between rounds of collapses: at the vertices and in the middles of triangles, in one
+//! batch each (`rounds`). Vertices go to its zero, or where their triangles lie nearest to it; from
+//! these positions the next round measures its planes. With an error to keep, a batch at the
+//! middles of triangles and edges tells how much each place may still give.
 //!
-//! Nearest is the default, since it is what accuracy means: a head of 202,276 triangles, itself 0.0155
-//! 512ths of the cube off, has a mean error of 0.0199 in 40,000 triangles without the field, 0.0257 with
-//! all vertices on its zero (chords lie on one side of a curve), and 0.0090 where they are nearest
-//! (`cargo bench --bench simplify`).
+//! Nearest is the default, since it is what accuracy means: a head of 202,276 triangles, itself
+//! 0.0155 512ths of the cube off, has a mean error of 0.0199 in 40,000 triangles without the field,
+//! 0.0257 with all vertices on its zero (chords lie on one side of a curve), and 0.0090 where they
+//! are nearest (`cargo bench --bench simplify`).
 //!
-//! Self-intersections are searched once, at the end, which costs a tenth of the collapses. If the mesh
-//! has any, the work starts over, and every collapse checks for crossings (`crossing`), at seven times the cost. So none is
-//! made, and those of the input do not become more.
+//! Self-intersections are searched once, at the end, which costs a tenth of the collapses. If the
+//! mesh has any, the work starts over, and every collapse checks for crossings (`crossing`), at
+//! seven times the cost. So none is made, and those of the input do not become more.
 
 mod collapse;
 mod crossing;
@@ -44,15 +45,17 @@ struct Task<'a> {
     monitor: &'a dyn Monitor,
 }
 
-/// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first; colors
-/// follow their vertices. A mesh that has no more triangles than `config.triangles` stays as it is.
+/// Simplifies a mesh in place to `config.triangles` or to `config.error`, whichever comes first;
+/// colors follow their vertices. A mesh that has no more triangles than `config.triangles` stays as
+/// it is.
 ///
-/// With a field, vertices end where the triangles lie nearest to its zero set (with an `error` to keep: on it) and normals
-/// are its gradient; without it, or where the gradient is shorter than 1e-6, normals are angle-weighted. Without it the
-/// `error` is kept by adding up how far each collapse strays from the planes before it, which is cautious.
+/// With a field, vertices end where the triangles lie nearest to its zero set (with an `error` to
+/// keep: on it) and normals are its gradient; without it, or where the gradient is shorter than
+/// 1e-6, normals are angle-weighted. Without it the `error` is kept by adding up how far each
+/// collapse strays from the planes before it, which is cautious.
 ///
-/// Topology never changes; borders stay borders. Vertices of edges with more than two triangles, or of
-/// several fans, are not touched. The same bytes for any number of threads.
+/// Topology never changes; borders stay borders. Vertices of edges with more than two triangles, or
+/// of several fans, are not touched. The same bytes for any number of threads.
 ///
 /// ```
 /// use glam::Vec3;
@@ -72,8 +75,8 @@ struct Task<'a> {
 ///
 /// # Errors
 ///
-/// A setting out of range, a mesh with a coordinate that is not finite or an index out of range, a field that returns
-/// the wrong number of values, a request to stop. The mesh is then as it was.
+/// A setting out of range, a mesh with a coordinate that is not finite or an index out of range, a
+/// field that returns the wrong number of values, a request to stop. The mesh is then as it was.
 pub fn simplify(
     mesh: &mut Mesh,
     field: Option<&dyn SdfField>,
@@ -123,7 +126,8 @@ pub fn simplify(
 pub struct SimplifyConfig {
     /// Number of triangles to keep; 0 for as few as `error` allows.
     pub triangles: usize,
-    /// Maximum distance from the surface, in units of the positions; 0 if only `triangles` limits the simplification.
+    /// Maximum distance from the surface, in units of the positions; 0 if only `triangles` limits
+    /// the simplification.
     pub error: f32,
 }
 
@@ -175,8 +179,8 @@ pub struct SimplifyReport {
     pub again: usize,
     /// Triangles that meet others in the result; not more than in the input.
     pub self_intersections: usize,
-    /// Largest distance from the surface at corners, middles of edges and triangles; measured only with
-    /// a field and an `error`, in units of the positions.
+    /// Largest distance from the surface at corners, middles of edges and triangles; measured only
+    /// with a field and an `error`, in units of the positions.
     pub worst: Option<f32>,
     /// Wall time.
     pub seconds: f64,

@@ -1,5 +1,5 @@
-//! The binary files: little-endian numbers, counts before lists. Every count is compared with the bytes that
-//! are left before anything is reserved.
+//! The binary files: little-endian numbers, counts before lists. Every count is compared with the
+//! bytes that are left before anything is reserved.
 
 use super::super::frame::LensModel;
 use super::{Camera, Image, Model, Rigid};
@@ -118,7 +118,8 @@ impl<'b> Cursor<'b> {
 
 pub(super) fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, ReadError> {
     let mut c = Cursor::of(source);
-    // number, model, width, height and two parameters at least: those of EQUIRECTANGULAR, to be refused by name
+    // number, model, width, height and two parameters at least: those of EQUIRECTANGULAR, to be
+    // refused by name
     let n = c.counted(4 + 4 + 16 + 2 * 8, "cameras")?;
     let mut cameras = HashMap::with_capacity(n);
     for _ in 0..n {

@@ -1,8 +1,8 @@
 //! The text files: a line of numbers for each entry, two for an image, `#` before comments.
 //!
-//! An image's second line holds the points that it shows (x, y, number), and is empty where there are
-//! none. Scripts and editors leave empty lines out: then the next image follows at once, which its
-//! numbers and its name tell from points.
+//! An image's second line holds the points that it shows (x, y, number), and is empty where there
+//! are none. Scripts and editors leave empty lines out: then the next image follows at once, which
+//! its numbers and its name tell from points.
 
 use super::super::folder::{in_file, shortened};
 use super::super::frame::LensModel;

@@ -55,7 +55,8 @@ impl Sensor {
     }
 }
 
-/// Returns rotation and location of a sensor of a rig. What is fixed at its default is an empty element.
+/// Returns rotation and location of a sensor of a rig. What is fixed at its default is an empty
+/// element.
 fn offset(sensor: Node) -> Result<Option<Pose>, String> {
     let part = |name: &str, count: usize| -> Result<Option<Vec<f64>>, String> {
         let values = numbers(child(sensor, name));

@@ -148,8 +148,8 @@ pub fn is_mask_folder(folded: &str) -> bool {
     is_like_masks(folded) && !words(folded).any(is_other)
 }
 
-/// Returns whether a folded word, such as `face`, `lips` or `lipmask`, says of something else than a
-/// head.
+/// Returns whether a folded word, such as `face`, `lips` or `lipmask`, says of something else than
+/// a head.
 fn is_other(word: &str) -> bool {
     let part = ["masks", "mask"].iter().find_map(|end| word.strip_suffix(end)).unwrap_or(word);
     let single = part.strip_suffix('s').unwrap_or(part);

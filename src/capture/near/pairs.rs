@@ -22,8 +22,8 @@ impl Pairs {
     }
 
     /// Returns whether the files are those of the names. Equal numbers alone show it only if every
-    /// name has a file, or every file a name and few are without: pictures that are counted on their
-    /// own, from 0 or 1, have some of the numbers of others.
+    /// name has a file, or every file a name and few are without: pictures that are counted on
+    /// their own, from 0 or 1, have some of the numbers of others.
     pub fn is_sure(&self) -> bool {
         let (n, all) = (self.count(), self.files.len());
         let is_sure = |numbered: usize| n == all || n == numbered && 4 * n >= 3 * all;

@@ -1,6 +1,6 @@
-//! The scene without masks: the box of the region that 40 % of the cameras have in their frame, no farther from the
-//! meeting point of the viewing axes than 0.6 of the cameras' median distance to it; drawn tighter around the
-//! dataset's points within it, or the dataset's own box.
+//! The scene without masks: the box of the region that 40 % of the cameras have in their frame, no
+//! farther from the meeting point of the viewing axes than 0.6 of the cameras' median distance to
+//! it; drawn tighter around the dataset's points within it, or the dataset's own box.
 
 use super::{Scene, aim, head_outside, scene_from, world_box};
 use crate::capture::carve::{self, Cube, Projector};
@@ -13,8 +13,8 @@ use tiface_base::math::rank::median;
 /// Minimum number of points for a box around them.
 const MIN_POINTS: usize = 100;
 
-/// Returns the box of the points that the cameras see, without one percent on each side, enlarged by a twentieth; `None`
-/// for too few points.
+/// Returns the box of the points that the cameras see, without one percent on each side, enlarged
+/// by a twentieth; `None` for too few points.
 pub(in crate::capture) fn around_points(views: &[View], points: &[DVec3]) -> Option<Aabb> {
     if points.len() < MIN_POINTS {
         return None;

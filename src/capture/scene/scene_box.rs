@@ -1,9 +1,9 @@
 //! The box in which fields are trained: around the head, the published one, or a given one.
 //!
-//! A given box, and the published one, override the masks. TI-Face's code
-//! has two worlds for its captures: T-Face's and the baseline's is the dataset's divided by 0.3, their box
-//! ±(1.5, 1.67, 1.0) in it; I-Face's is the dataset's, its box ±0.3. So a scene whose unit is 0.3 of the dataset's has
-//! I-Face in [-1, 1]³, as every scene has, and T-Face in its published numbers.
+//! A given box, and the published one, override the masks. TI-Face's code has two worlds for its
+//! captures: T-Face's and the baseline's is the dataset's divided by 0.3, their box ±(1.5, 1.67,
+//! 1.0) in it; I-Face's is the dataset's, its box ±0.3. So a scene whose unit is 0.3 of the
+//! dataset's has I-Face in [-1, 1]³, as every scene has, and T-Face in its published numbers.
 
 use super::{Scene, world_box};
 use glam::{DVec3, Vec3};
@@ -63,7 +63,8 @@ fn ilsh() -> Scene {
 
 /// Returns the scene of the configured box, and a warning if it cannot be used.
 ///
-/// `found` locates the head by cameras and masks, and is not called for a given box, which has no hull.
+/// `found` locates the head by cameras and masks, and is not called for a given box, which has no
+/// hull.
 pub fn in_box(
     found: impl FnOnce() -> Result<(Scene, Vec<String>)>,
     wanted: SceneBox,
@@ -119,7 +120,8 @@ mod tests {
         // I-Face's cube is [-1, 1]³ of every scene
         let corner = scene.scene_from_world.inverse().point(Vec3::ONE);
         assert!((corner - 0.3).abs().max_element() < 1e-7, "{corner}");
-        // T-Face's own numbers: 25 per unit, entry between 3.5 and 7, 141 × 157 × 94 vertices, 459 samples
+        // T-Face's own numbers: 25 per unit, entry between 3.5 and 7, 141 × 157 × 94 vertices, 459
+        // samples
         let bounds = [scene.aabb.min.to_array(), scene.aabb.max.to_array()];
         let c = VmConfig::preset(Preset::Paper).placed(bounds);
         assert!((c.distance_scale - 25.0).abs() < 1e-5 && (c.alpha_unit - 1.0).abs() < 1e-6, "{c:?}");

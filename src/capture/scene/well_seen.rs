@@ -1,8 +1,8 @@
 //! The part of the scene's box that enough cameras see.
 //!
-//! A body that the frames cut continues where hardly any camera sees it; a field can only guess that part.
-//! Training still needs that part (rays of good pixels pass through it), the mesh does not: it is closed by
-//! a flat cap where too few cameras see the body.
+//! A body that the frames cut continues where hardly any camera sees it; a field can only guess
+//! that part. Training still needs that part (rays of good pixels pass through it), the mesh does
+//! not: it is closed by a flat cap where too few cameras see the body.
 
 use super::Scene;
 use crate::capture::carve::Projector;
@@ -10,10 +10,11 @@ use glam::{DVec3, Vec3};
 use tiface_base::geom::{Aabb, Camera};
 use tiface_base::math::rank::median;
 
-/// Returns the part of the scene's box, in scene coordinates, whose outermost slabs of hull cells are, in the
-/// median, inside the frames of a `share` of the cameras, 0..=1 (three at least). `cameras` are in the world;
-/// only the face that looks most downward moves (`up` is a world direction): frames cut heads below, and a body
-/// whose shoulders end in walls left and right looks like a box.
+/// Returns the part of the scene's box, in scene coordinates, whose outermost slabs of hull cells
+/// are, in the median, inside the frames of a `share` of the cameras, 0..=1 (three at least).
+/// `cameras` are in the world; only the face that looks most downward moves (`up` is a world
+/// direction): frames cut heads below, and a body whose shoulders end in walls left and right looks
+/// like a box.
 ///
 /// Without a hull, and where every slab is seen, the whole box.
 pub fn well_seen(scene: &Scene, cameras: &[Camera], up: Vec3, share: f64) -> Aabb {
@@ -94,7 +95,8 @@ mod tests {
 
     #[test]
     fn what_every_frame_holds_is_kept_whole() {
-        // half the frame at distance 3, the nearest: 50 / 200 · 3 = 0.75; at 4: 1.0; median cells are in
+        // half the frame at distance 3, the nearest: 50 / 200 · 3 = 0.75; at 4: 1.0; median cells
+        // are in
         let wide: Vec<Camera> =
             cameras(0.0).into_iter().map(|c| Camera { fx: 80.0, fy: 80.0, ..c }).collect();
         assert_eq!(well_seen(&scene(), &wide, Vec3::Y, 1.0 / 3.0), Aabb::SCENE);
@@ -102,7 +104,8 @@ mod tests {
 
     #[test]
     fn a_body_that_the_frames_cut_below_ends_where_they_end() {
-        // one unit up: the frame reaches from about 0 to 2 on the axis, so the lower half is not seen
+        // one unit up: the frame reaches from about 0 to 2 on the axis, so the lower half is not
+        // seen
         let part = well_seen(&scene(), &cameras(1.0), Vec3::Y, 1.0 / 3.0);
         assert_eq!((part.max, part.min.x, part.min.z), (Vec3::ONE, -1.0, -1.0));
         assert!(part.min.y > -0.3 && part.min.y < 0.3, "{part:?}");

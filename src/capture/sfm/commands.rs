@@ -6,8 +6,9 @@
 //! | 3.13 | `FeatureExtraction.use_gpu`, `FeatureMatching.guided_matching` | the same |
 //! | 4.0 to 4.2 | the same | `colmap view_graph_calibrator`, then `colmap global_mapper` |
 //!
-//! The others have one name in all versions: `ImageReader`, `SiftExtraction.peak_threshold` and its kin,
-//! `Mapper.num_threads`, `BundleAdjustment.refine_principal_point`. The program's help says which it knows.
+//! The others have one name in all versions: `ImageReader`, `SiftExtraction.peak_threshold` and its
+//! kin, `Mapper.num_threads`, `BundleAdjustment.refine_principal_point`. The program's help says
+//! which it knows.
 
 use super::output::{NAMES, OPTIONS};
 use super::{Attempt, MAX_EXHAUSTIVE, SfmOptions, Work};
@@ -41,7 +42,8 @@ pub(super) struct Programs {
 pub(super) enum Mapper {
     /// COLMAP's `mapper`, which adds one photograph after the other.
     Incremental,
-    /// COLMAP's `global_mapper`, which GLOMAP became; the focal lengths are calibrated before where COLMAP can.
+    /// COLMAP's `global_mapper`, which GLOMAP became; the focal lengths are calibrated before where
+    /// COLMAP can.
     Global { calibrates: bool },
     /// `glomap mapper`, which calibrates by itself.
     Glomap(PathBuf),

@@ -94,8 +94,8 @@ impl<'a> Output<'a> {
     /// # Errors
     ///
     /// Fails if the folder has something else, and with
-    /// [`ErrorKind::NotNow`](tiface_base::ErrorKind::NotNow) if a search works in it, unless this process
-    /// holds its lock.
+    /// [`ErrorKind::NotNow`](tiface_base::ErrorKind::NotNow) if a search works in it, unless this
+    /// process holds its lock.
     pub fn result_of(&self, request: &Request, lock: Option<&Lock>) -> Result<Option<Solution>> {
         let exists = |what: String, hint: &str| {
             Error::cannot(format!("`{}` already exists{what}", self.out.display()), hint)

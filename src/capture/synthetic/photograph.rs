@@ -1,5 +1,5 @@
-//! Takes one picture of the demo head: sphere tracing, light, supersampled coverage; and how the head and its background
-//! look: albedo, lamps, shine, and the dark room behind.
+//! Takes one picture of the demo head: sphere tracing, light, supersampled coverage; and how the
+//! head and its background look: albedo, lamps, shine, and the dark room behind.
 //!
 //! A grid of distances sampled once lets rays and shadows stride through empty air for the price
 //! of a lookup; the exact function is only evaluated close to the surface.
@@ -257,8 +257,8 @@ impl DistanceGrid {
         trilinear(f, face(first), face(first + layer))
     }
 
-    /// Returns a step that cannot cross the surface: the slope is at most 1, so the trilinear value errs by
-    /// less than a cell's diagonal.
+    /// Returns a step that cannot cross the surface: the slope is at most 1, so the trilinear value
+    /// errs by less than a cell's diagonal.
     fn air(&self, p: Vec3) -> f32 {
         self.distance(p) - 1.75 * CELL
     }
@@ -271,8 +271,8 @@ struct Lamp {
     pub shadow: bool,
 }
 
-/// Returns the lamps that light the head: key from the upper left, fill from the right, one from behind
-/// and above, one from below in front.
+/// Returns the lamps that light the head: key from the upper left, fill from the right, one from
+/// behind and above, one from below in front.
 fn lamps() -> [Lamp; 4] {
     let lamp = |x: f32, y: f32, z: f32, light: [f32; 3], shadow| Lamp {
         towards: Vec3::new(x, y, z).normalize(),

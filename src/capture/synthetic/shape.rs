@@ -4,8 +4,8 @@
 //! minimum"), with a hair cap whose surface is displaced along combed strands. World: meters,
 //! +Z up, the face looks along −Y. Chin to crown is [`SyntheticHead::HEAD_HEIGHT`].
 //!
-//! Displacements, and everything else that is drawn, come from smooth value noise and hashed random numbers: the same bits
-//! on every machine.
+//! Displacements, and everything else that is drawn, come from smooth value noise and hashed random
+//! numbers: the same bits on every machine.
 
 use glam::{IVec3, Vec2, Vec3};
 use tiface_base::geom::Aabb;
@@ -54,7 +54,8 @@ impl SyntheticHead {
     pub const HEAD_HEIGHT: f32 = 0.25;
 
     /// Signed distance, meters, negative inside, scaled to a slope of at most 1: never more than
-    /// the true distance, about half of it in places. For measuring use [`SyntheticHead::distance`].
+    /// the true distance, about half of it in places. For measuring use
+    /// [`SyntheticHead::distance`].
     pub fn sdf(&self, p: Vec3) -> f32 {
         let parts = parts(p - OFFSET);
         parts.whole() / LIPSCHITZ
@@ -83,8 +84,8 @@ impl SyntheticHead {
         (Vec3::from_array(rise).normalize_or_zero(), here.material())
     }
 
-    /// Returns the distance from `p` to the surface, meters, ≥ 0, to first order: `|sdf| / |∇sdf|`. Good within
-    /// a few millimeters of the surface, where reconstructions are judged.
+    /// Returns the distance from `p` to the surface, meters, ≥ 0, to first order: `|sdf| / |∇sdf|`.
+    /// Good within a few millimeters of the surface, where reconstructions are judged.
     pub fn distance(&self, p: Vec3) -> f32 {
         self.sdf(p).abs() / self.gradient(p).length().max(0.05)
     }
@@ -94,8 +95,8 @@ impl SyntheticHead {
         Aabb { min: OFFSET + Vec3::new(-0.122, -0.126, -0.193), max: OFFSET + Vec3::new(0.122, 0.126, 0.148) }
     }
 
-    /// Returns whether `p` is in the part worth judging: the head above the line from jaw to nape, without neck
-    /// and shoulders.
+    /// Returns whether `p` is in the part worth judging: the head above the line from jaw to nape,
+    /// without neck and shoulders.
     pub fn is_head(&self, p: Vec3) -> bool {
         above_jaw(p - OFFSET)
     }
@@ -288,8 +289,8 @@ fn fringe(q: Vec3) -> f32 {
     0.011 * (slant - 0.5)
 }
 
-/// Returns where strands run from the whorl, as a unit vector that is the same along each, and the distance from it,
-/// meters.
+/// Returns where strands run from the whorl, as a unit vector that is the same along each, and the
+/// distance from it, meters.
 pub(super) fn combed(q: Vec3) -> (Vec2, f32) {
     let from_whorl = Vec2::new(q.x + 0.010, q.y - 0.055);
     let reach = from_whorl.length();
@@ -426,7 +427,8 @@ mod tests {
 
     #[test]
     fn the_head_is_a_quarter_of_a_meter_from_chin_to_crown() {
-        // down the middle of the skull, bald: q = (0, 0.02, z) leaves the skull at 0.043 + 0.085 = 0.128
+        // down the middle of the skull, bald: q = (0, 0.02, z) leaves the skull at 0.043 + 0.085 =
+        // 0.128
         assert!(parts(Vec3::new(0.0, 0.02, 0.128)).skin.abs() < 2e-3);
         // under the chin: 0.128 − 0.25 = −0.122
         let under = parts(Vec3::new(0.0, -0.078, -0.122)).skin;

@@ -4,8 +4,8 @@ use super::Object;
 use serde_json::Value;
 use std::collections::BTreeSet;
 
-/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle would
-/// be overruled by the whole file's focal length.
+/// Keys of the focal length. A frame that has one of them takes none from the top, or its own angle
+/// would be overruled by the whole file's focal length.
 pub(super) const FOCAL_KEYS: [&str; 4] = ["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"];
 
 /// Values read of a lens, its file's included, to compare unread values with.
@@ -17,8 +17,8 @@ pub(super) struct Known<'a> {
 /// Names of the values of a matrix of intrinsics.
 pub(super) const PINHOLE: [&str; 4] = ["fl_x", "fl_y", "cx", "cy"];
 
-/// Largest difference of focal lengths, relative, and of a principal point, in pixels: programs count these
-/// from the center of a pixel or from its corner. Angles are rounded more.
+/// Largest difference of focal lengths, relative, and of a principal point, in pixels: programs
+/// count these from the center of a pixel or from its corner. Angles are rounded more.
 const SAME_FOCAL: f64 = 1e-3;
 const SAME_ANGLE: f64 = 1e-2;
 const SAME_CENTER: f64 = 1.0;
@@ -51,8 +51,8 @@ impl Known<'_> {
         (value.abs() - known.abs()).abs() <= most
     }
 
-    /// Refuses a spelling beside the usual one that says something else. Which size is right, photographs
-    /// tell.
+    /// Refuses a spelling beside the usual one that says something else. Which size is right,
+    /// photographs tell.
     pub fn check_alias(
         &self,
         alias: &str,
@@ -104,7 +104,8 @@ impl Known<'_> {
         Ok(())
     }
 
-    /// Refuses a list of four numbers beside a focal length or an angle if it says more than is read.
+    /// Refuses a list of four numbers beside a focal length or an angle if it says more than is
+    /// read.
     pub fn check_list(&self, key: &str, four: [f64; 4]) -> Result<(), String> {
         let known = self.pinhole();
         let sides = [self.number("w"), self.number("h")];

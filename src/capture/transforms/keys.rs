@@ -1,9 +1,9 @@
-//! The keys of `transforms.json`, by the programs that write them: which are read, which change nothing
-//! here, and which change what a file means although they are not supported.
+//! The keys of `transforms.json`, by the programs that write them: which are read, which change
+//! nothing here, and which change what a file means although they are not supported.
 //!
-//! No key is passed over in silence: those that change nothing, or are not read because another one is, are
-//! a reason, unknown ones and those in the wrong place a warning, and those that change the meaning a
-//! warning or a problem of their own.
+//! No key is passed over in silence: those that change nothing, or are not read because another one
+//! is, are a reason, unknown ones and those in the wrong place a warning, and those that change the
+//! meaning a warning or a problem of their own.
 
 use super::{Object, lens, moments, pose};
 use crate::capture::folder::{in_file, shortened};
@@ -22,8 +22,8 @@ struct Dialect {
     harmless: &'static str,
 }
 
-/// All known keys, at the top of a file or in a frame. Those in [`CHANGES`] and the spellings in [`lens`]
-/// come on top.
+/// All known keys, at the top of a file or in a frame. Those in [`CHANGES`] and the spellings in
+/// [`lens`] come on top.
 const DIALECTS: [Dialect; 8] = [
     Dialect {
         program: "NeRF-Blender and D-NeRF",
@@ -178,7 +178,8 @@ fn is_true(value: &Value) -> bool {
     !matches!(value, Value::Null | Value::Bool(false)) && value.as_f64() != Some(0.0)
 }
 
-/// Returns whether a number, or one in a list or an object, is not zero. JSON is read with bounded depth.
+/// Returns whether a number, or one in a list or an object, is not zero. JSON is read with bounded
+/// depth.
 fn is_nonzero(value: &Value) -> bool {
     match value {
         Value::Number(v) => v.as_f64() != Some(0.0),
@@ -360,8 +361,8 @@ impl KeyLog {
         }
     }
 
-    /// Says what was not looked at, spellings that were `skipped` included, and refuses what changes the
-    /// meaning. What something else stands for is named only where that could be read.
+    /// Says what was not looked at, spellings that were `skipped` included, and refuses what
+    /// changes the meaning. What something else stands for is named only where that could be read.
     pub fn report(
         mut self,
         file: &str,

@@ -1,5 +1,5 @@
-//! The lens of a frame: its own keys and those for all frames, in the spellings of several programs, as
-//! intrinsics.
+//! The lens of a frame: its own keys and those for all frames, in the spellings of several
+//! programs, as intrinsics.
 
 use super::agreement::{FOCAL_KEYS, Known, PINHOLE, numbers};
 use super::{Fault, Object};
@@ -70,7 +70,8 @@ pub(super) const MATRICES: [&str; 8] = [
     "K",
 ];
 
-/// Keys that may be a focal length or an angle, of a unit that is not known; named where there is no other.
+/// Keys that may be a focal length or an angle, of a unit that is not known; named where there is
+/// no other.
 pub(super) const FOCAL_WORDS: [&str; 24] = [
     "focal",
     "focal_length",
@@ -116,8 +117,8 @@ pub(super) struct LensNotes {
 /// Why what is not understood is not read.
 const UNCLEAR: &str = "what is meant is not known";
 
-/// Returns what is read of an object, with one spelling of each key. Keys that `beyond` has are not taken
-/// from others.
+/// Returns what is read of an object, with one spelling of each key. Keys that `beyond` has are not
+/// taken from others.
 pub(super) fn canonical(
     object: &Object,
     beyond: Option<&Object>,
@@ -283,9 +284,9 @@ fn degrees(key: &str, value: &Value) -> Result<f64, String> {
 /// Skew beyond this share of the focal length is no pinhole's.
 const SKEW: f64 = 1e-3;
 
-/// Returns fx, fy, cx, cy of a matrix of intrinsics as rows or as one list, row by row or column by column,
-/// which its zeros tell apart; or of an object of that name. `None` for anything else, such as a list of
-/// four numbers.
+/// Returns fx, fy, cx, cy of a matrix of intrinsics as rows or as one list, row by row or column by
+/// column, which its zeros tell apart; or of an object of that name. `None` for anything else, such
+/// as a list of four numbers.
 fn matrix(key: &str, value: &Value) -> Result<Option<[f64; 4]>, String> {
     if let Value::Object(named) = value {
         let of = |names: [&str; 2]| names.iter().find_map(|name| named.get(*name)?.as_f64());
@@ -318,9 +319,9 @@ fn matrix(key: &str, value: &Value) -> Result<Option<[f64; 4]>, String> {
     Ok(Some([m[0][0], m[1][1], m[0][2], m[1][2]]))
 }
 
-/// Returns the coefficients in nerfstudio's `distortion_params`. Its loader takes six, k1 k2 k3 k4 p1 p2;
-/// OpenCV's lists of four and five have p1 in the third place, so that those are read only where both
-/// orders mean the same.
+/// Returns the coefficients in nerfstudio's `distortion_params`. Its loader takes six, k1 k2 k3 k4
+/// p1 p2; OpenCV's lists of four and five have p1 in the third place, so that those are read only
+/// where both orders mean the same.
 fn distortion_params(value: &Value, is_fisheye: bool) -> Result<Vec<(&'static str, f64)>, String> {
     const ORDER: [&str; 6] = ["k1", "k2", "k3", "k4", "p1", "p2"];
     let values: Vec<f64> = io::typed(value).map_err(|[key, found, expected]| {
@@ -425,8 +426,8 @@ fn of_all(text: String) -> Fault {
 /// Advice for keys at the top of a file.
 pub(super) const OF_ALL: &str = "correct what the file says of all its photographs";
 
-/// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says of the
-/// lens is as `like` has it.
+/// Returns the camera of a frame, whose pose is known. What neither it nor the top of its file says
+/// of the lens is as `like` has it.
 pub(in crate::capture) fn camera_like(
     top: &Object,
     own: &Object,
@@ -448,8 +449,8 @@ pub(in crate::capture) fn camera_like(
     Ok(Camera { cx, cy, distortion, rotation, position, ..like })
 }
 
-/// Returns the mistake of a frame that has no focal length, with the keys of it or of its file that may
-/// hold one.
+/// Returns the mistake of a frame that has no focal length, with the keys of it or of its file that
+/// may hold one.
 pub(super) fn no_focal(top: &Object, own: &Object) -> Fault {
     let words = MATRICES.iter().chain(&FOCAL_WORDS);
     let has = |key: &&&str| [own, top].iter().any(|object| object.get(**key).is_some_and(|v| !v.is_null()));
@@ -495,8 +496,8 @@ pub(super) fn intrinsics(keys: &FrameKeys, notes: &mut LensNotes) -> Result<Intr
     Ok(Intrinsics { size: w.zip(h), focal, angle, center, distortion })
 }
 
-/// Returns the lens model by COLMAP's name, in capital letters. COLMAP's FISHEYE is OPENCV_FISHEYE without
-/// coefficients, and other programs say it of that one.
+/// Returns the lens model by COLMAP's name, in capital letters. COLMAP's FISHEYE is OPENCV_FISHEYE
+/// without coefficients, and other programs say it of that one.
 fn model(keys: &FrameKeys) -> String {
     let name = keys.camera_model.as_deref().unwrap_or("OPENCV");
     let name = name.trim().to_ascii_uppercase().replace(['-', ' '], "_");
@@ -507,8 +508,8 @@ fn model(keys: &FrameKeys) -> String {
     }
 }
 
-/// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3 as
-/// well, and nerfstudio's perspective k4 exists in no other program.
+/// Returns the coefficients that a model has. OPENCV and FISHEYE are said of lenses with k1, k2, k3
+/// as well, and nerfstudio's perspective k4 exists in no other program.
 fn distortion(keys: &FrameKeys, model: &str, notes: &mut LensNotes) -> Result<Distortion, String> {
     let &FrameKeys { k1, k2, k3, k4, k5, k6, p1, p2, sx1, sy1, omega, .. } = keys;
     let given = Distortion { k1, k2, k3, p1, p2, k4, k5, k6, sx1, sy1, omega, ..Distortion::default() };

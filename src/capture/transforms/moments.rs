@@ -1,10 +1,10 @@
-//! Several moments of a moving head in one capture: VHAP, GaussianAvatars, D-NeRF, HyperNeRF, INSTA and
-//! NerFace write them, and one shape learned from all of them is none of them.
+//! Several moments of a moving head in one capture: VHAP, GaussianAvatars, D-NeRF, HyperNeRF, INSTA
+//! and NerFace write them, and one shape learned from all of them is none of them.
 //!
-//! Frames of several moments are refused where cameras stand still from one moment to another, for half of
-//! the frames or more: nothing but the head can have moved then. Where every photograph is from another
-//! place, as in a video of a head that holds still, the times of frames prove nothing, and there is only a
-//! warning.
+//! Frames of several moments are refused where cameras stand still from one moment to another, for
+//! half of the frames or more: nothing but the head can have moved then. Where every photograph is
+//! from another place, as in a video of a head that holds still, the times of frames prove nothing,
+//! and there is only a warning.
 
 use super::Object;
 use crate::capture::folder::shortened;
@@ -16,8 +16,8 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use tiface_base::Error;
 
-/// Keys that tell one moment from another, the best first, and whether each is worth a word where cameras
-/// move: all photographs have times.
+/// Keys that tell one moment from another, the best first, and whether each is worth a word where
+/// cameras move: all photographs have times.
 pub(super) const KEYS: [(&str, bool); 14] = [
     ("timestep_index", true),
     ("timestep_id", true),
@@ -35,8 +35,8 @@ pub(super) const KEYS: [(&str, bool); 14] = [
     ("timestamp", false),
 ];
 
-/// How far a camera may be off, as a share of the cameras' extent and of a rotation's entries, to stand
-/// where another does.
+/// How far a camera may be off, as a share of the cameras' extent and of a rotation's entries, to
+/// stand where another does.
 const SAME_PLACE: f64 = 1e-3;
 
 /// The moments of all frames of a capture.
@@ -130,7 +130,8 @@ impl Moments {
     }
 }
 
-/// Returns the command that leaves only the frames of one moment in some files, and no file without frames.
+/// Returns the command that leaves only the frames of one moment in some files, and no file without
+/// frames.
 fn keep(files: &[&str], key: &str, value: &str) -> String {
     let files: Vec<String> = files.iter().map(|file| format!("'{file}'")).collect();
     format!(
@@ -141,8 +142,8 @@ fn keep(files: &[&str], key: &str, value: &str) -> String {
     )
 }
 
-/// Returns a moment for a message, and as Python writes it if it is a number or a plain word, which is safe
-/// in a command.
+/// Returns a moment for a message, and as Python writes it if it is a number or a plain word, which
+/// is safe in a command.
 fn show(value: &Value) -> (String, Option<String>) {
     let is_plain = |text: &str| {
         text.len() <= 40

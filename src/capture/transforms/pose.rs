@@ -1,5 +1,5 @@
-//! The pose of a frame: `transform_matrix`, however its sixteen numbers are written, and what is there in
-//! its place.
+//! The pose of a frame: `transform_matrix`, however its sixteen numbers are written, and what is
+//! there in its place.
 
 use super::{Fault, Object};
 use serde_json::Value;
@@ -9,7 +9,8 @@ use tiface_base::io;
 const WRITTEN: &str = "camera to world, row by row, its last column the position; the camera has +X right, \
                        +Y up and looks along -Z";
 
-/// Keys of poses of other programs, which are not read: they say neither the direction nor the axes.
+/// Keys of poses of other programs, which are not read: they say neither the direction nor the
+/// axes.
 const FROM_CAMERA: &[&str] = &[
     "c2w",
     "cam2world",

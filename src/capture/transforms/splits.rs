@@ -1,8 +1,10 @@
-//! nerfstudio's lists of photographs by split, `train_filenames`, `val_filenames` and `test_filenames`.
+//! nerfstudio's lists of photographs by split, `train_filenames`, `val_filenames` and
+//! `test_filenames`.
 //!
-//! nerfstudio compares whole paths, refuses entries that are no photograph's, and leaves out photographs
-//! that no list has. Here an entry may be spelled otherwise than `file_path`: with `./`, backslashes,
-//! another ending or none, or with fewer or more folders in front, where only one photograph fits.
+//! nerfstudio compares whole paths, refuses entries that are no photograph's, and leaves out
+//! photographs that no list has. Here an entry may be spelled otherwise than `file_path`: with
+//! `./`, backslashes, another ending or none, or with fewer or more folders in front, where only
+//! one photograph fits.
 
 use super::Object;
 use crate::capture::folder::{PHOTOGRAPHS, has_ending, in_file, shortened};
@@ -28,8 +30,8 @@ pub(super) enum Listed {
     Nowhere,
 }
 
-/// Returns what the lists at the top of a file say about its frames, given by their `file_path`. Those that
-/// are `settled` name their split themselves, and need no list.
+/// Returns what the lists at the top of a file say about its frames, given by their `file_path`.
+/// Those that are `settled` name their split themselves, and need no list.
 pub(super) fn assign(
     file: &str,
     top: &Object,
@@ -64,8 +66,8 @@ fn lists(file: &str, top: &Object) -> Result<Vec<SplitList>, Error> {
     Ok(lists)
 }
 
-/// Returns the key and the split of the first list that names each frame, with what is to be said of
-/// frames in two lists and of entries that name none.
+/// Returns the key and the split of the first list that names each frame, with what is to be said
+/// of frames in two lists and of entries that name none.
 fn found_in(
     file: &str,
     lists: &[SplitList],

@@ -23,7 +23,8 @@ pub struct GpuDensity<'a> {
     device: Device,
     photographs: DeviceSampler,
     batch: DeviceBatch,
-    /// Samples in all occupied cells; `samples` has those up to where the transmittance has vanished.
+    /// Samples in all occupied cells; `samples` has those up to where the transmittance has
+    /// vanished.
     marched: Samples,
     samples: Samples,
     density: Density,

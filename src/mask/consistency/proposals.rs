@@ -1,17 +1,18 @@
 //! Which masks that a network proposes agree with those of other views.
 //!
-//! A network leaves out parts of the head, a garment or a crown, in some views and shows them in others; it seldom takes
-//! background for the head. Therefore [`verdicts`] weighs the two errors differently. The best cell of a pixel's ray is the one
-//! that the fewest other views rule out, among the cells that most views see and that a quarter of these have on the head.
-//! The views that rule it out share the blame in equal parts; a pixel without such a cell, or whose best cell is ruled out,
-//! is an open claim. The view with the largest
+//! A network leaves out parts of the head, a garment or a crown, in some views and shows them in
+//! others; it seldom takes background for the head. Therefore [`verdicts`] weighs the two errors
+//! differently. The best cell of a pixel's ray is the one that the fewest other views rule out,
+//! among the cells that most views see and that a quarter of these have on the head. The views that
+//! rule it out share the blame in equal parts; a pixel without such a cell, or whose best cell is
+//! ruled out, is an open claim. The view with the largest
 //!
 //! ```text
 //! claims of others that it rules out + ⅓ · its own open claims        in whole masks
 //! ```
 //!
-//! is set aside, and the comparison is repeated without it until no view exceeds the limits. (⅓ is the weight of an open
-//! claim relative to one that is ruled out.)
+//! is set aside, and the comparison is repeated without it until no view exceeds the limits. (⅓ is
+//! the weight of an open claim relative to one that is ruled out.)
 
 use super::{ConsistencyView, Opposition, SilhouetteConstraints, Votes, cells_on_ray, claims_of};
 use rayon::prelude::*;
@@ -21,7 +22,8 @@ use tiface_base::image::INSIDE;
 /// Rows and cells of [`verdicts`], which compares masks that a network proposes.
 const PROPOSAL_ROWS: u32 = 96;
 const PROPOSAL_CELLS: usize = 96;
-/// Share of the views that must see a cell for it to explain a claim: what lies below all frames explains everything.
+/// Share of the views that must see a cell for it to explain a claim: what lies below all frames
+/// explains everything.
 const MIN_VISIBLE_SHARE: f64 = 0.75;
 /// Share of the views that see a cell which must have it on the head.
 const MIN_SUPPORT_SHARE: f64 = 0.25;
@@ -54,7 +56,8 @@ struct Disagreement {
     ruled_out: f64,
 }
 
-/// Judges masks against each other; a view without one, or with an empty one, is [`MaskVerdict::Unlike`] the others.
+/// Judges masks against each other; a view without one, or with an empty one, is
+/// [`MaskVerdict::Unlike`] the others.
 ///
 /// # Errors
 /// When the cameras stand at one place or look in one direction.

@@ -1,14 +1,16 @@
 //! The smallest cut of a picture's pixels into two sets (Boykov & Kolmogorov 2004).
 //!
-//! Pixels are nodes joined to their 8 neighbors and to two terminals, *head* and *background*. A labeling costs
+//! Pixels are nodes joined to their 8 neighbors and to two terminals, *head* and *background*. A
+//! labeling costs
 //!
 //! ```text
 //! E = Σ_p cost of p's label + Σ_pq w_pq · [p and q have different labels]
 //! ```
 //!
-//! and the smallest cut is the labeling that costs least. Two search trees grow from the terminals until they
-//! touch; the path is saturated; what that tears off is adopted by another parent or set free, and the trees are
-//! reused for the next path. Capacities are whole numbers: sums are exact and the result is the same everywhere.
+//! and the smallest cut is the labeling that costs least. Two search trees grow from the terminals
+//! until they touch; the path is saturated; what that tears off is adopted by another parent or set
+//! free, and the trees are reused for the next path. Capacities are whole numbers: sums are exact
+//! and the result is the same everywhere.
 
 use std::collections::VecDeque;
 
@@ -27,14 +29,16 @@ const BACKGROUND: u8 = 2;
 
 /// A picture's graph: capacities in, labels out.
 ///
-/// Nodes lie in a frame one pixel wider on each side, whose edges carry nothing; so no step needs a border test.
+/// Nodes lie in a frame one pixel wider on each side, whose edges carry nothing; so no step needs a
+/// border test.
 pub struct PixelGraph {
     width: usize,
     height: usize,
     steps: [isize; 8],
     /// Residual capacity from a node to each neighbor.
     residual: Vec<[i32; 8]>,
-    /// Residual capacity to the terminals: positive from the head terminal, negative to the background terminal.
+    /// Residual capacity to the terminals: positive from the head terminal, negative to the
+    /// background terminal.
     terminal: Vec<i32>,
     tree: Vec<u8>,
     parent: Vec<u8>,
@@ -84,7 +88,8 @@ impl PixelGraph {
     /// Adds the costs of both labels of a pixel to its earlier costs. Costs are not negative.
     pub fn add_costs(&mut self, x: usize, y: usize, as_head: i32, as_background: i32) {
         let i = self.node(x, y);
-        // a cost that both labels share does not change the cut; the difference is the capacity to one terminal
+        // a cost that both labels share does not change the cut; the difference is the capacity to
+        // one terminal
         self.flow += as_head.min(as_background) as i64;
         let before = self.terminal[i];
         let give = as_background as i64 + before.max(0) as i64;
@@ -93,8 +98,8 @@ impl PixelGraph {
         self.terminal[i] = (give - take).clamp(-(i32::MAX as i64), i32::MAX as i64) as i32;
     }
 
-    /// Sets the cost of different labels of a pixel and its neighbor; `direction` 0 right, 2 below, 4 below right, 6 below
-    /// left. The neighbor must be in the picture.
+    /// Sets the cost of different labels of a pixel and its neighbor; `direction` 0 right, 2 below,
+    /// 4 below right, 6 below left. The neighbor must be in the picture.
     pub fn join(&mut self, x: usize, y: usize, direction: usize, weight: i32) {
         let (dx, dy) = STEPS[direction];
         let (u, v) = (x.wrapping_add_signed(dx), y.wrapping_add_signed(dy));
@@ -105,7 +110,8 @@ impl PixelGraph {
         self.residual[j][direction ^ 1] += weight;
     }
 
-    /// Finds the minimum cut. Returns labels `[height · width]`, true for head, and the cost of the cut.
+    /// Finds the minimum cut. Returns labels `[height · width]`, true for head, and the cost of the
+    /// cut.
     ///
     /// Of several minimum cuts it is the one with the smallest head.
     pub fn cut(mut self) -> (Vec<bool>, i64) {
@@ -122,7 +128,8 @@ impl PixelGraph {
         }
         while let Some(&p) = self.active.front() {
             let p = p as usize;
-            // a torn-off pixel may wait here still; a front pixel stays until it finds no more paths
+            // a torn-off pixel may wait here still; a front pixel stays until it finds no more
+            // paths
             match self.grow(p) {
                 Some((from, direction)) => {
                     self.augment(from, direction);
@@ -148,7 +155,8 @@ impl PixelGraph {
         }
     }
 
-    /// Returns whether flow can run between `p` and its neighbor in the sense of `p`'s tree, away from the root.
+    /// Returns whether flow can run between `p` and its neighbor in the sense of `p`'s tree, away
+    /// from the root.
     fn open(&self, p: usize, direction: usize, q: usize) -> bool {
         if self.tree[p] == HEAD {
             self.residual[p][direction] > 0
@@ -157,7 +165,8 @@ impl PixelGraph {
         }
     }
 
-    /// Takes free neighbors into `p`'s tree; ends with the first edge from the head's tree to the background's.
+    /// Takes free neighbors into `p`'s tree; ends with the first edge from the head's tree to the
+    /// background's.
     fn grow(&mut self, p: usize) -> Option<(usize, usize)> {
         if self.parent[p] == FREE {
             return None;
@@ -185,7 +194,8 @@ impl PixelGraph {
         None
     }
 
-    /// Returns the edge that carries flow between a node and its parent: the node it leaves, and in which direction.
+    /// Returns the edge that carries flow between a node and its parent: the node it leaves, and in
+    /// which direction.
     fn edge_to_parent(&self, p: usize) -> (usize, usize) {
         let up = self.parent[p] as usize;
         if self.tree[p] == HEAD { (self.step(p, up), up ^ 1) } else { (p, up) }
@@ -197,7 +207,8 @@ impl PixelGraph {
         self.residual[to][direction ^ 1] += flow;
     }
 
-    /// Saturates the path through the edge from `head_end`, in the head's tree, to its neighbor in the background's.
+    /// Saturates the path through the edge from `head_end`, in the head's tree, to its neighbor in
+    /// the background's.
     fn augment(&mut self, head_end: usize, direction: usize) {
         let ends = [head_end, self.step(head_end, direction)];
         let mut bottleneck = self.residual[head_end][direction];
@@ -227,12 +238,14 @@ impl PixelGraph {
         self.flow += bottleneck as i64;
     }
 
-    /// Queues a pixel as an orphan. It is marked only later, because the path is still being walked by its parents.
+    /// Queues a pixel as an orphan. It is marked only later, because the path is still being walked
+    /// by its parents.
     fn tear(&mut self, p: usize) {
         self.orphans.push_front(p as u32);
     }
 
-    /// Finds a new parent for every orphan, preferably near the root; orphans without one become free.
+    /// Finds a new parent for every orphan, preferably near the root; orphans without one become
+    /// free.
     fn adopt(&mut self) {
         self.time += 1;
         for &p in &self.orphans {
@@ -282,7 +295,8 @@ impl PixelGraph {
         self.tree[p] = 0;
     }
 
-    /// Returns whether flow may run between the root and `p` through its neighbor `q` in this direction.
+    /// Returns whether flow may run between the root and `p` through its neighbor `q` in this
+    /// direction.
     fn feeds(&self, q: usize, p: usize, direction: usize) -> bool {
         if self.tree[p] == HEAD {
             self.residual[q][direction ^ 1] > 0
@@ -291,7 +305,8 @@ impl PixelGraph {
         }
     }
 
-    /// Returns the number of steps from a node to its terminal, or `None` if an orphan lies on the path; marks the path as known.
+    /// Returns the number of steps from a node to its terminal, or `None` if an orphan lies on the
+    /// path; marks the path as known.
     fn depth_below_root(&mut self, start: usize) -> Option<u32> {
         let (mut q, mut steps) = (start, 0);
         let depth = loop {

@@ -1,9 +1,10 @@
 //! Colors of one thing as a mixture of Gaussians with full covariances, in coded RGB 0..=255.
 //!
-//! `p(c) = Σ_k w_k · N(c; μ_k, Σ_k)`. It starts from seeded k-means (Arthur & Vassilvitskii 2007) and is refitted
-//! as in GrabCut (Rother, Kolmogorov, Blake 2004): every color goes to its likeliest Gaussian, whose mean and
-//! covariance are measured again. A covariance always gains the minimum that 8-bit rounding and sensor noise leave,
-//! so that one flat color is no singular Gaussian.
+//! `p(c) = Σ_k w_k · N(c; μ_k, Σ_k)`. It starts from seeded k-means (Arthur & Vassilvitskii 2007)
+//! and is refitted as in GrabCut (Rother, Kolmogorov, Blake 2004): every color goes to its
+//! likeliest Gaussian, whose mean and covariance are measured again. A covariance always gains the
+//! minimum that 8-bit rounding and sensor noise leave, so that one flat color is no singular
+//! Gaussian.
 
 use tiface_base::geom::cofactors;
 use tiface_base::math::rng;
@@ -35,12 +36,13 @@ pub struct Mixture {
 }
 
 impl Mixture {
-    /// Fits `count` Gaussians to colors: k-means from a seeded start, then one measurement. `None` without
-    /// colors. Fewer distinct colors than Gaussians leave some without weight.
+    /// Fits `count` Gaussians to colors: k-means from a seeded start, then one measurement. `None`
+    /// without colors. Fewer distinct colors than Gaussians leave some without weight.
     pub fn fit(colors: &[Rgb], count: usize, seed: u64) -> Option<Mixture> {
         let first = colors.get(rng::below(seed, STREAM, 0, colors.len().max(1) as u64) as usize)?;
         let mut centers = vec![first.map(f64::from)];
-        // k-means++ : the next center is drawn with the squared distance to the nearest one as its chance
+        // k-means++ : the next center is drawn with the squared distance to the nearest one as its
+        // chance
         let mut nearest = vec![f64::INFINITY; colors.len()];
         while centers.len() < count {
             let last = centers[centers.len() - 1];
@@ -80,7 +82,8 @@ impl Mixture {
         Some(Mixture::measure(colors, &member, centers.len()))
     }
 
-    /// Sends every color to its likeliest Gaussian and measures these again; unchanged without colors.
+    /// Sends every color to its likeliest Gaussian and measures these again; unchanged without
+    /// colors.
     pub fn refit(&self, colors: &[Rgb]) -> Mixture {
         if colors.is_empty() {
             return self.clone();

@@ -1,27 +1,31 @@
-//! Closed-form matting (Levin, Lischinski, Weiss 2008): the opacity of the unknown band from the photograph.
+//! Closed-form matting (Levin, Lischinski, Weiss 2008): the opacity of the unknown band from the
+//! photograph.
 //!
-//! Where colors of head and background each lie on a line within every 3 × 3 window, alpha is an affine function
-//! of color in that window. Its deviation from one, over all windows, is a quadratic form `αᵀ L α` with
+//! Where colors of head and background each lie on a line within every 3 × 3 window, alpha is an
+//! affine function of color in that window. Its deviation from one, over all windows, is a
+//! quadratic form `αᵀ L α` with
 //!
 //! ```text
 //! L_ij = Σ_w  δ_ij − (1 + (I_i − μ_w)ᵀ (Σ_w + ε/9 · 1)⁻¹ (I_j − μ_w)) / 9
 //! ```
 //!
-//! (their equation 12; `I` coded color in 0..=1). Definite pixels are constrained to their value by a weight, and
-//! `(L + D) α = D b` is solved by conjugate gradients, preconditioned by an incomplete Cholesky factor with
-//! the pattern of `L` itself.
+//! (their equation 12; `I` coded color in 0..=1). Definite pixels are constrained to their value by
+//! a weight, and `(L + D) α = D b` is solved by conjugate gradients, preconditioned by an
+//! incomplete Cholesky factor with the pattern of `L` itself.
 //!
-//! Beyond the paper, the hard mask is the prior of unknown pixels, with a weight far below the constraint's. Where the
-//! photograph says what alpha is, that changes little; where colors of head and background are alike (dark hair before
-//! a dark background), alpha stays near the cut instead of bleeding through the band. Measured on three views each of two heads, mean
-//! squared error without and with it: hard masks cut from clicks 2.9 and 3.0, 2.7 and 2.1 of 1000; true ones 2.3 and
-//! 1.6, 1.6 and 1.2; 2 pixels too wide 2.8 and 2.7, 1.4 and 1.3; 2 too narrow 2.0 and 1.7, 1.8 and 1.8. Rounds of
-//! conjugate gradients fall from 70 to 42.
+//! Beyond the paper, the hard mask is the prior of unknown pixels, with a weight far below the
+//! constraint's. Where the photograph says what alpha is, that changes little; where colors of head
+//! and background are alike (dark hair before a dark background), alpha stays near the cut instead
+//! of bleeding through the band. Measured on three views each of two heads, mean squared error
+//! without and with it: hard masks cut from clicks 2.9 and 3.0, 2.7 and 2.1 of 1000; true ones 2.3
+//! and 1.6, 1.6 and 1.2; 2 pixels too wide 2.8 and 2.7, 1.4 and 1.3; 2 too narrow 2.0 and 1.7, 1.8
+//! and 1.8. Rounds of conjugate gradients fall from 70 to 42.
 //!
-//! Only windows that hold an unknown pixel are assembled, so work and memory follow the band, not the picture:
-//! about 310 bytes for each of its pixels and their neighbors within two. A row has 25 entries; being
-//! symmetric, 12 before the diagonal are kept. A sparse direct factorization (`faer`) was tried in their place: it is no
-//! faster, and for 750 × 1024 unknown pixels it takes 1.9 GB where this takes 0.25.
+//! Only windows that hold an unknown pixel are assembled, so work and memory follow the band, not
+//! the picture: about 310 bytes for each of its pixels and their neighbors within two. A row has 25
+//! entries; being symmetric, 12 before the diagonal are kept. A sparse direct factorization
+//! (`faer`) was tried in their place: it is no faster, and for 750 × 1024 unknown pixels it takes
+//! 1.9 GB where this takes 0.25.
 
 use super::{HEAD, UNKNOWN};
 use tiface_base::geom::cofactors;
@@ -99,8 +103,8 @@ impl Stencil {
         }
     }
 
-    /// `L` of `A ≈ L Lᵀ` with the pattern of `A`. An incomplete factor can fail where a whole one cannot, so the
-    /// diagonal is raised until it does not (Manteuffel 1980).
+    /// `L` of `A ≈ L Lᵀ` with the pattern of `A`. An incomplete factor can fail where a whole one
+    /// cannot, so the diagonal is raised until it does not (Manteuffel 1980).
     fn factor(&self) -> IncompleteCholesky<'_> {
         let shared = shared_neighbors();
         let mut raised = 0.0;
@@ -133,8 +137,8 @@ impl Stencil {
                 row[s] = (row[s] - known) * factor.inverse[j];
                 pivot -= row[s] * row[s];
             }
-            // a pivot that has lost nearly everything makes a factor worse than none. Raised often enough,
-            // any diagonal outweighs its row; what is no number then ends the gradients
+            // a pivot that has lost nearly everything makes a factor worse than none. Raised often
+            // enough, any diagonal outweighs its row; what is no number then ends the gradients
             if pivot <= 1e-3 * self.diagonal[i] && raised < 1e6 {
                 return None;
             }
@@ -173,7 +177,8 @@ impl IncompleteCholesky<'_> {
     }
 }
 
-/// For each neighbor `s`: pairs (slot of the row, slot of that neighbor) that mean the same pixel, before it.
+/// For each neighbor `s`: pairs (slot of the row, slot of that neighbor) that mean the same pixel,
+/// before it.
 fn shared_neighbors() -> [Vec<(usize, usize)>; 12] {
     std::array::from_fn(|s| {
         let pairs = (0..s).filter_map(|a| {
@@ -184,10 +189,12 @@ fn shared_neighbors() -> [Vec<(usize, usize)>; 12] {
     })
 }
 
-/// Returns the alpha of a photograph from its hard mask (head at 128 and more) and trimap (0, 128, 255); all of one size.
+/// Returns the alpha of a photograph from its hard mask (head at 128 and more) and trimap (0, 128,
+/// 255); all of one size.
 ///
 /// # Errors
-/// When the rounds are not enough or the numbers run away, and when no 3 × 3 window fits into the picture.
+/// When the rounds are not enough or the numbers run away, and when no 3 × 3 window fits into the
+/// picture.
 ///
 /// # Examples
 ///
@@ -242,7 +249,8 @@ pub fn closed_form(photo: &Photo, mask: &Gray, trimap: &Gray, options: &ClosedFo
     Ok(Matte { alpha, rounds, unknowns: pixels.len() })
 }
 
-/// Returns the matting Laplacian of the windows that hold an unknown pixel, and which pixel each row is.
+/// Returns the matting Laplacian of the windows that hold an unknown pixel, and which pixel each
+/// row is.
 fn assemble(photo: &Photo, trimap: &Gray, epsilon: f64) -> (Stencil, Vec<u32>) {
     const NONE: u32 = u32::MAX;
     let (width, height) = (photo.width as usize, photo.height as usize);

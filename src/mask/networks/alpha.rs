@@ -1,13 +1,14 @@
 //! Networks that give an alpha, with a file of the user.
 //!
-//! Any network from a picture to its alpha: U²-Net (Qin et al. 2020), ISNet (Qin et al. 2022), MODNet
-//! (Ke et al. 2022), BiRefNet (Zheng et al. 2024) and what is shaped like them.
+//! Any network from a picture to its alpha: U²-Net (Qin et al. 2020), ISNet (Qin et al. 2022),
+//! MODNet (Ke et al. 2022), BiRefNet (Zheng et al. 2024) and what is shaped like them.
 //!
-//! They take one picture, squeezed into a square, and give its alpha; further outputs are of their training. How colors
-//! become numbers is not in the file: the user says it, or `preprocessor_config.json` beside it, or the file's name. What
-//! is not within 0..1 are logits.
+//! They take one picture, squeezed into a square, and give its alpha; further outputs are of their
+//! training. How colors become numbers is not in the file: the user says it, or
+//! `preprocessor_config.json` beside it, or the file's name. What is not within 0..1 are logits.
 //!
-//! ViTMatte goes from a trimap to a soft alpha (Yao et al. 2024). It sees four channels, color and trimap, at a multiple of 32 pixels. Two conventions exist:
+//! ViTMatte goes from a trimap to a soft alpha (Yao et al. 2024). It sees four channels, color and
+//! trimap, at a multiple of 32 pixels. Two conventions exist:
 //!
 //! | | colors | unknown |
 //! | --- | --- | --- |
@@ -27,8 +28,8 @@ use tiface_base::{Error, Result};
 const ISNET: Normal = Normal { mean: [0.5; 3], std: [1.0; 3] };
 const MODNET: Normal = Normal { mean: [0.5; 3], std: [0.5; 3] };
 
-/// Words in file names, lower case, the first match counts: side of the square, colors. As the publishers' own
-/// scripts have it.
+/// Words in file names, lower case, the first match counts: side of the square, colors. As the
+/// publishers' own scripts have it.
 const KNOWN: [(&str, usize, Normal); 8] = [
     ("u2net", 320, IMAGENET),
     ("silueta", 320, IMAGENET),
@@ -86,7 +87,8 @@ impl AlphaNet {
         let input = NetworkArray::new(&[1, 3, h, w], planes);
         let given = self.session.run(&[(&self.session.inputs[0].name, input)])?;
         let (width, height) = self.session.one_picture(&given[0])?;
-        // half precision overshoots 0 and 1 a little; logits of a head and what is around it, by far
+        // half precision overshoots 0 and 1 a little; logits of a head and what is around it, by
+        // far
         let logits = given[0].values.iter().any(|v| !(-0.5..=1.5).contains(v));
         let coded = |v: f32| quantize(if logits { 1.0 / (1.0 + (-v).exp()) } else { v });
         let from = (width as u32, height as u32);
@@ -95,7 +97,8 @@ impl AlphaNet {
     }
 }
 
-/// `SIDE,MEAN,SCALE`: pixels of the square, and what is taken from colors in 0..1 before they are divided.
+/// `SIDE,MEAN,SCALE`: pixels of the square, and what is taken from colors in 0..1 before they are
+/// divided.
 fn parse(input: &str) -> Result<(usize, Normal)> {
     let parts: Vec<&str> = input.split(',').map(str::trim).collect();
     let read = match parts[..] {
@@ -118,7 +121,8 @@ fn parse(input: &str) -> Result<(usize, Normal)> {
     })
 }
 
-/// The picture is padded to a multiple of this: 16 pixels a token, halved once more in the detail head.
+/// The picture is padded to a multiple of this: 16 pixels a token, halved once more in the detail
+/// head.
 const STEP: usize = 32;
 
 /// A ViTMatte network.
@@ -145,7 +149,8 @@ impl VitMatte {
         Ok(VitMatte { session, normal: normal.unwrap_or(IMAGENET), thirds })
     }
 
-    /// Width and height with padding: the multiple of 32 that holds the photograph, or what the file fixes.
+    /// Width and height with padding: the multiple of 32 that holds the photograph, or what the
+    /// file fixes.
     pub(super) fn padded(&self, width: usize, height: usize) -> Result<(usize, usize)> {
         let fit = |old: usize, axis: usize| match self.session.input_extent("pixel_values", axis) {
             None => Some(old.next_multiple_of(STEP)),
@@ -164,7 +169,8 @@ impl VitMatte {
         }
     }
 
-    /// Returns the colors and trimap as the network takes them: `[1, 4, h, w]`, zeros right and below.
+    /// Returns the colors and trimap as the network takes them: `[1, 4, h, w]`, zeros right and
+    /// below.
     pub(super) fn pixels(&self, photo: &Photo, trimap: &Gray, padded: (usize, usize)) -> NetworkArray {
         let (w, h) = padded;
         let width = photo.width as usize;
@@ -182,7 +188,8 @@ impl VitMatte {
         NetworkArray::new(&[1, 4, h, w], values)
     }
 
-    /// Alpha in 0..=1 of each pixel, `[height · width]`, as the network says it: no cutting near 0 and 1.
+    /// Alpha in 0..=1 of each pixel, `[height · width]`, as the network says it: no cutting near 0
+    /// and 1.
     pub(super) fn alpha(&self, photo: &Photo, trimap: &Gray) -> Result<Vec<f32>> {
         let (width, height) = (photo.width as usize, photo.height as usize);
         let (w, h) = self.padded(width, height)?;

@@ -1,7 +1,8 @@
-//! `preprocessor_config.json`: the preparation of pictures that a network's publisher declares next to its file.
+//! `preprocessor_config.json`: the preparation of pictures that a network's publisher declares next
+//! to its file.
 //!
-//! It is searched in the folder of the network's file, and in the parent of a folder called `onnx`, as in public
-//! collections. A file of another network's processor is ignored.
+//! It is searched in the folder of the network's file, and in the parent of a folder called `onnx`,
+//! as in public collections. A file of another network's processor is ignored.
 
 use crate::onnx::file_error;
 use serde::Deserialize;
@@ -10,7 +11,8 @@ use std::path::Path;
 use tiface_base::Result;
 use tiface_base::io::{self, Limits};
 
-/// Mean and standard deviation of ImageNet's colors in 0..1: what SAM and ViTMatte were trained with.
+/// Mean and standard deviation of ImageNet's colors in 0..1: what SAM and ViTMatte were trained
+/// with.
 pub(super) const IMAGENET: Normal = Normal { mean: [0.485, 0.456, 0.406], std: [0.229, 0.224, 0.225] };
 
 /// Normalization of colors: `(c / 255 − mean) / std`.
@@ -23,8 +25,8 @@ pub(super) struct Normal {
 }
 
 impl Normal {
-    /// Planes `[channels, height, width]`: normalized colors of a picture `from` wide in the upper left of the first three,
-    /// zeros elsewhere.
+    /// Planes `[channels, height, width]`: normalized colors of a picture `from` wide in the upper
+    /// left of the first three, zeros elsewhere.
     pub(super) fn planes(
         &self,
         rgb: &[[u8; 3]],
@@ -49,7 +51,8 @@ impl Normal {
 pub(super) struct Processor {
     /// Its normalization.
     pub normal: Normal,
-    /// Side of the square (`pad_size`, else `size.longest_edge`, `size.height` or `size.shortest_edge`), if given.
+    /// Side of the square (`pad_size`, else `size.longest_edge`, `size.height` or
+    /// `size.shortest_edge`), if given.
     pub side: Option<usize>,
 }
 
@@ -63,8 +66,8 @@ struct ProcessorFile {
     size: Value,
 }
 
-/// Returns the processor file of the network at `network`, `None` without one, or if it is of another network than
-/// `kind` ("sam", "vitmatte", or empty for any).
+/// Returns the processor file of the network at `network`, `None` without one, or if it is of
+/// another network than `kind` ("sam", "vitmatte", or empty for any).
 pub(super) fn find(network: &Path, kind: &str) -> Result<Option<Processor>> {
     const NAME: &str = "preprocessor_config.json";
     let folder = network.parent().unwrap_or(Path::new(""));

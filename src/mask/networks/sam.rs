@@ -1,4 +1,5 @@
-//! SAM: from clicks to a hard mask, with the files of a user (Kirillov et al. 2023; SlimSAM, MobileSAM).
+//! SAM: from clicks to a hard mask, with the files of a user (Kirillov et al. 2023; SlimSAM,
+//! MobileSAM).
 //!
 //! ```text
 //! photograph ── longest side to S, normalize, pad to S × S ── encoder ── embedding ─┐
@@ -6,8 +7,8 @@
 //!               logits ── bilinear to S × S ── cut the padding off ── bilinear to the photograph ── > 0
 //! ```
 //!
-//! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label −1 at the
-//! end when no box is given. S and the embedding's width are read from the files.
+//! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label
+//! −1 at the end when no box is given. S and the embedding's width are read from the files.
 
 use super::processor::{self, IMAGENET, Normal};
 use crate::mask::clicks::{self, Click};
@@ -209,7 +210,8 @@ impl Sam {
     }
 
     fn check(&self, clicks: &[Click], (width, height): (usize, usize)) -> Result<()> {
-        // contradictions are searched at the size that was clicked on: reduced, two clicks may share a pixel
+        // contradictions are searched at the size that was clicked on: reduced, two clicks may
+        // share a pixel
         clicks::check_places("the photograph", clicks, width as u32, height as u32)?;
         if clicks.len() > MAX_CLICKS {
             return Err(Error::cannot(
@@ -229,7 +231,8 @@ impl Sam {
     }
 }
 
-/// Returns the photograph's colors at `width` × `height`, antialiased bilinear, as SAM's processors resize.
+/// Returns the photograph's colors at `width` × `height`, antialiased bilinear, as SAM's processors
+/// resize.
 pub(super) fn resized(photo: &Photo, width: usize, height: usize) -> Vec<[u8; 3]> {
     let picture = RgbImage::from_raw(photo.width, photo.height, photo.rgb.as_flattened().to_vec())
         .expect("as many colors as pixels, as checked");
@@ -237,8 +240,8 @@ pub(super) fn resized(photo: &Photo, width: usize, height: usize) -> Vec<[u8; 3]
     resized.as_chunks::<3>().0.to_vec()
 }
 
-/// Logits of `quarter` × `quarter` at the `side` of the square, then without its padding at the photograph's size: both
-/// bilinear, as PyTorch's without antialiasing.
+/// Logits of `quarter` × `quarter` at the `side` of the square, then without its padding at the
+/// photograph's size: both bilinear, as PyTorch's without antialiasing.
 pub(super) fn enlarged(
     logits: &[f32],
     quarter: usize,
@@ -262,8 +265,8 @@ fn highest(scores: &[f32], begin: usize) -> usize {
     (begin..scores.len()).fold(begin, |best, i| if scores[i] > scores[best] { i } else { best })
 }
 
-/// Returns the index of the mask to use. The original decoder gives one mask for several points and three for one: with two
-/// or more clicks the first is meant, with one the best of the others.
+/// Returns the index of the mask to use. The original decoder gives one mask for several points and
+/// three for one: with two or more clicks the first is meant, with one the best of the others.
 fn best_of_original(scores: &[f32], clicks: usize) -> usize {
     match scores.len() {
         4 if clicks >= 2 => 0,

@@ -1,7 +1,8 @@
 //! SAM and ViTMatte against the stored inputs and outputs of the reference.
 //!
-//! Tolerances are those of the vectors' own description: 1e-4 for embeddings, masks and logits, 5e-5 for scores
-//! and alphas, 1e-6 for normalized pixels, 2 of 255 and a mean of 0.3 for resized pictures, 1 % of mask pixels.
+//! Tolerances are those of the vectors' own description: 1e-4 for embeddings, masks and logits,
+//! 5e-5 for scores and alphas, 1e-6 for normalized pixels, 2 of 255 and a mean of 0.3 for resized
+//! pictures, 1 % of mask pixels.
 
 use super::Networks;
 use super::alpha::VitMatte;
@@ -28,7 +29,8 @@ fn numbers(array: &NetworkArray) -> &[f32] {
     &array.values
 }
 
-/// Checks the largest difference and prints it: the record of how far results are from the reference.
+/// Checks the largest difference and prints it: the record of how far results are from the
+/// reference.
 fn close(what: &str, found: &[f32], expected: &[f32], tolerance: f32) {
     assert_eq!(found.len(), expected.len(), "{what}");
     let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
@@ -291,7 +293,8 @@ fn both_encoders_of_the_original_form_feed_the_original_decoder() {
         let pixels = sam.pixels(&photo);
         let shape: &[usize] = if picture { &[256, 256, 3] } else { &[1, 3, 256, 256] };
         assert_eq!(pixels.shape, shape);
-        // cell (1, 0) spans columns 16..32: mean red 23.5, of rows 0..16: mean green 7.5; channel 1 weighs 3, 4, 5 of 96
+        // cell (1, 0) spans columns 16..32: mean red 23.5, of rows 0..16: mean green 7.5; channel 1
+        // weighs 3, 4, 5 of 96
         let given = sam.encoder.run(&[("input_image", pixels)]).unwrap();
         let color =
             |v: f64, c: usize| if picture { v } else { (v / 255.0 - IMAGENET.mean[c]) / IMAGENET.std[c] };

@@ -132,8 +132,8 @@ pub(crate) fn trimap_times(weight: f32) -> Vec<u8> {
     vitmatte(&[node("Conv", &["pixel_values", "w"], &["alphas"], &[])], &weights)
 }
 
-/// An encoder of the original form: means of 16 × 16 pixels, mixed into `depth` channels by weights 0, 1, 2 ….
-/// `picture`: takes `[H,W,3]`, which must be the whole square; else `[1,3,side,side]`.
+/// An encoder of the original form: means of 16 × 16 pixels, mixed into `depth` channels by weights
+/// 0, 1, 2 …. `picture`: takes `[H,W,3]`, which must be the whole square; else `[1,3,side,side]`.
 pub(crate) fn original_encoder(picture: bool, side: i64, depth: i64) -> Vec<u8> {
     let weights: Vec<f32> = (0..depth * 3).map(|i| i as f32 / (depth * 3) as f32).collect();
     let weights = [floats("w", &[depth, 3, 1, 1], &weights)];
@@ -153,7 +153,8 @@ pub(crate) fn original_encoder(picture: bool, side: i64, depth: i64) -> Vec<u8> 
     model(&graph(&nodes, &weights, &[port("input_image", 1, dims)], &[output]))
 }
 
-/// A network that gives `weight · mean of the channels + bias`, and something of its training beside it.
+/// A network that gives `weight · mean of the channels + bias`, and something of its training
+/// beside it.
 pub(crate) fn brightness(side: i64, weight: f32, bias: f32) -> Vec<u8> {
     let weights = [floats("w", &[1, 3, 1, 1], &[weight / 3.0; 3]), floats("b", &[1], &[bias])];
     let nodes = [

@@ -1,6 +1,7 @@
 //! Small copies of photographs and of their renders, and the error between them.
 //!
-//! Also the 3D viewer of a page: a copy of the head that is small enough, and the cameras of the photographs.
+//! Also the 3D viewer of a page: a copy of the head that is small enough, and the cameras of the
+//! photographs.
 
 use crate::capture::{Split, View};
 use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, ViewBackground, display_name};
@@ -63,8 +64,8 @@ pub(super) fn rows_of_run(session: &Session, most: usize) -> Result<(Vec<ViewRow
     rows(&session.read_capture()?.views, background, &shown_sets(session), session.run.dir(), most)
 }
 
-/// Returns the views that have pictures, or else the held-out ones, in about `most` bytes; and the files of the
-/// omitted ones. Files are relative to `folder`, that of the page.
+/// Returns the views that have pictures, or else the held-out ones, in about `most` bytes; and the
+/// files of the omitted ones. Files are relative to `folder`, that of the page.
 pub(in crate::pipeline) fn rows(
     views: &[View],
     background: ViewBackground,
@@ -163,7 +164,8 @@ pub(in crate::pipeline) fn heat(t: f32) -> [u8; 3] {
     [0, 1, 2].map(|c| mix(c).round() as u8)
 }
 
-/// Resamples a picture to a pinhole camera of the same intrinsics, so that a viewer can overlay it on a mesh.
+/// Resamples a picture to a pinhole camera of the same intrinsics, so that a viewer can overlay it
+/// on a mesh.
 fn straightened(picture: Photo, camera: &Camera) -> Photo {
     if camera.distortion.is_none() {
         return picture;
@@ -193,7 +195,8 @@ fn straightened(picture: Photo, camera: &Camera) -> Photo {
 
 /// Maximum size of a mesh inside a page, bytes: 100,000 triangles with a texture.
 const MAX_BYTES: usize = 4_600_000;
-/// Longest side of a base color in a page, and of a function of view-dependent color, which is smooth.
+/// Longest side of a base color in a page, and of a function of view-dependent color, which is
+/// smooth.
 const COLOR_PX: u32 = 2048;
 const LOBE_PX: u32 = 512;
 /// Mark of a GLB that this program wrote.
@@ -201,8 +204,8 @@ const GENERATOR: &[u8] = b"\"generator\":\"tiface ";
 /// Number of triangles of a larger mesh's copy, which has colors at its vertices.
 const REDUCED_TRIANGLES: usize = 100_000;
 
-/// Returns the head of a run without cameras, and the transform from the dataset's world to its coordinates; `None`
-/// before the stage `mesh`.
+/// Returns the head of a run without cameras, and the transform from the dataset's world to its
+/// coordinates; `None` before the stage `mesh`.
 pub(super) fn viewer(session: &Session) -> Result<Option<(Viewer, Similarity)>> {
     match read_record(&session.run.path(Stage::Mesh)) {
         Ok(Some(record)) => shown(session, &record).map(Some),
@@ -256,7 +259,8 @@ pub(super) fn cameras(
     rows.iter().enumerate().filter_map(camera).collect()
 }
 
-/// Returns a page with a 3D viewer of a run's head, and its held-out photographs if they can be opened.
+/// Returns a page with a 3D viewer of a run's head, and its held-out photographs if they can be
+/// opened.
 ///
 /// # Errors
 ///
@@ -274,8 +278,8 @@ pub fn head_page(session: &Session) -> Result<String> {
     viewer_html(&viewer, &rows)
 }
 
-/// Returns a page with a 3D viewer of a GLB, OBJ, PLY or STL file, and the features of it that cannot be shown. `up` is
-/// its up direction.
+/// Returns a page with a 3D viewer of a GLB, OBJ, PLY or STL file, and the features of it that
+/// cannot be shown. `up` is its up direction.
 ///
 /// # Errors
 ///
@@ -312,8 +316,9 @@ pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
     Ok((html, warnings))
 }
 
-/// Returns a head as a GLB for a page, and how it differs: with smaller pictures, then without soft layers and what
-/// depends on the view, then with fewer triangles that are colored at their vertices. `path` is for messages only.
+/// Returns a head as a GLB for a page, and how it differs: with smaller pictures, then without soft
+/// layers and what depends on the view, then with fewer triangles that are colored at their
+/// vertices. `path` is for messages only.
 fn small(
     mut head: HeadMesh,
     path: &Path,
@@ -395,14 +400,16 @@ mod tests {
             rotation,
             position,
         };
-        // a point at (0.5, 0) falls on 20 + 30 · 0.5 (1 − 0.2 · 0.25) = 34.25; a pinhole sees it at 35
+        // a point at (0.5, 0) falls on 20 + 30 · 0.5 (1 − 0.2 · 0.25) = 34.25; a pinhole sees it at
+        // 35
         let (at, _) = camera.project(Vec3::new(0.5, 0.0, -1.0)).unwrap();
         assert!((at.x - 34.25).abs() < 1e-4);
         let bright = |i: u32| if i % 40 == 34 { [255; 3] } else { [0; 3] };
         let taken = Photo { width: 40, height: 40, rgb: (0..1600).map(bright).collect(), alpha: None };
         let straight = straightened(taken.clone(), &camera);
         let row = &straight.rgb[20 * 40..21 * 40];
-        // column 34 holds 34 to 35: its middle, 34.5, was at 20 + 30 · 0.508 = 35.25 without distortion
+        // column 34 holds 34 to 35: its middle, 34.5, was at 20 + 30 · 0.508 = 35.25 without
+        // distortion
         assert!(row[35][0] > 150 && row[33][0] < 100, "{row:?}");
         let pinhole = Camera { distortion: Distortion::default(), ..camera };
         assert_eq!(straightened(taken.clone(), &pinhole), taken);

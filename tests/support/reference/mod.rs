@@ -1,4 +1,5 @@
-//! The formulas of the kernels in f64, one sample after the other: what the fast ones are compared with.
+//! The formulas of the kernels in f64, one sample after the other: what the fast ones are compared
+//! with.
 //!
 //! Tests of the crate's own modules and the stability cases include this module by its path.
 #![allow(dead_code)]
@@ -12,7 +13,8 @@ pub(crate) mod vm;
 use std::iter::Sum;
 use std::ops::{Add, AddAssign, Div, Mul, Neg, Sub};
 
-/// What the formulas are written in: f64, or a number that remembers how it came about, for exact gradients.
+/// What the formulas are written in: f64, or a number that remembers how it came about, for exact
+/// gradients.
 pub(crate) trait Real:
     Copy
     + Add<Output = Self>
@@ -84,7 +86,8 @@ impl Real for f64 {
     }
 }
 
-/// The sixteen functions of [`sh16`](tiface_base::geom::sphharm::sh16), their factors from the definition.
+/// The sixteen functions of [`sh16`](tiface_base::geom::sphharm::sh16), their factors from the
+/// definition.
 pub(crate) fn harmonics([x, y, z]: [f64; 3]) -> [f64; 16] {
     let root = |n: f64, d: f64| (n / (d * std::f64::consts::PI)).sqrt();
     let (r2, s2) = (x * x - y * y, 5.0 * z * z);

@@ -5,8 +5,9 @@ use std::array::from_fn;
 use tiface_kernels::cpu::hash;
 use tiface_kernels::cpu::sdf::FieldShape;
 
-/// What the geometry network reads at a point, `[3 + 2 levels]`, position first, and the derivatives of that by the
-/// point. The cells are those of the f32 kernel: at their borders derivatives jump.
+/// What the geometry network reads at a point, `[3 + 2 levels]`, position first, and the
+/// derivatives of that by the point. The cells are those of the f32 kernel: at their borders
+/// derivatives jump.
 pub(crate) fn features<R: Real>(shape: &FieldShape, table: &[[R; 2]], x: [f32; 3]) -> (Vec<R>, Vec<[R; 3]>) {
     let r = shape.radius as f64;
     let k = shape.layout().inputs;

@@ -1,6 +1,8 @@
-//! Numbers that remember how they came about: gradients of a formula by all of its inputs at once, exactly.
+//! Numbers that remember how they came about: gradients of a formula by all of its inputs at once,
+//! exactly.
 //!
-//! Reverse accumulation on a list of operations, one list per thread (Griewank and Walther 2008, §3.2).
+//! Reverse accumulation on a list of operations, one list per thread (Griewank and Walther 2008,
+//! §3.2).
 
 use super::Real;
 use std::cell::RefCell;
@@ -128,7 +130,8 @@ impl Sum for Var {
     }
 }
 
-/// An array of parameters before and after a step, with the moments before it, as an optimizer keeps them.
+/// An array of parameters before and after a step, with the moments before it, as an optimizer
+/// keeps them.
 pub(crate) struct Stepped {
     /// Values before.
     pub value: Vec<f64>,
@@ -150,9 +153,9 @@ pub(crate) struct AdamW {
 }
 
 impl AdamW {
-    /// Errors of the updates that an optimizer made and of the first moments that it has then, each as a share of what
-    /// this gradient asks for, or of a thousandth of the array's largest where that is more. β are the published 0.9 and
-    /// 0.99.
+    /// Errors of the updates that an optimizer made and of the first moments that it has then, each
+    /// as a share of what this gradient asks for, or of a thousandth of the array's largest where
+    /// that is more. β are the published 0.9 and 0.99.
     pub fn errors(&self, array: &Stepped, gradient: &[f64]) -> Vec<f64> {
         let moment = |beta: f64, before: f64, g: f64| beta * before + (1.0 - beta) * g;
         let unbiased = |beta: f64, m: f64| m / (1.0 - beta.powi(self.step));

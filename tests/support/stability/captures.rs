@@ -1,5 +1,5 @@
-//! Hard captures: both fields learned for a short while from photographs of the demo head whose cameras or world are
-//! odd, beside the same of plain ones; or the error that names what is wrong.
+//! Hard captures: both fields learned for a short while from photographs of the demo head whose
+//! cameras or world are odd, beside the same of plain ones; or the error that names what is wrong.
 
 use super::Breadth;
 use super::case::{Cases, StabilityCase};
@@ -21,8 +21,8 @@ struct Hard {
     name: &'static str,
     cameras: Vec<(Camera, bool)>,
     world: Similarity,
-    /// How much worse than the plain capture at most: dB of the radiance field, mm of the distance field. Else what the error
-    /// says, of which a part is here.
+    /// How much worse than the plain capture at most: dB of the radiance field, mm of the distance
+    /// field. Else what the error says, of which a part is here.
     expected: Result<[f64; 2], &'static str>,
 }
 
@@ -134,8 +134,8 @@ fn config(folder: &Path) -> Config {
     config
 }
 
-/// Learns both fields. Returns the PSNR of the held-out view inside its mask, dB, and the mean distance of the learned
-/// zero from the head's surface, millimeters.
+/// Learns both fields. Returns the PSNR of the held-out view inside its mask, dB, and the mean
+/// distance of the learned zero from the head's surface, millimeters.
 fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> {
     let run = Run::quiet(&folder.join("run"));
     let session = Session::open(&config, &run)?;
@@ -174,7 +174,8 @@ fn learn(folder: &Path, world: &Similarity, config: Config) -> Result<[f64; 2]> 
     Ok([-10.0 * (error / count).log10(), 1e3 * mean / scene_from_head.scale])
 }
 
-/// Trainings that start as sharp, and as soft, as a surface may be, and change that as fast as can be.
+/// Trainings that start as sharp, and as soft, as a surface may be, and change that as fast as can
+/// be.
 fn variances(cases: &mut Cases, scratch: &Path) -> Result<()> {
     let folder = scratch.join("0");
     // the run of the plain capture, whose masks need no second check
@@ -182,7 +183,8 @@ fn variances(cases: &mut Cases, scratch: &Path) -> Result<()> {
     for (name, start) in [("sharpest", 1.38), ("softest", -1.38)] {
         let mut config = config(&folder);
         (config.iface.variance, config.iface.lr_variance) = (start, 1.0);
-        // at such a rate it swings from one end to the other: it is stuck only if it is never seen elsewhere
+        // at such a rate it swings from one end to the other: it is stuck only if it is never seen
+        // elsewhere
         let (mut outside, mut stays) = (0f64, 1f64);
         for steps in (1..=8).rev().map(|k| 5 * k) {
             config.iface.steps = steps;

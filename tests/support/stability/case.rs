@@ -52,7 +52,8 @@ pub fn worst(errors: impl IntoIterator<Item = f64>) -> f64 {
     errors.into_iter().fold(0.0, |a: f64, b: f64| if a.is_nan() || b.is_nan() { f64::NAN } else { a.max(b) })
 }
 
-/// The largest error relative to the sizes of what is right, of which those below `least` count as that.
+/// The largest error relative to the sizes of what is right, of which those below `least` count as
+/// that.
 pub(super) fn relative(got: impl IntoIterator<Item = f32>, want: &[f64], least: f64) -> f64 {
     worst(got.into_iter().zip(want).map(|(g, w)| (g as f64 - w).abs() / w.abs().max(least)))
 }

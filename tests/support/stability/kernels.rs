@@ -144,14 +144,15 @@ fn grids(cases: &mut Cases) {
                 slopes.push(relative(got, &want, 1.0));
             }
         }
-        // positions of f32 in the finest of some thousand cells: 2048 · 6e-8, times the slopes of the table
+        // positions of f32 in the finest of some thousand cells: 2048 · 6e-8, times the slopes of
+        // the table
         cases.add(format!("hash grid of {name}: features"), worst(values), 1e-3, "of the table");
         cases.add(format!("hash grid of {name}: derivatives"), worst(slopes), 1e-3, "of the table");
     }
 }
 
-/// The networks of the distance field, from nothing to weights of ten times their usual size; forward, and backward
-/// along one drawn direction of all weights.
+/// The networks of the distance field, from nothing to weights of ten times their usual size;
+/// forward, and backward along one drawn direction of all weights.
 fn networks(cases: &mut Cases) {
     for (name, weight, feature, bound) in [
         ("nothing", 0.0, 0.0, 1e-5),
@@ -215,8 +216,8 @@ fn finite(mut values: impl Iterator<Item = f32>) -> f64 {
     if values.all(f32::is_finite) { 0.0 } else { f64::NAN }
 }
 
-/// How far a gradient's product with a direction is from the slope of the loss along it, relative to the root of the
-/// sum of the squares of its terms.
+/// How far a gradient's product with a direction is from the slope of the loss along it, relative
+/// to the root of the sum of the squares of its terms.
 fn along<'a>(parts: impl Iterator<Item = (&'a f32, &'a f32)>, loss: &dyn Fn(f64) -> f64, h: f64) -> f64 {
     let (mut sum, mut squares) = (0.0, 0.0);
     for (g, d) in parts {
@@ -337,8 +338,8 @@ fn cameras(cases: &mut Cases) {
     }
 }
 
-/// SSIM against its definition, window by window, the means taken away first: for noise, for pictures without
-/// contrast, and for such as lie beside the range.
+/// SSIM against its definition, window by window, the means taken away first: for noise, for
+/// pictures without contrast, and for such as lie beside the range.
 fn pictures(cases: &mut Cases) {
     let drawn = |stream: u64, base: f32, contrast: f32| {
         let mut image = Image::new(20, 18, 3);

@@ -1,7 +1,8 @@
-//! Hard cases, each with the largest error met and what it must stay below: what floating point, odd volumes, grazing
-//! rays and hard captures do to every part of the pipeline.
+//! Hard cases, each with the largest error met and what it must stay below: what floating point,
+//! odd volumes, grazing rays and hard captures do to every part of the pipeline.
 //!
-//! `tests/check/stability.rs` holds them to their bounds, `cargo bench --bench stability` prints them.
+//! `tests/check/stability.rs` holds them to their bounds, `cargo bench --bench stability` prints
+//! them.
 
 mod captures;
 pub mod case;

@@ -1,5 +1,5 @@
-//! Rays that graze, run along edges and through corners: the ray caster against exact arithmetic, the rasterizer against
-//! the ray caster, and marching through boxes and surfaces.
+//! Rays that graze, run along edges and through corners: the ray caster against exact arithmetic,
+//! the rasterizer against the ray caster, and marching through boxes and surfaces.
 
 use super::case::{Cases, StabilityCase, worst};
 use glam::{DMat3, DVec3, Vec2, Vec3};
@@ -166,7 +166,8 @@ fn rasterizer(cases: &mut Cases) {
     }
 }
 
-/// Rays of a box: through its middle, along its faces, edges and the walls of its cells, and through its corners.
+/// Rays of a box: through its middle, along its faces, edges and the walls of its cells, and
+/// through its corners.
 fn boxes(cases: &mut Cases) {
     let step = 0.013f32;
     let full = BitGrid::filled(16, true);
@@ -174,7 +175,8 @@ fn boxes(cases: &mut Cases) {
     let (mut cubic, mut vm) = (Vec::new(), Vec::new());
     for i in 0..3000u64 {
         let u = |k: u64| rng::uniform(31, k, i);
-        // places on a lattice that holds borders and walls; directions with exact and nearly zero components
+        // places on a lattice that holds borders and walls; directions with exact and nearly zero
+        // components
         let place = |k: u64| [-1.0, 1.0, 0.0, 0.25, 2.0 * u(k) - 1.0][rng::below(31, k + 8, i, 5) as usize];
         let slant = |k: u64| [0.0, -0.0, 1e-7, -1e-7, u(k) - 0.5][rng::below(31, k + 16, i, 5) as usize];
         let direction = Vec3::new(slant(3), slant(4), -1.0).normalize();
@@ -206,7 +208,8 @@ fn chord(origin: DVec3, direction: DVec3) -> f64 {
     (leave - enter).max(0.0)
 }
 
-/// NeuS through a sphere of radius 0.5, ever nearer to its outline: where a ray ends, and that one beside it does not.
+/// NeuS through a sphere of radius 0.5, ever nearer to its outline: where a ray ends, and that one
+/// beside it does not.
 fn spheres(cases: &mut Cases) {
     let full = BitGrid::filled(16, true);
     for (inv_s, step) in [(200.0f32, 0.004f32), (2000.0, 0.001), (1e6, 0.001)] {
@@ -231,7 +234,8 @@ fn spheres(cases: &mut Cases) {
         let inside = (0..100).map(|i| 0.495 * (i as f64 / 99.0).sqrt());
         let error = inside.map(|h| {
             let (opacity, depth) = see(h as f32);
-            // what is blurred by 1 / inv_s, seen aslant, cut into steps, and hidden by air: ε gives each step 1e-5
+            // what is blurred by 1 / inv_s, seen aslant, cut into steps, and hidden by air: ε gives
+            // each step 1e-5
             let slope = (1.0 - 4.0 * h * h).sqrt();
             let blur = step as f64 + 2.0 / (inv_s as f64 * slope) + 0.5e-5 / step as f64;
             if opacity < 0.5 { f64::NAN } else { (depth - (2.0 - (0.25 - h * h).sqrt())).abs() / blur }

@@ -1,4 +1,5 @@
-//! NeuS from the softest to the sharpest surface, forward and backward, against f64; and fields without a direction.
+//! NeuS from the softest to the sharpest surface, forward and backward, against f64; and fields
+//! without a direction.
 
 use super::case::{Cases, StabilityCase, relative, worst};
 use super::reference::{neus::composite, wide};
@@ -49,8 +50,8 @@ impl Bundle {
         Segments { offsets: &self.offsets, direction: &self.direction, t: &self.t, dt: &self.dt }
     }
 
-    /// Distances that cross zero somewhere on each ray, on a scale that the sharpness can tell; drawn gradients and
-    /// colors.
+    /// Distances that cross zero somewhere on each ray, on a scale that the sharpness can tell;
+    /// drawn gradients and colors.
     fn field(&self, inv_s: f32) -> Vec<f32> {
         let reach = (4.0 / inv_s).clamp(1e-6, 1.0);
         let one = |i: usize| -> [f32; WIDTH] {
@@ -92,7 +93,8 @@ fn sharp(cases: &mut Cases, inv_s: f32) {
         (0..RAYS)
             .for_each(|r| slopes[r * SAMPLES * WIDTH + at] = (loss(&up, r) - loss(&down, r)) / (2.0 * h));
     }
-    // each kind of value on its own scale; of a soft surface P − N is known to 3e-8 beside an ε of 1e-5
+    // each kind of value on its own scale; of a soft surface P − N is known to 3e-8 beside an ε of
+    // 1e-5
     let error = |kinds: std::ops::Range<usize>| {
         let own = |i: &usize| kinds.contains(&(i % WIDTH));
         let size = (0..field.len()).filter(own).map(|i| slopes[i] * slopes[i]).sum::<f64>();
@@ -125,12 +127,14 @@ fn directionless(cases: &mut Cases) {
             let finite = |v: &f32| if v.is_finite() { v.abs() as f64 } else { f64::NAN };
             largest.push(worst(out.iter().chain(&by_field).chain([&by_s]).map(finite)));
         }
-        // a direction's gradient is that of a unit vector by the length; by the distance up to the sharpness
+        // a direction's gradient is that of a unit vector by the length; by the distance up to the
+        // sharpness
         cases.add(format!("gradient of length {length:e}: largest number"), worst(largest), 1e8, "absolute");
     }
 }
 
-/// At the ends of the range in which the variance is kept, the surface is still asked to become softer or sharper.
+/// At the ends of the range in which the variance is kept, the surface is still asked to become
+/// softer or sharper.
 fn ends(cases: &mut Cases) {
     let bundle = Bundle::new();
     let g: Vec<f32> = (0..RAYS * neus::RAY_WIDTH).map(|i| rng::normal(46, 0, i as u64)).collect();

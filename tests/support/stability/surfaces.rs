@@ -1,4 +1,5 @@
-//! Hard volumes and fields through the extraction, and a mesh at hard scales through the simplification.
+//! Hard volumes and fields through the extraction, and a mesh at hard scales through the
+//! simplification.
 
 use super::case::{Cases, StabilityCase, worst};
 use glam::{DVec3, Vec3};
@@ -94,8 +95,8 @@ where
     }
 }
 
-/// The zero set of `field` in a box around `center`, of half edge `half`, coordinates f64. NaN in the place of the
-/// errors where it is refused.
+/// The zero set of `field` in a box around `center`, of half edge `half`, coordinates f64. NaN in
+/// the place of the errors where it is refused.
 fn extracted(
     center: DVec3,
     half: f64,
@@ -121,7 +122,8 @@ fn balls(cases: &mut Cases) {
         (1.0, 0.0, 1e-3),
         (1e-6, 0.0, 1e-3),
         (1e6, 0.0, 1e-3),
-        // beyond 1e-9 and 1e9 squares of areas leave f32, and vertices stay where the cells put them
+        // beyond 1e-9 and 1e9 squares of areas leave f32, and vertices stay where the cells put
+        // them
         (1e-30, 0.0, 0.05),
         (1e15, 0.0, 0.05),
         (1.0, 1e3, 2e-3), // beyond, the steps of f32: 12 cells · 1e5 · 6e-8 = 0.07
@@ -186,7 +188,8 @@ fn slopes(cases: &mut Cases) {
     }
 }
 
-/// The quadrics of the simplification: a cube of 1536 triangles loses most of them and stays a cube.
+/// The quadrics of the simplification: a cube of 1536 triangles loses most of them and stays a
+/// cube.
 fn cubes(cases: &mut Cases) {
     for (half, far, bound) in [(1.0, 0.0, 1e-5), (1e-6, 0.0, 1e-5), (1e6, 0.0, 1e-5), (1.0, 1e4, 1e-3)] {
         let center = DVec3::splat(far);

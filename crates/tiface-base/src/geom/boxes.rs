@@ -1,9 +1,10 @@
 //! Which boxes meet, for a bounded effort.
 //!
-//! A triangle of a sound mesh has a few dozen neighbors, but a file may put all of its triangles into one place,
-//! and comparing all with all is quadratic. So every search counts its comparisons: each item gets a share
-//! of an effort proportional to their number, unused effort is given to items that need more, and items that
-//! are not done then are named. All of it is counted work, never time: the answer is the same on every machine.
+//! A triangle of a sound mesh has a few dozen neighbors, but a file may put all of its triangles
+//! into one place, and comparing all with all is quadratic. So every search counts its comparisons:
+//! each item gets a share of an effort proportional to their number, unused effort is given to
+//! items that need more, and items that are not done then are named. All of it is counted work,
+//! never time: the answer is the same on every machine.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -12,7 +13,8 @@ use rayon::prelude::*;
 /// sound mesh takes half of it or less.
 pub const DEFAULT_EFFORT: usize = 1024;
 
-/// Minimum number of items that the total effort is computed for, so that small inputs are compared completely.
+/// Minimum number of items that the total effort is computed for, so that small inputs are compared
+/// completely.
 const MIN_EFFORT_ITEMS: usize = 1 << 15;
 
 /// The remaining effort of one item.
@@ -49,7 +51,8 @@ pub struct Shared<T> {
     pub unfinished: Vec<usize>,
 }
 
-/// Runs `work` for each item, with an effort of `each` per item on average; the total effort is bounded.
+/// Runs `work` for each item, with an effort of `each` per item on average; the total effort is
+/// bounded.
 pub fn share_out<T: Send>(
     items: usize,
     each: usize,
@@ -121,8 +124,8 @@ impl DBox {
 /// Most boxes in a leaf of the tree.
 const LEAF: usize = 4;
 
-/// Boxes in a balanced tree: each node holds half of its parent's, parted across the longest side. Its depth does
-/// not depend on where they are.
+/// Boxes in a balanced tree: each node holds half of its parent's, parted across the longest side.
+/// Its depth does not depend on where they are.
 pub struct Boxes {
     /// In the order of the tree, with their numbers.
     items: Vec<(DBox, u32)>,
@@ -145,7 +148,8 @@ impl Boxes {
         self.items.iter().map(|&(_, i)| i)
     }
 
-    /// Calls `visit` with every box that meets `query`, until it returns false or the effort is spent.
+    /// Calls `visit` with every box that meets `query`, until it returns false or the effort is
+    /// spent.
     pub fn meeting(
         &self,
         query: &DBox,
@@ -203,7 +207,8 @@ mod tests {
 
     #[test]
     fn the_tree_finds_what_all_pairs_find() {
-        // boxes 0 to 0.2 wide in the unit cube, from a counter; one of them far out, as strays of scans are
+        // boxes 0 to 0.2 wide in the unit cube, from a counter; one of them far out, as strays of
+        // scans are
         let mut state = 7u64;
         let mut next = move || {
             state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
@@ -235,7 +240,8 @@ mod tests {
 
     #[test]
     fn what_some_leave_over_goes_to_those_that_need_more() {
-        // item 3 asks for a hundred thousand, which all of them together may spend; none else asks for any
+        // item 3 asks for a hundred thousand, which all of them together may spend; none else asks
+        // for any
         let need = |i: usize| if i == 3 { 100_000 } else { 0 };
         let work = |i: usize, effort: &mut Effort| (0..need(i)).take_while(|_| effort.spend(1)).count();
         let shared = share_out(10, 10, work);

@@ -3,16 +3,17 @@
 //! A ray aimed exactly at an edge or a vertex of a closed mesh must hit. Three things make it so:
 //!
 //! - the triangle test of Woop, Benthin, Wald 2013 (*Watertight Ray/Triangle Intersection*, JCGT
-//!   2(1)): vertices are moved and sheared by constants of the ray alone, so two triangles compute the
-//!   very same numbers for a shared edge `U = Cx·By − Cy·Bx`. Where one of them is exactly 0 in f32
-//!   the decision is repeated in f64, in which the products are exact;
-//! - boxes grown by a few ulps of the largest coordinate, which covers the rounding of that test, and
-//!   slabs widened after Ize 2013 (*Robust BVH Ray Traversal*, JCGT 2(2)), which covers their own;
-//! - a ray that starts far away is first moved to the mesh in f64, since its own rounding near the mesh
-//!   would be larger than the triangles.
+//!   2(1)): vertices are moved and sheared by constants of the ray alone, so two triangles compute
+//!   the very same numbers for a shared edge `U = Cx·By − Cy·Bx`. Where one of them is exactly 0 in
+//!   f32 the decision is repeated in f64, in which the products are exact;
+//! - boxes grown by a few ulps of the largest coordinate, which covers the rounding of that test,
+//!   and slabs widened after Ize 2013 (*Robust BVH Ray Traversal*, JCGT 2(2)), which covers their
+//!   own;
+//! - a ray that starts far away is first moved to the mesh in f64, since its own rounding near the
+//!   mesh would be larger than the triangles.
 //!
-//! `obvhs` finds the tree (PLOC with reinsertion). We store it four wide, as Embree does: four boxes
-//! or four triangles are met by one SIMD instruction stream. Triangles lie in tree order.
+//! `obvhs` finds the tree (PLOC with reinsertion). We store it four wide, as Embree does: four
+//! boxes or four triangles are met by one SIMD instruction stream. Triangles lie in tree order.
 
 use super::mesh::Mesh;
 use super::ray::{Aabb, Hit, Ray};
@@ -94,8 +95,9 @@ pub struct Closest {
 /// assert_eq!(bvh.closest_point(-Vec3::X).unwrap().point, Vec3::ZERO);
 /// ```
 ///
-/// Holds its own copy of the corners, so the mesh may go. Triangles with a corner that is not finite,
-/// or with an index out of range, are left out. Degenerate ones are never hit, but can be nearest.
+/// Holds its own copy of the corners, so the mesh may go. Triangles with a corner that is not
+/// finite, or with an index out of range, are left out. Degenerate ones are never hit, but can be
+/// nearest.
 pub struct Bvh {
     nodes: Vec<WideNode>,
     leaves: Vec<Leaf>,
@@ -149,10 +151,10 @@ impl Bvh {
         self.nodes.is_empty()
     }
 
-    /// Returns the first triangle along the ray with `t_min <= t <= t_max`, from either side; of triangles
-    /// at the same `t` (a shared edge), the one with the smallest index. A ray that starts on the
-    /// surface meets it at `t = 0`, give or take rounding: pass a small `t_min` to leave it.
-    /// `None` for rays with a component that is not finite, or without direction.
+    /// Returns the first triangle along the ray with `t_min <= t <= t_max`, from either side; of
+    /// triangles at the same `t` (a shared edge), the one with the smallest index. A ray that
+    /// starts on the surface meets it at `t = 0`, give or take rounding: pass a small `t_min` to
+    /// leave it. `None` for rays with a component that is not finite, or without direction.
     pub fn closest_hit(&self, ray: &Ray) -> Option<Hit> {
         self.cast::<false>(ray)
     }
@@ -162,8 +164,8 @@ impl Bvh {
         self.cast::<true>(ray).is_some()
     }
 
-    /// Returns the nearest point of the surface; the smallest triangle index among equals. `None` for an
-    /// empty mesh or a query that is not finite.
+    /// Returns the nearest point of the surface; the smallest triangle index among equals. `None`
+    /// for an empty mesh or a query that is not finite.
     pub fn closest_point(&self, query: Vec3) -> Option<Closest> {
         if self.is_empty() || !query.is_finite() {
             return None;
@@ -211,7 +213,8 @@ impl Bvh {
         }
     }
 
-    /// Returns a stack of the size this tree needs: on the machine's own unless the tree is degenerate.
+    /// Returns a stack of the size this tree needs: on the machine's own unless the tree is
+    /// degenerate.
     fn stack_space<'a>(
         &self,
         fixed: &'a mut [(u32, f32); STACK],
@@ -396,8 +399,8 @@ impl Shear {
         let u = c[0] * b[1] - c[1] * b[0];
         let v = a[0] * c[1] - a[1] * c[0];
         let w = b[0] * a[1] - b[1] * a[0];
-        // Products round monotonically, so a sign is right wherever the value is not 0: unlike signs
-        // are a sure miss. Comparisons are written so that NaN stays a candidate.
+        // Products round monotonically, so a sign is right wherever the value is not 0: unlike
+        // signs are a sure miss. Comparisons are written so that NaN stays a candidate.
         let unlike = u.min(v).min(w).cmplt(Vec4::ZERO) & u.max(v).max(w).cmpgt(Vec4::ZERO);
         let mut candidates = !unlike.bitmask() & 0xf;
         while candidates != 0 {
@@ -427,7 +430,8 @@ impl Shear {
     }
 }
 
-/// Returns the point of triangle abc nearest to `p` (Ericson 2004, §5.1.5), also for degenerate triangles.
+/// Returns the point of triangle abc nearest to `p` (Ericson 2004, §5.1.5), also for degenerate
+/// triangles.
 fn closest_on_triangle(p: DVec3, a: DVec3, b: DVec3, c: DVec3) -> DVec3 {
     let (ab, ac, ap) = (b - a, c - a, p - a);
     let normal = ab.cross(ac).length_squared();

@@ -8,7 +8,8 @@ use super::similarity::Similarity;
 use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 
-/// Projection of a lens: the radius of the angle θ from its axis, before the distortion coefficients.
+/// Projection of a lens: the radius of the angle θ from its axis, before the distortion
+/// coefficients.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Projection {
@@ -17,7 +18,8 @@ pub enum Projection {
     Perspective,
     /// Equidistant, `r = θ` (OpenCV's fisheye).
     Fisheye,
-    /// `r = atan(2 tan θ tan(ω/2)) / ω` (Devernay and Faugeras, "Straight lines have to be straight").
+    /// `r = atan(2 tan θ tan(ω/2)) / ω` (Devernay and Faugeras, "Straight lines have to be
+    /// straight").
     Fov,
 }
 
@@ -25,9 +27,11 @@ pub enum Projection {
 ///
 /// With the projected point (u, v), r² = u² + v²:
 ///
-/// - perspective: radial `(1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)` (OpenCV's rational model);
+/// - perspective: radial `(1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)` (OpenCV's
+///   rational model);
 /// - fisheye: radial `1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸`, where r is the angle θ;
-/// - both: tangential p1, p2 as in OpenCV and a thin prism (sx1, sy1) · r² (Weng, Cohen and Herniou).
+/// - both: tangential p1, p2 as in OpenCV and a thin prism (sx1, sy1) · r² (Weng, Cohen and
+///   Herniou).
 ///
 /// At most half of a sphere is visible: no rays beyond 90° from the axis.
 #[derive(Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -85,7 +89,8 @@ impl std::fmt::Debug for Distortion {
     }
 }
 
-/// Returns whether a value is the default, which is not written, so that files of most lenses stay short.
+/// Returns whether a value is the default, which is not written, so that files of most lenses stay
+/// short.
 fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
 }
@@ -199,7 +204,8 @@ impl Distortion {
                 Some(spread / (self.omega * (1.0 + (spread * tangent).powi(2))))
             }
         };
-        // the radius as a function of the tangent has the slope `along`; across it, the scale is radius / tangent
+        // the radius as a function of the tangent has the slope `along`; across it, the scale is
+        // radius / tangent
         let scale = self.radius_over_tangent(self.projection, tangent);
         let bent = self.bend_slopes(scale * x, scale * y);
         let Some(along) = along else { return bent.map(|row| row.map(|v| v * scale)) };
@@ -211,9 +217,9 @@ impl Distortion {
         })
     }
 
-    /// Distorted normalized coordinates back to ideal ones: Newton on the coefficients with their exact Jacobian,
-    /// whose result is checked, then the projection's inverse. `None` where the model folds over (no ideal point has
-    /// this image) and from 90° on.
+    /// Distorted normalized coordinates back to ideal ones: Newton on the coefficients with their
+    /// exact Jacobian, whose result is checked, then the projection's inverse. `None` where the
+    /// model folds over (no ideal point has this image) and from 90° on.
     pub fn undistort(&self, xd: f64, yd: f64) -> Option<(f64, f64)> {
         if self.is_none() {
             return Some((xd, yd));
@@ -321,8 +327,8 @@ impl Camera {
         self.rotation.transpose() * (point - self.position)
     }
 
-    /// Returns the ideal normalized coordinates (y down) of a point in the axes of a camera, and its
-    /// distance along the viewing axis; `None` behind the camera.
+    /// Returns the ideal normalized coordinates (y down) of a point in the axes of a camera, and
+    /// its distance along the viewing axis; `None` behind the camera.
     #[inline]
     pub fn ideal(local: DVec3) -> Option<(DVec2, f64)> {
         let depth = -local.z;
@@ -379,8 +385,8 @@ impl Camera {
         }
     }
 
-    /// Returns a camera at (0, 0, z) that looks along −Z, with +Y up, without distortion and with the
-    /// middle of the picture as principal point.
+    /// Returns a camera at (0, 0, z) that looks along −Z, with +Y up, without distortion and with
+    /// the middle of the picture as principal point.
     pub fn above(width: u32, height: u32, focal: f64, z: f64) -> Camera {
         Camera {
             width,

@@ -1,11 +1,14 @@
-//! A colored signed distance: the interface of a learned field to the extraction and finishing of meshes.
+//! A colored signed distance: the interface of a learned field to the extraction and finishing of
+//! meshes.
 
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// A colored signed distance. A field is called from one thread, with thousands of points at a time where possible.
+/// A colored signed distance. A field is called from one thread, with thousands of points at a time
+/// where possible.
 ///
-/// A closure that returns the signed distance of a point is a gray field, with central differences as its gradient:
+/// A closure that returns the signed distance of a point is a gray field, with central differences
+/// as its gradient:
 ///
 /// ```
 /// use glam::Vec3;
@@ -19,11 +22,13 @@ pub trait SdfField: Sync {
     /// Returns the signed distances of points, negative inside. `[n]` → `[n]`.
     fn sdf(&self, points: &[Vec3]) -> Vec<f32>;
 
-    /// Returns the signed distances and their gradients, which need not be of unit length. `[n]` → `[n]`, `[n]`.
+    /// Returns the signed distances and their gradients, which need not be of unit length. `[n]` →
+    /// `[n]`, `[n]`.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>);
 
-    /// Returns the sRGB-coded colors of surface points `[n]` with unit normals `[n]`. Point `i` is seen along
-    /// `counts[i]` unit directions, away from the camera, all in one list; one color is returned per direction.
+    /// Returns the sRGB-coded colors of surface points `[n]` with unit normals `[n]`. Point `i` is
+    /// seen along `counts[i]` unit directions, away from the camera, all in one list; one color is
+    /// returned per direction.
     fn colors(&self, points: &[Vec3], normals: &[Vec3], counts: &[u32], directions: &[Vec3])
     -> Vec<[f32; 3]>;
 
@@ -32,8 +37,8 @@ pub trait SdfField: Sync {
         self.colors(points, normals, &vec![1; points.len()], directions)
     }
 
-    /// Returns the local sharpness, per unit of length: the opacity at a distance `f` outside the surface is
-    /// σ(−f · sharpness). `[n]` → `[n]`. Infinite where it is not known.
+    /// Returns the local sharpness, per unit of length: the opacity at a distance `f` outside the
+    /// surface is σ(−f · sharpness). `[n]` → `[n]`. Infinite where it is not known.
     fn sharpness(&self, points: &[Vec3]) -> Vec<f32> {
         vec![f32::INFINITY; points.len()]
     }

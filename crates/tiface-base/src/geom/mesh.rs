@@ -1,4 +1,5 @@
-//! A triangle mesh with what the pipeline attaches to its vertices, and where its triangles lie in its texture.
+//! A triangle mesh with what the pipeline attaches to its vertices, and where its triangles lie in
+//! its texture.
 
 use super::ray::{Aabb, Hit};
 use super::similarity::Similarity;
@@ -51,15 +52,16 @@ impl Mesh {
         0.5 * (b - a).cross(c - a).length()
     }
 
-    /// Watertight: every edge shared by exactly two triangles, oppositely wound. False where an index is out of range.
+    /// Watertight: every edge shared by exactly two triangles, oppositely wound. False where an
+    /// index is out of range.
     pub fn is_closed(&self) -> bool {
         let count = self.positions.len();
         let in_range = self.triangles.as_flattened().iter().all(|&v| (v as usize) < count);
         in_range && topology(&self.positions, &self.triangles).closed
     }
 
-    /// Unit vertex normals, weighted by the angles of the triangles at each vertex (Thürmer, Wüthrich 1998); +z
-    /// where all of them are degenerate.
+    /// Unit vertex normals, weighted by the angles of the triangles at each vertex (Thürmer,
+    /// Wüthrich 1998); +z where all of them are degenerate.
     pub fn angle_weighted_normals(&self) -> Vec<Vec3> {
         let mut sums = vec![Vec3::ZERO; self.positions.len()];
         for t in &self.triangles {
@@ -84,8 +86,8 @@ impl Mesh {
         sum / 6.0
     }
 
-    /// Returns the unit normal of a point of a triangle, interpolated between its vertices; `None` without normals, or where
-    /// they cancel.
+    /// Returns the unit normal of a point of a triangle, interpolated between its vertices; `None`
+    /// without normals, or where they cancel.
     #[inline]
     pub fn normal_at(&self, hit: &Hit) -> Option<Vec3> {
         let corners = self.triangles[hit.triangle as usize];
@@ -104,7 +106,8 @@ impl Mesh {
         hit.mix(self.corners(hit.triangle))
     }
 
-    /// Returns the color of a point of a triangle, interpolated between its vertices; black without colors.
+    /// Returns the color of a point of a triangle, interpolated between its vertices; black without
+    /// colors.
     #[inline]
     pub fn color_at(&self, hit: &Hit) -> [f32; 3] {
         let color = |v: u32| Vec3::from(self.colors.get(v as usize).copied().unwrap_or_default());
@@ -141,8 +144,8 @@ impl Mesh {
 
 /// Texture coordinates, indexed apart from the vertices: a vertex on a seam has several.
 ///
-/// glTF's convention: the origin is the texture's top left corner, v runs down, and the center of the texel
-/// in column i and row j is at ((i + 0.5) / width, (j + 0.5) / height).
+/// glTF's convention: the origin is the texture's top left corner, v runs down, and the center of
+/// the texel in column i and row j is at ((i + 0.5) / width, (j + 0.5) / height).
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Atlas {
     /// Coordinates, 0..=1.
@@ -156,7 +159,8 @@ pub struct Atlas {
 }
 
 impl Atlas {
-    /// Returns the corners of a triangle, in texels: (0, 0) is the top left corner of the top left texel.
+    /// Returns the corners of a triangle, in texels: (0, 0) is the top left corner of the top left
+    /// texel.
     #[inline]
     pub fn corners(&self, triangle: u32) -> [Vec2; 3] {
         let size = Vec2::new(self.width as f32, self.height as f32);
@@ -164,8 +168,8 @@ impl Atlas {
     }
 }
 
-/// Returns the texels that a bilinear look-up mixes, row-major, and their weights. `at` is in texels, whose centers are at
-/// whole numbers here; beyond the border the picture continues.
+/// Returns the texels that a bilinear look-up mixes, row-major, and their weights. `at` is in
+/// texels, whose centers are at whole numbers here; beyond the border the picture continues.
 #[inline]
 pub fn bilinear_taps(at: Vec2, [width, height]: [u32; 2]) -> [(u32, f32); 4] {
     let along = |p: f32, n: u32| {

@@ -1,17 +1,19 @@
 //! Which triangles of an atlas share area, decided without rounding.
 //!
-//! Two triangles share area unless a side of one of them has the whole other one on its far side: the
-//! separating axes of convex polygons in the plane. Each decision is the sign of an orientation determinant
-//! of f32 coordinates, exact after Shewchuk (1997). So triangles that share a side or a corner, or merely touch, never
-//! count.
+//! Two triangles share area unless a side of one of them has the whole other one on its far side:
+//! the separating axes of convex polygons in the plane. Each decision is the sign of an orientation
+//! determinant of f32 coordinates, exact after Shewchuk (1997). So triangles that share a side or a
+//! corner, or merely touch, never count.
 //!
-//! Beside that: whether two triangles in space pass through each other, and how far the charts of an atlas are apart.
+//! Beside that: whether two triangles in space pass through each other, and how far the charts of
+//! an atlas are apart.
 
 use super::boxes::{Boxes, DBox, DEFAULT_EFFORT, share_out};
 use glam::{DVec2, DVec3, Vec2};
 use rayon::prelude::*;
 
-/// On which side of the line a → b is c: 1 where (b − a) × (c − a) is positive, −1 where negative, 0 on it.
+/// On which side of the line a → b is c: 1 where (b − a) × (c − a) is positive, −1 where negative,
+/// 0 on it.
 #[inline]
 pub fn turn(a: Vec2, b: Vec2, c: Vec2) -> i32 {
     let coord = |v: Vec2| robust::Coord { x: f64::from(v.x), y: f64::from(v.y) };
@@ -24,7 +26,8 @@ pub(crate) fn share_area(p: [Vec2; 3], q: [Vec2; 3]) -> bool {
     !separates(p, q, turn) && !separates(q, p, turn)
 }
 
-/// Returns whether a side of a triangle has all of another one on its far side, by the sign of a turn.
+/// Returns whether a side of a triangle has all of another one on its far side, by the sign of a
+/// turn.
 fn separates<V: Copy>(a: [V; 3], b: [V; 3], turn: impl Fn(V, V, V) -> i32) -> bool {
     let inner = turn(a[0], a[1], a[2]);
     (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * inner <= 0))
@@ -60,7 +63,8 @@ pub struct Overlaps {
     pub pairs: Vec<(u32, u32)>,
     /// Number of triangles that share area with another one.
     pub covered: usize,
-    /// Number of triangles that were not compared with all neighbors of higher index: then both numbers above are lower bounds.
+    /// Number of triangles that were not compared with all neighbors of higher index: then both
+    /// numbers above are lower bounds.
     pub left: usize,
 }
 
@@ -71,8 +75,8 @@ pub const THOROUGH_EFFORT: usize = 1 << 16;
 const PAIR_TEST_COST: usize = 12;
 const OVERLAP_COST: usize = 64;
 
-/// Finds the pairs among the triangles that `fit`, for so much effort a triangle; those must be finite and have
-/// area.
+/// Finds the pairs among the triangles that `fit`, for so much effort a triangle; those must be
+/// finite and have area.
 pub fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effort: usize) -> Overlaps {
     let corners = |t: u32| triangles[t as usize].map(|i| uvs[i as usize]);
     let listed: Vec<u32> = (0..triangles.len() as u32).filter(|&t| fit[t as usize]).collect();
@@ -149,7 +153,8 @@ pub fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u32; 3])
     count < 2 && (crosses(p, in_p, q) || crosses(q, in_q, p))
 }
 
-/// Returns whether the segment goes from one side of the triangle to the other, through it or its border.
+/// Returns whether the segment goes from one side of the triangle to the other, through it or its
+/// border.
 fn pierces(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> bool {
     if orient(a, b, c, from) * orient(a, b, c, to) >= 0 {
         return false;
@@ -202,14 +207,16 @@ pub struct OutlineSide {
 
 /// Distance between charts.
 pub struct ChartDistance {
-    /// The smallest distance between sides of different charts, up to the given limit; `None` with fewer than
-    /// two charts.
+    /// The smallest distance between sides of different charts, up to the given limit; `None` with
+    /// fewer than two charts.
     pub distance: Option<f64>,
-    /// Number of sides that were not compared with all neighbors: then the distance is an upper bound.
+    /// Number of sides that were not compared with all neighbors: then the distance is an upper
+    /// bound.
     pub left: usize,
 }
 
-/// Returns the smallest distance between sides of different charts, up to `farthest`, beyond which it is given as that.
+/// Returns the smallest distance between sides of different charts, up to `farthest`, beyond which
+/// it is given as that.
 pub fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDistance {
     if sides.iter().all(|s| s.chart == sides[0].chart) {
         return ChartDistance { distance: None, left: 0 };
@@ -277,7 +284,8 @@ mod tests {
 
     #[test]
     fn turning_is_exact_where_f64_is_not() {
-        // c lies on the line through a and b but for one ulp of f32, near 1: the determinant is about 1e-15.
+        // c lies on the line through a and b but for one ulp of f32, near 1: the determinant is
+        // about 1e-15.
         let (a, b) = (Vec2::new(0.1, 0.1), Vec2::new(0.9, 0.9));
         assert_eq!(turn(a, b, Vec2::new(0.5, 0.5)), 0);
         assert_eq!(turn(a, b, Vec2::new(0.5, 0.5f32.next_up())), 1);

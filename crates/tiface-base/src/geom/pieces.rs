@@ -1,10 +1,12 @@
 //! Orientation of the closed pieces of a mesh.
 //!
-//! A piece is what edges connect, so solids that touch at a vertex are several. Wound outward, it has a positive volume.
-//! One of negative volume bounds a cavity if it lies inside the others: their winding number at its corners is positive.
-//! The winding number of a point is the number of triangles that a ray from it leaves minus those that it enters (+x here).
-//! A ray through an edge or a corner meets one of the triangles there: in the plane, a point on a side counts as left of
-//! it, and a side spans its lower end but not its upper one (as in simulation of simplicity, Edelsbrunner, Mücke 1990).
+//! A piece is what edges connect, so solids that touch at a vertex are several. Wound outward, it
+//! has a positive volume. One of negative volume bounds a cavity if it lies inside the others:
+//! their winding number at its corners is positive. The winding number of a point is the number of
+//! triangles that a ray from it leaves minus those that it enters (+x here). A ray through an edge
+//! or a corner meets one of the triangles there: in the plane, a point on a side counts as left of
+//! it, and a side spans its lower end but not its upper one (as in simulation of simplicity,
+//! Edelsbrunner, Mücke 1990).
 
 use super::boxes::{Boxes, DBox, DEFAULT_EFFORT, Effort, share_out};
 use super::overlap::{orient, turn};
@@ -36,8 +38,8 @@ struct Piece {
     volume: f64,
 }
 
-/// Returns the pieces of a closed mesh that enclose nothing, or are inside out and lie in no other one. A piece that could
-/// not be compared with all others for a bounded effort is one of them.
+/// Returns the pieces of a closed mesh that enclose nothing, or are inside out and lie in no other
+/// one. A piece that could not be compared with all others for a bounded effort is one of them.
 pub fn wrong_pieces(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<WrongPiece> {
     let corners = |t: u32| triangles[t as usize].map(|v| positions[v as usize].as_dvec3());
     let (pieces, piece_of) = pieces(positions, triangles);
@@ -53,7 +55,8 @@ pub fn wrong_pieces(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<WrongPiec
             if piece_of[t as usize] as usize != piece {
                 let corners = triangles[t as usize].map(|v| positions[v as usize]);
                 let around = winding_in_plane(flat, corners.map(|p| Vec2::new(p.y, p.z)));
-                // a triangle around the ray's line that lies before its origin is seen from the other side
+                // a triangle around the ray's line that lies before its origin is seen from the
+                // other side
                 let [a, b, c] = corners.map(|p| p.as_dvec3());
                 sum += if around == orient(a, b, c, from) { around } else { 0 };
             }
@@ -101,7 +104,8 @@ fn pieces(positions: &[Vec3], triangles: &[[u32; 3]]) -> (Vec<Piece>, Vec<u32>) 
     }
     for piece in &mut pieces {
         let at = |t: u32| triangles[t as usize].map(|v| positions[v as usize].as_dvec3());
-        // around one of its own corners: far from the origin, nothing else would be left of small volumes
+        // around one of its own corners: far from the origin, nothing else would be left of small
+        // volumes
         let origin = at(piece.triangles[0])[0];
         let (mut sum, mut size) = (0.0, 0.0);
         for &t in &piece.triangles {
@@ -115,7 +119,8 @@ fn pieces(positions: &[Vec3], triangles: &[[u32; 3]]) -> (Vec<Piece>, Vec<u32>) 
     (pieces, piece_of)
 }
 
-/// Returns how often the sides of a triangle run around a point: 1 counter-clockwise, −1 clockwise, 0 outside.
+/// Returns how often the sides of a triangle run around a point: 1 counter-clockwise, −1 clockwise,
+/// 0 outside.
 fn winding_in_plane(point: Vec2, corners: [Vec2; 3]) -> i32 {
     let crossing = |k: usize| {
         let (from, to) = (corners[k], corners[(k + 1) % 3]);
@@ -165,7 +170,8 @@ mod tests {
         let found = [(DVec3::new(4.5, 0.5, 0.5), -1.0)];
         assert_eq!(wrong(&[whole, beside]), found);
         assert_eq!(wrong(&[beside]), found);
-        // a solid in the cavity is sound, a cavity in the cavity is not: around it is nothing, 1 − 1 = 0
+        // a solid in the cavity is sound, a cavity in the cavity is not: around it is nothing, 1 −
+        // 1 = 0
         let cavity = (zero, Vec3::splat(2.0), false);
         let inner = (Vec3::splat(0.5), Vec3::splat(1.5), true);
         assert!(wrong(&[whole, cavity, inner]).is_empty());

@@ -25,7 +25,8 @@ impl Ray {
     }
 }
 
-/// Result of a ray through a radiance field or a scene; color is premultiplied by opacity (over black).
+/// Result of a ray through a radiance field or a scene; color is premultiplied by opacity (over
+/// black).
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RayResult {
     /// sRGB-coded color, premultiplied.
@@ -126,8 +127,8 @@ impl Aabb {
         point.cmpge(self.min).all() && point.cmple(self.max).all()
     }
 
-    /// Returns the parameters at which the line `origin + t · direction` enters and leaves, if it meets the
-    /// box at any `t` (negative ones included). Zero direction components are handled.
+    /// Returns the parameters at which the line `origin + t · direction` enters and leaves, if it
+    /// meets the box at any `t` (negative ones included). Zero direction components are handled.
     #[inline]
     pub fn intersect(self, origin: Vec3, direction: Vec3) -> Option<(f32, f32)> {
         let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);

@@ -1,20 +1,21 @@
-//! Translucent layers around a mesh, for parts that are softer than a surface, such as the outline of hair.
+//! Translucent layers around a mesh, for parts that are softer than a surface, such as the outline
+//! of hair.
 
 use super::bvh::Bvh;
 use super::mesh::Mesh;
 use super::ray::{Hit, Ray};
 use glam::Vec3;
 
-/// Layers around a mesh with normals, the innermost first: they are drawn in this order, after the mesh, and only where
-/// they face the viewer.
+/// Layers around a mesh with normals, the innermost first: they are drawn in this order, after the
+/// mesh, and only where they face the viewer.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Shells {
     /// The layers.
     pub layers: Vec<ShellLayer>,
 }
 
-/// A layer: triangles of the mesh, those with a vertex that is not transparent, moved along the normals of their
-/// vertices. It has the mesh's colors.
+/// A layer: triangles of the mesh, those with a vertex that is not transparent, moved along the
+/// normals of their vertices. It has the mesh's colors.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ShellLayer {
     /// Offset of each vertex of the mesh along its normal, in the mesh's units.
@@ -78,8 +79,8 @@ impl<'a> ShellCaster<'a> {
         ShellCaster { mesh, layers: shells.layers.iter().map(caster).collect() }
     }
 
-    /// Calls `meet` for each layer whose outside a ray meets before `end`, the outermost first: with its index, the
-    /// source position on the mesh, and its opacity.
+    /// Calls `meet` for each layer whose outside a ray meets before `end`, the outermost first:
+    /// with its index, the source position on the mesh, and its opacity.
     pub fn cast(&self, ray: &Ray, end: f32, mut meet: impl FnMut(usize, Hit, f32)) {
         for (k, LayerCaster { layer, surface, bvh, source }) in self.layers.iter().enumerate().rev() {
             let mut ahead = *ray;
@@ -102,7 +103,8 @@ impl<'a> ShellCaster<'a> {
 mod tests {
     use super::*;
 
-    /// Returns a square in z = 0 facing +z, vertices 0..4; its last vertex is transparent in both layers.
+    /// Returns a square in z = 0 facing +z, vertices 0..4; its last vertex is transparent in both
+    /// layers.
     fn square() -> (Mesh, Shells) {
         let at = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
         let mesh = Mesh {

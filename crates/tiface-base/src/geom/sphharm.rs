@@ -54,9 +54,11 @@ pub fn combine(coefficients: &[[f32; 3]], d: [f32; 3]) -> [f32; 3] {
 }
 
 /// Returns the matrix `M` for which `Y_k(R d) = Σ_j M[k][j] Y_j(d)` with the rotation `R`, of up to
-/// [`COEFFICIENTS_OF_DEGREE_2`] functions: coefficients `c` of `R d` are the coefficients `Σ_k c_k M[k]` of `d`.
+/// [`COEFFICIENTS_OF_DEGREE_2`] functions: coefficients `c` of `R d` are the coefficients
+/// `Σ_k c_k M[k]` of `d`.
 pub fn rotated(functions: usize, rotation: Mat3) -> Vec<Vec<f32>> {
-    // the means over the corners of an icosahedron are those over the sphere up to degree 5, and products have degree 4
+    // the means over the corners of an icosahedron are those over the sphere up to degree 5, and
+    // products have degree 4
     let golden = 0.5 * (1.0 + 5f32.sqrt());
     let signs = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)];
     let corners: Vec<Vec3> = signs
@@ -74,7 +76,8 @@ pub fn rotated(functions: usize, rotation: Mat3) -> Vec<Vec<f32>> {
     (0..functions).map(|k| (0..functions).map(|j| integral(k, j)).collect()).collect()
 }
 
-/// Spherical harmonics of the direction to the viewer at the vertices of a mesh, to be added to its base color.
+/// Spherical harmonics of the direction to the viewer at the vertices of a mesh, to be added to its
+/// base color.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Harmonics {
     /// Functions a vertex, 1, 4 or 9: those of [`sh16`] up to a degree.
@@ -86,8 +89,8 @@ pub struct Harmonics {
 }
 
 impl Harmonics {
-    /// Returns what is added where a ray along the unit `direction`, away from the camera, met the triangle of these
-    /// vertices.
+    /// Returns what is added where a ray along the unit `direction`, away from the camera, met the
+    /// triangle of these vertices.
     #[inline]
     pub fn seen_along(&self, direction: Vec3, hit: &Hit, triangle: [u32; 3]) -> [f32; 3] {
         let d = (self.turned * -direction).to_array();
@@ -128,7 +131,8 @@ mod tests {
 
     #[test]
     fn a_corner_shows_its_own_color_in_the_direction_it_is_seen_from() {
-        // -0.4886 x is the fourth function: red towards -x at the second vertex, nothing at the others
+        // -0.4886 x is the fourth function: red towards -x at the second vertex, nothing at the
+        // others
         let mut coefficients = vec![[0.0; 3]; 12];
         coefficients[4 + 3] = [1.0, 0.0, 0.0];
         let quarter = Mat3::from_rotation_z(std::f32::consts::FRAC_PI_2); // y -> -x

@@ -44,8 +44,8 @@ pub struct Topology {
 }
 
 impl Topology {
-    /// Returns whether the mesh is closed, manifold, finite, and without degenerate or doubled triangles: fit to be
-    /// printed or simulated.
+    /// Returns whether the mesh is closed, manifold, finite, and without degenerate or doubled
+    /// triangles: fit to be printed or simulated.
     pub fn is_solid(&self) -> bool {
         self.closed
             && self.manifold
@@ -93,8 +93,9 @@ impl Sets {
     }
 }
 
-/// Returns the directed sides of all triangles, sorted by undirected edge: `(low << 32 | high, corner)`, where
-/// corner `3 t + k` starts the side from vertex k to k + 1 of triangle t.
+/// Returns the directed sides of all triangles, sorted by undirected edge:
+/// `(low << 32 | high, corner)`, where corner `3 t + k` starts the side from vertex k to k + 1 of
+/// triangle t.
 pub fn sorted_sides(triangles: &[[u32; 3]]) -> Vec<(u64, u32)> {
     let mut sides: Vec<(u64, u32)> = triangles
         .par_iter()
@@ -117,8 +118,8 @@ pub fn side_ends(triangles: &[[u32; 3]], corner: u32) -> (u32, u32) {
     (t[k], t[(k + 1) % 3])
 }
 
-/// For every corner, the set of corners reached from it around its vertex across edges with exactly two
-/// triangles. A vertex with one set has one fan.
+/// For every corner, the set of corners reached from it around its vertex across edges with exactly
+/// two triangles. A vertex with one set has one fan.
 fn fans(triangles: &[[u32; 3]], sides: &[(u64, u32)]) -> Sets {
     let mut fans = Sets::new(3 * triangles.len());
     let vertex = |c: u32| side_ends(triangles, c).0;

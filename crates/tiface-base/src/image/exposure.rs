@@ -16,7 +16,8 @@ impl Exposure {
         self.gain.iter().product::<f32>().cbrt()
     }
 
-    /// Returns the photograph as it would be with the mean exposure. Pixels brighter than white become white.
+    /// Returns the photograph as it would be with the mean exposure. Pixels brighter than white
+    /// become white.
     pub fn divided_out(&self, mut photo: Photo) -> Photo {
         let coded = |b: u8, k: usize| {
             quantize(srgb_from_linear(linear_from_srgb(f32::from(b) / 255.0) / self.gain[k]))
@@ -35,7 +36,8 @@ mod tests {
 
     #[test]
     fn light_is_divided_channel_by_channel_and_bright_pixels_become_white() {
-        // 188 is half the light of white (0.5029); twice that is above white, half of it is 0.2515, coded 137
+        // 188 is half the light of white (0.5029); twice that is above white, half of it is 0.2515,
+        // coded 137
         let photo = Photo { width: 1, height: 1, rgb: vec![[188; 3]], alpha: None };
         let exposure = Exposure { gain: [0.5, 1.0, 2.0] };
         assert_eq!(exposure.divided_out(photo).rgb, [[255, 188, 137]]);

@@ -1,14 +1,16 @@
 //! Pictures at other sizes.
 //!
-//! Smaller is the mean over the area of each new pixel: of coded values ([`reduce_photo`]), which is what networks were trained on,
-//! and keeps the matting equation `I = α F + (1 − α) B` true in the space it is solved in; or in linear light, for a cut, whose
-//! colors only distinguish two sides, and for a photograph that stands for one of a coarser sensor. Larger is bilinear between
+//! Smaller is the mean over the area of each new pixel: of coded values ([`reduce_photo`]), which
+//! is what networks were trained on, and keeps the matting equation `I = α F + (1 − α) B` true in
+//! the space it is solved in; or in linear light, for a cut, whose colors only distinguish two
+//! sides, and for a photograph that stands for one of a coarser sensor. Larger is bilinear between
 //! pixel centers: column `x` of `W` samples `(x + ½) w / W − ½` of `w`.
 
 use super::{Gray, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use rayon::prelude::*;
 
-/// Returns the size of a picture brought down to at most `side` pixels on its longest side; never larger than it is.
+/// Returns the size of a picture brought down to at most `side` pixels on its longest side; never
+/// larger than it is.
 pub fn working_size(width: u32, height: u32, side: u32) -> (u32, u32) {
     let longest = width.max(height);
     if longest <= side {
@@ -100,8 +102,8 @@ pub fn size_at_rows((width, height): (u32, u32), rows: u32) -> (u32, u32) {
     }
 }
 
-/// Returns a photograph averaged down in linear light to at most `rows` rows, without its alpha; the same photograph
-/// when it is small enough already.
+/// Returns a photograph averaged down in linear light to at most `rows` rows, without its alpha;
+/// the same photograph when it is small enough already.
 pub fn reduce_to_rows(photo: &Photo, rows: u32) -> Photo {
     let from = (photo.width, photo.height);
     let size = size_at_rows(from, rows);
@@ -112,7 +114,8 @@ pub fn reduce_to_rows(photo: &Photo, rows: u32) -> Photo {
     Photo { width: size.0, height: size.1, rgb: bytes.as_chunks::<3>().0.to_vec(), alpha: None }
 }
 
-/// Returns a gray picture at another size: averaged where it is larger in both directions, else interpolated.
+/// Returns a gray picture at another size: averaged where it is larger in both directions, else
+/// interpolated.
 pub fn resize_gray(gray: &Gray, size: (u32, u32)) -> Gray {
     let from = (gray.width, gray.height);
     if size == from {
@@ -125,16 +128,16 @@ pub fn resize_gray(gray: &Gray, size: (u32, u32)) -> Gray {
     enlarge(&values, from, size, 0.0, 1.0)
 }
 
-/// Returns a mask (head where it is 128 or more) at another size, 255 or 0: resized and cut at one half. Its outline is
-/// smooth where copied pixels would make stairs.
+/// Returns a mask (head where it is 128 or more) at another size, 255 or 0: resized and cut at one
+/// half. Its outline is smooth where copied pixels would make stairs.
 pub fn resize_hard(mask: &Gray, size: (u32, u32)) -> Gray {
     let mut resized = resize_gray(mask, size);
     resized.values.iter_mut().for_each(|v| *v = if *v >= 128 { 255 } else { 0 });
     resized
 }
 
-/// Clamps alpha to 0..=1, with values near 0 and 1 set to 0 and 1. First
-/// clamped, then hardened: a learner takes every value but 0 for head, so a stray 1 of 255 costs a pixel.
+/// Clamps alpha to 0..=1, with values near 0 and 1 set to 0 and 1. First clamped, then hardened: a
+/// learner takes every value but 0 for head, so a stray 1 of 255 costs a pixel.
 #[inline]
 pub fn harden(alpha: f32, lowest: f32, highest: f32) -> f32 {
     match alpha.clamp(0.0, 1.0) {
@@ -144,16 +147,17 @@ pub fn harden(alpha: f32, lowest: f32, highest: f32) -> f32 {
     }
 }
 
-/// Alphas `[from.1 · from.0]` brought to `size` by bilinear interpolation, then hardened (`harden`) and coded in 8
-/// bit. Values that are no numbers become 0.
+/// Alphas `[from.1 · from.0]` brought to `size` by bilinear interpolation, then hardened (`harden`)
+/// and coded in 8 bit. Values that are no numbers become 0.
 pub fn enlarge(alpha: &[f32], from: (u32, u32), size: (u32, u32), lowest: f32, highest: f32) -> Gray {
     assert_eq!(alpha.len(), from.0 as usize * from.1 as usize);
     let coded = |v: f32| quantize(harden(v, lowest, highest));
     Gray { width: size.0, height: size.1, values: bilinear(alpha, from.0, from, size, coded) }
 }
 
-/// Returns a field of `from` (width, height) at the pixel centers of `to`, each value given to `with`; edges are
-/// repeated. Rows of `values` are `stride` apart, so the upper left `from` of a larger field can be taken.
+/// Returns a field of `from` (width, height) at the pixel centers of `to`, each value given to
+/// `with`; edges are repeated. Rows of `values` are `stride` apart, so the upper left `from` of a
+/// larger field can be taken.
 pub fn bilinear<T: Copy + Default + Send>(
     values: &[f32],
     stride: u32,
@@ -176,7 +180,8 @@ pub fn bilinear<T: Copy + Default + Send>(
     out
 }
 
-/// Returns the two neighbors of pixel `i` of `to` among `from`, and how far it is from the first to the second.
+/// Returns the two neighbors of pixel `i` of `to` among `from`, and how far it is from the first to
+/// the second.
 fn between(i: u32, from: u32, to: u32) -> (usize, usize, f32) {
     let at = ((i as f64 + 0.5) * from as f64 / to as f64 - 0.5).clamp(0.0, (from - 1) as f64);
     let first = at as usize;
@@ -191,7 +196,8 @@ mod tests {
     fn the_longest_side_is_brought_down_and_the_other_rounded() {
         assert_eq!(working_size(3000, 4096, 1024), (750, 1024));
         assert_eq!(working_size(384, 512, 1024), (384, 512));
-        // 2 · 1024 / 3000 = 0.68 → 1; 1 · 1024 / 5000 = 0.2 → 0, but a picture has at least one pixel
+        // 2 · 1024 / 3000 = 0.68 → 1; 1 · 1024 / 5000 = 0.2 → 0, but a picture has at least one
+        // pixel
         assert_eq!(working_size(3000, 2, 1024), (1024, 1));
         assert_eq!(working_size(5000, 1, 1024), (1024, 1));
     }

@@ -18,8 +18,8 @@ pub struct Animation {
     pub rate: u16,
 }
 
-/// Frames one after the other, so that few of them are in memory: `[height · width]` pixels each, sRGB-coded with straight
-/// alpha.
+/// Frames one after the other, so that few of them are in memory: `[height · width]` pixels each,
+/// sRGB-coded with straight alpha.
 pub type Frames<'a> = &'a mut dyn Iterator<Item = Result<Vec<[u8; 4]>>>;
 
 /// Number of frames of a GIF whose palettes are computed in parallel.
@@ -28,12 +28,13 @@ const PALETTE_FRAMES: usize = 8;
 /// The endings of [`write_animation`].
 pub const ANIMATIONS: [&str; 2] = ["png", "gif"];
 
-/// Writes an animated PNG, or a GIF (of 256 colors a frame, without half transparency) if `ending` is `gif`.
+/// Writes an animated PNG, or a GIF (of 256 colors a frame, without half transparency) if `ending`
+/// is `gif`.
 ///
 /// # Errors
 ///
-/// The file cannot be written, the frames cannot be stored so, or a frame is an error, which is handed on. Nothing is
-/// written then.
+/// The file cannot be written, the frames cannot be stored so, or a frame is an error, which is
+/// handed on. Nothing is written then.
 pub fn write_animation(path: &Path, ending: &str, animation: &Animation, frames: Frames) -> Result<()> {
     let mut failed = None;
     // up to the first that fails

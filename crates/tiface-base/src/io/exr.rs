@@ -1,7 +1,7 @@
 //! OpenEXR: float channels by name, in and out: colors, depth, normals.
 //!
-//! The data window is placed inside the display window: pixels outside are dropped, uncovered ones are 0. The first layer
-//! with all requested channels is used.
+//! The data window is placed inside the display window: pixels outside are dropped, uncovered ones
+//! are 0. The first layer with all requested channels is used.
 
 use super::read::{Limits, ReadError, read_bytes};
 use super::write::{WriteError, write_atomic};
@@ -54,7 +54,8 @@ fn damaged(path: &Path, problem: impl ToString) -> ReadError {
     ReadError::damaged(path, "OpenEXR", None, problem.to_string())
 }
 
-/// Returns the display window of a file whose header promises nothing that is over the limits or not read.
+/// Returns the display window of a file whose header promises nothing that is over the limits or
+/// not read.
 fn checked_window(path: &Path, bytes: &[u8], limits: &Limits) -> Result<ex::IntegerBounds, ReadError> {
     if !bytes.starts_with(&[0x76, 0x2F, 0x31, 0x01]) {
         return Err(ReadError::damaged(path, "OpenEXR", Some(0), "its first bytes are not those of OpenEXR"));
@@ -87,7 +88,8 @@ fn checked_window(path: &Path, bytes: &[u8], limits: &Limits) -> Result<ex::Inte
     display.filter(|_| width > 0 && height > 0).ok_or_else(|| damaged(path, "its display window is empty"))
 }
 
-/// Channels of a layer whose rows have `row` values and whose first one lies at `corner`, cut to a picture of `size`.
+/// Channels of a layer whose rows have `row` values and whose first one lies at `corner`, cut to a
+/// picture of `size`.
 fn placed(
     channels: &[&ex::AnyChannel<ex::FlatSamples>],
     row: usize,
@@ -108,7 +110,8 @@ fn placed(
     ExrImage { image, replaced }
 }
 
-/// Writes float32 channels, ZIP compressed (16 rows a block); each slice is row-major, top row first.
+/// Writes float32 channels, ZIP compressed (16 rows a block); each slice is row-major, top row
+/// first.
 pub fn write_exr(
     path: &Path,
     width: u32,

@@ -26,9 +26,9 @@ fn entries(path: &Path) -> std::io::Result<Vec<DirEntry>> {
     }
 }
 
-/// Removes everything inside `path` except files called `keep` and folders that are `apart`, which stay
-/// as they are; a folder that does not exist is empty. Links inside are removed, never followed; a link in
-/// the place of the folder itself is an error.
+/// Removes everything inside `path` except files called `keep` and folders that are `apart`, which
+/// stay as they are; a folder that does not exist is empty. Links inside are removed, never
+/// followed; a link in the place of the folder itself is an error.
 pub fn clear_folder(path: &Path, keep: &str, apart: &dyn Fn(&Path) -> bool) -> Result<(), WriteError> {
     if is_link(path) {
         return Err(failed(path)(linked()));
@@ -113,8 +113,8 @@ pub fn files_below(
     Some(files)
 }
 
-/// Returns how many bytes the files in a folder and below have, by their path in it; hidden ones and folders that are
-/// `apart` left out. No folder has no files.
+/// Returns how many bytes the files in a folder and below have, by their path in it; hidden ones
+/// and folders that are `apart` left out. No folder has no files.
 pub fn file_sizes(path: &Path, apart: &dyn Fn(&Path) -> bool) -> Result<BTreeMap<String, u64>, ReadError> {
     let mut sizes = BTreeMap::new();
     for entry in entries(path).map_err(|e| ReadError::io(path, e))? {
@@ -144,8 +144,8 @@ pub fn is_folder(path: &Path) -> bool {
     fs::metadata(path).is_ok_and(|m| m.is_dir())
 }
 
-/// Returns the names of the regular files directly in a folder, sorted by bytes; hidden ones left out. A name that
-/// is not UTF-8 is an error that shows it as well as it can.
+/// Returns the names of the regular files directly in a folder, sorted by bytes; hidden ones left
+/// out. A name that is not UTF-8 is an error that shows it as well as it can.
 pub fn list_files(folder: &Path) -> Result<Vec<String>, ReadError> {
     listed(folder, |name| !name.starts_with('.'))
 }
@@ -180,8 +180,8 @@ pub fn real_path(path: &Path) -> Result<PathBuf, ReadError> {
     fs::canonicalize(path).map_err(|e| ReadError::io(path, e))
 }
 
-/// Returns the path whose name is most like that of a path that does not exist: beside it, in a folder of a similar name, or
-/// the same name under `runs/`.
+/// Returns the path whose name is most like that of a path that does not exist: beside it, in a
+/// folder of a similar name, or the same name under `runs/`.
 pub fn similar(path: &Path) -> Option<PathBuf> {
     let name = path.file_name()?.to_str()?;
     let in_runs = Path::new("runs").join(path);
@@ -231,7 +231,8 @@ pub fn modified(path: &Path) -> Option<SystemTime> {
 }
 
 /// Appends a line to a log. If the last writer was stopped in the middle of a line, that line is
-/// ended first, so that it spoils only itself. A link is an error, because its target may be any file.
+/// ended first, so that it spoils only itself. A link is an error, because its target may be any
+/// file.
 pub fn append(path: &Path, line: &str) -> Result<(), WriteError> {
     if is_link(path) {
         return Err(failed(path)(linked()));
@@ -272,16 +273,16 @@ pub fn is_writable(folder: &Path) -> bool {
     fs::metadata(folder).is_ok_and(|m| !m.permissions().readonly())
 }
 
-/// Returns the bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
-/// does not tell.
+/// Returns the bytes an ordinary user may still write on the disk that holds `path`; `None` where
+/// the system does not tell.
 #[cfg(unix)]
 pub fn free_bytes(path: &Path) -> Option<u64> {
     let disk = rustix::fs::statvfs(path).ok()?;
     disk.f_bavail.checked_mul(disk.f_frsize)
 }
 
-/// Returns the bytes an ordinary user may still write on the disk that holds `path`; `None` where the system
-/// does not tell.
+/// Returns the bytes an ordinary user may still write on the disk that holds `path`; `None` where
+/// the system does not tell.
 #[cfg(not(unix))]
 pub fn free_bytes(_: &Path) -> Option<u64> {
     None

@@ -1,4 +1,5 @@
-//! JSON as untrusted input: bounded in bytes, depth and values, every key once, every number finite.
+//! JSON as untrusted input: bounded in bytes, depth and values, every key once, every number
+//! finite.
 
 use super::read::{Limits, ReadError, read_capped};
 use serde::de::{Deserialize, DeserializeOwned, DeserializeSeed, Error, MapAccess, SeqAccess, Visitor};
@@ -14,13 +15,15 @@ pub fn read_json(path: &Path, limits: &Limits) -> Result<Value, ReadError> {
     parse_json(path, &read_capped(path, limits.json_bytes, SIZE)?, limits)
 }
 
-/// As [`read_json`], as a value of a type. What does not fit is named with its key ([`ReadError::Value`]).
+/// As [`read_json`], as a value of a type. What does not fit is named with its key
+/// ([`ReadError::Value`]).
 pub fn read_typed<T: DeserializeOwned>(path: &Path, limits: &Limits) -> Result<T, ReadError> {
     typed(&read_json(path, limits)?)
         .map_err(|[key, found, expected]| ReadError::value(path, key, found, expected))
 }
 
-/// Converts a JSON value to a type, or returns the key that does not fit, its value and what was expected, in plain words.
+/// Converts a JSON value to a type, or returns the key that does not fit, its value and what was
+/// expected, in plain words.
 pub fn typed<'v, T: Deserialize<'v>>(value: &'v Value) -> Result<T, [String; 3]> {
     serde_path_to_error::deserialize(value).map_err(|e| {
         let (key, text) = (e.path().to_string(), e.inner().to_string());
@@ -63,8 +66,8 @@ fn in_plain_words(serde: &str) -> String {
 /// Returns the value in `bytes`; `path` is only for messages.
 ///
 /// A byte order mark and CRLF are accepted. Refused with line and column: duplicate keys (a second
-/// `frames` would silently hide the first), `NaN` and `Infinity` literals, numbers that overflow f64,
-/// nesting or counts over the limits, anything after the value.
+/// `frames` would silently hide the first), `NaN` and `Infinity` literals, numbers that overflow
+/// f64, nesting or counts over the limits, anything after the value.
 pub fn parse_json(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Value, ReadError> {
     if bytes.len() as u64 > limits.json_bytes {
         return Err(ReadError::too_large(path, SIZE, bytes.len() as u64, limits.json_bytes));

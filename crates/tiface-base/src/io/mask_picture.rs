@@ -17,8 +17,9 @@ pub struct MaskPicture {
     pub rgb: Vec<[u8; 3]>,
     /// `[height · width]` alpha; `None` without, and if it is opaque everywhere.
     pub alpha: Option<Vec<u8>>,
-    /// Colors by index, if the file is indexed and at least one of them is not gray; else empty. Those of a gray
-    /// palette are values themselves: programs that only compress files make such palettes, in any order.
+    /// Colors by index, if the file is indexed and at least one of them is not gray; else empty.
+    /// Those of a gray palette are values themselves: programs that only compress files make such
+    /// palettes, in any order.
     pub palette: Vec<[u8; 3]>,
 }
 
@@ -37,8 +38,8 @@ impl MaskPicture {
     }
 }
 
-/// Reads a mask file: PNG or JPEG. 16 bits are rounded to 8, except in a gray picture whose values all are below 256:
-/// these are labels, and are kept as they are.
+/// Reads a mask file: PNG or JPEG. 16 bits are rounded to 8, except in a gray picture whose values
+/// all are below 256: these are labels, and are kept as they are.
 ///
 /// `expected` is the size of its photograph, as for [`read_photo`](super::read_photo).
 pub fn read_mask(

@@ -1,14 +1,14 @@
-//! NumPy's `.npy`, parsed by `npyz` once the sizes that a file claims are known to be true, and `.npz`, a zip archive
-//! with one `.npy` file for each array, read whole or not at all.
+//! NumPy's `.npy`, parsed by `npyz` once the sizes that a file claims are known to be true, and
+//! `.npz`, a zip archive with one `.npy` file for each array, read whole or not at all.
 //!
-//! Format: magic, version, header length (u16 in version 1, u32 in 2 and 3), a Python dictionary with
-//! `descr`, `fortran_order` and `shape`, then exactly shape × size bytes (NumPy NEP 1). `npyz` reserves what
-//! the length says, multiplies the extents unchecked, and takes twice to three times as long for each bracket inside
-//! another, so all three are bounded here first.
+//! Format: magic, version, header length (u16 in version 1, u32 in 2 and 3), a Python dictionary
+//! with `descr`, `fortran_order` and `shape`, then exactly shape × size bytes (NumPy NEP 1). `npyz`
+//! reserves what the length says, multiplies the extents unchecked, and takes twice to three times
+//! as long for each bracket inside another, so all three are bounded here first.
 //!
-//! `numpy.savez` stores without compression; archives that a zip tool packed again are deflated. Names that stand
-//! twice and bytes that entries share, the two tricks that make small files unpack to large ones, are refused before
-//! anything is unpacked.
+//! `numpy.savez` stores without compression; archives that a zip tool packed again are deflated.
+//! Names that stand twice and bytes that entries share, the two tricks that make small files unpack
+//! to large ones, are refused before anything is unpacked.
 
 use super::read::{Limits, ReadError, read_bytes};
 use npyz::{DType, Deserialize, NpyFile, NpyHeader, Order, TypeChar, TypeStr};
@@ -40,7 +40,8 @@ pub struct Npy {
 pub enum NpyValues {
     /// From `bool`.
     Bool(Vec<bool>),
-    /// From any integer or float type; 64-bit integers beyond 2⁵³ are rounded. May hold NaN and Inf.
+    /// From any integer or float type; 64-bit integers beyond 2⁵³ are rounded. May hold NaN and
+    /// Inf.
     Number(Vec<f64>),
 }
 
@@ -137,7 +138,8 @@ pub fn parse_npy(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Npy, Read
     Ok(Npy { shape, values })
 }
 
-/// Returns the bytes of a `.npy` file of values that are in row-major order and of this type (`<f8`, `|b1`).
+/// Returns the bytes of a `.npy` file of values that are in row-major order and of this type
+/// (`<f8`, `|b1`).
 pub fn npy_bytes(kind: &str, shape: &[usize], values: &[u8]) -> Vec<u8> {
     let extents: String = shape.iter().map(|n| format!("{n}, ")).collect();
     let header =
@@ -150,8 +152,9 @@ pub fn npy_bytes(kind: &str, shape: &[usize], values: &[u8]) -> Vec<u8> {
     file
 }
 
-/// Returns whether the header's numbers are plain decimals whose product, with 1 for an extent of 0, fits into 64 bits. The parser
-/// also accepts sums, signs, hexadecimals and `1_000`, which no array needs.
+/// Returns whether the header's numbers are plain decimals whose product, with 1 for an extent of
+/// 0, fits into 64 bits. The parser also accepts sums, signs, hexadecimals and `1_000`, which no
+/// array needs.
 fn countable(header: &[u8]) -> bool {
     let words = header.split(|b| !(b.is_ascii_alphanumeric() || b"_+-".contains(b)));
     let mut numbers = words.filter(|w| w.first().is_some_and(|b| !(b.is_ascii_alphabetic() || *b == b'_')));
@@ -224,7 +227,8 @@ const MAX_ENTRIES: usize = 65_536;
 /// Matrices shrink little; deflate itself ends at 1032.
 const MAX_RATIO: u64 = 64;
 
-/// Reads every array of a `.npz` file, by its name without `.npy`. Entries that are no arrays are left out.
+/// Reads every array of a `.npz` file, by its name without `.npy`. Entries that are no arrays are
+/// left out.
 pub fn read_npz(path: &Path, limits: &Limits) -> Result<BTreeMap<String, Npy>, ReadError> {
     let mut arrays = BTreeMap::new();
     for (name, bytes) in unpack(path, &read_bytes(path, limits)?, limits)? {
@@ -235,8 +239,8 @@ pub fn read_npz(path: &Path, limits: &Limits) -> Result<BTreeMap<String, Npy>, R
     Ok(arrays)
 }
 
-/// Returns every entry by its full name: inside the file, apart from the others, named once, of the sum it was stored
-/// with.
+/// Returns every entry by its full name: inside the file, apart from the others, named once, of the
+/// sum it was stored with.
 fn unpack(path: &Path, bytes: &[u8], limits: &Limits) -> Result<BTreeMap<String, Vec<u8>>, ReadError> {
     let bad = |problem: String| ReadError::damaged(path, "npz", None, problem);
     let too_large = |what, found, limit| Err(ReadError::TooLarge { path: path.into(), what, found, limit });

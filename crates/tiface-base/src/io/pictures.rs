@@ -1,9 +1,10 @@
 //! Photographs and masks: PNG and JPEG, in and out.
 //!
-//! The content decides the format. Sizes are checked before anything is decoded, and the frame of the
-//! file (PNG chunks, JPEG segments) is walked to its end first: decoders forgive a missing tail and
-//! fill it with gray, which would then be learned as a face. One damage passes: a baseline JPEG whose scan was
-//! cut and closed again with a proper end marker, since only decoding each code could tell.
+//! The content decides the format. Sizes are checked before anything is decoded, and the frame of
+//! the file (PNG chunks, JPEG segments) is walked to its end first: decoders forgive a missing tail
+//! and fill it with gray, which would then be learned as a face. One damage passes: a baseline JPEG
+//! whose scan was cut and closed again with a proper end marker, since only decoding each code
+//! could tell.
 
 use super::read::{Limits, ReadError, open, read_bytes};
 use super::write::{WriteError, write_atomic};
@@ -32,21 +33,24 @@ pub struct PictureInfo {
 }
 
 impl PictureInfo {
-    /// Returns the size after the turn that `expected` calls for, as [`read_photo`] would return it.
+    /// Returns the size after the turn that `expected` calls for, as [`read_photo`] would return
+    /// it.
     pub fn size(&self, expected: Option<(u32, u32)>) -> (u32, u32) {
         let stored = (self.width, self.height);
         if is_turned(self.exif, stored, expected) { (stored.1, stored.0) } else { stored }
     }
 
-    /// Returns whether EXIF asks for a turn that leaves the size as it is, so that no size says whether it is expected.
+    /// Returns whether EXIF asks for a turn that leaves the size as it is, so that no size says
+    /// whether it is expected.
     pub fn is_turn_open(&self) -> bool {
         (2..=4).contains(&self.exif) || ((5..=8).contains(&self.exif) && self.width == self.height)
     }
 }
 
-/// Returns whether the EXIF rotation is applied. A quarter turn is, only when it is what makes the declared size true:
-/// else cameras were found for the stored pixels. Half turns, mirrors and turns of squares fit any size, which therefore
-/// does not say whether the cameras were found before or after them: [`turned_photo`] applies these.
+/// Returns whether the EXIF rotation is applied. A quarter turn is, only when it is what makes the
+/// declared size true: else cameras were found for the stored pixels. Half turns, mirrors and turns
+/// of squares fit any size, which therefore does not say whether the cameras were found before or
+/// after them: [`turned_photo`] applies these.
 fn is_turned(exif: u8, stored: (u32, u32), expected: Option<(u32, u32)>) -> bool {
     let turned = (stored.1, stored.0);
     (5..=8).contains(&exif) && expected == Some(turned) && stored != turned
@@ -73,7 +77,8 @@ fn focal_length(exif: &[u8]) -> Option<(u32, u32)> {
     Some((number(at, 4)?, number(at.checked_add(4)?, 4)?)).filter(|(above, below)| *above > 0 && *below > 0)
 }
 
-/// Returns the size, alpha, orientation and focal length of a PNG or JPEG file, from its header only.
+/// Returns the size, alpha, orientation and focal length of a PNG or JPEG file, from its header
+/// only.
 pub fn picture_info(path: &Path, limits: &Limits) -> Result<PictureInfo, ReadError> {
     let (file, length) = open(path)?;
     if length == 0 {
@@ -145,8 +150,8 @@ impl<'a> PictureFile<'a> {
 
     fn png_decoder(self) -> Result<(Png<'a>, PictureInfo), ReadError> {
         let be = |at: usize| self.bytes.get(at..)?.first_chunk().map(|b| u32::from_be_bytes(*b));
-        // width and height of IHDR, which must come first: checked before the decoder reserves a row, for the 8
-        // bytes that a pixel takes at most
+        // width and height of IHDR, which must come first: checked before the decoder reserves a
+        // row, for the 8 bytes that a pixel takes at most
         if let (Some(width), Some(height)) = (be(16), be(20)) {
             self.check_size(width, height, 8)?;
         }
@@ -212,8 +217,9 @@ impl<'a> PictureFile<'a> {
         }
     }
 
-    /// Walks the segments of a JPEG to the end-of-image marker and returns the maximum number of pixels in its picture data:
-    /// a block of 64 takes a bit at least, and without progression a second one for its end.
+    /// Walks the segments of a JPEG to the end-of-image marker and returns the maximum number of
+    /// pixels in its picture data: a block of 64 takes a bit at least, and without progression a
+    /// second one for its end.
     fn walk_jpeg(self) -> Result<u64, ReadError> {
         let bytes = self.bytes;
         let end = |problem: &str| self.jpeg(bytes.len() as u64, problem);
@@ -321,11 +327,12 @@ pub(super) fn photo_of(picture: DynamicImage) -> Photo {
     Photo { width, height, rgb, alpha }
 }
 
-/// Reads a photograph: PNG (gray, palette, color, 8 or 16 bit, with or without alpha) or JPEG (gray or
-/// color; CMYK is refused). Color profiles are not applied: bytes are taken as sRGB, 16 bits are rounded to 8.
+/// Reads a photograph: PNG (gray, palette, color, 8 or 16 bit, with or without alpha) or JPEG (gray
+/// or color; CMYK is refused). Color profiles are not applied: bytes are taken as sRGB, 16 bits are
+/// rounded to 8.
 ///
-/// `expected` is the size its cameras were calibrated for, if declared: a quarter turn that EXIF asks for is
-/// applied only if it leads to that size. Another size is not an error here.
+/// `expected` is the size its cameras were calibrated for, if declared: a quarter turn that EXIF
+/// asks for is applied only if it leads to that size. Another size is not an error here.
 pub fn read_photo(path: &Path, expected: Option<(u32, u32)>, limits: &Limits) -> Result<Photo, ReadError> {
     PictureFile { path, bytes: &read_bytes(path, limits)?, limits }.decode(expected).map(photo_of)
 }
@@ -355,8 +362,8 @@ fn oriented(mut picture: DynamicImage, exif: u8) -> DynamicImage {
     picture
 }
 
-/// Returns a picture that lies inside another file, as [`read_photo`] would read it from one of its own.
-/// `path` is for messages only.
+/// Returns a picture that lies inside another file, as [`read_photo`] would read it from one of its
+/// own. `path` is for messages only.
 pub fn parse_photo(bytes: &[u8], path: &Path, limits: &Limits) -> Result<Photo, ReadError> {
     PictureFile { path, bytes, limits }.decode(None).map(photo_of)
 }
@@ -422,8 +429,8 @@ pub fn write_png_gray16(path: &Path, width: u32, height: u32, values: &[u16]) ->
     write_png(path, width, height, bytemuck::cast_slice(values), ExtendedColorType::L16)
 }
 
-/// Returns a photograph as the bytes of a JPEG file of `quality` 1 to 100, without its alpha. `path` is for messages
-/// only.
+/// Returns a photograph as the bytes of a JPEG file of `quality` 1 to 100, without its alpha.
+/// `path` is for messages only.
 pub fn jpeg_bytes(photo: &Photo, quality: u8, path: &Path) -> Result<Vec<u8>, WriteError> {
     let content = |problem: String| WriteError::content(path, problem);
     let (width, height) = (photo.width, photo.height);

@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::sync::OnceLock;
 
-/// Returns the seconds of all threads of this process, user and system; those by the clock where the system does not
-/// say.
+/// Returns the seconds of all threads of this process, user and system; those by the clock where
+/// the system does not say.
 pub fn cpu_seconds() -> f64 {
     #[cfg(unix)]
     {
@@ -19,8 +19,8 @@ pub fn cpu_seconds() -> f64 {
     }
 }
 
-/// Returns the peak memory of this process since [`forget_peak_memory`], bytes; `None` where the system does
-/// not say.
+/// Returns the peak memory of this process since [`forget_peak_memory`], bytes; `None` where the
+/// system does not say.
 pub fn peak_memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
@@ -36,21 +36,22 @@ pub fn forget_peak_memory() {
 /// How the program's allocator gives its free memory back.
 static COLLECT: OnceLock<fn()> = OnceLock::new();
 
-/// Sets the function that gives the free memory of the program's allocator back to the system; only the first counts.
+/// Sets the function that gives the free memory of the program's allocator back to the system; only
+/// the first counts.
 pub fn set_memory_collector(collect: fn()) {
     let _ = COLLECT.set(collect);
 }
 
-/// Gives free memory back to the system, if the program has said how. Allocators keep it for long otherwise, and a stage
-/// would be charged for the memory of the one before.
+/// Gives free memory back to the system, if the program has said how. Allocators keep it for long
+/// otherwise, and a stage would be charged for the memory of the one before.
 pub fn give_memory_back() {
     if let Some(collect) = COLLECT.get() {
         collect();
     }
 }
 
-/// Returns whether a process of this machine runs and has a file open. Where the system shows no open files (such as of
-/// another user's process), whether it runs.
+/// Returns whether a process of this machine runs and has a file open. Where the system shows no
+/// open files (such as of another user's process), whether it runs.
 pub fn has_open(pid: u32, file: &Path) -> bool {
     let files = std::fs::read_dir(format!("/proc/{pid}/fd")).ok();
     match (files, file.canonicalize()) {
@@ -61,7 +62,8 @@ pub fn has_open(pid: u32, file: &Path) -> bool {
     }
 }
 
-/// Returns whether a process of this machine has ended: another one, or an earlier one of this one's number.
+/// Returns whether a process of this machine has ended: another one, or an earlier one of this
+/// one's number.
 pub fn has_ended(pid: u32) -> bool {
     pid == std::process::id() || !is_running(pid)
 }

@@ -1,4 +1,5 @@
-//! Other programs: where they are, and how they run with their messages in a log. Frames of a video, as FFmpeg decodes it.
+//! Other programs: where they are, and how they run with their messages in a log. Frames of a
+//! video, as FFmpeg decodes it.
 
 use super::folder::Lock;
 use super::read::{Limits, ReadError};
@@ -277,7 +278,8 @@ impl VideoFrames {
         lock: &Lock,
         limits: &Limits,
     ) -> Result<VideoFrames> {
-        // counted again and at a fixed rate, so that FFmpeg neither repeats frames nor leaves any out
+        // counted again and at a fixed rate, so that FFmpeg neither repeats frames nor leaves any
+        // out
         let words = "-vf settb=1/25,setpts=N -r 25 -pix_fmt rgb24 -c:v ppm -f image2pipe -";
         let before = "-nostdin -hide_banner -loglevel warning -protocol_whitelist file -i";
         let mut arguments: Vec<OsString> = before.split(' ').map(OsString::from).collect();

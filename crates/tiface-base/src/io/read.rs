@@ -1,12 +1,13 @@
-//! The bytes of a file: only regular ones, and no more than the limit; what readers refuse for its size; and why a file
-//! could not be read: the file, the place in it, and a suggested fix.
+//! The bytes of a file: only regular ones, and no more than the limit; what readers refuse for its
+//! size; and why a file could not be read: the file, the place in it, and a suggested fix.
 
 use crate::error::error_from;
 use std::fs::{self, File};
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Opens a regular file; checks the type before opening, since opening a pipe would wait for its writer.
+/// Opens a regular file; checks the type before opening, since opening a pipe would wait for its
+/// writer.
 pub(super) fn open(path: &Path) -> Result<(File, u64), ReadError> {
     let about = fs::metadata(path).map_err(|e| ReadError::io(path, e))?;
     regular(path, &about)?;
@@ -82,7 +83,8 @@ pub(super) fn read_capped(path: &Path, limit: u64, what: &'static str) -> Result
     if length > limit {
         return Err(too_large(length));
     }
-    // the length may be wrong (a growing file, /proc), so it sizes the buffer but does not end the read
+    // the length may be wrong (a growing file, /proc), so it sizes the buffer but does not end the
+    // read
     let mut bytes = Vec::with_capacity(length as usize);
     let read = file.take(limit + 1).read_to_end(&mut bytes).map_err(|e| ReadError::io(path, e))?;
     if read as u64 > limit {

@@ -1,9 +1,9 @@
 //! Checkpoints: safetensors with the checks the format leaves to us.
 //!
 //! Layout: u64 header length, JSON header (names, types, shapes, offsets, `__metadata__`), raw
-//! little-endian data. The header is written here, sorted, because the crate's writer takes a hash map
-//! and so gives other bytes each time; on reading, the crate checks offsets and we check what it accepts:
-//! duplicate names, NaN, and headers that take seconds.
+//! little-endian data. The header is written here, sorted, because the crate's writer takes a hash
+//! map and so gives other bytes each time; on reading, the crate checks offsets and we check what
+//! it accepts: duplicate names, NaN, and headers that take seconds.
 
 use super::json::parse_json;
 use super::read::{Limits, ReadError, read_bytes};
@@ -67,8 +67,9 @@ impl TensorValues {
 /// The content of a checkpoint: tensors by name, and `__metadata__`.
 pub type Tensors = (BTreeMap<String, (Vec<usize>, TensorValues)>, BTreeMap<String, String>);
 
-/// Writes a safetensors file in one step; the same content gives the same bytes, in whatever order the
-/// tensors come. Refused: a name given twice, a shape that does not fit its values, NaN and Inf.
+/// Writes a safetensors file in one step; the same content gives the same bytes, in whatever order
+/// the tensors come. Refused: a name given twice, a shape that does not fit its values, NaN and
+/// Inf.
 pub fn write_tensors(
     path: &Path,
     tensors: &[(String, Vec<usize>, TensorValues)],
@@ -127,8 +128,9 @@ pub fn read_tensors(path: &Path, limits: &Limits) -> Result<Tensors, ReadError> 
     parse_tensors(path, &read_bytes(path, limits)?, limits)
 }
 
-/// Tensors and metadata in `bytes`; `path` is only for messages. Refused: headers over 1 MiB or 10 000
-/// names, duplicate names, overlaps and holes, types other than F32, F64, U32, U64, NaN and Inf.
+/// Tensors and metadata in `bytes`; `path` is only for messages. Refused: headers over 1 MiB or 10
+/// 000 names, duplicate names, overlaps and holes, types other than F32, F64, U32, U64, NaN and
+/// Inf.
 pub fn parse_tensors(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Tensors, ReadError> {
     let bad = |offset: Option<u64>, problem: String| ReadError::damaged(path, "safetensors", offset, problem);
     let Some(length) = bytes.first_chunk::<8>().map(|b| u64::from_le_bytes(*b)) else {

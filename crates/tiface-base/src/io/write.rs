@@ -1,7 +1,7 @@
 //! Files that are never half-written: beside the target, flushed, synced, renamed, folder synced.
 //!
-//! At every instant the target is absent, the old version, or the new one. What an interrupted write
-//! leaves is `.NAME.PID.tmp`, named for its owner, and removed by [`remove_leftovers`].
+//! At every instant the target is absent, the old version, or the new one. What an interrupted
+//! write leaves is `.NAME.PID.tmp`, named for its owner, and removed by [`remove_leftovers`].
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{ErrorKind, Write};
@@ -170,8 +170,9 @@ fn sync_folder(_: &Path) -> std::io::Result<()> {
     Ok(()) // a folder cannot be opened as a file here
 }
 
-/// Removes what interrupted writes left directly in `folder`, as far as `is_over` says so of the file's name and the
-/// process, and says how many files that were. The holder of a file's lock decides; for others see [`has_ended`](super::has_ended).
+/// Removes what interrupted writes left directly in `folder`, as far as `is_over` says so of the
+/// file's name and the process, and says how many files that were. The holder of a file's lock
+/// decides; for others see [`has_ended`](super::has_ended).
 pub fn remove_leftovers(folder: &Path, is_over: impl Fn(&str, u32) -> bool) -> Result<usize, WriteError> {
     let fail = |source| WriteError::Io { path: folder.into(), source };
     let mut removed = 0;
@@ -189,7 +190,8 @@ pub fn remove_leftovers(folder: &Path, is_over: impl Fn(&str, u32) -> bool) -> R
     Ok(removed)
 }
 
-/// Returns the file that was being written and by which process, if a name is that of a file in progress.
+/// Returns the file that was being written and by which process, if a name is that of a file in
+/// progress.
 fn leftover_of(name: &str) -> Option<(&str, u32)> {
     let (rest, pid) = name.strip_prefix('.')?.strip_suffix(".tmp")?.rsplit_once('.')?;
     Some((rest, pid.parse().ok()?)).filter(|_| !rest.is_empty())

@@ -1,4 +1,5 @@
-//! Conjugate gradients for symmetric positive definite systems (Hestenes, Stiefel 1952), preconditioned.
+//! Conjugate gradients for symmetric positive definite systems (Hestenes, Stiefel 1952),
+//! preconditioned.
 
 /// Returns the scalar product of two vectors.
 #[inline]
@@ -8,10 +9,10 @@ pub fn dot(a: &[f64], b: &[f64]) -> f64 {
 
 /// Solves `A x = b` iteratively, starting from `x`, and returns the number of iterations.
 ///
-/// `residual` is `b − A x` of the initial `x`. `apply` writes `A` times its first argument into the second one, and
-/// `precondition` writes an approximate inverse of `A` times its first argument. The iteration ends when
-/// `done(iteration, residual)` returns true, with iterations counted from 0, or when `A` turns out not to be positive
-/// definite.
+/// `residual` is `b − A x` of the initial `x`. `apply` writes `A` times its first argument into the
+/// second one, and `precondition` writes an approximate inverse of `A` times its first argument.
+/// The iteration ends when `done(iteration, residual)` returns true, with iterations counted from
+/// 0, or when `A` turns out not to be positive definite.
 ///
 /// # Shapes
 ///

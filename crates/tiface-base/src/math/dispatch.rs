@@ -1,6 +1,7 @@
 //! One body, compiled for each level of CPU instructions, of which the best is chosen at run time.
 
-/// Declares `fn name(args)` that runs `body::<HAS_FMA>(args)` compiled for the best level this CPU has.
+/// Declares `fn name(args)` that runs `body::<HAS_FMA>(args)` compiled for the best level this CPU
+/// has.
 #[macro_export]
 macro_rules! dispatch {
     ($(#[$meta:meta])* $vis:vis fn $name:ident / $body:ident ( $($a:ident : $t:ty),* $(,)? )) => {

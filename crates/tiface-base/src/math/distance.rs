@@ -1,7 +1,8 @@
-//! Squared distances along a line: the step that exact distance transforms of pictures and volumes make along each axis
-//! (Felzenszwalb & Huttenlocher 2012).
+//! Squared distances along a line: the step that exact distance transforms of pictures and volumes
+//! make along each axis (Felzenszwalb & Huttenlocher 2012).
 
-/// Scratch memory for the lower envelope of the parabolas that stand over the values of a line, one for each value.
+/// Scratch memory for the lower envelope of the parabolas that stand over the values of a line, one
+/// for each value.
 pub struct LowerEnvelope {
     /// Position of each parabola of the envelope.
     apex: Vec<usize>,
@@ -32,7 +33,8 @@ impl LowerEnvelope {
                     self.from[k] = meet;
                     break;
                 }
-                // the parabola at p is never the lowest, so it is dropped; the first one starts at −∞ and always stays
+                // the parabola at p is never the lowest, so it is dropped; the first one starts at
+                // −∞ and always stays
                 k -= 1;
             }
         }

@@ -35,9 +35,9 @@ pub fn below(seed: u64, stream: u64, index: u64, n: u64) -> u64 {
     ((bits(seed, stream, index) as u128 * n as u128) >> 64) as u64
 }
 
-/// A random permutation of `0..n` that is computed, not stored: four rounds of a Feistel network over the next power of
-/// four, repeated until the result is below n (cycle walking; Black and Rogaway 2002, "Ciphers with arbitrary finite
-/// domains").
+/// A random permutation of `0..n` that is computed, not stored: four rounds of a Feistel network
+/// over the next power of four, repeated until the result is below n (cycle walking; Black and
+/// Rogaway 2002, "Ciphers with arbitrary finite domains").
 #[derive(Clone, Copy, Debug)]
 pub struct Permutation {
     /// Key that the streams of all rounds are derived from.
@@ -56,8 +56,9 @@ impl Permutation {
         Permutation { key: mix(key ^ 0x9e37_79b9_7f4a_7c15), half_bits, first: 0, n }
     }
 
-    /// Returns the permutation whose first `count` numbers a step uses. Successive steps use successive numbers, so no
-    /// number repeats until fewer than `count` are left; then a new permutation begins.
+    /// Returns the permutation whose first `count` numbers a step uses. Successive steps use
+    /// successive numbers, so no number repeats until fewer than `count` are left; then a new
+    /// permutation begins.
     pub fn of_step((seed, step): (u64, u64), count: u64, n: u64) -> Permutation {
         let steps = (n / count).max(1);
         let first = step % steps * count;

@@ -28,8 +28,8 @@ pub struct AdamStep {
 }
 
 impl AdamStep {
-    /// Returns a step over all weights, without weight decay, whose moments decay as published for hash grids and
-    /// TensoRF (β₁ = 0.9, β₂ = 0.99).
+    /// Returns a step over all weights, without weight decay, whose moments decay as published for
+    /// hash grids and TensoRF (β₁ = 0.9, β₂ = 0.99).
     pub fn new(lr: f64, epsilon: f32, step: u64) -> AdamStep {
         let (beta1, beta2) = (0.9, 0.99);
         AdamStep { lr: lr as f32, beta1, beta2, epsilon, weight_decay: 0.0, step, skip_zero: false }
@@ -71,8 +71,8 @@ dispatch! {
     fn adam_chunk / adam_body(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &mut [f32], s: &AdamStep)
 }
 
-/// Takes one AdamW step in place. The gradient is **left zero**, so that the next one can be accumulated in the same
-/// memory without a pass to clear it.
+/// Takes one AdamW step in place. The gradient is **left zero**, so that the next one can be
+/// accumulated in the same memory without a pass to clear it.
 ///
 /// # Shapes
 ///

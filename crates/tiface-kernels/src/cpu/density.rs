@@ -9,8 +9,8 @@
 //! distortion = Σ_k ⅓ δ w_k² + 2 w_k (m_k Σ_{j<k} w_j − Σ_{j<k} w_j m_j)     m: midpoints
 //! ```
 //!
-//! Distortion: Barron et al. 2022 ("Mip-NeRF 360", eq. 15). As in instant-nsr-pl, the gradient of the
-//! exponential is clamped to exp(15).
+//! Distortion: Barron et al. 2022 ("Mip-NeRF 360", eq. 15). As in instant-nsr-pl, the gradient of
+//! the exponential is clamped to exp(15).
 
 use super::hash::{self, Level};
 use super::march::Samples;
@@ -21,10 +21,11 @@ use tiface_base::geom::sphharm::sh16;
 
 /// Width of all hidden layers.
 pub const HIDDEN: usize = 64;
-/// Outputs of the geometry network: the logarithm of the density comes first, and all of them are inputs of the color
-/// network.
+/// Outputs of the geometry network: the logarithm of the density comes first, and all of them are
+/// inputs of the color network.
 pub const FEATURES: usize = 16;
-/// Inputs of the color network: the geometry network's outputs and 16 spherical harmonics of the direction.
+/// Inputs of the color network: the geometry network's outputs and 16 spherical harmonics of the
+/// direction.
 pub const COLOR_INPUTS: usize = FEATURES + 16;
 /// A ray is truncated where its transmittance falls below this.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
@@ -82,7 +83,8 @@ impl DensityWeights {
     }
 }
 
-/// Activations of a tile of samples, kept for the backward pass; all arrays are row-major, one row per sample.
+/// Activations of a tile of samples, kept for the backward pass; all arrays are row-major, one row
+/// per sample.
 #[derive(Clone, Debug, Default)]
 struct Tile {
     u: Vec<f32>,
@@ -229,7 +231,8 @@ fn outer<const F: bool>(g: &[f32], out: usize, v: &[f32], inputs: usize) -> Vec<
     sum
 }
 
-/// Returns `g W`, set to zero where the activation of the previous layer is not positive (the relu's gradient).
+/// Returns `g W`, set to zero where the activation of the previous layer is not positive (the
+/// relu's gradient).
 #[inline(always)]
 fn back<const F: bool>(g: &[f32], out: usize, w: &Matrix, inputs: usize, layer: Option<&[f32]>) -> Vec<f32> {
     let mut g_input = vec![0f32; CHUNK * inputs];
@@ -268,13 +271,13 @@ fn backward_body<const F: bool>(task: &mut BackwardTask, w: &DensityWeights) {
 
 dispatch! { fn backward_task / backward_body(task: &mut BackwardTask, w: &DensityWeights) }
 
-/// Returns the gradient with respect to the flat weights, and adds the gradient with respect to the table to
-/// `g_table`.
+/// Returns the gradient with respect to the flat weights, and adds the gradient with respect to the
+/// table to `g_table`.
 ///
 /// # Shapes
 ///
-/// - g_density: `[n]` and g_color: `[n, 3]`, gradients of the loss with respect to what [`evaluate`] returned with
-///   directions
+/// - g_density: `[n]` and g_color: `[n, 3]`, gradients of the loss with respect to what
+///   [`evaluate`] returned with directions
 /// - g_table: `[entries, 2]`
 pub fn backward(
     shape: &DensityShape,
@@ -328,7 +331,8 @@ pub fn backward(
     flat
 }
 
-/// Returns the compositing weights `[samples]` of a ray with densities `[samples]`, for intervals of length `dt`.
+/// Returns the compositing weights `[samples]` of a ray with densities `[samples]`, for intervals
+/// of length `dt`.
 pub fn weights(density: &[f32], dt: f32) -> Vec<f32> {
     let mut thickness = 0f32;
     let weight = |sigma: &f32| {
@@ -339,7 +343,8 @@ pub fn weights(density: &[f32], dt: f32) -> Vec<f32> {
     density.iter().map(weight).collect()
 }
 
-/// Returns the distortion loss of a ray's weights at midpoints `t`, and its gradient with respect to each weight.
+/// Returns the distortion loss of a ray's weights at midpoints `t`, and its gradient with respect
+/// to each weight.
 pub fn distortion(weight: &[f32], t: &[f32], dt: f32) -> (f32, Vec<f32>) {
     let (mut sum, mut moment) = (0f32, 0f32);
     let mut value = 0f32;
@@ -360,8 +365,8 @@ pub fn distortion(weight: &[f32], t: &[f32], dt: f32) -> (f32, Vec<f32>) {
     (value, g)
 }
 
-/// Returns the gradient with respect to a ray's densities of a loss whose gradient with respect to the ray's weights is
-/// `g`. All arrays are `[samples]`.
+/// Returns the gradient with respect to a ray's densities of a loss whose gradient with respect to
+/// the ray's weights is `g`. All arrays are `[samples]`.
 pub fn weights_backward(density: &[f32], weight: &[f32], g: &[f32], dt: f32) -> Vec<f32> {
     let mut thickness: f32 = density.iter().map(|s| s * dt).sum();
     let mut farther = 0f32; // Σ w_j g_j over the farther samples, j > k
@@ -375,8 +380,8 @@ pub fn weights_backward(density: &[f32], weight: &[f32], g: &[f32], dt: f32) -> 
     out
 }
 
-/// Truncates each ray where its transmittance falls below [`MIN_TRANSMITTANCE`], and returns the remaining samples.
-/// `density` is `[samples]`, in the order of `samples`.
+/// Truncates each ray where its transmittance falls below [`MIN_TRANSMITTANCE`], and returns the
+/// remaining samples. `density` is `[samples]`, in the order of `samples`.
 pub fn cut(samples: &Samples, density: &[f32], dt: f32) -> Samples {
     let mut kept = Samples { offsets: vec![0], t: Vec::new() };
     for range in samples.offsets.windows(2) {
@@ -393,8 +398,9 @@ pub fn cut(samples: &Samples, density: &[f32], dt: f32) -> Samples {
     kept
 }
 
-/// Returns the mean squared error, the smooth-L1 loss and the distortion of a batch of rays, and the gradients of
-/// `smooth + DISTORTION · distortion` with respect to the densities `[n]` and colors `[n, 3]` of the samples.
+/// Returns the mean squared error, the smooth-L1 loss and the distortion of a batch of rays, and
+/// the gradients of `smooth + DISTORTION · distortion` with respect to the densities `[n]` and
+/// colors `[n, 3]` of the samples.
 ///
 /// # Shapes
 ///

@@ -5,9 +5,9 @@
 //! tiny-cuda-nn (half-cell stagger, coherent-prime hash, dense levels while they fit).
 //!
 //! Features lie level-major, `[level][sample][2]`: one level's table is at most a few megabytes and
-//! stays in the cache while all samples pass; a random read from the whole table costs seven times as
-//! much. In the scatter one task owns the gradient of one level, so it needs no atomics and its result does not depend
-//! on the number of threads.
+//! stays in the cache while all samples pass; a random read from the whole table costs seven times
+//! as much. In the scatter one task owns the gradient of one level, so it needs no atomics and its
+//! result does not depend on the number of threads.
 
 use super::simd::fma;
 use rayon::prelude::*;
@@ -33,8 +33,8 @@ impl Level {
     }
 }
 
-/// Returns the levels of a grid: `scale_l = 2^(l · log₂ growth) · base − 1` in f32, tables of at most
-/// `2^log2_entries` entries, dense ones rounded up to a multiple of 8.
+/// Returns the levels of a grid: `scale_l = 2^(l · log₂ growth) · base − 1` in f32, tables of at
+/// most `2^log2_entries` entries, dense ones rounded up to a multiple of 8.
 pub fn levels(count: usize, base: u32, growth: f64, log2_entries: u32) -> Vec<Level> {
     let log2_growth = (growth as f32).log2();
     let mut offset = 0;
@@ -67,8 +67,8 @@ pub type Lanes = [f32; LANES];
 /// The derivatives of both features along the three axes, `[2 · 3]`, at [`LANES`] samples.
 pub type JacobianBlock = [Lanes; 6];
 
-/// Returns the eight table entries `[corner][sample]` of the cells around `x01`, and the positions inside the cells
-/// `[axis][sample]`, with coordinates in 0..1.
+/// Returns the eight table entries `[corner][sample]` of the cells around `x01`, and the positions
+/// inside the cells `[axis][sample]`, with coordinates in 0..1.
 ///
 /// Corner `k` lies at +1 along x when bit 0 of `k` is set, y with bit 1, z with bit 2.
 #[inline(always)]
@@ -102,7 +102,8 @@ pub fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES]) -> ([[u32; L
             for i in 0..LANES {
                 let at = |a: usize| low[a][i].wrapping_add((k >> a & 1) as u32);
                 let entry = at(0).wrapping_add(r.wrapping_mul(at(1).wrapping_add(r.wrapping_mul(at(2)))));
-                // because of the half-cell stagger, cell + 1 can equal the resolution at the border, and wraps
+                // because of the half-cell stagger, cell + 1 can equal the resolution at the
+                // border, and wraps
                 index[k][i] = entry.min(entry.wrapping_sub(level.entries));
             }
         }
@@ -125,8 +126,8 @@ fn block(x: &[[f32; 3]]) -> [[f32; 3]; LANES] {
     x.first_chunk().copied().unwrap_or_else(padded)
 }
 
-/// Returns the [`cells`] of the first block of samples, and has the CPU fetch their entries of `table`: the finer
-/// tables are larger than its second-level cache.
+/// Returns the [`cells`] of the first block of samples, and has the CPU fetch their entries of
+/// `table`: the finer tables are larger than its second-level cache.
 #[inline(always)]
 fn fetched_cells<const F: bool>(
     level: &Level,
@@ -137,7 +138,8 @@ fn fetched_cells<const F: bool>(
     #[cfg(target_arch = "x86_64")]
     for &i in found.0.as_flattened() {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // SAFETY: `cells` gives indices below `level.entries`, which is at most the length of the callers' tables.
+        // SAFETY: `cells` gives indices below `level.entries`, which is at most the length of the
+        // callers' tables.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(table.as_ptr().add(i as usize).cast()) };
     }
     found
@@ -319,9 +321,9 @@ dispatch! {
     )
 }
 
-/// Adds the gradient of a loss with respect to the table. The loss depends on the table through the features
-/// (`g_value`) and through the spatial gradient (`g_normal`) of a scalar whose derivative with respect to the features is
-/// `q`: the second-order path.
+/// Adds the gradient of a loss with respect to the table. The loss depends on the table through the
+/// features (`g_value`) and through the spatial gradient (`g_normal`) of a scalar whose derivative
+/// with respect to the features is `q`: the second-order path.
 ///
 /// `table[corner k] += g_value · w_k + q · (g_normal · ∇w_k)`
 ///
@@ -427,7 +429,8 @@ mod tests {
 
     #[test]
     fn the_scatter_is_the_adjoint_of_value_and_slope() {
-        // L = Σ g·value + Σ q·(J n) is linear in the table, so <gradient, table> must equal L exactly
+        // L = Σ g·value + Σ q·(J n) is linear in the table, so <gradient, table> must equal L
+        // exactly
         let (levels, table) = grid();
         let x = [[0.31, 0.62, 0.17], [0.8, 0.05, 0.44], [0.999, 0.0, 1.0]];
         let n = [[0.3f32, -0.2, 0.9], [0.1, 0.5, -0.7], [1.0, 0.2, 0.1]];

@@ -1,16 +1,18 @@
 //! The training loss of the signed-distance field and its gradients.
 //!
-//! With `C` and `O` a ray's color and opacity, `h` and `a` color (over black) and alpha of its pixel, `b` a background,
-//! `e = C + (1 − O) b − h − (1 − a) b`. Means are taken over the rays with samples (rgb_mse), over the rays whose pixel is
-//! entirely head (rgb_sample), over all rays (mask), over the samples (eikonal, sparsity) and over the stereo points
-//! (stereo), whose signed distance `f` is divided by the length `p` of a pixel:
+//! With `C` and `O` a ray's color and opacity, `h` and `a` color (over black) and alpha of its
+//! pixel, `b` a background, `e = C + (1 − O) b − h − (1 − a) b`. Means are taken over the rays with
+//! samples (rgb_mse), over the rays whose pixel is entirely head (rgb_sample), over all rays
+//! (mask), over the samples (eikonal, sparsity) and over the stereo points (stereo), whose signed
+//! distance `f` is divided by the length `p` of a pixel:
 //!
 //! ```text
 //! rgb_mse · ⟨e²⟩ + rgb_sample · ⟨Σ w (c − h)²⟩ + mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
 //!   + eikonal · ⟨(‖∇f‖ − 1)²⟩ + sparsity · ⟨exp(−β |f|)⟩ + stereo · ⟨w (√((f / p)² + k²) − k)⟩
 //! ```
 //!
-//! `Σ w (c − h)² = Σ w c² − 2 h Σ w c + h² Σ w`: compositing c² along with c is enough to compute it.
+//! `Σ w (c − h)² = Σ w c² − 2 h Σ w c + h² Σ w`: compositing c² along with c is enough to compute
+//! it.
 
 use super::neus::RAY_WIDTH;
 use super::sdf::WIDTH;
@@ -33,7 +35,8 @@ pub struct LossWeights {
     pub sparsity_scale: f32,
     /// Weight of the distance from stereo points.
     pub stereo: f32,
-    /// k: the distance from a stereo point, in pixels, up to which its loss is square and beyond which it is linear.
+    /// k: the distance from a stereo point, in pixels, up to which its loss is square and beyond
+    /// which it is linear.
     pub knee: f32,
 }
 
@@ -63,7 +66,8 @@ pub struct Targets<'a> {
     pub background: &'a [[f32; 3]],
 }
 
-/// Returns the unweighted loss terms of rays, and the gradient of the loss with respect to `composed`, `[rays, 9]`.
+/// Returns the unweighted loss terms of rays, and the gradient of the loss with respect to
+/// `composed`, `[rays, 9]`.
 ///
 /// # Shapes
 ///
@@ -105,8 +109,8 @@ pub fn of_rays(composed: &[f32], targets: Targets, w: &LossWeights) -> ([f32; RA
     (terms.map(|t| t as f32), gradient)
 }
 
-/// Returns the unweighted loss terms of samples, and adds their gradients with respect to the field's output to
-/// `g_field`.
+/// Returns the unweighted loss terms of samples, and adds their gradients with respect to the
+/// field's output to `g_field`.
 ///
 /// # Shapes
 ///
@@ -135,13 +139,14 @@ pub fn of_samples(field: &[f32], w: &LossWeights, g_field: &mut [f32]) -> [f32; 
     std::array::from_fn(|k| terms.iter().map(|t| t[k]).sum::<f64>() as f32)
 }
 
-/// Returns the unweighted loss term of stereo points, and adds its gradient with respect to the field's output to
-/// `g_field`.
+/// Returns the unweighted loss term of stereo points, and adds its gradient with respect to the
+/// field's output to `g_field`.
 ///
 /// # Shapes
 ///
 /// - field, g_field: `[points, 8]`
-/// - points: `[points, 2]`, the length of a pixel at each point in field units, and the point's weight
+/// - points: `[points, 2]`, the length of a pixel at each point in field units, and the point's
+///   weight
 pub fn of_points(field: &[f32], points: &[[f32; 2]], w: &LossWeights, g_field: &mut [f32]) -> f32 {
     let mut sum = 0f64;
     let rows = field.chunks_exact(WIDTH).zip(g_field.chunks_exact_mut(WIDTH));

@@ -11,15 +11,16 @@ use tiface_base::geom::{BitGrid, Ray};
 pub struct MarchRay {
     /// Origin, in field units.
     pub origin: [f32; 3],
-    /// Direction. It has unit length in this module; a vector-matrix field accepts any length, and its `t` is then a
-    /// multiple of that length.
+    /// Direction. It has unit length in this module; a vector-matrix field accepts any length, and
+    /// its `t` is then a multiple of that length.
     pub direction: [f32; 3],
     /// Offset of the sample lattice, as a fraction of a step in 0..1 (0 without jitter).
     pub jitter: f32,
 }
 
 impl MarchRay {
-    /// Converts a ray from scene coordinates to those of a field whose box is `radius` times the scene's.
+    /// Converts a ray from scene coordinates to those of a field whose box is `radius` times the
+    /// scene's.
     pub fn new(ray: &Ray, radius: f32, jitter: f32) -> MarchRay {
         MarchRay { origin: (ray.origin * radius).to_array(), direction: ray.direction.to_array(), jitter }
     }
@@ -49,7 +50,8 @@ impl Samples {
 /// Number of cells along the edge of a block of cells that is skipped as a whole.
 pub(crate) const BLOCK: usize = 8;
 
-/// The blocks of `BLOCK`³ cells in which a ray may find something, one bit each, in the order of cells.
+/// The blocks of `BLOCK`³ cells in which a ray may find something, one bit each, in the order of
+/// cells.
 struct Blocks {
     /// Blocks per axis.
     size: usize,
@@ -87,8 +89,8 @@ impl Blocks {
 }
 
 /// Marches one ray, calling `emit` with the midpoint of every step whose cell is occupied, until
-/// `emit` returns false or the ray reaches a cell of `solid`. Solid cells lie so deep inside that nothing beyond them is
-/// visible.
+/// `emit` returns false or the ray reaches a cell of `solid`. Solid cells lie so deep inside that
+/// nothing beyond them is visible.
 #[inline]
 fn march_one(
     mask: &BitGrid,
@@ -141,7 +143,8 @@ fn march_one(
         if solid.is_some_and(|solid| solid.get(cell)) {
             return;
         }
-        // skip to the border of this cell, or of its block if that is empty too, by a whole number of steps
+        // skip to the border of this cell, or of its block if that is empty too, by a whole number
+        // of steps
         let block = c.map(|c| c as usize / BLOCK);
         let empty = blocks.is_empty(block);
         let mut border = f32::INFINITY;
@@ -163,8 +166,8 @@ fn march_one(
     }
 }
 
-/// Marches a batch of rays and keeps the nearest `limit` samples of each. `solid` must have the resolution of `mask`;
-/// `radius` and `step` are in field units.
+/// Marches a batch of rays and keeps the nearest `limit` samples of each. `solid` must have the
+/// resolution of `mask`; `radius` and `step` are in field units.
 pub fn march(
     mask: &BitGrid,
     solid: Option<&BitGrid>,
@@ -263,7 +266,8 @@ mod tests {
 
     #[test]
     fn skipping_empty_blocks_loses_no_sample() {
-        // 3 % of 37³ cells, so that most blocks of 8³ have one, some have none; rays through all of the box
+        // 3 % of 37³ cells, so that most blocks of 8³ have one, some have none; rays through all of
+        // the box
         let mut mask = BitGrid::filled(37, false);
         let draw = |i: usize| (i as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40;
         (0..37usize.pow(3)).filter(|&i| draw(i) % 1000 < 30 && i % 37 > 12).for_each(|i| mask.set(i, true));

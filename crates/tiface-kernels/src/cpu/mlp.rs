@@ -6,8 +6,9 @@
 //! color     [13, SH 16, normal 3 (, hash 2L)] ─ 64 ─ relu ─ 64 ─ relu ─ 3 ─ sigmoid      no biases
 //! ```
 //!
-//! With the color skip (not published) the color network also reads the hash features: twelve outputs of a layer
-//! that is trained to represent the surface are a bottleneck for the appearance of a head.
+//! With the color skip (not published) the color network also reads the hash features: twelve
+//! outputs of a layer that is trained to represent the surface are a bottleneck for the appearance
+//! of a head.
 
 use super::simd::{Matrix, split};
 
@@ -17,7 +18,8 @@ pub const HIDDEN: usize = 64;
 pub const OUTPUTS: usize = 13;
 /// Inputs of the color network without the skip: 13 features, 16 harmonics, 3 of the normal.
 pub const COLOR_INPUTS: usize = 32;
-/// Index of the output that controls the softness of the surface, if the field's sharpness is local.
+/// Index of the output that controls the softness of the surface, if the field's sharpness is
+/// local.
 pub const SOFTNESS: usize = OUTPUTS - 1;
 /// [`OUTPUTS`] as stored in tiles, zero-padded.
 pub const OUTPUTS_PADDED: usize = 16;
@@ -51,7 +53,8 @@ impl Layout {
         self.color_inputs().next_multiple_of(8)
     }
 
-    /// Returns the shapes `[out, in]` in storage order: W1, b1, W2, b2, C1, C2, C3 (biases as `[n, 1]`).
+    /// Returns the shapes `[out, in]` in storage order: W1, b1, W2, b2, C1, C2, C3 (biases as
+    /// `[n, 1]`).
     pub fn shapes(&self) -> [(usize, usize); 7] {
         [
             (HIDDEN, self.inputs),
@@ -69,8 +72,8 @@ impl Layout {
         self.shapes().iter().map(|(o, i)| o * i).sum()
     }
 
-    /// Returns the shapes in which tiles accumulate gradients: padded, with three color channels stored as four and
-    /// geometry columns ordered as in [`Weights`].
+    /// Returns the shapes in which tiles accumulate gradients: padded, with three color channels
+    /// stored as four and geometry columns ordered as in [`Weights`].
     pub(super) fn gradient_shapes(&self) -> [(usize, usize); 7] {
         let (inputs, color_inputs) = (self.padded(), self.color_padded());
         let padded = OUTPUTS_PADDED;
@@ -85,14 +88,16 @@ impl Layout {
         ]
     }
 
-    /// Returns the number of columns of a tile of geometry inputs: `[hash 2L, x 3, zeros]`, padded to a multiple of 8.
+    /// Returns the number of columns of a tile of geometry inputs: `[hash 2L, x 3, zeros]`, padded
+    /// to a multiple of 8.
     pub fn padded(&self) -> usize {
         self.inputs.next_multiple_of(8)
     }
 }
 
-/// Network weights, padded for the matrix blocks and stored with their transpose. They are about ten thousand floats and
-/// are rebuilt once per step. Geometry columns are reordered to `[hash, x]`, so that hash features start aligned.
+/// Network weights, padded for the matrix blocks and stored with their transpose. They are about
+/// ten thousand floats and are rebuilt once per step. Geometry columns are reordered to
+/// `[hash, x]`, so that hash features start aligned.
 #[derive(Debug)]
 pub struct Weights {
     pub(super) layout: Layout,

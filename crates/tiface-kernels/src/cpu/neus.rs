@@ -9,12 +9,14 @@
 //! T_i = Π_{j<i} (1 − α_j)     w = T α     out = Σ w · (rgb, 1, t, n̂, ‖rgb‖²)
 //! ```
 //!
-//! The last column of the field's output is `ln(s / inv_s)` of the sample; in NeuS it is 0 everywhere.
+//! The last column of the field's output is `ln(s / inv_s)` of the sample; in NeuS it is 0
+//! everywhere.
 
 use super::sdf::WIDTH;
 use rayon::prelude::*;
 
-/// Number of values per ray: rgb (3), opacity, depth (Σ w t), normal (3, Σ w n̂), squared color (Σ w ‖rgb‖²).
+/// Number of values per ray: rgb (3), opacity, depth (Σ w t), normal (3, Σ w n̂), squared color (Σ
+/// w ‖rgb‖²).
 pub const RAY_WIDTH: usize = 9;
 
 /// The segments of rays that samples stand for, sorted by ray and then by `t`.
@@ -61,14 +63,15 @@ fn alpha_of(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> Alpha {
     Alpha { alpha: raw.clamp(0.0, 1.0), clipped: !(0.0..=1.0).contains(&raw), previous, next, ic, ic_by_cos }
 }
 
-/// Returns the opacity of a cell of half size `half` for the occupancy grid: that of a ray that meets the surface
-/// head-on.
+/// Returns the opacity of a cell of half size `half` for the occupancy grid: that of a ray that
+/// meets the surface head-on.
 pub fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
     alpha_of(sdf, -1.0, 2.0 * half, inv_s.clamp(1e-6, 1e6), 1.0).alpha
 }
 
-/// A field gradient that is not longer than this has no meaningful direction, so nothing is propagated back through its
-/// unit normal: that gradient would be scaled by the inverse length, up to 1e12.
+/// A field gradient that is not longer than this has no meaningful direction, so nothing is
+/// propagated back through its unit normal: that gradient would be scaled by the inverse length, up
+/// to 1e12.
 pub const MIN_GRADIENT_NORM: f32 = 1e-6;
 
 fn normal_of(field: &[f32]) -> ([f32; 3], f32) {
@@ -124,7 +127,8 @@ pub fn forward(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Ve
     out
 }
 
-/// Returns the gradients with respect to the field's output, `[samples, 8]`, and with respect to `inv_s`.
+/// Returns the gradients with respect to the field's output, `[samples, 8]`, and with respect to
+/// `inv_s`.
 ///
 /// # Shapes
 ///
@@ -154,7 +158,8 @@ pub fn backward(
             let first = segments.offsets[r] as usize;
             let n = g_samples.len() / WIDTH;
             let g = &g_out[r * RAY_WIDTH..][..RAY_WIDTH];
-            // recompute the forward pass: alphas, transmittances and the loss gradient g_w by each weight
+            // recompute the forward pass: alphas, transmittances and the loss gradient g_w by each
+            // weight
             let mut samples = Vec::with_capacity(n);
             let mut transmittance = 1f32;
             for s in first..first + n {
@@ -181,7 +186,8 @@ pub fn backward(
                 }
                 let g_alpha = transmittance * g_w - farther / (1.0 - a.alpha).max(1e-10);
                 farther += w * g_w;
-                // the gradient by the unit normal has two parts: as composited, and through the cosine
+                // the gradient by the unit normal has two parts: as composited, and through the
+                // cosine
                 let mut g_normal = [w * g[5], w * g[6], w * g[7]];
                 if !a.clipped {
                     let (p, q) = (a.previous, a.next);
@@ -192,7 +198,8 @@ pub fn backward(
                     out[0] = (g_p + g_q) * sharp;
                     let half = 0.5 * a.ic * segments.dt[s];
                     let sdf = field[s * WIDTH];
-                    // the gradient by ln s is that by the sample's offset and, divided by inv_s, that by inv_s
+                    // the gradient by ln s is that by the sample's offset and, divided by inv_s,
+                    // that by inv_s
                     let g_ln = (g_p * (sdf - half) + g_q * (sdf + half)) * sharp;
                     out[7] = g_ln;
                     g_s += g_ln as f64;
@@ -261,7 +268,8 @@ mod tests {
                     let (g_field, g_s) = backward(segments, &field, inv_s, 1.0, &g);
                     let gradients = || g_field.iter().chain([&g_s]);
                     assert!(gradients().all(|v| v.is_finite()), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
-                    // 3 · 1e6, the unit normal's 1 / MIN_GRADIENT_NORM, and 1e3 · 1e6 by the length of an interval
+                    // 3 · 1e6, the unit normal's 1 / MIN_GRADIENT_NORM, and 1e3 · 1e6 by the length
+                    // of an interval
                     assert!(gradients().all(|v| v.abs() < 1e10), "{inv_s} {sdf} {slope} {g_field:?} {g_s}");
                     if slope < MIN_GRADIENT_NORM {
                         assert!(g_field.as_chunks::<8>().0.iter().all(|g| g[1..4] == [0.0; 3]));

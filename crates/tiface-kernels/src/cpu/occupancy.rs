@@ -1,18 +1,19 @@
-//! Updates of the occupancy grid, by a band around the zero level set or by nerfacc's rule. The update functions take the
-//! field as a function of points.
+//! Updates of the occupancy grid, by a band around the zero level set or by nerfacc's rule. The
+//! update functions take the field as a function of points.
 
 use rayon::prelude::*;
 use tiface_base::geom::BitGrid;
 use tiface_base::math::rng;
 
-/// Number of warm-up steps, in which nerfacc's rule evaluates every cell. Later updates evaluate a random quarter of all
-/// cells, and at most as many of the occupied ones.
+/// Number of warm-up steps, in which nerfacc's rule evaluates every cell. Later updates evaluate a
+/// random quarter of all cells, and at most as many of the occupied ones.
 pub const WARMUP_STEPS: u64 = 256;
 /// Factor by which a cell's stored opacity decays at each evaluation of the cell.
 pub const DECAY: f32 = 0.95;
 /// Random streams of nerfacc's rule: any cells, occupied cells, points within cells.
 pub const STREAMS: [u64; 3] = [5, 6, 7];
-/// Opacity above which a cell of a signed-distance field is occupied, unless the mean opacity is less.
+/// Opacity above which a cell of a signed-distance field is occupied, unless the mean opacity is
+/// less.
 pub const OPAQUE: f32 = 1e-3;
 
 /// Width of the band around the zero level set.
@@ -26,12 +27,12 @@ pub struct BandRule {
 
 /// Updates the occupied and solid cells by a band around the zero level set.
 ///
-/// A cell of `allowed` is occupied if the band (`width` over the local sharpness) may reach it, for gradients up to
-/// about one, or if the sdf has the other sign at the center of a neighbor, however steep the field is in between. All other
-/// cells with a negative sdf are solid.
+/// A cell of `allowed` is occupied if the band (`width` over the local sharpness) may reach it, for
+/// gradients up to about one, or if the sdf has the other sign at the center of a neighbor, however
+/// steep the field is in between. All other cells with a negative sdf are solid.
 ///
-/// `field` evaluates signed distances at points of `[-radius, radius]³`, and the logarithms of the local sharpness divided
-/// by `inv_s`.
+/// `field` evaluates signed distances at points of `[-radius, radius]³`, and the logarithms of the
+/// local sharpness divided by `inv_s`.
 pub fn update_band(
     [occupied, solid]: [&mut BitGrid; 2],
     allowed: &BitGrid,
@@ -45,7 +46,8 @@ pub fn update_band(
     let half_diagonal = 0.5 * 3f32.sqrt() * cell;
     let cells: Vec<usize> = (0..r * r * r).filter(|&i| allowed.get(i)).collect();
     let center = |i: usize| [i / (r * r), i / r % r, i % r].map(|c| (c as f32 + 0.5) * cell - radius);
-    // cells that are not evaluated are NaN, which has no sign and never differs in sign from a neighbor
+    // cells that are not evaluated are NaN, which has no sign and never differs in sign from a
+    // neighbor
     let mut f = vec![f32::NAN; r * r * r];
     let mut band = vec![rule.width / inv_s + half_diagonal; r * r * r];
     for cells in cells.chunks(1 << 17) {
@@ -58,8 +60,8 @@ pub fn update_band(
             }
         }
     }
-    // softness varies within a cell, so the widest band of a cell and its neighbors counts; otherwise rays would end
-    // inside hair
+    // softness varies within a cell, so the widest band of a cell and its neighbors counts;
+    // otherwise rays would end inside hair
     let widest_near = |i: usize| {
         [1, r, r * r].into_iter().fold(band[i], |widest, stride| {
             let position = i / stride % r;
@@ -84,12 +86,12 @@ pub fn update_band(
     }
 }
 
-/// Updates the occupied cells by the rule of nerfacc 0.3.3: a cell of `allowed` is occupied if its decaying maximum of
-/// the opacity is above `threshold`, or above the mean if that is less.
+/// Updates the occupied cells by the rule of nerfacc 0.3.3: a cell of `allowed` is occupied if its
+/// decaying maximum of the opacity is above `threshold`, or above the mean if that is less.
 ///
-/// Before step [`WARMUP_STEPS`] all cells are evaluated, later a random quarter of them and at most as many of the
-/// occupied ones. `history` holds the maximum of each cell, `[cells]`; `seed` and the step `n` determine the draws, and
-/// `opacity` evaluates points of `[-radius, radius]³`.
+/// Before step [`WARMUP_STEPS`] all cells are evaluated, later a random quarter of them and at most
+/// as many of the occupied ones. `history` holds the maximum of each cell, `[cells]`; `seed` and
+/// the step `n` determine the draws, and `opacity` evaluates points of `[-radius, radius]³`.
 pub fn update_nerfacc(
     (occupied, history): (&mut BitGrid, &mut [f32]),
     allowed: &BitGrid,

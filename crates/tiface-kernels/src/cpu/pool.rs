@@ -1,7 +1,8 @@
 //! A pool of reusable buffers.
 //!
-//! A training step needs tens of megabytes of scratch memory. Memory that is newly allocated is paged in by the system
-//! each time, which costs more than the arithmetic; reused buffers avoid that.
+//! A training step needs tens of megabytes of scratch memory. Memory that is newly allocated is
+//! paged in by the system each time, which costs more than the arithmetic; reused buffers avoid
+//! that.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::Mutex;
@@ -30,7 +31,8 @@ pub fn keeps(capacity: usize) -> bool {
 pub struct Buffer(Vec<f32>);
 
 impl Buffer {
-    /// Returns a buffer of `len` floats with **arbitrary contents**: the caller must write before it reads.
+    /// Returns a buffer of `len` floats with **arbitrary contents**: the caller must write before
+    /// it reads.
     pub fn scratch(len: usize) -> Buffer {
         let mut free = FREE.lock().expect("no panic while the pool is locked");
         // take the smallest buffer that fits and is not wastefully large
@@ -51,8 +53,9 @@ impl Buffer {
     }
 }
 
-/// Splits buffers into pieces of `rows` rows; `widths` are the floats per row of each buffer. Each call of the returned
-/// function gives the next piece of every buffer, an empty one once a buffer is exhausted.
+/// Splits buffers into pieces of `rows` rows; `widths` are the floats per row of each buffer. Each
+/// call of the returned function gives the next piece of every buffer, an empty one once a buffer
+/// is exhausted.
 pub fn pieces<'a, const N: usize>(
     buffers: [&'a mut Buffer; N],
     widths: [usize; N],
@@ -63,7 +66,8 @@ pub fn pieces<'a, const N: usize>(
     move || cut.each_mut().map(|c| c.next().unwrap_or_default())
 }
 
-/// Splits the rows of a matrix, which are `width` long, into chunks of columns: for each chunk its part of every row.
+/// Splits the rows of a matrix, which are `width` long, into chunks of columns: for each chunk its
+/// part of every row.
 pub fn by_chunk<T>(matrix: &mut [T], width: usize, chunk: usize) -> Vec<Vec<&mut [T]>> {
     let mut chunks: Vec<Vec<&mut [T]>> = (0..width.div_ceil(chunk)).map(|_| Vec::new()).collect();
     for row in matrix.chunks_mut(width.max(1)) {

@@ -1,4 +1,5 @@
-//! State that a training step takes from the previous one: the number of rays and the length of a march step.
+//! State that a training step takes from the previous one: the number of rays and the length of a
+//! march step.
 
 use super::losses::TERMS;
 
@@ -28,8 +29,8 @@ impl StepLength {
     }
 }
 
-/// Rule for the number of rays of a step: 0.9 times that of the previous step plus 0.1 times the number that would have
-/// met the budget of samples.
+/// Rule for the number of rays of a step: 0.9 times that of the previous step plus 0.1 times the
+/// number that would have met the budget of samples.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RayBudget {
     /// Target number of samples per step.
@@ -41,8 +42,9 @@ pub struct RayBudget {
 }
 
 impl RayBudget {
-    /// Returns the number of rays of the next step, after a step of `rays` rays with `samples` samples in total. The
-    /// published code has no minimum and divides by zero if no ray has a sample; here the number is then kept.
+    /// Returns the number of rays of the next step, after a step of `rays` rays with `samples`
+    /// samples in total. The published code has no minimum and divides by zero if no ray has a
+    /// sample; here the number is then kept.
     pub fn next(&self, rays: usize, samples: usize) -> usize {
         if samples == 0 {
             return rays;
@@ -57,7 +59,8 @@ impl RayBudget {
 pub struct Figures {
     /// Unweighted losses of the step, in the order of [`super::losses`].
     pub losses: [f32; TERMS],
-    /// Mean squared color error over all steps since the last report; `None` if none of them had a sample.
+    /// Mean squared color error over all steps since the last report; `None` if none of them had a
+    /// sample.
     pub mean_square: Option<f32>,
     /// NeuS's variance parameter v after the step; the sharpness is exp(10 v).
     pub variance: f32,

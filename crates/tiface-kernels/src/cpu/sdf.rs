@@ -7,8 +7,8 @@
 //! s = sigmoid(100 z)     a = w ⊙ s     q = W1ᵀ a              n = ∇sdf = q_x + Jᵀ q_F
 //! ```
 //!
-//! `n` is an *output*, since NeuS alpha, color and eikonal loss use it; the backward pass is second order. Given the
-//! gradients `g_o` and `g_n`:
+//! `n` is an *output*, since NeuS alpha, color and eikonal loss use it; the backward pass is second
+//! order. Given the gradients `g_o` and `g_n`:
 //!
 //! ```text
 //! g_q = [J g_n, g_n]     g_a = W1 g_q     g_W1 += a g_qᵀ + g_z uᵀ     g_w += g_a ⊙ s
@@ -16,9 +16,9 @@
 //! table[corner] += g_F w + q_F (g_n · ∇w)
 //! ```
 //!
-//! If the sharpness is local, the last of the thirteen outputs also gives the ratio of the local to the maximum
-//! sharpness: `ln(s / s_max) = −L σ(o₁₂ − 2)`, after Wang et al. 2023, "Adaptive Shells", who learn a kernel size per
-//! position. Hair can then be soft while skin is sharp.
+//! If the sharpness is local, the last of the thirteen outputs also gives the ratio of the local to
+//! the maximum sharpness: `ln(s / s_max) = −L σ(o₁₂ − 2)`, after Wang et al. 2023, "Adaptive
+//! Shells", who learn a kernel size per position. Hair can then be soft while skin is sharp.
 //!
 //! Of `z`, `h` and `s` only `h` is kept for the backward pass, because `s = 1 − e^{−100 h}`.
 
@@ -39,8 +39,8 @@ mod infer;
 pub use backward::backward;
 pub use infer::{colors, gradients, softness, values, values_and_softness};
 
-/// Number of values per sample of the field's output: sdf, gradient (3), color (3), logarithm of the ratio of the local
-/// to the maximum sharpness (0 if the sharpness is global).
+/// Number of values per sample of the field's output: sdf, gradient (3), color (3), logarithm of
+/// the ratio of the local to the maximum sharpness (0 if the sharpness is global).
 pub const WIDTH: usize = 8;
 
 /// Shape of the field: its hash grid, its box and the variants of its networks.
@@ -50,16 +50,18 @@ pub struct FieldShape {
     pub levels: Vec<Level>,
     /// The field lives in `[-radius, radius]³`; the networks see positions divided by it.
     pub radius: f32,
-    /// Number of active hash levels, for coarse-to-fine training; features of the other levels are zero.
+    /// Number of active hash levels, for coarse-to-fine training; features of the other levels are
+    /// zero.
     pub active: usize,
     /// Whether the color network also reads the hash features.
     pub color_skip: bool,
-    /// L: ln of the largest ratio of the maximum to the local sharpness; 0 if the sharpness is global.
+    /// L: ln of the largest ratio of the maximum to the local sharpness; 0 if the sharpness is
+    /// global.
     pub soften: f32,
 }
 
-/// Returns ln of the ratio of the local to the maximum sharpness, from the network's output. The offset of −2 lets
-/// training start close to the maximum.
+/// Returns ln of the ratio of the local to the maximum sharpness, from the network's output. The
+/// offset of −2 lets training start close to the maximum.
 #[inline(always)]
 fn softened<const F: bool>(soften: f32, output: f32) -> f32 {
     -soften * sigmoid::<F>(output - 2.0)
@@ -101,7 +103,8 @@ pub struct Activations {
 /// Number of samples per task. It is fixed, so that sums do not depend on the number of threads.
 const CHUNK: usize = 16 * TILE;
 
-/// Inputs of the first layer for a range of samples: the hash features of each level, then the position.
+/// Inputs of the first layer for a range of samples: the hash features of each level, then the
+/// position.
 struct Inputs<'a> {
     /// Index of the first sample of the range.
     start: usize,
@@ -128,14 +131,15 @@ impl<'a> Inputs<'a> {
         }
     }
 
-    /// Returns the index of a level's first Jacobian block of the tile that starts at sample `base`.
+    /// Returns the index of a level's first Jacobian block of the tile that starts at sample
+    /// `base`.
     #[inline(always)]
     fn first_block(&self, level: usize, base: usize) -> usize {
         level * self.total.div_ceil(LANES) + (self.start + base) / LANES
     }
 
-    /// Writes the rows of a tile that starts at sample `base`. Columns of inactive levels and of padding are not
-    /// written.
+    /// Writes the rows of a tile that starts at sample `base`. Columns of inactive levels and of
+    /// padding are not written.
     #[inline(always)]
     fn fill(&self, u: &mut [f32], kp: usize, base: usize, rows: usize) {
         for l in 0..self.active {
@@ -169,7 +173,8 @@ struct SdfForwardTask<'a> {
     out: &'a mut [f32],
 }
 
-/// Replaces `z` by h = softplus₁₀₀(z + b) and writes a = w ⊙ sigmoid(100 (z + b)), sharing one exponential.
+/// Replaces `z` by h = softplus₁₀₀(z + b) and writes a = w ⊙ sigmoid(100 (z + b)), sharing one
+/// exponential.
 #[inline(always)]
 fn activate<const F: bool>(z: &mut [f32], a: &mut [f32], b: &[f32; HIDDEN], w: &[f32; HIDDEN]) {
     for (z, a) in z.as_chunks_mut::<HIDDEN>().0.iter_mut().zip(a.as_chunks_mut::<HIDDEN>().0) {
@@ -277,7 +282,8 @@ fn color_layers<const F: bool>(
     }
 }
 
-// Loops here are no closures: closures are compiled without the vector instructions of the kernel that calls them.
+// Loops here are no closures: closures are compiled without the vector instructions of the kernel
+// that calls them.
 #[inline(always)]
 fn relu(values: &mut [f32]) {
     for v in values {
@@ -285,8 +291,8 @@ fn relu(values: &mut [f32]) {
     }
 }
 
-/// Writes the columns of a row after the first [`COLOR_INPUTS`]: the hash features, if the color network reads them, and
-/// zero padding.
+/// Writes the columns of a row after the first [`COLOR_INPUTS`]: the hash features, if the color
+/// network reads them, and zero padding.
 #[inline(always)]
 fn write_skip(layout: Layout, u: &[f32], row: &mut [f32]) {
     let count = layout.color_inputs() - COLOR_INPUTS;
@@ -294,7 +300,8 @@ fn write_skip(layout: Layout, u: &[f32], row: &mut [f32]) {
     row[COLOR_INPUTS + count..].fill(0.0);
 }
 
-/// Returns v / ‖v‖ of each column, with the norm clamped to at least 1e-12, like torch's `normalize`.
+/// Returns v / ‖v‖ of each column, with the norm clamped to at least 1e-12, like torch's
+/// `normalize`.
 #[inline(always)]
 fn units(v: &[[f32; TILE]; 3]) -> [[f32; TILE]; 3] {
     let mut out = *v;
@@ -307,13 +314,15 @@ fn units(v: &[[f32; TILE]; 3]) -> [[f32; TILE]; 3] {
     out
 }
 
-/// Evaluates sdf, gradient and color at points, and keeps the activations that the backward pass needs.
+/// Evaluates sdf, gradient and color at points, and keeps the activations that the backward pass
+/// needs.
 ///
 /// # Shapes
 ///
 /// - table: `[entries, 2]`; weights: prepared from the flat `[P]`
 /// - x: `[n, 3]` in the field's box; direction: `[n, 3]` unit, away from the camera
-/// - output: `[n, 8]` = sdf, ∇sdf (3, field units), rgb (3, sRGB-coded, 0..1), ln of the local sharpness
+/// - output: `[n, 8]` = sdf, ∇sdf (3, field units), rgb (3, sRGB-coded, 0..1), ln of the local
+///   sharpness
 pub fn forward(
     shape: &FieldShape,
     table: &[[f32; 2]],

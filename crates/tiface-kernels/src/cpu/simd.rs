@@ -3,10 +3,11 @@
 //!
 //! Fixed-width arrays are left to the autovectorizer. Each hot body is `#[inline(always)]` and
 //! generic over `F` ("has fused multiply-add"), instantiated inside a `#[target_feature]` wrapper
-//! that [`tiface_base::dispatch!`] chooses at run time. `f32::mul_add` without hardware FMA is a library
-//! call, hence [`fma`].
+//! that [`tiface_base::dispatch!`] chooses at run time. `f32::mul_add` without hardware FMA is a
+//! library call, hence [`fma`].
 //!
-//! [`Matrix`] holds the weights of small networks, zero-padded to the size of the matrix blocks, with their transpose.
+//! [`Matrix`] holds the weights of small networks, zero-padded to the size of the matrix blocks,
+//! with their transpose.
 
 /// `a · b + c`, fused where the hardware can.
 #[inline(always)]
@@ -18,7 +19,8 @@ pub fn fma<const F: bool>(a: f32, b: f32, c: f32) -> f32 {
 /// the block is forty times slower.
 pub const ROWS: usize = 4;
 
-/// One block `C[ROWS, NR] (+)= Σ_p A[ROWS, p] · B[p, NR]`; `A` is strided, rows of `B` and `C` contiguous.
+/// One block `C[ROWS, NR] (+)= Σ_p A[ROWS, p] · B[p, NR]`; `A` is strided, rows of `B` and `C`
+/// contiguous.
 #[inline(always)]
 fn block<const F: bool, const NR: usize>(
     k: usize,
@@ -96,8 +98,8 @@ pub fn exp<const F: bool>(x: f32) -> f32 {
     let p = fma::<F>(r, p, 1.0 / 6.0);
     let p = fma::<F>(r, p, 0.5);
     let p = fma::<F>(r * r, p, r + 1.0);
-    // The lowest bits of `rounded` are n in [-126, 127], which becomes the exponent. A cast of n to an integer would
-    // saturate, which keeps loops from being vectorized.
+    // The lowest bits of `rounded` are n in [-126, 127], which becomes the exponent. A cast of n to
+    // an integer would saturate, which keeps loops from being vectorized.
     p * f32::from_bits((rounded.to_bits() << 23).wrapping_add(127 << 23))
 }
 
@@ -115,8 +117,8 @@ pub fn ln_1p<const F: bool>(e: f32) -> f32 {
     2.0 * t * p
 }
 
-/// Returns `g` if `h` is positive, else 0: the gradient of a relu whose output is `h`. A branch would become a masked store,
-/// which takes tens of cycles on some CPUs.
+/// Returns `g` if `h` is positive, else 0: the gradient of a relu whose output is `h`. A branch
+/// would become a masked store, which takes tens of cycles on some CPUs.
 #[inline(always)]
 pub fn relu_gradient(g: f32, h: f32) -> f32 {
     f32::from_bits(g.to_bits() & u32::from(h > 0.0).wrapping_neg())
@@ -138,7 +140,8 @@ pub struct Matrix {
 }
 
 impl Matrix {
-    /// Creates a matrix from row-major `values` of shape `[rows, columns]`, zero-padded to the shape `padded`.
+    /// Creates a matrix from row-major `values` of shape `[rows, columns]`, zero-padded to the
+    /// shape `padded`.
     pub fn new(values: &[f32], (rows, columns): (usize, usize), padded: (usize, usize)) -> Matrix {
         let mut m = vec![0.0; padded.0 * padded.1];
         let mut t = m.clone();
@@ -159,7 +162,8 @@ pub fn split<const N: usize>(mut flat: &[f32], shapes: [(usize, usize); N]) -> [
     })
 }
 
-/// Adds matrices to those of a flat vector. Each part is a matrix with the distance of its rows, in floats.
+/// Adds matrices to those of a flat vector. Each part is a matrix with the distance of its rows, in
+/// floats.
 pub fn add_to(mut flat: &mut [f32], shapes: &[(usize, usize)], parts: &[(&[f32], usize)]) {
     for (&(rows, columns), &(part, stride)) in shapes.iter().zip(parts) {
         let matrix = flat.split_off_mut(..rows * columns).expect("a gradient for each weight");

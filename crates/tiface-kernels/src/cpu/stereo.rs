@@ -1,19 +1,22 @@
-//! Multi-view stereo that refines an approximate surface: it finds how far each point should move along its normal.
+//! Multi-view stereo that refines an approximate surface: it finds how far each point should move
+//! along its normal.
 //!
-//! A small patch of the surface's tangent plane is sampled in every photograph in which it is visible. Once it is moved
-//! along its normal to the true surface, its image is the same in all of them, up to brightness and contrast. With
-//! patches `p_v` of mean 0 and length 1, the mean correlation of all pairs is
+//! A small patch of the surface's tangent plane is sampled in every photograph in which it is
+//! visible. Once it is moved along its normal to the true surface, its image is the same in all of
+//! them, up to brightness and contrast. With patches `p_v` of mean 0 and length 1, the mean
+//! correlation of all pairs is
 //!
 //! ```text
 //! score(d) = (‖Σ p_v(d)‖² − V) / (V (V − 1))          σ² = (1 − score) / −score″
 //! ```
 //!
-//! which treats all photographs equally, as Furukawa, Ponce 2010, "Accurate, Dense, and Robust Multiview Stereopsis",
-//! measure photo-consistency. Displacements are tried in steps that shift no two patches by more than a fraction
-//! of a pixel against each other; parabolas refine the peak and the tilt of the patch. Photographs that do not fit the
-//! others (because of a highlight or an occluder) are removed once. A point is accepted if its peak is unique and inside
-//! the range, if `σ`, the error to expect from noise and the width of the peak, is small, and if its neighbors agree,
-//! which in hair they rarely do.
+//! which treats all photographs equally, as Furukawa, Ponce 2010, "Accurate, Dense, and Robust
+//! Multiview Stereopsis", measure photo-consistency. Displacements are tried in steps that shift no
+//! two patches by more than a fraction of a pixel against each other; parabolas refine the peak and
+//! the tilt of the patch. Photographs that do not fit the others (because of a highlight or an
+//! occluder) are removed once. A point is accepted if its peak is unique and inside the range, if
+//! `σ`, the error to expect from noise and the width of the peak, is small, and if its neighbors
+//! agree, which in hair they rarely do.
 
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
@@ -38,13 +41,16 @@ const MIN_COSINE: f32 = 0.4;
 /// Maximum shift of one patch against another between neighboring hypotheses, in pixels.
 const STEP: f32 = 0.4;
 
-/// Search range to either side of a point, in pixel footprints. A half-trained field is that accurate.
+/// Search range to either side of a point, in pixel footprints. A half-trained field is that
+/// accurate.
 const REACH: f32 = 5.0;
 
-/// Minimum standard deviation of a patch with texture, where white is 1. Rounding to 8 bits has 0.3 / 255.
+/// Minimum standard deviation of a patch with texture, where white is 1. Rounding to 8 bits has 0.3
+/// / 255.
 const MIN_CONTRAST: f32 = 0.8 / 255.0;
 
-/// Minimum mean correlation of a photograph with the better half of the others; below it the photograph is removed.
+/// Minimum mean correlation of a photograph with the better half of the others; below it the
+/// photograph is removed.
 const MIN_FIT: f32 = 0.3;
 
 /// Minimum mean correlation of an accepted point.
@@ -75,8 +81,8 @@ pub struct StereoView {
     pub usable: Vec<bool>,
     /// Edge length of the cells of `depth`, in pixels.
     pub cell: usize,
-    /// `[⌈height / cell⌉, ⌈width / cell⌉]` distance of the surface along the viewing axis at the center of each cell;
-    /// infinite where the cell shows no surface.
+    /// `[⌈height / cell⌉, ⌈width / cell⌉]` distance of the surface along the viewing axis at the
+    /// center of each cell; infinite where the cell shows no surface.
     pub depth: Vec<f32>,
 }
 
@@ -143,8 +149,8 @@ impl Projected {
         })
     }
 
-    /// Samples the brightness of the patch and normalizes it to mean 0 and length 1. If the patch leaves the usable part
-    /// of the photograph or has no contrast, writes zeros and returns false.
+    /// Samples the brightness of the patch and normalizes it to mean 0 and length 1. If the patch
+    /// leaves the usable part of the photograph or has no contrast, writes zeros and returns false.
     fn sample_patch(&self, view: &StereoView, at: Displacement, patch: &mut [f32; PATCH]) -> bool {
         let center = self.center + at.shift * (self.slope + at.shift * self.curvature) - 0.5;
         let [a, b] = [0, 1].map(|k| self.axes[k] + at.tilt[k] * self.slope);
@@ -208,14 +214,16 @@ impl Matching<'_> {
         (square - with_contrast as f32) / (n * (n - 1.0))
     }
 
-    /// Removes photographs that do not fit the others at a displacement. Returns whether all of them fitted.
+    /// Removes photographs that do not fit the others at a displacement. Returns whether all of
+    /// them fitted.
     fn keep_fitting(&mut self, displacement: Displacement) -> bool {
         self.score(displacement);
         let n = self.visible.len();
         let fits = |v: usize| {
             let correlation =
                 |w: usize| (0..PATCH).map(|k| self.patches[v][k] * self.patches[w][k]).sum::<f32>();
-            // only the better half of the others counts, so that an outlier among them does not remove this one
+            // only the better half of the others counts, so that an outlier among them does not
+            // remove this one
             let mut others: Vec<f32> = (0..n).filter(|&w| w != v).map(correlation).collect();
             others.sort_by(|a, b| b.total_cmp(a));
             let best = &others[..others.len().div_ceil(2)];
@@ -227,8 +235,9 @@ impl Matching<'_> {
         self.visible.len() == n
     }
 
-    /// Returns the shift of the highest peak in the search range, and the step between shifts. Returns `None` if the peak
-    /// lies on the border of the range or is not unique, or if the baseline of the views is too small or too large.
+    /// Returns the shift of the highest peak in the search range, and the step between shifts.
+    /// Returns `None` if the peak lies on the border of the range or is not unique, or if the
+    /// baseline of the views is too small or too large.
     fn search(&mut self) -> Option<(f32, f32)> {
         let mut widest = 0f32;
         for (i, a) in self.visible.iter().enumerate() {
@@ -282,14 +291,16 @@ impl Matching<'_> {
     }
 }
 
-/// Returns the number of steps from the middle of three values towards their peak, clamped to -1..=1.
+/// Returns the number of steps from the middle of three values towards their peak, clamped to
+/// -1..=1.
 fn steps_to_peak([before, middle, after]: [f32; 3]) -> f32 {
     let (slope, curvature) = (0.5 * (after - before), 2.0 * middle - before - after);
     if curvature > 1e-6 { (slope / curvature).clamp(-1.0, 1.0) } else { slope.signum() }
 }
 
-/// Returns the peak of the parabola through three values that are one `step` apart: its offset from the middle, its value
-/// and its negative second derivative. Returns `None` if the middle value is not the highest.
+/// Returns the peak of the parabola through three values that are one `step` apart: its offset from
+/// the middle, its value and its negative second derivative. Returns `None` if the middle value is
+/// not the highest.
 fn parabola([before, middle, after]: [f32; 3], step: f32) -> Option<(f32, f32, f32)> {
     let curvature = 2.0 * middle - before - after;
     if before > middle || after > middle || curvature <= 1e-6 {
@@ -311,7 +322,8 @@ fn visible_in(views: &[StereoView], s: &Surfel) -> Vec<usize> {
         }
         let (x, y) = (pixel.x as usize, pixel.y as usize);
         let nearest = view.depth[y / view.cell * w.div_ceil(view.cell) + x / view.cell];
-        // tolerance: the surface's slope changes the depth within a cell, and hypotheses may lie up to REACH away
+        // tolerance: the surface's slope changes the depth within a cell, and hypotheses may lie up
+        // to REACH away
         let reach = (REACH + 1.5 * view.cell as f32) * depth / view.camera.fx as f32;
         (view.usable[y * w + x] && depth <= nearest + reach).then_some(cosine)
     };
@@ -321,8 +333,8 @@ fn visible_in(views: &[StereoView], s: &Surfel) -> Vec<usize> {
     visible.into_iter().map(|(_, v)| v).collect()
 }
 
-/// Returns the views in which a surfel is visible, the most frontal one first, and the length of a pixel of the first
-/// view at the surfel. Returns `None` for fewer than [`MIN_VIEWS`].
+/// Returns the views in which a surfel is visible, the most frontal one first, and the length of a
+/// pixel of the first view at the surfel. Returns `None` for fewer than [`MIN_VIEWS`].
 fn frontal(views: &[StereoView], s: &Surfel) -> Option<(Vec<usize>, f32)> {
     let visible = Some(visible_in(views, s)).filter(|visible| visible.len() >= MIN_VIEWS)?;
     let camera = &views[visible[0]].camera;
@@ -330,8 +342,8 @@ fn frontal(views: &[StereoView], s: &Surfel) -> Option<(Vec<usize>, f32)> {
     Some((visible, depth / camera.fx as f32))
 }
 
-/// Returns the length of a pixel at a surfel if `view` is its most frontal view and enough views see the surfel, else
-/// `None`. With this rule exactly one of all views that find a point keeps it.
+/// Returns the length of a pixel at a surfel if `view` is its most frontal view and enough views
+/// see the surfel, else `None`. With this rule exactly one of all views that find a point keeps it.
 pub fn owned_footprint(views: &[StereoView], view: usize, s: &Surfel) -> Option<f32> {
     frontal(views, s).filter(|(visible, _)| visible[0] == view).map(|(_, footprint)| footprint)
 }
@@ -369,13 +381,14 @@ fn match_one(views: &[StereoView], s: &Surfel) -> Option<StereoPoint> {
     })
 }
 
-/// Matches surfels and returns the points at which the photographs agree, in the order of `surfels`. Many surfels have
-/// none.
+/// Matches surfels and returns the points at which the photographs agree, in the order of
+/// `surfels`. Many surfels have none.
 pub fn matches(views: &[StereoView], surfels: &[Surfel]) -> Vec<StereoPoint> {
     surfels.par_iter().with_min_len(64).filter_map(|s| match_one(views, s)).collect()
 }
 
-/// Returns the points that at least half of their neighbors confirm. `points` lie about `spacing` apart, in scene units.
+/// Returns the points that at least half of their neighbors confirm. `points` lie about `spacing`
+/// apart, in scene units.
 pub fn confirmed(points: &[StereoPoint], spacing: f32) -> Vec<StereoPoint> {
     /// Maximum distance of a neighbor, in spacings.
     const NEIGHBOR_RADIUS: f32 = 2.5;

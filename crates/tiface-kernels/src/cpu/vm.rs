@@ -1,15 +1,16 @@
 //! TensoRF's vector-matrix decomposition (Chen et al. 2022, Eq. 7): planes times lines.
 //!
-//! A grid of `nx × ny × nz` vertices is three terms; term `i` is a plane over two axes times a line along
-//! the third, summed over its channels:
+//! A grid of `nx × ny × nz` vertices is three terms; term `i` is a plane over two axes times a line
+//! along the third, summed over its channels:
 //!
 //! ```text
 //! term 0: plane (x, y) · line z      term 1: plane (x, z) · line y      term 2: plane (y, z) · line x
 //! feature(p) = Σ_i Σ_c plane_i,c(p) · line_i,c(p)       bilinear and linear, vertices on the box's border
 //! ```
 //!
-//! The channels of a vertex are adjacent in memory (channel last). A corner is then one or a few cache lines, which makes
-//! lookups seven times faster than with the channel-first storage of the published code.
+//! The channels of a vertex are adjacent in memory (channel last). A corner is then one or a few
+//! cache lines, which makes lookups seven times faster than with the channel-first storage of the
+//! published code.
 
 mod decoder;
 mod gather;
@@ -32,8 +33,8 @@ pub const PLANE_AXES: [(usize, usize); 3] = [(0, 1), (0, 2), (1, 2)];
 /// Axis of each term's line.
 pub const LINE_AXIS: [usize; 3] = [2, 1, 0];
 
-/// Layout of planes and lines in a flat array: plane 0, 1, 2, each `[height, width, channels]`, then line 0, 1, 2, each
-/// `[n, channels]`.
+/// Layout of planes and lines in a flat array: plane 0, 1, 2, each `[height, width, channels]`,
+/// then line 0, 1, 2, each `[n, channels]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grid {
     /// Vertices along x, y, z; at least 2 each.
@@ -124,18 +125,21 @@ pub fn size_for(extent: [f32; 3], voxels: u64) -> [usize; 3] {
     extent.map(|e| ((e / edge) as usize).max(2))
 }
 
-/// Returns the length of a march step: `ratio` times the mean distance of vertices over the three axes.
+/// Returns the length of a march step: `ratio` times the mean distance of vertices over the three
+/// axes.
 pub fn step_size(extent: [f32; 3], size: [usize; 3], ratio: f32) -> f32 {
     (0..3).map(|a| extent[a] / (size[a] - 1) as f32).sum::<f32>() / 3.0 * ratio
 }
 
-/// Returns the number of samples of a ray for inference: enough for the box's diagonal, at most a million.
+/// Returns the number of samples of a ray for inference: enough for the box's diagonal, at most a
+/// million.
 pub fn samples_across(extent: [f32; 3], step: f32) -> usize {
     let diagonal = extent.iter().map(|e| e * e).sum::<f32>().sqrt();
     ((diagonal / step) as usize).saturating_add(1).min(1_000_000)
 }
 
-/// Returns the voxel counts of `steps` upsamplings, with equal ratios from `first` to `last`, computed in f32 as published.
+/// Returns the voxel counts of `steps` upsamplings, with equal ratios from `first` to `last`,
+/// computed in f32 as published.
 pub fn voxel_schedule(first: u64, last: u64, steps: usize) -> Vec<u64> {
     let (a, b) = ((first as f64).ln() as f32, (last as f64).ln() as f32);
     let at = |k: usize| {

@@ -1,5 +1,5 @@
-//! Weight normalization of the geometry network (Salimans, Kingma 2016): it converts trained parameters to the weights of
-//! a [`Layout`], and gradients back.
+//! Weight normalization of the geometry network (Salimans, Kingma 2016): it converts trained
+//! parameters to the weights of a [`Layout`], and gradients back.
 //!
 //! ```text
 //! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂),  ĝ the gradient by W

@@ -40,7 +40,8 @@ fn adam_kernel(
 /// Condition under which parameters are updated.
 #[derive(Clone, Copy)]
 pub struct Gate<'a> {
-    /// `[1]` or more: number of samples of the step in the first word. Nothing is updated if it is 0.
+    /// `[1]` or more: number of samples of the step in the first word. Nothing is updated if it
+    /// is 0.
     pub count: &'a Buffer,
     /// `[1]`: not 0 once a gradient was not finite. Nothing is updated from then on.
     pub non_finite: &'a Buffer,
@@ -83,7 +84,8 @@ mod tests {
             let device_state = [&p, &m, &v].map(|b| device.upload(b));
             for k in 0..5 {
                 step.step += 1;
-                // in each step a third of the gradients are zero, and the others have very different magnitudes
+                // in each step a third of the gradients are zero, and the others have very
+                // different magnitudes
                 let size = |i: u64| 10f32.powi(i as i32 % 12 - 8) * rng::normal(2, k, i);
                 let mut g: Vec<f32> = (0..n).map(|i| if (i + k) % 3 == 0 { 0.0 } else { size(i) }).collect();
                 let device_g = device.upload(&g);

@@ -4,8 +4,8 @@ use crate::cpu::hash;
 use crate::cpu::sdf::{FieldShape, WIDTH};
 use tiface_base::math::rng;
 
-/// A field with lively weights, samples in its box seen from anywhere, and gradients of its output. Positions and
-/// scales have few digits, so that the cells of all samples are found alike.
+/// A field with lively weights, samples in its box seen from anywhere, and gradients of its output.
+/// Positions and scales have few digits, so that the cells of all samples are found alike.
 pub(super) struct Case {
     pub shape: FieldShape,
     pub table: Vec<[f32; 2]>,

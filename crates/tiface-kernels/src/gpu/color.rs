@@ -1,5 +1,6 @@
-//! The color network that both fields on a hash grid have: two hidden layers over the outputs of the geometry network, the
-//! direction's spherical harmonics and, by field, the unit normal and the hash features.
+//! The color network that both fields on a hash grid have: two hidden layers over the outputs of
+//! the geometry network, the direction's spherical harmonics and, by field, the unit normal and the
+//! hash features.
 
 use super::tile::{
     self, Block, CHANNELS, LANES, Lane, at, ends, load_planes, outer_block, outer_row, output_layer, product,
@@ -20,7 +21,8 @@ const HARMONICS: usize = 16;
 pub(super) struct ColorPlan {
     /// Number of outputs of the geometry network.
     pub outputs: usize,
-    /// Whether the field is a signed distance, whose unit normal is an input and whose local sharpness is an output.
+    /// Whether the field is a signed distance, whose unit normal is an input and whose local
+    /// sharpness is an output.
     pub signed: bool,
     /// Number of hash features among the inputs.
     pub features: usize,
@@ -45,7 +47,8 @@ impl ColorPlan {
         ends([HIDDEN, HIDDEN, 3]).map(|row: usize| row + self.gradients[0])
     }
 
-    /// Returns the first channel of the normal, or the one after the harmonics for a field without normals.
+    /// Returns the first channel of the normal, or the one after the harmonics for a field without
+    /// normals.
     fn normal(&self) -> usize {
         self.outputs + HARMONICS
     }
@@ -71,8 +74,8 @@ pub(super) fn unit(x: F4, y: F4, z: F4) -> Unit {
     Unit { x: x / length, y: y / length, z: z / length, length }
 }
 
-/// Writes the inputs of the color network to a tile. `o` is the thread's output of the geometry network; `normal` is read
-/// by one thread of each row only.
+/// Writes the inputs of the color network to a tile. `o` is the thread's output of the geometry
+/// network; `normal` is read by one thread of each row only.
 #[cube]
 pub(super) fn color_inputs(
     a: &mut [F4],
@@ -140,7 +143,8 @@ fn harmonics(a: &mut [F4], #[comptime] first: usize, x: F4, y: F4, z: F4, row: u
     a[at(first + 15, row, LANES)] = x * (y2 * F4::new(3.0f32) - x2) * F4::new(0.590_043_6f32);
 }
 
-/// Writes colors to the field's output from the inputs in tile `a`, and the activations that the backward pass needs.
+/// Writes colors to the field's output from the inputs in tile `a`, and the activations that the
+/// backward pass needs.
 #[cube]
 pub(super) fn color_forward(
     a: &mut [F4],
@@ -169,7 +173,8 @@ pub(super) fn color_forward(
     }
 }
 
-/// Returns four samples' values, set to zero from sample number `samples` on; `first` is the number of the first one.
+/// Returns four samples' values, set to zero from sample number `samples` on; `first` is the number
+/// of the first one.
 #[cube]
 fn masked(v: F4, first: usize, samples: usize) -> F4 {
     let mut masked_v = v;
@@ -182,10 +187,10 @@ fn masked(v: F4, first: usize, samples: usize) -> F4 {
     masked_v
 }
 
-/// Backward pass of the color network. Writes, for each sample, the gradients with respect to the geometry network's
-/// outputs (of the density: before the exponential), the normal, and the features that the color network reads; and
-/// partial sums by group of the gradients with respect to the weights. `g_normal` and `g_value` are written only where
-/// these are inputs.
+/// Backward pass of the color network. Writes, for each sample, the gradients with respect to the
+/// geometry network's outputs (of the density: before the exponential), the normal, and the
+/// features that the color network reads; and partial sums by group of the gradients with respect
+/// to the weights. `g_normal` and `g_value` are written only where these are inputs.
 #[cube(launch_unchecked)]
 pub(super) fn color_backward(
     w: &[F4],

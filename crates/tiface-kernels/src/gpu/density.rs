@@ -1,5 +1,5 @@
-//! The density field of [`crate::cpu::density`], whose module holds the formulas: its networks forward and backward,
-//! truncation of rays by transmittance, and compositing with the losses.
+//! The density field of [`crate::cpu::density`], whose module holds the formulas: its networks
+//! forward and backward, truncation of rays by transmittance, and compositing with the losses.
 
 use super::color::{ColorPlan, color_backward, color_forward, color_inputs, unit};
 use super::device::{Buffer, Device, Words, groups, launch};
@@ -25,8 +25,8 @@ type F4 = Vector<f32, Const<4>>;
 /// Number of planes of the field's output: density and color.
 const WIDTH: usize = 4;
 
-/// Offsets of the matrices in rows of 64 floats. Weights are stored in the orders in which they are read, gradients
-/// row-major like on the CPU.
+/// Offsets of the matrices in rows of 64 floats. Weights are stored in the orders in which they are
+/// read, gradients row-major like on the CPU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct DensityPlan {
     /// Number of hash features: two per level.
@@ -68,8 +68,8 @@ impl DensityPlan {
     }
 }
 
-/// Writes densities and, if `colors` is set, colors to planes `[4, capacity]`, and the activations that the backward pass
-/// needs.
+/// Writes densities and, if `colors` is set, colors to planes `[4, capacity]`, and the activations
+/// that the backward pass needs.
 #[cube(launch_unchecked)]
 fn forward(
     w: &[F4],
@@ -129,8 +129,8 @@ fn features(a: &mut [F4], value: &[F4], lane: &Lane, #[comptime] count: usize) {
     }
 }
 
-/// Backward pass of the geometry network. Writes the gradients with respect to the features of each sample, and partial
-/// sums by group of those with respect to the weights.
+/// Backward pass of the geometry network. Writes the gradients with respect to the features of each
+/// sample, and partial sums by group of those with respect to the weights.
 #[cube(launch_unchecked)]
 fn geometry_backward(
     w: &[F4],
@@ -196,8 +196,8 @@ fn check(gradient: &[f32], non_finite: &mut [u32]) {
     }
 }
 
-/// Truncates rays by transmittance. A first pass counts the remaining samples of each ray; a second pass, after a prefix
-/// sum of the counts, copies them.
+/// Truncates rays by transmittance. A first pass counts the remaining samples of each ray; a second
+/// pass, after a prefix sum of the counts, copies them.
 #[cube(launch)]
 fn cut(
     density: &[f32],
@@ -248,8 +248,8 @@ fn opacity(x: f32) -> f32 {
     select(x < 0.1f32, series, 1.0f32 - (-x).exp())
 }
 
-/// Composites rays. Writes their loss terms, planes `[3, rays]`, and the gradients with respect to the field's output,
-/// planes `[4, capacity]`. `light` is scratch memory, planes `[2, capacity]`.
+/// Composites rays. Writes their loss terms, planes `[3, rays]`, and the gradients with respect to
+/// the field's output, planes `[4, capacity]`. `light` is scratch memory, planes `[2, capacity]`.
 #[cube(launch)]
 fn of_rays(
     field: &[f32],
@@ -328,7 +328,8 @@ fn smooth(e: f32) -> f32 {
     select(e.abs() < 1.0f32, 0.5f32 * e * e, e.abs() - 0.5f32)
 }
 
-/// A density field on a device, with the buffers of a training step for up to `rays` rays and `capacity` samples.
+/// A density field on a device, with the buffers of a training step for up to `rays` rays and
+/// `capacity` samples.
 pub struct Density {
     plan: DensityPlan,
     grid: Grid,
@@ -395,14 +396,15 @@ impl Density {
         2 * shape.levels.len() <= CHANNELS
     }
 
-    /// Returns the memory per sample in words, including its marched samples before and after truncation: the total, and
-    /// that of the largest buffer.
+    /// Returns the memory per sample in words, including its marched samples before and after
+    /// truncation: the total, and that of the largest buffer.
     pub fn words_per_sample(shape: &DensityShape) -> [usize; 2] {
         let features = 2 * shape.levels.len();
         [2 * features + 3 * HIDDEN + 2 * FEATURES + 2 * WIDTH + 2 + 2 * (3 + 3 + 2), HIDDEN.max(features)]
     }
 
-    /// Returns the memory of the groups' partial gradient sums in words, for up to `capacity` samples.
+    /// Returns the memory of the groups' partial gradient sums in words, for up to `capacity`
+    /// samples.
     pub fn words_of_sums(shape: &DensityShape, capacity: usize) -> usize {
         summing(capacity) * DensityPlan::new(shape).color.gradients[1] * CHANNELS
     }
@@ -414,12 +416,13 @@ impl Density {
         );
     }
 
-    /// Evaluates densities of samples and, if directions are given, colors: see [`crate::cpu::density::evaluate`].
+    /// Evaluates densities of samples and, if directions are given, colors: see
+    /// [`crate::cpu::density::evaluate`].
     ///
     /// # Shapes
     ///
-    /// - table: `[entries, 2]`; x, direction: planes `[3, capacity]`, finite after the last sample; count: `[1]`, the
-    ///   number of samples
+    /// - table: `[entries, 2]`; x, direction: planes `[3, capacity]`, finite after the last sample;
+    ///   count: `[1]`, the number of samples
     /// - output: planes `[4, capacity]`
     pub fn evaluate(
         &self,
@@ -444,8 +447,8 @@ impl Density {
         &self.out
     }
 
-    /// Truncates each ray where its transmittance falls below [`MIN_TRANSMITTANCE`], by the densities of the last
-    /// evaluation, and copies the remaining samples to `kept`.
+    /// Truncates each ray where its transmittance falls below [`MIN_TRANSMITTANCE`], by the
+    /// densities of the last evaluation, and copies the remaining samples to `kept`.
     pub fn cut(&self, device: &Device, samples: &Samples, kept: &Samples) {
         let pass = |writes: bool| {
             launch!(device, cut::launch, groups(kept.counts.word_count().div_ceil(UNITS as usize)), UNITS;
@@ -475,8 +478,8 @@ impl Density {
         );
     }
 
-    /// Adds the gradient with respect to the table, which must be zero before, writes that with respect to the weights, and
-    /// sets `non_finite` if the latter is not finite.
+    /// Adds the gradient with respect to the table, which must be zero before, writes that with
+    /// respect to the weights, and sets `non_finite` if the latter is not finite.
     pub fn backward(
         &self,
         device: &Device,
@@ -506,8 +509,8 @@ impl Density {
         self.grid.scatter(device, g_table, &samples.x, count, &self.g_value, None);
     }
 
-    /// Returns squared error, smooth-L1 loss and distortion of the last step, followed by the sums over steps as in
-    /// [`Losses::sums`](super::Losses::sums).
+    /// Returns squared error, smooth-L1 loss and distortion of the last step, followed by the sums
+    /// over steps as in [`Losses::sums`](super::Losses::sums).
     pub fn sums(&self) -> &Buffer {
         &self.sums
     }

@@ -21,8 +21,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, Once, OnceLock};
 use tiface_base::{Error, Result};
 
-/// The first error of wgpu, or the first launch refused, since a device was read. CubeCL turns such an error into a panic on a thread of its own, whose
-/// launches are lost while reads go on answering.
+/// The first error of wgpu, or the first launch refused, since a device was read. CubeCL turns such
+/// an error into a panic on a thread of its own, whose launches are lost while reads go on
+/// answering.
 static WGPU_ERROR: Mutex<Option<String>> = Mutex::new(None);
 
 /// Installs a panic hook that records errors of wgpu instead of printing them.
@@ -74,7 +75,8 @@ pub struct Device {
     kernels: Mutex<BTreeSet<&'static str>>,
 }
 
-/// Memory of a device: burn's one-dimensional tensor of 32-bit elements, the same type for floats and words.
+/// Memory of a device: burn's one-dimensional tensor of 32-bit elements, the same type for floats
+/// and words.
 pub type Buffer = FloatTensor<Cube>;
 
 /// A tensor as kernels see it.
@@ -124,7 +126,8 @@ pub struct Adapter {
     pub card: Option<String>,
     /// `vulkan`, `metal` or `dx12`.
     pub api: &'static str,
-    /// `discrete`, `integrated`, `virtual`, `other` (some virtual machines say no more) or `software`.
+    /// `discrete`, `integrated`, `virtual`, `other` (some virtual machines say no more) or
+    /// `software`.
     pub kind: &'static str,
     /// Whether the adapter is a software renderer.
     pub software: bool,
@@ -142,8 +145,8 @@ pub struct Adapter {
 const KINDS: [&str; 5] = ["discrete", "integrated", "virtual", "other", "software"];
 
 impl Adapter {
-    /// Returns every adapter of this machine, the fastest kind first. A card that several APIs reach is listed once for
-    /// each. Only the first call of a process queries the drivers.
+    /// Returns every adapter of this machine, the fastest kind first. A card that several APIs
+    /// reach is listed once for each. Only the first call of a process queries the drivers.
     pub fn all() -> &'static [Adapter] {
         static ALL: OnceLock<Vec<Adapter>> = OnceLock::new();
         ALL.get_or_init(Adapter::find)
@@ -282,8 +285,8 @@ impl Device {
     ///
     /// # Errors
     ///
-    /// If the driver refuses it: of kind [`NotNow`](tiface_base::ErrorKind::NotNow) where its memory is
-    /// used up, else of kind [`Cannot`](tiface_base::ErrorKind::Cannot).
+    /// If the driver refuses it: of kind [`NotNow`](tiface_base::ErrorKind::NotNow) where its
+    /// memory is used up, else of kind [`Cannot`](tiface_base::ErrorKind::Cannot).
     pub fn open(adapter: &Adapter) -> Result<Device> {
         note_errors();
         let client = adapter.client().map_err(|why| {
@@ -331,8 +334,8 @@ impl Device {
         }
     }
 
-    /// Returns the bytes that a training may use: the device's memory minus a reserve for the driver and other programs,
-    /// or `u64::MAX` if the driver does not report the memory.
+    /// Returns the bytes that a training may use: the device's memory minus a reserve for the
+    /// driver and other programs, or `u64::MAX` if the driver does not report the memory.
     pub fn available_memory(&self) -> u64 {
         const KEPT: u64 = 512 << 20;
         self.memory.map_or(u64::MAX, |memory| memory.saturating_sub(KEPT))
@@ -380,7 +383,8 @@ impl Device {
         self.tensor(self.client.create(Bytes::from_elems(values)), words, T::dtype())
     }
 
-    /// Copies values into a buffer, from its word `first` on. They are sent at once: the driver keeps a copy until then.
+    /// Copies values into a buffer, from its word `first` on. They are sent at once: the driver
+    /// keeps a copy until then.
     pub(super) fn write<T: Element>(&self, into: &Buffer, first: usize, values: Vec<T>) {
         let behind = into.word_count() - first - values.len();
         let handle = into.handle.clone().offset_start(4 * first as u64).offset_end(4 * behind as u64);
@@ -389,7 +393,8 @@ impl Device {
         let _ = self.client.flush();
     }
 
-    /// Allocates memory with **arbitrary contents**, which a kernel must write before another reads it.
+    /// Allocates memory with **arbitrary contents**, which a kernel must write before another reads
+    /// it.
     pub fn scratch<T: Element>(&self, words: usize) -> Buffer {
         self.tensor(self.client.empty(words.max(1) * 4), words, T::dtype())
     }
@@ -410,7 +415,8 @@ impl Device {
     ///
     /// Fails if the device does not answer, or an operation since the last call failed. Of kind
     /// [`NotNow`](tiface_base::ErrorKind::NotNow) where it is lost or has no memory left; of kind
-    /// [`Cannot`](tiface_base::ErrorKind::Cannot) where its driver refuses a kernel or a launch. Nothing on the host is harmed.
+    /// [`Cannot`](tiface_base::ErrorKind::Cannot) where its driver refuses a kernel or a launch.
+    /// Nothing on the host is harmed.
     pub fn fetch<T: Pod>(&self, buffer: &Buffer) -> Result<Vec<T>> {
         self.readbacks.fetch_add(1, Ordering::Relaxed);
         #[cfg(any(test, feature = "testing"))]
@@ -466,7 +472,8 @@ impl Device {
         &self.client
     }
 
-    /// Notes where a kernel's first launch was refused: the error of a later read does not always name the kernel.
+    /// Notes where a kernel's first launch was refused: the error of a later read does not always
+    /// name the kernel.
     pub(super) fn launched<'h>(&self, kernel: &'static str, buffers: impl FnOnce() -> Vec<&'h Handle>) {
         let mut kernels = self.kernels.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
         if kernels.insert(kernel)
@@ -492,9 +499,11 @@ fn on_one_line(text: impl Display, limit: usize) -> String {
     words.join(" ").chars().take(limit).collect()
 }
 
-/// Launches a kernel and counts it: `launch!(device, kernel::launch, groups, threads; buffers; scalars)`, with the threads
-/// of one group. Unsafe with `kernel::launch_unchecked`. Something else than a buffer takes its place
-/// if it has the methods `arg` and `handles` of [`Words`]: several buffers that kernels take as a struct.
+/// Launches a kernel and counts it:
+/// `launch!(device, kernel::launch, groups, threads; buffers; scalars)`, with the threads of one
+/// group. Unsafe with `kernel::launch_unchecked`. Something else than a buffer takes its place if
+/// it has the methods `arg` and `handles` of [`Words`]: several buffers that kernels take as a
+/// struct.
 macro_rules! launch {
     ($device:expr, $launch:expr, $groups:expr, $threads:expr; $($buffer:expr),+ $(; $($scalar:expr),+)?) => {{
         let device = &$device;
@@ -515,8 +524,8 @@ pub(super) use launch;
 /// Number of workgroups in one dimension that every adapter can launch.
 pub(super) const MAX_GROUPS: u32 = 65_535;
 
-/// Returns the launch size for `count` workgroups, in two dimensions beyond 65,535. Kernels use their absolute position
-/// and ignore the excess.
+/// Returns the launch size for `count` workgroups, in two dimensions beyond 65,535. Kernels use
+/// their absolute position and ignore the excess.
 pub(super) fn groups(count: usize) -> CubeCount {
     let rows = count.div_ceil(MAX_GROUPS as usize).max(1);
     CubeCount::Static(count.div_ceil(rows) as u32, rows as u32, 1)
@@ -548,7 +557,7 @@ mod tests {
                 "a_group_of_too_many_threads",
                 "a_device_that_is_lost",
             ] {
-                alone(&format!("gpu::testing::{test}"));
+                alone(&format!("gpu::device::tests::{test}"));
             }
         }
     }

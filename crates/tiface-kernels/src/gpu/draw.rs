@@ -1,4 +1,5 @@
-//! Sampling of random rays from photographs in device memory: 8 bits a channel, cropped to the box of drawable pixels.
+//! Sampling of random rays from photographs in device memory: 8 bits a channel, cropped to the box
+//! of drawable pixels.
 //!
 //! The pixel of a ray depends on seed, step and the ray's index alone, as on the CPU.
 
@@ -13,9 +14,9 @@ use tiface_base::math::rng;
 
 const UNITS: u32 = 256;
 
-/// Words that describe a photograph: pixels drawable up to and with it, box, its first pixel and the buffer that holds
-/// it, its first word of drawable bits, whether color is over black already, focal lengths, principal point, lens,
-/// rotation by columns, position, width of a pixel.
+/// Words that describe a photograph: pixels drawable up to and with it, box, its first pixel and
+/// the buffer that holds it, its first word of drawable bits, whether color is over black already,
+/// focal lengths, principal point, lens, rotation by columns, position, width of a pixel.
 const VIEW: usize = 39;
 const FIRST_PIXEL: usize = 5;
 const BUFFER: usize = 6;
@@ -38,16 +39,18 @@ pub const BUFFERS: usize = 4;
 pub struct DrawnView {
     /// Camera in scene coordinates.
     pub camera: Camera,
-    /// First column and row of the box of drawable pixels, its width and height; a width of 0 means none.
+    /// First column and row of the box of drawable pixels, its width and height; a width of 0 means
+    /// none.
     pub part: [u32; 4],
     /// The box's pixels, row by row: red, green, blue and alpha, from the lowest byte on.
     pub pixels: Vec<u32>,
-    /// Whether the colors are the head's over black already; otherwise they are the photograph's, to be multiplied by
-    /// alpha.
+    /// Whether the colors are the head's over black already; otherwise they are the photograph's,
+    /// to be multiplied by alpha.
     pub over_black: bool,
     /// One bit per pixel of the box, from the lowest of each word: whether the pixel is drawable.
     pub drawable: Vec<u32>,
-    /// The width of a pixel at the scene's middle, scene units, where rays may stand for squares of pixels; else infinite.
+    /// The width of a pixel at the scene's middle, scene units, where rays may stand for squares of
+    /// pixels; else infinite.
     pub pixel: f32,
 }
 
@@ -252,7 +255,8 @@ fn pixel_at(photographs: &PhotographArrays, view: usize, at: u32) -> u32 {
     }
 }
 
-/// Sums the square around a pixel of a view's box, at most `detail` wide; column and row are relative to the box.
+/// Sums the square around a pixel of a view's box, at most `detail` wide; column and row are
+/// relative to the box.
 #[cube]
 fn square(photographs: &PhotographArrays, view: usize, column: u32, row: u32, detail: f32) -> Square {
     let views = &photographs.views;
@@ -487,7 +491,8 @@ impl DeviceBatch {
 pub enum PixelOrder {
     /// Any drawable pixel, each as likely.
     Random,
-    /// Every photograph as often, any pixel of its box once: without a ray where that is not drawable.
+    /// Every photograph as often, any pixel of its box once: without a ray where that is not
+    /// drawable.
     EachView,
     /// Every drawable pixel once, then again in another order.
     Permuted {
@@ -519,7 +524,8 @@ pub struct Photographs {
     views: Buffer,
     pixels: [Buffer; BUFFERS],
     drawable: Buffer,
-    /// Drawable pixels of the view before each word of `drawable`; of one word where pixels are not permuted.
+    /// Drawable pixels of the view before each word of `drawable`; of one word where pixels are not
+    /// permuted.
     before: Buffer,
     /// Drawable pixels of all views.
     count: u32,
@@ -528,8 +534,8 @@ pub struct Photographs {
 }
 
 impl Photographs {
-    /// Copies photographs to the device, one after the other, into buffers of the given sizes in pixels,
-    /// first fit; the field's coordinates are the scene's times `radius`.
+    /// Copies photographs to the device, one after the other, into buffers of the given sizes in
+    /// pixels, first fit; the field's coordinates are the scene's times `radius`.
     ///
     /// # Panics
     ///
@@ -588,8 +594,8 @@ impl Photographs {
         self.arrays().map(|buffer| &buffer.handle)
     }
 
-    /// Draws the rays of a step, which depend on seed and step alone. A ray of a large photograph stands for a square of
-    /// pixels at most `detail` wide.
+    /// Draws the rays of a step, which depend on seed and step alone. A ray of a large photograph
+    /// stands for a square of pixels at most `detail` wide.
     ///
     /// # Shapes
     ///

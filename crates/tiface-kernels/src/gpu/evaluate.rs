@@ -13,8 +13,8 @@ use std::ops::Range;
 use tiface_base::Result;
 use tiface_base::geom::BitGrid;
 
-/// Number of samples evaluated together, which takes about two hundred megabytes of memory; fewer in
-/// tests, which drivers in software run.
+/// Number of samples evaluated together, which takes about two hundred megabytes of memory; fewer
+/// in tests, which drivers in software run.
 const CAPACITY: usize = if cfg!(test) { 1 << 15 } else { 1 << 17 };
 
 /// Smaller capacities for fewer points, because planes are copied whole.
@@ -52,8 +52,8 @@ impl Evaluator {
         Sdf::supports(shape)
     }
 
-    /// Uploads a field: its table, `[entries, 2]`, network weights, sharpness, and the cells to march through with those that
-    /// are solid.
+    /// Uploads a field: its table, `[entries, 2]`, network weights, sharpness, and the cells to
+    /// march through with those that are solid.
     pub fn new(
         device: Device,
         shape: &FieldShape,
@@ -81,8 +81,8 @@ impl Evaluator {
         }
     }
 
-    /// Evaluates `channels` of the eight outputs sdf, gradient (3), color (3) and logarithm of the local sharpness at points, a plane
-    /// `[n]` each.
+    /// Evaluates `channels` of the eight outputs sdf, gradient (3), color (3) and logarithm of the
+    /// local sharpness at points, a plane `[n]` each.
     ///
     /// # Shapes
     ///
@@ -122,7 +122,8 @@ impl Evaluator {
         Ok(out)
     }
 
-    /// Renders rays with march steps of `step`, and returns `[rays, 9]`: see [`crate::cpu::neus::forward`].
+    /// Renders rays with march steps of `step`, and returns `[rays, 9]`: see
+    /// [`crate::cpu::neus::forward`].
     pub fn render(&mut self, rays: &[MarchRay], step: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
         let device = &self.device;
         let step = device.upload(&[step]);

@@ -14,8 +14,9 @@ const GROUP: u32 = 256;
 /// Number of groups of threads that compute the bound on the sums of a level.
 const BOUNDING: usize = 64;
 
-/// Largest number of groups of threads that interpolate a level, or add to it: enough to fill a large card. They step
-/// through the samples, since their capacity is several times their usual number, and idle groups cost time, too.
+/// Largest number of groups of threads that interpolate a level, or add to it: enough to fill a
+/// large card. They step through the samples, since their capacity is several times their usual
+/// number, and idle groups cost time, too.
 const STEPPING: u32 = 128;
 
 /// Returns the groups that step through `capacity` samples of so many levels.
@@ -51,7 +52,8 @@ fn cell(levels: &[u32], level: usize, x: &[f32], s: usize, capacity: usize, worl
     }
 }
 
-/// Returns the entry of corner `k`, which lies at +1 along x if bit 0 is set, along y for bit 1 and along z for bit 2.
+/// Returns the entry of corner `k`, which lies at +1 along x if bit 0 is set, along y for bit 1 and
+/// along z for bit 2.
 #[cube]
 fn entry(levels: &[u32], level: usize, cell: &Cell, #[comptime] k: u32) -> usize {
     let (x, y, z) = (cell.low_x + (k & 1), cell.low_y + ((k >> 1) & 1), cell.low_z + (k >> 2));
@@ -78,8 +80,8 @@ fn signed(v: f32, #[comptime] up: bool) -> f32 {
 }
 
 /// Writes features of all levels, planes `[2 · levels, capacity]`, and their slopes, planes
-/// `[2 · levels · 3, capacity]`. Levels from `active` on are zero, and so are samples from `count[0]` to the end of the
-/// last tile.
+/// `[2 · levels · 3, capacity]`. Levels from `active` on are zero, and so are samples from
+/// `count[0]` to the end of the last tile.
 #[cube(launch)]
 fn gather(
     table: &[Vector<f32, Const<2>>],
@@ -178,9 +180,9 @@ fn scatter<S: Sum>(
     }
 }
 
-/// Writes partial sums of a bound on the sums of each level, `[levels, BOUNDING]`. The bound is the sum of all
-/// contributions, as if they went to one entry. Each level has [`BOUNDING`] groups of threads, each of which sums its own
-/// samples in a fixed order.
+/// Writes partial sums of a bound on the sums of each level, `[levels, BOUNDING]`. The bound is the
+/// sum of all contributions, as if they went to one entry. Each level has [`BOUNDING`] groups of
+/// threads, each of which sums its own samples in a fixed order.
 #[cube(launch)]
 fn bound(
     levels: &[u32],
@@ -277,8 +279,8 @@ impl Grid {
     /// # Shapes
     ///
     /// - table: `[entries, 2]`; x: planes `[3, capacity]`; count: `[1]`, the number of samples
-    /// - value: planes `[2 · levels, capacity]`; jacobian: planes `[2 · levels · 3, capacity]`, zeros after the last
-    ///   sample
+    /// - value: planes `[2 · levels, capacity]`; jacobian: planes `[2 · levels · 3, capacity]`,
+    ///   zeros after the last sample
     pub fn gather(
         &self,
         device: &Device,
@@ -301,8 +303,10 @@ impl Grid {
     ///
     /// # Shapes
     ///
-    /// - gradient: `[entries, 2]`; x: planes `[3, capacity]`; g_value: planes `[2 · levels, capacity]`
-    /// - slopes, if the Jacobian has a gradient: `q`, shaped like `g_value`, and `g_normal`, shaped like `x`
+    /// - gradient: `[entries, 2]`; x: planes `[3, capacity]`; g_value: planes
+    ///   `[2 · levels, capacity]`
+    /// - slopes, if the Jacobian has a gradient: `q`, shaped like `g_value`, and `g_normal`, shaped
+    ///   like `x`
     pub fn scatter(
         &self,
         device: &Device,
@@ -353,8 +357,9 @@ mod tests {
     const CAPACITY: usize = 1024;
     const RADIUS: f32 = 2.0;
 
-    /// Returns the published grid with smaller tables, and samples anywhere in the box. Positions and scales have few
-    /// digits, so that multiply-add gives the same result whether it is fused or not.
+    /// Returns the published grid with smaller tables, and samples anywhere in the box. Positions
+    /// and scales have few digits, so that multiply-add gives the same result whether it is fused
+    /// or not.
     fn grid() -> (Vec<hash::Level>, Vec<[f32; 2]>, Vec<[f32; 3]>) {
         let mut levels = hash::levels(16, 16, 1.447, 12);
         levels.iter_mut().for_each(|l| l.scale = l.scale.round());

@@ -13,15 +13,15 @@ const UNITS: u32 = 256;
 /// Number of words of [`tally`].
 pub(super) const TALLY: usize = 5;
 
-/// Offsets in the words of a tally: rays; rays with samples; rays whose pixel is entirely head; rays whose pixel is
-/// background; the last ray with samples, counted from 1.
+/// Offsets in the words of a tally: rays; rays with samples; rays whose pixel is entirely head;
+/// rays whose pixel is background; the last ray with samples, counted from 1.
 pub(super) const HIT: usize = 1;
 const HEAD: usize = 2;
 pub(super) const BACKGROUND: usize = 3;
 pub(super) const LAST: usize = 4;
 
-/// Counts rays. Runs as one group of threads. Without `sampled`, `offsets` is not read and no ray counts as one with
-/// samples.
+/// Counts rays. Runs as one group of threads. Without `sampled`, `offsets` is not read and no ray
+/// counts as one with samples.
 #[cube(launch)]
 pub(super) fn tally(
     offsets: &[u32],
@@ -70,7 +70,8 @@ pub(super) struct OpacityTerm {
     pub slope: f32,
 }
 
-/// Returns the binary cross entropy of an opacity with its target, times the ray's share in the mean.
+/// Returns the binary cross entropy of an opacity with its target, times the ray's share in the
+/// mean.
 #[cube]
 pub(super) fn cross_entropy(opacity: f32, target: f32, share: f32, weight: f32) -> OpacityTerm {
     let p = clamp(opacity, 1e-3f32, 1.0f32 - 1e-3f32);
@@ -79,8 +80,8 @@ pub(super) fn cross_entropy(opacity: f32, target: f32, share: f32, weight: f32) 
     OpacityTerm { value, slope: select(p == opacity, by_p, 0.0f32) }
 }
 
-/// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
-/// `[9, rays]`.
+/// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the
+/// composited values, planes `[9, rays]`.
 #[cube(launch)]
 fn of_rays(
     composed: &[f32],
@@ -130,7 +131,8 @@ fn of_rays(
     }
 }
 
-/// Writes the loss terms of samples, planes `[2, capacity]`, and adds their gradients with respect to the field's output.
+/// Writes the loss terms of samples, planes `[2, capacity]`, and adds their gradients with respect
+/// to the field's output.
 #[cube(launch)]
 fn of_samples(
     field: &[f32],
@@ -161,9 +163,9 @@ fn of_samples(
     }
 }
 
-/// Sums the loss terms in a fixed order, one group of threads per term. Also adds the squared error of a step with samples
-/// to a sum over steps, and counts such steps. `count` is the number of rows of `of_samples`, `met` that of samples of
-/// the step.
+/// Sums the loss terms in a fixed order, one group of threads per term. Also adds the squared error
+/// of a step with samples to a sum over steps, and counts such steps. `count` is the number of rows
+/// of `of_samples`, `met` that of samples of the step.
 #[cube(launch)]
 pub(super) fn sum(
     of_rays: &[f32],
@@ -245,8 +247,8 @@ impl Losses {
         &self.g_out
     }
 
-    /// Computes the losses of samples, and adds their gradients with respect to the field's output to `g_field`, planes
-    /// `[8, capacity]`.
+    /// Computes the losses of samples, and adds their gradients with respect to the field's output
+    /// to `g_field`, planes `[8, capacity]`.
     pub fn of_samples(&self, device: &Device, field: &Buffer, count: &Buffer, g_field: &Buffer) {
         let w = &self.weights;
         let capacity = self.sample_terms.word_count() / SAMPLE_TERMS;
@@ -262,9 +264,9 @@ impl Losses {
         );
     }
 
-    /// Returns the sums, `[8]`: the unweighted loss terms of the last step in the order of [`LossWeights`], with that of
-    /// stereo points last; then the sum of the squared errors of all steps with samples since
-    /// [`reset_sums`](Losses::reset_sums), and the number of these steps.
+    /// Returns the sums, `[8]`: the unweighted loss terms of the last step in the order of
+    /// [`LossWeights`], with that of stereo points last; then the sum of the squared errors of all
+    /// steps with samples since [`reset_sums`](Losses::reset_sums), and the number of these steps.
     pub fn sums(&self) -> &Buffer {
         &self.sums
     }
@@ -305,7 +307,8 @@ mod tests {
         field: Vec<[f32; 8]>,
     }
 
-    /// Returns five rays, one of them without samples, whose pixels are head, background and partly head.
+    /// Returns five rays, one of them without samples, whose pixels are head, background and partly
+    /// head.
     fn case() -> Case {
         let uniform = |stream: u64, i: usize| rng::uniform(9, stream, i as u64);
         let rows =

@@ -1,6 +1,6 @@
-//! Marching through the occupancy bitmask of [`crate::cpu::march`], without a readback of the number of samples: a
-//! first pass counts the samples of each ray, a prefix sum gives the offset of each ray, and a second pass writes the
-//! samples.
+//! Marching through the occupancy bitmask of [`crate::cpu::march`], without a readback of the
+//! number of samples: a first pass counts the samples of each ray, a prefix sum gives the offset of
+//! each ray, and a second pass writes the samples.
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::draw::DeviceBatch;
@@ -55,8 +55,8 @@ fn border(g: f32, cell: i32, d: f32) -> f32 {
     select(d == 0.0f32, FAR, (wall - g) * (1.0f32 / d))
 }
 
-/// Returns the number of samples of a ray that are written. A ray whose samples exceed the capacity is
-/// marked as not alive.
+/// Returns the number of samples of a ray that are written. A ray whose samples exceed the capacity
+/// is marked as not alive.
 #[cube]
 pub(super) fn room(offsets: &[u32], counts: &[u32], alive: &mut [u32], r: usize) -> u32 {
     let room = offsets[r + 1] - offsets[r];
@@ -168,7 +168,8 @@ fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
     for i in 0..unit {
         before += sums[i];
     }
-    // the largest end of a ray that fits the capacity, over this thread's rays and then over all rays
+    // the largest end of a ray that fits the capacity, over this thread's rays and then over all
+    // rays
     let mut last = 0u32;
     let mut at = before;
     for r in begin..end {
@@ -195,9 +196,9 @@ fn scan(counts: &[u32], offsets: &mut [u32], total: &mut [u32], capacity: u32) {
     }
 }
 
-/// Writes the offsets of each ray's samples, `[rays + 1]`, from their counts `[rays]`, and two totals, `[2]`: the number of
-/// samples, and the number with unlimited capacity. The first ray whose samples exceed the capacity, and all rays after
-/// it, get no samples.
+/// Writes the offsets of each ray's samples, `[rays + 1]`, from their counts `[rays]`, and two
+/// totals, `[2]`: the number of samples, and the number with unlimited capacity. The first ray
+/// whose samples exceed the capacity, and all rays after it, get no samples.
 pub(super) fn prefix_sum(
     device: &Device,
     counts: &Buffer,
@@ -256,9 +257,9 @@ impl Samples {
         }
     }
 
-    /// Marches rays with steps of length `step_length`, `[1]`: see [`crate::cpu::march::march`]. Each ray keeps at
-    /// most `limit` samples. Rays whose samples exceed the capacity are marked as not alive. The last `reserved` places
-    /// of the buffers stay free.
+    /// Marches rays with steps of length `step_length`, `[1]`: see [`crate::cpu::march::march`].
+    /// Each ray keeps at most `limit` samples. Rays whose samples exceed the capacity are marked as
+    /// not alive. The last `reserved` places of the buffers stay free.
     pub fn march(
         &self,
         device: &Device,
@@ -294,8 +295,8 @@ mod tests {
     const RADIUS: f32 = 1.1;
     const STEP: f32 = 0.02;
 
-    /// Returns a mask with holes, solid cells, and rays from all around towards the center, one along an axis and one that
-    /// misses.
+    /// Returns a mask with holes, solid cells, and rays from all around towards the center, one
+    /// along an axis and one that misses.
     fn scene() -> (BitGrid, BitGrid, Vec<MarchRay>) {
         let resolution = 24;
         let mut mask = BitGrid::filled(resolution, false);

@@ -42,7 +42,8 @@ fn between(previous: f32, next: f32) -> f32 {
     (previous - next + EPSILON) / (previous + EPSILON)
 }
 
-/// Writes the opacity at points of a march step that meets the surface head-on, `[capacity]`: see [`neus::occupancy`](crate::cpu::neus::occupancy).
+/// Writes the opacity at points of a march step that meets the surface head-on, `[capacity]`: see
+/// [`neus::occupancy`](crate::cpu::neus::occupancy).
 #[cube(launch)]
 fn opacities(field: &[f32], inv_s: &[f32], count: &[u32], out: &mut [f32], step: f32) {
     let s = ABSOLUTE_POS;
@@ -133,8 +134,8 @@ fn forward(
     }
 }
 
-/// Writes the gradients with respect to the field's output, and the contribution of each ray to that with respect to
-/// `ln inv_s`.
+/// Writes the gradients with respect to the field's output, and the contribution of each ray to
+/// that with respect to `ln inv_s`.
 #[cube(launch)]
 fn backward(
     offsets: &[u32],
@@ -204,8 +205,8 @@ fn backward(
     }
 }
 
-/// Sums the rays' gradients with respect to `ln inv_s` in a fixed order, and writes the gradient with respect to `inv_s`;
-/// it is zero if `inv_s` was clamped.
+/// Sums the rays' gradients with respect to `ln inv_s` in a fixed order, and writes the gradient
+/// with respect to `inv_s`; it is zero if `inv_s` was clamped.
 #[cube(launch)]
 fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
     let unit = UNIT_POS as usize;
@@ -244,8 +245,9 @@ impl Neus {
         &self.out
     }
 
-    /// Returns the opacities, `[capacity]`, of march steps of length `step` that meet the surface head-on at the first
-    /// `count` points of a field's output. The next forward pass overwrites them.
+    /// Returns the opacities, `[capacity]`, of march steps of length `step` that meet the surface
+    /// head-on at the first `count` points of a field's output. The next forward pass overwrites
+    /// them.
     pub fn opacities(
         &self,
         device: &Device,
@@ -261,13 +263,14 @@ impl Neus {
         out
     }
 
-    /// Returns the gradients with respect to the field's output of the last backward pass, planes `[8, capacity]`.
+    /// Returns the gradients with respect to the field's output of the last backward pass, planes
+    /// `[8, capacity]`.
     pub fn gradient(&self) -> &Buffer {
         &self.g_field
     }
 
-    /// Composites the field's output at the samples of rays, planes `[8, capacity]`, and returns planes
-    /// `[9, rays]`; inv_s: `[1]`.
+    /// Composites the field's output at the samples of rays, planes `[8, capacity]`, and returns
+    /// planes `[9, rays]`; inv_s: `[1]`.
     pub fn forward(
         &self,
         device: &Device,
@@ -284,8 +287,9 @@ impl Neus {
         &self.out
     }
 
-    /// Computes the gradients of the last forward pass. Returns those with respect to the field's output, planes
-    /// `[8, capacity]`, which are valid for existing samples only, and writes that with respect to `inv_s` to `g_inv_s`.
+    /// Computes the gradients of the last forward pass. Returns those with respect to the field's
+    /// output, planes `[8, capacity]`, which are valid for existing samples only, and writes that
+    /// with respect to `inv_s` to `g_inv_s`.
     pub fn backward(
         &self,
         device: &Device,
@@ -397,7 +401,8 @@ mod tests {
             let [got, want] = device_and_cpu(&device, segments, &field, inv_s, anneal, &g);
             agree("rays", &got.0, &want.0, 1e-4);
             for k in 0..8 {
-                // the gradient by the sdf is a difference of nearly equal numbers, which is no more accurate on the CPU
+                // the gradient by the sdf is a difference of nearly equal numbers, which is no more
+                // accurate on the CPU
                 let tolerance = if k == 0 { 2e-4 } else { 1e-4 };
                 let (got, want) = (&got.1[k * n..][..n], &want.1[k * n..][..n]);
                 agree(&format!("gradient by output {k}"), got, want, tolerance);

@@ -1,4 +1,5 @@
-//! Updates of the occupancy grid on the device, by a band around the zero level set or by nerfacc's rule.
+//! Updates of the occupancy grid on the device, by a band around the zero level set or by nerfacc's
+//! rule.
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::sdf::Sdf;
@@ -44,14 +45,15 @@ fn centers(
     }
 }
 
-/// Returns the reach of the band around a cell's center, where the local sharpness is `share` times the maximum.
+/// Returns the reach of the band around a cell's center, where the local sharpness is `share` times
+/// the maximum.
 #[cube]
 fn reach_at(band: f32, inv_s: f32, share: f32, half: f32) -> f32 {
     band / (clamp(inv_s, 1e-6f32, 1e6f32) * share) + half
 }
 
-/// Stores the signed distance and the reach of the evaluated cells. The reach is 0 where even the softest surface would
-/// be too far away.
+/// Stores the signed distance and the reach of the evaluated cells. The reach is 0 where even the
+/// softest surface would be too far away.
 #[cube(launch)]
 fn store(
     cells: &[u32],
@@ -132,8 +134,8 @@ fn decide(
     }
 }
 
-/// Masks on a device of the cells of a cubic grid over `[-radius, radius]³` that may contain surface, and of those that
-/// are solid.
+/// Masks on a device of the cells of a cubic grid over `[-radius, radius]³` that may contain
+/// surface, and of those that are solid.
 pub struct Occupancy {
     pub(super) mask: Buffer,
     pub(super) solid: Option<Buffer>,
@@ -154,8 +156,8 @@ impl Occupancy {
         Occupancy { mask: upload(mask), solid: solid.map(upload), resolution: mask.resolution, radius }
     }
 
-    /// Waits for the device and returns both masks: the occupied cells and the solid ones; the latter mask is empty if
-    /// the device holds none.
+    /// Waits for the device and returns both masks: the occupied cells and the solid ones; the
+    /// latter mask is empty if the device holds none.
     pub fn read(&self, device: &Device) -> Result<[BitGrid; 2]> {
         let mut masks = [BitGrid::filled(self.resolution, false), BitGrid::filled(self.resolution, false)];
         for (mask, buffer) in masks.iter_mut().zip([Some(&self.mask), self.solid.as_ref()]) {
@@ -193,8 +195,8 @@ impl BandUpdate {
         }
     }
 
-    /// Evaluates the field at all allowed cells and updates the masks. `x` and `direction` are planes `[3, capacity]`, of
-    /// which `x` is overwritten; `inv_s` is `[1]`.
+    /// Evaluates the field at all allowed cells and updates the masks. `x` and `direction` are
+    /// planes `[3, capacity]`, of which `x` is overwritten; `inv_s` is `[1]`.
     pub fn update(
         &self,
         device: &Device,

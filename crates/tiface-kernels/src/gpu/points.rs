@@ -1,8 +1,8 @@
-//! Stereo points, which the surface should pass through. Each step draws some of them and evaluates them together with its
-//! samples, after which they are stored.
+//! Stereo points, which the surface should pass through. Each step draws some of them and evaluates
+//! them together with its samples, after which they are stored.
 //!
-//! With `f` the distance at a point, `p` the length of a pixel at the point, and `w` its weight, the mean over the points of a
-//! step of `w (√((f / p)² + k²) − k)`.
+//! With `f` the distance at a point, `p` the length of a pixel at the point, and `w` its weight,
+//! the mean over the points of a step of `w (√((f / p)² + k²) − k)`.
 
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::march::Samples;
@@ -48,7 +48,8 @@ fn append(
     }
 }
 
-/// Writes the loss terms of points, `[points]`, and the gradients with respect to the field's output at the points.
+/// Writes the loss terms of points, `[points]`, and the gradients with respect to the field's
+/// output at the points.
 #[cube(launch)]
 fn of_points(
     rows: &[f32],
@@ -107,8 +108,8 @@ impl SurfacePoints {
         }
     }
 
-    /// Replaces the points. Each row holds the position in field coordinates, the length of a pixel at the point, and the
-    /// weight.
+    /// Replaces the points. Each row holds the position in field coordinates, the length of a pixel
+    /// at the point, and the weight.
     pub fn set(&mut self, device: &Device, rows: &[[f32; ROW]]) {
         self.count = rows.len();
         self.terms = device.zeros::<f32>(self.max_per_step());
@@ -122,8 +123,8 @@ impl SurfacePoints {
         self.terms.word_count()
     }
 
-    /// Draws points by seed and step, writes them after the step's samples, and returns the number of samples and points,
-    /// `[1]`.
+    /// Draws points by seed and step, writes them after the step's samples, and returns the number
+    /// of samples and points, `[1]`.
     pub fn append(&self, device: &Device, (seed, step): (u64, u64), samples: &Samples) -> &Buffer {
         let stream = stream(seed, step << 4 | STEREO_STREAM);
         launch!(device, append::launch, groups(self.max_per_step().div_ceil(UNITS as usize)), UNITS;
@@ -133,8 +134,8 @@ impl SurfacePoints {
         &self.total
     }
 
-    /// Writes the gradients with respect to the field's output at a step's points, after those of its samples, planes
-    /// `[8, capacity]`. `count` is the number of samples without points.
+    /// Writes the gradients with respect to the field's output at a step's points, after those of
+    /// its samples, planes `[8, capacity]`. `count` is the number of samples without points.
     pub fn losses(&self, device: &Device, field: &Buffer, count: &Buffer, g_field: &Buffer) {
         if self.count == 0 {
             return;
@@ -145,7 +146,8 @@ impl SurfacePoints {
         );
     }
 
-    /// Returns the unweighted contribution of each point of the last step to the loss, `[max_per_step]`.
+    /// Returns the unweighted contribution of each point of the last step to the loss,
+    /// `[max_per_step]`.
     pub fn terms(&self) -> &Buffer {
         &self.terms
     }

@@ -1,7 +1,8 @@
-//! The random numbers of [`tiface_base::math::rng`], with the same bits. 64-bit words are pairs of 32-bit words, because not
-//! every adapter has 64-bit integers.
+//! The random numbers of [`tiface_base::math::rng`], with the same bits. 64-bit words are pairs of
+//! 32-bit words, because not every adapter has 64-bit integers.
 //!
-//! [`upper_bound`] and [`ranked`] select the item of a random number, by binary search in running counts.
+//! [`upper_bound`] and [`ranked`] select the item of a random number, by binary search in running
+//! counts.
 
 use burn::cubecl::{self, prelude::*};
 use tiface_base::math::rng;
@@ -93,8 +94,8 @@ pub(super) fn word(bits: u64) -> WideLaunch {
     WideLaunch::new((bits >> 32) as u32, bits as u32)
 }
 
-/// Returns the first of `values[first..end]` that exceeds `v`, of non-decreasing values; only every `stride`-th counts,
-/// and indices count those.
+/// Returns the first of `values[first..end]` that exceeds `v`, of non-decreasing values; only every
+/// `stride`-th counts, and indices count those.
 #[cube]
 pub(super) fn upper_bound(
     values: &[u32],
@@ -116,8 +117,8 @@ pub(super) fn upper_bound(
     low
 }
 
-/// Returns the bit of the words `first..first + words` of a mask that has so many set bits before it; `before` holds the
-/// count before each word.
+/// Returns the bit of the words `first..first + words` of a mask that has so many set bits before
+/// it; `before` holds the count before each word.
 #[cube]
 pub(super) fn ranked(before: &[u32], mask: &[u32], first: usize, words: usize, rank: u32) -> u32 {
     let word = upper_bound(before, first, first + words, rank, 1usize) - 1;

@@ -1,5 +1,5 @@
-//! State that a training step takes from the previous one, without a readback: the number of rays and the length of a
-//! march step.
+//! State that a training step takes from the previous one, without a readback: the number of rays
+//! and the length of a march step.
 
 use super::device::{Buffer, Device, Words, launch};
 use crate::cpu::losses::TERMS;
@@ -93,8 +93,8 @@ impl Schedule {
         }
     }
 
-    /// Prepares the next step, from the sharpness and, unless it is the first step, from `count`, `[2]`: the number of
-    /// samples of the last step, and the number with unlimited capacity.
+    /// Prepares the next step, from the sharpness and, unless it is the first step, from `count`,
+    /// `[2]`: the number of samples of the last step, and the number with unlimited capacity.
     pub fn advance(&self, device: &Device, inv_s: &Buffer, count: &Buffer, first: bool) {
         let RayBudget { samples, min, max } = self.budget;
         let [units, shortest, longest] = match self.rule {
@@ -107,8 +107,8 @@ impl Schedule {
         );
     }
 
-    /// Waits for the device and returns the number of rays of the next step. `count` is the number of samples of the last
-    /// step, `[2]`, or `None` before the first one.
+    /// Waits for the device and returns the number of rays of the next step. `count` is the number
+    /// of samples of the last step, `[2]`, or `None` before the first one.
     pub fn next_rays(&self, device: &Device, count: Option<&Buffer>) -> Result<usize> {
         let rays = device.fetch::<u32>(&self.rays)?[0] as usize;
         let wanted = count.map(|count| device.fetch::<u32>(count)).transpose()?;

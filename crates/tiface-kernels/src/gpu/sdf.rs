@@ -1,12 +1,12 @@
-//! The signed-distance field of [`crate::cpu::sdf`], whose module holds the formulas: the forward pass with
-//! normals, and the backward pass with its second-order path.
+//! The signed-distance field of [`crate::cpu::sdf`], whose module holds the formulas: the forward
+//! pass with normals, and the backward pass with its second-order path.
 //!
-//! A group of 256 threads evaluates all layers for 64 samples. Activations are kept in workgroup memory, channel by
-//! channel; a thread holds four samples of four channels. Weights, 90 kB, are read from global memory: all groups read
-//! the same ones, so they stay in the nearest cache, and workgroup memory is free for two tiles of activations (32 KiB).
-//! Gradients of weights are summed by group, in registers, then over the groups in a fixed order.
-//! The backward pass is two kernels, one per network, because a software driver takes ten times as
-//! long to compile a single one.
+//! A group of 256 threads evaluates all layers for 64 samples. Activations are kept in workgroup
+//! memory, channel by channel; a thread holds four samples of four channels. Weights, 90 kB, are
+//! read from global memory: all groups read the same ones, so they stay in the nearest cache, and
+//! workgroup memory is free for two tiles of activations (32 KiB). Gradients of weights are summed
+//! by group, in registers, then over the groups in a fixed order. The backward pass is two kernels,
+//! one per network, because a software driver takes ten times as long to compile a single one.
 
 pub(super) mod kernels;
 
@@ -18,9 +18,9 @@ use crate::cpu::mlp::{HIDDEN, Layout, OUTPUTS, TILE};
 use crate::cpu::sdf::{FieldShape, WIDTH};
 use kernels::{forward, geometry_backward, prepare, sum_groups};
 
-/// Maximum number of groups that sum gradients of weights, each over its own tiles. wgpu states no number of
-/// multiprocessors; the largest cards run about a thousand groups of 256 threads with 32 KiB of workgroup memory at once.
-/// More groups than tiles are never launched.
+/// Maximum number of groups that sum gradients of weights, each over its own tiles. wgpu states no
+/// number of multiprocessors; the largest cards run about a thousand groups of 256 threads with 32
+/// KiB of workgroup memory at once. More groups than tiles are never launched.
 const SUMMING: usize = 1024;
 
 /// Returns the number of groups that sum gradients of up to `capacity` samples.
@@ -28,8 +28,8 @@ pub(super) fn summing(capacity: usize) -> usize {
     SUMMING.min(capacity / TILE)
 }
 
-/// Offsets of the matrices of a field, in rows of 64 floats. Weights are stored in the orders in which they are read,
-/// gradients row-major like on the CPU. Geometry columns are `[hash, x]`.
+/// Offsets of the matrices of a field, in rows of 64 floats. Weights are stored in the orders in
+/// which they are read, gradients row-major like on the CPU. Geometry columns are `[hash, x]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct SdfPlan {
     /// Number of hash features: two per level.
@@ -101,12 +101,13 @@ impl SdfPlan {
     }
 }
 
-/// Returns two index maps: for each float of the prepared weights, `rows` of 64, its index in the flat vector, or
-/// `u32::MAX` for padding; and for each float of the flat vector its index in the gradients.
+/// Returns two index maps: for each float of the prepared weights, `rows` of 64, its index in the
+/// flat vector, or `u32::MAX` for padding; and for each float of the flat vector its index in the
+/// gradients.
 ///
-/// The flat vector has matrices of these `shapes`, `(outputs, inputs)`; one with a single input is a bias, which is one
-/// row elsewhere. `places` are the first rows of a matrix as it is, of its transpose, and of its gradient. `column` returns
-/// the column of an input of a matrix.
+/// The flat vector has matrices of these `shapes`, `(outputs, inputs)`; one with a single input is
+/// a bias, which is one row elsewhere. `places` are the first rows of a matrix as it is, of its
+/// transpose, and of its gradient. `column` returns the column of an input of a matrix.
 pub(super) fn maps(
     shapes: &[(usize, usize)],
     places: &[(Option<usize>, Option<usize>, usize)],
@@ -130,7 +131,8 @@ pub(super) fn maps(
     (prepared, summed)
 }
 
-/// A signed-distance field on a device, with the activations and gradients of up to `capacity` samples.
+/// A signed-distance field on a device, with the activations and gradients of up to `capacity`
+/// samples.
 pub struct Sdf {
     plan: SdfPlan,
     grid: Grid,
@@ -157,7 +159,8 @@ pub struct Sdf {
 }
 
 impl Sdf {
-    /// Returns whether a device can compute a field of this shape; about twenty levels are too many.
+    /// Returns whether a device can compute a field of this shape; about twenty levels are too
+    /// many.
     pub fn supports(shape: &FieldShape) -> bool {
         SdfPlan::fits(shape.layout())
     }
@@ -201,7 +204,8 @@ impl Sdf {
         [6 * features + 3 * HIDDEN + 2 * OUTPUTS + WIDTH + 3, HIDDEN.max(3 * features)]
     }
 
-    /// Returns the memory of the groups' partial gradient sums in words, for up to `capacity` samples.
+    /// Returns the memory of the groups' partial gradient sums in words, for up to `capacity`
+    /// samples.
     pub fn words_of_sums(shape: &FieldShape, capacity: usize) -> usize {
         summing(capacity) * SdfPlan::new(shape.layout()).color.gradients[1] * CHANNELS
     }
@@ -216,13 +220,14 @@ impl Sdf {
         self.grid.activate(levels);
     }
 
-    /// Evaluates sdf, gradient and color of samples, and keeps the activations that the backward pass needs: see
-    /// [`crate::cpu::sdf::forward`].
+    /// Evaluates sdf, gradient and color of samples, and keeps the activations that the backward
+    /// pass needs: see [`crate::cpu::sdf::forward`].
     ///
     /// # Shapes
     ///
     /// - table: `[entries, 2]`; flat: the weights as [`Layout`] describes
-    /// - x, direction: planes `[3, capacity]`, finite after the last sample; count: `[1]`, the number of samples
+    /// - x, direction: planes `[3, capacity]`, finite after the last sample; count: `[1]`, the
+    ///   number of samples
     /// - output: planes `[8, capacity]`
     pub fn forward(
         &self,
@@ -236,8 +241,8 @@ impl Sdf {
         self.shade(device, [table, flat], x, direction, None, count)
     }
 
-    /// Evaluates samples like [`Sdf::forward`]. If normals are given, planes `[3, capacity]`, they replace the gradient both
-    /// as inputs of the color network and in the output.
+    /// Evaluates samples like [`Sdf::forward`]. If normals are given, planes `[3, capacity]`, they
+    /// replace the gradient both as inputs of the color network and in the output.
     pub fn shade(
         &self,
         device: &Device,
@@ -264,8 +269,9 @@ impl Sdf {
         &self.out
     }
 
-    /// Adds the gradient with respect to the table, which must be zero before, and writes that with respect to the weights,
-    /// for the samples of the last forward pass: see [`crate::cpu::sdf::backward`].
+    /// Adds the gradient with respect to the table, which must be zero before, and writes that with
+    /// respect to the weights, for the samples of the last forward pass: see
+    /// [`crate::cpu::sdf::backward`].
     ///
     /// # Shapes
     ///

@@ -1,11 +1,14 @@
-//! Sums over threads: atomic addition to one word, by [`Atomics`](super::Atomics), and sums over a group in a fixed order.
+//! Sums over threads: atomic addition to one word, by [`Atomics`](super::Atomics), and sums over a
+//! group in a fixed order.
 
 use burn::cubecl::{self, prelude::*};
 
-/// Integer to which the bound on a fixed-point sum is scaled. The margin up to 2³¹ allows for the rounding of 10⁸ terms.
+/// Integer to which the bound on a fixed-point sum is scaled. The margin up to 2³¹ allows for the
+/// rounding of 10⁸ terms.
 pub const FIXED_POINT_RANGE: f32 = 2e9;
 
-/// Returns the sum over the threads of a group, in their order, to the first thread; the others get 0.
+/// Returns the sum over the threads of a group, in their order, to the first thread; the others
+/// get 0.
 #[cube]
 pub fn group_sum<N: Numeric>(value: N, #[comptime] units: usize) -> N {
     let mut values = Shared::<[N]>::new_slice(units);
@@ -51,8 +54,9 @@ impl Sum for Exchange {
     type Word = u32;
 
     fn add(word: &Atomic<u32>, v: f32, _unit: f32) {
-        // Each iteration takes the value of the word and leaves 0, writes back the sum, and continues with whatever other
-        // threads wrote in between. A weak compare-exchange could fail spuriously without reporting it.
+        // Each iteration takes the value of the word and leaves 0, writes back the sum, and
+        // continues with whatever other threads wrote in between. A weak compare-exchange could
+        // fail spuriously without reporting it.
         let mut pending = v;
         while pending != 0.0f32 {
             let found = f32::reinterpret(word.exchange(0u32));

@@ -46,8 +46,8 @@ pub fn agree(what: &str, got: &[f32], want: &[f32], tolerance: f32) {
     assert!(worst <= tolerance, "{what}: {worst:.1e}");
 }
 
-/// Runs an ignored test in a process of its own: what is noted of one device fails the next read of any, and all take
-/// of the same memory.
+/// Runs an ignored test in a process of its own: what is noted of one device fails the next read of
+/// any, and all take of the same memory.
 pub fn alone(name: &str) {
     let this = std::env::current_exe().unwrap();
     let run = std::process::Command::new(this).args(["--ignored", "--exact", name]).output().unwrap();
@@ -56,7 +56,8 @@ pub fn alone(name: &str) {
     println!("{text}");
 }
 
-/// Returns the largest error of an array, as a part of the larger of a value and the mean magnitude.
+/// Returns the largest error of an array, as a part of the larger of a value and the mean
+/// magnitude.
 pub fn worst(got: &[f32], want: &[f32]) -> f32 {
     let mean = want.iter().map(|v| v.abs()).sum::<f32>() / want.len().max(1) as f32;
     let error = |(g, w): (&f32, &f32)| (g - w).abs() / w.abs().max(mean).max(f32::MIN_POSITIVE);

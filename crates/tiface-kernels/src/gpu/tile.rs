@@ -1,8 +1,9 @@
 //! Matrix products of tiles in workgroup memory, by 256 threads.
 //!
-//! A vector holds four samples of a channel. A tile has `lanes` vectors for each of its [`channels`]: it is 64 samples
-//! times 64 channels, or 32 times 128. Thread `(row, column)` owns vector `row` of channels `4 column .. 4 column + 4`, a
-//! [`Block`]. Weights are stored in rows with as many floats as a tile has channels, `[inputs, channels]`.
+//! A vector holds four samples of a channel. A tile has `lanes` vectors for each of
+//! its [`channels`]: it is 64 samples times 64 channels, or 32 times 128. Thread `(row, column)`
+//! owns vector `row` of channels `4 column .. 4 column + 4`, a [`Block`]. Weights are stored in
+//! rows with as many floats as a tile has channels, `[inputs, channels]`.
 
 use burn::cubecl::{self, prelude::*};
 
@@ -15,7 +16,8 @@ pub const LANES: usize = 16;
 /// Number of threads that work on a tile.
 pub const UNITS: u32 = 256;
 
-/// Returns the number of threads per row of a tile, which is also the number of vectors in a row of weights.
+/// Returns the number of threads per row of a tile, which is also the number of vectors in a row of
+/// weights.
 pub const fn columns(lanes: usize) -> usize {
     UNITS as usize / lanes
 }
@@ -25,16 +27,17 @@ pub const fn channels(lanes: usize) -> usize {
     4 * columns(lanes)
 }
 
-/// Returns the index of a channel's vector in a tile. The layout puts neighboring channels in different banks, whether a
-/// tile is read along channels or along samples.
+/// Returns the index of a channel's vector in a tile. The layout puts neighboring channels in
+/// different banks, whether a tile is read along channels or along samples.
 #[cube]
 pub fn at(channel: usize, row: usize, #[comptime] lanes: usize) -> usize {
     channel * lanes + (row ^ (channel % lanes))
 }
 
-/// Returns the first word of `count`, which all threads read from a tile that is not in use yet, after a barrier. FXC, the
-/// older compiler of DX12, rejects barriers in loops and branches whose condition comes from a buffer. On some adapters
-/// tiles take all of the workgroup memory, so the word is passed as two integers in the floats of a tile.
+/// Returns the first word of `count`, which all threads read from a tile that is not in use yet,
+/// after a barrier. FXC, the older compiler of DX12, rejects barriers in loops and branches whose
+/// condition comes from a buffer. On some adapters tiles take all of the workgroup memory, so the
+/// word is passed as two integers in the floats of a tile.
 #[cube]
 pub fn uniform_count(count: &[u32], tile: &mut [F4]) -> usize {
     if UNIT_POS == 0 {
@@ -123,8 +126,8 @@ pub fn product(
     Block::of(c0, c1, c2, c3)
 }
 
-/// Returns output `column` of a layer with few outputs, whose inputs are all channels; its weights are
-/// `[outputs, channels]`. Columns after the last output get zero.
+/// Returns output `column` of a layer with few outputs, whose inputs are all channels; its weights
+/// are `[outputs, channels]`. Columns after the last output get zero.
 #[cube]
 pub fn output_layer(
     a: &[F4],
@@ -148,8 +151,8 @@ pub fn output_layer(
     sum
 }
 
-/// Returns the transpose of a block: four samples' vectors of channels become four channels' vectors of samples, and
-/// vice versa.
+/// Returns the transpose of a block: four samples' vectors of channels become four channels'
+/// vectors of samples, and vice versa.
 #[cube]
 pub fn transposed(b: &Block) -> Block {
     Block::of(component(b, 0usize), component(b, 1usize), component(b, 2usize), component(b, 3usize))
@@ -324,8 +327,8 @@ pub fn zero_sums(#[comptime] count: usize) -> Array<F4> {
     sums
 }
 
-/// Adds [`outer_row`] of each row that a thread owns in a gradient, `row` and every `lanes`-th after
-/// it, to `sums[first..first + rows]`. Indices are constants, so the sums stay in registers.
+/// Adds [`outer_row`] of each row that a thread owns in a gradient, `row` and every `lanes`-th
+/// after it, to `sums[first..first + rows]`. Indices are constants, so the sums stay in registers.
 #[cube]
 pub fn add_outer(
     sums: &mut Array<F4>,
@@ -350,8 +353,8 @@ pub fn add_outer(
     }
 }
 
-/// Adds the sums of [`add_outer`] to a gradient whose rows have all channels of a tile, or overwrites
-/// it if `fresh` is set.
+/// Adds the sums of [`add_outer`] to a gradient whose rows have all channels of a tile, or
+/// overwrites it if `fresh` is set.
 #[cube]
 pub fn flush_outer(
     gradient: &mut [f32],

@@ -27,8 +27,8 @@ impl Vec3 {
         Vec3::new(0.0f32, 0.0f32, 0.0f32)
     }
 
-    /// Returns the vector whose components are words `first`, `first + stride` and `first + 2 stride`:
-    /// with a stride of one plane, those of an item of planes `[3, stride]`.
+    /// Returns the vector whose components are words `first`, `first + stride` and
+    /// `first + 2 stride`: with a stride of one plane, those of an item of planes `[3, stride]`.
     pub fn read(words: &[f32], stride: usize, first: usize) -> Vec3 {
         Vec3::new(words[first], words[first + stride], words[first + 2 * stride])
     }

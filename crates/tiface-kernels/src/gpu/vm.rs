@@ -1,8 +1,10 @@
-//! TensoRF's field of [`crate::cpu::vm`], whose modules hold the formulas: rays through it, and their gradients.
+//! TensoRF's field of [`crate::cpu::vm`], whose modules hold the formulas: rays through it, and
+//! their gradients.
 //!
-//! Samples in occupied cells are marched first; then their densities are looked up, weights are composited, and
-//! those worth a color are listed and decoded. The rays that the CPU ends early are marched on here, but what lies
-//! behind has neither weight nor gradient either. [`VmRenderer`] renders a trained field along any number of rays.
+//! Samples in occupied cells are marched first; then their densities are looked up, weights are
+//! composited, and those worth a color are listed and decoded. The rays that the CPU ends early are
+//! marched on here, but what lies behind has neither weight nor gradient either. [`VmRenderer`]
+//! renders a trained field along any number of rays.
 
 mod decoder;
 mod grid;
@@ -26,7 +28,8 @@ use tiface_base::Result;
 /// Number of samples of a tile; capacities are multiples of it.
 const TILE: usize = 64;
 
-/// Maximum number of samples of a pass of a field that is not trained; if rays have more, a pass takes fewer rays.
+/// Maximum number of samples of a pass of a field that is not trained; if rays have more, a pass
+/// takes fewer rays.
 const SEEN: usize = 1 << 22;
 
 /// A field on a device, with buffers for a batch of rays.
@@ -41,7 +44,8 @@ pub struct Vm {
     composited: CompositedRays,
 }
 
-/// The weights of a field on a device: planes and lines as [`DeviceGrid::upload`] lays them, the decoder's as the CPU's.
+/// The weights of a field on a device: planes and lines as [`DeviceGrid::upload`] lays them, the
+/// decoder's as the CPU's.
 #[derive(Clone, Copy)]
 pub struct VmValues<'a> {
     /// Planes and lines of the density.
@@ -53,14 +57,14 @@ pub struct VmValues<'a> {
 }
 
 impl Vm {
-    /// Allocates buffers for `rays` rays with any number of samples, and for gradients if `learns`. The decoder must be one that
-    /// [`DeviceDecoder::supports`].
+    /// Allocates buffers for `rays` rays with any number of samples, and for gradients if `learns`.
+    /// The decoder must be one that [`DeviceDecoder::supports`].
     pub fn new(device: &Device, field: &VmField, rays: usize, learns: bool) -> Vm {
         Vm::with_max_samples(device, field, rays, if learns { usize::MAX } else { SEEN }, learns)
     }
 
-    /// Returns the bytes of a field that learns from batches of so many rays: with values, moments and gradients, and for
-    /// each ray of a batch. Buffers hold all samples that rays can have.
+    /// Returns the bytes of a field that learns from batches of so many rays: with values, moments
+    /// and gradients, and for each ray of a batch. Buffers hold all samples that rays can have.
     pub fn bytes(device: &Device, field: &VmField, rays: usize) -> [u64; 2] {
         let floats = |grid: Grid| DeviceGrid::padded(grid).len();
         let copies = if device.atomics() == Atomics::Fixed { 5 } else { 4 };
@@ -98,7 +102,8 @@ impl Vm {
         }
     }
 
-    /// Renders all rays whose samples fit into the buffers: planes `[5, rays]`, see [`crate::cpu::vm::RAY_WIDTH`].
+    /// Renders all rays whose samples fit into the buffers: planes `[5, rays]`, see
+    /// [`crate::cpu::vm::RAY_WIDTH`].
     pub fn render(&self, device: &Device, values: VmValues, rays: &DeviceBatch) -> &Buffer {
         let (samples, composited) = (&self.samples, &self.composited);
         self.decoder.prepare(device, values.network);
@@ -115,9 +120,9 @@ impl Vm {
         &self.composited.out
     }
 
-    /// Adds the gradients of planes and lines to those of `gradients`, and writes those of the decoder's weights: of the
-    /// rays of the last render, by what was composited, planes `[5, rays]`. Where one of the latter is not finite,
-    /// `non_finite`, `[1]`, becomes 1.
+    /// Adds the gradients of planes and lines to those of `gradients`, and writes those of the
+    /// decoder's weights: of the rays of the last render, by what was composited, planes
+    /// `[5, rays]`. Where one of the latter is not finite, `non_finite`, `[1]`, becomes 1.
     pub fn backward(
         &self,
         device: &Device,
@@ -146,7 +151,8 @@ impl Vm {
         );
     }
 
-    /// Returns the number of samples that were looked up and that would have been with larger buffers, the same of decoded ones, `[2]` each; and the lattice points of each ray, `[rays]`.
+    /// Returns the number of samples that were looked up and that would have been with larger
+    /// buffers, the same of decoded ones, `[2]` each; and the lattice points of each ray, `[rays]`.
     pub fn counts(&self) -> [&Buffer; 3] {
         [&self.samples.count, &self.composited.count, &self.samples.points]
     }
@@ -165,8 +171,8 @@ pub struct VmRenderer {
 }
 
 impl VmRenderer {
-    /// Uploads flat planes and lines of density and appearance, and flat decoder weights. The decoder must be one that
-    /// [`DeviceDecoder::supports`].
+    /// Uploads flat planes and lines of density and appearance, and flat decoder weights. The
+    /// decoder must be one that [`DeviceDecoder::supports`].
     pub fn new(device: Arc<Device>, field: &VmField, [density, color, network]: [&[f32]; 3]) -> VmRenderer {
         let vm = Vm::new(&device, field, PASS, false);
         let values =

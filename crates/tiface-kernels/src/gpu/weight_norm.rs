@@ -1,5 +1,6 @@
-//! Conversion of trained parameters to the weights and the sharpness of the field, and of gradients back: weight
-//! normalization of the geometry network (Salimans, Kingma 2016) and the sharpness of NeuS.
+//! Conversion of trained parameters to the weights and the sharpness of the field, and of gradients
+//! back: weight normalization of the geometry network (Salimans, Kingma 2016) and the sharpness of
+//! NeuS.
 //!
 //! ```text
 //! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂),  ĝ the gradient by W
@@ -13,8 +14,9 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 
-/// Number of words that describe a row of weights, a piece: offsets of its parameters, of its length parameter and of its
-/// weights, and their number. A piece without a length parameter is copied.
+/// Number of words that describe a row of weights, a piece: offsets of its parameters, of its
+/// length parameter and of its weights, and their number. A piece without a length parameter is
+/// copied.
 const PIECE: usize = 4;
 
 /// Offset of a piece without a length parameter.
@@ -31,7 +33,8 @@ fn length(raw: &[f32], pieces: &[u32], i: usize) -> f32 {
     select(pieces[i * PIECE + 1] == NONE, 1.0f32, max(sum.sqrt(), 1e-12f32))
 }
 
-/// Returns whether a float is finite. Its bits are tested, because compilers may assume that floats are finite.
+/// Returns whether a float is finite. Its bits are tested, because compilers may assume that floats
+/// are finite.
 #[cube]
 pub(super) fn finite(v: f32) -> bool {
     (u32::reinterpret(v) & 0x7f80_0000u32) != 0x7f80_0000u32
@@ -122,7 +125,8 @@ fn backward(
 
 /// Weight normalization of a network on a device.
 ///
-/// Parameters are stored in one vector: v1, g1, b1, v2, g2, b2, c1, c2, c3; weights are as [`Layout`] describes them.
+/// Parameters are stored in one vector: v1, g1, b1, v2, g2, b2, c1, c2, c3; weights are as
+/// [`Layout`] describes them.
 pub struct WeightNorm {
     pieces: Buffer,
     count: usize,
@@ -142,8 +146,8 @@ impl WeightNorm {
         WeightNorm { pieces: device.upload(&pieces), count, parameters }
     }
 
-    /// Computes the weights `flat` and the sharpness `inv_s`, `[1]`, from the parameters `raw` and the variance, `[1]`, which
-    /// is first clamped to `range`.
+    /// Computes the weights `flat` and the sharpness `inv_s`, `[1]`, from the parameters `raw` and
+    /// the variance, `[1]`, which is first clamped to `range`.
     pub fn forward(
         &self,
         device: &Device,
@@ -159,9 +163,10 @@ impl WeightNorm {
         );
     }
 
-    /// Writes the gradients with respect to parameters and variance, given those with respect to weights and sharpness.
-    /// Sets `non_finite`, `[1]`, to 1 if one of them is not finite. The table needs no check of its own: a value that is not
-    /// finite reaches it through the layers checked here.
+    /// Writes the gradients with respect to parameters and variance, given those with respect to
+    /// weights and sharpness. Sets `non_finite`, `[1]`, to 1 if one of them is not finite. The
+    /// table needs no check of its own: a value that is not finite reaches it through the layers
+    /// checked here.
     pub fn backward(
         &self,
         device: &Device,

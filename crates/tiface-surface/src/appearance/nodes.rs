@@ -5,7 +5,8 @@ use rayon::prelude::*;
 use tiface_base::geom::{Atlas, Hit, Mesh, bilinear_taps};
 use tiface_base::image::Image;
 
-/// Returns items by the group that each is in, in their order: the start of each group, and all groups in one list.
+/// Returns items by the group that each is in, in their order: the start of each group, and all
+/// groups in one list.
 pub(super) fn grouped<T: Copy>(
     groups: usize,
     items: impl Iterator<Item = (u32, T)> + Clone,
@@ -35,8 +36,8 @@ pub struct Nodes {
 enum NodeLayout {
     /// The vertices of these triangles.
     Vertices(Vec<[u32; 3]>),
-    /// Texels: the corners of each triangle in texels, centers of texels at whole numbers; and the node of each
-    /// texel, row by row, `u32::MAX` where no triangle is near.
+    /// Texels: the corners of each triangle in texels, centers of texels at whole numbers; and the
+    /// node of each texel, row by row, `u32::MAX` where no triangle is near.
     Texels { corners: Vec<[Vec2; 3]>, width: usize, height: usize, node: Vec<u32> },
 }
 
@@ -54,7 +55,8 @@ impl Nodes {
         Nodes::linked(NodeLayout::Vertices(mesh.triangles.clone()), mesh.positions.len(), &edges)
     }
 
-    /// Returns one node a texel that a bilinear look-up on a triangle can meet; neighbors beside and below.
+    /// Returns one node a texel that a bilinear look-up on a triangle can meet; neighbors beside
+    /// and below.
     pub fn texels(atlas: &Atlas) -> Nodes {
         let (width, height) = (atlas.width as usize, atlas.height as usize);
         let corners: Vec<[Vec2; 3]> =
@@ -130,7 +132,8 @@ impl Nodes {
         texels.filter(|(_, n)| **n != u32::MAX).map(|(c, _)| *c).collect()
     }
 
-    /// Interpolates `values` `[nodes]` at the vertices of the mesh, in one of the triangles of each vertex.
+    /// Interpolates `values` `[nodes]` at the vertices of the mesh, in one of the triangles of each
+    /// vertex.
     pub fn at_corners(&self, mesh: &Mesh, values: &[[f32; 3]]) -> Vec<[f32; 3]> {
         let mut out = vec![[0f32; 3]; mesh.positions.len()];
         for (t, triangle) in mesh.triangles.iter().enumerate() {
@@ -145,7 +148,8 @@ impl Nodes {
         out
     }
 
-    /// Returns the texels of `image` with the `values` `[nodes]` in their places, and which texels have one.
+    /// Returns the texels of `image` with the `values` `[nodes]` in their places, and which texels
+    /// have one.
     pub fn onto(&self, values: &[[f32; 3]], image: &Image) -> (Vec<[f32; 3]>, Vec<bool>) {
         let NodeLayout::Texels { node, .. } = &self.place else { return (values.to_vec(), Vec::new()) };
         let texels = image.data.as_chunks::<3>().0.iter().zip(node);

@@ -27,8 +27,8 @@ pub struct Photograph<'a> {
 }
 
 impl Photograph<'_> {
-    /// Returns whether a pixel shows the head alone. Soft pixels also show the background, and would paint
-    /// the outline with it.
+    /// Returns whether a pixel shows the head alone. Soft pixels also show the background, and
+    /// would paint the outline with it.
     fn is_head(&self, at: usize) -> bool {
         self.mask.is_none_or(|m| m.values[at] >= OPAQUE_ALPHA) && self.valid.is_none_or(|v| v.values[at] > 0)
     }
@@ -82,8 +82,8 @@ impl Deref for Rows {
 }
 
 impl Rows {
-    /// Looks at every `stride`-th pixel each way of the photographs; `turned` leads from the mesh's coordinates to
-    /// those of the harmonics.
+    /// Looks at every `stride`-th pixel each way of the photographs; `turned` leads from the mesh's
+    /// coordinates to those of the harmonics.
     pub fn new(mesh: &Mesh, bvh: &Bvh, photographs: &[Photograph], stride: u32, turned: Mat3) -> Rows {
         let lines: Vec<(u32, u32)> = (0..photographs.len() as u32)
             .flat_map(|v| {

@@ -14,8 +14,8 @@ const STEPS: usize = 30;
 
 /// Weights of the smoothness terms, relative to the squared error of one pixel.
 ///
-/// On a surface the sum of squared differences is the same however fine the nodes are: its weight is the number of pixels that are
-/// on average in the area over which a fit is smoothed.
+/// On a surface the sum of squared differences is the same however fine the nodes are: its weight
+/// is the number of pixels that are on average in the area over which a fit is smoothed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Smoothness {
     /// Squares of differences between neighbors, of constant terms.
@@ -63,8 +63,8 @@ impl System<'_> {
         out
     }
 
-    /// Returns `x` `[nodes, count]` that brings the rows that `keep` names (by photograph) closest to `target`
-    /// `[rows]`.
+    /// Returns `x` `[nodes, count]` that brings the rows that `keep` names (by photograph) closest
+    /// to `target` `[rows]`.
     pub fn solve(
         &self,
         target: &[[f32; 3]],

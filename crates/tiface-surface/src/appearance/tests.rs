@@ -5,7 +5,8 @@ use tiface_base::geom::Camera;
 use tiface_base::image::{Gray, Photo};
 use tiface_base::math::rng;
 
-/// A square of 24 × 24 cells from −1 to 1 at z = 0 that faces +z, and an atlas of 48 × 48 texels over it.
+/// A square of 24 × 24 cells from −1 to 1 at z = 0 that faces +z, and an atlas of 48 × 48 texels
+/// over it.
 fn square() -> (Mesh, Atlas) {
     const N: u32 = 24;
     let mut mesh = Mesh::default();
@@ -45,7 +46,8 @@ fn cameras(count: usize) -> Vec<Camera> {
     (0..count).map(camera).collect()
 }
 
-/// What the cameras see of the square: `look` of a point and the unit direction to the viewer; white beside it.
+/// What the cameras see of the square: `look` of a point and the unit direction to the viewer;
+/// white beside it.
 fn photos(cameras: &[Camera], look: impl Fn(usize, Vec3, Vec3) -> [f32; 3]) -> Vec<(Photo, Gray)> {
     let view = |(v, camera): (usize, &Camera)| {
         let (width, height) = (camera.width, camera.height);

@@ -1,7 +1,7 @@
 //! Charts: triangles laid flat, before they have a place in the texture.
 //!
-//! Patches of a surface: which triangles lie beside each other, parts as meshes of their own, how far a chart is
-//! from the sizes of its surface.
+//! Patches of a surface: which triangles lie beside each other, parts as meshes of their own, how
+//! far a chart is from the sizes of its surface.
 //!
 //! The face stands upright in the texture, so that it can be painted.
 
@@ -60,8 +60,8 @@ impl Flat {
         alone.map(|run| side_ends(&self.corners, run[0].1)).collect()
     }
 
-    /// Returns the parts that are connected across sides, of the triangles that are `kept`. Parts that
-    /// meet in a corner only no longer share it.
+    /// Returns the parts that are connected across sides, of the triangles that are `kept`. Parts
+    /// that meet in a corner only no longer share it.
     pub fn parts(&self, kept: impl Fn(usize) -> bool) -> Vec<Flat> {
         let mut sets = Sets::new(self.corners.len());
         for run in sorted_sides(&self.corners).chunk_by(|a, b| a.0 == b.0) {
@@ -136,8 +136,8 @@ pub(super) fn stretch(mesh: &Mesh, flat: &Flat) -> f64 {
     sum / whole
 }
 
-/// Returns the triangle across the side from corner k to k + 1 of each triangle; [`NONE`] if not exactly one other
-/// shares it.
+/// Returns the triangle across the side from corner k to k + 1 of each triangle; [`NONE`] if not
+/// exactly one other shares it.
 pub(super) fn neighbors(mesh: &Mesh) -> Vec<[u32; 3]> {
     let mut beside = vec![[NONE; 3]; mesh.triangles.len()];
     for run in sorted_sides(&mesh.triangles).chunk_by(|a, b| a.0 == b.0) {
@@ -171,8 +171,8 @@ const MIN_UPRIGHT_SHARE: f64 = 0.01;
 /// Minimum mean rise, as a share of the steepest, from which an up direction is derived.
 const MIN_RISE: f64 = 0.1;
 
-/// Returns the unit up direction within each chart that has to stand upright: the one that the foremost triangle, seen
-/// along `front`, is part of.
+/// Returns the unit up direction within each chart that has to stand upright: the one that the
+/// foremost triangle, seen along `front`, is part of.
 pub(super) fn upright(mesh: &Mesh, charts: &[Flat], front: Vec3, up: Vec3) -> Vec<Option<DVec2>> {
     let depth = |t: u32| mesh.corners(t).map(|p| p.dot(front)).iter().sum::<f32>();
     let foremost = (0..mesh.triangles.len() as u32).max_by(|&a, &b| depth(a).total_cmp(&depth(b)));
@@ -197,7 +197,8 @@ fn rising(mesh: &Mesh, chart: &Flat, up: Vec3) -> Option<DVec2> {
         sum += DVec2::new(along * v.y - across * u.y, across * u.x - along * v.x)
             * twice_area([a, b, c]).signum();
     }
-    // seen from below or above, up is nowhere in it; the gradient of what stands straight is 1 everywhere
+    // seen from below or above, up is nowhere in it; the gradient of what stands straight is 1
+    // everywhere
     (sum.length() > MIN_RISE * 2.0 * chart.area()).then(|| sum.normalize())
 }
 
@@ -249,7 +250,8 @@ mod tests {
 
     #[test]
     fn up_in_a_chart_is_where_the_surface_rises() {
-        // a square in the plane y = 0, seen from -y, laid flat and turned by a quarter: its z runs along -x of the chart
+        // a square in the plane y = 0, seen from -y, laid flat and turned by a quarter: its z runs
+        // along -x of the chart
         let p = |x: f32, z: f32| Vec3::new(x, 0.0, z);
         let mesh = Mesh {
             positions: vec![p(0., 0.), p(1., 0.), p(1., 1.), p(0., 1.)],

@@ -1,12 +1,13 @@
-//! A surface divided into few charts: along the lines of a smooth copy, what is too small joined to a neighbor,
-//! laid flat, and relaxed to the sizes of the true surface.
+//! A surface divided into few charts: along the lines of a smooth copy, what is too small joined to
+//! a neighbor, laid flat, and relaxed to the sizes of the true surface.
 //!
 //! ```text
 //! smooth → divide (uvunwrap) → join the small → flatten the regions → relax on the true surface
 //! ```
 //!
-//! Divided as it is, a learned head gives hundreds of charts: a rough garment or the rim of a cap tilts single triangles
-//! away from the mean of their chart, and each of them costs a gutter and a seam.
+//! Divided as it is, a learned head gives hundreds of charts: a rough garment or the rim of a cap
+//! tilts single triangles away from the mean of their chart, and each of them costs a gutter and a
+//! seam.
 //!
 //! Flat pieces of a surface, such as the cap under a bust: laid out as they are, in one chart each.
 
@@ -20,8 +21,8 @@ use std::collections::HashMap;
 use tiface_base::geom::{Mesh, THOROUGH_EFFORT, overlaps};
 use tiface_base::{Monitor, Result};
 
-/// Rounds of smoothing for the copy that is divided. Of `lps` at 50 k triangles: 515 charts without, 22 with 3 rounds,
-/// 19 with 30; with 60, limbs become strings.
+/// Rounds of smoothing for the copy that is divided. Of `lps` at 50 k triangles: 515 charts
+/// without, 22 with 3 rounds, 19 with 30; with 60, limbs become strings.
 const SMOOTHING: usize = 30;
 
 /// Share of the surface below which a chart joins a neighbor.
@@ -30,13 +31,13 @@ const MIN_CHART_SHARE: f64 = 0.008;
 /// Times that regions are joined and laid flat.
 const JOINS: usize = 2;
 
-/// Maximum number of steps of relaxing, and of triangles times steps: charts of very many triangles are smooth ones, whose
-/// sizes are nearly right after half of the steps.
+/// Maximum number of steps of relaxing, and of triangles times steps: charts of very many triangles
+/// are smooth ones, whose sizes are nearly right after half of the steps.
 const RELAXING: usize = 100;
 const RELAXING_WORK: usize = 1_000_000;
 
-/// Mean area stretch, (r + 1/r) / 2, r being the scale of areas, from which a relaxed chart is halved, and which a face
-/// may have.
+/// Mean area stretch, (r + 1/r) / 2, r being the scale of areas, from which a relaxed chart is
+/// halved, and which a face may have.
 pub(super) const STRETCH: f64 = 1.05;
 
 /// Maximum number of times a chart is halved.
@@ -85,8 +86,9 @@ fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
         .collect()
 }
 
-/// Returns a chart in pieces that do not cover themselves: relaxing lets borders go where they like, and where two of
-/// them meet, the smaller of the two strips that lie over each other becomes a chart of its own.
+/// Returns a chart in pieces that do not cover themselves: relaxing lets borders go where they
+/// like, and where two of them meet, the smaller of the two strips that lie over each other becomes
+/// a chart of its own.
 fn uncovered(chart: Flat) -> Vec<Flat> {
     let points: Vec<Vec2> = chart.points.iter().map(|p| p.as_vec2()).collect();
     let pairs = overlaps(&points, &chart.corners, &vec![true; chart.corners.len()], THOROUGH_EFFORT).pairs;
@@ -119,7 +121,8 @@ fn uncovered(chart: Flat) -> Vec<Flat> {
     out
 }
 
-/// Returns the region of each triangle, numbered from 0: its chart, or the neighbor that the chart joined.
+/// Returns the region of each triangle, numbered from 0: its chart, or the neighbor that the chart
+/// joined.
 fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
     let count = mesh.triangles.len();
     // a triangle without a chart is a region of its own until it joins one
@@ -195,7 +198,8 @@ const MAX_PLANE_DISTANCE: f64 = 5e-4;
 /// Cosine of the angle by which a triangle may lean.
 const MIN_PLANE_COSINE: f64 = 0.999;
 
-/// Returns the flat pieces of at least a hundredth of the surface, starting from the largest triangles.
+/// Returns the flat pieces of at least a hundredth of the surface, starting from the largest
+/// triangles.
 pub(super) fn planar(mesh: &Mesh, adjacent: &[[u32; 3]]) -> Vec<Flat> {
     let count = mesh.triangles.len();
     let corners = |t: u32| mesh.corners(t).map(|p| p.as_dvec3());
@@ -213,7 +217,8 @@ pub(super) fn planar(mesh: &Mesh, adjacent: &[[u32; 3]]) -> Vec<Flat> {
     seeds.sort_by(|&a, &b| areas[b as usize].total_cmp(&areas[a as usize]).then(a.cmp(&b)));
     let mut piece = vec![NONE; count];
     let mut found = Vec::new();
-    // a flat piece that large has large triangles, or very many of a size: some hundred seeds find it
+    // a flat piece that large has large triangles, or very many of a size: some hundred seeds find
+    // it
     for seed in seeds.into_iter().take(512) {
         if piece[seed as usize] != NONE || areas[seed as usize] == 0.0 {
             continue;
@@ -340,7 +345,8 @@ mod tests {
 
     #[test]
     fn rough_ground_becomes_few_charts_that_keep_their_areas() {
-        // heights of up to a square's width from a fixed hash: sides that lean 45 degrees everywhere
+        // heights of up to a square's width from a fixed hash: sides that lean 45 degrees
+        // everywhere
         let rough = |x: u32, y: u32| ((x * 7919 + y * 104_729) % 97) as f32 / 97.0;
         let mesh = sheet(40, rough);
         let direct = flatten(&mesh, None, STRETCHED, &Quiet).unwrap();

@@ -1,9 +1,10 @@
 //! The face in one chart: what lies in front of a plane, as deep as it still lies flat.
 //!
-//! The library has no cost of seams, so its charts meet anywhere, half of their seams in the face. Here
-//! the part of the surface around its foremost point, up to a plane across the direction the face looks, is taken out,
-//! flattened in one piece by a smooth copy, and relaxed to its true sizes; the rim is the plane's contour, short and
-//! out of the way. The rest is divided as any surface.
+//! The library has no cost of seams, so its charts meet anywhere, half of their seams in the face.
+//! Here the part of the surface around its foremost point, up to a plane across the direction the
+//! face looks, is taken out, flattened in one piece by a smooth copy, and relaxed to its true
+//! sizes; the rim is the plane's contour, short and out of the way. The rest is divided as any
+//! surface.
 
 use super::chart::{NONE, neighbors, part, straighten, stretch};
 use super::divide::{STRETCH, divide};
@@ -14,15 +15,16 @@ use glam::Vec3;
 use tiface_base::geom::Mesh;
 use tiface_base::{Monitor, Result};
 
-/// The deepest plane lies so far behind the foremost point, in parts of the mesh's depth; the others are closer by
-/// equal steps.
+/// The deepest plane lies so far behind the foremost point, in parts of the mesh's depth; the
+/// others are closer by equal steps.
 const MAX_CUT_DEPTH: f32 = 0.5;
 const CUT_PLANES: usize = 16;
 
 /// Flattenings that may fail.
 const MAX_FAILURES: usize = 8;
 
-/// Rounds of smoothing for the copy that is flattened. With 30 a nose still folds, with 120 the ears of other heads do.
+/// Rounds of smoothing for the copy that is flattened. With 30 a nose still folds, with 120 the
+/// ears of other heads do.
 const FACE_SMOOTHING: usize = 60;
 
 /// Most steps of relaxing.
@@ -78,7 +80,8 @@ fn caps(mesh: &Mesh, front: Vec3) -> impl Iterator<Item = Vec<bool>> {
     })
 }
 
-/// Gives `number` to the first triangle and all connected ones without a number, and returns their count.
+/// Gives `number` to the first triangle and all connected ones without a number, and returns their
+/// count.
 fn flood(adjacent: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> usize {
     let (mut open, mut count) = (vec![first], 1);
     piece[first as usize] = number;
@@ -94,8 +97,8 @@ fn flood(adjacent: &[[u32; 3]], piece: &mut [u32], first: u32, number: u32) -> u
     count
 }
 
-/// Returns what hangs together with the foremost triangle in front of the plane, and all it encloses: eye sockets are
-/// deep.
+/// Returns what hangs together with the foremost triangle in front of the plane, and all it
+/// encloses: eye sockets are deep.
 fn cap(adjacent: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<bool> {
     // What is behind the plane has a number, so it is not flooded; then the rest takes its place.
     let behind = u32::MAX - 1;
@@ -123,7 +126,8 @@ mod tests {
     use super::*;
     use tiface_base::Quiet;
 
-    /// Returns a closed ball around the origin, a bump like a nose at its front (+z) and a dent below it.
+    /// Returns a closed ball around the origin, a bump like a nose at its front (+z) and a dent
+    /// below it.
     fn ball() -> Mesh {
         let (rings, around) = (40u32, 60u32);
         let mut mesh = Mesh { positions: vec![Vec3::Y], ..Mesh::default() };

@@ -1,5 +1,5 @@
-//! Flattening by the crate `uvunwrap`: least squares conformal maps (Lévy, Petitjean, Ray, Maillot 2002), halved
-//! until none folds.
+//! Flattening by the crate `uvunwrap`: least squares conformal maps (Lévy, Petitjean, Ray, Maillot
+//! 2002), halved until none folds.
 
 use super::chart::Flat;
 use glam::DVec2;
@@ -10,8 +10,9 @@ use tiface_base::error::COMPLETE_IS_KEPT;
 use tiface_base::geom::Mesh;
 use tiface_base::{Error, Monitor, Result};
 
-/// Degrees between a triangle and the mean of its chart. Lower than the library's own 70: rims come out straighter, so
-/// that seams are hardly longer and stretch is less, and small charts fill the texture better.
+/// Degrees between a triangle and the mean of its chart. Lower than the library's own 70: rims come
+/// out straighter, so that seams are hardly longer and stretch is less, and small charts fill the
+/// texture better.
 const MAX_TILTED: f32 = 55.0;
 
 /// Maximum ratio of areas within a chart: the library's default.
@@ -33,9 +34,9 @@ impl ChartSet {
     }
 }
 
-/// Flattens the regions of `labels`, one number a triangle: a region becomes one chart, or several where it
-/// cannot be flat without a triangle's area changing more than `most_stretched` times against the others'. Without
-/// labels the library chooses the regions.
+/// Flattens the regions of `labels`, one number a triangle: a region becomes one chart, or several
+/// where it cannot be flat without a triangle's area changing more than `most_stretched` times
+/// against the others'. Without labels the library chooses the regions.
 pub(super) fn flatten(
     mesh: &Mesh,
     labels: Option<&[u32]>,
@@ -78,8 +79,9 @@ pub(super) fn flatten(
     collect(out, DVec2::new(answer.width.into(), answer.height.into()) / f64::from(answer.texels_per_unit))
 }
 
-/// Vertices repeated between regions. Regions are handed over as texture coordinates that are one point a
-/// region: the library then takes each region as an island, finds the coordinates of no use, and flattens it.
+/// Vertices repeated between regions. Regions are handed over as texture coordinates that are one
+/// point a region: the library then takes each region as an island, finds the coordinates of no
+/// use, and flattens it.
 fn divided(mesh: &Mesh, labels: Option<&[u32]>) -> (Vec<[f32; 3]>, Vec<u32>, Option<Vec<[f32; 2]>>) {
     let Some(labels) = labels else {
         let positions = mesh.positions.iter().map(|p| p.to_array()).collect();

@@ -1,7 +1,7 @@
 //! The plain way to lay a mesh into a texture: every triangle the half of a square, in rows.
 //!
-//! Works for any triangles, at the price of a seam along every edge. Two halves share a square: right angles
-//! in opposite corners, `gap` to the square's sides and 2 gap between the long sides.
+//! Works for any triangles, at the price of a seam along every edge. Two halves share a square:
+//! right angles in opposite corners, `gap` to the square's sides and 2 gap between the long sides.
 
 use super::chart::widest;
 use super::{AtlasConfig, AtlasLayout};
@@ -12,7 +12,8 @@ use tiface_base::{Error, Result};
 /// The shortest leg worth having, in texels.
 const MIN_LEG_PX: f64 = 1.0;
 
-/// Gives each triangle a half square; the gutter becomes as wide as leaves a third of each square to its triangles.
+/// Gives each triangle a half square; the gutter becomes as wide as leaves a third of each square
+/// to its triangles.
 pub(super) fn half_squares(mesh: &Mesh, config: &AtlasConfig) -> Result<AtlasLayout> {
     let (count, size) = (mesh.triangles.len(), f64::from(config.size_px));
     let squares = count.div_ceil(2);

@@ -1,9 +1,11 @@
-//! Packing: charts turned, and placed one by one at the lowest free place, on the smallest square they all fit.
+//! Packing: charts turned, and placed one by one at the lowest free place, on the smallest square
+//! they all fit.
 //!
-//! Shapes, not boxes, on a grid of cells; in each a chart is grown by the gutter before it takes cells, so no two
-//! charts come closer than twice that. Each is turned to where its upper end is lowest. Drawing the shapes is what
-//! costs, placing them takes a millisecond: so they are drawn once, and many orders are tried, each a change to the
-//! best one so far, on squares that get smaller cell by cell.
+//! Shapes, not boxes, on a grid of cells; in each a chart is grown by the gutter before it takes
+//! cells, so no two charts come closer than twice that. Each is turned to where its upper end is
+//! lowest. Drawing the shapes is what costs, placing them takes a millisecond: so they are drawn
+//! once, and many orders are tried, each a change to the best one so far, on squares that get
+//! smaller cell by cell.
 //!
 //! Shapes of charts on a grid of cells: every cell that a chart grown by its gutter touches.
 
@@ -51,8 +53,8 @@ struct TurnedMask {
 /// Cells of the charts: turn, column and row of each.
 type CellPlaces = Vec<(usize, usize, usize)>;
 
-/// Places charts in a square texture: twice the gutter between any two of them and to the border. Where `stands` says
-/// where up is in a chart, it is turned to the texture's up and no other way.
+/// Places charts in a square texture: twice the gutter between any two of them and to the border.
+/// Where `stands` says where up is in a chart, it is turned to the texture's up and no other way.
 pub(super) fn pack(
     charts: &[Flat],
     stands: &[Option<DVec2>],
@@ -81,7 +83,8 @@ pub(super) fn pack(
     let cells = GRID_CELLS.min(inner_px);
     let mut used = INITIAL_FILL;
     while used > 1e-3 {
-        // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a fifth wider.
+        // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a
+        // fifth wider.
         let scale = cells * (used / area).sqrt() * size_px / inner_px;
         let mut max_side = (1.2 * cells) as usize;
         let mut start = cells as usize;
@@ -102,7 +105,8 @@ pub(super) fn pack(
             let cell = inner_px / side as f64;
             let place = |(chart, &(turn, x, y)): (usize, &(usize, usize, usize))| {
                 let TurnedMask { turn, low, .. } = drawn[chart][turn];
-                // The page begins a gutter from the border, the chart its reach from its shape's corner.
+                // The page begins a gutter from the border, the chart its reach from its shape's
+                // corner.
                 let corner = (DVec2::new(x as f64, y as f64) + reach) * cell + gutter_px;
                 ChartPose { turn, scale: scale * cell, offset: corner - low * (scale * cell) }
             };
@@ -140,8 +144,8 @@ fn draw(
     outlines.par_iter().zip(stands).map(one).collect()
 }
 
-/// Returns the smallest side found at which everything fits, from `start` on, at most `max_side`; `order` becomes the one
-/// that did it.
+/// Returns the smallest side found at which everything fits, from `start` on, at most `max_side`;
+/// `order` becomes the one that did it.
 fn smallest(
     drawn: &[Vec<TurnedMask>],
     order: &mut Vec<usize>,
@@ -228,8 +232,8 @@ impl Mask {
         &self.spans[self.starts[y] as usize..self.starts[y + 1] as usize]
     }
 
-    /// Returns the shape within an outline whose lowest coordinates are 0, grown by `reach`, so that the outline's
-    /// lowest corner lies at (`reach`, `reach`). Cells are squares of one unit.
+    /// Returns the shape within an outline whose lowest coordinates are 0, grown by `reach`, so
+    /// that the outline's lowest corner lies at (`reach`, `reach`). Cells are squares of one unit.
     fn of(outline: &[[DVec2; 2]], high: DVec2, reach: f64) -> Mask {
         let [width, height] = (high + 2.0 * reach).to_array().map(|v| (v.ceil() as usize).max(1));
         let words = width.div_ceil(64);
@@ -275,8 +279,8 @@ impl Mask {
     }
 }
 
-/// Takes the cells that come within `reach` of a side: per row of cells the interval of two discs and the
-/// rectangle between them, which together are convex.
+/// Takes the cells that come within `reach` of a side: per row of cells the interval of two discs
+/// and the rectangle between them, which together are convex.
 fn grown_side(bits: &mut [u64], a: DVec2, b: DVec2, reach: f64, [width, height]: [usize; 2]) {
     let words = width.div_ceil(64);
     let (low, high) = (a.y.min(b.y) - reach, a.y.max(b.y) + reach);
@@ -463,7 +467,8 @@ mod tests {
         let places = pack(&charts, &[None; 4], 512.0, 4.0, &Quiet).unwrap();
         let scale = places[0].scale;
         assert!(places.iter().all(|p| p.scale == scale));
-        // (512 − 16) / 4 = 124 if side by side along their length; across (512 − 16 − 3 · 8) / 4 = 118
+        // (512 − 16) / 4 = 124 if side by side along their length; across (512 − 16 − 3 · 8) / 4 =
+        // 118
         assert!((112.0..118.1).contains(&scale), "{scale}");
         assert!(pack(&charts, &[None; 4], 512.0, 4.0, &Stopping).unwrap_err().kind().is_stop());
         assert!(pack(&charts, &[None; 4], 16.0, 8.0, &Quiet).unwrap_err().to_string().contains("do not fit"));
@@ -482,7 +487,8 @@ mod tests {
         assert!((2..8).all(|y| mask.row(y) == [[0, 10]]));
         assert_eq!(mask.row(0), [[0, 10]]);
         let mask = Mask::of(&square(6.0), DVec2::splat(6.0), 4.0);
-        // grown by 4, cell (0, 0) reaches to (1, 1), 3 √2 = 4.24 away from (4, 4): free; (1, 0) is √13 = 3.6
+        // grown by 4, cell (0, 0) reaches to (1, 1), 3 √2 = 4.24 away from (4, 4): free; (1, 0) is
+        // √13 = 3.6
         assert_eq!(mask.row(0), [[1, 13]]);
         assert_eq!(mask.row(7), [[0, 14]]);
     }

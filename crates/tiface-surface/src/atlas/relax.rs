@@ -1,5 +1,6 @@
-//! Makes a flat chart keep the sizes and angles of its surface: symmetric Dirichlet energy (Smith & Schaefer 2015,
-//! "Bijective parameterization with free boundaries"), minimized by L-BFGS from a chart without folds.
+//! Makes a flat chart keep the sizes and angles of its surface: symmetric Dirichlet energy (Smith &
+//! Schaefer 2015, "Bijective parameterization with free boundaries"), minimized by L-BFGS from a
+//! chart without folds.
 //!
 //! Of a triangle with area `A`, and `a` in the chart, whose map has the singular values `σ₁`, `σ₂`:
 //!
@@ -7,8 +8,8 @@
 //! E = A · (σ₁² + σ₂²) · (1 + A² / a²) = A · (σ₁² + σ₂² + σ₁⁻² + σ₂⁻²),   4 A for an isometry
 //! ```
 //!
-//! It grows without bound as a triangle becomes thin, and no step is longer than 0.9 of the way to the first triangle
-//! without area: what starts without folds ends without.
+//! It grows without bound as a triangle becomes thin, and no step is longer than 0.9 of the way to
+//! the first triangle without area: what starts without folds ends without.
 
 use super::chart::Flat;
 use glam::DVec2;
@@ -18,8 +19,8 @@ use tiface_base::geom::Mesh;
 /// Number of past steps that L-BFGS stores.
 const LBFGS_HISTORY: usize = 5;
 
-/// Energy over area at which a chart is good enough: 4 is an isometry, and 0.01 more a mean area stretch below half a
-/// percent.
+/// Energy over area at which a chart is good enough: 4 is an isometry, and 0.01 more a mean area
+/// stretch below half a percent.
 const TARGET_ENERGY: f64 = 4.01;
 
 /// The surface's side of a triangle, as the energy needs it.
@@ -40,7 +41,8 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
     for (&t, &corners) in flat.triangles.iter().zip(&flat.corners) {
         let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
         let (u, v) = (b - a, c - a);
-        // a triangle that is a line would have endless energy; as thin as one part in a million it has little say
+        // a triangle that is a line would have endless energy; as thin as one part in a million it
+        // has little say
         let area = (0.5 * u.cross(v).length()).max(5e-7 * u.length_squared().max(v.length_squared()));
         whole += area;
         let half = 0.5 / area;
@@ -131,7 +133,8 @@ fn dot(a: &[DVec2], b: &[DVec2]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a.dot(*b)).sum()
 }
 
-/// L-BFGS (Nocedal & Wright, algorithm 7.4) with steps that halve until the energy falls enough (Armijo).
+/// L-BFGS (Nocedal & Wright, algorithm 7.4) with steps that halve until the energy falls enough
+/// (Armijo).
 fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: f64) {
     let n = points.len();
     let mut slope = vec![DVec2::ZERO; n];

@@ -1,8 +1,9 @@
-//! A smoothed copy of a surface: every vertex moves to the mean of its neighbors (uniform Laplacian; Taubin 1995
-//! without the step back, since here the shrinking is wanted).
+//! A smoothed copy of a surface: every vertex moves to the mean of its neighbors (uniform
+//! Laplacian; Taubin 1995 without the step back, since here the shrinking is wanted).
 //!
-//! A chart is a way to number the corners of triangles: coordinates that fold nowhere on the smooth copy fold
-//! nowhere on the surface. The copy has no creases and pores, divides along short lines, and lies flat in large pieces.
+//! A chart is a way to number the corners of triangles: coordinates that fold nowhere on the smooth
+//! copy fold nowhere on the surface. The copy has no creases and pores, divides along short lines,
+//! and lies flat in large pieces.
 
 use glam::Vec3;
 use tiface_base::geom::{Mesh, side_ends, sorted_sides};
@@ -81,7 +82,8 @@ mod tests {
     #[test]
     fn a_border_is_smoothed_along_itself() {
         let smooth = smoothed(&sheet(), 1);
-        // halfway from y = -1 to the mean of its two neighbors on the border, 0; the inside has no say
+        // halfway from y = -1 to the mean of its two neighbors on the border, 0; the inside has no
+        // say
         assert_eq!(smooth.positions[2], Vec3::new(2.0, -0.5, 0.0));
         let long = smoothed(&sheet(), 50);
         assert!(long.positions.iter().all(|p| p.is_finite() && p.z.abs() < 0.01));

@@ -106,7 +106,8 @@ fn a_moebius_strip_is_laid_flat() {
 
 #[test]
 fn needles_get_a_place_of_their_own_where_they_are_too_thin() {
-    // A flat strip whose middle row is a billionth high: all its triangles are thinner than rounding.
+    // A flat strip whose middle row is a billionth high: all its triangles are thinner than
+    // rounding.
     let mesh = sheet(20, 3, [false, false], |u, v| {
         let y = [0.0, 0.1, 0.1 + 1e-9, 0.2][(3.0 * v).round() as usize];
         Vec3::new(u, y, 0.0)
@@ -273,7 +274,8 @@ fn the_face_stands_upright_in_the_texture() {
 
 #[test]
 fn the_cap_of_a_head_takes_little_of_the_texture() {
-    // a sphere down to 120 degrees from its pole, on a fan: of the surface 0.75 pi of (3 + 0.75) pi is flat
+    // a sphere down to 120 degrees from its pole, on a fan: of the surface 0.75 pi of (3 + 0.75) pi
+    // is flat
     let mut mesh = sphere(40, 80);
     for p in &mut mesh.positions {
         let polar = p.y.acos() * (40.0 / 39.0) * (2.0 / 3.0);

@@ -1,7 +1,8 @@
 //! What a mesh shows, carried over to a simpler mesh of the same surface.
 //!
-//! A point of the simpler mesh takes what lies at the nearest point of the original: a vertex its normal, color and soft
-//! layers; a texel the texture, with colors averaged in linear light, lobes in their own values and normals as vectors.
+//! A point of the simpler mesh takes what lies at the nearest point of the original: a vertex its
+//! normal, color and soft layers; a texel the texture, with colors averaged in linear light, lobes
+//! in their own values and normals as vectors.
 
 use super::cover::Bands;
 use super::seams::Seams;
@@ -35,7 +36,8 @@ impl<'a> Original<'a> {
         Original { head, bvh: Bvh::new(&head.mesh) }
     }
 
-    /// Gives the vertices of a simpler mesh the original's normals and colors, and returns its soft layers on them.
+    /// Gives the vertices of a simpler mesh the original's normals and colors, and returns its soft
+    /// layers on them.
     pub fn carry_vertices(&self, mesh: &mut Mesh) -> Option<Shells> {
         let HeadMesh { mesh: from, shells, .. } = self.head;
         let hits = self.nearest(&mesh.positions);
@@ -58,8 +60,8 @@ impl<'a> Original<'a> {
         shells.as_ref().map(|shells| Shells { layers: shells.layers.iter().map(layer).collect() })
     }
 
-    /// Carries the original's `texture` over to a simpler mesh that is laid out by `atlas`. `side` and `gutter_px` are those
-    /// of [`super::BakeConfig`].
+    /// Carries the original's `texture` over to a simpler mesh that is laid out by `atlas`. `side`
+    /// and `gutter_px` are those of [`super::BakeConfig`].
     ///
     /// # Errors
     ///
@@ -141,8 +143,8 @@ struct NormalMap<'a> {
 }
 
 impl NormalMap<'_> {
-    /// Returns a normal of the map at a point of the mesh, in the mesh's coordinates; the opposite of
-    /// [`super::tangent_space()`].
+    /// Returns a normal of the map at a point of the mesh, in the mesh's coordinates; the opposite
+    /// of [`super::tangent_space()`].
     fn bent(&self, mesh: &Mesh, hit: &Hit, local: Vec3) -> Vec3 {
         let m = mesh.shading_normal(hit);
         let corners = self.tangents[hit.triangle as usize];

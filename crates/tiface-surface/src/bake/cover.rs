@@ -1,8 +1,9 @@
 //! Which texels a triangle covers, and where on the triangle their samples lie.
 //!
 //! Every texel is sampled at `side × side` regularly spaced points. A texel that a triangle touches
-//! without meeting any point still belongs to it (conservative rasterization): its one sample is the
-//! triangle's point nearest to the texel's center. Triangles thinner than a texel are never lost.
+//! without meeting any point still belongs to it (conservative rasterization): its one sample is
+//! the triangle's point nearest to the texel's center. Triangles thinner than a texel are never
+//! lost.
 
 use glam::Vec2;
 use std::ops::Range;
@@ -32,7 +33,8 @@ impl Sample {
     }
 }
 
-/// Triangles sorted into bands of rows, so that a picture is covered piece by piece in bounded memory.
+/// Triangles sorted into bands of rows, so that a picture is covered piece by piece in bounded
+/// memory.
 pub struct Bands {
     rows: u32,
     /// Triangles that touch a band.
@@ -64,8 +66,8 @@ impl Bands {
 
     /// Returns the samples of one band, sorted by texel; `side` points along each side of a texel.
     ///
-    /// A point that two triangles share (on a common edge) counts for both; a texel has a nearest-point
-    /// sample only where no regular point of it lies in any triangle.
+    /// A point that two triangles share (on a common edge) counts for both; a texel has a
+    /// nearest-point sample only where no regular point of it lies in any triangle.
     pub fn samples(&self, atlas: &Atlas, band: usize, side: u32) -> Vec<Sample> {
         let first = band as u32 * self.rows;
         let rows = first..(first + self.rows).min(atlas.height);
@@ -138,8 +140,9 @@ fn cover(
                 let (u, v) = nearest(corners, center);
                 let at = corners[0] + u * (corners[1] - corners[0]) + v * (corners[2] - corners[0]);
                 let off = (at - center).abs().max_element();
-                // the nearest point by distance may lie just outside a touched texel: half a texel of grace
-                // would color texels that nothing touches, so only those within the square count
+                // the nearest point by distance may lie just outside a touched texel: half a texel
+                // of grace would color texels that nothing touches, so only those within the square
+                // count
                 if off <= 0.5 {
                     touching.push((off, Sample { texel, triangle: t, u, v }));
                 }

@@ -1,8 +1,9 @@
 //! Filling of the texels between charts.
 //!
-//! Filtering and mip maps read beyond a chart's border. The nearest `gutter` texels repeat the chart's own
-//! (nearest covered texel), all else is filled by pull and push over a pyramid (Gortler et al. 1996), so that
-//! every mip level of every chart sees its own colors. ([`Seams`](super::Seams) then moves the texels next to a seam a little.)
+//! Filtering and mip maps read beyond a chart's border. The nearest `gutter` texels repeat the
+//! chart's own (nearest covered texel), all else is filled by pull and push over a pyramid (Gortler
+//! et al. 1996), so that every mip level of every chart sees its own colors.
+//! ([`Seams`](super::Seams) then moves the texels next to a seam a little.)
 
 use tiface_base::image::Image;
 
@@ -17,11 +18,12 @@ pub fn fill(image: &mut Image, covered: &[bool], gutter: u32) {
     push_pull(image, &known);
 }
 
-/// Copies the nearest covered texel into every texel within `gutter` of one (Euclidean); which are known now.
+/// Copies the nearest covered texel into every texel within `gutter` of one (Euclidean); which are
+/// known now.
 fn grow(image: &mut Image, covered: &[bool], gutter: u32) -> Vec<bool> {
     let (w, h) = (image.width as usize, image.height as usize);
-    // the nearest covered texel, found ring by ring through the neighbors' (a chamfer propagation: exact but
-    // for rare ties a fraction of a texel apart)
+    // the nearest covered texel, found ring by ring through the neighbors' (a chamfer propagation:
+    // exact but for rare ties a fraction of a texel apart)
     let mut source: Vec<u32> =
         covered.iter().enumerate().map(|(i, &c)| if c { i as u32 } else { u32::MAX }).collect();
     let distance = |i: usize, s: u32| {
@@ -172,7 +174,8 @@ mod tests {
     fn mip_levels_of_a_chart_keep_its_color() {
         let (mut image, covered) = charts();
         fill(&mut image, &covered, 8);
-        // level 3: a texel is the mean of 8 × 8; columns 16..24 hold the red chart's border and its gutter
+        // level 3: a texel is the mean of 8 × 8; columns 16..24 hold the red chart's border and its
+        // gutter
         let mean = |texel: u32, channel: usize| -> f32 {
             let all = (0..64).map(|i| image.pixel(8 * texel + i % 8, 8 + i / 8)[channel]);
             all.sum::<f32>() / 64.0

@@ -1,17 +1,20 @@
-//! Colors of surface points: their exact positions, the cameras that see them, and the field's colors.
+//! Colors of surface points: their exact positions, the cameras that see them, and the field's
+//! colors.
 //!
-//! View-dependent color in a few numbers a texel: real spherical harmonics of the direction to the viewer.
+//! View-dependent color in a few numbers a texel: real spherical harmonics of the direction to the
+//! viewer.
 //!
-//! A texel's color seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to degree 1 (4
-//! functions) or 2 (9) in the order and signs of [`tiface_base::geom::sphharm::sh16`]; [`tiface_base::geom::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
+//! A texel's color seen from direction `d` is `base + Σ_k L_k Y_k(d)`, sRGB-coded, with `Y` up to
+//! degree 1 (4 functions) or 2 (9) in the order and signs of [`tiface_base::geom::sphharm::sh16`];
+//! [`tiface_base::geom::sphharm::combine`] sums them. `base` is what an ordinary viewer shows. The
 //! coefficients minimize, over the cameras that see the point,
 //!
 //! ```text
 //! Σ_i w_i ‖base + Σ_k L_k Y_k(d_i) − c_i‖² + λ Σ_i w_i Σ_k ‖L_k‖²
 //! ```
 //!
-//! Cameras see a point from one side only, so that without the ridge term λ the functions would be free to grow
-//! in directions without cameras.
+//! Cameras see a point from one side only, so that without the ridge term λ the functions would be
+//! free to grow in directions without cameras.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -30,9 +33,9 @@ pub struct SurfacePoints {
     pub normals: Vec<Vec3>,
 }
 
-/// Moves points of the flat triangles onto the field's zero along their interpolated normals, at most `reach`
-/// far, and gives them the field's normals. A point from where the field's zero is not met stays as it is, with
-/// its interpolated normal.
+/// Moves points of the flat triangles onto the field's zero along their interpolated normals, at
+/// most `reach` far, and gives them the field's normals. A point from where the field's zero is not
+/// met stays as it is, with its interpolated normal.
 pub fn snap_to_surface(flat: &SurfacePoints, reach: f32, field: &dyn SdfField) -> SurfacePoints {
     let n = flat.positions.len();
     let mut offset = vec![0f32; n];
@@ -82,7 +85,8 @@ const FALLBACK_CAMERAS: usize = 3;
 /// Directions to the cameras that see each point, all in one list.
 #[derive(Default)]
 pub struct ViewDirections {
-    /// Whether any camera sees point `i`; else its directions are those of the cameras that come nearest to it.
+    /// Whether any camera sees point `i`; else its directions are those of the cameras that come
+    /// nearest to it.
     pub known: Vec<bool>,
     /// Directions of point `i`.
     pub counts: Vec<u32>,
@@ -93,13 +97,14 @@ pub struct ViewDirections {
 }
 
 impl Visibility<'_> {
-    /// Returns the cameras that see each point: in the frame, at most 75 degrees from its normal, nothing between.
+    /// Returns the cameras that see each point: in the frame, at most 75 degrees from its normal,
+    /// nothing between.
     ///
-    /// Angles are those to the mesh's own normals and lines of sight start from the mesh (`flat`): the field's
-    /// normals are rough, and a camera must not come and go from texel to texel. A point that no camera sees is
-    /// looked at from where the cameras stand that face it most: those are directions that the field has
-    /// learned colors for, unlike the one straight at it.
-    /// Without any camera, each point is viewed along its normal.
+    /// Angles are those to the mesh's own normals and lines of sight start from the mesh (`flat`):
+    /// the field's normals are rough, and a camera must not come and go from texel to texel. A
+    /// point that no camera sees is looked at from where the cameras stand that face it most: those
+    /// are directions that the field has learned colors for, unlike the one straight at it. Without
+    /// any camera, each point is viewed along its normal.
     pub fn directions(&self, points: &SurfacePoints, flat: &SurfacePoints) -> ViewDirections {
         let n = points.positions.len();
         if self.cameras.is_empty() {
@@ -171,7 +176,8 @@ fn in_frame(camera: &Camera, p: Vec3) -> bool {
     camera.project(p).is_some_and(|(at, _)| (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y))
 }
 
-/// Colors of points: what the cameras that see them see on average, and how it changes between them.
+/// Colors of points: what the cameras that see them see on average, and how it changes between
+/// them.
 pub struct Shades {
     /// `[n]` linear color.
     pub linear: Vec<[f32; 3]>,
@@ -181,8 +187,8 @@ pub struct Shades {
     pub seen: Vec<bool>,
 }
 
-/// Shades points. `functions` lobes are fitted in the coordinates that `turned` rotates to, where cameras see a
-/// point; 0 for none.
+/// Shades points. `functions` lobes are fitted in the coordinates that `turned` rotates to, where
+/// cameras see a point; 0 for none.
 pub fn shade(
     points: &SurfacePoints,
     seen: ViewDirections,
@@ -225,8 +231,8 @@ pub fn shade(
     Shades { linear, lobes: fitted, seen: seen.known }
 }
 
-/// sRGB-coded colors of points of a mesh with their normals, as its texture would have them: the mean over the
-/// cameras that see them. `reach` as in [`super::BakeConfig`].
+/// sRGB-coded colors of points of a mesh with their normals, as its texture would have them: the
+/// mean over the cameras that see them. `reach` as in [`super::BakeConfig`].
 pub fn seen_colors(
     mesh: &Mesh,
     positions: &[Vec3],
@@ -243,12 +249,12 @@ pub fn seen_colors(
     shades.linear.into_iter().map(|c| c.map(srgb_from_linear)).collect()
 }
 
-/// Weight of the ridge term: colors of a light stage change by a few percent of their range over a quarter of a
-/// turn, their noise is about as large.
+/// Weight of the ridge term: colors of a light stage change by a few percent of their range over a
+/// quarter of a turn, their noise is about as large.
 const RIDGE: f64 = 0.02;
 
-/// Coefficients `[functions][rgb]` that best turn `base` into `colors` seen from `directions` (unit, towards the
-/// viewer) with `weights`. Zero if no camera sees the point.
+/// Coefficients `[functions][rgb]` that best turn `base` into `colors` seen from `directions`
+/// (unit, towards the viewer) with `weights`. Zero if no camera sees the point.
 ///
 /// # Shapes
 ///

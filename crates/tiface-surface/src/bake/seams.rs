@@ -1,9 +1,10 @@
 //! Both sides of a seam show the same color.
 //!
-//! Charts sample the surface with different grids of texels, so their bilinear pictures differ along a common edge
-//! by what lies between texels: little on skin, much across the hard edge of a painted brow. [`Seams::even`] moves the
-//! texels that a seam is drawn from as little as makes both sides agree, in the least squares (after Liu, Ferguson,
-//! Jacobson, Gingold 2017, "Seamless: seam erasure and seam-aware decoupling of shape from mesh resolution").
+//! Charts sample the surface with different grids of texels, so their bilinear pictures differ
+//! along a common edge by what lies between texels: little on skin, much across the hard edge of a
+//! painted brow. [`Seams::even`] moves the texels that a seam is drawn from as little as makes both
+//! sides agree, in the least squares (after Liu, Ferguson, Jacobson, Gingold 2017, "Seamless: seam
+//! erasure and seam-aware decoupling of shape from mesh resolution").
 
 use glam::Vec2;
 use std::collections::HashMap;
@@ -11,14 +12,16 @@ use tiface_base::geom::{Atlas, Mesh, bilinear_taps};
 use tiface_base::image::{Image, Photo};
 use tiface_base::math::cg::{conjugate_gradients, dot};
 
-/// Weight of a texel's change relative to a difference along one texel of a seam: so low that the rest of a
-/// step is below the rounding to bytes, enough that a texel which hardly matters to a seam keeps its color.
+/// Weight of a texel's change relative to a difference along one texel of a seam: so low that the
+/// rest of a step is below the rounding to bytes, enough that a texel which hardly matters to a
+/// seam keeps its color.
 const STIFFNESS: f64 = 0.02;
 
 /// Number of points along each texel of a seam at which its sides are held together.
 const DENSITY: f32 = 2.0;
 
-/// Most rounds of conjugate gradients; each texel of a seam hangs on a dozen others only, so errors fade fast.
+/// Most rounds of conjugate gradients; each texel of a seam hangs on a dozen others only, so errors
+/// fade fast.
 const ROUNDS: usize = 60;
 
 /// Number of points along each edge of a seam that [`Seams::step`] compares.
@@ -33,7 +36,8 @@ pub struct Seams {
 }
 
 impl Seams {
-    /// Finds the seams of a manifold mesh, closed or open, edge by edge in the order of its triangles.
+    /// Finds the seams of a manifold mesh, closed or open, edge by edge in the order of its
+    /// triangles.
     pub fn new(mesh: &Mesh, atlas: &Atlas) -> Seams {
         // each directed edge of a triangle, with its texture coordinates
         let mut sides: HashMap<(u32, u32), (Vec2, Vec2)> = HashMap::with_capacity(3 * mesh.triangles.len());
@@ -60,8 +64,8 @@ impl Seams {
         Seams { edges, width: atlas.width, height: atlas.height }
     }
 
-    /// Returns the mean difference of the colors that both sides show at the same points of the surface, bilinear, in
-    /// 255ths of the coded range, over points and channels; 0 without seams.
+    /// Returns the mean difference of the colors that both sides show at the same points of the
+    /// surface, bilinear, in 255ths of the coded range, over points and channels; 0 without seams.
     ///
     /// `color` has the atlas's size.
     pub fn step(&self, color: &Photo) -> f64 {
@@ -82,9 +86,9 @@ impl Seams {
         sum / (3 * POINTS as usize * self.edges.len()).max(1) as f64
     }
 
-    /// Changes the texels around the seams of a picture with 3 channels, so that both sides agree in the
-    /// values that `code` makes of them; `decode` goes back. Texels between charts must be filled already: a seam is
-    /// drawn from the first of them, too.
+    /// Changes the texels around the seams of a picture with 3 channels, so that both sides agree
+    /// in the values that `code` makes of them; `decode` goes back. Texels between charts must be
+    /// filled already: a seam is drawn from the first of them, too.
     ///
     /// # Panics
     ///
@@ -112,8 +116,8 @@ impl Seams {
         Vec2::new(self.width as f32, self.height as f32)
     }
 
-    /// Returns the texels that seams are drawn from, and one row for each point of a seam: weights of its texels whose
-    /// sum should be zero, times the root of the length the point stands for.
+    /// Returns the texels that seams are drawn from, and one row for each point of a seam: weights
+    /// of its texels whose sum should be zero, times the root of the length the point stands for.
     fn system(&self) -> (Vec<u32>, Vec<[(u32, f64); 8]>) {
         let size = self.size();
         let mut texels = Vec::new();
@@ -173,7 +177,8 @@ mod tests {
 
     #[test]
     fn only_seams_count_and_their_step_is_in_bytes() {
-        // two triangles over a common edge 0–1, laid apart: the left half of the picture and the right half
+        // two triangles over a common edge 0–1, laid apart: the left half of the picture and the
+        // right half
         let mesh = Mesh {
             positions: vec![Vec3::ZERO, Vec3::Y, Vec3::X, -Vec3::X],
             triangles: vec![[0, 1, 3], [1, 0, 2]],

@@ -1,7 +1,8 @@
 //! Normals of the true surface as a tangent-space picture: the detail that simplification took.
 //!
-//! A texel holds `(x, y, z)` with `n = x t + y b + z m`, where `m` is the mesh's interpolated normal, `t` its
-//! tangent along u and `b = w · m × t` its bitangent up the picture (MikkTSpace, Mikkelsen 2008; OpenGL's +Y).
+//! A texel holds `(x, y, z)` with `n = x t + y b + z m`, where `m` is the mesh's interpolated
+//! normal, `t` its tangent along u and `b = w · m × t` its bitangent up the picture (MikkTSpace,
+//! Mikkelsen 2008; OpenGL's +Y).
 
 use super::cover::Bands;
 use super::fill::fill;
@@ -11,7 +12,8 @@ use tiface_base::image::{Image, Photo};
 
 /// Turns a picture of normals in the mesh's coordinates into one in tangent space.
 ///
-/// `tangents` has one per corner of each triangle, w = ±1; `normals` three channels of the atlas's size, unit.
+/// `tangents` has one per corner of each triangle, w = ±1; `normals` three channels of the atlas's
+/// size, unit.
 pub fn tangent_space(
     mesh: &Mesh,
     atlas: &Atlas,

@@ -1,9 +1,9 @@
-//! The evaluated nodes of a sparse grid, in blocks of 8³ nodes kept only near the surface, and the surface through
-//! them.
+//! The evaluated nodes of a sparse grid, in blocks of 8³ nodes kept only near the surface, and the
+//! surface through them.
 //!
-//! A plane of a block is one word, bit `x + 8 y`. An edge belongs to the block of its lower node, so a
-//! vertex on a block's border has one owner and one index: the block's first plus a count of bits before
-//! it. Nothing is merged by distance.
+//! A plane of a block is one word, bit `x + 8 y`. An edge belongs to the block of its lower node,
+//! so a vertex on a block's border has one owner and one index: the block's first plus a count of
+//! bits before it. Nothing is merged by distance.
 
 use super::NodeGrid;
 use super::marching::{LevelSet, PartCounts, cell_point, edge_point, largest_neighbor, sided};
@@ -129,8 +129,8 @@ impl Blocks {
         self.find(node).map_or(f32::NAN, |b| b.values[64 * plane + bit.trailing_zeros() as usize])
     }
 
-    /// Gives nodes whose value is not finite the size of their largest finite known neighbor, as in the dense volume,
-    /// or 1 without any; −∞ stays negative.
+    /// Gives nodes whose value is not finite the size of their largest finite known neighbor, as in
+    /// the dense volume, or 1 without any; −∞ stays negative.
     fn repair(&mut self, out: &mut LevelSet) {
         let nodes = std::mem::take(&mut self.non_finite);
         out.non_finite = nodes.len();
@@ -214,7 +214,8 @@ impl Blocks {
         owner
     }
 
-    /// Returns the eight blocks that hold the corners of this block's cells, by corner of the 2³ blocks.
+    /// Returns the eight blocks that hold the corners of this block's cells, by corner of the 2³
+    /// blocks.
     fn around(&self, block: &Block) -> [u32; 8] {
         std::array::from_fn(|c| {
             let node: [usize; 3] = std::array::from_fn(|a| block.start[a] + 8 * (c >> a & 1));
@@ -222,8 +223,8 @@ impl Blocks {
         })
     }
 
-    /// Calls `visit(cell, case, values)` for the evaluated cells of a block; values only when the case
-    /// needs them.
+    /// Calls `visit(cell, case, values)` for the evaluated cells of a block; values only when the
+    /// case needs them.
     fn for_each_cell(&self, block: &Block, mut visit: impl FnMut([usize; 3], u8, Option<CellSurface>)) {
         let around = self.around(block);
         for z in 0..8 {

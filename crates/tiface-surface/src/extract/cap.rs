@@ -1,9 +1,10 @@
 //! The cap that closes a surface where the box ends: neck and shoulders that the frames cut.
 //!
-//! The closed field `max(f, d)`, with `d` the signed distance to the box, has the cap in its zero set: what
-//! holds vertices on a field, or moves samples onto it, then treats skin and cap alike. The learned color within
-//! the body is no color of anything, so the cap is painted from the skin around it: inverse-distance weights
-//! (Shepard 1968) of the ring where it begins, which meets the skin without an edge.
+//! The closed field `max(f, d)`, with `d` the signed distance to the box, has the cap in its zero
+//! set: what holds vertices on a field, or moves samples onto it, then treats skin and cap alike.
+//! The learned color within the body is no color of anything, so the cap is painted from the skin
+//! around it: inverse-distance weights (Shepard 1968) of the ring where it begins, which meets the
+//! skin without an edge.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -103,7 +104,8 @@ impl Cap {
         on_cap.for_each(|(p, color)| *color = self.color(*p));
     }
 
-    /// Removes the cap, for callers that fit something to the opening. Returns the triangles removed.
+    /// Removes the cap, for callers that fit something to the opening. Returns the triangles
+    /// removed.
     pub fn open(&self, mesh: &mut Mesh) -> usize {
         let before = mesh.triangles.len();
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| self.holds(p)).collect();
@@ -135,7 +137,8 @@ mod tests {
     use crate::{ExtractOptions, extract};
     use tiface_base::Quiet;
 
-    /// Returns a column through the floor of the scene's box, red to the left and green to the right.
+    /// Returns a column through the floor of the scene's box, red to the left and green to the
+    /// right.
     fn column() -> (Mesh, Cap) {
         let f = |p: Vec3| (p.x.hypot(p.z) - 0.3).max(p.y - 0.5);
         let paint = |p: &[Vec3], _: &[Vec3], _: &[u32], _: &[Vec3]| {

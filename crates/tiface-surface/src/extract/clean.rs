@@ -1,7 +1,7 @@
 //! Cleaning of an extracted surface.
 //!
-//! Loose pieces and inner shells do not belong to the head. They are removed as a whole, by their signed volume, so a
-//! closed mesh stays closed.
+//! Loose pieces and inner shells do not belong to the head. They are removed as a whole, by their
+//! signed volume, so a closed mesh stays closed.
 
 use serde::{Deserialize, Serialize};
 use tiface_base::geom::{Mesh, Sets};
@@ -24,8 +24,8 @@ pub struct CleanReport {
     pub turned: bool,
 }
 
-/// Keeps the piece of largest volume of a closed mesh, wound outward: a head is one solid. Normals and colors, if any,
-/// follow their vertices.
+/// Keeps the piece of largest volume of a closed mesh, wound outward: a head is one solid. Normals
+/// and colors, if any, follow their vertices.
 ///
 /// # Errors
 ///
@@ -114,7 +114,8 @@ mod tests {
 
     #[test]
     fn twenty_specks_of_one_to_four_cells_and_a_ball_within_a_hollow_go() {
-        // cells of 1, the head around the middle node; each speck is about a node, so none slips through
+        // cells of 1, the head around the middle node; each speck is about a node, so none slips
+        // through
         let n = 49;
         let specks: Vec<(Vec3, f32)> = (0..20)
             .map(|i| {

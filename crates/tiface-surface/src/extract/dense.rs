@@ -1,8 +1,9 @@
 //! Extraction from all nodes of a grid, the two-pass method of the published code.
 //!
-//! instant-nsr-pl's `isosurface` runs marching cubes over `resolution`³ nodes of the box, then once more over as many
-//! nodes of the surface's own box, grown by a tenth of its size on every side. Nothing is closed, cleaned, moved or
-//! left out: a surface that leaves the box is open at its border.
+//! instant-nsr-pl's `isosurface` runs marching cubes over `resolution`³ nodes of the box, then once
+//! more over as many nodes of the surface's own box, grown by a tenth of its size on every side.
+//! Nothing is closed, cleaned, moved or left out: a surface that leaves the box is open at its
+//! border.
 
 use super::marching::{Volume, marching};
 use super::{BATCH, MeshReport, NodeGrid, colors_along_normals, off_surface};
@@ -15,13 +16,13 @@ use tiface_base::{Error, Monitor, Result};
 /// Margin around the surface's box on each side, as a share of its size.
 const MARGIN: f32 = 0.1;
 
-/// Meshes the zero level set of a field on all nodes of a grid of `resolution`³ nodes, first over `bounds` and then over
-/// the box of the surface found. Needs four bytes a node.
+/// Meshes the zero level set of a field on all nodes of a grid of `resolution`³ nodes, first over
+/// `bounds` and then over the box of the surface found. Needs four bytes a node.
 ///
 /// # Errors
 ///
-/// Fails for a resolution outside 2..=2048, a field without a surface, values of the wrong length, or a request to
-/// stop.
+/// Fails for a resolution outside 2..=2048, a field without a surface, values of the wrong length,
+/// or a request to stop.
 pub fn extract_dense(
     field: &dyn SdfField,
     bounds: Aabb,
@@ -104,7 +105,8 @@ mod tests {
     #[test]
     fn the_second_grid_lies_around_what_the_first_found_and_no_piece_is_dropped() {
         let (mesh, report) = extract_dense(&sdf, Aabb::SCENE, 65, &Quiet).unwrap();
-        // x from −0.63 to 0.5, grown by 0.113; y and z from −0.63 or −0.3 to 0.3: not cubes but a third of the box
+        // x from −0.63 to 0.5, grown by 0.113; y and z from −0.63 or −0.3 to 0.3: not cubes but a
+        // third of the box
         let [low, high] = report.grid;
         assert!((low[0] + 0.743).abs() < 0.01 && (high[0] - 0.613).abs() < 0.01, "{report:?}");
         assert!((low[2] + 0.36).abs() < 0.01 && (high[2] - 0.36).abs() < 0.01, "{report:?}");

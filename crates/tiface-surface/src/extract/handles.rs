@@ -1,19 +1,20 @@
 //! Small handles go: loops of hair are cut, holes between locks are filled.
 //!
-//! A surface is cut along a short loop that does not separate it (`loops`), both rims are drawn apart by half an
-//! edge and each is closed by the triangulation of least area (Barequet & Sharir 1995). That takes away exactly one handle and
-//! changes nothing else: where the loop goes around matter it is cut, where it goes around air that is
-//! filled, and the two differ only in which side of the new triangles is out.
+//! A surface is cut along a short loop that does not separate it (`loops`), both rims are drawn
+//! apart by half an edge and each is closed by the triangulation of least area (Barequet & Sharir
+//! 1995). That takes away exactly one handle and changes nothing else: where the loop goes around
+//! matter it is cut, where it goes around air that is filled, and the two differ only in which side
+//! of the new triangles is out.
 //!
-//! The field chooses among the loops of a handle: the one whose disc has the smallest `∫ |f|`. A thin
-//! strand has little matter to cut and a narrow slit little air to fill, however long the slit is. The
-//! field is not closed or opened itself and meshed again, as morphology would: how far that goes before a
-//! handle disappears is known only afterwards, it rounds off nearby surface, and costs a second extraction. Here
-//! every vertex stays on the zero set, and the new triangles become part of it for those who hold
-//! the mesh against the field later ([`Patches`]).
+//! The field chooses among the loops of a handle: the one whose disc has the smallest `∫ |f|`. A
+//! thin strand has little matter to cut and a narrow slit little air to fill, however long the slit
+//! is. The field is not closed or opened itself and meshed again, as morphology would: how far that
+//! goes before a handle disappears is known only afterwards, it rounds off nearby surface, and
+//! costs a second extraction. Here every vertex stays on the zero set, and the new triangles become
+//! part of it for those who hold the mesh against the field later ([`Patches`]).
 //!
-//! A loop whose discs would meet the surface is no place to cut (another strand may run through the hole): the
-//! next best is taken, and without any the handle stays and is counted.
+//! A loop whose discs would meet the surface is no place to cut (another strand may run through the
+//! hole): the next best is taken, and without any the handle stays and is counted.
 
 use super::BATCH;
 use super::loops::{Loop, LoopFinder};
@@ -28,7 +29,8 @@ use tiface_base::{Monitor, Result};
 /// Maximum number of sides of a loop that is cut: the triangulation's cost grows with its cube.
 const MAX_SIDES: usize = 256;
 
-/// Candidate distances by which the rims are drawn back, as shares of the way to the vertices behind them; the first that fits is used.
+/// Candidate distances by which the rims are drawn back, as shares of the way to the vertices
+/// behind them; the first that fits is used.
 const RIM_RETRACTIONS: [f32; 3] = [0.5, 0.25, 0.1];
 
 /// Boxes compared for one triangle of a cap, at most: a sound surface takes hundreds.
@@ -49,14 +51,16 @@ pub struct HandleReport {
     pub filled: Vec<f32>,
     /// Number of handles that were kept.
     pub left: usize,
-    /// A loop of a handle that was kept although it was short enough: it is too long to triangulate, or blocked.
+    /// A loop of a handle that was kept although it was short enough: it is too long to
+    /// triangulate, or blocked.
     pub left_length: Option<f32>,
     /// Triangles that close cut rims: the last ones of the mesh.
     pub triangles: usize,
 }
 
 impl HandleReport {
-    /// Returns a sentence if handles were cut or filled; `mm` is the unit of the positions in millimeters.
+    /// Returns a sentence if handles were cut or filled; `mm` is the unit of the positions in
+    /// millimeters.
     pub fn warning(&self, mm: f64) -> Option<String> {
         let list = |lengths: &[f32]| {
             let each: Vec<String> = lengths.iter().map(|&l| format!("{:.0}", f64::from(l) * mm)).collect();
@@ -75,9 +79,9 @@ impl HandleReport {
     }
 }
 
-/// Removes the handles of a closed manifold that have a loop no longer than `longest`, in place. Where the field is not
-/// finite it counts as 0. The mesh must not have vertex attributes yet. A surface without handles, or an open one, is
-/// unchanged.
+/// Removes the handles of a closed manifold that have a loop no longer than `longest`, in place.
+/// Where the field is not finite it counts as 0. The mesh must not have vertex attributes yet. A
+/// surface without handles, or an open one, is unchanged.
 ///
 /// # Errors
 ///
@@ -143,8 +147,9 @@ fn discs(loops: &LoopFinder, found: Vec<Loop>) -> Vec<Disc> {
     found.into_iter().filter_map(disc).collect()
 }
 
-/// Returns the triangulation of a closed polygon with the least area, its corners in the polygon's order. A diagonal
-/// that is `taken` would give an edge a third triangle; `None` if those cannot be avoided.
+/// Returns the triangulation of a closed polygon with the least area, its corners in the polygon's
+/// order. A diagonal that is `taken` would give an edge a third triangle; `None` if those cannot be
+/// avoided.
 fn least_area(points: &[DVec3], taken: impl Fn(usize, usize) -> bool) -> Option<Vec<[usize; 3]>> {
     let n = points.len();
     let at = |i: usize, j: usize| i * n + j;
@@ -161,7 +166,8 @@ fn least_area(points: &[DVec3], taken: impl Fn(usize, usize) -> bool) -> Option<
             }
             for k in i + 1..j {
                 let area = 0.5 * (points[k] - points[i]).cross(points[j] - points[i]).length();
-                // a triangle without area along a straight side would cost nothing: it is used only if no other is left
+                // a triangle without area along a straight side would cost nothing: it is used only
+                // if no other is left
                 let across = points[j].distance_squared(points[i]);
                 let flat = if area <= MIN_AREA * across { across / MIN_AREA } else { 0.0 };
                 let sum = cost[at(i, k)] + cost[at(k, j)] + area + flat;
@@ -215,7 +221,8 @@ struct HandleCutter<'a> {
     changed: Vec<bool>,
     /// The triangles that replace them in `next`, and the new ones.
     fresh: Vec<u32>,
-    /// The classes of the loops cut, reduced: while they are independent, the surface stays in one piece.
+    /// The classes of the loops cut, reduced: while they are independent, the surface stays in one
+    /// piece.
     basis: Vec<u64>,
 }
 
@@ -241,8 +248,8 @@ impl<'a> HandleCutter<'a> {
         }
     }
 
-    /// Cuts along a rim and closes both sides. Returns whether matter was cut or a hole filled; `None` if the cut is
-    /// impossible, also in combination with earlier ones.
+    /// Cuts along a rim and closes both sides. Returns whether matter was cut or a hole filled;
+    /// `None` if the cut is impossible, also in combination with earlier ones.
     fn along(&mut self, disc: &Disc) -> Option<bool> {
         let class = self.basis.iter().fold(disc.rim.class, |word, b| word.min(word ^ b));
         if class == 0 {

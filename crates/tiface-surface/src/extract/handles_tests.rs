@@ -22,7 +22,8 @@ fn slope(f: &impl Fn(Vec3) -> f32, p: Vec3) -> Vec3 {
     Vec3::new(d(Vec3::X), d(Vec3::Y), d(Vec3::Z))
 }
 
-/// Meshes twice, with handles and without; checks that the first has `genus` and the second none, and is as sound.
+/// Meshes twice, with handles and without; checks that the first has `genus` and the second none,
+/// and is as sound.
 fn simple(f: impl Fn(Vec3) -> f32 + Sync, longest_handle: f32, genus: i64) -> (Mesh, MeshReport) {
     let (kept, before) = mesh_of(&f, 0.0);
     assert_eq!((before.topology.genus, before.handles.left as i64), (Some(genus), genus));
@@ -68,7 +69,8 @@ fn a_surface_without_handles_is_the_same_with_and_without_the_search() {
 #[test]
 fn a_loop_of_hair_is_cut_once() {
     let (_, report) = simple(lock, 0.5, 1);
-    // 2 π 0.05 = 0.314 around the strand, along edges a little more or less; through the loop it is 0.8
+    // 2 π 0.05 = 0.314 around the strand, along edges a little more or less; through the loop it is
+    // 0.8
     let [around] = report.handles.cut[..] else { panic!("{:?}", report.handles) };
     assert!((0.25..0.4).contains(&around), "{around}");
     let heard = report.handles.warning(250.0).unwrap();
@@ -95,7 +97,8 @@ fn a_narrow_hole_beside_a_thick_strand_is_filled_although_both_loops_are_short_e
 
 #[test]
 fn a_long_slit_is_filled_before_the_rounder_strand_beside_it_is_cut() {
-    // a slit 0.06 × 0.4, 0.9 around; the strand beside it is 0.2 × 0.25, 0.9 around as well but with more to cut
+    // a slit 0.06 × 0.4, 0.9 around; the strand beside it is 0.2 × 0.25, 0.9 around as well but
+    // with more to cut
     let slit = |p: Vec3| {
         let q = (p - Vec3::new(0.37, 0.0, 0.0)).abs();
         let cut = (q.x - 0.03).max(q.y - 0.2);

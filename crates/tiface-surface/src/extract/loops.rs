@@ -1,15 +1,18 @@
-//! Short loops of a closed surface that do not separate it: around handles, and around the holes beside them.
+//! Short loops of a closed surface that do not separate it: around handles, and around the holes
+//! beside them.
 //!
-//! - A tree of triangles, grown breadth first, and a tree of vertices over the edges it does not cross leave
-//!   `2 · genus` edges (Eppstein 2003). Each closes a loop of triangles; of all such choices the one with the
-//!   shortest loops is taken (Erickson, Whittlesey 2005).
-//! - Every such loop has a random word, and an edge the exclusive or of the words of the loops that cross it. Along a
-//!   closed walk these add up to 0 if the walk separates the surface, and to the same word, its class, for
-//!   all walks that differ by separating ones.
-//! - So a loop that does not separate starts at some crossed edge. Shortest paths from that edge, as far as half
-//!   the length allowed, and the edges that join two of them with a class other than 0 are all short loops.
+//! - A tree of triangles, grown breadth first, and a tree of vertices over the edges it does not
+//!   cross leave `2 · genus` edges (Eppstein 2003). Each closes a loop of triangles; of all such
+//!   choices the one with the shortest loops is taken (Erickson, Whittlesey 2005).
+//! - Every such loop has a random word, and an edge the exclusive or of the words of the loops that
+//!   cross it. Along a closed walk these add up to 0 if the walk separates the surface, and to the
+//!   same word, its class, for all walks that differ by separating ones.
+//! - So a loop that does not separate starts at some crossed edge. Shortest paths from that edge,
+//!   as far as half the length allowed, and the edges that join two of them with a class other than
+//!   0 are all short loops.
 //!
-//! The words have 64 bits: two classes are taken for one by an accident of 1 in 10¹⁹, and then a handle stays.
+//! The words have 64 bits: two classes are taken for one by an accident of 1 in 10¹⁹, and then a
+//! handle stays.
 
 use glam::Vec3;
 use std::cmp::Reverse;
@@ -23,7 +26,8 @@ const NONE: u32 = u32::MAX;
 /// Maximum number of classes per round; the next round processes the others.
 const MAX_CLASSES: usize = 256;
 
-/// Number of vertices of a loop from which a shorter loop of its class is searched, and number of such searches.
+/// Number of vertices of a loop from which a shorter loop of its class is searched, and number of
+/// such searches.
 const SHORTENING_STARTS: usize = 8;
 const SHORTENING_ROUNDS: usize = 3;
 
@@ -34,12 +38,13 @@ pub(super) struct Loop {
     pub vertices: Vec<u32>,
     /// Length along the edges.
     pub length: f32,
-    /// The handles that it goes around: independent words belong to loops that together do not separate.
+    /// The handles that it goes around: independent words belong to loops that together do not
+    /// separate.
     pub class: u64,
 }
 
-/// A closed manifold with a word for each side, which distinguishes its loops. Corner `3 t + k` stands for the side
-/// from vertex k to k + 1 of triangle t.
+/// A closed manifold with a word for each side, which distinguishes its loops. Corner `3 t + k`
+/// stands for the side from vertex k to k + 1 of triangle t.
 pub(super) struct LoopFinder<'a> {
     positions: &'a [Vec3],
     triangles: &'a [[u32; 3]],
@@ -54,7 +59,8 @@ pub(super) struct LoopFinder<'a> {
 }
 
 impl<'a> LoopFinder<'a> {
-    /// `None` for a surface that is not closed or wound inconsistently; every vertex must have one fan.
+    /// `None` for a surface that is not closed or wound inconsistently; every vertex must have one
+    /// fan.
     pub(super) fn new(positions: &'a [Vec3], triangles: &'a [[u32; 3]]) -> Option<LoopFinder<'a>> {
         let mut twin = vec![NONE; 3 * triangles.len()];
         let start = |c: u32| side_ends(triangles, c).0;
@@ -167,9 +173,11 @@ impl<'a> LoopFinder<'a> {
         }
     }
 
-    /// Loops up to a length that do not separate the surface, some for every class found, in no useful order.
+    /// Loops up to a length that do not separate the surface, some for every class found, in no
+    /// useful order.
     pub(super) fn short(&self, longest: f32, monitor: &dyn Monitor) -> Result<Vec<Loop>> {
-        // from places a quarter of the length apart, as far as any short loop through that quarter goes
+        // from places a quarter of the length apart, as far as any short loop through that quarter
+        // goes
         let apart = 0.25 * longest;
         let mut ball = Ball::new(self);
         let mut covered = vec![false; self.positions.len()];
@@ -219,8 +227,8 @@ impl<'a> LoopFinder<'a> {
         Ok(out)
     }
 
-    /// Returns the length of a loop that does not separate the surface: no longer one than the shortest through a few
-    /// places of its handles. `None` without handles.
+    /// Returns the length of a loop that does not separate the surface: no longer one than the
+    /// shortest through a few places of its handles. `None` without handles.
     pub(super) fn some_length(&self) -> Option<f32> {
         let mut ball = Ball::new(self);
         let lengths = self.seeds.iter().take(SHORTENING_STARTS).filter_map(|&seed| {
@@ -286,7 +294,8 @@ impl<'a> Ball<'a> {
         }
     }
 
-    /// Returns for every class the side that closes the shortest closed walk, and the walk's length.
+    /// Returns for every class the side that closes the shortest closed walk, and the walk's
+    /// length.
     fn closing(&self) -> BTreeMap<u64, (f32, u32)> {
         let mut best: BTreeMap<u64, (f32, u32)> = BTreeMap::new();
         for &v in &self.reached {

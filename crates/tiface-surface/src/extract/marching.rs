@@ -1,10 +1,10 @@
 //! Marching cubes over a dense volume: closed, manifold, finite, with the trilinear topology.
 //!
-//! Passes over rows as in flying edges (Schroeder, Maynard, Geveci 2015): inside bits, 64 nodes to a
-//! word; crossings counted per row by comparing words; prefix sums; vertices and triangles written at
-//! fixed offsets. Cells without a crossing cost a sixty-fourth of a few word operations. A vertex's
-//! index is arithmetic: running counters per row, never a hash. What happens inside a cell is in
-//! `marching_cell`. The bytes are the same for any number of threads.
+//! Passes over rows as in flying edges (Schroeder, Maynard, Geveci 2015): inside bits, 64 nodes to
+//! a word; crossings counted per row by comparing words; prefix sums; vertices and triangles
+//! written at fixed offsets. Cells without a crossing cost a sixty-fourth of a few word operations.
+//! A vertex's index is arithmetic: running counters per row, never a hash. What happens inside a
+//! cell is in `marching_cell`. The bytes are the same for any number of threads.
 //!
 //! An exact zero is outside, `-0.0` too.
 
@@ -88,13 +88,13 @@ impl LevelSet {
 
 /// Returns the zero level set of a volume.
 ///
-/// With `closed`, nodes on the outer faces count as outside, so that a surface that leaves the box is capped
-/// within a thousandth of a cell of its faces; without, the surface is open at the faces.
+/// With `closed`, nodes on the outer faces count as outside, so that a surface that leaves the box
+/// is capped within a thousandth of a cell of its faces; without, the surface is open at the faces.
 ///
 /// # Errors
 ///
-/// Disagreeing `dims` and `values`, an axis with fewer than two nodes, more vertices or triangles than 32-bit indices
-/// can name.
+/// Disagreeing `dims` and `values`, an axis with fewer than two nodes, more vertices or triangles
+/// than 32-bit indices can name.
 pub fn marching(volume: &Volume, closed: bool) -> Result<LevelSet> {
     let nodes = volume.dims.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
     if volume.dims.iter().any(|&d| d < 2) || nodes != Some(volume.values.len()) {
@@ -120,7 +120,8 @@ pub fn marching(volume: &Volume, closed: bool) -> Result<LevelSet> {
     Ok(out)
 }
 
-/// Returns where the vertex of a crossed edge lies: on the edge that leaves `node` along `axis`, at `t` cells.
+/// Returns where the vertex of a crossed edge lies: on the edge that leaves `node` along `axis`, at
+/// `t` cells.
 pub(super) fn edge_point(origin: Vec3, spacing: Vec3, node: [usize; 3], axis: usize, t: f64) -> Vec3 {
     let mut at = [0.0; 3];
     at[axis] = t;
@@ -138,8 +139,8 @@ pub(super) fn sided(value: f32, inside: bool) -> f32 {
     if inside { value } else { value.max(0.0) }
 }
 
-/// Finite stand-ins: the sign as documented, the size that of the largest finite neighbor. One value per node, not
-/// per cell, so that cells agree on their common edges.
+/// Finite stand-ins: the sign as documented, the size that of the largest finite neighbor. One
+/// value per node, not per cell, so that cells agree on their common edges.
 fn repair(volume: &Volume, out: &mut LevelSet) -> Vec<f32> {
     let [nx, ny, _] = volume.dims;
     let mut values = volume.values.to_vec();
@@ -270,8 +271,8 @@ impl Passes<'_> {
             for_each_active(&self.bits, j, k, |i, index| {
                 let case = &cases[index as usize];
                 let step = &case.advance;
-                // A crossed y or z edge at the near side of the cell comes before the one at its far
-                // side; the x edges have one each.
+                // A crossed y or z edge at the near side of the cell comes before the one at its
+                // far side; the x edges have one each.
                 let ids = [
                     next[0],
                     next[1],
@@ -366,8 +367,8 @@ impl Bits {
     }
 }
 
-/// Calls `found(first node, word)` for every non-zero word of crossed edges that leave the nodes of row
-/// (j, k) along `axis`.
+/// Calls `found(first node, word)` for every non-zero word of crossed edges that leave the nodes of
+/// row (j, k) along `axis`.
 #[inline]
 pub(super) fn crossings(bits: &Bits, j: usize, k: usize, axis: usize, mut found: impl FnMut(usize, u64)) {
     let [nx, ny, nz] = bits.dims;
@@ -436,8 +437,8 @@ fn below_zero_short(values: &[f32]) -> (u64, bool) {
         .fold((0, true), |(word, finite), (i, v)| (word | u64::from(*v < 0.0) << i, finite & v.is_finite()))
 }
 
-/// SSE2, which every x86-64 has: sixteen comparisons to a mask at a time. `v − v` is NaN exactly when v
-/// is not finite, and a sum keeps it.
+/// SSE2, which every x86-64 has: sixteen comparisons to a mask at a time. `v − v` is NaN exactly
+/// when v is not finite, and a sum keeps it.
 #[cfg(target_arch = "x86_64")]
 #[inline]
 fn below_zero(values: &[f32; 64]) -> (u64, bool) {
@@ -480,8 +481,8 @@ mod tests {
 
     #[test]
     fn a_lone_inside_node_is_an_octahedron() {
-        // Node (1, 1, 1) at -1 among +1: six crossings half way along its edges. The octahedron with
-        // half axes ½ has volume 4/3 · (1/2)³ = 1/6, eight faces.
+        // Node (1, 1, 1) at -1 among +1: six crossings half way along its edges. The octahedron
+        // with half axes ½ has volume 4/3 · (1/2)³ = 1/6, eight faces.
         let mut v = vec![1.0; 27];
         v[13] = -1.0;
         let s = marching(&cube(3, &v), false).unwrap();

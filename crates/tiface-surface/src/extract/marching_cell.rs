@@ -1,21 +1,22 @@
 //! The surface inside one cell, with the topology of the trilinear interpolant.
 //!
-//! Corners are numbered `x + 2y + 4z`. Edges 0..4 run along x (`y + 2z`), 4..8 along y (`4 + x + 2z`),
-//! 8..12 along z (`8 + x + 2y`). A case is the eight inside bits.
+//! Corners are numbered `x + 2y + 4z`. Edges 0..4 run along x (`y + 2z`), 4..8 along y
+//! (`4 + x + 2z`), 8..12 along z (`8 + x + 2y`). A case is the eight inside bits.
 //!
 //! 1. **Faces.** Every crossed edge is entered from one face and left through another, so directed
-//!    segments on the six faces close into loops. A face with two diagonal corners inside is decided by
-//!    the sign of its saddle, `a c > b d` (Nielson, Hamann 1991): exact in f64 for f32 values, the same
-//!    for both cells that share the face. A tie joins the outside.
-//! 2. **Body.** Loops joined by a tunnel are found by a sweep. At height w the interpolant is bilinear
-//!    with corners linear in w; its zero set is at most two arcs, whose pairing changes only where a
-//!    vertical edge is crossed or where `A(w) C(w) − B(w) D(w) = 0`, a quadratic. Between those heights
-//!    every arc is a path on the surface between two points of the loops: so loops at its ends belong
-//!    together. This decides all cases of Chernyaev 1995, those corrected by Custodio et al. 2013
-//!    included (10, 12, 13), from one axis: a trilinear surface has no piece that meets no side face.
-//! 3. **Triangles.** A disk spans each lone loop, a strip joins two. No inner edge joins two vertices on
-//!    one cube face, because the neighbor may use the same pair and the edge would have four faces. A
-//!    loop that allows no such triangulation gets a vertex in its middle.
+//!    segments on the six faces close into loops. A face with two diagonal corners inside is
+//!    decided by the sign of its saddle, `a c > b d` (Nielson, Hamann 1991): exact in f64 for f32
+//!    values, the same for both cells that share the face. A tie joins the outside.
+//! 2. **Body.** Loops joined by a tunnel are found by a sweep. At height w the interpolant is
+//!    bilinear with corners linear in w; its zero set is at most two arcs, whose pairing changes
+//!    only where a vertical edge is crossed or where `A(w) C(w) − B(w) D(w) = 0`, a quadratic.
+//!    Between those heights every arc is a path on the surface between two points of the loops: so
+//!    loops at its ends belong together. This decides all cases of Chernyaev 1995, those corrected
+//!    by Custodio et al. 2013 included (10, 12, 13), from one axis: a trilinear surface has no
+//!    piece that meets no side face.
+//! 3. **Triangles.** A disk spans each lone loop, a strip joins two. No inner edge joins two
+//!    vertices on one cube face, because the neighbor may use the same pair and the edge would have
+//!    four faces. A loop that allows no such triangulation gets a vertex in its middle.
 
 use glam::Vec3;
 use std::sync::LazyLock;
@@ -31,9 +32,9 @@ const FACES: [[u8; 4]; 6] =
 /// First of the vertex codes that name inner vertices instead of edges.
 const INNER: u8 = 12;
 
-/// Returns where the surface crosses an edge, 0..=1 from the end with value `a`; one end is inside (< 0), the
-/// other outside (≥ 0). Kept off the nodes: vertices never coincide and no face loses its area when a
-/// node is exactly zero.
+/// Returns where the surface crosses an edge, 0..=1 from the end with value `a`; one end is inside
+/// (< 0), the other outside (≥ 0). Kept off the nodes: vertices never coincide and no face loses
+/// its area when a node is exactly zero.
 pub(super) fn crossing(a: f32, b: f32) -> f64 {
     let (a, b) = (f64::from(a), f64::from(b));
     (a / (a - b)).clamp(1.0 / 1024.0, 1023.0 / 1024.0)
@@ -57,8 +58,8 @@ pub(super) struct CellOutput<'a> {
 }
 
 impl CellOutput<'_> {
-    /// Writes a cell with these vertices on its edges: the surface of its case, or the one that was resolved. `point`
-    /// places its inner vertices.
+    /// Writes a cell with these vertices on its edges: the surface of its case, or the one that was
+    /// resolved. `point` places its inner vertices.
     #[inline]
     pub(super) fn write(
         &mut self,
@@ -148,7 +149,8 @@ fn edge_between(a: u8, b: u8) -> u8 {
     }
 }
 
-/// Returns whether two edges lie on one cube face: they do when they agree on a coordinate that is fixed for both.
+/// Returns whether two edges lie on one cube face: they do when they agree on a coordinate that is
+/// fixed for both.
 fn share_face(a: u8, b: u8) -> bool {
     let (ca, cb) = (EDGES[a as usize], EDGES[b as usize]);
     (0..3).any(|axis| {
@@ -206,8 +208,8 @@ impl Loops {
     }
 }
 
-/// Returns the surface in a cell with these values: inside corners (bits of `case`) below zero, the others at or above
-/// it, all finite.
+/// Returns the surface in a cell with these values: inside corners (bits of `case`) below zero, the
+/// others at or above it, all finite.
 pub(super) fn resolve(case: u8, values: &[f32; 8]) -> CellSurface {
     let v = values.map(f64::from);
     let loops = Loops::trace(case, |face| {
@@ -228,7 +230,8 @@ pub(super) fn resolve(case: u8, values: &[f32; 8]) -> CellSurface {
                     tunnel(list, &loops.loops[b], &at, &mut out);
                 }
             }
-            // Three loops on one piece do not occur; were rounding to say so, disks are still closed.
+            // Three loops on one piece do not occur; were rounding to say so, disks are still
+            // closed.
             _ => disk(list, &at, &mut out),
         }
     }
@@ -272,8 +275,8 @@ fn join(case: u8, v: &[f64; 8], loops: &Loops) -> [u8; 4] {
             let [bottom, top] = EDGES[UPRIGHT[i]];
             bit(case, if root[i].is_some_and(|r| w > r) { top } else { bottom })
         });
-        // The loop of the arc's end on each side face; a face with two segments is passed below both
-        // of its uprights' crossings or above both.
+        // The loop of the arc's end on each side face; a face with two segments is passed below
+        // both of its uprights' crossings or above both.
         let end: [Option<u8>; 4] = std::array::from_fn(|i| {
             let n = (i + 1) % 4;
             if inside[i] == inside[n] {
@@ -444,8 +447,8 @@ impl StripSearch<'_> {
         cost.is_finite().then_some((steps, start))
     }
 
-    /// Stands on rung (i, j) counted from the start; the last `run_p` steps went along p, or the last
-    /// `run_q` along q. A full turn around one loop about one vertex would use a rung twice.
+    /// Stands on rung (i, j) counted from the start; the last `run_p` steps went along p, or the
+    /// last `run_q` along q. A full turn around one loop about one vertex would use a rung twice.
     fn walk(&mut self, i: usize, j: usize, cost: f64, run_p: usize, run_q: usize) {
         let (m, n) = (self.p.len(), self.q.len());
         let (a, b) = (self.p[i % m], self.q[(self.start + j) % n]);

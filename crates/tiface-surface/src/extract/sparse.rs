@@ -1,15 +1,16 @@
-//! Sparse extraction of the zero level set of an expensive field: only nodes near the surface are evaluated.
+//! Sparse extraction of the zero level set of an expensive field: only nodes near the surface are
+//! evaluated.
 //!
 //! 1. Every `coarse_step`-th node of the grid, along each axis, is evaluated (every 8th: 0.2 %).
 //! 2. So is every node along the coarse edges that change sign.
-//! 3. **Flood.** Whenever two evaluated neighbors differ in sign, all four cells around that edge are
-//!    evaluated, until none is left. The rule depends on evaluated nodes only, so the surface it leaves is
-//!    closed by construction, and equal to the dense one on every piece it met.
+//! 3. **Flood.** Whenever two evaluated neighbors differ in sign, all four cells around that edge
+//!    are evaluated, until none is left. The rule depends on evaluated nodes only, so the surface
+//!    it leaves is closed by construction, and equal to the dense one on every piece it met.
 //!
-//! A piece that lies between coarse nodes is missed: a finer coarse step finds it. Nodes on the outer
-//! faces of the grid count as outside. Nodes outside the hull count as outside too, and are not
-//! evaluated. The flood starts everywhere at once, so its waves are few and large, and the field is
-//! evaluated at thousands of points at a time.
+//! A piece that lies between coarse nodes is missed: a finer coarse step finds it. Nodes on the
+//! outer faces of the grid count as outside. Nodes outside the hull count as outside too, and are
+//! not evaluated. The flood starts everywhere at once, so its waves are few and large, and the
+//! field is evaluated at thousands of points at a time.
 //!
 //! Evaluated nodes are kept in blocks near the surface (`blocks`).
 
@@ -36,13 +37,13 @@ pub struct Sparse {
 
 /// Returns the zero level set of `field` over `grid`, closed at its borders.
 ///
-/// The first nodes evaluated lie `coarse_step` cells apart. The field is called from one thread: it may well use all of
-/// them. Nodes that it excludes count as outside.
+/// The first nodes evaluated lie `coarse_step` cells apart. The field is called from one thread: it
+/// may well use all of them. Nodes that it excludes count as outside.
 ///
 /// # Errors
 ///
-/// A field that returns the wrong number of values, a coarse step other than 2, 4, 8, more vertices than 32-bit
-/// indices can name, a request to stop, which is checked between batches.
+/// A field that returns the wrong number of values, a coarse step other than 2, 4, 8, more vertices
+/// than 32-bit indices can name, a request to stop, which is checked between batches.
 pub fn sparse(
     field: &dyn SdfField,
     grid: &NodeGrid,
@@ -324,7 +325,8 @@ mod tests {
 
     #[test]
     fn a_face_in_a_block_border_and_a_tube_along_a_block_edge_survive() {
-        // 64 cells of 1/32: block borders lie at multiples of 1/4; the field is zero on the plane x = 0.25.
+        // 64 cells of 1/32: block borders lie at multiples of 1/4; the field is zero on the plane
+        // x = 0.25.
         let slab = |p: Vec3| (p.x - 0.25).max(-0.5 - p.x).max(p.y.abs() - 0.5).max(p.z.abs() - 0.5);
         let (few, dense) = both(slab, Aabb::SCENE, 64);
         assert_eq!(key(&few.surface), key(&dense));

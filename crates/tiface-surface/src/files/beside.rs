@@ -1,8 +1,9 @@
 //! Files that a mesh names: materials and pictures.
 //!
-//! Programs write them as they saw them: in quotes, with folders, with the drive of another machine. They are looked
-//! for in the mesh's own folder and the folders in it, and nowhere else: of `C:\scans\textures\head.png` first
-//! `textures/head.png`, then `head.png`. A file that is not found as it was written is told with the result.
+//! Programs write them as they saw them: in quotes, with folders, with the drive of another
+//! machine. They are looked for in the mesh's own folder and the folders in it, and nowhere else:
+//! of `C:\scans\textures\head.png` first `textures/head.png`, then `head.png`. A file that is not
+//! found as it was written is told with the result.
 
 use std::path::{Path, PathBuf};
 use tiface_base::io;
@@ -40,7 +41,8 @@ pub(super) fn names_between_blanks(text: &str) -> Vec<&str> {
     names
 }
 
-/// Finds a file in one of `folders` by the name that the file `by` writes, perhaps with a comment behind it.
+/// Finds a file in one of `folders` by the name that the file `by` writes, perhaps with a comment
+/// behind it.
 ///
 /// # Errors
 ///
@@ -90,7 +92,8 @@ fn find_whole(folders: &[&Path], by: &Path, written: &str) -> Result<Beside> {
     Err(Error::cannot(format!("`{shown}` names `{written}`, which is not there"), hint))
 }
 
-/// Returns the end of a path that leads into the folder: what follows the last `..`, without drive and root.
+/// Returns the end of a path that leads into the folder: what follows the last `..`, without drive
+/// and root.
 fn inner_parts(written: &str) -> Vec<&str> {
     let mut parts = Vec::new();
     for part in written.split(['/', '\\', ':']).map(str::trim) {
@@ -109,8 +112,9 @@ fn inner_parts(written: &str) -> Vec<&str> {
 const READ: [&str; 3] = ["png", "jpg", "jpeg"];
 const CONVERTED: [&str; 6] = ["tif", "tiff", "tga", "bmp", "webp", "exr"];
 
-/// Returns the picture that a file of a format that is not read was converted to, if it lies beside it: `Some(None)` if
-/// there is none, or more than one, `None` if the ending of the file is that of no such format.
+/// Returns the picture that a file of a format that is not read was converted to, if it lies beside
+/// it: `Some(None)` if there is none, or more than one, `None` if the ending of the file is that of
+/// no such format.
 pub(super) fn converted(file: &Path) -> Option<Option<PathBuf>> {
     let ending = file.extension()?.to_str()?.to_lowercase();
     let (folder, stem) = (file.parent()?, file.file_stem()?.to_str()?);
@@ -118,8 +122,8 @@ pub(super) fn converted(file: &Path) -> Option<Option<PathBuf>> {
     CONVERTED.contains(&ending.as_str()).then(|| Some(folder.join(other()?)))
 }
 
-/// Returns the only file in a folder whose name differs from this one by capital letters alone, or else, of a picture,
-/// by its ending.
+/// Returns the only file in a folder whose name differs from this one by capital letters alone, or
+/// else, of a picture, by its ending.
 fn nearly_the_same(folder: &Path, name: &str) -> Option<String> {
     // the folder of a bare file name is empty
     let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };

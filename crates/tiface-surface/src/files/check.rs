@@ -1,12 +1,14 @@
-//! Validation of a mesh. Counts are on vertices welded by equal position, so texture seams do not matter.
+//! Validation of a mesh. Counts are on vertices welded by equal position, so texture seams do not
+//! matter.
 //!
 //! - closed: every edge in exactly two triangles, oppositely wound;
-//! - watertight: closed, and every piece wound outward, except cavities: pieces wound inward that lie inside another;
+//! - watertight: closed, and every piece wound outward, except cavities: pieces wound inward that
+//!   lie inside another;
 //! - manifold: no edge in more than two triangles, no vertex with more than one fan;
 //! - Euler number `V − E + F`; genus = pieces − Euler/2 for a closed manifold;
-//! - self-intersection: an edge that runs from one side of another triangle to the other, through it
-//!   or its border, or two triangles of one plane that share area. Sharing a corner or an edge is not
-//!   one, nor is resting on another triangle. Signs come from the determinant in f64 with
+//! - self-intersection: an edge that runs from one side of another triangle to the other, through
+//!   it or its border, or two triangles of one plane that share area. Sharing a corner or an edge
+//!   is not one, nor is resting on another triangle. Signs come from the determinant in f64 with
 //!   Shewchuk's error bound (1997); what the bound cannot tell from zero counts as touching.
 //! - sliver: quality `4 √3 · area / Σ edge²` below 0.05 (1 for an equilateral triangle).
 
@@ -130,11 +132,11 @@ pub fn check_around(mesh: &Mesh, origin: DVec3, unit_m: f64) -> CheckReport {
 /// Cost of comparing two triangles, in comparisons of boxes.
 const TRIANGLE_TEST_COST: usize = 16;
 
-/// Returns how many triangles pass through or lie on another one, and how many others were not compared with all
-/// candidates.
+/// Returns how many triangles pass through or lie on another one, and how many others were not
+/// compared with all candidates.
 fn self_intersections(mesh: &Mesh, faces: &[[u32; 3]], sources: &[u32]) -> (usize, usize) {
-    // Triangles over the same corners lie on each other, so one of them stands for all: a shape that is repeated in
-    // one place costs no more than a single one.
+    // Triangles over the same corners lie on each other, so one of them stands for all: a shape
+    // that is repeated in one place costs no more than a single one.
     let mut sorted: Vec<([u32; 3], u32)> = (0..faces.len() as u32)
         .into_par_iter()
         .filter_map(|f| {
@@ -317,7 +319,8 @@ mod tests {
             triangles: vec![[0, 1, 2], [0, 1, 3], [0, 1, 4]],
             ..Mesh::default()
         };
-        // nothing says which two of the three go on into each other: each is a fan of its own at both ends
+        // nothing says which two of the three go on into each other: each is a fan of its own at
+        // both ends
         let r = check(&m, 1.0);
         assert_eq!((r.nonmanifold_edges, r.nonmanifold_vertices, r.boundary_edges), (1, 2, 6));
     }

@@ -1,4 +1,5 @@
-//! The result of [`check`](super::check()), its text, and the requirements of `tiface check --require`.
+//! The result of [`check`](super::check()), its text, and the requirements of
+//! `tiface check --require`.
 
 use super::uv_check::{UvReport, bound};
 use glam::DVec3;
@@ -6,7 +7,8 @@ use serde::Serialize;
 use std::fmt;
 use tiface_base::{Error, Result};
 
-/// The result of [`check`](super::check()). Counts of triangles are of the mesh as given; topology is after welding.
+/// The result of [`check`](super::check()). Counts of triangles are of the mesh as given; topology
+/// is after welding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CheckReport {
     /// Vertices as stored.
@@ -37,8 +39,8 @@ pub struct CheckReport {
     pub genus: Option<i64>,
     /// Triangles that pass through or lie on another.
     pub self_intersections: usize,
-    /// Triangles not among them that were not compared with all that lie near them, because too many do: then
-    /// their number is a lower bound.
+    /// Triangles not among them that were not compared with all that lie near them, because too
+    /// many do: then their number is a lower bound.
     pub self_intersections_left: usize,
     /// Long thin triangles.
     pub slivers: usize,
@@ -52,20 +54,21 @@ pub struct CheckReport {
     pub size_m: [f64; 3],
     /// Enclosed volume in liters, negative when wound inward; an open mesh encloses none.
     pub volume_l: Option<f64>,
-    /// Pieces of a closed mesh that are inside out and no cavity of another piece, or that enclose nothing. A piece is what
-    /// edges connect.
+    /// Pieces of a closed mesh that are inside out and no cavity of another piece, or that enclose
+    /// nothing. A piece is what edges connect.
     pub wrong_pieces: Vec<PieceReport>,
     /// Whether every vertex has a color.
     pub has_colors: bool,
-    /// Whether a texture gives the mesh its colors; set by readers, because [`check`](super::check()) receives only the mesh.
+    /// Whether a texture gives the mesh its colors; set by readers, because
+    /// [`check`](super::check()) receives only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub has_texture: Option<bool>,
     /// Whether every vertex has a normal.
     pub has_normals: bool,
     /// Normals whose length is not 1 within 5e-4.
     pub bad_normals: usize,
-    /// The report on its texture coordinates; set by callers of [`uv_check`](super::uv_check()), because
-    /// [`check`](super::check()) sees only the mesh.
+    /// The report on its texture coordinates; set by callers of [`uv_check`](super::uv_check()),
+    /// because [`check`](super::check()) sees only the mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub uv: Option<UvReport>,
 }
@@ -131,7 +134,8 @@ impl CheckReport {
     ///
     /// # Errors
     ///
-    /// Returns the first requirement missed, as [`ErrorKind::BelowBar`](tiface_base::ErrorKind::BelowBar); or an unknown requirement, as
+    /// Returns the first requirement missed, as
+    /// [`ErrorKind::BelowBar`](tiface_base::ErrorKind::BelowBar); or an unknown requirement, as
     /// [`ErrorKind::Usage`](tiface_base::ErrorKind::Usage).
     pub fn require(&self, requirements: &[&str]) -> Result<()> {
         for &requirement in requirements {

@@ -3,8 +3,8 @@
 /// Above this, colors cannot be light that is a little too bright: they count to 255.
 const BRIGHTEST: f32 = 2.0;
 
-/// Brings colors to 0..=1: those that count to 255 or 65535 are divided, all are clamped. Returns a sentence about it
-/// if any was above 1. `what` names the colors.
+/// Brings colors to 0..=1: those that count to 255 or 65535 are divided, all are clamped. Returns a
+/// sentence about it if any was above 1. `what` names the colors.
 pub(super) fn bring_into_range(colors: &mut [[f32; 3]], what: &str) -> Option<String> {
     let values = colors.as_flattened_mut();
     let highest = values.iter().copied().fold(0.0, f32::max);
@@ -25,7 +25,8 @@ pub(super) fn bring_into_range(colors: &mut [[f32; 3]], what: &str) -> Option<St
     }
 }
 
-/// Returns the mean color of the triangles around each vertex; black for a vertex without triangles.
+/// Returns the mean color of the triangles around each vertex; black for a vertex without
+/// triangles.
 pub(super) fn at_vertices(
     vertices: usize,
     triangles: &[[u32; 3]],

@@ -1,18 +1,20 @@
-//! Preparation of a mesh for any file format: index checks, finite numbers, unit normals, the file's up direction and
-//! unit.
+//! Preparation of a mesh for any file format: index checks, finite numbers, unit normals, the
+//! file's up direction and unit.
 //!
 //! The dataset's world stays untouched until here. glTF and OBJ are right-handed with +Y up, so a
 //! capture with another `up` is turned once, in the vertices: `(x, y, z) → (x, z, −y)` for +Z up.
 //!
 //! A scene may lie kilometers from its origin, where f32 steps over a whole head. So meshes come in
-//! coordinates of their own with the way into the world in f64, and are prepared around their own middle.
+//! coordinates of their own with the way into the world in f64, and are prepared around their own
+//! middle.
 //!
-//! `Mesh` and [`Atlas`](tiface_base::geom::Atlas) are indexed apart, as OBJ is: a vertex on a seam has one position and
-//! several texture coordinates, and the surface stays closed. GLB and textured PLY have one index for
-//! everything, so vertices are split where corners disagree. The copies are bit-identical in
-//! position and normal: welding equal positions closes the surface again.
+//! `Mesh` and [`Atlas`](tiface_base::geom::Atlas) are indexed apart, as OBJ is: a vertex on a seam
+//! has one position and several texture coordinates, and the surface stays closed. GLB and textured
+//! PLY have one index for everything, so vertices are split where corners disagree. The copies are
+//! bit-identical in position and normal: welding equal positions closes the surface again.
 //!
-//! All problems that prevent a mesh or a texture from being written are found before any bytes are produced.
+//! All problems that prevent a mesh or a texture from being written are found before any bytes are
+//! produced.
 
 use super::head_texture::{HeadTexture, check_atlas};
 use super::tangents::tangents_of;
@@ -30,8 +32,8 @@ use tiface_base::{Error, Result, io};
 pub struct ExportOptions {
     /// The object's name in viewers.
     pub name: String,
-    /// Base name of the files. Characters other than ASCII letters, digits, `-`, `_` and `.` become `_`, since
-    /// readers of MTL take a space for the end of a name.
+    /// Base name of the files. Characters other than ASCII letters, digits, `-`, `_` and `.` become
+    /// `_`, since readers of MTL take a space for the end of a name.
     pub stem: String,
     /// The up direction in the dataset's world; any length but 0.
     pub up: Vec3,
@@ -41,8 +43,8 @@ pub struct ExportOptions {
     pub unlit: bool,
     /// The transform from the mesh's own coordinates into the dataset's world.
     pub world_from_mesh: Similarity,
-    /// Quality, 1..=100, of colors stored as JPEG, which is smaller but lossy. `None` stores PNG, which is lossless;
-    /// normal maps are always PNG.
+    /// Quality, 1..=100, of colors stored as JPEG, which is smaller but lossy. `None` stores PNG,
+    /// which is lossless; normal maps are always PNG.
     pub jpeg_quality: Option<u8>,
 }
 
@@ -93,21 +95,21 @@ pub(super) struct FileMesh {
     pub source: Vec<u32>,
     /// The triangles, without those that use a vertex twice.
     pub triangles: Vec<[u32; 3]>,
-    /// Texture coordinates, 0..=1; empty without a texture. Zeros are positive, so that equal coordinates have equal
-    /// bytes.
+    /// Texture coordinates, 0..=1; empty without a texture. Zeros are positive, so that equal
+    /// coordinates have equal bytes.
     pub uvs: Vec<Vec2>,
     /// Indices into `uvs` for the corners of the triangles; empty once the mesh is split.
     pub corners: Vec<[u32; 3]>,
     /// Tangents, one for each vertex of a mesh that was split for a normal map, else empty.
     pub tangents: Vec<Vec4>,
-    /// Offset of all positions, in f64; zero unless the mesh lies far from the origin. Every coordinate is
-    /// representable as f32.
+    /// Offset of all positions, in f64; zero unless the mesh lies far from the origin. Every
+    /// coordinate is representable as f32.
     pub translation: DVec3,
 }
 
 impl FileMesh {
-    /// Checks, turns and scales a mesh with its texture. A mesh far from the origin is returned around its own
-    /// center, with that center as `translation`.
+    /// Checks, turns and scales a mesh with its texture. A mesh far from the origin is returned
+    /// around its own center, with that center as `translation`.
     pub fn new(mesh: &Mesh, texture: Option<&HeadTexture>, file_from_mesh: &Similarity) -> Result<FileMesh> {
         let vertices = mesh.positions.len();
         texture.map_or(Ok(()), |t| check_atlas(mesh, &t.atlas))?;
@@ -177,9 +179,9 @@ impl FileMesh {
         self.translation + position.as_dvec3()
     }
 
-    /// Converts to a single index: vertices are split where corners disagree about the texture coordinate or, for a
-    /// normal map, the tangent. Vertices come in the order of their first use; unused ones are left out. A mesh
-    /// without a texture is unchanged.
+    /// Converts to a single index: vertices are split where corners disagree about the texture
+    /// coordinate or, for a normal map, the tangent. Vertices come in the order of their first use;
+    /// unused ones are left out. A mesh without a texture is unchanged.
     pub fn split(self, with_tangents: bool) -> FileMesh {
         if self.corners.is_empty() {
             return self;
@@ -225,8 +227,8 @@ impl FileMesh {
         out
     }
 
-    /// Returns the positions of a layer over this part of a mesh: `scale` converts lengths of the mesh to those of
-    /// the file.
+    /// Returns the positions of a layer over this part of a mesh: `scale` converts lengths of the
+    /// mesh to those of the file.
     pub fn moved(&self, layer: &ShellLayer, scale: f32) -> Vec<Vec3> {
         let offset = |v: &u32| scale * layer.offsets[*v as usize];
         let each = self.positions.iter().zip(&self.normals).zip(&self.source);
@@ -234,8 +236,8 @@ impl FileMesh {
     }
 }
 
-/// Distance from the origin, in the mesh's own sizes, beyond which a mesh counts as far: up to it f32 rounds by less
-/// than a millionth of the size.
+/// Distance from the origin, in the mesh's own sizes, beyond which a mesh counts as far: up to it
+/// f32 rounds by less than a millionth of the size.
 const FAR_ORIGIN: f64 = 15.0;
 
 /// Returns the box of a mesh in the file's coordinates.
@@ -251,8 +253,8 @@ pub(super) fn middle((low, high): (DVec3, DVec3)) -> (DVec3, f64, bool) {
     (center, size, center.abs().max_element() > FAR_ORIGIN * size)
 }
 
-/// Returns the warning for a mesh far from the origin in a format that keeps absolute positions: the files hold
-/// enough digits, but many readers do not. `None` if no precision is lost.
+/// Returns the warning for a mesh far from the origin in a format that keeps absolute positions:
+/// the files hold enough digits, but many readers do not. `None` if no precision is lost.
 pub(super) fn distance_warning(mesh: &Mesh, file_from_mesh: &Similarity, ending: &str) -> Option<String> {
     let (center, size, far) = middle(placed_box(mesh, file_from_mesh));
     let away = center.abs().max_element();
@@ -438,7 +440,8 @@ pub(super) mod tests {
         assert!(text.contains("the .obj lies 5.000e6") && text.contains("to 5.0e-1, 2.0e0 of its"), "{text}");
     }
 
-    /// Returns a tetrahedron of which every face has a corner of the texture to itself, and its pictures.
+    /// Returns a tetrahedron of which every face has a corner of the texture to itself, and its
+    /// pictures.
     pub fn tetrahedron() -> (Mesh, HeadTexture) {
         let mesh = Mesh {
             positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, Vec3::Z],

@@ -4,19 +4,22 @@
 //! `KHR_materials_unlit`, beside a rough non-metal for viewers that do not know it.
 //!
 //! Color is either the vertices' own or a texture's, never both, since viewers multiply them:
-//! `COLOR_0` is **linear** light, while our vertex colors and pictures are sRGB-coded. Pictures lie in
-//! the file. A mesh far from the origin is written around its middle, which its node carries in f64: its shape
-//! is as exact as that of any other.
+//! `COLOR_0` is **linear** light, while our vertex colors and pictures are sRGB-coded. Pictures lie
+//! in the file. A mesh far from the origin is written around its middle, which its node carries in
+//! f64: its shape is as exact as that of any other.
 //!
-//! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node that users can hide: one
-//! primitive each, the innermost first, blended, with the mesh's base color times the alpha of `COLOR_0`, their back
-//! faces not drawn. glTF defines no drawing order: the layers look right where primitives are drawn in the file's
-//! order, after all opaque ones. Their material says `"extras": { "tiface": { "soft_layers": 2 } }`.
+//! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node that
+//! users can hide: one primitive each, the innermost first, blended, with the mesh's base color
+//! times the alpha of `COLOR_0`, their back faces not drawn. glTF defines no drawing order: the
+//! layers look right where primitives are drawn in the file's order, after all opaque ones. Their
+//! material says `"extras": { "tiface": { "soft_layers": 2 } }`.
 //!
-//! Textures that depend on the view: tools may drop a texture that nothing refers to, and the Khronos validator warns about a texture that only
-//! `extras` refers to. So each lobe is the base color of a material of its own, which the primitive offers as a
-//! variant (`KHR_materials_variants`). Viewers show the first material unless the user selects a variant; viewers
-//! without support for variants always do. The first material describes how to use the lobes:
+//! Textures that depend on the view: tools may drop a texture that nothing refers to, and the
+//! Khronos validator warns about a texture that only `extras` refers to. So each lobe is the base
+//! color of a material of its own, which the primitive offers as a variant
+//! (`KHR_materials_variants`). Viewers show the first material unless the user selects a variant;
+//! viewers without support for variants always do. The first material describes how to use the
+//! lobes:
 //!
 //! ```json
 //! "extras": { "tiface": { "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ],
@@ -41,13 +44,13 @@ use tiface_base::Result;
 use tiface_base::geom::{Mesh, Shells};
 use tiface_base::image::{Photo, linear_from_srgb, quantize};
 
-/// Returns a mesh as the bytes of a `.glb` file, with the pictures of its texture inside; without a texture it is
-/// colored by its vertices.
+/// Returns a mesh as the bytes of a `.glb` file, with the pictures of its texture inside; without a
+/// texture it is colored by its vertices.
 ///
 /// # Errors
 ///
-/// Fails if the mesh is empty or damaged, if texture and mesh do not belong together, if an option is invalid, or if
-/// the file would exceed 4 GiB.
+/// Fails if the mesh is empty or damaged, if texture and mesh do not belong together, if an option
+/// is invalid, or if the file would exceed 4 GiB.
 ///
 /// # Examples
 ///
@@ -486,7 +489,8 @@ mod tests {
                 "VEC4"
             );
         }
-        // vertex 2 stands at y = 1, which is half a meter here, its normal is +z and the first layer lies 0.3 before it
+        // vertex 2 stands at y = 1, which is half a meter here, its normal is +z and the first
+        // layer lies 0.3 before it
         let part = FileMesh::new(&head.mesh, None, &options.file_from_mesh().unwrap())
             .unwrap()
             .under(head.shells.as_ref().unwrap());

@@ -1,7 +1,8 @@
-//! A glTF document under construction, with its binary data: accessors, pictures, and the GLB container.
+//! A glTF document under construction, with its binary data: accessors, pictures, and the GLB
+//! container.
 //!
-//! Every accessor has a view of its own, at a multiple of four bytes; `min` and `max` are the stored
-//! numbers themselves. Views of pictures carry neither target nor stride.
+//! Every accessor has a view of its own, at a multiple of four bytes; `min` and `max` are the
+//! stored numbers themselves. Views of pictures carry neither target nor stride.
 
 use glam::{DVec3, Vec3};
 use gltf::json::accessor::{ComponentType, GenericComponentType, Type};
@@ -22,7 +23,8 @@ const SHORT_INDICES: usize = 65_535;
 pub(super) struct GlbDocument {
     pub root: Root,
     pub bin: Vec<u8>,
-    /// A node with its translation in f64: gltf-json's own is f32, and prints as numbers that read as others in f64.
+    /// A node with its translation in f64: gltf-json's own is f32, and prints as numbers that read
+    /// as others in f64.
     pub placed: Option<(Index<json::Node>, DVec3)>,
 }
 
@@ -44,8 +46,8 @@ impl GlbDocument {
         view
     }
 
-    /// Adds elements without gaps, or returns an accessor of the same bytes: layers may cover the whole mesh. Only
-    /// bytes are normalized.
+    /// Adds elements without gaps, or returns an accessor of the same bytes: layers may cover the
+    /// whole mesh. Only bytes are normalized.
     fn accessor(&mut self, bytes: &[u8], (component, type_): (ComponentType, Type)) -> Index<Accessor> {
         let is_same = |a: &Accessor| {
             let view = a.buffer_view.map(|view| &self.root.buffer_views[view.value()]);

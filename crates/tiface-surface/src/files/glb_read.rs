@@ -1,8 +1,10 @@
-//! Reads a GLB: all triangles of the default scene, transformed by their nodes, and their base color.
+//! Reads a GLB: all triangles of the default scene, transformed by their nodes, and their base
+//! color.
 //!
-//! `gltf` takes the container apart. Of its JSON only what is read here can cause an error, and numbers are f64: a node
-//! may lie kilometers from the origin, where `gltf-json`'s f32 has steps of half a meter. The document's references are
-//! checked before they are used. Only data in the file is read: buffers with a URI are refused.
+//! `gltf` takes the container apart. Of its JSON only what is read here can cause an error, and
+//! numbers are f64: a node may lie kilometers from the origin, where `gltf-json`'s f32 has steps of
+//! half a meter. The document's references are checked before they are used. Only data in the file
+//! is read: buffers with a URI are refused.
 
 use super::color_range::bring_into_range;
 use super::gltf_document::{GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};
@@ -137,8 +139,8 @@ impl GlbPart<'_> {
     }
 }
 
-/// A document and the mesh that is read from it. Normals, colors and texture coordinates are kept only if every part has
-/// them; colors also if a material without a texture has one.
+/// A document and the mesh that is read from it. Normals, colors and texture coordinates are kept
+/// only if every part has them; colors also if a material without a texture has one.
 struct GlbReader<'a> {
     root: &'a GlbRoot,
     bin: &'a [u8],
@@ -344,8 +346,8 @@ impl<'a> GlbReader<'a> {
         Ok(indices)
     }
 
-    /// Returns one value a vertex of an attribute, flat, and its number of components; `None` if the
-    /// part lacks it. The positions of the part have been added.
+    /// Returns one value a vertex of an attribute, flat, and its number of components; `None` if
+    /// the part lacks it. The positions of the part have been added.
     fn attribute(
         &self,
         part: &GlbPart,
@@ -369,7 +371,8 @@ impl<'a> GlbReader<'a> {
             self.bare_normals = true;
             return Ok(());
         };
-        // the inverse transpose, up to a factor that normalizing removes, also for singular matrices
+        // the inverse transpose, up to a factor that normalizing removes, also for singular
+        // matrices
         let linear = part.linear;
         let cofactor = DMat3::from_cols(
             linear.y_axis.cross(linear.z_axis),
@@ -428,8 +431,8 @@ impl<'a> GlbReader<'a> {
         Ok(())
     }
 
-    /// Returns all numbers of an accessor, flat, and how many an element has; normalized integers become −1..=1.
-    /// Finite.
+    /// Returns all numbers of an accessor, flat, and how many an element has; normalized integers
+    /// become −1..=1. Finite.
     fn numbers(&self, index: u32, kinds: &[Type], components: &[C]) -> Result<(Vec<f64>, usize)> {
         let source = self.source;
         let accessor = self.get("accessor", &self.root.accessors, index)?;
@@ -524,8 +527,8 @@ impl<'a> GlbReader<'a> {
         Ok(texture)
     }
 
-    /// Returns the picture behind a texture, and its size in the atlas. Its header is checked against the limits for
-    /// pictures; it is not decoded.
+    /// Returns the picture behind a texture, and its size in the atlas. Its header is checked
+    /// against the limits for pictures; it is not decoded.
     fn picture(&mut self, texture: u32) -> Result<PictureSource> {
         let source = self.source;
         let texture_at = format!("texture {texture}");

@@ -11,9 +11,11 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use tiface_base::Result;
 
-/// Maximum number of objects and arrays. One takes two bytes of JSON and up to 144 in memory, and twice that while a list grows.
+/// Maximum number of objects and arrays. One takes two bytes of JSON and up to 144 in memory, and
+/// twice that while a list grows.
 const MAX_NESTED: usize = 1 << 20;
-/// Maximum number of values. A key with an index takes six bytes of JSON and up to a hundred in memory.
+/// Maximum number of values. A key with an index takes six bytes of JSON and up to a hundred in
+/// memory.
 const MAX_VALUES: usize = 4 << 20;
 
 #[derive(Deserialize, Default)]
@@ -139,7 +141,8 @@ impl GlbNode {
         self.extensions.visibility.as_ref().is_some_and(|v| !v.visible)
     }
 
-    /// Features that move the triangles of a mesh away from their accessors and the nodes' transforms.
+    /// Features that move the triangles of a mesh away from their accessors and the nodes'
+    /// transforms.
     pub fn deformation(&self, mesh: &GlbMesh) -> Option<&'static str> {
         let weights = self.weights.as_deref().unwrap_or(&mesh.weights);
         let is_morphed = mesh.primitives.iter().any(|p| p.targets.is_some())
@@ -199,8 +202,8 @@ pub(super) struct GlbSpecular {
     pub diffuse_factor: Value,
 }
 
-/// The color of a material: its texture, its linear factors if they are not all 1, and a sentence if it is no base
-/// color.
+/// The color of a material: its texture, its linear factors if they are not all 1, and a sentence
+/// if it is no base color.
 #[derive(Clone, Copy, Default)]
 pub(super) struct GlbColor<'a> {
     pub texture: Option<&'a GlbTextureUse>,
@@ -214,7 +217,8 @@ impl GlbMaterial {
         self.extras["tiface"]["soft_layers"].is_u64()
     }
 
-    /// Returns the color that shows most: the base color, that of the older model, or light that the material emits.
+    /// Returns the color that shows most: the base color, that of the older model, or light that
+    /// the material emits.
     pub fn color(&self) -> GlbColor<'_> {
         let pbr = &self.pbr_metallic_roughness;
         let base = factors(&pbr.base_color_factor);

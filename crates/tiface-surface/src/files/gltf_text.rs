@@ -11,8 +11,8 @@ use tiface_base::{Error, Result};
 /// Buffers of one document; more are an attack.
 const MAX_BUFFERS: usize = 256;
 
-/// Returns a GLB of a `.gltf` whose numbers lie in data URIs or in `.bin` files in its folder; `None` if these bytes
-/// are no `.gltf`.
+/// Returns a GLB of a `.gltf` whose numbers lie in data URIs or in `.bin` files in its folder;
+/// `None` if these bytes are no `.gltf`.
 ///
 /// # Errors
 ///
@@ -91,8 +91,8 @@ fn data_of(buffer: &Value, path: &Path) -> Result<Option<Vec<u8>>> {
     Ok(Some(io::read_bytes(&file, &Limits::default())?))
 }
 
-/// Makes a view one of the only buffer, where the buffers begin at these places and have these lengths; returns whether
-/// it lies in one of them.
+/// Makes a view one of the only buffer, where the buffers begin at these places and have these
+/// lengths; returns whether it lies in one of them.
 fn moved(view: &mut Value, parts: &[(u64, u64)]) -> bool {
     let number = |key: &str| view.get(key).and_then(Value::as_u64);
     let (at, bytes) = (number("byteOffset").unwrap_or(0), number("byteLength").unwrap_or(0));

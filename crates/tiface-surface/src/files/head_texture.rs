@@ -13,8 +13,8 @@ pub struct HeadTexture {
     pub atlas: Atlas,
     /// Base color, sRGB-coded; its alpha is not written.
     pub color: Photo,
-    /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents of
-    /// [`tangents()`](super::tangents()). GLB only.
+    /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents
+    /// of [`tangents()`](super::tangents()). GLB only.
     pub normal: Option<Photo>,
     /// View-dependent color. GLB only.
     pub lobes: Option<Lobes>,
@@ -23,7 +23,8 @@ pub struct HeadTexture {
 /// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lobes {
-    /// One picture per spherical-harmonic function; a byte `b` stands for `(b − 128) / 127 · scale`.
+    /// One picture per spherical-harmonic function; a byte `b` stands for
+    /// `(b − 128) / 127 · scale`.
     pub pictures: Vec<Photo>,
     /// Scale of each, sRGB-coded.
     pub scale: Vec<f32>,
@@ -32,7 +33,8 @@ pub struct Lobes {
 }
 
 impl Lobes {
-    /// Returns the same lobes in the coordinates of other files, as sRGB-coded differences: one picture a function.
+    /// Returns the same lobes in the coordinates of other files, as sRGB-coded differences: one
+    /// picture a function.
     pub fn turned(&self, asset_from_world: Mat3) -> Vec<Image> {
         let matrix = rotated(self.pictures.len(), self.asset_from_world * asset_from_world.transpose());
         let turned = |j: usize| {
@@ -55,8 +57,8 @@ impl HeadTexture {
         HeadTexture { atlas, color, normal: None, lobes: None }
     }
 
-    /// Returns the texture with pictures whose longest side is at most `px`, those of lobes at most `lobe_px`: averaged,
-    /// colors in linear light.
+    /// Returns the texture with pictures whose longest side is at most `px`, those of lobes at most
+    /// `lobe_px`: averaged, colors in linear light.
     pub fn reduced(self, px: u32, lobe_px: u32) -> HeadTexture {
         let smaller = |photo: &Photo, px| reduce_photo(photo, working_size(photo.width, photo.height, px));
         let color = reduce_to_rows(&self.color, working_size(self.color.width, self.color.height, px).1);

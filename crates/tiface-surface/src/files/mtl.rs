@@ -1,7 +1,7 @@
 //! Reading of `.mtl`: the materials beside an OBJ, as far as they color it.
 //!
-//! Keys are known in any letters, names of pictures with blanks, in quotes and behind options. A picture stands in
-//! `map_Kd`; programs that write none may have it as `map_Ke` or `map_Ka`.
+//! Keys are known in any letters, names of pictures with blanks, in quotes and behind options. A
+//! picture stands in `map_Kd`; programs that write none may have it as `map_Ke` or `map_Ka`.
 
 use super::beside::unquoted;
 use super::source::{ReadOptions, Source, line_end, without_byte_order_mark};
@@ -32,7 +32,8 @@ pub struct Material {
 ///
 /// # Errors
 ///
-/// Fails if a picture has options that move, scale or brighten it, or if there are more than 65,536 materials.
+/// Fails if a picture has options that move, scale or brighten it, or if there are more than 65,536
+/// materials.
 pub fn materials_of_mtl(bytes: &[u8], path: &Path) -> Result<Vec<Material>> {
     let source = Source { path, format: "MTL", options: &ReadOptions::DEFAULT };
     if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
@@ -105,7 +106,8 @@ fn numbers(value: &str) -> Option<[f32; 3]> {
     }
 }
 
-/// Returns what follows the options before the name of a picture; an error if one changes where or how it is seen.
+/// Returns what follows the options before the name of a picture; an error if one changes where or
+/// how it is seen.
 fn behind_options(text: &str) -> std::result::Result<&str, ()> {
     let first_word = |text: &'_ str| -> usize { text.find(char::is_whitespace).unwrap_or(text.len()) };
     let mut rest = text.trim();

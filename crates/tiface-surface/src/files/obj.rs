@@ -1,12 +1,12 @@
 //! A mesh as Wavefront OBJ: text, +Y up, meters.
 //!
 //! Numbers are the shortest that read back as the same f32, which is never more than nine
-//! significant digits. `v`, `vt` and `vn` are indexed apart, so a surface that is closed stays closed
-//! whatever its seams. Color is `v x y z r g b`, sRGB-coded, or a picture that a `.mtl` beside it
-//! names; never both.
+//! significant digits. `v`, `vt` and `vn` are indexed apart, so a surface that is closed stays
+//! closed whatever its seams. Color is `v x y z r g b`, sRGB-coded, or a picture that a `.mtl`
+//! beside it names; never both.
 //!
-//! A mesh far from the origin needs more digits than f32 has: its positions are written with as many as
-//! hold a billionth of its size, for readers that keep f64.
+//! A mesh far from the origin needs more digits than f32 has: its positions are written with as
+//! many as hold a billionth of its size, for readers that keep f64.
 
 use super::file_mesh::{
     ExportOptions, ExportedFiles, FileMesh, distance_warning, encode, left_out, safe_name,
@@ -16,12 +16,13 @@ use std::io::Write;
 use tiface_base::Result;
 use tiface_base::geom::{Aabb, Mesh};
 
-/// Returns a mesh as an `.obj`, with a texture also its `.mtl` and its picture, which must lie in one folder; without
-/// one it is colored by its vertices.
+/// Returns a mesh as an `.obj`, with a texture also its `.mtl` and its picture, which must lie in
+/// one folder; without one it is colored by its vertices.
 ///
 /// # Errors
 ///
-/// Fails if the mesh is empty or damaged, if texture and mesh do not belong together, or if an option is invalid.
+/// Fails if the mesh is empty or damaged, if texture and mesh do not belong together, or if an
+/// option is invalid.
 pub fn to_obj(mesh: &Mesh, texture: Option<&HeadTexture>, options: &ExportOptions) -> Result<ExportedFiles> {
     let file_from_mesh = options.file_from_mesh()?;
     let mut file = FileMesh::new(mesh, texture, &file_from_mesh)?;
@@ -100,7 +101,8 @@ fn write_vertices(out: &mut Vec<u8>, mesh: &FileMesh) -> std::io::Result<()> {
     Ok(())
 }
 
-/// A number displayed by the shortest digits that give the same f32 back; with an exponent if zeros would fill the line.
+/// A number displayed by the shortest digits that give the same f32 back; with an exponent if zeros
+/// would fill the line.
 struct Short(f32);
 
 impl std::fmt::Display for Short {

@@ -1,10 +1,10 @@
-//! OBJ → mesh: `v` with optional colors, `vt`, `vn`, `f` in all its spellings, the names of its materials, and the
-//! colors that ZBrush writes in comments (`#MRGB`, eight digits a vertex: mask, red, green, blue); the rest is passed
-//! over. Its `.mtl` is read apart.
+//! OBJ → mesh: `v` with optional colors, `vt`, `vn`, `f` in all its spellings, the names of its
+//! materials, and the colors that ZBrush writes in comments (`#MRGB`, eight digits a vertex: mask,
+//! red, green, blue); the rest is passed over. Its `.mtl` is read apart.
 //!
-//! Written here because `tobj` 4 names no line in its errors, refuses lines that go on in the next and comments
-//! after a face, takes NaN for a number, passes over faces of two corners and splits vertices by object; it knows no
-//! `#MRGB`, and keeps quotes as part of names.
+//! Written here because `tobj` 4 names no line in its errors, refuses lines that go on in the next
+//! and comments after a face, takes NaN for a number, passes over faces of two corners and splits
+//! vertices by object; it knows no `#MRGB`, and keeps quotes as part of names.
 
 use super::beside::unquoted;
 use super::color_range::bring_into_range;
@@ -203,8 +203,8 @@ impl Obj {
     }
 }
 
-/// Returns the lines with their numbers. A line that ends with a backslash continues in the next, under its own
-/// number; a comment does not.
+/// Returns the lines with their numbers. A line that ends with a backslash continues in the next,
+/// under its own number; a comment does not.
 fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     let end = line_end(bytes);
     let mut lines = bytes.split(move |&b| b == end).map(|line| line.trim_ascii()).zip(1..);
@@ -225,7 +225,8 @@ fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, Cow<'_, str>)> {
     })
 }
 
-/// Returns whether a word is NaN, as any compiler writes it: `nan`, `-nan(ind)`, `1.#QNAN`, `-1.#IND`.
+/// Returns whether a word is NaN, as any compiler writes it: `nan`, `-nan(ind)`, `1.#QNAN`,
+/// `-1.#IND`.
 fn is_no_number(word: &str) -> bool {
     let word = word.trim_start_matches(['-', '+']);
     let begins = |with: &str| word.get(..with.len()).is_some_and(|start| start.eq_ignore_ascii_case(with));

@@ -1,7 +1,8 @@
-//! Opening of mesh files with the materials and pictures beside them: the one reader of `check`, `preview` and `metrics`.
+//! Opening of mesh files with the materials and pictures beside them: the one reader of `check`,
+//! `preview` and `metrics`.
 //!
-//! A texture that cannot be shown never stops a mesh from being opened: why it is not shown, and what was read otherwise
-//! than it is written, is returned with the mesh.
+//! A texture that cannot be shown never stops a mesh from being opened: why it is not shown, and
+//! what was read otherwise than it is written, is returned with the mesh.
 
 use super::beside::{self, Beside, unquoted};
 use super::color_range::{at_vertices, bring_into_range};
@@ -49,7 +50,8 @@ pub fn open_surface(path: &Path) -> Result<ReadMesh> {
     read_with(&bytes_of(path)?, path, &ReadOptions::SURFACE)
 }
 
-/// Opens a `.glb`, `.gltf`, `.obj`, `.ply` or `.stl` file with its texture, and says what cannot be shown.
+/// Opens a `.glb`, `.gltf`, `.obj`, `.ply` or `.stl` file with its texture, and says what cannot be
+/// shown.
 ///
 /// # Errors
 ///
@@ -111,7 +113,8 @@ fn multiply(photo: &mut Photo, tint: [f32; 3]) {
     }
 }
 
-/// Opens the picture that a mesh names, if it names one. Materials of one color become colors of vertices.
+/// Opens the picture that a mesh names, if it names one. Materials of one color become colors of
+/// vertices.
 fn open_picture(found: &mut ReadMesh, path: &Path) -> Result<Option<Photo>> {
     let limits = Limits::default();
     let folder = path.parent().unwrap_or(Path::new(""));
@@ -141,8 +144,8 @@ struct Library {
 /// A material and the file that it stands in.
 type Placed<'m> = (&'m Material, &'m Path);
 
-/// Opens the files behind each `mtllib`: of one name, which may have blanks, or else of several between blanks. Files
-/// that are not there are noted if others are.
+/// Opens the files behind each `mtllib`: of one name, which may have blanks, or else of several
+/// between blanks. Files that are not there are noted if others are.
 fn libraries(found: &mut ReadMesh, folder: &Path, path: &Path, lines: &[String]) -> Result<Vec<Library>> {
     let limits = Limits::default();
     let mut files = Vec::new();
@@ -226,7 +229,8 @@ fn used_materials<'m>(found: &mut ReadMesh, all: &[Placed<'m>], libraries: &[Lib
     if used.is_empty() { all.to_vec() } else { used }
 }
 
-/// Returns the name of the picture of these materials, if they have one, and the file that names it.
+/// Returns the name of the picture of these materials, if they have one, and the file that names
+/// it.
 fn picture_of<'m>(found: &mut ReadMesh, used: &[Placed<'m>]) -> Result<Option<(String, &'m Path)>> {
     if let Some((material, _)) = used.iter().find(|(m, _)| m.transparent.is_some()) {
         let (key, name) = (material.transparent.unwrap_or_default(), &material.name);
@@ -257,8 +261,8 @@ fn picture_of<'m>(found: &mut ReadMesh, used: &[Placed<'m>]) -> Result<Option<(S
     Ok(Some((name.to_owned(), file)))
 }
 
-/// Colors the vertices by the `Kd` of their faces' materials, unless they have colors, or no material is colored: gray
-/// is what programs write for a mesh without color.
+/// Colors the vertices by the `Kd` of their faces' materials, unless they have colors, or no
+/// material is colored: gray is what programs write for a mesh without color.
 fn color_by_materials(found: &mut ReadMesh, all: &[Placed], used: &[Placed]) {
     let is_colored = |m: &Material| m.color.is_some_and(|[r, g, b]| r != g || g != b);
     if !found.mesh.colors.is_empty() || !used.iter().any(|(m, _)| is_colored(m)) {

@@ -1,11 +1,11 @@
 //! A mesh as PLY: binary little endian, in the dataset's own world.
 //!
-//! Neither rotated nor scaled: PLY defines no axes and no unit, and Blender does not rotate it (it does turn OBJ and
-//! GLB). Colors are 8-bit and sRGB-coded, as every reader takes them. Positions are `float`, or `double` where
-//! the mesh lies so far from the origin that f32 would show.
+//! Neither rotated nor scaled: PLY defines no axes and no unit, and Blender does not rotate it (it
+//! does turn OBJ and GLB). Colors are 8-bit and sRGB-coded, as every reader takes them. Positions
+//! are `float`, or `double` where the mesh lies so far from the origin that f32 would show.
 //!
-//! PLY has one index for everything. Without a texture vertices stay whole, and so the surface closed:
-//! this is the file that later stages read. With one they are split at seams for the sake
+//! PLY has one index for everything. Without a texture vertices stay whole, and so the surface
+//! closed: this is the file that later stages read. With one they are split at seams for the sake
 //! of `s t` (v up, Blender's and trimesh's spelling) and names its picture in a comment, as MeshLab
 //! does; weld equal positions to close it again.
 
@@ -17,8 +17,8 @@ use tiface_base::Result;
 use tiface_base::geom::Mesh;
 use tiface_base::image::quantize;
 
-/// Returns a mesh as a `.ply`, colored by its vertices; a textured mesh is split at seams, with its picture beside
-/// it. The options `up` and `unit_m` do not matter.
+/// Returns a mesh as a `.ply`, colored by its vertices; a textured mesh is split at seams, with its
+/// picture beside it. The options `up` and `unit_m` do not matter.
 ///
 /// # Errors
 ///

@@ -63,8 +63,8 @@ pub(super) struct Element {
 }
 
 impl Property {
-    /// Returns the color that a number packs, `0xAARRGGBB` with an alpha of 0 or 255; that of a float by its bits, as
-    /// PCL does, with an alpha of 0.
+    /// Returns the color that a number packs, `0xAARRGGBB` with an alpha of 0 or 255; that of a
+    /// float by its bits, as PCL does, with an alpha of 0.
     pub fn unpacked(&self, value: f64) -> Option<[f32; 3]> {
         let code = match self.item {
             Scalar::U32 => Some(value as u32),
@@ -86,7 +86,8 @@ impl Property {
 }
 
 impl Element {
-    /// Returns where properties of these names stand, in any letters, if all of them do; lists are none.
+    /// Returns where properties of these names stand, in any letters, if all of them do; lists are
+    /// none.
     pub fn slots<const N: usize>(&self, names: [&str; N]) -> Option<[usize; N]> {
         let is_it = |p: &Property, name: &str| p.name.eq_ignore_ascii_case(name) && p.length.is_none();
         let slot = |name: &str| self.properties.iter().position(|p| is_it(p, name));

@@ -1,9 +1,12 @@
-//! Reading of PLY: text and both binary orders, any scalar types, any line ends, polygons fanned, strips cut up.
+//! Reading of PLY: text and both binary orders, any scalar types, any line ends, polygons fanned,
+//! strips cut up.
 //!
-//! Colors stand at vertices or on faces, under the names that programs give them; texture coordinates at vertices, or at
-//! the corners of faces as MeshLab writes them (`texcoord`, with `texnumber` for the picture).
+//! Colors stand at vertices or on faces, under the names that programs give them; texture
+//! coordinates at vertices, or at the corners of faces as MeshLab writes them (`texcoord`, with
+//! `texnumber` for the picture).
 //!
-//! Written here because `ply-rs-bw` 4 refuses carriage returns as line ends and several rows of text in one line.
+//! Written here because `ply-rs-bw` 4 refuses carriage returns as line ends and several rows of
+//! text in one line.
 
 use super::beside::unquoted;
 use super::color_range::{at_vertices, bring_into_range};
@@ -105,14 +108,16 @@ struct Header {
     elements: Vec<Element>,
     /// Offset of the body.
     start: usize,
-    /// The pictures named by `comment TextureFile`, as MeshLab writes it, in the order of `texnumber`.
+    /// The pictures named by `comment TextureFile`, as MeshLab writes it, in the order of
+    /// `texnumber`.
     pictures: Vec<String>,
 }
 
 fn header(bytes: &[u8], source: Source) -> Result<Header> {
     let (mut order, mut elements, mut at) = (None, Vec::<Element>::new(), 0);
     let mut pictures = Vec::<String>::new();
-    // All lines end as the first one does: the byte after the last line end may be anything, also a line feed.
+    // All lines end as the first one does: the byte after the last line end may be anything, also a
+    // line feed.
     let end = bytes.iter().position(|b| b"\r\n".contains(b)).unwrap_or(0);
     let ending: &[u8] = match bytes.get(end..) {
         Some([b'\r', b'\n', ..]) => b"\r\n",
@@ -358,7 +363,8 @@ struct Faces {
 }
 
 impl Faces {
-    /// Adds the texture coordinates of a polygon's corners, `u v` each, fanned as its triangles are.
+    /// Adds the texture coordinates of a polygon's corners, `u v` each, fanned as its triangles
+    /// are.
     fn add_wedges(
         &mut self,
         at: &dyn std::fmt::Display,
@@ -387,8 +393,8 @@ impl Faces {
     }
 }
 
-/// A polygon, which is fanned, or a strip, where each corner forms a triangle with the two before it,
-/// with alternating winding.
+/// A polygon, which is fanned, or a strip, where each corner forms a triangle with the two before
+/// it, with alternating winding.
 struct Polygon {
     strips: bool,
     /// Number of corners so far.

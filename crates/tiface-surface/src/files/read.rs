@@ -1,12 +1,12 @@
 //! Reading of meshes from files of other programs: GLB, PLY, OBJ and STL, from bytes.
 //!
-//! [`read`] returns the surface, [`read_with`] also its texture; [`open_mesh`](super::open_mesh) opens a file with the
-//! pictures beside it. The format is detected from the bytes, not from the
-//! name. Every count is compared with the remaining bytes before any allocation, no other file is opened, and
-//! non-finite numbers are refused.
+//! [`read`] returns the surface, [`read_with`] also its texture; [`open_mesh`](super::open_mesh)
+//! opens a file with the pictures beside it. The format is detected from the bytes, not from the
+//! name. Every count is compared with the remaining bytes before any allocation, no other file is
+//! opened, and non-finite numbers are refused.
 //!
-//! Positions are read in f64. Those of a mesh far from the origin, where f32 steps over its triangles, come around
-//! an origin of their own, see [`ReadMesh::origin`].
+//! Positions are read in f64. Those of a mesh far from the origin, where f32 steps over its
+//! triangles, come around an origin of their own, see [`ReadMesh::origin`].
 
 use super::file_mesh::middle;
 use super::foreign::refusal;
@@ -17,16 +17,16 @@ use std::path::Path;
 use tiface_base::geom::Mesh;
 use tiface_base::{Error, Result};
 
-/// Returns the mesh in the bytes of a `.glb`, `.ply`, `.obj` or `.stl` file, in the file's own coordinates, rounded to f32:
-/// for a mesh far from the origin see [`read_with`].
+/// Returns the mesh in the bytes of a `.glb`, `.ply`, `.obj` or `.stl` file, in the file's own
+/// coordinates, rounded to f32: for a mesh far from the origin see [`read_with`].
 ///
 /// `path` is for messages only. Colors come back sRGB-coded; normals only when every vertex has
 /// one. Polygons are fanned. Nothing is welded or repaired. Textures are passed over, sound or not.
 ///
 /// # Errors
 ///
-/// Fails if the bytes are none of these formats, break its rules, use unsupported features, hold no triangles, or
-/// more than the limits of [`ReadOptions`].
+/// Fails if the bytes are none of these formats, break its rules, use unsupported features, hold no
+/// triangles, or more than the limits of [`ReadOptions`].
 pub fn read(bytes: &[u8], path: &Path) -> Result<Mesh> {
     let ReadMesh { places, mesh, .. } = parse(bytes, path, &ReadOptions::SURFACE)?;
     Ok(Mesh { positions: places.iter().map(|p| p.as_vec3()).collect(), ..mesh })

@@ -6,15 +6,16 @@ use std::path::Path;
 use tiface_base::geom::{Atlas, Mesh};
 use tiface_base::{Error, Result};
 
-/// Options and limits of reading a file. GLB can reuse one buffer many times, so the number of bytes alone is no
-/// limit.
+/// Options and limits of reading a file. GLB can reuse one buffer many times, so the number of
+/// bytes alone is no limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadOptions {
     /// Maximum number of vertices.
     pub vertices: usize,
     /// Maximum number of triangles, after polygons are fanned.
     pub triangles: usize,
-    /// Maximum number of bytes of JSON in a GLB. Of them, at most 2²⁰ may be objects or arrays, and 2²² values.
+    /// Maximum number of bytes of JSON in a GLB. Of them, at most 2²⁰ may be objects or arrays, and
+    /// 2²² values.
     pub json: usize,
     /// Whether to read the texture; otherwise it is skipped, valid or not.
     pub texture: bool,
@@ -38,13 +39,14 @@ impl Default for ReadOptions {
 /// Location of a file's base color.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PictureSource {
-    /// In the file: PNG or JPEG, for [`tiface_base::io::parse_photo`]. Its header is within the limits for
-    /// pictures; the data is not checked.
+    /// In the file: PNG or JPEG, for [`tiface_base::io::parse_photo`]. Its header is within the
+    /// limits for pictures; the data is not checked.
     Inside(Vec<u8>),
-    /// In a picture of this name, as it is written, without quotes; it is looked for in the mesh's folder alone.
+    /// In a picture of this name, as it is written, without quotes; it is looked for in the mesh's
+    /// folder alone.
     Beside(String),
-    /// In the pictures and colors of `.mtl` files, which [`super::materials_of_mtl`] reads: what stands behind each
-    /// `mtllib`, a name, or several between blanks.
+    /// In the pictures and colors of `.mtl` files, which [`super::materials_of_mtl`] reads: what
+    /// stands behind each `mtllib`, a name, or several between blanks.
     Materials(Vec<String>),
 }
 
@@ -67,7 +69,8 @@ impl Source<'_> {
         Error::cannot(format!("`{}`, {at}: {what}", self.path.display()), hint)
     }
 
-    /// Returns the error for a word that is no number. A decimal comma is told with the way to a point.
+    /// Returns the error for a word that is no number. A decimal comma is told with the way to a
+    /// point.
     pub fn no_number(&self, at: impl Display, what: impl Display, word: &str) -> Error {
         let error = self.broken(at, what);
         let pointed = word.replacen(',', ".", 1);
@@ -112,11 +115,12 @@ impl Source<'_> {
 pub struct ReadMesh {
     /// The surface, its positions relative to `origin`.
     pub mesh: Mesh,
-    /// The origin of the mesh in the file's coordinates: the center of a mesh that lies more than fifteen of its
-    /// sizes from the file's origin, else that origin.
+    /// The origin of the mesh in the file's coordinates: the center of a mesh that lies more than
+    /// fifteen of its sizes from the file's origin, else that origin.
     pub origin: DVec3,
-    /// Texture coordinates, if the file has them for all triangles. The size is that of the picture in the file, else
-    /// 0 × 0. Coordinates are finite; in files of other programs they may leave 0..=1, where a texture repeats.
+    /// Texture coordinates, if the file has them for all triangles. The size is that of the picture
+    /// in the file, else 0 × 0. Coordinates are finite; in files of other programs they may leave
+    /// 0..=1, where a texture repeats.
     pub atlas: Option<Atlas>,
     /// The base color.
     pub picture: Option<PictureSource>,
@@ -148,7 +152,8 @@ pub(super) fn without_byte_order_mark(bytes: &[u8]) -> &[u8] {
     bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }
 
-/// Returns what ends the lines of a text: a line feed, which may follow a carriage return, or that alone.
+/// Returns what ends the lines of a text: a line feed, which may follow a carriage return, or that
+/// alone.
 pub(super) fn line_end(bytes: &[u8]) -> u8 {
     if bytes.contains(&b'\n') { b'\n' } else { b'\r' }
 }

@@ -1,7 +1,8 @@
 //! Reading of STL, text and binary: triangles without a shared corner and without color.
 //!
-//! A binary file is known by its length, 84 bytes and 50 for each triangle, since its header may begin with `solid`,
-//! too. Each triangle keeps three vertices of its own; normals of facets follow from them and are passed over.
+//! A binary file is known by its length, 84 bytes and 50 for each triangle, since its header may
+//! begin with `solid`, too. Each triangle keeps three vertices of its own; normals of facets follow
+//! from them and are passed over.
 
 use super::source::{ReadMesh, Source, line_end};
 use glam::DVec3;

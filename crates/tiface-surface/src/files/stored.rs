@@ -1,5 +1,5 @@
-//! Meshes as tensors, for later stages: in scene coordinates, because the world may be so far away that f32 could not
-//! represent a head in it.
+//! Meshes as tensors, for later stages: in scene coordinates, because the world may be so far away
+//! that f32 could not represent a head in it.
 //!
 //! - The extracted surface: the target of ray casting.
 //! - The head mesh: the simplified mesh with its texture.
@@ -19,7 +19,8 @@ use tiface_base::image::Photo;
 use tiface_base::io::{self, Limits, ReadError, TensorValues};
 use tiface_base::{Error, Result};
 
-/// Version of the layout; part of the stage's fingerprint, so that a mesh of another version is made again.
+/// Version of the layout; part of the stage's fingerprint, so that a mesh of another version is
+/// made again.
 pub const FORMAT: &str = "tiface-mesh-2";
 
 const MAKE_AGAIN: &str = "make the mesh again: `tiface mesh RUN --fresh mesh`";
@@ -203,7 +204,8 @@ impl ExtractedSurface {
     ///
     /// # Errors
     ///
-    /// Fails if the file is missing, damaged or of another version; the suggested fix is to make it again.
+    /// Fails if the file is missing, damaged or of another version; the suggested fix is to make it
+    /// again.
     pub fn load(folder: &Path) -> Result<ExtractedSurface> {
         let mut stored = StoredTensors::open(&folder.join(SURFACE_FILE))?;
         let mesh = stored.mesh()?;
@@ -307,7 +309,8 @@ impl HeadMesh {
     ///
     /// # Errors
     ///
-    /// Fails if files are missing, damaged or of another version; the suggested fix is to make them again.
+    /// Fails if files are missing, damaged or of another version; the suggested fix is to make them
+    /// again.
     pub fn load(folder: &Path) -> Result<HeadMesh> {
         let mut stored = StoredTensors::open(&folder.join(HEAD_FILE))?;
         let (mesh, world_from_scene) = (stored.mesh()?, stored.similarity("world_from_scene")?);

@@ -2,8 +2,8 @@
 //! *Simulation of Wrinkled Surfaces Revisited*, 2008, chapter 3.
 //!
 //! A normal map means nothing without the tangents it was baked for. Bake with these, and the file
-//! carries the same ones: `TANGENT` holds the direction of growing u and a sign w, and the bitangent
-//! `w · (n × t)` points up the picture (towards smaller v, since our v runs down).
+//! carries the same ones: `TANGENT` holds the direction of growing u and a sign w, and the
+//! bitangent `w · (n × t)` points up the picture (towards smaller v, since our v runs down).
 
 use super::head_texture::check_atlas;
 use super::wrong_length;
@@ -13,7 +13,8 @@ use glam::{Vec2, Vec3, Vec4};
 use tiface_base::Result;
 use tiface_base::geom::{Atlas, Mesh};
 
-/// Returns the tangent at each corner of each triangle: `xyz` unit, `w` ±1. Corners of a vertex agree within a chart.
+/// Returns the tangent at each corner of each triangle: `xyz` unit, `w` ±1. Corners of a vertex
+/// agree within a chart.
 ///
 /// # Errors
 ///
@@ -49,8 +50,8 @@ pub(super) fn tangents_of(
     found
 }
 
-/// Makes tangents unit and perpendicular to the normal. Triangles without area in the texture have no direction of
-/// their own.
+/// Makes tangents unit and perpendicular to the normal. Triangles without area in the texture have
+/// no direction of their own.
 fn repaired(tangent: Vec4, normal: Vec3) -> Vec4 {
     let across = tangent.truncate().reject_from(normal);
     let unit = if tangent.is_finite() && across.length() > 1e-4 {
@@ -103,7 +104,8 @@ impl Geometry for TangentInput<'_> {
 mod tests {
     use super::*;
 
-    /// Returns a square in the plane z = 0 that looks along +Z, with the picture upright or mirrored.
+    /// Returns a square in the plane z = 0 that looks along +Z, with the picture upright or
+    /// mirrored.
     fn square(mirrored: bool) -> (Mesh, Atlas) {
         let positions = vec![Vec3::ZERO, Vec3::X, Vec3::new(1.0, 1.0, 0.0), Vec3::Y];
         // v runs down: the top of the picture, v = 0, is at y = 1

@@ -2,7 +2,8 @@
 
 use base64::prelude::{BASE64_STANDARD, Engine};
 
-/// Returns the bytes of a data URI in Base64: `None` if it is the name of a file, `Some(None)` if it is damaged.
+/// Returns the bytes of a data URI in Base64: `None` if it is the name of a file, `Some(None)` if
+/// it is damaged.
 pub(super) fn data_of_uri(uri: &str) -> Option<Option<Vec<u8>>> {
     let (kind, data) = uri.strip_prefix("data:")?.split_once(',').unwrap_or_default();
     Some(kind.ends_with("base64").then(|| BASE64_STANDARD.decode(data.trim()).ok()).flatten())

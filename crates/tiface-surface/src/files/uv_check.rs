@@ -1,13 +1,15 @@
-//! Validation and quality of an atlas, for any mesh with texture coordinates, also from other tools.
+//! Validation and quality of an atlas, for any mesh with texture coordinates, also from other
+//! tools.
 //!
-//! Charts are triangles joined across edges whose two sides have equal uv. With Γ ≥ γ the largest and
-//! smallest length that a unit step in the texture has on the surface, both scaled so that texture and
-//! surface have the same area in total:
+//! Charts are triangles joined across edges whose two sides have equal uv. With Γ ≥ γ the largest
+//! and smallest length that a unit step in the texture has on the surface, both scaled so that
+//! texture and surface have the same area in total:
 //!
-//! - stretch of the atlas: root of the mean of (Γ² + γ²) / 2 over the surface: the L² norm of Sander, Snyder,
-//!   Gortler, Hoppe 2001 (*Texture mapping progressive meshes*, §3), as xatlas reports it; 1 is perfect;
-//! - area stretch of a triangle: (Γγ + 1 / Γγ) / 2, its angle stretch: (Γ/γ + γ/Γ) / 2 (the parts that Degener,
-//!   Meseth, Klein 2003, §3 split it into); 1 is perfect.
+//! - stretch of the atlas: root of the mean of (Γ² + γ²) / 2 over the surface: the L² norm of
+//!   Sander, Snyder, Gortler, Hoppe 2001 (*Texture mapping progressive meshes*, §3), as xatlas
+//!   reports it; 1 is perfect;
+//! - area stretch of a triangle: (Γγ + 1 / Γγ) / 2, its angle stretch: (Γ/γ + γ/Γ) / 2 (the parts
+//!   that Degener, Meseth, Klein 2003, §3 split it into); 1 is perfect.
 //!
 //! Texels are square even if the texture is not: all lengths are measured in texels.
 
@@ -31,12 +33,13 @@ pub const MIN_AREA_PX: f64 = 1e-6;
 pub struct UvReport {
     /// Triangles of the mesh.
     pub triangles: usize,
-    /// Triangles with an index out of range, or a corner or coordinate that is not finite; ignored below.
-    /// One for each triangle that only the mesh or only the atlas has, too.
+    /// Triangles with an index out of range, or a corner or coordinate that is not finite; ignored
+    /// below. One for each triangle that only the mesh or only the atlas has, too.
     pub invalid: usize,
     /// Flat patches.
     pub charts: usize,
-    /// Length on the surface of the edges along which the texture is cut, each counted once, over √area.
+    /// Length on the surface of the edges along which the texture is cut, each counted once, over
+    /// √area.
     pub seam_length: f64,
     /// Sander's L² stretch; 1 is perfect.
     pub stretch: f64,
@@ -56,8 +59,8 @@ pub struct UvReport {
     pub overlapping: usize,
     /// The area they share, in texels, summed over pairs.
     pub overlap_px: f64,
-    /// Triangles that were not compared with all that lie near them, because too many do: then the two above
-    /// are lower bounds.
+    /// Triangles that were not compared with all that lie near them, because too many do: then the
+    /// two above are lower bounds.
     pub overlaps_left: usize,
     /// Triangles wound against the rest of their chart.
     pub flipped: usize,
@@ -70,9 +73,11 @@ pub struct UvReport {
     /// Smallest distance between two charts, in texels; none for a single chart. Up to
     /// [`MAX_CHART_DISTANCE_PX`](UvReport::MAX_CHART_DISTANCE_PX).
     pub chart_distance_px: Option<f64>,
-    /// Sides of charts that were not compared with all that lie near them: then the distance is an upper bound.
+    /// Sides of charts that were not compared with all that lie near them: then the distance is an
+    /// upper bound.
     pub chart_distance_left: usize,
-    /// Smallest distance of a chart to the texture's border, in texels; negative when it reaches out.
+    /// Smallest distance of a chart to the texture's border, in texels; negative when it reaches
+    /// out.
     pub border_distance_px: f64,
 }
 
@@ -80,8 +85,8 @@ impl UvReport {
     /// Charts farther apart than this are not measured.
     pub const MAX_CHART_DISTANCE_PX: f64 = 128.0;
 
-    /// Returns whether every point of the surface has its own texel: no triangle is invalid, overlapping, flipped,
-    /// without area or outside.
+    /// Returns whether every point of the surface has its own texel: no triangle is invalid,
+    /// overlapping, flipped, without area or outside.
     pub fn is_sound(&self) -> bool {
         self.overlaps_left == 0
             && self.invalid + self.overlapping + self.flipped + self.zero_area + self.outside == 0
@@ -126,7 +131,8 @@ apart                {apart}, from the border {border:.2} texels
     }
 }
 
-/// Returns the text before and after a figure that is a bound because `left` candidates were not compared.
+/// Returns the text before and after a figure that is a bound because `left` candidates were not
+/// compared.
 pub(super) fn bound(which: &'static str, left: usize, of: &str) -> (&'static str, String) {
     if left == 0 { ("", String::new()) } else { (which, format!(" ({left} {of} not compared further)")) }
 }
@@ -211,8 +217,8 @@ fn is_valid(mesh: &Mesh, atlas: &Atlas, t: usize) -> bool {
         && atlas.triangles[t].iter().all(|&i| atlas.uvs.get(i as usize).is_some_and(|v| v.is_finite()))
 }
 
-/// Returns the length of the seams visible from `front` within 45 degrees, over √area: edges whose two triangles
-/// together face that direction, hidden or not.
+/// Returns the length of the seams visible from `front` within 45 degrees, over √area: edges whose
+/// two triangles together face that direction, hidden or not.
 pub fn seams_facing(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
     let valid: Vec<bool> =
         (0..mesh.triangles.len().min(atlas.triangles.len())).map(|t| is_valid(mesh, atlas, t)).collect();
@@ -230,7 +236,8 @@ pub fn seams_facing(mesh: &Mesh, atlas: &Atlas, front: Vec3) -> f64 {
 struct AtlasCharts {
     /// The lowest triangle of each triangle's chart.
     chart: Vec<u32>,
-    /// Sides that border on no triangle of the chart: `3 t + k` for the side from corner k of triangle t.
+    /// Sides that border on no triangle of the chart: `3 t + k` for the side from corner k of
+    /// triangle t.
     rims: Vec<u32>,
     /// Edges of the surface where its texture is cut: the two sides and the length.
     cuts: Vec<(u32, u32, f64)>,
@@ -301,7 +308,8 @@ fn twice_area(mesh: &Mesh, t: usize) -> f64 {
 }
 
 fn stretches(report: &mut UvReport, triangles: &[([DVec3; 3], [DVec2; 3])]) {
-    // (area on the surface, area in the texture, Γ² + γ²), before scaling; slivers without area have none
+    // (area on the surface, area in the texture, Γ² + γ²), before scaling; slivers without area
+    // have none
     let measured: Vec<(f64, f64, f64)> = triangles
         .par_iter()
         .filter_map(|&([p, q, r], [a, b, c])| {
@@ -344,8 +352,8 @@ fn quantiles(values: &mut [f64]) -> (f64, f64) {
 mod tests {
     use super::*;
 
-    /// Two unit squares of two triangles each, side by side in space; in the texture of 8 × 8 texels at
-    /// (1, 1)..(3, 3) and, as a chart of its own, at (4, 1)..(6, 3).
+    /// Two unit squares of two triangles each, side by side in space; in the texture of 8 × 8
+    /// texels at (1, 1)..(3, 3) and, as a chart of its own, at (4, 1)..(6, 3).
     fn two_squares() -> (Mesh, Atlas) {
         let p = |x: f32, y: f32| Vec3::new(x, y, 0.0);
         let mesh = Mesh {
@@ -384,8 +392,9 @@ mod tests {
         atlas.uvs[1].x = 5.0 / 8.0;
         atlas.uvs[2].x = 5.0 / 8.0;
         let r = uv_check(&mesh, &atlas);
-        // 1 × 1 on 4 × 2 texels: steps on the surface are 1/4 and 1/2, times √8 to have equal areas: 0.707
-        // and 1.414. L² = √((0.5 + 2) / 2) = 1.118; angle (2 + 1/2) / 2 = 1.25; area 1.
+        // 1 × 1 on 4 × 2 texels: steps on the surface are 1/4 and 1/2, times √8 to have equal
+        // areas: 0.707 and 1.414. L² = √((0.5 + 2) / 2) = 1.118; angle (2 + 1/2) / 2 = 1.25;
+        // area 1.
         assert!((r.stretch - 1.25f64.sqrt()).abs() < 1e-6, "{r:?}");
         assert!((r.angle_stretch_median - 1.25).abs() < 1e-6 && (r.area_stretch - 1.0).abs() < 1e-6);
         assert_eq!((r.charts, r.chart_distance_px), (1, None));
@@ -398,8 +407,8 @@ mod tests {
             let first = atlas.uvs[4];
             atlas.uvs[i] = first + (atlas.uvs[i] - first) / 2.0;
         }
-        // 4 and 1 texels for 1 and 1: scaled to the mean 2.5, ratios 1.6 and 0.4; (1.6 + 0.625) / 2 = 1.1125,
-        // (0.4 + 2.5) / 2 = 1.45
+        // 4 and 1 texels for 1 and 1: scaled to the mean 2.5, ratios 1.6 and 0.4; (1.6 + 0.625) /
+        // 2 = 1.1125, (0.4 + 2.5) / 2 = 1.45
         let r = uv_check(&mesh, &atlas);
         assert!((r.area_stretch - (1.1125 + 1.45) / 2.0).abs() < 1e-6, "{r:?}");
         assert!((r.angle_stretch_p99 - 1.0).abs() < 1e-6);

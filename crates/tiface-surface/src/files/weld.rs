@@ -4,8 +4,8 @@ use glam::Vec3;
 use std::collections::HashMap;
 use tiface_base::geom::Mesh;
 
-/// Returns for each vertex the index of its unique position, in order of first use, and these positions: files with a
-/// texture repeat vertices at seams. −0 equals 0.
+/// Returns for each vertex the index of its unique position, in order of first use, and these
+/// positions: files with a texture repeat vertices at seams. −0 equals 0.
 pub(super) fn weld_map(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
     let mut numbers: HashMap<[u32; 3], u32> = HashMap::with_capacity(mesh.positions.len());
     let mut welded = Vec::new();
@@ -20,11 +20,11 @@ pub(super) fn weld_map(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
     (map, welded)
 }
 
-/// Returns the mesh with equal positions merged, where −0 equals 0. Triangles keep their number and order, so an
-/// atlas stays parallel to them; degenerate ones are kept too.
+/// Returns the mesh with equal positions merged, where −0 equals 0. Triangles keep their number and
+/// order, so an atlas stays parallel to them; degenerate ones are kept too.
 ///
-/// A merged vertex has the color of its first copy, and their common normal; copies that disagree, as
-/// on creases, get the unit of their sum.
+/// A merged vertex has the color of its first copy, and their common normal; copies that disagree,
+/// as on creases, get the unit of their sum.
 pub fn weld(mesh: &Mesh) -> Mesh {
     let (new, positions) = weld_map(mesh);
     let mut creased = vec![false; positions.len()];

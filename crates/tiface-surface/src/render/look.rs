@@ -1,4 +1,5 @@
-//! Display modes of a mesh: its color, or a visualization of its shape, normals or texture coordinates.
+//! Display modes of a mesh: its color, or a visualization of its shape, normals or texture
+//! coordinates.
 
 use super::raycast::RayHits;
 use super::texture::MeshTexture;
@@ -12,7 +13,8 @@ const GRAY: [f32; 3] = [0.8; 3];
 /// Squares of the checker along each side of a texture.
 const CHECKER_SQUARES: f32 = 32.0;
 
-/// Lamps that follow the camera: direction (right, up, to the viewer; not unit) and brightness. Key, fill and rim.
+/// Lamps that follow the camera: direction (right, up, to the viewer; not unit) and brightness.
+/// Key, fill and rim.
 const LAMPS: [([f32; 3], f32); 3] =
     [([-0.6, 0.7, 0.8], 0.75), ([0.9, 0.1, 0.6], 0.25), ([0.3, 0.8, -0.8], 0.3)];
 
@@ -130,7 +132,8 @@ impl Surface<'_> {
         Some(hit.mix(atlas.triangles[hit.triangle as usize].map(|i| atlas.uvs[i as usize])))
     }
 
-    /// Returns a checker that runs from red to green along u and from dark to light along v (down the texture).
+    /// Returns a checker that runs from red to green along u and from dark to light along v (down
+    /// the texture).
     fn checker(&self, hits: &RayHits, i: usize) -> [f32; 3] {
         let Some(uv) = self.uv(hits, i) else { return GRAY };
         let square = (uv * CHECKER_SQUARES).floor();

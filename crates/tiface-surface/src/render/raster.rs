@@ -1,18 +1,20 @@
 //! Rasterization of a mesh: the same view as the ray caster's, in a fraction of the time.
 //!
-//! 1. Corners are projected and snapped to 1/256 of a pixel, triangles clipped to the frustum, and sorted into tiles
-//!    of 32 × 32 pixels (`project`). A lens that bends straight lines gets triangles halved until that no longer shows: so
-//!    edges stay shared, which a picture that is bent afterwards could not promise.
-//! 2. In each tile the nearest triangle is found at the center of every pixel and at four samples around it (`tile`).
-//! 3. What is seen is colored once a pixel, and again for each surface that ends within the pixel. The ray through the
-//!    pixel is met with its triangle as a ray caster would do it, so depth and attributes do not depend on the snapping
-//!    (`paint`).
+//! 1. Corners are projected and snapped to 1/256 of a pixel, triangles clipped to the frustum, and
+//!    sorted into tiles of 32 × 32 pixels (`project`). A lens that bends straight lines gets
+//!    triangles halved until that no longer shows: so edges stay shared, which a picture that is
+//!    bent afterwards could not promise.
+//! 2. In each tile the nearest triangle is found at the center of every pixel and at four samples
+//!    around it (`tile`).
+//! 3. What is seen is colored once a pixel, and again for each surface that ends within the pixel.
+//!    The ray through the pixel is met with its triangle as a ray caster would do it, so depth and
+//!    attributes do not depend on the snapping (`paint`).
 //!
-//! Translucent layers are drawn each into a tile of its own, where the mesh does not hide it, and blended sample by sample,
-//! the outermost first.
+//! Translucent layers are drawn each into a tile of its own, where the mesh does not hide it, and
+//! blended sample by sample, the outermost first.
 //!
-//! Coverage is that of the four samples; uncovered pixels are transparent black. Every tile is made by one thread in the
-//! order of the triangles: same mesh, same picture.
+//! Coverage is that of the four samples; uncovered pixels are transparent black. Every tile is made
+//! by one thread in the order of the triangles: same mesh, same picture.
 
 mod paint;
 mod project;
@@ -27,7 +29,8 @@ use tiface_base::geom::{Camera, Mesh, ShellLayer, Shells, Similarity};
 use tiface_base::image::Image;
 use tile::{NOTHING, SAMPLES, Tile};
 
-/// Depth change over one pixel, in pixel footprints, from which on a surface ends: tan 84°, as in the ray caster.
+/// Depth change over one pixel, in pixel footprints, from which on a surface ends: tan 84°, as in
+/// the ray caster.
 const JUMP: f32 = 10.0;
 
 /// Options of rasterization.
@@ -37,9 +40,11 @@ pub struct RasterOptions {
     pub cull: bool,
     /// Whether the picture of normals is rendered; otherwise it has no pixels.
     pub normals: bool,
-    /// Whether hits are passed to the color function without points and normals, which texture lookups do not need.
+    /// Whether hits are passed to the color function without points and normals, which texture
+    /// lookups do not need.
     pub bare_hits: bool,
-    /// The transform from the mesh's coordinates (which the camera is in, too) to those of depth and normals.
+    /// The transform from the mesh's coordinates (which the camera is in, too) to those of depth
+    /// and normals.
     pub world_from_scene: Similarity,
 }
 
@@ -54,7 +59,8 @@ impl Default for RasterOptions {
 pub struct RasterView {
     /// Color, depth and normals, as from the ray caster.
     pub view: RenderedView,
-    /// `[height · width]` triangles at the centers of the pixels, [`RasterView::NOTHING`] for empty ones.
+    /// `[height · width]` triangles at the centers of the pixels, [`RasterView::NOTHING`] for empty
+    /// ones.
     pub triangles: Vec<u32>,
 }
 
@@ -65,8 +71,8 @@ impl RasterView {
 
 /// Rasterizes a mesh, with optional translucent layers around it.
 ///
-/// `color` gets batches of hits and returns sRGB-coded colors in 0..=1, one per hit, `[n, 3]`; missing ones are
-/// black. It runs on several threads at once.
+/// `color` gets batches of hits and returns sRGB-coded colors in 0..=1, one per hit, `[n, 3]`;
+/// missing ones are black. It runs on several threads at once.
 ///
 /// # Examples
 ///
@@ -255,7 +261,8 @@ impl Scratch {
     }
 }
 
-/// Draws the tiles of a band of a picture of this width: the layers from the outermost, then the mesh.
+/// Draws the tiles of a band of a picture of this width: the layers from the outermost, then the
+/// mesh.
 fn draw_band<C: Fn(&RayHits) -> Vec<[f32; 3]>>(
     painter: &Painter<'_, C>,
     surfaces: &[BinnedSurface],

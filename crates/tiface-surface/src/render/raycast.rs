@@ -1,15 +1,17 @@
 //! Ray casting of a mesh: a pixel is the mean of `samples × samples` rays, colored where they hit.
 //!
-//! Edges get twice as many rays each way to avoid aliasing: pixels where some rays hit and some miss, or where depth
-//! jumps by more than a surface seen at 84° would within one pixel. Misses count as transparent black. The mean is of
-//! sRGB-coded values, as everywhere in rendering here: the fields composite coded color, so alpha does too.
+//! Edges get twice as many rays each way to avoid aliasing: pixels where some rays hit and some
+//! miss, or where depth jumps by more than a surface seen at 84° would within one pixel. Misses
+//! count as transparent black. The mean is of sRGB-coded values, as everywhere in rendering here:
+//! the fields composite coded color, so alpha does too.
 
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use tiface_base::geom::{Bvh, Camera, Hit, Mesh, Ray, ShellCaster, Similarity};
 use tiface_base::image::Image;
 
-/// Pixels processed at once by one thread: bounds memory, and gives the color network large batches.
+/// Pixels processed at once by one thread: bounds memory, and gives the color network large
+/// batches.
 const BATCH: usize = 8192;
 
 /// Depth change over one pixel, in pixel footprints, from which on it is an edge: tan 84°.
@@ -20,7 +22,8 @@ const JUMP: f32 = 10.0;
 pub struct RaycastOptions {
     /// Rays along each side of a pixel; twice as many on an edge. 1 is one ray everywhere.
     pub samples: u32,
-    /// The transform from the mesh's coordinates (which the camera is in, too) to those of depth and normals.
+    /// The transform from the mesh's coordinates (which the camera is in, too) to those of depth
+    /// and normals.
     pub world_from_scene: Similarity,
 }
 
@@ -35,10 +38,11 @@ impl Default for RaycastOptions {
 pub struct RenderedView {
     /// RGBA: sRGB-coded color premultiplied over black, and coverage.
     pub color: Image,
-    /// One channel: distance along the viewing axis in world units at the pixel's center; 0 = nothing.
+    /// One channel: distance along the viewing axis in world units at the pixel's center; 0 =
+    /// nothing.
     pub depth: Image,
-    /// Three channels: unit normal in the world at the pixel's center; 0 = nothing. No pixels at all if the method
-    /// has no normals.
+    /// Three channels: unit normal in the world at the pixel's center; 0 = nothing. No pixels at
+    /// all if the method has no normals.
     pub normal: Image,
 }
 
@@ -90,8 +94,8 @@ impl RayHits {
 
 /// Casts the rays of a camera at a mesh.
 ///
-/// `color` gets batches of hits and returns sRGB-coded colors in 0..=1, one per hit, `[n, 3]`; missing ones are
-/// black. It runs on several threads at once.
+/// `color` gets batches of hits and returns sRGB-coded colors in 0..=1, one per hit, `[n, 3]`;
+/// missing ones are black. It runs on several threads at once.
 ///
 /// # Examples
 ///
@@ -277,7 +281,8 @@ mod tests {
 
     #[test]
     fn an_edge_through_a_pixel_covers_half_of_it() {
-        // pixel 10 spans x = 0..1 pixel right of the axis: 0..0.04 at distance 4. The edge is at 0.02.
+        // pixel 10 spans x = 0..1 pixel right of the axis: 0..0.04 at distance 4. The edge is at
+        // 0.02.
         let mesh = half_plane(0.02);
         let bvh = Bvh::new(&mesh);
         let view = raycast(&bvh, &mesh, None, &camera(20, 8), &RaycastOptions::default(), red);
@@ -362,7 +367,8 @@ mod tests {
 
     #[test]
     fn layers_are_blended_over_the_mesh_and_beyond_it() {
-        // the half plane x > 0 and two layers before all of it, moved by 0.1 and 0.2, that end half a unit further left
+        // the half plane x > 0 and two layers before all of it, moved by 0.1 and 0.2, that end half
+        // a unit further left
         let mut mesh = half_plane(0.0);
         mesh.normals = vec![Vec3::Z; mesh.positions.len()];
         let wide = half_plane(-0.5);
@@ -376,7 +382,8 @@ mod tests {
         let red = |hits: &RayHits| vec![[1.0, 0.0, 0.0]; hits.hits.len()];
         let options = RaycastOptions { samples: 1, ..RaycastOptions::default() };
         let view = raycast(&Bvh::new(&mesh), &mesh, Some(&caster), &camera(40, 8), &options, red);
-        // all of it where the mesh is behind; 1 − ½ · ½ where only the layers are; nothing beyond. A pixel is 0.04 wide.
+        // all of it where the mesh is behind; 1 − ½ · ½ where only the layers are; nothing beyond.
+        // A pixel is 0.04 wide.
         assert_eq!(view.color.pixel(30, 4), [1.0, 0.0, 0.0, 1.0]);
         assert_eq!(view.color.pixel(15, 4), [0.75, 0.0, 0.0, 0.75]);
         assert_eq!(view.color.pixel(4, 4), [0.0; 4]);

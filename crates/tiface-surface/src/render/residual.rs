@@ -1,17 +1,19 @@
 //! Residuals: photograph minus rendered mesh in the training views, added to new views of the mesh.
 //!
-//! A hit gets the weighted mean `μ` of the residuals of the training views that see its point from a similar direction, as in
-//! view-dependent texture mapping (Debevec et al. 1996) and unstructured lumigraph rendering (Buehler et al. 2001). The weight
-//! of a view is
+//! A hit gets the weighted mean `μ` of the residuals of the training views that see its point from
+//! a similar direction, as in view-dependent texture mapping (Debevec et al. 1996) and unstructured
+//! lumigraph rendering (Buehler et al. 2001). The weight of a view is
 //!
 //! ```text
 //! w = c · v · g · (1 − u)² / (u + 0.1),    u = (1 − cos θ) / (1 − cos R)
 //! ```
 //!
-//! with the confidence `c` of the view's pixel, its visibility `v`, the slant `g` of the surface, and the angle `θ` between both
-//! directions, below the reach `R`. The hit's color changes by `μ · S / (S + w₀) / (1 + σ² / σ₀²)`, `S` being the sum of the weights
-//! and `σ²` the variance of the residuals: little where views are far or disagree. All factors are continuous, so that nothing
-//! pops along a camera path. Views that are judged get nothing of a photograph from their own position.
+//! with the confidence `c` of the view's pixel, its visibility `v`, the slant `g` of the surface,
+//! and the angle `θ` between both directions, below the reach `R`. The hit's color changes by
+//! `μ · S / (S + w₀) / (1 + σ² / σ₀²)`, `S` being the sum of the weights and `σ²` the variance of
+//! the residuals: little where views are far or disagree. All factors are continuous, so that
+//! nothing pops along a camera path. Views that are judged get nothing of a photograph from their
+//! own position.
 
 use super::{RayHits, RenderedView};
 use glam::{DVec3, Mat3, Vec2, Vec3};
@@ -22,13 +24,15 @@ use tiface_base::image::{Gray, OPAQUE_ALPHA, Photo, eroded};
 /// Residuals are stored in bytes of 1/512 around 128: up to a quarter of the range of colors.
 const STEPS: f32 = 512.0;
 
-/// Distance over which confidence grows from nothing at soft pixels, outlines and jumps of depth, in pixels.
+/// Distance over which confidence grows from nothing at soft pixels, outlines and jumps of depth,
+/// in pixels.
 const RAMP_PX: usize = 2;
 
 /// Depth change over one pixel, in pixel footprints, from which on it is an outline: tan 79°.
 const JUMP: f32 = 5.0;
 
-/// Depth behind the nearest surface of the view, in pixel footprints, up to which a point is seen by it.
+/// Depth behind the nearest surface of the view, in pixel footprints, up to which a point is seen
+/// by it.
 const DEPTH_TOLERANCE: f32 = 3.0;
 
 /// Coverage from which on a rendered pixel shows the mesh alone.
@@ -54,7 +58,8 @@ pub struct Residuals {
     views: Vec<ResidualView>,
     /// `1 − cos R`
     reach: f32,
-    /// Whether a view gets no residuals of the photograph from its own position: it could not be judged by this photograph.
+    /// Whether a view gets no residuals of the photograph from its own position: it could not be
+    /// judged by this photograph.
     leaves_out_own: bool,
 }
 
@@ -87,7 +92,8 @@ struct ResidualPixel {
 pub struct ResidualView {
     camera: Camera,
     position: Vec3,
-    /// From the mesh's coordinates, relative to the position, to the camera's: right, up, backwards.
+    /// From the mesh's coordinates, relative to the position, to the camera's: right, up,
+    /// backwards.
     rotation: Mat3,
     left: usize,
     top: usize,
@@ -97,8 +103,8 @@ pub struct ResidualView {
 }
 
 impl Residuals {
-    /// Returns the residuals of these views of a mesh around `center`; `None` without views. With `leaves_out_own`, a training
-    /// view adds nothing to a view from its own position.
+    /// Returns the residuals of these views of a mesh around `center`; `None` without views. With
+    /// `leaves_out_own`, a training view adds nothing to a view from its own position.
     pub fn new(views: Vec<ResidualView>, center: Vec3, leaves_out_own: bool) -> Option<Residuals> {
         let directions: Vec<Vec3> = views.iter().map(|v| (v.position - center).normalize_or_zero()).collect();
         let mut reaches: Vec<f32> = directions
@@ -215,7 +221,8 @@ impl ResidualView {
         })
     }
 
-    /// Projects a point to the photograph, like [`Camera::project`], in f32 where there is no distortion.
+    /// Projects a point to the photograph, like [`Camera::project`], in f32 where there is no
+    /// distortion.
     fn project(&self, point: Vec3) -> Option<(Vec2, f32)> {
         let Camera { fx, fy, cx, cy, distortion, .. } = &self.camera;
         if !distortion.is_none() {
@@ -227,7 +234,8 @@ impl ResidualView {
         (p.z < -1e-9).then_some((pixel, -p.z))
     }
 
-    /// Returns the residual at a point, between pixels, and how well the view sees the point, 0..=1.
+    /// Returns the residual at a point, between pixels, and how well the view sees the point,
+    /// 0..=1.
     fn look_up(&self, point: Vec3) -> (Vec3, f32) {
         const NOTHING: (Vec3, f32) = (Vec3::ZERO, 0.0);
         let Some((pixel, depth)) = self.project(point) else { return NOTHING };
@@ -254,7 +262,8 @@ impl ResidualView {
     }
 }
 
-/// Returns the share of set pixels in the square of half edge `margin` around each pixel, in 255ths.
+/// Returns the share of set pixels in the square of half edge `margin` around each pixel, in
+/// 255ths.
 fn means(set: &[bool], w: usize, h: usize, margin: usize) -> Vec<u8> {
     let window = |at: usize, n: usize| at.saturating_sub(margin)..(at + margin + 1).min(n);
     let row = |i: usize| window(i % w, w).filter(|x| set[i / w * w + x]).count();
@@ -340,7 +349,8 @@ mod tests {
         let photos = cameras.each_ref().map(|c| photo(c, patch));
         let residuals = residuals(&mesh, &cameras, &photos, None).unwrap();
         let seen = view(&residuals, &mesh, &camera(0.0));
-        // u = 1 / 4 at the middle of both, with a reach of twice the angle between them: each weighs (3/4)² / 0.35
+        // u = 1 / 4 at the middle of both, with a reach of twice the angle between them: each
+        // weighs (3/4)² / 0.35
         let sum = 2.0 * 0.5625 / 0.35;
         let expected = GRAY[0] + 40.0 / 255.0 * sum / (sum + HALF_WEIGHT);
         let middle = seen.pixel(30, 30)[0];

@@ -1,11 +1,11 @@
 //! Texture lookup: mip-mapped, filtered in linear light, with lobes for view-dependent color.
 //!
-//! A level has half the texels of the one before, rounded down, each the mean of the part of the picture that it
-//! covers: of three texels by their share where the number is odd (Guthe and Heckbert, *Non-power-of-two
-//! mipmapping*, 2005), so that no level is shifted against another.
+//! A level has half the texels of the one before, rounded down, each the mean of the part of the
+//! picture that it covers: of three texels by their share where the number is odd (Guthe and
+//! Heckbert, *Non-power-of-two mipmapping*, 2005), so that no level is shifted against another.
 //!
-//! Texels are 16-bit integers, half as large as floats and finer than any 8-bit picture: they are decoded once per
-//! lookup, after filtering.
+//! Texels are 16-bit integers, half as large as floats and finer than any 8-bit picture: they are
+//! decoded once per lookup, after filtering.
 
 use super::raycast::RayHits;
 use glam::{Mat3, Vec2, Vec3, Vec4};
@@ -16,8 +16,9 @@ use tiface_base::geom::sphharm;
 use tiface_base::geom::{Atlas, Camera, Hit, Mesh};
 use tiface_base::image::{Photo, linear_from_srgb, srgb_from_linear};
 
-/// View-dependent color beside a base color: one picture per spherical-harmonic function, in the order of
-/// [`sphharm::sh16`]. A byte `b` of picture `k` stands for the sRGB-coded difference `(b − 128) / 127 · scale[k]`.
+/// View-dependent color beside a base color: one picture per spherical-harmonic function, in the
+/// order of [`sphharm::sh16`]. A byte `b` of picture `k` stands for the sRGB-coded difference
+/// `(b − 128) / 127 · scale[k]`.
 pub struct LobePictures<'a> {
     /// Pictures of the atlas's size.
     pub pictures: &'a [Photo],
@@ -75,8 +76,8 @@ struct MipLevel {
 /// Number of hits whose texels are fetched together.
 const LANES: usize = 8;
 
-/// Returns the level for this many texels a pixel, and how far it is on the way to the next: the base-2 logarithm, its
-/// fraction by the chord's parabola (off by 0.009).
+/// Returns the level for this many texels a pixel, and how far it is on the way to the next: the
+/// base-2 logarithm, its fraction by the chord's parabola (off by 0.009).
 #[inline(always)]
 fn mip_level(texels: f32, levels: usize) -> (usize, f32) {
     let bits = texels.max(1.0).to_bits();
@@ -168,20 +169,23 @@ impl MeshTexture {
         }
     }
 
-    /// Returns the sRGB-coded colors of a camera's visible hits, interpolated between two levels (trilinear).
+    /// Returns the sRGB-coded colors of a camera's visible hits, interpolated between two levels
+    /// (trilinear).
     pub fn smooth_colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let mut colors = Vec::with_capacity(hits.hits.len());
         smooth(self, hits, camera, &mut colors);
         colors
     }
 
-    /// Returns the sRGB-coded colors of the hits of a camera's rays, `samples` of them along each side of a pixel.
+    /// Returns the sRGB-coded colors of the hits of a camera's rays, `samples` of them along each
+    /// side of a pixel.
     pub fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
         let forward = camera.forward();
         let mut values = vec![Vec4::ZERO; self.groups];
         let one = |(i, hit): (usize, &Hit)| {
             let (uv, density) = self.coordinates(hit);
-            // a ray's share of a pixel on a plane across the view; slanted surfaces stay sharp rather than blur
+            // a ray's share of a pixel on a plane across the view; slanted surfaces stay sharp
+            // rather than blur
             let footprint =
                 hit.t * hits.directions[i].dot(forward) / (camera.fx.abs() as f32 * samples as f32);
             let level =
@@ -317,8 +321,8 @@ fn halved(texels: &[Texel], [across, down]: [usize; 2], groups: usize) -> Vec<Te
     half
 }
 
-/// Returns the four texels around a place of a level, clamped at its borders, and how far it is on the way between
-/// them.
+/// Returns the four texels around a place of a level, clamped at its borders, and how far it is on
+/// the way between them.
 #[inline(always)]
 fn around(level: &MipLevel, u: f32, v: f32) -> ([u32; 4], Vec2) {
     let (x, y) = (
@@ -339,7 +343,8 @@ fn around(level: &MipLevel, u: f32, v: f32) -> ([u32; 4], Vec2) {
 #[inline(always)]
 fn whole(v: f32) -> u32 {
     let v = v.max(0.0).min(1e9);
-    // SAFETY: the value is in 0..2³¹, because `max` turns NaN into 0. A checked cast would not be vectorized.
+    // SAFETY: the value is in 0..2³¹, because `max` turns NaN into 0. A checked cast would not be
+    // vectorized.
     unsafe { v.to_int_unchecked::<i32>() as u32 }
 }
 
@@ -349,8 +354,8 @@ fn bilinear([a, b, c, d]: [Vec4; 4], f: Vec2) -> Vec4 {
     top + f.y * (bottom - top)
 }
 
-/// Returns the texels under each of `n` equal parts of a row of `from`, which has two to three a part, with their
-/// shares.
+/// Returns the texels under each of `n` equal parts of a row of `from`, which has two to three a
+/// part, with their shares.
 fn shares(from: usize, n: usize) -> Vec<[(usize, f32); 3]> {
     let part = |i: usize| {
         let first = i * from / n;
@@ -412,12 +417,14 @@ mod tests {
             let texels: Vec<Texel> = row.iter().map(|v| [*v; 4]).collect();
             halved(&texels, [row.len(), 1], 1).iter().map(|t| t[3]).collect::<Vec<_>>()
         };
-        // five texels in halves of 2.5: (100 + 200 + 0.5 · 400) / 2.5 and (0.5 · 400 + 800 + 1600) / 2.5
+        // five texels in halves of 2.5: (100 + 200 + 0.5 · 400) / 2.5 and (0.5 · 400 + 800 + 1600)
+        // / 2.5
         assert_eq!(row(&[100, 200, 400, 800, 1600]), [200, 1040]);
         assert_eq!(row(&[3, 6, 0]), [3]);
         assert_eq!(row(&[1, 3, 5, 9]), [2, 7]);
         assert_eq!(row(&[65535, 65535, 0, 1]), [65535, 1]);
-        // a bright spot keeps its place and its light on every level: 23 by 37 texels, the spot at (5, 30)
+        // a bright spot keeps its place and its light on every level: 23 by 37 texels, the spot at
+        // (5, 30)
         let (mut width, mut height) = (23, 37);
         let mut texels = vec![[0; 4]; width * height];
         texels[30 * width + 5] = [65535; 4];
@@ -446,7 +453,8 @@ mod tests {
         let (mesh, atlas, mut photo) = square();
         photo.rgb.iter_mut().enumerate().for_each(|(i, c)| *c = [255 * ((i + i / 4) % 2) as u8; 3]);
         let texture = MeshTexture::new(&mesh, &atlas, &photo, None);
-        // 2 pixels over the square: every pixel is the mean of 2 × 2 texels, linear 0.5, coded 0.735
+        // 2 pixels over the square: every pixel is the mean of 2 × 2 texels, linear 0.5, coded
+        // 0.735
         for p in view(&texture, &mesh, &Camera::above(2, 2, 2.0, 2.0), 1) {
             assert!((p[0] - srgb_from_linear(0.5)).abs() < 1e-3, "{p:?}");
         }
@@ -465,7 +473,8 @@ mod tests {
         let pixels = view(&texture, &mesh, &Camera::above(9, 9, 9.0, 2.0), 1);
         let middle = pixels[40];
         assert!((middle[0] - 128.0 / 255.0).abs() < 1e-3);
-        // the leftmost pixel is seen from the right: its direction to the viewer has x = 0.889 / √(4 + 0.79)
+        // the leftmost pixel is seen from the right: its direction to the viewer has x = 0.889 /
+        // √(4 + 0.79)
         let x = 8.0 / 9.0 / (4.0f32 + 64.0 / 81.0).sqrt();
         assert!((pixels[36][0] - (128.0 / 255.0 - 0.2 * 0.4886 * x)).abs() < 1e-3, "{:?}", pixels[36]);
         assert!((pixels[36][1] - 128.0 / 255.0).abs() < 1e-3);
@@ -487,7 +496,8 @@ mod tests {
         // as many pixels as texels: the texels themselves
         let each = seen(&texture, 4);
         assert!(each.iter().enumerate().all(|(i, p)| (p[0] - ((i + i / 4) % 2) as f32).abs() < 1e-3));
-        // a texture that is used outside of its picture is repeated: shifted by a whole picture it is the same
+        // a texture that is used outside of its picture is repeated: shifted by a whole picture it
+        // is the same
         let shifted =
             Atlas { uvs: atlas.uvs.iter().map(|uv| uv + Vec2::new(3.0, -2.0)).collect(), ..atlas.clone() };
         let again = seen(&MeshTexture::new(&mesh, &shifted, &photo, None), 4);

@@ -1,14 +1,15 @@
 //! Collapses of edges in the order of their cost, to a sixteenth of an octave.
 //!
-//! An edge may collapse under the link condition (Dey, Edelsbrunner, Guha, Nekhayev 1999): edge (a, b) may
-//! collapse without change of topology when every vertex joined to both is opposite to the edge in one of its
-//! triangles, and, with a border taken as joined to one vertex more, the same holds of edges. The triangles that
-//! stay may not turn by more than 60° nor become worse than a quality of 0.05, unless they were worse.
+//! An edge may collapse under the link condition (Dey, Edelsbrunner, Guha, Nekhayev 1999): edge (a,
+//! b) may collapse without change of topology when every vertex joined to both is opposite to the
+//! edge in one of its triangles, and, with a border taken as joined to one vertex more, the same
+//! holds of edges. The triangles that stay may not turn by more than 60° nor become worse than a
+//! quality of 0.05, unless they were worse.
 //!
-//! A heap would order edges exactly, at a cache miss a level. Here an edge falls into a bucket by the upper
-//! bits of its cost (positive floats are ordered as their bits), and a bucket is worked through first
-//! in, first out, which also visits neighbors in memory one after another. Outdated entries stay
-//! where they are: the caller recognizes them by `stamp`.
+//! A heap would order edges exactly, at a cache miss a level. Here an edge falls into a bucket by
+//! the upper bits of its cost (positive floats are ordered as their bits), and a bucket is worked
+//! through first in, first out, which also visits neighbors in memory one after another. Outdated
+//! entries stay where they are: the caller recognizes them by `stamp`.
 
 use super::crossing::CrossingIndex;
 use super::quadric::{AllowedTarget, PlaneQuadric, best, scaled_normal};
@@ -21,15 +22,15 @@ use tiface_base::geom::{Aabb, shape};
 /// Buckets that a cost may have grown since the edge was entered: a quarter of it.
 const COST_SLACK: usize = 4;
 
-/// Maximum number of edges of a new vertex that are queued, the cheapest first. The vertices around have theirs
-/// from before; all seven would take a tenth longer and win a hundredth of the error.
+/// Maximum number of edges of a new vertex that are queued, the cheapest first. The vertices around
+/// have theirs from before; all seven would take a tenth longer and win a hundredth of the error.
 const EDGES_PER_VERTEX: usize = 3;
 
 /// Number of collapses between two checks for a stop request.
 const STOP_CHECK_INTERVAL: usize = 1 << 12;
 
-/// Collapses edges until `target` triangles are left, or no edge may. With `budgets`, a collapse may not
-/// stray farther from the planes before it than both its ends have left, and uses that up.
+/// Collapses edges until `target` triangles are left, or no edge may. With `budgets`, a collapse
+/// may not stray farther from the planes before it than both its ends have left, and uses that up.
 pub(super) fn reduce(
     rings: &mut Rings,
     task: &Task,
@@ -327,7 +328,8 @@ impl EdgeLink {
     }
 }
 
-/// Returns the position of the new vertex of a collapse of (a, b), and its cost; `None` if an end is fixed.
+/// Returns the position of the new vertex of a collapse of (a, b), and its cost; `None` if an end
+/// is fixed.
 #[inline]
 pub(super) fn collapse_target(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f32)> {
     let (fa, fb) = (rings.flags[a as usize], rings.flags[b as usize]);
@@ -343,7 +345,8 @@ pub(super) fn collapse_target(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f3
     Some(best(pa, &rings.quadrics[a as usize], pb, &rings.quadrics[b as usize], allowed))
 }
 
-/// Number of leading bits of a cost that select its bucket: sign and exponent, and four bits of the mantissa.
+/// Number of leading bits of a cost that select its bucket: sign and exponent, and four bits of the
+/// mantissa.
 const SHIFT: u32 = 19;
 
 /// A queued edge with the stamps of its ends.
@@ -422,7 +425,8 @@ mod tests {
 
     #[test]
     fn the_waist_of_a_double_pyramid_must_not_close() {
-        // Over and under the triangle 0, 1, 2, which is no face: 0 and 1 have 2 for a common neighbor.
+        // Over and under the triangle 0, 1, 2, which is no face: 0 and 1 have 2 for a common
+        // neighbor.
         let waist = [[0, 1, 3], [1, 2, 3], [2, 0, 3], [1, 0, 4], [2, 1, 4], [0, 2, 4]];
         assert!(!may(&waist, 0, 1));
         assert!(may(&waist, 0, 3)); // leaves the tetrahedron 0, 1, 2, 4

@@ -1,7 +1,8 @@
 //! Triangles that pass through others: found in a finished mesh, and refused in the making.
 //!
-//! Triangles are entered into the cells of a grid that their boxes meet. The test of a pair is the one
-//! of `mesh::files::check`; before it, a triangle strictly on one side of the other's plane is let go.
+//! Triangles are entered into the cells of a grid that their boxes meet. The test of a pair is the
+//! one of `mesh::files::check`; before it, a triangle strictly on one side of the other's plane is
+//! let go.
 
 use super::rings::{NONE, Rings};
 use glam::{DVec3, IVec3, Vec3};
@@ -53,7 +54,8 @@ impl Cells {
         self.dims.x as usize * self.dims.y as usize * self.dims.z as usize
     }
 
-    /// Returns the cell of a point in the box; the conversion truncates, which is rounding down for such points.
+    /// Returns the cell of a point in the box; the conversion truncates, which is rounding down for
+    /// such points.
     fn cell(&self, p: Vec3) -> IVec3 {
         ((p - self.origin) * self.per_unit).as_ivec3().clamp(IVec3::ZERO, self.dims - 1)
     }
@@ -92,8 +94,8 @@ impl Facet {
         if a.min.cmpgt(b.max).any() || b.min.cmpgt(a.max).any() {
             return false;
         }
-        // All determinants below have three factors of at most this length: 1e-14 of its cube is more
-        // than their rounding.
+        // All determinants below have three factors of at most this length: 1e-14 of its cube is
+        // more than their rounding.
         let size = (a.max.max(b.max) - a.min.min(b.min)).length();
         let unsure = 1e-14 * f64::from(size).powi(3);
         if self.is_clear_of(other, unsure) || other.is_clear_of(self, unsure) {
@@ -182,7 +184,8 @@ impl CrossingIndex {
         }
     }
 
-    /// Returns whether these triangles, in the place of `instead`, would meet others or one another.
+    /// Returns whether these triangles, in the place of `instead`, would meet others or one
+    /// another.
     pub(super) fn would_cross(
         &mut self,
         rings: &Rings,

@@ -1,21 +1,23 @@
-//! Distance of a point from the planes of the triangles around a vertex: Garland, Heckbert 1997, without
-//! memory (Lindstrom, Turk 1998).
+//! Distance of a point from the planes of the triangles around a vertex: Garland, Heckbert 1997,
+//! without memory (Lindstrom, Turk 1998).
 //!
-//! Around a vertex `v` with triangles of unit normal `n` and area `A`, all of whose planes pass through
-//! `v`, the quadric is `Q(x) = (x − v)ᵀ S (x − v)` with `S = Σ A n nᵀ`. Since it forgets the triangles of
-//! former steps, six numbers a vertex are enough, and because they are relative to the vertex, f32 holds
-//! them wherever the mesh lies. An edge (a, b) costs the least of `Q_a + Q_b`, found in f64.
+//! Around a vertex `v` with triangles of unit normal `n` and area `A`, all of whose planes pass
+//! through `v`, the quadric is `Q(x) = (x − v)ᵀ S (x − v)` with `S = Σ A n nᵀ`. Since it forgets
+//! the triangles of former steps, six numbers a vertex are enough, and because they are relative to
+//! the vertex, f32 holds them wherever the mesh lies. An edge (a, b) costs the least of
+//! `Q_a + Q_b`, found in f64.
 
 use glam::{DVec3, Vec3};
 use tiface_base::geom::cofactors;
 
-/// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point to the middle
-/// where the triangles do not say (flat or along a crease). More costs accuracy: on a head simplified to
-/// a fifth, 1e-5, 1e-4, 1e-3 leave it 0.0198, 0.0206, 0.0223 off (in 512ths of the cube).
+/// Share of the trace added to the diagonal, about the middle of the edge: pulls the best point to
+/// the middle where the triangles do not say (flat or along a crease). More costs accuracy: on a
+/// head simplified to a fifth, 1e-5, 1e-4, 1e-3 leave it 0.0198, 0.0206, 0.0223 off (in 512ths of
+/// the cube).
 const MIDPOINT_WEIGHT: f64 = 1e-5;
 
-/// Share of the trace, times the squared half edge, added to the cost: short edges go first where all is
-/// flat, which halves the slivers of 1e-5 and costs no accuracy.
+/// Share of the trace, times the squared half edge, added to the cost: short edges go first where
+/// all is flat, which halves the slivers of 1e-5 and costs no accuracy.
 const LENGTH_WEIGHT: f64 = 3e-5;
 
 /// The best point lies at most this many edge lengths from the edge's middle.
@@ -25,8 +27,8 @@ const MAX_OFFSET: f64 = 1.5;
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct PlaneQuadric([f32; 6]);
 
-/// `√A n` (up to √2) of a triangle from twice its area vector, whose outer product is its share of a
-/// [`PlaneQuadric`]; zero for one without area.
+/// `√A n` (up to √2) of a triangle from twice its area vector, whose outer product is its share of
+/// a [`PlaneQuadric`]; zero for one without area.
 pub(super) fn scaled_normal(area: Vec3) -> Vec3 {
     let length = area.length();
     if length > 0.0 { area / length.sqrt() } else { Vec3::ZERO }
@@ -75,10 +77,11 @@ pub(super) enum AllowedTarget {
     Second,
 }
 
-/// Returns the best point for the collapse of edge (a, b), and its cost: squared distance times area.
+/// Returns the best point for the collapse of edge (a, b), and its cost: squared distance times
+/// area.
 ///
-/// Where the 3 × 3 system is worse than a condition of 1e6 or its solution lies far off, the better of
-/// the ends and the middle.
+/// Where the 3 × 3 system is worse than a condition of 1e6 or its solution lies far off, the better
+/// of the ends and the middle.
 pub(super) fn best(
     a: Vec3,
     qa: &PlaneQuadric,
@@ -124,8 +127,8 @@ fn solve(m: [f64; 6], r: DVec3) -> Option<DVec3> {
     let (c, det) = cofactors(m);
     let [xx, _, _, yy, _, zz] = m;
     let trace = xx + yy + zz;
-    // For eigenvalues p ≥ q ≥ r > 0: det = pqr and the sum of the principal minors c is about pq, so
-    // their quotient is about r, to be compared with the trace, about p.
+    // For eigenvalues p ≥ q ≥ r > 0: det = pqr and the sum of the principal minors c is about pq,
+    // so their quotient is about r, to be compared with the trace, about p.
     let minors = c[0] + c[3] + c[5];
     if !(trace > 0.0 && det > 1e-6 * trace * minors && det.is_finite()) {
         return None;

@@ -1,12 +1,12 @@
 //! The mesh while it shrinks: which triangles are around each vertex.
 //!
 //! Flat arrays only. The rings of all vertices lie in one pool; a ring that outgrows its slot moves
-//! to the pool's end. A collapse of (a, b) gives b's triangles to a and drops the one or two that held
-//! the edge; nothing else in the mesh changes its number.
+//! to the pool's end. A collapse of (a, b) gives b's triangles to a and drops the one or two that
+//! held the edge; nothing else in the mesh changes its number.
 //!
-//! On an edge with more than two triangles, or with two that run the same way, and at a vertex whose
-//! triangles form more than one fan, the link condition does not apply. Such vertices stay as they are,
-//! so that a mesh with a flaw keeps the flaw and gets no others.
+//! On an edge with more than two triangles, or with two that run the same way, and at a vertex
+//! whose triangles form more than one fan, the link condition does not apply. Such vertices stay as
+//! they are, so that a mesh with a flaw keeps the flaw and gets no others.
 
 use super::quadric::{PlaneQuadric, scaled_normal};
 use glam::Vec3;
@@ -16,7 +16,8 @@ use tiface_base::geom::{Mesh, area_vector};
 /// Stands for the corners of a dropped triangle.
 pub(super) const NONE: u32 = u32::MAX;
 
-/// A border edge resists leaving its line as much as a triangle of this many times its length squared.
+/// A border edge resists leaving its line as much as a triangle of this many times its length
+/// squared.
 const BORDER_WEIGHT: f32 = 3.0;
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -151,7 +152,8 @@ impl Rings {
         }
     }
 
-    /// Computes the quadric of a vertex, with the planes through its border edges, perpendicular to their triangles.
+    /// Computes the quadric of a vertex, with the planes through its border edges, perpendicular to
+    /// their triangles.
     pub(super) fn measure_at(&mut self, v: u32) {
         let mut quadric = PlaneQuadric::default();
         let at = self.positions[v as usize];
@@ -200,8 +202,8 @@ impl Rings {
         }
     }
 
-    /// Compacts the arrays, keeping the order of the remaining vertices and triangles. Also returns which vertices
-    /// must not move: those of borders, and where the mesh is not a manifold.
+    /// Compacts the arrays, keeping the order of the remaining vertices and triangles. Also returns
+    /// which vertices must not move: those of borders, and where the mesh is not a manifold.
     pub(super) fn into_mesh(self) -> (Mesh, Vec<bool>) {
         let mut fixed = Vec::new();
         let mut number = vec![NONE; self.positions.len()];
@@ -227,8 +229,9 @@ pub(super) const BORDER: u8 = 1;
 /// Takes part in no collapse and does not move.
 pub(super) const FIXED: u8 = 2;
 
-/// Returns the flags of a vertex, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it, each from one neighbor
-/// to the next: one closed walk through all of them is the inside of a surface, one open walk its border.
+/// Returns the flags of a vertex, [`BORDER`] or [`FIXED`] or neither, by the sides opposite to it,
+/// each from one neighbor to the next: one closed walk through all of them is the inside of a
+/// surface, one open walk its border.
 pub(super) fn vertex_flags(sides: &mut [(u32, u32)]) -> u8 {
     sides.sort_unstable();
     let after = |w: u32| sides.binary_search_by_key(&w, |side| side.0).ok();

@@ -1,9 +1,11 @@
-//! Rounds of collapses and evaluations of the field: to a number of triangles, or to as few as an error allows.
+//! Rounds of collapses and evaluations of the field: to a number of triangles, or to as few as an
+//! error allows.
 //!
-//! Between two evaluations of the field a collapse is only believed to stray as far as its new vertex lies from
-//! the planes before it, added up. Each round may use what the measured error leaves at each vertex, and
-//! is measured: at corners, middles of edges and of triangles. A round that went too far is undone and
-//! repeated with a smaller part. A ball takes 2.2 to 2.4 times the fewest triangles that would do.
+//! Between two evaluations of the field a collapse is only believed to stray as far as its new
+//! vertex lies from the planes before it, added up. Each round may use what the measured error
+//! leaves at each vertex, and is measured: at corners, middles of edges and of triangles. A round
+//! that went too far is undone and repeated with a smaller part. A ball takes 2.2 to 2.4 times the
+//! fewest triangles that would do.
 
 use super::collapse::reduce;
 use super::rings::{FIXED, Rings};
@@ -16,7 +18,8 @@ use glam::Vec3;
 use tiface_base::Result;
 use tiface_base::geom::Mesh;
 
-/// Collapses edges down to the requested number of triangles, then moves the vertices onto the field's zero.
+/// Collapses edges down to the requested number of triangles, then moves the vertices onto the
+/// field's zero.
 pub(super) fn counted(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh> {
     let mut rings = prepare(mesh, report);
     reduce(&mut rings, task, task.config.triangles, None, report)?;
@@ -104,8 +107,8 @@ fn worst(errors: &[f32]) -> f32 {
     errors.iter().copied().fold(0.0, f32::max)
 }
 
-/// Returns for every vertex the largest distance to the surface at corners, middles of edges and middles of the
-/// triangles around it.
+/// Returns for every vertex the largest distance to the surface at corners, middles of edges and
+/// middles of the triangles around it.
 fn measure(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Vec<f32>> {
     let mut errors = vec![0.0f32; mesh.positions.len()];
     let Some(field) = task.field else { return Ok(errors) };

@@ -338,8 +338,8 @@ fn an_error_is_kept_with_and_without_a_field() {
         let report = simplify(&mut mesh, Some(&ball), &config, &Quiet).unwrap();
         let worst = off_ball(&mesh);
         assert!(worst <= 1.01 * error && (report.worst.unwrap() - worst).abs() < 1e-5, "{worst} {report:?}");
-        // An equilateral triangle of edge l on a ball of radius r strays by l²/(6 r) in its middle: the
-        // ball needs 4 π r² / (√3/4 · 6 r error) of them. Three times that is fair.
+        // An equilateral triangle of edge l on a ball of radius r strays by l²/(6 r) in its middle:
+        // the ball needs 4 π r² / (√3/4 · 6 r error) of them. Three times that is fair.
         let fair = (4.0 * std::f32::consts::PI * 0.49 / (0.433 * 6.0 * 0.7 * error)) as usize;
         assert!(report.after < 3 * fair && report.after < last, "{} {fair}", report.after);
         last = report.after;

@@ -1,13 +1,15 @@
-//! Vertices of a simplified mesh to the field's zero, or to where their triangles lie nearest to it.
+//! Vertices of a simplified mesh to the field's zero, or to where their triangles lie nearest to
+//! it.
 //!
 //! - Newton: `p −= f g / |g|²`, twice, each step cut at half the mean length of the vertex's edges.
-//! - Fit: with every vertex on the surface the triangles are chords, all on one side of a curve. Offsets
-//!   `δ` along the gradients minimize `∫ (d + Σ φᵢ δᵢ)²`, where `d` is the distance of the triangles to
-//!   the surface and `φ` the hat functions: `M δ = −∫ d φᵢ`, `M` the mass matrix of the mesh, solved by
-//!   conjugate gradients. That takes out three quarters of the error on a sphere.
+//! - Fit: with every vertex on the surface the triangles are chords, all on one side of a curve.
+//!   Offsets `δ` along the gradients minimize `∫ (d + Σ φᵢ δᵢ)²`, where `d` is the distance of the
+//!   triangles to the surface and `φ` the hat functions: `M δ = −∫ d φᵢ`, `M` the mass matrix of
+//!   the mesh, solved by conjugate gradients. That takes out three quarters of the error on a
+//!   sphere.
 //!
-//! A vertex whose move would turn a triangle or make it a sliver, as no collapse may, moves half the way, a quarter,
-//! or stays.
+//! A vertex whose move would turn a triangle or make it a sliver, as no collapse may, moves half
+//! the way, a quarter, or stays.
 
 use super::collapse::{MIN_QUALITY, MIN_TURN_COSINE};
 use super::crossing::crossings;
@@ -91,7 +93,8 @@ pub(super) fn project_to_field(
     Ok(())
 }
 
-/// Takes back the moves of triangles that meet others now and did not at `start`. Returns the number of vertices.
+/// Takes back the moves of triangles that meet others now and did not at `start`. Returns the
+/// number of vertices.
 fn without_crossings(positions: &mut [Vec3], triangles: &[[u32; 3]], start: &[Vec3]) -> usize {
     const TRIES: usize = 8;
     let mut old = None;
@@ -137,7 +140,8 @@ fn reaches(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<f32> {
     sums.iter().map(|&(sum, n)| if n > 0.0 { 0.5 * sum / n } else { 0.0 }).collect()
 }
 
-/// Moves vertices to `targets`, or part of the way. Returns the number of vertices that were held back.
+/// Moves vertices to `targets`, or part of the way. Returns the number of vertices that were held
+/// back.
 fn move_to(positions: &mut [Vec3], triangles: &[[u32; 3]], targets: &[Vec3]) -> usize {
     let at = |i: usize, p: Vec3, share: f32| match share {
         1.0 => targets[i],
@@ -153,8 +157,8 @@ fn move_to(positions: &mut [Vec3], triangles: &[[u32; 3]], targets: &[Vec3]) -> 
     move_vertices(positions, triangles, at, spoiled)
 }
 
-/// Offsets of all vertices along their normals that bring the triangles nearest to the surface, from the
-/// signed distances at the vertices and at the middles of the triangles.
+/// Offsets of all vertices along their normals that bring the triangles nearest to the surface,
+/// from the signed distances at the vertices and at the middles of the triangles.
 ///
 /// The rule `A (3/4 d(middle) + 1/12 Σ d(corner))` integrates quadratics exactly.
 fn offsets(positions: &[Vec3], triangles: &[[u32; 3]], at_vertices: &[f32], at_middles: &[f32]) -> Vec<f64> {

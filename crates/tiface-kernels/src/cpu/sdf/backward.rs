@@ -15,7 +15,8 @@ struct SdfBackwardTask<'a> {
     g_out: &'a [f32],
     g_value: Vec<&'a mut [[f32; 2]]>, // of each active level
     g_normal: &'a mut [[f32; 3]],     // [n, 3]
-    /// Gradients with respect to the matrices, in the shapes of [`Layout::gradient_shapes`](crate::cpu::mlp::Layout::gradient_shapes).
+    /// Gradients with respect to the matrices, in the shapes of
+    /// [`Layout::gradient_shapes`](crate::cpu::mlp::Layout::gradient_shapes).
     gradients: [Vec<f32>; 7],
 }
 
@@ -161,12 +162,13 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
 
 dispatch! { fn backward_task / backward_body(t: &mut SdfBackwardTask, a: &Activations, w: &Weights) }
 
-/// Adds the gradient of a loss with respect to the table to `g_table`, and returns that with respect to the network
-/// weights.
+/// Adds the gradient of a loss with respect to the table to `g_table`, and returns that with
+/// respect to the network weights.
 ///
 /// # Shapes
 ///
-/// - g_out: `[n, 8]`, the loss's gradient by the output (the last column is used only if the sharpness is local)
+/// - g_out: `[n, 8]`, the loss's gradient by the output (the last column is used only if the
+///   sharpness is local)
 /// - g_table: `[entries, 2]`, added to
 /// - output: `[P]`, flat as [`Layout`](crate::cpu::mlp::Layout) describes
 pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32; 2]]) -> Vec<f32> {

@@ -49,12 +49,14 @@ dispatch! {
     fn values_task / values_body(inputs: &Inputs, soften: f32, values: &mut [[f32; 2]], w: &Weights)
 }
 
-/// Returns the signed distances at points, `[n, 3]` → `[n]`, in a third of the time of [`super::forward`].
+/// Returns the signed distances at points, `[n, 3]` → `[n]`, in a third of the time of
+/// [`super::forward`].
 pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
     values_and_softness(shape, table, weights, x).into_iter().map(|[value, _]| value).collect()
 }
 
-/// Returns ln of the ratio of the local to the maximum sharpness at points, `[n, 3]` → `[n]`, in `-soften..=0`.
+/// Returns ln of the ratio of the local to the maximum sharpness at points, `[n, 3]` → `[n]`, in
+/// `-soften..=0`.
 pub fn softness(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
     values_and_softness(shape, table, weights, x).into_iter().map(|[_, soft]| soft).collect()
 }
@@ -157,11 +159,11 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
 
 dispatch! { fn color_task / color_body(task: &mut ColorTask, w: &Weights) }
 
-/// Returns colors of points whose unit normals are known, such as points of a mesh. Point `i` is viewed along
-/// `counts[i]` directions, or along one if `counts` is `None`.
+/// Returns colors of points whose unit normals are known, such as points of a mesh. Point `i` is
+/// viewed along `counts[i]` directions, or along one if `counts` is `None`.
 ///
-/// No gradient is computed, which takes a third of the time of [`super::forward`], and the geometry network is evaluated
-/// once per point.
+/// No gradient is computed, which takes a third of the time of [`super::forward`], and the geometry
+/// network is evaluated once per point.
 ///
 /// # Shapes
 ///

@@ -1,4 +1,5 @@
-//! Tests of the fused field against a model of its formulas in f64, and against the model's finite differences.
+//! Tests of the fused field against a model of its formulas in f64, and against the model's finite
+//! differences.
 
 use super::*;
 use crate::cpu::reference::sdf::field as model;
@@ -104,8 +105,8 @@ fn the_backward_agrees_with_f64_finite_differences_second_order_included() {
     }
 }
 
-/// Arguments of a backward pass: it returns the gradients by weights and table of a loss whose gradient by the output is
-/// `g_out`.
+/// Arguments of a backward pass: it returns the gradients by weights and table of a loss whose
+/// gradient by the output is `g_out`.
 pub(crate) struct BackwardCase<'a> {
     pub shape: &'a FieldShape,
     pub table: &'a [[f32; 2]],
@@ -115,7 +116,8 @@ pub(crate) struct BackwardCase<'a> {
     pub g_out: &'a [f32],
 }
 
-/// Asserts that worst and median relative errors of the gradients by a selection of parameters are small.
+/// Asserts that worst and median relative errors of the gradients by a selection of parameters are
+/// small.
 pub(crate) fn backward_agrees(
     color_skip: bool,
     gradients: impl FnOnce(BackwardCase) -> (Vec<f32>, Vec<[f32; 2]>),

@@ -22,7 +22,8 @@ fn cameras() -> Vec<Camera> {
     (0..6).map(at).chain([camera_from(DVec3::new(0.05, 0.0, 1.0))]).collect()
 }
 
-/// Returns the brightness of a texture of waves with lengths of four to twelve pixels in all directions.
+/// Returns the brightness of a texture of waves with lengths of four to twelve pixels in all
+/// directions.
 fn texture(seed: u64, p: Vec3) -> f32 {
     let wave = |i: u64| {
         let (angle, phase) = (TAU * rng::uniform(seed, 1, i), TAU * rng::uniform(seed, 2, i));
@@ -32,7 +33,8 @@ fn texture(seed: u64, p: Vec3) -> f32 {
     0.4 + 0.03 * (0..12).map(wave).sum::<f32>()
 }
 
-/// Renders photographs of `color` on the surface with the given height over (x, y), with noise, gain and offset.
+/// Renders photographs of `color` on the surface with the given height over (x, y), with noise,
+/// gain and offset.
 fn photographs(
     cameras: &[Camera],
     height: impl Fn(f32, f32) -> f32,
@@ -61,7 +63,8 @@ fn photographs(
     cameras.iter().enumerate().map(view).collect()
 }
 
-/// Returns surfels two pixels apart, `off` pixels above the plane, with normals that are tilted against it.
+/// Returns surfels two pixels apart, `off` pixels above the plane, with normals that are tilted
+/// against it.
 fn surfels(off: f32) -> Vec<Surfel> {
     let normal = Vec3::new(0.1, -0.08, 1.0).normalize();
     let at = |i: usize| Vec3::new((i % 15) as f32 * 0.04 - 0.28, (i / 15) as f32 * 0.04 - 0.28, off * 0.02);

@@ -43,7 +43,8 @@ impl DecoderShape {
         self.features * (1 + 2 * self.feature_frequencies) + 3 * (1 + 2 * self.view_frequencies)
     }
 
-    /// Returns the shapes `[out, in]` in storage order: B, W1, b1, W2, b2, W3, b3 (biases as `[n, 1]`), all row-major.
+    /// Returns the shapes `[out, in]` in storage order: B, W1, b1, W2, b2, W3, b3 (biases as
+    /// `[n, 1]`), all row-major.
     pub fn shapes(&self) -> [(usize, usize); 7] {
         let h = self.hidden;
         [(self.features, self.channels), (h, self.inputs()), (h, 1), (h, h), (h, 1), (3, h), (3, 1)]
@@ -59,7 +60,8 @@ impl DecoderShape {
         [self.hidden, self.channels, self.features, self.inputs()].map(|n| n.next_multiple_of(8))
     }
 
-    /// Returns the shapes in which tiles accumulate gradients: padded, with three color channels stored as four.
+    /// Returns the shapes in which tiles accumulate gradients: padded, with three color channels
+    /// stored as four.
     fn gradient_shapes(&self) -> [(usize, usize); 7] {
         let [h, products, features, inputs] = self.padded();
         [(features, products), (h, inputs), (h, 1), (h, h), (h, 1), (4, h), (3, 1)]
@@ -246,7 +248,8 @@ struct DecodeBackwardTask<'a> {
     gradients: [Vec<f32>; 7],
 }
 
-/// Sets `g` to zero where the activation `h` is not positive (the relu's gradient), and adds the column sums to `bias`.
+/// Sets `g` to zero where the activation `h` is not positive (the relu's gradient), and adds the
+/// column sums to `bias`.
 #[inline(always)]
 fn relu_backward(g: &mut [f32], h: &[f32], bias: &mut [f32]) {
     for (g, h) in g.chunks_exact_mut(bias.len()).zip(h.chunks_exact(bias.len())) {
@@ -329,8 +332,8 @@ fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) 
 
 dispatch! { fn backward_task / backward_body(t: &mut DecodeBackwardTask, w: &DecoderWeights) }
 
-/// Adds the gradient with respect to the appearance grid to `g_values`, and returns that with respect to the flat
-/// weights.
+/// Adds the gradient with respect to the appearance grid to `g_values`, and returns that with
+/// respect to the flat weights.
 pub(super) fn decode_backward(
     grid: &Grid,
     w: &DecoderWeights,

@@ -1,4 +1,5 @@
-//! A small field that is defined by formulas. Its expected values were computed by independent code.
+//! A small field that is defined by formulas. Its expected values were computed by independent
+//! code.
 
 use super::mask::Lattice;
 use super::*;

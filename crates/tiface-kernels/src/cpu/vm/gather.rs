@@ -15,7 +15,8 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// Returns the cell of a point with coordinates 0..=1 along each axis of the box; outer vertices are at 0 and 1.
+    /// Returns the cell of a point with coordinates 0..=1 along each axis of the box; outer
+    /// vertices are at 0 and 1.
     #[inline(always)]
     pub fn new(size: [usize; 3], unit: [f32; 3]) -> Cell {
         let mut cell = Cell::default();
@@ -141,7 +142,8 @@ impl<'a> Lookup<'a> {
         total
     }
 
-    /// Writes plane and line values of all channels, term by term. Both slices are `[channels]` or longer.
+    /// Writes plane and line values of all channels, term by term. Both slices are `[channels]` or
+    /// longer.
     #[inline(always)]
     pub fn factors<const F: bool>(&self, cell: &Cell, planes: &mut [f32], lines: &mut [f32]) {
         let mut first = 0;
@@ -182,7 +184,8 @@ struct ScatterBand<'a> {
     first: usize,
     width: usize,
     values: &'a mut [f32],
-    /// Samples that contribute to this part of a plane, in increasing order; of a line, none are listed, since all do.
+    /// Samples that contribute to this part of a plane, in increasing order; of a line, none are
+    /// listed, since all do.
     samples: Vec<u32>,
 }
 
@@ -245,11 +248,12 @@ fn band_body<const F: bool>(band: &mut ScatterBand, gradients: &FactorGradients)
 
 dispatch! { fn scatter_band / band_body(band: &mut ScatterBand, gradients: &FactorGradients) }
 
-/// Number of bands of a plane. It is fixed, so that the order of sums does not depend on the number of threads.
+/// Number of bands of a plane. It is fixed, so that the order of sums does not depend on the number
+/// of threads.
 const BANDS: usize = 6;
 
-/// Adds the gradients of all samples to `gradient`, which is laid out as `grid`. Every vertex is summed in the order of
-/// the samples, for any number of threads.
+/// Adds the gradients of all samples to `gradient`, which is laid out as `grid`. Every vertex is
+/// summed in the order of the samples, for any number of threads.
 pub(super) fn scatter(grid: &Grid, gradients: &FactorGradients, gradient: &mut [f32]) {
     assert_eq!(gradient.len(), grid.len());
     let mut bands = Vec::new();

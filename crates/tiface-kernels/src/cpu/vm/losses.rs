@@ -1,7 +1,7 @@
 //! The training loss of TensoRF's field and its gradients.
 //!
-//! With `C` and `O` a ray's color and opacity, `h` and `a` color (over black) and alpha of its pixel, `b` the
-//! background of both, and means over the rays:
+//! With `C` and `O` a ray's color and opacity, `h` and `a` color (over black) and alpha of its
+//! pixel, `b` the background of both, and means over the rays:
 //!
 //! ```text
 //! ⟨(clamp(C + (1 − O) b) − h − (1 − a) b)²⟩
@@ -22,7 +22,8 @@ pub enum MaskTerm {
     None,
     /// Squared opacity of background rays, with a weight.
     L2(f32),
-    /// Cross entropy of opacity and mask, with a weight; every pixel with an alpha above 0 counts as head.
+    /// Cross entropy of opacity and mask, with a weight; every pixel with an alpha above 0 counts
+    /// as head.
     Ce(f32),
 }
 
@@ -46,8 +47,9 @@ pub struct Targets<'a> {
     pub background: &'a [[f32; 3]],
 }
 
-/// Returns the unweighted loss terms, and the gradient of the loss with respect to `composed`, `[rays, 5]`. The squared
-/// opacity of the background is 0 in a batch without background rays, where the published mean is NaN.
+/// Returns the unweighted loss terms, and the gradient of the loss with respect to `composed`,
+/// `[rays, 5]`. The squared opacity of the background is 0 in a batch without background rays,
+/// where the published mean is NaN.
 ///
 /// # Shapes
 ///
@@ -105,7 +107,8 @@ pub fn of_rays(
 /// Results of training steps since the last report.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct VmFigures {
-    /// Sums over the steps of the unweighted squared error, mask term and squared opacity of the background.
+    /// Sums over the steps of the unweighted squared error, mask term and squared opacity of the
+    /// background.
     pub terms: [f32; TERMS],
     /// Number of lattice points inside the box, including those that the mask skips.
     pub lattice: u64,

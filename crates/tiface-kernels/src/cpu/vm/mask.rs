@@ -1,14 +1,15 @@
 //! The occupied cells of a box, and marching through them on a fixed lattice of steps.
 //!
-//! TensoRF's alpha mask (Chen et al. 2022, §4.3; `alphaMask` of the published code) marks vertices and is
-//! looked up trilinearly: a point is kept if any vertex around it is marked. A cell is therefore either kept
-//! as a whole or empty, so cells are stored here, and a ray skips empty ones *before* the field is evaluated. Sample
-//! positions `t = entry + step · (k + jitter)` do not depend on the mask.
+//! TensoRF's alpha mask (Chen et al. 2022, §4.3; `alphaMask` of the published code) marks vertices
+//! and is looked up trilinearly: a point is kept if any vertex around it is marked. A cell is
+//! therefore either kept as a whole or empty, so cells are stored here, and a ray skips empty ones
+//! *before* the field is evaluated. Sample positions `t = entry + step · (k + jitter)` do not
+//! depend on the mask.
 
 use crate::cpu::march::{BLOCK, MarchRay};
 
-/// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`. A second bitmask holds
-/// the blocks with an occupied cell, so that rays can skip empty blocks.
+/// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`. A
+/// second bitmask holds the blocks with an occupied cell, so that rays can skip empty blocks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BoxMask {
     min: [f32; 3],
@@ -43,7 +44,8 @@ impl BoxMask {
         BoxMask::from_bits(min, max, size, bits).expect("a bit for each cell")
     }
 
-    /// Creates a mask from its bits, as [`BoxMask::bits`] returns them; `None` if their number does not fit the cells.
+    /// Creates a mask from its bits, as [`BoxMask::bits`] returns them; `None` if their number does
+    /// not fit the cells.
     pub fn from_bits(min: [f32; 3], max: [f32; 3], size: [usize; 3], bits: Vec<u64>) -> Option<BoxMask> {
         let count = size.iter().try_fold(1usize, |n, &s| n.checked_mul(s))?;
         if bits.len() != count.div_ceil(64) {
@@ -58,12 +60,13 @@ impl BoxMask {
         Some(BoxMask { min, max, size, bits, blocks })
     }
 
-    /// Creates a mask from marked vertices: a cell is occupied if one of its eight corners is marked. Vertex `(x, y, z)`
-    /// has index `(x · ny + y) · nz + z`; each axis has at least 2, and the outer ones lie on the border of
-    /// `min..max`.
+    /// Creates a mask from marked vertices: a cell is occupied if one of its eight corners is
+    /// marked. Vertex `(x, y, z)` has index `(x · ny + y) · nz + z`; each axis has at least 2, and
+    /// the outer ones lie on the border of `min..max`.
     ///
-    /// The cells extend beyond the vertices by one on every side. The published lookup pads with zeros, so a vertex on the
-    /// border still contributes to points that lie less than a cell outside.
+    /// The cells extend beyond the vertices by one on every side. The published lookup pads with
+    /// zeros, so a vertex on the border still contributes to points that lie less than a cell
+    /// outside.
     pub fn from_vertices(min: [f32; 3], max: [f32; 3], size: [usize; 3], vertices: &[bool]) -> BoxMask {
         assert_eq!(vertices.len(), size.iter().product::<usize>());
         let unit: [f32; 3] = std::array::from_fn(|a| (max[a] - min[a]) / (size[a] - 1) as f32);
@@ -97,7 +100,8 @@ impl BoxMask {
         &self.bits
     }
 
-    /// Returns one bit per block of 8³ cells, set if the block contains an occupied cell, in the order of cells.
+    /// Returns one bit per block of 8³ cells, set if the block contains an occupied cell, in the
+    /// order of cells.
     #[cfg(feature = "wgpu")]
     pub fn blocks(&self) -> &[u64] {
         &self.blocks
@@ -143,7 +147,8 @@ pub struct Lattice {
 }
 
 impl Lattice {
-    /// Returns the number of lattice points of a ray inside the box, which a renderer without a mask evaluates.
+    /// Returns the number of lattice points of a ray inside the box, which a renderer without a
+    /// mask evaluates.
     pub fn points(&self, ray: &MarchRay) -> u64 {
         match self.crossing(ray) {
             Some((enter, leave)) => {
@@ -163,8 +168,8 @@ impl Lattice {
     }
 }
 
-/// Returns `t` where a line enters and leaves a box; the first is greater than the second if the line misses. Zero
-/// components of the direction are replaced by 1e-6, as in the published code.
+/// Returns `t` where a line enters and leaves a box; the first is greater than the second if the
+/// line misses. Zero components of the direction are replaced by 1e-6, as in the published code.
 #[inline(always)]
 pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3]) -> (f32, f32) {
     let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
@@ -179,8 +184,8 @@ pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3
 
 /// Walks over the lattice points of a ray inside the box and inside a mask.
 ///
-/// This is a state rather than a closure, because a closure would be compiled without the vector instructions of the
-/// kernel that calls it.
+/// This is a state rather than a closure, because a closure would be compiled without the vector
+/// instructions of the kernel that calls it.
 pub struct Walk<'a> {
     lattice: &'a Lattice,
     mask: Option<&'a BoxMask>,
@@ -198,7 +203,8 @@ pub struct Walk<'a> {
 }
 
 impl<'a> Walk<'a> {
-    /// Creates a walk that starts before the first lattice point; it has no points if the ray misses the box.
+    /// Creates a walk that starts before the first lattice point; it has no points if the ray
+    /// misses the box.
     #[inline(always)]
     pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &MarchRay) -> Walk<'a> {
         let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
@@ -260,7 +266,8 @@ impl<'a> Walk<'a> {
                 self.k += 1;
                 return Some(t);
             }
-            // skip to the border of the empty cell, or of its block if that is empty too, by a whole number of steps
+            // skip to the border of the empty cell, or of its block if that is empty too, by a
+            // whole number of steps
             let block = [c[0] / BLOCK, c[1] / BLOCK, c[2] / BLOCK];
             let at = (block[0] * self.blocks[1] + block[1]) * self.blocks[2] + block[2];
             let empty = !bit(&mask.blocks, at);

@@ -23,8 +23,8 @@ struct RowsTask<'a> {
     k: [f32; 2],
 }
 
-/// Adds the gradient of TV: k (x − neighbor) for every neighbor, where `k` includes the factor 2 of the square's
-/// derivative.
+/// Adds the gradient of TV: k (x − neighbor) for every neighbor, where `k` includes the factor 2 of
+/// the square's derivative.
 #[inline(always)]
 fn rows_body<const F: bool>(task: &mut RowsTask) {
     let (pitch, n) = (task.factor.width * task.factor.channels, task.factor.channels);
@@ -55,13 +55,15 @@ fn rows_body<const F: bool>(task: &mut RowsTask) {
 
 dispatch! { fn penalize_rows / rows_body(task: &mut RowsTask) }
 
-/// Returns the factors of the sums of squared differences along height and width in the formula: 2 / count.
+/// Returns the factors of the sums of squared differences along height and width in the formula: 2
+/// / count.
 pub(crate) fn tv_factors(f: &Factor) -> [f64; 2] {
     let (h, w, c) = (f.height as f64, f.width as f64, f.channels.max(1) as f64);
     [2.0 / (c * (h - 1.0) * w), 2.0 / (c * h * (w - 1.0))]
 }
 
-/// Adds the gradient of the planes' total variation, times `weight`, to `gradient`. Both slices are laid out as `grid`.
+/// Adds the gradient of the planes' total variation, times `weight`, to `gradient`. Both slices are
+/// laid out as `grid`.
 pub fn penalize(grid: &Grid, weight: f32, values: &[f32], gradient: &mut [f32]) {
     const ROWS: usize = 16;
     assert!(values.len() == grid.len() && gradient.len() == grid.len());

@@ -6,7 +6,8 @@
 //! C = Σ w_k c_k  over w_k > threshold     opacity = Σ w_k              depth = Σ w_k t_k
 //! ```
 //!
-//! A ray is marched, evaluated and composited in one pass, so it can end where its transmittance is used up.
+//! A ray is marched, evaluated and composited in one pass, so it can end where its transmittance is
+//! used up.
 
 use super::decoder::{self, Decoded, DecoderWeights};
 use super::gather::{self, Cell, FactorGradients, Lookup};
@@ -254,9 +255,9 @@ dispatch! {
     )
 }
 
-/// Computes the gradients of a rendered batch: adds those with respect to the grids to `g_density` and `g_color`, and
-/// returns those with respect to the decoder's flat weights. `g` is the gradient with respect to [`Rendered::out`],
-/// `[rays, 5]`.
+/// Computes the gradients of a rendered batch: adds those with respect to the grids to `g_density`
+/// and `g_color`, and returns those with respect to the decoder's flat weights. `g` is the gradient
+/// with respect to [`Rendered::out`], `[rays, 5]`.
 pub fn backward(
     field: &VmField,
     density: &[f32],

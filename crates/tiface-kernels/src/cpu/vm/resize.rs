@@ -3,8 +3,9 @@
 use super::{Factor, Grid, LINE_AXIS, PLANE_AXES};
 use rayon::prelude::*;
 
-/// Returns planes and lines, resampled to another number of vertices over the same box: interpolation is linear and
-/// corners keep their values (torch's `interpolate` with `align_corners`).
+/// Returns planes and lines, resampled to another number of vertices over the same box:
+/// interpolation is linear and corners keep their values (torch's `interpolate` with
+/// `align_corners`).
 pub fn resized(from: &Grid, values: &[f32], to: &Grid) -> Vec<f32> {
     assert!(values.len() == from.len() && from.rank == to.rank);
     let mut out = vec![0f32; to.len()];
@@ -14,8 +15,8 @@ pub fn resized(from: &Grid, values: &[f32], to: &Grid) -> Vec<f32> {
     out
 }
 
-/// Returns the position of vertex `i` of `to` vertices among `from` vertices: the index of the vertex below, and the
-/// fraction of the way to the next.
+/// Returns the position of vertex `i` of `to` vertices among `from` vertices: the index of the
+/// vertex below, and the fraction of the way to the next.
 fn interpolation(i: usize, from: usize, to: usize) -> (usize, f32) {
     if from < 2 || to < 2 {
         return (0, 0.0);

@@ -252,7 +252,8 @@ fn vertices_occupy_the_cells_around_them() {
     let mut vertices = vec![false; 4 * 5 * 6];
     vertices[(2 * 5 + 1) * 6 + 5] = true;
     let mask = BoxMask::from_vertices([0.0; 3], [3.0, 4.0, 5.0], [4, 5, 6], &vertices);
-    // vertex (2, 1, 5) occupies all cells less than one away along every axis, also outside the border
+    // vertex (2, 1, 5) occupies all cells less than one away along every axis, also outside the
+    // border
     for (p, inside) in
         [([1.5, 0.5, 4.5], true), ([2.9, 1.9, 5.9], true), ([0.9, 1.0, 5.0], false), ([2.0, 1.0, 3.9], false)]
     {

@@ -18,7 +18,8 @@ fn tally(mask: &[u32], counts: &mut [u32]) {
     }
 }
 
-/// Returns the cell of draw `k`, or `u32::MAX` if the draw does not exist: see [`update_nerfacc`](crate::cpu::occupancy::update_nerfacc).
+/// Returns the cell of draw `k`, or `u32::MAX` if the draw does not exist: see
+/// [`update_nerfacc`](crate::cpu::occupancy::update_nerfacc).
 #[cube]
 fn drawn_cell(
     mask: &[u32],
@@ -47,7 +48,8 @@ fn drawn_cell(
     cell
 }
 
-/// Writes the number of the last draw of each cell, counted from 1, so that only one draw updates a cell.
+/// Writes the number of the last draw of each cell, counted from 1, so that only one draw updates a
+/// cell.
 #[cube(launch)]
 fn find_last_draws(
     mask: &[u32],
@@ -161,7 +163,8 @@ fn update_threshold(sums: &[f32], threshold: &mut [f32], cells: u32, max_thresho
     }
 }
 
-/// Writes the mask of cells whose history is above the threshold, `[1]`; each thread handles 32 cells.
+/// Writes the mask of cells whose history is above the threshold, `[1]`; each thread handles 32
+/// cells.
 #[cube(launch)]
 fn update_mask(history: &[f32], threshold: &[f32], last: &mut [u32], mask: &mut [u32]) {
     let word = ABSOLUTE_POS;
@@ -202,8 +205,9 @@ pub struct Nerfacc {
 }
 
 impl Nerfacc {
-    /// Creates the rule from the history of the cells, `[cells]`. A cell is occupied if its history is above `threshold`, or
-    /// above the mean if that is less. `capacity` is the number of cells that are evaluated in one batch.
+    /// Creates the rule from the history of the cells, `[cells]`. A cell is occupied if its history
+    /// is above `threshold`, or above the mean if that is less. `capacity` is the number of cells
+    /// that are evaluated in one batch.
     pub fn new(
         device: &Device,
         occupancy: &Occupancy,
@@ -232,8 +236,9 @@ impl Nerfacc {
         device.fetch(&self.history)
     }
 
-    /// Updates the mask before step `n`. Positions of cells are written to `x`, planes `[3, capacity]`; `opacity` gets the
-    /// number of positions, `[1]` or more, and returns their opacities, `[capacity]`, and a factor for them.
+    /// Updates the mask before step `n`. Positions of cells are written to `x`, planes
+    /// `[3, capacity]`; `opacity` gets the number of positions, `[1]` or more, and returns their
+    /// opacities, `[capacity]`, and a factor for them.
     pub fn update<'a>(
         &self,
         device: &Device,

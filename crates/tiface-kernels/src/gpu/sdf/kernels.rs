@@ -1,5 +1,5 @@
-//! Kernels of the signed-distance field: preparation of the weights, the forward pass, and the backward pass of the geometry
-//! network.
+//! Kernels of the signed-distance field: preparation of the weights, the forward pass, and the
+//! backward pass of the geometry network.
 
 use super::super::color::{color_forward, color_inputs, unit};
 use super::super::device::{Buffer, Device, Words, groups, launch};
@@ -119,8 +119,8 @@ fn geometry_inputs(
     }
 }
 
-/// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and the activations that the backward pass needs.
-/// If `given` is set, `normals` replace ∇sdf.
+/// Writes sdf, ∇sdf, color and local sharpness, planes `[8, capacity]`, and the activations that
+/// the backward pass needs. If `given` is set, `normals` replace ∇sdf.
 #[cube(launch_unchecked)]
 pub(super) fn forward(
     w: &[F4],
@@ -218,8 +218,9 @@ pub(super) fn forward(
     }
 }
 
-/// Backward pass of the geometry network, with first and second order. Writes the gradients with respect to the features
-/// of each sample, and partial sums by group of those with respect to the weights.
+/// Backward pass of the geometry network, with first and second order. Writes the gradients with
+/// respect to the features of each sample, and partial sums by group of those with respect to the
+/// weights.
 #[cube(launch_unchecked)]
 pub(super) fn geometry_backward(
     w: &[F4],

@@ -24,7 +24,8 @@ fn the_published_field_and_its_gradients_are_those_of_the_cpu() {
     agrees_with_the_cpu((16, false, 16), devices());
 }
 
-/// Compares a field with so many levels, with or without the color skip, of which so many levels are active.
+/// Compares a field with so many levels, with or without the color skip, of which so many levels
+/// are active.
 fn agrees_with_the_cpu((levels, skip, active): (usize, bool, usize), devices: Vec<Device>) {
     let Case { shape, table, flat, x, direction, g_out } = case(levels, skip, active);
     let weights = Weights::new(shape.layout(), &flat);

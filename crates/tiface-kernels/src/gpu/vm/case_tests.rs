@@ -32,9 +32,9 @@ pub(super) struct Shape {
     pub masked: bool,
 }
 
-/// Hidden layers of one tile and inputs of two, ranks of whole vectors: those of the preset `draft`,
-/// with which T-Face's tests share the compiled kernels. A driver in software takes seconds for each
-/// further shape.
+/// Hidden layers of one tile and inputs of two, ranks of whole vectors: those of the preset
+/// `draft`, with which T-Face's tests share the compiled kernels. A driver in software takes
+/// seconds for each further shape.
 pub(super) const NARROW: Shape = Shape {
     softplus: false,
     hidden: 64,

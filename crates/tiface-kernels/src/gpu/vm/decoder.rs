@@ -1,6 +1,7 @@
 //! The color decoder of [`crate::cpu::vm`] without encodings, like the published one.
 //!
-//! Only two matrices lie between the products and the first activation; here they are merged into one:
+//! Only two matrices lie between the products and the first activation; here they are merged into
+//! one:
 //!
 //! ```text
 //! M = W1_features B     h1 = relu(M products + W1_direction d + b1)
@@ -8,9 +9,10 @@
 //! g_B = W1_featuresᵀ g_M     g_W1_features = g_M Bᵀ
 //! ```
 //!
-//! A group of 256 threads evaluates all layers for 64 samples, or for 32 if hidden layers are wider than 64. The backward
-//! pass recomputes the activations, which costs less than storing and loading them. Gradients of weights are summed by
-//! group, in registers over its tiles, then over the groups in a fixed order.
+//! A group of 256 threads evaluates all layers for 64 samples, or for 32 if hidden layers are wider
+//! than 64. The backward pass recomputes the activations, which costs less than storing and loading
+//! them. Gradients of weights are summed by group, in registers over its tiles, then over the
+//! groups in a fixed order.
 
 mod kernels;
 
@@ -24,14 +26,16 @@ use super::rays::CompositedRays;
 use crate::cpu::vm::DecoderShape;
 use kernels::{backward, chain, forward, prepare};
 
-/// Maximum number of groups that sum gradients of weights, each over its own tiles. A thread keeps 50 to 200 sums in
-/// registers, which then suffice for one or two groups on a multiprocessor, and the largest cards have some 150.
+/// Maximum number of groups that sum gradients of weights, each over its own tiles. A thread keeps
+/// 50 to 200 sums in registers, which then suffice for one or two groups on a multiprocessor, and
+/// the largest cards have some 150.
 const GROUPS: usize = 256;
 
 /// Maximum number of groups that decode colors.
 const DECODING: usize = 4096;
 
-/// Sizes and offsets of the matrices of a decoder, in rows with as many floats as a tile has channels.
+/// Sizes and offsets of the matrices of a decoder, in rows with as many floats as a tile has
+/// channels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct DecoderPlan {
     /// Number of vectors of four channels of each term.
@@ -70,16 +74,16 @@ impl DecoderPlan {
         self.inputs().div_ceil(self.width())
     }
 
-    /// Returns the first rows of `[M, W1_direction]ᵀ`, b1, W2ᵀ, b2, W3, b3, `[M, W1_direction]` (one piece after the
-    /// other), W2, and the end.
+    /// Returns the first rows of `[M, W1_direction]ᵀ`, b1, W2ᵀ, b2, W3, b3, `[M, W1_direction]`
+    /// (one piece after the other), W2, and the end.
     fn rows(&self) -> [usize; 9] {
         let w = self.width();
         let counts = [self.inputs(), 1, w, 1, 3, 1, self.pieces() * w, w];
         std::array::from_fn(|i| counts[..i].iter().sum())
     }
 
-    /// Returns the first rows of the gradients of `[M, W1_direction]` (one piece after the other), b1, W2,
-    /// b2, W3, b3, and the end.
+    /// Returns the first rows of the gradients of `[M, W1_direction]` (one piece after the other),
+    /// b1, W2, b2, W3, b3, and the end.
     fn gradients(&self) -> [usize; 7] {
         let w = self.width();
         let counts = [self.pieces() * w, 1, w, 1, 3, 1];
@@ -135,15 +139,16 @@ impl DeviceDecoder {
         if shape.hidden > 128 { Err("hidden layers wider than 128") } else { Ok(()) }
     }
 
-    /// Returns the memory of the gradients of products and weights in words, for up to `capacity` samples.
+    /// Returns the memory of the gradients of products and weights in words, for up to `capacity`
+    /// samples.
     pub fn words_of_gradients(shape: &DecoderShape, quads: [usize; 3], capacity: usize) -> usize {
         let plan = DecoderPlan::new(shape, quads);
         let chunk = capacity.min(Self::CHUNK);
         chunk * 4 * plan.products() + (plan.groups(chunk) + 1) * plan.gradients()[6] * plan.width()
     }
 
-    /// Creates a decoder of the products of a grid, for up to `capacity` samples; buffers for gradients are allocated only if
-    /// `learns` is set.
+    /// Creates a decoder of the products of a grid, for up to `capacity` samples; buffers for
+    /// gradients are allocated only if `learns` is set.
     pub fn new(
         device: &Device,
         shape: &DecoderShape,
@@ -197,7 +202,8 @@ impl DeviceDecoder {
     ) {
         assert!(composited.index.word_count() == self.capacity && values.word_count() == grid.len());
         let tiles = self.capacity.div_ceil(4 * self.plan.lanes);
-        // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
+        // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches
+        // beyond it.
         unsafe {
             launch!(device, forward::launch_unchecked, groups(tiles.min(DECODING)), UNITS;
                 self.weights, values, grid.sizes(), samples.place, samples.ray, rays.direction,
@@ -207,8 +213,8 @@ impl DeviceDecoder {
         }
     }
 
-    /// Adds the gradient with respect to planes and lines, and writes that with respect to the flat weights. Sets `non_finite`,
-    /// `[1]`, to 1 if a value of the latter is not finite.
+    /// Adds the gradient with respect to planes and lines, and writes that with respect to the flat
+    /// weights. Sets `non_finite`, `[1]`, to 1 if a value of the latter is not finite.
     pub fn backward(
         &self,
         device: &Device,
@@ -224,7 +230,8 @@ impl DeviceDecoder {
     ) {
         assert!(composited.index.word_count() == self.capacity && values.word_count() == grid.len());
         for from in (0..self.capacity).step_by(self.chunk) {
-            // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile reaches beyond it.
+            // SAFETY: all planes have `capacity` samples, a multiple of a tile's, and no tile
+            // reaches beyond it.
             unsafe {
                 launch!(device, backward::launch_unchecked, groups(self.summing()), UNITS;
                     self.weights, values, grid.sizes(), samples.place, samples.ray, rays.direction,

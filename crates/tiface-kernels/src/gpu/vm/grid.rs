@@ -15,7 +15,8 @@ const GROUPS: usize = 4096;
 /// Number of groups that compute the bound on fixed-point sums.
 const BOUNDING: usize = 64;
 
-/// Offsets in the words of a grid: number of vertices (3), first vector of each plane (3) and of each line (3).
+/// Offsets in the words of a grid: number of vertices (3), first vector of each plane (3) and of
+/// each line (3).
 const PLANES: usize = 3;
 const LINES: usize = 6;
 
@@ -116,7 +117,8 @@ fn remaining(count: &[u32], from: u32, limit: u32) -> usize {
     min(max(count[0], from) - from, limit) as usize
 }
 
-/// Adds gradients of samples to planes and lines. Each thread handles one channel of a sample at a time.
+/// Adds gradients of samples to planes and lines. Each thread handles one channel of a sample at a
+/// time.
 #[cube(launch)]
 fn scatter<S: Sum>(
     gradient: &[Atomic<S::Word>],
@@ -183,8 +185,8 @@ fn reduced(shared: &mut [f32], value: f32, #[comptime] largest: bool) -> f32 {
     result
 }
 
-/// Writes for each group the sum of its samples' largest gradients, and the largest value of its part of planes and of
-/// lines.
+/// Writes for each group the sum of its samples' largest gradients, and the largest value of its
+/// part of planes and of lines.
 #[cube(launch)]
 fn bound(
     values: &[f32],
@@ -226,8 +228,8 @@ fn bound(
     }
 }
 
-/// Writes the scale of the fixed-point sums, the number of integer steps per 1: of planes, whose gradients are multiplied
-/// by lines, and of lines.
+/// Writes the scale of the fixed-point sums, the number of integer steps per 1: of planes, whose
+/// gradients are multiplied by lines, and of lines.
 #[cube(launch)]
 fn fixed_point_scales(partial: &[f32], units: &mut [f32]) {
     if ABSOLUTE_POS == 0 {
@@ -245,7 +247,8 @@ fn fixed_point_scales(partial: &[f32], units: &mut [f32]) {
     }
 }
 
-/// Adds the fixed-point sums as floats to the gradient and resets them to zero, if the step had samples from `from` on.
+/// Adds the fixed-point sums as floats to the gradient and resets them to zero, if the step had
+/// samples from `from` on.
 #[cube(launch)]
 fn flush_fixed_point(
     fixed_sums: &mut [i32],
@@ -263,8 +266,8 @@ fn flush_fixed_point(
     }
 }
 
-/// Adds the gradient of the planes' total variation; `factors` are those of the rows (3) and columns (3) of
-/// each plane.
+/// Adds the gradient of the planes' total variation; `factors` are those of the rows (3) and
+/// columns (3) of each plane.
 #[cube(launch)]
 fn penalize(
     values: &[f32],
@@ -308,8 +311,8 @@ fn penalize(
     }
 }
 
-/// Layout of a grid's planes and lines on a device. The channels of each term are padded to vectors of four; padding stays
-/// zero.
+/// Layout of a grid's planes and lines on a device. The channels of each term are padded to vectors
+/// of four; padding stays zero.
 pub struct DeviceGrid {
     grid: Grid,
     padded: Grid,
@@ -386,7 +389,8 @@ impl DeviceGrid {
         planes.chain((0..3).map(move |i| (a.line(i), b.line(i))))
     }
 
-    /// Converts planes and lines from the layout of the CPU to that of the device, with zeros as padding.
+    /// Converts planes and lines from the layout of the CPU to that of the device, with zeros as
+    /// padding.
     pub fn pad(&self, values: Vec<f32>) -> Vec<f32> {
         assert_eq!(values.len(), self.grid.len());
         if self.grid == self.padded {
@@ -418,8 +422,8 @@ impl DeviceGrid {
         device.upload(&self.pad(values.to_vec()))
     }
 
-    /// Writes the features of samples, `[capacity]`: the sum over terms and channels. place: planes `[3, capacity]`, in
-    /// units of vertices.
+    /// Writes the features of samples, `[capacity]`: the sum over terms and channels. place: planes
+    /// `[3, capacity]`, in units of vertices.
     pub fn gather(&self, device: &Device, values: &Buffer, place: &Buffer, count: &Buffer, feature: &Buffer) {
         assert!(values.word_count() == self.len() && place.word_count() == 3 * feature.word_count());
         let groups = groups(feature.word_count().div_ceil(UNITS as usize).min(GROUPS));
@@ -428,9 +432,9 @@ impl DeviceGrid {
         );
     }
 
-    /// Adds the gradients of samples to `gradient`. Without `index`, `g` is `[capacity]`, with respect to the features of
-    /// [`DeviceGrid::gather`]. With it, `g` is `[limit, channels]`, with respect to the products of plane and line of samples
-    /// `index[from..from + limit]`.
+    /// Adds the gradients of samples to `gradient`. Without `index`, `g` is `[capacity]`, with
+    /// respect to the features of [`DeviceGrid::gather`]. With it, `g` is `[limit, channels]`, with
+    /// respect to the products of plane and line of samples `index[from..from + limit]`.
     pub fn scatter(
         &self,
         device: &Device,

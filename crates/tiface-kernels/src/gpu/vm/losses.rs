@@ -16,8 +16,8 @@ const UNITS: u32 = 256;
 /// samples, rays, whether a gradient was not finite.
 const TOTALS: usize = TERMS + 5;
 
-/// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the composited values, planes
-/// `[5, rays]`.
+/// Writes the loss terms of rays, planes `[3, rays]`, and the gradients with respect to the
+/// composited values, planes `[5, rays]`.
 #[cube(launch)]
 fn of_rays(
     composed: &[f32],
@@ -74,7 +74,8 @@ fn of_rays(
     }
 }
 
-/// Adds the results of a step to the totals, with one group of threads for each loss term, and one for all counts.
+/// Adds the results of a step to the totals, with one group of threads for each loss term, and one
+/// for all counts.
 #[cube(launch)]
 fn add(
     terms: &[f32],
@@ -133,8 +134,8 @@ impl VmLosses {
         }
     }
 
-    /// Computes the losses of rays, and returns the gradients with respect to the output of [`Vm::render`], planes
-    /// `[5, rays]`.
+    /// Computes the losses of rays, and returns the gradients with respect to the output of
+    /// [`Vm::render`], planes `[5, rays]`.
     pub fn of_rays(
         &self,
         device: &Device,
@@ -157,7 +158,8 @@ impl VmLosses {
         &self.g_out
     }
 
-    /// Returns the gradients of the last call of [`of_rays`](VmLosses::of_rays), planes `[5, rays]`.
+    /// Returns the gradients of the last call of [`of_rays`](VmLosses::of_rays), planes
+    /// `[5, rays]`.
     pub fn gradient(&self) -> &Buffer {
         &self.g_out
     }

@@ -12,18 +12,20 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 256;
 
-/// Offsets in the floats of a lattice: box (6), step, near, far; corner of the mask (3), its cells per unit of length (3).
+/// Offsets in the floats of a lattice: box (6), step, near, far; corner of the mask (3), its cells
+/// per unit of length (3).
 const STEP: usize = 6;
 const MASK: usize = 9;
 const SCALE: usize = 12;
 
-/// Offsets in the integers of a lattice: samples of a ray; vertices (3); cells of the mask (3); blocks (3).
+/// Offsets in the integers of a lattice: samples of a ray; vertices (3); cells of the mask (3);
+/// blocks (3).
 const VERTICES: usize = 1;
 const CELLS: usize = 4;
 const BLOCKS: usize = 7;
 
-/// Intersects the interval with the extent of the box along one axis. A zero component of the direction is replaced by
-/// 1e-6, as in the published code.
+/// Intersects the interval with the extent of the box along one axis. A zero component of the
+/// direction is replaced by 1e-6, as in the published code.
 #[cube]
 fn crossed(span: Span, o: f32, d: f32, low: f32, high: f32) -> Span {
     let d = select(d == 0.0f32, 1e-6f32, d);
@@ -135,8 +137,8 @@ fn pass(
                     let (cx, cy, cz) = (cell(g.x, nx), cell(g.y, ny), cell(g.z, nz));
                     if !bit(bits, (cx * ny + cy) * nz + cz) {
                         kept = false;
-                        // skip to the border of the empty cell, or of its block if that is empty too, by a whole
-                        // number of steps
+                        // skip to the border of the empty cell, or of its block if that is empty
+                        // too, by a whole number of steps
                         let size = comptime!(BLOCK as u32);
                         let b = (cx / size * sizes[BLOCKS + 1] + cy / size) * sizes[BLOCKS + 2] + cz / size;
                         let empty = !bit(blocks, b);
@@ -144,7 +146,8 @@ fn pass(
                             border(g.x, cx, nx, d.x, u.x, empty),
                             min(border(g.y, cy, ny, d.y, u.y, empty), border(g.z, cz, nz, d.z, u.z, empty)),
                         );
-                        // slightly less than that, so that rounding cannot skip a sample in the next cell
+                        // slightly less than that, so that rounding cannot skip a sample in the
+                        // next cell
                         let whole = (max(far, 0.0f32) / step - 1e-3f32).ceil();
                         skip = u32::cast_from(clamp(whole, 1.0f32, 1e9f32));
                     }
@@ -205,7 +208,8 @@ impl DeviceLattice {
         DeviceLattice { lattice: device.upload(&numbers), sizes: device.upload(&sizes), mask, max_samples }
     }
 
-    /// Returns the maximum number of samples of a ray: those of the box's diagonal, and a few more for rounding.
+    /// Returns the maximum number of samples of a ray: those of the box's diagonal, and a few more
+    /// for rounding.
     pub fn max_samples(field: &VmField) -> usize {
         let l = &field.lattice;
         let diagonal = (0..3).map(|a| (l.max[a] - l.min[a]).powi(2)).sum::<f32>().sqrt();
@@ -223,7 +227,8 @@ pub struct VmSamples {
     pub t: Buffer,
     /// `[capacity]`: ray of each sample.
     pub ray: Buffer,
-    /// Planes `[3, capacity]`: positions in units of vertices of the grid, clamped to the outer ones.
+    /// Planes `[3, capacity]`: positions in units of vertices of the grid, clamped to the outer
+    /// ones.
     pub place: Buffer,
     /// `[rays]`: number of lattice points inside the box, including those that the mask skips.
     pub points: Buffer,

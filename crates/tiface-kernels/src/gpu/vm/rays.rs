@@ -12,8 +12,8 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 
-/// Computes the weights of samples up to where a ray's transmittance is used up, and counts the samples whose weight is
-/// above the threshold, which need a color.
+/// Computes the weights of samples up to where a ray's transmittance is used up, and counts the
+/// samples whose weight is above the threshold, which need a color.
 #[cube(launch)]
 fn compute_weights(
     offsets: &[u32],
@@ -104,7 +104,8 @@ fn composite(
     }
 }
 
-/// Writes the gradients with respect to features, and with respect to the inputs of the colors' sigmoids.
+/// Writes the gradients with respect to features, and with respect to the inputs of the colors'
+/// sigmoids.
 #[cube(launch)]
 fn backward(
     offsets: &[u32],
@@ -196,11 +197,12 @@ pub struct CompositedRays {
 impl CompositedRays {
     /// Memory per sample of a field that is trained, in words.
     pub const WORDS: usize = 12;
-    /// Memory per ray, in words: composited values, their gradients and loss terms, offsets, counts, and the ray itself.
+    /// Memory per ray, in words: composited values, their gradients and loss terms, offsets,
+    /// counts, and the ray itself.
     pub const OF_RAY: usize = 2 * RAY_WIDTH + 24;
 
-    /// Allocates buffers for `rays` rays and up to `capacity` samples of a field; buffers for gradients only if `learns` is
-    /// set.
+    /// Allocates buffers for `rays` rays and up to `capacity` samples of a field; buffers for
+    /// gradients only if `learns` is set.
     pub fn new(
         device: &Device,
         field: &VmField,
@@ -237,7 +239,8 @@ impl CompositedRays {
         groups(self.ends.word_count().div_ceil(UNITS as usize))
     }
 
-    /// Computes the weights of samples from their features, and lists the samples that need a color.
+    /// Computes the weights of samples from their features, and lists the samples that need a
+    /// color.
     pub fn compute_weights(&self, device: &Device, samples: &VmSamples) {
         launch!(device, compute_weights::launch, self.groups(), UNITS;
             samples.offsets, self.feature, self.alpha, self.light, self.weight, self.ends, self.counts;
@@ -257,7 +260,8 @@ impl CompositedRays {
         );
     }
 
-    /// Computes the gradients of samples from those with respect to the composited rays, planes `[5, rays]`.
+    /// Computes the gradients of samples from those with respect to the composited rays, planes
+    /// `[5, rays]`.
     pub fn backward(&self, device: &Device, samples: &VmSamples, g_out: &Buffer) {
         assert!(
             g_out.word_count() == self.out.word_count()

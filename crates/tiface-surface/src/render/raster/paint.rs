@@ -1,5 +1,5 @@
-//! The third step, from the visible triangles of a tile to pixels: intersects the rays through the samples with their
-//! triangles, and weights the hits of each pixel.
+//! The third step, from the visible triangles of a tile to pixels: intersects the rays through the
+//! samples with their triangles, and weights the hits of each pixel.
 
 use super::super::raycast::RayHits;
 use super::project::{TILE, UNIT};
@@ -50,8 +50,8 @@ pub(super) struct Painter<'a, C> {
     /// Scale from the mesh's units to those of depth.
     pub scale: f32,
     pub world_from_mesh: Mat3,
-    /// For a lens without distortion: the ray through the picture's corner, and the steps to the next pixel in x and
-    /// y.
+    /// For a lens without distortion: the ray through the picture's corner, and the steps to the
+    /// next pixel in x and y.
     pub straight: Option<[DVec3; 3]>,
     /// Relative change of depth over one pixel from which on a surface ends.
     pub jump: f32,
@@ -73,8 +73,8 @@ pub(super) fn straight_rays(c: &Camera) -> Option<[DVec3; 3]> {
 }
 
 impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
-    /// Writes depth and normals of a tile's pixels, and queues its hits for coloring. `light` is the transmittance of
-    /// each sample after the layers drawn before; empty if it is 1 everywhere.
+    /// Writes depth and normals of a tile's pixels, and queues its hits for coloring. `light` is
+    /// the transmittance of each sample after the layers drawn before; empty if it is 1 everywhere.
     pub fn paint(
         &self,
         tile: &Tile,
@@ -93,7 +93,8 @@ impl<C: Fn(&RayHits) -> Vec<[f32; 3]>> Painter<'_, C> {
                 if present == 0 && seen[CENTER] == NOTHING {
                     continue;
                 }
-                // samples of the same surface are colored together, first those of the one at the center
+                // samples of the same surface are colored together, first those of the one at the
+                // center
                 let same = |own: f32| {
                     let near = |s: usize| (depths[s] - own).abs() <= self.jump * own.min(depths[s]);
                     (0..SAMPLES).fold(0, |bits, s| bits | u8::from(near(s)) << s)
@@ -229,8 +230,8 @@ pub(super) struct SampleBatch {
 }
 
 tiface_base::dispatch! {
-    /// Computes the intersections of the rays with their triangles, or the nearest points: samples lie in snapped
-    /// triangles.
+    /// Computes the intersections of the rays with their triangles, or the nearest points: samples
+    /// lie in snapped triangles.
     fn meet / meet_all(batch: &mut SampleBatch, straight: Option<[DVec3; 3]>, origin: Vec3)
 }
 

@@ -1,5 +1,5 @@
-//! Projection of triangles: transformed to the camera, clipped to its frustum, snapped to 1/256 of a pixel, and sorted into
-//! tiles.
+//! Projection of triangles: transformed to the camera, clipped to its frustum, snapped to 1/256 of
+//! a pixel, and sorted into tiles.
 
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -15,10 +15,12 @@ pub(super) const UNIT: i32 = 256;
 const FIRST_SAMPLE: i32 = 32;
 const LAST_SAMPLE: i32 = 224;
 
-/// Number of triangles that are binned together; fixed, so that the result does not depend on the number of threads.
+/// Number of triangles that are binned together; fixed, so that the result does not depend on the
+/// number of threads.
 const CHUNK: usize = 4096;
 
-/// Farthest from the picture's corner, 1/256 pixels: products of two distances fit into 64 bits many times over.
+/// Farthest from the picture's corner, 1/256 pixels: products of two distances fit into 64 bits
+/// many times over.
 const MAX_COORDINATE: f64 = (1 << 23) as f64;
 
 /// Tolerance for a corner made by clipping, which is rounded.
@@ -130,7 +132,8 @@ impl<'a> Lens<'a> {
             let (x, y) = (reach(camera.fx, camera.cx), reach(camera.fy, camera.cy));
             [x.0, x.1, y.0, y.1]
         } else {
-            // a tenth more for directions between these samples of a distorted lens; more would reach its fold
+            // a tenth more for directions between these samples of a distorted lens; more would
+            // reach its fold
             let border = 0.1 * (high - low);
             [low.x - border.x, high.x + border.x, low.y - border.y, high.y + border.y]
         };
@@ -216,7 +219,8 @@ impl<'a> Lens<'a> {
 
     /// Clips a triangle, given in camera coordinates, to the picture, and adds the rest.
     ///
-    /// A new corner is computed from the end of its edge that is kept, so both triangles at an edge get the same one.
+    /// A new corner is computed from the end of its edge that is kept, so both triangles at an edge
+    /// get the same one.
     fn cut(&self, triangle: [Vec3; 3], id: u32, cull: bool, out: &mut Vec<Face>) {
         let [left, right, top, bottom] = self.seen;
         let planes: [(Vec3, f32); 5] = [
@@ -254,8 +258,8 @@ impl<'a> Lens<'a> {
         }
     }
 
-    /// Adds a triangle, halved until its edges are where the lens puts them. Whether an edge is halved depends on its
-    /// ends alone, so the triangles at both sides agree.
+    /// Adds a triangle, halved until its edges are where the lens puts them. Whether an edge is
+    /// halved depends on its ends alone, so the triangles at both sides agree.
     fn bend(&self, [a, b, c]: [Vec3; 3], id: u32, cull: bool, out: &mut Vec<Face>) {
         let mut pieces = vec![([a, b, c], 0)];
         while let Some((piece, depth)) = pieces.pop() {
@@ -286,7 +290,8 @@ impl<'a> Lens<'a> {
     #[inline(always)]
     fn add(&self, [a, b, c]: [Corner; 3], triangle: u32, cull: bool, out: &mut Vec<Face>) {
         let area = area([a, b, c]);
-        // y runs down: what is counter-clockwise from outside is so on the picture, and its area is negative
+        // y runs down: what is counter-clockwise from outside is so on the picture, and its area is
+        // negative
         let back = (area > 0) != self.mirrored;
         if area == 0 || (back && cull) {
             return;
@@ -329,8 +334,8 @@ impl<'a> Lens<'a> {
     }
 }
 
-/// First and last column, first and last row of pixels in which a face may hold a sample; the first exceeds the last if
-/// no such pixel exists.
+/// First and last column, first and last row of pixels in which a face may hold a sample; the first
+/// exceeds the last if no such pixel exists.
 #[inline(always)]
 pub(super) fn reach(face: &Face) -> ((i32, i32), (i32, i32)) {
     let [a, b, c] = face.corners;

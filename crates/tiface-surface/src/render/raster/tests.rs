@@ -38,7 +38,8 @@ fn camera(side: u32) -> Camera {
     Camera { rotation, position, ..Camera::above(side, side, 1.7 * f64::from(side), 0.0) }
 }
 
-/// The triangles at each place of [`GRID`] in each pixel of a tile; of faces at one depth the first stays.
+/// The triangles at each place of [`GRID`] in each pixel of a tile; of faces at one depth the first
+/// stays.
 fn drawn<'a>(tile: &mut Tile, faces: impl Iterator<Item = &'a Face>) -> Vec<u32> {
     tile.move_to(0, 0, TILE, TILE);
     faces.for_each(|face| tile.draw(face));
@@ -47,12 +48,13 @@ fn drawn<'a>(tile: &mut Tile, faces: impl Iterator<Item = &'a Face>) -> Vec<u32>
 
 /// Draws meshes until they have so many shared edges.
 fn draw_shared_edges(least: usize) {
-    // a square over the tile with random corners inside, cut at each of them in turn: every edge within is shared by two
-    // triangles, and every sample of the tile lies in exactly one of all
+    // a square over the tile with random corners inside, cut at each of them in turn: every edge
+    // within is shared by two triangles, and every sample of the tile lies in exactly one of all
     let mut tile = Tile::new();
     let (mut edges, mut meshes, mut drawings) = (0, 0, 0);
     while edges < least {
-        // from corners on samples and lines through them to a few far beyond the tile, which need 64 bits
+        // from corners on samples and lines through them to a few far beyond the tile, which need
+        // 64 bits
         let step = [1, 32, 64, 256][meshes % 4];
         let reach = if meshes % 5 == 4 { 1 << 20 } else { 0 };
         let (low, high) = (-reach, TILE as i32 * UNIT + reach);
@@ -94,7 +96,8 @@ fn a_million_shared_edges_leave_no_gap_and_hit_no_sample_twice() {
 
 #[test]
 fn a_closed_mesh_covers_every_sample_from_both_sides() {
-    // twice 30,000 shared edges through projection and binning: what its front covers, its back covers, too
+    // twice 30,000 shared edges through projection and binning: what its front covers, its back
+    // covers, too
     let (mesh, camera) = (ball(60), camera(300));
     let front =
         raster(&mesh, None, &camera, &RasterOptions { cull: true, ..RasterOptions::default() }, white);
@@ -106,7 +109,8 @@ fn a_closed_mesh_covers_every_sample_from_both_sides() {
     assert!(front.triangles.iter().zip(&back.triangles).all(|(a, b)| (*a == NOTHING) == (*b == NOTHING)));
 }
 
-/// Shares of pixels with another triangle, largest difference of depth, and PSNR against the ray caster.
+/// Shares of pixels with another triangle, largest difference of depth, and PSNR against the ray
+/// caster.
 fn differences(mesh: &Mesh, camera: &Camera) -> (f64, f32, f64) {
     let color = |hits: &RayHits| -> Vec<[f32; 3]> {
         let wave = |p: &Vec3| [0.5 + 0.4 * (5.0 * p.x).sin(), 0.5 + 0.4 * (4.0 * p.y).cos(), 0.4 + 0.3 * p.z];

@@ -1,8 +1,9 @@
 //! A tile of the picture: which triangle is nearest at each of its samples.
 //!
-//! A sample lies in a triangle where three edge functions are not negative, and where one of them is 0 if that edge is a
-//! left or a top one (Pineda, *A Parallel Algorithm for Polygon Rasterization*, 1988). All of it is in whole numbers, so
-//! triangles that share an edge leave no sample between them out and hit none twice.
+//! A sample lies in a triangle where three edge functions are not negative, and where one of them
+//! is 0 if that edge is a left or a top one (Pineda, *A Parallel Algorithm for Polygon
+//! Rasterization*, 1988). All of it is in whole numbers, so triangles that share an edge leave no
+//! sample between them out and hit none twice.
 
 use super::project::{Corner, Face, TILE, UNIT, area, reach};
 use std::array::from_fn;
@@ -12,7 +13,8 @@ use std::ops::{Add, BitOr, Mul, Sub};
 /// Samples of a pixel that are processed at once.
 const LANES: usize = 8;
 
-/// Pixels of a row that are tested at once against a large face, and side of a block whose farthest depth is cached.
+/// Pixels of a row that are tested at once against a large face, and side of a block whose farthest
+/// depth is cached.
 const BLOCK: usize = 8;
 const BLOCKS: usize = TILE / BLOCK;
 
@@ -22,8 +24,8 @@ const REFRESH: usize = 256;
 /// Samples of a pixel's coverage.
 pub(super) const SAMPLES: usize = 4;
 
-/// Positions of the samples in a pixel: a rotated grid, in which no two share a row or a column. The remaining lanes
-/// hold the center, which is sampled but does not count for coverage.
+/// Positions of the samples in a pixel: a rotated grid, in which no two share a row or a column.
+/// The remaining lanes hold the center, which is sampled but does not count for coverage.
 pub(super) const GRID: [(i32, i32); LANES] =
     [(96, 32), (224, 96), (32, 160), (160, 224), (128, 128), (128, 128), (128, 128), (128, 128)];
 
@@ -165,19 +167,22 @@ impl Tile {
                     let w = wr + dx * (column as i32 * UNIT) as f32;
                     let (depths, triangles) =
                         (&mut self.inverse_depth[row + column], &mut self.triangle[row + column]);
-                    // all in whole numbers, which compilers turn into vectors: those of positive floats are in their order
+                    // all in whole numbers, which compilers turn into vectors: those of positive
+                    // floats are in their order
                     let (old_depths, old_triangles) = (*depths, *triangles);
                     let mut visible = [0u32; LANES];
                     for l in 0..LANES {
                         let outside = (et + e.at[l]) | (ft + f.at[l]) | (gt + g.at[l]);
-                        // a sliver's slope is unreliable: it is no nearer and no farther than its corners
+                        // a sliver's slope is unreliable: it is no nearer and no farther than its
+                        // corners
                         let new = (w + first[l]).max(farthest).min(nearest).to_bits() as i32;
                         let old = old_depths[l].to_bits() as i32;
                         let best = old.max(new & !outside.sign());
                         depths[l] = f32::from_bits(best as u32);
                         visible[l] = ((old - best) >> 31) as u32;
                     }
-                    // the place hidden, lest compilers store the lanes that changed alone: some machines are slow at that
+                    // the place hidden, lest compilers store the lanes that changed alone: some
+                    // machines are slow at that
                     let triangles = black_box(triangles);
                     for l in 0..LANES {
                         triangles[l] = old_triangles[l] ^ ((old_triangles[l] ^ face.triangle) & visible[l]);

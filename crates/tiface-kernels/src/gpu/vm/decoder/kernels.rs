@@ -1,5 +1,5 @@
-//! Kernels of the color decoder: preparation of the weights, forward and backward pass of the layers, and gradients of the
-//! weights.
+//! Kernels of the color decoder: preparation of the weights, forward and backward pass of the
+//! layers, and gradients of the weights.
 
 use super::super::super::tile::{
     self, Block, add, add_outer, at, channel_sums, flush_outer, flush_row, output_layer, product,
@@ -34,7 +34,8 @@ fn merged(flat: &[f32], real: &[u32], h: usize, c: usize, #[comptime] plan: Deco
     sum
 }
 
-/// Returns a value of a matrix of `rows` times `columns` that begins at `start`; zero outside of the matrix.
+/// Returns a value of a matrix of `rows` times `columns` that begins at `start`; zero outside of
+/// the matrix.
 #[cube]
 fn zero_padded(
     flat: &[f32],
@@ -81,8 +82,8 @@ pub(super) fn prepare(flat: &[f32], real: &[u32], out: &mut [f32], #[comptime] p
     }
 }
 
-/// Returns four inputs of a sample: products of a term's channels, or the direction. `k` is the sample's position in the
-/// list `index` of samples with a color.
+/// Returns four inputs of a sample: products of a term's channels, or the direction. `k` is the
+/// sample's position in the list `index` of samples with a color.
 #[cube]
 fn input(
     values: &[F4],
@@ -182,8 +183,8 @@ fn first_layer(
     let lanes = comptime!(plan.lanes);
     let rows = comptime!(plan.rows());
     let bias = w[comptime!(rows[1] * tile::columns(lanes)) + column];
-    // a loop of the kernel, like the other one over pieces: unrolled, the interpolation is compiled once for each piece,
-    // which takes software drivers a minute
+    // a loop of the kernel, like the other one over pieces: unrolled, the interpolation is compiled
+    // once for each piece, which takes software drivers a minute
     let mut c0 = broadcast(bias, 0usize);
     let mut c1 = broadcast(bias, 1usize);
     let mut c2 = broadcast(bias, 2usize);
@@ -217,7 +218,8 @@ fn second_layer(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan:
     ))
 }
 
-/// Computes both hidden layers of a tile of samples: the first one in tile `b`, the second one in `a`.
+/// Computes both hidden layers of a tile of samples: the first one in tile `b`, the second one in
+/// `a`.
 #[cube]
 fn hidden_layers(
     a: &mut [F4],
@@ -280,8 +282,8 @@ pub(super) fn forward(
     }
 }
 
-/// Returns the gradient with respect to the input of the sigmoid of color channel `o`, for four samples; zero after the
-/// last sample.
+/// Returns the gradient with respect to the input of the sigmoid of color channel `o`, for four
+/// samples; zero after the last sample.
 #[cube]
 fn g_color(g_pre: &[F4], o: usize, here: usize, samples: usize) -> F4 {
     let mut v = g_pre[o * (g_pre.len() / 3) + here];
@@ -300,8 +302,9 @@ fn from_colors(g0: F4, g1: F4, g2: F4, w0: F4, w1: F4, w2: F4, #[comptime] j: us
     g0 * broadcast(w0, j) + g1 * broadcast(w1, j) + g2 * broadcast(w2, j)
 }
 
-/// Writes the gradients with respect to products of samples `from..from + limit`, `[limit, channels]`, and adds a group's
-/// sums of those with respect to the weights to its part of `partial`, or overwrites it with those of the first samples.
+/// Writes the gradients with respect to products of samples `from..from + limit`,
+/// `[limit, channels]`, and adds a group's sums of those with respect to the weights to its part of
+/// `partial`, or overwrites it with those of the first samples.
 #[cube(launch_unchecked)]
 pub(super) fn backward(
     w: &[F4],
