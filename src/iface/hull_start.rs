@@ -106,7 +106,7 @@ fn fit_points(
         let u = |a: u64| 2.0 * rng::uniform(seed, 201 + (step << 10), 4 * k as u64 + a) - 1.0;
         let p = [u(0), u(1), u(2)];
         let f = distance.at(p);
-        (k % 2 == 0 || f.abs() <= 0.1).then(|| (p.map(|c| c * radius), f * radius))
+        (k.is_multiple_of(2) || f.abs() <= 0.1).then(|| (p.map(|c| c * radius), f * radius))
     };
     let (mut x, mut target) = (Vec::with_capacity(count), Vec::with_capacity(count));
     let mut drawn = 0;
