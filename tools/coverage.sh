@@ -4,7 +4,7 @@
 #     rustup component add llvm-tools
 #     TIFACE_FUZZ_S=60 tools/coverage.sh
 #
-# Only this crate is instrumented; what it depends on stays as it was built. The program that cargo builds beside the tests
+# Only the packages of this workspace are instrumented; what they depend on stays as it was built. The program that cargo builds beside the tests
 # is removed in the end: instrumented, it is up to a hundred times as slow.
 set -eu -o pipefail
 cd "$(dirname "$0")/.."

@@ -223,14 +223,18 @@ lint() {
   # once with all features, and once without any; then built once
   step "lints" cargo clippy --release --workspace --all-targets --features matting,wgpu -- -D warnings
   step "no features" cargo clippy --release --workspace --lib --bins -- -D warnings
+  # alone, without what other packages turn on
+  step "tiface-surface alone" cargo check --release -p tiface-surface
   step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --workspace --features matting,wgpu --no-deps
   step "figures of the documents" "${PYTHON:-python3}" tools/reference/figures.py check
 }
 
 # unit_tests OPTIONS...: the unit tests of all packages, one after the other
 unit_tests() {
-  local program ended=0
-  for program in $(executables src/lib.rs); do
+  local program programs ended=0
+  programs=$(executables src/lib.rs)
+  [ "$(wc -w <<< "$programs")" = 4 ] || { echo "the tests of four packages were not built"; return 1; }
+  for program in $programs; do
     tests "$(basename "$program")" "$program" "$@" || ended=1
   done
   return $ended

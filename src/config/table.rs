@@ -15,7 +15,7 @@
 ///         /// A word, text, switch or list has no range; one value may serve every preset.
 ///         masks: MaskUse [Iface if has_masks, Surface] => MaskUse::Soft;
 ///         /// How often it is saved, which is the same result.
-///         #[flag("every", Text("SECONDS"), ["iface"], "Seconds between checkpoints")]
+///         #[flag("every", Text("SECONDS"), ["mesh"], "Seconds between checkpoints")]
 ///         checkpoint_s: f64, 0.05..=86_400.0 [nothing] => 60.0;
 ///     }
 ///     constants {

@@ -16,10 +16,10 @@ use tiface_kernels::cpu::hash;
 
 const MIB: f64 = (1u64 << 20) as f64;
 
-/// Memory that a stage takes on the CPU, MiB; each is that of the whole process while the stage
-/// works.
+/// Memory that a stage takes on the CPU, MiB a unit of each part; `Session::cost` adds them up.
 ///
-/// `tools/reference/estimates.py RUN...` compares what these say with the peaks that runs recorded.
+/// `tools/reference/estimates.py RUN...` compares these estimates with the peaks that runs
+/// recorded.
 mod mib {
     /// The program and what its libraries hold.
     pub const PROGRAM: f64 = 75.0;

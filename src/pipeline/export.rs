@@ -98,7 +98,7 @@ impl KeptHead {
             } else if !PART_KEYS.contains(&key.as_str()) && key != key!(device) {
                 let what =
                     format!("`{key}` affects what is made, and `export` only writes what has been made");
-                return Err(Error::usage(what, self.anew(&key, &value)));
+                return Err(Error::usage(what, self.made_again(&key, &value)));
             }
         }
         self.export = Export::new(&self.capture, asked);
@@ -148,7 +148,7 @@ impl KeptHead {
     }
 
     /// Returns what to do about a setting that needs a mesh of its own.
-    fn anew(&self, key: &str, value: &str) -> String {
+    fn made_again(&self, key: &str, value: &str) -> String {
         match key.split_once('.') {
             Some(("mesh", _)) => {
                 let run = self.run.display();
@@ -163,7 +163,7 @@ impl KeptHead {
     /// Refuses a value that asks for more than the run keeps.
     fn more(&self, key: &str, value: impl ToString, kept: &str) -> Error {
         let value = value.to_string();
-        Error::usage(format!("`{key}` is {value}, but the run keeps {kept}"), self.anew(key, &value))
+        Error::usage(format!("`{key}` is {value}, but the run keeps {kept}"), self.made_again(key, &value))
     }
 
     /// Leaves out what is asked to be left out: soft layers, lobes, the normal map.

@@ -199,3 +199,39 @@ fn files_intervals_and_limits_make_nothing_again() {
     assert_eq!(both(key!(render.samples)), [true, true]);
     assert_eq!(both(key!(render.orbit_views)), [false, false]);
 }
+
+/// The parts of stage `mesh` that each of its keys makes again, as they were worked out by hand: a
+/// view shows the head, and neither its files nor what is only in them.
+#[test]
+fn keys_of_the_mesh_make_its_surface_its_head_or_its_files_again() {
+    let config = Config::preset(crate::config::Preset::Draft);
+    let innermost = |row: &Key| {
+        let parts = [(Product::Surface, "surface"), (Product::Head, "head"), (Product::Files, "files")];
+        parts
+            .into_iter()
+            .find(|(product, _)| row.affects(*product, &config))
+            .map_or("nothing", |(_, part)| part)
+    };
+    let of_mesh = all_keys().filter(|(name, _)| name.starts_with("mesh."));
+    let found: Vec<(String, &str)> = of_mesh.map(|(name, row)| (name, innermost(row))).collect();
+    let expected = [
+        (key!(mesh.resolution), "surface"),
+        (key!(mesh.genus), "surface"),
+        (key!(mesh.cap), "surface"),
+        (key!(mesh.triangles), "head"),
+        (key!(mesh.max_error), "head"),
+        (key!(mesh.color), "surface"),
+        (key!(mesh.texture_px), "head"),
+        (key!(mesh.lobes), "head"),
+        (key!(mesh.hair), "head"),
+        (key!(mesh.normal_map), "head"),
+        (key!(mesh.material), "files"),
+        (key!(mesh.texture_format), "files"),
+        (key!(mesh.exr), "files"),
+        (key!(mesh.format), "files"),
+        (key!(mesh.frame), "files"),
+        (key!(mesh.height_m), "files"),
+    ];
+    let expected: Vec<(String, &str)> = expected.map(|(name, part)| (name.to_string(), part)).to_vec();
+    assert_eq!(found, expected);
+}

@@ -109,7 +109,7 @@ fn shrink(
     replace(state, density, color, step);
 }
 
-/// Makes the grids finer where, after `step` steps, upsampling `which` (from 0) is due.
+/// Makes the grids finer: upsampling `which` (from 0), after `step` steps.
 pub fn upsample(state: &mut VmState, config: &VmConfig, which: usize, step: u64) {
     let VmConfig { voxels_start, voxels_final, upsample_at, .. } = config;
     let voxels = voxel_schedule(*voxels_start, *voxels_final, upsample_at.len().max(1))[which];

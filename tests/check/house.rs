@@ -1,5 +1,6 @@
-//! The house rules that the compiler does not see: who may know whom within the package `tiface`,
-//! in no circle within any package, who opens files, who prints.
+//! The house rules that the compiler does not see: who may know whom within the package `tiface`;
+//! no cycle of files within any package; who opens files, who prints; no empty names; keys that
+//! messages name exist, and code names keys by the macro.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -7,14 +8,15 @@ use std::path::{Path, PathBuf};
 
 /// Layers of the package `tiface`, from the ground up; a module may know those below its own layer.
 const LAYERS: &[(&str, &[&str])] = &[
-    ("shared", &["config", "capture", "field", "onnx", "run", "report"]),
+    ("settings", &["config"]),
+    ("shared", &["capture", "field", "onnx", "run", "report"]),
     ("stages", &["mask", "rig", "tface", "iface", "ensemble", "metrics"]),
     ("pipeline", &["pipeline"]),
     ("cli", &["cli"]),
 ];
 
 /// Modules of these layers may know each other; stages never.
-const SOCIABLE: &[&str] = &["shared", "pipeline", "cli"];
+const SOCIABLE: &[&str] = &["settings", "shared", "pipeline", "cli"];
 
 /// The package of the pipeline and of the program, at the root of the workspace.
 const ROOT: &str = "tiface";
@@ -69,7 +71,7 @@ fn read(package: &str, src: &Path, path: &Path, place: String) -> Option<Source>
     let name = path.file_stem().unwrap().to_str().unwrap();
     // the two roots of the program know everything; whole files of and for tests may too
     if (package == ROOT && ["lib", "main"].contains(&module.as_str()))
-        || name == "tests"
+        || ["tests", "testing"].contains(&name)
         || name.ends_with("_tests")
     {
         return None;

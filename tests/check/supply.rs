@@ -8,20 +8,20 @@ fn read(name: &str) -> String {
     std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(name)).unwrap()
 }
 
-/// Name, what stands behind the version, and license of every crate in the program.
-fn crates() -> Vec<(String, String, String)> {
+/// Returns the folders of the workspace's packages.
+fn packages() -> Vec<String> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("crates");
+    let below = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name());
+    let below = below.map(|name| format!("crates/{}", name.to_str().unwrap()));
+    std::iter::once(".".to_string()).chain(below).collect()
+}
+
+/// Name, what stands behind the version, and license of every crate that a package is built from.
+fn crates(options: &[&str]) -> Vec<(String, String, String)> {
     let output = Command::new(env!("CARGO"))
-        .args([
-            "tree",
-            "--locked",
-            "--features",
-            "matting,wgpu",
-            "--edges",
-            "normal,build",
-            "--prefix",
-            "none",
-        ])
+        .args(["tree", "--locked", "--edges", "normal,build", "--prefix", "none"])
         .args(["--format", "{p}|{l}"])
+        .args(options)
         .current_dir(env!("CARGO_MANIFEST_DIR"))
         .output()
         .unwrap();
@@ -62,10 +62,11 @@ fn every_crate_is_from_the_registry_under_an_allowed_license_and_without_a_netwo
     };
     let (licenses, banned) = (list("licenses", "allow"), list("bans", "deny"));
     let licenses: Vec<&str> = licenses.iter().map(String::as_str).collect();
-    let crates = crates();
+    let crates = crates(&["--features", "matting,wgpu"]);
     assert!(crates.len() > 300, "{}", crates.len());
     for (name, source, license) in &crates {
-        assert!(source.is_empty() || name.starts_with("tiface"), "`{name}` comes from {source}");
+        let is_ours = source.starts_with(concat!("(", env!("CARGO_MANIFEST_DIR")));
+        assert!(source.is_empty() || is_ours, "`{name}` comes from {source}");
         assert!(allowed(license, &licenses), "`{name}` is under `{license}`");
         assert!(!banned.contains(name), "`{name}` speaks to a network");
     }
@@ -86,8 +87,8 @@ fn expressions_of_licenses_are_read() {
 #[test]
 fn every_crate_the_program_names_has_a_note_on_its_unsafe_code() {
     let mut named = Vec::new();
-    for package in ["", "crates/tiface-base/", "crates/tiface-surface/", "crates/tiface-kernels/"] {
-        let manifest: toml::Table = read(&format!("{package}Cargo.toml")).parse().unwrap();
+    for folder in packages() {
+        let manifest: toml::Table = read(&format!("{folder}/Cargo.toml")).parse().unwrap();
         let unix = manifest.get("target").map(|target| &target["cfg(unix)"]["dependencies"]);
         let tables = [Some(&manifest["dependencies"]), unix];
         named.extend(tables.into_iter().flatten().flat_map(|t| t.as_table().unwrap().keys().cloned()));
@@ -95,5 +96,15 @@ fn every_crate_the_program_names_has_a_note_on_its_unsafe_code() {
     let notes = read("docs/dependencies.md");
     for name in named.into_iter().filter(|name| !name.starts_with("tiface-")) {
         assert!(notes.contains(&format!("`{name}`")), "docs/dependencies.md says nothing of `{name}`");
+    }
+}
+
+#[test]
+fn meshing_needs_neither_tensors_nor_networks() {
+    let crates = crates(&["--package", "tiface-surface"]);
+    assert!(crates.iter().any(|(name, ..)| name == "tiface-base"), "{crates:?}");
+    for (name, ..) in &crates {
+        let is_heavy = ["burn", "cubecl", "wgpu", "tract", "clap"].iter().any(|word| name.starts_with(word));
+        assert!(!is_heavy, "tiface-surface needs `{name}`");
     }
 }

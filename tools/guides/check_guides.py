@@ -5,7 +5,7 @@
 Blocks of `sh` run line by line in one folder per guide, where captures lie as the guide has them; a user's own
 configuration makes them small. Blocks of `python` run with this interpreter. `sh colmap` needs COLMAP and photographs of
 something real; it is left out aloud where they are not. `sh cluster` needs GPUs or a cluster: what the engine would do
-there is planned alone. `yaml` is a job for Kubernetes, and only read.
+there is planned alone. `yaml kubernetes` is a job for Kubernetes, and only read.
 """
 
 import json
@@ -84,7 +84,7 @@ def run(guide, tiface, seen):
                     count += 1
         elif kind == "sh cluster":
             count += cluster(guide, body, folder, environment)
-        elif kind == "yaml":
+        elif kind == "yaml kubernetes":
             kubernetes(body)
         else:
             assert kind == "text", f"{guide.name}: a block of `{kind}` is not tested"

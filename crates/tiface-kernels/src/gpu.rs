@@ -1,5 +1,5 @@
-//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal and DX12. Each is the twin of a
-//! kernel of [`super::cpu`].
+//! The kernels on a GPU, in CubeCL: one source for Vulkan, Metal and DX12. Most are the
+//! twin of a kernel of [`super::cpu`]; the twins of drawing and of points are in `tiface`.
 //!
 //! Values of samples lie plane by plane, `[channels, capacity]`: neighboring threads read
 //! neighboring words, and a plane is read four samples at a time. `capacity` is a multiple of

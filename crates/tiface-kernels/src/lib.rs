@@ -1,8 +1,9 @@
 //! The arithmetic of the learned fields of `tiface`: slices or buffers in, slices or buffers out.
 //!
 //! [`cpu`] has the kernels that define the results; with the feature `wgpu`, `gpu` has those on
-//! Vulkan, Metal and DX12. A kernel of a GPU has the name of its twin on the CPU. Losses, schedules
-//! and the choice of steps belong to the package `tiface`.
+//! Vulkan, Metal and DX12. Most kernels of a GPU have a twin of their name on the CPU. Which losses
+//! a step has, and when, is decided in the package `tiface`; their formulas and the rules of step
+//! length and ray budget are here.
 
 // The reference arithmetic of tests names the crate as its other users do.
 #[cfg(test)]

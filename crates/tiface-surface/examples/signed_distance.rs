@@ -10,7 +10,7 @@ use tiface_surface::bake::{BakeConfig, bake};
 use tiface_surface::files::{ExportOptions, HeadTexture, check, to_glb};
 use tiface_surface::{AtlasConfig, ExtractOptions, SimplifyConfig, atlas, extract, simplify};
 
-/// A ring of radius 0.6 and thickness 0.25.
+/// A ring of radius 0.6 around z, whose tube has radius 0.25.
 fn ring(p: Vec3) -> f32 {
     Vec2::new(p.truncate().length() - 0.6, p.z).length() - 0.25
 }

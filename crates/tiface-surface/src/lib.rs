@@ -2,10 +2,10 @@
 //!
 //! # Modules
 //!
-//! - `extract`: [`sparse`] evaluates a field only near its surface, [`clean`] keeps the head and
-//!   drops loose pieces; [`extract`] runs both, adds normals and colors, and removes small handles.
-//!   [`Cap`] closes the surface where the frames cut it. [`extract_dense`] evaluates a field at all
-//!   nodes of a grid, which [`marching`] meshes.
+//! - `extract`: [`sparse`] evaluates a field only near its surface, [`clean`] keeps the largest
+//!   surface and drops loose pieces; [`extract`] runs both, adds normals and colors, and removes
+//!   small handles. [`Cap`] closes the surface where the frames cut it. [`extract_dense`] evaluates
+//!   a field at all nodes of a grid, which [`marching`] meshes.
 //! - [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured mesh.
 //! - [`files`] writes, reads and checks GLB, OBJ and PLY, and reads glTF and STL.
 //! - [`render`] shows a mesh from a camera.

@@ -1,5 +1,3 @@
-//! Movement of vertices towards a surface without spoiling triangles.
-//!
 //! [`Polish`] moves vertices onto the field's zero and apart from each other, without ever spoiling
 //! a face.
 //!

@@ -1,4 +1,4 @@
-//! Stage: the ways to render a view.
+//! Ray casting and rasterizing: color, depth and normals of a mesh from a camera.
 
 mod look;
 mod raster;

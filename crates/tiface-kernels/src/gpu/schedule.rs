@@ -156,7 +156,7 @@ mod tests {
         let rule = StepLength::OfSharpness { units: 1.0, min: 0.004, max: 0.05 };
         let schedule = Schedule::new(&device, rule, budget, 256);
         let inv_s = device.upload(&[100f32]);
-        // 100 samples per ray; the sequence is worked out by hand in `kernel::cpu::schedule`
+        // 100 samples per ray; the sequence is worked out by hand in `crate::cpu::schedule`
         let mut rays = 256;
         for (k, want) in [256, 492, 704, 895, 1067, 1222, 1361].into_iter().enumerate() {
             let count = device.upload(&[0, 100 * rays]);

@@ -4,7 +4,7 @@
 //! `gltf` takes the container apart. Of its JSON only what is read here can cause an error, and
 //! numbers are f64: a node may lie kilometers from the origin, where `gltf-json`'s f32 has steps of
 //! half a meter. The document's references are checked before they are used. Only data in the file
-//! is read: buffers with a URI are refused.
+//! is read: buffers with a URI are refused, and a picture with one is named for the caller to open.
 
 use super::color_range::bring_into_range;
 use super::gltf_document::{GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};

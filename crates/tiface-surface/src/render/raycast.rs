@@ -196,13 +196,14 @@ impl Raycaster<'_> {
     }
 
     /// Casts `n × n` rays through the pixel at a corner.
-    fn cast_grid(&self, x: f32, y: f32, n: usize, found: &mut Vec<Met>) {
+    fn cast_grid(&self, x: f32, y: f32, n: usize, found: &mut Vec<CastRay>) {
         let sub = |k: usize| (k as f32 + 0.5) / n as f32;
         found.extend((0..n * n).map(|k| self.cast(x + sub(k % n), y + sub(k / n))));
     }
 
-    /// Returns the first hit of a ray with the mesh, and the layers in front of it.
-    fn cast(&self, x: f32, y: f32) -> Met {
+    /// Returns the ray through a pixel and its first hit with the mesh; `None` where the lens has
+    /// no ray.
+    fn cast(&self, x: f32, y: f32) -> CastRay {
         let ray = self.camera.ray(Vec2::new(x, y))?;
         Some((ray, self.bvh.closest_hit(&ray)))
     }
@@ -213,7 +214,7 @@ impl Raycaster<'_> {
     }
 
     /// Returns whether some of a pixel's rays miss and others hit, or hit at very different depths.
-    fn is_edge(&self, found: &[Met]) -> bool {
+    fn is_edge(&self, found: &[CastRay]) -> bool {
         let (mut low, mut high) = (f32::INFINITY, 0f32);
         for one in found {
             let depth = match one {
@@ -227,7 +228,7 @@ impl Raycaster<'_> {
     }
 
     /// Queues a hit for its color.
-    fn enqueue(&self, queue: &mut RayHits, pixel: usize, met: &Met, weight: f32) {
+    fn enqueue(&self, queue: &mut RayHits, pixel: usize, met: &CastRay, weight: f32) {
         let Some((ray, hit)) = met else { return };
         let mut left = weight;
         let mut push = |hit: &Hit, weight: f32| {
@@ -250,7 +251,7 @@ impl Raycaster<'_> {
 }
 
 /// A ray, and its first hit of the mesh.
-type Met = Option<(Ray, Option<Hit>)>;
+type CastRay = Option<(Ray, Option<Hit>)>;
 
 #[cfg(test)]
 mod tests {
