@@ -2,7 +2,6 @@
 //! CPU's.
 
 use serde::Serialize;
-use tiface_base::Result;
 
 /// The reason for the CPU on a machine without GPUs.
 pub(super) const NO_GPU: &str = "no GPU is here";
@@ -14,7 +13,7 @@ pub struct SelfTest {
     pub field: &'static str,
     /// Runs the step on an adapter and on the CPU, and compares the results.
     #[cfg(feature = "wgpu")]
-    pub run: fn(&tiface_kernels::gpu::Adapter) -> Result<Vec<Check>>,
+    pub run: fn(&tiface_kernels::gpu::Adapter) -> tiface_base::Result<Vec<Check>>,
 }
 
 /// One quantity of a training step, and its deviation from the CPU's value.
