@@ -89,7 +89,7 @@ fn every_crate_the_program_names_has_a_note_on_its_unsafe_code() {
     let mut named = Vec::new();
     for folder in packages() {
         let manifest: toml::Table = read(&format!("{folder}/Cargo.toml")).parse().unwrap();
-        let unix = manifest.get("target").map(|target| &target["cfg(unix)"]["dependencies"]);
+        let unix = manifest.get("target").and_then(|target| target["cfg(unix)"].get("dependencies"));
         let tables = [Some(&manifest["dependencies"]), unix];
         named.extend(tables.into_iter().flatten().flat_map(|t| t.as_table().unwrap().keys().cloned()));
     }
