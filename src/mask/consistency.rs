@@ -14,8 +14,8 @@ mod proposals;
 
 pub use proposals::{MaskVerdict, verdicts};
 
+use super::distance::squared_distance;
 use super::hull::{self, ViewFrame};
-use super::morphology::squared_distance;
 use crate::capture::carve::Cube;
 use glam::{DVec3, Vec2};
 use rayon::prelude::*;
