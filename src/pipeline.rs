@@ -161,6 +161,8 @@ mod ensemble_tests;
 #[cfg(test)]
 mod exposure_tests;
 #[cfg(test)]
+mod formula_tests;
+#[cfg(test)]
 mod path_tests;
 #[cfg(test)]
 mod plan_tests;
