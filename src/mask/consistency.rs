@@ -234,13 +234,9 @@ impl Conflicts {
     fn of(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Conflicts {
         let count = claims.len();
         let costs = votes.costs(active);
-        let best = |claims, pixel| {
+        let found = oppositions(votes, claims, active, |claims, pixel| {
             best_on_ray(&votes.cube, claims, pixel, &costs).map(|(no, cell)| (false, no, cell))
-        };
-        let found: Vec<Option<Opposition>> = (0..count)
-            .into_par_iter()
-            .map(|j| active[j].then(|| Opposition::of(votes, &claims[j], active, |p| best(&claims[j], p))))
-            .collect();
+        });
         let others = (active.iter().filter(|a| **a).count().max(2) - 1) as f64;
         let zero = || vec![0.0; count];
         let mut conflict = Conflicts { too_much: zero(), taken: zero(), credit: zero(), others };
@@ -285,6 +281,18 @@ struct Opposition {
     /// Per view: the share of the claims that it rules out, divided among all views that do; and
     /// the same undivided.
     opposing: Vec<[f64; 2]>,
+}
+
+/// Returns the conflicts of each active view with the other ones; `best` is that of
+/// [`Opposition::of`] for a pixel of any view.
+fn oppositions(
+    votes: &Votes,
+    claims: &[SilhouetteConstraints],
+    active: &[bool],
+    best: impl Fn(&SilhouetteConstraints, usize) -> Option<(bool, u16, usize)> + Sync,
+) -> Vec<Option<Opposition>> {
+    let opposition = |j: usize| Opposition::of(votes, &claims[j], active, |pixel| best(&claims[j], pixel));
+    (0..claims.len()).into_par_iter().map(|j| active[j].then(|| opposition(j))).collect()
 }
 
 impl Opposition {
@@ -392,25 +400,25 @@ mod tests {
     use glam::DMat3;
     use tiface_base::geom::Distortion;
 
-    /// Eight cameras on a ring, rising a little from one to the next.
+    /// Returns a camera that looks at the origin from 10 away, turned around y after it was tilted.
+    pub(super) fn camera(turn: f64, tilt: f64) -> Camera {
+        let rotation = DMat3::from_rotation_y(turn) * DMat3::from_rotation_x(tilt);
+        Camera {
+            width: 96,
+            height: 128,
+            fx: 300.0,
+            fy: 300.0,
+            cx: 48.0,
+            cy: 64.0,
+            distortion: Distortion::default(),
+            rotation,
+            position: rotation * DVec3::new(0.0, 0.0, 10.0),
+        }
+    }
+
+    /// Returns cameras on a ring, rising a little from one to the next.
     fn ring(count: usize) -> Vec<Camera> {
-        (0..count)
-            .map(|i| {
-                let turn = i as f64 * std::f64::consts::TAU / 9.0;
-                let rotation = DMat3::from_rotation_y(turn) * DMat3::from_rotation_x(-0.05 * i as f64);
-                Camera {
-                    width: 96,
-                    height: 128,
-                    fx: 300.0,
-                    fy: 300.0,
-                    cx: 48.0,
-                    cy: 64.0,
-                    distortion: Distortion::default(),
-                    rotation,
-                    position: rotation * DVec3::new(0.0, 0.0, 10.0),
-                }
-            })
-            .collect()
+        (0..count).map(|i| camera(i as f64 * std::f64::consts::TAU / 9.0, -0.05 * i as f64)).collect()
     }
 
     /// Returns a snowman with a nose, seen by a camera.
