@@ -371,7 +371,7 @@ impl View {
             ViewMask::File(path) => {
                 let picture = io::read_mask(path, Some(self.photo_size), limits)?;
                 if let Some(values) = values {
-                    *values = Some(MaskValues::of(&picture));
+                    *values = Some(MaskValues::count(&picture));
                 }
                 self.reduced(path, self.mask_reading.read(picture), Average::Mean).map(Some)
             }

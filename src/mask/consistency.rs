@@ -93,7 +93,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
     let mut active = vec![true; claims.len()];
     let mut conflicts = Vec::new();
     loop {
-        let conflict = Conflicts::of(&votes, &claims, &active);
+        let conflict = Conflicts::among(&votes, &claims, &active);
         let left = active.iter().filter(|a| **a).count();
         // of equals the first
         let worst = (0..claims.len())
@@ -231,7 +231,7 @@ struct Conflicts {
 }
 
 impl Conflicts {
-    fn of(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Conflicts {
+    fn among(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Conflicts {
         let count = claims.len();
         let costs = votes.costs(active);
         let found = oppositions(votes, claims, active, |claims, pixel| {
@@ -284,21 +284,22 @@ struct Opposition {
 }
 
 /// Returns the conflicts of each active view with the other ones; `best` is that of
-/// [`Opposition::of`] for a pixel of any view.
+/// [`Opposition::against`] for a pixel of any view.
 fn oppositions(
     votes: &Votes,
     claims: &[SilhouetteConstraints],
     active: &[bool],
     best: impl Fn(&SilhouetteConstraints, usize) -> Option<(bool, u16, usize)> + Sync,
 ) -> Vec<Option<Opposition>> {
-    let opposition = |j: usize| Opposition::of(votes, &claims[j], active, |pixel| best(&claims[j], pixel));
+    let opposition =
+        |j: usize| Opposition::against(votes, &claims[j], active, |pixel| best(&claims[j], pixel));
     (0..claims.len()).into_par_iter().map(|j| active[j].then(|| opposition(j))).collect()
 }
 
 impl Opposition {
     /// `best` returns the best cell on a pixel's ray: whether it lacks support (then it explains
     /// nothing, but no view is to blame), how many active views rule it out, and its index.
-    fn of(
+    fn against(
         votes: &Votes,
         claims: &SilhouetteConstraints,
         active: &[bool],

@@ -110,7 +110,7 @@ impl<'a> Search<'a> {
         }
         let digest = |parts: Vec<String>| Fingerprint::of_bytes(parts.join("\n").as_bytes());
         let fingerprint = asked(sfm).input(PHOTOGRAPHS, digest(photographs)).input("masks", digest(masks));
-        let (output, request) = (Output::of(sfm), Request { source: io::real_path(root)?, fingerprint });
+        let (output, request) = (Output::new(sfm), Request { source: io::real_path(root)?, fingerprint });
         if let Some(solution) = output.result_of(&request, None)? {
             return Ok(Search { sfm, request, work: Planned::Nothing(solution) });
         }
@@ -134,13 +134,13 @@ impl<'a> Search<'a> {
         }
         let fingerprint = asked(sfm).setting("every", every).input(PHOTOGRAPHS, Fingerprint::of_file(video)?);
         let request = Request { source: io::real_path(video)?, fingerprint };
-        if let Some(solution) = Output::of(sfm).result_of(&request, None)? {
+        if let Some(solution) = Output::new(sfm).result_of(&request, None)? {
             return Ok(Search { sfm, request, work: Planned::Nothing(solution) });
         }
         let missing = || Error::cannot("`ffmpeg` is not installed", INSTALL_FFMPEG);
         let ffmpeg = io::find_program("ffmpeg").ok_or_else(missing)?;
         let programs = Programs::find(sfm)?;
-        Output::of(sfm).require_room(database_bytes(MIN_VIEWS, true))?;
+        Output::new(sfm).require_room(database_bytes(MIN_VIEWS, true))?;
         Ok(Search { sfm, request, work: Planned::Video { video: video.into(), every, ffmpeg, programs } })
     }
 
@@ -158,7 +158,7 @@ impl<'a> Search<'a> {
     /// registered, and as the functions that plan it.
     pub fn run(self) -> Result<Solution> {
         let Search { sfm, request, work } = self;
-        let output = Output::of(sfm);
+        let output = Output::new(sfm);
         if let Planned::Nothing(solution) = work {
             return Ok(solution);
         }
@@ -297,7 +297,7 @@ fn without_cameras(root: &Path, options: &CaptureOptions) -> Result<Capture> {
             "give the folder that holds them, as PNG or JPEG; for a video, `tiface cameras --video FILE`",
         )
     };
-    let inside = FolderEntries::of(root).photographs().ok_or_else(none)?;
+    let inside = FolderEntries::list(root).photographs().ok_or_else(none)?;
     let mut names = photographs(&inside)?;
     names.retain(|name| is_nameable(name));
     let unnameable = unnameable(&inside)?;

@@ -24,7 +24,7 @@ fn typed(
     let dir = tempfile::tempdir().unwrap();
     let lock = Lock::take(&dir.path().join(".lock")).unwrap();
     let (output, request) =
-        (Output::of(&sfm), Request { source: "photographs".into(), fingerprint: asked(&sfm) });
+        (Output::new(&sfm), Request { source: "photographs".into(), fingerprint: asked(&sfm) });
     let (sfm, warnings, masked) = (&sfm, Vec::new(), true);
     let work = Work { sfm, output, request, lock, programs, names, warnings, shared, masked, is_video };
     let Commands { extractor, matcher, calibrator, mapper } =

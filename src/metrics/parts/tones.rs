@@ -46,7 +46,7 @@ struct ToneSamples([[[u64; 256]; 3]; 2]);
 
 impl ToneSamples {
     /// Collects the samples of one photograph (not cut out); `None` without a region of interest.
-    fn of(photo: &Photo, masks: Masks) -> Option<ToneSamples> {
+    fn collect(photo: &Photo, masks: Masks) -> Option<ToneSamples> {
         let (region, (width, height)) = (masks.region?, masks.size());
         let head = masks.mask.inside();
         let rest: Vec<bool> = head.iter().map(|h| !h).collect();
@@ -80,7 +80,7 @@ impl ToneSamples {
         if (skin.min(hair) as f64) <= MIN_SHARE * (skin + hair) as f64 {
             return None;
         }
-        let [skin, hair] = [0, 1].map(|kind| Tone::of(&self.0[kind]));
+        let [skin, hair] = [0, 1].map(|kind| Tone::from_histograms(&self.0[kind]));
         let apart = (0..3)
             .any(|c| (skin.median[c] - hair.median[c]).abs() > 2.0 * (skin.deviation[c] + hair.deviation[c]));
         apart.then_some(Tones { skin, hair })
@@ -88,7 +88,7 @@ impl ToneSamples {
 }
 
 impl Tone {
-    fn of(counts: &[[u64; 256]; 3]) -> Tone {
+    fn from_histograms(counts: &[[u64; 256]; 3]) -> Tone {
         let median = counts.each_ref().map(|counts| median_of_counts(counts));
         let deviation = std::array::from_fn(|c| {
             let mut away = [0; 256];
@@ -106,10 +106,10 @@ impl Tone {
 
 impl Tones {
     /// Learns the classifier from photographs; `None` if they do not separate skin and hair.
-    pub fn of(views: &[&View]) -> Result<Option<Tones>> {
+    pub fn learn(views: &[&View]) -> Result<Option<Tones>> {
         let samples = |view: &&View| -> Result<Option<ToneSamples>> {
             let loaded = view.load(&Limits::default())?;
-            Ok(Masks::of(&loaded).and_then(|masks| ToneSamples::of(&loaded.photo, masks)))
+            Ok(Masks::of(&loaded).and_then(|masks| ToneSamples::collect(&loaded.photo, masks)))
         };
         let found = views.par_iter().map(samples).collect::<Result<Vec<_>>>()?;
         let sum = found.into_iter().flatten().reduce(|a, b| a.and(&b));
@@ -168,7 +168,7 @@ mod tests {
     fn a_soft_rim_shows_the_color_of_hair_and_a_hard_one_that_of_skin() {
         let (photo, mask, region) = head([60, 40, 30], [200, 150, 140]);
         let masks = Masks { region: Some(&region), ..only(&mask) };
-        let samples = ToneSamples::of(&photo, masks).unwrap();
+        let samples = ToneSamples::collect(&photo, masks).unwrap();
         let tones = samples.clone().and(&samples).tones().unwrap();
         assert_eq!((tones.hair.median, tones.skin.median), ([60.0, 40.0, 30.0], [200.0, 150.0, 140.0]));
         let (skin, hair) = tones.split(&photo, masks).unwrap();
@@ -191,10 +191,10 @@ mod tests {
         let (photo, mut mask, region) = head([60, 40, 30], [200, 150, 140]);
         let same = Photo { rgb: vec![[90; 3]; 800], ..photo.clone() };
         let masks = Masks { region: Some(&region), ..only(&mask) };
-        assert_eq!(ToneSamples::of(&same, masks).unwrap().tones(), None);
-        assert!(ToneSamples::of(&photo, only(&mask)).is_none());
+        assert_eq!(ToneSamples::collect(&same, masks).unwrap().tones(), None);
+        assert!(ToneSamples::collect(&photo, only(&mask)).is_none());
         mask.values.iter_mut().for_each(|m| *m = if *m >= 128 { 255 } else { 0 });
         let masks = Masks { region: Some(&region), ..only(&mask) };
-        assert_eq!(ToneSamples::of(&photo, masks).unwrap().tones(), None);
+        assert_eq!(ToneSamples::collect(&photo, masks).unwrap().tones(), None);
     }
 }
