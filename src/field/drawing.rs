@@ -193,7 +193,7 @@ mod tests {
         }
     }
 
-    /// With `--release --ignored --nocapture` and `TIFACE_PHOTOGRAPHS=28` it measures a whole capture.
+    /// With `TIFACE_PHOTOGRAPHS=28`, `--release`, `--ignored`, `--nocapture`: a whole capture.
     #[test]
     #[cfg(target_os = "linux")]
     #[ignore = "run by the test above, in a process of its own"]
