@@ -64,6 +64,30 @@ const PICTURE_BYTES: u64 = 8192 * (128 + 24);
 /// Bytes of the database for two pictures that are matched, on average.
 const PAIR_BYTES: u64 = 2 << 10;
 
+/// Advice where COLMAP ended otherwise than it should.
+const READ_LOG: &str = "the end of the log says why; if memory ran out, set RAYON_NUM_THREADS=1, which is COLMAP's number of \
+                        threads as well, or reduce the photographs";
+
+/// Advice where too few photographs were registered.
+const MORE_OVERLAP: &str = "photograph the head again, sharply and in even light, from all sides with 10° to 15° between \
+                            neighbors, while it holds still; a textured background that stays with the head helps";
+
+/// Where the result goes, and how it is found.
+pub struct SfmOptions<'a> {
+    /// The new capture.
+    pub out: PathBuf,
+    /// Whether each photograph has a lens of its own, even if sizes and focal lengths agree.
+    pub lens_each: bool,
+    /// Whether GLOMAP, or the global mapper that it became, finds the poses from COLMAP's matches.
+    pub glomap: bool,
+    /// Limits of what is read.
+    pub limits: Limits,
+    /// Receives a line about each step.
+    pub say: &'a dyn Fn(&str),
+    /// Whether to stop.
+    pub stop: &'a dyn Fn() -> bool,
+}
+
 /// Cameras that were found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Solution {

@@ -24,30 +24,6 @@ use tiface_base::{Error, Result};
 const INSTALL_FFMPEG: &str = "install FFmpeg: `apt-get install ffmpeg` on Debian and Ubuntu, `brew install ffmpeg` on macOS, \
                               `winget install ffmpeg` on Windows";
 
-/// Advice where COLMAP ended otherwise than it should.
-const READ_LOG: &str = "the end of the log says why; if memory ran out, set RAYON_NUM_THREADS=1, which is COLMAP's number of \
-                        threads as well, or reduce the photographs";
-
-/// Advice where too few photographs were registered.
-const MORE_OVERLAP: &str = "photograph the head again, sharply and in even light, from all sides with 10° to 15° between \
-                            neighbors, while it holds still; a textured background that stays with the head helps";
-
-/// Where the result goes, and how it is found.
-pub struct SfmOptions<'a> {
-    /// The new capture.
-    pub out: PathBuf,
-    /// Whether each photograph has a lens of its own, even if sizes and focal lengths agree.
-    pub lens_each: bool,
-    /// Whether GLOMAP, or the global mapper that it became, finds the poses from COLMAP's matches.
-    pub glomap: bool,
-    /// Limits of what is read.
-    pub limits: Limits,
-    /// Receives a line about each step.
-    pub say: &'a dyn Fn(&str),
-    /// Whether to stop.
-    pub stop: &'a dyn Fn() -> bool,
-}
-
 /// A search for cameras that can begin: what may refuse it has been asked, and nothing has been
 /// written.
 pub struct Search<'a> {
