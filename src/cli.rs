@@ -1,16 +1,17 @@
-//! The command line: a file per command, with its name; small commands share `about`, `capture` and
-//! `status`. The only module that prints.
+//! The command line: a file per command, with its name; those that work on captures share
+//! `capture`. The only module that prints.
 //!
 //! Data goes to stdout, everything else to stderr; the exit code distinguishes errors worth a retry
 //! ([`tiface_base::ErrorKind`]).
 
-mod about;
 mod bench;
 mod cameras;
 mod capture;
 mod check;
 mod complete;
+mod config;
 mod demo;
+mod doctor;
 mod experiment;
 mod export;
 mod flags;
@@ -22,6 +23,7 @@ mod run;
 mod screen;
 mod signals;
 mod status;
+mod verify;
 
 use crate::config::key;
 use crate::pipeline::Stage;
@@ -462,10 +464,10 @@ pub fn main(collect: fn()) -> ExitCode {
         Command::Experiment(options) => experiment::run(&invocation, options),
         Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
         Command::Report { runs, table } => report::run(&invocation, runs, *table),
-        Command::Verify { runs } => makes_nothing("verify").and_then(|()| status::verify(&invocation, runs)),
+        Command::Verify { runs } => makes_nothing("verify").and_then(|()| verify::run(&invocation, runs)),
         Command::Config { input, explain } => makes_nothing("config")
-            .and_then(|()| about::config(&common, input.path.as_deref(), explain.as_deref())),
-        Command::Doctor => makes_nothing("doctor").and_then(|()| about::doctor(&common)),
+            .and_then(|()| config::run(&common, input.path.as_deref(), explain.as_deref())),
+        Command::Doctor => makes_nothing("doctor").and_then(|()| doctor::run(&common)),
         Command::Completions { shell } => {
             makes_nothing("completions").and_then(|()| screen::print(&complete::script(*shell)))
         }

@@ -12,26 +12,34 @@
 //! place.
 
 mod affects;
+mod device;
+mod explain;
 pub mod iface;
 mod mask;
 mod mesh;
+mod preset;
 mod render;
+mod row;
 mod source;
 mod stage;
 mod table;
 mod vm;
 
 pub use affects::{Effect, Product};
+pub use device::DeviceChoice;
+pub use explain::{Explained, explain, explained};
 pub use iface::IfaceConfig;
 pub use mask::{
     CameraPoses, CaptureConfig, CutMethod, Exposures, HeadValue, MaskConfig, MaskHead, MaskMeaning,
     MaskSource, MattingMethod, VitmatteColors,
 };
 pub use mesh::{ColorSource, Genus, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
+pub use preset::Preset;
 pub use render::{
     EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
     display_name,
 };
+pub use row::{Flag, Key, Takes};
 pub use source::{Fallback, Sources, known_words};
 pub use stage::Stage;
 pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
@@ -41,111 +49,9 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
 use toml::{Table, Value};
-
-/// A key of the configuration: what it means and what a number may be.
-#[derive(Clone, Copy, Debug)]
-pub struct Key {
-    /// Name inside its table.
-    pub name: &'static str,
-    /// What it means, with its unit.
-    pub doc: &'static str,
-    /// Minimum; `f64::NEG_INFINITY` if unbounded or not numeric.
-    pub min: f64,
-    /// Maximum; `f64::INFINITY` if unbounded or not numeric.
-    pub max: f64,
-    /// What its value changes; empty: no result.
-    pub affects: &'static [Effect],
-    /// The option of commands that sets it.
-    pub flag: Option<Flag>,
-}
-
-/// An option of commands that sets a key.
-#[derive(Clone, Copy, Debug)]
-pub struct Flag {
-    /// Its name, without `--`.
-    pub long: &'static str,
-    /// The values that it takes.
-    pub takes: Takes,
-    /// The commands that have it.
-    pub commands: &'static [&'static str],
-    /// What it does; empty: the documentation of the key.
-    pub help: &'static str,
-}
-
-/// The values of a [`Flag`], with their name in help.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Takes {
-    /// One value.
-    Text(&'static str),
-    /// A file, which is stored by its absolute path.
-    File,
-    /// The option is repeatable: a list.
-    Each(&'static str),
-    /// None: the option stands for this value.
-    Switch(&'static str),
-}
-
-impl Key {
-    /// Returns whether the value of this key affects a product directly, with these settings.
-    pub fn affects(&self, product: Product, config: &Config) -> bool {
-        self.affects.iter().any(|effect| effect.reaches(product, config))
-    }
-
-    /// `1 to 64`, `at least 1`; empty where every value is allowed.
-    pub fn range(&self) -> String {
-        match (self.min.is_finite(), self.max.is_finite()) {
-            (true, true) => format!("{} to {}", self.min, self.max),
-            (true, false) => format!("at least {}", self.min),
-            (false, true) => format!("at most {}", self.max),
-            (false, false) => String::new(),
-        }
-    }
-}
-
-/// How much effort: the starting values of every table.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Preset {
-    /// A look in two to three minutes on two cores: [`Preset::Draft`] with fewer steps.
-    Quick,
-    /// A first result in minutes.
-    Draft,
-    /// What to use.
-    #[default]
-    Standard,
-    /// The published recipe; changes only to be corrected.
-    Paper,
-}
-
-impl Preset {
-    /// All presets, from the least effort to the most.
-    pub const ALL: [Preset; 4] = [Preset::Quick, Preset::Draft, Preset::Standard, Preset::Paper];
-
-    /// Its word in the configuration.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Preset::Quick => "quick",
-            Preset::Draft => "draft",
-            Preset::Standard => "standard",
-            Preset::Paper => "paper",
-        }
-    }
-}
-
-impl FromStr for Preset {
-    type Err = Error;
-
-    fn from_str(word: &str) -> Result<Preset> {
-        let found = Preset::ALL.into_iter().find(|preset| preset.as_str() == word);
-        found.ok_or_else(|| {
-            Error::usage(format!("there is no preset `{word}`"), "use quick, draft, standard or paper")
-        })
-    }
-}
 
 /// The whole configuration, complete and valid.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -415,56 +321,6 @@ impl Config {
     }
 }
 
-/// A key with its meaning, its range and its value in every preset.
-#[derive(Clone, Debug, Serialize)]
-pub struct Explained {
-    /// Its full, dotted name.
-    pub key: String,
-    /// What it means, with its unit.
-    pub meaning: &'static str,
-    /// The numbers that are allowed, as text; empty where every value is.
-    pub allowed: String,
-    /// Its value by preset.
-    pub values: BTreeMap<&'static str, Value>,
-}
-
-/// Returns a key, or all keys of a table; an unknown name is an error that knows the nearest one.
-pub fn explained(name: &str) -> Result<Vec<Explained>> {
-    let wanted = all_keys().filter(|(full, _)| full == name || full.starts_with(&format!("{name}.")));
-    let tables = Preset::ALL.map(|preset| (preset.as_str(), Config::preset(preset).to_table()));
-    let one = |(full, key): (String, &Key)| {
-        let value = |(preset, table): &(&'static str, Table)| Some((*preset, lookup(table, &full)?.clone()));
-        let values = tables.iter().filter_map(value).collect();
-        Explained { key: full, meaning: key.doc, allowed: key.range(), values }
-    };
-    let found: Vec<Explained> = wanted.map(one).collect();
-    if found.is_empty() { Err(source::unknown(name).within("`--explain`")) } else { Ok(found) }
-}
-
-/// Returns what a key or a whole table means, its range and its value in every preset; an unknown
-/// name is an error that knows the nearest one.
-pub fn explain(name: &str) -> Result<String> {
-    let mut out = String::new();
-    for (i, Explained { key, meaning, allowed, values }) in explained(name)?.into_iter().enumerate() {
-        if i > 0 {
-            out.push('\n');
-        }
-        let _ = writeln!(out, "{key}\n  {meaning}");
-        if !allowed.is_empty() {
-            let _ = writeln!(out, "  allowed: {allowed}");
-        }
-        let [quick, draft, standard, paper] =
-            Preset::ALL.map(|preset| values.get(preset.as_str()).map(show).unwrap_or_default());
-        if key == key!(preset) || (quick == draft && draft == standard && standard == paper) {
-            let _ = writeln!(out, "  default: {standard}");
-        } else {
-            let _ =
-                writeln!(out, "  quick: {quick}   draft: {draft}   standard: {standard}   paper: {paper}");
-        }
-    }
-    Ok(out)
-}
-
 fn lookup<'a>(root: &'a Table, dotted: &str) -> Option<&'a Value> {
     let mut parts = dotted.split('.');
     let mut value = root.get(parts.next()?)?;
@@ -482,50 +338,6 @@ fn show(value: &Value) -> String {
             format!("{:?}", *f as f32) // `1e-5` and `2.0` are TOML as they stand
         }
         other => other.to_string(),
-    }
-}
-
-/// Names of devices.
-const DEVICES: [&str; 6] = ["auto", "cpu", "wgpu", "vulkan", "metal", "dx12"];
-
-/// A device, and how it is to be used.
-#[derive(Clone, Debug, PartialEq)]
-pub struct DeviceChoice {
-    /// `auto`, `cpu`, `wgpu` (Vulkan, Metal or DX12), `vulkan`, `metal` or `dx12`.
-    pub name: String,
-    /// Which of its adapters, from 0.
-    pub number: Option<usize>,
-    /// Whether GPU sums are accumulated in fixed point, bitwise reproducible; on the CPU they
-    /// always are.
-    pub deterministic: bool,
-    /// Memory that a training may use, GiB; `None`: all of it.
-    pub memory_gib: Option<f64>,
-}
-
-impl DeviceChoice {
-    /// Returns the choice of a word; none where it is no such word.
-    pub fn parse(word: &str) -> Option<DeviceChoice> {
-        let mut parts = word.split('+');
-        let device = parts.next()?;
-        let (name, number) = match device.split_once(':') {
-            Some((name, number)) => (name, Some(number.parse().ok()?)),
-            None => (device, None),
-        };
-        if !DEVICES.contains(&name) || (number.is_some() && ["auto", "cpu"].contains(&name)) {
-            return None;
-        }
-        let mut choice = DeviceChoice { name: name.into(), number, deterministic: false, memory_gib: None };
-        for part in parts {
-            match part.strip_suffix("GiB") {
-                Some(gib) => {
-                    let gib = gib.parse().ok().filter(|gib: &f64| gib.is_finite() && *gib > 0.0);
-                    choice.memory_gib = Some(gib?);
-                }
-                None if part == "deterministic" => choice.deterministic = true,
-                None => return None,
-            }
-        }
-        Some(choice)
     }
 }
 
@@ -577,55 +389,11 @@ mod tests {
     }
 
     #[test]
-    fn explaining_a_key_gives_its_range_and_its_value_in_every_preset() {
-        let text = explain("mesh.resolution").unwrap();
-        assert!(
-            text.contains("allowed: 16 to 4096") && text.contains("quick: 256   draft: 256   standard: 512"),
-            "{text}"
-        );
-        let text = explain("iface.steps").unwrap();
-        assert!(text.contains("quick: 1200   draft: 3000   standard: 8000"), "{text}");
-        assert!(explain("mesh").unwrap().matches("mesh.").count() > 3);
-        assert!(explain("mesh.resolutoin").unwrap_err().hint().contains("mesh.resolution"));
-    }
-
-    #[test]
     fn a_number_from_an_f32_is_written_with_the_digits_of_an_f32() {
         assert_eq!(show(&Value::Float(0.1f32 as f64)), "0.1");
         assert_eq!(show(&Value::Float(0.1)), "0.1");
         assert_eq!(show(&Value::Float(2.0)), "2.0");
         let tiny = show(&Value::Float(1e-12f32 as f64));
         assert_eq!(tiny.parse::<f32>().unwrap(), 1e-12f32);
-    }
-
-    #[test]
-    fn words_are_taken_apart_and_others_are_none() {
-        let parsed = |word| DeviceChoice::parse(word);
-        let plain = parsed("auto").unwrap();
-        assert_eq!((plain.name.as_str(), plain.number, plain.deterministic), ("auto", None, false));
-        let all = parsed("vulkan:3+deterministic+7.5GiB").unwrap();
-        let want = DeviceChoice {
-            name: "vulkan".into(),
-            number: Some(3),
-            deterministic: true,
-            memory_gib: Some(7.5),
-        };
-        assert_eq!(all, want);
-        assert_eq!(parsed("dx12:1").unwrap().number, Some(1));
-        for wrong in [
-            "",
-            "gpu",
-            "cpu:0",
-            "auto:1",
-            "wgpu:",
-            "wgpu:-1",
-            "wgpu+",
-            "wgpu+fast",
-            "wgpu+0GiB",
-            "wgpu+NaNGiB",
-            "cuda",
-        ] {
-            assert_eq!(parsed(wrong), None, "{wrong}");
-        }
     }
 }

@@ -22,6 +22,8 @@ pub mod pixels;
 #[cfg(feature = "wgpu")]
 pub(crate) mod self_test;
 pub mod soft_pixels;
+#[cfg(test)]
+pub(crate) mod testing;
 pub mod training;
 
 pub use compute_device::{ComputeDevice, compute_device, examine_devices, require_device};

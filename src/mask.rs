@@ -11,8 +11,9 @@
 //! unknown in a trimap.
 
 mod clicks;
+pub mod distance;
 mod hull;
-pub mod morphology;
+mod morphology;
 
 pub mod prompts;
 

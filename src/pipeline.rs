@@ -31,6 +31,7 @@ pub mod experiment;
 mod export;
 mod exposure;
 mod finish;
+mod frames;
 mod inputs;
 mod learn;
 mod mask;
@@ -52,7 +53,7 @@ pub use crate::config::Stage;
 pub use bench::{Bench, SWEEPS};
 pub use compare::{Judged, compare_runs, judge};
 pub use export::KeptHead;
-pub use finish::Export;
+pub use frames::Export;
 pub use inputs::capture_options;
 pub use mask::{click_page, inspect_capture};
 pub use metrics::{Truth, against_truth};
@@ -159,6 +160,8 @@ mod clicks_tests;
 mod ensemble_tests;
 #[cfg(test)]
 mod exposure_tests;
+#[cfg(test)]
+mod formula_tests;
 #[cfg(test)]
 mod path_tests;
 #[cfg(test)]

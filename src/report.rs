@@ -9,19 +9,22 @@ mod chart;
 pub mod experiment;
 mod live;
 mod runs;
+mod text;
+mod verdicts;
 
 pub use chart::{Chart, Curve, charts, curves_csv};
 pub use live::live_html;
 pub use runs::{RunRow, runs_csv, runs_html};
+pub(crate) use text::{base64, escape};
+pub use text::{duration, leaves, link, picture_url, relative};
+pub use verdicts::{blend_verdict, glb_megabytes, height, judged_by, warnings};
 
-use crate::config::{Stage, display_name};
-use crate::run::Record;
-use base64::prelude::{BASE64_STANDARD, Engine};
+use crate::config::Stage;
 use minijinja::{Environment, context};
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::json;
 use sha2::{Digest, Sha256};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use tiface_base::image::{Photo, over_black, quantize, reduce_photo, srgb_from_linear, working_size};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, ErrorKind, Result};
@@ -51,13 +54,6 @@ fn views(run: &Path, word: &str) -> Vec<String> {
     let is_beside = |path: &Path| ["depth", "float"].iter().any(|name| path == root.join(name));
     let files = io::file_sizes(&root, &is_beside).unwrap_or_default().into_keys();
     files.filter(|f| f.ends_with(".png") || f.ends_with(".exr")).map(|f| format!("{folder}/{f}")).collect()
-}
-
-/// Returns a text as a quoted field of comma-separated values.
-fn csv_text(text: &str) -> String {
-    // spreadsheets take text that begins like a formula for one
-    let text = if text.starts_with(['=', '+', '-', '@']) { format!("'{text}") } else { text.to_owned() };
-    format!("\"{}\"", text.replace('"', "\"\""))
 }
 
 /// Returns a view over black as a JPEG file of at most `side` pixels; `None` where it cannot be
@@ -289,140 +285,10 @@ fn fill(template: &str, script: &str, context: minijinja::Value) -> Result<Strin
     parts.and(page).and_then(|page| page.render(context)).map_err(|e| Error::new(ErrorKind::Bug, e))
 }
 
-/// Returns a picture file, PNG, JPEG or SVG, as a `data:` address.
-pub fn picture_url(file: &[u8]) -> String {
-    let kind = match file {
-        [0xFF, 0xD8, ..] => "jpeg",
-        [b'<', ..] => "svg+xml",
-        _ => "png",
-    };
-    format!("data:image/{kind};base64,{}", base64(file))
-}
-
-/// Returns a path as an address relative to the page: reserved characters are percent-encoded (RFC
-/// 3986).
-pub fn link(path: &str) -> String {
-    let byte = |b: u8| match b {
-        b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' | b'/' => (b as char).to_string(),
-        other => format!("%{other:02X}"),
-    };
-    path.bytes().map(byte).collect()
-}
-
-/// Returns the address of a file, relative to the folder of a page; of the file itself if one of
-/// them does not exist.
-pub fn relative(file: &Path, folder: &Path) -> String {
-    let (Ok(file), Ok(folder)) = (io::real_path(file), io::real_path(folder)) else {
-        return link(&file.to_string_lossy());
-    };
-    let shared = file.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
-    let up = folder.components().skip(shared).map(|_| Path::new(".."));
-    let path: PathBuf = up.chain(file.components().skip(shared).map(|c| Path::new(c.as_os_str()))).collect();
-    link(&path.to_string_lossy())
-}
-
-/// Leaves of a JSON value with dotted names, as a person reads them; lists in one row.
-pub fn leaves(value: &Value) -> Vec<(String, String)> {
-    let Value::Object(map) = value else {
-        let text = match value {
-            Value::Number(n) if n.is_f64() => format!("{:.4}", n.as_f64().unwrap_or(f64::NAN)),
-            Value::Null => "–".into(),
-            Value::String(s) => s.clone(),
-            other => other.to_string(),
-        };
-        return vec![(String::new(), text)];
-    };
-    let inner = |(key, value): (&String, &Value)| {
-        let name = |inner: String| if inner.is_empty() { key.clone() } else { format!("{key}.{inner}") };
-        leaves(value).into_iter().map(|(inner, text)| (name(inner), text)).collect::<Vec<_>>()
-    };
-    map.iter().flat_map(inner).collect()
-}
-
-/// Returns what the figures of `metrics.json` were taken against, from its `truth`: a few words, or
-/// nothing where it says nothing.
-pub fn judged_by(truth: &Value) -> Option<String> {
-    let photographs = match truth["photographs"].as_str()? {
-        "photo" => "against photographs as they were taken",
-        _ => "against photographs cut out by their masks",
-    };
-    let masks = match truth["masks"].as_str()? {
-        "capture" => "inside the capture's masks",
-        "run" => "inside masks that this run made: others may judge otherwise",
-        _ => "without masks",
-    };
-    Some(format!("judged {photographs}, {masks}"))
-}
-
-/// Returns the statement that a blend is no better than the best of its members, from the `blend`
-/// of `metrics.json`; `None` if the blend is better.
-pub fn blend_verdict(blend: &Value) -> Option<String> {
-    let gain = blend["gain_db"].as_f64().filter(|gain| *gain <= 0.0)?;
-    let member = display_name(blend["best_member"].as_str()?);
-    Some(format!(
-        "the blend is not better than its best member on the views that are judged: {:.2} dB below {member}",
-        -gain
-    ))
-}
-
-/// Returns the height of what a run shows, from the figures of its stages: the mesh's own, else
-/// that of the masks' hull.
-pub fn height(mask: Option<&Value>, mesh: Option<&Value>) -> Option<String> {
-    let of = |figures: &Value| Some((figures["height_units"].as_f64()?, figures["height_m"].as_f64()?));
-    let told = |what: &str, (units, meters): (f64, f64)| {
-        format!("{what} {meters:.3} m high ({units:.3} units of the dataset)")
-    };
-    let shown = mesh.and_then(|mesh| Some(told(mesh["shows"].as_str().unwrap_or("head"), of(mesh)?)));
-    shown.or_else(|| Some(told("by the masks", of(mask?)?)))
-}
-
-/// Returns the size of a run's `head.glb` in megabytes of 10⁶ bytes.
-pub fn glb_megabytes(run: &Path) -> Option<f64> {
-    io::file_size(&run.join("mesh/head.glb")).map(|bytes| bytes as f64 / 1e6)
-}
-
-/// Returns the warnings of a run by its records: what its stages warned of, what is wrong with
-/// their results, and which files are no longer as a stage left them, each with what to do. The
-/// reports of one run and of many have the same.
-pub fn warnings<'r>(run: &Path, records: impl IntoIterator<Item = (Stage, &'r Record)>) -> Vec<String> {
-    let mut all = Vec::new();
-    for (stage, record) in records {
-        all.extend(record.warnings.iter().map(|w| format!("{stage}: {w}")));
-        let verdict = blend_verdict(&record.summary["blend"]);
-        all.extend(verdict.map(|v| format!("{stage}: {v}; use its views, or give `ensemble.weights`")));
-        if record.summary["closed"] == false {
-            all.push(format!("{stage}: the surface is not watertight; `tiface check RUN` says why"));
-        }
-        all.extend(record.faults(&run.join(stage)).iter().map(|fault| format!("{stage}: {fault}")));
-    }
-    all
-}
-
-/// `8.2 s`, `2 min 25 s`, `3 h 07 min`.
-pub fn duration(seconds: f64) -> String {
-    let s = seconds.max(0.0);
-    let whole = s.round() as u64;
-    match whole {
-        0..10 => format!("{s:.1} s"),
-        10..60 => format!("{whole} s"),
-        60..3600 => format!("{} min {:02} s", whole / 60, whole % 60),
-        _ => format!("{} h {:02} min", whole / 3600, whole % 3600 / 60),
-    }
-}
-
-/// Text for between and inside the tags of a page.
-pub(crate) fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
-}
-
-/// RFC 4648, with padding.
-pub(crate) fn base64(bytes: &[u8]) -> String {
-    BASE64_STANDARD.encode(bytes)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::path::PathBuf;
 
     const HOSTILE: &str = "<img src=x onerror=alert(1)>\"'</script>";
 
@@ -567,43 +433,6 @@ mod tests {
     }
 
     #[test]
-    fn the_height_told_is_that_of_the_mesh_where_there_is_one() {
-        let mask = json!({"height_units": 1.5, "height_m": 0.3});
-        let mesh = json!({"shows": "head and shoulders", "height_units": 1.4, "height_m": 0.28});
-        let said = |mask, mesh| height(mask, mesh).unwrap_or_default();
-        assert_eq!(
-            said(Some(&mask), Some(&mesh)),
-            "head and shoulders 0.280 m high (1.400 units of the dataset)"
-        );
-        assert_eq!(said(Some(&mask), None), "by the masks 0.300 m high (1.500 units of the dataset)");
-        // a mesh of a run from before tells none
-        assert!(said(Some(&mask), Some(&json!({}))).starts_with("by the masks"));
-        assert_eq!(height(Some(&json!({"height_units": null})), None), None);
-    }
-
-    #[test]
-    fn a_report_has_the_warnings_of_all_stages_with_what_to_do() {
-        let record = |summary: Value, warned: &[&str]| -> Record {
-            serde_json::from_value(json!({
-                "stage": "", "fingerprint": crate::run::Fingerprint::default(), "digest": "", "summary": summary,
-                "elapsed_s": 1.0, "warnings": warned, "finished": 0, "version": "",
-            }))
-            .unwrap()
-        };
-        let blend = json!({"blend": {"best_member": "tface", "gain_db": -0.5}});
-        let records = [
-            (Stage::Mask, record(json!({}), &["one mask is white"])),
-            (Stage::Mesh, record(json!({"closed": false}), &["the GPU failed"])),
-            (Stage::Metrics, record(blend, &[])),
-        ];
-        let run = Path::new("run");
-        let all = warnings(run, records.iter().map(|(stage, record)| (*stage, record)));
-        assert_eq!(all[..2], ["mask: one mask is white", "mesh: the GPU failed"]);
-        assert!(all[2].starts_with("mesh: the surface is not watertight; `tiface check"), "{all:?}");
-        assert!(all[3].starts_with("metrics: the blend") && all[3].contains("`ensemble.weights`"), "{all:?}");
-    }
-
-    #[test]
     fn the_best_of_a_column_is_marked_by_what_is_better_there() {
         let MethodTable { headings, rows } = report().table;
         assert_eq!(headings, ["PSNR", "s", "triangles"]);
@@ -611,19 +440,5 @@ mod tests {
         assert_eq!(cells(0), [("30.00", false), ("31.00", true)]);
         assert_eq!(cells(1), [("2.0", true), ("–", false)]);
         assert_eq!(cells(2), [("–", false), ("9", false)]);
-    }
-
-    #[test]
-    fn a_link_is_a_path_and_nothing_else() {
-        assert_eq!(link("render/tface/a b.png"), "render/tface/a%20b.png");
-        assert_eq!(link("javascript:x#?%ü"), "javascript%3Ax%23%3F%25%C3%BC");
-    }
-
-    #[test]
-    fn times_are_short() {
-        assert_eq!(
-            [8.24, 59.6, 145.0, 11_220.0].map(duration),
-            ["8.2 s", "1 min 00 s", "2 min 25 s", "3 h 07 min"]
-        );
     }
 }

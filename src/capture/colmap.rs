@@ -332,8 +332,8 @@ pub(super) fn files(images: &[(String, &geom::Camera)]) -> Result<[(&'static str
     let mut lenses: Vec<(u32, Camera)> = Vec::new();
     let mut listed = (images.len() as u64).to_le_bytes().to_vec();
     for (i, (name, camera)) in images.iter().enumerate() {
-        let (model, values) =
-            LensModel::of(camera).ok_or_else(|| format!("no model of COLMAP's has the lens of `{name}`"))?;
+        let (model, values) = LensModel::for_camera(camera)
+            .ok_or_else(|| format!("no model of COLMAP's has the lens of `{name}`"))?;
         let lens = Camera { model, width: camera.width.into(), height: camera.height.into(), values };
         let known = lenses.iter().find(|(_, known)| *known == lens).map(|(id, _)| *id);
         let number = known.unwrap_or(lenses.len() as u32 + 1);

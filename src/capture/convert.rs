@@ -296,7 +296,7 @@ fn lens(files: &ViewFiles) -> Result<Map<String, Value>> {
         let message = format!("no camera model has the lens of `{}`", files.view.name);
         Error::cannot(message, "undistort the photographs first")
     };
-    let (model, values) = LensModel::of(camera).ok_or_else(unknown)?;
+    let (model, values) = LensModel::for_camera(camera).ok_or_else(unknown)?;
     let mut keys = Map::new();
     keys.insert("camera_model".into(), model.name.into());
     keys.insert("w".into(), camera.width.into());

@@ -165,7 +165,7 @@ impl CaptureFolder<'_> {
         if let Some(name) = names.iter().find(|name| io::is_folder(&self.root.join(name))) {
             return listed(name);
         }
-        let folders = FolderEntries::of(self.root).folders;
+        let folders = FolderEntries::list(self.root).folders;
         let among = |names: &[&str]| -> Vec<&String> {
             let is_there = |name: &&String| names.contains(&fold(name).as_str());
             let has_photographs =
@@ -239,7 +239,7 @@ pub(super) struct FolderEntries {
 
 impl FolderEntries {
     /// Lists a folder. Names that are not UTF-8, and folders that cannot be listed, are ignored.
-    pub fn of(root: &Path) -> FolderEntries {
+    pub fn list(root: &Path) -> FolderEntries {
         let name = |p: &PathBuf| Some(p.file_name()?.to_str()?.to_owned());
         let folders = io::list_folders(root).unwrap_or_default();
         FolderEntries {
@@ -284,7 +284,7 @@ impl FolderEntries {
         [self.root.clone()]
             .into_iter()
             .chain(folders)
-            .find(|f| FolderEntries::of(f).ending(&PHOTOGRAPHS).is_some())
+            .find(|f| FolderEntries::list(f).ending(&PHOTOGRAPHS).is_some())
     }
 }
 

@@ -57,7 +57,7 @@ impl CameraFiles {
         if let Some(file) = found_of(&neus::FILES).first() {
             return Some(CameraFiles::Neus(file));
         }
-        let found = FolderEntries::of(root);
+        let found = FolderEntries::list(root);
         let metashape = || found.holding("xml", "<chunk").cloned().map(CameraFiles::Metashape);
         let table = |ending| found.beginning(ending, realitycapture::is_table).cloned();
         let csv = || ["csv", "tsv", "txt"].into_iter().find_map(table).map(CameraFiles::RealityCapture);
@@ -150,7 +150,7 @@ pub fn is_run(folder: &Path) -> bool {
     };
     let is_begun = || Stage::ALL.iter().any(has_record);
     let is_capture = || {
-        let found = FolderEntries::of(folder);
+        let found = FolderEntries::list(folder);
         let is_recognized = programs::recognized(&found).is_some() || found.photographs().is_some();
         CameraFiles::find(folder).is_some() || is_recognized || found.ending(&VIDEOS).is_some()
     };
@@ -163,7 +163,7 @@ fn not_a_capture(root: &Path, found: impl Display, hint: impl Into<String>) -> E
 
 /// Returns the error for a folder that is no capture: what it looks like, and how to convert it.
 pub(super) fn explain(root: &Path) -> Error {
-    let found = FolderEntries::of(root);
+    let found = FolderEntries::list(root);
     if is_run(root)
         && let Some(path) =
             Config::of_run(root).map(|run| run.capture.path).filter(|path| !path.as_os_str().is_empty())
@@ -300,7 +300,7 @@ fn has_pictures(root: &Path) -> bool {
 fn above(root: &Path) -> Option<Error> {
     let real = io::real_path(root).ok()?;
     let is_photographs = real.file_name().and_then(|n| n.to_str()).is_some_and(is_common_name)
-        && FolderEntries::of(root).ending(&PHOTOGRAPHS).is_some();
+        && FolderEntries::list(root).ending(&PHOTOGRAPHS).is_some();
     real.ancestors().enumerate().skip(1).take(3).find_map(|(level, folder)| {
         let is_inside = |place: &str| folder.join(place).starts_with(&real);
         let model =
@@ -363,7 +363,7 @@ fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
     }
     let cameras = format!("`tiface cameras {}`", found.root.display());
     let is_folder_of_pictures =
-        |name: &String| FolderEntries::of(&found.root.join(name)).ending(&PHOTOGRAPHS).is_some();
+        |name: &String| FolderEntries::list(&found.root.join(name)).ending(&PHOTOGRAPHS).is_some();
     let photographs = found.photographs();
     if (photographs.is_some() || found.folders.iter().take(64).any(is_folder_of_pictures))
         && let Some(file) = programs::cameras_of_unknown_kind(found)
@@ -376,7 +376,7 @@ fn recognized(found: &FolderEntries) -> Option<(&'static str, String, String)> {
         return Some(("photographs with cameras in a form whose axes are not known", file, way));
     }
     if let Some(folder) = photographs {
-        let first = FolderEntries::of(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();
+        let first = FolderEntries::list(&folder).ending(&PHOTOGRAPHS).cloned().unwrap_or_default();
         let nearest =
             nearest(found).map_or(String::new(), |n| format!("; nearest to a file of cameras is {n}"));
         let way = format!("find them with COLMAP: {cameras}{nearest}");

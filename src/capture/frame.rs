@@ -335,7 +335,7 @@ impl LensModel {
     }
 
     /// Returns the shortest model that says everything about a camera's lens, and its parameters.
-    pub fn of(camera: &Camera) -> Option<(&'static LensModel, Vec<f64>)> {
+    pub fn for_camera(camera: &Camera) -> Option<(&'static LensModel, Vec<f64>)> {
         let shortest = ["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "FOV"];
         shortest.into_iter().find_map(|name| {
             let model = LensModel::named(name).ok()?;
@@ -473,7 +473,7 @@ mod tests {
             let values: Vec<f64> = model.parameters.split(' ').enumerate().map(value).collect();
             let intrinsics = model.intrinsics((160, 120), &values).unwrap();
             let camera = intrinsics.camera((160, 120), DMat3::IDENTITY, DVec3::ZERO).unwrap();
-            let (other, again) = LensModel::of(&camera).unwrap();
+            let (other, again) = LensModel::for_camera(&camera).unwrap();
             let back = other.intrinsics((160, 120), &again).unwrap();
             assert_eq!(back.camera((160, 120), DMat3::IDENTITY, DVec3::ZERO).unwrap(), camera, "{model:?}");
             // and its corners look somewhere

@@ -185,7 +185,7 @@ pub(crate) struct MaskValues {
 
 impl MaskValues {
     /// Counts the values of a file.
-    pub fn of(picture: &MaskPicture) -> MaskValues {
+    pub fn count(picture: &MaskPicture) -> MaskValues {
         let mut tallies = vec![Tally::default(); 256 + (1 << 15)];
         let width = picture.width as usize;
         let mut run = Tally::default();
@@ -494,7 +494,7 @@ mod tests {
     fn surveyed(files: &[MaskPicture]) -> MaskSurvey {
         let mut survey = MaskSurvey::default();
         for (i, picture) in files.iter().enumerate() {
-            survey.add(Path::new(&format!("/a/masks/{i}.png")), MaskValues::of(picture), None);
+            survey.add(Path::new(&format!("/a/masks/{i}.png")), MaskValues::count(picture), None);
         }
         survey
     }
@@ -509,7 +509,7 @@ mod tests {
 
     #[test]
     fn pixels_of_nearly_one_color_vote_for_the_most_frequent_one() {
-        let values = MaskValues::of(&file(&[[9; 3], [80, 0, 255], [81, 1, 254], [80, 0, 255]]));
+        let values = MaskValues::count(&file(&[[9; 3], [80, 0, 255], [81, 1, 254], [80, 0, 255]]));
         // 24 columns of 6 rows each: 12 rows of (80, 0, 255), 6 of (81, 1, 254) in one tally
         let (_, color) = values.tallies.iter().find(|(_, t)| brightest(t.color) > 200).unwrap();
         assert_eq!((color.pixels, color.votes, color.color), (24 * 18, 24 * 6, [80, 0, 255]));

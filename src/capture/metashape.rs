@@ -46,13 +46,13 @@ pub(super) fn list(folder: &CaptureFolder, file: &str, listing: &mut Listing) ->
     let problem = |text: String| in_file(file, text, EXPORT);
     let mut components = HashMap::new();
     for component in within(chunk, "components", "component") {
-        components.insert(id(component), Frame::of(component).map_err(problem)?);
+        components.insert(id(component), Frame::from_node(component).map_err(problem)?);
     }
-    let whole = Frame::of(chunk).map_err(problem)?;
+    let whole = Frame::from_node(chunk).map_err(problem)?;
     let cameras: Vec<Node> = within(chunk, "cameras", "camera").collect();
     folder.options.limits.check_views(&path, cameras.len())?;
     let rig = Rig {
-        sensors: within(chunk, "sensors", "sensor").map(|s| (id(s), Sensor::of(s))).collect(),
+        sensors: within(chunk, "sensors", "sensor").map(|s| (id(s), Sensor::from_node(s))).collect(),
         cameras: cameras.iter().map(|camera| (id(*camera), *camera)).collect(),
     };
     let placed = rig.place(file, &cameras, listing)?;
@@ -322,7 +322,7 @@ impl Frame {
     const IDENTITY: Frame = Frame { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
     /// Returns the `transform` of a node; `None` without one.
-    fn of(node: Node) -> Result<Option<Frame>, String> {
+    fn from_node(node: Node) -> Result<Option<Frame>, String> {
         let Some(transform) = child(node, "transform") else { return Ok(None) };
         let part = |name: &str, count: usize| match child(transform, name) {
             None => Ok(None),

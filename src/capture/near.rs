@@ -47,7 +47,7 @@ struct Wanted {
 }
 
 impl Wanted {
-    fn of(name: &str) -> Option<Wanted> {
+    fn parse(name: &str) -> Option<Wanted> {
         let text = name.replace('\\', "/");
         let has_drive = text.as_bytes().get(1) == Some(&b':');
         let is_absolute = text.starts_with('/') || has_drive;
@@ -110,7 +110,7 @@ pub(super) struct Picture {
 }
 
 impl Picture {
-    fn of(path: String) -> Picture {
+    fn new(path: String) -> Picture {
         let (folder, name) = path.rsplit_once('/').unwrap_or(("", &path));
         let (stem, ending) = without_ending(name);
         let [folder, stem, ending] = [folder, stem, ending].map(fold);
@@ -138,14 +138,14 @@ struct Index {
 }
 
 impl Index {
-    fn of(root: &Path) -> Index {
+    fn build(root: &Path) -> Index {
         // a run has views and masks under the photographs' names
         let is_run = |folder: &Path| io::is_file(&folder.join("config.toml"));
         let Some(files) = io::files_below(root, MAX_DEPTH, MAX_ENTRIES, &is_run) else {
             return Index::default();
         };
         let pictures: Vec<Picture> =
-            files.into_iter().filter(|f| has_ending(f, &PHOTOGRAPHS)).map(Picture::of).collect();
+            files.into_iter().filter(|f| has_ending(f, &PHOTOGRAPHS)).map(Picture::new).collect();
         let mut by_name: HashMap<String, Vec<usize>> = HashMap::new();
         for (i, picture) in pictures.iter().enumerate() {
             by_name.entry(bare(&picture.stem).0.into()).or_default().push(i);
@@ -254,12 +254,12 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 
 impl Search {
     fn index(&self, root: &Path) -> &Index {
-        self.index.get_or_init(|| Index::of(root))
+        self.index.get_or_init(|| Index::build(root))
     }
 
     /// Returns the only file near a name, as its path below the capture, and remembers the answer.
     pub fn nearest(&self, root: &Path, kind: Kind, name: &str, downscale: u32) -> Option<String> {
-        let wanted = Wanted::of(name)?;
+        let wanted = Wanted::parse(name)?;
         let found = self.index(root).nearest(&wanted, kind, downscale);
         let path = match &found {
             NearMatch::One { path, .. } => Some(path.clone()),

@@ -45,7 +45,7 @@ impl PoseFolder {
     pub fn find(root: &Path) -> Option<PoseFolder> {
         let intrinsics = INTRINSICS.into_iter().find(|name| io::is_file(&root.join(name)))?;
         let photos = PHOTOS.into_iter().find(|name| io::is_folder(&root.join(name)))?;
-        let has_poses = |name: &&str| FolderEntries::of(&root.join(name)).ending(&["txt"]).is_some();
+        let has_poses = |name: &&str| FolderEntries::list(&root.join(name)).ending(&["txt"]).is_some();
         let folder = POSES.into_iter().find(has_poses)?;
         Some(PoseFolder { folder, intrinsics, photos })
     }
@@ -58,7 +58,7 @@ impl PoseFolder {
 
 /// Lists one frame for each pose.
 pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Listing) -> Result<()> {
-    let mut poses = FolderEntries::of(&folder.root.join(files.folder)).files;
+    let mut poses = FolderEntries::list(&folder.root.join(files.folder)).files;
     poses.retain(|name| has_ending(name, &["txt"]));
     folder.options.limits.check_views(&folder.root.join(files.folder), poses.len())?;
     let stems: Vec<String> = poses.iter().map(|name| stem(name)).collect();
@@ -89,7 +89,7 @@ pub(super) fn list(folder: &CaptureFolder, files: &PoseFolder, listing: &mut Lis
         listing.warnings.push(format!("{text}; their photographs are left out: {}", few(&lost)));
     }
     let known: HashSet<&str> = stems.iter().map(String::as_str).collect();
-    let photos = FolderEntries::of(&folder.root.join(files.photos)).files;
+    let photos = FolderEntries::list(&folder.root.join(files.photos)).files;
     let photos = photos.iter().filter(|f| has_ending(f, &PHOTOGRAPHS));
     let without: Vec<&String> = photos.filter(|photo| !known.contains(stem(photo).as_str())).collect();
     if !without.is_empty() {

@@ -23,7 +23,7 @@ use Sign::{AnyWords, Ending, Entry, Inside, Words, WordsBelow};
 
 impl Sign {
     /// Returns the file or folder that shows it.
-    fn of(&self, found: &FolderEntries) -> Option<String> {
+    fn find_in(&self, found: &FolderEntries) -> Option<String> {
         match *self {
             Entry(name) => found.any(&[name]).map(str::to_owned),
             Ending(ending) => found.ending(&[ending]).cloned(),
@@ -47,7 +47,7 @@ impl Sign {
 /// is as asked for.
 fn below(found: &FolderEntries, ending: &str, is_wanted: impl Fn(&str) -> bool) -> Option<String> {
     let inside = |folder: &String| {
-        let inner = FolderEntries::of(&found.root.join(folder));
+        let inner = FolderEntries::list(&found.root.join(folder));
         inner.beginning(ending, &is_wanted).map(|file| join(folder, file))
     };
     let here = found.beginning(ending, &is_wanted).cloned();
@@ -64,8 +64,8 @@ struct Program {
 
 impl Program {
     /// Returns what a folder is, the file or folder that shows it, and the way from there.
-    fn of(&self, found: &FolderEntries) -> Option<(&'static str, String, String)> {
-        let file = self.signs.iter().find_map(|sign| sign.of(found))?;
+    fn recognize(&self, found: &FolderEntries) -> Option<(&'static str, String, String)> {
+        let file = self.signs.iter().find_map(|sign| sign.find_in(found))?;
         let way = self.way_from(&found.root.display().to_string(), &found.at(&file));
         Some((self.what, file, way))
     }
@@ -215,12 +215,12 @@ pub(super) fn recognized(found: &FolderEntries) -> Option<(&'static str, String,
     let has_photographs = found.photographs().is_some();
     // `params.json` is too common a name to identify anything without photographs
     let is_candidate = |p: &&Program| has_photographs || !matches!(p.signs, [Entry("params.json")]);
-    PROGRAMS.iter().chain([&UNFINISHED]).filter(is_candidate).find_map(|program| program.of(found))
+    PROGRAMS.iter().chain([&UNFINISHED]).filter(is_candidate).find_map(|program| program.recognize(found))
 }
 
 /// Returns the same of a folder without photographs.
 pub(super) fn scene(found: &FolderEntries) -> Option<(&'static str, String, String)> {
-    SCENES.iter().find_map(|program| program.of(found))
+    SCENES.iter().find_map(|program| program.recognize(found))
 }
 
 /// Returns which program's a file is by its ending, and the way from there; `root` is its folder.
@@ -276,7 +276,7 @@ pub(super) fn cameras_of_unknown_kind(found: &FolderEntries) -> Option<String> {
     let is_one = |name: &str| NAMES.iter().any(|word| name.to_lowercase().contains(word));
     let here = || found.files.iter().find(|name| is_one(name) && has_ending(name, &ENDINGS)).cloned();
     let inside = |folder: &String| {
-        FolderEntries::of(&found.root.join(folder)).ending(&ENDINGS).map(|file| join(folder, file))
+        FolderEntries::list(&found.root.join(folder)).ending(&ENDINGS).map(|file| join(folder, file))
     };
     let in_folder = || found.folders.iter().filter(|name| is_one(name)).take(16).find_map(inside);
     let by_words = || below(found, "json", |text| KEYS.iter().any(|key| text.contains(key)));

@@ -123,15 +123,15 @@ fn entry(heading: &Heading, values: &[String]) -> Result<Entry, String> {
 /// Returns the folder below the capture whose photographs have XMP files of RealityCapture beside
 /// them.
 pub(super) fn xmp_folder(root: &Path) -> Option<PathBuf> {
-    let inside = FolderEntries::of(root).photographs().into_iter();
+    let inside = FolderEntries::list(root).photographs().into_iter();
     let mut folders = [root.to_path_buf()].into_iter().chain(inside);
-    let found = folders.find(|f| FolderEntries::of(f).holding("xmp", NAMESPACE).is_some())?;
+    let found = folders.find(|f| FolderEntries::list(f).holding("xmp", NAMESPACE).is_some())?;
     found.strip_prefix(root).ok().map(Path::to_path_buf)
 }
 
 /// Lists the cameras of XMP files, each beside its photograph.
 pub(super) fn list_xmp(folder: &CaptureFolder, inside: &Path, listing: &mut Listing) -> Result<()> {
-    let entries = FolderEntries::of(&folder.root.join(inside));
+    let entries = FolderEntries::list(&folder.root.join(inside));
     let mut without = 0;
     for photo in entries.files.iter().filter(|f| has_ending(f, &PHOTOGRAPHS)) {
         let stem = Path::new(photo).with_extension("").to_string_lossy().into_owned();

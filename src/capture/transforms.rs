@@ -11,6 +11,7 @@ mod keys;
 mod lens;
 mod moments;
 mod pose;
+mod spellings;
 mod splits;
 
 pub(super) use lens::camera_like;
@@ -21,9 +22,10 @@ use super::masks::few;
 use super::view::Split;
 use glam::DVec3;
 use keys::KeyLog;
-use lens::{FrameKeys, LensNotes};
+use lens::FrameKeys;
 use moments::Moments;
 use serde_json::{Map, Value};
+use spellings::LensNotes;
 use splits::Listed;
 use std::path::PathBuf;
 use tiface_base::io;
@@ -265,7 +267,7 @@ impl<'a> Reading<'a> {
         let (mut notes, mut log) = (LensNotes::default(), KeyLog::new());
         log.look(written, "");
         let refused = |text: String| in_file(file, text, lens::OF_ALL);
-        let shared = lens::canonical(written, None, &mut notes).map_err(refused)?;
+        let shared = spellings::canonical(written, None, &mut notes).map_err(refused)?;
         Ok(Reading { folder, file, written, shared, notes, log, missing: Vec::new() })
     }
 
@@ -273,7 +275,7 @@ impl<'a> Reading<'a> {
     fn keys(&mut self, entry: &Entry) -> Result<FrameKeys, Fault> {
         let own = entry.value.as_object().ok_or_else(|| "it is not a JSON object".to_string())?;
         self.log.look(own, &entry.label);
-        let mut read = lens::canonical(own, Some(&self.shared), &mut self.notes)?;
+        let mut read = spellings::canonical(own, Some(&self.shared), &mut self.notes)?;
         if !read.contains_key("file_path") {
             let key = entry.key.ok_or_else(|| "it has no `file_path`".to_string())?;
             read.insert("file_path".into(), key.into());
@@ -328,7 +330,7 @@ impl<'a> Reading<'a> {
     /// Says how the file was read; what was not, only if all else was.
     fn report(self, has_failed: bool, listing: &mut Listing) {
         let (file, LensNotes { ignored, taken, skipped, doubts, misread }) = (self.file, self.notes);
-        let spelled = |(key, of): &(&str, &str)| match lens::ALIASES.contains(&(key, of)) {
+        let spelled = |(key, of): &(&str, &str)| match spellings::ALIASES.contains(&(key, of)) {
             true => format!("`{key}` as `{of}`"),
             false => format!("`{key}` as {of}"),
         };

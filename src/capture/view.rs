@@ -239,6 +239,31 @@ pub struct LoadedView {
 }
 
 impl View {
+    /// Returns a view of which nothing but name and camera matters.
+    #[cfg(test)]
+    pub(crate) fn bare(name: &str, camera: Camera) -> View {
+        let size = (camera.width, camera.height);
+        View {
+            name: name.into(),
+            camera,
+            split: Split::Train,
+            photo: PathBuf::new(),
+            mask: ViewMask::None,
+            mask_meaning: MaskMeaning::Empty,
+            mask_reading: MaskReading::default(),
+            side_turn: None,
+            valid: None,
+            region: None,
+            downscale: 1,
+            photo_size: size,
+            declared: size,
+            declared_by: String::new(),
+            turn: None,
+            mask_turn: None,
+            exposure: None,
+        }
+    }
+
     /// Reads the photograph alone, at the size of its camera, with its exposure divided out.
     pub fn load_photo(&self, limits: &Limits) -> Result<Photo> {
         let photo = self.stored_photo(limits)?;
@@ -346,7 +371,7 @@ impl View {
             ViewMask::File(path) => {
                 let picture = io::read_mask(path, Some(self.photo_size), limits)?;
                 if let Some(values) = values {
-                    *values = Some(MaskValues::of(&picture));
+                    *values = Some(MaskValues::count(&picture));
                 }
                 self.reduced(path, self.mask_reading.read(picture), Average::Mean).map(Some)
             }

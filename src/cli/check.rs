@@ -250,7 +250,7 @@ fn compare(mesh: &Mesh, origin: DVec3, other: &Path, seen_by: Option<&Path>, uni
 fn skin_and_hair(views: &[&View]) -> Result<Vec<Vec<Option<usize>>>> {
     // only photographs with region masks are read
     let able = views.iter().any(|v| v.region.is_some());
-    let Some(tones) = able.then(|| Tones::of(views)).transpose()?.flatten() else { return Ok(Vec::new()) };
+    let Some(tones) = able.then(|| Tones::learn(views)).transpose()?.flatten() else { return Ok(Vec::new()) };
     let kinds = |view: &&View| -> Result<Vec<Option<usize>>> {
         let loaded = view.load(&Limits::default())?;
         let split = Masks::of(&loaded).and_then(|masks| tones.split(&loaded.photo, masks));

@@ -134,7 +134,7 @@ enum Kind {
 }
 
 impl Kind {
-    fn of(options: &PreviewOptions) -> Kind {
+    fn from_options(options: &PreviewOptions) -> Kind {
         match (options.turntable, options.sheet, &options.cameras) {
             (true, ..) => Kind::Turntable,
             (_, true, _) => Kind::Sheet,
@@ -174,7 +174,7 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
         let out = Out::find(common.out.as_deref(), "page")?;
         return page(invocation, options.path.as_deref(), options.up, out.as_ref());
     }
-    let kind = Kind::of(options);
+    let kind = Kind::from_options(options);
     if kind == Kind::Sheet && options.size.is_some_and(|size| size > MAX_SHEET_PX) {
         let what = format!("`--size` of a picture on a sheet is at most {MAX_SHEET_PX}");
         return Err(Error::usage(what, "render larger pictures one by one"));

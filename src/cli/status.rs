@@ -4,7 +4,7 @@ use super::Invocation;
 use super::screen::{figure, one_line, print};
 use crate::config::Stage;
 use crate::report::duration;
-use crate::run::{Phase, Record, RunStatus, StageStatus, Status, Verification, VerifiedFile};
+use crate::run::{Phase, Record, RunStatus, StageStatus, Status};
 use clap::Args;
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -42,7 +42,7 @@ pub(super) fn run(invocation: &Invocation, options: &StatusOptions) -> Result<()
         // listed each time: runs may be added meanwhile
         let all = named_runs(invocation, &options.runs)?;
         let found: Vec<(&Path, Result<RunStatus>)> =
-            all.par_iter().map(|run| (run.as_path(), look(run))).collect();
+            all.par_iter().map(|run| (run.as_path(), read_status(run))).collect();
         let text = match &found[..] {
             found if common.json => objects(found, options.failed),
             [(run, Ok(status))] if !options.failed => stages(run, status),
@@ -124,68 +124,8 @@ pub(super) fn named_runs(invocation: &Invocation, named: &[PathBuf]) -> Result<V
     }
 }
 
-/// Compares the products of runs with their records.
-pub(super) fn verify(invocation: &Invocation, runs: &[PathBuf]) -> Result<()> {
-    let runs = named_runs(invocation, runs)?;
-    let all: Vec<_> = runs.par_iter().map(|run| look(run).and_then(|_| crate::run::verify(run))).collect();
-    let mut text = String::new();
-    let (mut changed, mut unreadable) = (0, None);
-    for (run, found) in runs.iter().zip(all) {
-        match found {
-            Ok(found) => {
-                changed += usize::from(found.differing().next().is_some());
-                text += &verification(invocation, run, &found);
-            }
-            Err(e) => {
-                invocation.screen.note(&name(run), &e.to_string());
-                unreadable.get_or_insert(e);
-            }
-        }
-    }
-    print(&text)?;
-    match unreadable {
-        Some(e) => Err(e),
-        None if changed > 0 => Err(Error::below(
-            format!("{changed} of {} differ from what was written", counted(runs.len(), "run")),
-            "put the files back, or make each again with the command beside it; a stage made again removes what follows",
-        )),
-        None => Ok(()),
-    }
-}
-
-/// Returns what was found in a run: an object, or a line and one for each difference.
-fn verification(invocation: &Invocation, run: &Path, found: &Verification) -> String {
-    if invocation.common.json {
-        let mut value = json!(found);
-        value["run"] = json!(run);
-        return format!("{value}\n");
-    }
-    let by_size = found.files.iter().filter(|file| file.sha256.is_none()).count();
-    let mut text = format!("{}: {}", run.display(), counted(found.files.len(), "file"));
-    if by_size > 0 {
-        text += &format!(", {by_size} compared by size only, as an older version recorded no digests");
-    }
-    if !found.unlisted.is_empty() {
-        let stages = found.unlisted.join(", ");
-        text += &format!(", and none of {stages}, as an older version recorded neither sizes nor digests");
-    }
-    text += match found.differing().next() {
-        None => ", as recorded\n",
-        Some(_) => "\n",
-    };
-    for VerifiedFile { problem, again, .. } in found.differing() {
-        let line = format!(
-            "{}; `{}` makes it again",
-            problem.as_deref().unwrap_or_default(),
-            again.as_deref().unwrap_or_default()
-        );
-        text += &format!("  {}\n", one_line(&line));
-    }
-    text
-}
-
 /// Returns the state of a run, if it is a folder.
-fn look(run: &Path) -> Result<RunStatus> {
+pub(super) fn read_status(run: &Path) -> Result<RunStatus> {
     if !io::is_folder(run) {
         return Err(Error::cannot(format!("`{}` is not a folder", run.display()), ""));
     }
@@ -197,7 +137,7 @@ fn has_failed(run: &Result<RunStatus>) -> bool {
     WRONG.iter().any(|(wrong, ..)| *wrong == phase(run))
 }
 
-fn name(run: &Path) -> String {
+pub(super) fn run_name(run: &Path) -> String {
     one_line(&run.file_name().unwrap_or(run.as_os_str()).to_string_lossy()).into_owned()
 }
 
@@ -205,7 +145,7 @@ fn name(run: &Path) -> String {
 fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> String {
     let mut text = String::new();
     let shown: Vec<_> = runs.iter().filter(|(_, run)| !failed || has_failed(run)).collect();
-    let width = shown.iter().map(|(run, _)| name(run).chars().count()).max().unwrap_or(0).clamp(8, 32);
+    let width = shown.iter().map(|(run, _)| run_name(run).chars().count()).max().unwrap_or(0).clamp(8, 32);
     let mut shared: BTreeMap<&str, Vec<String>> = BTreeMap::new();
     let mut left_s = 0.0;
     let mut counts: BTreeMap<usize, (&str, usize)> = BTreeMap::new();
@@ -218,17 +158,17 @@ fn heads(runs: &[(&Path, Result<RunStatus>)], failed: bool, each: bool) -> Strin
         let status = match status {
             Ok(status) => status,
             Err(e) => {
-                let _ = writeln!(text, "{:<width$}  UNREADABLE: {}", name(run), one_line(&e.to_string()));
+                let _ = writeln!(text, "{:<width$}  UNREADABLE: {}", run_name(run), one_line(&e.to_string()));
                 continue;
             }
         };
         let settled = [Phase::Done, Phase::Waiting].contains(&status.phase);
         if settled && !each && runs.len() > MAX_LINES {
-            shared.entry(word(status.phase)).or_default().push(name(run));
+            shared.entry(word(status.phase)).or_default().push(run_name(run));
             continue;
         }
         let bar: String = status.stages.iter().map(|s| sign(s.phase)).collect();
-        let _ = writeln!(text, "{:<width$}  {bar}  {}", name(run), one_line(&described(status)));
+        let _ = writeln!(text, "{:<width$}  {bar}  {}", run_name(run), one_line(&described(status)));
     }
     for (word, names) in shared {
         let mut line = format!("{word}:");

@@ -16,6 +16,22 @@ pub fn views() -> Vec<TrainView> {
         .collect()
 }
 
+/// Returns photographs of a ball textured with waves of a few pixels: nine from the front and three
+/// from the back.
+#[cfg(test)]
+pub fn textured_views() -> Vec<TrainView> {
+    let waves = |p: Vec3| {
+        let wave = |i: u64| {
+            let [x, y, z] = [0, 1, 2].map(|k| 90.0 * tiface_base::math::rng::uniform(5, i, k) - 45.0);
+            (p.dot(Vec3::new(x, y, z)) + i as f32).sin()
+        };
+        [(128.0 + 12.0 * (0..9).map(wave).sum::<f32>()) as u8; 3]
+    };
+    let before = (0..9).map(|i| (0.4 * (i % 3) as f64 - 0.4, 0.4 * (i / 3) as f64 - 0.4));
+    let behind = (2..5).map(|i| (i as f64 * std::f64::consts::TAU / 6.0, 0.3));
+    before.chain(behind).map(|(azimuth, elevation)| view(80, azimuth, elevation, waves)).collect()
+}
+
 /// Renders a photograph of the ball, with its mask.
 pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8; 3]) -> TrainView {
     let rotation = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-elevation);
@@ -72,9 +88,3 @@ pub fn cells_within(radius: f32) -> BitGrid {
     }
     cells
 }
-
-#[cfg(test)]
-#[path = "ball_tests.rs"]
-mod tests;
-#[cfg(test)]
-pub use tests::*;

@@ -193,7 +193,7 @@ mod tests {
         }
     }
 
-    /// `TIFACE_PHOTOGRAPHS=28 cargo test --release --features wgpu --lib memory_of_photographs -- --ignored --nocapture`
+    /// With `TIFACE_PHOTOGRAPHS=28`, `--release`, `--ignored`, `--nocapture`: a whole capture.
     #[test]
     #[cfg(target_os = "linux")]
     #[ignore = "run by the test above, in a process of its own"]

@@ -1,8 +1,8 @@
 //! Tests of trainings on a GPU, with a field's training as a parameter: each field calls them.
 
-use super::ball::{StopAfter, bytes, copied, temporary};
 use super::checkpoint::TrainingProgress;
 use super::pixels::TrainView;
+use super::testing::{StopAfter, bytes, copied, temporary};
 use super::training::{self, Model, StepReport};
 use glam::Vec2;
 use std::path::Path;

@@ -121,7 +121,7 @@ pub fn compare_cells(field: &str, got: &[u64], want: &[u64]) -> Check {
 mod tests {
     use super::*;
 
-    fn of(slope: f32, moved: f32, loss: f64) -> StepResult {
+    fn step_result(slope: f32, moved: f32, loss: f64) -> StepResult {
         let group = |value: f32| {
             let mut group = HostGroup::flat("table", vec![value; 100]);
             group.state[1] = vec![slope; 100];
@@ -133,15 +133,15 @@ mod tests {
     #[test]
     fn what_is_wrong_is_named_and_a_failed_step_is_wrong() {
         let wrong = |got: &StepResult| -> Vec<String> {
-            let checks = compare("density", got, &of(0.5, -0.01, 2.0));
+            let checks = compare("density", got, &step_result(0.5, -0.01, 2.0));
             checks.into_iter().filter(|check| !check.passed).map(|check| check.name).collect()
         };
-        assert!(wrong(&of(0.5, -0.01, 2.0)).is_empty());
-        assert_eq!(wrong(&of(0.5, -0.01, 2.1)), ["density: rgb"]);
-        assert_eq!(wrong(&of(0.51, -0.01, 2.0)), ["density: gradient of table"]);
-        assert_eq!(wrong(&of(f32::NAN, -0.01, 2.0)), ["density: gradient of table"]);
-        assert_eq!(wrong(&of(0.5, 0.01, 2.0)), ["density: optimizer"]);
-        let failed = StepResult { figures: Vec::new(), ..of(0.0, 0.0, 0.0) };
+        assert!(wrong(&step_result(0.5, -0.01, 2.0)).is_empty());
+        assert_eq!(wrong(&step_result(0.5, -0.01, 2.1)), ["density: rgb"]);
+        assert_eq!(wrong(&step_result(0.51, -0.01, 2.0)), ["density: gradient of table"]);
+        assert_eq!(wrong(&step_result(f32::NAN, -0.01, 2.0)), ["density: gradient of table"]);
+        assert_eq!(wrong(&step_result(0.5, 0.01, 2.0)), ["density: optimizer"]);
+        let failed = StepResult { figures: Vec::new(), ..step_result(0.0, 0.0, 0.0) };
         assert_eq!(wrong(&failed).len(), 3);
         assert!(!compare_cells("", &[0b1011], &[0b1111]).passed && compare_cells("", &[7], &[7]).passed);
         let same = |got: f32| compare_values("colors".into(), &[got, 0.5], &[0.5, 0.5]).passed;

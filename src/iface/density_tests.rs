@@ -3,7 +3,8 @@
 use super::cpu::march;
 use super::*;
 use crate::config::Preset;
-use crate::field::ball::{BALL, resumes, session, temporary, views};
+use crate::field::ball::{BALL, views};
+use crate::field::testing::{resumes, session, temporary};
 use crate::iface::schedule::step_length;
 use crate::reference::tape::{AdamW, Stepped, Var, gradient};
 use crate::reference::{Real, density as plain, wide};

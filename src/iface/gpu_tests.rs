@@ -7,7 +7,7 @@ use super::super::train::{SdfModel, sampler};
 use super::*;
 use crate::config::Preset;
 use crate::config::iface::Start;
-use crate::field::ball::{self, StopAfter, hull, temporary, textured_views};
+use crate::field::ball::{hull, textured_views};
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::field::gpu_tests::{
     CountedStep, Outcome, RunOn, alike, alone_and_in_turn, counted_step, cpu_and_both, fixed_sums_repeat,
@@ -15,6 +15,7 @@ use crate::field::gpu_tests::{
 };
 use crate::field::ops::ArrayDevice;
 use crate::field::pixels::TrainView;
+use crate::field::testing::{StopAfter, session, temporary};
 use crate::field::training::{Model, TrainingSession};
 use crate::iface::{IFace, IfaceReport, train};
 use std::path::Path;
@@ -78,7 +79,7 @@ impl Monitor for Recorder<'_> {
 }
 
 fn on<'a>(device: &'a str, dir: &'a Path, monitor: &'a dyn Monitor) -> TrainingSession<'a> {
-    TrainingSession { device, ..ball::session("iface", dir, "ball", monitor) }
+    TrainingSession { device, ..session("iface", dir, "ball", monitor) }
 }
 
 /// A training before its first step.

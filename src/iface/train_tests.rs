@@ -4,11 +4,11 @@ use super::super::stereo::SurfacePoint;
 use super::*;
 use crate::capture::synthetic::shared::Files;
 use crate::config::Preset;
-use crate::field::ball::{
-    BALL, beginning, hull, negative, refuses, resumes, resumes_from, says, session, tampered, temporary,
-    textured_views, views,
-};
+use crate::field::ball::{BALL, hull, textured_views, views};
 use crate::field::checkpoint::{self, Checkpoint};
+use crate::field::testing::{
+    beginning, negative, refuses, resumes, resumes_from, says, session, tampered, temporary,
+};
 use glam::{Vec2, Vec3};
 use std::path::Path;
 use std::sync::OnceLock;

@@ -14,8 +14,8 @@ mod proposals;
 
 pub use proposals::{MaskVerdict, verdicts};
 
+use super::distance::squared_distance;
 use super::hull::{self, ViewFrame};
-use super::morphology::squared_distance;
 use crate::capture::carve::Cube;
 use glam::{DVec3, Vec2};
 use rayon::prelude::*;
@@ -93,7 +93,7 @@ fn check_at(rows: u32, cells: usize, views: &[ConsistencyView]) -> Result<Consis
     let mut active = vec![true; claims.len()];
     let mut conflicts = Vec::new();
     loop {
-        let conflict = Conflicts::of(&votes, &claims, &active);
+        let conflict = Conflicts::among(&votes, &claims, &active);
         let left = active.iter().filter(|a| **a).count();
         // of equals the first
         let worst = (0..claims.len())
@@ -231,16 +231,12 @@ struct Conflicts {
 }
 
 impl Conflicts {
-    fn of(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Conflicts {
+    fn among(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Conflicts {
         let count = claims.len();
         let costs = votes.costs(active);
-        let best = |claims, pixel| {
+        let found = oppositions(votes, claims, active, |claims, pixel| {
             best_on_ray(&votes.cube, claims, pixel, &costs).map(|(no, cell)| (false, no, cell))
-        };
-        let found: Vec<Option<Opposition>> = (0..count)
-            .into_par_iter()
-            .map(|j| active[j].then(|| Opposition::of(votes, &claims[j], active, |p| best(&claims[j], p))))
-            .collect();
+        });
         let others = (active.iter().filter(|a| **a).count().max(2) - 1) as f64;
         let zero = || vec![0.0; count];
         let mut conflict = Conflicts { too_much: zero(), taken: zero(), credit: zero(), others };
@@ -287,10 +283,23 @@ struct Opposition {
     opposing: Vec<[f64; 2]>,
 }
 
+/// Returns the conflicts of each active view with the other ones; `best` is that of
+/// [`Opposition::against`] for a pixel of any view.
+fn oppositions(
+    votes: &Votes,
+    claims: &[SilhouetteConstraints],
+    active: &[bool],
+    best: impl Fn(&SilhouetteConstraints, usize) -> Option<(bool, u16, usize)> + Sync,
+) -> Vec<Option<Opposition>> {
+    let opposition =
+        |j: usize| Opposition::against(votes, &claims[j], active, |pixel| best(&claims[j], pixel));
+    (0..claims.len()).into_par_iter().map(|j| active[j].then(|| opposition(j))).collect()
+}
+
 impl Opposition {
     /// `best` returns the best cell on a pixel's ray: whether it lacks support (then it explains
     /// nothing, but no view is to blame), how many active views rule it out, and its index.
-    fn of(
+    fn against(
         votes: &Votes,
         claims: &SilhouetteConstraints,
         active: &[bool],
@@ -392,25 +401,25 @@ mod tests {
     use glam::DMat3;
     use tiface_base::geom::Distortion;
 
-    /// Eight cameras on a ring, rising a little from one to the next.
+    /// Returns a camera that looks at the origin from 10 away, turned around y after it was tilted.
+    pub(super) fn camera(turn: f64, tilt: f64) -> Camera {
+        let rotation = DMat3::from_rotation_y(turn) * DMat3::from_rotation_x(tilt);
+        Camera {
+            width: 96,
+            height: 128,
+            fx: 300.0,
+            fy: 300.0,
+            cx: 48.0,
+            cy: 64.0,
+            distortion: Distortion::default(),
+            rotation,
+            position: rotation * DVec3::new(0.0, 0.0, 10.0),
+        }
+    }
+
+    /// Returns cameras on a ring, rising a little from one to the next.
     fn ring(count: usize) -> Vec<Camera> {
-        (0..count)
-            .map(|i| {
-                let turn = i as f64 * std::f64::consts::TAU / 9.0;
-                let rotation = DMat3::from_rotation_y(turn) * DMat3::from_rotation_x(-0.05 * i as f64);
-                Camera {
-                    width: 96,
-                    height: 128,
-                    fx: 300.0,
-                    fy: 300.0,
-                    cx: 48.0,
-                    cy: 64.0,
-                    distortion: Distortion::default(),
-                    rotation,
-                    position: rotation * DVec3::new(0.0, 0.0, 10.0),
-                }
-            })
-            .collect()
+        (0..count).map(|i| camera(i as f64 * std::f64::consts::TAU / 9.0, -0.05 * i as f64)).collect()
     }
 
     /// Returns a snowman with a nose, seen by a camera.

@@ -21,7 +21,8 @@ pub mod mixture;
 use self::maxflow::PixelGraph;
 use self::mixture::{Mixture, Rgb};
 use super::clicks::{self, Click};
-use super::morphology::{fill_holes, gray, keep_pieces, open, squared_distance};
+use super::distance::squared_distance;
+use super::morphology::{fill_holes, gray, keep_pieces, open};
 use tiface_base::image::{Gray, Photo, grow, reduce_to_rows};
 use tiface_base::{Error, Result};
 

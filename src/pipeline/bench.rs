@@ -5,7 +5,8 @@
 //! (steps, photographs' size, the hash grid), others the path from a surface to the head mesh
 //! (simplification, texture).
 
-use super::finish::{Export, Finish};
+use super::finish::Finish;
+use super::frames::Export;
 use super::mesh::{Extraction, extract, photographs};
 use super::render::{Meshes, Renderer};
 use super::session::Session;

@@ -8,12 +8,13 @@
 
 use crate::capture::{Capture, Split};
 use crate::config::{MaskConfig, key};
+use crate::mask::Click;
+use crate::mask::distance::squared_distance;
 use crate::mask::grabcut::grabcut;
 use crate::mask::matting::{SoftMask, SoftenOptions, UnknownBand, soften_with};
 use crate::mask::networks::Networks;
 use crate::mask::prompts::{self, PhotoPrompts, Prompts};
 use crate::mask::propagate::{PropagateView, propagate, propagate_proposals, rows_size};
-use crate::mask::{Click, morphology};
 use crate::run::{Fingerprint, StageDir};
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -294,7 +295,7 @@ pub(super) fn propagated_clicks(mask: &Gray, size: (u32, u32)) -> Vec<Click> {
     let mut out = Vec::new();
     for (head, count) in [(true, 3), (false, 2)] {
         let outside: Vec<bool> = mask.values.iter().map(|&v| (v >= 128) != head).collect();
-        let mut deep = morphology::squared_distance(&outside, w, h);
+        let mut deep = squared_distance(&outside, w, h);
         for _ in 0..count {
             let Some((best, &d)) = deep.iter().enumerate().rev().max_by(|a, b| a.1.total_cmp(b.1)) else {
                 break;

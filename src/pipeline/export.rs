@@ -6,7 +6,8 @@
 //! of the kept one ([`Original`]).
 
 use super::cameras::CameraCheck;
-use super::finish::{Export, center, lobes};
+use super::finish::lobes;
+use super::frames::{Export, center};
 use super::mesh::{finished_mesh, read_finished};
 use super::scene_file::read_capture;
 use super::session::{check_feasible, unusable};

@@ -8,7 +8,8 @@
 //!      frames.json   the transform from the dataset's world to GLB and OBJ files
 //! ```
 
-use super::finish::{Export, Finish, FinishedHead, REACH};
+use super::finish::{Finish, FinishedHead, REACH};
+use super::frames::Export;
 use super::learn;
 use super::surface::{ClosedSurface, Surface};
 use crate::capture::scene::Scene;

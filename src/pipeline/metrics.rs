@@ -155,7 +155,7 @@ impl<'a> Judge<'a> {
         views.sort_by(|a, b| a.name.cmp(&b.name));
         views.dedup_by(|a, b| a.name == b.name);
         let lpips = Lpips::open(config.metrics.lpips.as_ref(), config.mask.memory_gib)?;
-        Ok(Judge { config, tones: Tones::of(&views)?, lpips, exposure })
+        Ok(Judge { config, tones: Tones::learn(&views)?, lpips, exposure })
     }
 
     /// Returns the figures of a set of pictures as in `metrics.json`; `None` without pictures.

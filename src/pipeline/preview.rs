@@ -4,7 +4,7 @@
 //! viewing process renders it, so the training is not disturbed and its results stay the same, bit
 //! by bit.
 
-use super::finish::{center as center_of, front as front_of};
+use super::frames::{center as center_of, front as front_of};
 use super::learn::load_field;
 use super::mesh::read_finished;
 use super::page::views::{error, heat};

@@ -191,7 +191,7 @@ fn decide(capture: &Capture, options: &CaptureOptions) -> Result<(Reading, Strin
         [(only, _)] => (*only, Vec::new()),
         all => {
             let found = |(reading, capture): &(Reading, Capture)| {
-                Ok((*reading, ReadingFit::of(capture.clone(), &options.limits)?))
+                Ok((*reading, ReadingFit::measure(capture.clone(), &options.limits)?))
             };
             let found = all.iter().map(found).collect::<Result<Vec<_>, String>>()?;
             match clearest(&found) {
@@ -350,7 +350,7 @@ fn small_masks(views: &[View], limits: &Limits) -> Result<Vec<Option<Gray>>> {
 impl ReadingFit {
     /// Measures the training views of a capture. Returns the reason instead if that is not
     /// possible.
-    fn of(mut capture: Capture, limits: &Limits) -> Result<ReadingFit, String> {
+    fn measure(mut capture: Capture, limits: &Limits) -> Result<ReadingFit, String> {
         let said = |e: Error| e.to_string();
         capture.views.retain(|view| view.split == Split::Train);
         let every = capture.views.len().div_ceil(MAX_VIEWS).max(1);

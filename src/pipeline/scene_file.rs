@@ -196,26 +196,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("cameras.json");
         let named = |name: &str| {
-            let camera = tiface_base::geom::Camera::above(4, 4, 4.0, 3.0);
-            let view = View {
-                name: name.into(),
-                split: crate::capture::Split::Test,
-                camera,
-                photo: "photo.png".into(),
-                mask: crate::capture::ViewMask::None,
-                mask_meaning: crate::config::MaskMeaning::Empty,
-                mask_reading: Default::default(),
-                side_turn: None,
-                valid: None,
-                region: None,
-                downscale: 1,
-                photo_size: (4, 4),
-                declared: (4, 4),
-                declared_by: String::new(),
-                turn: None,
-                mask_turn: None,
-                exposure: None,
-            };
+            let view = View::bare(name, tiface_base::geom::Camera::above(4, 4, 4.0, 3.0));
             let value =
                 json!({"capture": "a", "format": "b", "up": [0, 0, 1], "unit_m": 1.0, "views": [view]});
             std::fs::write(&path, value.to_string()).unwrap();

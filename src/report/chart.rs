@@ -1,6 +1,6 @@
 //! Line charts over training steps or another quantity, as SVG inside a page.
 
-use super::{csv_text, escape};
+use super::text::{csv_text, escape};
 use serde_json::Value;
 use std::fmt::Write;
 

@@ -1,6 +1,7 @@
 //! One page of many runs, one row each, that is searched, filtered and sorted by any column.
 
-use super::{STYLE, csv_text, fill, glb_megabytes, picture_url, relative, small_view, views, warnings};
+use super::text::csv_text;
+use super::{STYLE, fill, glb_megabytes, picture_url, relative, small_view, views, warnings};
 use crate::config::{Config, NAMES, Stage, display_name};
 use crate::run::{Phase, Record, RunStatus};
 use glam::Vec3;

@@ -327,7 +327,7 @@ pub fn gauge(given: &[Camera], adjusted: &[Camera], points: &[DVec3]) -> Similar
         let equations: Vec<Equations> = given
             .par_iter()
             .zip(adjusted)
-            .map(|(given, adjusted)| Equations::of(given, adjusted, points, middle, &total))
+            .map(|(given, adjusted)| Equations::accumulate(given, adjusted, points, middle, &total))
             .collect();
         let mut squares: Vec<f64> = equations.iter().map(|e| e.mean_square).collect();
         let scale = USUAL * median(&mut squares).max(1e-12);
@@ -359,7 +359,7 @@ struct Equations {
 }
 
 impl Equations {
-    fn of(
+    fn accumulate(
         given: &Camera,
         adjusted: &Camera,
         points: &[DVec3],

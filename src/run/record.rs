@@ -24,10 +24,8 @@ pub struct Record {
     /// Seconds of work.
     pub elapsed_s: f64,
     /// CPU seconds of the process that finished it; `None` in older records.
-    #[serde(default)]
     pub cpu_s: Option<f64>,
     /// Peak memory of the process, bytes; `None` if the system does not report it.
-    #[serde(default)]
     pub peak_bytes: Option<u64>,
     /// Warnings.
     #[serde(default)]

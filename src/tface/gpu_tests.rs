@@ -5,13 +5,14 @@ use super::*;
 use crate::config::Preset;
 use crate::config::{MaskLoss, VmBackground};
 use crate::field;
-use crate::field::ball::{self, StopAfter, hull, session, temporary};
+use crate::field::ball::{self, hull};
 use crate::field::checkpoint::TrainingProgress;
 use crate::field::gpu_tests::{
     CountedStep, Outcome, alike, counted_step, cpu_and_both, outlives_lost_devices, psnr,
 };
 use crate::field::ops::ArrayDevice;
 use crate::field::pixels::TrainView;
+use crate::field::testing::{StopAfter, session, temporary};
 use crate::field::training::{self, Model, StepReport, TrainingSession};
 use crate::tface::{FieldMean, TFace};
 use std::path::Path;

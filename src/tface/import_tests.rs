@@ -1,7 +1,7 @@
 //! A converted checkpoint rendered by our kernels, compared with the published arithmetic.
 
 use super::*;
-use crate::field::ball::session;
+use crate::field::testing::session;
 use glam::{DVec3, Vec3};
 use serde_json::Value;
 use std::path::PathBuf;

@@ -187,7 +187,8 @@ impl Monitor for FieldMonitor<'_> {
 mod tests {
     use super::*;
     use crate::config::Preset;
-    use crate::field::ball::{StopAfter, hull, session, temporary, views};
+    use crate::field::ball::{hull, views};
+    use crate::field::testing::{StopAfter, session, temporary};
     use std::sync::Mutex;
     use tiface_base::Quiet;
 

@@ -73,7 +73,7 @@ pub struct FieldRecord {
 
 impl FieldRecord {
     /// Returns the record of a field in training.
-    pub fn of(config: &VmConfig) -> FieldRecord {
+    pub fn new(config: &VmConfig) -> FieldRecord {
         let (density, color) = grids(config, [2; 3]);
         FieldRecord {
             density_rank: density.rank,

@@ -58,7 +58,7 @@ fn trained_field(
     size: [usize; 3],
     mask: Option<BoxMask>,
 ) -> VmField {
-    let mut field = FieldRecord::of(config).field(bounds, size, mask);
+    let mut field = FieldRecord::new(config).field(bounds, size, mask);
     let vertices = size.iter().map(|&n| (n * n) as f32).sum::<f32>().sqrt();
     field.lattice.samples = ((vertices / config.step_ratio as f32) as usize).min(1_000_000);
     field
@@ -106,14 +106,14 @@ impl VmState {
         let mask = self.mask.clone();
         Arc::new(match training {
             true => trained_field(config, self.bounds, self.size, mask),
-            false => FieldRecord::of(config).field(self.bounds, self.size, mask),
+            false => FieldRecord::new(config).field(self.bounds, self.size, mask),
         })
     }
 
     /// Writes the state into a checkpoint. A finished checkpoint omits the optimizer's moments,
     /// because no training resumes from it.
     pub fn save(&self, config: &VmConfig, into: &mut Checkpoint, finished: bool) {
-        FieldRecord::of(config).save(self.bounds, self.size, self.mask.as_ref(), into);
+        FieldRecord::new(config).save(self.bounds, self.size, self.mask.as_ref(), into);
         self.groups.iter().for_each(|group| group.save(into, !finished));
         into.set("reset", self.reset);
         into.set("moments_from", self.moments_from);

@@ -5,8 +5,9 @@
 use super::super::ops::mask_term;
 use super::*;
 use crate::config::{DensityActivation, MaskLoss, Preset, VmBackground};
-use crate::field::ball::{session, temporary, views};
+use crate::field::ball::views;
 use crate::field::parameters::HostGroup;
+use crate::field::testing::{session, temporary};
 use crate::reference::tape::{AdamW, Stepped, Var, gradient};
 use crate::reference::{Real, vm, wide};
 use std::path::Path;

@@ -2,11 +2,11 @@
 
 use super::*;
 use crate::config::{DensityActivation, Preset};
-use crate::field::ball::{
-    BALL, StopAfter, bytes, hull, negative, refuses, resumes, says, session, tampered, temporary, views,
-    words,
-};
+use crate::field::ball::{BALL, hull, views};
 use crate::field::checkpoint;
+use crate::field::testing::{
+    StopAfter, bytes, negative, refuses, resumes, says, session, tampered, temporary, words,
+};
 use crate::tface::{TFace, train};
 use glam::{Vec2, Vec3};
 use std::path::Path;

@@ -12,7 +12,7 @@ use tiface::capture::synthetic::{SyntheticOptions, write_borders};
 use tiface::image::Gray;
 use tiface::io::{Limits, read_gray, read_photo, write_png_gray, write_png_rgb};
 use tiface::mask::Click;
-use tiface::mask::morphology::squared_distance;
+use tiface::mask::distance::squared_distance;
 use tiface::mask::prompts::{PhotoPrompts, Prompts};
 
 /// A capture without any mask; beside it, clicks on three of its photographs: three in the head,

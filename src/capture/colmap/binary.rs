@@ -36,7 +36,7 @@ struct Cursor<'b> {
 }
 
 impl<'b> Cursor<'b> {
-    fn of((path, bytes): &'b Source) -> Cursor<'b> {
+    fn new((path, bytes): &'b Source) -> Cursor<'b> {
         Cursor { path, bytes, at: 0 }
     }
 
@@ -117,7 +117,7 @@ impl<'b> Cursor<'b> {
 }
 
 pub(super) fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, ReadError> {
-    let mut c = Cursor::of(source);
+    let mut c = Cursor::new(source);
     // number, model, width, height and two parameters at least: those of EQUIRECTANGULAR, to be
     // refused by name
     let n = c.counted(4 + 4 + 16 + 2 * 8, "cameras")?;
@@ -138,7 +138,7 @@ pub(super) fn read_cameras(source: &Source) -> Result<HashMap<u32, Camera>, Read
 }
 
 pub(super) fn read_images(source: &Source, limits: &Limits) -> Result<Vec<Image>, ReadError> {
-    let mut c = Cursor::of(source);
+    let mut c = Cursor::new(source);
     // number, pose, camera, an empty name, no points
     let n = c.counted(4 + 56 + 4 + 1 + 8, "images")?;
     limits.check_views(&source.0, n)?;
@@ -164,7 +164,7 @@ pub(super) struct Points {
 }
 
 pub(super) fn read_points(source: &Source) -> Result<Points, ReadError> {
-    let mut c = Cursor::of(source);
+    let mut c = Cursor::new(source);
     // number, position, color, error, no track
     let n = c.counted(8 + 24 + 3 + 8 + 8, "points")?;
     let mut points = Points { positions: Vec::with_capacity(n), ..Points::default() };

@@ -26,7 +26,7 @@ pub(super) struct Sensor {
 }
 
 impl Sensor {
-    pub fn of(sensor: Node) -> Sensor {
+    pub fn from_node(sensor: Node) -> Sensor {
         let id = sensor.attribute("id").unwrap_or_default();
         Sensor {
             intrinsics: intrinsics(sensor),

@@ -94,26 +94,7 @@ mod tests {
         let options = synthetic::SyntheticOptions::default();
         let cameras: Vec<Camera> =
             synthetic::cameras(&options).into_iter().map(|(camera, _)| camera).collect();
-        let view = |camera: &Camera| View {
-            name: String::new(),
-            camera: camera.clone(),
-            split: crate::capture::view::Split::Train,
-            photo: Default::default(),
-            mask: crate::capture::view::ViewMask::None,
-            mask_meaning: crate::config::MaskMeaning::Empty,
-            mask_reading: Default::default(),
-            side_turn: None,
-            valid: None,
-            region: None,
-            downscale: 1,
-            photo_size: (1, 1),
-            declared: (1, 1),
-            declared_by: String::new(),
-            turn: None,
-            mask_turn: None,
-            exposure: None,
-        };
-        let views: Vec<View> = cameras.iter().map(view).collect();
+        let views: Vec<View> = cameras.iter().map(|camera| View::bare("", camera.clone())).collect();
         let mut points: Vec<DVec3> =
             synthetic::SyntheticHead.surface_points(2000, 3).iter().map(|p| p.as_dvec3()).collect();
         points.push(DVec3::splat(500.0)); // what else is in the pictures

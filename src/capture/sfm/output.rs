@@ -80,7 +80,7 @@ pub(super) struct Output<'a> {
 }
 
 impl<'a> Output<'a> {
-    pub fn of(sfm: &'a SfmOptions) -> Output<'a> {
+    pub fn new(sfm: &'a SfmOptions) -> Output<'a> {
         Output { out: &sfm.out, limits: &sfm.limits }
     }
 

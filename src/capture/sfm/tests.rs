@@ -1,38 +1,6 @@
 use super::commands::{Commands, Mapper};
+use super::search::asked;
 use super::*;
-
-fn photo(width: u32, height: u32, value: impl Fn(u32, u32) -> u8) -> Photo {
-    let rgb = (0..width * height).map(|i| [value(i % width, i / width); 3]).collect();
-    Photo { width, height, rgb, alpha: None }
-}
-
-#[test]
-fn sharpness_is_the_mean_squared_step_along_rows_and_columns() {
-    // 0 10   along rows 10² and 0², along columns 0² and 10²: 200 for four pixels
-    // 0  0
-    assert_eq!(sharpness(&photo(2, 2, |x, y| if (x, y) == (1, 0) { 10 } else { 0 })), 50.0);
-    assert_eq!(sharpness(&photo(3, 1, |_, _| 7)), 0.0);
-}
-
-#[test]
-fn the_sharpest_of_each_window_is_kept_the_first_of_equal_ones_and_one_of_the_rest() {
-    let steps = [3, 9, 1, /* */ 5, 5, 2, /* */ 0, 4];
-    let frames = || steps.iter().map(|&step| Ok(photo(2, 1, move |x, _| if x == 0 { 0 } else { step })));
-    let kept = |every: usize| {
-        let mut kept = Vec::new();
-        sharpest(frames(), every, |number, frame| {
-            kept.push((number, frame.rgb[1][0]));
-            Ok(())
-        })
-        .unwrap();
-        kept
-    };
-    assert_eq!(kept(3), [(1, 9), (3, 5), (7, 4)]);
-    assert_eq!(kept(1).len(), 8);
-    assert_eq!(kept(100), [(1, 9)]);
-    let cut = frames().take(2).chain([Err(Error::cannot("cut", ""))]);
-    assert_eq!(sharpest(cut, 1, |_, _| Ok(())).unwrap_err().to_string(), "cut");
-}
 
 /// Returns the commands of an attempt, as typed; nothing for one that is not run.
 fn typed(
@@ -56,7 +24,7 @@ fn typed(
     let dir = tempfile::tempdir().unwrap();
     let lock = Lock::take(&dir.path().join(".lock")).unwrap();
     let (output, request) =
-        (Output::of(&sfm), Request { source: "photographs".into(), fingerprint: asked(&sfm) });
+        (Output::new(&sfm), Request { source: "photographs".into(), fingerprint: asked(&sfm) });
     let (sfm, warnings, masked) = (&sfm, Vec::new(), true);
     let work = Work { sfm, output, request, lock, programs, names, warnings, shared, masked, is_video };
     let Commands { extractor, matcher, calibrator, mapper } =

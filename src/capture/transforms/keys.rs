@@ -5,7 +5,7 @@
 //! is, are a reason, unknown ones and those in the wrong place a warning, and those that change the
 //! meaning a warning or a problem of their own.
 
-use super::{Object, lens, moments, pose};
+use super::{Object, moments, pose, spellings};
 use crate::capture::folder::{in_file, shortened};
 use crate::capture::frame::Listing;
 use crate::capture::masks::few;
@@ -23,7 +23,7 @@ struct Dialect {
 }
 
 /// All known keys, at the top of a file or in a frame. Those in [`CHANGES`] and the spellings in
-/// [`lens`] come on top.
+/// [`spellings`] come on top.
 const DIALECTS: [Dialect; 8] = [
     Dialect {
         program: "NeRF-Blender and D-NeRF",
@@ -76,7 +76,7 @@ const DIALECTS: [Dialect; 8] = [
     },
 ];
 
-/// Keys that are read at the top of a file only, besides those of [`lens`].
+/// Keys that are read at the top of a file only, besides those of [`spellings`].
 const OF_FILES: &str = "frames up n_frames applied_transform applied_scale units unit train_filenames \
                         val_filenames test_filenames";
 
@@ -288,23 +288,24 @@ impl KeyLog {
         let dialects = DIALECTS.iter().flat_map(|d| {
             words(d.read, read(Place::Anywhere)).chain(words(d.harmless, Use::Ignored(d.program)))
         });
-        let spellings = lens::ALIASES.iter().map(|(key, of)| match *of {
+        let aliases = spellings::ALIASES.iter().map(|(key, of)| match *of {
             "file_path" => (*key, Use::Read(Place::Frame)),
             _ => (*key, Use::Read(Place::Anywhere)),
         });
-        let matrices = lens::MATRICES.iter().map(|key| (*key, Use::Read(Place::Anywhere)));
-        let focal =
-            lens::FOCAL_WORDS.iter().map(|key| (*key, Use::Beaten("a focal length or an angle is there")));
+        let matrices = spellings::MATRICES.iter().map(|key| (*key, Use::Read(Place::Anywhere)));
+        let focal = spellings::FOCAL_WORDS
+            .iter()
+            .map(|key| (*key, Use::Beaten("a focal length or an angle is there")));
         let poses = pose::names().map(|key| (key, Use::Beaten("`transform_matrix` is there")));
         let changes = CHANGES.iter().flat_map(|change| words(change.keys, Use::Changes(change)));
         let axes = words(AXES, Use::Axes);
         let moments = moments::KEYS.iter().filter(|(_, is_telling)| *is_telling);
         let frames = moments.map(|(key, _)| (*key, Use::Read(Place::Frame)));
-        let frames = frames.chain(words(lens::FRAME_KEYS, read(Place::Frame)));
+        let frames = frames.chain(words(spellings::FRAME_KEYS, read(Place::Frame)));
         let frames = frames.chain([("transform_matrix", Use::Read(Place::Frame))]);
         let files = words(OF_FILES, read(Place::Top));
         // what comes later counts
-        let known = focal.chain(poses).chain(dialects).chain(spellings).chain(matrices);
+        let known = focal.chain(poses).chain(dialects).chain(aliases).chain(matrices);
         let known = known.chain(changes).chain(axes).chain(frames).chain(files).collect();
         KeyLog {
             known,
@@ -441,10 +442,10 @@ mod tests {
             }
         }
         let log = KeyLog::new();
-        for key in lens::SHARED_KEYS.split(' ').chain(FOCAL_KEYS) {
+        for key in spellings::SHARED_KEYS.split(' ').chain(FOCAL_KEYS) {
             assert!(matches!(log.known.get(key), Some(Use::Read(_))), "`{key}`");
         }
-        for (alias, key) in lens::ALIASES {
+        for (alias, key) in spellings::ALIASES {
             assert!(
                 matches!(log.known.get(alias), Some(Use::Read(_))) && seen.contains_key(key),
                 "`{alias}`"

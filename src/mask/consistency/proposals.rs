@@ -14,8 +14,9 @@
 //! is set aside, and the comparison is repeated without it until no view exceeds the limits. (⅓ is
 //! the weight of an open claim relative to one that is ruled out.)
 
-use super::{ConsistencyView, Opposition, SilhouetteConstraints, Votes, cells_on_ray, claims_of};
-use rayon::prelude::*;
+use super::{
+    ConsistencyView, Opposition, SilhouetteConstraints, Votes, cells_on_ray, claims_of, oppositions,
+};
 use tiface_base::Result;
 use tiface_base::image::INSIDE;
 
@@ -104,15 +105,11 @@ fn blame(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Ve
         let unsupported = yes < 2 || f64::from(yes) < MIN_SUPPORT_SHARE * f64::from(no + yes);
         (unsupported, no, u16::MAX - yes)
     };
-    let best = |claims: &SilhouetteConstraints, pixel| {
+    let found = oppositions(votes, claims, active, |claims, pixel| {
         let cells = cells_on_ray(&votes.cube, claims, pixel);
         let seen = cells.filter(|&cell| f64::from(costs[cell].0 + costs[cell].1) >= least_seen);
         seen.min_by_key(key).map(|cell| (key(&cell).0, costs[cell].0, cell))
-    };
-    let found: Vec<Option<Opposition>> = (0..claims.len())
-        .into_par_iter()
-        .map(|j| active[j].then(|| Opposition::of(votes, &claims[j], active, |p| best(&claims[j], p))))
-        .collect();
+    });
     let mut out: Vec<Disagreement> = claims.iter().map(|_| Disagreement::default()).collect();
     for (j, opposition) in found.iter().enumerate() {
         let Some(Opposition { open, opposing, .. }) = opposition else { continue };
@@ -128,29 +125,14 @@ fn blame(votes: &Votes, claims: &[SilhouetteConstraints], active: &[bool]) -> Ve
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{DMat3, DVec3, Vec2};
-    use tiface_base::geom::{Camera, Distortion};
+    use crate::mask::consistency::tests::camera;
+    use glam::{DVec3, Vec2};
+    use tiface_base::geom::Camera;
     use tiface_base::image::Gray;
 
     /// Twelve cameras on a ring, looking a little down.
     fn ring() -> Vec<Camera> {
-        (0..12)
-            .map(|i| {
-                let turn = i as f64 * std::f64::consts::TAU / 12.0;
-                let rotation = DMat3::from_rotation_y(turn) * DMat3::from_rotation_x(-0.2);
-                Camera {
-                    width: 96,
-                    height: 128,
-                    fx: 300.0,
-                    fy: 300.0,
-                    cx: 48.0,
-                    cy: 64.0,
-                    distortion: Distortion::default(),
-                    rotation,
-                    position: rotation * DVec3::new(0.0, 0.0, 10.0),
-                }
-            })
-            .collect()
+        (0..12).map(|i| camera(i as f64 * std::f64::consts::TAU / 12.0, -0.2)).collect()
     }
 
     /// Returns a ball with a smaller one on top, or the ball alone.

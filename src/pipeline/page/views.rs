@@ -5,7 +5,7 @@
 
 use crate::capture::{Split, View};
 use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, ViewBackground, display_name};
-use crate::pipeline::finish::{Export, center};
+use crate::pipeline::frames::{Export, center};
 use crate::pipeline::mesh::{head_mesh, read_finished};
 use crate::pipeline::metrics::{Comparable, PictureSet, comparable, picture_sets};
 use crate::pipeline::pictures;

@@ -1,32 +1,13 @@
-//! Helpers that the tests of the learned fields share, besides the ball.
+//! Trainings that are stopped, resumed and refused, for the tests of every learned field.
 
-use super::view;
+use super::checkpoint::newest;
+use super::training::TrainingSession;
 use crate::capture::synthetic::shared::Files;
-use crate::field::checkpoint::newest;
-use crate::field::pixels::TrainView;
-use crate::field::training::TrainingSession;
-use glam::Vec3;
 use std::path::Path;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use tiface_base::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
-use tiface_base::math::rng;
 use tiface_base::{Monitor, Quiet, Result};
-
-/// Returns photographs of a ball textured with waves of a few pixels: nine from the front and three
-/// from the back.
-pub fn textured_views() -> Vec<TrainView> {
-    let waves = |p: Vec3| {
-        let wave = |i: u64| {
-            let [x, y, z] = [0, 1, 2].map(|k| 90.0 * rng::uniform(5, i, k) - 45.0);
-            (p.dot(Vec3::new(x, y, z)) + i as f32).sin()
-        };
-        [(128.0 + 12.0 * (0..9).map(wave).sum::<f32>()) as u8; 3]
-    };
-    let before = (0..9).map(|i| (0.4 * (i % 3) as f64 - 0.4, 0.4 * (i / 3) as f64 - 0.4));
-    let behind = (2..5).map(|i| (i as f64 * std::f64::consts::TAU / 6.0, 0.3));
-    before.chain(behind).map(|(azimuth, elevation)| view(80, azimuth, elevation, waves)).collect()
-}
 
 pub fn temporary() -> tempfile::TempDir {
     tempfile::tempdir().expect("a temporary folder")

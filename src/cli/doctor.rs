@@ -1,35 +1,12 @@
-//! `tiface config`: the effective configuration, or the documentation of a key. `tiface doctor`:
-//! devices and features of this machine and build, for the choice of a device and for bug reports.
+//! `tiface doctor`: devices and features of this machine and build, for the choice of a device and
+//! for bug reports.
 
-use super::options::{Common, RunTarget};
+use super::options::Common;
 use super::screen::print;
-use crate::config::{explain, explained};
 use crate::field::{DeviceReport, examine_devices};
 use serde::Serialize;
-use serde_json::json;
 use std::fmt::{self, Display};
-use std::path::Path;
 use tiface_base::{Error, ErrorKind, Result, io};
-
-pub(super) fn config(common: &Common, path: Option<&Path>, key: Option<&str>) -> Result<()> {
-    if let Some(key) = key {
-        return match common.json {
-            true => print(&format!("{}\n", json!(explained(key)?))),
-            false => print(&explain(key)?),
-        };
-    }
-    // without a capture or run, this is the configuration of a new run
-    let saved = match path.or(common.run.as_deref()) {
-        Some(path) => RunTarget::find(common, Some(path))?.saved,
-        None => None,
-    };
-    let config = common.resolve(saved.as_deref(), None, &[])?;
-    match common.json {
-        // not by a `Value`, which would write an f32 with the digits of an f64
-        true => print(&format!("{}\n", serde_json::to_string(&config).unwrap_or_default())),
-        false => print(&config.to_toml()),
-    }
-}
 
 /// A machine's devices and features.
 #[derive(Serialize)]
@@ -44,7 +21,7 @@ struct Examination {
     auto: String,
 }
 
-pub(super) fn doctor(common: &Common) -> Result<()> {
+pub(super) fn run(common: &Common) -> Result<()> {
     let features = [("wgpu", cfg!(feature = "wgpu")), ("matting", cfg!(feature = "matting"))];
     let tests = [crate::iface::SDF_TEST, crate::tface::VM_TEST, crate::iface::DENSITY_TEST];
     let (devices, auto) = examine_devices(&tests)?;
