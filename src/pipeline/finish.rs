@@ -3,6 +3,7 @@
 //! The files of a head mesh are in the dataset's coordinates or turned so that the face looks at
 //! the viewer ([`Export`]).
 
+use super::advice::{advised, sentence};
 use crate::capture::Capture;
 use crate::capture::scene::Scene;
 use crate::config::{ColorSource, Config, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
@@ -101,8 +102,8 @@ impl Finish<'_> {
         let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
         if fewer || c.max_error > 0.0 {
             let config = SimplifyConfig { triangles: c.triangles as usize, error: c.max_error * self.cell };
-            let done = simplify(&mut mesh, Some(self.field), &config, self.monitor)?;
-            log.warnings.extend(done.warnings(&config));
+            let done = simplify(&mut mesh, Some(self.field), &config, self.monitor).map_err(advised)?;
+            log.warnings.extend(done.warnings(&config).iter().map(sentence));
             log.report.insert("simplify".into(), json!(done));
         }
         Ok(mesh)
@@ -166,7 +167,7 @@ impl Finish<'_> {
         let center = center(self.surface, &scene_from_world.inverse());
         let config = self.export.atlas_config(center, scene_from_world, c.texture_px, c.gutter_px);
         let (layout, done) = atlas(mesh, &config, self.monitor)?;
-        log.warnings.extend(done.warnings());
+        log.warnings.extend(done.warnings().iter().map(sentence));
         log.report.insert("atlas".into(), json!(done));
         Ok(layout)
     }
@@ -322,8 +323,11 @@ impl Export {
         };
         match format {
             MeshFormat::Glb => {
-                let bytes = to_glb(mesh, texture.as_ref(), shells.as_ref(), &options)?;
-                Ok(ExportedFiles { files: vec![(format!("{stem}.glb"), bytes)], warnings: Vec::new() })
+                let bytes = to_glb(mesh, texture.as_ref(), shells.as_ref(), &options);
+                bytes.map(|bytes| ExportedFiles {
+                    files: vec![(format!("{stem}.glb"), bytes)],
+                    warnings: Vec::new(),
+                })
             }
             MeshFormat::Obj => to_obj(mesh, texture.as_ref(), &options),
             // always in the dataset's world, with colors at the vertices: one index per vertex, so
@@ -332,6 +336,7 @@ impl Export {
                 to_ply(mesh, None, &ExportOptions { world_from_mesh: *world_from_scene, ..options })
             }
         }
+        .map_err(advised)
     }
 
     /// Returns the options that place a mesh in its files, whatever it is called and shows.

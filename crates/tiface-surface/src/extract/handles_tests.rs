@@ -73,7 +73,7 @@ fn a_loop_of_hair_is_cut_once() {
     // 0.8
     let [around] = report.handles.cut[..] else { panic!("{:?}", report.handles) };
     assert!((0.25..0.4).contains(&around), "{around}");
-    let heard = report.handles.warning(250.0).unwrap();
+    let heard = report.handles.warning(250.0).unwrap().to_string();
     assert!(heard.contains("1 cut (") && heard.contains("0 holes filled,"), "{heard}");
 }
 
