@@ -8,6 +8,7 @@ mod handles;
 mod loops;
 mod marching;
 mod marching_cell;
+mod polish;
 mod sparse;
 
 pub use cap::{Cap, RimVertex};
@@ -17,10 +18,10 @@ pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
 
-use super::moves::Polish;
 use super::{Warning, check_len, evaluate, setting};
 use glam::{DVec3, Vec3};
 use handles::cut_handles;
+use polish::Polish;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 use tiface_base::error::{Cause, counted};

@@ -1,9 +1,9 @@
 //! The density field of [`crate::cpu::density`], whose module holds the formulas: its networks
 //! forward and backward, truncation of rays by transmittance, and compositing with the losses.
 
+use super::batch::DeviceBatch;
 use super::color::{ColorPlan, color_backward, color_forward, color_inputs, unit};
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::DeviceBatch;
 use super::hash::Grid;
 use super::losses::{HIT, LAST, TALLY, sum, tally};
 use super::march::{Samples, prefix_sum};

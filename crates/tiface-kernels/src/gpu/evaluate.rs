@@ -1,7 +1,7 @@
 //! Evaluation of a trained signed-distance field on a device, in batches that fill the device.
 
+use super::batch::DeviceBatch;
 use super::device::{Buffer, Device};
-use super::draw::DeviceBatch;
 use super::march::Samples;
 use super::neus::Neus;
 use super::occupancy::Occupancy;

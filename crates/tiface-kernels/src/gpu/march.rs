@@ -2,8 +2,8 @@
 //! number of samples: a first pass counts the samples of each ray, a prefix sum gives the offset of
 //! each ray, and a second pass writes the samples.
 
+use super::batch::DeviceBatch;
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::DeviceBatch;
 use super::occupancy::Occupancy;
 use super::vec3::Vec3;
 use burn::cubecl::{self, prelude::*};

@@ -16,8 +16,8 @@ pub use decoder::DeviceDecoder;
 pub use grid::DeviceGrid;
 pub use losses::VmLosses;
 
+use super::batch::DeviceBatch;
 use super::device::{Atomics, Buffer, Device};
-use super::draw::DeviceBatch;
 use crate::cpu::march::MarchRay;
 use crate::cpu::vm::{Grid, RAY_WIDTH, VmField};
 use march::{DeviceLattice, VmSamples};

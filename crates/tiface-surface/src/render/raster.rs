@@ -20,7 +20,8 @@ mod paint;
 mod project;
 mod tile;
 
-use super::raycast::{RayHits, RenderedView};
+use super::hits::RayHits;
+use super::view::RenderedView;
 use bytemuck::Zeroable;
 use paint::{Painter, PictureRows, RasterSurface, SampleBatch, TileArea, straight_rays};
 use project::{Bins, Faces, Lens, TILE};

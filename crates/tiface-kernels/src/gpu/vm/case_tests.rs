@@ -1,7 +1,7 @@
 //! A vector-matrix field and rays to test kernels on.
 
+use super::super::batch::DeviceBatch;
 use super::super::device::{Buffer, Device, Words};
-use super::super::draw::DeviceBatch;
 use super::super::evaluate::planes;
 use super::{Vm, VmValues};
 use crate::cpu::march::MarchRay;
