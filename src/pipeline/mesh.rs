@@ -209,8 +209,8 @@ pub(super) fn extract(
         tiface_surface::extract(&field, kept, &options, monitor)
     }
     .map_err(advised)?;
-    let patches = Patches::of(&mesh, &report.handles);
-    let cap = (!c.dense).then(|| Cap::of(&mesh, report.bounds(), report.cell_size));
+    let patches = Patches::find(&mesh, &report.handles);
+    let cap = (!c.dense).then(|| Cap::find(&mesh, report.bounds(), report.cell_size));
     Ok(Extraction { mesh, report, cap: cap.flatten(), patches })
 }
 

@@ -285,7 +285,7 @@ fn placed(mesh: &Mesh, charts: &[Flat], poses: &[ChartPose], config: &AtlasConfi
     for (chart, pose) in charts.iter().zip(poses) {
         let first = atlas.uvs.len() as u32;
         for &point in &chart.points {
-            let p = pose.of(point) / size;
+            let p = pose.place(point) / size;
             // v runs down; as seen in the image the surface is not mirrored
             atlas.uvs.push(DVec2::new(p.x, 1.0 - p.y).as_vec2().clamp(Vec2::ZERO, Vec2::ONE));
         }

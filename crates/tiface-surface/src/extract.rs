@@ -220,7 +220,7 @@ pub fn extract(
     }
     // vertices whose normal is not the field's slope
     let mut edged = on_faces(&mesh);
-    if let Some(patches) = Patches::of(&mesh, &report.handles) {
+    if let Some(patches) = Patches::find(&mesh, &report.handles) {
         patches.corners().for_each(|v| edged[v as usize] = true);
         gradients = gradient(&mesh.positions)?.1;
     }

@@ -181,7 +181,7 @@ fn geometry_backward(
     if group < samples.div_ceil(TILE) {
         let lane = lane_of(group, plane);
         let (row, column) = (lane.row, lane.column);
-        let sums = Block::of(w1_0, w1_1, w1_2, w1_3);
+        let sums = Block::new(w1_0, w1_1, w1_2, w1_3);
         store_outer(partial, sum, &sums, inputs, row, column);
         store_row(partial, sum + (row + HIDDEN) * CHANNELS, w2, HIDDEN, column);
     }

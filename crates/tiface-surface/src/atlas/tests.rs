@@ -12,7 +12,7 @@ fn config(size_px: u32) -> AtlasConfig {
 }
 
 /// A sphere of rings and a pole at each end.
-fn sphere(rings: u32, around: u32) -> Mesh {
+pub(super) fn sphere(rings: u32, around: u32) -> Mesh {
     let mut mesh = Mesh { positions: vec![Vec3::Y], ..Mesh::default() };
     for i in 1..rings {
         for j in 0..around {

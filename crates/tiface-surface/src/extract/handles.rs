@@ -326,7 +326,7 @@ impl<'a> HandleCutter<'a> {
                 }
             };
             let mut free = true;
-            let mut effort = Effort::of(CAP_EFFORT);
+            let mut effort = Effort::new(CAP_EFFORT);
             self.boxes.meeting(&span(p), &mut effort, |o, _| {
                 let replaced = self.changed[o as usize] || cut.at_rims.contains_key(&o);
                 free = replaced || !meets(self.mesh.triangles[o as usize]);
@@ -351,7 +351,7 @@ pub struct Patches {
 
 impl Patches {
     /// Returns the patches of a mesh as extracted; `None` if nothing was cut.
-    pub fn of(mesh: &Mesh, report: &HandleReport) -> Option<Patches> {
+    pub fn find(mesh: &Mesh, report: &HandleReport) -> Option<Patches> {
         let first = mesh.triangles.len().checked_sub(report.triangles)?;
         let triangles = mesh.triangles[first..].to_vec();
         let mesh = Mesh { positions: mesh.positions.clone(), triangles, ..Mesh::default() };
