@@ -8,7 +8,8 @@ use std::ops::{Add, Mul};
 pub struct Ray {
     /// Origin: the camera center.
     pub origin: Vec3,
-    /// Unit direction, away from the camera.
+    /// Direction, away from the camera. It has unit length in the scene; a field may count `t` in
+    /// another unit, and its rays' directions have the length of that.
     pub direction: Vec3,
     /// Nearest parameter of interest, ≥ 0.
     pub t_min: f32,
@@ -17,6 +18,19 @@ pub struct Ray {
 }
 
 impl Ray {
+    /// Returns the whole half line from `origin` along `direction`.
+    #[inline]
+    pub fn new(origin: impl Into<Vec3>, direction: impl Into<Vec3>) -> Ray {
+        Ray { origin: origin.into(), direction: direction.into(), t_min: 0.0, t_max: f32::INFINITY }
+    }
+
+    /// Returns the ray in coordinates that are `scale` times those of this one.
+    #[inline]
+    pub fn scaled(self, scale: f32) -> Ray {
+        let [t_min, t_max] = [self.t_min, self.t_max].map(|t| t * scale);
+        Ray { origin: self.origin * scale, t_min, t_max, ..self }
+    }
+
     /// Returns the point at parameter `t`.
     #[inline]
     pub fn at(&self, t: f32) -> Vec3 {

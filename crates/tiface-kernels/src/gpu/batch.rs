@@ -1,9 +1,10 @@
 //! Rays of a step in device memory.
 
 use super::device::{Buffer, Device, Words, groups, launch};
-use crate::cpu::march::MarchRay;
+use crate::cpu::march::shift;
 use burn::cubecl::server::Handle;
 use burn::cubecl::{self, prelude::*};
+use tiface_base::geom::Ray;
 
 const UNITS: u32 = 256;
 
@@ -31,7 +32,7 @@ fn keep(wanted: &[u32], alive: &mut [u32]) {
 pub struct DeviceBatch {
     /// Planes `[3, rays]`, where they start, in the field's coordinates.
     pub origin: Buffer,
-    /// Planes `[3, rays]`, unit directions.
+    /// Planes `[3, rays]`, directions.
     pub direction: Buffer,
     /// `[rays]`: the part of a step that samples are shifted by.
     pub jitter: Buffer,
@@ -59,22 +60,23 @@ impl DeviceBatch {
         }
     }
 
-    /// Uploads rays into a batch of the given capacity, with black colors.
-    pub fn of_rays(device: &Device, rays: &[MarchRay], capacity: usize) -> DeviceBatch {
-        assert!(rays.len() <= capacity);
+    /// Uploads rays into a batch of the given capacity, with black colors. `jitter` is empty, or
+    /// has one a ray.
+    pub fn upload(device: &Device, rays: &[Ray], jitter: &[f32], capacity: usize) -> DeviceBatch {
+        assert!(rays.len() <= capacity && (jitter.is_empty() || jitter.len() == rays.len()));
         let mut planes = [vec![0f32; 3 * capacity], vec![0f32; 3 * capacity]];
-        let (mut jitter, mut alive) = (vec![0f32; capacity], vec![0u32; capacity]);
+        let (mut shifts, mut alive) = (vec![0f32; capacity], vec![0u32; capacity]);
         for (r, ray) in rays.iter().enumerate() {
             for a in 0..3 {
                 planes[0][a * capacity + r] = ray.origin[a];
                 planes[1][a * capacity + r] = ray.direction[a];
             }
-            (jitter[r], alive[r]) = (ray.jitter, 1);
+            (shifts[r], alive[r]) = (shift(jitter, r), 1);
         }
         DeviceBatch {
             origin: device.upload(&planes[0]),
             direction: device.upload(&planes[1]),
-            jitter: device.upload(&jitter),
+            jitter: device.upload(&shifts),
             alive: device.upload(&alive),
             ..DeviceBatch::new(device, capacity)
         }
