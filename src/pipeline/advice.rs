@@ -10,7 +10,9 @@ pub(super) fn advised(error: Error) -> Error {
     let hint = match error.cause() {
         Some(Cause::NowhereFinite) => "training diverged: resume `iface` from an earlier checkpoint".into(),
         Some(Cause::AllInside) => {
-            "the field may be inverted (negative must be inside), untrained, or the box may lie within the head".into()
+            "the field may be inverted (negative must be inside), untrained, or the box may lie within the \
+             head"
+                .into()
         }
         Some(Cause::AllOutside) => format!(
             "train `iface` longer, check that the box holds the head (`{}`), or raise `{}` for small pieces",
@@ -80,7 +82,8 @@ mod tests {
         let handles = Warning::Handles { cut_mm: vec![40.0], filled_mm: Vec::new(), left: 0 };
         assert_eq!(
             sentence(&handles),
-            "the surface had loops: 1 cut (40 mm around), 0 holes filled, 0 left; `mesh.genus = \"keep\"` keeps all"
+            "the surface had loops: 1 cut (40 mm around), 0 holes filled, 0 left; `mesh.genus = \"keep\"` \
+             keeps all"
         );
         assert_eq!(
             sentence(&Warning::NoCharts { gutter_px: 0.5, reason: "it broke".into() }),

@@ -262,17 +262,15 @@ fn check_surface(found: &Sparse) -> Result<()> {
         ));
     }
     if largest < 0.0 && found.skipped == 0 && found.surface.non_finite == 0 && nodes > 0 {
-        let how = format!(
-            "the field is negative at all {nodes} nodes evaluated (largest {largest:.3e}), everything is inside"
-        );
-        return Err(no_surface(Cause::AllInside, how));
+        let how =
+            format!("negative at all {nodes} nodes evaluated (largest {largest:.3e}), everything is inside");
+        return Err(no_surface(Cause::AllInside, format!("the field is {how}")));
     }
     // with an empty hull nothing is evaluated: then the smallest is infinite
     if found.surface.mesh.triangles.is_empty() {
-        let how = format!(
-            "the field is positive at all {nodes} nodes evaluated (smallest {smallest:.3e}), nothing is inside"
-        );
-        return Err(no_surface(Cause::AllOutside, how));
+        let how =
+            format!("positive at all {nodes} nodes evaluated (smallest {smallest:.3e}), nothing is inside");
+        return Err(no_surface(Cause::AllOutside, format!("the field is {how}")));
     }
     Ok(())
 }

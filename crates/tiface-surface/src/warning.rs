@@ -93,8 +93,8 @@ impl fmt::Display for Warning {
             ),
             Warning::TooManyTriangles { left, asked } => write!(
                 f,
-                "{left} triangles are left instead of {asked}: fewer would change the topology, fold the surface or make \
-                 it cross itself"
+                "{left} triangles are left instead of {asked}: fewer would change the topology, fold the surface \
+                 or make it cross itself"
             ),
             Warning::NotManifold(vertices) => {
                 write!(f, "{vertices} vertices are not manifold and stayed as they are")
@@ -102,7 +102,8 @@ impl fmt::Display for Warning {
             Warning::Crossing(triangles) => write!(f, "{triangles} triangles cross others, as in the input"),
             Warning::NoCharts { gutter_px, reason } => write!(
                 f,
-                "every triangle has a piece of the texture of its own, {gutter_px:.1} texels of gutter: {reason}"
+                "every triangle has a piece of the texture of its own, {gutter_px:.1} texels of gutter: \
+                 {reason}"
             ),
             Warning::OwnCharts(triangles) => write!(
                 f,

@@ -295,8 +295,8 @@ mod tests {
     const RADIUS: f32 = 1.1;
     const STEP: f32 = 0.02;
 
-    /// Returns a mask with holes, solid cells, and jittered rays from all around towards the center,
-    /// one along an axis and one that misses.
+    /// Returns a mask with holes, solid cells, and rays from all around towards the center, one
+    /// along an axis and one that misses, with their jitter.
     fn scene() -> (BitGrid, BitGrid, Vec<Ray>, Vec<f32>) {
         let resolution = 24;
         let mut mask = BitGrid::filled(resolution, false);

@@ -205,8 +205,8 @@ pub struct Walk<'a> {
 }
 
 impl<'a> Walk<'a> {
-    /// Creates a walk that starts before the first lattice point, which `jitter` shifts by that part
-    /// of a step; it has no points if the ray misses the box.
+    /// Creates a walk that starts before the first lattice point, which `jitter` shifts by that
+    /// part of a step; it has no points if the ray misses the box.
     #[inline(always)]
     pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &Ray, jitter: f32) -> Walk<'a> {
         let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
