@@ -3,7 +3,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// Returns the first-order step to a field's zero, `−f g / |g|²`; zero if value or gradient is
+/// Returns the first-order step to a field's zero, `−f g / |g|²`; `None` if value or gradient is
 /// unusable.
 pub(super) fn newton(f: f32, g: Vec3) -> Option<Vec3> {
     let slope = g.length_squared();
