@@ -124,6 +124,7 @@ fn cap(adjacent: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<b
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::atlas::tests::sphere;
     use tiface_base::Quiet;
 
     /// Returns a closed ball around the origin, a bump like a nose at its front (+z) and a dent
@@ -132,7 +133,8 @@ mod tests {
         let mut mesh = sphere(40, 60);
         for p in &mut mesh.positions {
             let near = |q: Vec3| (-40.0 * p.distance_squared(q.normalize())).exp();
-            *p *= 1.0 + 0.15 * near(Vec3::Z) - 0.05 * near(Vec3::new(0.0, -0.5, 1.0));
+            let r = 1.0 + 0.15 * near(Vec3::Z) - 0.05 * near(Vec3::new(0.0, -0.5, 1.0));
+            *p *= r;
         }
         mesh
     }
