@@ -117,7 +117,7 @@ fn random_rays(bounds: Aabb, count: usize) -> Vec<Ray> {
             let flat = (1.0 - z * z).sqrt();
             let origin = bounds.center() + radius * Vec3::new(flat * turn.cos(), flat * turn.sin(), z);
             let target = bounds.min + bounds.size() * Vec3::new(next(), next(), next());
-            Ray { origin, direction: (target - origin).normalize(), t_min: 0.0, t_max: f32::INFINITY }
+            Ray::new(origin, (target - origin).normalize())
         })
         .collect()
 }

@@ -76,7 +76,7 @@ impl Training {
         };
         let [[density, .., g_density], [color, .., g_color], [network, .., g_network]] = &mut self.arrays;
         let weights = DecoderWeights::new(self.field.decoder, network);
-        let rendered = vm::render(&self.field, density, color, &weights, &s.rays);
+        let rendered = vm::render(&self.field, density, color, &weights, &s.rays, &s.jitter);
         let counts = [rendered.density_samples, rendered.color_samples];
         lap(0);
         let targets = Targets { color: &self.color, alpha: &self.alpha, background: &self.background };

@@ -21,6 +21,7 @@
 //! loading anything. The device is not part of the fingerprint, because it decides how fast a field
 //! is trained, not what the field is.
 
+mod advice;
 mod bench;
 mod cameras;
 mod clicks;

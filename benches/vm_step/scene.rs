@@ -1,6 +1,6 @@
 //! A field with the content of a head, and rays of cameras around it; everything from fixed seeds.
 
-use tiface::kernel::cpu::march::MarchRay;
+use tiface::geom::Ray;
 use tiface::kernel::cpu::vm::mask::{BoxMask, Lattice};
 use tiface::kernel::cpu::vm::{self, DecoderShape, Grid, PLANE_AXES, Shading, VmField};
 use tiface::math::rng;
@@ -19,7 +19,8 @@ pub struct Scene {
     pub density: Vec<f32>,
     pub color: Vec<f32>,
     pub network: Vec<f32>,
-    pub rays: Vec<MarchRay>,
+    pub rays: Vec<Ray>,
+    pub jitter: Vec<f32>,
     /// `[rays, 3]`
     pub target: Vec<f32>,
     /// `[rays]`: 1 where the matte is empty, else 0.
@@ -76,9 +77,9 @@ pub fn scene(size: [usize; 3], peak: f32, rays: usize) -> Scene {
             (0..(rows * columns) as u64).map(move |i| bound * (2.0 * rng::uniform(11, 20 + k, i) - 1.0))
         })
         .collect();
-    let (rays, target, background) = batch(rays);
+    let (rays, [jitter, target, background]) = batch(rays);
     let color = noise(2, color.len(), 0.3);
-    let mut s = Scene { field, density: values, color, network, rays, target, background };
+    let mut s = Scene { field, density: values, color, network, rays, jitter, target, background };
     s.field.mask = Some(alpha_mask(&s));
     s
 }
@@ -106,9 +107,10 @@ fn alpha_mask(s: &Scene) -> BoxMask {
     BoxMask::from_vertices(l.min, l.max, n, &wider)
 }
 
-/// Rays of 24 cameras on a dome, 3.5 half extents from the box's middle, that meet the box.
-fn batch(count: usize) -> (Vec<MarchRay>, Vec<f32>, Vec<f32>) {
-    let mut rays = Vec::with_capacity(count);
+/// Rays of 24 cameras on a dome, 3.5 half extents from the box's middle, that meet the box; their
+/// jitter, targets and backgrounds.
+fn batch(count: usize) -> (Vec<Ray>, [Vec<f32>; 3]) {
+    let (mut rays, mut jitter) = (Vec::with_capacity(count), Vec::with_capacity(count));
     let (mut target, mut background) = (Vec::new(), Vec::new());
     let half = EXTENT.map(|e| 0.5 * e);
     for i in 0.. {
@@ -126,7 +128,6 @@ fn batch(count: usize) -> (Vec<MarchRay>, Vec<f32>, Vec<f32>) {
         let toward: [f32; 3] = std::array::from_fn(|a| aim[a] - origin[a]);
         let length = toward.iter().map(|c| c * c).sum::<f32>().sqrt();
         let direction = toward.map(|c| c / length);
-        let ray = MarchRay { origin, direction, jitter: u(3) };
         let (mut enter, mut leave) = (f32::NEG_INFINITY, f32::INFINITY);
         for a in 0..3 {
             let (p, q) = ((-half[a] - origin[a]) / direction[a], (half[a] - origin[a]) / direction[a]);
@@ -140,9 +141,10 @@ fn batch(count: usize) -> (Vec<MarchRay>, Vec<f32>, Vec<f32>) {
         let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
         let (o, d) = (scaled(origin), scaled(direction));
         let head = dot(o, d).powi(2) > dot(d, d) * (dot(o, o) - 1.0);
-        rays.push(ray);
+        rays.push(Ray::new(origin, direction));
+        jitter.push(u(3));
         background.push(f32::from(!head));
         target.extend((0..3).map(|k| if head { 0.2 + 0.6 * u(4 + k) } else { 0.0 }));
     }
-    (rays, target, background)
+    (rays, [jitter, target, background])
 }

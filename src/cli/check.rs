@@ -180,7 +180,10 @@ pub(super) fn run(
         uv_check(&weld(&mesh), &atlas)
     });
     let requirements: Vec<&str> = require.iter().map(String::as_str).collect();
-    let passed = report.require(&requirements);
+    let passed = report.require(&requirements).map_err(|e| match e.kind() {
+        ErrorKind::BelowBar => e.with_hint("`tiface check` without `--require` prints the whole report"),
+        _ => e,
+    });
     if let Err(e) = &passed
         && e.kind() == ErrorKind::Usage
     {

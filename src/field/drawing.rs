@@ -77,9 +77,9 @@ impl DeviceSampler {
         let mut alive = vec![0u32; rays];
         drawn.number.iter().for_each(|&r| alive[r as usize] = 1);
         *batch = DeviceBatch {
-            origin: triples(&|k| drawn.rays[k].origin),
-            direction: triples(&|k| drawn.rays[k].direction),
-            jitter: floats(&|k| drawn.rays[k].jitter),
+            origin: triples(&|k| drawn.rays[k].origin.to_array()),
+            direction: triples(&|k| drawn.rays[k].direction.to_array()),
+            jitter: floats(&|k| drawn.jitter[k]),
             color: triples(&|k| drawn.color[k]),
             alpha: floats(&|k| drawn.alpha[k]),
             background: device.upload(&planes(&background, rays)),

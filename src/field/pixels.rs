@@ -17,7 +17,6 @@ use rayon::prelude::*;
 use tiface_base::geom::{Camera, Ray};
 use tiface_base::image::{Gray, Photo, dilated};
 use tiface_base::math::rng;
-use tiface_kernels::cpu::march::MarchRay;
 use tiface_kernels::cpu::vm::mask::crossing;
 #[cfg(feature = "wgpu")]
 use tiface_kernels::gpu;
@@ -38,7 +37,9 @@ pub struct TrainView {
 #[derive(Default)]
 pub struct HostBatch {
     /// Rays in field coordinates.
-    pub rays: Vec<MarchRay>,
+    pub rays: Vec<Ray>,
+    /// `[rays]` part of a step by which the samples of a ray are shifted.
+    pub jitter: Vec<f32>,
     /// `[rays, 3]` head over black, sRGB-coded 0..=1: premultiplied by `alpha`.
     pub color: Vec<[f32; 3]>,
     /// `[rays]` soft alpha; 1 where the view has no mask.
@@ -52,10 +53,19 @@ impl HostBatch {
     /// Drops all rays after the first `count`.
     pub fn truncate(&mut self, count: usize) {
         self.rays.truncate(count);
+        self.jitter.truncate(count);
         self.color.truncate(count);
         self.alpha.truncate(count);
         self.number.truncate(count);
     }
+}
+
+/// One ray of a [`HostBatch`].
+struct DrawnRay {
+    ray: Ray,
+    jitter: f32,
+    color: [f32; 3],
+    alpha: f32,
 }
 
 /// Inclusive box of drawable pixels and one bit per pixel.
@@ -203,8 +213,9 @@ impl<'a> RaySampler<'a> {
         let drawn: Vec<_> = (0..count).into_par_iter().with_min_len(256).map(draw).collect();
         let mut batch = HostBatch::default();
         for (i, drawn) in drawn.into_iter().enumerate() {
-            let Some((ray, color, alpha)) = drawn else { continue };
+            let Some(DrawnRay { ray, jitter, color, alpha }) = drawn else { continue };
             batch.rays.push(ray);
+            batch.jitter.push(jitter);
             batch.color.push(color);
             batch.alpha.push(alpha);
             batch.number.push(i as u32);
@@ -278,15 +289,14 @@ impl<'a> RaySampler<'a> {
         }
     }
 
-    /// Draws ray `i` of a batch of `count` in the order without repetition: the ray, its pixel's
-    /// color over black, and the pixel's alpha.
+    /// Draws ray `i` of a batch of `count` in the order without repetition.
     fn draw_next(
         &self,
         order: &Order,
         (seed, step): (u64, u64),
         (i, count): (u64, u64),
         jitter: bool,
-    ) -> Option<(MarchRay, [f32; 3], f32)> {
+    ) -> Option<DrawnRay> {
         let which = rng::Permutation::of_step((seed, step), count, self.count()).get(i)?;
         let v = self.cumulative.partition_point(|&c| c <= which);
         let rank = (which - if v > 0 { self.cumulative[v - 1] } else { 0 }) as u32;
@@ -298,9 +308,8 @@ impl<'a> RaySampler<'a> {
         let ray = view.camera.ray(center(p, view.photo.width as usize))?;
         let jitter = if jitter { rng::uniform(seed, (step << 4) + 2, i) } else { 0.0 };
         let depth = if order.depth_directions { ray.direction.dot(view.camera.forward()) } else { 1.0 };
-        let (origin, direction) = (ray.origin.to_array(), (ray.direction / depth).to_array());
         let (color, alpha) = self.premultiplied_color(v, p);
-        Some((MarchRay { origin, direction, jitter }, color, alpha))
+        Some(DrawnRay { ray: Ray::new(ray.origin, ray.direction / depth), jitter, color, alpha })
     }
 
     /// Returns color and alpha of pixel `p` of view `v`. The color is already over black if the
@@ -346,15 +355,8 @@ impl<'a> RaySampler<'a> {
         (Vec2::from(middle), color.map(|sum| mean(sum, 255 * 255)), mean(alpha, 255))
     }
 
-    /// Draws ray `i` of a batch independently of the others, and returns what
-    /// [`draw_next`](RaySampler::draw_next) does.
-    fn draw_one(
-        &self,
-        (seed, step): (u64, u64),
-        i: u64,
-        jitter: bool,
-        detail: f32,
-    ) -> Option<(MarchRay, [f32; 3], f32)> {
+    /// Draws ray `i` of a batch independently of the others.
+    fn draw_one(&self, (seed, step): (u64, u64), i: u64, jitter: bool, detail: f32) -> Option<DrawnRay> {
         let stream = step << 4;
         let v = if self.reference_sampling {
             rng::below(seed, stream, i, self.views.len() as u64) as usize
@@ -387,7 +389,7 @@ impl<'a> RaySampler<'a> {
             };
             let Some(ray) = view.camera.ray(at) else { continue };
             let jitter = if jitter { rng::uniform(seed, stream + 2, i) } else { 0.0 };
-            return Some((MarchRay::new(&ray, self.radius, jitter), color, alpha));
+            return Some(DrawnRay { ray: ray.scaled(self.radius), jitter, color, alpha });
         }
         None
     }

@@ -171,11 +171,11 @@ impl SdfOps for CpuSdf<'_> {
 
     fn march(&mut self) {
         let (config, step) = (self.config, &mut self.step);
-        step.samples = self.occupancy.march(config, step.dt, &step.batch.rays);
+        step.samples = self.occupancy.march(config, step.dt, &step.batch.rays, &step.batch.jitter);
         let wanted = step.samples.t.len();
         truncate(&mut step.batch, &mut step.samples, MAX_BUDGETS * config.samples);
         step.background.truncate(step.batch.rays.len());
-        step.direction = step.batch.rays.iter().map(|r| r.direction).collect();
+        step.direction = step.batch.rays.iter().map(|r| r.direction.to_array()).collect();
         step.dts = vec![step.dt; step.samples.t.len()];
         self.samples_wanted = Some(wanted);
         self.empty_steps = if wanted == 0 { self.empty_steps + 1 } else { 0 };

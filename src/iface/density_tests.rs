@@ -73,7 +73,7 @@ fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, 
     let weights = DensityWeights::new(&shape, &before[1][0]);
     let batch = sampler.draw(3, 2, state.rays, false, 0.0);
     let table = bytemuck::cast_slice(&before[0][0]);
-    let samples = march(config, &state.occupancy, (&shape, table, &weights), &batch.rays);
+    let samples = march(config, &state.occupancy, (&shape, table, &weights), &batch.rays, &batch.jitter);
     let n = samples.t.len();
     assert!(n > 100, "{n} samples");
     let dt = f64::from(step_length(config).at(0.0));
@@ -93,7 +93,7 @@ fn agrees_on<O: DensityOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, 
             let (mut thickness, mut seen, mut w) = (of(0.0), [of(0.0); 3], Vec::new());
             for &t in &samples.t[own.clone()] {
                 let p = std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]);
-                let (sigma, color) = plain::field(&shape, &table, network, p, ray.direction);
+                let (sigma, color) = plain::field(&shape, &table, network, p, ray.direction.to_array());
                 let weight = (-thickness).exp() * (of(1.0) - (-sigma * of(dt)).exp());
                 thickness += sigma * of(dt);
                 (0..3).for_each(|k| seen[k] += weight * color[k]);

@@ -17,9 +17,9 @@ use crate::field::ops::Ops;
 use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;
 use std::ops::Range;
+use tiface_base::geom::Ray;
 use tiface_base::{Error, Result};
 use tiface_kernels::cpu::hash;
-use tiface_kernels::cpu::march::MarchRay;
 use tiface_kernels::cpu::mlp::TILE;
 use tiface_kernels::cpu::neus::RAY_WIDTH;
 use tiface_kernels::cpu::occupancy::OPAQUE;
@@ -370,7 +370,7 @@ impl DeviceField for gpu::Evaluator {
         gpu::Evaluator::evaluate(self, points, directions, normals, channels)
     }
 
-    fn render(&mut self, rays: &[MarchRay], dt: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
+    fn render(&mut self, rays: &[Ray], dt: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
         gpu::Evaluator::render(self, rays, dt)
     }
 }

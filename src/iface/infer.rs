@@ -14,7 +14,6 @@ use std::sync::Arc;
 use tiface_base::Result;
 use tiface_base::geom::{BitGrid, Ray, RayResult, SdfField};
 use tiface_base::io::Lock;
-use tiface_kernels::cpu::march::MarchRay;
 use tiface_kernels::cpu::mlp::Weights;
 use tiface_kernels::cpu::neus::{self, Segments};
 use tiface_kernels::cpu::sdf::{self, FieldShape, WIDTH};
@@ -32,7 +31,7 @@ pub(super) trait DeviceField: Send {
     ) -> Result<Vec<Vec<f32>>>;
 
     /// Returns the composited rays of a volume render with samples `dt` apart.
-    fn render(&mut self, rays: &[MarchRay], dt: f32) -> Result<Vec<[f32; neus::RAY_WIDTH]>>;
+    fn render(&mut self, rays: &[Ray], dt: f32) -> Result<Vec<[f32; neus::RAY_WIDTH]>>;
 }
 
 /// The trained field on the host. All positions and distances are in scene units, the box is [-1,
@@ -205,7 +204,7 @@ impl IFace {
 
     fn render_pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let dt = step_length(&self.config).at(self.inv_s);
-        let marched: Vec<MarchRay> = rays.iter().map(|r| MarchRay::new(r, self.config.radius, 0.0)).collect();
+        let marched: Vec<Ray> = rays.iter().map(|r| r.scaled(self.config.radius)).collect();
         if let Some(composited) = self.on_gpu.ask(|field| field.render(&marched, dt)) {
             return composited.iter().map(|o| self.result(o)).collect();
         }
@@ -214,12 +213,12 @@ impl IFace {
 
     /// Composites the samples of rays. Each round evaluates the next few samples of the rays that
     /// are not opaque yet; a sample takes about two kilobytes.
-    fn composite(&self, rays: &[MarchRay], dt: f32) -> Vec<[f32; neus::RAY_WIDTH]> {
+    fn composite(&self, rays: &[Ray], dt: f32) -> Vec<[f32; neus::RAY_WIDTH]> {
         /// Samples of a ray that are evaluated together.
         const AHEAD: usize = 8;
         /// Light that may be left where a ray ends.
         const OPAQUE: f32 = 1e-4;
-        let samples = self.occupancy.march(&self.config, dt, rays);
+        let samples = self.occupancy.march(&self.config, dt, rays, &[]);
         let end = |r: usize| samples.offsets[r + 1] as usize;
         let mut out = vec![[0f32; neus::RAY_WIDTH]; rays.len()];
         let mut open: Vec<(usize, usize)> =
@@ -227,7 +226,7 @@ impl IFace {
         while !open.is_empty() {
             let (mut x, mut d, mut t, mut offsets) = (Vec::new(), Vec::new(), Vec::new(), vec![0]);
             for &(r, k) in &open {
-                let MarchRay { origin, direction, .. } = rays[r];
+                let [origin, direction] = [rays[r].origin, rays[r].direction].map(|v| v.to_array());
                 for &at in &samples.t[k..end(r).min(k + AHEAD)] {
                     x.push(std::array::from_fn(|a| origin[a] + at * direction[a]));
                     d.push(direction);
@@ -236,7 +235,7 @@ impl IFace {
                 offsets.push(t.len() as i32);
             }
             let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
-            let direction: Vec<[f32; 3]> = open.iter().map(|&(r, _)| rays[r].direction).collect();
+            let direction: Vec<[f32; 3]> = open.iter().map(|&(r, _)| rays[r].direction.to_array()).collect();
             let pieces = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &vec![dt; t.len()] };
             let composited = neus::forward(pieces, field.output(), self.inv_s, 1.0);
             let mut pieces = composited.as_chunks::<{ neus::RAY_WIDTH }>().0.iter();

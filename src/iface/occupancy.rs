@@ -4,8 +4,8 @@ use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::Checkpoint;
 use rayon::prelude::*;
 use tiface_base::Result;
-use tiface_base::geom::BitGrid;
-use tiface_kernels::cpu::march::{self, MarchRay, Samples};
+use tiface_base::geom::{BitGrid, Ray};
+use tiface_kernels::cpu::march::{self, Samples};
 use tiface_kernels::cpu::neus;
 use tiface_kernels::cpu::occupancy::{self, BandRule};
 
@@ -139,11 +139,11 @@ impl Occupancy {
         occupancy::update_nerfacc(cells, &self.allowed, radius, at, threshold, opacity);
     }
 
-    /// Marches rays through the occupied cells, with steps of `dt`.
-    pub fn march(&self, config: &IfaceConfig, dt: f32, rays: &[MarchRay]) -> Samples {
+    /// Marches rays through the occupied cells, with steps of `dt`; see [`march::march`].
+    pub fn march(&self, config: &IfaceConfig, dt: f32, rays: &[Ray], jitter: &[f32]) -> Samples {
         let solid = (config.occupancy == OccupancyRule::Band).then_some(&self.solid);
         let limit = (3.6 * config.radius / dt) as usize + 2;
-        march::march(&self.occupied, solid, config.radius, dt, rays, limit)
+        march::march(&self.occupied, solid, config.radius, dt, rays, jitter, limit)
     }
 
     /// Returns the share of cells that are occupied.

@@ -11,9 +11,9 @@ use crate::field::testing::{session, temporary};
 use crate::reference::tape::{AdamW, Stepped, Var, gradient};
 use crate::reference::{Real, neus, sdf, wide};
 use tiface_base::Quiet;
+use tiface_base::geom::Ray;
 use tiface_base::math::rng;
 use tiface_kernels::cpu::losses::STEREO_STREAM;
-use tiface_kernels::cpu::march::MarchRay;
 use tiface_kernels::cpu::neus::Segments;
 
 /// As published, but for the sizes.
@@ -91,15 +91,15 @@ fn kept(state: &SdfState) -> Vec<(&'static str, [Vec<f32>; 3])> {
 }
 
 /// Midpoints of a ray's samples: a lattice from where it enters the box, in cells that are marked.
-fn samples(config: &IfaceConfig, state: &SdfState, ray: &MarchRay, dt: f64) -> Vec<f64> {
+fn samples(config: &IfaceConfig, state: &SdfState, (ray, jitter): (&Ray, f32), dt: f64) -> Vec<f64> {
     let (radius, n) = (config.radius as f64, config.occupancy_resolution);
-    let (o, d) = (ray.origin.map(f64::from), ray.direction.map(f64::from));
+    let (o, d) = (ray.origin.as_dvec3(), ray.direction.as_dvec3());
     let (mut enter, mut leave) = (0f64, f64::INFINITY);
     for a in 0..3 {
         let (p, q) = ((-radius - o[a]) / d[a], (radius - o[a]) / d[a]);
         (enter, leave) = (enter.max(p.min(q)), leave.min(p.max(q)));
     }
-    let place = |k: usize| enter + ray.jitter as f64 * dt + (k as f64 + 0.5) * dt;
+    let place = |k: usize| enter + jitter as f64 * dt + (k as f64 + 0.5) * dt;
     let marked = |t: f64| {
         let cell = |a: usize| {
             let u = (o[a] + t * d[a] + radius) / (2.0 * radius) * n as f64;
@@ -146,16 +146,16 @@ fn formulas(
     // the f32 of 1.732 · 2 r / n
     let dt = f64::from(1.732 * 2.0 * config.radius / config.samples_per_ray as f32);
     let (mut offsets, mut t) = (vec![0i32], Vec::new());
-    for ray in &batch.rays {
-        t.extend(samples(config, state, ray, dt).into_iter().map(|t| t as f32));
+    for (ray, &jitter) in batch.rays.iter().zip(&batch.jitter) {
+        t.extend(samples(config, state, (ray, jitter), dt).into_iter().map(|t| t as f32));
         offsets.push(t.len() as i32);
     }
-    let direction: Vec<[f32; 3]> = batch.rays.iter().map(|r| r.direction).collect();
+    let direction: Vec<[f32; 3]> = batch.rays.iter().map(|r| r.direction.to_array()).collect();
     let mut outputs = Vec::new();
     for (r, ray) in batch.rays.iter().enumerate() {
         for t in &t[offsets[r] as usize..offsets[r + 1] as usize] {
             let p = std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]);
-            outputs.extend(sdf::field(&shape, &table, &flat, p, ray.direction));
+            outputs.extend(sdf::field(&shape, &table, &flat, p, ray.direction.to_array()));
         }
     }
     let n = t.len();

@@ -9,10 +9,9 @@ use crate::config::iface::IfaceConfig;
 use crate::field::pixels::TrainView;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
-use tiface_base::geom::Camera;
+use tiface_base::geom::{Camera, Ray};
 use tiface_base::image::eroded;
 use tiface_base::math::rank::median;
-use tiface_kernels::cpu::march::MarchRay;
 use tiface_kernels::cpu::mlp::Weights;
 use tiface_kernels::cpu::sdf::{self, FieldShape};
 use tiface_kernels::cpu::stereo::{self, StereoPoint, StereoView, Surfel};
@@ -129,7 +128,7 @@ fn first_crossings(
     let middle = |i: usize| {
         ((i % columns * STRIDE + STRIDE / 2).min(w - 1), (i / columns * STRIDE + STRIDE / 2).min(h - 1))
     };
-    let pixels: Vec<(usize, MarchRay)> = (0..columns * rows)
+    let pixels: Vec<(usize, Ray)> = (0..columns * rows)
         .into_par_iter()
         .filter_map(|i| {
             let (x, y) = middle(i);
@@ -137,11 +136,11 @@ fn first_crossings(
                 return None;
             }
             let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
-            Some((i, MarchRay::new(&ray, config.radius, 0.0)))
+            Some((i, ray.scaled(config.radius)))
         })
         .collect();
-    let rays: Vec<MarchRay> = pixels.iter().map(|p| p.1).collect();
-    let samples = occupancy.march(config, config.min_step, &rays);
+    let rays: Vec<Ray> = pixels.iter().map(|p| p.1).collect();
+    let samples = occupancy.march(config, config.min_step, &rays, &[]);
     let at = |r: usize, t: f32| std::array::from_fn(|a| rays[r].origin[a] + t * rays[r].direction[a]);
     // A crossing is the first step from outside to inside. Each round evaluates the next few
     // samples of every open ray.

@@ -5,6 +5,7 @@
 //! fewer triangles gets an atlas of its own, and everything that it shows from the nearest points
 //! of the kept one ([`Original`]).
 
+use super::advice::{advised, sentence};
 use super::cameras::CameraCheck;
 use super::finish::lobes;
 use super::frames::{Export, center};
@@ -70,7 +71,7 @@ impl KeptHead {
             // the other files are not read
             let problem = record.require_products(&folder).err();
             let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
-            Ok((HeadMesh::load(&folder.join("parts"))?, warnings))
+            Ok((HeadMesh::load(&folder.join("parts")).map_err(advised)?, warnings))
         })?;
         let mut capture = read_capture(&run.join("cameras.json"), &made.capture.path)
             .map_err(|e| Error::cannot(&e, format!("`tiface mask {}` writes it again", run.display())))?;
@@ -256,7 +257,8 @@ impl KeptHead {
         let HeadMesh { mesh: kept, world_from_scene, texture, .. } = &self.head;
         let mut mesh = kept.clone();
         let config = SimplifyConfig { triangles, ..SimplifyConfig::default() };
-        self.warnings.extend(simplify(&mut mesh, None, &config, monitor)?.warnings(&config));
+        let done = simplify(&mut mesh, None, &config, monitor)?;
+        self.warnings.extend(done.warnings(&config).iter().map(sentence));
         let original = Original::new(&self.head);
         let shells = original.carry_vertices(&mut mesh);
         let gutter_px = self.made.mesh.gutter_px;
@@ -265,7 +267,7 @@ impl KeptHead {
             let config =
                 self.export.atlas_config(center(kept, world_from_scene), &scene_from_world, px, gutter_px);
             let (layout, done) = atlas(&mesh, &config, monitor)?;
-            self.warnings.extend(done.warnings());
+            self.warnings.extend(done.warnings().iter().map(sentence));
             let side = texture.color.width.div_ceil(px).clamp(1, 2);
             let carried = original.carry_texture(texture, &mesh, &layout, side, gutter_px, monitor)?;
             let bend = |normals| -> Result<_> {

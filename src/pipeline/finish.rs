@@ -1,5 +1,6 @@
 //! From the extracted surface to the head mesh: simplification, atlas and texture baking.
 
+use super::advice::{advised, sentence};
 use super::frames::{Export, Frames, center};
 use crate::capture::scene::Scene;
 use crate::config::{ColorSource, Hair, MeshConfig, MeshFrame};
@@ -96,8 +97,8 @@ impl Finish<'_> {
         let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
         if fewer || c.max_error > 0.0 {
             let config = SimplifyConfig { triangles: c.triangles as usize, error: c.max_error * self.cell };
-            let done = simplify(&mut mesh, Some(self.field), &config, self.monitor)?;
-            log.warnings.extend(done.warnings(&config));
+            let done = simplify(&mut mesh, Some(self.field), &config, self.monitor).map_err(advised)?;
+            log.warnings.extend(done.warnings(&config).iter().map(sentence));
             log.report.insert("simplify".into(), json!(done));
         }
         Ok(mesh)
@@ -161,7 +162,7 @@ impl Finish<'_> {
         let center = center(self.surface, &scene_from_world.inverse());
         let config = self.export.atlas_config(center, scene_from_world, c.texture_px, c.gutter_px);
         let (layout, done) = atlas(mesh, &config, self.monitor)?;
-        log.warnings.extend(done.warnings());
+        log.warnings.extend(done.warnings().iter().map(sentence));
         log.report.insert("atlas".into(), json!(done));
         Ok(layout)
     }

@@ -1,6 +1,7 @@
 //! The coordinate frames of a head mesh, and its files in them: in the dataset's coordinates, or
 //! turned so that the face looks at the viewer.
 
+use super::advice::advised;
 use crate::capture::Capture;
 use crate::config::{Config, Material, MeshFormat, MeshFrame, TextureFormat};
 use glam::{DMat3, DVec3, Vec3};
@@ -69,8 +70,11 @@ impl Export {
         };
         match format {
             MeshFormat::Glb => {
-                let bytes = to_glb(mesh, texture.as_ref(), shells.as_ref(), &options)?;
-                Ok(ExportedFiles { files: vec![(format!("{stem}.glb"), bytes)], warnings: Vec::new() })
+                let bytes = to_glb(mesh, texture.as_ref(), shells.as_ref(), &options);
+                bytes.map(|bytes| ExportedFiles {
+                    files: vec![(format!("{stem}.glb"), bytes)],
+                    warnings: Vec::new(),
+                })
             }
             MeshFormat::Obj => to_obj(mesh, texture.as_ref(), &options),
             // always in the dataset's world, with colors at the vertices: one index per vertex, so
@@ -79,6 +83,7 @@ impl Export {
                 to_ply(mesh, None, &ExportOptions { world_from_mesh: *world_from_scene, ..options })
             }
         }
+        .map_err(advised)
     }
 
     /// Returns the options that place a mesh in its files, whatever it is called and shows.

@@ -8,6 +8,7 @@
 //!      frames.json   the transform from the dataset's world to GLB and OBJ files
 //! ```
 
+use super::advice::{advised, sentence};
 use super::finish::{Finish, FinishedHead, REACH};
 use super::frames::Export;
 use super::learn;
@@ -49,7 +50,7 @@ pub(super) fn mesh(
         world_from_mesh: world_from_scene,
         ..ExportOptions::default()
     };
-    write_files(&to_ply(&extracted.mesh, None, &in_world)?, dir.folder())?;
+    write_files(&to_ply(&extracted.mesh, None, &in_world).map_err(advised)?, dir.folder())?;
     // vertices have the color seen along the normal; textures and rays, and so their cap, have the
     // color that cameras see
     let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
@@ -160,8 +161,8 @@ impl Extraction {
     /// a scene unit.
     fn announce(&self, capped: bool, mm: f64, dir: &StageDir) {
         self.report.end(capped).iter().for_each(|text| dir.note(text));
-        self.report.warnings().iter().for_each(|w| dir.warn(w));
-        self.report.handles.warning(mm).iter().for_each(|w| dir.warn(w));
+        let warnings = self.report.warnings().into_iter().chain(self.report.handles.warning(mm));
+        warnings.for_each(|w| dir.warn(&sentence(&w)));
     }
 
     /// Paints the cap, or opens the surface where it is.
@@ -195,7 +196,7 @@ pub(super) fn extract(
     monitor: &dyn Monitor,
 ) -> Result<Extraction> {
     let (mesh, report) = if c.dense {
-        tiface_surface::extract_dense(field, Aabb::SCENE, c.resolution as usize, monitor)?
+        tiface_surface::extract_dense(field, Aabb::SCENE, c.resolution as usize, monitor)
     } else {
         let options = tiface_surface::ExtractOptions {
             resolution: c.resolution as usize,
@@ -206,10 +207,11 @@ pub(super) fn extract(
         // below the frames' border the surface is a guess: close the mesh where enough cameras see
         // it
         let kept = capture::well_seen(scene, cameras, up, c.seen_by);
-        tiface_surface::extract(&field, kept, &options, monitor)?
-    };
-    let patches = Patches::of(&mesh, &report.handles);
-    let cap = (!c.dense).then(|| Cap::of(&mesh, report.bounds(), report.cell_size));
+        tiface_surface::extract(&field, kept, &options, monitor)
+    }
+    .map_err(advised)?;
+    let patches = Patches::find(&mesh, &report.handles);
+    let cap = (!c.dense).then(|| Cap::find(&mesh, report.bounds(), report.cell_size));
     Ok(Extraction { mesh, report, cap: cap.flatten(), patches })
 }
 
@@ -271,13 +273,13 @@ pub(super) fn read_finished<T>(run: &Path, read: impl FnOnce(&Record) -> Result<
 
 /// Returns the head mesh that the stage wrote.
 pub(super) fn head_mesh(run: &Run) -> Result<HeadMesh> {
-    HeadMesh::load(&run.path("mesh/parts"))
+    HeadMesh::load(&run.path("mesh/parts")).map_err(advised)
 }
 
 /// Returns the extracted surface that the stage wrote, in scene coordinates, as it was before
 /// export.
 pub(super) fn extracted_surface(run: &Run) -> Result<ExtractedSurface> {
-    ExtractedSurface::load(&run.path("mesh/parts"))
+    ExtractedSurface::load(&run.path("mesh/parts")).map_err(advised)
 }
 
 /// Returns the extracted surface that the stage wrote, in the dataset's world.

@@ -4,6 +4,7 @@
 //! viewing process renders it, so the training is not disturbed and its results stay the same, bit
 //! by bit.
 
+use super::advice::advised;
 use super::frames::{center as center_of, front as front_of};
 use super::learn::load_field;
 use super::mesh::read_finished;
@@ -60,7 +61,7 @@ impl Preview {
             // previews show `mesh/parts`: a problem with other files of the stage does not matter
             let problem = record.require_products(&run.join(Stage::Mesh)).err();
             let warnings = problem.map(|e| format!("{e}; {}", e.hint())).into_iter().collect();
-            Ok((HeadMesh::load(&run.join("mesh/parts"))?, warnings))
+            Ok((HeadMesh::load(&run.join("mesh/parts")).map_err(advised)?, warnings))
         })?;
         let capture = read_capture(&run.join("cameras.json"), Path::new(""))?;
         let to_scene = head.world_from_scene.rotation_f32().transpose();

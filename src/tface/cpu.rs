@@ -89,7 +89,8 @@ impl VmOps for CpuVm<'_> {
         let field = self.field();
         let weights = DecoderWeights::new(field.decoder, slice(network.value()));
         let [density, color] = [density, color].map(|group| slice(group.value()));
-        let rendered = vm::render(field, density, color, &weights, &self.batch.rays);
+        let HostBatch { rays, jitter, .. } = &self.batch;
+        let rendered = vm::render(field, density, color, &weights, rays, jitter);
         self.figures.density += rendered.density_samples;
         self.figures.color += rendered.color_samples;
         self.rendered = Some((weights, rendered));

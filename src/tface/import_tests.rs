@@ -7,7 +7,6 @@ use serde_json::Value;
 use std::path::PathBuf;
 use tiface_base::Quiet;
 use tiface_base::geom::Ray;
-use tiface_kernels::cpu::march::MarchRay;
 use tiface_kernels::cpu::vm::{DecoderWeights, RAY_WIDTH, render};
 
 fn reference(name: &str) -> PathBuf {
@@ -36,9 +35,9 @@ fn an_imported_checkpoint_renders_as_the_published_arithmetic_does() {
     open.mask = None;
     let mut compared = 0;
     for ray in want["rays"].as_array().unwrap() {
-        let vm = MarchRay { origin: three(&ray["origin"]), direction: three(&ray["direction"]), jitter: 0.0 };
+        let vm = Ray::new(three(&ray["origin"]), three(&ray["direction"]));
         for (field, key) in [(&open, "without_mask"), (&face.field, "with_mask")] {
-            let out = render(field, &face.values[0], &face.values[1], &weights, &[vm]).out;
+            let out = render(field, &face.values[0], &face.values[1], &weights, &[vm], &[]).out;
             let black = three(&ray[key]["black"]);
             let opacity = ray[key]["opacity"].as_f64().unwrap() as f32;
             for c in 0..3 {
@@ -63,12 +62,11 @@ fn an_imported_field_renders_in_the_scene_as_in_its_own_world() {
     // 1
     let (origin, direction) = (Vec3::new(0.1, -0.2, 4.5), Vec3::new(0.02, 0.05, -1.0));
     let in_scene = |p: Vec3| scene.point(p * 0.3);
-    let ray =
-        Ray { origin: in_scene(origin), direction: direction.normalize(), t_min: 0.0, t_max: f32::INFINITY };
+    let ray = Ray::new(in_scene(origin), direction.normalize());
     let seen = face.render(&[ray], Vec3::NEG_Z)[0];
     let weights = DecoderWeights::new(face.field.decoder, &face.values[2]);
-    let vm = MarchRay { origin: origin.to_array(), direction: direction.to_array(), jitter: 0.0 };
-    let want = render(&face.field, &face.values[0], &face.values[1], &weights, &[vm]).out;
+    let vm = Ray::new(origin, direction);
+    let want = render(&face.field, &face.values[0], &face.values[1], &weights, &[vm], &[]).out;
     for c in 0..3 {
         assert!((seen.color[c] - want[c]).abs() < 1e-5, "{seen:?} {want:?}");
     }

@@ -13,11 +13,10 @@ use glam::{DMat3, Vec3};
 use std::path::Path;
 use tiface_base::Result;
 use tiface_base::geom::{Ray, RayResult, Similarity};
-use tiface_kernels::cpu::march::MarchRay;
 use tiface_kernels::cpu::vm::{self, DecoderWeights, RAY_WIDTH, VmField};
 
 /// Renders rays in the field's coordinates on a device. `[n]` rays → `[n]`.
-type Renderer = dyn FnMut(&[MarchRay]) -> Result<Vec<[f32; RAY_WIDTH]>> + Send;
+type Renderer = dyn FnMut(&[Ray]) -> Result<Vec<[f32; RAY_WIDTH]>> + Send;
 
 /// The trained field on the host. Positions and distances are in scene units.
 pub struct TFace {
@@ -64,7 +63,7 @@ impl TFace {
         if DeviceDecoder::supports(&self.field.decoder).is_ok() {
             let values = self.values.each_ref().map(|v| v.as_slice());
             let mut renderer = VmRenderer::new(device, &self.field, values);
-            let render: Box<Renderer> = Box::new(move |rays: &[MarchRay]| renderer.render(rays));
+            let render: Box<Renderer> = Box::new(move |rays: &[Ray]| renderer.render(rays));
             self.on_gpu = GpuField::new(Some(render));
         }
     }
@@ -82,12 +81,9 @@ impl TFace {
         let stretch = |r: &Ray| {
             if p.depth_directions { 1.0 / r.direction.dot(forward).max(1e-3) } else { 1.0 }
         };
-        let in_field = |rays: &[Ray]| -> Vec<MarchRay> {
-            let to_field = |r: &Ray| MarchRay {
-                origin: std::array::from_fn(|a| p.scale * r.origin[a] + p.offset[a]),
-                direction: (r.direction * stretch(r)).to_array(),
-                jitter: 0.0,
-            };
+        let in_field = |rays: &[Ray]| -> Vec<Ray> {
+            let to_field =
+                |r: &Ray| Ray::new(p.scale * r.origin + Vec3::from(p.offset), r.direction * stretch(r));
             rays.iter().map(to_field).collect()
         };
         let result = |(o, r): (&[f32; RAY_WIDTH], &Ray)| RayResult {
@@ -101,7 +97,7 @@ impl TFace {
         }
         let [density, color, _] = &self.values;
         let pass = |rays: &[Ray]| -> Vec<RayResult> {
-            let composited = vm::render(&self.field, density, color, &self.weights, &in_field(rays)).out;
+            let composited = vm::render(&self.field, density, color, &self.weights, &in_field(rays), &[]).out;
             composited.as_chunks().0.iter().zip(rays).map(result).collect()
         };
         rays.chunks(PASS).flat_map(pass).collect()

@@ -72,7 +72,7 @@ fn formulas((config, sampler, state): (&VmConfig, &RaySampler, &VmState), x: &[V
     let seed = 3; // of the session
     let field = state.field(config, true);
     let batch = sampler.draw(seed, step, config.rays, true, 0.0);
-    let out = vm::render(&field, x, &batch.rays);
+    let out = vm::render(&field, x, &batch.rays, &batch.jitter);
     let n = batch.rays.len();
     let white = config.background == VmBackground::Reference && rng::uniform(seed, step << 4 | 9, 0) < 0.5;
     let (mut squares, mut outside, mut cross, mut count) = (of(0.0), of(0.0), of(0.0), 0.0);

@@ -44,19 +44,37 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 /// Hint for a stop between steps, for [`Error::stopped`].
 pub const COMPLETE_IS_KEPT: &str = "what is complete is kept";
 
+/// What is wrong, for a caller that can suggest a better fix than the code that found it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Cause {
+    /// There is no surface: a field is finite nowhere.
+    NowhereFinite,
+    /// There is no surface: a field is negative everywhere.
+    AllInside,
+    /// There is no surface: a field is negative nowhere.
+    AllOutside,
+    /// A mesh has no triangles.
+    NoTriangles,
+    /// The resolution is out of range, or makes more vertices than indices can name.
+    Resolution,
+    /// A file that a program wrote for itself is missing, damaged, or of another version.
+    Stale,
+}
+
 /// An error: its kind, a message that names file and place, and a suggested fix.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Error {
     kind: ErrorKind,
     message: String,
     hint: String,
-    no_surface: bool,
+    cause: Option<Cause>,
 }
 
 impl Error {
     /// Returns an error of this kind without a suggested fix.
     pub fn new(kind: ErrorKind, message: impl Display) -> Error {
-        Error { kind, message: message.to_string(), hint: String::new(), no_surface: false }
+        Error { kind, message: message.to_string(), hint: String::new(), cause: None }
     }
 
     /// Returns an error of kind [`ErrorKind::Cannot`]; `hint` may be empty.
@@ -79,15 +97,14 @@ impl Error {
         Error { hint: hint.into(), ..Error::new(ErrorKind::BelowBar, message) }
     }
 
-    /// Returns the error of kind [`ErrorKind::Cannot`] that says that a field has no surface, and
-    /// how that shows.
-    pub fn no_surface(how: impl Display, hint: impl Into<String>) -> Error {
-        Error { no_surface: true, ..Error::cannot(format!("no surface: {how}"), hint) }
+    /// Returns what is wrong, if the code that found it knows.
+    pub fn cause(&self) -> Option<Cause> {
+        self.cause
     }
 
-    /// Returns whether this is [`Error::no_surface`], wherever it happened.
+    /// Returns whether a field has no surface, wherever that was found.
     pub fn is_no_surface(&self) -> bool {
-        self.no_surface
+        matches!(self.cause, Some(Cause::NowhereFinite | Cause::AllInside | Cause::AllOutside))
     }
 
     /// Returns the error that ends work on request, with what became of the work. It counts as
@@ -125,6 +142,11 @@ impl Error {
     /// Replaces the suggested fix.
     pub fn with_hint(self, hint: impl Into<String>) -> Error {
         Error { hint: hint.into(), ..self }
+    }
+
+    /// Says what is wrong, for [`Error::cause`].
+    pub fn with_cause(self, cause: Cause) -> Error {
+        Error { cause: Some(cause), ..self }
     }
 
     /// Puts where it happened before the message: "`a.png`: …".
@@ -172,6 +194,9 @@ mod tests {
         let e = Error::usage("is not a number", "write one").within("`iface.steps`");
         assert_eq!((e.kind().code(), e.hint()), (2, "write one"));
         assert_eq!(e.to_string(), "`iface.steps`: is not a number");
+        let caused = Error::cannot("it is open", "").with_cause(Cause::AllInside);
+        assert_eq!((e.cause(), caused.cause()), (None, Some(Cause::AllInside)));
+        assert!(caused.within("a").with_hint("close it").is_no_surface() && !e.is_no_surface());
         assert!(Error::already_printed(ErrorKind::BelowBar).is_printed() && !e.is_printed());
         assert!(Error::stopped("x").kind().is_stop() && !e.kind().is_stop());
     }

@@ -1,5 +1,6 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
+mod aabb;
 mod bit_grid;
 mod boxes;
 mod bvh;
@@ -14,6 +15,7 @@ mod similarity;
 pub mod sphharm;
 mod topology;
 
+pub use aabb::Aabb;
 pub use bit_grid::{BitGrid, dilated_cells};
 pub use boxes::{Boxes, DBox, DEFAULT_EFFORT, Effort, share_out};
 pub use bvh::{Bvh, Closest};
@@ -23,7 +25,7 @@ pub use mesh::{Atlas, Mesh};
 pub use mesh::{area_vector, bilinear_taps, shape};
 pub use overlap::{OutlineSide, THOROUGH_EFFORT, intersect, nearest_charts, overlaps, shared_area, turn};
 pub use pieces::{WrongPiece, wrong_pieces};
-pub use ray::{Aabb, Hit, Ray, RayResult};
+pub use ray::{Hit, Ray, RayResult};
 pub use shells::{ShellCaster, ShellLayer, Shells};
 pub use similarity::Similarity;
 pub use sphharm::Harmonics;

@@ -11,6 +11,8 @@
 //! have a fixed order.
 
 mod adam;
+mod adapter;
+mod batch;
 mod color;
 mod composite;
 mod density;
@@ -18,6 +20,7 @@ mod device;
 mod draw;
 mod evaluate;
 mod hash;
+mod lens;
 mod losses;
 mod march;
 mod neus;
@@ -33,9 +36,11 @@ mod vm;
 mod weight_norm;
 
 pub use adam::{Gate, adam};
+pub use adapter::Adapter;
+pub use batch::DeviceBatch;
 pub use density::Density;
-pub use device::{Adapter, Atomics, Buffer, Device, DeviceLimits, Words};
-pub use draw::{BUFFERS, DeviceBatch, DrawnView, Photographs, PixelOrder, SamplingOptions};
+pub use device::{Atomics, Buffer, Device, DeviceLimits, Words};
+pub use draw::{BUFFERS, DrawnView, Photographs, PixelOrder, SamplingOptions};
 pub use evaluate::{Evaluator, planes};
 pub use hash::Grid;
 pub use losses::Losses;

@@ -22,7 +22,7 @@ mod relax;
 mod smooth;
 
 use crate::files::{UvReport, seams_facing, uv_check};
-use crate::{check_indices, setting};
+use crate::{Warning, check_indices, setting};
 use chart::{Flat, height, neighbors, part, upright};
 use divide::{divide, planar};
 use face::divide_around;
@@ -32,7 +32,6 @@ use half_squares::half_squares;
 use pack::{ChartPose, pack};
 use serde::Serialize;
 use std::time::Instant;
-use tiface_base::error::counted;
 use tiface_base::geom::{Atlas, Mesh, THOROUGH_EFFORT, overlaps, turn};
 use tiface_base::{Error, Monitor, Result};
 
@@ -55,23 +54,12 @@ pub struct AtlasReport {
 }
 
 impl AtlasReport {
-    /// Returns warnings for the user, one sentence each.
-    pub fn warnings(&self) -> Vec<String> {
-        let mut out = Vec::new();
-        if let Some(reason) = &self.fallback {
-            let gutter = self.gutter_px;
-            out.push(format!(
-                "every triangle has a piece of the texture of its own, {gutter:.1} texels of gutter: {reason}; a larger \
-                 `mesh.texture_px` or fewer `mesh.triangles` help"
-            ));
-        }
-        if self.repaired > 0 {
-            let repaired = counted(self.repaired, "triangle");
-            out.push(format!(
-                "{repaired} could not stay in a larger chart and got a chart of their own; fewer `mesh.triangles` help"
-            ));
-        }
-        out
+    /// Returns what is doubtful of the atlas.
+    pub fn warnings(&self) -> Vec<Warning> {
+        let no_charts =
+            |reason: &String| Warning::NoCharts { gutter_px: self.gutter_px, reason: reason.clone() };
+        let own = (self.repaired > 0).then_some(Warning::OwnCharts(self.repaired));
+        self.fallback.iter().map(no_charts).chain(own).collect()
     }
 }
 
@@ -297,7 +285,7 @@ fn placed(mesh: &Mesh, charts: &[Flat], poses: &[ChartPose], config: &AtlasConfi
     for (chart, pose) in charts.iter().zip(poses) {
         let first = atlas.uvs.len() as u32;
         for &point in &chart.points {
-            let p = pose.of(point) / size;
+            let p = pose.place(point) / size;
             // v runs down; as seen in the image the surface is not mirrored
             atlas.uvs.push(DVec2::new(p.x, 1.0 - p.y).as_vec2().clamp(Vec2::ZERO, Vec2::ONE));
         }

@@ -8,6 +8,7 @@ mod handles;
 mod loops;
 mod marching;
 mod marching_cell;
+mod polish;
 mod sparse;
 
 pub use cap::{Cap, RimVertex};
@@ -17,13 +18,13 @@ pub use handles::{HandleReport, Patches};
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
 
-use super::moves::Polish;
-use super::{check_len, evaluate, setting};
+use super::{Warning, check_len, evaluate, setting};
 use glam::{DVec3, Vec3};
 use handles::cut_handles;
+use polish::Polish;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-use tiface_base::error::counted;
+use tiface_base::error::{Cause, counted};
 use tiface_base::geom::{Aabb, Mesh, SdfField, Topology, topology};
 use tiface_base::{Error, Monitor, Result};
 
@@ -122,27 +123,17 @@ impl MeshReport {
         })
     }
 
-    /// Returns warnings for the user, one sentence each, with what to do.
-    pub fn warnings(&self) -> Vec<String> {
-        let mut out = Vec::new();
-        if self.non_finite > 0 {
-            out.push(format!(
-                "the field was NaN or infinite at {} near the surface; train it again with another `--seed`",
-                counted(self.non_finite, "node")
-            ));
-        }
-        if self.clean.dropped_triangles > 0 {
-            out.push(format!(
-                "removed {} and {} ({}); if a part of the head is missing, look for it in `mask/sheet.html`",
-                counted(self.clean.dust, "small piece"),
-                counted(self.clean.inner_shells, "inner shell"),
-                counted(self.clean.dropped_triangles, "triangle")
-            ));
-        }
-        if !self.topology.is_solid() {
-            out.push("the mesh is not a closed manifold; `tiface check RUN` says what is wrong".into());
-        }
-        out
+    /// Returns what is doubtful of the surface, handles aside: [`HandleReport::warning`].
+    pub fn warnings(&self) -> Vec<Warning> {
+        let CleanReport { dust, inner_shells, dropped_triangles: triangles, .. } = self.clean;
+        [
+            (self.non_finite > 0).then_some(Warning::NotFinite(self.non_finite)),
+            (triangles > 0).then_some(Warning::Removed { dust, inner_shells, triangles }),
+            (!self.topology.is_solid()).then_some(Warning::NotSolid),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
     }
 }
 
@@ -229,7 +220,7 @@ pub fn extract(
     }
     // vertices whose normal is not the field's slope
     let mut edged = on_faces(&mesh);
-    if let Some(patches) = Patches::of(&mesh, &report.handles) {
+    if let Some(patches) = Patches::find(&mesh, &report.handles) {
         patches.corners().for_each(|v| edged[v as usize] = true);
         gradients = gradient(&mesh.positions)?.1;
     }
@@ -264,27 +255,43 @@ fn colors_along_normals(mesh: &Mesh, field: &dyn SdfField) -> Result<Vec<[f32; 3
 fn check_surface(found: &Sparse) -> Result<()> {
     let nodes = found.evaluated;
     let (smallest, largest) = found.range;
-    let none = |what: String, hint: &str| Err(Error::no_surface(format!("the field is {what}"), hint));
     if smallest > largest && nodes > 0 {
-        return none(
-            format!("NaN or infinite at all {nodes} nodes evaluated"),
-            "training diverged: resume `iface` from an earlier checkpoint",
-        );
+        return Err(no_surface(
+            Cause::NowhereFinite,
+            format!("the field is NaN or infinite at all {nodes} nodes evaluated"),
+        ));
     }
     if largest < 0.0 && found.skipped == 0 && found.surface.non_finite == 0 && nodes > 0 {
-        return none(
-            format!("negative at all {nodes} nodes evaluated (largest {largest:.3e}), everything is inside"),
-            "the field may be inverted (negative must be inside), untrained, or the box may lie within the head",
-        );
+        let how =
+            format!("negative at all {nodes} nodes evaluated (largest {largest:.3e}), everything is inside");
+        return Err(no_surface(Cause::AllInside, format!("the field is {how}")));
     }
     // with an empty hull nothing is evaluated: then the smallest is infinite
     if found.surface.mesh.triangles.is_empty() {
-        return none(
-            format!("positive at all {nodes} nodes evaluated (smallest {smallest:.3e}), nothing is inside"),
-            "train `iface` longer, check that the box holds the head, or raise `mesh.resolution` for small pieces",
-        );
+        let how =
+            format!("positive at all {nodes} nodes evaluated (smallest {smallest:.3e}), nothing is inside");
+        return Err(no_surface(Cause::AllOutside, format!("the field is {how}")));
     }
     Ok(())
+}
+
+/// Refuses fewer than 2 cells or nodes along a side, and more than `most`.
+fn check_resolution(resolution: usize, most: usize) -> Result<()> {
+    let expected = format!("2..={most}");
+    setting((2..=most).contains(&resolution), "resolution", &expected, resolution)
+        .map_err(|e| e.with_cause(Cause::Resolution))
+}
+
+/// Returns the error for a field without a surface, and how that shows.
+fn no_surface(cause: Cause, how: String) -> Error {
+    let hint = match cause {
+        Cause::NowhereFinite => "a field must return finite numbers",
+        Cause::AllInside => {
+            "a field must be negative inside alone, and the bounds must reach out of the surface"
+        }
+        _ => "check that the bounds hold the surface, or raise the resolution for small pieces",
+    };
+    Error::cannot(format!("no surface: {how}"), hint).with_cause(cause)
 }
 
 /// Returns the mean first-order distance to the surface, in cells, over vertices that are not
@@ -324,7 +331,7 @@ impl NodeGrid {
             let message = format!("the box to mesh in, {min} to {max}, is empty or not finite");
             return Err(Error::cannot(message, "check the scene box of the capture"));
         }
-        setting((2..=8192).contains(&resolution), "mesh.resolution", "2..=8192", resolution)?;
+        check_resolution(resolution, 8192)?;
         let spacing = size.max_element() / resolution as f32;
         // A side a rounding error longer than n cells is n cells long.
         let cells = size.to_array().map(|s| ((s / spacing - 1e-3).ceil() as usize).max(2));

@@ -21,6 +21,7 @@ mod moves;
 pub mod render;
 mod shells;
 mod simplify;
+mod warning;
 
 pub use appearance::{Appearance, AppearanceReport, Colors, Photograph, fit as fit_appearance};
 pub use atlas::{AtlasConfig, AtlasReport, atlas};
@@ -30,14 +31,15 @@ pub use extract::{
 };
 pub use shells::{ShellsReport, fit as fit_shells};
 pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
+pub use warning::Warning;
 
 use glam::Vec3;
 use std::fmt::Display;
+use tiface_base::error::Cause;
 use tiface_base::geom::{Mesh, SdfField};
 use tiface_base::{Error, Monitor, Result};
 
-/// Refuses a setting that is not `ok`. `name` is the configuration's key if it has one, else the
-/// parameter or field.
+/// Refuses a parameter or field `name` that is not `ok`.
 fn setting(ok: bool, name: &str, expected: &str, found: impl Display) -> Result<()> {
     if ok { Ok(()) } else { Err(Error::cannot(format!("`{name}` is {found}, expected {expected}"), "")) }
 }
@@ -81,7 +83,7 @@ fn check_count(vertices: u64, triangles: u64) -> Result<()> {
         return Ok(());
     }
     let message = format!("the surface has {vertices} vertices, more than 32-bit indices can name");
-    Err(Error::cannot(message, "lower `mesh.resolution`"))
+    Err(Error::cannot(message, "use larger cells").with_cause(Cause::Resolution))
 }
 
 /// Refuses a field's values if their number differs from the number of points.

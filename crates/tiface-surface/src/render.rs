@@ -1,13 +1,17 @@
 //! Ray casting and rasterizing: color, depth and normals of a mesh from a camera.
 
+mod hits;
 mod look;
 mod raster;
 mod raycast;
 mod residual;
 mod texture;
+mod view;
 
+pub use hits::RayHits;
 pub use look::{Look, Surface};
 pub use raster::{RasterLayers, RasterOptions, RasterView, raster, raster_into};
-pub use raycast::{RayHits, RaycastOptions, RenderedView, raycast};
+pub use raycast::{RaycastOptions, raycast};
 pub use residual::{ResidualSource, ResidualView, Residuals};
 pub use texture::{LobePictures, MeshTexture};
+pub use view::RenderedView;

@@ -27,7 +27,7 @@ mod rings;
 mod rounds;
 mod to_field;
 
-use crate::{check_count, check_indices, finite, setting};
+use crate::{Warning, check_count, check_indices, finite, setting};
 use crossing::crossings;
 use rounds::{bounded, counted};
 use serde::{Deserialize, Serialize};
@@ -187,29 +187,18 @@ pub struct SimplifyReport {
 }
 
 impl SimplifyReport {
-    /// Returns warnings for the user, one sentence each.
-    pub fn warnings(&self, config: &SimplifyConfig) -> Vec<String> {
-        let mut out = Vec::new();
-        if config.triangles > 0 && self.after > config.triangles && config.error == 0.0 {
-            out.push(format!(
-                "{} triangles are left instead of {}: fewer would change the topology, fold the surface or make it cross \
-                 itself; `mesh.triangles` can be raised to that",
-                self.after, config.triangles
-            ));
-        }
-        if self.held > 0 {
-            out.push(format!(
-                "{} vertices are not manifold and stayed as they are; another `mesh.resolution` may avoid them",
-                self.held
-            ));
-        }
-        if self.self_intersections > 0 {
-            out.push(format!(
-                "{} triangles cross others, as in the input; another `mesh.resolution` may avoid them",
-                self.self_intersections
-            ));
-        }
-        out
+    /// Returns what is doubtful of the result.
+    pub fn warnings(&self, config: &SimplifyConfig) -> Vec<Warning> {
+        let (left, asked) = (self.after, config.triangles);
+        [
+            (asked > 0 && left > asked && config.error == 0.0)
+                .then_some(Warning::TooManyTriangles { left, asked }),
+            (self.held > 0).then_some(Warning::NotManifold(self.held)),
+            (self.self_intersections > 0).then_some(Warning::Crossing(self.self_intersections)),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
     }
 }
 

@@ -9,9 +9,10 @@ use crate::field::training::StepAt;
 use crate::iface::occupancy::Occupancy;
 use crate::iface::schedule;
 use tiface_base::Result;
+use tiface_base::geom::Ray;
 use tiface_kernels::cpu::density::{self, DensitySamples, DensityShape, DensityWeights};
 use tiface_kernels::cpu::losses::TERMS;
-use tiface_kernels::cpu::march::{MarchRay, Samples};
+use tiface_kernels::cpu::march::Samples;
 use tiface_kernels::cpu::schedule::Figures;
 
 /// Returns the samples along rays in occupied cells, up to where the transmittance has vanished.
@@ -19,10 +20,11 @@ pub fn march(
     config: &IfaceConfig,
     occupancy: &Occupancy,
     (shape, table, weights): (&DensityShape, &[[f32; 2]], &DensityWeights),
-    rays: &[MarchRay],
+    rays: &[Ray],
+    jitter: &[f32],
 ) -> Samples {
     let dt = schedule::step_length(config).at(0.0);
-    let all = occupancy.march(config, dt, rays);
+    let all = occupancy.march(config, dt, rays, jitter);
     let (x, _) = all.points(rays);
     density::cut(&all, &density::evaluate(shape, table, weights, &x, None).density, dt)
 }
@@ -121,7 +123,8 @@ impl DensityOps for CpuDensity<'_> {
     fn march(&mut self, groups: &DensityGroups<Self>) {
         let (table, weights) = self.field(groups);
         let field = (&self.shape, table, &weights);
-        self.samples = march(self.config, &self.occupancy, field, &self.batch.rays);
+        let HostBatch { rays, jitter, .. } = &self.batch;
+        self.samples = march(self.config, &self.occupancy, field, rays, jitter);
         self.last_samples = Some(self.samples.t.len());
         self.weights = Some(weights);
     }

@@ -11,7 +11,6 @@ use std::path::Path;
 use tiface_base::Result;
 use tiface_base::geom::{Ray, RayResult, SdfField};
 use tiface_kernels::cpu::density::{self, DensityShape, DensityWeights};
-use tiface_kernels::cpu::march::MarchRay;
 
 /// Density of the level set that is taken as the surface.
 const LEVEL: f32 = 5.0;
@@ -97,14 +96,9 @@ impl DensityField {
 
     fn pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let radius = self.config.radius;
-        let marched = |r: &Ray| MarchRay {
-            origin: (r.origin * radius).to_array(),
-            direction: r.direction.to_array(),
-            jitter: 0.0,
-        };
-        let rays: Vec<MarchRay> = rays.iter().map(marched).collect();
+        let rays: Vec<Ray> = rays.iter().map(|r| r.scaled(radius)).collect();
         let field = (&self.shape, self.table(), &self.weights);
-        let samples = march(&self.config, &self.occupancy, field, &rays);
+        let samples = march(&self.config, &self.occupancy, field, &rays, &[]);
         let (x, d) = samples.points(&rays);
         let found = density::evaluate(&self.shape, self.table(), &self.weights, &x, Some(&d));
         let dt = step_length(&self.config).at(0.0);

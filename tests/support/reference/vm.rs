@@ -2,7 +2,7 @@
 
 use super::{Real, sigmoid};
 use std::array::from_fn;
-use tiface_kernels::cpu::march::MarchRay;
+use tiface_base::geom::Ray;
 use tiface_kernels::cpu::vm::mask::Walk;
 use tiface_kernels::cpu::vm::{Grid, LINE_AXIS, PLANE_AXES, RAY_WIDTH, VmField};
 
@@ -74,14 +74,16 @@ pub(crate) fn decode<R: Real>(f: &VmField, network: &[R], products: &[R], d: [f3
 }
 
 /// `[rays, 5]` of the weights `x`: density's grid, appearance's grid, decoder. No ray ends early.
-pub(crate) fn render<R: Real>(f: &VmField, x: &[R], rays: &[MarchRay]) -> Vec<R> {
+/// `jitter` has one number a ray.
+pub(crate) fn render<R: Real>(f: &VmField, x: &[R], rays: &[Ray], jitter: &[f32]) -> Vec<R> {
     let (of_density, rest) = x.split_at(f.density.len());
     let (of_color, network) = rest.split_at(f.color.len());
     let mut all = Vec::new();
-    for ray in rays {
+    assert_eq!(rays.len(), jitter.len());
+    for (ray, &jitter) in rays.iter().zip(jitter) {
         let mut light = R::of(1.0);
         let mut out = [R::of(0.0); RAY_WIDTH];
-        let mut walk = Walk::new(&f.lattice, f.mask.as_ref(), ray);
+        let mut walk = Walk::new(&f.lattice, f.mask.as_ref(), ray, jitter);
         while let Some(t) = walk.advance() {
             let p = from_fn(|a| ray.origin[a] as f64 + t as f64 * ray.direction[a] as f64);
             let sigma = density(f, of_density, p);
@@ -90,7 +92,7 @@ pub(crate) fn render<R: Real>(f: &VmField, x: &[R], rays: &[MarchRay]) -> Vec<R>
             let w = light * alpha;
             light = light * (R::of(1.0 + 1e-10) - alpha);
             if w.value() > f.shading.weight_threshold as f64 {
-                let c = decode(f, network, &products(f, &f.color, of_color, p), ray.direction);
+                let c = decode(f, network, &products(f, &f.color, of_color, p), ray.direction.to_array());
                 (0..3).for_each(|k| out[k] += w * c[k]);
             }
             out[3] += w;

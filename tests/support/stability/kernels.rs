@@ -5,11 +5,10 @@ use super::reference::{self, wide};
 use glam::{DMat3, DVec3, Vec2};
 use std::array::from_fn;
 use tiface::geom::sphharm::sh16;
-use tiface::geom::{Camera, Distortion};
+use tiface::geom::{Camera, Distortion, Ray};
 use tiface::image::{Image, linear_from_srgb, srgb_from_linear};
 use tiface::kernel::cpu::adam::{AdamStep, adam};
 use tiface::kernel::cpu::hash::{self, Level};
-use tiface::kernel::cpu::march::MarchRay;
 use tiface::kernel::cpu::mlp::Weights;
 use tiface::kernel::cpu::sdf::{self, FieldShape};
 use tiface::kernel::cpu::simd;
@@ -266,20 +265,16 @@ fn radiance(cases: &mut Cases) {
         let size = worst(want.iter().copied());
         let got = vm::density_at(&f, &of_density, &x);
         cases.add(format!("radiance field, {name}: density"), relative(got, &want, size), 1e-5, "relative");
-        let rays: Vec<MarchRay> = (0..40)
+        let (rays, jitter): (Vec<Ray>, Vec<f32>) = (0..40)
             .map(|i| {
                 let u = |k: u64| rng::uniform(56, k, i) - 0.5;
-                MarchRay {
-                    origin: [u(0), u(1), 2.5],
-                    direction: [0.4 * u(2), 0.4 * u(3), -1.0],
-                    jitter: u(4) + 0.5,
-                }
+                (Ray::new([u(0), u(1), 2.5], [0.4 * u(2), 0.4 * u(3), -1.0]), u(4) + 0.5)
             })
-            .collect();
+            .unzip();
         let weights = DecoderWeights::new(f.decoder, &network);
-        let rendered = vm::render(&f, &of_density, &of_color, &weights, &rays);
+        let rendered = vm::render(&f, &of_density, &of_color, &weights, &rays, &jitter);
         let flat = wide(&[&of_density[..], &of_color, &network].concat());
-        let want = reference::vm::render(&f, &flat, &rays);
+        let want = reference::vm::render(&f, &flat, &rays, &jitter);
         let got = rendered.out.clone();
         cases.add(format!("radiance field, {name}: rays"), relative(got, &want, 1.0), 2e-5, "absolute");
         let g = normals(10, want.len(), 1.0);
@@ -290,7 +285,8 @@ fn radiance(cases: &mut Cases) {
         let toward = normals(11, flat.len(), 1.0);
         let loss = |h: f64| -> f64 {
             let moved: Vec<f64> = flat.iter().zip(&toward).map(|(v, d)| v + h * *d as f64).collect();
-            reference::vm::render(&f, &moved, &rays).iter().zip(&g).map(|(o, g)| o * *g as f64).sum()
+            let out = reference::vm::render(&f, &moved, &rays, &jitter);
+            out.iter().zip(&g).map(|(o, g)| o * *g as f64).sum()
         };
         let error = along(gradient.iter().zip(&toward), &loss, if scale < 0.01 { 1e-7 } else { 1e-9 });
         // of a thin step 1 − exp(−x) is known to 6e-8, which is a good part of it

@@ -5,7 +5,7 @@ use super::case::{Cases, StabilityCase, worst};
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use tiface::geom::{BitGrid, Bvh, Camera, Distortion, Mesh, Ray};
 use tiface::kernel::cpu::hash;
-use tiface::kernel::cpu::march::{MarchRay, march};
+use tiface::kernel::cpu::march::march;
 use tiface::kernel::cpu::neus::{self, Segments};
 use tiface::kernel::cpu::vm::mask::{Lattice, Walk};
 use tiface::math::rng;
@@ -35,7 +35,7 @@ fn ball() -> Mesh {
 }
 
 fn ray(origin: Vec3, direction: Vec3) -> Ray {
-    Ray { origin, direction, t_min: 0.0, t_max: f32::INFINITY }
+    Ray::new(origin, direction)
 }
 
 /// Leaks of a ball from within, and what exact arithmetic says of rays that graze it.
@@ -181,11 +181,11 @@ fn boxes(cases: &mut Cases) {
         let slant = |k: u64| [0.0, -0.0, 1e-7, -1e-7, u(k) - 0.5][rng::below(31, k + 16, i, 5) as usize];
         let direction = Vec3::new(slant(3), slant(4), -1.0).normalize();
         let origin = Vec3::new(place(0), place(1), 0.3) - 2.7 * direction;
-        let r = MarchRay { origin: origin.to_array(), direction: direction.to_array(), jitter: 0.0 };
+        let r = Ray::new(origin, direction);
         let chord = chord(origin.as_dvec3(), direction.as_dvec3());
         let want = chord / step as f64;
-        cubic.push((march(&full, None, 1.0, step, &[r], 1 << 20).t.len() as f64 - want).abs());
-        let mut walk = Walk::new(&lattice, None, &r);
+        cubic.push((march(&full, None, 1.0, step, &[r], &[], 1 << 20).t.len() as f64 - want).abs());
+        let mut walk = Walk::new(&lattice, None, &r, 0.0);
         let mut n = 0;
         while walk.advance().is_some() {
             n += 1;
@@ -214,8 +214,8 @@ fn spheres(cases: &mut Cases) {
     let full = BitGrid::filled(16, true);
     for (inv_s, step) in [(200.0f32, 0.004f32), (2000.0, 0.001), (1e6, 0.001)] {
         let see = |height: f32| {
-            let r = MarchRay { origin: [height, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.37 };
-            let samples = march(&full, None, 1.0, step, &[r], 1 << 20);
+            let r = Ray::new([height, 0.0, 2.0], [0.0, 0.0, -1.0]);
+            let samples = march(&full, None, 1.0, step, &[r], &[0.37], 1 << 20);
             let (x, _) = samples.points(&[r]);
             let field: Vec<f32> = x
                 .iter()
@@ -226,8 +226,12 @@ fn spheres(cases: &mut Cases) {
                 })
                 .collect();
             let dt = vec![step; samples.t.len()];
-            let segments =
-                Segments { offsets: &samples.offsets, direction: &[r.direction], t: &samples.t, dt: &dt };
+            let segments = Segments {
+                offsets: &samples.offsets,
+                direction: &[r.direction.to_array()],
+                t: &samples.t,
+                dt: &dt,
+            };
             let out = neus::forward(segments, &field, inv_s, 1.0);
             (out[3] as f64, (out[4] / out[3]) as f64)
         };

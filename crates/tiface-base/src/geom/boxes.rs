@@ -25,7 +25,7 @@ pub struct Effort {
 
 impl Effort {
     /// Returns an effort of `left` steps.
-    pub fn of(left: usize) -> Effort {
+    pub fn new(left: usize) -> Effort {
         Effort { left, short: false }
     }
 
@@ -64,7 +64,7 @@ pub fn share_out<T: Send>(
     // a second time from the start, with what the others left over
     for _ in 0..2 {
         let run = |&i: &usize| {
-            let mut effort = Effort::of(share);
+            let mut effort = Effort::new(share);
             (work(i, &mut effort), share - effort.left, effort.short)
         };
         let runs: Vec<(T, usize, bool)> = unfinished.par_iter().map(run).collect();

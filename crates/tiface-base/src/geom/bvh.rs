@@ -89,7 +89,7 @@ pub struct Closest {
 ///
 /// let positions = vec![Vec3::ZERO, 2.0 * Vec3::X, 2.0 * Vec3::Y];
 /// let bvh = Bvh::new(&Mesh { positions, triangles: vec![[0, 1, 2]], ..Mesh::default() });
-/// let ray = Ray { origin: Vec3::new(0.5, 0.5, 3.0), direction: -Vec3::Z, t_min: 0.0, t_max: f32::INFINITY };
+/// let ray = Ray::new([0.5, 0.5, 3.0], -Vec3::Z);
 /// let hit = bvh.closest_hit(&ray).unwrap();
 /// assert_eq!((hit.t, hit.u, hit.v), (3.0, 0.25, 0.25));
 /// assert_eq!(bvh.closest_point(-Vec3::X).unwrap().point, Vec3::ZERO);

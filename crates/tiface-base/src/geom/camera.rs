@@ -282,12 +282,7 @@ impl Camera {
         let yd = (pixel.y as f64 - self.cy) / self.fy;
         let (x, y) = self.distortion.undistort(xd, yd)?;
         let direction = (self.rotation * DVec3::new(x, -y, -1.0)).normalize();
-        Some(Ray {
-            origin: self.position.as_vec3(),
-            direction: direction.as_vec3(),
-            t_min: 0.0,
-            t_max: f32::INFINITY,
-        })
+        Some(Ray::new(self.position.as_vec3(), direction.as_vec3()))
     }
 
     /// Picture position and distance along the viewing axis of a world point; `None` behind the

@@ -121,7 +121,7 @@ mod tests {
     }
 
     fn ray(from: Vec3, to: Vec3) -> Ray {
-        Ray { origin: from, direction: (to - from).normalize(), t_min: 0.0, t_max: f32::INFINITY }
+        Ray::new(from, (to - from).normalize())
     }
 
     #[test]

@@ -6,24 +6,11 @@
 use rayon::prelude::*;
 use tiface_base::geom::{BitGrid, Ray};
 
-/// A ray in a field's coordinates, for marching.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct MarchRay {
-    /// Origin, in field units.
-    pub origin: [f32; 3],
-    /// Direction. It has unit length in this module; a vector-matrix field accepts any length, and
-    /// its `t` is then a multiple of that length.
-    pub direction: [f32; 3],
-    /// Offset of the sample lattice, as a fraction of a step in 0..1 (0 without jitter).
-    pub jitter: f32,
-}
-
-impl MarchRay {
-    /// Converts a ray from scene coordinates to those of a field whose box is `radius` times the
-    /// scene's.
-    pub fn new(ray: &Ray, radius: f32, jitter: f32) -> MarchRay {
-        MarchRay { origin: (ray.origin * radius).to_array(), direction: ray.direction.to_array(), jitter }
-    }
+/// Returns the part of a step, 0..1, by which the sample lattice of a ray is shifted: `jitter` has
+/// one a ray, or none at all, which stands for 0.
+#[inline(always)]
+pub(crate) fn shift(jitter: &[f32], ray: usize) -> f32 {
+    jitter.get(ray).copied().unwrap_or(0.0)
 }
 
 /// The samples of a batch of rays, sorted by ray and then by `t`.
@@ -37,9 +24,9 @@ pub struct Samples {
 
 impl Samples {
     /// Returns positions and directions of the samples of the batch's rays.
-    pub fn points(&self, rays: &[MarchRay]) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
-        let ray_points = |(r, ray): (usize, &MarchRay)| {
-            let MarchRay { origin: o, direction: d, .. } = *ray;
+    pub fn points(&self, rays: &[Ray]) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
+        let ray_points = |(r, ray): (usize, &Ray)| {
+            let (o, d) = (ray.origin.to_array(), ray.direction.to_array());
             let span = self.offsets[r] as usize..self.offsets[r + 1] as usize;
             self.t[span].iter().map(move |t| (std::array::from_fn(|a| o[a] + t * d[a]), d))
         };
@@ -98,12 +85,13 @@ fn march_one(
     blocks: &Blocks,
     radius: f32,
     step: f32,
-    ray: &MarchRay,
+    (ray, jitter): (&Ray, f32),
     mut emit: impl FnMut(f32) -> bool,
 ) {
+    let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
     let (mut enter, mut leave) = (0f32, f32::INFINITY);
     for a in 0..3 {
-        let (o, d) = (ray.origin[a], ray.direction[a]);
+        let (o, d) = (origin[a], direction[a]);
         if d == 0.0 {
             if o.abs() > radius {
                 return;
@@ -120,8 +108,8 @@ fn march_one(
     let r = mask.resolution as f32;
     let top = mask.resolution as i32 - 1;
     let scale = 0.5 * r / radius; // cells per unit length
-    let start = enter + ray.jitter * step;
-    let inverse: [f32; 3] = std::array::from_fn(|a| 1.0 / ray.direction[a]);
+    let start = enter + jitter * step;
+    let inverse: [f32; 3] = std::array::from_fn(|a| 1.0 / direction[a]);
     // t = start + (k + ½) · step for integer k: computed, never accumulated
     let mut k = 0i64;
     loop {
@@ -129,7 +117,7 @@ fn march_one(
         if t >= leave {
             return;
         }
-        let g: [f32; 3] = std::array::from_fn(|a| (ray.origin[a] + t * ray.direction[a] + radius) * scale);
+        let g: [f32; 3] = std::array::from_fn(|a| (origin[a] + t * direction[a] + radius) * scale);
         // casts truncate, which is `floor` here: what is negative belongs to the first cell
         let c: [i32; 3] = std::array::from_fn(|a| (g[a] as i32).clamp(0, top));
         let cell = (c[0] as usize * mask.resolution + c[1] as usize) * mask.resolution + c[2] as usize;
@@ -149,8 +137,8 @@ fn march_one(
         let empty = blocks.is_empty(block);
         let mut border = f32::INFINITY;
         for a in 0..3 {
-            if ray.direction[a] != 0.0 {
-                let ahead = usize::from(ray.direction[a] > 0.0);
+            if direction[a] != 0.0 {
+                let ahead = usize::from(direction[a] > 0.0);
                 let wall = if empty {
                     ((block[a] + ahead) * BLOCK).min(mask.resolution)
                 } else {
@@ -166,26 +154,37 @@ fn march_one(
     }
 }
 
-/// Marches a batch of rays and keeps the nearest `limit` samples of each. `solid` must have the
-/// resolution of `mask`; `radius` and `step` are in field units.
+/// Marches a batch of whole rays, of unit directions and in field units, and keeps the nearest
+/// `limit` samples of each. `solid` must have the resolution of `mask`; `radius` and `step` are in
+/// field units.
+///
+/// # Shapes
+///
+/// - jitter: `[rays]`, the part of a step by which each ray's samples are shifted; `[0]` for none
 pub fn march(
     mask: &BitGrid,
     solid: Option<&BitGrid>,
     radius: f32,
     step: f32,
-    rays: &[MarchRay],
+    rays: &[Ray],
+    jitter: &[f32],
     limit: usize,
 ) -> Samples {
+    /// Rays per task.
+    const RAYS: usize = 256;
+    assert!(jitter.is_empty() || jitter.len() == rays.len());
     assert!(solid.is_none_or(|s| s.resolution == mask.resolution));
     let blocks = Blocks::new(mask, solid);
     let per_chunk: Vec<(Vec<i32>, Vec<f32>)> = rays
-        .par_chunks(256)
-        .map(|rays| {
+        .par_chunks(RAYS)
+        .enumerate()
+        .map(|(task, rays)| {
             let mut counts = Vec::with_capacity(rays.len());
             let mut t = Vec::with_capacity(rays.len() * 32);
-            for ray in rays {
+            for (r, ray) in rays.iter().enumerate() {
                 let before = t.len();
-                march_one(mask, solid, &blocks, radius, step, ray, |t_mid| {
+                let jitter = shift(jitter, task * RAYS + r);
+                march_one(mask, solid, &blocks, radius, step, (ray, jitter), |t_mid| {
                     t.push(t_mid);
                     t.len() - before < limit
                 });
@@ -210,12 +209,15 @@ pub fn march(
 mod tests {
     use super::*;
 
-    const RAY: MarchRay = MarchRay { origin: [0.03, 0.01, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
+    /// Returns a ray down along z, near the axis.
+    fn ray() -> Ray {
+        Ray::new([0.03, 0.01, 2.0], [0.0, 0.0, -1.0])
+    }
 
     #[test]
     fn a_full_box_of_edge_two_holds_twenty_steps_of_a_tenth() {
         let mask = BitGrid::filled(8, true);
-        let s = march(&mask, None, 1.0, 0.1, &[RAY], 1000);
+        let s = march(&mask, None, 1.0, 0.1, &[ray()], &[], 1000);
         assert_eq!(s.offsets, [0, 20]);
         assert!((s.t[0] - 1.05).abs() < 1e-5 && (s.t[19] - 2.95).abs() < 1e-5);
     }
@@ -229,9 +231,9 @@ mod tests {
                 holes.set(i, false);
             }
         }
-        let ray = MarchRay { origin: [2.0, 1.7, 1.9], direction: [-0.6, -0.48, -0.64], jitter: 0.3 };
-        let all = march(&full, None, 1.0, 0.02, &[ray], 1000).t;
-        let some = march(&holes, None, 1.0, 0.02, &[ray], 1000).t;
+        let ray = Ray::new([2.0, 1.7, 1.9], [-0.6, -0.48, -0.64]);
+        let all = march(&full, None, 1.0, 0.02, &[ray], &[0.3], 1000).t;
+        let some = march(&holes, None, 1.0, 0.02, &[ray], &[0.3], 1000).t;
         assert!(some.len() < all.len() && !some.is_empty());
         for t in &some {
             assert!(all.iter().any(|u| u == t));
@@ -278,14 +280,14 @@ mod tests {
             let from = [3.0 * unit(3) - 1.5, 3.0 * unit(4) - 1.5, 2.5 * (unit(5) - 0.5).signum()];
             let way: [f32; 3] = std::array::from_fn(|a| to[a] - from[a]);
             let length = way.iter().map(|d| d * d).sum::<f32>().sqrt();
-            let ray = MarchRay { origin: from, direction: way.map(|d| d / length), jitter: unit(6) };
-            let all = march(&BitGrid::filled(37, true), None, 1.0, 0.01, &[ray], 1000).t;
+            let (ray, jitter) = (Ray::new(from, way.map(|d| d / length)), [unit(6)]);
+            let all = march(&BitGrid::filled(37, true), None, 1.0, 0.01, &[ray], &jitter, 1000).t;
             let cell = |t: f32| {
                 let c = |a: usize| ((ray.origin[a] + t * ray.direction[a] + 1.0) * 18.5) as i32;
                 [0, 1, 2].iter().fold(0, |i, &a| i * 37 + c(a).clamp(0, 36) as usize)
             };
             let want: Vec<f32> = all.into_iter().filter(|&t| mask.get(cell(t))).collect();
-            assert_eq!(march(&mask, None, 1.0, 0.01, &[ray], 1000).t, want);
+            assert_eq!(march(&mask, None, 1.0, 0.01, &[ray], &jitter, 1000).t, want);
             kept += want.len();
         }
         assert!(kept > 100, "{kept}");
@@ -298,7 +300,7 @@ mod tests {
         let mut solid = BitGrid::filled(8, false);
         mask.set((4 * 8 + 4) * 8 + 4, false);
         solid.set((4 * 8 + 4) * 8 + 4, true);
-        let s = march(&mask, Some(&solid), 1.0, 0.1, &[RAY], 1000);
+        let s = march(&mask, Some(&solid), 1.0, 0.1, &[ray()], &[], 1000);
         // z from 1 down to 0.25 in steps of 0.1, midpoints 0.95 … 0.25: eight of them
         assert_eq!(s.offsets, [0, 8]);
     }
@@ -306,8 +308,8 @@ mod tests {
     #[test]
     fn rays_that_miss_own_nothing() {
         let mask = BitGrid::filled(8, true);
-        let miss = MarchRay { origin: [0.0, 0.0, 2.0], direction: [0.0, 0.0, 1.0], jitter: 0.0 };
-        let outside = MarchRay { origin: [1.5, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 };
-        assert_eq!(march(&mask, None, 1.0, 0.1, &[miss, RAY, outside], 5).offsets, [0, 0, 5, 5]);
+        let miss = Ray::new([0.0, 0.0, 2.0], [0.0, 0.0, 1.0]);
+        let outside = Ray::new([1.5, 0.0, 2.0], [0.0, 0.0, -1.0]);
+        assert_eq!(march(&mask, None, 1.0, 0.1, &[miss, ray(), outside], &[], 5).offsets, [0, 0, 5, 5]);
     }
 }

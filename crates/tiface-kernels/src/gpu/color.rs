@@ -324,7 +324,7 @@ pub(super) fn color_backward(
     if group < samples.div_ceil(TILE) {
         let lane = tile::lane_of(group, plane);
         let (row, column) = (lane.row, lane.column);
-        let sums = Block::of(c1_0, c1_1, c1_2, c1_3);
+        let sums = Block::new(c1_0, c1_1, c1_2, c1_3);
         store_outer(
             partial,
             sum + comptime!(gradient_rows[0] * CHANNELS),
@@ -333,7 +333,7 @@ pub(super) fn color_backward(
             row,
             column,
         );
-        let sums = Block::of(c2_0, c2_1, c2_2, c2_3);
+        let sums = Block::new(c2_0, c2_1, c2_2, c2_3);
         store_outer(partial, sum + comptime!(gradient_rows[1] * CHANNELS), &sums, HIDDEN, row, column);
         if row < 3 {
             let start = sum + (comptime!(gradient_rows[2]) + row) * CHANNELS;

@@ -1,9 +1,9 @@
 //! The density field of [`crate::cpu::density`], whose module holds the formulas: its networks
 //! forward and backward, truncation of rays by transmittance, and compositing with the losses.
 
+use super::batch::DeviceBatch;
 use super::color::{ColorPlan, color_backward, color_forward, color_inputs, unit};
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::DeviceBatch;
 use super::hash::Grid;
 use super::losses::{HIT, LAST, TALLY, sum, tally};
 use super::march::{Samples, prefix_sum};
@@ -181,7 +181,7 @@ fn geometry_backward(
     if group < samples.div_ceil(TILE) {
         let lane = lane_of(group, plane);
         let (row, column) = (lane.row, lane.column);
-        let sums = Block::of(w1_0, w1_1, w1_2, w1_3);
+        let sums = Block::new(w1_0, w1_1, w1_2, w1_3);
         store_outer(partial, sum, &sums, inputs, row, column);
         store_row(partial, sum + (row + HIDDEN) * CHANNELS, w2, HIDDEN, column);
     }

@@ -3,10 +3,11 @@
 //!
 //! The pixel of a ray depends on seed, step and the ray's index alone, as on the CPU.
 
+use super::batch::{DeviceBatch, RayArrays};
 use super::device::{Buffer, Device, Words, groups, launch};
+use super::lens::{number, undistort};
 use super::rng::{Wide, below, permuted, ranked, stream, uniform, upper_bound, word};
 use super::vec3::Vec3;
-use crate::cpu::march::MarchRay;
 use burn::cubecl::server::Handle;
 use burn::cubecl::{self, prelude::*};
 use tiface_base::geom::{Camera, Projection};
@@ -78,12 +79,6 @@ impl DrawnView {
     }
 }
 
-/// A float of a view.
-#[cube]
-fn number(views: &[u32], view: usize, i: usize) -> f32 {
-    f32::reinterpret(views[view + i])
-}
-
 /// Three floats of a view.
 #[cube]
 fn vector(views: &[u32], view: usize, i: usize) -> Vec3 {
@@ -102,18 +97,6 @@ struct PhotographArrays {
     before: Box<[u32]>,
 }
 
-/// The rays that a kernel writes; [`DeviceBatch`] documents the arrays.
-#[derive(CubeType, CubeLaunch)]
-struct RayArrays {
-    origin: Box<[f32]>,
-    direction: Box<[f32]>,
-    jitter: Box<[f32]>,
-    color: Box<[f32]>,
-    alpha: Box<[f32]>,
-    background: Box<[f32]>,
-    alive: Box<[u32]>,
-}
-
 /// The random numbers of a step: keys of streams, and the permutation of all drawable pixels.
 #[derive(CubeType, CubeLaunch)]
 struct StepDraws {
@@ -126,98 +109,6 @@ struct StepDraws {
     half_bits: u32,
     /// Place of the step's first ray in the order of the permutation.
     first: u32,
-}
-
-/// A point of the picture's plane.
-#[derive(CubeType, Clone, Copy)]
-struct Point {
-    x: f32,
-    y: f32,
-    found: bool,
-}
-
-/// A point distorted by a lens, and the Jacobian of the distortion.
-#[derive(CubeType, Clone, Copy)]
-struct DistortJacobian {
-    x: f32,
-    y: f32,
-    xx: f32,
-    xy: f32,
-    yx: f32,
-    yy: f32,
-}
-
-#[cube]
-fn distort(views: &[u32], lens: usize, x: f32, y: f32) -> DistortJacobian {
-    let (k1, k2, k3) = (number(views, lens, 2), number(views, lens, 3), number(views, lens, 4));
-    let (k4, k5, k6) = (number(views, lens, 5), number(views, lens, 6), number(views, lens, 7));
-    let (p1, p2) = (number(views, lens, 8), number(views, lens, 9));
-    let (sx, sy) = (number(views, lens, 10), number(views, lens, 11));
-    let r2 = x * x + y * y;
-    let mut radial = 1.0f32 + r2 * (k1 + r2 * (k2 + r2 * k3));
-    let mut slope = k1 + r2 * (2.0f32 * k2 + 3.0f32 * r2 * k3);
-    if views[lens] == 1 {
-        radial += r2 * r2 * r2 * r2 * k4;
-        slope += 4.0f32 * r2 * r2 * r2 * k4;
-    } else {
-        let under = 1.0f32 + r2 * (k4 + r2 * (k5 + r2 * k6));
-        radial /= under;
-        slope = (slope - radial * (k4 + r2 * (2.0f32 * k5 + 3.0f32 * r2 * k6))) / under;
-    }
-    slope *= 2.0f32;
-    let cross = x * y * slope + 2.0f32 * p1 * x + 2.0f32 * p2 * y;
-    DistortJacobian {
-        x: x * radial + 2.0f32 * p1 * x * y + p2 * (r2 + 2.0f32 * x * x) + sx * r2,
-        y: y * radial + p1 * (r2 + 2.0f32 * y * y) + 2.0f32 * p2 * x * y + sy * r2,
-        xx: radial + x * x * slope + 2.0f32 * p1 * y + 6.0f32 * p2 * x + 2.0f32 * sx * x,
-        xy: cross + 2.0f32 * sx * y,
-        yx: cross + 2.0f32 * sy * x,
-        yy: radial + y * y * slope + 6.0f32 * p1 * y + 2.0f32 * p2 * x + 2.0f32 * sy * y,
-    }
-}
-
-/// Inverts the distortion of a lens; see [`tiface_base::geom::Distortion::undistort`].
-#[cube]
-fn undistort(views: &[u32], lens: usize, xd: f32, yd: f32) -> Point {
-    let mut x = xd;
-    let mut y = yd;
-    let mut found = true;
-    if views[lens + 1] == 0 {
-        for _ in 0..10u32 {
-            let at = distort(views, lens, x, y);
-            let (ex, ey) = (at.x - xd, at.y - yd);
-            let det = at.xx * at.yy - at.xy * at.yx;
-            found = found && det > 1e-6f32;
-            let over = 1.0f32 / max(det, 1e-6f32);
-            x -= (at.yy * ex - at.xy * ey) * over;
-            y -= (at.xx * ey - at.yx * ex) * over;
-        }
-        let at = distort(views, lens, x, y);
-        found = found && (at.x - xd).abs() + (at.y - yd).abs() < 1e-5f32;
-        // tan θ / r of the projection
-        let r = (x * x + y * y).sqrt();
-        let widest = 1.569_796_3f32;
-        let mut scale = 1.0f32;
-        if views[lens] == 1 {
-            found = found && r < widest;
-            if r > 1e-4f32 {
-                scale = min(r, widest).tan() / r;
-            }
-        }
-        let omega = number(views, lens, 12);
-        if views[lens] == 2 && omega.abs() > 1e-6f32 {
-            let spread = 2.0f32 * (0.5f32 * omega).tan().abs();
-            let angle = r * omega.abs();
-            found = found && angle < widest;
-            scale = omega.abs() / spread;
-            if angle > 1e-4f32 {
-                scale = min(angle, widest).tan() / (spread * r);
-            }
-        }
-        x *= scale;
-        y *= scale;
-    }
-    Point { x, y, found }
 }
 
 /// Sums over the drawable pixels of a square.
@@ -394,95 +285,6 @@ fn draw_rays(
             }
             rays.background[c as usize * count + r] = channel;
         }
-    }
-}
-
-#[cube(launch)]
-fn keep(wanted: &[u32], alive: &mut [u32]) {
-    let r = ABSOLUTE_POS;
-    if r < alive.len() && r >= wanted[0] as usize {
-        alive[r] = 0;
-    }
-}
-
-/// Rays of a step, and the colors of their pixels.
-pub struct DeviceBatch {
-    /// Planes `[3, rays]`, where they start, in the field's coordinates.
-    pub origin: Buffer,
-    /// Planes `[3, rays]`, unit directions.
-    pub direction: Buffer,
-    /// `[rays]`: the part of a step that samples are shifted by.
-    pub jitter: Buffer,
-    /// Planes `[3, rays]`: the head over black, sRGB-coded, 0 to 1.
-    pub color: Buffer,
-    /// `[rays]`: soft alpha, 1 without a mask.
-    pub alpha: Buffer,
-    /// Planes `[3, rays]`: background color of render and target.
-    pub background: Buffer,
-    /// `[rays]`: 1 for rays in use; the others have no samples and no part in any mean.
-    pub alive: Buffer,
-}
-
-impl DeviceBatch {
-    /// Allocates a batch with a capacity of `rays`, all inactive.
-    pub fn new(device: &Device, rays: usize) -> DeviceBatch {
-        DeviceBatch {
-            origin: device.zeros::<f32>(3 * rays),
-            direction: device.zeros::<f32>(3 * rays),
-            jitter: device.zeros::<f32>(rays),
-            color: device.zeros::<f32>(3 * rays),
-            alpha: device.zeros::<f32>(rays),
-            background: device.zeros::<f32>(3 * rays),
-            alive: device.zeros::<u32>(rays),
-        }
-    }
-
-    /// Uploads rays into a batch of the given capacity, with black colors.
-    pub fn of_rays(device: &Device, rays: &[MarchRay], capacity: usize) -> DeviceBatch {
-        assert!(rays.len() <= capacity);
-        let mut planes = [vec![0f32; 3 * capacity], vec![0f32; 3 * capacity]];
-        let (mut jitter, mut alive) = (vec![0f32; capacity], vec![0u32; capacity]);
-        for (r, ray) in rays.iter().enumerate() {
-            for a in 0..3 {
-                planes[0][a * capacity + r] = ray.origin[a];
-                planes[1][a * capacity + r] = ray.direction[a];
-            }
-            (jitter[r], alive[r]) = (ray.jitter, 1);
-        }
-        DeviceBatch {
-            origin: device.upload(&planes[0]),
-            direction: device.upload(&planes[1]),
-            jitter: device.upload(&jitter),
-            alive: device.upload(&alive),
-            ..DeviceBatch::new(device, capacity)
-        }
-    }
-
-    /// Returns the capacity in rays.
-    pub fn rays(&self) -> usize {
-        self.jitter.word_count()
-    }
-
-    fn arrays(&self) -> [&Buffer; 7] {
-        let DeviceBatch { origin, direction, jitter, color, alpha, background, alive } = self;
-        [origin, direction, jitter, color, alpha, background, alive]
-    }
-
-    /// Returns the buffers as a kernel argument.
-    fn arg(&self) -> RayArraysLaunch {
-        let [origin, direction, jitter, color, alpha, background, alive] = self.arrays().map(Words::arg);
-        RayArraysLaunch::new(origin, direction, jitter, color, alpha, background, alive)
-    }
-
-    /// Returns the handles of the buffers' memory.
-    fn handles(&self) -> [&Handle; 7] {
-        self.arrays().map(|buffer| &buffer.handle)
-    }
-
-    /// Deactivates all rays after the first `wanted`, `[1]`.
-    pub fn keep(&self, device: &Device, wanted: &Buffer) {
-        let count = groups(self.rays().div_ceil(UNITS as usize));
-        launch!(device, keep::launch, count, UNITS; wanted, self.alive);
     }
 }
 

@@ -1,17 +1,16 @@
 //! Evaluation of a trained signed-distance field on a device, in batches that fill the device.
 
+use super::batch::DeviceBatch;
 use super::device::{Buffer, Device};
-use super::draw::DeviceBatch;
 use super::march::Samples;
 use super::neus::Neus;
 use super::occupancy::Occupancy;
 use super::sdf::Sdf;
-use crate::cpu::march::MarchRay;
 use crate::cpu::neus::RAY_WIDTH;
 use crate::cpu::sdf::FieldShape;
 use std::ops::Range;
 use tiface_base::Result;
-use tiface_base::geom::BitGrid;
+use tiface_base::geom::{BitGrid, Ray};
 
 /// Number of samples evaluated together, which takes about two hundred megabytes of memory; fewer
 /// in tests, which drivers in software run.
@@ -124,7 +123,7 @@ impl Evaluator {
 
     /// Renders rays with march steps of `step`, and returns `[rays, 9]`: see
     /// [`crate::cpu::neus::forward`].
-    pub fn render(&mut self, rays: &[MarchRay], step: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
+    pub fn render(&mut self, rays: &[Ray], step: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
         let device = &self.device;
         let step = device.upload(&[step]);
         let made = || (Samples::new(device, RAYS, CAPACITY), Neus::new(device, RAYS, CAPACITY));
@@ -132,7 +131,7 @@ impl Evaluator {
         let mut out = Vec::with_capacity(rays.len());
         while out.len() < rays.len() {
             let own = &rays[out.len()..(out.len() + RAYS).min(rays.len())];
-            let batch = DeviceBatch::of_rays(device, own, RAYS);
+            let batch = DeviceBatch::upload(device, own, &[], RAYS);
             samples.march(device, &self.occupancy, &batch, &step, usize::MAX, 0);
             let (x, view_dir, count) = (&samples.x, &samples.direction, &samples.count);
             let field = self.sdf.forward(device, &self.table, &self.flat, x, view_dir, count);
@@ -192,23 +191,24 @@ mod tests {
 
         // More rays and more samples than the buffers hold: 4,300 of about 15.
         let step = 0.16;
-        let rays: Vec<MarchRay> = (0..4_300)
+        let rays: Vec<Ray> = (0..4_300)
             .map(|i| {
                 let d = direction[i % 700];
-                let origin = std::array::from_fn(|a| -3.0 * d[a] + rng::normal(1, 2, (3 * i + a) as u64));
-                MarchRay { origin, direction: d, jitter: 0.0 }
+                let origin: [f32; 3] =
+                    std::array::from_fn(|a| -3.0 * d[a] + rng::normal(1, 2, (3 * i + a) as u64));
+                Ray::new(origin, d)
             })
             .collect();
-        let marched = |rays: &[MarchRay]| march::march(&mask, None, shape.radius, step, rays, usize::MAX);
+        let marched = |rays: &[Ray]| march::march(&mask, None, shape.radius, step, rays, &[], usize::MAX);
         assert!(rays.len() > RAYS && marched(&rays[..RAYS]).t.len() > CAPACITY);
         let got = evaluator.render(&rays, step).unwrap();
         assert_eq!(got.len(), rays.len());
         let some: Vec<usize> = (0..rays.len()).step_by(7).collect();
-        let few: Vec<MarchRay> = some.iter().map(|&r| rays[r]).collect();
+        let few: Vec<Ray> = some.iter().map(|&r| rays[r]).collect();
         let samples = marched(&few);
         let (x, d) = samples.points(&few);
         let field = sdf::forward(&shape, &table, &weights, &x, &d);
-        let along: Vec<[f32; 3]> = few.iter().map(|r| r.direction).collect();
+        let along: Vec<[f32; 3]> = few.iter().map(|r| r.direction.to_array()).collect();
         let dt = vec![step; x.len()];
         let segments = crate::cpu::neus::Segments {
             offsets: &samples.offsets,

@@ -1,7 +1,7 @@
 //! The training loss of the signed-distance field and its gradients: see [`crate::cpu::losses`].
 
+use super::batch::DeviceBatch;
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::DeviceBatch;
 use super::sum::group_sum;
 use super::vec3::Vec3;
 use crate::cpu::losses::{LossWeights, RAY_TERMS, SAMPLE_TERMS, TERMS};

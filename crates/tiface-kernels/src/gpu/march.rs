@@ -2,8 +2,8 @@
 //! number of samples: a first pass counts the samples of each ray, a prefix sum gives the offset of
 //! each ray, and a second pass writes the samples.
 
+use super::batch::DeviceBatch;
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::DeviceBatch;
 use super::occupancy::Occupancy;
 use super::vec3::Vec3;
 use burn::cubecl::{self, prelude::*};
@@ -288,16 +288,16 @@ impl Samples {
 mod tests {
     use super::super::testing::{agree, device, planes};
     use super::*;
-    use crate::cpu::march::{MarchRay, march};
-    use tiface_base::geom::BitGrid;
+    use crate::cpu::march::march;
+    use tiface_base::geom::{BitGrid, Ray};
     use tiface_base::math::rng;
 
     const RADIUS: f32 = 1.1;
     const STEP: f32 = 0.02;
 
     /// Returns a mask with holes, solid cells, and rays from all around towards the center, one
-    /// along an axis and one that misses.
-    fn scene() -> (BitGrid, BitGrid, Vec<MarchRay>) {
+    /// along an axis and one that misses, with their jitter.
+    fn scene() -> (BitGrid, BitGrid, Vec<Ray>, Vec<f32>) {
         let resolution = 24;
         let mut mask = BitGrid::filled(resolution, false);
         let mut solid = mask.clone();
@@ -307,31 +307,32 @@ mod tests {
             mask.set(i, (0.3..0.7).contains(&r) && i % 7 != 0);
             solid.set(i, r < 0.25);
         }
-        let mut rays: Vec<MarchRay> = (0..700)
+        let (mut rays, mut jitter): (Vec<Ray>, Vec<f32>) = (0..700)
             .map(|i| {
                 let normal = |k: u64| rng::normal(1, 2, 7 * i + k);
                 let unit = |v: [f32; 3]| v.map(|c| c / v.iter().map(|c| c * c).sum::<f32>().sqrt());
                 let origin = unit([normal(0), normal(1), normal(2)]).map(|c| 2.0 * c);
                 let aim = [normal(3), normal(4), normal(5)].map(|c| 0.4 * c);
                 let direction = unit(std::array::from_fn(|a| aim[a] - origin[a]));
-                MarchRay { origin, direction, jitter: rng::uniform(1, 3, i) }
+                (Ray::new(origin, direction), rng::uniform(1, 3, i))
             })
-            .collect();
-        rays.push(MarchRay { origin: [0.03, 0.01, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.0 });
-        rays.push(MarchRay { origin: [1.5, 0.0, 2.0], direction: [0.0, 0.0, -1.0], jitter: 0.5 });
-        (mask, solid, rays)
+            .unzip();
+        rays.push(Ray::new([0.03, 0.01, 2.0], [0.0, 0.0, -1.0]));
+        rays.push(Ray::new([1.5, 0.0, 2.0], [0.0, 0.0, -1.0]));
+        jitter.extend([0.0, 0.5]);
+        (mask, solid, rays, jitter)
     }
 
     fn on_device(
         device: &Device,
         occupancy: &Occupancy,
-        rays: &[MarchRay],
+        (rays, jitter): (&[Ray], &[f32]),
         capacity: usize,
         limit: usize,
     ) -> (Samples, Vec<u32>) {
         // the buffers have capacity for more rays and samples than are used
         let samples = Samples::new(device, rays.len() + 5, capacity + 3);
-        let batch = DeviceBatch::of_rays(device, rays, rays.len() + 5);
+        let batch = DeviceBatch::upload(device, rays, jitter, rays.len() + 5);
         samples.march(device, occupancy, &batch, &device.upload(&[STEP]), limit, 3);
         (samples, device.read(&batch.alive))
     }
@@ -339,12 +340,12 @@ mod tests {
     #[test]
     fn samples_are_those_of_the_cpu() {
         let Some(device) = device() else { return };
-        let (mask, solid, rays) = scene();
+        let (mask, solid, rays, jitter) = scene();
         for (solid, limit) in [(None, 1000), (Some(&solid), 1000), (Some(&solid), 7)] {
-            let want = march(&mask, solid, RADIUS, STEP, &rays, limit);
+            let want = march(&mask, solid, RADIUS, STEP, &rays, &jitter, limit);
             let n = want.t.len();
             let occupancy = Occupancy::new(&device, &mask, solid, RADIUS);
-            let (got, alive) = on_device(&device, &occupancy, &rays, (1 << 16) - 3, limit);
+            let (got, alive) = on_device(&device, &occupancy, (&rays, &jitter), (1 << 16) - 3, limit);
             assert_eq!(device.read::<u32>(&got.count), [n as u32; 2]);
             assert_eq!(device.read::<i32>(&got.offsets)[..=rays.len()], want.offsets);
             assert!((0..alive.len()).all(|r| (alive[r] == 1) == (r < rays.len())));
@@ -359,12 +360,12 @@ mod tests {
     #[test]
     fn rays_beyond_the_capacity_get_no_samples() {
         let Some(device) = device() else { return };
-        let (mask, _, rays) = scene();
-        let whole = march(&mask, None, RADIUS, STEP, &rays, 1000).offsets;
+        let (mask, _, rays, jitter) = scene();
+        let whole = march(&mask, None, RADIUS, STEP, &rays, &jitter, 1000).offsets;
         let occupancy = Occupancy::new(&device, &mask, None, RADIUS);
         // rays from 300 on do not fit, except empty ones that directly follow
         let capacity = whole[300] + 1;
-        let (got, alive) = on_device(&device, &occupancy, &rays, capacity as usize, 1000);
+        let (got, alive) = on_device(&device, &occupancy, (&rays, &jitter), capacity as usize, 1000);
         let fits = *whole.iter().filter(|&&o| o <= capacity).max().unwrap();
         let want: Vec<i32> = whole.iter().map(|&o| o.min(fits)).collect();
         assert_eq!(device.read::<i32>(&got.offsets)[..=rays.len()], want);

@@ -1,8 +1,8 @@
 //! NeuS compositing of ragged rays, one thread per ray: see [`crate::cpu::neus`].
 
+use super::batch::DeviceBatch;
 use super::composite::Composited;
 use super::device::{Buffer, Device, Words, groups, launch};
-use super::draw::DeviceBatch;
 use super::march::Samples;
 use super::sum::group_sum;
 use super::vec3::Vec3;

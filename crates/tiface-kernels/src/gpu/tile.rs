@@ -84,7 +84,7 @@ pub struct Block {
 #[cube]
 impl Block {
     /// Creates a block from the vectors of four channels.
-    pub fn of(c0: F4, c1: F4, c2: F4, c3: F4) -> Block {
+    pub fn new(c0: F4, c1: F4, c2: F4, c3: F4) -> Block {
         Block { c0, c1, c2, c3 }
     }
 
@@ -123,7 +123,7 @@ pub fn product(
         c2 += v * F4::new(m.extract(2usize));
         c3 += v * F4::new(m.extract(3usize));
     }
-    Block::of(c0, c1, c2, c3)
+    Block::new(c0, c1, c2, c3)
 }
 
 /// Returns output `column` of a layer with few outputs, whose inputs are all channels; its weights
@@ -155,7 +155,7 @@ pub fn output_layer(
 /// vectors of samples, and vice versa.
 #[cube]
 pub fn transposed(b: &Block) -> Block {
-    Block::of(component(b, 0usize), component(b, 1usize), component(b, 2usize), component(b, 3usize))
+    Block::new(component(b, 0usize), component(b, 1usize), component(b, 2usize), component(b, 3usize))
 }
 
 /// Returns component `k` of all four vectors.
@@ -181,7 +181,7 @@ pub fn store_block(a: &mut [F4], block: &Block, row: usize, column: usize, #[com
 #[cube]
 pub fn load_block(a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Block {
     let c = 4 * column;
-    Block::of(
+    Block::new(
         a[at(c, row, lanes)],
         a[at(c + 1, row, lanes)],
         a[at(c + 2, row, lanes)],
@@ -256,7 +256,7 @@ pub fn outer_block(a: &[F4], b: &[F4], row: usize, column: usize) -> Block {
         c2 += dots(a[at(row + 32, r, LANES)], b0, b1, b2, b3);
         c3 += dots(a[at(row + 48, r, LANES)], b0, b1, b2, b3);
     }
-    Block::of(c0, c1, c2, c3)
+    Block::new(c0, c1, c2, c3)
 }
 
 /// Writes what [`outer_row`] returns for a row, of a gradient with `n` columns, to the row that
@@ -413,14 +413,14 @@ fn positive(v: F4) -> F4 {
 /// Returns `max(v, 0)` of all values of a block.
 #[cube]
 pub fn relu(b: &Block) -> Block {
-    Block::of(positive(b.c0), positive(b.c1), positive(b.c2), positive(b.c3))
+    Block::new(positive(b.c0), positive(b.c1), positive(b.c2), positive(b.c3))
 }
 
 /// Returns `g` where the activations of tile `a` are positive, else zero: the gradient of the relu.
 #[cube]
 pub fn relu_backward(g: &Block, a: &[F4], row: usize, column: usize, #[comptime] lanes: usize) -> Block {
     let v = load_block(a, row, column, lanes);
-    Block::of(
+    Block::new(
         relu_backward_channel(g.c0, v.c0),
         relu_backward_channel(g.c1, v.c1),
         relu_backward_channel(g.c2, v.c2),
@@ -437,13 +437,13 @@ fn relu_backward_channel(g: F4, v: F4) -> F4 {
 /// Returns the elementwise product of two blocks.
 #[cube]
 pub fn times(a: &Block, b: &Block) -> Block {
-    Block::of(a.c0 * b.c0, a.c1 * b.c1, a.c2 * b.c2, a.c3 * b.c3)
+    Block::new(a.c0 * b.c0, a.c1 * b.c1, a.c2 * b.c2, a.c3 * b.c3)
 }
 
 /// Returns a block times one weight per channel.
 #[cube]
 pub fn weighted(a: &Block, w: F4) -> Block {
-    let w = Block::of(
+    let w = Block::new(
         F4::new(w.extract(0usize)),
         F4::new(w.extract(1usize)),
         F4::new(w.extract(2usize)),
@@ -466,7 +466,7 @@ pub fn activate(z: &Block, bias: F4) -> Active {
     let a1 = activated(z.c1, bias.extract(1usize));
     let a2 = activated(z.c2, bias.extract(2usize));
     let a3 = activated(z.c3, bias.extract(3usize));
-    Active { h: Block::of(a0.h, a1.h, a2.h, a3.h), s: Block::of(a0.s, a1.s, a2.s, a3.s) }
+    Active { h: Block::new(a0.h, a1.h, a2.h, a3.h), s: Block::new(a0.s, a1.s, a2.s, a3.s) }
 }
 
 #[derive(CubeType)]
@@ -497,7 +497,7 @@ fn activated(z: F4, bias: f32) -> ActiveChannel {
 /// Returns s for given h: `1 − e^{−100 h}`.
 #[cube]
 pub fn slope(h: &Block) -> Block {
-    Block::of(slope_channel(h.c0), slope_channel(h.c1), slope_channel(h.c2), slope_channel(h.c3))
+    Block::new(slope_channel(h.c0), slope_channel(h.c1), slope_channel(h.c2), slope_channel(h.c3))
 }
 
 #[cube]
@@ -508,7 +508,7 @@ fn slope_channel(h: F4) -> F4 {
 /// Returns the gradient `g_z = s (g_h + 100 g_a w (1 − s))`.
 #[cube]
 pub fn softplus_backward(s: &Block, g_h: &Block, g_a: &Block, w: F4) -> Block {
-    Block::of(
+    Block::new(
         softplus_backward_channel(s.c0, g_h.c0, g_a.c0, w.extract(0usize)),
         softplus_backward_channel(s.c1, g_h.c1, g_a.c1, w.extract(1usize)),
         softplus_backward_channel(s.c2, g_h.c2, g_a.c2, w.extract(2usize)),

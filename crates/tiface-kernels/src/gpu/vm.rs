@@ -16,14 +16,14 @@ pub use decoder::DeviceDecoder;
 pub use grid::DeviceGrid;
 pub use losses::VmLosses;
 
+use super::batch::DeviceBatch;
 use super::device::{Atomics, Buffer, Device};
-use super::draw::DeviceBatch;
-use crate::cpu::march::MarchRay;
 use crate::cpu::vm::{Grid, RAY_WIDTH, VmField};
 use march::{DeviceLattice, VmSamples};
 use rays::CompositedRays;
 use std::sync::Arc;
 use tiface_base::Result;
+use tiface_base::geom::Ray;
 
 /// Number of samples of a tile; capacities are multiples of it.
 const TILE: usize = 64;
@@ -181,13 +181,13 @@ impl VmRenderer {
     }
 
     /// Renders rays, `[rays]`: see [`RAY_WIDTH`].
-    pub fn render(&mut self, rays: &[MarchRay]) -> Result<Vec<[f32; RAY_WIDTH]>> {
+    pub fn render(&mut self, rays: &[Ray]) -> Result<Vec<[f32; RAY_WIDTH]>> {
         let (device, [density, color, network]) = (&self.device, &self.values);
         let values = VmValues { density, color, network };
         let mut seen = Vec::with_capacity(rays.len());
         while seen.len() < rays.len() {
             let own = &rays[seen.len()..rays.len().min(seen.len() + self.pass)];
-            let out = self.vm.render(device, values, &DeviceBatch::of_rays(device, own, PASS));
+            let out = self.vm.render(device, values, &DeviceBatch::upload(device, own, &[], PASS));
             let out = device.fetch::<f32>(out)?;
             let [count, ..] = self.vm.counts();
             let found = device.fetch::<u32>(count)?;
@@ -221,7 +221,7 @@ mod renderer_tests {
         let Some(device) = device() else { return };
         let case = case(NARROW, 500);
         let weights = DecoderWeights::new(case.field.decoder, &case.network);
-        let want = render(&case.field, &case.density, &case.color, &weights, &case.rays).out;
+        let want = render(&case.field, &case.density, &case.color, &weights, &case.rays, &[]).out;
         let values = [case.density.as_slice(), &case.color, &case.network];
         let mut renderer = VmRenderer::new(Arc::new(device), &case.field, values);
         agree("rendered", renderer.render(&case.rays).unwrap().as_flattened(), &want, 1e-4);

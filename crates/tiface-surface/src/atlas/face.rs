@@ -124,35 +124,17 @@ fn cap(adjacent: &[[u32; 3]], depth: &[f32], foremost: u32, plane: f32) -> Vec<b
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::atlas::tests::sphere;
     use tiface_base::Quiet;
 
     /// Returns a closed ball around the origin, a bump like a nose at its front (+z) and a dent
     /// below it.
     fn ball() -> Mesh {
-        let (rings, around) = (40u32, 60u32);
-        let mut mesh = Mesh { positions: vec![Vec3::Y], ..Mesh::default() };
-        for i in 1..rings {
-            for j in 0..around {
-                let (polar, turn) = (
-                    std::f32::consts::PI * i as f32 / rings as f32,
-                    std::f32::consts::TAU * j as f32 / around as f32,
-                );
-                let p = Vec3::new(polar.sin() * turn.sin(), polar.cos(), polar.sin() * turn.cos());
-                let near = |q: Vec3| (-40.0 * p.distance_squared(q.normalize())).exp();
-                let r = 1.0 + 0.15 * near(Vec3::Z) - 0.05 * near(Vec3::new(0.0, -0.5, 1.0));
-                mesh.positions.push(r * p);
-            }
-        }
-        mesh.positions.push(-Vec3::Y);
-        let last = mesh.positions.len() as u32 - 1;
-        let at = |i: u32, j: u32| 1 + i * around + j % around;
-        for j in 0..around {
-            mesh.triangles.push([0, at(0, j), at(0, j + 1)]);
-            mesh.triangles.push([last, at(rings - 2, j + 1), at(rings - 2, j)]);
-            for i in 0..rings - 2 {
-                mesh.triangles.push([at(i, j), at(i + 1, j), at(i + 1, j + 1)]);
-                mesh.triangles.push([at(i, j), at(i + 1, j + 1), at(i, j + 1)]);
-            }
+        let mut mesh = sphere(40, 60);
+        for p in &mut mesh.positions {
+            let near = |q: Vec3| (-40.0 * p.distance_squared(q.normalize())).exp();
+            let r = 1.0 + 0.15 * near(Vec3::Z) - 0.05 * near(Vec3::new(0.0, -0.5, 1.0));
+            *p *= r;
         }
         mesh
     }

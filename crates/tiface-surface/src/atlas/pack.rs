@@ -36,8 +36,8 @@ pub(super) struct ChartPose {
 }
 
 impl ChartPose {
-    /// In texels, y up.
-    pub fn of(&self, p: DVec2) -> DVec2 {
+    /// Returns where a point of the chart lies, in texels, y up.
+    pub fn place(&self, p: DVec2) -> DVec2 {
         self.turn.rotate(p) * self.scale + self.offset
     }
 }
@@ -133,7 +133,7 @@ fn draw(
     let drawn = |outline: &[[DVec2; 2]], turn: DVec2| {
         let (low, high) = bounds(outline, turn);
         let sides: Vec<_> = outline.iter().map(|s| s.map(|p| (turn.rotate(p) - low) * scale)).collect();
-        TurnedMask { mask: Mask::of(&sides, (high - low) * scale, reach), turn, low }
+        TurnedMask { mask: Mask::rasterize(&sides, (high - low) * scale, reach), turn, low }
     };
     let every = |k: usize| DVec2::from_angle(std::f64::consts::TAU * k as f64 / turns as f64);
     let one = |(outline, stands): (&Vec<[DVec2; 2]>, &Option<DVec2>)| match stands {
@@ -234,7 +234,7 @@ impl Mask {
 
     /// Returns the shape within an outline whose lowest coordinates are 0, grown by `reach`, so
     /// that the outline's lowest corner lies at (`reach`, `reach`). Cells are squares of one unit.
-    fn of(outline: &[[DVec2; 2]], high: DVec2, reach: f64) -> Mask {
+    fn rasterize(outline: &[[DVec2; 2]], high: DVec2, reach: f64) -> Mask {
         let [width, height] = (high + 2.0 * reach).to_array().map(|v| (v.ceil() as usize).max(1));
         let words = width.div_ceil(64);
         let (mut near, mut within) = (vec![0u64; words * height], vec![0u64; words * height]);
@@ -445,7 +445,7 @@ mod tests {
     }
 
     fn corners(chart: &Flat, place: &ChartPose) -> Vec<DVec2> {
-        chart.points.iter().map(|&p| place.of(p)).collect()
+        chart.points.iter().map(|&p| place.place(p)).collect()
     }
 
     #[test]
@@ -481,12 +481,12 @@ mod tests {
 
     #[test]
     fn a_square_grown_by_two_loses_its_corners() {
-        let mask = Mask::of(&square(6.0), DVec2::splat(6.0), 2.0);
+        let mask = Mask::rasterize(&square(6.0), DVec2::splat(6.0), 2.0);
         // rows 0..10; the corner cell (0, 0) is √2 away from the point (2, 2) at its nearest: taken
         assert_eq!((mask.width, mask.height), (10, 10));
         assert!((2..8).all(|y| mask.row(y) == [[0, 10]]));
         assert_eq!(mask.row(0), [[0, 10]]);
-        let mask = Mask::of(&square(6.0), DVec2::splat(6.0), 4.0);
+        let mask = Mask::rasterize(&square(6.0), DVec2::splat(6.0), 4.0);
         // grown by 4, cell (0, 0) reaches to (1, 1), 3 √2 = 4.24 away from (4, 4): free; (1, 0) is
         // √13 = 3.6
         assert_eq!(mask.row(0), [[1, 13]]);
@@ -497,14 +497,14 @@ mod tests {
     fn an_outline_with_a_hole_keeps_it_free() {
         let mut outline = square(20.0);
         outline.extend(square(10.0).iter().map(|s| s.map(|p| p + 5.0)));
-        let mask = Mask::of(&outline, DVec2::splat(20.0), 1.0);
+        let mask = Mask::rasterize(&outline, DVec2::splat(20.0), 1.0);
         // the hole is 6..16, less one on each side
         assert_eq!(mask.row(11), [[0, 7], [15, 22]]);
         let mut page = Page::new(70);
         page.take(&mask, 0, 0);
-        let small = Mask::of(&square(6.0), DVec2::splat(6.0), 1.0);
+        let small = Mask::rasterize(&square(6.0), DVec2::splat(6.0), 1.0);
         assert_eq!(page.find(&small, usize::MAX), Some((22, 0)));
-        let tall = Mask::of(&square(68.0), DVec2::splat(68.0), 1.0);
+        let tall = Mask::rasterize(&square(68.0), DVec2::splat(68.0), 1.0);
         assert_eq!(page.find(&tall, usize::MAX), None);
         page.take(&small, 22, 0);
         page.take(&small, 30, 0);
@@ -523,7 +523,7 @@ mod tests {
         let mut taken = vec![[false; 100]; 100];
         for i in 0..14 {
             let s = 3.0 + f64::from(i * 5 % 7);
-            let mask = Mask::of(&l_shape(s), s * DVec2::new(3.0, 4.0), 1.5);
+            let mask = Mask::rasterize(&l_shape(s), s * DVec2::new(3.0, 4.0), 1.5);
             let fits = |x: usize, y: usize| {
                 (0..mask.height)
                     .all(|r| mask.row(r).iter().all(|s| (s[0]..s[1]).all(|c| !taken[y + r][x + c as usize])))

@@ -42,7 +42,7 @@ impl Cap {
     }
 
     /// Returns the cap of a mesh extracted within `bounds` with cells of `cell`, if it has one.
-    pub fn of(mesh: &Mesh, bounds: Aabb, cell: f32) -> Option<Cap> {
+    pub fn find(mesh: &Mesh, bounds: Aabb, cell: f32) -> Option<Cap> {
         let cap = Cap::bare(bounds, cell);
         let capped: Vec<bool> = mesh.positions.iter().map(|&p| cap.holds(p)).collect();
         let mut on_ring = vec![false; mesh.positions.len()];
@@ -147,7 +147,7 @@ mod tests {
         let options = ExtractOptions { resolution: 48, ..ExtractOptions::default() };
         let (mut mesh, report) =
             extract(&Painted { shape: f, paint }, Aabb::SCENE, &options, &Quiet).unwrap();
-        let cap = Cap::of(&mesh, report.bounds(), report.cell_size).unwrap();
+        let cap = Cap::find(&mesh, report.bounds(), report.cell_size).unwrap();
         cap.paint(&mut mesh);
         (mesh, cap)
     }
@@ -210,6 +210,6 @@ mod tests {
             ..Mesh::default()
         };
         let bounds = Aabb { min: Vec3::splat(-2.0), max: Vec3::splat(2.0) };
-        assert!(Cap::of(&mesh, bounds, 0.1).is_none());
+        assert!(Cap::find(&mesh, bounds, 0.1).is_none());
     }
 }

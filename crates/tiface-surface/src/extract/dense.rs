@@ -6,12 +6,13 @@
 //! border.
 
 use super::marching::{Volume, marching};
-use super::{BATCH, MeshReport, NodeGrid, colors_along_normals, off_surface};
-use crate::{check_len, evaluate, setting};
+use super::{BATCH, MeshReport, NodeGrid, check_resolution, colors_along_normals, no_surface, off_surface};
+use crate::{check_len, evaluate};
 use glam::Vec3;
 use std::time::Instant;
+use tiface_base::error::Cause;
 use tiface_base::geom::{Aabb, Mesh, SdfField};
-use tiface_base::{Error, Monitor, Result};
+use tiface_base::{Monitor, Result};
 
 /// Margin around the surface's box on each side, as a share of its size.
 const MARGIN: f32 = 0.1;
@@ -30,7 +31,7 @@ pub fn extract_dense(
     monitor: &dyn Monitor,
 ) -> Result<(Mesh, MeshReport)> {
     let begin = Instant::now();
-    setting((2..=2048).contains(&resolution), "mesh.resolution", "2..=2048", resolution)?;
+    check_resolution(resolution, 2048)?;
     NodeGrid::fit(bounds, resolution)?; // refuses an invalid box
     let steps = 2 * resolution as u64;
     let layers = |pass: u64, inside: Aabb| -> Result<(Vec<f32>, Vec3)> {
@@ -60,10 +61,8 @@ pub fn extract_dense(
         let found = marching(&volume, false)?;
         if found.mesh.triangles.is_empty() {
             let (nodes, size) = (values.len(), inside.size());
-            return Err(Error::no_surface(
-                format!("the field does not change its sign at {nodes} nodes of {size:.3}"),
-                "train longer, or check that the box holds the head (`capture.box`)",
-            ));
+            let how = format!("the field does not change its sign at {nodes} nodes of {size:.3}");
+            return Err(no_surface(Cause::AllOutside, how));
         }
         report.cells = [resolution - 1; 3];
         report.cell_size = spacing.max_element();

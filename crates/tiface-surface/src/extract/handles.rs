@@ -18,11 +18,10 @@
 
 use super::BATCH;
 use super::loops::{Loop, LoopFinder};
-use crate::check_len;
+use crate::{Warning, check_len};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use tiface_base::error::counted;
 use tiface_base::geom::{Aabb, Boxes, Bvh, DBox, Effort, Mesh, SdfField, area_vector, intersect, topology};
 use tiface_base::{Monitor, Result};
 
@@ -59,23 +58,13 @@ pub struct HandleReport {
 }
 
 impl HandleReport {
-    /// Returns a sentence if handles were cut or filled; `mm` is the unit of the positions in
+    /// Returns a warning if handles were cut or filled; `mm` is the unit of the positions in
     /// millimeters.
-    pub fn warning(&self, mm: f64) -> Option<String> {
-        let list = |lengths: &[f32]| {
-            let each: Vec<String> = lengths.iter().map(|&l| format!("{:.0}", f64::from(l) * mm)).collect();
-            if each.is_empty() { String::new() } else { format!(" ({} mm around)", each.join(", ")) }
-        };
-        (!self.cut.is_empty() || !self.filled.is_empty()).then(|| {
-            format!(
-                "the surface had loops: {} cut{}, {} filled{}, {} left; `mesh.genus = \"keep\"` keeps all",
-                self.cut.len(),
-                list(&self.cut),
-                counted(self.filled.len(), "hole"),
-                list(&self.filled),
-                self.left
-            )
-        })
+    pub fn warning(&self, mm: f64) -> Option<Warning> {
+        let [cut_mm, filled_mm] =
+            [&self.cut, &self.filled].map(|each| each.iter().map(|&l| f64::from(l) * mm).collect::<Vec<_>>());
+        let any = !cut_mm.is_empty() || !filled_mm.is_empty();
+        any.then_some(Warning::Handles { cut_mm, filled_mm, left: self.left })
     }
 }
 
@@ -337,7 +326,7 @@ impl<'a> HandleCutter<'a> {
                 }
             };
             let mut free = true;
-            let mut effort = Effort::of(CAP_EFFORT);
+            let mut effort = Effort::new(CAP_EFFORT);
             self.boxes.meeting(&span(p), &mut effort, |o, _| {
                 let replaced = self.changed[o as usize] || cut.at_rims.contains_key(&o);
                 free = replaced || !meets(self.mesh.triangles[o as usize]);
@@ -362,7 +351,7 @@ pub struct Patches {
 
 impl Patches {
     /// Returns the patches of a mesh as extracted; `None` if nothing was cut.
-    pub fn of(mesh: &Mesh, report: &HandleReport) -> Option<Patches> {
+    pub fn find(mesh: &Mesh, report: &HandleReport) -> Option<Patches> {
         let first = mesh.triangles.len().checked_sub(report.triangles)?;
         let triangles = mesh.triangles[first..].to_vec();
         let mesh = Mesh { positions: mesh.positions.clone(), triangles, ..Mesh::default() };

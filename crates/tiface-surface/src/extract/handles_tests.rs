@@ -73,7 +73,7 @@ fn a_loop_of_hair_is_cut_once() {
     // 0.8
     let [around] = report.handles.cut[..] else { panic!("{:?}", report.handles) };
     assert!((0.25..0.4).contains(&around), "{around}");
-    let heard = report.handles.warning(250.0).unwrap();
+    let heard = report.handles.warning(250.0).unwrap().to_string();
     assert!(heard.contains("1 cut (") && heard.contains("0 holes filled,"), "{heard}");
 }
 
@@ -170,7 +170,7 @@ fn handles_where_the_surface_is_capped_go_too() {
     };
     let (mesh, report) = simple(column, 0.4, 2);
     assert!(report.capped > 0);
-    let cap = super::Cap::of(&mesh, report.bounds(), report.cell_size);
+    let cap = super::Cap::find(&mesh, report.bounds(), report.cell_size);
     assert!(cap.is_some());
 }
 
@@ -213,7 +213,7 @@ impl SdfField for Closed {
 #[test]
 fn what_was_cut_stays_where_it_is_when_triangles_are_held_against_the_field() {
     let (mut mesh, report) = simple(lock, 0.5, 1);
-    let closed = Closed(Patches::of(&mesh, &report.handles).unwrap());
+    let closed = Closed(Patches::find(&mesh, &report.handles).unwrap());
     let first = mesh.triangles.len() - report.handles.triangles;
     let middles: Vec<Vec3> =
         (first..mesh.triangles.len()).map(|t| mesh.corners(t as u32).iter().sum::<Vec3>() / 3.0).collect();

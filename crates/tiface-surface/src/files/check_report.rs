@@ -174,7 +174,7 @@ impl CheckReport {
                 }
             };
             if !reached {
-                let hint = "`tiface check` without `--require` prints the whole report";
+                let hint = "the whole report says more";
                 return Err(Error::below(format!("not {requirement}: {found}"), hint));
             }
         }

@@ -23,6 +23,7 @@ use crate::check_indices;
 use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
 use std::collections::HashMap;
 use std::path::Path;
+use tiface_base::error::Cause;
 use tiface_base::geom::{Mesh, ShellLayer, Shells, Similarity};
 use tiface_base::image::Photo;
 use tiface_base::{Error, Result, io};
@@ -122,8 +123,10 @@ impl FileMesh {
         let has_three_corners = |[a, b, c]: &[u32; 3]| a != b && b != c && c != a;
         let triangles: Vec<[u32; 3]> = mesh.triangles.iter().copied().filter(has_three_corners).collect();
         if triangles.is_empty() {
-            let hint = "train longer, or check the mask: an empty surface has no file";
-            return Err(Error::cannot("the mesh has no triangles to write", hint));
+            let hint = "an empty surface has no file";
+            return Err(
+                Error::cannot("the mesh has no triangles to write", hint).with_cause(Cause::NoTriangles)
+            );
         }
         let (center, _, far) = middle(placed_box(mesh, file_from_mesh));
         // rounded, so that readers in f32 and in f64 get the same value
@@ -353,7 +356,7 @@ fn not_finite(vertex: usize, what: &str, found: String) -> Error {
 
 /// Returns an error for an up direction without direction, or a unit without size.
 fn wrong_option(what: &str, found: impl ToString, expected: &str) -> Error {
-    let hint = "set it in the configuration, or leave it to the capture";
+    let hint = "correct it in the options";
     Error::cannot(format!("`{what}` is {}, expected {expected}", found.to_string()), hint)
 }
 

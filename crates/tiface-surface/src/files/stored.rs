@@ -13,7 +13,9 @@ use super::head_texture::{HeadTexture, Lobes};
 use crate::extract::{Cap, RimVertex};
 use glam::{DMat3, DVec3, Mat3, Vec2, Vec3};
 use std::collections::BTreeMap;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
+use tiface_base::error::Cause;
 use tiface_base::geom::{Aabb, Atlas, Harmonics, Mesh, ShellLayer, Shells, Similarity};
 use tiface_base::image::Photo;
 use tiface_base::io::{self, Limits, ReadError, TensorValues};
@@ -23,7 +25,10 @@ use tiface_base::{Error, Result};
 /// made again.
 pub const FORMAT: &str = "tiface-mesh-2";
 
-const MAKE_AGAIN: &str = "make the mesh again: `tiface mesh RUN --fresh mesh`";
+/// Returns the error for a file that its writer has to write again.
+fn stale(what: impl Display) -> Error {
+    Error::cannot(what, "save the mesh again").with_cause(Cause::Stale)
+}
 
 type Tensor = (String, Vec<usize>, TensorValues);
 
@@ -56,7 +61,7 @@ fn format() -> BTreeMap<String, String> {
 fn damaged(e: ReadError) -> Error {
     match &e {
         ReadError::Io { source, .. } if source.kind() != std::io::ErrorKind::NotFound => e.into(),
-        _ => Error::cannot(&e, "make it again: repeat the command with `--fresh mesh`"),
+        _ => stale(&e),
     }
 }
 
@@ -69,7 +74,7 @@ struct StoredTensors {
 
 impl StoredTensors {
     fn open(path: &Path) -> Result<StoredTensors> {
-        let wrong = |what: &str| Err(Error::cannot(format!("`{}`: {what}", path.display()), MAKE_AGAIN));
+        let wrong = |what: &str| Err(stale(format!("`{}`: {what}", path.display())));
         if !io::is_file(path) {
             return wrong("the file is missing");
         }
@@ -88,8 +93,7 @@ impl StoredTensors {
     }
 
     fn missing(&self, name: &str) -> Error {
-        let what = format!("`{}`: `{name}` is missing or of another shape", self.path.display());
-        Error::cannot(what, MAKE_AGAIN)
+        stale(format!("`{}`: `{name}` is missing or of another shape", self.path.display()))
     }
 
     fn wrong(&self, key: &str, found: impl ToString, expected: &str) -> Error {
@@ -410,16 +414,16 @@ mod tests {
                 .save(dir.path())
                 .unwrap();
             let error = ExtractedSurface::load(dir.path()).unwrap_err();
-            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+            assert_eq!(error.cause(), Some(Cause::Stale), "{error:?}");
             error.to_string()
         };
         let swapped = Aabb { min: Vec3::ONE, max: Vec3::NEG_ONE };
         assert!(error(swapped, 1e-5).contains("`cap_box`"));
         assert!(error(Aabb::SCENE, -1.0).contains("`cap_near` is -1, expected 0 or more"));
         std::fs::write(dir.path().join("surface.safetensors"), b"torn").unwrap();
-        assert!(ExtractedSurface::load(dir.path()).unwrap_err().hint().contains("--fresh mesh"));
+        assert_eq!(ExtractedSurface::load(dir.path()).unwrap_err().cause(), Some(Cause::Stale));
         let missing = ExtractedSurface::load(&dir.path().join("nothing")).unwrap_err();
-        assert!(missing.hint().contains("--fresh mesh"), "{missing:?}");
+        assert!(missing.cause() == Some(Cause::Stale) && !missing.hint().is_empty(), "{missing:?}");
     }
 
     #[test]
@@ -446,7 +450,7 @@ mod tests {
             change(&mut head);
             head.save(dir.path()).unwrap();
             let error = HeadMesh::load(dir.path()).unwrap_err();
-            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+            assert_eq!(error.cause(), Some(Cause::Stale), "{error:?}");
             error.to_string()
         };
         assert!(error(&|p| p.mesh.triangles[2] = [0, 1, 9]).contains("`triangles`"));
@@ -470,7 +474,7 @@ mod tests {
             HeadMesh::load(dir.path()).unwrap_err(),
             HeadMesh::load(&dir.path().join("nothing")).unwrap_err(),
         ] {
-            assert!(error.hint().contains("--fresh mesh"), "{error:?}");
+            assert_eq!(error.cause(), Some(Cause::Stale), "{error:?}");
         }
         assert!(HeadMesh::load(dir.path()).unwrap_err().to_string().contains("`tiface-mesh-1`"));
     }

@@ -1,7 +1,7 @@
 //! Display modes of a mesh: its color, or a visualization of its shape, normals or texture
 //! coordinates.
 
-use super::raycast::RayHits;
+use super::hits::RayHits;
 use super::texture::MeshTexture;
 use glam::{Vec2, Vec3};
 use tiface_base::geom::{Atlas, Camera, Harmonics, Mesh};

@@ -20,7 +20,8 @@ mod paint;
 mod project;
 mod tile;
 
-use super::raycast::{RayHits, RenderedView};
+use super::hits::RayHits;
+use super::view::RenderedView;
 use bytemuck::Zeroable;
 use paint::{Painter, PictureRows, RasterSurface, SampleBatch, TileArea, straight_rays};
 use project::{Bins, Faces, Lens, TILE};
@@ -274,7 +275,7 @@ fn draw_band<C: Fn(&RayHits) -> Vec<[f32; 3]>>(
     let (across, height) = (width.div_ceil(TILE), out.depth.len() / width);
     for column in 0..across {
         let index = out.top / TILE * across + column;
-        let has = |bins: &[Bins]| bins.iter().any(|b| b.of(index).len() > 0);
+        let has = |bins: &[Bins]| bins.iter().any(|b| b.faces(index).len() > 0);
         if !surfaces.iter().any(|(bins, _)| has(bins)) {
             continue;
         }
@@ -304,7 +305,7 @@ tiface_base::dispatch! {
 #[inline(always)]
 fn draw_faces<const F: bool>(tile: &mut Tile, bins: &[Bins], index: usize) {
     let mut has_backs = false;
-    for face in bins.iter().flat_map(|b| b.of(index)) {
+    for face in bins.iter().flat_map(|b| b.faces(index)) {
         if face.back {
             has_backs = true;
         } else {
@@ -313,7 +314,7 @@ fn draw_faces<const F: bool>(tile: &mut Tile, bins: &[Bins], index: usize) {
     }
     if has_backs {
         tile.look_up_farthest();
-        bins.iter().flat_map(|b| b.of(index)).filter(|face| face.back).for_each(|face| tile.draw(face));
+        bins.iter().flat_map(|b| b.faces(index)).filter(|face| face.back).for_each(|face| tile.draw(face));
     }
 }
 

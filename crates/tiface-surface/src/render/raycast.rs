@@ -5,10 +5,11 @@
 //! count as transparent black. The mean is of sRGB-coded values, as everywhere in rendering here:
 //! the fields composite coded color, so alpha does too.
 
-use glam::{Vec2, Vec3};
+use super::hits::RayHits;
+use super::view::RenderedView;
+use glam::Vec2;
 use rayon::prelude::*;
 use tiface_base::geom::{Bvh, Camera, Hit, Mesh, Ray, ShellCaster, Similarity};
-use tiface_base::image::Image;
 
 /// Pixels processed at once by one thread: bounds memory, and gives the color network large
 /// batches.
@@ -30,65 +31,6 @@ pub struct RaycastOptions {
 impl Default for RaycastOptions {
     fn default() -> RaycastOptions {
         RaycastOptions { samples: 2, world_from_scene: Similarity::IDENTITY }
-    }
-}
-
-/// The view of one camera.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct RenderedView {
-    /// RGBA: sRGB-coded color premultiplied over black, and coverage.
-    pub color: Image,
-    /// One channel: distance along the viewing axis in world units at the pixel's center; 0 =
-    /// nothing.
-    pub depth: Image,
-    /// Three channels: unit normal in the world at the pixel's center; 0 = nothing. No pixels at
-    /// all if the method has no normals.
-    pub normal: Image,
-}
-
-impl RenderedView {
-    /// Returns an empty view.
-    pub fn new(width: u32, height: u32, has_normals: bool) -> RenderedView {
-        let [w, h] = if has_normals { [width, height] } else { [0, 0] };
-        RenderedView {
-            color: Image::new(width, height, 4),
-            depth: Image::new(width, height, 1),
-            normal: Image::new(w, h, 3),
-        }
-    }
-}
-
-/// The hits of rays, for the color function. All `[n]`.
-#[derive(Clone, Debug, Default)]
-pub struct RayHits {
-    /// Points, in the mesh's coordinates.
-    pub points: Vec<Vec3>,
-    /// Unit normals: the vertices' interpolated, or the triangle's own if the mesh has none.
-    pub normals: Vec<Vec3>,
-    /// Unit directions, away from the camera.
-    pub directions: Vec<Vec3>,
-    /// Triangle, weights of its corners and distance.
-    pub hits: Vec<Hit>,
-    /// The pixel of each hit, and the hit's weight in it.
-    pub(super) pixels: Vec<(usize, f32)>,
-}
-
-impl RayHits {
-    /// Adds the colors of all hits to their pixels, and forgets the hits.
-    pub(super) fn shade(&mut self, rgba: &mut [[f32; 4]], color: &impl Fn(&RayHits) -> Vec<[f32; 3]>) {
-        if self.pixels.is_empty() {
-            return;
-        }
-        let colors = color(self);
-        for (k, (pixel, share)) in self.pixels.drain(..).enumerate() {
-            let c = colors.get(k).unwrap_or(&[0.0; 3]).map(|c| c.clamp(0.0, 1.0));
-            let p = &mut rgba[pixel];
-            *p = [p[0] + share * c[0], p[1] + share * c[1], p[2] + share * c[2], p[3] + share];
-        }
-        self.points.clear();
-        self.normals.clear();
-        self.directions.clear();
-        self.hits.clear();
     }
 }
 
@@ -256,7 +198,7 @@ type CastRay = Option<(Ray, Option<Hit>)>;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{DMat3, DVec3};
+    use glam::{DMat3, DVec3, Vec3};
     use tiface_base::geom::{ShellLayer, Shells};
 
     fn camera(width: u32, height: u32) -> Camera {

@@ -7,7 +7,7 @@
 //! Texels are 16-bit integers, half as large as floats and finer than any 8-bit picture: they are
 //! decoded once per lookup, after filtering.
 
-use super::raycast::RayHits;
+use super::hits::RayHits;
 use glam::{Mat3, Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 use std::array::from_fn;

@@ -132,7 +132,7 @@ pub(super) fn crossings(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<u32> 
         .enumerate()
         .flat_map_iter(|(t, facet)| {
             let mut met = Vec::new();
-            boxes.meeting(&DBox::around(facet.p), &mut Effort::of(usize::MAX), |other, _| {
+            boxes.meeting(&DBox::around(facet.p), &mut Effort::new(usize::MAX), |other, _| {
                 if other as usize > t && facet.meets(&facets[other as usize]) {
                     met.extend([t as u32, other]);
                 }

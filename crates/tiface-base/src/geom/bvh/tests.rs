@@ -37,7 +37,7 @@ fn head(n: usize) -> Mesh {
 }
 
 fn ray(origin: Vec3, direction: Vec3) -> Ray {
-    Ray { origin, direction, t_min: 0.0, t_max: f32::INFINITY }
+    Ray::new(origin, direction)
 }
 
 /// Numbers in 0..1, the same every time.

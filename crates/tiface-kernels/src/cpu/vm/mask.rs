@@ -6,7 +6,8 @@
 //! *before* the field is evaluated. Sample positions `t = entry + step · (k + jitter)` do not
 //! depend on the mask.
 
-use crate::cpu::march::{BLOCK, MarchRay};
+use crate::cpu::march::BLOCK;
+use tiface_base::geom::Ray;
 
 /// The occupied cells of a box, one bit each; cell `(x, y, z)` has index `(x · ny + y) · nz + z`. A
 /// second bitmask holds the blocks with an occupied cell, so that rays can skip empty blocks.
@@ -149,7 +150,7 @@ pub struct Lattice {
 impl Lattice {
     /// Returns the number of lattice points of a ray inside the box, which a renderer without a
     /// mask evaluates.
-    pub fn points(&self, ray: &MarchRay) -> u64 {
+    pub fn points(&self, ray: &Ray) -> u64 {
         match self.crossing(ray) {
             Some((enter, leave)) => {
                 let inside = (leave - enter.clamp(self.near, self.far)) / self.step;
@@ -161,8 +162,8 @@ impl Lattice {
 
     /// Returns `t` where a ray enters and leaves the box; `None` if it misses.
     #[inline(always)]
-    fn crossing(&self, ray: &MarchRay) -> Option<(f32, f32)> {
-        let (enter, leave) = crossing([self.min, self.max], ray.origin, ray.direction);
+    fn crossing(&self, ray: &Ray) -> Option<(f32, f32)> {
+        let (enter, leave) = crossing([self.min, self.max], ray.origin.to_array(), ray.direction.to_array());
         // also refuses NaN
         (enter <= leave).then_some((enter, leave))
     }
@@ -189,7 +190,8 @@ pub fn crossing([low, high]: [[f32; 3]; 2], origin: [f32; 3], direction: [f32; 3
 pub struct Walk<'a> {
     lattice: &'a Lattice,
     mask: Option<&'a BoxMask>,
-    ray: MarchRay,
+    origin: [f32; 3],
+    direction: [f32; 3],
     start: f32,
     leave: f32,
     /// Index of the next lattice point.
@@ -203,13 +205,14 @@ pub struct Walk<'a> {
 }
 
 impl<'a> Walk<'a> {
-    /// Creates a walk that starts before the first lattice point; it has no points if the ray
-    /// misses the box.
+    /// Creates a walk that starts before the first lattice point, which `jitter` shifts by that
+    /// part of a step; it has no points if the ray misses the box.
     #[inline(always)]
-    pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &MarchRay) -> Walk<'a> {
+    pub fn new(lattice: &'a Lattice, mask: Option<&'a BoxMask>, ray: &Ray, jitter: f32) -> Walk<'a> {
+        let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
         let crossing = lattice.crossing(ray).filter(|_| lattice.step > 0.0);
         let (enter, leave) = crossing.unwrap_or((0.0, 0.0));
-        let start = enter.clamp(lattice.near, lattice.far) + ray.jitter * lattice.step;
+        let start = enter.clamp(lattice.near, lattice.far) + jitter * lattice.step;
         let any = crossing.is_some() && start.is_finite();
         let mut scale = [0f32; 3];
         let mut inverse = [0f32; 3];
@@ -217,12 +220,12 @@ impl<'a> Walk<'a> {
         if let Some(m) = mask {
             for a in 0..3 {
                 scale[a] = m.size[a] as f32 / (m.max[a] - m.min[a]);
-                inverse[a] = 1.0 / (ray.direction[a] * scale[a]);
+                inverse[a] = 1.0 / (direction[a] * scale[a]);
                 blocks[a] = m.size[a].div_ceil(BLOCK);
             }
         }
         let end = if any { lattice.samples.saturating_sub(1) as i64 } else { 0 };
-        Walk { lattice, mask, ray: *ray, start, leave, k: 0, end, scale, inverse, blocks }
+        Walk { lattice, mask, origin, direction, start, leave, k: 0, end, scale, inverse, blocks }
     }
 
     /// Returns `t` of the next lattice point.
@@ -238,7 +241,7 @@ impl<'a> Walk<'a> {
             let mut p = [0f32; 3];
             let mut outside = false;
             for a in 0..3 {
-                p[a] = self.ray.origin[a] + t * self.ray.direction[a];
+                p[a] = self.origin[a] + t * self.direction[a];
                 let slack = 1e-6 * (l.max[a] - l.min[a]);
                 // written so that NaN is outside, too
                 outside |= !(p[a] >= l.min[a] - slack && p[a] <= l.max[a] + slack);
@@ -273,8 +276,8 @@ impl<'a> Walk<'a> {
             let empty = !bit(&mask.blocks, at);
             let mut border = f32::INFINITY;
             for a in 0..3 {
-                let ahead = usize::from(self.ray.direction[a] > 0.0);
-                if self.ray.direction[a] != 0.0 {
+                let ahead = usize::from(self.direction[a] > 0.0);
+                if self.direction[a] != 0.0 {
                     let wall =
                         if empty { ((block[a] + ahead) * BLOCK).min(mask.size[a]) } else { c[a] + ahead };
                     border = border.min((wall as f32 - g[a]) * self.inverse[a]);

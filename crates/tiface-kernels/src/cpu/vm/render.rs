@@ -13,12 +13,13 @@ use super::decoder::{self, Decoded, DecoderWeights};
 use super::gather::{self, Cell, FactorGradients, Lookup};
 use super::mask::{BoxMask, Lattice, Walk};
 use super::{DecoderShape, Grid};
-use crate::cpu::march::MarchRay;
+use crate::cpu::march::shift;
 use crate::cpu::pool::Buffer;
 use crate::cpu::simd::{exp, ln_1p};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tiface_base::dispatch;
+use tiface_base::geom::Ray;
 
 /// Number of values of a rendered ray: rgb over black (3), opacity, Σ w t.
 pub const RAY_WIDTH: usize = 5;
@@ -120,7 +121,8 @@ pub struct Rendered {
 const RAYS: usize = 32;
 
 struct MarchTask<'a> {
-    rays: &'a [MarchRay],
+    rays: &'a [Ray],
+    jitter: &'a [f32],
     kept: Vec<KeptSample>,
     cells: Vec<Cell>,
     counts: Vec<u32>,
@@ -131,12 +133,13 @@ struct MarchTask<'a> {
 fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Lookup) {
     let s = &field.shading;
     let length = field.lattice.step * s.distance_scale;
-    for ray in task.rays {
+    for (r, ray) in task.rays.iter().enumerate() {
+        let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
         let before = task.kept.len();
         let mut transmittance = 1f32;
-        let mut walk = Walk::new(&field.lattice, field.mask.as_ref(), ray);
+        let mut walk = Walk::new(&field.lattice, field.mask.as_ref(), ray, shift(task.jitter, r));
         while let Some(t) = walk.advance() {
-            let cell = field.cell(std::array::from_fn(|a| ray.origin[a] + t * ray.direction[a]));
+            let cell = field.cell(std::array::from_fn(|a| origin[a] + t * direction[a]));
             let feature = lookup.sum::<F>(&cell);
             task.looked_up += 1;
             if !s.softplus && feature <= 0.0 {
@@ -157,25 +160,30 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
 
 dispatch! { fn march_rays / march_body(task: &mut MarchTask, field: &VmField, lookup: &Lookup) }
 
-/// Renders a batch of rays.
+/// Renders a batch of whole rays; directions may have any length, which is then the unit of `t`.
 ///
 /// # Shapes
 ///
 /// - density, color: flat planes and lines of the field's two grids
+/// - jitter: `[rays]`, the part of a step by which each ray's samples are shifted; `[0]` for none
 /// - output: `[rays, 5]` = rgb over black, opacity, Σ w t
 pub fn render(
     field: &VmField,
     density: &[f32],
     color: &[f32],
     decoder: &DecoderWeights,
-    rays: &[MarchRay],
+    rays: &[Ray],
+    jitter: &[f32],
 ) -> Rendered {
+    assert!(jitter.is_empty() || jitter.len() == rays.len());
     let lookup = Lookup::new(&field.density, density);
     assert_eq!(lookup.size(), field.color.size);
     let mut tasks: Vec<MarchTask> = rays
         .chunks(RAYS)
-        .map(|rays| MarchTask {
+        .enumerate()
+        .map(|(task, rays)| MarchTask {
             rays,
+            jitter: jitter.get(task * RAYS..task * RAYS + rays.len()).unwrap_or(&[]),
             kept: Vec::with_capacity(rays.len() * 32),
             cells: Vec::with_capacity(rays.len() * 32),
             counts: Vec::with_capacity(rays.len()),
@@ -206,7 +214,7 @@ pub fn render(
             let k = &kept[i as usize];
             if k.alpha * k.transmittance > threshold {
                 colored.push(i);
-                directions.push(ray.direction);
+                directions.push(ray.direction.to_array());
             }
         }
     }

@@ -2,8 +2,8 @@ use super::fixture::{color, decoder, density, field, grid, network};
 use super::mask::{BoxMask, Lattice, Walk};
 use super::penalty::tv_factors;
 use super::*;
-use crate::cpu::march::MarchRay;
 use crate::cpu::reference;
+use tiface_base::geom::Ray;
 use tiface_base::math::rng;
 
 /// Returns the position of a point with coordinates -1..=1 along each axis of the fixture's box.
@@ -51,11 +51,9 @@ fn rendered_rays_have_the_published_values() {
     let f = field();
     assert!((f.lattice.step - 0.2918889).abs() < 1e-7);
     let weights = DecoderWeights::new(decoder(), &network());
-    let rays = [
-        MarchRay { origin: [0.1, -0.2, 4.5], direction: [0.02, 0.05, -1.0], jitter: 0.0 },
-        MarchRay { origin: [0.3, 0.4, 4.2], direction: [-0.1, 0.02, -1.0], jitter: 0.0 },
-    ];
-    let out = render(&f, &density(), &color(), &weights, &rays).out;
+    let rays =
+        [Ray::new([0.1, -0.2, 4.5], [0.02, 0.05, -1.0]), Ray::new([0.3, 0.4, 4.2], [-0.1, 0.02, -1.0])];
+    let out = render(&f, &density(), &color(), &weights, &rays, &[]).out;
     // rgb over black, over white, depth with the published code's extra (1 − opacity) d_z
     let golden = [
         ([0.5031043, 0.5020230, 0.4993656], [0.5031812, 0.5020999, 0.4994425], 3.6129913),
@@ -118,8 +116,8 @@ fn voxel_counts_and_sizes_are_the_published_ones() {
 }
 
 /// Returns Σ g · out, by the formulas in f64.
-fn reference_loss(f: &VmField, x: &[f64], rays: &[MarchRay], g: &[f32]) -> f64 {
-    reference::vm::render(f, x, rays).iter().zip(g).map(|(o, g)| o * *g as f64).sum()
+fn reference_loss(f: &VmField, x: &[f64], (rays, jitter): (&[Ray], &[f32]), g: &[f32]) -> f64 {
+    reference::vm::render(f, x, rays, jitter).iter().zip(g).map(|(o, g)| o * *g as f64).sum()
 }
 
 fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
@@ -146,19 +144,15 @@ fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
     let density: Vec<f32> = normal(1, f.density.len(), 0.4).iter().map(|v| v + 0.2).collect();
     let color = normal(2, f.color.len(), 0.7);
     let network = normal(3, f.decoder.len(), 0.5);
-    let rays: Vec<MarchRay> = (0..24)
+    let (rays, jitter): (Vec<Ray>, Vec<f32>) = (0..24)
         .map(|i| {
             let u = |k: u64| rng::uniform(seed, 4, 8 * i + k) - 0.5;
-            MarchRay {
-                origin: [2.0 * u(0), 2.0 * u(1), 4.6],
-                direction: [0.3 * u(2), 0.3 * u(3), -1.0],
-                jitter: u(4) + 0.5,
-            }
+            (Ray::new([2.0 * u(0), 2.0 * u(1), 4.6], [0.3 * u(2), 0.3 * u(3), -1.0]), u(4) + 0.5)
         })
-        .collect();
+        .unzip();
     let g = normal(5, rays.len() * RAY_WIDTH, 1.0);
     let weights = DecoderWeights::new(f.decoder, &network);
-    let rendered = render(&f, &density, &color, &weights, &rays);
+    let rendered = render(&f, &density, &color, &weights, &rays, &jitter);
     assert!(rendered.color_samples > 200, "{}", rendered.color_samples);
     let (mut gd, mut gc) = (vec![0.0; density.len()], vec![0.0; color.len()]);
     let gn = backward(&f, &density, &weights, rendered, &g, &mut gd, &mut gc);
@@ -170,9 +164,9 @@ fn check_gradients(softplus: bool, encodings: usize, seed: u64) -> Vec<f64> {
         let i = rng::below(seed, 6, k, x.len() as u64) as usize;
         let (old, h) = (x[i], 1e-6);
         x[i] = old + h;
-        let up = reference_loss(&f, &x, &rays, &g);
+        let up = reference_loss(&f, &x, (&rays, &jitter), &g);
         x[i] = old - h;
-        let down = reference_loss(&f, &x, &rays, &g);
+        let down = reference_loss(&f, &x, (&rays, &jitter), &g);
         x[i] = old;
         let want = (up - down) / (2.0 * h);
         let error = (analytic[i] as f64 - want).abs() / want.abs().max(1e-2 * largest);
@@ -227,9 +221,9 @@ fn a_mask_removes_samples_and_moves_none() {
     for i in 0..50 {
         let u = |k: u64| rng::uniform(9, 1, 8 * i + k) - 0.5;
         let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(0), 0.8 * u(1), -1.0] };
-        let ray = MarchRay { origin: [u(2), u(3), 3.0], direction, jitter: u(4) + 0.5 };
+        let ray = Ray::new([u(2), u(3), 3.0], direction);
         let points = |mask: Option<&BoxMask>| {
-            let mut walk = Walk::new(&lattice, mask, &ray);
+            let mut walk = Walk::new(&lattice, mask, &ray, u(4) + 0.5);
             std::iter::from_fn(|| walk.advance()).collect::<Vec<f32>>()
         };
         let (all, some) = (points(None), points(Some(&mask)));
@@ -292,10 +286,10 @@ fn early_termination_changes_a_ray_by_less_than_its_transmittance() {
     f.lattice.step = 0.02;
     f.lattice.samples = 300;
     let weights = DecoderWeights::new(decoder(), &network());
-    let ray = [MarchRay { origin: [0.1, -0.2, 4.5], direction: [0.02, 0.05, -1.0], jitter: 0.0 }];
-    let all = render(&f, &density(), &color(), &weights, &ray);
+    let ray = [Ray::new([0.1, -0.2, 4.5], [0.02, 0.05, -1.0])];
+    let all = render(&f, &density(), &color(), &weights, &ray, &[]);
     f.shading.stop = 1e-3;
-    let some = render(&f, &density(), &color(), &weights, &ray);
+    let some = render(&f, &density(), &color(), &weights, &ray, &[]);
     assert!(some.density_samples < all.density_samples);
     for (a, b) in all.out.iter().zip(&some.out).take(4) {
         assert!((a - b).abs() < 1e-3, "{:?} {:?}", all.out, some.out);

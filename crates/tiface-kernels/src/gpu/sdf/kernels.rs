@@ -330,7 +330,7 @@ pub(super) fn geometry_backward(
     if group < samples.div_ceil(TILE) {
         let lane = tile::lane_of(group, plane);
         let (row, column) = (lane.row, lane.column);
-        let sums = Block::of(w1_0, w1_1, w1_2, w1_3);
+        let sums = Block::new(w1_0, w1_1, w1_2, w1_3);
         store_outer(partial, sum, &sums, padded, row, column);
         if row < OUTPUTS {
             store_row(partial, sum + (comptime!(gradient_rows[2]) + row) * CHANNELS, w2, HIDDEN, column);

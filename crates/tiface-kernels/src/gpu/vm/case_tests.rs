@@ -1,13 +1,13 @@
 //! A vector-matrix field and rays to test kernels on.
 
+use super::super::batch::DeviceBatch;
 use super::super::device::{Buffer, Device, Words};
-use super::super::draw::DeviceBatch;
 use super::super::evaluate::planes;
 use super::{Vm, VmValues};
-use crate::cpu::march::MarchRay;
 use crate::cpu::vm::mask::{BoxMask, Lattice};
 use crate::cpu::vm::{self, DecoderShape, DecoderWeights, Grid, RAY_WIDTH, Rendered, VmField};
 use tiface_base::Result;
+use tiface_base::geom::Ray;
 use tiface_base::math::rng;
 
 /// A field, its values, rays, and gradients of what they see.
@@ -16,7 +16,8 @@ pub(super) struct Case {
     pub density: Vec<f32>,
     pub color: Vec<f32>,
     pub network: Vec<f32>,
-    pub rays: Vec<MarchRay>,
+    pub rays: Vec<Ray>,
+    pub jitter: Vec<f32>,
     pub g: Vec<f32>,
 }
 
@@ -78,15 +79,17 @@ pub(super) fn case(shape: Shape, count: u64) -> Case {
     // the basis: features of about one
     network[..field.decoder.channels * field.decoder.features].iter_mut().for_each(|v| *v *= 0.5);
     let density: Vec<f32> = normal(1, field.density.len(), 0.4).iter().map(|v| v + 0.2).collect();
-    let rays = (0..count).map(|i| {
+    let jittered = (0..count).map(|i| {
         let u = |k: u64| rng::uniform(5, 4, 8 * i + k) - 0.5;
         let direction = if i == 0 { [0.0, 0.0, -1.0] } else { [0.8 * u(2), 0.8 * u(3), -1.0] };
-        MarchRay { origin: [3.0 * u(0), 3.0 * u(1), 3.0], direction, jitter: u(4) + 0.5 }
+        (Ray::new([3.0 * u(0), 3.0 * u(1), 3.0], direction), u(4) + 0.5)
     });
+    let (rays, jitter) = jittered.unzip();
     Case {
         color: normal(2, field.color.len(), 0.7),
         network,
-        rays: rays.collect(),
+        rays,
+        jitter,
         g: normal(5, count as usize * RAY_WIDTH, 1.0),
         density,
         field,
@@ -116,7 +119,7 @@ impl DeviceCase {
                 vm.color.upload(device, &case.color),
                 device.upload(&case.network),
             ],
-            rays: DeviceBatch::of_rays(device, &case.rays, n),
+            rays: DeviceBatch::upload(device, &case.rays, &case.jitter, n),
             g_out: device.upload(&planes::<RAY_WIDTH>(case.g.as_chunks().0, n)),
             vm,
         }
@@ -145,7 +148,7 @@ impl DeviceCase {
 /// What the CPU renders, and gradients of density, appearance and decoder.
 pub(super) fn on_cpu(case: &Case) -> (Rendered, [Vec<f32>; 3]) {
     let weights = DecoderWeights::new(case.field.decoder, &case.network);
-    let rendered = vm::render(&case.field, &case.density, &case.color, &weights, &case.rays);
+    let rendered = vm::render(&case.field, &case.density, &case.color, &weights, &case.rays, &case.jitter);
     let (mut d, mut c) = (vec![0.0; case.density.len()], vec![0.0; case.color.len()]);
     let n = vm::backward(&case.field, &case.density, &weights, rendered.clone(), &case.g, &mut d, &mut c);
     (rendered, [d, c, n])

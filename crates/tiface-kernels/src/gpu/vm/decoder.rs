@@ -16,8 +16,8 @@
 
 mod kernels;
 
+use super::super::batch::DeviceBatch;
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::draw::DeviceBatch;
 use super::super::sdf::kernels::sum_groups;
 use super::super::tile::{self, UNITS};
 use super::grid::{DeviceGrid, NONE};

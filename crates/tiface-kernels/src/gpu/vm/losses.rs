@@ -1,7 +1,7 @@
 //! The training loss of TensoRF's field and its gradients: see [`crate::cpu::vm::losses`].
 
+use super::super::batch::DeviceBatch;
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::draw::DeviceBatch;
 use super::super::losses::{BACKGROUND, TALLY, cross_entropy, tally};
 use super::super::sum::group_sum;
 use super::Vm;

@@ -1,8 +1,8 @@
 //! The lattice points of rays inside a box and a mask: the same rule as
 //! [`crate::cpu::vm::mask::Walk`].
 
+use super::super::batch::DeviceBatch;
 use super::super::device::{Buffer, Device, Words, groups, launch};
-use super::super::draw::DeviceBatch;
 use super::super::march::{FAR, Span, bit, count_and_write, narrowed, room};
 use super::super::occupancy::u32_words;
 use super::super::vec3::Vec3;

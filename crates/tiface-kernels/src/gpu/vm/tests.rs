@@ -29,8 +29,8 @@ fn lattice_points_are_those_of_the_cpu_with_and_without_a_mask() {
         let on_gpu = DeviceCase::new(&device, &case);
         on_gpu.vm.samples.march(&device, &on_gpu.vm.lattice, &on_gpu.rays);
         let (mut t, mut offsets, mut points) = (vec![], vec![0u32], vec![]);
-        for ray in &case.rays {
-            let mut walk = Walk::new(&case.field.lattice, case.field.mask.as_ref(), ray);
+        for (ray, &jitter) in case.rays.iter().zip(&case.jitter) {
+            let mut walk = Walk::new(&case.field.lattice, case.field.mask.as_ref(), ray, jitter);
             t.extend(std::iter::from_fn(|| walk.advance()));
             offsets.push(t.len() as u32);
             points.push(case.field.lattice.points(ray) as u32);
@@ -117,7 +117,7 @@ fn gradients_agree_with_differences(shapes: &[Shape]) {
         let got = on_gpu.gradients(&device).unwrap().concat();
         let mut x = reference::wide(&[case.density.as_slice(), &case.color, &case.network].concat());
         let loss = |x: &[f64]| -> f64 {
-            let out = reference::vm::render(&case.field, x, &case.rays);
+            let out = reference::vm::render(&case.field, x, &case.rays, &case.jitter);
             out.iter().zip(&case.g).map(|(o, &g)| o * g as f64).sum()
         };
         let largest = got.iter().fold(0f32, |m, g| m.max(g.abs())) as f64;

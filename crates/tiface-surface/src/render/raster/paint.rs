@@ -1,7 +1,7 @@
 //! The third step, from the visible triangles of a tile to pixels: intersects the rays through the
 //! samples with their triangles, and weights the hits of each pixel.
 
-use super::super::raycast::RayHits;
+use super::super::hits::RayHits;
 use super::project::{TILE, UNIT};
 use super::tile::{CENTER, GRID, NOTHING, SAMPLES, Tile};
 use bytemuck::Zeroable;

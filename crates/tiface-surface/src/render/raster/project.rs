@@ -73,7 +73,7 @@ pub(super) struct Bins {
 
 impl Bins {
     /// Returns the faces of a tile in the order of their triangles.
-    pub fn of(&self, tile: usize) -> impl ExactSizeIterator<Item = &Face> {
+    pub fn faces(&self, tile: usize) -> impl ExactSizeIterator<Item = &Face> {
         let (from, to) = (self.starts[tile] as usize, self.starts[tile + 1] as usize);
         self.order[from..to].iter().map(|&face| &self.faces[face as usize])
     }

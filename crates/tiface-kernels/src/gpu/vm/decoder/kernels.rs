@@ -147,7 +147,7 @@ fn inputs(
     let quad = piece * comptime!(tile::columns(lanes)) + column;
     if quad < comptime!(plan.inputs() / 4) {
         let k = 4 * (tile * lanes + row);
-        let block = Block::of(
+        let block = Block::new(
             input(values, words, place, ray, direction, index, k, samples, quad, plan),
             input(values, words, place, ray, direction, index, k + 1, samples, quad, plan),
             input(values, words, place, ray, direction, index, k + 2, samples, quad, plan),
@@ -200,7 +200,7 @@ fn first_layer(
         c3 += z.channel(3usize);
         sync_cube();
     }
-    tile::relu(&Block::of(c0, c1, c2, c3))
+    tile::relu(&Block::new(c0, c1, c2, c3))
 }
 
 /// Returns a thread's block of the second hidden layer, computed from the first one in tile `b`.
@@ -210,7 +210,7 @@ fn second_layer(b: &[F4], w: &[F4], row: usize, column: usize, #[comptime] plan:
     let rows = comptime!(plan.rows());
     let bias = w[comptime!(rows[3] * tile::columns(lanes)) + column];
     let z = product(b, 0usize, w, comptime!(rows[2]), comptime!(plan.hidden), row, column, lanes);
-    tile::relu(&Block::of(
+    tile::relu(&Block::new(
         z.channel(0usize) + broadcast(bias, 0usize),
         z.channel(1usize) + broadcast(bias, 1usize),
         z.channel(2usize) + broadcast(bias, 2usize),
@@ -371,7 +371,7 @@ pub(super) fn backward(
         let w0 = w[comptime!(rows[4] * columns) + column];
         let w1 = w[comptime!((rows[4] + 1) * columns) + column];
         let w2 = w[comptime!((rows[4] + 2) * columns) + column];
-        let g_h2 = Block::of(
+        let g_h2 = Block::new(
             from_colors(g0, g1, g2, w0, w1, w2, 0usize),
             from_colors(g0, g1, g2, w0, w1, w2, 1usize),
             from_colors(g0, g1, g2, w0, w1, w2, 2usize),
