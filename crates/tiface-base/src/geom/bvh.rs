@@ -15,8 +15,9 @@
 //! `obvhs` finds the tree (PLOC with reinsertion). We store it four wide, as Embree does: four
 //! boxes or four triangles are met by one SIMD instruction stream. Triangles lie in tree order.
 
+use super::aabb::Aabb;
 use super::mesh::Mesh;
-use super::ray::{Aabb, Hit, Ray};
+use super::ray::{Hit, Ray};
 use glam::{DVec3, Vec3, Vec4};
 use obvhs::{
     BvhBuildParams,

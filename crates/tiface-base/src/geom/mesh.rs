@@ -1,7 +1,8 @@
 //! A triangle mesh with what the pipeline attaches to its vertices, and where its triangles lie in
 //! its texture.
 
-use super::ray::{Aabb, Hit};
+use super::aabb::Aabb;
+use super::ray::Hit;
 use super::similarity::Similarity;
 use super::topology::topology;
 use glam::{Vec2, Vec3};
