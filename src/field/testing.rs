@@ -88,35 +88,36 @@ pub fn bytes(dir: &Path) -> Vec<u8> {
     std::fs::read(newest(dir)).unwrap()
 }
 
-/// Returns the checkpoint that a training begins with.
-pub(crate) fn beginning(run: Run) -> Files {
-    /// Keeps the files that lie in a folder after the first step, and stops.
+/// Returns the checkpoint that a training begins with, and what lies in its folder at its end.
+pub(crate) fn undisturbed(run: Run) -> [Files; 2] {
+    /// Keeps the files that lie in a folder after the first step.
     struct First<'a>(&'a Path, OnceLock<Files>);
     impl Monitor for First<'_> {
         fn step(&self, _: u64, _: u64, _: &[(&str, f64)]) {
             self.1.get_or_init(|| Files::read(self.0));
         }
         fn stop(&self) -> bool {
-            self.1.get().is_some()
+            false
         }
     }
     let dir = temporary();
     let first = First(dir.path(), OnceLock::new());
-    assert!(run(dir.path(), &first).unwrap_err().kind().is_stop());
-    first.1.into_inner().unwrap()
+    run(dir.path(), &first).unwrap();
+    [first.1.into_inner().unwrap(), Files::read(dir.path())]
 }
 
 /// Asserts that a training stopped `stops` times after 11 steps, whose newest checkpoint is then
-/// truncated as by a crash, ends with the same bytes as an uninterrupted training. Returns the
-/// folder of the latter.
-pub fn resumes(run: Run, stops: usize) -> tempfile::TempDir {
-    resumes_from(&Files::default(), run, stops)
+/// truncated as by a crash, ends with the same bytes as an uninterrupted training.
+pub fn resumes(run: Run, stops: usize) {
+    let [_, ended] = undisturbed(run);
+    resumes_from([&Files::default(), &ended], run, stops);
 }
 
-/// Asserts what [`resumes`] does of a training that is stopped and begins with these files.
-pub(crate) fn resumes_from(begun: &Files, run: Run, stops: usize) -> tempfile::TempDir {
+/// Asserts what [`resumes`] does of a training that begins with some files, where those of the end
+/// of an uninterrupted one are known.
+pub(crate) fn resumes_from([begun, ended]: [&Files; 2], run: Run, stops: usize) {
     let (undisturbed, stopped) = (temporary(), temporary());
-    run(undisturbed.path(), &Quiet).unwrap();
+    ended.write(undisturbed.path());
     begun.write(stopped.path());
     for _ in 0..stops {
         assert!(run(stopped.path(), &StopAfter::new(11)).unwrap_err().kind().is_stop());
@@ -126,7 +127,6 @@ pub(crate) fn resumes_from(begun: &Files, run: Run, stops: usize) -> tempfile::T
     run(stopped.path(), &Quiet).unwrap();
     assert_eq!(bytes(undisturbed.path()), bytes(stopped.path()));
     assert!(!stopped.path().join("checkpoint.previous.safetensors").exists());
-    undisturbed
 }
 
 /// Asserts that each changed checkpoint of a training that was stopped twice is reported with its

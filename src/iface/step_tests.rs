@@ -207,14 +207,16 @@ fn formulas(
         e * e
     });
     let sparsity = mean(&|o| (o[0].abs() * of(-config.sparsity_scale)).exp());
+    // points are few, and each is drawn many times
+    let distance = |p: &SurfacePoint| sdf::field(&shape, &table, &flat, p.position, [0.0, 0.0, 1.0])[0];
+    let distances: Vec<Var> = state.stereo.iter().map(distance).collect();
     let mut stereo = of(0.0);
-    for i in 0..if state.stereo.is_empty() { 0 } else { STEREO_POINTS } {
-        let p =
-            state.stereo[rng::below(seed, step << 4 | STEREO_STREAM, i, state.stereo.len() as u64) as usize];
-        let distance = sdf::field(&shape, &table, &flat, p.position, [0.0, 0.0, 1.0])[0];
-        let e = distance / of(p.footprint.into());
+    for i in 0..if distances.is_empty() { 0 } else { STEREO_POINTS } {
+        let k = rng::below(seed, step << 4 | STEREO_STREAM, i, distances.len() as u64) as usize;
+        let SurfacePoint { footprint, weight, .. } = state.stereo[k];
+        let e = distances[k] / of(footprint.into());
         stereo +=
-            ((e * e + of(0.15 * 0.15)).sqrt() - of(0.15)) * of(f64::from(p.weight) / STEREO_POINTS as f64);
+            ((e * e + of(0.15 * 0.15)).sqrt() - of(0.15)) * of(f64::from(weight) / STEREO_POINTS as f64);
     }
     let total = rgb * of(config.rgb_mse)
         + of_samples / of(3.0 * full) * of(config.rgb_sample)

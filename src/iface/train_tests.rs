@@ -7,7 +7,7 @@ use crate::config::Preset;
 use crate::field::ball::{BALL, hull, textured_views, views};
 use crate::field::checkpoint::{self, Checkpoint};
 use crate::field::testing::{
-    beginning, negative, refuses, resumes, resumes_from, says, session, tampered, temporary,
+    negative, refuses, resumes, resumes_from, says, session, tampered, temporary, undisturbed,
 };
 use glam::{Vec2, Vec3};
 use std::path::Path;
@@ -36,17 +36,23 @@ fn small() -> IfaceConfig {
     IfaceConfig { rays: 64, max_rays: 128, samples: 1024, start: Start::Sphere, ..config() }
 }
 
-/// The checkpoint that trainings of [`config`] begin with, whatever is photographed: that of the
-/// fit to the hull, which takes seconds. Made once a test program.
-fn fitted() -> &'static Files {
-    static FITTED: OnceLock<Files> = OnceLock::new();
+/// Points are found at step 42.
+fn with_points() -> IfaceConfig {
+    IfaceConfig { steps: 70, anneal_end: 0.7, warmup: 0.3, ..config() }
+}
+
+/// The checkpoint that a training [`with_points`] begins with, and its end. All trainings of
+/// [`config`] begin with that checkpoint, whatever is photographed: that of the fit to the hull,
+/// which takes seconds. Made once a test program.
+fn fitted() -> &'static [Files; 2] {
+    static FITTED: OnceLock<[Files; 2]> = OnceLock::new();
     FITTED.get_or_init(|| {
-        let (views, hull) = (views(), hull());
+        let (views, hull) = (textured_views(), hull());
         let run = |dir: &Path, monitor: &dyn Monitor| {
-            train(&views, Some(&hull), &config(), &session("iface", dir, "ball", monitor))
+            train(&views, Some(&hull), &with_points(), &session("iface", dir, "ball", monitor))
                 .map(|(_, r)| r.warnings)
         };
-        beginning(&run)
+        undisturbed(&run)
     })
 }
 
@@ -55,7 +61,7 @@ fn fitted() -> &'static Files {
 #[test]
 fn a_ball_is_learned_from_eight_views() {
     let dir = temporary();
-    fitted().write(dir.path());
+    fitted()[0].write(dir.path());
     let (views, hull) = (views(), hull());
     let (face, report) =
         train(&views, Some(&hull), &config(), &session("iface", dir.path(), "ball", &Quiet)).unwrap();
@@ -89,14 +95,15 @@ fn stopping_and_going_on_gives_the_bytes_of_an_undisturbed_run() {
 /// with the hull.
 #[test]
 fn a_training_goes_on_with_the_points_that_photographs_agree_on() {
-    let (views, hull) = (textured_views(), hull());
-    let config = IfaceConfig { steps: 70, anneal_end: 0.7, warmup: 0.3, ..config() };
+    let (views, hull, config) = (textured_views(), hull(), with_points());
     let run = |dir: &Path, monitor: &dyn Monitor| {
         train(&views, Some(&hull), &config, &session("iface", dir, "ball", monitor)).map(|(_, r)| r.warnings)
     };
-    // stopped before step 42, at which points are found, and after it; the undisturbed training
-    // makes its own fit to the hull
-    let dir = resumes_from(fitted(), &run, 5);
+    // stopped before the step at which points are found, and after it; the undisturbed training
+    // made its own fit to the hull
+    resumes_from(fitted().each_ref(), &run, 5);
+    let dir = temporary();
+    fitted()[1].write(dir.path());
     let state = |config: &IfaceConfig, dir: &Path| {
         let mut file = Checkpoint::read(&checkpoint::newest(dir), "iface", FORMAT).unwrap();
         SdfState::restore(parts(config), config, Some(&hull), &mut file).unwrap()

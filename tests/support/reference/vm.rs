@@ -1,5 +1,6 @@
 //! TensoRF's field and its rays: see [`tiface_kernels::cpu::vm`].
 
+use super::tape::{self, Var};
 use super::{Real, sigmoid};
 use std::array::from_fn;
 use tiface_base::geom::Ray;
@@ -71,6 +72,14 @@ pub(crate) fn decode<R: Real>(f: &VmField, network: &[R], products: &[R], d: [f3
     let relu = |v: Vec<R>| -> Vec<R> { v.into_iter().map(R::relu).collect() };
     let rgb = layer(5, &relu(layer(3, &relu(layer(1, &input)))));
     from_fn(|c| sigmoid(rgb[c]))
+}
+
+/// Gradient of Σ g · [`render`] by all weights `x`.
+pub(crate) fn gradient(f: &VmField, x: &[f64], (rays, jitter): (&[Ray], &[f32]), g: &[f32]) -> Vec<f64> {
+    let loss = |x: &[Var]| {
+        render(f, x, rays, jitter).into_iter().zip(g).map(|(out, g)| out * Var::of(f64::from(*g))).sum()
+    };
+    tape::gradient(x, loss).1
 }
 
 /// `[rays, 5]` of the weights `x`: density's grid, appearance's grid, decoder. No ray ends early.

@@ -63,7 +63,7 @@ fn agrees_with_the_cpu((levels, skip, active): (usize, bool, usize), devices: Ve
 
 #[test]
 #[ignore = "long: run by `tools/test.sh all`; device and CPU are compared in the check, and the CPU with f64"]
-fn the_gradients_agree_with_f64_finite_differences_second_order_included() {
+fn the_gradients_are_those_of_the_model_second_order_included() {
     for skip in [false, true] {
         let Some(device) = device() else { return };
         sdf::tests::backward_agrees(skip, |case| {
