@@ -59,9 +59,9 @@ pub(super) fn move_vertices(
 }
 
 /// Below this shape a face counts as spoiled, unless it was no better before.
-const MIN_QUALITY: f32 = 0.02;
+pub(super) const MIN_QUALITY: f32 = 0.02;
 /// A face may turn until this cosine against its direction at extraction.
-const MIN_TURN_COSINE: f32 = 0.2;
+pub(super) const MIN_TURN_COSINE: f32 = 0.2;
 
 /// Moving vertices, with their start positions.
 pub(super) struct Polish<'a> {
