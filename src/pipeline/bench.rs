@@ -381,8 +381,8 @@ const POINTS: usize = 20_000;
 const TRIANGLES: [usize; 6] = [2000, 5000, 10_000, 20_000, 50_000, 100_000];
 
 impl Bench<'_> {
-    /// Returns the median distance of a mesh to the zero set of a field, to first order, mm.
-    fn off_field(&self, mesh: &Mesh, field: &dyn SdfField) -> Option<f64> {
+    /// Returns the median distance of a mesh to the extracted surface, mm.
+    fn off_surface(&self, mesh: &Mesh, field: &dyn SdfField) -> Option<f64> {
         let (values, gradients) = field.sdf_gradient(&distance::sample(mesh, POINTS));
         let mut off: Vec<f32> =
             values.iter().zip(&gradients).map(|(f, g)| f.abs() / g.length().max(0.05)).collect();
@@ -394,7 +394,7 @@ impl Bench<'_> {
         let fields = self.fields(&[Stage::Iface])?;
         let c = &self.config().mesh;
         let extracted = self.extracted(&fields, c)?;
-        let (mesh, closed) = (&extracted.mesh, extracted.closed(fields.surface()?));
+        let (mesh, surface) = (&extracted.mesh, extracted.distance(fields.surface()?));
         let note = format!(
             "From {} triangles, extracted at {} cells; distances are medians.",
             mesh.triangles.len(),
@@ -405,12 +405,12 @@ impl Bench<'_> {
             self.check_stop()?;
             let mut mesh = mesh.clone();
             let config = SimplifyConfig { triangles, ..SimplifyConfig::default() };
-            let (_, cost) = timed(|| simplify(&mut mesh, Some(&closed), &config, self.monitor()))?;
-            let figures = vec![self.off_field(&mesh, &closed)];
+            let (_, cost) = timed(|| simplify(&mut mesh, Some(&surface), &config, self.monitor()))?;
+            let figures = vec![self.off_surface(&mesh, &surface)];
             rows.push(Row { series: "".into(), choice: triangles.to_string(), cost, figures });
         }
         let measures = vec![Measure {
-            name: "off the field, mm".into(),
+            name: "off the surface, mm".into(),
             digits: 4,
             more_is_better: Some(false),
             noise: (0.0, 0.03),
@@ -482,12 +482,12 @@ struct Finisher<'f> {
 impl<'f> Finisher<'f> {
     /// Extracts and simplifies a surface with the settings `c`.
     pub fn new(bench: &Bench, fields: &'f dyn Fields, c: &MeshConfig) -> Result<Finisher<'f>> {
-        let mut extracted = bench.extracted(fields, c)?;
-        let mut mesh = std::mem::take(&mut extracted.mesh);
+        let extracted = bench.extracted(fields, c)?;
+        let mut mesh = extracted.mesh.clone();
         if c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len() {
-            let closed = extracted.closed(fields.surface()?);
+            let surface = extracted.distance(fields.surface()?);
             let config = SimplifyConfig { triangles: c.triangles as usize, ..SimplifyConfig::default() };
-            simplify(&mut mesh, Some(&closed), &config, bench.monitor())?;
+            simplify(&mut mesh, Some(&surface), &config, bench.monitor())?;
         }
         let views = learn::training_views(bench.session.refined_capture()?, &bench.scene, bench.config())?;
         Ok(Finisher { mesh, extracted, fields, views })
@@ -497,12 +497,12 @@ impl<'f> Finisher<'f> {
     pub fn finish(&self, bench: &Bench, c: &MeshConfig) -> Result<HeadMesh> {
         let (capture, config) = (&bench.session.capture, bench.config());
         let (export, cell) = (Export::new(capture, config), self.extracted.report.cell_size);
-        let (closed, cameras) = (self.extracted.closed(self.fields.surface()?), bench.cameras());
+        let (surface, cameras) = (self.extracted.distance(self.fields.surface()?), bench.cameras());
         let photographs = photographs(&self.views);
         let finish = Finish {
             surface: &self.mesh,
             cell,
-            field: &closed,
+            field: &surface,
             cameras: &cameras,
             photographs: &photographs,
             scene: &bench.scene,

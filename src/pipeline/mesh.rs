@@ -12,7 +12,7 @@ use super::advice::{advised, sentence};
 use super::finish::{Finish, FinishedHead, REACH};
 use super::frames::Export;
 use super::learn;
-use super::surface::{ClosedSurface, Surface};
+use super::surface::{CappedField, Surface};
 use crate::capture::scene::Scene;
 use crate::capture::{self, Capture, LoadedView, Split};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, Stage};
@@ -26,7 +26,7 @@ use tiface_base::io::{self, Limits};
 use tiface_base::{Error, ErrorKind, Monitor, Result};
 use tiface_surface::bake::seen_colors;
 use tiface_surface::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
-use tiface_surface::{self, Cap, HandleReport, MAX_HANDLE, MeshReport, Patches, Photograph};
+use tiface_surface::{self, Cap, HandleReport, MAX_HANDLE, MeshDistance, MeshReport, Photograph};
 
 /// Runs the stage `mesh`: writes the whole surface as `surface.ply` in the dataset's world, and the
 /// head mesh in the configured formats.
@@ -62,7 +62,7 @@ pub(super) fn mesh(
     let finish = Finish {
         surface: &extracted.mesh,
         cell: extracted.report.cell_size,
-        field: &extracted.closed(field),
+        field: &extracted.distance(field),
         cameras: &cameras,
         photographs: &photographs(&views),
         scene,
@@ -72,7 +72,7 @@ pub(super) fn mesh(
     };
     let FinishedHead { head, linear, report: steps, warnings } = finish.run()?;
     warnings.iter().for_each(|w| dir.warn(w));
-    let Extraction { mesh: surface, report, cap, .. } = extracted;
+    let Extraction { mesh: surface, report, cap } = extracted;
     let surface_triangles = surface.triangles.len();
     let plain = Mesh { colors: Vec::new(), ..surface };
     ExtractedSurface { mesh: plain, cap: cap.filter(|_| c.cap) }.save(&dir.folder().join("parts"))?;
@@ -147,14 +147,13 @@ pub(super) struct Extraction {
     pub report: MeshReport,
     /// The cap where the frames cut the body; `None` for a dense extraction.
     pub cap: Option<Cap>,
-    /// The patches where handles were cut.
-    pub patches: Option<Patches>,
 }
 
 impl Extraction {
-    /// Returns the field whose zero set is the surface with its cap and patches.
-    pub fn closed<'a>(&'a self, field: &'a dyn Surface) -> ClosedSurface<'a> {
-        ClosedSurface { field, hull: None, cap: self.cap.as_ref(), patches: self.patches.as_ref() }
+    /// Returns the surface as a field, with its cap: what the steps after the extraction are held
+    /// against. It is smoother than the zero set of `field`, whose colors it has.
+    pub fn distance<'a>(&'a self, field: &'a dyn Surface) -> MeshDistance<'a, CappedField<'a>> {
+        MeshDistance::new(&self.mesh, CappedField { field, hull: None, cap: self.cap.as_ref() })
     }
 
     /// Tells how the surface ends and what is doubtful of it; `mm` is the number of millimeters in
@@ -201,18 +200,18 @@ pub(super) fn extract(
         let options = tiface_surface::ExtractOptions {
             resolution: c.resolution as usize,
             longest_handle: if c.genus == Genus::Simple { MAX_HANDLE } else { 0.0 },
+            smooth: true,
             ..tiface_surface::ExtractOptions::default()
         };
-        let field = ClosedSurface { field, hull: scene.hull.as_ref(), cap: None, patches: None };
+        let field = CappedField { field, hull: scene.hull.as_ref(), cap: None };
         // below the frames' border the surface is a guess: close the mesh where enough cameras see
         // it
         let kept = capture::well_seen(scene, cameras, up, c.seen_by);
         tiface_surface::extract(&field, kept, &options, monitor)
     }
     .map_err(advised)?;
-    let patches = Patches::find(&mesh, &report.handles);
     let cap = (!c.dense).then(|| Cap::find(&mesh, report.bounds(), report.cell_size));
-    Ok(Extraction { mesh, report, cap: cap.flatten(), patches })
+    Ok(Extraction { mesh, report, cap: cap.flatten() })
 }
 
 /// Writes files; the mesh file comes last, because it refers to the others.

@@ -9,8 +9,8 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use tiface_base::Result;
 use tiface_base::geom::{BitGrid, Camera, Ray, RayResult, SdfField, Similarity};
+use tiface_surface::Cap;
 use tiface_surface::render::RenderedView;
-use tiface_surface::{Cap, Patches};
 
 /// A signed distance that may also be rendered by marching rays through it.
 pub trait Surface: SdfField {
@@ -26,34 +26,23 @@ pub trait Surface: SdfField {
     }
 }
 
-/// A field within the visual hull, with the parts that close it where its own zero set does not.
+/// A field within the visual hull, with the color of the cap that closes its surface.
 #[derive(Clone, Copy)]
-pub(super) struct ClosedSurface<'a> {
+pub(super) struct CappedField<'a> {
     pub field: &'a dyn Surface,
     /// Visual hull of the masks; points outside it are outside the surface.
     pub hull: Option<&'a BitGrid>,
     /// The cap where the frames cut the body.
     pub cap: Option<&'a Cap>,
-    /// The patches where handles were cut.
-    pub patches: Option<&'a Patches>,
 }
 
-impl SdfField for ClosedSurface<'_> {
+impl SdfField for CappedField<'_> {
     fn sdf(&self, points: &[Vec3]) -> Vec<f32> {
         self.field.sdf(points)
     }
 
-    /// Returns values and gradients; the closed surface includes the cap over the opening of the
-    /// field's zero set.
     fn sdf_gradient(&self, points: &[Vec3]) -> (Vec<f32>, Vec<Vec3>) {
-        let (mut values, mut gradients) = self.field.sdf_gradient(points);
-        if let Some(cap) = self.cap {
-            cap.close(points, &mut values, &mut gradients);
-        }
-        if let Some(patches) = self.patches {
-            patches.close(points, &mut values, &mut gradients);
-        }
-        (values, gradients)
+        self.field.sdf_gradient(points)
     }
 
     /// Returns colors; the cap has its own.

@@ -68,7 +68,7 @@ fn sweeps_leave_a_page_and_results() {
     stopped["asked"] = serde_json::json!(["steps", "triangles"]);
     std::fs::write(dir.path().join("first/bench.json"), stopped.to_string()).unwrap();
     let whole =
-        swept(dir.path(), "steps,triangles", &["triangles (1 of 1)", "Triangles after", "off the field"]);
+        swept(dir.path(), "steps,triangles", &["triangles (1 of 1)", "Triangles after", "off the surface"]);
     assert_eq!(whole["sweeps"][0], found["sweeps"][0]);
     assert!(whole["sweeps"][1]["name"] == "triangles" && !rows(&whole, 1).is_empty(), "{whole}");
     // results are not written over

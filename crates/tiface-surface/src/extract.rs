@@ -14,10 +14,11 @@ mod sparse;
 pub use cap::{Cap, RimVertex};
 pub use clean::{CleanReport, clean};
 pub use dense::extract_dense;
-pub use handles::{HandleReport, Patches};
+pub use handles::HandleReport;
 pub use marching::{LevelSet, Volume, marching};
 pub use sparse::{Sparse, sparse};
 
+use super::smooth::{SmoothReport, smooth};
 use super::{Warning, check_len, evaluate, setting};
 use glam::{DVec3, Vec3};
 use handles::cut_handles;
@@ -39,6 +40,8 @@ pub struct ExtractOptions {
     /// Handles are cut, or their holes filled, where they have a loop no longer than this share of
     /// the surface's longest side; 0..=1, 0 leaves them all.
     pub longest_handle: f32,
+    /// Whether the noise of a learned field is taken out of the surface ([`smooth()`](crate::smooth)).
+    pub smooth: bool,
 }
 
 /// The loops of locks and between them, not those of a body: 45 mm of a head with its neck, 300 mm
@@ -57,7 +60,7 @@ const RELAX: f32 = 0.5;
 
 impl Default for ExtractOptions {
     fn default() -> ExtractOptions {
-        ExtractOptions { resolution: 512, coarse_step: 8, longest_handle: MAX_HANDLE }
+        ExtractOptions { resolution: 512, coarse_step: 8, longest_handle: MAX_HANDLE, smooth: false }
     }
 }
 
@@ -91,6 +94,9 @@ pub struct MeshReport {
     pub held_back: usize,
     /// Handles that were cut, filled or left.
     pub handles: HandleReport,
+    /// The report of smoothing, if the surface was smoothed.
+    #[serde(default)]
+    pub smoothed: Option<SmoothReport>,
     /// The finished mesh: closed, manifold, pieces, Euler number.
     pub topology: Topology,
     /// Enclosed volume, in units of the bounds cubed.
@@ -144,7 +150,8 @@ impl MeshReport {
 ///
 /// The mesh is closed (capped where the field leaves the box), its vertices moved onto the field's
 /// zero, its normals the field's gradient. Handles with a loop no longer than
-/// `options.longest_handle` are removed.
+/// `options.longest_handle` are removed. With `options.smooth` the vertices then leave the field's
+/// zero, and normals are those of the smoothed surface.
 ///
 /// ```
 /// use glam::Vec3;
@@ -220,22 +227,31 @@ pub fn extract(
     }
     // vertices whose normal is not the field's slope
     let mut edged = on_faces(&mesh);
-    if let Some(patches) = Patches::find(&mesh, &report.handles) {
-        patches.corners().for_each(|v| edged[v as usize] = true);
+    if report.handles.triangles > 0 {
+        report.handles.patches(&mesh).as_flattened().iter().for_each(|&v| edged[v as usize] = true);
         gradients = gradient(&mesh.positions)?.1;
     }
-    mesh.normals = mesh.angle_weighted_normals();
-    for (i, normal) in mesh.normals.iter_mut().enumerate() {
+    mesh.normals = field_normals(&mesh, &gradients, &edged);
+    mesh.colors = colors_along_normals(&mesh, field)?;
+    // after the colors, which the field knows at its own zero and along its own normals
+    report.smoothed = options.smooth.then(|| smooth(&mut mesh, &edged));
+    progress(&[("vertices", mesh.positions.len() as f64)])?;
+    report.measure(&mesh, begin);
+    progress(&[("euler", report.topology.euler as f64)])?;
+    Ok((mesh, report))
+}
+
+/// Returns the field's slopes as normals; angle-weighted ones where vertices are `edged` or the
+/// slope is unusable.
+fn field_normals(mesh: &Mesh, gradients: &[Vec3], edged: &[bool]) -> Vec<Vec3> {
+    let mut normals = mesh.angle_weighted_normals();
+    for (i, normal) in normals.iter_mut().enumerate() {
         let g = gradients[i];
         if !edged[i] && g.is_finite() && g.length() >= 1e-6 {
             *normal = g.normalize();
         }
     }
-    mesh.colors = colors_along_normals(&mesh, field)?;
-    progress(&[("vertices", mesh.positions.len() as f64)])?;
-    report.measure(&mesh, begin);
-    progress(&[("euler", report.topology.euler as f64)])?;
-    Ok((mesh, report))
+    normals
 }
 
 /// Returns the colors of the vertices as seen along their normals; non-finite values become 0.

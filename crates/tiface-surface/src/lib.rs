@@ -6,6 +6,8 @@
 //!   surface and drops loose pieces; [`extract`] runs both, adds normals and colors, and removes
 //!   small handles. [`Cap`] closes the surface where the frames cut it. [`extract_dense`] evaluates
 //!   a field at all nodes of a grid, which [`marching`] meshes.
+//! - [`smooth()`] takes the noise of a learned field out of the surface; [`MeshDistance`] is the
+//!   result as a field, for the steps after it.
 //! - [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured mesh.
 //! - [`files`] writes, reads and checks GLB, OBJ and PLY, and reads glTF and STL.
 //! - [`render`] shows a mesh from a camera.
@@ -17,20 +19,24 @@ mod extract;
 pub mod files;
 #[cfg(test)]
 mod fixtures;
+mod mesh_distance;
 mod moves;
 pub mod render;
 mod shells;
 mod simplify;
+mod smooth;
 mod warning;
 
 pub use appearance::{Appearance, AppearanceReport, Colors, Photograph, fit as fit_appearance};
 pub use atlas::{AtlasConfig, AtlasReport, atlas};
 pub use extract::{
-    Cap, CleanReport, ExtractOptions, HandleReport, LevelSet, MAX_HANDLE, MeshReport, NodeGrid, Patches,
-    RimVertex, Sparse, Volume, clean, extract, extract_dense, marching, sparse,
+    Cap, CleanReport, ExtractOptions, HandleReport, LevelSet, MAX_HANDLE, MeshReport, NodeGrid, RimVertex,
+    Sparse, Volume, clean, extract, extract_dense, marching, sparse,
 };
+pub use mesh_distance::MeshDistance;
 pub use shells::{ShellsReport, fit as fit_shells};
 pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
+pub use smooth::{SmoothReport, smooth};
 pub use warning::Warning;
 
 use glam::Vec3;

@@ -3,6 +3,11 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
+/// Below this shape a face counts as spoiled, unless it was no better before.
+pub(super) const MIN_QUALITY: f32 = 0.02;
+/// A face may turn until this cosine against its direction at extraction.
+pub(super) const MIN_TURN_COSINE: f32 = 0.2;
+
 /// Returns the first-order step to a field's zero, `−f g / |g|²`; `None` if value or gradient is
 /// unusable.
 pub(super) fn newton(f: f32, g: Vec3) -> Option<Vec3> {

@@ -27,6 +27,8 @@ mod rings;
 mod rounds;
 mod to_field;
 
+pub(crate) use crossing::without_crossings;
+
 use crate::{Warning, check_count, check_indices, finite, setting};
 use crossing::crossings;
 use rounds::{bounded, counted};

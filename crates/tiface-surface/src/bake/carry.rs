@@ -8,6 +8,7 @@ use super::cover::Bands;
 use super::seams::Seams;
 use super::{Texels, on_triangles};
 use crate::files::{HeadMesh, HeadTexture, tangents};
+use crate::mesh_distance::hit_at;
 use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 use tiface_base::geom::{Atlas, Bvh, Hit, Mesh, ShellLayer, Shells, bilinear_taps};
@@ -152,17 +153,6 @@ impl NormalMap<'_> {
         let t = (t - m * m.dot(t)).normalize_or(m.any_orthonormal_vector());
         local.x * t + local.y * corners[0].w * m.cross(t) + local.z * m
     }
-}
-
-/// Returns the point of a triangle at this position.
-fn hit_at(mesh: &Mesh, triangle: u32, point: Vec3) -> Hit {
-    let [a, b, c] = mesh.corners(triangle).map(|p| p.as_dvec3());
-    let (e, f, p) = (b - a, c - a, point.as_dvec3() - a);
-    let det = e.length_squared() * f.length_squared() - e.dot(f).powi(2);
-    let share = |x: f64| if det > 0.0 { (x / det).clamp(0.0, 1.0) } else { 0.0 };
-    let u = share(f.length_squared() * p.dot(e) - e.dot(f) * p.dot(f));
-    let v = share(e.length_squared() * p.dot(f) - e.dot(f) * p.dot(e)).min(1.0 - u);
-    Hit { t: 0.0, triangle, u: u as f32, v: v as f32 }
 }
 
 /// Returns the values of a picture at texture coordinates, interpolated bilinearly.

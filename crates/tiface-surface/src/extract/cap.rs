@@ -1,7 +1,5 @@
 //! The cap that closes a surface where the box ends: neck and shoulders that the frames cut.
 //!
-//! The closed field `max(f, d)`, with `d` the signed distance to the box, has the cap in its zero
-//! set: what holds vertices on a field, or moves samples onto it, then treats skin and cap alike.
 //! The learned color within the body is no color of anything, so the cap is painted from the skin
 //! around it: inverse-distance weights (Shepard 1968) of the ring where it begins, which meets the
 //! skin without an edge.
@@ -114,20 +112,6 @@ impl Cap {
         mesh.drop_unused_vertices();
         removed
     }
-
-    /// Closes answers of a field at `points`: `max(f, d)` and its gradient.
-    pub fn close(&self, points: &[Vec3], values: &mut [f32], gradients: &mut [Vec3]) {
-        for ((p, f), g) in points.iter().zip(values).zip(gradients) {
-            let (low, high) = (self.bounds.min - *p, *p - self.bounds.max);
-            let d = low.max(high).max_element();
-            if d > *f {
-                let outward = |axis: usize| if high[axis] > low[axis] { 1.0 } else { -1.0 };
-                let axis = low.max(high).max_position();
-                *f = d;
-                *g = Vec3::AXES[axis] * outward(axis);
-            }
-        }
-    }
 }
 
 #[cfg(test)]
@@ -189,17 +173,6 @@ mod tests {
         let topology = tiface_base::geom::topology(&mesh.positions, &mesh.triangles);
         // a disc: V − E + F = 1
         assert_eq!((topology.pieces, topology.euler), (1, 1));
-    }
-
-    #[test]
-    fn the_closed_field_is_zero_on_the_cap_and_the_field_elsewhere() {
-        let (_, cap) = column();
-        let points = [Vec3::new(0.0, -1.0, 0.0), Vec3::new(0.3, 0.0, 0.0), Vec3::new(0.0, -1.25, 0.0)];
-        let mut values = [-0.3, 0.0, -0.3];
-        let mut gradients = [Vec3::X; 3];
-        cap.close(&points, &mut values, &mut gradients);
-        assert!(values[0].abs() < 1e-6 && values[1] == 0.0 && (values[2] - 0.25).abs() < 1e-6);
-        assert_eq!(gradients, [-Vec3::Y, Vec3::X, -Vec3::Y]);
     }
 
     #[test]

@@ -10,8 +10,8 @@
 //! thin strand has little matter to cut and a narrow slit little air to fill, however long the slit
 //! is. The field is not closed or opened itself and meshed again, as morphology would: how far that
 //! goes before a handle disappears is known only afterwards, it rounds off nearby surface, and
-//! costs a second extraction. Here every vertex stays on the zero set, and the new triangles become
-//! part of it for those who hold the mesh against the field later ([`Patches`]).
+//! costs a second extraction. Here every vertex stays on the zero set, and later steps hold the mesh
+//! against itself, new triangles included ([`crate::MeshDistance`]).
 //!
 //! A loop whose discs would meet the surface is no place to cut (another strand may run through the
 //! hole): the next best is taken, and without any the handle stays and is counted.
@@ -22,7 +22,7 @@ use crate::{Warning, check_len};
 use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use tiface_base::geom::{Aabb, Boxes, Bvh, DBox, Effort, Mesh, SdfField, area_vector, intersect, topology};
+use tiface_base::geom::{Aabb, Boxes, DBox, Effort, Mesh, SdfField, area_vector, intersect, topology};
 use tiface_base::{Monitor, Result};
 
 /// Maximum number of sides of a loop that is cut: the triangulation's cost grows with its cube.
@@ -58,6 +58,12 @@ pub struct HandleReport {
 }
 
 impl HandleReport {
+    /// Returns the triangles that close the cuts of a mesh as extracted: part of the surface,
+    /// although the field is not zero at them.
+    pub(super) fn patches<'a>(&self, mesh: &'a Mesh) -> &'a [[u32; 3]] {
+        &mesh.triangles[mesh.triangles.len() - self.triangles..]
+    }
+
     /// Returns a warning if handles were cut or filled; `mm` is the unit of the positions in
     /// millimeters.
     pub fn warning(&self, mm: f64) -> Option<Warning> {
@@ -341,40 +347,6 @@ impl<'a> HandleCutter<'a> {
 
 fn span(corners: [Vec3; 3]) -> DBox {
     DBox::around(corners.map(Vec3::as_dvec3))
-}
-
-/// The triangles that close the cuts: part of the surface, although the field is not zero at them.
-pub struct Patches {
-    mesh: Mesh,
-    bvh: Bvh,
-}
-
-impl Patches {
-    /// Returns the patches of a mesh as extracted; `None` if nothing was cut.
-    pub fn find(mesh: &Mesh, report: &HandleReport) -> Option<Patches> {
-        let first = mesh.triangles.len().checked_sub(report.triangles)?;
-        let triangles = mesh.triangles[first..].to_vec();
-        let mesh = Mesh { positions: mesh.positions.clone(), triangles, ..Mesh::default() };
-        (!mesh.triangles.is_empty()).then(|| Patches { bvh: Bvh::new(&mesh), mesh })
-    }
-
-    /// Returns the vertices of the mesh that patches use.
-    pub(super) fn corners(&self) -> impl Iterator<Item = u32> + '_ {
-        self.mesh.triangles.iter().flatten().copied()
-    }
-
-    /// Replaces a field's values at `points` where a patch is nearer than the field's own zero.
-    pub fn close(&self, points: &[Vec3], values: &mut [f32], gradients: &mut [Vec3]) {
-        for ((&p, f), g) in points.iter().zip(values).zip(gradients) {
-            let Some(near) = self.bvh.closest_point(p) else { continue };
-            if near.distance < f.abs() {
-                let out = area_vector(self.mesh.corners(near.triangle)).normalize_or_zero();
-                let side = if (p - near.point).dot(out) < 0.0 { -1.0 } else { 1.0 };
-                *f = side * near.distance;
-                *g = out;
-            }
-        }
-    }
 }
 
 #[cfg(test)]

@@ -6,15 +6,10 @@
 //! towards the middle of its neighbors, which turns the slivers of marching cubes into fair
 //! triangles at no further evaluation.
 
-use crate::moves::{move_vertices, newton};
+use crate::moves::{MIN_QUALITY, MIN_TURN_COSINE, move_vertices, newton};
 use glam::Vec3;
 use rayon::prelude::*;
 use tiface_base::geom::{area_vector, shape};
-
-/// Below this shape a face counts as spoiled, unless it was no better before.
-const MIN_QUALITY: f32 = 0.02;
-/// A face may turn until this cosine against its direction at extraction.
-const MIN_TURN_COSINE: f32 = 0.2;
 
 /// Moving vertices, with their start positions.
 pub(super) struct Polish<'a> {

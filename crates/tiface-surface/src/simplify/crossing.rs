@@ -146,6 +146,34 @@ pub(super) fn crossings(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<u32> 
     found
 }
 
+/// Takes back the moves of triangles that meet others now and did not at `start`. Returns the
+/// number of vertices.
+pub(crate) fn without_crossings(positions: &mut [Vec3], triangles: &[[u32; 3]], start: &[Vec3]) -> usize {
+    const TRIES: usize = 8;
+    let mut old = None;
+    let mut back = 0;
+    for _ in 0..TRIES {
+        let found = crossings(positions, triangles);
+        if found.is_empty() {
+            return back;
+        }
+        let old = old.get_or_insert_with(|| crossings(start, triangles));
+        let mut any = false;
+        for t in found.iter().filter(|t| old.binary_search(t).is_err()) {
+            for v in triangles[*t as usize].map(|v| v as usize) {
+                any |= positions[v] != start[v];
+                back += usize::from(positions[v] != start[v]);
+                positions[v] = start[v];
+            }
+        }
+        if !any {
+            return back;
+        }
+    }
+    positions.copy_from_slice(start);
+    back
+}
+
 /// An index of the triangles of a shrinking mesh, used to refuse collapses that cause crossings.
 pub(super) struct CrossingIndex {
     cells: Cells,

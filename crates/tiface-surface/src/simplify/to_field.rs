@@ -12,7 +12,7 @@
 //! the way, a quarter, or stays.
 
 use super::collapse::{MIN_QUALITY, MIN_TURN_COSINE};
-use super::crossing::crossings;
+use super::crossing::without_crossings;
 use super::{SimplifyReport, Task};
 use crate::evaluate;
 use crate::extract::BATCH;
@@ -91,34 +91,6 @@ pub(super) fn project_to_field(
         }
     }
     Ok(())
-}
-
-/// Takes back the moves of triangles that meet others now and did not at `start`. Returns the
-/// number of vertices.
-fn without_crossings(positions: &mut [Vec3], triangles: &[[u32; 3]], start: &[Vec3]) -> usize {
-    const TRIES: usize = 8;
-    let mut old = None;
-    let mut back = 0;
-    for _ in 0..TRIES {
-        let found = crossings(positions, triangles);
-        if found.is_empty() {
-            return back;
-        }
-        let old = old.get_or_insert_with(|| crossings(start, triangles));
-        let mut any = false;
-        for t in found.iter().filter(|t| old.binary_search(t).is_err()) {
-            for v in triangles[*t as usize].map(|v| v as usize) {
-                any |= positions[v] != start[v];
-                back += usize::from(positions[v] != start[v]);
-                positions[v] = start[v];
-            }
-        }
-        if !any {
-            return back;
-        }
-    }
-    positions.copy_from_slice(start);
-    back
 }
 
 /// Conjugate gradients on a mass matrix gain a digit in about five steps; two digits are ample.
