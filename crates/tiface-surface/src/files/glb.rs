@@ -10,9 +10,10 @@
 //!
 //! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node that
 //! users can hide: one primitive each, the innermost first, blended, with the mesh's base color
-//! times the alpha of `COLOR_0`, their back faces not drawn. glTF defines no drawing order: the
-//! layers look right where primitives are drawn in the file's order, after all opaque ones. Their
-//! material says `"extras": { "tiface": { "soft_layers": 2 } }`.
+//! times the alpha of `COLOR_0`, drawn from both sides, since path tracers draw both anyway. glTF
+//! defines no drawing order: the layers look right where primitives are drawn in the file's order,
+//! after all opaque ones, or sorted by distance. Their material says
+//! `"extras": { "tiface": { "soft_layers": 2 } }`.
 //!
 //! Textures that depend on the view: tools may drop a texture that nothing refers to, and the
 //! Khronos validator warns about a texture that only `extras` refers to. So each lobe is the base
@@ -134,18 +135,15 @@ fn soft_layers(
     let mut soft = material(options, name.clone());
     soft.pbr_metallic_roughness.base_color_texture = texture;
     soft.alpha_mode = Valid(json::material::AlphaMode::Blend);
-    soft.extras = extras(json!({"soft_layers": shells.layers.len()}));
-    let part = file.under(shells);
-    if part.triangles.is_empty() {
-        return None;
-    }
-    // all layers share everything but positions and opacity; an unlit material needs no normals
-    let indices = document.indices(&part.triangles, part.positions.len());
-    let uvs = (!part.uvs.is_empty()).then(|| document.floats(&part.uvs));
-    let normals = (!options.unlit).then(|| document.floats(&part.normals));
+    soft.double_sided = true;
     let white = [1.0; 3];
     let mut primitives = Vec::new();
     for layer in &shells.layers {
+        let part = file.under(layer);
+        if part.triangles.is_empty() {
+            continue;
+        }
+        let indices = document.indices(&part.triangles, part.positions.len());
         let color = |(v, source): (usize, &u32)| {
             let [r, g, b] = part.colors.get(v).map_or(white, |c| c.map(linear_from_srgb));
             [r, g, b, layer.alphas[*source as usize]].map(quantize)
@@ -155,10 +153,19 @@ fn soft_layers(
             (Valid(Semantic::Positions), document.positions(&part.moved(layer, scale))),
             (Valid(Semantic::Colors(0)), document.bytes(&colors)),
         ]);
-        attributes.extend(uvs.map(|uvs| (Valid(Semantic::TexCoords(0)), uvs)));
-        attributes.extend(normals.map(|normals| (Valid(Semantic::Normals), normals)));
+        if !part.uvs.is_empty() {
+            attributes.insert(Valid(Semantic::TexCoords(0)), document.floats(&part.uvs));
+        }
+        // an unlit material needs no normals
+        if !options.unlit {
+            attributes.insert(Valid(Semantic::Normals), document.floats(&part.normals));
+        }
         primitives.push(primitive(attributes, indices));
     }
+    if primitives.is_empty() {
+        return None;
+    }
+    soft.extras = extras(json!({"soft_layers": primitives.len()}));
     let material = document.root.push(soft);
     primitives.iter_mut().for_each(|p| p.material = Some(material));
     Some(mesh(primitives, Some(name)))
@@ -483,7 +490,7 @@ mod tests {
                 (&json!("BLEND"), &json!(2))
             );
             assert_eq!(material["pbrMetallicRoughness"]["baseColorTexture"]["index"], 0);
-            assert_ne!(material["doubleSided"], true);
+            assert_eq!(material["doubleSided"], true);
             assert_eq!(
                 json["accessors"][layer["attributes"]["COLOR_0"].as_u64().unwrap() as usize]["type"],
                 "VEC4"
@@ -493,7 +500,7 @@ mod tests {
         // layer lies 0.3 before it
         let part = FileMesh::new(&head.mesh, None, &options.file_from_mesh().unwrap())
             .unwrap()
-            .under(head.shells.as_ref().unwrap());
+            .under(&head.shells.as_ref().unwrap().layers[0]);
         let at = part.source.iter().position(|&v| v == 2).unwrap();
         let moved = part.moved(&head.shells.unwrap().layers[0], 0.5);
         assert!(moved[at].distance(Vec3::new(0.0, 0.5, 0.15)) < 1e-6);
