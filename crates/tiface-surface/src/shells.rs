@@ -35,9 +35,16 @@ use tiface_base::{Monitor, Result};
 /// stop at the eighth transparent face allow no more of them, with some to spare for folds.
 const LAYERS: [f32; 3] = [1.5, 3.5, 6.0];
 
-/// Softness `1 / s` from which on a vertex has layers, and that from which on they have their full
-/// distance and opacity, in pixels of the nearest camera: antialiasing shows the rest.
-const SOFTNESS_PX: [f32; 2] = [0.9, 1.3];
+/// Softness `1 / s` from which on a vertex has layers, in pixels of the nearest camera, at least and
+/// at most: antialiasing shows the rest. It is the least for which all layers together have no more
+/// than [`MAX_SHARE`] of the mesh's triangles.
+const SOFTNESS_PX: [f32; 2] = [1.0, 1.5];
+
+/// Softness beyond that from which on layers have their full distance and opacity, in pixels.
+const FULL_SOFTNESS_PX: f32 = 0.3;
+
+/// Number of triangles of all layers together that is aimed at, as a share of the mesh's.
+const MAX_SHARE: f64 = 0.8;
 
 /// Opacity from which on a vertex of a layer is seen: the least of 8 bits above 1/50. A triangle
 /// without such a vertex is left out.
@@ -176,13 +183,11 @@ fn from_field(
         width = (0..width.len()).into_par_iter().map(mean).collect();
     }
     let pixels: Vec<f32> = (0..width.len()).into_par_iter().map(pixel).collect::<Option<_>>()?;
-    let share: Vec<f32> = width
-        .iter()
-        .zip(&pixels)
-        .map(|(w, p)| ((w / p - SOFTNESS_PX[0]) / (SOFTNESS_PX[1] - SOFTNESS_PX[0])).clamp(0.0, 1.0))
-        .collect();
-    let mut soft: Vec<f32> =
-        (0..width.len()).filter(|&v| share[v] > 0.0).map(|v| width[v] / pixels[v]).collect();
+    let softness: Vec<f32> = width.iter().zip(&pixels).map(|(w, p)| w / p).collect();
+    let least = least_softness(mesh, &softness);
+    let share: Vec<f32> =
+        softness.iter().map(|soft| ((soft - least) / FULL_SOFTNESS_PX).clamp(0.0, 1.0)).collect();
+    let mut soft: Vec<f32> = softness.into_iter().filter(|soft| *soft > least).collect();
     let median = median(&mut soft, f32::total_cmp)?;
     let mut layers = Vec::new();
     for (k, q) in LAYERS.into_iter().enumerate() {
@@ -195,6 +200,15 @@ fn from_field(
         });
     }
     Some((Shells { layers }, median))
+}
+
+/// Returns the softness from which on vertices of this softness have layers, in pixels.
+fn least_softness(mesh: &Mesh, softness: &[f32]) -> f32 {
+    let of = |t: &[u32; 3]| t.iter().map(|&v| softness[v as usize]).fold(0.0, f32::max);
+    let mut softest: Vec<f32> = mesh.triangles.iter().map(of).collect();
+    softest.sort_by(|a, b| b.total_cmp(a));
+    let most = (MAX_SHARE * softest.len() as f64) as usize / LAYERS.len();
+    softest.get(most).map_or(SOFTNESS_PX[0], |soft| soft.clamp(SOFTNESS_PX[0], SOFTNESS_PX[1]))
 }
 
 fn sigmoid(x: f32) -> f32 {
@@ -310,6 +324,19 @@ mod tests {
         assert_eq!(run(4000.0, 4000.0), (None, ShellsReport::default()));
         let (none, report) = run(20.0, 4000.0);
         assert!(none.is_none() && !report.kept && report.triangles > 0, "{report:?}");
+    }
+
+    #[test]
+    fn layers_stay_where_the_mesh_is_softest() {
+        // from 1.0 pixels below to 1.4 above
+        let mesh = ball();
+        let softness: Vec<f32> = mesh.positions.iter().map(|p| 1.2 + 0.4 * p.z).collect();
+        let least = least_softness(&mesh, &softness);
+        let more = |t: &&[u32; 3]| t.iter().any(|&v| softness[v as usize] > least);
+        let share = mesh.triangles.iter().filter(more).count() as f64 / mesh.triangles.len() as f64;
+        assert!((1.0..1.5).contains(&least) && (share - MAX_SHARE / 3.0).abs() < 0.01, "{least} {share}");
+        assert_eq!(least_softness(&mesh, &vec![2.0; mesh.positions.len()]), 1.5);
+        assert_eq!(least_softness(&mesh, &vec![0.2; mesh.positions.len()]), 1.0);
     }
 
     #[test]

@@ -7,8 +7,9 @@ use tiface_base::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, Shells};
 use tiface_base::math::cg::{conjugate_gradients, dot};
 use tiface_base::{Monitor, Result};
 
-/// Width of the band on each side of a mask's outline whose pixels are compared.
-const BAND_PX: usize = 6;
+/// Width of the band on each side of a mask's outline whose pixels are compared: no layer may reach
+/// beyond it unseen.
+const BAND_PX: usize = 10;
 
 /// Approximate maximum number of compared pixels.
 const MAX_PIXELS: usize = 400_000;
