@@ -220,8 +220,9 @@ fn sigmoid(x: f32) -> f32 {
 mod tests {
     use super::*;
     use crate::{Volume, marching};
-    use glam::{DMat3, DVec3, Vec3};
+    use glam::{DMat3, DVec3, Vec2, Vec3};
     use tiface_base::Quiet;
+    use tiface_base::geom::Camera;
     use tiface_base::image::{Gray, Photo};
 
     const SIZE: u32 = 48;
