@@ -319,6 +319,7 @@ mod tests {
     use crate::files::file_mesh::tests::tetrahedron;
     use crate::files::{PictureSource, ReadOptions, read, read_with, weld};
     use std::path::Path;
+    use tiface_base::geom::ShellLayer;
     use tiface_base::image::srgb_from_linear;
     use tiface_base::io::{Limits, parse_photo};
 
@@ -505,5 +506,54 @@ mod tests {
         let moved = part.moved(&head.shells.unwrap().layers[0], 0.5);
         assert!(moved[at].distance(Vec3::new(0.0, 0.5, 0.15)) < 1e-6);
         assert_eq!(part.triangles.len(), 4);
+    }
+
+    /// Returns the bytes of an accessor of a GLB.
+    fn bytes_of_accessor<'a>(glb: &'a [u8], json: &serde_json::Value, at: &serde_json::Value) -> &'a [u8] {
+        let number = |v: &serde_json::Value| v.as_u64().unwrap_or(0) as usize;
+        let accessor = &json["accessors"][number(at)];
+        let view = &json["bufferViews"][number(&accessor["bufferView"])];
+        let binary = &glb[20 + u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize + 8..];
+        &binary[number(&view["byteOffset"])..][..number(&view["byteLength"])]
+    }
+
+    #[test]
+    fn a_file_holds_the_triangles_of_each_layer_that_rays_meet() {
+        // the first layer is on the first half of a strip, the second on a tenth in the middle
+        let mesh = strip(200);
+        let layer = |from: usize, to: usize| ShellLayer {
+            offsets: vec![from as f32 * 1e-3 + 0.5; 200],
+            alphas: (0..200).map(|v| if (from..to).contains(&v) { 51.0 / 255.0 } else { 0.0 }).collect(),
+        };
+        let shells = Shells { layers: vec![layer(0, 100), layer(90, 110)] };
+        let glb = to_glb(&mesh, None, Some(&shells), &ExportOptions::default()).unwrap();
+        let json = json_of(&glb);
+        let primitives = json["meshes"][1]["primitives"].as_array().unwrap();
+        assert_eq!(primitives.len(), 2);
+        for (primitive, layer) in primitives.iter().zip(&shells.layers) {
+            let floats = |name: &str| -> Vec<f32> {
+                let bytes = bytes_of_accessor(&glb, &json, &primitive["attributes"][name]);
+                bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect()
+            };
+            let at = floats("POSITION");
+            let colors = bytes_of_accessor(&glb, &json, &primitive["attributes"]["COLOR_0"]);
+            let corners: Vec<usize> = bytes_of_accessor(&glb, &json, &primitive["indices"])
+                .as_chunks::<2>()
+                .0
+                .iter()
+                .map(|b| u16::from_le_bytes(*b) as usize)
+                .collect();
+            // what ray caster and rasterizer draw
+            let (surface, _) = layer.surface(&mesh);
+            assert_eq!(corners.len(), 3 * surface.triangles.len());
+            // an accessor is padded to four bytes
+            let used = corners.iter().max().unwrap() + 1;
+            assert!(used < 200 && at.len() == 3 * used, "no more vertices than its triangles have");
+            for (&corner, &v) in corners.iter().zip(surface.triangles.as_flattened()) {
+                let p = Vec3::new(at[3 * corner], at[3 * corner + 1], at[3 * corner + 2]);
+                assert!(p.distance(surface.positions[v as usize]) < 1e-6);
+                assert_eq!(f32::from(colors[4 * corner + 3]) / 255.0, layer.alphas[v as usize]);
+            }
+        }
     }
 }
