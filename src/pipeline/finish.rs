@@ -76,11 +76,11 @@ impl Finish<'_> {
         let fit = self.color_fit(&frames, &mut log);
         let shells = self.shells(&mesh, &mut log)?;
         let (texture, harmonics, linear) = if self.config.texture_px == 0 {
-            let fitted = self.fit_colors(&mut mesh, Colors::Vertices, &fit, &mut log)?;
+            let fitted = self.fit_colors(&mut mesh, shells.as_ref(), Colors::Vertices, &fit, &mut log)?;
             (None, fitted.and_then(|fitted| fitted.harmonics), None)
         } else {
             let layout = self.unwrap(&mesh, &mut log)?;
-            let (mut baked, harmonics) = self.bake(&mut mesh, &layout, &fit, &mut log)?;
+            let (mut baked, harmonics) = self.bake(&mut mesh, shells.as_ref(), &layout, &fit, &mut log)?;
             let file_from_world = frames.file_from_world().rotation_f32();
             let texture =
                 self.texture(&mesh, layout, &mut baked, harmonics.as_ref(), file_from_world, &mut log);
@@ -144,12 +144,14 @@ impl Finish<'_> {
     fn fit_colors(
         &self,
         mesh: &mut Mesh,
+        shells: Option<&Shells>,
         colors: Colors,
         fit: &ColorFit,
         log: &mut StepLog,
     ) -> Result<Option<Appearance>> {
         let Some(photographs) = fit.photographs else { return Ok(None) };
-        let fitted = fit_appearance(mesh, colors, photographs, fit.max_degree, fit.turned, self.monitor)?;
+        let fitted =
+            fit_appearance(mesh, shells, colors, photographs, fit.max_degree, fit.turned, self.monitor)?;
         let Some(mut fitted) = fitted else { return Ok(None) };
         log.report.insert("appearance".into(), json!(fitted.report));
         mesh.colors = std::mem::take(&mut fitted.vertices);
@@ -171,6 +173,7 @@ impl Finish<'_> {
     fn bake(
         &self,
         mesh: &mut Mesh,
+        shells: Option<&Shells>,
         layout: &Atlas,
         fit: &ColorFit,
         log: &mut StepLog,
@@ -193,7 +196,7 @@ impl Finish<'_> {
         }
         let mut image = baked.color.clone();
         image.data.iter_mut().for_each(|v| *v = srgb_from_linear(*v));
-        let Some(fitted) = self.fit_colors(mesh, Colors::Texels(layout, &image), fit, log)? else {
+        let Some(fitted) = self.fit_colors(mesh, shells, Colors::Texels(layout, &image), fit, log)? else {
             return Ok((baked, None));
         };
         let (texels, known) = fitted.texels;

@@ -237,7 +237,7 @@ class Painter {
     // of a normal: the cofactors, which are the transposed inverse but for a factor
     const [x, y, z] = [0, 4, 8].map((k) => placed.slice(k, k + 3));
     const turned = [...cross(y, z), ...cross(z, x), ...cross(x, y)].map((v) => v / (Math.hypot(...cross(y, z)) || 1));
-    const part = { placed, turned, attributes, indices, blend: material.alphaMode === "BLEND",
+    const part = { placed, turned, attributes, indices, blend: material.alphaMode === "BLEND", bothSides: material.doubleSided === true,
       cutoff: material.alphaMode === "MASK" ? material.alphaCutoff ?? 0.5 : -1,
       factor: pbr.baseColorFactor ?? [1, 1, 1, 1], texture: pbr.baseColorTexture?.index, lobes,
       scale: notes?.view_dependent_color?.scale ?? [], pictures: [], count: indices?.count ?? attributes.POSITION.count };
@@ -386,7 +386,15 @@ class Painter {
       gl.depthMask(true);
       gl.disable(gl.BLEND);
     }
-    if (mode < 2 || alone) this.shells.forEach(paint);
+    // the far side of a layer first, as three.js does
+    if (mode < 2 || alone) {
+      for (const shell of this.shells) {
+        for (const hidden of shell.bothSides ? [gl.FRONT, gl.BACK] : [gl.BACK]) {
+          gl.cullFace(hidden);
+          paint(shell);
+        }
+      }
+    }
     gl.depthMask(true);
     gl.bindVertexArray(null);
   }

@@ -58,7 +58,7 @@ def emit(found):
 
 
 def soften(found):
-    """Soft layers emit their base color through their opacity, outwards alone: Cycles draws both sides of a face."""
+    """Soft layers emit their base color through their opacity."""
     emit(found)
     for material in found.data.materials:
         tree = material.node_tree
@@ -66,14 +66,8 @@ def soften(found):
         out = next(node for node in tree.nodes if node.type == "OUTPUT_MATERIAL")
         opacity = tree.nodes.new("ShaderNodeVertexColor")
         opacity.layer_name = found.data.color_attributes[0].name
-        inside = tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]
-        outwards = tree.nodes.new("ShaderNodeMath")
-        outwards.operation = "SUBTRACT"
-        tree.links.new(opacity.outputs["Alpha"], outwards.inputs[0])
-        tree.links.new(inside, outwards.inputs[1])
-        outwards.use_clamp = True
         mix = tree.nodes.new("ShaderNodeMixShader")
-        tree.links.new(outwards.outputs[0], mix.inputs[0])
+        tree.links.new(opacity.outputs["Alpha"], mix.inputs[0])
         tree.links.new(tree.nodes.new("ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
         tree.links.new(emission.outputs[0], mix.inputs[2])
         tree.links.new(mix.outputs[0], out.inputs["Surface"])
@@ -104,6 +98,7 @@ def main():
     arguments.add_argument("camera", type=pathlib.Path)
     arguments.add_argument("out", type=pathlib.Path)
     arguments.add_argument("--samples", type=int, default=16)
+    arguments.add_argument("--transparent-bounces", type=int, default=8, help="surfaces that a ray may pass; Blender's own default")
     arguments.add_argument("--lobes", action="store_true", help="colors that change with the view")
     arguments = arguments.parse_args()
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -128,7 +123,7 @@ def main():
     scene.cycles.use_denoising = False
     scene.cycles.use_adaptive_sampling = False
     scene.cycles.max_bounces = 0
-    scene.cycles.transparent_max_bounces = 16
+    scene.cycles.transparent_max_bounces = arguments.transparent_bounces
     scene.cycles.pixel_filter_type = "BOX"
     scene.cycles.filter_width = 1.0
     scene.render.film_transparent = True

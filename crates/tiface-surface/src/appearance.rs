@@ -9,7 +9,8 @@
 //! ```
 //!
 //! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before
-//! the fit, `W` the shares of the nodes under the pixel's rays (visibility and footprint in one),
+//! the fit, `W` the shares of the nodes under the pixel's rays (visibility, footprint and the
+//! opacity of soft layers, which have the colors of the surface under them, in one),
 //! `Y_k` real spherical harmonics of the direction to the viewer and `∇` the difference between
 //! neighboring nodes. `D` is the root of the cosine between view and surface where the head alone
 //! fills the pixel, by the mask and by all rays, and else 0: what is behind the head never bleeds
@@ -29,12 +30,12 @@ pub use rows::Photograph;
 
 use glam::Mat3;
 use rayon::prelude::*;
-use rows::{Row, Rows};
+use rows::{Row, Rows, Seen};
 use serde::Serialize;
 use solve::{Smoothness, System};
 use std::time::Instant;
 use tiface_base::geom::sphharm::{Y0, functions};
-use tiface_base::geom::{Atlas, Bvh, Harmonics, Mesh};
+use tiface_base::geom::{Atlas, Bvh, Harmonics, Mesh, ShellCaster, Shells};
 use tiface_base::image::Image;
 use tiface_base::{Monitor, Result};
 
@@ -99,8 +100,8 @@ pub enum Colors<'a> {
     Vertices,
 }
 
-/// Fits colors to photographs, whose masks have their sizes; vertices have colors. What depends on
-/// the view has degree `max_degree` at most, and 2; the degree and its smoothness are those that
+/// Fits colors to photographs, whose masks have their sizes; vertices have colors, and normals if
+/// there are `shells` around the mesh. What depends on the view has degree `max_degree` at most, and 2; the degree and its smoothness are those that
 /// show photographs best that were left out of a first fit.
 ///
 /// Returns `None` where no photograph shows the head.
@@ -110,6 +111,7 @@ pub enum Colors<'a> {
 /// A request to stop.
 pub fn fit(
     mesh: &Mesh,
+    shells: Option<&Shells>,
     colors: Colors,
     photographs: &[Photograph],
     max_degree: u32,
@@ -119,7 +121,8 @@ pub fn fit(
     let (begin, max_degree) = (Instant::now(), max_degree.min(2));
     let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
     let stride = (head as f64 / MAX_PIXELS as f64).sqrt().ceil().max(1.0) as u32;
-    let rows = Rows::new(mesh, &Bvh::new(mesh), photographs, stride, turned);
+    let layers = shells.map(|shells| ShellCaster::new(mesh, shells));
+    let rows = Rows::new(&Seen { mesh, bvh: Bvh::new(mesh), layers }, photographs, stride, turned);
     if rows.is_empty() {
         return Ok(None);
     }

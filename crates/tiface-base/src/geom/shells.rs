@@ -7,7 +7,8 @@ use super::ray::{Hit, Ray};
 use glam::Vec3;
 
 /// Layers around a mesh with normals, the innermost first: they are drawn in this order, after the
-/// mesh, and only where they face the viewer.
+/// mesh. Both sides of them are drawn, so that a ray along the outline meets each layer twice, and
+/// one that the mesh stops once.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Shells {
     /// The layers.
@@ -59,7 +60,6 @@ pub struct ShellCaster<'a> {
 
 struct LayerCaster<'a> {
     layer: &'a ShellLayer,
-    surface: Mesh,
     bvh: Bvh,
     /// Triangle of the mesh that each of the surface's is.
     source: Vec<u32>,
@@ -74,27 +74,27 @@ impl<'a> ShellCaster<'a> {
     pub fn new(mesh: &'a Mesh, shells: &'a Shells) -> ShellCaster<'a> {
         let caster = |layer: &'a ShellLayer| {
             let (surface, source) = layer.surface(mesh);
-            LayerCaster { layer, bvh: Bvh::new(&surface), surface, source }
+            LayerCaster { layer, bvh: Bvh::new(&surface), source }
         };
         ShellCaster { mesh, layers: shells.layers.iter().map(caster).collect() }
     }
 
-    /// Calls `meet` for each layer whose outside a ray meets before `end`, the outermost first:
-    /// with its index, the source position on the mesh, and its opacity.
+    /// Calls `meet` wherever a ray meets a layer before `end`, from either side, the nearest first:
+    /// with the index of the layer, the source position on the mesh, and the opacity.
     pub fn cast(&self, ray: &Ray, end: f32, mut meet: impl FnMut(usize, Hit, f32)) {
-        for (k, LayerCaster { layer, surface, bvh, source }) in self.layers.iter().enumerate().rev() {
+        let mut met: Vec<(usize, Hit)> = Vec::new();
+        for (k, LayerCaster { bvh, source, .. }) in self.layers.iter().enumerate() {
             let mut ahead = *ray;
             ahead.t_max = ahead.t_max.min(end);
             while let Some(hit) = bvh.closest_hit(&ahead) {
-                let [a, b, c] = surface.corners(hit.triangle);
-                if (b - a).cross(c - a).dot(ray.direction) < 0.0 {
-                    let hit = Hit { triangle: source[hit.triangle as usize], ..hit };
-                    meet(k, hit, layer.alpha(&hit, self.mesh.triangles[hit.triangle as usize]));
-                    break;
-                }
-                // the inner side is not drawn; on by some steps of f32
+                met.push((k, Hit { triangle: source[hit.triangle as usize], ..hit }));
+                // on by some steps of f32
                 ahead.t_min = hit.t + 1e-6 * hit.t.max(1e-3);
             }
+        }
+        met.sort_by(|a, b| a.1.t.total_cmp(&b.1.t));
+        for (k, hit) in met {
+            meet(k, hit, self.layers[k].layer.alpha(&hit, self.mesh.triangles[hit.triangle as usize]));
         }
     }
 }
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ray_meets_the_outermost_layer_first_and_none_behind_its_end() {
+    fn a_ray_meets_the_nearest_layer_first_and_none_behind_its_end() {
         let (mesh, shells) = square();
         let caster = ShellCaster::new(&mesh, &shells);
         let met = |ray: &Ray, end: f32| {
@@ -140,10 +140,41 @@ mod tests {
         assert!((all[0].2 - 0.7).abs() < 1e-6 && (all[1].2 - 0.9).abs() < 1e-6, "{all:?}");
         assert!((all[0].3 - 0.4 * 0.5).abs() < 1e-6 && (all[1].3 - 0.8 * 0.5).abs() < 1e-6, "{all:?}");
         assert_eq!(met(&down, 0.8).len(), 1);
-        // the other triangle has no vertex that shows, and from behind nothing does
+        // the other triangle has no vertex that shows
         assert!(met(&ray(Vec3::new(-0.5, 0.5, 1.0), Vec3::new(-0.5, 0.5, 0.0)), f32::INFINITY).is_empty());
-        assert!(
-            met(&ray(Vec3::new(0.25, -0.75, -1.0), Vec3::new(0.25, -0.75, 0.0)), f32::INFINITY).is_empty()
-        );
+        // from behind the innermost is the nearest
+        let up = met(&ray(Vec3::new(0.25, -0.75, -1.0), Vec3::new(0.25, -0.75, 0.0)), f32::INFINITY);
+        assert_eq!(up.iter().map(|m| m.0).collect::<Vec<_>>(), [0, 1]);
+        assert!((up[0].2 - 1.1).abs() < 1e-6 && (up[1].2 - 1.3).abs() < 1e-6, "{up:?}");
+    }
+
+    #[test]
+    fn a_ray_beside_the_mesh_meets_both_sides_of_a_layer() {
+        // an octahedron of radius 1 and a layer of radius 1.5 around it: at x = 1.2 a ray along z
+        // meets the layer's surface |x| + |y| + |z| = 1.5 at z = 0.3 and at z = -0.3
+        let axes = [Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z];
+        let mesh = Mesh {
+            positions: axes.to_vec(),
+            normals: axes.to_vec(),
+            triangles: vec![
+                [0, 1, 2],
+                [1, 3, 2],
+                [3, 4, 2],
+                [4, 0, 2],
+                [1, 0, 5],
+                [3, 1, 5],
+                [4, 3, 5],
+                [0, 4, 5],
+            ],
+            ..Mesh::default()
+        };
+        let shells = Shells { layers: vec![ShellLayer { offsets: vec![0.5; 6], alphas: vec![0.25; 6] }] };
+        let mut met = Vec::new();
+        let beside = ray(Vec3::new(1.199, 0.001, 2.0), Vec3::new(1.199, 0.001, 0.0));
+        ShellCaster::new(&mesh, &shells)
+            .cast(&beside, f32::INFINITY, |_, hit, alpha| met.push((hit.t, alpha)));
+        assert_eq!(met.len(), 2, "{met:?}");
+        assert!((met[0].0 - 1.7).abs() < 1e-5 && (met[1].0 - 2.3).abs() < 1e-5, "{met:?}");
+        assert!(met.iter().all(|m| (m.1 - 0.25).abs() < 1e-6), "{met:?}");
     }
 }

@@ -4,7 +4,7 @@ use super::nodes::{Nodes, grouped};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 use std::ops::Deref;
-use tiface_base::geom::{Bvh, Camera, Hit, Mesh, area_vector};
+use tiface_base::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, area_vector};
 use tiface_base::image::{Gray, OPAQUE_ALPHA, Photo, eroded};
 
 /// Rays along each side of a pixel.
@@ -67,7 +67,15 @@ pub struct Row {
     pub weight: f32,
     /// Its photograph.
     pub view: u32,
-    hits: [Hit; RAYS],
+    /// What its rays meet, layers first, with the share in the pixel; the shares sum to 1.
+    hits: Box<[(Hit, f32)]>,
+}
+
+/// A mesh, and the translucent layers around it, as rays meet them.
+pub struct Seen<'a> {
+    pub mesh: &'a Mesh,
+    pub bvh: Bvh,
+    pub layers: Option<ShellCaster<'a>>,
 }
 
 /// The pixels that colors are fitted to.
@@ -84,7 +92,7 @@ impl Deref for Rows {
 impl Rows {
     /// Looks at every `stride`-th pixel each way of the photographs; `turned` leads from the mesh's
     /// coordinates to those of the harmonics.
-    pub fn new(mesh: &Mesh, bvh: &Bvh, photographs: &[Photograph], stride: u32, turned: Mat3) -> Rows {
+    pub fn new(seen: &Seen, photographs: &[Photograph], stride: u32, turned: Mat3) -> Rows {
         let lines: Vec<(u32, u32)> = (0..photographs.len() as u32)
             .flat_map(|v| {
                 let height = photographs[v as usize].photo.height;
@@ -94,7 +102,7 @@ impl Rows {
         let line = |&(view, y): &(u32, u32)| {
             let photograph = &photographs[view as usize];
             let xs = (y / stride % stride..photograph.photo.width).step_by(stride as usize);
-            xs.filter_map(move |x| Row::new(mesh, bvh, (view, photograph), [x, y], turned))
+            xs.filter_map(move |x| Row::new(seen, (view, photograph), [x, y], turned))
         };
         Rows(lines.par_iter().flat_map_iter(line).collect())
     }
@@ -113,10 +121,10 @@ impl Rows {
                 let mut row: Vec<(u32, f32)> = Vec::new();
                 for Row { hits, .. } in rows {
                     row.clear();
-                    for hit in hits {
+                    for (hit, share) in hits {
                         nodes.under(hit, |node, w| match row.iter_mut().find(|e| e.0 == node) {
-                            Some(e) => e.1 += w / RAYS as f32,
-                            None => row.push((node, w / RAYS as f32)),
+                            Some(e) => e.1 += w * share,
+                            None => row.push((node, w * share)),
                         });
                     }
                     counts.push(row.len() as u32);
@@ -144,8 +152,7 @@ impl Rows {
 impl Row {
     /// Returns a pixel of a photograph, if the head fills it.
     fn new(
-        mesh: &Mesh,
-        bvh: &Bvh,
+        Seen { mesh, bvh, layers }: &Seen,
         (view, photograph): (u32, &Photograph),
         [x, y]: [u32; 2],
         turned: Mat3,
@@ -156,13 +163,21 @@ impl Row {
             return None;
         }
         let mut cosine = 0.0;
-        let mut hits = [Hit { t: 0.0, triangle: 0, u: 0.0, v: 0.0 }; RAYS];
-        for (slot, k) in hits.iter_mut().zip(0..) {
+        let mut hits = Vec::with_capacity(RAYS);
+        for k in 0..RAYS as u32 {
             let sub = |k: u32| (k as f32 + 0.5) / SIDE as f32;
             let ray = camera.ray(Vec2::new(x as f32 + sub(k % SIDE), y as f32 + sub(k / SIDE)))?;
-            *slot = bvh.closest_hit(&ray)?;
-            let normal = area_vector(mesh.corners(slot.triangle)).normalize_or_zero();
+            let hit = bvh.closest_hit(&ray)?;
+            let normal = area_vector(mesh.corners(hit.triangle)).normalize_or_zero();
             cosine -= normal.dot(ray.direction) / RAYS as f32;
+            let mut left = 1.0 / RAYS as f32;
+            if let Some(layers) = layers {
+                layers.cast(&ray, hit.t, |_, hit, alpha| {
+                    hits.push((hit, left * alpha));
+                    left *= 1.0 - alpha;
+                });
+            }
+            hits.push((hit, left));
         }
         let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
         Some(Row {
@@ -170,7 +185,7 @@ impl Row {
             direction: turned * -ray.direction,
             weight: cosine.clamp(0.0, 1.0).sqrt(),
             view,
-            hits,
+            hits: hits.into(),
         })
     }
 }

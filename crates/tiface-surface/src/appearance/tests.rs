@@ -1,7 +1,7 @@
 use super::*;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use tiface_base::Quiet;
-use tiface_base::geom::Camera;
+use tiface_base::geom::{Camera, ShellLayer, Shells};
 use tiface_base::image::{Gray, Photo};
 use tiface_base::math::rng;
 
@@ -102,7 +102,7 @@ fn matt_paint_comes_back_and_nothing_depends_on_the_view() {
     let photographs = photographs(&cameras, &photos);
     let image = gray(&atlas);
     for colors in [Colors::Texels(&atlas, &image), Colors::Vertices] {
-        let fitted = fit(&mesh, colors, &photographs, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+        let fitted = fit(&mesh, None, colors, &photographs, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
         assert!(worst(&mesh, &fitted.vertices, |p| p.abs().max_element() < 0.95) < 0.02);
         // the borders are looked at by fewer pixels; the white beside the square must not bleed in
         assert!(worst(&mesh, &fitted.vertices, |_| true) < 0.06, "{:?}", fitted.report);
@@ -122,7 +122,7 @@ fn gloss_is_found_in_the_degree_that_it_has() {
     let turned = Mat3::from_rotation_z(0.7);
     let photographs = photographs(&cameras, &photos);
     let fitted =
-        fit(&mesh, Colors::Texels(&atlas, &image), &photographs, 2, turned, &Quiet).unwrap().unwrap();
+        fit(&mesh, None, Colors::Texels(&atlas, &image), &photographs, 2, turned, &Quiet).unwrap().unwrap();
     let harmonics = fitted.harmonics.expect("photographs that were left out want it");
     assert!(fitted.report.psnr[2] > fitted.report.psnr[1] + 6.0, "{:?}", fitted.report);
     // in the middle, from the left and from the right of what the cameras saw
@@ -142,7 +142,7 @@ fn the_exposure_of_photographs_is_not_painted_onto_the_head() {
     let image = gray(&atlas);
     let photographs = photographs(&cameras, &photos);
     let colors = Colors::Texels(&atlas, &image);
-    let fitted = fit(&mesh, colors, &photographs, 1, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+    let fitted = fit(&mesh, None, colors, &photographs, 1, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
     assert!(fitted.report.psnr[2] > 38.0, "{:?}", fitted.report);
     let [low, high] = fitted.report.gains;
     let all: Vec<f32> = (0..12).map(|v| 1.0 / gain(v)).collect();
@@ -164,16 +164,19 @@ fn what_nobody_sees_keeps_its_color_and_no_photograph_fits_nothing() {
     let cameras = cameras(3);
     let photos = photos(&cameras, |_, p, _| paint(p));
     let photographs = photographs(&cameras, &photos);
-    let fitted = fit(&mesh, Colors::Vertices, &photographs, 1, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+    let fitted =
+        fit(&mesh, None, Colors::Vertices, &photographs, 1, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
     assert!(fitted.vertices[n as usize..].iter().all(|c| *c == [0.3; 3]));
     let blind = [Photograph {
         mask: Some(&Gray { values: vec![249; 96 * 96], ..photos[0].1.clone() }),
         ..photographs[0]
     }];
-    assert!(fit(&mesh, Colors::Vertices, &blind, 1, Mat3::IDENTITY, &Quiet).unwrap().is_none());
+    assert!(fit(&mesh, None, Colors::Vertices, &blind, 1, Mat3::IDENTITY, &Quiet).unwrap().is_none());
     let image = gray(&atlas);
     let (square, _) = square();
-    assert!(fit(&square, Colors::Texels(&atlas, &image), &[], 1, Mat3::IDENTITY, &Quiet).unwrap().is_none());
+    assert!(
+        fit(&square, None, Colors::Texels(&atlas, &image), &[], 1, Mat3::IDENTITY, &Quiet).unwrap().is_none()
+    );
 }
 
 #[test]
@@ -187,9 +190,37 @@ fn fits_do_not_depend_on_the_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
             let colors = Colors::Texels(&atlas, &image);
-            let fitted = fit(&mesh, colors, &photographs, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+            let fitted = fit(&mesh, None, colors, &photographs, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
             (fitted.texels, fitted.harmonics)
         })
     };
     assert_eq!(look(1), look(3));
+}
+
+#[test]
+fn layers_in_front_take_part_in_the_colors() {
+    // one layer of half opacity, a fifth before the square: what it shows beside the square's own
+    // color is that of another place, and the fit unmixes the two
+    let (mut mesh, atlas) = square();
+    mesh.normals = vec![Vec3::Z; mesh.positions.len()];
+    let n = mesh.positions.len();
+    let shells = Shells { layers: vec![ShellLayer { offsets: vec![0.2; n], alphas: vec![0.5; n] }] };
+    let cameras = cameras(12);
+    let stripes = |p: Vec3| [0.5 + 0.2 * (12.0 * p.x).sin(); 3];
+    let photos = photos(&cameras, |_, p, d| {
+        // where the ray met the layer, whose color is that of the square under it
+        let (own, before) = (stripes(p), stripes(p + 0.2 / d.z * d));
+        std::array::from_fn(|k| 0.5 * (own[k] + before[k]))
+    });
+    let photographs = photographs(&cameras, &photos);
+    let image = gray(&atlas);
+    let error = |shells: Option<&Shells>| {
+        let colors = Colors::Texels(&atlas, &image);
+        let fitted = fit(&mesh, shells, colors, &photographs, 0, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+        // beside the border, where rays miss the layer
+        let each = mesh.positions.iter().zip(&fitted.vertices).filter(|(p, _)| p.abs().max_element() < 0.6);
+        each.map(|(p, c)| (c[0] - stripes(*p)[0]).abs()).fold(0f32, f32::max)
+    };
+    let (with, without) = (error(Some(&shells)), error(None));
+    assert!(with < 0.04 && without > 2.0 * with, "{with} {without}");
 }

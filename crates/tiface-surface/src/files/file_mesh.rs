@@ -24,7 +24,7 @@ use glam::{DMat3, DVec3, Vec2, Vec3, Vec4};
 use std::collections::HashMap;
 use std::path::Path;
 use tiface_base::error::Cause;
-use tiface_base::geom::{Mesh, ShellLayer, Shells, Similarity};
+use tiface_base::geom::{Mesh, ShellLayer, Similarity};
 use tiface_base::image::Photo;
 use tiface_base::{Error, Result, io};
 
@@ -211,12 +211,12 @@ impl FileMesh {
         out
     }
 
-    /// Returns the part of this mesh that has these soft layers. The mesh must have been split.
-    pub fn under(&self, shells: &Shells) -> FileMesh {
+    /// Returns the part of this mesh that has this soft layer. The mesh must have been split.
+    pub fn under(&self, layer: &ShellLayer) -> FileMesh {
         let mut out = FileMesh { translation: self.translation, ..FileMesh::default() };
         let mut known = vec![u32::MAX; self.positions.len()];
         let of_mesh = |t: &[u32; 3]| t.map(|v| self.source[v as usize]);
-        let has = |t: &&[u32; 3]| shells.layers.iter().any(|layer| layer.has(&of_mesh(t)));
+        let has = |t: &&[u32; 3]| layer.has(&of_mesh(t));
         for triangle in self.triangles.iter().filter(has) {
             let own = triangle.map(|v| {
                 if known[v as usize] == u32::MAX {

@@ -10,9 +10,10 @@
 //!
 //! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node that
 //! users can hide: one primitive each, the innermost first, blended, with the mesh's base color
-//! times the alpha of `COLOR_0`, their back faces not drawn. glTF defines no drawing order: the
-//! layers look right where primitives are drawn in the file's order, after all opaque ones. Their
-//! material says `"extras": { "tiface": { "soft_layers": 2 } }`.
+//! times the alpha of `COLOR_0`, drawn from both sides, since path tracers draw both anyway. glTF
+//! defines no drawing order: the layers look right where primitives are drawn in the file's order,
+//! after all opaque ones, or sorted by distance. Their material says
+//! `"extras": { "tiface": { "soft_layers": 2 } }`.
 //!
 //! Textures that depend on the view: tools may drop a texture that nothing refers to, and the
 //! Khronos validator warns about a texture that only `extras` refers to. So each lobe is the base
@@ -134,18 +135,15 @@ fn soft_layers(
     let mut soft = material(options, name.clone());
     soft.pbr_metallic_roughness.base_color_texture = texture;
     soft.alpha_mode = Valid(json::material::AlphaMode::Blend);
-    soft.extras = extras(json!({"soft_layers": shells.layers.len()}));
-    let part = file.under(shells);
-    if part.triangles.is_empty() {
-        return None;
-    }
-    // all layers share everything but positions and opacity; an unlit material needs no normals
-    let indices = document.indices(&part.triangles, part.positions.len());
-    let uvs = (!part.uvs.is_empty()).then(|| document.floats(&part.uvs));
-    let normals = (!options.unlit).then(|| document.floats(&part.normals));
+    soft.double_sided = true;
     let white = [1.0; 3];
     let mut primitives = Vec::new();
     for layer in &shells.layers {
+        let part = file.under(layer);
+        if part.triangles.is_empty() {
+            continue;
+        }
+        let indices = document.indices(&part.triangles, part.positions.len());
         let color = |(v, source): (usize, &u32)| {
             let [r, g, b] = part.colors.get(v).map_or(white, |c| c.map(linear_from_srgb));
             [r, g, b, layer.alphas[*source as usize]].map(quantize)
@@ -155,10 +153,19 @@ fn soft_layers(
             (Valid(Semantic::Positions), document.positions(&part.moved(layer, scale))),
             (Valid(Semantic::Colors(0)), document.bytes(&colors)),
         ]);
-        attributes.extend(uvs.map(|uvs| (Valid(Semantic::TexCoords(0)), uvs)));
-        attributes.extend(normals.map(|normals| (Valid(Semantic::Normals), normals)));
+        if !part.uvs.is_empty() {
+            attributes.insert(Valid(Semantic::TexCoords(0)), document.floats(&part.uvs));
+        }
+        // an unlit material needs no normals
+        if !options.unlit {
+            attributes.insert(Valid(Semantic::Normals), document.floats(&part.normals));
+        }
         primitives.push(primitive(attributes, indices));
     }
+    if primitives.is_empty() {
+        return None;
+    }
+    soft.extras = extras(json!({"soft_layers": primitives.len()}));
     let material = document.root.push(soft);
     primitives.iter_mut().for_each(|p| p.material = Some(material));
     Some(mesh(primitives, Some(name)))
@@ -312,6 +319,7 @@ mod tests {
     use crate::files::file_mesh::tests::tetrahedron;
     use crate::files::{PictureSource, ReadOptions, read, read_with, weld};
     use std::path::Path;
+    use tiface_base::geom::ShellLayer;
     use tiface_base::image::srgb_from_linear;
     use tiface_base::io::{Limits, parse_photo};
 
@@ -483,7 +491,7 @@ mod tests {
                 (&json!("BLEND"), &json!(2))
             );
             assert_eq!(material["pbrMetallicRoughness"]["baseColorTexture"]["index"], 0);
-            assert_ne!(material["doubleSided"], true);
+            assert_eq!(material["doubleSided"], true);
             assert_eq!(
                 json["accessors"][layer["attributes"]["COLOR_0"].as_u64().unwrap() as usize]["type"],
                 "VEC4"
@@ -493,10 +501,56 @@ mod tests {
         // layer lies 0.3 before it
         let part = FileMesh::new(&head.mesh, None, &options.file_from_mesh().unwrap())
             .unwrap()
-            .under(head.shells.as_ref().unwrap());
+            .under(&head.shells.as_ref().unwrap().layers[0]);
         let at = part.source.iter().position(|&v| v == 2).unwrap();
         let moved = part.moved(&head.shells.unwrap().layers[0], 0.5);
         assert!(moved[at].distance(Vec3::new(0.0, 0.5, 0.15)) < 1e-6);
         assert_eq!(part.triangles.len(), 4);
+    }
+
+    /// Returns the bytes of an accessor of a GLB.
+    fn bytes_of_accessor<'a>(glb: &'a [u8], json: &serde_json::Value, at: &serde_json::Value) -> &'a [u8] {
+        let number = |v: &serde_json::Value| v.as_u64().unwrap_or(0) as usize;
+        let accessor = &json["accessors"][number(at)];
+        let view = &json["bufferViews"][number(&accessor["bufferView"])];
+        let binary = &glb[20 + u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize + 8..];
+        &binary[number(&view["byteOffset"])..][..number(&view["byteLength"])]
+    }
+
+    #[test]
+    fn a_file_holds_the_triangles_of_each_layer_that_rays_meet() {
+        // the first layer is on the first half of a strip, the second on a tenth in the middle
+        let mesh = strip(200);
+        let layer = |from: usize, to: usize| ShellLayer {
+            offsets: vec![from as f32 * 1e-3 + 0.5; 200],
+            alphas: (0..200).map(|v| if (from..to).contains(&v) { 51.0 / 255.0 } else { 0.0 }).collect(),
+        };
+        let shells = Shells { layers: vec![layer(0, 100), layer(90, 110)] };
+        let glb = to_glb(&mesh, None, Some(&shells), &ExportOptions::default()).unwrap();
+        let json = json_of(&glb);
+        let primitives = json["meshes"][1]["primitives"].as_array().unwrap();
+        assert_eq!(primitives.len(), 2);
+        for (primitive, layer) in primitives.iter().zip(&shells.layers) {
+            let floats = |name: &str| -> Vec<f32> {
+                let bytes = bytes_of_accessor(&glb, &json, &primitive["attributes"][name]);
+                bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect()
+            };
+            let at = floats("POSITION");
+            let colors = bytes_of_accessor(&glb, &json, &primitive["attributes"]["COLOR_0"]);
+            let indices = bytes_of_accessor(&glb, &json, &primitive["indices"]).as_chunks::<2>().0;
+            let count = json["accessors"][primitive["indices"].as_u64().unwrap() as usize]["count"].as_u64();
+            let corners: Vec<usize> =
+                indices.iter().take(count.unwrap() as usize).map(|b| u16::from_le_bytes(*b).into()).collect();
+            // what ray caster and rasterizer draw
+            let (surface, _) = layer.surface(&mesh);
+            assert_eq!(corners.len(), 3 * surface.triangles.len());
+            let used = corners.iter().max().unwrap() + 1;
+            assert!(used < 200 && at.len() == 3 * used, "no more vertices than its triangles have");
+            for (&corner, &v) in corners.iter().zip(surface.triangles.as_flattened()) {
+                let p = Vec3::new(at[3 * corner], at[3 * corner + 1], at[3 * corner + 2]);
+                assert!(p.distance(surface.positions[v as usize]) < 1e-6);
+                assert_eq!(f32::from(colors[4 * corner + 3]) / 255.0, layer.alphas[v as usize]);
+            }
+        }
     }
 }

@@ -11,7 +11,8 @@
 //!    attributes do not depend on the snapping (`paint`).
 //!
 //! Translucent layers are drawn each into a tile of its own, where the mesh does not hide it, and
-//! blended sample by sample, the outermost first.
+//! blended sample by sample: the front faces from the outermost layer, then the back faces from the
+//! innermost. Where a side of a layer lies over itself, the nearest one is drawn.
 //!
 //! Coverage is that of the four samples; uncovered pixels are transparent black. Every tile is made
 //! by one thread in the order of the triangles: same mesh, same picture.
@@ -24,7 +25,7 @@ use super::hits::RayHits;
 use super::view::RenderedView;
 use bytemuck::Zeroable;
 use paint::{Painter, PictureRows, RasterSurface, SampleBatch, TileArea, straight_rays};
-use project::{Bins, Faces, Lens, TILE};
+use project::{Bins, Faces, Lens, Sides, TILE};
 use rayon::prelude::*;
 use tiface_base::geom::{Camera, Mesh, ShellLayer, Shells, Similarity};
 use tiface_base::image::Image;
@@ -225,18 +226,21 @@ fn bands(
 /// Triangles that share their vertices, sorted into tiles.
 type BinnedSurface<'a> = (Vec<Bins>, RasterSurface<'a>);
 
-/// Returns the mesh, and the layers around it from the innermost.
+/// Returns the mesh, and the sides of the layers around it, the nearest first.
 fn surfaces<'a>(
     lens: &Lens,
     mesh: &'a Mesh,
     layers: Option<&'a RasterLayers>,
     cull: bool,
 ) -> Vec<BinnedSurface<'a>> {
-    let core = Faces { positions: &mesh.positions, triangles: &mesh.triangles, ids: None, cull };
+    let sides = if cull { Sides::Front } else { Sides::Both };
+    let core = Faces { positions: &mesh.positions, triangles: &mesh.triangles, ids: None, sides };
     let mut surfaces = vec![(lens.bin(&core), RasterSurface { positions: &mesh.positions, shell: None })];
-    for layer in layers.iter().flat_map(|l| &l.layers) {
+    let layers = layers.map_or(&[][..], |l| &l.layers);
+    let fronts = layers.iter().rev().map(|layer| (layer, Sides::Front));
+    for (layer, sides) in fronts.chain(layers.iter().map(|layer| (layer, Sides::Back))) {
         let RasterLayer { layer, surface: Mesh { positions, triangles, .. }, ids } = layer;
-        let faces = Faces { positions, triangles, ids: Some(ids), cull: true };
+        let faces = Faces { positions, triangles, ids: Some(ids), sides };
         surfaces.push((lens.bin(&faces), RasterSurface { positions, shell: Some(layer) }));
     }
     surfaces
@@ -262,7 +266,7 @@ impl Scratch {
     }
 }
 
-/// Draws the tiles of a band of a picture of this width: the layers from the outermost, then the
+/// Draws the tiles of a band of a picture of this width: the layers from the nearest side, then the
 /// mesh.
 fn draw_band<C: Fn(&RayHits) -> Vec<[f32; 3]>>(
     painter: &Painter<'_, C>,
@@ -284,7 +288,7 @@ fn draw_band<C: Fn(&RayHits) -> Vec<[f32; 3]>>(
         let (core, own) = &surfaces[0];
         draw(tile, core, index);
         let mut light = Vec::new();
-        for (bins, surface) in surfaces[1..].iter().rev().filter(|(bins, _)| has(bins)) {
+        for (bins, surface) in surfaces[1..].iter().filter(|(bins, _)| has(bins)) {
             if over.is_empty() {
                 over.push(Tile::new());
             }

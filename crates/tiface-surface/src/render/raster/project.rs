@@ -98,8 +98,16 @@ pub(super) struct Faces<'a> {
     pub triangles: &'a [[u32; 3]],
     /// Their indices in the mesh; `None` if they are the same.
     pub ids: Option<&'a [u32]>,
-    /// Whether back faces are left out.
-    pub cull: bool,
+    /// The faces that are drawn.
+    pub sides: Sides,
+}
+
+/// The sides of triangles that are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Sides {
+    Both,
+    Front,
+    Back,
 }
 
 impl<'a> Lens<'a> {
@@ -171,11 +179,11 @@ impl<'a> Lens<'a> {
                 if straight {
                     let face = t.map(|v| corners[v as usize]);
                     if face.iter().all(|c| c.inverse_depth > 0.0) {
-                        self.add(face, triangle, all.cull, &mut faces);
+                        self.add(face, triangle, all.sides, &mut faces);
                         continue;
                     }
                 }
-                self.cut(t.map(|v| self.inside(all.positions[v as usize])), triangle, all.cull, &mut faces);
+                self.cut(t.map(|v| self.inside(all.positions[v as usize])), triangle, all.sides, &mut faces);
             }
             self.sort(faces)
         };
@@ -221,7 +229,7 @@ impl<'a> Lens<'a> {
     ///
     /// A new corner is computed from the end of its edge that is kept, so both triangles at an edge
     /// get the same one.
-    fn cut(&self, triangle: [Vec3; 3], id: u32, cull: bool, out: &mut Vec<Face>) {
+    fn cut(&self, triangle: [Vec3; 3], id: u32, sides: Sides, out: &mut Vec<Face>) {
         let [left, right, top, bottom] = self.seen;
         let planes: [(Vec3, f32); 5] = [
             (Vec3::Z, self.near),
@@ -254,13 +262,13 @@ impl<'a> Lens<'a> {
         let ideal = |p: &Vec3| Vec3::new(p.x, p.y, 1.0) / p.z.max(self.near);
         let polygon: Vec<Vec3> = polygon.iter().map(ideal).collect();
         for k in 2..polygon.len() {
-            self.bend([polygon[0], polygon[k - 1], polygon[k]], id, cull, out);
+            self.bend([polygon[0], polygon[k - 1], polygon[k]], id, sides, out);
         }
     }
 
     /// Adds a triangle, halved until its edges are where the lens puts them. Whether an edge is
     /// halved depends on its ends alone, so the triangles at both sides agree.
-    fn bend(&self, [a, b, c]: [Vec3; 3], id: u32, cull: bool, out: &mut Vec<Face>) {
+    fn bend(&self, [a, b, c]: [Vec3; 3], id: u32, sides: Sides, out: &mut Vec<Face>) {
         let mut pieces = vec![([a, b, c], 0)];
         while let Some((piece, depth)) = pieces.pop() {
             let off = |k: usize| {
@@ -280,7 +288,7 @@ impl<'a> Lens<'a> {
                 _ => {
                     let corners = piece.map(|p| self.corner(p, MAX_CLIPPED_COORDINATE));
                     if corners.iter().all(|c| c.inverse_depth > 0.0) {
-                        self.add(corners, id, cull, out);
+                        self.add(corners, id, sides, out);
                     }
                 }
             }
@@ -288,12 +296,12 @@ impl<'a> Lens<'a> {
     }
 
     #[inline(always)]
-    fn add(&self, [a, b, c]: [Corner; 3], triangle: u32, cull: bool, out: &mut Vec<Face>) {
+    fn add(&self, [a, b, c]: [Corner; 3], triangle: u32, sides: Sides, out: &mut Vec<Face>) {
         let area = area([a, b, c]);
         // y runs down: what is counter-clockwise from outside is so on the picture, and its area is
         // negative
         let back = (area > 0) != self.mirrored;
-        if area == 0 || (back && cull) {
+        if area == 0 || sides == (if back { Sides::Front } else { Sides::Back }) {
             return;
         }
         out.push(Face { corners: if area > 0 { [a, b, c] } else { [a, c, b] }, triangle, back });

@@ -157,7 +157,7 @@ fn layers_are_blended_as_the_ray_caster_blends_them() {
     let mut mesh = ball(24);
     mesh.normals = mesh.angle_weighted_normals();
     let layer = |k: usize| ShellLayer {
-        offsets: mesh.positions.iter().map(|p| 0.04 * k as f32 * (1.0 + 0.3 * (8.0 * p.x).sin())).collect(),
+        offsets: mesh.positions.iter().map(|p| 0.04 * k as f32 * (1.0 + 0.3 * (5.0 * p.x).sin())).collect(),
         // none at all below
         alphas: mesh.positions.iter().map(|p| (0.6 * p.y + 0.1 * k as f32).clamp(0.0, 0.9)).collect(),
     };

@@ -1,0 +1,238 @@
+//! Photographs' outlines as equations for the opacities of layers.
+
+use super::super::appearance::{Nodes, Photograph};
+use glam::Vec2;
+use rayon::prelude::*;
+use tiface_base::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, Shells};
+use tiface_base::math::cg::{conjugate_gradients, dot};
+use tiface_base::{Monitor, Result};
+
+/// Width of the band on each side of a mask's outline whose pixels are compared: no layer may reach
+/// beyond it unseen.
+const BAND_PX: usize = 10;
+
+/// Approximate maximum number of compared pixels.
+const MAX_PIXELS: usize = 400_000;
+
+/// Rays along each side of a pixel.
+const RAYS_PER_SIDE: usize = 2;
+
+/// Rays of a pixel.
+const RAYS_PER_PIXEL: usize = RAYS_PER_SIDE * RAYS_PER_SIDE;
+
+/// Weights of squared opacities, and of squared differences along an edge, against the square of
+/// one pixel's error: where no outline tells, there is no layer.
+const RIDGE: f64 = 0.05;
+const SMOOTH: f64 = 0.3;
+
+/// Gauss-Newton steps.
+const ROUNDS: usize = 4;
+
+/// Maximum number of steps of conjugate gradients in each.
+const STEPS: usize = 60;
+
+/// Maximum opacity of a layer: beyond it no light would be left to learn from.
+const MAX_ALPHA: f32 = 0.95;
+
+/// The hits of the rays of pixels near the outlines.
+#[derive(Default)]
+pub struct Outlines {
+    /// Photograph of each row.
+    view: Vec<u32>,
+    /// Its mask, 0..=1.
+    target: Vec<f32>,
+    /// Rays of each row that meet the mesh.
+    whole: Vec<usize>,
+    /// The other rays of each row: the layers that each meets, the nearest first.
+    pub rays: Vec<[Layers; RAYS_PER_PIXEL]>,
+    /// Vertices of the triangles of the mesh.
+    triangles: Vec<[u32; 3]>,
+}
+
+/// The layers that a ray meets, the nearest first, and where.
+pub type Layers = Vec<(usize, Hit)>;
+
+/// Returns the number of a pixel's rays that hit the mesh, and the layers that the others hit.
+fn look(
+    camera: &Camera,
+    (x, y): (usize, usize),
+    bvh: &Bvh,
+    caster: &ShellCaster,
+) -> (usize, [Layers; RAYS_PER_PIXEL]) {
+    let (mut whole, mut rays) = (0, [const { Layers::new() }; RAYS_PER_PIXEL]);
+    for (k, layers) in rays.iter_mut().enumerate() {
+        let sub = |at: usize, k: usize| at as f32 + (k as f32 + 0.5) / RAYS_PER_SIDE as f32;
+        let Some(ray) = camera.ray(Vec2::new(sub(x, k % RAYS_PER_SIDE), sub(y, k / RAYS_PER_SIDE))) else {
+            continue;
+        };
+        if bvh.any_hit(&ray) {
+            whole += 1;
+        } else {
+            caster.cast(&ray, f32::INFINITY, |layer, hit, _| layers.push((layer, hit)));
+        }
+    }
+    (whole, rays)
+}
+
+impl Outlines {
+    /// Casts the rays of the pixels near the outlines of photographs, on a mesh with these layers.
+    ///
+    /// # Errors
+    ///
+    /// A request to stop.
+    pub fn new(
+        mesh: &Mesh,
+        shells: &Shells,
+        photographs: &[Photograph],
+        monitor: &dyn Monitor,
+    ) -> Result<Outlines> {
+        let (bvh, caster) = (Bvh::new(mesh), ShellCaster::new(mesh, shells));
+        let mut all = Outlines { triangles: mesh.triangles.clone(), ..Outlines::default() };
+        let bands: Vec<Vec<usize>> = photographs.par_iter().map(|p| p.outline(BAND_PX)).collect();
+        let stride = bands.iter().map(Vec::len).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
+        for ((v, photograph), band) in photographs.iter().enumerate().zip(bands) {
+            monitor.check_stop()?;
+            let Some(mask) = photograph.mask else { continue };
+            let some: Vec<usize> = band.into_iter().step_by(stride).collect();
+            let row = |&at: &usize| {
+                let target = f32::from(mask.values[at]) / 255.0;
+                let (x, y) = (at % mask.width as usize, at / mask.width as usize);
+                let (whole, rays) = look(photograph.camera, (x, y), &bvh, &caster);
+                // pixels without opacity in render and mask, and opaque ones, carry no information
+                let says = whole < RAYS_PER_PIXEL && (target > 0.0 || rays.iter().any(|l| !l.is_empty()));
+                says.then_some((target, whole, rays))
+            };
+            for (target, whole, rays) in some.par_iter().filter_map(row).collect::<Vec<_>>() {
+                all.view.push(v as u32);
+                all.target.push(target);
+                all.whole.push(whole);
+                all.rays.push(rays);
+            }
+        }
+        Ok(all)
+    }
+
+    /// Returns the number of compared pixels.
+    pub fn rows(&self) -> usize {
+        self.view.len()
+    }
+
+    /// Returns the opacity of a row, and adds its derivatives by the opacities of the layers'
+    /// vertices, `vertices` a layer.
+    pub fn opacity(&self, row: usize, shells: Option<&Shells>, slopes: Option<&mut Vec<(u32, f32)>>) -> f32 {
+        let mut opacity = self.whole[row] as f32;
+        let mut slopes = slopes;
+        for layers in &self.rays[row] {
+            let Some(shells) = shells else { break };
+            let mut through = 1.0;
+            let alphas: Vec<f32> = layers
+                .iter()
+                .map(|(layer, hit)| {
+                    let alpha = shells.layers[*layer].alpha(hit, self.triangles[hit.triangle as usize]);
+                    through *= 1.0 - alpha;
+                    alpha
+                })
+                .collect();
+            opacity += 1.0 - through;
+            if let Some(slopes) = slopes.as_deref_mut() {
+                for (k, (layer, hit)) in layers.iter().enumerate() {
+                    let others =
+                        (0..alphas.len()).filter(|&o| o != k).map(|o| 1.0 - alphas[o]).product::<f32>();
+                    let own = &shells.layers[*layer].alphas;
+                    for (v, w) in self.triangles[hit.triangle as usize].into_iter().zip(hit.weights()) {
+                        let slope = others * w / RAYS_PER_PIXEL as f32;
+                        let at = (layer * own.len()) as u32 + v;
+                        match slopes.iter_mut().find(|s| s.0 == at) {
+                            Some(s) => s.1 += slope,
+                            None => slopes.push((at, slope)),
+                        }
+                    }
+                }
+            }
+        }
+        opacity / RAYS_PER_PIXEL as f32
+    }
+
+    /// Returns the root mean square error of the opacity of the rows that `keep` names (by
+    /// photograph).
+    pub fn error(&self, shells: Option<&Shells>, keep: &dyn Fn(u32) -> bool) -> f64 {
+        let rows: Vec<usize> = (0..self.rows()).filter(|&row| keep(self.view[row])).collect();
+        let square = |&row: &usize| f64::from(self.opacity(row, shells, None) - self.target[row]).powi(2);
+        (rows.iter().map(square).sum::<f64>() / rows.len().max(1) as f64).sqrt()
+    }
+
+    /// Returns the opacities that bring the rows that `keep` names (by photograph) closest to their
+    /// masks, from those of `shells`; vertices without opacity keep none.
+    ///
+    /// Steps of Gauss and Newton, each projected onto the opacities' range: a vertex at its lower
+    /// end takes part in a step only if it is to leave it.
+    pub fn fit(&self, shells: &Shells, nodes: &Nodes, keep: &dyn Fn(u32) -> bool) -> Shells {
+        let vertices = nodes.len();
+        let rows: Vec<usize> = (0..self.rows()).filter(|&row| keep(self.view[row])).collect();
+        let known: Vec<bool> =
+            shells.layers.iter().flat_map(|layer| layer.alphas.iter().map(|a| *a > 0.0)).collect();
+        let mut fitted = shells.clone();
+        for _ in 0..ROUNDS {
+            let equations = self.equations(&rows, &fitted);
+            let x: Vec<f64> =
+                fitted.layers.iter().flat_map(|layer| layer.alphas.iter().map(|a| f64::from(*a))).collect();
+            let step = step(&equations, nodes, &x, &known);
+            for (layer, step) in fitted.layers.iter_mut().zip(step.chunks(vertices)) {
+                for (alpha, step) in layer.alphas.iter_mut().zip(step) {
+                    *alpha = (*alpha + *step as f32).clamp(0.0, MAX_ALPHA);
+                }
+            }
+        }
+        fitted
+    }
+
+    /// Returns what each row misses of its mask's opacity, with the slopes of its own.
+    fn equations(&self, rows: &[usize], shells: &Shells) -> Vec<(f32, Vec<(u32, f32)>)> {
+        let equation = |&row: &usize| {
+            let mut slopes = Vec::new();
+            let opacity = self.opacity(row, Some(shells), Some(&mut slopes));
+            (self.target[row] - opacity, slopes)
+        };
+        rows.par_iter().map(equation).collect()
+    }
+}
+
+/// Returns the step of the opacities `x` that meets the equations best, `vertices` a layer; none of
+/// those that are not `known`.
+fn step(equations: &[(f32, Vec<(u32, f32)>)], nodes: &Nodes, x: &[f64], known: &[bool]) -> Vec<f64> {
+    let vertices = nodes.len();
+    // the weights of squares and of differences; what neighbors without a layer have counts, so
+    // that opacity falls towards them
+    let prior = |x: &[f64], i: usize| {
+        let base = i / vertices * vertices;
+        let near = nodes.near(i - base).iter().map(|&n| x[i] - x[base + n as usize]).sum::<f64>();
+        RIDGE * x[i] + SMOOTH * near
+    };
+    let mut right: Vec<f64> = (0..x.len()).map(|i| if known[i] { -prior(x, i) } else { 0.0 }).collect();
+    let mut diagonal: Vec<f64> =
+        (0..x.len()).map(|i| RIDGE + SMOOTH * nodes.near(i % vertices).len() as f64).collect();
+    for (rest, slopes) in equations {
+        for &(at, slope) in slopes {
+            right[at as usize] += f64::from(slope * rest);
+            diagonal[at as usize] += f64::from(slope).powi(2);
+        }
+    }
+    let free: Vec<bool> = (0..x.len()).map(|i| known[i] && (x[i] > 0.0 || right[i] > 0.0)).collect();
+    right.iter_mut().zip(&free).filter(|(_, free)| !**free).for_each(|(r, _)| *r = 0.0);
+    let apply = |x: &[f64], out: &mut [f64]| {
+        (0..x.len()).for_each(|i| out[i] = prior(x, i));
+        for (_, slopes) in equations {
+            let sum: f64 = slopes.iter().map(|&(at, slope)| f64::from(slope) * x[at as usize]).sum();
+            slopes.iter().for_each(|&(at, slope)| out[at as usize] += f64::from(slope) * sum);
+        }
+        out.iter_mut().zip(&free).filter(|(_, free)| !**free).for_each(|(o, _)| *o = 0.0);
+    };
+    let precondition = |r: &[f64], z: &mut [f64]| {
+        z.iter_mut().zip(r).zip(&diagonal).for_each(|((z, r), d)| *z = r / d);
+    };
+    let first = dot(&right, &right);
+    let mut step = vec![0f64; x.len()];
+    let done = |round: usize, r: &[f64]| round >= STEPS || dot(r, r) <= 1e-6 * first;
+    conjugate_gradients(&mut step, right, apply, precondition, done);
+    step
+}
