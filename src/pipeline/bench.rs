@@ -502,6 +502,7 @@ impl<'f> Finisher<'f> {
             surface: &self.mesh,
             cell,
             field: &closed,
+            cap: self.extracted.cap.as_ref(),
             cameras: &cameras,
             photographs: &photographs,
             scene: &bench.scene,

@@ -8,7 +8,7 @@ use glam::{Vec2, Vec3};
 
 /// Triangles over shared vertices, counter-clockwise seen from outside.
 ///
-/// `normals` and `colors` are either empty or as long as `positions`.
+/// `normals`, `colors` and `seen_by` are either empty or as long as `positions`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {
     /// Vertex positions.
@@ -17,6 +17,8 @@ pub struct Mesh {
     pub normals: Vec<Vec3>,
     /// Vertex colors, sRGB-coded, 0..=1.
     pub colors: Vec<[f32; 3]>,
+    /// Number of cameras that see each vertex, up to 255.
+    pub seen_by: Vec<u8>,
     /// Vertex indices, three a triangle.
     pub triangles: Vec<[u32; 3]>,
 }
@@ -129,6 +131,7 @@ impl Mesh {
         pick(&mut self.positions, &to);
         pick(&mut self.normals, &to);
         pick(&mut self.colors, &to);
+        pick(&mut self.seen_by, &to);
     }
 
     /// Returns the same mesh in another coordinate system.
@@ -137,6 +140,7 @@ impl Mesh {
             positions: self.positions.iter().map(|&p| b_from_a.point(p)).collect(),
             normals: self.normals.iter().map(|&n| b_from_a.direction(n).normalize_or_zero()).collect(),
             colors: self.colors.clone(),
+            seen_by: self.seen_by.clone(),
             triangles: self.triangles.clone(),
         }
     }

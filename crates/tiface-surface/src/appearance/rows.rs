@@ -33,6 +33,14 @@ impl Photograph<'_> {
         self.mask.is_none_or(|m| m.values[at] >= OPAQUE_ALPHA) && self.valid.is_none_or(|v| v.values[at] > 0)
     }
 
+    /// Returns whether a point of the scene falls on a pixel that shows the head alone.
+    pub fn shows_head_at(&self, point: Vec3) -> bool {
+        let Some((at, _)) = self.camera.project(point) else { return false };
+        let (w, h) = (self.photo.width as f32, self.photo.height as f32);
+        let inside = (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y);
+        inside && self.is_head(at.y as usize * self.photo.width as usize + at.x as usize)
+    }
+
     /// Returns the usable pixels within `margin` pixels of the mask's outline.
     pub fn outline(&self, margin: usize) -> Vec<usize> {
         let Some(mask) = self.mask else { return Vec::new() };

@@ -14,6 +14,9 @@
 //! layers look right where primitives are drawn in the file's order, after all opaque ones. Their
 //! material says `"extras": { "tiface": { "soft_layers": 2 } }`.
 //!
+//! How many cameras see a vertex is its attribute `_SEEN_BY`, if the mesh knows: a number as float,
+//! which programs that import attributes can mask by.
+//!
 //! Textures that depend on the view: tools may drop a texture that nothing refers to, and the
 //! Khronos validator warns about a texture that only `extras` refers to. So each lobe is the base
 //! color of a material of its own, which the primitive offers as a variant
@@ -298,6 +301,10 @@ fn attributes(document: &mut GlbDocument, file: &FileMesh) -> Attributes {
         let linear: Vec<Vec3> = file.colors.iter().map(|c| c.map(linear_from_srgb).into()).collect();
         attributes.insert(Valid(Semantic::Colors(0)), document.floats(&linear));
     }
+    if !file.seen_by.is_empty() {
+        let numbers: Vec<f32> = file.seen_by.iter().map(|&n| f32::from(n)).collect();
+        attributes.insert(Valid(Semantic::Extras("SEEN_BY".into())), document.floats(&numbers));
+    }
     attributes
 }
 
@@ -322,6 +329,7 @@ mod tests {
             positions: (0..vertices).map(at).collect(),
             normals: (0..vertices).map(|_| Vec3::Y).collect(),
             colors: (0..vertices).map(|i| [i as f32 / vertices as f32, 0.5, 1.0]).collect(),
+            seen_by: Vec::new(),
             triangles: (0..vertices - 2).map(|i| [i, i + 1, i + 2]).collect(),
         }
     }

@@ -23,7 +23,7 @@ pub(super) fn weld_map(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
 /// Returns the mesh with equal positions merged, where −0 equals 0. Triangles keep their number and
 /// order, so an atlas stays parallel to them; degenerate ones are kept too.
 ///
-/// A merged vertex has the color of its first copy, and their common normal; copies that disagree,
+/// A merged vertex has the color and the number of cameras of its first copy, and their common normal; copies that disagree,
 /// as on creases, get the unit of their sum.
 pub fn weld(mesh: &Mesh) -> Mesh {
     let (new, positions) = weld_map(mesh);
@@ -36,6 +36,7 @@ pub fn weld(mesh: &Mesh) -> Mesh {
             first += 1;
             out.colors.extend(mesh.colors.get(i));
             out.normals.extend(mesh.normals.get(i));
+            out.seen_by.extend(mesh.seen_by.get(i));
         } else if let Some(&n) = mesh.normals.get(i)
             && (creased[number] || out.normals[number] != n)
         {
