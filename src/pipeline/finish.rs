@@ -117,6 +117,7 @@ impl Finish<'_> {
             log.warnings.extend(done.warnings(&config));
             log.report.insert("simplify".into(), json!(done));
         }
+        self.cap.iter().for_each(|cap| cap.flatten(&mut mesh));
         Ok(mesh)
     }
 

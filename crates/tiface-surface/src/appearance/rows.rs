@@ -1,5 +1,6 @@
 //! Pixels of photographs as rows of a linear system.
 
+use super::glare::is_glare;
 use super::nodes::{Nodes, grouped};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -29,7 +30,7 @@ pub struct Photograph<'a> {
 impl Photograph<'_> {
     /// Returns whether a pixel shows the head alone. Soft pixels also show the background, and
     /// would paint the outline with it.
-    fn is_head(&self, at: usize) -> bool {
+    pub(super) fn is_head(&self, at: usize) -> bool {
         self.mask.is_none_or(|m| m.values[at] >= OPAQUE_ALPHA) && self.valid.is_none_or(|v| v.values[at] > 0)
     }
 
@@ -99,9 +100,12 @@ impl Rows {
                 (0..height).filter(move |y| y % stride == v % stride).map(move |y| (v, y))
             })
             .collect();
+        let glare: Vec<Vec<bool>> = photographs.par_iter().map(is_glare).collect();
         let line = |&(view, y): &(u32, u32)| {
-            let photograph = &photographs[view as usize];
+            let (photograph, glare) = (&photographs[view as usize], &glare[view as usize]);
             let xs = (y / stride % stride..photograph.photo.width).step_by(stride as usize);
+            let row = y as usize * photograph.photo.width as usize;
+            let xs = xs.filter(move |x| !glare[row + *x as usize]);
             xs.filter_map(move |x| Row::new(mesh, bvh, (view, photograph), [x, y], turned))
         };
         Rows(lines.par_iter().flat_map_iter(line).collect())

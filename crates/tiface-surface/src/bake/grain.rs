@@ -105,7 +105,7 @@ impl Grain<'_> {
             let fresh = || Surroundings::new(self.mesh.positions.len());
             let one = |near: &mut Surroundings, &(middle, source): &(u32, u32)| {
                 let vertices = near.of(self.mesh, self.nodes, middle, 1.2 * radius);
-                let own = vertices.into_iter().flat_map(of_vertex);
+                let own = vertices.into_iter().flat_map(&of_vertex);
                 let patch = Patch::new(self.mesh, middle, source, radius);
                 own.filter_map(|s| Some((s, self.copied(&bvh, &patch, &samples[s as usize])?)))
                     .collect::<Vec<_>>()

@@ -66,11 +66,11 @@ impl SmoothColors<'_> {
             let (seen, guessed) = (SURE * f64::from(trust[v]), GUESS * f64::from(1.0 - trust[v]));
             let (p, q) = (materials.probabilities(own[v]), materials.probabilities(guess[v]));
             let value = |k: usize| (seen * p[k] + guessed * q[k]) / (seen + guessed);
-            (seen + guessed, (0..materials.len()).map(value).collect())
+            (seen + guessed, (0..materials.len()).map(value).collect::<Vec<f64>>())
         };
         let (weights, priors): (Vec<f64>, Vec<Vec<f64>>) =
             (0..trust.len()).into_par_iter().with_min_len(1024).map(prior).unzip();
-        let share = |k: usize| {
+        let share = |k: usize| -> Vec<f32> {
             let values: Vec<f64> = priors.iter().map(|p| p[k]).collect();
             membrane(nodes, &weights, &values, 1.0).into_iter().map(|s| (s as f32).clamp(0.0, 1.0)).collect()
         };
@@ -86,7 +86,8 @@ impl SmoothColors<'_> {
         };
         let channels: Vec<Vec<f64>> = (0..3 * shares.len()).into_par_iter().map(channel).collect();
         let color = |[r, g, b]: &[Vec<f64>; 3], v: usize| [r[v], g[v], b[v]].map(|x| x as f32);
-        let of_material = |rgb| (0..trust.len()).map(|v| color(rgb, v)).collect();
+        let of_material =
+            |rgb: &[Vec<f64>; 3]| -> Vec<[f32; 3]> { (0..trust.len()).map(|v| color(rgb, v)).collect() };
         let colors = channels.as_chunks::<3>().0.iter().map(of_material).collect();
         Some(SmoothColors { triangles: &mesh.triangles, shares, colors })
     }

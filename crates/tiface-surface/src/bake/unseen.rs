@@ -22,6 +22,9 @@ const BRIGHTEST: f64 = 0.999;
 /// Trust below which a texel counts as unseen.
 const UNSEEN: f32 = 0.5;
 
+/// Trust from which on a texel keeps its color: 1, but for rounding.
+const FULL: f32 = 0.999;
+
 /// Texels of a texture by what is known of them, to measure what was made of the unseen ones.
 pub struct TexelTrust {
     /// Texels whose color is trusted, with their materials.
@@ -127,13 +130,13 @@ impl FittedTexture<'_> {
         let trust_of: Vec<f32> =
             trust.iter().zip(&evidence).map(|(t, e)| if *e > 1e-3 { *t } else { 0.0 }).collect();
         let smooth = SmoothColors::new(mesh, &nodes, &trust_of, &own, &guesses)?;
-        let open: Vec<Sample> = all.iter().filter(|s| trust_at(s) < 1.0).copied().collect();
+        let open: Vec<Sample> = all.iter().filter(|s| trust_at(s) < FULL).copied().collect();
         let grain =
             Grain { mesh, atlas, nodes: &nodes, trust: &trust_of, smooth: &smooth, image: &*image, calm };
         let grain = grain.of(&open);
         let material = |s: &Sample| (s.texel, smooth.material_at(&s.hit()).0 as u8);
         let texels = TexelTrust {
-            trusted: all.iter().filter(|s| trust_at(s) >= 1.0).map(material).collect(),
+            trusted: all.iter().filter(|s| trust_at(s) >= FULL).map(material).collect(),
             unseen: open.iter().filter(|s| trust_at(s) < UNSEEN).map(material).collect(),
             texels: all.len(),
             materials: smooth.materials(),
