@@ -334,6 +334,29 @@ mod tests {
         }
     }
 
+    #[test]
+    fn a_file_says_how_many_cameras_see_each_vertex() {
+        let mesh = Mesh { seen_by: vec![0, 1, 2, 3, 255], ..strip(5) };
+        let glb = to_glb(&mesh, None, None, &ExportOptions::default()).unwrap();
+        let json = json_of(&glb);
+        let accessor = &json["meshes"][0]["primitives"][0]["attributes"]["_SEEN_BY"];
+        let accessor = &json["accessors"][accessor.as_u64().unwrap() as usize];
+        assert_eq!((&accessor["type"], &accessor["componentType"]), (&"SCALAR".into(), &5126.into()));
+        // vertices, not indices
+        let view = &json["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+        assert_eq!(view["target"], 34962);
+        assert_eq!(read(&glb, Path::new("a.glb")).unwrap().seen_by, mesh.seen_by);
+        // split at seams
+        let head = crate::files::testing::tetrahedron();
+        let glb = to_glb(&head.mesh, head.texture.as_ref(), None, &ExportOptions::default()).unwrap();
+        let back = read(&glb, Path::new("a.glb")).unwrap();
+        for (p, n) in back.positions.iter().zip(&back.seen_by) {
+            let of = head.mesh.positions.iter().position(|q| q == p).unwrap();
+            assert_eq!(*n, head.mesh.seen_by[of], "{p}");
+        }
+        assert_eq!(back.seen_by.len(), back.positions.len());
+    }
+
     fn json_of(glb: &[u8]) -> serde_json::Value {
         let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
         serde_json::from_slice(&glb[20..20 + length]).unwrap()
