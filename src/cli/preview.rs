@@ -31,8 +31,8 @@ pub(super) struct PreviewOptions {
     /// newest under runs/]
     #[arg(value_name = "RUN|FILE")]
     path: Option<PathBuf>,
-    /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (checkerboard)
-    /// or wire [default: unlit if the mesh has colors, else studio]
+    /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (checkerboard),
+    /// wire or seen (number of cameras) [default: unlit if the mesh has colors, else studio]
     #[arg(long, value_name = "LOOK")]
     #[arg(value_parser = PossibleValuesParser::new(Look::ALL.map(Look::word)).map(|word| look(&word)))]
     light: Option<Look>,
@@ -186,6 +186,10 @@ pub(super) fn run(invocation: &Invocation, options: &PreviewOptions) -> Result<(
     if look == Look::Uv && !preview.has_uvs() {
         let what = format!("`{name}` has no texture coordinates to show");
         return Err(Error::cannot(what, "choose another --light, or add texture coordinates"));
+    }
+    if look == Look::Seen && !preview.knows_cameras() {
+        let what = format!("`{name}` does not say how many cameras see it");
+        return Err(Error::cannot(what, "choose another --light; `tiface mesh` writes it into a run's mesh"));
     }
     let (names, shots) = shots(&preview, options, kind, look)?;
     let destination = kind.destination(out, &name);

@@ -503,6 +503,7 @@ impl<'f> Finisher<'f> {
             surface: &self.mesh,
             cell,
             field: &surface,
+            cap: self.extracted.cap.as_ref(),
             cameras: &cameras,
             photographs: &photographs,
             scene: &bench.scene,

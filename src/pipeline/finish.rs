@@ -9,10 +9,13 @@ use serde_json::{Map, Value, json};
 use tiface_base::geom::{Atlas, Camera, Harmonics, Mesh, SdfField, Shells, Similarity};
 use tiface_base::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
 use tiface_base::{Monitor, Result};
-use tiface_surface::bake::{BakeConfig, Baked, Seams, bake, bake_harmonics, complete, tangent_space};
+use tiface_surface::bake::{
+    BakeConfig, Baked, FittedTexture, Seams, Seen, bake, bake_harmonics, complete, complete_unseen_vertices,
+    tangent_space,
+};
 use tiface_surface::files::{HeadMesh, HeadTexture, Lobes, tangents};
 use tiface_surface::{
-    Appearance, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
+    Appearance, Cap, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
 };
 
 /// How far the true surface may lie from a triangle, in cells: the chords of large triangles and
@@ -41,6 +44,8 @@ pub(super) struct Finish<'a> {
     /// Size of the cells that the surface was extracted with.
     pub cell: f32,
     pub field: &'a dyn SdfField,
+    /// The cap where the frames cut the body.
+    pub cap: Option<&'a Cap>,
     pub cameras: &'a [Camera],
     pub photographs: &'a [Photograph<'a>],
     pub scene: &'a Scene,
@@ -71,16 +76,23 @@ impl Finish<'_> {
     pub fn run(&self) -> Result<FinishedHead> {
         let mut log = StepLog::default();
         let mut mesh = self.simplify(&mut log)?;
+        let seen = Seen::of(&mesh, self.cameras, self.photographs, REACH * self.cell);
+        mesh.seen_by.clone_from(&seen.cameras);
         let world_from_scene = self.scene.scene_from_world.inverse();
         let frames = self.lobe_frames(&mesh, &world_from_scene)?;
         let fit = self.color_fit(&frames, &mut log);
         let shells = self.shells(&mesh, &mut log)?;
         let (texture, harmonics, linear) = if self.config.texture_px == 0 {
+            let guess = mesh.colors.clone();
             let fitted = self.fit_colors(&mut mesh, shells.as_ref(), Colors::Vertices, &fit, &mut log)?;
+            if fitted.is_some() {
+                complete_unseen_vertices(&mut mesh, &seen.trust, &guess);
+            }
             (None, fitted.and_then(|fitted| fitted.harmonics), None)
         } else {
             let layout = self.unwrap(&mesh, &mut log)?;
-            let (mut baked, harmonics) = self.bake(&mut mesh, shells.as_ref(), &layout, &fit, &mut log)?;
+            let (mut baked, harmonics) =
+                self.bake(&mut mesh, shells.as_ref(), &layout, &fit, &seen, &mut log)?;
             let file_from_world = frames.file_from_world().rotation_f32();
             let texture =
                 self.texture(&mesh, layout, &mut baked, harmonics.as_ref(), file_from_world, &mut log);
@@ -101,6 +113,7 @@ impl Finish<'_> {
             log.warnings.extend(done.warnings(&config).iter().map(sentence));
             log.report.insert("simplify".into(), json!(done));
         }
+        self.cap.iter().for_each(|cap| cap.flatten(&mut mesh));
         Ok(mesh)
     }
 
@@ -176,6 +189,7 @@ impl Finish<'_> {
         shells: Option<&Shells>,
         layout: &Atlas,
         fit: &ColorFit,
+        seen: &Seen,
         log: &mut StepLog,
     ) -> Result<(Baked, Option<Harmonics>)> {
         let (c, fits) = (self.config, fit.photographs.is_some());
@@ -199,9 +213,25 @@ impl Finish<'_> {
         let Some(fitted) = self.fit_colors(mesh, shells, Colors::Texels(layout, &image), fit, log)? else {
             return Ok((baked, None));
         };
-        let (texels, known) = fitted.texels;
-        image.data = texels.into_flattened();
+        let (texels, mut known) = fitted.texels;
+        let own =
+            Image { width: layout.width, height: layout.height, channels: 3, data: texels.into_flattened() };
+        let before = own.clone();
+        let guess = std::mem::replace(&mut image, own);
+        let fitted_texture = FittedTexture {
+            mesh: &mut *mesh,
+            atlas: layout,
+            trust: &seen.trust,
+            guess: &guess,
+            image: &mut image,
+            known: &mut known,
+            calm: &|p| self.cap.is_some_and(|cap| cap.holds(p)),
+        };
+        let unseen = fitted_texture.complete_unseen();
         complete(&mut image, &known, c.gutter_px, &Seams::new(mesh, layout));
+        if let Some(unseen) = unseen {
+            log.report.insert("unseen".into(), json!(unseen.report(&before, &image)));
+        }
         image.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
         baked.color = image;
         Ok((baked, fitted.harmonics))

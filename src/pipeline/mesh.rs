@@ -5,6 +5,7 @@
 //! mesh/surface.ply   the whole extraction with colors at its vertices, in the dataset's world
 //!      parts         the same and the head mesh, for the stages after this one
 //!      head.glb …    the head mesh as files
+//!      seen_by.png   how many cameras see each texel: black for none, white for three and more
 //!      frames.json   the transform from the dataset's world to GLB and OBJ files
 //! ```
 
@@ -24,7 +25,7 @@ use tiface_base::geom::{Aabb, Camera, Mesh, Similarity};
 use tiface_base::image::Image;
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, ErrorKind, Monitor, Result};
-use tiface_surface::bake::seen_colors;
+use tiface_surface::bake::{Seen, seen_colors, seen_map, seen_shares};
 use tiface_surface::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use tiface_surface::{self, Cap, HandleReport, MAX_HANDLE, MeshDistance, MeshReport, Photograph};
 
@@ -44,6 +45,9 @@ pub(super) fn mesh(
     let mm = world_from_scene.scale * export.meters(&extracted.mesh, &world_from_scene) * 1000.0;
     extracted.announce(c.cap, mm, dir);
     extracted.end(c.cap);
+    let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
+    let reach = REACH * extracted.report.cell_size;
+    extracted.mesh.seen_by = Seen::of(&extracted.mesh, &cameras, &[], reach).cameras;
     // the extraction took longest, so it is kept even if a later step fails
     let in_world = ExportOptions {
         stem: "surface".into(),
@@ -53,7 +57,6 @@ pub(super) fn mesh(
     write_files(&to_ply(&extracted.mesh, None, &in_world).map_err(advised)?, dir.folder())?;
     // vertices have the color seen along the normal; textures and rays, and so their cap, have the
     // color that cameras see
-    let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
     let views = match c.color {
         ColorSource::Network if c.hair == Hair::None => Vec::new(),
         _ => learn::training_views(capture, scene, config)?,
@@ -63,6 +66,7 @@ pub(super) fn mesh(
         surface: &extracted.mesh,
         cell: extracted.report.cell_size,
         field: &extracted.distance(field),
+        cap: extracted.cap.as_ref().filter(|_| c.cap),
         cameras: &cameras,
         photographs: &photographs(&views),
         scene,
@@ -74,10 +78,13 @@ pub(super) fn mesh(
     warnings.iter().for_each(|w| dir.warn(w));
     let Extraction { mesh: surface, report, cap } = extracted;
     let surface_triangles = surface.triangles.len();
-    let plain = Mesh { colors: Vec::new(), ..surface };
+    let plain = Mesh { colors: Vec::new(), seen_by: Vec::new(), ..surface };
     ExtractedSurface { mesh: plain, cap: cap.filter(|_| c.cap) }.save(&dir.folder().join("parts"))?;
     write_head(&head, linear, &export, c, dir)?;
+    let shares = seen_shares(&head.mesh);
+    seen_note(shares).iter().for_each(|text| dir.note(text));
     let mut summary = shape(&head, &export);
+    summary["seen_by"] = json!(shares);
     summary["surface_triangles"] = json!(surface_triangles);
     summary["handles"] = handles(&report.handles, mm);
     summary["report"] = json!(report);
@@ -97,6 +104,10 @@ fn write_head(
     let frames = json!({"file_from_world": frames.file_from_world()});
     io::write_atomic(&dir.folder().join("frames.json"), format!("{frames:#}\n").as_bytes())?;
     head.save(&dir.folder().join("parts"))?;
+    if let Some(texture) = &head.texture {
+        let map = seen_map(&head.mesh, &texture.atlas, c.gutter_px);
+        io::write_png_gray(&dir.folder().join("seen_by.png"), &map)?;
+    }
     if let Some(linear) = linear {
         write_exr(&linear, &dir.folder().join("head.exr"))?;
     }
@@ -125,6 +136,21 @@ fn shape(head: &HeadMesh, export: &Export) -> Value {
         "closed": mesh.is_closed(),
         "texture_px": texture.as_ref().map_or(0, |t| t.color.width),
         "size_m": size.to_array(),
+    })
+}
+
+/// Shares of the surface below which it is not said who saw it.
+const WORTH_SAYING: f64 = 0.01;
+
+/// Says how much of a surface no camera and only one saw, by the shares that 0, 1, 2, and 3 or more
+/// cameras see; `None` where all but a hundredth was seen.
+pub(super) fn seen_note([none, one, ..]: [f64; 4]) -> Option<String> {
+    (none >= WORTH_SAYING).then(|| {
+        format!(
+            "{:.0} % of this surface was seen by no camera, {:.0} % by one: shape and color there follow what lies around",
+            100.0 * none,
+            100.0 * one
+        )
     })
 }
 
@@ -302,6 +328,13 @@ fn handles(report: &HandleReport, mm: f64) -> Value {
 mod tests {
     use super::*;
     use crate::run::{Fingerprint, Plan};
+
+    #[test]
+    fn what_no_camera_saw_is_said_from_a_hundredth_on() {
+        assert_eq!(seen_note([0.009, 0.5, 0.1, 0.391]), None);
+        let said = seen_note([0.297, 0.081, 0.1, 0.522]).unwrap();
+        assert!(said.starts_with("30 % of this surface was seen by no camera, 8 % by one"), "{said}");
+    }
 
     #[test]
     fn a_mesh_that_is_made_again_is_not_read_half() {

@@ -131,6 +131,8 @@ fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
     ];
     let of = |stage: Stage| records.iter().find(|(s, _)| *s == stage).map(|(_, record)| &record.summary);
     facts.extend(report::height(of(Stage::Mask), of(Stage::Mesh)));
+    let unseen = of(Stage::Mesh).and_then(|mesh| mesh["seen_by"][0].as_f64());
+    facts.extend(unseen.map(|share| format!("{:.0} % of the surface seen by no camera", 100.0 * share)));
     if let Some(megabytes) = report::glb_megabytes(session.run.dir()) {
         facts.push(format!("head.glb {megabytes:.1} MB"));
     }

@@ -94,6 +94,11 @@ impl Preview {
         if is_colored { Look::Unlit } else { Look::Studio }
     }
 
+    /// Returns whether the mesh says how many cameras see it.
+    pub fn knows_cameras(&self) -> bool {
+        !self.head.mesh.seen_by.is_empty()
+    }
+
     /// Returns whether the mesh has UV coordinates.
     pub fn has_uvs(&self) -> bool {
         self.head.texture.is_some() || self.bare_atlas.is_some()

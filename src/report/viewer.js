@@ -17,12 +17,15 @@ const BASIS = [
   "-1.0925484 * d.y * d.z", "0.9461747 * d.z * d.z - 0.31539157", "-1.0925484 * d.x * d.z",
   "0.5462742 * (d.x * d.x - d.y * d.y)",
 ];
-const MODES = ["view", "texture", "normals", "shape", "wire"];
+const MODES = ["view", "texture", "normals", "shape", "wire", "seen"];
+/** Colors of what no camera sees, one, two, and three or more: those of `tiface preview --light seen`. */
+const SEEN_BY = ["0.55, 0.1, 0.15", "0.85, 0.45, 0.1", "0.95, 0.8, 0.3", "0.75, 0.9, 0.8"];
 /** Of a lens whose picture is as wide as two fifths of its distance, and how much of that a mesh fills at first. */
 const FIELD_OF_VIEW = 2 * Math.atan(0.2);
 const FILLED = 0.95;
 /** Where the attributes of a vertex are bound, and what stands for one that is missing. */
-const ATTRIBUTES = [["POSITION", [0, 0, 0, 1]], ["NORMAL", [0, 0, 0, 0]], ["TEXCOORD_0", [0, 0, 0, 0]], ["COLOR_0", [1, 1, 1, 1]]];
+const ATTRIBUTES = [["POSITION", [0, 0, 0, 1]], ["NORMAL", [0, 0, 0, 0]], ["TEXCOORD_0", [0, 0, 0, 0]], ["COLOR_0", [1, 1, 1, 1]],
+  ["_SEEN_BY", [0, 0, 0, 1]]];
 const BYTES = { 5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4 };
 const WIDTH = { SCALAR: 1, VEC2: 2, VEC3: 3, VEC4: 4 };
 
@@ -131,12 +134,15 @@ layout(location = 0) in vec3 position;
 layout(location = 1) in vec3 normal;
 layout(location = 2) in vec2 uv;
 layout(location = 3) in vec4 color;
+layout(location = 4) in float seenBy;
 uniform mat4 clipFromModel, placeFromModel;
 uniform mat3 normalFromModel;
 out vec3 place, around, corner;
 out vec2 at;
 out vec4 tint;
+out float watched;
 void main() {
+  watched = min(seenBy, 3.0);
   place = (placeFromModel * vec4(position, 1.0)).xyz;
   around = normalFromModel * normal;
   at = uv;
@@ -151,6 +157,7 @@ precision highp float;
 in vec3 place, around, corner;
 in vec2 at;
 in vec4 tint;
+in float watched;
 uniform vec3 eye;
 uniform mat3 viewFromPlace;
 uniform vec4 factor;
@@ -175,6 +182,9 @@ void main() {
     c = clamp(c + sum, 0.0, 1.0);
   } else if (mode == 2) {
     c = 0.5 + 0.5 * viewFromPlace * n;
+  } else if (mode == 5) {
+    const vec3 colors[4] = vec3[4](${SEEN_BY.map((c) => `vec3(${c})`)});
+    c = colors[int(watched + 0.5)];
   } else if (mode >= 3) {
     c = vec3(0.83, 0.80, 0.77) * (0.2 + 0.8 * abs(dot(n, d)));
   }
@@ -206,6 +216,7 @@ class Painter {
     this.solid = this.parts.filter((p) => !p.blend);
     this.shells = this.parts.filter((p) => p.blend);
     this.lobes = Math.max(...this.parts.map((p) => p.lobes.length));
+    this.knowsCameras = this.solid.some((p) => p.attributes._SEEN_BY);
     this.colored = this.parts.some((p) => p.texture !== undefined || p.attributes.COLOR_0);
   }
 
@@ -586,7 +597,7 @@ async function viewer(root) {
   canvas.addEventListener("keydown", (e) => {
     if (e.ctrlKey || e.metaKey || e.altKey) return;
     const arrow = e.shiftKey && e.key.startsWith("Arrow"), act = KEYS[arrow ? `Shift+${e.key}` : e.key];
-    if (/^[1-5]$/.test(e.key)) choose(Number(e.key) - 1);
+    if (/^[1-6]$/.test(e.key)) choose(Number(e.key) - 1);
     else if (act) act();
     else return;
     e.preventDefault();
@@ -634,6 +645,8 @@ async function viewer(root) {
     painter = next;
     const none = painter.lobes === 0;
     controls.mode.querySelector("input").disabled = none;
+    controls.mode.querySelector("[value=seen]").closest("label").hidden = !painter.knowsCameras;
+    controls.mode.querySelector("[value=seen]").disabled = !painter.knowsCameras;
     if (none) controls.mode.querySelector("label").title = "This file has one color for all views.";
     if (state.distance === undefined) {
       state.mode = !painter.colored ? 3 : none ? 1 : 0;

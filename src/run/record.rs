@@ -48,7 +48,7 @@ pub(super) const TIMED: [&str; 3] = ["done.json", "status.json", "log.jsonl"];
 
 /// Files that no stage reads; a run is complete without them. `tiface export` writes the head again
 /// from the stage's folder `parts`.
-const EXPORTS: [&str; 10] = [
+const EXPORTS: [&str; 11] = [
     "head.glb",
     "head.obj",
     "head.mtl",
@@ -57,6 +57,7 @@ const EXPORTS: [&str; 10] = [
     "head.jpg",
     "head.exr",
     "surface.ply",
+    "seen_by.png",
     "sheet.html",
     "inputs.json",
 ];

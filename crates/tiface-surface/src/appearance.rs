@@ -14,13 +14,14 @@
 //! `Y_k` real spherical harmonics of the direction to the viewer and `∇` the difference between
 //! neighboring nodes. `D` is the root of the cosine between view and surface where the head alone
 //! fills the pixel, by the mask and by all rays, and else 0: what is behind the head never bleeds
-//! in. All values are sRGB-coded, as the metrics are.
+//! in. Near the mask's outline pixels that shine or look like what is behind count as that, too. All values are sRGB-coded, as the metrics are.
 //!
 //! It is solved twice. The diffuse color (one function) has the finest nodes available, and is what
 //! every viewer shows. What depends on the view is smooth over the surface, so that the vertices
 //! carry it, as a difference to the diffuse color. What no photograph shows follows its neighbors
 //! some nodes far, and keeps its color beyond.
 
+mod glare;
 mod nodes;
 mod rows;
 mod solve;

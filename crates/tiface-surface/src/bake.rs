@@ -14,16 +14,23 @@
 mod carry;
 mod cover;
 mod fill;
+mod grain;
 mod light;
+mod materials;
 mod seams;
+mod smooth;
 mod tangent_space;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;
+mod trust;
+mod unseen;
 
 pub use carry::{CarriedTexture, Original};
 pub use light::seen_colors;
 pub use seams::Seams;
 pub use tangent_space::tangent_space;
+pub use trust::{Seen, seen_map, seen_shares};
+pub use unseen::{FittedTexture, TexelTrust, UnseenReport, complete_unseen_vertices};
 
 use crate::setting;
 use cover::{Bands, Sample};

@@ -6,7 +6,7 @@
 use crate::capture::{Split, View};
 use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, ViewBackground, display_name};
 use crate::pipeline::frames::{Export, center};
-use crate::pipeline::mesh::{head_mesh, read_finished};
+use crate::pipeline::mesh::{head_mesh, read_finished, seen_note};
 use crate::pipeline::metrics::{Comparable, PictureSet, comparable, picture_sets};
 use crate::pipeline::pictures;
 use crate::pipeline::session::Session;
@@ -22,6 +22,7 @@ use tiface_base::geom::{Camera, Similarity};
 use tiface_base::image::{Photo, quantize, reduce_photo, working_size};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Quiet, Result};
+use tiface_surface::bake::seen_shares;
 use tiface_surface::files::{ExportOptions, HeadMesh, HeadTexture, OpenedMesh, open_mesh, to_glb, weld};
 use tiface_surface::{SimplifyConfig, simplify};
 
@@ -228,7 +229,9 @@ fn shown(session: &Session, mesh: &Record) -> Result<(Viewer, Similarity)> {
             file_from_world.direction(front)
         }
     };
+    let unseen = seen_note(seen_shares(&head.mesh)).map(|said| said + ".");
     let (glb, note) = small(head, &session.run.path("mesh/parts"), as_glb)?;
+    let note = unseen.into_iter().chain((!note.is_empty()).then_some(note)).collect::<Vec<_>>().join(" ");
     let name = session.capture.name.clone();
     let viewer = Viewer { name, note, front: front.to_array(), glb, cameras: Vec::new() };
     Ok((viewer, file_from_world))

@@ -9,7 +9,7 @@ use glam::{Vec2, Vec3};
 
 /// Triangles over shared vertices, counter-clockwise seen from outside.
 ///
-/// `normals` and `colors` are either empty or as long as `positions`.
+/// `normals`, `colors` and `seen_by` are either empty or as long as `positions`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {
     /// Vertex positions.
@@ -18,6 +18,8 @@ pub struct Mesh {
     pub normals: Vec<Vec3>,
     /// Vertex colors, sRGB-coded, 0..=1.
     pub colors: Vec<[f32; 3]>,
+    /// Number of cameras that see each vertex, up to 255.
+    pub seen_by: Vec<u8>,
     /// Vertex indices, three a triangle.
     pub triangles: Vec<[u32; 3]>,
 }
@@ -130,6 +132,7 @@ impl Mesh {
         pick(&mut self.positions, &to);
         pick(&mut self.normals, &to);
         pick(&mut self.colors, &to);
+        pick(&mut self.seen_by, &to);
     }
 
     /// Returns the same mesh in another coordinate system.
@@ -138,6 +141,7 @@ impl Mesh {
             positions: self.positions.iter().map(|&p| b_from_a.point(p)).collect(),
             normals: self.normals.iter().map(|&n| b_from_a.direction(n).normalize_or_zero()).collect(),
             colors: self.colors.clone(),
+            seen_by: self.seen_by.clone(),
             triangles: self.triangles.clone(),
         }
     }

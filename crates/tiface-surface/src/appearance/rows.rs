@@ -1,5 +1,6 @@
 //! Pixels of photographs as rows of a linear system.
 
+use super::glare::is_glare;
 use super::nodes::{Nodes, grouped};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
@@ -29,8 +30,16 @@ pub struct Photograph<'a> {
 impl Photograph<'_> {
     /// Returns whether a pixel shows the head alone. Soft pixels also show the background, and
     /// would paint the outline with it.
-    fn is_head(&self, at: usize) -> bool {
+    pub(super) fn is_head(&self, at: usize) -> bool {
         self.mask.is_none_or(|m| m.values[at] >= OPAQUE_ALPHA) && self.valid.is_none_or(|v| v.values[at] > 0)
+    }
+
+    /// Returns whether a point of the scene falls on a pixel that shows the head alone.
+    pub fn shows_head_at(&self, point: Vec3) -> bool {
+        let Some((at, _)) = self.camera.project(point) else { return false };
+        let (w, h) = (self.photo.width as f32, self.photo.height as f32);
+        let inside = (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y);
+        inside && self.is_head(at.y as usize * self.photo.width as usize + at.x as usize)
     }
 
     /// Returns the usable pixels within `margin` pixels of the mask's outline.
@@ -99,9 +108,12 @@ impl Rows {
                 (0..height).filter(move |y| y % stride == v % stride).map(move |y| (v, y))
             })
             .collect();
+        let glare: Vec<Vec<bool>> = photographs.par_iter().map(is_glare).collect();
         let line = |&(view, y): &(u32, u32)| {
-            let photograph = &photographs[view as usize];
+            let (photograph, glare) = (&photographs[view as usize], &glare[view as usize]);
             let xs = (y / stride % stride..photograph.photo.width).step_by(stride as usize);
+            let row = y as usize * photograph.photo.width as usize;
+            let xs = xs.filter(move |x| !glare[row + *x as usize]);
             xs.filter_map(move |x| Row::new(seen, (view, photograph), [x, y], turned))
         };
         Rows(lines.par_iter().flat_map_iter(line).collect())

@@ -6,6 +6,7 @@
 
 use super::cover::Bands;
 use super::seams::Seams;
+use super::trust::seen_at;
 use super::{Texels, on_triangles};
 use crate::files::{HeadMesh, HeadTexture, tangents};
 use crate::mesh_distance::hit_at;
@@ -37,8 +38,8 @@ impl<'a> Original<'a> {
         Original { head, bvh: Bvh::new(&head.mesh) }
     }
 
-    /// Gives the vertices of a simpler mesh the original's normals and colors, and returns its soft
-    /// layers on them.
+    /// Gives the vertices of a simpler mesh the original's normals and colors and the number of
+    /// cameras that see them, and returns its soft layers on them.
     pub fn carry_vertices(&self, mesh: &mut Mesh) -> Option<Shells> {
         let HeadMesh { mesh: from, shells, .. } = self.head;
         let hits = self.nearest(&mesh.positions);
@@ -47,6 +48,9 @@ impl<'a> Original<'a> {
         }
         if !from.colors.is_empty() {
             mesh.colors = hits.iter().map(|hit| from.color_at(hit)).collect();
+        }
+        if !from.seen_by.is_empty() {
+            mesh.seen_by = hits.iter().map(|hit| seen_at(from, hit)).collect();
         }
         let layer = |layer: &ShellLayer| {
             let at = |values: &[f32], hit: &Hit| {

@@ -120,38 +120,18 @@ impl Visibility<'_> {
             .into_par_iter()
             .with_min_len(256)
             .map(|i| {
-                let (p, normal) = (points.positions[i], flat.normals[i]);
-                let from = flat.positions[i] + self.clearance * normal;
-                let all: Vec<(Vec3, f32)> = self
-                    .cameras
-                    .iter()
-                    .map(|camera| {
-                        let direction = (camera.position.as_vec3() - p).normalize_or_zero();
-                        (direction, direction.dot(normal))
-                    })
-                    .collect();
-                let sees = |(camera, &(direction, cos)): (&Camera, &(Vec3, f32))| {
-                    if cos < MIN_COSINE || !in_frame(camera, p) {
-                        return None;
-                    }
-                    let way = camera.position.as_vec3() - from;
-                    let ray = Ray {
-                        origin: from,
-                        direction: way.normalize_or_zero(),
-                        t_min: 0.0,
-                        t_max: way.length(),
-                    };
-                    (!self.bvh.any_hit(&ray)).then_some((direction, cos * cos))
-                };
-                let mut list: Vec<_> = self.cameras.iter().zip(&all).filter_map(sees).collect();
+                let (p, from, normal) = (points.positions[i], flat.positions[i], flat.normals[i]);
+                let sees = |camera| self.seen_from(camera, p, from, normal).map(|(d, cos)| (d, cos * cos));
+                let mut list: Vec<_> = self.cameras.iter().filter_map(sees).collect();
                 if list.len() > self.max_cameras {
                     list.sort_by(|a, b| b.1.total_cmp(&a.1));
                     list.truncate(self.max_cameras);
                 }
-                if !list.is_empty() || all.is_empty() {
-                    return (!list.is_empty(), list);
+                if !list.is_empty() {
+                    return (true, list);
                 }
-                let mut nearest = all;
+                let facing = |camera: &Camera| facing(camera, p, normal);
+                let mut nearest: Vec<(Vec3, f32)> = self.cameras.iter().map(facing).collect();
                 nearest.sort_by(|a, b| b.1.total_cmp(&a.1));
                 nearest.truncate(FALLBACK_CAMERAS);
                 (false, nearest.into_iter().map(|(d, cos)| (d, cos.max(0.0).powi(2) + 1e-3)).collect())
@@ -168,6 +148,25 @@ impl Visibility<'_> {
         }
         seen
     }
+
+    /// Returns the unit direction to a camera that sees a point, and its cosine to the normal. The
+    /// line of sight starts `clearance` above `from`, the point's place on the mesh.
+    pub fn seen_from(&self, camera: &Camera, p: Vec3, from: Vec3, normal: Vec3) -> Option<(Vec3, f32)> {
+        let (direction, cosine) = facing(camera, p, normal);
+        if cosine < MIN_COSINE || !in_frame(camera, p) {
+            return None;
+        }
+        let origin = from + self.clearance * normal;
+        let way = camera.position.as_vec3() - origin;
+        let ray = Ray { origin, direction: way.normalize_or_zero(), t_min: 0.0, t_max: way.length() };
+        (!self.bvh.any_hit(&ray)).then_some((direction, cosine))
+    }
+}
+
+/// Returns the unit direction from a point to a camera, and its cosine to the normal.
+fn facing(camera: &Camera, p: Vec3, normal: Vec3) -> (Vec3, f32) {
+    let direction = (camera.position.as_vec3() - p).normalize_or_zero();
+    (direction, direction.dot(normal))
 }
 
 /// Returns whether a point is within a camera's picture.

@@ -102,6 +102,12 @@ impl Cap {
         on_cap.for_each(|(p, color)| *color = self.color(*p));
     }
 
+    /// Moves vertices beyond the box onto its faces: simplification pushes the edge of a cut out, to
+    /// make up for the chords of its triangles, and a cut is flat.
+    pub fn flatten(&self, mesh: &mut Mesh) {
+        mesh.positions.iter_mut().for_each(|p| *p = p.clamp(self.bounds.min, self.bounds.max));
+    }
+
     /// Removes the cap, for callers that fit something to the opening. Returns the triangles
     /// removed.
     pub fn open(&self, mesh: &mut Mesh) -> usize {
@@ -173,6 +179,20 @@ mod tests {
         let topology = tiface_base::geom::topology(&mesh.positions, &mesh.triangles);
         // a disc: V − E + F = 1
         assert_eq!((topology.pieces, topology.euler), (1, 1));
+    }
+
+    #[test]
+    fn a_simplified_column_ends_flat() {
+        let (mut mesh, cap) = column();
+        let config = crate::SimplifyConfig { triangles: 800, ..Default::default() };
+        let f = |p: Vec3| (p.x.hypot(p.z) - 0.3).max(p.y - 0.5).max(-1.0 - p.y);
+        let field = |p: Vec3| f(p);
+        crate::simplify(&mut mesh, Some(&field), &config, &Quiet).unwrap();
+        let sides = mesh.positions.iter().filter(|p| p.y > -0.9).copied().collect::<Vec<_>>();
+        cap.flatten(&mut mesh);
+        assert!(mesh.is_closed() && mesh.positions.iter().all(|p| p.y >= -1.0));
+        // what is not at the cut stays
+        assert!(sides.iter().all(|p| mesh.positions.contains(p)));
     }
 
     #[test]

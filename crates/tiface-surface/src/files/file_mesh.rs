@@ -92,6 +92,8 @@ pub(super) struct FileMesh {
     pub normals: Vec<Vec3>,
     /// sRGB-coded, or empty.
     pub colors: Vec<[f32; 3]>,
+    /// Number of cameras that see each vertex, or empty.
+    pub seen_by: Vec<u8>,
     /// The index of each vertex in the original mesh.
     pub source: Vec<u32>,
     /// The triangles, without those that use a vertex twice.
@@ -115,7 +117,8 @@ impl FileMesh {
         let vertices = mesh.positions.len();
         texture.map_or(Ok(()), |t| check_atlas(mesh, &t.atlas))?;
         check_indices(mesh)?;
-        for (what, found) in [("normals", mesh.normals.len()), ("colors", mesh.colors.len())] {
+        let [normals, colors, seen_by] = [mesh.normals.len(), mesh.colors.len(), mesh.seen_by.len()];
+        for (what, found) in [("normals", normals), ("colors", colors), ("numbers of cameras", seen_by)] {
             if found != 0 && found != vertices {
                 return Err(wrong_length(found, what, vertices));
             }
@@ -157,9 +160,12 @@ impl FileMesh {
             corners = kept.filter(|(t, _)| has_three_corners(t)).map(|(_, c)| *c).collect();
             uvs = texture.atlas.uvs.iter().map(|&uv| uv + Vec2::ZERO).collect();
         }
-        let (colors, tangents) = (mesh.colors.clone(), Vec::new());
+        let (colors, seen_by) = (mesh.colors.clone(), mesh.seen_by.clone());
         let source = (0..vertices as u32).collect();
-        Ok(FileMesh { positions, normals, colors, source, triangles, uvs, corners, tangents, translation })
+        let mut file =
+            FileMesh { positions, normals, colors, seen_by, source, triangles, ..FileMesh::default() };
+        (file.uvs, file.corners, file.translation) = (uvs, corners, translation);
+        Ok(file)
     }
 
     /// Adds a copy of a vertex of another mesh, and returns its index.
@@ -169,6 +175,7 @@ impl FileMesh {
         self.positions.push(of.positions[v]);
         self.normals.extend(of.normals.get(v));
         self.colors.extend(of.colors.get(v));
+        self.seen_by.extend(of.seen_by.get(v));
         self.positions.len() as u32 - 1
     }
 
@@ -451,6 +458,7 @@ pub(super) mod tests {
             normals: vec![-Vec3::ONE.normalize(), Vec3::X, Vec3::Y, Vec3::Z],
             colors: vec![[0.0, 0.2, 0.4], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
             triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
+            ..Mesh::default()
         };
         let mut atlas = Atlas { width: 8, height: 4, ..Atlas::default() };
         for i in 0..4 {

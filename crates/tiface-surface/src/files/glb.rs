@@ -15,6 +15,9 @@
 //! after all opaque ones, or sorted by distance. Their material says
 //! `"extras": { "tiface": { "soft_layers": 2 } }`.
 //!
+//! How many cameras see a vertex is its attribute `_SEEN_BY`, if the mesh knows: a number as float,
+//! which programs that import attributes can mask by.
+//!
 //! Textures that depend on the view: tools may drop a texture that nothing refers to, and the
 //! Khronos validator warns about a texture that only `extras` refers to. So each lobe is the base
 //! color of a material of its own, which the primitive offers as a variant
@@ -305,6 +308,10 @@ fn attributes(document: &mut GlbDocument, file: &FileMesh) -> Attributes {
         let linear: Vec<Vec3> = file.colors.iter().map(|c| c.map(linear_from_srgb).into()).collect();
         attributes.insert(Valid(Semantic::Colors(0)), document.floats(&linear));
     }
+    if !file.seen_by.is_empty() {
+        let numbers: Vec<f32> = file.seen_by.iter().map(|&n| f32::from(n)).collect();
+        attributes.insert(Valid(Semantic::Extras("SEEN_BY".into())), document.floats(&numbers));
+    }
     attributes
 }
 
@@ -330,8 +337,32 @@ mod tests {
             positions: (0..vertices).map(at).collect(),
             normals: (0..vertices).map(|_| Vec3::Y).collect(),
             colors: (0..vertices).map(|i| [i as f32 / vertices as f32, 0.5, 1.0]).collect(),
+            seen_by: Vec::new(),
             triangles: (0..vertices - 2).map(|i| [i, i + 1, i + 2]).collect(),
         }
+    }
+
+    #[test]
+    fn a_file_says_how_many_cameras_see_each_vertex() {
+        let mesh = Mesh { seen_by: vec![0, 1, 2, 3, 255], ..strip(5) };
+        let glb = to_glb(&mesh, None, None, &ExportOptions::default()).unwrap();
+        let json = json_of(&glb);
+        let accessor = &json["meshes"][0]["primitives"][0]["attributes"]["_SEEN_BY"];
+        let accessor = &json["accessors"][accessor.as_u64().unwrap() as usize];
+        assert_eq!((&accessor["type"], &accessor["componentType"]), (&"SCALAR".into(), &5126.into()));
+        // vertices, not indices
+        let view = &json["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+        assert_eq!(view["target"], 34962);
+        assert_eq!(read(&glb, Path::new("a.glb")).unwrap().seen_by, mesh.seen_by);
+        // split at seams
+        let head = crate::files::testing::tetrahedron();
+        let glb = to_glb(&head.mesh, head.texture.as_ref(), None, &ExportOptions::default()).unwrap();
+        let back = read(&glb, Path::new("a.glb")).unwrap();
+        for (p, n) in back.positions.iter().zip(&back.seen_by) {
+            let of = head.mesh.positions.iter().position(|q| q == p).unwrap();
+            assert_eq!(*n, head.mesh.seen_by[of], "{p}");
+        }
+        assert_eq!(back.seen_by.len(), back.positions.len());
     }
 
     fn json_of(glb: &[u8]) -> serde_json::Value {

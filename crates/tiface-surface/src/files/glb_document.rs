@@ -61,7 +61,7 @@ impl GlbDocument {
         if let Some(known) = self.root.accessors.iter().position(is_same) {
             return Index::new(known as u32);
         }
-        let is_index = matches!(type_, Type::Scalar);
+        let is_index = matches!((component, type_), (ComponentType::U16 | ComponentType::U32, Type::Scalar));
         let target = if is_index { Target::ElementArrayBuffer } else { Target::ArrayBuffer };
         let view = self.view(bytes, Some(target));
         self.root.push(Accessor {
@@ -80,9 +80,10 @@ impl GlbDocument {
         })
     }
 
-    /// Vectors of f32: [`glam::Vec2`], `Vec3`, `Vec4` or arrays.
+    /// Numbers or vectors of f32: [`glam::Vec2`], `Vec3`, `Vec4` or arrays.
     pub fn floats<T: bytemuck::NoUninit>(&mut self, values: &[T]) -> Index<Accessor> {
         let kind = match size_of::<T>() / 4 {
+            1 => Type::Scalar,
             2 => Type::Vec2,
             3 => Type::Vec3,
             _ => Type::Vec4,

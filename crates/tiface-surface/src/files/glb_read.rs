@@ -184,6 +184,9 @@ impl<'a> GlbReader<'a> {
         if self.bare_normals {
             self.out.mesh.normals.clear();
         }
+        if self.out.mesh.seen_by.len() != self.out.places.len() {
+            self.out.mesh.seen_by.clear();
+        }
         if self.bare_colors && !self.tinted {
             if self.out.mesh.colors.iter().any(|c| *c != [1.0; 3]) {
                 self.out.note("vertex colors are not shown: some parts of the mesh have no `COLOR_0`");
@@ -307,6 +310,7 @@ impl<'a> GlbReader<'a> {
         }
         self.add_normals(&part)?;
         self.add_colors(&part)?;
+        self.add_seen_by(&part);
         let color = material.map(|m| m.color()).unwrap_or_default();
         color.note.into_iter().for_each(|note| self.out.note(note));
         if let Some(factors) = color.tint.filter(|_| color.texture.is_none()) {
@@ -404,6 +408,17 @@ impl<'a> GlbReader<'a> {
         }
         self.out.mesh.colors.extend(linear.into_iter().map(|c| c.map(srgb_from_linear)));
         Ok(())
+    }
+
+    /// Adds the numbers of cameras, if all parts before have them, too. Another program's attribute
+    /// of this name may be of any kind, and is left out then.
+    fn add_seen_by(&mut self, part: &GlbPart) {
+        let kinds = (&[Type::Scalar], &[C::F32]);
+        let found = self.attribute(part, Semantic::Extras("SEEN_BY".into()), kinds.0, kinds.1);
+        let Ok(Some((numbers, _))) = found else { return };
+        if self.out.mesh.seen_by.len() == part.first {
+            self.out.mesh.seen_by.extend(numbers.into_iter().map(|n| n.round().clamp(0.0, 255.0) as u8));
+        }
     }
 
     /// Adds the texture coordinates, and the texture and its factor to those of the other parts.

@@ -4,6 +4,8 @@
 //! does turn OBJ and GLB). Colors are 8-bit and sRGB-coded, as every reader takes them. Positions
 //! are `float`, or `double` where the mesh lies so far from the origin that f32 would show.
 //!
+//! How many cameras see a vertex is its property `seen_by`, if the mesh knows.
+//!
 //! PLY has one index for everything. Without a texture vertices stay whole, and so the surface
 //! closed: this is the file that later stages read. With one they are split at seams for the sake
 //! of `s t` (v up, Blender's and trimesh's spelling) and names its picture in a comment, as MeshLab
@@ -63,11 +65,14 @@ fn bytes(mesh: &FileMesh, picture: Option<&str>) -> Vec<u8> {
     if !mesh.uvs.is_empty() {
         property("float", &["s", "t"]);
     }
+    if !mesh.seen_by.is_empty() {
+        property("uchar", &["seen_by"]);
+    }
     header += &format!("element face {}\n", mesh.triangles.len());
     header += "property list uchar uint vertex_indices\nend_header\n";
 
     let mut out = header.into_bytes();
-    out.reserve(mesh.positions.len() * if far { 47 } else { 35 } + mesh.triangles.len() * 13);
+    out.reserve(mesh.positions.len() * if far { 48 } else { 36 } + mesh.triangles.len() * 13);
     for (i, p) in mesh.positions.iter().enumerate() {
         if far {
             out.extend(mesh.translated(*p).to_array().iter().flat_map(|v| v.to_le_bytes()));
@@ -80,6 +85,7 @@ fn bytes(mesh: &FileMesh, picture: Option<&str>) -> Vec<u8> {
             out.extend_from_slice(&uv.x.to_le_bytes());
             out.extend_from_slice(&(1.0 - uv.y).to_le_bytes());
         }
+        out.extend(mesh.seen_by.get(i));
     }
     for t in &mesh.triangles {
         out.push(3);
@@ -102,12 +108,13 @@ mod tests {
             positions: vec![Vec3::ZERO, Vec3::X, Vec3::new(0.1, 0.2, 0.3)],
             normals: vec![Vec3::Z; 3],
             colors: vec![[0.0, 1.0, 0.2]; 3], // 0.2 is 51/255
+            seen_by: vec![0, 3, 255],
             triangles: vec![[0, 1, 2], [2, 1, 0]],
         };
         let bytes = |mesh: &Mesh| to_ply(mesh, None, &ExportOptions::default()).unwrap().files.remove(0).1;
         let ply = bytes(&mesh);
         assert_eq!(read(&ply, Path::new("a.ply")).unwrap(), mesh);
-        let bare = Mesh { normals: vec![], colors: vec![], ..mesh };
+        let bare = Mesh { normals: vec![], colors: vec![], seen_by: vec![], ..mesh };
         let ply = bytes(&bare);
         assert_eq!(read(&ply, Path::new("a.ply")).unwrap(), bare);
         let e = to_ply(&Mesh::default(), None, &ExportOptions::default()).unwrap_err();

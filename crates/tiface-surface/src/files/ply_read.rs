@@ -289,6 +289,8 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
     };
     let (normal, color) = (element.slots(["nx", "ny", "nz"]), element.color());
     let packed = element.packed_color();
+    // whole numbers up to 255; of another type they are another program's
+    let seen_by = element.slots(["seen_by"]).filter(|[k]| element.properties[*k].item == Scalar::U8);
     let alpha = color
         .and_then(|_| ["alpha", "diffuse_alpha", "a"].into_iter().find_map(|name| element.slots([name])));
     let mut opacity = f64::INFINITY;
@@ -320,6 +322,7 @@ fn vertices(body: &mut Body, element: &Element, out: &mut ReadMesh) -> Result<Op
             out.mesh.colors.push(coded.ok_or_else(|| source.broken(format!("vertex {i}"), what))?);
         }
         out.mesh.colors.extend(packed.and_then(|k| element.properties[k].unpacked(row[k])));
+        out.mesh.seen_by.extend(seen_by.map(|[k]| row[k] as u8));
         if let Some([k]) = alpha {
             opacity = opacity.min(f64::from(element.properties[k].coded(row[k])));
         }

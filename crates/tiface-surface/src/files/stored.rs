@@ -50,6 +50,12 @@ fn geometry(mesh: &Mesh) -> Vec<Tensor> {
         floats("colors", &mesh.colors),
         indices("triangles", &mesh.triangles),
     ]
+    .into_iter()
+    .chain((!mesh.seen_by.is_empty()).then(|| {
+        let numbers = mesh.seen_by.iter().map(|&n| u32::from(n)).collect();
+        ("seen_by".into(), vec![mesh.seen_by.len()], TensorValues::U32(numbers))
+    }))
+    .collect()
 }
 
 /// Returns the version as it is written in a file.
@@ -151,11 +157,20 @@ impl StoredTensors {
                 return Err(self.missing(name));
             }
         }
+        let seen_by = match self.tensors.remove("seen_by") {
+            None => Vec::new(),
+            Some((shape, TensorValues::U32(v)))
+                if shape == [positions.len()] && v.iter().all(|&n| n <= u32::from(u8::MAX)) =>
+            {
+                v.into_iter().map(|n| n as u8).collect()
+            }
+            Some(_) => return Err(self.missing("seen_by")),
+        };
         let triangles = self.indices("triangles", positions.len())?;
         if triangles.is_empty() {
             return Err(self.wrong("triangles", "an empty list", "at least one"));
         }
-        Ok(Mesh { positions, normals, colors, triangles })
+        Ok(Mesh { positions, normals, colors, seen_by, triangles })
     }
 
     /// Scale, rotation by columns, translation.

@@ -113,7 +113,7 @@ mod tests {
         let uvs = positions.iter().map(uv).collect();
         let triangles = vec![[0, 1, 2], [0, 2, 3]];
         let atlas = Atlas { uvs, triangles: triangles.clone(), width: 4, height: 4 };
-        (Mesh { normals: vec![Vec3::Z; 4], positions, triangles, colors: vec![] }, atlas)
+        (Mesh { normals: vec![Vec3::Z; 4], positions, triangles, ..Mesh::default() }, atlas)
     }
 
     #[test]

@@ -12,6 +12,7 @@ pub fn tetrahedron() -> HeadMesh {
         positions: at.map(|(x, y, z)| Vec3::new(x, y, z)).to_vec(),
         normals: vec![Vec3::Z; 4],
         colors: vec![[0.5; 3]; 4],
+        seen_by: vec![0, 1, 2, 255],
         triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
     };
     let photo = |b: u8| Photo { width: 8, height: 8, rgb: vec![[b, 1, 2]; 64], alpha: None };

@@ -23,7 +23,7 @@ pub(super) fn weld_map(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
 /// Returns the mesh with equal positions merged, where −0 equals 0. Triangles keep their number and
 /// order, so an atlas stays parallel to them; degenerate ones are kept too.
 ///
-/// A merged vertex has the color of its first copy, and their common normal; copies that disagree,
+/// A merged vertex has the color and the number of cameras of its first copy, and their common normal; copies that disagree,
 /// as on creases, get the unit of their sum.
 pub fn weld(mesh: &Mesh) -> Mesh {
     let (new, positions) = weld_map(mesh);
@@ -36,6 +36,7 @@ pub fn weld(mesh: &Mesh) -> Mesh {
             first += 1;
             out.colors.extend(mesh.colors.get(i));
             out.normals.extend(mesh.normals.get(i));
+            out.seen_by.extend(mesh.seen_by.get(i));
         } else if let Some(&n) = mesh.normals.get(i)
             && (creased[number] || out.normals[number] != n)
         {
@@ -60,12 +61,14 @@ mod tests {
             positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, -Vec3::ZERO, Vec3::Y, Vec3::X],
             normals: vec![Vec3::Z, Vec3::Z, Vec3::X, Vec3::Z, Vec3::Y, Vec3::Z],
             colors: (0..6).map(|i| [i as f32; 3]).collect(),
+            seen_by: vec![0, 1, 2, 3, 4, 5],
             triangles: vec![[0, 1, 2], [3, 4, 5]],
         };
         let welded = weld(&mesh);
         assert_eq!(welded.positions, [Vec3::ZERO, Vec3::X, Vec3::Y]);
         assert_eq!(welded.triangles, [[0, 1, 2], [0, 2, 1]]);
         assert_eq!(welded.colors, [[0.0; 3], [1.0; 3], [2.0; 3]]);
+        assert_eq!(welded.seen_by, [0, 1, 2]);
         // x + y, normalized
         let half = std::f32::consts::FRAC_1_SQRT_2;
         assert_eq!(&welded.normals[..2], [Vec3::Z; 2]);

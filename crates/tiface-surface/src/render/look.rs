@@ -4,7 +4,7 @@
 use super::hits::RayHits;
 use super::texture::MeshTexture;
 use glam::{Vec2, Vec3};
-use tiface_base::geom::{Atlas, Camera, Harmonics, Mesh};
+use tiface_base::geom::{Atlas, Camera, Harmonics, Hit, Mesh};
 use tiface_base::image::{linear_from_srgb, srgb_from_linear};
 
 /// sRGB-coded color of a surface that has no color of its own.
@@ -12,6 +12,10 @@ const GRAY: [f32; 3] = [0.8; 3];
 
 /// Squares of the checker along each side of a texture.
 const CHECKER_SQUARES: f32 = 32.0;
+
+/// sRGB-coded colors of a surface that no camera sees, one, two, and three or more; their
+/// brightness rises, too. The viewer of pages has the same.
+const SEEN_BY: [[f32; 3]; 4] = [[0.55, 0.1, 0.15], [0.85, 0.45, 0.1], [0.95, 0.8, 0.3], [0.75, 0.9, 0.8]];
 
 /// Lamps that follow the camera: direction (right, up, to the viewer; not unit) and brightness.
 /// Key, fill and rim.
@@ -42,11 +46,14 @@ pub enum Look {
     Uv,
     /// Triangles, as a wireframe.
     Wire,
+    /// Number of cameras that see the surface: none, 1, 2, 3 and more.
+    Seen,
 }
 
 impl Look {
     /// All looks.
-    pub const ALL: [Look; 6] = [Look::Studio, Look::Unlit, Look::Normals, Look::Matcap, Look::Uv, Look::Wire];
+    pub const ALL: [Look; 7] =
+        [Look::Studio, Look::Unlit, Look::Normals, Look::Matcap, Look::Uv, Look::Wire, Look::Seen];
 
     /// Returns whether the soft layers are shown too. They have a color and no shape of their own.
     pub fn has_layers(self) -> bool {
@@ -55,12 +62,12 @@ impl Look {
 
     /// Returns whether the look needs only the color of a hit, not its point and normal.
     pub fn is_bare(self) -> bool {
-        matches!(self, Look::Unlit | Look::Uv)
+        matches!(self, Look::Unlit | Look::Uv | Look::Seen)
     }
 
     /// Returns the look's name on the command line.
     pub fn word(self) -> &'static str {
-        ["studio", "unlit", "normals", "matcap", "uv", "wire"][self as usize]
+        ["studio", "unlit", "normals", "matcap", "uv", "wire", "seen"][self as usize]
     }
 }
 
@@ -116,6 +123,7 @@ impl Surface<'_> {
             Look::Normals => normals().map(|n| (0.5 + 0.5 * n).to_array()).collect(),
             Look::Matcap => normals().map(clay).collect(),
             Look::Uv => (0..hits.hits.len()).map(|i| self.checker(hits, i)).collect(),
+            Look::Seen => hits.hits.iter().map(|hit| self.seen(hit)).collect(),
             Look::Wire => {
                 let on_line = |(i, n): (usize, Vec3)| {
                     let shade = 0.75 + 0.25 * n.z;
@@ -124,6 +132,15 @@ impl Surface<'_> {
                 };
                 normals().enumerate().map(on_line).collect()
             }
+        }
+    }
+
+    /// Returns the color that says how many cameras see a point; gray where the mesh does not know.
+    fn seen(&self, hit: &Hit) -> [f32; 3] {
+        let number = |v: u32| self.mesh.seen_by.get(v as usize).map(|&n| f32::from(n.min(3)));
+        match self.mesh.triangles[hit.triangle as usize].map(number) {
+            [Some(a), Some(b), Some(c)] => SEEN_BY[hit.mix([a, b, c]).round() as usize],
+            _ => GRAY,
         }
     }
 
@@ -173,4 +190,27 @@ fn clay(n: Vec3) -> [f32; 3] {
     let shine = 0.25 * toward(0).max(0.0).powi(24);
     let rim = 0.15 * (1.0 - n.z.clamp(0.0, 1.0)).powi(3);
     [0.80, 0.62, 0.52].map(|c: f32| srgb_from_linear(c * (0.08 + 0.9 * key) + shine + rim))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_color_says_how_many_cameras_see_a_point() {
+        let mut mesh = Mesh {
+            positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y],
+            triangles: vec![[0, 1, 2]],
+            seen_by: vec![0, 2, 200],
+            ..Mesh::default()
+        };
+        let color = |mesh: &Mesh, u: f32, v: f32| {
+            let surface = Surface { mesh, texture: None, atlas: None, harmonics: None };
+            surface.seen(&Hit { t: 1.0, triangle: 0, u, v })
+        };
+        let at_corners = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.5, 0.0)].map(|(u, v)| color(&mesh, u, v));
+        assert_eq!(at_corners, [SEEN_BY[0], SEEN_BY[2], SEEN_BY[3], SEEN_BY[1]]);
+        mesh.seen_by.clear();
+        assert_eq!(color(&mesh, 0.2, 0.2), GRAY);
+    }
 }
