@@ -131,6 +131,7 @@ mod tests {
             normals: vec![-Vec3::Y; 3],
             colors: vec![[1.0, 0.5, 0.25], [0.0; 3], [2.0, -1.0, 0.1]],
             triangles: vec![[0, 1, 2]],
+            ..Mesh::default()
         };
         let options = ExportOptions { up: Vec3::Z, name: "two\nlines".into(), ..Default::default() };
         let obj = String::from_utf8(to_obj(&mesh, None, &options).unwrap().files.remove(0).1).unwrap();

@@ -61,12 +61,14 @@ mod tests {
             positions: vec![Vec3::ZERO, Vec3::X, Vec3::Y, -Vec3::ZERO, Vec3::Y, Vec3::X],
             normals: vec![Vec3::Z, Vec3::Z, Vec3::X, Vec3::Z, Vec3::Y, Vec3::Z],
             colors: (0..6).map(|i| [i as f32; 3]).collect(),
+            seen_by: vec![0, 1, 2, 3, 4, 5],
             triangles: vec![[0, 1, 2], [3, 4, 5]],
         };
         let welded = weld(&mesh);
         assert_eq!(welded.positions, [Vec3::ZERO, Vec3::X, Vec3::Y]);
         assert_eq!(welded.triangles, [[0, 1, 2], [0, 2, 1]]);
         assert_eq!(welded.colors, [[0.0; 3], [1.0; 3], [2.0; 3]]);
+        assert_eq!(welded.seen_by, [0, 1, 2]);
         // x + y, normalized
         let half = std::f32::consts::FRAC_1_SQRT_2;
         assert_eq!(&welded.normals[..2], [Vec3::Z; 2]);
