@@ -722,8 +722,8 @@ mod tests {
             let bytes = &ply.files[0].1;
             let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
             assert!(String::from_utf8_lossy(&bytes[..end]).contains("property double x\n"));
-            // three doubles, a normal, a color
-            for (row, &p) in bytes[end..].chunks(24 + 12 + 3).zip(&mesh.positions) {
+            // three doubles, a normal, a color, a number of cameras
+            for (row, &p) in bytes[end..].chunks(24 + 12 + 3 + 1).zip(&mesh.positions) {
                 let v = row.as_chunks::<8>().0;
                 let found =
                     DVec3::new(f64::from_le_bytes(v[0]), f64::from_le_bytes(v[1]), f64::from_le_bytes(v[2]));
