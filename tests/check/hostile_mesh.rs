@@ -18,7 +18,7 @@ fn tetrahedron() -> Mesh {
         normals: vec![-Vec3::ONE.normalize(), Vec3::X, Vec3::Y, Vec3::Z],
         colors: vec![[0.0, 0.2, 0.4], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
-        seen_by: Vec::new(),
+        ..Mesh::default()
     }
 }
 

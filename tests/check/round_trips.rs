@@ -53,7 +53,7 @@ fn mesh() -> impl Strategy<Value = Mesh> {
                     colors: vertices.iter().filter(|_| colored).map(|(_, c, ..)| color(c)).collect(),
                     normals: vertices.iter().filter(|_| smooth).map(|&(.., u, v)| normal(u, v)).collect(),
                     triangles,
-                    seen_by: Vec::new(),
+                    ..Mesh::default()
                 }
             },
         )
