@@ -16,7 +16,8 @@ use tiface_surface::files::{
     ExportOptions, ExportedFiles, HeadMesh, HeadTexture, Lobes, tangents, to_glb, to_obj, to_ply,
 };
 use tiface_surface::{
-    Appearance, AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, simplify,
+    Appearance, AtlasConfig, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells, resolved,
+    simplify,
 };
 
 /// How far the true surface may lie from a triangle, in cells: the chords of large triangles and
@@ -164,7 +165,10 @@ impl Finish<'_> {
     fn unwrap(&self, mesh: &Mesh, log: &mut StepLog) -> Result<Atlas> {
         let (c, scene_from_world) = (self.config, &self.scene.scene_from_world);
         let center = center(self.surface, &scene_from_world.inverse());
-        let config = self.export.atlas_config(center, scene_from_world, c.texture_px, c.gutter_px);
+        let config = AtlasConfig {
+            resolved: Some(resolved(mesh, self.cameras)),
+            ..self.export.atlas_config(center, scene_from_world, c.texture_px, c.gutter_px)
+        };
         let (layout, done) = atlas(mesh, &config, self.monitor)?;
         log.warnings.extend(done.warnings());
         log.report.insert("atlas".into(), json!(done));
@@ -403,7 +407,7 @@ impl Export {
     ) -> AtlasConfig {
         let front = self.front(center).map(|d| scene_from_world.direction(d));
         let up = front.map(|_| scene_from_world.direction(self.up.normalize_or(Vec3::Y)));
-        AtlasConfig { size_px, gutter_px, front, up }
+        AtlasConfig { size_px, gutter_px, front, up, resolved: None }
     }
 
     /// Returns the rotation that brings up to +Y and the face of a head at `center` towards +Z.
