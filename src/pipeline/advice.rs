@@ -42,6 +42,9 @@ pub(super) fn sentence(warning: &Warning) -> String {
         Warning::NoCharts { .. } => {
             format!("a larger `{}` or fewer `{triangles}` help", key!(mesh.texture_px))
         }
+        Warning::FinerThanPhotographs { sufficient_px, .. } => {
+            format!("set `{}` to {sufficient_px}", key!(mesh.texture_px))
+        }
         Warning::OwnCharts(_) => format!("fewer `{triangles}` help"),
     };
     format!("{warning}; {advice}")

@@ -155,7 +155,7 @@ impl Export {
     ) -> AtlasConfig {
         let front = self.front(center).map(|d| scene_from_world.direction(d));
         let up = front.map(|_| scene_from_world.direction(self.up.normalize_or(Vec3::Y)));
-        AtlasConfig { size_px, gutter_px, front, up }
+        AtlasConfig { size_px, gutter_px, front, up, resolved: None }
     }
 
     /// Returns the rotation that brings up to +Y and the face of a head at `center` towards +Z.

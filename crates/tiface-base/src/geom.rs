@@ -29,7 +29,7 @@ pub use ray::{Hit, Ray, RayResult};
 pub use shells::{ShellCaster, ShellLayer, Shells};
 pub use similarity::Similarity;
 pub use sphharm::Harmonics;
-pub use topology::{Sets, side_ends, sorted_sides};
+pub use topology::{Sets, fans, side_ends, sorted_sides};
 pub use topology::{Topology, topology};
 
 /// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of

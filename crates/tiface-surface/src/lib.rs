@@ -28,7 +28,7 @@ mod smooth;
 mod warning;
 
 pub use appearance::{Appearance, AppearanceReport, Colors, Photograph, fit as fit_appearance};
-pub use atlas::{AtlasConfig, AtlasReport, atlas};
+pub use atlas::{AtlasConfig, AtlasReport, PartReport, atlas, resolved};
 pub use extract::{
     Cap, CleanReport, ExtractOptions, HandleReport, LevelSet, MAX_HANDLE, MeshReport, NodeGrid, RimVertex,
     Sparse, Volume, clean, extract, extract_dense, marching, sparse,

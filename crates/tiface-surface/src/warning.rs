@@ -47,6 +47,13 @@ pub enum Warning {
         /// Why there are no larger charts.
         reason: String,
     },
+    /// The texture was asked for with more texels than photographs resolve.
+    FinerThanPhotographs {
+        /// Texels across that hold all that photographs resolve.
+        sufficient_px: u32,
+        /// Texels across asked for.
+        asked_px: u32,
+    },
     /// This number of triangles have a small chart of their own.
     OwnCharts(usize),
 }
@@ -63,6 +70,7 @@ impl Warning {
             Warning::NotManifold(_) => "mend these vertices, or extract the surface at another resolution",
             Warning::Crossing(_) => "mend these triangles, or extract the surface at another resolution",
             Warning::NoCharts { .. } => "a larger `AtlasConfig::size_px` or fewer triangles help",
+            Warning::FinerThanPhotographs { .. } => "a smaller `AtlasConfig::size_px` suffices",
             Warning::OwnCharts(_) => "fewer triangles help",
         }
     }
@@ -104,6 +112,11 @@ impl fmt::Display for Warning {
                 f,
                 "every triangle has a piece of the texture of its own, {gutter_px:.1} texels of gutter: \
                  {reason}"
+            ),
+            Warning::FinerThanPhotographs { sufficient_px: px, asked_px } => write!(
+                f,
+                "a texture of {px} × {px} texels holds all that the photographs resolve, {asked_px} × {asked_px} \
+                 were asked for: no part of it is finer, the rest is left empty"
             ),
             Warning::OwnCharts(triangles) => write!(
                 f,

@@ -120,7 +120,7 @@ pub fn side_ends(triangles: &[[u32; 3]], corner: u32) -> (u32, u32) {
 
 /// For every corner, the set of corners reached from it around its vertex across edges with exactly
 /// two triangles. A vertex with one set has one fan.
-fn fans(triangles: &[[u32; 3]], sides: &[(u64, u32)]) -> Sets {
+pub fn fans(triangles: &[[u32; 3]], sides: &[(u64, u32)]) -> Sets {
     let mut fans = Sets::new(3 * triangles.len());
     let vertex = |c: u32| side_ends(triangles, c).0;
     let after = |c: u32| c / 3 * 3 + (c % 3 + 1) % 3;

@@ -165,23 +165,13 @@ pub(super) fn straighten<L: Copy + PartialEq>(beside: &[[u32; 3]], region: &mut 
     }
 }
 
-/// Minimum share of the surface for a chart to be turned upright.
-const MIN_UPRIGHT_SHARE: f64 = 0.01;
-
 /// Minimum mean rise, as a share of the steepest, from which an up direction is derived.
 const MIN_RISE: f64 = 0.1;
 
-/// Returns the unit up direction within each chart that has to stand upright: the one that the
-/// foremost triangle, seen along `front`, is part of.
-pub(super) fn upright(mesh: &Mesh, charts: &[Flat], front: Vec3, up: Vec3) -> Vec<Option<DVec2>> {
-    let depth = |t: u32| mesh.corners(t).map(|p| p.dot(front)).iter().sum::<f32>();
-    let foremost = (0..mesh.triangles.len() as u32).max_by(|&a, &b| depth(a).total_cmp(&depth(b)));
-    let whole: f64 = charts.iter().map(Flat::area).sum();
-    let stands = |chart: &Flat| {
-        let is_face = foremost.is_some_and(|t| chart.triangles.contains(&t))
-            && chart.area() > MIN_UPRIGHT_SHARE * whole;
-        is_face.then(|| rising(mesh, chart, up)).flatten()
-    };
+/// Returns the unit up direction within the chart that has to stand upright: the one that triangle
+/// `of_face` is part of.
+pub(super) fn upright(mesh: &Mesh, charts: &[Flat], of_face: u32, up: Vec3) -> Vec<Option<DVec2>> {
+    let stands = |chart: &Flat| chart.triangles.contains(&of_face).then(|| rising(mesh, chart, up)).flatten();
     charts.iter().map(stands).collect()
 }
 
@@ -264,12 +254,12 @@ mod tests {
             corners: vec![[0, 1, 2], [0, 2, 3]],
             points: vec![q(0., 0.), q(0., 1.), q(-1., 1.), q(-1., 0.)],
         };
-        let found = upright(&mesh, std::slice::from_ref(&chart), -Vec3::Y, Vec3::Z)[0].unwrap();
+        let found = upright(&mesh, std::slice::from_ref(&chart), 0, Vec3::Z)[0].unwrap();
         assert!((found - DVec2::NEG_X).length() < 1e-12, "{found}");
         // level ground rises nowhere
         let nearly_level = (Vec3::Y + 0.05 * Vec3::Z).normalize();
         for up in [Vec3::Y, nearly_level] {
-            assert_eq!(upright(&mesh, std::slice::from_ref(&chart), -Vec3::Y, up), [None]);
+            assert_eq!(upright(&mesh, std::slice::from_ref(&chart), 0, up), [None]);
         }
     }
 }

@@ -18,7 +18,7 @@ use super::smooth::smoothed;
 use glam::{DVec2, DVec3, Vec2};
 use rayon::prelude::*;
 use std::collections::HashMap;
-use tiface_base::geom::{Mesh, THOROUGH_EFFORT, overlaps};
+use tiface_base::geom::{Mesh, Sets, THOROUGH_EFFORT, overlaps};
 use tiface_base::{Monitor, Result};
 
 /// Rounds of smoothing for the copy that is divided. Of `lps` at 50 k triangles: 515 charts
@@ -49,7 +49,7 @@ pub(super) fn divide(mesh: &Mesh, monitor: &dyn Monitor) -> Result<ChartSet> {
     let smooth = smoothed(mesh, SMOOTHING);
     let mut best = flatten(&smooth, None, STRETCHED, monitor)?;
     for _ in 0..JOINS {
-        let labels = joined(mesh, &adjacent, &best);
+        let labels = joined(mesh, &adjacent, labels(&best, mesh.triangles.len()), MIN_CHART_SHARE);
         let regions = labels.iter().max().map_or(0, |most| *most as usize + 1);
         if regions == best.charts.len() {
             break;
@@ -71,7 +71,11 @@ fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
     if splits == 0 || stretch(mesh, &chart) <= STRETCH {
         return uncovered(chart);
     }
-    // across its longer side, in the chart
+    halves(&chart).into_iter().flat_map(|half| settled(mesh, half, splits - 1)).collect()
+}
+
+/// Returns the parts of a chart on both sides of a line across its longer side.
+pub(super) fn halves(chart: &Flat) -> Vec<Flat> {
     let middle = |k: usize| chart.at(k).iter().sum::<DVec2>() / 3.0;
     let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
     for p in &chart.points {
@@ -79,11 +83,8 @@ fn settled(mesh: &Mesh, mut chart: Flat, splits: usize) -> Vec<Flat> {
     }
     let axis = if high.x - low.x >= high.y - low.y { DVec2::X } else { DVec2::Y };
     let line = 0.5 * (low + high).dot(axis);
-    [true, false]
-        .into_iter()
-        .flat_map(|side| chart.parts(|k| (middle(k).dot(axis) < line) == side))
-        .flat_map(|half| settled(mesh, half, splits - 1))
-        .collect()
+    let half = |side: bool| chart.parts(|k| (middle(k).dot(axis) < line) == side);
+    [true, false].into_iter().flat_map(half).collect()
 }
 
 /// Returns a chart in pieces that do not cover themselves: relaxing lets borders go where they
@@ -121,20 +122,46 @@ fn uncovered(chart: Flat) -> Vec<Flat> {
     out
 }
 
-/// Returns the region of each triangle, numbered from 0: its chart, or the neighbor that the chart
-/// joined.
-fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
-    let count = mesh.triangles.len();
-    // a triangle without a chart is a region of its own until it joins one
+/// Returns the chart of each triangle; one without a chart has a number of its own.
+fn labels(flat: &ChartSet, count: usize) -> Vec<u32> {
     let mut label = vec![NONE; count];
     for (c, chart) in flat.charts.iter().enumerate() {
         chart.triangles.iter().for_each(|&t| label[t as usize] = c as u32);
     }
-    let mut regions = flat.charts.len() as u32;
+    let mut next = flat.charts.len() as u32;
     for l in label.iter_mut().filter(|l| **l == NONE) {
-        *l = regions;
-        regions += 1;
+        *l = next;
+        next += 1;
     }
+    label
+}
+
+/// Returns the number of each triangle's connected piece of one region, counted from 0.
+pub(super) fn components<L: PartialEq>(adjacent: &[[u32; 3]], region: &[L]) -> Vec<u32> {
+    let mut sets = Sets::new(region.len());
+    for (t, beside) in adjacent.iter().enumerate() {
+        for &n in beside.iter().filter(|&&n| n != NONE && region[n as usize] == region[t]) {
+            sets.join(t as u32, n);
+        }
+    }
+    numbered((0..region.len() as u32).map(|t| sets.find(t)))
+}
+
+/// Returns the labels as numbers from 0, in the order in which they appear.
+fn numbered(labels: impl Iterator<Item = u32>) -> Vec<u32> {
+    let mut number = HashMap::new();
+    labels
+        .map(|l| {
+            let next = number.len() as u32;
+            *number.entry(l).or_insert(next)
+        })
+        .collect()
+}
+
+/// Returns the region of each triangle, numbered from 0: its `label`, or the neighbor that joined it
+/// because one had less than a share of the surface.
+pub(super) fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], mut label: Vec<u32>, min_share: f64) -> Vec<u32> {
+    let regions = label.iter().max().map_or(0, |most| most + 1);
     let mut area = vec![0.0; regions as usize];
     // shared border of regions, both ways
     let mut border: Vec<HashMap<u32, f64>> = vec![HashMap::new(); regions as usize];
@@ -148,7 +175,7 @@ fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
             }
         }
     }
-    let min_area = MIN_CHART_SHARE * area.iter().sum::<f64>();
+    let min_area = min_share * area.iter().sum::<f64>();
     let mut into: Vec<u32> = (0..regions).collect();
     let mut open: Vec<u32> = (0..regions).filter(|&r| area[r as usize] < min_area).collect();
     // the smallest first, so that confetti becomes pieces before pieces are given away
@@ -179,14 +206,7 @@ fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], flat: &ChartSet) -> Vec<u32> {
     };
     label.iter_mut().for_each(|l| *l = root(*l));
     straighten(adjacent, &mut label);
-    let mut number = HashMap::new();
-    label
-        .iter()
-        .map(|l| {
-            let next = number.len() as u32;
-            *number.entry(*l).or_insert(next)
-        })
-        .collect()
+    numbered(label.into_iter())
 }
 
 /// Share of the surface from which a flat piece is worth a chart of its own.
@@ -303,7 +323,7 @@ mod tests {
         let mesh = sheet(20, |_, _| 0.0);
         let crumb = |q: u32| q % 20 == 9 && q / 20 == 10;
         let flat = charts(&mesh, |t| if crumb(t / 2) { 2 } else { u32::from(t / 2 % 20 >= 10) });
-        let labels = joined(&mesh, &neighbors(&mesh), &flat);
+        let labels = joined(&mesh, &neighbors(&mesh), labels(&flat, mesh.triangles.len()), MIN_CHART_SHARE);
         // three of its sides are the left half's
         assert!((0..800).all(|t: u32| labels[t as usize] == u32::from(t / 2 % 20 >= 10)));
     }
@@ -316,7 +336,7 @@ mod tests {
         mesh.triangles.push([island, island + 1, island + 2]);
         let mut flat = charts(&mesh, |t| u32::from(t == 800));
         flat.charts[0].triangles.retain(|t| !(300..303).contains(t));
-        let labels = joined(&mesh, &neighbors(&mesh), &flat);
+        let labels = joined(&mesh, &neighbors(&mesh), labels(&flat, mesh.triangles.len()), MIN_CHART_SHARE);
         assert!((0..800).all(|t| labels[t] == 0) && labels[800] == 1);
     }
 

@@ -50,7 +50,7 @@ pub(super) fn half_squares(mesh: &Mesh, config: &AtlasConfig) -> Result<AtlasLay
         triangle.rotate_right(widest(mesh, t));
         atlas.triangles.push(triangle);
     }
-    Ok(AtlasLayout { atlas, repaired: 0, gutter_px: gap })
+    Ok(AtlasLayout { atlas, repaired: 0, gutter_px: gap, head: None })
 }
 
 #[cfg(test)]

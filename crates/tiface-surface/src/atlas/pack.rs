@@ -25,7 +25,7 @@ const MAX_ROTATIONS: usize = 16;
 const PLACEMENT_BUDGET: usize = 2400;
 
 /// The share of the texture that the first drawing is meant for.
-const INITIAL_FILL: f64 = 0.62;
+pub(super) const INITIAL_FILL: f64 = 0.62;
 
 /// Pose of a chart: turned by the angle with this cosine and sine, scaled, and moved.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -54,12 +54,13 @@ struct TurnedMask {
 type CellPlaces = Vec<(usize, usize, usize)>;
 
 /// Places charts in a square texture: twice the gutter between any two of them and to the border.
-/// Where `stands` says where up is in a chart, it is turned to the texture's up and no other way.
+/// Where `stands` says where up is in a chart, it is turned to the texture's up and no other way. A
+/// unit becomes at most `limit` texels.
 pub(super) fn pack(
     charts: &[Flat],
     stands: &[Option<DVec2>],
-    size_px: f64,
-    gutter_px: f64,
+    limit: f64,
+    [size_px, gutter_px]: [f64; 2],
     monitor: &dyn Monitor,
 ) -> Result<Vec<ChartPose>> {
     let area: f64 = charts.iter().map(Flat::area).sum();
@@ -81,19 +82,20 @@ pub(super) fn pack(
     order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
     let turns = (16_000 / charts.len()).clamp(4, MAX_ROTATIONS) / 4 * 4;
     let cells = GRID_CELLS.min(inner_px);
-    let mut used = INITIAL_FILL;
+    let mut used = INITIAL_FILL.min(limit * limit * area / (size_px * size_px));
     while used > 1e-3 {
         // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a
         // fifth wider.
         let scale = cells * (used / area).sqrt() * size_px / inner_px;
         let mut max_side = (1.2 * cells) as usize;
-        let mut start = cells as usize;
+        let least = (scale * inner_px / limit).ceil() as usize;
+        let mut start = (cells as usize).max(least);
         let mut found = None;
         // The first time with the gutter that the widest needs, then with that of the size found.
         for _ in 0..2 {
             let reach = gutter_px * max_side as f64 / inner_px;
             let drawn = draw(&outlines, stands, scale, reach, turns);
-            match smallest(&drawn, &mut order, start, max_side, monitor)? {
+            match smallest(&drawn, &mut order, [least, start, max_side], monitor)? {
                 Some((side, layout)) => {
                     (max_side, start) = (side, side);
                     found = Some((drawn, layout, side, reach));
@@ -144,13 +146,12 @@ fn draw(
     outlines.par_iter().zip(stands).map(one).collect()
 }
 
-/// Returns the smallest side found at which everything fits, from `start` on, at most `max_side`;
-/// `order` becomes the one that did it.
+/// Returns the smallest side found at which everything fits, of `least` at least, from `start` on, of
+/// `max_side` at most; `order` becomes the one that did it.
 fn smallest(
     drawn: &[Vec<TurnedMask>],
     order: &mut Vec<usize>,
-    start: usize,
-    max_side: usize,
+    [least, start, max_side]: [usize; 3],
     monitor: &dyn Monitor,
 ) -> Result<Option<(usize, CellPlaces)>> {
     let mut side = start;
@@ -174,6 +175,10 @@ fn smallest(
     let mut step = (side / 40).max(1);
     for _ in 0..tries {
         monitor.check_stop()?;
+        step = step.min(side - least);
+        if step == 0 {
+            break;
+        }
         let mut trial = order.clone();
         if step == 1 && count > 1 {
             let i = below(count);
@@ -451,7 +456,8 @@ mod tests {
     #[test]
     fn a_square_fills_the_texture_but_for_two_gutters() {
         let chart = rectangle(3.0, 3.0);
-        let places = pack(std::slice::from_ref(&chart), &[None], 256.0, 8.0, &Quiet).unwrap();
+        let places =
+            pack(std::slice::from_ref(&chart), &[None], f64::INFINITY, [256.0, 8.0], &Quiet).unwrap();
         let p = corners(&chart, &places[0]);
         let low = p.iter().fold(DVec2::INFINITY, |m, p| m.min(*p));
         let high = p.iter().fold(DVec2::NEG_INFINITY, |m, p| m.max(*p));
@@ -464,14 +470,32 @@ mod tests {
     fn four_strips_lie_side_by_side_at_one_scale() {
         // 4 × 1 each: together a square
         let charts = vec![rectangle(4.0, 1.0); 4];
-        let places = pack(&charts, &[None; 4], 512.0, 4.0, &Quiet).unwrap();
+        let places = pack(&charts, &[None; 4], f64::INFINITY, [512.0, 4.0], &Quiet).unwrap();
         let scale = places[0].scale;
         assert!(places.iter().all(|p| p.scale == scale));
         // (512 − 16) / 4 = 124 if side by side along their length; across (512 − 16 − 3 · 8) / 4 =
         // 118
         assert!((112.0..118.1).contains(&scale), "{scale}");
-        assert!(pack(&charts, &[None; 4], 512.0, 4.0, &Stopping).unwrap_err().kind().is_stop());
-        assert!(pack(&charts, &[None; 4], 16.0, 8.0, &Quiet).unwrap_err().to_string().contains("do not fit"));
+        assert!(
+            pack(&charts, &[None; 4], f64::INFINITY, [512.0, 4.0], &Stopping).unwrap_err().kind().is_stop()
+        );
+        assert!(
+            pack(&charts, &[None; 4], f64::INFINITY, [16.0, 8.0], &Quiet)
+                .unwrap_err()
+                .to_string()
+                .contains("do not fit")
+        );
+    }
+
+    #[test]
+    fn charts_grow_up_to_the_limit() {
+        let charts = vec![rectangle(4.0, 1.0); 4];
+        for limit in [3.0, 40.0, 100.0] {
+            let places = pack(&charts, &[None; 4], limit, [512.0, 4.0], &Quiet).unwrap();
+            assert!(places.iter().all(|p| p.scale <= limit && p.scale > 0.9 * limit), "{limit}");
+            let all: Vec<DVec2> = charts.iter().zip(&places).flat_map(|(c, p)| corners(c, p)).collect();
+            assert!(all.iter().all(|p| p.min_element() > 8.0 - 1e-9 && p.max_element() < 504.0 + 1e-9));
+        }
     }
 
     fn square(side: f64) -> Vec<[DVec2; 2]> {

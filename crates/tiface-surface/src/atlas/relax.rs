@@ -9,7 +9,8 @@
 //! ```
 //!
 //! It grows without bound as a triangle becomes thin, and no step is longer than 0.9 of the way to
-//! the first triangle without area: what starts without folds ends without.
+//! the first triangle without area: what starts without folds ends without. A border that starts
+//! without crossing itself ends without, too (ibid., §4): then no two triangles share any area.
 
 use super::chart::Flat;
 use glam::DVec2;
@@ -22,6 +23,9 @@ const LBFGS_HISTORY: usize = 5;
 /// Energy over area at which a chart is good enough: 4 is an isometry, and 0.01 more a mean area
 /// stretch below half a percent.
 const TARGET_ENERGY: f64 = 4.01;
+
+/// Area over the squared length of the thinnest triangle in a chart.
+const THINNEST: f64 = 5e-3;
 
 /// The surface's side of a triangle, as the energy needs it.
 struct RestTriangle {
@@ -41,9 +45,9 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
     for (&t, &corners) in flat.triangles.iter().zip(&flat.corners) {
         let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
         let (u, v) = (b - a, c - a);
-        // a triangle that is a line would have endless energy; as thin as one part in a million it
-        // has little say
-        let area = (0.5 * u.cross(v).length()).max(5e-7 * u.length_squared().max(v.length_squared()));
+        // a triangle that is a line would have endless energy, and none of its own in the texture: it
+        // becomes as high as a hundredth of its length
+        let area = (0.5 * u.cross(v).length()).max(THINNEST * u.length_squared().max(v.length_squared()));
         whole += area;
         let half = 0.5 / area;
         rest.push(RestTriangle {
@@ -62,7 +66,8 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
     if (0..flat.corners.len()).any(|k| super::chart::twice_area(flat.at(k)) <= 0.0) {
         return;
     }
-    descend(&rest, &mut flat.points, rounds, whole);
+    let border = Border::new(flat.outline(), &flat.points);
+    descend(&rest, &mut flat.points, rounds, whole, &border);
 }
 
 fn energy(rest: &[RestTriangle], points: &[DVec2], slope: Option<&mut [DVec2]>) -> f64 {
@@ -129,13 +134,47 @@ fn reach(rest: &[RestTriangle], points: &[DVec2], step: &[DVec2]) -> f64 {
     nearest
 }
 
+/// The border of a chart, which may not cross itself.
+struct Border {
+    /// Ends of its sides; empty where it crosses itself from the start.
+    sides: Vec<(u32, u32)>,
+}
+
+impl Border {
+    fn new(sides: Vec<(u32, u32)>, points: &[DVec2]) -> Border {
+        let border = Border { sides };
+        if border.allows(points) { border } else { Border { sides: Vec::new() } }
+    }
+
+    /// Returns whether no two sides cross.
+    fn allows(&self, points: &[DVec2]) -> bool {
+        let at = |(a, b): (u32, u32)| [points[a as usize], points[b as usize]];
+        let mut sides: Vec<([DVec2; 2], (u32, u32))> = self.sides.iter().map(|&s| (at(s), s)).collect();
+        let least = |s: &[DVec2; 2]| s[0].x.min(s[1].x);
+        sides.sort_by(|a, b| least(&a.0).total_cmp(&least(&b.0)));
+        (0..sides.len()).all(|i| {
+            let (p, (a, b)) = sides[i];
+            let last = p[0].x.max(p[1].x);
+            let beside = sides[i + 1..].iter().take_while(|q| least(&q.0) <= last);
+            let mut apart = beside.filter(|(_, (c, d))| a != *c && a != *d && b != *c && b != *d);
+            apart.all(|(q, _)| !crosses(p, *q))
+        })
+    }
+}
+
+/// Returns whether two segments meet in a point within both.
+fn crosses([a, b]: [DVec2; 2], [c, d]: [DVec2; 2]) -> bool {
+    let side = |p: DVec2, q: DVec2, r: DVec2| (q - p).perp_dot(r - p);
+    side(a, b, c) * side(a, b, d) < 0.0 && side(c, d, a) * side(c, d, b) < 0.0
+}
+
 fn dot(a: &[DVec2], b: &[DVec2]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a.dot(*b)).sum()
 }
 
 /// L-BFGS (Nocedal & Wright, algorithm 7.4) with steps that halve until the energy falls enough
 /// (Armijo).
-fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: f64) {
+fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: f64, border: &Border) {
     let n = points.len();
     let mut slope = vec![DVec2::ZERO; n];
     let mut now = energy(rest, points, Some(&mut slope));
@@ -172,7 +211,7 @@ fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: 
             let next: Vec<DVec2> = points.iter().zip(&step).map(|(p, s)| *p + length * *s).collect();
             let mut new_slope = vec![DVec2::ZERO; n];
             let value = energy(rest, &next, Some(&mut new_slope));
-            if value <= now + 1e-4 * length * downhill {
+            if value <= now + 1e-4 * length * downhill && border.allows(&next) {
                 break (next, new_slope, value);
             }
             length *= 0.5;
@@ -313,5 +352,18 @@ mod tests {
         let step = [DVec2::ZERO, DVec2::ZERO, DVec2::new(0.0, -0.25)];
         // the height falls by a quarter a unit
         assert!((reach(&[one], &points, &step) - 4.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_border_may_touch_nothing_but_its_neighbors() {
+        let p = |x: f64, y: f64| DVec2::new(x, y);
+        let mut points = [p(0., 0.), p(4., 0.), p(4., 4.), p(2., 1.), p(0., 4.)];
+        let border = Border::new((0..5).map(|i| (i, (i + 1) % 5)).collect(), &points);
+        assert!(border.allows(&points));
+        // the dent through the lower side
+        points[3] = p(2., -0.1);
+        assert!(!border.allows(&points));
+        // what crosses itself from the start may go on
+        assert!(Border::new(border.sides, &points).allows(&points));
     }
 }

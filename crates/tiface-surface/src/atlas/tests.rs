@@ -210,7 +210,7 @@ fn heap(mesh: &Mesh, config: &AtlasConfig) -> AtlasLayout {
     let uvs = vec![glam::Vec2::splat(0.4), glam::Vec2::new(0.4, 0.6), glam::Vec2::splat(0.6)];
     let (width, height) = (config.size_px, config.size_px);
     let atlas = Atlas { uvs, triangles: vec![[0, 1, 2]; mesh.triangles.len()], width, height };
-    AtlasLayout { atlas, repaired: 0, gutter_px: 4.0 }
+    AtlasLayout { atlas, repaired: 0, gutter_px: 4.0, head: None }
 }
 
 #[test]
