@@ -8,6 +8,6 @@ mod texture;
 
 pub use look::{Look, Surface};
 pub use raster::{RasterLayers, RasterOptions, RasterView, raster, raster_into};
-pub use raycast::{RayHits, RaycastOptions, RenderedView, raycast};
+pub use raycast::{RayHits, RaycastOptions, RenderedView, raycast, raycast_each};
 pub use residual::{ResidualSource, ResidualView, Residuals};
-pub use texture::{LobePictures, MeshTexture};
+pub use texture::MeshTexture;
