@@ -340,7 +340,7 @@ mod tests {
         assert!((700..=800).contains(&mesh.triangles.len()) && mesh.is_closed(), "{}", mesh.triangles.len());
         let texture = after.head.texture.as_ref().unwrap();
         let lobes = texture.lobes.as_ref().unwrap();
-        assert_eq!((texture.color.width, lobes.pictures[0].width), (256, 128));
+        assert_eq!((texture.color.width, lobes.pictures[0].width), (256, 256 / LOBE_TEXEL));
         assert_eq!(after.head.shells.as_ref().unwrap().layers[0].alphas.len(), mesh.positions.len());
         let glb = after.files(MeshFormat::Glb, "head").unwrap().files.remove(0).1;
         assert!(String::from_utf8_lossy(&glb).contains("ball soft layers"));

@@ -21,7 +21,7 @@ pub struct HeadTexture {
 }
 
 /// Texels of a base color along each side of a texel of lobes, which are smooth.
-pub const LOBE_TEXEL: u32 = 2;
+pub const LOBE_TEXEL: u32 = 4;
 
 /// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
 #[derive(Clone, Debug, PartialEq)]

@@ -118,7 +118,8 @@ impl MipMaps {
     /// channels, `[4 · groups]`.
     fn new([width, height]: [u32; 2], groups: usize, fill: impl Fn(usize, &mut [u16]) + Sync) -> MipMaps {
         let (mut width, mut height) = (width as usize, height as usize);
-        let mut texels: Vec<Texel> = Vec::with_capacity((width * height / 3 * 4 + 2 * (width + height)) * groups);
+        let mut texels: Vec<Texel> =
+            Vec::with_capacity((width * height / 3 * 4 + 2 * (width + height)) * groups);
         texels.resize(width * height * groups, [0; 4]);
         let each = texels.par_chunks_exact_mut(groups).enumerate();
         each.for_each(|(i, texel)| fill(i, texel.as_flattened_mut()));
