@@ -20,7 +20,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let options =
         ExportOptions { name: "globe".into(), stem: "globe".into(), up: Vec3::Z, ..ExportOptions::default() };
     let plain = HeadTexture::new(atlas, color);
-    let lobes = Lobes { pictures: vec![gloss], scale: vec![0.5], asset_from_world: Mat3::IDENTITY };
+    let lobes = Lobes { pictures: vec![gloss], scale: vec![0.5], turned: Mat3::IDENTITY };
     let rich = HeadTexture { normal: Some(flat), lobes: Some(lobes), ..plain.clone() };
     let mut files = to_obj(&mesh, Some(&plain), &options)?.files;
     files.extend(to_ply(&mesh, Some(&plain), &options)?.files);

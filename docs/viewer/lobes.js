@@ -1,4 +1,4 @@
-// Colors that change with the view, for a GLB of `tiface mesh --lobes` in three.js (WebGLRenderer).
+// Colors that change with the view, for a GLB of `tiface` in three.js (WebGLRenderer).
 //
 //     const gltf = await new GLTFLoader().loadAsync("head.glb");
 //     const strength = await addLobes(gltf);     // null: the file holds none
@@ -27,34 +27,44 @@ export const BASIS = [
 ];
 
 /**
- * Gives every mesh of a loaded glTF whose material names lobes a material that shows them.
+ * Gives every mesh of a loaded glTF whose material names lobes, the head and its soft layers, a material that shows
+ * them.
  *
  * Returns a uniform shared by all of them, `{ value: 1 }`: with 0 they show the base color alone. Null if there are
  * no lobes in the file.
  */
 export async function addLobes(gltf) {
   const strength = { value: 1 };
-  const meshes = [];
+  const meshes = [], textures = new Map();
   gltf.scene.traverse((object) => {
     if (object.isMesh && object.material.userData.tiface?.lobes?.length) meshes.push(object);
   });
   for (const mesh of meshes) {
-    mesh.material = await lobeMaterial(gltf.parser, mesh.material, strength);
+    mesh.material = await lobeMaterial(gltf.parser, mesh.material, strength, textures);
   }
   return meshes.length ? strength : null;
 }
 
-async function lobeMaterial(parser, plain, strength) {
+/** A texture of a file as numbers, which are no colors; kept in `known` for the next that asks. */
+async function numbersOf(parser, texture, known) {
+  if (!known.has(texture)) {
+    const numbers = (await parser.getDependency("texture", texture)).clone();
+    numbers.colorSpace = NoColorSpace;
+    numbers.needsUpdate = true;
+    known.set(texture, numbers);
+  }
+  return known.get(texture);
+}
+
+async function lobeMaterial(parser, plain, strength, known) {
   const { lobes, view_dependent_color: model } = plain.userData.tiface;
   if (lobes.length > BASIS.length) throw new Error(`${lobes.length} lobes, but ${BASIS.length} functions are known`);
-  const textures = await Promise.all(lobes.map(async ({ texture }) => {
-    const lobe = (await parser.getDependency("texture", texture)).clone();
-    lobe.colorSpace = NoColorSpace; // numbers, no colors
-    lobe.needsUpdate = true;
-    return lobe;
-  }));
+  const textures = [];
+  for (const { texture } of lobes) textures.push(await numbersOf(parser, texture, known));
   // the pictures hold the light already: no lamp of the scene may touch them, and no tone mapping
-  const material = new MeshBasicMaterial({ name: plain.name, map: plain.map, side: plain.side, toneMapped: false });
+  const { name, map, side, transparent, opacity, depthWrite, alphaTest, vertexColors } = plain;
+  const material = new MeshBasicMaterial({
+    name, map, side, transparent, opacity, depthWrite, alphaTest, vertexColors, toneMapped: false });
   material.userData = plain.userData;
   material.customProgramCacheKey = () => `tiface lobes ${lobes.length}`;
   material.onBeforeCompile = (shader) => {

@@ -5,6 +5,7 @@ use super::table::table;
 use serde::{Deserialize, Serialize};
 use std::str::FromStr;
 use tiface_base::{Error, Result};
+use tiface_surface::files::LOBE_TEXEL;
 
 /// A mesh file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -125,10 +126,11 @@ table! {
             "Side of the texture, texels; 0 stores colors at the vertices")]
         texture_px: u32, 0.0..=16384.0 [Head] => 1024, 2048, 0;
         /// Degree of the view-dependent spherical harmonics in the GLB: 0 (none), 1 or 2; limits
-        /// all views of the mesh.
+        /// all views of the mesh. Fewer if photographs do not support as many; none without a
+        /// texture.
         #[flag("lobes", Text("DEGREE"), ["mesh"],
             "Degree of the view-dependent spherical harmonics in the GLB: 0, 1 or 2")]
-        lobes: u32, 0.0..=2.0 [Head] => 0;
+        lobes: u32, 0.0..=2.0 [Head] => 2, 2, 0;
         /// Hair and other soft outlines: shells (translucent layers in the GLB, where they help) or
         /// none. raycast renders them with `mesh.color=photographs`.
         #[flag("hair", Text("KIND"), ["mesh", "export"],
@@ -153,7 +155,7 @@ table! {
         /// Coordinate frame of the files: dataset, or head (+Y up, face towards +Z, centered).
         #[flag("frame", Text("FRAME"), ["mesh", "export"],
             "Coordinate frame: dataset, or head (+Y up, face towards +Z)")]
-        frame: MeshFrame [Files, Head if |c| c.mesh.lobes > 0] => MeshFrame::Dataset;
+        frame: MeshFrame [Files] => MeshFrame::Dataset;
         /// Height of the head mesh in GLB and OBJ files, meters, from the crown to the end of what
         /// is shown of the body; 0: as `capture.unit_m` says.
         #[flag("height", Text("METERS"), ["mesh", "export"],
@@ -181,21 +183,21 @@ impl MeshConfig {
         u64::from(self.texture_px).pow(2)
     }
 
-    /// Pictures of a texture: color, normals, lobes.
+    /// Pictures of lobes, one a function.
+    fn lobe_pictures(&self) -> u64 {
+        if self.lobes == 0 { 0 } else { (u64::from(self.lobes) + 1).pow(2) }
+    }
+
+    /// Number of pictures of the texture's size that a texture holds: color, normals, lobes.
     pub fn pictures(&self) -> u64 {
-        let lobes = if self.lobes == 0 { 0 } else { (u64::from(self.lobes) + 1).pow(2) };
-        1 + u64::from(self.normal_map) + lobes
+        1 + u64::from(self.normal_map) + self.lobe_pictures().div_ceil(u64::from(LOBE_TEXEL).pow(2))
     }
 
     /// Returns what the ranges of single keys cannot say: a key, its problem, and a suggested fix.
     pub fn problem(&self) -> Option<(&'static str, String, &'static str)> {
         let px = self.texture_px;
         if px == 0 {
-            let asked = [
-                (self.lobes > 0, key!(mesh.lobes)),
-                (self.normal_map, key!(mesh.normal_map)),
-                (self.exr, key!(mesh.exr)),
-            ];
+            let asked = [(self.normal_map, key!(mesh.normal_map)), (self.exr, key!(mesh.exr))];
             return asked.iter().find(|(on, _)| *on).map(|(_, key)| {
                 let problem = "asks for a picture, but `mesh.texture_px` is 0".to_owned();
                 (*key, problem, "set `mesh.texture_px`, to 2048 for example")
@@ -206,10 +208,12 @@ impl MeshConfig {
             let hint = "it must be 0, or at least 64";
             return Some((key!(mesh.texture_px), problem, hint));
         }
-        // held as floats while they are baked
-        let pictures = self.pictures();
-        // and the sums of a fit for each texel
-        let fit = if self.color == ColorSource::Photographs { 250 } else { 0 };
+        // held as floats while they are baked, lobes of the network as fine as the color; and the
+        // sums of a fit for each texel
+        let (pictures, fit) = match self.color {
+            ColorSource::Photographs => (self.pictures(), 250),
+            ColorSource::Network => (1 + u64::from(self.normal_map) + self.lobe_pictures(), 0),
+        };
         let gib = (self.texels() * (21 * pictures + fit)) >> 30;
         (gib > 16).then(|| {
             let problem = format!("is {px}: {pictures} pictures of that size take {gib} GiB to make");

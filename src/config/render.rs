@@ -20,7 +20,9 @@ pub enum Method {
     /// fitted to the photographs, or the whole extraction with those of the network, by
     /// `mesh.color`.
     Raycast,
-    /// Rays cast at the product, color from its texture: what a viewer of `head.glb` sees.
+    /// Rays cast at the product, its base color alone: what any viewer of `head.glb` shows.
+    Plain,
+    /// The same with its lobes: what viewers of ours show.
     Textured,
     /// The same, rasterized in a fraction of the time, without soft layers.
     Raster,
@@ -28,13 +30,14 @@ pub enum Method {
 
 /// Pictures that are judged, in pipeline order: their word in folders, the configuration and
 /// `metrics.json`, and what they are called. All but the last are those of [`Method`].
-pub const NAMES: [(&str, &str); 7] = [
+pub const NAMES: [(&str, &str); 8] = [
     ("baseline", "baseline"),
     ("tface", "T-Face"),
     ("volume", "I-Face"),
     ("raycast", "I-Face's mesh"),
-    ("textured", "head.glb"),
-    ("raster", "head.glb, rasterized"),
+    ("plain", "head.glb in any viewer"),
+    ("textured", "head.glb with lobes"),
+    ("raster", "head.glb with lobes, rasterized"),
     ("ensemble", "blend"),
 ];
 
@@ -59,7 +62,7 @@ impl Method {
             Method::Baseline => Stage::Baseline,
             Method::Tface => Stage::Tface,
             Method::Volume => Stage::Iface,
-            Method::Raycast | Method::Textured | Method::Raster => Stage::Mesh,
+            Method::Raycast | Method::Plain | Method::Textured | Method::Raster => Stage::Mesh,
         }
     }
 }
@@ -97,14 +100,15 @@ table! {
              transforms.json)")]
         cameras: String [Path if |c| !c.render.cameras_are_a_file()] => "test".into();
         /// Methods, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with
-        /// view-dependent color), textured (head.glb, as a viewer shows it) and raster (the same,
-        /// rasterized, without soft layers).
+        /// view-dependent color), plain (head.glb, as any viewer shows it), textured (head.glb with
+        /// its lobes, as viewers of ours show it) and raster (the same, rasterized, without soft
+        /// layers).
         #[flag("with", Text("LIST"), ["render"],
-            "Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), \
-             textured (head.glb, as a viewer shows it) and raster (the same, rasterized)")]
+            "Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), plain \
+             (head.glb, as any viewer shows it), textured (with its lobes) and raster (the same, rasterized)")]
         method: Vec<Method> [Views]
-            => vec![Method::Tface, Method::Raycast],
-            vec![Method::Tface, Method::Raycast],
+            => vec![Method::Tface, Method::Raycast, Method::Plain, Method::Textured],
+            vec![Method::Tface, Method::Raycast, Method::Plain, Method::Textured],
             vec![Method::Baseline, Method::Tface, Method::Volume, Method::Raycast];
         /// Number of views of an orbit around the head.
         orbit_views: u32, 1.0..=10_000.0 [Path if |c| c.render.cameras == "orbit"] => 36;
@@ -146,11 +150,11 @@ table! {
     /// Members and weights of the blend.
     pub struct EnsembleConfig;
     keys {
-        /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh)
-        /// and textured (head.glb); empty: no blend.
+        /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh),
+        /// plain and textured (head.glb); empty: no blend.
         #[flag("members", Text("LIST"), ["ensemble"],
             "Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's \
-             mesh), textured and raster (head.glb)")]
+             mesh), plain, textured and raster (head.glb)")]
         members: Vec<Method> [Blend]
             => vec![Method::Tface, Method::Raycast],
             vec![Method::Tface, Method::Raycast],
@@ -197,7 +201,7 @@ mod tests {
     #[test]
     fn every_picture_has_one_word_and_one_name() {
         use Method::*;
-        let methods = [Baseline, Tface, Volume, Raycast, Textured, Raster];
+        let methods = [Baseline, Tface, Volume, Raycast, Plain, Textured, Raster];
         for (method, (word, _)) in methods.into_iter().zip(NAMES) {
             // the word of the folder is the word of the configuration
             assert_eq!((serde_json::json!(method), method.as_str()), (serde_json::json!(word), word));

@@ -459,7 +459,7 @@ impl Bench<'_> {
             self.check_stop()?;
             let (head, cost) = timed(|| finisher.finish(self, &c))?;
             let triangles = head.mesh.triangles.len() as f64;
-            let meshes = Meshes::of_head(head, [true, false]);
+            let meshes = Meshes::of_head(head);
             let renderer = Renderer::new(&self.scene, &fields, &meshes, 2, self.monitor());
             let psnr = self.evaluator.psnr(&self.scene, &renderer, Method::Textured)?;
             let figures = vec![psnr, Some(triangles)];

@@ -289,7 +289,7 @@ fn draw(views: &[&View], config: &Config, mesh: &Path, folder: &Path) -> Result<
     let HeadMesh { world_from_scene, .. } = head;
     let report = check(&weld(&head.mesh), world_from_scene.scale * config.capture.unit_m);
     let options = RaycastOptions { samples: config.render.samples, world_from_scene };
-    let visible = VisibleHead::new(&head, [true, false]);
+    let visible = VisibleHead::new(&head);
     let scene_from_world = world_from_scene.inverse();
     for view in views {
         let mut drawn = visible.as_in_viewer(&view.camera.transformed(&scene_from_world), &options);

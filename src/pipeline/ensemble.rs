@@ -179,7 +179,7 @@ fn trained_with_masks(capture: &Capture, config: &Config, method: Method) -> boo
     let has_mask = |v: &View| v.mask != ViewMask::None && v.mask_meaning == MaskMeaning::Empty;
     let used = match method {
         Method::Baseline | Method::Tface => config.radiance(method.stage()).masks != MaskUse::None,
-        Method::Volume | Method::Raycast | Method::Textured | Method::Raster => true,
+        Method::Volume | Method::Raycast | Method::Plain | Method::Textured | Method::Raster => true,
     };
     used && capture.views.iter().any(has_mask)
 }

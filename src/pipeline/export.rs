@@ -7,7 +7,6 @@
 
 use super::advice::{advised, sentence};
 use super::cameras::CameraCheck;
-use super::finish::lobes;
 use super::frames::{Export, center};
 use super::mesh::{finished_mesh, read_finished};
 use super::scene_file::read_capture;
@@ -18,7 +17,7 @@ use crate::run::Fingerprint;
 use std::path::{Path, PathBuf};
 use tiface_base::{Error, Monitor, Result};
 use tiface_surface::bake::{Original, tangent_space};
-use tiface_surface::files::{ExportedFiles, HeadMesh, HeadTexture, tangents};
+use tiface_surface::files::{ExportedFiles, HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
 use tiface_surface::{SimplifyConfig, atlas, simplify};
 
 /// Keys that affect how the files of a mesh are written, each with what it is and the formats that
@@ -106,7 +105,6 @@ impl KeptHead {
         self.export = Export::new(&self.capture, asked);
         self.leave_out(asked)?;
         self.resize(asked, formats, monitor)?;
-        self.turn_lobes()?;
         let has_normals = self.head.texture.as_ref().is_some_and(|t| t.normal.is_some());
         if asked.mesh.material == Material::Unlit && self.made.mesh.material == Material::Lit && has_normals {
             let left_out = key!(mesh.normal_map);
@@ -234,20 +232,8 @@ impl KeptHead {
                     format!("use {least} or more"),
                 ));
             }
-            Some(texture) if px > 0 => self.head.texture = Some(texture.reduced(px, px)),
+            Some(texture) if px > 0 => self.head.texture = Some(texture.reduced(px, px / LOBE_TEXEL)),
             _ => {}
-        }
-        Ok(())
-    }
-
-    /// Brings the lobes into the coordinates of the files.
-    fn turn_lobes(&mut self) -> Result<()> {
-        let frames = self.export.frames(&self.head.mesh, &self.head.world_from_scene)?;
-        let asset_from_world = frames.file_from_world().rotation_f32();
-        if let Some(texture) = &mut self.head.texture
-            && let Some(kept) = texture.lobes.take_if(|kept| kept.asset_from_world != asset_from_world)
-        {
-            texture.lobes = lobes(&kept.turned(asset_from_world), asset_from_world);
         }
         Ok(())
     }
@@ -274,7 +260,8 @@ impl KeptHead {
                 Ok(tangent_space(&mesh, &layout, &tangents(&mesh, &layout)?, normals, gutter_px))
             };
             let normal = carried.normal.as_ref().map(bend).transpose()?;
-            let lobes = texture.lobes.as_ref().and_then(|l| lobes(&carried.lobes, l.asset_from_world));
+            let lobes = texture.lobes.as_ref().and_then(|l| Lobes::new(&carried.lobes, l.turned));
+            let lobes = lobes.map(|l| l.reduced(px / LOBE_TEXEL));
             Ok(HeadTexture { color: carried.color.encoded(), normal, lobes, atlas: layout })
         };
         let texture = texture.as_ref().filter(|_| px > 0).map(carry).transpose()?;
@@ -311,10 +298,9 @@ fn not_shown(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{MeshFrame, Preset};
-    use glam::{Vec3, vec3};
+    use crate::config::Preset;
+    use glam::Vec3;
     use tiface_base::Quiet;
-    use tiface_base::geom::sphharm::combine;
     use tiface_surface::bake::testing::ball;
     use tiface_surface::files::testing::tetrahedron;
     use tiface_surface::files::{read, weld};
@@ -347,34 +333,6 @@ mod tests {
     }
 
     #[test]
-    fn lobes_add_the_same_color_in_another_frame() {
-        let head = kept(tetrahedron(), |c| (c.mesh.lobes, c.mesh.normal_map) = (1, true));
-        let seen = |head: &HeadMesh, d: Vec3| {
-            let lobes = head.texture.as_ref().unwrap().lobes.as_ref().unwrap();
-            let texel = lobes.pictures.iter().zip(&lobes.scale);
-            let value = |(p, s): (&tiface_base::image::Photo, &f32)| {
-                p.rgb[9].map(|b| (f32::from(b) - 128.0) / 127.0 * s)
-            };
-            Vec3::from(combine(
-                &texel.map(value).collect::<Vec<_>>(),
-                (lobes.asset_from_world * d).to_array(),
-            ))
-        };
-        let before = head.head.clone();
-        let asked = asked(&head, |c| c.mesh.frame = MeshFrame::Head);
-        let after = head.changed(&asked, &[MeshFormat::Glb], &Quiet).unwrap();
-        let turned = |h: &HeadMesh| h.texture.as_ref().unwrap().lobes.as_ref().unwrap().asset_from_world;
-        let frames = after.export.frames(&after.head.mesh, &after.head.world_from_scene).unwrap();
-        assert_eq!(turned(&after.head), frames.file_from_world().rotation_f32());
-        assert!(!turned(&after.head).abs_diff_eq(turned(&before), 0.1));
-        for d in [Vec3::X, Vec3::NEG_Y, vec3(0.6, 0.0, -0.8), vec3(-0.48, 0.64, 0.6)] {
-            let (is, was) = (seen(&after.head, d), seen(&before, d));
-            // four functions of about 0.5, each rounded by half a 127th of up to 0.4
-            assert!(is.abs_diff_eq(was, 0.004) && was.length() > 0.05, "{is} {was}");
-        }
-    }
-
-    #[test]
     fn fewer_triangles_keep_layers_and_view_dependent_color() {
         let head = kept(ball(), |c| (c.mesh.texture_px, c.mesh.lobes) = (512, 1));
         let before = head.head.clone();
@@ -384,7 +342,7 @@ mod tests {
         assert!((700..=800).contains(&mesh.triangles.len()) && mesh.is_closed(), "{}", mesh.triangles.len());
         let texture = after.head.texture.as_ref().unwrap();
         let lobes = texture.lobes.as_ref().unwrap();
-        assert_eq!((texture.color.width, lobes.pictures[0].width), (256, 256));
+        assert_eq!((texture.color.width, lobes.pictures[0].width), (256, 256 / LOBE_TEXEL));
         assert_eq!(after.head.shells.as_ref().unwrap().layers[0].alphas.len(), mesh.positions.len());
         let glb = after.files(MeshFormat::Glb, "head").unwrap().files.remove(0).1;
         assert!(String::from_utf8_lossy(&glb).contains("ball soft layers"));

@@ -1,19 +1,19 @@
 //! From the extracted surface to the head mesh: simplification, atlas and texture baking.
 
 use super::advice::{advised, sentence};
-use super::frames::{Export, Frames, center};
+use super::frames::{Export, center};
 use crate::capture::scene::Scene;
 use crate::config::{ColorSource, Hair, MeshConfig, MeshFrame};
 use glam::Mat3;
 use serde_json::{Map, Value, json};
 use tiface_base::geom::{Atlas, Camera, Harmonics, Mesh, SdfField, Shells, Similarity};
-use tiface_base::image::{Image, Photo, linear_from_srgb, srgb_from_linear};
+use tiface_base::image::{Image, linear_from_srgb, srgb_from_linear};
 use tiface_base::{Monitor, Result};
 use tiface_surface::bake::{
     BakeConfig, Baked, FittedTexture, Seams, Seen, bake, bake_harmonics, complete, complete_unseen_vertices,
     tangent_space,
 };
-use tiface_surface::files::{HeadMesh, HeadTexture, Lobes, tangents};
+use tiface_surface::files::{HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
 use tiface_surface::{
     Appearance, AtlasConfig, Cap, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells,
     resolved, simplify,
@@ -80,8 +80,8 @@ impl Finish<'_> {
         let seen = Seen::of(&mesh, self.cameras, self.photographs, REACH * self.cell);
         mesh.seen_by.clone_from(&seen.cameras);
         let world_from_scene = self.scene.scene_from_world.inverse();
-        let frames = self.lobe_frames(&mesh, &world_from_scene)?;
-        let fit = self.color_fit(&frames, &mut log);
+        let turned = self.lobe_coordinates(&mesh, &world_from_scene)?;
+        let fit = self.color_fit(turned, &mut log);
         let shells = self.shells(&mesh, &mut log)?;
         let (texture, harmonics, linear) = if self.config.texture_px == 0 {
             let guess = mesh.colors.clone();
@@ -94,9 +94,7 @@ impl Finish<'_> {
             let layout = self.unwrap(&mesh, &mut log)?;
             let (mut baked, harmonics) =
                 self.bake(&mut mesh, shells.as_ref(), &layout, &fit, &seen, &mut log)?;
-            let file_from_world = frames.file_from_world().rotation_f32();
-            let texture =
-                self.texture(&mesh, layout, &mut baked, harmonics.as_ref(), file_from_world, &mut log);
+            let texture = self.texture(&mesh, layout, &mut baked, harmonics.as_ref(), turned, &mut log);
             (Some(texture), harmonics, self.config.exr.then_some(baked.color))
         };
         let head = HeadMesh { mesh, world_from_scene, texture, harmonics, shells };
@@ -118,15 +116,16 @@ impl Finish<'_> {
         Ok(mesh)
     }
 
-    /// Returns the frames that lobes are kept in: turned as [`Export::files`] turns the file. Data
-    /// that is in no file is the same in all formats.
-    fn lobe_frames(&self, mesh: &Mesh, world_from_scene: &Similarity) -> Result<Frames> {
-        let frame = if self.config.lobes > 0 { self.export.frame } else { MeshFrame::Dataset };
-        Export { frame, ..self.export.clone() }.frames(mesh, world_from_scene)
+    /// Returns the rotation from the scene to the coordinates that harmonics are kept in: those of
+    /// files in the dataset's frame, which then hold them as they are. In other frames
+    /// [`to_glb`] turns them.
+    fn lobe_coordinates(&self, mesh: &Mesh, world_from_scene: &Similarity) -> Result<Mat3> {
+        let export = Export { frame: MeshFrame::Dataset, ..self.export.clone() };
+        Ok(export.frames(mesh, world_from_scene)?.file_from_scene.rotation_f32())
     }
 
     /// Decides whether colors are fitted to photographs; warns if they should be, but cannot.
-    fn color_fit(&self, frames: &Frames, log: &mut StepLog) -> ColorFit<'_> {
+    fn color_fit(&self, turned: Mat3, log: &mut StepLog) -> ColorFit<'_> {
         let c = self.config;
         let fits = c.color == ColorSource::Photographs;
         let photographs_say = fits && self.photographs.iter().any(|p| p.head_pixels() > 0);
@@ -139,7 +138,7 @@ impl Finish<'_> {
         ColorFit {
             photographs: photographs_say.then_some(self.photographs),
             max_degree: if c.lobes > 0 { c.lobes } else { 2 },
-            turned: frames.file_from_scene.rotation_f32(),
+            turned,
         }
     }
 
@@ -249,7 +248,7 @@ impl Finish<'_> {
         layout: Atlas,
         baked: &mut Baked,
         harmonics: Option<&Harmonics>,
-        file_from_world: Mat3,
+        turned: Mat3,
         log: &mut StepLog,
     ) -> HeadTexture {
         let c = self.config;
@@ -270,27 +269,8 @@ impl Finish<'_> {
         if let Some(harmonics) = harmonics.filter(|_| c.lobes > 0) {
             baked.lobes = bake_harmonics(mesh, &layout, harmonics, c.gutter_px);
         }
-        let lobes = lobes(&baked.lobes, file_from_world);
+        // the network's are as fine as the color
+        let lobes = Lobes::new(&baked.lobes, turned).map(|l| l.reduced(c.texture_px / LOBE_TEXEL));
         HeadTexture { atlas: layout, color, normal, lobes }
     }
-}
-
-/// Returns the lobes as pictures. Each is scaled by the value that all but a thousandth of its
-/// texels stay below, so that a few outliers do not cost the others their precision.
-pub(super) fn lobes(images: &[Image], asset_from_world: Mat3) -> Option<Lobes> {
-    if images.is_empty() {
-        return None;
-    }
-    let (mut pictures, mut scale) = (Vec::new(), Vec::new());
-    for image in images {
-        let mut sizes: Vec<f32> = image.data.iter().map(|v| v.abs()).collect();
-        let at = (sizes.len() as f64 * 0.999) as usize;
-        let most = if sizes.is_empty() { 0.0 } else { *sizes.select_nth_unstable_by(at, f32::total_cmp).1 };
-        let most = most.max(1e-4);
-        let byte = |v: f32| (v / most * 127.0 + 128.5).clamp(1.0, 255.0) as u8;
-        let rgb = image.data.as_chunks::<3>().0.iter().map(|c| c.map(byte)).collect();
-        pictures.push(Photo { width: image.width, height: image.height, rgb, alpha: None });
-        scale.push(most);
-    }
-    Some(Lobes { pictures, scale, asset_from_world })
 }

@@ -251,11 +251,18 @@ fn a_surface_may_stay_open_and_without_a_texture() {
     // the demo's neck runs out of the box
     assert_eq!(mesh["closed"], json!(mesh["report"]["capped"] == 0), "{mesh}");
     assert_eq!(mesh["texture_px"], 0);
-    let error = complete(&session, Stage::Render, &exact).unwrap_err();
-    assert!(error.hint().contains("--texture"), "{error}");
-    config.mesh.lobes = 1;
+    // a viewer shows the colors of its vertices
+    complete(&session, Stage::Render, &exact).unwrap();
+    let seen = pictures::read(&run.path("render/textured/012.png")).unwrap();
+    let colors: Vec<&[f32; 4]> = seen.data.as_chunks::<4>().0.iter().filter(|p| p[3] == 1.0).collect();
+    let range = |k: usize| {
+        let of = colors.iter().map(|p| p[k]);
+        of.clone().fold(0.0, f32::max) - of.fold(1.0, f32::min)
+    };
+    assert!(colors.len() > 1000 && range(0) > 0.1 && range(0) != range(2), "{} {}", colors.len(), range(0));
+    config.mesh.normal_map = true;
     let error = Session::open(&config, &run).err().unwrap();
-    assert!(error.to_string().contains("mesh.lobes") && error.hint().contains("texture_px"), "{error}");
+    assert!(error.to_string().contains("mesh.normal_map") && error.hint().contains("texture_px"), "{error}");
 }
 
 /// The demo head with a tunnel from ear to ear, 0.06 wide in a scene of 2.

@@ -124,7 +124,6 @@ fn cases(dir: &Path) -> Vec<(Config, Vec<&'static str>)> {
         (with(&|c| c.mask.point = vec!["16,20,1".into()]), vec![key!(mask.point), key!(mask.view)]),
         (with(&|c| c.mask.alpha_net = file("alpha_net")), vec![key!(mask.alpha_net), key!(mask.alpha_input)]),
         (imports, vec![key!(baseline.import), key!(tface.import), key!(capture.tiles)]),
-        (with(&|c| c.mesh.lobes = 1), vec![key!(mesh.frame)]),
         (with(&|c| c.metrics.lpips = file("lpips")), vec![key!(metrics.lpips)]),
     ]
 }

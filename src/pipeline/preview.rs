@@ -23,9 +23,9 @@ use tiface_base::geom::{Atlas, Camera, Distortion, Similarity};
 use tiface_base::image::{Image, Photo, quantize, reduce_photo, working_size};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
-use tiface_surface::files::{HeadMesh, OpenedMesh, open_mesh};
+use tiface_surface::files::{HeadMesh, HeadTexture, OpenedMesh, open_mesh};
 use tiface_surface::render::{
-    LobePictures, Look, MeshTexture, RasterLayers, RasterOptions, RasterView, Surface, raster_into,
+    Look, MeshTexture, RasterLayers, RasterOptions, RasterView, Surface, raster_into,
 };
 
 /// The lens of a preview: distance over visible width. A long one, as for portraits.
@@ -158,16 +158,10 @@ impl Preview {
 
     /// Prepares the mesh for rendering.
     pub fn renderer(&self) -> PreviewRenderer<'_> {
-        let HeadMesh { mesh, world_from_scene, texture, shells, .. } = &self.head;
+        let HeadMesh { mesh, texture, shells, .. } = &self.head;
         let layers = shells.as_ref().map(|shells| RasterLayers::new(mesh, shells));
-        let texture = texture.as_ref().map(|texture| {
-            let lobes = texture.lobes.as_ref().map(|l| LobePictures {
-                pictures: &l.pictures,
-                scale: &l.scale,
-                turned: l.asset_from_world * world_from_scene.rotation_f32(),
-            });
-            MeshTexture::new(mesh, &texture.atlas, &texture.color, lobes.as_ref())
-        });
+        let prepared = |t: &HeadTexture| MeshTexture::new(mesh, &t.atlas, &t.color, t.lobes.as_ref());
+        let texture = texture.as_ref().map(prepared);
         PreviewRenderer { preview: self, texture, layers }
     }
 }

@@ -21,18 +21,20 @@ use crate::capture::{Capture, Split};
 use crate::config::{ColorSource, Config, Method, RenderConfig};
 use crate::run::{Run, StageDir};
 use serde_json::{Map, Value, json};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
-use tiface_base::geom::{Bvh, Camera, Ray, ShellCaster, Similarity};
+use tiface_base::geom::{Bvh, Camera, Harmonics, Ray, ShellCaster, Similarity};
 use tiface_base::io;
-use tiface_base::{Error, Monitor, Result};
-use tiface_surface::files::{ExtractedSurface, HeadMesh};
+use tiface_base::{Monitor, Result};
+use tiface_surface::files::{ExtractedSurface, HeadMesh, HeadTexture};
 use tiface_surface::render::{
-    LobePictures, MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView,
-    ResidualSource, ResidualView, Residuals, Surface, raster, raycast,
+    MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView, ResidualSource,
+    ResidualView, Residuals, Surface, raster, raycast, raycast_each,
 };
 
 /// Renders one folder per method and one picture per camera, and the `fitted` cameras by the
-/// methods that compare poses; `unit_m` is the number of meters in a dataset unit.
+/// methods that compare poses; `unit_m` is the number of meters in a dataset unit. Methods that
+/// show the same surface share its rays, and so the seconds of a view.
 pub(super) fn render(
     c: &RenderConfig,
     renderer: &Renderer,
@@ -42,45 +44,78 @@ pub(super) fn render(
     unit_m: f64,
     dir: &StageDir,
 ) -> Result<Value> {
-    let background = pictures::background_color(c.background);
-    let own_poses = |m: Method| if matches!(m, Method::Tface | Method::Raycast) { fitted } else { &[] };
-    let total: usize = c.method.iter().map(|&m| cameras.len() + own_poses(m).len()).sum();
+    let own_poses = |m: &Method| if matches!(m, Method::Tface | Method::Raycast) { fitted.len() } else { 0 };
+    let total: usize = c.method.iter().map(|m| cameras.len() + own_poses(m)).sum();
     let mut done = 0;
     let mut seconds = Map::new();
-    for &method in &c.method {
+    for group in renderer.groups(&c.method) {
         let (mut spent, mut made) = (Duration::ZERO, 0);
-        let whole = dir.folder().join(method.as_str());
-        let own = own_poses(method).iter().map(|camera| (camera, whole.join(pictures::OWN_POSE), None));
-        let float = c.float.then(|| whole.join(pictures::FLOAT));
-        let given = cameras.iter().map(|camera| (camera, whole.clone(), float.clone()));
-        for (NamedCamera { name, camera }, folder, float) in given.chain(own) {
-            let files = pictures::files(&folder, name, float.as_deref(), c.format);
+        let fitting: Vec<Method> = group.iter().copied().filter(|m| own_poses(m) > 0).collect();
+        let given = cameras.iter().map(|camera| (camera, &group, false));
+        let own = fitted.iter().map(|camera| (camera, &fitting, true));
+        for (NamedCamera { name, camera }, methods, is_own_pose) in given.chain(own) {
+            let target = |method: &Method| ViewTarget::new(c, dir, *method, name, is_own_pose);
             // an interrupted process left only complete files of the same settings
-            if !files.iter().all(|file| io::is_file(file)) {
+            let targets = methods.iter().map(|method| (*method, target(method)));
+            let missing: Vec<(Method, ViewTarget)> = targets.filter(|(_, t)| !t.is_complete(c)).collect();
+            if !missing.is_empty() {
                 let camera = camera.transformed(&scene.scene_from_world);
                 let begin = Instant::now();
-                let view = renderer.view(method, &camera)?;
+                let methods: Vec<Method> = missing.iter().map(|(method, _)| *method).collect();
+                let views = renderer.views(&methods, &camera)?;
                 spent += begin.elapsed();
-                made += 1;
+                made += missing.len();
                 dir.check_stop()?; // what it holds then is not whole
-                if let Some(mut view) = view {
-                    if let Some(float) = &float {
-                        pictures::write_float(float, name, &view)?;
-                    }
-                    if let Some(background) = background {
-                        pictures::over(&mut view, background);
-                    }
-                    pictures::write(&folder, name, &view, c.format, unit_m)?;
+                for ((_, target), view) in missing.iter().zip(views) {
+                    view.map_or(Ok(()), |view| target.write(view, c, unit_m))?;
                 }
             }
-            done += 1;
+            done += methods.len();
             dir.step(done, total)?;
         }
         let per_view = spent.as_secs_f64() / made.max(1) as f64;
-        seconds.insert(method.as_str().to_owned(), json!(per_view));
+        seconds.extend(group.iter().map(|m| (m.as_str().to_owned(), json!(per_view))));
     }
     let methods: Vec<_> = c.method.iter().map(|m| m.as_str()).collect();
     Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
+}
+
+/// Where a view is written.
+struct ViewTarget<'a> {
+    name: &'a str,
+    folder: PathBuf,
+    float: Option<PathBuf>,
+}
+
+impl<'a> ViewTarget<'a> {
+    fn new(
+        c: &RenderConfig,
+        dir: &StageDir,
+        method: Method,
+        name: &'a str,
+        is_own_pose: bool,
+    ) -> ViewTarget<'a> {
+        let whole = dir.folder().join(method.as_str());
+        match is_own_pose {
+            true => ViewTarget { name, folder: whole.join(pictures::OWN_POSE), float: None },
+            false => ViewTarget { name, float: c.float.then(|| whole.join(pictures::FLOAT)), folder: whole },
+        }
+    }
+
+    fn is_complete(&self, c: &RenderConfig) -> bool {
+        let files = pictures::files(&self.folder, self.name, self.float.as_deref(), c.format);
+        files.iter().all(|file| io::is_file(file))
+    }
+
+    fn write(&self, mut view: RenderedView, c: &RenderConfig, unit_m: f64) -> Result<()> {
+        if let Some(float) = &self.float {
+            pictures::write_float(float, self.name, &view)?;
+        }
+        if let Some(background) = pictures::background_color(c.background) {
+            pictures::over(&mut view, background);
+        }
+        Ok(pictures::write(&self.folder, self.name, &view, c.format, unit_m)?)
+    }
 }
 
 /// Returns the cameras of the evaluation: those held out from training, or all if none is.
@@ -109,8 +144,11 @@ pub(super) fn cameras(
 /// are evaluated on the extracted surface.
 pub(super) fn shows_head(config: &Config, methods: &[Method]) -> bool {
     let fitted = config.mesh.color == ColorSource::Photographs;
-    let shows =
-        |m: &Method| matches!(m, Method::Textured | Method::Raster) || *m == Method::Raycast && fitted;
+    let shows = |m: &Method| match m {
+        Method::Plain | Method::Textured | Method::Raster => true,
+        Method::Raycast => fitted,
+        _ => false,
+    };
     methods.iter().any(shows)
 }
 
@@ -118,30 +156,21 @@ pub(super) fn shows_head(config: &Config, methods: &[Method]) -> bool {
 pub(super) struct Meshes {
     extracted: Option<ExtractedSurface>,
     head: Option<HeadMesh>,
-    /// Whether the head is shown as a viewer shows it, and with view-dependent color.
-    shown: [bool; 2],
 }
 
 impl Meshes {
     /// Loads the meshes that `methods` show from the run.
     pub fn load(run: &Run, config: &Config, methods: &[Method]) -> Result<Meshes> {
-        let (raycast, textured) = (methods.contains(&Method::Raycast), methods.contains(&Method::Textured));
-        let raster = methods.contains(&Method::Raster);
         let fitted = config.mesh.color == ColorSource::Photographs;
-        let extracted = (raycast && !fitted).then(|| extracted_surface(run)).transpose()?;
+        let extracted =
+            (methods.contains(&Method::Raycast) && !fitted).then(|| extracted_surface(run)).transpose()?;
         let head = shows_head(config, methods).then(|| head_mesh(run)).transpose()?;
-        if textured && head.as_ref().is_some_and(|head| head.texture.is_none()) {
-            return Err(Error::cannot(
-                "the mesh has no texture to be shown",
-                "make one: `tiface mesh RUN --fresh mesh --texture 2048`",
-            ));
-        }
-        Ok(Meshes { extracted, head, shown: [textured || raster, raycast && fitted] })
+        Ok(Meshes { extracted, head })
     }
 
-    /// Prepares a head mesh for rendering as a viewer shows it and with view-dependent color.
-    pub fn of_head(head: HeadMesh, shown: [bool; 2]) -> Meshes {
-        Meshes { extracted: None, head: Some(head), shown }
+    /// Prepares a head mesh for rendering.
+    pub fn of_head(head: HeadMesh) -> Meshes {
+        Meshes { extracted: None, head: Some(head) }
     }
 }
 
@@ -151,70 +180,82 @@ pub(super) struct VisibleHead<'a> {
     bvh: Bvh,
     shells: Option<ShellCaster<'a>>,
     layers: Option<RasterLayers<'a>>,
-    /// The texture as an ordinary viewer shows it.
-    shown: Option<MeshTexture>,
-    /// The base color alone.
-    base: Option<MeshTexture>,
+    texture: Option<MeshTexture>,
 }
 
 impl<'a> VisibleHead<'a> {
-    /// Prepares a head to be shown as a viewer shows it, and with view-dependent color.
-    pub fn new(head: &'a HeadMesh, shown: [bool; 2]) -> VisibleHead<'a> {
-        let (mesh, world_from_scene) = (&head.mesh, head.world_from_scene.rotation_f32());
-        let texture = |lobes: bool| {
-            let texture = head.texture.as_ref()?;
-            let lobes = texture.lobes.as_ref().filter(|_| lobes).map(|l| LobePictures {
-                pictures: &l.pictures,
-                scale: &l.scale,
-                turned: l.asset_from_world * world_from_scene,
-            });
-            Some(MeshTexture::new(mesh, &texture.atlas, &texture.color, lobes.as_ref()))
-        };
-        let [shown, base] = [(shown[0], true), (shown[1], false)]
-            .map(|(is_shown, lobes)| is_shown.then(|| texture(lobes)).flatten());
+    /// Prepares a head to be shown.
+    pub fn new(head: &'a HeadMesh) -> VisibleHead<'a> {
+        let mesh = &head.mesh;
+        let prepared = |t: &HeadTexture| MeshTexture::new(mesh, &t.atlas, &t.color, t.lobes.as_ref());
         let shells = head.shells.as_ref().map(|shells| ShellCaster::new(mesh, shells));
         let layers = head.shells.as_ref().map(|shells| RasterLayers::new(mesh, shells));
-        VisibleHead { head, bvh: Bvh::new(mesh), shells, layers, shown, base }
+        let texture = head.texture.as_ref().map(prepared);
+        VisibleHead { head, bvh: Bvh::new(mesh), shells, layers, texture }
     }
 
-    /// Renders a view with its soft layers, in these colors.
-    fn view(
+    /// Renders views with soft layers, one for each list of colors that `colors` returns.
+    fn views(
         &self,
         camera: &Camera,
         options: &RaycastOptions,
-        color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
-    ) -> RenderedView {
-        raycast(&self.bvh, &self.head.mesh, self.shells.as_ref(), camera, options, color)
+        count: usize,
+        colors: impl Fn(&RayHits) -> Vec<Vec<[f32; 3]>> + Sync,
+    ) -> Vec<RenderedView> {
+        raycast_each(&self.bvh, &self.head.mesh, self.shells.as_ref(), camera, options, count, colors)
     }
 
-    /// Renders a view as a viewer shows the head: with its texture or the colors of its vertices,
-    /// else in gray, lit from the camera.
+    /// Renders a view as our viewers show the head.
     pub fn as_in_viewer(&self, camera: &Camera, options: &RaycastOptions) -> RenderedView {
+        let colors = |hits: &RayHits| self.colors(&[Method::Textured], hits, camera, options.samples);
+        self.views(camera, options, 1, colors).remove(0)
+    }
+
+    /// Returns the sRGB-coded base colors of hits: the texture's or the vertices', else gray, lit
+    /// from the camera.
+    fn base_colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
         let mesh = &self.head.mesh;
-        self.view(camera, options, |hits| match &self.shown {
-            Some(texture) => texture.colors(hits, camera, options.samples),
+        match &self.texture {
+            Some(texture) => texture.base_colors(hits, camera, samples),
             None if mesh.colors.is_empty() => {
                 let normals = hits.normals.iter().zip(&hits.directions);
                 normals.map(|(n, d)| [n.dot(*d).abs(); 3]).collect()
             }
             None => hits.hits.iter().map(|hit| mesh.color_at(hit)).collect(),
-        })
+        }
     }
 
-    /// Returns the sRGB-coded colors of hits, with view-dependent color.
-    fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
-        let mesh = &self.head.mesh;
-        let mut colors = match &self.base {
-            Some(texture) => texture.colors(hits, camera, samples),
-            None => hits.hits.iter().map(|hit| mesh.color_at(hit)).collect(),
-        };
-        if let Some(harmonics) = &self.head.harmonics {
-            for ((color, hit), &direction) in colors.iter_mut().zip(&hits.hits).zip(&hits.directions) {
-                let more = harmonics.seen_along(direction, hit, mesh.triangles[hit.triangle as usize]);
-                (0..3).for_each(|k| color[k] = (color[k] + more[k]).clamp(0.0, 1.0));
+    /// Returns the sRGB-coded colors of hits by each of these methods. They differ in what is added
+    /// to the base color: nothing (plain), the lobes of the file (textured), or the harmonics that
+    /// these were drawn from (ray cast).
+    fn colors(
+        &self,
+        methods: &[Method],
+        hits: &RayHits,
+        camera: &Camera,
+        samples: u32,
+    ) -> Vec<Vec<[f32; 3]>> {
+        let base = self.base_colors(hits, camera, samples);
+        let by = |method: &Method| {
+            let mut colors = base.clone();
+            match (method, &self.texture, &self.head.harmonics) {
+                (Method::Textured, Some(texture), _) => {
+                    texture.add_lobes(hits, camera, samples, &mut colors);
+                }
+                (Method::Raycast, _, Some(harmonics)) => self.add_harmonics(harmonics, hits, &mut colors),
+                _ => {}
             }
+            colors
+        };
+        methods.iter().map(by).collect()
+    }
+
+    fn add_harmonics(&self, harmonics: &Harmonics, hits: &RayHits, colors: &mut [[f32; 3]]) {
+        let triangles = &self.head.mesh.triangles;
+        for ((color, hit), &direction) in colors.iter_mut().zip(&hits.hits).zip(&hits.directions) {
+            let more = harmonics.seen_along(direction, hit, triangles[hit.triangle as usize]);
+            (0..3).for_each(|k| color[k] = (color[k] + more[k]).clamp(0.0, 1.0));
         }
-        colors
     }
 }
 
@@ -243,7 +284,7 @@ impl<'a> Renderer<'a> {
         Renderer {
             fields,
             extracted: meshes.extracted.as_ref().map(|s| (s, Bvh::new(&s.mesh))),
-            head: meshes.head.as_ref().map(|head| VisibleHead::new(head, meshes.shown)),
+            head: meshes.head.as_ref().map(VisibleHead::new),
             samples,
             world_from_scene: scene.scene_from_world.inverse(),
             residuals: None,
@@ -274,7 +315,7 @@ impl<'a> Renderer<'a> {
             }
             let (camera, loaded) = learn::training_view(view, &tiles, scene)?;
             let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
-            if let Some(view) = self.cast(&camera, &options)? {
+            if let Some(view) = self.cast(&[Method::Raycast], &camera, &options)?.pop() {
                 let source = ResidualSource { camera: &camera, photo: &loaded.photo, mask, valid, view };
                 residuals.extend(ResidualView::new(source));
             }
@@ -284,35 +325,77 @@ impl<'a> Renderer<'a> {
         Ok(self)
     }
 
-    /// Renders the mesh with all that is known of its color.
-    fn cast(&self, camera: &Camera, options: &RaycastOptions) -> Result<Option<RenderedView>> {
+    /// Returns these methods in groups whose views come from the same rays, in their order.
+    fn groups(&self, methods: &[Method]) -> Vec<Vec<Method>> {
+        let mut groups: Vec<Vec<Method>> = Vec::new();
+        for &method in methods {
+            let shares = |other: &Method| self.casts_at_head(*other) && self.casts_at_head(method);
+            match groups.iter_mut().find(|group| group.iter().any(shares)) {
+                Some(group) => group.push(method),
+                None => groups.push(vec![method]),
+            }
+        }
+        groups
+    }
+
+    /// Returns whether a method's rays are cast at the head mesh.
+    fn casts_at_head(&self, method: Method) -> bool {
+        match method {
+            Method::Plain | Method::Textured => true,
+            Method::Raycast => self.extracted.is_none(),
+            _ => false,
+        }
+    }
+
+    /// Casts the rays of a camera at the mesh of a group of methods, once for all of them; by ray
+    /// casting, it has all that is known of its color. Returns no view without a mesh.
+    fn cast(
+        &self,
+        methods: &[Method],
+        camera: &Camera,
+        options: &RaycastOptions,
+    ) -> Result<Vec<RenderedView>> {
         let residuals = &self.residuals;
-        let improved = |hits: &RayHits, mut colors: Vec<[f32; 3]>| {
-            residuals.iter().for_each(|residuals| residuals.add(hits, camera, &mut colors));
-            colors
+        let improve = |hits: &RayHits, colors: &mut [[f32; 3]]| {
+            residuals.iter().for_each(|residuals| residuals.add(hits, camera, colors));
         };
-        if let Some((ExtractedSurface { mesh, cap }, bvh)) = &self.extracted {
+        if let Some((ExtractedSurface { mesh, cap }, bvh)) =
+            self.extracted.as_ref().filter(|_| methods == [Method::Raycast])
+        {
             let field = self.fields.surface()?;
-            return Ok(Some(raycast(bvh, mesh, None, camera, options, |hits| {
+            return Ok(vec![raycast(bvh, mesh, None, camera, options, |hits| {
                 let mut colors = field.color(&hits.points, &hits.normals, &hits.directions);
                 // the field's color at the cap is that of the body's inside
                 if let Some(cap) = cap {
                     cap.recolor(&hits.points, &mut colors);
                 }
-                improved(hits, colors)
-            })));
+                improve(hits, &mut colors);
+                colors
+            })]);
         }
-        Ok(self.head.as_ref().map(|visible| {
-            visible
-                .view(camera, options, |hits| improved(hits, visible.colors(hits, camera, options.samples)))
-        }))
+        let Some(visible) = &self.head else { return Ok(Vec::new()) };
+        let colors = |hits: &RayHits| {
+            let mut all = visible.colors(methods, hits, camera, options.samples);
+            let known = all.iter_mut().zip(methods).filter(|(_, method)| **method == Method::Raycast);
+            known.for_each(|(colors, _)| improve(hits, colors));
+            all
+        };
+        Ok(visible.views(camera, options, methods.len(), colors))
     }
 
     /// Renders the view of a camera in scene coordinates, over nothing.
     pub fn view(&self, method: Method, camera: &Camera) -> Result<Option<RenderedView>> {
-        let samples = self.samples;
-        let options = RaycastOptions { samples, world_from_scene: self.world_from_scene };
-        Ok(match method {
+        Ok(self.views(&[method], camera)?.remove(0))
+    }
+
+    /// Renders the same by each method of a group.
+    fn views(&self, methods: &[Method], camera: &Camera) -> Result<Vec<Option<RenderedView>>> {
+        let options = RaycastOptions { samples: self.samples, world_from_scene: self.world_from_scene };
+        let [method] = methods else {
+            let mut views = self.cast(methods, camera, &options)?.into_iter();
+            return Ok(methods.iter().map(|_| views.next()).collect());
+        };
+        let view = match method {
             Method::Baseline | Method::Tface => {
                 let field = self.fields.radiance(method.stage())?;
                 // a large view takes minutes, so a stop request is checked within it
@@ -323,22 +406,19 @@ impl<'a> Renderer<'a> {
                 Some(march(camera, &self.world_from_scene, false, render_rays))
             }
             Method::Volume => self.fields.surface()?.volume(camera, &self.world_from_scene),
-            Method::Raycast => self.cast(camera, &options)?,
-            Method::Textured => {
-                let textured = self.head.as_ref().filter(|visible| visible.shown.is_some());
-                textured.map(|visible| visible.as_in_viewer(camera, &options))
-            }
-            Method::Raster => self.head.as_ref().map(|VisibleHead { head, layers, shown, .. }| {
+            Method::Raycast | Method::Plain | Method::Textured => self.cast(methods, camera, &options)?.pop(),
+            Method::Raster => self.head.as_ref().map(|VisibleHead { head, layers, texture, .. }| {
                 let options = RasterOptions {
                     world_from_scene: self.world_from_scene,
                     bare_hits: true,
                     ..RasterOptions::default()
                 };
                 let (mesh, harmonics) = (&head.mesh, head.harmonics.as_ref());
-                let surface = Surface { mesh, texture: shown.as_ref(), atlas: None, harmonics };
+                let surface = Surface { mesh, texture: texture.as_ref(), atlas: None, harmonics };
                 raster(mesh, layers.as_ref(), camera, &options, |hits| surface.colors(hits, camera)).view
             }),
-        })
+        };
+        Ok(vec![view])
     }
 }
 
@@ -350,6 +430,7 @@ mod tests {
     use glam::Vec3;
     use tiface_base::Quiet;
     use tiface_base::geom::{Aabb, Mesh, SdfField};
+    use tiface_surface::files::testing::tetrahedron;
     use tiface_surface::{Cap, RimVertex};
 
     /// A field that is red everywhere.
@@ -385,8 +466,7 @@ mod tests {
     fn fitted_poses_are_shown_beside_the_given_ones_by_t_face_and_the_ray_cast_mesh() {
         let corners = [(-0.5, -0.5), (0.5, -0.5), (0.0, 0.5)].map(|(x, y)| Vec3::new(x, y, 0.0));
         let mesh = Mesh { positions: corners.to_vec(), triangles: vec![[0, 1, 2]], ..Mesh::default() };
-        let meshes =
-            Meshes { extracted: Some(ExtractedSurface { mesh, cap: None }), head: None, shown: [false; 2] };
+        let meshes = Meshes { extracted: Some(ExtractedSurface { mesh, cap: None }), head: None };
         let scene_from_world = Similarity::IDENTITY;
         let scene = Scene { scene_from_world, aabb: Aabb::SCENE, hull: None };
         let named = |height| NamedCamera { name: "a".into(), camera: Camera::above(16, 16, 16.0, height) };
@@ -410,6 +490,35 @@ mod tests {
         assert!(io::is_file(&run.path("render/raycast/float/a.exr")));
         assert!(!io::is_folder(&run.path("render/raycast/own_pose/float")));
         assert!(!io::is_folder(&run.path("render/textured/own_pose")));
+    }
+
+    #[test]
+    fn rays_are_cast_once_for_all_methods_that_show_the_head() {
+        use Method::*;
+        let meshes = Meshes::of_head(tetrahedron());
+        let scene = Scene { scene_from_world: Similarity::IDENTITY, aabb: Aabb::SCENE, hull: None };
+        let renderer = Renderer::new(&scene, &Red, &meshes, 2, &Quiet);
+        let groups = renderer.groups(&[Tface, Raycast, Plain, Raster, Textured]);
+        assert_eq!(groups, [vec![Tface], vec![Raycast, Plain, Textured], vec![Raster]]);
+        let camera = Camera::above(32, 32, 32.0, 4.0);
+        let views = renderer.views(&groups[1], &camera).unwrap();
+        for (method, view) in groups[1].iter().zip(&views) {
+            assert!(view.is_some() && *view == renderer.view(*method, &camera).unwrap(), "{method:?}");
+        }
+        let [raycast, plain, textured] = &views[..] else { panic!("{}", views.len()) };
+        let [raycast, plain, textured] = [raycast, plain, textured].map(|view| view.as_ref().unwrap());
+        assert!(raycast.depth == plain.depth && plain.depth == textured.depth);
+        // the base color alone where nothing shines through; what is added to it differs
+        let pixels = |view: &RenderedView| view.color.data.as_chunks::<4>().0.to_vec();
+        let covered: Vec<usize> = (0..32 * 32).filter(|&i| pixels(plain)[i][3] > 0.999).collect();
+        assert!(covered.len() > 20, "{}", covered.len());
+        for &i in &covered {
+            let [r, g, b, _] = pixels(plain)[i].map(|v| 255.0 * v);
+            assert!((r - 9.0).abs() < 0.1 && (g - 1.0).abs() < 0.1 && (b - 2.0).abs() < 0.1, "{r} {g} {b}");
+        }
+        let differs =
+            |a: &RenderedView, b: &RenderedView| covered.iter().any(|&i| pixels(a)[i] != pixels(b)[i]);
+        assert!(differs(plain, textured) && differs(plain, raycast) && differs(textured, raycast));
     }
 
     #[test]

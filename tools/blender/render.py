@@ -13,7 +13,7 @@ along -Z. `fl_y` defaults to `fl_x`, the principal point to the middle. Lens dis
 undistort the photograph.
 
 Colors come out as they are stored: every surface emits its base color, with `--lobes` that of the view
-(tools/blender/lobes.py), and the picture is written in sRGB without tone mapping, straight alpha, transparent where
+(tools/blender/tiface_import.py), and the picture is written in sRGB without tone mapping, straight alpha, transparent where
 nothing is. Cycles on the CPU.
 """
 
@@ -25,7 +25,7 @@ import sys
 import bpy
 import mathutils
 
-from lobes import add_lobes
+from tiface_import import add_lobes
 
 BLENDER_FROM_GLTF = mathutils.Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 
@@ -108,10 +108,10 @@ def main():
             continue
         if found.parent is not None and found.parent.type == "MESH":
             soften(found)
-        elif not arguments.lobes:
+        else:
             emit(found)
-        elif not add_lobes(found, arguments.glb):
-            sys.exit(f"{arguments.glb} holds no lobes")
+    if arguments.lobes and not add_lobes(bpy.context.scene.objects, arguments.glb):
+        sys.exit(f"{arguments.glb} holds no lobes")
     scene = bpy.context.scene
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)

@@ -26,15 +26,15 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 RECORD = pathlib.Path(__file__).with_name("figures.json")
 DOCUMENTS = ["README.md", "docs/results.md", "docs/artist.md", "docs/bench.md", "docs/cookbook.md"]
 FIGURE = re.compile(r"<!--figure ([\w.]+) (\d)-->(.*?)<!--/-->")
-METHODS = ["baseline", "tface", "volume", "raycast", "textured", "raster", "ensemble"]
-ALL_METHODS = "--set render.method=tface,volume,raycast,textured"
+METHODS = ["baseline", "tface", "volume", "raycast", "plain", "textured", "raster", "ensemble"]
+ALL_METHODS = "--set render.method=tface,volume,raycast,plain,textured"
 COMMANDS = {
     "demo": "tiface demo --run RUN",
     "quick_man": "tiface run MAN --preset quick --run RUN",
     "draft_man": f"tiface run MAN --preset draft {ALL_METHODS} --run RUN",
     "draft_bust": f"tiface run BUST --preset draft {ALL_METHODS} --run RUN",
-    "methods": "tiface demo --set iface.steps=1500 --set mesh.lobes=2 --set render.residuals=false "
-    "--set render.method=tface,volume,raycast,textured,raster --run RUN",
+    "methods": "tiface demo --set iface.steps=1500 --set render.residuals=false "
+    "--set render.method=tface,volume,raycast,plain,textured,raster --run RUN",
 }
 
 

@@ -32,6 +32,7 @@ pub use tangent_space::tangent_space;
 pub use trust::{Seen, seen_map, seen_shares};
 pub use unseen::{FittedTexture, TexelTrust, UnseenReport, complete_unseen_vertices};
 
+use crate::files::LOBE_TEXEL;
 use crate::setting;
 use cover::{Bands, Sample};
 use fill::fill;
@@ -268,9 +269,13 @@ pub fn complete(image: &mut Image, known: &[bool], gutter_px: u32, seams: &Seams
     seams.even(image, |v| v, |v| v);
 }
 
-/// Draws harmonics at the vertices of a mesh into the texels of its atlas: a picture a function,
-/// complete.
+/// Draws harmonics at the vertices of a mesh into coarse texels of its atlas, each of
+/// [`LOBE_TEXEL`] of the atlas's along a side: a picture a function, complete. `gutter_px` counts
+/// texels of the atlas.
 pub fn bake_harmonics(mesh: &Mesh, atlas: &Atlas, harmonics: &Harmonics, gutter_px: u32) -> Vec<Image> {
+    let coarse = |px: u32| (px / LOBE_TEXEL).max(1);
+    let atlas = &Atlas { width: coarse(atlas.width), height: coarse(atlas.height), ..atlas.clone() };
+    let gutter_px = coarse(gutter_px);
     let (width, height, count) = (atlas.width, atlas.height, harmonics.functions);
     let mut pictures = vec![Image::new(width, height, 3); count];
     let mut known = vec![false; width as usize * height as usize];

@@ -30,7 +30,7 @@ pub fn ball() -> HeadMesh {
     fill(&mut image, &covered, 4);
     let rgb = image.data.as_chunks::<3>().0.iter().map(|c| c.map(quantize)).collect();
     let photo = Photo { width: 512, height: 512, rgb, alpha: None };
-    let lobes = Lobes { pictures: vec![photo.clone()], scale: vec![0.254], asset_from_world: Mat3::IDENTITY };
+    let lobes = Lobes { pictures: vec![photo.clone()], scale: vec![0.254], turned: Mat3::IDENTITY };
     let alphas = mesh.positions.iter().map(|p| if p.y > 0.0 { 1.0 } else { 0.0 }).collect();
     let offsets = mesh.positions.iter().map(|p| 0.1 * p.x).collect();
     let shells = Some(Shells { layers: vec![ShellLayer { offsets, alphas }] });

@@ -369,6 +369,7 @@ fn wrong_option(what: &str, found: impl ToString, expected: &str) -> Error {
 
 #[cfg(test)]
 pub(super) mod tests {
+    use super::super::head_texture::Lobes;
     use super::*;
     use tiface_base::geom::Atlas;
 
@@ -523,6 +524,15 @@ pub(super) mod tests {
         assert!(message(&|t| t.color = square.clone()).contains("the shape of its atlas, 8 × 4"));
         let half = Photo { width: 2, height: 1, rgb: vec![[0; 3]; 2], alpha: None };
         assert_eq!(fails(&|t| t.color = half.clone()), None);
+        // lobes may be coarser than the color, but all of them have one size
+        let lobes = |t: &mut HeadTexture, pictures: &[&Photo]| {
+            let pictures: Vec<Photo> = pictures.iter().map(|p| (*p).clone()).collect();
+            let scale = vec![0.5; pictures.len()];
+            t.lobes = Some(Lobes { pictures, scale, turned: glam::Mat3::IDENTITY });
+        };
+        assert_eq!(fails(&|t| lobes(t, &[&half, &half])), None);
+        let mixed = message(&|t| lobes(t, &[&half, &t.color.clone()]));
+        assert_eq!(mixed, "the texture `lobe 1` is 8 × 4 pixels, expected the size of the first, 2 × 1");
         let bare = Mesh { normals: vec![], ..mesh.clone() };
         let mapped = HeadTexture { normal: Some(texture.color.clone()), ..texture.clone() };
         assert_eq!(prepare(&bare, &mapped).err().unwrap().to_string(), "0 normals for 4 vertices");

@@ -22,8 +22,8 @@
 //! Khronos validator warns about a texture that only `extras` refers to. So each lobe is the base
 //! color of a material of its own, which the primitive offers as a variant
 //! (`KHR_materials_variants`). Viewers show the first material unless the user selects a variant;
-//! viewers without support for variants always do. The first material describes how to use the
-//! lobes:
+//! viewers without support for variants always do. The first material, and that of the layers,
+//! describe how to use the lobes, whose directions are turned to the file's coordinates:
 //!
 //! ```json
 //! "extras": { "tiface": { "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ],
@@ -42,7 +42,7 @@ use gltf::json::mesh::{Mode, Primitive, Semantic};
 use gltf::json::texture::Info;
 use gltf::json::validation::Checked::Valid;
 use gltf::json::{self, Index, Material, Texture, Value};
-use serde_json::json;
+use serde_json::{Map, json};
 use std::collections::BTreeMap;
 use tiface_base::Result;
 use tiface_base::geom::{Mesh, Shells};
@@ -91,7 +91,7 @@ pub fn to_glb(
     let mut file = file.split(texture.is_some_and(|t| t.normal.is_some()));
     let mut document = GlbDocument::default();
     let mut main = material(options, options.name.clone());
-    let mut lobes = Vec::new();
+    let (mut lobes, mut notes) = (Vec::new(), Map::new());
     if let Some(texture) = texture {
         file.colors = Vec::new(); // viewers would multiply them into the texture
         let mut picture = |name: &str, picture: &Photo, quality| -> Result<Index<json::Texture>> {
@@ -107,10 +107,15 @@ pub fn to_glb(
             main.normal_texture =
                 Some(NormalTexture { index, scale: 1.0, tex_coord: 0, extensions: None, extras });
         }
-        for (k, lobe) in texture.lobe_pictures().iter().enumerate() {
+        // a reader knows no coordinates but the file's
+        let turned = texture.lobes.as_ref().and_then(|l| l.in_coordinates(file_from_mesh.rotation_f32()));
+        for (k, lobe) in turned.iter().flat_map(|l| &l.pictures).enumerate() {
             lobes.push(picture(&lobe_name(k), lobe, options.jpeg_quality)?);
         }
-        main.extras = texture.lobes.as_ref().and_then(|l| lobe_notes(l, &lobes));
+        notes = turned.map(|l| lobe_notes(&l, &lobes)).unwrap_or_default();
+    }
+    if !notes.is_empty() {
+        main.extras = extras(notes.clone());
     }
     let main = document.root.push(main);
     let variants = (!lobes.is_empty()).then(|| variants(&mut document, &lobes, options));
@@ -119,19 +124,20 @@ pub fn to_glb(
             let scale = file_from_mesh.scale as f32;
             let texture =
                 document.root.materials[main.value()].pbr_metallic_roughness.base_color_texture.clone();
-            soft_layers(&mut document, &file, (shells, scale), texture, options)
+            soft_layers(&mut document, &file, (shells, scale), (texture, notes), options)
         }
         _ => None,
     };
     finish(document, &file, main, variants, layers, options)
 }
 
-/// Writes soft layers as a glTF mesh; see the head of this file. `None` if no layer is visible.
+/// Writes soft layers as a glTF mesh; see the head of this file. They have the mesh's texture, and
+/// its notes about lobes. `None` if no layer is visible.
 fn soft_layers(
     document: &mut GlbDocument,
     file: &FileMesh,
     (shells, scale): (&Shells, f32),
-    texture: Option<json::texture::Info>,
+    (texture, mut notes): (Option<json::texture::Info>, Map<String, Value>),
     options: &ExportOptions,
 ) -> Option<json::Mesh> {
     let name = format!("{} soft layers", options.name);
@@ -168,7 +174,8 @@ fn soft_layers(
     if primitives.is_empty() {
         return None;
     }
-    soft.extras = extras(json!({"soft_layers": primitives.len()}));
+    notes.insert("soft_layers".into(), json!(primitives.len()));
+    soft.extras = extras(notes);
     let material = document.root.push(soft);
     primitives.iter_mut().for_each(|p| p.material = Some(material));
     Some(mesh(primitives, Some(name)))
@@ -215,8 +222,8 @@ fn variants(
     mesh::KhrMaterialsVariants { mappings }
 }
 
-/// Returns the first material's `extras` about the lobes; see the head of this file.
-fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> json::Extras {
+/// Returns what a material's `extras` say about the lobes; see the head of this file.
+fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> Map<String, Value> {
     let list = textures.iter().enumerate().map(|(i, texture)| {
         json!({"name": lobe_name(i), "texture": texture.value(), "material": i + 1, "variant": i})
     });
@@ -228,12 +235,14 @@ fn lobe_notes(lobes: &Lobes, textures: &[Index<json::Texture>]) -> json::Extras 
         "decode": "(byte - 128) / 127 * scale",
         "color": "base color + sum of decoded lobes times basis, all sRGB-coded",
     });
-    let notes = json!({"view_dependent_color": model, "lobes": list.collect::<Vec<Value>>()});
-    extras(notes)
+    Map::from_iter([
+        ("view_dependent_color".into(), model),
+        ("lobes".into(), list.collect::<Vec<Value>>().into()),
+    ])
 }
 
 /// Returns our `extras` of a material.
-fn extras(notes: Value) -> json::Extras {
+fn extras(notes: Map<String, Value>) -> json::Extras {
     let text = json!({ "tiface": notes }).to_string();
     Some(json::extras::RawValue::from_string(text).expect("a value is valid JSON"))
 }
@@ -327,6 +336,7 @@ mod tests {
     use crate::files::{PictureSource, ReadOptions, read, read_with, weld};
     use std::path::Path;
     use tiface_base::geom::ShellLayer;
+    use tiface_base::geom::sphharm::combine;
     use tiface_base::image::srgb_from_linear;
     use tiface_base::io::{Limits, parse_photo};
 
@@ -472,8 +482,7 @@ mod tests {
         let color = texture.color.clone();
         texture.normal = Some(color.clone());
         let pictures = vec![color.clone(), color];
-        texture.lobes =
-            Some(Lobes { pictures, scale: vec![0.5, 0.25], asset_from_world: glam::Mat3::IDENTITY });
+        texture.lobes = Some(Lobes { pictures, scale: vec![0.5, 0.25], turned: glam::Mat3::IDENTITY });
         let jpeg = ExportOptions { jpeg_quality: Some(90), ..ExportOptions::default() };
         let glb = to_glb(&mesh, Some(&texture), None, &jpeg).unwrap();
         let json = json_of(&glb);
@@ -493,6 +502,47 @@ mod tests {
         assert!(json.get("extensionsRequired").is_none());
         let back = read_with(&glb, Path::new("a.glb"), &ReadOptions::default()).unwrap();
         assert!(matches!(&back.picture, Some(PictureSource::Inside(b)) if b.starts_with(&[0xff, 0xd8])));
+    }
+
+    #[test]
+    fn lobes_add_the_same_color_in_every_frame_of_the_file() {
+        let head = crate::files::testing::tetrahedron();
+        let texture = head.texture.as_ref().unwrap();
+        let kept = texture.lobes.as_ref().unwrap();
+        let decoded = |pictures: &[tiface_base::image::Photo], scale: &[f32]| -> Vec<[f32; 3]> {
+            let value = |(p, s): (&tiface_base::image::Photo, &f32)| {
+                p.rgb[9].map(|b| (f32::from(b) - 128.0) / 127.0 * s)
+            };
+            pictures.iter().zip(scale).map(value).collect()
+        };
+        let own = decoded(&kept.pictures, &kept.scale);
+        for up in [Vec3::Y, Vec3::Z, Vec3::new(0.6, 0.0, -0.8)] {
+            let options = ExportOptions { up, ..ExportOptions::default() };
+            let glb = to_glb(&head.mesh, Some(texture), None, &options).unwrap();
+            let json = json_of(&glb);
+            let notes = &json["materials"][0]["extras"]["tiface"];
+            let scale: Vec<f32> =
+                serde_json::from_value(notes["view_dependent_color"]["scale"].clone()).unwrap();
+            let bin = &glb[28 + u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize..];
+            let picture = |lobe: &serde_json::Value| {
+                let texture = &json["textures"][lobe["texture"].as_u64().unwrap() as usize];
+                let image = &json["images"][texture["source"].as_u64().unwrap() as usize];
+                let view = &json["bufferViews"][image["bufferView"].as_u64().unwrap() as usize];
+                let at = view["byteOffset"].as_u64().unwrap_or(0) as usize;
+                let bytes = &bin[at..at + view["byteLength"].as_u64().unwrap() as usize];
+                parse_photo(bytes, Path::new("a"), &Limits::default()).unwrap()
+            };
+            let pictures: Vec<_> = notes["lobes"].as_array().unwrap().iter().map(picture).collect();
+            assert_eq!((pictures.len(), pictures[0].width), (4, 4));
+            let found = decoded(&pictures, &scale);
+            let file_from_mesh = options.file_from_mesh().unwrap().rotation_f32();
+            for d in [Vec3::X, Vec3::NEG_Y, Vec3::new(0.6, 0.0, -0.8), Vec3::new(-0.48, 0.64, 0.6)] {
+                let was = Vec3::from(combine(&own, (kept.turned * d).to_array()));
+                let is = Vec3::from(combine(&found, (file_from_mesh * d).to_array()));
+                // four functions of about 0.5, each rounded by half a 127th of up to 0.4
+                assert!(is.abs_diff_eq(was, 0.004) && was.length() > 0.05, "{up} {d}: {is} {was}");
+            }
+        }
     }
 
     #[test]
@@ -527,6 +577,12 @@ mod tests {
                 json["accessors"][layer["attributes"]["COLOR_0"].as_u64().unwrap() as usize]["type"],
                 "VEC4"
             );
+        }
+        // layers change with the view as the surface does
+        for key in ["lobes", "view_dependent_color"] {
+            let notes = json["materials"].as_array().unwrap().iter().map(|m| &m["extras"]["tiface"][key]);
+            let notes: Vec<_> = notes.filter(|notes| !notes.is_null()).collect();
+            assert!(notes.len() == 2 && notes[0] == notes[1], "{notes:?}");
         }
         // vertex 2 stands at y = 1, which is half a meter here, its normal is +z and the first
         // layer lies 0.3 before it

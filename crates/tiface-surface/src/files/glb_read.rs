@@ -7,8 +7,8 @@
 //! is read: buffers with a URI are refused, and a picture with one is named for the caller to open.
 
 use super::color_range::bring_into_range;
-use super::gltf_document::{GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};
-use super::source::{PictureSource, ReadMesh, Source};
+use super::gltf_document::{GlbLobes, GlbNode, GlbPrimitive, GlbRoot, GlbTextureUse};
+use super::source::{LobeSource, PictureSource, ReadMesh, Source};
 use super::uri::{data_of_uri, name_of_uri};
 use glam::{DMat3, DMat4, DVec3, Vec2};
 use gltf::Glb;
@@ -65,6 +65,7 @@ pub(super) fn read(bytes: &[u8], source: Source) -> Result<ReadMesh> {
         tinted: false,
         textures: BTreeSet::new(),
         tints: Vec::new(),
+        lobes: Vec::new(),
     };
     reader.scene()?;
     reader.finish()
@@ -156,6 +157,8 @@ struct GlbReader<'a> {
     textures: BTreeSet<Option<u32>>,
     /// Factors of the parts with a texture.
     tints: Vec<Option<[f32; 3]>>,
+    /// Lobes of the parts with a texture; `None` for a part without, or turned by its nodes.
+    lobes: Vec<Option<GlbLobes>>,
 }
 
 impl<'a> GlbReader<'a> {
@@ -206,7 +209,24 @@ impl<'a> GlbReader<'a> {
             return Err(self.source.unsupported("`materials`", "a mesh with several base colors"));
         }
         self.out.tint = self.tints.first().copied().flatten();
-        self.out.picture = first.map(|texture| self.picture(texture)).transpose()?;
+        if let Some(texture) = first {
+            let (picture, size) = self.picture(texture)?;
+            if let (Some(atlas), Some([width, height])) = (&mut self.out.atlas, size) {
+                (atlas.width, atlas.height) = (width, height);
+            }
+            self.out.picture = Some(picture);
+        }
+        self.lobes.dedup();
+        if let ([Some(lobes)], None) = (&self.lobes[..], self.out.tint) {
+            let pictures = lobes.textures.iter().map(|texture| match self.picture(*texture)? {
+                (PictureSource::Inside(bytes), _) => Ok(bytes),
+                _ => Err(self.source.unsupported("lobes", "a picture outside of the file")),
+            });
+            match pictures.collect::<Result<_>>() {
+                Ok(pictures) => self.out.lobes = Some(LobeSource { pictures, scale: lobes.scale.clone() }),
+                Err(e) => self.out.note(format!("colors that change with the view are not shown: {e}")),
+            }
+        }
         Ok(self.out)
     }
 
@@ -426,6 +446,10 @@ impl<'a> GlbReader<'a> {
         let used = self.texture_of(part.primitive.material)?;
         self.textures.insert(used.map(|i| i.index));
         if used.is_some() {
+            let material = part.primitive.material.and_then(|m| self.root.materials.get(m as usize));
+            // directions are those of the file's axes
+            let lobes = material.and_then(|m| m.lobes()).filter(|_| part.linear == DMat3::IDENTITY);
+            self.lobes.push(lobes);
             self.tints.push(tint);
         }
         let set = used.map_or(0, GlbTextureUse::set);
@@ -542,9 +566,9 @@ impl<'a> GlbReader<'a> {
         Ok(texture)
     }
 
-    /// Returns the picture behind a texture, and its size in the atlas. Its header is checked
-    /// against the limits for pictures; it is not decoded.
-    fn picture(&mut self, texture: u32) -> Result<PictureSource> {
+    /// Returns the picture behind a texture, and its size if it is in the file. Its header is
+    /// checked against the limits for pictures; it is not decoded.
+    fn picture(&self, texture: u32) -> Result<(PictureSource, Option<[u32; 2]>)> {
         let source = self.source;
         let texture_at = format!("texture {texture}");
         let texture = self.get("texture", &self.root.textures, texture)?;
@@ -566,16 +590,13 @@ impl<'a> GlbReader<'a> {
                 self.view(view)?.0.to_vec()
             }
             Some(uri) => match data_of_uri(uri) {
-                None => return Ok(PictureSource::Beside(name_of_uri(uri))),
+                None => return Ok((PictureSource::Beside(name_of_uri(uri)), None)),
                 Some(data) => data.ok_or_else(|| source.broken(&at, "its data URI is not Base64"))?,
             },
         };
         let info = io::parse_picture_info(&bytes, source.path, &io::Limits::default())
             .map_err(|e| source.broken(&at, e))?;
-        if let Some(atlas) = &mut self.out.atlas {
-            (atlas.width, atlas.height) = (info.width, info.height);
-        }
-        Ok(PictureSource::Inside(bytes))
+        Ok((PictureSource::Inside(bytes), Some([info.width, info.height])))
     }
 }
 

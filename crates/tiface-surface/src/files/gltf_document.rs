@@ -10,6 +10,7 @@ use serde::de::IgnoredAny;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use tiface_base::Result;
+use tiface_base::geom::sphharm::COEFFICIENTS_OF_DEGREE_2;
 
 /// Maximum number of objects and arrays. One takes two bytes of JSON and up to 144 in memory, and
 /// twice that while a list grows.
@@ -202,6 +203,13 @@ pub(super) struct GlbSpecular {
     pub diffuse_factor: Value,
 }
 
+/// Lobes of a material: the texture and the scale of each.
+#[derive(Clone, PartialEq)]
+pub(super) struct GlbLobes {
+    pub textures: Vec<u32>,
+    pub scale: Vec<f32>,
+}
+
 /// The color of a material: its texture, its linear factors if they are not all 1, and a sentence
 /// if it is no base color.
 #[derive(Clone, Copy, Default)]
@@ -215,6 +223,20 @@ impl GlbMaterial {
     /// Returns whether the material is marked as one of the soft layers around a mesh.
     pub fn is_soft_layer(&self) -> bool {
         self.extras["tiface"]["soft_layers"].is_u64()
+    }
+
+    /// Returns the lobes beside the base color, if the material is marked as one of ours with some.
+    pub fn lobes(&self) -> Option<GlbLobes> {
+        let notes = &self.extras["tiface"];
+        let texture = |lobe: &Value| u32::try_from(lobe["texture"].as_u64()?).ok();
+        let number = |v: &Value| v.as_f64().map(|v| v as f32).filter(|v| v.is_finite());
+        let textures: Option<Vec<u32>> = notes["lobes"].as_array()?.iter().map(texture).collect();
+        let scale: Option<Vec<f32>> =
+            notes["view_dependent_color"]["scale"].as_array()?.iter().map(number).collect();
+        let found = GlbLobes { textures: textures?, scale: scale? };
+        let fits = found.textures.len() == found.scale.len()
+            && (1..=COEFFICIENTS_OF_DEGREE_2).contains(&found.scale.len());
+        fits.then_some(found)
     }
 
     /// Returns the color that shows most: the base color, that of the older model, or light that

@@ -20,24 +20,57 @@ pub struct HeadTexture {
     pub lobes: Option<Lobes>,
 }
 
+/// Texels of a base color along each side of a texel of lobes, which are smooth.
+pub const LOBE_TEXEL: u32 = 4;
+
 /// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lobes {
-    /// One picture per spherical-harmonic function; a byte `b` stands for
-    /// `(b − 128) / 127 · scale`.
+    /// One picture per spherical-harmonic function, all of one size and of the atlas's shape; a
+    /// byte `b` stands for `(b − 128) / 127 · scale`.
     pub pictures: Vec<Photo>,
     /// Scale of each, sRGB-coded.
     pub scale: Vec<f32>,
-    /// Rotates directions of the dataset's world to those of the exported files.
-    pub asset_from_world: Mat3,
+    /// Turns directions of the mesh's coordinates into those of the harmonics.
+    pub turned: Mat3,
 }
 
 impl Lobes {
-    /// Returns the same lobes in the coordinates of other files, as sRGB-coded differences: one
-    /// picture a function.
-    pub fn turned(&self, asset_from_world: Mat3) -> Vec<Image> {
-        let matrix = rotated(self.pictures.len(), self.asset_from_world * asset_from_world.transpose());
-        let turned = |j: usize| {
+    /// Returns lobes as pictures, sRGB-coded differences of 3 channels: one a function. Each is
+    /// scaled by the value that all but a thousandth of its texels stay below, so that a few
+    /// outliers do not cost the others their precision. `None` without a picture.
+    pub fn new(images: &[Image], turned: Mat3) -> Option<Lobes> {
+        let (mut pictures, mut scale) = (Vec::new(), Vec::new());
+        for image in images {
+            let mut sizes: Vec<f32> = image.data.iter().map(|v| v.abs()).collect();
+            let at = (sizes.len() as f64 * 0.999) as usize;
+            let most =
+                if sizes.is_empty() { 0.0 } else { *sizes.select_nth_unstable_by(at, f32::total_cmp).1 };
+            let most = most.max(1e-4);
+            let byte = |v: f32| (v / most * 127.0 + 128.5).clamp(1.0, 255.0) as u8;
+            let rgb = image.data.as_chunks::<3>().0.iter().map(|c| c.map(byte)).collect();
+            pictures.push(Photo { width: image.width, height: image.height, rgb, alpha: None });
+            scale.push(most);
+        }
+        (!pictures.is_empty()).then_some(Lobes { pictures, scale, turned })
+    }
+
+    /// Returns the lobes with pictures whose longest side is at most `px`, averaged.
+    pub fn reduced(mut self, px: u32) -> Lobes {
+        for picture in &mut self.pictures {
+            *picture = reduce_photo(picture, working_size(picture.width, picture.height, px));
+        }
+        self
+    }
+
+    /// Returns the same lobes with harmonics in other coordinates, to which `turned` leads from
+    /// those of the mesh; unchanged where they are in these already.
+    pub fn in_coordinates(&self, turned: Mat3) -> Option<Lobes> {
+        if turned == self.turned {
+            return Some(self.clone());
+        }
+        let matrix = rotated(self.pictures.len(), self.turned * turned.transpose());
+        let image = |j: usize| {
             let Photo { width, height, .. } = self.pictures[j];
             let mut image = Image::new(width, height, 3);
             for (k, picture) in self.pictures.iter().enumerate() {
@@ -47,7 +80,8 @@ impl Lobes {
             }
             image
         };
-        (0..self.pictures.len()).map(turned).collect()
+        let images: Vec<Image> = (0..self.pictures.len()).map(image).collect();
+        Lobes::new(&images, turned)
     }
 }
 
@@ -60,13 +94,10 @@ impl HeadTexture {
     /// Returns the texture with pictures whose longest side is at most `px`, those of lobes at most
     /// `lobe_px`: averaged, colors in linear light.
     pub fn reduced(self, px: u32, lobe_px: u32) -> HeadTexture {
-        let smaller = |photo: &Photo, px| reduce_photo(photo, working_size(photo.width, photo.height, px));
-        let color = reduce_to_rows(&self.color, working_size(self.color.width, self.color.height, px).1);
-        let normal = self.normal.map(|normal| smaller(&normal, px));
-        let lobes = self.lobes.map(|lobes| Lobes {
-            pictures: lobes.pictures.iter().map(|picture| smaller(picture, lobe_px)).collect(),
-            ..lobes
-        });
+        let size = |photo: &Photo| working_size(photo.width, photo.height, px);
+        let color = reduce_to_rows(&self.color, size(&self.color).1);
+        let normal = self.normal.map(|normal| reduce_photo(&normal, size(&normal)));
+        let lobes = self.lobes.map(|lobes| lobes.reduced(lobe_px));
         let atlas = Atlas { width: color.width, height: color.height, ..self.atlas };
         HeadTexture { atlas, color, normal, lobes }
     }
@@ -76,12 +107,25 @@ impl HeadTexture {
         self.lobes.as_ref().map_or(&[], |l| &l.pictures)
     }
 
-    /// Checks that every picture is complete and has the atlas's aspect ratio; its scale is free.
+    /// Checks that every picture is complete and has the atlas's aspect ratio; its scale is free,
+    /// but lobes have one.
     pub(super) fn check_pictures(&self) -> Result<()> {
         self.check("base color", &self.color)?;
         self.normal.as_ref().map_or(Ok(()), |normal| self.check("normal map", normal))?;
-        let mut lobes = self.lobe_pictures().iter().enumerate();
-        lobes.try_for_each(|(k, picture)| self.check(&format!("texture `lobe {k}`"), picture))
+        let lobes = self.lobe_pictures();
+        for (k, picture) in lobes.iter().enumerate() {
+            let (what, Photo { width, height, .. }) = (format!("texture `lobe {k}`"), &lobes[0]);
+            self.check(&what, picture)?;
+            if (picture.width, picture.height) != (*width, *height) {
+                let found = format!("{} × {} pixels", picture.width, picture.height);
+                return Err(wrong_picture(
+                    &what,
+                    found,
+                    &format!("the size of the first, {width} × {height}"),
+                ));
+            }
+        }
+        Ok(())
     }
 
     fn check(&self, what: &str, picture: &Photo) -> Result<()> {
@@ -144,8 +188,7 @@ mod tests {
             rgb: (0..8).map(|i| [if i % 2 == 0 { 0 } else { 255 }; 3]).collect(),
             alpha: None,
         };
-        let lobes =
-            Lobes { pictures: vec![photo.clone()], scale: vec![0.5], asset_from_world: Mat3::IDENTITY };
+        let lobes = Lobes { pictures: vec![photo.clone()], scale: vec![0.5], turned: Mat3::IDENTITY };
         let atlas = Atlas { width: 4, height: 2, ..Atlas::default() };
         let texture =
             HeadTexture { atlas, color: photo.clone(), normal: Some(photo.clone()), lobes: Some(lobes) };

@@ -7,12 +7,13 @@
 use super::beside::{self, Beside, unquoted};
 use super::color_range::{at_vertices, bring_into_range};
 use super::gltf_text::as_glb;
-use super::head_texture::HeadTexture;
+use super::head_texture::{HeadTexture, Lobes};
 use super::mtl::{Material, materials_of_mtl};
 use super::obj_read::MAX_LIBRARIES;
 use super::read::read_with;
-use super::source::{PictureSource, ReadMesh, ReadOptions, Source};
+use super::source::{LobeSource, PictureSource, ReadMesh, ReadOptions, Source};
 use super::stored::HeadMesh;
+use glam::Mat3;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use tiface_base::geom::{Atlas, Similarity};
@@ -67,14 +68,18 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
         texture_problem = Some(with_way(&e));
         None
     });
-    let ReadMesh { mesh, origin, atlas, tint, mut notes, .. } = found;
+    let ReadMesh { mesh, origin, atlas, lobes, tint, mut notes, .. } = found;
     if let (Some(photo), Some(tint)) = (&mut photo, tint) {
         multiply(photo, tint);
     }
     let (texture, bare_atlas) = match (atlas, photo) {
         (Some(atlas), Some(color)) => {
             let (width, height) = (color.width, color.height);
-            (Some(HeadTexture::new(Atlas { width, height, ..atlas }, color)), None)
+            let mut texture = HeadTexture::new(Atlas { width, height, ..atlas }, color);
+            if let Some(Err(e)) = lobes.map(|lobes| open_lobes(&mut texture, lobes, path)) {
+                notes.push(format!("colors that change with the view are not shown: {}", with_way(&e)));
+            }
+            (Some(texture), None)
         }
         (None, Some(_)) => {
             let what = "has a texture, but does not say where in it all of its triangles lie";
@@ -89,6 +94,14 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
     let world_from_scene = Similarity { translation: origin, ..Similarity::IDENTITY };
     let head = HeadMesh { mesh, world_from_scene, texture, harmonics: None, shells: None };
     Ok(OpenedMesh { head, bare_atlas, texture_problem, notes })
+}
+
+/// Opens the lobes of a texture, whose directions are those of the file's axes.
+fn open_lobes(texture: &mut HeadTexture, lobes: LobeSource, path: &Path) -> Result<()> {
+    let open = |bytes: &Vec<u8>| io::parse_photo(bytes, path, &Limits::default());
+    let pictures = lobes.pictures.iter().map(open).collect::<Result<Vec<Photo>, _>>()?;
+    texture.lobes = Some(Lobes { pictures, scale: lobes.scale, turned: Mat3::IDENTITY });
+    texture.check_pictures().inspect_err(|_| texture.lobes = None)
 }
 
 /// Returns the bytes of a mesh file; those of a `.gltf` as the GLB that it would be.
@@ -294,7 +307,33 @@ fn color_by_materials(found: &mut ReadMesh, all: &[Placed], used: &[Placed]) {
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::tetrahedron;
+    use super::super::{ExportOptions, to_glb};
     use super::*;
+
+    #[test]
+    fn a_file_of_ours_is_opened_with_its_lobes_and_without_damaged_ones() {
+        let head = tetrahedron();
+        let texture = head.texture.as_ref().unwrap();
+        let glb = to_glb(&head.mesh, Some(texture), None, &ExportOptions::default()).unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.glb");
+        let open = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).unwrap();
+            let opened = open_mesh(&path).unwrap();
+            (opened.head.texture.unwrap(), opened.notes)
+        };
+        let (found, notes) = open(&glb);
+        assert_eq!(found.lobes, texture.lobes.as_ref().unwrap().in_coordinates(Mat3::IDENTITY));
+        assert!(found.lobes.is_some() && notes.is_empty(), "{notes:?}");
+        // color, normals and four lobes are textures 0 to 5
+        let (named, missing) = (br#""lobe 3","texture":5"#, br#""lobe 3","texture":9"#);
+        let at = glb.windows(named.len()).position(|bytes| bytes == named).unwrap();
+        let damaged = [&glb[..at], &missing[..], &glb[at + named.len()..]].concat();
+        let (found, notes) = open(&damaged);
+        assert!(found.lobes.is_none() && found.color == texture.color);
+        assert!(notes.len() == 1 && notes[0].contains("texture 9"), "{notes:?}");
+    }
 
     #[test]
     fn a_tint_multiplies_light() {

@@ -50,6 +50,15 @@ pub enum PictureSource {
     Materials(Vec<String>),
 }
 
+/// Lobes beside a base color, which only a GLB of ours holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LobeSource {
+    /// One picture a function, as in [`PictureSource::Inside`].
+    pub pictures: Vec<Vec<u8>>,
+    /// Scale of each.
+    pub scale: Vec<f32>,
+}
+
 /// The file being read, its format, and its limits.
 #[derive(Clone, Copy)]
 pub(super) struct Source<'a> {
@@ -124,6 +133,8 @@ pub struct ReadMesh {
     pub atlas: Option<Atlas>,
     /// The base color.
     pub picture: Option<PictureSource>,
+    /// Lobes beside the base color.
+    pub lobes: Option<LobeSource>,
     /// Linear red, green and blue factors of the base color, if the file has them.
     pub tint: Option<[f32; 3]>,
     /// The names of the materials that an OBJ uses, each with the triangle where it begins.

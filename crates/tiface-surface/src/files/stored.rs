@@ -318,7 +318,7 @@ impl HeadMesh {
                     write(&format!("lobe_{k}.png"), picture)?;
                 }
                 tensors.push(floats::<1>("lobe_scale", bytemuck::cast_slice(&lobes.scale)));
-                tensors.push(floats("asset_from_world", &lobes.asset_from_world.to_cols_array_2d()));
+                tensors.push(floats("lobes_from_scene", &lobes.turned.to_cols_array_2d()));
             }
         }
         Ok(io::write_tensors(&folder.join(HEAD_FILE), &tensors, &metadata)?)
@@ -356,12 +356,21 @@ fn load_texture(folder: &Path, stored: &mut StoredTensors, mesh: &Mesh) -> Resul
     }
     if stored.contains("lobe_scale") {
         let scale = stored.rows::<1>("lobe_scale")?.into_flattened();
-        let asset_from_world = stored.matrix("asset_from_world")?;
-        if scale.len() > MAX_LOBES {
+        let turned = stored.matrix("lobes_from_scene")?;
+        if !(1..=MAX_LOBES).contains(&scale.len()) {
             return Err(stored.missing("lobe_scale"));
         }
-        let pictures = (0..scale.len()).map(|k| load_photo(folder, &format!("lobe_{k}.png"), size));
-        texture.lobes = Some(Lobes { pictures: pictures.collect::<Result<_>>()?, scale, asset_from_world });
+        let name = |k: usize| format!("lobe_{k}.png");
+        let first = load_photo(folder, &name(0), None)?;
+        let (w, h) = (first.width, first.height);
+        if u64::from(w) * u64::from(height) != u64::from(h) * u64::from(width) {
+            let expected = format!("the shape of `color.png`, {width} × {height}");
+            let found = format!("{w} × {h} pixels");
+            return Err(damaged(ReadError::value(&folder.join(name(0)), "size", found, expected)));
+        }
+        let others = (1..scale.len()).map(|k| load_photo(folder, &name(k), Some((w, h))));
+        let pictures = std::iter::once(Ok(first)).chain(others).collect::<Result<_>>()?;
+        texture.lobes = Some(Lobes { pictures, scale, turned });
     }
     Ok(texture)
 }
@@ -387,7 +396,7 @@ fn load_shells(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Shells> {
     Ok(Shells { layers: offsets.into_iter().zip(alphas).map(layer).collect() })
 }
 
-/// Loads a picture of the texture; all have the size of the first.
+/// Loads a picture of the texture, of this size if one is given.
 fn load_photo(folder: &Path, name: &str, size: Option<(u32, u32)>) -> Result<Photo> {
     let path = folder.join(name);
     let photo = io::read_photo(&path, size, &Limits::default()).map_err(damaged)?;
@@ -395,7 +404,7 @@ fn load_photo(folder: &Path, name: &str, size: Option<(u32, u32)>) -> Result<Pho
     match size.filter(|size| *size != (w, h)) {
         None => Ok(photo),
         Some(size) => {
-            let expected = format!("{} × {}, as `color.png`", size.0, size.1);
+            let expected = format!("{} × {}, as the first", size.0, size.1);
             Err(damaged(ReadError::value(&path, "size", format!("{w} × {h} pixels"), expected)))
         }
     }
@@ -477,6 +486,12 @@ mod tests {
             error(&|p| p.world_from_scene.rotation.x_axis *= -1.0).contains("`world_from_scene.rotation`")
         );
         assert!(error(&|p| p.texture.as_mut().unwrap().normal = Some(odd())).contains("`size`"));
+        // lobes may be coarser than the color, all of them alike and in its shape
+        fn lobe(p: &mut HeadMesh, k: usize) -> &mut Photo {
+            &mut p.texture.as_mut().unwrap().lobes.as_mut().unwrap().pictures[k]
+        }
+        assert!(error(&|p| *lobe(p, 0) = odd()).contains("the shape of `color.png`, 8 × 8"));
+        assert!(error(&|p| *lobe(p, 2) = odd()).contains("4 × 4, as the first"));
         assert!(error(&|p| p.texture.as_mut().unwrap().atlas.triangles.truncate(1)).contains("uv_triangles"));
         let cut = |p: &mut HeadMesh| p.harmonics.as_mut().unwrap().coefficients.truncate(12);
         assert!(error(&cut).contains("`harmonics`"));

@@ -16,6 +16,7 @@ pub fn tetrahedron() -> HeadMesh {
         triangles: vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
     };
     let photo = |b: u8| Photo { width: 8, height: 8, rgb: vec![[b, 1, 2]; 64], alpha: None };
+    let coarse = |b: u8| Photo { width: 4, height: 4, rgb: vec![[b, 1, 2]; 16], alpha: None };
     let atlas = Atlas {
         uvs: vec![Vec2::ZERO, Vec2::X, Vec2::ONE],
         triangles: vec![[0, 1, 2]; 4],
@@ -23,9 +24,9 @@ pub fn tetrahedron() -> HeadMesh {
         height: 8,
     };
     let lobes = Lobes {
-        pictures: (0..4).map(|k| photo(100 + k)).collect(),
+        pictures: (0..4).map(|k| coarse(100 + k)).collect(),
         scale: vec![0.1, 0.2, 0.3, 0.4],
-        asset_from_world: Mat3::from_rotation_x(0.5),
+        turned: Mat3::from_rotation_x(0.5),
     };
     let texture = HeadTexture { atlas, color: photo(9), normal: Some(photo(128)), lobes: Some(lobes) };
     let world_from_scene = Similarity {

@@ -21,15 +21,26 @@ pub struct RayHits {
 impl RayHits {
     /// Adds the colors of all hits to their pixels, and forgets the hits.
     pub(super) fn shade(&mut self, rgba: &mut [[f32; 4]], color: &impl Fn(&RayHits) -> Vec<[f32; 3]>) {
+        self.shade_each(&mut [rgba], &|hits: &RayHits| vec![color(hits)]);
+    }
+
+    /// The same for several pictures of the same pixels; `colors` returns a list for each.
+    pub(super) fn shade_each(
+        &mut self,
+        pictures: &mut [&mut [[f32; 4]]],
+        colors: &impl Fn(&RayHits) -> Vec<Vec<[f32; 3]>>,
+    ) {
         if self.pixels.is_empty() {
             return;
         }
-        let colors = color(self);
-        for (k, (pixel, share)) in self.pixels.drain(..).enumerate() {
-            let c = colors.get(k).unwrap_or(&[0.0; 3]).map(|c| c.clamp(0.0, 1.0));
-            let p = &mut rgba[pixel];
-            *p = [p[0] + share * c[0], p[1] + share * c[1], p[2] + share * c[2], p[3] + share];
+        for (rgba, colors) in pictures.iter_mut().zip(colors(self)) {
+            for (k, &(pixel, share)) in self.pixels.iter().enumerate() {
+                let c = colors.get(k).unwrap_or(&[0.0; 3]).map(|c| c.clamp(0.0, 1.0));
+                let p = &mut rgba[pixel];
+                *p = [p[0] + share * c[0], p[1] + share * c[1], p[2] + share * c[2], p[3] + share];
+            }
         }
+        self.pixels.clear();
         self.points.clear();
         self.normals.clear();
         self.directions.clear();

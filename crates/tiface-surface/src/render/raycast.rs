@@ -66,24 +66,46 @@ pub fn raycast(
     options: &RaycastOptions,
     color: impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync,
 ) -> RenderedView {
+    raycast_each(bvh, mesh, shells, camera, options, 1, |hits| vec![color(hits)]).remove(0)
+}
+
+/// Casts the rays of a camera at a mesh once, for `count` views, at least 1, that differ in color
+/// alone. `colors` returns what `color` of [`raycast`] does, a list for each view.
+pub fn raycast_each(
+    bvh: &Bvh,
+    mesh: &Mesh,
+    shells: Option<&ShellCaster>,
+    camera: &Camera,
+    options: &RaycastOptions,
+    count: usize,
+    colors: impl Fn(&RayHits) -> Vec<Vec<[f32; 3]>> + Sync,
+) -> Vec<RenderedView> {
     let (width, height) = (camera.width, camera.height);
     let mut view = RenderedView::new(width, height, true);
     if width == 0 || height == 0 {
-        return view;
+        return vec![view; count.max(1)];
     }
     let w = width as usize;
     let rows = (BATCH / w).max(1);
-    let bands = view
-        .color
-        .data
-        .par_chunks_mut(rows * w * 4)
+    let mut others = vec![view.color.clone(); count.max(1) - 1];
+    // the rows of each band in every picture
+    let mut pictures: Vec<Vec<&mut [[f32; 4]]>> = Vec::new();
+    for image in std::iter::once(&mut view.color).chain(&mut others) {
+        let parts = image.data.as_chunks_mut::<4>().0.chunks_mut(rows * w);
+        pictures.resize_with(parts.len(), Vec::new);
+        pictures.iter_mut().zip(parts).for_each(|(band, part)| band.push(part));
+    }
+    let bands = pictures
+        .into_par_iter()
         .zip(view.depth.data.par_chunks_mut(rows * w))
         .zip(view.normal.data.par_chunks_mut(rows * w * 3));
     let caster = Raycaster { bvh, mesh, shells, camera, options };
-    bands.enumerate().for_each(|(band, ((rgba, depth), normal))| {
-        caster.band(band * rows, rgba.as_chunks_mut().0, depth, normal.as_chunks_mut().0, &color);
+    bands.enumerate().for_each(|(band, ((mut rgba, depth), normal))| {
+        caster.band(band * rows, &mut rgba, depth, normal.as_chunks_mut().0, &colors);
     });
-    view
+    let others: Vec<RenderedView> =
+        others.into_iter().map(|color| RenderedView { color, ..view.clone() }).collect();
+    std::iter::once(view).chain(others).collect()
 }
 
 /// The data that every band of rows shares.
@@ -96,20 +118,20 @@ struct Raycaster<'a> {
 }
 
 impl Raycaster<'_> {
-    /// Renders the rows from `top` on, as many as the slices hold.
+    /// Renders the rows from `top` on, as many as the slices hold, of all pictures.
     fn band(
         &self,
         top: usize,
-        rgba: &mut [[f32; 4]],
+        rgba: &mut [&mut [[f32; 4]]],
         depth: &mut [f32],
         normal: &mut [[f32; 3]],
-        color: &(impl Fn(&RayHits) -> Vec<[f32; 3]> + Sync),
+        colors: &(impl Fn(&RayHits) -> Vec<Vec<[f32; 3]>> + Sync),
     ) {
         let w = self.camera.width as usize;
         let n = self.options.samples.max(1) as usize;
         let mut queue = RayHits::default();
         let mut found = Vec::with_capacity(4 * n * n);
-        for i in 0..rgba.len() {
+        for i in 0..depth.len() {
             let (x, y) = ((i % w) as f32, (top + i / w) as f32);
             let center = self.cast(x + 0.5, y + 0.5);
             if let Some((ray, Some(hit))) = &center {
@@ -131,10 +153,10 @@ impl Raycaster<'_> {
                 self.enqueue(&mut queue, i, one, 1.0 / found.len() as f32);
             }
             if queue.pixels.len() >= BATCH {
-                queue.shade(rgba, color);
+                queue.shade_each(rgba, colors);
             }
         }
-        queue.shade(rgba, color);
+        queue.shade_each(rgba, colors);
     }
 
     /// Casts `n × n` rays through the pixel at a corner.
@@ -306,6 +328,19 @@ mod tests {
             red,
         );
         assert!(nothing.color.data.iter().chain(&nothing.depth.data).all(|v| *v == 0.0));
+    }
+
+    #[test]
+    fn several_colors_of_the_same_rays_are_several_views() {
+        let mesh = half_plane(0.02);
+        let (bvh, camera, options) = (Bvh::new(&mesh), camera(150, 200), RaycastOptions::default());
+        let green = |hits: &RayHits| -> Vec<[f32; 3]> {
+            hits.points.iter().map(|p| [0.0, p.y.abs().min(1.0), 0.0]).collect()
+        };
+        let each = raycast_each(&bvh, &mesh, None, &camera, &options, 2, |hits| vec![red(hits), green(hits)]);
+        assert!(each[0] == raycast(&bvh, &mesh, None, &camera, &options, red));
+        assert!(each[1] == raycast(&bvh, &mesh, None, &camera, &options, green));
+        assert!(each.len() == 2 && each[0] != each[1]);
     }
 
     #[test]

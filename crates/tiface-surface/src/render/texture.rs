@@ -5,9 +5,11 @@
 //! Heckbert, *Non-power-of-two mipmapping*, 2005), so that no level is shifted against another.
 //!
 //! Texels are 16-bit integers, half as large as floats and finer than any 8-bit picture: they are
-//! decoded once per lookup, after filtering.
+//! decoded once per lookup, after filtering. Lobes have mip maps of their own, for they are coarser
+//! than the color.
 
 use super::hits::RayHits;
+use crate::files::Lobes;
 use glam::{Mat3, Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 use std::array::from_fn;
@@ -16,32 +18,34 @@ use tiface_base::geom::sphharm;
 use tiface_base::geom::{Atlas, Camera, Hit, Mesh};
 use tiface_base::image::{Photo, linear_from_srgb, srgb_from_linear};
 
-/// View-dependent color beside a base color: one picture per spherical-harmonic function, in the
-/// order of [`sphharm::sh16`]. A byte `b` of picture `k` stands for the sRGB-coded difference
-/// `(b − 128) / 127 · scale[k]`.
-pub struct LobePictures<'a> {
-    /// Pictures of the atlas's size.
-    pub pictures: &'a [Photo],
-    /// Scale of each function.
-    pub scale: &'a [f32],
-    /// Rotates directions of the mesh's coordinates to those of the harmonics.
-    pub turned: Mat3,
-}
-
 /// A texture prepared for lookups.
 pub struct MeshTexture {
-    /// `[levels, height, width, groups]`: linear color and then the lobes.
+    /// Linear color.
+    base: MipMaps,
+    lobes: Option<LobeTexture>,
+    /// Whether coordinates leave the picture, which is then repeated.
+    repeats: bool,
+    triangles: Vec<TexturedTriangle>,
+}
+
+/// The lobes of a texture.
+struct LobeTexture {
+    maps: MipMaps,
+    /// Texels along a side of the base color to one of the lobes'.
+    coarser: f32,
+    /// Scale and offset of each channel.
+    scale: Vec<Vec4>,
+    offset: Vec<Vec4>,
+    turned: Mat3,
+}
+
+/// Pictures of one size at all mip levels.
+struct MipMaps {
+    /// `[levels, height, width, groups]`
     texels: Vec<Texel>,
     levels: Vec<MipLevel>,
     /// Groups of four channels a texel.
     groups: usize,
-    /// Scale and offset of each channel of the lobes.
-    scale: Vec<Vec4>,
-    offset: Vec<Vec4>,
-    /// Whether coordinates leave the picture, which is then repeated.
-    repeats: bool,
-    turned: Mat3,
-    triangles: Vec<TexturedTriangle>,
 }
 
 /// The texture coordinates of a triangle.
@@ -51,7 +55,7 @@ struct TexturedTriangle {
     first: Vec2,
     right: Vec2,
     down: Vec2,
-    /// Texels per unit of length.
+    /// Texels of the base color per unit of length.
     density: f32,
 }
 
@@ -109,30 +113,16 @@ fn srgb_table() -> &'static [f32; SRGB_STEPS + 1] {
     })
 }
 
-impl MeshTexture {
-    /// Prepares the pictures of a mesh; `color` and the lobes have one size of the atlas's shape.
-    pub fn new(mesh: &Mesh, atlas: &Atlas, color: &Photo, lobes: Option<&LobePictures>) -> MeshTexture {
-        let table: [u16; 256] = from_fn(|i| (linear_from_srgb(i as f32 / 255.0) * STEPS).round() as u16);
-        let pictures = lobes.map_or(&[][..], |l| l.pictures);
-        // padded, so that a texel is a whole number of vectors
-        let groups = (3 + 3 * pictures.len()).div_ceil(4);
-        let (mut width, mut height) = (color.width as usize, color.height as usize);
-        let mut texels = Vec::with_capacity((width * height / 3 * 4 + 2 * (width + height)) * groups);
+impl MipMaps {
+    /// Returns all levels of pictures of this size; `fill` gives each texel of the finest its
+    /// channels, `[4 · groups]`.
+    fn new([width, height]: [u32; 2], groups: usize, fill: impl Fn(usize, &mut [u16]) + Sync) -> MipMaps {
+        let (mut width, mut height) = (width as usize, height as usize);
+        let mut texels: Vec<Texel> =
+            Vec::with_capacity((width * height / 3 * 4 + 2 * (width + height)) * groups);
         texels.resize(width * height * groups, [0; 4]);
-        texels.par_chunks_exact_mut(groups).zip(&color.rgb).enumerate().for_each(|(i, (texel, c))| {
-            let texel = texel.as_flattened_mut();
-            (0..3).for_each(|k| texel[k] = table[c[k] as usize]);
-            for (k, picture) in pictures.iter().enumerate() {
-                let own = &mut texel[3 + 3 * k..][..3];
-                (0..3).for_each(|c| own[c] = u16::from(picture.rgb[i][c]) * LOBE_STEPS);
-            }
-        });
-        let (mut scale, mut offset) = (vec![Vec4::splat(1.0 / STEPS); groups], vec![Vec4::ZERO; groups]);
-        for channel in 3..3 + 3 * pictures.len() {
-            let step = lobes.map_or(0.0, |l| l.scale[channel / 3 - 1]) / 127.0;
-            scale[channel / 4][channel % 4] = step / f32::from(LOBE_STEPS);
-            offset[channel / 4][channel % 4] = -128.0 * step;
-        }
+        let each = texels.par_chunks_exact_mut(groups).enumerate();
+        each.for_each(|(i, texel)| fill(i, texel.as_flattened_mut()));
         let level = |first: usize, width: usize, height: usize| MipLevel {
             first: (first / groups) as u32,
             width: width as f32,
@@ -146,6 +136,72 @@ impl MeshTexture {
             (width, height) = (width / 2, height / 2);
             levels.push(level(first, width, height));
         }
+        MipMaps { texels, levels, groups }
+    }
+
+    /// Returns the level whose texels are nearest in size to a footprint of this many of the
+    /// finest.
+    fn nearest(&self, texels: f32) -> &MipLevel {
+        let last = self.levels.len() - 1;
+        &self.levels[texels.max(1.0).log2().round().clamp(0.0, last as f32) as usize]
+    }
+
+    /// Interpolates a group of channels bilinearly, in integer steps.
+    #[inline(always)]
+    fn look_up(&self, texels: [u32; 4], way: Vec2, group: usize) -> Vec4 {
+        bilinear(texels.map(|t| floats(self.texels[t as usize * self.groups + group])), way)
+    }
+}
+
+impl LobeTexture {
+    /// Prepares the pictures of lobes beside a base color of this width; `None` without a picture.
+    fn new(lobes: &Lobes, width: u32) -> Option<LobeTexture> {
+        let Lobes { pictures, scale, turned } = lobes;
+        let first = pictures.first()?;
+        let groups = (3 * pictures.len()).div_ceil(4); // whole vectors
+        let maps = MipMaps::new([first.width, first.height], groups, |i, texel| {
+            for (own, picture) in texel.as_chunks_mut::<3>().0.iter_mut().zip(pictures) {
+                *own = picture.rgb[i].map(|byte| u16::from(byte) * LOBE_STEPS);
+            }
+        });
+        let mut found = LobeTexture {
+            maps,
+            coarser: width as f32 / first.width as f32,
+            scale: vec![Vec4::ZERO; groups],
+            offset: vec![Vec4::ZERO; groups],
+            turned: *turned,
+        };
+        for channel in 0..3 * pictures.len() {
+            let step = scale[channel / 3] / 127.0;
+            found.scale[channel / 4][channel % 4] = step / f32::from(LOBE_STEPS);
+            found.offset[channel / 4][channel % 4] = -128.0 * step;
+        }
+        Some(found)
+    }
+
+    /// Adds to a color what is seen along a direction, away from the camera, where a pixel covers
+    /// this many texels of the base color; `values` is memory for the channels. Lobes are smooth:
+    /// the nearest level is enough.
+    fn add(&self, color: &mut [f32; 3], uv: Vec2, texels: f32, direction: Vec3, values: &mut [Vec4]) {
+        let (at, way) = around(self.maps.nearest(texels / self.coarser), uv.x, uv.y);
+        for (g, (value, (scale, offset))) in
+            values.iter_mut().zip(self.scale.iter().zip(&self.offset)).enumerate()
+        {
+            *value = self.maps.look_up(at, way, g) * *scale + *offset;
+        }
+        let lobes = bytemuck::cast_slice::<Vec4, f32>(values).as_chunks::<3>().0;
+        let more = sphharm::combine(lobes, (self.turned * -direction).to_array());
+        (0..3).for_each(|k| color[k] = (color[k] + more[k]).clamp(0.0, 1.0));
+    }
+}
+
+impl MeshTexture {
+    /// Prepares a base color and the lobes beside it; all pictures have the atlas's shape.
+    pub fn new(mesh: &Mesh, atlas: &Atlas, color: &Photo, lobes: Option<&Lobes>) -> MeshTexture {
+        let table: [u16; 256] = from_fn(|i| (linear_from_srgb(i as f32 / 255.0) * STEPS).round() as u16);
+        let base = MipMaps::new([color.width, color.height], 1, |i, texel| {
+            (0..3).for_each(|k| texel[k] = table[color.rgb[i][k] as usize]);
+        });
         let size = Vec2::new(color.width as f32, color.height as f32);
         let triangle = |t: u32| {
             let [a, b, c] = mesh.corners(t);
@@ -158,43 +214,58 @@ impl MeshTexture {
         };
         let inside = |uv: &Vec2| uv.cmpge(Vec2::ZERO).all() && uv.cmple(Vec2::ONE).all();
         MeshTexture {
-            texels,
-            levels,
-            groups,
-            scale,
-            offset,
+            base,
+            lobes: lobes.and_then(|lobes| LobeTexture::new(lobes, color.width)),
             repeats: !atlas.uvs.iter().all(inside),
-            turned: lobes.map_or(Mat3::IDENTITY, |l| l.turned),
             triangles: (0..mesh.triangles.len() as u32).map(triangle).collect(),
         }
     }
 
-    /// Returns the sRGB-coded colors of a camera's visible hits, interpolated between two levels
-    /// (trilinear).
+    /// Returns the sRGB-coded colors of a camera's visible hits; base colors are interpolated
+    /// between two levels (trilinear).
     pub fn smooth_colors(&self, hits: &RayHits, camera: &Camera) -> Vec<[f32; 3]> {
         let mut colors = Vec::with_capacity(hits.hits.len());
         smooth(self, hits, camera, &mut colors);
+        self.add_lobes(hits, camera, 1, &mut colors);
         colors
     }
 
-    /// Returns the sRGB-coded colors of the hits of a camera's rays, `samples` of them along each
-    /// side of a pixel.
-    pub fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
-        let forward = camera.forward();
-        let mut values = vec![Vec4::ZERO; self.groups];
-        let one = |(i, hit): (usize, &Hit)| {
-            let (uv, density) = self.coordinates(hit);
-            // a ray's share of a pixel on a plane across the view; slanted surfaces stay sharp
-            // rather than blur
-            let footprint =
-                hit.t * hits.directions[i].dot(forward) / (camera.fx.abs() as f32 * samples as f32);
-            let level =
-                (footprint * density).max(1.0).log2().round().clamp(0.0, (self.levels.len() - 1) as f32);
-            self.look_up(&self.levels[level as usize], uv, &mut values);
-            let base: [f32; 3] = from_fn(|k| srgb_from_linear(values[0][k] / STEPS));
-            self.with_lobes(base, &mut values, hits.directions[i])
+    /// Returns the sRGB-coded base colors of the hits of a camera's rays, `samples` of them along
+    /// each side of a pixel.
+    pub fn base_colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
+        let one = |i: usize| {
+            let (uv, texels) = self.footprint(hits, i, camera, samples);
+            let (at, way) = around(self.base.nearest(texels), uv.x, uv.y);
+            let linear = self.base.look_up(at, way, 0);
+            from_fn(|k| srgb_from_linear(linear[k] / STEPS))
         };
-        hits.hits.iter().enumerate().map(one).collect()
+        (0..hits.hits.len()).map(one).collect()
+    }
+
+    /// Adds the lobes to the base colors of hits, if the texture has any.
+    pub fn add_lobes(&self, hits: &RayHits, camera: &Camera, samples: u32, colors: &mut [[f32; 3]]) {
+        let Some(lobes) = &self.lobes else { return };
+        let mut values = vec![Vec4::ZERO; lobes.maps.groups];
+        for (i, color) in colors.iter_mut().enumerate() {
+            let (uv, texels) = self.footprint(hits, i, camera, samples);
+            lobes.add(color, uv, texels, hits.directions[i], &mut values);
+        }
+    }
+
+    /// Returns the sRGB-coded colors of hits: [`MeshTexture::base_colors`] with the lobes.
+    pub fn colors(&self, hits: &RayHits, camera: &Camera, samples: u32) -> Vec<[f32; 3]> {
+        let mut colors = self.base_colors(hits, camera, samples);
+        self.add_lobes(hits, camera, samples, &mut colors);
+        colors
+    }
+
+    /// Returns the texture coordinates of a hit, and the number of texels along a side of its ray's
+    /// share of a pixel: on a plane across the view, so that slanted surfaces stay sharp rather
+    /// than blur.
+    fn footprint(&self, hits: &RayHits, i: usize, camera: &Camera, samples: u32) -> (Vec2, f32) {
+        let (uv, density) = self.coordinates(&hits.hits[i]);
+        let depth = hits.hits[i].t * hits.directions[i].dot(camera.forward());
+        (uv, depth / (camera.fx.abs() as f32 * samples as f32) * density)
     }
 
     /// Returns the texture coordinates of a hit, and the number of texels per unit of length at it.
@@ -204,32 +275,10 @@ impl MeshTexture {
         let uv = first + hit.u * right + hit.v * down;
         (if self.repeats { uv - uv.floor() } else { uv }, density)
     }
-
-    /// Interpolates bilinearly, in integer steps.
-    fn look_up(&self, level: &MipLevel, uv: Vec2, out: &mut [Vec4]) {
-        let (texels, f) = around(level, uv.x, uv.y);
-        for (g, out) in out.iter_mut().enumerate() {
-            *out = bilinear(texels.map(|t| floats(self.texels[t as usize * self.groups + g])), f);
-        }
-    }
-
-    /// Adds the looked-up lobes' values along a direction to a base color.
-    #[inline(always)]
-    fn with_lobes(&self, base: [f32; 3], values: &mut [Vec4], direction: Vec3) -> [f32; 3] {
-        if self.groups == 1 {
-            return base;
-        }
-        for (v, (scale, offset)) in values.iter_mut().zip(self.scale.iter().zip(&self.offset)) {
-            *v = *v * *scale + *offset;
-        }
-        let lobes = bytemuck::cast_slice::<Vec4, f32>(values)[3..].as_chunks::<3>().0;
-        let more = sphharm::combine(lobes, (self.turned * -direction).to_array());
-        from_fn(|k| (base[k] + more[k]).clamp(0.0, 1.0))
-    }
 }
 
 tiface_base::dispatch! {
-    /// Interpolates colors between two levels.
+    /// Interpolates base colors between two levels.
     fn smooth / smooth_all(texture: &MeshTexture, hits: &RayHits, camera: &Camera, colors: &mut Vec<[f32; 3]>)
 }
 
@@ -242,8 +291,8 @@ fn smooth_all<const F: bool>(
 ) {
     let (forward, per_pixel) = (camera.forward(), 1.0 / camera.fx.abs() as f32);
     let table = srgb_table(); // read once, outside the loop
-    let last = texture.levels.len() - 1;
-    let mut values = vec![Vec4::ZERO; texture.groups];
+    let MipMaps { levels, .. } = &texture.base;
+    let last = levels.len() - 1;
     for (hits, directions) in hits.hits.chunks(LANES).zip(hits.directions.chunks(LANES)) {
         let (mut u, mut v, mut texels) = ([0f32; LANES], [0f32; LANES], [1f32; LANES]);
         for (l, (hit, direction)) in hits.iter().zip(directions).enumerate() {
@@ -255,42 +304,26 @@ fn smooth_all<const F: bool>(
         for l in 0..LANES {
             (level[l], share[l]) = mip_level(texels[l], last + 1);
         }
-        let (fine, coarse) =
-            (level.map(|l| texture.levels[l]), level.map(|l| texture.levels[(l + 1).min(last)]));
+        let (fine, coarse) = (level.map(|l| levels[l]), level.map(|l| levels[(l + 1).min(last)]));
         let (mut at, mut way) = ([[[0u32; 4]; LANES]; 2], [[Vec2::ZERO; LANES]; 2]);
         for l in 0..LANES {
             (at[0][l], way[0][l]) = around(&fine[l], u[l], v[l]);
             (at[1][l], way[1][l]) = around(&coarse[l], u[l], v[l]);
         }
         let mut base = [[0f32; LANES]; 3];
-        if texture.groups == 1 {
+        for l in 0..LANES {
+            let texel = |level: usize, k: usize| floats(texture.base.texels[at[level][l][k] as usize]);
+            let a = bilinear(from_fn(|k| texel(0, k)), way[0][l]);
+            let b = bilinear(from_fn(|k| texel(1, k)), way[1][l]);
+            let linear = (a + share[l] * (b - a)) * (1.0 / STEPS);
+            (base[0][l], base[1][l], base[2][l]) = (linear.x, linear.y, linear.z);
+        }
+        for values in &mut base {
             for l in 0..LANES {
-                let texel = |level: usize, k: usize| floats(texture.texels[at[level][l][k] as usize]);
-                let a = bilinear(from_fn(|k| texel(0, k)), way[0][l]);
-                let b = bilinear(from_fn(|k| texel(1, k)), way[1][l]);
-                let linear = (a + share[l] * (b - a)) * (1.0 / STEPS);
-                (base[0][l], base[1][l], base[2][l]) = (linear.x, linear.y, linear.z);
+                values[l] = coded(table, values[l]);
             }
-            for values in &mut base {
-                for l in 0..LANES {
-                    values[l] = coded(table, values[l]);
-                }
-            }
-            colors.extend((0..hits.len()).map(|l| base.map(|values| values[l])));
-            continue;
         }
-        for (l, direction) in directions.iter().enumerate() {
-            for (g, value) in values.iter_mut().enumerate() {
-                let texel = |level: usize, k: usize| {
-                    floats(texture.texels[at[level][l][k] as usize * texture.groups + g])
-                };
-                let a = bilinear(from_fn(|k| texel(0, k)), way[0][l]);
-                let b = bilinear(from_fn(|k| texel(1, k)), way[1][l]);
-                *value = a + share[l] * (b - a);
-            }
-            let base = from_fn(|k| coded(table, values[0][k] / STEPS));
-            colors.push(texture.with_lobes(base, &mut values, *direction));
-        }
+        colors.extend((0..hits.len()).map(|l| base.map(|values| values[l])));
     }
 }
 
@@ -466,9 +499,9 @@ mod tests {
         photo.rgb.fill([128; 3]);
         let flat = |b: u8| Photo { rgb: vec![[b, 128, 128]; 16], ..photo.clone() };
         // −0.4886 x is the fourth function: 255 stands for its scale
-        let pictures = [flat(128), flat(128), flat(128), flat(255)];
-        let scale = [0.1, 0.1, 0.1, 0.2];
-        let lobes = LobePictures { pictures: &pictures, scale: &scale, turned: Mat3::IDENTITY };
+        let pictures = vec![flat(128), flat(128), flat(128), flat(255)];
+        let scale = vec![0.1, 0.1, 0.1, 0.2];
+        let lobes = Lobes { pictures, scale, turned: Mat3::IDENTITY };
         let texture = MeshTexture::new(&mesh, &atlas, &photo, Some(&lobes));
         let pixels = view(&texture, &mesh, &Camera::above(9, 9, 9.0, 2.0), 1);
         let middle = pixels[40];
@@ -478,6 +511,35 @@ mod tests {
         let x = 8.0 / 9.0 / (4.0f32 + 64.0 / 81.0).sqrt();
         assert!((pixels[36][0] - (128.0 / 255.0 - 0.2 * 0.4886 * x)).abs() < 1e-3, "{:?}", pixels[36]);
         assert!((pixels[36][1] - 128.0 / 255.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn lobes_may_be_coarser_than_the_color() {
+        let (mesh, atlas, mut photo) = square();
+        photo.rgb.fill([128; 3]);
+        // 2 × 2 texels of the constant function: less to the left, more to the right
+        let rgb = [1, 255, 1, 255].map(|b| [b, 128, 128]).to_vec();
+        let pictures = vec![Photo { width: 2, height: 2, rgb, alpha: None }];
+        let lobes = Lobes { pictures, scale: vec![0.2], turned: Mat3::IDENTITY };
+        let texture = MeshTexture::new(&mesh, &atlas, &photo, Some(&lobes));
+        let camera = Camera::above(8, 8, 8.0, 2.0);
+        let bvh = Bvh::new(&mesh);
+        let options = RasterOptions::default();
+        let raster = raster(&mesh, None, &camera, &options, |hits| texture.smooth_colors(hits, &camera));
+        for pixels in [view(&texture, &mesh, &camera, 1), raster.view.color.data.as_chunks::<4>().0.to_vec()]
+        {
+            // the outer quarters are beyond the middles of the coarse texels: all of 0.2 · 0.2821;
+            // in the middle they cancel out, half a pixel of eight from it
+            let more = |x: usize| pixels[32 + x][0] - 128.0 / 255.0;
+            assert!((more(0) + 0.0564).abs() < 1e-3 && (more(7) - 0.0564).abs() < 1e-3, "{}", more(0));
+            assert!((more(3) + 0.0564 / 4.0).abs() < 1e-3 && (more(4) - 0.0564 / 4.0).abs() < 1e-3);
+            assert!((pixels[32][1] - 128.0 / 255.0).abs() < 1e-3);
+        }
+        // without them the base color is left
+        let plain = raycast(&bvh, &mesh, None, &camera, &RaycastOptions::default(), |hits| {
+            texture.base_colors(hits, &camera, 2)
+        });
+        assert!(plain.color.data.as_chunks::<4>().0.iter().all(|p| (p[0] - 128.0 / 255.0).abs() < 1e-3));
     }
 
     #[test]
