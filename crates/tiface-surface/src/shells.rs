@@ -17,8 +17,8 @@
 //! dropped if they gain nothing. The mesh itself stays as it is: inside of it nothing is
 //! transparent.
 //!
-//! Of each layer only the triangles that one sees remain, and at the border of what remains the
-//! opacity falls to nothing ([`confine`]).
+//! Of each layer only the triangles that one sees remain. At the border of what remains the opacity
+//! has fallen to nothing: vertices that have none take part in the fit as neighbors.
 
 mod outlines;
 
@@ -102,9 +102,9 @@ pub fn fit(
     // of a few photographs the last
     let every = VALIDATION_STRIDE.min(photographs.len());
     let left_out = |view: u32| every > 1 && view as usize % every == every - 1;
-    let fitted = |keep: &dyn Fn(u32) -> bool| confine(outlines.fit(&field, &nodes, keep), &nodes);
+    let fitted = |keep: &dyn Fn(u32) -> bool| confine(outlines.fit(&field, &nodes, keep));
     let first = fitted(&|view| !left_out(view));
-    let seen = confine(field.clone(), &nodes);
+    let seen = confine(field.clone());
     let errors = [None, Some(&seen), Some(&first)].map(|s| outlines.error(s, &left_out));
     report.left_out = errors;
     let best = errors[1].min(errors[2]);
@@ -122,42 +122,12 @@ fn triangles(shells: &Shells, mesh: &Mesh) -> usize {
     shells.layers.iter().map(|layer| mesh.triangles.iter().filter(|t| layer.has(t)).count()).sum()
 }
 
-/// Returns the layers where one sees them: a vertex of less than [`MIN_ALPHA`] gets none, and `n`
-/// edges away from such vertices the opacity is at most `n² MIN_ALPHA`, so that no layer has a
-/// visible border. Opacities are multiples of 1/255, as files keep them.
-fn confine(mut shells: Shells, nodes: &Nodes) -> Shells {
-    for layer in &mut shells.layers {
-        let inside: Vec<bool> = layer.alphas.iter().map(|&alpha| alpha >= MIN_ALPHA).collect();
-        let away = edges_away(&inside, nodes);
-        for (alpha, n) in layer.alphas.iter_mut().zip(away) {
-            let limit = n.map_or(1.0, |n| MIN_ALPHA * (n * n) as f32);
-            *alpha = f32::from(quantize(alpha.min(limit))) / 255.0;
-        }
-    }
+/// Returns the layers where one sees them: a vertex of less than [`MIN_ALPHA`] gets no opacity. The
+/// others' are multiples of 1/255, as files keep them.
+fn confine(mut shells: Shells) -> Shells {
+    let seen = |alpha: f32| if alpha < MIN_ALPHA { 0.0 } else { f32::from(quantize(alpha)) / 255.0 };
+    shells.layers.iter_mut().flat_map(|layer| &mut layer.alphas).for_each(|alpha| *alpha = seen(*alpha));
     shells
-}
-
-/// Returns the number of edges from each node to the nearest one that is not `inside`; `None` if
-/// there is no way to one.
-fn edges_away(inside: &[bool], nodes: &Nodes) -> Vec<Option<u32>> {
-    let mut away: Vec<Option<u32>> = inside.iter().map(|inside| (!inside).then_some(0)).collect();
-    let mut front: Vec<u32> = (0..inside.len() as u32).filter(|&v| !inside[v as usize]).collect();
-    for n in 1.. {
-        let mut next = Vec::new();
-        for v in front {
-            for &near in nodes.near(v as usize) {
-                if away[near as usize].is_none() {
-                    away[near as usize] = Some(n);
-                    next.push(near);
-                }
-            }
-        }
-        if next.is_empty() {
-            break;
-        }
-        front = next;
-    }
-    away
 }
 
 /// Returns the layers of the field itself, and the median softness of their vertices, in pixels.
@@ -343,25 +313,45 @@ mod tests {
     }
 
     #[test]
-    fn opacity_falls_to_nothing_at_the_border_of_a_layer() {
-        // half of a ball is opaque to 9/10, the rest to less than one sees
+    fn a_layer_ends_where_one_does_not_see_it() {
+        // opacity falls evenly from 1/2 above to nothing at the equator, and is none below
         let mesh = ball();
-        let alphas = mesh.positions.iter().map(|p| if p.z > 0.0 { 0.9 } else { 0.5 * MIN_ALPHA }).collect();
-        let layer = ShellLayer { offsets: vec![0.1; mesh.positions.len()], alphas };
-        let nodes = Nodes::vertices(&mesh);
-        let layer = confine(Shells { layers: vec![layer] }, &nodes).layers.swap_remove(0);
-        let far = |alpha: f32| (alpha - 0.9).abs() < 0.5 / 255.0 + 1e-6;
-        assert!(layer.alphas.iter().any(|a| far(*a)) && layer.alphas.contains(&0.0));
-        for triangle in &mesh.triangles {
-            let of = triangle.map(|v| layer.alphas[v as usize]);
-            let (low, high) = (of.into_iter().fold(1f32, f32::min), of.into_iter().fold(0f32, f32::max));
-            // what is drawn is seen; and from n² to (n + 1)² thresholds in one step, up to n = 6
-            assert!(high == 0.0 || high >= MIN_ALPHA - 1e-6, "{of:?}");
-            assert!(high - low <= 13.0 * MIN_ALPHA + 1.0 / 255.0, "{of:?}");
+        let alphas: Vec<f32> = mesh.positions.iter().map(|p| p.z.max(0.0)).collect();
+        let layer = ShellLayer { offsets: vec![0.1; mesh.positions.len()], alphas: alphas.clone() };
+        let layer = confine(Shells { layers: vec![layer] }).layers.swap_remove(0);
+        for (before, after) in alphas.iter().zip(&layer.alphas) {
+            let kept = if *before < MIN_ALPHA { 0.0 } else { *before };
+            assert!((kept - after).abs() <= 0.5 / 255.0 + 1e-6, "{before} {after}");
         }
-        // two edges away from nothing: four thresholds
-        let two = f32::from(quantize(4.0 * MIN_ALPHA)) / 255.0;
-        assert!(layer.alphas.contains(&two));
+        for triangle in mesh.triangles.iter().filter(|t| layer.has(t)) {
+            let most = triangle.iter().map(|&v| alphas[v as usize]).fold(0.0, f32::max);
+            assert!(most >= 1.0 / 50.0, "{most}");
+        }
+    }
+
+    #[test]
+    fn opacity_falls_towards_where_no_layer_is() {
+        // masks are soft all around, but the field below is hard
+        let (mesh, photo, cameras) = (ball(), black(), cameras());
+        let masks: Vec<Gray> = cameras.iter().map(|c| mask(c, 20.0)).collect();
+        let view = |(camera, mask)| Photograph { camera, photo: &photo, mask: Some(mask), valid: None };
+        let photographs: Vec<Photograph> = cameras.iter().zip(&masks).map(view).collect();
+        let sharpness: Vec<f32> =
+            mesh.positions.iter().map(|p| if p.y > 0.0 { 20.0 } else { 4000.0 }).collect();
+        let shells = fit(&mesh, &sharpness, &photographs, &Quiet).unwrap().0.unwrap();
+        let nodes = Nodes::vertices(&mesh);
+        for layer in &shells.layers {
+            let ring = |v: usize| nodes.near(v).iter().any(|&n| layer.offsets[n as usize] == 0.0);
+            let mean = |of: &dyn Fn(usize) -> bool| {
+                let some: Vec<f32> = (0..mesh.positions.len())
+                    .filter(|&v| layer.offsets[v] > 0.0 && of(v))
+                    .map(|v| layer.alphas[v])
+                    .collect();
+                some.iter().sum::<f32>() / some.len() as f32
+            };
+            let (border, inside) = (mean(&ring), mean(&|v| mesh.positions[v].y > 0.2));
+            assert!(border < 0.75 * inside, "{border} {inside}");
+        }
     }
 
     #[test]

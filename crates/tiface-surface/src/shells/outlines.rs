@@ -22,11 +22,11 @@ const RAYS_PER_PIXEL: usize = RAYS_PER_SIDE * RAYS_PER_SIDE;
 
 /// Weights of squared opacities, and of squared differences along an edge, against the square of
 /// one pixel's error: where no outline tells, there is no layer.
-const RIDGE: f64 = 0.05;
-const SMOOTH: f64 = 0.3;
+const RIDGE: f64 = 0.02;
+const SMOOTH: f64 = 3.0;
 
 /// Gauss-Newton steps.
-const ROUNDS: usize = 4;
+const ROUNDS: usize = 3;
 
 /// Maximum number of steps of conjugate gradients in each.
 const STEPS: usize = 60;
