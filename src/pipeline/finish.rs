@@ -89,7 +89,7 @@ impl Finish<'_> {
             if fitted.is_some() {
                 complete_unseen_vertices(&mut mesh, &seen.trust, &guess);
             }
-            (None, fitted.and_then(|fitted| fitted.harmonics), None)
+            (None, fitted.and_then(|fitted| fitted.harmonics).map(|h| faded(h, &seen.trust)), None)
         } else {
             let layout = self.unwrap(&mesh, &mut log)?;
             let (mut baked, harmonics) =
@@ -237,7 +237,7 @@ impl Finish<'_> {
         }
         image.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
         baked.color = image;
-        Ok((baked, fitted.harmonics))
+        Ok((baked, fitted.harmonics.map(|h| faded(h, &seen.trust))))
     }
 
     /// Returns the pictures of a texture, coded as in files. Harmonics that were fitted replace
@@ -272,5 +272,35 @@ impl Finish<'_> {
         // the network's are as fine as the color
         let lobes = Lobes::new(&baked.lobes, turned).map(|l| l.reduced(c.texture_px / LOBE_TEXEL));
         HeadTexture { atlas: layout, color, normal, lobes }
+    }
+}
+
+/// Returns view-dependent color that each vertex has by its trust: what nobody saw looks the same
+/// from everywhere.
+fn faded(mut harmonics: Harmonics, trust: &[f32]) -> Harmonics {
+    for (own, trust) in harmonics.coefficients.chunks_mut(harmonics.functions).zip(trust) {
+        own.iter_mut().flatten().for_each(|c| *c *= trust);
+    }
+    harmonics
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tiface_surface::files::testing::tetrahedron;
+
+    #[test]
+    fn what_nobody_saw_looks_the_same_from_everywhere() {
+        let harmonics = tetrahedron().harmonics.unwrap();
+        let (functions, before) = (harmonics.functions, harmonics.coefficients.clone());
+        let after = faded(harmonics, &[0.0, 1.0, 0.5, 1.0]).coefficients;
+        assert!(after[..functions].iter().all(|c| *c == [0.0; 3]));
+        assert_eq!(after[functions..2 * functions], before[functions..2 * functions]);
+        assert!(
+            after[2 * functions..3 * functions]
+                .iter()
+                .zip(&before[2 * functions..])
+                .all(|(a, b)| a[2] == 0.5 * b[2])
+        );
     }
 }
