@@ -220,7 +220,13 @@ impl<'a> Workload<'a> {
             let empty = if *method == Method::Baseline || has_shell(&c) { 0.25e-6 } else { 0.1e-6 };
             empty * (c.voxels_final as f64).cbrt()
         };
+        let config = self.session.render_config();
+        let methods = &config.method;
+        let fitted = self.config.mesh.color == ColorSource::Photographs;
+        let shares_rays = fitted && methods.contains(&Method::Raycast);
         let pixel = |method: &Method| match method {
+            // colors and files
+            Method::Plain | Method::Textured if shares_rays => 1.5e-6,
             Method::Baseline | Method::Tface if published => whole(method),
             // no occupancy exists yet, so every sample of a ray is evaluated
             Method::Volume if published && self.config.mask.source == MaskSource::None => 700e-6,
@@ -229,8 +235,6 @@ impl<'a> Workload<'a> {
             Method::Volume => 20e-6,
             _ => 2.5e-6,
         };
-        let config = self.session.render_config();
-        let methods = &config.method;
         let residuals = if config.shows_residuals(methods) { self.all } else { 0.0 };
         let cpu_s = 0.1 + self.shown * methods.iter().map(pixel).sum::<f64>() + 1.6e-6 * residuals;
         (cpu_s, mib::VIEW_PIXEL * self.each + self.renderers(methods, residuals))

@@ -45,7 +45,7 @@ pub struct ExportOptions {
     /// The transform from the mesh's own coordinates into the dataset's world.
     pub world_from_mesh: Similarity,
     /// Quality, 1..=100, of colors stored as JPEG, which is smaller but lossy. `None` stores PNG,
-    /// which is lossless; normal maps are always PNG.
+    /// which is lossless; normal maps and lobes are always PNG.
     pub jpeg_quality: Option<u8>,
 }
 
