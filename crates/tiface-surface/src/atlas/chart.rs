@@ -187,9 +187,10 @@ fn rising(mesh: &Mesh, chart: &Flat, up: Vec3) -> Option<DVec2> {
         sum += DVec2::new(along * v.y - across * u.y, across * u.x - along * v.x)
             * twice_area([a, b, c]).signum();
     }
-    // seen from below or above, up is nowhere in it; the gradient of what stands straight is 1
+    // seen from below or above, up is nowhere in it; what stands straight rises by its scale
     // everywhere
-    (sum.length() > MIN_RISE * 2.0 * chart.area()).then(|| sum.normalize())
+    let surface: f64 = chart.triangles.iter().map(|&t| mesh.area(t)).sum();
+    (sum.length() > MIN_RISE * 2.0 * (surface * chart.area()).sqrt()).then(|| sum.normalize())
 }
 
 #[cfg(test)]
@@ -254,8 +255,11 @@ mod tests {
             corners: vec![[0, 1, 2], [0, 2, 3]],
             points: vec![q(0., 0.), q(0., 1.), q(-1., 1.), q(-1., 0.)],
         };
-        let found = upright(&mesh, std::slice::from_ref(&chart), 0, Vec3::Z)[0].unwrap();
-        assert!((found - DVec2::NEG_X).length() < 1e-12, "{found}");
+        for scale in [1.0, 300.0] {
+            let points = chart.points.iter().map(|p| *p * scale).collect();
+            let found = upright(&mesh, &[Flat { points, ..chart.clone() }], 0, Vec3::Z)[0].unwrap();
+            assert!((found - DVec2::NEG_X).length() < 1e-12, "{found}");
+        }
         // level ground rises nowhere
         let nearly_level = (Vec3::Y + 0.05 * Vec3::Z).normalize();
         for up in [Vec3::Y, nearly_level] {

@@ -69,7 +69,15 @@ pub(super) fn divide_head(
     charts.insert(0, HeadChart { flat: face, part: Part::Face });
     monitor.check_stop()?;
     halve_stretched(mesh, &mut charts);
+    charts.iter_mut().for_each(|chart| sized(mesh, &mut chart.flat));
     Ok(Some(charts))
+}
+
+/// Gives a chart the area of its surface.
+fn sized(mesh: &Mesh, flat: &mut Flat) {
+    let surface: f64 = flat.triangles.iter().map(|&t| mesh.area(t)).sum();
+    let scale = (surface / flat.area()).sqrt();
+    flat.points.iter_mut().for_each(|p| *p *= scale);
 }
 
 fn of(region: &[u32], wanted: usize) -> Vec<u32> {

@@ -82,8 +82,9 @@ pub(super) fn pack(
     order.sort_by(|&a, &b| sizes[b].total_cmp(&sizes[a]));
     let turns = (16_000 / charts.len()).clamp(4, MAX_ROTATIONS) / 4 * 4;
     let cells = GRID_CELLS.min(inner_px);
-    let mut used = INITIAL_FILL.min(limit * limit * area / (size_px * size_px));
-    while used > 1e-3 {
+    let first = INITIAL_FILL.min(limit * limit * area / (size_px * size_px));
+    let mut used = first;
+    while used > 1e-3 * first {
         // Cells a unit, so that the texture is `cells` wide when `used` is right; it may become a
         // fifth wider.
         let scale = cells * (used / area).sqrt() * size_px / inner_px;

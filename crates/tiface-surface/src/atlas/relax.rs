@@ -24,6 +24,9 @@ const LBFGS_HISTORY: usize = 5;
 /// stretch below half a percent.
 const TARGET_ENERGY: f64 = 4.01;
 
+/// Rounds after which a border that does not cross itself is kept: on its way it may.
+const BORDER_ROUNDS: usize = 25;
+
 /// Area over the squared length of the thinnest triangle in a chart.
 const THINNEST: f64 = 5e-3;
 
@@ -67,7 +70,18 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
         return;
     }
     let border = Border::new(flat.outline(), &flat.points);
-    descend(&rest, &mut flat.points, rounds, whole, &border);
+    let mut apart = flat.points.clone();
+    let mut keep = |points: &Vec<DVec2>, round: usize| {
+        if round % BORDER_ROUNDS == 0 && border.allows(points) {
+            apart.clone_from(points);
+        }
+        true
+    };
+    descend(&rest, &mut flat.points, rounds, whole, &mut keep);
+    if !border.allows(&flat.points) {
+        flat.points = apart;
+        descend(&rest, &mut flat.points, rounds, whole, &mut |points, _| border.allows(points));
+    }
 }
 
 fn energy(rest: &[RestTriangle], points: &[DVec2], slope: Option<&mut [DVec2]>) -> f64 {
@@ -173,8 +187,14 @@ fn dot(a: &[DVec2], b: &[DVec2]) -> f64 {
 }
 
 /// L-BFGS (Nocedal & Wright, algorithm 7.4) with steps that halve until the energy falls enough
-/// (Armijo).
-fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: f64, border: &Border) {
+/// (Armijo) and the caller `allows` the points of that round.
+fn descend(
+    rest: &[RestTriangle],
+    points: &mut Vec<DVec2>,
+    rounds: usize,
+    area: f64,
+    allows: &mut dyn FnMut(&Vec<DVec2>, usize) -> bool,
+) {
     let n = points.len();
     let mut slope = vec![DVec2::ZERO; n];
     let mut now = energy(rest, points, Some(&mut slope));
@@ -211,7 +231,7 @@ fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: 
             let next: Vec<DVec2> = points.iter().zip(&step).map(|(p, s)| *p + length * *s).collect();
             let mut new_slope = vec![DVec2::ZERO; n];
             let value = energy(rest, &next, Some(&mut new_slope));
-            if value <= now + 1e-4 * length * downhill && border.allows(&next) {
+            if value <= now + 1e-4 * length * downhill && allows(&next, round) {
                 break (next, new_slope, value);
             }
             length *= 0.5;
