@@ -27,6 +27,7 @@ impl ViewFrame {
     }
 
     /// Returns the pixel that shows a point; `None` outside the frame.
+    #[inline(always)]
     fn pixel(&self, point: DVec3) -> Option<usize> {
         let (x, y, _) = self.projector.project(point)?;
         let inside = x >= 0.0 && y >= 0.0 && x < self.width as f64 && y < self.height as f64;
@@ -48,20 +49,19 @@ pub(super) fn vote<T: Copy + Default + Send>(
 ) -> Vec<T> {
     let n = cube.n;
     let [xs, ys, zs] = cube.centers();
-    let slab = |x: usize| {
-        let mut slab = vec![T::default(); n * n * values];
+    let mut cells = vec![T::default(); n * n * n * values];
+    cells.par_chunks_exact_mut(n * n * values).zip(&xs).for_each(|(slab, x)| {
         for (k, frame) in frames.iter().enumerate() {
             for (row, y) in slab.chunks_exact_mut(n * values).zip(&ys) {
                 for (cell, z) in row.chunks_exact_mut(values).zip(&zs) {
-                    if let Some(pixel) = frame.pixel(DVec3::new(xs[x], *y, *z)) {
+                    if let Some(pixel) = frame.pixel(DVec3::new(*x, *y, *z)) {
                         vote(cell, k, pixel);
                     }
                 }
             }
         }
-        slab
-    };
-    (0..n).into_par_iter().map(slab).collect::<Vec<_>>().concat()
+    });
+    cells
 }
 
 /// A hard mask with its camera.
