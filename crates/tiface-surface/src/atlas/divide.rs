@@ -128,11 +128,8 @@ fn labels(flat: &ChartSet, count: usize) -> Vec<u32> {
     for (c, chart) in flat.charts.iter().enumerate() {
         chart.triangles.iter().for_each(|&t| label[t as usize] = c as u32);
     }
-    let mut next = flat.charts.len() as u32;
-    for l in label.iter_mut().filter(|l| **l == NONE) {
-        *l = next;
-        next += 1;
-    }
+    let alone = label.iter_mut().filter(|l| **l == NONE);
+    alone.zip(flat.charts.len() as u32..).for_each(|(l, next)| *l = next);
     label
 }
 

@@ -72,7 +72,7 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
     let border = Border::new(flat.outline(), &flat.points);
     let mut apart = flat.points.clone();
     let mut keep = |points: &Vec<DVec2>, round: usize| {
-        if round % BORDER_ROUNDS == 0 && border.allows(points) {
+        if round.is_multiple_of(BORDER_ROUNDS) && border.allows(points) {
             apart.clone_from(points);
         }
         true

@@ -188,7 +188,7 @@ mod tests {
     #[test]
     fn a_hidden_point_is_not_seen() {
         let (mut mesh, radius, camera) = seen_ball();
-        let plain = Seen::of(&mesh, &[camera.clone()], &[], 0.02 * radius);
+        let plain = Seen::of(&mesh, std::slice::from_ref(&camera), &[], 0.02 * radius);
         // a triangle between, much larger than the ball
         let at = mesh.positions.len() as u32;
         let far = 20.0 * radius;
