@@ -55,8 +55,8 @@ const TEXELS: Smoothness = Smoothness { constant: 0.25, others: 0.0, ridge: 0.0,
 /// Candidates for the smoothness of view-dependent color, over vertices: skin prefers the first,
 /// hair the second.
 const VERTICES: [Smoothness; 2] = [
-    Smoothness { constant: 0.02, others: 0.05, ridge: 8e-6, unseen: 0.3 },
-    Smoothness { constant: 0.25, others: 0.75, ridge: 1e-4, unseen: 0.3 },
+    Smoothness { constant: 0.02, others: 0.05, ridge: 8e-6, unseen: 0.05 },
+    Smoothness { constant: 0.25, others: 0.75, ridge: 1e-4, unseen: 0.05 },
 ];
 
 /// Fitted colors.
