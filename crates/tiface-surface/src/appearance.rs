@@ -5,7 +5,7 @@
 //!
 //! ```text
 //! min_c  Σ_p D_p ‖ g y_p − b_p − Σ_k Y_k(d_p) Σ_t W_pt c_tk ‖²
-//!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖²
+//!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖² + ν Σ_t ∫_{U_t} ‖Σ_k Y_k(d) c_tk‖² dd
 //! ```
 //!
 //! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before
@@ -18,8 +18,10 @@
 //!
 //! It is solved twice. The diffuse color (one function) has the finest nodes available, and is what
 //! every viewer shows. What depends on the view is smooth over the surface, so that the vertices
-//! carry it, as a difference to the diffuse color. What no photograph shows follows its neighbors
-//! some nodes far, and keeps its color beyond.
+//! carry it, as a difference to the diffuse color. It is kept small in the directions `U` from which
+//! a vertex could be seen but no photograph looks: polynomials that fit the others may be anything
+//! there, and glared from behind. What no photograph shows follows its neighbors some nodes far, and
+//! keeps its color beyond.
 
 mod glare;
 mod nodes;
@@ -29,14 +31,14 @@ mod solve;
 pub(super) use nodes::Nodes;
 pub use rows::Photograph;
 
-use glam::Mat3;
+use glam::{Mat3, Vec3};
 use rayon::prelude::*;
 use rows::{Row, Rows, Seen};
 use serde::Serialize;
 use solve::{Smoothness, System};
 use std::time::Instant;
 use tiface_base::geom::sphharm::{Y0, functions};
-use tiface_base::geom::{Atlas, Bvh, Harmonics, Mesh, ShellCaster, Shells};
+use tiface_base::geom::{Atlas, Bvh, Harmonics, Mesh, ShellCaster, Shells, area_vector};
 use tiface_base::image::Image;
 use tiface_base::{Monitor, Result};
 
@@ -50,13 +52,13 @@ const VALIDATION_STRIDE: u32 = 6;
 const MAX_GAIN: f32 = 1.25;
 
 /// Smoothness of the diffuse color over texels.
-const TEXELS: Smoothness = Smoothness { constant: 0.25, others: 0.0, ridge: 0.0 };
+const TEXELS: Smoothness = Smoothness { constant: 0.25, others: 0.0, ridge: 0.0, unseen: 0.0 };
 
 /// Candidates for the smoothness of view-dependent color, over vertices: skin prefers the first,
 /// hair the second.
 const VERTICES: [Smoothness; 2] = [
-    Smoothness { constant: 0.02, others: 0.05, ridge: 8e-6 },
-    Smoothness { constant: 0.25, others: 0.75, ridge: 1e-4 },
+    Smoothness { constant: 0.02, others: 0.05, ridge: 8e-6, unseen: 0.05 },
+    Smoothness { constant: 0.25, others: 0.75, ridge: 1e-4, unseen: 0.05 },
 ];
 
 /// Fitted colors.
@@ -128,6 +130,7 @@ pub fn fit(
         return Ok(None);
     }
     let vertices = Nodes::vertices(mesh);
+    let normals = vertex_normals(mesh, turned);
     let (fine, before) = match colors {
         Colors::Vertices => (Nodes::vertices(mesh), mesh.colors.clone()),
         Colors::Texels(atlas, image) => {
@@ -142,18 +145,19 @@ pub fn fit(
     };
     monitor.check_stop()?;
     let fine_start = (&fine, &before[..], &smooth);
-    let choice = choose(&rows.quarter(), &vertices, fine_start, photographs.len(), max_degree, monitor)?;
+    let lobes = (&vertices, &normals[..]);
+    let choice = choose(&rows.quarter(), lobes, fine_start, photographs.len(), max_degree, monitor)?;
     let Choice { degree, smoothness, gains, left_out } = choice;
     monitor.check_stop()?;
 
     let all = |_: u32| true;
     let (in_fine, in_vertices) = (rows.matrix(&fine), rows.matrix(&vertices));
-    let system = System { rows: &rows, matrix: &in_fine, nodes: &fine };
+    let system = System { rows: &rows, matrix: &in_fine, nodes: &fine, normals: &[] };
     let target = system.missing(&photo(&rows, &gains), &before, 1);
     let change = system.solve(&target, 1, &smooth, &all);
     let rest = system.missing(&target, &change, 1);
     monitor.check_stop()?;
-    let system = System { rows: &rows, matrix: &in_vertices, nodes: &vertices };
+    let system = System { rows: &rows, matrix: &in_vertices, nodes: &vertices, normals: &normals };
     let mut report =
         AppearanceReport { psnr: [&target, &rest, &rest].map(|e| psnr(e)), ..Default::default() };
     let harmonics = (degree > 0).then(|| {
@@ -187,6 +191,16 @@ pub fn fit(
     Ok(Some(Appearance { texels, vertices, harmonics, report }))
 }
 
+/// Returns the unit normals of a mesh's vertices, by the areas around them, turned.
+fn vertex_normals(mesh: &Mesh, turned: Mat3) -> Vec<Vec3> {
+    let mut sums = vec![Vec3::ZERO; mesh.positions.len()];
+    for (t, triangle) in mesh.triangles.iter().enumerate() {
+        let area = turned * area_vector(mesh.corners(t as u32));
+        triangle.iter().for_each(|&v| sums[v as usize] += area);
+    }
+    sums.into_iter().map(Vec3::normalize_or_zero).collect()
+}
+
 /// Degree and smoothness, chosen by the photographs that were left out.
 struct Choice {
     degree: u32,
@@ -198,7 +212,7 @@ struct Choice {
 
 fn choose(
     rows: &Rows,
-    vertices: &Nodes,
+    (vertices, normals): (&Nodes, &[Vec3]),
     (fine, before, smooth): (&Nodes, &[[f32; 3]], &Smoothness),
     photographs: usize,
     max_degree: u32,
@@ -209,17 +223,18 @@ fn choose(
     let ones = vec![[1f32; 3]; photographs];
     let (in_fine, in_vertices) = (rows.matrix(fine), rows.matrix(vertices));
     let (of_fine, of_vertices) = (
-        System { rows, matrix: &in_fine, nodes: fine },
-        System { rows, matrix: &in_vertices, nodes: vertices },
+        System { rows, matrix: &in_fine, nodes: fine, normals: &[] },
+        System { rows, matrix: &in_vertices, nodes: vertices, normals },
     );
     let start = of_fine.missing(&photo(rows, &ones), before, 1);
     // even a coarse fit to all photographs gives their brightness; twice, since the fit follows
-    // them
+    // them. It is one of whole colors, which no direction makes small
     let (count, mut gains) = (functions(max_degree.min(1)), ones.clone());
+    let coarse = Smoothness { unseen: 0.0, ..VERTICES[0] };
     for _ in 0..2 {
         let target = of_fine.missing(&photo(rows, &gains), before, 1);
         monitor.check_stop()?;
-        let x = of_vertices.solve(&target, count, &VERTICES[0], &all);
+        let x = of_vertices.solve(&target, count, &coarse, &all);
         gains = gains_of(rows, &of_vertices.missing(&start, &x, count), photographs);
     }
     let target = of_fine.missing(&photo(rows, &gains), before, 1);

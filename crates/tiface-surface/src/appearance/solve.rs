@@ -2,6 +2,7 @@
 
 use super::nodes::Nodes;
 use super::rows::{Matrix, Rows};
+use glam::Vec3;
 use rayon::prelude::*;
 use tiface_base::geom::sphharm::{COEFFICIENTS_OF_DEGREE_2, sh16};
 use tiface_base::math::cg::{conjugate_gradients, dot};
@@ -24,7 +25,19 @@ pub struct Smoothness {
     pub others: f32,
     /// Squares of all other terms themselves, per pixel of a node on average.
     pub ridge: f32,
+    /// Squares of what is seen from where no photograph looks, per pixel of a node on average.
+    pub unseen: f32,
 }
+
+/// Directions over the sphere in which what no photograph shows is kept small.
+const DIRECTIONS: usize = 96;
+
+/// Cosines of the angle between a direction and the nearest photograph's, from which on it counts as
+/// unseen, and at which it does fully: 25° and 37°.
+const UNSEEN: [f32; 2] = [0.906, 0.8];
+
+/// Cosine of the angle between a node's normal and a direction below which nothing is seen.
+const GRAZING: f32 = 0.1;
 
 /// A linear system: pixels, and the nodes that they show.
 pub struct System<'a> {
@@ -34,6 +47,9 @@ pub struct System<'a> {
     pub matrix: &'a Matrix,
     /// The nodes.
     pub nodes: &'a Nodes,
+    /// Unit normals of nodes whose colors depend on the view, in the coordinates of the harmonics;
+    /// else empty.
+    pub normals: &'a [Vec3],
 }
 
 /// Values of the functions in each direction: the first is 1, the others are [`sh16`]'s.
@@ -42,8 +58,33 @@ pub type Functions = [f32; COEFFICIENTS_OF_DEGREE_2];
 impl System<'_> {
     /// Returns the values of the functions in the direction of a row.
     pub fn functions(&self, row: usize) -> Functions {
-        let y = sh16(self.rows[row].direction.to_array());
-        std::array::from_fn(|k| if k == 0 { 1.0 } else { y[k] })
+        functions_at(self.rows[row].direction)
+    }
+
+    /// Returns the mean products of the functions over the sphere's directions from which a node
+    /// could be seen, but no row that `keep` names looks, `[nodes, count, count]`.
+    fn unseen(&self, count: usize, keep: &(dyn Fn(u32) -> bool + Sync)) -> Vec<f32> {
+        let directions = over_sphere();
+        let functions: Vec<Functions> = directions.iter().map(|d| functions_at(*d)).collect();
+        let mut out = vec![0f32; self.normals.len() * count * count];
+        out.par_chunks_mut(count * count).enumerate().with_min_len(256).for_each(|(node, out)| {
+            // one direction a photograph: rows are sorted by them
+            let mut seen: Vec<(u32, Vec3)> = Vec::new();
+            for row in self.matrix.column(node).iter().map(|&(p, _)| &self.rows[p as usize]) {
+                if keep(row.view) && seen.last().is_none_or(|last| last.0 != row.view) {
+                    seen.push((row.view, row.direction));
+                }
+            }
+            let front = |d: &Vec3| self.normals[node].dot(*d) > GRAZING;
+            for (d, y) in directions.iter().zip(&functions).filter(|(d, _)| front(d)) {
+                let nearest = seen.iter().map(|(_, s)| s.dot(*d)).fold(-1.0, f32::max);
+                let share = ((UNSEEN[0] - nearest) / (UNSEEN[0] - UNSEEN[1])).clamp(0.0, 1.0);
+                for (out, (a, b)) in out.iter_mut().zip(pairs(&y[..count])) {
+                    *out += share * a * b / DIRECTIONS as f32;
+                }
+            }
+        });
+        out
     }
 
     /// Returns the product of a row with `x` `[nodes, count]`.
@@ -79,7 +120,9 @@ impl System<'_> {
             _ => (0..rows.len()).into_par_iter().map(|p| self.functions(p)).collect(),
         };
         let per_node = rows.len() as f32 / self.nodes.len().max(1) as f32;
-        let Smoothness { constant, others, ridge } = *smoothness;
+        let Smoothness { constant, others, ridge, unseen } = *smoothness;
+        let mut products = if count > 1 && unseen > 0.0 { self.unseen(count, keep) } else { Vec::new() };
+        products.iter_mut().for_each(|product| *product *= per_node * unseen);
         let normal = Normal {
             system: self,
             weight: &weight,
@@ -87,6 +130,7 @@ impl System<'_> {
             count,
             constant: [constant, 0.0],
             others: [others, per_node * ridge],
+            unseen: products,
         };
         let right: Vec<[f32; 3]> = target.iter().zip(&weight).map(|(t, w)| t.map(|t| w * t)).collect();
         let mut residual = vec![0f64; self.nodes.len() * count * 3];
@@ -104,6 +148,29 @@ impl System<'_> {
     }
 }
 
+/// Returns the values of the functions in a direction.
+fn functions_at(direction: Vec3) -> Functions {
+    let y = sh16(direction.to_array());
+    std::array::from_fn(|k| if k == 0 { 1.0 } else { y[k] })
+}
+
+/// Returns all pairs of some values, row by row.
+fn pairs(values: &[f32]) -> impl Iterator<Item = (f32, f32)> {
+    values.iter().flat_map(|a| values.iter().map(|b| (*a, *b)))
+}
+
+/// Returns unit vectors in equal areas of the sphere: a spiral by the golden angle.
+fn over_sphere() -> Vec<Vec3> {
+    let golden = std::f32::consts::PI * (3.0 - 5f32.sqrt());
+    let at = |i: usize| {
+        let z = 1.0 - (2 * i + 1) as f32 / DIRECTIONS as f32;
+        let (sin, cos) = (golden * i as f32).sin_cos();
+        let r = (1.0 - z * z).sqrt();
+        Vec3::new(r * cos, r * sin, z)
+    };
+    (0..DIRECTIONS).map(at).collect()
+}
+
 /// The operator `Aᵀ D A` with the smoothness terms.
 struct Normal<'a> {
     system: &'a System<'a>,
@@ -115,11 +182,19 @@ struct Normal<'a> {
     constant: [f32; 2],
     /// The same of all others.
     others: [f32; 2],
+    /// Weights of products of functions, `[nodes, count, count]`; empty without.
+    unseen: Vec<f32>,
 }
 
 impl Normal<'_> {
     fn y(&self, row: usize) -> &[f32] {
         self.harmonics.get(row).map_or(&[1.0], |y| &y[..self.count])
+    }
+
+    /// Returns the weights of a node's products with a function, `[count]`; empty without.
+    fn unseen(&self, node: usize, k: usize) -> &[f32] {
+        let first = (node * self.count + k) * self.count;
+        self.unseen.get(first..first + self.count).unwrap_or_default()
     }
 
     /// Writes `Aᵀ values`, and `more` of each node and function.
@@ -152,13 +227,18 @@ impl Normal<'_> {
             (0..self.weight.len()).into_par_iter().with_min_len(4096).map(value).collect();
         let more = |node: usize, k: usize, near: &[u32]| {
             let [smooth, ridge] = if k == 0 { self.constant } else { self.others };
-            let own = x[node * self.count + k];
+            let all = &x[node * self.count..][..self.count];
+            let own = all[k];
             let mut sum = [0f32; 3];
             for &other in near {
                 let theirs = x[other as usize * self.count + k];
                 (0..3).for_each(|c| sum[c] += own[c] - theirs[c]);
             }
-            std::array::from_fn(|c| smooth * sum[c] + ridge * own[c])
+            let mut out: [f32; 3] = std::array::from_fn(|c| smooth * sum[c] + ridge * own[c]);
+            for (w, theirs) in self.unseen(node, k).iter().zip(all) {
+                (0..3).for_each(|c| out[c] += w * theirs[c]);
+            }
+            out
         };
         self.gather(&values, more, out);
     }
@@ -175,7 +255,8 @@ impl Normal<'_> {
             let near = self.system.nodes.near(node).len() as f32;
             for (k, out) in out.iter_mut().enumerate() {
                 let [smooth, ridge] = if k == 0 { self.constant } else { self.others };
-                *out = 1.0 / f64::from((own[k] + smooth * near + ridge).max(1e-6));
+                let unseen = self.unseen(node, k).get(k).unwrap_or(&0.0);
+                *out = 1.0 / f64::from((own[k] + smooth * near + ridge + unseen).max(1e-6));
             }
         });
         out

@@ -134,6 +134,31 @@ fn gloss_is_found_in_the_degree_that_it_has() {
 }
 
 #[test]
+fn from_where_no_photograph_looks_the_diffuse_color_is_seen() {
+    let (mesh, atlas) = square();
+    // cameras stand from 46° to the left to 46° to the right: z is 0.69 to 1, and the mean of the
+    // gloss 0.04
+    let gloss = |d: Vec3| 0.6 * d.z - 0.5;
+    let cameras = cameras(12);
+    let photos = photos(&cameras, |_, p, d| paint(p).map(|c| c + gloss(d)));
+    let image = gray(&atlas);
+    let photographs = photographs(&cameras, &photos);
+    let colors = Colors::Texels(&atlas, &image);
+    let fitted = fit(&mesh, colors, &photographs, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+    let harmonics = fitted.harmonics.unwrap();
+    let middle = mesh.triangles.iter().position(|t| t.contains(&(12 * 25 + 12))).unwrap();
+    let hit = tiface_base::geom::Hit { t: 1.0, triangle: middle as u32, u: 0.3, v: 0.3 };
+    let at = |d: Vec3| harmonics.seen_along(-d, &hit, mesh.triangles[middle])[0];
+    // 0.08 brighter from the front than from the side
+    let (front, side) = (at(Vec3::Z), at(Vec3::new(0.5, 0.0, 0.866)));
+    assert!((0.03..0.12).contains(&(front - side)), "{front} {side}");
+    // nobody looks from above or below, where the gloss continued would be 0.35 darker than its mean
+    for d in [Vec3::new(0.0, 0.95, 0.312), Vec3::new(0.0, -0.95, 0.312)] {
+        assert!(at(d).abs() < 0.15, "{}", at(d));
+    }
+}
+
+#[test]
 fn the_exposure_of_photographs_is_not_painted_onto_the_head() {
     let (mesh, atlas) = square();
     let cameras = cameras(12);

@@ -25,7 +25,7 @@ pub const LOBE_TEXEL: u32 = 4;
 
 /// Steps of a lobe from 0 to its largest value. Finer ones take half as many bytes more and bring
 /// views 0.01 dB closer to photographs.
-const LOBE_STEPS: f32 = 48.0;
+const LOBE_LEVELS: f32 = 48.0;
 
 /// View-dependent color of a texture: spherical harmonics of the direction to the viewer.
 #[derive(Clone, Debug, PartialEq)]
@@ -50,7 +50,7 @@ impl Lobes {
             let at = (sizes.len() as f64 * 0.999) as usize;
             let most =
                 if sizes.is_empty() { 0.0 } else { *sizes.select_nth_unstable_by(at, f32::total_cmp).1 };
-            let most = most.max(1e-4) * 127.0 / LOBE_STEPS;
+            let most = most.max(1e-4) * 127.0 / LOBE_LEVELS;
             let byte = |v: f32| (v / most * 127.0 + 128.5).clamp(1.0, 255.0) as u8;
             let rgb = image.data.as_chunks::<3>().0.iter().map(|c| c.map(byte)).collect();
             pictures.push(Photo { width: image.width, height: image.height, rgb, alpha: None });
