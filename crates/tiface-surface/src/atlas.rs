@@ -81,15 +81,19 @@ pub struct PartReport {
     pub density: f64,
 }
 
+/// A texture larger than this, over the size that suffices, is worth a warning: twice the texels.
+const OVERSIZE: f64 = std::f64::consts::SQRT_2;
+
 impl AtlasReport {
     /// Returns warnings for the user, one sentence each.
     pub fn warnings(&self) -> Vec<String> {
         let mut out = Vec::new();
-        if let Some(px) = self.sufficient_px.filter(|&px| px < self.size_px) {
+        let size = self.size_px;
+        // a preset's texture may well be a little larger than small photographs need
+        if let Some(px) = self.sufficient_px.filter(|&px| f64::from(size) > OVERSIZE * f64::from(px)) {
             out.push(format!(
-                "a texture of {px} × {px} texels holds all that the photographs resolve, {size} × {size} were asked for: \
-                 no part of it is finer, the rest is left empty; set `mesh.texture_px` to {px}",
-                size = self.size_px
+                "a texture of {px} × {px} texels holds all that the photographs resolve, {size} × {size} were asked \
+                 for: no part of it is finer, and the rest stays empty; set `mesh.texture_px` to {px}"
             ));
         }
         if let Some(reason) = &self.fallback {
