@@ -80,15 +80,20 @@ pub struct PartReport {
     pub density: f64,
 }
 
+/// A texture larger than this, over the size that suffices, is worth a warning: twice the texels.
+const OVERSIZE: f64 = std::f64::consts::SQRT_2;
+
 impl AtlasReport {
     /// Returns what is doubtful of the atlas.
     pub fn warnings(&self) -> Vec<Warning> {
         let no_charts =
             |reason: &String| Warning::NoCharts { gutter_px: self.gutter_px, reason: reason.clone() };
         let own = (self.repaired > 0).then_some(Warning::OwnCharts(self.repaired));
+        // a preset's texture may well be a little larger than small photographs need
+        let oversize = |px: &u32| f64::from(self.size_px) > OVERSIZE * f64::from(*px);
         let finer = self
             .sufficient_px
-            .filter(|&px| px < self.size_px)
+            .filter(oversize)
             .map(|sufficient_px| Warning::FinerThanPhotographs { sufficient_px, asked_px: self.size_px });
         finer.into_iter().chain(self.fallback.iter().map(no_charts)).chain(own).collect()
     }

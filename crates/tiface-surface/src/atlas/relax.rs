@@ -24,9 +24,6 @@ const LBFGS_HISTORY: usize = 5;
 /// stretch below half a percent.
 const TARGET_ENERGY: f64 = 4.01;
 
-/// Rounds after which a border that does not cross itself is kept: on its way it may.
-const BORDER_ROUNDS: usize = 25;
-
 /// Area over the squared length of the thinnest triangle in a chart.
 const THINNEST: f64 = 5e-3;
 
@@ -70,18 +67,7 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
         return;
     }
     let border = Border::new(flat.outline(), &flat.points);
-    let mut apart = flat.points.clone();
-    let mut keep = |points: &Vec<DVec2>, round: usize| {
-        if round.is_multiple_of(BORDER_ROUNDS) && border.allows(points) {
-            apart.clone_from(points);
-        }
-        true
-    };
-    descend(&rest, &mut flat.points, rounds, whole, &mut keep);
-    if !border.allows(&flat.points) {
-        flat.points = apart;
-        descend(&rest, &mut flat.points, rounds, whole, &mut |points, _| border.allows(points));
-    }
+    descend(&rest, &mut flat.points, rounds, whole, &border);
 }
 
 fn energy(rest: &[RestTriangle], points: &[DVec2], slope: Option<&mut [DVec2]>) -> f64 {
@@ -157,22 +143,26 @@ struct Border {
 impl Border {
     fn new(sides: Vec<(u32, u32)>, points: &[DVec2]) -> Border {
         let border = Border { sides };
-        if border.allows(points) { border } else { Border { sides: Vec::new() } }
+        if border.crossing(points).is_empty() { border } else { Border { sides: Vec::new() } }
     }
 
-    /// Returns whether no two sides cross.
-    fn allows(&self, points: &[DVec2]) -> bool {
+    /// Returns the ends of all sides that cross another one.
+    fn crossing(&self, points: &[DVec2]) -> Vec<u32> {
         let at = |(a, b): (u32, u32)| [points[a as usize], points[b as usize]];
         let mut sides: Vec<([DVec2; 2], (u32, u32))> = self.sides.iter().map(|&s| (at(s), s)).collect();
         let least = |s: &[DVec2; 2]| s[0].x.min(s[1].x);
         sides.sort_by(|a, b| least(&a.0).total_cmp(&least(&b.0)));
-        (0..sides.len()).all(|i| {
-            let (p, (a, b)) = sides[i];
+        let mut found = Vec::new();
+        for (i, &(p, (a, b))) in sides.iter().enumerate() {
             let last = p[0].x.max(p[1].x);
             let beside = sides[i + 1..].iter().take_while(|q| least(&q.0) <= last);
-            let mut apart = beside.filter(|(_, (c, d))| a != *c && a != *d && b != *c && b != *d);
-            apart.all(|(q, _)| !crosses(p, *q))
-        })
+            for &(q, (c, d)) in beside.filter(|(_, (c, d))| a != *c && a != *d && b != *c && b != *d) {
+                if crosses(p, q) {
+                    found.extend([a, b, c, d]);
+                }
+            }
+        }
+        found
     }
 }
 
@@ -186,15 +176,40 @@ fn dot(a: &[DVec2], b: &[DVec2]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a.dot(*b)).sum()
 }
 
-/// L-BFGS (Nocedal & Wright, algorithm 7.4) with steps that halve until the energy falls enough
-/// (Armijo) and the caller `allows` the points of that round.
-fn descend(
+/// Returns the points along `step` where the energy, which is `now` with this `slope`, falls enough,
+/// their slope and energy; `None` if none is found.
+fn searched(
     rest: &[RestTriangle],
-    points: &mut Vec<DVec2>,
-    rounds: usize,
-    area: f64,
-    allows: &mut dyn FnMut(&Vec<DVec2>, usize) -> bool,
-) {
+    points: &[DVec2],
+    step: &mut [DVec2],
+    (now, slope): (f64, &[DVec2]),
+    border: &Border,
+) -> Option<(Vec<DVec2>, Vec<DVec2>, f64)> {
+    let mut downhill = dot(step, slope);
+    let mut length = (0.9 * reach(rest, points, step)).min(1.0);
+    while downhill < 0.0 && length > 1e-12 {
+        let next: Vec<DVec2> = points.iter().zip(&*step).map(|(p, s)| *p + length * *s).collect();
+        let crossing = border.crossing(&next);
+        if !crossing.is_empty() {
+            crossing.iter().for_each(|&i| step[i as usize] = DVec2::ZERO);
+            downhill = dot(step, slope);
+            length = (0.9 * reach(rest, points, step)).min(length);
+            continue;
+        }
+        let mut new_slope = vec![DVec2::ZERO; points.len()];
+        let value = energy(rest, &next, Some(&mut new_slope));
+        if value <= now + 1e-4 * length * downhill {
+            return Some((next, new_slope, value));
+        }
+        length *= 0.5;
+    }
+    None
+}
+
+/// L-BFGS (Nocedal & Wright, algorithm 7.4) with steps that halve until the energy falls enough
+/// (Armijo). Where a step would make the border cross itself, the ends of the sides that cross stay
+/// where they are, in this step.
+fn descend(rest: &[RestTriangle], points: &mut Vec<DVec2>, rounds: usize, area: f64, border: &Border) {
     let n = points.len();
     let mut slope = vec![DVec2::ZERO; n];
     let mut now = energy(rest, points, Some(&mut slope));
@@ -218,26 +233,12 @@ fn descend(
             let back = rho * dot(y, &step);
             step.iter_mut().zip(s).for_each(|(p, s)| *p += (along[m] - back) * *s);
         }
-        let downhill = dot(&step, &slope);
-        if downhill >= 0.0 {
+        let Some((next, new_slope, value)) = searched(rest, points, &mut step, (now, &slope), border) else {
             if past.is_empty() {
                 return;
             }
             past.clear();
             continue;
-        }
-        let mut length = (0.9 * reach(rest, points, &step)).min(1.0);
-        let (next, new_slope, value) = loop {
-            let next: Vec<DVec2> = points.iter().zip(&step).map(|(p, s)| *p + length * *s).collect();
-            let mut new_slope = vec![DVec2::ZERO; n];
-            let value = energy(rest, &next, Some(&mut new_slope));
-            if value <= now + 1e-4 * length * downhill && allows(&next, round) {
-                break (next, new_slope, value);
-            }
-            length *= 0.5;
-            if length < 1e-12 {
-                return;
-            }
         };
         let s: Vec<DVec2> = next.iter().zip(&*points).map(|(a, b)| *a - *b).collect();
         let y: Vec<DVec2> = new_slope.iter().zip(&slope).map(|(a, b)| *a - *b).collect();
@@ -379,11 +380,14 @@ mod tests {
         let p = |x: f64, y: f64| DVec2::new(x, y);
         let mut points = [p(0., 0.), p(4., 0.), p(4., 4.), p(2., 1.), p(0., 4.)];
         let border = Border::new((0..5).map(|i| (i, (i + 1) % 5)).collect(), &points);
-        assert!(border.allows(&points));
-        // the dent through the lower side
+        assert!(border.crossing(&points).is_empty());
+        // the dent through the lower side: both of its sides cross that one
         points[3] = p(2., -0.1);
-        assert!(!border.allows(&points));
+        let mut found = border.crossing(&points);
+        found.sort_unstable();
+        found.dedup();
+        assert_eq!(found, [0, 1, 2, 3, 4]);
         // what crosses itself from the start may go on
-        assert!(Border::new(border.sides, &points).allows(&points));
+        assert!(Border::new(border.sides, &points).crossing(&points).is_empty());
     }
 }
