@@ -27,7 +27,7 @@ const GUESS: f64 = 0.02;
 const LENGTH: f32 = 0.015;
 
 /// Power of the shares by which materials mix at a point: their border is a line.
-const SHARPNESS: i32 = 4;
+const SHARPNESS: i32 = 8;
 
 /// Trust from which on a color tells materials apart.
 pub const TRUSTED: f32 = 0.9;
@@ -183,7 +183,7 @@ mod tests {
         let nodes = Nodes::vertices(&mesh);
         let mut weights = vec![0.0; 16];
         let values: Vec<f64> = (0..16).map(|i| if i < 2 { 3.0 } else { 10.0 }).collect();
-        [0, 1, 14, 15].iter().for_each(|&i| weights[i] = 1e9);
+        [0, 1, 14, 15].iter().for_each(|&i| weights[i] = 1e3);
         let x = membrane(&nodes, &weights, &values, 1.0);
         // each side of the strip by itself runs from 3 to 10 in seven steps; diagonals join them
         for (i, x) in x.iter().enumerate() {

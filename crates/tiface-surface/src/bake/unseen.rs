@@ -25,6 +25,9 @@ const UNSEEN: f32 = 0.5;
 /// Trust from which on a texel keeps its color: 1, but for rounding.
 const FULL: f32 = 0.999;
 
+/// Half a step of a picture of bytes: what is brighter by less, is not.
+const HALF_STEP: f32 = 0.5 / 255.0;
+
 /// Texels of a texture by what is known of them, to measure what was made of the unseen ones.
 pub struct TexelTrust {
     /// Texels whose color is trusted, with their materials.
@@ -61,7 +64,7 @@ impl TexelTrust {
         }
         self.unseen
             .iter()
-            .filter(|(texel, material)| brightness(*texel) > most[usize::from(*material)])
+            .filter(|(texel, material)| brightness(*texel) > most[usize::from(*material)] + HALF_STEP)
             .count()
     }
 
