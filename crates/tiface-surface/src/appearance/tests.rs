@@ -144,7 +144,7 @@ fn from_where_no_photograph_looks_the_diffuse_color_is_seen() {
     let image = gray(&atlas);
     let photographs = photographs(&cameras, &photos);
     let colors = Colors::Texels(&atlas, &image);
-    let fitted = fit(&mesh, colors, &photographs, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+    let fitted = fit(&mesh, None, colors, &photographs, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
     let harmonics = fitted.harmonics.unwrap();
     let middle = mesh.triangles.iter().position(|t| t.contains(&(12 * 25 + 12))).unwrap();
     let hit = tiface_base::geom::Hit { t: 1.0, triangle: middle as u32, u: 0.3, v: 0.3 };
