@@ -25,6 +25,7 @@ fn another(key: &str, config: &Config, dir: &Path) -> Option<String> {
         (key!(tface.density_rank), "8,8,7"),
         (key!(tface.color_rank), "24,24,23"),
         (key!(mesh.format), "glb,obj"),
+        (key!(mesh.lobes), "1"),
         (key!(render.cameras), "orbit"),
         (key!(render.method), "tface,raycast"),
         (key!(ensemble.members), "raycast"),

@@ -196,7 +196,10 @@ fn a_head_that_was_cut_lost_or_changed_is_noticed_and_put_back() {
 #[test]
 fn a_smaller_head_is_watertight_and_keeps_its_texture() {
     let dir = tempfile::tempdir().unwrap();
-    let run = finished(dir.path(), &["mesh.normal_map=true", "mesh.lobes=1", "mesh.hair=shells"]);
+    let run = finished(
+        dir.path(),
+        &["mesh.normal_map=true", "mesh.color=network", "mesh.lobes=1", "mesh.hair=shells"],
+    );
     let before = files(&run);
     let words = ["export", "runs/head", "--triangles", "300", "--texture", "64"];
     worked(dir.path(), &[&words[..], &["--format", "glb,obj", "--out", "small/"]].concat());

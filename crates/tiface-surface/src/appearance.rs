@@ -25,11 +25,12 @@
 
 mod glare;
 mod nodes;
+mod photograph;
 mod rows;
 mod solve;
 
 pub(super) use nodes::Nodes;
-pub use rows::Photograph;
+pub use photograph::Photograph;
 
 use glam::{Mat3, Vec3};
 use rayon::prelude::*;

@@ -3,7 +3,7 @@
 //! A mask is right to a pixel or two at best, and lamps behind hair outshine it through gaps that a
 //! mask does not have. Such a pixel, fitted at a steep angle, would paint the back of the head.
 
-use super::rows::Photograph;
+use super::photograph::Photograph;
 use tiface_base::image::eroded;
 
 /// Pixels within this many of a pixel that is not the head alone may show what is behind.
