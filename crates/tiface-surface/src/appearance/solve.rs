@@ -75,8 +75,8 @@ impl System<'_> {
                     seen.push((row.view, row.direction));
                 }
             }
-            let front = |d: &Vec3| self.normals[node].dot(*d) > GRAZING;
-            for (d, y) in directions.iter().zip(&functions).filter(|(d, _)| front(d)) {
+            let front = directions.iter().zip(&functions);
+            for (d, y) in front.filter(|(d, _)| self.normals[node].dot(**d) > GRAZING) {
                 let nearest = seen.iter().map(|(_, s)| s.dot(*d)).fold(-1.0, f32::max);
                 let share = ((UNSEEN[0] - nearest) / (UNSEEN[0] - UNSEEN[1])).clamp(0.0, 1.0);
                 for (out, (a, b)) in out.iter_mut().zip(pairs(&y[..count])) {
@@ -156,7 +156,7 @@ fn functions_at(direction: Vec3) -> Functions {
 
 /// Returns all pairs of some values, row by row.
 fn pairs(values: &[f32]) -> impl Iterator<Item = (f32, f32)> {
-    values.iter().flat_map(|a| values.iter().map(|b| (*a, *b)))
+    values.iter().flat_map(move |a| values.iter().map(move |b| (*a, *b)))
 }
 
 /// Returns unit vectors in equal areas of the sphere: a spiral by the golden angle.
