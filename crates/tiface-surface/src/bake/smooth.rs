@@ -20,8 +20,9 @@ use tiface_base::math::cg::{conjugate_gradients, dot};
 /// Weight of a trusted color's material relative to a difference between neighbors.
 const SURE: f64 = 10.0;
 
-/// The same of the network's guess: it decides over tens of vertices together, and a glare is less.
-const GUESS: f64 = 0.02;
+/// Length over which the network's guess decides what material is where, relative to the longest
+/// side: half as wide as a head, and wider than a glare.
+const GUESS: f32 = 0.1;
 
 /// Length over which trusted colors are smoothed, relative to the longest side.
 const LENGTH: f32 = 0.015;
@@ -62,8 +63,10 @@ impl SmoothColors<'_> {
             return None;
         }
         let materials = Materials::of(&trusted);
+        let (side, edge) = (mesh.bounds().size().max_element(), mean_edge(mesh, nodes));
+        let guess_weight = f64::from(edge / (GUESS * side)).powi(2);
         let prior = |v: usize| {
-            let (seen, guessed) = (SURE * f64::from(trust[v]), GUESS * f64::from(1.0 - trust[v]));
+            let (seen, guessed) = (SURE * f64::from(trust[v]), guess_weight * f64::from(1.0 - trust[v]));
             let (p, q) = (materials.probabilities(own[v]), materials.probabilities(guess[v]));
             let value = |k: usize| (seen * p[k] + guessed * q[k]) / (seen + guessed);
             (seen + guessed, (0..materials.len()).map(value).collect::<Vec<f64>>())
@@ -75,8 +78,7 @@ impl SmoothColors<'_> {
             membrane(nodes, &weights, &values, 1.0).into_iter().map(|s| (s as f32).clamp(0.0, 1.0)).collect()
         };
         let shares: Vec<Vec<f32>> = (0..materials.len()).into_par_iter().map(share).collect();
-        let smoothness =
-            f64::from(LENGTH * mesh.bounds().size().max_element() / mean_edge(mesh, nodes)).powi(2);
+        let smoothness = f64::from(LENGTH * side / edge).powi(2);
         let channel = |i: usize| {
             let (shares, c) = (&shares[i / 3], i % 3);
             let weight = |(t, s): (&f32, &f32)| f64::from(*t) * f64::from(*s).powi(2);
@@ -198,7 +200,7 @@ mod tests {
         let paint = |y: f32| if y > 0.0 { [0.8, 0.6, 0.5] } else { [0.2, 0.25, 0.4] };
         let own: Vec<[f32; 3]> = mesh.positions.iter().map(|p| paint(p.y)).collect();
         let trust: Vec<f32> = mesh.positions.iter().map(|p| if p.x < 4.0 { 1.0 } else { 0.0 }).collect();
-        let lamp = |p: &glam::Vec3| p.distance(glam::Vec3::new(11.0, -5.0, 0.0)) < 3.0;
+        let lamp = |p: &glam::Vec3| p.distance(glam::Vec3::new(11.0, -5.0, 0.0)) < 1.2;
         let guess =
             mesh.positions.iter().zip(&own).map(|(p, c)| if lamp(p) { [1.0; 3] } else { *c }).collect();
         (mesh, trust, own, guess)
