@@ -17,11 +17,6 @@ fn mesh_at(resolution: usize, f: impl Fn(Vec3) -> f32 + Sync, longest_handle: f3
     extract(&f, Aabb::SCENE, &config, &Quiet).unwrap()
 }
 
-fn slope(f: &impl Fn(Vec3) -> f32, p: Vec3) -> Vec3 {
-    let d = |e: Vec3| (f(p + 1e-3 * e) - f(p - 1e-3 * e)) / 2e-3;
-    Vec3::new(d(Vec3::X), d(Vec3::Y), d(Vec3::Z))
-}
-
 /// Meshes twice, with handles and without; checks that the first has `genus` and the second none,
 /// and is as sound.
 fn simple(f: impl Fn(Vec3) -> f32 + Sync, longest_handle: f32, genus: i64) -> (Mesh, MeshReport) {
