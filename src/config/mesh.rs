@@ -136,8 +136,7 @@ table! {
         #[flag("hair", Text("KIND"), ["mesh", "export"],
             "Hair and other soft outlines: shells (translucent layers, where they help) or none")]
         hair: Hair [Head] => Hair::Shells, Hair::Shells, Hair::None;
-        /// Write a tangent-space map of the surface's normals before simplification to the GLB: true or
-        /// false.
+        /// Write a tangent-space map of the unsimplified normals to the GLB: true or false.
         #[flag("normal-map", Switch("true"), ["mesh"],
             "Store the detail that simplification removes in a normal map; makes the material lit")]
         normal_map: bool [Head] => false;

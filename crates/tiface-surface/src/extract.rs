@@ -40,7 +40,8 @@ pub struct ExtractOptions {
     /// Handles are cut, or their holes filled, where they have a loop no longer than this share of
     /// the surface's longest side; 0..=1, 0 leaves them all.
     pub longest_handle: f32,
-    /// Whether the noise of a learned field is taken out of the surface ([`smooth()`](crate::smooth)).
+    /// Whether the noise of a learned field is taken out of the surface
+    /// ([`smooth()`](crate::smooth)).
     pub smooth: bool,
 }
 

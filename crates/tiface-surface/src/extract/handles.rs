@@ -10,8 +10,8 @@
 //! thin strand has little matter to cut and a narrow slit little air to fill, however long the slit
 //! is. The field is not closed or opened itself and meshed again, as morphology would: how far that
 //! goes before a handle disappears is known only afterwards, it rounds off nearby surface, and
-//! costs a second extraction. Here every vertex stays on the zero set, and later steps hold the mesh
-//! against itself, new triangles included ([`crate::MeshDistance`]).
+//! costs a second extraction. Here every vertex stays on the zero set, and later steps hold the
+//! mesh against itself, new triangles included ([`crate::MeshDistance`]).
 //!
 //! A loop whose discs would meet the surface is no place to cut (another strand may run through the
 //! hole): the next best is taken, and without any the handle stays and is counted.
