@@ -5,7 +5,7 @@
 //!
 //! ```text
 //! min_c  Σ_p D_p ‖ g y_p − b_p − Σ_k Y_k(d_p) Σ_t W_pt c_tk ‖²
-//!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖² + ν Σ_t ∫_{U_t} ‖Σ_k Y_k(d) c_tk‖² dd
+//!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖² + ν Σ_t ∫_{U_t} ‖Σ_k Y_k c_tk‖²
 //! ```
 //!
 //! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before
@@ -18,9 +18,9 @@
 //!
 //! It is solved twice. The diffuse color (one function) has the finest nodes available, and is what
 //! every viewer shows. What depends on the view is smooth over the surface, so that the vertices
-//! carry it, as a difference to the diffuse color. It is kept small in the directions `U` from which
-//! a vertex could be seen but no photograph looks: polynomials that fit the others may be anything
-//! there, and glared from behind. What no photograph shows follows its neighbors some nodes far, and
+//! carry it, as a difference to the diffuse color. It is kept small in the directions `U` from
+//! which a vertex could be seen but no photograph looks: a fit to the others may be anything there,
+//! and would glare from behind. What no photograph shows follows its neighbors some nodes far, and
 //! keeps its color beyond.
 
 mod glare;

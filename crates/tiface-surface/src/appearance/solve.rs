@@ -32,8 +32,8 @@ pub struct Smoothness {
 /// Directions over the sphere in which what no photograph shows is kept small.
 const DIRECTIONS: usize = 96;
 
-/// Cosines of the angle between a direction and the nearest photograph's, from which on it counts as
-/// unseen, and at which it does fully: 25° and 37°.
+/// Cosines of the angle between a direction and the nearest photograph's, from which on it counts
+/// as unseen, and at which it does fully: 25° and 37°.
 const UNSEEN: [f32; 2] = [0.906, 0.8];
 
 /// Cosine of the angle between a node's normal and a direction below which nothing is seen.

@@ -152,7 +152,7 @@ fn from_where_no_photograph_looks_the_diffuse_color_is_seen() {
     // 0.08 brighter from the front than from the side
     let (front, side) = (at(Vec3::Z), at(Vec3::new(0.5, 0.0, 0.866)));
     assert!((0.03..0.12).contains(&(front - side)), "{front} {side}");
-    // nobody looks from above or below, where the gloss continued would be 0.35 darker than its mean
+    // nobody looks from above or below, where the gloss, continued, is 0.35 darker than its mean
     for d in [Vec3::new(0.0, 0.95, 0.312), Vec3::new(0.0, -0.95, 0.312)] {
         assert!(at(d).abs() < 0.15, "{}", at(d));
     }
