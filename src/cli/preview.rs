@@ -31,8 +31,9 @@ pub(super) struct PreviewOptions {
     /// newest under runs/]
     #[arg(value_name = "RUN|FILE")]
     path: Option<PathBuf>,
-    /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv (checkerboard),
-    /// wire or seen (number of cameras) [default: unlit if the mesh has colors, else studio]
+    /// Shading: studio (lamps), unlit (colors as stored), normals, matcap (clay), uv
+    /// (checkerboard), wire or seen (number of cameras) [default: unlit if the mesh has colors,
+    /// else studio]
     #[arg(long, value_name = "LOOK")]
     #[arg(value_parser = PossibleValuesParser::new(Look::ALL.map(Look::word)).map(|word| look(&word)))]
     light: Option<Look>,

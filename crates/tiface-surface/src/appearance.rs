@@ -10,11 +10,12 @@
 //!
 //! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before
 //! the fit, `W` the shares of the nodes under the pixel's rays (visibility, footprint and the
-//! opacity of soft layers, which have the colors of the surface under them, in one),
-//! `Y_k` real spherical harmonics of the direction to the viewer and `∇` the difference between
-//! neighboring nodes. `D` is the root of the cosine between view and surface where the head alone
-//! fills the pixel, by the mask and by all rays, and else 0: what is behind the head never bleeds
-//! in. Near the mask's outline pixels that shine or look like what is behind count as that, too. All values are sRGB-coded, as the metrics are.
+//! opacity of soft layers, which have the colors of the surface under them, in one), `Y_k` real
+//! spherical harmonics of the direction to the viewer and `∇` the difference between neighboring
+//! nodes. `D` is the root of the cosine between view and surface where the head alone fills the
+//! pixel, by the mask and by all rays, and else 0: what is behind the head never bleeds in. Near
+//! the mask's outline pixels that shine or look like what is behind count as that, too. All values
+//! are sRGB-coded, as the metrics are.
 //!
 //! It is solved twice. The diffuse color (one function) has the finest nodes available, and is what
 //! every viewer shows. What depends on the view is smooth over the surface, so that the vertices
@@ -105,8 +106,9 @@ pub enum Colors<'a> {
 }
 
 /// Fits colors to photographs, whose masks have their sizes; vertices have colors, and normals if
-/// there are `shells` around the mesh. What depends on the view has degree `max_degree` at most, and 2; the degree and its smoothness are those that
-/// show photographs best that were left out of a first fit.
+/// there are `shells` around the mesh. What depends on the view has degree `max_degree` at most,
+/// and 2; the degree and its smoothness are those that show photographs best that were left out of
+/// a first fit.
 ///
 /// Returns `None` where no photograph shows the head.
 ///

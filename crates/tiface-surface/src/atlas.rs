@@ -69,8 +69,8 @@ pub struct AtlasReport {
 /// A part of a head in its texture.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct PartReport {
-    /// What it shows: `face`, `left` and `right` of the scalp, `nape`, `chest`, `back`, or `cap`, what
-    /// closes the shoulders.
+    /// What it shows: `face`, `left` and `right` of the scalp, `nape`, `chest`, `back`, or `cap`,
+    /// what closes the shoulders.
     pub part: String,
     /// Its share of the surface.
     pub surface: f64,
@@ -193,10 +193,11 @@ pub struct AtlasConfig {
     /// Charts are at least twice this far from each other and from the border; 0..=256 and at most
     /// an eighth of the texture.
     pub gutter_px: u32,
-    /// Direction that the face looks in, in the mesh's coordinates: the surface is divided as a head,
-    /// its face one chart with seams behind the ears and at crown, nape and collar, and texels by
-    /// importance: more than twice as many along a line on the face as on a garment, hardly any on
-    /// what closes the shoulders. That costs stretch: the nose is laid flat with the cheeks.
+    /// Direction that the face looks in, in the mesh's coordinates: the surface is divided as a
+    /// head, its face one chart with seams behind the ears and at crown, nape and collar, and
+    /// texels by importance: more than twice as many along a line on the face as on a garment,
+    /// hardly any on what closes the shoulders. That costs stretch: the nose is laid flat with the
+    /// cheeks.
     pub front: Option<Vec3>,
     /// Up direction in the mesh's coordinates: the face stands upright in the texture. Only used
     /// with `front`.
@@ -314,8 +315,8 @@ fn head_pieces(
     }))
 }
 
-/// Returns the charts of a mesh that is not known to be a head: its flat pieces, and what `uvunwrap`
-/// makes of the rest.
+/// Returns the charts of a mesh that is not known to be a head: its flat pieces, and what
+/// `uvunwrap` makes of the rest.
 fn plain_pieces(mesh: &Mesh, monitor: &dyn Monitor) -> Result<Pieces> {
     let flat = planar(mesh, &neighbors(mesh));
     let mut taken = vec![false; mesh.triangles.len()];

@@ -31,14 +31,14 @@ use tiface_base::image::quantize;
 use tiface_base::math::rank::median;
 use tiface_base::{Monitor, Result};
 
-/// Distances of the layers, in lengths `1 / s`. A ray meets each of them twice, and more often where
-/// they are folded, and path tracers stop at the eighth transparent face. Three layers would say
-/// little more than two of the same number of triangles.
+/// Distances of the layers, in lengths `1 / s`. A ray meets each of them twice, and more often
+/// where they are folded, and path tracers stop at the eighth transparent face. Three layers would
+/// say little more than two of the same number of triangles.
 const LAYERS: [f32; 2] = [2.0, 5.0];
 
-/// Softness `1 / s` from which on a vertex has layers, in pixels of the nearest camera, at least and
-/// at most: antialiasing shows the rest. It is the least for which all layers together have no more
-/// than [`MAX_SHARE`] of the mesh's triangles.
+/// Softness `1 / s` from which on a vertex has layers, in pixels of the nearest camera, at least
+/// and at most: antialiasing shows the rest. It is the least for which all layers together have no
+/// more than [`MAX_SHARE`] of the mesh's triangles.
 const SOFTNESS_PX: [f32; 2] = [0.85, 1.2];
 
 /// Softness beyond that from which on layers have their full distance and opacity, in pixels.

@@ -139,8 +139,8 @@ mod tests {
     use super::*;
     use glam::Vec3;
 
-    /// Returns `n` × `n` squares in a plane, two triangles each, pulled out to a bulb of this height in
-    /// the middle that is wider than its neck.
+    /// Returns `n` × `n` squares in a plane, two triangles each, pulled out to a bulb of this
+    /// height in the middle that is wider than its neck.
     fn bulb(n: u32, height: f32) -> Mesh {
         let at = |i: u32| Vec3::new((i % (n + 1)) as f32, (i / (n + 1)) as f32, 0.0);
         let middle = Vec3::new(n as f32, n as f32, 0.0) / 2.0;

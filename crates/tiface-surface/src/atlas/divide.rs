@@ -155,8 +155,8 @@ fn numbered(labels: impl Iterator<Item = u32>) -> Vec<u32> {
         .collect()
 }
 
-/// Returns the region of each triangle, numbered from 0: its `label`, or the neighbor that joined it
-/// because one had less than a share of the surface.
+/// Returns the region of each triangle, numbered from 0: its `label`, or the neighbor that joined
+/// it because one had less than a share of the surface.
 pub(super) fn joined(mesh: &Mesh, adjacent: &[[u32; 3]], mut label: Vec<u32>, min_share: f64) -> Vec<u32> {
     let regions = label.iter().max().map_or(0, |most| most + 1);
     let mut area = vec![0.0; regions as usize];

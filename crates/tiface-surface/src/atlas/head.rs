@@ -1,6 +1,6 @@
 //! A head divided where an artist cuts: the face one chart, seams behind the ears, at crown, nape
-//! and collar ([`regions`](super::regions)). Every chart begins as a disc without folds and is relaxed
-//! to its true sizes, so rough hair costs stretch, never more charts.
+//! and collar ([`regions`](super::regions)). Every chart begins as a disc without folds and is
+//! relaxed to its true sizes, so rough hair costs stretch, never more charts.
 
 use super::chart::{Flat, neighbors, stretch};
 use super::disc::embedded;
@@ -22,7 +22,8 @@ const EARS: [f32; 3] = [0.62, 0.52, 0.42];
 /// Mean area stretch that a face may have.
 const FACE_STRETCH: f64 = 1.08;
 
-/// Most steps of relaxing: at 300 the face of `lps` has a mean area stretch of 1.06, at 800 of 1.02.
+/// Most steps of relaxing: at 300 the face of `lps` has a mean area stretch of 1.06, at 800 of
+/// 1.02.
 const RELAXING: usize = 800;
 
 /// Times that a region that is no disc is halved.

@@ -147,8 +147,8 @@ fn draw(
     outlines.par_iter().zip(stands).map(one).collect()
 }
 
-/// Returns the smallest side found at which everything fits, of `least` at least, from `start` on, of
-/// `max_side` at most; `order` becomes the one that did it.
+/// Returns the smallest side found at which everything fits, of `least` at least, from `start` on,
+/// of `max_side` at most; `order` becomes the one that did it.
 fn smallest(
     drawn: &[Vec<TurnedMask>],
     order: &mut Vec<usize>,

@@ -10,8 +10,8 @@
 //!    ----- collar -----       cap       what closes the shoulders from below
 //! ```
 //!
-//! All lines are drawn on a smooth copy, so that curls and folds do not make them ragged, and a part
-//! is one piece: crumbs join the neighbor that they share the longest border with.
+//! All lines are drawn on a smooth copy, so that curls and folds do not make them ragged, and a
+//! part is one piece: crumbs join the neighbor that they share the longest border with.
 
 use super::chart::straighten;
 use super::divide::{components, joined};
@@ -122,9 +122,9 @@ impl<'a> Head<'a> {
         head
     }
 
-    /// Returns the angle about the up direction, counter-clockwise from the assumed front, of the plane
-    /// in which the head mirrors itself best: cameras may stand more to one side. 0 where no other
-    /// plane is clearly better.
+    /// Returns the angle about the up direction, counter-clockwise from the assumed front, of the
+    /// plane in which the head mirrors itself best: cameras may stand more to one side. 0 where no
+    /// other plane is clearly better.
     fn turn_to_symmetry(&self) -> f32 {
         let heights = [self.neck.unwrap_or(self.collar), self.ends[1]];
         let Some([z0, x0]) = self.mean(1, heights).zip(self.mean(2, heights)).map(<[f32; 2]>::from) else {
@@ -323,7 +323,8 @@ mod tests {
         assert_eq!(is_face, [true, true, true, false, false, false, false, true]);
     }
 
-    /// Returns a tube around the y axis with these radii, one a unit of height, closed by its poles.
+    /// Returns a tube around the y axis with these radii, one a unit of height, closed by its
+    /// poles.
     fn vase(radii: &[f32]) -> Mesh {
         let around = 32u32;
         let rows = radii.len() as u32;

@@ -45,8 +45,8 @@ pub(super) fn relax(mesh: &Mesh, flat: &mut Flat, rounds: usize) {
     for (&t, &corners) in flat.triangles.iter().zip(&flat.corners) {
         let [a, b, c] = mesh.corners(t).map(|p| p.as_dvec3());
         let (u, v) = (b - a, c - a);
-        // a triangle that is a line would have endless energy, and none of its own in the texture: it
-        // becomes as high as a hundredth of its length
+        // a triangle that is a line would have endless energy, and none of its own in the texture:
+        // it becomes as high as a hundredth of its length
         let area = (0.5 * u.cross(v).length()).max(THINNEST * u.length_squared().max(v.length_squared()));
         whole += area;
         let half = 0.5 / area;
@@ -176,8 +176,8 @@ fn dot(a: &[DVec2], b: &[DVec2]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a.dot(*b)).sum()
 }
 
-/// Returns the points along `step` where the energy, which is `now` with this `slope`, falls enough,
-/// their slope and energy; `None` if none is found.
+/// Returns the points along `step` where the energy, which is `now` with this `slope`, falls
+/// enough, their slope and energy; `None` if none is found.
 fn searched(
     rest: &[RestTriangle],
     points: &[DVec2],

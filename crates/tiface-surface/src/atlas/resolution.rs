@@ -1,8 +1,8 @@
 //! How many texels each chart gets: by what it shows, and never finer than the photographs.
 //!
-//! With `k` texels along a unit of the face, a part of fineness `f` has `k f`. Where the photographs
-//! resolve no more than that on the face, hair takes what is left, up to what they resolve there; a
-//! garment never does, and the face keeps its share.
+//! With `k` texels along a unit of the face, a part of fineness `f` has `k f`. Where the
+//! photographs resolve no more than that on the face, hair takes what is left, up to what they
+//! resolve there; a garment never does, and the face keeps its share.
 
 use super::chart::Flat;
 use super::head::HeadChart;
@@ -138,8 +138,8 @@ mod tests {
         HeadChart { flat: Flat { triangles: vec![triangle], corners: vec![[0, 1, 2]], points }, part }
     }
 
-    /// Returns the texels along a unit of a face, a scalp and a cap of one size after they were shared
-    /// out.
+    /// Returns the texels along a unit of a face, a scalp and a cap of one size after they were
+    /// shared out.
     fn shared(resolved: Option<&[f32]>) -> ([f64; 3], Shares) {
         let mut charts = vec![chart(0, Part::Face), chart(1, Part::Left), chart(2, Part::Cap)];
         // (1 + 0.65² + 0.12²) / 2: 100 texels along a unit of the face

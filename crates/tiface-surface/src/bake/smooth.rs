@@ -1,8 +1,8 @@
 //! Smooth colors all over a surface, from those vertices whose color is trusted.
 //!
-//! A vertex is of each material by a share. Where the color is trusted, it says which one; elsewhere
-//! shares follow the neighbors, and a little what the network guesses (Grady 2006, "Random walks
-//! for image segmentation", with priors). Each material then has a color everywhere:
+//! A vertex is of each material by a share. Where the color is trusted, it says which one;
+//! elsewhere shares follow the neighbors, and a little what the network guesses (Grady 2006,
+//! "Random walks for image segmentation", with priors). Each material then has a color everywhere:
 //!
 //! ```text
 //! min_c  Σ_v t_v s_v² ‖c_v − own_v‖² + μ Σ_{v ~ w} ‖c_v − c_w‖²

@@ -165,8 +165,8 @@ mod tests {
         }
         mesh.seen_by = seen.cameras;
         let shares = seen_shares(&mesh);
-        // from 10 radii a point at the angle a from the axis is seen at a + atan(sin a / (10 − cos a)),
-        // so up to 69.4°: (1 − cos 69.4°) / 2
+        // from 10 radii a point at the angle a from the axis is seen at a + atan(sin a / (10 − cos
+        // a)), so up to 69.4°: (1 − cos 69.4°) / 2
         assert!((shares[2] - 0.325).abs() < 0.03 && shares[1] == 0.0 && shares[3] == 0.0, "{shares:?}");
         assert!((shares.iter().sum::<f64>() - 1.0).abs() < 1e-9);
         mesh.seen_by.clear();

@@ -102,8 +102,8 @@ impl Cap {
         on_cap.for_each(|(p, color)| *color = self.color(*p));
     }
 
-    /// Moves vertices beyond the box onto its faces: simplification pushes the edge of a cut out, to
-    /// make up for the chords of its triangles, and a cut is flat.
+    /// Moves vertices beyond the box onto its faces: simplification pushes the edge of a cut out,
+    /// to make up for the chords of its triangles, and a cut is flat.
     pub fn flatten(&self, mesh: &mut Mesh) {
         mesh.positions.iter_mut().for_each(|p| *p = p.clamp(self.bounds.min, self.bounds.max));
     }

@@ -23,8 +23,8 @@ pub(super) fn weld_map(mesh: &Mesh) -> (Vec<u32>, Vec<Vec3>) {
 /// Returns the mesh with equal positions merged, where −0 equals 0. Triangles keep their number and
 /// order, so an atlas stays parallel to them; degenerate ones are kept too.
 ///
-/// A merged vertex has the color and the number of cameras of its first copy, and their common normal; copies that disagree,
-/// as on creases, get the unit of their sum.
+/// A merged vertex has the color and the number of cameras of its first copy, and their common
+/// normal; copies that disagree, as on creases, get the unit of their sum.
 pub fn weld(mesh: &Mesh) -> Mesh {
     let (new, positions) = weld_map(mesh);
     let mut creased = vec![false; positions.len()];
