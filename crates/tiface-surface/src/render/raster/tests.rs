@@ -171,14 +171,15 @@ fn layers_are_blended_as_the_ray_caster_blends_them() {
     let bare = raster(&mesh, None, &camera, &options, color);
     let seen = raster(&mesh, Some(&layers), &camera, &options, color);
     let bvh = Bvh::new(&mesh);
-    let cast = raycast(&bvh, &mesh, Some(&caster), &camera, &RaycastOptions::default(), color);
+    // fine rays: a layer's outline is no edge of the mesh, where the caster adds some
+    let fine = RaycastOptions { samples: 4, ..RaycastOptions::default() };
+    let cast = raycast(&bvh, &mesh, Some(&caster), &camera, &fine, color);
     let psnr = |a: &Image, b: &Image| {
         let error: f64 = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
         -10.0 * (error / a.data.len() as f64).log10()
     };
     let (with, without) = (psnr(&seen.view.color, &cast.color), psnr(&bare.view.color, &cast.color));
-    // both sides of three layers begin and end in pixels of the outline
-    assert!(with > 41.0 && without < with - 10.0, "{with:.1} {without:.1}");
+    assert!(with > 43.0 && without < with - 10.0, "{with:.1} {without:.1}");
     // depth, normals and triangles are the mesh's, and no sample has more than all of its light
     assert!(seen.view.depth == bare.view.depth && seen.triangles == bare.triangles);
     assert!(seen.view.color.channel(3).iter().all(|a| *a <= 1.0 + 1e-5));
