@@ -8,8 +8,9 @@
 //! min_c  Σ_v t_v s_v² ‖c_v − own_v‖² + μ Σ_{v ~ w} ‖c_v − c_w‖²
 //! ```
 //!
-//! with trust `t` and share `s`. So what nobody saw is never brighter or darker than what was seen
-//! of its material, and a lamp that the network took for hair is no color of anything.
+//! with trust `t` and share `s`, if that is the larger part. So what nobody saw is never brighter
+//! or darker than what was seen of its material, and a lamp that the network took for hair is no
+//! color of anything.
 
 use super::materials::Materials;
 use crate::appearance::Nodes;
@@ -26,6 +27,9 @@ const GUESS: f32 = 0.1;
 
 /// Length over which trusted colors are smoothed, relative to the longest side.
 const LENGTH: f32 = 0.015;
+
+/// Share of a material from which on a vertex tells its color.
+const MAJORITY: f32 = 0.5;
 
 /// Power of the shares by which materials mix at a point: their border is a line.
 const SHARPNESS: i32 = 8;
@@ -81,7 +85,9 @@ impl SmoothColors<'_> {
         let smoothness = f64::from(LENGTH * side / edge).powi(2);
         let channel = |i: usize| {
             let (shares, c) = (&shares[i / 3], i % 3);
-            let weight = |(t, s): (&f32, &f32)| f64::from(*t) * f64::from(*s).powi(2);
+            // a little of many vertices of another material would tint all that is far from its own
+            let own_share = |s: f32| if s > MAJORITY { f64::from(s).powi(2) } else { 0.0 };
+            let weight = |(t, s): (&f32, &f32)| f64::from(*t) * own_share(*s);
             let weights: Vec<f64> = trust.iter().zip(shares).map(weight).collect();
             let values: Vec<f64> = own.iter().map(|own| f64::from(own[c])).collect();
             membrane(nodes, &weights, &values, smoothness)
