@@ -87,9 +87,9 @@ impl Finish<'_> {
             let guess = mesh.colors.clone();
             let fitted = self.fit_colors(&mut mesh, shells.as_ref(), Colors::Vertices, &fit, &mut log)?;
             if fitted.is_some() {
-                complete_unseen_vertices(&mut mesh, &seen.trust, &guess);
+                complete_unseen_vertices(&mut mesh, &seen, &guess);
             }
-            (None, fitted.and_then(|fitted| fitted.harmonics).map(|h| faded(h, &seen.trust)), None)
+            (None, fitted.and_then(|fitted| fitted.harmonics).map(|h| faded(h, &seen.glimpse)), None)
         } else {
             let layout = self.unwrap(&mesh, &mut log)?;
             let (mut baked, harmonics) =
@@ -224,7 +224,7 @@ impl Finish<'_> {
         let fitted_texture = FittedTexture {
             mesh: &mut *mesh,
             atlas: layout,
-            trust: &seen.trust,
+            seen,
             guess: &guess,
             image: &mut image,
             known: &mut known,
@@ -237,7 +237,7 @@ impl Finish<'_> {
         }
         image.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
         baked.color = image;
-        Ok((baked, fitted.harmonics.map(|h| faded(h, &seen.trust))))
+        Ok((baked, fitted.harmonics.map(|h| faded(h, &seen.glimpse))))
     }
 
     /// Returns the pictures of a texture, coded as in files. Harmonics that were fitted replace

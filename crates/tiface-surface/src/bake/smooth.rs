@@ -13,7 +13,9 @@
 //! color of anything.
 
 use super::materials::Materials;
+use super::trust::{ROUNDS as TRUST_ROUNDS, Seen, smoothed};
 use crate::appearance::Nodes;
+use glam::Vec3;
 use rayon::prelude::*;
 use tiface_base::geom::{Hit, Mesh};
 use tiface_base::math::cg::{conjugate_gradients, dot};
@@ -36,6 +38,10 @@ const SHARPNESS: i32 = 8;
 
 /// Trust from which on a color tells materials apart.
 pub const TRUSTED: f32 = 0.9;
+
+/// Distances from the smooth color, in their mean of trusted vertices of the material, between
+/// which what was only glimpsed agrees no longer: it may be a lamp.
+const AGREES: [f32; 2] = [2.0, 3.0];
 
 /// Most rounds of conjugate gradients, and the sum of squares at which they end, of that at their
 /// start.
@@ -114,16 +120,47 @@ impl SmoothColors<'_> {
 
     /// Returns the smooth color of a point.
     pub fn at(&self, hit: &Hit) -> [f32; 3] {
-        let corners = self.triangles[hit.triangle as usize];
+        let corners = self.triangles[hit.triangle as usize].map(|v| v as usize);
+        let color = |k: usize| hit.mix(corners.map(|v| Vec3::from(self.colors[k][v]))).to_array();
+        self.mixed(|k| hit.mix(corners.map(|v| self.shares[k][v])), color)
+    }
+
+    /// Returns the mixture of the materials' colors at a point, by their shares there.
+    fn mixed(&self, share: impl Fn(usize) -> f32, color: impl Fn(usize) -> [f32; 3]) -> [f32; 3] {
         let (mut sum, mut total) = ([0f32; 3], 0f32);
-        for (shares, colors) in self.shares.iter().zip(&self.colors) {
-            let weight = hit.mix(corners.map(|v| shares[v as usize])).powi(SHARPNESS);
+        for k in 0..self.materials() {
+            let weight = share(k).powi(SHARPNESS);
             total += weight;
-            for (k, sum) in sum.iter_mut().enumerate() {
-                *sum += weight * hit.mix(corners.map(|v| colors[v as usize][k]));
-            }
+            sum.iter_mut().zip(color(k)).for_each(|(sum, c)| *sum += weight * c);
         }
         sum.map(|s| s / total.max(f32::MIN_POSITIVE))
+    }
+
+    /// Returns the trust in vertices, `own` color given, with that in what was glimpsed, as far as
+    /// it agrees with the smooth color.
+    pub fn confirmed(&self, nodes: &Nodes, seen: &Seen, own: &[[f32; 3]]) -> Vec<f32> {
+        let materials = self.of_vertices();
+        let apart = |v: usize| {
+            let plain = self.mixed(|k| self.shares[k][v], |k| self.colors[k][v]);
+            plain.iter().zip(own[v]).map(|(a, b)| (a - b).powi(2)).sum::<f32>()
+        };
+        let squares: Vec<f32> = (0..own.len()).map(apart).collect();
+        let mut sums = vec![(0f64, 0usize); self.materials()];
+        for (v, square) in squares.iter().enumerate().filter(|(v, _)| seen.trust[*v] > TRUSTED) {
+            let (sum, count) = &mut sums[materials[v].0];
+            (*sum, *count) = (*sum + f64::from(*square), *count + 1);
+        }
+        let agrees = |v: usize| {
+            let (sum, count) = sums[materials[v].0];
+            let mean = (sum / count.max(1) as f64).sqrt().max(1e-6) as f32;
+            ((AGREES[1] - squares[v].sqrt() / mean) / (AGREES[1] - AGREES[0])).clamp(0.0, 1.0)
+        };
+        let agrees: Vec<f32> = (0..own.len()).map(agrees).collect();
+        // a lamp is wider than what is too bright of it
+        let around = |v: usize| nodes.near(v).iter().map(|&n| agrees[n as usize]).fold(agrees[v], f32::min);
+        let agrees = smoothed(nodes, (0..own.len()).map(around).collect(), TRUST_ROUNDS);
+        let glimpsed = seen.trust.iter().zip(&seen.glimpse).zip(agrees);
+        glimpsed.map(|((trust, glimpse), agrees)| trust + (glimpse - trust).max(0.0) * agrees).collect()
     }
 
     /// Returns the material that each vertex is of by the largest share, and that share.

@@ -3,7 +3,8 @@
 //! A camera tells the more of a point the more directly it looks: seen at an angle, a pixel covers
 //! more of the surface, an error of the surface moves it farther, and in front of lamps light comes
 //! through hair. Each camera counts with the fourth power of the cosine between its line of sight
-//! and the normal; trust goes from 0 to 1 between two sums of these.
+//! and the normal; trust goes from 0 to 1 between two sums of these. Smaller sums are a glimpse: it
+//! is trusted, too, where it agrees with what is certain of its material (`smooth`).
 
 use super::cover::Bands;
 use super::fill::fill;
@@ -17,9 +18,12 @@ use tiface_base::image::{Gray, Image};
 /// five at 68.
 const TRUST: [f32; 2] = [0.02, 0.1];
 
+/// The same of a glimpse: one camera at 75 degrees, and one at 65.
+const GLIMPSE: [f32; 2] = [0.005, 0.03];
+
 /// Rounds in which trust is smoothed over neighboring vertices: normals are rough, and trust must
 /// not come and go from vertex to vertex.
-const ROUNDS: usize = 2;
+pub(super) const ROUNDS: usize = 2;
 
 /// What the cameras have seen of the vertices of a mesh.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -29,6 +33,8 @@ pub struct Seen {
     pub cameras: Vec<u8>,
     /// Trust in each vertex's color, 0..=1.
     pub trust: Vec<f32>,
+    /// The same if its color agrees with others of its material; not less.
+    pub glimpse: Vec<f32>,
 }
 
 impl Seen {
@@ -59,21 +65,27 @@ impl Seen {
         let found: Vec<(u8, f32)> =
             (0..mesh.positions.len()).into_par_iter().with_min_len(256).map(one).collect();
         let (cameras, sums): (Vec<u8>, Vec<f32>) = found.into_iter().unzip();
-        Seen { cameras, trust: trust(&Nodes::vertices(mesh), sums) }
+        let sums = smoothed(&Nodes::vertices(mesh), sums, ROUNDS);
+        Seen { cameras, trust: ramp(&sums, TRUST), glimpse: ramp(&sums, GLIMPSE) }
     }
 }
 
-/// Returns the trust that sums of cos⁴ at vertices earn.
-fn trust(nodes: &Nodes, mut sums: Vec<f32>) -> Vec<f32> {
-    for _ in 0..ROUNDS {
+/// Returns values at vertices, each mixed with those of its neighbors in some rounds.
+pub(super) fn smoothed(nodes: &Nodes, mut values: Vec<f32>, rounds: usize) -> Vec<f32> {
+    for _ in 0..rounds {
         let mean = |v: usize| {
             let near = nodes.near(v);
-            (sums[v] + near.iter().map(|&n| sums[n as usize]).sum::<f32>()) / (near.len() + 1) as f32
+            (values[v] + near.iter().map(|&n| values[n as usize]).sum::<f32>()) / (near.len() + 1) as f32
         };
-        sums = (0..sums.len()).map(mean).collect();
+        values = (0..values.len()).map(mean).collect();
     }
-    let ramp = |sum: f32| ((sum - TRUST[0]) / (TRUST[1] - TRUST[0])).clamp(0.0, 1.0);
-    sums.into_iter().map(ramp).map(|t| t * t * (3.0 - 2.0 * t)).collect()
+    values
+}
+
+/// Returns values as 0 below a range, 1 above it, and smoothly between.
+fn ramp(values: &[f32], [low, high]: [f32; 2]) -> Vec<f32> {
+    let share = |value: &f32| ((value - low) / (high - low)).clamp(0.0, 1.0);
+    values.iter().map(share).map(|t| t * t * (3.0 - 2.0 * t)).collect()
 }
 
 /// Returns the shares of a mesh's area that 0, 1, 2, and 3 or more cameras see; a corner of a
@@ -162,6 +174,7 @@ mod tests {
             // 2 · 0.75⁴ = 0.63 is enough, 2 · 0.2⁴ = 0.003 is not
             assert!(cosine < 0.75 || seen.trust[v] == 1.0, "{p} {}", seen.trust[v]);
             assert!(cosine > 0.1 || seen.trust[v] == 0.0, "{p} {}", seen.trust[v]);
+            assert!(seen.glimpse[v] >= seen.trust[v], "{p}");
         }
         mesh.seen_by = seen.cameras;
         let shares = seen_shares(&mesh);

@@ -9,6 +9,7 @@
 use super::cover::{Bands, Sample};
 use super::grain::Grain;
 use super::smooth::SmoothColors;
+use super::trust::Seen;
 use crate::appearance::Nodes;
 use glam::Vec3;
 use serde::Serialize;
@@ -99,8 +100,8 @@ pub struct FittedTexture<'a> {
     pub mesh: &'a mut Mesh,
     /// Its atlas.
     pub atlas: &'a Atlas,
-    /// Trust in the vertices' colors, `[vertices]`, 0..=1.
-    pub trust: &'a [f32],
+    /// What cameras have seen of the vertices.
+    pub seen: &'a Seen,
     /// The picture before the fit, sRGB-coded.
     pub guess: &'a Image,
     /// The picture, sRGB-coded.
@@ -116,7 +117,7 @@ impl FittedTexture<'_> {
     /// where nothing is trusted. Texels that no triangle covers are no longer known beside a texel
     /// that was changed: they repeat it.
     pub fn complete_unseen(self) -> Option<TexelTrust> {
-        let FittedTexture { mesh, atlas, trust, guess, image, known, calm } = self;
+        let FittedTexture { mesh, atlas, seen, guess, image, known, calm } = self;
         let nodes = Nodes::vertices(mesh);
         let bands = Bands::new(atlas, 1);
         let all: Vec<Sample> = (0..bands.len())
@@ -125,21 +126,26 @@ impl FittedTexture<'_> {
                 samples.chunk_by(|a, b| a.texel == b.texel).map(|s| s[0]).collect::<Vec<_>>()
             })
             .collect();
-        let trust_at =
-            |s: &Sample| s.hit().mix(mesh.triangles[s.triangle as usize].map(|v| trust[v as usize]));
+        let at = |s: &Sample, trust: &[f32]| {
+            s.hit().mix(mesh.triangles[s.triangle as usize].map(|v| trust[v as usize]))
+        };
+        let sure = |s: &Sample| at(s, &seen.trust);
         let (guesses, _) = at_vertices(mesh, &all, guess, |_| 1.0);
-        let (own, evidence) = at_vertices(mesh, &all, image, trust_at);
+        let (own, evidence) = at_vertices(mesh, &all, image, sure);
         // a vertex without a trusted texel has no color that could be trusted
-        let trust_of: Vec<f32> =
-            trust.iter().zip(&evidence).map(|(t, e)| if *e > 1e-3 { *t } else { 0.0 }).collect();
-        let smooth = SmoothColors::new(mesh, &nodes, &trust_of, &own, &guesses)?;
+        let some = |(trust, evidence): (&f32, &f32)| if *evidence > 1e-3 { *trust } else { 0.0 };
+        let certain: Vec<f32> = seen.trust.iter().zip(&evidence).map(some).collect();
+        let smooth = SmoothColors::new(mesh, &nodes, &certain, &own, &guesses)?;
+        let (shown, _) = at_vertices(mesh, &all, image, |_| 1.0);
+        let trust = smooth.confirmed(&nodes, seen, &shown);
+        let trust_at = |s: &Sample| at(s, &trust);
         let open: Vec<Sample> = all.iter().filter(|s| trust_at(s) < FULL).copied().collect();
         let grain =
-            Grain { mesh, atlas, nodes: &nodes, trust: &trust_of, smooth: &smooth, image: &*image, calm };
+            Grain { mesh, atlas, nodes: &nodes, trust: &certain, smooth: &smooth, image: &*image, calm };
         let grain = grain.of(&open);
         let material = |s: &Sample| (s.texel, smooth.material_at(&s.hit()).0 as u8);
         let texels = TexelTrust {
-            trusted: all.iter().filter(|s| trust_at(s) >= FULL).map(material).collect(),
+            trusted: all.iter().filter(|s| sure(s) >= FULL).map(material).collect(),
             unseen: open.iter().filter(|s| trust_at(s) < UNSEEN).map(material).collect(),
             texels: all.len(),
             materials: smooth.materials(),
@@ -156,21 +162,18 @@ impl FittedTexture<'_> {
             image.data[at..at + 3].copy_from_slice(&limited);
         }
         repeat_beside(&all, &open, known, atlas.width as usize);
-        let colors = vertex_colors(mesh, trust, &smooth);
+        let colors = vertex_colors(mesh, &trust, &smooth);
         mesh.colors = colors;
         Some(texels)
     }
 }
 
 /// Gives vertices with colors, but without trust, the color of their material.
-pub fn complete_unseen_vertices(mesh: &mut Mesh, trust: &[f32], guess: &[[f32; 3]]) {
+pub fn complete_unseen_vertices(mesh: &mut Mesh, seen: &Seen, guess: &[[f32; 3]]) {
     let nodes = Nodes::vertices(mesh);
     let own = mesh.colors.clone();
-    let Some(colors) =
-        SmoothColors::new(mesh, &nodes, trust, &own, guess).map(|s| vertex_colors(mesh, trust, &s))
-    else {
-        return;
-    };
+    let Some(smooth) = SmoothColors::new(mesh, &nodes, &seen.trust, &own, guess) else { return };
+    let colors = vertex_colors(mesh, &smooth.confirmed(&nodes, seen, &own), &smooth);
     mesh.colors = colors;
 }
 
@@ -256,7 +259,7 @@ mod tests {
     struct Scene {
         mesh: Mesh,
         atlas: Atlas,
-        trust: Vec<f32>,
+        seen: Seen,
         guess: Image,
         image: Image,
         known: Vec<bool>,
@@ -272,7 +275,8 @@ mod tests {
     fn scene() -> Scene {
         let HeadMesh { mesh, texture, .. } = ball();
         let atlas = texture.unwrap().atlas;
-        let trust = mesh.positions.iter().map(|p| ((6.0 - p.x) / 2.0).clamp(0.0, 1.0)).collect();
+        let trust: Vec<f32> = mesh.positions.iter().map(|p| ((6.0 - p.x) / 2.0).clamp(0.0, 1.0)).collect();
+        let seen = Seen { cameras: Vec::new(), glimpse: trust.clone(), trust };
         let (w, h) = (atlas.width, atlas.height);
         let (mut image, mut guess) = (Image::new(w, h, 3), Image::new(w, h, 3));
         let (mut known, mut places) = (vec![false; (w * h) as usize], Vec::new());
@@ -290,7 +294,7 @@ mod tests {
         // a look-up at the border of a chart must not meet black
         fill(&mut image, &known, 4);
         fill(&mut guess, &known, 4);
-        Scene { mesh, atlas, trust, guess, image, known, places }
+        Scene { mesh, atlas, seen, guess, image, known, places }
     }
 
     #[test]
@@ -300,7 +304,7 @@ mod tests {
         let fitted = FittedTexture {
             mesh: &mut s.mesh,
             atlas: &s.atlas,
-            trust: &s.trust,
+            seen: &s.seen,
             guess: &s.guess,
             image: &mut s.image,
             known: &mut s.known,
@@ -338,12 +342,12 @@ mod tests {
     fn a_calm_place_has_no_grain_and_without_trust_nothing_changes() {
         let mut s = scene();
         let before = s.image.clone();
-        let trust = s.trust.clone();
-        let complete = |s: &mut Scene, trust: &[f32]| {
+        let seen = s.seen.clone();
+        let complete = |s: &mut Scene, seen: &Seen| {
             let fitted = FittedTexture {
                 mesh: &mut s.mesh,
                 atlas: &s.atlas,
-                trust,
+                seen,
                 guess: &s.guess,
                 image: &mut s.image,
                 known: &mut s.known,
@@ -351,13 +355,45 @@ mod tests {
             };
             fitted.complete_unseen().is_some()
         };
-        assert!(!complete(&mut s, &vec![0.0; trust.len()]));
+        let none = vec![0.0; seen.trust.len()];
+        assert!(!complete(&mut s, &Seen { trust: none.clone(), glimpse: none, ..Seen::default() }));
         assert_eq!(s.image, before);
-        assert!(complete(&mut s, &trust));
+        assert!(complete(&mut s, &seen));
         for &(texel, p) in s.places.iter().filter(|(_, p)| p.x > 8.0 && p.y < -3.0) {
             let found = texel_of(&s.image, texel);
             assert!((0..3).all(|k| (found[k] - CLOTH[k]).abs() < 0.03), "{p} {found:?}");
         }
+    }
+
+    #[test]
+    fn what_was_glimpsed_stays_unless_it_is_a_lamp() {
+        let mut s = scene();
+        // all of it was glimpsed; the fit shows the lamp
+        s.seen.glimpse.fill(1.0);
+        let before = s.image.clone();
+        let fitted = FittedTexture {
+            mesh: &mut s.mesh,
+            atlas: &s.atlas,
+            seen: &s.seen,
+            guess: &s.guess,
+            image: &mut s.image,
+            known: &mut s.known,
+            calm: &|_| false,
+        };
+        assert!(fitted.complete_unseen().is_some());
+        let mut kept = Vec::new();
+        for &(texel, p) in s.places.iter().filter(|(_, p)| p.x > 7.0 && p.y.abs() > 3.0) {
+            let (found, was) = (texel_of(&s.image, texel), texel_of(&before, texel));
+            let away = p.distance(Vec3::new(11.0, -5.0, 0.0));
+            if away < 0.5 {
+                assert!(found[0] < 0.4, "{p} {found:?}");
+            } else if away > 6.0 {
+                kept.push((0..3).all(|k| (found[k] - was[k]).abs() < 1e-3));
+            }
+        }
+        // but where stripes happen to be all light or all dark around a vertex
+        let count = kept.iter().filter(|kept| **kept).count();
+        assert!(10 * count > 8 * kept.len(), "{count} of {}", kept.len());
     }
 
     #[test]
