@@ -243,54 +243,22 @@ fn a_network_masks_all_views_without_a_click() {
 /// The clicked views of the light stage.
 const CLICKED: [&str; 3] = ["010", "013", "015"];
 
-/// Copies every so-manyth training view of the light stage, and the clicked ones, into a folder.
-fn thinned(root: &Path, every: usize, folder: &Path) {
-    let mut value = io::read_json(&root.join("transforms.json"), &Limits::default()).unwrap();
-    let frames = value["frames"].as_array_mut().unwrap();
-    frames.retain(|frame| frame["split"] == "train");
-    let is_clicked = |file: &str| CLICKED.iter().any(|name| file.contains(name));
-    let mut number = 0;
-    frames.retain(|frame| {
-        number += 1;
-        number % every == 1 || is_clicked(frame["file_path"].as_str().unwrap())
-    });
-    for key in ["file_path", "mask_path", "face_mask_path"] {
-        for file in frames.iter().map(|frame| frame[key].as_str().unwrap()) {
-            io::create_folder(folder.join(file).parent().unwrap()).unwrap();
-            std::fs::copy(root.join(file), folder.join(file)).unwrap();
-        }
-    }
-    std::fs::write(folder.join("transforms.json"), value.to_string()).unwrap();
-    std::fs::copy(root.join("prompts.json"), folder.join("prompts.json")).unwrap();
-}
-
-/// Masks every so-manyth view of a capture of a light stage from the clicks that come with it, once
-/// for each band around the cut, and holds the masks against its true ones: so much are their mean
-/// and least overlap. Returns the squared errors of the alphas of clicked views.
-fn masked_light_stage(
-    every: usize,
-    downscale: u32,
-    bands: &[f32],
-    [mean_least, worst_least]: [f64; 2],
-) -> Vec<f64> {
+/// Masks a capture of a light stage from the clicks that come with it, once for each band around the
+/// cut, and holds the masks against its true ones: so much are their mean and least overlap. Returns
+/// the squared errors of the alphas of clicked views.
+fn masked_light_stage(bands: &[f32], [mean_least, worst_least]: [f64; 2]) -> Vec<f64> {
     let shared =
         std::env::var("TIFACE_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());
-    let mut root = Path::new(&shared).join("data/captures/lps");
+    let root = Path::new(&shared).join("data/captures/lps");
     if !root.is_dir() {
         eprintln!("skipped: masks of `lps` from clicks, it is not at {}", root.display());
         return Vec::new();
     }
-    let few = tempfile::tempdir().unwrap();
-    if every > 1 {
-        thinned(&root, every, few.path());
-        root = few.path().into();
-    }
     let dir = tempfile::tempdir().unwrap();
-    let truth = capture::open(&root, &CaptureOptions { downscale, ..CaptureOptions::default() }).unwrap();
+    let truth = capture::open(&root, &CaptureOptions::default()).unwrap();
     let mut errors = Vec::new();
     for &band in bands {
         let mut config = draft(&root);
-        config.capture.downscale = downscale;
         config.mask.prompts = root.join("prompts.json").to_str().unwrap().into();
         config.mask.band = band;
         let run = run(dir.path(), &band.to_string());
@@ -315,22 +283,16 @@ fn masked_light_stage(
         let mean = overlap.iter().sum::<f64>() / overlap.len() as f64;
         let worst = overlap.iter().copied().fold(1.0, f64::min);
         eprintln!("lps, band {band}: IoU {mean:.4}, worst {worst:.4}, squared error {error:.0}");
-        assert!(overlap.len() >= 24 / every && mean > mean_least && worst > worst_least, "{mean} {worst}");
+        assert!(overlap.len() == 24 && mean > mean_least && worst > worst_least, "{mean} {worst}");
         errors.push(error);
     }
     errors
 }
 
 #[test]
-fn three_clicked_photographs_of_a_light_stage_mask_every_third() {
-    // a pixel of outline is twice as much of a photograph of half the size
-    masked_light_stage(3, 2, &[0.023], [0.97, 0.95]);
-}
-
-#[test]
 #[ignore = "long: run by `tools/test.sh all`; masks 32 photographs twice at their full size"]
 fn three_clicked_photographs_mask_all_at_full_size_and_matting_takes_four_tenths_of_the_error() {
-    if let [soft, hard] = masked_light_stage(1, 1, &[0.023, 0.0], [0.979, 0.965])[..] {
+    if let [soft, hard] = masked_light_stage(&[0.023, 0.0], [0.979, 0.965])[..] {
         assert!(soft < 0.6 * hard, "{soft} {hard}");
     }
 }
