@@ -111,7 +111,7 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
             let renderer = match c.shows_residuals(&c.method) {
                 true => {
                     let leaves_out_own = session.path.is_none();
-                    renderer.with_residuals(session.refined_capture()?, &scene, config, leaves_out_own)?
+                    renderer.with_photographs(session.refined_capture()?, &scene, config, leaves_out_own)?
                 }
                 false => renderer,
             };

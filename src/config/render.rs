@@ -114,8 +114,9 @@ table! {
         orbit_views: u32, 1.0..=10_000.0 [Path if |c| c.render.cameras == "orbit"] => 36;
         /// Rays along each side of a pixel of the mesh; twice as many at its edges.
         samples: u32, 1.0..=8.0 [Views] => 2;
-        /// Add to views of raycast what the mesh misses of the nearest training photographs, which
-        /// must be there: true or false. No exported file has it.
+        /// Show views of raycast as photographs are: add what the mesh misses of the nearest
+        /// training photographs, which must be there, and filter pixels as they do: true or false.
+        /// No exported file has it.
         residuals: bool [Views if |c| c.render.method.contains(&Method::Raycast)] => true, true, false;
         /// Picture format: png (8-bit sRGB) or exr (float, with depth and normals).
         #[flag("format", Text("FORMAT"), ["render"], "Picture format: png or exr")]

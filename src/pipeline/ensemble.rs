@@ -13,12 +13,12 @@ use super::surface::Fields;
 use super::{learn, pictures};
 use crate::capture::scene::Scene;
 use crate::capture::{Capture, MaskMeaning, View, ViewMask};
-use crate::config::{Config, EnsembleConfig, MaskUse, Method, ViewBackground, display_name, key};
+use crate::config::{Config, EnsembleConfig, MaskUse, Method, display_name, key};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::run::{Run, StageDir};
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant};
-use tiface_base::image::{Gray, INSIDE, Image, Photo};
+use tiface_base::image::{Gray, Image, Photo};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
 use tiface_surface::render::RenderedView;
@@ -40,7 +40,7 @@ pub(super) fn ensemble(
             let meshes = Meshes::load(run, config, &c.members)?;
             let renderer = Renderer::new(scene, fields, &meshes, render.samples, dir.monitor());
             let renderer = match render.shows_residuals(&c.members) {
-                true => renderer.with_residuals(capture, scene, config, true)?,
+                true => renderer.with_photographs(capture, scene, config, true)?,
                 false => renderer,
             };
             fit(capture, config, scene, &renderer, dir)?
@@ -209,7 +209,7 @@ fn fit(
     }
     let mut sums = Vec::new();
     for (view, tiles) in learn::held_out_tiles(capture, config) {
-        let (photo, weight) = target(view)?;
+        let (photo, weight) = pictures::target(&view.load(&Limits::default())?);
         let camera = view.camera.transformed(&scene.scene_from_world);
         let mut sum = Fit::new(c.members.len())?;
         for tile in tiles {
@@ -247,17 +247,6 @@ fn fit(
     dir.note(&format!("fitted weights: {}", shares.join(", ")));
     let record = json!({"pixels": all.pixels(), "psnr": all.psnr(&weights)?, "psnr_alone": alone});
     Ok((weights, record))
-}
-
-/// Returns the photograph that the members are compared with, and where it counts.
-fn target(view: &View) -> Result<(Photo, Gray)> {
-    let loaded = view.load(&Limits::default())?;
-    let photo = pictures::expected(&loaded.photo, loaded.mask.as_ref(), ViewBackground::None);
-    let (width, height) = (photo.width, photo.height);
-    let inside = |of: &Option<Gray>, i: usize| of.as_ref().is_none_or(|m| m.values[i] >= INSIDE);
-    let counts = |i: usize| if inside(&loaded.mask, i) && inside(&loaded.valid, i) { 255 } else { 0 };
-    let values = (0..photo.rgb.len()).map(counts).collect();
-    Ok((photo, Gray { width, height, values }))
 }
 
 /// Returns the pixels of the members in a tile.

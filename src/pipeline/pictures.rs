@@ -1,9 +1,10 @@
 //! Writing and reading rendered views.
 
+use crate::capture::LoadedView;
 use crate::config::{PictureFormat, ViewBackground};
 use std::path::{Path, PathBuf};
 use tiface_base::Result;
-use tiface_base::image::{Gray, Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
+use tiface_base::image::{Gray, INSIDE, Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use tiface_base::io::{self, Limits, ReadError, WriteError};
 use tiface_surface::render::RenderedView;
 
@@ -180,6 +181,17 @@ pub(super) fn expected(photo: &Photo, mask: Option<&Gray>, background: ViewBackg
         .map(|(p, &m)| [mix(p[0], behind[0], m), mix(p[1], behind[1], m), mix(p[2], behind[2], m)])
         .collect();
     Photo { rgb, alpha: None, ..photo.clone() }
+}
+
+/// Returns the photograph that a render over black is compared with, and a weight that is 0 where
+/// it does not count: outside the head or not valid.
+pub(super) fn target(loaded: &LoadedView) -> (Photo, Gray) {
+    let photo = expected(&loaded.photo, loaded.mask.as_ref(), ViewBackground::None);
+    let (width, height) = (photo.width, photo.height);
+    let inside = |of: &Option<Gray>, i: usize| of.as_ref().is_none_or(|m| m.values[i] >= INSIDE);
+    let counts = |i: usize| if inside(&loaded.mask, i) && inside(&loaded.valid, i) { 255 } else { 0 };
+    let values = (0..photo.rgb.len()).map(counts).collect();
+    (photo, Gray { width, height, values })
 }
 
 #[cfg(test)]

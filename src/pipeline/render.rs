@@ -3,7 +3,7 @@
 //! ```text
 //! render/tface/NAME.png   as asked for: 8-bit or EXR, over the background
 //!        tface/depth/     16-bit millimeters beside 8-bit views
-//!        tface/float/     the same view for `ensemble`: float, coded, no background
+//!        tface/float/     the same view for `ensemble`: float, coded, not filtered, no background
 //! ```
 //!
 //! These are the held-out views. Where poses were refined, T-Face and the ray-cast mesh are also
@@ -28,9 +28,12 @@ use tiface_base::io;
 use tiface_base::{Monitor, Result};
 use tiface_surface::files::{ExtractedSurface, HeadMesh, HeadTexture};
 use tiface_surface::render::{
-    MeshTexture, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView, ResidualSource,
-    ResidualView, Residuals, Surface, raster, raycast, raycast_each,
+    MeshTexture, PixelFilterFit, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView,
+    ResidualSource, ResidualView, Residuals, Surface, raster, raycast, raycast_each,
 };
+
+/// Most training views that the pixel filter of ray casting is fitted to.
+const FILTERED_VIEWS: usize = 6;
 
 /// Renders one folder per method and one picture per camera, and the `fitted` cameras by the
 /// methods that compare poses; `unit_m` is the number of meters in a dataset unit. Methods that
@@ -66,8 +69,9 @@ pub(super) fn render(
                 spent += begin.elapsed();
                 made += missing.len();
                 dir.check_stop()?; // what it holds then is not whole
-                for ((_, target), view) in missing.iter().zip(views) {
-                    view.map_or(Ok(()), |view| target.write(view, c, unit_m))?;
+                for ((method, target), view) in missing.iter().zip(views) {
+                    let filter_px = if *method == Method::Raycast { renderer.pixel_filter_px } else { 0.0 };
+                    view.map_or(Ok(()), |view| target.write(view, c, unit_m, filter_px))?;
                 }
             }
             done += methods.len();
@@ -77,7 +81,11 @@ pub(super) fn render(
         seconds.extend(group.iter().map(|m| (m.as_str().to_owned(), json!(per_view))));
     }
     let methods: Vec<_> = c.method.iter().map(|m| m.as_str()).collect();
-    Ok(json!({"cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds}))
+    let tenths = (10.0 * f64::from(renderer.pixel_filter_px)).round();
+    let filter = (tenths > 0.0).then_some(tenths / 10.0);
+    Ok(json!({
+        "cameras": cameras.len(), "methods": methods, "seconds_per_view": seconds, "pixel_filter_px": filter,
+    }))
 }
 
 /// Where a view is written.
@@ -107,10 +115,13 @@ impl<'a> ViewTarget<'a> {
         files.iter().all(|file| io::is_file(file))
     }
 
-    fn write(&self, mut view: RenderedView, c: &RenderConfig, unit_m: f64) -> Result<()> {
+    /// Writes a view, with its pixels filtered where it is shown: blended, it is to be as sharp as it
+    /// can be.
+    fn write(&self, mut view: RenderedView, c: &RenderConfig, unit_m: f64, filter_px: f32) -> Result<()> {
         if let Some(float) = &self.float {
             pictures::write_float(float, self.name, &view)?;
         }
+        view.filter(filter_px);
         if let Some(background) = pictures::background_color(c.background) {
             pictures::over(&mut view, background);
         }
@@ -268,6 +279,8 @@ pub(super) struct Renderer<'a> {
     world_from_scene: Similarity,
     /// Residuals of ray casting in the training photographs.
     residuals: Option<Residuals>,
+    /// Deviation of the Gaussian that makes a ray-cast view look like a photograph, pixels.
+    pixel_filter_px: f32,
     monitor: &'a dyn Monitor,
 }
 
@@ -288,14 +301,15 @@ impl<'a> Renderer<'a> {
             samples,
             world_from_scene: scene.scene_from_world.inverse(),
             residuals: None,
+            pixel_filter_px: 0.0,
             monitor,
         }
     }
 
-    /// Returns the renderer with the residuals of the training views, which ray casting then adds
-    /// to other views. With `leaves_out_own`, a training view adds nothing to a view from its own
-    /// position.
-    pub fn with_residuals(
+    /// Returns the renderer with what the training photographs tell of ray-cast views: their pixel
+    /// filter, and residuals, which are added to other views. With `leaves_out_own`, a training
+    /// view adds nothing to a view from its own position.
+    pub fn with_photographs(
         mut self,
         capture: &Capture,
         scene: &Scene,
@@ -307,13 +321,21 @@ impl<'a> Renderer<'a> {
         let Some(mesh) = meshes.into_iter().flatten().next() else { return Ok(self) };
         // depth in the scene's units; colors are filtered over a pixel, whatever the number of rays
         let options = RaycastOptions { samples: 1, ..RaycastOptions::default() };
-        let mut residuals = Vec::new();
+        let as_shown = RaycastOptions { samples: self.samples, ..options };
+        let (mut residuals, mut filters) = (Vec::new(), PixelFilterFit::default());
         // one photograph at a time: all of them with their views could fill the memory
-        for (view, tiles) in learn::held_out_tiles(capture, config) {
+        let views = learn::held_out_tiles(capture, config);
+        let every = views.len().div_ceil(FILTERED_VIEWS).max(1);
+        for (i, (view, tiles)) in views.into_iter().enumerate() {
             if self.monitor.stop() {
                 break; // what was made is not used then
             }
             let (camera, loaded) = learn::training_view(view, &tiles, scene)?;
+            if loaded.mask.is_some() && i % every == 0 {
+                let (photo, weight) = pictures::target(&loaded);
+                let shown = self.cast(&[Method::Raycast], &camera, &as_shown)?.pop();
+                shown.iter().for_each(|view| filters.add(view, &photo, &weight));
+            }
             let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
             if let Some(view) = self.cast(&[Method::Raycast], &camera, &options)?.pop() {
                 let source = ResidualSource { camera: &camera, photo: &loaded.photo, mask, valid, view };
@@ -322,6 +344,7 @@ impl<'a> Renderer<'a> {
         }
         let center = mesh.bounds().center();
         self.residuals = Residuals::new(residuals, center, leaves_out_own);
+        self.pixel_filter_px = filters.deviation_px();
         Ok(self)
     }
 

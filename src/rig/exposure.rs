@@ -14,12 +14,12 @@
 //! −0.24 and +0.11 on captures without any, since grazing skin lies at the outline.
 
 use super::adjust::median;
-use super::tracks::{HEAD, MIN_VIEWS, Seed, blurred, is_set, seeds};
+use super::tracks::{HEAD, MIN_VIEWS, Seed, is_set, seeds};
 use glam::DVec3;
 use rayon::prelude::*;
 use std::ops::Range;
 use tiface_base::geom::{Camera, Mesh};
-use tiface_base::image::{Exposure, Gray, Photo, eroded, linear_from_srgb};
+use tiface_base::image::{Exposure, Gray, Photo, blurred, eroded, linear_from_srgb};
 use tiface_base::math::cholesky::solve;
 
 /// Points spread over the surface.

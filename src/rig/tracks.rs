@@ -12,7 +12,7 @@ use super::adjust::{Sighting, Track, project};
 use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 use tiface_base::geom::{Bvh, Camera, Mesh, Ray};
-use tiface_base::image::{Gray, Photo, eroded};
+use tiface_base::image::{Gray, Photo, blurred, eroded};
 
 /// Samples from a patch's center to its edge.
 const HALF: i32 = 6;
@@ -114,38 +114,6 @@ struct Level {
 /// The sharp picture, and the blurred one that the search may begin with.
 const LEVELS: [Level; 2] =
     [Level { blur: 0.7, spacing: 1.0, steps: 5 }, Level { blur: 1.5, spacing: 2.0, steps: 5 }];
-
-/// Returns a picture convolved with a Gaussian.
-pub fn blurred(picture: &[f32], w: usize, deviation: f32) -> Vec<f32> {
-    let reach = (3.0 * deviation).ceil() as usize;
-    let weight = |k: usize| (-0.5 * (k as f32 / deviation).powi(2)).exp();
-    let total = weight(0) + 2.0 * (1..=reach).map(weight).sum::<f32>();
-    let weights: Vec<f32> = (0..=reach).map(|k| weight(k) / total).collect();
-    if picture.is_empty() {
-        return Vec::new();
-    }
-    // whole rows are added, which fills the lanes of the CPU
-    let add = |out: &mut [f32], weight: f32, one: &[f32], other: &[f32]| {
-        out.iter_mut().zip(one).zip(other).for_each(|((sum, a), b)| *sum += weight * (a + b));
-    };
-    let mut across = vec![0f32; picture.len()];
-    let mut padded = vec![0f32; w + 2 * reach];
-    for (row, out) in picture.chunks_exact(w).zip(across.chunks_exact_mut(w)) {
-        padded[..reach].fill(row[0]);
-        padded[reach..][..w].copy_from_slice(row);
-        padded[reach + w..].fill(row[w - 1]);
-        (1..=reach).for_each(|k| add(out, weights[k], &padded[reach - k..][..w], &padded[reach + k..][..w]));
-        out.iter_mut().zip(row).for_each(|(sum, v)| *sum += weights[0] * v);
-    }
-    let rows: Vec<&[f32]> = across.chunks_exact(w).collect();
-    let mut blurred = vec![0f32; picture.len()];
-    for (y, out) in blurred.chunks_exact_mut(w).enumerate() {
-        let below = |k: usize| rows[(y + k).min(rows.len() - 1)];
-        (1..=reach).for_each(|k| add(out, weights[k], rows[y.saturating_sub(k)], below(k)));
-        out.iter_mut().zip(rows[y]).for_each(|(sum, v)| *sum += weights[0] * v);
-    }
-    blurred
-}
 
 /// Spreads `count` points evenly over a surface, and finds out which views see each. `is_usable`
 /// says whether a view can be used at a position of its picture.

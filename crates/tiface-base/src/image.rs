@@ -3,10 +3,12 @@
 //! The fields learn and render **sRGB-coded** color, as the published system does, so a render
 //! here is coded too and meets linear light only at the edge (EXR, glTF vertex colors, filtering).
 
+mod blur;
 mod exposure;
 mod morphology;
 mod resize;
 
+pub use blur::blurred;
 pub use exposure::Exposure;
 pub use morphology::{dilated, eroded, grow, shrink};
 pub use resize::{

@@ -2,6 +2,7 @@
 
 mod hits;
 mod look;
+mod pixel_filter;
 mod raster;
 mod raycast;
 mod residual;
@@ -10,6 +11,7 @@ mod view;
 
 pub use hits::RayHits;
 pub use look::{Look, Surface};
+pub use pixel_filter::PixelFilterFit;
 pub use raster::{RasterLayers, RasterOptions, RasterView, raster, raster_into};
 pub use raycast::{RaycastOptions, raycast, raycast_each};
 pub use residual::{ResidualSource, ResidualView, Residuals};

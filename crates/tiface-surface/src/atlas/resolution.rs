@@ -129,7 +129,7 @@ mod tests {
         // 100 pixels a unit of slope, 5 and 2 units above: 0.05 and 0.02 a pixel
         let cameras = [5.0, 2.0].map(|z| Camera::above(80, 60, 100.0, z));
         let found = resolved(&mesh, &cameras);
-        assert!((found[0] - 0.01).abs() < 1e-6 && found[1].is_infinite(), "{found:?}");
+        assert!((found[0] - 0.02 / TEXELS_PER_PIXEL).abs() < 1e-6 && found[1].is_infinite(), "{found:?}");
     }
 
     /// Returns a chart of one triangle with an area of one half.
