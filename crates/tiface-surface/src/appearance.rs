@@ -35,7 +35,7 @@ pub use photograph::Photograph;
 
 use glam::{Mat3, Vec3};
 use rayon::prelude::*;
-use rows::{Row, Rows, Seen};
+use rows::{RayTarget, Row, Rows};
 use serde::Serialize;
 use solve::{Smoothness, System};
 use std::time::Instant;
@@ -128,7 +128,7 @@ pub fn fit(
     let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
     let stride = (head as f64 / MAX_PIXELS as f64).sqrt().ceil().max(1.0) as u32;
     let layers = shells.map(|shells| ShellCaster::new(mesh, shells));
-    let rows = Rows::new(&Seen { mesh, bvh: Bvh::new(mesh), layers }, photographs, stride, turned);
+    let rows = Rows::new(&RayTarget { mesh, bvh: Bvh::new(mesh), layers }, photographs, stride, turned);
     if rows.is_empty() {
         return Ok(None);
     }

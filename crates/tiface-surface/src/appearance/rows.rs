@@ -30,7 +30,7 @@ pub struct Row {
 }
 
 /// A mesh, and the translucent layers around it, as rays meet them.
-pub struct Seen<'a> {
+pub struct RayTarget<'a> {
     pub mesh: &'a Mesh,
     pub bvh: Bvh,
     pub layers: Option<ShellCaster<'a>>,
@@ -50,7 +50,7 @@ impl Deref for Rows {
 impl Rows {
     /// Looks at every `stride`-th pixel each way of the photographs; `turned` leads from the mesh's
     /// coordinates to those of the harmonics.
-    pub fn new(seen: &Seen, photographs: &[Photograph], stride: u32, turned: Mat3) -> Rows {
+    pub fn new(target: &RayTarget, photographs: &[Photograph], stride: u32, turned: Mat3) -> Rows {
         let lines: Vec<(u32, u32)> = (0..photographs.len() as u32)
             .flat_map(|v| {
                 let height = photographs[v as usize].photo.height;
@@ -63,7 +63,7 @@ impl Rows {
             let xs = (y / stride % stride..photograph.photo.width).step_by(stride as usize);
             let row = y as usize * photograph.photo.width as usize;
             let xs = xs.filter(move |x| !glare[row + *x as usize]);
-            xs.filter_map(move |x| Row::new(seen, (view, photograph), [x, y], turned))
+            xs.filter_map(move |x| Row::new(target, (view, photograph), [x, y], turned))
         };
         Rows(lines.par_iter().flat_map_iter(line).collect())
     }
@@ -113,7 +113,7 @@ impl Rows {
 impl Row {
     /// Returns a pixel of a photograph, if the head fills it.
     fn new(
-        Seen { mesh, bvh, layers }: &Seen,
+        RayTarget { mesh, bvh, layers }: &RayTarget,
         (view, photograph): (u32, &Photograph),
         [x, y]: [u32; 2],
         turned: Mat3,
