@@ -504,10 +504,18 @@ mod tests {
         let plan =
             crate::run::Plan { name: "render", fingerprint, device: "cpu", needs_bytes: 0, saves: false };
         run.stage(plan, |dir| {
-            let renderer = Renderer::new(&scene, &Red, &meshes, 1, &Quiet);
+            let mut renderer = Renderer::new(&scene, &Red, &meshes, 1, &Quiet);
+            renderer.pixel_filter_px = 1.0;
             render(&c, &renderer, &[named(4.0)], &[named(3.0)], &scene, 1.0, dir)
         })
         .unwrap();
+        // what is shown is filtered, what is blended is not: its pixels are covered or not
+        let float = pictures::float_path(&run.path("render/raycast/float"), "a");
+        let sharp = pictures::read_float(&float).unwrap().channel(3);
+        assert!(sharp.iter().all(|a| [0.0, 1.0].contains(a)));
+        let shown = io::read_photo(&run.path("render/raycast/a.png"), None, &io::Limits::default()).unwrap();
+        let soft = shown.alpha.unwrap().iter().filter(|a| (1..255).contains(*a)).count();
+        assert!(soft > 8, "{soft}");
         let picture = |place: &str| std::fs::read(run.path("render/raycast").join(place)).unwrap();
         assert_ne!(picture("a.png"), picture("own_pose/a.png"));
         assert!(io::is_file(&run.path("render/raycast/float/a.exr")));
@@ -561,16 +569,9 @@ mod tests {
         let camera = Camera::above(8, 8, 8.0, 4.0);
         let look = |cap: Option<Cap>| {
             let surface = ExtractedSurface { mesh: mesh.clone(), cap };
-            let bvh = Bvh::new(&surface.mesh);
-            let renderer = Renderer {
-                fields: &Red,
-                extracted: Some((&surface, bvh)),
-                head: None,
-                samples: 1,
-                world_from_scene: Similarity::IDENTITY,
-                residuals: None,
-                monitor: &Quiet,
-            };
+            let meshes = Meshes { extracted: Some(surface), head: None };
+            let scene = Scene { scene_from_world: Similarity::IDENTITY, aabb: Aabb::SCENE, hull: None };
+            let renderer = Renderer::new(&scene, &Red, &meshes, 1, &Quiet);
             let view = renderer.view(Method::Raycast, &camera).unwrap().unwrap();
             // at x = (2.5 − 4) / 8 · 3 = −0.56 and (5.5 − 4) / 8 · 3.5 = 0.66
             [view.color.pixel(2, 4).to_vec(), view.color.pixel(5, 4).to_vec()]
