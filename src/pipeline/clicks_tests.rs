@@ -243,9 +243,9 @@ fn a_network_masks_all_views_without_a_click() {
 /// The clicked views of the light stage.
 const CLICKED: [&str; 3] = ["010", "013", "015"];
 
-/// Masks a capture of a light stage from the clicks that come with it, once for each band around the
-/// cut, and holds the masks against its true ones: so much are their mean and least overlap. Returns
-/// the squared errors of the alphas of clicked views.
+/// Masks a capture of a light stage from the clicks that come with it, once for each band around
+/// the cut, and holds the masks against its true ones: so much are their mean and least overlap.
+/// Returns the squared errors of the alphas of clicked views.
 fn masked_light_stage(bands: &[f32], [mean_least, worst_least]: [f64; 2]) -> Vec<f64> {
     let shared =
         std::env::var("TIFACE_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../shared").into());

@@ -115,8 +115,8 @@ impl<'a> ViewTarget<'a> {
         files.iter().all(|file| io::is_file(file))
     }
 
-    /// Writes a view, with its pixels filtered where it is shown: blended, it is to be as sharp as it
-    /// can be.
+    /// Writes a view, with its pixels filtered where it is shown: blended, it is to be as sharp as
+    /// it can be.
     fn write(&self, mut view: RenderedView, c: &RenderConfig, unit_m: f64, filter_px: f32) -> Result<()> {
         if let Some(float) = &self.float {
             pictures::write_float(float, self.name, &view)?;

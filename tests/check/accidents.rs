@@ -149,8 +149,8 @@ fn few_open_files_and_little_memory_end_in_a_product_or_a_sentence() {
     let memory = "ulimit -v 1048576"; // KiB
     worked(&limited(memory, &run("little")));
     same(&calm, &files(&dir.path().join("little")), "in 1 GiB");
-    // a table of more than there is, of which no page is touched: the sentence, and then all the same
-    // a run
+    // a table of more than there is, of which no page is touched: the sentence, and then all the
+    // same a run
     let large =
         limited(memory, run("large").args(["--set", "iface.levels=16", "--set", "iface.log2_table=24"]));
     let text = err(&large);

@@ -43,6 +43,10 @@ pub const TRUSTED: f32 = 0.9;
 /// which what was only glimpsed agrees no longer: it may be a lamp.
 const AGREES: [f32; 2] = [2.0, 3.0];
 
+/// Least mean distance that these are held against: plain paint differs by the noise of
+/// photographs.
+const LEAST_DISTANCE: f32 = 0.02;
+
 /// Most rounds of conjugate gradients, and the sum of squares at which they end, of that at their
 /// start.
 const ROUNDS: usize = 600;
@@ -152,7 +156,7 @@ impl SmoothColors<'_> {
         }
         let agrees = |v: usize| {
             let (sum, count) = sums[materials[v].0];
-            let mean = (sum / count.max(1) as f64).sqrt().max(1e-6) as f32;
+            let mean = ((sum / count.max(1) as f64).sqrt() as f32).max(LEAST_DISTANCE);
             ((AGREES[1] - squares[v].sqrt() / mean) / (AGREES[1] - AGREES[0])).clamp(0.0, 1.0)
         };
         let agrees: Vec<f32> = (0..own.len()).map(agrees).collect();
