@@ -21,6 +21,7 @@ pub mod files;
 mod fixtures;
 mod mesh_distance;
 mod moves;
+mod regularized;
 pub mod render;
 mod shells;
 mod simplify;
