@@ -1,5 +1,5 @@
-//! Stage `mesh`: the zero level set of the trained distance field, closed, in the dataset's world;
-//! and the head mesh made from it.
+//! Stage `mesh`: the zero level set of the trained distance field, smoothed, moved to the outlines
+//! of the masks and closed, in the dataset's world; and the head mesh made from it.
 //!
 //! ```text
 //! mesh/surface.ply   the whole extraction with colors at its vertices, in the dataset's world
@@ -27,7 +27,9 @@ use tiface_base::io::{self, Limits};
 use tiface_base::{Error, ErrorKind, Monitor, Result};
 use tiface_surface::bake::{Seen, seen_colors, seen_map, seen_shares};
 use tiface_surface::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
-use tiface_surface::{self, Cap, HandleReport, MAX_HANDLE, MeshDistance, MeshReport, Photograph};
+use tiface_surface::{
+    self, Cap, HandleReport, MAX_HANDLE, MeshDistance, MeshReport, OutlineReport, Photograph,
+};
 
 /// Runs the stage `mesh`: writes the whole surface as `surface.ply` in the dataset's world, and the
 /// head mesh in the configured formats.
@@ -41,7 +43,13 @@ pub(super) fn mesh(
     let c = &config.mesh;
     let (world_from_scene, export) = (scene.scene_from_world.inverse(), Export::new(capture, config));
     let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
+    let views = match c.color {
+        ColorSource::Network if c.hair == Hair::None => Vec::new(),
+        _ => learn::training_views(capture, scene, config)?,
+    };
+    let photographs = photographs(&views);
     let mut extracted = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
+    let outlines = if c.dense { None } else { extracted.fit_outlines(&photographs, dir.monitor())? };
     let mm = world_from_scene.scale * export.meters(&extracted.mesh, &world_from_scene) * 1000.0;
     extracted.announce(c.cap, mm, dir);
     extracted.end(c.cap);
@@ -57,10 +65,6 @@ pub(super) fn mesh(
     write_files(&to_ply(&extracted.mesh, None, &in_world).map_err(advised)?, dir.folder())?;
     // vertices have the color seen along the normal; textures and rays, and so their cap, have the
     // color that cameras see
-    let views = match c.color {
-        ColorSource::Network if c.hair == Hair::None => Vec::new(),
-        _ => learn::training_views(capture, scene, config)?,
-    };
     extracted.shade_cap(field, &cameras);
     let finish = Finish {
         surface: &extracted.mesh,
@@ -68,7 +72,7 @@ pub(super) fn mesh(
         field: &extracted.distance(field),
         cap: extracted.cap.as_ref().filter(|_| c.cap),
         cameras: &cameras,
-        photographs: &photographs(&views),
+        photographs: &photographs,
         scene,
         export: &export,
         config: c,
@@ -88,6 +92,7 @@ pub(super) fn mesh(
     summary["surface_triangles"] = json!(surface_triangles);
     summary["handles"] = handles(&report.handles, mm);
     summary["report"] = json!(report);
+    summary["outlines"] = json!(outlines);
     summary["steps"] = Value::Object(steps);
     Ok(summary)
 }
@@ -177,9 +182,26 @@ pub(super) struct Extraction {
 
 impl Extraction {
     /// Returns the surface as a field, with its cap: what the steps after the extraction are held
-    /// against. It is smoother than the zero set of `field`, whose colors it has.
+    /// against. It is smoother than the zero set of `field`, whose colors it has, and as large as
+    /// the masks say.
     pub fn distance<'a>(&'a self, field: &'a dyn Surface) -> MeshDistance<'a, CappedField<'a>> {
         MeshDistance::new(&self.mesh, CappedField { field, hull: None, cap: self.cap.as_ref() })
+    }
+
+    /// Moves the surface to the outlines of the photographs' masks; the cap stays.
+    fn fit_outlines(
+        &mut self,
+        photographs: &[Photograph],
+        monitor: &dyn Monitor,
+    ) -> Result<Option<OutlineReport>> {
+        let Extraction { mesh, report, cap } = self;
+        let capped = |p: &Vec3| cap.as_ref().is_some_and(|cap| cap.holds(*p));
+        let fixed: Vec<bool> = mesh.positions.iter().map(capped).collect();
+        let fitted = tiface_surface::fit_outlines(mesh, &fixed, photographs, monitor)?;
+        // the skin around the cap has moved
+        *cap = cap.as_ref().and_then(|_| Cap::find(mesh, report.bounds(), report.cell_size));
+        report.volume = mesh.signed_volume();
+        Ok(fitted)
     }
 
     /// Tells how the surface ends and what is doubtful of it; `mm` is the number of millimeters in

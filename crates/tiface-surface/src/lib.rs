@@ -6,8 +6,9 @@
 //!   surface and drops loose pieces; [`extract`] runs both, adds normals and colors, and removes
 //!   small handles. [`Cap`] closes the surface where the frames cut it. [`extract_dense`] evaluates
 //!   a field at all nodes of a grid, which [`marching`] meshes.
-//! - [`smooth()`] takes the noise of a learned field out of the surface; [`MeshDistance`] is the
-//!   result as a field, for the steps after it.
+//! - [`smooth()`] takes the noise of a learned field out of the surface, and [`fit_outlines`] moves
+//!   it to the outlines in photographs; [`MeshDistance`] is the result as a field, for the steps
+//!   after it.
 //! - [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured mesh.
 //! - [`files`] writes, reads and checks GLB, OBJ and PLY, and reads glTF and STL.
 //! - [`render`] shows a mesh from a camera.
@@ -21,6 +22,8 @@ pub mod files;
 mod fixtures;
 mod mesh_distance;
 mod moves;
+mod outline;
+mod regularized;
 pub mod render;
 mod shells;
 mod simplify;
@@ -34,6 +37,7 @@ pub use extract::{
     Sparse, Volume, clean, extract, extract_dense, marching, sparse,
 };
 pub use mesh_distance::MeshDistance;
+pub use outline::{OutlineReport, fit as fit_outlines};
 pub use shells::{ShellsReport, fit as fit_shells};
 pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
 pub use smooth::{SmoothReport, smooth};

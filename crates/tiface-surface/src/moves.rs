@@ -1,7 +1,8 @@
-//! Moves of vertices towards a field's zero: the step, and how much of it triangles allow.
+//! Moves of vertices: the step towards a field's zero, and how much of a move triangles allow.
 
 use glam::Vec3;
 use rayon::prelude::*;
+use tiface_base::geom::{area_vector, shape};
 
 /// Below this shape a face counts as spoiled, unless it was no better before.
 pub(super) const MIN_QUALITY: f32 = 0.02;
@@ -54,4 +55,37 @@ pub(super) fn move_vertices(
         watched = (0..triangles.len()).filter(touched).collect();
     }
     share.iter().filter(|&&s| s < 3).count()
+}
+
+/// What a move may do to a triangle.
+pub(super) struct MoveLimits {
+    /// Minimum cosine of the angle by which it turns.
+    pub turn_cosine: f32,
+    /// Minimum shape, unless it was no better before.
+    pub quality: f32,
+}
+
+/// The limits for a surface as it was extracted.
+pub(super) const EXTRACTED: MoveLimits = MoveLimits { turn_cosine: MIN_TURN_COSINE, quality: MIN_QUALITY };
+
+/// Moves vertices to `targets`, or part of the way where a triangle would be spoiled. Returns the
+/// number of vertices that were held back.
+pub(super) fn move_to(
+    positions: &mut [Vec3],
+    triangles: &[[u32; 3]],
+    targets: &[Vec3],
+    limits: &MoveLimits,
+) -> usize {
+    let at = |i: usize, p: Vec3, share: f32| match share {
+        1.0 => targets[i],
+        _ => p + share * (targets[i] - p),
+    };
+    let spoiled = |t: usize, from: &[Vec3], to: &[Vec3]| {
+        let [was, is] = [from, to].map(|p| triangles[t].map(|v| p[v as usize]));
+        let (old, new) = (area_vector(was), area_vector(is));
+        let along = old.dot(new);
+        let turned = along <= limits.turn_cosine * old.length() * new.length() || along.is_nan();
+        (turned && old != Vec3::ZERO) || (shape(is) < limits.quality && shape(is) < shape(was))
+    };
+    move_vertices(positions, triangles, at, spoiled)
 }

@@ -189,61 +189,19 @@ fn sigmoid(x: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Volume, marching};
-    use glam::{DMat3, DVec3, Vec2, Vec3};
+    use crate::fixtures::{SIZE, ball, ball_mask, cameras};
     use tiface_base::Quiet;
-    use tiface_base::geom::Camera;
     use tiface_base::image::{Gray, Photo};
-
-    const SIZE: u32 = 48;
-
-    /// Returns a ball of triangles of radius 0.5 around the origin.
-    fn ball() -> Mesh {
-        const N: usize = 33;
-        let at = |i: usize| i as f32 / (N - 1) as f32 * 2.0 - 1.0;
-        let value = |i: usize| Vec3::new(at(i % N), at(i / N % N), at(i / (N * N))).length() - 0.5;
-        let values: Vec<f32> = (0..N * N * N).map(value).collect();
-        let spacing = Vec3::splat(2.0 / (N - 1) as f32);
-        let volume = Volume { dims: [N; 3], values: &values, origin: Vec3::NEG_ONE, spacing };
-        let surface = marching(&volume, true).unwrap().mesh;
-        let normals = surface.positions.iter().map(|p| p.normalize()).collect();
-        Mesh { normals, ..surface }
-    }
-
-    /// Cameras around it, three units away.
-    fn cameras() -> Vec<Camera> {
-        let camera = |k: usize| {
-            let rotation = DMat3::from_rotation_y(k as f64 * std::f64::consts::TAU / 12.0);
-            Camera {
-                position: rotation * DVec3::new(0.0, 0.0, 3.0),
-                rotation,
-                ..Camera::above(SIZE, SIZE, 100.0, 3.0)
-            }
-        };
-        (0..12).map(camera).collect()
-    }
-
-    /// Returns the mask of a ball whose opacity falls from 1 to 0 as that of a field of this
-    /// sharpness does, seen by a camera: a ray that comes as near as `f` to the surface has σ(−f ·
-    /// sharpness).
-    fn mask(camera: &Camera, sharpness: f32) -> Gray {
-        let value = |i: u32| {
-            let ray = camera.ray(Vec2::new((i % SIZE) as f32 + 0.5, (i / SIZE) as f32 + 0.5)).unwrap();
-            let nearest = ray.origin.cross(ray.direction).length() - 0.5;
-            (sigmoid(-nearest * sharpness) * 255.0 + 0.5) as u8
-        };
-        Gray { width: SIZE, height: SIZE, values: (0..SIZE * SIZE).map(value).collect() }
-    }
 
     fn black() -> Photo {
         Photo { width: SIZE, height: SIZE, rgb: vec![[0; 3]; (SIZE * SIZE) as usize], alpha: None }
     }
 
     fn run(field: f32, masks: f32) -> (Option<Shells>, ShellsReport) {
-        let mesh = ball();
+        let mesh = ball(0.5);
         let photo = black();
         let cameras = cameras();
-        let masks: Vec<Gray> = cameras.iter().map(|c| mask(c, masks)).collect();
+        let masks: Vec<Gray> = cameras.iter().map(|c| ball_mask(c, 0.5, masks)).collect();
         let view = |(camera, mask)| Photograph { camera, photo: &photo, mask: Some(mask), valid: None };
         let photographs: Vec<Photograph> = cameras.iter().zip(&masks).map(view).collect();
         let sharpness = vec![field; mesh.positions.len()];
@@ -265,13 +223,13 @@ mod tests {
             assert_eq!(f32::from(quantize(*alpha)) / 255.0, *alpha);
             assert!(*alpha == 0.0 || *alpha >= MIN_ALPHA - 1e-6, "{alpha}");
         }
-        assert_eq!(report.kept_triangles, triangles(&shells, &ball()));
+        assert_eq!(report.kept_triangles, triangles(&shells, &ball(0.5)));
     }
 
     #[test]
     fn the_field_says_how_much_rays_lose_between_layers() {
-        let (mesh, camera) = (ball(), &cameras()[0]);
-        let (photo, mask) = (black(), mask(camera, 20.0));
+        let (mesh, camera) = (ball(0.5), &cameras()[0]);
+        let (photo, mask) = (black(), ball_mask(camera, 0.5, 20.0));
         let photographs = [Photograph { camera, photo: &photo, mask: Some(&mask), valid: None }];
         let sharpness = vec![20.0; mesh.positions.len()];
         let (shells, _) = from_field(&mesh, &Nodes::vertices(&mesh), &sharpness, &photographs).unwrap();
@@ -302,7 +260,7 @@ mod tests {
     #[test]
     fn layers_stay_where_the_mesh_is_softest() {
         // from 0.9 pixels below to 1.2 above
-        let mesh = ball();
+        let mesh = ball(0.5);
         let softness: Vec<f32> = mesh.positions.iter().map(|p| 1.05 + 0.3 * p.z).collect();
         let least = least_softness(&mesh, &softness);
         let more = |t: &&[u32; 3]| t.iter().any(|&v| softness[v as usize] > least);
@@ -315,7 +273,7 @@ mod tests {
     #[test]
     fn a_layer_ends_where_one_does_not_see_it() {
         // opacity falls evenly from 1/2 above to nothing at the equator, and is none below
-        let mesh = ball();
+        let mesh = ball(0.5);
         let alphas: Vec<f32> = mesh.positions.iter().map(|p| p.z.max(0.0)).collect();
         let layer = ShellLayer { offsets: vec![0.1; mesh.positions.len()], alphas: alphas.clone() };
         let layer = confine(Shells { layers: vec![layer] }).layers.swap_remove(0);
@@ -332,8 +290,8 @@ mod tests {
     #[test]
     fn opacity_falls_towards_where_no_layer_is() {
         // masks are soft all around, but the field below is hard
-        let (mesh, photo, cameras) = (ball(), black(), cameras());
-        let masks: Vec<Gray> = cameras.iter().map(|c| mask(c, 20.0)).collect();
+        let (mesh, photo, cameras) = (ball(0.5), black(), cameras());
+        let masks: Vec<Gray> = cameras.iter().map(|c| ball_mask(c, 0.5, 20.0)).collect();
         let view = |(camera, mask)| Photograph { camera, photo: &photo, mask: Some(mask), valid: None };
         let photographs: Vec<Photograph> = cameras.iter().zip(&masks).map(view).collect();
         let sharpness: Vec<f32> =
@@ -355,9 +313,9 @@ mod tests {
 
     #[test]
     fn slopes_are_those_of_differences() {
-        let mesh = ball();
+        let mesh = ball(0.5);
         let camera = &cameras()[3];
-        let mask = mask(camera, 20.0);
+        let mask = ball_mask(camera, 0.5, 20.0);
         let photo = black();
         let photographs = [Photograph { camera, photo: &photo, mask: Some(&mask), valid: None }];
         let nodes = Nodes::vertices(&mesh);

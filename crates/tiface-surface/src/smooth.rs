@@ -21,12 +21,12 @@
 //! smoothing (Vollmer, Mencl, Müller 1999) moves vertices four times as far for normals that are no
 //! better, and rounds edges.
 
-use crate::moves::{MIN_QUALITY, MIN_TURN_COSINE, move_vertices};
+use crate::moves::{EXTRACTED, move_to};
 use crate::simplify::without_crossings;
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use tiface_base::geom::{Mesh, area_vector, shape};
+use tiface_base::geom::{Mesh, area_vector};
 
 /// Rounds of averaging normals. With `SIGMA` and `MOVES` by the angle to the true normals of skin
 /// and the distance to the true skin, of three heads.
@@ -63,14 +63,7 @@ pub fn smooth(mesh: &mut Mesh, fixed: &[bool]) -> SmoothReport {
     let normals = filtered_normals(mesh, &fans);
     let targets = followed(mesh, &fans, &normals, &stays);
     let start = mesh.positions.clone();
-    let at = |v: usize, p: Vec3, share: f32| p + share * (targets[v] - p);
-    let spoiled = |t: usize, from: &[Vec3], to: &[Vec3]| {
-        let [was, is] = [from, to].map(|p| mesh.triangles[t].map(|v| p[v as usize]));
-        let (old, new) = (area_vector(was), area_vector(is));
-        let turned = old.dot(new) <= MIN_TURN_COSINE * old.length() * new.length();
-        (turned && old != Vec3::ZERO) || (shape(is) < MIN_QUALITY && shape(is) < shape(was))
-    };
-    let held_back = move_vertices(&mut mesh.positions, &mesh.triangles, at, spoiled)
+    let held_back = move_to(&mut mesh.positions, &mesh.triangles, &targets, &EXTRACTED)
         + without_crossings(&mut mesh.positions, &mesh.triangles, &start);
     mesh.normals = mesh.angle_weighted_normals();
     let moves = || mesh.positions.iter().zip(&start).map(|(p, from)| p.distance(*from));

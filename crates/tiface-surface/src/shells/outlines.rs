@@ -1,10 +1,10 @@
 //! Photographs' outlines as equations for the opacities of layers.
 
 use super::super::appearance::{Nodes, Photograph};
+use super::super::regularized::{Equation, Prior, step};
 use glam::Vec2;
 use rayon::prelude::*;
 use tiface_base::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, Shells};
-use tiface_base::math::cg::{conjugate_gradients, dot};
 use tiface_base::{Monitor, Result};
 
 /// Width of the band on each side of a mask's outline whose pixels are compared: no layer may reach
@@ -20,10 +20,9 @@ const RAYS_PER_SIDE: usize = 2;
 /// Rays of a pixel.
 const RAYS_PER_PIXEL: usize = RAYS_PER_SIDE * RAYS_PER_SIDE;
 
-/// Weights of squared opacities, and of squared differences along an edge, against the square of
-/// one pixel's error: where no outline tells, there is no layer.
-const RIDGE: f64 = 0.02;
-const SMOOTH: f64 = 3.0;
+/// Against the square of one pixel's error: where no outline tells, there is no layer. What
+/// neighbors without a layer have counts, so that opacity falls towards them.
+const PRIOR: Prior = Prior { ridge: 0.02, smooth: 3.0 };
 
 /// Gauss-Newton steps.
 const ROUNDS: usize = 3;
@@ -176,7 +175,8 @@ impl Outlines {
             let equations = self.equations(&rows, &fitted);
             let x: Vec<f64> =
                 fitted.layers.iter().flat_map(|layer| layer.alphas.iter().map(|a| f64::from(*a))).collect();
-            let step = step(&equations, nodes, &x, &known);
+            let free = |i: usize, up: f64| known[i] && (x[i] > 0.0 || up > 0.0);
+            let step = step(&equations, nodes, &x, PRIOR, free, STEPS);
             for (layer, step) in fitted.layers.iter_mut().zip(step.chunks(vertices)) {
                 for (alpha, step) in layer.alphas.iter_mut().zip(step) {
                     *alpha = (*alpha + *step as f32).clamp(0.0, MAX_ALPHA);
@@ -187,7 +187,7 @@ impl Outlines {
     }
 
     /// Returns what each row misses of its mask's opacity, with the slopes of its own.
-    fn equations(&self, rows: &[usize], shells: &Shells) -> Vec<(f32, Vec<(u32, f32)>)> {
+    fn equations(&self, rows: &[usize], shells: &Shells) -> Vec<Equation> {
         let equation = |&row: &usize| {
             let mut slopes = Vec::new();
             let opacity = self.opacity(row, Some(shells), Some(&mut slopes));
@@ -195,44 +195,4 @@ impl Outlines {
         };
         rows.par_iter().map(equation).collect()
     }
-}
-
-/// Returns the step of the opacities `x` that meets the equations best, `vertices` a layer; none of
-/// those that are not `known`.
-fn step(equations: &[(f32, Vec<(u32, f32)>)], nodes: &Nodes, x: &[f64], known: &[bool]) -> Vec<f64> {
-    let vertices = nodes.len();
-    // the weights of squares and of differences; what neighbors without a layer have counts, so
-    // that opacity falls towards them
-    let prior = |x: &[f64], i: usize| {
-        let base = i / vertices * vertices;
-        let near = nodes.near(i - base).iter().map(|&n| x[i] - x[base + n as usize]).sum::<f64>();
-        RIDGE * x[i] + SMOOTH * near
-    };
-    let mut right: Vec<f64> = (0..x.len()).map(|i| if known[i] { -prior(x, i) } else { 0.0 }).collect();
-    let mut diagonal: Vec<f64> =
-        (0..x.len()).map(|i| RIDGE + SMOOTH * nodes.near(i % vertices).len() as f64).collect();
-    for (rest, slopes) in equations {
-        for &(at, slope) in slopes {
-            right[at as usize] += f64::from(slope * rest);
-            diagonal[at as usize] += f64::from(slope).powi(2);
-        }
-    }
-    let free: Vec<bool> = (0..x.len()).map(|i| known[i] && (x[i] > 0.0 || right[i] > 0.0)).collect();
-    right.iter_mut().zip(&free).filter(|(_, free)| !**free).for_each(|(r, _)| *r = 0.0);
-    let apply = |x: &[f64], out: &mut [f64]| {
-        (0..x.len()).for_each(|i| out[i] = prior(x, i));
-        for (_, slopes) in equations {
-            let sum: f64 = slopes.iter().map(|&(at, slope)| f64::from(slope) * x[at as usize]).sum();
-            slopes.iter().for_each(|&(at, slope)| out[at as usize] += f64::from(slope) * sum);
-        }
-        out.iter_mut().zip(&free).filter(|(_, free)| !**free).for_each(|(o, _)| *o = 0.0);
-    };
-    let precondition = |r: &[f64], z: &mut [f64]| {
-        z.iter_mut().zip(r).zip(&diagonal).for_each(|((z, r), d)| *z = r / d);
-    };
-    let first = dot(&right, &right);
-    let mut step = vec![0f64; x.len()];
-    let done = |round: usize, r: &[f64]| round >= STEPS || dot(r, r) <= 1e-6 * first;
-    conjugate_gradients(&mut step, right, apply, precondition, done);
-    step
 }

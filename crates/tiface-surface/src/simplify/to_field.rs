@@ -16,11 +16,11 @@ use super::crossing::without_crossings;
 use super::{SimplifyReport, Task};
 use crate::evaluate;
 use crate::extract::BATCH;
-use crate::moves::{move_vertices, newton};
+use crate::moves::{MoveLimits, move_to, newton};
 use glam::Vec3;
 use rayon::prelude::*;
 use tiface_base::Result;
-use tiface_base::geom::{Mesh, SdfField, area_vector, shape};
+use tiface_base::geom::{Mesh, SdfField, area_vector};
 use tiface_base::math::cg::conjugate_gradients;
 
 /// Placement of the vertices.
@@ -31,6 +31,9 @@ pub(super) enum VertexPlacement {
     /// At the least-squares zero of their triangles.
     Nearest,
 }
+
+/// The limits of a collapse hold for moves after it.
+const LIMITS: MoveLimits = MoveLimits { turn_cosine: MIN_TURN_COSINE, quality: MIN_QUALITY };
 
 /// Moves the vertices that are not `fixed` to the field, and takes their normals from it.
 pub(super) fn project_to_field(
@@ -78,7 +81,7 @@ pub(super) fn project_to_field(
                     .collect()
             }
         };
-        report.held_back += move_to(&mut mesh.positions, &mesh.triangles, &targets);
+        report.held_back += move_to(&mut mesh.positions, &mesh.triangles, &targets, &LIMITS);
         gradients = slopes;
     }
     if task.apart {
@@ -110,23 +113,6 @@ fn reaches(positions: &[Vec3], triangles: &[[u32; 3]]) -> Vec<f32> {
         }
     }
     sums.iter().map(|&(sum, n)| if n > 0.0 { 0.5 * sum / n } else { 0.0 }).collect()
-}
-
-/// Moves vertices to `targets`, or part of the way. Returns the number of vertices that were held
-/// back.
-fn move_to(positions: &mut [Vec3], triangles: &[[u32; 3]], targets: &[Vec3]) -> usize {
-    let at = |i: usize, p: Vec3, share: f32| match share {
-        1.0 => targets[i],
-        _ => p + share * (targets[i] - p),
-    };
-    let spoiled = |t: usize, from: &[Vec3], to: &[Vec3]| {
-        let [was, is] = [from, to].map(|p| triangles[t].map(|v| p[v as usize]));
-        let (old, new) = (area_vector(was), area_vector(is));
-        let along = old.dot(new);
-        let turned = along <= MIN_TURN_COSINE * old.length() * new.length() || along.is_nan();
-        (turned && old != Vec3::ZERO) || (shape(is) < MIN_QUALITY && shape(is) < shape(was))
-    };
-    move_vertices(positions, triangles, at, spoiled)
 }
 
 /// Offsets of all vertices along their normals that bring the triangles nearest to the surface,
