@@ -99,7 +99,7 @@ impl<'a> Shown<'a> {
         let ends = edge.ends.map(|v| positions[v as usize]);
         let (a, b) = (at(ends[0])?, at(ends[1])?);
         let length = a.distance(b);
-        if !(length > 1e-3) {
+        if length.is_nan() || length <= 1e-3 {
             return None;
         }
         let across = (b - a).perp() / length;
