@@ -418,6 +418,7 @@ pages() {
 # The pages of the demo head, as a person opens them.
 demo_pages() {
   "$target/release/tiface" preview "$scratch/demo" --size 512 --out "$scratch/demo/preview.png" &&
+    "$target/release/tiface" preview "$scratch/demo" --size 512 --light seen --out "$scratch/demo/preview_seen.png" &&
     "$target/release/tiface" report "$scratch/demo" "$scratch/demo/capture" --out "$scratch/demo/runs.html" &&
     node tools/page/check_report.mjs "$scratch/demo" &&
     node tools/page/check_watch.mjs "$target/release/tiface" "$scratch/demo"

@@ -24,7 +24,7 @@ pub enum Method {
     Plain,
     /// The same with its lobes: what viewers of ours show.
     Textured,
-    /// The same, rasterized in a fraction of the time, without soft layers.
+    /// The same, rasterized in a fraction of the time.
     Raster,
 }
 
@@ -101,8 +101,7 @@ table! {
         cameras: String [Path if |c| !c.render.cameras_are_a_file()] => "test".into();
         /// Methods, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh with
         /// view-dependent color), plain (head.glb, as any viewer shows it), textured (head.glb with
-        /// its lobes, as viewers of ours show it) and raster (the same, rasterized, without soft
-        /// layers).
+        /// its lobes, as viewers of ours show it) and raster (the same, rasterized).
         #[flag("with", Text("LIST"), ["render"],
             "Methods, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's mesh), plain \
              (head.glb, as any viewer shows it), textured (with its lobes) and raster (the same, rasterized)")]

@@ -184,7 +184,8 @@ void main() {
     c = 0.5 + 0.5 * viewFromPlace * n;
   } else if (mode == 5) {
     const vec3 colors[4] = vec3[4](${SEEN_BY.map((c) => `vec3(${c})`)});
-    c = colors[int(watched + 0.5)];
+    // values at a triangle's border reach beyond those of its corners
+    c = colors[clamp(int(watched + 0.5), 0, 3)];
   } else if (mode >= 3) {
     c = vec3(0.83, 0.80, 0.77) * (0.2 + 0.8 * abs(dot(n, d)));
   }

@@ -3,6 +3,7 @@
 //     tiface demo --preset draft --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured --run RUN
 //     tiface report RUN OTHER --out RUN/runs.html      (if there, the page of many runs is tried, too)
 //     tiface preview RUN --size 512 --out RUN/preview.png      (if there, the first picture must be this one)
+//     tiface preview RUN --size 512 --light seen --out RUN/preview_seen.png      (likewise, by number of cameras)
 //     npm ci --prefix tools/readers
 //     node tools/page/check_report.mjs RUN
 //
@@ -81,17 +82,21 @@ try {
   const one = await open("head"), { page } = one;
   await page.goto(page_url);
   await ready(page);
-  // the first picture, and the places of the photographs
-  if (await there("preview.png")) {
-    const ours = await readFile(at("preview.png")), { width, height } = PNG.sync.read(ours);
-    const drawn = bytesOf(await page.evaluate(([w, h]) => {
-      const { viewer } = document.querySelector(".viewer");
+  // the first picture, how many cameras see the surface, and the places of the photographs
+  for (const [file, mode] of [["preview.png"], ["preview_seen.png", 5]]) {
+    if (!await there(file)) continue;
+    const ours = await readFile(at(file)), { width, height } = PNG.sync.read(ours);
+    const drawn = bytesOf(await page.evaluate(([w, h, mode]) => {
+      const { viewer } = document.querySelector(".viewer"), before = viewer.state.mode;
       viewer.fit(w, h);
-      return viewer.picture(w, h);
-    }, [width, height]));
-    await writeFile(at("report_first.png"), drawn);
+      viewer.state.mode = mode ?? before;
+      const picture = viewer.picture(w, h);
+      viewer.state.mode = before;
+      return picture;
+    }, [width, height, mode]));
+    await writeFile(at(file.replace("preview", "report_first")), drawn);
     const found = decibels(drawn, ours);
-    check(`the first picture is that of \`tiface preview\`: ${Number(found).toFixed(1)} dB`, found >= LEAST_DB, `at least ${LEAST_DB}`);
+    check(`the report shows what \`tiface preview\` drew as ${file}: ${Number(found).toFixed(1)} dB`, found >= LEAST_DB, `at least ${LEAST_DB}`);
   }
   const names = await page.evaluate(() => JSON.parse(document.querySelector(".viewer-data").textContent).cameras.map((c) => c.name));
   const rendered = await there("render/textured") ? await readdir(at("render/textured")) : [];
@@ -137,7 +142,7 @@ try {
   await change(["Shift+ArrowRight"], "target");
   await change(["+"], "distance");
   await change(["-", "-"], "distance");
-  for (const mode of [2, 3, 4, 5]) same(`${mode} chooses a mode`, (await change([String(mode)], "mode")).mode, mode - 1);
+  for (const mode of [2, 3, 4, 5, 6]) same(`${mode} chooses a mode`, (await change([String(mode)], "mode")).mode, mode - 1);
   await change(["2"], "mode");
   await change(["0"], "distance");
   if (names.length) {

@@ -4,8 +4,8 @@
     .venv-blender/bin/python tools/readers/check_addon.py RUN
 
 Checked: every vertex of the head is seen where the run's own cameras see it, through `mesh/surface.ply`'s world, to 0.05
-pixels; each view has its photograph; colors are shown as stored; folders that are no runs are refused in a sentence. Exits 1
-after printing every disagreement.
+pixels; vertices have their number of cameras; each view has its photograph; colors are shown as stored; folders that are
+no runs are refused in a sentence. Exits 1 after printing every disagreement.
 """
 
 import json
@@ -69,6 +69,15 @@ def main():
         shown = [background.image for background in camera.data.background_images]
         if len(shown) != 1 or tuple(shown[0].size) != (width, height):
             wrong.append(f"{view['name']} has the backgrounds {[tuple(image.size) for image in shown]}")
+    # numbers of cameras, as an attribute to mask by
+    seen_by = head.data.attributes.get("_SEEN_BY")
+    if seen_by is None or seen_by.domain != "POINT" or seen_by.data_type != "FLOAT":
+        wrong.append("the head has no number of cameras at its vertices")
+    else:
+        numbers = numpy.empty(len(seen_by.data), numpy.float32)
+        seen_by.data.foreach_get("value", numbers)
+        if (numbers % 1).any() or not 0 < numbers.max() <= len(views):
+            wrong.append(f"vertices are seen by {numbers.min()} to {numbers.max()} of {len(views)} cameras")
     print(f"{len(cameras)} cameras; {farthest:.4f} pixels at most from where the run sees {len(picked)} vertices")
     if not farthest <= MOST_PX:
         wrong.append(f"vertices are {farthest} pixels off, at most {MOST_PX} expected")

@@ -9,7 +9,7 @@ use tiface_base::image::eroded;
 /// Pixels within this many of a pixel that is not the head alone may show what is behind.
 const EDGE: usize = 4;
 
-/// Side of the window, less a half, over which head and background around a pixel are averaged.
+/// Pixels on each side of a pixel over which head and background around it are averaged.
 const WINDOW: usize = 8;
 
 /// Byte that all channels of a lamp reach.
