@@ -1,6 +1,7 @@
 //! A capture, its configuration and its run folder, which every stage works on.
 
 use super::cameras::CameraCheck;
+use super::clean::require_float_views;
 use super::exposure::ExposureCheck;
 use super::inputs::{Inputs, missing_capture};
 use super::path::CameraPath;
@@ -165,8 +166,8 @@ impl<'a> Session<'a> {
         self.path.as_ref().map_or(&self.config.render, |path| &path.render)
     }
 
-    /// Fails if an input of one of these stages is missing: photographs, checkpoints, networks or
-    /// the device.
+    /// Fails if an input of one of these stages is missing: photographs, checkpoints, float views,
+    /// networks or the device.
     pub(super) fn require_inputs(&self, stages: &[Stage]) -> Result<()> {
         if let Some(problem) = self.inputs.missing_capture.as_ref().filter(|_| !stages.is_empty()) {
             return Err(missing_capture(problem));
@@ -178,6 +179,7 @@ impl<'a> Session<'a> {
             .filter(|i| stages.contains(&i.stage))
             .filter_map(|i| i.missing.clone());
         lost.next().map_or(Ok(()), Err)?;
+        require_float_views(self.run, stages)?;
         if stages.contains(&Stage::Metrics) {
             Lpips::open(self.config.metrics.lpips.as_ref(), self.config.mask.memory_gib)?;
         }
