@@ -11,6 +11,7 @@ sends nothing anywhere.
 
 import argparse
 import importlib
+import itertools
 import pathlib
 import sys
 import tomllib
@@ -22,12 +23,10 @@ PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb", "trackio": "trackio
 
 
 def steps(run):
-    """The figures of each logged step: (stage, step, {STAGE/FIGURE: value}), in the order of the logs."""
-    rows = {}
-    for stage, step, _, name, value in curves(run):
-        if value is not None:
-            rows.setdefault((stage, step), {})[f"{stage}/{name}"] = value
-    return [(stage, step, values) for (stage, step), values in rows.items()]
+    """The figures of each line of the logs: (stage, step, {STAGE/FIGURE: value}), in their order."""
+    lines = itertools.groupby(curves(run), key=lambda row: row[:3])
+    each = ((stage, step, {f"{stage}/{name}": v for *_, name, v in rows if v is not None}) for (stage, step, _), rows in lines)
+    return [line for line in each if line[2]]
 
 
 def means(run):
