@@ -24,7 +24,7 @@
 #              on that driver once, beside the CPU.
 # fleet        six heads under kills of tasks and of the engine, two and a half minutes. Only the recipe in `tools/fleet` is
 #              not in the check; the kills, waits and exit codes that it relies on are, in `resume`, `accidents` and `cli`.
-# guides       every command of three guides, five minutes. The commands themselves are in the check, in `cli`.
+# guides       every command of four guides, five minutes. The commands themselves are in the check, in `cli`.
 # blender      exports, lobes and the import of a run in Blender: a download of 350 MB. The check reads the same files with
 #              five other readers.
 # browser      the annotation page, the report and the page of many runs in Chromium: a download of 90 MB and scripts of a
