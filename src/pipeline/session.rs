@@ -166,8 +166,15 @@ impl<'a> Session<'a> {
         self.path.as_ref().map_or(&self.config.render, |path| &path.render)
     }
 
-    /// Fails if an input of one of these stages is missing: photographs, checkpoints, float views,
-    /// networks or the device.
+    /// Fails if one of these stages cannot be worked on, because an input of it is missing or was
+    /// removed from the run.
+    pub(super) fn require_work(&self, stages: &[Stage]) -> Result<()> {
+        require_float_views(self.run, stages)?;
+        self.require_inputs(stages)
+    }
+
+    /// Fails if an input of one of these stages is missing: photographs, checkpoints, networks or
+    /// the device.
     pub(super) fn require_inputs(&self, stages: &[Stage]) -> Result<()> {
         if let Some(problem) = self.inputs.missing_capture.as_ref().filter(|_| !stages.is_empty()) {
             return Err(missing_capture(problem));
@@ -179,7 +186,6 @@ impl<'a> Session<'a> {
             .filter(|i| stages.contains(&i.stage))
             .filter_map(|i| i.missing.clone());
         lost.next().map_or(Ok(()), Err)?;
-        require_float_views(self.run, stages)?;
         if stages.contains(&Stage::Metrics) {
             Lpips::open(self.config.metrics.lpips.as_ref(), self.config.mask.memory_gib)?;
         }
