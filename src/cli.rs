@@ -8,6 +8,7 @@ mod bench;
 mod cameras;
 mod capture;
 mod check;
+mod clean;
 mod complete;
 mod config;
 mod demo;
@@ -377,6 +378,23 @@ each run, with size, SHA-256 and state (recorded, changed, cut or gone) of every
         /// Run folders [default: all under runs/]
         runs: Vec<PathBuf>,
     },
+    /// Remove what finished runs do not need: optimizer state, float views, old checkpoints
+    #[command(after_long_help = "Examples:
+  tiface clean runs/002_00                      list what would be removed, with its size
+  tiface clean runs/002_00 --yes                list it, then remove it
+  tiface clean runs/* --json | jq .bytes        print an object for each run
+
+Photographs, masks, weights, meshes, pictures, figures and pages stay, and so does everything of a stage that is not
+finished. All stages stay finished; `run`, `export`, `preview`, `report` and `verify` work as before. To repeat the blend
+or the metrics alone, the views are then rendered again (--fresh render). A run in use is refused.")]
+    Clean {
+        /// Run folders
+        #[arg(value_name = "RUN", required = true)]
+        runs: Vec<PathBuf>,
+        /// Remove what is listed
+        #[arg(long)]
+        yes: bool,
+    },
     /// Print the effective configuration, or explain a key
     #[command(after_long_help = "Examples:
   tiface config --preset paper
@@ -465,6 +483,9 @@ pub fn main(collect: fn()) -> ExitCode {
         Command::Status(options) => makes_nothing("status").and_then(|()| status::run(&invocation, options)),
         Command::Report { runs, table } => report::run(&invocation, runs, *table),
         Command::Verify { runs } => makes_nothing("verify").and_then(|()| verify::run(&invocation, runs)),
+        Command::Clean { runs, yes } => {
+            makes_nothing("clean").and_then(|()| clean::run(&invocation, runs, *yes))
+        }
         Command::Config { input, explain } => makes_nothing("config")
             .and_then(|()| config::run(&common, input.path.as_deref(), explain.as_deref())),
         Command::Doctor => makes_nothing("doctor").and_then(|()| doctor::run(&common)),
@@ -511,7 +532,7 @@ fn ignored(command: &str) -> &'static [&'static str] {
         "status" | "verify" => {
             &["fresh", "seed", "config", "preset", "set", "device", "deterministic", "memory"]
         }
-        "doctor" | "completions" => {
+        "clean" | "doctor" | "completions" => {
             &["run", "fresh", "seed", "config", "preset", "set", "device", "deterministic", "memory"]
         }
         "inspect" | "cameras" | "convert" | "check" => {

@@ -29,7 +29,8 @@ pub use infer::IFace;
 pub use train::{IfaceReport, train};
 
 use crate::config::iface::IfaceConfig;
-use crate::field::{ComputeDevice, SelfTest};
+use crate::field::{ComputeDevice, SelfTest, checkpoint};
+use std::path::Path;
 use tiface_base::Result;
 
 /// Whether a GPU learns a signed distance as the CPU does.
@@ -45,6 +46,12 @@ pub const DENSITY_TEST: SelfTest = SelfTest {
     #[cfg(feature = "wgpu")]
     run: self_test::density,
 };
+
+/// Returns the bytes of a finished checkpoint without what only training reads; `None` if it holds
+/// nothing else, or is not finished.
+pub fn without_moments(checkpoint: &Path) -> Result<Option<Vec<u8>>> {
+    checkpoint::without_moments(checkpoint, "iface", &[state::FORMAT, density::FORMAT])
+}
 
 /// Refuses a GPU that cannot hold a training, before its photographs are known: they need no memory
 /// there.

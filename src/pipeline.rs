@@ -24,6 +24,7 @@
 mod advice;
 mod bench;
 mod cameras;
+mod clean;
 mod clicks;
 mod compare;
 mod cost;
@@ -52,6 +53,7 @@ mod surface;
 
 pub use crate::config::Stage;
 pub use bench::{Bench, SWEEPS};
+pub use clean::{cost_of_removal, remove_surplus, stage_folders, surplus};
 pub use compare::{Judged, compare_runs, judge};
 pub use export::KeptHead;
 pub use frames::Export;

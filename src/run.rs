@@ -19,6 +19,7 @@
 //! and so differ from run to run.
 
 use tiface_base::{Error, ErrorKind, Quiet, Result};
+mod clean;
 mod estimate;
 mod failure;
 mod fingerprint;
@@ -28,6 +29,7 @@ mod stage;
 mod status;
 mod verify;
 
+pub use clean::{HeldStages, Surplus, SurplusKind};
 pub use estimate::{Cost, ESTIMATE, Estimate, read_estimate};
 pub use failure::{FAILED, Failure, read_failure};
 pub use fingerprint::Fingerprint;
@@ -121,22 +123,8 @@ impl Run {
     ///
     /// Fails if a folder is a link or contains files of another origin; then nothing is removed.
     pub fn fresh(&self, names: &[String]) -> Result<()> {
-        let folders: Vec<&String> = names.iter().filter(|n| io::is_folder(&self.path(n))).collect();
-        for name in &folders {
-            if let Some(link) = self.link(name) {
-                return Err(Error::cannot(
-                    format!("`{}` is a link, and links are not followed to remove files", link.display()),
-                    "remove the link, then repeat the command",
-                ));
-            }
-            self.is_ours(name)?;
-        }
-        let mut locks = Vec::new();
-        for name in folders {
-            locks.push((self.path(name), self.lock(name)?));
-        }
         // the last stage first: stopped halfway, no stage is left without its input
-        for (folder, _lock) in locks.iter().rev() {
+        for folder in self.hold(names)?.folders().rev() {
             io::remove(&folder.join("done.json"))?;
             io::clear_folder(folder, LOCK, &has_record)?;
         }

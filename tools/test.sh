@@ -10,7 +10,7 @@
 # unit         unit tests, examples in the documentation
 # integration  the program as a user runs it: commands, hostile files, kills
 # readers      exported shapes in trimesh, open3d, three.js and the Khronos validator
-# demo         the demo head, from photographs to views, in all of these readers
+# demo         the demo head, from photographs to views, in all of these readers; its files beside their schemas
 # fuzz         three seconds for every reader of foreign bytes
 #
 # `all` adds loops and breadth. Each claim has its test in the check, or is about a program of somebody else:
@@ -24,7 +24,7 @@
 #              on that driver once, beside the CPU.
 # fleet        six heads under kills of tasks and of the engine, two and a half minutes. Only the recipe in `tools/fleet` is
 #              not in the check; the kills, waits and exit codes that it relies on are, in `resume`, `accidents` and `cli`.
-# guides       every command of three guides, five minutes. The commands themselves are in the check, in `cli`.
+# guides       every command of four guides, five minutes. The commands themselves are in the check, in `cli`.
 # blender      exports, lobes and the import of a run in Blender: a download of 350 MB. The check reads the same files with
 #              five other readers.
 # browser      the annotation page, the report and the page of many runs in Chromium: a download of 90 MB and scripts of a
@@ -343,6 +343,9 @@ demo() {
   readers_agree "the demo head" "$head" --up 0 0 1
   step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$head"
   readers_agree "the exported head" "$exported" --up 0 0 1
+  local checks=tools/readers
+  step "the files of the run are as their schemas say" .venv/bin/python $checks/check_schemas.py "$scratch/demo"
+  step "scripts read the run" .venv/bin/python $checks/check_scripts.py "$scratch/demo"
 }
 
 ## Parts of `all` alone.
@@ -401,7 +404,8 @@ blender_agrees() {
   in_blender "Blender agrees on the soft globe" $checks/check_blender.py "$scratch/globe/globe_soft.glb" --up 0 0 1
   in_blender "Blender agrees on the demo head" $checks/check_blender.py "$head" --up 0 0 1
   in_blender "Blender agrees on the exported head" $checks/check_blender.py "$exported" --lit --up 0 0 1
-  in_blender "Blender imports the run" $checks/check_addon.py "$scratch/demo"
+  in_blender "the Blender extension is packed" tools/blender/make_extension.py "$target/tiface_import.zip"
+  in_blender "Blender imports the run with it" $checks/check_addon.py "$scratch/demo"
   in_blender "Blender shows its lobes" $checks/check_lobes.py "$scratch/demo"
 }
 

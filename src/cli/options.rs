@@ -36,8 +36,10 @@ pub(super) struct Common {
     /// Set a configuration key; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE", add = ArgValueCompleter::new(complete_setting))]
     pub set: Vec<String>,
-    /// Device to train and render on: auto, cpu, wgpu, vulkan, metal or dx12; :N selects an adapter
-    /// by number
+    /// Device: auto, cpu, wgpu, vulkan, metal or dx12; :N selects an adapter
+    ///
+    /// It trains and renders. `vulkan:1` is the second adapter of that kind, as `tiface doctor`
+    /// numbers them.
     #[arg(long, global = true, env = "TIFACE_DEVICE", hide_env = true)]
     pub device: Option<String>,
     /// Make training on a GPU bitwise reproducible, by fixed-point accumulation; on the CPU it

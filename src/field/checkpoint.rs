@@ -10,7 +10,8 @@ use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use tiface_base::io::{
-    Limits, ReadError, TensorValues, Tensors, is_file, read_tensors, remove, rename, write_tensors,
+    Limits, ReadError, TensorValues, Tensors, WriteError, is_file, read_tensors, remove, rename,
+    tensor_bytes, write_tensors,
 };
 use tiface_base::{Error, ErrorKind, Result};
 
@@ -32,9 +33,39 @@ fn previous(dir: &Path) -> PathBuf {
     dir.join("checkpoint.previous.safetensors")
 }
 
+fn next(dir: &Path) -> PathBuf {
+    dir.join("checkpoint.next.safetensors")
+}
+
 /// Removes the previous checkpoint, which a completed training no longer needs.
 pub fn finish(dir: &Path) -> Result<()> {
     Ok(remove(&previous(dir))?)
+}
+
+/// Returns whether this is the name of a checkpoint that a completed training no longer needs.
+pub fn is_old(name: &str) -> bool {
+    [previous, next].iter().any(|path| path(Path::new("")) == Path::new(name))
+}
+
+/// Returns the bytes of a finished checkpoint of a stage without the optimizer's moments, which
+/// only a training that goes on reads; `None` if it is not finished, has no moments, or is of
+/// another format than these.
+pub fn without_moments(path: &Path, stage: &'static str, formats: &[&str]) -> Result<Option<Vec<u8>>> {
+    let (tensors, header) = read_tensors(path, &Limits::default()).map_err(|e| unreadable(e, stage))?;
+    let says = |key: &str, words: &[&str]| header.get(key).is_some_and(|word| words.contains(&word.as_str()));
+    let (moments, kept): (Vec<_>, Vec<_>) = tensors
+        .into_iter()
+        .map(|(name, (shape, v))| (name, shape, v))
+        .partition(|(name, ..)| is_moment(name));
+    if moments.is_empty() || !says("finished", &["1"]) || !says("format", formats) {
+        return Ok(None);
+    }
+    let bytes = tensor_bytes(&kept, &header).map_err(|problem| WriteError::content(path, problem))?;
+    Ok(Some(bytes))
+}
+
+fn is_moment(name: &str) -> bool {
+    ["first.", "second."].iter().any(|prefix| name.starts_with(prefix))
 }
 
 /// Returns the hint for errors that no checkpoint of a stage can recover from.
@@ -101,7 +132,7 @@ impl Checkpoint {
     /// previous one.
     pub fn save(self, dir: &Path) -> Result<()> {
         let path = newest(dir);
-        let next = dir.join("checkpoint.next.safetensors");
+        let next = next(dir);
         let tensors: Vec<_> = self.tensors.into_iter().map(|(name, (shape, v))| (name, shape, v)).collect();
         write_tensors(&next, &tensors, &self.header)?;
         if is_file(&path) {
@@ -144,6 +175,11 @@ impl Checkpoint {
     /// Returns whether the checkpoint holds a tensor.
     pub fn has(&self, name: &str) -> bool {
         self.tensors.contains_key(name)
+    }
+
+    /// Returns whether the checkpoint holds the optimizer's moments, which a finished one may lack.
+    pub fn has_moments(&self) -> bool {
+        self.tensors.keys().any(|name| is_moment(name))
     }
 
     /// Removes and returns a tensor of floats, which must have exactly this shape.

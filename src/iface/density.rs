@@ -40,7 +40,7 @@ use tiface_kernels::cpu::schedule::Figures;
 use tiface_kernels::gpu::Adapter;
 
 /// Version of the checkpoints' layout.
-const FORMAT: &str = "tiface-density-1";
+pub(super) const FORMAT: &str = "tiface-density-1";
 
 /// Milestones of the learning rate, as shares of the steps (10, 15 and 18 of 20 thousand), and its
 /// factor at each.

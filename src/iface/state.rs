@@ -48,7 +48,7 @@ impl<const GROUPS: usize> FieldState<GROUPS> {
     }
 
     /// Reads the state from a checkpoint; names, shapes and types must be exactly those of the
-    /// parts.
+    /// parts. The moments that a finished checkpoint may lack are then zero.
     pub fn restore(
         parts: [Vec<ParameterPart>; GROUPS],
         config: &IfaceConfig,
@@ -57,8 +57,9 @@ impl<const GROUPS: usize> FieldState<GROUPS> {
     ) -> Result<Self> {
         let mut state =
             FieldState::start(parts.map(|parts| HostGroup { parts, ..HostGroup::default() }), config, hull);
+        let with_moments = from.has_moments() || from.number_or("finished", 0, 0..=1)? == 0;
         for group in &mut state.groups {
-            *group = HostGroup::restore(std::mem::take(&mut group.parts), from, true)?;
+            *group = HostGroup::restore(std::mem::take(&mut group.parts), from, with_moments)?;
         }
         state.occupancy.restore(from)?;
         if from.has("stereo") {

@@ -77,8 +77,23 @@ fn a_ball_is_learned_from_eight_views() {
     let seen = face.render(&[ray])[0];
     assert!(seen.opacity > 0.9 && seen.color[0] > seen.color[1], "{seen:?}");
     // the same field comes back from its checkpoint
-    let loaded = IFace::load(dir.path(), &config(), Some(&hull)).unwrap();
-    assert_eq!(loaded.render(&[ray])[0], seen);
+    let load = || IFace::load(dir.path(), &config(), Some(&hull));
+    assert_eq!(load().unwrap().render(&[ray])[0], seen);
+    // and without the moments, two thirds of the file, which an unfinished one must have
+    let file = checkpoint::newest(dir.path());
+    let size = std::fs::metadata(&file).unwrap().len();
+    let rest = crate::iface::without_moments(&file).unwrap().unwrap();
+    assert!((rest.len() as u64) < size * 2 / 5, "{} of {size}", rest.len());
+    std::fs::write(&file, &rest).unwrap();
+    assert_eq!(load().unwrap().render(&[ray])[0], seen);
+    let (again, _) =
+        train(&views, Some(&hull), &config(), &session("iface", dir.path(), "ball", &Quiet)).unwrap();
+    assert_eq!(again.render(&[ray])[0], seen);
+    assert_eq!(std::fs::read(&file).unwrap(), rest);
+    assert!(crate::iface::without_moments(&file).unwrap().is_none());
+    tampered(dir.path(), says("finished", "0"));
+    let error = load().map(drop).unwrap_err().to_string();
+    assert!(error.contains("`first.table` is missing"), "{error}");
 }
 
 #[test]

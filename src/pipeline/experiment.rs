@@ -326,7 +326,7 @@ fn figures(session: &Session, row: &ExperimentRow, value: &Value) -> Measured {
 pub fn ahead(session: &Session, run: &str) -> Result<Option<Cost>> {
     let is_left = |stage: &Stage| !session.run.is_done(&session.plan(*stage));
     let left: Vec<Stage> = stages(session, run).into_iter().filter(is_left).collect();
-    session.require_inputs(&left)?;
+    session.require_work(&left)?;
     Ok(left.into_iter().map(|stage| session.cost(stage)).reduce(|sum, cost| sum + cost))
 }
 

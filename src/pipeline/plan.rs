@@ -53,7 +53,7 @@ impl Session<'_> {
             });
             found.push((name.to_string(), differences));
         }
-        self.require_inputs(&missing)?;
+        self.require_work(&missing)?;
         self.require_masks(&missing)?;
         Ok(found)
     }
@@ -74,7 +74,7 @@ impl Session<'_> {
         self.agrees(until, &[])?;
         let order = self.order(until).into_iter();
         let left: Vec<Stage> = order.filter(|stage| !self.run.is_done(&self.plan(*stage))).collect();
-        self.require_inputs(&left)?;
+        self.require_work(&left)?;
         self.write_estimate(left.is_empty())?;
         self.write("config.toml", self.config.to_toml().as_bytes(), left.is_empty())
     }
@@ -162,7 +162,7 @@ impl Session<'_> {
             .into_iter()
             .filter(|s| *s == stage || names.iter().any(|name| name == s.as_str()))
             .collect();
-        self.require_inputs(&made)?;
+        self.require_work(&made)?;
         self.require_masks(&made)?;
         // do not clear a finished blend whose views could not be made again
         let blended = names.iter().any(|n| n == Stage::Ensemble.as_str())

@@ -1,6 +1,7 @@
 //! A capture, its configuration and its run folder, which every stage works on.
 
 use super::cameras::CameraCheck;
+use super::clean::require_float_views;
 use super::exposure::ExposureCheck;
 use super::inputs::{Inputs, missing_capture};
 use super::path::CameraPath;
@@ -163,6 +164,13 @@ impl<'a> Session<'a> {
     /// if the session has one.
     pub(super) fn render_config(&self) -> &RenderConfig {
         self.path.as_ref().map_or(&self.config.render, |path| &path.render)
+    }
+
+    /// Fails if one of these stages cannot be worked on, because an input of it is missing or was
+    /// removed from the run.
+    pub(super) fn require_work(&self, stages: &[Stage]) -> Result<()> {
+        require_float_views(self.run, stages)?;
+        self.require_inputs(stages)
     }
 
     /// Fails if an input of one of these stages is missing: photographs, checkpoints, networks or

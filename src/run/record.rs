@@ -37,6 +37,9 @@ pub struct Record {
     /// SHA-256 of the same files, hexadecimal; empty in older records.
     #[serde(default)]
     pub sha256: BTreeMap<String, String>,
+    /// Bytes that [`Run::clean`](super::Run::clean) removed, by the path of the file.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub cleaned: BTreeMap<String, u64>,
     /// Seconds since 1970.
     pub finished: u64,
     /// Version of `tiface`.
@@ -104,6 +107,12 @@ impl Display for Fault {
 }
 
 impl Record {
+    /// Writes the record into the stage's folder.
+    pub(super) fn write(&self, folder: &Path) -> Result<()> {
+        let text = serde_json::to_string_pretty(self).unwrap_or_default();
+        Ok(io::write_atomic(&folder.join("done.json"), format!("{text}\n").as_bytes())?)
+    }
+
     /// Returns the fault of one of the stage's files, if it is missing from the stage's folder or
     /// has another size.
     pub fn fault(&self, folder: &Path, name: &str) -> Option<Fault> {

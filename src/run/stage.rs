@@ -271,11 +271,11 @@ impl Run {
             warnings: stage.progress.warnings(),
             products,
             sha256,
+            cleaned: BTreeMap::new(),
             finished: now(),
             version: env!("CARGO_PKG_VERSION").into(),
         };
-        let text = serde_json::to_string_pretty(&record).unwrap_or_default();
-        io::write_atomic(&stage.folder.join("done.json"), format!("{text}\n").as_bytes())?;
+        record.write(&stage.folder)?;
         self.observer.event(&Event::Done { stage: plan.name, elapsed_s, summary: &summary });
         Ok(Done { digest, summary, skipped: false })
     }
@@ -328,7 +328,7 @@ fn same(plan: &Plan, found: &Fingerprint, done: bool) -> Result<()> {
 
 /// Removes temporary files in a stage's folder and its subfolders, except behind links and in
 /// folders that another process may be writing.
-fn sweep(folder: &Path) -> Result<usize> {
+pub(super) fn sweep(folder: &Path) -> Result<usize> {
     if io::is_link(folder) {
         return Ok(0);
     }

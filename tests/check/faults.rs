@@ -137,13 +137,14 @@ fn faults_lose_nothing(most: usize, least: usize) {
         let (after, count) = bench.try_faults(&place, &[stage.as_str(), capture, "--run", "HERE/run"], tried);
         (place, tried) = (after, tried + count);
     }
-    let words: [&[&str]; 6] = [
+    let words: [&[&str]; 7] = [
         &["report", "HERE/run", "--out", "HERE/page.html"],
         &["export", "HERE/run", "--triangles", "200", "--out", "HERE/small.obj"],
         &["mesh", "HERE/run", "--out", "HERE/head.obj"],
         &["render", "HERE/run", "--out", "HERE/views/"],
         &["preview", "HERE/run", "--size", "64", "--out", "HERE/turn.png"],
         &["run", "HERE/run", "--fresh", "mesh"],
+        &["clean", "HERE/run", "--yes"],
     ];
     for words in words {
         tried += bench.try_faults(&place, words, tried).1;

@@ -20,6 +20,7 @@ mod accidents;
 mod bench;
 mod cameras;
 mod captures;
+mod clean;
 mod cli;
 mod colmap;
 #[cfg(all(feature = "wgpu", unix))]

@@ -28,7 +28,7 @@ pub fn capture(folder: &Path) -> PathBuf {
 /// The program with these words in a folder, and the settings of the smallest run.
 pub fn tiface(folder: &Path, words: &[&str]) -> Command {
     let mut command = command(folder, words);
-    if !["report", "convert", "preview", "export", "status"].contains(&words[0]) {
+    if !["report", "convert", "preview", "export", "status", "clean"].contains(&words[0]) {
         command.args(["--preset", "draft"]);
         for setting in FIELD.split_whitespace().chain(OTHERS.split_whitespace()) {
             command.args(["--set", setting]);

@@ -1,7 +1,7 @@
-"""Blender add-on that imports a run of tiface: the head, its cameras, and their photographs as backgrounds.
+"""Blender extension that imports a run of tiface: the head, its cameras, and their photographs as backgrounds.
 
-Install: Edit > Preferences > Add-ons > Install from Disk, choose this file, switch it on. Then File > Import > tiface run, and
-choose the folder of the run. From a script:
+Pack it with `python tools/blender/make_extension.py`, then Edit > Preferences > Get Extensions > Install from Disk, and choose
+the zip. Then File > Import > tiface run, and choose the folder of the run. From a script, with this folder in Python's path:
 
     import tiface_import
     tiface_import.import_run("runs/head")
@@ -31,16 +31,6 @@ import tomllib
 import bpy
 import bpy_extras.io_utils
 import mathutils
-
-bl_info = {
-    "name": "tiface run",
-    "author": "tiface",
-    "version": (0, 1, 0),
-    "blender": (4, 2, 0),
-    "location": "File > Import > tiface run",
-    "description": "Import a head with its cameras and photographs",
-    "category": "Import-Export",
-}
 
 BLENDER_FROM_GLTF = mathutils.Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 SENSOR_MM = 36.0
@@ -314,8 +304,11 @@ def add_background(camera, photograph):
 
 def set_scene(scene, views):
     """Shows unlit colors as they are stored, in pictures of the size and the pixels that most photographs have."""
+    scene.display_settings.display_device = "sRGB"
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
+    scene.view_settings.exposure, scene.view_settings.gamma = 0.0, 1.0
+    scene.view_settings.use_curve_mapping = False
     if hasattr(scene, "cycles"):
         scene.cycles.transparent_max_bounces = max(scene.cycles.transparent_max_bounces, TRANSPARENT_BOUNCES)
     shapes = collections.Counter(
@@ -412,7 +405,3 @@ def register():
 def unregister():
     bpy.types.TOPBAR_MT_file_import.remove(menu)
     bpy.utils.unregister_class(ImportTifaceRun)
-
-
-if __name__ == "__main__":
-    register()

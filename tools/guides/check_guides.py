@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
 from tiny_heads import SETTINGS, photograph  # noqa: E402
 
-GUIDES = [ROOT / "docs" / name for name in ("artist.md", "researcher.md", "many-heads.md")]
+GUIDES = [ROOT / "docs" / name for name in ("artist.md", "export.md", "researcher.md", "many-heads.md")]
 
 
 def blocks(text):

@@ -1,27 +1,68 @@
-"""Imports a run with tools/blender/tiface_import.py, without a window, and compares what Blender then has with the run.
+"""Installs the extension of tools/blender as a user does, imports a run with it, without a window, and compares what Blender
+then has with the run.
 
     python3.11 -m venv .venv-blender && .venv-blender/bin/pip install -r tools/readers/requirements-blender.txt
     .venv-blender/bin/python tools/readers/check_addon.py RUN
 
-Checked: every vertex of the head is seen where the run's own cameras see it, through `mesh/surface.ply`'s world, to 0.05
-pixels; vertices have their number of cameras; each view has its photograph; colors are shown as stored; folders that are
-no runs are refused in a sentence. Exits 1 after printing every disagreement.
+Checked: the zip installs, with the version of the program; every vertex of the head is seen where the run's own cameras see
+it, through `mesh/surface.ply`'s world, to 0.05 pixels; vertices have their number of cameras; each view has its photograph;
+soft layers are there if the file has them; a picture with the scene as it is then shows the colors of the run's own view
+(`render/textured`), to two levels on average where both are opaque; folders that are no runs are refused in a sentence.
+Exits 1 after printing every disagreement.
 """
 
 import json
+import os
 import pathlib
+import subprocess
 import sys
 import tempfile
+import tomllib
 
-import bpy
-import mathutils
-import numpy
-from bpy_extras.object_utils import world_to_camera_view
+# nobody's own extensions and preferences
+scratch_folder = tempfile.TemporaryDirectory()
+os.environ["BLENDER_USER_RESOURCES"] = scratch_folder.name
 
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "blender"))
-import tiface_import
+import bpy  # noqa: E402
+import mathutils  # noqa: E402
+import numpy  # noqa: E402
+from bpy_extras.object_utils import world_to_camera_view  # noqa: E402
+from PIL import Image  # noqa: E402
 
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 MOST_PX = 0.05
+MOST_LEVELS = 2.0
+
+
+def installed(wrong):
+    """Packs the extension, installs it with Blender's own installer, and returns its module."""
+    package = pathlib.Path(scratch_folder.name) / "tiface_import.zip"
+    subprocess.run([sys.executable, ROOT / "tools/blender/make_extension.py", package], check=True)
+    bpy.ops.extensions.package_install_files(repo="user_default", filepath=str(package), enable_on_install=True)
+    manifest = tomllib.loads((ROOT / "tools/blender/blender_manifest.toml").read_text())
+    version = tomllib.loads((ROOT / "Cargo.toml").read_text())["workspace"]["package"]["version"]
+    if manifest["version"] != version:
+        wrong.append(f"the extension has version {manifest['version']}, the program {version}")
+    return sys.modules["bl_ext.user_default.tiface_import"]
+
+
+def shown_colors(scene, run, view, wrong):
+    """Renders the scene as the import has left it, from the camera of a view, and compares it with the run's own view."""
+    own = numpy.asarray(Image.open(run / f"render/textured/{view['name']}.png").convert("RGBA"), float)
+    scene.camera = scene.objects[view["name"]]
+    scene.render.resolution_x, scene.render.resolution_y = view["camera"]["width"], view["camera"]["height"]
+    scene.render.engine = "CYCLES"
+    scene.cycles.device, scene.cycles.samples = "CPU", 16
+    scene.render.film_transparent = True
+    scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
+    scene.render.filepath = str(pathlib.Path(scratch_folder.name) / "shown.png")
+    bpy.ops.render.render(write_still=True)
+    shown = numpy.asarray(Image.open(scene.render.filepath), float)
+    opaque = (shown[..., 3] == 255) & (own[..., 3] == 255)
+    off = numpy.abs(shown - own)[opaque][:, :3].mean()
+    print(f"{view['name']}: {off:.2f} levels on average over {opaque.sum()} opaque pixels")
+    if not (off <= MOST_LEVELS and opaque.sum() > 0.5 * (own[..., 3] == 255).sum()):
+        wrong.append(f"{view['name']} is shown {off:.2f} levels off, over {opaque.sum()} opaque pixels")
 
 
 def matrix(columns):
@@ -32,7 +73,7 @@ def main():
     run = pathlib.Path(sys.argv[1])
     wrong = []
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    tiface_import.register()
+    tiface_import = installed(wrong)
     if bpy.ops.import_scene.tiface_run(directory=str(run)) != {"FINISHED"}:
         wrong.append("the operator did not finish")
     scene = bpy.context.scene
@@ -83,6 +124,13 @@ def main():
         wrong.append(f"vertices are {farthest} pixels off, at most {MOST_PX} expected")
     if scene.view_settings.view_transform != "Standard":
         wrong.append(f"view transform {scene.view_settings.view_transform}")
+    if scene.cycles.transparent_max_bounces < tiface_import.TRANSPARENT_BOUNCES:
+        wrong.append(f"{scene.cycles.transparent_max_bounces} transparent bounces")
+    document, _ = tiface_import.read_glb(run / "mesh/head.glb")
+    meshes = [found for found in scene.objects if found.type == "MESH"]
+    if len(meshes) != len(document["meshes"]):
+        wrong.append(f"{len(meshes)} meshes, {len(document['meshes'])} in the file: soft layers are a mesh of their own")
+    shown_colors(scene, run, next(view for view in views if view["split"] == "test"), wrong)
     # what is no run, a run cut short
     with tempfile.TemporaryDirectory() as scratch:
         broken = pathlib.Path(scratch) / "broken"
@@ -111,7 +159,9 @@ def main():
         found = [view["camera"] for view in tiface_import.views_of(broken)]
         if found != [{"fx": 1, "position": [1, 2, 3]}, {"position": [0, 0, 0]}]:
             wrong.append(f"poses {found}")
-    tiface_import.unregister()
+    bpy.ops.extensions.package_uninstall(repo_index=1, pkg_id="tiface_import")
+    if hasattr(bpy.types, "IMPORT_SCENE_OT_tiface_run"):
+        wrong.append("the extension stays after it is removed")
     for line in wrong:
         print("WRONG", line)
     return 1 if wrong else 0

@@ -23,7 +23,7 @@ pub use animation::{ANIMATIONS, Animation, Frames, write_animation};
 pub use folder::{
     Lock, LockError, any_file, append, begins, clear_folder, create_folder, exists, file_size, file_sizes,
     files_below, free_bytes, is_file, is_folder, is_link, is_writable, list_files, list_folders, list_hidden,
-    modified, real_path, remove_empty_folder, similar,
+    modified, real_path, remove_empty_folder, set_modified, similar,
 };
 pub use json::{parse_json, read_json, read_typed, typed};
 pub use mask_picture::{MaskPicture, read_gray, read_mask};

@@ -230,6 +230,12 @@ pub fn modified(path: &Path) -> Option<SystemTime> {
     fs::metadata(path).and_then(|m| m.modified()).ok()
 }
 
+/// Sets when a file was last changed.
+pub fn set_modified(path: &Path, time: SystemTime) -> Result<(), WriteError> {
+    let file = OpenOptions::new().write(true).open(path).map_err(failed(path))?;
+    file.set_modified(time).map_err(failed(path))
+}
+
 /// Appends a line to a log. If the last writer was stopped in the middle of a line, that line is
 /// ended first, so that it spoils only itself. A link is an error, because its target may be any
 /// file.

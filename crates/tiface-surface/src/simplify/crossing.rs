@@ -170,6 +170,7 @@ pub(crate) fn without_crossings(positions: &mut [Vec3], triangles: &[[u32; 3]], 
             return back;
         }
     }
+    back += positions.iter().zip(start).filter(|(p, from)| p != from).count();
     positions.copy_from_slice(start);
     back
 }
