@@ -105,9 +105,11 @@ impl fmt::Display for Warning {
                  or make it cross itself"
             ),
             Warning::NotManifold(vertices) => {
-                write!(f, "{vertices} vertices are not manifold and stayed as they are")
+                write!(f, "vertices where the surface is no manifold, which stayed: {vertices}")
             }
-            Warning::Crossing(triangles) => write!(f, "{triangles} triangles cross others, as in the input"),
+            Warning::Crossing(triangles) => {
+                write!(f, "triangles that cross others, as in the input: {triangles}")
+            }
             Warning::NoCharts { gutter_px, reason } => write!(
                 f,
                 "every triangle has a piece of the texture of its own, {gutter_px:.1} texels of gutter: \
