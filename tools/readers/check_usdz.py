@@ -3,8 +3,8 @@
     tiface export RUN --format glb,usdz --out DIR/
     python tools/readers/check_usdz.py DIR/head.usdz ...
 
-The rules of `usdchecker --arkit` hold: alignment, encapsulation, types of shaders, up direction and unit.
-As in the GLB: triangles, bounds to 1e-6 of the size, closed as it is, volume, corners of the texture,
+All validators of `usdchecker` accept it, with those of USDZ: alignment, encapsulation, endings, shaders,
+up direction and unit. So do ARKit's lists of types, which `usdchecker` no longer has. As in the GLB: triangles, bounds to 1e-6 of the size, closed as it is, volume, corners of the texture,
 pixels of the picture, and whether the material is unlit, which a USDZ says by emitting the color. Texture
 coordinates lie within 0..1. Exits 1 after printing every disagreement.
 """
@@ -12,12 +12,13 @@ coordinates lie within 0..1. Exits 1 after printing every disagreement.
 import io
 import json
 import pathlib
+import re
 import sys
 import zipfile
 
 import numpy
 import PIL.Image
-from pxr import Usd, UsdGeom, UsdShade, UsdUtils
+from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
 from meshes import LoadedMesh, closed_and_volume, with_trimesh
 
@@ -29,10 +30,20 @@ def is_unlit(glb):
     return "KHR_materials_unlit" in document["materials"][0].get("extensions", {})
 
 
-def rules_broken(path):
-    checker = UsdUtils.ComplianceChecker(arkit=True)
-    checker.CheckCompliance(str(path))
-    return [*checker.GetErrors(), *checker.GetFailedChecks(), *checker.GetWarnings()]
+def rules_broken(stage):
+    """What validators and the lists of ARKit say of a stage."""
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    names = [validator.GetMetadata().name for validator in validators]
+    wrong = [] if "usdUtilsValidators:RootPackageValidator" in names else ["there is no validator of USDZ"]
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    wrong += [error.GetErrorAsString() for error in errors]
+    for prim in stage.Traverse():
+        if prim.GetTypeName() not in ["Xform", "Mesh", "Material", "Shader"]:
+            wrong.append(f"{prim.GetPath()} is of type `{prim.GetTypeName()}`")
+        shader = UsdShade.Shader(prim)
+        if shader and not re.fullmatch("UsdPreviewSurface|UsdUVTexture|UsdPrimvarReader_.*", shader.GetShaderId()):
+            wrong.append(f"{prim.GetPath()} is the shader `{shader.GetShaderId()}`")
+    return wrong
 
 
 def picture_of(path, texture):
@@ -52,7 +63,7 @@ def source_of(shader, name):
 def with_pxr(path):
     """The mesh, which of its inputs shows the color, and what is wrong with its stage."""
     stage = Usd.Stage.Open(str(path))
-    wrong = []
+    wrong = rules_broken(stage)
     if (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) != ("Y", 1.0):
         wrong.append("not in meters with +Y up")
     (prim,) = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
@@ -128,7 +139,6 @@ def main():
         glb = path.with_suffix(".glb")
         print(f"{path.name} in USD {'.'.join(map(str, Usd.GetVersion()))}: {path.stat().st_size} bytes,"
               f" {len(loaded.vertices)} vertices {len(loaded.faces)} triangles, color as {shown}")
-        bad += rules_broken(path)
         bad += differences(loaded, with_trimesh(glb), shown, is_unlit(glb))
         wrong += [f"{path.name}: {line}" for line in bad]
     for line in wrong:
