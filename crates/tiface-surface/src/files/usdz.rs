@@ -165,7 +165,7 @@ fn put_mesh(out: &mut String, file: &FileMesh, is_closed: bool, root: &str) {
     }
     put_vectors(out, "point3f[] points", None, file.positions.iter().map(|p| p.to_array()));
     if !file.colors.is_empty() {
-        let linear = file.colors.iter().map(|c| c.map(|v| linear_from_srgb(v.clamp(0.0, 1.0))));
+        let linear = file.colors.iter().map(|c| c.map(linear_from_srgb));
         put_vectors(out, "color3f[] primvars:displayColor", Some("vertex"), linear);
     }
     if !file.corners.is_empty() {
