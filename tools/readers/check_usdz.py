@@ -4,9 +4,10 @@
     python tools/readers/check_usdz.py DIR/head.usdz ...
 
 All validators of `usdchecker` accept it, with those of USDZ: alignment, encapsulation, endings, shaders,
-up direction and unit. So do ARKit's lists of types, which `usdchecker` no longer has. As in the GLB: triangles, bounds to 1e-6 of the size, closed as it is, volume, corners of the texture,
-pixels of the picture, and whether the material is unlit, which a USDZ says by emitting the color. Texture
-coordinates lie within 0..1. Exits 1 after printing every disagreement.
+up direction and unit. So do ARKit's lists of types, which `usdchecker` no longer has. As in the GLB:
+triangles, bounds to 1e-6 of the size, closed as it is, volume, corners of the texture, pixels of the
+picture, and whether the material is unlit, which a USDZ says by emitting the color. Texture coordinates
+lie within 0..1. Exits 1 after printing every disagreement.
 """
 
 import io
@@ -21,6 +22,9 @@ import PIL.Image
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
 from meshes import LoadedMesh, closed_and_volume, with_trimesh
+
+
+ARKIT_SHADERS = "UsdPreviewSurface|UsdUVTexture|UsdTransform2d|UsdPrimvarReader_.*"
 
 
 def is_unlit(glb):
@@ -41,7 +45,7 @@ def rules_broken(stage):
         if prim.GetTypeName() not in ["Xform", "Mesh", "Material", "Shader"]:
             wrong.append(f"{prim.GetPath()} is of type `{prim.GetTypeName()}`")
         shader = UsdShade.Shader(prim)
-        if shader and not re.fullmatch("UsdPreviewSurface|UsdUVTexture|UsdPrimvarReader_.*", shader.GetShaderId()):
+        if shader and not re.fullmatch(ARKIT_SHADERS, shader.GetShaderId()):
             wrong.append(f"{prim.GetPath()} is the shader `{shader.GetShaderId()}`")
     return wrong
 

@@ -1,10 +1,10 @@
 //! A mesh as USDZ: a stage of *Universal Scene Description* with its pictures in one file, which
 //! Safari and the viewers of iPhone, iPad, Mac and Vision Pro show, also in the room.
 //!
-//! +Y up, meters, counter-clockwise, no subdivision. The stage is text (`.usda`), which every reader
-//! of USDZ takes. Positions and texture coordinates are indexed apart, as in an OBJ: the surface
-//! stays closed whatever its seams. A mesh far from the origin lies around its own middle, with the
-//! way there in f64 on the node above it.
+//! +Y up, meters, counter-clockwise, no subdivision. The stage is text (`.usda`), which every
+//! reader of USDZ takes. Positions and texture coordinates are indexed apart, as in an OBJ: the
+//! surface stays closed whatever its seams. A mesh far from the origin lies around its own middle,
+//! with the way there in f64 on the node above it.
 //!
 //! Shading is `UsdPreviewSurface`, the only one that all of these viewers know, and it has no unlit
 //! kind. Colors that already hold the light are therefore emitted, by a surface that reflects
@@ -12,8 +12,8 @@
 //! end, as tone mapping, it does to these, too.
 //!
 //! What is left out: soft layers, since no input of that shader makes what is emitted transparent,
-//! Apple's viewers read no opacity from vertices, and USD defines no drawing order; and textures that
-//! depend on the view.
+//! Apple's viewers read no opacity from vertices, and USD defines no drawing order; and textures
+//! that depend on the view.
 //!
 //! Names within the file do not depend on its own, so a file that is renamed has the same bytes.
 
@@ -307,7 +307,7 @@ mod tests {
     fn a_colored_triangle_is_this_stage() {
         let options = ExportOptions { up: Vec3::Z, name: "7 \"heads\"\n".into(), ..Default::default() };
         let (stage, others) = opened(&written(&triangle(), None, &options));
-        // z becomes y; −y, the normal, becomes z; colors are 0 or 1, which linear light leaves alone
+        // z becomes y; −y, the normal, becomes z; colors are 0 or 1, in linear light, too
         let expected = r#"    metersPerUnit = 1
     upAxis = "Y"
 )
