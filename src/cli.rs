@@ -267,6 +267,7 @@ pictures of meshes are written to CAPTURE_judged/ or to --out; no run is started
     /// Write the finished mesh of a run in another format, material, frame or smaller size
     #[command(after_long_help = "Examples:
   tiface export runs/002_00 --out head.obj      the ending selects the format
+  tiface export runs/002_00 --out head.usdz     iPhone, iPad, Mac and Safari show it by themselves
   tiface export runs/002_00 --material lit --frame head --out lit.glb
   tiface export runs/002_00 --format glb,ply --triangles 10000 --texture 1024 --out small/
   tiface export runs/002_00 --hair none --height 0.3        write to 002_00.glb

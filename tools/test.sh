@@ -10,7 +10,7 @@
 # unit         unit tests, examples in the documentation
 # integration  the program as a user runs it: commands, hostile files, kills
 # readers      exported shapes in trimesh, open3d, three.js and the Khronos validator
-# demo         the demo head, from photographs to views, in all of these readers; its files beside their schemas
+# demo         the demo head, from photographs to views, in all of these readers and Pixar's USD; its files beside their schemas
 # fuzz         three seconds for every reader of foreign bytes
 #
 # `all` adds loops and breadth. Each claim has its test in the check, or is about a program of somebody else:
@@ -108,7 +108,7 @@ python_readers() {
   .venv/bin/python -m pip install --quiet --disable-pip-version-check -r tools/readers/requirements.txt || return
   # open3d's wheel leaves four shared libraries to the system
   .venv/bin/python -c 'import open3d' 2> /dev/null || apt_installs libusb-1.0-0 libgl1 libgomp1 libx11-6 || return
-  .venv/bin/python -c 'import open3d, trimesh' &&
+  .venv/bin/python -c 'import open3d, trimesh; from pxr import Usd' &&
     npm ci --silent --no-audit --no-fund --prefix tools/readers
 }
 
@@ -316,7 +316,7 @@ readers() {
 train_demo() {
   "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps="$1" \
     --set tface.steps=$(($1 * 2 / 3)) --set baseline.steps=$(($1 / 3)) --set mesh.resolution=128 \
-    --set mesh.format=glb,obj,ply --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured "${@:2}"
+    --set mesh.format=glb,obj,ply,usdz --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured "${@:2}"
 }
 demo_made=no
 make_demo() {
@@ -332,8 +332,8 @@ make_demo() {
 }
 # The demo head again, with fewer triangles, another material and a smaller texture.
 export_demo() {
-  "$target/release/tiface" export "$scratch/demo" --material lit --triangles 3000 --texture 512 --format glb,obj,ply \
-    --out "$scratch/exported/"
+  "$target/release/tiface" export "$scratch/demo" --material lit --triangles 3000 --texture 512 \
+    --format glb,obj,ply,usdz --out "$scratch/exported/"
 }
 head=$scratch/demo/mesh/head.glb
 exported=$scratch/exported/head.glb
@@ -343,6 +343,9 @@ demo() {
   readers_agree "the demo head" "$head" --up 0 0 1
   step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$head"
   readers_agree "the exported head" "$exported" --up 0 0 1
+  # unlit, as the stage left it, and lit, as it was exported
+  step "USD agrees on both, by the rules of ARKit" .venv/bin/python tools/readers/check_usdz.py "${head%.glb}.usdz" \
+    "${exported%.glb}.usdz"
   local checks=tools/readers
   step "the files of the run are as their schemas say" .venv/bin/python $checks/check_schemas.py "$scratch/demo"
   step "scripts read the run" .venv/bin/python $checks/check_scripts.py "$scratch/demo"

@@ -146,6 +146,10 @@ fn mesh_of(path: &Path, is_compared: bool) -> Result<(PathBuf, Option<Error>)> {
     let file =
         names.iter().map(|name| folder.join(name)).find(|file| io::is_file(file)).ok_or_else(|| {
             let run = path.display();
+            if io::is_file(&folder.join("head.usdz")) {
+                let what = format!("`{run}` has its mesh as .usdz alone, which is not read");
+                return Error::cannot(what, format!("write a GLB: `tiface export {run} --out head.glb`"));
+            }
             Error::cannot(format!("`{run}` has no exported mesh"), format!("`tiface run {run}` makes it"))
         })?;
     Ok((file, None))

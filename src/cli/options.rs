@@ -22,8 +22,8 @@ pub(super) struct Common {
     pub run: Option<PathBuf>,
     /// Also write the result to PATH, a file or a folder
     ///
-    /// A file has the ending of its format: .glb, .obj or .ply, .json for metrics. A folder exists
-    /// or ends with /.
+    /// A file has the ending of its format: .glb, .obj, .ply or .usdz, .json for metrics. A folder
+    /// exists or ends with /.
     #[arg(short, long, global = true, value_name = "PATH")]
     pub out: Option<PathBuf>,
     /// Read a configuration file; repeatable, later files win

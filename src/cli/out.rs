@@ -24,8 +24,8 @@ pub(super) enum Out {
 /// Returns the file endings that a command can write.
 fn endings(product: &str) -> &'static [&'static str] {
     match product {
-        "run" => &["glb", "obj", "ply", "json"],
-        "mesh" | "export" => &["glb", "obj", "ply"],
+        "run" => &["glb", "obj", "ply", "usdz", "json"],
+        "mesh" | "export" => &["glb", "obj", "ply", "usdz"],
         "metrics" => &["json"],
         "page" | "report" => &["html"],
         "preview" => &["png"],

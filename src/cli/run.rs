@@ -237,7 +237,7 @@ fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &[PathBuf]) 
     }
     if let Some(mesh) = summary(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
-        let files = ["glb", "obj", "ply"].map(|e| run.path(format!("mesh/head.{e}")));
+        let files = ["glb", "obj", "ply", "usdz"].map(|e| run.path(format!("mesh/head.{e}")));
         let found = files.iter().find(|f| io::is_file(f));
         let first = found.map_or_else(|| "in no file".into(), |file| file.display().to_string());
         let handles = handles(&mesh["handles"]);

@@ -17,6 +17,8 @@ pub enum MeshFormat {
     Obj,
     /// Stanford, binary.
     Ply,
+    /// Universal Scene Description, a zip.
+    Usdz,
 }
 
 impl MeshFormat {
@@ -26,6 +28,7 @@ impl MeshFormat {
             MeshFormat::Glb => "glb",
             MeshFormat::Obj => "obj",
             MeshFormat::Ply => "ply",
+            MeshFormat::Usdz => "usdz",
         }
     }
 }
@@ -34,10 +37,10 @@ impl FromStr for MeshFormat {
     type Err = Error;
 
     fn from_str(word: &str) -> Result<MeshFormat> {
-        let all = [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply];
-        all.into_iter()
-            .find(|format| format.as_str() == word)
-            .ok_or_else(|| Error::usage(format!("there is no mesh format `{word}`"), "use glb, obj or ply"))
+        let all = [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply, MeshFormat::Usdz];
+        all.into_iter().find(|format| format.as_str() == word).ok_or_else(|| {
+            Error::usage(format!("there is no mesh format `{word}`"), "use glb, obj, ply or usdz")
+        })
     }
 }
 
@@ -136,12 +139,12 @@ table! {
         #[flag("hair", Text("KIND"), ["mesh", "export"],
             "Hair and other soft outlines: shells (translucent layers, where they help) or none")]
         hair: Hair [Head] => Hair::Shells, Hair::Shells, Hair::None;
-        /// Write a tangent-space map of the unsimplified normals to the GLB: true or false.
+        /// Write a tangent-space map of the unsimplified normals to GLB and USDZ: true or false.
         #[flag("normal-map", Switch("true"), ["mesh"],
             "Store the detail that simplification removes in a normal map; makes the material lit")]
         normal_map: bool [Head] => false;
-        /// Material of the GLB: unlit (colors as photographed, light included) or lit (shaded by
-        /// lamps, as a normal map needs).
+        /// Material of GLB and USDZ: unlit (colors as photographed, light included) or lit (shaded
+        /// by lamps, as a normal map needs).
         #[flag("material", Text("KIND"), ["mesh", "export"],
             "Material in other programs: unlit (colors as photographed) or lit (shaded by lamps)")]
         material: Material [Files] => Material::Unlit;
@@ -149,17 +152,17 @@ table! {
         texture_format: TextureFormat [Files] => TextureFormat::Png;
         /// Write the baked color to head.exr too, scene-linear: true or false.
         exr: bool [Files] => false;
-        /// Formats to write, a list of glb, obj, ply.
-        #[flag("format", Text("LIST"), ["mesh", "export"], "Formats to write: glb, obj, ply")]
+        /// Formats to write, a list of glb, obj, ply, usdz.
+        #[flag("format", Text("LIST"), ["mesh", "export"], "Formats to write: glb, obj, ply, usdz")]
         format: Vec<MeshFormat> [Files] => vec![MeshFormat::Glb];
         /// Coordinate frame of the files: dataset, or head (+Y up, face towards +Z, centered).
         #[flag("frame", Text("FRAME"), ["mesh", "export"],
             "Coordinate frame: dataset, or head (+Y up, face towards +Z)")]
         frame: MeshFrame [Files] => MeshFrame::Dataset;
-        /// Height of the head mesh in GLB and OBJ files, meters, from the crown to the end of what
-        /// is shown of the body; 0: as `capture.unit_m` says.
+        /// Height of the head mesh in GLB, OBJ and USDZ files, meters, from the crown to the end of
+        /// what is shown of the body; 0: as `capture.unit_m` says.
         #[flag("height", Text("METERS"), ["mesh", "export"],
-            "Height of the mesh in GLB and OBJ files: the dataset's units are scaled to it")]
+            "Height of the mesh in GLB, OBJ and USDZ files: the dataset's units are scaled to it")]
         height_m: f64, 0.0..=10.0 [Files] => 0.0;
     }
     constants {

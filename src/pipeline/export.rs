@@ -23,13 +23,16 @@ use tiface_surface::{SimplifyConfig, atlas, simplify};
 /// Keys that affect how the files of a mesh are written, each with what it is and the formats that
 /// show it.
 const FILE_KEYS: [(&str, &str, &[MeshFormat]); 6] = [
-    (key!(mesh.format), "format", &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply]),
-    (key!(mesh.material), "material", &[MeshFormat::Glb]),
-    (key!(mesh.frame), "frame but the dataset's", &[MeshFormat::Glb, MeshFormat::Obj]),
-    (key!(mesh.height_m), "height in meters", &[MeshFormat::Glb, MeshFormat::Obj]),
-    (key!(capture.unit_m), "length in meters", &[MeshFormat::Glb, MeshFormat::Obj]),
-    (key!(mesh.texture_format), "picture", &[MeshFormat::Glb, MeshFormat::Obj]),
+    (key!(mesh.format), "format", &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply, MeshFormat::Usdz]),
+    (key!(mesh.material), "material", &[MeshFormat::Glb, MeshFormat::Usdz]),
+    (key!(mesh.frame), "frame but the dataset's", TEXTURED),
+    (key!(mesh.height_m), "height in meters", TEXTURED),
+    (key!(capture.unit_m), "length in meters", TEXTURED),
+    (key!(mesh.texture_format), "picture", TEXTURED),
 ];
+
+/// Formats of a textured mesh in meters; the others keep the dataset's world.
+const TEXTURED: &[MeshFormat] = &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Usdz];
 
 /// Keys that affect how much of the kept head the files show.
 const PART_KEYS: [&str; 5] =
@@ -205,8 +208,7 @@ impl KeptHead {
             return Err(self.more(key!(mesh.texture_px), px, "no colors at the vertices"));
         }
         if px > 0 && px < kept_px {
-            let shown_by = &[MeshFormat::Glb, MeshFormat::Obj];
-            self.warnings.extend(not_shown(key!(mesh.texture_px), "texture", shown_by, formats)?);
+            self.warnings.extend(not_shown(key!(mesh.texture_px), "texture", TEXTURED, formats)?);
         }
         let count = is.triangles as usize;
         let more = was.triangles != 0 && is.triangles > was.triangles && count > kept;

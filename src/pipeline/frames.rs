@@ -8,7 +8,7 @@ use glam::{DMat3, DVec3, Vec3};
 use tiface_base::Result;
 use tiface_base::geom::{Mesh, Similarity};
 use tiface_surface::AtlasConfig;
-use tiface_surface::files::{ExportOptions, ExportedFiles, HeadMesh, to_glb, to_obj, to_ply};
+use tiface_surface::files::{ExportOptions, ExportedFiles, HeadMesh, to_glb, to_obj, to_ply, to_usdz};
 
 /// The quality of textures that are stored as JPEG.
 const JPEG_QUALITY: u8 = 92;
@@ -36,7 +36,7 @@ pub struct Export {
     pub frame: MeshFrame,
     /// How pictures are stored with the mesh.
     pub texture_format: TextureFormat,
-    /// The material of the GLB, lit or unlit.
+    /// The material of GLB and USDZ, lit or unlit.
     pub material: Material,
     /// Camera positions in the world; a face is assumed to look at the cameras.
     pub cameras: Vec<DVec3>,
@@ -82,6 +82,7 @@ impl Export {
             MeshFormat::Ply => {
                 to_ply(mesh, None, &ExportOptions { world_from_mesh: *world_from_scene, ..options })
             }
+            MeshFormat::Usdz => to_usdz(mesh, texture.as_ref(), &options),
         }
         .map_err(advised)
     }
@@ -133,7 +134,7 @@ impl Export {
         }
     }
 
-    /// Returns the frames of a mesh, its scene, and its GLB and OBJ files.
+    /// Returns the frames of a mesh, its scene, and its GLB, OBJ and USDZ files.
     pub(super) fn frames(&self, mesh: &Mesh, world_from_scene: &Similarity) -> Result<Frames> {
         let file_from_scene = self.placed(mesh, world_from_scene).file_from_mesh()?;
         Ok(Frames { world_from_scene: *world_from_scene, file_from_scene })
@@ -184,12 +185,13 @@ impl Export {
 pub(super) struct Frames {
     /// From the scene to the dataset's world.
     pub world_from_scene: Similarity,
-    /// From the scene to the coordinates of GLB and OBJ files: meters, +Y up.
+    /// From the scene to the coordinates of GLB, OBJ and USDZ files: meters, +Y up.
     pub file_from_scene: Similarity,
 }
 
 impl Frames {
-    /// Returns the transform from the dataset's world to the coordinates of GLB and OBJ files.
+    /// Returns the transform from the dataset's world to the coordinates of GLB, OBJ and USDZ
+    /// files.
     pub fn file_from_world(&self) -> Similarity {
         self.file_from_scene.after(&self.world_from_scene.inverse())
     }
@@ -443,5 +445,6 @@ mod tests {
         assert_eq!(names(MeshFormat::Glb), ["head.glb"]);
         assert_eq!(names(MeshFormat::Obj), ["head.obj", "head.mtl", "head.png"]);
         assert_eq!(names(MeshFormat::Ply), ["head.ply"]);
+        assert_eq!(names(MeshFormat::Usdz), ["head.usdz"]);
     }
 }

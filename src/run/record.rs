@@ -51,11 +51,12 @@ pub(super) const TIMED: [&str; 3] = ["done.json", "status.json", "log.jsonl"];
 
 /// Files that no stage reads; a run is complete without them. `tiface export` writes the head again
 /// from the stage's folder `parts`.
-const EXPORTS: [&str; 11] = [
+const EXPORTS: [&str; 12] = [
     "head.glb",
     "head.obj",
     "head.mtl",
     "head.ply",
+    "head.usdz",
     "head.png",
     "head.jpg",
     "head.exr",
@@ -143,7 +144,7 @@ impl Record {
     fn again(&self, folder: &Path, name: &str) -> String {
         let run = folder.ancestors().nth(self.stage.split('/').count()).unwrap_or(folder).display();
         let exported = match name {
-            "head.glb" | "head.ply" => Some(name),
+            "head.glb" | "head.ply" | "head.usdz" => Some(name),
             // an OBJ refers to the other files
             "head.obj" | "head.mtl" | "head.png" | "head.jpg" => Some("head.obj"),
             _ => None,

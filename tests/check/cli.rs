@@ -678,7 +678,7 @@ fn an_out_or_a_device_that_cannot_be_is_refused_before_anything_begins() {
     let dir = tempfile::tempdir().unwrap();
     small_head(dir.path());
     for (words, expected, said) in [
-        (&["mesh", "head", "--out", "head.fbx"][..], 2, "end it in .glb, .obj, .ply, or in `/`"),
+        (&["mesh", "head", "--out", "head.fbx"][..], 2, "end it in .glb, .obj, .ply, .usdz, or in `/`"),
         (&["run", "head", "--out", "head.stl"], 2, ".json"),
         (&["metrics", "head", "--out", "m.glb"], 2, "end it in .json"),
         (&["render", "head", "--out", "turn"], 2, "with `/` at its end"),

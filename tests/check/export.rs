@@ -241,6 +241,63 @@ fn a_smaller_head_is_watertight_and_keeps_its_texture() {
     assert!(bare.picture.is_none() && bare.mesh.is_closed() && !bare.mesh.colors.is_empty());
 }
 
+/// The text of the stage in a USDZ, which is its first file.
+fn stage_of(file: &Path) -> String {
+    let usdz = std::fs::read(file).unwrap();
+    let number = |at: usize, length: usize| {
+        usdz[at..at + length].iter().rev().fold(0, |sum, &byte| sum << 8 | usize::from(byte))
+    };
+    let (size, start) = (number(22, 4), 30 + number(26, 2) + number(28, 2));
+    assert_eq!((&usdz[..4], &usdz[30..39], start % 64), (&b"PK\x03\x04"[..], &b"head.usda"[..], 0));
+    String::from_utf8(usdz[start..start + size].to_vec()).unwrap()
+}
+
+#[test]
+fn a_usdz_shows_the_mesh_of_the_glb_and_is_not_read_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &["mesh.format=usdz", "mesh.color=network", "mesh.lobes=1"]);
+    let before = files(&run);
+    let own = run.join("mesh/head.usdz");
+    worked(dir.path(), &["export", "runs/head", "--out", "Other.USDZ"]);
+    assert!(std::fs::read(dir.path().join("Other.USDZ")).unwrap() == before[&own], "not the stage's");
+    let settings = ["--format", "glb,usdz", "--material", "lit", "--frame", "head", "--height", "0.3"];
+    let said_of = worked(dir.path(), &[&["export", "runs/head", "--out", "new/"][..], &settings].concat());
+    assert!(said_of.contains("a .usdz has no place for 4 textures"), "{said_of}");
+    assert_eq!(names(&dir.path().join("new")), ["head.glb", "head.usdz"]);
+    assert!(before == files(&run));
+    let (unlit, lit) = (stage_of(&own), stage_of(&dir.path().join("new/head.usdz")));
+    assert!(unlit.contains("emissiveColor.connect") && lit.contains("diffuseColor.connect"));
+    let shown = weld(&mesh(&dir.path().join("new/head.glb")).mesh);
+    let numbers = |name: &str| -> Vec<f32> {
+        let line = lit.lines().find_map(|line| line.trim_start().strip_prefix(name)).unwrap();
+        let list = line.split_once('[').unwrap().1.split_once(']').unwrap().0;
+        list.split(',').map(|word| word.trim_matches(['(', ')']).parse().unwrap()).collect()
+    };
+    assert_eq!(numbers("int[] faceVertexIndices = ").len(), 3 * shown.triangles.len());
+    assert_eq!(numbers("int[] primvars:st:indices = ").len(), 3 * shown.triangles.len());
+    assert_eq!(numbers("point3f[] points = ").len(), 3 * shown.positions.len());
+    let (extent, bounds) = (numbers("float3[] extent = "), shown.bounds());
+    assert_eq!(extent, [bounds.min.to_array(), bounds.max.to_array()].concat());
+    assert!((bounds.size().y - 0.3).abs() < 1e-5);
+    assert!(numbers("texCoord2f[] primvars:st = ").iter().all(|v| (0.0..=1.0).contains(v)));
+    // it is an export, but no mesh that is read
+    for (words, text) in [
+        (&["check", "Other.USDZ"][..], "USDZ"),
+        (&["preview", "Other.USDZ", "--size", "16"], "USDZ"),
+        (&["check", "runs/head"], "`tiface export runs/head --out head.glb`"),
+    ] {
+        let output = tiface(dir.path(), words);
+        assert_eq!(output.status.code(), Some(1), "{words:?}: {}", said(&output));
+        assert!(said(&output).contains(text) && said(&output).contains("not read"), "{}", said(&output));
+    }
+    std::fs::remove_file(&own).unwrap();
+    let verified = tiface(dir.path(), &["verify", "runs/head"]);
+    let put_back = "tiface export runs/head --out runs/head/mesh/head.usdz";
+    assert!(verified.status.code() == Some(3) && said(&verified).contains(put_back), "{}", said(&verified));
+    worked(dir.path(), &put_back.split(' ').skip(1).collect::<Vec<_>>());
+    assert!(before == files(&run));
+}
+
 #[test]
 fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
     let dir = tempfile::tempdir().unwrap();
@@ -252,7 +309,7 @@ fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
         (&["began"][..], 1, &["`began` has no mesh yet", "tiface mesh began"][..]),
         (&["head"], 2, &["`head` is not a run"]),
         (&["absent"], 1, &["`absent`"]),
-        (&["--out", "head.fbx"], 2, &["end it in .glb, .obj, .ply, or in `/`"]),
+        (&["--out", "head.fbx"], 2, &["end it in .glb, .obj, .ply, .usdz, or in `/`"]),
         (&["--out", "absent/head.glb"], 1, &["the folder `absent` does not exist"]),
         (&["--out", "runs/head/head.glb"], 2, &["is inside the run"]),
         (&["--out", "runs/head/new/"], 2, &["is inside the run"]),
@@ -266,6 +323,7 @@ fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
         ),
         (&["--frame", "head", "--out", "a.ply"], 2, &[".ply has no frame", "`mesh.frame`"]),
         (&["--texture", "64", "--out", "a.ply"], 2, &[".ply has no texture"]),
+        (&["--texture", "256", "--out", "a.usdz"], 2, &["`mesh.texture_px` is 256"]),
         (
             &["--texture", "256"],
             2,

@@ -1,9 +1,9 @@
-//! Mesh files: GLB, OBJ and PLY, written, read and checked; glTF and STL, read.
+//! Mesh files: GLB, OBJ and PLY, written, read and checked; USDZ, written; glTF and STL, read.
 //!
-//! [`to_glb`], [`to_obj`] and [`to_ply`] write; [`open_mesh`] opens all formats from any program,
-//! with the pictures beside them, and [`read()`] the surface in bytes. [`check()`] examines a
-//! surface, [`uv_check()`] its texture coordinates. [`ExtractedSurface`] and [`HeadMesh`] are the
-//! meshes that later stages read.
+//! [`to_glb`], [`to_obj`], [`to_ply`] and [`to_usdz`] write; [`open_mesh`] opens the other formats
+//! from any program, with the pictures beside them, and [`read()`] the surface in bytes.
+//! [`check()`] examines a surface, [`uv_check()`] its texture coordinates. [`ExtractedSurface`] and
+//! [`HeadMesh`] are the meshes that later stages read.
 
 mod beside;
 mod check;
@@ -28,10 +28,12 @@ mod read;
 mod source;
 mod stl;
 mod stored;
+mod stored_zip;
 mod tangents;
 #[cfg(any(test, feature = "testing"))]
 pub mod testing;
 mod uri;
+mod usdz;
 mod uv_check;
 mod weld;
 
@@ -49,6 +51,7 @@ pub use source::{LobeSource, PictureSource, ReadMesh, ReadOptions};
 pub use stored::FORMAT;
 pub use stored::{ExtractedSurface, HeadMesh};
 pub use tangents::tangents;
+pub use usdz::to_usdz;
 pub use uv_check::{MIN_AREA_PX, UvReport, seams_facing, uv_check};
 pub use weld::weld;
 

@@ -10,7 +10,7 @@
 //!   it to the outlines in photographs; [`MeshDistance`] is the result as a field, for the steps
 //!   after it.
 //! - [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured mesh.
-//! - [`files`] writes, reads and checks GLB, OBJ and PLY, and reads glTF and STL.
+//! - [`files`] writes, reads and checks GLB, OBJ and PLY, writes USDZ, and reads glTF and STL.
 //! - [`render`] shows a mesh from a camera.
 
 mod appearance;

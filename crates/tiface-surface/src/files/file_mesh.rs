@@ -340,19 +340,24 @@ pub(super) fn safe_name(name: &str) -> String {
     if name.is_empty() { "mesh".into() } else { name.into() }
 }
 
-/// Returns a warning about the parts of a texture that the format leaves out.
+/// Returns warnings about the parts of a texture that a format of one picture leaves out.
 pub(super) fn left_out(texture: Option<&HeadTexture>, ending: &str) -> Vec<String> {
     let mut warnings = Vec::new();
     if texture.is_some_and(|t| t.normal.is_some()) {
         warnings.push(format!("a .{ending} has no place for the normal map; it is in the .glb alone"));
     }
-    let lobes = texture.map_or(0, |t| t.lobe_pictures().len());
-    if lobes > 0 {
-        warnings.push(format!(
-            "a .{ending} has no place for {lobes} textures that depend on the view; they are in the .glb alone"
-        ));
-    }
+    warnings.extend(lobes_left_out(texture, ending));
     warnings
+}
+
+/// Returns a warning about lobes, which the format leaves out.
+pub(super) fn lobes_left_out(texture: Option<&HeadTexture>, ending: &str) -> Option<String> {
+    let lobes = texture.map_or(0, |t| t.lobe_pictures().len());
+    (lobes > 0).then(|| {
+        format!(
+            "a .{ending} has no place for {lobes} textures that depend on the view; they are in the .glb alone"
+        )
+    })
 }
 
 /// Returns an error if a coordinate is NaN or infinite, before or after turning and scaling.

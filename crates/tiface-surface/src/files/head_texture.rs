@@ -14,7 +14,7 @@ pub struct HeadTexture {
     /// Base color, sRGB-coded; its alpha is not written.
     pub color: Photo,
     /// Normals in tangent space: linear, +X along u, +Y up the picture (OpenGL), for the tangents
-    /// of [`tangents()`](super::tangents()). GLB only.
+    /// of [`tangents()`](super::tangents()). GLB and USDZ only.
     pub normal: Option<Photo>,
     /// View-dependent color. GLB only.
     pub lobes: Option<Lobes>,

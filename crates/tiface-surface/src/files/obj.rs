@@ -103,7 +103,7 @@ fn write_vertices(out: &mut Vec<u8>, mesh: &FileMesh) -> std::io::Result<()> {
 
 /// A number displayed by the shortest digits that give the same f32 back; with an exponent if zeros
 /// would fill the line.
-struct Short(f32);
+pub(super) struct Short(pub f32);
 
 impl std::fmt::Display for Short {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
