@@ -24,7 +24,7 @@ use tiface_surface::{SimplifyConfig, atlas, simplify};
 /// show it.
 const FILE_KEYS: [(&str, &str, &[MeshFormat]); 6] = [
     (key!(mesh.format), "format", &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply, MeshFormat::Usdz]),
-    (key!(mesh.material), "material", &[MeshFormat::Glb, MeshFormat::Usdz]),
+    (key!(mesh.material), "choice of material", &[MeshFormat::Glb, MeshFormat::Usdz]),
     (key!(mesh.frame), "frame but the dataset's", TEXTURED),
     (key!(mesh.height_m), "height in meters", TEXTURED),
     (key!(capture.unit_m), "length in meters", TEXTURED),
@@ -288,7 +288,7 @@ fn not_shown(
     if without.is_empty() {
         return Ok(None);
     }
-    let problem = format!("a file {without} has no {what}, so `{key}` does not affect it");
+    let problem = format!("`{key}` does not affect {without} files, which have no {what}");
     match formats.iter().any(|f| shown_by.contains(f)) {
         true => Ok(Some(problem)),
         false => {
