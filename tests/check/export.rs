@@ -321,8 +321,8 @@ fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
             2,
             &["`mesh.material` does not affect .obj files, which have no choice of material", "write .glb"],
         ),
-        (&["--frame", "head", "--out", "a.ply"], 2, &[".ply has no frame", "`mesh.frame`"]),
-        (&["--texture", "64", "--out", "a.ply"], 2, &[".ply has no texture"]),
+        (&["--frame", "head", "--out", "a.ply"], 2, &[".ply files, which have no frame", "`mesh.frame`"]),
+        (&["--texture", "64", "--out", "a.ply"], 2, &[".ply files, which have no texture"]),
         (&["--texture", "256", "--out", "a.usdz"], 2, &["`mesh.texture_px` is 256"]),
         (
             &["--texture", "256"],
