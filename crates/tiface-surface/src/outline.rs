@@ -30,8 +30,9 @@ use tiface_base::geom::Mesh;
 use tiface_base::math::rank::median;
 use tiface_base::{Monitor, Result};
 
-/// Against the square of a pixel's distance on a pixel's length of outline.
-const PRIOR: Prior = Prior { ridge: 0.1, smooth: 1.0 };
+/// Against the square of a pixel's distance on a pixel's length of outline. With a third of this
+/// ridge outlines are hardly closer, and the surface lies 0.03 pixels outside.
+const PRIOR: Prior = Prior { ridge: 0.3, smooth: 1.0 };
 
 /// Distance beyond which a point counts linearly, pixels: the mask shows something else there.
 const KNEE: f32 = 1.0;
