@@ -190,7 +190,8 @@ fn textured_heads((resolution, texture_px): (u32, u32), heads: &[(ColorSource, u
             let [raycast, textured] = ["raycast", "textured"].map(|m| figures(m).psnr_masked.unwrap());
             let square = |psnr: f64| 10f64.powf(-psnr / 10.0);
             let apart = (square(raycast) - square(textured)).abs();
-            assert!(raycast > 28.0 && apart < 4e-5, "{raycast} {textured}");
+            // lobes have a quarter of the texture's few texels
+            assert!(raycast > 28.0 && apart < (2.0f64 / 255.0).powi(2), "{raycast} {textured}");
             assert!(mesh["steps"]["appearance"]["psnr"][1].as_f64().unwrap() > 30.0, "{mesh}");
             continue;
         }
