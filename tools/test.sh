@@ -195,9 +195,9 @@ need_build() {
 executables() { sed -n "s|.*Executable.*$1.* (\(.*\))$|\1|p" "$scratch/build.log"; }
 executable() { executables "$1" | tail -n 1; }
 
-# tests LOG PROGRAM OPTIONS...: runs a program of tests. Each test is shown as it ends, and what failing ones said; the
-# summary repeats what was skipped, so that a skipped test is not taken for a passed one. Times are an unstable option of
-# Rust's test harness, which the variable allows.
+# tests LOG PROGRAM OPTIONS...: runs a program of tests. Each test is shown as it ends. The summary has what failing ones
+# said, and what was skipped, so that a skipped test is not taken for a passed one. Times are an unstable option of Rust's
+# test harness, which the variable allows.
 tests() {
   local log=$scratch/$1.log program=$2
   shift 2
@@ -208,7 +208,7 @@ tests() {
   tail -n +1 --pid=$pid -f "$log" | grep -E --line-buffered '^test .* \.\.\. |^test result'
   wait $pid
   local ended=$?
-  [ $ended = 0 ] || sed -n '/^failures:/,$p' "$log"
+  [ $ended = 0 ] || sed -n '/^failures:/,$p' "$log" | tee -a "$scratch/failures"
   grep -h '^skipped:' "$log" | sort -u >> "$scratch/skipped"
   sed -n 's/^test \(.*\) \.\.\. [a-zA-Z]* <\([0-9.]*\)s>$/\2 \1/p' "$log" >> "$scratch/times"
   return $ended
@@ -455,5 +455,6 @@ if [ -s "$scratch/times" ]; then
     "$(awk '{ sum += $1 } END { print int(sum) }' "$scratch/times")"
   sort -rn "$scratch/times" | head -n 20
 fi
+[ -s "$scratch/failures" ] && { printf 'what failed:\n'; cat "$scratch/failures"; }
 [ -s "$scratch/skipped" ] && { printf 'tests that this machine could not run:\n'; sort -u "$scratch/skipped"; }
 exit $failed
