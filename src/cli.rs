@@ -35,6 +35,7 @@ use clap::parser::ValueSource;
 use clap::{ArgMatches, Args, CommandFactory, FromArgMatches, Parser, Subcommand};
 use clap_complete::{ArgValueCompleter, Shell};
 use experiment::ExperimentOptions;
+use export::ExportOptions;
 use flags::KeyFlags;
 use options::{Common, RunTarget};
 use out::Out;
@@ -53,7 +54,7 @@ Examples:
   tiface demo                                   reconstruct a synthetic head, from photographs to mesh
   tiface inspect captures/002_00                list what is in a folder of photographs, and what is wrong
   tiface run captures/002_00 --preset draft     reconstruct your own head quickly, into runs/002_00
-  tiface export --material lit --out head.glb   write the mesh of the newest run to a file
+  tiface export --out head.usdz                 write the head of the newest run to a file
 
 Exit codes:
   0         success
@@ -203,10 +204,10 @@ background twice. The masks of the other views follow from the cameras.")]
     #[command(after_long_help = "Examples:
   tiface mesh runs/002_00
   tiface mesh runs/002_00 --out head.glb        the ending selects the format
-  tiface mesh captures/002_00 --format glb,obj,ply --frame head
+  tiface mesh captures/002_00 --format glb,obj,ply
   tiface mesh runs/002_00 --fresh mesh --triangles 200000 --texture 4096 --lobes 1 --normal-map
 
-`tiface export` writes a finished mesh in another format, material, frame or smaller size, without making it again.")]
+`tiface export` writes a finished mesh in another format, material, frame or size, without making it again.")]
     Mesh {
         #[command(flatten)]
         input: CaptureOrRun,
@@ -264,23 +265,18 @@ pictures of meshes are written to CAPTURE_judged/ or to --out; no run is started
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
-    /// Write the finished mesh of a run in another format, material, frame or smaller size
+    /// Write the finished head of a run to files for other programs
     #[command(after_long_help = "Examples:
   tiface export runs/002_00 --out head.obj      the ending selects the format
   tiface export runs/002_00 --out head.usdz     iPhone, iPad, Mac and Safari show it by themselves
   tiface export runs/002_00 --material lit --frame head --out lit.glb
   tiface export runs/002_00 --format glb,ply --triangles 10000 --texture 1024 --out small/
-  tiface export runs/002_00 --hair none --height 0.3        write to 002_00.glb
+  tiface export runs/002_00 --no-layers --height 0.24       write to 002_00.glb
+  tiface export runs/002_00 --measure -0.03,0.1,0.2 0.03,0.1,0.2 0.064 --out head.glb
 
-It takes seconds, opens no photograph, and changes nothing in the run: views, their blend and the metrics stay
-valid. Settings that are not given are the run's. More triangles or a larger texture need `tiface mesh RUN --fresh mesh`.")]
-    Export {
-        /// Run [default: the run in this folder, else the newest under runs/]
-        #[arg(value_name = "RUN")]
-        path: Option<PathBuf>,
-        #[command(flatten)]
-        flags: KeyFlags,
-    },
+It takes seconds, opens no photograph, writes nothing into the run and remembers nothing: the same command writes the same
+bytes, whatever was exported before. More triangles or a larger texture need `tiface mesh RUN --fresh mesh`.")]
+    Export(ExportOptions),
     /// Render pictures of a run's mesh, or of any .glb, .gltf, .obj, .ply or .stl
     #[command(after_long_help = "Examples:
   tiface preview runs/002_00                    draw a three-quarter view, 1024 pixels, as a PNG
@@ -477,7 +473,7 @@ pub fn main(collect: fn()) -> ExitCode {
         Command::Convert { capture, to } => capture::convert(&invocation, capture, to),
         Command::Check { mesh, require, against, seen_by } => makes_nothing("check")
             .and_then(|()| check::run(&common, mesh, require, against.as_deref(), seen_by.as_deref())),
-        Command::Export { path, flags } => export::run(&invocation, path.as_deref(), flags),
+        Command::Export(options) => export::run(&invocation, options),
         Command::Preview(options) => preview::run(&invocation, options),
         Command::Bench(options) => bench::run(&invocation, options),
         Command::Experiment(options) => experiment::run(&invocation, options),
@@ -539,7 +535,8 @@ fn ignored(command: &str) -> &'static [&'static str] {
         "inspect" | "cameras" | "convert" | "check" => {
             &["run", "fresh", "seed", "device", "deterministic", "memory"]
         }
-        "preview" | "report" | "export" => &["fresh", "deterministic", "memory"],
+        "preview" | "report" => &["fresh", "deterministic", "memory"],
+        "export" => &["fresh", "seed", "config", "preset", "set", "device", "deterministic", "memory"],
         "config" | "bench" => &["fresh"],
         _ => &[],
     }

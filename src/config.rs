@@ -33,7 +33,7 @@ pub use mask::{
     CameraPoses, CaptureConfig, CutMethod, Exposures, HeadValue, MaskConfig, MaskHead, MaskMeaning,
     MaskSource, MattingMethod, VitmatteColors,
 };
-pub use mesh::{ColorSource, Genus, Hair, Material, MeshConfig, MeshFormat, MeshFrame, TextureFormat};
+pub use mesh::{ColorSource, Genus, Hair, MeshConfig, MeshFormat};
 pub use preset::Preset;
 pub use render::{
     EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,

@@ -398,7 +398,7 @@ pub fn doubtful_height(height: f64, unit_m: f64) -> Option<String> {
         format!(
             "the head is {height:.3} units high: {height_m:.3} m if a unit of the dataset is {unit_m} m, and a head is {} to \
              {} m high. Give the unit's length in meters, `--set capture.unit_m=METERS` (with {:.3} this head is 0.3 m high), \
-             or the height that exported meshes should have, `--set mesh.height_m=METERS`",
+             or the height from chin to crown that a file should have, `tiface export --height METERS`",
             HEIGHTS_M.start(),
             HEIGHTS_M.end(),
             0.3 / height

@@ -1,36 +1,184 @@
-//! `tiface export`: writes the finished mesh of a run again.
+//! `tiface export`: writes the finished head of a run to files for other programs.
 
 use super::Invocation;
-use super::flags::KeyFlags;
 use super::options::RunTarget;
 use super::out::{Out, require_outside, write_head};
 use super::screen::print;
-use crate::config::{Config, MeshFormat, Stage, key};
-use crate::pipeline::KeptHead;
+use crate::config::{Config, MeshFormat, Stage};
+use crate::pipeline::{ExportRequest, KeptHead, Material, MeshFrame, Size};
+use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use glam::DVec3;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use tiface_base::{Error, Quiet, Result, io};
 
-/// Writes the mesh of a run with the settings of these options.
-pub(super) fn run(invocation: &Invocation, path: Option<&Path>, flags: &KeyFlags) -> Result<()> {
+/// Options of `tiface export`.
+#[derive(Args, Debug)]
+pub(super) struct ExportOptions {
+    /// Run [default: the run in this folder, else the newest under runs/]
+    #[arg(value_name = "RUN")]
+    path: Option<PathBuf>,
+    /// Formats to write: glb, obj, ply, usdz [default: as --out ends, else glb]
+    #[arg(long, value_name = "LIST", value_delimiter = ',')]
+    #[arg(value_parser = PossibleValuesParser::new(MeshFormat::ALL.map(MeshFormat::as_str)).try_map(|word| word.parse::<MeshFormat>()))]
+    format: Vec<MeshFormat>,
+    /// Material of GLB and USDZ: unlit (colors as photographed) or lit (shaded by lamps)
+    /// [default: unlit; lit with a normal map]
+    #[arg(long, value_name = "KIND")]
+    #[arg(value_parser = PossibleValuesParser::new(["unlit", "lit"]).map(|word| material(&word)))]
+    material: Option<Material>,
+    /// Coordinate frame: dataset, or head (+Y up, face towards +Z, centered)
+    #[arg(long, value_name = "FRAME", default_value = "dataset")]
+    #[arg(value_parser = PossibleValuesParser::new(["dataset", "head"]).map(|word| frame(&word)))]
+    frame: MeshFrame,
+    /// Height of the head from chin to crown in GLB, OBJ and USDZ files, meters; shoulders follow
+    /// [default: as long as `capture.unit_m` says]
+    #[arg(long, value_name = "METERS", value_parser = length, conflicts_with = "measure")]
+    height: Option<f64>,
+    /// Scale GLB, OBJ and USDZ files by the distance of two points, meters; points are x,y,z in
+    /// the dataset's world, the coordinates of .ply
+    #[arg(long, num_args = 3, value_names = ["A", "B", "METERS"], allow_hyphen_values = true)]
+    measure: Vec<String>,
+    /// Unit of OBJ, which states none: m, cm or mm
+    #[arg(long, value_name = "UNIT", default_value = "m")]
+    #[arg(value_parser = PossibleValuesParser::new(["m", "cm", "mm"]).map(|word| meters(&word)))]
+    unit: f64,
+    /// Number of triangles at most [default: all that the run keeps]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(4..))]
+    triangles: Option<u32>,
+    /// Side of the texture, texels; 0 stores colors at the vertices [default: the run's]
+    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(0..=16384))]
+    texture: Option<u32>,
+    /// Store the color as JPEG, which is smaller and lossy
+    #[arg(long)]
+    jpeg: bool,
+    /// Leave out the soft layers of hair
+    #[arg(long)]
+    no_layers: bool,
+    /// Leave out view-dependent color
+    #[arg(long)]
+    no_lobes: bool,
+    /// Leave out the normal map
+    #[arg(long)]
+    no_normal_map: bool,
+}
+
+fn material(word: &str) -> Material {
+    if word == "lit" { Material::Lit } else { Material::Unlit }
+}
+
+fn frame(word: &str) -> MeshFrame {
+    if word == "head" { MeshFrame::Head } else { MeshFrame::Dataset }
+}
+
+fn meters(unit: &str) -> f64 {
+    match unit {
+        "mm" => 1e-3,
+        "cm" => 1e-2,
+        _ => 1.0,
+    }
+}
+
+/// Parses a length in meters.
+fn length(word: &str) -> std::result::Result<f64, String> {
+    let found = word.parse().ok().filter(|meters: &f64| meters.is_finite() && *meters > 0.0);
+    found.ok_or_else(|| "it must be a number of meters above 0".into())
+}
+
+/// Parses a point `x,y,z`.
+fn point(word: &str) -> Result<DVec3> {
+    let numbers: Option<Vec<f64>> = word.split(',').map(|number| number.trim().parse().ok()).collect();
+    match numbers.as_deref() {
+        Some(&[x, y, z]) if [x, y, z].iter().all(|v| v.is_finite()) => Ok(DVec3::new(x, y, z)),
+        _ => {
+            let text = format!("`--measure`: `{word}` is no point");
+            Err(Error::usage(text, "write it as x,y,z: `--measure 0.01,0.2,0.03 0.07,0.2,0.03 0.06`"))
+        }
+    }
+}
+
+impl ExportOptions {
+    /// Returns what is asked for, in these formats.
+    fn request(&self, formats: Vec<MeshFormat>) -> Result<ExportRequest> {
+        Ok(ExportRequest {
+            formats,
+            material: self.material,
+            frame: self.frame,
+            jpeg: self.jpeg,
+            obj_unit_m: self.unit,
+            size: self.size()?,
+            triangles: self.triangles,
+            texture_px: self.texture,
+            layers: !self.no_layers,
+            lobes: !self.no_lobes,
+            normal_map: !self.no_normal_map,
+        })
+    }
+
+    fn size(&self) -> Result<Size> {
+        match (self.height, self.measure.as_slice()) {
+            (Some(meters), _) => Ok(Size::Head(meters)),
+            (None, [a, b, meters]) => {
+                let meters = length(meters).map_err(|e| {
+                    Error::usage(format!("`--measure`: `{meters}`: {e}"), "write it as 0.064")
+                })?;
+                Ok(Size::Between([point(a)?, point(b)?], meters))
+            }
+            _ => Ok(Size::Dataset),
+        }
+    }
+
+    /// Returns the files to write with their formats: `--out`, files in its folder, or else files
+    /// in the working directory with the run's name.
+    fn destinations(&self, out: Option<&Out>, run: &Path) -> Result<Vec<(PathBuf, MeshFormat)>> {
+        let formats = if self.format.is_empty() { &[MeshFormat::Glb][..] } else { &self.format };
+        let named = |folder: &Path, stem: &str| {
+            let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.as_str())), *format);
+            formats.iter().map(file).collect()
+        };
+        match out {
+            Some(Out::File(file, ending)) => {
+                let format = ending
+                    .parse()
+                    .ok()
+                    .filter(|format: &MeshFormat| self.format.is_empty() || self.format == [*format]);
+                let format = format.ok_or_else(|| {
+                    let what =
+                        format!("`--out {}` is one .{ending}, and `--format` lists others", file.display());
+                    Error::usage(what, "leave out `--format`, or end `--out` in `/` for a folder")
+                })?;
+                Ok(vec![(file.clone(), format)])
+            }
+            Some(Out::Folder(folder)) => Ok(named(folder, "head")),
+            None => {
+                let name = io::real_path(run)
+                    .ok()
+                    .and_then(|run| Some(run.file_name()?.to_string_lossy().into_owned()));
+                Ok(named(Path::new(""), &name.unwrap_or_else(|| "head".into())))
+            }
+        }
+    }
+}
+
+/// Writes the head of a run as these options ask for it.
+pub(super) fn run(invocation: &Invocation, options: &ExportOptions) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
     let out = Out::find(common.out.as_deref(), "export")?;
-    let target = RunTarget::find(common, path)?;
+    let target = RunTarget::find(common, options.path.as_deref())?;
     let Some(saved) = &target.saved else {
-        let what = format!("`{}` is not a run", path.unwrap_or(&target.run).display());
+        let what = format!("`{}` is not a run", options.path.as_deref().unwrap_or(&target.run).display());
         return Err(Error::usage(what, "name the folder of a run"));
     };
     if target.guessed {
         screen.note("run", &format!("using `{}`", target.run.display()));
     }
-    let asked = common.resolve(Some(saved), None, &flags.options()?)?;
-    let lists_formats = flags.typed(key!(mesh.format)).is_some();
-    let files = destinations(out.as_ref(), &target.run, lists_formats, &asked)?;
+    let files = options.destinations(out.as_ref(), &target.run)?;
     // a file of the run may be put back, but not replaced by another
     let (own, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| is_own(file, &target.run));
     others.iter().try_for_each(|(file, _)| require_outside(file, &target.run))?;
-    let formats: Vec<MeshFormat> = files.iter().map(|(_, format)| *format).collect();
-    let mut head = KeptHead::read(&target.run, &Config::read(saved)?)?.changed(&asked, &formats, &Quiet)?;
+    let request = options.request(files.iter().map(|(_, format)| *format).collect())?;
+    let mut head = KeptHead::read(&target.run, &Config::read(saved)?)?.changed(&request, &Quiet)?;
     own.iter().try_for_each(|(_, format)| head.require_recorded(*format))?;
     let mut warn = |warning: &str| screen.note("export: warning", warning);
     std::mem::take(&mut head.warnings).iter().for_each(|w| warn(w));
@@ -51,14 +199,39 @@ pub(super) fn run(invocation: &Invocation, path: Option<&Path>, flags: &KeyFlags
     for (file, format) in &files {
         written.extend(write_head(file, &head, *format, &mut warn)?);
     }
-    if common.json {
-        let result =
-            json!({"event": "result", "run": target.run, "out": written, "triangles": head.triangles()});
-        print(&format!("{result}\n"))?;
-    } else if !common.quiet {
-        print(&written.iter().map(|file| format!("export    {}\n", file.display())).collect::<String>())?;
+    tell(invocation, &target.run, &head, &written)
+}
+
+/// Prints what was written, how large it is on the disk and in the world, and of how many
+/// triangles.
+fn tell(invocation: &Invocation, run: &Path, head: &KeptHead, written: &[PathBuf]) -> Result<()> {
+    let (triangles, of_layers) = (head.triangles(), head.layer_triangles());
+    let [width, height, depth] = head.size_m()?;
+    if invocation.common.json {
+        let result = json!({
+            "event": "result",
+            "run": run,
+            "out": written,
+            "bytes": written.iter().map(|file| io::file_size(file)).collect::<Vec<_>>(),
+            "triangles": triangles,
+            "layer_triangles": of_layers,
+            "size_m": [width, height, depth],
+        });
+        return print(&format!("{result}\n"));
     }
-    Ok(())
+    if invocation.common.quiet {
+        return Ok(());
+    }
+    let file = |file: &PathBuf| {
+        let size = io::file_size(file).map(|bytes| format!("  {:.2} MB", bytes as f64 / 1e6));
+        format!("export    {}{}\n", file.display(), size.unwrap_or_default())
+    };
+    let layers = if of_layers > 0 { format!(", and {of_layers} of soft layers") } else { String::new() };
+    let mut text: String = written.iter().map(file).collect();
+    text += &format!(
+        "export    {triangles} triangles{layers}; {width:.3} x {height:.3} x {depth:.3} m (width, height, depth)\n"
+    );
+    print(&text)
 }
 
 /// Returns whether a file is one that the stage `mesh` of the run writes in this format.
@@ -67,37 +240,4 @@ fn is_own((file, format): &(PathBuf, MeshFormat), run: &Path) -> bool {
     let is_there =
         folder.is_some_and(|folder| io::real_path(&run.join(Stage::Mesh)).is_ok_and(|own| own == folder));
     is_there && file.file_name().is_some_and(|name| name == format!("head.{}", format.as_str()).as_str())
-}
-
-/// Returns the files to write with their formats: `--out`, files in its folder, or else files in
-/// the working directory with the run's name.
-fn destinations(
-    out: Option<&Out>,
-    run: &Path,
-    lists_formats: bool,
-    asked: &Config,
-) -> Result<Vec<(PathBuf, MeshFormat)>> {
-    let formats = &asked.mesh.format;
-    let named = |folder: &Path, stem: &str| {
-        let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.as_str())), *format);
-        formats.iter().map(file).collect()
-    };
-    match out {
-        Some(Out::File(file, ending)) => {
-            let format =
-                ending.parse().ok().filter(|format: &MeshFormat| !lists_formats || formats == &[*format]);
-            let format = format.ok_or_else(|| {
-                let what =
-                    format!("`--out {}` is one .{ending}, and `--format` lists others", file.display());
-                Error::usage(what, "leave out `--format`, or end `--out` in `/` for a folder")
-            })?;
-            Ok(vec![(file.clone(), format)])
-        }
-        Some(Out::Folder(folder)) => Ok(named(folder, "head")),
-        None => {
-            let name =
-                io::real_path(run).ok().and_then(|run| Some(run.file_name()?.to_string_lossy().into_owned()));
-            Ok(named(Path::new(""), &name.unwrap_or_else(|| "head".into())))
-        }
-    }
 }

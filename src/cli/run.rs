@@ -83,7 +83,7 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
     })?;
     if common.dry_run {
         print(&plan_summary(&session, *until, common)?)?;
-        if common.fresh == Some(Stage::Mesh) && session.differs_in_files() {
+        if common.fresh == Some(Stage::Mesh) && session.differs_in_formats() {
             let again = format!(
                 "`tiface export {}` writes the finished mesh with these settings",
                 run.dir().display()

@@ -22,6 +22,9 @@ pub enum MeshFormat {
 }
 
 impl MeshFormat {
+    /// All formats.
+    pub const ALL: [MeshFormat; 4] = [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply, MeshFormat::Usdz];
+
     /// Its word, which is the ending of its files.
     pub fn as_str(self) -> &'static str {
         match self {
@@ -37,21 +40,10 @@ impl FromStr for MeshFormat {
     type Err = Error;
 
     fn from_str(word: &str) -> Result<MeshFormat> {
-        let all = [MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply, MeshFormat::Usdz];
-        all.into_iter().find(|format| format.as_str() == word).ok_or_else(|| {
+        MeshFormat::ALL.into_iter().find(|format| format.as_str() == word).ok_or_else(|| {
             Error::usage(format!("there is no mesh format `{word}`"), "use glb, obj, ply or usdz")
         })
     }
-}
-
-/// The coordinates a mesh is exported in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum MeshFrame {
-    /// The dataset's own world, turned to +Y up where the format demands it.
-    Dataset,
-    /// +Y up through the crown, face towards +Z, origin at the center of the box.
-    Head,
 }
 
 /// What becomes of handles: loops of hair, holes between locks.
@@ -84,28 +76,8 @@ pub enum Hair {
     None,
 }
 
-/// What light does to the mesh in other programs.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Material {
-    /// Nothing: the photographs' light is in its colors already.
-    Unlit,
-    /// It shades a rough surface that is no metal.
-    Lit,
-}
-
-/// How a texture is stored inside or beside a mesh.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum TextureFormat {
-    /// Lossless.
-    Png,
-    /// Smaller, quality 92.
-    Jpeg,
-}
-
 table! {
-    /// How the surface is extracted and exported.
+    /// How the surface is extracted and becomes the head mesh.
     pub struct MeshConfig;
     keys {
         /// Grid samples along the longest side of the box.
@@ -117,7 +89,7 @@ table! {
         #[flag("no-cap", Switch("false"), ["mesh"], "Leave the mesh open where the frames cut the body")]
         cap: bool [Surface] => true, true, false;
         /// Number of triangles after simplification; 0 keeps all.
-        #[flag("triangles", Text("N"), ["mesh", "export"])]
+        #[flag("triangles", Text("N"), ["mesh"])]
         triangles: u32, 0.0..=1e8 [Head] => 50_000, 50_000, 0;
         /// Largest distance of the simplified mesh from the field's surface, cells; 0: no limit.
         max_error: f32, 0.0..=100.0 [Head] => 0.0;
@@ -125,7 +97,7 @@ table! {
         color: ColorSource [Surface]
             => ColorSource::Photographs, ColorSource::Photographs, ColorSource::Network;
         /// Side of the texture, texels; 0: colors at the vertices.
-        #[flag("texture", Text("PX"), ["mesh", "export"],
+        #[flag("texture", Text("PX"), ["mesh"],
             "Side of the texture, texels; 0 stores colors at the vertices")]
         texture_px: u32, 0.0..=16384.0 [Head] => 1024, 2048, 0;
         /// Degree of the view-dependent spherical harmonics in the GLB: 0 (none), 1 or 2; limits
@@ -136,34 +108,19 @@ table! {
         lobes: u32, 0.0..=2.0 [Head] => 2, 2, 0;
         /// Hair and other soft outlines: shells (translucent layers in the GLB, where they help) or
         /// none. raycast renders them with `mesh.color=photographs`.
-        #[flag("hair", Text("KIND"), ["mesh", "export"],
+        #[flag("hair", Text("KIND"), ["mesh"],
             "Hair and other soft outlines: shells (translucent layers, where they help) or none")]
         hair: Hair [Head] => Hair::Shells, Hair::Shells, Hair::None;
         /// Write a tangent-space map of the unsimplified normals to GLB and USDZ: true or false.
         #[flag("normal-map", Switch("true"), ["mesh"],
             "Store the detail that simplification removes in a normal map; makes the material lit")]
         normal_map: bool [Head] => false;
-        /// Material of GLB and USDZ: unlit (colors as photographed, light included) or lit (shaded
-        /// by lamps, as a normal map needs).
-        #[flag("material", Text("KIND"), ["mesh", "export"],
-            "Material in other programs: unlit (colors as photographed) or lit (shaded by lamps)")]
-        material: Material [Files] => Material::Unlit;
-        /// Format of the texture: png or jpeg.
-        texture_format: TextureFormat [Files] => TextureFormat::Png;
         /// Write the baked color to head.exr too, scene-linear: true or false.
         exr: bool [Files] => false;
-        /// Formats to write, a list of glb, obj, ply, usdz.
-        #[flag("format", Text("LIST"), ["mesh", "export"], "Formats to write: glb, obj, ply, usdz")]
+        /// Formats to write, a list of glb, obj, ply, usdz; `tiface export` writes others of a
+        /// finished run.
+        #[flag("format", Text("LIST"), ["mesh"], "Formats to write: glb, obj, ply, usdz")]
         format: Vec<MeshFormat> [Files] => vec![MeshFormat::Glb];
-        /// Coordinate frame of the files: dataset, or head (+Y up, face towards +Z, centered).
-        #[flag("frame", Text("FRAME"), ["mesh", "export"],
-            "Coordinate frame: dataset, or head (+Y up, face towards +Z)")]
-        frame: MeshFrame [Files] => MeshFrame::Dataset;
-        /// Height of the head mesh in GLB, OBJ and USDZ files, meters, from the crown to the end of
-        /// what is shown of the body; 0: as `capture.unit_m` says.
-        #[flag("height", Text("METERS"), ["mesh", "export"],
-            "Height of the mesh in GLB, OBJ and USDZ files: the dataset's units are scaled to it")]
-        height_m: f64, 0.0..=10.0 [Files] => 0.0;
     }
     constants {
         /// Evaluate the whole grid, and keep every surface found (published).

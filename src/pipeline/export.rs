@@ -1,46 +1,102 @@
-//! The head of a finished run, written again: in another format, material, frame or size.
+//! The head of a finished run in files: in another format, material, frame or size.
 //!
-//! Only what the run keeps is read, `mesh/parts` and the cameras; nothing of the run is written.
-//! With the run's own settings the files are those of the stage `mesh`, byte by byte. A mesh of
-//! fewer triangles gets an atlas of its own, and everything that it shows from the nearest points
-//! of the kept one ([`Original`]).
+//! Only what the run keeps is read, `mesh/parts`, the cameras and the settings of the stage; nothing
+//! of the run is written, and nothing is remembered. A request that names nothing gives the files
+//! of the stage `mesh`, byte by byte. A mesh of fewer triangles gets an atlas of its own, and
+//! everything that it shows from the nearest points of the kept one ([`Original`]).
 
 use super::advice::{advised, sentence};
 use super::cameras::CameraCheck;
-use super::frames::{Export, center};
+use super::frames::{Export, Material, MeshFrame, center};
 use super::mesh::{finished_mesh, read_finished};
 use super::scene_file::read_capture;
-use super::session::{check_feasible, unusable};
-use crate::capture::Capture;
-use crate::config::{Config, Hair, Material, MeshFormat, Stage, key};
+use super::session::unusable;
+use crate::config::{Config, MeshFormat, Stage, key};
 use crate::run::Fingerprint;
+use glam::DVec3;
 use std::path::{Path, PathBuf};
+use tiface_base::geom::{ShellLayer, Similarity};
 use tiface_base::{Error, Monitor, Result};
 use tiface_surface::bake::{Original, tangent_space};
 use tiface_surface::files::{ExportedFiles, HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
 use tiface_surface::{SimplifyConfig, atlas, simplify};
 
-/// Keys that affect how the files of a mesh are written, each with what it is and the formats that
-/// show it.
-const FILE_KEYS: [(&str, &str, &[MeshFormat]); 6] = [
-    (key!(mesh.format), "format", &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Ply, MeshFormat::Usdz]),
-    (key!(mesh.material), "choice of material", &[MeshFormat::Glb, MeshFormat::Usdz]),
-    (key!(mesh.frame), "frame but the dataset's", TEXTURED),
-    (key!(mesh.height_m), "height in meters", TEXTURED),
-    (key!(capture.unit_m), "length in meters", TEXTURED),
-    (key!(mesh.texture_format), "picture", TEXTURED),
-];
+/// What files show of a kept head, and how they are written.
+#[derive(Clone, Debug)]
+pub struct ExportRequest {
+    /// Formats to write.
+    pub formats: Vec<MeshFormat>,
+    /// Material of GLB and USDZ; unlit by default, but lit with a normal map.
+    pub material: Option<Material>,
+    /// Coordinate frame.
+    pub frame: MeshFrame,
+    /// Whether the color is stored as JPEG, not PNG.
+    pub jpeg: bool,
+    /// Meters per unit of an OBJ, which states none.
+    pub obj_unit_m: f64,
+    /// What the size of the files follows.
+    pub size: Size,
+    /// Number of triangles; by default all that the run keeps.
+    pub triangles: Option<u32>,
+    /// Side of the texture, texels, 0 for colors at the vertices; by default the kept one.
+    pub texture_px: Option<u32>,
+    /// Whether soft layers are written.
+    pub layers: bool,
+    /// Whether view-dependent color is written.
+    pub lobes: bool,
+    /// Whether a normal map is written.
+    pub normal_map: bool,
+}
+
+impl Default for ExportRequest {
+    fn default() -> ExportRequest {
+        ExportRequest {
+            formats: vec![MeshFormat::Glb],
+            material: None,
+            frame: MeshFrame::Dataset,
+            jpeg: false,
+            obj_unit_m: 1.0,
+            size: Size::Dataset,
+            triangles: None,
+            texture_px: None,
+            layers: true,
+            lobes: true,
+            normal_map: true,
+        }
+    }
+}
+
+/// What the size of a head in its files follows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Size {
+    /// The length of the dataset's unit, `capture.unit_m`.
+    Dataset,
+    /// The head's height from chin to crown, meters.
+    Head(f64),
+    /// The distance between two points of the dataset's world, meters.
+    Between([DVec3; 2], f64),
+}
 
 /// Formats of a textured mesh in meters; the others keep the dataset's world.
 const TEXTURED: &[MeshFormat] = &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Usdz];
 
-/// Keys that affect how much of the kept head the files show.
-const PART_KEYS: [&str; 5] =
-    [key!(mesh.triangles), key!(mesh.texture_px), key!(mesh.hair), key!(mesh.lobes), key!(mesh.normal_map)];
+/// Formats that say how light falls on a mesh.
+const SHADED: &[MeshFormat] = &[MeshFormat::Glb, MeshFormat::Usdz];
 
-/// Returns whether a key affects only how the files of a mesh are written.
-pub(super) fn is_file_key(key: &str) -> bool {
-    FILE_KEYS.iter().any(|(name, ..)| *name == key)
+impl ExportRequest {
+    /// Returns the options that are asked for, each with what it is and the formats that show it.
+    fn options(&self) -> Vec<(&'static str, &'static str, &'static [MeshFormat])> {
+        let options = [
+            (self.material.is_some(), "--material", "choice of material", SHADED),
+            (self.frame != MeshFrame::Dataset, "--frame", "frame but the dataset's", TEXTURED),
+            (self.jpeg, "--jpeg", "picture", TEXTURED),
+            (self.obj_unit_m != 1.0, "--unit", "choice of unit", &[MeshFormat::Obj]),
+            (matches!(self.size, Size::Head(_)), "--height", "height in meters", TEXTURED),
+            (matches!(self.size, Size::Between(..)), "--measure", "length in meters", TEXTURED),
+        ];
+        let asked = options.into_iter().filter(|(asked, ..)| *asked);
+        asked.map(|(_, option, what, shown_by)| (option, what, shown_by)).collect()
+    }
 }
 
 /// The head of a finished run, as the stage `mesh` left it.
@@ -48,7 +104,6 @@ pub struct KeptHead {
     run: PathBuf,
     /// The settings that it was made with.
     made: Config,
-    capture: Capture,
     head: HeadMesh,
     export: Export,
     /// Warnings for the user.
@@ -80,42 +135,58 @@ impl KeptHead {
         let check = CameraCheck::read(&run.join(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
         check.iter().for_each(|check| check.apply(&mut capture));
         let export = Export::new(&capture, made);
-        Ok(KeptHead { run: run.into(), made: made.clone(), capture, head, export, warnings })
+        Ok(KeptHead { run: run.into(), made: made.clone(), head, export, warnings })
     }
 
-    /// Returns the head as the settings `asked` have it in files of these formats.
+    /// Returns the head as it is asked for.
     ///
     /// # Errors
     ///
-    /// Fails if a setting asks for more than the run keeps, or for something that none of the
-    /// formats shows; the error names it.
-    pub fn changed(
-        mut self,
-        asked: &Config,
-        formats: &[MeshFormat],
-        monitor: &dyn Monitor,
-    ) -> Result<KeptHead> {
-        check_feasible(asked)?;
-        for [key, value, _] in asked.differences(&self.made) {
-            if let Some((_, what, shown_by)) = FILE_KEYS.iter().find(|(name, ..)| *name == key) {
-                self.warnings.extend(not_shown(&key, what, shown_by, formats)?);
-            } else if !PART_KEYS.contains(&key.as_str()) && key != key!(device) {
-                let what =
-                    format!("`{key}` affects what is made, and `export` only writes what has been made");
-                return Err(Error::usage(what, self.made_again(&key, &value)));
+    /// Fails if more is asked for than the run keeps, or something that none of the formats shows;
+    /// the error names the option.
+    pub fn changed(mut self, asked: &ExportRequest, monitor: &dyn Monitor) -> Result<KeptHead> {
+        for (option, what, shown_by) in asked.options() {
+            self.warnings.extend(not_shown(option, what, shown_by, &asked.formats)?);
+        }
+        self.leave_out(asked);
+        self.resize(asked, monitor)?;
+        let has_normals = self.head.texture.as_ref().is_some_and(|t| t.normal.is_some());
+        if asked.material == Some(Material::Unlit) && has_normals {
+            self.warnings.push(
+                "the material stays lit, for a normal map needs light; `--no-normal-map` leaves it out"
+                    .into(),
+            );
+        }
+        self.export = Export {
+            unit_m: self.unit_m(asked.size)?,
+            obj_unit_m: asked.obj_unit_m,
+            frame: asked.frame,
+            jpeg: asked.jpeg,
+            material: asked.material.unwrap_or(Material::Unlit),
+            ..self.export
+        };
+        Ok(self)
+    }
+
+    /// Returns the length of a dataset unit that gives the head a size, meters.
+    fn unit_m(&self, size: Size) -> Result<f64> {
+        match size {
+            Size::Dataset => Ok(self.export.unit_m),
+            Size::Head(meters) => {
+                Ok(meters / self.export.height(&self.head.mesh, &self.head.world_from_scene))
+            }
+            Size::Between([a, b], meters) => {
+                let distance = a.distance(b);
+                if distance.is_finite() && distance > 0.0 {
+                    return Ok(meters / distance);
+                }
+                let text = format!("the points {a} and {b} of `--measure` have no distance");
+                Err(Error::usage(
+                    text,
+                    "give two points of the head in the dataset's coordinates, as in its .ply",
+                ))
             }
         }
-        self.export = Export::new(&self.capture, asked);
-        self.leave_out(asked)?;
-        self.resize(asked, formats, monitor)?;
-        let has_normals = self.head.texture.as_ref().is_some_and(|t| t.normal.is_some());
-        if asked.mesh.material == Material::Unlit && self.made.mesh.material == Material::Lit && has_normals {
-            let left_out = key!(mesh.normal_map);
-            self.warnings.push(format!(
-                "the material stays lit, for a normal map needs light; `--set {left_out}=false` leaves it out"
-            ));
-        }
-        Ok(self)
     }
 
     /// Returns the files of the head in a format, the mesh first. `stem` is their base name.
@@ -150,86 +221,80 @@ impl KeptHead {
         self.head.mesh.triangles.len()
     }
 
-    /// Returns what to do about a setting that needs a mesh of its own.
-    fn made_again(&self, key: &str, value: &str) -> String {
-        match key.split_once('.') {
-            Some(("mesh", _)) => {
-                let run = self.run.display();
-                format!(
-                    "leave it out, or make the mesh again: `tiface mesh {run} --fresh mesh --set {key}={value}`"
-                )
-            }
-            _ => "leave it out".into(),
-        }
+    /// Returns the number of triangles of its soft layers.
+    pub fn layer_triangles(&self) -> usize {
+        let HeadMesh { mesh, shells, .. } = &self.head;
+        let count = |layer: &ShellLayer| mesh.triangles.iter().filter(|t| layer.has(t)).count();
+        shells.iter().flat_map(|shells| &shells.layers).map(count).sum()
+    }
+
+    /// Returns the width, height and depth of the mesh in GLB, OBJ and USDZ files, meters.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the mesh has no up direction.
+    pub fn size_m(&self) -> Result<[f32; 3]> {
+        let HeadMesh { mesh, world_from_scene, .. } = &self.head;
+        let file_from_scene = self.export.frames(mesh, world_from_scene)?.file_from_scene;
+        // without the translation, which f32 may not represent
+        let in_place = Similarity { translation: DVec3::ZERO, ..file_from_scene };
+        Ok(mesh.transformed(&in_place).bounds().size().to_array())
     }
 
     /// Refuses a value that asks for more than the run keeps.
-    fn more(&self, key: &str, value: impl ToString, kept: &str) -> Error {
-        let value = value.to_string();
-        Error::usage(format!("`{key}` is {value}, but the run keeps {kept}"), self.made_again(key, &value))
+    fn more(&self, option: &str, key: &str, value: u32, kept: &str) -> Error {
+        let run = self.run.display();
+        Error::usage(
+            format!("`{option}` is {value}, but the run keeps {kept}"),
+            format!(
+                "leave it out, or make the mesh again: `tiface mesh {run} --fresh mesh --set {key}={value}`"
+            ),
+        )
     }
 
-    /// Leaves out what is asked to be left out: soft layers, lobes, the normal map.
-    fn leave_out(&mut self, asked: &Config) -> Result<()> {
-        let (was, is) = (&self.made.mesh, &asked.mesh);
-        if is.hair != was.hair {
-            if is.hair == Hair::Shells {
-                return Err(self.more(key!(mesh.hair), "shells", "no soft layers"));
-            }
-            self.head.shells = None;
-        }
-        if is.normal_map && !was.normal_map {
-            return Err(self.more(key!(mesh.normal_map), true, "no normal map"));
-        }
-        if is.lobes != was.lobes && is.lobes != 0 {
-            return Err(self.more(key!(mesh.lobes), is.lobes, &format!("lobes of degree {}", was.lobes)));
-        }
+    /// Leaves out what is not asked for: soft layers, lobes, the normal map.
+    fn leave_out(&mut self, asked: &ExportRequest) {
+        self.head.shells = self.head.shells.take().filter(|_| asked.layers);
         if let Some(texture) = &mut self.head.texture {
-            texture.normal = texture.normal.take().filter(|_| is.normal_map);
-            texture.lobes = texture.lobes.take().filter(|_| is.lobes > 0);
+            texture.normal = texture.normal.take().filter(|_| asked.normal_map);
+            texture.lobes = texture.lobes.take().filter(|_| asked.lobes);
         }
-        Ok(())
     }
 
     /// Brings the mesh and its texture to the size that is asked for.
-    fn resize(&mut self, asked: &Config, formats: &[MeshFormat], monitor: &dyn Monitor) -> Result<()> {
-        let (was, is) = (&self.made.mesh, &asked.mesh);
+    fn resize(&mut self, asked: &ExportRequest, monitor: &dyn Monitor) -> Result<()> {
         let kept_px = self.head.texture.as_ref().map_or(0, |t| t.color.width);
         let kept = self.triangles();
-        let px = if is.texture_px == was.texture_px { kept_px } else { is.texture_px };
+        let px = asked.texture_px.unwrap_or(kept_px);
         if px > kept_px {
             let kept = match kept_px {
                 0 => "no texture".into(),
                 kept => format!("a texture of {kept}"),
             };
-            return Err(self.more(key!(mesh.texture_px), px, &kept));
+            return Err(self.more("--texture", key!(mesh.texture_px), px, &kept));
         }
         if px == 0 && kept_px > 0 && self.head.mesh.colors.is_empty() {
-            return Err(self.more(key!(mesh.texture_px), px, "no colors at the vertices"));
+            return Err(self.more("--texture", key!(mesh.texture_px), px, "no colors at the vertices"));
         }
         if px > 0 && px < kept_px {
-            self.warnings.extend(not_shown(key!(mesh.texture_px), "texture", TEXTURED, formats)?);
+            self.warnings.extend(not_shown("--texture", "texture", TEXTURED, &asked.formats)?);
         }
-        let count = is.triangles as usize;
-        let more = was.triangles != 0 && is.triangles > was.triangles && count > kept;
-        if is.triangles != was.triangles && (count == 0 || more) {
-            return Err(self.more(
-                key!(mesh.triangles),
-                is.triangles,
-                &format!("a mesh of {kept} triangles"),
-            ));
+        let count = asked.triangles.map_or(kept, |n| n as usize);
+        if count > kept {
+            let kept = format!("a mesh of {kept} triangles");
+            return Err(self.more("--triangles", key!(mesh.triangles), count as u32, &kept));
         }
-        if is.triangles != was.triangles && count < kept {
+        if count < kept {
             return self.simplify(count, px, monitor);
         }
+        let gutter_px = self.made.mesh.gutter_px;
         match self.head.texture.take() {
             Some(texture) if px == kept_px => self.head.texture = Some(texture),
-            Some(_) if px > 0 && px * was.gutter_px < kept_px => {
-                let least = kept_px.div_ceil(was.gutter_px);
+            Some(_) if px > 0 && px * gutter_px < kept_px => {
+                let least = kept_px.div_ceil(gutter_px);
                 return Err(Error::usage(
                     format!(
-                        "`{}` is {px}: charts of the kept texture of {kept_px} would run into each other",
-                        key!(mesh.texture_px)
+                        "`--texture` is {px}: charts of the kept texture of {kept_px} would run into each other"
                     ),
                     format!("use {least} or more"),
                 ));
@@ -273,10 +338,10 @@ impl KeptHead {
     }
 }
 
-/// Returns a warning for each of the formats that does not show a changed setting. Fails if none
-/// shows it.
+/// Returns a warning that names the formats which do not show what an option asks for. Fails if
+/// none shows it.
 fn not_shown(
-    key: &str,
+    option: &str,
     what: &str,
     shown_by: &[MeshFormat],
     formats: &[MeshFormat],
@@ -288,7 +353,7 @@ fn not_shown(
     if without.is_empty() {
         return Ok(None);
     }
-    let problem = format!("`{key}` does not affect {without} files, which have no {what}");
+    let problem = format!("`{option}` does not affect {without} files, which have no {what}");
     match formats.iter().any(|f| shown_by.contains(f)) {
         true => Ok(Some(problem)),
         false => {
@@ -300,6 +365,7 @@ fn not_shown(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::Capture;
     use crate::config::Preset;
     use glam::Vec3;
     use tiface_base::Quiet;
@@ -325,21 +391,15 @@ mod tests {
             readings: Vec::new(),
         };
         let export = Export::new(&capture, &made);
-        KeptHead { run: "run".into(), made, capture, head, export, warnings: Vec::new() }
-    }
-
-    fn asked(kept: &KeptHead, change: impl Fn(&mut Config)) -> Config {
-        let mut asked = kept.made.clone();
-        change(&mut asked);
-        asked
+        KeptHead { run: "run".into(), made, head, export, warnings: Vec::new() }
     }
 
     #[test]
     fn fewer_triangles_keep_layers_and_view_dependent_color() {
         let head = kept(ball(), |c| (c.mesh.texture_px, c.mesh.lobes) = (512, 1));
         let before = head.head.clone();
-        let asked = asked(&head, |c| (c.mesh.triangles, c.mesh.texture_px) = (800, 256));
-        let after = head.changed(&asked, &[MeshFormat::Glb], &Quiet).unwrap();
+        let asked = ExportRequest { triangles: Some(800), texture_px: Some(256), ..ExportRequest::default() };
+        let after = head.changed(&asked, &Quiet).unwrap();
         let mesh = &after.head.mesh;
         assert!((700..=800).contains(&mesh.triangles.len()) && mesh.is_closed(), "{}", mesh.triangles.len());
         let texture = after.head.texture.as_ref().unwrap();
@@ -368,22 +428,15 @@ mod tests {
 
     #[test]
     fn a_smaller_texture_that_would_mix_charts_is_refused() {
-        let head = || kept(ball(), |c| c.mesh.texture_px = 512);
-        let change = |px: u32| {
-            let head = head();
-            let asked = asked(&head, |c| c.mesh.texture_px = px);
-            head.changed(&asked, &[MeshFormat::Glb], &Quiet)
+        let change = |gutter_px: u32, px: u32| {
+            let head = kept(ball(), |c| (c.mesh.texture_px, c.mesh.gutter_px) = (512, gutter_px));
+            head.changed(&ExportRequest { texture_px: Some(px), ..ExportRequest::default() }, &Quiet)
         };
         // an eighth, which is one texel of a gutter of eight
-        assert_eq!(change(64).unwrap().head.texture.unwrap().atlas.width, 64);
-        let e = change(32).err().unwrap();
+        assert_eq!(change(8, 64).unwrap().head.texture.unwrap().atlas.width, 64);
+        let e = change(8, 32).err().unwrap();
         assert_eq!(e.kind().code(), 2, "{e}");
-        let wide = {
-            let mut head = head();
-            head.made.mesh.gutter_px = 4;
-            let asked = asked(&head, |c| c.mesh.texture_px = 100);
-            head.changed(&asked, &[MeshFormat::Glb], &Quiet).err().unwrap()
-        };
+        let wide = change(4, 100).err().unwrap();
         assert!(
             wide.to_string().contains("would run into each other") && wide.hint() == "use 128 or more",
             "{wide:?}"
@@ -392,13 +445,12 @@ mod tests {
 
     #[test]
     fn the_normal_map_keeps_the_material_lit_and_says_so() {
-        let head = kept(tetrahedron(), |c| (c.mesh.material, c.mesh.normal_map) = (Material::Lit, true));
-        let unlit = asked(&head, |c| c.mesh.material = Material::Unlit);
-        let without = asked(&head, |c| (c.mesh.material, c.mesh.normal_map) = (Material::Unlit, false));
-        let lit = head.changed(&unlit, &[MeshFormat::Glb], &Quiet).unwrap();
-        assert!(lit.warnings[0].contains("`--set mesh.normal_map=false`"), "{:?}", lit.warnings);
-        let head = kept(tetrahedron(), |c| (c.mesh.material, c.mesh.normal_map) = (Material::Lit, true));
-        let unlit = head.changed(&without, &[MeshFormat::Glb], &Quiet).unwrap();
+        let head = || kept(tetrahedron(), |c| c.mesh.normal_map = true);
+        let unlit = ExportRequest { material: Some(Material::Unlit), ..ExportRequest::default() };
+        let lit = head().changed(&unlit, &Quiet).unwrap();
+        assert!(lit.warnings[0].contains("`--no-normal-map`"), "{:?}", lit.warnings);
+        assert!(head().changed(&ExportRequest::default(), &Quiet).unwrap().warnings.is_empty());
+        let unlit = head().changed(&ExportRequest { normal_map: false, ..unlit }, &Quiet).unwrap();
         assert!(unlit.warnings.is_empty() && unlit.head.texture.as_ref().unwrap().normal.is_none());
         let glb = unlit.files(MeshFormat::Glb, "head").unwrap().files.remove(0).1;
         assert!(String::from_utf8_lossy(&glb).contains("KHR_materials_unlit"));

@@ -3,7 +3,7 @@
 use super::advice::{advised, sentence};
 use super::frames::{Export, center};
 use crate::capture::scene::Scene;
-use crate::config::{ColorSource, Hair, MeshConfig, MeshFrame};
+use crate::config::{ColorSource, Hair, MeshConfig};
 use glam::Mat3;
 use serde_json::{Map, Value, json};
 use tiface_base::geom::{Atlas, Camera, Harmonics, Mesh, SdfField, Shells, Similarity};
@@ -117,11 +117,10 @@ impl Finish<'_> {
     }
 
     /// Returns the rotation from the scene to the coordinates that harmonics are kept in: those of
-    /// files in the dataset's frame, which then hold them as they are. In other frames
-    /// [`to_glb`] turns them.
+    /// the stage's files, which then hold them as they are. Where a file has another frame, its
+    /// writer turns them.
     fn lobe_coordinates(&self, mesh: &Mesh, world_from_scene: &Similarity) -> Result<Mat3> {
-        let export = Export { frame: MeshFrame::Dataset, ..self.export.clone() };
-        Ok(export.frames(mesh, world_from_scene)?.file_from_scene.rotation_f32())
+        Ok(self.export.frames(mesh, world_from_scene)?.file_from_scene.rotation_f32())
     }
 
     /// Decides whether colors are fitted to photographs; warns if they should be, but cannot.

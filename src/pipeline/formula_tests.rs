@@ -1,9 +1,9 @@
 //! The stages after learning, on the demo head's formula in place of trained fields.
 
-use super::tests::{NoFields, demo_head, draft, head_run, masked, quiet, tiny_run};
+use super::tests::{NoFields, demo_head, draft, head_run, masked, quiet};
 use super::*;
 use crate::capture::synthetic::SyntheticHead;
-use crate::config::{ColorSource, Config, Genus, Hair, MeshFormat, MeshFrame, Method, ViewBackground};
+use crate::config::{ColorSource, Config, Genus, Hair, MeshFormat, Method, ViewBackground};
 use crate::metrics::compare;
 use crate::run::{Run, read_record};
 use glam::Vec3;
@@ -147,10 +147,10 @@ fn the_stages_after_learning_keep_the_exact_head_exact() {
     assert!(warnings[0].contains("head.glb` has 4 bytes") && warnings[0].contains("`--fresh mesh`"));
 }
 
-/// Makes heads with colors from a source, lobes and a frame each. By the photographs, a head must
+/// Makes heads with colors from a source and lobes each. By the photographs, a head must
 /// look as rays show it and like the photograph; for every other one the difference between what
 /// rays and what a viewer shows is returned.
-fn textured_heads((resolution, texture_px): (u32, u32), heads: &[(ColorSource, u32, MeshFrame)]) -> Vec<f64> {
+fn textured_heads((resolution, texture_px): (u32, u32), heads: &[(ColorSource, u32)]) -> Vec<f64> {
     let (dir, mut config, _) = sharp_run();
     config.mesh.resolution = resolution;
     config.mesh.triangles = 8000;
@@ -161,11 +161,10 @@ fn textured_heads((resolution, texture_px): (u32, u32), heads: &[(ColorSource, u
     config.render.residuals = false; // they are in no file
     config.ensemble.members = Vec::new();
     let mut errors = Vec::new();
-    for (number, &(color, lobes, frame)) in heads.iter().enumerate() {
+    for (number, &(color, lobes)) in heads.iter().enumerate() {
         config.mesh.color = color;
         config.mesh.lobes = lobes;
         config.mesh.normal_map = lobes > 0;
-        config.mesh.frame = frame;
         let run = quiet(&dir.path().join(number.to_string()));
         let session = Session::open(&config, &run).unwrap();
         session.remember(Stage::Render).unwrap();
@@ -213,28 +212,10 @@ fn textured_heads((resolution, texture_px): (u32, u32), heads: &[(ColorSource, u
 /// view is in its lobes.
 #[test]
 fn the_textured_head_looks_like_the_field_it_was_baked_from() {
-    let heads = [
-        (ColorSource::Network, 0, MeshFrame::Dataset),
-        (ColorSource::Network, 1, MeshFrame::Head),
-        (ColorSource::Photographs, 1, MeshFrame::Head),
-    ];
+    let heads = [(ColorSource::Network, 0), (ColorSource::Network, 1), (ColorSource::Photographs, 1)];
     let errors = textured_heads((80, 256), &heads);
     // the stripes swing by 0.1, the view's part by 0.05
     assert!(errors[0] < 0.025 && errors[1] < 0.6 * errors[0], "{errors:?}");
-}
-
-#[test]
-#[ignore = "long: run by `tools/test.sh all`; bakes four heads of 512 texels"]
-fn the_textured_head_looks_the_same_in_whatever_frame_it_is_exported() {
-    let heads = [
-        (ColorSource::Network, 0, MeshFrame::Dataset),
-        (ColorSource::Network, 1, MeshFrame::Dataset),
-        (ColorSource::Network, 1, MeshFrame::Head),
-        (ColorSource::Photographs, 1, MeshFrame::Head),
-    ];
-    let errors = textured_heads((96, 512), &heads);
-    assert!(errors[0] < 0.025 && errors[1] < 0.6 * errors[0], "{errors:?}");
-    assert!((errors[1] - errors[2]).abs() < 1e-3, "{errors:?}");
 }
 
 #[test]
@@ -352,24 +333,4 @@ fn a_handle_of_the_field_is_gone_from_the_head_unless_it_is_to_be_kept() {
     let [(removed, 0), (0, kept)] = counts[..] else { panic!("{counts:?}") };
     assert!(removed == kept && removed > 0, "{counts:?}");
     assert_ne!(digests[0], digests[1]);
-}
-
-#[test]
-fn the_frame_of_a_file_shapes_nothing_that_views_show() {
-    let (dir, mut config, _) = tiny_run();
-    let parts = [MeshFrame::Dataset, MeshFrame::Head].map(|frame| {
-        config.mesh.resolution = 48;
-        config.mesh.triangles = 1000;
-        config.mesh.texture_px = 128;
-        config.mesh.frame = frame;
-        let run = Run::quiet(&dir.path().join(format!("{frame:?}")));
-        let session = Session::open(&config, &run).unwrap();
-        masked(&session);
-        let exact = Formula(Exact { world_from_scene: session.scene().unwrap().scene_from_world.inverse() });
-        complete(&session, Stage::Mesh, &exact).unwrap();
-        let parts = run.path("mesh/parts");
-        let names = io::list_files(&parts).unwrap();
-        names.into_iter().map(|n| (std::fs::read(parts.join(&n)).unwrap(), n)).collect::<Vec<_>>()
-    });
-    assert!(parts[0].len() > 1 && parts[0] == parts[1]);
 }

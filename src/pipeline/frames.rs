@@ -3,12 +3,30 @@
 
 use super::advice::advised;
 use crate::capture::Capture;
-use crate::config::{Config, Material, MeshFormat, MeshFrame, TextureFormat};
+use crate::config::{Config, MeshFormat};
 use glam::{DMat3, DVec3, Vec3};
 use tiface_base::Result;
 use tiface_base::geom::{Mesh, Similarity};
 use tiface_surface::AtlasConfig;
 use tiface_surface::files::{ExportOptions, ExportedFiles, HeadMesh, to_glb, to_obj, to_ply, to_usdz};
+
+/// The coordinates that a file is in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MeshFrame {
+    /// The dataset's own world, turned to +Y up where the format demands it.
+    Dataset,
+    /// +Y up through the crown, face towards +Z, origin at the center of the box.
+    Head,
+}
+
+/// What light does to the mesh in other programs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Material {
+    /// Nothing: the photographs' light is in its colors already.
+    Unlit,
+    /// It shades a rough surface that is no metal.
+    Lit,
+}
 
 /// The quality of textures that are stored as JPEG.
 const JPEG_QUALITY: u8 = 92;
@@ -30,12 +48,12 @@ pub struct Export {
     pub up: Vec3,
     /// Meters per dataset unit.
     pub unit_m: f64,
-    /// Height of a mesh in its files, meters; 0 where `unit_m` decides.
-    pub height_m: f64,
+    /// Meters per unit of an OBJ, which states none.
+    pub obj_unit_m: f64,
     /// The coordinate frame of the files.
     pub frame: MeshFrame,
-    /// How pictures are stored with the mesh.
-    pub texture_format: TextureFormat,
+    /// Whether the color is stored as JPEG, not PNG.
+    pub jpeg: bool,
     /// The material of GLB and USDZ, lit or unlit.
     pub material: Material,
     /// Camera positions in the world; a face is assumed to look at the cameras.
@@ -43,16 +61,16 @@ pub struct Export {
 }
 
 impl Export {
-    /// Returns the export options of a capture.
+    /// Returns how the stage `mesh` exports the head of a capture.
     pub fn new(capture: &Capture, config: &Config) -> Export {
         Export {
             name: capture.name.clone(),
             up: capture.up,
             unit_m: config.capture.unit_m,
-            height_m: config.mesh.height_m,
-            frame: config.mesh.frame,
-            material: config.mesh.material,
-            texture_format: config.mesh.texture_format,
+            obj_unit_m: 1.0,
+            frame: MeshFrame::Dataset,
+            jpeg: false,
+            material: Material::Unlit,
             cameras: capture.views.iter().map(|v| v.camera.position).collect(),
         }
     }
@@ -65,7 +83,7 @@ impl Export {
             stem: stem.into(),
             // an unlit material shows no normal map, so a normal map implies a lit one
             unlit: self.material == Material::Unlit && texture.as_ref().is_none_or(|t| t.normal.is_none()),
-            jpeg_quality: (self.texture_format == TextureFormat::Jpeg).then_some(JPEG_QUALITY),
+            jpeg_quality: self.jpeg.then_some(JPEG_QUALITY),
             ..self.placed(mesh, world_from_scene)
         };
         match format {
@@ -76,7 +94,10 @@ impl Export {
                     warnings: Vec::new(),
                 })
             }
-            MeshFormat::Obj => to_obj(mesh, texture.as_ref(), &options),
+            MeshFormat::Obj => {
+                let unit_m = options.unit_m / self.obj_unit_m;
+                to_obj(mesh, texture.as_ref(), &ExportOptions { unit_m, ..options })
+            }
             // always in the dataset's world, with colors at the vertices: one index per vertex, so
             // that the surface stays closed for every reader
             MeshFormat::Ply => {
@@ -93,16 +114,7 @@ impl Export {
             MeshFrame::Dataset => (self.up, *world_from_scene),
             MeshFrame::Head => (Vec3::Y, self.head_from_mesh(mesh, world_from_scene)),
         };
-        let unit_m = self.meters(mesh, world_from_scene);
-        ExportOptions { up, unit_m, world_from_mesh, ..ExportOptions::default() }
-    }
-
-    /// Returns the length of a dataset unit in the files of a mesh, meters.
-    pub(super) fn meters(&self, mesh: &Mesh, world_from_scene: &Similarity) -> f64 {
-        if self.height_m == 0.0 {
-            return self.unit_m;
-        }
-        self.height_m / self.height(mesh, world_from_scene)
+        ExportOptions { up, unit_m: self.unit_m, world_from_mesh, ..ExportOptions::default() }
     }
 
     /// Returns the height of a mesh along the up direction, dataset units.
@@ -224,10 +236,10 @@ mod tests {
             name: "x".into(),
             up,
             unit_m: 1.0,
-            height_m: 0.0,
+            obj_unit_m: 1.0,
             frame: MeshFrame::Dataset,
+            jpeg: false,
             material: Material::Unlit,
-            texture_format: TextureFormat::Png,
             cameras,
         }
     }
@@ -247,25 +259,6 @@ mod tests {
             assert_eq!(export.shows(&bust, &world_from_scene), "head and shoulders");
             // from 1 to -2, of 0.1 units each
             assert!((export.height(&bust, &world_from_scene) - 0.3).abs() < 1e-6);
-        }
-    }
-
-    #[test]
-    fn a_head_of_a_given_height_has_it_in_every_frame_whatever_the_units_and_the_up_direction() {
-        let positions =
-            (0..8).map(|i| Vec3::new((i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32)).collect();
-        let mesh = Mesh { positions, ..Mesh::default() };
-        let turn = DMat3::from_rotation_x(0.7) * DMat3::from_rotation_z(0.4);
-        let world_from_scene = Similarity { scale: 40.0, rotation: turn, translation: DVec3::splat(900.0) };
-        for frame in [MeshFrame::Dataset, MeshFrame::Head] {
-            let export =
-                Export { height_m: 0.24, frame, ..export(Vec3::new(0.6, 0.0, 0.8), vec![DVec3::ZERO]) };
-            let file_from_scene = export.frames(&mesh, &world_from_scene).unwrap().file_from_scene;
-            let placed = mesh.transformed(&Similarity { translation: DVec3::ZERO, ..file_from_scene });
-            let height = placed.bounds().size().y;
-            assert!((height - 0.24).abs() < 1e-5, "{frame:?}: {height}");
-            let plain = Export { height_m: 0.0, ..export }.frames(&mesh, &world_from_scene).unwrap();
-            assert!((plain.file_from_scene.scale - 40.0).abs() < 1e-9);
         }
     }
 

@@ -108,8 +108,7 @@ pub(super) fn mask(
     };
     found.require(dir)?;
     let height = scene::height(&scene, capture.up);
-    let stated = whole.mesh.height_m > 0.0;
-    let doubt = height.filter(|_| !stated).and_then(|h| scene::doubtful_height(h, capture.unit_m));
+    let doubt = height.and_then(|h| scene::doubtful_height(h, capture.unit_m));
     doubt.iter().for_each(|text| dir.warn(text));
     let covered = coverage.iter().sum::<f64>() / coverage.len().max(1) as f64;
     let mut summary = json!({

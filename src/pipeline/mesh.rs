@@ -50,7 +50,7 @@ pub(super) fn mesh(
     let photographs = photographs(&views);
     let mut extracted = extract(scene, field, &cameras, capture.up, c, dir.monitor())?;
     let outlines = if c.dense { None } else { extracted.fit_outlines(&photographs, dir.monitor())? };
-    let mm = world_from_scene.scale * export.meters(&extracted.mesh, &world_from_scene) * 1000.0;
+    let mm = world_from_scene.scale * export.unit_m * 1000.0;
     extracted.announce(c.cap, mm, dir);
     extracted.end(c.cap);
     let cameras: Vec<Camera> = cameras.iter().map(|c| c.transformed(&scene.scene_from_world)).collect();
@@ -129,13 +129,12 @@ fn shape(head: &HeadMesh, export: &Export) -> Value {
     let HeadMesh { mesh, world_from_scene, texture, .. } = head;
     // without the translation, which f32 may not represent
     let in_place = Similarity { translation: DVec3::ZERO, ..*world_from_scene };
-    let meters = export.meters(mesh, world_from_scene);
-    let size = mesh.transformed(&in_place).bounds().size() * meters as f32;
+    let size = mesh.transformed(&in_place).bounds().size() * export.unit_m as f32;
     let height = export.height(mesh, world_from_scene);
     json!({
         "shows": export.shows(mesh, world_from_scene),
         "height_units": height,
-        "height_m": height * meters,
+        "height_m": height * export.unit_m,
         "vertices": mesh.positions.len(),
         "triangles": mesh.triangles.len(),
         "closed": mesh.is_closed(),

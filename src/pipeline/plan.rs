@@ -1,7 +1,6 @@
 //! The inputs of each stage, known before anything runs.
 
 use super::ensemble::can_blend;
-use super::export::is_file_key;
 use super::inputs::capture_options;
 use super::mask::inspect_capture;
 use super::path::{CameraPath, PATHS};
@@ -139,13 +138,14 @@ impl Session<'_> {
         Ok(format!("{} file{plural}, {:.1} MB", files.len(), files.values().sum::<u64>() as f64 / 1e6))
     }
 
-    /// Returns whether the finished mesh differs from the settings only in how its files are
-    /// written.
-    pub fn differs_in_files(&self) -> bool {
+    /// Returns whether the finished mesh differs from the settings only in the formats of its
+    /// files.
+    pub fn differs_in_formats(&self) -> bool {
         let Ok(Some(record)) = read_record(&self.run.path(Stage::Mesh)) else { return false };
         let differences = self.compared_plan(Stage::Mesh).fingerprint.differences(&record.fingerprint);
-        let is_file = |line: &String| line.split_once(": ").is_some_and(|(key, _)| is_file_key(key));
-        !differences.is_empty() && differences.iter().all(is_file)
+        let is_format =
+            |line: &String| line.split_once(": ").is_some_and(|(key, _)| key == key!(mesh.format));
+        !differences.is_empty() && differences.iter().all(is_format)
     }
 
     /// Returns the folders that are out of date for `until`, if a stage is to be made again.
@@ -188,7 +188,7 @@ impl Session<'_> {
         let plans = self.order(until).into_iter().map(|stage| self.compared_plan(stage));
         let mut kept = plans.filter(|plan| !cleared.iter().any(|name| name == plan.name));
         kept.try_for_each(|plan| {
-            self.run.agrees(&plan).map_err(|e| match plan.name == Stage::Mesh.as_str() && self.differs_in_files() {
+            self.run.agrees(&plan).map_err(|e| match plan.name == Stage::Mesh.as_str() && self.differs_in_formats() {
                 true => {
                     let run = self.run.dir().display();
                     let hint = format!(

@@ -225,12 +225,8 @@ fn keys_of_the_mesh_make_its_surface_its_head_or_its_files_again() {
         (key!(mesh.lobes), "head"),
         (key!(mesh.hair), "head"),
         (key!(mesh.normal_map), "head"),
-        (key!(mesh.material), "files"),
-        (key!(mesh.texture_format), "files"),
         (key!(mesh.exr), "files"),
         (key!(mesh.format), "files"),
-        (key!(mesh.frame), "files"),
-        (key!(mesh.height_m), "files"),
     ];
     let expected: Vec<(String, &str)> = expected.map(|(name, part)| (name.to_string(), part)).to_vec();
     assert_eq!(found, expected);

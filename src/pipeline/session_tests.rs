@@ -3,10 +3,7 @@
 use super::tests::{NoFields, head_run, masked, quiet, tiny_run, words};
 use super::*;
 use crate::capture::Split;
-use crate::config::{
-    ColorSource, Config, MaskSource, Material, MeshConfig, MeshFormat, MeshFrame, Method, TextureFormat,
-    ViewBackground,
-};
+use crate::config::{ColorSource, Config, MaskSource, MeshConfig, MeshFormat, Method, ViewBackground};
 use crate::run::{Run, Stop};
 use serde_json::json;
 use tiface_base::io::{self, Limits};
@@ -258,14 +255,13 @@ fn done(session: &Session) -> String {
 }
 
 #[test]
-fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
+fn other_formats_leave_the_views_and_their_figures_alone() {
     let (dir, mut config, run) = tiny_run();
     finish(&Session::open(&config, &run).unwrap());
     let all = "mask tface iface mesh render ensemble metrics";
     for change in [
-        |c: &mut Config| c.mesh.material = Material::Lit,
         |c: &mut Config| c.mesh.format = vec![MeshFormat::Glb, MeshFormat::Obj],
-        |c: &mut Config| (c.mesh.frame, c.mesh.texture_format) = (MeshFrame::Head, TextureFormat::Jpeg),
+        |c: &mut Config| c.mesh.exr = true,
     ] {
         change(&mut config);
         let session = Session::open(&config, &run).unwrap();
@@ -285,11 +281,11 @@ fn another_material_format_or_frame_leaves_the_views_and_their_figures_alone() {
     };
     let session = Session::open(&config, &run).unwrap().with_camera_path(orbit).unwrap();
     session.run.stage(session.plan(Stage::Render), |_| Ok(json!(null))).unwrap();
-    for (material, triangles, expected) in [
-        (Material::Unlit, config.mesh.triangles, &["mesh"][..]),
-        (Material::Lit, 100, &["mesh", "render", "ensemble", "metrics", "render/paths/orbit"]),
+    for (exr, triangles, expected) in [
+        (false, config.mesh.triangles, &["mesh"][..]),
+        (true, 100, &["mesh", "render", "ensemble", "metrics", "render/paths/orbit"]),
     ] {
-        let mesh = MeshConfig { material, triangles, ..config.mesh.clone() };
+        let mesh = MeshConfig { exr, triangles, ..config.mesh.clone() };
         let other = Config { mesh, ..config.clone() };
         let session = Session::open(&other, &run).unwrap();
         assert_eq!(session.out_of_date(Stage::Mesh).unwrap(), expected);

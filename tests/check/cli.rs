@@ -406,11 +406,8 @@ fn offered(shell: &str, words: &[&str]) -> Vec<String> {
 #[test]
 fn keys_and_values_of_settings_complete() {
     let keys = offered("bash", &["mesh", "runs/a", "--set", "mesh.tex"]);
-    assert_eq!(keys, ["mesh.texture_px=", "mesh.texture_format="]);
-    assert_eq!(
-        offered("bash", &["run", "--set", "mesh.material="]),
-        ["mesh.material=unlit", "mesh.material=lit"]
-    );
+    assert_eq!(keys, ["mesh.texture_px="]);
+    assert_eq!(offered("bash", &["run", "--set", "mesh.hair="]), ["mesh.hair=shells", "mesh.hair=none"]);
     assert_eq!(offered("bash", &["run", "--set", "mesh.cap=f"]), ["mesh.cap=false"]);
     assert_eq!(offered("bash", &["run", "--set", "mesh.format=glb,p"]), ["mesh.format=glb,ply"]);
     assert!(offered("bash", &["run", "--set", "mesh.resolution="]).is_empty());
@@ -432,13 +429,13 @@ fn bash_completes_with_the_printed_script() {
     let program = Path::new(env!("CARGO_BIN_EXE_tiface"));
     let script = r#"
         source <(tiface completions bash)
-        COMP_WORDS=(tiface run --set mesh.material=u) COMP_CWORD=3 COMP_TYPE=9
+        COMP_WORDS=(tiface run --set mesh.hair=s) COMP_CWORD=3 COMP_TYPE=9
         [[ $COMP_WORDBREAKS == *=* ]] && exit 3
-        _clap_complete_tiface tiface mesh.material=u --set
+        _clap_complete_tiface tiface mesh.hair=s --set
         echo "${COMPREPLY[@]}""#;
     let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
     let o = Command::new("bash").args(["-c", script]).env("PATH", path).output().unwrap();
-    assert_eq!((code(&o), out(&o).trim()), (0, "mesh.material=unlit"), "{}", err(&o));
+    assert_eq!((code(&o), out(&o).trim()), (0, "mesh.hair=shells"), "{}", err(&o));
 }
 
 #[test]

@@ -4,7 +4,7 @@
 //! photographs.
 
 use crate::capture::{Split, View};
-use crate::config::{MeshFormat, MeshFrame, Stage, TextureFormat, ViewBackground, display_name};
+use crate::config::{MeshFormat, Stage, ViewBackground, display_name};
 use crate::pipeline::frames::{Export, center};
 use crate::pipeline::mesh::{head_mesh, read_finished, seen_note};
 use crate::pipeline::metrics::{Comparable, PictureSet, comparable, picture_sets};
@@ -217,18 +217,12 @@ pub(super) fn viewer(session: &Session) -> Result<Option<(Viewer, Similarity)>> 
 /// Returns the head of a run whose mesh is done.
 fn shown(session: &Session, mesh: &Record) -> Result<(Viewer, Similarity)> {
     mesh.require_products(&session.run.path(Stage::Mesh))?;
-    let export =
-        Export { texture_format: TextureFormat::Jpeg, ..Export::new(&session.capture, session.config) };
+    let export = Export { jpeg: true, ..Export::new(&session.capture, session.config) };
     let head = head_mesh(session.run)?;
     let as_glb = |head: &HeadMesh| Ok(export.files(head, MeshFormat::Glb, "head")?.files.swap_remove(0).1);
     let file_from_world = export.frames(&head.mesh, &head.world_from_scene)?.file_from_world();
-    let front = match export.frame {
-        MeshFrame::Head => Vec3::Z,
-        MeshFrame::Dataset => {
-            let front = export.front(center(&head.mesh, &head.world_from_scene)).unwrap_or(Vec3::ZERO);
-            file_from_world.direction(front)
-        }
-    };
+    let front = export.front(center(&head.mesh, &head.world_from_scene)).unwrap_or(Vec3::ZERO);
+    let front = file_from_world.direction(front);
     let unseen = seen_note(seen_shares(&head.mesh)).map(|said| said + ".");
     let (glb, note) = small(head, &session.run.path("mesh/parts"), as_glb)?;
     let note = unseen.into_iter().chain((!note.is_empty()).then_some(note)).collect::<Vec<_>>().join(" ");
