@@ -1,7 +1,7 @@
 """How the two materials of a head look in Blender under light that people have: decibels from its own colors.
 
-    tiface mesh RUN --fresh mesh --material unlit --out unlit.glb
-    tiface mesh RUN --fresh mesh --material lit --out lit.glb
+    tiface export RUN --material unlit --out unlit.glb
+    tiface export RUN --material lit --out lit.glb
     tiface render RUN --with textured
     .venv-blender/bin/python tools/readers/material_blender.py RUN unlit.glb lit.glb [--save DIR]
 

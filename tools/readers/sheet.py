@@ -5,7 +5,7 @@ docs/soft-layers.jpg have them.
     python tools/readers/sheet.py layers PICTURES OUT.jpg VIEW LEFT TOP RIGHT BOTTOM
 
 `lobes`: of each view the base color and the color with lobes, three.js above, Blender below. `layers`: this part of a view,
-before white and before gray: VIEW_bare.png, a render by tools/blender/render.py of `tiface export RUN --hair none`; then
+before white and before gray: VIEW_bare.png, a render by tools/blender/render.py of `tiface export RUN --no-layers`; then
 with layers tiface, three.js and Blender. Needs numpy and Pillow.
 """
 
