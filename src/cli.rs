@@ -265,7 +265,7 @@ pictures of meshes are written to CAPTURE_judged/ or to --out; no run is started
         #[arg(long, value_name = "BAR")]
         require: Vec<String>,
     },
-    /// Write the finished head of a run to files for other programs
+    /// Write the finished head of a run, or a mesh file, to files for other programs
     #[command(after_long_help = "Examples:
   tiface export runs/002_00 --out head.obj      the ending selects the format
   tiface export runs/002_00 --out head.usdz     iPhone, iPad, Mac and Safari show it by themselves
@@ -273,6 +273,7 @@ pictures of meshes are written to CAPTURE_judged/ or to --out; no run is started
   tiface export runs/002_00 --format glb,ply --triangles 10000 --texture 1024 --out small/
   tiface export runs/002_00 --no-layers --height 0.24       write to 002_00.glb
   tiface export runs/002_00 --measure -0.03,0.1,0.2 0.03,0.1,0.2 0.064 --out head.glb
+  tiface export scan.ply --up z --triangles 20000 --out scan.usdz
 
 It takes seconds, opens no photograph, writes nothing into the run and remembers nothing: the same command writes the same
 bytes, whatever was exported before. More triangles or a larger texture need `tiface mesh RUN --fresh mesh`.")]

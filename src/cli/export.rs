@@ -3,12 +3,13 @@
 use super::Invocation;
 use super::options::RunTarget;
 use super::out::{Out, require_outside, write_head};
+use super::preview::{AXES, axis};
 use super::screen::print;
 use crate::config::{Config, MeshFormat, Stage};
 use crate::pipeline::{ExportRequest, KeptHead, Material, MeshFrame, Size};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use tiface_base::{Error, Quiet, Result, io};
@@ -16,8 +17,9 @@ use tiface_base::{Error, Quiet, Result, io};
 /// Options of `tiface export`.
 #[derive(Args, Debug)]
 pub(super) struct ExportOptions {
-    /// Run [default: the run in this folder, else the newest under runs/]
-    #[arg(value_name = "RUN")]
+    /// Run, or .glb, .gltf, .obj, .ply or .stl file [default: the run in this folder, else the
+    /// newest under runs/]
+    #[arg(value_name = "RUN|MESH")]
     path: Option<PathBuf>,
     /// Formats to write: glb, obj, ply, usdz [default: as --out ends, else glb]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
@@ -40,6 +42,10 @@ pub(super) struct ExportOptions {
     /// the dataset's world, the coordinates of .ply
     #[arg(long, num_args = 3, value_names = ["A", "B", "METERS"], allow_hyphen_values = true)]
     measure: Vec<String>,
+    /// Up axis of a mesh file: x, -x, y, -y, z or -z
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true, default_value = "y")]
+    #[arg(value_parser = PossibleValuesParser::new(AXES).map(|word| axis(&word)))]
+    up: Vec3,
     /// Unit of OBJ, which states none: m, cm or mm
     #[arg(long, value_name = "UNIT", default_value = "m")]
     #[arg(value_parser = PossibleValuesParser::new(["m", "cm", "mm"]).map(|word| meters(&word)))]
@@ -129,9 +135,26 @@ impl ExportOptions {
         }
     }
 
+    /// Returns the run or the file that is named, and its head.
+    fn read(&self, invocation: &Invocation) -> Result<(PathBuf, KeptHead)> {
+        if let Some(file) = self.path.as_deref().filter(|path| io::is_file(path)) {
+            return Ok((file.into(), KeptHead::open(file, self.up)?));
+        }
+        let target = RunTarget::find(invocation.common, self.path.as_deref())?;
+        let Some(saved) = &target.saved else {
+            let what = format!("`{}` is not a run", self.path.as_deref().unwrap_or(&target.run).display());
+            return Err(Error::usage(what, "name the folder of a run, or a mesh file"));
+        };
+        if target.guessed {
+            invocation.screen.note("run", &format!("using `{}`", target.run.display()));
+        }
+        let head = KeptHead::read(&target.run, &Config::read(saved)?)?;
+        Ok((target.run, head))
+    }
+
     /// Returns the files to write with their formats: `--out`, files in its folder, or else files
-    /// in the working directory with the run's name.
-    fn destinations(&self, out: Option<&Out>, run: &Path) -> Result<Vec<(PathBuf, MeshFormat)>> {
+    /// in the working directory with the name of the run or the mesh file.
+    fn destinations(&self, out: Option<&Out>, source: &Path) -> Result<Vec<(PathBuf, MeshFormat)>> {
         let formats = if self.format.is_empty() { &[MeshFormat::Glb][..] } else { &self.format };
         let named = |folder: &Path, stem: &str| {
             let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.as_str())), *format);
@@ -152,10 +175,10 @@ impl ExportOptions {
             }
             Some(Out::Folder(folder)) => Ok(named(folder, "head")),
             None => {
-                let name = io::real_path(run)
-                    .ok()
-                    .and_then(|run| Some(run.file_name()?.to_string_lossy().into_owned()));
-                Ok(named(Path::new(""), &name.unwrap_or_else(|| "head".into())))
+                let source = io::real_path(source).unwrap_or_else(|_| source.into());
+                // the dots of a run's name are no ending
+                let name = if io::is_file(&source) { source.file_stem() } else { source.file_name() };
+                Ok(named(Path::new(""), &name.map_or("head".into(), |name| name.to_string_lossy())))
             }
         }
     }
@@ -165,20 +188,13 @@ impl ExportOptions {
 pub(super) fn run(invocation: &Invocation, options: &ExportOptions) -> Result<()> {
     let (common, screen) = (invocation.common, &invocation.screen);
     let out = Out::find(common.out.as_deref(), "export")?;
-    let target = RunTarget::find(common, options.path.as_deref())?;
-    let Some(saved) = &target.saved else {
-        let what = format!("`{}` is not a run", options.path.as_deref().unwrap_or(&target.run).display());
-        return Err(Error::usage(what, "name the folder of a run"));
-    };
-    if target.guessed {
-        screen.note("run", &format!("using `{}`", target.run.display()));
-    }
-    let files = options.destinations(out.as_ref(), &target.run)?;
+    let (source, mut head) = options.read(invocation)?;
+    let files = options.destinations(out.as_ref(), &source)?;
     // a file of the run may be put back, but not replaced by another
-    let (own, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| is_own(file, &target.run));
-    others.iter().try_for_each(|(file, _)| require_outside(file, &target.run))?;
+    let (own, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| is_own(file, &source));
+    others.iter().try_for_each(|(file, _)| require_apart(file, &source))?;
     let request = options.request(files.iter().map(|(_, format)| *format).collect())?;
-    let mut head = KeptHead::read(&target.run, &Config::read(saved)?)?.changed(&request, &Quiet)?;
+    head = head.changed(&request, &Quiet)?;
     own.iter().try_for_each(|(_, format)| head.require_recorded(*format))?;
     let mut warn = |warning: &str| screen.note("export: warning", warning);
     std::mem::take(&mut head.warnings).iter().for_each(|w| warn(w));
@@ -199,18 +215,18 @@ pub(super) fn run(invocation: &Invocation, options: &ExportOptions) -> Result<()
     for (file, format) in &files {
         written.extend(write_head(file, &head, *format, &mut warn)?);
     }
-    tell(invocation, &target.run, &head, &written)
+    tell(invocation, &source, &head, &written)
 }
 
 /// Prints what was written, how large it is on the disk and in the world, and of how many
 /// triangles.
-fn tell(invocation: &Invocation, run: &Path, head: &KeptHead, written: &[PathBuf]) -> Result<()> {
+fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[PathBuf]) -> Result<()> {
     let (triangles, of_layers) = (head.triangles(), head.layer_triangles());
     let [width, height, depth] = head.size_m()?;
     if invocation.common.json {
         let result = json!({
             "event": "result",
-            "run": run,
+            "run": source,
             "out": written,
             "bytes": written.iter().map(|file| io::file_size(file)).collect::<Vec<_>>(),
             "triangles": triangles,
@@ -232,6 +248,20 @@ fn tell(invocation: &Invocation, run: &Path, head: &KeptHead, written: &[PathBuf
         "export    {triangles} triangles{layers}; {width:.3} x {height:.3} x {depth:.3} m (width, height, depth)\n"
     );
     print(&text)
+}
+
+/// Refuses a file inside the run, or that is the mesh file itself.
+fn require_apart(file: &Path, source: &Path) -> Result<()> {
+    if !io::is_file(source) {
+        return require_outside(file, source);
+    }
+    match (io::real_path(file), io::real_path(source)) {
+        (Ok(file), Ok(source)) if file == source => Err(Error::usage(
+            format!("`{}` is the file that is read", source.display()),
+            "choose another name with `--out`",
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// Returns whether a file is one that the stage `mesh` of the run writes in this format.

@@ -62,7 +62,7 @@ pub(super) struct PreviewOptions {
     background: ViewBackground,
     /// Up axis of a mesh file: x, -x, y, -y, z or -z [default: y]
     #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
-    #[arg(value_parser = PossibleValuesParser::new(["x", "-x", "y", "-y", "z", "-z"]).map(|word| axis(&word)))]
+    #[arg(value_parser = PossibleValuesParser::new(AXES).map(|word| axis(&word)))]
     up: Option<Vec3>,
     /// Write a self-contained page that shows the mesh in a browser
     #[arg(long, conflicts_with_all = ["turntable", "sheet", "cameras", "light", "size", "background", "frames"])]
@@ -85,7 +85,11 @@ fn background(word: &str) -> ViewBackground {
     }
 }
 
-fn axis(word: &str) -> Vec3 {
+/// The words of `--up`.
+pub(super) const AXES: [&str; 6] = ["x", "-x", "y", "-y", "z", "-z"];
+
+/// Returns the direction that a word of [`AXES`] names.
+pub(super) fn axis(word: &str) -> Vec3 {
     let axis = match word.trim_start_matches('-') {
         "x" => Vec3::X,
         "z" => Vec3::Z,

@@ -1,7 +1,7 @@
 //! The head of a finished run in files: in another format, material, frame or size.
 //!
 //! Only what the run keeps is read, `mesh/parts`, the cameras and the settings of the stage; nothing
-//! of the run is written, and nothing is remembered. A request that names nothing gives the files
+//! of the run is written, and nothing is remembered. A mesh file can take the place of a run. A request that names nothing gives the files
 //! of the stage `mesh`, byte by byte. A mesh of fewer triangles gets an atlas of its own, and
 //! everything that it shows from the nearest points of the kept one ([`Original`]).
 
@@ -13,13 +13,13 @@ use super::scene_file::read_capture;
 use super::session::unusable;
 use crate::config::{Config, MeshFormat, Stage, key};
 use crate::run::Fingerprint;
-use glam::DVec3;
+use glam::{DVec3, Vec3};
 use std::path::{Path, PathBuf};
 use tiface_base::geom::{ShellLayer, Similarity};
 use tiface_base::{Error, Monitor, Result};
 use tiface_surface::bake::{Original, tangent_space};
-use tiface_surface::files::{ExportedFiles, HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
-use tiface_surface::{SimplifyConfig, atlas, simplify};
+use tiface_surface::files::{ExportedFiles, HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, open_mesh, tangents};
+use tiface_surface::{AtlasConfig, SimplifyConfig, atlas, simplify};
 
 /// What files show of a kept head, and how they are written.
 #[derive(Clone, Debug)]
@@ -99,12 +99,13 @@ impl ExportRequest {
     }
 }
 
-/// The head of a finished run, as the stage `mesh` left it.
+/// A head to be exported: that of a finished run, as the stage `mesh` left it, or that of a file.
 pub struct KeptHead {
-    run: PathBuf,
-    /// The settings that it was made with.
-    made: Config,
+    /// `None` for a file.
+    run: Option<PathBuf>,
     head: HeadMesh,
+    /// Texels that repeat a chart's border around it.
+    gutter_px: u32,
     export: Export,
     /// Warnings for the user.
     pub warnings: Vec<String>,
@@ -135,7 +136,20 @@ impl KeptHead {
         let check = CameraCheck::read(&run.join(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
         check.iter().for_each(|check| check.apply(&mut capture));
         let export = Export::new(&capture, made);
-        Ok(KeptHead { run: run.into(), made: made.clone(), head, export, warnings })
+        Ok(KeptHead { run: Some(run.into()), head, gutter_px: made.mesh.gutter_px, export, warnings })
+    }
+
+    /// Opens a mesh file. `up` is its up direction; its unit is the meter.
+    ///
+    /// # Errors
+    ///
+    /// Fails if the surface cannot be read.
+    pub fn open(file: &Path, up: Vec3) -> Result<KeptHead> {
+        let opened = open_mesh(file).map_err(advised)?;
+        let warnings = opened.warnings();
+        let name = file.file_stem().map_or_else(|| "head".into(), |stem| stem.to_string_lossy().into_owned());
+        let gutter_px = AtlasConfig::default().gutter_px;
+        Ok(KeptHead { run: None, head: opened.head, gutter_px, export: Export::of_file(name, up), warnings })
     }
 
     /// Returns the head as it is asked for.
@@ -145,6 +159,12 @@ impl KeptHead {
     /// Fails if more is asked for than the run keeps, or something that none of the formats shows;
     /// the error names the option.
     pub fn changed(mut self, asked: &ExportRequest, monitor: &dyn Monitor) -> Result<KeptHead> {
+        if self.run.is_none() && asked.frame == MeshFrame::Head {
+            return Err(Error::usage(
+                "`--frame head` is asked for, but a file has no cameras, which say where the face looks",
+                "leave it out, or export from a run",
+            ));
+        }
         for (option, what, shown_by) in asked.options() {
             self.warnings.extend(not_shown(option, what, shown_by, &asked.formats)?);
         }
@@ -201,7 +221,8 @@ impl KeptHead {
     /// Fails unless the files of a format are those that the stage `mesh` left in the run, by their
     /// recorded digests; older records have sizes alone.
     pub fn require_recorded(&self, format: MeshFormat) -> Result<()> {
-        let record = finished_mesh(&self.run)?;
+        let Some(run) = &self.run else { return Ok(()) };
+        let record = finished_mesh(run)?;
         let written = self.files(format, "head")?.files;
         let is_own = |(name, bytes): &(String, Vec<u8>)| match record.sha256.get(name) {
             Some(digest) => *digest == Fingerprint::of_bytes(bytes),
@@ -243,12 +264,16 @@ impl KeptHead {
 
     /// Refuses a value that asks for more than the run keeps.
     fn more(&self, option: &str, key: &str, value: u32, kept: &str) -> Error {
-        let run = self.run.display();
-        Error::usage(
-            format!("`{option}` is {value}, but the run keeps {kept}"),
+        let what = if self.run.is_some() { "run keeps" } else { "file has" };
+        let again = |run: &PathBuf| {
+            let run = run.display();
             format!(
                 "leave it out, or make the mesh again: `tiface mesh {run} --fresh mesh --set {key}={value}`"
-            ),
+            )
+        };
+        Error::usage(
+            format!("`{option}` is {value}, but the {what} {kept}"),
+            self.run.as_ref().map_or("leave it out".into(), again),
         )
     }
 
@@ -287,7 +312,7 @@ impl KeptHead {
         if count < kept {
             return self.simplify(count, px, monitor);
         }
-        let gutter_px = self.made.mesh.gutter_px;
+        let gutter_px = self.gutter_px;
         match self.head.texture.take() {
             Some(texture) if px == kept_px => self.head.texture = Some(texture),
             Some(_) if px > 0 && px * gutter_px < kept_px => {
@@ -314,7 +339,7 @@ impl KeptHead {
         self.warnings.extend(done.warnings(&config).iter().map(sentence));
         let original = Original::new(&self.head);
         let shells = original.carry_vertices(&mut mesh);
-        let gutter_px = self.made.mesh.gutter_px;
+        let gutter_px = self.gutter_px;
         let carry = |texture: &HeadTexture| -> Result<HeadTexture> {
             let scene_from_world = world_from_scene.inverse();
             let config =
@@ -391,7 +416,8 @@ mod tests {
             readings: Vec::new(),
         };
         let export = Export::new(&capture, &made);
-        KeptHead { run: "run".into(), made, head, export, warnings: Vec::new() }
+        let gutter_px = made.mesh.gutter_px;
+        KeptHead { run: Some("run".into()), head, gutter_px, export, warnings: Vec::new() }
     }
 
     #[test]

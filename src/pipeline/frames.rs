@@ -64,14 +64,23 @@ impl Export {
     /// Returns how the stage `mesh` exports the head of a capture.
     pub fn new(capture: &Capture, config: &Config) -> Export {
         Export {
-            name: capture.name.clone(),
-            up: capture.up,
             unit_m: config.capture.unit_m,
+            cameras: capture.views.iter().map(|v| v.camera.position).collect(),
+            ..Export::of_file(capture.name.clone(), capture.up)
+        }
+    }
+
+    /// Returns how a mesh from a file is exported, whose unit is the meter.
+    pub(super) fn of_file(name: String, up: Vec3) -> Export {
+        Export {
+            name,
+            up,
+            unit_m: 1.0,
             obj_unit_m: 1.0,
             frame: MeshFrame::Dataset,
             jpeg: false,
             material: Material::Unlit,
-            cameras: capture.views.iter().map(|v| v.camera.position).collect(),
+            cameras: Vec::new(),
         }
     }
 
@@ -232,16 +241,7 @@ mod tests {
 
     /// Returns an export of unlit meshes in the dataset's frame, whose unit is the meter.
     fn export(up: Vec3, cameras: Vec<DVec3>) -> Export {
-        Export {
-            name: "x".into(),
-            up,
-            unit_m: 1.0,
-            obj_unit_m: 1.0,
-            frame: MeshFrame::Dataset,
-            jpeg: false,
-            material: Material::Unlit,
-            cameras,
-        }
+        Export { cameras, ..Export::of_file("x".into(), up) }
     }
 
     #[test]

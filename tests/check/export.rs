@@ -7,7 +7,7 @@ use crate::tiny::{FIELD, capture};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tiface::geom::topology;
-use tiface::io::{Limits, parse_picture_info, read_tensors};
+use tiface::io::{Limits, parse_photo, parse_picture_info, read_tensors};
 use tiface::mesh::files::{HeadMesh, PictureSource, ReadMesh, ReadOptions, read_with, weld};
 
 /// A mesh in all formats, and views of it that need no radiance field.
@@ -143,6 +143,54 @@ fn a_file_has_the_material_frame_size_and_picture_that_are_asked_for() {
     assert!(plan.contains("mesh     to do again: removes "), "{plan}");
     assert!(plan.contains("`tiface export runs/head` writes the finished mesh"), "{plan}");
     assert!(before == files(&run));
+}
+
+#[test]
+fn a_mesh_file_goes_to_the_other_formats_and_sizes() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &[]);
+    for file in ["head.glb", "head.obj", "head.mtl", "head.png"] {
+        std::fs::copy(run.join("mesh").join(file), dir.path().join(file)).unwrap();
+    }
+    let before = files(dir.path());
+    worked(dir.path(), &["export", "head.obj", "--format", "glb,obj,ply,usdz", "--out", "all/"]);
+    let all = ["head.glb", "head.mtl", "head.obj", "head.ply", "head.png", "head.usdz"];
+    assert_eq!(names(&dir.path().join("all")), all);
+    let shape = |file: &str| {
+        let mesh = weld(&mesh(&dir.path().join(file)).mesh);
+        (mesh.triangles.len(), mesh.is_closed(), mesh.bounds())
+    };
+    let (triangles, closed, bounds) = shape("head.glb");
+    assert!(closed);
+    for file in ["all/head.glb", "all/head.obj", "all/head.ply"] {
+        let (n, closed, b) = shape(file);
+        assert!((n, closed) == (triangles, true), "{file}");
+        assert!((b.size() - bounds.size()).abs().max_element() < 1e-5, "{file}: {}", b.size());
+    }
+    let picture = |file: &str| match mesh(&dir.path().join(file)).picture {
+        Some(PictureSource::Inside(picture)) => picture,
+        _ => panic!("{file} has no picture"),
+    };
+    let pixels = |file: &str| parse_photo(&picture(file), Path::new(file), &Limits::default()).unwrap().rgb;
+    assert!(pixels("all/head.glb") == pixels("head.glb"));
+    // smaller, and up along another axis
+    let small =
+        ["--triangles", "300", "--texture", "64", "--up", "z", "--height", "0.2", "--out", "small.glb"];
+    worked(dir.path(), &[&["export", "head.glb"][..], &small].concat());
+    let (n, closed, b) = shape("small.glb");
+    assert!(n <= 300 && closed && (b.size().y / b.size().z - bounds.size().z / bounds.size().y).abs() < 0.05);
+    worked(dir.path(), &["check", "small.glb", "--require", "sound-uv"]);
+    for (words, code, text) in [
+        (&["head.glb"][..], 2, "`head.glb` is the file that is read"),
+        (&["head.glb", "--frame", "head", "--out", "a.glb"], 2, "a file has no cameras"),
+        (&["head.glb", "--triangles", "9000", "--out", "a.glb"], 2, "the file has a mesh of"),
+        (&["absent.glb", "--out", "a.glb"], 1, "absent.glb"),
+    ] {
+        let output = tiface(dir.path(), &[&["export"][..], words].concat());
+        assert_eq!(output.status.code(), Some(code), "{words:?}: {}", said(&output));
+        assert!(said(&output).contains(text), "{words:?}: {}", said(&output));
+    }
+    assert!(before.iter().all(|(file, bytes)| std::fs::read(file).unwrap() == *bytes));
 }
 
 #[test]
