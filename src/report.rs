@@ -157,6 +157,8 @@ pub struct Viewer {
     pub note: String,
     /// Cameras of the photographs.
     pub cameras: Vec<ViewerCamera>,
+    /// Its USDZ, relative to the page; empty without.
+    pub usdz: String,
     /// Direction that the face looks in, in the file's coordinates; any length.
     pub front: [f32; 3],
     /// The bytes of a GLB.

@@ -80,6 +80,10 @@ fn page(session: &Session) -> Result<String> {
     let (views, left_out) = views::rows_of_run(session, MAX_BYTES.saturating_sub(masks.len() + glb))?;
     let viewer = found.map(|(viewer, file_from_world)| Viewer {
         cameras: views::cameras(session, &views, &file_from_world),
+        usdz: Some("mesh/head.usdz")
+            .filter(|file| io::is_file(&session.run.path(file)))
+            .unwrap_or_default()
+            .into(),
         ..viewer
     });
     let records: Vec<(Stage, Record)> = Stage::ALL

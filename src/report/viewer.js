@@ -420,6 +420,15 @@ async function viewer(root) {
   const controls = { mode: $(".modes"), camera: $(".camera"), fade: $(".fade"), reset: $(".reset"), full: $(".full"),
     measure: $(".measure"), save: $(".save") };
   const marks = [...root.querySelectorAll(".mark")];
+  // browsers that show USDZ themselves do so beside the canvas: on a page, or after a tap in the room
+  const native = $(".native"), link = native?.querySelector("a");
+  if (native && "HTMLModelElement" in window) {
+    const model = document.createElement("model");
+    model.setAttribute("src", link.getAttribute("href"));
+    native.prepend(model);
+    native.hidden = false;
+  }
+  if (native && link.relList.supports("ar")) native.hidden = false;
   const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
   if (!gl) {
     root.classList.add("dead");

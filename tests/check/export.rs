@@ -331,6 +331,12 @@ fn a_usdz_shows_the_mesh_of_the_glb_and_is_not_read_back() {
     let (extent, bounds) = (numbers("float3[] extent = "), shown.bounds());
     assert_eq!(extent, [bounds.min.to_array(), bounds.max.to_array()].concat());
     assert!(numbers("texCoord2f[] primvars:st = ").iter().all(|v| (0.0..=1.0).contains(v)));
+    // the report offers it to browsers that show it, while it is there
+    let offers = || {
+        let page = std::fs::read_to_string(run.join("report.html")).unwrap();
+        page.contains("<a rel=\"ar\" href=\"mesh/head.usdz\">")
+    };
+    assert!(offers());
     // it is an export, but no mesh that is read
     for (words, text) in [
         (&["check", "Other.USDZ"][..], "USDZ"),
@@ -342,11 +348,14 @@ fn a_usdz_shows_the_mesh_of_the_glb_and_is_not_read_back() {
         assert!(said(&output).contains(text) && said(&output).contains("not read"), "{}", said(&output));
     }
     std::fs::remove_file(&own).unwrap();
+    worked(dir.path(), &["report", "runs/head"]);
+    assert!(!offers());
     let verified = tiface(dir.path(), &["verify", "runs/head"]);
     let put_back = "tiface export runs/head --out runs/head/mesh/head.usdz";
     assert!(verified.status.code() == Some(3) && said(&verified).contains(put_back), "{}", said(&verified));
     worked(dir.path(), &put_back.split(' ').skip(1).collect::<Vec<_>>());
-    assert!(before == files(&run));
+    worked(dir.path(), &["report", "runs/head"]);
+    assert!(before == files(&run) && offers());
 }
 
 #[test]

@@ -227,8 +227,7 @@ fn shown(session: &Session, mesh: &Record) -> Result<(Viewer, Similarity)> {
     let (glb, note) = small(head, &session.run.path("mesh/parts"), as_glb)?;
     let note = unseen.into_iter().chain((!note.is_empty()).then_some(note)).collect::<Vec<_>>().join(" ");
     let name = session.capture.name.clone();
-    let viewer = Viewer { name, note, front: front.to_array(), glb, cameras: Vec::new() };
-    Ok((viewer, file_from_world))
+    Ok((Viewer { name, note, front: front.to_array(), glb, ..Viewer::default() }, file_from_world))
 }
 
 /// Returns the cameras of these rows' photographs.
@@ -309,7 +308,7 @@ pub fn viewer_of_file(path: &Path, up: Vec3) -> Result<(String, Vec<String>)> {
         small(head, path, as_glb)?
     };
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let html = viewer_html(&Viewer { name, note, front: [0.0, 0.0, 1.0], glb, cameras: Vec::new() }, &[])?;
+    let html = viewer_html(&Viewer { name, note, front: [0.0, 0.0, 1.0], glb, ..Viewer::default() }, &[])?;
     Ok((html, warnings))
 }
 
