@@ -1,9 +1,10 @@
 //! The head of a finished run in files: in another format, material, frame or size.
 //!
-//! Only what the run keeps is read, `mesh/parts`, the cameras and the settings of the stage; nothing
-//! of the run is written, and nothing is remembered. A mesh file can take the place of a run. A request that names nothing gives the files
-//! of the stage `mesh`, byte by byte. A mesh of fewer triangles gets an atlas of its own, and
-//! everything that it shows from the nearest points of the kept one ([`Original`]).
+//! Only what the run keeps is read, `mesh/parts`, the cameras and the settings of the stage;
+//! nothing of the run is written, and nothing is remembered. A mesh file can take the place of a
+//! run. A request that names nothing gives the files of the stage `mesh`, byte by byte. A mesh of
+//! fewer triangles gets an atlas of its own, and everything that it shows from the nearest points
+//! of the kept one ([`Original`]).
 
 use super::advice::{advised, sentence};
 use super::cameras::CameraCheck;
