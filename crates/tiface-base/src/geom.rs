@@ -5,6 +5,7 @@ mod bit_grid;
 mod boxes;
 mod bvh;
 mod camera;
+pub mod distance;
 mod field;
 mod mesh;
 mod overlap;

@@ -25,7 +25,9 @@ pub mod testing;
 mod trust;
 mod unseen;
 
+pub(crate) use carry::bilinear;
 pub use carry::{CarriedTexture, Original};
+pub(crate) use cover::Bands;
 pub use light::seen_colors;
 pub use seams::Seams;
 pub use tangent_space::tangent_space;
@@ -34,7 +36,7 @@ pub use unseen::{FittedTexture, TexelTrust, UnseenReport, complete_unseen_vertic
 
 use crate::files::LOBE_TEXEL;
 use crate::setting;
-use cover::{Bands, Sample};
+use cover::Sample;
 use fill::fill;
 use glam::{Mat3, Vec3};
 use light::{Shades, SurfacePoints, ViewDirections, Visibility, shade, snap_to_surface};

@@ -17,6 +17,7 @@ mod glb_read;
 mod gltf_document;
 mod gltf_text;
 mod head_texture;
+mod meshopt;
 mod mtl;
 mod obj;
 mod obj_read;

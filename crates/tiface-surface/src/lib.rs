@@ -10,21 +10,26 @@
 //!   it to the outlines in photographs; [`MeshDistance`] is the result as a field, for the steps
 //!   after it.
 //! - [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured mesh.
+//! - [`resized`] makes smaller meshes of a finished one and [`lods`] a chain of them; [`cut`] cuts it
+//!   by a plane, such as those that [`measure`] finds below the chin and above the shoulders.
 //! - [`files`] writes, reads and checks GLB, OBJ and PLY, writes USDZ, and reads glTF and STL.
 //! - [`render`] shows a mesh from a camera.
 
 mod appearance;
 mod atlas;
 pub mod bake;
+mod cut;
 mod extract;
 pub mod files;
 #[cfg(test)]
 mod fixtures;
+mod measure;
 mod mesh_distance;
 mod moves;
 mod outline;
 mod regularized;
 pub mod render;
+mod resize;
 mod shells;
 mod simplify;
 mod smooth;
@@ -32,12 +37,15 @@ mod warning;
 
 pub use appearance::{Appearance, AppearanceReport, Colors, Photograph, fit as fit_appearance};
 pub use atlas::{AtlasConfig, AtlasReport, PartReport, atlas, resolved};
+pub use cut::{CutReport, Plane, cut};
 pub use extract::{
     Cap, CleanReport, ExtractOptions, HandleReport, LevelSet, MAX_HANDLE, MeshReport, NodeGrid, RimVertex,
     Sparse, Volume, clean, extract, extract_dense, marching, sparse,
 };
+pub use measure::{HeadMeasures, measure};
 pub use mesh_distance::MeshDistance;
 pub use outline::{OutlineReport, fit as fit_outlines};
+pub use resize::{DetailLevel, Resize, ResizeReport, lods, resized};
 pub use shells::{ShellsReport, fit as fit_shells};
 pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
 pub use smooth::{SmoothReport, smooth};

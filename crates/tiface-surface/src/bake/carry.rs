@@ -160,7 +160,7 @@ impl NormalMap<'_> {
 }
 
 /// Returns the values of a picture at texture coordinates, interpolated bilinearly.
-fn bilinear(photo: &Photo, uv: Vec2, value: &dyn Fn(u8) -> f32) -> Vec3 {
+pub(crate) fn bilinear(photo: &Photo, uv: Vec2, value: &dyn Fn(u8) -> f32) -> Vec3 {
     let size = Vec2::new(photo.width as f32, photo.height as f32);
     let taps = bilinear_taps(uv * size - 0.5, [photo.width, photo.height]);
     taps.into_iter().map(|(texel, w)| w * Vec3::from(photo.rgb[texel as usize].map(value))).sum()

@@ -17,6 +17,7 @@
 //! produced.
 
 use super::head_texture::{HeadTexture, check_atlas};
+use super::meshopt::in_cache_order;
 use super::tangents::tangents_of;
 use super::{DAMAGED, wrong_length};
 use crate::check_indices;
@@ -47,6 +48,9 @@ pub struct ExportOptions {
     /// Quality, 1..=100, of colors stored as JPEG, which is smaller but lossy. `None` stores PNG,
     /// which is lossless; normal maps and lobes are always PNG.
     pub jpeg_quality: Option<u8>,
+    /// Whether a GLB's arrays are compressed (`EXT_meshopt_compression`), which not every program
+    /// reads: positions are rounded to a 65 534th of the longest side of the box.
+    pub compress: bool,
 }
 
 impl Default for ExportOptions {
@@ -59,6 +63,7 @@ impl Default for ExportOptions {
             unlit: true,
             world_from_mesh: Similarity::IDENTITY,
             jpeg_quality: None,
+            compress: false,
         }
     }
 }
@@ -220,14 +225,26 @@ impl FileMesh {
 
     /// Returns the part of this mesh that has this soft layer. The mesh must have been split.
     pub fn under(&self, layer: &ShellLayer) -> FileMesh {
+        let of_mesh = |t: &[u32; 3]| t.map(|v| self.source[v as usize]);
+        self.part(self.triangles.iter().filter(|t| layer.has(&of_mesh(t))))
+    }
+
+    /// Returns the mesh with triangles in an order in which neighbors follow each other, and
+    /// vertices in the order of their first use. The mesh must have been split.
+    pub fn in_cache_order(&self) -> FileMesh {
+        self.part(in_cache_order(&self.triangles, self.positions.len()).iter())
+    }
+
+    /// Returns a mesh of these triangles, with vertices in the order of their first use. The mesh
+    /// must have been split.
+    fn part<'a>(&self, triangles: impl Iterator<Item = &'a [u32; 3]>) -> FileMesh {
         let mut out = FileMesh { translation: self.translation, ..FileMesh::default() };
         let mut known = vec![u32::MAX; self.positions.len()];
-        let of_mesh = |t: &[u32; 3]| t.map(|v| self.source[v as usize]);
-        let has = |t: &&[u32; 3]| layer.has(&of_mesh(t));
-        for triangle in self.triangles.iter().filter(has) {
+        for triangle in triangles {
             let own = triangle.map(|v| {
                 if known[v as usize] == u32::MAX {
                     out.uvs.extend(self.uvs.get(v as usize));
+                    out.tangents.extend(self.tangents.get(v as usize));
                     known[v as usize] = out.copy(self, v);
                 }
                 known[v as usize]

@@ -1,0 +1,183 @@
+//! A head mesh in fewer triangles, and chains of them for programs that show distant heads by less
+//! detail.
+//!
+//! Each smaller mesh is made from the head itself, never from another smaller one, so that errors
+//! do not add up: edges are collapsed ([`simplify`]), the mesh gets an atlas of its own, and
+//! everything that it shows comes from the nearest points of the head ([`Original`]).
+
+use crate::bake::{Original, tangent_space};
+use crate::files::{HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
+use crate::{AtlasConfig, AtlasReport, SimplifyConfig, SimplifyReport, Warning, atlas, setting, simplify};
+use tiface_base::geom::Bvh;
+use tiface_base::geom::distance::one_way;
+use tiface_base::{Monitor, Result};
+
+/// Options of [`resized`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct Resize {
+    /// Number of triangles to keep.
+    pub triangles: usize,
+    /// The atlas of the smaller mesh, its texture's size and gutter among them; `None` leaves the
+    /// texture out. Without effect on a head that has none.
+    pub atlas: Option<AtlasConfig>,
+}
+
+/// How a head was resized.
+#[derive(Clone, Debug)]
+pub struct ResizeReport {
+    /// The simplification.
+    pub simplify: SimplifyReport,
+    /// The atlas, if the mesh has a texture.
+    pub atlas: Option<AtlasReport>,
+    /// What is doubtful of the result.
+    pub warnings: Vec<Warning>,
+}
+
+/// Returns a head in fewer triangles and with a new texture of it; with its soft layers and lobes,
+/// and with a normal map if it has one. A head that has no more triangles than asked for keeps its
+/// surface and gets the new texture. Harmonics are left out: no file holds those of vertices.
+///
+/// The smaller mesh is closed if the head is.
+///
+/// # Errors
+///
+/// An option out of range, a texture too small for its triangles, a damaged mesh, or a request to
+/// stop.
+pub fn resized(head: &HeadMesh, resize: &Resize, monitor: &dyn Monitor) -> Result<(HeadMesh, ResizeReport)> {
+    let mut mesh = head.mesh.clone();
+    let config = SimplifyConfig { triangles: resize.triangles, ..SimplifyConfig::default() };
+    let simplified = simplify(&mut mesh, None, &config, monitor)?;
+    let mut report =
+        ResizeReport { warnings: simplified.warnings(&config), simplify: simplified, atlas: None };
+    let original = Original::new(head);
+    let shells = original.carry_vertices(&mut mesh);
+    let mut texture = None;
+    if let (Some(from), Some(config)) = (&head.texture, &resize.atlas) {
+        let (layout, done) = atlas(&mesh, config, monitor)?;
+        report.warnings.extend(done.warnings());
+        report.atlas = Some(done);
+        let AtlasConfig { size_px, gutter_px, .. } = *config;
+        let side = from.color.width.div_ceil(size_px).clamp(1, 2);
+        let carried = original.carry_texture(from, &mesh, &layout, side, gutter_px, monitor)?;
+        let bend = |normals| -> Result<_> {
+            Ok(tangent_space(&mesh, &layout, &tangents(&mesh, &layout)?, normals, gutter_px))
+        };
+        let normal = carried.normal.as_ref().map(bend).transpose()?;
+        let lobes = from.lobes.as_ref().and_then(|l| Lobes::new(&carried.lobes, l.turned));
+        let lobes = lobes.map(|l| l.reduced(size_px / LOBE_TEXEL));
+        texture = Some(HeadTexture { color: carried.color.encoded(), normal, lobes, atlas: layout });
+    }
+    let world_from_scene = head.world_from_scene;
+    Ok((HeadMesh { mesh, world_from_scene, texture, harmonics: None, shells }, report))
+}
+
+/// A head of a chain of levels of detail.
+#[derive(Clone, Debug)]
+pub struct DetailLevel {
+    /// The head.
+    pub head: HeadMesh,
+    /// Largest distance between its surface and the chain's first, measured both ways, in scene
+    /// units.
+    pub largest: f64,
+    /// Mean distance, the larger of both ways, in scene units.
+    pub mean: f64,
+    /// How it was made; `None` of the first, which is the head itself.
+    pub report: Option<ResizeReport>,
+}
+
+/// Points at which the distance between two surfaces is measured: some for each triangle of a
+/// head of 50,000.
+const DISTANCE_SAMPLES: usize = 200_000;
+
+/// Fewest triangles of a level: fewer show no face.
+const FEWEST: usize = 200;
+
+/// Smallest side of a level's texture.
+const SMALLEST_PX: u32 = 128;
+
+/// Returns a chain of `levels` heads: the head itself, then each with half as many triangles as the
+/// one before. A quarter of the triangles is for a head of half the size on the screen, so the side
+/// of the texture halves from the first to the second and at every other level after it, down to
+/// 128. `atlas` has the options of the new atlases; its `size_px` is the side of the head's own
+/// texture, which the first level keeps.
+///
+/// # Errors
+///
+/// As [`resized`]; and a chain whose last level would have fewer than 200 triangles.
+pub fn lods(
+    head: &HeadMesh,
+    levels: usize,
+    atlas: &AtlasConfig,
+    monitor: &dyn Monitor,
+) -> Result<Vec<DetailLevel>> {
+    let triangles = head.mesh.triangles.len();
+    let most = 1 + (triangles / FEWEST).max(1).ilog2() as usize;
+    setting((1..=most).contains(&levels), "levels", &format!("1..={most} of {triangles} triangles"), levels)?;
+    let kept = Bvh::new(&head.mesh);
+    let mut chain = vec![DetailLevel { head: head.clone(), largest: 0.0, mean: 0.0, report: None }];
+    for level in 1..levels {
+        let size_px = (atlas.size_px >> level.div_ceil(2)).max(SMALLEST_PX.min(atlas.size_px));
+        // a gutter as wide on the surface
+        let gutter_px = (atlas.gutter_px >> level.div_ceil(2)).max(2).min(atlas.gutter_px);
+        let atlas = AtlasConfig { size_px, gutter_px, resolved: None, ..atlas.clone() };
+        let resize = Resize { triangles: triangles >> level, atlas: Some(atlas) };
+        let (smaller, report) = resized(head, &resize, monitor)?;
+        let ways = [
+            one_way(&smaller.mesh, &kept, DISTANCE_SAMPLES),
+            one_way(&head.mesh, &Bvh::new(&smaller.mesh), DISTANCE_SAMPLES),
+        ];
+        let most = |of: fn(&tiface_base::geom::distance::Distances) -> f64| {
+            ways.iter().flatten().map(of).fold(0.0, f64::max)
+        };
+        let (largest, mean) = (most(|way| way.max), most(|way| way.mean));
+        chain.push(DetailLevel { head: smaller, largest, mean, report: Some(report) });
+    }
+    Ok(chain)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bake::testing::ball;
+    use crate::files::check;
+    use tiface_base::Quiet;
+
+    #[test]
+    fn each_level_has_half_the_triangles_and_lies_within_its_distance() {
+        let head = ball();
+        let atlas = AtlasConfig { size_px: 512, gutter_px: 4, ..AtlasConfig::default() };
+        let chain = lods(&head, 4, &atlas, &Quiet).unwrap();
+        let all = head.mesh.triangles.len();
+        assert_eq!(chain[0].head, head);
+        for (k, level) in chain.iter().enumerate() {
+            let DetailLevel { head, largest, mean, .. } = level;
+            let (found, asked) = (head.mesh.triangles.len(), all >> k);
+            assert!(found <= asked && found + 2 >= asked, "{found} of {asked}");
+            let report = check(&head.mesh, 1.0);
+            assert!(
+                report.require(&["watertight", "one-piece", "no-self-intersections"]).is_ok(),
+                "{report}"
+            );
+            let texture = head.texture.as_ref().unwrap();
+            assert_eq!(texture.color.width, [512, 256, 256, 128][k]);
+            assert_eq!(texture.lobes.is_some() && head.shells.is_some(), true);
+            // a chord of a ball of radius 12 of n triangles, each of area 4 π r² / n with sides of
+            // about 2.3 r √(4 π / √3 / n) / 2, lies r (side / r)² / 6 inside at most
+            let told = if k == 0 { 0.0 } else { 12.0 * 14.5 / found as f64 };
+            assert!(*mean <= *largest && *largest < 2.0 * told + 1e-9, "level {k}: {mean} {largest} {told}");
+            assert!(k == 0 || *mean > chain[k - 1].mean, "level {k}: {mean}");
+        }
+        let e = lods(&head, 9, &atlas, &Quiet).unwrap_err();
+        assert!(e.to_string().contains("`levels` is 9"), "{e}");
+    }
+
+    #[test]
+    fn a_head_without_a_texture_or_a_wish_for_one_gets_none() {
+        let head = ball();
+        let resize = Resize { triangles: 1000, atlas: None };
+        let (small, report) = resized(&head, &resize, &Quiet).unwrap();
+        assert!(small.texture.is_none() && report.atlas.is_none() && small.mesh.is_closed());
+        let [colors, vertices] = [small.mesh.colors.len(), small.mesh.positions.len()];
+        assert!(small.mesh.triangles.len() <= 1000 && colors == vertices && small.harmonics.is_none());
+    }
+}
