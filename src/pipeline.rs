@@ -55,7 +55,7 @@ pub use crate::config::Stage;
 pub use bench::{Bench, SWEEPS};
 pub use clean::{cost_of_removal, remove_surplus, stage_folders, surplus};
 pub use compare::{Judged, compare_runs, judge};
-pub use export::{ExportRequest, KeptHead, Size};
+pub use export::{Cut, ExportRequest, KeptHead, Size};
 pub use frames::{Export, Material, MeshFrame};
 pub use inputs::capture_options;
 pub use mask::{click_page, inspect_capture};

@@ -6,7 +6,7 @@ use super::out::{Out, require_outside, write_head};
 use super::preview::{AXES, axis};
 use super::screen::print;
 use crate::config::{Config, MeshFormat, Stage};
-use crate::pipeline::{ExportRequest, KeptHead, Material, MeshFrame, Size};
+use crate::pipeline::{Cut, ExportRequest, KeptHead, Material, MeshFrame, Size};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use glam::{DVec3, Vec3};
@@ -50,7 +50,16 @@ pub(super) struct ExportOptions {
     #[arg(long, value_name = "UNIT", default_value = "m")]
     #[arg(value_parser = PossibleValuesParser::new(["m", "cm", "mm"]).map(|word| meters(&word)))]
     unit: f64,
-    /// Number of triangles at most [default: all that the run keeps]
+    /// Where the head ends: none (as in the run), chin (below it, rising to the nape) or collar (at
+    /// the neck's base, above the shoulders); the cut is closed
+    #[arg(long, value_name = "WHERE", default_value = "none")]
+    #[arg(value_parser = PossibleValuesParser::new(["none", "chin", "collar"]).map(|word| cut(&word)))]
+    cut: Cut,
+    /// Write N levels of detail, each with half the triangles of the one before, as NAME_lod1 and
+    /// so on
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=12))]
+    lod: u8,
+    /// Number of triangles at most, up to all of the extracted surface [default: as in the run]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(4..))]
     triangles: Option<u32>,
     /// Side of the texture, texels; 0 stores colors at the vertices [default: the run's]
@@ -59,6 +68,9 @@ pub(super) struct ExportOptions {
     /// Store the color as JPEG, which is smaller and lossy
     #[arg(long)]
     jpeg: bool,
+    /// Compress a GLB (EXT_meshopt_compression), with the color as JPEG; not every program reads it
+    #[arg(long)]
+    compress: bool,
     /// Leave out the soft layers of hair
     #[arg(long)]
     no_layers: bool,
@@ -72,6 +84,14 @@ pub(super) struct ExportOptions {
 
 fn material(word: &str) -> Material {
     if word == "lit" { Material::Lit } else { Material::Unlit }
+}
+
+fn cut(word: &str) -> Cut {
+    match word {
+        "chin" => Cut::Chin,
+        "collar" => Cut::Collar,
+        _ => Cut::None,
+    }
 }
 
 fn frame(word: &str) -> MeshFrame {
@@ -104,6 +124,25 @@ fn point(word: &str) -> Result<DVec3> {
     }
 }
 
+/// A file to write.
+struct Target {
+    file: PathBuf,
+    format: MeshFormat,
+    /// Its level of detail; the first is 0.
+    level: usize,
+}
+
+impl Target {
+    /// Returns whether the file is one that the stage `mesh` of the run writes.
+    fn is_own(&self, run: &Path) -> bool {
+        let folder = self.file.parent().and_then(|folder| io::real_path(folder).ok());
+        let is_there =
+            folder.is_some_and(|folder| io::real_path(&run.join(Stage::Mesh)).is_ok_and(|own| own == folder));
+        let name = format!("head.{}", self.format.as_str());
+        self.level == 0 && is_there && self.file.file_name().is_some_and(|found| found == name.as_str())
+    }
+}
+
 impl ExportOptions {
     /// Returns what is asked for, in these formats.
     fn request(&self, formats: Vec<MeshFormat>) -> Result<ExportRequest> {
@@ -112,9 +151,12 @@ impl ExportOptions {
             material: self.material,
             frame: self.frame,
             jpeg: self.jpeg,
+            compress: self.compress,
             obj_unit_m: self.unit,
             size: self.size()?,
+            cut: self.cut,
             triangles: self.triangles,
+            levels: self.lod.into(),
             texture_px: self.texture,
             layers: !self.no_layers,
             lobes: !self.no_lobes,
@@ -152,7 +194,24 @@ impl ExportOptions {
         Ok((target.run, head))
     }
 
-    /// Returns the files to write with their formats: `--out`, files in its folder, or else files
+    /// Returns all files to write: each destination, and its smaller levels of detail beside it.
+    fn targets(&self, out: Option<&Out>, source: &Path) -> Result<Vec<Target>> {
+        let levels = |(file, format): (PathBuf, MeshFormat)| {
+            let stem = file.file_stem().map_or("head".into(), |stem| stem.to_string_lossy().into_owned());
+            let smaller = (1..usize::from(self.lod)).map({
+                let file = file.clone();
+                move |level| Target {
+                    file: file.with_file_name(format!("{stem}_lod{level}.{}", format.as_str())),
+                    format,
+                    level,
+                }
+            });
+            std::iter::once(Target { file, format, level: 0 }).chain(smaller)
+        };
+        Ok(self.destinations(out, source)?.into_iter().flat_map(levels).collect())
+    }
+
+    /// Returns the destinations with their formats: `--out`, files in its folder, or else files
     /// in the working directory with the name of the run or the mesh file.
     fn destinations(&self, out: Option<&Out>, source: &Path) -> Result<Vec<(PathBuf, MeshFormat)>> {
         let formats = if self.format.is_empty() { &[MeshFormat::Glb][..] } else { &self.format };
@@ -189,17 +248,17 @@ pub(super) fn run(invocation: &Invocation, options: &ExportOptions) -> Result<()
     let (common, screen) = (invocation.common, &invocation.screen);
     let out = Out::find(common.out.as_deref(), "export")?;
     let (source, mut head) = options.read(invocation)?;
-    let files = options.destinations(out.as_ref(), &source)?;
+    let targets = options.targets(out.as_ref(), &source)?;
     // a file of the run may be put back, but not replaced by another
-    let (own, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| is_own(file, &source));
-    others.iter().try_for_each(|(file, _)| require_apart(file, &source))?;
-    let request = options.request(files.iter().map(|(_, format)| *format).collect())?;
+    let (own, others): (Vec<_>, Vec<_>) = targets.iter().partition(|target| target.is_own(&source));
+    others.iter().try_for_each(|target| require_apart(&target.file, &source))?;
+    let request = options.request(targets.iter().map(|target| target.format).collect())?;
     head = head.changed(&request, &Quiet)?;
-    own.iter().try_for_each(|(_, format)| head.require_recorded(*format))?;
-    let mut warn = |warning: &str| screen.note("export: warning", warning);
+    own.iter().try_for_each(|target| head.require_recorded(target.format))?;
+    let warn = |warning: &str| screen.note("export: warning", warning);
     std::mem::take(&mut head.warnings).iter().for_each(|w| warn(w));
-    for (file, _) in &files {
-        let (shown, triangles) = (file.display(), head.triangles());
+    for Target { file, level, .. } in &targets {
+        let (shown, triangles) = (file.display(), head.triangles(*level));
         match (common.dry_run, io::exists(file)) {
             (true, false) => screen.note("export", &format!("would write `{shown}`, {triangles} triangles")),
             (true, true) => screen.note("export", &format!("would replace `{shown}`, {triangles} triangles")),
@@ -212,8 +271,14 @@ pub(super) fn run(invocation: &Invocation, options: &ExportOptions) -> Result<()
     }
     out.iter().try_for_each(Out::prepare)?;
     let mut written = Vec::new();
-    for (file, format) in &files {
-        written.extend(write_head(file, &head, *format, &mut warn)?);
+    for Target { file, format, level } in &targets {
+        // what a format cannot represent is said once
+        let mut warn = |warning: &str| {
+            if *level == 0 {
+                warn(warning)
+            }
+        };
+        written.extend(write_head(file, |stem| head.files(*level, *format, stem), &mut warn)?);
     }
     tell(invocation, &source, &head, &written)
 }
@@ -221,9 +286,14 @@ pub(super) fn run(invocation: &Invocation, options: &ExportOptions) -> Result<()
 /// Prints what was written, how large it is on the disk and in the world, and of how many
 /// triangles.
 fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[PathBuf]) -> Result<()> {
-    let (triangles, of_layers) = (head.triangles(), head.layer_triangles());
-    let [width, height, depth] = head.size_m()?;
+    let (triangles, of_layers) = (head.triangles(0), head.layer_triangles());
+    let ([width, height, depth], chin_to_crown) = (head.size_m()?, head.head_height_m());
+    let levels: Vec<(usize, [f64; 2])> = (1..)
+        .zip(head.level_distances_m())
+        .map(|(level, m)| (head.triangles(level), m.map(|m| 1e3 * m)))
+        .collect();
     if invocation.common.json {
+        let level = |(triangles, [largest, mean]): &(usize, [f64; 2])| json!({"triangles": triangles, "largest_mm": largest, "mean_mm": mean});
         let result = json!({
             "event": "result",
             "run": source,
@@ -231,7 +301,9 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
             "bytes": written.iter().map(|file| io::file_size(file)).collect::<Vec<_>>(),
             "triangles": triangles,
             "layer_triangles": of_layers,
+            "levels": levels.iter().map(level).collect::<Vec<_>>(),
             "size_m": [width, height, depth],
+            "head_m": chin_to_crown,
         });
         return print(&format!("{result}\n"));
     }
@@ -242,11 +314,16 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
         let size = io::file_size(file).map(|bytes| format!("  {:.2} MB", bytes as f64 / 1e6));
         format!("export    {}{}\n", file.display(), size.unwrap_or_default())
     };
-    let layers = if of_layers > 0 { format!(", and {of_layers} of soft layers") } else { String::new() };
     let mut text: String = written.iter().map(file).collect();
-    text += &format!(
-        "export    {triangles} triangles{layers}; {width:.3} x {height:.3} x {depth:.3} m (width, height, depth)\n"
-    );
+    let layers = if of_layers > 0 { format!(", and {of_layers} of soft layers") } else { String::new() };
+    text += &format!("export    {triangles} triangles{layers}\n");
+    for (triangles, [largest, mean]) in levels {
+        text += &format!(
+            "export    {triangles} triangles, within {largest:.2} mm of these, {mean:.2} mm on average\n"
+        );
+    }
+    text += &format!("export    {width:.3} m wide, {height:.3} m high, {depth:.3} m deep");
+    text += &chin_to_crown.map_or("\n".into(), |meters| format!("; {meters:.3} m from chin to crown\n"));
     print(&text)
 }
 
@@ -262,12 +339,4 @@ fn require_apart(file: &Path, source: &Path) -> Result<()> {
         )),
         _ => Ok(()),
     }
-}
-
-/// Returns whether a file is one that the stage `mesh` of the run writes in this format.
-fn is_own((file, format): &(PathBuf, MeshFormat), run: &Path) -> bool {
-    let folder = file.parent().and_then(|folder| io::real_path(folder).ok());
-    let is_there =
-        folder.is_some_and(|folder| io::real_path(&run.join(Stage::Mesh)).is_ok_and(|own| own == folder));
-    is_there && file.file_name().is_some_and(|name| name == format!("head.{}", format.as_str()).as_str())
 }

@@ -106,7 +106,8 @@ impl Out {
         match self {
             Out::File(file, ending) if let Ok(format) = ending.parse() => {
                 let head = KeptHead::read(run.dir(), session.config())?;
-                write_head(file, &head, format, &mut |warning| run.warn("mesh", warning))
+                head.warnings.iter().for_each(|warning| run.warn("mesh", warning));
+                write_head(file, |stem| head.files(0, format, stem), &mut |warning| run.warn("mesh", warning))
             }
             Out::File(file, ending) if ending == "json" => {
                 copy_file(&run.path("metrics/metrics.json"), file)?;
@@ -152,17 +153,16 @@ pub(super) fn require_outside(path: &Path, run: &Path) -> Result<()> {
     }
 }
 
-/// Writes a head to a file, and the files that it refers to beside it; returns their paths.
-/// Warnings go to `warn`.
+/// Writes a head to a file, and the files that it refers to beside it; returns their paths. `files`
+/// makes them with a base name. Warnings go to `warn`.
 pub(super) fn write_head(
     file: &Path,
-    head: &KeptHead,
-    format: MeshFormat,
+    files: impl FnOnce(&str) -> Result<ExportedFiles>,
     warn: &mut dyn FnMut(&str),
 ) -> Result<Vec<PathBuf>> {
     let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
-    let ExportedFiles { files, warnings } = head.files(format, stem)?;
-    head.warnings.iter().chain(&warnings).for_each(|w| warn(w));
+    let ExportedFiles { files, warnings } = files(stem)?;
+    warnings.iter().for_each(|w| warn(w));
     // the mesh refers to its pictures, so it is written last, under the requested name
     let mut written = vec![file.to_path_buf()];
     for (name, bytes) in files.iter().skip(1).rev() {

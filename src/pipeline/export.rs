@@ -4,7 +4,7 @@
 //! nothing of the run is written, and nothing is remembered. A mesh file can take the place of a
 //! run. A request that names nothing gives the files of the stage `mesh`, byte by byte. A mesh of
 //! fewer triangles gets an atlas of its own, and everything that it shows from the nearest points
-//! of the kept one ([`Original`]).
+//! of the kept one ([`resized`]).
 
 use super::advice::{advised, sentence};
 use super::cameras::CameraCheck;
@@ -18,9 +18,8 @@ use glam::{DVec3, Vec3};
 use std::path::{Path, PathBuf};
 use tiface_base::geom::{ShellLayer, Similarity};
 use tiface_base::{Error, Monitor, Result};
-use tiface_surface::bake::{Original, tangent_space};
-use tiface_surface::files::{ExportedFiles, HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, open_mesh, tangents};
-use tiface_surface::{AtlasConfig, SimplifyConfig, atlas, simplify};
+use tiface_surface::files::{ExportedFiles, ExtractedSurface, HeadMesh, LOBE_TEXEL, open_mesh};
+use tiface_surface::{AtlasConfig, DetailLevel, HeadMeasures, Plane, Resize, cut, lods, measure, resized};
 
 /// What files show of a kept head, and how they are written.
 #[derive(Clone, Debug)]
@@ -33,12 +32,18 @@ pub struct ExportRequest {
     pub frame: MeshFrame,
     /// Whether the color is stored as JPEG, not PNG.
     pub jpeg: bool,
+    /// Whether a GLB is compressed, with its color as JPEG.
+    pub compress: bool,
     /// Meters per unit of an OBJ, which states none.
     pub obj_unit_m: f64,
     /// What the size of the files follows.
     pub size: Size,
-    /// Number of triangles; by default all that the run keeps.
+    /// Where the head ends.
+    pub cut: Cut,
+    /// Number of triangles at most; by default those of the run's own files.
     pub triangles: Option<u32>,
+    /// Number of levels of detail, each with half the triangles of the one before.
+    pub levels: usize,
     /// Side of the texture, texels, 0 for colors at the vertices; by default the kept one.
     pub texture_px: Option<u32>,
     /// Whether soft layers are written.
@@ -56,9 +61,12 @@ impl Default for ExportRequest {
             material: None,
             frame: MeshFrame::Dataset,
             jpeg: false,
+            compress: false,
             obj_unit_m: 1.0,
             size: Size::Dataset,
+            cut: Cut::None,
             triangles: None,
+            levels: 1,
             texture_px: None,
             layers: true,
             lobes: true,
@@ -78,6 +86,17 @@ pub enum Size {
     Between([DVec3; 2], f64),
 }
 
+/// Where a head ends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cut {
+    /// Where the run's own ends.
+    None,
+    /// Below the chin, rising to the nape.
+    Chin,
+    /// At the neck's base, above the shoulders.
+    Collar,
+}
+
 /// Formats of a textured mesh in meters; the others keep the dataset's world.
 const TEXTURED: &[MeshFormat] = &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Usdz];
 
@@ -91,6 +110,7 @@ impl ExportRequest {
             (self.material.is_some(), "--material", "choice of material", SHADED),
             (self.frame != MeshFrame::Dataset, "--frame", "frame but the dataset's", TEXTURED),
             (self.jpeg, "--jpeg", "picture", TEXTURED),
+            (self.compress, "--compress", "compression", &[MeshFormat::Glb]),
             (self.obj_unit_m != 1.0, "--unit", "choice of unit", &[MeshFormat::Obj]),
             (matches!(self.size, Size::Head(_)), "--height", "height in meters", TEXTURED),
             (matches!(self.size, Size::Between(..)), "--measure", "length in meters", TEXTURED),
@@ -108,6 +128,8 @@ pub struct KeptHead {
     /// Texels that repeat a chart's border around it.
     gutter_px: u32,
     export: Export,
+    /// Its smaller levels of detail.
+    levels: Vec<DetailLevel>,
     /// Warnings for the user.
     pub warnings: Vec<String>,
 }
@@ -137,7 +159,8 @@ impl KeptHead {
         let check = CameraCheck::read(&run.join(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
         check.iter().for_each(|check| check.apply(&mut capture));
         let export = Export::new(&capture, made);
-        Ok(KeptHead { run: Some(run.into()), head, gutter_px: made.mesh.gutter_px, export, warnings })
+        let gutter_px = made.mesh.gutter_px;
+        Ok(KeptHead { run: Some(run.into()), head, gutter_px, export, levels: Vec::new(), warnings })
     }
 
     /// Opens a mesh file. `up` is its up direction; its unit is the meter.
@@ -150,7 +173,8 @@ impl KeptHead {
         let warnings = opened.warnings();
         let name = file.file_stem().map_or_else(|| "head".into(), |stem| stem.to_string_lossy().into_owned());
         let gutter_px = AtlasConfig::default().gutter_px;
-        Ok(KeptHead { run: None, head: opened.head, gutter_px, export: Export::of_file(name, up), warnings })
+        let export = Export::of_file(name, up);
+        Ok(KeptHead { run: None, head: opened.head, gutter_px, export, levels: Vec::new(), warnings })
     }
 
     /// Returns the head as it is asked for.
@@ -160,17 +184,35 @@ impl KeptHead {
     /// Fails if more is asked for than the run keeps, or something that none of the formats shows;
     /// the error names the option.
     pub fn changed(mut self, asked: &ExportRequest, monitor: &dyn Monitor) -> Result<KeptHead> {
-        if self.run.is_none() && asked.frame == MeshFrame::Head {
-            return Err(Error::usage(
-                "`--frame head` is asked for, but a file has no cameras, which say where the face looks",
-                "leave it out, or export from a run",
-            ));
-        }
         for (option, what, shown_by) in asked.options() {
             self.warnings.extend(not_shown(option, what, shown_by, &asked.formats)?);
         }
+        let needs_face = [
+            (asked.frame == MeshFrame::Head, "--frame head"),
+            (matches!(asked.size, Size::Head(_)), "--height"),
+            (asked.cut != Cut::None, "--cut"),
+        ];
+        let needs_face = needs_face.into_iter().find_map(|(asked, option)| asked.then_some(option));
+        if let Some(option) = needs_face.filter(|_| self.run.is_none()) {
+            return Err(Error::usage(
+                format!(
+                    "`{option}` needs to know where the face looks, and a file has no cameras that say it"
+                ),
+                "leave it out, or export from a run",
+            ));
+        }
+        self.export.unit_m = self.unit_m(asked.size)?;
+        let plane = self.plane(asked.cut)?;
         self.leave_out(asked);
         self.resize(asked, monitor)?;
+        if let Some(plane) = plane {
+            let (head, done) = cut(&self.head, &plane, self.gutter_px).map_err(advised)?;
+            self.head = head;
+            if done.dropped > 0 {
+                self.warnings.push(format!("{} smaller pieces above the cut are left out", done.dropped));
+            }
+        }
+        self.make_levels(asked.levels, monitor)?;
         let has_normals = self.head.texture.as_ref().is_some_and(|t| t.normal.is_some());
         if asked.material == Some(Material::Unlit) && has_normals {
             self.warnings.push(
@@ -179,10 +221,10 @@ impl KeptHead {
             );
         }
         self.export = Export {
-            unit_m: self.unit_m(asked.size)?,
             obj_unit_m: asked.obj_unit_m,
             frame: asked.frame,
-            jpeg: asked.jpeg,
+            jpeg: asked.jpeg || asked.compress,
+            compress: asked.compress,
             material: asked.material.unwrap_or(Material::Unlit),
             ..self.export
         };
@@ -194,7 +236,10 @@ impl KeptHead {
         match size {
             Size::Dataset => Ok(self.export.unit_m),
             Size::Head(meters) => {
-                Ok(meters / self.export.height(&self.head.mesh, &self.head.world_from_scene))
+                let height = self
+                    .measures()
+                    .map_err(|e| e.with_hint("give a known distance: `--measure A B METERS`"))?;
+                Ok(meters / (f64::from(height.height()) * self.head.world_from_scene.scale))
             }
             Size::Between([a, b], meters) => {
                 let distance = a.distance(b);
@@ -210,13 +255,37 @@ impl KeptHead {
         }
     }
 
-    /// Returns the files of the head in a format, the mesh first. `stem` is their base name.
+    /// Returns where the parts of the head are, in scene coordinates.
+    fn measures(&self) -> Result<HeadMeasures> {
+        let HeadMesh { mesh, world_from_scene, .. } = &self.head;
+        let scene_from_world = world_from_scene.inverse();
+        let front = self.export.front(center(mesh, world_from_scene)).unwrap_or(Vec3::ZERO);
+        measure(mesh, scene_from_world.direction(self.export.up), scene_from_world.direction(front))
+            .map_err(advised)
+    }
+
+    /// Returns the plane at which the head is cut, in scene coordinates.
+    fn plane(&self, cut: Cut) -> Result<Option<Plane>> {
+        match cut {
+            Cut::None => Ok(None),
+            Cut::Chin => Ok(Some(self.measures()?.chin_plane())),
+            Cut::Collar => self.measures()?.collar_plane().map(Some).map_err(advised),
+        }
+    }
+
+    /// Returns the files of a level of detail in a format, the mesh first; all levels lie in the
+    /// same place. `stem` is their base name.
     ///
     /// # Errors
     ///
     /// Fails if the mesh is damaged.
-    pub fn files(&self, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
-        self.export.files(&self.head, format, stem)
+    pub fn files(&self, level: usize, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
+        self.export.files_beside(self.level(level), &self.head.mesh, format, stem)
+    }
+
+    /// Returns a level of detail, of which the first is the head itself.
+    fn level(&self, level: usize) -> &HeadMesh {
+        level.checked_sub(1).map_or(&self.head, |smaller| &self.levels[smaller].head)
     }
 
     /// Fails unless the files of a format are those that the stage `mesh` left in the run, by their
@@ -224,7 +293,7 @@ impl KeptHead {
     pub fn require_recorded(&self, format: MeshFormat) -> Result<()> {
         let Some(run) = &self.run else { return Ok(()) };
         let record = finished_mesh(run)?;
-        let written = self.files(format, "head")?.files;
+        let written = self.files(0, format, "head")?.files;
         let is_own = |(name, bytes): &(String, Vec<u8>)| match record.sha256.get(name) {
             Some(digest) => *digest == Fingerprint::of_bytes(bytes),
             None => record.products.get(name) == Some(&(bytes.len() as u64)),
@@ -238,9 +307,19 @@ impl KeptHead {
         }
     }
 
-    /// Returns the number of triangles.
-    pub fn triangles(&self) -> usize {
-        self.head.mesh.triangles.len()
+    /// Returns the number of triangles of a level of detail.
+    pub fn triangles(&self, level: usize) -> usize {
+        self.level(level).mesh.triangles.len()
+    }
+
+    /// Returns the largest and the mean distance of each smaller level of detail from the first, in
+    /// the units of GLB, OBJ and USDZ files, meters.
+    pub fn level_distances_m(&self) -> Vec<[f64; 2]> {
+        let meters = self.head.world_from_scene.scale * self.export.unit_m;
+        self.levels
+            .iter()
+            .map(|level| [level.largest, level.mean].map(|distance| meters * distance))
+            .collect()
     }
 
     /// Returns the number of triangles of its soft layers.
@@ -248,6 +327,13 @@ impl KeptHead {
         let HeadMesh { mesh, shells, .. } = &self.head;
         let count = |layer: &ShellLayer| mesh.triangles.iter().filter(|t| layer.has(t)).count();
         shells.iter().flat_map(|shells| &shells.layers).map(count).sum()
+    }
+
+    /// Returns the height of the head from chin to crown in GLB, OBJ and USDZ files, meters; `None`
+    /// if its shape does not say where the chin is.
+    pub fn head_height_m(&self) -> Option<f64> {
+        let measures = self.run.as_ref().and_then(|_| self.measures().ok())?;
+        Some(f64::from(measures.height()) * self.head.world_from_scene.scale * self.export.unit_m)
     }
 
     /// Returns the width, height and depth of the mesh in GLB, OBJ and USDZ files, meters.
@@ -263,14 +349,12 @@ impl KeptHead {
         Ok(mesh.transformed(&in_place).bounds().size().to_array())
     }
 
-    /// Refuses a value that asks for more than the run keeps.
-    fn more(&self, option: &str, key: &str, value: u32, kept: &str) -> Error {
+    /// Refuses a value that asks for more than the run keeps, which it would with these settings.
+    fn more(&self, option: &str, value: u32, kept: &str, settings: &str) -> Error {
         let what = if self.run.is_some() { "run keeps" } else { "file has" };
         let again = |run: &PathBuf| {
             let run = run.display();
-            format!(
-                "leave it out, or make the mesh again: `tiface mesh {run} --fresh mesh --set {key}={value}`"
-            )
+            format!("leave it out, or make the mesh again: `tiface mesh {run} --fresh mesh --set {settings}`")
         };
         Error::usage(
             format!("`{option}` is {value}, but the {what} {kept}"),
@@ -290,28 +374,24 @@ impl KeptHead {
     /// Brings the mesh and its texture to the size that is asked for.
     fn resize(&mut self, asked: &ExportRequest, monitor: &dyn Monitor) -> Result<()> {
         let kept_px = self.head.texture.as_ref().map_or(0, |t| t.color.width);
-        let kept = self.triangles();
+        let kept = self.triangles(0);
         let px = asked.texture_px.unwrap_or(kept_px);
         if px > kept_px {
             let kept = match kept_px {
                 0 => "no texture".into(),
                 kept => format!("a texture of {kept}"),
             };
-            return Err(self.more("--texture", key!(mesh.texture_px), px, &kept));
+            return Err(self.more("--texture", px, &kept, &format!("{}={px}", key!(mesh.texture_px))));
         }
         if px == 0 && kept_px > 0 && self.head.mesh.colors.is_empty() {
-            return Err(self.more("--texture", key!(mesh.texture_px), px, "no colors at the vertices"));
+            let settings = format!("{}=0", key!(mesh.texture_px));
+            return Err(self.more("--texture", px, "no colors at the vertices", &settings));
         }
         if px > 0 && px < kept_px {
             self.warnings.extend(not_shown("--texture", "texture", TEXTURED, &asked.formats)?);
         }
-        let count = asked.triangles.map_or(kept, |n| n as usize);
-        if count > kept {
-            let kept = format!("a mesh of {kept} triangles");
-            return Err(self.more("--triangles", key!(mesh.triangles), count as u32, &kept));
-        }
-        if count < kept {
-            return self.simplify(count, px, monitor);
+        if let Some(triangles) = asked.triangles.filter(|n| *n as usize != kept) {
+            return self.simplify(triangles, px, monitor);
         }
         let gutter_px = self.gutter_px;
         match self.head.texture.take() {
@@ -331,35 +411,47 @@ impl KeptHead {
         Ok(())
     }
 
-    /// Simplifies the mesh and carries what it shows over to a new atlas of `px` texels.
-    fn simplify(&mut self, triangles: usize, px: u32, monitor: &dyn Monitor) -> Result<()> {
-        let HeadMesh { mesh: kept, world_from_scene, texture, .. } = &self.head;
-        let mut mesh = kept.clone();
-        let config = SimplifyConfig { triangles, ..SimplifyConfig::default() };
-        let done = simplify(&mut mesh, None, &config, monitor)?;
-        self.warnings.extend(done.warnings(&config).iter().map(sentence));
-        let original = Original::new(&self.head);
-        let shells = original.carry_vertices(&mut mesh);
-        let gutter_px = self.gutter_px;
-        let carry = |texture: &HeadTexture| -> Result<HeadTexture> {
-            let scene_from_world = world_from_scene.inverse();
-            let config =
-                self.export.atlas_config(center(kept, world_from_scene), &scene_from_world, px, gutter_px);
-            let (layout, done) = atlas(&mesh, &config, monitor)?;
-            self.warnings.extend(done.warnings().iter().map(sentence));
-            let side = texture.color.width.div_ceil(px).clamp(1, 2);
-            let carried = original.carry_texture(texture, &mesh, &layout, side, gutter_px, monitor)?;
-            let bend = |normals| -> Result<_> {
-                Ok(tangent_space(&mesh, &layout, &tangents(&mesh, &layout)?, normals, gutter_px))
-            };
-            let normal = carried.normal.as_ref().map(bend).transpose()?;
-            let lobes = texture.lobes.as_ref().and_then(|l| Lobes::new(&carried.lobes, l.turned));
-            let lobes = lobes.map(|l| l.reduced(px / LOBE_TEXEL));
-            Ok(HeadTexture { color: carried.color.encoded(), normal, lobes, atlas: layout })
+    /// Simplifies the surface that the run keeps, or the mesh of a file, and carries what the head
+    /// shows over to a new atlas of `px` texels.
+    fn simplify(&mut self, triangles: u32, px: u32, monitor: &dyn Monitor) -> Result<()> {
+        let surface = match &self.run {
+            Some(run) => ExtractedSurface::load(&run.join(Stage::Mesh).join("parts")).map_err(advised)?.mesh,
+            None => self.head.mesh.clone(),
         };
-        let texture = texture.as_ref().filter(|_| px > 0).map(carry).transpose()?;
-        // no file holds the harmonics of vertices
-        self.head = HeadMesh { mesh, world_from_scene: *world_from_scene, texture, harmonics: None, shells };
+        let most = surface.triangles.len();
+        if triangles as usize > most {
+            let kept = format!("a surface of {most} triangles");
+            let settings = format!("{}=N", key!(mesh.resolution));
+            return Err(self.more("--triangles", triangles, &kept, &settings));
+        }
+        let resize = Resize { triangles: triangles as usize, atlas: self.atlas_config(px) };
+        let (head, done) = resized(&self.head, &surface, &resize, monitor).map_err(advised)?;
+        self.head = head;
+        self.warnings.extend(done.warnings.iter().map(sentence));
+        Ok(())
+    }
+
+    /// Returns the options of an atlas whose texture has `px` texels on a side; `None` without.
+    fn atlas_config(&self, px: u32) -> Option<AtlasConfig> {
+        let HeadMesh { mesh, world_from_scene, .. } = &self.head;
+        let center = center(mesh, world_from_scene);
+        let config = || self.export.atlas_config(center, &world_from_scene.inverse(), px, self.gutter_px);
+        (px > 0).then(config)
+    }
+
+    /// Makes the smaller levels of detail.
+    fn make_levels(&mut self, levels: usize, monitor: &dyn Monitor) -> Result<()> {
+        if levels == 1 {
+            return Ok(());
+        }
+        let px = self.head.texture.as_ref().map_or(0, |t| t.color.width);
+        let atlas = self.atlas_config(px).unwrap_or_default();
+        let mut all = lods(&self.head, levels, &atlas, monitor).map_err(advised)?;
+        self.levels = all.split_off(1);
+        let reports = self.levels.iter().filter_map(|level| level.report.as_ref());
+        let mut said: Vec<String> = reports.flat_map(|report| report.warnings.iter().map(sentence)).collect();
+        said.dedup();
+        self.warnings.extend(said);
         Ok(())
     }
 }
@@ -399,7 +491,7 @@ mod tests {
     use tiface_surface::files::testing::tetrahedron;
     use tiface_surface::files::{read, weld};
 
-    /// A head as a run would keep it that was made with these settings.
+    /// A head as a file has it that was written with these settings.
     fn kept(head: HeadMesh, change: impl Fn(&mut Config)) -> KeptHead {
         let mut made = Config::preset(Preset::Draft);
         change(&mut made);
@@ -418,7 +510,7 @@ mod tests {
         };
         let export = Export::new(&capture, &made);
         let gutter_px = made.mesh.gutter_px;
-        KeptHead { run: Some("run".into()), head, gutter_px, export, warnings: Vec::new() }
+        KeptHead { run: None, head, gutter_px, export, levels: Vec::new(), warnings: Vec::new() }
     }
 
     #[test]
@@ -433,7 +525,7 @@ mod tests {
         let lobes = texture.lobes.as_ref().unwrap();
         assert_eq!((texture.color.width, lobes.pictures[0].width), (256, 256 / LOBE_TEXEL));
         assert_eq!(after.head.shells.as_ref().unwrap().layers[0].alphas.len(), mesh.positions.len());
-        let glb = after.files(MeshFormat::Glb, "head").unwrap().files.remove(0).1;
+        let glb = after.files(0, MeshFormat::Glb, "head").unwrap().files.remove(0).1;
         assert!(String::from_utf8_lossy(&glb).contains("ball soft layers"));
         assert!(weld(&read(&glb, Path::new("a.glb")).unwrap()).is_closed());
         // half of the sphere is under the layer, as before
@@ -479,7 +571,7 @@ mod tests {
         assert!(head().changed(&ExportRequest::default(), &Quiet).unwrap().warnings.is_empty());
         let unlit = head().changed(&ExportRequest { normal_map: false, ..unlit }, &Quiet).unwrap();
         assert!(unlit.warnings.is_empty() && unlit.head.texture.as_ref().unwrap().normal.is_none());
-        let glb = unlit.files(MeshFormat::Glb, "head").unwrap().files.remove(0).1;
+        let glb = unlit.files(0, MeshFormat::Glb, "head").unwrap().files.remove(0).1;
         assert!(String::from_utf8_lossy(&glb).contains("KHR_materials_unlit"));
     }
 }

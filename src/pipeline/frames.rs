@@ -54,6 +54,8 @@ pub struct Export {
     pub frame: MeshFrame,
     /// Whether the color is stored as JPEG, not PNG.
     pub jpeg: bool,
+    /// Whether a GLB is compressed.
+    pub compress: bool,
     /// The material of GLB and USDZ, lit or unlit.
     pub material: Material,
     /// Camera positions in the world; a face is assumed to look at the cameras.
@@ -79,6 +81,7 @@ impl Export {
             obj_unit_m: 1.0,
             frame: MeshFrame::Dataset,
             jpeg: false,
+            compress: false,
             material: Material::Unlit,
             cameras: Vec::new(),
         }
@@ -86,6 +89,17 @@ impl Export {
 
     /// Returns the files of a head mesh in a format, the mesh first. `stem` is their base name.
     pub(super) fn files(&self, head: &HeadMesh, format: MeshFormat, stem: &str) -> Result<ExportedFiles> {
+        self.files_beside(head, &head.mesh, format, stem)
+    }
+
+    /// Returns the files of a head mesh that are placed as those of another mesh of the same scene.
+    pub(super) fn files_beside(
+        &self,
+        head: &HeadMesh,
+        other: &Mesh,
+        format: MeshFormat,
+        stem: &str,
+    ) -> Result<ExportedFiles> {
         let HeadMesh { mesh, world_from_scene, texture, shells, .. } = head;
         let options = ExportOptions {
             name: self.name.clone(),
@@ -93,7 +107,8 @@ impl Export {
             // an unlit material shows no normal map, so a normal map implies a lit one
             unlit: self.material == Material::Unlit && texture.as_ref().is_none_or(|t| t.normal.is_none()),
             jpeg_quality: self.jpeg.then_some(JPEG_QUALITY),
-            ..self.placed(mesh, world_from_scene)
+            compress: self.compress,
+            ..self.placed(other, world_from_scene)
         };
         match format {
             MeshFormat::Glb => {

@@ -147,6 +147,51 @@ fn a_file_has_the_material_frame_size_and_picture_that_are_asked_for() {
 }
 
 #[test]
+fn levels_of_detail_halve_are_closed_and_lie_in_one_place() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &[]);
+    let before = files(&run);
+    let words = ["export", "runs/head", "--lod", "2", "--format", "glb,ply", "--frame", "head"];
+    let json = worked(dir.path(), &[&words[..], &["--out", "lod/", "--json"]].concat());
+    let json: serde_json::Value = serde_json::from_str(json.lines().last().unwrap()).unwrap();
+    let all = ["head.glb", "head.ply", "head_lod1.glb", "head_lod1.ply"];
+    assert_eq!(names(&dir.path().join("lod")), all);
+    let level = &json["levels"][0];
+    let (largest, mean) = (level["largest_mm"].as_f64().unwrap(), level["mean_mm"].as_f64().unwrap());
+    assert!(level["triangles"].as_u64().unwrap() <= 300 && 0.0 < mean && mean < largest, "{level}");
+    let mesh = |file: &str| weld(&mesh(&dir.path().join("lod").join(file)).mesh);
+    let [full, half] = ["head.glb", "head_lod1.glb"].map(mesh);
+    assert!(full.is_closed() && half.is_closed() && half.triangles.len() <= 300);
+    // no vertex of the smaller one lies farther from the box of the first than is told
+    let (outer, inner) = (full.bounds(), half.bounds());
+    let beyond = (inner.max - outer.max).max(outer.min - inner.min).max_element();
+    assert!(f64::from(beyond) <= 1e-3 * largest + 1e-6, "{beyond} {largest}");
+    // more triangles than the run's files have, from the surface that it keeps
+    worked(dir.path(), &["export", "runs/head", "--triangles", "900", "--out", "more.glb"]);
+    let more = weld(&self::mesh(&dir.path().join("more.glb")).mesh);
+    assert!((850..=900).contains(&more.triangles.len()) && more.is_closed(), "{}", more.triangles.len());
+    let refused = tiface(dir.path(), &["export", "runs/head", "--lod", "9", "--out", "a.glb"]);
+    assert!(refused.status.code() == Some(2) && said(&refused).contains("--lod"), "{}", said(&refused));
+    assert!(before == files(&run));
+}
+
+#[test]
+fn a_compressed_head_is_small_and_says_what_a_reader_needs() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = finished(dir.path(), &["mesh.lobes=0"]);
+    worked(dir.path(), &["export", "runs/head", "--compress", "--out", "small.glb"]);
+    let small = document(&dir.path().join("small.glb"));
+    let required = small["extensionsRequired"].to_string();
+    assert!(required.contains("EXT_meshopt_compression"), "{required}");
+    let plain = document(&run.join("mesh/head.glb"));
+    let count = |document: &serde_json::Value| document["accessors"][0]["count"].clone();
+    assert_eq!(count(&small), count(&plain));
+    assert_eq!(small["images"][0]["mimeType"], "image/jpeg");
+    let refused = tiface(dir.path(), &["export", "runs/head", "--compress", "--out", "a.ply"]);
+    assert!(refused.status.code() == Some(2) && said(&refused).contains("`--compress` does not affect .ply"));
+}
+
+#[test]
 fn a_mesh_file_goes_to_the_other_formats_and_sizes() {
     let dir = tempfile::tempdir().unwrap();
     let run = finished(dir.path(), &[]);
@@ -187,7 +232,7 @@ fn a_mesh_file_goes_to_the_other_formats_and_sizes() {
     for (words, code, text) in [
         (&["head.glb"][..], 2, "`head.glb` is the file that is read"),
         (&["head.glb", "--frame", "head", "--out", "a.glb"], 2, "a file has no cameras"),
-        (&["head.glb", "--triangles", "9000", "--out", "a.glb"], 2, "the file has a mesh of"),
+        (&["head.glb", "--triangles", "9000", "--out", "a.glb"], 2, "the file has a surface of"),
         (&["absent.glb", "--out", "a.glb"], 1, "absent.glb"),
     ] {
         let output = tiface(dir.path(), &[&["export"][..], words].concat());
@@ -394,7 +439,7 @@ fn what_cannot_be_exported_is_refused_by_name_and_leaves_nothing() {
             2,
             &["`--texture` is 256", "a texture of 128", "--fresh mesh --set mesh.texture_px=256"],
         ),
-        (&["--triangles", "90000"], 2, &["`--triangles` is 90000", "a mesh of ", "--fresh mesh"]),
+        (&["--triangles", "90000"], 2, &["`--triangles` is 90000", "a surface of ", "mesh.resolution=N"]),
         (&["--triangles", "0"], 2, &["invalid value '0'"]),
         (&["--height=-1"], 2, &["above 0"]),
         (&["--measure", "0,0,0", "0,0,0", "1"], 2, &["have no distance"]),

@@ -8,8 +8,8 @@
 use crate::bake::{Original, tangent_space};
 use crate::files::{HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
 use crate::{AtlasConfig, AtlasReport, SimplifyConfig, SimplifyReport, Warning, atlas, setting, simplify};
-use tiface_base::geom::Bvh;
 use tiface_base::geom::distance::one_way;
+use tiface_base::geom::{Bvh, Mesh};
 use tiface_base::{Monitor, Result};
 
 /// Options of [`resized`].
@@ -33,18 +33,24 @@ pub struct ResizeReport {
     pub warnings: Vec<Warning>,
 }
 
-/// Returns a head in fewer triangles and with a new texture of it; with its soft layers and lobes,
-/// and with a normal map if it has one. A head that has no more triangles than asked for keeps its
-/// surface and gets the new texture. Harmonics are left out: no file holds those of vertices.
+/// Returns a head in other triangles and with a new texture of it; with its soft layers and lobes,
+/// and with a normal map if it has one. Harmonics are left out: no file holds those of vertices.
 ///
-/// The smaller mesh is closed if the head is.
+/// `surface` is simplified to these triangles: the head's own mesh, or the finer one that the head
+/// was made from. One that has no more triangles than asked for stays as it is. The result is
+/// closed if `surface` is.
 ///
 /// # Errors
 ///
 /// An option out of range, a texture too small for its triangles, a damaged mesh, or a request to
 /// stop.
-pub fn resized(head: &HeadMesh, resize: &Resize, monitor: &dyn Monitor) -> Result<(HeadMesh, ResizeReport)> {
-    let mut mesh = head.mesh.clone();
+pub fn resized(
+    head: &HeadMesh,
+    surface: &Mesh,
+    resize: &Resize,
+    monitor: &dyn Monitor,
+) -> Result<(HeadMesh, ResizeReport)> {
+    let mut mesh = surface.clone();
     let config = SimplifyConfig { triangles: resize.triangles, ..SimplifyConfig::default() };
     let simplified = simplify(&mut mesh, None, &config, monitor)?;
     let mut report =
@@ -121,7 +127,7 @@ pub fn lods(
         let gutter_px = (atlas.gutter_px >> level.div_ceil(2)).max(2).min(atlas.gutter_px);
         let atlas = AtlasConfig { size_px, gutter_px, resolved: None, ..atlas.clone() };
         let resize = Resize { triangles: triangles >> level, atlas: Some(atlas) };
-        let (smaller, report) = resized(head, &resize, monitor)?;
+        let (smaller, report) = resized(head, &head.mesh, &resize, monitor)?;
         let ways = [
             one_way(&smaller.mesh, &kept, DISTANCE_SAMPLES),
             one_way(&head.mesh, &Bvh::new(&smaller.mesh), DISTANCE_SAMPLES),
@@ -175,7 +181,7 @@ mod tests {
     fn a_head_without_a_texture_or_a_wish_for_one_gets_none() {
         let head = ball();
         let resize = Resize { triangles: 1000, atlas: None };
-        let (small, report) = resized(&head, &resize, &Quiet).unwrap();
+        let (small, report) = resized(&head, &head.mesh, &resize, &Quiet).unwrap();
         assert!(small.texture.is_none() && report.atlas.is_none() && small.mesh.is_closed());
         let [colors, vertices] = [small.mesh.colors.len(), small.mesh.positions.len()];
         assert!(small.mesh.triangles.len() <= 1000 && colors == vertices && small.harmonics.is_none());
