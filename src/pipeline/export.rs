@@ -19,7 +19,9 @@ use std::path::{Path, PathBuf};
 use tiface_base::geom::{ShellLayer, Similarity};
 use tiface_base::{Error, Monitor, Result};
 use tiface_surface::files::{ExportedFiles, ExtractedSurface, HeadMesh, LOBE_TEXEL, open_mesh};
-use tiface_surface::{AtlasConfig, DetailLevel, HeadMeasures, Plane, Resize, cut, lods, measure, resized};
+use tiface_surface::{
+    AtlasConfig, DetailLevel, HeadMeasures, Plane, Resize, cut, lods, measure, most_levels, resized,
+};
 
 /// What files show of a kept head, and how they are written.
 #[derive(Clone, Debug)]
@@ -446,6 +448,16 @@ impl KeptHead {
         }
         let px = self.head.texture.as_ref().map_or(0, |t| t.color.width);
         let atlas = self.atlas_config(px).unwrap_or_default();
+        let most = most_levels(self.triangles(0));
+        if levels > most {
+            return Err(Error::usage(
+                format!(
+                    "`--lod` is {levels}, but of {} triangles the last level would show no face",
+                    self.triangles(0)
+                ),
+                format!("write {most} levels at most"),
+            ));
+        }
         let mut all = lods(&self.head, levels, &atlas, monitor).map_err(advised)?;
         self.levels = all.split_off(1);
         let reports = self.levels.iter().filter_map(|level| level.report.as_ref());

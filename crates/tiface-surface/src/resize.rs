@@ -101,6 +101,11 @@ const FEWEST: usize = 200;
 /// Smallest side of a level's texture.
 const SMALLEST_PX: u32 = 128;
 
+/// Returns how many levels of detail a mesh of so many triangles can have.
+pub fn most_levels(triangles: usize) -> usize {
+    1 + (triangles / FEWEST).max(1).ilog2() as usize
+}
+
 /// Returns a chain of `levels` heads: the head itself, then each with half as many triangles as the
 /// one before. A quarter of the triangles is for a head of half the size on the screen, so the side
 /// of the texture halves from the first to the second and at every other level after it, down to
@@ -117,7 +122,7 @@ pub fn lods(
     monitor: &dyn Monitor,
 ) -> Result<Vec<DetailLevel>> {
     let triangles = head.mesh.triangles.len();
-    let most = 1 + (triangles / FEWEST).max(1).ilog2() as usize;
+    let most = most_levels(triangles);
     setting((1..=most).contains(&levels), "levels", &format!("1..={most} of {triangles} triangles"), levels)?;
     let kept = Bvh::new(&head.mesh);
     let mut chain = vec![DetailLevel { head: head.clone(), largest: 0.0, mean: 0.0, report: None }];
