@@ -228,7 +228,10 @@ fn fit(
         }
         sums.push(sum);
     }
-    let Some(weights) = ensemble::fit_weights(&sums)? else {
+    let learned: Vec<bool> =
+        c.members.iter().map(|method| matches!(method, Method::Baseline | Method::Tface)).collect();
+    let from_new: Vec<Fit> = sums.iter().map(|sum| sum.for_new_cameras(&learned)).collect();
+    let Some(weights) = ensemble::fit_weights(&from_new)? else {
         dir.warn(
             "no square of capture.tiles shows the head: the members are blended alike; raise capture.tiles, or give \
              ensemble.weights",
