@@ -18,7 +18,7 @@ use glam::{DVec3, Vec3};
 use std::path::{Path, PathBuf};
 use tiface_base::geom::{ShellLayer, Similarity};
 use tiface_base::{Error, Monitor, Result};
-use tiface_surface::files::{ExportedFiles, ExtractedSurface, HeadMesh, LOBE_TEXEL, open_mesh};
+use tiface_surface::files::{ExportedFiles, ExtractedSurface, HeadMesh, LOBE_TEXEL, open_mesh, weld};
 use tiface_surface::{
     AtlasConfig, DetailLevel, HeadMeasures, Plane, Resize, cut, lods, measure, most_levels, resized,
 };
@@ -132,6 +132,8 @@ pub struct KeptHead {
     export: Export,
     /// Its smaller levels of detail.
     levels: Vec<DetailLevel>,
+    /// Where its parts are before it is cut, in scene coordinates; `None` if its shape does not say.
+    measures: Option<HeadMeasures>,
     /// Warnings for the user.
     pub warnings: Vec<String>,
 }
@@ -162,7 +164,15 @@ impl KeptHead {
         check.iter().for_each(|check| check.apply(&mut capture));
         let export = Export::new(&capture, made);
         let gutter_px = made.mesh.gutter_px;
-        Ok(KeptHead { run: Some(run.into()), head, gutter_px, export, levels: Vec::new(), warnings })
+        Ok(KeptHead {
+            run: Some(run.into()),
+            head,
+            gutter_px,
+            export,
+            levels: Vec::new(),
+            measures: None,
+            warnings,
+        })
     }
 
     /// Opens a mesh file. `up` is its up direction; its unit is the meter.
@@ -171,12 +181,22 @@ impl KeptHead {
     ///
     /// Fails if the surface cannot be read.
     pub fn open(file: &Path, up: Vec3) -> Result<KeptHead> {
-        let opened = open_mesh(file).map_err(advised)?;
+        let mut opened = open_mesh(file).map_err(advised)?;
+        // files have a vertex for each side of a seam, along which a simpler mesh would open
+        opened.head.mesh = weld(&opened.head.mesh);
         let warnings = opened.warnings();
         let name = file.file_stem().map_or_else(|| "head".into(), |stem| stem.to_string_lossy().into_owned());
         let gutter_px = AtlasConfig::default().gutter_px;
         let export = Export::of_file(name, up);
-        Ok(KeptHead { run: None, head: opened.head, gutter_px, export, levels: Vec::new(), warnings })
+        Ok(KeptHead {
+            run: None,
+            head: opened.head,
+            gutter_px,
+            export,
+            levels: Vec::new(),
+            measures: None,
+            warnings,
+        })
     }
 
     /// Returns the head as it is asked for.
@@ -203,6 +223,7 @@ impl KeptHead {
                 "leave it out, or export from a run",
             ));
         }
+        self.measures = self.run.as_ref().and_then(|_| self.measures().ok());
         self.export.unit_m = self.unit_m(asked.size)?;
         let plane = self.plane(asked.cut)?;
         self.leave_out(asked);
@@ -334,7 +355,7 @@ impl KeptHead {
     /// Returns the height of the head from chin to crown in GLB, OBJ and USDZ files, meters; `None`
     /// if its shape does not say where the chin is.
     pub fn head_height_m(&self) -> Option<f64> {
-        let measures = self.run.as_ref().and_then(|_| self.measures().ok())?;
+        let measures = self.measures.as_ref()?;
         Some(f64::from(measures.height()) * self.head.world_from_scene.scale * self.export.unit_m)
     }
 
