@@ -543,7 +543,15 @@ mod tests {
         };
         let export = Export::new(&capture, &made);
         let gutter_px = made.mesh.gutter_px;
-        KeptHead { run: None, head, gutter_px, export, levels: Vec::new(), warnings: Vec::new() }
+        KeptHead {
+            run: None,
+            head,
+            gutter_px,
+            export,
+            levels: Vec::new(),
+            measures: None,
+            warnings: Vec::new(),
+        }
     }
 
     #[test]
