@@ -330,19 +330,25 @@ make_demo() {
   step "the demo head is reconstructed" train_demo "${size[@]}"
   step "the demo head is exported" export_demo
 }
-# The demo head again, with fewer triangles, another material and a smaller texture.
+# The demo head again, with fewer triangles, another material and a smaller texture; cut below the chin, at two levels of
+# detail; and compressed.
 export_demo() {
-  "$target/release/tiface" export "$scratch/demo" --material lit --triangles 3000 --texture 512 \
-    --format glb,obj,ply,usdz --out "$scratch/exported/"
+  local export=("$target/release/tiface" export "$scratch/demo")
+  "${export[@]}" --material lit --triangles 3000 --texture 512 --format glb,obj,ply,usdz --out "$scratch/exported/" &&
+    "${export[@]}" --cut chin --lod 2 --format glb,obj,ply --out "$scratch/cut/" &&
+    "${export[@]}" --compress --out "$scratch/small.glb"
 }
 head=$scratch/demo/mesh/head.glb
 exported=$scratch/exported/head.glb
 
 demo() {
+  local level
   make_demo
   readers_agree "the demo head" "$head" --up 0 0 1
   step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$head"
   readers_agree "the exported head" "$exported" --up 0 0 1
+  for level in head head_lod1; do readers_agree "the cut $level" "$scratch/cut/$level.glb" --up 0 0 1; done
+  step "three.js decodes the compressed head" node tools/readers/check_compressed.mjs "$scratch/small.glb" "$head"
   # unlit, as the stage left it, and lit, as it was exported
   step "USD agrees on both, by the rules of ARKit" .venv/bin/python tools/readers/check_usdz.py "${head%.glb}.usdz" \
     "${exported%.glb}.usdz"
