@@ -10,8 +10,8 @@
 //!   it to the outlines in photographs; [`MeshDistance`] is the result as a field, for the steps
 //!   after it.
 //! - [`simplify`], [`atlas`] and [`bake`] turn the surface into a textured mesh.
-//! - [`resized`] makes smaller meshes of a finished one and [`lods`] a chain of them; [`cut`] cuts it
-//!   by a plane, such as those that [`measure`] finds below the chin and above the shoulders.
+//! - [`resized`] makes smaller meshes of a finished one and [`lods`] a chain of them; [`cut`] cuts
+//!   it by a plane, such as those that [`measure`] finds below the chin and above the shoulders.
 //! - [`files`] writes, reads and checks GLB, OBJ and PLY, writes USDZ, and reads glTF and STL.
 //! - [`render`] shows a mesh from a camera.
 

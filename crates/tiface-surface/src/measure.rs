@@ -23,7 +23,7 @@ const NARROWER: f64 = 1.1;
 const SHOULDERS: [f64; 2] = [1.25, 1.5];
 
 /// Share of its largest distance from the line between neck and nose at which the chin ends.
-const CHIN_END: f64 = 0.7;
+const CHIN_END: f64 = 0.5;
 
 /// Smallest distance of a chin from that line, in the line's length: 45 mm of 150 would be far.
 const FLAT_CHIN: f64 = 0.03;
@@ -339,8 +339,8 @@ mod tests {
         // the box ends at -0.5
         let collar = found.collar.unwrap();
         assert!((collar + 0.5).abs() < 0.04 && found.neck > collar && found.neck < 0.0, "{found:?}");
-        // the ellipsoid meets the neck, 0.2 from the middle of 0.5, at 0.4 - 0.5 √(1 - 0.16) = -0.06,
-        // and is at 45 degrees at 0.4 - 0.35 = 0.05
+        // the ellipsoid meets the neck, 0.2 from the middle of 0.5, at 0.4 - 0.5 √(1 - 0.16) =
+        // -0.06, and is at 45 degrees at 0.4 - 0.35 = 0.05
         assert!(found.chin > -0.06 && found.chin < 0.1, "{found:?}");
         assert!((found.height() - (found.crown - found.chin)).abs() < 1e-6);
         assert!(found.chin_point.y < -0.25 && found.nape.y > 0.18 && found.nape.y < 0.25, "{found:?}");

@@ -8,7 +8,7 @@
 use crate::bake::{Original, tangent_space};
 use crate::files::{HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
 use crate::{AtlasConfig, AtlasReport, SimplifyConfig, SimplifyReport, Warning, atlas, setting, simplify};
-use tiface_base::geom::distance::one_way;
+use tiface_base::geom::distance::{Distances, one_way};
 use tiface_base::geom::{Bvh, Mesh};
 use tiface_base::{Monitor, Result};
 
@@ -91,9 +91,8 @@ pub struct DetailLevel {
     pub report: Option<ResizeReport>,
 }
 
-/// Points at which the distance between two surfaces is measured: some for each triangle of a
-/// head of 50,000.
-const DISTANCE_SAMPLES: usize = 200_000;
+/// Points for each triangle of the head at which the distance between two surfaces is measured.
+const DISTANCE_SAMPLES: usize = 4;
 
 /// Fewest triangles of a level: fewer show no face.
 const FEWEST: usize = 200;
@@ -124,7 +123,7 @@ pub fn lods(
     let triangles = head.mesh.triangles.len();
     let most = most_levels(triangles);
     setting((1..=most).contains(&levels), "levels", &format!("1..={most} of {triangles} triangles"), levels)?;
-    let kept = Bvh::new(&head.mesh);
+    let (kept, samples) = (Bvh::new(&head.mesh), DISTANCE_SAMPLES * triangles);
     let mut chain = vec![DetailLevel { head: head.clone(), largest: 0.0, mean: 0.0, report: None }];
     for level in 1..levels {
         let size_px = (atlas.size_px >> level.div_ceil(2)).max(SMALLEST_PX.min(atlas.size_px));
@@ -133,13 +132,9 @@ pub fn lods(
         let atlas = AtlasConfig { size_px, gutter_px, resolved: None, ..atlas.clone() };
         let resize = Resize { triangles: triangles >> level, atlas: Some(atlas) };
         let (smaller, report) = resized(head, &head.mesh, &resize, monitor)?;
-        let ways = [
-            one_way(&smaller.mesh, &kept, DISTANCE_SAMPLES),
-            one_way(&head.mesh, &Bvh::new(&smaller.mesh), DISTANCE_SAMPLES),
-        ];
-        let most = |of: fn(&tiface_base::geom::distance::Distances) -> f64| {
-            ways.iter().flatten().map(of).fold(0.0, f64::max)
-        };
+        let ways =
+            [one_way(&smaller.mesh, &kept, samples), one_way(&head.mesh, &Bvh::new(&smaller.mesh), samples)];
+        let most = |of: fn(&Distances) -> f64| ways.iter().flatten().map(of).fold(0.0, f64::max);
         let (largest, mean) = (most(|way| way.max), most(|way| way.mean));
         chain.push(DetailLevel { head: smaller, largest, mean, report: Some(report) });
     }
@@ -171,7 +166,7 @@ mod tests {
             );
             let texture = head.texture.as_ref().unwrap();
             assert_eq!(texture.color.width, [512, 256, 256, 128][k]);
-            assert_eq!(texture.lobes.is_some() && head.shells.is_some(), true);
+            assert!(texture.lobes.is_some() && head.shells.is_some());
             // a chord of a ball of radius 12 of n triangles, each of area 4 π r² / n with sides of
             // about 2.3 r √(4 π / √3 / n) / 2, lies r (side / r)² / 6 inside at most
             let told = if k == 0 { 0.0 } else { 12.0 * 14.5 / found as f64 };

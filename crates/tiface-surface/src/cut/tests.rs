@@ -36,7 +36,8 @@ fn a_cut_ball_is_a_cap_of_the_ball_with_a_flat_face_of_the_color_of_its_rim() {
     assert!((out.mesh.signed_volume() / volume - 1.0).abs() < 0.02, "{}", out.mesh.signed_volume());
     let bottom = 6.3 + report.moved as f32;
     assert!((out.mesh.bounds().min.z - bottom).abs() < 1e-5);
-    // within the face the vertices' normals point down, and every color lies between those of the rim
+    // within the face the vertices' normals point down, and every color lies between those of the
+    // rim
     let shown_at = |p: Vec3| Vec3::from(shown(p));
     let texture = out.texture.as_ref().unwrap();
     let mut inner = 0;

@@ -1,5 +1,5 @@
-//! Compression of the arrays in a GLB: `EXT_meshopt_compression` of integers of 8 and 16 bits, which
-//! stand in the place of floats (`KHR_mesh_quantization`).
+//! Compression of the arrays in a GLB: `EXT_meshopt_compression` of integers of 8 and 16 bits,
+//! which stand in the place of floats (`KHR_mesh_quantization`).
 //!
 //! Positions are on a grid of 65 534 steps along the longest side, 5 µm on a head, and the mesh's
 //! node brings them to their place; equal positions stay equal, so a closed surface stays closed.
