@@ -9,9 +9,9 @@ use super::{BlendTarget, MAX_MEMBERS, Members, in_bands, no_members, normalized}
 use tiface_base::{Error, Result};
 
 /// How much larger the squared error of a radiance field is from a new camera than in squares left
-/// out of the photographs that it was learned from, beside that of a mesh. Weights that are best for
-/// held-out views of `lps`, `nefertiti` and the demo head, whole, have it at 2.1, 2.6 and 2.5 with
-/// 1,500 steps and at 1.2 with 450; half of the way is safe where the field learned less.
+/// out of the photographs that it was learned from, beside that of a mesh. Weights that are best
+/// for held-out views of `lps`, `nefertiti` and the demo head, whole, have it at 2.1, 2.6 and 2.5
+/// with 1,500 steps and at 1.2 with 450; half of the way is safe where the field learned less.
 const UNSEEN_CAMERA: f64 = 1.5;
 
 /// Sums over the pixels seen so far: `members²` numbers, so each view may keep its own.
@@ -65,8 +65,8 @@ impl Fit {
     }
 
     /// Returns the sums that new cameras would give. `learned` tells which members are radiance
-    /// fields, learned through the very cameras of the pixels: of their squared error, the part that
-    /// they do not share with the other members counts [`UNSEEN_CAMERA`] times.
+    /// fields, learned through the very cameras of the pixels: of their squared error, the part
+    /// that they do not share with the other members counts `UNSEEN_CAMERA` times.
     pub fn for_new_cameras(&self, learned: &[bool]) -> Fit {
         let m = self.members;
         let mut out = self.clone();

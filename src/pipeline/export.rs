@@ -132,7 +132,8 @@ pub struct KeptHead {
     export: Export,
     /// Its smaller levels of detail.
     levels: Vec<DetailLevel>,
-    /// Where its parts are before it is cut, in scene coordinates; `None` if its shape does not say.
+    /// Where its parts are before it is cut, in scene coordinates; `None` if its shape does not
+    /// say.
     measures: Option<HeadMeasures>,
     /// Warnings for the user.
     pub warnings: Vec<String>,
