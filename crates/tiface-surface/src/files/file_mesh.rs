@@ -49,7 +49,8 @@ pub struct ExportOptions {
     /// which is lossless; normal maps and lobes are always PNG.
     pub jpeg_quality: Option<u8>,
     /// Whether a GLB's arrays are compressed (`EXT_meshopt_compression`), which not every program
-    /// reads: positions are rounded to a 65 534th of the longest side of the box.
+    /// reads: positions are rounded to a 65 534th of the longest side of the box, and lobes are
+    /// half as fine.
     pub compress: bool,
 }
 

@@ -19,7 +19,8 @@
 //! which programs that import attributes can mask by.
 //!
 //! [`ExportOptions::compress`] stores arrays as `EXT_meshopt_compression`: a fifth of the bytes,
-//! for programs that know it. Vertices and triangles come in another order then.
+//! for programs that know it. Vertices and triangles come in another order then, and lobes are half
+//! as fine.
 //!
 //! Textures that depend on the view: tools may drop a texture that nothing refers to, and the
 //! Khronos validator warns about a texture that only `extras` refers to. So each lobe is the base
@@ -35,7 +36,7 @@
 
 use super::file_mesh::{ExportOptions, FileMesh, encode};
 use super::glb_document::GlbDocument;
-use super::head_texture::{HeadTexture, Lobes};
+use super::head_texture::{HeadTexture, LOBE_TEXEL, Lobes};
 use super::meshopt::Encoder;
 use super::wrong_length;
 use glam::Vec3;
@@ -119,6 +120,9 @@ pub fn to_glb(
         }
         // a reader knows no coordinates but the file's
         let turned = texture.lobes.as_ref().and_then(|l| l.in_coordinates(file_from_mesh.rotation_f32()));
+        // half as fine where bytes count: four lobes weigh as much as the color otherwise
+        let finest = texture.color.width.max(texture.color.height).div_ceil(2 * LOBE_TEXEL);
+        let turned = if options.compress { turned.map(|l| l.reduced(finest)) } else { turned };
         for (k, lobe) in turned.iter().flat_map(|l| &l.pictures).enumerate() {
             lobes.push(picture(&lobe_name(k), lobe, None)?);
         }

@@ -294,6 +294,24 @@ mod tests {
     }
 
     #[test]
+    fn lobes_of_a_compressed_file_are_half_as_fine() {
+        let head = ball();
+        let side = |compress: bool| {
+            let options = ExportOptions { compress, ..ExportOptions::default() };
+            let glb = to_glb(&head.mesh, head.texture.as_ref(), None, &options).unwrap();
+            let (json, bin) = opened(&glb);
+            let images = json["images"].as_array().unwrap();
+            let image = images.iter().find(|image| image["name"] == "lobe 0").unwrap();
+            let view = &json["bufferViews"][number(&image["bufferView"])];
+            // a PNG's header has the width after 16 bytes
+            let at = number(&view["byteOffset"]) + 16;
+            u32::from_be_bytes(bin[at..at + 4].try_into().unwrap())
+        };
+        // 512 texels of color, an eighth of them of lobes; the ball's own are too fine
+        assert_eq!((side(false), side(true)), (512, 64));
+    }
+
+    #[test]
     fn colors_numbers_and_tangents_come_back() {
         let bounds = Aabb::around([Vec3::ZERO, Vec3::ONE]);
         let mut encoder = Encoder::new(bounds);
