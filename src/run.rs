@@ -29,6 +29,8 @@ mod stage;
 mod status;
 mod verify;
 
+#[cfg(test)]
+pub(crate) use clean::tests::finish;
 pub use clean::{HeldStages, Surplus, SurplusKind};
 pub use estimate::{Cost, ESTIMATE, Estimate, read_estimate};
 pub use failure::{FAILED, Failure, read_failure};

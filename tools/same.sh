@@ -35,7 +35,7 @@ settings=(
   --set tface.voxels_start=32768 --set tface.voxels_final=110592
   --set baseline.steps=60 --set baseline.rays=512
   --set mesh.resolution=96 --set mesh.triangles=6000 --set mesh.texture_px=512
-  --set mesh.lobes=2 --set mesh.normal_map=true --set mesh.format=glb,obj,ply
+  --set mesh.normal_map=true --set mesh.format=glb,obj,ply
   --set render.method=baseline,tface,volume,raycast,textured
   --set ensemble.members=tface,volume --set ensemble.weights=0.7,0.3
 )

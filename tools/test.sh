@@ -316,7 +316,7 @@ readers() {
 train_demo() {
   "$target/release/tiface" demo --run "$scratch/demo" --preset draft --set iface.steps="$1" \
     --set tface.steps=$(($1 * 2 / 3)) --set baseline.steps=$(($1 / 3)) --set mesh.resolution=128 \
-    --set mesh.format=glb,obj,ply,usdz --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured "${@:2}"
+    --set mesh.format=glb,obj,ply,usdz --set render.method=tface,volume,raycast,textured "${@:2}"
 }
 demo_made=no
 make_demo() {

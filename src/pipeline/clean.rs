@@ -149,24 +149,8 @@ fn float_views(run: &Run) -> Result<Vec<Surplus>> {
 mod tests {
     use super::*;
     use crate::config::Preset;
-    use crate::run::{Fingerprint, Plan};
-    use serde_json::Value;
+    use crate::run::finish;
     use tiface_base::io;
-
-    /// Finishes a stage with these files of one byte.
-    fn finish(run: &Run, name: &str, files: &[&str]) {
-        let fingerprint = Fingerprint::default();
-        let plan = Plan { name, fingerprint, device: "cpu", needs_bytes: 0, saves: false };
-        run.stage(plan, |stage| {
-            for name in files {
-                let file = stage.folder().join(name);
-                io::create_folder(file.parent().unwrap())?;
-                io::write_atomic(&file, b"x")?;
-            }
-            Ok(Value::Null)
-        })
-        .unwrap();
-    }
 
     fn names(found: &[Surplus]) -> Vec<&str> {
         found.iter().map(|s| s.file.as_str()).collect()
@@ -207,7 +191,7 @@ mod tests {
         finish(&run, "tface", &[old[0], old[1], "checkpoint.safetensors", "1/checkpoint.safetensors"]);
         let found = surplus(&run, &config).unwrap().0;
         assert_eq!(names(&found), [old[1], old[0]]);
-        assert!(found.iter().all(|s| (s.kind, s.bytes) == (SurplusKind::OldCheckpoint, 1)), "{found:?}");
+        assert!(found.iter().all(|s| (s.kind, s.bytes) == (SurplusKind::OldCheckpoint, 4)), "{found:?}");
         io::remove(&dir.path().join("tface/done.json")).unwrap();
         assert!(surplus(&run, &config).unwrap().0.is_empty());
     }

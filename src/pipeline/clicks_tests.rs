@@ -15,14 +15,14 @@ use tiface_base::io::{self, Limits};
 /// Photographs that masks are held against the truth on.
 const SHARP: (u32, u32) = (120, 160);
 
-/// Photographs that are only to be masked.
+/// Photographs that are only to be masked, fewer of them.
 const SMALL: (u32, u32) = (72, 96);
 
 /// A synthetic capture, clicks on three of its views at the deepest places of the true masks, and
 /// those masks.
 fn clicked(dir: &Path, size: (u32, u32)) -> (Config, Vec<Gray>) {
     let root = dir.join("head");
-    demo_head(&root, size, (8, 2));
+    demo_head(&root, size, if size == SMALL { (6, 1) } else { (8, 2) });
     let capture = capture::open(&root, &CaptureOptions::default()).unwrap();
     let truth: Vec<Gray> =
         capture.views.iter().map(|v| v.load_mask(&Limits::default()).unwrap().unwrap()).collect();

@@ -1,6 +1,6 @@
 "use strict";
-// Some rows at a time, of those that match; in the order of a column: numbers by size, the rest by letters, what is not known
-// last.
+// Some rows at a time, of those that match; in the order of a column: numbers by size, the rest by
+// letters, what is not known last.
 const PAGE = 25;
 const body = document.querySelector("tbody"), search = document.querySelector("[name=search]"), state = document.querySelector("[name=state]");
 const [previous, next] = ["previous", "next"].map((name) => document.querySelector(`.${name}`));

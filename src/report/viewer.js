@@ -1,12 +1,14 @@
-// A head to turn: shows the GLB inside the page with WebGL 2, alone and from the places of the photographs.
+// A head to turn: shows the GLB inside the page with WebGL 2, alone and from the places of the
+// photographs.
 //
-// Coordinates are the file's own, +Y up, kept in f64 around the middle of the mesh until they meet the graphics card.
-// Colors that change with the view are those of docs/view-dependent-color.md:
+// Coordinates are the file's own, +Y up, kept in f64 around the middle of the mesh until they meet
+// the graphics card. Colors that change with the view are those of docs/view-dependent-color.md:
 //
 //     base + sum over k of L_k Y_k(d),     L_k = (byte - 128) / 127 * scale[k]
 //
-// in sRGB-coded values; d is the unit vector from the point to the viewer. Primitives whose material says BLEND are
-// drawn after all others, in the order of the file, without their back faces and without writing depth.
+// in sRGB-coded values; d is the unit vector from the point to the viewer. Primitives whose
+// material says BLEND are drawn after all others, in the order of the file, without their back
+// faces and without writing depth.
 
 "use strict";
 

@@ -134,18 +134,16 @@ impl Record {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::run::{Plan, verify};
     use serde_json::Value;
     use std::fs;
     use tiface_base::ErrorKind;
 
-    /// A run whose stage `render` has left these files, each of four bytes.
-    fn finished(dir: &Path, files: &[&str]) -> Run {
-        let run = Run::quiet(dir);
-        let plan = plan();
-        run.stage(plan, |stage| {
+    /// Finishes a stage with these files, each of four bytes.
+    pub(crate) fn finish(run: &Run, stage: &str, files: &[&str]) {
+        run.stage(plan(stage), |stage| {
             for name in files {
                 let file = stage.folder().join(name);
                 io::create_folder(file.parent().unwrap())?;
@@ -154,12 +152,18 @@ mod tests {
             Ok(Value::Null)
         })
         .unwrap();
+    }
+
+    /// Returns a run whose stage `render` has left these files.
+    fn finished(dir: &Path, files: &[&str]) -> Run {
+        let run = Run::quiet(dir);
+        finish(&run, "render", files);
         run
     }
 
-    fn plan() -> Plan<'static> {
+    fn plan(name: &str) -> Plan<'_> {
         let fingerprint = Fingerprint::default();
-        Plan { name: "render", fingerprint, device: "cpu", needs_bytes: 0, saves: false }
+        Plan { name, fingerprint, device: "cpu", needs_bytes: 0, saves: false }
     }
 
     fn surplus(file: &str, kind: SurplusKind, bytes: u64) -> Surplus {
@@ -190,7 +194,7 @@ mod tests {
         assert_eq!(record.cleaned.values().sum::<u64>(), 7);
         assert_eq!(io::modified(&done), Some(time));
         assert!(verify(dir.path()).unwrap().differing().next().is_none());
-        assert!(run.stage(plan(), |_| panic!("the stage should have been skipped")).unwrap().skipped);
+        assert!(run.stage(plan("render"), |_| panic!("the stage should have been skipped")).unwrap().skipped);
     }
 
     #[test]
@@ -203,10 +207,10 @@ mod tests {
         let stop = |_: &Path| Err(Error::cannot("stopped", ""));
         assert!(run.clean(&held, &goes, stop).is_err());
         drop(held);
-        assert!(run.stage(plan(), |_| panic!("the stage should have been skipped")).unwrap().skipped);
+        assert!(run.stage(plan("render"), |_| panic!("the stage should have been skipped")).unwrap().skipped);
         // killed after the file was written, and before it was listed again
         fs::write(folder.join("weights"), "a").unwrap();
-        assert!(run.stage(plan(), |_| panic!("the stage should have been skipped")).unwrap().skipped);
+        assert!(run.stage(plan("render"), |_| panic!("the stage should have been skipped")).unwrap().skipped);
         run.clean(&run.hold(&names).unwrap(), &[], |_| Ok(None)).unwrap();
         assert_eq!(read_record(&folder).unwrap().unwrap().products["weights"], 1);
     }

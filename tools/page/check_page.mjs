@@ -4,9 +4,10 @@
 //     npm ci --prefix tools/readers
 //     node tools/page/check_page.mjs DIR/page.html
 //
-// Screenshots go beside the page. Checked: what is saved holds the pixels that were clicked, in all three sizes of the
-// picture; right click, Shift, touch and keyboard; undo, redo, removing; opening a file, also a senseless one; a file name made to break the page;
-// that nothing is asked of a network. Exits 1 after printing every disagreement.
+// Screenshots go beside the page. Checked: what is saved holds the pixels that were clicked, in
+// all three sizes of the picture; right click, Shift, touch and keyboard; undo, redo, removing;
+// opening a file, also a senseless one; a file name made to break the page; that nothing is asked
+// of a network. Exits 1 after printing every disagreement.
 
 import { readFile, writeFile } from "node:fs/promises";
 import path from "node:path";

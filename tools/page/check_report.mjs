@@ -1,16 +1,20 @@
 // Opens the report of a run as a person would, in Chromium without a window.
 //
-//     tiface demo --preset draft --set mesh.lobes=2 --set render.method=tface,volume,raycast,textured --run RUN
-//     tiface report RUN OTHER --out RUN/runs.html      (if there, the page of many runs is tried, too)
-//     tiface preview RUN --size 512 --out RUN/preview.png      (if there, the first picture must be this one)
-//     tiface preview RUN --size 512 --light seen --out RUN/preview_seen.png      (likewise, by number of cameras)
+//     tiface demo --preset draft --set render.method=tface,volume,raycast,textured --run RUN
+//     tiface report RUN OTHER --out RUN/runs.html
+//     tiface preview RUN --size 512 --out RUN/preview.png
+//     tiface preview RUN --size 512 --light seen --out RUN/preview_seen.png
 //     npm ci --prefix tools/readers
 //     node tools/page/check_report.mjs RUN
 //
-// Checked: the page's size; no errors, nothing asked of a network, no scrolling sideways, at 1280 and 400 pixels, in
-// light and dark; the head drawn as `tiface` draws it (30 dB); all modes; nothing drawn while nothing changes; mouse,
-// touch and keyboard; a browser without WebGL 2; a view whose name is made to break the page. How long loading takes is
-// printed. Screenshots go beside the page. Exits 1 after printing every disagreement.
+// If they are there, the page of many runs is tried, too, and the first pictures of the head must
+// be those previews, in its colors and by number of cameras.
+//
+// Checked: the page's size; no errors, nothing asked of a network, no scrolling sideways, at 1280
+// and 400 pixels, in light and dark; the head drawn as `tiface` draws it (30 dB); all modes;
+// nothing drawn while nothing changes; mouse, touch and keyboard; a browser without WebGL 2; a view
+// whose name is made to break the page. How long loading takes is printed. Screenshots go beside
+// the page. Exits 1 after printing every disagreement.
 
 import { access, readFile, readdir, stat, writeFile } from "node:fs/promises";
 import { createRequire } from "node:module";

@@ -2,8 +2,9 @@
 //
 //     node tools/page/check_watch.mjs TIFACE RUN
 //
-// Checked: the page with its stages and curves; that it renews itself; pictures; the report behind it; that Ctrl-C ends
-// the command, and the page says so. Exits 1 after printing every disagreement.
+// Checked: the page with its stages and curves; that it renews itself; pictures; the report
+// behind it; that Ctrl-C ends the command, and the page says so. Exits 1 after printing every
+// disagreement.
 
 import { spawn } from "node:child_process";
 import { appendFile, mkdtemp, cp, rm } from "node:fs/promises";

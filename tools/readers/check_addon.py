@@ -29,6 +29,8 @@ import numpy  # noqa: E402
 from bpy_extras.object_utils import world_to_camera_view  # noqa: E402
 from PIL import Image  # noqa: E402
 
+from verdict import exit_code  # noqa: E402
+
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 MOST_PX = 0.05
 MOST_LEVELS = 2.0
@@ -162,9 +164,7 @@ def main():
     bpy.ops.extensions.package_uninstall(repo_index=1, pkg_id="tiface_import")
     if hasattr(bpy.types, "IMPORT_SCENE_OT_tiface_run"):
         wrong.append("the extension stays after it is removed")
-    for line in wrong:
-        print("WRONG", line)
-    return 1 if wrong else 0
+    return exit_code(wrong)
 
 
 if __name__ == "__main__":

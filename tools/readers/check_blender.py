@@ -23,6 +23,7 @@ import numpy
 import PIL.Image
 
 from axes import turn_to_y_up
+from verdict import exit_code
 
 BLENDER_FROM_GLTF = numpy.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)
 
@@ -143,9 +144,7 @@ def main():
                 bad.append("its material is unlit" if unlit else "its material is lit")
         print(f"{path.name:20} in Blender {bpy.app.version_string}: {said}  volume {volume:.9f}")
         wrong += [f"{path.name}: {line}" for line in bad]
-    for line in wrong:
-        print("WRONG", line)
-    return 1 if wrong else 0
+    return exit_code(wrong)
 
 
 if __name__ == "__main__":

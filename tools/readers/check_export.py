@@ -21,6 +21,7 @@ import PIL.Image
 
 from axes import turn_to_y_up
 from meshes import LoadedMesh, closed_and_volume, with_trimesh
+from verdict import exit_code
 
 
 def with_open3d(path):
@@ -117,9 +118,7 @@ def main():
             if uvs is None:
                 uvs = loaded.uvs
             wrong += [f"{name}: {line}" for line in bad]
-    for line in wrong:
-        print("WRONG", line)
-    return 1 if wrong else 0
+    return exit_code(wrong)
 
 
 if __name__ == "__main__":

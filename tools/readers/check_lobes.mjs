@@ -1,14 +1,16 @@
-// Shows a head with lobes in three.js, as docs/viewer does, from the held-out cameras of its run, and compares with
-// what `tiface render --with textured` shows from there. In Chromium without a window, WebGL in software.
+// Shows a head with lobes in three.js, as docs/viewer does, from the held-out cameras of its run,
+// and compares with what `tiface render --with textured` shows from there. In Chromium without a
+// window, WebGL in software.
 //
-//     tiface render RUN --fresh mesh --set mesh.lobes=2 --with textured
+//     tiface render RUN --with textured
 //     npm ci --prefix tools/readers
 //     node tools/readers/check_lobes.mjs RUN [--views 2] [--save DIR]
 //
-// Compared are pixels that the head covers in both pictures. Checked: PSNR above 35 dB, and above that of the base
-// color alone; that docs/viewer/index.html shows the file, without a word from the browser and without asking for
-// anything but three.js. --save keeps the pictures: NAME_{base,three,tiface}.png. The browser is
-// /usr/bin/chromium, or what CHROMIUM names. Exits 1 after printing every disagreement.
+// Compared are pixels that the head covers in both pictures. Checked: PSNR above 35 dB, and above
+// that of the base color alone; that docs/viewer/index.html shows the file, without a word from the
+// browser and without asking for anything but three.js. --save keeps the pictures:
+// NAME_{base,three,tiface}.png. The browser is /usr/bin/chromium, or what CHROMIUM names. Exits 1
+// after printing every disagreement.
 
 import { createServer } from "node:http";
 import { mkdir, readFile, readdir, writeFile } from "node:fs/promises";

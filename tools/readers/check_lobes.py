@@ -1,7 +1,7 @@
 """Shows a head with lobes in Blender, by tools/blender/lobes.py, from the held-out cameras of its run, and compares
 with what `tiface render --with textured` shows from there.
 
-    tiface render RUN --fresh mesh --set mesh.lobes=2 --with textured
+    tiface render RUN --with textured
     python3.11 -m venv .venv-blender && .venv-blender/bin/pip install -r tools/readers/requirements-blender.txt
     .venv-blender/bin/python tools/readers/check_lobes.py RUN [--views 1] [--samples 4] [--save DIR]
 
@@ -20,6 +20,7 @@ import numpy
 import PIL.Image
 
 from axes import turn_to_y_up
+from verdict import exit_code
 
 RENDER = pathlib.Path(__file__).resolve().parents[1] / "blender/render.py"
 LEAST = 35.0
@@ -86,9 +87,7 @@ def main():
                 wrong.append(f"{name}: the head is not in the picture")
             if not lobes > LEAST:
                 wrong.append(f"{name}: expected more than {LEAST} dB")
-    for line in wrong:
-        print("WRONG", line)
-    return 1 if wrong else 0
+    return exit_code(wrong)
 
 
 if __name__ == "__main__":

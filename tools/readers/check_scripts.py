@@ -21,6 +21,8 @@ import trimesh
 from PIL import Image
 from tensorboardX.proto.event_pb2 import Event
 
+from verdict import exit_code
+
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "examples"))
 import read_run  # noqa: E402
@@ -111,9 +113,7 @@ def main():
                           f"sys.modules['trackio'] = None; runpy.run_path({str(ROOT / 'tools/track.py')!r}, run_name='__main__')")
         if bare.returncode != 1 or "error: " not in bare.stderr or "hint: pip install" not in bare.stderr:
             wrong.append(f"without a tracker: {bare.returncode} {bare.stderr[-500:]}")
-    for line in wrong:
-        print("WRONG", line)
-    return 1 if wrong else 0
+    return exit_code(wrong)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ import PIL.Image
 from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
 from meshes import LoadedMesh, closed_and_volume, with_trimesh
+from verdict import exit_code
 
 
 ARKIT_SHADERS = "UsdPreviewSurface|UsdUVTexture|UsdTransform2d|UsdPrimvarReader_.*"
@@ -145,9 +146,7 @@ def main():
               f" {len(loaded.vertices)} vertices {len(loaded.faces)} triangles, color as {shown}")
         bad += differences(loaded, with_trimesh(glb), shown, is_unlit(glb))
         wrong += [f"{path.name}: {line}" for line in bad]
-    for line in wrong:
-        print("WRONG", line)
-    return 1 if wrong else 0
+    return exit_code(wrong)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,10 @@
 //     npm ci --prefix tools/readers
 //     node tools/readers/material_three.mjs RUN unlit.glb lit.glb [--save DIR]
 //
-// Each file is shown from the first held-out camera: in a scene without light, in the room that most viewers put around a
-// model (RoomEnvironment), and in even light from everywhere. Compared with what `tiface render --with textured` shows
-// from there, over pixels that both cover. In Chromium without a window, WebGL in software.
+// Each file is shown from the first held-out camera: in a scene without light, in the room that
+// most viewers put around a model (RoomEnvironment), and in even light from everywhere. Compared
+// with what `tiface render --with textured` shows from there, over pixels that both cover. In
+// Chromium without a window, WebGL in software.
 
 import { createServer } from "node:http";
 import { mkdir, readFile, readdir, writeFile } from "node:fs/promises";

@@ -1,5 +1,5 @@
-// What checks of pictures in three.js share: a browser, cameras of a run in the axes of its file, and how far pictures
-// differ.
+// What checks of pictures in three.js share: a browser, cameras of a run in the axes of its file,
+// and how far pictures differ.
 
 import { chromium } from "playwright-core";
 import { Matrix4, Quaternion, Vector3 } from "three";

@@ -309,6 +309,15 @@ impl Camera {
         Some((pixel.as_vec2(), depth as f32))
     }
 
+    /// Returns where in the picture a point is seen; `None` behind the camera and beside the
+    /// picture.
+    #[inline]
+    pub fn project_inside(&self, point: Vec3) -> Option<Vec2> {
+        let (at, _) = self.project(point)?;
+        let (width, height) = (self.width as f32, self.height as f32);
+        ((0.0..width).contains(&at.x) && (0.0..height).contains(&at.y)).then_some(at)
+    }
+
     /// Returns what [`Self::project`] returns, in f64.
     #[inline]
     pub fn project_f64(&self, point: DVec3) -> Option<(DVec2, f64)> {
@@ -423,6 +432,24 @@ mod tests {
             let (back, _) = c.project(ray.at(2.0)).unwrap();
             assert!(back.distance(pixel) < 1e-3, "{pixel} {back}");
         }
+    }
+
+    #[test]
+    fn a_point_is_inside_up_to_the_borders_of_the_picture_and_not_behind_the_camera() {
+        let c = camera();
+        let (near, far) = (Vec2::new(0.5, 0.5), Vec2::new(199.5, 99.5));
+        for (pixel, inside) in [
+            (near, true),
+            (far, true),
+            (Vec2::new(-0.5, 0.5), false),
+            (Vec2::new(0.5, -0.5), false),
+            (Vec2::new(200.5, 99.5), false),
+            (Vec2::new(199.5, 100.5), false),
+        ] {
+            let seen = c.project_inside(c.ray(pixel).unwrap().at(2.0));
+            assert!(seen.map(|at| at.distance(pixel) < 1e-3) == inside.then_some(true), "{pixel} {seen:?}");
+        }
+        assert_eq!(c.project_inside(c.ray(near).unwrap().at(-2.0)), None);
     }
 
     #[test]

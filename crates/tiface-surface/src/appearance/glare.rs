@@ -4,6 +4,7 @@
 //! mask does not have. Such a pixel, fitted at a steep angle, would paint the back of the head.
 
 use super::photograph::Photograph;
+use glam::Vec3;
 use tiface_base::image::eroded;
 
 /// Pixels within this many of a pixel that is not the head alone may show what is behind.
@@ -40,13 +41,10 @@ pub(super) fn is_glare(photograph: &Photograph) -> Vec<bool> {
         }
         let (Some(head), Some(behind)) = (heads.around(at), backgrounds.around(at)) else { return false };
         let own = photo.rgb[at].map(|byte| f32::from(byte) / 255.0);
-        distance(head, behind) > APART && distance(own, behind) < NEARER * distance(own, head)
+        let [head, behind, own] = [head, behind, own].map(Vec3::from);
+        head.distance(behind) > APART && own.distance(behind) < NEARER * own.distance(head)
     };
     (0..w * h).map(|at| head[at] && !inner[at] && shows_behind(at)).collect()
-}
-
-fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
-    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>().sqrt()
 }
 
 /// Sums of some pixels over all rectangles from the top left corner (Crow 1984).

@@ -27,10 +27,8 @@ impl Photograph<'_> {
 
     /// Returns whether a point of the scene falls on a pixel that shows the head alone.
     pub fn shows_head_at(&self, point: Vec3) -> bool {
-        let Some((at, _)) = self.camera.project(point) else { return false };
-        let (w, h) = (self.photo.width as f32, self.photo.height as f32);
-        let inside = (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y);
-        inside && self.is_head(at.y as usize * self.photo.width as usize + at.x as usize)
+        let Some(at) = self.camera.project_inside(point) else { return false };
+        self.is_head(at.y as usize * self.photo.width as usize + at.x as usize)
     }
 
     /// Returns the usable pixels within `margin` pixels of the mask's outline.

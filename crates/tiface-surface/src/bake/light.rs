@@ -153,7 +153,7 @@ impl Visibility<'_> {
     /// line of sight starts `clearance` above `from`, the point's place on the mesh.
     pub fn seen_from(&self, camera: &Camera, p: Vec3, from: Vec3, normal: Vec3) -> Option<(Vec3, f32)> {
         let (direction, cosine) = facing(camera, p, normal);
-        if cosine < MIN_COSINE || !in_frame(camera, p) {
+        if cosine < MIN_COSINE || camera.project_inside(p).is_none() {
             return None;
         }
         let origin = from + self.clearance * normal;
@@ -167,12 +167,6 @@ impl Visibility<'_> {
 fn facing(camera: &Camera, p: Vec3, normal: Vec3) -> (Vec3, f32) {
     let direction = (camera.position.as_vec3() - p).normalize_or_zero();
     (direction, direction.dot(normal))
-}
-
-/// Returns whether a point is within a camera's picture.
-fn in_frame(camera: &Camera, p: Vec3) -> bool {
-    let (w, h) = (camera.width as f32, camera.height as f32);
-    camera.project(p).is_some_and(|(at, _)| (0.0..w).contains(&at.x) && (0.0..h).contains(&at.y))
 }
 
 /// Colors of points: what the cameras that see them see on average, and how it changes between

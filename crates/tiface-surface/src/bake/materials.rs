@@ -4,6 +4,7 @@
 //! counts half: light changes it most within a material. Clusters are found by k-means from seeds
 //! that lie far apart, and near ones become one.
 
+use glam::Vec3;
 use tiface_base::image::linear_from_srgb;
 
 /// Weight of lightness relative to the two axes of hue.
@@ -127,7 +128,7 @@ fn nearest(centers: &[[f32; 3]], point: &[f32; 3]) -> usize {
 }
 
 fn distance_squared(a: &[f32; 3], b: &[f32; 3]) -> f32 {
-    a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum()
+    Vec3::from(*a).distance_squared(Vec3::from(*b))
 }
 
 /// Returns a color in Oklab, its lightness weighted.

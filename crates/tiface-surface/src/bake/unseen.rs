@@ -266,6 +266,21 @@ mod tests {
         places: Vec<(u32, Vec3)>,
     }
 
+    impl Scene {
+        /// Returns the fit of the scene, to be completed with grain but where it is calm.
+        fn fitted<'a>(&'a mut self, calm: &'a (dyn Fn(Vec3) -> bool + Sync)) -> FittedTexture<'a> {
+            FittedTexture {
+                mesh: &mut self.mesh,
+                atlas: &self.atlas,
+                seen: &self.seen,
+                guess: &self.guess,
+                image: &mut self.image,
+                known: &mut self.known,
+                calm,
+            }
+        }
+    }
+
     /// Stripes along x, a few texels wide.
     fn paint(p: Vec3) -> [f32; 3] {
         let stripe = if (2.0 * p.z).rem_euclid(2.0) < 1.0 { 0.03 } else { -0.03 };
@@ -301,16 +316,7 @@ mod tests {
     fn a_lamp_where_nobody_looked_becomes_cloth_with_its_grain() {
         let mut s = scene();
         let before = s.image.clone();
-        let fitted = FittedTexture {
-            mesh: &mut s.mesh,
-            atlas: &s.atlas,
-            seen: &s.seen,
-            guess: &s.guess,
-            image: &mut s.image,
-            known: &mut s.known,
-            calm: &|p| p.y < -11.0,
-        };
-        let texels = fitted.complete_unseen().unwrap();
+        let texels = s.fitted(&|p| p.y < -11.0).complete_unseen().unwrap();
         let report = texels.report(&before, &s.image);
         assert!(report.materials < 5 && report.brighter == 0, "{report:?}");
         assert!(report.brighter_before > 100 && report.share > 0.15 && report.share < 0.35, "{report:?}");
@@ -342,23 +348,13 @@ mod tests {
     fn a_calm_place_has_no_grain_and_without_trust_nothing_changes() {
         let mut s = scene();
         let before = s.image.clone();
-        let seen = s.seen.clone();
-        let complete = |s: &mut Scene, seen: &Seen| {
-            let fitted = FittedTexture {
-                mesh: &mut s.mesh,
-                atlas: &s.atlas,
-                seen,
-                guess: &s.guess,
-                image: &mut s.image,
-                known: &mut s.known,
-                calm: &|_| true,
-            };
-            fitted.complete_unseen().is_some()
-        };
-        let none = vec![0.0; seen.trust.len()];
-        assert!(!complete(&mut s, &Seen { trust: none.clone(), glimpse: none, ..Seen::default() }));
+        let none = vec![0.0; s.seen.trust.len()];
+        let unseen = Seen { trust: none.clone(), glimpse: none, ..Seen::default() };
+        let seen = std::mem::replace(&mut s.seen, unseen);
+        assert!(s.fitted(&|_| true).complete_unseen().is_none());
         assert_eq!(s.image, before);
-        assert!(complete(&mut s, &seen));
+        s.seen = seen;
+        assert!(s.fitted(&|_| true).complete_unseen().is_some());
         for &(texel, p) in s.places.iter().filter(|(_, p)| p.x > 8.0 && p.y < -3.0) {
             let found = texel_of(&s.image, texel);
             assert!((0..3).all(|k| (found[k] - CLOTH[k]).abs() < 0.03), "{p} {found:?}");
@@ -374,16 +370,7 @@ mod tests {
                 s.seen.glimpse.fill(1.0);
             }
             let before = s.image.clone();
-            let fitted = FittedTexture {
-                mesh: &mut s.mesh,
-                atlas: &s.atlas,
-                seen: &s.seen,
-                guess: &s.guess,
-                image: &mut s.image,
-                known: &mut s.known,
-                calm: &|_| false,
-            };
-            assert!(fitted.complete_unseen().is_some());
+            assert!(s.fitted(&|_| false).complete_unseen().is_some());
             let (mut kept, mut all) = (0, 0);
             for &(texel, p) in s.places.iter().filter(|(_, p)| p.x > 7.0 && p.y < -3.0) {
                 let (found, was) = (texel_of(&s.image, texel), texel_of(&before, texel));

@@ -71,7 +71,7 @@ fn gradients_are_those_of_the_cpu_however_they_are_added() {
 }
 
 fn gradients_like_the_cpu(shape: Shape, devices: Vec<Device>) {
-    let case = case(shape, 200);
+    let case = case(shape, 80);
     let (_, want) = on_cpu(&case);
     for device in devices {
         let mut on_gpu = DeviceCase::new(&device, &case);
