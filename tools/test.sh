@@ -348,6 +348,7 @@ demo() {
   step "three.js agrees on the demo head" node tools/readers/check_three.mjs "$head"
   readers_agree "the exported head" "$exported" --up 0 0 1
   for level in head head_lod1; do readers_agree "the cut $level" "$scratch/cut/$level.glb" --up 0 0 1; done
+  step "three.js agrees on the cut head" node tools/readers/check_three.mjs "$scratch/cut/head.glb"
   step "three.js decodes the compressed head" node tools/readers/check_compressed.mjs "$scratch/small.glb" "$head"
   # unlit, as the stage left it, and lit, as it was exported
   step "USD agrees on both, by the rules of ARKit" .venv/bin/python tools/readers/check_usdz.py "${head%.glb}.usdz" \
@@ -412,6 +413,7 @@ blender_agrees() {
   in_blender "Blender agrees on the rich globe" $checks/check_blender.py "$scratch/globe/globe_rich.glb"
   in_blender "Blender agrees on the soft globe" $checks/check_blender.py "$scratch/globe/globe_soft.glb" --up 0 0 1
   in_blender "Blender agrees on the demo head" $checks/check_blender.py "$head" --up 0 0 1
+  in_blender "Blender agrees on the cut head" $checks/check_blender.py "$scratch/cut/head.glb" --up 0 0 1
   in_blender "Blender agrees on the exported head" $checks/check_blender.py "$exported" --lit --up 0 0 1
   in_blender "the Blender extension is packed" tools/blender/make_extension.py "$target/tiface_import.zip"
   in_blender "Blender imports the run with it" $checks/check_addon.py "$scratch/demo"
