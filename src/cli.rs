@@ -276,7 +276,7 @@ pictures of meshes are written to CAPTURE_judged/ or to --out; no run is started
   tiface export scan.ply --up z --triangles 20000 --out scan.usdz
 
 It takes seconds, opens no photograph, writes nothing into the run and remembers nothing: the same command writes the same
-bytes, whatever was exported before. More triangles or a larger texture need `tiface mesh RUN --fresh mesh`.")]
+bytes, whatever was exported before. A larger texture needs `tiface mesh RUN --fresh mesh`.")]
     Export(ExportOptions),
     /// Render pictures of a run's mesh, or of any .glb, .gltf, .obj, .ply or .stl
     #[command(after_long_help = "Examples:
@@ -560,8 +560,10 @@ fn refuse_ignored(found: &ArgMatches) -> Result<()> {
 /// meant.
 fn suggest(error: Error) -> Error {
     let text = error.to_string();
-    let is_missing =
-        |word: &String| text.starts_with(&format!("`{word}`")) && !tiface_base::io::exists(Path::new(word));
+    let is_missing = |word: &String| {
+        let is_option = word.starts_with('-');
+        !is_option && text.starts_with(&format!("`{word}`")) && !tiface_base::io::exists(Path::new(word))
+    };
     let mut words = std::env::args_os().skip(1).filter_map(|word| word.into_string().ok());
     let missing = words.find(is_missing);
     match missing.and_then(|word| tiface_base::io::similar(Path::new(&word))) {

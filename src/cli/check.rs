@@ -173,7 +173,7 @@ pub(super) fn run(
         (Err(_), Some(fault)) => return Err(fault.clone()),
         (opened, _) => opened?,
     };
-    let OpenedMesh { head, bare_atlas, texture_problem: problem, notes } = opened;
+    let OpenedMesh { head, bare_atlas, texture_problem: problem, notes, .. } = opened;
     let (mesh, origin, unit_m) = (head.mesh, head.world_from_scene.translation, config.capture.unit_m);
     let mut report = check_around(&mesh, origin, unit_m);
     report.has_texture = Some(head.texture.is_some());

@@ -2,8 +2,8 @@
 
 use super::Invocation;
 use super::options::RunTarget;
-use super::out::{Out, require_outside, write_head};
-use super::preview::{AXES, axis};
+use super::out::{Out, require_outside, write_files};
+use super::preview::{AXES, axis, no_up};
 use super::screen::print;
 use crate::config::{Config, MeshFormat, Stage};
 use crate::pipeline::{Cut, ExportRequest, KeptHead, Material, MeshFrame, Size};
@@ -13,6 +13,7 @@ use glam::{DVec3, Vec3};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use tiface_base::{Error, Quiet, Result, io};
+use tiface_surface::files::ExportedFiles;
 
 /// Options of `tiface export`.
 #[derive(Args, Debug)]
@@ -42,10 +43,10 @@ pub(super) struct ExportOptions {
     /// the dataset's world, the coordinates of .ply
     #[arg(long, num_args = 3, value_names = ["A", "B", "METERS"], allow_hyphen_values = true)]
     measure: Vec<String>,
-    /// Up axis of a mesh file: x, -x, y, -y, z or -z
-    #[arg(long, value_name = "AXIS", allow_hyphen_values = true, default_value = "y")]
+    /// Up axis of a mesh file: x, -x, y, -y, z or -z [default: y]
+    #[arg(long, value_name = "AXIS", allow_hyphen_values = true)]
     #[arg(value_parser = PossibleValuesParser::new(AXES).map(|word| axis(&word)))]
-    up: Vec3,
+    up: Option<Vec3>,
     /// Unit of OBJ, which states none: m, cm or mm
     #[arg(long, value_name = "UNIT", default_value = "m")]
     #[arg(value_parser = PossibleValuesParser::new(["m", "cm", "mm"]).map(|word| meters(&word)))]
@@ -59,7 +60,8 @@ pub(super) struct ExportOptions {
     /// so on
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=12))]
     lod: u8,
-    /// Number of triangles at most, up to all of the extracted surface [default: as in the run]
+    /// Number of triangles at most, before a cut; up to all of the extracted surface [default: as
+    /// in the run]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(4..))]
     triangles: Option<u32>,
     /// Side of the texture, texels; 0 stores colors at the vertices [default: the run's]
@@ -180,8 +182,9 @@ impl ExportOptions {
     /// Returns the run or the file that is named, and its head.
     fn read(&self, invocation: &Invocation) -> Result<(PathBuf, KeptHead)> {
         if let Some(file) = self.path.as_deref().filter(|path| io::is_file(path)) {
-            return Ok((file.into(), KeptHead::open(file, self.up)?));
+            return Ok((file.into(), KeptHead::open(file, self.up.unwrap_or(Vec3::Y))?));
         }
+        no_up(self.up)?;
         let target = RunTarget::find(invocation.common, self.path.as_deref())?;
         let Some(saved) = &target.saved else {
             let what = format!("`{}` is not a run", self.path.as_deref().unwrap_or(&target.run).display());
@@ -214,7 +217,8 @@ impl ExportOptions {
     /// Returns the destinations with their formats: `--out`, files in its folder, or else files
     /// in the working directory with the name of the run or the mesh file.
     fn destinations(&self, out: Option<&Out>, source: &Path) -> Result<Vec<(PathBuf, MeshFormat)>> {
-        let formats = if self.format.is_empty() { &[MeshFormat::Glb][..] } else { &self.format };
+        let all = MeshFormat::ALL.into_iter().filter(|format| self.format.contains(format));
+        let formats = if self.format.is_empty() { vec![MeshFormat::Glb] } else { all.collect() };
         let named = |folder: &Path, stem: &str| {
             let file = |format: &MeshFormat| (folder.join(format!("{stem}.{}", format.as_str())), *format);
             formats.iter().map(file).collect()
@@ -257,7 +261,13 @@ pub(super) fn run(invocation: &Invocation, options: &ExportOptions) -> Result<()
     own.iter().try_for_each(|target| head.require_recorded(target.format))?;
     let warn = |warning: &str| screen.note("export: warning", warning);
     std::mem::take(&mut head.warnings).iter().for_each(|w| warn(w));
-    for Target { file, level, .. } in &targets {
+    let mut exports = Vec::new();
+    for Target { file, format, level } in &targets {
+        let stem = file.file_stem().and_then(|stem| stem.to_str()).unwrap_or("head");
+        let export = head.files(*level, *format, stem)?;
+        // what a format cannot represent is said once
+        export.warnings.iter().filter(|_| *level == 0).for_each(|w| warn(w));
+        require_free(file, &export, &source, &head)?;
         let (shown, triangles) = (file.display(), head.triangles(*level));
         match (common.dry_run, io::exists(file)) {
             (true, false) => screen.note("export", &format!("would write `{shown}`, {triangles} triangles")),
@@ -265,29 +275,50 @@ pub(super) fn run(invocation: &Invocation, options: &ExportOptions) -> Result<()
             (false, true) => screen.note("export", &format!("replaces `{shown}`")),
             (false, false) => {}
         }
+        exports.push((file, export));
     }
     if common.dry_run {
         return Ok(());
     }
     out.iter().try_for_each(Out::prepare)?;
     let mut written = Vec::new();
-    for Target { file, format, level } in &targets {
-        // what a format cannot represent is said once
-        let mut warn = |warning: &str| {
-            if *level == 0 {
-                warn(warning)
-            }
-        };
-        written.extend(write_head(file, |stem| head.files(*level, *format, stem), &mut warn)?);
+    for (file, export) in &exports {
+        written.extend(write_files(file, export)?);
     }
     tell(invocation, &source, &head, &written)
+}
+
+/// Refuses an export whose further files would replace some that the mesh needs, or that belong to
+/// something else: the picture of an OBJ is replaced with the OBJ alone.
+fn require_free(file: &Path, export: &ExportedFiles, source: &Path, head: &KeptHead) -> Result<()> {
+    let real = |path: &Path| io::real_path(path).unwrap_or_else(|_| path.into());
+    for (name, bytes) in export.files.iter().skip(1) {
+        let further = file.with_file_name(name);
+        // as an export that was killed has left it
+        if io::read_bytes(&further, &io::Limits::default()).is_ok_and(|found| found == *bytes) {
+            continue;
+        }
+        let is_read = head.beside.iter().any(|read| real(read) == real(&further));
+        if io::exists(&further) && (is_read || !io::exists(file)) {
+            let what = if is_read {
+                format!("belongs to `{}`", source.display())
+            } else {
+                "is there already".into()
+            };
+            let text = format!("`{}` {what}, and the export would replace it", further.display());
+            return Err(Error::usage(text, "choose another name or folder with `--out`"));
+        }
+    }
+    Ok(())
 }
 
 /// Prints what was written, how large it is on the disk and in the world, and of how many
 /// triangles.
 fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[PathBuf]) -> Result<()> {
-    let (triangles, of_layers) = (head.triangles(0), head.layer_triangles());
-    let ([width, height, depth], chin_to_crown) = (head.size_m()?, head.head_height_m());
+    let is_glb = |file: &PathBuf| file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("glb"));
+    let of_layers = if written.iter().any(is_glb) { head.layer_triangles() } else { 0 };
+    let triangles = head.triangles(0);
+    let ([x, y, z], chin_to_crown) = (head.size_m()?, head.head_height_m());
     let levels: Vec<(usize, [f64; 2])> = (1..)
         .zip(head.level_distances_m())
         .map(|(level, m)| (head.triangles(level), m.map(|m| 1e3 * m)))
@@ -296,13 +327,13 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
         let level = |(triangles, [largest, mean]): &(usize, [f64; 2])| json!({"triangles": triangles, "largest_mm": largest, "mean_mm": mean});
         let result = json!({
             "event": "result",
-            "run": source,
+            "source": source,
             "out": written,
             "bytes": written.iter().map(|file| io::file_size(file)).collect::<Vec<_>>(),
             "triangles": triangles,
             "layer_triangles": of_layers,
             "levels": levels.iter().map(level).collect::<Vec<_>>(),
-            "size_m": [width, height, depth],
+            "size_m": [x, y, z],
             "head_m": chin_to_crown,
         });
         return print(&format!("{result}\n"));
@@ -319,10 +350,10 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
     text += &format!("export    {triangles} triangles{layers}\n");
     for (triangles, [largest, mean]) in levels {
         text += &format!(
-            "export    {triangles} triangles, within {largest:.2} mm of these, {mean:.2} mm on average\n"
+            "export    {triangles} triangles, up to {largest:.2} mm from these, {mean:.2} mm on average\n"
         );
     }
-    text += &format!("export    {width:.3} m wide, {height:.3} m high, {depth:.3} m deep");
+    text += &format!("export    {x:.3} x {y:.3} x {z:.3} m");
     text += &chin_to_crown.map_or("\n".into(), |meters| format!("; {meters:.3} m from chin to crown\n"));
     print(&text)
 }

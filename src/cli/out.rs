@@ -106,8 +106,10 @@ impl Out {
         match self {
             Out::File(file, ending) if let Ok(format) = ending.parse() => {
                 let head = KeptHead::read(run.dir(), session.config())?;
-                head.warnings.iter().for_each(|warning| run.warn("mesh", warning));
-                write_head(file, |stem| head.files(0, format, stem), &mut |warning| run.warn("mesh", warning))
+                let stem = file.file_stem().and_then(|stem| stem.to_str()).unwrap_or("head");
+                let export = head.files(0, format, stem)?;
+                head.warnings.iter().chain(&export.warnings).for_each(|warning| run.warn("mesh", warning));
+                write_files(file, &export)
             }
             Out::File(file, ending) if ending == "json" => {
                 copy_file(&run.path("metrics/metrics.json"), file)?;
@@ -153,23 +155,16 @@ pub(super) fn require_outside(path: &Path, run: &Path) -> Result<()> {
     }
 }
 
-/// Writes a head to a file, and the files that it refers to beside it; returns their paths. `files`
-/// makes them with a base name. Warnings go to `warn`.
-pub(super) fn write_head(
-    file: &Path,
-    files: impl FnOnce(&str) -> Result<ExportedFiles>,
-    warn: &mut dyn FnMut(&str),
-) -> Result<Vec<PathBuf>> {
-    let stem = file.file_stem().and_then(|s| s.to_str()).unwrap_or("head");
-    let ExportedFiles { files, warnings } = files(stem)?;
-    warnings.iter().for_each(|w| warn(w));
+/// Writes an exported mesh to a file, and the files that it refers to beside it; returns their
+/// paths.
+pub(super) fn write_files(file: &Path, export: &ExportedFiles) -> Result<Vec<PathBuf>> {
     // the mesh refers to its pictures, so it is written last, under the requested name
     let mut written = vec![file.to_path_buf()];
-    for (name, bytes) in files.iter().skip(1).rev() {
+    for (name, bytes) in export.files.iter().skip(1).rev() {
         written.push(file.with_file_name(name));
         io::write_atomic(&written[written.len() - 1], bytes)?;
     }
-    io::write_atomic(file, &files[0].1)?;
+    io::write_atomic(file, &export.files[0].1)?;
     Ok(written)
 }
 

@@ -400,7 +400,7 @@ fn page(invocation: &Invocation, path: Option<&Path>, up: Option<Vec3>, out: Opt
 }
 
 /// Refuses an up axis for a run, which has its own.
-fn no_up(up: Option<Vec3>) -> Result<()> {
+pub(super) fn no_up(up: Option<Vec3>) -> Result<()> {
     match up {
         Some(_) => {
             Err(Error::usage("`--up` applies to mesh files; a run has its own up axis", "leave it out"))

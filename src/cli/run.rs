@@ -84,11 +84,10 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
     if common.dry_run {
         print(&plan_summary(&session, *until, common)?)?;
         if common.fresh == Some(Stage::Mesh) && session.differs_in_formats() {
-            let again = format!(
-                "`tiface export {}` writes the finished mesh with these settings",
-                run.dir().display()
-            );
-            screen.note("mesh", &format!("{again}, removes nothing and takes seconds"));
+            let (run, formats) = (run.dir().display(), session.formats());
+            let export =
+                format!("`tiface export {run} --format {formats}` writes these files beside the run");
+            screen.note("mesh", &format!("{export}, removes nothing and takes seconds"));
         }
         return session.require(*until, common.fresh).map(|_| ());
     }

@@ -18,9 +18,11 @@ use glam::{DVec3, Vec3};
 use std::path::{Path, PathBuf};
 use tiface_base::geom::{ShellLayer, Similarity};
 use tiface_base::{Error, Monitor, Result};
-use tiface_surface::files::{ExportedFiles, ExtractedSurface, HeadMesh, LOBE_TEXEL, open_mesh, weld};
+use tiface_surface::files::{
+    ExportedFiles, ExtractedSurface, HeadMesh, LOBE_TEXEL, OpenedMesh, open_mesh, weld,
+};
 use tiface_surface::{
-    AtlasConfig, DetailLevel, HeadMeasures, Plane, Resize, cut, lods, measure, most_levels, resized,
+    AtlasConfig, DetailLevel, HeadMeasures, Plane, Resize, Warning, cut, lods, measure, most_levels, resized,
 };
 
 /// What files show of a kept head, and how they are written.
@@ -130,6 +132,10 @@ pub struct KeptHead {
     /// Texels that repeat a chart's border around it.
     gutter_px: u32,
     export: Export,
+    /// Why the texture of a file is not there.
+    texture_problem: Option<String>,
+    /// Files beside a mesh file that were read.
+    pub beside: Vec<PathBuf>,
     /// Its smaller levels of detail.
     levels: Vec<DetailLevel>,
     /// Where its parts are before it is cut, in scene coordinates; `None` if its shape does not
@@ -164,16 +170,13 @@ impl KeptHead {
         let check = CameraCheck::read(&run.join(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
         check.iter().for_each(|check| check.apply(&mut capture));
         let export = Export::new(&capture, made);
-        let gutter_px = made.mesh.gutter_px;
-        Ok(KeptHead {
-            run: Some(run.into()),
-            head,
-            gutter_px,
-            export,
-            levels: Vec::new(),
-            measures: None,
-            warnings,
-        })
+        Ok(KeptHead { run: Some(run.into()), warnings, ..KeptHead::new(head, made.mesh.gutter_px, export) })
+    }
+
+    fn new(head: HeadMesh, gutter_px: u32, export: Export) -> KeptHead {
+        let (levels, beside, warnings) = (Vec::new(), Vec::new(), Vec::new());
+        let (run, texture_problem, measures) = (None, None, None);
+        KeptHead { run, head, gutter_px, export, texture_problem, beside, levels, measures, warnings }
     }
 
     /// Opens a mesh file. `up` is its up direction; its unit is the meter.
@@ -182,22 +185,17 @@ impl KeptHead {
     ///
     /// Fails if the surface cannot be read.
     pub fn open(file: &Path, up: Vec3) -> Result<KeptHead> {
-        let mut opened = open_mesh(file).map_err(advised)?;
+        let OpenedMesh { mut head, texture_problem, soft_layers, beside, notes: warnings, .. } =
+            open_mesh(file).map_err(advised)?;
         // files have a vertex for each side of a seam, along which a simpler mesh would open
-        opened.head.mesh = weld(&opened.head.mesh);
-        let warnings = opened.warnings();
+        head.mesh = weld(&head.mesh);
         let name = file.file_stem().map_or_else(|| "head".into(), |stem| stem.to_string_lossy().into_owned());
-        let gutter_px = AtlasConfig::default().gutter_px;
-        let export = Export::of_file(name, up);
-        Ok(KeptHead {
-            run: None,
-            head: opened.head,
-            gutter_px,
-            export,
-            levels: Vec::new(),
-            measures: None,
-            warnings,
-        })
+        let kept = KeptHead::new(head, AtlasConfig::default().gutter_px, Export::of_file(name, up));
+        let mut kept = KeptHead { texture_problem, beside, warnings, ..kept };
+        if soft_layers > 0 {
+            kept.warnings.push(format!("soft layers of `{}` are not read; a run has them", file.display()));
+        }
+        Ok(kept)
     }
 
     /// Returns the head as it is asked for.
@@ -210,13 +208,20 @@ impl KeptHead {
         for (option, what, shown_by) in asked.options() {
             self.warnings.extend(not_shown(option, what, shown_by, &asked.formats)?);
         }
-        let needs_face = [
-            (asked.frame == MeshFrame::Head, "--frame head"),
-            (matches!(asked.size, Size::Head(_)), "--height"),
-            (asked.cut != Cut::None, "--cut"),
-        ];
-        let needs_face = needs_face.into_iter().find_map(|(asked, option)| asked.then_some(option));
-        if let Some(option) = needs_face.filter(|_| self.run.is_none()) {
+        let without: Vec<String> = asked
+            .formats
+            .iter()
+            .filter(|format| **format != MeshFormat::Glb)
+            .map(|format| format!(".{}", format.as_str()))
+            .collect();
+        if asked.layers && self.head.shells.is_some() && !without.is_empty() {
+            self.warnings
+                .push(format!("soft layers are left out of {}; a .glb has them", without.join(", ")));
+        }
+        let by_face = [(matches!(asked.size, Size::Head(_)), "--height"), (asked.cut != Cut::None, "--cut")];
+        let by_face = by_face.into_iter().find_map(|(asked, option)| asked.then_some(option));
+        let framed = (asked.frame == MeshFrame::Head).then_some("--frame head");
+        if let Some(option) = by_face.or(framed).filter(|_| self.run.is_none()) {
             return Err(Error::usage(
                 format!(
                     "`{option}` needs to know where the face looks, and a file has no cameras that say it"
@@ -224,13 +229,26 @@ impl KeptHead {
                 "leave it out, or export from a run",
             ));
         }
-        self.measures = self.run.as_ref().and_then(|_| self.measures().ok());
+        if let Some(problem) = self.texture_problem.take().filter(|_| asked.texture_px != Some(0)) {
+            return Err(Error::cannot(problem, "mend it, or leave the texture out: `--texture 0`"));
+        }
+        let measures = self.run.is_some().then(|| self.measure());
+        if let Some(option) = by_face
+            && let Some(Err(e)) = &measures
+        {
+            let hint =
+                format!("leave `{option}` out; `--measure A B METERS` gives the size by a known distance");
+            return Err(Error::usage(format!("`{option}`: {e}"), hint));
+        }
+        self.measures = measures.and_then(Result::ok);
         self.export.unit_m = self.unit_m(asked.size)?;
         let plane = self.plane(asked.cut)?;
         self.leave_out(asked);
         self.resize(asked, monitor)?;
         if let Some(plane) = plane {
-            let (head, done) = cut(&self.head, &plane, self.gutter_px).map_err(advised)?;
+            let hint = "leave `--cut` out, or choose another; an open mesh is closed by `--fresh mesh --set mesh.cap=true`";
+            let (head, done) =
+                cut(&self.head, &plane, self.gutter_px).map_err(|e| advised(e).with_hint(hint))?;
             self.head = head;
             if done.dropped > 0 {
                 self.warnings.push(format!("{} smaller pieces above the cut are left out", done.dropped));
@@ -260,10 +278,8 @@ impl KeptHead {
         match size {
             Size::Dataset => Ok(self.export.unit_m),
             Size::Head(meters) => {
-                let height = self
-                    .measures()
-                    .map_err(|e| e.with_hint("give a known distance: `--measure A B METERS`"))?;
-                Ok(meters / (f64::from(height.height()) * self.head.world_from_scene.scale))
+                let height = self.measures.as_ref().map_or(f32::NAN, HeadMeasures::height);
+                Ok(meters / (f64::from(height) * self.head.world_from_scene.scale))
             }
             Size::Between([a, b], meters) => {
                 let distance = a.distance(b);
@@ -280,20 +296,23 @@ impl KeptHead {
     }
 
     /// Returns where the parts of the head are, in scene coordinates.
-    fn measures(&self) -> Result<HeadMeasures> {
+    fn measure(&self) -> Result<HeadMeasures> {
         let HeadMesh { mesh, world_from_scene, .. } = &self.head;
         let scene_from_world = world_from_scene.inverse();
         let front = self.export.front(center(mesh, world_from_scene)).unwrap_or(Vec3::ZERO);
         measure(mesh, scene_from_world.direction(self.export.up), scene_from_world.direction(front))
-            .map_err(advised)
     }
 
     /// Returns the plane at which the head is cut, in scene coordinates.
     fn plane(&self, cut: Cut) -> Result<Option<Plane>> {
+        let measures = self.measures.as_ref();
         match cut {
             Cut::None => Ok(None),
-            Cut::Chin => Ok(Some(self.measures()?.chin_plane())),
-            Cut::Collar => self.measures()?.collar_plane().map(Some).map_err(advised),
+            Cut::Chin => Ok(measures.map(HeadMeasures::chin_plane)),
+            Cut::Collar => measures
+                .map(HeadMeasures::collar_plane)
+                .transpose()
+                .map_err(|e| e.with_hint("leave `--cut` out, or use `--cut chin`")),
         }
     }
 
@@ -325,8 +344,8 @@ impl KeptHead {
         match written.iter().all(is_own) {
             true => Ok(()),
             false => Err(Error::usage(
-                format!("these settings write another `head.{}` than the run's", format.as_str()),
-                "choose a place beside the run with `--out`, or leave the settings out",
+                format!("these options write another `head.{}` than the run's", format.as_str()),
+                "choose a place beside the run with `--out`, or leave the options out",
             )),
         }
     }
@@ -346,7 +365,7 @@ impl KeptHead {
             .collect()
     }
 
-    /// Returns the number of triangles of its soft layers.
+    /// Returns the number of triangles of its soft layers, which a GLB alone has.
     pub fn layer_triangles(&self) -> usize {
         let HeadMesh { mesh, shells, .. } = &self.head;
         let count = |layer: &ShellLayer| mesh.triangles.iter().filter(|t| layer.has(t)).count();
@@ -451,7 +470,7 @@ impl KeptHead {
         let resize = Resize { triangles: triangles as usize, atlas: self.atlas_config(px) };
         let (head, done) = resized(&self.head, &surface, &resize, monitor).map_err(advised)?;
         self.head = head;
-        self.warnings.extend(done.warnings.iter().map(sentence));
+        self.warnings.extend(done.warnings.iter().map(as_options));
         Ok(())
     }
 
@@ -477,17 +496,24 @@ impl KeptHead {
                     "`--lod` is {levels}, but of {} triangles the last level would show no face",
                     self.triangles(0)
                 ),
-                format!("write {most} levels at most"),
+                if most == 1 { "leave `--lod` out".into() } else { format!("write {most} levels at most") },
             ));
         }
         let mut all = lods(&self.head, levels, &atlas, monitor).map_err(advised)?;
         self.levels = all.split_off(1);
         let reports = self.levels.iter().filter_map(|level| level.report.as_ref());
-        let mut said: Vec<String> = reports.flat_map(|report| report.warnings.iter().map(sentence)).collect();
+        let mut said: Vec<String> =
+            reports.flat_map(|report| report.warnings.iter().map(as_options)).collect();
         said.dedup();
         self.warnings.extend(said);
         Ok(())
     }
+}
+
+/// Returns a warning as a sentence that names the option of `tiface export` that helps.
+fn as_options(warning: &Warning) -> String {
+    let options = [(key!(mesh.triangles), "--triangles"), (key!(mesh.texture_px), "--texture")];
+    options.iter().fold(sentence(warning), |text, (key, option)| text.replace(key, option))
 }
 
 /// Returns a warning that names the formats which do not show what an option asks for. Fails if
@@ -517,47 +543,19 @@ fn not_shown(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::Capture;
-    use crate::config::Preset;
-    use glam::Vec3;
     use tiface_base::Quiet;
     use tiface_surface::bake::testing::ball;
     use tiface_surface::files::testing::tetrahedron;
     use tiface_surface::files::{read, weld};
 
-    /// A head as a file has it that was written with these settings.
-    fn kept(head: HeadMesh, change: impl Fn(&mut Config)) -> KeptHead {
-        let mut made = Config::preset(Preset::Draft);
-        change(&mut made);
-        let capture = Capture {
-            root: PathBuf::new(),
-            name: "ball".into(),
-            format: String::new(),
-            reasons: Vec::new(),
-            views: Vec::new(),
-            up: Vec3::Z,
-            focus: None,
-            unit_m: 1.0,
-            stray_masks: None,
-            warnings: Vec::new(),
-            readings: Vec::new(),
-        };
-        let export = Export::new(&capture, &made);
-        let gutter_px = made.mesh.gutter_px;
-        KeptHead {
-            run: None,
-            head,
-            gutter_px,
-            export,
-            levels: Vec::new(),
-            measures: None,
-            warnings: Vec::new(),
-        }
+    /// A head as a file has it, whose charts have such a gutter.
+    fn kept(head: HeadMesh, gutter_px: u32) -> KeptHead {
+        KeptHead::new(head, gutter_px, Export::of_file("ball".into(), Vec3::Z))
     }
 
     #[test]
     fn fewer_triangles_keep_layers_and_view_dependent_color() {
-        let head = kept(ball(), |c| (c.mesh.texture_px, c.mesh.lobes) = (512, 1));
+        let head = kept(ball(), 8);
         let before = head.head.clone();
         let asked = ExportRequest { triangles: Some(800), texture_px: Some(256), ..ExportRequest::default() };
         let after = head.changed(&asked, &Quiet).unwrap();
@@ -590,7 +588,7 @@ mod tests {
     #[test]
     fn a_smaller_texture_that_would_mix_charts_is_refused() {
         let change = |gutter_px: u32, px: u32| {
-            let head = kept(ball(), |c| (c.mesh.texture_px, c.mesh.gutter_px) = (512, gutter_px));
+            let head = kept(ball(), gutter_px);
             head.changed(&ExportRequest { texture_px: Some(px), ..ExportRequest::default() }, &Quiet)
         };
         // an eighth, which is one texel of a gutter of eight
@@ -606,7 +604,7 @@ mod tests {
 
     #[test]
     fn the_normal_map_keeps_the_material_lit_and_says_so() {
-        let head = || kept(tetrahedron(), |c| c.mesh.normal_map = true);
+        let head = || kept(tetrahedron(), 8);
         let unlit = ExportRequest { material: Some(Material::Unlit), ..ExportRequest::default() };
         let lit = head().changed(&unlit, &Quiet).unwrap();
         assert!(lit.warnings[0].contains("`--no-normal-map`"), "{:?}", lit.warnings);

@@ -9,9 +9,9 @@ use crate::run::{Run, read_record};
 use glam::Vec3;
 use serde_json::json;
 use tempfile::TempDir;
-use tiface_base::Result;
 use tiface_base::geom::{SdfField, Similarity};
 use tiface_base::io::{self, Limits};
+use tiface_base::{Quiet, Result};
 
 /// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little
 /// brighter seen from one side.
@@ -125,6 +125,20 @@ fn the_stages_after_learning_keep_the_exact_head_exact() {
     let bytes = |file: &str| io::read_bytes(&run.path(file), &Limits::default()).unwrap();
     assert_eq!(bytes("ensemble/012.png"), bytes("render/raycast/012.png"));
     assert_eq!(metrics.summary["ensemble"]["head"], metrics.summary["raycast"]["head"]);
+
+    // a file of it, cut below the chin, has the height that is asked for from chin to crown
+    let asked = ExportRequest {
+        size: Size::Head(0.24),
+        cut: Cut::Chin,
+        texture_px: Some(0),
+        ..ExportRequest::default()
+    };
+    let kept = KeptHead::read(run.dir(), &config).unwrap().changed(&asked, &Quiet).unwrap();
+    let height = f64::from(kept.size_m().unwrap()[1]);
+    assert!((kept.head_height_m().unwrap() - 0.24).abs() < 1e-6);
+    // a little is left below the chin, and less at the nape
+    assert!((0.24..0.26).contains(&height), "{height}");
+    assert!(kept.triangles(0) < 5000 && kept.triangles(0) > 2500, "{}", kept.triangles(0));
 
     // all of it again: nothing is loaded, nothing is done
     for stage in [Stage::Mask, Stage::Mesh, Stage::Render, Stage::Ensemble, Stage::Metrics] {

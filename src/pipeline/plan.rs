@@ -138,6 +138,11 @@ impl Session<'_> {
         Ok(format!("{} file{plural}, {:.1} MB", files.len(), files.values().sum::<u64>() as f64 / 1e6))
     }
 
+    /// Returns the configured formats of the mesh, in the syntax of `--format`.
+    pub fn formats(&self) -> String {
+        self.config.mesh.format.iter().map(|format| format.as_str()).collect::<Vec<_>>().join(",")
+    }
+
     /// Returns whether the finished mesh differs from the settings only in the formats of its
     /// files.
     pub fn differs_in_formats(&self) -> bool {
@@ -192,7 +197,8 @@ impl Session<'_> {
                 true => {
                     let run = self.run.dir().display();
                     let hint = format!(
-                        "`tiface export {run}` writes the finished mesh with such settings, and keeps the run; or {}",
+                        "`tiface export {run} --format {}` writes these files beside the run, and keeps it; or {}",
+                        self.formats(),
                         e.hint()
                     );
                     e.with_hint(hint)

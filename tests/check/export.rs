@@ -139,10 +139,13 @@ fn a_file_has_the_material_frame_size_and_picture_that_are_asked_for() {
     assert!((obj.size() / new.size() - 100.0).abs().max_element() < 0.01, "{} {}", obj.size(), new.size());
     // the stage's formats alone can be changed, which needs no stage
     let other = tiface(dir.path(), &["mesh", "runs/head", "--format", "obj"]);
-    assert!(other.status.code() == Some(1) && said(&other).contains("`tiface export runs/head` writes"));
+    assert!(
+        other.status.code() == Some(1)
+            && said(&other).contains("`tiface export runs/head --format obj` writes")
+    );
     let plan = worked(dir.path(), &["mesh", "runs/head", "--fresh", "mesh", "--format", "obj", "--dry-run"]);
     assert!(plan.contains("mesh     to do again: removes "), "{plan}");
-    assert!(plan.contains("`tiface export runs/head` writes the finished mesh"), "{plan}");
+    assert!(plan.contains("`tiface export runs/head --format obj` writes these files"), "{plan}");
     assert!(before == files(&run));
 }
 
@@ -246,7 +249,30 @@ fn a_mesh_file_goes_to_the_other_formats_and_sizes() {
         assert_eq!(output.status.code(), Some(code), "{words:?}: {}", said(&output));
         assert!(said(&output).contains(text), "{words:?}: {}", said(&output));
     }
+    // a picture that the mesh needs, or that belongs to something else, is not replaced
+    std::fs::rename(dir.path().join("head.obj"), dir.path().join("scan.obj")).unwrap();
+    for source in ["scan.obj", "head.glb"] {
+        let words = ["export", source, "--texture", "64", "--out", "head.obj"];
+        let output = tiface(dir.path(), &words);
+        assert_eq!(output.status.code(), Some(2), "{words:?}: {}", said(&output));
+        assert!(
+            said(&output).contains("head.mtl` ") || said(&output).contains("head.png` "),
+            "{}",
+            said(&output)
+        );
+    }
+    std::fs::rename(dir.path().join("scan.obj"), dir.path().join("head.obj")).unwrap();
+    let refused = tiface(dir.path(), &["export", run.to_str().unwrap(), "--up", "z", "--out", "a.glb"]);
+    assert!(refused.status.code() == Some(2) && said(&refused).contains("a run has its own up axis"));
     assert!(before.iter().all(|(file, bytes)| std::fs::read(file).unwrap() == *bytes));
+    // a texture that is gone is not left out in silence
+    std::fs::remove_file(dir.path().join("head.png")).unwrap();
+    let refused = tiface(dir.path(), &["export", "head.obj", "--out", "bare.glb"]);
+    assert!(
+        refused.status.code() == Some(1) && said(&refused).contains("`--texture 0`"),
+        "{}",
+        said(&refused)
+    );
 }
 
 #[test]

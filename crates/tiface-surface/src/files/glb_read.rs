@@ -312,6 +312,7 @@ impl<'a> GlbReader<'a> {
         let source = self.source;
         let material = primitive.material.and_then(|m| self.root.materials.get(m as usize));
         if material.is_some_and(|m| m.is_soft_layer()) {
+            self.out.soft_layers += 1;
             return Ok(());
         }
         let part = GlbPart { at, primitive, first: self.out.places.len(), linear: DMat3::from_mat4(matrix) };

@@ -30,6 +30,10 @@ pub struct OpenedMesh {
     pub bare_atlas: Option<Atlas>,
     /// Why the texture that the file names is not shown.
     pub texture_problem: Option<String>,
+    /// Number of soft layers around the surface, which are not read.
+    pub soft_layers: usize,
+    /// Files beside it that were read: libraries of materials, and pictures.
+    pub beside: Vec<PathBuf>,
     /// Values that were read otherwise than they are written, or left out.
     pub notes: Vec<String>,
 }
@@ -68,7 +72,7 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
         texture_problem = Some(with_way(&e));
         None
     });
-    let ReadMesh { mesh, origin, atlas, lobes, tint, mut notes, .. } = found;
+    let ReadMesh { mesh, origin, atlas, lobes, tint, soft_layers, beside, mut notes, .. } = found;
     if let (Some(photo), Some(tint)) = (&mut photo, tint) {
         multiply(photo, tint);
     }
@@ -93,7 +97,7 @@ pub fn open_mesh(path: &Path) -> Result<OpenedMesh> {
     }
     let world_from_scene = Similarity { translation: origin, ..Similarity::IDENTITY };
     let head = HeadMesh { mesh, world_from_scene, texture, harmonics: None, shells: None };
-    Ok(OpenedMesh { head, bare_atlas, texture_problem, notes })
+    Ok(OpenedMesh { head, bare_atlas, texture_problem, soft_layers, beside, notes })
 }
 
 /// Opens the lobes of a texture, whose directions are those of the file's axes.
@@ -187,6 +191,7 @@ fn libraries(found: &mut ReadMesh, folder: &Path, path: &Path, lines: &[String])
         note.into_iter().for_each(|note| found.note(note));
         if libraries.iter().all(|known| known.file != file) {
             let materials = materials_of_mtl(&io::read_maybe_empty(&file, &limits)?, &file)?;
+            found.beside.push(file.clone());
             libraries.push(Library { file, materials });
         }
     }
@@ -209,7 +214,10 @@ fn open_beside(found: &mut ReadMesh, folders: &[&Path], by: &Path, name: &str) -
     let beside = beside::find(folders, by, name)?;
     beside.note.into_iter().for_each(|note| found.note(note));
     let error = match io::read_photo(&beside.file, None, &Limits::default()) {
-        Ok(photo) => return Ok(Some(photo)),
+        Ok(photo) => {
+            found.beside.push(beside.file);
+            return Ok(Some(photo));
+        }
         Err(e) => Error::from(e),
     };
     // a picture of a format that is not read, perhaps with what it was converted to

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 use std::fmt::Display;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use tiface_base::geom::{Atlas, Mesh};
 use tiface_base::{Error, Result};
 
@@ -139,6 +139,10 @@ pub struct ReadMesh {
     pub tint: Option<[f32; 3]>,
     /// The names of the materials that an OBJ uses, each with the triangle where it begins.
     pub materials: Vec<(u32, String)>,
+    /// Number of soft layers around the surface, which are not read.
+    pub soft_layers: usize,
+    /// Files beside it that were read.
+    pub beside: Vec<PathBuf>,
     /// Values that were read otherwise than they are written, or left out; one sentence each.
     pub notes: Vec<String>,
     /// The positions in the file's coordinates while the file is read; then they move to `mesh`.
