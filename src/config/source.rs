@@ -75,17 +75,20 @@ fn not_toml(place: &str, problem: &str) -> Error {
     Error::usage(problem, "write `table.key = value`; words in double quotes").within(place)
 }
 
-/// Keys that have become options of `tiface export`.
+/// Keys of the mesh that have become options of `tiface export`.
 const EXPORT_OPTIONS: [(&str, &str); 4] = [
-    ("mesh.material", "--material"),
-    ("mesh.frame", "--frame"),
-    ("mesh.height_m", "--height"),
-    ("mesh.texture_format", "--jpeg"),
+    ("material", "--material"),
+    ("frame", "--frame"),
+    ("height_m", "--height"),
+    ("texture_format", "--jpeg"),
 ];
 
 /// Returns the error for an unknown key, which suggests the most similar known one.
 pub(super) fn unknown(key: &str) -> Error {
-    if let Some((_, option)) = EXPORT_OPTIONS.iter().find(|(old, _)| *old == key) {
+    let of_mesh = key.split_once('.').filter(|(table, _)| *table == "mesh");
+    if let Some((_, option)) =
+        of_mesh.and_then(|(_, name)| EXPORT_OPTIONS.iter().find(|(old, _)| *old == name))
+    {
         let hint = format!("leave it out: it is the option `{option}` of `tiface export`");
         return Error::usage(format!("there is no key `{key}`"), hint);
     }
