@@ -66,10 +66,10 @@ fn an_unknown_key_names_its_line_and_the_nearest_known_one() {
     assert!(e.hint().contains("`iface.steps`"), "{}", e.hint());
     let e = from("", &["resolution=9"]).unwrap_err();
     assert_eq!(e.to_string(), "`--set resolution=9`: there is no key `resolution`");
+    assert!(e.hint().contains("`mesh.resolution`"));
     // one that is an option now
     let e = from("[mesh]\nmaterial = \"lit\"\n", &[]).unwrap_err();
     assert!(e.hint().contains("`--material` of `tiface export`"), "{}", e.hint());
-    assert!(e.hint().contains("`mesh.resolution`"));
     assert!(from("[iface.steps]\nx = 1", &[]).unwrap_err().to_string().contains("iface.steps.x"));
     assert!(from("[nonsense]", &[]).unwrap_err().to_string().contains("nonsense"));
     assert!(from("\"iface.steps\" = 3", &[]).is_err());
