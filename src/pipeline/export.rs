@@ -433,8 +433,10 @@ impl KeptHead {
         if px > 0 && px < kept_px {
             self.warnings.extend(not_shown("--texture", "texture", TEXTURED, &asked.formats)?);
         }
-        if let Some(triangles) = asked.triangles.filter(|n| *n as usize != kept) {
-            return self.simplify(triangles, px, monitor);
+        if let Some(triangles) = asked.triangles.filter(|n| *n as usize != kept)
+            && self.simplify(triangles as usize, px, monitor)?
+        {
+            return Ok(());
         }
         let gutter_px = self.gutter_px;
         match self.head.texture.take() {
@@ -455,23 +457,25 @@ impl KeptHead {
     }
 
     /// Simplifies the surface that the run keeps, or the mesh of a file, and carries what the head
-    /// shows over to a new atlas of `px` texels.
-    fn simplify(&mut self, triangles: u32, px: u32, monitor: &dyn Monitor) -> Result<()> {
+    /// shows over to a new atlas of `px` texels. Returns false where the head has as many triangles
+    /// as the surface allows.
+    fn simplify(&mut self, triangles: usize, px: u32, monitor: &dyn Monitor) -> Result<bool> {
         let surface = match &self.run {
             Some(run) => ExtractedSurface::load(&run.join(Stage::Mesh).join("parts")).map_err(advised)?.mesh,
             None => self.head.mesh.clone(),
         };
         let most = surface.triangles.len();
-        if triangles as usize > most {
-            let kept = format!("a surface of {most} triangles");
-            let settings = format!("{}=N", key!(mesh.resolution));
-            return Err(self.more("--triangles", triangles, &kept, &settings));
+        if triangles > most {
+            self.warnings.push(format!("the surface has {most} triangles, which are all written"));
         }
-        let resize = Resize { triangles: triangles as usize, atlas: self.atlas_config(px) };
+        if triangles.min(most) == self.triangles(0) {
+            return Ok(false);
+        }
+        let resize = Resize { triangles: triangles.min(most), atlas: self.atlas_config(px) };
         let (head, done) = resized(&self.head, &surface, &resize, monitor).map_err(advised)?;
         self.head = head;
         self.warnings.extend(done.warnings.iter().map(as_options));
-        Ok(())
+        Ok(true)
     }
 
     /// Returns the options of an atlas whose texture has `px` texels on a side; `None` without.
