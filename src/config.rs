@@ -29,10 +29,7 @@ pub use affects::{Effect, Product};
 pub use device::DeviceChoice;
 pub use explain::{Explained, explain, explained};
 pub use iface::IfaceConfig;
-pub use mask::{
-    CameraPoses, CaptureConfig, CutMethod, Exposures, HeadValue, MaskConfig, MaskHead, MaskMeaning,
-    MaskSource, MattingMethod, VitmatteColors,
-};
+pub use mask::{CaptureConfig, CutMethod, MaskConfig, MattingMethod, VitmatteColors};
 pub use mesh::{ColorSource, Genus, Hair, MeshConfig, MeshFormat};
 pub use preset::Preset;
 pub use render::{
@@ -42,6 +39,7 @@ pub use render::{
 pub use row::{Flag, Key, Takes};
 pub use source::{Fallback, Sources, known_words};
 pub use stage::Stage;
+pub use tiface_capture::{CameraPoses, Exposures, HeadValue, MaskHead, MaskMeaning, MaskSource};
 pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
 use affects::affects;

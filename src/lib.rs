@@ -45,22 +45,22 @@
 //! [ARCHITECTURE.md](../../../ARCHITECTURE.md) shows components, data flow, coordinate frames and
 //! tensor layouts on one page.
 
-pub use tiface_base::{Error, ErrorKind, Monitor, Quiet, Result, error, geom, image, io, math, monitor};
+pub use tiface_base::{
+    Error, ErrorKind, Fingerprint, Monitor, Quiet, Result, error, geom, image, io, math, monitor,
+};
+pub use tiface_capture::{self as capture, rig};
 pub use tiface_kernels as kernel;
 pub use tiface_surface::{self as mesh, render};
 
 pub mod config;
 pub mod run;
 
-pub mod capture;
 pub mod field;
 #[cfg_attr(not(feature = "matting"), path = "onnx/absent.rs")]
 mod onnx;
 pub mod report;
 
 pub mod mask;
-
-pub mod rig;
 
 pub mod tface;
 

@@ -225,7 +225,7 @@ fn no_input_makes_a_reader_panic_hang_or_fill_the_memory() {
         let dir = tempfile::tempdir_in(&scratch).unwrap();
         prepare(dir.path());
         let mut found = |what: String, input: &[u8]| {
-            let digest = tiface::run::Fingerprint::of_bytes(input);
+            let digest = tiface::Fingerprint::of_bytes(input);
             let file = root.join(name).join(format!("found-{}", &digest[..12]));
             std::fs::write(&file, input).unwrap();
             findings.push(format!("{name}: {what}: {}", file.display()));

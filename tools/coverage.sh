@@ -21,6 +21,6 @@ tests=$(cargo test --release --features matting,wgpu --test fuzz --no-run --mess
 LLVM_PROFILE_FILE=$scratch/%p.profraw "$tests" --nocapture
 "$bin/llvm-profdata" merge -sparse "$scratch"/*.profraw -o "$scratch/fuzz.profdata"
 "$bin/llvm-cov" report "$tests" --instr-profile "$scratch/fuzz.profdata" \
-  crates/tiface-base/src/io src/capture crates/tiface-surface/src/files src/mask/prompts.rs src/field/checkpoint.rs \
+  crates/tiface-base/src/io crates/tiface-capture/src crates/tiface-surface/src/files src/mask/prompts.rs src/field/checkpoint.rs \
   src/config src/config.rs |
   awk '/^Filename|TOTAL|\.rs/ { printf "%-44s %9s lines %9s reached\n", $1, $8, $10 }'

@@ -225,6 +225,7 @@ lint() {
   step "no features" cargo clippy --release --workspace --lib --bins -- -D warnings
   # alone, without what other packages turn on
   step "tiface-surface alone" cargo check --release -p tiface-surface
+  step "tiface-capture alone" cargo check --release -p tiface-capture
   step "documentation" env RUSTDOCFLAGS="-D warnings" cargo doc --release --workspace --features matting,wgpu --no-deps
   step "figures of the documents" "${PYTHON:-python3}" tools/reference/figures.py check
 }
@@ -233,7 +234,7 @@ lint() {
 unit_tests() {
   local program programs ended=0
   programs=$(executables src/lib.rs)
-  [ "$(wc -w <<< "$programs")" = 4 ] || { echo "the tests of four packages were not built"; return 1; }
+  [ "$(wc -w <<< "$programs")" = 5 ] || { echo "the tests of five packages were not built"; return 1; }
   for program in $programs; do
     tests "$(basename "$program")" "$program" "$@" || ended=1
   done

@@ -2,11 +2,11 @@
 
 use super::Invocation;
 use super::screen::print;
-use crate::capture::sfm::{Search, SfmOptions, default_folder};
 use crate::pipeline::capture_options;
 use clap::Args;
 use std::path::PathBuf;
 use tiface_base::{Error, Result};
+use tiface_capture::sfm::{Search, SfmOptions, default_folder};
 
 /// Options of `cameras`.
 #[derive(Args, Debug)]

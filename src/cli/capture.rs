@@ -5,15 +5,16 @@ use super::Invocation;
 use super::options::Common;
 use super::out::Out;
 use super::screen::{one_line, print};
-use crate::capture;
-use crate::capture::convert::CameraFormat;
 use crate::config::{CameraPoses, Config};
 use crate::pipeline::{self, capture_options, click_page, inspect_capture, open_capture};
+use crate::run::is_run;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use tiface_base::error::counted;
 use tiface_base::io::Limits;
 use tiface_base::{Error, ErrorKind, Result, io};
+use tiface_capture as capture;
+use tiface_capture::convert::CameraFormat;
 
 pub(super) fn inspect(common: &Common, capture: &Path) -> Result<()> {
     let (config, root) = capture_of(common, capture)?;
@@ -56,7 +57,7 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
 /// Returns the settings for a capture and its folder; a run's configuration has its capture and the
 /// size of its photographs.
 fn capture_of(common: &Common, path: &Path) -> Result<(Config, PathBuf)> {
-    let saved = capture::is_run(path).then(|| path.join("config.toml"));
+    let saved = is_run(path).then(|| path.join("config.toml"));
     let config = common.resolve(saved.as_deref(), None, &[])?;
     let known = &config.capture.path;
     let root = if saved.is_some() && !known.as_os_str().is_empty() { known.clone() } else { path.into() };
@@ -86,7 +87,7 @@ pub(super) fn judge(
     let out = out.unwrap_or_else(|| Out::Folder(format!("{}_judged", capture.name).into()));
     let page = out.file("report.html");
     let folder = page.parent().unwrap_or(Path::new("."));
-    if capture::is_run(folder) || capture::has_cameras(folder) {
+    if is_run(folder) || capture::has_cameras(folder) {
         let problem =
             format!("`--out {}` is a run or a capture, whose files it would replace", folder.display());
         return Err(Error::usage(problem, "name a folder of its own, with `/` at its end"));

@@ -2,12 +2,11 @@
 
 use super::options::Common;
 use super::screen::{one_line, print};
-use crate::capture::{self, CaptureOptions, Split, View};
 use crate::config::Stage;
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
 use crate::pipeline::open_capture;
-use crate::run::{Fault, ProductState, read_record};
+use crate::run::{Fault, ProductState, is_run, read_record};
 use glam::DVec3;
 use serde::Serialize;
 use std::fmt::{self, Display};
@@ -16,6 +15,7 @@ use std::path::{Path, PathBuf};
 use tiface_base::geom::{Bvh, Camera, Mesh};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, ErrorKind, Result};
+use tiface_capture::{CaptureOptions, Split, View};
 use tiface_surface::files::{
     CheckReport, OpenedMesh, ReadMesh, check_around, open_mesh, open_surface, uv_check, weld,
 };
@@ -120,14 +120,14 @@ struct CheckJson<'a> {
 /// dataset's world, if it is compared with another, and else the exported head; and the error if it
 /// is not the one that the run recorded.
 fn mesh_of(path: &Path, is_compared: bool) -> Result<(PathBuf, Option<Error>)> {
-    if !capture::is_run(path) && io::is_folder(path) {
+    if !is_run(path) && io::is_folder(path) {
         let text = format!("`{}` is a folder, but not that of a run", path.display());
         return Err(Error::cannot(
             text,
             "name a .glb, .gltf, .obj, .ply or .stl file, or the folder of a run",
         ));
     }
-    if !capture::is_run(path) {
+    if !is_run(path) {
         return Ok((path.into(), None));
     }
     let folder = path.join(Stage::Mesh);

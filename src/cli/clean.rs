@@ -3,9 +3,9 @@
 use super::Invocation;
 use super::screen::print;
 use super::status::run_name;
-use crate::capture::is_run;
 use crate::config::Config;
 use crate::pipeline::{cost_of_removal, remove_surplus, stage_folders, surplus};
+use crate::run::is_run;
 use crate::run::{Run, Surplus, SurplusKind};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};

@@ -4,7 +4,6 @@ use super::Invocation;
 use super::options::RunTarget;
 use super::out::Out;
 use super::run::{StageCommand, run as run_stages};
-use crate::capture::synthetic::{MadeCapture, SyntheticOptions, check, write_borders, write_capture};
 use crate::config::{Fallback, Preset};
 use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
 use crate::report::duration;
@@ -12,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use tiface_base::io;
 use tiface_base::{Error, Result};
+use tiface_capture::synthetic::{MadeCapture, SyntheticOptions, check, write_borders, write_capture};
 
 /// Settings of the demo: few steps, because its pictures are small.
 pub(super) const DEMO: Fallback = (Preset::Draft, |config| {

@@ -6,8 +6,6 @@ use super::options::Common;
 use super::out::Out;
 use super::run::in_words;
 use super::screen::{Screen, print};
-use crate::capture::is_run;
-use crate::capture::synthetic::SyntheticOptions;
 use crate::config::{Config, key};
 use crate::pipeline::Session;
 use crate::pipeline::experiment::{
@@ -15,6 +13,7 @@ use crate::pipeline::experiment::{
 };
 use crate::report::duration;
 use crate::report::experiment::{Experiment, ExperimentRow, Measured, Published, read_published};
+use crate::run::is_run;
 use crate::run::{Cost, Run};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
@@ -22,6 +21,7 @@ use serde_json::json;
 use std::path::{Path, PathBuf};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
+use tiface_capture::synthetic::SyntheticOptions;
 
 /// Options of `tiface experiment`.
 #[derive(Args, Debug)]

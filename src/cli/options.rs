@@ -2,8 +2,8 @@
 //! of a command.
 
 use super::complete::complete_setting;
-use crate::capture::is_run;
 use crate::config::{Config, Fallback, Preset, Sources, Stage, key};
+use crate::run::is_run;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ColorChoice};
 use clap_complete::ArgValueCompleter;

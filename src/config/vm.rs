@@ -298,7 +298,50 @@ impl BaselineConfig {
 mod tests {
     use super::*;
     use crate::config::{Config, Preset};
-    use tiface_kernels::cpu::vm::{DecoderShape, Grid, size_for, voxel_schedule};
+    use glam::DVec3;
+    use tiface_base::geom::{Aabb, Similarity};
+    use tiface_capture::scene::{Scene, SceneBox, in_box};
+    use tiface_kernels::cpu::vm::{DecoderShape, Grid, samples_across, size_for, step_size, voxel_schedule};
+
+    /// Returns the scene of `capture.box = "ilsh"` for a head around a point on the diagonal,
+    /// dataset units, and its bounds.
+    fn in_published_box(center: f64, half: f64) -> (Scene, [[f32; 3]; 2]) {
+        let scene_from_world = Similarity::scale_translate(1.0 / half, DVec3::splat(-center / half));
+        let found = Scene { scene_from_world, aabb: Aabb::SCENE, hull: None };
+        let (scene, _) = in_box(|| Ok((found, Vec::new())), SceneBox::Ilsh).unwrap();
+        let bounds = [scene.aabb.min.to_array(), scene.aabb.max.to_array()];
+        (scene, bounds)
+    }
+
+    #[test]
+    fn the_published_box_has_the_published_optics_and_grid() {
+        let (scene, bounds) = in_published_box(0.02, 0.3);
+        // T-Face's own numbers: 25 per unit, entry between 3.5 and 7, 141 × 157 × 94 vertices, 459
+        // samples
+        let c = VmConfig::preset(Preset::Paper).placed(bounds);
+        assert!((c.distance_scale - 25.0).abs() < 1e-5 && (c.alpha_unit - 1.0).abs() < 1e-6, "{c:?}");
+        assert_eq!((c.near, c.far), (3.5, 7.0));
+        // 83.3 per dataset unit
+        assert!((c.distance_scale * scene.scene_from_world.scale - 83.333).abs() < 1e-2);
+        let extent = scene.aabb.size().to_array();
+        let size = size_for(extent, c.voxels_start);
+        assert_eq!(size, [141, 157, 94]);
+        let step = step_size(extent, size, c.step_ratio as f32);
+        assert_eq!(samples_across(extent, step), 459);
+    }
+
+    #[test]
+    fn another_box_has_the_same_optics_for_its_size_and_no_near_nor_far() {
+        let (_, bounds) = in_published_box(3.0, 0.3);
+        let c = VmConfig::preset(Preset::Paper).placed(bounds);
+        // 25 · 1.67 / 1: as thick across the box as in the published one
+        assert!((c.distance_scale - 41.75).abs() < 1e-9 && c.near == 0.0, "{c:?}");
+        // alpha of a step: 1 − exp(−σ step), the step in units of 1 / 1.67
+        assert!((c.alpha_unit * 1.67 - 1.0).abs() < 1e-9);
+        // and the others' constants are of the scene, whatever the box
+        let c = VmConfig::preset(Preset::Draft).placed(bounds);
+        assert_eq!((c.distance_scale, c.alpha_unit, c.near, c.far), (100.0, 1.0, 0.0, 1e6));
+    }
 
     /// What follows from the published settings in the published box.
     #[test]

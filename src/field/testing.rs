@@ -2,12 +2,12 @@
 
 use super::checkpoint::newest;
 use super::training::TrainingSession;
-use crate::capture::synthetic::shared::Files;
 use std::path::Path;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use tiface_base::io::{Limits, TensorValues, Tensors, read_tensors, write_tensors};
 use tiface_base::{Monitor, Quiet, Result};
+use tiface_capture::testing::Files;
 
 pub fn temporary() -> tempfile::TempDir {
     tempfile::tempdir().expect("a temporary folder")

@@ -2,7 +2,6 @@
 
 use super::super::stereo::SurfacePoint;
 use super::*;
-use crate::capture::synthetic::shared::Files;
 use crate::config::Preset;
 use crate::field::ball::{BALL, hull, textured_views, views};
 use crate::field::checkpoint::{self, Checkpoint};
@@ -14,6 +13,7 @@ use std::path::Path;
 use std::sync::OnceLock;
 use tiface_base::geom::SdfField;
 use tiface_base::{Monitor, Quiet};
+use tiface_capture::testing::Files;
 
 fn config() -> IfaceConfig {
     IfaceConfig {

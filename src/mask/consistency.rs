@@ -16,12 +16,12 @@ pub use proposals::{MaskVerdict, verdicts};
 
 use super::distance::squared_distance;
 use super::hull::{self, ViewFrame};
-use crate::capture::carve::Cube;
 use glam::{DVec3, Vec2};
 use rayon::prelude::*;
 use tiface_base::Result;
 use tiface_base::geom::Camera;
 use tiface_base::image::{Gray, resize_hard};
+use tiface_capture::carve::Cube;
 
 /// Rows that masks are reduced to.
 const ROWS: u32 = 160;

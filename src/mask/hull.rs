@@ -5,12 +5,12 @@
 //! beside, and not at all outside its frame. A set of cells is drawn back into any view by its
 //! surface.
 
-use crate::capture::carve::{Cube, Projector, around, meeting_point};
 use glam::DVec3;
 use rayon::prelude::*;
 use tiface_base::geom::Camera;
 use tiface_base::image::Gray;
 use tiface_base::{Error, Result};
+use tiface_capture::carve::{Cube, Projector, around, meeting_point};
 
 /// The frame of a picture: which of its pixels shows a point.
 pub(super) struct ViewFrame {

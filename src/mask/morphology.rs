@@ -1,7 +1,7 @@
 //! Connected pieces of binary pictures: keeping some, filling holes, smoothing with a 3 × 3 square.
 
-use crate::capture::carve::{self, Pieces};
 use tiface_base::image::{Gray, dilated};
+use tiface_capture::carve::{self, Pieces};
 
 /// Connected pieces, over edges only (`corners` false) or over corners too.
 fn pieces(marked: &[bool], width: usize, height: usize, corners: bool) -> Pieces {

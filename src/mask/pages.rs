@@ -13,7 +13,6 @@
 
 use super::matting::{UNKNOWN, unknown_share};
 use super::prompts::{Prompts, file_path};
-use crate::capture::{Capture, View, coverage, findings};
 use crate::report::{base64, escape};
 use minijinja::{Environment, context};
 use rayon::prelude::*;
@@ -23,6 +22,7 @@ use std::path::Path;
 use tiface_base::image::{Gray, Photo, reduce_photo, resize_gray, resize_hard, working_size};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, ErrorKind, Result};
+use tiface_capture::{Capture, View, coverage, findings};
 
 const TEMPLATE: &str = include_str!("annotation.html");
 

@@ -12,7 +12,6 @@
 //! checked.
 
 use super::clicks::Click;
-use crate::capture::{Capture, View};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 use serde_json::{Number, Value, json};
@@ -20,6 +19,7 @@ use std::collections::BTreeMap;
 use std::path::{Component, Path};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
+use tiface_capture::{Capture, View};
 
 /// Value of `convention` that the writer uses.
 const CONVENTION: &str =
@@ -525,7 +525,7 @@ mod tests {
             }
             let prompts = read_prompts(&folder.join("prompts.json"), &Limits::default()).unwrap();
             assert_eq!(prompts.frames.len(), 3);
-            let capture = crate::capture::open(&folder, &Default::default()).unwrap();
+            let capture = tiface_capture::open(&folder, &Default::default()).unwrap();
             let clicks = prompts.clicks("prompts.json", &capture).unwrap();
             let clicked = |v: &&Vec<Click>| v.len() == 6 && v.iter().filter(|c| c.head).count() == 3;
             assert_eq!(clicks.iter().filter(clicked).count(), 3, "{name}");

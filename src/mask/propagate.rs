@@ -19,13 +19,13 @@ use super::grabcut::mixture::Rgb;
 use super::grabcut::{self, Grabcut, Models, Seed};
 use super::hull::{self, Voter};
 use super::morphology::gray;
-use crate::capture::carve::{Cube, drop_dust};
-use crate::capture::findings;
 use glam::DVec3;
 use rayon::prelude::*;
 use tiface_base::geom::Camera;
 use tiface_base::image::{Gray, Photo, grow, reduce_to_rows, shrink, size_at_rows};
 use tiface_base::{Error, Result};
+use tiface_capture::carve::{Cube, drop_dust};
+use tiface_capture::findings;
 
 /// Cells along each side of the carved cube.
 const CELLS: usize = 112;

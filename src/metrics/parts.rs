@@ -15,9 +15,9 @@ mod tones;
 pub use tones::Tones;
 
 use super::{picture, rounded};
-use crate::capture::LoadedView;
 use serde::Serialize;
 use tiface_base::image::{Gray, INSIDE, Image, Photo, grow};
+use tiface_capture::LoadedView;
 
 /// Half of the band around the mask's contour, pixels.
 const EDGE_PX: f32 = 3.0;

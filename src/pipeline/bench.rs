@@ -12,8 +12,6 @@ use super::render::{Meshes, Renderer};
 use super::session::Session;
 use super::surface::Fields;
 use super::{complete, learn, pictures};
-use crate::capture::scene::Scene;
-use crate::capture::{LoadedView, Split, View};
 use crate::config::{ColorSource, Config, Hair, MeshConfig, Method, Stage, ViewBackground};
 use crate::field::training::TrainingSession;
 use crate::metrics::{compare, distance};
@@ -27,6 +25,8 @@ use tiface_base::image::Photo;
 use tiface_base::io::{self, Limits};
 use tiface_base::math::rank::median;
 use tiface_base::{Error, Monitor, Quiet, Result};
+use tiface_capture::scene::Scene;
+use tiface_capture::{LoadedView, Split, View};
 use tiface_surface::files::HeadMesh;
 use tiface_surface::{SimplifyConfig, simplify};
 

@@ -1,16 +1,13 @@
 //! How well the cameras of a capture fit each other, in words, and the refined poses that a run
 //! keeps.
 //!
-//! The measurement is [`crate::rig`]'s. It takes photographs of the training views and the hull of
-//! their masks; held-out views take no part. The stage `mask` makes it and writes `poses.json`,
-//! later stages read refined poses there. Where poses are refined, each held-out view is then
-//! fitted alone: the evaluation shows it from both poses.
+//! The measurement is [`tiface_capture::rig`]'s. It takes photographs of the training views and the
+//! hull of their masks; held-out views take no part. The stage `mask` makes it and writes
+//! `poses.json`, later stages read refined poses there. Where poses are refined, each held-out view
+//! is then fitted alone: the evaluation shows it from both poses.
 
 use super::rig_photos::RigPhotos;
-use crate::capture::path::NamedCamera;
-use crate::capture::{Capture, Split, View};
 use crate::config::CameraPoses;
-use crate::rig::{self, CameraState, LEAST_SIGHTINGS, PoseDecision, RigView};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -18,6 +15,9 @@ use tiface_base::geom::{Camera, Similarity};
 use tiface_base::image::{Gray, Photo};
 use tiface_base::io::{self, Limits, ReadError};
 use tiface_base::{Error, Result};
+use tiface_capture::path::NamedCamera;
+use tiface_capture::rig::{self, CameraState, LEAST_SIGHTINGS, PoseDecision, RigView};
+use tiface_capture::{Capture, Split, View};
 
 /// File name of the measurement, in the folder of the stage `mask`.
 pub(super) const POSES: &str = "poses.json";

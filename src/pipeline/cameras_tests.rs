@@ -5,18 +5,18 @@ use super::cameras::{CameraCheck, POSES, check_by};
 use super::rig_photos::RigPhotos;
 use super::tests::{NoFields, draft, measured_head, quiet, scene_of};
 use super::{Session, Stage, capture_options, complete, inspect_capture};
-use crate::capture::path::NamedCamera;
-use crate::capture::scene::{self, SceneOptions};
-use crate::capture::synthetic::SyntheticHead;
-use crate::capture::{self, Capture, Split, View};
 use crate::config::{CameraPoses, Config, MaskSource, Preset};
-use crate::rig;
 use crate::run::read_record;
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::{Value, json};
 use std::sync::OnceLock;
 use tiface_base::geom::Camera;
 use tiface_base::io::{self, Limits};
+use tiface_capture::path::NamedCamera;
+use tiface_capture::rig;
+use tiface_capture::scene::{self, SceneOptions};
+use tiface_capture::synthetic::SyntheticHead;
+use tiface_capture::{self as capture, Capture, Split, View};
 
 /// A quarter of the points is enough for small photographs, and takes a quarter of the time.
 const POINTS: usize = rig::POINTS / 4;

@@ -6,7 +6,6 @@
 //! proposals → those that agree ───┘    → band → matting (closed form, ViTMatte) → alpha
 //! ```
 
-use crate::capture::{Capture, Split};
 use crate::config::{MaskConfig, key};
 use crate::mask::Click;
 use crate::mask::distance::squared_distance;
@@ -15,14 +14,15 @@ use crate::mask::matting::{SoftMask, SoftenOptions, UnknownBand, soften_with};
 use crate::mask::networks::Networks;
 use crate::mask::prompts::{self, PhotoPrompts, Prompts};
 use crate::mask::propagate::{PropagateView, propagate, propagate_proposals, rows_size};
-use crate::run::{Fingerprint, StageDir};
+use crate::run::StageDir;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::Path;
 use tiface_base::image::{Gray, Photo, reduce_photo, working_size};
 use tiface_base::io::{self, Limits};
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Fingerprint, Result};
+use tiface_capture::{Capture, Split};
 
 /// Memory that photographs processed in parallel may take without networks, bytes.
 const MAX_BYTES: u64 = 3 << 29;
@@ -234,7 +234,7 @@ fn hard_masks(
         (vec![found.mask], found.warnings)
     } else {
         let view = |(v, clicks)| {
-            let v: &crate::capture::View = v;
+            let v: &tiface_capture::View = v;
             // held-out photographs affect only their own masks
             PropagateView { name: &v.name, camera: &v.camera, clicks, votes: v.split == Split::Train }
         };

@@ -3,7 +3,6 @@
 use super::clicks::propagated_clicks;
 use super::tests::{NoFields, demo_head, draft, masked};
 use super::*;
-use crate::capture::{self, CaptureOptions, Split};
 use crate::config::{Config, MaskSource, Preset};
 use crate::mask::prompts::{PhotoPrompts, Prompts, file_path};
 use crate::run::{Event, Observer, Run, Stop};
@@ -11,6 +10,7 @@ use std::path::{Path, PathBuf};
 use tiface_base::ErrorKind;
 use tiface_base::image::Gray;
 use tiface_base::io::{self, Limits};
+use tiface_capture::{self as capture, CaptureOptions, Split};
 
 /// Photographs that masks are held against the truth on.
 const SHARP: (u32, u32) = (120, 160);

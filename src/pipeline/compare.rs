@@ -7,7 +7,6 @@ use super::page::{COLUMNS, MAX_BYTES, curves, judged, methods, quality};
 use super::pictures;
 use super::render::VisibleHead;
 use super::session::Session;
-use crate::capture::{Capture, Split, View, ViewMask};
 use crate::config::{Config, PictureFormat, Stage};
 use crate::metrics::distance::one_way;
 use crate::pipeline::mesh::{finished_mesh, read_finished, surface_in_world};
@@ -19,6 +18,7 @@ use tiface_base::error::counted;
 use tiface_base::geom::Bvh;
 use tiface_base::io;
 use tiface_base::{Error, Result};
+use tiface_capture::{Capture, Split, View, ViewMask};
 use tiface_surface::files::{HeadMesh, OpenedMesh, check, open_mesh, weld};
 use tiface_surface::render::RaycastOptions;
 

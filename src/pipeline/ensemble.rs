@@ -11,8 +11,6 @@
 use super::render::{Meshes, Renderer, held_out};
 use super::surface::Fields;
 use super::{learn, pictures};
-use crate::capture::scene::Scene;
-use crate::capture::{Capture, MaskMeaning, View, ViewMask};
 use crate::config::{Config, EnsembleConfig, MaskUse, Method, display_name, key};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::run::{Run, StageDir};
@@ -21,6 +19,8 @@ use std::time::{Duration, Instant};
 use tiface_base::image::{Gray, Image, Photo};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
+use tiface_capture::scene::Scene;
+use tiface_capture::{Capture, MaskMeaning, View, ViewMask};
 use tiface_surface::render::RenderedView;
 
 /// Blends one picture per camera of `render`. `fields` are evaluated only if weights are to be

@@ -2,7 +2,6 @@
 
 use super::tests::{NoFields, masked, tiny_run, words};
 use super::*;
-use crate::capture::{Split, View};
 use crate::config::{Config, Method, Preset, ViewBackground};
 use crate::run::Run;
 use glam::Vec3;
@@ -12,6 +11,7 @@ use tiface_base::geom::{Camera, Ray};
 use tiface_base::image::{Image, quantize};
 use tiface_base::io;
 use tiface_base::{ErrorKind, Result};
+use tiface_capture::{Split, View};
 use tiface_surface::render::RenderedView;
 
 /// Size of the photographs of [`tiny_run`].

@@ -4,7 +4,6 @@
 use super::inputs::capture_options;
 use super::session::Session;
 use super::{Stage, complete, learn, reconstruct};
-use crate::capture;
 use crate::config::iface::FieldKind;
 use crate::config::{
     Config, MaskLoss, MaskSource, MaskUse, Method, Preset, Sources, TruthPhoto, VmBackground, VmConfig,
@@ -14,6 +13,7 @@ use crate::run::{Cost, read_record, read_status};
 use serde_json::Value;
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
+use tiface_capture as capture;
 
 /// The tables, by their name and heading.
 pub const TABLES: [(&str, &str); 4] = [

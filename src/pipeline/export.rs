@@ -13,11 +13,10 @@ use super::mesh::{finished_mesh, read_finished};
 use super::scene_file::read_capture;
 use super::session::unusable;
 use crate::config::{Config, MeshFormat, Stage, key};
-use crate::run::Fingerprint;
 use glam::{DVec3, Vec3};
 use std::path::{Path, PathBuf};
 use tiface_base::geom::{ShellLayer, Similarity};
-use tiface_base::{Error, Monitor, Result};
+use tiface_base::{Error, Fingerprint, Monitor, Result};
 use tiface_surface::files::{
     ExportedFiles, ExtractedSurface, HeadMesh, LOBE_TEXEL, OpenedMesh, open_mesh, weld,
 };

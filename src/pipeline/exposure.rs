@@ -1,13 +1,11 @@
 //! How exposure and white balance of a capture's photographs differ, in words, and what a run
 //! divides out of them.
 //!
-//! The measurement is [`crate::rig::exposure`]'s. The stage `mask` makes it and writes
+//! The measurement is [`tiface_capture::rig::exposure`]'s. The stage `mask` makes it and writes
 //! `exposure.json`; later stages read training photographs with their exposure divided out.
 //! Held-out views are rendered with the mean exposure, and their own is used by the metrics alone.
 
 use super::rig_photos::RigPhotos;
-use crate::capture::{Capture, Split, View};
-use crate::rig::exposure::{self, ExposureView, Incomparable, MIN_TRAINING_VIEWS};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -15,6 +13,8 @@ use tiface_base::Result;
 use tiface_base::error::counted;
 use tiface_base::image::Exposure;
 use tiface_base::io::{self, Limits, ReadError};
+use tiface_capture::rig::exposure::{self, ExposureView, Incomparable, MIN_TRAINING_VIEWS};
+use tiface_capture::{Capture, Split, View};
 
 /// File name of the measurement, in the folder of the stage `mask`.
 pub(super) const EXPOSURE: &str = "exposure.json";

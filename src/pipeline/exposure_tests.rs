@@ -4,12 +4,12 @@ use super::exposure::{EXPOSURE, ExposureCheck};
 use super::rig_photos::RigPhotos;
 use super::tests::{NoFields, measured_head, quiet, scene_of};
 use super::{Session, Stage, complete};
-use crate::capture::{self, Capture, CaptureOptions, View};
 use crate::config::{CameraPoses, Config, Exposures, Preset};
 use serde_json::{Value, json};
 use std::sync::OnceLock;
 use tiface_base::image::{Exposure, Photo};
 use tiface_base::io::{self, Limits};
+use tiface_capture::{self as capture, Capture, CaptureOptions, View};
 
 fn measure(capture: &Capture) -> ExposureCheck {
     tried(capture).unwrap()

@@ -2,13 +2,13 @@
 
 use super::advice::{advised, sentence};
 use super::frames::{Export, center};
-use crate::capture::scene::Scene;
 use crate::config::{ColorSource, Hair, MeshConfig};
 use glam::Mat3;
 use serde_json::{Map, Value, json};
 use tiface_base::geom::{Atlas, Camera, Harmonics, Mesh, SdfField, Shells, Similarity};
 use tiface_base::image::{Image, linear_from_srgb, srgb_from_linear};
 use tiface_base::{Monitor, Result};
+use tiface_capture::scene::Scene;
 use tiface_surface::bake::{
     BakeConfig, Baked, FittedTexture, Seams, Seen, bake, bake_harmonics, complete, complete_unseen_vertices,
     tangent_space,

@@ -2,7 +2,6 @@
 
 use super::tests::{NoFields, demo_head, draft, head_run, masked, quiet};
 use super::*;
-use crate::capture::synthetic::SyntheticHead;
 use crate::config::{ColorSource, Config, Genus, Hair, MeshFormat, Method, ViewBackground};
 use crate::metrics::compare;
 use crate::run::{Run, read_record};
@@ -12,6 +11,7 @@ use tempfile::TempDir;
 use tiface_base::geom::{SdfField, Similarity};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Quiet, Result};
+use tiface_capture::synthetic::SyntheticHead;
 
 /// The demo head itself, as a perfectly learned field would be; painted in soft stripes, a little
 /// brighter seen from one side.

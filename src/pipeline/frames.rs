@@ -2,11 +2,11 @@
 //! turned so that the face looks at the viewer.
 
 use super::advice::advised;
-use crate::capture::Capture;
 use crate::config::{Config, MeshFormat};
 use glam::{DMat3, DVec3, Vec3};
 use tiface_base::Result;
 use tiface_base::geom::{Mesh, Similarity};
+use tiface_capture::Capture;
 use tiface_surface::AtlasConfig;
 use tiface_surface::files::{ExportOptions, ExportedFiles, HeadMesh, to_glb, to_obj, to_ply, to_usdz};
 

@@ -7,15 +7,15 @@
 use super::clicks::MaskPrompts;
 use super::readings::{Settled, decide_reading};
 use super::{mask, scene_file};
-use crate::capture::{self, Capture, CaptureOptions, Reading, View, ViewMask};
 use crate::config::{Config, MaskSource, Stage};
-use crate::run::{Fingerprint, Run, read_record};
+use crate::run::{Run, read_record, taken_for_capture};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind::NotFound;
 use std::path::Path;
 use tiface_base::io::{self, Limits};
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Fingerprint, Result};
+use tiface_capture::{self as capture, Capture, CaptureOptions, Reading, View, ViewMask};
 
 /// Digests of what the stages read from outside the run.
 #[derive(Default)]
@@ -65,7 +65,8 @@ impl Inputs {
     /// Opens the capture and reads every file that the stages will read, to compute its digest.
     pub fn read(config: &Config, run: &Run) -> Result<(Capture, Inputs)> {
         let mut options = capture_options(config);
-        let opened = capture::open(&config.capture.path, &options);
+        let root = &config.capture.path;
+        let opened = capture::open(root, &options).map_err(|e| taken_for_capture(root).unwrap_or(e));
         let (capture, mut inputs) = match opened.and_then(|capture| decide_reading(capture, &options)) {
             Err(e) => restore_from_run(config, run, e)?,
             Ok(Settled { mut capture, reading, reason, .. }) => {

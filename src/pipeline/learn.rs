@@ -6,8 +6,6 @@
 
 use super::session::Session;
 use super::surface::{Fields, Radiance, Surface, march};
-use crate::capture::scene::Scene;
-use crate::capture::{Capture, LoadedView, Split, View};
 use crate::config::iface::FieldKind;
 use crate::config::{Config, MaskUse, Preset, Stage};
 use crate::ensemble::{self, Tile};
@@ -25,6 +23,8 @@ use tiface_base::geom::Camera;
 use tiface_base::image::Gray;
 use tiface_base::io::Limits;
 use tiface_base::{Error, Result};
+use tiface_capture::scene::Scene;
+use tiface_capture::{Capture, LoadedView, Split, View};
 use tiface_surface::render::RenderedView;
 
 /// Trains or imports the field of a stage; training resumes from the last checkpoint.

@@ -6,15 +6,12 @@ use super::exposure::ExposureCheck;
 use super::readings::{Settled, decide_reading};
 use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
 use super::scene_file;
-use crate::capture::inspect::{Inspection, Problem, grouped, inspect};
-use crate::capture::scene::{self, Scene, SceneBox, SceneOptions, in_box};
-use crate::capture::{self, Capture, CaptureOptions, MASK_HINT, MaskReading, MaskSurvey, Split, View};
 use crate::config::{CameraPoses, Config, Exposures, MaskConfig, MaskMeaning, Preset};
 use crate::mask::consistency::{ConsistencyView, check_consistency};
 use crate::mask::matting::unknown_share;
 use crate::mask::pages::{SheetView, page_of, sheet};
 use crate::mask::prompts::read_prompts;
-use crate::run::StageDir;
+use crate::run::{StageDir, taken_for_capture};
 use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::borrow::Cow;
@@ -22,6 +19,11 @@ use std::path::{Path, PathBuf};
 use tiface_base::image::{Gray, Photo, resize_gray, working_size};
 use tiface_base::io::{self, Limits, ReadError};
 use tiface_base::{Error, Result};
+use tiface_capture::inspect::{Inspection, Problem, grouped, inspect};
+use tiface_capture::scene::{self, Scene, SceneBox, SceneOptions, in_box};
+use tiface_capture::{
+    self as capture, Capture, CaptureOptions, MASK_HINT, MaskReading, MaskSurvey, Split, View,
+};
 
 /// File name of the contact sheet, in the stage's folder.
 pub(super) const SHEET: &str = "sheet.html";
@@ -449,6 +451,9 @@ pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     let reading = settled.as_ref().and_then(|settled| settled.reading);
     let options = &CaptureOptions { reading, ..options.clone() };
     let mut found = inspect(root, options);
+    if let Some(e) = taken_for_capture(root) {
+        found.problems = grouped(&[e]);
+    }
     if let Some(Settled { reason, doubt, .. }) = settled {
         found.reasons.extend(reason);
         found.warnings.extend(doubt);

@@ -14,8 +14,6 @@ use super::finish::{Finish, FinishedHead, REACH};
 use super::frames::Export;
 use super::learn;
 use super::surface::{CappedField, Surface};
-use crate::capture::scene::Scene;
-use crate::capture::{self, Capture, LoadedView, Split};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, Stage};
 use crate::run::{Phase, Record, Run, StageDir, StageStatus, Status};
 use glam::{DVec3, Vec3};
@@ -25,6 +23,8 @@ use tiface_base::geom::{Aabb, Camera, Mesh, Similarity};
 use tiface_base::image::Image;
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, ErrorKind, Monitor, Result};
+use tiface_capture::scene::Scene;
+use tiface_capture::{self as capture, Capture, LoadedView, Split};
 use tiface_surface::bake::{Seen, seen_colors, seen_map, seen_shares};
 use tiface_surface::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use tiface_surface::{
@@ -348,7 +348,8 @@ fn handles(report: &HandleReport, mm: f64) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::{Fingerprint, Plan};
+    use crate::run::Plan;
+    use tiface_base::Fingerprint;
 
     #[test]
     fn what_no_camera_saw_is_said_from_a_hundredth_on() {

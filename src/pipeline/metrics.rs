@@ -4,8 +4,6 @@
 
 use super::exposure::ExposureCheck;
 use super::pictures;
-use crate::capture::synthetic::SyntheticHead;
-use crate::capture::{Capture, LoadedView, View};
 use crate::config::{Config, Method, TruthPhoto, ViewBackground};
 use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
 use crate::run::{Run, StageDir};
@@ -17,6 +15,8 @@ use tiface_base::geom::{Bvh, Mesh};
 use tiface_base::image::{Gray, Image, Photo};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
+use tiface_capture::synthetic::SyntheticHead;
+use tiface_capture::{Capture, LoadedView, View};
 
 /// Largest mask value that counts as empty.
 const MAX_EMPTY: u8 = 0;

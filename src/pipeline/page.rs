@@ -126,7 +126,7 @@ fn text(file: &Path) -> Result<String> {
 }
 
 fn facts(session: &Session, records: &[(Stage, Record)]) -> Vec<String> {
-    use crate::capture::Split::{Test, Train};
+    use tiface_capture::Split::{Test, Train};
     let [train, test] = [Train, Test].map(|split| session.capture.split(split).count());
     let mut facts = vec![
         format!("{} to learn from, {test} held out", counted(train, "photograph")),

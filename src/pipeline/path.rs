@@ -9,14 +9,13 @@
 //! No stage reads these views, so making or removing them does not affect the evaluation's views,
 //! their blend or the metrics.
 
-use crate::capture::path::{NamedCamera, from_json};
-use crate::capture::{Capture, Split, View};
 use crate::config::RenderConfig;
-use crate::run::Fingerprint;
 use std::path::Path;
 use tiface_base::geom::Camera;
 use tiface_base::io::{self, Limits};
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Fingerprint, Result};
+use tiface_capture::path::{NamedCamera, from_json};
+use tiface_capture::{Capture, Split, View};
 
 /// Folder of the paths, relative to the run: one folder for each path.
 pub(super) const PATHS: &str = "render/paths";

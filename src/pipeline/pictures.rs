@@ -1,11 +1,11 @@
 //! Writing and reading rendered views.
 
-use crate::capture::LoadedView;
 use crate::config::{PictureFormat, ViewBackground};
 use std::path::{Path, PathBuf};
 use tiface_base::Result;
 use tiface_base::image::{Gray, INSIDE, Image, Photo, linear_from_srgb, quantize, srgb_from_linear};
 use tiface_base::io::{self, Limits, ReadError, WriteError};
+use tiface_capture::LoadedView;
 use tiface_surface::render::RenderedView;
 
 /// Returns the color behind the head, sRGB-coded; `None` leaves alpha.

@@ -6,11 +6,11 @@ use super::mask::inspect_capture;
 use super::path::{CameraPath, PATHS};
 use super::render::shows_head;
 use super::session::Session;
-use crate::capture::View;
 use crate::config::{Config, Method, Product, Stage, VmConfig, key};
-use crate::run::{Fingerprint, Plan, read_record, read_status};
+use crate::run::{Plan, read_record, read_status};
 use std::path::Path;
-use tiface_base::{Error, Result, io};
+use tiface_base::{Error, Fingerprint, Result, io};
+use tiface_capture::View;
 
 /// Version of the stages' files and of what is recorded of their settings; raised when their
 /// meaning changes.

@@ -5,11 +5,11 @@ use super::inputs::capture_options;
 use super::render::shows_head;
 use super::tests::{demo_head, draft, quiet, words};
 use super::*;
-use crate::capture;
 use crate::config::{Config, Key, Method, Product, Sources, all_keys, key};
 use crate::mask::prompts::{PhotoPrompts, Prompts, file_path, parse_point};
 use std::collections::BTreeSet;
 use std::path::Path;
+use tiface_capture as capture;
 
 /// Another value of a key, as `--set` takes it; of a file the same content elsewhere. `None` if the
 /// key names no file.

@@ -12,8 +12,6 @@ use super::page::views::{error, heat};
 use super::path::cameras_of_file;
 use super::pictures::{self, background_color, expected, over, straight};
 use super::scene_file::{read_capture, read_scene};
-use crate::capture::path::{NamedCamera, orbit};
-use crate::capture::{Split, View};
 use crate::config::{Config, Stage, ViewBackground};
 use glam::{DMat3, DVec3, Vec3};
 use rayon::prelude::*;
@@ -23,6 +21,8 @@ use tiface_base::geom::{Atlas, Camera, Distortion, Similarity};
 use tiface_base::image::{Image, Photo, quantize, reduce_photo, working_size};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
+use tiface_capture::path::{NamedCamera, orbit};
+use tiface_capture::{Split, View};
 use tiface_surface::files::{HeadMesh, HeadTexture, OpenedMesh, open_mesh};
 use tiface_surface::render::{
     Look, MeshTexture, RasterLayers, RasterOptions, RasterView, Surface, raster_into,

@@ -3,25 +3,26 @@
 //!
 //! Camera files without names pair rows with photographs by order alone, and a half turn that EXIF
 //! asks for fits any size. Each way to read the capture is tried by what is measured of poses
-//! anyway ([`crate::rig`]), on small photographs and by few points: where photographs and cameras
-//! belong together, points of the head are found again in many photographs, near to where its
-//! camera expects them. The one that fits clearly better is taken; where none does, turns are left
-//! alone with a warning, and an order is refused, since nothing good is learned from the
+//! anyway ([`tiface_capture::rig`]), on small photographs and by few points: where photographs and
+//! cameras belong together, points of the head are found again in many photographs, near to where
+//! its camera expects them. The one that fits clearly better is taken; where none does, turns are
+//! left alone with a warning, and an order is refused, since nothing good is learned from the
 //! photographs of other cameras.
 
 use super::cameras::grouped;
 use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
-use crate::capture::scene::{self, SceneOptions};
-use crate::capture::{self, Capture, CaptureOptions, Reading, Split, View, ViewMask, by_number};
 use crate::config::{CameraPoses, MaskMeaning, MaskSource};
 use crate::mask::consistency::{ConsistencyView, check_consistency};
-use crate::rig::{self, PoseDecision};
+use crate::run::taken_for_capture;
 use rayon::prelude::*;
 use std::path::Path;
 use tiface_base::geom::Camera;
 use tiface_base::image::{Gray, resize_gray, working_size};
 use tiface_base::io::Limits;
 use tiface_base::{Error, Result};
+use tiface_capture::rig::{self, PoseDecision};
+use tiface_capture::scene::{self, SceneOptions};
+use tiface_capture::{self as capture, Capture, CaptureOptions, Reading, Split, View, ViewMask, by_number};
 
 /// Longest side of the photographs that are compared, pixels.
 const SIDE_PX: u32 = 256;
@@ -84,7 +85,8 @@ impl Settled {
 /// Opens a capture as [`capture::open`] does, and decides by its photographs what its files leave
 /// open.
 pub fn open_capture(root: &Path, options: &CaptureOptions) -> Result<Capture> {
-    Ok(decide_reading(capture::open(root, options)?, options)?.capture)
+    let opened = capture::open(root, options).map_err(|e| taken_for_capture(root).unwrap_or(e));
+    Ok(decide_reading(opened?, options)?.capture)
 }
 
 /// Decides how a capture is read that was opened with these options.

@@ -15,9 +15,6 @@ use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
 use super::pictures;
 use super::surface::{Fields, march};
-use crate::capture::path::{NamedCamera, orbit};
-use crate::capture::scene::{self, Scene};
-use crate::capture::{Capture, Split};
 use crate::config::{ColorSource, Config, Method, RenderConfig};
 use crate::run::{Run, StageDir};
 use serde_json::{Map, Value, json};
@@ -26,6 +23,9 @@ use std::time::{Duration, Instant};
 use tiface_base::geom::{Bvh, Camera, Harmonics, Ray, ShellCaster, Similarity};
 use tiface_base::io;
 use tiface_base::{Monitor, Result};
+use tiface_capture::path::{NamedCamera, orbit};
+use tiface_capture::scene::{self, Scene};
+use tiface_capture::{Capture, Split};
 use tiface_surface::files::{ExtractedSurface, HeadMesh, HeadTexture};
 use tiface_surface::render::{
     MeshTexture, PixelFilterFit, RasterLayers, RasterOptions, RayHits, RaycastOptions, RenderedView,
@@ -500,7 +500,7 @@ mod tests {
             float: true,
             ..Config::preset(crate::config::Preset::Draft).render
         };
-        let fingerprint = crate::run::Fingerprint::default();
+        let fingerprint = tiface_base::Fingerprint::default();
         let plan =
             crate::run::Plan { name: "render", fingerprint, device: "cpu", needs_bytes: 0, saves: false };
         run.stage(plan, |dir| {

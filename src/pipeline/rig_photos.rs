@@ -1,9 +1,6 @@
 //! What cameras and exposures are measured on: photographs at a moderate size, their masks, and the
 //! surface of the hull.
 
-use crate::capture::scene::Scene;
-use crate::capture::{Capture, Split, View};
-use crate::rig::{self, Rig, RigView};
 use glam::Vec3;
 use rayon::prelude::*;
 use tiface_base::Result;
@@ -11,6 +8,9 @@ use tiface_base::error::counted;
 use tiface_base::geom::{BitGrid, Camera, Mesh, Similarity};
 use tiface_base::image::{Gray, Photo, reduce_photo, resize_gray, working_size};
 use tiface_base::io::Limits;
+use tiface_capture::rig::{self, Rig, RigView};
+use tiface_capture::scene::Scene;
+use tiface_capture::{Capture, Split, View};
 use tiface_surface::{Volume, marching};
 
 /// Longest side of the photographs, pixels.

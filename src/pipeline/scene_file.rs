@@ -3,8 +3,6 @@
 
 use super::cameras::CameraCheck;
 use super::exposure::ExposureCheck;
-use crate::capture::scene::Scene;
-use crate::capture::{Capture, View};
 use glam::Vec3;
 use serde::Deserialize;
 use serde_json::json;
@@ -12,6 +10,8 @@ use std::path::Path;
 use tiface_base::Result;
 use tiface_base::geom::{Aabb, BitGrid};
 use tiface_base::io::{self, Limits, ReadError, WriteError};
+use tiface_capture::scene::Scene;
+use tiface_capture::{Capture, View};
 
 /// Maximum number of cells along an axis of a hull; the stage makes 128.
 const MAX_CELLS: usize = 1024;

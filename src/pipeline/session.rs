@@ -6,8 +6,6 @@ use super::exposure::ExposureCheck;
 use super::inputs::{Inputs, missing_capture};
 use super::path::CameraPath;
 use super::{mask, scene_file};
-use crate::capture::scene::{Scene, SceneBox};
-use crate::capture::{Capture, MaskReading, Split, View, ViewMask};
 use crate::config::{Config, RenderConfig, Stage};
 use crate::metrics::Lpips;
 use crate::run::Run;
@@ -17,6 +15,8 @@ use std::io::ErrorKind::NotFound;
 use std::sync::OnceLock;
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
+use tiface_capture::scene::{Scene, SceneBox};
+use tiface_capture::{Capture, MaskReading, Split, View, ViewMask};
 
 /// A capture, its configuration and its run folder.
 pub struct Session<'a> {

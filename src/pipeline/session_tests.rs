@@ -2,12 +2,12 @@
 
 use super::tests::{NoFields, head_run, masked, quiet, tiny_run, words};
 use super::*;
-use crate::capture::Split;
 use crate::config::{ColorSource, Config, MaskSource, MeshConfig, MeshFormat, Method, ViewBackground};
 use crate::run::{Run, Stop};
 use serde_json::json;
 use tiface_base::io::{self, Limits};
 use tiface_base::{ErrorKind, Result};
+use tiface_capture::Split;
 
 #[test]
 fn views_held_out_for_validation_cost_what_test_views_cost() {
@@ -335,13 +335,13 @@ fn a_stage_that_the_disk_has_no_room_for_is_refused_before_the_old_one_is_cleare
 fn later_stages_read_masks_in_a_color_as_the_stage_mask_found_them() {
     let (dir, config, run) = tiny_run();
     let root = dir.path().join("head");
-    let load = |views: &[crate::capture::View]| -> Vec<Vec<u8>> {
+    let load = |views: &[tiface_capture::View]| -> Vec<Vec<u8>> {
         views.iter().map(|view| view.load_mask(&Limits::default()).unwrap().unwrap().values).collect()
     };
-    let capture = crate::capture::open(&root, &capture_options(&config)).unwrap();
+    let capture = tiface_capture::open(&root, &capture_options(&config)).unwrap();
     let truth = load(&capture.views);
     for (view, mask) in capture.views.iter().zip(&truth) {
-        let crate::capture::ViewMask::File(file) = &view.mask else { panic!("{:?}", view.mask) };
+        let tiface_capture::ViewMask::File(file) = &view.mask else { panic!("{:?}", view.mask) };
         let blue: Vec<[u8; 3]> = mask.iter().map(|&m| [0, 0, m]).collect();
         io::write_png_rgb(file, view.camera.width, view.camera.height, &blue).unwrap();
     }

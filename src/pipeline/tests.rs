@@ -1,10 +1,6 @@
 //! What the tests of the pipeline share.
 
 use super::{Fields, Radiance, Session, Stage, Surface, complete};
-use crate::capture::scene::{self, Scene, SceneOptions};
-use crate::capture::synthetic::SyntheticOptions;
-use crate::capture::synthetic::shared::{Files, write_capture};
-use crate::capture::{self, Capture, CaptureOptions, Split};
 use crate::config::{CameraPoses, Config, Exposures, Preset};
 use crate::run::{Done, Run};
 use std::collections::BTreeMap;
@@ -15,6 +11,10 @@ use tiface_base::Result;
 use tiface_base::geom::Camera;
 use tiface_base::image::Gray;
 use tiface_base::io::Limits;
+use tiface_capture::scene::{self, Scene, SceneOptions};
+use tiface_capture::synthetic::SyntheticOptions;
+use tiface_capture::testing::{Files, write_capture};
+use tiface_capture::{self as capture, Capture, CaptureOptions, Split};
 
 /// Fields that no stage may load.
 pub(super) struct NoFields;

@@ -282,7 +282,7 @@ mod tests {
     #[test]
     fn a_mesh_that_was_cut_is_not_shown_as_watertight() {
         let dir = tempfile::tempdir().unwrap();
-        let fingerprint = crate::run::Fingerprint::default();
+        let fingerprint = tiface_base::Fingerprint::default();
         let plan =
             crate::run::Plan { name: "mesh", fingerprint, device: "cpu", needs_bytes: 0, saves: false };
         let done = crate::run::Run::quiet(dir.path()).stage(plan, |stage| {

@@ -89,7 +89,7 @@ mod tests {
     fn a_report_has_the_warnings_of_all_stages_with_what_to_do() {
         let record = |summary: Value, warned: &[&str]| -> Record {
             serde_json::from_value(json!({
-                "stage": "", "fingerprint": crate::run::Fingerprint::default(), "digest": "", "summary": summary,
+                "stage": "", "fingerprint": tiface_base::Fingerprint::default(), "digest": "", "summary": summary,
                 "elapsed_s": 1.0, "warnings": warned, "finished": 0, "version": "",
             }))
             .unwrap()

@@ -1,12 +1,12 @@
 //! Removal of files that the finished stages of a run do not need any more.
 
+use super::Run;
 use super::record::{Record, read_record};
 use super::stage::sweep;
-use super::{Fingerprint, Run};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use tiface_base::io::{self, Lock};
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Fingerprint, Result};
 
 /// Kind of a file that a finished stage does not need, whole or in part.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

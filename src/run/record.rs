@@ -1,6 +1,5 @@
 //! `done.json`: the record of a complete stage, and comparison of its files with it.
 
-use super::Fingerprint;
 use crate::config::key;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -8,7 +7,7 @@ use std::collections::BTreeMap;
 use std::fmt::{self, Display};
 use std::path::Path;
 use tiface_base::io::{self, Limits, ReadError};
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Fingerprint, Result};
 
 /// `done.json`: the stage is complete.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -3,14 +3,14 @@
 use super::progress::Progress;
 use super::record::TIMED;
 use super::status::{host, now};
-use super::{Event, Fingerprint, Record, Run, State, Status};
+use super::{Event, Record, Run, State, Status};
 use super::{has_record, read_record, read_status};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use tiface_base::io;
-use tiface_base::{Error, Monitor, Result};
+use tiface_base::{Error, Fingerprint, Monitor, Result};
 
 /// Plan of a stage.
 #[derive(Clone, Debug)]
@@ -98,7 +98,8 @@ impl Run {
     /// figures.
     ///
     /// ```
-    /// use tiface::run::{Fingerprint, Plan, Run};
+    /// use tiface::Fingerprint;
+    /// use tiface::run::{Plan, Run};
     ///
     /// let folder = tempfile::tempdir()?;
     /// let run = Run::quiet(folder.path());

@@ -1,14 +1,15 @@
 //! `status.json`, the progress of a stage; [`RunStatus`], the state of a whole run from the files
 //! of its stages.
 
+use super::LOCK;
 use super::estimate::read_estimate;
 use super::failure::read_failure;
 use super::record::{Fault, Record, not_negative, read_if_present, read_record};
-use super::{Fingerprint, LOCK};
 use crate::config::{Config, Stage};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
+use tiface_base::Fingerprint;
 use tiface_base::io::{self, Limits, ReadError};
 
 /// The state of a stage.

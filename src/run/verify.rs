@@ -1,11 +1,10 @@
 //! Comparison of a run's products with the records of its stages, byte for byte.
 
-use super::Fingerprint;
 use super::record::{Fault, ProductState, Record, read_record};
 use serde::Serialize;
 use std::path::Path;
 use tiface_base::io;
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Fingerprint, Result};
 
 /// What [`verify`] found in a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]

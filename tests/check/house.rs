@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 /// Layers of the package `tiface`, from the ground up; a module may know those below its own layer.
 const LAYERS: &[(&str, &[&str])] = &[
     ("settings", &["config"]),
-    ("shared", &["capture", "field", "onnx", "run", "report"]),
-    ("stages", &["mask", "rig", "tface", "iface", "ensemble", "metrics"]),
+    ("shared", &["field", "onnx", "run", "report"]),
+    ("stages", &["mask", "tface", "iface", "ensemble", "metrics"]),
     ("pipeline", &["pipeline"]),
     ("cli", &["cli"]),
 ];

@@ -100,11 +100,15 @@ fn every_crate_the_program_names_has_a_note_on_its_unsafe_code() {
 }
 
 #[test]
-fn meshing_needs_neither_tensors_nor_networks() {
-    let crates = crates(&["--package", "tiface-surface"]);
-    assert!(crates.iter().any(|(name, ..)| name == "tiface-base"), "{crates:?}");
-    for (name, ..) in &crates {
-        let is_heavy = ["burn", "cubecl", "wgpu", "tract", "clap"].iter().any(|word| name.starts_with(word));
-        assert!(!is_heavy, "tiface-surface needs `{name}`");
+fn meshing_captures_and_kernels_know_the_base_alone_and_need_neither_tensors_nor_networks() {
+    for package in ["tiface-capture", "tiface-kernels", "tiface-surface"] {
+        let crates = crates(&["--package", package]);
+        let ours = crates.iter().map(|(name, ..)| name.as_str()).filter(|name| name.starts_with("tiface"));
+        assert_eq!(Vec::from_iter(ours), ["tiface-base", package]);
+        for (name, ..) in &crates {
+            let heavy = ["burn", "cubecl", "wgpu", "tract", "clap", "toml"];
+            let is_heavy = heavy.iter().any(|word| name.starts_with(word));
+            assert!(!is_heavy, "{package} needs `{name}`");
+        }
     }
 }

@@ -1,12 +1,12 @@
 //! Skin and hair, told apart by the colors that the capture itself shows of them.
 
 use super::Masks;
-use crate::capture::View;
 use rayon::prelude::*;
 use tiface_base::Result;
 use tiface_base::image::{Gray, INSIDE, Photo, grow};
 use tiface_base::io::Limits;
 use tiface_base::math::rank::median_of_counts;
+use tiface_capture::View;
 
 /// Around a soft rim this many pixels of opaque head are the hair's, and along a hard rim the
 /// skin's.

@@ -3,7 +3,6 @@
 //! Also the 3D viewer of a page: a copy of the head that is small enough, and the cameras of the
 //! photographs.
 
-use crate::capture::{Split, View};
 use crate::config::{MeshFormat, Stage, ViewBackground, display_name};
 use crate::pipeline::frames::{Export, center};
 use crate::pipeline::mesh::{head_mesh, read_finished, seen_note};
@@ -22,6 +21,7 @@ use tiface_base::geom::{Camera, Similarity};
 use tiface_base::image::{Photo, quantize, reduce_photo, working_size};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Quiet, Result};
+use tiface_capture::{Split, View};
 use tiface_surface::bake::seen_shares;
 use tiface_surface::files::{ExportOptions, HeadMesh, HeadTexture, OpenedMesh, open_mesh, to_glb, weld};
 use tiface_surface::{SimplifyConfig, simplify};
