@@ -32,3 +32,25 @@ pub fn taken_for_capture(folder: &Path) -> Option<Error> {
     let hint = format!("inspect its capture, `{capture}`; `tiface status` shows the state of the run");
     Some(not_a_capture(&folder, "it is the folder of a run", hint))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+
+    #[test]
+    fn a_run_that_is_given_as_a_capture_is_said_to_be_one_by_its_own_capture() {
+        let dir = tempfile::tempdir().unwrap();
+        let put = |name: &str, text: &str| fs::write(dir.path().join(name), text).unwrap();
+        put("config.toml", "");
+        assert_eq!(taken_for_capture(dir.path()), None, "it names no capture");
+        put("config.toml", "[capture]\npath = \"heads/002\"\n");
+        let error = taken_for_capture(&dir.path().join("")).unwrap();
+        let said = format!("`{}` is not a capture: it is the folder of a run", dir.path().display());
+        assert_eq!(error.to_string(), said);
+        assert!(error.hint().starts_with("inspect its capture, `heads/002`; "), "{}", error.hint());
+        // cameras beside the settings make it a capture
+        put("transforms.json", "{}");
+        assert_eq!(taken_for_capture(dir.path()), None);
+    }
+}
