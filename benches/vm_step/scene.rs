@@ -46,8 +46,14 @@ pub fn scene(size: [usize; 3], peak: f32, rays: usize) -> Scene {
         near: 0.0,
         far: 1e6,
     };
-    let shading =
-        Shading { softplus: false, shift: -10.0, distance_scale: 25.0, weight_threshold: 1e-4, stop: 0.0 };
+    let shading = Shading {
+        softplus: false,
+        shift: -10.0,
+        distance_scale: 25.0,
+        weight_threshold: 1e-4,
+        stop: 0.0,
+        group_weight: 0.0,
+    };
     let field = VmField { density, color, decoder, lattice, shading, mask: None };
     let noise = |stream: u64, n: usize, scale: f32| -> Vec<f32> {
         (0..n as u64).map(|i| scale * rng::normal(11, stream, i)).collect()

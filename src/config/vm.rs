@@ -170,6 +170,9 @@ table! {
         step_ratio: f64 => 1.0, 1.0, 0.5;
         /// Color is evaluated only of samples with more weight.
         weight_threshold: f64 => 1e-3, 1e-3, 1e-4;
+        /// Samples next to each other on a ray share a color until their weights sum to this
+        /// (published: each has its own).
+        group_weight: f64 => 0.05, 0.05, 0.0;
         /// A ray ends where less than this of its light is left.
         stop: f64 => 1e-3, 1e-3, 0.0;
         /// Learning rate of planes and lines.

@@ -85,6 +85,7 @@ impl FieldRecord {
                 distance_scale: config.distance_scale as f32,
                 weight_threshold: config.weight_threshold as f32,
                 stop: config.stop as f32,
+                group_weight: config.group_weight as f32,
             },
             step_ratio: config.step_ratio as f32,
             near: config.near as f32,
@@ -101,7 +102,8 @@ impl FieldRecord {
     /// Checks that the field can be rendered, and otherwise returns the reason.
     pub fn validate(&self) -> Result<(), &'static str> {
         let (d, s) = (&self.decoder, &self.shading);
-        let numbers = [s.shift, s.distance_scale, s.weight_threshold, s.stop, self.mask_threshold];
+        let numbers =
+            [s.shift, s.distance_scale, s.weight_threshold, s.stop, s.group_weight, self.mask_threshold];
         let ranks = [self.density_rank, self.color_rank];
         if ranks.iter().any(|r| r.iter().all(|n| *n == 0) || r.iter().any(|n| *n > 4096)) {
             return Err("its planes have no channels, or more than 4096");

@@ -90,8 +90,12 @@ pub(crate) fn render<R: Real>(f: &VmField, x: &[R], rays: &[Ray], jitter: &[f32]
     let mut all = Vec::new();
     assert_eq!(rays.len(), jitter.len());
     for (ray, &jitter) in rays.iter().zip(jitter) {
+        let color_at =
+            |p: [f64; 3]| decode(f, network, &products(f, &f.color, of_color, p), ray.direction.to_array());
         let mut light = R::of(1.0);
         let mut out = [R::of(0.0); RAY_WIDTH];
+        let mut waiting = (R::of(0.0), None); // weight that has no color yet, and its last point
+        let mut color = None;
         let mut walk = Walk::new(&f.lattice, f.mask.as_ref(), ray, jitter);
         while let Some(t) = walk.advance() {
             let p = from_fn(|a| ray.origin[a] as f64 + t as f64 * ray.direction[a] as f64);
@@ -101,11 +105,19 @@ pub(crate) fn render<R: Real>(f: &VmField, x: &[R], rays: &[Ray], jitter: &[f32]
             let w = light * alpha;
             light = light * (R::of(1.0 + 1e-10) - alpha);
             if w.value() > f.shading.weight_threshold as f64 {
-                let c = decode(f, network, &products(f, &f.color, of_color, p), ray.direction.to_array());
-                (0..3).for_each(|k| out[k] += w * c[k]);
+                waiting = (waiting.0 + w, Some(p));
+                if waiting.0.value() >= f.shading.group_weight as f64 {
+                    let c = color_at(p);
+                    (0..3).for_each(|k| out[k] += waiting.0 * c[k]);
+                    (waiting, color) = ((R::of(0.0), None), Some(c));
+                }
             }
             out[3] += w;
             out[4] += w * R::of(t as f64);
+        }
+        if let (w, Some(p)) = waiting {
+            let c = color.unwrap_or_else(|| color_at(p));
+            (0..3).for_each(|k| out[k] += w * c[k]);
         }
         all.extend(out);
     }

@@ -250,8 +250,14 @@ fn radiance(cases: &mut Cases) {
             near: 0.0,
             far: 9.0,
         };
-        let shading =
-            Shading { softplus, shift: -3.0, distance_scale: 25.0, weight_threshold: 0.0, stop: 0.0 };
+        let shading = Shading {
+            softplus,
+            shift: -3.0,
+            distance_scale: 25.0,
+            weight_threshold: 0.0,
+            stop: 0.0,
+            group_weight: 0.0,
+        };
         let grid = |rank| Grid { size: [9, 8, 7], rank };
         let (density, color) = (grid([4, 3, 5]), grid([6, 2, 4]));
         let f = VmField { density, color, decoder, lattice, shading, mask: None };

@@ -30,6 +30,7 @@ pub fn field() -> VmField {
             distance_scale: 25.0,
             weight_threshold: 1e-4,
             stop: 0.0,
+            group_weight: 0.0,
         },
         mask: None,
     }

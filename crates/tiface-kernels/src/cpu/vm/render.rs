@@ -6,6 +6,8 @@
 //! C = Σ w_k c_k  over w_k > threshold     opacity = Σ w_k              depth = Σ w_k t_k
 //! ```
 //!
+//! Neighboring samples of a ray may share a color c_k: see [`Shading::group_weight`].
+//!
 //! A ray is marched, evaluated and composited in one pass, so it can end where its transmittance is
 //! used up.
 
@@ -37,6 +39,10 @@ pub struct Shading {
     pub weight_threshold: f32,
     /// A ray ends where its transmittance is at most this; at 0 it does not end early.
     pub stop: f32,
+    /// Samples next to each other on a ray share the color of the last of them, until their weights
+    /// sum to this; what is left at the end of a ray shares that before. At 0 each has its own.
+    #[serde(default)]
+    pub group_weight: f32,
 }
 
 impl Shading {
@@ -99,6 +105,15 @@ struct KeptSample {
     transmittance: f32,
 }
 
+impl KeptSample {
+    fn weight(&self) -> f32 {
+        self.alpha * self.transmittance
+    }
+}
+
+/// In the place of a color's index: the weight of the sample is too small for one.
+pub(super) const COLORLESS: u32 = u32::MAX;
+
 /// A rendered batch of rays, with the intermediate values that its backward pass needs.
 #[derive(Clone, Debug)]
 pub struct Rendered {
@@ -112,8 +127,8 @@ pub struct Rendered {
     cells: Vec<Cell>,
     /// `[rays + 1]` into `kept`.
     offsets: Vec<u32>,
-    /// Indices into `kept`, in increasing order.
-    colored: Vec<u32>,
+    /// `[kept]`: index into the decoded colors, or [`COLORLESS`].
+    color_of: Vec<u32>,
     decoded: Decoded,
 }
 
@@ -159,6 +174,43 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
 }
 
 dispatch! { fn march_rays / march_body(task: &mut MarchTask, field: &VmField, lookup: &Lookup) }
+
+/// Assigns colors to the samples of a ray, whose indices start at `start`, and appends the samples
+/// that these are decoded at to `colored`.
+pub(super) fn assign_colors(
+    shading: &Shading,
+    weights: impl Iterator<Item = f32>,
+    start: u32,
+    color_of: &mut [u32],
+    colored: &mut Vec<u32>,
+) {
+    let first = colored.len();
+    let mut group = 0f32; // weight of the samples whose color is not decoded yet
+    let mut last = None;
+    for ((i, w), color) in (start..).zip(weights).zip(color_of.iter_mut()) {
+        *color = COLORLESS;
+        if w > shading.weight_threshold {
+            *color = colored.len() as u32;
+            group += w;
+            last = Some(i);
+            if group >= shading.group_weight {
+                colored.extend(last.take());
+                group = 0.0;
+            }
+        }
+    }
+    if colored.len() == first {
+        colored.extend(last);
+        return;
+    }
+    let end = colored.len() as u32;
+    for color in color_of.iter_mut().rev().filter(|color| **color != COLORLESS) {
+        if *color < end {
+            break;
+        }
+        *color = end - 1;
+    }
+}
 
 /// Renders a batch of whole rays; directions may have any length, which is then the unit of `t`.
 ///
@@ -206,37 +258,32 @@ pub fn render(
         cells.extend_from_slice(&task.cells);
         density_samples += task.looked_up;
     }
-    let threshold = field.shading.weight_threshold;
+    let mut color_of = vec![COLORLESS; total];
     let mut colored = Vec::with_capacity(total);
     let mut directions = Vec::with_capacity(total);
     for (ray, range) in rays.iter().zip(offsets.windows(2)) {
-        for i in range[0]..range[1] {
-            let k = &kept[i as usize];
-            if k.alpha * k.transmittance > threshold {
-                colored.push(i);
-                directions.push(ray.direction.to_array());
-            }
-        }
+        let of_ray = range[0] as usize..range[1] as usize;
+        let weights = kept[of_ray.clone()].iter().map(KeptSample::weight);
+        assign_colors(&field.shading, weights, range[0], &mut color_of[of_ray], &mut colored);
+        directions.resize(colored.len(), ray.direction.to_array());
     }
     let color_cells: Vec<Cell> = colored.iter().map(|&i| cells[i as usize]).collect();
     let decoded = decoder::decode(&field.color, color, decoder, color_cells, &directions);
 
     let mut out = vec![0f32; rays.len() * RAY_WIDTH];
-    let mut next = 0;
     for (r, out) in out.chunks_exact_mut(RAY_WIDTH).enumerate() {
-        for i in offsets[r]..offsets[r + 1] {
-            let k = &kept[i as usize];
-            let w = k.alpha * k.transmittance;
-            if colored.get(next) == Some(&i) {
-                (0..3).for_each(|c| out[c] += w * decoded.rgb[next][c]);
-                next += 1;
+        for i in offsets[r] as usize..offsets[r + 1] as usize {
+            let k = &kept[i];
+            let w = k.weight();
+            if let Some(color) = decoded.rgb.get(color_of[i] as usize) {
+                (0..3).for_each(|c| out[c] += w * color[c]);
             }
             out[3] += w;
             out[4] += w * k.t;
         }
     }
     let color_samples = colored.len() as u64;
-    Rendered { out, density_samples, color_samples, kept, cells, offsets, colored, decoded }
+    Rendered { out, density_samples, color_samples, kept, cells, offsets, color_of, decoded }
 }
 
 #[inline(always)]
@@ -275,29 +322,28 @@ pub fn backward(
     g_density: &mut [f32],
     g_color: &mut [f32],
 ) -> Vec<f32> {
-    let Rendered { kept, cells, offsets, colored, decoded, .. } = rendered;
+    let Rendered { kept, cells, offsets, color_of, decoded, .. } = rendered;
     let length = field.lattice.step * field.shading.distance_scale;
     let mut g_feature = vec![0f32; kept.len()];
-    let mut g_rgb = vec![[0f32; 3]; colored.len()];
-    let mut end = colored.len();
+    let mut g_rgb = vec![[0f32; 3]; decoded.rgb.len()];
     for r in (0..offsets.len() - 1).rev() {
         let g = &g[r * RAY_WIDTH..][..RAY_WIDTH];
         let mut farther = 0f32; // Σ w_j dL/dw_j over the farther samples
         for i in (offsets[r]..offsets[r + 1]).rev() {
-            let k = &kept[i as usize];
-            let w = k.alpha * k.transmittance;
+            let i = i as usize;
+            let k = &kept[i];
+            let w = k.weight();
             let mut g_w = g[3] + g[4] * k.t;
-            if end > 0 && colored[end - 1] == i {
-                end -= 1;
-                let c = decoded.rgb[end];
+            let color = color_of[i] as usize;
+            if let (Some(c), Some(g_rgb)) = (decoded.rgb.get(color), g_rgb.get_mut(color)) {
                 g_w += g[0] * c[0] + g[1] * c[1] + g[2] * c[2];
-                g_rgb[end] = [w * g[0], w * g[1], w * g[2]];
+                (0..3).for_each(|channel| g_rgb[channel] += w * g[channel]);
             }
             let open = 1.0 - k.alpha;
             let g_alpha = k.transmittance * g_w - farther / (open + 1e-10);
             // dα/dσ = (1 − α) δ s
             let slope = field.shading.slope::<true>(k.feature);
-            g_feature[i as usize] = g_alpha * open * length * slope;
+            g_feature[i] = g_alpha * open * length * slope;
             farther += w * g_w;
         }
     }

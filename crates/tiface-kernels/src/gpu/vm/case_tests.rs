@@ -30,6 +30,7 @@ pub(super) struct Shape {
     pub color: [usize; 3],
     pub threshold: f32,
     pub stop: f32,
+    pub group_weight: f32,
     pub masked: bool,
 }
 
@@ -43,6 +44,7 @@ pub(super) const NARROW: Shape = Shape {
     color: [24, 24, 24],
     threshold: 1e-3,
     stop: 1e-3,
+    group_weight: 0.05,
     masked: true,
 };
 
@@ -69,6 +71,7 @@ pub(super) fn case(shape: Shape, count: u64) -> Case {
             distance_scale: 3.0,
             weight_threshold: shape.threshold,
             stop: shape.stop,
+            group_weight: shape.group_weight,
         },
         mask: shape.masked.then_some(mask),
     };

@@ -12,27 +12,32 @@ use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
 
-/// Computes the weights of samples up to where a ray's transmittance is used up, and counts the
-/// samples whose weight is above the threshold, which need a color.
+/// In the place of a color's index: the weight of the sample is too small for one.
+const COLORLESS: u32 = u32::MAX;
+
+/// Computes the weights of samples up to where a ray's transmittance is used up, and numbers the
+/// colors that they share, from 0 on each ray.
 #[cube(launch)]
 fn compute_weights(
     offsets: &[u32],
     feature: &[f32],
     alpha: &mut [f32],
     light: &mut [f32],
-    weight: &mut [f32],
+    color_of: &mut [u32],
     ends: &mut [u32],
     counts: &mut [u32],
     shift: f32,
     length: f32,
     threshold: f32,
+    group_weight: f32,
     stop: f32,
     #[comptime] softplus: bool,
 ) {
     let r = ABSOLUTE_POS;
     if r < ends.len() {
         let mut transmittance = 1.0f32;
-        let mut colored = 0u32;
+        let mut colors = 0u32;
+        let mut group = 0.0f32; // weight of the samples whose color is not counted yet
         let mut s = offsets[r] as usize;
         let end = offsets[r + 1] as usize;
         let mut marching = s < end;
@@ -47,28 +52,36 @@ fn compute_weights(
             let w = a * transmittance;
             alpha[s] = a;
             light[s] = transmittance;
-            weight[s] = w;
-            colored += select(w > threshold, 1u32, 0u32);
+            let has_color = w > threshold;
+            color_of[s] = select(has_color, colors, COLORLESS);
+            group += select(has_color, w, 0.0f32);
+            let full = has_color && group >= group_weight;
+            colors += select(full, 1u32, 0u32);
+            group = select(full, 0.0f32, group);
             transmittance *= 1.0f32 - a + 1e-10f32;
             s += 1;
             let dark = a > 0.0f32 && transmittance <= stop;
             marching = s < end && !dark;
         }
         ends[r] = s as u32;
-        counts[r] = colored;
+        counts[r] = select(group > 0.0f32, max(colors, 1u32), colors);
     }
 }
 
-/// Lists the samples whose weight is above the threshold.
+/// Lists the samples at which colors are decoded: the last of each group. Numbers the colors in the
+/// order of that list; what is left at the end of a ray shares the color before.
 #[cube(launch)]
-fn list(offsets: &[u32], ends: &[u32], weight: &[f32], firsts: &[u32], index: &mut [u32], threshold: f32) {
+fn list(offsets: &[u32], ends: &[u32], color_of: &mut [u32], firsts: &[u32], index: &mut [u32]) {
     let r = ABSOLUTE_POS;
     if r < ends.len() {
-        let mut next = firsts[r] as usize;
+        let (first, end) = (firsts[r], firsts[r + 1]);
         for s in (offsets[r] as usize)..(ends[r] as usize) {
-            if weight[s] > threshold {
-                index[next] = s as u32;
-                next += 1;
+            let color = color_of[s];
+            if color != COLORLESS {
+                if first + color < end {
+                    index[(first + color) as usize] = s as u32;
+                }
+                color_of[s] = min(first + color, end - 1);
             }
         }
     }
@@ -79,24 +92,23 @@ fn list(offsets: &[u32], ends: &[u32], weight: &[f32], firsts: &[u32], index: &m
 fn composite(
     offsets: &[u32],
     ends: &[u32],
-    firsts: &[u32],
     t: &[f32],
-    weight: &[f32],
+    alpha: &[f32],
+    light: &[f32],
+    color_of: &[u32],
     rgb: &[f32],
     out: &mut [f32],
-    threshold: f32,
 ) {
     let r = ABSOLUTE_POS;
     let rays = ends.len();
     if r < rays {
         let plane = rgb.len() / 3;
-        let mut next = firsts[r] as usize;
         let mut sums = Composited::empty();
         for s in (offsets[r] as usize)..(ends[r] as usize) {
-            let w = weight[s];
-            if w > threshold {
-                sums.rgb.add_weighted(w, Vec3::read(rgb, plane, next));
-                next += 1;
+            let w = alpha[s] * light[s];
+            let color = color_of[s];
+            if color != COLORLESS {
+                sums.rgb.add_weighted(w, Vec3::read(rgb, plane, color as usize));
             }
             sums.add(w, t[s]);
         }
@@ -110,19 +122,17 @@ fn composite(
 fn backward(
     offsets: &[u32],
     ends: &[u32],
-    firsts: &[u32],
     t: &[f32],
     feature: &[f32],
     alpha: &[f32],
     light: &[f32],
-    weight: &[f32],
+    color_of: &[u32],
     rgb: &[f32],
     g_out: &[f32],
     g_feature: &mut [f32],
     g_pre: &mut [f32],
     shift: f32,
     length: f32,
-    threshold: f32,
     #[comptime] softplus: bool,
 ) {
     let r = ABSOLUTE_POS;
@@ -135,22 +145,27 @@ fn backward(
         for s in end..(offsets[r + 1] as usize) {
             g_feature[s] = 0.0f32;
         }
-        let mut next = firsts[r + 1] as usize;
+        let mut of_group = Vec3::zero(); // gradient with respect to the color of the group
+        let mut group = color_of.len() as u32; // the index of no color
         let mut farther = 0.0f32; // Σ_{j>k} w_j dL/dw_j
         for k in 0..end - begin {
             let s = end - 1 - k;
-            let w = weight[s];
+            let w = alpha[s] * light[s];
             let mut g_w = g_opacity + g_depth * t[s];
-            if w > threshold {
-                next -= 1;
-                let c = Vec3::read(rgb, plane, next);
+            let color = color_of[s];
+            if color != COLORLESS {
+                let c = Vec3::read(rgb, plane, color as usize);
                 g_w += g_color.dot(c);
+                let same = color == group;
+                group = color;
+                of_group.x = select(same, of_group.x, 0.0f32) + w * g_color.x;
+                of_group.y = select(same, of_group.y, 0.0f32) + w * g_color.y;
+                of_group.z = select(same, of_group.z, 0.0f32) + w * g_color.z;
                 // the derivative of a sigmoid with value c is c (1 − c)
-                let g = g_color * w;
-                let x = g.x * c.x * (1.0f32 - c.x);
-                let y = g.y * c.y * (1.0f32 - c.y);
-                let z = g.z * c.z * (1.0f32 - c.z);
-                Vec3::new(x, y, z).write(g_pre, plane, next);
+                let x = of_group.x * c.x * (1.0f32 - c.x);
+                let y = of_group.y * c.y * (1.0f32 - c.y);
+                let z = of_group.z * c.z * (1.0f32 - c.z);
+                Vec3::new(x, y, z).write(g_pre, plane, color as usize);
             }
             let open = 1.0f32 - alpha[s];
             let g_alpha = light[s] * g_w - farther / (open + 1e-10f32);
@@ -183,13 +198,14 @@ pub struct CompositedRays {
     pub out: Buffer,
     alpha: Buffer,
     light: Buffer,
-    weight: Buffer,
+    color_of: Buffer,
     ends: Buffer,
     counts: Buffer,
     firsts: Buffer,
     shift: f32,
     length: f32,
     threshold: f32,
+    group_weight: f32,
     stop: f32,
     softplus: bool,
 }
@@ -223,13 +239,14 @@ impl CompositedRays {
             out: device.scratch::<f32>(RAY_WIDTH * rays),
             alpha: samples(1),
             light: samples(1),
-            weight: samples(1),
+            color_of: device.scratch::<u32>(capacity),
             ends: device.scratch::<u32>(rays),
             counts: device.scratch::<u32>(rays),
             firsts: device.scratch::<u32>(rays + 1),
             shift: s.shift,
             length: field.lattice.step * s.distance_scale,
             threshold: s.weight_threshold,
+            group_weight: s.group_weight,
             stop: s.stop,
             softplus: s.softplus,
         }
@@ -243,20 +260,20 @@ impl CompositedRays {
     /// color.
     pub fn compute_weights(&self, device: &Device, samples: &VmSamples) {
         launch!(device, compute_weights::launch, self.groups(), UNITS;
-            samples.offsets, self.feature, self.alpha, self.light, self.weight, self.ends, self.counts;
-            self.shift, self.length, self.threshold, self.stop, self.softplus
+            samples.offsets, self.feature, self.alpha, self.light, self.color_of, self.ends, self.counts;
+            self.shift, self.length, self.threshold, self.group_weight, self.stop, self.softplus
         );
         prefix_sum(device, &self.counts, &self.firsts, &self.count, self.index.word_count());
         launch!(device, list::launch, self.groups(), UNITS;
-            samples.offsets, self.ends, self.weight, self.firsts, self.index; self.threshold
+            samples.offsets, self.ends, self.color_of, self.firsts, self.index
         );
     }
 
     /// Composites the colors of samples.
     pub fn composite(&self, device: &Device, samples: &VmSamples) {
         launch!(device, composite::launch, self.groups(), UNITS;
-            samples.offsets, self.ends, self.firsts, samples.t, self.weight, self.rgb, self.out;
-            self.threshold
+            samples.offsets, self.ends, samples.t, self.alpha, self.light, self.color_of, self.rgb,
+            self.out
         );
     }
 
@@ -268,9 +285,9 @@ impl CompositedRays {
                 && self.g_feature.word_count() == self.feature.word_count()
         );
         launch!(device, backward::launch, self.groups(), UNITS;
-            samples.offsets, self.ends, self.firsts, samples.t, self.feature, self.alpha, self.light,
-            self.weight, self.rgb, g_out, self.g_feature, self.g_pre;
-            self.shift, self.length, self.threshold, self.softplus
+            samples.offsets, self.ends, samples.t, self.feature, self.alpha, self.light, self.color_of,
+            self.rgb, g_out, self.g_feature, self.g_pre;
+            self.shift, self.length, self.softplus
         );
     }
 }

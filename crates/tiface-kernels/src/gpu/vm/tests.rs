@@ -18,6 +18,7 @@ const WIDE: Shape = Shape {
     color: [9, 0, 6],
     threshold: 0.0,
     stop: 0.0,
+    group_weight: 0.0,
     masked: false,
 };
 
