@@ -2,10 +2,11 @@
 //! thread.
 //!
 //! ```text
-//! cargo bench --bench simplify                           202 k to 40 k triangles, 506 k to 100 k
-//! cargo bench --bench simplify -- 245 40000              one of them: nodes along an axis, target
-//! cargo bench --bench simplify -- --write 245 head       the input as head.vertices, head.triangles
-//! cargo bench --bench simplify -- --read a.vertices a.triangles   the accuracy of another tool's result
+//! cargo bench --bench simplify                      202 k to 40 k triangles, 506 k to 100 k
+//! cargo bench --bench simplify -- 245 40000         one of them: nodes along an axis, target
+//! cargo bench --bench simplify -- --write 245 head  the input as head.vertices, head.triangles
+//! cargo bench --bench simplify -- --read a.vertices a.triangles
+//!                                                   the accuracy of another tool's result
 //! ```
 //! Errors are distances of points of the triangles to the true surface, weighted by area, in 512ths
 //! of the cube's edge. Raw files are little-endian f32 and u32.

@@ -252,7 +252,8 @@ impl Config {
     /// assert_eq!((config.preset, config.mesh.resolution), (Preset::Standard, 300));
     ///
     /// let error = Config::resolve(&set("mesh.resolutoin=300")).unwrap_err();
-    /// assert_eq!(error.to_string(), "`--set mesh.resolutoin=300`: there is no key `mesh.resolutoin`");
+    /// let expected = "`--set mesh.resolutoin=300`: there is no key `mesh.resolutoin`";
+    /// assert_eq!(error.to_string(), expected);
     /// assert!(error.hint().starts_with("did you mean `mesh.resolution`?"));
     /// # Ok::<(), tiface::Error>(())
     /// ```

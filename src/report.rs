@@ -250,7 +250,8 @@ pub fn html(report: &Report) -> Result<String> {
         include_str!("report/page.html"),
         &format!("{}\n{viewer_script}", include_str!("report/page.js")),
         context! {
-            style => STYLE, viewer, methods, heat => heat(), most => (MAX_ERROR * 255.0).round(), ..minijinja::Value::from_serialize(report)
+            style => STYLE, viewer, methods, heat => heat(), most => (MAX_ERROR * 255.0).round(),
+            ..minijinja::Value::from_serialize(report)
         },
     )
 }

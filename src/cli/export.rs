@@ -13,6 +13,7 @@ use glam::{DVec3, Vec3};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use tiface_base::{Error, Quiet, Result, io};
+use tiface_surface::CutReport;
 use tiface_surface::files::ExportedFiles;
 
 /// Options of `tiface export`.
@@ -24,7 +25,8 @@ pub(super) struct ExportOptions {
     path: Option<PathBuf>,
     /// Formats to write: glb, obj, ply, usdz [default: as --out ends, else glb]
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
-    #[arg(value_parser = PossibleValuesParser::new(MeshFormat::ALL.map(MeshFormat::as_str)).try_map(|word| word.parse::<MeshFormat>()))]
+    #[arg(value_parser = PossibleValuesParser::new(MeshFormat::ALL.map(MeshFormat::as_str))
+        .try_map(|word| word.parse::<MeshFormat>()))]
     format: Vec<MeshFormat>,
     /// Material of GLB and USDZ: unlit (colors as photographed) or lit (shaded by lamps)
     /// [default: unlit; lit with a normal map]
@@ -318,13 +320,21 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
     let is_glb = |file: &PathBuf| file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("glb"));
     let of_layers = if written.iter().any(is_glb) { head.layer_triangles() } else { 0 };
     let triangles = head.triangles(0);
-    let ([x, y, z], chin_to_crown) = (head.size_m()?, head.head_height_m());
+    let ([x, y, z], chin_to_crown, cut) = (head.size_m()?, head.head_height_m(), head.cut_m());
     let levels: Vec<(usize, [f64; 2])> = (1..)
         .zip(head.level_distances_m())
         .map(|(level, m)| (head.triangles(level), m.map(|m| 1e3 * m)))
         .collect();
     if invocation.common.json {
         let level = |(triangles, [largest, mean]): &(usize, [f64; 2])| json!({"triangles": triangles, "largest_mm": largest, "mean_mm": mean});
+        let cut = cut.map(|CutReport { moved, dropped, loops, face_triangles }| {
+            json!({
+                "face_triangles": face_triangles,
+                "loops": loops,
+                "dropped": dropped,
+                "moved_mm": 1e3 * moved,
+            })
+        });
         let result = json!({
             "event": "result",
             "source": source,
@@ -332,6 +342,7 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
             "bytes": written.iter().map(|file| io::file_size(file)).collect::<Vec<_>>(),
             "triangles": triangles,
             "layer_triangles": of_layers,
+            "cut": cut,
             "levels": levels.iter().map(level).collect::<Vec<_>>(),
             "size_m": [x, y, z],
             "head_m": chin_to_crown,
@@ -347,14 +358,18 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
     };
     let mut text: String = written.iter().map(file).collect();
     let layers = if of_layers > 0 { format!(", and {of_layers} of soft layers") } else { String::new() };
-    text += &format!("export    {triangles} triangles{layers}\n");
+    let face = cut.map(|cut| format!(", {} of them close the cut", cut.face_triangles));
+    text += &format!("export    {triangles} triangles{}{layers}\n", face.unwrap_or_default());
     for (triangles, [largest, mean]) in levels {
         text += &format!(
             "export    {triangles} triangles, up to {largest:.2} mm from these, {mean:.2} mm on average\n"
         );
     }
     text += &format!("export    {x:.3} x {y:.3} x {z:.3} m");
-    text += &chin_to_crown.map_or("\n".into(), |meters| format!("; {meters:.3} m from chin to crown\n"));
+    // a mesh of fewer triangles, or one that is cut, may not say where its chin is
+    let height =
+        chin_to_crown.map(|meters| format!("; {meters:.3} m from chin to crown of the run's own mesh"));
+    text += &format!("{}\n", height.unwrap_or_default());
     print(&text)
 }
 

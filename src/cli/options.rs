@@ -31,7 +31,8 @@ pub(super) struct Common {
     pub config: Vec<PathBuf>,
     /// Configuration preset
     #[arg(long, global = true)]
-    #[arg(value_parser = PossibleValuesParser::new(Preset::ALL.map(Preset::as_str)).try_map(|word| word.parse::<Preset>()))]
+    #[arg(value_parser = PossibleValuesParser::new(Preset::ALL.map(Preset::as_str))
+        .try_map(|word| word.parse::<Preset>()))]
     pub preset: Option<Preset>,
     /// Set a configuration key; repeatable
     #[arg(long, global = true, value_name = "KEY=VALUE", add = ArgValueCompleter::new(complete_setting))]
@@ -54,7 +55,8 @@ pub(super) struct Common {
     pub seed: Option<u64>,
     /// Recompute a stage and all stages that depend on it
     #[arg(long, global = true, value_name = "STAGE")]
-    #[arg(value_parser = PossibleValuesParser::new(Stage::ALL.map(Stage::as_str)).try_map(|word| word.parse::<Stage>()))]
+    #[arg(value_parser = PossibleValuesParser::new(Stage::ALL.map(Stage::as_str))
+        .try_map(|word| word.parse::<Stage>()))]
     pub fresh: Option<Stage>,
     /// Print the plan without running it
     #[arg(long, global = true)]

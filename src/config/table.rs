@@ -19,7 +19,8 @@
 ///         checkpoint_s: f64, 0.05..=86_400.0 [nothing] => 60.0;
 ///     }
 ///     constants {
-///         /// Part of a preset that users have no reason to change: no key, not written to `config.toml`.
+///         /// Part of a preset that users have no reason to change: no key, not written to
+///         /// `config.toml`.
 ///         lr_grid: f64 => 0.02;
 ///     }
 /// }

@@ -1,10 +1,11 @@
 //! The trainer that all fields share.
 //!
 //! ```text
-//! restore, or start and save → prepare → rays, losses, gradients → Adam → read losses → after the step
-//!                                → not finite? back to the last checkpoint, once
-//!                                → stop asked for, or time? save
-//!                                → finish
+//! restore, or start and save
+//!   → prepare → rays, losses, gradients → Adam → read losses → after the step
+//!     → not finite? back to the last checkpoint, once
+//!     → stop asked for, or time? save
+//!     → finish
 //! ```
 //!
 //! A model defines what differs between fields, and keeps its rays, samples, parameters and moments

@@ -6,7 +6,7 @@
 //! | `table` | `[entries, 2]` | |
 //! | `v1`, `g1`, `b1` | `[64, 3 + 2 levels]`, `[64, 1]`, `[64]` | directions, row lengths, bias |
 //! | `v2`, `g2`, `b2` | `[13, 64]`, `[13, 1]`, `[13]` | |
-//! | `c1`, `c2`, `c3` | `[64, 32]`, `[64, 64]`, `[3, 64]` | `c1` with the color skip `[64, 32 + 2 levels]` |
+//! | `c1`, `c2`, `c3` | `[64, 32]`, `[64, 64]`, `[3, 64]` | `c1` with skip `[64, 32 + 2 levels]` |
 //! | `variance` | `[1]` | v of inv_s = exp(10 v) |
 //!
 //! Columns of `v1` are the position, then the features.

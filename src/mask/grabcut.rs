@@ -4,7 +4,8 @@
 //! round's labels are the smallest cut of
 //!
 //! ```text
-//! E = Σ_p −ln p(c_p | label) + γ Σ_pq exp(−β ‖c_p − c_q‖²) / |p − q| · [labels differ],  β = 1 / (2 ⟨‖Δ‖²⟩)
+//! E = Σ_p −ln p(c_p | label) + γ Σ_pq exp(−β ‖c_p − c_q‖²) / |p − q| · [labels differ]
+//! β = 1 / (2 ⟨‖Δ‖²⟩)
 //! ```
 //!
 //! over 8 neighbors. At the end only pieces with a click stay, small holes are filled and threads
@@ -75,7 +76,8 @@ pub struct HardMask {
 /// use tiface::mask::grabcut::grabcut;
 ///
 /// let inside = |i: u32| (16..48).contains(&(i % 64)) && (16..48).contains(&(i / 64));
-/// let rgb = (0..64 * 64).map(|i| if inside(i) { [200, 160, 140] } else { [15, 15, 20] }).collect();
+/// let color = |i: u32| if inside(i) { [200, 160, 140] } else { [15, 15, 20] };
+/// let rgb = (0..64 * 64).map(color).collect();
 /// let photo = Photo { width: 64, height: 64, rgb, alpha: None };
 /// let clicks = [(32.0, 32.0, true), (4.0, 32.0, false)].map(|(x, y, head)| Click { x, y, head });
 /// let cut = grabcut("example", &photo, &clicks)?;

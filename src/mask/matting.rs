@@ -13,7 +13,9 @@
 //! The trimap has the unknown region around a mask's outline:
 //!
 //! ```text
-//! 255  still head after the mask was shrunk      0  still outside after it was grown      128  between
+//! 255  still head after the mask was shrunk
+//! 128  between
+//!   0  still outside after it was grown
 //! ```
 //!
 //! Two ways to shrink and grow: squares as the published pipeline does (OpenCV's `erode` and

@@ -125,20 +125,7 @@ pub fn seen_one_way(
 mod tests {
     use super::*;
     use glam::DVec3;
-
-    /// Returns a 2 × 1 rectangle at height z, of two triangles.
-    fn sheet(z: f32) -> Mesh {
-        Mesh {
-            positions: vec![
-                Vec3::new(0.0, 0.0, z),
-                Vec3::new(2.0, 0.0, z),
-                Vec3::new(2.0, 1.0, z),
-                Vec3::new(0.0, 1.0, z),
-            ],
-            triangles: vec![[0, 1, 2], [0, 2, 3]],
-            ..Mesh::default()
-        }
-    }
+    use tiface_base::geom::testing::sheet;
 
     #[test]
     fn a_sheet_under_another_is_not_seen_from_above() {

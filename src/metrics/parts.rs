@@ -2,7 +2,7 @@
 //!
 //! | part | pixels |
 //! | --- | --- |
-//! | opaque | the mask is 1 (alpha ≥ 0.999): neither background nor partial coverage has an influence |
+//! | opaque | the mask is 1 (alpha ≥ 0.999): neither background nor partial coverage counts |
 //! | edge | within 3 pixels of the mask's 0.5 contour, on either side; the frame's border is none |
 //! | skin, hair | pixels of the region of interest, as [`Tones`] classifies them |
 //!

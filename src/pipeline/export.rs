@@ -6,6 +6,8 @@
 //! fewer triangles gets an atlas of its own, and everything that it shows from the nearest points
 //! of the kept one ([`resized`]).
 
+mod request;
+
 use super::advice::{advised, sentence};
 use super::cameras::CameraCheck;
 use super::frames::{Export, Material, MeshFrame, center};
@@ -14,6 +16,8 @@ use super::scene_file::read_capture;
 use super::session::unusable;
 use crate::config::{Config, MeshFormat, Stage, key};
 use glam::{DVec3, Vec3};
+pub use request::{Cut, ExportRequest, Size};
+use request::{TEXTURED, not_shown};
 use std::path::{Path, PathBuf};
 use tiface_base::geom::{ShellLayer, Similarity};
 use tiface_base::{Error, Fingerprint, Monitor, Result};
@@ -21,107 +25,9 @@ use tiface_surface::files::{
     ExportedFiles, ExtractedSurface, HeadMesh, LOBE_TEXEL, OpenedMesh, open_mesh, weld,
 };
 use tiface_surface::{
-    AtlasConfig, DetailLevel, HeadMeasures, Plane, Resize, Warning, cut, lods, measure, most_levels, resized,
+    AtlasConfig, CutReport, DetailLevel, HeadMeasures, Plane, Resize, Warning, cut, lods, measure,
+    most_levels, resized,
 };
-
-/// What files show of a kept head, and how they are written.
-#[derive(Clone, Debug)]
-pub struct ExportRequest {
-    /// Formats to write.
-    pub formats: Vec<MeshFormat>,
-    /// Material of GLB and USDZ; unlit by default, but lit with a normal map.
-    pub material: Option<Material>,
-    /// Coordinate frame.
-    pub frame: MeshFrame,
-    /// Whether the color is stored as JPEG, not PNG.
-    pub jpeg: bool,
-    /// Whether a GLB is compressed, with its color as JPEG.
-    pub compress: bool,
-    /// Meters per unit of an OBJ, which states none.
-    pub obj_unit_m: f64,
-    /// What the size of the files follows.
-    pub size: Size,
-    /// Where the head ends.
-    pub cut: Cut,
-    /// Number of triangles at most; by default those of the run's own files.
-    pub triangles: Option<u32>,
-    /// Number of levels of detail, each with half the triangles of the one before.
-    pub levels: usize,
-    /// Side of the texture, texels, 0 for colors at the vertices; by default the kept one.
-    pub texture_px: Option<u32>,
-    /// Whether soft layers are written.
-    pub layers: bool,
-    /// Whether view-dependent color is written.
-    pub lobes: bool,
-    /// Whether a normal map is written.
-    pub normal_map: bool,
-}
-
-impl Default for ExportRequest {
-    fn default() -> ExportRequest {
-        ExportRequest {
-            formats: vec![MeshFormat::Glb],
-            material: None,
-            frame: MeshFrame::Dataset,
-            jpeg: false,
-            compress: false,
-            obj_unit_m: 1.0,
-            size: Size::Dataset,
-            cut: Cut::None,
-            triangles: None,
-            levels: 1,
-            texture_px: None,
-            layers: true,
-            lobes: true,
-            normal_map: true,
-        }
-    }
-}
-
-/// What the size of a head in its files follows.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Size {
-    /// The length of the dataset's unit, `capture.unit_m`.
-    Dataset,
-    /// The head's height from chin to crown, meters.
-    Head(f64),
-    /// The distance between two points of the dataset's world, meters.
-    Between([DVec3; 2], f64),
-}
-
-/// Where a head ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Cut {
-    /// Where the run's own ends.
-    None,
-    /// Below the chin, rising to the nape.
-    Chin,
-    /// At the neck's base, above the shoulders.
-    Collar,
-}
-
-/// Formats of a textured mesh in meters; the others keep the dataset's world.
-const TEXTURED: &[MeshFormat] = &[MeshFormat::Glb, MeshFormat::Obj, MeshFormat::Usdz];
-
-/// Formats that say how light falls on a mesh.
-const SHADED: &[MeshFormat] = &[MeshFormat::Glb, MeshFormat::Usdz];
-
-impl ExportRequest {
-    /// Returns the options that are asked for, each with what it is and the formats that show it.
-    fn options(&self) -> Vec<(&'static str, &'static str, &'static [MeshFormat])> {
-        let options = [
-            (self.material.is_some(), "--material", "choice of material", SHADED),
-            (self.frame != MeshFrame::Dataset, "--frame", "frame but the dataset's", TEXTURED),
-            (self.jpeg, "--jpeg", "picture", TEXTURED),
-            (self.compress, "--compress", "compression", &[MeshFormat::Glb]),
-            (self.obj_unit_m != 1.0, "--unit", "choice of unit", &[MeshFormat::Obj]),
-            (matches!(self.size, Size::Head(_)), "--height", "height in meters", TEXTURED),
-            (matches!(self.size, Size::Between(..)), "--measure", "length in meters", TEXTURED),
-        ];
-        let asked = options.into_iter().filter(|(asked, ..)| *asked);
-        asked.map(|(_, option, what, shown_by)| (option, what, shown_by)).collect()
-    }
-}
 
 /// A head to be exported: that of a finished run, as the stage `mesh` left it, or that of a file.
 pub struct KeptHead {
@@ -140,6 +46,8 @@ pub struct KeptHead {
     /// Where its parts are before it is cut, in scene coordinates; `None` if its shape does not
     /// say.
     measures: Option<HeadMeasures>,
+    /// How it was cut, if it was.
+    cut: Option<CutReport>,
     /// Warnings for the user.
     pub warnings: Vec<String>,
 }
@@ -174,8 +82,8 @@ impl KeptHead {
 
     fn new(head: HeadMesh, gutter_px: u32, export: Export) -> KeptHead {
         let (levels, beside, warnings) = (Vec::new(), Vec::new(), Vec::new());
-        let (run, texture_problem, measures) = (None, None, None);
-        KeptHead { run, head, gutter_px, export, texture_problem, beside, levels, measures, warnings }
+        let (run, texture_problem, measures, cut) = (None, None, None, None);
+        KeptHead { run, head, gutter_px, export, texture_problem, beside, levels, measures, cut, warnings }
     }
 
     /// Opens a mesh file. `up` is its up direction; its unit is the meter.
@@ -252,6 +160,7 @@ impl KeptHead {
             if done.dropped > 0 {
                 self.warnings.push(format!("{} smaller pieces above the cut are left out", done.dropped));
             }
+            self.cut = Some(done);
         }
         self.make_levels(asked.levels, monitor)?;
         let has_normals = self.head.texture.as_ref().is_some_and(|t| t.normal.is_some());
@@ -354,14 +263,24 @@ impl KeptHead {
         self.level(level).mesh.triangles.len()
     }
 
+    /// Returns the length of a unit of the scene in GLB, OBJ and USDZ files, meters.
+    fn scene_unit_m(&self) -> f64 {
+        self.head.world_from_scene.scale * self.export.unit_m
+    }
+
     /// Returns the largest and the mean distance of each smaller level of detail from the first, in
     /// the units of GLB, OBJ and USDZ files, meters.
     pub fn level_distances_m(&self) -> Vec<[f64; 2]> {
-        let meters = self.head.world_from_scene.scale * self.export.unit_m;
+        let meters = self.scene_unit_m();
         self.levels
             .iter()
             .map(|level| [level.largest, level.mean].map(|distance| meters * distance))
             .collect()
+    }
+
+    /// Returns how the head was cut, if it was, with lengths in GLB, OBJ and USDZ files, meters.
+    pub fn cut_m(&self) -> Option<CutReport> {
+        self.cut.as_ref().map(|cut| CutReport { moved: self.scene_unit_m() * cut.moved, ..cut.clone() })
     }
 
     /// Returns the number of triangles of its soft layers, which a GLB alone has.
@@ -371,11 +290,12 @@ impl KeptHead {
         shells.iter().flat_map(|shells| &shells.layers).map(count).sum()
     }
 
-    /// Returns the height of the head from chin to crown in GLB, OBJ and USDZ files, meters; `None`
-    /// if its shape does not say where the chin is.
+    /// Returns the height of the head from chin to crown in GLB, OBJ and USDZ files, meters, as it
+    /// is before triangles are taken away and the head is cut; `None` if its shape does not say
+    /// where the chin is.
     pub fn head_height_m(&self) -> Option<f64> {
         let measures = self.measures.as_ref()?;
-        Some(f64::from(measures.height()) * self.head.world_from_scene.scale * self.export.unit_m)
+        Some(f64::from(measures.height()) * self.scene_unit_m())
     }
 
     /// Returns the width, height and depth of the mesh in GLB, OBJ and USDZ files, meters.
@@ -471,9 +391,9 @@ impl KeptHead {
             return Ok(false);
         }
         let resize = Resize { triangles: triangles.min(most), atlas: self.atlas_config(px) };
-        let (head, done) = resized(&self.head, &surface, &resize, monitor).map_err(advised)?;
+        let (head, warnings) = resized(&self.head, &surface, &resize, monitor).map_err(advised)?;
         self.head = head;
-        self.warnings.extend(done.warnings.iter().map(as_options));
+        self.warnings.extend(warnings.iter().map(as_options));
         Ok(true)
     }
 
@@ -502,11 +422,9 @@ impl KeptHead {
                 if most == 1 { "leave `--lod` out".into() } else { format!("write {most} levels at most") },
             ));
         }
-        let mut all = lods(&self.head, levels, &atlas, monitor).map_err(advised)?;
-        self.levels = all.split_off(1);
-        let reports = self.levels.iter().filter_map(|level| level.report.as_ref());
+        self.levels = lods(&self.head, levels, &atlas, monitor).map_err(advised)?;
         let mut said: Vec<String> =
-            reports.flat_map(|report| report.warnings.iter().map(as_options)).collect();
+            self.levels.iter().flat_map(|level| level.warnings.iter().map(as_options)).collect();
         said.dedup();
         self.warnings.extend(said);
         Ok(())
@@ -517,30 +435,6 @@ impl KeptHead {
 fn as_options(warning: &Warning) -> String {
     let options = [(key!(mesh.triangles), "--triangles"), (key!(mesh.texture_px), "--texture")];
     options.iter().fold(sentence(warning), |text, (key, option)| text.replace(key, option))
-}
-
-/// Returns a warning that names the formats which do not show what an option asks for. Fails if
-/// none shows it.
-fn not_shown(
-    option: &str,
-    what: &str,
-    shown_by: &[MeshFormat],
-    formats: &[MeshFormat],
-) -> Result<Option<String>> {
-    let endings = |list: &mut dyn Iterator<Item = &MeshFormat>| {
-        list.map(|format| format!(".{}", format.as_str())).collect::<Vec<_>>().join(", ")
-    };
-    let without = endings(&mut formats.iter().filter(|f| !shown_by.contains(f)));
-    if without.is_empty() {
-        return Ok(None);
-    }
-    let problem = format!("`{option}` does not affect {without} files, which have no {what}");
-    match formats.iter().any(|f| shown_by.contains(f)) {
-        true => Ok(Some(problem)),
-        false => {
-            Err(Error::usage(problem, format!("leave it out, or write {}", endings(&mut shown_by.iter()))))
-        }
-    }
 }
 
 #[cfg(test)]

@@ -139,6 +139,8 @@ fn the_stages_after_learning_keep_the_exact_head_exact() {
     // a little is left below the chin, and less at the nape
     assert!((0.24..0.26).contains(&height), "{height}");
     assert!(kept.triangles(0) < 5000 && kept.triangles(0) > 2500, "{}", kept.triangles(0));
+    let cut = kept.cut_m().unwrap();
+    assert!(cut.loops == 1 && cut.face_triangles > 20 && cut.moved.abs() < 1e-3, "{cut:?}");
 
     // all of it again: nothing is loaded, nothing is done
     for stage in [Stage::Mask, Stage::Mesh, Stage::Render, Stage::Ensemble, Stage::Metrics] {

@@ -3,7 +3,7 @@
 //! ```text
 //! render/paths/orbit/tface/0001.png   around the head
 //!              train/                 from the training cameras
-//!              flight-1f0c2a9b/       from a file of cameras: its name, and the beginning of its digest
+//!              flight-1f0c2a9b/       from a file of cameras: its name, how its digest begins
 //! ```
 //!
 //! No stage reads these views, so making or removing them does not affect the evaluation's views,

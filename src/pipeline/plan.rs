@@ -193,17 +193,17 @@ impl Session<'_> {
         let plans = self.order(until).into_iter().map(|stage| self.compared_plan(stage));
         let mut kept = plans.filter(|plan| !cleared.iter().any(|name| name == plan.name));
         kept.try_for_each(|plan| {
-            self.run.agrees(&plan).map_err(|e| match plan.name == Stage::Mesh.as_str() && self.differs_in_formats() {
-                true => {
-                    let run = self.run.dir().display();
-                    let hint = format!(
-                        "`tiface export {run} --format {}` writes these files beside the run, and keeps it; or {}",
-                        self.formats(),
-                        e.hint()
-                    );
-                    e.with_hint(hint)
+            self.run.agrees(&plan).map_err(|e| {
+                if plan.name != Stage::Mesh.as_str() || !self.differs_in_formats() {
+                    return e;
                 }
-                false => e,
+                let run = self.run.dir().display();
+                let hint = format!(
+                    "`tiface export {run} --format {}` writes these files beside the run, and keeps it; or {}",
+                    self.formats(),
+                    e.hint()
+                );
+                e.with_hint(hint)
             })
         })
     }

@@ -61,7 +61,9 @@ pub fn live_html(
     fill(
         include_str!("live.html"),
         script,
-        context! { style => STYLE, title, stages, charts => drawn, newest, report, now, renewed, beside => true },
+        context! {
+            style => STYLE, title, stages, charts => drawn, newest, report, now, renewed, beside => true,
+        },
     )
 }
 

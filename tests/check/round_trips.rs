@@ -159,10 +159,12 @@ proptest! {
             assert!(apart.into_iter().all(|(a, b)| (0..3).all(|k| a[k].distance(b[k]) < 1e-4)), "{format}");
             // as one byte a channel
             let near = |a: f32, b: f32| (a - b).abs() < 0.6 / 255.0;
-            let attributes = |m: &Mesh| (0..m.triangles.len()).flat_map(|t| m.triangles[t]).map(|i| i as usize).map(|i| {
-                (m.colors.get(i).copied(), m.normals.get(i).copied())
-            }).collect::<Vec<_>>();
-            for ((color, normal), (own_color, own_normal)) in attributes(&found.mesh).into_iter().zip(attributes(&mesh)) {
+            let attributes = |m: &Mesh| {
+                let of = |&v: &u32| (m.colors.get(v as usize).copied(), m.normals.get(v as usize).copied());
+                m.triangles.as_flattened().iter().map(of).collect::<Vec<_>>()
+            };
+            let both = attributes(&found.mesh).into_iter().zip(attributes(&mesh));
+            for ((color, normal), (own_color, own_normal)) in both {
                 assert_eq!((color.is_some(), normal.is_some()), (own_color.is_some(), own_normal.is_some()), "{format}");
                 assert!(color.zip(own_color).is_none_or(|(a, b)| (0..3).all(|k| near(a[k], b[k]))), "{format}");
                 assert!(normal.zip(own_normal).is_none_or(|(a, b)| a.distance(b) < 1e-5), "{format}");

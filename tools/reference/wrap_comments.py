@@ -5,8 +5,8 @@
 
 A paragraph of `//`, `///` or `//!` is filled again if one of its lines is longer than 100 columns; all others stay as they
 are, so a second run changes nothing. Blocks of code, tables, headings, definitions of links, drawings (lines with two spaces
-or more inside) and comments behind code are never touched; spans of code and links are not broken. Nothing but the
-places of line breaks changes, which is checked before a file is written.
+or more inside) and comments behind code are never touched, and are listed if they are longer; spans of code and links are
+not broken. Nothing but the places of line breaks changes, which is checked before a file is written.
 """
 
 import re
@@ -16,8 +16,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = ("src", "tests", "benches", "examples", "crates")
 WIDTH = 100
-# blocks of code, tables and drawings may be as wide as code
-CODE_WIDTH = 110
 
 COMMENT = re.compile(r"^( *)(///|//!|//)(?!/)( ?)(.*)$")
 ITEM = re.compile(r"^( *)([-*+]|\d+[.)]) +(?=\S)")
@@ -173,15 +171,6 @@ def rewrap(text):
     return "\n".join(out)
 
 
-def changed(text):
-    """The numbers of the lines that wrapping would change."""
-    lines, found = text.split("\n"), set()
-    for begin, end, is_comment in blocks(text):
-        if is_comment and (new := set(wrapped(lines[begin:end]))) != set(lines[begin:end]):
-            found.update(number for number in range(begin, end) if lines[number] not in new)
-    return found
-
-
 def code(text):
     """A source without its line comments, and without the space around them."""
     out, at = [], 0
@@ -197,23 +186,10 @@ def prose(text):
 
 
 def too_long(text):
-    """The lines with a comment that are too long and could be shorter, by number."""
-    lines, found = text.split("\n"), []
-    shorter = changed(text)
-    at = [0]
-    for line in lines:
-        at.append(at[-1] + len(line) + 1)
-    commented = {text.count("\n", 0, begin): begin for begin, _ in comments(text)}
-    for number, begin in commented.items():
-        line = lines[number]
-        if len(line) <= WIDTH:
-            continue
-        is_behind = line[: begin - at[number]].strip()
-        match = None if is_behind else COMMENT.match(line)
-        is_one_word = match and len(words([match.group(4).strip()])) == 1
-        if not is_one_word and (is_behind or len(line) > CODE_WIDTH or number in shorter):
-            found.append(number + 1)
-    return found
+    """The lines with a comment that are too long, by number."""
+    lines = text.split("\n")
+    commented = {text.count("\n", 0, begin) for begin, _ in comments(text)}
+    return sorted(number + 1 for number in commented if len(lines[number]) > WIDTH)
 
 
 def main():

@@ -14,6 +14,8 @@ mod ray;
 mod shells;
 mod similarity;
 pub mod sphharm;
+#[cfg(any(test, feature = "testing"))]
+pub mod testing;
 mod topology;
 
 pub use aabb::Aabb;

@@ -121,7 +121,8 @@ pub struct BakeReport {
 /// // a ball that shows sRGB-coded 0.5 from everywhere
 /// let ball = |p: Vec3| p.length() - 1.0;
 /// let config = BakeConfig {
-///     side: 2, gutter_px: 2, reach: 0.5, views: 8, lobes: 0, normals: false, turned: Mat3::IDENTITY,
+///     side: 2, gutter_px: 2, reach: 0.5, views: 8,
+///     lobes: 0, normals: false, turned: Mat3::IDENTITY,
 /// };
 /// let baked = bake(&mesh, &atlas, &ball, &[], &config, &tiface_base::Quiet)?;
 /// assert!(baked.color.data.iter().all(|v| (v - 0.2140).abs() < 1e-3)); // linear

@@ -59,7 +59,8 @@ const MAX_MOVE: f64 = 1e-3;
 /// Returns what of a closed head is above a plane, closed by a flat face, and how it was cut: the
 /// largest piece by area. The face takes its color from its rim; it has no view-dependent color, no
 /// bumps and no soft layers, and layers fade out towards it. Charts stay where they are; that of
-/// the face lies `gutter_px` from them.
+/// the face lies `gutter_px` from them. Parts of a chart that the plane divides may lie closer to
+/// each other; the texels between keep the colors of the skin that was there, which belong to both.
 ///
 /// Vertices on the rim belong to both sides of the edge, and keep the normals of the skin.
 ///

@@ -26,6 +26,7 @@ mod fixtures;
 mod measure;
 mod mesh_distance;
 mod moves;
+mod neck;
 mod outline;
 mod regularized;
 pub mod render;
@@ -45,7 +46,7 @@ pub use extract::{
 pub use measure::{HeadMeasures, measure};
 pub use mesh_distance::MeshDistance;
 pub use outline::{OutlineReport, fit as fit_outlines};
-pub use resize::{DetailLevel, Resize, ResizeReport, lods, most_levels, resized};
+pub use resize::{DetailLevel, Resize, lods, most_levels, resized};
 pub use shells::{ShellsReport, fit as fit_shells};
 pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
 pub use smooth::{SmoothReport, smooth};

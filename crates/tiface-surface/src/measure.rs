@@ -1,12 +1,14 @@
 //! Measures of a head by its shape alone: where crown, chin, nape and neck are, and the planes that
 //! cut it below them.
 //!
-//! The neck is the height whose horizontal section is smallest beside larger ones above and below.
+//! The neck is the height whose horizontal section is smallest beside larger ones above and below
+//! ([`narrowest`]).
 //! Above it the profile of the middle runs from the neck forward to the chin and up the face: the
 //! chin is where it lies farthest before the straight line from the neck to the nose. On the other
 //! side the nape is where the back of the profile lies farthest forward.
 
 use crate::cut::Plane;
+use crate::neck::{narrowest, widens_below};
 use crate::{check_indices, finite};
 use glam::{DVec2, DVec3, Vec3};
 use tiface_base::geom::Mesh;
@@ -16,11 +18,11 @@ use tiface_base::{Error, Result};
 const LEVELS: usize = 400;
 
 /// Share of a neck's section by which what is above and below must be larger.
-const NARROWER: f64 = 1.1;
+const NARROWER: f32 = 1.1;
 
 /// Sections of the neck, in its smallest: below, shoulders begin; up to the second, its front is
 /// looked for.
-const SHOULDERS: [f64; 2] = [1.25, 1.5];
+const SHOULDERS: [f32; 2] = [1.25, 1.5];
 
 /// Share of its largest distance from the line between neck and nose at which the chin ends.
 const CHIN_END: f64 = 0.5;
@@ -46,8 +48,6 @@ pub struct HeadMeasures {
     pub crown: f32,
     /// Height of the lower end of the chin.
     pub chin: f32,
-    /// Height of the neck's smallest section; of the lower end, if there are no shoulders below.
-    pub neck: f32,
     /// Height of the neck's base, below which shoulders begin; `None` of a head without shoulders.
     pub collar: Option<f32>,
     /// The lower end of the chin, in the middle of the face.
@@ -121,7 +121,6 @@ pub fn measure(mesh: &Mesh, up: Vec3, front: Vec3) -> Result<HeadMeasures> {
         front: frame[1].as_vec3(),
         crown: placed.range[1] as f32,
         chin: chin.lowest.y as f32,
-        neck: height(neck.narrowest),
         collar: neck.base.map(height),
         chin_point: at(chin.lowest),
         nape: at(chin.nape),
@@ -158,7 +157,7 @@ impl Placed<'_> {
     }
 
     /// Returns the areas of the horizontal sections, by Gauss's formula over the edges of each.
-    fn sections(&self) -> Vec<f64> {
+    fn sections(&self) -> Vec<f32> {
         let mut doubled = vec![0.0; LEVELS];
         for t in self.triangles {
             let corners = t.map(|v| self.positions[v as usize]);
@@ -169,7 +168,7 @@ impl Placed<'_> {
                 }
             }
         }
-        doubled.into_iter().map(|area| 0.5 * area.abs()).collect()
+        doubled.into_iter().map(|area| (0.5 * area.abs()) as f32).collect()
     }
 
     /// Returns the middle of what is above a level, from the left to the right.
@@ -235,21 +234,16 @@ struct Neck {
 
 impl Neck {
     /// Finds the neck of a head by the areas of its sections.
-    fn find(sections: &[f64]) -> Neck {
-        let largest = |areas: &[f64]| areas.iter().copied().fold(0.0, f64::max);
-        let beside = |level: usize| largest(&sections[..level]).min(largest(&sections[level..]));
-        let share = |level: usize| if sections[level] > 0.0 { beside(level) / sections[level] } else { 0.0 };
-        // a crown has much above it and little below, so the best is a neck
-        let best = (0..sections.len()).max_by(|&a, &b| share(a).total_cmp(&share(b))).unwrap_or(0);
-        if share(best) < NARROWER {
+    fn find(sections: &[f32]) -> Neck {
+        let Some(narrowest) = narrowest(sections, NARROWER) else {
             return Neck { narrowest: 0, base: None, floor: 0 };
-        }
-        let above = |part: f64| {
-            let wide = sections[..best].iter().rposition(|area| *area > part * sections[best]);
+        };
+        let above = |part: f32| {
+            let wide = widens_below(sections, narrowest, part * sections[narrowest]);
             wide.map_or(0, |level| level + 1)
         };
         let [base, floor] = SHOULDERS.map(above);
-        Neck { narrowest: best, base: Some(base), floor }
+        Neck { narrowest, base: Some(base), floor }
     }
 }
 
@@ -266,7 +260,7 @@ struct Chin {
 }
 
 impl Profile {
-    fn chin(&self, sections: &[f64], neck: &Neck) -> Result<Chin> {
+    fn chin(&self, sections: &[f32], neck: &Neck) -> Result<Chin> {
         let none = |why: &str| {
             let hint = "name two points and their distance instead of the head's height, or a plane of your own; \
                         the face must look to the front, and the crown up";
@@ -274,7 +268,7 @@ impl Profile {
         };
         let ends_early = || none("it ends above its neck, or its profile does not recede below the face");
         let front = |range: std::ops::Range<usize>| range.filter(|&k| self.front[k].x.is_finite());
-        let widest = sections.iter().copied().fold(0.0, f64::max);
+        let widest = sections.iter().copied().fold(0.0, f32::max);
         let foremost = |a: &usize, b: &usize| self.front[*a].x.total_cmp(&self.front[*b].x);
         let nose = front(neck.floor..LEVELS).filter(|&k| sections[k] > 0.05 * widest).max_by(foremost);
         let nose = nose.ok_or_else(ends_early)?;
@@ -338,7 +332,7 @@ mod tests {
         assert!((found.crown - 0.9).abs() < 0.01, "{found:?}");
         // the box ends at -0.5
         let collar = found.collar.unwrap();
-        assert!((collar + 0.5).abs() < 0.04 && found.neck > collar && found.neck < 0.0, "{found:?}");
+        assert!((collar + 0.5).abs() < 0.04, "{found:?}");
         // the ellipsoid meets the neck, 0.2 from the middle of 0.5, at 0.4 - 0.5 √(1 - 0.16) =
         // -0.06, and is at 45 degrees at 0.4 - 0.35 = 0.05
         assert!(found.chin > -0.06 && found.chin < 0.1, "{found:?}");
@@ -370,7 +364,8 @@ mod tests {
         );
         let chin = found.chin_plane();
         assert!(chin.height(found.chin_point) > 0.0 && chin.height(found.chin_point) < 0.04);
-        assert!(chin.height(Vec3::new(0.0, 0.0, found.neck)) < 0.0);
+        // the middle of the neck
+        assert!(chin.height(Vec3::new(0.0, 0.0, -0.3)) < 0.0);
         let tilt = chin.normal.normalize().angle_between(Vec3::Z);
         assert!((0.0..=MAX_TILT as f32 + 1e-3).contains(&tilt), "{tilt}");
     }

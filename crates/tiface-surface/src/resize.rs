@@ -7,7 +7,7 @@
 
 use crate::bake::{Original, tangent_space};
 use crate::files::{HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
-use crate::{AtlasConfig, AtlasReport, SimplifyConfig, SimplifyReport, Warning, atlas, setting, simplify};
+use crate::{AtlasConfig, SimplifyConfig, Warning, atlas, setting, simplify};
 use tiface_base::geom::distance::{Distances, one_way};
 use tiface_base::geom::{Bvh, Mesh};
 use tiface_base::{Monitor, Result};
@@ -22,23 +22,12 @@ pub struct Resize {
     pub atlas: Option<AtlasConfig>,
 }
 
-/// How a head was resized.
-#[derive(Clone, Debug)]
-pub struct ResizeReport {
-    /// The simplification.
-    pub simplify: SimplifyReport,
-    /// The atlas, if the mesh has a texture.
-    pub atlas: Option<AtlasReport>,
-    /// What is doubtful of the result.
-    pub warnings: Vec<Warning>,
-}
-
 /// Returns a head in other triangles and with a new texture of it; with its soft layers and lobes,
 /// and with a normal map if it has one. Harmonics are left out: no file holds those of vertices.
 ///
 /// `surface` is simplified to these triangles: the head's own mesh, or the finer one that the head
 /// was made from. One that has no more triangles than asked for stays as it is. The result is
-/// closed if `surface` is.
+/// closed if `surface` is, and comes with what is doubtful of it.
 ///
 /// # Errors
 ///
@@ -49,19 +38,16 @@ pub fn resized(
     surface: &Mesh,
     resize: &Resize,
     monitor: &dyn Monitor,
-) -> Result<(HeadMesh, ResizeReport)> {
+) -> Result<(HeadMesh, Vec<Warning>)> {
     let mut mesh = surface.clone();
     let config = SimplifyConfig { triangles: resize.triangles, ..SimplifyConfig::default() };
-    let simplified = simplify(&mut mesh, None, &config, monitor)?;
-    let mut report =
-        ResizeReport { warnings: simplified.warnings(&config), simplify: simplified, atlas: None };
+    let mut warnings = simplify(&mut mesh, None, &config, monitor)?.warnings(&config);
     let original = Original::new(head);
     let shells = original.carry_vertices(&mut mesh);
     let mut texture = None;
     if let (Some(from), Some(config)) = (&head.texture, &resize.atlas) {
         let (layout, done) = atlas(&mesh, config, monitor)?;
-        report.warnings.extend(done.warnings());
-        report.atlas = Some(done);
+        warnings.extend(done.warnings());
         let AtlasConfig { size_px, gutter_px, .. } = *config;
         let side = from.color.width.div_ceil(size_px).clamp(1, 2);
         let carried = original.carry_texture(from, &mesh, &layout, side, gutter_px, monitor)?;
@@ -74,21 +60,21 @@ pub fn resized(
         texture = Some(HeadTexture { color: carried.color.encoded(), normal, lobes, atlas: layout });
     }
     let world_from_scene = head.world_from_scene;
-    Ok((HeadMesh { mesh, world_from_scene, texture, harmonics: None, shells }, report))
+    Ok((HeadMesh { mesh, world_from_scene, texture, harmonics: None, shells }, warnings))
 }
 
-/// A head of a chain of levels of detail.
+/// A smaller head of a chain of levels of detail.
 #[derive(Clone, Debug)]
 pub struct DetailLevel {
     /// The head.
     pub head: HeadMesh,
-    /// Largest distance between its surface and the chain's first, measured both ways, in scene
-    /// units.
+    /// Largest distance between its surface and that of the chain's head, measured both ways, in
+    /// scene units.
     pub largest: f64,
     /// Mean distance, the larger of both ways, in scene units.
     pub mean: f64,
-    /// How it was made; `None` of the first, which is the head itself.
-    pub report: Option<ResizeReport>,
+    /// What is doubtful of it.
+    pub warnings: Vec<Warning>,
 }
 
 /// Points for each triangle of the head at which the distance between two surfaces is measured.
@@ -100,16 +86,16 @@ const FEWEST: usize = 200;
 /// Smallest side of a level's texture.
 const SMALLEST_PX: u32 = 128;
 
-/// Returns how many levels of detail a mesh of so many triangles can have.
+/// Returns how many levels of detail a mesh of so many triangles can have, itself among them.
 pub fn most_levels(triangles: usize) -> usize {
     1 + (triangles / FEWEST).max(1).ilog2() as usize
 }
 
-/// Returns a chain of `levels` heads: the head itself, then each with half as many triangles as the
-/// one before. A quarter of the triangles is for a head of half the size on the screen, so the side
-/// of the texture halves from the first to the second and at every other level after it, down to
-/// 128. `atlas` has the options of the new atlases; its `size_px` is the side of the head's own
-/// texture, which the first level keeps.
+/// Returns all but the first of a chain of `levels` heads: the first is the head itself, each other
+/// has half as many triangles as the one before. A quarter of the triangles is for a head of half
+/// the size on the screen, so the side of the texture halves from the first to the second and at
+/// every other level after it, down to 128. `atlas` has the options of the new atlases; its
+/// `size_px` is the side of the head's own texture.
 ///
 /// # Errors
 ///
@@ -124,19 +110,19 @@ pub fn lods(
     let most = most_levels(triangles);
     setting((1..=most).contains(&levels), "levels", &format!("1..={most} of {triangles} triangles"), levels)?;
     let (kept, samples) = (Bvh::new(&head.mesh), DISTANCE_SAMPLES * triangles);
-    let mut chain = vec![DetailLevel { head: head.clone(), largest: 0.0, mean: 0.0, report: None }];
+    let mut chain = Vec::new();
     for level in 1..levels {
         let size_px = (atlas.size_px >> level.div_ceil(2)).max(SMALLEST_PX.min(atlas.size_px));
         // a gutter as wide on the surface
         let gutter_px = (atlas.gutter_px >> level.div_ceil(2)).max(2).min(atlas.gutter_px);
         let atlas = AtlasConfig { size_px, gutter_px, resolved: None, ..atlas.clone() };
         let resize = Resize { triangles: triangles >> level, atlas: Some(atlas) };
-        let (smaller, report) = resized(head, &head.mesh, &resize, monitor)?;
+        let (smaller, warnings) = resized(head, &head.mesh, &resize, monitor)?;
         let ways =
             [one_way(&smaller.mesh, &kept, samples), one_way(&head.mesh, &Bvh::new(&smaller.mesh), samples)];
         let most = |of: fn(&Distances) -> f64| ways.iter().flatten().map(of).fold(0.0, f64::max);
         let (largest, mean) = (most(|way| way.max), most(|way| way.mean));
-        chain.push(DetailLevel { head: smaller, largest, mean, report: Some(report) });
+        chain.push(DetailLevel { head: smaller, largest, mean, warnings });
     }
     Ok(chain)
 }
@@ -153,10 +139,9 @@ mod tests {
         let head = ball();
         let atlas = AtlasConfig { size_px: 512, gutter_px: 4, ..AtlasConfig::default() };
         let chain = lods(&head, 4, &atlas, &Quiet).unwrap();
-        let all = head.mesh.triangles.len();
-        assert_eq!(chain[0].head, head);
-        for (k, level) in chain.iter().enumerate() {
-            let DetailLevel { head, largest, mean, .. } = level;
+        assert_eq!(chain.len(), 3);
+        let (all, mut before) = (head.mesh.triangles.len(), 0.0);
+        for (k, DetailLevel { head, largest, mean, .. }) in (1..).zip(&chain) {
             let (found, asked) = (head.mesh.triangles.len(), all >> k);
             assert!(found <= asked && found + 2 >= asked, "{found} of {asked}");
             let report = check(&head.mesh, 1.0);
@@ -169,10 +154,12 @@ mod tests {
             assert!(texture.lobes.is_some() && head.shells.is_some());
             // a chord of a ball of radius 12 of n triangles, each of area 4 π r² / n with sides of
             // about 2.3 r √(4 π / √3 / n) / 2, lies r (side / r)² / 6 inside at most
-            let told = if k == 0 { 0.0 } else { 12.0 * 14.5 / found as f64 };
-            assert!(*mean <= *largest && *largest < 2.0 * told + 1e-9, "level {k}: {mean} {largest} {told}");
-            assert!(k == 0 || *mean > chain[k - 1].mean, "level {k}: {mean}");
+            let told = 12.0 * 14.5 / found as f64;
+            assert!(*mean <= *largest && *largest < 2.0 * told, "level {k}: {mean} {largest} {told}");
+            assert!(*mean > before, "level {k}: {mean}");
+            before = *mean;
         }
+        assert!(lods(&head, 1, &atlas, &Quiet).unwrap().is_empty());
         let e = lods(&head, 9, &atlas, &Quiet).unwrap_err();
         assert!(e.to_string().contains("`levels` is 9"), "{e}");
     }
@@ -181,8 +168,8 @@ mod tests {
     fn a_head_without_a_texture_or_a_wish_for_one_gets_none() {
         let head = ball();
         let resize = Resize { triangles: 1000, atlas: None };
-        let (small, report) = resized(&head, &head.mesh, &resize, &Quiet).unwrap();
-        assert!(small.texture.is_none() && report.atlas.is_none() && small.mesh.is_closed());
+        let (small, _) = resized(&head, &head.mesh, &resize, &Quiet).unwrap();
+        assert!(small.texture.is_none() && small.mesh.is_closed());
         let [colors, vertices] = [small.mesh.colors.len(), small.mesh.positions.len()];
         assert!(small.mesh.triangles.len() <= 1000 && colors == vertices && small.harmonics.is_none());
     }

@@ -3,8 +3,9 @@
 //!
 //! ```text
 //! photograph ── longest side to S, normalize, pad to S × S ── encoder ── embedding ─┐
-//! clicks ────── times S / longest side ─────────────────────────────────── decoder ─┴─ S/4 × S/4 logits
-//!               logits ── bilinear to S × S ── cut the padding off ── bilinear to the photograph ── > 0
+//! clicks ────── times S / longest side ─────────────────────────────────── decoder ─┴─ logits
+//!
+//! logits of S/4 × S/4 ── bilinear to S × S ── padding cut off ── bilinear to the photograph ── > 0
 //! ```
 //!
 //! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label

@@ -81,20 +81,7 @@ pub fn sample_triangles(mesh: &Mesh, count: usize) -> Vec<(Vec3, u32)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Returns a 2 × 1 rectangle at height z, of two triangles.
-    fn sheet(z: f32) -> Mesh {
-        Mesh {
-            positions: vec![
-                Vec3::new(0.0, 0.0, z),
-                Vec3::new(2.0, 0.0, z),
-                Vec3::new(2.0, 1.0, z),
-                Vec3::new(0.0, 1.0, z),
-            ],
-            triangles: vec![[0, 1, 2], [0, 2, 3]],
-            ..Mesh::default()
-        }
-    }
+    use crate::geom::testing::sheet;
 
     /// From the first to the second, and back.
     fn both_ways(a: &Mesh, b: &Mesh, samples: usize) -> Option<[Distances; 2]> {

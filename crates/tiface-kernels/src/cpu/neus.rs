@@ -5,7 +5,8 @@
 //!
 //! ```text
 //! cos = d·n̂     ic = −[relu(½ − ½cos)(1 − a) + relu(−cos) a]     (a: anneal, 0 → 1)
-//! P = σ(s (f − ½ ic δ))     N = σ(s (f + ½ ic δ))     α = clip((P − N + ε)/(P + ε), 0, 1),  ε = 1e-5
+//! P = σ(s (f − ½ ic δ))     N = σ(s (f + ½ ic δ))
+//! α = clip((P − N + ε)/(P + ε), 0, 1)     ε = 1e-5
 //! T_i = Π_{j<i} (1 − α_j)     w = T α     out = Σ w · (rgb, 1, t, n̂, ‖rgb‖²)
 //! ```
 //!

@@ -4,8 +4,9 @@
 //! along the third, summed over its channels:
 //!
 //! ```text
-//! term 0: plane (x, y) · line z      term 1: plane (x, z) · line y      term 2: plane (y, z) · line x
-//! feature(p) = Σ_i Σ_c plane_i,c(p) · line_i,c(p)       bilinear and linear, vertices on the box's border
+//! term 0: plane (x, y) · line z    term 1: plane (x, z) · line y    term 2: plane (y, z) · line x
+//! feature(p) = Σ_i Σ_c plane_i,c(p) · line_i,c(p)
+//!              bilinear and linear, vertices on the box's border
 //! ```
 //!
 //! The channels of a vertex are adjacent in memory (channel last). A corner is then one or a few

@@ -2,7 +2,8 @@
 //! parameters to the weights of a [`Layout`], and gradients back.
 //!
 //! ```text
-//! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂),  ĝ the gradient by W
+//! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂)
+//! ĝ: the gradient by W
 //! ```
 //!
 //! Parameters are stored in one vector: v1, g1, b1, v2, g2, b2, c1, c2, c3.

@@ -273,8 +273,8 @@ impl Samples {
         let run_pass = |writes: bool| {
             launch!(device, pass::launch, groups(rays.rays().div_ceil(UNITS as usize)), UNITS;
                 occupancy.mask, occupancy.solid.as_ref().unwrap_or(&occupancy.mask), rays.origin,
-                rays.direction, rays.jitter, rays.alive, self.offsets, self.counts, step_length, self.t, self.dt,
-                self.x, self.direction;
+                rays.direction, rays.jitter, rays.alive, self.offsets, self.counts, step_length, self.t,
+                self.dt, self.x, self.direction;
                 occupancy.resolution as u32, occupancy.radius, limit.min(u32::MAX as usize) as u32, writes,
                 occupancy.solid.is_some()
             );

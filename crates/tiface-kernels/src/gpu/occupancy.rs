@@ -222,7 +222,8 @@ impl BandUpdate {
             );
         }
         launch!(device, decide::launch, groups(occupancy.mask.word_count().div_ceil(UNITS as usize)), UNITS;
-            self.allowed, self.value, self.reach, inv_s, occupancy.mask, solid; resolution, self.rule.width, half
+            self.allowed, self.value, self.reach, inv_s, occupancy.mask, solid;
+            resolution, self.rule.width, half
         );
     }
 }

@@ -3,7 +3,8 @@
 //! NeuS.
 //!
 //! ```text
-//! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂),  ĝ the gradient by W
+//! W = g v / ‖v‖ by rows     g_g = ĝ · v / ‖v‖     g_v = g / ‖v‖ (ĝ − (ĝ · v̂) v̂)
+//! ĝ: the gradient by W
 //! inv_s = exp(10 s)         g_s = 10 inv_s g_inv_s
 //! ```
 

@@ -5,12 +5,19 @@ use tiface_base::geom::{Camera, ShellLayer, Shells};
 use tiface_base::image::{Gray, Photo};
 use tiface_base::math::rng;
 
-/// A square of 24 × 24 cells from −1 to 1 at z = 0 that faces +z, and an atlas of 48 × 48 texels
-/// over it.
+/// Cells along a side of the square.
+const N: u32 = 16;
+
+/// The vertex in its middle.
+const MIDDLE: u32 = N / 2 * (N + 1) + N / 2;
+
+/// Pixels along a side of a photograph.
+const SIDE: u32 = 64;
+
+/// A square of cells from −1 to 1 at z = 0 that faces +z, and an atlas of 2 × 2 texels for each.
 fn square() -> (Mesh, Atlas) {
-    const N: u32 = 24;
     let mut mesh = Mesh::default();
-    let mut atlas = Atlas { width: 48, height: 48, ..Atlas::default() };
+    let mut atlas = Atlas { width: 2 * N, height: 2 * N, ..Atlas::default() };
     for j in 0..=N {
         for i in 0..=N {
             let at = Vec2::new(i as f32, j as f32) / N as f32;
@@ -41,7 +48,7 @@ fn cameras(count: usize) -> Vec<Camera> {
         let angle = (k as f64 + 0.5) / count as f64 - 0.5;
         let rotation = DMat3::from_rotation_y(1.6 * angle) * DMat3::from_rotation_x(0.4 * angle);
         let position = rotation * DVec3::new(0.0, 0.0, 3.0);
-        Camera { rotation, position, ..Camera::above(96, 96, 100.0, 3.0) }
+        Camera { rotation, position, ..Camera::above(SIDE, SIDE, 1.04 * f64::from(SIDE), 3.0) }
     };
     (0..count).map(camera).collect()
 }
@@ -126,7 +133,7 @@ fn gloss_is_found_in_the_degree_that_it_has() {
     let harmonics = fitted.harmonics.expect("photographs that were left out want it");
     assert!(fitted.report.psnr[2] > fitted.report.psnr[1] + 6.0, "{:?}", fitted.report);
     // in the middle, from the left and from the right of what the cameras saw
-    let middle = mesh.triangles.iter().position(|t| t.contains(&(12 * 25 + 12))).unwrap();
+    let middle = mesh.triangles.iter().position(|t| t.contains(&MIDDLE)).unwrap();
     let hit = tiface_base::geom::Hit { t: 1.0, triangle: middle as u32, u: 0.3, v: 0.3 };
     let at = |d: Vec3| harmonics.seen_along(-d, &hit, mesh.triangles[middle])[0];
     let (left, right) = (Vec3::new(-0.5, 0.0, 0.866), Vec3::new(0.5, 0.0, 0.866));
@@ -146,7 +153,7 @@ fn from_where_no_photograph_looks_the_diffuse_color_is_seen() {
     let colors = Colors::Texels(&atlas, &image);
     let fitted = fit(&mesh, None, colors, &photographs, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
     let harmonics = fitted.harmonics.unwrap();
-    let middle = mesh.triangles.iter().position(|t| t.contains(&(12 * 25 + 12))).unwrap();
+    let middle = mesh.triangles.iter().position(|t| t.contains(&MIDDLE)).unwrap();
     let hit = tiface_base::geom::Hit { t: 1.0, triangle: middle as u32, u: 0.3, v: 0.3 };
     let at = |d: Vec3| harmonics.seen_along(-d, &hit, mesh.triangles[middle])[0];
     // 0.08 brighter from the front than from the side
@@ -193,7 +200,7 @@ fn what_nobody_sees_keeps_its_color_and_no_photograph_fits_nothing() {
         fit(&mesh, None, Colors::Vertices, &photographs, 1, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
     assert!(fitted.vertices[n as usize..].iter().all(|c| *c == [0.3; 3]));
     let blind = [Photograph {
-        mask: Some(&Gray { values: vec![249; 96 * 96], ..photos[0].1.clone() }),
+        mask: Some(&Gray { values: vec![249; (SIDE * SIDE) as usize], ..photos[0].1.clone() }),
         ..photographs[0]
     }];
     assert!(fit(&mesh, None, Colors::Vertices, &blind, 1, Mat3::IDENTITY, &Quiet).unwrap().is_none());

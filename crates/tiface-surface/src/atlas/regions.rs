@@ -16,6 +16,7 @@
 use super::chart::straighten;
 use super::divide::{components, joined};
 use super::smooth::smoothed;
+use crate::neck::{narrowest, widens_below};
 use glam::Vec3;
 use tiface_base::geom::{Mesh, area_vector};
 
@@ -163,17 +164,12 @@ impl<'a> Head<'a> {
             (*least, *most) = (least.min(x), most.max(x));
         }
         let width = sides.map(|[least, most]| (most - least).max(0.0));
-        let widest = |range: std::ops::Range<usize>| width[range].iter().copied().fold(0.0, f32::max);
-        let prominence = |i: usize| widest(0..i).min(widest(i..SLICES)) / width[i].max(f32::MIN_POSITIVE);
-        // both ends taper to nothing
-        let inner = (1..SLICES - 1).filter(|&i| width[i] > 0.0);
-        let narrow = inner.max_by(|&a, &b| prominence(a).total_cmp(&prominence(b)));
-        let narrow = narrow.filter(|&i| prominence(i) > NECK);
+        let narrow = narrowest(&width, NECK);
         // hair may hide the neck: then shoulders are what is wider than the head
         let mut upper = width[SLICES / 2..].to_vec();
         upper.sort_by(f32::total_cmp);
         let (from, usual) = narrow.map_or((SLICES / 2, upper[upper.len() / 2]), |i| (i, width[i]));
-        let shoulders = (0..from).rev().find(|&i| width[i] > COLLAR * usual);
+        let shoulders = widens_below(&width, from, COLLAR * usual);
         self.neck = narrow.map(height);
         self.collar = shoulders.map_or(low, height);
     }

@@ -78,7 +78,7 @@ fn a_closed_sphere_is_laid_in_few_charts_with_little_stretch() {
 
 #[test]
 fn a_torus_is_laid_flat() {
-    let mesh = sheet(60, 30, [true, true], |u, v| {
+    let mesh = sheet(40, 20, [true, true], |u, v| {
         let r = 2.0 + 0.7 * (TAU * v).cos();
         Vec3::new(r * (TAU * u).cos(), -r * (TAU * u).sin(), 0.7 * (TAU * v).sin())
     });
@@ -198,7 +198,7 @@ fn a_mesh_that_cannot_be_textured_is_a_named_error_with_a_hint() {
 #[test]
 fn tiny_and_huge_meshes_are_laid_like_any_other() {
     for size in [1e-12f32, 1e-3, 1e6] {
-        let mut mesh = sphere(20, 30);
+        let mut mesh = sphere(14, 20);
         mesh.positions.iter_mut().for_each(|p| *p = *p * size + Vec3::splat(3.0 * size));
         let (_, r) = laid(&mesh, &config(512));
         assert!(r.fallback.is_none() && r.uv.used > 0.4, "{size}: {r:?}");
@@ -239,14 +239,14 @@ impl Monitor for Patience {
 #[test]
 fn it_stops_when_told_to() {
     for patience in [0, 1, 3, 6] {
-        let stopped = atlas(&sphere(30, 60), &config(512), &Patience(AtomicU64::new(patience)));
+        let stopped = atlas(&sphere(20, 40), &config(512), &Patience(AtomicU64::new(patience)));
         assert!(stopped.unwrap_err().kind().is_stop(), "{patience}");
     }
 }
 
 #[test]
 fn one_thread_and_two_make_the_same_bytes() {
-    let mesh = sphere(60, 90);
+    let mesh = sphere(36, 54);
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| laid(&mesh, &AtlasConfig { front: Some(Vec3::Z), ..config(512) }).0)
@@ -256,7 +256,7 @@ fn one_thread_and_two_make_the_same_bytes() {
 
 #[test]
 fn the_face_stands_upright_in_the_texture() {
-    let mesh = sphere(60, 90);
+    let mesh = sphere(36, 54);
     for up in [Vec3::Y, Vec3::X, Vec3::new(1.0, -2.0, 0.0).normalize()] {
         let front = AtlasConfig { front: Some(Vec3::Z), up: Some(up), ..config(512) };
         let (atlas, report) = laid(&mesh, &front);

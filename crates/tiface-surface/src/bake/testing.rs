@@ -5,12 +5,18 @@ use super::fill::fill;
 use crate::files::{HeadMesh, HeadTexture, Lobes};
 use crate::{AtlasConfig, Volume, atlas, marching};
 use glam::{Mat3, Vec3};
+use std::sync::OnceLock;
 use tiface_base::Quiet;
 use tiface_base::geom::{ShellLayer, Shells, Similarity};
 use tiface_base::image::{Image, Photo, quantize};
 
 /// Returns a ball of radius 12 whose texture shows the position, with a layer that is opaque above.
 pub fn ball() -> HeadMesh {
+    static BALL: OnceLock<HeadMesh> = OnceLock::new();
+    BALL.get_or_init(made).clone()
+}
+
+fn made() -> HeadMesh {
     let at = |i: usize| i as f32 - 15.5;
     let distance = |i: usize| Vec3::new(at(i % 32), at(i / 32 % 32), at(i / 1024)).length() - 12.0;
     let values: Vec<f32> = (0..32 * 32 * 32).map(distance).collect();

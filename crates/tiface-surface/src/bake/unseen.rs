@@ -250,12 +250,14 @@ mod tests {
     use super::*;
     use crate::bake::testing::ball;
     use crate::files::HeadMesh;
+    use std::sync::OnceLock;
 
     const SKIN: [f32; 3] = [0.8, 0.6, 0.5];
     const CLOTH: [f32; 3] = [0.2, 0.25, 0.4];
 
     /// A ball of radius 12, skin above and striped cloth below, that was seen where x < 4; where
     /// nobody looked, the guess has a lamp.
+    #[derive(Clone)]
     struct Scene {
         mesh: Mesh,
         atlas: Atlas,
@@ -288,6 +290,11 @@ mod tests {
     }
 
     fn scene() -> Scene {
+        static SCENE: OnceLock<Scene> = OnceLock::new();
+        SCENE.get_or_init(made).clone()
+    }
+
+    fn made() -> Scene {
         let HeadMesh { mesh, texture, .. } = ball();
         let atlas = texture.unwrap().atlas;
         let trust: Vec<f32> = mesh.positions.iter().map(|p| ((6.0 - p.x) / 2.0).clamp(0.0, 1.0)).collect();

@@ -1,8 +1,9 @@
 use super::*;
 use crate::bake::testing::{ball, shown};
-use crate::files::{check, uv_check};
+use crate::files::{LOBE_TEXEL, check, uv_check};
 use crate::fixtures;
 use tiface_base::geom::{Bvh, Similarity};
+use tiface_base::image::Photo;
 
 fn plane(height: f32) -> Plane {
     Plane { point: height * Vec3::Z, normal: 2.0 * Vec3::Z }
@@ -69,8 +70,42 @@ fn a_cut_ball_is_a_cap_of_the_ball_with_a_flat_face_of_the_color_of_its_rim() {
         let is_flat = triangle.iter().all(|&v| (out.mesh.positions[v as usize].z - bottom).abs() < 1e-5);
         assert!(!(is_flat && layer.has(triangle)));
     }
-    let lobes = texture.lobes.as_ref().unwrap();
-    assert_eq!(lobes.pictures.len(), 1);
+}
+
+#[test]
+fn a_face_has_neither_lobes_nor_bumps_and_the_skin_keeps_its_own() {
+    const GUTTER: u32 = 8;
+    let mut head = ball();
+    let texture = head.texture.as_mut().unwrap();
+    // lobes in their usual size, a texel for 4 × 4 of the color, and bumps that lean everywhere
+    texture.lobes = texture.lobes.take().map(|lobes| lobes.reduced(512 / LOBE_TEXEL));
+    texture.normal = Some(Photo { rgb: vec![[200, 90, 220]; 512 * 512], ..texture.color.clone() });
+    let (out, report) = cut(&head, &plane(6.3), GUTTER).unwrap();
+    let bottom = 6.3 + report.moved as f32;
+    let texture = out.texture.as_ref().unwrap();
+    let (normal, lobe) = (texture.normal.as_ref().unwrap(), &texture.lobes.as_ref().unwrap().pictures[0]);
+    let at = |picture: &Photo, uv: Vec2| crate::bake::bilinear(picture, uv, &f32::from);
+    let is = |found: Vec3, expected: [f32; 3]| (found - Vec3::from(expected)).abs().max_element() < 0.01;
+    let (mut face, mut skin) = (0, 0);
+    for (t, corners) in texture.atlas.triangles.iter().enumerate() {
+        let is_face = out.mesh.corners(t as u32).iter().all(|p| (p.z - bottom).abs() < 1e-5);
+        let uvs = corners.map(|k| texture.atlas.uvs[k as usize]);
+        let center = uvs.iter().sum::<Vec2>() / 3.0;
+        if is_face {
+            // up to its rim, where a look-up takes texels around it
+            for uv in uvs.into_iter().chain([center]) {
+                assert!(is(at(normal, uv), [128.0, 128.0, 255.0]), "{uv} {}", at(normal, uv));
+                assert!(is(at(lobe, uv), [128.0; 3]), "{uv} {}", at(lobe, uv));
+            }
+            face += 1;
+        } else {
+            assert!(is(at(normal, center), [200.0, 90.0, 220.0]), "{center}");
+            let before = &head.texture.as_ref().unwrap().lobes.as_ref().unwrap().pictures[0];
+            assert_eq!(at(lobe, center), at(before, center));
+            skin += 1;
+        }
+    }
+    assert!(face == report.face_triangles && skin > 500, "{face} {skin}");
 }
 
 #[test]

@@ -175,8 +175,8 @@ fn noise_full_of_handles_comes_out_sound_with_fewer() {
         let q = 7.0 * p;
         (q.x + 2.0 * q.y.sin()).sin() + (q.y + 2.0 * q.z.sin()).sin() + (q.z + 2.0 * q.x.sin()).sin()
     };
-    let (kept, before) = mesh_at(32, field, 0.0);
-    let (mesh, report) = mesh_at(32, field, 0.7);
+    let (kept, before) = mesh_at(24, field, 0.0);
+    let (mesh, report) = mesh_at(24, field, 0.7);
     assert!(before.topology.genus > Some(20), "{:?}", before.topology);
     assert!(report.topology.is_solid() && report.topology.pieces == 1);
     assert!(report.topology.genus < before.topology.genus, "{:?}", report.topology);

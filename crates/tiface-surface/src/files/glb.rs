@@ -30,7 +30,8 @@
 //! describe how to use the lobes, whose directions are turned to the file's coordinates:
 //!
 //! ```json
-//! "extras": { "tiface": { "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ],
+//! "extras": { "tiface": {
+//!   "lobes": [ { "name": "lobe 0", "texture": 1, "material": 1, "variant": 0 } ],
 //!   "view_dependent_color": { …how their bytes become a color… } } }
 //! ```
 

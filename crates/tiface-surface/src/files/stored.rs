@@ -376,7 +376,8 @@ fn load_texture(folder: &Path, stored: &mut StoredTensors, mesh: &Mesh) -> Resul
 }
 
 fn load_harmonics(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Harmonics> {
-    let fits = |shape: &[usize]| matches!(*shape, [n, count, 3] if n == mesh.positions.len() && (1..=MAX_LOBES).contains(&count));
+    let vertices = mesh.positions.len();
+    let fits = |shape: &[usize]| matches!(*shape, [n, count, 3] if n == vertices && (1..=MAX_LOBES).contains(&count));
     let (shape, values) = stored.numbers("harmonics", fits)?;
     let turned = stored.matrix("harmonics_from_scene")?;
     Ok(Harmonics { functions: shape[1], coefficients: values.as_chunks::<3>().0.to_vec(), turned })

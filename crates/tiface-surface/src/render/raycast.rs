@@ -48,8 +48,8 @@ impl Default for RaycastOptions {
 /// use tiface_base::geom::{Bvh, Camera, Mesh};
 /// use tiface_surface::render::{RaycastOptions, raycast};
 ///
-/// let positions = vec![Vec3::new(-3.0, -3.0, 0.0), Vec3::new(3.0, -3.0, 0.0), Vec3::new(0.0, 3.0, 0.0)];
-/// let mesh = Mesh { positions, triangles: vec![[0, 1, 2]], ..Mesh::default() };
+/// let corners = [(-3.0, -3.0), (3.0, -3.0), (0.0, 3.0)].map(|(x, y)| Vec3::new(x, y, 0.0));
+/// let mesh = Mesh { positions: corners.to_vec(), triangles: vec![[0, 1, 2]], ..Mesh::default() };
 /// let camera = Camera::above(20, 10, 10.0, 2.0);
 /// let view = raycast(&Bvh::new(&mesh), &mesh, None, &camera, &RaycastOptions::default(), |hits| {
 ///     hits.normals.iter().map(|n| n.to_array().map(|v| v.abs())).collect()

@@ -1,7 +1,7 @@
 //! Volume rendering of the field, front to back, and its gradients.
 //!
 //! ```text
-//! σ_k = activation(feature(p_k))          α_k = 1 − exp(−σ_k δ s)      δ the step, s the distance scale
+//! σ_k = activation(feature(p_k))          α_k = 1 − exp(−σ_k δ s)      δ: step, s: distance scale
 //! T_k = Π_{j<k} (1 − α_j + 1e-10)         w_k = T_k α_k
 //! C = Σ w_k c_k  over w_k > threshold     opacity = Σ w_k              depth = Σ w_k t_k
 //! ```

@@ -137,9 +137,9 @@ fn differences(mesh: &Mesh, camera: &Camera) -> (f64, f32, f64) {
 
 #[test]
 fn it_sees_what_the_ray_caster_sees() {
-    let mut mesh = ball(40);
+    let mut mesh = ball(20);
     mesh.normals = mesh.angle_weighted_normals();
-    let straight = camera(500);
+    let straight = camera(250);
     let distortion = Distortion { k1: -0.25, k2: 0.08, p1: 0.004, p2: -0.003, ..Distortion::default() };
     let bent = Camera { distortion, ..straight.clone() };
     let most = 1e-5 * mesh.bounds().size().length();
@@ -154,7 +154,7 @@ fn it_sees_what_the_ray_caster_sees() {
 
 #[test]
 fn layers_are_blended_as_the_ray_caster_blends_them() {
-    let mut mesh = ball(24);
+    let mut mesh = ball(16);
     mesh.normals = mesh.angle_weighted_normals();
     let layer = |k: usize| ShellLayer {
         offsets: mesh.positions.iter().map(|p| 0.04 * k as f32 * (1.0 + 0.3 * (5.0 * p.x).sin())).collect(),
@@ -162,7 +162,7 @@ fn layers_are_blended_as_the_ray_caster_blends_them() {
         alphas: mesh.positions.iter().map(|p| (0.6 * p.y + 0.1 * k as f32).clamp(0.0, 0.9)).collect(),
     };
     let shells = Shells { layers: [1, 2, 3].map(layer).to_vec() };
-    let camera = camera(200);
+    let camera = camera(120);
     let color = |hits: &RayHits| -> Vec<[f32; 3]> {
         hits.points.iter().map(|p| [0.5 + 0.4 * (5.0 * p.x).sin(), 0.5 + 0.4 * p.y, 0.6]).collect()
     };
