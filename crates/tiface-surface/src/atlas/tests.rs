@@ -256,7 +256,7 @@ fn one_thread_and_two_make_the_same_bytes() {
 
 #[test]
 fn the_face_stands_upright_in_the_texture() {
-    let mesh = sphere(36, 54);
+    let mesh = sphere(60, 90);
     for up in [Vec3::Y, Vec3::X, Vec3::new(1.0, -2.0, 0.0).normalize()] {
         let front = AtlasConfig { front: Some(Vec3::Z), up: Some(up), ..config(512) };
         let (atlas, report) = laid(&mesh, &front);

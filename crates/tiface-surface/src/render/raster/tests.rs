@@ -137,24 +137,24 @@ fn differences(mesh: &Mesh, camera: &Camera) -> (f64, f32, f64) {
 
 #[test]
 fn it_sees_what_the_ray_caster_sees() {
-    let mut mesh = ball(20);
+    let mut mesh = ball(24);
     mesh.normals = mesh.angle_weighted_normals();
-    let straight = camera(250);
+    let straight = camera(300);
     let distortion = Distortion { k1: -0.25, k2: 0.08, p1: 0.004, p2: -0.003, ..Distortion::default() };
     let bent = Camera { distortion, ..straight.clone() };
     let most = 1e-5 * mesh.bounds().size().length();
     for (what, camera) in [("straight", &straight), ("bent", &bent)] {
         let (other, depth, psnr) = differences(&mesh, camera);
-        assert!(other <= 1e-3 && depth <= most && psnr >= 45.0, "{what}: {other:.5} {depth:e} {psnr:.1}");
+        assert!(other <= 1e-3 && depth <= most && psnr >= 42.0, "{what}: {other:.5} {depth:e} {psnr:.1}");
     }
     // a few large triangles, which a bent lens bends
     let (other, depth, psnr) = differences(&ball(1), &bent);
-    assert!(other <= 1e-3 && depth <= most && psnr >= 45.0, "large: {other:.5} {depth:e} {psnr:.1}");
+    assert!(other <= 1e-3 && depth <= most && psnr >= 42.0, "large: {other:.5} {depth:e} {psnr:.1}");
 }
 
 #[test]
 fn layers_are_blended_as_the_ray_caster_blends_them() {
-    let mut mesh = ball(16);
+    let mut mesh = ball(24);
     mesh.normals = mesh.angle_weighted_normals();
     let layer = |k: usize| ShellLayer {
         offsets: mesh.positions.iter().map(|p| 0.04 * k as f32 * (1.0 + 0.3 * (5.0 * p.x).sin())).collect(),
@@ -162,7 +162,7 @@ fn layers_are_blended_as_the_ray_caster_blends_them() {
         alphas: mesh.positions.iter().map(|p| (0.6 * p.y + 0.1 * k as f32).clamp(0.0, 0.9)).collect(),
     };
     let shells = Shells { layers: [1, 2, 3].map(layer).to_vec() };
-    let camera = camera(120);
+    let camera = camera(140);
     let color = |hits: &RayHits| -> Vec<[f32; 3]> {
         hits.points.iter().map(|p| [0.5 + 0.4 * (5.0 * p.x).sin(), 0.5 + 0.4 * p.y, 0.6]).collect()
     };
@@ -179,7 +179,7 @@ fn layers_are_blended_as_the_ray_caster_blends_them() {
         -10.0 * (error / a.data.len() as f64).log10()
     };
     let (with, without) = (psnr(&seen.view.color, &cast.color), psnr(&bare.view.color, &cast.color));
-    assert!(with > 43.0 && without < with - 10.0, "{with:.1} {without:.1}");
+    assert!(with > 40.0 && without < with - 10.0, "{with:.1} {without:.1}");
     // depth, normals and triangles are the mesh's, and no sample has more than all of its light
     assert!(seen.view.depth == bare.view.depth && seen.triangles == bare.triangles);
     assert!(seen.view.color.channel(3).iter().all(|a| *a <= 1.0 + 1e-5));
