@@ -2,7 +2,7 @@
 //!
 //! | COLMAP | options of features and matches | `--glomap` |
 //! |---|---|---|
-//! | 3.8 to 3.12 | `SiftExtraction.use_gpu`, `SiftMatching.guided_matching` | `glomap mapper` (a program) |
+//! | 3.8 to 3.12 | `SiftExtraction.use_gpu`, `SiftMatching.guided_matching` | `glomap mapper` |
 //! | 3.13 | `FeatureExtraction.use_gpu`, `FeatureMatching.guided_matching` | the same |
 //! | 4.0 to 4.2 | the same | `colmap view_graph_calibrator`, then `colmap global_mapper` |
 //!
