@@ -13,8 +13,7 @@ use crate::pipeline::experiment::{
 };
 use crate::report::duration;
 use crate::report::experiment::{Experiment, ExperimentRow, Measured, Published, read_published};
-use crate::run::is_run;
-use crate::run::{Cost, Run};
+use crate::run::{Cost, Run, is_run};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use serde_json::json;

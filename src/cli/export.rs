@@ -330,8 +330,8 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
         let cut = cut.map(|CutReport { moved, dropped, loops, face_triangles }| {
             json!({
                 "face_triangles": face_triangles,
-                "loops": loops,
-                "dropped": dropped,
+                "face_loops": loops,
+                "dropped_pieces": dropped,
                 "moved_mm": 1e3 * moved,
             })
         });
@@ -358,7 +358,7 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
     };
     let mut text: String = written.iter().map(file).collect();
     let layers = if of_layers > 0 { format!(", and {of_layers} of soft layers") } else { String::new() };
-    let face = cut.map(|cut| format!(", {} of them close the cut", cut.face_triangles));
+    let face = cut.map(|cut| format!(", {} of which close the cut", cut.face_triangles));
     text += &format!("export    {triangles} triangles{}{layers}\n", face.unwrap_or_default());
     for (triangles, [largest, mean]) in levels {
         text += &format!(
@@ -366,9 +366,9 @@ fn tell(invocation: &Invocation, source: &Path, head: &KeptHead, written: &[Path
         );
     }
     text += &format!("export    {x:.3} x {y:.3} x {z:.3} m");
-    // a mesh of fewer triangles, or one that is cut, may not say where its chin is
+    // measured before the head is simplified and cut: afterwards its chin may not be found
     let height =
-        chin_to_crown.map(|meters| format!("; {meters:.3} m from chin to crown of the run's own mesh"));
+        chin_to_crown.map(|meters| format!("; {meters:.3} m from chin to crown in the run's own mesh"));
     text += &format!("{}\n", height.unwrap_or_default());
     print(&text)
 }

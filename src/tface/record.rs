@@ -118,6 +118,9 @@ impl FieldRecord {
             return Err("its decoder is wider than 4096, or its hidden layers are no multiple of 8 wide");
         }
         let finite = |v: &f32| v.is_finite();
+        if s.weight_threshold < 0.0 || s.group_weight < 0.0 {
+            return Err("its thresholds of weights are negative");
+        }
         if !numbers.iter().chain([&self.near, &self.far]).all(finite) || self.near > self.far {
             return Err("its numbers are not finite, or near lies behind far");
         }

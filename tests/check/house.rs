@@ -173,6 +173,18 @@ fn arrows_point_down_only() {
     assert!(wrong.is_empty(), "\n{}", wrong.join("\n"));
 }
 
+/// Opening a capture needs no poses measured, no exposures.
+#[test]
+fn captures_know_no_rigs() {
+    let mut wrong = Vec::new();
+    for source in sources().iter().filter(|s| s.package == "tiface-capture" && s.module != "rig") {
+        let knows = |line: &str| named(line).iter().any(|module| module == "rig");
+        let lines = source.lines.iter().filter(|(_, line)| knows(line));
+        wrong.extend(lines.map(|(number, _)| format!("{}:{number}", source.place)));
+    }
+    assert!(wrong.is_empty(), "`rig` knows captures, not the other way round:\n{}", wrong.join("\n"));
+}
+
 /// A module of a package: what it names of others there, and what it hands on (`pub use`), as paths
 /// that begin with the package.
 struct Module {

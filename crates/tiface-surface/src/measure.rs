@@ -2,13 +2,13 @@
 //! cut it below them.
 //!
 //! The neck is the height whose horizontal section is smallest beside larger ones above and below
-//! ([`narrowest`]).
+//! ([`find_neck`]).
 //! Above it the profile of the middle runs from the neck forward to the chin and up the face: the
 //! chin is where it lies farthest before the straight line from the neck to the nose. On the other
 //! side the nape is where the back of the profile lies farthest forward.
 
 use crate::cut::Plane;
-use crate::neck::{narrowest, widens_below};
+use crate::neck::{find_neck, find_shoulders};
 use crate::{check_indices, finite};
 use glam::{DVec2, DVec3, Vec3};
 use tiface_base::geom::Mesh;
@@ -235,11 +235,11 @@ struct Neck {
 impl Neck {
     /// Finds the neck of a head by the areas of its sections.
     fn find(sections: &[f32]) -> Neck {
-        let Some(narrowest) = narrowest(sections, NARROWER) else {
+        let Some(narrowest) = find_neck(sections, NARROWER) else {
             return Neck { narrowest: 0, base: None, floor: 0 };
         };
         let above = |part: f32| {
-            let wide = widens_below(sections, narrowest, part * sections[narrowest]);
+            let wide = find_shoulders(sections, narrowest, part * sections[narrowest]);
             wide.map_or(0, |level| level + 1)
         };
         let [base, floor] = SHOULDERS.map(above);

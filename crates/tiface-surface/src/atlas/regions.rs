@@ -16,7 +16,7 @@
 use super::chart::straighten;
 use super::divide::{components, joined};
 use super::smooth::smoothed;
-use crate::neck::{narrowest, widens_below};
+use crate::neck::{find_neck, find_shoulders};
 use glam::Vec3;
 use tiface_base::geom::{Mesh, area_vector};
 
@@ -164,12 +164,12 @@ impl<'a> Head<'a> {
             (*least, *most) = (least.min(x), most.max(x));
         }
         let width = sides.map(|[least, most]| (most - least).max(0.0));
-        let narrow = narrowest(&width, NECK);
+        let narrow = find_neck(&width, NECK);
         // hair may hide the neck: then shoulders are what is wider than the head
         let mut upper = width[SLICES / 2..].to_vec();
         upper.sort_by(f32::total_cmp);
         let (from, usual) = narrow.map_or((SLICES / 2, upper[upper.len() / 2]), |i| (i, width[i]));
-        let shoulders = widens_below(&width, from, COLLAR * usual);
+        let shoulders = find_shoulders(&width, from, COLLAR * usual);
         self.neck = narrow.map(height);
         self.collar = shoulders.map_or(low, height);
     }

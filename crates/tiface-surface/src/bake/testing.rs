@@ -13,10 +13,10 @@ use tiface_base::image::{Image, Photo, quantize};
 /// Returns a ball of radius 12 whose texture shows the position, with a layer that is opaque above.
 pub fn ball() -> HeadMesh {
     static BALL: OnceLock<HeadMesh> = OnceLock::new();
-    BALL.get_or_init(made).clone()
+    BALL.get_or_init(make_ball).clone()
 }
 
-fn made() -> HeadMesh {
+fn make_ball() -> HeadMesh {
     let at = |i: usize| i as f32 - 15.5;
     let distance = |i: usize| Vec3::new(at(i % 32), at(i / 32 % 32), at(i / 1024)).length() - 12.0;
     let values: Vec<f32> = (0..32 * 32 * 32).map(distance).collect();

@@ -291,10 +291,10 @@ mod tests {
 
     fn scene() -> Scene {
         static SCENE: OnceLock<Scene> = OnceLock::new();
-        SCENE.get_or_init(made).clone()
+        SCENE.get_or_init(make_scene).clone()
     }
 
-    fn made() -> Scene {
+    fn make_scene() -> Scene {
         let HeadMesh { mesh, texture, .. } = ball();
         let atlas = texture.unwrap().atlas;
         let trust: Vec<f32> = mesh.positions.iter().map(|p| ((6.0 - p.x) / 2.0).clamp(0.0, 1.0)).collect();

@@ -39,8 +39,9 @@ pub struct Shading {
     pub weight_threshold: f32,
     /// A ray ends where its transmittance is at most this; at 0 it does not end early.
     pub stop: f32,
-    /// Samples next to each other on a ray share the color of the last of them, until their weights
-    /// sum to this; what is left at the end of a ray shares that before. At 0 each has its own.
+    /// Neighboring samples of a ray share one color, decoded at the last of them, until their
+    /// weights sum to this; what is left at the end of a ray takes the color before it. At 0 each
+    /// sample has its own.
     #[serde(default)]
     pub group_weight: f32,
 }
@@ -111,8 +112,8 @@ impl KeptSample {
     }
 }
 
-/// In the place of a color's index: the weight of the sample is too small for one.
-pub(super) const COLORLESS: u32 = u32::MAX;
+/// Index of a color for samples whose weight is below the threshold, which have none.
+pub(crate) const COLORLESS: u32 = u32::MAX;
 
 /// A rendered batch of rays, with the intermediate values that its backward pass needs.
 #[derive(Clone, Debug)]
@@ -175,8 +176,8 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
 
 dispatch! { fn march_rays / march_body(task: &mut MarchTask, field: &VmField, lookup: &Lookup) }
 
-/// Assigns colors to the samples of a ray, whose indices start at `start`, and appends the samples
-/// that these are decoded at to `colored`.
+/// Assigns colors to the samples of a ray, the first of which has the index `start`; appends the
+/// indices of the samples at which colors are decoded to `colored`.
 pub(super) fn assign_colors(
     shading: &Shading,
     weights: impl Iterator<Item = f32>,

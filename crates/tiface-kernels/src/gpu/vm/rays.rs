@@ -7,13 +7,10 @@ use super::super::march::prefix_sum;
 use super::super::neus::sigmoid;
 use super::super::vec3::Vec3;
 use super::march::VmSamples;
-use crate::cpu::vm::{RAY_WIDTH, VmField};
+use crate::cpu::vm::{COLORLESS, RAY_WIDTH, VmField};
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
-
-/// In the place of a color's index: the weight of the sample is too small for one.
-const COLORLESS: u32 = u32::MAX;
 
 /// Computes the weights of samples up to where a ray's transmittance is used up, and numbers the
 /// colors that they share, from 0 on each ray.
@@ -38,6 +35,7 @@ fn compute_weights(
         let mut transmittance = 1.0f32;
         let mut colors = 0u32;
         let mut group = 0.0f32; // weight of the samples whose color is not counted yet
+        let mut waiting = 0u32; // whether there are any
         let mut s = offsets[r] as usize;
         let end = offsets[r + 1] as usize;
         let mut marching = s < end;
@@ -58,18 +56,19 @@ fn compute_weights(
             let full = has_color && group >= group_weight;
             colors += select(full, 1u32, 0u32);
             group = select(full, 0.0f32, group);
+            waiting = select(full, 0u32, select(has_color, 1u32, waiting));
             transmittance *= 1.0f32 - a + 1e-10f32;
             s += 1;
             let dark = a > 0.0f32 && transmittance <= stop;
             marching = s < end && !dark;
         }
         ends[r] = s as u32;
-        counts[r] = select(group > 0.0f32, max(colors, 1u32), colors);
+        counts[r] = max(colors, waiting);
     }
 }
 
 /// Lists the samples at which colors are decoded: the last of each group. Numbers the colors in the
-/// order of that list; what is left at the end of a ray shares the color before.
+/// order of that list; what is left at the end of a ray takes the color before it.
 #[cube(launch)]
 fn list(offsets: &[u32], ends: &[u32], color_of: &mut [u32], firsts: &[u32], index: &mut [u32]) {
     let r = ABSOLUTE_POS;
@@ -186,9 +185,9 @@ pub struct CompositedRays {
     pub feature: Buffer,
     /// `[capacity]`: gradients with respect to features.
     pub g_feature: Buffer,
-    /// `[2]`: number of samples with a color, in both words.
+    /// `[2]`: number of decoded colors, in both words.
     pub count: Buffer,
-    /// `[capacity]`: list of the samples with a color.
+    /// `[capacity]`: samples at which colors are decoded.
     pub index: Buffer,
     /// Planes `[3, capacity]`: colors of the listed samples.
     pub rgb: Buffer,
@@ -198,6 +197,7 @@ pub struct CompositedRays {
     pub out: Buffer,
     alpha: Buffer,
     light: Buffer,
+    /// `[capacity]`: index of the color of a sample, or [`COLORLESS`].
     color_of: Buffer,
     ends: Buffer,
     counts: Buffer,
@@ -256,8 +256,8 @@ impl CompositedRays {
         groups(self.ends.word_count().div_ceil(UNITS as usize))
     }
 
-    /// Computes the weights of samples from their features, and lists the samples that need a
-    /// color.
+    /// Computes the weights of samples from their features, and lists the samples at which colors
+    /// are decoded.
     pub fn compute_weights(&self, device: &Device, samples: &VmSamples) {
         launch!(device, compute_weights::launch, self.groups(), UNITS;
             samples.offsets, self.feature, self.alpha, self.light, self.color_of, self.ends, self.counts;
