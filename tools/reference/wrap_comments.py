@@ -23,8 +23,9 @@ KEPT = re.compile(r"^(#{1,6} |#!?\[|\||>|<|={3,}|-{3,}|\[[^\]]*\]:( |$))")
 # a line that began with one of these would be another block of Markdown
 GLUED = re.compile(r"^([-*+>|=]+|#+|\d+[.)]|\[[^\]]*\]:.*)$")
 DRAWING = re.compile(r"\S {2,}\S")
-RAW = re.compile(r'(?:br|cr|r)(#*)"')
-CHARACTER = re.compile(r"b?'(?:\\(?:u\{[0-9a-fA-F_]+\}|x[0-9a-fA-F]{2}|.)|[^\\'\n])'")
+BEGIN = re.compile(r"""//|/\*|["']|(?<!\w)(?:br|cr|r)(#*)\"""")
+STRING = re.compile(r'"(?:\\.|[^"\\])*"?', re.DOTALL)
+CHARACTER = re.compile(r"'(?:\\(?:u\{[0-9a-fA-F_]+\}|x[0-9a-fA-F]{2}|.)|[^\\'\n])'")
 
 
 def sources():
@@ -35,40 +36,28 @@ def sources():
 def comments(text):
     """The ranges of the line comments of a source, with strings, characters and block comments passed over."""
     found, i = [], 0
-    while i < len(text):
-        two = text[i : i + 2]
-        if two == "//":
+    while begin := BEGIN.search(text, i):
+        i = begin.start()
+        if begin[0] == "//":
             end = text.find("\n", i)
             end = len(text) if end < 0 else end
             found.append((i, end))
             i = end
-        elif two == "/*":
+        elif begin[0] == "/*":
             depth, i = 1, i + 2
             while depth and i < len(text):
                 step = {"/*": 1, "*/": -1}.get(text[i : i + 2], 0)
                 depth += step
                 i += 2 if step else 1
-        elif text[i] in "rbc" and not (i and (text[i - 1].isalnum() or text[i - 1] == "_")) and raw(text, i):
-            i = raw(text, i)
-        elif text[i] == '"':
-            i += 1
-            while i < len(text) and text[i] != '"':
-                i += 2 if text[i] == "\\" else 1
-            i += 1
-        elif text[i] == "'" and CHARACTER.match(text, i):
-            i = CHARACTER.match(text, i).end()
-        else:
-            i += 1
+        elif begin[0] == '"':
+            i = STRING.match(text, i).end()
+        elif begin[0] == "'":
+            character = CHARACTER.match(text, i)
+            i = character.end() if character else i + 1
+        else:  # a raw string
+            end = text.find('"' + begin[1], begin.end())
+            i = len(text) if end < 0 else end + 1 + len(begin[1])
     return found
-
-
-def raw(text, i):
-    """Where a raw string that begins at `i` ends; nothing if none does."""
-    begin = RAW.match(text, i)
-    if not begin:
-        return None
-    end = text.find('"' + begin.group(1), begin.end())
-    return len(text) if end < 0 else end + 1 + len(begin.group(1))
 
 
 def words(paragraph):
