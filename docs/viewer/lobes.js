@@ -8,12 +8,16 @@
 //
 //     base + sum over k of L_k Y_k(d),     L_k = (byte - 128) / 127 * scale[k]
 //
-// in sRGB-coded values, clamped to 0..1. L_k comes from one texture a function; Y_k are real spherical harmonics;
-// d is the unit vector from the point to the viewer in the file's own axes, whatever the scene does to the head.
+// in sRGB-coded values, clamped to 0..1. L_k comes from one texture a function; Y_k are real spherical
+// harmonics; d is the unit vector from the point to the viewer in the file's own axes, whatever the scene
+// does to the head.
 
 import { MeshBasicMaterial, NoColorSpace } from "three";
 
-/** Y_k of the unit vector d, in the order of the file's textures: the first four are degree 1, all nine degree 2. */
+/**
+ * Y_k of the unit vector d, in the order of the file's textures: the first four are degree 1, all nine
+ * degree 2.
+ */
 export const BASIS = [
   "0.28209479",
   "-0.48860251 * d.y",
@@ -27,11 +31,11 @@ export const BASIS = [
 ];
 
 /**
- * Gives every mesh of a loaded glTF whose material names lobes, the head and its soft layers, a material that shows
- * them.
+ * Gives every mesh of a loaded glTF whose material names lobes, the head and its soft layers, a material
+ * that shows them.
  *
- * Returns a uniform shared by all of them, `{ value: 1 }`: with 0 they show the base color alone. Null if there are
- * no lobes in the file.
+ * Returns a uniform shared by all of them, `{ value: 1 }`: with 0 they show the base color alone. Null if
+ * there are no lobes in the file.
  */
 export async function addLobes(gltf) {
   const strength = { value: 1 };

@@ -1,4 +1,5 @@
-/* Lets the program's n-th change of a file below a folder go wrong; loaded in front of the C library (LD_PRELOAD).
+/* Lets the program's n-th change of a file below a folder go wrong; loaded in front of the C library
+ * (LD_PRELOAD).
  *
  *   FAULT_UNDER  the folder
  *   FAULT_AT     which change, from 1; 0: none
@@ -46,7 +47,8 @@ static int below_fd(int fd) {
     return below(path);
 }
 
-/* What becomes of a change: an errno, 0 for nothing special, -1 for half of it, -2 for half of it and the end. */
+/* What becomes of a change: an errno, 0 for nothing special, -1 for half of it, -2 for half of it and the
+ * end. */
 static int fate(const char *what, int needs_space, int is_write) {
     pthread_mutex_lock(&lock);
     const char *kind = getenv("FAULT_KIND"), *at = getenv("FAULT_AT"), *log = getenv("FAULT_LOG");

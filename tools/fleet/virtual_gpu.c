@@ -1,5 +1,6 @@
-// A Vulkan layer under which every adapter calls itself a virtual GPU: so check_fleet.py tries on a software driver what
-// is meant for GPUs. What it needs of Vulkan's headers is written out: they are not where a compiler alone is installed.
+// A Vulkan layer under which every adapter calls itself a virtual GPU: so check_fleet.py tries on a software
+// driver what is meant for GPUs. What it needs of Vulkan's headers is written out: they are not where a
+// compiler alone is installed.
 #include <stdint.h>
 #include <string.h>
 
@@ -25,7 +26,8 @@ static GetProc below;
 static GetProperties below_properties, below_properties2;
 
 static int create(const void *info, const void *allocator, void **instance) {
-  // 47: VK_STRUCTURE_TYPE_LOADER_INSTANCE_CREATE_INFO, 0: VK_LAYER_LINK_INFO; -3: VK_ERROR_INITIALIZATION_FAILED
+  // 47: VK_STRUCTURE_TYPE_LOADER_INSTANCE_CREATE_INFO, 0: VK_LAYER_LINK_INFO;
+  // -3: VK_ERROR_INITIALIZATION_FAILED
   const struct Info *chain = ((const struct Info *)info)->next;
   while (chain && !(chain->type == 47 && chain->function == 0)) chain = chain->next;
   if (!chain) return -3;

@@ -24,8 +24,8 @@ export function checks() {
 }
 
 /**
- * Waits until the predicate, a true or false, holds in the page, also while another page is opened. Playwright's own way
- * evaluates text there, which the policy of our pages refuses.
+ * Waits until the predicate, a true or false, holds in the page, also while another page is opened.
+ * Playwright's own way evaluates text there, which the policy of our pages refuses.
  */
 export async function holds(page, predicate) {
   for (const end = Date.now() + 60_000; ; await page.waitForTimeout(50)) {
@@ -35,8 +35,8 @@ export async function holds(page, predicate) {
 }
 
 /**
- * A browser whose pages remember what they asked a network for, and their errors. `gl`: with WebGL, drawn by the
- * CPU. `folder` is for files that are needed meanwhile.
+ * A browser whose pages remember what they asked a network for, and their errors. `gl`: with WebGL, drawn
+ * by the CPU. `folder` is for files that are needed meanwhile.
  */
 export async function browser({ gl = false } = {}) {
   const profile = await mkdtemp(path.join(tmpdir(), "page-"));

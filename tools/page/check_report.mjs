@@ -35,7 +35,9 @@ const at = (name) => path.resolve(run, name);
 const there = (name) => access(at(name)).then(() => true, () => false);
 const all = checks(), { check, same } = all;
 
-/** PSNR of a drawn picture against one of ours, over the pixels that ours covers, laid over the color behind. */
+/**
+ * PSNR of a drawn picture against one of ours, over the pixels that ours covers, laid over the color behind.
+ */
 function decibels(drawn, ours) {
   const [a, b] = [drawn, ours].map((bytes) => PNG.sync.read(bytes));
   if (a.width !== b.width || a.height !== b.height) return `${a.width} × ${a.height}, ${b.width} × ${b.height}`;
