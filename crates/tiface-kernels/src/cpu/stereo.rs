@@ -21,6 +21,7 @@
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use std::collections::HashMap;
+use tiface_base::dispatch;
 use tiface_base::geom::Camera;
 
 /// Number of samples from a patch's center to its edge; samples are a pixel apart.
@@ -28,6 +29,25 @@ const HALF: i32 = 4;
 
 /// Number of samples of a patch.
 const PATCH: usize = (2 * HALF as usize + 1).pow(2);
+
+/// Number of samples that are evaluated together.
+const LANES: usize = 8;
+
+/// Length of a patch in memory, whole lanes; the samples beyond [`PATCH`] are zero.
+const PADDED: usize = PATCH.next_multiple_of(LANES);
+
+/// Column and row of the samples of a patch, counted from its center.
+const OFFSETS: [[f32; PADDED]; 2] = {
+    let mut offsets = [[0f32; PADDED]; 2];
+    let mut k = 0;
+    while k < PATCH {
+        let side = 2 * HALF + 1;
+        offsets[0][k] = (k as i32 % side - HALF) as f32;
+        offsets[1][k] = (k as i32 / side - HALF) as f32;
+        k += 1;
+    }
+    offsets
+};
 
 /// Maximum number of photographs in which a point is compared; the most frontal ones are used.
 const MAX_VIEWS: usize = 8;
@@ -151,9 +171,11 @@ impl Projected {
 
     /// Samples the brightness of the patch and normalizes it to mean 0 and length 1. If the patch
     /// leaves the usable part of the photograph or has no contrast, writes zeros and returns false.
-    fn sample_patch(&self, view: &StereoView, at: Displacement, patch: &mut [f32; PATCH]) -> bool {
+    #[inline(always)]
+    fn sample_patch(&self, view: &StereoView, at: Displacement, patch: &mut [f32; PADDED]) -> bool {
         let center = self.center + at.shift * (self.slope + at.shift * self.curvature) - 0.5;
-        let [a, b] = [0, 1].map(|k| self.axes[k] + at.tilt[k] * self.slope);
+        let a = self.axes[0] + at.tilt.x * self.slope;
+        let b = self.axes[1] + at.tilt.y * self.slope;
         let (w, h) = (view.camera.width as usize, view.camera.height as usize);
         let extent = HALF as f32 * (a.abs() + b.abs());
         let (low, high) = (center - extent, center + extent);
@@ -165,53 +187,129 @@ impl Projected {
             patch.fill(0.0);
             return false;
         }
-        let (mut k, mut sum) = (0, 0f32);
-        for j in -HALF..=HALF {
-            let row = center + j as f32 * b;
-            for i in -HALF..=HALF {
-                let (x, y) = (row.x + i as f32 * a.x, row.y + i as f32 * a.y);
-                let (cx, cy) = (x as usize, y as usize);
-                let (fx, fy) = (x - cx as f32, y - cy as f32);
-                let corner = cy * w + cx;
-                let (top, bottom) = (&view.gray[corner..][..2], &view.gray[corner + w..][..2]);
-                let (t, u) = (top[0] + fx * (top[1] - top[0]), bottom[0] + fx * (bottom[1] - bottom[0]));
-                patch[k] = t + fy * (u - t);
-                sum += patch[k];
-                k += 1;
-            }
-        }
-        let mean = sum / PATCH as f32;
-        let mut square = 0f32;
-        for v in patch.iter_mut() {
-            *v -= mean;
-            square += *v * *v;
-        }
-        let has_contrast = square >= MIN_CONTRAST * MIN_CONTRAST * PATCH as f32;
-        let scale = if has_contrast { 1.0 / square.sqrt() } else { 0.0 };
-        patch.iter_mut().for_each(|v| *v *= scale);
-        has_contrast
+        interpolate(&view.gray, (w, h), center, [a, b], patch);
+        normalize(patch)
     }
+}
+
+/// Interpolates brightness at the samples of a patch, which lie inside of the photograph, a pixel
+/// or more from its right and lower edge.
+#[inline(always)]
+fn interpolate(
+    gray: &[f32],
+    (w, h): (usize, usize),
+    center: Vec2,
+    [a, b]: [Vec2; 2],
+    patch: &mut [f32; PADDED],
+) {
+    assert!(gray.len() == w * h);
+    let mut corner = [0i32; PADDED];
+    let (mut fx, mut fy) = ([0f32; PADDED], [0f32; PADDED]);
+    for k in 0..PADDED {
+        let x = center.x + OFFSETS[1][k] * b.x + OFFSETS[0][k] * a.x;
+        let y = center.y + OFFSETS[1][k] * b.y + OFFSETS[0][k] * a.y;
+        // SAFETY: the caller has them inside of the photograph; `max` and `min` also bound NaN.
+        let cx = unsafe { x.max(0.0).min((w - 2) as f32).to_int_unchecked::<i32>() };
+        // SAFETY: as above.
+        let cy = unsafe { y.max(0.0).min((h - 2) as f32).to_int_unchecked::<i32>() };
+        fx[k] = x - cx as f32;
+        fy[k] = y - cy as f32;
+        corner[k] = cy * w as i32 + cx;
+    }
+    let mut pixels = [[0f32; PADDED]; 4];
+    for k in 0..PADDED {
+        let corner = corner[k] as usize;
+        for (i, at) in [corner, corner + 1, corner + w, corner + w + 1].into_iter().enumerate() {
+            // SAFETY: column and row of the corner are at most w − 2 and h − 2, by the bounds above.
+            pixels[i][k] = unsafe { *gray.get_unchecked(at) };
+        }
+    }
+    for k in 0..PADDED {
+        let top = pixels[0][k] + fx[k] * (pixels[1][k] - pixels[0][k]);
+        let bottom = pixels[2][k] + fx[k] * (pixels[3][k] - pixels[2][k]);
+        patch[k] = top + fy[k] * (bottom - top);
+    }
+}
+
+/// Brings a patch to mean 0 and length 1, or to zero where it has no contrast, for which it returns
+/// false.
+#[inline(always)]
+fn normalize(patch: &mut [f32; PADDED]) -> bool {
+    patch[PATCH..].fill(0.0);
+    let mut sum = [0f32; LANES];
+    for block in patch.as_chunks::<LANES>().0 {
+        for i in 0..LANES {
+            sum[i] += block[i];
+        }
+    }
+    let mean = sum.iter().sum::<f32>() / PATCH as f32;
+    for v in patch.iter_mut() {
+        *v -= mean;
+    }
+    patch[PATCH..].fill(0.0);
+    let square = squares(patch);
+    let has_contrast = square >= MIN_CONTRAST * MIN_CONTRAST * PATCH as f32;
+    let scale = if has_contrast { 1.0 / square.sqrt() } else { 0.0 };
+    for v in patch.iter_mut() {
+        *v *= scale;
+    }
+    has_contrast
+}
+
+/// Returns Σ v².
+#[inline(always)]
+fn squares(patch: &[f32; PADDED]) -> f32 {
+    let mut sum = [0f32; LANES];
+    for block in patch.as_chunks::<LANES>().0 {
+        for i in 0..LANES {
+            sum[i] += block[i] * block[i];
+        }
+    }
+    sum.iter().sum()
+}
+
+/// Writes the normalized patches of a surfel at a displacement, and the squared length of their sum
+/// less the number of those with contrast.
+#[inline(always)]
+fn sum_patches_body<const F: bool>(
+    views: &[StereoView],
+    visible: &[Projected],
+    at: Displacement,
+    patches: &mut [[f32; PADDED]],
+    out: &mut f32,
+) {
+    let mut sum = [0f32; PADDED];
+    let mut with_contrast = 0;
+    for (p, patch) in visible.iter().zip(patches) {
+        with_contrast += i32::from(p.sample_patch(&views[p.view], at, patch));
+        for k in 0..PADDED {
+            sum[k] += patch[k];
+        }
+    }
+    *out = squares(&sum) - with_contrast as f32;
+}
+
+dispatch! {
+    fn sum_patches / sum_patches_body(
+        views: &[StereoView], visible: &[Projected], at: Displacement, patches: &mut [[f32; PADDED]],
+        out: &mut f32,
+    )
 }
 
 /// A surfel with its projections into the photographs in which it is visible.
 struct Matching<'a> {
     views: &'a [StereoView],
     visible: Vec<Projected>,
-    patches: Vec<[f32; PATCH]>,
+    patches: Vec<[f32; PADDED]>,
 }
 
 impl Matching<'_> {
     /// Returns the mean correlation of all pairs of photographs at a displacement.
     fn score(&mut self, displacement: Displacement) -> f32 {
-        let mut sum = [0f32; PATCH];
-        let mut with_contrast = 0;
-        for (p, patch) in self.visible.iter().zip(&mut self.patches) {
-            with_contrast += i32::from(p.sample_patch(&self.views[p.view], displacement, patch));
-            (0..PATCH).for_each(|k| sum[k] += patch[k]);
-        }
+        let mut square = 0.0;
+        sum_patches(self.views, &self.visible, displacement, &mut self.patches, &mut square);
         let n = self.visible.len() as f32;
-        let square: f32 = sum.iter().map(|s| s * s).sum();
-        (square - with_contrast as f32) / (n * (n - 1.0))
+        square / (n * (n - 1.0))
     }
 
     /// Removes photographs that do not fit the others at a displacement. Returns whether all of
@@ -360,7 +458,7 @@ fn match_one(views: &[StereoView], s: &Surfel) -> Option<StereoPoint> {
     if visible.len() < MIN_VIEWS {
         return None;
     }
-    let mut matching = Matching { views, patches: vec![[0f32; PATCH]; visible.len()], visible };
+    let mut matching = Matching { views, patches: vec![[0f32; PADDED]; visible.len()], visible };
     let (mut shift, mut step) = matching.search()?;
     if !matching.keep_fitting(Displacement { shift, tilt: Vec2::ZERO }) {
         if matching.visible.len() < MIN_VIEWS {
