@@ -124,7 +124,7 @@ impl<'a> Lookup<'a> {
     /// Returns the sum over terms and channels of plane times line.
     #[inline(always)]
     pub fn sum<const F: bool>(&self, cell: &Cell) -> f32 {
-        let mut total = 0f32;
+        let mut sums = [0f32; 16];
         for i in 0..3 {
             let term = &self.terms[i];
             let at = corners(i, cell, term.width, term.channels);
@@ -132,14 +132,18 @@ impl<'a> Lookup<'a> {
             let line = cell.index[axis] as usize * term.channels;
             in_pieces!(term.channels, c, W, {
                 let (p, v) = look_up::<F, W>(term, &at, line, cell.frac[axis], c);
-                let mut s = [0f32; W];
                 for k in 0..W {
-                    s[k] = p[k] * v[k];
+                    sums[k] = fma::<F>(p[k], v[k], sums[k]);
                 }
-                total += s.iter().sum::<f32>();
             });
         }
-        total
+        // by halves: one after the other, sixteen additions would wait for each other
+        for half in [8, 4, 2, 1] {
+            for k in 0..half {
+                sums[k] += sums[k + half];
+            }
+        }
+        sums[0]
     }
 
     /// Writes plane and line values of all channels, term by term. Both slices are `[channels]` or
