@@ -36,33 +36,64 @@ impl AdamStep {
     }
 }
 
+/// Number of weights that are skipped together: a line of the cache.
+const BLOCK: usize = 16;
+
+/// Number of weights that are fetched together, 32 blocks.
+const GROUP: usize = 32 * BLOCK;
+
+/// Returns the blocks of the group at `first` that a step changes, a bit each, and has the CPU fetch
+/// their values and moments: it does not guess which ones are skipped.
+#[inline(always)]
+fn touched(p: &[f32], m: &[f32], v: &[f32], g: &[f32], first: usize, skip_zero: bool) -> u32 {
+    let group = &g[first.min(g.len())..(first + GROUP).min(g.len())];
+    let mut blocks = 0;
+    for (i, block) in group.chunks(BLOCK).enumerate() {
+        let mut any = !skip_zero;
+        for &g in block {
+            any |= g != 0.0;
+        }
+        blocks |= u32::from(any) << i;
+        #[cfg(target_arch = "x86_64")]
+        if any {
+            use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+            for values in [p, m, v] {
+                // SAFETY: the three are as long as `g`, and the block starts within it.
+                unsafe { _mm_prefetch::<_MM_HINT_T0>(values.as_ptr().add(first + BLOCK * i).cast()) };
+            }
+        }
+    }
+    blocks
+}
+
 #[inline(always)]
 fn adam_body<const F: bool>(p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &mut [f32], s: &AdamStep) {
     let c1 = (1.0 / (1.0 - (s.beta1 as f64).powf(s.step as f64))) as f32;
     let c2 = (1.0 / (1.0 - (s.beta2 as f64).powf(s.step as f64))) as f32;
     let keep = 1.0 - s.lr * s.weight_decay;
-    const W: usize = 16;
     let n = p.len();
     assert!(m.len() == n && v.len() == n && g.len() == n);
-    let mut i = 0;
-    while i < n {
-        let w = W.min(n - i);
-        let (gi, pi) = (&mut g[i..i + w], &mut p[i..i + w]);
-        i += w;
-        if s.skip_zero && gi.iter().all(|&g| g == 0.0) {
-            continue;
-        }
-        let (mi, vi) = (&mut m[i - w..i], &mut v[i - w..i]);
-        for k in 0..w {
-            let g = gi[k];
-            let m1 = fma::<F>(s.beta1, mi[k], (1.0 - s.beta1) * g);
-            let v1 = fma::<F>(s.beta2, vi[k], (1.0 - s.beta2) * g * g);
-            let p1 = fma::<F>(pi[k], keep, -s.lr * (m1 * c1) / ((v1 * c2).sqrt() + s.epsilon));
-            let idle = s.skip_zero && g == 0.0;
-            mi[k] = if idle { mi[k] } else { m1 };
-            vi[k] = if idle { vi[k] } else { v1 };
-            pi[k] = if idle { pi[k] } else { p1 };
-            gi[k] = 0.0;
+    let mut next = touched(p, m, v, g, 0, s.skip_zero);
+    for group in (0..n).step_by(GROUP) {
+        let mut blocks = next;
+        next = touched(p, m, v, g, group + GROUP, s.skip_zero);
+        while blocks != 0 {
+            let first = group + BLOCK * blocks.trailing_zeros() as usize;
+            blocks &= blocks - 1;
+            let span = first..(first + BLOCK).min(n);
+            let (pi, mi) = (&mut p[span.clone()], &mut m[span.clone()]);
+            let (vi, gi) = (&mut v[span.clone()], &mut g[span]);
+            for k in 0..gi.len() {
+                let g = gi[k];
+                let m1 = fma::<F>(s.beta1, mi[k], (1.0 - s.beta1) * g);
+                let v1 = fma::<F>(s.beta2, vi[k], (1.0 - s.beta2) * g * g);
+                let p1 = fma::<F>(pi[k], keep, -s.lr * (m1 * c1) / ((v1 * c2).sqrt() + s.epsilon));
+                let idle = s.skip_zero && g == 0.0;
+                mi[k] = if idle { mi[k] } else { m1 };
+                vi[k] = if idle { vi[k] } else { v1 };
+                pi[k] = if idle { pi[k] } else { p1 };
+                gi[k] = 0.0;
+            }
         }
     }
 }
