@@ -121,8 +121,8 @@ pub fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES]) -> ([[u32; L
 
 /// Returns the first block of `x`, padded with zeros.
 #[inline(always)]
-fn block(x: &[[f32; 3]]) -> [[f32; 3]; LANES] {
-    let padded = || std::array::from_fn(|i| x.get(i).copied().unwrap_or_default());
+fn block<const N: usize>(x: &[[f32; N]]) -> [[f32; N]; LANES] {
+    let padded = || std::array::from_fn(|i| x.get(i).copied().unwrap_or([0.0; N]));
     x.first_chunk().copied().unwrap_or_else(padded)
 }
 
@@ -215,7 +215,11 @@ fn gather_body<const F: bool>(
                 }
             }
         }
-        value.copy_from_slice(&out[..value.len()]);
+        // a copy of a length that is not known would be a call
+        match value.first_chunk_mut() {
+            Some(value) => *value = out,
+            None => value.copy_from_slice(&out[..value.len()]),
+        }
     }
 }
 
@@ -287,9 +291,7 @@ fn scatter_body<const F: bool>(
         let (index, f) = next;
         next = fetched_cells::<F>(level, gradient, &x01[span.end..]);
         let normal = block(&g_normal[span.clone()]);
-        let (mut gv, mut qv) = ([[0f32; 2]; LANES], [[0f32; 2]; LANES]);
-        gv[..count].copy_from_slice(&g_value[span.clone()]);
-        qv[..count].copy_from_slice(&q[span]);
+        let (gv, qv) = (block(&g_value[span.clone()]), block(&q[span]));
         let mut add = [[[0f32; 2]; LANES]; 8];
         for k in 0..8 {
             let up = |a: usize| (k >> a & 1) == 1;

@@ -25,12 +25,16 @@ pub struct Samples {
 impl Samples {
     /// Returns positions and directions of the samples of the batch's rays.
     pub fn points(&self, rays: &[Ray]) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
-        let ray_points = |(r, ray): (usize, &Ray)| {
+        let (mut points, mut directions) = (vec![[0f32; 3]; self.t.len()], vec![[0f32; 3]; self.t.len()]);
+        for (ray, span) in rays.iter().zip(self.offsets.windows(2)) {
             let (o, d) = (ray.origin.to_array(), ray.direction.to_array());
-            let span = self.offsets[r] as usize..self.offsets[r + 1] as usize;
-            self.t[span].iter().map(move |t| (std::array::from_fn(|a| o[a] + t * d[a]), d))
-        };
-        rays.iter().enumerate().flat_map(ray_points).unzip()
+            for s in span[0] as usize..span[1] as usize {
+                let t = self.t[s];
+                points[s] = [o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]];
+                directions[s] = d;
+            }
+        }
+        (points, directions)
     }
 }
 
