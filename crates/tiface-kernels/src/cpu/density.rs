@@ -137,10 +137,10 @@ fn forward_body<const F: bool>(task: &mut ForwardTask, w: &DensityWeights) {
         }
     }
     t.h = vec![0.0; CHUNK * HIDDEN];
-    gemm::<F>((CHUNK, HIDDEN, inputs), &t.u, (inputs, 1), &w.m[0].t, HIDDEN, &mut t.h, HIDDEN, false);
+    gemm((CHUNK, HIDDEN, inputs), &t.u, (inputs, 1), &w.m[0].t, HIDDEN, &mut t.h, HIDDEN, false);
     relu(&mut t.h);
     t.o = vec![0.0; CHUNK * FEATURES];
-    gemm::<F>((CHUNK, FEATURES, HIDDEN), &t.h, (HIDDEN, 1), &w.m[1].t, FEATURES, &mut t.o, FEATURES, false);
+    gemm((CHUNK, FEATURES, HIDDEN), &t.h, (HIDDEN, 1), &w.m[1].t, FEATURES, &mut t.o, FEATURES, false);
     for (s, density) in task.density.iter_mut().enumerate() {
         *density = exp::<F>(t.o[s * FEATURES] - 1.0);
     }
@@ -153,13 +153,13 @@ fn forward_body<const F: bool>(task: &mut ForwardTask, w: &DensityWeights) {
     }
     t.c1 = vec![0.0; CHUNK * HIDDEN];
     let size = (CHUNK, HIDDEN, COLOR_INPUTS);
-    gemm::<F>(size, &t.c0, (COLOR_INPUTS, 1), &w.m[2].t, HIDDEN, &mut t.c1, HIDDEN, false);
+    gemm(size, &t.c0, (COLOR_INPUTS, 1), &w.m[2].t, HIDDEN, &mut t.c1, HIDDEN, false);
     relu(&mut t.c1);
     t.c2 = vec![0.0; CHUNK * HIDDEN];
-    gemm::<F>((CHUNK, HIDDEN, HIDDEN), &t.c1, (HIDDEN, 1), &w.m[3].t, HIDDEN, &mut t.c2, HIDDEN, false);
+    gemm((CHUNK, HIDDEN, HIDDEN), &t.c1, (HIDDEN, 1), &w.m[3].t, HIDDEN, &mut t.c2, HIDDEN, false);
     relu(&mut t.c2);
     t.rgb = vec![0.0; CHUNK * RGB];
-    gemm::<F>((CHUNK, RGB, HIDDEN), &t.c2, (HIDDEN, 1), &w.m[4].t, RGB, &mut t.rgb, RGB, false);
+    gemm((CHUNK, RGB, HIDDEN), &t.c2, (HIDDEN, 1), &w.m[4].t, RGB, &mut t.rgb, RGB, false);
     for (s, color) in task.color.iter_mut().enumerate() {
         *color = std::array::from_fn(|c| sigmoid::<F>(t.rgb[s * RGB + c]));
     }
@@ -227,7 +227,7 @@ struct BackwardTask<'a> {
 #[inline(always)]
 fn outer<const F: bool>(g: &[f32], out: usize, v: &[f32], inputs: usize) -> Vec<f32> {
     let mut sum = vec![0f32; out * inputs];
-    gemm::<F>((out, inputs, CHUNK), g, (1, out), v, inputs, &mut sum, inputs, false);
+    gemm((out, inputs, CHUNK), g, (1, out), v, inputs, &mut sum, inputs, false);
     sum
 }
 
@@ -236,7 +236,7 @@ fn outer<const F: bool>(g: &[f32], out: usize, v: &[f32], inputs: usize) -> Vec<
 #[inline(always)]
 fn back<const F: bool>(g: &[f32], out: usize, w: &Matrix, inputs: usize, layer: Option<&[f32]>) -> Vec<f32> {
     let mut g_input = vec![0f32; CHUNK * inputs];
-    gemm::<F>((CHUNK, inputs, out), g, (out, 1), &w.m, inputs, &mut g_input, inputs, false);
+    gemm((CHUNK, inputs, out), g, (out, 1), &w.m, inputs, &mut g_input, inputs, false);
     if let Some(layer) = layer {
         g_input.iter_mut().zip(layer).for_each(|(g, v)| *g = if *v > 0.0 { *g } else { 0.0 });
     }

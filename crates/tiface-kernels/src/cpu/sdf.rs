@@ -206,16 +206,16 @@ fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
         inputs.fill(u, kp, base, rows);
         let u = &*u;
         let h = &mut t.h[base * HIDDEN..][..TILE * HIDDEN];
-        gemm::<F>((TILE, HIDDEN, kp), u, (kp, 1), &w.w1.t, HIDDEN, h, HIDDEN, false);
+        gemm((TILE, HIDDEN, kp), u, (kp, 1), &w.w1.t, HIDDEN, h, HIDDEN, false);
         activate::<F>(h, &mut a, &w.b1, w.output_row(0));
         let out16 = OUTPUTS_PADDED;
-        gemm::<F>((TILE, out16, HIDDEN), h, (HIDDEN, 1), &w.w2.t, out16, &mut o, out16, false);
+        gemm((TILE, out16, HIDDEN), h, (HIDDEN, 1), &w.w2.t, out16, &mut o, out16, false);
         for row in o.as_chunks_mut::<OUTPUTS_PADDED>().0 {
             for j in 0..OUTPUTS_PADDED {
                 row[j] += w.b2[j];
             }
         }
-        gemm::<F>((TILE, kp, HIDDEN), &a, (HIDDEN, 1), &w.w1.m, kp, &mut q, kp, false);
+        gemm((TILE, kp, HIDDEN), &a, (HIDDEN, 1), &w.w1.m, kp, &mut q, kp, false);
         let mut n: [[f32; TILE]; 3] =
             std::array::from_fn(|k| std::array::from_fn(|r| q[r * kp + first + k] * inputs.inv_radius));
         for (l, level_q) in t.q.iter_mut().enumerate() {
@@ -272,11 +272,11 @@ fn color_layers<const F: bool>(
     rgb: &mut [f32; TILE * RGB_PADDED],
 ) {
     let ci = w.layout.color_padded();
-    gemm::<F>((TILE, HIDDEN, ci), c0, (ci, 1), &w.c1.t, HIDDEN, c1, HIDDEN, false);
+    gemm((TILE, HIDDEN, ci), c0, (ci, 1), &w.c1.t, HIDDEN, c1, HIDDEN, false);
     relu(c1);
-    gemm::<F>((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2.t, HIDDEN, c2, HIDDEN, false);
+    gemm((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2.t, HIDDEN, c2, HIDDEN, false);
     relu(c2);
-    gemm::<F>((TILE, RGB_PADDED, HIDDEN), c2, (HIDDEN, 1), &w.c3.t, RGB_PADDED, rgb, RGB_PADDED, false);
+    gemm((TILE, RGB_PADDED, HIDDEN), c2, (HIDDEN, 1), &w.c3.t, RGB_PADDED, rgb, RGB_PADDED, false);
     for v in rgb {
         *v = sigmoid::<F>(*v);
     }

@@ -59,18 +59,18 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
                 g_pre[r * RGB_PADDED + c] = g_out[r * WIDTH + 4 + c] * y * (1.0 - y);
             }
         }
-        gemm::<F>((4, HIDDEN, TILE), &g_pre, (1, RGB_PADDED), c2, HIDDEN, g_c3_weights, HIDDEN, true);
-        gemm::<F>((TILE, HIDDEN, 3), &g_pre, (RGB_PADDED, 1), &w.c3.m, HIDDEN, &mut g_c2, HIDDEN, false);
+        gemm((4, HIDDEN, TILE), &g_pre, (1, RGB_PADDED), c2, HIDDEN, g_c3_weights, HIDDEN, true);
+        gemm((TILE, HIDDEN, 3), &g_pre, (RGB_PADDED, 1), &w.c3.m, HIDDEN, &mut g_c2, HIDDEN, false);
         for i in 0..TILE * HIDDEN {
             g_c2[i] = relu_gradient(g_c2[i], c2[i]);
         }
-        gemm::<F>((HIDDEN, HIDDEN, TILE), &g_c2, (1, HIDDEN), c1, HIDDEN, g_c2_weights, HIDDEN, true);
-        gemm::<F>((TILE, HIDDEN, HIDDEN), &g_c2, (HIDDEN, 1), &w.c2.m, HIDDEN, &mut g_c1, HIDDEN, false);
+        gemm((HIDDEN, HIDDEN, TILE), &g_c2, (1, HIDDEN), c1, HIDDEN, g_c2_weights, HIDDEN, true);
+        gemm((TILE, HIDDEN, HIDDEN), &g_c2, (HIDDEN, 1), &w.c2.m, HIDDEN, &mut g_c1, HIDDEN, false);
         for i in 0..TILE * HIDDEN {
             g_c1[i] = relu_gradient(g_c1[i], c1[i]);
         }
-        gemm::<F>((HIDDEN, ci, TILE), &g_c1, (1, HIDDEN), c0, ci, g_c1_weights, ci, true);
-        gemm::<F>((TILE, ci, HIDDEN), &g_c1, (HIDDEN, 1), &w.c1.m, ci, &mut g_c0, ci, false);
+        gemm((HIDDEN, ci, TILE), &g_c1, (1, HIDDEN), c0, ci, g_c1_weights, ci, true);
+        gemm((TILE, ci, HIDDEN), &g_c1, (HIDDEN, 1), &w.c1.m, ci, &mut g_c0, ci, false);
 
         // outputs of the geometry network and the spatial gradient
         g_o.fill(0.0);
@@ -126,10 +126,10 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
                 a[j] = s[j] * first_row[j];
             }
         }
-        gemm::<F>((TILE, HIDDEN, kp), &g_q, (kp, 1), &w.w1.t, HIDDEN, &mut g_a, HIDDEN, false);
+        gemm((TILE, HIDDEN, kp), &g_q, (kp, 1), &w.w1.t, HIDDEN, &mut g_a, HIDDEN, false);
         let (go, op) = (&g_o, OUTPUTS_PADDED);
-        gemm::<F>((TILE, HIDDEN, OUTPUTS), go, (op, 1), &w.w2.m, HIDDEN, &mut g_z, HIDDEN, false);
-        gemm::<F>((op, HIDDEN, TILE), go, (1, op), h, HIDDEN, g_w2, HIDDEN, true);
+        gemm((TILE, HIDDEN, OUTPUTS), go, (op, 1), &w.w2.m, HIDDEN, &mut g_z, HIDDEN, false);
+        gemm((op, HIDDEN, TILE), go, (1, op), h, HIDDEN, g_w2, HIDDEN, true);
         for row in g_o.as_chunks::<OUTPUTS_PADDED>().0 {
             g_b2.iter_mut().zip(row).for_each(|(sum, g)| *sum += g);
         }
@@ -145,10 +145,10 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
             }
         }
         g_z[rows * HIDDEN..].fill(0.0);
-        gemm::<F>((HIDDEN, kp, TILE), &weighted, (1, HIDDEN), &g_q, kp, g_w1, kp, true);
-        gemm::<F>((HIDDEN, kp, TILE), &g_z, (1, HIDDEN), u, kp, g_w1, kp, true);
+        gemm((HIDDEN, kp, TILE), &weighted, (1, HIDDEN), &g_q, kp, g_w1, kp, true);
+        gemm((HIDDEN, kp, TILE), &g_z, (1, HIDDEN), u, kp, g_w1, kp, true);
         let wide = (TILE, features_padded, HIDDEN);
-        gemm::<F>(wide, &g_z, (HIDDEN, 1), &w.w1.m, kp, &mut g_u, kp, false);
+        gemm(wide, &g_z, (HIDDEN, 1), &w.w1.m, kp, &mut g_u, kp, false);
         for (l, g_value) in t.g_value.iter_mut().enumerate() {
             for (r, g) in g_value[tile * TILE..][..rows].iter_mut().enumerate() {
                 let of_layer = &g_u[r * kp + 2 * l..][..2];

@@ -28,7 +28,7 @@ fn values_body<const F: bool>(inputs: &Inputs, soften: f32, values: &mut [[f32; 
     let mut h = [0f32; TILE * HIDDEN];
     for (tile, values) in values.chunks_mut(TILE).enumerate() {
         inputs.fill(&mut u, kp, tile * TILE, values.len());
-        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
+        gemm((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
         softplus::<F>(&mut h, &w.b1);
         for (value, h) in values.iter_mut().zip(h.as_chunks::<HIDDEN>().0) {
             for (value, output) in value.iter_mut().zip([0, SOFTNESS]) {
@@ -133,10 +133,10 @@ fn color_body<const F: bool>(task: &mut ColorTask, w: &Weights) {
         let base = tile * TILE;
         let rows = TILE.min(samples - base);
         task.inputs.fill(&mut u, kp, base, rows);
-        gemm::<F>((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
+        gemm((TILE, HIDDEN, kp), &u, (kp, 1), &w.w1.t, HIDDEN, &mut h, HIDDEN, false);
         softplus::<F>(&mut h, &w.b1);
         let op = OUTPUTS_PADDED;
-        gemm::<F>((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2.t, op, &mut o, op, false);
+        gemm((TILE, op, HIDDEN), &h, (HIDDEN, 1), &w.w2.t, op, &mut o, op, false);
         for r in 0..rows {
             for _ in 0..task.counts.map_or(1, |c| c[base + r]) {
                 let row = &mut shader.c0[filled * ci..][..ci];

@@ -176,19 +176,19 @@ fn forward_body<const F: bool>(t: &mut DecodeTask, w: &DecoderWeights, lookup: &
             }
         }
         products[rows * cp..].fill(0.0);
-        gemm::<F>((TILE, fp, cp), &products, (cp, 1), &w.basis.t, fp, &mut features, fp, false);
+        gemm((TILE, fp, cp), &products, (cp, 1), &w.basis.t, fp, &mut features, fp, false);
         let inputs = &mut t.inputs[base * ip..][..TILE * ip];
         for r in 0..rows {
             encode(s, &features[r * fp..], t.direction[base + r], &mut inputs[r * ip..][..ip]);
         }
         inputs[rows * ip..].fill(0.0);
         let h1 = &mut t.h1[base * h..][..TILE * h];
-        gemm::<F>((TILE, h, ip), inputs, (ip, 1), &w.w1.t, h, h1, h, false);
+        gemm((TILE, h, ip), inputs, (ip, 1), &w.w1.t, h, h1, h, false);
         relu(h1, &w.b1);
         let h2 = &mut t.h2[base * h..][..TILE * h];
-        gemm::<F>((TILE, h, h), h1, (h, 1), &w.w2.t, h, h2, h, false);
+        gemm((TILE, h, h), h1, (h, 1), &w.w2.t, h, h2, h, false);
         relu(h2, &w.b2);
-        gemm::<F>((TILE, RGB, h), h2, (h, 1), &w.w3.t, RGB, &mut out, RGB, false);
+        gemm((TILE, RGB, h), h2, (h, 1), &w.w3.t, RGB, &mut out, RGB, false);
         for r in 0..rows {
             for c in 0..3 {
                 t.rgb[base + r][c] = sigmoid::<F>(out[r * RGB + c] + w.b3[c]);
@@ -286,14 +286,14 @@ fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) 
                 g_b3[c] += v;
             }
         }
-        gemm::<F>((4, h, TILE), &g_pre, (1, RGB), h2, h, g_w3, h, true);
-        gemm::<F>((TILE, h, 3), &g_pre, (RGB, 1), &w.w3.m, h, &mut g_h2, h, false);
+        gemm((4, h, TILE), &g_pre, (1, RGB), h2, h, g_w3, h, true);
+        gemm((TILE, h, 3), &g_pre, (RGB, 1), &w.w3.m, h, &mut g_h2, h, false);
         relu_backward(&mut g_h2, h2, g_b2);
-        gemm::<F>((h, h, TILE), &g_h2, (1, h), h1, h, g_w2, h, true);
-        gemm::<F>((TILE, h, h), &g_h2, (h, 1), &w.w2.m, h, &mut g_h1, h, false);
+        gemm((h, h, TILE), &g_h2, (1, h), h1, h, g_w2, h, true);
+        gemm((TILE, h, h), &g_h2, (h, 1), &w.w2.m, h, &mut g_h1, h, false);
         relu_backward(&mut g_h1, h1, g_b1);
-        gemm::<F>((h, ip, TILE), &g_h1, (1, h), inputs, ip, g_w1, ip, true);
-        gemm::<F>((TILE, ip, h), &g_h1, (h, 1), &w.w1.m, ip, &mut g_in, ip, false);
+        gemm((h, ip, TILE), &g_h1, (1, h), inputs, ip, g_w1, ip, true);
+        gemm((TILE, ip, h), &g_h1, (h, 1), &w.w1.m, ip, &mut g_in, ip, false);
         // back through the features' encoding; the direction's gradient is not needed
         g_features.fill(0.0);
         let (f, k) = (s.features, s.feature_frequencies);
@@ -317,8 +317,8 @@ fn backward_body<const F: bool>(t: &mut DecodeBackwardTask, w: &DecoderWeights) 
             }
         }
         products[rows * cp..].fill(0.0);
-        gemm::<F>((fp, cp, TILE), &g_features, (1, fp), &products, cp, g_basis, cp, true);
-        gemm::<F>((TILE, cp, fp), &g_features, (fp, 1), &w.basis.m, cp, &mut g_products, cp, false);
+        gemm((fp, cp, TILE), &g_features, (1, fp), &products, cp, g_basis, cp, true);
+        gemm((TILE, cp, fp), &g_features, (fp, 1), &w.basis.m, cp, &mut g_products, cp, false);
         for r in 0..rows {
             let (p, l) = (&mut t.planes[(base + r) * cp..][..cp], &mut t.lines[(base + r) * cp..][..cp]);
             for c in 0..cp {
