@@ -48,6 +48,8 @@ struct CpuStep {
     samples: Samples,
     direction: Vec<[f32; 3]>,
     dts: Vec<f32>,
+    /// `[samples, 3]` directions of the samples' rays.
+    along: Vec<[f32; 3]>,
     points: Vec<SurfacePoint>,
     activations: Option<Activations>,
     composed: Vec<f32>,
@@ -67,6 +69,11 @@ impl CpuStep {
     fn is_empty(&self) -> bool {
         self.samples.t.is_empty()
     }
+}
+
+/// Returns the output of the field, empty before it is evaluated.
+fn output(activations: &Option<Activations>) -> &[f32] {
+    activations.as_ref().map_or(&[], |a| a.output())
 }
 
 /// Drops the last rays of a batch until at most `max_samples` are left (one ray always stays).
@@ -194,19 +201,23 @@ impl SdfOps for CpuSdf<'_> {
             return;
         }
         let step = &self.step;
-        let (mut x, mut d) = step.samples.points(&step.batch.rays);
+        let (mut x, along) = step.samples.points(&step.batch.rays);
         x.extend(step.points.iter().map(|p| p.position));
-        // any direction will do: the color of points has no loss
-        d.resize(x.len(), [0.0, 0.0, 1.0]);
         let table = bytemuck::cast_slice(slice(table.value()));
-        let activations = sdf::forward(&self.shape, table, self.prepared(), &x, &d);
-        self.step.activations = Some(activations);
+        let activations = sdf::geometry(&self.shape, table, self.prepared(), &x);
+        (self.step.activations, self.step.along) = (Some(activations), along);
     }
 
     fn neus(&mut self, anneal: f32) {
-        let step = &mut self.step;
-        let field = step.activations.as_ref().map_or(&[][..], |a| a.output());
-        step.composed = neus::forward(step.segments(), field, self.inv_s, anneal);
+        let mut activations = self.step.activations.take();
+        let step = &self.step;
+        let weights = neus::weights(step.segments(), output(&activations), self.inv_s, anneal);
+        if let Some(activations) = &mut activations {
+            // points have no color: no loss asks for one
+            activations.shade(self.prepared(), neus::shown(&weights), &step.along);
+        }
+        let composed = neus::composite(step.segments(), output(&activations), &weights);
+        (self.step.composed, self.step.activations) = (composed, activations);
     }
 
     fn losses(&mut self, anneal: f32) {
@@ -215,7 +226,7 @@ impl SdfOps for CpuSdf<'_> {
         let HostBatch { color, alpha, .. } = &step.batch;
         let targets = Targets { offsets: &step.samples.offsets, color, alpha, background: &step.background };
         let (of_rays, g_composed) = losses::of_rays(&step.composed, targets, &w);
-        let field = step.activations.as_ref().map_or(&[][..], |a| a.output());
+        let field = output(&step.activations);
         let n = step.samples.t.len();
         let (mut g_field, g_inv_s) =
             neus::backward(step.segments(), &field[..n * WIDTH], self.inv_s, anneal, &g_composed);

@@ -16,6 +16,7 @@ use tiface_base::geom::BitGrid;
 use tiface_base::math::distance::LowerEnvelope;
 use tiface_base::math::rng;
 use tiface_kernels::cpu::adam::adam;
+use tiface_kernels::cpu::hash;
 use tiface_kernels::cpu::losses::{self, LossWeights};
 use tiface_kernels::cpu::sdf::{self, FieldShape, WIDTH};
 use tiface_kernels::cpu::weight_norm;
@@ -148,7 +149,7 @@ pub fn fit_hull(
     for step in 0..STEPS {
         let (x, target) = fit_points(&distance, session.seed, step, POINTS, config.radius);
         let (_, weights) = state.weights(&shape);
-        let field = sdf::forward(&shape, state.table(), &weights, &x, &[[0.0, 0.0, 1.0]; POINTS]);
+        let field = sdf::geometry(&shape, state.table(), &weights, &x);
         let mut g_field = vec![0f32; field.output().len()];
         losses::of_samples(field.output(), &eikonal, &mut g_field);
         let rows = field.output().chunks_exact(WIDTH).zip(g_field.chunks_exact_mut(WIDTH));
@@ -168,7 +169,7 @@ pub fn fit_hull(
             return Err(StepError::Failed(Error::cannot(problem, hint)));
         }
         let steps = schedule::adam_steps(config, factor, step + 1);
-        let counts = [g_table.len(), geometry];
+        let counts = [2 * hash::entries(&shape.levels[..shape.active]), geometry];
         for (((group, g), count), step) in
             state.groups.iter_mut().zip([&mut g_table, &mut g_network]).zip(counts).zip(&steps)
         {

@@ -234,10 +234,12 @@ impl IFace {
                 }
                 offsets.push(t.len() as i32);
             }
-            let field = sdf::forward(&self.shape, self.table(), &self.weights, &x, &d);
+            let mut field = sdf::geometry(&self.shape, self.table(), &self.weights, &x);
             let direction: Vec<[f32; 3]> = open.iter().map(|&(r, _)| rays[r].direction.to_array()).collect();
             let pieces = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &vec![dt; t.len()] };
-            let composited = neus::forward(pieces, field.output(), self.inv_s, 1.0);
+            let weights = neus::weights(pieces, field.output(), self.inv_s, 1.0);
+            field.shade(&self.weights, neus::shown(&weights), &d);
+            let composited = neus::composite(pieces, field.output(), &weights);
             let mut pieces = composited.as_chunks::<{ neus::RAY_WIDTH }>().0.iter();
             open.retain_mut(|(r, k)| {
                 let out = &mut out[*r];

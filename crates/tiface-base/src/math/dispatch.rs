@@ -3,8 +3,8 @@
 /// Declares `fn name(args)` that runs `body::<HAS_FMA>(args)` compiled for the best level this CPU
 /// has.
 ///
-/// `fn name / body / wide (args)` has a level more: `wide::<true>(args)` on CPUs with vectors of 512
-/// bits. Other code gains nothing from them, and takes its time to compile.
+/// `fn name / body / wide (args)` has a level more: `wide::<true>(args)` on CPUs with vectors of
+/// 512 bits. Other code gains nothing from them, and takes its time to compile.
 #[macro_export]
 macro_rules! dispatch {
     ($(#[$meta:meta])* $vis:vis fn $name:ident / $body:ident ( $($a:ident : $t:ty),* $(,)? )) => {

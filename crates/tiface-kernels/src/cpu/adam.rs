@@ -42,8 +42,8 @@ const BLOCK: usize = 16;
 /// Number of weights that are fetched together, 32 blocks.
 const GROUP: usize = 32 * BLOCK;
 
-/// Returns the blocks of the group at `first` that a step changes, a bit each, and has the CPU fetch
-/// their values and moments: it does not guess which ones are skipped.
+/// Returns the blocks of the group at `first` that a step changes, a bit each, and has the CPU
+/// fetch their values and moments: it does not guess which ones are skipped.
 #[inline(always)]
 fn touched(p: &[f32], m: &[f32], v: &[f32], g: &[f32], first: usize, skip_zero: bool) -> u32 {
     let group = &g[first.min(g.len())..(first + GROUP).min(g.len())];

@@ -12,9 +12,15 @@
 //!
 //! The last column of the field's output is `ln(s / inv_s)` of the sample; in NeuS it is 0
 //! everywhere.
+//!
+//! A sample whose weight is at most [`MIN_WEIGHT`] counts as black, so that nobody need ask for its
+//! color; its opacity counts.
 
+use super::hash::{LANES, Lanes};
 use super::sdf::WIDTH;
+use super::simd::{exp, sigmoid};
 use rayon::prelude::*;
+use tiface_base::dispatch;
 
 /// Number of values per ray: rgb (3), opacity, depth (Σ w t), normal (3, Σ w n̂), squared color (Σ
 /// w ‖rgb‖²).
@@ -33,41 +39,43 @@ pub struct Segments<'a> {
     pub dt: &'a [f32],
 }
 
-const EPSILON: f32 = 1e-5;
+/// Weight above which the color of a sample counts; that of TensoRF.
+pub const MIN_WEIGHT: f32 = 1e-4;
 
-fn sigmoid(x: f32) -> f32 {
-    if x >= 0.0 {
-        1.0 / (1.0 + (-x).exp())
-    } else {
-        let e = x.exp();
-        e / (1.0 + e)
-    }
-}
+const EPSILON: f32 = 1e-5;
 
 /// Opacity of one sample, with the intermediate values that its derivative needs.
 struct Alpha {
-    alpha: f32,
-    clipped: bool,
+    /// Opacity before it is clipped.
+    raw: f32,
     previous: f32,
     next: f32,
     ic: f32,
     ic_by_cos: f32,
 }
 
-fn alpha_of(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> Alpha {
+impl Alpha {
+    #[inline(always)]
+    fn clipped(&self) -> f32 {
+        self.raw.clamp(0.0, 1.0)
+    }
+}
+
+#[inline(always)]
+fn alpha_of<const F: bool>(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32) -> Alpha {
     let (soft, hard) = (0.5 - 0.5 * cos, -cos);
     let ic = -(soft.max(0.0) * (1.0 - anneal) + hard.max(0.0) * anneal);
-    let ic_by_cos = 0.5 * (1.0 - anneal) * f32::from(soft > 0.0) + anneal * f32::from(hard > 0.0);
+    let by_soft = if soft > 0.0 { 0.5 * (1.0 - anneal) } else { 0.0 };
+    let ic_by_cos = by_soft + if hard > 0.0 { anneal } else { 0.0 };
     let half = 0.5 * ic * dt;
-    let (previous, next) = (sigmoid((sdf - half) * inv_s), sigmoid((sdf + half) * inv_s));
-    let raw = (previous - next + EPSILON) / (previous + EPSILON);
-    Alpha { alpha: raw.clamp(0.0, 1.0), clipped: !(0.0..=1.0).contains(&raw), previous, next, ic, ic_by_cos }
+    let (previous, next) = (sigmoid::<F>((sdf - half) * inv_s), sigmoid::<F>((sdf + half) * inv_s));
+    Alpha { raw: (previous - next + EPSILON) / (previous + EPSILON), previous, next, ic, ic_by_cos }
 }
 
 /// Returns the opacity of a cell of half size `half` for the occupancy grid: that of a ray that
 /// meets the surface head-on.
 pub fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
-    alpha_of(sdf, -1.0, 2.0 * half, inv_s.clamp(1e-6, 1e6), 1.0).alpha
+    alpha_of::<false>(sdf, -1.0, 2.0 * half, inv_s.clamp(1e-6, 1e6), 1.0).clipped()
 }
 
 /// A field gradient that is not longer than this has no meaningful direction, so nothing is
@@ -75,57 +83,254 @@ pub fn occupancy(sdf: f32, half: f32, inv_s: f32) -> f32 {
 /// to 1e12.
 pub const MIN_GRADIENT_NORM: f32 = 1e-6;
 
-fn normal_of(field: &[f32]) -> ([f32; 3], f32) {
+#[inline(always)]
+fn normal_of(field: &[f32]) -> [f32; 3] {
     let n = [field[1], field[2], field[3]];
     let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt().max(1e-12);
-    (n.map(|c| c / length), length)
+    n.map(|c| c / length)
 }
 
+#[inline(always)]
 fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Returns the values of a sample that are composited, before they are multiplied by its weight.
+/// Returns the values of a sample of weight `w` that are composited, before they are multiplied by
+/// it.
 #[inline]
-fn values_of(field: &[f32], n: [f32; 3], t: f32) -> [f32; RAY_WIDTH] {
-    let [r, g, b] = [field[4], field[5], field[6]];
+fn values_of(field: &[f32], w: f32, n: [f32; 3], t: f32) -> [f32; RAY_WIDTH] {
+    let [r, g, b] = if w > MIN_WEIGHT { [field[4], field[5], field[6]] } else { [0.0; 3] };
     [r, g, b, 1.0, t, n[0], n[1], n[2], r * r + g * g + b * b]
 }
 
-/// Returns the sharpness at a sample, clamped to [1e-6, 1e6].
-fn local_sharpness(inv_s: f32, field: &[f32]) -> f32 {
-    (inv_s * field[7].exp()).clamp(1e-6, 1e6)
+/// What compositing derives from the field's output at [`LANES`] samples of a ray.
+#[derive(Default)]
+struct Block {
+    raw: Lanes,
+    previous: Lanes,
+    next: Lanes,
+    ic: Lanes,
+    ic_by_cos: Lanes,
+    /// Sharpness, clamped to [1e-6, 1e6].
+    sharp: Lanes,
+    normal: [Lanes; 3],
+    /// Length of the gradient.
+    length: Lanes,
 }
 
-/// Composites the samples of each ray. The values of a ray without samples are zero.
+/// Evaluates up to [`LANES`] samples of a ray; those that are missing get arbitrary values.
+#[inline(always)]
+fn block<const F: bool>(field: &[f32], dt: &[f32], direction: [f32; 3], inv_s: f32, anneal: f32) -> Block {
+    let mut columns = [[0f32; LANES]; WIDTH];
+    let mut lengths = [0f32; LANES];
+    for (i, (row, dt)) in field.as_chunks::<WIDTH>().0.iter().zip(dt).take(LANES).enumerate() {
+        for k in 0..WIDTH {
+            columns[k][i] = row[k];
+        }
+        lengths[i] = *dt;
+    }
+    let [sdf, x, y, z, .., ln_sharp] = &columns;
+    let mut b = Block::default();
+    for i in 0..LANES {
+        b.length[i] = (x[i] * x[i] + y[i] * y[i] + z[i] * z[i]).sqrt().max(1e-12);
+        let n = [x[i] / b.length[i], y[i] / b.length[i], z[i] / b.length[i]];
+        let cos = direction[0] * n[0] + direction[1] * n[1] + direction[2] * n[2];
+        b.sharp[i] = (inv_s * exp::<F>(ln_sharp[i])).clamp(1e-6, 1e6);
+        let a = alpha_of::<F>(sdf[i], cos, lengths[i], b.sharp[i], anneal);
+        [b.normal[0][i], b.normal[1][i], b.normal[2][i]] = n;
+        (b.raw[i], b.previous[i], b.next[i]) = (a.raw, a.previous, a.next);
+        (b.ic[i], b.ic_by_cos[i]) = (a.ic, a.ic_by_cos);
+    }
+    b
+}
+
+/// Number of rays per task.
+const RAYS: usize = 64;
+
+/// Splits the rows of samples, `width` long, into those of each task, with its first ray.
+fn by_task<'a>(offsets: &[i32], mut rows: &'a mut [f32], width: usize) -> Vec<(usize, &'a mut [f32])> {
+    let rays = offsets.len() - 1;
+    let mut cut = |first: usize| {
+        let samples = (offsets[(first + RAYS).min(rays)] - offsets[first]) as usize;
+        (first, rows.split_off_mut(..samples * width).expect("a row for each sample"))
+    };
+    (0..rays).step_by(RAYS).map(&mut cut).collect()
+}
+
+/// Rays of a task whose first is `first`, with the ranges of their samples.
+#[inline(always)]
+fn rays_of(segments: Segments<'_>, first: usize) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> {
+    let end = (first + RAYS).min(segments.offsets.len() - 1);
+    (first..end).map(move |r| (r, segments.offsets[r] as usize..segments.offsets[r + 1] as usize))
+}
+
+#[inline(always)]
+fn weights_body<const F: bool>(
+    first: usize,
+    weights: &mut [f32],
+    segments: Segments,
+    field: &[f32],
+    inv_s: f32,
+    anneal: f32,
+) {
+    let begin = segments.offsets[first] as usize;
+    for (r, span) in rays_of(segments, first) {
+        let mut transmittance = 1f32;
+        for start in span.clone().step_by(LANES) {
+            let end = (start + LANES).min(span.end);
+            let (rows, dt) = (&field[start * WIDTH..end * WIDTH], &segments.dt[start..end]);
+            let block = block::<F>(rows, dt, segments.direction[r], inv_s, anneal);
+            for (weight, raw) in weights[start - begin..end - begin].iter_mut().zip(block.raw) {
+                let alpha = raw.clamp(0.0, 1.0);
+                *weight = transmittance * alpha;
+                transmittance *= 1.0 - alpha;
+            }
+        }
+    }
+}
+
+dispatch! {
+    fn weights_task / weights_body(
+        first: usize, weights: &mut [f32], segments: Segments, field: &[f32], inv_s: f32, anneal: f32,
+    )
+}
+
+/// Returns the weight of each sample, `[samples]`, for which colors are not needed.
 ///
 /// # Shapes
 ///
 /// - field: `[samples, 8]`, the output of the field
-/// - output: `[rays, 9]` = rgb, opacity, Σ w t, Σ w n̂, Σ w ‖rgb‖²
-pub fn forward(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
+pub fn weights(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
     let inv_s = inv_s.clamp(1e-6, 1e6);
+    let mut weights = vec![0f32; segments.t.len()];
+    by_task(segments.offsets, &mut weights, 1)
+        .into_par_iter()
+        .for_each(|(first, weights)| weights_task(first, weights, segments, field, inv_s, anneal));
+    weights
+}
+
+/// Returns the samples whose color counts, ascending.
+pub fn shown(weights: &[f32]) -> Vec<u32> {
+    (0..weights.len() as u32).filter(|&s| weights[s as usize] > MIN_WEIGHT).collect()
+}
+
+/// Composites the samples of each ray by their weights. The values of a ray without samples are
+/// zero.
+///
+/// # Shapes
+///
+/// - field: `[samples, 8]`, the output of the field; weights: `[samples]`
+/// - output: `[rays, 9]` = rgb, opacity, Σ w t, Σ w n̂, Σ w ‖rgb‖²
+pub fn composite(segments: Segments, field: &[f32], weights: &[f32]) -> Vec<f32> {
     let count = segments.offsets.len() - 1;
     let mut out = vec![0f32; count * RAY_WIDTH];
     out.par_chunks_mut(RAY_WIDTH).with_min_len(64).enumerate().for_each(|(r, out)| {
-        let mut transmittance = 1f32;
         for s in segments.offsets[r] as usize..segments.offsets[r + 1] as usize {
-            let f = &field[s * WIDTH..][..WIDTH];
-            let (n, _) = normal_of(f);
-            let a = alpha_of(
-                f[0],
-                dot(segments.direction[r], n),
-                segments.dt[s],
-                local_sharpness(inv_s, f),
-                anneal,
-            )
-            .alpha;
-            let w = transmittance * a;
-            out.iter_mut().zip(values_of(f, n, segments.t[s])).for_each(|(out, value)| *out += w * value);
-            transmittance *= 1.0 - a;
+            let (f, w) = (&field[s * WIDTH..][..WIDTH], weights[s]);
+            let values = values_of(f, w, normal_of(f), segments.t[s]);
+            out.iter_mut().zip(values).for_each(|(out, value)| *out += w * value);
         }
     });
     out
+}
+
+/// Composites the samples of each ray: [`composite`] by [`weights`].
+pub fn forward(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Vec<f32> {
+    composite(segments, field, &weights(segments, field, inv_s, anneal))
+}
+
+/// The backward pass of some rays.
+struct NeusBackwardTask<'a> {
+    first: usize,
+    g_field: &'a mut [f32],
+    /// Of each ray, the gradient with respect to `ln inv_s`.
+    g_ln_inv_s: Vec<f64>,
+}
+
+#[inline(always)]
+fn backward_body<const F: bool>(
+    t: &mut NeusBackwardTask,
+    segments: Segments,
+    field: &[f32],
+    inv_s: f32,
+    anneal: f32,
+    g_out: &[f32],
+) {
+    let begin = segments.offsets[t.first] as usize;
+    let mut blocks: Vec<(Block, [f32; LANES])> = Vec::new();
+    for (r, span) in rays_of(segments, t.first) {
+        let direction = segments.direction[r];
+        let g = &g_out[r * RAY_WIDTH..][..RAY_WIDTH];
+        // recompute the forward pass: opacities and transmittances
+        blocks.clear();
+        let mut light = 1f32;
+        for start in span.clone().step_by(LANES) {
+            let end = (start + LANES).min(span.end);
+            let (rows, dt) = (&field[start * WIDTH..end * WIDTH], &segments.dt[start..end]);
+            let block = block::<F>(rows, dt, direction, inv_s, anneal);
+            let mut transmittance = [0f32; LANES];
+            for i in 0..end - start {
+                transmittance[i] = light;
+                light *= 1.0 - block.raw[i].clamp(0.0, 1.0);
+            }
+            blocks.push((block, transmittance));
+        }
+        let mut farther = 0f32; // Σ_{j>k} w_j g_w_j
+        let mut g_s = 0f64;
+        for s in span.clone().rev() {
+            let ((b, transmittance), i) = (&blocks[(s - span.start) / LANES], (s - span.start) % LANES);
+            let (alpha, transmittance) = (b.raw[i].clamp(0.0, 1.0), transmittance[i]);
+            let normal = [b.normal[0][i], b.normal[1][i], b.normal[2][i]];
+            let w = transmittance * alpha;
+            let row = &field[s * WIDTH..][..WIDTH];
+            // the loss gradient by the weight
+            let mut g_w = 0f32;
+            for (g, value) in g.iter().zip(values_of(row, w, normal, segments.t[s])) {
+                g_w += g * value;
+            }
+            let out = &mut t.g_field[(s - begin) * WIDTH..][..WIDTH];
+            if w > MIN_WEIGHT {
+                for c in 0..3 {
+                    out[4 + c] = w * (g[c] + 2.0 * g[8] * row[4 + c]);
+                }
+            }
+            let g_alpha = transmittance * g_w - farther / (1.0 - alpha).max(1e-10);
+            farther += w * g_w;
+            // the gradient by the unit normal has two parts: as composited, and through the cosine
+            let mut g_normal = [w * g[5], w * g[6], w * g[7]];
+            if alpha == b.raw[i] {
+                let (p, q, sharp) = (b.previous[i], b.next[i], b.sharp[i]);
+                let d = p + EPSILON;
+                // α = (P − N + ε)/(P + ε): ∂P = N/(P+ε)², ∂N = −1/(P+ε)
+                let g_p = g_alpha * q / (d * d) * p * (1.0 - p);
+                let g_q = -g_alpha / d * q * (1.0 - q);
+                out[0] = (g_p + g_q) * sharp;
+                let (sdf, half) = (row[0], 0.5 * b.ic[i] * segments.dt[s]);
+                // the gradient by ln s is that by the sample's offset and, divided by inv_s, that
+                // by inv_s
+                let g_ln = (g_p * (sdf - half) + g_q * (sdf + half)) * sharp;
+                out[7] = g_ln;
+                g_s += g_ln as f64;
+                let g_cos = (g_q - g_p) * sharp * 0.5 * segments.dt[s] * b.ic_by_cos[i];
+                for c in 0..3 {
+                    g_normal[c] += g_cos * direction[c];
+                }
+            }
+            let (radial, length) = (dot(normal, g_normal), b.length[i]);
+            if length > MIN_GRADIENT_NORM {
+                for c in 0..3 {
+                    out[1 + c] = (g_normal[c] - normal[c] * radial) / length;
+                }
+            }
+        }
+        t.g_ln_inv_s.push(g_s);
+    }
+}
+
+dispatch! {
+    fn backward_task / backward_body(
+        t: &mut NeusBackwardTask, segments: Segments, field: &[f32], inv_s: f32, anneal: f32, g_out: &[f32],
+    )
 }
 
 /// Returns the gradients with respect to the field's output, `[samples, 8]`, and with respect to
@@ -142,86 +347,15 @@ pub fn backward(
     g_out: &[f32],
 ) -> (Vec<f32>, f32) {
     let clamped = inv_s.clamp(1e-6, 1e6);
-    let count = segments.offsets.len() - 1;
     let mut g_field = vec![0f32; field.len()];
-    // each ray owns a contiguous piece of the samples
-    let mut rest = &mut g_field[..];
-    let split_ray = |r: usize| {
-        let n = (segments.offsets[r + 1] - segments.offsets[r]) as usize;
-        rest.split_off_mut(..n * WIDTH).expect("a row for each sample")
-    };
-    let tasks: Vec<&mut [f32]> = (0..count).map(split_ray).collect();
-    let g_inv_s: Vec<f64> = tasks
-        .into_par_iter()
-        .enumerate()
-        .with_min_len(64)
-        .map(|(r, g_samples)| {
-            let first = segments.offsets[r] as usize;
-            let n = g_samples.len() / WIDTH;
-            let g = &g_out[r * RAY_WIDTH..][..RAY_WIDTH];
-            // recompute the forward pass: alphas, transmittances and the loss gradient g_w by each
-            // weight
-            let mut samples = Vec::with_capacity(n);
-            let mut transmittance = 1f32;
-            for s in first..first + n {
-                let f = &field[s * WIDTH..][..WIDTH];
-                let (normal, length) = normal_of(f);
-                let cos = dot(segments.direction[r], normal);
-                let sharp = local_sharpness(clamped, f);
-                let a = alpha_of(f[0], cos, segments.dt[s], sharp, anneal);
-                let g_w: f32 =
-                    g.iter().zip(values_of(f, normal, segments.t[s])).map(|(g, value)| g * value).sum();
-                let next = transmittance * (1.0 - a.alpha);
-                samples.push((a, normal, length, transmittance, g_w, sharp));
-                transmittance = next;
-            }
-            let mut farther = 0f32; // Σ_{j>k} w_j g_w_j
-            let mut g_s = 0f64;
-            for k in (0..n).rev() {
-                let (a, normal, length, transmittance, g_w, sharp) = &samples[k];
-                let s = first + k;
-                let w = transmittance * a.alpha;
-                let out = &mut g_samples[k * WIDTH..][..WIDTH];
-                for c in 0..3 {
-                    out[4 + c] = w * (g[c] + 2.0 * g[8] * field[s * WIDTH + 4 + c]);
-                }
-                let g_alpha = transmittance * g_w - farther / (1.0 - a.alpha).max(1e-10);
-                farther += w * g_w;
-                // the gradient by the unit normal has two parts: as composited, and through the
-                // cosine
-                let mut g_normal = [w * g[5], w * g[6], w * g[7]];
-                if !a.clipped {
-                    let (p, q) = (a.previous, a.next);
-                    let d = p + EPSILON;
-                    // α = (P − N + ε)/(P + ε): ∂P = N/(P+ε)², ∂N = −1/(P+ε)
-                    let g_p = g_alpha * q / (d * d) * p * (1.0 - p);
-                    let g_q = -g_alpha / d * q * (1.0 - q);
-                    out[0] = (g_p + g_q) * sharp;
-                    let half = 0.5 * a.ic * segments.dt[s];
-                    let sdf = field[s * WIDTH];
-                    // the gradient by ln s is that by the sample's offset and, divided by inv_s,
-                    // that by inv_s
-                    let g_ln = (g_p * (sdf - half) + g_q * (sdf + half)) * sharp;
-                    out[7] = g_ln;
-                    g_s += g_ln as f64;
-                    let g_ic = (g_q - g_p) * sharp * 0.5 * segments.dt[s];
-                    let g_cos = g_ic * a.ic_by_cos;
-                    for c in 0..3 {
-                        g_normal[c] += g_cos * segments.direction[r][c];
-                    }
-                }
-                let radial = dot(*normal, g_normal);
-                if *length > MIN_GRADIENT_NORM {
-                    for c in 0..3 {
-                        out[1 + c] = (g_normal[c] - normal[c] * radial) / length;
-                    }
-                }
-            }
-            g_s
-        })
+    let mut tasks: Vec<NeusBackwardTask> = by_task(segments.offsets, &mut g_field, WIDTH)
+        .into_iter()
+        .map(|(first, g_field)| NeusBackwardTask { first, g_field, g_ln_inv_s: Vec::with_capacity(RAYS) })
         .collect();
+    tasks.par_iter_mut().for_each(|t| backward_task(t, segments, field, clamped, anneal, g_out));
+    let total: f64 = tasks.iter().flat_map(|t| &t.g_ln_inv_s).sum();
     let inside = (1e-6..=1e6).contains(&inv_s);
-    (g_field, if inside { (g_inv_s.iter().sum::<f64>() / inv_s as f64) as f32 } else { 0.0 })
+    (g_field, if inside { (total / inv_s as f64) as f32 } else { 0.0 })
 }
 
 #[cfg(test)]
@@ -239,7 +373,7 @@ mod tests {
             (-0.05, -1.0, 1000.0, 1.0, 1.0),
             (0.02, 0.5, 200.0, 0.5, 4.66413e-4),
         ] {
-            let got = alpha_of(sdf, cos, dt, s, a).alpha;
+            let got = alpha_of::<true>(sdf, cos, dt, s, a).clipped();
             assert!((got - want).abs() < 2e-6 * want.max(0.05), "{got} {want}");
         }
         for (sdf, s, want) in

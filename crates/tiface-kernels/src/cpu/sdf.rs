@@ -21,19 +21,21 @@
 //! Shells", who learn a kernel size per position. Hair can then be soft while skin is sharp.
 //!
 //! Of `z`, `h` and `s` only `h` is kept for the backward pass, because `s = 1 − e^{−100 h}`.
+//!
+//! Geometry comes first, at all samples; color, two thirds of the arithmetic, is evaluated where a
+//! sample shows, which its weight along the ray says.
 
 use super::hash::{self, JacobianBlock, LANES, Level};
-use super::mlp::{
-    COLOR_INPUTS, HIDDEN, Layout, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights,
-};
+use super::mlp::{HIDDEN, Layout, OUTPUTS_PADDED, SOFTNESS, TILE, Weights};
 use super::pool::{Buffer, by_chunk, pieces};
 use super::simd::{exp, fma, gemm, ln_1p, sigmoid};
+use color::Shaded;
 use rayon::prelude::*;
 use std::ops::Range;
 use tiface_base::dispatch;
-use tiface_base::geom::sphharm::sh16;
 
 mod backward;
+mod color;
 mod infer;
 
 pub use backward::backward;
@@ -94,10 +96,9 @@ pub struct Activations {
     q: Buffer,        // [levels, n, 2]
     u: Buffer,        // [np, kp]; np = n rounded up to whole tiles
     h: Buffer,        // [np, 64]
-    c0: Buffer,       // [np, cp] color inputs
-    c1: Buffer,       // [np, 64]
-    c2: Buffer,       // [np, 64]
-    out: Buffer,      // [n, 8]
+    o: Buffer,        // [np, 16] outputs of the geometry network
+    shaded: Shaded,
+    out: Buffer, // [n, 8]
 }
 
 /// Number of samples per task. It is fixed, so that sums do not depend on the number of threads.
@@ -161,15 +162,12 @@ impl<'a> Inputs<'a> {
 /// The forward pass of a range of samples; all slices are cut to that range.
 struct SdfForwardTask<'a> {
     inputs: Inputs<'a>,
-    direction: Option<&'a [[f32; 3]]>,
     jacobian: &'a [JacobianBlock], // of all samples
     soften: f32,
     u: &'a mut [f32],
     h: &'a mut [f32],
     q: Vec<&'a mut [[f32; 2]]>, // of each level
-    c0: &'a mut [f32],
-    c1: &'a mut [f32],
-    c2: &'a mut [f32],
+    o: &'a mut [f32],
     out: &'a mut [f32],
 }
 
@@ -190,14 +188,12 @@ fn activate<const F: bool>(z: &mut [f32], a: &mut [f32], b: &[f32; HIDDEN], w: &
 
 #[inline(always)]
 fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
-    let (kp, ci) = (w.layout.padded(), w.layout.color_padded());
+    let kp = w.layout.padded();
     let inputs = &t.inputs;
     let first = 2 * inputs.levels;
     let samples = inputs.x.len();
     let mut a = [0f32; TILE * HIDDEN];
     let mut q = vec![0f32; TILE * kp];
-    let mut o = [0f32; TILE * OUTPUTS_PADDED];
-    let mut rgb = [0f32; TILE * RGB_PADDED];
     for tile in 0..samples.div_ceil(TILE) {
         let base = tile * TILE;
         let rows = TILE.min(samples - base);
@@ -209,7 +205,8 @@ fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
         gemm((TILE, HIDDEN, kp), u, (kp, 1), &w.w1.t, HIDDEN, h, HIDDEN, false);
         activate::<F>(h, &mut a, &w.b1, w.output_row(0));
         let out16 = OUTPUTS_PADDED;
-        gemm((TILE, out16, HIDDEN), h, (HIDDEN, 1), &w.w2.t, out16, &mut o, out16, false);
+        let o = &mut t.o[base * out16..][..TILE * out16];
+        gemm((TILE, out16, HIDDEN), h, (HIDDEN, 1), &w.w2.t, out16, o, out16, false);
         for row in o.as_chunks_mut::<OUTPUTS_PADDED>().0 {
             for j in 0..OUTPUTS_PADDED {
                 row[j] += w.b2[j];
@@ -234,117 +231,32 @@ fn forward_body<const F: bool>(t: &mut SdfForwardTask, w: &Weights) {
                 *pair = [q[r * kp + 2 * l], q[r * kp + 2 * l + 1]];
             }
         }
-        let c0 = &mut t.c0[base * ci..][..TILE * ci];
-        if let Some(direction) = t.direction {
-            let units = units(&n);
-            for r in 0..rows {
-                let row = &mut c0[r * ci..][..ci];
-                row[..OUTPUTS].copy_from_slice(&o[r * out16..][..OUTPUTS]);
-                row[OUTPUTS..OUTPUTS + 16].copy_from_slice(&sh16(direction[base + r]));
-                row[OUTPUTS + 16..COLOR_INPUTS].copy_from_slice(&[units[0][r], units[1][r], units[2][r]]);
-                write_skip(w.layout, &u[r * kp..], row);
-            }
-            c0[rows * ci..].fill(0.0);
-            let c1 = &mut t.c1[base * HIDDEN..][..TILE * HIDDEN];
-            let c2 = &mut t.c2[base * HIDDEN..][..TILE * HIDDEN];
-            color_layers::<F>(w, c0, c1, c2, &mut rgb);
-        }
         let mut soft = [0f32; TILE];
         for r in 0..TILE {
             soft[r] = softened::<F>(t.soften, o[r * out16 + SOFTNESS]);
         }
         for r in 0..rows {
-            let (c, out) = (&rgb[r * RGB_PADDED..], &mut t.out[(base + r) * WIDTH..][..WIDTH]);
-            out.copy_from_slice(&[o[r * out16], n[0][r], n[1][r], n[2][r], c[0], c[1], c[2], soft[r]]);
+            let out = &mut t.out[(base + r) * WIDTH..][..WIDTH];
+            out.copy_from_slice(&[o[r * out16], n[0][r], n[1][r], n[2][r], 0.0, 0.0, 0.0, soft[r]]);
         }
     }
 }
 
 dispatch! { fn forward_task / forward_body(t: &mut SdfForwardTask, w: &Weights) }
 
-/// Evaluates the color network on a tile of inputs.
-#[inline(always)]
-fn color_layers<const F: bool>(
-    w: &Weights,
-    c0: &[f32],
-    c1: &mut [f32],
-    c2: &mut [f32],
-    rgb: &mut [f32; TILE * RGB_PADDED],
-) {
-    let ci = w.layout.color_padded();
-    gemm((TILE, HIDDEN, ci), c0, (ci, 1), &w.c1.t, HIDDEN, c1, HIDDEN, false);
-    relu(c1);
-    gemm((TILE, HIDDEN, HIDDEN), c1, (HIDDEN, 1), &w.c2.t, HIDDEN, c2, HIDDEN, false);
-    relu(c2);
-    gemm((TILE, RGB_PADDED, HIDDEN), c2, (HIDDEN, 1), &w.c3.t, RGB_PADDED, rgb, RGB_PADDED, false);
-    for v in rgb {
-        *v = sigmoid::<F>(*v);
-    }
-}
-
-// Loops here are no closures: closures are compiled without the vector instructions of the kernel
-// that calls them.
-#[inline(always)]
-fn relu(values: &mut [f32]) {
-    for v in values {
-        *v = v.max(0.0);
-    }
-}
-
-/// Writes the columns of a row after the first [`COLOR_INPUTS`]: the hash features, if the color
-/// network reads them, and zero padding.
-#[inline(always)]
-fn write_skip(layout: Layout, u: &[f32], row: &mut [f32]) {
-    let count = layout.color_inputs() - COLOR_INPUTS;
-    row[COLOR_INPUTS..COLOR_INPUTS + count].copy_from_slice(&u[..count]);
-    row[COLOR_INPUTS + count..].fill(0.0);
-}
-
-/// Returns v / ‖v‖ of each column, with the norm clamped to at least 1e-12, like torch's
-/// `normalize`.
-#[inline(always)]
-fn units(v: &[[f32; TILE]; 3]) -> [[f32; TILE]; 3] {
-    let mut out = *v;
-    for r in 0..TILE {
-        let length = (v[0][r] * v[0][r] + v[1][r] * v[1][r] + v[2][r] * v[2][r]).sqrt().max(1e-12);
-        for k in 0..3 {
-            out[k][r] /= length;
-        }
-    }
-    out
-}
-
-/// Evaluates sdf, gradient and color at points, and keeps the activations that the backward pass
-/// needs.
+/// Evaluates sdf, gradient and local sharpness at points, and keeps the activations that the
+/// backward pass needs. Colors are zero until [`Activations::shade`].
 ///
 /// # Shapes
 ///
 /// - table: `[entries, 2]`; weights: prepared from the flat `[P]`
-/// - x: `[n, 3]` in the field's box; direction: `[n, 3]` unit, away from the camera
-/// - output: `[n, 8]` = sdf, ∇sdf (3, field units), rgb (3, sRGB-coded, 0..1), ln of the local
-///   sharpness
-pub fn forward(
-    shape: &FieldShape,
-    table: &[[f32; 2]],
-    weights: &Weights,
-    x: &[[f32; 3]],
-    direction: &[[f32; 3]],
-) -> Activations {
-    assert_eq!(x.len(), direction.len());
-    run(shape, table, weights, x, Some(direction))
-}
-
-fn run(
-    shape: &FieldShape,
-    table: &[[f32; 2]],
-    weights: &Weights,
-    x: &[[f32; 3]],
-    direction: Option<&[[f32; 3]]>,
-) -> Activations {
+/// - x: `[n, 3]` in the field's box
+/// - output: `[n, 8]` = sdf, ∇sdf (3, field units), zeros (3), ln of the local sharpness
+pub fn geometry(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Activations {
     let n = x.len();
     let np = n.next_multiple_of(TILE);
     let levels = shape.levels.len();
-    let (kp, ci) = (weights.layout.padded(), weights.layout.color_padded());
+    let kp = weights.layout.padded();
     let x01 = shape.x01(x);
     let mut value = Buffer::scratch(levels * n * 2);
     let block_floats = n.div_ceil(LANES) * 6 * LANES;
@@ -358,16 +270,13 @@ fn run(
         bytemuck::cast_slice_mut(&mut value[..active.len() * n * 2]),
         Some(bytemuck::cast_slice_mut(&mut jacobian[..active.len() * block_floats])),
     );
-    let color = direction.is_some();
     let mut u = Buffer::scratch(np * kp);
     let mut q = Buffer::scratch(active.len() * n * 2);
     let mut h = Buffer::scratch(np * HIDDEN);
-    let mut c0 = Buffer::scratch(np * ci);
-    let mut c1 = Buffer::scratch(if color { np * HIDDEN } else { 0 });
-    let mut c2 = Buffer::scratch(if color { np * HIDDEN } else { 0 });
+    let mut o = Buffer::scratch(np * OUTPUTS_PADDED);
     let mut out = Buffer::scratch(n * WIDTH);
-    let widths = [kp, HIDDEN, ci, HIDDEN, HIDDEN, WIDTH];
-    let mut cut = pieces([&mut u, &mut h, &mut c0, &mut c1, &mut c2, &mut out], widths, CHUNK);
+    let widths = [kp, HIDDEN, OUTPUTS_PADDED, WIDTH];
+    let mut cut = pieces([&mut u, &mut h, &mut o, &mut out], widths, CHUNK);
     let q_of_chunks = by_chunk(bytemuck::cast_slice_mut(&mut q), n, CHUNK);
     let jacobian_blocks = bytemuck::cast_slice(&jacobian);
     let mut tasks: Vec<SdfForwardTask> = (0..n)
@@ -375,21 +284,42 @@ fn run(
         .zip(q_of_chunks)
         .map(|(start, q)| {
             let range = start..(start + CHUNK).min(n);
-            let direction = direction.map(|d| &d[range.clone()]);
             let inputs = Inputs::new(shape, x, &value, range);
-            let [u, h, c0, c1, c2, out] = cut();
+            let [u, h, o, out] = cut();
             let (jacobian, soften) = (jacobian_blocks, shape.soften);
-            SdfForwardTask { inputs, direction, jacobian, soften, u, h, q, c0, c1, c2, out }
+            SdfForwardTask { inputs, jacobian, soften, u, h, q, o, out }
         })
         .collect();
     tasks.par_iter_mut().for_each(|t| forward_task(t, weights));
     drop((tasks, cut));
     drop(value);
-    Activations { shape: shape.clone(), samples: n, x01, jacobian, q, u, h, c0, c1, c2, out }
+    let shaded = Shaded::default();
+    Activations { shape: shape.clone(), samples: n, x01, jacobian, q, u, h, o, shaded, out }
+}
+
+/// Evaluates sdf, gradient, local sharpness and color at points: [`geometry`], then
+/// [`Activations::shade`] of all of them.
+///
+/// # Shapes
+///
+/// - x: `[n, 3]` in the field's box; direction: `[n, 3]` unit, away from the camera
+/// - output: `[n, 8]` = sdf, ∇sdf (3, field units), rgb (3, sRGB-coded, 0..1), ln of the local
+///   sharpness
+pub fn forward(
+    shape: &FieldShape,
+    table: &[[f32; 2]],
+    weights: &Weights,
+    x: &[[f32; 3]],
+    direction: &[[f32; 3]],
+) -> Activations {
+    assert_eq!(x.len(), direction.len());
+    let mut activations = geometry(shape, table, weights, x);
+    activations.shade(weights, (0..x.len() as u32).collect(), direction);
+    activations
 }
 
 impl Activations {
-    /// Returns the output of the field, `[n, 8]`: see [`forward`].
+    /// Returns the output of the field, `[n, 8]`: see [`geometry`] and [`forward`].
     pub fn output(&self) -> &[f32] {
         &self.out
     }

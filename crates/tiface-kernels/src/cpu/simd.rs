@@ -119,8 +119,8 @@ fn columns<const F: bool, const NR: usize>(
 }
 
 dispatch! {
-    /// `C[m, n] (+)= A[m, k] · B[k, n]` for a `size` of `(m, n, k)`: `m` a multiple of 4, `n` a multiple
-    /// of 8.
+    /// `C[m, n] (+)= A[m, k] · B[k, n]` for a `size` of `(m, n, k)`: `m` a multiple of 4, `n` a
+    /// multiple of 8.
     ///
     /// `A[i, p] = a[i · strides.0 + p · strides.1]`, so a transpose costs nothing.
     pub fn gemm / gemm_body / gemm_wide (

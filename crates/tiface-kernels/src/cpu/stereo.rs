@@ -220,7 +220,8 @@ fn interpolate(
     for k in 0..PADDED {
         let corner = corner[k] as usize;
         for (i, at) in [corner, corner + 1, corner + w, corner + w + 1].into_iter().enumerate() {
-            // SAFETY: column and row of the corner are at most w − 2 and h − 2, by the bounds above.
+            // SAFETY: column and row of the corner are at most w − 2 and h − 2, by the bounds
+            // above.
             pixels[i][k] = unsafe { *gray.get_unchecked(at) };
         }
     }

@@ -6,7 +6,7 @@ use super::device::{Buffer, Device, Words, groups, launch};
 use super::march::Samples;
 use super::sum::group_sum;
 use super::vec3::Vec3;
-use crate::cpu::neus::MIN_GRADIENT_NORM;
+use crate::cpu::neus::{MIN_GRADIENT_NORM, MIN_WEIGHT};
 use crate::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
 
@@ -120,9 +120,10 @@ fn forward(
         for s in (offsets[r] as usize)..(offsets[r + 1] as usize) {
             let a = sample(field, plane, s, dt[s], d, inv_s, anneal);
             let w = transmittance * a.alpha;
+            let shown = select(w > MIN_WEIGHT, w, 0.0f32);
             let color = Vec3::read(field, plane, 4 * plane + s);
-            sums.rgb.add_weighted(w, color);
-            squares += w * color.dot(color);
+            sums.rgb.add_weighted(shown, color);
+            squares += shown * color.dot(color);
             sums.add(w, t[s]);
             normal.add_weighted(w, a.normal);
             light[s] = transmittance;
@@ -166,7 +167,10 @@ fn backward(
         for k in 0..end - begin {
             let s = end - 1 - k;
             let a = sample(field, plane, s, dt[s], d, inv_s, anneal);
-            let color = Vec3::read(field, plane, 4 * plane + s);
+            let transmittance = light[s];
+            let w = transmittance * a.alpha;
+            let shown = select(w > MIN_WEIGHT, 1.0f32, 0.0f32);
+            let color = Vec3::read(field, plane, 4 * plane + s) * shown;
             // from left to right, without brackets around the dot product of the normals
             let g_w = g_rgb.dot(color)
                 + g_squares * color.dot(color)
@@ -175,9 +179,7 @@ fn backward(
                 + g_normal.x * a.normal.x
                 + g_normal.y * a.normal.y
                 + g_normal.z * a.normal.z;
-            let transmittance = light[s];
-            let w = transmittance * a.alpha;
-            ((g_rgb + color * (2.0f32 * g_squares)) * w).write(g_field, plane, 4 * plane + s);
+            ((g_rgb + color * (2.0f32 * g_squares)) * (w * shown)).write(g_field, plane, 4 * plane + s);
             let g_alpha = transmittance * g_w - farther / max(1.0f32 - a.alpha, 1e-10f32);
             farther += w * g_w;
             // the gradient by the unit normal has two parts: as composited, and through the cosine

@@ -1,17 +1,18 @@
 //! The hand-written backward pass of the fused signed-distance field; [`super`] has its formulas.
 
+use super::color::backward_rows;
 use super::{Activations, CHUNK, WIDTH};
 use crate::cpu::hash::{self, JacobianBlock, LANES};
-use crate::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights};
+use crate::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, SOFTNESS, TILE, Weights};
 use crate::cpu::neus::MIN_GRADIENT_NORM;
 use crate::cpu::pool::{Buffer, by_chunk};
-use crate::cpu::simd::{add_to, exp, fma, gemm, relu_gradient};
+use crate::cpu::simd::{ROWS, add_to, exp, fma, gemm};
 use rayon::prelude::*;
 use tiface_base::dispatch;
 
 /// The backward pass of a range of samples.
 struct SdfBackwardTask<'a> {
-    start: usize,
+    chunk: usize,
     g_out: &'a [f32],
     g_value: Vec<&'a mut [[f32; 2]]>, // of each active level
     g_normal: &'a mut [[f32; 3]],     // [n, 3]
@@ -28,10 +29,12 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
     let inv_radius = 1.0 / a.shape.radius;
     let blocks = a.samples.div_ceil(LANES);
     let jacobian: &[JacobianBlock] = bytemuck::cast_slice(&a.jacobian);
-    let [g_w1, g_b1, g_w2, g_b2, g_c1_weights, g_c2_weights, g_c3_weights] = &mut t.gradients;
-    let mut g_pre = [0f32; TILE * RGB_PADDED];
-    let mut g_c2 = [0f32; TILE * HIDDEN];
-    let mut g_c1 = [0f32; TILE * HIDDEN];
+    let [g_w1, g_b1, g_w2, g_b2, of_color @ ..] = &mut t.gradients;
+    let start = t.chunk * CHUNK;
+    let mut shaded = a.shaded.samples(t.chunk).iter().map(|&s| s as usize).peekable();
+    let mut g_inputs = Buffer::scratch(shaded.len().next_multiple_of(ROWS) * ci);
+    backward_rows::<F>(a, w, t.chunk, t.g_out, of_color.each_mut().map(|g| &mut g[..]), &mut g_inputs);
+    let mut of_rows = g_inputs.chunks_exact(ci);
     let mut g_c0 = vec![0f32; TILE * ci];
     let mut g_o = [0f32; TILE * OUTPUTS_PADDED];
     let mut g_q = vec![0f32; TILE * kp];
@@ -41,36 +44,19 @@ fn backward_body<const F: bool>(t: &mut SdfBackwardTask, a: &Activations, w: &We
     let mut g_a = [0f32; TILE * HIDDEN];
     let mut g_z = [0f32; TILE * HIDDEN];
     for tile in 0..t.g_normal.len().div_ceil(TILE) {
-        let base = t.start + tile * TILE;
+        let base = start + tile * TILE;
         let rows = TILE.min(t.g_normal.len() - tile * TILE);
         let h = &a.h[base * HIDDEN..][..TILE * HIDDEN];
         let u = &a.u[base * kp..][..TILE * kp];
-        let c0 = &a.c0[base * ci..][..TILE * ci];
-        let c1 = &a.c1[base * HIDDEN..][..TILE * HIDDEN];
-        let c2 = &a.c2[base * HIDDEN..][..TILE * HIDDEN];
         let g_out = &t.g_out[tile * TILE * WIDTH..][..rows * WIDTH];
         let out = &a.out[base * WIDTH..][..rows * WIDTH];
 
-        // color network; rows beyond the last sample carry zero gradients and vanish
-        g_pre.fill(0.0);
-        for r in 0..rows {
-            for c in 0..3 {
-                let y = out[r * WIDTH + 4 + c];
-                g_pre[r * RGB_PADDED + c] = g_out[r * WIDTH + 4 + c] * y * (1.0 - y);
-            }
+        // from the color network; samples without color give it zeros
+        g_c0.fill(0.0);
+        while let Some(s) = shaded.next_if(|&s| s < base + rows) {
+            let row = of_rows.next().expect("a row for each sample with a color");
+            g_c0[(s - base) * ci..][..ci].copy_from_slice(row);
         }
-        gemm((4, HIDDEN, TILE), &g_pre, (1, RGB_PADDED), c2, HIDDEN, g_c3_weights, HIDDEN, true);
-        gemm((TILE, HIDDEN, 3), &g_pre, (RGB_PADDED, 1), &w.c3.m, HIDDEN, &mut g_c2, HIDDEN, false);
-        for i in 0..TILE * HIDDEN {
-            g_c2[i] = relu_gradient(g_c2[i], c2[i]);
-        }
-        gemm((HIDDEN, HIDDEN, TILE), &g_c2, (1, HIDDEN), c1, HIDDEN, g_c2_weights, HIDDEN, true);
-        gemm((TILE, HIDDEN, HIDDEN), &g_c2, (HIDDEN, 1), &w.c2.m, HIDDEN, &mut g_c1, HIDDEN, false);
-        for i in 0..TILE * HIDDEN {
-            g_c1[i] = relu_gradient(g_c1[i], c1[i]);
-        }
-        gemm((HIDDEN, ci, TILE), &g_c1, (1, HIDDEN), c0, ci, g_c1_weights, ci, true);
-        gemm((TILE, ci, HIDDEN), &g_c1, (HIDDEN, 1), &w.c1.m, ci, &mut g_c0, ci, false);
 
         // outputs of the geometry network and the spatial gradient
         g_o.fill(0.0);
@@ -189,7 +175,7 @@ pub fn backward(a: &Activations, w: &Weights, g_out: &[f32], g_table: &mut [[f32
         .zip(g_out.chunks(CHUNK * WIDTH))
         .enumerate()
         .map(|(i, ((g_value, g_normal), g_out))| SdfBackwardTask {
-            start: i * CHUNK,
+            chunk: i,
             g_out,
             g_value,
             g_normal,

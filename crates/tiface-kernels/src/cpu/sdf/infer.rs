@@ -1,6 +1,7 @@
 //! Inference of the signed-distance field: no activations are kept for a backward pass.
 
-use super::{CHUNK, FieldShape, Inputs, WIDTH, color_layers, run, softened, write_skip};
+use super::color::{color_layers, write_skip};
+use super::{CHUNK, FieldShape, Inputs, WIDTH, geometry, softened};
 use crate::cpu::hash;
 use crate::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights};
 use crate::cpu::pool::Buffer;
@@ -50,7 +51,7 @@ dispatch! {
 }
 
 /// Returns the signed distances at points, `[n, 3]` → `[n]`, in a third of the time of
-/// [`super::forward`].
+/// [`super::geometry`].
 pub fn values(shape: &FieldShape, table: &[[f32; 2]], weights: &Weights, x: &[[f32; 3]]) -> Vec<f32> {
     values_and_softness(shape, table, weights, x).into_iter().map(|[value, _]| value).collect()
 }
@@ -107,7 +108,7 @@ impl Shader {
     #[inline(always)]
     fn run<const F: bool>(&mut self, w: &Weights, out: &mut [[f32; 3]]) {
         let Shader { c0, c1, c2, rgb } = self;
-        color_layers::<F>(w, c0, c1, c2, rgb);
+        color_layers::<F>(w, TILE, c0, c1, c2, rgb);
         for (rgb, out) in rgb.as_chunks::<RGB_PADDED>().0.iter().zip(out) {
             *out = [rgb[0], rgb[1], rgb[2]];
         }
@@ -218,7 +219,7 @@ pub fn gradients(
     const PASS: usize = 1 << 15;
     x.chunks(PASS)
         .flat_map(|x| {
-            let a = run(shape, table, weights, x, None);
+            let a = geometry(shape, table, weights, x);
             a.out.chunks_exact(WIDTH).map(|o| (o[0], [o[1], o[2], o[3]])).collect::<Vec<_>>()
         })
         .collect()
