@@ -1,7 +1,8 @@
 //! SAM, ViTMatte and alpha networks from files that a user brings (feature `matting`).
 //!
 //! ```text
-//! photograph + clicks ── segment ── hard mask        photograph + trimap ── alpha ── soft alpha
+//! photograph + clicks ── segment ── hard mask
+//! photograph + trimap ── alpha ──── soft alpha
 //! photograph ─────────── propose ── alpha of the network's foreground
 //! ```
 //!

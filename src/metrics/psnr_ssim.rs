@@ -5,7 +5,8 @@
 //! Structural similarity (Wang, Bovik, Sheikh, Simoncelli 2004) with the constants of the published
 //! evaluations: Gaussian window of 11 × 11, σ = 1.5, k₁ = 0.01, k₂ = 0.03, range 1.
 //!
-//! `(2 μa μb + c₁)(2 σab + c₂) / ((μa² + μb² + c₁)(σa² + σb² + c₂))`, per channel, then the mean.
+//! `(2 μa μb + c₁)(2 σab + c₂) / ((μa² + μb² + c₁)(σa² + σb² + c₂))`, per channel, then the
+//! mean.
 //!
 //! Two variants exist and are not equal. TensoRF's keeps only windows that fit (*valid*) and forces
 //! variances to be possible. instant-nsr-pl's mirrors the border (*reflect*), which gives one value

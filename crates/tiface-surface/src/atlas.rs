@@ -1,9 +1,9 @@
 //! A texture atlas: the surface cut into charts, laid flat, and packed into a square.
 //!
 //! ```text
-//! a head: face, scalp, nape, garment, cap → share out the texels ─┐
-//! else: divide and flatten (uvunwrap) ────────────────────────────┴→ repair → pack → check
-//!                                         └── fails → one half square a triangle
+//! a head: face, scalp, … → share out the texels ─┐
+//! else: divide and flatten (uvunwrap) ───────────┴→ repair → pack → check
+//!                        └── fails → one half square a triangle
 //! ```
 //!
 //! Every triangle of the result has area, none is flipped, no two share any, and charts keep their

@@ -5,7 +5,8 @@
 //! Of a triangle with area `A`, and `a` in the chart, whose map has the singular values `σ₁`, `σ₂`:
 //!
 //! ```text
-//! E = A · (σ₁² + σ₂²) · (1 + A² / a²) = A · (σ₁² + σ₂² + σ₁⁻² + σ₂⁻²),   4 A for an isometry
+//! E = A · (σ₁² + σ₂²) · (1 + A² / a²)
+//!   = A · (σ₁² + σ₂² + σ₁⁻² + σ₂⁻²),   4 A for an isometry
 //! ```
 //!
 //! It grows without bound as a triangle becomes thin, and no step is longer than 0.9 of the way to
