@@ -12,11 +12,14 @@
 //! place.
 
 mod affects;
+mod capture;
 mod device;
+mod ensemble;
 mod explain;
 pub mod iface;
 mod mask;
 mod mesh;
+mod metrics;
 mod preset;
 mod render;
 mod row;
@@ -26,16 +29,16 @@ mod table;
 mod vm;
 
 pub use affects::{Effect, Product};
+pub use capture::CaptureConfig;
 pub use device::DeviceChoice;
+pub use ensemble::EnsembleConfig;
 pub use explain::{Explained, explain, explained};
 pub use iface::IfaceConfig;
-pub use mask::{CaptureConfig, CutMethod, MaskConfig, MattingMethod, VitmatteColors};
+pub use mask::{CutMethod, MaskConfig, MattingMethod, VitmatteColors};
 pub use mesh::{ColorSource, Genus, Hair, MeshConfig, MeshFormat};
+pub use metrics::{MetricsConfig, TruthPhoto};
 pub use preset::Preset;
-pub use render::{
-    EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
-    display_name,
-};
+pub use render::{Method, NAMES, PictureFormat, RenderConfig, ViewBackground, display_name};
 pub use row::{Flag, Key, Takes};
 pub use source::{Fallback, Sources, known_words};
 pub use stage::Stage;

@@ -1,9 +1,9 @@
 //! `tiface demo`: renders photographs of a synthetic head, and runs the pipeline on them.
 
 use super::Invocation;
-use super::options::RunTarget;
 use super::out::Out;
 use super::run::{StageCommand, run as run_stages};
+use super::target::RunTarget;
 use crate::config::{Fallback, Preset};
 use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
 use crate::report::duration;

@@ -13,11 +13,13 @@
 mod alpha;
 mod processor;
 mod sam;
+mod vitmatte;
 
 pub use crate::onnx::NetworkFile;
 
-use self::alpha::{AlphaNet, VitMatte};
+use self::alpha::AlphaNet;
 use self::sam::Sam;
+use self::vitmatte::VitMatte;
 use super::clicks::Click;
 use crate::config::MaskConfig;
 use crate::onnx::Contract;

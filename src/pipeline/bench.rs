@@ -6,8 +6,8 @@
 //! (simplification, texture).
 
 use super::finish::Finish;
-use super::frames::Export;
 use super::mesh::{Extraction, extract, photographs};
+use super::mesh_files::Export;
 use super::render::{Meshes, Renderer};
 use super::session::Session;
 use super::surface::Fields;

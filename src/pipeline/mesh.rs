@@ -11,8 +11,8 @@
 
 use super::advice::{advised, sentence};
 use super::finish::{Finish, FinishedHead, REACH};
-use super::frames::Export;
 use super::learn;
+use super::mesh_files::Export;
 use super::surface::{CappedField, Surface};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, Stage};
 use crate::run::{Phase, Record, Run, StageDir, StageStatus, Status};

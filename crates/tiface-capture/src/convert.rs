@@ -9,7 +9,7 @@
 
 use super::colmap;
 use super::folder::is_hidden;
-use super::frame::LensModel;
+use super::lens_model::LensModel;
 use super::view::{Capture, Split, View, ViewMask};
 use super::{every_eighth, up};
 use rayon::prelude::*;

@@ -2,10 +2,11 @@
 
 use super::{Activations, CHUNK, WIDTH};
 use crate::cpu::hash::{self, JacobianBlock, LANES};
+use crate::cpu::matrix::add_to;
 use crate::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, SOFTNESS, TILE, Weights};
 use crate::cpu::neus::MIN_GRADIENT_NORM;
 use crate::cpu::pool::{Buffer, by_chunk};
-use crate::cpu::simd::{add_to, exp, fma, gemm, relu_gradient};
+use crate::cpu::simd::{exp, fma, gemm, relu_gradient};
 use rayon::prelude::*;
 use tiface_base::dispatch;
 
