@@ -54,6 +54,9 @@ use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
 use toml::{Table, Value};
 
+/// Name of the file in a run that has all of its settings.
+pub const SETTINGS_FILE: &str = "config.toml";
+
 /// The whole configuration, complete and valid.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -203,7 +206,7 @@ impl Config {
     /// Returns the configuration that the run in `folder` was last worked on with; none where it
     /// has no `config.toml`, or one that is not understood any more.
     pub fn of_run(folder: &Path) -> Option<Config> {
-        Config::read(&folder.join("config.toml")).ok()
+        Config::read(&folder.join(SETTINGS_FILE)).ok()
     }
 
     /// Reads a configuration from the text of a complete file.

@@ -4,6 +4,7 @@ use super::Invocation;
 use super::out::Out;
 use super::run::{StageCommand, run as run_stages};
 use super::target::RunTarget;
+use crate::config::SETTINGS_FILE;
 use crate::config::{Fallback, Preset};
 use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
 use crate::report::duration;
@@ -38,7 +39,7 @@ pub(super) fn run(
         }
     }
     // repeated, the demo continues with its saved settings
-    let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
+    let saved = Some(run.join(SETTINGS_FILE)).filter(|f| io::is_file(f));
     let fallback = Some(DEMO);
     // command-line errors are reported before any photograph is rendered
     Out::find(common.out.as_deref(), "run")?;

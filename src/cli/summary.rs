@@ -1,7 +1,7 @@
 //! The printed summary of a run: its files and its quality.
 
 use super::screen::{figure, one_line};
-use crate::config::{NAMES, display_name};
+use crate::config::{MeshFormat, NAMES, display_name};
 use crate::pipeline::Stage;
 use crate::report::{blend_verdict, height, judged_by};
 use crate::run::{Done, Run, read_record};
@@ -20,7 +20,7 @@ pub(super) fn summary(run: &Run, views: &str, done: &[(Stage, Done)], written: &
     }
     if let Some(mesh) = summary(Stage::Mesh) {
         let state = if mesh["closed"] == true { "watertight" } else { "NOT closed" };
-        let files = ["glb", "obj", "ply", "usdz"].map(|e| run.path(format!("mesh/head.{e}")));
+        let files = MeshFormat::ALL.map(|f| run.path(format!("mesh/head.{}", f.as_str())));
         let found = files.iter().find(|f| io::is_file(f));
         let first = found.map_or_else(|| "in no file".into(), |file| file.display().to_string());
         let handles = handles(&mesh["handles"]);

@@ -1,6 +1,7 @@
 //! The capture and the run that a command works on.
 
 use super::options::{Common, KeyOption};
+use crate::config::SETTINGS_FILE;
 use crate::config::{Config, Fallback};
 use crate::run::is_run;
 use std::path::{Path, PathBuf};
@@ -77,7 +78,7 @@ impl RunTarget {
     }
 
     fn run(run: PathBuf, guessed: bool) -> RunTarget {
-        RunTarget { saved: Some(run.join("config.toml")), run, capture: None, guessed }
+        RunTarget { saved: Some(run.join(SETTINGS_FILE)), run, capture: None, guessed }
     }
 }
 
@@ -88,7 +89,7 @@ fn guess(here: &Path) -> Result<RunTarget> {
     }
     let runs = io::list_folders(&here.join("runs"))?;
     let newest =
-        runs.into_iter().filter(|run| is_run(run)).max_by_key(|run| io::modified(&run.join("config.toml")));
+        runs.into_iter().filter(|run| is_run(run)).max_by_key(|run| io::modified(&run.join(SETTINGS_FILE)));
     match newest {
         Some(run) => Ok(RunTarget::run(run, true)),
         None => Err(Error::usage(

@@ -81,7 +81,7 @@ mod tests {
     use crate::config::iface::Foreground;
     use crate::field::ball;
     use crate::field::memory::resident;
-    use crate::field::pixels::TrainView;
+    use tiface_capture::LoadedView;
     use tiface_kernels::gpu::testing::{agree, device};
 
     #[test]
@@ -139,9 +139,14 @@ mod tests {
         let device = device().unwrap();
         let count = std::env::var("TIFACE_PHOTOGRAPHS").map_or(5, |n| n.parse().unwrap());
         let one = ball::view(2000, 0.0, 0.0, |_| [90; 3]);
-        let again =
-            |_| TrainView { camera: one.camera.clone(), photo: one.photo.clone(), mask: None, valid: None };
-        let views: Vec<TrainView> = (0..count).map(again).collect();
+        let again = |_| LoadedView {
+            camera: one.camera.clone(),
+            photo: one.photo.clone(),
+            mask: None,
+            valid: None,
+            region: None,
+        };
+        let views: Vec<LoadedView> = (0..count).map(again).collect();
         let sampler = RaySampler::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
         let drawing = SamplingOptions { jitter: true, background: true, background_stream: 8 };
         let bytes = resident(&sampler, &device, u64::MAX).unwrap();

@@ -476,7 +476,7 @@ struct Finisher<'f> {
     mesh: Mesh,
     extracted: Extraction,
     fields: &'f dyn Fields,
-    views: Vec<(Camera, LoadedView)>,
+    views: Vec<LoadedView>,
 }
 
 impl<'f> Finisher<'f> {

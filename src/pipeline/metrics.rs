@@ -261,6 +261,7 @@ mod tests {
     use super::super::exposure_tests;
     use super::super::tests::measured_head;
     use super::*;
+    use tiface_base::geom::Camera;
 
     #[test]
     fn a_blend_that_is_below_its_best_member_is_told_by_how_much() {
@@ -321,8 +322,13 @@ mod tests {
         let gray = |values: [u8; 4]| Some(Gray { width: 4, height: 1, values: values.to_vec() });
         let photo = Photo { width: 4, height: 1, rgb: vec![[0; 3]; 4], alpha: None };
         // a hair of head in pixel 1, pixel 3 not valid: 0.5² + 0.1² = 0.26 over two pixels
-        let loaded =
-            LoadedView { photo, mask: gray([0, 1, 0, 0]), valid: gray([255, 255, 255, 0]), region: None };
+        let loaded = LoadedView {
+            camera: Camera::above(4, 1, 4.0, 1.0),
+            photo,
+            mask: gray([0, 1, 0, 0]),
+            valid: gray([255, 255, 255, 0]),
+            region: None,
+        };
         let (sum, pixels) = square_opacity_outside(&render, &loaded).unwrap();
         assert!((sum - 0.26).abs() < 1e-6 && pixels == 2, "{sum} over {pixels}");
         assert_eq!(square_opacity_outside(&render, &LoadedView { mask: None, ..loaded }), None);

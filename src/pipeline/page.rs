@@ -7,6 +7,7 @@
 pub(super) mod viewer;
 pub(super) mod views;
 
+use crate::config::SETTINGS_FILE;
 pub use viewer::{head_page, viewer_of_file};
 
 use super::session::Session;
@@ -39,7 +40,7 @@ fn is_current(session: &Session) -> bool {
     let time = |name: &str| io::modified(&session.run.path(name));
     let report = time("report.html").filter(|_| io::is_file(&session.run.path("report.html")));
     let records = Stage::ALL.map(|stage| time(&format!("{stage}/done.json")));
-    report.is_some_and(|report| records.into_iter().flatten().chain(time("config.toml")).all(|t| t < report))
+    report.is_some_and(|report| records.into_iter().flatten().chain(time(SETTINGS_FILE)).all(|t| t < report))
 }
 
 /// Writes the report of a run again, from the run's contents.

@@ -330,15 +330,16 @@ impl<'a> Renderer<'a> {
             if self.monitor.stop() {
                 break; // what was made is not used then
             }
-            let (camera, loaded) = learn::training_view(view, &tiles, scene)?;
+            let loaded = learn::training_view(view, &tiles, scene)?;
+            let camera = &loaded.camera;
             if loaded.mask.is_some() && i % every == 0 {
                 let (photo, weight) = pictures::target(&loaded);
-                let shown = self.cast(&[Method::Raycast], &camera, &as_shown)?.pop();
+                let shown = self.cast(&[Method::Raycast], camera, &as_shown)?.pop();
                 shown.iter().for_each(|view| filters.add(view, &photo, &weight));
             }
             let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
-            if let Some(view) = self.cast(&[Method::Raycast], &camera, &options)?.pop() {
-                let source = ResidualSource { camera: &camera, photo: &loaded.photo, mask, valid, view };
+            if let Some(view) = self.cast(&[Method::Raycast], camera, &options)?.pop() {
+                let source = ResidualSource { camera, photo: &loaded.photo, mask, valid, view };
                 residuals.extend(ResidualView::new(source));
             }
         }
