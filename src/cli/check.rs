@@ -2,8 +2,7 @@
 
 use super::options::Common;
 use super::screen::{one_line, print};
-use crate::config::SETTINGS_FILE;
-use crate::config::Stage;
+use crate::config::{SETTINGS_FILE, Stage};
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
 use crate::pipeline::open_capture;

@@ -3,8 +3,7 @@
 use super::Invocation;
 use super::screen::print;
 use super::status::run_name;
-use crate::config::Config;
-use crate::config::SETTINGS_FILE;
+use crate::config::{Config, SETTINGS_FILE};
 use crate::pipeline::{cost_of_removal, remove_surplus, stage_folders, surplus};
 use crate::run::{Run, Surplus, SurplusKind, is_run};
 use serde_json::{Value, json};

@@ -4,14 +4,12 @@ use super::Invocation;
 use super::out::Out;
 use super::run::{StageCommand, run as run_stages};
 use super::target::RunTarget;
-use crate::config::SETTINGS_FILE;
-use crate::config::{Fallback, Preset};
+use crate::config::{Fallback, Preset, SETTINGS_FILE};
 use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
 use crate::report::duration;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use tiface_base::io;
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Result, io};
 use tiface_capture::synthetic::{MadeCapture, SyntheticOptions, check, write_borders, write_capture};
 
 /// Settings of the demo: few steps, because its pictures are small.

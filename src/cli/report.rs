@@ -11,8 +11,7 @@ use crate::run::{Run, read_record};
 use rayon::prelude::*;
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use tiface_base::io;
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Result, io};
 
 pub(super) fn run(invocation: &Invocation, runs: &[PathBuf], table: bool) -> Result<()> {
     let common = invocation.common;

@@ -1,12 +1,10 @@
 //! The capture and the run that a command works on.
 
 use super::options::{Common, KeyOption};
-use crate::config::SETTINGS_FILE;
-use crate::config::{Config, Fallback};
+use crate::config::{Config, Fallback, SETTINGS_FILE};
 use crate::run::is_run;
 use std::path::{Path, PathBuf};
-use tiface_base::io::{self};
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Result, io};
 
 /// The run, and the capture, of a command.
 #[derive(Debug, PartialEq)]

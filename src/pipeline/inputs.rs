@@ -7,8 +7,7 @@
 use super::clicks::MaskPrompts;
 use super::readings::{Settled, decide_reading};
 use super::{mask, scene_file};
-use crate::config::SETTINGS_FILE;
-use crate::config::{Config, MaskSource, Stage};
+use crate::config::{Config, MaskSource, SETTINGS_FILE, Stage};
 use crate::run::{Run, read_record, taken_for_capture};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};

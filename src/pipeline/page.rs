@@ -7,11 +7,10 @@
 pub(super) mod viewer;
 pub(super) mod views;
 
-use crate::config::SETTINGS_FILE;
+use crate::config::{NAMES, SETTINGS_FILE, Stage, display_name};
 pub use viewer::{head_page, viewer_of_file};
 
 use super::session::Session;
-use crate::config::{NAMES, Stage, display_name};
 use crate::report::{self, Chart, LEARNED, MethodTable, Report, Viewer, duration};
 use crate::run::{Record, read_record};
 use serde_json::Value;

@@ -1,7 +1,6 @@
 //! Tells the folder of a run from that of a capture.
 
-use crate::config::SETTINGS_FILE;
-use crate::config::{Config, Stage};
+use crate::config::{Config, SETTINGS_FILE, Stage};
 use std::path::{Path, PathBuf};
 use tiface_base::{Error, io};
 use tiface_capture::{has_cameras, not_a_capture, resembles_capture};

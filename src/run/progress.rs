@@ -10,8 +10,7 @@ use serde_json::{Map, Value};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
-use tiface_base::io;
-use tiface_base::{Monitor, Result};
+use tiface_base::{Monitor, Result, io};
 
 /// Receives the events of a run.
 #[derive(Clone, Copy, Debug, Serialize)]

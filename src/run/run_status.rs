@@ -8,7 +8,7 @@ use super::status::{State, Status, host, read_status};
 use crate::config::{Config, Stage};
 use serde::Serialize;
 use std::path::Path;
-use tiface_base::io::{self};
+use tiface_base::io;
 
 /// The state of a stage or a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -184,8 +184,7 @@ mod tests {
     use super::*;
     use crate::run::{ESTIMATE, FAILED, Failure, Plan, ProductState, Run, StageDir};
     use serde_json::{Value, json};
-    use tiface_base::Fingerprint;
-    use tiface_base::{Error, Result};
+    use tiface_base::{Error, Fingerprint, Result};
 
     fn plan(stage: &str) -> Plan<'_> {
         Plan {

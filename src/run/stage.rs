@@ -4,14 +4,12 @@ use super::progress::Progress;
 use super::record::TIMED;
 use super::status::{host, now};
 use super::stop::RunningStage;
-use super::{Event, Record, Run, State, Status};
-use super::{has_record, read_record, read_status};
+use super::{Event, Record, Run, State, Status, has_record, read_record, read_status};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use tiface_base::io;
-use tiface_base::{Error, Fingerprint, Monitor, Result};
+use tiface_base::{Error, Fingerprint, Monitor, Result, io};
 
 /// Plan of a stage.
 #[derive(Clone, Debug)]

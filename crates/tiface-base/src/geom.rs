@@ -42,8 +42,7 @@ pub use pieces::{WrongPiece, wrong_pieces};
 pub use ray::{Hit, Ray, RayResult};
 pub use shells::{ShellCaster, ShellLayer, Shells};
 pub use similarity::Similarity;
-pub use topology::{Sets, fans, side_ends, sorted_sides};
-pub use topology::{Topology, topology};
+pub use topology::{Sets, Topology, fans, side_ends, sorted_sides, topology};
 
 /// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of
 /// entries `xx xy xz yy yz zz`: their quotient is the inverse.

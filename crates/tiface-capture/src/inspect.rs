@@ -1,14 +1,13 @@
 //! The report on a capture: format, cameras, masks, splits, and all problems, not only the first.
 
 use super::frame::Agreement;
-use super::gather;
-use super::mask_checks;
 use super::mask_values::{MaskReading, MaskSurvey};
 use super::masks::{self, few};
 use super::options::{CaptureOptions, MaskMeaning};
 use super::photo_checks::{self, PhotoCheck};
 use super::scene::{self, Scene, SceneOptions};
 use super::view::{Capture, Split, View, ViewMask};
+use super::{gather, mask_checks};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;

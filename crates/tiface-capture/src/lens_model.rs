@@ -151,8 +151,7 @@ pub(super) fn check_distortion(d: &Distortion) -> Result<(), String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::Vec2;
-    use glam::{DMat3, DVec3};
+    use glam::{DMat3, DVec3, Vec2};
 
     #[test]
     fn every_model_is_read_as_it_was_written() {

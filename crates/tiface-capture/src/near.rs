@@ -10,9 +10,9 @@
 pub(super) mod names;
 pub(super) mod pairs;
 
-use names::{PHOTOGRAPHS, READABLE_FORMATS};
 use names::{
-    bare, fold, has_ending, is_aside, is_common_name, is_mask_folder, is_same_format, reduced, without_ending,
+    PHOTOGRAPHS, READABLE_FORMATS, bare, fold, has_ending, is_aside, is_common_name, is_mask_folder,
+    is_same_format, reduced, without_ending,
 };
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;

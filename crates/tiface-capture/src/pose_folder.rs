@@ -18,9 +18,8 @@ use super::view::Split;
 use glam::{DMat3, DVec3, Vec3};
 use std::collections::HashSet;
 use std::path::Path;
-use tiface_base::Result;
 use tiface_base::geom::{Aabb, meeting_point};
-use tiface_base::io;
+use tiface_base::{Result, io};
 
 /// Where the poses are, in this order.
 const POSES: [&str; 2] = ["pose", "poses"];

@@ -10,8 +10,7 @@ use serde_json::json;
 use std::collections::HashMap;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime};
-use tiface_base::io::{self};
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Result, io};
 
 /// The live page in the run's folder.
 const WATCH_FILE: &str = "watch.html";

@@ -12,8 +12,7 @@ use minijinja::{Environment, context};
 use serde::Serialize;
 use std::path::Path;
 use tiface_base::image::{Gray, Photo, reduce_photo, resize_gray, resize_hard, working_size};
-use tiface_base::io::{self};
-use tiface_base::{Error, ErrorKind, Result};
+use tiface_base::{Error, ErrorKind, Result, io};
 use tiface_capture::{coverage, findings};
 
 const OUTLINE: [u8; 3] = [0, 230, 255];

@@ -8,7 +8,7 @@ use glam::{Mat3, Vec3};
 /// base color.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Harmonics {
-    /// Functions a vertex, 1, 4 or 9: those of [`sh16`] up to a degree.
+    /// Functions a vertex, 1, 4 or 9: those of [`sh16`](super::sphharm::sh16) up to a degree.
     pub functions: usize,
     /// `[vertices, functions]` coefficients, sRGB-coded.
     pub coefficients: Vec<[f32; 3]>,

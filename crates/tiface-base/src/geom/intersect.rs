@@ -1,5 +1,5 @@
-//! Whether two triangles in space pass through each other, decided without rounding where a product
-//! in f64 would not tell.
+//! Whether two triangles in space pass through each other: by signs of determinants in f64, which
+//! count as zero where rounding could decide them.
 
 use super::overlap::separates;
 use glam::{DVec2, DVec3};
