@@ -3,7 +3,8 @@
 #     docker build -t tiface .
 #     docker run --rm -v "$PWD:/data" -w /data tiface run captures/002_00
 #
-# On NVIDIA add `--gpus all -e NVIDIA_DRIVER_CAPABILITIES=graphics,compute,utility`, on others `--device /dev/dri`.
+# On NVIDIA add `--gpus all -e NVIDIA_DRIVER_CAPABILITIES=graphics,compute,utility`,
+# on others `--device /dev/dri`.
 FROM rust:1.95-bookworm AS build
 WORKDIR /build
 COPY Cargo.toml Cargo.lock rust-toolchain* ./

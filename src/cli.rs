@@ -21,10 +21,13 @@ mod options;
 mod out;
 mod preview;
 mod report;
+mod requirement;
 mod run;
 mod screen;
 mod signals;
 mod status;
+mod summary;
+mod target;
 mod verify;
 
 use crate::config::key;

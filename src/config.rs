@@ -12,11 +12,14 @@
 //! place.
 
 mod affects;
+mod capture;
 mod device;
+mod ensemble;
 mod explain;
 pub mod iface;
 mod mask;
 mod mesh;
+mod metrics;
 mod preset;
 mod render;
 mod row;
@@ -26,16 +29,16 @@ mod table;
 mod vm;
 
 pub use affects::{Effect, Product};
+pub use capture::CaptureConfig;
 pub use device::DeviceChoice;
+pub use ensemble::EnsembleConfig;
 pub use explain::{Explained, explain, explained};
 pub use iface::IfaceConfig;
-pub use mask::{CaptureConfig, CutMethod, MaskConfig, MattingMethod, VitmatteColors};
+pub use mask::{CutMethod, MaskConfig, MattingMethod, VitmatteColors};
 pub use mesh::{ColorSource, Genus, Hair, MeshConfig, MeshFormat};
+pub use metrics::{MetricsConfig, TruthPhoto};
 pub use preset::Preset;
-pub use render::{
-    EnsembleConfig, Method, MetricsConfig, NAMES, PictureFormat, RenderConfig, TruthPhoto, ViewBackground,
-    display_name,
-};
+pub use render::{Method, NAMES, PictureFormat, RenderConfig, ViewBackground, display_name};
 pub use row::{Flag, Key, Takes};
 pub use source::{Fallback, Sources, known_words};
 pub use stage::Stage;
@@ -50,6 +53,9 @@ use std::path::{Path, PathBuf};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
 use toml::{Table, Value};
+
+/// Name of the file in a run that has all of its settings.
+pub const SETTINGS_FILE: &str = "config.toml";
 
 /// The whole configuration, complete and valid.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -200,7 +206,7 @@ impl Config {
     /// Returns the configuration that the run in `folder` was last worked on with; none where it
     /// has no `config.toml`, or one that is not understood any more.
     pub fn of_run(folder: &Path) -> Option<Config> {
-        Config::read(&folder.join("config.toml")).ok()
+        Config::read(&folder.join(SETTINGS_FILE)).ok()
     }
 
     /// Reads a configuration from the text of a complete file.

@@ -16,6 +16,8 @@ pub mod drawing;
 mod gpu_field;
 #[cfg(all(test, feature = "wgpu"))]
 pub(crate) mod gpu_tests;
+#[cfg(feature = "wgpu")]
+pub mod memory;
 pub mod ops;
 pub mod parameters;
 pub mod pixels;

@@ -22,11 +22,13 @@ pub mod distance;
 #[cfg(feature = "matting")]
 mod lpips;
 mod parts;
-mod psnr_ssim;
+mod psnr;
+mod ssim;
 
 pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
-pub use psnr_ssim::{psnr, ssim_reflect_map, ssim_valid};
+pub use psnr::psnr;
+pub use ssim::{ssim_reflect_map, ssim_valid};
 
 #[cfg(not(feature = "matting"))]
 use crate::onnx as lpips;

@@ -16,12 +16,15 @@
 //! runs float16 and int8 files and more of what recent exporters write; but it needs a library to
 //! be installed, cannot be kept from large arrays, and a crash ends the process.
 
+mod engine;
 mod network;
 
+pub(crate) use self::engine::{NetworkArray, file_error};
 pub use self::network::NetworkFile;
-pub(crate) use self::network::{Contract, NetworkArray, Role, file_error};
+pub(crate) use self::network::{Contract, Role};
 
-use self::network::{I64, NetworkInputs, Port, guarded, in_words, one_line};
+use self::engine::{NetworkInputs, guarded, one_line};
+use self::network::{I64, Port, in_words};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};

@@ -25,8 +25,10 @@ mod failure;
 mod folder;
 mod progress;
 mod record;
+mod run_status;
 mod stage;
 mod status;
+mod stop;
 mod verify;
 
 #[cfg(test)]
@@ -35,10 +37,12 @@ pub use clean::{HeldStages, Surplus, SurplusKind};
 pub use estimate::{Cost, ESTIMATE, Estimate, read_estimate};
 pub use failure::{FAILED, Failure, read_failure};
 pub use folder::{is_run, taken_for_capture};
-pub use progress::{Event, Observer, Stop};
+pub use progress::{Event, Observer};
 pub use record::{Fault, ProductState, Record, read_record};
+pub use run_status::{Phase, RunStatus, StageStatus};
 pub use stage::{Done, Plan, StageDir};
-pub use status::{Phase, RunStatus, StageStatus, State, Status, read_status};
+pub use status::{State, Status, read_status};
+pub use stop::Stop;
 pub use verify::{Verification, VerifiedFile, verify};
 
 use record::TIMED;

@@ -7,6 +7,7 @@
 mod cpu;
 #[cfg(feature = "wgpu")]
 mod gpu;
+mod import;
 mod infer;
 mod mean;
 mod ops;
@@ -17,7 +18,8 @@ mod self_test;
 mod state;
 mod train;
 
-pub use infer::{TFace, import};
+pub use import::import;
+pub use infer::TFace;
 pub use mean::{FieldMean, train};
 pub use train::TfaceReport;
 

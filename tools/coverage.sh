@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# How much of the readers' code the inputs of tests/fuzz.rs reach: a line for each file, and all of them together.
+# How much of the readers' code the inputs of tests/fuzz.rs reach: a line for each file, and all of them
+# together.
 #
 #     rustup component add llvm-tools
 #     TIFACE_FUZZ_S=60 tools/coverage.sh
 #
-# Only the packages of this workspace are instrumented; what they depend on stays as it was built. The program that cargo builds beside the tests
-# is removed in the end: instrumented, it is up to a hundred times as slow.
+# Only the packages of this workspace are instrumented; what they depend on stays as it was built. The program
+# that cargo builds beside the tests is removed in the end: instrumented, it is up to a hundred times as slow.
 set -eu -o pipefail
 cd "$(dirname "$0")/.."
 

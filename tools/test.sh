@@ -6,29 +6,33 @@
 #     tools/test.sh unit NAME...       only tests whose names contain one of these; likewise integration
 #     tools/test.sh all                the check, then every part below
 #
-# lint         format, width of comments, clippy with all features, a check without any, documentation and its figures
+# lint         format, width of comments, clippy with all features, a check without any, documentation and its
+#              figures
 # unit         unit tests, examples in the documentation
 # integration  the program as a user runs it: commands, hostile files, kills
 # readers      exported shapes in trimesh, open3d, three.js and the Khronos validator
-# demo         the demo head, from photographs to views, in all of these readers and Pixar's USD; its files beside their schemas
+# demo         the demo head, from photographs to views, in all of these readers and Pixar's USD; its files
+#              beside their schemas
 # fuzz         three seconds for every reader of foreign bytes
 #
 # `all` adds loops and breadth. Each claim has its test in the check, or is about a program of somebody else:
 #
-# long         tests marked `#[ignore = "long: …"]`: GPU trainings at full length and of every preset, kills by the dozen,
-#              every write that fails, every change of every byte of a model, masks of all views of two captures, sweeps of
-#              cases, inputs of `../shared`, gradients of the device against f64. The check makes the same claims on fewer
-#              steps, kills, bytes, views and cases, and compares the device with the CPU.
+# long         tests marked `#[ignore = "long: …"]`: GPU trainings at full length and of every preset, kills
+#              by the dozen, every write that fails, every change of every byte of a model, masks of all views
+#              of two captures, sweeps of cases, inputs of `../shared`, gradients of the device against f64.
+#              The check makes the same claims on fewer steps, kills, bytes, views and cases, and compares the
+#              device with the CPU.
 # fuzz         a minute for every reader instead of three seconds
-# gpu          `tools/gpu/first_look.sh`, eleven trainings on a driver in software, six minutes. The check trains each field
-#              on that driver once, beside the CPU.
-# fleet        six heads under kills of tasks and of the engine, two and a half minutes. Only the recipe in `tools/fleet` is
-#              not in the check; the kills, waits and exit codes that it relies on are, in `resume`, `accidents` and `cli`.
+# gpu          `tools/gpu/first_look.sh`, eleven trainings on a driver in software, six minutes. The check
+#              trains each field on that driver once, beside the CPU.
+# fleet        six heads under kills of tasks and of the engine, two and a half minutes. Only the recipe in
+#              `tools/fleet` is not in the check; the kills, waits and exit codes that it relies on are, in
+#              `resume`, `accidents` and `cli`.
 # guides       every command of four guides, five minutes. The commands themselves are in the check, in `cli`.
-# blender      exports, lobes and the import of a run in Blender: a download of 350 MB. The check reads the same files with
-#              five other readers.
-# browser      the annotation page, the report and the page of many runs in Chromium: a download of 90 MB and scripts of a
-#              minute. The check reads the pages' content in unit tests.
+# blender      exports, lobes and the import of a run in Blender: a download of 350 MB. The check reads the
+#              same files with five other readers.
+# browser      the annotation page, the report and the page of many runs in Chromium: a download of 90 MB and
+#              scripts of a minute. The check reads the pages' content in unit tests.
 set -u -o pipefail
 cd "$(dirname "$0")/.."
 
@@ -77,7 +81,8 @@ step() {
 }
 skip() { results+=("SKIPPED         $*"); }
 
-# begin WORD COMMAND...: runs the command beside the steps that follow; end WORD: waits for it and shows what it said
+# begin WORD COMMAND...: runs the command beside the steps that follow; end WORD: waits for it and shows what
+# it said
 begin() {
   local word=$1
   shift
@@ -112,8 +117,8 @@ python_readers() {
     npm ci --silent --no-audit --no-fund --prefix tools/readers
 }
 
-# Blender as a module has its own environment, since it brings its own numpy. Its wheel leaves the libraries of a display
-# to the system, even where nothing is displayed.
+# Blender as a module has its own environment, since it brings its own numpy. Its wheel leaves the libraries
+# of a display to the system, even where nothing is displayed.
 blender() {
   [ -x .venv-blender/bin/python ] || "${PYTHON:-python3}" -m venv .venv-blender || return
   .venv-blender/bin/python -m pip install --quiet --disable-pip-version-check \
@@ -195,9 +200,9 @@ need_build() {
 executables() { sed -n "s|.*Executable.*$1.* (\(.*\))$|\1|p" "$scratch/build.log"; }
 executable() { executables "$1" | tail -n 1; }
 
-# tests LOG PROGRAM OPTIONS...: runs a program of tests. Each test is shown as it ends. The summary has what failing ones
-# said, and what was skipped, so that a skipped test is not taken for a passed one. Times are an unstable option of Rust's
-# test harness, which the variable allows.
+# tests LOG PROGRAM OPTIONS...: runs a program of tests. Each test is shown as it ends. The summary has what
+# failing ones said, and what was skipped, so that a skipped test is not taken for a passed one. Times are an
+# unstable option of Rust's test harness, which the variable allows.
 tests() {
   local log=$scratch/$1.log program=$2
   shift 2
@@ -324,15 +329,15 @@ make_demo() {
   [ $demo_made = no ] || return
   demo_made=yes
   need_build
-  # A head that has learned its colors is compared as a picture by the browser and Blender. Before that its surface is soft,
-  # and would get layers, which some readers take for a part of it.
+  # A head that has learned its colors is compared as a picture by the browser and Blender. Before that its
+  # surface is soft, and would get layers, which some readers take for a part of it.
   local size=(150 --size 128x160 --views 16 --set mesh.hair=none)
   if wanted browser || wanted blender; then size=(600); fi
   step "the demo head is reconstructed" train_demo "${size[@]}"
   step "the demo head is exported" export_demo
 }
-# The demo head again, with fewer triangles, another material and a smaller texture; cut below the chin, at two levels of
-# detail; and compressed.
+# The demo head again, with fewer triangles, another material and a smaller texture; cut below the chin, at
+# two levels of detail; and compressed.
 export_demo() {
   local export=("$target/release/tiface" export "$scratch/demo")
   "${export[@]}" --material lit --triangles 3000 --texture 512 --format glb,obj,ply,usdz --out "$scratch/exported/" &&

@@ -3,7 +3,8 @@
 import subprocess
 import time
 
-# With a checkpoint often enough that kills leave something to go on from. What a command's own options say wins.
+# With a checkpoint often enough that kills leave something to go on from. What a command's own options say
+# wins.
 SETTINGS = """
 device = "cpu"
 [iface]

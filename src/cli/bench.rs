@@ -1,9 +1,9 @@
 //! `tiface bench`: speed against error of settings, measured on this machine.
 
 use super::Invocation;
-use super::options::RunTarget;
 use super::out::Out;
 use super::screen::print;
+use super::target::RunTarget;
 use crate::config::{Config, Fallback, Preset};
 use crate::pipeline::{Bench, SWEEPS, Session, check_feasible, require_device};
 use crate::report::bench::BenchResult;

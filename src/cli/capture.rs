@@ -5,7 +5,7 @@ use super::Invocation;
 use super::options::Common;
 use super::out::Out;
 use super::screen::{one_line, print};
-use crate::config::{CameraPoses, Config};
+use crate::config::{CameraPoses, Config, SETTINGS_FILE};
 use crate::pipeline::{self, capture_options, click_page, inspect_capture, open_capture};
 use crate::run::is_run;
 use serde_json::json;
@@ -57,7 +57,7 @@ pub(super) fn convert(invocation: &Invocation, from: &Path, to: &str) -> Result<
 /// Returns the settings for a capture and its folder; a run's configuration has its capture and the
 /// size of its photographs.
 fn capture_of(common: &Common, path: &Path) -> Result<(Config, PathBuf)> {
-    let saved = is_run(path).then(|| path.join("config.toml"));
+    let saved = is_run(path).then(|| path.join(SETTINGS_FILE));
     let config = common.resolve(saved.as_deref(), None, &[])?;
     let known = &config.capture.path;
     let root = if saved.is_some() && !known.as_os_str().is_empty() { known.clone() } else { path.into() };

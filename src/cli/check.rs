@@ -2,7 +2,7 @@
 
 use super::options::Common;
 use super::screen::{one_line, print};
-use crate::config::Stage;
+use crate::config::{SETTINGS_FILE, Stage};
 use crate::metrics::distance::{Distances, kinds_one_way, one_way, seen_one_way};
 use crate::metrics::{Masks, Tones};
 use crate::pipeline::open_capture;
@@ -225,7 +225,8 @@ fn compare(mesh: &Mesh, origin: DVec3, other: &Path, seen_by: Option<&Path>, uni
     let back = one_way(&truth, &Bvh::new(mesh), SURFACE_SAMPLES).ok_or_else(|| empty(other))?;
     let (mut seen, mut by_views, mut parts) = (None, Vec::new(), Vec::new());
     if let Some(root) = seen_by {
-        let capture = open_capture(root, &CaptureOptions::default())?;
+        let capture =
+            open_capture(root, &CaptureOptions { result_file: SETTINGS_FILE, ..CaptureOptions::default() })?;
         let moved = |c: &Camera| Camera { position: c.position - origin, ..c.clone() };
         let views: Vec<&View> = capture.split(Split::Train).collect();
         let cameras: Vec<Camera> = views.iter().map(|v| moved(&v.camera)).collect();

@@ -3,7 +3,7 @@
 use super::Invocation;
 use super::screen::print;
 use super::status::run_name;
-use crate::config::Config;
+use crate::config::{Config, SETTINGS_FILE};
 use crate::pipeline::{cost_of_removal, remove_surplus, stage_folders, surplus};
 use crate::run::{Run, Surplus, SurplusKind, is_run};
 use serde_json::{Value, json};
@@ -37,7 +37,7 @@ fn clean(invocation: &Invocation, folder: &Path, removes: bool) -> Result<u64> {
         let what = format!("`{}` is not a run", folder.display());
         return Err(Error::usage(what, "name the folder of a run"));
     }
-    let config = Config::read(&folder.join("config.toml"))?;
+    let config = Config::read(&folder.join(SETTINGS_FILE))?;
     let run = Run::open(folder, invocation.stop.clone(), invocation.screen.clone());
     // held before it is looked at: what is listed is what goes
     let held = removes.then(|| run.hold(&stage_folders())).transpose()?;

@@ -1,7 +1,8 @@
 //! `tiface config`: the effective configuration, or the documentation of a key.
 
-use super::options::{Common, RunTarget};
+use super::options::Common;
 use super::screen::print;
+use super::target::RunTarget;
 use crate::config::{explain, explained};
 use serde_json::json;
 use std::path::Path;

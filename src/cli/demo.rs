@@ -1,16 +1,15 @@
 //! `tiface demo`: renders photographs of a synthetic head, and runs the pipeline on them.
 
 use super::Invocation;
-use super::options::RunTarget;
 use super::out::Out;
 use super::run::{StageCommand, run as run_stages};
-use crate::config::{Fallback, Preset};
+use super::target::RunTarget;
+use crate::config::{Fallback, Preset, SETTINGS_FILE};
 use crate::pipeline::{DEMO_CAPTURE, Stage, check_feasible, require_device};
 use crate::report::duration;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use tiface_base::io;
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Result, io};
 use tiface_capture::synthetic::{MadeCapture, SyntheticOptions, check, write_borders, write_capture};
 
 /// Settings of the demo: few steps, because its pictures are small.
@@ -38,7 +37,7 @@ pub(super) fn run(
         }
     }
     // repeated, the demo continues with its saved settings
-    let saved = Some(run.join("config.toml")).filter(|f| io::is_file(f));
+    let saved = Some(run.join(SETTINGS_FILE)).filter(|f| io::is_file(f));
     let fallback = Some(DEMO);
     // command-line errors are reported before any photograph is rendered
     Out::find(common.out.as_deref(), "run")?;

@@ -1,10 +1,10 @@
 //! `tiface export`: writes the finished head of a run to files for other programs.
 
 use super::Invocation;
-use super::options::RunTarget;
 use super::out::{Out, require_outside, write_files};
 use super::preview::{AXES, axis, no_up};
 use super::screen::print;
+use super::target::RunTarget;
 use crate::config::{Config, MeshFormat, Stage};
 use crate::pipeline::{Cut, ExportRequest, KeptHead, Material, MeshFrame, Size};
 use clap::Args;

@@ -1,9 +1,9 @@
 //! `tiface report`: rewrites the page of a run, compares two runs, or writes one page of many runs.
 
 use super::Invocation;
-use super::options::RunTarget;
 use super::out::Out;
 use super::screen::print;
+use super::target::RunTarget;
 use crate::config::{Config, Stage};
 use crate::pipeline::{Session, compare_runs, curves, renew_report};
 use crate::report::{RunRow, curves_csv, runs_csv, runs_html};
@@ -11,8 +11,7 @@ use crate::run::{Run, read_record};
 use rayon::prelude::*;
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use tiface_base::io;
-use tiface_base::{Error, Result};
+use tiface_base::{Error, Result, io};
 
 pub(super) fn run(invocation: &Invocation, runs: &[PathBuf], table: bool) -> Result<()> {
     let common = invocation.common;

@@ -1,5 +1,4 @@
-//! `[render]`: the views made of the result; `[ensemble]`: how several views of one camera become
-//! one; `[metrics]`: how the result is judged.
+//! `[render]`: the views made of the result.
 
 use super::stage::Stage;
 use super::table::table;
@@ -146,57 +145,9 @@ impl RenderConfig {
     }
 }
 
-table! {
-    /// Members and weights of the blend.
-    pub struct EnsembleConfig;
-    keys {
-        /// Methods to blend, a list of baseline, tface, volume (I-Face), raycast (I-Face's mesh),
-        /// plain and textured (head.glb); empty: no blend.
-        #[flag("members", Text("LIST"), ["ensemble"],
-            "Methods to blend, separated by commas: baseline, tface, volume (I-Face), raycast (I-Face's \
-             mesh), plain, textured and raster (head.glb)")]
-        members: Vec<Method> [Blend]
-            => vec![Method::Tface, Method::Raycast],
-            vec![Method::Tface, Method::Raycast],
-            vec![Method::Baseline, Method::Tface, Method::Volume];
-        /// Weights of the members, in their order, with sum 1; empty: fit them on capture.tiles.
-        #[flag("weights", Text("LIST"), ["ensemble"],
-            "Weights of the methods, in that order, with sum 1 [default: fitted]")]
-        weights: Vec<f64>, 0.0..=1.0 [Blend] => Vec::new(), Vec::new(), vec![0.1, 0.6, 0.3];
-        /// Cut members that were trained without masks to the head: true or false.
-        cut: bool [Blend] => true, true, false;
-    }
-}
-
-/// What a photograph looks like that views are compared with.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum TruthPhoto {
-    /// As it was taken, background and all.
-    Photo,
-    /// Cut out by its mask and laid over the views' background.
-    Masked,
-}
-
-table! {
-    /// Comparison of views with photographs, and of the surface with a known one.
-    pub struct MetricsConfig;
-    keys {
-        /// Reference of the views: photo (as taken; whole-frame figures include the background) or
-        /// masked (cut out by its mask, over render.background).
-        truth: TruthPhoto [Metrics] => TruthPhoto::Masked, TruthPhoto::Masked, TruthPhoto::Photo;
-        /// LPIPS network, an ONNX file that takes two pictures (needs a build with the feature
-        /// `matting`); empty: no LPIPS.
-        lpips: String [nothing] => String::new();
-        /// Number of points sampled on a surface to compare it with a known one.
-        surface_points: u32, 100.0..=10_000_000.0 [Metrics] => 20_000, 100_000, 100_000;
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, Sources};
 
     #[test]
     fn every_picture_has_one_word_and_one_name() {
@@ -208,25 +159,5 @@ mod tests {
         }
         assert_eq!(display_name("volume"), "I-Face (volume)");
         assert_eq!((display_name("baseline"), display_name("truth")), ("baseline".into(), "truth".into()));
-    }
-
-    fn set(set: &[&str]) -> Config {
-        let set = set.iter().map(|s| s.to_string()).collect();
-        Config::resolve(&Sources { set, ..Sources::default() }).unwrap()
-    }
-
-    #[test]
-    fn weights_are_fitted_unless_they_are_given_and_iface_is_a_word_for_volume() {
-        let c = set(&[]);
-        assert_eq!(c.ensemble.members, [Method::Tface, Method::Raycast]);
-        assert!(c.ensemble.weights.is_empty() && c.capture.tiles > 0.0);
-        assert!(!c.render.method.contains(&Method::Baseline));
-        let c = set(&["preset=paper"]);
-        assert_eq!(c.ensemble.members, [Method::Baseline, Method::Tface, Method::Volume]);
-        assert_eq!((c.ensemble.weights.iter().sum::<f64>(), c.capture.tiles), (1.0, 0.0));
-        assert!(c.render.method.contains(&Method::Baseline));
-        let c = set(&["ensemble.members=tface,iface", "ensemble.weights=1,0"]).ensemble;
-        assert_eq!((c.members[1], c.weights.as_slice()), (Method::Volume, &[1.0, 0.0][..]));
-        assert!(set(&["preset=paper", "ensemble.weights="]).ensemble.weights.is_empty());
     }
 }

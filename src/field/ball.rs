@@ -1,15 +1,15 @@
 //! Photographs of an analytic ball, the training data of self-tests and tests.
 
-use super::pixels::TrainView;
 use glam::{DMat3, DVec3, Vec2, Vec3};
 use tiface_base::geom::{BitGrid, Camera, Distortion};
 use tiface_base::image::{Gray, Photo};
+use tiface_capture::LoadedView;
 
 /// Radius of the ball, scene units.
 pub const BALL: f32 = 0.6;
 
 /// Returns photographs from eight sides of a red and green ball in front of a blue wall.
-pub fn views() -> Vec<TrainView> {
+pub fn views() -> Vec<LoadedView> {
     let color = |p: Vec3| if p.y > 0.0 { [200, 40, 30] } else { [40, 180, 60] };
     (0..8)
         .map(|i| view(40, i as f64 * std::f64::consts::TAU / 8.0, if i % 2 == 0 { 0.4 } else { -0.4 }, color))
@@ -19,7 +19,7 @@ pub fn views() -> Vec<TrainView> {
 /// Returns photographs of a ball textured with waves of a few pixels: nine from the front and three
 /// from the back.
 #[cfg(test)]
-pub fn textured_views() -> Vec<TrainView> {
+pub fn textured_views() -> Vec<LoadedView> {
     let waves = |p: Vec3| {
         let wave = |i: u64| {
             let [x, y, z] = [0, 1, 2].map(|k| 90.0 * tiface_base::math::rng::uniform(5, i, k) - 45.0);
@@ -33,7 +33,7 @@ pub fn textured_views() -> Vec<TrainView> {
 }
 
 /// Renders a photograph of the ball, with its mask.
-pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8; 3]) -> TrainView {
+pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8; 3]) -> LoadedView {
     let rotation = DMat3::from_rotation_y(azimuth) * DMat3::from_rotation_x(-elevation);
     let camera = Camera {
         width: size,
@@ -65,11 +65,12 @@ pub fn view(size: u32, azimuth: f64, elevation: f64, color: impl Fn(Vec3) -> [u8
             }
         }
     }
-    TrainView {
+    LoadedView {
         camera,
         photo: Photo { width: size, height: size, rgb, alpha: None },
         mask: Some(Gray { width: size, height: size, values: alpha }),
         valid: None,
+        region: None,
     }
 }
 

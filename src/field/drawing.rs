@@ -3,30 +3,16 @@
 //! Photographs that fit are copied to the device, and kernels sample them. Otherwise the CPU
 //! samples the same rays from host memory while the device computes the previous step, and uploads
 //! rays and colors: about half a megabyte per step.
-//!
-//! [`MemoryNeed`] plans a training's memory on a device.
 
 use super::pixels::{RaySampler, ray_backgrounds};
 use super::training::StepAt;
-use tiface_base::{Error, Result};
-use tiface_kernels::gpu::{BUFFERS, Buffer, Device, DeviceBatch, Photographs, SamplingOptions, planes};
+use tiface_kernels::gpu::{Buffer, Device, DeviceBatch, Photographs, SamplingOptions, planes};
 
 /// Source of the rays of a training on a device.
 pub struct DeviceSampler {
     /// Photographs in device memory; `None` if the CPU samples the rays.
     resident: Option<Photographs>,
     drawing: SamplingOptions,
-}
-
-/// Returns the bytes that the photographs take on a device, or `None` if they do not fit in
-/// `available` bytes.
-pub fn resident(sampler: &RaySampler, device: &Device, available: u64) -> Option<u64> {
-    let buffers = sampler.buffers_on_device(device.limits().largest_buffer);
-    // A pixel takes four bytes for its color, one bit for whether it is drawable, and its share of
-    // the bits' counts.
-    let bytes = buffers.iter().sum::<u64>() * 17 / 4;
-    let fits = buffers.len() <= BUFFERS && bytes <= available;
-    (fits && sampler.count() <= u32::MAX as u64).then_some(bytes)
 }
 
 impl DeviceSampler {
@@ -89,61 +75,13 @@ impl DeviceSampler {
     }
 }
 
-/// Memory that a training needs on a device.
-pub struct MemoryNeed {
-    /// Bytes that do not depend on the step's size, and their purpose for messages.
-    pub fixed: (u64, &'static str),
-    /// Unit of a step's size: `samples` or `rays`.
-    pub unit: &'static str,
-    /// Bytes per unit in all buffers together, and in the largest buffer.
-    pub each: [u64; 2],
-    /// Largest number of units that a step uses.
-    pub wanted: u64,
-    /// Smallest number of units that a step can run with.
-    pub minimum: u64,
-}
-
-impl MemoryNeed {
-    /// Returns how many samples or rays fit on the device, up to the wanted number, and whether the
-    /// photographs fit as well.
-    ///
-    /// # Errors
-    ///
-    /// If fewer than the minimum fit; `remedy` receives how many fit and returns the setting to
-    /// lower.
-    pub fn plan(
-        &self,
-        sampler: &RaySampler,
-        device: &Device,
-        remedy: impl FnOnce(u64) -> String,
-    ) -> Result<(usize, bool)> {
-        let [bytes, widest] = self.each;
-        let (fixed, what) = self.fixed;
-        let left = device.available_memory().saturating_sub(fixed);
-        let resident = resident(sampler, device, left.saturating_sub(self.wanted.saturating_mul(bytes)));
-        let by_buffer = device.limits().largest_buffer / widest;
-        let fits = self.wanted.min(by_buffer).min((left - resident.unwrap_or(0)) / bytes);
-        if fits < self.minimum {
-            let problem = format!(
-                "the device `{}` has memory for {fits} {} of a step beside {} MiB of {what}, {} are needed",
-                device.name(),
-                self.unit,
-                fixed.div_ceil(1 << 20),
-                self.minimum,
-            );
-            let hint = format!("lower {}, or give more with `--memory`", remedy(fits));
-            return Err(Error::cannot(problem, hint));
-        }
-        Ok((fits as usize, resident.is_some()))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::iface::Foreground;
     use crate::field::ball;
-    use crate::field::pixels::TrainView;
+    use crate::field::memory::resident;
+    use tiface_capture::LoadedView;
     use tiface_kernels::gpu::testing::{agree, device};
 
     #[test]
@@ -201,9 +139,14 @@ mod tests {
         let device = device().unwrap();
         let count = std::env::var("TIFACE_PHOTOGRAPHS").map_or(5, |n| n.parse().unwrap());
         let one = ball::view(2000, 0.0, 0.0, |_| [90; 3]);
-        let again =
-            |_| TrainView { camera: one.camera.clone(), photo: one.photo.clone(), mask: None, valid: None };
-        let views: Vec<TrainView> = (0..count).map(again).collect();
+        let again = |_| LoadedView {
+            camera: one.camera.clone(),
+            photo: one.photo.clone(),
+            mask: None,
+            valid: None,
+            region: None,
+        };
+        let views: Vec<LoadedView> = (0..count).map(again).collect();
         let sampler = RaySampler::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
         let drawing = SamplingOptions { jitter: true, background: true, background_stream: 8 };
         let bytes = resident(&sampler, &device, u64::MAX).unwrap();

@@ -1,19 +1,19 @@
 //! Tests of trainings on a GPU, with a field's training as a parameter: each field calls them.
 
 use super::checkpoint::TrainingProgress;
-use super::pixels::TrainView;
 use super::testing::{StopAfter, bytes, copied, temporary};
 use super::training::{self, Model, StepReport};
 use glam::Vec2;
 use std::path::Path;
 use tiface_base::geom::{Ray, RayResult};
 use tiface_base::{Monitor, Quiet, Result};
+use tiface_capture::LoadedView;
 use tiface_kernels::gpu::testing::{devices, lose_after};
 use tiface_kernels::gpu::{Atomics, Device};
 
 /// Returns the error of the colors that a field shows of every third pixel of a view over black,
 /// dB.
-pub fn psnr(view: &TrainView, render: impl FnOnce(&[Ray]) -> Vec<RayResult>) -> f64 {
+pub fn psnr(view: &LoadedView, render: impl FnOnce(&[Ray]) -> Vec<RayResult>) -> f64 {
     let width = view.camera.width as usize;
     let pixels: Vec<usize> = (0..view.photo.rgb.len()).step_by(3).collect();
     let center = |p: usize| Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);

@@ -14,24 +14,13 @@ use super::training::StepAt;
 use crate::config::iface::Foreground;
 use glam::Vec2;
 use rayon::prelude::*;
-use tiface_base::geom::{Camera, Ray};
-use tiface_base::image::{Gray, Photo, dilated};
+use tiface_base::geom::Ray;
+use tiface_base::image::dilated;
 use tiface_base::math::rng;
+use tiface_capture::LoadedView;
 use tiface_kernels::cpu::vm::mask::crossing;
 #[cfg(feature = "wgpu")]
 use tiface_kernels::gpu;
-
-/// One training photograph.
-pub struct TrainView {
-    /// Camera in scene coordinates (the head's box is [-1, 1]³).
-    pub camera: Camera,
-    /// Photograph.
-    pub photo: Photo,
-    /// Soft alpha of the head, same size; `None` without a mask.
-    pub mask: Option<Gray>,
-    /// Usable pixels (non-zero), same size.
-    pub valid: Option<Gray>,
-}
 
 /// Rays drawn for one step, with the colors and alphas of their pixels.
 #[derive(Default)]
@@ -50,6 +39,25 @@ pub struct HostBatch {
 }
 
 impl HostBatch {
+    /// Adds the ray with this number, and color and alpha of its pixel.
+    fn push(&mut self, number: u64, ray: Ray, jitter: f32, (color, alpha): ([f32; 3], f32)) {
+        self.rays.push(ray);
+        self.jitter.push(jitter);
+        self.color.push(color);
+        self.alpha.push(alpha);
+        self.number.push(number as u32);
+    }
+
+    /// Returns both batches as one, this one first.
+    fn followed_by(mut self, next: HostBatch) -> HostBatch {
+        self.rays.extend(next.rays);
+        self.jitter.extend(next.jitter);
+        self.color.extend(next.color);
+        self.alpha.extend(next.alpha);
+        self.number.extend(next.number);
+        self
+    }
+
     /// Drops all rays after the first `count`.
     pub fn truncate(&mut self, count: usize) {
         self.rays.truncate(count);
@@ -60,20 +68,12 @@ impl HostBatch {
     }
 }
 
-/// One ray of a [`HostBatch`].
-struct DrawnRay {
-    ray: Ray,
-    jitter: f32,
-    color: [f32; 3],
-    alpha: f32,
-}
-
 /// Inclusive box of drawable pixels and one bit per pixel.
 type Drawable = (u32, u32, u32, u32, Vec<u64>);
 
 /// The drawable pixels of all views.
 pub struct RaySampler<'a> {
-    views: &'a [TrainView],
+    views: &'a [LoadedView],
     /// Per view: target colors over black of the soft pixels; `None` if the target is alpha times
     /// the photograph.
     soft: Vec<Option<SoftPixels>>,
@@ -111,13 +111,13 @@ impl<'a> RaySampler<'a> {
     /// `reference_sampling` draws as the published code does: a uniformly random view, then a
     /// uniformly random pixel of its frame.
     pub fn new(
-        views: &'a [TrainView],
+        views: &'a [LoadedView],
         reach: f32,
         radius: f32,
         foreground: Foreground,
         reference_sampling: bool,
     ) -> RaySampler<'a> {
-        let usable = |v: &TrainView| v.mask.as_ref().is_some_and(|m| m.values.iter().any(|&a| a < 255));
+        let usable = |v: &LoadedView| v.mask.as_ref().is_some_and(|m| m.values.iter().any(|&a| a < 255));
         let has_masks = views.iter().any(usable);
         let reach = if reference_sampling { f32::INFINITY } else { reach };
         let soft = views
@@ -145,7 +145,7 @@ impl<'a> RaySampler<'a> {
     /// The permutation is computed, not stored: for twenty-four photographs of twelve megapixels
     /// its table would take two gigabytes.
     pub fn permuted(
-        views: &'a [TrainView],
+        views: &'a [LoadedView],
         foreground: Foreground,
         bounds: [[f32; 3]; 2],
         depth_directions: bool,
@@ -193,7 +193,7 @@ impl<'a> RaySampler<'a> {
     }
 
     /// Returns the photographs.
-    pub fn views(&self) -> &'a [TrainView] {
+    pub fn views(&self) -> &'a [LoadedView] {
         self.views
     }
 
@@ -206,21 +206,17 @@ impl<'a> RaySampler<'a> {
     /// photograph stands for a square of pixels, the widest of [`SIDES`] that is at most `detail`
     /// wide, in scene units.
     pub fn draw(&self, seed: u64, step: u64, count: usize, jitter: bool, detail: f32) -> HostBatch {
-        let draw = |i: usize| match &self.order {
-            Some(order) => self.draw_next(order, (seed, step), (i as u64, count as u64), jitter),
-            None => self.draw_one((seed, step), i as u64, jitter, detail),
+        let draw = |mut batch: HostBatch, i: usize| {
+            let i = i as u64;
+            match &self.order {
+                Some(order) => self.draw_next(order, (seed, step), (i, count as u64), jitter, &mut batch),
+                None => self.draw_one((seed, step), i, jitter, detail, &mut batch),
+            }
+            batch
         };
-        let drawn: Vec<_> = (0..count).into_par_iter().with_min_len(256).map(draw).collect();
-        let mut batch = HostBatch::default();
-        for (i, drawn) in drawn.into_iter().enumerate() {
-            let Some(DrawnRay { ray, jitter, color, alpha }) = drawn else { continue };
-            batch.rays.push(ray);
-            batch.jitter.push(jitter);
-            batch.color.push(color);
-            batch.alpha.push(alpha);
-            batch.number.push(i as u32);
-        }
-        batch
+        let parts = (0..count).into_par_iter().with_min_len(256).fold(HostBatch::default, draw);
+        // in the order of the rays
+        parts.reduce(HostBatch::default, HostBatch::followed_by)
     }
 
     /// Copies the photographs to a device, in buffers of at most `largest` bytes. The device draws
@@ -289,15 +285,16 @@ impl<'a> RaySampler<'a> {
         }
     }
 
-    /// Draws ray `i` of a batch of `count` in the order without repetition.
+    /// Draws ray `i` of `count` in the order without repetition into a batch.
     fn draw_next(
         &self,
         order: &Order,
         (seed, step): (u64, u64),
         (i, count): (u64, u64),
         jitter: bool,
-    ) -> Option<DrawnRay> {
-        let which = rng::Permutation::of_step((seed, step), count, self.count()).get(i)?;
+        batch: &mut HostBatch,
+    ) {
+        let Some(which) = rng::Permutation::of_step((seed, step), count, self.count()).get(i) else { return };
         let v = self.cumulative.partition_point(|&c| c <= which);
         let rank = (which - if v > 0 { self.cumulative[v - 1] } else { 0 }) as u32;
         let word = order.before[v].partition_point(|&b| b <= rank) - 1;
@@ -305,11 +302,11 @@ impl<'a> RaySampler<'a> {
         (order.before[v][word]..rank).for_each(|_| bits &= bits - 1);
         let p = 64 * word + bits.trailing_zeros() as usize;
         let view = &self.views[v];
-        let ray = view.camera.ray(center(p, view.photo.width as usize))?;
+        let Some(ray) = view.camera.ray(center(p, view.photo.width as usize)) else { return };
         let jitter = if jitter { rng::uniform(seed, (step << 4) + 2, i) } else { 0.0 };
         let depth = if order.depth_directions { ray.direction.dot(view.camera.forward()) } else { 1.0 };
-        let (color, alpha) = self.premultiplied_color(v, p);
-        Some(DrawnRay { ray: Ray::new(ray.origin, ray.direction / depth), jitter, color, alpha })
+        let ray = Ray::new(ray.origin, ray.direction / depth);
+        batch.push(i, ray, jitter, self.premultiplied_color(v, p));
     }
 
     /// Returns color and alpha of pixel `p` of view `v`. The color is already over black if the
@@ -333,7 +330,7 @@ impl<'a> RaySampler<'a> {
 
     /// Returns the middle of the drawable pixels of the square with its corner at `at`, and their
     /// mean color and alpha.
-    fn square(&self, v: usize, at: [u32; 2], side: u32) -> (Vec2, [f32; 3], f32) {
+    fn square(&self, v: usize, at: [u32; 2], side: u32) -> (Vec2, ([f32; 3], f32)) {
         let (.., bits) = &self.drawable[v];
         let photo = &self.views[v].photo;
         let (mut middle, mut color, mut alpha, mut count) = ([0u32; 2], [0u32; 3], 0u32, 0u32);
@@ -352,11 +349,11 @@ impl<'a> RaySampler<'a> {
         }
         let mean = |sum: u32, whole: u32| sum as f32 / (whole * count) as f32;
         let middle = [0, 1].map(|a| at[a] as f32 + mean(middle[a], 1) + 0.5);
-        (Vec2::from(middle), color.map(|sum| mean(sum, 255 * 255)), mean(alpha, 255))
+        (Vec2::from(middle), (color.map(|sum| mean(sum, 255 * 255)), mean(alpha, 255)))
     }
 
-    /// Draws ray `i` of a batch independently of the others.
-    fn draw_one(&self, (seed, step): (u64, u64), i: u64, jitter: bool, detail: f32) -> Option<DrawnRay> {
+    /// Draws ray `i` independently of the others into a batch.
+    fn draw_one(&self, (seed, step): (u64, u64), i: u64, jitter: bool, detail: f32, batch: &mut HostBatch) {
         let stream = step << 4;
         let v = if self.reference_sampling {
             rng::below(seed, stream, i, self.views.len() as u64) as usize
@@ -366,7 +363,7 @@ impl<'a> RaySampler<'a> {
         };
         let (x0, y0, x1, y1, bits) = &self.drawable[v];
         if x0 > x1 {
-            return None; // the view has no drawable pixel
+            return; // the view has no drawable pixel
         }
         let view = &self.views[v];
         let width = view.photo.width;
@@ -381,17 +378,15 @@ impl<'a> RaySampler<'a> {
                 continue;
             }
             let side = side(self.pixel[v], detail);
-            let (at, color, alpha) = if side == 1 {
-                let (color, alpha) = self.premultiplied_color(v, p);
-                (Vec2::new(x as f32 + 0.5, y as f32 + 0.5), color, alpha)
+            let (at, pixel) = if side == 1 {
+                (Vec2::new(x as f32 + 0.5, y as f32 + 0.5), self.premultiplied_color(v, p))
             } else {
                 self.square(v, [x, y].map(|at| at / side * side), side)
             };
             let Some(ray) = view.camera.ray(at) else { continue };
             let jitter = if jitter { rng::uniform(seed, stream + 2, i) } else { 0.0 };
-            return Some(DrawnRay { ray: ray.scaled(self.radius), jitter, color, alpha });
+            return batch.push(i, ray.scaled(self.radius), jitter, pixel);
         }
-        None
     }
 }
 
@@ -431,7 +426,7 @@ fn center(p: usize, width: usize) -> Vec2 {
 
 /// Returns box and bits of the pixels to draw from in one view: those within `reach` scene units of
 /// the mask, or all without a mask; none if `reach` is `None`.
-fn drawable(view: &TrainView, reach: Option<f32>) -> Drawable {
+fn drawable(view: &LoadedView, reach: Option<f32>) -> Drawable {
     let (w, h) = (view.photo.width as usize, view.photo.height as usize);
     let mut in_reach = vec![reach.is_some(); w * h];
     if let (Some(mask), Some(reach)) = (&view.mask, reach)

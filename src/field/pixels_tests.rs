@@ -1,17 +1,20 @@
 //! Tests of pixel sampling on the CPU and on a device.
 
 use super::*;
+use tiface_base::geom::Camera;
+use tiface_base::image::{Gray, Photo};
 
-fn view() -> TrainView {
+fn view() -> LoadedView {
     let camera = Camera::above(20, 10, 20.0, 4.0);
     let rgb = (0..200).map(|i| [i as u8, 0, 255]).collect();
     let mut values = vec![0; 200];
     values[5 * 20 + 8] = 255;
-    TrainView {
+    LoadedView {
         camera,
         photo: Photo { width: 20, height: 10, rgb, alpha: None },
         mask: Some(Gray { width: 20, height: 10, values }),
         valid: None,
+        region: None,
     }
 }
 
@@ -81,11 +84,11 @@ fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_
 fn a_view_without_a_mask_teaches_nothing_beside_views_with_one() {
     let mut white = view();
     white.mask.as_mut().unwrap().values.fill(255);
-    let views = [view(), TrainView { mask: None, ..view() }, white];
+    let views = [view(), LoadedView { mask: None, ..view() }, white];
     let sampler = RaySampler::new(&views, 0.1, 1.0, Foreground::Photo, false);
     assert_eq!(sampler.count(), 25);
     // As the only view it is drawn from everywhere.
-    let alone = [TrainView { mask: None, ..view() }];
+    let alone = [LoadedView { mask: None, ..view() }];
     assert_eq!(RaySampler::new(&alone, 0.1, 1.0, Foreground::Photo, false).count(), 200);
 }
 
@@ -159,7 +162,7 @@ fn a_device_draws_the_same_rays() {
         Distortion { k1: -0.2, k2: 0.05, k4: 0.1, p1: 0.01, p2: -0.02, sx1: 0.003, ..Distortion::default() };
     let fisheye = Distortion { k1: 0.02, k4: -0.01, projection: Projection::Fisheye, ..perspective };
     let fov = Distortion { omega: 0.9, projection: Projection::Fov, ..Distortion::default() };
-    let empty = TrainView { mask: None, ..view() };
+    let empty = LoadedView { mask: None, ..view() };
     let views = [view(), bent(perspective), empty, bent(fisheye), bent(fov)];
     // the last but one with squares of two pixels for a ray, a twentieth of the distance 4 wide
     // each

@@ -20,17 +20,17 @@ use crate::config::iface::{Foreground, IfaceConfig, OccupancyRule};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::{ArrayDevice, Ops};
 use crate::field::parameters::{HostGroup, ParameterGroup, ParameterPart};
-use crate::field::pixels::{RaySampler, TrainView};
+use crate::field::pixels::RaySampler;
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
-use crate::field::{self as fields, ComputeDevice};
+use crate::field::{self as fields, Check, ComputeDevice, self_test::TestedModel};
 #[cfg(feature = "wgpu")]
-use crate::field::{Check, self_test::TestedModel};
 use cpu::CpuDensity;
 #[cfg(feature = "wgpu")]
 pub(super) use gpu::GpuDensity;
 use std::time::Instant;
 use tiface_base::math::rng;
 use tiface_base::{Error, Result};
+use tiface_capture::LoadedView;
 use tiface_kernels::cpu::adam::AdamStep;
 use tiface_kernels::cpu::density::DensityShape;
 use tiface_kernels::cpu::hash;
@@ -90,7 +90,7 @@ struct DensityModel<'a, O: DensityOps> {
 /// Trains until `config.steps`, saving checkpoints and continuing from the one that lies in the
 /// session's folder. `views` have their cameras in scene coordinates.
 pub fn train_density(
-    views: &[TrainView],
+    views: &[LoadedView],
     config: &IfaceConfig,
     session: &TrainingSession,
 ) -> Result<(DensityField, IfaceReport)> {

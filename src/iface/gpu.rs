@@ -12,7 +12,7 @@ use super::schedule;
 use super::stereo::SurfacePoint;
 use crate::config::iface::{IfaceConfig, OccupancyRule};
 use crate::field::drawing::DeviceSampler;
-use crate::field::drawing::MemoryNeed;
+use crate::field::memory::MemoryNeed;
 use crate::field::ops::Ops;
 use crate::field::pixels::RaySampler;
 use crate::field::training::StepAt;

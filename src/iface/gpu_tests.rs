@@ -14,7 +14,6 @@ use crate::field::gpu_tests::{
     outlives_lost_devices, psnr,
 };
 use crate::field::ops::ArrayDevice;
-use crate::field::pixels::TrainView;
 use crate::field::testing::{StopAfter, session, temporary};
 use crate::field::training::{Model, TrainingSession};
 use crate::iface::{IFace, IfaceReport, train};
@@ -22,6 +21,7 @@ use std::path::Path;
 use std::sync::Mutex;
 use tiface_base::geom::BitGrid;
 use tiface_base::{Monitor, Quiet};
+use tiface_capture::LoadedView;
 use tiface_kernels::gpu::testing::{device, devices};
 
 /// As small as a driver in software needs it, for which a step takes as long as it has samples.
@@ -102,7 +102,7 @@ fn stepped(model: &mut SdfModel<GpuSdf>, step: u64) -> CountedStep {
 }
 
 fn learned(
-    views: &[TrainView],
+    views: &[LoadedView],
     config: &IfaceConfig,
     session: &TrainingSession,
 ) -> Result<(IFace, IfaceReport)> {
@@ -315,7 +315,7 @@ fn cells_of_the_published_rule_are_those_that_the_cpu_keeps() {
 
 /// A training by the paper, and what it comes to.
 fn by_the_paper(
-    views: &[TrainView],
+    views: &[LoadedView],
     config: &IfaceConfig,
     dir: &Path,
     device: &str,

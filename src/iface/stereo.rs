@@ -6,12 +6,12 @@
 
 use super::occupancy::Occupancy;
 use crate::config::iface::IfaceConfig;
-use crate::field::pixels::TrainView;
 use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use tiface_base::geom::{Camera, Ray};
 use tiface_base::image::eroded;
 use tiface_base::math::rank::median;
+use tiface_capture::LoadedView;
 use tiface_kernels::cpu::mlp::Weights;
 use tiface_kernels::cpu::sdf::{self, FieldShape};
 use tiface_kernels::cpu::stereo::{self, StereoPoint, StereoView, Surfel};
@@ -74,7 +74,7 @@ impl HostField<'_> {
 
 /// Returns the depths of the zero set in each view, and points spread over it, in scene units.
 fn surface(
-    views: &[TrainView],
+    views: &[LoadedView],
     config: &IfaceConfig,
     field: &HostField,
     occupancy: &Occupancy,
@@ -112,7 +112,7 @@ fn surface(
 /// Returns a view for stereo with its depths, and the first crossings of its rays with the zero
 /// set, in field coordinates.
 fn first_crossings(
-    view: &TrainView,
+    view: &LoadedView,
     config: &IfaceConfig,
     field: &HostField,
     occupancy: &Occupancy,
@@ -195,7 +195,7 @@ struct Reduced {
 }
 
 impl Reduced {
-    fn new(view: &TrainView) -> Reduced {
+    fn new(view: &LoadedView) -> Reduced {
         /// Longest side in pixels, up to twice: a surface that is half trained is right to a few of
         /// these, and a tenth of one suffices.
         const SIDE: u32 = 512;
@@ -226,7 +226,7 @@ impl Reduced {
 
 /// Returns points that photographs agree on. The result does not depend on the number of threads.
 pub fn points(
-    views: &[TrainView],
+    views: &[LoadedView],
     config: &IfaceConfig,
     field: &HostField,
     occupancy: &Occupancy,
@@ -253,11 +253,12 @@ mod tests {
     fn a_large_photograph_is_averaged_and_a_pixel_is_head_where_all_of_it_is() {
         // 1031 / 512: two by two; the last column is left out
         let (w, h) = (1031, 6);
-        let mut view = TrainView {
+        let mut view = LoadedView {
             camera: Camera::above(w, h, 500.0, 3.0),
             photo: Photo { width: w, height: h, rgb: vec![[51; 3]; 1031 * 6], alpha: None },
             mask: Some(Gray { width: w, height: h, values: vec![255; 1031 * 6] }),
             valid: Some(Gray { width: w, height: h, values: vec![255; 1031 * 6] }),
+            region: None,
         };
         view.photo.rgb[1031 + 3] = [255; 3]; // one of four of pixel (1, 0)
         view.mask.as_mut().unwrap().values[1031 * 2] = 254; // of pixel (0, 1)

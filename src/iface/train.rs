@@ -15,13 +15,14 @@ use crate::config::iface::{IfaceConfig, OccupancyRule, Start};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::ArrayDevice;
 use crate::field::parameters::ParameterGroup;
-use crate::field::pixels::{LARGE, RaySampler, TrainView};
+use crate::field::pixels::{LARGE, RaySampler};
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self, ComputeDevice};
 use serde::Serialize;
 use std::time::Instant;
 use tiface_base::geom::BitGrid;
 use tiface_base::{Error, Result};
+use tiface_capture::LoadedView;
 use tiface_kernels::cpu::schedule::Figures;
 
 /// Report of a training.
@@ -65,7 +66,7 @@ pub(super) struct SdfModel<'a, O: SdfOps> {
 
 /// Collects the pixels that training rays are drawn from.
 pub(super) fn sampler<'a>(
-    views: &'a [TrainView],
+    views: &'a [LoadedView],
     hull: Option<&BitGrid>,
     config: &IfaceConfig,
 ) -> Result<RaySampler<'a>> {
@@ -92,7 +93,7 @@ pub(super) fn sampler<'a>(
 /// `views` have their cameras in scene coordinates; `hull` is the masks' visual hull over the
 /// scene's box.
 pub fn train(
-    views: &[TrainView],
+    views: &[LoadedView],
     hull: Option<&BitGrid>,
     config: &IfaceConfig,
     session: &TrainingSession,

@@ -19,9 +19,8 @@ use super::hull::{self, ViewFrame};
 use glam::{DVec3, Vec2};
 use rayon::prelude::*;
 use tiface_base::Result;
-use tiface_base::geom::Camera;
+use tiface_base::geom::{Camera, CellCube};
 use tiface_base::image::{Gray, resize_hard};
-use tiface_capture::carve::Cube;
 
 /// Rows that masks are reduced to.
 const ROWS: u32 = 160;
@@ -122,7 +121,7 @@ fn claims_of(
     used: &[usize],
     cells: usize,
     rows: u32,
-) -> Result<(Cube, Vec<SilhouetteConstraints>)> {
+) -> Result<(CellCube, Vec<SilhouetteConstraints>)> {
     let cameras: Vec<Camera> = used.iter().map(|&i| views[i].camera.clone()).collect();
     let cube = hull::cube(&cameras, cells, CUBE)?;
     let claims = used
@@ -164,7 +163,7 @@ struct SilhouetteConstraints {
 }
 
 impl SilhouetteConstraints {
-    fn new(camera: &Camera, mask: &Gray, cube: &Cube, rows: u32) -> SilhouetteConstraints {
+    fn new(camera: &Camera, mask: &Gray, cube: &CellCube, rows: u32) -> SilhouetteConstraints {
         let height = rows.clamp(16, mask.height.max(16));
         let width = ((mask.width as f64 * height as f64 / mask.height as f64).round() as u32).max(1);
         let camera = camera.resized(width, height);
@@ -185,13 +184,13 @@ impl SilhouetteConstraints {
 /// Which views vote against and for every cell: bits of views, `words` of them against and as many
 /// for.
 struct Votes {
-    cube: Cube,
+    cube: CellCube,
     words: usize,
     bits: Vec<u64>,
 }
 
 impl Votes {
-    fn count(cube: Cube, claims: &[SilhouetteConstraints]) -> Votes {
+    fn count(cube: CellCube, claims: &[SilhouetteConstraints]) -> Votes {
         let words = claims.len().div_ceil(64);
         let frames: Vec<&ViewFrame> = claims.iter().map(|c| &c.frame).collect();
         let bits = hull::vote(&cube, &frames, 2 * words, |cell: &mut [u64], k, pixel| {
@@ -326,7 +325,7 @@ impl Opposition {
 
 /// Returns the cells on a pixel's ray, from the camera on, each half a cell from the last.
 fn cells_on_ray<'a>(
-    cube: &'a Cube,
+    cube: &'a CellCube,
     claims: &SilhouetteConstraints,
     pixel: usize,
 ) -> impl Iterator<Item = usize> + use<'a> {
@@ -372,7 +371,7 @@ fn cells_on_ray<'a>(
 /// on the head, if any; of equals the one that most views have on the head. `None` when no other
 /// view looks at the ray within the cube.
 fn best_on_ray(
-    cube: &Cube,
+    cube: &CellCube,
     claims: &SilhouetteConstraints,
     pixel: usize,
     costs: &[(u16, u16)],

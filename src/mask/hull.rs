@@ -7,10 +7,10 @@
 
 use glam::DVec3;
 use rayon::prelude::*;
-use tiface_base::geom::Camera;
+use tiface_base::geom::{Camera, CellCube, cells_around, meeting_point};
 use tiface_base::image::Gray;
 use tiface_base::{Error, Result};
-use tiface_capture::carve::{Cube, Projector, around, meeting_point};
+use tiface_capture::Projector;
 
 /// The frame of a picture: which of its pixels shows a point.
 pub(super) struct ViewFrame {
@@ -42,7 +42,7 @@ impl ViewFrame {
 ///
 /// - output: `[n, n, n, values]` with x outermost
 pub(super) fn vote<T: Copy + Default + Send>(
-    cube: &Cube,
+    cube: &CellCube,
     frames: &[&ViewFrame],
     values: usize,
     vote: impl Fn(&mut [T], usize, usize) + Sync,
@@ -78,7 +78,7 @@ impl Voter {
 }
 
 /// Returns how many masks vote against and for every cell: `[n, n, n]` with x outermost.
-pub(super) fn count(cube: &Cube, voters: &[Voter]) -> Vec<[u16; 2]> {
+pub(super) fn count(cube: &CellCube, voters: &[Voter]) -> Vec<[u16; 2]> {
     let frames: Vec<&ViewFrame> = voters.iter().map(|v| &v.frame).collect();
     vote(cube, &frames, 1, |cell: &mut [[u16; 2]], k, pixel| cell[0][voters[k].head[pixel] as usize] += 1)
 }
@@ -91,7 +91,7 @@ pub(super) fn cells(votes: &[[u16; 2]], most_negative: usize, least_positive: us
 
 /// Returns the cube around the point where the viewing axes meet, `margin` times as high as the
 /// frames at that point.
-pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
+pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<CellCube> {
     let alike = |how: &str| {
         Error::cannot(
             format!(
@@ -108,11 +108,11 @@ pub(super) fn cube(cameras: &[Camera], n: usize, margin: f64) -> Result<Cube> {
     if !(half.is_finite() && half > 0.0) {
         return Err(alike("stand at one place"));
     }
-    Ok(Cube { center, half, n })
+    Ok(CellCube { center, half, n })
 }
 
 /// Returns the centers of the cells of a set that lie at its surface.
-pub(super) fn surface(cube: &Cube, cells: &[bool]) -> Vec<DVec3> {
+pub(super) fn surface(cube: &CellCube, cells: &[bool]) -> Vec<DVec3> {
     let n = cube.n;
     let mut centers = Vec::new();
     for i in (0..cells.len()).filter(|&i| cells[i]) {
@@ -136,7 +136,7 @@ pub(super) fn surface(cube: &Cube, cells: &[bool]) -> Vec<DVec3> {
 
 /// Returns the pixels that a set of cells covers in a view. `surface` are the centers of those at
 /// its surface: they cover what they surround.
-pub(super) fn silhouette(cube: &Cube, surface: &[DVec3], camera: &Camera) -> Vec<bool> {
+pub(super) fn silhouette(cube: &CellCube, surface: &[DVec3], camera: &Camera) -> Vec<bool> {
     let (w, h) = (camera.width as usize, camera.height as usize);
     let projector = Projector::new(camera);
     let mut covered = vec![false; w * h];
@@ -163,7 +163,7 @@ pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
     let at = |i: usize| [i / (n * n), i / n % n, i % n];
     // cells beside an outside cell; cells beyond the cube are unknown, so its walls do not peel
     for i in (0..cells.len()).filter(|&i| cells[i]) {
-        if around(at(i), n, false).any(|j| !cells[j]) {
+        if cells_around(at(i), n, false).any(|j| !cells[j]) {
             depth[i] = 1;
             front.push(i);
         }
@@ -173,7 +173,7 @@ pub(super) fn core(cells: &[bool], n: usize, share: f64) -> Vec<bool> {
         layer += 1;
         let mut next = Vec::new();
         for &i in &front {
-            around(at(i), n, layer % 2 == 0).for_each(|j| {
+            cells_around(at(i), n, layer % 2 == 0).for_each(|j| {
                 if cells[j] && depth[j] == 0 {
                     depth[j] = layer;
                     next.push(j);

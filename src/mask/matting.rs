@@ -2,8 +2,8 @@
 //! hardened.
 //!
 //! ```text
-//! photograph ─ reduce ─┬────────────── opacity of the band ─ enlarge ─ harden ─ alpha
-//! hard mask ── reduce ─┴─ trimap ─────┘
+//! photograph → reduce ─────────┐
+//! hard mask → reduce → trimap ─┴→ opacity of the band → enlarge → harden → alpha
 //! ```
 //!
 //! The opacity is found at a working size, since the band of a photograph of 3000 × 4096 would hold

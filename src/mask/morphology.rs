@@ -1,11 +1,12 @@
-//! Connected pieces of binary pictures: keeping some, filling holes, smoothing with a 3 × 3 square.
+//! Connected components of binary pictures: keeping some, filling holes, smoothing with a 3 × 3
+//! square.
 
 use tiface_base::image::{Gray, dilated};
-use tiface_capture::carve::{self, Pieces};
+use tiface_base::math::{Components, components};
 
-/// Connected pieces, over edges only (`corners` false) or over corners too.
-fn pieces(marked: &[bool], width: usize, height: usize, corners: bool) -> Pieces {
-    carve::pieces(marked, |i| {
+/// Connected components, over edges only (`corners` false) or over corners too.
+fn pieces(marked: &[bool], width: usize, height: usize, corners: bool) -> Components {
+    components(marked, |i| {
         let (x, y) = (i % width, i / width);
         let rows = y.saturating_sub(1)..(y + 2).min(height);
         let columns = x.saturating_sub(1)..(x + 2).min(width);

@@ -1,7 +1,8 @@
 //! SAM, ViTMatte and alpha networks from files that a user brings (feature `matting`).
 //!
 //! ```text
-//! photograph + clicks ── segment ── hard mask        photograph + trimap ── alpha ── soft alpha
+//! photograph + clicks ── segment ── hard mask
+//! photograph + trimap ── alpha ──── soft alpha
 //! photograph ─────────── propose ── alpha of the network's foreground
 //! ```
 //!
@@ -12,11 +13,13 @@
 mod alpha;
 mod processor;
 mod sam;
+mod vitmatte;
 
 pub use crate::onnx::NetworkFile;
 
-use self::alpha::{AlphaNet, VitMatte};
+use self::alpha::AlphaNet;
 use self::sam::Sam;
+use self::vitmatte::VitMatte;
 use super::clicks::Click;
 use crate::config::MaskConfig;
 use crate::onnx::Contract;

@@ -468,8 +468,8 @@ mod tests {
         let photos =
             [photograph("images/b.png", "b", (42, 30), 4), photograph("images/a.png", "a", (42, 30), 4)];
         let clicks = parsed(&one("images/a.png", text)).unwrap().of_photographs("p.json", &photos).unwrap();
-        // (0 + ½) / 4 − ½ = −3/8 and (1.5 + ½) / 4 − ½ = 0; (29 + ½) / 4 − ½ = 6.875 of 7 rows is 6
-        // at most; column 41 lies in the two that fill no block of four: the last of 10 takes it
+        // (0 + ½) / 4 − ½ = −3/8 and (1.5 + ½) / 4 − ½ = 0; (29 + ½) / 4 − ½ = 6.875, of 7 rows
+        // 6 at most; column 41 lies in the two that fill no block of four: the last of 10 takes it
         assert!(clicks[0].is_empty());
         let found: Vec<_> = clicks[1].iter().map(|c| (c.x, c.y, c.head)).collect();
         assert_eq!(found, [(-0.375, 0.0, true), (9.0, 6.0, false)]);

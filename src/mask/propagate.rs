@@ -16,15 +16,15 @@
 use super::clicks::{self, Click};
 use super::consistency::{ConsistencyView, MaskVerdict, verdicts};
 use super::grabcut::mixture::Rgb;
-use super::grabcut::{self, Grabcut, Models, Seed};
+use super::grabcut::seeds::{BORDER_MARGIN, Seed};
+use super::grabcut::{self, Grabcut, Models};
 use super::hull::{self, Voter};
 use super::morphology::gray;
 use glam::DVec3;
 use rayon::prelude::*;
-use tiface_base::geom::Camera;
+use tiface_base::geom::{Camera, CellCube, drop_small_components};
 use tiface_base::image::{Gray, Photo, grow, reduce_to_rows, shrink, size_at_rows};
 use tiface_base::{Error, Result};
-use tiface_capture::carve::{Cube, drop_dust};
 use tiface_capture::findings;
 
 /// Cells along each side of the carved cube.
@@ -144,7 +144,7 @@ struct Propagation<'a> {
     views: &'a [PropagateView<'a>],
     /// At the working size.
     photos: Vec<Photo>,
-    cube: Cube,
+    cube: CellCube,
     /// Per view: what lies well inside its proposed mask; empty where that is not believed.
     inside: Vec<Vec<bool>>,
     warnings: Vec<String>,
@@ -188,7 +188,7 @@ impl<'a> Propagation<'a> {
     /// once a hull says where the head is, it may touch any border.
     fn grabcut(&self, i: usize, margins: bool) -> (Grabcut, Vec<String>) {
         let (v, photo) = (&self.views[i], &self.photos[i]);
-        let margin = if margins { grabcut::BORDER_MARGIN } else { 0.0 };
+        let margin = if margins { BORDER_MARGIN } else { 0.0 };
         Grabcut::new(v.name, photo.clone(), (v.camera.width, v.camera.height), v.clicks, margin)
     }
 
@@ -281,7 +281,7 @@ impl<'a> Propagation<'a> {
             false => (MAX_NEGATIVE.min(total / 6), (MIN_POSITIVE * total as f64).ceil() as usize),
         };
         let mut hull = hull::cells(&votes, against, support);
-        drop_dust(&mut hull, n, 0.02);
+        drop_small_components(&mut hull, n, 0.02);
         let mut solid = hull::cells(&votes, against, support.max(total.div_ceil(2)));
         solid.iter_mut().zip(&hull).for_each(|(s, h)| *s &= h);
         let core = hull::core(&solid, n, CORE_DEPTH);

@@ -6,8 +6,8 @@
 //! (simplification, texture).
 
 use super::finish::Finish;
-use super::frames::Export;
 use super::mesh::{Extraction, extract, photographs};
+use super::mesh_files::Export;
 use super::render::{Meshes, Renderer};
 use super::session::Session;
 use super::surface::Fields;
@@ -476,7 +476,7 @@ struct Finisher<'f> {
     mesh: Mesh,
     extracted: Extraction,
     fields: &'f dyn Fields,
-    views: Vec<(Camera, LoadedView)>,
+    views: Vec<LoadedView>,
 }
 
 impl<'f> Finisher<'f> {

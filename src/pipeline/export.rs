@@ -10,8 +10,9 @@ mod request;
 
 use super::advice::{advised, sentence};
 use super::cameras::CameraCheck;
-use super::frames::{Export, Material, MeshFrame, center};
+use super::frames::{MeshFrame, center};
 use super::mesh::{finished_mesh, read_finished};
+use super::mesh_files::{Export, Material};
 use super::scene_file::read_capture;
 use super::session::unusable;
 use crate::config::{Config, MeshFormat, Stage, key};

@@ -1,7 +1,8 @@
 //! From the extracted surface to the head mesh: simplification, atlas and texture baking.
 
 use super::advice::{advised, sentence};
-use super::frames::{Export, center};
+use super::frames::center;
+use super::mesh_files::Export;
 use crate::config::{ColorSource, Hair, MeshConfig};
 use glam::Mat3;
 use serde_json::{Map, Value, json};

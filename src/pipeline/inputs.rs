@@ -7,7 +7,7 @@
 use super::clicks::MaskPrompts;
 use super::readings::{Settled, decide_reading};
 use super::{mask, scene_file};
-use crate::config::{Config, MaskSource, Stage};
+use crate::config::{Config, MaskSource, SETTINGS_FILE, Stage};
 use crate::run::{Run, read_record, taken_for_capture};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -204,6 +204,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
         cameras: c.cameras,
         exposure: c.exposure,
         unit_m: c.unit_m,
+        result_file: SETTINGS_FILE,
         ..CaptureOptions::default()
     }
 }
@@ -268,7 +269,7 @@ fn is_missing(e: &io::ReadError) -> bool {
 /// does not exist yet; otherwise that the run has not recorded its capture yet.
 fn restore_from_run(config: &Config, run: &Run, error: Error) -> Result<(Capture, Inputs)> {
     let root = &config.capture.path;
-    if capture::has_cameras(root) || !io::is_file(&run.path("config.toml")) {
+    if capture::has_cameras(root) || !io::is_file(&run.path(SETTINGS_FILE)) {
         return Err(error);
     }
     let problem = error.to_string();

@@ -10,7 +10,6 @@ use crate::config::iface::FieldKind;
 use crate::config::{Config, MaskUse, Preset, Stage};
 use crate::ensemble::{self, Tile};
 use crate::field::compute_device;
-use crate::field::pixels::TrainView;
 use crate::field::training::TrainingSession;
 use crate::iface::{self, DensityField, IFace, SDF_TEST};
 use crate::run::StageDir;
@@ -95,14 +94,9 @@ pub(super) fn train_views(
     scene: &Scene,
     config: &Config,
     masked: bool,
-) -> Result<Vec<TrainView>> {
+) -> Result<Vec<LoadedView>> {
     let views = training_views(capture, scene, config)?.into_iter();
-    let view = |(camera, loaded): (Camera, LoadedView)| TrainView {
-        camera,
-        photo: loaded.photo,
-        mask: loaded.mask.filter(|_| masked),
-        valid: loaded.valid,
-    };
+    let view = |view: LoadedView| LoadedView { mask: view.mask.filter(|_| masked), region: None, ..view };
     Ok(views.map(view).collect())
 }
 
@@ -196,18 +190,14 @@ pub(super) fn held_out_tiles<'c>(capture: &'c Capture, config: &Config) -> Vec<(
 
 /// Returns the training photographs, with their cameras in the scene. Pixels of `capture.tiles`
 /// count as not valid.
-pub(super) fn training_views(
-    capture: &Capture,
-    scene: &Scene,
-    config: &Config,
-) -> Result<Vec<(Camera, LoadedView)>> {
+pub(super) fn training_views(capture: &Capture, scene: &Scene, config: &Config) -> Result<Vec<LoadedView>> {
     let views = held_out_tiles(capture, config);
     views.par_iter().map(|(view, tiles)| training_view(view, tiles, scene)).collect()
 }
 
 /// Returns a training photograph, with its camera in the scene. Pixels of the tiles count as not
 /// valid.
-pub(super) fn training_view(view: &View, tiles: &[Tile], scene: &Scene) -> Result<(Camera, LoadedView)> {
+pub(super) fn training_view(view: &View, tiles: &[Tile], scene: &Scene) -> Result<LoadedView> {
     let mut loaded = view.load(&Limits::default())?;
     let (width, height) = (loaded.photo.width, loaded.photo.height);
     for tile in tiles {
@@ -215,7 +205,8 @@ pub(super) fn training_view(view: &View, tiles: &[Tile], scene: &Scene) -> Resul
         let values = &mut loaded.valid.get_or_insert_with(all).values;
         tile.pixels(width).for_each(|i| values[i] = 0);
     }
-    Ok((view.camera.transformed(&scene.scene_from_world), loaded))
+    loaded.camera = view.camera.transformed(&scene.scene_from_world);
+    Ok(loaded)
 }
 
 #[cfg(test)]

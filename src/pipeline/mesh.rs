@@ -11,8 +11,8 @@
 
 use super::advice::{advised, sentence};
 use super::finish::{Finish, FinishedHead, REACH};
-use super::frames::Export;
 use super::learn;
+use super::mesh_files::Export;
 use super::surface::{CappedField, Surface};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, Stage};
 use crate::run::{Phase, Record, Run, StageDir, StageStatus, Status};
@@ -159,11 +159,11 @@ pub(super) fn seen_note([none, one, ..]: [f64; 4]) -> Option<String> {
 }
 
 /// Returns loaded views in the form that colors are fitted to.
-pub(super) fn photographs(views: &[(Camera, LoadedView)]) -> Vec<Photograph<'_>> {
+pub(super) fn photographs(views: &[LoadedView]) -> Vec<Photograph<'_>> {
     views
         .iter()
-        .map(|(camera, view)| Photograph {
-            camera,
+        .map(|view| Photograph {
+            camera: &view.camera,
             photo: &view.photo,
             mask: view.mask.as_ref(),
             valid: view.valid.as_ref(),

@@ -1,21 +1,18 @@
 //! Stage `metrics`: compares every view of every member and of the blends with its photograph.
-//!
-//! A mesh of the demo head is compared with its exact surface ([`against_truth`]).
 
 use super::exposure::ExposureCheck;
 use super::pictures;
+use super::truth::against_truth;
 use crate::config::{Config, Method, TruthPhoto, ViewBackground};
-use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, distance, parts};
+use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, parts};
 use crate::run::{Run, StageDir};
 use rayon::prelude::*;
-use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
-use tiface_base::geom::{Bvh, Mesh};
+use tiface_base::geom::Mesh;
 use tiface_base::image::{Gray, Image, Photo};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
-use tiface_capture::synthetic::SyntheticHead;
 use tiface_capture::{Capture, LoadedView, View};
 
 /// Largest mask value that counts as empty.
@@ -259,52 +256,12 @@ pub(super) fn means(metrics: &Value) -> Value {
     }
 }
 
-/// Distances in per cent of head height, over the head without neck and shoulders.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Truth {
-    /// Points measured in each direction.
-    pub points: usize,
-    /// Mean distance from the mesh to the true surface (accuracy).
-    pub accuracy_mean: f64,
-    /// 90 % of the mesh is nearer than this.
-    pub accuracy_p90: f64,
-    /// Mean distance from the true surface to the mesh (completeness).
-    pub completeness_mean: f64,
-    /// 90 % of the true surface is nearer than this.
-    pub completeness_p90: f64,
-}
-
-/// Compares a mesh in world coordinates with the synthetic head. `None` if no part of it is head.
-pub fn against_truth(mesh: &Mesh, points: usize) -> Option<Truth> {
-    let percent = |d: f32| 100.0 * d as f64 / SyntheticHead::HEAD_HEIGHT as f64;
-    let summary = |mut d: Vec<f32>| {
-        d.sort_by(f32::total_cmp);
-        let mean = d.iter().map(|&v| percent(v)).sum::<f64>() / d.len() as f64;
-        Some((mean, percent(*d.get((d.len() * 9).div_ceil(10).checked_sub(1)?)?)))
-    };
-    let here: Vec<f32> = distance::sample(mesh, points)
-        .into_par_iter()
-        .filter(|&p| SyntheticHead.is_head(p))
-        .map(|p| SyntheticHead.distance(p))
-        .collect();
-    let bvh = Bvh::new(mesh);
-    let to_mesh: Vec<f32> = SyntheticHead
-        .surface_points(points, 1)
-        .into_par_iter()
-        .filter(|&p| SyntheticHead.is_head(p))
-        .filter_map(|p| bvh.closest_point(p).map(|c| c.distance))
-        .collect();
-    let count = here.len().min(to_mesh.len());
-    let (accuracy_mean, accuracy_p90) = summary(here)?;
-    let (completeness_mean, completeness_p90) = summary(to_mesh)?;
-    Some(Truth { points: count, accuracy_mean, accuracy_p90, completeness_mean, completeness_p90 })
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::exposure_tests;
     use super::super::tests::measured_head;
     use super::*;
+    use tiface_base::geom::Camera;
 
     #[test]
     fn a_blend_that_is_below_its_best_member_is_told_by_how_much() {
@@ -365,8 +322,13 @@ mod tests {
         let gray = |values: [u8; 4]| Some(Gray { width: 4, height: 1, values: values.to_vec() });
         let photo = Photo { width: 4, height: 1, rgb: vec![[0; 3]; 4], alpha: None };
         // a hair of head in pixel 1, pixel 3 not valid: 0.5² + 0.1² = 0.26 over two pixels
-        let loaded =
-            LoadedView { photo, mask: gray([0, 1, 0, 0]), valid: gray([255, 255, 255, 0]), region: None };
+        let loaded = LoadedView {
+            camera: Camera::above(4, 1, 4.0, 1.0),
+            photo,
+            mask: gray([0, 1, 0, 0]),
+            valid: gray([255, 255, 255, 0]),
+            region: None,
+        };
         let (sum, pixels) = square_opacity_outside(&render, &loaded).unwrap();
         assert!((sum - 0.26).abs() < 1e-6 && pixels == 2, "{sum} over {pixels}");
         assert_eq!(square_opacity_outside(&render, &LoadedView { mask: None, ..loaded }), None);

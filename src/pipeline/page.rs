@@ -4,12 +4,13 @@
 //! The page stays below eight megabytes, so that it opens at once and can be sent: pictures are
 //! small copies that link to the originals; if there are many views and masks, only some are shown.
 
+pub(super) mod viewer;
 pub(super) mod views;
 
-pub use views::{head_page, viewer_of_file};
+use crate::config::{NAMES, SETTINGS_FILE, Stage, display_name};
+pub use viewer::{head_page, viewer_of_file};
 
 use super::session::Session;
-use crate::config::{NAMES, Stage, display_name};
 use crate::report::{self, Chart, LEARNED, MethodTable, Report, Viewer, duration};
 use crate::run::{Record, read_record};
 use serde_json::Value;
@@ -38,7 +39,7 @@ fn is_current(session: &Session) -> bool {
     let time = |name: &str| io::modified(&session.run.path(name));
     let report = time("report.html").filter(|_| io::is_file(&session.run.path("report.html")));
     let records = Stage::ALL.map(|stage| time(&format!("{stage}/done.json")));
-    report.is_some_and(|report| records.into_iter().flatten().chain(time("config.toml")).all(|t| t < report))
+    report.is_some_and(|report| records.into_iter().flatten().chain(time(SETTINGS_FILE)).all(|t| t < report))
 }
 
 /// Writes the report of a run again, from the run's contents.
@@ -75,11 +76,11 @@ pub fn curves(runs: &[(&Session, &str)]) -> Result<Vec<Chart>> {
 fn page(session: &Session) -> Result<String> {
     let sheet = text(&session.run.path(Stage::Mask).join(super::mask::SHEET))?;
     let masks = crate::mask::pages::part(&sheet, MASK_BYTES).unwrap_or_default();
-    let found = views::viewer(session)?;
+    let found = viewer::viewer(session)?;
     let glb = found.as_ref().map_or(0, |(v, _)| v.glb.len().div_ceil(3) * 4);
     let (views, left_out) = views::rows_of_run(session, MAX_BYTES.saturating_sub(masks.len() + glb))?;
     let viewer = found.map(|(viewer, file_from_world)| Viewer {
-        cameras: views::cameras(session, &views, &file_from_world),
+        cameras: viewer::cameras(session, &views, &file_from_world),
         usdz: Some("mesh/head.usdz")
             .filter(|file| io::is_file(&session.run.path(file)))
             .unwrap_or_default()

@@ -6,7 +6,7 @@ use super::mask::inspect_capture;
 use super::path::{CameraPath, PATHS};
 use super::render::shows_head;
 use super::session::Session;
-use crate::config::{Config, Method, Product, Stage, VmConfig, key};
+use crate::config::{Config, Method, Product, SETTINGS_FILE, Stage, VmConfig, key};
 use crate::run::{Plan, read_record, read_status};
 use std::path::Path;
 use tiface_base::{Error, Fingerprint, Result, io};
@@ -75,7 +75,7 @@ impl Session<'_> {
         let left: Vec<Stage> = order.filter(|stage| !self.run.is_done(&self.plan(*stage))).collect();
         self.require_work(&left)?;
         self.write_estimate(left.is_empty())?;
-        self.write("config.toml", self.config.to_toml().as_bytes(), left.is_empty())
+        self.write(SETTINGS_FILE, self.config.to_toml().as_bytes(), left.is_empty())
     }
 
     /// Returns the non-empty folders of the run that become out of date when a stage is made again,

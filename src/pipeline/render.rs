@@ -10,19 +10,17 @@
 //! shown from the poses fitted to each held-out view alone, in `own_pose/` below the method's
 //! folder. Views along a camera path are written to a folder of their own, `render/paths/`.
 
-use super::learn;
 use super::mesh::{extracted_surface, head_mesh};
 use super::path::{CameraPath, cameras_of};
-use super::pictures;
 use super::surface::{Fields, march};
+use super::{learn, pictures};
 use crate::config::{ColorSource, Config, Method, RenderConfig};
 use crate::run::{Run, StageDir};
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use tiface_base::geom::{Bvh, Camera, Harmonics, Ray, ShellCaster, Similarity};
-use tiface_base::io;
-use tiface_base::{Monitor, Result};
+use tiface_base::{Monitor, Result, io};
 use tiface_capture::path::{NamedCamera, orbit};
 use tiface_capture::scene::{self, Scene};
 use tiface_capture::{Capture, Split};
@@ -330,15 +328,16 @@ impl<'a> Renderer<'a> {
             if self.monitor.stop() {
                 break; // what was made is not used then
             }
-            let (camera, loaded) = learn::training_view(view, &tiles, scene)?;
+            let loaded = learn::training_view(view, &tiles, scene)?;
+            let camera = &loaded.camera;
             if loaded.mask.is_some() && i % every == 0 {
                 let (photo, weight) = pictures::target(&loaded);
-                let shown = self.cast(&[Method::Raycast], &camera, &as_shown)?.pop();
+                let shown = self.cast(&[Method::Raycast], camera, &as_shown)?.pop();
                 shown.iter().for_each(|view| filters.add(view, &photo, &weight));
             }
             let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
-            if let Some(view) = self.cast(&[Method::Raycast], &camera, &options)?.pop() {
-                let source = ResidualSource { camera: &camera, photo: &loaded.photo, mask, valid, view };
+            if let Some(view) = self.cast(&[Method::Raycast], camera, &options)?.pop() {
+                let source = ResidualSource { camera, photo: &loaded.photo, mask, valid, view };
                 residuals.extend(ResidualView::new(source));
             }
         }

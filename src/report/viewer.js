@@ -22,8 +22,9 @@ const BASIS = [
 const MODES = ["view", "texture", "normals", "shape", "wire", "seen"];
 /** Colors of what no camera sees, one, two, and three or more: those of `tiface preview --light seen`. */
 const SEEN_BY = ["0.55, 0.1, 0.15", "0.85, 0.45, 0.1", "0.95, 0.8, 0.3", "0.75, 0.9, 0.8"];
-/** Of a lens whose picture is as wide as two fifths of its distance, and how much of that a mesh fills at first. */
+/** Field of view of a lens whose picture is as wide as two fifths of its distance. */
 const FIELD_OF_VIEW = 2 * Math.atan(0.2);
+/** Share of the picture that a mesh fills at first. */
 const FILLED = 0.95;
 /** Where the attributes of a vertex are bound, and what stands for one that is missing. */
 const ATTRIBUTES = [["POSITION", [0, 0, 0, 1]], ["NORMAL", [0, 0, 0, 0]], ["TEXCOORD_0", [0, 0, 0, 0]], ["COLOR_0", [1, 1, 1, 1]],

@@ -1,6 +1,6 @@
 //! Tells the folder of a run from that of a capture.
 
-use crate::config::{Config, Stage};
+use crate::config::{Config, SETTINGS_FILE, Stage};
 use std::path::{Path, PathBuf};
 use tiface_base::{Error, io};
 use tiface_capture::{has_cameras, not_a_capture, resembles_capture};
@@ -13,7 +13,7 @@ pub fn is_run(folder: &Path) -> bool {
         ["done.json", "status.json"].iter().any(|f| io::is_file(&folder.join(stage.as_str()).join(f)))
     };
     let is_begun = || Stage::ALL.iter().any(has_record);
-    io::is_file(&folder.join("config.toml")) && (is_begun() || !resembles_capture(folder))
+    io::is_file(&folder.join(SETTINGS_FILE)) && (is_begun() || !resembles_capture(folder))
 }
 
 /// Returns the error for the folder of a run that is given as a capture, which names the capture of

@@ -1,19 +1,16 @@
-//! Reports a stage's progress to status, log and screen at different rates; and the stop request,
-//! which keeps the running stage.
+//! Reports a stage's progress to status, log and screen at different rates.
 //!
 //! All intervals use the monotonic clock, so that a change of the system time has no effect.
 
 use super::status::now;
+use super::stop::Stop;
 use super::{State, Status};
 use serde::{Serialize, Serializer};
 use serde_json::{Map, Value};
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
-use tiface_base::error::COMPLETE_IS_KEPT;
-use tiface_base::io;
-use tiface_base::{Error, ErrorKind, Monitor, Result};
+use tiface_base::{Monitor, Result, io};
 
 /// Receives the events of a run.
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -144,10 +141,6 @@ impl Progress {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub fn stage(&self) -> &str {
-        &self.stage
-    }
-
     pub fn elapsed_s(&self) -> f64 {
         self.before_s + self.start.elapsed().as_secs_f64()
     }
@@ -257,105 +250,5 @@ impl Monitor for Progress {
 
     fn stop(&self) -> bool {
         self.stop.requested().is_some()
-    }
-}
-
-/// A request to stop, shared between the signal handler and all computation.
-#[derive(Clone, Default)]
-pub struct Stop(Arc<StopState>);
-
-#[derive(Default)]
-struct StopState {
-    /// 0 or the exit code.
-    code: AtomicU8,
-    current: Mutex<CurrentStage>,
-}
-
-#[derive(Default)]
-struct CurrentStage {
-    /// The running stage, and whether it saves a checkpoint on a stop request.
-    stage: Option<(Arc<Progress>, bool)>,
-    /// When a stage last began or ended.
-    since: Option<Instant>,
-}
-
-/// Marks a stage as running until it is dropped.
-pub(super) struct ActiveGuard<'a>(&'a Stop);
-
-impl Stop {
-    /// Not requested.
-    pub fn new() -> Stop {
-        Stop::default()
-    }
-
-    /// Asks to stop, to end with `exit`.
-    pub fn request(&self, exit: ErrorKind) {
-        self.0.code.store(exit.code(), Ordering::SeqCst);
-    }
-
-    /// Returns the exit code to end with, if a stop was requested.
-    pub fn requested(&self) -> Option<ErrorKind> {
-        match self.0.code.load(Ordering::SeqCst) {
-            0 => None,
-            143 => Some(ErrorKind::Terminated),
-            _ => Some(ErrorKind::Interrupted),
-        }
-    }
-
-    /// Returns the error to end with, which says which files are kept.
-    pub fn error(&self, kept: impl std::fmt::Display) -> Error {
-        Error::stopped(kept).with_kind(self.requested().unwrap_or(ErrorKind::Interrupted))
-    }
-
-    /// Returns the error to end the process with before its stages end. `None` while a stage that
-    /// saves has something to save, and within `patience` of a stage's beginning or end. The status
-    /// of the stage then says that it was stopped.
-    ///
-    /// Nothing is lost by it that a stop would have kept: files are written aside and renamed, and
-    /// only learning can go on in the middle of a stage.
-    pub fn abandon(&self, patience: Duration) -> Option<Error> {
-        let current = self.current();
-        if current.since.is_some_and(|t| t.elapsed() < patience) {
-            return None;
-        }
-        match &current.stage {
-            Some((progress, saves)) if *saves && progress.has_stepped() => None,
-            Some((progress, _)) => {
-                progress.stopped();
-                let stage = format!("stage `{}`", progress.stage());
-                Some(self.error(COMPLETE_IS_KEPT).within(stage))
-            }
-            None => Some(self.error("before its end").with_hint("")),
-        }
-    }
-
-    pub(super) fn at_work(&self, progress: &Arc<Progress>, saves: bool) -> ActiveGuard<'_> {
-        *self.current() =
-            CurrentStage { stage: Some((progress.clone(), saves)), since: Some(Instant::now()) };
-        ActiveGuard(self)
-    }
-
-    fn current(&self) -> std::sync::MutexGuard<'_, CurrentStage> {
-        self.0.current.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Drop for ActiveGuard<'_> {
-    fn drop(&mut self) {
-        *self.0.current() = CurrentStage { stage: None, since: Some(Instant::now()) };
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_stop_request_keeps_the_signal_that_made_it() {
-        let stop = Stop::new();
-        assert_eq!(stop.requested(), None);
-        stop.clone().request(ErrorKind::Terminated); // clones share
-        assert_eq!(stop.requested(), Some(ErrorKind::Terminated));
-        assert_eq!(stop.error("x").kind().code(), 143);
     }
 }

@@ -3,14 +3,13 @@
 use super::progress::Progress;
 use super::record::TIMED;
 use super::status::{host, now};
-use super::{Event, Record, Run, State, Status};
-use super::{has_record, read_record, read_status};
+use super::stop::RunningStage;
+use super::{Event, Record, Run, State, Status, has_record, read_record, read_status};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use tiface_base::io;
-use tiface_base::{Error, Fingerprint, Monitor, Result};
+use tiface_base::{Error, Fingerprint, Monitor, Result, io};
 
 /// Plan of a stage.
 #[derive(Clone, Debug)]
@@ -160,7 +159,12 @@ impl Run {
         let progress = Arc::new(Progress::new(name, folder.clone(), stop, observer, status));
         let cpu_before_s = io::cpu_seconds();
         io::forget_peak_memory();
-        let _at_work = self.stop.at_work(&progress, plan.saves);
+        let (saves, [working, ending]) = (plan.saves, [progress.clone(), progress.clone()]);
+        let _at_work = self.stop.at_work(RunningStage {
+            name: name.into(),
+            saves: Box::new(move || saves && working.has_stepped()),
+            stopped: Box::new(move || ending.stopped()),
+        });
         progress.save(|_| {})?;
         self.observer.event(&Event::Started { stage: name });
         let stage = StageDir { folder, identity: plan.fingerprint.digest(), progress };

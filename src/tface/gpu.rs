@@ -7,7 +7,7 @@ use super::record::decoder;
 use super::state::first_and_last;
 use crate::config::VmConfig;
 use crate::field::drawing::DeviceSampler;
-use crate::field::drawing::MemoryNeed;
+use crate::field::memory::MemoryNeed;
 use crate::field::ops::{ArrayDevice, Ops};
 use crate::field::parameters::{HostGroup, ParameterGroup};
 use crate::field::pixels::RaySampler;

@@ -2,8 +2,7 @@ use super::super::cpu::CpuVm;
 use super::super::state::VmState;
 use super::super::train::{VmModel, train_one};
 use super::*;
-use crate::config::Preset;
-use crate::config::{MaskLoss, VmBackground};
+use crate::config::{MaskLoss, Preset, VmBackground};
 use crate::field;
 use crate::field::ball::{self, hull};
 use crate::field::checkpoint::TrainingProgress;
@@ -11,12 +10,12 @@ use crate::field::gpu_tests::{
     CountedStep, Outcome, alike, counted_step, cpu_and_both, outlives_lost_devices, psnr,
 };
 use crate::field::ops::ArrayDevice;
-use crate::field::pixels::TrainView;
 use crate::field::testing::{StopAfter, session, temporary};
 use crate::field::training::{self, Model, StepReport, TrainingSession};
 use crate::tface::{FieldMean, TFace};
 use std::path::Path;
 use tiface_base::{Monitor, Quiet};
+use tiface_capture::LoadedView;
 use tiface_kernels::gpu::testing::device;
 
 const BOUNDS: [[f32; 3]; 2] = [[-0.8; 3], [0.8; 3]];
@@ -37,7 +36,7 @@ fn config() -> VmConfig {
     }
 }
 
-fn sampler<'a>(views: &'a [TrainView], config: &VmConfig) -> RaySampler<'a> {
+fn sampler<'a>(views: &'a [LoadedView], config: &VmConfig) -> RaySampler<'a> {
     RaySampler::new(views, 0.25, 1.0, config.foreground, config.whole_frame)
 }
 
@@ -108,7 +107,7 @@ fn losses_stay_those_of_the_cpu() {
 }
 
 /// A device sees in a field what the CPU does.
-fn a_device_sees_the_same(view: &TrainView, dir: &Path) {
+fn a_device_sees_the_same(view: &LoadedView, dir: &Path) {
     let face = TFace::load("tface", dir).unwrap();
     let device = field::compute_device("wgpu:0", &crate::tface::VM_TEST).unwrap();
     let on_gpu = FieldMean::load("tface", dir, 1).unwrap().on(device);

@@ -19,7 +19,7 @@ use super::TFace;
 use super::train::{self, TfaceReport, train_one};
 use crate::config::{MaskUse, VmConfig, VmStart};
 use crate::field::ComputeDevice;
-use crate::field::pixels::{LARGE, RaySampler, TrainView};
+use crate::field::pixels::{LARGE, RaySampler};
 use crate::field::training::{self, TrainingSession};
 use glam::Vec3;
 use std::path::{Path, PathBuf};
@@ -27,6 +27,7 @@ use std::sync::Arc;
 use tiface_base::geom::{Aabb, BitGrid, Ray, RayResult};
 use tiface_base::io::Lock;
 use tiface_base::{Monitor, Result, io};
+use tiface_capture::LoadedView;
 
 /// The trained fields of a stage. Positions and distances are in scene units.
 pub struct FieldMean {
@@ -99,7 +100,7 @@ fn folder(dir: &Path, i: usize) -> PathBuf {
 /// `views` have their cameras in scene coordinates; `bounds` is the scene's tight box; `hull` the
 /// masks' visual hull over [-1, 1]³.
 pub fn train(
-    views: Vec<TrainView>,
+    views: Vec<LoadedView>,
     bounds: Aabb,
     hull: Option<&BitGrid>,
     config: &VmConfig,

@@ -10,13 +10,14 @@ use super::state::VmState;
 use crate::config::{MaskUse, VmConfig};
 use crate::field::checkpoint::{Checkpoint, TrainingProgress};
 use crate::field::ops::ArrayDevice;
-use crate::field::pixels::{RaySampler, TrainView};
+use crate::field::pixels::RaySampler;
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
 use crate::field::{self, ComputeDevice};
 use serde::Serialize;
 use std::time::Instant;
 use tiface_base::geom::BitGrid;
 use tiface_base::{Error, Result};
+use tiface_capture::LoadedView;
 use tiface_kernels::cpu::adam::AdamStep;
 use tiface_kernels::cpu::vm::losses::VmFigures;
 
@@ -190,7 +191,7 @@ fn tv_fade(config: &VmConfig, step: u64) -> f64 {
 pub(super) const DETAIL: f32 = 0.25;
 
 /// Returns the views with their masks removed or binarized as configured.
-pub(super) fn masked_as_configured(mut views: Vec<TrainView>, masks: MaskUse) -> Vec<TrainView> {
+pub(super) fn masked_as_configured(mut views: Vec<LoadedView>, masks: MaskUse) -> Vec<LoadedView> {
     let threshold = match masks {
         MaskUse::None | MaskUse::Soft => None,
         MaskUse::Binary => Some(1),

@@ -209,7 +209,8 @@ def main():
     broken["frames"][4]["transform_matrix"][0][3] = "north"
     frames.write_text(json.dumps(broken))
 
-    # the tables are made of what can be made; a capture that is mended within its files gets its rows at the next start
+    # the tables are made of what can be made; a capture that is mended within its files gets its rows at the
+    # next start
     engine_words = [sys.executable, "-m", "snakemake", "--snakefile", HERE / "Snakefile"]
     engine_words = [str(word) for word in [*engine_words, "--profile", HERE / "profiles/local", "--cores", "2"]]
     plan = engine_words, captures, folder / "planned/runs", tiface, config

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # One task of the fleet: task.sh ATTEMPT MARK LOG CAPTURE COMMAND...
 #
-# Engines retry whatever fails. What would fail again the same way is not tried again: MARK keeps the exit code of the
-# last attempt, and only 75 ("not now") and ends by a signal are worth another one. A word CAPTURE in the command stands
-# for the capture, or for its copy under $SCRATCH.
+# Engines retry whatever fails. What would fail again the same way is not tried again: MARK keeps the exit
+# code of the last attempt, and only 75 ("not now") and ends by a signal are worth another one. A word CAPTURE
+# in the command stands for the capture, or for its copy under $SCRATCH.
 set -u
 attempt=$1 mark=$2 log=$3 capture=$4
 shift 4

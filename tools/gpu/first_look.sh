@@ -3,9 +3,9 @@
 #
 #     tools/gpu/first_look.sh DEVICE OUT [PART...]
 #
-# DEVICE is what `--device` takes (`wgpu`, `vulkan:0`, ...). Figures go to OUT as they are measured, so a part that is cut
-# short still counts; OUT/figures.txt holds one line a figure, which `docs/gpu.md` explains. Parts, in the order in which
-# they are run where none is named:
+# DEVICE is what `--device` takes (`wgpu`, `vulkan:0`, ...). Figures go to OUT as they are measured, so a part
+# that is cut short still counts; OUT/figures.txt holds one line a figure, which `docs/gpu.md` explains.
+# Parts, in the order in which they are run where none is named:
 #
 #     doctor     the self-test cold and warm; the demo head on the CPU and on the GPU, with dB side by side
 #     kernels    time of each kernel by timestamps, at 24,576, 262,144 and 1,048,576 samples of a step
@@ -13,9 +13,9 @@
 #     product    a capture in preset `standard`, whole, with the time of each stage
 #     resume     a training moved between devices; `--memory`; two processes on one device
 #
-# It needs bash, awk and this program, no network: TIFACE names the program (default: target/release/tiface) and CAPTURE a
-# capture (default: the demo head's, made on the way). SHARE is the share of the steps to make, in hundredths (default: 100;
-# `tools/test.sh all` makes one hundredth on a driver in software).
+# It needs bash, awk and this program, no network: TIFACE names the program (default: target/release/tiface)
+# and CAPTURE a capture (default: the demo head's, made on the way). SHARE is the share of the steps to make,
+# in hundredths (default: 100; `tools/test.sh all` makes one hundredth on a driver in software).
 set -u -o pipefail
 
 [ $# -ge 2 ] || { sed -n '2,20s/^# \{0,1\}//p' "$0" >&2; exit 2; }
@@ -158,7 +158,8 @@ capture() {
 }
 
 photographs=(--size 256x320 --views 32)
-# Settings under which every stage takes seconds; an update of the occupancy grid evaluates the field in each of its cells.
+# Settings under which every stage takes seconds; an update of the occupancy grid evaluates the field in each
+# of its cells.
 tiny=(--preset draft --set iface.steps=4 --set iface.samples=1024 --set iface.levels=6 --set iface.log2_table=12
   --set iface.occupancy_resolution=32
   --set tface.steps=4 --set tface.fields=1 --set tface.rays=256 --set tface.voxels_start=4096 --set tface.voxels_final=13824

@@ -125,8 +125,8 @@ def cluster(guide, body, folder, environment):
                 print(f"skipped: {guide.name}: a plan for a cluster: `{line}` failed: {done.stderr.strip()[-200:]}")
                 return count
         elif words[:1] == ["snakemake"]:
-            # captures lie here and not where all nodes would look for them; what is done already is planned as well, so
-            # that the recipe is asked for each task's threads, memory, time and words
+            # captures lie here and not where all nodes would look for them; what is done already is planned
+            # as well, so that the recipe is asked for each task's threads, memory, time and words
             line = line.replace("=/data/", "=") + " --dry-run --forceall --printshellcmds"
             done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True)
             answer = done.stdout + done.stderr

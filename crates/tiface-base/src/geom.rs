@@ -1,12 +1,18 @@
 //! The vocabulary: plain f32 geometry on glam; no files, no tensors.
 
 mod aabb;
+mod atlas;
 mod bit_grid;
 mod boxes;
 mod bvh;
 mod camera;
+mod cell_cube;
+mod chart_distance;
 pub mod distance;
 mod field;
+mod harmonics;
+mod intersect;
+mod meeting_point;
 mod mesh;
 mod overlap;
 mod pieces;
@@ -19,21 +25,24 @@ pub mod testing;
 mod topology;
 
 pub use aabb::Aabb;
+pub use atlas::{Atlas, bilinear_taps};
 pub use bit_grid::{BitGrid, dilated_cells};
 pub use boxes::{Boxes, DBox, DEFAULT_EFFORT, Effort, share_out};
 pub use bvh::{Bvh, Closest};
 pub use camera::{Camera, Distortion, Projection};
+pub use cell_cube::{CellCube, cells_around, drop_small_components, extent_of_cells};
+pub use chart_distance::{OutlineSide, nearest_charts};
 pub use field::SdfField;
-pub use mesh::{Atlas, Mesh};
-pub use mesh::{area_vector, bilinear_taps, shape};
-pub use overlap::{OutlineSide, THOROUGH_EFFORT, intersect, nearest_charts, overlaps, shared_area, turn};
+pub use harmonics::Harmonics;
+pub use intersect::intersect;
+pub use meeting_point::meeting_point;
+pub use mesh::{Mesh, area_vector, shape};
+pub use overlap::{THOROUGH_EFFORT, overlaps, shared_area, turn};
 pub use pieces::{WrongPiece, wrong_pieces};
 pub use ray::{Hit, Ray, RayResult};
 pub use shells::{ShellCaster, ShellLayer, Shells};
 pub use similarity::Similarity;
-pub use sphharm::Harmonics;
-pub use topology::{Sets, fans, side_ends, sorted_sides};
-pub use topology::{Topology, topology};
+pub use topology::{Sets, Topology, fans, side_ends, sorted_sides, topology};
 
 /// Returns the cofactors, themselves symmetric, and the determinant of a symmetric 3 × 3 matrix of
 /// entries `xx xy xz yy yz zz`: their quotient is the inverse.

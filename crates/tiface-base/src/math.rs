@@ -5,7 +5,10 @@
 
 pub mod cg;
 pub mod cholesky;
+mod components;
 mod dispatch;
 pub mod distance;
 pub mod rank;
 pub mod rng;
+
+pub use components::{Components, components};

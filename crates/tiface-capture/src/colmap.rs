@@ -16,7 +16,8 @@ mod text;
 pub(super) use files::{ModelFiles, mixed_model, model_elsewhere};
 
 use super::folder::{CaptureFolder, FLIP, in_file, in_frame, join};
-use super::frame::{CameraFrame, LensModel, Listing};
+use super::frame::{CameraFrame, Listing};
+use super::lens_model::LensModel;
 use super::masks::few;
 use super::view::Split;
 use glam::{DMat3, DQuat, DVec3};

@@ -7,11 +7,10 @@
 //! cannot represent is an error if pictures would no longer match their cameras, and a warning
 //! otherwise.
 
-use super::colmap;
 use super::folder::is_hidden;
-use super::frame::LensModel;
+use super::lens_model::LensModel;
 use super::view::{Capture, Split, View, ViewMask};
-use super::{every_eighth, up};
+use super::{colmap, every_eighth, up};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::{Map, Value, json};

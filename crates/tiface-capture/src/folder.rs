@@ -44,7 +44,12 @@ pub(super) struct CaptureFolder<'a> {
 
 impl CaptureFolder<'_> {
     pub fn new<'a>(root: &'a Path, options: &'a CaptureOptions) -> Result<CaptureFolder<'a>> {
-        Ok(CaptureFolder { root, real: io::real_path(root)?, options, search: Search::default() })
+        Ok(CaptureFolder {
+            root,
+            real: io::real_path(root)?,
+            options,
+            search: Search::new(options.result_file),
+        })
     }
 
     /// Returns how what the files leave open is read.

@@ -1,13 +1,13 @@
 //! The report on a capture: format, cameras, masks, splits, and all problems, not only the first.
 
 use super::frame::Agreement;
-use super::gather;
 use super::mask_values::{MaskReading, MaskSurvey};
 use super::masks::{self, few};
 use super::options::{CaptureOptions, MaskMeaning};
 use super::photo_checks::{self, PhotoCheck};
 use super::scene::{self, Scene, SceneOptions};
 use super::view::{Capture, Split, View, ViewMask};
+use super::{gather, mask_checks};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -246,15 +246,16 @@ fn load_all(capture: &Capture, options: &CaptureOptions) -> (Vec<Result<ViewPixe
     let load = |view: &View| {
         let mut values = None;
         let loaded = view.load_examined(limits, Some(&mut values))?;
-        let refused = loaded.mask.as_ref().and_then(|m| masks::refuse(&view.name, &loaded.photo, m).err());
+        let refused =
+            loaded.mask.as_ref().and_then(|m| mask_checks::refuse(&view.name, &loaded.photo, m).err());
         let mask = match (loaded.mask, &view.mask) {
             (None, ViewMask::None) => None,
             (None, _) => view.load_mask(limits)?, // "not looked at": judged all the same
             (mask, _) => mask,
         };
-        let judged = mask.as_ref().map(|m| (refused, masks::findings(m), masks::coverage(m)));
+        let judged = mask.as_ref().map(|m| (refused, mask_checks::findings(m), mask_checks::coverage(m)));
         let photo = PhotoCheck::new(&loaded.photo, mask.as_ref());
-        let valid_share = loaded.valid.as_ref().map(masks::coverage);
+        let valid_share = loaded.valid.as_ref().map(mask_checks::coverage);
         Ok((ViewPixels { mask, judged, valid_share, photo }, values))
     };
     let (mut all, mut survey) = (Vec::new(), MaskSurvey::default());

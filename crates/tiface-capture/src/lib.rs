@@ -6,13 +6,13 @@
 //!   dataset has it. [`View::load`] brings one photograph with its masks into memory.
 //! - [`inspect`] reports everything that can be found wrong, and [`convert`] writes cameras in
 //!   another format. [`sfm`] finds cameras by COLMAP.
-//! - [`scene`] says where the head is, by [`carve`], the visual hull of the masks.
+//! - [`scene`] says where the head is, by the visual hull of the masks.
 //! - [`rig`] measures how well poses fit each other, and finds better ones; [`rig::exposure`]
 //!   measures exposures.
 //! - [`path`] makes and reads the cameras of new views.
 //! - [`synthetic`] photographs an analytic head.
 
-pub mod carve;
+mod carve;
 mod colmap;
 pub mod convert;
 mod downscale;
@@ -20,7 +20,9 @@ mod folder;
 mod format;
 mod frame;
 pub mod inspect;
+mod lens_model;
 mod llff;
+mod mask_checks;
 mod mask_names;
 mod mask_values;
 mod masks;
@@ -34,6 +36,7 @@ pub mod path;
 mod photo_checks;
 mod pose_folder;
 mod programs;
+mod projector;
 mod realitycapture;
 pub mod rig;
 pub mod scene;
@@ -47,12 +50,14 @@ mod upright;
 mod view;
 
 pub use format::{not_a_capture, resembles_capture};
+pub use mask_checks::{MASK_HINT, coverage, findings, refuse};
 pub use mask_values::{MaskReading, MaskSurvey, MaskValues};
-pub use masks::{MASK_HINT, coverage, findings, refuse, require_masks};
+pub use masks::require_masks;
 pub use options::{
     CameraPoses, CaptureOptions, Exposures, HeadValue, MaskHead, MaskMeaning, MaskSource, Reading,
 };
 pub use order::by_number;
+pub use projector::Projector;
 pub use scene::well_seen;
 pub use view::{Capture, LoadedView, Split, View, ViewMask};
 

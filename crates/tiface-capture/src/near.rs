@@ -10,9 +10,9 @@
 pub(super) mod names;
 pub(super) mod pairs;
 
-use names::{PHOTOGRAPHS, READABLE_FORMATS};
 use names::{
-    bare, fold, has_ending, is_aside, is_common_name, is_mask_folder, is_same_format, reduced, without_ending,
+    PHOTOGRAPHS, READABLE_FORMATS, bare, fold, has_ending, is_aside, is_common_name, is_mask_folder,
+    is_same_format, reduced, without_ending,
 };
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
@@ -138,9 +138,9 @@ struct Index {
 }
 
 impl Index {
-    fn build(root: &Path) -> Index {
-        // settings lie beside results, which have views and masks under the photographs' names
-        let is_result = |folder: &Path| io::is_file(&folder.join("config.toml"));
+    fn build(root: &Path, result_file: &str) -> Index {
+        // results have views and masks under the photographs' names
+        let is_result = |folder: &Path| !result_file.is_empty() && io::is_file(&folder.join(result_file));
         let Some(files) = io::files_below(root, MAX_DEPTH, MAX_ENTRIES, &is_result) else {
             return Index::default();
         };
@@ -241,8 +241,10 @@ pub(super) struct Answer {
 }
 
 /// The search in one capture, and its answers.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Search {
+    /// See [`CaptureOptions::result_file`](super::CaptureOptions::result_file).
+    result_file: &'static str,
     index: OnceLock<Index>,
     answers: Mutex<Vec<Answer>>,
     notes: Mutex<Vec<String>>,
@@ -253,8 +255,13 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Search {
+    /// Returns a search that passes over folders with a `result_file`.
+    pub fn new(result_file: &'static str) -> Search {
+        Search { result_file, index: OnceLock::new(), answers: Mutex::default(), notes: Mutex::default() }
+    }
+
     fn index(&self, root: &Path) -> &Index {
-        self.index.get_or_init(|| Index::build(root))
+        self.index.get_or_init(|| Index::build(root, self.result_file))
     }
 
     /// Returns the only file near a name, as its path below the capture, and remembers the answer.
@@ -312,7 +319,7 @@ mod tests {
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
             std::fs::write(path, b"x").unwrap();
         }
-        let search = Search::default();
+        let search = Search::new("result.toml");
         search.nearest(dir.path(), kind, name, 1);
         search.taken().0.pop().map_or(NearMatch::Nothing, |answer| answer.found)
     }
@@ -344,7 +351,7 @@ mod tests {
         let none = |files: &[&str], name: &str| assert_eq!(photo(files, name), None, "{name}");
         none(&["left/000.jpg", "right/000.jpg"], "images/000.jpg");
         none(&["masks/000.png", "depth/000.png", "images/000_mask.png"], "images/000.jpg");
-        none(&["run/config.toml", "run/render/000.png", ".hidden/000.png"], "images/000.jpg");
+        none(&["run/result.toml", "run/render/000.png", ".hidden/000.png"], "images/000.jpg");
         none(&["images/000.jpg"], "../000.jpg");
         none(&["images/000.jpg"], "images/");
         none(&["images/000.jpg"], "");

@@ -42,6 +42,9 @@ pub struct CaptureOptions {
     pub unit_m: f64,
     /// How what the files leave open is read, where that has been decided.
     pub reading: Option<Reading>,
+    /// Name of a file that marks folders of results, in which no photograph or mask is searched;
+    /// empty if there are none.
+    pub result_file: &'static str,
     /// Limits of files.
     pub limits: Limits,
 }
@@ -59,6 +62,7 @@ impl Default for CaptureOptions {
             exposure: Exposures::Auto,
             unit_m: 1.0,
             reading: None,
+            result_file: "",
             limits: Limits::default(),
         }
     }

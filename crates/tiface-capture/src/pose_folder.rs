@@ -8,7 +8,6 @@
 //! size is the middle, as Blender's is. NSVF's names begin with 0 for training, 1 for validation
 //! (testing, if there is no 2) and 2 for testing.
 
-use super::carve;
 use super::folder::{
     CaptureFolder, FLIP, FolderEntries, PHOTOGRAPHS, has_ending, in_file, in_frame, shortened,
 };
@@ -19,9 +18,8 @@ use super::view::Split;
 use glam::{DMat3, DVec3, Vec3};
 use std::collections::HashSet;
 use std::path::Path;
-use tiface_base::Result;
-use tiface_base::geom::Aabb;
-use tiface_base::io;
+use tiface_base::geom::{Aabb, meeting_point};
+use tiface_base::{Result, io};
 
 /// Where the poses are, in this order.
 const POSES: [&str; 2] = ["pose", "poses"];
@@ -110,7 +108,7 @@ fn check_axes(files: &PoseFolder, size: (u32, u32), listing: &mut Listing) -> Re
     let ray = |frame: &CameraFrame| (frame.position, -frame.rotation.z_axis);
     let rays: Vec<(DVec3, DVec3)> = listing.frames.iter().map(ray).collect();
     let focus = listing.focus.map(|focus| focus.center().as_dvec3());
-    let Some(center) = focus.or_else(|| carve::meeting_point(&rays)) else { return Ok(()) };
+    let Some(center) = focus.or_else(|| meeting_point(&rays)) else { return Ok(()) };
     let sees = |frame: &&CameraFrame| {
         let at = frame.rotation.transpose() * (center - frame.position);
         let (width, height) = frame.intrinsics.size.unwrap_or(size);

@@ -14,6 +14,7 @@
 //! Without masks, the frames of the cameras and the dataset's points or box decide (`frusta`); a
 //! given box, and the published one, override both ([`SceneBox`]).
 
+mod aim;
 mod frusta;
 mod scene_box;
 mod well_seen;
@@ -22,13 +23,17 @@ pub(super) use frusta::around_points;
 pub use scene_box::{SceneBox, in_box};
 pub use well_seen::well_seen;
 
-use super::carve::{self, Cube, Projector, SilhouetteTable};
+use super::carve::{self, SilhouetteTable};
 use super::masks::few;
+use super::projector::Projector;
+use aim::ray_to;
 use frusta::from_frusta;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 use tiface_base::error::counted;
-use tiface_base::geom::{Aabb, BitGrid, Camera, Similarity};
+use tiface_base::geom::{
+    Aabb, BitGrid, Camera, CellCube, Similarity, drop_small_components, extent_of_cells, meeting_point,
+};
 use tiface_base::image::Gray;
 use tiface_base::math::rank::median;
 use tiface_base::{Error, Result};
@@ -141,14 +146,14 @@ fn fit_axes(
         let scene = from_frusta(cameras, options.focus)?;
         return Ok((scene, warnings));
     }
-    let aims: Vec<_> = used.iter().map(|&i| carve::ray_to(&cameras[i], masks[i].as_ref())).collect();
+    let aims: Vec<_> = used.iter().map(|&i| ray_to(&cameras[i], masks[i].as_ref())).collect();
     let some: Vec<&Camera> = used.iter().map(|&i| &cameras[i]).collect();
     let center = aim(&some, &aims)?;
     let silhouettes: Vec<SilhouetteTable> = used
         .iter()
         .filter_map(|&i| Some(SilhouetteTable::new(i, &cameras[i], masks[i].as_ref()?, THRESHOLD)))
         .collect();
-    let cube = Cube { center, half: first_half(&some, center), n: 64.min(options.resolution) };
+    let cube = CellCube { center, half: first_half(&some, center), n: 64.min(options.resolution) };
     let head = carve_tightly(cube, &silhouettes, options, &mut warnings)?;
     warnings.extend(head.contradictions(&silhouettes, options));
     Ok((head.scene(), warnings))
@@ -204,7 +209,7 @@ fn locating_views(
 
 /// The carved head in a cube that it fills, but for the margin.
 struct CarvedHead {
-    cube: Cube,
+    cube: CellCube,
     /// First and last cell of the box on each axis.
     extent: [(usize, usize); 3],
     /// Cells that enough masks touch for the hull, in the box and outside it.
@@ -218,7 +223,7 @@ struct CarvedHead {
 /// Carves a cube, grows it if it cuts the head, and shrinks it to the remaining cells until it no
 /// longer shrinks.
 fn carve_tightly(
-    mut cube: Cube,
+    mut cube: CellCube,
     silhouettes: &[SilhouetteTable],
     options: &SceneOptions,
     warnings: &mut Vec<String>,
@@ -230,12 +235,12 @@ fn carve_tightly(
     loop {
         let carved = carve::carve(&cube, silhouettes);
         let mut kept = carved.touching(core);
-        let dropped = carve::drop_dust(&mut kept, cube.n, 0.02);
+        let dropped = drop_small_components(&mut kept, cube.n, 0.02);
         let total = kept.iter().filter(|k| **k).count() as u64;
         if shrunk == 0 {
             (alone, coarse_total) = (carved.alone.clone(), total);
         }
-        let Some(extent) = carve::extent(&kept, cube.n) else {
+        let Some(extent) = extent_of_cells(&kept, cube.n) else {
             return Err(no_common_point(silhouettes, &alone, options));
         };
         let (first, last) = (cube.n == options.resolution, shrunk == 4);
@@ -276,14 +281,14 @@ fn no_common_point(silhouettes: &[SilhouetteTable], alone: &[u64], options: &Sce
 }
 
 /// Returns the cube of `resolution` cells a side around cells of another, with the margin.
-fn around_cells(cube: &Cube, extent: &[(usize, usize); 3], resolution: usize) -> Cube {
+fn around_cells(cube: &CellCube, extent: &[(usize, usize); 3], resolution: usize) -> CellCube {
     let lo = DVec3::from(extent.map(|(lo, _)| lo as f64));
     let hi = DVec3::from(extent.map(|(_, hi)| hi as f64 + 1.0));
     let center = cube.center - cube.half + 0.5 * (lo + hi) * cube.cell();
     let cells = (hi - lo).max_element();
     // the margin is counted in cells of the next cube, of which `resolution` make its side
     let share = 1.0 - 2.0 * MARGIN_CELLS as f64 / resolution as f64;
-    Cube { center, half: 0.5 * cells * cube.cell() / share.max(0.5), n: resolution }
+    CellCube { center, half: 0.5 * cells * cube.cell() / share.max(0.5), n: resolution }
 }
 
 impl CarvedHead {
@@ -344,7 +349,7 @@ fn aim(cameras: &[&Camera], rays: &[(DVec3, DVec3)]) -> Result<DVec3> {
     if spread <= 1e-9 * (1.0 + mean.length()) {
         return Err(alike("stand at one place"));
     }
-    let center = carve::meeting_point(rays).ok_or_else(|| alike("look in one direction"))?;
+    let center = meeting_point(rays).ok_or_else(|| alike("look in one direction"))?;
     let distance = cameras.iter().map(|c| c.position.distance(center)).fold(0.0, f64::max);
     if spread < 1e-4 * distance {
         return Err(alike("stand at one place"));

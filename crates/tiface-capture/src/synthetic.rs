@@ -8,6 +8,7 @@
 //! Same options, same bytes.
 
 mod photograph;
+mod reflectance;
 mod shape;
 
 pub use shape::SyntheticHead;

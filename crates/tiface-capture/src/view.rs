@@ -166,8 +166,10 @@ impl Capture {
 }
 
 /// The pixels of a [`View`], all at the size of its camera.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct LoadedView {
+    /// Its camera: in the world, or for training in scene coordinates (the head's box is [-1, 1]³).
+    pub camera: Camera,
     /// The photograph; its alpha is kept even when it is also the mask.
     pub photo: Photo,
     /// Soft head alpha: 0 = empty space. `None` without a mask, or when it means "not looked at".
@@ -268,7 +270,7 @@ impl View {
             self.reduced(path, region, Average::Mean)
         });
         let region = region.transpose()?;
-        Ok(LoadedView { photo, mask, valid, region })
+        Ok(LoadedView { camera: self.camera.clone(), photo, mask, valid, region })
     }
 
     /// Returns the mask of this view at the camera's size, without its meaning; `None` without one.

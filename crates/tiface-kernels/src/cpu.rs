@@ -10,6 +10,7 @@ pub mod density;
 pub mod hash;
 pub mod losses;
 pub mod march;
+mod matrix;
 pub mod mlp;
 pub mod neus;
 pub mod occupancy;

@@ -27,6 +27,7 @@ mod neus;
 mod occupancy;
 mod points;
 mod rng;
+mod running_counts;
 mod schedule;
 mod sdf;
 mod sum;

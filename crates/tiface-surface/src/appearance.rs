@@ -5,7 +5,8 @@
 //!
 //! ```text
 //! min_c  Σ_p D_p ‖ g y_p − b_p − Σ_k Y_k(d_p) Σ_t W_pt c_tk ‖²
-//!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖² + ν Σ_t ∫_{U_t} ‖Σ_k Y_k c_tk‖²
+//!        + μ₀ ‖∇c₀‖² + μ₁ Σ_{k>0} ‖∇c_k‖² + λ Σ_{k>0} ‖c_k‖²
+//!        + ν Σ_t ∫_{U_t} ‖Σ_k Y_k c_tk‖²
 //! ```
 //!
 //! `y` is the photograph's pixel and `g` its photograph's gain, `b` the color of the surface before

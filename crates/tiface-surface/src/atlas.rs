@@ -1,9 +1,9 @@
 //! A texture atlas: the surface cut into charts, laid flat, and packed into a square.
 //!
 //! ```text
-//! a head: face, scalp, nape, garment, cap → share out the texels ─┐
-//! else: divide and flatten (uvunwrap) ────────────────────────────┴→ repair → pack → check
-//!                                         └── fails → one half square a triangle
+//! a head: face, scalp, … → share out the texels ─┐
+//! else: divide and flatten (uvunwrap) ───────────┴→ repair → pack → check
+//!                        └── fails → one half square a triangle
 //! ```
 //!
 //! Every triangle of the result has area, none is flipped, no two share any, and charts keep their
@@ -20,6 +20,8 @@ mod flatten;
 mod half_squares;
 mod head;
 mod pack;
+mod patches;
+mod planar;
 mod regions;
 mod relax;
 mod resolution;
@@ -27,13 +29,15 @@ mod smooth;
 
 use crate::files::{UvReport, seams_facing, uv_check};
 use crate::{Warning, check_indices, setting};
-use chart::{Flat, height, neighbors, part, upright};
-use divide::{divide, planar};
+use chart::{Flat, height};
+use divide::divide;
 use flatten::ChartSet;
 use glam::{DVec2, Vec2, Vec3};
 use half_squares::half_squares;
 use head::divide_head;
 use pack::{ChartPose, INITIAL_FILL, pack};
+use patches::{neighbors, part};
+use planar::planar;
 use regions::Part;
 pub use resolution::resolved;
 use resolution::share_out;
@@ -41,6 +45,7 @@ use serde::Serialize;
 use std::time::Instant;
 use tiface_base::geom::{Atlas, Mesh, THOROUGH_EFFORT, overlaps, turn};
 use tiface_base::{Error, Monitor, Result};
+use upright::upright;
 
 /// A report of an atlas: its construction and quality.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -439,3 +444,4 @@ fn faults(atlas: &Atlas) -> Vec<bool> {
 mod head_tests;
 #[cfg(test)]
 mod tests;
+mod upright;

@@ -16,6 +16,7 @@ mod cover;
 mod fill;
 mod grain;
 mod light;
+mod lobes;
 mod materials;
 mod seams;
 mod smooth;

@@ -1,4 +1,4 @@
-//! The stage `mesh`, first part: from a signed distance to a closed mesh with normals and colors.
+//! From a signed distance to a closed mesh with normals and colors.
 
 mod blocks;
 mod cap;
@@ -8,6 +8,7 @@ mod handles;
 mod loops;
 mod marching;
 mod marching_cell;
+mod node_grid;
 mod polish;
 mod sparse;
 
@@ -20,8 +21,9 @@ pub use sparse::{Sparse, sparse};
 
 use super::smooth::{SmoothReport, smooth};
 use super::{Warning, check_len, evaluate, setting};
-use glam::{DVec3, Vec3};
+use glam::Vec3;
 use handles::cut_handles;
+pub use node_grid::NodeGrid;
 use polish::Polish;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
@@ -292,13 +294,6 @@ fn check_surface(found: &Sparse) -> Result<()> {
     Ok(())
 }
 
-/// Refuses fewer than 2 cells or nodes along a side, and more than `most`.
-fn check_resolution(resolution: usize, most: usize) -> Result<()> {
-    let expected = format!("2..={most}");
-    setting((2..=most).contains(&resolution), "resolution", &expected, resolution)
-        .map_err(|e| e.with_cause(Cause::Resolution))
-}
-
 /// Returns the error for a field without a surface, and how that shows.
 fn no_surface(cause: Cause, how: String) -> Error {
     let hint = match cause {
@@ -320,58 +315,6 @@ fn off_surface(values: &[f32], gradients: &[Vec3], capped: &[bool], cell: f32) -
         .filter(|d| d.is_finite());
     let (sum, n) = distances.fold((0.0, 0usize), |(s, n), d| (s + d, n + 1));
     if n > 0 { sum / n as f64 } else { 0.0 }
-}
-
-/// Cubic cells over a box.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct NodeGrid {
-    /// Nodes along x, y, z.
-    pub dims: [usize; 3],
-    /// Node (0, 0, 0).
-    pub origin: Vec3,
-    /// Cell edge.
-    pub spacing: f32,
-}
-
-impl NodeGrid {
-    /// `resolution` cells along the longest side; along the others as many as cover the box, the
-    /// surplus split between both ends.
-    ///
-    /// # Errors
-    ///
-    /// An empty or unbounded box, a resolution outside 2..=8192.
-    pub fn fit(bounds: Aabb, resolution: usize) -> Result<NodeGrid> {
-        let size = bounds.size();
-        if bounds.is_empty() || !size.is_finite() || !bounds.center().is_finite() || size.min_element() <= 0.0
-        {
-            let Aabb { min, max } = bounds;
-            let message = format!("the box to mesh in, {min} to {max}, is empty or not finite");
-            return Err(Error::cannot(message, "check the scene box of the capture"));
-        }
-        check_resolution(resolution, 8192)?;
-        let spacing = size.max_element() / resolution as f32;
-        // A side a rounding error longer than n cells is n cells long.
-        let cells = size.to_array().map(|s| ((s / spacing - 1e-3).ceil() as usize).max(2));
-        let half = DVec3::from(cells.map(|c| 0.5 * c as f64 * f64::from(spacing)));
-        let origin = (bounds.center().as_dvec3() - half).as_vec3();
-        Ok(NodeGrid { dims: cells.map(|c| c + 1), origin, spacing })
-    }
-
-    /// Returns the position of a node.
-    pub fn point(&self, node: [usize; 3]) -> Vec3 {
-        let n = DVec3::new(node[0] as f64, node[1] as f64, node[2] as f64);
-        (self.origin.as_dvec3() + n * f64::from(self.spacing)).as_vec3()
-    }
-
-    /// Returns the number of nodes.
-    pub fn nodes(&self) -> usize {
-        self.dims.iter().product()
-    }
-
-    /// Returns whether a node lies on the outer faces.
-    fn on_border(&self, node: [usize; 3]) -> bool {
-        (0..3).any(|a| node[a] == 0 || node[a] + 1 == self.dims[a])
-    }
 }
 
 #[cfg(test)]

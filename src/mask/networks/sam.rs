@@ -2,10 +2,10 @@
 //! MobileSAM).
 //!
 //! ```text
-//! photograph ── longest side to S, normalize, pad to S × S ── encoder ── embedding ─┐
-//! clicks ────── times S / longest side ─────────────────────────────────── decoder ─┴─ logits
-//!
-//! logits of S/4 × S/4 ── bilinear to S × S ── padding cut off ── bilinear to the photograph ── > 0
+//! photograph: longest side to S, normalize, pad to S × S → encoder → embedding
+//! clicks:     times S / longest side
+//! embedding, clicks → decoder → logits of S/4 × S/4
+//! logits: bilinear to S × S → cut off the padding → bilinear to the photograph → > 0
 //! ```
 //!
 //! The split export pads the prompt itself; the original decoder wants the point (0, 0) with label

@@ -5,9 +5,9 @@
 //! pictures, 1 % of mask pixels.
 
 use super::Networks;
-use super::alpha::VitMatte;
 use super::processor::IMAGENET;
 use super::sam::{Sam, enlarged, normalized, resized};
+use super::vitmatte::VitMatte;
 use crate::config::{MaskConfig, VitmatteColors};
 use crate::mask::Click;
 use crate::onnx::tests::{config, made, shared};

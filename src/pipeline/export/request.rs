@@ -1,7 +1,8 @@
 //! What is asked of an export: which files, and what they show of a head.
 
 use crate::config::MeshFormat;
-use crate::pipeline::frames::{Material, MeshFrame};
+use crate::pipeline::frames::MeshFrame;
+use crate::pipeline::mesh_files::Material;
 use glam::DVec3;
 use tiface_base::{Error, Result};
 

@@ -4,12 +4,9 @@
 //! the separating axes of convex polygons in the plane. Each decision is the sign of an orientation
 //! determinant of f32 coordinates, exact after Shewchuk (1997). So triangles that share a side or a
 //! corner, or merely touch, never count.
-//!
-//! Beside that: whether two triangles in space pass through each other, and how far the charts of
-//! an atlas are apart.
 
-use super::boxes::{Boxes, DBox, DEFAULT_EFFORT, share_out};
-use glam::{DVec2, DVec3, Vec2};
+use super::boxes::{Boxes, DBox, share_out};
+use glam::{DVec2, Vec2};
 use rayon::prelude::*;
 
 /// On which side of the line a → b is c: 1 where (b − a) × (c − a) is positive, −1 where negative,
@@ -28,7 +25,7 @@ pub(crate) fn share_area(p: [Vec2; 3], q: [Vec2; 3]) -> bool {
 
 /// Returns whether a side of a triangle has all of another one on its far side, by the sign of a
 /// turn.
-fn separates<V: Copy>(a: [V; 3], b: [V; 3], turn: impl Fn(V, V, V) -> i32) -> bool {
+pub(super) fn separates<V: Copy>(a: [V; 3], b: [V; 3], turn: impl Fn(V, V, V) -> i32) -> bool {
     let inner = turn(a[0], a[1], a[2]);
     (0..3).any(|k| b.iter().all(|&v| turn(a[k], a[(k + 1) % 3], v) * inner <= 0))
 }
@@ -129,153 +126,9 @@ pub fn overlaps(uvs: &[Vec2], triangles: &[[u32; 3]], fit: &[bool], effort: usiz
     Overlaps { pairs, covered, left: shared.unfinished.len() }
 }
 
-/// Returns whether two triangles meet in more than the corners they share.
-pub fn intersect(p: [DVec3; 3], p_ids: [u32; 3], q: [DVec3; 3], q_ids: [u32; 3]) -> bool {
-    let shared = |ids: [u32; 3], others: [u32; 3]| ids.map(|i| others.contains(&i));
-    let (in_p, in_q) = (shared(p_ids, q_ids), shared(q_ids, p_ids));
-    let count = in_p.iter().filter(|&&s| s).count();
-    if count == 3 {
-        return true;
-    }
-    let sides = q.map(|v| orient(p[0], p[1], p[2], v));
-    match sides {
-        [0, 0, 0] => return overlap_in_plane(p, q),
-        [1, 1, 1] | [-1, -1, -1] => return false, // apart
-        _ => {}
-    }
-    // The edge opposite a shared corner, or every edge without one; with a shared edge, none.
-    let crosses = |a: [DVec3; 3], touching: [bool; 3], b: [DVec3; 3]| {
-        (0..3).any(|k| {
-            let next = (k + 1) % 3;
-            !touching[k] && !touching[next] && pierces(a[k], a[next], b)
-        })
-    };
-    count < 2 && (crosses(p, in_p, q) || crosses(q, in_q, p))
-}
-
-/// Returns whether the segment goes from one side of the triangle to the other, through it or its
-/// border.
-fn pierces(from: DVec3, to: DVec3, [a, b, c]: [DVec3; 3]) -> bool {
-    if orient(a, b, c, from) * orient(a, b, c, to) >= 0 {
-        return false;
-    }
-    let turns = [orient(from, to, a, b), orient(from, to, b, c), orient(from, to, c, a)];
-    turns.iter().all(|&s| s >= 0) || turns.iter().all(|&s| s <= 0)
-}
-
-/// Sign of the determinant of `(a − d, b − d, c − d)`; 0 where rounding could decide it.
-pub(super) fn orient(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> i32 {
-    let (a, b, c) = (a - d, b - d, c - d);
-    let det = a.dot(b.cross(c));
-    let (x, y, z) = (a.abs(), b.abs(), c.abs());
-    let permanent =
-        x.x * (y.y * z.z + y.z * z.y) + x.y * (y.z * z.x + y.x * z.z) + x.z * (y.x * z.y + y.y * z.x);
-    // (7 + 56 u) u with u = 2⁻⁵³ (Shewchuk 1997), and a little for the differences
-    if det.abs() <= 1e-15 * permanent { 0 } else { det.signum() as i32 }
-}
-
-/// Returns whether two triangles of one plane share area: not if a side of either separates them.
-fn overlap_in_plane(p: [DVec3; 3], q: [DVec3; 3]) -> bool {
-    let normal = (p[1] - p[0]).cross(p[2] - p[0]).abs();
-    let flat = |v: DVec3| {
-        if normal.x >= normal.y && normal.x >= normal.z {
-            DVec2::new(v.y, v.z)
-        } else if normal.y >= normal.z {
-            DVec2::new(v.z, v.x)
-        } else {
-            DVec2::new(v.x, v.y)
-        }
-    };
-    let turn = |a: DVec2, b: DVec2, c: DVec2| {
-        let (x, y) = ((b.x - a.x) * (c.y - a.y), (b.y - a.y) * (c.x - a.x));
-        if (x - y).abs() <= 1e-15 * (x.abs() + y.abs()) { 0 } else { (x - y).signum() as i32 }
-    };
-    let (p, q) = (p.map(flat), q.map(flat));
-    !separates(p, q, turn) && !separates(q, p, turn)
-}
-
-/// A piece of a chart's outline, in texels.
-#[derive(Clone, Copy, Debug)]
-pub struct OutlineSide {
-    /// Which chart.
-    pub chart: u32,
-    /// Its ends.
-    pub from: DVec2,
-    /// Its ends.
-    pub to: DVec2,
-}
-
-/// Distance between charts.
-pub struct ChartDistance {
-    /// The smallest distance between sides of different charts, up to the given limit; `None` with
-    /// fewer than two charts.
-    pub distance: Option<f64>,
-    /// Number of sides that were not compared with all neighbors: then the distance is an upper
-    /// bound.
-    pub left: usize,
-}
-
-/// Returns the smallest distance between sides of different charts, up to `farthest`, beyond which
-/// it is given as that.
-pub fn nearest_charts(sides: &[OutlineSide], farthest: f64) -> ChartDistance {
-    if sides.iter().all(|s| s.chart == sides[0].chart) {
-        return ChartDistance { distance: None, left: 0 };
-    }
-    let span = |s: &OutlineSide| DBox::around([s.from, s.to].map(|p| p.extend(0.0)));
-    let boxes = Boxes::new(sides.iter().map(span));
-    // Neighbors in the tree are mostly neighbors in the plane: a first bound, so that the search
-    // has a short way to go.
-    let order: Vec<u32> = boxes.order().collect();
-    let mut bound = farthest;
-    for near in order.windows(LEAF_NEIGHBORS) {
-        let side = &sides[near[0] as usize];
-        let others = near[1..].iter().map(|&i| &sides[i as usize]).filter(|s| s.chart != side.chart);
-        bound = others.fold(bound, |nearest, other| nearest.min(distance(side, other)));
-    }
-    let shared = share_out(sides.len(), DEFAULT_EFFORT / 2, |i, effort| {
-        let (side, mut nearest) = (&sides[i], bound);
-        if nearest > 0.0 {
-            boxes.meeting(&span(side).grown(bound), effort, |j, effort| {
-                let other = &sides[j as usize];
-                if side.chart < other.chart {
-                    if !effort.spend(SIDE_DISTANCE_COST) {
-                        return false;
-                    }
-                    nearest = nearest.min(distance(side, other));
-                }
-                nearest > 0.0
-            });
-        }
-        nearest
-    });
-    let nearest = shared.found.into_iter().fold(bound, f64::min);
-    // nothing is nearer than touching
-    ChartDistance { distance: Some(nearest), left: if nearest > 0.0 { shared.unfinished.len() } else { 0 } }
-}
-
-/// Number of successive sides in the order of the tree that are compared first.
-const LEAF_NEIGHBORS: usize = 8;
-
-/// Cost of a distance of two sides, in comparisons of boxes.
-const SIDE_DISTANCE_COST: usize = 8;
-
-fn point_distance(p: DVec2, s: &OutlineSide) -> f64 {
-    let along = s.to - s.from;
-    let t = (p - s.from).dot(along) / along.length_squared();
-    p.distance(s.from + along * if t.is_nan() { 0.0 } else { t.clamp(0.0, 1.0) })
-}
-
-fn distance(a: &OutlineSide, b: &OutlineSide) -> f64 {
-    let turn = |s: &OutlineSide, p: DVec2| (s.to - s.from).perp_dot(p - s.from);
-    if turn(a, b.from) * turn(a, b.to) < 0.0 && turn(b, a.from) * turn(b, a.to) < 0.0 {
-        return 0.0; // they cross
-    }
-    let ends = [point_distance(a.from, b), point_distance(a.to, b), point_distance(b.from, a)];
-    ends.into_iter().fold(point_distance(b.to, a), f64::min)
-}
-
 #[cfg(test)]
 mod tests {
+    use super::super::boxes::DEFAULT_EFFORT;
     use super::*;
 
     fn at(p: [f32; 6]) -> [Vec2; 3] {
@@ -350,47 +203,5 @@ mod tests {
         assert!(found.left > 39_000 && found.pairs.len() * OVERLAP_COST <= DEFAULT_EFFORT * triangles.len());
         // what each of them finds first is enough to know that it is covered, but not by how many
         assert_eq!(found.covered, triangles.len());
-    }
-
-    fn side(chart: u32, p: [f64; 4]) -> OutlineSide {
-        OutlineSide { chart, from: DVec2::new(p[0], p[1]), to: DVec2::new(p[2], p[3]) }
-    }
-
-    fn nearest(sides: &[OutlineSide], farthest: f64) -> Option<f64> {
-        let ChartDistance { distance, left } = nearest_charts(sides, farthest);
-        assert_eq!(left, 0);
-        distance
-    }
-
-    #[test]
-    fn distances_are_between_different_charts_only() {
-        let a = side(0, [0.0, 0.0, 10.0, 0.0]);
-        assert_eq!(nearest(&[a, side(0, [0.0, 1.0, 10.0, 1.0])], 64.0), None);
-        assert_eq!(nearest(&[a, side(1, [3.0, 5.0, 3.0, 9.0])], 64.0), Some(5.0));
-        assert_eq!(nearest(&[a, side(1, [3.0, -5.0, 3.0, 9.0])], 64.0), Some(0.0)); // crossing
-        assert_eq!(nearest(&[a, side(1, [13.0, 4.0, 19.0, 4.0])], 64.0), Some(5.0)); // 3, 4, 5
-        assert_eq!(nearest(&[a, side(1, [0.0, 900.0, 1.0, 900.0])], 64.0), Some(64.0));
-        assert_eq!(nearest(&[], 64.0), None);
-    }
-
-    #[test]
-    fn far_and_long_sides_agree_with_all_pairs() {
-        // sides on two combs of slanted teeth
-        let sides: Vec<OutlineSide> = (0..200)
-            .map(|i| {
-                let x = 3.0 * f64::from(i) + f64::from(i % 7);
-                let chart = (i / 2) as u32;
-                side(chart, [x, f64::from(i % 5), x + 900.0, 500.0 + 20.0 * f64::from(i)])
-            })
-            .collect();
-        let mut least = f64::INFINITY;
-        for a in &sides {
-            for b in &sides {
-                if a.chart != b.chart {
-                    least = least.min(distance(a, b));
-                }
-            }
-        }
-        assert_eq!(nearest(&sides, 64.0), Some(least));
     }
 }

@@ -9,7 +9,8 @@
 //! Edelsbrunner, Mücke 1990).
 
 use super::boxes::{Boxes, DBox, DEFAULT_EFFORT, Effort, share_out};
-use super::overlap::{orient, turn};
+use super::intersect::orient;
+use super::overlap::turn;
 use super::topology::{Sets, sorted_sides};
 use glam::{DVec3, Vec2, Vec3};
 

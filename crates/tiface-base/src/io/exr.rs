@@ -3,7 +3,9 @@
 //! The data window is placed inside the display window: pixels outside are dropped, uncovered ones
 //! are 0. The first layer with all requested channels is used.
 
-use super::read::{Limits, ReadError, read_bytes};
+use super::limits::Limits;
+use super::read::read_bytes;
+use super::read_error::ReadError;
 use super::write::{WriteError, write_atomic};
 use crate::image::Image;
 use ::exr::meta::MetaData;

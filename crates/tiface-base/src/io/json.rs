@@ -1,7 +1,9 @@
 //! JSON as untrusted input: bounded in bytes, depth and values, every key once, every number
 //! finite.
 
-use super::read::{Limits, ReadError, read_capped};
+use super::limits::Limits;
+use super::read::read_capped;
+use super::read_error::ReadError;
 use serde::de::{Deserialize, DeserializeOwned, DeserializeSeed, Error, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 use std::cell::Cell;

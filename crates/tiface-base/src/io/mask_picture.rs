@@ -1,7 +1,9 @@
 //! Mask files before anything says which of their values is the head.
 
+use super::limits::Limits;
 use super::pictures::{PictureFile, photo_of};
-use super::read::{Limits, ReadError, read_bytes};
+use super::read::read_bytes;
+use super::read_error::ReadError;
 use crate::image::Gray;
 use image::DynamicImage;
 use std::path::Path;

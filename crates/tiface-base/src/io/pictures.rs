@@ -6,7 +6,9 @@
 //! whose scan was cut and closed again with a proper end marker, since only decoding each code
 //! could tell.
 
-use super::read::{Limits, ReadError, open, read_bytes};
+use super::limits::Limits;
+use super::read::{open, read_bytes};
+use super::read_error::ReadError;
 use super::write::{WriteError, write_atomic};
 use crate::image::{Gray, Photo};
 use image::codecs::jpeg::JpegEncoder;

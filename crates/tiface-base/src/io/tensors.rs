@@ -6,7 +6,9 @@
 //! it accepts: duplicate names, NaN, and headers that take seconds.
 
 use super::json::parse_json;
-use super::read::{Limits, ReadError, read_bytes};
+use super::limits::Limits;
+use super::read::read_bytes;
+use super::read_error::ReadError;
 use super::write::{WriteError, write_atomic};
 use safetensors::{Dtype, SafeTensors};
 use std::collections::BTreeMap;

@@ -1,7 +1,7 @@
 //! The binary files: little-endian numbers, counts before lists. Every count is compared with the
 //! bytes that are left before anything is reserved.
 
-use super::super::frame::LensModel;
+use super::super::lens_model::LensModel;
 use super::{Camera, Image, Model, Rigid};
 use glam::DVec3;
 use std::collections::HashMap;

@@ -5,7 +5,7 @@
 //! its numbers and its name tell from points.
 
 use super::super::folder::{in_file, shortened};
-use super::super::frame::LensModel;
+use super::super::lens_model::LensModel;
 use super::{Camera, Image, Model, Rigid};
 use glam::DVec3;
 use std::cell::Cell;

@@ -2,12 +2,13 @@
 //! farther from the meeting point of the viewing axes than 0.6 of the cameras' median distance to
 //! it; drawn tighter around the dataset's points within it, or the dataset's own box.
 
+use super::aim::ray_to;
 use super::{Scene, aim, head_outside, scene_from, world_box};
-use crate::carve::{self, Cube, Projector};
+use crate::projector::Projector;
 use crate::view::View;
 use glam::{DVec3, Vec3};
 use tiface_base::Result;
-use tiface_base::geom::{Aabb, Camera};
+use tiface_base::geom::{Aabb, Camera, CellCube, drop_small_components, extent_of_cells};
 use tiface_base::math::rank::median;
 
 /// Minimum number of points for a box around them.
@@ -53,11 +54,11 @@ pub(super) fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Sce
         return Ok(scene);
     }
     let some: Vec<&Camera> = cameras.iter().collect();
-    let axes: Vec<_> = cameras.iter().map(|c| carve::ray_to(c, None)).collect();
+    let axes: Vec<_> = cameras.iter().map(|c| ray_to(c, None)).collect();
     let center = aim(&some, &axes)?;
     let mut distances: Vec<f64> = cameras.iter().map(|c| c.position.distance(center)).collect();
     let half = 0.6 * median(&mut distances, f64::total_cmp).unwrap_or(0.0);
-    let cube = Cube { center, half, n: 48 };
+    let cube = CellCube { center, half, n: 48 };
     let projectors: Vec<Projector> = cameras.iter().map(Projector::new).collect();
     let least = (2 * cameras.len()).div_ceil(5).max(2);
     let mut kept = vec![false; cube.n.pow(3)];
@@ -65,8 +66,8 @@ pub(super) fn from_frusta(cameras: &[Camera], focus: Option<Aabb>) -> Result<Sce
         let p = cube.cell_center(i / (cube.n * cube.n), i / cube.n % cube.n, i % cube.n);
         *cell = p.distance(center) <= half && projectors.iter().filter(|c| c.sees(p)).count() >= least;
     }
-    carve::drop_dust(&mut kept, cube.n, 1.0);
-    let Some(extent) = carve::extent(&kept, cube.n) else {
+    drop_small_components(&mut kept, cube.n, 1.0);
+    let Some(extent) = extent_of_cells(&kept, cube.n) else {
         let seen = projectors.iter().filter(|c| c.sees(center)).count();
         return Err(head_outside(seen, cameras.len()));
     };

@@ -5,7 +5,7 @@
 //! not: it is closed by a flat cap where too few cameras see the body.
 
 use super::Scene;
-use crate::carve::Projector;
+use crate::projector::Projector;
 use glam::{DVec3, Vec3};
 use tiface_base::geom::{Aabb, Camera};
 use tiface_base::math::rank::median;

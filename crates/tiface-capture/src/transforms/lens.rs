@@ -3,7 +3,8 @@
 use super::agreement::FOCAL_KEYS;
 use super::spellings::{FOCAL_WORDS, LensNotes, MATRICES, SHARED_KEYS, canonical};
 use super::{Fault, Object};
-use crate::frame::{self, Intrinsics, LensModel};
+use crate::frame::Intrinsics;
+use crate::lens_model::{self, LensModel};
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
 use serde_json::Value;
@@ -184,7 +185,7 @@ fn distortion(keys: &FrameKeys, model: &str, notes: &mut LensNotes) -> Result<Di
     };
     let all = "k1 k2 k3 k4 k5 k6 p1 p2 sx1 sy1 omega".split(' ');
     for key in all.filter(|key| !parameters.split(' ').any(|p| p == *key)) {
-        if *frame::coefficient(&mut { given }, key) != 0.0 {
+        if *lens_model::coefficient(&mut { given }, key) != 0.0 {
             let list = if keys.distortion_params.is_some() { " (in `distortion_params`)" } else { "" };
             return Err(format!(
                 "its lens has `{key}`{list}, which its camera model `{model}` has not; undistort the \
@@ -192,8 +193,8 @@ fn distortion(keys: &FrameKeys, model: &str, notes: &mut LensNotes) -> Result<Di
             ));
         }
     }
-    let distortion = Distortion { projection: frame::projection(model), ..given };
-    frame::check_distortion(&distortion)?;
+    let distortion = Distortion { projection: lens_model::projection(model), ..given };
+    lens_model::check_distortion(&distortion)?;
     Ok(distortion)
 }
 

@@ -14,7 +14,8 @@
 
 use super::hash::{self, Level};
 use super::march::Samples;
-use super::simd::{Matrix, add_to, exp, gemm, sigmoid, split};
+use super::matrix::{Matrix, add_to, split};
+use super::simd::{exp, gemm, sigmoid};
 use rayon::prelude::*;
 use tiface_base::dispatch;
 use tiface_base::geom::sphharm::sh16;

@@ -7,8 +7,10 @@
 //! distance `f` is divided by the length `p` of a pixel:
 //!
 //! ```text
-//! rgb_mse · ⟨e²⟩ + rgb_sample · ⟨Σ w (c − h)²⟩ + mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
-//!   + eikonal · ⟨(‖∇f‖ − 1)²⟩ + sparsity · ⟨exp(−β |f|)⟩ + stereo · ⟨w (√((f / p)² + k²) − k)⟩
+//! rgb_mse · ⟨e²⟩ + rgb_sample · ⟨Σ w (c − h)²⟩
+//!   + mask · ⟨−a ln O − (1 − a) ln(1 − O)⟩
+//!   + eikonal · ⟨(‖∇f‖ − 1)²⟩ + sparsity · ⟨exp(−β |f|)⟩
+//!   + stereo · ⟨w (√((f / p)² + k²) − k)⟩
 //! ```
 //!
 //! `Σ w (c − h)² = Σ w c² − 2 h Σ w c + h² Σ w`: compositing c² along with c is enough to compute

@@ -10,7 +10,7 @@
 //! outputs of a layer that is trained to represent the surface are a bottleneck for the appearance
 //! of a head.
 
-use super::simd::{Matrix, split};
+use super::matrix::{Matrix, split};
 
 /// Width of every hidden layer.
 pub const HIDDEN: usize = 64;

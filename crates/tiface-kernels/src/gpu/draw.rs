@@ -6,7 +6,8 @@
 use super::batch::{DeviceBatch, RayArrays};
 use super::device::{Buffer, Device, Words, groups, launch};
 use super::lens::{number, undistort};
-use super::rng::{Wide, below, permuted, ranked, stream, uniform, upper_bound, word};
+use super::rng::{Wide, below, permuted, stream, uniform, word};
+use super::running_counts::{ranked, upper_bound};
 use super::vec3::Vec3;
 use burn::cubecl::server::Handle;
 use burn::cubecl::{self, prelude::*};

@@ -1,8 +1,5 @@
 //! The random numbers of [`tiface_base::math::rng`], with the same bits. 64-bit words are pairs of
 //! 32-bit words, because not every adapter has 64-bit integers.
-//!
-//! [`upper_bound`] and [`ranked`] select the item of a random number, by binary search in running
-//! counts.
 
 use burn::cubecl::{self, prelude::*};
 use tiface_base::math::rng;
@@ -92,42 +89,6 @@ pub(super) fn stream(seed: u64, stream: u64) -> WideLaunch {
 /// Returns a word as an argument of a launch.
 pub(super) fn word(bits: u64) -> WideLaunch {
     WideLaunch::new((bits >> 32) as u32, bits as u32)
-}
-
-/// Returns the first of `values[first..end]` that exceeds `v`, of non-decreasing values; only every
-/// `stride`-th counts, and indices count those.
-#[cube]
-pub(super) fn upper_bound(
-    values: &[u32],
-    first: usize,
-    end: usize,
-    v: u32,
-    #[comptime] stride: usize,
-) -> usize {
-    let mut low = first;
-    let mut high = end;
-    while low < high {
-        let middle = (low + high) / 2;
-        if values[middle * stride] <= v {
-            low = middle + 1;
-        } else {
-            high = middle;
-        }
-    }
-    low
-}
-
-/// Returns the bit of the words `first..first + words` of a mask that has so many set bits before
-/// it; `before` holds the count before each word.
-#[cube]
-pub(super) fn ranked(before: &[u32], mask: &[u32], first: usize, words: usize, rank: u32) -> u32 {
-    let word = upper_bound(before, first, first + words, rank, 1usize) - 1;
-    let mut bits = mask[word];
-    for _ in before[word]..rank {
-        // clears the lowest bit
-        bits &= bits - 1;
-    }
-    32 * u32::cast_from(word - first) + bits.trailing_zeros()
 }
 
 #[cfg(test)]

@@ -2,7 +2,8 @@
 //! at a weighted mean of its neighbors (Tutte 1963, *How to draw a graph*; Floater 1997). Positive
 //! weights and a convex border leave no triangle clockwise; cotangents keep angles where they can.
 
-use super::chart::{Flat, NONE, twice_area};
+use super::chart::{Flat, twice_area};
+use super::patches::NONE;
 use glam::DVec2;
 use std::collections::HashMap;
 use std::f64::consts::TAU;

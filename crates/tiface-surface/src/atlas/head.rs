@@ -2,9 +2,10 @@
 //! and collar ([`regions`](super::regions)). Every chart begins as a disc without folds and is
 //! relaxed to its true sizes, so rough hair costs stretch, never more charts.
 
-use super::chart::{Flat, neighbors, stretch};
+use super::chart::{Flat, stretch};
 use super::disc::embedded;
 use super::divide::{STRETCH, components, halves};
+use super::patches::neighbors;
 use super::regions::{Head, Part};
 use super::relax::relax;
 use glam::Vec3;

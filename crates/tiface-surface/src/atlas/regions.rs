@@ -13,8 +13,8 @@
 //! All lines are drawn on a smooth copy, so that curls and folds do not make them ragged, and a
 //! part is one piece: crumbs join the neighbor that they share the longest border with.
 
-use super::chart::straighten;
 use super::divide::{components, joined};
+use super::patches::straighten;
 use super::smooth::smoothed;
 use crate::neck::{find_neck, find_shoulders};
 use glam::Vec3;
@@ -295,7 +295,7 @@ fn smoothing(triangles: usize) -> usize {
 
 #[cfg(test)]
 mod tests {
-    use super::super::chart::{NONE, neighbors};
+    use super::super::patches::{NONE, neighbors};
     use super::*;
 
     #[test]

@@ -6,7 +6,8 @@
 //! border.
 
 use super::marching::{Volume, marching};
-use super::{BATCH, MeshReport, NodeGrid, check_resolution, colors_along_normals, no_surface, off_surface};
+use super::node_grid::check_resolution;
+use super::{BATCH, MeshReport, NodeGrid, colors_along_normals, no_surface, off_surface};
 use crate::{check_len, evaluate};
 use glam::Vec3;
 use std::time::Instant;

@@ -3,10 +3,11 @@
 use super::color::backward_rows;
 use super::{Activations, CHUNK, WIDTH};
 use crate::cpu::hash::{self, JacobianBlock, LANES};
+use crate::cpu::matrix::add_to;
 use crate::cpu::mlp::{COLOR_INPUTS, HIDDEN, OUTPUTS, OUTPUTS_PADDED, SOFTNESS, TILE, Weights};
 use crate::cpu::neus::MIN_GRADIENT_NORM;
 use crate::cpu::pool::{Buffer, by_chunk};
-use crate::cpu::simd::{ROWS, add_to, exp, fma, gemm};
+use crate::cpu::simd::{ROWS, exp, fma, gemm};
 use rayon::prelude::*;
 use tiface_base::dispatch;
 

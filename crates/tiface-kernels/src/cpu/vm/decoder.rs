@@ -8,8 +8,9 @@
 
 use super::gather::FactorGradients;
 use super::{Cell, Grid};
+use crate::cpu::matrix::{Matrix, add_to, split};
 use crate::cpu::pool::{Buffer, pieces};
-use crate::cpu::simd::{Matrix, add_to, gemm, relu_gradient, sigmoid, split};
+use crate::cpu::simd::{gemm, relu_gradient, sigmoid};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use tiface_base::dispatch;

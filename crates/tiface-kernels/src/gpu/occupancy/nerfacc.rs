@@ -2,7 +2,8 @@
 
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
-use super::super::rng::{self, Wide, ranked};
+use super::super::rng::{self, Wide};
+use super::super::running_counts::ranked;
 use super::super::sum::group_sum;
 use super::{Occupancy, UNITS};
 use crate::cpu::occupancy::{DECAY, STREAMS, WARMUP_STEPS};

@@ -1,11 +1,8 @@
-//! Similarity of two pictures, per pixel and in structure.
-//!
-//! Peak signal-to-noise ratio: `−10 log10(Σ e² / (3 · pixels))`, data range 1.
-//!
 //! Structural similarity (Wang, Bovik, Sheikh, Simoncelli 2004) with the constants of the published
 //! evaluations: Gaussian window of 11 × 11, σ = 1.5, k₁ = 0.01, k₂ = 0.03, range 1.
 //!
-//! `(2 μa μb + c₁)(2 σab + c₂) / ((μa² + μb² + c₁)(σa² + σb² + c₂))`, per channel, then the mean.
+//! `(2 μa μb + c₁)(2 σab + c₂) / ((μa² + μb² + c₁)(σa² + σb² + c₂))`, per channel, then the
+//! mean.
 //!
 //! Two variants exist and are not equal. TensoRF's keeps only windows that fit (*valid*) and forces
 //! variances to be possible. instant-nsr-pl's mirrors the border (*reflect*), which gives one value
@@ -13,24 +10,6 @@
 
 use rayon::prelude::*;
 use tiface_base::image::Image;
-
-/// PSNR in dB of two three-channel pictures of one size, over the pixels where `inside` holds, or
-/// all. `None` without pixels, with different sizes, or without any difference.
-pub fn psnr(a: &Image, b: &Image, inside: Option<&[bool]>) -> Option<f64> {
-    if (a.width, a.height, a.channels) != (b.width, b.height, b.channels) {
-        return None;
-    }
-    let (mut sum, mut count) = (0.0f64, 0usize);
-    let pixels = a.data.chunks_exact(a.channels).zip(b.data.chunks_exact(b.channels));
-    for (i, (x, y)) in pixels.enumerate() {
-        if inside.is_none_or(|m| m.get(i) == Some(&true)) {
-            sum += x.iter().zip(y).map(|(x, y)| (*x as f64 - *y as f64).powi(2)).sum::<f64>();
-            count += a.channels;
-        }
-    }
-    let value = -10.0 * (sum / count as f64).log10();
-    value.is_finite().then_some(value)
-}
 
 const WINDOW: usize = 11;
 const RADIUS: usize = WINDOW / 2;
@@ -129,14 +108,6 @@ fn blur(plane: &[f64], width: usize) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_golden_pair_has_its_golden_value() {
-        let (a, b) = crate::metrics::golden();
-        assert!((psnr(&a, &b, None).unwrap() - 10.5292616).abs() < 1e-6);
-        assert_eq!(psnr(&a, &a, None), None);
-        assert_eq!(psnr(&a, &b, Some(&[false; 576])), None);
-    }
 
     #[test]
     fn the_golden_pair_has_both_golden_values() {
