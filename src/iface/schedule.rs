@@ -32,10 +32,11 @@ pub fn adam_steps(config: &IfaceConfig, factor: f64, step: u64) -> [AdamStep; 3]
     [AdamStep { skip_zero: config.touched_rows, ..table }, network, variance]
 }
 
-/// Returns the rule by which the number of rays adapts to the samples of the previous step.
-pub fn ray_budget(config: &IfaceConfig) -> RayBudget {
+/// Returns the rule by which the number of rays of a step adapts to the samples of the one before.
+pub fn ray_budget(config: &IfaceConfig, step: u64) -> RayBudget {
     let min = if config.occupancy == OccupancyRule::Band { 64 } else { 1 };
-    RayBudget { samples: config.samples, min, max: config.max_rays }
+    let share = if step < steps(config, config.full_samples) { config.early_samples } else { 1.0 };
+    RayBudget { samples: (config.samples as f64 * share) as usize, min, max: config.max_rays }
 }
 
 /// Returns the number of active hash levels at a step.
