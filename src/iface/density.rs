@@ -22,8 +22,9 @@ use crate::field::ops::{ArrayDevice, Ops};
 use crate::field::parameters::{HostGroup, ParameterGroup, ParameterPart};
 use crate::field::pixels::RaySampler;
 use crate::field::training::{self, Model, StepAt, StepError, StepReport, TrainingSession};
-use crate::field::{self as fields, Check, ComputeDevice, self_test::TestedModel};
+use crate::field::{self as fields, ComputeDevice};
 #[cfg(feature = "wgpu")]
+use crate::field::{Check, self_test::TestedModel};
 use cpu::CpuDensity;
 #[cfg(feature = "wgpu")]
 pub(super) use gpu::GpuDensity;
