@@ -10,16 +10,19 @@
 //!
 //! 32 768 samples (256 rays of 128), 16 levels of 2 features, tables of 2¹⁹ entries, base 16,
 //! growth 1.447; color, mask and eikonal losses, backward to table and network weights, AdamW of
-//! the table. CPU time (user + system of the process) is what is compared: it does not depend on
-//! what else the machine does.
+//! the table. Colors are evaluated where a sample shows, as in training. CPU time (user + system of
+//! the process) is what is compared: it does not depend on what else the machine does. Times of
+//! networks stand beside their share of the processor's peak in f32, that of the optimizer beside
+//! its share of the memory's.
 
 mod process;
 
 use process::cpu_s;
+use process::roof::Roof;
 use tiface::kernel::cpu::adam::{AdamStep, adam};
 use tiface::kernel::cpu::hash;
 use tiface::kernel::cpu::losses::{self, LossWeights, Targets};
-use tiface::kernel::cpu::mlp::Weights;
+use tiface::kernel::cpu::mlp::{HIDDEN, OUTPUTS, OUTPUTS_PADDED, RGB_PADDED, Weights};
 use tiface::kernel::cpu::neus::{self, Segments};
 use tiface::kernel::cpu::sdf::{self, FieldShape};
 use tiface::math::rng;
@@ -88,8 +91,8 @@ const STEP: AdamStep = AdamStep {
     skip_zero: true,
 };
 
-/// A step; adds the CPU seconds of each kernel.
-fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 5]) {
+/// A step; adds the CPU seconds of each kernel. Returns the number of samples that show.
+fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 7]) -> usize {
     let mut clock = cpu_s();
     let mut lap = |k: usize| {
         let now = cpu_s();
@@ -98,10 +101,16 @@ fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 5]) {
     };
     let w = Weights::new(i.shape.layout(), &i.flat);
     let [p, m, v, g] = state;
-    let a = sdf::forward(&i.shape, bytemuck::cast_slice(p), &w, &i.x, &i.d);
+    let mut a = sdf::geometry(&i.shape, bytemuck::cast_slice(p), &w, &i.x);
     lap(0);
     let segments = Segments { offsets: &i.offsets, direction: &i.directions, t: &i.t, dt: &i.dt };
-    let out = neus::forward(segments, a.output(), 20.0, 0.5);
+    let weights = neus::weights(segments, a.output(), 20.0, 0.5);
+    lap(1);
+    let shown = neus::shown(&weights);
+    let colors = shown.len();
+    a.shade(&w, shown, &i.d);
+    lap(5);
+    let out = neus::composite(segments, a.output(), &weights);
     lap(1);
     let targets =
         Targets { offsets: &i.offsets, color: &i.directions, alpha: &i.alpha, background: &i.directions };
@@ -111,11 +120,29 @@ fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 5]) {
     lap(1);
     losses::of_samples(a.output(), &WEIGHTS, &mut g_field);
     lap(2);
-    std::hint::black_box(sdf::backward(&a, &w, &g_field, bytemuck::cast_slice_mut(g)));
+    let g_network = sdf::backward(&a, &w, &g_field, bytemuck::cast_slice_mut(g));
     lap(3);
+    let finite = |values: &[f32]| values.iter().all(|v| v.is_finite());
+    assert!(finite(&out) && finite(&g_network) && finite(g), "a value or a gradient is not finite");
     drop(a);
+    lap(6);
     adam(p, m, v, g, &STEP);
     lap(4);
+    colors
+}
+
+/// Operations of the networks in a step with `shown` colors: geometry, color, backward.
+fn operations(i: &Input, shown: usize) -> [f64; 3] {
+    let (layout, samples, shown) = (i.shape.layout(), N as f64, shown as f64);
+    let (inputs, colors) = (layout.padded(), layout.color_padded());
+    // multiply-adds of a sample: outputs, then the gradient by the inputs
+    let geometry = HIDDEN * (2 * inputs + OUTPUTS_PADDED);
+    let color = HIDDEN * (colors + HIDDEN + RGB_PADDED);
+    // gradients by weights and by what they multiply; of the first layer also second order
+    let by_geometry = HIDDEN * (4 * inputs + OUTPUTS + OUTPUTS_PADDED);
+    let by_color = HIDDEN * (2 * colors + 2 * HIDDEN + 4 + 3);
+    let twice = |multiply_adds: usize| 2.0 * multiply_adds as f64;
+    [twice(geometry) * samples, twice(color) * shown, twice(by_geometry) * samples + twice(by_color) * shown]
 }
 
 const WEIGHTS: LossWeights = LossWeights {
@@ -133,23 +160,30 @@ fn main() {
     let i = input();
     let entries = hash::entries(&i.shape.levels);
     println!("{N} samples, {entries} entries, {} threads", rayon::current_num_threads());
+    let roof = Roof::measure();
     let repeat = 10;
-    let mut state = [i.table.clone(), vec![0.0; 2 * entries], vec![0.0; 2 * entries], vec![0.0; 2 * entries]];
-    let mut parts = [0.0; 5];
-    kernels(&i, &mut state, &mut [0.0; 5]);
+    let start = [i.table.clone(), vec![0.0; 2 * entries], vec![0.0; 2 * entries], vec![0.0; 2 * entries]];
+    let mut state = start.clone();
+    let mut parts = [0.0; 7];
+    kernels(&i, &mut state, &mut [0.0; 7]);
+    let mut again = start;
+    kernels(&i, &mut again, &mut [0.0; 7]);
+    assert!(state == again, "the same step gives other bytes");
+    let mut shown = 0;
     for _ in 0..repeat {
-        kernels(&i, &mut state, &mut parts);
+        shown = kernels(&i, &mut state, &mut parts);
     }
-    let ms = parts.map(|p| 1e3 * p / repeat as f64);
-    let step: f64 = ms.iter().sum();
+    let [geometry, neus, losses, backward, adam, color, _] = parts.map(|p| 1e3 * p / repeat as f64);
+    let step = geometry + neus + losses + backward + adam + color;
+    let of = operations(&i, shown);
     println!(
-        "a step {step:7.1} CPU ms, {:.0} k samples per core-second: forward {:.1}, NeuS {:.1}, losses {:.1}, backward {:.1}, \
-         AdamW {:.1}",
+        "a step {step:.1} CPU ms, {:.0} k samples per core-second, {shown} of {N} samples show: geometry {}, color {}, \
+         NeuS {neus:.1}, losses {losses:.1}, backward {}, AdamW {}",
         N as f64 / step,
-        ms[0],
-        ms[1],
-        ms[2],
-        ms[3],
-        ms[4]
+        roof.computed(geometry, of[0]),
+        roof.computed(color, of[1]),
+        roof.computed(backward, of[2]),
+        // at most: three arrays and the gradient, read and written
+        roof.moved(adam, (8 * 4 * 2 * entries) as f64),
     );
 }

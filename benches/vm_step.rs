@@ -10,13 +10,14 @@
 //! of both grids, backward to every parameter, Adam.
 //!
 //! CPU time (user + system of the process) is what is compared: it does not depend on what else the
-//! machine does.
+//! machine does. Adam's stands beside its share of the peak of the machine's memory.
 
 mod process;
 
 #[path = "vm_step/scene.rs"]
 mod scene;
 
+use process::roof::Roof;
 use process::{cpu_s, peak_gib};
 use scene::{Scene, scene};
 use tiface::kernel::cpu::adam::{AdamStep, adam};
@@ -67,7 +68,7 @@ impl Training {
 
     /// One step; adds the seconds of forward, losses, backward, penalty, Adam. Densities looked up,
     /// colors decoded.
-    fn step(&mut self, s: &Scene, parts: &mut [f64; 5]) -> [u64; 2] {
+    fn step(&mut self, s: &Scene, parts: &mut [f64; 6]) -> [u64; 2] {
         let mut clock = cpu_s();
         let mut lap = |k: usize| {
             let now = cpu_s();
@@ -88,6 +89,9 @@ impl Training {
         vm::penalize(&self.field.density, TV, density, g_density);
         vm::penalize(&self.field.color, TV, color, g_color);
         lap(3);
+        let finite = self.arrays.iter().all(|[.., g]| g.iter().all(|g| g.is_finite()));
+        assert!(finite, "a gradient is not finite");
+        lap(5);
         for ([p, m, v, g], step) in self.arrays.iter_mut().zip([GRID, GRID, NETWORK]) {
             adam(p, m, v, g, &step);
         }
@@ -96,28 +100,30 @@ impl Training {
     }
 }
 
-fn regime(name: &str, size: [usize; 3], peak: f32, repeat: usize) {
+fn regime(roof: &Roof, name: &str, size: [usize; 3], peak: f32, repeat: usize) {
     let s = scene(size, peak, RAYS);
     let lattice: u64 = s.rays.iter().map(|r| s.field.lattice.points(r)).sum();
     let [density, color, network] = [s.density.len(), s.color.len(), s.network.len()];
     println!("\n{name}: {size:?} vertices, {density} + {color} + {network} parameters");
     for masked in [true, false] {
         let mut training = Training::new(&s, masked);
-        let mut parts = [0.0; 5];
+        let mut parts = [0.0; 6];
         let mut counts = [0; 2];
-        (0..3).for_each(|_| counts = training.step(&s, &mut [0.0; 5]));
+        (0..3).for_each(|_| counts = training.step(&s, &mut [0.0; 6]));
         (0..repeat).for_each(|_| counts = training.step(&s, &mut parts));
-        let [forward, losses, backward, penalty, adam] = parts.map(|p| 1e3 * p / repeat as f64);
+        let [forward, losses, backward, penalty, adam, _] = parts.map(|p| 1e3 * p / repeat as f64);
         let step = forward + losses + backward + penalty + adam;
         println!(
             "  {} {step:8.1} CPU ms: {:6.1} k rays, {:7.0} k lattice samples per core-second; a ray looks up {:.1} and \
              decodes {:.1}\n      march + forward {forward:.1}, losses {losses:.1}, backward {backward:.1}, penalty \
-             {penalty:.1}, Adam {adam:.1}",
+             {penalty:.1}, Adam {}",
             if masked { "masked " } else { "no mask" },
             RAYS as f64 / step,
             lattice as f64 / step,
             counts[0] as f64 / RAYS as f64,
             counts[1] as f64 / RAYS as f64,
+            // values, moments and gradient, read and written
+            roof.moved(adam, (8 * 4 * (density + color + network)) as f64),
         );
     }
     println!("  most memory so far {:.1} GiB", peak_gib());
@@ -125,7 +131,8 @@ fn regime(name: &str, size: [usize; 3], peak: f32, repeat: usize) {
 
 fn main() {
     println!("{RAYS} rays, {} threads", rayon::current_num_threads());
-    regime("early", [141, 157, 94], 1.0, 10);
-    regime("late", [141, 157, 94], 60.0, 10);
-    regime("last grid", [331, 368, 220], 140.0, 5);
+    let roof = Roof::measure();
+    regime(&roof, "early", [141, 157, 94], 1.0, 10);
+    regime(&roof, "late", [141, 157, 94], 60.0, 10);
+    regime(&roof, "last grid", [331, 368, 220], 140.0, 5);
 }

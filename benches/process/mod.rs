@@ -3,6 +3,8 @@
 // each bench takes what it needs
 #![allow(dead_code)]
 
+pub mod roof;
+
 use std::time::Instant;
 
 /// User + system time of this process, seconds (Linux; wall time elsewhere).

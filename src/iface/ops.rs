@@ -90,7 +90,8 @@ pub trait SdfOps: Ops {
     /// Draws random stereo points, which are evaluated together with the samples.
     fn append_points(&mut self, at: StepAt);
 
-    /// Evaluates the field with the first `levels` of its hash grid at samples and points.
+    /// Evaluates the field with the first `levels` of its hash grid at samples and points. Colors
+    /// may wait until [`neus`](SdfOps::neus) knows which samples show.
     fn sdf_field(&mut self, groups: &SdfGroups<Self>, levels: usize);
 
     /// Composites the samples of each ray; `anneal` is the share of the hard cosine.

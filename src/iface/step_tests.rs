@@ -175,6 +175,10 @@ fn formulas(
         }
     }
     let single = neus::composite(segments, &off, inv_s, anneal);
+    // a sample that does not show counts as black: what is left of the opacity
+    let mut white = outputs.clone();
+    white.chunks_mut(8).for_each(|out| out[4] = of(1.0));
+    let showing = neus::composite(segments, &white, inv_s, anneal);
 
     let (mut squares, mut of_samples, mut cross) = (of(0.0), of(0.0), of(0.0));
     let (mut met, mut full) = (0.0, 0.0);
@@ -194,7 +198,9 @@ fn formulas(
         }
         if a > 0.999 {
             full += 1.0;
-            of_samples += (0..3).map(|c| single[9 * r + c]).sum();
+            let black = out[3] - showing[9 * r];
+            let head = |c: usize| of(f64::from(batch.color[r][c]));
+            of_samples += (0..3).map(|c| single[9 * r + c] + head(c) * head(c) * black).sum();
         }
         let p = out[3].within(1e-3, 1.0 - 1e-3);
         cross += -(of(a) * p.ln() + of(1.0 - a) * (of(1.0) - p).ln());

@@ -124,26 +124,44 @@ impl<'a> Lookup<'a> {
     /// Returns the sum over terms and channels of plane times line.
     #[inline(always)]
     pub fn sum<const F: bool>(&self, cell: &Cell) -> f32 {
-        let mut sums = [0f32; 16];
+        // a number of channels that is known leaves nothing to ask at each sample
+        match self.terms.each_ref().map(|term| term.channels) {
+            [8, 8, 8] => self.sum_of::<F, 8>(cell),
+            _ => self.sum_of::<F, 0>(cell),
+        }
+    }
+
+    /// As [`Lookup::sum`], of `N` channels a term, or of any number if it is 0.
+    #[inline(always)]
+    fn sum_of<const F: bool, const N: usize>(&self, cell: &Cell) -> f32 {
+        // of whole lanes and of what is left of the channels, apart so that lanes stay whole
+        let (mut sums, mut rest) = ([0f32; 8], 0f32);
         for i in 0..3 {
             let term = &self.terms[i];
-            let at = corners(i, cell, term.width, term.channels);
+            let channels = if N > 0 { N } else { term.channels };
+            let at = corners(i, cell, term.width, channels);
             let axis = LINE_AXIS[i];
-            let line = cell.index[axis] as usize * term.channels;
-            in_pieces!(term.channels, c, W, {
+            let line = cell.index[axis] as usize * channels;
+            in_pieces!(channels, c, W, {
                 let (p, v) = look_up::<F, W>(term, &at, line, cell.frac[axis], c);
                 for k in 0..W {
-                    sums[k] = fma::<F>(p[k], v[k], sums[k]);
+                    if W >= 8 {
+                        sums[k % 8] = fma::<F>(p[k], v[k], sums[k % 8]);
+                    } else {
+                        rest = fma::<F>(p[k], v[k], rest);
+                    }
                 }
             });
         }
-        // by halves: one after the other, sixteen additions would wait for each other
-        for half in [8, 4, 2, 1] {
+        // By halves, since eight additions in a row would wait for each other. Seen together with
+        // them, products are computed one by one.
+        let mut sums = std::hint::black_box(sums);
+        for half in [4, 2, 1] {
             for k in 0..half {
                 sums[k] += sums[k + half];
             }
         }
-        sums[0]
+        sums[0] + rest
     }
 
     /// Writes plane and line values of all channels, term by term. Both slices are `[channels]` or
@@ -217,7 +235,18 @@ fn add_pair<const F: bool>(into: &mut [f32], g: &[f32], a: f32, b: f32, n: usize
 
 #[inline(always)]
 fn band_body<const F: bool>(band: &mut ScatterBand, gradients: &FactorGradients) {
-    let n = band.channels;
+    // the ranks of our presets
+    match band.channels {
+        8 => band_of::<F, 8>(band, gradients),
+        24 => band_of::<F, 24>(band, gradients),
+        _ => band_of::<F, 0>(band, gradients),
+    }
+}
+
+/// Adds gradients to a part of `N` channels, or of any number if it is 0.
+#[inline(always)]
+fn band_of<const F: bool, const N: usize>(band: &mut ScatterBand, gradients: &FactorGradients) {
+    let n = if N > 0 { N } else { band.channels };
     if band.line {
         let axis = LINE_AXIS[band.term];
         for (s, cell) in gradients.cells.iter().enumerate() {
