@@ -1,7 +1,7 @@
 //! Triangles that pass through others: found in a finished mesh, and refused in the making.
 //!
 //! Triangles are entered into the cells of a grid that their boxes meet. The test of a pair is the
-//! one of `mesh::files::check`; before it, a triangle strictly on one side of the other's plane is
+//! one of `files::check`; before it, a triangle strictly on one side of the other's plane is
 //! let go.
 
 use super::rings::{NONE, Rings};
