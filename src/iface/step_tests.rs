@@ -237,7 +237,9 @@ fn formulas(
 fn agrees(config: &IfaceConfig) {
     let views = views();
     let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, config.foreground, true);
-    agrees_on(CpuSdf::new(config, &sampler), config, &sampler, [1e-5, 1e-3]);
+    // the worst entry is one that a few samples of little opacity touch, the difference of two
+    // sigmoids near one
+    agrees_on(CpuSdf::new(config, &sampler), config, &sampler, [1e-5, 2e-3]);
     #[cfg(feature = "wgpu")]
     if let Some(device) = tiface_kernels::gpu::testing::device() {
         agrees_on(GpuSdf::new(config, &sampler, device).unwrap(), config, &sampler, [1e-4, 1e-2]);
