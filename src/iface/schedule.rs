@@ -136,6 +136,17 @@ mod tests {
     }
 
     #[test]
+    fn a_draft_has_half_the_samples_for_three_fifths_of_its_steps_and_the_paper_all() {
+        let samples = |preset: Preset, steps: u64, step: u64| {
+            ray_budget(&IfaceConfig { steps, ..IfaceConfig::preset(preset) }, step).samples
+        };
+        let draft = [0, 1799, 1800, 2999].map(|step| samples(Preset::Draft, 3000, step));
+        assert_eq!(draft, [12_288, 12_288, 24_576, 24_576]);
+        let paper = [0, 11_999, 19_999].map(|step| samples(Preset::Paper, 20_000, step));
+        assert_eq!(paper, [262_144; 3]);
+    }
+
+    #[test]
     fn rays_stand_for_less_as_levels_come_and_for_a_pixel_in_the_second_half() {
         let config = IfaceConfig { steps: 3200, ..IfaceConfig::preset(Preset::Draft) };
         // all fourteen levels after a quarter of the steps, eight of them in intervals of a

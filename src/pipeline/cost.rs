@@ -191,9 +191,10 @@ impl<'a> Workload<'a> {
 
     fn iface(&self) -> (f64, f64) {
         let (c, all) = (&self.config.iface, self.all);
-        let samples = (c.steps as usize * c.samples) as f64;
+        let share = 1.0 - (1.0 - c.early_samples) * c.full_samples;
+        let samples = (c.steps as usize * c.samples) as f64 * share;
         let table = ((c.levels as u64 * 2) << c.log2_table.min(32)) as f64;
-        let cpu_s = 3.8 + 2.5e-6 * samples + 2e-9 * table * c.steps as f64 + 1.8e-6 * all;
+        let cpu_s = 3.8 + 1.5e-6 * samples + 1.3e-9 * table * c.steps as f64 + 1.8e-6 * all;
         let trained = mib::TABLE_FLOAT * table + mib::SDF_SAMPLE * c.samples as f64;
         (cpu_s, mib::PIXEL * all + trained)
     }
