@@ -112,11 +112,6 @@ table! {
         all_levels: f64 => 0.25, 0.25, 0.0;
         /// Whether the color network also reads the hash features.
         color_skip: bool => true, true, false;
-        /// Share of `samples` that a step has before `full_samples`: at first only the direction of
-        /// a step matters, at the end its noise, too.
-        early_samples: f64 => 0.5, 1.0, 1.0;
-        /// Share of the steps after which each has all `samples`.
-        full_samples: f64 => 0.6;
         /// Half edge of the field's box.
         radius: f32 => 1.0, 1.0, 0.3;
         /// Initial surface.

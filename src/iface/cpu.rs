@@ -18,7 +18,7 @@ use tiface_kernels::cpu::losses::{self, RAY_TERMS, STEREO_STREAM, TERMS, Targets
 use tiface_kernels::cpu::march::Samples;
 use tiface_kernels::cpu::mlp::Weights;
 use tiface_kernels::cpu::neus::{self, Segments};
-use tiface_kernels::cpu::schedule::{Figures, RayBudget};
+use tiface_kernels::cpu::schedule::Figures;
 use tiface_kernels::cpu::sdf::{self, Activations, FieldShape, WIDTH};
 use tiface_kernels::cpu::weight_norm;
 
@@ -30,8 +30,6 @@ pub struct CpuSdf<'a> {
     occupancy: Occupancy,
     all_points: Vec<SurfacePoint>,
     rays: usize,
-    /// Rule for the rays of the next step.
-    budget: RayBudget,
     /// Number of consecutive steps without a sample.
     empty_steps: u64,
     /// Samples of the last step before truncation to the budget; `None` before the first step.
@@ -99,7 +97,6 @@ impl<'a> CpuSdf<'a> {
             occupancy: Occupancy::new(config, None),
             all_points: Vec::new(),
             rays: config.rays,
-            budget: schedule::ray_budget(config, 0),
             empty_steps: 0,
             samples_wanted: None,
             weights: None,
@@ -113,7 +110,7 @@ impl<'a> CpuSdf<'a> {
     }
 
     fn next_rays(&self) -> usize {
-        self.samples_wanted.map_or(self.rays, |n| self.budget.next(self.rays, n))
+        self.samples_wanted.map_or(self.rays, |n| schedule::ray_budget(self.config).next(self.rays, n))
     }
 }
 
@@ -168,9 +165,8 @@ impl SdfOps for CpuSdf<'_> {
         self.occupancy.update(self.config, (at.seed, at.step), self.inv_s, dt, field);
     }
 
-    fn advance(&mut self, step: u64) {
+    fn advance(&mut self) {
         self.rays = self.next_rays();
-        self.budget = schedule::ray_budget(self.config, step + 1);
         self.step.dt = schedule::step_length(self.config).at(self.inv_s);
     }
 

@@ -113,7 +113,7 @@ impl<'a> GpuSdf<'a> {
             schedule: Schedule::new(
                 &device,
                 schedule::step_length(config),
-                schedule::ray_budget(config, 0),
+                schedule::ray_budget(config),
                 config.rays,
             ),
             occupancy,
@@ -250,7 +250,7 @@ impl SdfOps for GpuSdf<'_> {
     fn load(&mut self, occupancy: &Occupancy, rays: usize, points: &[SurfacePoint]) {
         let (device, config) = (&self.device, self.config);
         (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.word_count());
-        let budget = schedule::ray_budget(config, 0);
+        let budget = schedule::ray_budget(config);
         self.schedule = Schedule::new(device, schedule::step_length(config), budget, rays);
         self.non_finite = device.zeros::<u32>(1);
         self.losses.reset_sums(device);
@@ -298,9 +298,8 @@ impl SdfOps for GpuSdf<'_> {
         }
     }
 
-    fn advance(&mut self, step: u64) {
+    fn advance(&mut self) {
         self.schedule.advance(&self.device, &self.inv_s, &self.samples.count, !self.stepped);
-        self.schedule.budget = schedule::ray_budget(self.config, step + 1);
         self.stepped = true;
     }
 

@@ -77,9 +77,8 @@ pub trait SdfOps: Ops {
     /// contain surface.
     fn update_occupancy(&mut self, groups: &SdfGroups<Self>, levels: usize, at: StepAt);
 
-    /// Computes march step and number of rays of a step from the sharpness and the samples of the
-    /// step before.
-    fn advance(&mut self, step: u64);
+    /// Computes march step and number of rays from the sharpness and the samples of the last step.
+    fn advance(&mut self);
 
     /// Draws rays. A ray of a large photograph stands for a square of pixels at most `detail` wide.
     fn draw(&mut self, at: StepAt, detail: f32);

@@ -32,11 +32,10 @@ pub fn adam_steps(config: &IfaceConfig, factor: f64, step: u64) -> [AdamStep; 3]
     [AdamStep { skip_zero: config.touched_rows, ..table }, network, variance]
 }
 
-/// Returns the rule by which the number of rays of a step adapts to the samples of the one before.
-pub fn ray_budget(config: &IfaceConfig, step: u64) -> RayBudget {
+/// Returns the rule by which the number of rays adapts to the samples of the previous step.
+pub fn ray_budget(config: &IfaceConfig) -> RayBudget {
     let min = if config.occupancy == OccupancyRule::Band { 64 } else { 1 };
-    let share = if step < steps(config, config.full_samples) { config.early_samples } else { 1.0 };
-    RayBudget { samples: (config.samples as f64 * share) as usize, min, max: config.max_rays }
+    RayBudget { samples: config.samples, min, max: config.max_rays }
 }
 
 /// Returns the number of active hash levels at a step.
@@ -133,17 +132,6 @@ mod tests {
         assert_eq!((updates(&few), updates(&many)), (8 + 13, 8 + 13));
         let one = IfaceConfig { steps: 1, ..few };
         assert!(updates_occupancy(&one, 0) && learning_rate(&one, 0) > 0.0 && anneal(&one, 0) == 0.0);
-    }
-
-    #[test]
-    fn a_draft_has_half_the_samples_for_three_fifths_of_its_steps_and_the_paper_all() {
-        let samples = |preset: Preset, steps: u64, step: u64| {
-            ray_budget(&IfaceConfig { steps, ..IfaceConfig::preset(preset) }, step).samples
-        };
-        let draft = [0, 1799, 1800, 2999].map(|step| samples(Preset::Draft, 3000, step));
-        assert_eq!(draft, [12_288, 12_288, 24_576, 24_576]);
-        let paper = [0, 11_999, 19_999].map(|step| samples(Preset::Paper, 20_000, step));
-        assert_eq!(paper, [262_144; 3]);
     }
 
     #[test]

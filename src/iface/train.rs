@@ -209,7 +209,7 @@ impl<O: SdfOps> Model for SdfModel<'_, O> {
     fn backward(&mut self, at: StepAt) {
         let (config, ops) = (self.config, &mut self.ops);
         let anneal = schedule::anneal(config, at.step);
-        ops.advance(at.step);
+        ops.advance();
         ops.draw(at, schedule::detail(config, at.step));
         ops.march();
         ops.append_points(at);

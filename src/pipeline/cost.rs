@@ -179,8 +179,9 @@ impl<'a> Workload<'a> {
             _ if has_shell(&c) => 2.3,
             _ => 1.0,
         };
-        // samples along a ray are as dense as the grid
-        let ray = outside * (3e-6 + 0.09e-6 * (c.voxels_final as f64).cbrt());
+        // samples along a ray are as dense as the grid; many of them share a color
+        let sample = if c.group_weight > 0.0 { 0.04e-6 } else { 0.09e-6 };
+        let ray = outside * (3e-6 + sample * (c.voxels_final as f64).cbrt());
         let cpu_s = 0.1 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
         let trained = mib::VM_PARAMETER * parameters + mib::VM_RAY * c.rays as f64;
         match c.import.is_empty() {
@@ -191,8 +192,7 @@ impl<'a> Workload<'a> {
 
     fn iface(&self) -> (f64, f64) {
         let (c, all) = (&self.config.iface, self.all);
-        let share = 1.0 - (1.0 - c.early_samples) * c.full_samples;
-        let samples = (c.steps as usize * c.samples) as f64 * share;
+        let samples = (c.steps as usize * c.samples) as f64;
         let table = ((c.levels as u64 * 2) << c.log2_table.min(32)) as f64;
         let cpu_s = 3.8 + 1.5e-6 * samples + 1.3e-9 * table * c.steps as f64 + 1.8e-6 * all;
         let trained = mib::TABLE_FLOAT * table + mib::SDF_SAMPLE * c.samples as f64;

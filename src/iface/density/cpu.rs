@@ -69,8 +69,7 @@ impl<'a> CpuDensity<'a> {
     }
 
     fn next_rays(&self) -> usize {
-        self.last_samples
-            .map_or(self.rays, |n| schedule::ray_budget(self.config, self.config.steps).next(self.rays, n))
+        self.last_samples.map_or(self.rays, |n| schedule::ray_budget(self.config).next(self.rays, n))
     }
 
     fn field<'g>(&self, [table, network]: &'g DensityGroups<Self>) -> (&'g [[f32; 2]], DensityWeights) {

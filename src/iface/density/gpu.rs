@@ -63,7 +63,7 @@ impl<'a> GpuDensity<'a> {
         let (capacity, resident) = max_samples(config, sampler, &device)?;
         let drawing = SamplingOptions { jitter: config.jitter, background: false, background_stream: 0 };
         let (occupancy, cells) = cells(&device, config, &Occupancy::new(config, None), capacity);
-        let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config, config.steps));
+        let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         Ok(GpuDensity {
             config,
             sampler,
@@ -118,7 +118,7 @@ impl DensityOps for GpuDensity<'_> {
     fn load(&mut self, occupancy: &Occupancy, rays: usize) {
         let (device, config) = (&self.device, self.config);
         (self.occupancy, self.cells) = cells(device, config, occupancy, self.samples.t.word_count());
-        let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config, config.steps));
+        let (length, budget) = (schedule::step_length(config), schedule::ray_budget(config));
         self.schedule = Schedule::new(device, length, budget, rays);
         self.non_finite = device.zeros::<u32>(1);
         self.density.reset_sums(device);

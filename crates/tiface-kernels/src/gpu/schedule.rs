@@ -70,8 +70,7 @@ const SUMS: usize = TERMS + 2;
 /// The number of rays and the length of a march step, updated on the device.
 pub struct Schedule {
     rule: StepLength,
-    /// Rule for the rays of the next step.
-    pub budget: RayBudget,
+    budget: RayBudget,
     /// `[1]`: number of rays of the current step.
     pub rays: Buffer,
     /// `[1]`: length of a march step in the current step, in field units.

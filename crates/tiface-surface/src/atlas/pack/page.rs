@@ -138,12 +138,7 @@ fn next(row: &[u64], x: usize, end: usize, set: bool) -> usize {
 
 /// Returns the first row whose longest run of free cells is shorter than the longest of the mask.
 fn narrow_row(free: &[u32], longest: &[u32]) -> Option<usize> {
-    for r in 0..longest.len() {
-        if free[r] < longest[r] {
-            return Some(r);
-        }
-    }
-    None
+    longest.iter().zip(free).position(|(longest, free)| free < longest)
 }
 
 /// `0..n` by halving: 0, n − 1, the middle, the quarters, ...
