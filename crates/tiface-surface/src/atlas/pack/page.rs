@@ -138,7 +138,11 @@ fn next(row: &[u64], x: usize, end: usize, set: bool) -> usize {
 
 /// Returns the first row whose longest run of free cells is shorter than the longest of the mask.
 fn narrow_row(free: &[u32], longest: &[u32]) -> Option<usize> {
-    longest.iter().zip(free).position(|(longest, free)| free < longest)
+    let mut r = 0;
+    while r < longest.len() && free[r] >= longest[r] {
+        r += 1;
+    }
+    (r < longest.len()).then_some(r)
 }
 
 /// `0..n` by halving: 0, n − 1, the middle, the quarters, ...
