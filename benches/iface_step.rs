@@ -103,10 +103,11 @@ fn kernels(i: &Input, state: &mut [Vec<f32>; 4], parts: &mut [f64; 7]) -> usize 
     let [p, m, v, g] = state;
     let mut a = sdf::geometry(&i.shape, bytemuck::cast_slice(p), &w, &i.x);
     lap(0);
-    let segments = Segments { offsets: &i.offsets, direction: &i.directions, t: &i.t, dt: &i.dt };
+    let segments =
+        Segments { offsets: &i.offsets, direction: &i.directions, t: &i.t, dt: &i.dt, min_weight: 1e-4 };
     let weights = neus::weights(segments, a.output(), 20.0, 0.5);
     lap(1);
-    let shown = neus::shown(&weights);
+    let shown = neus::shown(&weights, 1e-4);
     let colors = shown.len();
     a.shade(&w, shown, &i.d);
     lap(5);

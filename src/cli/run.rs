@@ -7,7 +7,7 @@ use super::requirement::Requirement;
 use super::screen::print;
 use super::summary::summary;
 use super::target::RunTarget;
-use crate::config::{Fallback, RenderConfig, key};
+use crate::config::{Fallback, RenderConfig, SETTINGS_FILE, key};
 use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::duration;
 use crate::run::{Cost, Phase, Run, RunStatus};
@@ -109,7 +109,7 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
 
 /// Returns the settings that a run was last worked on with, as text; `None` if it has not begun.
 fn saved_config(run: &Run) -> Option<String> {
-    let bytes = io::read_bytes(&run.path("config.toml"), &io::Limits::default()).ok()?;
+    let bytes = io::read_bytes(&run.path(SETTINGS_FILE), &io::Limits::default()).ok()?;
     Some(without_device(&String::from_utf8_lossy(&bytes)))
 }
 
@@ -173,7 +173,7 @@ pub(super) fn in_words(cost: Cost) -> String {
 /// Returns how the evaluation's views are rendered: by the run's saved settings, else by the
 /// defaults and `--set`, but not by the options of this command.
 fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
-    let kept = Some(target.run.join("config.toml")).filter(|file| io::is_file(file));
+    let kept = Some(target.run.join(SETTINGS_FILE)).filter(|file| io::is_file(file));
     let config = match kept {
         Some(kept) => Common::default().resolve(Some(&kept), None, &[])?,
         None => common.resolve(None, None, &[])?,

@@ -112,6 +112,9 @@ table! {
         all_levels: f64 => 0.25, 0.25, 0.0;
         /// Whether the color network also reads the hash features.
         color_skip: bool => true, true, false;
+        /// Weight along a ray above which the color of a sample counts, which is that of TensoRF;
+        /// 0: each sample has its color (published).
+        min_weight: f32 => 1e-4, 1e-4, 0.0;
         /// Half edge of the field's box.
         radius: f32 => 1.0, 1.0, 0.3;
         /// Initial surface.

@@ -61,9 +61,9 @@ struct CpuStep {
 }
 
 impl CpuStep {
-    fn segments(&self) -> Segments<'_> {
+    fn segments(&self, min_weight: f32) -> Segments<'_> {
         let Samples { offsets, t } = &self.samples;
-        Segments { offsets, direction: &self.direction, t, dt: &self.dts }
+        Segments { offsets, direction: &self.direction, t, dt: &self.dts, min_weight }
     }
 
     fn is_empty(&self) -> bool {
@@ -210,13 +210,14 @@ impl SdfOps for CpuSdf<'_> {
 
     fn neus(&mut self, anneal: f32) {
         let mut activations = self.step.activations.take();
-        let step = &self.step;
-        let weights = neus::weights(step.segments(), output(&activations), self.inv_s, anneal);
+        let min_weight = self.config.min_weight;
+        let segments = self.step.segments(min_weight);
+        let weights = neus::weights(segments, output(&activations), self.inv_s, anneal);
         if let Some(activations) = &mut activations {
             // points have no color: no loss asks for one
-            activations.shade(self.prepared(), neus::shown(&weights), &step.along);
+            activations.shade(self.prepared(), neus::shown(&weights, min_weight), &self.step.along);
         }
-        let composed = neus::composite(step.segments(), output(&activations), &weights);
+        let composed = neus::composite(segments, output(&activations), &weights);
         (self.step.composed, self.step.activations) = (composed, activations);
     }
 
@@ -228,8 +229,13 @@ impl SdfOps for CpuSdf<'_> {
         let (of_rays, g_composed) = losses::of_rays(&step.composed, targets, &w);
         let field = output(&step.activations);
         let n = step.samples.t.len();
-        let (mut g_field, g_inv_s) =
-            neus::backward(step.segments(), &field[..n * WIDTH], self.inv_s, anneal, &g_composed);
+        let (mut g_field, g_inv_s) = neus::backward(
+            step.segments(self.config.min_weight),
+            &field[..n * WIDTH],
+            self.inv_s,
+            anneal,
+            &g_composed,
+        );
         let of_samples = losses::of_samples(&field[..n * WIDTH], &w, &mut g_field);
         g_field.resize(field.len(), 0.0);
         let points: Vec<[f32; 2]> = step.points.iter().map(|p| [p.footprint, p.weight]).collect();

@@ -103,7 +103,7 @@ impl<'a> GpuSdf<'a> {
             total_count: device.zeros::<u32>(1),
             norm: WeightNorm::new(&device, shape.layout()),
             sdf: Sdf::new(&device, &shape, capacity),
-            neus: Neus::new(&device, rays, capacity),
+            neus: Neus::new(&device, rays, capacity, config.min_weight),
             losses: Losses::new(&device, weights, rays, capacity),
             flat: device.zeros::<f32>(flat),
             g_flat: device.zeros::<f32>(flat),

@@ -205,7 +205,8 @@ impl IFace {
     fn render_pass(&self, rays: &[Ray]) -> Vec<RayResult> {
         let dt = step_length(&self.config).at(self.inv_s);
         let marched: Vec<Ray> = rays.iter().map(|r| r.scaled(self.config.radius)).collect();
-        if let Some(composited) = self.on_gpu.ask(|field| field.render(&marched, dt)) {
+        if let Some(composited) = self.on_gpu.ask(|field| field.render(&marched, dt, self.config.min_weight))
+        {
             return composited.iter().map(|o| self.result(o)).collect();
         }
         self.composite(&marched, dt).iter().map(|o| self.result(o)).collect()
@@ -236,16 +237,20 @@ impl IFace {
             }
             let mut field = sdf::geometry(&self.shape, self.table(), &self.weights, &x);
             let direction: Vec<[f32; 3]> = open.iter().map(|&(r, _)| rays[r].direction.to_array()).collect();
-            let pieces = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &vec![dt; t.len()] };
-            let weights = neus::weights(pieces, field.output(), self.inv_s, 1.0);
-            field.shade(&self.weights, neus::shown(&weights), &d);
+            let (dt, min_weight) = (&vec![dt; t.len()], self.config.min_weight);
+            let pieces = Segments { offsets: &offsets, direction: &direction, t: &t, dt, min_weight };
+            let mut weights = neus::weights(pieces, field.output(), self.inv_s, 1.0);
+            for (i, &(r, _)) in open.iter().enumerate() {
+                let light = 1.0 - out[r][3];
+                weights[offsets[i] as usize..offsets[i + 1] as usize].iter_mut().for_each(|w| *w *= light);
+            }
+            field.shade(&self.weights, neus::shown(&weights, min_weight), &d);
             let composited = neus::composite(pieces, field.output(), &weights);
             let mut pieces = composited.as_chunks::<{ neus::RAY_WIDTH }>().0.iter();
             open.retain_mut(|(r, k)| {
                 let out = &mut out[*r];
-                let light = 1.0 - out[3];
                 for (out, piece) in out.iter_mut().zip(pieces.next().into_iter().flatten()) {
-                    *out += light * piece;
+                    *out += piece;
                 }
                 *k += AHEAD;
                 1.0 - out[3] > OPAQUE && *k < end(*r)

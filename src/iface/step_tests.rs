@@ -161,7 +161,13 @@ fn formulas(
     let n = t.len();
     assert!(n > 150, "{n} samples");
     let steps = vec![dt as f32; n];
-    let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &steps };
+    let segments = Segments {
+        offsets: &offsets,
+        direction: &direction,
+        t: &t,
+        dt: &steps,
+        min_weight: config.min_weight,
+    };
     let anneal = step as f64 / (config.anneal_end * config.steps as f64).round();
     let seen = neus::composite(segments, &outputs, inv_s, anneal);
     // Σ w ‖c − head‖²: the same compositing of what each sample is off
@@ -237,9 +243,7 @@ fn formulas(
 fn agrees(config: &IfaceConfig) {
     let views = views();
     let sampler = RaySampler::new(&views, f32::INFINITY, config.radius, config.foreground, true);
-    // the worst entry is one that a few samples of little opacity touch, the difference of two
-    // sigmoids near one
-    agrees_on(CpuSdf::new(config, &sampler), config, &sampler, [1e-5, 2e-3]);
+    agrees_on(CpuSdf::new(config, &sampler), config, &sampler, [1e-5, 1e-3]);
     #[cfg(feature = "wgpu")]
     if let Some(device) = tiface_kernels::gpu::testing::device() {
         agrees_on(GpuSdf::new(config, &sampler, device).unwrap(), config, &sampler, [1e-4, 1e-2]);
@@ -247,7 +251,7 @@ fn agrees(config: &IfaceConfig) {
 }
 
 /// The third step of a training, so that the moments are some; terms and the median of the updates
-/// within the first tolerance, every update within the second.
+/// within the first tolerance, every update within the second, those of the hash table within 2e-3.
 fn agrees_on<O: SdfOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, [close, near]: [f64; 2]) {
     let dir = temporary();
     let mut model = model(ops, config, sampler, dir.path());
@@ -311,6 +315,8 @@ fn agrees_on<O: SdfOps>(ops: O, config: &IfaceConfig, sampler: &RaySampler, [clo
         errors.sort_by(f64::total_cmp);
         let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
         println!("{} of {}: median {median:.1e}, worst {worst:.1e}", errors.len(), name);
+        // an entry that a few faint samples touch is a difference of sigmoids near one
+        let near = if name == "table" { near.max(2e-3) } else { near };
         assert!(worst <= near && median <= close, "{name}: median {median:.1e}, worst {worst:.1e}");
     }
 }

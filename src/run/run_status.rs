@@ -5,7 +5,7 @@ use super::estimate::read_estimate;
 use super::failure::read_failure;
 use super::record::{Fault, Record, read_record};
 use super::status::{State, Status, host, read_status};
-use crate::config::{Config, Stage};
+use crate::config::{Config, SETTINGS_FILE, Stage};
 use serde::Serialize;
 use std::path::Path;
 use tiface_base::io;
@@ -98,7 +98,7 @@ impl RunStatus {
             };
         }
         let failure = read_failure(run);
-        let settings = Some(run.join("config.toml")).filter(|file| io::is_file(file));
+        let settings = Some(run.join(SETTINGS_FILE)).filter(|file| io::is_file(file));
         let settings = settings.and_then(|file| Config::read(&file).err());
         let has = |phase: Phase| stages.iter().rev().find(|s| s.phase == phase);
         let is_done = match &estimate {

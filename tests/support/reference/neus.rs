@@ -2,7 +2,7 @@
 
 use super::{Real, sigmoid};
 use std::array::from_fn;
-use tiface_kernels::cpu::neus::{MIN_WEIGHT, RAY_WIDTH, Segments};
+use tiface_kernels::cpu::neus::{RAY_WIDTH, Segments};
 use tiface_kernels::cpu::sdf::WIDTH;
 
 /// `[rays, 9]` of a field `[samples, 8]`, of any sharpness.
@@ -24,7 +24,7 @@ pub(crate) fn composite<R: Real>(segments: Segments, field: &[R], inv_s: R, anne
             let (p, q) = (sigmoid((f[0] - half) * sharp), sigmoid((f[0] + half) * sharp));
             let alpha = ((p - q + of(1e-5)) / (p + of(1e-5))).within(0.0, 1.0);
             let w = transmittance * alpha;
-            if w.value() > MIN_WEIGHT.into() {
+            if w.value() > segments.min_weight.into() {
                 for c in 0..3 {
                     out[c] += w * f[4 + c];
                 }

@@ -231,6 +231,7 @@ fn spheres(cases: &mut Cases) {
                 direction: &[r.direction.to_array()],
                 t: &samples.t,
                 dt: &dt,
+                min_weight: 0.0,
             };
             let out = neus::forward(segments, &field, inv_s, 1.0);
             (out[3] as f64, (out[4] / out[3]) as f64)

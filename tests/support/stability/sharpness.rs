@@ -47,7 +47,13 @@ impl Bundle {
     }
 
     fn rays(&self) -> Segments<'_> {
-        Segments { offsets: &self.offsets, direction: &self.direction, t: &self.t, dt: &self.dt }
+        Segments {
+            offsets: &self.offsets,
+            direction: &self.direction,
+            t: &self.t,
+            dt: &self.dt,
+            min_weight: 0.0,
+        }
     }
 
     /// Distances that cross zero somewhere on each ray, on a scale that the sharpness can tell;

@@ -4,13 +4,14 @@
 /// has.
 ///
 /// `fn name / body / wide (args)` has a level more: `wide::<true>(args)` on CPUs with vectors of
-/// 512 bits. Other code gains nothing from them, and takes its time to compile.
+/// 512 bits, which must compute the same bytes. Other code gains nothing from them, and takes its
+/// time to compile.
 #[macro_export]
 macro_rules! dispatch {
     ($(#[$meta:meta])* $vis:vis fn $name:ident / $body:ident ( $($a:ident : $t:ty),* $(,)? )) => {
         $(#[$meta])*
         $vis fn $name($($a: $t),*) {
-            $crate::dispatch!(run $body ($($a: $t),*));
+            $crate::dispatch!(@run $body ($($a: $t),*));
         }
     };
     ($(#[$meta:meta])* $vis:vis fn $name:ident / $body:ident / $wide:ident ( $($a:ident : $t:ty),* $(,)? )) => {
@@ -22,6 +23,7 @@ macro_rules! dispatch {
                 fn v4($($a: $t),*) { $wide::<true>($($a),*) }
                 if std::is_x86_feature_detected!("avx512f")
                     && std::is_x86_feature_detected!("avx512vl")
+                    && std::is_x86_feature_detected!("avx2")
                     && std::is_x86_feature_detected!("fma")
                     && std::is_x86_feature_detected!("bmi2")
                 {
@@ -29,10 +31,10 @@ macro_rules! dispatch {
                     return unsafe { v4($($a),*) };
                 }
             }
-            $crate::dispatch!(run $body ($($a: $t),*));
+            $crate::dispatch!(@run $body ($($a: $t),*));
         }
     };
-    (run $body:ident ($($a:ident : $t:ty),*)) => {
+    (@run $body:ident ($($a:ident : $t:ty),*)) => {
         #[cfg(target_arch = "x86_64")]
         {
             #[target_feature(enable = "avx2,fma,bmi2")]

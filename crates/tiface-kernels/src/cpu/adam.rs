@@ -43,7 +43,7 @@ const BLOCK: usize = 16;
 const GROUP: usize = 32 * BLOCK;
 
 /// Returns the blocks of the group at `first` that a step changes, a bit each, and has the CPU
-/// fetch their values and moments: it does not guess which ones are skipped.
+/// fetch their values and moments: its own prefetching cannot predict which ones are skipped.
 #[inline(always)]
 fn touched(p: &[f32], m: &[f32], v: &[f32], g: &[f32], first: usize, skip_zero: bool) -> u32 {
     let group = &g[first.min(g.len())..(first + GROUP).min(g.len())];
@@ -58,8 +58,9 @@ fn touched(p: &[f32], m: &[f32], v: &[f32], g: &[f32], first: usize, skip_zero: 
         if any {
             use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
             for values in [p, m, v] {
-                // SAFETY: the three are as long as `g`, and the block starts within it.
-                unsafe { _mm_prefetch::<_MM_HINT_T0>(values.as_ptr().add(first + BLOCK * i).cast()) };
+                let at = values.as_ptr().wrapping_add(first + BLOCK * i);
+                // SAFETY: any address may be fetched ahead; those that are not mapped are ignored.
+                unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast()) };
             }
         }
     }

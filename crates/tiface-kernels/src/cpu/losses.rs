@@ -73,7 +73,7 @@ pub struct Targets<'a> {
 ///
 /// # Shapes
 ///
-/// - composed: `[rays, 9]`, the output of [`neus::forward`](super::neus::forward)
+/// - composed: `[rays, 9]`, the output of [`neus::composite`](super::neus::composite)
 pub fn of_rays(composed: &[f32], targets: Targets, w: &LossWeights) -> ([f32; RAY_TERMS], Vec<f32>) {
     let Targets { offsets, color, alpha, background } = targets;
     let has_samples = |r: usize| offsets[r + 1] > offsets[r];

@@ -13,8 +13,8 @@
 //! The last column of the field's output is `ln(s / inv_s)` of the sample; in NeuS it is 0
 //! everywhere.
 //!
-//! A sample whose weight is at most [`MIN_WEIGHT`] counts as black, so that nobody need ask for its
-//! color; its opacity counts.
+//! A sample whose weight is at most [`Segments::min_weight`] counts as black, so its color is not
+//! evaluated; its opacity counts.
 
 use super::hash::{LANES, Lanes};
 use super::sdf::WIDTH;
@@ -37,10 +37,9 @@ pub struct Segments<'a> {
     pub t: &'a [f32],
     /// `[samples]` lengths.
     pub dt: &'a [f32],
+    /// Weight along the ray above which the color of a sample counts.
+    pub min_weight: f32,
 }
-
-/// Weight above which the color of a sample counts; that of TensoRF.
-pub const MIN_WEIGHT: f32 = 1e-4;
 
 const EPSILON: f32 = 1e-5;
 
@@ -95,11 +94,11 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Returns the values of a sample of weight `w` that are composited, before they are multiplied by
-/// it.
+/// Returns the values of a sample that are composited, before they are multiplied by its weight; it
+/// is black unless its color counts.
 #[inline]
-fn values_of(field: &[f32], w: f32, n: [f32; 3], t: f32) -> [f32; RAY_WIDTH] {
-    let [r, g, b] = if w > MIN_WEIGHT { [field[4], field[5], field[6]] } else { [0.0; 3] };
+fn values_of(field: &[f32], counts: bool, n: [f32; 3], t: f32) -> [f32; RAY_WIDTH] {
+    let [r, g, b] = if counts { [field[4], field[5], field[6]] } else { [0.0; 3] };
     [r, g, b, 1.0, t, n[0], n[1], n[2], r * r + g * g + b * b]
 }
 
@@ -209,9 +208,9 @@ pub fn weights(segments: Segments, field: &[f32], inv_s: f32, anneal: f32) -> Ve
     weights
 }
 
-/// Returns the samples whose color counts, ascending.
-pub fn shown(weights: &[f32]) -> Vec<u32> {
-    (0..weights.len() as u32).filter(|&s| weights[s as usize] > MIN_WEIGHT).collect()
+/// Returns the samples whose weight is above `min_weight`, ascending.
+pub fn shown(weights: &[f32], min_weight: f32) -> Vec<u32> {
+    (0..weights.len() as u32).filter(|&s| weights[s as usize] > min_weight).collect()
 }
 
 /// Composites the samples of each ray by their weights. The values of a ray without samples are
@@ -227,7 +226,7 @@ pub fn composite(segments: Segments, field: &[f32], weights: &[f32]) -> Vec<f32>
     out.par_chunks_mut(RAY_WIDTH).with_min_len(64).enumerate().for_each(|(r, out)| {
         for s in segments.offsets[r] as usize..segments.offsets[r + 1] as usize {
             let (f, w) = (&field[s * WIDTH..][..WIDTH], weights[s]);
-            let values = values_of(f, w, normal_of(f), segments.t[s]);
+            let values = values_of(f, w > segments.min_weight, normal_of(f), segments.t[s]);
             out.iter_mut().zip(values).for_each(|(out, value)| *out += w * value);
         }
     });
@@ -282,14 +281,15 @@ fn backward_body<const F: bool>(
             let (alpha, transmittance) = (b.raw[i].clamp(0.0, 1.0), transmittance[i]);
             let normal = [b.normal[0][i], b.normal[1][i], b.normal[2][i]];
             let w = transmittance * alpha;
+            let counts = w > segments.min_weight;
             let row = &field[s * WIDTH..][..WIDTH];
             // the loss gradient by the weight
             let mut g_w = 0f32;
-            for (g, value) in g.iter().zip(values_of(row, w, normal, segments.t[s])) {
+            for (g, value) in g.iter().zip(values_of(row, counts, normal, segments.t[s])) {
                 g_w += g * value;
             }
             let out = &mut t.g_field[(s - begin) * WIDTH..][..WIDTH];
-            if w > MIN_WEIGHT {
+            if counts {
                 for c in 0..3 {
                     out[4 + c] = w * (g[c] + 2.0 * g[8] * row[4 + c]);
                 }
@@ -388,7 +388,8 @@ mod tests {
     fn extreme_fields_have_finite_opacities_and_bounded_gradients() {
         let offsets = [0, 4];
         let (direction, t, dt) = ([[0.6, 0.0, -0.8]], [1.0, 1.1, 1.2, 1.3], [1e-9, 0.05, 3.0, 1e3]);
-        let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments =
+            Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, min_weight: 1e-4 };
         let g = [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0];
         for inv_s in [0.0, 1e-9, 1e-6, 1.0, 1e6, 1e9, f32::INFINITY] {
             for sdf in [0.0, 1e-30, -1e-6, 1.0, -1e3, 1e20] {
@@ -426,9 +427,12 @@ mod tests {
         let direction = [[0.6, 0.0, -0.8], [0.0, 0.0, 1.0], [0.36, -0.48, 0.8]];
         let t: Vec<f32> = (0..12).map(|i| 1.0 + 0.05 * i as f32).collect();
         let dt = vec![0.05f32; 12];
-        let segments = Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments =
+            Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, min_weight: 1e-4 };
         let field: Vec<f32> = (0..96)
             .map(|i| match i % 8 {
+                // so far outside that its color does not count
+                0 if i / 8 == 4 => 0.5,
                 0 => 0.12 - 0.03 * (i / 8 % 6) as f32,
                 7 => -0.1 * (i % 5) as f32,
                 1..=3 => (i as f32 * 0.7).sin() * 0.8 + if i % 8 == 3 { 0.5 } else { 0.0 },
@@ -438,6 +442,9 @@ mod tests {
         let g: Vec<f32> = (0..27).map(|i| (i as f32 * 0.9).sin()).collect();
         let (inv_s, anneal) = (30f32, 0.4f32);
         let (g_field, g_s) = backward(segments, &field, inv_s, anneal, &g);
+        let faint = |w: &f32| *w <= segments.min_weight;
+        assert!(faint(&weights(segments, &field, inv_s, anneal)[4]) && g_field[36..39] == [0.0; 3]);
+        assert!(g_field[32] != 0.0, "its opacity counts");
         let wide = reference::wide(&field);
         let at = |f: &[f64], s: f64| loss(segments, f, s, anneal as f64, &g);
         let scale = g_field.iter().fold(0f32, |a, &b| a.max(b.abs())) as f64;

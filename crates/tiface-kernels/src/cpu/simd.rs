@@ -140,7 +140,7 @@ pub fn exp<const F: bool>(x: f32) -> f32 {
     let p = fma::<F>(r, p, 1.0 / 24.0);
     let p = fma::<F>(r, p, 1.0 / 6.0);
     let p = fma::<F>(r, p, 0.5);
-    // the last sum alone rounds by what counts
+    // only the last addition rounds at the precision of the result
     let p = fma::<F>(r * r, p, r) + 1.0;
     // The lowest bits of `rounded` are n in [-126, 127], which becomes the exponent. A cast of n to
     // an integer would saturate, which keeps loops from being vectorized.

@@ -192,8 +192,8 @@ impl Projected {
     }
 }
 
-/// Interpolates brightness at the samples of a patch, which lie inside of the photograph, a pixel
-/// or more from its right and lower edge.
+/// Interpolates brightness at the samples of a patch, which lie inside of the photograph of at most
+/// 2²⁴ pixels, a pixel or more from its right and lower edge.
 #[inline(always)]
 fn interpolate(
     gray: &[f32],
@@ -202,13 +202,13 @@ fn interpolate(
     [a, b]: [Vec2; 2],
     patch: &mut [f32; PADDED],
 ) {
-    assert!(gray.len() == w * h);
+    assert!(w >= 2 && h >= 2 && gray.len() == w * h && gray.len() <= 1 << 24);
     let mut corner = [0i32; PADDED];
     let (mut fx, mut fy) = ([0f32; PADDED], [0f32; PADDED]);
     for k in 0..PADDED {
         let x = center.x + OFFSETS[1][k] * b.x + OFFSETS[0][k] * a.x;
         let y = center.y + OFFSETS[1][k] * b.y + OFFSETS[0][k] * a.y;
-        // SAFETY: the caller has them inside of the photograph; `max` and `min` also bound NaN.
+        // SAFETY: `max` and `min` bound it, NaN too, by 0 and a whole number below 2²⁴.
         let cx = unsafe { x.max(0.0).min((w - 2) as f32).to_int_unchecked::<i32>() };
         // SAFETY: as above.
         let cy = unsafe { y.max(0.0).min((h - 2) as f32).to_int_unchecked::<i32>() };

@@ -122,11 +122,11 @@ impl Evaluator {
     }
 
     /// Renders rays with march steps of `step`, and returns `[rays, 9]`: see
-    /// [`crate::cpu::neus::forward`].
-    pub fn render(&mut self, rays: &[Ray], step: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
+    /// [`crate::cpu::neus::forward`]. All calls have the same `min_weight`.
+    pub fn render(&mut self, rays: &[Ray], step: f32, min_weight: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
         let device = &self.device;
         let step = device.upload(&[step]);
-        let made = || (Samples::new(device, RAYS, CAPACITY), Neus::new(device, RAYS, CAPACITY));
+        let made = || (Samples::new(device, RAYS, CAPACITY), Neus::new(device, RAYS, CAPACITY, min_weight));
         let (samples, neus) = self.rays.get_or_insert_with(made);
         let mut out = Vec::with_capacity(rays.len());
         while out.len() < rays.len() {
@@ -201,7 +201,7 @@ mod tests {
             .collect();
         let marched = |rays: &[Ray]| march::march(&mask, None, shape.radius, step, rays, &[], usize::MAX);
         assert!(rays.len() > RAYS && marched(&rays[..RAYS]).t.len() > CAPACITY);
-        let got = evaluator.render(&rays, step).unwrap();
+        let got = evaluator.render(&rays, step, 1e-4).unwrap();
         assert_eq!(got.len(), rays.len());
         let some: Vec<usize> = (0..rays.len()).step_by(7).collect();
         let few: Vec<Ray> = some.iter().map(|&r| rays[r]).collect();
@@ -215,6 +215,7 @@ mod tests {
             direction: &along,
             t: &samples.t,
             dt: &dt,
+            min_weight: 1e-4,
         };
         let want = crate::cpu::neus::forward(segments, field.output(), 20.0, 1.0);
         let got: Vec<[f32; RAY_WIDTH]> = some.iter().map(|&r| got[r]).collect();

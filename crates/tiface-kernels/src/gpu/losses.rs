@@ -407,7 +407,7 @@ mod tests {
             alive: device.upload(&[1u32, 1, 1, 1, 1, 0]),
             ..DeviceBatch::new(&device, 6)
         };
-        let (neus, losses) = (Neus::new(&device, 6, 24), Losses::new(&device, WEIGHTS, 6, 24));
+        let (neus, losses) = (Neus::new(&device, 6, 24, 1e-4), Losses::new(&device, WEIGHTS, 6, 24));
         let (count, g_s) = (device.upload(&[24u32]), device.zeros::<f32>(1));
         let composed = neus.forward(&device, &batch, &samples, &field, &sharp, ANNEAL as f32);
         let g_out = losses.of_rays(&device, composed, &batch, &samples.offsets);

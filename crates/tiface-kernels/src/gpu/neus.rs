@@ -6,7 +6,7 @@ use super::device::{Buffer, Device, Words, groups, launch};
 use super::march::Samples;
 use super::sum::group_sum;
 use super::vec3::Vec3;
-use crate::cpu::neus::{MIN_GRADIENT_NORM, MIN_WEIGHT};
+use crate::cpu::neus::MIN_GRADIENT_NORM;
 use crate::cpu::sdf::WIDTH;
 use burn::cubecl::{self, prelude::*};
 
@@ -106,6 +106,7 @@ fn forward(
     out: &mut [f32],
     light: &mut [f32],
     anneal: f32,
+    min_weight: f32,
 ) {
     let rays = direction.len() / 3;
     let plane = t.len();
@@ -120,7 +121,7 @@ fn forward(
         for s in (offsets[r] as usize)..(offsets[r + 1] as usize) {
             let a = sample(field, plane, s, dt[s], d, inv_s, anneal);
             let w = transmittance * a.alpha;
-            let shown = select(w > MIN_WEIGHT, w, 0.0f32);
+            let shown = select(w > min_weight, w, 0.0f32);
             let color = Vec3::read(field, plane, 4 * plane + s);
             sums.rgb.add_weighted(shown, color);
             squares += shown * color.dot(color);
@@ -150,6 +151,7 @@ fn backward(
     g_field: &mut [f32],
     g_ln: &mut [f32],
     anneal: f32,
+    min_weight: f32,
 ) {
     let rays = direction.len() / 3;
     let plane = t.len();
@@ -169,7 +171,7 @@ fn backward(
             let a = sample(field, plane, s, dt[s], d, inv_s, anneal);
             let transmittance = light[s];
             let w = transmittance * a.alpha;
-            let shown = select(w > MIN_WEIGHT, 1.0f32, 0.0f32);
+            let shown = select(w > min_weight, 1.0f32, 0.0f32);
             let color = Vec3::read(field, plane, 4 * plane + s) * shown;
             // from left to right, without brackets around the dot product of the normals
             let g_w = g_rgb.dot(color)
@@ -225,6 +227,8 @@ fn sharpness(g_ln: &[f32], inv_s: &[f32], g_inv_s: &mut [f32]) {
 
 /// Buffers of compositing and its gradients.
 pub struct Neus {
+    /// Weight along the ray above which the color of a sample counts.
+    min_weight: f32,
     out: Buffer,
     light: Buffer,
     g_field: Buffer,
@@ -232,9 +236,11 @@ pub struct Neus {
 }
 
 impl Neus {
-    /// Allocates buffers for `rays` rays and up to `capacity` samples.
-    pub fn new(device: &Device, rays: usize, capacity: usize) -> Neus {
+    /// Allocates buffers for `rays` rays and up to `capacity` samples, whose color counts where
+    /// their weight along the ray is above `min_weight`.
+    pub fn new(device: &Device, rays: usize, capacity: usize, min_weight: f32) -> Neus {
         Neus {
+            min_weight,
             out: device.scratch::<f32>(RAY_WIDTH * rays),
             light: device.scratch::<f32>(capacity),
             g_field: device.scratch::<f32>(WIDTH * capacity),
@@ -284,7 +290,7 @@ impl Neus {
     ) -> &Buffer {
         launch!(device, forward::launch, groups(self.g_ln.word_count().div_ceil(UNITS as usize)), UNITS;
             samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.out, self.light;
-            anneal
+            anneal, self.min_weight
         );
         &self.out
     }
@@ -306,7 +312,7 @@ impl Neus {
         launch!(device, backward::launch, groups(self.g_ln.word_count().div_ceil(UNITS as usize)), UNITS;
             samples.offsets, rays.direction, samples.t, samples.dt, field, inv_s, self.light, g_out,
             self.g_field, self.g_ln;
-            anneal
+            anneal, self.min_weight
         );
         let one = CubeCount::new_single();
         launch!(device, sharpness::launch, one, UNITS; self.g_ln, inv_s, g_inv_s);
@@ -334,7 +340,7 @@ mod tests {
         g: &[[f32; RAY_WIDTH]],
     ) -> [Results; 2] {
         let (n, count) = (field.len(), segments.direction.len());
-        let device_neus = Neus::new(device, count, n);
+        let device_neus = Neus::new(device, count, n, segments.min_weight);
         let direction = device.upload(&planes(segments.direction, count));
         let rays = DeviceBatch { direction, ..DeviceBatch::new(device, count) };
         let samples = Samples {
@@ -396,7 +402,8 @@ mod tests {
             }
         }
         let dt = vec![0.01f32; n];
-        let segments = neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments =
+            neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, min_weight: 1e-4 };
         let g: Vec<[f32; RAY_WIDTH]> =
             (0..200).map(|r| std::array::from_fn(|k| normal(5, RAY_WIDTH * r + k))).collect();
         for (inv_s, anneal) in [(20.0, 0.0), (60.0, 0.4), (200.0, 1.0)] {
@@ -428,7 +435,8 @@ mod tests {
         let offsets: Vec<i32> = (0..=count as i32).map(|r| 4 * r).collect();
         let direction = vec![[0.6, 0.0, -0.8]; count];
         let (t, dt) = ([1.0, 1.1, 1.2, 1.3].repeat(count), [1e-9, 0.05, 3.0, 1e3].repeat(count));
-        let segments = neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt };
+        let segments =
+            neus::Segments { offsets: &offsets, direction: &direction, t: &t, dt: &dt, min_weight: 1e-4 };
         let g = vec![[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]; count];
         for inv_s in [0.0, 1e-6, 1.0, 1e6, 1e9] {
             let [(out, g_field, g_s), _] = device_and_cpu(&device, segments, &field, inv_s, 1.0, &g);

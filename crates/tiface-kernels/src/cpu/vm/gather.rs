@@ -153,8 +153,8 @@ impl<'a> Lookup<'a> {
                 }
             });
         }
-        // By halves, since eight additions in a row would wait for each other. Seen together with
-        // them, products are computed one by one.
+        // By halves, since eight additions in a row would wait for each other. Without the black
+        // box the compiler splits the products above into scalars.
         let mut sums = std::hint::black_box(sums);
         for half in [4, 2, 1] {
             for k in 0..half {
@@ -235,7 +235,7 @@ fn add_pair<const F: bool>(into: &mut [f32], g: &[f32], a: f32, b: f32, n: usize
 
 #[inline(always)]
 fn band_body<const F: bool>(band: &mut ScatterBand, gradients: &FactorGradients) {
-    // the ranks of our presets
+    // the ranks of the presets `draft` and `standard`
     match band.channels {
         8 => band_of::<F, 8>(band, gradients),
         24 => band_of::<F, 24>(band, gradients),
