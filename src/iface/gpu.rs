@@ -370,8 +370,8 @@ impl DeviceField for gpu::Evaluator {
         gpu::Evaluator::evaluate(self, points, directions, normals, channels)
     }
 
-    fn render(&mut self, rays: &[Ray], dt: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
-        gpu::Evaluator::render(self, rays, dt)
+    fn render(&mut self, rays: &[Ray], dt: f32, min_weight: f32) -> Result<Vec<[f32; RAY_WIDTH]>> {
+        gpu::Evaluator::render(self, rays, dt, min_weight)
     }
 }
 

@@ -31,7 +31,7 @@ pub(super) trait DeviceField: Send {
     ) -> Result<Vec<Vec<f32>>>;
 
     /// Returns the composited rays of a volume render with samples `dt` apart.
-    fn render(&mut self, rays: &[Ray], dt: f32) -> Result<Vec<[f32; neus::RAY_WIDTH]>>;
+    fn render(&mut self, rays: &[Ray], dt: f32, min_weight: f32) -> Result<Vec<[f32; neus::RAY_WIDTH]>>;
 }
 
 /// The trained field on the host. All positions and distances are in scene units, the box is [-1,
