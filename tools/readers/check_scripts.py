@@ -27,7 +27,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "examples"))
 import read_run  # noqa: E402
 
-LEAST_INSIDE = 0.97
+LEAST_INSIDE = 0.99
 
 
 def logged(run):
@@ -57,6 +57,9 @@ def check_cameras(run, wrong):
     cameras = {name: camera for name, camera in read_run.cameras(run).items() if camera["split"] == "test"}
     for name, camera in cameras.items():
         opaque = read_run.picture(run / f"render/textured/{name}.png")[..., 3] > 0.5
+        # a vertex of the outline may lie in the pixel beside the last opaque one
+        rows = opaque | numpy.roll(opaque, 1, 0) | numpy.roll(opaque, -1, 0)
+        opaque = rows | numpy.roll(rows, 1, 1) | numpy.roll(rows, -1, 1)
         x, y = numpy.floor(read_run.project(camera, points)).astype(int).T
         width, height = camera["size"]
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
