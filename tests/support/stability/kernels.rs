@@ -38,6 +38,10 @@ fn unit(stream: u64, i: usize) -> [f32; 3] {
     d.map(|c| c / length)
 }
 
+fn logistic(x: f64) -> f64 {
+    1.0 / (1.0 + (-x).exp())
+}
+
 /// exp, ln(1 + e), the logistic function, spherical harmonics, sRGB, AdamW.
 fn functions(cases: &mut Cases) {
     let along = |low: f32, high: f32| (0..20_000).map(move |i| low + (high - low) * i as f32 / 19_999.0);
@@ -51,10 +55,11 @@ fn functions(cases: &mut Cases) {
         let want: Vec<f64> = along(low, high).map(|x| want(x as f64)).collect();
         cases.add(name, relative(along(low, high).map(got), &want, least), bound, "relative");
     };
-    let logistic = |x: f64| 1.0 / (1.0 + (-x).exp());
     of("exp on -87..88", -87.0, 88.0, simd::exp::<false>, f64::exp, 0.0, 5e-7);
     of("ln(1 + e) on 0..1", 0.0, 1.0, simd::ln_1p::<false>, f64::ln_1p, 1e-30, 5e-7);
     of("logistic on -80..80", -80.0, 80.0, simd::sigmoid::<false>, logistic, 0.0, 1e-6);
+    let complement = |x| simd::sigmoid_and_complement::<false>(x)[1];
+    of("logistic's complement on -80..80", -80.0, 80.0, complement, |x| logistic(-x), 0.0, 1e-6);
     let coded = |c: f64| if c <= 0.0031308 { 12.92 * c } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 };
     let linear = |s: f64| if s <= 0.04045 { s / 12.92 } else { ((s + 0.055) / 1.055).powf(2.4) };
     of("sRGB from linear", 0.0, 1.0, srgb_from_linear, coded, 1e-3, 1e-6);

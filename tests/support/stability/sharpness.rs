@@ -99,8 +99,8 @@ fn sharp(cases: &mut Cases, inv_s: f32) {
         (0..RAYS)
             .for_each(|r| slopes[r * SAMPLES * WIDTH + at] = (loss(&up, r) - loss(&down, r)) / (2.0 * h));
     }
-    // each kind of value on its own scale; of a soft surface P − N is known to 3e-8 beside an ε of
-    // 1e-5
+    // each kind of value on its own scale; near a soft surface, where P and N are about 1/2, their
+    // difference is known to 3e-8 beside an ε of 1e-5
     let error = |kinds: std::ops::Range<usize>| {
         let own = |i: &usize| kinds.contains(&(i % WIDTH));
         let size = (0..field.len()).filter(own).map(|i| slopes[i] * slopes[i]).sum::<f64>();

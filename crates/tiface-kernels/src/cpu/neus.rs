@@ -18,7 +18,7 @@
 
 use super::hash::{LANES, Lanes};
 use super::sdf::WIDTH;
-use super::simd::{exp, sigmoid};
+use super::simd::{exp, sigmoid_and_complement};
 use rayon::prelude::*;
 use tiface_base::dispatch;
 
@@ -47,8 +47,10 @@ const EPSILON: f32 = 1e-5;
 struct Alpha {
     /// Opacity before it is clipped.
     raw: f32,
-    previous: f32,
-    next: f32,
+    /// P and 1 − P.
+    previous: [f32; 2],
+    /// N and 1 − N.
+    next: [f32; 2],
     ic: f32,
     ic_by_cos: f32,
 }
@@ -67,8 +69,10 @@ fn alpha_of<const F: bool>(sdf: f32, cos: f32, dt: f32, inv_s: f32, anneal: f32)
     let by_soft = if soft > 0.0 { 0.5 * (1.0 - anneal) } else { 0.0 };
     let ic_by_cos = by_soft + if hard > 0.0 { anneal } else { 0.0 };
     let half = 0.5 * ic * dt;
-    let (previous, next) = (sigmoid::<F>((sdf - half) * inv_s), sigmoid::<F>((sdf + half) * inv_s));
-    Alpha { raw: (previous - next + EPSILON) / (previous + EPSILON), previous, next, ic, ic_by_cos }
+    let [previous, next] = [sdf - half, sdf + half].map(|f| sigmoid_and_complement::<F>(f * inv_s));
+    // outside the surface the complements are the smaller ones: their difference loses fewer digits
+    let between = if sdf > 0.0 { next[1] - previous[1] } else { previous[0] - next[0] };
+    Alpha { raw: (between + EPSILON) / (previous[0] + EPSILON), previous, next, ic, ic_by_cos }
 }
 
 /// Returns the opacity of a cell of half size `half` for the occupancy grid: that of a ray that
@@ -106,8 +110,10 @@ fn values_of(field: &[f32], counts: bool, n: [f32; 3], t: f32) -> [f32; RAY_WIDT
 #[derive(Default)]
 struct Block {
     raw: Lanes,
-    previous: Lanes,
-    next: Lanes,
+    /// P and 1 − P.
+    previous: [Lanes; 2],
+    /// N and 1 − N.
+    next: [Lanes; 2],
     ic: Lanes,
     ic_by_cos: Lanes,
     /// Sharpness, clamped to [1e-6, 1e6].
@@ -137,7 +143,9 @@ fn block<const F: bool>(field: &[f32], dt: &[f32], direction: [f32; 3], inv_s: f
         b.sharp[i] = (inv_s * exp::<F>(ln_sharp[i])).clamp(1e-6, 1e6);
         let a = alpha_of::<F>(sdf[i], cos, lengths[i], b.sharp[i], anneal);
         [b.normal[0][i], b.normal[1][i], b.normal[2][i]] = n;
-        (b.raw[i], b.previous[i], b.next[i]) = (a.raw, a.previous, a.next);
+        [b.previous[0][i], b.previous[1][i]] = a.previous;
+        [b.next[0][i], b.next[1][i]] = a.next;
+        b.raw[i] = a.raw;
         (b.ic[i], b.ic_by_cos[i]) = (a.ic, a.ic_by_cos);
     }
     b
@@ -299,11 +307,13 @@ fn backward_body<const F: bool>(
             // the gradient by the unit normal has two parts: as composited, and through the cosine
             let mut g_normal = [w * g[5], w * g[6], w * g[7]];
             if alpha == b.raw[i] {
-                let (p, q, sharp) = (b.previous[i], b.next[i], b.sharp[i]);
+                let [p, not_p] = b.previous.map(|lanes| lanes[i]);
+                let [q, not_q] = b.next.map(|lanes| lanes[i]);
+                let sharp = b.sharp[i];
                 let d = p + EPSILON;
                 // α = (P − N + ε)/(P + ε): ∂P = N/(P+ε)², ∂N = −1/(P+ε)
-                let g_p = g_alpha * q / (d * d) * p * (1.0 - p);
-                let g_q = -g_alpha / d * q * (1.0 - q);
+                let g_p = g_alpha * q / (d * d) * p * not_p;
+                let g_q = -g_alpha / d * q * not_q;
                 out[0] = (g_p + g_q) * sharp;
                 let (sdf, half) = (row[0], 0.5 * b.ic[i] * segments.dt[s]);
                 // the gradient by ln s is that by the sample's offset and, divided by inv_s, that

@@ -174,6 +174,16 @@ pub fn sigmoid<const F: bool>(x: f32) -> f32 {
     1.0 / (1.0 + exp::<F>(-x))
 }
 
+/// Returns σ(x) and σ(−x) = 1 − σ(x), for |x| ≤ 87 with a relative error below 3e-7: the smaller
+/// one has no cancellation.
+#[inline(always)]
+pub fn sigmoid_and_complement<const F: bool>(x: f32) -> [f32; 2] {
+    let e = exp::<F>(-x.abs());
+    let large = 1.0 / (1.0 + e);
+    let small = e * large;
+    if x < 0.0 { [small, large] } else { [large, small] }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -185,6 +195,10 @@ mod tests {
             let want = (x as f64).exp();
             assert!(((exp::<false>(x) as f64 - want) / want).abs() < 9e-8, "exp {x}");
             assert!(((exp::<true>(x) as f64 - want) / want).abs() < 9e-8, "exp {x}");
+            let both = [x, -x].map(|x| 1.0 / (1.0 + (-x as f64).exp()));
+            for (got, want) in sigmoid_and_complement::<true>(x).into_iter().zip(both) {
+                assert!(((got as f64 - want) / want).abs() < 3e-7, "sigmoid {x}");
+            }
         }
         for i in 0..=1000 {
             let e = i as f32 / 1000.0;

@@ -22,8 +22,8 @@ const EPSILON: f32 = 1e-5;
 struct Sample {
     alpha: f32,
     clipped: bool,
-    previous: f32,
-    next: f32,
+    previous: Sigmoid,
+    next: Sigmoid,
     half: f32,
     ic_by_cos: f32,
     sharp: f32,
@@ -31,15 +31,36 @@ struct Sample {
     length: f32,
 }
 
-#[cube]
-pub(super) fn sigmoid(v: f32) -> f32 {
-    1.0f32 / (1.0f32 + (-v).exp())
+/// A sigmoid and its complement, each without cancellation.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+struct Sigmoid {
+    value: f32,
+    complement: f32,
 }
 
-/// Returns the opacity between two sigmoids before it is clipped.
 #[cube]
-fn between(previous: f32, next: f32) -> f32 {
-    (previous - next + EPSILON) / (previous + EPSILON)
+impl Sigmoid {
+    /// Returns the sigmoid of a value.
+    fn new(v: f32) -> Sigmoid {
+        let e = (-v.abs()).exp();
+        let large = 1.0f32 / (1.0f32 + e);
+        let small = e * large;
+        Sigmoid { value: select(v < 0.0f32, small, large), complement: select(v < 0.0f32, large, small) }
+    }
+
+    /// Returns the derivative, σ (1 − σ).
+    fn slope(self) -> f32 {
+        self.value * self.complement
+    }
+}
+
+/// Returns the opacity between two sigmoids around `sdf` before it is clipped.
+#[cube]
+fn between(sdf: f32, previous: Sigmoid, next: Sigmoid) -> f32 {
+    // outside the surface the complements are the smaller ones: their difference loses fewer digits
+    let difference = select(sdf > 0.0f32, next.complement - previous.complement, previous.value - next.value);
+    (difference + EPSILON) / (previous.value + EPSILON)
 }
 
 /// Writes the opacity at points of a march step that meets the surface head-on, `[capacity]`: see
@@ -50,9 +71,9 @@ fn opacities(field: &[f32], inv_s: &[f32], count: &[u32], out: &mut [f32], step:
     if s < count[0] as usize {
         let sharp = clamp(inv_s[0] * field[7 * out.len() + s].exp(), 1e-6f32, 1e6f32);
         // head-on the signed distance decreases along the ray
-        let previous = sigmoid((field[s] + 0.5f32 * step) * sharp);
-        let next = sigmoid((field[s] - 0.5f32 * step) * sharp);
-        out[s] = clamp(between(previous, next), 0.0f32, 1.0f32);
+        let previous = Sigmoid::new((field[s] + 0.5f32 * step) * sharp);
+        let next = Sigmoid::new((field[s] - 0.5f32 * step) * sharp);
+        out[s] = clamp(between(field[s], previous, next), 0.0f32, 1.0f32);
     }
 }
 
@@ -77,9 +98,9 @@ fn sample(
     let by_hard = select(hard > 0.0f32, anneal, 0.0f32);
     let sharp = clamp(inv_s * field[7 * plane + s].exp(), 1e-6f32, 1e6f32);
     let half = 0.5f32 * ic * dt;
-    let previous = sigmoid((field[s] - half) * sharp);
-    let next = sigmoid((field[s] + half) * sharp);
-    let raw = between(previous, next);
+    let previous = Sigmoid::new((field[s] - half) * sharp);
+    let next = Sigmoid::new((field[s] + half) * sharp);
+    let raw = between(field[s], previous, next);
     let alpha = clamp(raw, 0.0f32, 1.0f32);
     Sample {
         alpha,
@@ -189,10 +210,10 @@ fn backward(
             let mut g_sdf = 0.0f32;
             let mut ln = 0.0f32;
             if !a.clipped {
-                let d = a.previous + EPSILON;
+                let d = a.previous.value + EPSILON;
                 // α = (P − N + ε)/(P + ε): ∂P = N/(P+ε)², ∂N = −1/(P+ε)
-                let g_p = g_alpha * a.next / (d * d) * a.previous * (1.0f32 - a.previous);
-                let g_q = -g_alpha / d * a.next * (1.0f32 - a.next);
+                let g_p = g_alpha * a.next.value / (d * d) * a.previous.slope();
+                let g_q = -g_alpha / d * a.next.slope();
                 g_sdf = (g_p + g_q) * a.sharp;
                 ln = (g_p * (field[s] - a.half) + g_q * (field[s] + a.half)) * a.sharp;
                 g_cos = (g_q - g_p) * a.sharp * 0.5f32 * dt[s] * a.ic_by_cos;

@@ -4,13 +4,17 @@
 use super::super::composite::Composited;
 use super::super::device::{Buffer, Device, Words, groups, launch};
 use super::super::march::prefix_sum;
-use super::super::neus::sigmoid;
 use super::super::vec3::Vec3;
 use super::march::VmSamples;
 use crate::cpu::vm::{COLORLESS, RAY_WIDTH, VmField};
 use burn::cubecl::{self, prelude::*};
 
 const UNITS: u32 = 64;
+
+#[cube]
+fn sigmoid(v: f32) -> f32 {
+    1.0f32 / (1.0f32 + (-v).exp())
+}
 
 /// Computes the weights of samples up to where a ray's transmittance is used up, and numbers the
 /// colors that they share, from 0 on each ray.
