@@ -154,4 +154,25 @@ mod tests {
         adam(&mut p, &mut m, &mut v, &mut g, &step);
         assert!((p[0] - 0.999).abs() < 1e-7);
     }
+
+    #[test]
+    fn a_weight_gets_the_same_step_among_many_as_alone() {
+        // more than two groups, with a part of one; every third block has no gradient
+        const N: usize = 2 * GROUP + 5 * BLOCK + 3;
+        let wave = |i: usize, k: f32| ((i as f32 + 0.5) * k).sin();
+        for skip_zero in [false, true] {
+            let step = AdamStep { skip_zero, weight_decay: 0.01, ..AdamStep::new(0.1, 1e-8, 3) };
+            let gradient =
+                |i: usize| if i / BLOCK % 3 == 1 || i.is_multiple_of(7) { 0.0 } else { wave(i, 2.3) };
+            let start = |i: usize| [wave(i, 0.7), wave(i, 1.1), wave(i, 1.9).abs(), gradient(i)];
+            let mut all: [Vec<f32>; 4] = std::array::from_fn(|k| (0..N).map(|i| start(i)[k]).collect());
+            let [p, m, v, g] = &mut all;
+            adam(p, m, v, g, &step);
+            for i in 0..N {
+                let [p, m, v, g] = &mut start(i).map(|x| [x]);
+                adam(p, m, v, g, &step);
+                assert_eq!(all.each_ref().map(|x| x[i]), [p[0], m[0], v[0], g[0]], "{i}");
+            }
+        }
+    }
 }

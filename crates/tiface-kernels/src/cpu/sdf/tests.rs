@@ -81,6 +81,23 @@ fn forward_agrees(color_skip: bool) {
 }
 
 #[test]
+fn colors_of_some_samples_are_those_of_all() {
+    let (shape, table, flat) = small_field(true);
+    // two chunks, of which the first has fewer of these than the second
+    let (x, d) = points(CHUNK + 150);
+    let w = Weights::new(shape.layout(), &flat);
+    let all = forward(&shape, &table, &w, &x, &d);
+    let some = |i: &usize| i.is_multiple_of(if *i < CHUNK { 11 } else { 2 });
+    let mut a = geometry(&shape, &table, &w, &x);
+    a.shade(&w, (0..x.len()).filter(some).map(|i| i as u32).collect(), &d);
+    let before = geometry(&shape, &table, &w, &x);
+    for i in 0..x.len() {
+        let of = |a: &Activations| a.output()[i * WIDTH..][..WIDTH].to_vec();
+        assert_eq!(of(&a), if some(&i) { of(&all) } else { of(&before) }, "{i}");
+    }
+}
+
+#[test]
 fn levels_that_are_not_active_read_as_zero() {
     let (shape, mut table, flat) = field();
     let (x, d) = points(70);
