@@ -108,6 +108,18 @@ impl Nodes {
         &self.near[self.near_start[node] as usize..self.near_start[node + 1] as usize]
     }
 
+    /// Returns values at nodes, each averaged with those of its neighbors in some rounds.
+    pub fn smoothed(&self, mut values: Vec<f32>, rounds: usize) -> Vec<f32> {
+        for _ in 0..rounds {
+            let mean = |v: usize| {
+                let near = self.near(v);
+                (values[v] + near.iter().map(|&n| values[n as usize]).sum::<f32>()) / (near.len() + 1) as f32
+            };
+            values = (0..values.len()).into_par_iter().map(mean).collect();
+        }
+        values
+    }
+
     /// Calls `f` with the nodes under a point of a triangle and their weights, which sum to 1.
     pub fn under(&self, hit: &Hit, mut f: impl FnMut(u32, f32)) {
         match &self.place {

@@ -5,15 +5,15 @@
 //! "Random walks for image segmentation", with priors). Each material then has a color everywhere:
 //!
 //! ```text
-//! min_c  Σ_v t_v s_v² ‖c_v − own_v‖² + μ Σ_{v ~ w} ‖c_v − c_w‖²
+//! min_c  Σ_v t_v (s_v / max_k s_kv)⁸ ‖c_v − own_v‖² + μ Σ_{v ~ w} ‖c_v − c_w‖²
 //! ```
 //!
-//! with trust `t` and share `s`, if that is the larger part. So what nobody saw is never brighter
-//! or darker than what was seen of its material, and a lamp that the network took for hair is no
-//! color of anything.
+//! with trust `t`, share `s` and the largest share of any material at the vertex. So what nobody
+//! saw is about as bright as what was seen of its material, and a lamp that the network took for
+//! hair is no color of anything.
 
 use super::materials::Materials;
-use super::trust::{ROUNDS as TRUST_ROUNDS, Seen, smoothed};
+use super::trust::{ROUNDS as TRUST_ROUNDS, Seen};
 use crate::appearance::Nodes;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -30,10 +30,8 @@ const GUESS: f32 = 0.1;
 /// Length over which trusted colors are smoothed, relative to the longest side.
 const LENGTH: f32 = 0.015;
 
-/// Share of a material from which on a vertex tells its color.
-const MAJORITY: f32 = 0.5;
-
-/// Power of the shares by which materials mix at a point: their border is a line.
+/// Power of the shares by which vertices tell the colors of materials, and by which those mix at a
+/// point: the border of materials is a line.
 const SHARPNESS: i32 = 8;
 
 /// Trust from which on a color tells materials apart.
@@ -92,13 +90,18 @@ impl SmoothColors<'_> {
             membrane(nodes, &weights, &values, 1.0).into_iter().map(|s| (s as f32).clamp(0.0, 1.0)).collect()
         };
         let shares: Vec<Vec<f32>> = (0..materials.len()).into_par_iter().map(share).collect();
+        let largest = largest_shares(&shares);
         let smoothness = f64::from(LENGTH * side / edge).powi(2);
         let channel = |i: usize| {
             let (shares, c) = (&shares[i / 3], i % 3);
-            // a little of many vertices of another material would tint all that is far from its own
-            let own_share = |s: f32| if s > MAJORITY { f64::from(s).powi(2) } else { 0.0 };
-            let weight = |(t, s): (&f32, &f32)| f64::from(*t) * own_share(*s);
-            let weights: Vec<f64> = trust.iter().zip(shares).map(weight).collect();
+            // as a power, since a little of many vertices of another material would tint all that
+            // is far from its own; relative, since a shade between clusters has no majority
+            // anywhere
+            let weight = |v: usize| {
+                let share = shares[v] / largest[v].1.max(f32::MIN_POSITIVE);
+                f64::from(trust[v]) * f64::from(share).powi(SHARPNESS)
+            };
+            let weights: Vec<f64> = (0..trust.len()).map(weight).collect();
             let values: Vec<f64> = own.iter().map(|own| f64::from(own[c])).collect();
             membrane(nodes, &weights, &values, smoothness)
         };
@@ -118,8 +121,7 @@ impl SmoothColors<'_> {
     /// Returns the material that a point is of by the largest share, and that share.
     pub fn material_at(&self, hit: &Hit) -> (usize, f32) {
         let corners = self.triangles[hit.triangle as usize];
-        let share = |k: usize| hit.mix(corners.map(|v| self.shares[k][v as usize]));
-        (0..self.materials()).map(|k| (k, share(k))).fold((0, -1.0), |m, s| if s.1 > m.1 { s } else { m })
+        largest((0..self.materials()).map(|k| hit.mix(corners.map(|v| self.shares[k][v as usize]))))
     }
 
     /// Returns the smooth color of a point.
@@ -162,19 +164,25 @@ impl SmoothColors<'_> {
         let agrees: Vec<f32> = (0..own.len()).map(agrees).collect();
         // a lamp is wider than what is too bright of it
         let around = |v: usize| nodes.near(v).iter().map(|&n| agrees[n as usize]).fold(agrees[v], f32::min);
-        let agrees = smoothed(nodes, (0..own.len()).map(around).collect(), TRUST_ROUNDS);
+        let agrees = nodes.smoothed((0..own.len()).map(around).collect(), TRUST_ROUNDS);
         let glimpsed = seen.trust.iter().zip(&seen.glimpse).zip(agrees);
         glimpsed.map(|((trust, glimpse), agrees)| trust + (glimpse - trust).max(0.0) * agrees).collect()
     }
 
     /// Returns the material that each vertex is of by the largest share, and that share.
     pub fn of_vertices(&self) -> Vec<(usize, f32)> {
-        let largest = |v: usize| {
-            let all = self.shares.iter().enumerate().map(|(k, shares)| (k, shares[v]));
-            all.fold((0, -1.0), |m, s| if s.1 > m.1 { s } else { m })
-        };
-        (0..self.shares[0].len()).map(largest).collect()
+        largest_shares(&self.shares)
     }
+}
+
+/// Returns the material with the largest share at each vertex, and that share.
+fn largest_shares(shares: &[Vec<f32>]) -> Vec<(usize, f32)> {
+    (0..shares[0].len()).map(|v| largest(shares.iter().map(|s| s[v]))).collect()
+}
+
+/// Returns which of some shares is the largest, the first of equal ones, and that share.
+fn largest(shares: impl Iterator<Item = f32>) -> (usize, f32) {
+    shares.enumerate().fold((0, -1.0), |m, s| if s.1 > m.1 { s } else { m })
 }
 
 /// Returns the mean length of the edges of a mesh.
@@ -278,5 +286,26 @@ mod tests {
         }
         let nothing = vec![0.0; trust.len()];
         assert!(SmoothColors::new(&mesh, &nodes, &nothing, &hidden, &guess).is_none());
+    }
+
+    #[test]
+    fn a_shade_between_materials_stays_that_of_its_surroundings() {
+        // from dark to bright along y, so that much of it is of no material for the most part; a
+        // cap of radius 5 was not seen
+        let mesh = ball().mesh;
+        let paint = |y: f32| [0.8, 0.6, 0.5].map(|c: f32| c * (0.6 + y / 30.0));
+        let own: Vec<[f32; 3]> = mesh.positions.iter().map(|p| paint(p.y)).collect();
+        let trust: Vec<f32> = mesh.positions.iter().map(|p| if p.x < 11.0 { 1.0 } else { 0.0 }).collect();
+        let nodes = Nodes::vertices(&mesh);
+        let smooth = SmoothColors::new(&mesh, &nodes, &trust, &own, &own).unwrap();
+        assert!(smooth.of_vertices().iter().any(|(_, share)| *share < 0.5));
+        let off = |t: u32| {
+            let hit = Hit { t: 0.0, triangle: t, u: 1.0 / 3.0, v: 1.0 / 3.0 };
+            let (found, p) = (smooth.at(&hit), mesh.point_at(&hit));
+            let off = (0..3).map(|k| (found[k] - paint(p.y)[k]).abs()).fold(0.0, f32::max);
+            if p.x < 11.0 { 0.0 } else { off }
+        };
+        let worst = (0..mesh.triangles.len() as u32).map(off).fold(0.0, f32::max);
+        assert!(worst < 0.05, "{worst}");
     }
 }

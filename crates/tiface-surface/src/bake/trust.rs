@@ -65,21 +65,9 @@ impl Seen {
         let found: Vec<(u8, f32)> =
             (0..mesh.positions.len()).into_par_iter().with_min_len(256).map(one).collect();
         let (cameras, sums): (Vec<u8>, Vec<f32>) = found.into_iter().unzip();
-        let sums = smoothed(&Nodes::vertices(mesh), sums, ROUNDS);
+        let sums = Nodes::vertices(mesh).smoothed(sums, ROUNDS);
         Seen { cameras, trust: ramp(&sums, TRUST), glimpse: ramp(&sums, GLIMPSE) }
     }
-}
-
-/// Returns values at vertices, each mixed with those of its neighbors in some rounds.
-pub(super) fn smoothed(nodes: &Nodes, mut values: Vec<f32>, rounds: usize) -> Vec<f32> {
-    for _ in 0..rounds {
-        let mean = |v: usize| {
-            let near = nodes.near(v);
-            (values[v] + near.iter().map(|&n| values[n as usize]).sum::<f32>()) / (near.len() + 1) as f32
-        };
-        values = (0..values.len()).map(mean).collect();
-    }
-    values
 }
 
 /// Returns values as 0 below a range, 1 above it, and smoothly between.
