@@ -11,8 +11,8 @@ square error of opacity.
 `steps`: two folders of pictures from the same cameras, by any method and by T-Face, straight alpha, enlarged `zoom`
 times against the photographs (`tiface render RUN --cameras FILE --with tface,textured`). Both are laid over white.
 Along the normals of the outline, where T-Face's opacity is 1/2, the brightness is a profile, mean over an arc of 12
-pixels of a photograph. A step is its largest change over half such a pixel, from 1 to 10 pixels outside the outline:
-there T-Face's strands end, and layers end in rings. Prints the mean of the arcs, 1/255, of both, and of the difference.
+pixels of a photograph. A step is its largest change over half such a pixel, from 1 to 16 pixels outside the outline:
+there T-Face's strands end, and layers end. Prints the mean of the arcs, 1/255, of both, and of the difference.
 
 Needs numpy, scipy and Pillow.
 """
@@ -26,7 +26,7 @@ from scipy import ndimage
 
 BAND_PX = 3
 ARC_PX = 12
-REACH_PX = (1.0, 10.0)
+REACH_PX = (1.0, 16.0)
 SAMPLES_PER_PX = 4
 
 

@@ -8,8 +8,9 @@ use tiface_base::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, Shells};
 use tiface_base::{Monitor, Result};
 
 /// Width of the band on each side of a mask's outline whose pixels are compared: no layer may reach
-/// beyond it unseen.
-const BAND_PX: usize = 10;
+/// beyond it unseen. It is the largest distance of the outer layer, 8 / s, at a softness of two
+/// pixels.
+const BAND_PX: usize = 16;
 
 /// Approximate maximum number of compared pixels.
 const MAX_PIXELS: usize = 400_000;
