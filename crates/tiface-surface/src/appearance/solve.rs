@@ -10,8 +10,13 @@ use tiface_base::math::cg::{conjugate_gradients, dot};
 /// The sum of squares left at which a fit ends, of that at its start.
 const TOLERANCE: f64 = 1e-8;
 
-/// Maximum number of steps of conjugate gradients.
-const STEPS: usize = 30;
+/// Maximum number of steps of conjugate gradients for constant colors: on the man of the results
+/// twelve lose 0.005 dB against thirty.
+const CONSTANT_STEPS: usize = 12;
+
+/// Maximum number of steps for colors that depend on the view: there twelve lose 0.1 dB against
+/// thirty, sixty gain 0.01.
+const VIEW_DEPENDENT_STEPS: usize = 30;
 
 /// Weights of the smoothness terms, relative to the squared error of one pixel.
 ///
@@ -142,7 +147,8 @@ impl System<'_> {
             let each = z.par_iter_mut().zip(r).enumerate().with_min_len(1 << 14);
             each.for_each(|(i, (z, r))| *z = r * inverse[i / 3]);
         };
-        let done = |round: usize, r: &[f64]| round >= STEPS || dot(r, r) <= TOLERANCE * first;
+        let steps = if count == 1 { CONSTANT_STEPS } else { VIEW_DEPENDENT_STEPS };
+        let done = |round: usize, r: &[f64]| round >= steps || dot(r, r) <= TOLERANCE * first;
         conjugate_gradients(&mut x, residual, |v, out| normal.apply(v, out), precondition, done);
         x.as_chunks::<3>().0.iter().map(|c| c.map(|v| v as f32)).collect()
     }
