@@ -104,7 +104,7 @@ def markdown(rows):
     return "\n".join(lines) + "\n"
 
 
-def panel(rows, column, title, left):
+def panel(rows, column, title, left, colors):
     """One diagram as SVG elements: `column` over CPU seconds, a line for every capture and variant."""
     width, height, top = 300, 220, 40
     curves = {}
@@ -130,7 +130,7 @@ def panel(rows, column, title, left):
         out.append(text(x(t), top + height + 14, f"{t:.0f}", 'text-anchor="middle"'))
         out.append(text(left - 4, y(v) + 4, f"{v:.2f}", 'text-anchor="end"'))
     for i, ((capture, variant), curve) in enumerate(curves.items()):
-        color = COLORS[i % len(COLORS)]
+        color = colors[capture, variant]
         line = " ".join(f"{x(t):.1f},{y(v):.1f}" for t, v, _ in curve)
         out.append(f'<polyline points="{line}" fill="none" stroke="{color}" stroke-width="1.5"/>')
         out += [
@@ -151,7 +151,11 @@ def picture(rows):
         ("tface", "psnr_db", "T-Face: its views, dB"),
     ]
     kinds = [kind for kind in kinds if any(r[kind[1]] for r in of(kind[0]))]
-    panels = [e for i, (f, column, title) in enumerate(kinds) for e in panel(of(f), column, title, 50 + 370 * i)]
+    names = sorted({(r["capture"], r["variant"]) for r in rows})
+    colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(names)}
+    panels = [
+        e for i, (f, column, title) in enumerate(kinds) for e in panel(of(f), column, title, 50 + 370 * i, colors)
+    ]
     curves = max([len({(r["capture"], r["variant"]) for r in of(f)}) for f, _, _ in kinds], default=0)
     size = f'width="{370 * len(kinds) + 10}" height="{320 + 13 * curves}"'
     background = '<rect width="100%" height="100%" fill="white"/>'
