@@ -230,7 +230,7 @@ mod tests {
         let shells = shells.unwrap();
         assert!((report.softness_px - 0.05 / 0.025).abs() < 0.1, "{report:?}");
         let [none, _, fitted] = report.left_out;
-        assert!(fitted < 0.6 * none, "{report:?}");
+        assert!(fitted < 0.5 * none, "{report:?}");
         // frayed to both sides alike
         for (layer, distance) in shells.layers.iter().zip([0.1, 0.25]) {
             let parts: Vec<f32> = layer.offsets.iter().map(|o| o / distance).collect();
@@ -268,7 +268,7 @@ mod tests {
             let layer = run(20.0, masks).0.unwrap().layers.swap_remove(1);
             layer.alphas.iter().sum::<f32>() / layer.alphas.len() as f32
         };
-        assert!(alpha(10.0) > alpha(20.0) + 0.015, "{} {}", alpha(10.0), alpha(20.0));
+        assert!(alpha(10.0) > alpha(20.0) + 0.02, "{} {}", alpha(10.0), alpha(20.0));
     }
 
     #[test]
@@ -330,7 +330,7 @@ mod tests {
             some.iter().sum::<f32>() / some.len() as f32
         };
         let (border, inside) = (mean(&ring), mean(&|v| mesh.positions[v].y > 0.2));
-        assert!(border < 0.8 * inside, "{border} {inside}");
+        assert!(border < 0.75 * inside, "{border} {inside}");
     }
 
     #[test]
