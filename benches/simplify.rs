@@ -132,7 +132,7 @@ fn measure(n: usize, triangles: usize) {
         ("with it, nearest", true, 0.0),
     ];
     for (name, with, error) in ways {
-        let config = SimplifyConfig { triangles, error };
+        let config = SimplifyConfig { triangles, error, ..SimplifyConfig::default() };
         let (mut best, mut mesh) = ((f64::INFINITY, 0.0), Mesh::default());
         for _ in 0..RUNS {
             mesh = input.clone();

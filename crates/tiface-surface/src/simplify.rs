@@ -89,6 +89,15 @@ pub fn simplify(
     config.check()?;
     finite(mesh)?;
     check_indices(mesh)?;
+    let importance = &config.importance;
+    setting(
+        importance.is_empty()
+            || importance.len() == mesh.positions.len()
+                && importance.iter().all(|factor| *factor > 0.0 && factor.is_finite()),
+        "SimplifyConfig::importance",
+        "empty, or a number above 0 for each vertex",
+        importance.len(),
+    )?;
     // corners are numbered by 32 bits, and rings grow in their pool
     check_count(mesh.positions.len() as u64, 16 * mesh.triangles.len() as u64)?;
     let before = mesh.triangles.len();
@@ -131,11 +140,14 @@ pub struct SimplifyConfig {
     /// Maximum distance from the surface, in units of the positions; 0 if only `triangles` limits
     /// the simplification.
     pub error: f32,
+    /// Factor of the cost of changes around each vertex, above 0, if only `triangles` limits the
+    /// simplification; empty for 1 everywhere.
+    pub importance: Vec<f32>,
 }
 
 impl Default for SimplifyConfig {
     fn default() -> SimplifyConfig {
-        SimplifyConfig { triangles: 200_000, error: 0.0 }
+        SimplifyConfig { triangles: 200_000, error: 0.0, importance: Vec::new() }
     }
 }
 

@@ -287,6 +287,9 @@ impl EdgeLink {
             let (ca, cb) = (rings.colors[a as usize], rings.colors[b as usize]);
             rings.colors[a as usize] = [0, 1, 2].map(|k| ca[k] + share * (cb[k] - ca[k]));
         }
+        if !rings.importance.is_empty() {
+            rings.importance[a as usize] = rings.mean_importance(a, b);
+        }
         rings.positions[a as usize] = x;
         rings.flags[a as usize] |= rings.flags[b as usize];
         rings.stamps[a as usize] += 1;
@@ -342,7 +345,8 @@ pub(super) fn collapse_target(rings: &Rings, a: u32, b: u32) -> Option<(Vec3, f3
         _ => AllowedTarget::Free,
     };
     let [pa, pb] = [a, b].map(|v| rings.positions[v as usize]);
-    Some(best(pa, &rings.quadrics[a as usize], pb, &rings.quadrics[b as usize], allowed))
+    let (x, cost) = best(pa, &rings.quadrics[a as usize], pb, &rings.quadrics[b as usize], allowed);
+    Some((x, if rings.importance.is_empty() { cost } else { rings.mean_importance(a, b) * cost }))
 }
 
 /// Number of leading bits of a cost that select its bucket: sign and exponent, and four bits of the

@@ -33,6 +33,8 @@ pub(super) struct Rings {
     pub positions: Vec<Vec3>,
     /// Empty, or one a vertex.
     pub colors: Vec<[f32; 3]>,
+    /// Empty, or a factor of the cost of changes for each vertex.
+    pub importance: Vec<f32>,
     /// Dropped triangles are [`NONE`] thrice.
     pub triangles: Vec<[u32; 3]>,
     /// `√A n` of each triangle.
@@ -58,6 +60,7 @@ impl Rings {
         let mut rings = Rings {
             positions: mesh.positions.clone(),
             colors,
+            importance: Vec::new(),
             scaled_normals: vec![Vec3::ZERO; triangles.len()],
             quadrics: vec![PlaneQuadric::default(); n],
             flags: vec![0; n],
@@ -113,6 +116,12 @@ impl Rings {
     /// Returns the three corners of a triangle.
     pub(super) fn corners(&self, t: u32) -> [Vec3; 3] {
         self.triangles[t as usize].map(|v| self.positions[v as usize])
+    }
+
+    /// Returns the importance of the vertex that an edge collapses to: the geometric mean of its
+    /// ends'.
+    pub(super) fn mean_importance(&self, a: u32, b: u32) -> f32 {
+        (self.importance[a as usize] * self.importance[b as usize]).sqrt()
     }
 
     /// Returns the triangles that are left.

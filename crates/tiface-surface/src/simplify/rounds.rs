@@ -22,6 +22,7 @@ use tiface_base::geom::Mesh;
 /// field's zero.
 pub(super) fn counted(mesh: &Mesh, task: &Task, report: &mut SimplifyReport) -> Result<Mesh> {
     let mut rings = prepare(mesh, report);
+    rings.importance.clone_from(&task.config.importance);
     reduce(&mut rings, task, task.config.triangles, None, report)?;
     let (mut out, fixed) = rings.into_mesh();
     if let Some(field) = task.field {

@@ -333,7 +333,7 @@ fn an_error_is_kept_with_and_without_a_field() {
     let start = mesh_of(ball, 40);
     let mut last = usize::MAX;
     for error in [2e-3, 1e-2, 4e-2] {
-        let config = SimplifyConfig { triangles: 0, error };
+        let config = SimplifyConfig { error, ..to(0) };
         let mut mesh = start.clone();
         let report = simplify(&mut mesh, Some(&ball), &config, &Quiet).unwrap();
         let worst = off_ball(&mesh);
@@ -404,6 +404,10 @@ fn a_mesh_that_is_none_and_a_bad_field_are_named_errors_and_change_nothing() {
     let short = Answers(|_| (vec![0.0], vec![Vec3::X]));
     fails(&sound, Some(&short), &to(100), "and returned 1");
     fails(&sound, None, &to(0), "`SimplifyConfig::triangles` is 0");
+    let short = SimplifyConfig { importance: vec![1.0], ..to(9) };
+    fails(&sound, None, &short, "`SimplifyConfig::importance` is 1");
+    let none = SimplifyConfig { importance: vec![0.0; sound.positions.len()], ..to(9) };
+    fails(&sound, None, &none, "`SimplifyConfig::importance` is");
     fails(&sound, None, &SimplifyConfig { error: f32::NAN, ..to(9) }, "`SimplifyConfig::error` is NaN");
     // a field without numbers moves nothing, and the mesh stays sound
     let nothing = Answers(|p| (vec![f32::NAN; p.len()], vec![Vec3::NAN; p.len()]));
