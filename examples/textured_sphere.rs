@@ -32,7 +32,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         offsets: equator.iter().map(|e| offset * e).collect(),
         alphas: equator.iter().map(|e| alpha * e).collect(),
     };
-    let soft = Shells { layers: vec![layer(0.001, 0.6), layer(0.003, 0.3)] };
+    let soft = Shells { layers: vec![layer(0.001, 0.6), layer(0.003, 0.3)], ..Shells::default() };
     files.push(("globe_soft.glb".into(), to_glb(&mesh, Some(&plain), Some(&soft), &options)?));
     std::fs::create_dir_all(&folder)?;
     Ok(files.iter().try_for_each(|(name, bytes)| std::fs::write(folder.join(name), bytes))?)

@@ -17,7 +17,7 @@ use tiface_surface::bake::{
 use tiface_surface::files::{HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
 use tiface_surface::{
     Appearance, AtlasConfig, Cap, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells,
-    resolved, simplify,
+    resolved, shell_importance, simplify,
 };
 
 /// How far the true surface may lie from a triangle, in cells: the chords of large triangles and
@@ -108,7 +108,15 @@ impl Finish<'_> {
         let mut mesh = self.surface.clone();
         let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
         if fewer || c.max_error > 0.0 {
-            let config = SimplifyConfig { triangles: c.triangles as usize, error: c.max_error * self.cell };
+            let importance = match c.hair {
+                Hair::Shells => {
+                    let sharpness = self.field.sharpness(&mesh.positions);
+                    shell_importance(&mesh, &sharpness, self.photographs)
+                }
+                Hair::None => Vec::new(),
+            };
+            let error = c.max_error * self.cell;
+            let config = SimplifyConfig { triangles: c.triangles as usize, error, importance };
             let done = simplify(&mut mesh, Some(self.field), &config, self.monitor).map_err(advised)?;
             log.warnings.extend(done.warnings(&config).iter().map(sentence));
             log.report.insert("simplify".into(), json!(done));

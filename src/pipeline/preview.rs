@@ -70,6 +70,7 @@ impl Preview {
         let front = front_of(capture.up, &eyes, center);
         let up = to_scene * capture.up.normalize_or(Vec3::Y);
         let front = front.map_or_else(|| up.any_orthonormal_vector(), |f| to_scene * f);
+        let head = head.as_drawn();
         Ok(Preview { head, bare_atlas: None, up, front, views: capture.views, warnings })
     }
 

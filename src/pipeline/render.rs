@@ -174,12 +174,12 @@ impl Meshes {
         let extracted =
             (methods.contains(&Method::Raycast) && !fitted).then(|| extracted_surface(run)).transpose()?;
         let head = shows_head(config, methods).then(|| head_mesh(run)).transpose()?;
-        Ok(Meshes { extracted, head })
+        Ok(Meshes { extracted, head: head.map(HeadMesh::as_drawn) })
     }
 
     /// Prepares a head mesh for rendering.
     pub fn of_head(head: HeadMesh) -> Meshes {
-        Meshes { extracted: None, head: Some(head) }
+        Meshes { extracted: None, head: Some(head.as_drawn()) }
     }
 }
 

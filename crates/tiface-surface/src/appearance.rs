@@ -128,8 +128,11 @@ pub fn fit(
     let (begin, max_degree) = (Instant::now(), max_degree.min(2));
     let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
     let stride = (head as f64 / MAX_PIXELS as f64).sqrt().ceil().max(1.0) as u32;
-    let layers = shells.map(|shells| ShellCaster::new(mesh, shells));
-    let rows = Rows::new(&RayTarget { mesh, bvh: Bvh::new(mesh), layers }, photographs, stride, turned);
+    let shown = shells.map(|shells| shells.on_core(mesh));
+    let (core, layers) = shown.as_ref().map_or((mesh, None), |(core, layers)| (core, Some(layers)));
+    let layers = layers.map(|layers| ShellCaster::new(core, layers));
+    let target = RayTarget { mesh: core, bvh: Bvh::new(core), layers };
+    let rows = Rows::new(&target, photographs, stride, turned);
     if rows.is_empty() {
         return Ok(None);
     }

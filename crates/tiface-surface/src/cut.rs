@@ -316,7 +316,13 @@ fn assembled(
             .map(|&v| if let VertexSource::Kept(v) = v { layer.alphas[v as usize] } else { 0.0 })
             .collect(),
     };
-    let shells = head.shells.as_ref().map(|s| Shells { layers: s.layers.iter().map(layer).collect() });
+    let shells = head.shells.as_ref().map(|Shells { layers, depths }| Shells {
+        layers: layers.iter().map(layer).collect(),
+        depths: match depths.is_empty() {
+            true => Vec::new(),
+            false => vertices.iter().map(|&v| number(depths, v)).collect(),
+        },
+    });
     let harmonics = head.harmonics.as_ref().map(|harmonics| {
         let n = harmonics.functions;
         let one = |k: usize, v: VertexSource<Vec3>| {

@@ -6,13 +6,37 @@ use super::mesh::Mesh;
 use super::ray::{Hit, Ray};
 use glam::Vec3;
 
-/// Layers around a mesh with normals, the innermost first: they are drawn in this order, after the
-/// mesh. Both sides of them are drawn, so that a ray along the outline meets each layer twice, and
-/// one that the mesh stops once.
+/// Layers around a mesh with normals, the innermost first: they are drawn in this order, after what
+/// is opaque. Both sides of them are drawn, so that a ray along the outline meets each layer twice,
+/// and one that the mesh stops once.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Shells {
     /// The layers.
     pub layers: Vec<ShellLayer>,
+    /// Depth of what is opaque under the layers below each vertex of the mesh, along its normal, in
+    /// the mesh's units; empty if it is the mesh itself.
+    pub depths: Vec<f32>,
+}
+
+impl Shells {
+    /// Returns what is opaque under the layers, and the layers around that.
+    ///
+    /// # Panics
+    ///
+    /// The layers or depths have not one number for each vertex, or the mesh has no normals.
+    pub fn on_core(&self, mesh: &Mesh) -> (Mesh, Shells) {
+        if self.depths.is_empty() {
+            return (mesh.clone(), self.clone());
+        }
+        let moved = |((p, n), depth): ((&Vec3, &Vec3), &f32)| *p - *n * *depth;
+        let positions = mesh.positions.iter().zip(&mesh.normals).zip(&self.depths).map(moved).collect();
+        let layer = |layer: &ShellLayer| ShellLayer {
+            offsets: layer.offsets.iter().zip(&self.depths).map(|(offset, depth)| offset + depth).collect(),
+            alphas: layer.alphas.clone(),
+        };
+        let layers = self.layers.iter().map(layer).collect();
+        (Mesh { positions, ..mesh.clone() }, Shells { layers, depths: Vec::new() })
+    }
 }
 
 /// A layer: triangles of the mesh, those with a vertex that is not transparent, moved along the
@@ -117,7 +141,7 @@ mod tests {
             offsets: vec![offset; 4],
             alphas: vec![0.0, alpha, 0.0, 0.0],
         };
-        (mesh, Shells { layers: vec![layer(0.1, 0.8), layer(0.3, 0.4)] })
+        (mesh, Shells { layers: vec![layer(0.1, 0.8), layer(0.3, 0.4)], ..Shells::default() })
     }
 
     fn ray(from: Vec3, to: Vec3) -> Ray {
@@ -149,6 +173,20 @@ mod tests {
     }
 
     #[test]
+    fn layers_stay_where_they_are_around_a_deeper_mesh() {
+        let (mesh, shells) = square();
+        assert_eq!(shells.on_core(&mesh), (mesh.clone(), shells.clone()));
+        let shells = Shells { depths: vec![0.5, 0.25, 0.0, 0.0], ..shells };
+        let (core, around) = shells.on_core(&mesh);
+        assert_eq!(core.positions.iter().map(|p| p.z).collect::<Vec<_>>(), [-0.5, -0.25, 0.0, 0.0]);
+        assert_eq!((&core.normals, &core.triangles), (&mesh.normals, &mesh.triangles));
+        for (layer, before) in around.layers.iter().zip(&shells.layers) {
+            let (is, was) = (layer.surface(&core).0.positions, before.surface(&mesh).0.positions);
+            assert!(is.iter().zip(&was).all(|(a, b)| a.distance(*b) < 1e-6) && layer.alphas == before.alphas);
+        }
+    }
+
+    #[test]
     fn a_ray_beside_the_mesh_meets_both_sides_of_a_layer() {
         // an octahedron of radius 1 and a layer of radius 1.5 around it: at x = 1.2 a ray along z
         // meets the layer's surface |x| + |y| + |z| = 1.5 at z = 0.3 and at z = -0.3
@@ -168,7 +206,10 @@ mod tests {
             ],
             ..Mesh::default()
         };
-        let shells = Shells { layers: vec![ShellLayer { offsets: vec![0.5; 6], alphas: vec![0.25; 6] }] };
+        let shells = Shells {
+            layers: vec![ShellLayer { offsets: vec![0.5; 6], alphas: vec![0.25; 6] }],
+            ..Shells::default()
+        };
         let mut met = Vec::new();
         let beside = ray(Vec3::new(1.199, 0.001, 2.0), Vec3::new(1.199, 0.001, 0.0));
         ShellCaster::new(&mesh, &shells)

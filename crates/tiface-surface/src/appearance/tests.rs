@@ -236,7 +236,10 @@ fn layers_in_front_take_part_in_the_colors() {
     let (mut mesh, atlas) = square();
     mesh.normals = vec![Vec3::Z; mesh.positions.len()];
     let n = mesh.positions.len();
-    let shells = Shells { layers: vec![ShellLayer { offsets: vec![0.2; n], alphas: vec![0.5; n] }] };
+    let shells = Shells {
+        layers: vec![ShellLayer { offsets: vec![0.2; n], alphas: vec![0.5; n] }],
+        ..Shells::default()
+    };
     let cameras = cameras(12);
     let stripes = |p: Vec3| [0.5 + 0.2 * (12.0 * p.x).sin(); 3];
     let photos = photos(&cameras, |_, p, d| {

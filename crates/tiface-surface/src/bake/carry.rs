@@ -52,17 +52,18 @@ impl<'a> Original<'a> {
         if !from.seen_by.is_empty() {
             mesh.seen_by = hits.iter().map(|hit| seen_at(from, hit)).collect();
         }
-        let layer = |layer: &ShellLayer| {
-            let at = |values: &[f32], hit: &Hit| {
-                hit.mix(from.triangles[hit.triangle as usize].map(|v| values[v as usize]))
-            };
-            ShellLayer {
-                offsets: hits.iter().map(|hit| at(&layer.offsets, hit)).collect(),
-                // rounding must not leave the range
-                alphas: hits.iter().map(|hit| at(&layer.alphas, hit).clamp(0.0, 1.0)).collect(),
-            }
+        let at = |values: &[f32], hit: &Hit| {
+            hit.mix(from.triangles[hit.triangle as usize].map(|v| values[v as usize]))
         };
-        shells.as_ref().map(|shells| Shells { layers: shells.layers.iter().map(layer).collect() })
+        let layer = |layer: &ShellLayer| ShellLayer {
+            offsets: hits.iter().map(|hit| at(&layer.offsets, hit)).collect(),
+            // rounding must not leave the range
+            alphas: hits.iter().map(|hit| at(&layer.alphas, hit).clamp(0.0, 1.0)).collect(),
+        };
+        let Shells { layers, depths } = shells.as_ref()?;
+        let depths =
+            if depths.is_empty() { Vec::new() } else { hits.iter().map(|hit| at(depths, hit)).collect() };
+        Some(Shells { layers: layers.iter().map(layer).collect(), depths })
     }
 
     /// Carries the original's `texture` over to a simpler mesh that is laid out by `atlas`. `side`

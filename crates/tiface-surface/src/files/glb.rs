@@ -51,7 +51,7 @@ use gltf::json::{self, Index, Material, Texture, Value};
 use serde_json::{Map, json};
 use std::collections::BTreeMap;
 use tiface_base::Result;
-use tiface_base::geom::{Aabb, Mesh, Shells};
+use tiface_base::geom::{Aabb, Mesh, ShellLayer, Shells};
 use tiface_base::image::{Photo, linear_from_srgb, quantize};
 
 /// Returns a mesh as the bytes of a `.glb` file, with the pictures of its texture inside; without a
@@ -86,13 +86,19 @@ pub fn to_glb(
     options: &ExportOptions,
 ) -> Result<Vec<u8>> {
     let file_from_mesh = options.file_from_mesh()?;
-    for layer in shells.iter().flat_map(|shells| &shells.layers) {
-        for (what, found) in [("offsets", layer.offsets.len()), ("alphas", layer.alphas.len())] {
+    // a mesh without normals has no layers
+    let shells = shells.filter(|_| !mesh.normals.is_empty());
+    if let Some(Shells { layers, depths }) = shells {
+        let of_layer = |l: &ShellLayer| [("offsets", l.offsets.len()), ("alphas", l.alphas.len())];
+        let depths = (!depths.is_empty()).then_some(("depths", depths.len()));
+        for (what, found) in layers.iter().flat_map(of_layer).chain(depths) {
             if found != mesh.positions.len() {
                 return Err(wrong_length(found, what, mesh.positions.len()));
             }
         }
     }
+    let shown = shells.map(|shells| shells.on_core(mesh));
+    let (mesh, shells) = shown.as_ref().map_or((mesh, None), |(core, shells)| (core, Some(shells)));
     let file = FileMesh::new(mesh, texture, &file_from_mesh)?;
     let mut file = file.split(texture.is_some_and(|t| t.normal.is_some()));
     let mut document = GlbDocument::default();
@@ -135,13 +141,13 @@ pub fn to_glb(
     let main = document.root.push(main);
     let variants = (!lobes.is_empty()).then(|| variants(&mut document, &lobes, options));
     let layers = match shells {
-        Some(shells) if !file.normals.is_empty() => {
+        Some(shells) => {
             let scale = file_from_mesh.scale as f32;
             let texture =
                 document.root.materials[main.value()].pbr_metallic_roughness.base_color_texture.clone();
             soft_layers(&mut document, &file, (shells, scale), (texture, notes), options)
         }
-        _ => None,
+        None => None,
     };
     finish(document, &file, main, variants, layers, options)
 }
@@ -573,7 +579,11 @@ mod tests {
     fn soft_layers_are_a_mesh_of_their_own_that_no_reader_of_ours_takes_for_the_surface() {
         let head = crate::files::testing::tetrahedron();
         let options = ExportOptions { unit_m: 0.5, ..ExportOptions::default() };
-        let bare = to_glb(&head.mesh, head.texture.as_ref(), None, &options).unwrap();
+        // the surface is what is opaque under the layers: a quarter of a unit deeper, along +z
+        let core = head.clone().as_drawn().mesh;
+        let deeper = |(a, b): (&Vec3, &Vec3)| (*a - *b).abs_diff_eq(Vec3::Z / 4.0, 1e-6);
+        assert!(head.mesh.positions.iter().zip(&core.positions).all(deeper));
+        let bare = to_glb(&core, head.texture.as_ref(), None, &options).unwrap();
         let glb = to_glb(&head.mesh, head.texture.as_ref(), head.shells.as_ref(), &options).unwrap();
         let surface = |glb: &[u8]| read(glb, Path::new("a.glb")).unwrap();
         assert_eq!(surface(&glb), surface(&bare));
@@ -630,7 +640,7 @@ mod tests {
             offsets: vec![from as f32 * 1e-3 + 0.5; 200],
             alphas: (0..200).map(|v| if (from..to).contains(&v) { 51.0 / 255.0 } else { 0.0 }).collect(),
         };
-        let shells = Shells { layers: vec![layer(0, 100), layer(90, 110)] };
+        let shells = Shells { layers: vec![layer(0, 100), layer(90, 110)], ..Shells::default() };
         let glb = to_glb(&mesh, None, Some(&shells), &ExportOptions::default()).unwrap();
         let json = json_of(&glb);
         let primitives = json["meshes"][1]["primitives"].as_array().unwrap();

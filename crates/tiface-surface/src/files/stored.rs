@@ -273,6 +273,15 @@ pub struct HeadMesh {
 }
 
 impl HeadMesh {
+    /// Returns the head as its soft layers are drawn: around the opaque core under them.
+    pub fn as_drawn(mut self) -> HeadMesh {
+        if let Some(shells) = self.shells.take() {
+            let (core, shells) = shells.on_core(&self.mesh);
+            (self.mesh, self.shells) = (core, Some(shells));
+        }
+        self
+    }
+
     /// Writes the mesh into a folder, which is created if necessary.
     ///
     /// # Errors
@@ -293,13 +302,16 @@ impl HeadMesh {
             tensors.push(("harmonics".into(), shape, TensorValues::F32(values)));
             tensors.push(floats("harmonics_from_scene", &harmonics.turned.to_cols_array_2d()));
         }
-        if let Some(Shells { layers }) = &self.shells {
+        if let Some(Shells { layers, depths }) = &self.shells {
             let tensor = |name: &str, values: &dyn Fn(&ShellLayer) -> Vec<f32>| {
                 let all: Vec<f32> = layers.iter().flat_map(values).collect();
                 (name.into(), vec![layers.len(), self.mesh.positions.len()], TensorValues::F32(all))
             };
             tensors.push(tensor("shell_offsets", &|layer| layer.offsets.clone()));
             tensors.push(tensor("shell_alphas", &|layer| layer.alphas.clone()));
+            if !depths.is_empty() {
+                tensors.push(floats::<1>("shell_depths", bytemuck::cast_slice(depths)));
+            }
         }
         let mut metadata = format();
         if let Some(texture) = &self.texture {
@@ -393,8 +405,13 @@ fn load_shells(stored: &mut StoredTensors, mesh: &Mesh) -> Result<Shells> {
     if offsets.len() != alphas.len() || !alphas.iter().flatten().all(|a| (0.0..=1.0).contains(a)) {
         return Err(stored.missing("shell_alphas"));
     }
+    let depths = stored.contains("shell_depths").then(|| stored.rows::<1>("shell_depths")).transpose()?;
+    let depths = depths.unwrap_or_default().into_flattened();
+    if !depths.is_empty() && depths.len() != vertices {
+        return Err(stored.missing("shell_depths"));
+    }
     let layer = |(offsets, alphas)| ShellLayer { offsets, alphas };
-    Ok(Shells { layers: offsets.into_iter().zip(alphas).map(layer).collect() })
+    Ok(Shells { layers: offsets.into_iter().zip(alphas).map(layer).collect(), depths })
 }
 
 /// Loads a picture of the texture, of this size if one is given.
@@ -498,6 +515,8 @@ mod tests {
         assert!(error(&cut).contains("`harmonics`"));
         let opaque = |p: &mut HeadMesh| p.shells.as_mut().unwrap().layers[1].alphas[2] = 1.5;
         assert!(error(&opaque).contains("`shell_alphas`"));
+        let short = |p: &mut HeadMesh| p.shells.as_mut().unwrap().depths.truncate(3);
+        assert!(error(&short).contains("`shell_depths`"));
         let old = std::collections::BTreeMap::from([("format".to_owned(), "tiface-mesh-1".to_owned())]);
         io::write_tensors(&dir.path().join("geometry.safetensors"), &geometry(&tetrahedron().mesh), &old)
             .unwrap();

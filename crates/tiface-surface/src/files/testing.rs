@@ -37,6 +37,9 @@ pub fn tetrahedron() -> HeadMesh {
     let coefficients = (0..16).map(|i| [0.1 * i as f32, -0.2, 0.3]).collect();
     let harmonics = Some(Harmonics { functions: 4, coefficients, turned: Mat3::from_rotation_y(0.2) });
     let layer = ShellLayer { offsets: vec![0.1, 0.2, 0.3, 0.0], alphas: vec![0.5, 0.25, 1.0, 0.0] };
-    let shells = Some(Shells { layers: vec![layer.clone(), ShellLayer { offsets: vec![0.5; 4], ..layer }] });
+    let shells = Some(Shells {
+        layers: vec![layer.clone(), ShellLayer { offsets: vec![0.5; 4], ..layer }],
+        depths: vec![0.25; 4],
+    });
     HeadMesh { mesh, world_from_scene, texture: Some(texture), harmonics, shells }
 }

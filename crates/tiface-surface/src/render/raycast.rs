@@ -354,7 +354,7 @@ mod tests {
             let offsets = vec![by; mesh.positions.len()];
             ShellLayer { offsets, alphas: vec![0.5; mesh.positions.len()] }
         };
-        let shells = Shells { layers: vec![moved(0.1), moved(0.2)] };
+        let shells = Shells { layers: vec![moved(0.1), moved(0.2)], ..Shells::default() };
         let source = Mesh { normals: mesh.normals.clone(), ..wide };
         let caster = ShellCaster::new(&source, &shells);
         let red = |hits: &RayHits| vec![[1.0, 0.0, 0.0]; hits.hits.len()];

@@ -8,9 +8,9 @@ use tiface_base::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, Shells};
 use tiface_base::{Monitor, Result};
 
 /// Width of the band on each side of a mask's outline whose pixels are compared: no layer may reach
-/// beyond it unseen. It is the largest distance of the outer layer, 8 / s, at a softness of two
-/// pixels.
-const BAND_PX: usize = 16;
+/// beyond it unseen. It is the largest distance of the outer layer, 11 / s, at a softness of almost
+/// two pixels.
+const BAND_PX: usize = 20;
 
 /// Approximate maximum number of compared pixels.
 const MAX_PIXELS: usize = 400_000;
@@ -21,8 +21,9 @@ const RAYS_PER_SIDE: usize = 2;
 /// Rays of a pixel.
 const RAYS_PER_PIXEL: usize = RAYS_PER_SIDE * RAYS_PER_SIDE;
 
-/// Against the square of one pixel's error: where no outline tells, there is no layer. What
-/// neighbors without a layer have counts, so that opacity falls towards them.
+/// Prior of the changes of opacities, against the square of one pixel's error: where no outline
+/// tells, they stay as the field says. Neighbors without a layer have none, so that opacity falls
+/// towards them as the field's does.
 const PRIOR: Prior = Prior { ridge: 0.02, smooth: 3.0 };
 
 /// Gauss-Newton steps.
@@ -41,10 +42,15 @@ pub struct Outlines {
     view: Vec<u32>,
     /// Its mask, 0..=1.
     target: Vec<f32>,
-    /// Rays of each row that meet the mesh.
+    /// Rays of each row that meet the mesh itself.
+    bare: Vec<usize>,
+    /// Rays of each row that meet the opaque mesh under the layers.
     whole: Vec<usize>,
     /// The other rays of each row: the layers that each meets, the nearest first.
     pub rays: Vec<[Layers; RAYS_PER_PIXEL]>,
+    /// Of each photograph the number of pixels near the outline, and the squared error of those
+    /// that are opaque with and without layers, and so have no row.
+    pixels: Vec<(usize, f64)>,
     /// Vertices of the triangles of the mesh.
     triangles: Vec<[u32; 3]>,
 }
@@ -52,30 +58,42 @@ pub struct Outlines {
 /// The layers that a ray meets, the nearest first, and where.
 pub type Layers = Vec<(usize, Hit)>;
 
-/// Returns the number of a pixel's rays that hit the mesh, and the layers that the others hit.
-fn look(
-    camera: &Camera,
-    (x, y): (usize, usize),
-    bvh: &Bvh,
-    caster: &ShellCaster,
-) -> (usize, [Layers; RAYS_PER_PIXEL]) {
-    let (mut whole, mut rays) = (0, [const { Layers::new() }; RAYS_PER_PIXEL]);
-    for (k, layers) in rays.iter_mut().enumerate() {
+/// What the rays of a pixel meet.
+#[derive(Default)]
+struct Met {
+    bare: usize,
+    whole: usize,
+    rays: [Layers; RAYS_PER_PIXEL],
+}
+
+/// A mesh, and the layers around the opaque mesh under them, as rays meet them.
+struct Target<'a> {
+    bare: Bvh,
+    core: Bvh,
+    layers: ShellCaster<'a>,
+}
+
+/// Returns what the rays of a pixel meet.
+fn look(camera: &Camera, (x, y): (usize, usize), target: &Target) -> Met {
+    let mut met = Met::default();
+    for (k, layers) in met.rays.iter_mut().enumerate() {
         let sub = |at: usize, k: usize| at as f32 + (k as f32 + 0.5) / RAYS_PER_SIDE as f32;
         let Some(ray) = camera.ray(Vec2::new(sub(x, k % RAYS_PER_SIDE), sub(y, k / RAYS_PER_SIDE))) else {
             continue;
         };
-        if bvh.any_hit(&ray) {
-            whole += 1;
+        met.bare += usize::from(target.bare.any_hit(&ray));
+        if target.core.any_hit(&ray) {
+            met.whole += 1;
         } else {
-            caster.cast(&ray, f32::INFINITY, |layer, hit, _| layers.push((layer, hit)));
+            target.layers.cast(&ray, f32::INFINITY, |layer, hit, _| layers.push((layer, hit)));
         }
     }
-    (whole, rays)
+    met
 }
 
 impl Outlines {
-    /// Casts the rays of the pixels near the outlines of photographs, on a mesh with these layers.
+    /// Casts the rays of the pixels near the outlines of photographs, on a mesh with normals and
+    /// these layers.
     ///
     /// # Errors
     ///
@@ -86,28 +104,42 @@ impl Outlines {
         photographs: &[Photograph],
         monitor: &dyn Monitor,
     ) -> Result<Outlines> {
-        let (bvh, caster) = (Bvh::new(mesh), ShellCaster::new(mesh, shells));
+        let (core, around) = shells.on_core(mesh);
+        let layers = ShellCaster::new(&core, &around);
+        let target = Target { bare: Bvh::new(mesh), core: Bvh::new(&core), layers };
         let mut all = Outlines { triangles: mesh.triangles.clone(), ..Outlines::default() };
         let bands: Vec<Vec<usize>> = photographs.par_iter().map(|p| p.outline(BAND_PX)).collect();
         let stride = bands.iter().map(Vec::len).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
         for ((v, photograph), band) in photographs.iter().enumerate().zip(bands) {
             monitor.check_stop()?;
-            let Some(mask) = photograph.mask else { continue };
+            let Some(mask) = photograph.mask else {
+                all.pixels.push((0, 0.0));
+                continue;
+            };
             let some: Vec<usize> = band.into_iter().step_by(stride).collect();
             let row = |&at: &usize| {
-                let target = f32::from(mask.values[at]) / 255.0;
+                let opacity = f32::from(mask.values[at]) / 255.0;
                 let (x, y) = (at % mask.width as usize, at / mask.width as usize);
-                let (whole, rays) = look(photograph.camera, (x, y), &bvh, &caster);
-                // pixels without opacity in render and mask, and opaque ones, carry no information
-                let says = whole < RAYS_PER_PIXEL && (target > 0.0 || rays.iter().any(|l| !l.is_empty()));
-                says.then_some((target, whole, rays))
+                let met = look(photograph.camera, (x, y), &target);
+                (opacity, met)
             };
-            for (target, whole, rays) in some.par_iter().filter_map(row).collect::<Vec<_>>() {
+            let mut opaque = 0.0;
+            for (opacity, Met { bare, whole, rays }) in some.par_iter().map(row).collect::<Vec<_>>() {
+                // pixels without opacity in render and mask, and opaque ones, carry no information
+                if whole == RAYS_PER_PIXEL {
+                    opaque += f64::from(1.0 - opacity).powi(2);
+                    continue;
+                }
+                if opacity == 0.0 && rays.iter().all(Vec::is_empty) && bare == 0 {
+                    continue;
+                }
                 all.view.push(v as u32);
-                all.target.push(target);
+                all.target.push(opacity);
+                all.bare.push(bare);
                 all.whole.push(whole);
                 all.rays.push(rays);
             }
+            all.pixels.push((some.len(), opaque));
         }
         Ok(all)
     }
@@ -117,13 +149,13 @@ impl Outlines {
         self.view.len()
     }
 
-    /// Returns the opacity of a row, and adds its derivatives by the opacities of the layers'
-    /// vertices, `vertices` a layer.
+    /// Returns the opacity of a row, without layers that of the mesh itself, and adds its
+    /// derivatives by the opacities of the layers' vertices, `vertices` a layer.
     pub fn opacity(&self, row: usize, shells: Option<&Shells>, slopes: Option<&mut Vec<(u32, f32)>>) -> f32 {
+        let Some(shells) = shells else { return self.bare[row] as f32 / RAYS_PER_PIXEL as f32 };
         let mut opacity = self.whole[row] as f32;
         let mut slopes = slopes;
         for layers in &self.rays[row] {
-            let Some(shells) = shells else { break };
             let mut through = 1.0;
             let alphas: Vec<f32> = layers
                 .iter()
@@ -153,12 +185,14 @@ impl Outlines {
         opacity / RAYS_PER_PIXEL as f32
     }
 
-    /// Returns the root mean square error of the opacity of the rows that `keep` names (by
-    /// photograph).
+    /// Returns the root mean square error of opacity near the outlines of the photographs that
+    /// `keep` names.
     pub fn error(&self, shells: Option<&Shells>, keep: &dyn Fn(u32) -> bool) -> f64 {
-        let rows: Vec<usize> = (0..self.rows()).filter(|&row| keep(self.view[row])).collect();
-        let square = |&row: &usize| f64::from(self.opacity(row, shells, None) - self.target[row]).powi(2);
-        (rows.iter().map(square).sum::<f64>() / rows.len().max(1) as f64).sqrt()
+        let rows = (0..self.rows()).filter(|&row| keep(self.view[row]));
+        let square = |row: usize| f64::from(self.opacity(row, shells, None) - self.target[row]).powi(2);
+        let kept = (0u32..).zip(&self.pixels).filter(|(view, _)| keep(*view));
+        let (count, opaque) = kept.fold((0, 0.0), |sum, (_, own)| (sum.0 + own.0, sum.1 + own.1));
+        ((rows.map(square).sum::<f64>() + opaque) / count.max(1) as f64).sqrt()
     }
 
     /// Returns the opacities that bring the rows that `keep` names (by photograph) closest to their
@@ -169,15 +203,17 @@ impl Outlines {
     pub fn fit(&self, shells: &Shells, nodes: &Nodes, keep: &dyn Fn(u32) -> bool) -> Shells {
         let vertices = nodes.len();
         let rows: Vec<usize> = (0..self.rows()).filter(|&row| keep(self.view[row])).collect();
-        let known: Vec<bool> =
-            shells.layers.iter().flat_map(|layer| layer.alphas.iter().map(|a| *a > 0.0)).collect();
+        let alphas = |shells: &Shells| -> Vec<f64> {
+            shells.layers.iter().flat_map(|layer| &layer.alphas).map(|alpha| f64::from(*alpha)).collect()
+        };
+        let start = alphas(shells);
         let mut fitted = shells.clone();
         for _ in 0..ROUNDS {
             let equations = self.equations(&rows, &fitted);
-            let x: Vec<f64> =
-                fitted.layers.iter().flat_map(|layer| layer.alphas.iter().map(|a| f64::from(*a))).collect();
-            let free = |i: usize, up: f64| known[i] && (x[i] > 0.0 || up > 0.0);
-            let step = step(&equations, nodes, &x, PRIOR, free, STEPS);
+            let now = alphas(&fitted);
+            let changes: Vec<f64> = now.iter().zip(&start).map(|(now, start)| now - start).collect();
+            let free = |i: usize, up: f64| start[i] > 0.0 && (now[i] > 0.0 || up > 0.0);
+            let step = step(&equations, nodes, &changes, PRIOR, free, STEPS);
             for (layer, step) in fitted.layers.iter_mut().zip(step.chunks(vertices)) {
                 for (alpha, step) in layer.alphas.iter_mut().zip(step) {
                     *alpha = (*alpha + *step as f32).clamp(0.0, MAX_ALPHA);

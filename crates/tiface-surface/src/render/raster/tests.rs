@@ -161,7 +161,7 @@ fn layers_are_blended_as_the_ray_caster_blends_them() {
         // none at all below
         alphas: mesh.positions.iter().map(|p| (0.6 * p.y + 0.1 * k as f32).clamp(0.0, 0.9)).collect(),
     };
-    let shells = Shells { layers: [1, 2, 3].map(layer).to_vec() };
+    let shells = Shells { layers: [1, 2, 3].map(layer).to_vec(), ..Shells::default() };
     let camera = camera(140);
     let color = |hits: &RayHits| -> Vec<[f32; 3]> {
         hits.points.iter().map(|p| [0.5 + 0.4 * (5.0 * p.x).sin(), 0.5 + 0.4 * p.y, 0.6]).collect()
