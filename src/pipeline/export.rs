@@ -101,7 +101,10 @@ impl KeptHead {
         let kept = KeptHead::new(head, AtlasConfig::default().gutter_px, Export::of_file(name, up));
         let mut kept = KeptHead { texture_problem, beside, warnings, ..kept };
         if soft_layers > 0 {
-            kept.warnings.push(format!("soft layers of `{}` are not read; a run has them", file.display()));
+            kept.warnings.push(format!(
+                "soft layers of `{}` are not read, and the head under them may end below the surface of hair; a run has both",
+                file.display()
+            ));
         }
         Ok(kept)
     }

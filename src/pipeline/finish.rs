@@ -77,13 +77,12 @@ impl Finish<'_> {
     /// Simplifies the surface, and colors the vertices or bakes a texture.
     pub fn run(&self) -> Result<FinishedHead> {
         let mut log = StepLog::default();
-        let mut mesh = self.simplify(&mut log)?;
+        let (mut mesh, shells) = self.simplified(&mut log)?;
         let seen = Seen::of(&mesh, self.cameras, self.photographs, REACH * self.cell);
         mesh.seen_by.clone_from(&seen.cameras);
         let world_from_scene = self.scene.scene_from_world.inverse();
         let turned = self.lobe_coordinates(&mesh, &world_from_scene)?;
         let fit = self.color_fit(turned, &mut log);
-        let shells = self.shells(&mesh, &mut log)?;
         let (texture, harmonics, linear) = if self.config.texture_px == 0 {
             let guess = mesh.colors.clone();
             let fitted = self.fit_colors(&mut mesh, shells.as_ref(), Colors::Vertices, &fit, &mut log)?;
@@ -102,19 +101,34 @@ impl Finish<'_> {
         Ok(FinishedHead { head, linear, report: log.report, warnings: log.warnings })
     }
 
+    /// Returns the simplified surface and its soft layers: with fewer triangles in hair if it has
+    /// some.
+    fn simplified(&self, log: &mut StepLog) -> Result<(Mesh, Option<Shells>)> {
+        let c = self.config;
+        let importance = match c.hair {
+            // to an error all places are simplified alike
+            Hair::Shells if c.max_error == 0.0 => {
+                let sharpness = self.field.sharpness(&self.surface.positions);
+                shell_importance(self.surface, &sharpness, self.photographs)
+            }
+            _ => Vec::new(),
+        };
+        let (even, warnings) = (importance.is_empty(), log.warnings.len());
+        let mesh = self.simplify(importance, log)?;
+        let shells = self.shells(&mesh, log)?;
+        if even || shells.is_some() {
+            return Ok((mesh, shells));
+        }
+        log.warnings.truncate(warnings);
+        Ok((self.simplify(Vec::new(), log)?, None))
+    }
+
     /// Returns the surface with at most the configured number of triangles and error.
-    fn simplify(&self, log: &mut StepLog) -> Result<Mesh> {
+    fn simplify(&self, importance: Vec<f32>, log: &mut StepLog) -> Result<Mesh> {
         let c = self.config;
         let mut mesh = self.surface.clone();
         let fewer = c.triangles > 0 && (c.triangles as usize) < mesh.triangles.len();
         if fewer || c.max_error > 0.0 {
-            let importance = match c.hair {
-                Hair::Shells => {
-                    let sharpness = self.field.sharpness(&mesh.positions);
-                    shell_importance(&mesh, &sharpness, self.photographs)
-                }
-                Hair::None => Vec::new(),
-            };
             let error = c.max_error * self.cell;
             let config = SimplifyConfig { triangles: c.triangles as usize, error, importance };
             let done = simplify(&mut mesh, Some(self.field), &config, self.monitor).map_err(advised)?;

@@ -173,7 +173,7 @@ class Tones:
 class Surface:
     def __init__(self, path):
         scene = trimesh.load(path, process=False)
-        if isinstance(scene, trimesh.Scene):  # translucent layers are around the surface, not of it
+        if isinstance(scene, trimesh.Scene):  # translucent layers; what is left is the head under them
             soft = [name for name, g in scene.geometry.items()
                     if getattr(getattr(g.visual, "material", None), "alphaMode", None) == "BLEND"]
             scene.delete_geometry(soft)

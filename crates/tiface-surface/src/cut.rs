@@ -316,11 +316,21 @@ fn assembled(
             .map(|&v| if let VertexSource::Kept(v) = v { layer.alphas[v as usize] } else { 0.0 })
             .collect(),
     };
+    let bottom = mesh.positions.iter().map(|p| p.dot(down)).fold(f32::MIN, f32::max);
+    // what is opaque under the layers stays above the face, at least half as high as the mesh
+    let depth = |depths: &[f32], v: u32| {
+        let (p, n, depth) = (from.positions[v as usize], from.normals[v as usize], depths[v as usize]);
+        let sinks = -n.dot(down);
+        if sinks > 0.0 { depth.min(0.5 * (bottom - p.dot(down)) / sinks) } else { depth }
+    };
     let shells = head.shells.as_ref().map(|Shells { layers, depths }| Shells {
         layers: layers.iter().map(layer).collect(),
         depths: match depths.is_empty() {
             true => Vec::new(),
-            false => vertices.iter().map(|&v| number(depths, v)).collect(),
+            // neither does the face sink in where the rim has no layer
+            false => (vertices.iter())
+                .map(|&v| if let VertexSource::Kept(v) = v { depth(depths, v) } else { 0.0 })
+                .collect(),
         },
     });
     let harmonics = head.harmonics.as_ref().map(|harmonics| {

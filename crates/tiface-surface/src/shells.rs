@@ -91,7 +91,7 @@ const MIN_GAIN: f64 = 0.05;
 /// A report of the layers.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ShellsReport {
-    /// Number of layers.
+    /// Number of layers that left-out photographs like best, whether they are kept or not.
     pub layers: usize,
     /// Triangles of the field's layers, all together.
     pub triangles: usize,
@@ -131,7 +131,7 @@ pub fn fit(
     for design in &DESIGNS {
         let count = Some(design.layers.len());
         let Some(softness) = Softness::new(mesh, &nodes, sharpness, photographs, count) else {
-            return Ok((None, ShellsReport::default()));
+            continue;
         };
         let candidate = Candidate::new(mesh, &nodes, design, &softness, photographs, monitor)?;
         if best.as_ref().is_none_or(|best| candidate.report.error() < best.report.error()) {
@@ -260,7 +260,13 @@ fn from_field(mesh: &Mesh, nodes: &Nodes, design: &Design, softness: &Softness) 
         let low = 0.5 * (q + if k == 0 { -depth } else { distances[k - 1] });
         let high = distances.get(k + 1).map_or(1.0, |next| sigmoid(0.5 * (q + next)));
         let alpha = 1.0 - (sigmoid(low) / high).sqrt();
-        let offset = |v: usize| (fray[v] * (q + depth) - depth) * width[v] * share[v];
+        // as far above what is opaque as its depth was reached
+        let offset = |v: usize| {
+            let (full, reached) = (width[v] * share[v], depths.get(v).copied().unwrap_or(0.0));
+            let inside = q < 0.0 && full > 0.0;
+            let distance = if inside { q * reached / depth } else { q * full };
+            fray[v] * (distance + reached) - reached
+        };
         layers.push(ShellLayer {
             offsets: (0..width.len()).map(offset).collect(),
             alphas: share.iter().map(|share| alpha * share).collect(),

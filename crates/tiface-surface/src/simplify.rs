@@ -89,15 +89,9 @@ pub fn simplify(
     config.check()?;
     finite(mesh)?;
     check_indices(mesh)?;
-    let importance = &config.importance;
-    setting(
-        importance.is_empty()
-            || importance.len() == mesh.positions.len()
-                && importance.iter().all(|factor| *factor > 0.0 && factor.is_finite()),
-        "SimplifyConfig::importance",
-        "empty, or a number above 0 for each vertex",
-        importance.len(),
-    )?;
+    let (importance, vertices) = (config.importance.len(), mesh.positions.len());
+    let each = importance == 0 || importance == vertices;
+    setting(each, "SimplifyConfig::importance", "empty, or of one number a vertex", importance)?;
     // corners are numbered by 32 bits, and rings grow in their pool
     check_count(mesh.positions.len() as u64, 16 * mesh.triangles.len() as u64)?;
     let before = mesh.triangles.len();
@@ -164,7 +158,9 @@ impl SimplifyConfig {
             "SimplifyConfig::triangles",
             "at least 1, or an `error`",
             0,
-        )
+        )?;
+        let wrong = self.importance.iter().find(|factor| !(**factor > 0.0 && factor.is_finite()));
+        setting(wrong.is_none(), "SimplifyConfig::importance", "above 0", wrong.copied().unwrap_or(0.0))
     }
 }
 

@@ -23,11 +23,15 @@ impl Shells {
     ///
     /// # Panics
     ///
-    /// The layers or depths have not one number for each vertex, or the mesh has no normals.
+    /// There are depths, and the mesh has no normals, or depths or offsets are not one for each
+    /// vertex.
     pub fn on_core(&self, mesh: &Mesh) -> (Mesh, Shells) {
         if self.depths.is_empty() {
             return (mesh.clone(), self.clone());
         }
+        let counts =
+            self.layers.iter().map(|l| l.offsets.len()).chain([mesh.normals.len(), self.depths.len()]);
+        counts.for_each(|count| assert_eq!(count, mesh.positions.len()));
         let moved = |((p, n), depth): ((&Vec3, &Vec3), &f32)| *p - *n * *depth;
         let positions = mesh.positions.iter().zip(&mesh.normals).zip(&self.depths).map(moved).collect();
         let layer = |layer: &ShellLayer| ShellLayer {

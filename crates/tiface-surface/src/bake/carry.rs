@@ -192,6 +192,7 @@ mod tests {
             assert!((Vec3::from(mesh.colors[v]) - Vec3::from(shown(*p))).abs().max_element() < 0.01);
             let layer = &shells.layers[0];
             assert!((layer.offsets[v] - 0.1 * p.x).abs() < 0.02, "{p} {}", layer.offsets[v]);
+            assert!((shells.depths[v] - 0.2 - 0.01 * p.x).abs() < 0.002, "{p} {}", shells.depths[v]);
             let alpha = if p.y > 0.0 { 1.0 } else { 0.0 };
             assert!(p.y.abs() < 1.5 || (layer.alphas[v] - alpha).abs() < 1e-6, "{p} {}", layer.alphas[v]);
         }

@@ -39,7 +39,8 @@ fn make_ball() -> HeadMesh {
     let lobes = Lobes { pictures: vec![photo.clone()], scale: vec![0.254], turned: Mat3::IDENTITY };
     let alphas = mesh.positions.iter().map(|p| if p.y > 0.0 { 1.0 } else { 0.0 }).collect();
     let offsets = mesh.positions.iter().map(|p| 0.1 * p.x).collect();
-    let shells = Some(Shells { layers: vec![ShellLayer { offsets, alphas }], ..Shells::default() });
+    let depths = mesh.positions.iter().map(|p| 0.2 + 0.01 * p.x).collect();
+    let shells = Some(Shells { layers: vec![ShellLayer { offsets, alphas }], depths });
     let texture = Some(HeadTexture { lobes: Some(lobes), ..HeadTexture::new(layout, photo) });
     HeadMesh { mesh, world_from_scene: Similarity::IDENTITY, texture, harmonics: None, shells }
 }

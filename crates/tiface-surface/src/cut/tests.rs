@@ -20,6 +20,12 @@ fn cut_ball(plane: &Plane) -> (HeadMesh, CutReport) {
     for count in [out.mesh.normals.len(), out.mesh.colors.len(), layer.alphas.len(), layer.offsets.len()] {
         assert_eq!(count, vertices);
     }
+    // what is opaque under the layers is closed by the same face
+    let core = out.clone().as_drawn().mesh;
+    let found = check(&core, 1.0);
+    assert!(found.require(&["watertight", "no-self-intersections"]).is_ok(), "{found}");
+    let depths = &out.shells.as_ref().unwrap().depths;
+    assert!(depths.contains(&0.0) && depths.iter().any(|depth| *depth > 0.1));
     let uv = uv_check(&out.mesh, &out.texture.as_ref().unwrap().atlas);
     assert!(uv.is_sound() && uv.overlapping == 0 && uv.outside == 0, "{uv:?}");
     assert!(uv.chart_distance_px.unwrap() >= 4.0, "{uv:?}");

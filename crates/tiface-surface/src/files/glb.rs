@@ -8,12 +8,12 @@
 //! in the file. A mesh far from the origin is written around its middle, which its node carries in
 //! f64: its shape is as exact as that of any other.
 //!
-//! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node that
-//! users can hide: one primitive each, the innermost first, blended, with the mesh's base color
-//! times the alpha of `COLOR_0`, drawn from both sides, since path tracers draw both anyway. glTF
-//! defines no drawing order: the layers look right where primitives are drawn in the file's order,
-//! after all opaque ones, or sorted by distance. Their material says
-//! `"extras": { "tiface": { "soft_layers": 2 } }`.
+//! Layers around the mesh ([`Shells`]) are a mesh of their own, a child of the mesh's node, which
+//! is then what is opaque under them ([`Shells::on_core`]): one primitive each, the innermost
+//! first, blended, with the mesh's base color times the alpha of `COLOR_0`, drawn from both sides,
+//! since path tracers draw both anyway. glTF defines no drawing order: the layers look right where
+//! primitives are drawn in the file's order, after all opaque ones, or sorted by distance. Their
+//! material says `"extras": { "tiface": { "soft_layers": 4 } }`.
 //!
 //! How many cameras see a vertex is its attribute `_SEEN_BY`, if the mesh knows: a number as float,
 //! which programs that import attributes can mask by.

@@ -253,6 +253,7 @@ mod tests {
         assert!(scale.x > 2.4 / 65534.0 && scale.x < 2.7 / 65534.0, "{scale}");
 
         // the triangles are those of the mesh, in another order
+        let head = head.as_drawn();
         let split = FileMesh::new(&head.mesh, Some(&texture), &world_from_mesh).unwrap().split(false);
         let expected = split.in_cache_order();
         let own: Vec<u32> = (0..head.mesh.positions.len() as u32).collect();

@@ -274,6 +274,10 @@ pub struct HeadMesh {
 
 impl HeadMesh {
     /// Returns the head as its soft layers are drawn: around the opaque core under them.
+    ///
+    /// # Panics
+    ///
+    /// Those of [`Shells::on_core`].
     pub fn as_drawn(mut self) -> HeadMesh {
         if let Some(shells) = self.shells.take() {
             let (core, shells) = shells.on_core(&self.mesh);

@@ -407,7 +407,7 @@ fn a_mesh_that_is_none_and_a_bad_field_are_named_errors_and_change_nothing() {
     let short = SimplifyConfig { importance: vec![1.0], ..to(9) };
     fails(&sound, None, &short, "`SimplifyConfig::importance` is 1");
     let none = SimplifyConfig { importance: vec![0.0; sound.positions.len()], ..to(9) };
-    fails(&sound, None, &none, "`SimplifyConfig::importance` is");
+    fails(&sound, None, &none, "`SimplifyConfig::importance` is 0");
     fails(&sound, None, &SimplifyConfig { error: f32::NAN, ..to(9) }, "`SimplifyConfig::error` is NaN");
     // a field without numbers moves nothing, and the mesh stays sound
     let nothing = Answers(|p| (vec![f32::NAN; p.len()], vec![Vec3::NAN; p.len()]));
