@@ -83,14 +83,13 @@ impl ShellLayer {
 /// Layers to be met by rays.
 pub struct ShellCaster<'a> {
     mesh: &'a Mesh,
-    layers: Vec<LayerCaster<'a>>,
-}
-
-struct LayerCaster<'a> {
-    layer: &'a ShellLayer,
+    layers: &'a [ShellLayer],
+    /// Over the triangles of all layers, one after the other.
     bvh: Bvh,
-    /// Triangle of the mesh that each of the surface's is.
+    /// Triangle of the mesh that each of these is.
     source: Vec<u32>,
+    /// The first of these of each layer.
+    first: Vec<u32>,
 }
 
 impl<'a> ShellCaster<'a> {
@@ -100,29 +99,31 @@ impl<'a> ShellCaster<'a> {
     ///
     /// A layer has not one offset and one alpha for each vertex.
     pub fn new(mesh: &'a Mesh, shells: &'a Shells) -> ShellCaster<'a> {
-        let caster = |layer: &'a ShellLayer| {
-            let (surface, source) = layer.surface(mesh);
-            LayerCaster { layer, bvh: Bvh::new(&surface), source }
-        };
-        ShellCaster { mesh, layers: shells.layers.iter().map(caster).collect() }
+        let (mut all, mut source, mut first) = (Mesh::default(), Vec::new(), Vec::new());
+        for layer in &shells.layers {
+            let (surface, of_mesh) = layer.surface(mesh);
+            let base = all.positions.len() as u32;
+            first.push(source.len() as u32);
+            all.positions.extend(surface.positions);
+            all.triangles.extend(surface.triangles.iter().map(|t| t.map(|v| base + v)));
+            source.extend(of_mesh);
+        }
+        ShellCaster { mesh, layers: &shells.layers, bvh: Bvh::new(&all), source, first }
     }
 
     /// Calls `meet` wherever a ray meets a layer before `end`, from either side, the nearest first:
-    /// with the index of the layer, the source position on the mesh, and the opacity.
+    /// with the index of the layer, the source position on the mesh, and the opacity. Of layers
+    /// that lie within rounding of each other only one counts.
     pub fn cast(&self, ray: &Ray, end: f32, mut meet: impl FnMut(usize, Hit, f32)) {
-        let mut met: Vec<(usize, Hit)> = Vec::new();
-        for (k, LayerCaster { bvh, source, .. }) in self.layers.iter().enumerate() {
-            let mut ahead = *ray;
-            ahead.t_max = ahead.t_max.min(end);
-            while let Some(hit) = bvh.closest_hit(&ahead) {
-                met.push((k, Hit { triangle: source[hit.triangle as usize], ..hit }));
-                // on by some steps of f32
-                ahead.t_min = hit.t + 1e-6 * hit.t.max(1e-3);
-            }
-        }
-        met.sort_by(|a, b| a.1.t.total_cmp(&b.1.t));
-        for (k, hit) in met {
-            meet(k, hit, self.layers[k].layer.alpha(&hit, self.mesh.triangles[hit.triangle as usize]));
+        let mut ahead = *ray;
+        ahead.t_max = ahead.t_max.min(end);
+        while let Some(hit) = self.bvh.closest_hit(&ahead) {
+            let layer = self.first.partition_point(|first| *first <= hit.triangle) - 1;
+            let triangle = self.source[hit.triangle as usize];
+            let alpha = self.layers[layer].alpha(&hit, self.mesh.triangles[triangle as usize]);
+            meet(layer, Hit { triangle, ..hit }, alpha);
+            // on by some steps of f32
+            ahead.t_min = hit.t + 1e-6 * hit.t.max(1e-3);
         }
     }
 }
