@@ -35,7 +35,7 @@ pub use ensemble::EnsembleConfig;
 pub use explain::{Explained, explain, explained};
 pub use iface::IfaceConfig;
 pub use mask::{CutMethod, MaskConfig, MattingMethod, VitmatteColors};
-pub use mesh::{ColorSource, Genus, Hair, MeshConfig, MeshFormat};
+pub use mesh::{ColorSource, Genus, Hair, HairViews, MeshConfig, MeshFormat};
 pub use metrics::{MetricsConfig, TruthPhoto};
 pub use preset::Preset;
 pub use render::{Method, NAMES, PictureFormat, RenderConfig, ViewBackground, display_name};

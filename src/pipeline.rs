@@ -34,6 +34,7 @@ mod export;
 mod exposure;
 mod finish;
 mod frames;
+mod hair_views;
 mod inputs;
 mod learn;
 mod mask;
@@ -103,9 +104,7 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
         Stage::Baseline | Stage::Tface | Stage::Iface => {
             learn::learn(stage, session.refined_capture()?, &session.scene()?, config, dir)
         }
-        Stage::Mesh => {
-            mesh::mesh(session.refined_capture()?, &session.scene()?, fields.surface()?, config, dir)
-        }
+        Stage::Mesh => mesh::mesh(session.refined_capture()?, &session.scene()?, fields, config, dir),
         Stage::Render => {
             let (scene, c) = (session.scene()?, session.render_config());
             let cameras = render::cameras(session.refined_capture()?, session.path.as_ref(), &scene)?;

@@ -158,8 +158,8 @@ mod tests {
                 count += 1;
             }
         }
-        // seven of clicks for two commands, and seven of a mesh, four and two of one
-        assert_eq!(count, 14 + 7 + 4 + 2);
+        // seven of clicks for two commands, and eight of a mesh, four and two of one
+        assert_eq!(count, 14 + 8 + 4 + 2);
     }
 
     #[test]

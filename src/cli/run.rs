@@ -7,12 +7,12 @@ use super::requirement::Requirement;
 use super::screen::print;
 use super::summary::summary;
 use super::target::RunTarget;
-use crate::config::{Fallback, RenderConfig, SETTINGS_FILE, key};
+use crate::config::{Config, Fallback, HairViews, RenderConfig, SETTINGS_FILE, key};
 use crate::pipeline::{Session, Stage, reconstruct};
 use crate::report::duration;
-use crate::run::{Cost, Phase, Run, RunStatus};
+use crate::run::{Cost, Phase, Run, RunStatus, read_record, read_status};
 use serde_json::{Map, Value, json};
-use tiface_base::{ErrorKind, Result, io};
+use tiface_base::{ErrorKind, Fingerprint, Result, io};
 
 /// A command that runs stages.
 pub(super) struct StageCommand<'a> {
@@ -47,6 +47,8 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
     }
     let requirements = require.iter().map(|r| Requirement::parse(r)).collect::<Result<Vec<_>>>()?;
     let run = Run::open(&target.run, stop.clone(), screen.clone());
+    let wanted = path.as_ref().map_or(vec![*until], RenderConfig::shows);
+    config.mesh.hair_views = hair_views(&config, &run, wanted, common.fresh);
     // everything that can be refused is refused here, before the first stage
     let open = || -> Result<Session> {
         let mut session = Session::open(&config, &run)?;
@@ -105,6 +107,26 @@ pub(super) fn run(invocation: &Invocation, command: &StageCommand) -> Result<()>
         print(&summary(&run, session.views(), &done, &written))?;
     }
     requirements.iter().try_for_each(|requirement| requirement.check(&done))
+}
+
+/// Returns which views hair is fitted to on the way to some stages, where this is left open: those
+/// of T-Face if that stage is among them. A mesh that was begun, and is not made again, keeps its
+/// own.
+fn hair_views(config: &Config, run: &Run, wanted: Vec<Stage>, fresh: Option<Stage>) -> HairViews {
+    let HairViews::Auto = config.mesh.hair_views else { return config.mesh.hair_views };
+    let folder = run.path(Stage::Mesh);
+    let record = read_record(&folder).ok().flatten().map(|record| record.fingerprint);
+    let begun = record.or_else(|| Some(read_status(&folder).ok()??.fingerprint));
+    let is_fitted = |begun: &Fingerprint| begun.settings.contains_key(key!(mesh.hair_views));
+    let is_cleared = fresh.is_some_and(|stage| stage.followers(config).contains(&Stage::Mesh));
+    let order = Stage::with_needs(wanted, config);
+    match begun {
+        Some(begun) if is_fitted(&begun) => HairViews::Tface,
+        Some(_) if !is_cleared => HairViews::None,
+        _ if !order.contains(&Stage::Mesh) => HairViews::Auto,
+        _ if order.contains(&Stage::Tface) => HairViews::Tface,
+        _ => HairViews::None,
+    }
 }
 
 /// Returns the settings that a run was last worked on with, as text; `None` if it has not begun.
@@ -179,4 +201,63 @@ fn evaluation(common: &Common, target: &RunTarget) -> Result<RenderConfig> {
         None => common.resolve(None, None, &[])?,
     };
     Ok(RenderConfig { cameras: "test".into(), ..config.render })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::{Preset, Product};
+    use crate::run::Plan;
+    use tiface_base::Error;
+
+    /// Makes the stage `mesh` with these settings, or begins with it and fails.
+    fn make(run: &Run, config: &Config, is_done: bool) {
+        let settings = config.settings_of(Product::of(Stage::Mesh));
+        let fingerprint = Fingerprint::new(1, settings);
+        let plan = Plan { name: "mesh", fingerprint, device: "cpu", needs_bytes: 0, saves: false };
+        let made = run.stage(plan, |_| match is_done {
+            true => Ok(Value::Null),
+            false => Err(Error::cannot("stopped", "")),
+        });
+        assert_eq!(made.is_ok(), is_done);
+    }
+
+    #[test]
+    fn hair_is_fitted_to_views_of_tface_where_it_is_made_anyway() {
+        let dir = tempfile::tempdir().unwrap();
+        let run = Run::quiet(dir.path());
+        let mut config = Config::preset(Preset::Draft);
+        let of = |config: &Config, until: Stage| hair_views(config, &run, vec![until], None);
+        assert_eq!(of(&config, Stage::Mask), HairViews::Auto);
+        assert_eq!(of(&config, Stage::Tface), HairViews::Auto);
+        assert_eq!(of(&config, Stage::Mesh), HairViews::None);
+        assert_eq!(of(&config, Stage::Metrics), HairViews::Tface);
+        config.mesh.hair_views = HairViews::None;
+        assert_eq!(of(&config, Stage::Metrics), HairViews::None);
+    }
+
+    #[test]
+    fn a_mesh_that_was_begun_keeps_the_views_that_its_hair_is_fitted_to() {
+        let config = Config::preset(Preset::Draft);
+        let with = |hair_views: HairViews| {
+            let mut config = config.clone();
+            config.mesh.hair_views = hair_views;
+            config
+        };
+        for is_done in [true, false] {
+            for begun in [HairViews::None, HairViews::Tface] {
+                let dir = tempfile::tempdir().unwrap();
+                let run = Run::quiet(dir.path());
+                make(&run, &with(begun), is_done);
+                let of = |until: Stage, fresh| hair_views(&config, &run, vec![until], fresh);
+                for until in [Stage::Iface, Stage::Mesh, Stage::Metrics] {
+                    assert_eq!(of(until, None), begun, "{until}");
+                }
+                assert_eq!(of(Stage::Metrics, Some(Stage::Render)), begun);
+                // made again, it has what a new one has
+                assert_eq!(of(Stage::Metrics, Some(Stage::Mesh)), HairViews::Tface);
+                assert_eq!(of(Stage::Mesh, Some(Stage::Iface)), begun);
+            }
+        }
+    }
 }

@@ -76,6 +76,18 @@ pub enum Hair {
     None,
 }
 
+/// Views that hair is fitted to besides the photographs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum HairViews {
+    /// T-Face's where its stage is made anyway.
+    Auto,
+    /// T-Face's, from between the cameras.
+    Tface,
+    /// None.
+    None,
+}
+
 table! {
     /// How the surface is extracted and becomes the head mesh.
     pub struct MeshConfig;
@@ -111,6 +123,14 @@ table! {
         #[flag("hair", Text("KIND"), ["mesh"],
             "Hair and other soft outlines: shells (translucent layers, where they help) or none")]
         hair: Hair [Head] => Hair::Shells, Hair::Shells, Hair::None;
+        /// Views that soft layers and their colors are fitted to besides the photographs: tface
+        /// (T-Face's from between the cameras; it is trained before the mesh is made), none, or
+        /// auto (tface where the same command needs T-Face anyway, as `tiface run` does; a mesh
+        /// that is there keeps its own).
+        #[flag("hair-views", Text("KIND"), ["mesh"],
+            "Views that hair is fitted to besides the photographs: tface (T-Face is trained first), none, or \
+             auto (tface where the command needs it anyway; an existing mesh keeps its own)")]
+        hair_views: HairViews [Head if |c| c.mesh.uses_tface()] => HairViews::Auto;
         /// Write a tangent-space map of the unsimplified normals to GLB and USDZ: true or false.
         #[flag("normal-map", Switch("true"), ["mesh"],
             "Store the detail that simplification removes in a normal map; makes the material lit")]
@@ -151,6 +171,11 @@ impl MeshConfig {
     /// Number of pictures of the texture's size that a texture holds: color, normals, lobes.
     pub fn pictures(&self) -> u64 {
         1 + u64::from(self.normal_map) + self.lobe_pictures().div_ceil(u64::from(LOBE_TEXEL).pow(2))
+    }
+
+    /// Returns whether soft layers are fitted to views of T-Face.
+    pub fn uses_tface(&self) -> bool {
+        self.hair == Hair::Shells && self.hair_views == HairViews::Tface
     }
 
     /// Returns what the ranges of single keys cannot say: a key, its problem, and a suggested fix.

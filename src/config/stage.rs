@@ -54,6 +54,7 @@ impl Stage {
         match self {
             Mask => Vec::new(),
             Baseline | Tface | Iface => vec![Mask],
+            Mesh if config.mesh.uses_tface() => vec![Tface, Iface],
             Mesh => vec![Iface],
             Render => config.render.shows(),
             Ensemble => vec![Render],

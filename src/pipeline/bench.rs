@@ -5,8 +5,8 @@
 //! (steps, photographs' size, the hash grid), others the path from a surface to the head mesh
 //! (simplification, texture).
 
-use super::finish::Finish;
-use super::mesh::{Extraction, extract, photographs};
+use super::finish::{Finish, photographs};
+use super::mesh::{Extraction, extract};
 use super::mesh_files::Export;
 use super::render::{Meshes, Renderer};
 use super::session::Session;
@@ -506,6 +506,7 @@ impl<'f> Finisher<'f> {
             cap: self.extracted.cap.as_ref(),
             cameras: &cameras,
             photographs: &photographs,
+            fields: self.fields,
             scene: &bench.scene,
             export: &export,
             config: &MeshConfig { triangles: 0, max_error: 0.0, ..c.clone() },

@@ -4,6 +4,7 @@
 //! The constants were measured on runs of the synthetic head and of a bust, at 64 x 80 to 384 x 512
 //! pixels and tiny to full settings; `docs/many-heads.md` says how far off other runs were.
 
+use super::hair_views;
 use super::path::CameraPath;
 use super::render::held_out;
 use super::session::Session;
@@ -144,6 +145,10 @@ struct Workload<'a> {
     shown: f64,
 }
 
+/// Largest number of views that hair is fitted to, and of pixels of each.
+const HAIR_VIEWS: f64 = hair_views::VIEWS as f64;
+const HAIR_VIEW_PIXELS: f64 = hair_views::SIDE_PX as f64 * hair_views::SIDE_PX as f64 * 0.75;
+
 impl<'a> Workload<'a> {
     fn new(session: &'a Session<'a>) -> Workload<'a> {
         let all = session.pixels() as f64;
@@ -207,9 +212,17 @@ impl<'a> Workload<'a> {
             ColorSource::Photographs => mib::FITTED_TEXEL,
             ColorSource::Network => mib::TEXEL,
         };
+        // if hair is soft enough for layers, views that they are fitted to
+        let (views, loaded) = match c.uses_tface() {
+            true => (HAIR_VIEWS * self.each.min(HAIR_VIEW_PIXELS), self.renderers(&[Method::Tface], 0.0)),
+            false => (0.0, 0.0),
+        };
         (
-            0.5 + 1.3e-4 * cells + 5e-6 * texels * pictures + 1e-6 * all,
-            mib::PIXEL * all + mib::CELL * cells + (texel + mib::PICTURE_TEXEL * pictures) * texels,
+            0.5 + 1.3e-4 * cells + 5e-6 * texels * pictures + 1e-6 * all + 5e-6 * views,
+            mib::PIXEL * (all + views)
+                + mib::CELL * cells
+                + (texel + mib::PICTURE_TEXEL * pictures) * texels
+                + loaded,
         )
     }
 

@@ -2,13 +2,16 @@
 
 use super::advice::{advised, sentence};
 use super::frames::center;
+use super::hair_views::hair_views;
 use super::mesh_files::Export;
-use crate::config::{ColorSource, Hair, MeshConfig};
+use super::surface::Fields;
+use crate::config::{ColorSource, Hair, MeshConfig, Stage};
 use glam::Mat3;
 use serde_json::{Map, Value, json};
 use tiface_base::geom::{Atlas, Camera, Harmonics, Mesh, SdfField, Shells, Similarity};
 use tiface_base::image::{Image, linear_from_srgb, srgb_from_linear};
 use tiface_base::{Monitor, Result};
+use tiface_capture::LoadedView;
 use tiface_capture::scene::Scene;
 use tiface_surface::bake::{
     BakeConfig, Baked, FittedTexture, Seams, Seen, bake, bake_harmonics, complete, complete_unseen_vertices,
@@ -16,8 +19,8 @@ use tiface_surface::bake::{
 };
 use tiface_surface::files::{HeadMesh, HeadTexture, LOBE_TEXEL, Lobes, tangents};
 use tiface_surface::{
-    Appearance, AtlasConfig, Cap, Colors, Photograph, SimplifyConfig, atlas, fit_appearance, fit_shells,
-    resolved, shell_importance, simplify,
+    Appearance, AtlasConfig, Cap, Colors, FittedShells, Photograph, SimplifyConfig, atlas, fit_appearance,
+    fit_shells, resolved, shell_importance, simplify,
 };
 
 /// How far the true surface may lie from a triangle, in cells: the chords of large triangles and
@@ -50,6 +53,8 @@ pub(super) struct Finish<'a> {
     pub cap: Option<&'a Cap>,
     pub cameras: &'a [Camera],
     pub photographs: &'a [Photograph<'a>],
+    /// The fields of the run: hair may be fitted to views of T-Face.
+    pub fields: &'a dyn Fields,
     pub scene: &'a Scene,
     pub export: &'a Export,
     pub config: &'a MeshConfig,
@@ -77,12 +82,16 @@ impl Finish<'_> {
     /// Simplifies the surface, and colors the vertices or bakes a texture.
     pub fn run(&self) -> Result<FinishedHead> {
         let mut log = StepLog::default();
-        let (mut mesh, shells) = self.simplified(&mut log)?;
+        let (mut mesh, fitted) = self.simplified(&mut log)?;
+        let views = fitted.as_ref().map_or(Ok(Vec::new()), |fitted| self.hair_views(&mesh, fitted))?;
+        let rendered = photographs(&views).into_iter().map(|p| Photograph { rendered: true, ..p });
+        let pictures: Vec<Photograph> = self.photographs.iter().copied().chain(rendered).collect();
+        let shells = fitted.map(|fitted| self.refit(&mesh, fitted, &pictures, &mut log)).transpose()?;
         let seen = Seen::of(&mesh, self.cameras, self.photographs, REACH * self.cell);
         mesh.seen_by.clone_from(&seen.cameras);
         let world_from_scene = self.scene.scene_from_world.inverse();
         let turned = self.lobe_coordinates(&mesh, &world_from_scene)?;
-        let fit = self.color_fit(turned, &mut log);
+        let fit = self.color_fit(&pictures, turned, &mut log);
         let (texture, harmonics, linear) = if self.config.texture_px == 0 {
             let guess = mesh.colors.clone();
             let fitted = self.fit_colors(&mut mesh, shells.as_ref(), Colors::Vertices, &fit, &mut log)?;
@@ -103,7 +112,7 @@ impl Finish<'_> {
 
     /// Returns the simplified surface and its soft layers: with fewer triangles in hair if it has
     /// some.
-    fn simplified(&self, log: &mut StepLog) -> Result<(Mesh, Option<Shells>)> {
+    fn simplified(&self, log: &mut StepLog) -> Result<(Mesh, Option<FittedShells>)> {
         let c = self.config;
         let importance = match c.hair {
             // to an error all places are simplified alike
@@ -147,7 +156,7 @@ impl Finish<'_> {
     }
 
     /// Decides whether colors are fitted to photographs; warns if they should be, but cannot.
-    fn color_fit(&self, turned: Mat3, log: &mut StepLog) -> ColorFit<'_> {
+    fn color_fit<'p>(&self, pictures: &'p [Photograph<'p>], turned: Mat3, log: &mut StepLog) -> ColorFit<'p> {
         let c = self.config;
         let fits = c.color == ColorSource::Photographs;
         let photographs_say = fits && self.photographs.iter().any(|p| p.head_pixels() > 0);
@@ -158,20 +167,46 @@ impl Finish<'_> {
             );
         }
         ColorFit {
-            photographs: photographs_say.then_some(self.photographs),
+            photographs: photographs_say.then_some(pictures),
             max_degree: if c.lobes > 0 { c.lobes } else { 2 },
             turned,
         }
     }
 
     /// Returns the soft layers of the hair, if they are asked for and show more of the head.
-    fn shells(&self, mesh: &Mesh, log: &mut StepLog) -> Result<Option<Shells>> {
+    fn shells(&self, mesh: &Mesh, log: &mut StepLog) -> Result<Option<FittedShells>> {
         if self.config.hair != Hair::Shells {
             return Ok(None);
         }
         let sharpness = self.field.sharpness(&mesh.positions);
         let (shells, done) = fit_shells(mesh, &sharpness, self.photographs, self.monitor)?;
         log.report.insert("shells".into(), json!(done));
+        Ok(shells)
+    }
+
+    /// Returns the views that layers are fitted to besides the photographs.
+    fn hair_views(&self, mesh: &Mesh, fitted: &FittedShells) -> Result<Vec<LoadedView>> {
+        if !self.config.uses_tface() {
+            return Ok(Vec::new());
+        }
+        let field = self.fields.radiance(Stage::Tface)?;
+        hair_views(mesh, &fitted.shells, self.cameras, field, self.monitor)
+    }
+
+    /// Fits layers to all pictures, if there may be more than they were fitted to.
+    fn refit(
+        &self,
+        mesh: &Mesh,
+        fitted: FittedShells,
+        pictures: &[Photograph],
+        log: &mut StepLog,
+    ) -> Result<Shells> {
+        if !self.config.uses_tface() {
+            return Ok(fitted.shells);
+        }
+        let (shells, triangles) = fitted.refit(mesh, pictures, self.monitor)?;
+        let views = pictures.len() - self.photographs.len();
+        log.report.insert("hair_views".into(), json!({"views": views, "kept_triangles": triangles}));
         Ok(shells)
     }
 
@@ -243,6 +278,7 @@ impl Finish<'_> {
             Image { width: layout.width, height: layout.height, channels: 3, data: texels.into_flattened() };
         let before = own.clone();
         let guess = std::mem::replace(&mut image, own);
+        let cap = self.cap;
         let fitted_texture = FittedTexture {
             mesh: &mut *mesh,
             atlas: layout,
@@ -250,7 +286,7 @@ impl Finish<'_> {
             guess: &guess,
             image: &mut image,
             known: &mut known,
-            calm: &|p| self.cap.is_some_and(|cap| cap.holds(p)),
+            calm: &|p| cap.is_some_and(|cap| cap.holds(p)),
         };
         let unseen = fitted_texture.complete_unseen();
         complete(&mut image, &known, c.gutter_px, &Seams::new(mesh, layout));
@@ -295,6 +331,20 @@ impl Finish<'_> {
         let lobes = Lobes::new(&baked.lobes, turned).map(|l| l.reduced(c.texture_px / LOBE_TEXEL));
         HeadTexture { atlas: layout, color, normal, lobes }
     }
+}
+
+/// Returns loaded photographs in the form that colors are fitted to.
+pub(super) fn photographs(views: &[LoadedView]) -> Vec<Photograph<'_>> {
+    views
+        .iter()
+        .map(|view| Photograph {
+            camera: &view.camera,
+            photo: &view.photo,
+            mask: view.mask.as_ref(),
+            valid: view.valid.as_ref(),
+            rendered: false,
+        })
+        .collect()
 }
 
 /// Returns view-dependent color that each vertex has by its trust: what nobody saw looks the same

@@ -10,10 +10,10 @@
 //! ```
 
 use super::advice::{advised, sentence};
-use super::finish::{Finish, FinishedHead, REACH};
+use super::finish::{Finish, FinishedHead, REACH, photographs};
 use super::learn;
 use super::mesh_files::Export;
-use super::surface::{CappedField, Surface};
+use super::surface::{CappedField, Fields, Surface};
 use crate::config::{ColorSource, Config, Genus, Hair, MeshConfig, Stage};
 use crate::run::{Phase, Record, Run, StageDir, StageStatus, Status};
 use glam::{DVec3, Vec3};
@@ -24,7 +24,7 @@ use tiface_base::image::Image;
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, ErrorKind, Monitor, Result};
 use tiface_capture::scene::Scene;
-use tiface_capture::{self as capture, Capture, LoadedView, Split};
+use tiface_capture::{self as capture, Capture, Split};
 use tiface_surface::bake::{Seen, seen_colors, seen_map, seen_shares};
 use tiface_surface::files::{ExportOptions, ExportedFiles, ExtractedSurface, HeadMesh, read, to_ply};
 use tiface_surface::{
@@ -36,11 +36,11 @@ use tiface_surface::{
 pub(super) fn mesh(
     capture: &Capture,
     scene: &Scene,
-    field: &dyn Surface,
+    fields: &dyn Fields,
     config: &Config,
     dir: &StageDir,
 ) -> Result<Value> {
-    let c = &config.mesh;
+    let (c, field) = (&config.mesh, fields.surface()?);
     let (world_from_scene, export) = (scene.scene_from_world.inverse(), Export::new(capture, config));
     let cameras: Vec<Camera> = capture.split(Split::Train).map(|v| v.camera.clone()).collect();
     let views = match c.color {
@@ -73,6 +73,7 @@ pub(super) fn mesh(
         cap: extracted.cap.as_ref().filter(|_| c.cap),
         cameras: &cameras,
         photographs: &photographs,
+        fields,
         scene,
         export: &export,
         config: c,
@@ -156,19 +157,6 @@ pub(super) fn seen_note([none, one, ..]: [f64; 4]) -> Option<String> {
             100.0 * one
         )
     })
-}
-
-/// Returns loaded views in the form that colors are fitted to.
-pub(super) fn photographs(views: &[LoadedView]) -> Vec<Photograph<'_>> {
-    views
-        .iter()
-        .map(|view| Photograph {
-            camera: &view.camera,
-            photo: &view.photo,
-            mask: view.mask.as_ref(),
-            valid: view.valid.as_ref(),
-        })
-        .collect()
 }
 
 /// The whole surface of a field, in scene coordinates.

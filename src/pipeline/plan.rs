@@ -258,7 +258,9 @@ impl Session<'_> {
     fn fingerprint(&self, product: Product) -> Fingerprint {
         let (stage, config) = (product.stage(), self.config);
         let mut fingerprint = Fingerprint::new(FORMAT, config.settings_of(product));
-        for needed in stage.needs(config) {
+        // T-Face's views show in the layers of the head mesh alone
+        let reads = |needed: &Stage| product != Product::Surface || *needed != Stage::Tface;
+        for needed in stage.needs(config).into_iter().filter(reads) {
             fingerprint = fingerprint.input(needed.as_str(), self.input(needed, &config.render.method));
         }
         for (name, digest) in self.inputs.read_by(stage) {

@@ -5,7 +5,7 @@ use super::inputs::capture_options;
 use super::render::shows_head;
 use super::tests::{demo_head, draft, quiet, words};
 use super::*;
-use crate::config::{Config, Key, Method, Product, Sources, all_keys, key};
+use crate::config::{Config, HairViews, Key, Method, Product, Sources, all_keys, key};
 use crate::mask::prompts::{PhotoPrompts, Prompts, file_path, parse_point};
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -119,8 +119,10 @@ fn cases(dir: &Path) -> Vec<(Config, Vec<&'static str>)> {
         key!(mask.trust),
     ];
     let imports = with(&|c| (c.baseline.import, c.tface.import) = (file("baseline"), file("tface")));
+    let fitted_to_views = with(&|c| c.mesh.hair_views = HairViews::Tface);
     vec![
         (base.clone(), Vec::new()),
+        (fitted_to_views, vec![key!(mesh.hair_views), key!(tface.steps), key!(mesh.resolution)]),
         (clicked, of_clicks),
         (with(&|c| c.mask.point = vec!["16,20,1".into()]), vec![key!(mask.point), key!(mask.view)]),
         (with(&|c| c.mask.alpha_net = file("alpha_net")), vec![key!(mask.alpha_net), key!(mask.alpha_input)]),
@@ -204,7 +206,8 @@ fn files_intervals_and_limits_make_nothing_again() {
 /// view shows the head, and neither its files nor what is only in them.
 #[test]
 fn keys_of_the_mesh_make_its_surface_its_head_or_its_files_again() {
-    let config = Config::preset(crate::config::Preset::Draft);
+    let mut config = Config::preset(crate::config::Preset::Draft);
+    config.mesh.hair_views = HairViews::Tface;
     let innermost = |row: &Key| {
         let parts = [(Product::Surface, "surface"), (Product::Head, "head"), (Product::Files, "files")];
         parts
@@ -224,6 +227,7 @@ fn keys_of_the_mesh_make_its_surface_its_head_or_its_files_again() {
         (key!(mesh.texture_px), "head"),
         (key!(mesh.lobes), "head"),
         (key!(mesh.hair), "head"),
+        (key!(mesh.hair_views), "head"),
         (key!(mesh.normal_map), "head"),
         (key!(mesh.exr), "files"),
         (key!(mesh.format), "files"),

@@ -2,7 +2,9 @@
 
 use super::tests::{NoFields, head_run, masked, quiet, tiny_run, words};
 use super::*;
-use crate::config::{ColorSource, Config, MaskSource, MeshConfig, MeshFormat, Method, ViewBackground};
+use crate::config::{
+    ColorSource, Config, Hair, HairViews, MaskSource, MeshConfig, MeshFormat, Method, ViewBackground,
+};
 use crate::run::{Run, Stop};
 use serde_json::json;
 use tiface_base::io::{self, Limits};
@@ -184,6 +186,13 @@ fn a_command_runs_what_its_stage_needs_and_nothing_else() {
     assert_eq!(words(&Stage::Tface.followers(&base)), "tface render ensemble metrics");
     assert_eq!(words(&Stage::Iface.followers(&base)), "iface mesh render ensemble metrics");
     assert_eq!(words(&Stage::Mask.followers(&base)), words(&Stage::ALL));
+    // hair that is fitted to views of T-Face needs them
+    let mut fitted = base.clone();
+    (fitted.mesh.hair, fitted.mesh.hair_views) = (Hair::Shells, HairViews::Tface);
+    assert_eq!(words(&Session::open(&fitted, &run).unwrap().order(Stage::Mesh)), "mask tface iface mesh");
+    assert_eq!(words(&Stage::Tface.followers(&fitted)), "tface mesh render ensemble metrics");
+    fitted.mesh.hair = Hair::None;
+    assert_eq!(words(&Session::open(&fitted, &run).unwrap().order(Stage::Mesh)), "mask iface mesh");
 }
 
 #[test]

@@ -114,7 +114,7 @@ impl Radiance for crate::tface::FieldMean {
 }
 
 /// Number of rays marched together: a few megabytes, and enough for any number of threads.
-const BAND: usize = 1 << 16;
+pub(super) const BAND: usize = 1 << 16;
 
 /// Renders a camera in scene coordinates; depth and normals are in the world.
 ///

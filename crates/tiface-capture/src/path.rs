@@ -1,7 +1,9 @@
-//! Cameras of novel views: an orbit around the head, or a file.
+//! Cameras of novel views: an orbit around the head, a file, or between others.
 
+mod between;
 mod file;
 
+pub use between::between;
 pub use file::from_json;
 
 use glam::{BVec3, DMat3, DVec3, Vec3};

@@ -35,7 +35,6 @@ pub(super) use nodes::Nodes;
 pub use photograph::Photograph;
 
 use glam::{Mat3, Vec3};
-use rayon::prelude::*;
 use rows::{RayTarget, Row, Rows};
 use serde::Serialize;
 use solve::{Smoothness, System};
@@ -45,7 +44,8 @@ use tiface_base::geom::{Atlas, Bvh, Harmonics, Mesh, ShellCaster, Shells, area_v
 use tiface_base::image::Image;
 use tiface_base::{Monitor, Result};
 
-/// Approximate maximum number of pixels that colors are fitted to: more hardly change the colors.
+/// Approximate maximum number of photographs' pixels that colors are fitted to: more hardly change
+/// the colors.
 const MAX_PIXELS: usize = 1_000_000;
 
 /// Every n-th photograph is left out of the first fits, to validate them.
@@ -80,7 +80,7 @@ pub struct Appearance {
 /// A report of a fit.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct AppearanceReport {
-    /// Pixels of photographs that were fitted to.
+    /// Pixels that were fitted to, those of rendered views included.
     pub pixels: usize,
     /// Share of the nodes that some of them show, 0..=1.
     pub seen: f64,
@@ -126,7 +126,8 @@ pub fn fit(
     monitor: &dyn Monitor,
 ) -> Result<Option<Appearance>> {
     let (begin, max_degree) = (Instant::now(), max_degree.min(2));
-    let head: usize = photographs.iter().map(Photograph::head_pixels).sum();
+    let taken = photographs.iter().filter(|p| !p.rendered);
+    let head: usize = taken.map(Photograph::head_pixels).sum();
     let stride = (head as f64 / MAX_PIXELS as f64).sqrt().ceil().max(1.0) as u32;
     let shown = shells.map(|shells| shells.on_core(mesh));
     let (core, layers) = shown.as_ref().map_or((mesh, None), |(core, layers)| (core, Some(layers)));
@@ -153,7 +154,7 @@ pub fn fit(
     monitor.check_stop()?;
     let fine_start = (&fine, &before[..], &smooth);
     let lobes = (&vertices, &normals[..]);
-    let choice = choose(&rows.quarter(), lobes, fine_start, photographs.len(), max_degree, monitor)?;
+    let choice = choose(&rows.half(), lobes, fine_start, photographs, max_degree, monitor)?;
     let Choice { degree, smoothness, gains, left_out } = choice;
     monitor.check_stop()?;
 
@@ -184,7 +185,7 @@ pub fn fit(
         Colors::Texels(_, image) => (fine.onto(&own, image), fine.at_corners(mesh, &own)),
     };
     let shown = |v: &usize| rows.binary_search_by_key(&(*v as u32), |row| row.view).is_ok();
-    let of_all = (0..gains.len()).filter(shown).flat_map(|v| gains[v]);
+    let of_all = (0..gains.len()).filter(|&v| !photographs[v].rendered).filter(shown).flat_map(|v| gains[v]);
     report = AppearanceReport {
         pixels: rows.len(),
         seen,
@@ -212,7 +213,7 @@ fn vertex_normals(mesh: &Mesh, turned: Mat3) -> Vec<Vec3> {
 struct Choice {
     degree: u32,
     smoothness: Smoothness,
-    /// `[photographs]`, per channel; their mean is 1.
+    /// `[photographs]`, per channel; the mean of those that are not rendered is 1.
     gains: Vec<[f32; 3]>,
     left_out: Vec<(u32, f32, f64)>,
 }
@@ -221,13 +222,13 @@ fn choose(
     rows: &Rows,
     (vertices, normals): (&Nodes, &[Vec3]),
     (fine, before, smooth): (&Nodes, &[[f32; 3]], &Smoothness),
-    photographs: usize,
+    photographs: &[Photograph],
     max_degree: u32,
     monitor: &dyn Monitor,
 ) -> Result<Choice> {
     let all = |_: u32| true;
-    let held = |v: u32| v % VALIDATION_STRIDE == VALIDATION_STRIDE / 2;
-    let ones = vec![[1f32; 3]; photographs];
+    let held = |v: u32| v % VALIDATION_STRIDE == VALIDATION_STRIDE / 2 && !photographs[v as usize].rendered;
+    let ones = vec![[1f32; 3]; photographs.len()];
     let (in_fine, in_vertices) = (rows.matrix(fine), rows.matrix(vertices));
     let (of_fine, of_vertices) = (
         System { rows, matrix: &in_fine, nodes: fine, normals: &[] },
@@ -262,7 +263,7 @@ fn choose(
     }
     let left_out = candidates.iter().map(|(d, s, db)| (*d, s.others, *db)).collect();
     // without data to decide on, the more careful one
-    let enough = (0..photographs as u32).any(held);
+    let enough = (0..photographs.len() as u32).any(held);
     let best = match enough {
         true => candidates.iter().fold(&candidates[0], |best, c| if c.2 > best.2 { c } else { best }),
         false => &candidates[0],
@@ -277,9 +278,9 @@ fn photo(rows: &Rows, gains: &[[f32; 3]]) -> Vec<[f32; 3]> {
 }
 
 /// Returns the gain of each photograph that brings it closest to the fitted image, which is the
-/// photograph less `error` `[rows]`; relative to their mean.
-fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]> {
-    let mut sums = vec![[[0f64; 2]; 3]; photographs];
+/// photograph less `error` `[rows]`; relative to the mean of those that are not rendered.
+fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: &[Photograph]) -> Vec<[f32; 3]> {
+    let mut sums = vec![[[0f64; 2]; 3]; photographs.len()];
     for (row, error) in rows.iter().zip(error) {
         for k in 0..3 {
             let (y, e) = (f64::from(row.photo[k]), f64::from(error[k]));
@@ -289,7 +290,8 @@ fn gains_of(rows: &Rows, error: &[[f32; 3]], photographs: usize) -> Vec<[f32; 3]
     }
     let raw = |s: &[f64; 2]| if s[1] > 0.0 { s[0] / s[1] } else { 1.0 };
     let mean: [f64; 3] = std::array::from_fn(|k| {
-        let seen = sums.iter().filter(|s| s[k][1] > 0.0);
+        let taken = sums.iter().zip(photographs).filter(|(_, p)| !p.rendered).map(|(s, _)| s);
+        let seen = taken.filter(|s| s[k][1] > 0.0);
         let (total, n) = seen.fold((0.0, 0), |(t, n), s| (t + raw(&s[k]).max(1e-3).ln(), n + 1));
         (total / f64::from(n.max(1))).exp()
     });
@@ -309,11 +311,8 @@ impl System<'_> {
     /// Returns the residual of `target` `[rows]` after subtracting the rows of `x`
     /// `[nodes, count]`.
     fn missing(&self, target: &[[f32; 3]], x: &[[f32; 3]], count: usize) -> Vec<[f32; 3]> {
-        let left = |(p, t): (usize, &[f32; 3])| {
-            let shown = self.shown(p, x, count);
-            std::array::from_fn(|k| t[k] - shown[k])
-        };
-        target.par_iter().enumerate().with_min_len(4096).map(left).collect()
+        let left = |(t, shown): (&[f32; 3], [f32; 3])| std::array::from_fn(|k| t[k] - shown[k]);
+        target.iter().zip(self.shown(x, count)).map(left).collect()
     }
 }
 

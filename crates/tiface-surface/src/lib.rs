@@ -47,7 +47,7 @@ pub use measure::{HeadMeasures, measure};
 pub use mesh_distance::MeshDistance;
 pub use outline::{OutlineReport, fit as fit_outlines};
 pub use resize::{DetailLevel, Resize, lods, most_levels, resized};
-pub use shells::{ShellsReport, fit as fit_shells, importance as shell_importance};
+pub use shells::{FittedShells, ShellsReport, fit as fit_shells, importance as shell_importance};
 pub use simplify::{SimplifyConfig, SimplifyReport, simplify};
 pub use smooth::{SmoothReport, smooth};
 pub use warning::Warning;

@@ -212,7 +212,13 @@ mod tests {
         // a ramp of about a pixel
         let masks: Vec<Gray> =
             cameras.iter().enumerate().map(|(k, camera)| ball_mask(camera, radius(k), 130.0)).collect();
-        let view = |(camera, mask)| Photograph { camera, photo: &photo, mask: Some(mask), valid: None };
+        let view = |(camera, mask)| Photograph {
+            camera,
+            photo: &photo,
+            mask: Some(mask),
+            valid: None,
+            rendered: false,
+        };
         let photographs: Vec<Photograph> = cameras.iter().zip(&masks).map(view).collect();
         let report = fit(&mut mesh, fixed, &photographs, monitor);
         (mesh, report)

@@ -113,6 +113,42 @@ impl ShellsReport {
     }
 }
 
+/// Layers that were fitted to photographs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FittedShells {
+    /// The layers.
+    pub shells: Shells,
+    /// The same with the opacities of the field, from which a fit begins.
+    field: Shells,
+    /// Whether left-out photographs look better with fitted opacities than with the field's.
+    is_better: bool,
+}
+
+impl FittedShells {
+    /// Returns the layers fitted anew, to these pictures, and the number of triangles of all of
+    /// them together. Where fits are worse than what the field says, that stays.
+    ///
+    /// # Errors
+    ///
+    /// A request to stop.
+    pub fn refit(
+        self,
+        mesh: &Mesh,
+        pictures: &[Photograph],
+        monitor: &dyn Monitor,
+    ) -> Result<(Shells, usize)> {
+        let shells = match self.is_better {
+            true => {
+                let outlines = Outlines::new(mesh, &self.field, pictures, monitor)?;
+                confine(outlines.fit(&self.field, &Nodes::vertices(mesh), &|_| true))
+            }
+            false => self.shells,
+        };
+        let triangles = triangles(&shells, mesh);
+        Ok((shells, triangles))
+    }
+}
+
 /// Returns layers around a mesh whose vertices have normals, of the local `sharpness` of the field
 /// at its vertices, and how deep below it the mesh is opaque. Returns `None` if the masks carry no
 /// information, nothing is soft, or left-out photographs do not look better.
@@ -125,7 +161,7 @@ pub fn fit(
     sharpness: &[f32],
     photographs: &[Photograph],
     monitor: &dyn Monitor,
-) -> Result<(Option<Shells>, ShellsReport)> {
+) -> Result<(Option<FittedShells>, ShellsReport)> {
     let nodes = Nodes::vertices(mesh);
     let mut best: Option<Candidate> = None;
     for design in &DESIGNS {
@@ -145,10 +181,11 @@ pub fn fit(
         return Ok((None, report));
     }
     let [_, seen, fitted] = report.left_out;
-    let shells = if fitted < seen { outlines.fit(&field, &nodes, &|_| true) } else { field };
+    let is_better = fitted < seen;
+    let shells = if is_better { outlines.fit(&field, &nodes, &|_| true) } else { field.clone() };
     let shells = confine(shells);
     report.kept_triangles = triangles(&shells, mesh);
-    Ok((Some(shells), report))
+    Ok((Some(FittedShells { shells, field, is_better }), report))
 }
 
 /// Layers of a design as the field has them, and how they are judged.
@@ -316,21 +353,41 @@ mod tests {
     use super::*;
     use crate::fixtures::{SIZE, ball, ball_mask, cameras};
     use tiface_base::Quiet;
+    use tiface_base::geom::Camera;
     use tiface_base::image::{Gray, Photo};
 
-    fn black() -> Photo {
-        Photo { width: SIZE, height: SIZE, rgb: vec![[0; 3]; (SIZE * SIZE) as usize], alpha: None }
+    /// Black photographs of a ball with soft masks.
+    struct Photos {
+        photo: Photo,
+        cameras: Vec<Camera>,
+        masks: Vec<Gray>,
     }
 
-    fn run(field: f32, masks: f32) -> (Option<Shells>, ShellsReport) {
+    impl Photos {
+        fn new(sharpness: f32) -> Photos {
+            let cameras = cameras();
+            let masks = cameras.iter().map(|c| ball_mask(c, 0.5, sharpness)).collect();
+            let rgb = vec![[0; 3]; (SIZE * SIZE) as usize];
+            Photos { photo: Photo { width: SIZE, height: SIZE, rgb, alpha: None }, cameras, masks }
+        }
+
+        fn photographs(&self) -> Vec<Photograph<'_>> {
+            let views = self.cameras.iter().zip(&self.masks);
+            let view = |(camera, mask)| Photograph {
+                camera,
+                photo: &self.photo,
+                mask: Some(mask),
+                valid: None,
+                rendered: false,
+            };
+            views.map(view).collect()
+        }
+    }
+
+    fn run(field: f32, masks: f32) -> (Option<FittedShells>, ShellsReport) {
         let mesh = ball(0.5);
-        let photo = black();
-        let cameras = cameras();
-        let masks: Vec<Gray> = cameras.iter().map(|c| ball_mask(c, 0.5, masks)).collect();
-        let view = |(camera, mask)| Photograph { camera, photo: &photo, mask: Some(mask), valid: None };
-        let photographs: Vec<Photograph> = cameras.iter().zip(&masks).map(view).collect();
         let sharpness = vec![field; mesh.positions.len()];
-        fit(&mesh, &sharpness, &photographs, &Quiet).unwrap()
+        fit(&mesh, &sharpness, &Photos::new(masks).photographs(), &Quiet).unwrap()
     }
 
     fn of_field(mesh: &Mesh, sharpness: &[f32], photographs: &[Photograph]) -> Shells {
@@ -343,7 +400,7 @@ mod tests {
     fn a_soft_ball_gets_layers_as_soft_as_its_masks() {
         // 1 / s is 0.05, and a pixel 0.025 at the nearest vertex
         let (shells, report) = run(20.0, 20.0);
-        let shells = shells.unwrap();
+        let shells = shells.unwrap().shells;
         assert!((report.softness_px - 0.05 / 0.025).abs() < 0.1, "{report:?}");
         assert_eq!((report.layers, shells.layers.len()), (4, 4));
         let [none, _, fitted] = report.left_out;
@@ -370,11 +427,9 @@ mod tests {
 
     #[test]
     fn the_field_says_how_much_rays_lose_between_layers() {
-        let (mesh, camera) = (ball(0.5), &cameras()[0]);
-        let (photo, mask) = (black(), ball_mask(camera, 0.5, 20.0));
-        let photographs = [Photograph { camera, photo: &photo, mask: Some(&mask), valid: None }];
+        let (mesh, photos) = (ball(0.5), Photos::new(20.0));
         let sharpness = vec![20.0; mesh.positions.len()];
-        let shells = of_field(&mesh, &sharpness, &photographs);
+        let shells = of_field(&mesh, &sharpness, &photos.photographs()[..1]);
         // layers at -1 and 1/2 above what is opaque at -2: 1 − √(σ(-3/2) / σ(-1/4)) =
         // 1 − √(0.18243 / 0.43782); and the last, from 17/4 on: 1 − √0.98594
         let most = |layer: &ShellLayer| layer.alphas.iter().copied().fold(0.0, f32::max);
@@ -385,10 +440,29 @@ mod tests {
     #[test]
     fn masks_softer_than_the_field_make_outer_layers_denser() {
         let alpha = |masks: f32| {
-            let layer = run(20.0, masks).0.unwrap().layers.swap_remove(2);
+            let layer = run(20.0, masks).0.unwrap().shells.layers.swap_remove(2);
             layer.alphas.iter().sum::<f32>() / layer.alphas.len() as f32
         };
         assert!(alpha(10.0) > alpha(20.0) + 0.02, "{} {}", alpha(10.0), alpha(20.0));
+    }
+
+    #[test]
+    fn rendered_views_change_opacities_where_they_are_valid() {
+        let (mesh, photos, denser) = (ball(0.5), Photos::new(20.0), Photos::new(10.0));
+        let opacity = |views: Vec<Photograph>| {
+            let pictures: Vec<Photograph> = photos.photographs().into_iter().chain(views).collect();
+            let (shells, triangles) = run(20.0, 20.0).0.unwrap().refit(&mesh, &pictures, &Quiet).unwrap();
+            assert_eq!(triangles, super::triangles(&shells, &mesh));
+            shells.layers[2].alphas.iter().sum::<f32>() / mesh.positions.len() as f32
+        };
+        let rendered = |valid| -> Vec<Photograph> {
+            let views = denser.photographs().into_iter();
+            views.map(|p| Photograph { rendered: true, valid: Some(valid), ..p }).collect()
+        };
+        let all = |value: u8| Gray { values: vec![value; (SIZE * SIZE) as usize], ..denser.masks[0].clone() };
+        let (some, none) = (opacity(rendered(&all(255))), opacity(rendered(&all(0))));
+        assert_eq!(none, opacity(Vec::new()));
+        assert!(some > none + 0.01, "{some} {none}");
     }
 
     #[test]
@@ -433,17 +507,15 @@ mod tests {
     fn the_surface_stays_opaque_where_that_is_closer_to_left_out_masks() {
         // strands of the field reach farther than those of the masks
         let (shells, report) = run(20.0, 60.0);
-        let shells = shells.unwrap();
+        let shells = shells.unwrap().shells;
         assert_eq!((report.layers, shells.layers.len(), shells.depths.len()), (2, 2, 0));
     }
 
     #[test]
     fn what_will_have_layers_is_simplified_more() {
         // pixels are 0.025 at the nearest vertex: half a pixel above, two below
-        let (mesh, photo, cameras) = (ball(0.5), black(), cameras());
-        let masks: Vec<Gray> = cameras.iter().map(|c| ball_mask(c, 0.5, 20.0)).collect();
-        let view = |(camera, mask)| Photograph { camera, photo: &photo, mask: Some(mask), valid: None };
-        let photographs: Vec<Photograph> = cameras.iter().zip(&masks).map(view).collect();
+        let (mesh, photos) = (ball(0.5), Photos::new(20.0));
+        let photographs = photos.photographs();
         let sharpness: Vec<f32> =
             mesh.positions.iter().map(|p| if p.z > 0.0 { 80.0 } else { 20.0 }).collect();
         let importance = importance(&mesh, &sharpness, &photographs);
@@ -466,13 +538,10 @@ mod tests {
     #[test]
     fn opacity_falls_towards_where_no_layer_is() {
         // masks are soft all around, but the field below is hard
-        let (mesh, photo, cameras) = (ball(0.5), black(), cameras());
-        let masks: Vec<Gray> = cameras.iter().map(|c| ball_mask(c, 0.5, 20.0)).collect();
-        let view = |(camera, mask)| Photograph { camera, photo: &photo, mask: Some(mask), valid: None };
-        let photographs: Vec<Photograph> = cameras.iter().zip(&masks).map(view).collect();
+        let (mesh, photos) = (ball(0.5), Photos::new(20.0));
         let sharpness: Vec<f32> =
             mesh.positions.iter().map(|p| if p.y > 0.0 { 20.0 } else { 4000.0 }).collect();
-        let shells = fit(&mesh, &sharpness, &photographs, &Quiet).unwrap().0.unwrap();
+        let shells = fit(&mesh, &sharpness, &photos.photographs(), &Quiet).unwrap().0.unwrap().shells;
         let nodes = Nodes::vertices(&mesh);
         let layer = &shells.layers[3];
         // as does the depth of what is opaque
@@ -494,13 +563,10 @@ mod tests {
 
     #[test]
     fn slopes_are_those_of_differences() {
-        let mesh = ball(0.5);
-        let camera = &cameras()[3];
-        let mask = ball_mask(camera, 0.5, 20.0);
-        let photo = black();
-        let photographs = [Photograph { camera, photo: &photo, mask: Some(&mask), valid: None }];
-        let shells = of_field(&mesh, &vec![20.0; mesh.positions.len()], &photographs);
-        let outlines = Outlines::new(&mesh, &shells, &photographs, &Quiet).unwrap();
+        let (mesh, photos) = (ball(0.5), Photos::new(20.0));
+        let photographs = &photos.photographs()[3..4];
+        let shells = of_field(&mesh, &vec![20.0; mesh.positions.len()], photographs);
+        let outlines = Outlines::new(&mesh, &shells, photographs, &Quiet).unwrap();
         let row = (0..outlines.rows()).find(|&r| outlines.rays[r].iter().any(|l| l.len() == 8)).unwrap();
         let mut slopes = Vec::new();
         outlines.opacity(row, Some(&shells), Some(&mut slopes));

@@ -25,11 +25,12 @@ const NEARER: f32 = 0.5;
 /// Alpha up to which a pixel shows the background alone.
 const CLEAR: u8 = 5;
 
-/// Returns for each pixel whether it counts as the head by the mask, but shows light from behind.
+/// Returns for each pixel whether it counts as the head by the mask, but shows light from behind;
+/// in a rendered view none does.
 pub(super) fn is_glare(photograph: &Photograph) -> Vec<bool> {
     let photo = photograph.photo;
     let (w, h) = (photo.width as usize, photo.height as usize);
-    let Some(mask) = photograph.mask else { return vec![false; w * h] };
+    let Some(mask) = photograph.mask.filter(|_| !photograph.rendered) else { return vec![false; w * h] };
     let head: Vec<bool> = (0..w * h).map(|at| photograph.is_head(at)).collect();
     let inner = eroded(head.clone(), w, h, EDGE);
     let heads = WindowMeans::new(&photo.rgb, [w, h], |at| inner[at]);
@@ -101,13 +102,15 @@ mod tests {
         let photo = Photo { width: w as u32, height: h as u32, rgb, alpha: None };
         let mask = Gray { width: w as u32, height: h as u32, values };
         let camera = Camera::above(w as u32, h as u32, 40.0, 3.0);
-        let whole = Photograph { camera: &camera, photo: &photo, mask: Some(&mask), valid: None };
+        let whole =
+            Photograph { camera: &camera, photo: &photo, mask: Some(&mask), valid: None, rendered: false };
         let glare = is_glare(&whole);
         for (i, is) in glare.iter().enumerate() {
             let (x, y) = (i % w, i / w);
             assert_eq!(*is, x == 20 || x == 21 || (x, y) == (19, 15), "{x} {y}");
         }
         assert!(is_glare(&Photograph { mask: None, ..whole }).iter().all(|g| !g));
+        assert!(is_glare(&Photograph { rendered: true, ..whole }).iter().all(|g| !g));
     }
 
     #[test]
@@ -119,7 +122,8 @@ mod tests {
             values: (0..900).map(|i| if i % 30 < 15 { 255 } else { 0 }).collect(),
         };
         let camera = Camera::above(30, 30, 40.0, 3.0);
-        let photograph = Photograph { camera: &camera, photo: &photo, mask: Some(&mask), valid: None };
+        let photograph =
+            Photograph { camera: &camera, photo: &photo, mask: Some(&mask), valid: None, rendered: false };
         assert!(is_glare(&photograph).iter().all(|g| !g));
     }
 }

@@ -16,6 +16,8 @@ pub struct Photograph<'a> {
     pub mask: Option<&'a Gray>,
     /// Usable pixels (non-zero), same size; `None`: all are.
     pub valid: Option<&'a Gray>,
+    /// Whether it is a field's view: no camera took it, so nothing is judged by it.
+    pub rendered: bool,
 }
 
 impl Photograph<'_> {

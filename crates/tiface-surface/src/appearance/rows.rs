@@ -8,11 +8,8 @@ use rayon::prelude::*;
 use std::ops::Deref;
 use tiface_base::geom::{Bvh, Hit, Mesh, ShellCaster, area_vector};
 
-/// Rays along each side of a pixel.
+/// Rays along each side of a photograph's pixel; a rendered one is of a single ray.
 const SIDE: u32 = 2;
-
-/// Rays of a pixel.
-const RAYS: usize = (SIDE * SIDE) as usize;
 
 /// A pixel that the head fills, by the mask and by all of its rays.
 #[derive(Clone)]
@@ -48,18 +45,20 @@ impl Deref for Rows {
 }
 
 impl Rows {
-    /// Looks at every `stride`-th pixel each way of the photographs; `turned` leads from the mesh's
-    /// coordinates to those of the harmonics.
+    /// Looks at every `stride`-th pixel each way of the photographs, and at every one of rendered
+    /// views; `turned` leads from the mesh's coordinates to those of the harmonics.
     pub fn new(target: &RayTarget, photographs: &[Photograph], stride: u32, turned: Mat3) -> Rows {
+        let stride = |v: u32| if photographs[v as usize].rendered { 1 } else { stride };
         let lines: Vec<(u32, u32)> = (0..photographs.len() as u32)
             .flat_map(|v| {
-                let height = photographs[v as usize].photo.height;
+                let (height, stride) = (photographs[v as usize].photo.height, stride(v));
                 (0..height).filter(move |y| y % stride == v % stride).map(move |y| (v, y))
             })
             .collect();
         let glare: Vec<Vec<bool>> = photographs.par_iter().map(is_glare).collect();
         let line = |&(view, y): &(u32, u32)| {
             let (photograph, glare) = (&photographs[view as usize], &glare[view as usize]);
+            let stride = stride(view);
             let xs = (y / stride % stride..photograph.photo.width).step_by(stride as usize);
             let row = y as usize * photograph.photo.width as usize;
             let xs = xs.filter(move |x| !glare[row + *x as usize]);
@@ -68,9 +67,10 @@ impl Rows {
         Rows(lines.par_iter().flat_map_iter(line).collect())
     }
 
-    /// Returns every fourth row, for a first, cheap fit.
-    pub fn quarter(&self) -> Rows {
-        Rows(self.0.iter().step_by(4).cloned().collect())
+    /// Returns every second row, for a first, cheaper fit. Of every fourth, colors seem to depend
+    /// less on the view than they do.
+    pub fn half(&self) -> Rows {
+        Rows(self.0.iter().step_by(2).cloned().collect())
     }
 
     /// Returns the nodes under all rows, and their weights.
@@ -124,14 +124,16 @@ impl Row {
             return None;
         }
         let mut cosine = 0.0;
-        let mut hits = Vec::with_capacity(RAYS);
-        for k in 0..RAYS as u32 {
-            let sub = |k: u32| (k as f32 + 0.5) / SIDE as f32;
-            let ray = camera.ray(Vec2::new(x as f32 + sub(k % SIDE), y as f32 + sub(k / SIDE)))?;
+        let side = if photograph.rendered { 1 } else { SIDE };
+        let share = 1.0 / (side * side) as f32;
+        let mut hits = Vec::with_capacity((side * side) as usize);
+        for k in 0..side * side {
+            let sub = |k: u32| (k as f32 + 0.5) / side as f32;
+            let ray = camera.ray(Vec2::new(x as f32 + sub(k % side), y as f32 + sub(k / side)))?;
             let hit = bvh.closest_hit(&ray)?;
             let normal = area_vector(mesh.corners(hit.triangle)).normalize_or_zero();
-            cosine -= normal.dot(ray.direction) / RAYS as f32;
-            let mut left = 1.0 / RAYS as f32;
+            cosine -= normal.dot(ray.direction) * share;
+            let mut left = share;
             if let Some(layers) = layers {
                 layers.cast(&ray, hit.t, |_, hit, alpha| {
                     hits.push((hit, left * alpha));

@@ -84,6 +84,7 @@ fn photographs<'a>(cameras: &'a [Camera], photos: &'a [(Photo, Gray)]) -> Vec<Ph
         photo,
         mask: Some(mask),
         valid: None,
+        rendered: false,
     };
     cameras.iter().zip(photos).map(of).collect()
 }
@@ -258,4 +259,26 @@ fn layers_in_front_take_part_in_the_colors() {
     };
     let (with, without) = (error(Some(&shells)), error(None));
     assert!(with < 0.04 && without > 2.0 * with, "{with} {without}");
+}
+
+#[test]
+fn nothing_is_judged_by_rendered_views() {
+    // gloss, which photographs that are left out would find
+    let (mesh, atlas) = square();
+    let cameras = cameras(12);
+    let photos = photos(&cameras, |_, p, d| paint(p).map(|c| c + 0.3 * d.x));
+    let image = gray(&atlas);
+    let taken = photographs(&cameras, &photos);
+    let degree = |pictures: &[Photograph]| {
+        let colors = Colors::Texels(&atlas, &image);
+        let fitted = fit(&mesh, None, colors, pictures, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+        (fitted.report.degree, fitted.report.pixels)
+    };
+    let rendered: Vec<Photograph> = taken.iter().map(|p| Photograph { rendered: true, ..*p }).collect();
+    assert_eq!(degree(&taken).0, 1);
+    assert_eq!(degree(&rendered).0, 0);
+    // but colors are fitted to them, too
+    let both: Vec<Photograph> = taken.iter().chain(&rendered).copied().collect();
+    let (degree, pixels) = degree(&both);
+    assert!(degree == 1 && pixels > taken.iter().map(Photograph::head_pixels).sum::<usize>());
 }

@@ -179,7 +179,8 @@ mod tests {
         let (mesh, radius, camera) = seen_ball();
         let photo = Photo { width: 64, height: 64, rgb: vec![[9; 3]; 64 * 64], alpha: None };
         let none = Gray { width: 64, height: 64, values: vec![0; 64 * 64] };
-        let photograph = Photograph { camera: &camera, photo: &photo, mask: Some(&none), valid: None };
+        let photograph =
+            Photograph { camera: &camera, photo: &photo, mask: Some(&none), valid: None, rendered: false };
         let seen = Seen::of(&mesh, &[], &[photograph], 0.02 * radius);
         assert!(seen.cameras.contains(&1) && seen.trust.iter().all(|&t| t == 0.0));
         let all = Photograph { mask: None, ..photograph };

@@ -4,7 +4,7 @@ use super::super::appearance::{Nodes, Photograph};
 use super::super::regularized::{Equation, Prior, step};
 use glam::Vec2;
 use rayon::prelude::*;
-use tiface_base::geom::{Bvh, Camera, Hit, Mesh, ShellCaster, Shells};
+use tiface_base::geom::{Bvh, Hit, Mesh, ShellCaster, Shells};
 use tiface_base::{Monitor, Result};
 
 /// Width of the band on each side of a mask's outline whose pixels are compared: no layer may reach
@@ -13,7 +13,7 @@ use tiface_base::{Monitor, Result};
 const BAND_PX: usize = 20;
 
 /// Approximate maximum number of compared pixels.
-const MAX_PIXELS: usize = 400_000;
+const MAX_PIXELS: usize = 600_000;
 
 /// Rays along each side of a pixel.
 const RAYS_PER_SIDE: usize = 2;
@@ -73,19 +73,24 @@ struct Target<'a> {
     layers: ShellCaster<'a>,
 }
 
-/// Returns what the rays of a pixel meet.
-fn look(camera: &Camera, (x, y): (usize, usize), target: &Target) -> Met {
+/// Returns what the rays of a pixel meet. Those of a rendered pixel are all the one that it was
+/// rendered with.
+fn look(photograph: &Photograph, (x, y): (usize, usize), target: &Target) -> Met {
+    let side = if photograph.rendered { 1 } else { RAYS_PER_SIDE };
+    let stand_for = RAYS_PER_PIXEL / (side * side);
     let mut met = Met::default();
-    for (k, layers) in met.rays.iter_mut().enumerate() {
-        let sub = |at: usize, k: usize| at as f32 + (k as f32 + 0.5) / RAYS_PER_SIDE as f32;
-        let Some(ray) = camera.ray(Vec2::new(sub(x, k % RAYS_PER_SIDE), sub(y, k / RAYS_PER_SIDE))) else {
+    for (k, rays) in met.rays.chunks_exact_mut(stand_for).enumerate() {
+        let sub = |at: usize, k: usize| at as f32 + (k as f32 + 0.5) / side as f32;
+        let Some(ray) = photograph.camera.ray(Vec2::new(sub(x, k % side), sub(y, k / side))) else {
             continue;
         };
-        met.bare += usize::from(target.bare.any_hit(&ray));
+        met.bare += stand_for * usize::from(target.bare.any_hit(&ray));
         if target.core.any_hit(&ray) {
-            met.whole += 1;
+            met.whole += stand_for;
         } else {
+            let mut layers = Layers::new();
             target.layers.cast(&ray, f32::INFINITY, |layer, hit, _| layers.push((layer, hit)));
+            rays.fill(layers);
         }
     }
     met
@@ -120,7 +125,7 @@ impl Outlines {
             let row = |&at: &usize| {
                 let opacity = f32::from(mask.values[at]) / 255.0;
                 let (x, y) = (at % mask.width as usize, at / mask.width as usize);
-                let met = look(photograph.camera, (x, y), &target);
+                let met = look(photograph, (x, y), &target);
                 (opacity, met)
             };
             let mut opaque = 0.0;
