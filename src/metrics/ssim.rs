@@ -9,10 +9,15 @@
 //! per pixel: that one can be averaged over a mask.
 
 use rayon::prelude::*;
+use tiface_base::dispatch;
 use tiface_base::image::Image;
 
 const WINDOW: usize = 11;
 const RADIUS: usize = WINDOW / 2;
+
+/// Outputs of the window that are summed together.
+const BLOCK: usize = 16;
+
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
@@ -88,21 +93,47 @@ fn blur(plane: &[f64], width: usize) -> Vec<f64> {
         std::array::from_fn(|i| (-((i as f64 - RADIUS as f64) / 1.5).powi(2) / 2.0).exp());
     let sum: f64 = kernel.iter().sum();
     kernel.iter_mut().for_each(|k| *k /= sum);
-    let rows: Vec<f64> = plane
-        .chunks_exact(width)
-        .flat_map(|row| row.windows(WINDOW).map(|w| w.iter().zip(&kernel).map(|(v, k)| v * k).sum()))
-        .collect();
-    let narrow = width - WINDOW + 1;
-    let height = rows.len() / narrow;
+    let (narrow, height) = (width - WINDOW + 1, plane.len() / width);
+    let mut rows = vec![0.0; narrow * height];
+    for (out, row) in rows.chunks_exact_mut(narrow).zip(plane.chunks_exact(width)) {
+        weighted_sum(out, row, 1, &kernel);
+    }
     let mut out = vec![0.0; narrow * (height - WINDOW + 1)];
     for (y, line) in out.chunks_exact_mut(narrow).enumerate() {
-        for (k, weight) in kernel.iter().enumerate() {
-            for (o, v) in line.iter_mut().zip(&rows[(y + k) * narrow..]) {
-                *o += weight * v;
-            }
-        }
+        weighted_sum(line, &rows[y * narrow..], narrow, &kernel);
     }
     out
+}
+
+dispatch! {
+    /// Writes `out[i] = Σ_k kernel[k] · values[i + k · stride]`, summed in the order of k.
+    fn weighted_sum / weighted_sum_body(
+        out: &mut [f64],
+        values: &[f64],
+        stride: usize,
+        kernel: &[f64; WINDOW],
+    )
+}
+
+#[inline(always)]
+fn weighted_sum_body<const HAS_FMA: bool>(
+    out: &mut [f64],
+    values: &[f64],
+    stride: usize,
+    kernel: &[f64; WINDOW],
+) {
+    // some outputs at a time stay in registers over all of the kernel
+    for (block, out) in out.chunks_mut(BLOCK).enumerate() {
+        let mut sums = [0f64; BLOCK];
+        for (k, weight) in kernel.iter().enumerate() {
+            let values = &values[block * BLOCK + k * stride..][..out.len()];
+            match <&[f64; BLOCK]>::try_from(values) {
+                Ok(values) => (0..BLOCK).for_each(|i| sums[i] += weight * values[i]),
+                Err(_) => values.iter().zip(&mut sums).for_each(|(v, sum)| *sum += weight * v),
+            }
+        }
+        out.copy_from_slice(&sums[..out.len()]);
+    }
 }
 
 #[cfg(test)]
