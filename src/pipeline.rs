@@ -114,8 +114,9 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
             let renderer = Renderer::new(&scene, fields, &meshes, c.samples, dir.monitor());
             let renderer = match c.shows_residuals(&c.method) {
                 true => {
-                    let leaves_out_own = session.path.is_none();
-                    renderer.with_photographs(session.refined_capture()?, &scene, config, leaves_out_own)?
+                    let (capture, leaves_out_own) = (session.refined_capture()?, session.path.is_none());
+                    let renderer = renderer.with_pixel_filter(capture, &scene, config)?;
+                    renderer.with_residuals(capture, &scene, config, leaves_out_own)?
                 }
                 false => renderer,
             };

@@ -40,7 +40,7 @@ pub(super) fn ensemble(
             let meshes = Meshes::load(run, config, &c.members)?;
             let renderer = Renderer::new(scene, fields, &meshes, render.samples, dir.monitor());
             let renderer = match render.shows_residuals(&c.members) {
-                true => renderer.with_photographs(capture, scene, config, true)?,
+                true => renderer.with_residuals(capture, scene, config, true)?,
                 false => renderer,
             };
             fit(capture, config, scene, &renderer, dir)?

@@ -304,10 +304,37 @@ impl<'a> Renderer<'a> {
         }
     }
 
-    /// Returns the renderer with what the training photographs tell of ray-cast views: their pixel
-    /// filter, and residuals, which are added to other views. With `leaves_out_own`, a training
-    /// view adds nothing to a view from its own position.
-    pub fn with_photographs(
+    /// Returns the renderer with the pixel filter that makes ray-cast views most like the training
+    /// photographs.
+    pub fn with_pixel_filter(
+        mut self,
+        capture: &Capture,
+        scene: &Scene,
+        config: &Config,
+    ) -> Result<Renderer<'a>> {
+        let options = RaycastOptions { samples: self.samples, ..RaycastOptions::default() };
+        let mut fit = PixelFilterFit::default();
+        let views = learn::held_out_tiles(capture, config);
+        let every = views.len().div_ceil(FILTERED_VIEWS).max(1);
+        for (view, tiles) in views.into_iter().step_by(every) {
+            if self.monitor.stop() {
+                break; // what was made is not used then
+            }
+            let loaded = learn::training_view(view, &tiles, scene)?;
+            if loaded.mask.is_some() {
+                let (photo, weight) = pictures::target(&loaded);
+                let shown = self.cast(&[Method::Raycast], &loaded.camera, &options)?.pop();
+                shown.iter().for_each(|view| fit.add(view, &photo, &weight));
+            }
+        }
+        self.pixel_filter_px = fit.deviation_px();
+        Ok(self)
+    }
+
+    /// Returns the renderer with the residuals of ray casting in the training photographs, which
+    /// are added to other ray-cast views. With `leaves_out_own`, a training view adds nothing to a
+    /// view from its own position.
+    pub fn with_residuals(
         mut self,
         capture: &Capture,
         scene: &Scene,
@@ -319,31 +346,20 @@ impl<'a> Renderer<'a> {
         let Some(mesh) = meshes.into_iter().flatten().next() else { return Ok(self) };
         // depth in the scene's units; colors are filtered over a pixel, whatever the number of rays
         let options = RaycastOptions { samples: 1, ..RaycastOptions::default() };
-        let as_shown = RaycastOptions { samples: self.samples, ..options };
-        let (mut residuals, mut filters) = (Vec::new(), PixelFilterFit::default());
+        let mut residuals = Vec::new();
         // one photograph at a time: all of them with their views could fill the memory
-        let views = learn::held_out_tiles(capture, config);
-        let every = views.len().div_ceil(FILTERED_VIEWS).max(1);
-        for (i, (view, tiles)) in views.into_iter().enumerate() {
+        for (view, tiles) in learn::held_out_tiles(capture, config) {
             if self.monitor.stop() {
                 break; // what was made is not used then
             }
             let loaded = learn::training_view(view, &tiles, scene)?;
-            let camera = &loaded.camera;
-            if loaded.mask.is_some() && i % every == 0 {
-                let (photo, weight) = pictures::target(&loaded);
-                let shown = self.cast(&[Method::Raycast], camera, &as_shown)?.pop();
-                shown.iter().for_each(|view| filters.add(view, &photo, &weight));
-            }
-            let (mask, valid) = (loaded.mask.as_ref(), loaded.valid.as_ref());
+            let (camera, mask, valid) = (&loaded.camera, loaded.mask.as_ref(), loaded.valid.as_ref());
             if let Some(view) = self.cast(&[Method::Raycast], camera, &options)?.pop() {
                 let source = ResidualSource { camera, photo: &loaded.photo, mask, valid, view };
                 residuals.extend(ResidualView::new(source));
             }
         }
-        let center = mesh.bounds().center();
-        self.residuals = Residuals::new(residuals, center, leaves_out_own);
-        self.pixel_filter_px = filters.deviation_px();
+        self.residuals = Residuals::new(residuals, mesh.bounds().center(), leaves_out_own);
         Ok(self)
     }
 
