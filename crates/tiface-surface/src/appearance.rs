@@ -42,7 +42,7 @@ use std::time::Instant;
 use tiface_base::geom::sphharm::{Y0, functions};
 use tiface_base::geom::{Atlas, Bvh, Harmonics, Mesh, ShellCaster, Shells, area_vector};
 use tiface_base::image::Image;
-use tiface_base::{Monitor, Result};
+use tiface_base::{Error, Monitor, Result};
 
 /// Approximate maximum number of photographs' pixels that colors are fitted to: more hardly change
 /// the colors.
@@ -253,22 +253,34 @@ fn choose(
             rows.iter().zip(error).filter(|(row, _)| held(row.view)).map(|(_, e)| *e).collect();
         psnr(&of)
     };
-    let mut candidates: Vec<(u32, Smoothness, f64)> = Vec::new();
-    candidates.push((0, VERTICES[1], judge(&rest)));
-    for (degree, smoothness) in (1..=max_degree).flat_map(|d| VERTICES.map(|s| (d, s))) {
+    let view_dependent = |degree: u32, smoothness: Smoothness| {
         monitor.check_stop()?;
         let x = of_vertices.solve(&rest, functions(degree), &smoothness, &|v| !held(v));
         let error = of_vertices.missing(&rest, &x, functions(degree));
-        candidates.push((degree, smoothness, judge(&error)));
+        Ok::<_, Error>((degree, smoothness, judge(&error)))
+    };
+    let mut candidates: Vec<(u32, Smoothness, f64)> = vec![(0, VERTICES[1], judge(&rest))];
+    for degree in 1..=max_degree {
+        candidates.push(view_dependent(degree, VERTICES[0])?);
+    }
+    if max_degree > 0 {
+        // the second smoothness, of the degree that is best by the first
+        let degree = best_of(&candidates[1..]).0;
+        candidates.push(view_dependent(degree, VERTICES[1])?);
     }
     let left_out = candidates.iter().map(|(d, s, db)| (*d, s.others, *db)).collect();
     // without data to decide on, the more careful one
     let enough = (0..photographs.len() as u32).any(held);
     let best = match enough {
-        true => candidates.iter().fold(&candidates[0], |best, c| if c.2 > best.2 { c } else { best }),
+        true => best_of(&candidates),
         false => &candidates[0],
     };
     Ok(Choice { degree: best.0, smoothness: best.1, gains, left_out })
+}
+
+/// Returns the candidate with the highest PSNR, the first among equals.
+fn best_of(candidates: &[(u32, Smoothness, f64)]) -> &(u32, Smoothness, f64) {
+    candidates.iter().fold(&candidates[0], |best, c| if c.2 > best.2 { c } else { best })
 }
 
 /// Returns the photographs' pixels with gains, `[rows]`.
