@@ -132,7 +132,11 @@ fn weighted_sum_body<const HAS_FMA: bool>(
                 Err(_) => values.iter().zip(&mut sums).for_each(|(v, sum)| *sum += weight * v),
             }
         }
-        out.copy_from_slice(&sums[..out.len()]);
+        // a copy of a length that is not known would be a call
+        match out.first_chunk_mut() {
+            Some(out) => *out = sums,
+            None => out.copy_from_slice(&sums[..out.len()]),
+        }
     }
 }
 

@@ -159,12 +159,16 @@ pub fn fit(
     monitor.check_stop()?;
 
     let all = |_: u32| true;
-    let (in_fine, in_vertices) = (rows.matrix(&fine), rows.matrix(&vertices));
+    let in_fine = rows.matrix(&fine);
     let system = System { rows: &rows, matrix: &in_fine, nodes: &fine, normals: &[] };
     let target = system.missing(&photo(&rows, &gains), &before, 1);
     let change = system.solve(&target, 1, &smooth, &all);
     let rest = system.missing(&target, &change, 1);
+    let seen = in_fine.seen();
+    // as large as the next one
+    drop(in_fine);
     monitor.check_stop()?;
+    let in_vertices = rows.matrix(&vertices);
     let system = System { rows: &rows, matrix: &in_vertices, nodes: &vertices, normals: &normals };
     let mut report =
         AppearanceReport { psnr: [&target, &rest, &rest].map(|e| psnr(e)), ..Default::default() };
@@ -177,7 +181,6 @@ pub fn fit(
         Harmonics { functions, coefficients, turned }
     });
 
-    let seen = in_fine.seen();
     let color = |(b, c): (&[f32; 3], &[f32; 3])| std::array::from_fn(|k| (b[k] + c[k]).clamp(0.0, 1.0));
     let own: Vec<[f32; 3]> = before.iter().zip(&change).map(color).collect();
     let (texels, vertices) = match colors {

@@ -67,14 +67,16 @@ pub type Lanes = [f32; LANES];
 /// The derivatives of both features along the three axes, `[2 · 3]`, at [`LANES`] samples.
 pub type JacobianBlock = [Lanes; 6];
 
-/// Returns the eight table entries `[corner][sample]` of the cells around `x01`, and the positions
-/// inside the cells `[axis][sample]`, with coordinates in 0..1.
+/// The eight table entries `[corner][sample]` of the cells around [`LANES`] samples, and the
+/// positions inside the cells `[axis][sample]`, with coordinates in 0..1.
 ///
 /// Corner `k` lies at +1 along x when bit 0 of `k` is set, y with bit 1, z with bit 2.
+type Cells = ([[u32; LANES]; 8], [Lanes; 3]);
+
+/// Writes the cells around `x01`. To return that much would be a call that copies it.
 #[inline(always)]
-pub fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES]) -> ([[u32; LANES]; 8], [Lanes; 3]) {
+fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES], (index, fraction): &mut Cells) {
     let mut low = [[0u32; LANES]; 3];
-    let mut fraction = [[0f32; LANES]; 3];
     for a in 0..3 {
         for i in 0..LANES {
             let position = fma::<F>(level.scale, x01[i][a], 0.5);
@@ -86,7 +88,6 @@ pub fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES]) -> ([[u32; L
             low[a][i] = unsafe { above.min(1e9).to_int_unchecked::<i32>() } as u32;
         }
     }
-    let mut index = [[0u32; LANES]; 8];
     if level.is_hashed() {
         // hashed tables are powers of two, so `mod entries` is a mask
         let mask = level.entries - 1;
@@ -116,7 +117,6 @@ pub fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES]) -> ([[u32; L
             index.as_flattened_mut().iter_mut().for_each(|i| *i %= level.entries);
         }
     }
-    (index, fraction)
 }
 
 /// Returns the first block of `x`, padded with zeros.
@@ -126,15 +126,16 @@ fn block<const N: usize>(x: &[[f32; N]]) -> [[f32; N]; LANES] {
     x.first_chunk().copied().unwrap_or_else(padded)
 }
 
-/// Returns the [`cells`] of the first block of samples, and has the CPU fetch their entries of
+/// Writes the [`cells`] of the first block of samples, and has the CPU fetch their entries of
 /// `table`: the finer tables are larger than its second-level cache.
 #[inline(always)]
-fn fetched_cells<const F: bool>(
+fn fetch_cells<const F: bool>(
     level: &Level,
     table: &[[f32; 2]],
     x01: &[[f32; 3]],
-) -> ([[u32; LANES]; 8], [Lanes; 3]) {
-    let found = cells::<F>(level, &block(x01));
+    found: &mut Cells,
+) {
+    cells::<F>(level, &block(x01), found);
     #[cfg(target_arch = "x86_64")]
     for &i in found.0.as_flattened() {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
@@ -142,7 +143,6 @@ fn fetched_cells<const F: bool>(
         // callers' tables.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(table.as_ptr().add(i as usize).cast()) };
     }
-    found
 }
 
 /// `a + t (b − a)` for each sample.
@@ -178,10 +178,13 @@ fn gather_body<const F: bool>(
     assert!(table.len() >= level.entries as usize);
     // derivatives are computed in any case, which takes no longer than the reads of the table
     let mut unused = [[0f32; LANES]; 6];
-    let mut next = fetched_cells::<F>(level, table, x01);
+    // of a block and of the next one, in turn
+    let mut found = [Cells::default(); 2];
+    fetch_cells::<F>(level, table, x01, &mut found[0]);
     for (b, value) in value.chunks_mut(LANES).enumerate() {
-        let (index, [fx, fy, fz]) = next;
-        next = fetched_cells::<F>(level, table, x01.get((b + 1) * LANES..).unwrap_or_default());
+        let next = x01.get((b + 1) * LANES..).unwrap_or_default();
+        fetch_cells::<F>(level, table, next, &mut found[(b + 1) % 2]);
+        let (index, [fx, fy, fz]) = &found[b % 2];
         let jacobian = jacobian.as_mut().map_or(&mut unused, |jacobian| &mut jacobian[b]);
         let mut corner = [[[0f32; 2]; LANES]; 8];
         for k in 0..8 {
@@ -199,16 +202,16 @@ fn gather_body<const F: bool>(
                 }
             }
             // along x at the four edges, along y at the two faces, then along z
-            let edge: [Lanes; 4] = std::array::from_fn(|k| mix::<F>(&e[2 * k], &e[2 * k + 1], &fx));
-            let face: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&edge[2 * k], &edge[2 * k + 1], &fy));
-            let sum = mix::<F>(&face[0], &face[1], &fz);
+            let edge: [Lanes; 4] = std::array::from_fn(|k| mix::<F>(&e[2 * k], &e[2 * k + 1], fx));
+            let face: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&edge[2 * k], &edge[2 * k + 1], fy));
+            let sum = mix::<F>(&face[0], &face[1], fz);
             for i in 0..LANES {
                 out[i][c] = sum[i];
             }
             let dx: [Lanes; 4] = std::array::from_fn(|k| minus(&e[2 * k + 1], &e[2 * k]));
-            let dx: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&dx[2 * k], &dx[2 * k + 1], &fy));
+            let dx: [Lanes; 2] = std::array::from_fn(|k| mix::<F>(&dx[2 * k], &dx[2 * k + 1], fy));
             let dy: [Lanes; 2] = std::array::from_fn(|k| minus(&edge[2 * k + 1], &edge[2 * k]));
-            let d = [mix::<F>(&dx[0], &dx[1], &fz), mix::<F>(&dy[0], &dy[1], &fz), minus(&face[1], &face[0])];
+            let d = [mix::<F>(&dx[0], &dx[1], fz), mix::<F>(&dy[0], &dy[1], fz), minus(&face[1], &face[0])];
             for a in 0..3 {
                 for i in 0..LANES {
                     jacobian[3 * c + a][i] = d[a][i] * slope;
@@ -284,12 +287,13 @@ fn scatter_body<const F: bool>(
     let slope = level.scale * world;
     assert!(gradient.len() >= level.entries as usize);
     assert!(g_value.len() == x01.len() && q.len() == x01.len() && g_normal.len() == x01.len());
-    let mut next = fetched_cells::<F>(level, gradient, x01);
+    let mut found = [Cells::default(); 2];
+    fetch_cells::<F>(level, gradient, x01, &mut found[0]);
     for first in (0..x01.len()).step_by(LANES) {
         let span = first..(first + LANES).min(x01.len());
-        let count = span.len();
-        let (index, f) = next;
-        next = fetched_cells::<F>(level, gradient, &x01[span.end..]);
+        let (count, b) = (span.len(), first / LANES);
+        fetch_cells::<F>(level, gradient, &x01[span.end..], &mut found[(b + 1) % 2]);
+        let (index, f) = &found[b % 2];
         let normal = block(&g_normal[span.clone()]);
         let (gv, qv) = (block(&g_value[span.clone()]), block(&q[span]));
         let mut add = [[[0f32; 2]; LANES]; 8];
@@ -384,8 +388,9 @@ mod tests {
         for (base, growth, l, scale, first, last) in golden {
             let level = levels(16, base, growth, 19)[l];
             assert!((level.scale - scale).abs() < 2e-4 * scale.sqrt(), "{base} {l} {} {scale}", level.scale);
-            let (index, _) = cells::<true>(&level, &[[0.3, 0.6, 0.9]; LANES]);
-            assert_eq!((index[0][0], index[7][0]), (first, last), "base {base} level {l}");
+            let mut found = Cells::default();
+            cells::<true>(&level, &[[0.3, 0.6, 0.9]; LANES], &mut found);
+            assert_eq!((found.0[0][0], found.0[7][0]), (first, last), "base {base} level {l}");
         }
         let all = levels(16, 32, B32, 19);
         assert_eq!(entries(&all), 6_984_576);
