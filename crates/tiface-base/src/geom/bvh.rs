@@ -157,12 +157,28 @@ impl Bvh {
     /// starts on the surface meets it at `t = 0`, give or take rounding: pass a small `t_min` to
     /// leave it. `None` for rays with a component that is not finite, or without direction.
     pub fn closest_hit(&self, ray: &Ray) -> Option<Hit> {
-        self.cast::<false>(ray)
+        let mut nearest = Nearest(None);
+        self.cast(ray, &mut nearest);
+        nearest.0
     }
 
     /// Returns whether the ray hits a triangle with `t_min <= t <= t_max`.
     pub fn any_hit(&self, ray: &Ray) -> bool {
-        self.cast::<true>(ray).is_some()
+        let mut any = Any(false);
+        self.cast(ray, &mut any);
+        any.0
+    }
+
+    /// Returns all triangles along the ray with `t_min <= t <= t_max`, from either side, in the
+    /// order in which [`Self::closest_hit`] would find them. None for rays that it returns none
+    /// for.
+    pub fn all_hits(&self, ray: &Ray) -> Vec<Hit> {
+        let mut all = All(Vec::new());
+        self.cast(ray, &mut all);
+        all.0.sort_unstable_by(|a, b| a.t.total_cmp(&b.t).then(a.triangle.cmp(&b.triangle)));
+        // leaves repeat triangles
+        all.0.dedup_by_key(|hit| hit.triangle);
+        all.0
     }
 
     /// Returns the nearest point of the surface; the smallest triangle index among equals. `None`
@@ -231,37 +247,32 @@ impl Bvh {
 
     /// Traversal with the best instructions this machine has. The arithmetic is the same, without
     /// fused multiply-add, so the answers are too.
-    fn cast<const ANY: bool>(&self, ray: &Ray) -> Option<Hit> {
+    fn cast(&self, ray: &Ray, search: &mut impl Search) {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("bmi1") {
             // SAFETY: the machine has both features, detected just above.
-            return unsafe { self.cast_avx2::<ANY>(ray) };
+            return unsafe { self.cast_avx2(ray, search) };
         }
-        self.walk::<ANY>(ray)
+        self.walk(ray, search)
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,bmi1")]
-    fn cast_avx2<const ANY: bool>(&self, ray: &Ray) -> Option<Hit> {
-        self.walk::<ANY>(ray)
+    fn cast_avx2(&self, ray: &Ray, search: &mut impl Search) {
+        self.walk(ray, search)
     }
 
-    /// Nearest child first. `ANY` stops at the first hit.
+    /// Nearest child first.
     #[inline(always)]
-    fn walk<const ANY: bool>(&self, ray: &Ray) -> Option<Hit> {
+    fn walk(&self, ray: &Ray, search: &mut impl Search) {
         let sane = ray.origin.is_finite() && ray.direction.is_finite() && ray.direction != Vec3::ZERO;
         if self.is_empty() || !sane {
-            return None;
+            return;
         }
-        let (origin, advanced) = self.approach(ray)?;
+        let Some((origin, advanced)) = self.approach(ray) else { return };
         let t_min = (ray.t_min as f64 - advanced) as f32;
         let shear = Shear::new(origin, ray.direction);
-        let mut best = Hit {
-            t: ((ray.t_max as f64 - advanced) as f32).min(f32::MAX),
-            triangle: u32::MAX,
-            u: 0.0,
-            v: 0.0,
-        };
+        let mut end = ((ray.t_max as f64 - advanced) as f32).min(f32::MAX);
         // 1/0 is made finite: 0 · ∞ would be NaN where the ray lies in a slab's plane.
         let inverse = (1.0 / ray.direction).clamp(Vec3::splat(-f32::MAX), Vec3::splat(f32::MAX));
         let near_side = [0, 1, 2].map(|axis| (ray.direction[axis].is_sign_negative()) as usize);
@@ -274,8 +285,8 @@ impl Bvh {
         loop {
             if current & LEAF != 0 {
                 let leaf = &self.leaves[(current ^ LEAF) as usize];
-                shear.meet(leaf, t_min, &mut best);
-                if ANY && best.triangle != u32::MAX {
+                end = shear.meet(leaf, t_min, end, search);
+                if search.is_done() {
                     break;
                 }
             } else {
@@ -288,7 +299,7 @@ impl Bvh {
                     .min((b[1 - near_side[1]][1] - oy) * iy)
                     .min((b[1 - near_side[2]][2] - oz) * iz);
                 let near = near.max(start);
-                let far = (far * SLAB_ROUNDING).min(Vec4::splat(best.t));
+                let far = (far * SLAB_ROUNDING).min(Vec4::splat(end));
                 let hits = near.cmple(far).bitmask();
                 if hits != 0 && hits & (hits - 1) == 0 {
                     current = node.child[hits.trailing_zeros() as usize];
@@ -298,16 +309,16 @@ impl Bvh {
             }
             loop {
                 if top == 0 {
-                    return finish(best, advanced);
+                    return search.finish(advanced);
                 }
                 top -= 1;
-                if stack[top].1 <= best.t {
+                if stack[top].1 <= end {
                     current = stack[top].0;
                     break;
                 }
             }
         }
-        finish(best, advanced)
+        search.finish(advanced);
     }
 
     /// Returns where to start from, and how far along the ray that is. Only far rays move.
@@ -356,8 +367,89 @@ fn push_nearest_last(stack: &mut [(u32, f32)], top: &mut usize, hits: u32, near:
     }
 }
 
-fn finish(best: Hit, advanced: f64) -> Option<Hit> {
-    (best.triangle != u32::MAX).then_some(Hit { t: (best.t as f64 + advanced) as f32, ..best })
+/// What a traversal looks for.
+trait Search {
+    /// Returns whether a triangle that is met at `t`, not behind `end`, counts.
+    fn counts(&self, t: f32, triangle: u32, end: f32) -> bool;
+
+    /// Takes a hit that counts, and returns where the traversal ends from now on.
+    fn take(&mut self, hit: Hit, end: f32) -> f32;
+
+    /// Returns whether nothing more is looked for.
+    fn is_done(&self) -> bool {
+        false
+    }
+
+    /// Moves hits back by what the ray was advanced.
+    fn finish(&mut self, advanced: f64);
+}
+
+/// Returns a hit of an advanced ray as one of the ray itself.
+fn moved_back(hit: Hit, advanced: f64) -> Hit {
+    Hit { t: (hit.t as f64 + advanced) as f32, ..hit }
+}
+
+/// The nearest hit; of those at the same place the one with the smallest index.
+struct Nearest(Option<Hit>);
+
+impl Search for Nearest {
+    #[inline(always)]
+    fn counts(&self, t: f32, triangle: u32, end: f32) -> bool {
+        t < end || self.0.is_none_or(|best| triangle < best.triangle)
+    }
+
+    #[inline(always)]
+    fn take(&mut self, hit: Hit, _: f32) -> f32 {
+        self.0 = Some(hit);
+        hit.t
+    }
+
+    fn finish(&mut self, advanced: f64) {
+        self.0 = self.0.map(|hit| moved_back(hit, advanced));
+    }
+}
+
+/// Whether anything is hit.
+struct Any(bool);
+
+impl Search for Any {
+    #[inline(always)]
+    fn counts(&self, _: f32, _: u32, _: f32) -> bool {
+        true
+    }
+
+    #[inline(always)]
+    fn take(&mut self, _: Hit, end: f32) -> f32 {
+        self.0 = true;
+        end
+    }
+
+    #[inline(always)]
+    fn is_done(&self) -> bool {
+        self.0
+    }
+
+    fn finish(&mut self, _: f64) {}
+}
+
+/// All hits, in any order.
+struct All(Vec<Hit>);
+
+impl Search for All {
+    #[inline(always)]
+    fn counts(&self, _: f32, _: u32, _: f32) -> bool {
+        true
+    }
+
+    #[inline(always)]
+    fn take(&mut self, hit: Hit, end: f32) -> f32 {
+        self.0.push(hit);
+        end
+    }
+
+    fn finish(&mut self, advanced: f64) {
+        self.0.iter_mut().for_each(|hit| *hit = moved_back(*hit, advanced));
+    }
 }
 
 /// The ray's own coordinates: it looks along z from the origin (Woop, Benthin, Wald 2013, §3).
@@ -386,9 +478,9 @@ impl Shear {
         }
     }
 
-    /// Tests four triangles and keeps the best hit.
+    /// Tests four triangles from `t_min` to `end`, and returns the new end.
     #[inline(always)]
-    fn meet(&self, leaf: &Leaf, t_min: f32, best: &mut Hit) {
+    fn meet(&self, leaf: &Leaf, t_min: f32, mut end: f32, search: &mut impl Search) -> f32 {
         let [kx, ky, kz] = self.axes;
         let [a, b, c] = [0, 1, 2].map(|corner| {
             let p = &leaf.corners[corner];
@@ -424,10 +516,11 @@ impl Shear {
             let z = uk * a[2][k] as f64 + vk * b[2][k] as f64 + wk * c[2][k] as f64;
             let t = (z / det) as f32 * self.shear[2][k];
             let triangle = leaf.triangle[k];
-            if t >= t_min && (t < best.t || t == best.t && triangle < best.triangle) {
-                *best = Hit { t, triangle, u: (vk / det) as f32, v: (wk / det) as f32 };
+            if t >= t_min && t <= end && search.counts(t, triangle, end) {
+                end = search.take(Hit { t, triangle, u: (vk / det) as f32, v: (wk / det) as f32 }, end);
             }
         }
+        end
     }
 }
 

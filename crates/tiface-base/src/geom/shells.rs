@@ -115,15 +115,17 @@ impl<'a> ShellCaster<'a> {
     /// with the index of the layer, the source position on the mesh, and the opacity. Of layers
     /// that lie within rounding of each other only one counts.
     pub fn cast(&self, ray: &Ray, end: f32, mut meet: impl FnMut(usize, Hit, f32)) {
-        let mut ahead = *ray;
-        ahead.t_max = ahead.t_max.min(end);
-        while let Some(hit) = self.bvh.closest_hit(&ahead) {
+        let mut from = ray.t_min;
+        for hit in self.bvh.all_hits(&Ray { t_max: ray.t_max.min(end), ..*ray }) {
+            if hit.t < from {
+                continue;
+            }
             let layer = self.first.partition_point(|first| *first <= hit.triangle) - 1;
             let triangle = self.source[hit.triangle as usize];
             let alpha = self.layers[layer].alpha(&hit, self.mesh.triangles[triangle as usize]);
             meet(layer, Hit { triangle, ..hit }, alpha);
             // on by some steps of f32
-            ahead.t_min = hit.t + 1e-6 * hit.t.max(1e-3);
+            from = hit.t + 1e-6 * hit.t.max(1e-3);
         }
     }
 }

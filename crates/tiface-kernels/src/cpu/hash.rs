@@ -129,12 +129,7 @@ fn block<const N: usize>(x: &[[f32; N]]) -> [[f32; N]; LANES] {
 /// Writes the [`cells`] of the first block of samples, and has the CPU fetch their entries of
 /// `table`: the finer tables are larger than its second-level cache.
 #[inline(always)]
-fn fetch_cells<const F: bool>(
-    level: &Level,
-    table: &[[f32; 2]],
-    x01: &[[f32; 3]],
-    found: &mut Cells,
-) {
+fn fetch_cells<const F: bool>(level: &Level, table: &[[f32; 2]], x01: &[[f32; 3]], found: &mut Cells) {
     cells::<F>(level, &block(x01), found);
     #[cfg(target_arch = "x86_64")]
     for &i in found.0.as_flattened() {

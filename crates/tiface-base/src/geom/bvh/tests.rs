@@ -130,6 +130,26 @@ proptest! {
                 prop_assert!(h.u.min(h.v).min(1.0 - h.u - h.v) < 1e-5, "{:?}", h);
             }
         }
+        let all = bvh.all_hits(&r);
+        prop_assert_eq!(all.first().copied(), ours);
+        prop_assert!(all.is_sorted_by(|a, b| (a.t, a.triangle) < (b.t, b.triangle)), "{:?}", all);
+        for (t, &corners) in mesh.triangles.iter().enumerate() {
+            let alone = Bvh::new(&Mesh { triangles: vec![corners], ..mesh.clone() }).closest_hit(&r);
+            match (alone, all.iter().find(|hit| hit.triangle == t as u32)) {
+                (Some(a), Some(b)) => prop_assert!((a.t - b.t).abs() < 1e-4 * (1.0 + b.t), "{:?} {:?}", a, b),
+                (None, None) => {}
+                (Some(h), None) | (None, Some(&h)) => {
+                    prop_assert!(h.u.min(h.v).min(1.0 - h.u - h.v) < 1e-5, "{:?}", h);
+                }
+            }
+        }
+        if let [first, .., last] = all[..] {
+            let within = bvh.all_hits(&Ray { t_min: first.t, t_max: last.t, ..r });
+            prop_assert_eq!(&within, &all);
+            let before = bvh.all_hits(&Ray { t_max: 0.5 * (first.t + last.t), ..r });
+            prop_assert!(before.len() < all.len() || first.t == last.t);
+            prop_assert_eq!(&before[..], &all[..before.len()]);
+        }
         let near = bvh.closest_point(o).unwrap();
         let least = (0..mesh.triangles.len() as u32)
             .map(|t| {
