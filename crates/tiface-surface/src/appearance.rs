@@ -42,6 +42,7 @@ use std::time::Instant;
 use tiface_base::geom::sphharm::{Y0, functions};
 use tiface_base::geom::{Atlas, Bvh, Harmonics, Mesh, ShellCaster, Shells, area_vector};
 use tiface_base::image::Image;
+use tiface_base::io::give_memory_back;
 use tiface_base::{Error, Monitor, Result};
 
 /// Approximate maximum number of photographs' pixels that colors are fitted to: more hardly change
@@ -157,6 +158,8 @@ pub fn fit(
     let choice = choose(&rows.half(), lobes, fine_start, photographs, max_degree, monitor)?;
     let Choice { degree, smoothness, gains, left_out } = choice;
     monitor.check_stop()?;
+    // the choice took as much memory as what follows takes
+    give_memory_back();
 
     let all = |_: u32| true;
     let in_fine = rows.matrix(&fine);
@@ -165,9 +168,9 @@ pub fn fit(
     let change = system.solve(&target, 1, &smooth, &all);
     let rest = system.missing(&target, &change, 1);
     let seen = in_fine.seen();
-    // as large as the next one
     drop(in_fine);
     monitor.check_stop()?;
+    give_memory_back();
     let in_vertices = rows.matrix(&vertices);
     let system = System { rows: &rows, matrix: &in_vertices, nodes: &vertices, normals: &normals };
     let mut report =

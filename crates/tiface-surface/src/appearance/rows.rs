@@ -5,7 +5,8 @@ use super::nodes::{Nodes, grouped};
 use super::photograph::Photograph;
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
-use std::ops::Deref;
+use std::ops::{Deref, Range};
+use std::sync::Arc;
 use tiface_base::geom::{Bvh, Hit, Mesh, ShellCaster, area_vector};
 
 /// Rays along each side of a photograph's pixel; a rendered one is of a single ray.
@@ -22,9 +23,12 @@ pub struct Row {
     pub weight: f32,
     /// Its photograph.
     pub view: u32,
-    /// What its rays meet, layers first, with the share in the pixel; the shares sum to 1.
-    hits: Box<[(Hit, f32)]>,
+    /// What its rays meet, as [`Rows`] lists it.
+    hits: Range<u32>,
 }
+
+/// What a ray meets, and its share in the pixel.
+type Met = (Hit, f32);
 
 /// A mesh, and the translucent layers around it, as rays meet them.
 pub struct RayTarget<'a> {
@@ -34,13 +38,17 @@ pub struct RayTarget<'a> {
 }
 
 /// The pixels that colors are fitted to.
-pub struct Rows(Vec<Row>);
+pub struct Rows {
+    rows: Vec<Row>,
+    /// What the rays of all rows meet, of a ray layers first; the shares of a row sum to 1.
+    met: Arc<Vec<Met>>,
+}
 
 impl Deref for Rows {
     type Target = [Row];
 
     fn deref(&self) -> &[Row] {
-        &self.0
+        &self.rows
     }
 }
 
@@ -61,16 +69,32 @@ impl Rows {
             let stride = stride(view);
             let xs = (y / stride % stride..photograph.photo.width).step_by(stride as usize);
             let row = y as usize * photograph.photo.width as usize;
-            let xs = xs.filter(move |x| !glare[row + *x as usize]);
-            xs.filter_map(move |x| Row::new(target, (view, photograph), [x, y], turned))
+            let (mut rows, mut met) = (Vec::new(), Vec::new());
+            for x in xs.filter(|x| !glare[row + *x as usize]) {
+                let before = met.len();
+                match Row::new(target, (view, photograph), [x, y], turned, &mut met) {
+                    Some(row) => rows.push(row),
+                    None => met.truncate(before),
+                }
+            }
+            (rows, met)
         };
-        Rows(lines.par_iter().flat_map_iter(line).collect())
+        let parts: Vec<(Vec<Row>, Vec<Met>)> = lines.par_iter().map(line).collect();
+        let mut rows = Vec::with_capacity(parts.iter().map(|part| part.0.len()).sum());
+        let mut met: Vec<Met> = Vec::with_capacity(parts.iter().map(|part| part.1.len()).sum());
+        for (of_line, met_there) in parts {
+            let base = met.len() as u32;
+            let moved = |Range { start, end }: Range<u32>| base + start..base + end;
+            rows.extend(of_line.into_iter().map(|row| Row { hits: moved(row.hits), ..row }));
+            met.extend(met_there);
+        }
+        Rows { rows, met: Arc::new(met) }
     }
 
     /// Returns every second row, for a first, cheaper fit. Of every fourth, colors seem to depend
     /// less on the view than they do.
     pub fn half(&self) -> Rows {
-        Rows(self.0.iter().step_by(2).cloned().collect())
+        Rows { rows: self.rows.iter().step_by(2).cloned().collect(), met: self.met.clone() }
     }
 
     /// Returns the nodes under all rows, and their weights.
@@ -82,7 +106,7 @@ impl Rows {
                 let mut row: Vec<(u32, f32)> = Vec::new();
                 for Row { hits, .. } in rows {
                     row.clear();
-                    for (hit, share) in hits {
+                    for (hit, share) in &self.met[hits.start as usize..hits.end as usize] {
                         nodes.under(hit, |node, w| match row.iter_mut().find(|e| e.0 == node) {
                             Some(e) => e.1 += w * share,
                             None => row.push((node, w * share)),
@@ -111,12 +135,14 @@ impl Rows {
 }
 
 impl Row {
-    /// Returns a pixel of a photograph, if the head fills it.
+    /// Returns a pixel of a photograph, if the head fills it, and appends what its rays meet to
+    /// `met`.
     fn new(
         RayTarget { mesh, bvh, layers }: &RayTarget,
         (view, photograph): (u32, &Photograph),
         [x, y]: [u32; 2],
         turned: Mat3,
+        met: &mut Vec<Met>,
     ) -> Option<Row> {
         let Photograph { camera, photo, .. } = photograph;
         let at = y as usize * photo.width as usize + x as usize;
@@ -126,7 +152,7 @@ impl Row {
         let mut cosine = 0.0;
         let side = if photograph.rendered { 1 } else { SIDE };
         let share = 1.0 / (side * side) as f32;
-        let mut hits = Vec::with_capacity((side * side) as usize);
+        let first = met.len() as u32;
         for k in 0..side * side {
             let sub = |k: u32| (k as f32 + 0.5) / side as f32;
             let ray = camera.ray(Vec2::new(x as f32 + sub(k % side), y as f32 + sub(k / side)))?;
@@ -136,11 +162,11 @@ impl Row {
             let mut left = share;
             if let Some(layers) = layers {
                 layers.cast(&ray, hit.t, |_, hit, alpha| {
-                    hits.push((hit, left * alpha));
+                    met.push((hit, left * alpha));
                     left *= 1.0 - alpha;
                 });
             }
-            hits.push((hit, left));
+            met.push((hit, left));
         }
         let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))?;
         Some(Row {
@@ -148,7 +174,7 @@ impl Row {
             direction: turned * -ray.direction,
             weight: cosine.clamp(0.0, 1.0).sqrt(),
             view,
-            hits: hits.into(),
+            hits: first..met.len() as u32,
         })
     }
 }
