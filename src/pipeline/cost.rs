@@ -260,7 +260,7 @@ impl<'a> Workload<'a> {
         let shows_residuals = fits && self.config.render.shows_residuals(members);
         let residuals = if shows_residuals { self.all } else { 0.0 };
         let rendered = if fits { self.renderers(members, residuals) } else { 0.0 };
-        (0.2 + 3e-6 * self.held_out + 1.6e-6 * residuals, mib::VIEW_PIXEL * self.each + rendered)
+        (0.2 + 3e-6 * self.held_out + 0.8e-6 * residuals, mib::VIEW_PIXEL * self.each + rendered)
     }
 
     fn metrics(&self) -> (f64, f64) {

@@ -304,14 +304,15 @@ impl<'a> Renderer<'a> {
         }
     }
 
-    /// Returns the renderer with the pixel filter that makes ray-cast views most like the training
-    /// photographs.
+    /// Returns the renderer with the pixel filter that makes ray-cast views without residuals most
+    /// like the training photographs.
     pub fn with_pixel_filter(
         mut self,
         capture: &Capture,
         scene: &Scene,
         config: &Config,
     ) -> Result<Renderer<'a>> {
+        debug_assert!(self.residuals.is_none());
         let options = RaycastOptions { samples: self.samples, ..RaycastOptions::default() };
         let mut fit = PixelFilterFit::default();
         let views = learn::held_out_tiles(capture, config);

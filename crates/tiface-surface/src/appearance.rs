@@ -109,8 +109,8 @@ pub enum Colors<'a> {
 
 /// Fits colors to photographs, whose masks have their sizes; vertices have colors, and normals if
 /// there are `shells` around the mesh. What depends on the view has degree `max_degree` at most,
-/// and 2; the degree and its smoothness are those that show photographs best that were left out of
-/// a first fit.
+/// and 2: the one that shows photographs best that were left out of a first fit. They decide
+/// between two smoothnesses of this degree, too.
 ///
 /// Returns `None` where no photograph shows the head.
 ///
@@ -158,7 +158,7 @@ pub fn fit(
     let choice = choose(&rows.half(), lobes, fine_start, photographs, max_degree, monitor)?;
     let Choice { degree, smoothness, gains, left_out } = choice;
     monitor.check_stop()?;
-    // the choice took as much memory as what follows takes
+    // the matrices of the choice: freed, they would stay resident beside those that follow
     give_memory_back();
 
     let all = |_: u32| true;
@@ -171,11 +171,11 @@ pub fn fit(
     drop(in_fine);
     monitor.check_stop()?;
     give_memory_back();
-    let in_vertices = rows.matrix(&vertices);
-    let system = System { rows: &rows, matrix: &in_vertices, nodes: &vertices, normals: &normals };
     let mut report =
         AppearanceReport { psnr: [&target, &rest, &rest].map(|e| psnr(e)), ..Default::default() };
     let harmonics = (degree > 0).then(|| {
+        let in_vertices = rows.matrix(&vertices);
+        let system = System { rows: &rows, matrix: &in_vertices, nodes: &vertices, normals: &normals };
         let functions = functions(degree);
         let mut coefficients = system.solve(&rest, functions, &smoothness, &all);
         report.psnr[2] = psnr(&system.missing(&rest, &coefficients, functions));
@@ -254,6 +254,7 @@ fn choose(
     let target = of_fine.missing(&photo(rows, &gains), before, 1);
     let change = of_fine.solve(&target, 1, smooth, &|v| !held(v));
     let rest = of_fine.missing(&target, &change, 1);
+    drop(in_fine);
     let judge = |error: &[[f32; 3]]| -> f64 {
         let of: Vec<[f32; 3]> =
             rows.iter().zip(error).filter(|(row, _)| held(row.view)).map(|(_, e)| *e).collect();

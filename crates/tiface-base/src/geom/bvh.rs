@@ -24,6 +24,7 @@ use obvhs::{
     bvh2::{Bvh2, builder::build_bvh2},
 };
 use rayon::prelude::*;
+use std::cmp::Ordering;
 use std::time::Duration;
 
 /// Rounding of the shear (2.5 ε of the distance) for distances up to five times the largest
@@ -170,14 +171,11 @@ impl Bvh {
     }
 
     /// Returns all triangles along the ray with `t_min <= t <= t_max`, from either side, in the
-    /// order in which [`Self::closest_hit`] would find them. None for rays that it returns none
-    /// for.
+    /// order in which [`Self::closest_hit`] would find them. Empty for rays with a component that
+    /// is not finite, or without direction.
     pub fn all_hits(&self, ray: &Ray) -> Vec<Hit> {
         let mut all = All(Vec::new());
         self.cast(ray, &mut all);
-        all.0.sort_unstable_by(|a, b| a.t.total_cmp(&b.t).then(a.triangle.cmp(&b.triangle)));
-        // leaves repeat triangles
-        all.0.dedup_by_key(|hit| hit.triangle);
         all.0
     }
 
@@ -380,7 +378,7 @@ trait Search {
         false
     }
 
-    /// Moves hits back by what the ray was advanced.
+    /// Ends the search: orders hits, and moves them back by what the ray was advanced.
     fn finish(&mut self, advanced: f64);
 }
 
@@ -432,7 +430,7 @@ impl Search for Any {
     fn finish(&mut self, _: f64) {}
 }
 
-/// All hits, in any order.
+/// All hits; in order when the search has ended.
 struct All(Vec<Hit>);
 
 impl Search for All {
@@ -448,6 +446,10 @@ impl Search for All {
     }
 
     fn finish(&mut self, advanced: f64) {
+        let key = |hit: &Hit| (hit.t, hit.triangle);
+        self.0.sort_unstable_by(|a, b| key(a).partial_cmp(&key(b)).unwrap_or(Ordering::Equal));
+        // leaves repeat triangles
+        self.0.dedup_by_key(|hit| hit.triangle);
         self.0.iter_mut().for_each(|hit| *hit = moved_back(*hit, advanced));
     }
 }

@@ -68,12 +68,12 @@ pub type Lanes = [f32; LANES];
 pub type JacobianBlock = [Lanes; 6];
 
 /// The eight table entries `[corner][sample]` of the cells around [`LANES`] samples, and the
-/// positions inside the cells `[axis][sample]`, with coordinates in 0..1.
+/// samples' positions in their cells, 0..1, `[axis][sample]`.
 ///
 /// Corner `k` lies at +1 along x when bit 0 of `k` is set, y with bit 1, z with bit 2.
 type Cells = ([[u32; LANES]; 8], [Lanes; 3]);
 
-/// Writes the cells around `x01`. To return that much would be a call that copies it.
+/// Writes the cells around `x01`. Returned by value, this much would be copied by a call.
 #[inline(always)]
 fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES], (index, fraction): &mut Cells) {
     let mut low = [[0u32; LANES]; 3];

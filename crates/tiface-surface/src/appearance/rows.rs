@@ -23,7 +23,7 @@ pub struct Row {
     pub weight: f32,
     /// Its photograph.
     pub view: u32,
-    /// What its rays meet, as [`Rows`] lists it.
+    /// Its part of [`Rows::met`].
     hits: Range<u32>,
 }
 
@@ -40,7 +40,8 @@ pub struct RayTarget<'a> {
 /// The pixels that colors are fitted to.
 pub struct Rows {
     rows: Vec<Row>,
-    /// What the rays of all rows meet, of a ray layers first; the shares of a row sum to 1.
+    /// What their rays meet, of a ray layers first; the shares of a row sum to 1. It is shared with
+    /// the rows that these are a part of.
     met: Arc<Vec<Met>>,
 }
 
@@ -83,7 +84,7 @@ impl Rows {
         let mut rows = Vec::with_capacity(parts.iter().map(|part| part.0.len()).sum());
         let mut met: Vec<Met> = Vec::with_capacity(parts.iter().map(|part| part.1.len()).sum());
         for (of_line, met_there) in parts {
-            let base = met.len() as u32;
+            let base = u32::try_from(met.len()).expect("rays of some million pixels meet less");
             let moved = |Range { start, end }: Range<u32>| base + start..base + end;
             rows.extend(of_line.into_iter().map(|row| Row { hits: moved(row.hits), ..row }));
             met.extend(met_there);

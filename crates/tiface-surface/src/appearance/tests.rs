@@ -272,6 +272,11 @@ fn nothing_is_judged_by_rendered_views() {
     let degree = |pictures: &[Photograph]| {
         let colors = Colors::Texels(&atlas, &image);
         let fitted = fit(&mesh, None, colors, pictures, 2, Mat3::IDENTITY, &Quiet).unwrap().unwrap();
+        // both degrees with the first smoothness, the better one with the second
+        let tried: Vec<u32> = fitted.report.left_out.iter().map(|c| c.0).collect();
+        let better = if fitted.report.left_out[2].2 > fitted.report.left_out[1].2 { 2 } else { 1 };
+        assert_eq!(tried, [0, 1, 2, better]);
+        assert_eq!(fitted.report.left_out.iter().filter(|c| c.1 == VERTICES[1].others).count(), 2);
         (fitted.report.degree, fitted.report.pixels)
     };
     let rendered: Vec<Photograph> = taken.iter().map(|p| Photograph { rendered: true, ..*p }).collect();

@@ -146,10 +146,14 @@ proptest! {
         if let [first, .., last] = all[..] {
             let within = bvh.all_hits(&Ray { t_min: first.t, t_max: last.t, ..r });
             prop_assert_eq!(&within, &all);
-            let before = bvh.all_hits(&Ray { t_max: 0.5 * (first.t + last.t), ..r });
-            prop_assert!(before.len() < all.len() || first.t == last.t);
-            prop_assert_eq!(&before[..], &all[..before.len()]);
+            let middle = 0.5 * (first.t + last.t);
+            let before = bvh.all_hits(&Ray { t_max: middle, ..r });
+            prop_assert_eq!(&before[..], &all[..all.partition_point(|hit| hit.t <= middle)]);
         }
+        // a ray that is moved to the mesh first
+        let far = ray(r.at(-100.0), r.direction);
+        prop_assert_eq!(bvh.all_hits(&far).first().copied(), bvh.closest_hit(&far));
+        prop_assert!(bvh.all_hits(&far).is_sorted_by(|a, b| a.t <= b.t));
         let near = bvh.closest_point(o).unwrap();
         let least = (0..mesh.triangles.len() as u32)
             .map(|t| {
