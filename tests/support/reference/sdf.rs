@@ -18,7 +18,9 @@ pub(crate) fn features<R: Real>(shape: &FieldShape, table: &[[R; 2]], x: [f32; 3
     }
     for (l, level) in shape.levels.iter().enumerate().take(shape.active) {
         let x01: [f32; 3] = from_fn(|a| x[a] * (0.5 / shape.radius) + 0.5);
-        let (index, fraction) = hash::cells::<true>(level, &[x01; hash::LANES]);
+        let mut found = hash::Cells::default();
+        hash::cells::<true>(level, &[x01; hash::LANES], &mut found);
+        let (index, fraction) = found;
         let f: [f64; 3] = from_fn(|a| {
             let p = level.scale as f64 * (x[a] as f64 * (0.5 / r) + 0.5) + 0.5;
             p - (p - fraction[a][0] as f64).round()

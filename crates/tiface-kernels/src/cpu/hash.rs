@@ -71,11 +71,11 @@ pub type JacobianBlock = [Lanes; 6];
 /// samples' positions in their cells, 0..1, `[axis][sample]`.
 ///
 /// Corner `k` lies at +1 along x when bit 0 of `k` is set, y with bit 1, z with bit 2.
-type Cells = ([[u32; LANES]; 8], [Lanes; 3]);
+pub type Cells = ([[u32; LANES]; 8], [Lanes; 3]);
 
 /// Writes the cells around `x01`. Returned by value, this much would be copied by a call.
 #[inline(always)]
-fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES], (index, fraction): &mut Cells) {
+pub fn cells<const F: bool>(level: &Level, x01: &[[f32; 3]; LANES], (index, fraction): &mut Cells) {
     let mut low = [[0u32; LANES]; 3];
     for a in 0..3 {
         for i in 0..LANES {
