@@ -368,12 +368,16 @@ fn push_nearest_last(stack: &mut [(u32, f32)], top: &mut usize, hits: u32, near:
 /// What a traversal looks for.
 trait Search {
     /// Returns whether a triangle that is met at `t`, not behind `end`, counts.
-    fn counts(&self, t: f32, triangle: u32, end: f32) -> bool;
+    #[inline(always)]
+    fn counts(&self, _t: f32, _triangle: u32, _end: f32) -> bool {
+        true
+    }
 
     /// Takes a hit that counts, and returns where the traversal ends from now on.
     fn take(&mut self, hit: Hit, end: f32) -> f32;
 
     /// Returns whether nothing more is looked for.
+    #[inline(always)]
     fn is_done(&self) -> bool {
         false
     }
@@ -412,11 +416,6 @@ struct Any(bool);
 
 impl Search for Any {
     #[inline(always)]
-    fn counts(&self, _: f32, _: u32, _: f32) -> bool {
-        true
-    }
-
-    #[inline(always)]
     fn take(&mut self, _: Hit, end: f32) -> f32 {
         self.0 = true;
         end
@@ -434,11 +433,6 @@ impl Search for Any {
 struct All(Vec<Hit>);
 
 impl Search for All {
-    #[inline(always)]
-    fn counts(&self, _: f32, _: u32, _: f32) -> bool {
-        true
-    }
-
     #[inline(always)]
     fn take(&mut self, hit: Hit, end: f32) -> f32 {
         self.0.push(hit);
