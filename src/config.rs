@@ -42,7 +42,7 @@ pub use render::{Method, NAMES, PictureFormat, RenderConfig, ViewBackground, dis
 pub use row::{Flag, Key, Takes};
 pub use source::{Fallback, Sources, known_words};
 pub use stage::Stage;
-pub use tiface_capture::{CameraPoses, Exposures, HeadValue, MaskHead, MaskMeaning, MaskSource};
+pub use tiface_capture::{CameraPoses, Exposures, Glares, HeadValue, MaskHead, MaskMeaning, MaskSource};
 pub use vm::{BaselineConfig, DensityActivation, MaskLoss, MaskUse, VmBackground, VmConfig, VmStart};
 
 use affects::affects;

@@ -34,6 +34,7 @@ mod export;
 mod exposure;
 mod finish;
 mod frames;
+mod glare;
 mod hair_views;
 mod inputs;
 mod learn;
@@ -168,6 +169,8 @@ mod ensemble_tests;
 mod exposure_tests;
 #[cfg(test)]
 mod formula_tests;
+#[cfg(test)]
+mod glare_tests;
 #[cfg(test)]
 mod path_tests;
 #[cfg(test)]

@@ -5,7 +5,7 @@ use super::{Config, Stage};
 /// A result that keys affect: that of a stage, or a part of it that later stages read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Product {
-    /// The stage `mask`: masks, poses, exposures and the box.
+    /// The stage `mask`: masks, poses, exposures, glare and the box.
     Masks,
     /// The stage `baseline`.
     Baseline,

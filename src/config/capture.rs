@@ -2,7 +2,7 @@
 
 use super::table::table;
 use std::path::PathBuf;
-use tiface_capture::{CameraPoses, Exposures};
+use tiface_capture::{CameraPoses, Exposures, Glares};
 
 table! {
     /// How a capture is read.
@@ -18,6 +18,10 @@ table! {
         /// Exposure and white balance of the photographs: auto (measured, and divided out of the
         /// training photographs where they differ) or given (photographs are used as they are).
         exposure: Exposures [Masks] => Exposures::Auto, Exposures::Auto, Exposures::Given;
+        /// Glare of lamps that stand behind the head before a dark background: auto (measured on
+        /// that background, and taken out of the training photographs) or given (photographs are
+        /// used as they are).
+        glare: Glares [Masks] => Glares::Auto, Glares::Auto, Glares::Given;
         /// Bounding box of the fields: head (found from cameras and masks), ilsh (published: ±0.45,
         /// ±0.501, ±0.3 dataset units for radiance, ±0.3 for I-Face; falls back to head if the head
         /// is elsewhere) or six numbers in dataset units, lowest corner first.

@@ -203,6 +203,7 @@ pub fn capture_options(config: &Config) -> CaptureOptions {
         trust_masks: config.mask.trust,
         cameras: c.cameras,
         exposure: c.exposure,
+        glare: c.glare,
         unit_m: c.unit_m,
         result_file: SETTINGS_FILE,
         ..CaptureOptions::default()

@@ -3,10 +3,11 @@
 use super::cameras::{CameraCheck, check_cameras};
 use super::clicks::{MaskPrompts, make_masks};
 use super::exposure::ExposureCheck;
+use super::glare;
 use super::readings::{Settled, decide_reading};
 use super::rig_photos::{NO_SILHOUETTES, RigPhotos};
 use super::scene_file;
-use crate::config::{CameraPoses, Config, Exposures, MaskConfig, MaskMeaning, Preset};
+use crate::config::{CameraPoses, Config, Exposures, Glares, MaskConfig, MaskMeaning, Preset};
 use crate::mask::consistency::{ConsistencyView, check_consistency};
 use crate::mask::matting::unknown_share;
 use crate::mask::pages::{SheetView, page_of, sheet};
@@ -16,7 +17,7 @@ use rayon::prelude::*;
 use serde_json::{Value, json};
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
-use tiface_base::image::{Gray, Photo, resize_gray, working_size};
+use tiface_base::image::{Glare, Gray, Photo, resize_gray, working_size};
 use tiface_base::io::{self, Limits, ReadError};
 use tiface_base::{Error, Result};
 use tiface_capture::inspect::{Inspection, Problem, grouped, inspect};
@@ -103,10 +104,14 @@ pub(super) fn mask(
     // pixels that a mask marks as unknown may still show the head
     let scene = locate_head(capture, masks.into_iter().map(|m| m.filter(|_| silhouettes)), wanted, dir)?;
     scene_file::write_scene(&dir.folder().join("scene.json"), &scene)?;
-    let (cameras, exposure) = (whole.capture.cameras, whole.capture.exposure);
+    let wanted = RigWanted {
+        poses: whole.capture.cameras,
+        exposures: whole.capture.exposure,
+        glare: whole.capture.glare,
+    };
     let found = match silhouettes {
-        true => RigCheck::measure(capture, &scene, cameras, exposure, &Limits::default())?,
-        false => RigCheck::left_out(cameras, exposure, NO_SILHOUETTES),
+        true => RigCheck::measure(capture, &scene, wanted, &Limits::default())?,
+        false => RigCheck::left_out(wanted, NO_SILHOUETTES),
     };
     found.require(dir)?;
     let height = scene::height(&scene, capture.up);
@@ -128,6 +133,9 @@ pub(super) fn mask(
     }
     if let Some(check) = &found.exposure {
         summary["exposure"] = check.summary();
+    }
+    if let Some(glare) = &found.glare {
+        summary["glare"] = json!(glare);
     }
     Ok(summary)
 }
@@ -165,48 +173,53 @@ fn review(
     Ok(views.into_iter().filter(|v| !v.suspicions.is_empty()).map(|v| v.name).collect())
 }
 
-/// Results of the checks of cameras and exposures.
+/// What is to be measured of cameras and photographs.
+#[derive(Clone, Copy)]
+struct RigWanted {
+    poses: CameraPoses,
+    exposures: Exposures,
+    glare: Glares,
+}
+
+/// Results of the checks of cameras, exposures and glare.
 #[derive(Default)]
 struct RigCheck {
     cameras: Option<CameraCheck>,
     exposure: Option<ExposureCheck>,
+    glare: Option<Glare>,
     /// Corrections of poses, and of exposures, that were asked for and not made.
     poses_left: Option<String>,
     exposures_left: Option<String>,
 }
 
 impl RigCheck {
-    /// Returns what is said where neither can be measured, for this reason.
-    fn left_out(poses: CameraPoses, exposures: Exposures, why: &str) -> RigCheck {
-        let poses_left = match poses {
+    /// Returns what is said where nothing can be measured, for this reason.
+    fn left_out(wanted: RigWanted, why: &str) -> RigCheck {
+        let poses_left = match wanted.poses {
             CameraPoses::Given => None,
             CameraPoses::Auto => Some(format!("poses are not checked: {why}; they are used as given")),
             CameraPoses::Refine => {
                 Some(format!("`capture.cameras=refine` refines nothing: {why}; poses are used as given"))
             }
         };
-        let exposures_left = (exposures != Exposures::Given).then(|| not_compared(why));
+        let exposures_left = (wanted.exposures != Exposures::Given).then(|| not_compared(why));
         RigCheck { poses_left, exposures_left, ..RigCheck::default() }
     }
 
     /// Measures what is not to be used as given, where it can be measured.
-    fn measure(
-        capture: &Capture,
-        scene: &Scene,
-        poses: CameraPoses,
-        exposures: Exposures,
-        limits: &Limits,
-    ) -> Result<RigCheck> {
-        let (cameras, exposure) = (poses != CameraPoses::Given, exposures != Exposures::Given);
-        if !cameras && !exposure {
+    fn measure(capture: &Capture, scene: &Scene, wanted: RigWanted, limits: &Limits) -> Result<RigCheck> {
+        let (cameras, exposure) = (wanted.poses != CameraPoses::Given, wanted.exposures != Exposures::Given);
+        let glare = wanted.glare != Glares::Given;
+        if !cameras && !exposure && !glare {
             return Ok(RigCheck::default());
         }
-        let photos = match RigPhotos::load(capture, scene, limits)? {
+        let mut photos = match RigPhotos::load(capture, scene, limits)? {
             Ok(photos) => photos,
-            Err(why) => return Ok(RigCheck::left_out(poses, exposures, &why)),
+            Err(why) => return Ok(RigCheck::left_out(wanted, &why)),
         };
-        let cameras = cameras.then(|| check_cameras(&photos, poses));
-        let asked = cameras.as_ref().filter(|_| poses == CameraPoses::Refine);
+        let glare = if glare { glare::measure(&mut photos) } else { None };
+        let cameras = cameras.then(|| check_cameras(&photos, wanted.poses));
+        let asked = cameras.as_ref().filter(|_| wanted.poses == CameraPoses::Refine);
         let poses_left = asked.and_then(CameraCheck::not_refined);
         let (exposure, exposures_left) = match exposure.then(|| ExposureCheck::measure(&photos)) {
             None => (None, None),
@@ -216,12 +229,12 @@ impl RigCheck {
             }
             Some(Err(why)) => (None, Some(not_compared(&why))),
         };
-        Ok(RigCheck { cameras, exposure, poses_left, exposures_left })
+        Ok(RigCheck { cameras, exposure, glare, poses_left, exposures_left })
     }
 
-    /// Returns the findings about poses and about exposures in words, with what a run does about
+    /// Returns the findings about poses, exposures and glare in words, with what a run does about
     /// them and what it does not.
-    fn announcements(&self) -> [Option<String>; 2] {
+    fn announcements(&self) -> [Option<String>; 3] {
         let both = |found: Option<String>, left: &Option<String>| {
             let parts: Vec<String> = found.into_iter().chain(left.clone()).collect();
             (!parts.is_empty()).then(|| parts.join("; "))
@@ -230,6 +243,7 @@ impl RigCheck {
         [
             both(cameras.map(CameraCheck::announcement), &self.poses_left),
             both(exposure.map(ExposureCheck::announcement), &self.exposures_left),
+            self.glare.map(|_| format!("{}; a run takes it out", glare::FOUND)),
         ]
     }
 
@@ -252,6 +266,11 @@ impl RigCheck {
                 dir.warn(&format!("{}: evened out; {kept}", check.sentence()));
             }
             check.write(dir.folder())?;
+        }
+        if let Some(glare) = &self.glare {
+            let kept = "`capture.glare=given` leaves it";
+            dir.warn(&format!("{}: taken out of the training photographs; {kept}", glare::FOUND));
+            glare::write(glare, dir.folder())?;
         }
         self.poses_left.iter().chain(&self.exposures_left).for_each(|text| dir.warn(text));
         Ok(())
@@ -459,9 +478,10 @@ pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
         found.warnings.extend(doubt);
     }
     found.problems.extend(grouped(refused.as_slice()));
+    let rig = RigWanted { poses: options.cameras, exposures: options.exposure, glare: options.glare };
     if options.mask_meaning == MaskMeaning::Ignore {
-        let left = RigCheck::left_out(options.cameras, options.exposure, NO_SILHOUETTES);
-        [found.fit, found.exposure] = left.announcements();
+        let left = RigCheck::left_out(rig, NO_SILHOUETTES);
+        [found.fit, found.exposure, found.glare] = left.announcements();
         return found;
     }
     // inputs that cannot be opened or read are already among the problems
@@ -476,9 +496,9 @@ pub fn inspect_capture(root: &Path, options: &CaptureOptions) -> Inspection {
     found.warnings.extend(warnings);
     // a measurement says something only of cameras whose masks fit together
     if let Some(scene) = found.placed.take().filter(|_| found.is_usable()) {
-        match RigCheck::measure(&capture, &scene, options.cameras, options.exposure, &options.limits) {
+        match RigCheck::measure(&capture, &scene, rig, &options.limits) {
             Ok(check) => {
-                [found.fit, found.exposure] = check.announcements();
+                [found.fit, found.exposure, found.glare] = check.announcements();
                 found.problems.extend(check.cameras.iter().flat_map(|check| grouped(&check.problems())));
             }
             Err(e) => found.problems.extend(grouped(&[e])),

@@ -1,5 +1,5 @@
-//! What cameras and exposures are measured on: photographs at a moderate size, their masks, and the
-//! surface of the hull.
+//! What cameras, exposures and glare are measured on: photographs at a moderate size, their masks,
+//! and the surface of the hull.
 
 use glam::Vec3;
 use rayon::prelude::*;

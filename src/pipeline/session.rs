@@ -3,6 +3,7 @@
 use super::cameras::CameraCheck;
 use super::clean::require_float_views;
 use super::exposure::ExposureCheck;
+use super::glare;
 use super::inputs::{Inputs, missing_capture};
 use super::path::CameraPath;
 use super::{mask, scene_file};
@@ -21,8 +22,8 @@ use tiface_capture::{Capture, MaskReading, Split, View, ViewMask};
 /// A capture, its configuration and its run folder.
 pub struct Session<'a> {
     pub(super) capture: Capture,
-    /// The capture as the stage `mask` read its masks, refined its poses and evened out its
-    /// exposures, once it is used.
+    /// The capture as the stage `mask` read its masks, refined its poses, evened out its exposures
+    /// and took glare out, once it is used.
     refined: OnceLock<Capture>,
     pub(super) config: &'a Config,
     pub(super) run: &'a Run,
@@ -131,8 +132,8 @@ impl<'a> Session<'a> {
         ExposureCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))
     }
 
-    /// Returns the capture with the poses that the stage `mask` refined and the exposures that it
-    /// evened out, for the stages after it.
+    /// Returns the capture with the poses that the stage `mask` refined, the exposures that it
+    /// evened out and the glare that it found, for the stages after it.
     pub(super) fn refined_capture(&self) -> Result<&Capture> {
         if let Some(capture) = self.refined.get() {
             return Ok(capture);
@@ -140,6 +141,8 @@ impl<'a> Session<'a> {
         let mut capture = self.read_capture()?.into_owned();
         self.camera_check()?.iter().for_each(|check| check.apply(&mut capture));
         self.exposure()?.iter().for_each(|check| check.apply(&mut capture));
+        let found = glare::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))?;
+        found.into_iter().for_each(|found| glare::apply(found, &mut capture));
         Ok(self.refined.get_or_init(|| capture))
     }
 

@@ -1,7 +1,7 @@
 //! What the tests of the pipeline share.
 
 use super::{Fields, Radiance, Session, Stage, Surface, complete};
-use crate::config::{CameraPoses, Config, Exposures, Preset};
+use crate::config::{CameraPoses, Config, Exposures, Glares, Preset};
 use crate::run::{Done, Run};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -45,13 +45,14 @@ pub(super) fn demo_head(root: &Path, (width, height): (u32, u32), (train, test):
     write_capture(root, &SyntheticOptions { width, height, train, test, seed: 1 });
 }
 
-/// The configuration of a draft of the capture in a folder. Cameras and exposures are used as
-/// given: their measurement takes longer than all else of the stage `mask`, and has tests of its
+/// The configuration of a draft of the capture in a folder. Cameras, exposures and glare are used
+/// as given: their measurement takes longer than all else of the stage `mask`, and has tests of its
 /// own.
 pub(super) fn draft(root: &Path) -> Config {
     let mut config = Config::preset(Preset::Draft);
     config.capture.path = root.into();
     (config.capture.cameras, config.capture.exposure) = (CameraPoses::Given, Exposures::Given);
+    config.capture.glare = Glares::Given;
     config
 }
 

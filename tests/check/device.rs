@@ -15,7 +15,7 @@ const SMALL: &str = "iface.steps=20 iface.rays=32 iface.max_rays=64 iface.sample
     iface.occupancy_resolution=16 iface.stereo=0 iface.checkpoint_s=0.05 tface.steps=8 tface.rays=64 \
     tface.voxels_start=512 tface.voxels_final=512 mesh.resolution=24 mesh.triangles=300 mesh.texture_px=64 \
     mesh.format=glb mesh.hair=none render.samples=1 render.method=tface,volume,raycast ensemble.weights=0.5,0.5 \
-    capture.cameras=given capture.exposure=given";
+    capture.cameras=given capture.exposure=given capture.glare=given";
 
 /// The program whose locks of devices are in its own folder: other tests use the devices of this
 /// machine, too.

@@ -122,7 +122,10 @@ fn photographs_without_leading_zeros_are_paired_with_cameras_by_number() {
         );
     }
     // `inspect` says the same, and that the poses fit
-    let found = tiface(dir.path(), &["inspect", ".", "--set", "capture.exposure=given"]);
+    let found = tiface(
+        dir.path(),
+        &["inspect", ".", "--set", "capture.exposure=given", "--set", "capture.glare=given"],
+    );
     let text = worked(&found);
     assert!(text.contains("paired with cameras by number") && text.contains("poses fit within 0."), "{text}");
 }
@@ -237,7 +240,7 @@ fn a_run_keeps_the_order_that_was_decided_and_resumes_with_it() {
     let head = dir.path().join("head");
     pictures(&head, ["images", "masks"], [&plain, &plain]);
     write_llff(&head, &cameras());
-    let words = "mask head --run run --set capture.cameras=given --set capture.exposure=given";
+    let words = "mask head --run run --set capture.cameras=given --set capture.exposure=given --set capture.glare=given";
     let words: Vec<&str> = words.split(' ').collect();
     let first = worked(&tiface(dir.path(), &words));
     assert!(first.contains("paired with cameras by number"), "{first}");

@@ -19,7 +19,7 @@ import sys
 import tempfile
 
 program = os.environ.get("TIFACE", "target/release/tiface")
-short = ["--preset", "draft", "--set", "iface.steps=1500", "--set", 'render.method=["raycast"]', "--set", "ensemble.members=[]"]
+short = ["--preset", "draft", "--set", "capture.glare=given", "--set", "iface.steps=1500", "--set", 'render.method=["raycast"]', "--set", "ensemble.members=[]"]
 
 
 def spent():

@@ -5,11 +5,13 @@
 
 mod blur;
 mod exposure;
+mod glare;
 mod morphology;
 mod resize;
 
 pub use blur::blurred;
 pub use exposure::Exposure;
+pub use glare::Glare;
 pub use morphology::{dilated, eroded, grow, shrink};
 pub use resize::{
     bilinear, enlarge, reduce_photo, reduce_to_rows, resize_gray, resize_hard, size_at_rows, working_size,

@@ -146,6 +146,9 @@ pub struct Inspection {
     /// How exposure and white balance differ, and what a run does about it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub exposure: Option<String>,
+    /// Whether lamps shed glare on the head, and what a run does about it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub glare: Option<String>,
     /// The head's box and hull.
     #[serde(skip)]
     pub placed: Option<Scene>,
@@ -383,6 +386,9 @@ impl fmt::Display for Inspection {
         }
         if let Some(text) = &self.exposure {
             writeln!(f, "  exposure  {text}")?;
+        }
+        if let Some(text) = &self.glare {
+            writeln!(f, "  glare     {text}")?;
         }
         let percent = |r: Range| [r.min, r.max, r.median].map(|v| 100.0 * v);
         if let Some([min, max, median]) = self.coverage.map(percent) {

@@ -54,7 +54,7 @@ pub use mask_checks::{MASK_HINT, coverage, findings, refuse};
 pub use mask_values::{MaskReading, MaskSurvey, MaskValues};
 pub use masks::require_masks;
 pub use options::{
-    CameraPoses, CaptureOptions, Exposures, HeadValue, MaskHead, MaskMeaning, MaskSource, Reading,
+    CameraPoses, CaptureOptions, Exposures, Glares, HeadValue, MaskHead, MaskMeaning, MaskSource, Reading,
 };
 pub use order::by_number;
 pub use projector::Projector;
@@ -384,6 +384,7 @@ fn view(folder: &CaptureFolder, frame: &CameraFrame, name: String, info: &Pictur
         turn: turn(turned),
         mask_turn: turn(masks_turned),
         exposure: None,
+        glare: None,
     })
 }
 

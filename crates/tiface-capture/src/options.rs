@@ -38,6 +38,8 @@ pub struct CaptureOptions {
     pub cameras: CameraPoses,
     /// Whether exposures are to be measured.
     pub exposure: Exposures,
+    /// Whether the glare of lamps is to be measured.
+    pub glare: Glares,
     /// Meters per dataset unit.
     pub unit_m: f64,
     /// How what the files leave open is read, where that has been decided.
@@ -60,6 +62,7 @@ impl Default for CaptureOptions {
             trust_masks: false,
             cameras: CameraPoses::Auto,
             exposure: Exposures::Auto,
+            glare: Glares::Auto,
             unit_m: 1.0,
             reading: None,
             result_file: "",
@@ -85,6 +88,16 @@ pub enum CameraPoses {
 #[serde(rename_all = "lowercase")]
 pub enum Exposures {
     /// The mean of all where a measurement says that they differ.
+    Auto,
+    /// Their own, unmeasured.
+    Given,
+}
+
+/// Which glare of lamps training photographs have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Glares {
+    /// None where it can be told from other light.
     Auto,
     /// Their own, unmeasured.
     Given,

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use tiface_base::geom::{Aabb, Camera};
-use tiface_base::image::{Exposure, Gray, Photo};
+use tiface_base::image::{Exposure, Glare, Gray, Photo};
 use tiface_base::io::{self, Limits, NpyValues};
 use tiface_base::{Error, Result};
 
@@ -123,6 +123,9 @@ pub struct View {
     /// The exposure that is divided out of the photograph when it is read.
     #[serde(skip)]
     pub exposure: Option<Exposure>,
+    /// The glare of lamps that is taken out of the photograph when it is read with its mask.
+    #[serde(skip)]
+    pub glare: Option<Glare>,
 }
 
 impl Capture {
@@ -203,16 +206,21 @@ impl View {
             turn: None,
             mask_turn: None,
             exposure: None,
+            glare: None,
         }
     }
 
-    /// Reads the photograph alone, at the size of its camera, with its exposure divided out.
+    /// Reads the photograph alone, at the size of its camera, with its exposure divided out. Glare
+    /// stays in: a mask tells lamps from the head.
     pub fn load_photo(&self, limits: &Limits) -> Result<Photo> {
-        let photo = self.stored_photo(limits)?;
-        Ok(match &self.exposure {
+        Ok(self.evened_out(self.stored_photo(limits)?))
+    }
+
+    fn evened_out(&self, photo: Photo) -> Photo {
+        match &self.exposure {
             Some(exposure) => exposure.divided_out(photo),
             None => photo,
-        })
+        }
     }
 
     /// Reads the photograph at its own size, turned as the camera sees it.
@@ -248,8 +256,14 @@ impl View {
         limits: &Limits,
         values: Option<&mut Option<MaskValues>>,
     ) -> Result<LoadedView> {
-        let photo = self.load_photo(limits)?;
+        let photo = self.stored_photo(limits)?;
         let mask = self.head_mask(photo.alpha.as_deref(), limits, values)?;
+        // glare was measured at the photograph's own exposure
+        let photo = match (&self.glare, &mask) {
+            (Some(glare), Some(mask)) => glare.taken_out(photo, mask),
+            _ => photo,
+        };
+        let photo = self.evened_out(photo);
         let valid = self
             .valid
             .as_deref()
