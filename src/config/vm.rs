@@ -121,10 +121,8 @@ table! {
         checkpoint_s: f64, 0.05..=86_400.0 [nothing] => 120.0;
     }
     constants {
-        /// What a pixel with a soft mask should look like. As published: the views are compared
-        /// with photographs times mask, and what the background sheds on soft hair belongs to those
-        /// (I-Face, whose mesh leaves the background, learns without it).
-        foreground: Foreground => Foreground::Photo;
+        /// Target color of a pixel with a soft mask.
+        foreground: Foreground => Foreground::Estimated, Foreground::Estimated, Foreground::Photo;
         /// Cells at the start.
         start: VmStart => VmStart::Hull, VmStart::Hull, VmStart::Box;
         /// Draw as published: every valid pixel of the frames whose ray meets the box, in a random
