@@ -75,7 +75,7 @@ table! {
         /// Target number of samples per step, over all rays.
         samples: usize, 64.0..=1e8 [Iface] => 24_576, 24_576, 262_144;
         /// Levels of the hash grid.
-        levels: usize, 1.0..=32.0 [Iface] => 14, 14, 16;
+        levels: usize, 1.0..=32.0 [Iface] => 14, 14, 16, 12;
         /// Cells per axis of the coarsest level.
         base_resolution: u32, 2.0..=1024.0 [Iface] => 16, 16, 32;
         /// Ratio of the resolutions of consecutive levels.
