@@ -28,7 +28,7 @@ mod ssim;
 pub use lpips::Lpips;
 pub use parts::{Masks, PartMetrics, Tones, parts};
 pub use psnr::psnr;
-pub use ssim::{ssim_reflect_map, ssim_valid};
+pub use ssim::{Ssim, ssim, ssim_reflect_map, ssim_valid};
 
 #[cfg(not(feature = "matting"))]
 use crate::onnx as lpips;
@@ -104,6 +104,9 @@ fn mean<V>(views: &[V], of: fn(&V) -> Option<f64>) -> Option<f64> {
 ///
 /// A render with alpha is taken as it is over black. `mask` says where the head is, `valid` where
 /// the photograph can be used; both count from half. Without a mask the masked figures are `None`.
+///
+/// # Errors
+/// Fails if the sizes differ, or if the render has no three or four channels.
 pub fn compare(
     name: &str,
     render: &Image,
@@ -111,17 +114,30 @@ pub fn compare(
     mask: Option<&Gray>,
     valid: Option<&Gray>,
 ) -> Result<ViewMetrics> {
+    compare_in(name, render, photo, [mask], valid).map(|[metrics]| metrics)
+}
+
+/// Compares a render with the photograph of the same view in several masks, as [`compare`] does in
+/// one: what they share is computed once.
+///
+/// # Errors
+/// Fails as [`compare`] does.
+pub fn compare_in<const N: usize>(
+    name: &str,
+    render: &Image,
+    photo: &Photo,
+    masks: [Option<&Gray>; N],
+    valid: Option<&Gray>,
+) -> Result<[ViewMetrics; N]> {
     let problem = |text: String| {
         let hint = "render the view again at the size of the photograph";
         Err(Error::cannot(format_args!("view `{name}`: {text}"), hint))
     };
     let (width, height) = (photo.width, photo.height);
-    let sizes = [
-        ("render", Some((render.width, render.height))),
-        ("mask", mask.map(|m| (m.width, m.height))),
-        ("valid mask", valid.map(|m| (m.width, m.height))),
-    ];
-    for (what, found) in sizes {
+    let size = |m: &Gray| (m.width, m.height);
+    let render_size = [("render", Some((render.width, render.height)))].into_iter();
+    let mask_sizes = masks.iter().map(|mask| ("mask", mask.map(size)));
+    for (what, found) in render_size.chain(mask_sizes).chain([("valid mask", valid.map(size))]) {
         if let Some((w, h)) = found.filter(|&found| found != (width, height)) {
             return problem(format!("the {what} is {w} × {h} pixels, expected {width} × {height}"));
         }
@@ -130,23 +146,29 @@ pub fn compare(
         return problem(format!("the render has {} channels, expected 3 or 4", render.channels));
     }
     let (ours, theirs) = (rounded(render), picture(photo));
-    let inside: Option<Vec<bool>> = mask.map(|m| {
-        let usable = |i: usize| valid.is_none_or(|v| v.values[i] >= INSIDE);
-        (0..m.values.len()).map(|i| m.values[i] >= INSIDE && usable(i)).collect()
-    });
-    let ssim_masked = inside.as_ref().and_then(|inside| {
-        let map = ssim_reflect_map(&ours, &theirs)?;
-        let chosen: Vec<f64> = map.iter().zip(inside).filter(|(_, m)| **m).map(|(s, _)| *s).collect();
-        (!chosen.is_empty()).then(|| chosen.iter().sum::<f64>() / chosen.len() as f64)
-    });
-    Ok(ViewMetrics {
-        name: name.into(),
-        psnr: psnr(&ours, &theirs, None),
-        ssim: ssim_valid(&ours, &theirs),
-        psnr_masked: inside.as_ref().and_then(|m| psnr(&ours, &theirs, Some(m))),
-        ssim_masked,
-        lpips: None,
-    })
+    let whole = psnr(&ours, &theirs, None);
+    let ssim = match masks.iter().any(Option::is_some) {
+        true => ssim(&ours, &theirs),
+        false => Ssim { valid: ssim_valid(&ours, &theirs), reflect_map: None },
+    };
+    let usable = |i: usize| valid.is_none_or(|v| v.values[i] >= INSIDE);
+    Ok(masks.map(|mask| {
+        let inside: Option<Vec<bool>> =
+            mask.map(|m| (0..m.values.len()).map(|i| m.values[i] >= INSIDE && usable(i)).collect());
+        let ssim_masked = inside.as_ref().and_then(|inside| {
+            let map = ssim.reflect_map.iter().flatten();
+            let chosen: Vec<f64> = map.zip(inside).filter(|(_, m)| **m).map(|(s, _)| *s).collect();
+            (!chosen.is_empty()).then(|| chosen.iter().sum::<f64>() / chosen.len() as f64)
+        });
+        ViewMetrics {
+            name: name.into(),
+            psnr: whole,
+            ssim: ssim.valid,
+            psnr_masked: inside.as_ref().and_then(|m| psnr(&ours, &theirs, Some(m))),
+            ssim_masked,
+            lpips: None,
+        }
+    }))
 }
 
 /// Rounds the colors to 8 bits and back; NaN becomes 0.
@@ -227,6 +249,27 @@ mod tests {
         // −10 log10(0.04 / 2) = 16.9897
         assert!((m.psnr_masked.unwrap() - 16.9897).abs() < 1e-4);
         assert!(m.ssim_masked.unwrap() < 1.0);
+    }
+
+    #[test]
+    fn figures_in_several_masks_are_those_in_each() {
+        let ramp = |by: f32| Image {
+            data: (0..24 * 20 * 4).map(|i| (i as f32 * by).sin().abs()).collect(),
+            ..Image::new(24, 20, 4)
+        };
+        let (render, valid) = (ramp(0.37), Gray { width: 24, height: 20, values: vec![255; 480] });
+        let rgb = (0..480u32).map(|i| [(i * 7) as u8, (i * 13) as u8, (i * 29) as u8]).collect();
+        let photo = Photo { width: 24, height: 20, rgb, alpha: None };
+        let half = |right: bool| Gray {
+            values: (0..480).map(|i| if (i % 24 < 12) == right { 255 } else { 0 }).collect(),
+            ..valid.clone()
+        };
+        let (left, right) = (half(false), half(true));
+        let masks = [None, Some(&left), Some(&right)];
+        let each = masks.map(|mask| compare("a", &render, &photo, mask, Some(&valid)).unwrap());
+        assert_eq!(compare_in("a", &render, &photo, masks, Some(&valid)).unwrap(), each);
+        assert!(each[0].ssim_masked.is_none() && each[1].ssim_masked != each[2].ssim_masked);
+        assert!(each[1].psnr_masked != each[2].psnr_masked && each[0].ssim == each[1].ssim);
     }
 
     #[test]

@@ -21,24 +21,45 @@ const BLOCK: usize = 16;
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
+/// Both variants of a pair of pictures.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Ssim {
+    /// The figure of [`ssim_valid`].
+    pub valid: Option<f64>,
+    /// That of [`ssim_reflect_map`].
+    pub reflect_map: Option<Vec<f64>>,
+}
+
 /// Returns the mean over the windows that fit; TensoRF's figure. `None` for pictures of different
 /// shape or smaller than the window.
 pub fn ssim_valid(a: &Image, b: &Image) -> Option<f64> {
-    let maps = maps(a, b, 0, true)?;
-    let count: usize = maps.iter().map(Vec::len).sum();
-    Some(maps.iter().flatten().sum::<f64>() / count as f64)
+    mean_of_fitting(&channels(a, b, 0, [true, false])?)
 }
 
 /// One value a pixel, `[height · width]`, mean over channels, with mirrored borders; their mean is
 /// instant-nsr-pl's figure. `None` for pictures of different shape or below 6 pixels.
 pub fn ssim_reflect_map(a: &Image, b: &Image) -> Option<Vec<f64>> {
-    let maps = maps(a, b, RADIUS, false)?;
-    let count = maps.len() as f64;
-    Some((0..maps[0].len()).map(|i| maps.iter().map(|m| m[i]).sum::<f64>() / count).collect())
+    Some(mean_of_channels(&channels(a, b, RADIUS, [false, true])?))
 }
 
-/// Returns a map per channel, after mirroring `border` pixels on every side.
-fn maps(a: &Image, b: &Image, border: usize, possible: bool) -> Option<Vec<Vec<f64>>> {
+/// Returns both variants for the time of one: windows that fit are those of the mirrored pictures
+/// that reach over no border.
+pub fn ssim(a: &Image, b: &Image) -> Ssim {
+    let Some(channels) = channels(a, b, RADIUS, [true, true]) else { return Ssim::default() };
+    Ssim { valid: mean_of_fitting(&channels), reflect_map: Some(mean_of_channels(&channels)) }
+}
+
+/// Similarities in the windows of one channel of two pictures.
+struct Channel {
+    /// In the windows that fit, with possible variances.
+    fitting: Vec<f64>,
+    /// In all windows.
+    all: Vec<f64>,
+}
+
+/// Returns the similarities of each channel, after mirroring `border` pixels on every side;
+/// `wanted`: in the windows that fit, in all of them.
+fn channels(a: &Image, b: &Image, border: usize, wanted: [bool; 2]) -> Option<Vec<Channel>> {
     let (w, h) = (a.width as usize, a.height as usize);
     let same = (a.width, a.height, a.channels) == (b.width, b.height, b.channels) && a.channels > 0;
     let fits = w.min(h) > border && w.min(h) + 2 * border >= WINDOW;
@@ -46,29 +67,46 @@ fn maps(a: &Image, b: &Image, border: usize, possible: bool) -> Option<Vec<Vec<f
         return None;
     }
     let channel = |c: usize| {
-        let x = padded(a, c, border);
-        let y = padded(b, c, border);
+        let (x, y) = (padded(a, c, border), padded(b, c, border));
         let width = w + 2 * border;
         let blurred = |f: &dyn Fn(f64, f64) -> f64| {
             blur(&x.iter().zip(&y).map(|(x, y)| f(*x, *y)).collect::<Vec<f64>>(), width)
         };
-        let (ma, mb) = (blurred(&|x, _| x), blurred(&|_, y| y));
+        let (ma, mb) = (blur(&x, width), blur(&y, width));
         let (aa, bb, ab) = (blurred(&|x, _| x * x), blurred(&|_, y| y * y), blurred(&|x, y| x * y));
-        (0..ma.len())
-            .map(|i| {
-                let mut va = aa[i] - ma[i] * ma[i];
-                let mut vb = bb[i] - mb[i] * mb[i];
-                let mut cov = ab[i] - ma[i] * mb[i];
-                if possible {
-                    (va, vb) = (va.max(0.0), vb.max(0.0));
-                    cov = cov.signum() * cov.abs().min((va * vb).sqrt());
-                }
-                (2.0 * ma[i] * mb[i] + C1) * (2.0 * cov + C2)
-                    / ((ma[i] * ma[i] + mb[i] * mb[i] + C1) * (va + vb + C2))
-            })
-            .collect()
+        let similarity = |i: usize, possible: bool| {
+            let mut va = aa[i] - ma[i] * ma[i];
+            let mut vb = bb[i] - mb[i] * mb[i];
+            let mut cov = ab[i] - ma[i] * mb[i];
+            if possible {
+                (va, vb) = (va.max(0.0), vb.max(0.0));
+                cov = cov.signum() * cov.abs().min((va * vb).sqrt());
+            }
+            (2.0 * ma[i] * mb[i] + C1) * (2.0 * cov + C2)
+                / ((ma[i] * ma[i] + mb[i] * mb[i] + C1) * (va + vb + C2))
+        };
+        // windows within the picture, of those of the mirrored one
+        let [columns, rows] = [w, h].map(|n| if wanted[0] { n.saturating_sub(WINDOW - 1) } else { 0 });
+        let within = (0..rows).flat_map(|y| (0..columns).map(move |x| (y, x)));
+        let stride = width - (WINDOW - 1);
+        let fitting = within.map(|(y, x)| similarity((y + border) * stride + x + border, true)).collect();
+        let all = (0..if wanted[1] { ma.len() } else { 0 }).map(|i| similarity(i, false)).collect();
+        Channel { fitting, all }
     };
     Some((0..a.channels).into_par_iter().map(channel).collect())
+}
+
+/// Returns the mean over the windows that fit; `None` if there are none.
+fn mean_of_fitting(channels: &[Channel]) -> Option<f64> {
+    let count: usize = channels.iter().map(|c| c.fitting.len()).sum();
+    let sum: f64 = channels.iter().flat_map(|c| &c.fitting).sum();
+    (count > 0).then(|| sum / count as f64)
+}
+
+/// Returns the mean over the channels in every window.
+fn mean_of_channels(channels: &[Channel]) -> Vec<f64> {
+    let count = channels.len() as f64;
+    (0..channels[0].all.len()).map(|i| channels.iter().map(|c| c.all[i]).sum::<f64>() / count).collect()
 }
 
 /// One channel with mirrored borders; the edge pixel itself is not repeated.
@@ -151,6 +189,21 @@ mod tests {
         let reflected = ssim_reflect_map(&a, &b).unwrap();
         let mean = reflected.iter().sum::<f64>() / reflected.len() as f64;
         assert!((mean - 0.5162364).abs() < 1e-6, "{mean}");
+    }
+
+    #[test]
+    fn both_variants_together_are_what_each_is_alone() {
+        let ramp = |w: u32, h: u32, by: f32| Image {
+            data: (0..w * h * 3).map(|i| (i as f32 * by).sin().abs()).collect(),
+            ..Image::new(w, h, 3)
+        };
+        // a window fits in all, in one way, not at all
+        for (w, h) in [(40, 23), (11, 16), (11, 11), (10, 30), (6, 6), (5, 30)] {
+            let (a, b) = (ramp(w, h, 0.13), ramp(w, h, 0.17));
+            let alone = Ssim { valid: ssim_valid(&a, &b), reflect_map: ssim_reflect_map(&a, &b) };
+            assert_eq!(ssim(&a, &b), alone, "{w} × {h}");
+            assert_eq!(alone.valid.is_some(), w >= 11, "{w} × {h}");
+        }
     }
 
     #[test]

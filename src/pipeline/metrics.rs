@@ -4,7 +4,7 @@ use super::exposure::ExposureCheck;
 use super::pictures;
 use super::truth::against_truth;
 use crate::config::{Config, Method, TruthPhoto, ViewBackground};
-use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, parts};
+use crate::metrics::{Lpips, Masks, Metrics, PartMetrics, Tones, ViewMetrics, compare, compare_in, parts};
 use crate::run::{Run, StageDir};
 use rayon::prelude::*;
 use serde_json::{Map, Value, json};
@@ -191,8 +191,9 @@ fn figures(
         against(&render, evened.as_ref().unwrap_or(&photo), loaded.mask.as_ref())
     });
     let own_pose = own_pose.transpose()?;
-    let region = loaded.region.as_ref().map(|r| against(&render, &photo, Some(r))).transpose()?;
-    let mut head = against(&render, &photo, loaded.mask.as_ref())?;
+    let masks = [loaded.mask.as_ref(), loaded.region.as_ref()];
+    let [mut head, region] = compare_in(&picture.view.name, &render, &photo, masks, loaded.valid.as_ref())?;
+    let region = loaded.region.is_some().then_some(region);
     head.lpips = lpips.map(|network| network.distance(&render, &photo)).transpose()?;
     // a picture over a background is opaque; its original alpha is in the float view
     let before = picture.float.as_ref().map(|float| pictures::read_float(float)).transpose()?;
