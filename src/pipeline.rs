@@ -117,14 +117,28 @@ pub fn complete(session: &Session, stage: Stage, fields: &dyn Fields) -> Result<
                 true => {
                     let (capture, leaves_out_own) = (session.refined_capture()?, session.path.is_none());
                     let renderer = renderer.with_pixel_filter(capture, &scene, config)?;
-                    renderer.with_residuals(capture, &scene, config, leaves_out_own)?
+                    let residuals = renderer.residuals(capture, &scene, config, leaves_out_own)?;
+                    dir.check_stop()?; // residuals of a stopped stage lack views
+                    if leaves_out_own && ensemble::fits_with_residuals(config) {
+                        session.keep_residuals(residuals.clone());
+                    }
+                    renderer.with_residuals(residuals)
                 }
                 false => renderer,
             };
             render::render(c, &renderer, &cameras, &fitted, &scene, config.capture.unit_m, dir)
         }
         Stage::Ensemble => {
-            ensemble::ensemble(session.refined_capture()?, config, run, &session.scene()?, fields, dir)
+            let residuals = session.take_residuals();
+            ensemble::ensemble(
+                session.refined_capture()?,
+                config,
+                run,
+                &session.scene()?,
+                fields,
+                residuals,
+                dir,
+            )
         }
         Stage::Metrics => {
             let has_mesh = session.order(Stage::Metrics).contains(&Stage::Mesh);

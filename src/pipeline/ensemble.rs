@@ -15,22 +15,24 @@ use crate::config::{Config, EnsembleConfig, MaskUse, Method, display_name, key};
 use crate::ensemble::{self, BlendTarget, Fit, Member, Members, Tile, blend, shares_hint};
 use crate::run::{Run, StageDir};
 use serde_json::{Map, Value, json};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tiface_base::image::{Gray, Image, Photo};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
 use tiface_capture::scene::Scene;
 use tiface_capture::{Capture, MaskMeaning, View, ViewMask};
-use tiface_surface::render::RenderedView;
+use tiface_surface::render::{RenderedView, Residuals};
 
 /// Blends one picture per camera of `render`. `fields` are evaluated only if weights are to be
-/// fitted.
+/// fitted, with the residuals of the stage `render` if they are known.
 pub(super) fn ensemble(
     capture: &Capture,
     config: &Config,
     run: &Run,
     scene: &Scene,
     fields: &dyn Fields,
+    residuals: Option<Arc<Residuals>>,
     dir: &StageDir,
 ) -> Result<Value> {
     let Config { ensemble: c, render, .. } = config;
@@ -39,10 +41,12 @@ pub(super) fn ensemble(
         true => {
             let meshes = Meshes::load(run, config, &c.members)?;
             let renderer = Renderer::new(scene, fields, &meshes, render.samples, dir.monitor());
-            let renderer = match render.shows_residuals(&c.members) {
-                true => renderer.with_residuals(capture, scene, config, true)?,
-                false => renderer,
+            let residuals = match (fits_with_residuals(config), residuals) {
+                (false, _) => None,
+                (true, None) => renderer.residuals(capture, scene, config, true)?,
+                (true, known) => known,
             };
+            let renderer = renderer.with_residuals(residuals);
             fit(capture, config, scene, &renderer, dir)?
         }
         false => (shares(c), Value::Null),
@@ -66,6 +70,11 @@ pub(super) fn ensemble(
     // warnings about the blend alone: its members' warnings are in the stage `render`
     summary["seconds_per_view"] = json!(spent.as_secs_f64() / cameras.len().max(1) as f64);
     Ok(summary)
+}
+
+/// Returns whether weights are fitted to members that show residuals.
+pub(super) fn fits_with_residuals(config: &Config) -> bool {
+    config.ensemble.weights.is_empty() && config.render.shows_residuals(&config.ensemble.members)
 }
 
 /// Checks, before any work, that the members of the blend will be available.

@@ -163,6 +163,36 @@ fn the_stages_after_learning_keep_the_exact_head_exact() {
     assert!(warnings[0].contains("head.glb` has 4 bytes") && warnings[0].contains("`--fresh mesh`"));
 }
 
+/// The blend is fitted with the residuals of the views, whether they are still known or not.
+#[test]
+fn a_blend_has_the_same_bytes_with_the_residuals_of_its_views_and_with_its_own() {
+    let (_dir, mut config, run) = sharp_run();
+    config.mesh.resolution = 64;
+    config.mesh.triangles = 3000;
+    config.mesh.texture_px = 128;
+    config.mesh.color = ColorSource::Photographs;
+    config.render.method = vec![Method::Raycast, Method::Plain];
+    config.ensemble.members = config.render.method.clone();
+    assert!(config.render.residuals && config.ensemble.weights.is_empty());
+    let session = Session::open(&config, &run).unwrap();
+    session.remember(Stage::Ensemble).unwrap();
+    masked(&session);
+    let exact = Formula(Exact { world_from_scene: session.scene().unwrap().scene_from_world.inverse() });
+    complete(&session, Stage::Mesh, &exact).unwrap();
+    complete(&session, Stage::Render, &exact).unwrap();
+    let kept = session.take_residuals();
+    assert!(kept.is_some());
+    session.keep_residuals(kept);
+    let blend = |session: &Session| {
+        assert!(!complete(session, Stage::Ensemble, &exact).unwrap().skipped);
+        assert!(session.take_residuals().is_none());
+        ["weights.json", "012.png"].map(|file| std::fs::read(run.path("ensemble").join(file)).unwrap())
+    };
+    let with_those_of_views = blend(&session);
+    std::fs::remove_dir_all(run.path("ensemble")).unwrap();
+    assert_eq!(blend(&Session::open(&config, &run).unwrap()), with_those_of_views);
+}
+
 /// Makes heads with colors from a source and lobes each. By the photographs, a head must
 /// look as rays show it and like the photograph; for every other one the difference between what
 /// rays and what a viewer shows is returned.

@@ -18,6 +18,7 @@ use crate::config::{ColorSource, Config, Method, RenderConfig};
 use crate::run::{Run, StageDir};
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tiface_base::geom::{Bvh, Camera, Harmonics, Ray, ShellCaster, Similarity};
 use tiface_base::{Monitor, Result, io};
@@ -276,7 +277,7 @@ pub(super) struct Renderer<'a> {
     samples: u32,
     world_from_scene: Similarity,
     /// Residuals of ray casting in the training photographs.
-    residuals: Option<Residuals>,
+    residuals: Option<Arc<Residuals>>,
     /// Deviation of the Gaussian that makes a ray-cast view look like a photograph, pixels.
     pixel_filter_px: f32,
     monitor: &'a dyn Monitor,
@@ -332,19 +333,20 @@ impl<'a> Renderer<'a> {
         Ok(self)
     }
 
-    /// Returns the renderer with the residuals of ray casting in the training photographs, which
-    /// are added to other ray-cast views. With `leaves_out_own`, a training view adds nothing to a
-    /// view from its own position.
-    pub fn with_residuals(
-        mut self,
+    /// Returns what ray casting misses of the training photographs. With `leaves_out_own`, a
+    /// training view adds nothing to a view from its own position. `None` if nothing can be
+    /// compared.
+    pub fn residuals(
+        &self,
         capture: &Capture,
         scene: &Scene,
         config: &Config,
         leaves_out_own: bool,
-    ) -> Result<Renderer<'a>> {
+    ) -> Result<Option<Arc<Residuals>>> {
+        debug_assert!(self.residuals.is_none());
         let meshes =
             [self.extracted.as_ref().map(|(s, _)| &s.mesh), self.head.as_ref().map(|h| &h.head.mesh)];
-        let Some(mesh) = meshes.into_iter().flatten().next() else { return Ok(self) };
+        let Some(mesh) = meshes.into_iter().flatten().next() else { return Ok(None) };
         // depth in the scene's units; colors are filtered over a pixel, whatever the number of rays
         let options = RaycastOptions { samples: 1, ..RaycastOptions::default() };
         let mut residuals = Vec::new();
@@ -360,8 +362,12 @@ impl<'a> Renderer<'a> {
                 residuals.extend(ResidualView::new(source));
             }
         }
-        self.residuals = Residuals::new(residuals, mesh.bounds().center(), leaves_out_own);
-        Ok(self)
+        Ok(Residuals::new(residuals, mesh.bounds().center(), leaves_out_own).map(Arc::new))
+    }
+
+    /// Returns the renderer with residuals that are added to ray-cast views.
+    pub fn with_residuals(self, residuals: Option<Arc<Residuals>>) -> Renderer<'a> {
+        Renderer { residuals, ..self }
     }
 
     /// Returns these methods in groups whose views come from the same rays, in their order.

@@ -13,11 +13,12 @@ use crate::run::Run;
 use std::borrow::Cow;
 use std::fmt::Display;
 use std::io::ErrorKind::NotFound;
-use std::sync::OnceLock;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use tiface_base::io::{self, Limits};
 use tiface_base::{Error, Result};
 use tiface_capture::scene::{Scene, SceneBox};
 use tiface_capture::{Capture, MaskReading, Split, View, ViewMask};
+use tiface_surface::render::Residuals;
 
 /// A capture, its configuration and its run folder.
 pub struct Session<'a> {
@@ -25,6 +26,8 @@ pub struct Session<'a> {
     /// The capture as the stage `mask` read its masks, refined its poses, evened out its exposures
     /// and took glare out, once it is used.
     refined: OnceLock<Capture>,
+    /// What the mesh misses of the training photographs, from the stage `render` to the blend.
+    residuals: Mutex<Option<Arc<Residuals>>>,
     pub(super) config: &'a Config,
     pub(super) run: &'a Run,
     /// Inputs of the fingerprints of the stages besides the settings.
@@ -57,7 +60,15 @@ impl<'a> Session<'a> {
         if is_demo(config, run) {
             capture.name = "demo".into();
         }
-        Ok(Session { capture, refined: OnceLock::new(), config, run, inputs, path: None })
+        Ok(Session {
+            capture,
+            refined: OnceLock::new(),
+            residuals: Mutex::default(),
+            config,
+            run,
+            inputs,
+            path: None,
+        })
     }
 
     /// Returns a session whose stage `render` makes the views of `render.cameras` in a folder of
@@ -130,6 +141,17 @@ impl<'a> Session<'a> {
     /// Returns the exposures that the stage `mask` measured.
     pub(super) fn exposure(&self) -> Result<Option<ExposureCheck>> {
         ExposureCheck::read(&self.run.path(Stage::Mask)).map_err(|e| unusable(e, Stage::Mask))
+    }
+
+    /// Keeps the residuals of the held-out views for the blend's members, which have the same.
+    pub(super) fn keep_residuals(&self, residuals: Option<Arc<Residuals>>) {
+        *self.residuals.lock().unwrap_or_else(PoisonError::into_inner) = residuals;
+    }
+
+    /// Returns the residuals of the held-out views if this process has measured them, and forgets
+    /// them.
+    pub(super) fn take_residuals(&self) -> Option<Arc<Residuals>> {
+        self.residuals.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
     /// Returns the capture with the poses that the stage `mask` refined, the exposures that it
