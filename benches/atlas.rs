@@ -53,6 +53,7 @@ fn main() {
             }
             println!("seams facing +z      {:.2} × √area", seams_facing(&mesh, &atlas, Vec3::Z));
             println!("{uv}");
+            assert!(uv.is_sound(), "the atlas has faults");
         }
     }
 }

@@ -66,6 +66,7 @@ fn table(name: &str, c: &Clicked, times: u32) {
     let s = cpu_s() - start;
     let overlaps: Vec<f64> = masks.masks.iter().zip(&c.truth).map(|(m, t)| overlap(m, t)).collect();
     row("all views", &overlaps, s);
+    assert!(overlaps.iter().all(|o| *o > 0.8), "{name}: a mask is not the head");
     masks.warnings.iter().for_each(|w| println!("  {w}"));
 
     let start = cpu_s();

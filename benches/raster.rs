@@ -14,6 +14,7 @@ mod process;
 use glam::{DMat3, DVec3, Vec2};
 use head::head;
 use process::cpu_s;
+use process::roof::Roof;
 use tiface::geom::{Atlas, Bvh, Camera, Distortion, Mesh};
 use tiface::image::Photo;
 use tiface::render::{
@@ -30,6 +31,7 @@ fn main() {
     let (atlas, photo) = texture(&mesh, n);
     let texture = MeshTexture::new(&mesh, &atlas, &photo, None);
     let camera = camera(&mesh);
+    let roof = Roof::measure();
     println!(
         "{} triangles, {SIDE} × {SIDE} pixels, {} covered",
         mesh.triangles.len(),
@@ -47,7 +49,10 @@ fn main() {
         let color = |hits: &RayHits| texture.smooth_colors(hits, camera);
         let textured = cost(|| raster_into(&mut view, &mesh, None, camera, options, color));
         let bare = cost(|| raster_into(&mut view, &mesh, None, camera, options, |_| Vec::new()));
-        println!("{name:12} {textured:6.1} CPU ms textured, {bare:6.1} without a texture");
+        // corners and triangles are read; color, depth and triangle of every pixel are written
+        let bytes = 24 * mesh.positions.len() + 12 * mesh.triangles.len() + 24 * (SIDE * SIDE) as usize;
+        let bare = roof.moved(bare, bytes as f64);
+        println!("{name:12} {textured:6.1} CPU ms textured, {bare} without a texture");
     }
     let seen = raster(&mesh, None, &camera, &both, |hits| texture.smooth_colors(hits, &camera));
     let options = RaycastOptions::default();
@@ -55,7 +60,9 @@ fn main() {
         raycast(&Bvh::new(&mesh), &mesh, None, &camera, &options, |hits| texture.colors(hits, &camera, 2));
     let square = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
     let error: f64 = seen.view.color.data.iter().zip(&cast.color.data).map(square).sum();
-    println!("{:.1} dB from the ray caster's", -10.0 * (error / cast.color.data.len() as f64).log10());
+    let psnr = -10.0 * (error / cast.color.data.len() as f64).log10();
+    println!("{psnr:.1} dB from the ray caster's");
+    assert!(psnr > 30.0, "the rasterizer shows another picture than the ray caster");
 }
 
 /// CPU milliseconds of a picture, warm.

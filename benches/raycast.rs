@@ -40,6 +40,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let seconds = best_of(5, || {
             hits = rays.iter().filter(|r| black_box(bvh.closest_hit(r)).is_some()).count();
         });
+        let any = rays.iter().filter(|r| bvh.any_hit(r)).count();
+        assert_eq!(any, hits, "a search for any hit finds others");
         println!(
             "{name:8} {:6.2} Mrays/s   {hits} of {} hit",
             rays.len() as f64 * 1e-6 / seconds,
@@ -51,11 +53,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let seconds = best_of(3, || {
         sum = near.iter().filter_map(|&p| bvh.closest_point(p)).map(|c| c.distance as f64).sum();
     });
-    println!(
-        "closest  {:6.2} Mpoints/s  mean {:.6}",
-        near.len() as f64 * 1e-6 / seconds,
-        sum / near.len() as f64
-    );
+    let mean = sum / near.len() as f64;
+    // corners were moved by a hundredth of their distance from the origin
+    let moved = near.iter().map(|p| f64::from(p.length())).sum::<f64>() / 101.0 / near.len() as f64;
+    assert!((0.0..1.001 * moved).contains(&mean), "{mean} is farther than the mesh, {moved} away");
+    println!("closest  {:6.2} Mpoints/s  mean {mean:.6}", near.len() as f64 * 1e-6 / seconds);
 
     if let Some(folder) = dump {
         std::fs::create_dir_all(&folder)?;

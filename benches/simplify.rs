@@ -145,6 +145,8 @@ fn measure(n: usize, triangles: usize) {
             }
         }
         show(name, Some(best), &mesh);
+        let report = check(&mesh, 1.0);
+        assert!(report.closed && report.manifold, "{name}: the mesh is not closed or not manifold");
     }
 }
 
