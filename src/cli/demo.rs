@@ -14,6 +14,7 @@ use tiface_capture::synthetic::{MadeCapture, SyntheticOptions, check, write_bord
 
 /// Settings of the demo: few steps, because its pictures are small.
 pub(super) const DEMO: Fallback = (Preset::Draft, |config| {
+    config.iface.steps = 1800;
     (config.tface.steps, config.tface.rays) = (800, 2048);
     (config.baseline.steps, config.baseline.rays) = (600, 2048);
 });

@@ -69,7 +69,7 @@ mod tests {
             "{text}"
         );
         let text = explain("iface.steps").unwrap();
-        assert!(text.contains("quick: 1200   draft: 3000   standard: 8000"), "{text}");
+        assert!(text.contains("quick: 900   draft: 3000   standard: 8000"), "{text}");
         assert!(explain("mesh").unwrap().matches("mesh.").count() > 3);
         assert!(explain("mesh.resolutoin").unwrap_err().hint().contains("mesh.resolution"));
     }

@@ -67,7 +67,7 @@ table! {
         /// paper).
         field: FieldKind [Iface] => FieldKind::Sdf;
         /// Optimizer steps.
-        steps: u64, 1.0..=1e7 [Iface] => 3000, 8000, 20_000, 1200;
+        steps: u64, 1.0..=1e7 [Iface] => 3000, 8000, 20_000, 900;
         /// Rays per step at the start.
         rays: usize, 1.0..=1_048_576.0 [Iface] => 1024, 1024, 256;
         /// Largest number of rays per step; the number adapts to `samples`.

@@ -126,11 +126,13 @@ table! {
         /// Views that soft layers and their colors are fitted to besides the photographs: tface
         /// (T-Face's from between the cameras; it is trained before the mesh is made), none, or
         /// auto (tface where the same command needs T-Face anyway, as `tiface run` does; a mesh
-        /// that is there keeps its own).
+        /// that is there keeps its own). Views of T-Face take a third of the time of the stage
+        /// `mesh`, which preset quick saves.
         #[flag("hair-views", Text("KIND"), ["mesh"],
             "Views that hair is fitted to besides the photographs: tface (T-Face is trained first), none, or \
-             auto (tface where the command needs it anyway; an existing mesh keeps its own)")]
-        hair_views: HairViews [Head if |c| c.mesh.uses_tface()] => HairViews::Auto;
+             auto (tface where the command needs it anyway; an existing mesh keeps its own); none in preset quick")]
+        hair_views: HairViews [Head if |c| c.mesh.uses_tface()]
+            => HairViews::Auto, HairViews::Auto, HairViews::Auto, HairViews::None;
         /// Write a tangent-space map of the unsimplified normals to GLB and USDZ: true or false.
         #[flag("normal-map", Switch("true"), ["mesh"],
             "Store the detail that simplification removes in a normal map; makes the material lit")]

@@ -8,7 +8,7 @@ use tiface_base::{Error, Result};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// A look in two to three minutes on two cores: [`Preset::Draft`] with fewer steps.
+    /// A look in two minutes on two cores: [`Preset::Draft`] with fewer steps.
     Quick,
     /// A first result in minutes.
     Draft,

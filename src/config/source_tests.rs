@@ -120,8 +120,13 @@ fn constants_of_a_preset_are_no_keys_and_come_with_it() {
     let text = paper.to_toml();
     assert!(!text.contains("lr_grid") && !text.contains("step_ratio"), "{text}");
     let back = from(&text, &["tface.steps=7"]).unwrap();
-    // 0.5 as published, 1.0 in the other presets
+    // 0.5 as published, 1.0 or more in the other presets
     assert_eq!((back.tface.steps, back.tface.step_ratio, back.iface.radius), (7, 0.5, 0.3));
+    // quick has some of its own
+    let quick = from(&Config::preset(Preset::Quick).to_toml(), &["tface.steps=7"]).unwrap().tface;
+    let of_draft = Config::preset(Preset::Draft).tface;
+    assert_eq!((quick.steps, quick.lr_network, quick.lr_final), (7, 0.002, 0.1));
+    assert_eq!((of_draft.lr_network, of_draft.lr_final), (0.001, 0.01));
     assert!(from("", &["tface.step_ratio=1"]).unwrap_err().to_string().contains("there is no key"));
 }
 

@@ -40,7 +40,8 @@ macro_rules! table {
         }
         $(constants {
             $($(#[doc = $constant_doc:literal])+ $constant:ident: $constant_ty:ty
-                => $constant_draft:expr $(, $constant_standard:expr, $constant_paper:expr)?;)+
+                => $constant_draft:expr
+                $(, $constant_standard:expr, $constant_paper:expr $(, $constant_quick:expr)?)?;)+
         })?
     ) => {
         $(#[$about])*
@@ -70,7 +71,8 @@ macro_rules! table {
                         preset, $draft $(, $standard, $paper $(, $quick)?)?
                     ),)+
                     $($($constant: $crate::config::table::of_preset!(
-                        preset, $constant_draft $(, $constant_standard, $constant_paper)?
+                        preset, $constant_draft
+                        $(, $constant_standard, $constant_paper $(, $constant_quick)?)?
                     ),)+)?
                 }
             }
@@ -82,7 +84,8 @@ macro_rules! table {
                 let _ = preset; // where every preset has the same constants
                 $name {
                     $($constant: $crate::config::table::of_preset!(
-                        preset, $constant_draft $(, $constant_standard, $constant_paper)?
+                        preset, $constant_draft
+                        $(, $constant_standard, $constant_paper $(, $constant_quick)?)?
                     ),)+
                     ..self
                 }

@@ -184,8 +184,9 @@ impl<'a> Workload<'a> {
             _ if has_shell(&c) => 2.3,
             _ => 1.0,
         };
-        // samples along a ray are as dense as the grid; many of them share a color
-        let sample = if c.group_weight > 0.0 { 0.04e-6 } else { 0.09e-6 };
+        // samples along a ray are as dense as the grid, or `step_ratio` times as far apart; many of
+        // them share a color
+        let sample = if c.group_weight > 0.0 { 0.04e-6 } else { 0.045e-6 } / c.step_ratio;
         let ray = outside * (3e-6 + sample * (c.voxels_final as f64).cbrt());
         let cpu_s = 0.1 + ray * rays + 4e-9 * parameters * (c.steps as usize * c.learned()) as f64;
         let trained = mib::VM_PARAMETER * parameters + mib::VM_RAY * c.rays as f64;
@@ -260,12 +261,13 @@ impl<'a> Workload<'a> {
         let shows_residuals = fits && self.config.render.shows_residuals(members);
         let residuals = if shows_residuals { self.all } else { 0.0 };
         let rendered = if fits { self.renderers(members, residuals) } else { 0.0 };
-        (0.2 + 3e-6 * self.held_out + 0.8e-6 * residuals, mib::VIEW_PIXEL * self.each + rendered)
+        // the stage `render` has measured the residuals if it ran just before
+        (0.2 + 3e-6 * self.held_out, mib::VIEW_PIXEL * self.each + rendered)
     }
 
     fn metrics(&self) -> (f64, f64) {
         let methods = self.session.render_config().method.len();
-        (0.2 + 1.2e-6 * self.held_out * methods as f64, 215.0 + mib::VIEW_PIXEL * self.each)
+        (0.2 + 0.7e-6 * self.held_out * methods as f64, 215.0 + mib::VIEW_PIXEL * self.each)
     }
 
     /// Returns the memory of views by these methods besides the views themselves, MiB.

@@ -498,7 +498,7 @@ fn the_configuration_as_json_is_json_and_a_key_is_explained_with_its_value_in_pr
     let explained = json(&["config", "--explain", "iface.steps", "--json"]);
     assert_eq!(
         (&explained[0]["key"], &explained[0]["values"]["quick"]),
-        (&"iface.steps".into(), &1200.into())
+        (&"iface.steps".into(), &900.into())
     );
     let text = out(&tiface(dir.path(), &["config", "--explain", "mesh.resolution"]));
     assert!(text.contains("quick: 256   draft: 256   standard: 512"), "{text}");
