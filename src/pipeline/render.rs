@@ -31,8 +31,9 @@ use tiface_surface::render::{
     ResidualSource, ResidualView, Residuals, Surface, raster, raycast, raycast_each,
 };
 
-/// Most training views that the pixel filter of ray casting is fitted to.
-const FILTERED_VIEWS: usize = 6;
+/// Most training views that the pixel filter of ray casting is fitted to. Six chose the same width
+/// for the heads of the results.
+const FILTERED_VIEWS: usize = 3;
 
 /// Renders one folder per method and one picture per camera, and the `fitted` cameras by the
 /// methods that compare poses; `unit_m` is the number of meters in a dataset unit. Methods that
