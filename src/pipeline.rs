@@ -49,6 +49,7 @@ mod plan;
 mod preview;
 mod readings;
 mod render;
+mod renderer;
 mod rig_photos;
 mod scene_file;
 mod session;
@@ -73,7 +74,7 @@ pub use tiface_base::geom::RayResult;
 pub use truth::{Truth, against_truth};
 
 use crate::run::{Done, StageDir};
-use render::{Meshes, Renderer};
+use renderer::{Meshes, Renderer};
 use tiface_base::{Result, io};
 use tiface_kernels as kernel;
 

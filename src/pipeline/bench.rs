@@ -8,7 +8,7 @@
 use super::finish::{Finish, photographs};
 use super::mesh::{Extraction, extract};
 use super::mesh_files::Export;
-use super::render::{Meshes, Renderer};
+use super::renderer::{Meshes, Renderer};
 use super::session::Session;
 use super::surface::Fields;
 use super::{complete, learn, pictures};

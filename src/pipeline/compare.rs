@@ -5,7 +5,7 @@ use super::metrics::{Comparable, Judge, means};
 use super::page::views::{ShownSet, rows, shown_sets};
 use super::page::{COLUMNS, MAX_BYTES, curves, judged, methods, quality};
 use super::pictures;
-use super::render::VisibleHead;
+use super::renderer::VisibleHead;
 use super::session::Session;
 use crate::config::{Config, PictureFormat, Stage};
 use crate::metrics::distance::one_way;

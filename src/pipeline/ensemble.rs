@@ -8,7 +8,8 @@
 //! The weights are fitted on tiles of the training photographs that were excluded from training,
 //! unless the settings give them.
 
-use super::render::{Meshes, Renderer, held_out};
+use super::render::held_out;
+use super::renderer::{Meshes, Renderer};
 use super::surface::Fields;
 use super::{learn, pictures};
 use crate::config::{Config, EnsembleConfig, MaskUse, Method, display_name, key};

@@ -4,7 +4,7 @@ use super::ensemble::can_blend;
 use super::inputs::capture_options;
 use super::mask::inspect_capture;
 use super::path::{CameraPath, PATHS};
-use super::render::shows_head;
+use super::renderer::shows_head;
 use super::session::Session;
 use crate::config::{Config, Method, Product, SETTINGS_FILE, Stage, VmConfig, key};
 use crate::run::{Plan, read_record, read_status};

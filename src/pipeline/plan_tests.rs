@@ -2,7 +2,7 @@
 //! do.
 
 use super::inputs::capture_options;
-use super::render::shows_head;
+use super::renderer::shows_head;
 use super::tests::{demo_head, draft, quiet, words};
 use super::*;
 use crate::config::{Config, HairViews, Key, Method, Product, Sources, all_keys, key};
