@@ -128,6 +128,9 @@ table! {
         /// Draw as published: every valid pixel of the frames whose ray meets the box, in a random
         /// order without repetition; else those near the masks, with repetition.
         whole_frame: bool => false, false, true;
+        /// Draw two of five pixels where masked photographs are smooth: 0.26 and 0.27 dB more on
+        /// two heads after 360 steps, for 3 and 6 % more CPU time; nothing and 0.1 dB after 1500.
+        thinned: bool => false, false, false, true;
         /// Directions have depth 1, not length 1, so that steps are longer off the axis
         /// (published).
         depth_directions: bool => false, false, true;

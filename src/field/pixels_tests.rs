@@ -81,6 +81,55 @@ fn a_ray_of_a_large_photograph_stands_for_a_square_of_pixels_while_the_field_is_
 }
 
 #[test]
+fn of_smooth_pixels_two_of_five_are_drawn_and_all_of_the_others() {
+    // left of column 10 one gray, right of it stripes; all is head but a column at either border
+    let stripes = |i: usize| if i % 20 < 10 || i % 2 == 1 { [90; 3] } else { [120; 3] };
+    let views = [LoadedView {
+        photo: Photo { rgb: (0..200).map(stripes).collect(), ..view().photo },
+        mask: Some(Gray {
+            width: 20,
+            height: 10,
+            values: (0..200).map(|i| if matches!(i % 20, 0 | 19) { 0 } else { 255 }).collect(),
+        }),
+        ..view()
+    }];
+    let all = RaySampler::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false);
+    assert_eq!(all.count(), 200);
+    let thinned = RaySampler::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false).thinned();
+    let drawn = |x: usize, y: usize| {
+        let p = 20 * y + x;
+        thinned.drawable[0].4[p >> 6] >> (p & 63) & 1 == 1
+    };
+    for y in 0..10 {
+        // windows of two pixels to either side: columns 3 to 7 see neither the border nor a stripe
+        assert_eq!((3..8).filter(|&x| drawn(x, y)).count(), 2, "{y}");
+        assert!((0..3).chain(8..20).all(|x| drawn(x, y)), "{y}");
+        // none is left out without a neighbor that is drawn
+        assert!((3..8).all(|x| drawn(x - 1, y) || drawn(x, y) || drawn(x + 1, y)), "{y}");
+    }
+    assert_eq!(thinned.count(), 200 - 3 * 10);
+    // nothing is dropped from a large photograph (pixels are 0.2 wide), and nothing without masks
+    let large = RaySampler::new(&views, f32::INFINITY, 1.0, Foreground::Estimated, false).with_large(0.3);
+    assert_eq!(large.thinned().count(), 200);
+    let bare = [LoadedView { mask: None, ..view() }];
+    let bare = RaySampler::new(&bare, f32::INFINITY, 1.0, Foreground::Estimated, false).thinned();
+    assert_eq!(bare.count(), 200);
+    // behind the photograph's stripes nothing is head: only the outline is no smooth place
+    let outside = [LoadedView {
+        mask: Some(Gray {
+            width: 20,
+            height: 10,
+            values: (0..200).map(|i| 255 * u8::from(i % 20 < 10)).collect(),
+        }),
+        ..views[0].clone()
+    }];
+    let count =
+        |foreground| RaySampler::new(&outside, f32::INFINITY, 1.0, foreground, false).thinned().count();
+    // columns 8 to 11 see the outline; of 8 columns to either side two fifths stay
+    assert_eq!([Foreground::Estimated, Foreground::Photo].map(count), [40 + 64; 2]);
+}
+
+#[test]
 fn a_view_without_a_mask_teaches_nothing_beside_views_with_one() {
     let mut white = view();
     white.mask.as_mut().unwrap().values.fill(255);
@@ -170,10 +219,25 @@ fn a_device_draws_the_same_rays() {
         |foreground, published| RaySampler::new(&views, 0.1, 0.3, foreground, published).with_large(0.3);
     let all = [[-1.0f32; 3], [1.0; 3]];
     let permuted = |depth| RaySampler::permuted(&views, Foreground::Photo, all, depth);
+    // all one gray but for a border of background
+    let flat = LoadedView {
+        photo: Photo { rgb: vec![[90; 3]; 200], ..view().photo },
+        mask: Some(Gray {
+            width: 20,
+            height: 10,
+            values: (0..200).map(|i| 255 * u8::from(i % 20 > 1)).collect(),
+        }),
+        ..view()
+    };
+    let flat = [view(), flat];
+    let unthinned = || RaySampler::new(&flat, 0.1, 0.3, Foreground::Estimated, false);
+    let thinned = unthinned().thinned();
+    assert!(thinned.count() < unthinned().count() - 50, "{}", thinned.count());
     for (sampler, published, detail, largest) in [
         (new(Foreground::Estimated, false), false, 0.0, u64::MAX),
         (new(Foreground::Photo, true), true, 0.0, u64::MAX),
         (new(Foreground::Estimated, false), false, 0.5, u64::MAX),
+        (thinned, false, 0.0, u64::MAX),
         // a buffer holds two photographs of 200 pixels
         (new(Foreground::Estimated, false), false, 0.5, 1600),
         (permuted(false), false, 0.0, 1600),

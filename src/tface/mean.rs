@@ -118,8 +118,9 @@ pub fn train(
         false => {
             let volume: f32 = (0..3).map(|a| bounds[1][a] - bounds[0][a]).product();
             let cell = (volume as f64 / config.voxels_final as f64).cbrt() as f32;
-            RaySampler::new(&views, reach, 1.0, config.foreground, false)
-                .with_large(LARGE.min(train::DETAIL * cell))
+            let sampler = RaySampler::new(&views, reach, 1.0, config.foreground, false)
+                .with_large(LARGE.min(train::DETAIL * cell));
+            if config.thinned { sampler.thinned() } else { sampler }
         }
     };
     if sampler.count() == 0 {
