@@ -155,8 +155,8 @@ table! {
         stereo_at: f64 => 0.6;
         /// March step in units of 1 / inv_s, the sharpest (`band` rule).
         march: f32 => 1.0;
-        /// Shortest march step of the `band` rule. Drafts with 0.006 and 16,384 samples a step take a
-        /// fifth less CPU time than with 0.004 and 24,576, and their views are as good.
+        /// Shortest march step of the `band` rule. Drafts with 0.006 and 16,384 samples a step take
+        /// a fifth less CPU time than with 0.004 and 24,576, and their views are as good.
         min_step: f32 => 0.006, 0.003, 0.004;
         /// Longest march step of the `band` rule.
         max_step: f32 => 0.05;
