@@ -16,14 +16,18 @@ pub fn fma<const F: bool>(a: f32, b: f32, c: f32) -> f32 {
     if F { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// Rows of the accumulator block. With eight rows the accumulators no longer stay in registers and
-/// the block is forty times slower.
+/// Rows of the accumulator block. With eight rows the accumulators no longer stay in the 16 vector
+/// registers of AVX2, and the block is forty times slower.
 pub const ROWS: usize = 4;
 
-/// One block `C[ROWS, NR] (+)= Σ_p A[ROWS, p] · B[p, NR]`; `A` is strided, rows of `B` and `C`
+/// Rows of the accumulator block for vectors of 512 bits, of which there are 32: half as many reads
+/// of `B` a product.
+const TALL_ROWS: usize = 2 * ROWS;
+
+/// One block `C[R, NR] (+)= Σ_p A[R, p] · B[p, NR]`; `A` is strided, rows of `B` and `C`
 /// contiguous.
 #[inline(always)]
-fn block<const F: bool, const NR: usize>(
+fn block<const F: bool, const R: usize, const NR: usize>(
     k: usize,
     a: &[f32],
     row_stride: usize,
@@ -34,22 +38,22 @@ fn block<const F: bool, const NR: usize>(
     ldc: usize,
     add: bool,
 ) {
-    assert!(a.len() > (ROWS - 1) * row_stride + (k - 1) * column_stride);
+    assert!(a.len() > (R - 1) * row_stride + (k - 1) * column_stride);
     assert!(b.len() >= (k - 1) * ldb + NR);
-    assert!(c.len() >= (ROWS - 1) * ldc + NR);
-    let mut acc = [[0f32; NR]; ROWS];
+    assert!(c.len() >= (R - 1) * ldc + NR);
+    let mut acc = [[0f32; NR]; R];
     for p in 0..k {
         // SAFETY: the three extents were asserted above and p < k.
         let row: &[f32; NR] = unsafe { &*(b.as_ptr().add(p * ldb) as *const [f32; NR]) };
-        for i in 0..ROWS {
-            // SAFETY: as above, i < ROWS.
+        for i in 0..R {
+            // SAFETY: as above, i < R.
             let v = unsafe { *a.get_unchecked(i * row_stride + p * column_stride) };
             for l in 0..NR {
                 acc[i][l] = fma::<F>(v, row[l], acc[i][l]);
             }
         }
     }
-    for i in 0..ROWS {
+    for i in 0..R {
         let out = &mut c[i * ldc..][..NR];
         for l in 0..NR {
             out[l] = if add { out[l] + acc[i][l] } else { acc[i][l] };
@@ -68,10 +72,11 @@ fn gemm_body<const F: bool>(
     ldc: usize,
     add: bool,
 ) {
-    columns::<F, 16>(size, a, strides, b, ldb, c, ldc, add, 0);
+    columns::<F, ROWS, 16>(size, a, strides, b, ldb, c, ldc, add, 0);
 }
 
-/// As [`gemm_body`], with blocks of 32 columns for vectors of 512 bits. The sums are the same.
+/// As [`gemm_body`], with blocks of 8 rows and 32 columns for vectors of 512 bits. The sums are the
+/// same.
 #[inline(always)]
 fn gemm_wide<const F: bool>(
     size: (usize, usize, usize),
@@ -84,16 +89,16 @@ fn gemm_wide<const F: bool>(
     add: bool,
 ) {
     let done = size.1 / 32 * 32;
-    columns::<F, 32>((size.0, done, size.2), a, strides, b, ldb, c, ldc, add, 0);
-    columns::<F, 16>(size, a, strides, b, ldb, c, ldc, add, done);
+    columns::<F, TALL_ROWS, 32>((size.0, done, size.2), a, strides, b, ldb, c, ldc, add, 0);
+    columns::<F, TALL_ROWS, 16>(size, a, strides, b, ldb, c, ldc, add, done);
 }
 
 /// Computes the columns of a product from `first` on, in blocks of `NR`, the last 8 in one of 8.
 #[inline(always)]
-fn columns<const F: bool, const NR: usize>(
-    (m, n, k): (usize, usize, usize),
+fn columns<const F: bool, const R: usize, const NR: usize>(
+    size: (usize, usize, usize),
     a: &[f32],
-    (row_stride, column_stride): (usize, usize),
+    strides: (usize, usize),
     b: &[f32],
     ldb: usize,
     c: &mut [f32],
@@ -101,17 +106,39 @@ fn columns<const F: bool, const NR: usize>(
     add: bool,
     first: usize,
 ) {
-    debug_assert!(m % ROWS == 0 && n % 8 == 0);
-    for i in (0..m).step_by(ROWS) {
-        let a = &a[i * row_stride..];
-        let mut j = first;
-        while j + NR <= n {
-            block::<F, NR>(k, a, row_stride, column_stride, &b[j..], ldb, &mut c[i * ldc + j..], ldc, add);
-            j += NR;
-        }
-        if j < n {
-            block::<F, 8>(k, a, row_stride, column_stride, &b[j..], ldb, &mut c[i * ldc + j..], ldc, add);
-        }
+    let n = size.1;
+    debug_assert!(size.0.is_multiple_of(ROWS) && n.is_multiple_of(8));
+    let mut j = first;
+    while j + NR <= n {
+        rows::<F, R, NR>(size, a, strides, &b[j..], ldb, &mut c[j..], ldc, add);
+        j += NR;
+    }
+    if j < n {
+        rows::<F, R, 8>(size, a, strides, &b[j..], ldb, &mut c[j..], ldc, add);
+    }
+}
+
+/// Computes the first `NR` columns of a product, in blocks of `R` rows, the last [`ROWS`] in one of
+/// their own. These columns of `B` stay in the first-level cache meanwhile.
+#[inline(always)]
+fn rows<const F: bool, const R: usize, const NR: usize>(
+    (m, _, k): (usize, usize, usize),
+    a: &[f32],
+    (row_stride, column_stride): (usize, usize),
+    b: &[f32],
+    ldb: usize,
+    c: &mut [f32],
+    ldc: usize,
+    add: bool,
+) {
+    let tall = m - m % R;
+    for i in (0..tall).step_by(R) {
+        let (a, c) = (&a[i * row_stride..], &mut c[i * ldc..]);
+        block::<F, R, NR>(k, a, row_stride, column_stride, b, ldb, c, ldc, add);
+    }
+    for i in (tall..m).step_by(ROWS) {
+        let (a, c) = (&a[i * row_stride..], &mut c[i * ldc..]);
+        block::<F, ROWS, NR>(k, a, row_stride, column_stride, b, ldb, c, ldc, add);
     }
 }
 
@@ -209,7 +236,7 @@ mod tests {
     #[test]
     fn gemm_agrees_with_three_loops_for_both_orders_and_on_every_level() {
         type Gemm = fn((usize, usize, usize), &[f32], (usize, usize), &[f32], usize, &mut [f32], usize, bool);
-        let (m, n, k) = (8, 56, 5); // blocks of 32, 16 and 8 columns
+        let (m, n, k) = (12, 56, 5); // blocks of 8 and 4 rows, of 32, 16 and 8 columns
         let a: Vec<f32> = (0..m * k).map(|i| (i as f32 * 0.37).sin()).collect();
         let b: Vec<f32> = (0..k * n).map(|i| (i as f32 * 0.61).cos()).collect();
         let at: Vec<f32> = (0..m * k).map(|i| a[(i % m) * k + i / m]).collect(); // [k, m]
