@@ -6,7 +6,8 @@ use rayon::prelude::*;
 use tiface_base::dispatch;
 
 /// Position of a point between the vertices of a grid.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C)]
 pub struct Cell {
     /// Index of the vertex below the point along each axis; the vertex above always exists.
     pub index: [u32; 3],

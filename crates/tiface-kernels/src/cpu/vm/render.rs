@@ -20,6 +20,7 @@ use crate::cpu::pool::Buffer;
 use crate::cpu::simd::{exp, ln_1p};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 use tiface_base::dispatch;
 use tiface_base::geom::Ray;
 
@@ -124,36 +125,103 @@ pub struct Rendered {
     pub density_samples: u64,
     /// Number of samples whose color was decoded.
     pub color_samples: u64,
+    /// The samples of each task's rays.
+    marched: Vec<Marched>,
+    /// The colors of all tasks, one after the other.
+    decoded: Decoded,
+}
+
+/// The samples of a task's rays that contribute to a ray or its gradient.
+#[derive(Clone, Debug)]
+struct Marched {
     kept: Vec<KeptSample>,
     cells: Vec<Cell>,
     /// `[rays + 1]` into `kept`.
     offsets: Vec<u32>,
-    /// `[kept]`: index into the decoded colors, or [`COLORLESS`].
+    /// `[kept]`: index into the colors of the task, or [`COLORLESS`].
     color_of: Vec<u32>,
-    decoded: Decoded,
+    /// Samples at which colors are decoded, `[colors of the task]`.
+    colored: Vec<u32>,
+    /// Number of densities that were looked up.
+    looked_up: u64,
+}
+
+impl Marched {
+    /// Returns, for each ray, the range of its samples.
+    fn rays(&self) -> impl DoubleEndedIterator<Item = Range<usize>> {
+        self.offsets.windows(2).map(|ends| ends[0] as usize..ends[1] as usize)
+    }
+
+    /// Returns the gradients by the features of samples, and drops the cells of those whose
+    /// gradient is exactly zero, which need no scatter: both lists then have the others alone. Adds
+    /// the gradients by the task's colors `rgb` to `g_rgb`; `g` is `[rays, 5]`.
+    fn gradients(
+        &mut self,
+        field: &VmField,
+        g: &[f32],
+        rgb: &[[f32; 3]],
+        g_rgb: &mut [[f32; 3]],
+    ) -> Vec<f32> {
+        let length = field.lattice.step * field.shading.distance_scale;
+        let mut g_feature = vec![0f32; self.kept.len()];
+        for (g, samples) in g.chunks_exact(RAY_WIDTH).zip(self.rays()) {
+            let mut farther = 0f32; // Σ w_j dL/dw_j over the farther samples
+            for i in samples.rev() {
+                let k = &self.kept[i];
+                let w = k.weight();
+                let mut g_w = g[3] + g[4] * k.t;
+                let color = self.color_of[i] as usize;
+                if let (Some(c), Some(g_rgb)) = (rgb.get(color), g_rgb.get_mut(color)) {
+                    g_w += g[0] * c[0] + g[1] * c[1] + g[2] * c[2];
+                    (0..3).for_each(|channel| g_rgb[channel] += w * g[channel]);
+                }
+                let open = 1.0 - k.alpha;
+                let g_alpha = k.transmittance * g_w - farther / (open + 1e-10);
+                // dα/dσ = (1 − α) δ s
+                let slope = field.shading.slope::<true>(k.feature);
+                g_feature[i] = g_alpha * open * length * slope;
+                farther += w * g_w;
+            }
+        }
+        let mut of_cells = g_feature.iter();
+        self.cells.retain(|_| of_cells.next().is_some_and(|g| *g != 0.0));
+        g_feature.retain(|g| *g != 0.0);
+        g_feature
+    }
+}
+
+/// Splits a list that has an element for each color into the parts of the tasks.
+fn by_task<'a, T>(marched: &[Marched], mut of_colors: &'a [T]) -> Vec<&'a [T]> {
+    let part = |m: &Marched| of_colors.split_off(..m.colored.len()).expect("an element for each color");
+    marched.iter().map(part).collect()
+}
+
+/// As [`by_task`], for a list to be written.
+fn by_task_mut<'a, T>(marched: &[Marched], mut of_colors: &'a mut [T]) -> Vec<&'a mut [T]> {
+    let part = |m: &Marched| of_colors.split_off_mut(..m.colored.len()).expect("an element for each color");
+    marched.iter().map(part).collect()
 }
 
 /// Number of rays per task.
 const RAYS: usize = 32;
 
-struct MarchTask<'a> {
-    rays: &'a [Ray],
-    jitter: &'a [f32],
-    kept: Vec<KeptSample>,
-    cells: Vec<Cell>,
-    counts: Vec<u32>,
-    looked_up: u64,
-}
+/// Floats that a cell takes in a [`Buffer`].
+const CELL_FLOATS: usize = size_of::<Cell>() / size_of::<f32>();
 
 #[inline(always)]
-fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Lookup) {
+fn march_body<const F: bool>(
+    task: &mut Marched,
+    rays: &[Ray],
+    jitter: &[f32],
+    field: &VmField,
+    lookup: &Lookup,
+) {
     let s = &field.shading;
     let length = field.lattice.step * s.distance_scale;
-    for (r, ray) in task.rays.iter().enumerate() {
+    for (r, ray) in rays.iter().enumerate() {
         let (origin, direction) = (ray.origin.to_array(), ray.direction.to_array());
-        let before = task.kept.len();
         let mut transmittance = 1f32;
-        let mut walk = Walk::new(&field.lattice, field.mask.as_ref(), ray, shift(task.jitter, r));
+        let mut walk = Walk::new(&field.lattice, field.mask.as_ref(), ray, shift(jitter, r));
         while let Some(t) = walk.advance() {
             let cell = field.cell(std::array::from_fn(|a| origin[a] + t * direction[a]));
             let feature = lookup.sum::<F>(&cell);
@@ -170,11 +238,15 @@ fn march_body<const F: bool>(task: &mut MarchTask, field: &VmField, lookup: &Loo
                 break;
             }
         }
-        task.counts.push((task.kept.len() - before) as u32);
+        task.offsets.push(task.kept.len() as u32);
     }
 }
 
-dispatch! { fn march_rays / march_body(task: &mut MarchTask, field: &VmField, lookup: &Lookup) }
+dispatch! {
+    fn march_rays / march_body(
+        task: &mut Marched, rays: &[Ray], jitter: &[f32], field: &VmField, lookup: &Lookup,
+    )
+}
 
 /// Assigns colors to the samples of a ray, the first of which has the index `start`; appends the
 /// indices of the samples at which colors are decoded to `colored`.
@@ -231,60 +303,57 @@ pub fn render(
     assert!(jitter.is_empty() || jitter.len() == rays.len());
     let lookup = Lookup::new(&field.density, density);
     assert_eq!(lookup.size(), field.color.size);
-    let mut tasks: Vec<MarchTask> = rays
-        .chunks(RAYS)
-        .enumerate()
-        .map(|(task, rays)| MarchTask {
-            rays,
-            jitter: jitter.get(task * RAYS..task * RAYS + rays.len()).unwrap_or(&[]),
+    let march = |(task, rays): (usize, &[Ray])| {
+        let jitter = jitter.get(task * RAYS..task * RAYS + rays.len()).unwrap_or(&[]);
+        let mut marched = Marched {
             kept: Vec::with_capacity(rays.len() * 32),
             cells: Vec::with_capacity(rays.len() * 32),
-            counts: Vec::with_capacity(rays.len()),
+            offsets: vec![0],
+            color_of: Vec::new(),
+            colored: Vec::new(),
             looked_up: 0,
-        })
-        .collect();
-    tasks.par_iter_mut().for_each(|task| march_rays(task, field, &lookup));
-
-    let total = tasks.iter().map(|t| t.kept.len()).sum();
-    let mut kept = Vec::with_capacity(total);
-    let mut cells = Vec::with_capacity(total);
-    let mut offsets = vec![0u32];
-    let (mut end, mut density_samples) = (0, 0);
-    for task in tasks {
-        for count in task.counts {
-            end += count;
-            offsets.push(end);
+        };
+        march_rays(&mut marched, rays, jitter, field, &lookup);
+        marched.color_of.resize(marched.kept.len(), COLORLESS);
+        let Marched { kept, offsets, color_of, colored, .. } = &mut marched;
+        for ends in offsets.windows(2) {
+            let of_ray = ends[0] as usize..ends[1] as usize;
+            let weights = kept[of_ray.clone()].iter().map(KeptSample::weight);
+            assign_colors(&field.shading, weights, ends[0], &mut color_of[of_ray], colored);
         }
-        kept.extend_from_slice(&task.kept);
-        cells.extend_from_slice(&task.cells);
-        density_samples += task.looked_up;
+        marched
+    };
+    let marched: Vec<Marched> = rays.par_chunks(RAYS).enumerate().map(march).collect();
+
+    let colors = marched.iter().map(|m| m.colored.len()).sum();
+    let (mut color_cells, mut directions) = (Vec::with_capacity(colors), Vec::with_capacity(colors));
+    for (m, rays) in marched.iter().zip(rays.chunks(RAYS)) {
+        color_cells.extend(m.colored.iter().map(|&i| m.cells[i as usize]));
+        let mut colored = m.colored.iter().peekable();
+        for (ray, samples) in rays.iter().zip(m.rays()) {
+            while colored.next_if(|&&i| (i as usize) < samples.end).is_some() {
+                directions.push(ray.direction.to_array());
+            }
+        }
     }
-    let mut color_of = vec![COLORLESS; total];
-    let mut colored = Vec::with_capacity(total);
-    let mut directions = Vec::with_capacity(total);
-    for (ray, range) in rays.iter().zip(offsets.windows(2)) {
-        let of_ray = range[0] as usize..range[1] as usize;
-        let weights = kept[of_ray.clone()].iter().map(KeptSample::weight);
-        assign_colors(&field.shading, weights, range[0], &mut color_of[of_ray], &mut colored);
-        directions.resize(colored.len(), ray.direction.to_array());
-    }
-    let color_cells: Vec<Cell> = colored.iter().map(|&i| cells[i as usize]).collect();
     let decoded = decoder::decode(&field.color, color, decoder, color_cells, &directions);
 
     let mut out = vec![0f32; rays.len() * RAY_WIDTH];
-    for (r, out) in out.chunks_exact_mut(RAY_WIDTH).enumerate() {
-        for i in offsets[r] as usize..offsets[r + 1] as usize {
-            let k = &kept[i];
-            let w = k.weight();
-            if let Some(color) = decoded.rgb.get(color_of[i] as usize) {
-                (0..3).for_each(|c| out[c] += w * color[c]);
+    let rgb = by_task(&marched, &decoded.rgb);
+    out.par_chunks_mut(RAYS * RAY_WIDTH).zip(marched.par_iter().zip(rgb)).for_each(|(out, (m, rgb))| {
+        for (out, samples) in out.chunks_exact_mut(RAY_WIDTH).zip(m.rays()) {
+            for (k, &color) in m.kept[samples.clone()].iter().zip(&m.color_of[samples]) {
+                let w = k.weight();
+                if let Some(color) = rgb.get(color as usize) {
+                    (0..3).for_each(|c| out[c] += w * color[c]);
+                }
+                out[3] += w;
+                out[4] += w * k.t;
             }
-            out[3] += w;
-            out[4] += w * k.t;
         }
-    }
-    let color_samples = colored.len() as u64;
-    Rendered { out, density_samples, color_samples, kept, cells, offsets, color_of, decoded }
+    });
+    let density_samples = marched.iter().map(|m| m.looked_up).sum();
+    Rendered { out, density_samples, color_samples: colors as u64, marched, decoded }
 }
 
 #[inline(always)]
@@ -323,45 +392,38 @@ pub fn backward(
     g_density: &mut [f32],
     g_color: &mut [f32],
 ) -> Vec<f32> {
-    let Rendered { kept, cells, offsets, color_of, decoded, .. } = rendered;
-    let length = field.lattice.step * field.shading.distance_scale;
-    let mut g_feature = vec![0f32; kept.len()];
+    assert_eq!(g.len(), rendered.out.len(), "a gradient for each ray");
+    let Rendered { mut marched, decoded, .. } = rendered;
     let mut g_rgb = vec![[0f32; 3]; decoded.rgb.len()];
-    for r in (0..offsets.len() - 1).rev() {
-        let g = &g[r * RAY_WIDTH..][..RAY_WIDTH];
-        let mut farther = 0f32; // Σ w_j dL/dw_j over the farther samples
-        for i in (offsets[r]..offsets[r + 1]).rev() {
-            let i = i as usize;
-            let k = &kept[i];
-            let w = k.weight();
-            let mut g_w = g[3] + g[4] * k.t;
-            let color = color_of[i] as usize;
-            if let (Some(c), Some(g_rgb)) = (decoded.rgb.get(color), g_rgb.get_mut(color)) {
-                g_w += g[0] * c[0] + g[1] * c[1] + g[2] * c[2];
-                (0..3).for_each(|channel| g_rgb[channel] += w * g[channel]);
-            }
-            let open = 1.0 - k.alpha;
-            let g_alpha = k.transmittance * g_w - farther / (open + 1e-10);
-            // dα/dσ = (1 − α) δ s
-            let slope = field.shading.slope::<true>(k.feature);
-            g_feature[i] = g_alpha * open * length * slope;
-            farther += w * g_w;
-        }
-    }
-    // samples with a gradient of exactly zero need no scatter
-    let (cells, g_feature): (Vec<Cell>, Vec<f32>) =
-        cells.into_iter().zip(g_feature).filter(|(_, g)| *g != 0.0).unzip();
+    let (rgb_of, g_rgb_of) = (by_task(&marched, &decoded.rgb), by_task_mut(&marched, &mut g_rgb));
+    let of_rays = g.par_chunks(RAYS * RAY_WIDTH);
+    let g_feature: Vec<Vec<f32>> = (&mut marched, of_rays, rgb_of, g_rgb_of)
+        .into_par_iter()
+        .map(|(m, g, rgb, g_rgb)| m.gradients(field, g, rgb, g_rgb))
+        .collect();
+
     let lookup = Lookup::new(&field.density, density);
     let n = field.density.channels();
-    let mut planes = Buffer::scratch(cells.len() * n);
-    let mut lines = Buffer::scratch(cells.len() * n);
-    const CHUNK: usize = 1024;
-    planes
-        .par_chunks_mut(CHUNK * n)
-        .zip(lines.par_chunks_mut(CHUNK * n))
-        .zip(cells.par_chunks(CHUNK).zip(g_feature.par_chunks(CHUNK)))
-        .for_each(|((p, l), (cells, g))| factor_gradients(cells, g, p, l, n, &lookup));
-    let gradients = FactorGradients { cells: &cells, planes: &planes, lines: &lines, stride: n };
+    let count = g_feature.iter().map(Vec::len).sum::<usize>();
+    let mut cells = Buffer::scratch(count * CELL_FLOATS);
+    let [mut planes, mut lines] = [(); 2].map(|()| Buffer::scratch(count * n));
+    let mut rest = [&mut cells[..], &mut planes[..], &mut lines[..]];
+    let tasks: Vec<_> = g_feature
+        .iter()
+        .zip(&marched)
+        .map(|(g, m)| {
+            let mut cut = |k: usize, width: usize| {
+                rest[k].split_off_mut(..g.len() * width).expect("a row for each sample")
+            };
+            (m, g, cut(0, CELL_FLOATS), cut(1, n), cut(2, n))
+        })
+        .collect();
+    tasks.into_par_iter().for_each(|(m, g, cells, planes, lines)| {
+        bytemuck::cast_slice_mut(cells).copy_from_slice(&m.cells);
+        factor_gradients(&m.cells, g, planes, lines, n, &lookup);
+    });
+    let cells: &[Cell] = bytemuck::cast_slice(&cells);
+    let gradients = FactorGradients { cells, planes: &planes, lines: &lines, stride: n };
     gather::scatter(&field.density, &gradients, g_density);
     decoder::decode_backward(&field.color, decoder, decoded, &g_rgb, g_color)
 }
